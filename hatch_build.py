@@ -10,7 +10,7 @@ from typing import Any
 from hatchling.builders.hooks.plugin.interface import BuildHookInterface
 
 PLACE = "gscompleter/viewer/libraries.json"
-"""Where `gscompleter.viewer.packages` looks for it in the wheel."""
+"""Where `gscompleter.apps.viewer.packages` looks for it in the wheel."""
 
 
 class ViewerLibraries(BuildHookInterface[Any]):
@@ -31,8 +31,8 @@ class ViewerLibraries(BuildHookInterface[Any]):
     def fetched(self) -> Path | None:
         """A file of the libraries; None, with a warning, where they cannot be had."""
         sys.path.insert(0, str(Path(self.root) / "src"))
+        from gscompleter.apps.viewer.packages import write_libraries
         from gscompleter.errors import InputError
-        from gscompleter.viewer.packages import write_libraries
 
         self.folder = tempfile.TemporaryDirectory()
         packed = Path(self.folder.name) / "libraries.json"

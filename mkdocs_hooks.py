@@ -149,7 +149,7 @@ def as_definitions(help_text: str) -> str:
 
 def help_of(command: str) -> str:
     """Return the help of a command, 100 characters wide and without colours."""
-    from gscompleter.cli import parsed
+    from gscompleter.cli import parse_command
 
     output = io.StringIO()
     plain = {"COLUMNS": "100", "NO_COLOR": "1", "TERM": "dumb"}
@@ -158,7 +158,7 @@ def help_of(command: str) -> str:
         contextlib.redirect_stdout(output),
         contextlib.suppress(SystemExit),
     ):
-        parsed([command, "--help-all"])
+        parse_command([command, "--help-all"])
     return re.sub(r"\x1b\[[0-9;]*m", "", output.getvalue()).strip()
 
 

@@ -22,33 +22,35 @@ from jaxtyping import Float
 from skimage.restoration import inpaint_biharmonic
 from torch import Tensor
 
+from gscompleter.apps.report.completion import join_images
 from gscompleter.data.cases import Case, read_cases
-from gscompleter.generators.warp import Warped, warp_photographs
+from gscompleter.generators.warp import WarpedImage, warp_photographs
 from gscompleter.generators.warp_inpaint import WarpInpaint
-from gscompleter.interpolation import push_pull
+from gscompleter.image_ops import push_pull
 from gscompleter.io.image import write_image
 from gscompleter.reconstructors import load_reconstructor
 from gscompleter.render import load_renderer
-from gscompleter.reports.completion import strip
-from gscompleter.stages.anchor import nearest_view
-from gscompleter.types import SceneContext, View
+from gscompleter.stages.select_anchor import find_nearest_view
+from gscompleter.types import GeneratorInput, View
 
 Image = Float[Tensor, "h w 3"]
-Method = Callable[[View, View, SceneContext, Warped], Image]
+Method = Callable[[View, View, GeneratorInput, WarpedImage], Image]
 
 
-def ours(nearest: View, target: View, context: SceneContext, warped: Warped) -> Image:
+def fill_ours(nearest: View, target: View, context: GeneratorInput, warped: WarpedImage) -> Image:
     return WarpInpaint()(nearest, target.camera, context)
 
 
-def averages(nearest: View, target: View, context: SceneContext, warped: Warped) -> Image:
+def fill_averages(
+    nearest: View, target: View, context: GeneratorInput, warped: WarpedImage
+) -> Image:
     return push_pull(warped.image, warped.known.to(warped.image.dtype))
 
 
-def opencv(flag: int) -> Method:
+def make_opencv_method(flag: int) -> Method:
     """Make a method of cv2.inpaint with a radius of 5 pixels."""
 
-    def fill(nearest: View, target: View, context: SceneContext, warped: Warped) -> Image:
+    def fill(nearest: View, target: View, context: GeneratorInput, warped: WarpedImage) -> Image:
         image = (warped.image.numpy() * 255).round().astype(np.uint8)
         hole = (~warped.known).numpy().astype(np.uint8)
         return torch.from_numpy(cv2.inpaint(image, hole, 5, flag)).float() / 255
@@ -56,7 +58,9 @@ def opencv(flag: int) -> Method:
     return fill
 
 
-def biharmonic(nearest: View, target: View, context: SceneContext, warped: Warped) -> Image:
+def fill_biharmonic(
+    nearest: View, target: View, context: GeneratorInput, warped: WarpedImage
+) -> Image:
     h, w = warped.known.shape
     size = (w // 2, h // 2)
     image = cv2.resize(warped.image.numpy(), size, interpolation=cv2.INTER_AREA)
@@ -67,25 +71,25 @@ def biharmonic(nearest: View, target: View, context: SceneContext, warped: Warpe
 
 
 METHODS: dict[str, Method] = {
-    "warp-inpaint": ours,
-    "pyramid of averages": averages,
-    "OpenCV Telea": opencv(cv2.INPAINT_TELEA),
-    "OpenCV Navier-Stokes": opencv(cv2.INPAINT_NS),
-    "scikit-image biharmonic": biharmonic,
+    "warp-inpaint": fill_ours,
+    "pyramid of averages": fill_averages,
+    "OpenCV Telea": make_opencv_method(cv2.INPAINT_TELEA),
+    "OpenCV Navier-Stokes": make_opencv_method(cv2.INPAINT_NS),
+    "scikit-image biharmonic": fill_biharmonic,
 }
 
 
-def known_scene(case: Case) -> tuple[View, View, SceneContext]:
+def load_known_scene(case: Case) -> tuple[View, View, GeneratorInput]:
     """Load the nearest photograph, the target photograph, and the reconstructed scene."""
     views, (target,) = case.load(case.context), case.load((case.target,))
     scene = load_reconstructor("plane-sweep")(views).gaussians
     renderer = load_renderer("cpu")
-    context = SceneContext(
+    context = GeneratorInput(
         tuple(views),
         tuple(renderer.render(scene, view.camera) for view in views),
         renderer.render(scene, target.camera),
     )
-    return views[nearest_view(target.camera, views)], target, context
+    return views[find_nearest_view(target.camera, views)], target, context
 
 
 def main(
@@ -101,12 +105,12 @@ def main(
     scores: dict[str, list[float]] = {name: [] for name in METHODS}
     seconds: dict[str, list[float]] = {name: [] for name in METHODS}
     for number, case in enumerate(c for c in read_cases(cases) if only in c.name):
-        nearest, target, context = known_scene(case)
+        nearest, target, context = load_known_scene(case)
         warped = warp_photographs(nearest, target.camera, context)
         if warped.known.all():
             continue
         if number == 0:
-            ours(nearest, target, context, warped)  # compiles before the clock starts
+            fill_ours(nearest, target, context, warped)  # compiles before the clock starts
         images = []
         for name, method in METHODS.items():
             start = time.perf_counter()
@@ -119,7 +123,7 @@ def main(
         if pictures is not None:
             pictures.mkdir(parents=True, exist_ok=True)
             name = case.name.replace(" ", "_").replace(">", "-")
-            write_image(pictures / f"{name}.png", strip([*images, target.image]))
+            write_image(pictures / f"{name}.png", join_images([*images, target.image]))
 
     print(f"\n{'':24s} {'hole PSNR':>10s} {'worst loss':>11s} {'time':>9s} {'time ratio':>11s}")
     for name in METHODS:

@@ -20,25 +20,25 @@ from jaxtyping import Float
 from torch import Tensor
 
 import gscompleter as gsc
-from gscompleter.matching.depth_range import depth_range_of
-from gscompleter.metrics.image import psnr
+from gscompleter.evaluation.metrics.image import psnr
+from gscompleter.reconstructors.features.depth_range import get_depth_range
 from gscompleter.reconstructors.plane_sweep import PlaneSweep
 from gscompleter.types import Gaussians, View, merge
 
 SIZE = 256, 256
 
 
-def jointly(views: Sequence[View]) -> Gaussians:
+def reconstruct_jointly(views: Sequence[View]) -> Gaussians:
     return PlaneSweep()(views).gaussians
 
 
-def by_pairs(views: Sequence[View]) -> Gaussians:
+def reconstruct_by_pairs(views: Sequence[View]) -> Gaussians:
     """Reconstruct pairs of neighbouring photographs and merge them, as two-view models do."""
     pairs = [views[i : i + 2] for i in range(0, len(views) - 1, 2)]
     return merge([PlaneSweep()(pair).gaussians for pair in pairs])
 
 
-def spread(scene: Path, count: int) -> tuple[list[View], list[View]]:
+def load_spread_views(scene: Path, count: int) -> tuple[list[View], list[View]]:
     """Load `count` evenly spread photographs and those halfway between, with one depth range."""
     last = len(gsc.load_views(scene, resolution=(16, 16))) - 1
     given = np.linspace(0, last, count).round().astype(int).tolist()
@@ -46,36 +46,39 @@ def spread(scene: Path, count: int) -> tuple[list[View], list[View]]:
     views, between = (
         gsc.load_views(scene, frames=frames, resolution=SIZE) for frames in (given, sorted(middle))
     )
-    near, far = depth_range_of(views)
-    return ranged(views, near, far), ranged(between, near, far)
+    near, far = get_depth_range(views)
+    return set_depth_range(views, near, far), set_depth_range(between, near, far)
 
 
-def ranged(views: Sequence[View], near: float, far: float) -> list[View]:
+def set_depth_range(views: Sequence[View], near: float, far: float) -> list[View]:
     return [replace(v, camera=replace(v.camera, near=near, far=far)) for v in views]
 
 
-def scores(gaussians: Gaussians, views: Sequence[View]) -> list[float]:
+def compute_scores(gaussians: Gaussians, views: Sequence[View]) -> list[float]:
     """Compute PSNR (dB) at each view, in its exposure."""
     renderer = gsc.load_renderer("cpu")
     images = [renderer.render(gaussians, view.camera).image for view in views]
     return [
-        psnr(exposed_as(v.image, image), v.image) for image, v in zip(images, views, strict=True)
+        psnr(match_exposure(v.image, image), v.image)
+        for image, v in zip(images, views, strict=True)
     ]
 
 
-def exposed_as(
+def match_exposure(
     photograph: Float[Tensor, "h w 3"], image: Float[Tensor, "h w 3"]
 ) -> Float[Tensor, "h w 3"]:
     """Multiply each channel of `image` by its best gain for `photograph`."""
     return image * (image * photograph).sum((0, 1)) / image.square().sum((0, 1))
 
 
-def row(name: str, make: Callable[[Sequence[View]], Gaussians], scene: Path, count: int) -> None:
-    views, between = spread(scene, count)
+def print_row(
+    name: str, make: Callable[[Sequence[View]], Gaussians], scene: Path, count: int
+) -> None:
+    views, between = load_spread_views(scene, count)
     start = time.perf_counter()
     made = make(views)
     seconds = time.perf_counter() - start
-    given, others = scores(made, views), scores(made, between) or [float("nan")]
+    given, others = compute_scores(made, views), compute_scores(made, between) or [float("nan")]
     print(
         f"| {scene.name} | {name} | {count} | {seconds:.1f} | {seconds / count:.2f} | "
         f"{len(made) / 1000:.0f} | {np.mean(given):.2f} ({min(given):.2f}) | "
@@ -94,8 +97,8 @@ def main() -> None:
     print("| --- | --- | ---: | ---: | ---: | ---: | ---: | ---: |")
     for scene in given.scenes:
         for count in given.views:
-            row("jointly", jointly, scene, count)
-            row("by pairs", by_pairs, scene, count)
+            print_row("jointly", reconstruct_jointly, scene, count)
+            print_row("by pairs", reconstruct_by_pairs, scene, count)
 
 
 if __name__ == "__main__":

@@ -18,13 +18,13 @@ import tyro
 from rich.console import Console
 from rich.table import Table
 
-from bench_render import median_seconds
-from gscompleter.commands.demo import write_motorcycle_scene
+from bench_render import measure_median_seconds
+from gscompleter.apps.commands.demo import write_motorcycle_scene
 from gscompleter.data.scene import load_views
+from gscompleter.evaluation.memory import measure_peak_memory
+from gscompleter.models.weights.published import PUBLISHED
 from gscompleter.reconstructors import Reconstructor, load_reconstructor
-from gscompleter.runs.memory import peak_memory
 from gscompleter.types import View
-from gscompleter.weights.published import PUBLISHED
 
 MODELS = (
     "plane-sweep",
@@ -40,41 +40,43 @@ MODELS = (
 
 
 @dataclass(frozen=True)
-class Measured:
+class ModelCost:
     seconds: float
     peak_bytes: int | None
 
 
-def photographs(size: int) -> list[View]:
+def load_motorcycle_pair(size: int) -> list[View]:
     """Load the centre of the Middlebury motorcycle pair of scikit-image."""
     with TemporaryDirectory() as folder:
         write_motorcycle_scene(Path(folder))
         return load_views(folder, resolution=(size, size), near=1.0, far=20.0)
 
 
-def model(
+def load_model(
     name: str, device: str = "cpu", dtype: torch.dtype = torch.float32
 ) -> tuple[Reconstructor, int]:
     """Load a reconstructor, with random weights if it has any, and their number."""
     if name not in PUBLISHED:
         return load_reconstructor(name), 0
-    from gscompleter.reconstructors.feed_forward.build import around, network_of
+    from gscompleter.models.feed_forward.build import create_network, wrap_network
 
     torch.manual_seed(0)
-    network = network_of(PUBLISHED[name]).eval().requires_grad_(False).to(device)
-    return around(network, dtype), sum(p.numel() for p in network.parameters())
+    network = create_network(PUBLISHED[name]).eval().requires_grad_(False).to(device)
+    return wrap_network(network, dtype), sum(p.numel() for p in network.parameters())
 
 
-def repeated(reconstruct: Reconstructor, views: list[View], repetitions: int) -> Measured:
-    with peak_memory(views[0].image.device) as peak:
-        seconds = median_seconds(lambda: reconstruct(views), repetitions)
-    return Measured(seconds, peak.bytes)
+def measure_repeatedly(
+    reconstruct: Reconstructor, views: list[View], repetitions: int
+) -> ModelCost:
+    with measure_peak_memory(views[0].image.device) as peak:
+        seconds = measure_median_seconds(lambda: reconstruct(views), repetitions)
+    return ModelCost(seconds, peak.bytes)
 
 
-def measure(name: str, size: int, repetitions: int) -> tuple[int, Measured]:
+def measure(name: str, size: int, repetitions: int) -> tuple[int, ModelCost]:
     """Return the number of parameters of a model, and its measurement on a CPU."""
-    reconstruct, parameters = model(name)
-    return parameters, repeated(reconstruct, photographs(size), repetitions)
+    reconstruct, parameters = load_model(name)
+    return parameters, measure_repeatedly(reconstruct, load_motorcycle_pair(size), repetitions)
 
 
 def main(size: int = 256, repetitions: int = 3, only: tuple[str, ...] = MODELS) -> None:

@@ -19,12 +19,12 @@ import tyro
 from rich.console import Console
 from rich.table import Table
 
-from bench_render import now
-from gscompleter.generators.diffusion.kontext import nearest_size
-from gscompleter.generators.diffusion.placing import precision_on
-from gscompleter.generators.diffusion.position_ids import target_ids
-from gscompleter.generators.diffusion.published import PE_FIELD_TRANSFORMER
-from gscompleter.generators.diffusion.rotary import with_per_head_positions
+from bench_render import read_clock
+from gscompleter.models.diffusion.kontext import find_nearest_size
+from gscompleter.models.diffusion.placing import select_dtype
+from gscompleter.models.diffusion.position_ids import compute_target_ids
+from gscompleter.models.diffusion.published import PE_FIELD_TRANSFORMER
+from gscompleter.models.diffusion.rotary import enable_per_head_positions
 
 BLOCKS = (PE_FIELD_TRANSFORMER["num_layers"], PE_FIELD_TRANSFORMER["num_single_layers"])
 """Double and single blocks of the published transformer."""
@@ -62,7 +62,7 @@ class Pass:
     """Peak memory of the GPU; None on a CPU."""
 
 
-def transformer(blocks: tuple[int, int], device: str) -> Any:
+def build_transformer(blocks: tuple[int, int], device: str) -> Any:
     """Build FLUX's transformer with random weights."""
     from diffusers import FluxTransformer2DModel
 
@@ -70,7 +70,7 @@ def transformer(blocks: tuple[int, int], device: str) -> Any:
         model = FluxTransformer2DModel(
             **{**PE_FIELD_TRANSFORMER, "num_layers": blocks[0], "num_single_layers": blocks[1]}
         )
-    model = model.to(precision_on(device)).to_empty(device=device)
+    model = model.to(select_dtype(device)).to_empty(device=device)
     torch.manual_seed(0)
     with torch.no_grad():
         for parameter in model.parameters():
@@ -78,11 +78,11 @@ def transformer(blocks: tuple[int, int], device: str) -> Any:
     return model.eval()
 
 
-def call(model: Any, options: Options, numbers: int) -> Callable[[], None]:
+def make_call(model: Any, options: Options, numbers: int) -> Callable[[], None]:
     """Make a function that evaluates the transformer; `numbers` is the length of a position."""
-    size = nearest_size(options.height, options.width)
+    size = find_nearest_size(options.height, options.width)
     grid = (size[0] // TOKEN, size[1] // TOKEN)
-    ids = target_ids(size, grid)[:, :numbers].repeat(2, 1).to(options.device)
+    ids = compute_target_ids(size, grid)[:, :numbers].repeat(2, 1).to(options.device)
     if numbers > 3:
         ids = ids.repeat(1, options.images)
     device, dtype, b = options.device, next(model.parameters()).dtype, options.images
@@ -113,17 +113,17 @@ class Stopwatch:
             self.hooks.append(block.register_forward_hook(self.stop))
 
     def start(self, *_: Any) -> None:
-        self.seconds -= now()
+        self.seconds -= read_clock()
 
     def stop(self, *_: Any) -> None:
-        self.seconds += now()
+        self.seconds += read_clock()
 
     def remove(self) -> None:
         for hook in self.hooks:
             hook.remove()
 
 
-def measured(model: Any, once: Callable[[], None], options: Options) -> Pass:
+def measure_pass(model: Any, once: Callable[[], None], options: Options) -> Pass:
     """Measure the median pass, with missing blocks estimated from those that are built."""
     kinds = (model.transformer_blocks, model.single_transformer_blocks)
     missing = [all_of_them / len(b) - 1 for b, all_of_them in zip(kinds, BLOCKS, strict=True)]
@@ -133,9 +133,9 @@ def measured(model: Any, once: Callable[[], None], options: Options) -> Pass:
     passes = []
     for _ in range(options.repetitions):
         watches = [Stopwatch(blocks) for blocks in kinds] if any(missing) else []
-        start = now()
+        start = read_clock()
         once()
-        seconds = now() - start
+        seconds = read_clock() - start
         for watch, share in zip(watches, missing, strict=False):
             watch.remove()
             seconds += share * watch.seconds
@@ -151,15 +151,15 @@ def main() -> None:
     if options.device == "cuda" and not torch.cuda.is_available():
         raise SystemExit("--device cuda needs a GPU, and there is none; leave it out.")
     built = options.blocks or ((1, 1) if options.device == "cpu" else BLOCKS)
-    model = transformer(built, options.device)
-    rows = {"plain positions": measured(model, call(model, options, 3), options)}
-    with_per_head_positions(model)
-    rows["a position for each head"] = measured(model, call(model, options, 63), options)
+    model = build_transformer(built, options.device)
+    rows = {"plain positions": measure_pass(model, make_call(model, options, 3), options)}
+    enable_per_head_positions(model)
+    rows["a position for each head"] = measure_pass(model, make_call(model, options, 63), options)
     if options.compile:
         compiled = torch.compile(model)
-        once = call(compiled, options, 63)
-        rows["the same, compiled"] = measured(model, once, options)
-    size = nearest_size(options.height, options.width)
+        once = make_call(compiled, options, 63)
+        rows["the same, compiled"] = measure_pass(model, once, options)
+    size = find_nearest_size(options.height, options.width)
     tokens = 2 * (size[0] // TOKEN) * (size[1] // TOKEN) + TEXT
     table = Table(
         "",

@@ -16,41 +16,43 @@ import torch
 import tyro
 
 from gscompleter import Gaussians, View, load_renderer, merge
-from gscompleter.commands.demo import motorcycle_cameras, moved
-from gscompleter.geometry import widened
-from gscompleter.types import observed, sh_from_rgb
+from gscompleter.apps.commands.demo import get_motorcycle_cameras, move_right
+from gscompleter.geometry import pad_camera
+from gscompleter.types import make_observed, sh_from_rgb
 
 
-def now() -> float:
+def read_clock() -> float:
     """Return the clock in seconds, after all GPU work is done."""
     if torch.cuda.is_initialized():
         torch.cuda.synchronize()
     return time.perf_counter()
 
 
-def median_seconds(function: Callable[[], object], runs: int = 7, warm: bool = True) -> float:
+def measure_median_seconds(
+    function: Callable[[], object], runs: int = 7, warm: bool = True
+) -> float:
     """Measure the median over `runs`, after a warm-up run unless `warm` is False."""
     if warm:
         function()
     seconds = []
     for _ in range(runs):
-        start = now()
+        start = read_clock()
         function()
-        seconds.append(now() - start)
+        seconds.append(read_clock() - start)
     return statistics.median(seconds)
 
 
-def pixel_gaussians(size: int, shift: float) -> tuple[Gaussians, View]:
+def make_pixel_gaussians(size: int, shift: float) -> tuple[Gaussians, View]:
     """Make one Gaussian per pixel of a camera moved by `shift` metres, on a surface 3 m away."""
-    left, _ = motorcycle_cameras(741, 500)
+    left, _ = get_motorcycle_cameras(741, 500)
     K = torch.tensor([[1.2 * size, 0, size / 2], [0, 1.2 * size, size / 2], [0, 0, 1]])
-    camera = moved(replace(left, K=K, width=size, height=size, near=1.0, far=8.0), shift)
+    camera = move_right(replace(left, K=K, width=size, height=size, near=1.0, far=8.0), shift)
     x = torch.linspace(0, 12, size)
     depth = 3 + 0.5 * torch.sin(x)[None] * torch.cos(x)[:, None]
     n = size * size
     colours = torch.rand(n, 3, generator=torch.Generator().manual_seed(0))
     means = (camera.center + depth[..., None] * camera.z_rays()).reshape(-1, 3)
-    gaussians = observed(
+    gaussians = make_observed(
         means,
         torch.tensor([1.0, 0, 0, 0]).repeat(n, 1),
         (0.5 * depth / K[0, 0]).reshape(-1, 1).repeat(1, 3),
@@ -77,27 +79,29 @@ def main(size: int = 256, reference_size: int = 48) -> None:
 
         return step
 
-    small, view = pixel_gaussians(reference_size, 0.0)
-    camera = widened(view.camera, 0.0).wide
-    ours = median_seconds(optimise(lambda g: cpu.render(g, camera).image, small))
-    theirs = median_seconds(optimise(lambda g: reference.render(g, camera).image, small), runs=2)
+    small, view = make_pixel_gaussians(reference_size, 0.0)
+    camera = pad_camera(view.camera, 0.0).padded
+    ours = measure_median_seconds(optimise(lambda g: cpu.render(g, camera).image, small))
+    theirs = measure_median_seconds(
+        optimise(lambda g: reference.render(g, camera).image, small), runs=2
+    )
     print(f"forward and backward, {len(small):,} Gaussians, {reference_size} px: reference / cpu")
     print(f"  {theirs / ours:10.1f} x   (cpu {1e3 * ours:.1f} ms)")
 
-    context = merge([pixel_gaussians(size, x)[0] for x in (-0.2, 0.2)])
-    new, view = pixel_gaussians(size, 0.4)
+    context = merge([make_pixel_gaussians(size, x)[0] for x in (-0.2, 0.2)])
+    new, view = make_pixel_gaussians(size, 0.4)
     frozen = cpu.freeze(context, view.camera)
-    together = median_seconds(
+    together = measure_median_seconds(
         optimise(lambda g: cpu.render(merge([context, g]), view.camera).image, new)
     )
-    composite = median_seconds(optimise(lambda g: frozen.composite(g).image, new))
-    plan = frozen.plan(new)
+    composite = measure_median_seconds(optimise(lambda g: frozen.composite(g).image, new))
+    plan = frozen.vary_opacities(new)
 
     def planned() -> None:
         opacities = new.opacities.clone().requires_grad_()
         plan(opacities).image.sum().backward()
 
-    opacity_only = median_seconds(planned)
+    opacity_only = measure_median_seconds(planned)
     print(f"a step of optimisation, {len(context):,} frozen and {len(new):,} new Gaussians:")
     print(f"  {together / composite:10.1f} x   all of them / composite of the frozen view")
     print(f"  {composite / opacity_only:10.1f} x   composite / plan, if only opacities move")

@@ -18,11 +18,11 @@ from skimage.data import stereo_motorcycle
 from skimage.restoration import denoise_tv_chambolle
 
 from gscompleter import View
-from gscompleter.commands.demo import (
+from gscompleter.apps.commands.demo import (
     BASELINE_M,
     FOCAL_PX,
     PRINCIPAL_POINT_DX_PX,
-    motorcycle_cameras,
+    get_motorcycle_cameras,
 )
 from gscompleter.reconstructors.plane_sweep import PlaneSweep
 from gscompleter.reconstructors.plane_sweep.surfaces import ITERATIONS, fit_surfaces
@@ -46,7 +46,8 @@ def main() -> None:
     truth = truth[:height, :width]
     half = torch.tensor([[0.5], [0.5], [1.0]])
     cameras = [
-        replace(c, K=c.K * half, width=width, height=height) for c in motorcycle_cameras(741, 500)
+        replace(c, K=c.K * half, width=width, height=height)
+        for c in get_motorcycle_cameras(741, 500)
     ]
     views = [
         View(torch.from_numpy(i / 255).float(), c) for i, c in zip(halves, cameras, strict=True)
@@ -58,7 +59,7 @@ def main() -> None:
     PlaneSweep()(views)
     whole = time.perf_counter() - start
     start = time.perf_counter()
-    found = PlaneSweep().depths(views)[0].depth.numpy()
+    found = PlaneSweep().estimate_depths(views)[0].depth.numpy()
     ours = time.perf_counter() - start
     report("plane-sweep (both views)", found, truth, ours)
 

@@ -23,15 +23,15 @@ from typing import Any
 
 import torch
 
-from bench_models import MODELS, model, repeated
-from bench_pe_field import transformer
-from bench_render import median_seconds
-from gpu_report import Part, Row, main, shortened, tried
+from bench_models import MODELS, load_model, measure_repeatedly
+from bench_pe_field import build_transformer
+from bench_render import measure_median_seconds
+from gpu_report import Part, Row, main, shorten, try_rows
 from gscompleter import Gaussians, GSCompleter, View, load_renderer
-from gscompleter.generators.diffusion.pe_field import PEField
-from gscompleter.render import FrozenView, Renderer
-from gscompleter.render.reference import ReferenceView
-from gscompleter.types import Camera, SceneContext, merge
+from gscompleter.models.diffusion.pe_field import PEField
+from gscompleter.render import FrozenScene, Renderer
+from gscompleter.render.reference import ReferenceFrozenScene
+from gscompleter.types import Camera, GeneratorInput, merge
 from scenes import Room, camera_at, gaussians_of, view_of
 
 ROOT = Path(__file__).resolve().parents[1]
@@ -56,7 +56,7 @@ class Bench:
     def renderer(self) -> Renderer:
         return load_renderer(self.device)
 
-    def camera(self, x: float, size: tuple[int, int], yaw: float = 0.0) -> Camera:
+    def make_camera(self, x: float, size: tuple[int, int], yaw: float = 0.0) -> Camera:
         """Make a camera of `size` in the room, with the focal length of a square one."""
         height, width = size
         camera = camera_at(x, yaw=yaw, size=height)
@@ -64,38 +64,40 @@ class Bench:
         K[0, 2] = width / 2
         return replace(camera, K=K, width=width)
 
-    def views(self, size: tuple[int, int]) -> list[View]:
-        shots = [view_of(Room(), self.camera(x, size), i) for i, x in enumerate((-0.3, 0.1))]
+    def make_views(self, size: tuple[int, int]) -> list[View]:
+        shots = [view_of(Room(), self.make_camera(x, size), i) for i, x in enumerate((-0.3, 0.1))]
         return [shot.to(self.device) for shot in shots]
 
-    def target(self, size: tuple[int, int]) -> Camera:
-        return self.camera(0.5, size, yaw=10).to(self.device)
+    def make_target(self, size: tuple[int, int]) -> Camera:
+        return self.make_camera(0.5, size, yaw=10).to(self.device)
 
-    def scene(self, views: list[View]) -> Gaussians:
+    def make_scene(self, views: list[View]) -> Gaussians:
         return merge([gaussians_of(view.to("cpu")) for view in views]).to(self.device)
 
 
-def built(bench: Bench) -> Iterator[Row]:
+def measure_build(bench: Bench) -> Iterator[Row]:
     """Measure the first render, for which gsplat compiles its kernels."""
-    view = bench.views((64, 64))[0]
-    scene = bench.scene([view])
-    seconds = median_seconds(lambda: bench.renderer.render(scene, view.camera), 1, warm=False)
+    view = bench.make_views((64, 64))[0]
+    scene = bench.make_scene([view])
+    seconds = measure_median_seconds(
+        lambda: bench.renderer.render(scene, view.camera), 1, warm=False
+    )
     yield Row("until the first picture", seconds, "s")
 
 
-def tested(*arguments: str) -> Iterator[Row]:
+def run_tests(*arguments: str) -> Iterator[Row]:
     """Run pytest with these arguments; no passed test counts as a failure."""
     command = [sys.executable, "-m", "pytest", "-q", "-p", "no:cacheprovider", *arguments]
     done = subprocess.run(command, capture_output=True, text=True, cwd=ROOT, check=False)
-    lines = done.stdout.strip().splitlines() or [shortened(done.stderr) or "no output"]
+    lines = done.stdout.strip().splitlines() or [shorten(done.stderr) or "no output"]
     for line in lines:
         if line.startswith(("FAILED", "ERROR")):
-            yield Row("test", note=shortened(line), failed=True)
+            yield Row("test", note=shorten(line), failed=True)
     whole = done.returncode == 0 and re.search(r"\d+ passed", lines[-1]) is not None
     yield Row(f"pytest {' '.join(arguments)}", note=lines[-1].strip("= "), failed=not whole)
 
 
-def agreement(bench: Bench) -> Iterator[Row]:
+def measure_agreement(bench: Bench) -> Iterator[Row]:
     """Compare renders and gradients with those of the reference renderer on the CPU."""
     from test_render import CAMERA, PARAMETERS, REFERENCE, SCENES, gradients
 
@@ -113,23 +115,23 @@ def agreement(bench: Bench) -> Iterator[Row]:
             yield Row(f"{name}: relative difference of gradients in {parameter}", relative.item())
 
 
-def renderer(bench: Bench) -> Iterator[Row]:
+def measure_renderer(bench: Bench) -> Iterator[Row]:
     """Measure a step of registration and of refinement, with and without a frozen scene."""
     for size in bench.sizes:
-        views = bench.views(size)
-        context, camera = bench.scene(views), bench.target(size)
-        new = bench.scene([view_of(Room(), camera.to("cpu"))])
+        views = bench.make_views(size)
+        context, camera = bench.make_scene(views), bench.make_target(size)
+        new = bench.make_scene([view_of(Room(), camera.to("cpu"))])
         shown = f"{size[0]}x{size[1]}, {len(context):,} frozen and {len(new):,} new"
-        plain = ReferenceView(bench.renderer, context, camera)
+        plain = ReferenceFrozenScene(bench.renderer, context, camera)
         frozen = bench.renderer.freeze(context, camera)
-        for step, make in (("composite", composite_step), ("opacities", opacity_step)):
-            anew = median_seconds(make(plain, new), bench.repetitions)
-            ours = median_seconds(make(frozen, new), bench.repetitions)
+        for step, make in (("composite", make_composite_step), ("opacities", make_opacity_step)):
+            anew = measure_median_seconds(make(plain, new), bench.repetitions)
+            ours = measure_median_seconds(make(frozen, new), bench.repetitions)
             yield Row(f"{shown}: {step}, all anew", 1e3 * anew, "ms")
             yield Row(f"{shown}: {step}, frozen", 1e3 * ours, "ms", f"{anew / ours:.1f} times")
 
 
-def composite_step(view: FrozenView, new: Gaussians) -> Callable[[], None]:
+def make_composite_step(view: FrozenScene, new: Gaussians) -> Callable[[], None]:
 
     def step() -> None:
         means = new.means.clone().requires_grad_()
@@ -138,8 +140,8 @@ def composite_step(view: FrozenView, new: Gaussians) -> Callable[[], None]:
     return step
 
 
-def opacity_step(view: FrozenView, new: Gaussians) -> Callable[[], None]:
-    plan = view.plan(new)
+def make_opacity_step(view: FrozenScene, new: Gaussians) -> Callable[[], None]:
+    plan = view.vary_opacities(new)
 
     def step() -> None:
         opacities = new.opacities.clone().requires_grad_()
@@ -148,24 +150,24 @@ def opacity_step(view: FrozenView, new: Gaussians) -> Callable[[], None]:
     return step
 
 
-def stages(bench: Bench) -> Iterator[Row]:
+def measure_stages(bench: Bench) -> Iterator[Row]:
     """Measure the second completion of the room; the first one compiles kernels."""
     complete = GSCompleter(renderer=bench.renderer)
     for size in bench.sizes:
-        views, target = bench.views(size), bench.target(size)
+        views, target = bench.make_views(size), bench.make_target(size)
         complete(views, target)
         done = complete(views, target)
         for stage, seconds in done.seconds.items():
             yield Row(f"{size[0]}x{size[1]}: {stage}", seconds, "s")
 
 
-def completions(bench: Bench) -> Iterator[Row]:
+def measure_completions(bench: Bench) -> Iterator[Row]:
     """Complete with all models; with random weights only success and provenance are checked."""
     size = bench.sizes[0]
-    views, target = bench.views(size), bench.target(size)
+    views, target = bench.make_views(size), bench.make_target(size)
 
     def completed(name: str) -> Iterator[Row]:
-        network, _ = model(name, bench.device)
+        network, _ = load_model(name, bench.device)
         done = GSCompleter(reconstructor=network, renderer=bench.renderer)(views, target)
         added = int((done.scene.generated > 0).sum())
         finite = bool(done.scene.means.isfinite().all())
@@ -174,16 +176,16 @@ def completions(bench: Bench) -> Iterator[Row]:
         yield Row(name, done.seconds["total"], "s", f"{added:,} Gaussians added")
 
     for name in bench.models:
-        yield from tried(name, lambda name=name: completed(name))
+        yield from try_rows(name, lambda name=name: completed(name))
 
 
-def models(bench: Bench) -> Iterator[Row]:
+def measure_models(bench: Bench) -> Iterator[Row]:
     """Measure two photographs through each network."""
-    views = bench.views(bench.sizes[0])
+    views = bench.make_views(bench.sizes[0])
 
     def passed(name: str, dtype: str) -> Iterator[Row]:
-        network, _ = model(name, bench.device, DTYPES[dtype])
-        found = repeated(network, views, bench.repetitions)
+        network, _ = load_model(name, bench.device, DTYPES[dtype])
+        found = measure_repeatedly(network, views, bench.repetitions)
         peak = "" if found.peak_bytes is None else f"{found.peak_bytes / 2**30:.2f} GiB"
         yield Row(f"{name}, {dtype}", 1e3 * found.seconds, "ms", peak)
 
@@ -191,38 +193,38 @@ def models(bench: Bench) -> Iterator[Row]:
         if name in NETWORKS:
             for dtype in bench.dtypes:
                 what = f"{name}, {dtype}"
-                yield from tried(what, lambda n=name, d=dtype: passed(n, d))
+                yield from try_rows(what, lambda n=name, d=dtype: passed(n, d))
 
 
-def pe_field(bench: Bench, kontext: Callable[[str], Any] | None = None) -> Iterator[Row]:
+def measure_pe_field(bench: Bench, kontext: Callable[[str], Any] | None = None) -> Iterator[Row]:
     """Measure an image in four steps, with encoding and decoding."""
     size = bench.sizes[-1]
-    views, target = bench.views(size), bench.target(size)
-    scene = bench.scene(views)
+    views, target = bench.make_views(size), bench.make_target(size)
+    scene = bench.make_scene(views)
     seen = tuple(bench.renderer.render(scene, view.camera) for view in views)
-    context = SceneContext(tuple(views), seen, bench.renderer.render(scene, target))
-    generator = PEField((kontext or random_kontext)(bench.device))
+    context = GeneratorInput(tuple(views), seen, bench.renderer.render(scene, target))
+    generator = PEField((kontext or build_random_kontext)(bench.device))
 
     def painted() -> None:
-        generator.painted([generator.condition(views[1], target, context)], seed=0)
+        generator.generate_images([generator.create_condition(views[1], target, context)], seed=0)
 
-    seconds = median_seconds(painted, bench.repetitions)
+    seconds = measure_median_seconds(painted, bench.repetitions)
     yield Row(f"{size[0]}x{size[1]}, {generator.steps} steps", seconds, "s")
     if bench.device == "cuda":
         peak = torch.cuda.max_memory_allocated() / 2**30
         yield Row("most memory that torch held", peak, "GiB")
 
 
-def random_kontext(device: str) -> Any:
+def build_random_kontext(device: str) -> Any:
     """Build FLUX Kontext with random weights and an empty prompt."""
     from diffusers import AutoencoderKL, FlowMatchEulerDiscreteScheduler, FluxKontextPipeline
 
     from bench_pe_field import BLOCKS, TEXT
-    from gscompleter.generators.diffusion.kontext import Kontext, Prompt
-    from gscompleter.generators.diffusion.placing import precision_on
-    from gscompleter.generators.diffusion.rotary import with_per_head_positions
+    from gscompleter.models.diffusion.kontext import Kontext, Prompt
+    from gscompleter.models.diffusion.placing import select_dtype
+    from gscompleter.models.diffusion.rotary import enable_per_head_positions
 
-    dtype, levels = precision_on(device), 4
+    dtype, levels = select_dtype(device), 4
     vae = AutoencoderKL(
         block_out_channels=(128, 256, 512, 512),
         down_block_types=("DownEncoderBlock2D",) * levels,
@@ -238,7 +240,7 @@ def random_kontext(device: str) -> Any:
     pipeline = FluxKontextPipeline(
         scheduler=FlowMatchEulerDiscreteScheduler(use_dynamic_shifting=True, shift=3.0),
         vae=vae.to(device, dtype).eval(),
-        transformer=with_per_head_positions(transformer(BLOCKS, device)),
+        transformer=enable_per_head_positions(build_transformer(BLOCKS, device)),
         **unused,
     )
     tokens = torch.zeros(1, TEXT, 4096, device=device, dtype=dtype)
@@ -248,20 +250,24 @@ def random_kontext(device: str) -> Any:
 
 BENCH = Bench()
 PARTS = {
-    "build": Part("gsplat compiles", 270, lambda: built(BENCH)),
-    "tests": Part("Tests", 90, lambda: tested("-m", "gpu"), needs="build"),
+    "build": Part("gsplat compiles", 270, lambda: measure_build(BENCH)),
+    "tests": Part("Tests", 90, lambda: run_tests("-m", "gpu"), needs="build"),
     "agreement": Part(
-        "Agreement with the reference renderer", 60, lambda: agreement(BENCH), needs="build"
+        "Agreement with the reference renderer", 60, lambda: measure_agreement(BENCH), needs="build"
     ),
-    "renderer": Part("Renderer, a step of optimisation", 60, lambda: renderer(BENCH), "build"),
-    "stages": Part("Stages, embedded models", 120, lambda: stages(BENCH), needs="build"),
-    "completions": Part("A completion with every Ψ", 120, lambda: completions(BENCH), "build"),
-    "models": Part("Ψ, two photographs at 256x256", 90, lambda: models(BENCH)),
-    "pe-field": Part("PE-Field, all of it", 120, lambda: pe_field(BENCH)),
+    "renderer": Part(
+        "Renderer, a step of optimisation", 60, lambda: measure_renderer(BENCH), "build"
+    ),
+    "stages": Part("Stages, embedded models", 120, lambda: measure_stages(BENCH), needs="build"),
+    "completions": Part(
+        "A completion with every Ψ", 120, lambda: measure_completions(BENCH), "build"
+    ),
+    "models": Part("Ψ, two photographs at 256x256", 90, lambda: measure_models(BENCH)),
+    "pe-field": Part("PE-Field, all of it", 120, lambda: measure_pe_field(BENCH)),
 }
 
 
-def machine() -> dict[str, str]:
+def describe_machine() -> dict[str, str]:
     """Describe the GPU and the versions; exit with code 2 if torch sees no GPU."""
     if not torch.cuda.is_available():
         print("make gpu needs a CUDA device, and torch sees none on this machine.", file=sys.stderr)
@@ -275,14 +281,14 @@ def machine() -> dict[str, str]:
         "device": torch.cuda.get_device_name(),
         "driver": driver[0].strip() or "unknown",
         "torch": f"{torch.__version__}, CUDA {torch.version.cuda}",
-        "gsplat": installed("gsplat"),
-        "diffusers": installed("diffusers"),
+        "gsplat": get_installed_version("gsplat"),
+        "diffusers": get_installed_version("diffusers"),
         "python": platform.python_version(),
         "date": date.today().isoformat(),
     }
 
 
-def installed(package: str) -> str:
+def get_installed_version(package: str) -> str:
     try:
         return version(package)
     except PackageNotFoundError:
@@ -290,4 +296,4 @@ def installed(package: str) -> str:
 
 
 if __name__ == "__main__":
-    main(PARTS, machine, __doc__ or "")
+    main(PARTS, describe_machine, __doc__ or "")

@@ -37,7 +37,7 @@ class Row:
     note: str = ""
     failed: bool = False
 
-    def shown(self) -> str:
+    def format(self) -> str:
         number = "" if self.value is None else f"{self.value:.4g} {self.unit}".strip()
         text = "; ".join(part for part in (number, self.note) if part)
         return f"**failed**: {text}" if self.failed else text
@@ -57,7 +57,7 @@ class Part:
 
 
 @dataclass(frozen=True)
-class Found:
+class PartResult:
     title: str
     seconds: float
     rows: tuple[Row, ...]
@@ -95,8 +95,8 @@ def main(parts: Mapping[str, Part], machine: Callable[[], dict[str, str]], about
         raise SystemExit(f"There is no part {unknown[0]!r}; choose one of {', '.join(parts)}.")
     described = machine()
     wanted = {name: p for name, p in parts.items() if not options.only or name in options.only}
-    found = measured(wanted, Path(sys.argv[0]), options.seconds)
-    write(options.out, described, found)
+    found = measure_parts(wanted, Path(sys.argv[0]), options.seconds)
+    write_report(options.out, described, found)
     if any(part.failed for part in found.values()):
         raise SystemExit(1)
 
@@ -108,18 +108,18 @@ def append(path: Path, rows: Iterable[Row]) -> None:
             file.flush()
 
 
-def tried(what: str, compute: Callable[[], Iterable[Row]]) -> Iterator[Row]:
+def try_rows(what: str, compute: Callable[[], Iterable[Row]]) -> Iterator[Row]:
     """Yield rows, or a failed row if they raise, so that the other rows continue."""
     try:
         yield from compute()
     except Exception as error:
-        yield Row(what, note=f"{type(error).__name__}: {shortened(str(error))}", failed=True)
+        yield Row(what, note=f"{type(error).__name__}: {shorten(str(error))}", failed=True)
 
 
-def measured(parts: Mapping[str, Part], script: Path, seconds: float) -> dict[str, Found]:
+def measure_parts(parts: Mapping[str, Part], script: Path, seconds: float) -> dict[str, PartResult]:
     """Run the parts one after the other, within `seconds` in total."""
     end = time.monotonic() + seconds
-    found: dict[str, Found] = {}
+    found: dict[str, PartResult] = {}
     for name, part in parts.items():
         needed = None if part.needs is None else found.get(part.needs)
         left = min(part.limit, end - time.monotonic())
@@ -128,27 +128,27 @@ def measured(parts: Mapping[str, Part], script: Path, seconds: float) -> dict[st
         elif left <= 0:
             reason = f"left out, because the {seconds:.0f} s of all parts are over"
         else:
-            found[name] = in_process(name, part, script, left)
+            found[name] = measure_in_process(name, part, script, left)
             continue
-        found[name] = Found(part.title, 0.0, (Row(part.title, note=reason, failed=True),))
+        found[name] = PartResult(part.title, 0.0, (Row(part.title, note=reason, failed=True),))
     return found
 
 
-def in_process(name: str, part: Part, script: Path, limit: float) -> Found:
+def measure_in_process(name: str, part: Part, script: Path, limit: float) -> PartResult:
     print(f"{part.title} ...", flush=True)
     start = time.monotonic()
     with TemporaryDirectory() as folder:
         path = Path(folder) / "rows.jsonl"
         path.touch()
         command = [sys.executable, str(script), MEASURE, name, str(path)]
-        reason = reason_of(command, limit)
+        reason = run_limited(command, limit)
         rows = [Row(**json.loads(line)) for line in path.read_text().splitlines()]
     if reason is not None:
         rows.append(Row(part.title, note=reason, failed=True))
-    return Found(part.title, time.monotonic() - start, tuple(rows))
+    return PartResult(part.title, time.monotonic() - start, tuple(rows))
 
 
-def reason_of(command: list[str], limit: float) -> str | None:
+def run_limited(command: list[str], limit: float) -> str | None:
     """Run a command for at most `limit` seconds, and return the reason if it fails."""
     quiet = {"stdout": subprocess.DEVNULL, "stderr": subprocess.PIPE}
     process = subprocess.Popen(command, text=True, start_new_session=True, **quiet)
@@ -163,25 +163,25 @@ def reason_of(command: list[str], limit: float) -> str | None:
     lines = errors.strip().splitlines() or [f"exit code {process.returncode}, no message"]
     # A compiler's log may follow the line that names the error.
     named = [line for line in lines if EXCEPTION.match(line)]
-    return shortened((named or lines)[-1])
+    return shorten((named or lines)[-1])
 
 
-def shortened(text: str, most: int = 200) -> str:
+def shorten(text: str, most: int = 200) -> str:
     """Shorten to one line of at most `most` characters, without table syntax."""
     line = " ".join(text.split()).replace("|", "/")
     return line if len(line) <= most else line[: most - 1] + "…"
 
 
-def write(folder: Path, machine: Mapping[str, str], found: Mapping[str, Found]) -> None:
+def write_report(folder: Path, machine: Mapping[str, str], found: Mapping[str, PartResult]) -> None:
     content = {"machine": machine, "parts": {name: asdict(part) for name, part in found.items()}}
     (folder / "gpu.json").write_text(json.dumps(content, indent=2) + "\n")
-    (folder / "gpu.md").write_text(page(machine, found))
+    (folder / "gpu.md").write_text(format_page(machine, found))
 
 
-def page(machine: Mapping[str, str], found: Mapping[str, Found]) -> str:
+def format_page(machine: Mapping[str, str], found: Mapping[str, PartResult]) -> str:
     lines = ["# On a GPU", "", "Written by `make gpu`; [gpu.json](gpu.json) holds the same.", ""]
     lines += ["| | |", "|---|---|", *(f"| {key} | {value} |" for key, value in machine.items())]
     for part in found.values():
         lines += ["", f"## {part.title} ({part.seconds:.0f} s)", "", "| | |", "|---|---|"]
-        lines += [f"| {row.what} | {row.shown()} |" for row in part.rows]
+        lines += [f"| {row.what} | {row.format()} |" for row in part.rows]
     return "\n".join(lines) + "\n"

@@ -61,12 +61,12 @@ def replay(seconds: Sequence[float], fleet: Fleet, seed: int = 0) -> Replay:
     return Replay(end / 3600, useful / (end * fleet.workers), repeated, given_up)
 
 
-def rows_of(out: Path) -> list[dict]:
+def read_done_rows(out: Path) -> list[dict]:
     rows = [json.loads(path.read_text()) for path in sorted((out / "rows").glob("*.json"))]
     return [row for row in rows if row["state"] == "done"]
 
 
-def measured_hours(out: Path, rows: Sequence[dict]) -> float:
+def compute_measured_hours(out: Path, rows: Sequence[dict]) -> float:
     """Compute the hours from the start of the first job to the end of the last."""
     ends = [(out / "rows" / f"{row['job']}.json").stat().st_mtime for row in rows]
     return (max(ends) - min(e - r["seconds"] for e, r in zip(ends, rows, strict=True))) / 3600
@@ -81,14 +81,14 @@ def main() -> None:
     parser.add_argument("--lost-per-hour", type=float, default=0.0)
     parser.add_argument("--longer", type=float, default=1.0, help="jobs take so many times as long")
     given = parser.parse_args()
-    rows = rows_of(given.out)
+    rows = read_done_rows(given.out)
     seconds = [given.longer * row["seconds"] for row in rows]
     if given.jobs:
         seconds = random.Random(0).choices(seconds, k=given.jobs)
     found = replay(seconds, Fleet(given.workers, given.start_seconds, given.lost_per_hour))
     print(f"{len(seconds):,} jobs, {given.workers:,} workers: {found.hours:.3f} h, {found}")
     if not given.jobs:
-        print(f"measured: {measured_hours(given.out, rows):.3f} h")
+        print(f"measured: {compute_measured_hours(given.out, rows):.3f} h")
 
 
 if __name__ == "__main__":

@@ -21,18 +21,18 @@ from torch import Tensor
 from gscompleter.completer import GSCompleter
 from gscompleter.config import TrustConfig
 from gscompleter.data.formats import open_photographs
-from gscompleter.metrics.image import psnr
+from gscompleter.evaluation.metrics.image import psnr
 from gscompleter.render import load_renderer
 from gscompleter.splats.formats import load_splat
-from gscompleter.stages.context import depth_range_of_scene
-from gscompleter.stages.support import (
-    believed_alpha,
-    difference,
-    gather_evidence,
-    support,
-    weight_sums,
+from gscompleter.stages.context import measure_depth_range
+from gscompleter.trust.photometric import (
+    compute_color_difference,
+    compute_trust,
+    compute_trusted_alpha,
+    gather_observations,
+    sum_weights,
 )
-from gscompleter.types import Evidence, Gaussians, Proxy, View
+from gscompleter.types import Gaussians, PhotoObservations, Proxy, View
 
 LONG_SIDE = 320
 WRONG = 0.1
@@ -52,7 +52,7 @@ def main() -> None:
     trained = [n for n, name in enumerate(names) if name in options.train.read_text().split()]
     views = photographs.views(list(range(len(names))), LONG_SIDE)
     scene = load_splat(options.splat)
-    near, far = depth_range_of_scene(scene, [v.camera for v in views], load_renderer("cpu"))
+    near, far = measure_depth_range(scene, [v.camera for v in views], load_renderer("cpu"))
     views = [replace(v, camera=replace(v.camera, near=near, far=far)) for v in views]
     find(scene, views, trained)
     for frame in options.complete:
@@ -62,28 +62,28 @@ def main() -> None:
 def find(scene: Gaussians, views: Sequence[View], trained: Sequence[int]) -> None:
     renderer, config = load_renderer("cpu"), TrustConfig()
     frozen_views = [renderer.freeze(scene, view.camera) for view in views]
-    evidence = gather_evidence(Proxy(scene), views, frozen_views, config)
+    evidence = gather_observations(Proxy(scene), views, frozen_views, config)
     for frame in sorted(set(range(len(views))) - set(trained)):
         view = views[frame]
         frozen = frozen_views[frame]
-        wrong, sums = difference(frozen.context, view) > WRONG, weight_sums(frozen)
+        wrong, sums = compute_color_difference(frozen.render, view) > WRONG, sum_weights(frozen)
         areas = []
         for numbers in ([n for n in range(len(views)) if n != frame], list(trained)):
-            part = chosen(evidence, numbers)
-            trust = support(part, sums, view.camera, config)
-            areas.append(roc(believed_alpha(frozen, trust), wrong))
+            part = select_evidence(evidence, numbers)
+            trust = compute_trust(part, sums, view.camera, config)
+            areas.append(compute_roc_area(compute_trusted_alpha(frozen, trust), wrong))
         share = wrong.float().mean().item()
         print(f"{frame}: wrong {share:.3f}, by all others {areas[0]:.3f}, trained {areas[1]:.3f}")
 
 
-def chosen(evidence: Evidence, told: list[int]) -> Evidence:
+def select_evidence(evidence: PhotoObservations, numbers: list[int]) -> PhotoObservations:
     parts = (evidence.centers, evidence.areas, evidence.agreement)
-    return Evidence(evidence.proxy, *(part[told] for part in parts))
+    return PhotoObservations(evidence.proxy, *(part[numbers] for part in parts))
 
 
-def roc(believed: Tensor, wrong: Tensor) -> float:
+def compute_roc_area(alpha: Tensor, wrong: Tensor) -> float:
     """Compute the area under the ROC curve of low alpha as a sign of wrong pixels."""
-    ranks = believed.flatten().argsort(descending=True).argsort().double() + 1
+    ranks = alpha.flatten().argsort(descending=True).argsort().double() + 1
     bad = wrong.flatten()
     positives, negatives = int(bad.sum()), int((~bad).sum())
     if not positives or not negatives:
@@ -111,7 +111,7 @@ def complete(scene: Gaussians, views: Sequence[View], frame: int, trained: Seque
 
     of_trained = [gain(n) for n in trained]
     of_others = [gain(n) for n in others if n not in trained]
-    pruned = 0 if completion.set_aside is None else int(completion.set_aside.sum())
+    pruned = 0 if completion.pruned is None else int(completion.pruned.sum())
     print(
         f"completed for {frame}: {gain(frame):+.2f} dB there; "
         f"trained {min(of_trained):+.3f} at worst, {sum(of_trained) / len(of_trained):+.3f} mean; "

@@ -12,12 +12,12 @@ import torch
 
 import gscompleter as gsc
 from gscompleter.reconstructors.plane_sweep import PlaneSweep
-from gscompleter.types import SceneContext
+from gscompleter.types import GeneratorInput
 
 
-def mean_colour(nearest: gsc.View, target: gsc.Camera, context: SceneContext) -> torch.Tensor:
+def mean_colour(nearest: gsc.View, target: gsc.Camera, context: GeneratorInput) -> torch.Tensor:
     """What the scene shows, and the photograph's mean colour where it shows nothing."""
-    seen = context.at_target
+    seen = context.target_render
     fill = nearest.image.mean(dim=(0, 1))
     return (seen.image + (1 - seen.alpha)[..., None] * fill).clamp(0, 1)
 

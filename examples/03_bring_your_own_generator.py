@@ -12,10 +12,10 @@ import cv2
 import torch
 
 import gscompleter as gsc
-from gscompleter.generators import Synthesis
-from gscompleter.generators.agreement import checked
+from gscompleter.generators import GeneratorOutput
+from gscompleter.generators.agreement import paint_consistently
 from gscompleter.generators.warp import warp_photographs
-from gscompleter.types import SceneContext
+from gscompleter.types import GeneratorInput
 
 
 @dataclass(frozen=True)
@@ -24,7 +24,9 @@ class Telea:
 
     radius: float = 5.0
 
-    def __call__(self, nearest: gsc.View, target: gsc.Camera, context: SceneContext) -> Synthesis:
+    def __call__(
+        self, nearest: gsc.View, target: gsc.Camera, context: GeneratorInput
+    ) -> GeneratorOutput:
         """The image [h, w, 3] in [0, 1], and sentences for `notes` of the target."""
         warped = warp_photographs(nearest, target, context)
         pixels = (255 * warped.image).byte().cpu().numpy()
@@ -34,7 +36,7 @@ class Telea:
             filled = cv2.inpaint(pixels, hole, self.radius, cv2.INPAINT_TELEA)
             return torch.from_numpy(filled).float().to(nearest.image.device) / 255
 
-        return checked(paint, seed=0, observed=warped)
+        return paint_consistently(paint, seed=0, observed=warped)
 
 
 def main() -> None:

@@ -13,7 +13,7 @@ from tempfile import TemporaryDirectory
 
 from playwright.sync_api import sync_playwright
 
-from gscompleter.commands.view import ViewOptions, run_view
+from gscompleter.apps.commands.view import ViewOptions, run_view
 
 SWITCHES = ["--no-sandbox", "--use-angle=swiftshader", "--enable-unsafe-swiftshader"]
 LINK = "#camera=target-2&mode=side&generated=show"

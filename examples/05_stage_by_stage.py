@@ -12,11 +12,12 @@ from dataclasses import replace
 import torch
 
 import gscompleter as gsc
-from gscompleter.stages.anchor import lift, select_anchor, synthesize
-from gscompleter.stages.context import init_context, working_range
-from gscompleter.stages.integration import hole_mask, keep_in_holes, refine_opacities
-from gscompleter.stages.registration import register
-from gscompleter.types import SceneContext
+from gscompleter.stages.context import find_depth_range, init_context
+from gscompleter.stages.filter_holes import compute_hole_mask, filter_holes
+from gscompleter.stages.refine import refine_opacities
+from gscompleter.stages.select_anchor import lift, select_anchor, synthesize
+from gscompleter.stages.slide_along_rays import register
+from gscompleter.types import GeneratorInput
 
 
 def main() -> None:
@@ -25,7 +26,7 @@ def main() -> None:
     renderer = gsc.load_renderer("cpu")
 
     views = gsc.load_views(scene, frames=[first, second], resolution=256)
-    near, far = working_range(views, None, renderer)
+    near, far = find_depth_range(views, None, renderer)
     views = gsc.load_views(scene, frames=[first, second], resolution=256, near=near, far=far)
     target = gsc.load_camera(scene, frame=number, resolution=256, near=near, far=far)
 
@@ -36,8 +37,8 @@ def main() -> None:
     # 2. Anchor and lift: an image at the target, and its stereo with the best photograph.
     at_target = renderer.freeze(context, target)
     at_views = [renderer.freeze(context, view.camera) for view in views]
-    seen = tuple(frozen.context for frozen in at_views)
-    reference = synthesize(phi, target, SceneContext(tuple(views), seen, at_target.context))
+    seen = tuple(frozen.render for frozen in at_views)
+    reference = synthesize(phi, target, GeneratorInput(tuple(views), seen, at_target.render))
     choice = select_anchor(target, views)
     anchor = views[choice.index].camera
     lifted = lift(psi, reference, views[choice.index])
@@ -50,11 +51,11 @@ def main() -> None:
     print(f"loss: {registered.losses[0]:.4f} to {registered.losses[-1]:.4f}")
 
     # 4. Integrate: what lies in the hole, with opacities that suit all images.
-    holes = hole_mask(at_target.context.alpha)
-    added = keep_in_holes(registered.gaussians, lifted.pixel_index, holes, target)
-    planned = [view.plan(added) for view in at_views]
-    added, _ = refine_opacities(added, at_target.plan(added), reference, planned, views)
-    left = hole_mask(at_target.composite(added).alpha)
+    holes = compute_hole_mask(at_target.render.alpha)
+    added = filter_holes(registered.gaussians, lifted.pixel_index, holes, target)
+    planned = [view.vary_opacities(added) for view in at_views]
+    added, _ = refine_opacities(added, at_target.vary_opacities(added), reference, planned, views)
+    left = compute_hole_mask(at_target.composite(added).alpha)
     print(
         f"holes: {holes.float().mean():.1%} of the target's pixels, {left.float().mean():.1%} left"
     )

@@ -12,13 +12,13 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from gscompleter.batch.engines import Engine
-from gscompleter.batch.engines.local import LocalEngine
-from gscompleter.batch.engines.ray import RayEngine
-from gscompleter.batch.jobs import JOBS, Job, Outcome, missing, settle
-from gscompleter.batch.places import FolderPlace
-from gscompleter.batch.rounds import BatchRows, Rounds
 from gscompleter.errors import InputError
+from gscompleter.jobs.engines import Engine
+from gscompleter.jobs.engines.local import LocalEngine
+from gscompleter.jobs.engines.ray import RayEngine
+from gscompleter.jobs.jobs import JOBS, Job, Outcome, find_missing_jobs, run_claimed
+from gscompleter.jobs.places import FolderPlace
+from gscompleter.jobs.rounds import BatchRows, Rounds
 
 
 @dataclass(frozen=True)
@@ -30,7 +30,7 @@ class Writing:
 
     def __call__(self, job: Job) -> Outcome:
         place = FolderPlace(Path(self.out))
-        return settle(job, place, lambda: self.written(job), self.retries)
+        return run_claimed(job, place, lambda: self.written(job), self.retries)
 
     def written(self, job: Job) -> dict[str, Any]:
         noted(Path(self.out) / "begun" / job.name)
@@ -59,8 +59,10 @@ def noted(path: Path) -> None:
 def outcomes(out: Path, jobs: Sequence[Job], engine: Engine, retries: int = 2) -> list[Outcome]:
     """Run the jobs without a row and yield their outcomes."""
     place = FolderPlace(out)
-    rounds = Rounds(place, BatchRows(place), missing(jobs, place, again=False), retries)
-    return list(rounds.outcomes(engine, Writing(str(out), retries)))
+    rounds = Rounds(
+        place, BatchRows(place), find_missing_jobs(jobs, place, rerun_failed=False), retries
+    )
+    return list(rounds.run(engine, Writing(str(out), retries)))
 
 
 def engine_named(name: str, workers: int) -> Engine:

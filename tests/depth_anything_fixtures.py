@@ -12,8 +12,8 @@ import torch
 from torch import Tensor, nn
 
 from feed_forward_fixtures import EVERY, STORED, Case, rule_v1
-from gscompleter.reconstructors.depth_anything.alignment import similarity_of_most
-from gscompleter.reconstructors.depth_anything.config import (
+from gscompleter.models.depth_anything.alignment import fit_robust_similarity
+from gscompleter.models.depth_anything.config import (
     VARIANTS,
     WIDE,
     DepthAnythingConfig,
@@ -21,27 +21,30 @@ from gscompleter.reconstructors.depth_anything.config import (
     NestedConfig,
     VitConfig,
 )
-from gscompleter.reconstructors.depth_anything.images import normalised_images
-from gscompleter.reconstructors.depth_anything.metric import MetricDepthAnything, with_far_sky
-from gscompleter.reconstructors.depth_anything.nested import NestedDepthAnything
-from gscompleter.reconstructors.depth_anything.network import DepthAnything, Prediction
-from gscompleter.reconstructors.depth_anything.normalisation import authors_units, seen_from_first
-from gscompleter.reconstructors.depth_anything.poses import Poses
-from gscompleter.reconstructors.depth_anything.reconstructor import centers_of
-from gscompleter.reconstructors.depth_anything.reference_view import balanced_view
-from gscompleter.reconstructors.feed_forward.build import network_with
-from gscompleter.reconstructors.feed_forward.gaussian_adapter import PixelGaussians
+from gscompleter.models.depth_anything.images import normalize_colors
+from gscompleter.models.depth_anything.metric import MetricDepthAnything, set_sky_depth
+from gscompleter.models.depth_anything.nested import NestedDepthAnything
+from gscompleter.models.depth_anything.network import DepthAnything, Prediction
+from gscompleter.models.depth_anything.normalisation import compute_authors_units, normalize_poses
+from gscompleter.models.depth_anything.poses import Poses
+from gscompleter.models.depth_anything.reconstructor import get_camera_centers
+from gscompleter.models.depth_anything.reference_view import select_reference_view
+from gscompleter.models.feed_forward.build import create_depth_anything
+from gscompleter.models.feed_forward.gaussian_adapter import PixelGaussians
 from parity import relative_error
 
 FIXTURES = STORED / "da3"
 NARROW = (48, 96, 192, 384)
-TINY = VitConfig(384, 6, 12, (5, 7, 9, 11), 3, gated=True)
+TINY = VitConfig(384, 6, 12, (5, 7, 9, 11), 3, is_gated=True)
 METRIC_TINY = MetricDepthConfig(VitConfig(384, 6, 24, (4, 11, 17, 23), None), 64, NARROW)
 STAND_INS = {
     "small": VARIANTS["da3-small"],
-    "gs-tiny": DepthAnythingConfig(TINY, 64, NARROW, gaussians=True),
+    "gs-tiny": DepthAnythingConfig(TINY, 64, NARROW, has_gaussian_head=True),
     "gs-giantlike": DepthAnythingConfig(
-        replace(TINY, blocks=40, outputs=(19, 27, 33, 39), alternates_from=13), 256, WIDE, True
+        replace(TINY, blocks=40, output_block_ids=(19, 27, 33, 39), first_multi_view_block=13),
+        256,
+        WIDE,
+        True,
     ),
     "metric-tiny": METRIC_TINY,
     "nested-tiny": NestedConfig(DepthAnythingConfig(), METRIC_TINY),
@@ -75,7 +78,9 @@ def weighted(network: nn.Module, multipliers: dict[str, float]) -> nn.Module:
 def network_for(name: str) -> DepthAnything | MetricDepthAnything | NestedDepthAnything:
     """Return the shared network of a fixture with its weights; do not modify it."""
     multipliers = json.loads((FIXTURES / "multipliers.json").read_text())["multipliers"]
-    return weighted(network_with(STAND_INS[name]), multipliers).eval().requires_grad_(False)
+    return (
+        weighted(create_depth_anything(STAND_INS[name]), multipliers).eval().requires_grad_(False)
+    )
 
 
 def shapes_in(path: Path) -> dict[str, tuple[int, ...]]:
@@ -100,11 +105,11 @@ class Outputs:
 
 def images_and_poses(case: Case) -> tuple[Tensor, Poses | None]:
     """Load the network input, with poses normalised as in the authors' inference."""
-    images = normalised_images(case.tensor("in_image_u8"))
+    images = normalize_colors(case.tensor("in_image_u8"))
     if "in_c2w" not in case.values:
         return images, None
     given = Poses(case.tensor("in_c2w"), case.tensor("in_intrinsics_px"))
-    return images, seen_from_first(given, authors_units(given.centers))
+    return images, normalize_poses(given, compute_authors_units(given.centers))
 
 
 def between(outputs: dict[str, object], network: nn.Module) -> dict[str, Tensor]:
@@ -138,7 +143,7 @@ def through_any_view(network: DepthAnything, case: Case) -> tuple[Prediction, di
     with torch.no_grad():
         predicted = network(images, poses)
         pyramid = [outputs.of[f"head.resize_layers.{i}"] for i in range(4)]
-        ray, ray_confidence = network.head.rays(pyramid, size)
+        ray, ray_confidence = network.head.predict_rays(pyramid, size)
     for hook in hooks:
         hook.remove()
     found = between(outputs.of, network)
@@ -149,9 +154,9 @@ def through_any_view(network: DepthAnything, case: Case) -> tuple[Prediction, di
         found["ext_norm"] = poses.w2c
     if predicted.raw is not None:
         found["raw_gs"] = predicted.raw[..., :37]
-    start = network.config.vit.alternates_from
+    start = network.config.vit.first_multi_view_block
     tokens = found[f"blk{start - 2}"].unflatten(0, (scenes, views))[:, :, 0]
-    found["ref_view"] = balanced_view(tokens) if views > 1 else torch.zeros(scenes)
+    found["ref_view"] = select_reference_view(tokens) if views > 1 else torch.zeros(scenes)
     return predicted, found
 
 
@@ -178,14 +183,16 @@ def any_view_errors(network: DepthAnything, case: Case) -> dict[str, float]:
     out = outputs_of(predicted) | {"depth": predicted.depth, "depth_conf": predicted.confidence}
     errors = errors_of(found, case, "mid", stride) | errors_of(out, case, "out", stride)
     if "out_align_scale" in case.values:
-        pairs = zip(case.values["in_c2w"][..., :3, 3], centers_of(predicted.poses), strict=True)
-        scales = [similarity_of_most(known, ours).scale for known, ours in pairs]
+        pairs = zip(
+            case.values["in_c2w"][..., :3, 3], get_camera_centers(predicted.poses), strict=True
+        )
+        scales = [fit_robust_similarity(known, ours).scale for known, ours in pairs]
         expected = case.tensor("out_align_scale")
         errors["out_align_scale"] = relative_error(torch.tensor(scales).to(expected), expected)
     if predicted.raw is None:
         return errors
     used = case.values.get("out_pose_scale_used", np.ones(len(predicted.raw)))
-    gaussians = predicted.gaussians(torch.from_numpy(used).float())
+    gaussians = predicted.create_gaussians(torch.from_numpy(used).float())
     return errors | gaussian_errors(gaussians, case, "out_")
 
 
@@ -193,7 +200,11 @@ def outputs_of(predicted: Prediction, scale: float = 1.0) -> dict[str, Tensor]:
     """Convert the predicted cameras to a unit of 1 / `scale`."""
     w2c = predicted.poses.w2c[:, :, :3].clone()
     w2c[..., 3] *= scale
-    return {"pose_enc": predicted.numbers, "extrinsics": w2c, "intrinsics": predicted.poses.K}
+    return {
+        "pose_enc": predicted.camera_parameters,
+        "extrinsics": w2c,
+        "intrinsics": predicted.poses.K,
+    }
 
 
 def gaussian_errors(gaussians: PixelGaussians, case: Case, prefix: str) -> dict[str, float]:
@@ -230,7 +241,7 @@ def metric_errors(network: MetricDepthAnything, case: Case) -> dict[str, float]:
     for hook in hooks:
         hook.remove()
     found = between(outputs.of, network) | {"depth_before_sky": predicted.depth}
-    out = {"depth": with_far_sky(predicted.depth, predicted.solid), "sky": predicted.sky}
+    out = {"depth": set_sky_depth(predicted.depth, predicted.solid), "sky": predicted.sky}
     stride = int(case.values["mid_stride"])
     return errors_of(found, case, "mid", stride) | errors_of(out, case, "out", stride)
 

@@ -17,9 +17,9 @@ import numpy as np
 import torch
 from torch import Tensor, nn
 
-from gscompleter.geometry import quats_from, quats_product, rotations_from
-from gscompleter.reconstructors.feed_forward.cameras import Cameras
-from gscompleter.reconstructors.feed_forward.gaussian_adapter import PixelGaussians
+from gscompleter.geometry import multiply_quats, quats_to_rotations, rotations_to_quats
+from gscompleter.models.feed_forward.cameras import Cameras
+from gscompleter.models.feed_forward.gaussian_adapter import PixelGaussians
 from parity import relative_error
 
 STORED = Path(__file__).parent / "fixtures" / "feed_forward"
@@ -92,10 +92,10 @@ class Case:
         SH are compared degree by degree, because higher ones are below 0.001 of the constant.
         """
         step = int(self.values["stride"])
-        axes = rotations_from(predicted.quats)
+        axes = quats_to_rotations(predicted.quats)
         spread = axes * predicted.scales[..., None, :]
-        world_to_camera = quats_from(self.cameras.c2w[..., :3, :3].transpose(-1, -2))
-        in_camera = quats_product(world_to_camera[:, :, None, None], predicted.quats)
+        world_to_camera = rotations_to_quats(self.cameras.c2w[..., :3, :3].transpose(-1, -2))
+        in_camera = multiply_quats(world_to_camera[:, :, None, None], predicted.quats)
         values = {
             "means": predicted.means,
             "covariances": spread @ spread.transpose(-1, -2),

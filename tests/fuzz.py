@@ -651,10 +651,11 @@ def finished(running: dict[int, Running], given: set[str]) -> list[Outcome]:
 def import_everything() -> None:
     """Import everything once for all forks. Nothing is computed, as threads do not survive."""
     sys.path.insert(0, str(Path(__file__).parent))
-    import chunk_files  # noqa: F401  (its photographs are drawn in one thread)
-    import gscompleter.cli
     import gscompleter.commands.complete
     import gscompleter.commands.evaluate
+
+    import chunk_files  # noqa: F401  (its photographs are drawn in one thread)
+    import gscompleter.cli
     import gscompleter.generators.warp_inpaint
     import gscompleter.reconstructors.plane_sweep  # noqa: F401
     import pose_files  # noqa: F401  (likewise)

@@ -9,13 +9,13 @@ from pathlib import Path
 
 import numpy as np
 
+from gscompleter.data.driving.range_image import build_poses
 from gscompleter.data.formats import open_photographs
-from gscompleter.data.range_image import poses_of
 from waymo_segment import OPENCV_FROM_CAMERA, Laser, Moment, RigCamera, Seen, write_segment
 
 ABOVE_ROAD = 1.65
-MOUNTED = poses_of(np.array([0.0, 0.0, 0.0, 1.6, 0.0, ABOVE_ROAD]))
-LASER = Laser(1, poses_of(np.array([0.0, 0.0, 0.0, 1.2, 0.0, 2.0])), -0.5, 0.05)
+MOUNTED = build_poses(np.array([0.0, 0.0, 0.0, 1.6, 0.0, ABOVE_ROAD]))
+LASER = Laser(1, build_poses(np.array([0.0, 0.0, 0.0, 1.2, 0.0, 2.0])), -0.5, 0.05)
 
 
 def road_ahead(shape: tuple[int, int] = (48, 720)) -> np.ndarray:
@@ -40,7 +40,7 @@ def kitti_city_segment(
         Moment(
             100_000 * number,
             frame.c2w @ OPENCV_FROM_CAMERA @ np.linalg.inv(MOUNTED),
-            {1: frame.stored().read_bytes()},
+            {1: frame.find_stored().read_bytes()},
             {1: road_ahead()},
             boxes=boxes,
         )

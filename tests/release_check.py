@@ -19,7 +19,7 @@ from collections.abc import Iterator
 from pathlib import Path
 
 from gscompleter import __version__
-from gscompleter.commands.doctor import PURPOSES
+from gscompleter.apps.commands.doctor import PURPOSES
 
 ROOT = Path(__file__).resolve().parents[1]
 
@@ -29,7 +29,7 @@ IMPORT_EXTRA = """
 import sys
 from importlib import import_module
 from importlib.metadata import distribution
-from gscompleter.commands.doctor import required
+from gscompleter.apps.commands.doctor import list_requirements
 for name in {requirement.name for requirement in required(sys.argv[1])}:
     paths = [path.parts for path in distribution(name).files]
     folders = {parts[0] for parts in paths if parts[1:] == ("__init__.py",)}

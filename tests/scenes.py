@@ -18,17 +18,17 @@ from jaxtyping import Float
 from torch import Tensor
 
 from gscompleter.data.scene import write_cameras
-from gscompleter.generators import Request, Synthesis, as_generator
+from gscompleter.generators import GeneratorOutput, GeneratorRequest, as_generator
 from gscompleter.io.image import write_image
-from gscompleter.io.ply import save_ply
+from gscompleter.splats.ply import save_ply
 from gscompleter.types import (
     Camera,
     DepthMap,
     Gaussians,
     Reconstruction,
     View,
+    make_observed,
     merge,
-    observed,
     sh_from_rgb,
 )
 
@@ -128,7 +128,7 @@ def gaussians_of(view: View, depth: Float[Tensor, "h w"] | None = None) -> Gauss
     assert depth is not None
     means = (camera.center + depth[..., None] * camera.z_rays()).reshape(-1, 3)
     n = len(means)
-    return observed(
+    return make_observed(
         means=means,
         quats=torch.tensor([1.0, 0, 0, 0]).repeat(n, 1),
         scales=(0.6 * depth / camera.K[0, 0]).reshape(-1, 1).repeat(1, 3),
@@ -179,7 +179,7 @@ def random_gaussians(n: int, seed: int = 0, sh_degree: int = 0) -> Gaussians:
         return torch.rand(shape, generator=generator)
 
     means = torch.stack([uniform(n) * 4 - 2, uniform(n) * 4 - 2, uniform(n) * 4 + 1], dim=-1)
-    return observed(
+    return make_observed(
         means=means,
         quats=torch.randn(n, 4, generator=generator),
         scales=torch.exp(uniform(n, 3) * 3 - 5),
@@ -198,9 +198,9 @@ def scaled(gaussians: Gaussians, factor: float) -> Gaussians:
     )
 
 
-def answer(phi, nearest, target, context) -> Synthesis:
+def answer(phi, nearest, target, context) -> GeneratorOutput:
     """Return the output of a generator, or a plain function, for one request."""
-    return as_generator(phi).synthesize([Request(nearest, target, context)])[0]
+    return as_generator(phi).synthesize([GeneratorRequest(nearest, target, context)])[0]
 
 
 def open_street(camera: Camera) -> View:

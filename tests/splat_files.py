@@ -15,7 +15,7 @@ import zstandard
 from PIL import Image
 
 from gscompleter import save_splat
-from gscompleter.splats.frames import ABOUT_Z, half_turned
+from gscompleter.splats.transform import HALF_TURN_Z, rotate_half_turn
 from gscompleter.types import SH_C0, Gaussians
 from scenes import random_gaussians
 
@@ -277,7 +277,7 @@ def made(folder: Path, name: str, gaussians: Gaussians) -> Path:
     elif path.suffix == ".ksplat":
         write_ksplat(path, gaussians, level=1)
     elif path.suffix == ".glb":
-        write_glb(path, *glb_table(half_turned(gaussians, ABOUT_Z)))
+        write_glb(path, *glb_table(rotate_half_turn(gaussians, HALF_TURN_Z)))
     elif name == "plain.spz":
         path.write_bytes(gzip.decompress(made(folder, "scene.spz", gaussians).read_bytes()))
     elif path.suffix == ".spz":

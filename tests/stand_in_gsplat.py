@@ -13,9 +13,9 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from gscompleter.geometry import inside
+from gscompleter.geometry import is_inside
 from gscompleter.render.reference import Splats, composite, project
-from gscompleter.types import Camera, observed
+from gscompleter.types import Camera, make_observed
 
 
 def rasterization(
@@ -41,7 +41,7 @@ def rasterization(
     assert colors.shape == (len(means), (sh_degree + 1) ** 2, 3)
     assert viewmats.shape == (1, 4, 4)
     camera = Camera(torch.linalg.inv(viewmats[0]), Ks[0], width, height, near=100 * near_plane)
-    gaussians = observed(means, quats, scales, opacities, colors)
+    gaussians = make_observed(means, quats, scales, opacities, colors)
     gaussians = replace(gaussians, is_antialiased=rasterize_mode == "antialiased")
     n = len(means)
     found = {
@@ -61,7 +61,7 @@ def rasterization(
         found["radii"][0, i] = 1
         found["means2d"][0, i], found["depths"][0, i] = own.centers[0], own.depths[0]
         found["conics"][0, i] = own.precisions[0].flatten()[[0, 1, 3]]
-        values[0, i] = torch.cat([own.colours[0], own.depths])
+        values[0, i] = torch.cat([own.colors[0], own.depths])
         found["opacities"][0, i] = own.opacities[0]
     found["flatten_ids"] = found["radii"][0, :, 0].nonzero()[:, 0].to(torch.int32)
     tiles = (found["tile_size"], found["isect_offsets"], found["flatten_ids"])
@@ -78,7 +78,7 @@ def touches(splats: Splats, camera: Camera) -> bool:
     reach = 3.33 * covariance.diagonal().sqrt()
     size = torch.tensor([camera.width, camera.height])
     nearest = splats.centers.clamp(min=torch.zeros(2), max=size - 0.5)
-    assert inside(nearest, splats.depths, camera).all()
+    assert is_inside(nearest, splats.depths, camera).all()
     return bool(((splats.centers[0] - nearest[0]).abs() < reach).all())
 
 

@@ -4,11 +4,11 @@ import pytest
 import torch
 
 from gscompleter import InputError
-from gscompleter.generators import Synthesis, as_generator
-from gscompleter.generators.agreement import checked, compare
-from gscompleter.generators.warp import Warped
+from gscompleter.generators import GeneratorOutput, as_generator
+from gscompleter.generators.agreement import compare_with_observed, paint_consistently
+from gscompleter.generators.warp import WarpedImage
 from gscompleter.generators.warp_inpaint import WarpInpaint
-from gscompleter.stages.anchor import synthesize
+from gscompleter.stages.select_anchor import synthesize
 from scenes import Room, camera_at, view_of
 from test_generators import TARGET, known_room
 
@@ -19,21 +19,21 @@ SHIFTED = (TRUTH - OFFSET) / GAIN
 NOISE = torch.rand(96, 96, 3, generator=torch.Generator().manual_seed(0))
 
 
-def observed() -> Warped:
+def observed() -> WarpedImage:
     """The left half of the true image; the right half is unknown."""
     image = torch.where(SEEN[..., None], TRUTH, torch.zeros_like(TRUTH))
-    return Warped(image, SEEN, torch.ones(96, 96), ())
+    return WarpedImage(image, SEEN, torch.ones(96, 96), ())
 
 
 def paint_checked(*arguments) -> tuple[torch.Tensor, tuple[str, ...]]:
     """Return the image and the notes of `paint_consistently`."""
-    found = checked(*arguments)
+    found = paint_consistently(*arguments)
     return found.image, found.notes
 
 
 def test_a_colour_shift_is_measured_and_taken_back_in_the_unseen_part_too():
-    found = compare(SHIFTED, observed().image, SEEN)
-    assert found.agrees
+    found = compare_with_observed(SHIFTED, observed().image, SEEN)
+    assert found.is_consistent
     assert torch.allclose(found.gain, GAIN, atol=0.01)
     assert torch.allclose(found.offset, OFFSET, atol=0.01)
     assert (found.image - TRUTH).abs().max() < 0.01
@@ -48,8 +48,8 @@ def test_a_colour_shift_stays_where_the_paper_leaves_it():
 def test_a_fifth_of_the_image_that_shows_something_else_does_not_bend_the_colours():
     spoiled = SHIFTED.clone()
     spoiled[:, :12] = 1.0
-    found = compare(spoiled, observed().image, SEEN)
-    assert found.agrees
+    found = compare_with_observed(spoiled, observed().image, SEEN)
+    assert found.is_consistent
     assert (found.image - TRUTH)[:, 14:].abs().max() < 0.03
 
 
@@ -68,8 +68,8 @@ def test_something_else_is_noted_and_left_as_it_is():
 
 
 def test_an_image_in_negative_is_no_colour_shift():
-    found = compare(1 - TRUTH, observed().image, SEEN)
-    assert not found.agrees
+    found = compare_with_observed(1 - TRUTH, observed().image, SEEN)
+    assert not found.is_consistent
     assert found.residual < found.limit
     _, (note,) = paint_checked(lambda seed: 1 - TRUTH, 0, observed())
     assert "a colour channel matches only with factor -1.00 and offset +1.00" in note
@@ -79,27 +79,29 @@ def test_an_image_in_negative_is_no_colour_shift():
 def test_the_limit_follows_the_contrast_of_the_scene(contrast):
     """The limit is relative to the residual of a constant colour, so that plain grey fails."""
     dull = 0.5 + contrast * (TRUTH - 0.5)
-    found = compare(dull, dull, SEEN)
-    assert found.agrees
-    assert found.limit == pytest.approx(contrast * compare(TRUTH, TRUTH, SEEN).limit)
-    grey = compare(torch.full_like(TRUTH, 0.5) + 0.01 * NOISE, dull, SEEN)
+    found = compare_with_observed(dull, dull, SEEN)
+    assert found.is_consistent
+    assert found.limit == pytest.approx(contrast * compare_with_observed(TRUTH, TRUTH, SEEN).limit)
+    grey = compare_with_observed(torch.full_like(TRUTH, 0.5) + 0.01 * NOISE, dull, SEEN)
     assert grey.residual > grey.limit
-    assert not grey.agrees
+    assert not grey.is_consistent
 
 
 def test_a_blank_wall_over_most_of_the_scene_hides_nothing():
     walled = TRUTH.clone()
     walled[:57] = 0.7
-    assert compare(walled, walled, SEEN).agrees
+    assert compare_with_observed(walled, walled, SEEN).is_consistent
     grey = torch.full_like(TRUTH, 0.7) + 0.001 * NOISE
-    assert not compare(grey, walled, SEEN).agrees
-    assert not compare(torch.cat([grey[:57], NOISE[57:]]), walled, SEEN).agrees
+    assert not compare_with_observed(grey, walled, SEEN).is_consistent
+    assert not compare_with_observed(torch.cat([grey[:57], NOISE[57:]]), walled, SEEN).is_consistent
 
 
 def test_of_images_that_all_disagree_the_nearest_is_kept():
     images = {7: NOISE, 8: 0.5 * NOISE + 0.5 * TRUTH.flip(1), 9: TRUTH.flip(0)}
-    found = {seed: compare(image, observed().image, SEEN) for seed, image in images.items()}
-    assert not any(one.agrees for one in found.values())
+    found = {
+        seed: compare_with_observed(image, observed().image, SEEN) for seed, image in images.items()
+    }
+    assert not any(one.is_consistent for one in found.values())
     best = min(found, key=lambda seed: found[seed].residual)
     assert len({one.residual for one in found.values()}) == 3
     image, _ = paint_checked(lambda seed: images[seed], 7, observed(), 2)
@@ -111,12 +113,12 @@ def test_a_seed_that_gives_nan_is_passed_over_and_nothing_but_nan_is_refused():
     image, _ = paint_checked(lambda seed: broken if seed == 0 else TRUTH, 0, observed(), 1)
     assert (image - TRUTH).abs().max() < 1e-3
     with pytest.raises(InputError, match=r"no finite image \(2 seed"):
-        checked(lambda seed: broken, 0, observed(), 1)
+        paint_consistently(lambda seed: broken, 0, observed(), 1)
 
 
 def test_in_fog_anything_agrees():
     fog = torch.full_like(TRUTH, 0.5) + 0.02 * NOISE
-    assert compare(torch.full_like(TRUTH, 0.45), fog, SEEN).agrees
+    assert compare_with_observed(torch.full_like(TRUTH, 0.45), fog, SEEN).is_consistent
 
 
 def test_further_seeds_are_tried_where_asked_and_only_until_one_agrees():
@@ -137,7 +139,7 @@ def test_further_seeds_are_tried_where_asked_and_only_until_one_agrees():
 
 
 def test_where_nothing_was_seen_nothing_is_said():
-    nothing = Warped(TRUTH, torch.zeros_like(SEEN), torch.ones(96, 96), ())
+    nothing = WarpedImage(TRUTH, torch.zeros_like(SEEN), torch.ones(96, 96), ())
     image, notes = paint_checked(lambda seed: NOISE, 0, nothing)
     assert torch.equal(image, NOISE)
     assert notes == ()
@@ -148,7 +150,7 @@ class Talking:
 
     def __call__(self, nearest, target, context):
         image = torch.full((target.height, target.width, 3), 0.5)
-        return Synthesis(image, ("Painted grey.",))
+        return GeneratorOutput(image, ("Painted grey.",))
 
 
 def test_the_stage_takes_the_notes_of_a_generator_that_has_some():

@@ -4,7 +4,7 @@ import pytest
 import torch
 
 from gscompleter.config import AlignmentConfig, CompleterConfig
-from gscompleter.stages.alignment import fit_affine, unless_contradicted
+from gscompleter.stages.align_depth import fit_affine, refit_at_target
 from gscompleter.types import DepthAffine, DepthMap
 
 CONFIG = AlignmentConfig()
@@ -91,7 +91,7 @@ def checked(
     """What becomes of an affine that fits the anchor, where the target sees `context`."""
     random = torch.Generator().manual_seed(0)
     through_anchor = DepthAffine(scale, 0.0, 0.9, "ransac")
-    return unless_contradicted(
+    return refit_at_target(
         through_anchor, everywhere(depths()), everywhere(context), random, config, reject_below
     )
 
@@ -108,7 +108,7 @@ def test_an_affine_that_the_target_confirms_or_cannot_judge_stays():
     none = DepthMap(depths(), torch.zeros(64, 64, dtype=torch.bool))
     affine = DepthAffine(3.0, 0.0, 0.9, "ransac")
     random = torch.Generator()
-    assert unless_contradicted(affine, everywhere(depths()), none, random, CONFIG) == affine
+    assert refit_at_target(affine, everywhere(depths()), none, random, CONFIG) == affine
 
 
 def unlike() -> torch.Tensor:
@@ -118,16 +118,16 @@ def unlike() -> torch.Tensor:
 
 def test_where_no_affine_fits_what_the_target_sees_the_one_of_the_anchor_is_refuted():
     affine = checked(1.0, unlike())
-    assert (affine.refuted, affine.contradicted, affine.scale) == (True, False, 1.0)
+    assert (affine.is_rejected, affine.contradicted, affine.scale) == (True, False, 1.0)
     assert 0 < affine.agreement < 0.1
-    assert not checked(1.0, unlike(), reject_below=None).refuted
+    assert not checked(1.0, unlike(), reject_below=None).is_rejected
 
 
 @pytest.mark.parametrize("share", [0.05, 0.2, 0.4])
 def test_where_enough_agrees_the_affine_is_not_refuted(share):
     like = torch.rand(64, 64, generator=torch.Generator().manual_seed(6)) < share
     affine = checked(1.0, torch.where(like, depths(), unlike()))
-    assert affine.refuted == (share < 0.15)
+    assert affine.is_rejected == (share < 0.15)
     assert affine.agreement == pytest.approx(share, abs=0.05)
 
 
@@ -139,8 +139,8 @@ def test_what_is_seen_of_little_refutes_nothing():
     through_anchor = DepthAffine(1.0, 0.0, 0.9, "ransac")
     for share, refuted in ((seen, False), (torch.ones_like(seen), True)):
         context = DepthMap(unlike().repeat(2, 2), share)
-        affine = unless_contradicted(through_anchor, predicted, context, random, config)
-        assert affine.refuted == refuted
+        affine = refit_at_target(through_anchor, predicted, context, random, config)
+        assert affine.is_rejected == refuted
         assert affine.agreement < 0.1
 
 

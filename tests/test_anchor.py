@@ -4,8 +4,8 @@ import pytest
 import torch
 
 from gscompleter.config import AnchorConfig, CompleterConfig
-from gscompleter.stages.anchor import lift, nearest_view, select_anchor, synthesize
-from gscompleter.types import Camera, DepthMap, Reconstruction, Render, SceneContext, View, merge
+from gscompleter.stages.select_anchor import find_nearest_view, lift, select_anchor, synthesize
+from gscompleter.types import Camera, DepthMap, GeneratorInput, Reconstruction, Render, View, merge
 from scenes import Room, camera_at, gaussians_of, view_of
 
 TARGET = camera_at()
@@ -57,7 +57,7 @@ def test_without_anchor_selection_the_nearest_view_is_taken():
 
 
 def test_of_equally_near_views_the_least_turned_is_the_nearest():
-    assert nearest_view(TARGET, [view(x=1, yaw=20), view(x=-1, yaw=5)]) == 1
+    assert find_nearest_view(TARGET, [view(x=1, yaw=20), view(x=-1, yaw=5)]) == 1
 
 
 def test_without_views_there_is_no_anchor():
@@ -65,16 +65,16 @@ def test_without_views_there_is_no_anchor():
         select_anchor(TARGET, [])
 
 
-def context_of(*views: View) -> SceneContext:
+def context_of(*views: View) -> GeneratorInput:
     nothing = Render(torch.zeros(96, 96, 3), torch.zeros(96, 96), torch.zeros(96, 96))
-    return SceneContext(tuple(views), tuple(nothing for _ in views), nothing)
+    return GeneratorInput(tuple(views), tuple(nothing for _ in views), nothing)
 
 
 def test_the_generator_is_asked_with_the_nearest_view():
     near, far = view(x=1, yaw=0), view(x=2, yaw=0)
     asked = []
 
-    def generator(nearest: View, target: Camera, context: SceneContext):
+    def generator(nearest: View, target: Camera, context: GeneratorInput):
         asked.append(nearest)
         return torch.full((target.height, target.width, 3), 0.25)
 

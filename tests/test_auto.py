@@ -9,10 +9,10 @@ import torch
 
 from command import run
 from gscompleter import load_cameras
-from gscompleter.cli import parsed
-from gscompleter.commands.words import auto_counted
+from gscompleter.apps.commands.words import insert_auto_count
+from gscompleter.cli import parse_command
 from gscompleter.data.formats import open_photographs
-from gscompleter.geometry import baseline_between
+from gscompleter.geometry import measure_baseline
 from scenes import camera_at, photographed
 
 PLACES = ((-0.4, -4), (-0.2, 0), (0.0, 0), (0.3, 4), (0.5, 8))
@@ -77,7 +77,7 @@ def test_the_cameras_stand_beside_the_photographs_they_were_derived_from(scene, 
     assert len(found) == len(rows)
     for camera, row in zip(found, rows, strict=True):
         assert (camera.width, camera.height) == (48, 48)
-        assert baseline_between(camera, photographs.camera(row["derived_from"], 48)) < 0.5
+        assert measure_baseline(camera, photographs.camera(row["derived_from"], 48)) < 0.5
 
 
 def test_a_dry_run_writes_the_cameras_alone_and_shows_them(scene, tmp_path, monkeypatch, capsys):
@@ -120,7 +120,7 @@ def test_a_scene_that_was_brought_is_explored_with_its_doubts(
     assert run(monkeypatch, *words) == 0
     (camera,) = load_cameras(out / "targets.json")
     near = min(
-        baseline_between(camera, open_photographs(scene).camera(number))
+        measure_baseline(camera, open_photographs(scene).camera(number))
         for number in range(len(PLACES))
     )
     assert near < 0.5
@@ -138,8 +138,8 @@ def test_a_dry_run_shows_what_named_targets_would_cost(scene, tmp_path, monkeypa
 
 def test_a_number_may_follow_auto_or_not():
     words = ["complete", "SCENE", "--out", "OUT"]
-    assert parsed(words).auto is None
-    assert parsed([*words, "--auto", "7"]).auto == 7
-    assert parsed([*words, "--auto"]).auto == 4
-    assert parsed(["complete", "SCENE", "--auto", "--out", "OUT"]).auto == 4
-    assert auto_counted(["complete", "--auto", "x"]) == ["complete", "--auto", "4", "x"]
+    assert parse_command(words).auto is None
+    assert parse_command([*words, "--auto", "7"]).auto == 7
+    assert parse_command([*words, "--auto"]).auto == 4
+    assert parse_command(["complete", "SCENE", "--auto", "--out", "OUT"]).auto == 4
+    assert insert_auto_count(["complete", "--auto", "x"]) == ["complete", "--auto", "4", "x"]

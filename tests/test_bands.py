@@ -6,14 +6,19 @@ import numpy as np
 import pytest
 import torch
 
+from gscompleter.evaluation.metrics.image import compute_gradient_energy_ratio
 from gscompleter.kernels import stereo
 from gscompleter.kernels.stereo import TILE_COLUMNS, TILE_ROWS
-from gscompleter.metrics.image import gradient_energy_ratio
-from gscompleter.reconstructors.plane_sweep import PlaneSweep, measuring
-from gscompleter.reconstructors.plane_sweep.bands import around, bands_of, every_plane, tiles_of
-from gscompleter.reconstructors.plane_sweep.matching import inverse_depth_planes, matched_costs
-from gscompleter.reconstructors.plane_sweep.measuring import fractions, swept
-from gscompleter.reconstructors.plane_sweep.rig import rig_of
+from gscompleter.reconstructors.plane_sweep import PlaneSweep, sweep
+from gscompleter.reconstructors.plane_sweep.depth_bands import (
+    compute_tile_grid,
+    make_bands,
+    make_full_bands,
+    make_guided_bands,
+)
+from gscompleter.reconstructors.plane_sweep.matching import compute_costs, place_planes
+from gscompleter.reconstructors.plane_sweep.rig import build_rig
+from gscompleter.reconstructors.plane_sweep.sweep import compute_plane_index, sweep_view
 from gscompleter.render import load_renderer
 from gscompleter.types import sh_from_rgb
 from scenes import Room, camera_at, view_of
@@ -57,26 +62,26 @@ def one_path(costs, dy, dx, small, large):
 def rig():
     """Two photographs of a room, large enough to be matched at half their size first."""
     views = [view_of(Room(), camera_at(x, size=SIZE)) for x in (-0.2, 0.2)]
-    return rig_of(views), views
+    return build_rig(views), views
 
 
 def test_costs_lie_without_gaps_in_the_order_of_the_tiles():
     size = (2 * TILE_ROWS + 3, TILE_COLUMNS + 5)
-    high = np.arange(6).reshape(tiles_of(size)) + 1
-    bands = bands_of(np.zeros_like(high), high, size)
+    high = np.arange(6).reshape(compute_tile_grid(size)) + 1
+    bands = make_bands(np.zeros_like(high), high, size)
     pixels = np.outer([TILE_ROWS, TILE_ROWS, 3], [TILE_COLUMNS, 5])
     np.testing.assert_array_equal(np.diff(bands.start), (pixels * high).flatten())
 
 
 def test_a_band_holds_the_very_costs_of_all_planes(rig):
     (image, other), transform = rig[0].images, rig[0].transforms[0, 1]
-    planes = inverse_depth_planes(image, [(other, transform)], NEAR, FAR)
-    everything = every_plane(image.size, len(planes))
+    planes = place_planes(image, [(other, transform)], NEAR, FAR)
+    everything = make_full_bands(image.size, len(planes))
     low = np.random.default_rng(0).integers(0, len(planes) - 9, everything.low.shape)
-    bands = bands_of(low, low + 9, image.size)
+    bands = make_bands(low, low + 9, image.size)
     dense, banded = (
         volume(
-            matched_costs(image, [(other, transform)], planes, b), b, image.size, len(planes), -1
+            compute_costs(image, [(other, transform)], planes, b), b, image.size, len(planes), -1
         )
         for b in (everything, bands)
     )
@@ -89,21 +94,21 @@ def test_paths_cross_from_band_to_band():
     size, planes = (2 * TILE_ROWS, TILE_COLUMNS + 9), 12
     rng = np.random.default_rng(0)
     low = np.array([[0, 3], [5, 7]])
-    bands = bands_of(low, low + np.array([[6, 4], [7, 5]]), size)
+    bands = make_bands(low, low + np.array([[6, 4], [7, 5]]), size)
     costs = rng.integers(0, 254, bands.start[-1]).astype(np.uint8)
     h, w = size
     small, large = np.int16(25), np.int16(90)
     penalties = [
         np.full(s, large) for s in ((h, w - 1), (h - 1, w), (h - 1, w - 1), (h - 1, w - 1))
     ]
-    total = stereo.semi_global(costs, bands, *penalties, small)
+    total = stereo.aggregate_semi_globally(costs, bands, *penalties, small)
     dense = volume(costs, bands, size, planes, 1e9)
     steps = [(dy, dx) for dy in (-1, 0, 1) for dx in (-1, 0, 1) if (dy, dx) != (0, 0)]
     expected = sum(one_path(dense, dy, dx, small, large) for dy, dx in steps)
     found = volume(total, bands, size, planes, -1)
     within = found >= 0
     np.testing.assert_array_equal(found[within], expected[within])
-    index, margin = stereo.winners(total, bands, h, w)
+    index, margin = stereo.select_planes(total, bands, h, w)
     best = np.where(within, expected, 1e9).argmin(-1)
     assert (np.abs(index - best) <= 0.5).all()
     assert (margin >= 0).all()
@@ -111,12 +116,14 @@ def test_paths_cross_from_band_to_band():
 
 def test_bands_around_a_guess_hold_the_truth_at_a_fraction_of_the_planes(rig):
     stereo_rig, views = rig
-    guess = swept(0, stereo_rig.halved(), NEAR / stereo_rig.unit, FAR / stereo_rig.unit)
+    guess = sweep_view(0, stereo_rig.halve(), NEAR / stereo_rig.unit, FAR / stereo_rig.unit)
     image = stereo_rig.images[0]
     sources = [(stereo_rig.images[1], stereo_rig.transforms[0, 1])]
-    planes = inverse_depth_planes(image, sources, NEAR / stereo_rig.unit, FAR / stereo_rig.unit)
-    bands = around(fractions(planes, guess.inverse), 2, image.size, len(planes))
-    true = fractions(planes, stereo_rig.unit / views[0].depth.numpy())
+    planes = place_planes(image, sources, NEAR / stereo_rig.unit, FAR / stereo_rig.unit)
+    bands = make_guided_bands(
+        compute_plane_index(planes, guess.inverse), 2, image.size, len(planes)
+    )
+    true = compute_plane_index(planes, stereo_rig.unit / views[0].depth.numpy())
     rows, columns = np.indices(image.size) // np.array([TILE_ROWS, TILE_COLUMNS])[:, None, None]
     low, high = bands.low[rows, columns], bands.high[rows, columns]
     assert ((true >= low) & (true <= high - 1)).mean() > 0.96
@@ -125,9 +132,9 @@ def test_bands_around_a_guess_hold_the_truth_at_a_fraction_of_the_planes(rig):
 
 def test_two_large_photographs_are_measured_as_well_as_at_all_planes(rig, monkeypatch):
     views, truth = rig[1], rig[1][0].depth
-    guided = PlaneSweep().depths(views)[0]
-    monkeypatch.setattr("gscompleter.reconstructors.plane_sweep.measuring.GUIDED_FROM", SIZE + 1)
-    plain = PlaneSweep().depths(views)[0]
+    guided = PlaneSweep().estimate_depths(views)[0]
+    monkeypatch.setattr("gscompleter.reconstructors.plane_sweep.sweep.MIN_GUIDED_SIDE", SIZE + 1)
+    plain = PlaneSweep().estimate_depths(views)[0]
 
     def off(found):
         return ((found.depth - truth).abs() / truth).median().item()
@@ -142,18 +149,18 @@ def test_coarse_images_say_first_where_to_look_down_to_the_smallest(rig, monkeyp
 
     def counted(reference, sources, planes, bands):
         seen.append((reference.size, bands.start[-1]))
-        return matched_costs(reference, sources, planes, bands)
+        return compute_costs(reference, sources, planes, bands)
 
-    monkeypatch.setattr(measuring, "matched_costs", counted)
-    monkeypatch.setattr(measuring, "GUIDED_FROM", SIZE // 2)
-    guided = measuring.sweeps_of(stereo_rig, *depths)
+    monkeypatch.setattr(sweep, "compute_costs", counted)
+    monkeypatch.setattr(sweep, "MIN_GUIDED_SIDE", SIZE // 2)
+    guided = sweep.sweep_views(stereo_rig, *depths)
     assert [size for size, _ in seen] == [
         (s, s) for s in (SIZE // 4, SIZE // 2, SIZE) for _ in "ab"
     ]
     work = sum(cells for _, cells in seen)
     seen.clear()
-    monkeypatch.setattr(measuring, "GUIDED_FROM", SIZE + 1)
-    plain = measuring.sweeps_of(stereo_rig, *depths)
+    monkeypatch.setattr(sweep, "MIN_GUIDED_SIDE", SIZE + 1)
+    plain = sweep.sweep_views(stereo_rig, *depths)
     assert work < 0.6 * sum(cells for _, cells in seen)
     truth = stereo_rig.unit / views[0].depth.numpy()
     errors = [np.abs(sweeps[0].inverse - truth) / truth for sweeps in (guided, plain)]
@@ -184,7 +191,7 @@ def test_what_is_lifted_shows_the_synthesized_image_as_sharply_as_it_is(rig):
     fitted, blurred = (
         load_renderer("cpu").render(g, views[0].camera).image for g in (lifted, plain)
     )
-    ratios = [gradient_energy_ratio(x, views[0].image, inner) for x in (fitted, blurred)]
+    ratios = [compute_gradient_energy_ratio(x, views[0].image, inner) for x in (fitted, blurred)]
     assert ratios[1] < 0.9
     assert 0.9 < ratios[0] < 1.1
     errors = [(x - views[0].image)[inner].square().mean() for x in (fitted, blurred)]

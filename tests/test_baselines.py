@@ -9,30 +9,30 @@ import torch
 from skimage.metrics import structural_similarity
 
 from gscompleter import load_renderer
-from gscompleter.baselines.mixture_wasserstein import (
+from gscompleter.evaluation.baselines.mixture_wasserstein import (
     Mixture,
-    matrix_root,
-    mixture_wasserstein,
-    pairwise_costs,
-    reduced,
+    compute_matrix_root,
+    compute_mixture_wasserstein,
+    compute_pairwise_costs,
+    reduce_mixture,
 )
-from gscompleter.baselines.optimization import (
+from gscompleter.evaluation.baselines.optimization import (
     OptimizationConfig,
-    densified,
-    image_slopes,
+    compute_image_gradients,
+    control_density,
     optimize,
     ssim_map,
 )
-from gscompleter.baselines.reggs import (
+from gscompleter.evaluation.baselines.reggs import (
     RegGSConfig,
     Similarity,
-    carried,
-    clustered,
-    into_scene,
+    cluster_gaussians,
+    move_into_scene,
+    move_scene,
     register_by_similarity,
-    turned,
+    rotate_mixture,
 )
-from gscompleter.metrics.image import psnr
+from gscompleter.evaluation.metrics.image import psnr
 from gscompleter.types import Gaussians, View, merge
 from parity import assert_close
 from scenes import Room, camera_at, gaussians_of, random_gaussians, view_of
@@ -49,7 +49,7 @@ def upstream() -> dict[str, torch.Tensor]:
 def mixtures(upstream: dict[str, torch.Tensor]) -> tuple[Mixture, Mixture]:
     a = Mixture(upstream["mu"], upstream["cov"], upstream["w"])
     b = Mixture(upstream["mu2"], upstream["cov2"], upstream["w2"])
-    return reduced(a, upstream["clusters_a"]), reduced(b, upstream["clusters_b"])
+    return reduce_mixture(a, upstream["clusters_a"]), reduce_mixture(b, upstream["clusters_b"])
 
 
 def test_reduced_mixtures_equal_upstreams(upstream):
@@ -61,10 +61,10 @@ def test_reduced_mixtures_equal_upstreams(upstream):
 
 def test_costs_loss_and_gradient_equal_upstreams(upstream):
     a, b = mixtures(upstream)
-    assert_close(pairwise_costs(a, b), upstream["cost"], "cost")
+    assert_close(compute_pairwise_costs(a, b), upstream["cost"], "cost")
     scale = torch.tensor(upstream["scale"].item(), dtype=torch.float32, requires_grad=True)
     larger = Mixture(a.means * scale, a.covariances * scale**2, a.weights)
-    loss = mixture_wasserstein(larger, b)
+    loss = compute_mixture_wasserstein(larger, b)
     (gradient,) = torch.autograd.grad(loss, scale)
     assert_close(loss, upstream["loss"], "loss")
     assert_close(gradient, upstream["grad_scale"], "grad_scale")
@@ -73,14 +73,14 @@ def test_costs_loss_and_gradient_equal_upstreams(upstream):
 def test_the_root_squared_is_the_matrix():
     random = torch.randn(20, 3, 3, generator=torch.Generator().manual_seed(0))
     positive = random @ random.transpose(-1, -2)
-    root = matrix_root(positive)
+    root = compute_matrix_root(positive)
     assert torch.allclose(root @ root, positive, atol=1e-3)
 
 
 def test_a_cluster_keeps_mean_and_covariance_of_its_members():
     gaussians = random_gaussians(50)
-    mixture = clustered(gaussians, camera_at(), 1000, seed=0)
-    merged = reduced(mixture, torch.zeros(50, dtype=torch.long))
+    mixture = cluster_gaussians(gaussians, camera_at(), 1000, seed=0)
+    merged = reduce_mixture(mixture, torch.zeros(50, dtype=torch.long))
     mean = (mixture.weights[:, None] * mixture.means).sum(0)
     assert torch.allclose(merged.means[0], mean, atol=1e-5)
     offset = mixture.means - mean
@@ -95,7 +95,7 @@ SMALL_TURN = torch.tensor([0.99, 0.05, -0.08, 0.03])
 def test_into_scene_undoes_carried():
     gaussians, camera = random_gaussians(40), camera_at(0.3, yaw=10)
     fit = Similarity(torch.tensor(1.0), SMALL_TURN, torch.tensor([0.2, -0.1, 0.3]))
-    back = into_scene(carried(gaussians, fit), fit, camera)
+    back = move_into_scene(move_scene(gaussians, fit), fit, camera)
     assert torch.allclose(back.means, gaussians.means, atol=1e-5)
     same = torch.nn.functional.normalize(gaussians.quats, dim=-1)
     agreement = (torch.nn.functional.normalize(back.quats, dim=-1) * same).sum(-1).abs()
@@ -105,8 +105,8 @@ def test_into_scene_undoes_carried():
 def test_a_mixture_moves_as_its_gaussians_do():
     gaussians, camera = random_gaussians(40), camera_at(0.3, yaw=10)
     fit = Similarity(torch.tensor(1.0), SMALL_TURN, torch.tensor([0.2, -0.1, 0.3]))
-    moved = clustered(carried(gaussians, fit), camera, 1000, seed=0)
-    mixture = turned(clustered(gaussians, camera, 1000, seed=0), fit, camera)
+    moved = cluster_gaussians(move_scene(gaussians, fit), camera, 1000, seed=0)
+    mixture = rotate_mixture(cluster_gaussians(gaussians, camera, 1000, seed=0), fit, camera)
     assert torch.allclose(mixture.means, moved.means, atol=1e-4)
     assert torch.allclose(mixture.covariances, moved.covariances, atol=1e-4)
 
@@ -169,7 +169,7 @@ def test_density_control_clones_splits_and_prunes():
     scene = replace(scene, scales=scales, opacities=opacities)
     crowded = torch.tensor([True, True, False, False, False, False])
     random = torch.Generator().manual_seed(0)
-    dense = densified(scene, crowded, 1.0, random, OptimizationConfig())
+    dense = control_density(scene, crowded, 1.0, random, OptimizationConfig())
     # Six, one of them twice, one as two halves, one gone.
     assert len(dense) == 7
     assert (dense.means == scene.means[0]).all(-1).sum() == 2
@@ -190,7 +190,7 @@ def test_gradients_in_the_image_are_those_of_the_rendered_position():
     }
     image = renderer.render(replace(gaussian, means=means, **tensors), camera).image
     (gradient,) = torch.autograd.grad((image * weights).sum(), means)
-    length, seen = image_slopes(means.detach(), gradient, camera)
+    length, seen = compute_image_gradients(means.detach(), gradient, camera)
 
     def at(shift: float) -> float:
         K = camera.K.clone()

@@ -13,16 +13,16 @@ import pytest
 from batch_jobs import Writing, engine_named, outcomes, plain_jobs
 from command import run
 from gscompleter import InputError
-from gscompleter.batch import jobs as batch
-from gscompleter.batch.engines.local import LocalEngine
-from gscompleter.batch.engines.submitit import SubmititEngine
-from gscompleter.batch.jobs import Job, missing, settle
-from gscompleter.batch.manifest import read_manifest
-from gscompleter.batch.places import FolderPlace, StorePlace, lease, place_of
-from gscompleter.batch.rounds import BatchRows, Rounds, in_this_process
-from gscompleter.batch.shards import parse_shard
-from gscompleter.commands.row_options import options_of
+from gscompleter.apps.batch.manifest import read_manifest
+from gscompleter.apps.commands.row_options import parse_row
 from gscompleter.errors import OutputError
+from gscompleter.jobs import jobs as batch
+from gscompleter.jobs.engines.local import LocalEngine
+from gscompleter.jobs.engines.submitit import SubmititEngine
+from gscompleter.jobs.jobs import Job, find_missing_jobs, run_claimed
+from gscompleter.jobs.places import FolderPlace, StorePlace, make_lease, open_place
+from gscompleter.jobs.rounds import BatchRows, Rounds, run_in_this_process
+from gscompleter.jobs.shards import parse_shard
 from scenes import camera_at, photographed
 from simulate_batch import Fleet, Replay, replay
 
@@ -133,28 +133,30 @@ def test_what_somebody_else_does_is_waited_for(tmp_path):
     place, job = FolderPlace(tmp_path), Job("one")
 
     rounds = Rounds(place, BatchRows(place), [], retries=0)
-    with place.claimed("claims/one"):
+    with place.hold_claim("claims/one"):
         assert place.is_held("claims/one")
         assert Writing(str(tmp_path))(job).state == "elsewhere"
         rounds.elsewhere.append(job)
-        assert list(rounds.done_by_others()) == []
+        assert list(rounds.collect_from_others()) == []
         assert rounds.elsewhere == [job]
     assert not place.is_held("claims/one")
-    assert [o.state for o in rounds.outcomes(in_this_process, Writing(str(tmp_path)))] == ["done"]
+    assert [o.state for o in rounds.run(run_in_this_process, Writing(str(tmp_path)))] == ["done"]
 
 
 def test_a_full_disk_ends_the_run_and_loses_nothing(tmp_path, monkeypatch):
     place = FolderPlace(tmp_path)
-    settle(Job("first"), place, lambda: {"size": 1}, retries=2)
+    run_claimed(Job("first"), place, lambda: {"size": 1}, retries=2)
 
     def full() -> dict[str, int]:
         raise OutputError("Cannot write it: there is no space left.")
 
     with pytest.raises(OutputError, match="no space left"):
-        settle(Job("second"), place, full, retries=2)
-    assert [job.name for job in missing([Job("first"), Job("second")], place, False)] == ["second"]
+        run_claimed(Job("second"), place, full, retries=2)
+    assert [job.name for job in find_missing_jobs([Job("first"), Job("second")], place, False)] == [
+        "second"
+    ]
     assert os.listdir(tmp_path / "claims") == []
-    assert settle(Job("second"), place, lambda: {"size": 1}, retries=2).state == "done"
+    assert run_claimed(Job("second"), place, lambda: {"size": 1}, retries=2).state == "done"
 
 
 def test_done_with_other_options_is_refused_and_failed_is_done_again(tmp_path):
@@ -163,29 +165,29 @@ def test_done_with_other_options_is_refused_and_failed_is_done_again(tmp_path):
     perform(Job("good"))
     perform(Job("bad", {"ends": "sentence"}))
     with pytest.raises(InputError, match="job good done with other options"):
-        missing([Job("good", {"seconds": 1})], place, False)
-    assert missing([Job("bad", {"ends": "sentence"})], place, False) == []
-    assert len(missing([Job("bad", {"ends": "sentence"})], place, True)) == 1
+        find_missing_jobs([Job("good", {"seconds": 1})], place, False)
+    assert find_missing_jobs([Job("bad", {"ends": "sentence"})], place, False) == []
+    assert len(find_missing_jobs([Job("bad", {"ends": "sentence"})], place, True)) == 1
     perform(Job("bad", {"ends": "sentence"}))
     mended = Job("bad", {})
-    assert missing([mended], place, False) == [mended]
+    assert find_missing_jobs([mended], place, False) == [mended]
     assert perform(mended).state == "done"
 
 
 def test_in_a_store_one_holds_a_claim_until_it_is_not_renewed(tmp_path):
-    place = place_of(f"file://{tmp_path}/out")
+    place = open_place(f"file://{tmp_path}/out")
     assert isinstance(place, StorePlace)
-    with place.claimed("claims/one") as lost:
+    with place.hold_claim("claims/one") as lost:
         assert lost == 0
         assert place.is_held("claims/one")
-        with place.claimed("claims/one") as other:
+        with place.hold_claim("claims/one") as other:
             assert other is None
     assert not place.is_held("claims/one")
-    old = json.loads(lease("someone", 1)) | {"renewed": time.time() - 1000}
+    old = json.loads(make_lease("someone", 1)) | {"renewed": time.time() - 1000}
     place.write("claims/two", json.dumps(old).encode())
-    with place.claimed("claims/two") as lost:
+    with place.hold_claim("claims/two") as lost:
         assert lost == 2
-    assert place.names("claims") == set()
+    assert place.list_names("claims") == set()
 
 
 @pytest.mark.parametrize(
@@ -221,12 +223,12 @@ def test_manifests_of_all_kinds_name_the_same_jobs(tmp_path):
     by_folder = read_manifest(str(tmp_path / "scenes"), {})
     for jobs in (by_csv, by_json, by_folder):
         assert [job.name for job in jobs] == ["one", "two-scenes"]
-    options = [[options_of(j.options, tmp_path / "o") for j in jobs] for jobs in (by_csv, by_json)]
+    options = [[parse_row(j.options, tmp_path / "o") for j in jobs] for jobs in (by_csv, by_json)]
     assert options[0] == options[1]
     assert options[0][0].target == ("4", "6")
     assert options[0][0].video
     assert options[0][0].config.holes.max_alpha == 0.4
-    assert options[0][1] == options_of(by_folder[1].options, tmp_path / "o")
+    assert options[0][1] == parse_row(by_folder[1].options, tmp_path / "o")
 
 
 def test_rows_of_one_scene_get_numbers_and_equal_names_are_refused(tmp_path):
@@ -253,7 +255,7 @@ def test_rows_of_one_scene_get_numbers_and_equal_names_are_refused(tmp_path):
 )
 def test_a_wrong_row_is_a_sentence(row, sentence, tmp_path):
     with pytest.raises(InputError, match=sentence):
-        options_of({"folder": "room", **row}, tmp_path / "out")
+        parse_row({"folder": "room", **row}, tmp_path / "out")
 
 
 @pytest.fixture(scope="module")
@@ -315,17 +317,17 @@ def test_a_batch_does_what_complete_does_and_tells_of_what_is_broken(
 
 def test_a_store_gets_the_same_results_and_needs_no_folder_here(manifest, tmp_path):
     """Run the work of a worker in this process."""
-    from gscompleter.commands.batch import CompletingJob
+    from gscompleter.apps.commands.batch import JobCompleter
 
     [job] = [j for j in read_manifest(str(manifest), {}) if j.name == "room-0"]
     room = {**job.options, "folder": f"file://{job.options['folder']}"}
     here, there = tmp_path / "here", tmp_path / "there"
-    assert CompletingJob(str(here), 0)(job).state == "done"
-    outcome = CompletingJob(f"file://{there}", 0)(Job("room-0", room))
+    assert JobCompleter(str(here), 0)(job).state == "done"
+    outcome = JobCompleter(f"file://{there}", 0)(Job("room-0", room))
     assert outcome.state == "done", outcome.reason
     same_results(here, there / "jobs", "room-0")
     missing_there = {**room, "folder": f"file://{tmp_path}/nothing"}
-    outcome = CompletingJob(f"file://{there}", 0)(Job("gone", missing_there))
+    outcome = JobCompleter(f"file://{there}", 0)(Job("gone", missing_there))
     assert outcome.state == "failed"
     assert "There is nothing at" in outcome.reason
 

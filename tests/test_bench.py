@@ -8,18 +8,18 @@ import pytest
 import torch
 
 from command import run
-from gscompleter.benchmark.completions import PROCESS, REST
-from gscompleter.benchmark.crowding import crowded
-from gscompleter.benchmark.growth import Growth, slope
-from gscompleter.benchmark.manifest import BenchCase, grown_from, read_manifest
-from gscompleter.benchmark.plots import plot_growth
-from gscompleter.benchmark.processes import run_alone
-from gscompleter.benchmark.report import Report, content, report_markdown, times
-from gscompleter.benchmark.rounds import Task, in_rounds
-from gscompleter.benchmark.samples import Measured, Sample, Spread
-from gscompleter.benchmark.unfrozen import Unfrozen
-from gscompleter.benchmark.yardstick import Yardstick
-from gscompleter.commands.bench import names_of
+from gscompleter.apps.bench.completions import PROCESS, REST
+from gscompleter.apps.bench.crowding import multiply_gaussians
+from gscompleter.apps.bench.growth import Growth, fit_exponent
+from gscompleter.apps.bench.manifest import BenchCase, make_series, read_manifest
+from gscompleter.apps.bench.plots import plot_growth
+from gscompleter.apps.bench.processes import run_command
+from gscompleter.apps.bench.report import Report, build_content, compute_time_ratio, format_report
+from gscompleter.apps.bench.rounds import BenchTask, measure_in_rounds
+from gscompleter.apps.bench.samples import Sample, SampleSet, Spread
+from gscompleter.apps.bench.unfrozen import UnfrozenRenderer
+from gscompleter.apps.bench.yardstick import Yardstick
+from gscompleter.apps.commands.bench import map_case_names
 from gscompleter.completer import GSCompleter
 from gscompleter.config import CompleterConfig
 from gscompleter.errors import InputError
@@ -103,14 +103,14 @@ def test_nothing_frozen_descends_as_what_is_frozen_does():
         return torch.tensor([*target.losses["register"], *target.losses["refine"]])
 
     for config in (CompleterConfig(), CompleterConfig.paper()):
-        frozen, plain = losses(renderer, config), losses(Unfrozen(renderer), config)
+        frozen, plain = losses(renderer, config), losses(UnfrozenRenderer(renderer), config)
         assert (frozen - plain).abs().max() < 1e-4 * frozen.abs().max()
 
 
 def test_a_crowd_of_copies_looks_like_the_scene():
     view = view_of(Room(), CAMERAS[0])
     scene, renderer = gaussians_of(view), load_renderer("cpu")
-    crowd = crowded(scene, 10 * len(scene) + 7)
+    crowd = multiply_gaussians(scene, 10 * len(scene) + 7)
     assert len(crowd) == 10 * len(scene) + 7
     one, many = (renderer.render(g, view.camera) for g in (scene, crowd))
     assert (one.image - many.image).square().mean() < 0.2 * one.image.var()
@@ -119,32 +119,36 @@ def test_a_crowd_of_copies_looks_like_the_scene():
 
 def test_a_crowd_is_the_same_for_the_same_seed_and_may_be_smaller():
     scene = gaussians_of(view_of(Room(), CAMERAS[0]))
-    assert torch.equal(crowded(scene, 100, 3).means, crowded(scene, 100, 3).means)
-    assert not torch.equal(crowded(scene, 100, 3).means, crowded(scene, 100, 4).means)
-    few = crowded(scene, 100)
+    assert torch.equal(
+        multiply_gaussians(scene, 100, 3).means, multiply_gaussians(scene, 100, 3).means
+    )
+    assert not torch.equal(
+        multiply_gaussians(scene, 100, 3).means, multiply_gaussians(scene, 100, 4).means
+    )
+    few = multiply_gaussians(scene, 100)
     assert torch.allclose(few.opacities, torch.full((100,), 0.95), atol=1e-6)
 
 
 def test_the_yardstick_is_one_gaussian_per_pixel_of_three_cameras():
-    yardstick = Yardstick.on(load_renderer("cpu"), "cpu")
+    yardstick = Yardstick.create(load_renderer("cpu"), "cpu")
     assert len(yardstick.gaussians) == 3 * 256 * 256
-    gradients = yardstick.draw()
+    gradients = yardstick.render()
     assert all(gradient.abs().max() > 0 for gradient in gradients[:4])
-    found, unit = yardstick.beside(lambda: "found")
+    found, unit = yardstick.measure_beside(lambda: "found")
     assert found == "found"
     assert unit > 0
 
 
 def test_the_slope_of_a_power_is_its_exponent():
     sizes = [10, 20, 40, 80]
-    assert slope(sizes, [0.3 * n**1.5 for n in sizes]) == pytest.approx(1.5)
-    assert slope(sizes, [2.0] * 4) == pytest.approx(0)
-    assert slope(sizes, [0.0, 0.0, 0.0, 1.0]) is None
-    assert slope([5, 5], [1.0, 2.0]) is None
+    assert fit_exponent(sizes, [0.3 * n**1.5 for n in sizes]) == pytest.approx(1.5)
+    assert fit_exponent(sizes, [2.0] * 4) == pytest.approx(0)
+    assert fit_exponent(sizes, [0.0, 0.0, 0.0, 1.0]) is None
+    assert fit_exponent([5, 5], [1.0, 2.0]) is None
 
 
 def test_a_sample_in_yardsticks_is_its_seconds_over_theirs():
-    measured = Measured("case", (sample(1.0, 0.5), sample(3.0, 0.5), sample(10.0, 2.0)))
+    measured = SampleSet("case", (sample(1.0, 0.5), sample(3.0, 0.5), sample(10.0, 2.0)))
     assert measured.seconds[PROCESS] == Spread(3.0, 1.0, 10.0)
     assert measured.ratios[PROCESS] == Spread(5.0, 2.0, 6.0)
     assert measured.peak_bytes == 2**30
@@ -154,10 +158,10 @@ def test_everything_has_its_turn_before_anything_has_two():
     turns = []
 
     def task(name, repeats):
-        return Task(name, lambda: turns.append(name) or sample(1.0), PROCESS, repeats)
+        return BenchTask(name, lambda: turns.append(name) or sample(1.0), PROCESS, repeats)
 
     lines = []
-    found = in_rounds([task("a", 3), task("b", 1)], lines.append)
+    found = measure_in_rounds([task("a", 3), task("b", 1)], lines.append)
     assert turns == ["a", "b", "a", "a"]
     assert [len(found[name].samples) for name in "ab"] == [3, 1]
     assert lines[-1].startswith("4/4 a:")
@@ -165,30 +169,30 @@ def test_everything_has_its_turn_before_anything_has_two():
 
 def test_methods_are_told_in_multiples_of_the_first():
     def method(name, own):
-        return Measured(name, (Sample({"register": own, "own": own}, 0.5, None, {}),))
+        return SampleSet(name, (Sample({"register": own, "own": own}, 0.5, None, {}),))
 
     ours, theirs = method("full", 0.5), method("reggs", 150.0)
-    assert times(theirs, ours) == pytest.approx(300)
+    assert compute_time_ratio(theirs, ours) == pytest.approx(300)
     report = Report({}, {"repeats": 1}, (), (ours, theirs), ())
-    assert "| reggs | 150.00 | 150.00 | 300.0 | 300 | – |" in report_markdown(report)
+    assert "| reggs | 150.00 | 150.00 | 300.0 | 300 | – |" in format_report(report)
 
 
 def test_a_case_that_several_series_share_is_measured_once():
-    growth = grown_from(CASE)
+    growth = make_series(CASE)
     base = replace(CASE, targets=(4,))
     assert [c.resolution for c in growth["pixels"]][2] == base.resolution
-    names = names_of([base, *(case for found in growth.values() for case in found)])
+    names = map_case_names([base, *(case for found in growth.values() for case in found)])
     assert len(names) == 1 + 4 + 4 + 1 + 1  # each but Gaussians holds the base
     assert [c.context for c in growth["views"]] == [(0, 1), (0, 1, 2, 3)]
     assert [c.targets for c in growth["targets"]] == [(4,), (4, 5)]
 
 
 def test_growth_is_drawn_and_told_with_its_exponents(tmp_path):
-    points = tuple(Measured(f"{n}", (sample(0.1 * n, 0.5),)) for n in (1, 2, 4))
+    points = tuple(SampleSet(f"{n}", (sample(0.1 * n, 0.5),)) for n in (1, 2, 4))
     series = Growth("targets", (1, 2, 4), points)
     report = Report({"cores": 2}, {"repeats": 1}, (), (), (series,))
-    assert content(report)["growth"][0]["slopes"][PROCESS] == pytest.approx(1)
-    assert "| exponent | 1.00 | 1.00 | 0.00 |" in report_markdown(report)
+    assert build_content(report)["growth"][0]["slopes"][PROCESS] == pytest.approx(1)
+    assert "| exponent | 1.00 | 1.00 | 0.00 |" in format_report(report)
     images = [plot_growth(tmp_path / f"{n}.png", [series]).read_bytes() for n in (1, 2)]
     assert images[0] == images[1]
     assert images[0].startswith(b"\x89PNG")
@@ -206,12 +210,12 @@ def test_the_cases_of_the_documentation_can_be_read():
 
 def test_a_process_that_refuses_its_input_says_why(tmp_path):
     with pytest.raises(InputError, match="nowhere"):
-        run_alone(["complete", str(tmp_path / "nowhere"), "--out", str(tmp_path / "out")])
+        run_command(["complete", str(tmp_path / "nowhere"), "--out", str(tmp_path / "out")])
 
 
 def test_a_process_tells_its_own_memory_and_not_its_parents():
     ballast = torch.ones(2**28)  # 1 GiB
-    ended = run_alone(["models", "--json"])
+    ended = run_command(["models", "--json"])
     assert ended.seconds > 0
     assert ended.peak_bytes is None or 0 < ended.peak_bytes < ballast.numel() * 4
 

@@ -5,16 +5,16 @@ import torch
 
 from gscompleter import Camera
 from gscompleter.config import NextBestViewConfig
-from gscompleter.geometry import baseline_between, rotation_between
-from gscompleter.stages.candidates import (
-    candidates,
-    moves,
-    opening,
-    shrunk,
-    spacing,
-    spread_cameras,
-    upward,
+from gscompleter.geometry import (
+    compute_field_of_view,
+    compute_spacing,
+    estimate_up,
+    measure_baseline,
+    measure_rotation,
+    select_spread_cameras,
+    shrink_camera,
 )
+from gscompleter.next_best_view.candidates import make_moves, propose_candidates
 from gscompleter.types import Render
 from scenes import Room, camera_at, cast
 
@@ -34,12 +34,12 @@ def tilted(camera: Camera) -> float:
 
 def test_there_are_six_translations_four_turns_and_four_orbits():
     camera = camera_at(0.3, yaw=20)
-    found = moves(camera, 3.0, 0.4, 0.25, UP)
-    rotations = torch.tensor([rotation_between(camera, other) for other in found])
-    baselines = torch.tensor([baseline_between(camera, other) for other in found])
+    found = make_moves(camera, 3.0, 0.4, 0.25, UP)
+    rotations = torch.tensor([measure_rotation(camera, other) for other in found])
+    baselines = torch.tensor([measure_baseline(camera, other) for other in found])
     assert torch.allclose(rotations[:6], torch.zeros(6), atol=1e-3)
     assert torch.allclose(baselines[:6], torch.full((6,), 0.4), rtol=1e-4)
-    quarter = torch.rad2deg(torch.tensor(opening(camera)[0] / 4))
+    quarter = torch.rad2deg(torch.tensor(compute_field_of_view(camera)[0] / 4))
     assert torch.allclose(rotations[6:10], quarter.expand(4), rtol=1e-3)
     assert torch.allclose(baselines[6:10], torch.zeros(4), atol=1e-6)
     assert torch.allclose(baselines[10:], torch.full((4,), 0.4), rtol=1e-2)
@@ -49,7 +49,7 @@ def test_there_are_six_translations_four_turns_and_four_orbits():
 
 
 def test_no_move_tilts_the_horizon():
-    for other in moves(camera_at(0.3, yaw=20), 3.0, 0.4, 0.25, UP):
+    for other in make_moves(camera_at(0.3, yaw=20), 3.0, 0.4, 0.25, UP):
         assert tilted(other) < 1e-5
 
 
@@ -57,14 +57,14 @@ def test_up_is_what_is_up_in_most_images():
     rolled = camera_at()
     rolled.c2w[:3, :2] = -rolled.c2w[:3, :2]
     cameras = [camera_at(yaw=yaw) for yaw in (0, 90, 200)]
-    assert torch.allclose(upward([rolled, *cameras]), UP, atol=1e-6)
+    assert torch.allclose(estimate_up([rolled, *cameras]), UP, atol=1e-6)
 
 
 def test_a_candidate_behind_a_surface_is_none():
     """The camera is one step in front of the wall at z = 5, which a second one sees from afar."""
     cameras = [camera_at(-2.0, z=4.2), camera_at(-2.0, z=1.0)]
     far = NextBestViewConfig(max_step=1.0)
-    found = candidates(cameras, [seen_by(c) for c in cameras], 0.79, far)
+    found = propose_candidates(cameras, [seen_by(c) for c in cameras], 0.79, far)
     centers = torch.stack([c.camera.center for c in found])
     assert (centers[:, 2] < 4.9).all()
     assert len(found) < 28
@@ -76,27 +76,30 @@ def test_a_step_is_as_long_as_cameras_stand_apart_and_short_of_the_scene():
     renders = [seen_by(camera) for camera in cameras]
     longest = {
         step: max(
-            baseline_between(c.camera, cameras[c.base]) for c in candidates(cameras, renders, step)
+            measure_baseline(c.camera, cameras[c.base])
+            for c in propose_candidates(cameras, renders, step)
         )
-        for step in (spacing(cameras), 50.0, 0.0)
+        for step in (compute_spacing(cameras), 50.0, 0.0)
     }
-    assert longest[spacing(cameras)] == pytest.approx(0.2, rel=1e-3)
+    assert longest[compute_spacing(cameras)] == pytest.approx(0.2, rel=1e-3)
     assert longest[50.0] == longest[0.0] == pytest.approx(0.2 * 4.6, rel=0.2)
 
 
 def test_cameras_that_are_spread_are_no_neighbours():
     cameras = [camera_at(x) for x in (0.0, 0.01, 0.02, 1.0, 1.01, 2.0)]
-    assert sorted(spread_cameras(cameras, 3)) == [0, 3, 5]
+    assert sorted(select_spread_cameras(cameras, 3)) == [0, 3, 5]
     turned = [camera_at(), camera_at(), camera_at(yaw=90)]
-    assert spread_cameras(turned, 2) == [0, 2]
-    assert sorted(spread_cameras(cameras, 99)) == list(range(6))
+    assert select_spread_cameras(turned, 2) == [0, 2]
+    assert sorted(select_spread_cameras(cameras, 99)) == list(range(6))
 
 
 @pytest.mark.parametrize("unit", [1e-4, 1e4])
 def test_the_unit_of_the_scene_changes_no_candidate(unit):
     places = ((-0.3, 0), (0.1, 10), (0.7, 12))
     found = [
-        candidates(cameras, [seen_by(c, Room(unit=u)) for c in cameras], spacing(cameras))
+        propose_candidates(
+            cameras, [seen_by(c, Room(unit=u)) for c in cameras], compute_spacing(cameras)
+        )
         for u in (1.0, unit)
         for cameras in [[camera_at(x, yaw=yaw, unit=u) for x, yaw in places]]
     ]
@@ -106,7 +109,7 @@ def test_the_unit_of_the_scene_changes_no_candidate(unit):
 
 
 def test_a_small_image_sees_the_same():
-    small = shrunk(camera_at(size=96), 48)
+    small = shrink_camera(camera_at(size=96), 48)
     assert (small.width, small.height) == (48, 48)
-    assert opening(small) == pytest.approx(opening(camera_at(size=96)))
-    assert shrunk(camera_at(size=40), 48).width == 40
+    assert compute_field_of_view(small) == pytest.approx(compute_field_of_view(camera_at(size=96)))
+    assert shrink_camera(camera_at(size=40), 48).width == 40

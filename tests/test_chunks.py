@@ -20,8 +20,8 @@ from chunk_files import (
     save_dataset,
 )
 from gscompleter import InputError
+from gscompleter.data.cases import SkippedScene, filter_usable, open_clips
 from gscompleter.data.chunks import open_chunks
-from gscompleter.data.datasets import Skipped, open_clips, usable
 from gscompleter.data.photographs import PosedPhotographs
 from gscompleter.data.real_estate import read_camera_file
 from gscompleter.geometry import project
@@ -147,7 +147,7 @@ def skip_reason(tmp_path: Path, change) -> str | None:
     one = example()
     change(one["cameras"])
     (clip,) = open_chunks(save_chunk(tmp_path / "000000.torch", one))
-    return clip.reason_to_skip()
+    return clip.find_skip_reason()
 
 
 def set_to(frame, column, value):
@@ -183,17 +183,17 @@ def test_what_benchmarks_leave_out_has_a_reason(tmp_path, change, reason):
 
 def test_the_size_of_images_is_checked_only_where_asked(tmp_path):
     (clip,) = open_chunks(save_chunk(tmp_path / "000000.torch", example()))
-    assert clip.reason_to_skip() is None
-    assert clip.reason_to_skip((64, 64)) is None
-    assert clip.reason_to_skip((360, 640)) == "frame 0: its image is 64 × 64 and not 360 × 640"
+    assert clip.find_skip_reason() is None
+    assert clip.find_skip_reason((64, 64)) is None
+    assert clip.find_skip_reason((360, 640)) == "frame 0: its image is 64 × 64 and not 360 × 640"
 
 
 def test_what_is_left_out_is_recorded(tmp_path):
     wide = example("wide")
     wide["cameras"][0, 0] = 0.3
     path = save_chunk(tmp_path / "000000.torch", example("a"), wide, example("b"))
-    skipped: list[Skipped] = []
-    assert [clip.name for clip in usable(open_chunks(path), skipped)] == ["a", "b"]
+    skipped: list[SkippedScene] = []
+    assert [clip.name for clip in filter_usable(open_chunks(path), skipped)] == ["a", "b"]
     assert [(s.name, "opening angle" in s.reason) for s in skipped] == [("wide", True)]
 
 
@@ -329,7 +329,7 @@ def test_a_real_chunk_agrees_with_its_camera_file_and_its_photographs(shared):
     folder = shared / "formats" / "re10k"
     (clip,) = open_clips(folder / "000000.torch")
     assert (clip.name, len(clip)) == ("0d4de33c6888a754", 93)
-    assert clip.reason_to_skip((360, 640)) is None
+    assert clip.find_skip_reason((360, 640)) is None
     listed = read_camera_file(folder / "0d4de33c6888a754.head.txt")
     for ours, theirs in zip(listed.frames, clip.frames, strict=False):
         assert np.allclose(ours.c2w, theirs.c2w, atol=1e-7)

@@ -10,12 +10,12 @@ import pytest
 import torch
 
 from command import run
+from gscompleter.cleaning import find_removable, find_superfluous, predict_error_change
 from gscompleter.config.cleaning import CleaningConfig
-from gscompleter.io.ply import load_ply
-from gscompleter.metrics.image import psnr
+from gscompleter.evaluation.metrics.image import psnr
+from gscompleter.guards.psnr import compute_squared_error
 from gscompleter.render import load_renderer
-from gscompleter.stages.cleaning import change_without, superfluous, unwanted
-from gscompleter.stages.harm import squared_error
+from gscompleter.splats.ply import load_ply
 from gscompleter.types import View, merge, sh_from_rgb
 from scenes import Room, camera_at, gaussians_of, labelled, photographed, view_of
 
@@ -60,40 +60,40 @@ def losses(scene, taken, views=VIEWS):
 def test_floaters_go_and_nothing_else():
     """Single Gaussians of the wall behind them may go, too, as photographs hardly change."""
     assert len(FLOATERS) > 3
-    taken = superfluous(SCENE, VIEWS, RENDERER, ONLY_HARMFUL)
+    taken = find_superfluous(SCENE, VIEWS, RENDERER, ONLY_HARMFUL)
     assert taken[FLOAT].all()
     assert (taken & ~FLOAT).float().mean() < 1e-3
 
 
 def test_walls_are_not_blamed_for_the_floaters_before_them():
-    at_first = unwanted(SCENE, NONE, VIEWS, RENDERER, ONLY_HARMFUL)
-    taken = superfluous(SCENE, VIEWS, RENDERER, ONLY_HARMFUL)
+    at_first = find_removable(SCENE, NONE, VIEWS, RENDERER, ONLY_HARMFUL)
+    taken = find_superfluous(SCENE, VIEWS, RENDERER, ONLY_HARMFUL)
     assert (taken & ~FLOAT).sum() < 0.2 * (at_first & ~FLOAT).sum()
 
 
 def test_what_is_idle_goes_too_and_no_photograph_gets_worse():
-    taken = superfluous(SCENE, VIEWS, RENDERER)
+    taken = find_superfluous(SCENE, VIEWS, RENDERER)
     assert taken[FLOAT].all()
     assert max(losses(SCENE, taken)) <= CleaningConfig().tolerance
 
 
 def test_a_scene_that_is_right_stays_as_it_is():
-    assert not superfluous(SURFACES, VIEWS, RENDERER, ONLY_HARMFUL).any()
+    assert not find_superfluous(SURFACES, VIEWS, RENDERER, ONLY_HARMFUL).any()
 
 
 def test_what_no_photograph_shows_or_what_was_generated_stays():
     behind = replace(FLOATERS, means=FLOATERS.means - torch.tensor([0.0, 0.0, 20.0]))
     ours = replace(FLOATERS, generated=torch.ones_like(FLOATERS.generated))
-    taken = superfluous(merge([SURFACES, behind, ours]), VIEWS, RENDERER)
+    taken = find_superfluous(merge([SURFACES, behind, ours]), VIEWS, RENDERER)
     assert not taken[len(SURFACES) :].any()
 
 
 def test_the_change_is_the_one_that_drawing_shows():
     view, generator = VIEWS[0], torch.Generator().manual_seed(1)
-    change = change_without(SCENE, NONE, view, RENDERER, 64, generator)
+    change = predict_error_change(SCENE, NONE, view, RENDERER, 64, generator)
 
     def error(scene):
-        return squared_error(RENDERER.render(scene, view.camera).image, view.image).item()
+        return compute_squared_error(RENDERER.render(scene, view.camera).image, view.image).item()
 
     for row in (*torch.nonzero(FLOAT)[:3, 0].tolist(), *change.topk(3).indices.tolist()):
         alone = torch.arange(len(SCENE)) == row
@@ -106,10 +106,10 @@ def test_without_the_guard_photographs_would_get_worse():
     views = [view_of(Room(), camera) for camera in CAMERAS]
     config = CleaningConfig(idle=1e3)
     none = torch.zeros(len(thrice), dtype=torch.bool)
-    doubtful = unwanted(thrice, none, views, RENDERER, config)
+    doubtful = find_removable(thrice, none, views, RENDERER, config)
     assert max(losses(thrice, doubtful, views)) > 1.0
-    unguarded = superfluous(thrice, views, RENDERER, replace(config, tolerance=10.0))
-    guarded = superfluous(thrice, views, RENDERER, config)
+    unguarded = find_superfluous(thrice, views, RENDERER, replace(config, tolerance=10.0))
+    guarded = find_superfluous(thrice, views, RENDERER, config)
     assert max(losses(thrice, unguarded, views)) > 0.05
     assert guarded.any()
     assert max(losses(thrice, guarded, views)) <= config.tolerance

@@ -21,9 +21,9 @@ import torch
 
 from command import run
 from gscompleter import load_ply, save_ply
-from gscompleter.cli import parsed
-from gscompleter.commands.renamed import warn_of
-from gscompleter.commands.row_options import options_of
+from gscompleter.apps.commands.renamed import warn_renamed
+from gscompleter.apps.commands.row_options import parse_row
+from gscompleter.cli import parse_command
 from gscompleter.config import CompleterConfig
 from gscompleter.config.generators import (
     GENERATORS,
@@ -336,7 +336,7 @@ def test_a_splat_in_place_of_the_photographs_is_sent_to_its_option(tmp_path, mon
 def config_of(scene, tmp_path, monkeypatch, *more) -> CompleterConfig:
     """Return the settings of a command."""
     words = [str(word) for word in complete(scene, tmp_path / "out", *more)]
-    return parsed(words).config
+    return parse_command(words).config
 
 
 def test_single_settings_are_applied_over_those_that_are_named(scene, tmp_path, monkeypatch):
@@ -376,13 +376,15 @@ def test_the_options_of_a_generator_are_its_settings(scene, tmp_path):
         "--generator-batch-size",
         3,
     )
-    options = parsed([str(w) for w in complete(scene, tmp_path, *words, "--generator-offload")])
-    assert options.synthesis.settings() == PEFieldSettings("a/b", 2, True, 8, "monocular", 3)
+    options = parse_command(
+        [str(w) for w in complete(scene, tmp_path, *words, "--generator-offload")]
+    )
+    assert options.synthesis.make_settings() == PEFieldSettings("a/b", 2, True, 8, "monocular", 3)
     words = ("--generator", "diffusers-inpaint", "--generator-prompt", "a quiet street")
-    options = parsed([str(word) for word in complete(scene, tmp_path, *words)])
-    assert options.synthesis.settings() == DiffusersInpaintSettings(prompt="a quiet street")
-    options = parsed([str(word) for word in complete(scene, tmp_path)])
-    assert options.synthesis.settings() == WarpInpaintSettings()
+    options = parse_command([str(word) for word in complete(scene, tmp_path, *words)])
+    assert options.synthesis.make_settings() == DiffusersInpaintSettings(prompt="a quiet street")
+    options = parse_command([str(word) for word in complete(scene, tmp_path)])
+    assert options.synthesis.make_settings() == WarpInpaintSettings()
 
 
 @pytest.mark.parametrize(
@@ -397,9 +399,11 @@ def test_the_options_of_a_generator_are_its_settings(scene, tmp_path):
     ],
 )
 def test_an_old_option_name_works_and_a_line_names_the_new_one(scene, tmp_path, capsys, old, new):
-    warn_of.cache_clear()
+    warn_renamed.cache_clear()
     more = ("--generator", "pe-field")
-    options = [parsed(list(map(str, complete(scene, tmp_path, *more, *o)))) for o in (old, new)]
+    options = [
+        parse_command(list(map(str, complete(scene, tmp_path, *more, *o)))) for o in (old, new)
+    ]
     assert options[0] == options[1]
     name = old[0].split("=")[0].replace("_", "-")
     assert capsys.readouterr().err == (
@@ -409,13 +413,15 @@ def test_an_old_option_name_works_and_a_line_names_the_new_one(scene, tmp_path, 
 
 
 def test_old_option_names_of_other_commands_and_of_rows_work_too(tmp_path, capsys):
-    warn_of.cache_clear()
+    warn_renamed.cache_clear()
     words = ["evaluate", "cases.json", "--out", "o", "--again", "scores", "--ignore-masked"]
-    options = parsed(words)
+    options = parse_command(words)
     assert (options.rerun, options.use_masks) == ("scores", True)
-    assert parsed(["batch", "m.csv", "--out", "o", "--again", "failures"]).rerun == "failures"
+    assert (
+        parse_command(["batch", "m.csv", "--out", "o", "--again", "failures"]).rerun == "failures"
+    )
     row = {"folder": "scene", "keep_unsupported": "true", "film": "no"}
-    options = options_of(row, tmp_path)
+    options = parse_row(row, tmp_path)
     assert (options.no_prune, options.video) == (True, False)
     assert capsys.readouterr().err.count("\n") == 4  # once each
 

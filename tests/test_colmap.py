@@ -13,11 +13,11 @@ from PIL import Image
 
 from command import run
 from gscompleter import InputError, load_cameras
-from gscompleter.data.colmap.lenses import MODELS, intrinsics_of
-from gscompleter.data.colmap.scene import _roots
+from gscompleter.data.colmap.lenses import MODELS, build_intrinsics
+from gscompleter.data.colmap.scene import _list_roots
 from gscompleter.data.formats import open_photographs
-from gscompleter.data.lens import Distortion, distort
-from gscompleter.data.sparse_points import with_depth_range
+from gscompleter.data.points import add_depth_range
+from gscompleter.data.undistort import Distortion, distort
 from gscompleter.io.image import write_image
 from gscompleter.types import Camera, View
 from pose_files import (
@@ -91,7 +91,7 @@ def test_the_images_file_that_is_named_is_read(tmp_path):
 
 
 def test_a_model_at_the_top_of_the_file_system_ends_the_search():
-    assert _roots(Path("/sparse/0"), Path("/sparse/0"))[-1] == Path("/")
+    assert _list_roots(Path("/sparse/0"), Path("/sparse/0"))[-1] == Path("/")
 
 
 def test_names_of_files_may_be_written_in_any_case(tmp_path):
@@ -310,7 +310,7 @@ class BentCamera(Camera):
 def test_photographs_of_every_lens_show_the_room_without_it(tmp_path, model):
     size = (LENS_SIZE, LENS_SIZE)
     parameters = [LENS_NUMBERS[name] for name in MODELS[model].parameters]
-    lens = intrinsics_of(MODELS[model], size, parameters, "the camera").distortion
+    lens = build_intrinsics(MODELS[model], size, parameters, "the camera").distortion
     straight = camera_at(size=LENS_SIZE)
     photograph, _ = cast(Room(), BentCamera(straight.c2w, straight.K, *size, lens=lens))
     (tmp_path / "images").mkdir()
@@ -469,5 +469,5 @@ def test_points_of_a_real_scene_enclose_it(shared):
     fox = shared / "splats" / "fox"
     if not fox.is_dir():
         pytest.skip(f"needs {fox}")
-    photographs = with_depth_range(open_photographs(fox), [0, 4])
+    photographs = add_depth_range(open_photographs(fox), [0, 4])
     assert (photographs.near, photographs.far) == (pytest.approx(2.3, 0.1), pytest.approx(17, 0.1))

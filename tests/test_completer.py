@@ -14,20 +14,26 @@ from gscompleter import (
     load_ply,
     load_renderer,
 )
+from gscompleter.apps.report.completion import (
+    Target,
+    render_before_after,
+    render_context_views,
+    write_report,
+)
 from gscompleter.completer import STAGES
 from gscompleter.config import PsnrGuardConfig
-from gscompleter.generators import Synthesis
+from gscompleter.evaluation.metrics.image import psnr
+from gscompleter.generators import GeneratorOutput
 from gscompleter.geometry import project
-from gscompleter.metrics.image import psnr
-from gscompleter.render.antialiasing import in_mode_of
+from gscompleter.guards.free_space import respect_free_space
+from gscompleter.guards.psnr import is_mostly_faded
+from gscompleter.render.antialiasing import adapt_to_mode
 from gscompleter.render.cpu import CpuRenderer
-from gscompleter.reports.completion import Target, at_photographs, compare, write_report
-from gscompleter.stages.anchor import lift
-from gscompleter.stages.free_space import respect_free_space
-from gscompleter.stages.harm import is_undone
-from gscompleter.stages.integration import hole_mask
-from gscompleter.stages.registration import apply_affine
-from gscompleter.types import Camera, Completion, Gaussians, View, merge
+from gscompleter.stages.filter_holes import compute_hole_mask
+from gscompleter.stages.select_anchor import lift
+from gscompleter.stages.slide_along_rays import apply_affine
+from gscompleter.state import Completion
+from gscompleter.types import Camera, Gaussians, View, merge
 from parity import assert_close
 from scenes import Room, camera_at, gaussians_of, reconstruction_of, scaled, view_of
 
@@ -90,7 +96,7 @@ class KnowingTogether(KnowingGenerator):
     def synthesize(self, requests):
         self.calls.append(list(requests))
         notes = (f"One of {len(requests)}.",)
-        return [Synthesis(self(r.nearest, r.target, r.context), notes) for r in requests]
+        return [GeneratorOutput(self(r.nearest, r.target, r.context), notes) for r in requests]
 
 
 def knowing(config: CompleterConfig = CompleterConfig(), unit: float = 1.0) -> GSCompleter:
@@ -120,7 +126,7 @@ def test_the_hole_closes_and_the_picture_gets_better(config):
     (result,) = completed(config).targets
     truth = view_of(Room(), target).image
     assert result.hole_fraction > 0.1
-    assert hole_mask(result.after.alpha).float().mean() < 0.2 * result.hole_fraction
+    assert compute_hole_mask(result.after.alpha).float().mean() < 0.2 * result.hole_fraction
     assert psnr(result.after.image, truth) > psnr(result.before.image, truth) + 3
 
 
@@ -189,15 +195,15 @@ def test_several_targets_are_completed_one_after_the_other_into_one_scene():
 def test_a_target_is_widened_only_where_a_hole_reaches_its_edge():
     """A hole that is enclosed by the image needs no padding."""
     completer, (_, target) = knowing(), cameras()
-    wide = completer.window(completer.begin(photographs()), target).wide
+    wide = completer.pad_target(completer.begin(photographs()), target).padded
     whole = gaussians_of(view_of(Room(), wide))
     x, y = project(whole.means, target)[0].unbind(-1)
     nothing_there = {"middle": ((x - 32).abs() < 8) & ((y - 32).abs() < 8), "edge": x < 8}
     for where, side in {"middle": SIZE, "edge": wide.width}.items():
         completion = completer.begin(photographs(), whole[~nothing_there[where]])
-        assert completer.sight(completion, target).window.wide.width == side
-        given = completer.sight(completion, target, wide)  # padding of a given image
-        assert given.window.wide.width == wide.width
+        assert completer.observe(completion, target).camera.padded.width == side
+        given = completer.observe(completion, target, wide)  # padding of a given image
+        assert given.camera.padded.width == wide.width
         assert completer.advance(completion, target).targets[0].after.image.shape[0] == SIZE
 
 
@@ -220,8 +226,8 @@ def test_targets_are_synthesized_together_where_the_generator_can():
         for request in calls:
             nearest, wide, context = request.nearest, request.target, request.context
             assert nearest is context.views[1]
-            assert_close(context.at_target.alpha, renderer.render(scene, wide).alpha, "alpha")
-            for view, seen in zip(context.views, context.at_views, strict=True):
+            assert_close(context.target_render.alpha, renderer.render(scene, wide).alpha, "alpha")
+            for view, seen in zip(context.views, context.view_renders, strict=True):
                 assert_close(seen.alpha, renderer.render(scene, view.camera).alpha, "alpha")
     assert [result.notes[:1] for result in together.targets] == [
         ("One of 1.",),
@@ -342,11 +348,11 @@ def test_a_report_draws_no_photograph_again():
     done = completer(photographs(), cameras()[1])
     assert len(done.added) > 0
     renderer.frozen.clear()
-    found = at_photographs(done, completer)
+    found = render_context_views(done, completer)
     assert renderer.frozen == []
     for images, view in zip(found, done.views, strict=True):
-        drawn = compare(done, view.camera, view, CpuRenderer())
-        assert images.truth is drawn.truth
+        drawn = render_before_after(done, view.camera, view, CpuRenderer())
+        assert images.photograph is drawn.photograph
         for seen, again in ((images.before, drawn.before), (images.after, drawn.after)):
             assert torch.equal(seen.image, again.image)
             assert torch.equal(seen.alpha, again.alpha)
@@ -391,7 +397,7 @@ def test_a_generator_that_takes_no_margin_is_asked_for_the_target_itself():
 def test_the_reference_is_the_one_that_a_step_takes():
     views, (_, target) = photographs(), cameras()
     begun = knowing().begin(views)
-    reference = knowing().reference(begun, target)
+    reference = knowing().synthesize_reference(begun, target)
     taken = knowing().advance(begun, target).targets[0].reference
     assert torch.equal(reference.image, taken.image)
 
@@ -402,7 +408,7 @@ class Mistaken(KnowingTogether):
     def synthesize(self, requests):
         said = "It is another room."
         return [
-            Synthesis(1 - answer.image, (said,), disagrees=True)
+            GeneratorOutput(1 - answer.image, (said,), is_inconsistent=True)
             for answer in super().synthesize(requests)
         ]
 
@@ -439,7 +445,7 @@ def test_depths_that_the_scene_contradicts_are_reported_and_not_added(tmp_path):
     refused = completer(context, target)
     (result,) = refused.targets
     assert len(refused.added) == len(result.added) == 0
-    assert result.affine.refuted
+    assert result.affine.is_rejected
     assert result.losses == {}
     assert torch.equal(result.after.image, result.before.image)
     summary = write_report(tmp_path, refused, [Target(target)], completer, {})
@@ -458,23 +464,23 @@ def test_a_scene_that_is_doubted_refutes_nothing():
     scene = completer.begin(context).context
     for witnesses, refuted in ((None, True), ([], False)):
         (result,) = completer(context, target, scene, witnesses).targets
-        assert result.affine.refuted == refuted
+        assert result.affine.is_rejected == refuted
         assert result.affine.agreement < 0.1
 
 
 def test_depths_that_are_a_little_wrong_are_mended_and_added():
     (result,) = completed(CompleterConfig()).targets
-    assert not result.affine.refuted
+    assert not result.affine.is_rejected
     assert result.affine.agreement > 0.5
     assert len(result.added) > 0
 
 
 def test_what_photographs_make_fade_is_not_added():
     added = gaussians_of(photographs()[0]).opacities
-    assert is_undone(added, 0.2 * added)
-    assert not is_undone(added, 0.3 * added)
-    assert not is_undone(added[:0], added[:0])
-    assert not is_undone(added, 0.0 * added, PsnrGuardConfig(max_opacity_loss=None))
+    assert is_mostly_faded(added, 0.2 * added)
+    assert not is_mostly_faded(added, 0.3 * added)
+    assert not is_mostly_faded(added[:0], added[:0])
+    assert not is_mostly_faded(added, 0.0 * added, PsnrGuardConfig(max_opacity_loss=None))
 
 
 def test_nothing_is_added_before_what_an_earlier_target_sees(monkeypatch):
@@ -495,7 +501,7 @@ def test_nothing_is_added_before_what_an_earlier_target_sees(monkeypatch):
 def antialiased_room() -> Gaussians:
     """Reconstruct the photographs as Gaussians for antialiased rendering."""
     mode = replace(gaussians_of(photographs()[0])[:0], is_antialiased=True)
-    return merge([in_mode_of(mode, gaussians_of(v), v.camera) for v in photographs()])
+    return merge([adapt_to_mode(mode, gaussians_of(v), v.camera) for v in photographs()])
 
 
 def test_what_was_made_for_classic_rendering_covers_as_much_antialiased():
@@ -505,15 +511,15 @@ def test_what_was_made_for_classic_rendering_covers_as_much_antialiased():
     for factor, most in ((0.1, 0.2), (1.0, 0.7), (5.0, 0.98)):
         sized = replace(made, scales=factor * made.scales)
         marked = replace(sized, is_antialiased=True)
-        same = in_mode_of(marked[:0], sized, view.camera)
+        same = adapt_to_mode(marked[:0], sized, view.camera)
         truth, ours, less = (
             renderer.render(gaussians, view.camera).alpha.sum()
             for gaussians in (sized, same, marked)
         )
         assert less < most * truth
         assert ours == pytest.approx(truth.item(), rel=0.05)
-        assert in_mode_of(sized[:0], sized, view.camera) is sized
-        assert in_mode_of(marked[:0], marked, view.camera) is marked
+        assert adapt_to_mode(sized[:0], sized, view.camera) is sized
+        assert adapt_to_mode(marked[:0], marked, view.camera) is marked
 
 
 @pytest.mark.parametrize("doubted", [False, True])
@@ -553,10 +559,10 @@ def test_a_target_that_sees_nothing_of_the_scene_is_refused(target, config):
         completer(views, target)
     done = completer(views, [target, beside])
     refused, completed = done.targets
-    assert refused.notes == (refused.refused,)
-    assert "at least 2% are needed" in refused.refused
+    assert refused.notes == (refused.refusal,)
+    assert "at least 2% are needed" in refused.refusal
     assert len(refused.added) == 0
-    assert completed.refused is None
+    assert completed.refusal is None
     assert len(completed.added) > 0
 
 

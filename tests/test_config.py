@@ -11,11 +11,11 @@ from gscompleter.config import (
     CompleterConfig,
     HoleConfig,
     RefineConfig,
+    get_named_config,
     load_config,
-    named_config,
 )
 from gscompleter.config.renamed import RENAMED
-from gscompleter.config.settings import checked
+from gscompleter.config.settings import validate
 from gscompleter.errors import InputError
 
 
@@ -28,7 +28,7 @@ def test_the_papers_numbers():
     assert (paper.registration.lr_unit, paper.registration.footprint) == ("scene", "fixed")
     assert not paper.registration.mask_occluded
     assert (paper.holes.max_alpha, paper.holes.dilation) == (0.5, 0)
-    assert named_config("paper/dilation").holes.dilation == 3
+    assert get_named_config("paper/dilation").holes.dilation == 3
     assert (paper.refine.iterations, paper.refine.learning_rate) == (30, 0.08)
     assert (paper.refine.target_weight, paper.refine.num_views) == (0.1, 2)
     assert paper.psnr_guard.max_drop is None
@@ -40,11 +40,11 @@ def test_the_papers_numbers():
 
 @pytest.mark.parametrize("name", [n for n in ABLATIONS if n not in ("no-dilation", "theta-45")])
 def test_every_ablation_changes_something_of_the_paper(name):
-    assert named_config(f"paper/{name}") != CompleterConfig.paper()
+    assert get_named_config(f"paper/{name}") != CompleterConfig.paper()
 
 
 def test_without_anything_is_without_each():
-    config = named_config("none")
+    config = get_named_config("none")
     assert config.anchor.selection == "nearest"
     assert config.alignment.align_at == "none"
     assert config.registration.iterations == 0
@@ -162,7 +162,7 @@ def test_bytes_that_are_no_text_are_refused(tmp_path):
 
 @pytest.mark.parametrize("name", ["default", "paper", *ABLATIONS])
 def test_every_named_config_is_within_its_ranges(name):
-    assert checked(named_config(name)) == named_config(name)
+    assert validate(get_named_config(name)) == get_named_config(name)
 
 
 @pytest.mark.parametrize(
@@ -174,7 +174,7 @@ def test_every_named_config_is_within_its_ranges(name):
 )
 def test_python_is_checked_alike_and_the_argument_is_named(config, name):
     with pytest.raises(InputError, match=name) as told:
-        checked(config, "config.")
+        validate(config, "config.")
     assert told.value.argument == f"config.{name}"
 
 

@@ -9,9 +9,9 @@ import torch
 from jaxtyping import TypeCheckError
 
 import gscompleter
-from gscompleter.baselines.optimization import ssim_map
-from gscompleter.geometry import rotations_from
-from gscompleter.metrics.image import psnr
+from gscompleter.evaluation.baselines.optimization import ssim_map
+from gscompleter.evaluation.metrics.image import psnr
+from gscompleter.geometry import quats_to_rotations
 
 MODULES = [
     module.name
@@ -29,7 +29,7 @@ def test_every_module_but_the_compiled_ones_is_loaded_by_the_hook():
 
 @pytest.mark.parametrize(
     ("function", "shapes"),
-    [(rotations_from, [(5, 3)]), (psnr, [(4, 4)] * 2), (ssim_map, [(4, 4, 3), (4, 5, 3)])],
+    [(quats_to_rotations, [(5, 3)]), (psnr, [(4, 4)] * 2), (ssim_map, [(4, 4, 3), (4, 5, 3)])],
 )
 def test_a_wrong_shape_is_refused(function, shapes):
     with pytest.raises(TypeCheckError):

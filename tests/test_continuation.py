@@ -4,8 +4,8 @@ import cv2
 import numpy as np
 import pytest
 
-from gscompleter.generators.smooth import sum_pyramid
-from gscompleter.kernels.continuation import LEAST_WEIGHT, means, pyramid_of
+from gscompleter.generators.smooth import build_sum_pyramid
+from gscompleter.kernels.pyramid_fill import MIN_LEVEL_WEIGHT, build_pyramid, compute_means
 
 
 def whole_images(levels):
@@ -17,7 +17,7 @@ def whole_images(levels):
         planes = [cv2.resize(plane, (w, h)) for plane in np.moveaxis(level, -1, 0)]
         sums = np.stack(planes, axis=-1)
         own = sums[..., :-1] / np.maximum(sums[..., -1:], 1e-12)
-        wider = np.where(sums[..., -1:] > LEAST_WEIGHT, own, wider)
+        wider = np.where(sums[..., -1:] > MIN_LEVEL_WEIGHT, own, wider)
         found.append(wider)
     return np.stack(found[::-1])
 
@@ -30,7 +30,7 @@ def test_means_at_pixels_are_those_of_whole_images(size, channels):
     weight[:4, :3] = 1
     values = rng.random((*size, channels), np.float32)
     weighted = np.concatenate([values * weight[..., None], weight[..., None]], axis=-1)
-    levels = sum_pyramid(weighted)
+    levels = build_sum_pyramid(weighted)
     pixels = np.argwhere(weight >= 0)
     level = rng.uniform(0, len(levels) - 1, len(pixels))
     below = level.astype(int)
@@ -38,6 +38,6 @@ def test_means_at_pixels_are_those_of_whole_images(size, channels):
     plain = whole_images(levels)
     rows, columns = pixels.T
     expected = (1 - share) * plain[below, rows, columns] + share * plain[above, rows, columns]
-    found = means(pyramid_of(levels), pixels, level)
+    found = compute_means(build_pyramid(levels), pixels, level)
     assert np.abs(found - expected).max() < 1e-5
     assert np.ptp(expected) > 0.01

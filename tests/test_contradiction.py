@@ -9,8 +9,9 @@ from torch import Tensor
 from gscompleter import GSCompleter
 from gscompleter.config import CompleterConfig, DynamicMasksConfig
 from gscompleter.geometry import project, sample, unproject
-from gscompleter.stages.contradiction import contradicted
-from gscompleter.types import Camera, Completion, Render, TargetCompletion, View
+from gscompleter.guards.dynamic_masks import find_dynamic_masks
+from gscompleter.state import Completion, TargetResult
+from gscompleter.types import Camera, Render, View
 from scenes import Room, camera_at, cast, texture, view_of
 
 SIZE = 96
@@ -66,8 +67,8 @@ def test_what_moved_is_found_in_both_photographs():
     views, reds = photographed()
     begun = beginning(0.12)
     for k, (view, red) in enumerate(zip(begun.views, reds, strict=True)):
-        assert view.contradicted is not None
-        found, other = view.contradicted, 1 - k
+        assert view.dynamic_mask is not None
+        found, other = view.dynamic_mask, 1 - k
         here = red | carried(reds[other], CAMERAS[other], views[k])
         assert (found & red).sum() >= 0.8 * red.sum()
         assert (found & here).sum() >= 0.8 * here.sum()
@@ -77,14 +78,14 @@ def test_what_moved_is_found_in_both_photographs():
 def test_a_room_in_which_nothing_moved_is_trusted():
     cameras = (camera_at(-0.1, size=SIZE), camera_at(0.2, size=SIZE))
     begun = GSCompleter().begin([view_of(Room(), camera) for camera in cameras])
-    assert all((~view.trusted).float().mean() <= 0.005 for view in begun.views)
+    assert all((~view.static_mask).float().mean() <= 0.005 for view in begun.views)
 
 
 def test_exposure_is_no_contradiction():
     views = [view_of(ROOM, camera) for camera in CAMERAS]
     darker = View(0.6 * views[1].image, CAMERAS[1], depth=views[1].depth)
     pair = [views[0], darker]
-    assert not any(mask.any() for mask in contradicted(pair, as_seen(pair)))
+    assert not any(mask.any() for mask in find_dynamic_masks(pair, as_seen(pair)))
 
 
 def test_of_three_photographs_most_decide():
@@ -92,17 +93,17 @@ def test_of_three_photographs_most_decide():
     third = camera_at(-0.3, -0.15, size=SIZE)
     red_view, red = with_something_red(CAMERAS[0], PLACES[0])
     views = [red_view, view_of(ROOM, CAMERAS[1]), view_of(ROOM, third)]
-    first, second, last = contradicted(views, as_seen(views))
+    first, second, last = find_dynamic_masks(views, as_seen(views))
     assert (first & red).sum() >= 0.8 * red.sum()
     for mask, view in zip((second, last), views[1:], strict=True):
         behind = carried(red, CAMERAS[0], view)
         assert (mask & behind).sum() <= 0.2 * behind.sum()
-    both = contradicted(views[:2], as_seen(views[:2]))
+    both = find_dynamic_masks(views[:2], as_seen(views[:2]))
     behind = carried(red, CAMERAS[0], views[1])
     assert (both[1] & behind).sum() >= 0.8 * behind.sum()
 
 
-def completed(min_difference: float | None) -> TargetCompletion:
+def completed(min_difference: float | None) -> TargetResult:
     """Complete a hole behind an occluder, next to something red, from farther to the left."""
     target, begun = camera_at(-0.4, -0.1, size=SIZE), beginning(min_difference)
     return GSCompleter().advance(begun, target).targets[0]
@@ -114,7 +115,7 @@ def test_holes_are_not_painted_with_what_moved():
     assert credulous.reference is not None
     truth = is_red(cast(ROOM, wary.target)[0])
 
-    def reds(result: TargetCompletion, image: Float[Tensor, "h w 3"]) -> float:
+    def reds(result: TargetResult, image: Float[Tensor, "h w 3"]) -> float:
         return (is_red(image) & ~truth)[result.hole_mask].float().mean().item()
 
     assert reds(credulous, credulous.reference.image) > 0.1
@@ -128,5 +129,5 @@ def test_the_context_stays_as_it_is():
     assert torch.equal(with_check.context.means, without.context.means)
     assert torch.equal(with_check.context.sh, without.context.sh)
     assert [b.limit for b in with_check.budgets[0]] == [b.limit for b in without.budgets[0]]
-    assert all(view.contradicted is None for view in without.views)
+    assert all(view.dynamic_mask is None for view in without.views)
     assert CompleterConfig.paper().dynamic_masks.min_color_difference is None

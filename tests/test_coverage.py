@@ -7,10 +7,10 @@ import torch
 
 from gscompleter import CompleterConfig, GSCompleter, load_renderer
 from gscompleter.config import FreeSpaceConfig, HoleConfig, RegistrationConfig
-from gscompleter.coverage import COVERED
+from gscompleter.config.coverage import COVERED
 from gscompleter.generators.warp import warp_photographs
 from gscompleter.geometry import project
-from gscompleter.stages.registration import register
+from gscompleter.stages.slide_along_rays import register
 from gscompleter.types import DepthMap, Gaussians, Lift, Reconstruction, Render, merge
 from scenes import Room, camera_at, gaussians_of, view_of
 

@@ -24,9 +24,9 @@ from depth_anything_fixtures import (
 from feed_forward_fixtures import Case, extra
 from gscompleter import GSCompleter, InputError
 from gscompleter.config import CompleterConfig, HoleConfig
-from gscompleter.geometry import project, rotation_about, rotations_from, unproject
-from gscompleter.reconstructors import depth_anything, load_reconstructor
-from gscompleter.reconstructors.depth_anything import (
+from gscompleter.geometry import axis_angle_to_matrix, project, quats_to_rotations, unproject
+from gscompleter.models import depth_anything
+from gscompleter.models.depth_anything import (
     VARIANTS,
     AnyViewDepth,
     AnyViewGaussians,
@@ -38,28 +38,26 @@ from gscompleter.reconstructors.depth_anything import (
     MetricViewDepth,
     NestedConfig,
     NestedDepthAnything,
-    Sizing,
+    ResizeConfig,
 )
-from gscompleter.reconstructors.depth_anything.alignment import (
-    similarity_between,
-    similarity_of_most,
+from gscompleter.models.depth_anything.alignment import fit_center_similarity, fit_robust_similarity
+from gscompleter.models.depth_anything.config import VitConfig
+from gscompleter.models.depth_anything.harmonics import rotate_3dgs_sh
+from gscompleter.models.depth_anything.images import normalize_colors
+from gscompleter.models.depth_anything.inputs import Window, create_any_view_batch, crop_to_patches
+from gscompleter.models.depth_anything.metric import MetricDepth
+from gscompleter.models.depth_anything.network import Prediction
+from gscompleter.models.depth_anything.normalisation import (
+    compute_authors_units,
+    compute_scene_units,
+    normalize_poses,
 )
-from gscompleter.reconstructors.depth_anything.config import VitConfig
-from gscompleter.reconstructors.depth_anything.harmonics import turned_harmonics
-from gscompleter.reconstructors.depth_anything.images import normalised_images
-from gscompleter.reconstructors.depth_anything.inputs import Window, batch_of, seen_of
-from gscompleter.reconstructors.depth_anything.metric import MetricDepth
-from gscompleter.reconstructors.depth_anything.network import Prediction
-from gscompleter.reconstructors.depth_anything.normalisation import (
-    authors_units,
-    scene_units,
-    seen_from_first,
-)
-from gscompleter.reconstructors.depth_anything.poses import Poses, decoded, encoded
-from gscompleter.reconstructors.depth_anything.reconstructor import in_world
-from gscompleter.reconstructors.feed_forward.build import around, network_with
+from gscompleter.models.depth_anything.poses import Poses, decode_poses, encode_poses
+from gscompleter.models.depth_anything.reconstructor import move_to_given_frame
+from gscompleter.models.feed_forward.build import create_depth_anything, wrap_network
+from gscompleter.reconstructors import load_reconstructor
 from gscompleter.reconstructors.from_depth import FromDepth
-from gscompleter.render.spherical_harmonics import sh_basis
+from gscompleter.render.spherical_harmonics import evaluate_sh_basis
 from gscompleter.types import View
 from parity import assert_within, relative_error
 from scenes import Room, camera_at, view_of
@@ -155,7 +153,9 @@ def test_weights_are_named_and_shaped_as_in_more_lists(path):
 def check_names(path: Path) -> None:
     name = path.stem.removeprefix("keys-")
     with torch.device("meta"):
-        network = network_with(VARIANTS[OFFICIAL[name]] if name in OFFICIAL else STAND_INS[name])
+        network = create_depth_anything(
+            VARIANTS[OFFICIAL[name]] if name in OFFICIAL else STAND_INS[name]
+        )
     ours = {key: tuple(value.shape) for key, value in network.state_dict().items()}
     assert ours == shapes_in(path)
 
@@ -167,18 +167,18 @@ def test_cameras_are_normalised_and_aligned_as_by_the_authors(path):
     assert counts
     for count in counts:
         given = Poses(case.tensor(f"in_c2w_{count}")[None], torch.eye(3).repeat(1, count, 1, 1))
-        normalized = seen_from_first(given, authors_units(given.centers))
+        normalized = normalize_poses(given, compute_authors_units(given.centers))
         expected = case.tensor(f"out_ext_norm_{count}")
         assert relative_error(normalized.w2c[0], expected) < BOUND
         w2c = case.tensor(f"in_pred_w2c_{count}").double()
         found = (-w2c[:, :, :3].transpose(1, 2) @ w2c[:, :, 3:])[..., 0].numpy()
         if f"out_align_s_{count}" not in case.values:
             continue
-        ours = similarity_of_most(given.centers[0].double().numpy(), found)
+        ours = fit_robust_similarity(given.centers[0].double().numpy(), found)
         for name, value in (("r", ours.rotation), ("t", ours.shift), ("s", ours.scale)):
             theirs = case.tensor(f"out_align_{name}_{count}")
             assert relative_error(torch.as_tensor(value, dtype=torch.float64), theirs) < BOUND, name
-        scale = similarity_between(found, normalized.centers[0].double().numpy()).scale
+        scale = fit_center_similarity(found, normalized.centers[0].double().numpy()).scale
         assert scale == pytest.approx(float(case.values[f"out_pose_scale_{count}"]), rel=BOUND)
 
 
@@ -189,7 +189,7 @@ def check_world(path: Path) -> None:
     given = Poses(case.tensor("in_c2w"), case.tensor("in_intrinsics_px"))
     with torch.no_grad():
         predicted = network_for(path.stem.split("_")[0])(images, poses)
-    errors = gaussian_errors(in_world(predicted, given), case, "out_world_")
+    errors = gaussian_errors(move_to_given_frame(predicted, given), case, "out_world_")
     rotations = errors.pop("out_world_rotations")
     assert rotations < ROTATIONS
     assert len(errors) >= 2
@@ -219,18 +219,21 @@ def check_images(path: Path) -> None:
     for number in numbers:
         bound, fit = str(case.values[f"in_method_{number}"]).split("_bound_")
         side, fit = {"upper": "longer", "lower": "shorter"}[bound], {"resize": "resized"}.get(fit)
-        sizing = Sizing(int(case.values[f"in_res_{number}"]), side, fit or "cropped")
+        sizing = ResizeConfig(int(case.values[f"in_res_{number}"]), side, fit or "cropped")
         image, expected = case.values[f"in_image_{number}"], case.values[f"out_image_{number}"]
-        seen, window = seen_of(image, sizing)
+        seen, window = crop_to_patches(image, sizing)
         assert seen.shape == expected.shape
         apart = np.abs(seen.astype(int) - expected)
         assert apart.max() <= 1
         assert (apart > 0).mean() < 0.02
         h, w = image.shape[:2]
         camera = replace(camera_at(), K=case.tensor(f"in_K_{number}"), width=w, height=h)
-        assert relative_error(window.intrinsics(camera), case.tensor(f"out_K_{number}")) < BOUND
+        assert (
+            relative_error(window.compute_intrinsics(camera), case.tensor(f"out_K_{number}"))
+            < BOUND
+        )
         if f"out_tensor_{number}" in case.values:
-            tensor = normalised_images(torch.from_numpy(expected[None].copy()))[..., ::3, ::3]
+            tensor = normalize_colors(torch.from_numpy(expected[None].copy()))[..., ::3, ::3]
             assert relative_error(tensor, case.tensor(f"out_tensor_{number}")) < BOUND
 
 
@@ -249,7 +252,7 @@ def test_photographs_are_resized_as_by_the_authors_in_more_cases(path):
 def turned_cameras(count: int = 3) -> Poses:
     generator = torch.Generator().manual_seed(0)
     c2w = torch.eye(4).repeat(1, count, 1, 1)
-    c2w[0, :, :3, :3] = rotations_from(torch.randn(count, 4, generator=generator))
+    c2w[0, :, :3, :3] = quats_to_rotations(torch.randn(count, 4, generator=generator))
     c2w[0, :, :3, 3] = torch.randn(count, 3, generator=generator)
     K = torch.tensor([[50.0, 0.0, 42.0], [0.0, 60.0, 28.0], [0.0, 0.0, 1.0]])
     return Poses(c2w, K.repeat(1, count, 1, 1))
@@ -257,7 +260,7 @@ def turned_cameras(count: int = 3) -> Poses:
 
 def test_nine_numbers_tell_a_camera():
     poses = turned_cameras()
-    again = decoded(encoded(poses, (56, 84)), (56, 84))
+    again = decode_poses(encode_poses(poses, (56, 84)), (56, 84))
     assert relative_error(again.c2w, poses.c2w) < 1e-5
     assert relative_error(again.K, poses.K) < 1e-5
 
@@ -268,19 +271,19 @@ def test_the_network_is_told_the_same_in_any_unit(count):
     moved = poses.c2w.clone()
     moved[..., :3, 3] *= 1e-4
     small = replace(poses, c2w=moved)
-    ours = [seen_from_first(p, scene_units(p.centers)).c2w for p in (poses, small)]
+    ours = [normalize_poses(p, compute_scene_units(p.centers)).c2w for p in (poses, small)]
     assert relative_error(ours[1], ours[0]) < 1e-5
     assert (
         torch.equal(ours[0][:, 0], torch.eye(4)[None])
         or ours[0][:, 0].sub(torch.eye(4)).abs().max() < 1e-6
     )
-    theirs = [seen_from_first(p, authors_units(p.centers)).c2w for p in (poses, small)]
+    theirs = [normalize_poses(p, compute_authors_units(p.centers)).c2w for p in (poses, small)]
     assert relative_error(theirs[1], theirs[0]) > 0.1
 
 
 def test_the_unit_of_many_cameras_is_the_authors():
     centers = turned_cameras(5).centers
-    assert torch.equal(scene_units(centers), authors_units(centers))
+    assert torch.equal(compute_scene_units(centers), compute_authors_units(centers))
 
 
 def test_cameras_in_one_place_are_refused():
@@ -292,7 +295,7 @@ def test_cameras_in_one_place_are_refused():
 def test_the_scale_of_cameras_on_one_line_is_told():
     line = np.arange(4.0)[:, None] * np.array([1.0, 2.0, -1.0])
     for count in (2, 4):
-        found = similarity_between(line[:count], 3 * line[:count] + 1)
+        found = fit_center_similarity(line[:count], 3 * line[:count] + 1)
         assert found.scale == pytest.approx(3)
 
 
@@ -300,27 +303,27 @@ def test_a_minority_of_wrong_cameras_is_left_out():
     given = np.random.default_rng(0).normal(size=(12, 3))
     found = 2 * given
     found[:2] += 5
-    assert similarity_of_most(given, found).scale == pytest.approx(2)
-    assert abs(similarity_between(given, found).scale - 2) > 0.05
+    assert fit_robust_similarity(given, found).scale == pytest.approx(2)
+    assert abs(fit_center_similarity(given, found).scale - 2) > 0.05
 
 
 def test_harmonics_turn_with_what_they_colour():
     generator = torch.Generator().manual_seed(0)
     sh = torch.randn(1, 1, 1, 1, 9, 3, generator=generator)
-    turn = rotations_from(torch.randn(4, generator=generator))
+    turn = quats_to_rotations(torch.randn(4, generator=generator))
     directions = torch.nn.functional.normalize(torch.randn(20, 3, generator=generator), dim=-1)
-    turned = turned_harmonics(sh, turn[None, None])[0, 0, 0, 0]
-    before = sh_basis(directions, 9) @ sh[0, 0, 0, 0]
-    assert relative_error(sh_basis(directions @ turn.T, 9) @ turned, before) < 1e-5
+    turned = rotate_3dgs_sh(sh, turn[None, None])[0, 0, 0, 0]
+    before = evaluate_sh_basis(directions, 9) @ sh[0, 0, 0, 0]
+    assert relative_error(evaluate_sh_basis(directions @ turn.T, 9) @ turned, before) < 1e-5
 
 
 # Ψ
 
 TINY = DepthAnythingConfig(VitConfig(64, 1, 4, (0, 1, 2, 3), 1), 32, (16, 16, 16, 16))
-TINY_GAUSSIANS = replace(TINY, gaussians=True)
+TINY_GAUSSIANS = replace(TINY, has_gaussian_head=True)
 TINY_METRIC = MetricDepthConfig(VitConfig(64, 1, 4, (0, 1, 2, 3), None), 32, (16, 16, 16, 16))
 SIZE = 56
-QUICK = Inference(Sizing(SIZE))
+QUICK = Inference(ResizeConfig(SIZE))
 
 
 class Knowing(DepthAnything):
@@ -332,7 +335,7 @@ class Knowing(DepthAnything):
 
     def forward(self, images: Tensor, poses: Poses | None = None) -> Prediction:
         factor = 7.0
-        turn = rotation_about(torch.tensor([0.0, 0.6, 0.8]), 0.3)
+        turn = axis_angle_to_matrix(torch.tensor([0.0, 0.6, 0.8]), 0.3)
         c2w = poses.c2w.clone()
         if self.raw is None:
             c2w[..., :3, :] = turn @ c2w[..., :3, :]
@@ -340,7 +343,9 @@ class Knowing(DepthAnything):
         unit = (poses.centers[0, 1] - poses.centers[0, 0]).norm()
         depth = factor * unit * self.depth[None]
         predicted = Poses(c2w, poses.K)
-        return Prediction(depth, 1 + self.depth[None], encoded(poses, (1, 1)), predicted, self.raw)
+        return Prediction(
+            depth, 1 + self.depth[None], encode_poses(poses, (1, 1)), predicted, self.raw
+        )
 
 
 def photographs(unit: float = 1.0, size: int = SIZE) -> list[View]:
@@ -447,7 +452,7 @@ def test_metres_are_brought_to_the_unit_that_shared_features_tell():
     metres = torch.stack([view.depth for view in views]) / 3.7
     network = KnowingMetric(metres, float(views[0].camera.K[0, 0]))
     for found, view in zip(
-        MetricViewDepth(network, Inference(Sizing(size)))(views), views, strict=True
+        MetricViewDepth(network, Inference(ResizeConfig(size)))(views), views, strict=True
     ):
         ratio = found.depth[4:] / view.depth[4:]
         assert torch.allclose(ratio, torch.ones(()), rtol=0.05)
@@ -466,14 +471,14 @@ def test_photographs_without_features_tell_no_metre():
 def test_maps_of_a_resized_window_are_read_where_their_pixels_lie():
     """The inverse depth of a plane is linear in the pixel, so that nothing is lost."""
     camera = replace(camera_at(size=60), height=40)
-    window = Window(top=3, left=5, height=70, width=80, across=1.5, down=2.0)
+    window = Window(top=3, left=5, height=70, width=80, scale_x=1.5, scale_y=2.0)
 
     def plane(x: Tensor, y: Tensor) -> Tensor:
         return 1 / (0.2 + 0.001 * x + 0.003 * y)
 
     x, y = torch.arange(80) + 0.5 + 5, torch.arange(70) + 0.5 + 3
     depth = plane(x / 1.5, y[:, None] / 2.0)
-    found = window.depth_map(depth, torch.full_like(depth, 0.8), camera)
+    found = window.resample_depth_map(depth, torch.full_like(depth, 0.8), camera)
     assert found.depth.shape == (40, 60)
     u, v = torch.arange(60) + 0.5, torch.arange(40) + 0.5
     inside = (u * 1.5 >= 5) & (u * 1.5 <= 85) & (v[:, None] * 2 >= 3) & (v[:, None] * 2 <= 73)
@@ -485,8 +490,8 @@ def test_maps_of_a_resized_window_are_read_where_their_pixels_lie():
 
 def test_each_pixel_of_the_window_belongs_to_the_pixel_it_lies_in():
     views = photographs(size=40)
-    (image,) = batch_of(views[:1], Sizing(56), 1).windows
-    numbers = image.pixel_index(views[0].camera).view(56, 56)
+    (image,) = create_any_view_batch(views[:1], ResizeConfig(56), 1).windows
+    numbers = image.compute_pixel_indices(views[0].camera).view(56, 56)
     assert numbers[0, 0] == 0
     assert numbers[55, 55] == 40 * 40 - 1
     assert numbers[28, 14] == 20 * 40 + 10
@@ -495,11 +500,11 @@ def test_each_pixel_of_the_window_belongs_to_the_pixel_it_lies_in():
 @cache
 def random(config: DepthAnythingConfig | MetricDepthConfig | NestedConfig):
     torch.manual_seed(0)
-    return network_with(config).eval().requires_grad_(False)
+    return create_depth_anything(config).eval().requires_grad_(False)
 
 
 def psi_of(config: DepthAnythingConfig | NestedConfig) -> FromDepth | AnyViewGaussians:
-    if isinstance(config, DepthAnythingConfig) and not config.gaussians:
+    if isinstance(config, DepthAnythingConfig) and not config.has_gaussian_head:
         return FromDepth(model=AnyViewDepth(random(config), QUICK))
     return AnyViewGaussians(random(config), QUICK)
 
@@ -532,8 +537,8 @@ def test_the_same_views_give_the_same_bytes():
 @pytest.mark.parametrize("config", [TINY_GAUSSIANS, TINY_METRIC], ids=["gaussians", "metric"])
 def test_heads_and_geometry_stay_exact_where_the_transformer_runs_in_lower_precision(config):
     """On a CPU, where this can be tried."""
-    batch = batch_of(photographs(), QUICK.sizing, 2)
-    poses = seen_from_first(batch.poses, scene_units(batch.poses.centers))
+    batch = create_any_view_batch(photographs(), QUICK.sizing, 2)
+    poses = normalize_poses(batch.poses, compute_scene_units(batch.poses.centers))
     given = (batch.images,) if config is TINY_METRIC else (batch.images, poses)
     found = []
     for lower in (False, True):
@@ -547,19 +552,19 @@ def test_heads_and_geometry_stay_exact_where_the_transformer_runs_in_lower_preci
 
 
 def test_each_kind_of_network_becomes_its_own_reconstructor():
-    assert isinstance(around(random(TINY)).model, AnyViewDepth)
-    assert isinstance(around(random(TINY_METRIC)).model, MetricViewDepth)
-    assert isinstance(around(random(TINY_GAUSSIANS)), AnyViewGaussians)
+    assert isinstance(wrap_network(random(TINY)).model, AnyViewDepth)
+    assert isinstance(wrap_network(random(TINY_METRIC)).model, MetricViewDepth)
+    assert isinstance(wrap_network(random(TINY_GAUSSIANS)), AnyViewGaussians)
     nested = random(NestedConfig(TINY_GAUSSIANS, TINY_METRIC))
     assert isinstance(nested, NestedDepthAnything)
-    assert isinstance(around(nested), AnyViewGaussians)
+    assert isinstance(wrap_network(nested), AnyViewGaussians)
 
 
 def test_wrong_views_and_precisions_are_refused_with_a_sentence():
     with pytest.raises(InputError, match="1 view was given, and the model matches at least 2"):
         AnyViewDepth(random(TINY), QUICK)(photographs()[:1])
     with pytest.raises(InputError, match="cpu and torch.bfloat16 needs a GPU"):
-        around(random(TINY), torch.bfloat16)
+        wrap_network(random(TINY), torch.bfloat16)
 
 
 def test_a_file_as_published_fills_the_network(tmp_path, monkeypatch):

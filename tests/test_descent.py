@@ -2,7 +2,7 @@
 
 import torch
 
-from gscompleter.descent import Adam
+from gscompleter.optim import Adam
 
 
 def slope_of(x: torch.Tensor, y: torch.Tensor) -> torch.Tensor:

@@ -10,36 +10,40 @@ import torch
 
 from elsewhere import DEVICE, Elsewhere, MixedError, There, without_autocast
 from gscompleter import GSCompleter, load_reconstructor, load_renderer
-from gscompleter.baselines.optimization import OptimizationConfig, optimize
-from gscompleter.baselines.reggs import RegGSConfig, register_by_similarity
 from gscompleter.config import CompleterConfig
-from gscompleter.generators.agreement import compare
-from gscompleter.generators.diffusion.position_ids import source_ids
-from gscompleter.generators.diffusion.source_depth import context_depth, from_disparity, rescaled
-from gscompleter.metrics.scores import Truth, score
-from gscompleter.reconstructors import Reconstructor, reconstructed, tensors_in
-from gscompleter.reconstructors.depth_anything import (
+from gscompleter.evaluation.baselines.optimization import OptimizationConfig, optimize
+from gscompleter.evaluation.baselines.reggs import RegGSConfig, register_by_similarity
+from gscompleter.evaluation.metrics.scores import Truth, score
+from gscompleter.generators.agreement import compare_with_observed
+from gscompleter.models.depth_anything import (
     AnyViewDepth,
     AnyViewGaussians,
     DepthAnything,
     DepthAnythingConfig,
     Inference,
-    Sizing,
+    ResizeConfig,
 )
-from gscompleter.reconstructors.depth_anything.config import VitConfig
-from gscompleter.reconstructors.feed_forward import (
+from gscompleter.models.depth_anything.config import VitConfig
+from gscompleter.models.diffusion.position_ids import compute_source_ids
+from gscompleter.models.diffusion.source_depth import (
+    compute_context_depth,
+    convert_disparity,
+    rescale_depth,
+)
+from gscompleter.models.feed_forward import (
     DepthSplat,
     FeedForward,
     MVSplat,
     VolSplat,
     VolSplatConfig,
 )
-from gscompleter.reconstructors.feed_forward.depth_predictor import DepthConfig
-from gscompleter.reconstructors.feed_forward.depthsplat import VARIANTS
+from gscompleter.models.feed_forward.depth_predictor import DepthConfig
+from gscompleter.models.feed_forward.depthsplat import VARIANTS
+from gscompleter.reconstructors import Reconstructor, iterate_tensors, run_reconstructor
 from gscompleter.reconstructors.from_depth import FromDepth
-from gscompleter.stages.anchor import lift
-from gscompleter.stages.context import depth_range_of_scene, init_context
-from gscompleter.stages.integration import keep_in_holes
+from gscompleter.stages.context import init_context, measure_depth_range
+from gscompleter.stages.filter_holes import filter_holes
+from gscompleter.stages.select_anchor import lift
 from gscompleter.types import Lift, Reconstruction, View
 from scenes import Room, camera_at, gaussians_of, view_of
 
@@ -64,7 +68,7 @@ def views(elsewhere) -> list[View]:
 
 def check_there(value: object) -> None:
     """Check that a frozen value has tensors, all of them elsewhere."""
-    found = dict(tensors_in(value, "it"))
+    found = dict(iterate_tensors(value, "it"))
     assert found
     assert [name for name, tensor in found.items() if not isinstance(tensor, There)] == []
 
@@ -97,11 +101,12 @@ def test_networks_reconstruct_where_the_views_lie_and_run_where_they_lie_themsel
     pair = [view_of(Room(), camera_at(x, size=64), i) for i, x in enumerate((-0.3, 0.1))]
     network.requires_grad_(False)
     there = [view.to(DEVICE) for view in pair]
-    check_there(reconstructed(FeedForward(network), there))
+    check_there(run_reconstructor(FeedForward(network), there))
     moved = FeedForward(network.to(DEVICE))
     check_there(lift(moved, *there))
     assert not any(
-        isinstance(tensor, There) for _, tensor in tensors_in(reconstructed(moved, pair), "it")
+        isinstance(tensor, There)
+        for _, tensor in iterate_tensors(run_reconstructor(moved, pair), "it")
     )
 
 
@@ -115,22 +120,23 @@ def test_depth_anything_reconstructs_where_the_views_lie(elsewhere, gaussians):
     there = [view.to(DEVICE) for view in pair]
 
     def psi() -> Reconstructor:
-        inference = Inference(Sizing(56))
+        inference = Inference(ResizeConfig(56))
         if gaussians:
             return AnyViewGaussians(network, inference)
         return FromDepth(model=AnyViewDepth(network, inference))
 
-    check_there(reconstructed(psi(), there))
+    check_there(run_reconstructor(psi(), there))
     network.to(DEVICE)
     check_there(lift(psi(), *there))
     assert not any(
-        isinstance(tensor, There) for _, tensor in tensors_in(reconstructed(psi(), pair), "it")
+        isinstance(tensor, There)
+        for _, tensor in iterate_tensors(run_reconstructor(psi(), pair), "it")
     )
 
 
 def test_a_given_scene_tells_its_depth_range_anywhere(views):
     scene = gaussians_of(VIEWS[0]).to(DEVICE)
-    near, far = depth_range_of_scene(scene, [view.camera for view in views], REFERENCE)
+    near, far = measure_depth_range(scene, [view.camera for view in views], REFERENCE)
     assert 0 < near < far
 
 
@@ -162,12 +168,12 @@ def test_scores_are_those_of_the_cpu(views):
 
 def test_what_diffusion_is_told_is_made_on_any_device(views):
     render = REFERENCE.render(gaussians_of(VIEWS[0]).to(DEVICE), views[0].camera)
-    depth = context_depth(views[0], render)
+    depth = compute_context_depth(views[0], render)
     guess = (2 / depth.clamp_min(0.1)).detach()
-    check_there((depth, rescaled(guess, render), from_disparity(guess, render)))
-    check_there(source_ids(depth, views[0].camera, TARGET.to(DEVICE), (8, 8), (8, 8)))
+    check_there((depth, rescale_depth(guess, render), convert_disparity(guess, render)))
+    check_there(compute_source_ids(depth, views[0].camera, TARGET.to(DEVICE), (8, 8), (8, 8)))
     known = render.alpha > 0.5
-    check_there(compare(views[0].image, views[1].image, known))
+    check_there(compare_with_observed(views[0].image, views[1].image, known))
 
 
 @pytest.mark.parametrize("name", ["view_index", "pixel_index", "gaussians", "depths"])
@@ -192,7 +198,7 @@ def test_a_mixture_of_devices_is_an_error_as_on_a_gpu(views):
     mask = torch.ones(SIZE, SIZE, dtype=torch.bool, device=DEVICE)
     assert isinstance(found, Lift)
     with pytest.raises(MixedError):
-        keep_in_holes(found.gaussians, found.pixel_index.cpu(), mask, views[0].camera)
+        filter_holes(found.gaussians, found.pixel_index.cpu(), mask, views[0].camera)
     there = views[0].image
     for mixed in (
         lambda: there + VIEWS[0].image,

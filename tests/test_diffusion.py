@@ -22,23 +22,23 @@ from safetensors.torch import load_file, save_file
 import tiny_diffusion
 from command import run
 from gscompleter import InputError, load_generator, load_renderer
-from gscompleter.config.generators import DiffusersInpaintSettings, PEFieldSettings, settings_class
-from gscompleter.generators import Request
-from gscompleter.generators.diffusion import pe_field
-from gscompleter.generators.diffusion.inpaint import (
-    DiffusersInpaint,
-    completed_warp,
-    load_painter,
+from gscompleter.config.generators import (
+    DiffusersInpaintSettings,
+    PEFieldSettings,
+    get_settings_class,
 )
-from gscompleter.generators.diffusion.kontext import SIZES, nearest_size
-from gscompleter.generators.diffusion.loading import PROMPT, load_kontext
-from gscompleter.generators.diffusion.pe_field import PEField, grouped
-from gscompleter.generators.diffusion.source_depth import (
+from gscompleter.generators import GeneratorRequest
+from gscompleter.models.diffusion import pe_field
+from gscompleter.models.diffusion.inpaint import DiffusersInpaint, complete_warp, load_painter
+from gscompleter.models.diffusion.kontext import SIZES, find_nearest_size
+from gscompleter.models.diffusion.loading import PROMPT, load_kontext
+from gscompleter.models.diffusion.pe_field import PEField, group_by_size
+from gscompleter.models.diffusion.source_depth import (
     MonocularDepth,
-    context_depth,
+    compute_context_depth,
     load_monocular,
 )
-from gscompleter.types import Gaussians, SceneContext, merge
+from gscompleter.types import Gaussians, GeneratorInput, merge
 from parity import assert_close
 from scenes import Room, answer, camera_at, gaussians_of, photographed, view_of
 from test_generators import TARGET, known_room
@@ -47,7 +47,7 @@ from test_source_depth import tiny_model
 SIZE = 64
 
 
-def scene_of(context: SceneContext) -> Gaussians:
+def scene_of(context: GeneratorInput) -> Gaussians:
     return merge([gaussians_of(view) for view in context.views])
 
 
@@ -68,13 +68,13 @@ def test_the_sizes_are_those_of_diffusers_and_the_nearest_aspect_wins():
 
     assert {(h, w) for w, h in PREFERRED_KONTEXT_RESOLUTIONS} == set(SIZES)
     assert len(SIZES) == 17
-    assert nearest_size(256, 256) == (1024, 1024)
-    assert nearest_size(480, 720) == (832, 1248)
-    assert nearest_size(720, 480) == (1248, 832)
+    assert find_nearest_size(256, 256) == (1024, 1024)
+    assert find_nearest_size(480, 720) == (832, 1248)
+    assert find_nearest_size(720, 480) == (1248, 832)
     for height, width in ((256, 448), (448, 256), (360, 640), (193, 640), (640, 360), (96, 100)):
         aspect = width / height
         _, w, h = min((abs(aspect - w / h), w, h) for w, h in PREFERRED_KONTEXT_RESOLUTIONS)
-        assert nearest_size(height, width) == (h, w)
+        assert find_nearest_size(height, width) == (h, w)
 
 
 def test_with_plain_positions_our_loop_is_the_pipeline_of_diffusers(kontext_folder):
@@ -105,7 +105,7 @@ def test_with_plain_positions_our_loop_is_the_pipeline_of_diffusers(kontext_fold
         max_area=size[0] * size[1],
         _auto_resize=False,
     ).images[0]
-    assert model.grid(size) == grid
+    assert model.compute_grid(size) == grid
     assert found.std() > 0.01
     assert_close(found, expected.permute(1, 2, 0), "image")
 
@@ -129,8 +129,8 @@ def test_pe_field_depends_on_seed_and_depth_and_on_nothing_else(kontext_folder):
     assert first.shape == (TARGET.height, TARGET.width, 3)
     assert torch.equal(first, image(seed=1))
     assert not torch.equal(first, image(seed=2))
-    renders = tuple(replace(r, depth=r.depth**2) for r in context.at_views)
-    assert not torch.equal(first, image(replace(context, at_views=renders), seed=1))
+    renders = tuple(replace(r, depth=r.depth**2) for r in context.view_renders)
+    assert not torch.equal(first, image(replace(context, view_renders=renders), seed=1))
 
 
 def test_images_made_together_are_those_made_alone(kontext_folder):
@@ -138,16 +138,16 @@ def test_images_made_together_are_those_made_alone(kontext_folder):
     flat = replace(flat, height=48)  # another size, which is painted by itself
     targets = [TARGET, camera_at(0.5, yaw=10, size=96), flat, camera_at(0.4, yaw=9, size=96)]
     contexts = [
-        replace(context, at_target=load_renderer("cpu").render(scene_of(context), target))
+        replace(context, target_render=load_renderer("cpu").render(scene_of(context), target))
         for target in targets
     ]
-    generator = PEField(load_kontext(str(kontext_folder)), steps=2, at_once=2)
+    generator = PEField(load_kontext(str(kontext_folder)), steps=2, max_batch_size=2)
     calls = [
-        Request(context.views[1], target, known)
+        GeneratorRequest(context.views[1], target, known)
         for target, known in zip(targets, contexts, strict=True)
     ]
-    conditions = [generator.condition(r.nearest, r.target, r.context) for r in calls]
-    assert grouped(conditions, 2) == [[0, 1], [3], [2]]
+    conditions = [generator.create_condition(r.nearest, r.target, r.context) for r in calls]
+    assert group_by_size(conditions, 2) == [[0, 1], [3], [2]]
     together = [found.image for found in generator.synthesize(calls)]
     alone = [generator.synthesize([call])[0].image for call in calls]
     for image, expected in zip(together, alone, strict=True):
@@ -158,8 +158,8 @@ def test_images_made_together_are_those_made_alone(kontext_folder):
 def test_pe_field_takes_the_depth_that_the_completer_names(kontext_folder, tmp_path, monkeypatch):
     """`paper()` names a monocular network, the default the scene."""
     network = load_monocular(str(tiny_model(tmp_path)))
-    named = {"context": context_depth, "monocular": network}
-    monkeypatch.setattr(pe_field, "source_depth_named", lambda name, device: named[name])
+    named = {"context": compute_context_depth, "monocular": network}
+    monkeypatch.setattr(pe_field, "load_source_depth", lambda name, device: named[name])
     context = known_room()
     generator = PEField(load_kontext(str(kontext_folder)), steps=1)
 
@@ -193,10 +193,10 @@ def test_settings_reach_the_generators(kontext_folder, inpaint_folder, tmp_path)
     chosen_settings = PEFieldSettings(str(kontext_folder), steps=3, retries=2, batch_size=1)
     generator = load_generator("pe-field", 5, settings=chosen_settings)
     assert (generator.seed, generator.steps, generator.retries) == (5, 3, 2)
-    assert generator.at_once == 1
+    assert generator.max_batch_size == 1
     assert generator.depth is None
     chosen = load_generator("pe-field", settings=replace(chosen_settings, depth="context"))
-    assert chosen.depth is context_depth
+    assert chosen.depth is compute_context_depth
     assert load_generator("pe-field", settings=PEFieldSettings(chosen_settings.weights)).steps == 4
     network = tiny_model(tmp_path)
     with_depth = load_generator("pe-field", settings=replace(chosen_settings, depth=str(network)))
@@ -229,13 +229,13 @@ def test_noise_in_place_of_the_scene_is_told(kontext_folder):
 
 def test_a_scene_that_the_photograph_does_not_see_is_refused(kontext_folder):
     context = known_room()
-    empty = tuple(replace(r, alpha=0 * r.alpha) for r in context.at_views)
+    empty = tuple(replace(r, alpha=0 * r.alpha) for r in context.view_renders)
     with pytest.raises(InputError, match="sees nothing of the scene"):
         answer(
             PEField(load_kontext(str(kontext_folder))),
             context.views[1],
             TARGET,
-            replace(context, at_views=empty),
+            replace(context, view_renders=empty),
         )
 
 
@@ -246,7 +246,7 @@ def test_inpainting_keeps_what_was_warped_and_fills_the_rest(name, tmp_path):
     painter = replace(painter, side=min(painter.side, 256))  # Flux counts 128 latents
     generator = DiffusersInpaint(painter, steps=2)
     image = generator(context.views[1], TARGET, context).image
-    warped = completed_warp(context.views[1], TARGET, context)
+    warped = complete_warp(context.views[1], TARGET, context)
     assert 0.05 < (~warped.known).float().mean() < 0.9
     assert torch.equal(image[warped.known], warped.image[warped.known])
     assert (image - warped.image)[~warped.known].abs().mean() > 0.01
@@ -260,8 +260,8 @@ def test_inpainting_keeps_what_was_warped_and_fills_the_rest(name, tmp_path):
 def test_the_size_follows_the_pipeline_and_the_aspect(inpaint_folder):
     painter = load_painter(str(inpaint_folder))
     assert (painter.side, painter.multiple) == (64, 4)
-    assert painter.size_for(500, 500) == (64, 64)
-    h, w = painter.size_for(200, 800)
+    assert painter.compute_size(500, 500) == (64, 64)
+    h, w = painter.compute_size(200, 800)
     assert (h % 4, w % 4) == (0, 0)
     assert h * w == pytest.approx(64 * 64, rel=0.1)
     assert w / h == pytest.approx(4, rel=0.15)
@@ -317,7 +317,7 @@ def test_weights_that_lack_a_tensor_are_refused_and_never_made_up(
     weights.pop(sorted(weights)[len(weights) // 2])
     save_file(weights, file, metadata={"format": "pt"})
     with pytest.raises(InputError, match=f"its {part} lacks the tensor"):
-        load_generator(name, settings=settings_class(name)(str(folder)))
+        load_generator(name, settings=get_settings_class(name)(str(folder)))
 
 
 def completed(tmp_path, monkeypatch, *model) -> dict:

@@ -4,18 +4,18 @@ import pytest
 
 from command import run
 from gscompleter import InputError, load_generator
-from gscompleter.commands.generator_options import GeneratorOptions
-from gscompleter.config.generators import PEFieldSettings, settings_class
-from gscompleter.generators.diffusion import published
-from gscompleter.generators.diffusion.loading import sources
-from gscompleter.generators.diffusion.published import (
+from gscompleter.apps.commands.generator_options import GeneratorOptions
+from gscompleter.config.generators import PEFieldSettings, get_settings_class
+from gscompleter.models.diffusion import published
+from gscompleter.models.diffusion.loading import find_sources
+from gscompleter.models.diffusion.published import (
     KONTEXT,
     PE_FIELD,
     IncompleteWeightsError,
     Source,
     announce,
-    cannot_load,
-    source_of,
+    create_load_error,
+    parse_source,
 )
 from scenes import camera_at, photographed
 
@@ -24,7 +24,7 @@ from scenes import camera_at, photographed
 def test_without_the_packages_one_sentence_says_what_to_install(name, monkeypatch):
     monkeypatch.setattr(published, "PACKAGES", ("a_package_nobody_has", "torch"))
     with pytest.raises(InputError) as caught:
-        load_generator(name, settings=settings_class(name)(weights="somebody/something"))
+        load_generator(name, settings=get_settings_class(name)(weights="somebody/something"))
     message = str(caught.value)
     assert "a_package_nobody_has" in message
     assert "torch" not in message
@@ -43,7 +43,7 @@ def test_without_the_packages_one_sentence_says_what_to_install(name, monkeypatc
 def test_a_setting_that_a_generator_does_not_know_is_refused(name, setting, way_out):
     ((key, value),) = setting.items()
     with pytest.raises(InputError) as caught:
-        GeneratorOptions(name, setting).settings()
+        GeneratorOptions(name, setting).make_settings()
     assert f"{name!r} has no setting {key} ({value})" in str(caught.value)
     assert way_out in str(caught.value)
     assert caught.value.argument == f"generator_{key}"
@@ -92,23 +92,27 @@ def test_an_inpainter_must_be_named(monkeypatch):
 
 
 def test_a_path_is_a_folder_or_an_id_with_or_without_its_commit(tmp_path):
-    assert source_of(str(tmp_path)) == Source(place=str(tmp_path))
-    assert source_of(str(tmp_path)).is_pinned
-    loose = source_of("somebody/something")
-    assert (loose.place, loose.revision, loose.is_pinned) == ("somebody/something", "main", False)
+    assert parse_source(str(tmp_path)) == Source(location=str(tmp_path))
+    assert parse_source(str(tmp_path)).is_pinned
+    loose = parse_source("somebody/something")
+    assert (loose.location, loose.revision, loose.is_pinned) == (
+        "somebody/something",
+        "main",
+        False,
+    )
     commit = "0123456789abcdef" * 2 + "01234567"
-    pinned = source_of(f"somebody/something@{commit}")
+    pinned = parse_source(f"somebody/something@{commit}")
     assert (pinned.revision, pinned.is_pinned) == (commit, True)
-    assert source_of("somebody/flux-fill").terms != loose.terms
+    assert parse_source("somebody/flux-fill").terms != loose.terms
     for wrong in ("nothing", "./a/b", "/a/b", "a/b/c", "a/"):
         with pytest.raises(InputError, match="no repository"):
-            source_of(wrong)
+            parse_source(wrong)
 
 
 def test_gate_licence_and_missing_pin_are_named_before_a_download_and_a_folder_needs_no_word(
     capsys, tmp_path
 ):
-    announce([Source(place=str(tmp_path))])
+    announce([Source(location=str(tmp_path))])
     assert capsys.readouterr().err == ""
     announce([KONTEXT, PE_FIELD])
     printed = capsys.readouterr().err
@@ -120,14 +124,14 @@ def test_gate_licence_and_missing_pin_are_named_before_a_download_and_a_folder_n
 
 
 def test_what_is_read_twice_is_announced_once(capsys):
-    base, transformer = sources("somebody/something@abc")
+    base, transformer = find_sources("somebody/something@abc")
     announce([base, transformer])
     assert capsys.readouterr().err.count("somebody/something") == 1
 
 
 def test_the_sentence_names_what_did_not_load_and_how_to_mend_it(tmp_path):
     def message_for(source: Source, error: Exception, setting: str = "weights") -> str:
-        return str(cannot_load(source, error, setting))
+        return str(create_load_error(source, error, setting))
 
     lost = IncompleteWeightsError("vae", ["a", "b", "c"])
     assert "its vae lacks the tensor a and 2 more" in message_for(PE_FIELD, lost)
@@ -136,25 +140,25 @@ def test_the_sentence_names_what_did_not_load_and_how_to_mend_it(tmp_path):
     assert "accepted its terms at https://huggingface.co/black" in message_for(
         KONTEXT, OSError("gated")
     )
-    depth = source_of("somebody/depth", "transformers")
+    depth = parse_source("somebody/depth", "transformers")
     assert "give a folder as its depth" in message_for(depth, OSError("?"), "depth")
     assert "see that it is complete" in message_for(
-        source_of(str(tmp_path)), OSError("no config.json")
+        parse_source(str(tmp_path)), OSError("no config.json")
     )
     with pytest.raises(InputError, match="a folder that transformers saved"):
-        source_of("nothing", "transformers")
+        parse_source("nothing", "transformers")
 
 
 def test_a_pipeline_brings_its_own_transformer_and_a_transformer_joins_the_published_base(tmp_path):
-    assert sources(None) == (KONTEXT, PE_FIELD)
+    assert find_sources(None) == (KONTEXT, PE_FIELD)
     whole, alone = tmp_path / "whole", tmp_path / "alone"
     for folder, file in ((whole, "model_index.json"), (alone, "config.json")):
         folder.mkdir()
         (folder / file).write_text("{}")
-    base, transformer = sources(str(whole))
-    assert (base.place, base.subfolder) == (str(whole), None)
-    assert (transformer.place, transformer.subfolder) == (str(whole), "transformer")
-    assert sources(str(alone)) == (KONTEXT, Source(place=str(alone)))
-    base, transformer = sources("somebody/something@abc")
-    assert base.arguments == {"revision": "abc"}
-    assert transformer.arguments == {"revision": "abc", "subfolder": "transformer"}
+    base, transformer = find_sources(str(whole))
+    assert (base.location, base.subfolder) == (str(whole), None)
+    assert (transformer.location, transformer.subfolder) == (str(whole), "transformer")
+    assert find_sources(str(alone)) == (KONTEXT, Source(location=str(alone)))
+    base, transformer = find_sources("somebody/something@abc")
+    assert base.load_arguments == {"revision": "abc"}
+    assert transformer.load_arguments == {"revision": "abc", "subfolder": "transformer"}

@@ -12,16 +12,16 @@ import torch
 
 from command import run
 from gscompleter import InputError, load_cameras, load_ply, save_ply
-from gscompleter.cli import parsed
-from gscompleter.commands import complete as command
-from gscompleter.commands import opening
-from gscompleter.commands.evaluate import chosen_tasks
-from gscompleter.commands.opening import Opened, Task, near_and_far, read_task
-from gscompleter.commands.options import CompleteOptions
-from gscompleter.commands.understood import budget_line
+from gscompleter.apps.commands import complete as command
+from gscompleter.apps.commands.evaluate import collect_tasks
+from gscompleter.apps.commands.options import CompleteOptions
+from gscompleter.apps.inputs import opening
+from gscompleter.apps.inputs.opening import Opened, Task, read_task, select_near_and_far
+from gscompleter.apps.inputs.plan import describe_budget
+from gscompleter.cli import parse_command
 from gscompleter.data.formats import open_photographs
 from gscompleter.data.scene import write_cameras
-from gscompleter.memory import images_that_fit, needed_bytes
+from gscompleter.memory import count_fitting_images, estimate_bytes
 from gscompleter.types import View
 from pose_files import write_colmap_text, write_photographs
 from scenes import camera_at, photographed
@@ -48,7 +48,7 @@ def chosen(scene, tmp_path_factory) -> tuple[Path, list[str]]:
     out = tmp_path_factory.mktemp("runs") / "out"
     with pytest.MonkeyPatch.context() as monkeypatch:
         said: list[str] = []
-        monkeypatch.setattr(command, "say", lambda _console, *lines: said.extend(lines))
+        monkeypatch.setattr(command, "print_lines", lambda _console, *lines: said.extend(lines))
         assert run(monkeypatch, *complete(scene, out, "--resolution", 48, "--far", 20)) == 0
     return out, said
 
@@ -79,7 +79,7 @@ def test_the_longer_side_has_640_pixels_unless_another_size_is_asked_for():
     sizes = {(): 640, ("full",): "full", ("300",): 300, ("300", "200"): (300, 200)}
     for given, size in sizes.items():
         asked = [*words, "--resolution", *given] if given else words
-        assert parsed(asked).resolution == size
+        assert parse_command(asked).resolution == size
 
 
 def test_without_a_context_the_frames_that_matter_are_taken(chosen):
@@ -113,7 +113,7 @@ def test_four_lines_come_before_the_work(scene, chosen):
 
 def opened_with(scene: Path, *words: object) -> tuple[CompleteOptions, Task]:
     """Open `scene` with these options; nothing is completed."""
-    options = parsed([str(word) for word in ("complete", scene, *words, "--out", "OUT")])
+    options = parse_command([str(word) for word in ("complete", scene, *words, "--out", "OUT")])
     photographs = open_photographs(scene, near=0.5, far=20.0)
     return options, read_task(options, Opened(photographs, "nerfstudio", 5), "cpu")
 
@@ -121,24 +121,24 @@ def opened_with(scene: Path, *words: object) -> tuple[CompleteOptions, Task]:
 def test_fewer_photographs_are_chosen_where_there_is_no_memory_for_more(scene, monkeypatch):
     pixels = SIZE * SIZE
     for fit, chosen in ((9, 3), (3, 2), (0, 2)):
-        monkeypatch.setattr(opening, "images_that_fit", lambda _pixels, fit=fit: fit)
+        monkeypatch.setattr(opening, "count_fitting_images", lambda _pixels, fit=fit: fit)
         options, task = opened_with(scene, "--target", TARGET)
         assert len(task.views) == chosen
-        said = budget_line(options, task, "cpu")
+        said = describe_budget(options, task, "cpu")
         assert said.startswith(f"at most {chosen} of 4 photographs for the context")
         assert (" (memory is too small for 3) (" in said) == (chosen < 3)
-    for memory in (needed_bytes(pixels, 3), needed_bytes(pixels, 3) - 1):
-        monkeypatch.setattr("gscompleter.memory.memory_bytes", lambda memory=memory: memory)
-        assert images_that_fit(pixels) == (3 if memory == needed_bytes(pixels, 3) else 2)
+    for memory in (estimate_bytes(pixels, 3), estimate_bytes(pixels, 3) - 1):
+        monkeypatch.setattr("gscompleter.memory.read_memory_bytes", lambda memory=memory: memory)
+        assert count_fitting_images(pixels) == (3 if memory == estimate_bytes(pixels, 3) else 2)
 
 
 def test_a_context_that_is_named_is_the_one_that_is_taken(scene):
     options, task = opened_with(scene, "--target", TARGET, "--context", 0, 4)
     assert [view.frame for view in task.views] == [0, 4]
-    said = budget_line(options, task, "cpu")
+    said = describe_budget(options, task, "cpu")
     assert said.startswith("2 photographs for the context, as named, up to 1 GB ")
     assert "to reconstruct the context on two cores" in said
-    assert not budget_line(options, task, "cuda").endswith("GHz")
+    assert not describe_budget(options, task, "cuda").endswith("GHz")
 
 
 def test_time_and_memory_that_are_said_grow_with_pixels_and_photographs(scene):
@@ -153,13 +153,15 @@ def test_time_and_memory_that_are_said_grow_with_pixels_and_photographs(scene):
         return replace(task, views=views)
 
     def seconds(task: Task) -> int:
-        found = re.search(r"about ([0-9,]+) s to reconstruct", budget_line(options, task, "cpu"))
+        found = re.search(
+            r"about ([0-9,]+) s to reconstruct", describe_budget(options, task, "cpu")
+        )
         return int(found[1].replace(",", ""))
 
     assert seconds(large(pair, 1000)) == 40
     assert seconds(large(more, 1000)) == 80
     assert seconds(large(pair, 2000)) == 160
-    assert "up to 4 GB of " in budget_line(options, large(pair, 1000), "cpu")
+    assert "up to 4 GB of " in describe_budget(options, large(pair, 1000), "cpu")
 
 
 def test_the_summary_says_what_was_opened_and_between_which_depths(chosen):
@@ -289,19 +291,19 @@ def test_evaluate_tells_the_notes_of_what_it_opens_once(tmp_path):
     content = {"resolution": [32, 32], "cases": [row, {**row, "target": 3}, missing]}
     (tmp_path / "cases.json").write_text(json.dumps(content))
     for words in ([tmp_path / "cases.json"], [room, "--protocol", "sequence-1"]):
-        options = parsed([*map(str, ["evaluate", *words, "--out", tmp_path / "out"])])
+        options = parse_command([*map(str, ["evaluate", *words, "--out", tmp_path / "out"])])
         notes: list[str] = []
-        assert chosen_tasks(options, [], notes)
+        assert collect_tasks(options, [], notes)
         assert notes == [note]
 
 
 def test_a_splat_is_doubted_by_photographs_that_are_near_and_by_some_from_everywhere():
     """Half of the check views are near the target, the others spread over a long path."""
     path = {2 * n: camera_at(0.1 * n) for n in range(60)}
-    chosen = near_and_far([camera_at(0.45)], path, 16)
+    chosen = select_near_and_far([camera_at(0.45)], path, 16)
     assert chosen == sorted(set(chosen))
     assert len(chosen) == 16
     assert set(range(2, 18, 2)) <= set(chosen)
     assert max(b - a for a, b in zip(chosen, [*chosen[1:], 118], strict=True)) < 118 / 4
-    assert near_and_far([camera_at(0.45)], path, 60) == list(path)
-    assert near_and_far([camera_at(0.45)], {}, 16) == []
+    assert select_near_and_far([camera_at(0.45)], path, 60) == list(path)
+    assert select_near_and_far([camera_at(0.45)], {}, 16) == []

@@ -15,10 +15,10 @@ from PIL import Image
 from scipy.spatial.transform import Rotation
 
 from gscompleter import InputError
-from gscompleter.data.datasets import open_clips
+from gscompleter.data.cases import open_clips
+from gscompleter.data.driving.restricted_pickle import load_plain
+from gscompleter.data.driving.velodyne import read_sweep
 from gscompleter.data.formats import open_photographs
-from gscompleter.data.restricted_pickle import load_plain
-from gscompleter.data.velodyne import read_sweep
 from gscompleter.geometry import project
 
 

@@ -14,18 +14,17 @@ from torch import Tensor
 
 from command import run
 from gscompleter.config import CompleterConfig
-from gscompleter.data.cases import Case
-from gscompleter.data.datasets import open_clips
+from gscompleter.data.cases import Case, open_clips
 from gscompleter.data.formats import open_photographs
 from gscompleter.data.photographs import Photographs
 from gscompleter.data.scene import write_cameras
+from gscompleter.evaluation.protocols import parse_protocol
+from gscompleter.evaluation.tasks import make_tasks
 from gscompleter.io.image import read_image, write_image
 from gscompleter.io.json_file import read_json
-from gscompleter.matching.features import features_of
-from gscompleter.matching.stereo_image import stereo_images
 from gscompleter.reconstructors import load_reconstructor
-from gscompleter.runs.protocols import parse_protocol
-from gscompleter.runs.tasks import tasks_of
+from gscompleter.reconstructors.features.sift import detect_features
+from gscompleter.reconstructors.features.stereo_image import make_stereo_images
 from gscompleter.stages.context import init_context
 from gscompleter.types import SH_C0, Camera
 from scenes import camera_at, open_street
@@ -103,7 +102,7 @@ def test_its_mask_follows_the_framing(clip):
 @pytest.mark.parametrize("paint", [untouched, with_even_road])
 def test_a_street_has_none(tmp_path, paint):
     """Neither its sky, which is even, nor a road without texture is a vehicle."""
-    assert all(view.ignored is None for view in drive(tmp_path, paint).views(range(COUNT)))
+    assert all(view.ignore_mask is None for view in drive(tmp_path, paint).views(range(COUNT)))
 
 
 def circle() -> list[Camera]:
@@ -122,7 +121,7 @@ def circle() -> list[Camera]:
     ids=["few", "standing", "hardly moving", "turning"],
 )
 def test_nothing_is_told_without_a_drive(tmp_path, cameras):
-    assert drive(tmp_path, cameras=cameras).views([0])[0].ignored is None
+    assert drive(tmp_path, cameras=cameras).views([0])[0].ignore_mask is None
 
 
 def test_each_camera_of_a_vehicle_is_looked_at_alone(tmp_path):
@@ -132,7 +131,7 @@ def test_each_camera_of_a_vehicle_is_looked_at_alone(tmp_path):
     alternating = drive(
         tmp_path, lambda image, n: with_bonnet(image, n) if n % 2 else image, cameras=both
     )
-    seen = [view.ignored is not None for view in alternating.views(range(4))]
+    seen = [view.ignore_mask is not None for view in alternating.views(range(4))]
     assert seen == [False, True, False, True]
 
 
@@ -141,31 +140,31 @@ def test_damaged_photographs_are_passed_over(tmp_path):
     (tmp_path / "00.png").write_bytes(b"nothing")
     (tmp_path / "03.png").unlink()
     (view,) = photographs.views([5])
-    assert overlap(view.ignored, bonnet()) > 0.85
+    assert overlap(view.ignore_mask, bonnet()) > 0.85
 
 
 def test_it_can_be_switched_off(clip):
     assert CompleterConfig().ego_mask
     assert not CompleterConfig.paper().ego_mask
-    assert clip.with_ego_vehicle().views([0])[0].ignored is None
+    assert clip.keep_ego_vehicle().views([0])[0].ignored is None
     folder = clip.frames[0].image.parent
     case = Case(folder, (0, 1), 3, (), None)
-    assert case.load((0,))[0].ignored is not None
+    assert case.load((0,))[0].ignore_mask is not None
     assert replace(case, ego_mask=False).load((0,))[0].ignored is None
 
 
 def test_evaluations_ignore_it(clip):
     (opened,) = open_clips(clip.frames[0].image.parent)
-    task = tasks_of(parse_protocol("n-2"), opened)[0]
+    task = make_tasks(parse_protocol("n-2"), opened)[0]
     assert all(view.ignored is not None for view in pickle.loads(pickle.dumps(task.load))((0, 1)))
 
 
 def test_nothing_is_matched_or_made_of_it(clip):
     views = clip.views([2, 3, 4])
-    for image in stereo_images(views)[0]:
-        columns, rows = features_of(image)[0].astype(int).T
+    for image in make_stereo_images(views)[0]:
+        columns, rows = detect_features(image)[0].astype(int).T
         assert len(rows)
-        assert not image.ignored[rows, columns].any()
+        assert not image.ignore_mask[rows, columns].any()
     scene, _ = init_context(load_reconstructor("plane-sweep"), views)
     plain, _ = init_context(
         load_reconstructor("plane-sweep"), [replace(view, ignored=None) for view in views]

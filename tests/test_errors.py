@@ -5,23 +5,23 @@ from pathlib import Path
 import pytest
 
 from gscompleter import load_ply, load_splat
-from gscompleter.commands.words import sentence_of
+from gscompleter.apps.commands.words import format_error
 from gscompleter.data.chunks import open_chunks
 from gscompleter.data.colmap.binary import read_images
-from gscompleter.data.point_cloud import read_point_cloud
-from gscompleter.data.upright import write_upright
-from gscompleter.errors import InputError, names_listed, numbers_listed, quoted, warn_deprecated
+from gscompleter.data.points import read_point_cloud
+from gscompleter.data.sfm.upright import write_upright
+from gscompleter.errors import InputError, join_names, join_numbers, quote_value, warn_deprecated
 from gscompleter.io.image import read_pixels
-from gscompleter.weights.reading import check_kind
+from gscompleter.models.weights.reading import check_kind
 
 
 def test_a_short_value_is_quoted_as_it_is():
-    assert quoted("room/0.png") == "room/0.png"
-    assert quoted([1, "a"]) == "[1, 'a']"
+    assert quote_value("room/0.png") == "room/0.png"
+    assert quote_value([1, "a"]) == "[1, 'a']"
 
 
 def test_a_long_one_keeps_its_two_ends():
-    shown = quoted("a" * 60_000 + "b" * 60_000)
+    shown = quote_value("a" * 60_000 + "b" * 60_000)
     assert len(shown) <= 60
     assert shown.startswith("aaa")
     assert shown.endswith("bbb")
@@ -29,12 +29,12 @@ def test_a_long_one_keeps_its_two_ends():
 
 
 def test_a_quote_stays_on_its_line_and_shows_no_control_characters():
-    assert quoted("a\nb\x1b[31m") == "a b [31m"
+    assert quote_value("a\nb\x1b[31m") == "a b [31m"
 
 
 def test_integers_that_python_refuses_to_write_are_described():
-    assert quoted(10**5000) == "an integer of about 5,000 digits"
-    assert quoted([10**5000]) == "a list that cannot be written out"
+    assert quote_value(10**5000) == "an integer of about 5,000 digits"
+    assert quote_value([10**5000]) == "a list that cannot be written out"
 
 
 def test_lists_are_quoted_without_walking_all_of_them():
@@ -44,7 +44,7 @@ def test_lists_are_quoted_without_walking_all_of_them():
     for _ in range(40):
         wide = [wide] * 10
     for value in (endless, wide, {"a": wide}, [["x" * 10**6] * 10**4] * 10**4):
-        assert len(quoted(value)) <= 60
+        assert len(quote_value(value)) <= 60
 
 
 @pytest.mark.parametrize(
@@ -61,7 +61,7 @@ def test_lists_are_quoted_without_walking_all_of_them():
 @pytest.mark.parametrize("argument", [None, "context", "x" * 1000])
 def test_whatever_an_error_is_made_of_it_is_one_line(message, argument):
     error = InputError(message, argument)
-    shown = f"gscompleter: {sentence_of(error)}"
+    shown = f"gscompleter: {format_error(error)}"
     assert 150 < len(shown) <= 300
     assert "\n" not in shown
 
@@ -73,17 +73,17 @@ def test_what_matters_of_a_long_error_is_kept():
 
 
 def test_names_and_numbers_are_summarized():
-    assert names_listed(["a", "bb\nb", "c"], 2) == "a, bb b and 1 more"
-    assert names_listed([], 2) == ""
-    assert numbers_listed([]) == ""
-    assert numbers_listed([3]) == "3"
-    assert numbers_listed([2, 1, 0, 2]) == "0-2"
-    assert numbers_listed([*range(40), 52, 60, 61, 70, 80]) == "0-39, 52, 60-61 and 2 others"
+    assert join_names(["a", "bb\nb", "c"], 2) == "a, bb b and 1 more"
+    assert join_names([], 2) == ""
+    assert join_numbers([]) == ""
+    assert join_numbers([3]) == "3"
+    assert join_numbers([2, 1, 0, 2]) == "0-2"
+    assert join_numbers([*range(40), 52, 60, 61, 70, 80]) == "0-39, 52, 60-61 and 2 others"
 
 
 def test_a_path_has_more_room_and_is_written_plainly():
-    assert quoted(Path("a" * 200)) == "a" * 200
-    assert len(quoted(Path("a" * 2000))) <= 250
+    assert quote_value(Path("a" * 200)) == "a" * 200
+    assert len(quote_value(Path("a" * 2000))) <= 250
 
 
 def test_every_reader_tells_a_pointer_of_git_lfs_in_the_same_words(tmp_path):

@@ -9,11 +9,11 @@ from command import run
 from gscompleter import GSCompleter
 from gscompleter.data.cases import Case
 from gscompleter.data.scene import write_cameras
+from gscompleter.evaluation.runner import RunConfig, evaluate, prepare_task
+from gscompleter.evaluation.store import get_step_path, get_task_folder, load_prediction
+from gscompleter.evaluation.tasks import make_case_task
 from gscompleter.io.image import write_image
-from gscompleter.io.ply import save_ply
-from gscompleter.runs.runner import RunConfig, evaluate, prepare
-from gscompleter.runs.store import load_prediction, step_path, task_folder
-from gscompleter.runs.tasks import task_of
+from gscompleter.splats.ply import save_ply
 from scenes import camera_at, view_of
 from test_contradiction import CAMERAS, ROOM, SIZE, photographed
 
@@ -39,11 +39,11 @@ def test_a_case_gives_the_bytes_of_complete(method, config, scene, tmp_path, mon
     assert run(monkeypatch, "complete", scene, *frames, "--config", config, "--out", out) == 0
 
     results = tmp_path / "results"
-    task = task_of(Case(scene, (0, 1), 2, (), (SIZE, SIZE), 0.5, 20.0))
+    task = make_case_task(Case(scene, (0, 1), 2, (), (SIZE, SIZE), 0.5, 20.0))
     evaluate([task], ["context", "full", "paper"], results)
-    folder = task_folder(results, task.name)
-    context = prepare(task, folder, RunConfig()).context
-    prediction = load_prediction(step_path(folder, method, 1), context)
+    folder = get_task_folder(results, task.name)
+    context = prepare_task(task, folder, RunConfig()).context
+    prediction = load_prediction(get_step_path(folder, method, 1), context)
     save_ply(tmp_path / "evaluated.ply", prediction.scene, provenance=True)
     assert (tmp_path / "evaluated.ply").read_bytes() == (out / "completed.ply").read_bytes()
 

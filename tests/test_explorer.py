@@ -7,11 +7,18 @@ import torch
 
 from gscompleter import CompleterConfig, GSCompleter
 from gscompleter.config import AlignmentConfig, NextBestViewConfig, RegistrationConfig
-from gscompleter.explorer import Explorer, with_bystanders
-from gscompleter.metrics.coverage import coverage_of, covered, held_out_cameras, looks_of
+from gscompleter.evaluation.metrics.coverage import (
+    compute_coverage,
+    compute_covered_share,
+    render_pairs,
+    sample_held_out_cameras,
+)
+from gscompleter.next_best_view.gain import compute_gain, make_placeholders, simplify_completion
+from gscompleter.next_best_view.planner import ViewPlanner, add_free_space_cameras
 from gscompleter.render import load_renderer
-from gscompleter.stages.exploration import gain, miniature, overlap_of, stand_ins
-from gscompleter.types import Camera, Completion, Gaussians, Render, View
+from gscompleter.stages.select_anchor import compute_overlap
+from gscompleter.state import Completion
+from gscompleter.types import Camera, Gaussians, Render, View
 from scenes import Room, camera_at, cast, gaussians_of, view_of
 from test_completer import KnowingGenerator, KnowingReconstructor, knowing
 
@@ -23,9 +30,9 @@ def photographs() -> list[View]:
     return [view_of(Room(), camera_at(x, size=SIZE), i) for i, x in enumerate(PLACES)]
 
 
-def explorer(**changes: float) -> Explorer:
+def explorer(**changes: float) -> ViewPlanner:
     config = replace(CompleterConfig(), next_best_view=NextBestViewConfig(image_size=48, **changes))
-    return Explorer(GSCompleter(KnowingReconstructor(), KnowingGenerator(), config=config))
+    return ViewPlanner(GSCompleter(KnowingReconstructor(), KnowingGenerator(), config=config))
 
 
 @pytest.fixture(scope="module")
@@ -41,11 +48,11 @@ def test_holes_count_where_they_border_on_what_was_observed():
     holes = torch.zeros(40, 40, dtype=torch.bool)
     holes[:, 20:] = True
     near = NextBestViewConfig(border_radius=0.1)
-    assert gain(holes, 1.0, near) == pytest.approx(4 / 40)
-    assert gain(holes, 0.5, near) == pytest.approx(2 / 40)
-    assert gain(holes, 1.0, NextBestViewConfig(border_radius=1.0)) == pytest.approx(0.5)
-    assert gain(torch.ones_like(holes), 1.0) == 0.0
-    assert gain(torch.zeros_like(holes), 1.0) == 0.0
+    assert compute_gain(holes, 1.0, near) == pytest.approx(4 / 40)
+    assert compute_gain(holes, 0.5, near) == pytest.approx(2 / 40)
+    assert compute_gain(holes, 1.0, NextBestViewConfig(border_radius=1.0)) == pytest.approx(0.5)
+    assert compute_gain(torch.ones_like(holes), 1.0) == 0.0
+    assert compute_gain(torch.zeros_like(holes), 1.0) == 0.0
 
 
 def test_overlap_is_what_the_anchor_sees_too():
@@ -54,12 +61,12 @@ def test_overlap_is_what_the_anchor_sees_too():
         return camera, Render(image, depth, torch.ones_like(depth))
 
     here = seen(camera_at())
-    assert overlap_of(*here, *here) > 0.97
-    assert overlap_of(*here, *seen(camera_at(yaw=180))) == 0.0
-    aside = overlap_of(*here, *seen(camera_at(yaw=25)))
+    assert compute_overlap(*here, *here) > 0.97
+    assert compute_overlap(*here, *seen(camera_at(yaw=180))) == 0.0
+    aside = compute_overlap(*here, *seen(camera_at(yaw=25)))
     assert 0.2 < aside < 0.8
     covered_by_a_wall = replace(here[1], depth=torch.full_like(here[1].depth, 0.5))
-    assert overlap_of(*here, here[0], covered_by_a_wall) < 0.02
+    assert compute_overlap(*here, here[0], covered_by_a_wall) < 0.02
 
 
 def test_cameras_are_found_until_little_is_left_and_the_scene_covers_more(begun):
@@ -67,8 +74,8 @@ def test_cameras_are_found_until_little_is_left_and_the_scene_covers_more(begun)
     assert 1 <= len(choices) <= 3
     assert len(completion.targets) == len(choices)
     assert all(choice.gain >= 0.01 for choice in choices)
-    aside = held_out_cameras(cameras(), seed=0)
-    found = coverage_of(looks_of(completion, aside, load_renderer("cpu")))
+    aside = sample_held_out_cameras(cameras(), seed=0)
+    found = compute_coverage(render_pairs(completion, aside, load_renderer("cpu")))
     assert found.before < 0.95
     assert found.after - found.before > 0.4 * (1 - found.before)
 
@@ -76,7 +83,9 @@ def test_cameras_are_found_until_little_is_left_and_the_scene_covers_more(begun)
 def test_the_second_camera_is_chosen_in_the_scene_that_the_first_left(begun):
     searching = explorer()
     completion, (first,) = searching.explore(begun, cameras(), 1)
-    (before,), (after,) = (searching.judged(c, [first.candidate]) for c in (begun, completion))
+    (before,), (after,) = (
+        searching.score_candidates(c, [first.candidate]) for c in (begun, completion)
+    )
     assert before.gain == first.gain
     assert after.gain < 0.5 * before.gain
 
@@ -94,14 +103,16 @@ def test_a_plan_takes_the_first_camera_that_is_completed_and_then_another(begun)
     _, (first,) = searching.explore(begun, cameras(), 1)
     assert torch.equal(plan[0].camera.c2w, first.camera.c2w)
     assert all(choice.camera is not plan[0].camera for choice in plan[1:])
-    assert searching.holes(begun, [first.camera] * 2)[1] < 0.1 * first.hole
+    assert (
+        searching.compute_hole_fractions(begun, [first.camera] * 2)[1] < 0.1 * first.hole_fraction
+    )
 
 
 def test_a_camera_before_a_surface_gains_nothing(begun):
     searching = explorer()
     (found,) = searching.plan(begun, cameras(), 1)
-    (far,) = searching.judged(begun, [replace(found.candidate, nearest=1e-3)])
-    (near,) = searching.judged(begun, [replace(found.candidate, nearest=1e3)])
+    (far,) = searching.score_candidates(begun, [replace(found.candidate, nearest=1e-3)])
+    (near,) = searching.score_candidates(begun, [replace(found.candidate, nearest=1e3)])
     assert far.gain > 0
     assert near.gain == 0
 
@@ -111,7 +122,7 @@ def test_stand_ins_close_the_hole_and_hide_nothing():
     renderer, scene = load_renderer("cpu"), gaussians_of(photographs()[0])
     render = renderer.render(scene, target)
     holes = render.alpha < 0.5
-    added = stand_ins(render, holes, target)
+    added = make_placeholders(render, holes, target)
     assert len(added) == int(holes.sum()) > 0
     assert (renderer.render(added, target).alpha[holes] > 0.5).float().mean() > 0.98
     depth = renderer.render(added, target).depth[holes]
@@ -120,12 +131,12 @@ def test_stand_ins_close_the_hole_and_hide_nothing():
 
 
 def test_a_miniature_covers_what_the_scene_covers(begun):
-    small = miniature(begun, 3000)
-    assert len(small.drawn) <= 3000 < len(begun.drawn)
+    small = simplify_completion(begun, 3000)
+    assert len(small.rendered_scene) <= 3000 < len(begun.rendered_scene)
     renderer = load_renderer("cpu")
-    aside = held_out_cameras(cameras(), seed=3, count=8)
+    aside = sample_held_out_cameras(cameras(), seed=3, count=8)
     shares = [
-        covered([renderer.render(completion.scene, camera) for camera in aside])
+        compute_covered_share([renderer.render(completion.scene, camera) for camera in aside])
         for completion in (begun, small)
     ]
     assert shares[1] == pytest.approx(shares[0], abs=0.02)
@@ -133,11 +144,11 @@ def test_a_miniature_covers_what_the_scene_covers(begun):
 
 def test_cameras_that_judge_coverage_are_the_same_for_the_same_seed():
     given = [camera_at(x, yaw=30 * x) for x in (0.0, 0.4, 0.8, 1.2)]
-    one, same, other = (held_out_cameras(given, seed, 5) for seed in (0, 0, 1))
+    one, same, other = (sample_held_out_cameras(given, seed, 5) for seed in (0, 0, 1))
     for first, second in zip(one, same, strict=True):
         assert torch.equal(first.c2w, second.c2w)
     assert not torch.equal(one[0].c2w, other[0].c2w)
-    centers = torch.stack([camera.center for camera in held_out_cameras(given, 0, 64)])
+    centers = torch.stack([camera.center for camera in sample_held_out_cameras(given, 0, 64)])
     assert centers[:, 0].min() < 0.2
     assert centers[:, 0].max() > 1.0
     assert centers[:, 1:].abs().max() < 1.5
@@ -151,8 +162,8 @@ def test_nothing_is_added_before_what_a_bystander_sees(begun):
     completer = replace(knowing(), config=config)
     target = camera_at(0.7, yaw=12, size=SIZE)
     aside = [camera_at(x, yaw=yaw, size=SIZE) for x, yaw in ((0.5, 4), (-0.6, -4))]
-    watched = with_bystanders(begun, [*cameras(), *aside])
-    assert len(watched.bystanders) == 2
+    watched = add_free_space_cameras(begun, [*cameras(), *aside])
+    assert len(watched.free_space_cameras) == 2
     hidden = []
     for state in (begun, watched):
         scene = completer.advance(state, target).scene

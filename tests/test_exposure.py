@@ -7,11 +7,11 @@ import pytest
 import torch
 
 from gscompleter import GSCompleter, View, load_renderer
-from gscompleter.metrics.image import psnr
-from gscompleter.reconstructors.plane_sweep import PlaneSweep, splatter
-from gscompleter.reconstructors.plane_sweep.exposure import gains_of
+from gscompleter.evaluation.metrics.image import psnr
+from gscompleter.reconstructors.plane_sweep import PlaneSweep, depth_to_gaussians
+from gscompleter.reconstructors.plane_sweep.exposure import estimate_gains
 from gscompleter.reconstructors.plane_sweep.fusion import Layer
-from gscompleter.reconstructors.plane_sweep.rig import rig_of
+from gscompleter.reconstructors.plane_sweep.rig import build_rig
 from gscompleter.stages.context import init_context
 from scenes import Room, camera_at, view_of
 
@@ -39,10 +39,10 @@ def photographs(size: int = SIZE) -> list[View]:
 
 def found_gains(views: list[View]) -> np.ndarray:
     """Gains that perfect stereo gives."""
-    rig = rig_of(views)
+    rig = build_rig(views)
     inverses = [np.float32(rig.unit) / view.depth.numpy() for view in views]
     layers = [Layer(i, d, np.ones_like(d)) for i, d in zip(rig.images, inverses, strict=True)]
-    return gains_of(layers, rig.transforms)
+    return estimate_gains(layers, rig.transforms)
 
 
 def at_best_gain(image: torch.Tensor, truth: torch.Tensor) -> float:
@@ -59,7 +59,9 @@ def made():
 def uneven():
     """Reconstruction of the same photographs without exposure correction."""
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(splatter, "gains_of", lambda layers, _: np.ones((len(layers), 3)))
+        patch.setattr(
+            depth_to_gaussians, "estimate_gains", lambda layers, _: np.ones((len(layers), 3))
+        )
         return PlaneSweep()(photographs())
 
 
@@ -113,7 +115,7 @@ def test_each_photograph_is_what_is_drawn_times_its_gain(made):
     for view, gain in zip(photographs(), made.gains, strict=True):
         image = renderer.render(made.gaussians, view.camera).image
         assert psnr(gain * image, view.image) > 26
-        assert psnr(image, view.evened(gain).image) > 26
+        assert psnr(image, view.normalize_exposure(gain).image) > 26
 
 
 def test_two_photographs_keep_their_exposures():

@@ -14,8 +14,8 @@ from torch import Tensor
 
 from feed_forward_fixtures import STORED, Case, Pass, extra, published_shapes, with_rule_v1
 from gscompleter import GSCompleter, InputError
-from gscompleter.geometry import project, rotations_from, widened
-from gscompleter.reconstructors.feed_forward import (
+from gscompleter.geometry import pad_camera, project, quats_to_rotations
+from gscompleter.models.feed_forward import (
     VARIANTS,
     DepthSplat,
     DepthSplatConfig,
@@ -23,14 +23,14 @@ from gscompleter.reconstructors.feed_forward import (
     MVSplat,
     MVSplatConfig,
 )
-from gscompleter.reconstructors.feed_forward.cameras import Cameras, nearest_views
-from gscompleter.reconstructors.feed_forward.cost_volume import cost_volume, sampling_grid
-from gscompleter.reconstructors.feed_forward.depth_predictor import DepthConfig, candidates_around
-from gscompleter.reconstructors.feed_forward.gaussian_adapter import in_world
-from gscompleter.reconstructors.feed_forward.inputs import Crop, batch_of, central_crops
-from gscompleter.reconstructors.feed_forward.spherical_harmonics import (
-    harmonics,
-    rotation_of_degree,
+from gscompleter.models.feed_forward.cameras import Cameras, find_nearest_views
+from gscompleter.models.feed_forward.cost_volume import compute_cost_volume, compute_sampling_grid
+from gscompleter.models.feed_forward.depth_predictor import DepthConfig, sample_candidates
+from gscompleter.models.feed_forward.gaussian_adapter import place_in_world
+from gscompleter.models.feed_forward.inputs import Crop, compute_central_crops, create_batch
+from gscompleter.models.feed_forward.spherical_harmonics import (
+    compute_wigner_matrices,
+    evaluate_harmonics,
 )
 from gscompleter.types import View
 from parity import assert_close, assert_within, relative_error
@@ -49,7 +49,7 @@ NETWORKS = ("mvsplat", "small-s1-u4-l4")
 
 @cache
 def network(name: str) -> MVSplat | DepthSplat:
-    """Return the shared network with the fixtures' weights; copy it with `changed` to modify it."""
+    """Return the shared network with the fixtures' weights; copy it with `update` to modify it."""
     if name == "mvsplat":
         return with_rule_v1(MVSplat(), "mvsplat")
     return with_rule_v1(DepthSplat(VARIANTS[ARCHITECTURES[name]]), "depthsplat")
@@ -159,28 +159,30 @@ def fixture(name: str) -> str:
 
 def random_rotations(count: int) -> Tensor:
     generator = torch.Generator().manual_seed(1)
-    return rotations_from(torch.randn(count, 4, generator=generator, dtype=torch.float64))
+    return quats_to_rotations(torch.randn(count, 4, generator=generator, dtype=torch.float64))
 
 
 @pytest.mark.parametrize("degree", range(5))
 def test_harmonics_turn_with_the_matrices_of_e3nn(degree):
     case = Case.load(STORED / "sh" / "wigner.npz")
-    ours = rotation_of_degree(degree, case.tensor("R"))
+    ours = compute_wigner_matrices(degree, case.tensor("R"))
     assert_close(ours, case.tensor(f"D{degree}"), f"D{degree}")
 
 
 @pytest.mark.parametrize("degree", range(1, 5))
 def test_a_turned_harmonic_is_the_harmonic_of_the_turned_direction(degree):
     rotations, directions = random_rotations(3), random_rotations(3)[:, 0]
-    turned = harmonics(degree, (rotations @ directions[..., None])[..., 0])
-    matrices = rotation_of_degree(degree, rotations)
-    ours = (matrices @ harmonics(degree, directions)[..., None])[..., 0]
+    turned = evaluate_harmonics(degree, (rotations @ directions[..., None])[..., 0])
+    matrices = compute_wigner_matrices(degree, rotations)
+    ours = (matrices @ evaluate_harmonics(degree, directions)[..., None])[..., 0]
     assert torch.allclose(ours, turned, atol=1e-12)
 
 
 def test_harmonics_of_degree_one_have_their_pole_along_y():
     directions = random_rotations(2)[:, 0]
-    assert torch.allclose(harmonics(1, directions), 0.4886025119029199 * directions, atol=1e-12)
+    assert torch.allclose(
+        evaluate_harmonics(1, directions), 0.4886025119029199 * directions, atol=1e-12
+    )
 
 
 # Cost volumes
@@ -198,15 +200,15 @@ def test_a_point_that_is_not_in_front_of_the_source_is_projected_from_a_thousand
     """Pixel (1, 0) at depth 2 is (2, 0, 2), and (2, 0, -3) in the source: x = 2 / 0.001."""
     transform = torch.eye(4)
     transform[2, 3] = -5
-    grid = sampling_grid(torch.eye(3), transform, torch.full((1, 2, 3), 2.0))
+    grid = compute_sampling_grid(torch.eye(3), transform, torch.full((1, 2, 3), 2.0))
     assert grid[0, 0, 1].tolist() == pytest.approx([1999.0, -1.0], rel=1e-5)
 
 
 def test_a_point_is_compared_with_the_pixel_where_the_source_sees_it():
     """At depth 3.6 a baseline of 0.4 moves the pixels of an 8 pixel wide map by 0.8."""
-    K = camera_pair().intrinsics(8, 8)[0, 0]
-    transform = camera_pair().sources_from_views(torch.tensor([[[1], [0]]]))[0, 0, 0]
-    grid = sampling_grid(K, transform, torch.full((1, 8, 8), 3.6))
+    K = camera_pair().scale_intrinsics(8, 8)[0, 0]
+    transform = camera_pair().compute_sources_from_views(torch.tensor([[[1], [0]]]))[0, 0, 0]
+    grid = compute_sampling_grid(K, transform, torch.full((1, 8, 8), 3.6))
     columns = (grid[0, 2, :, 0] + 1) / 2 * 7
     assert torch.allclose(columns, torch.arange(8) - 0.8, atol=1e-5)
 
@@ -216,10 +218,10 @@ def test_the_size_of_the_chunks_changes_nothing():
     features = torch.randn(2, 32, 8, 8, generator=generator)
     candidates = torch.linspace(0.01, 1, 20)[None, :, None, None].expand(2, -1, 1, 1)
     sources = torch.tensor([[[1], [0]]])
-    whole = cost_volume(features, camera_pair(), sources, candidates, 20)
+    whole = compute_cost_volume(features, camera_pair(), sources, candidates, 20)
     assert whole.abs().max() > 0.1
     for size in (1, 7):
-        parts = cost_volume(features, camera_pair(), sources, candidates, size)
+        parts = compute_cost_volume(features, camera_pair(), sources, candidates, size)
         assert_close(parts, whole, "costs")
 
 
@@ -241,7 +243,7 @@ def test_finer_candidates_lie_around_the_coarse_estimate():
     low, high = torch.full((1, 1, 1, 1), 0.01), torch.full((1, 1, 1, 1), 2.0)
     coarse = torch.tensor([1.0, 0.05, 1.95]).view(1, 1, 1, 3)
     interval = torch.full((1, 1, 1, 1), 0.01)
-    candidates = candidates_around(coarse, interval, 32, low, high)[0, :, 0]
+    candidates = sample_candidates(coarse, interval, 32, low, high)[0, :, 0]
     assert candidates[:, 0].tolist() == pytest.approx([0.84 + 0.01 * i for i in range(32)])
     # The end that would lie beyond a limit is moved there; the others close up evenly.
     assert candidates[:, 1].tolist() == pytest.approx([0.01 + i * 0.19 / 31 for i in range(32)])
@@ -253,7 +255,7 @@ def test_the_nearest_views_are_the_closest_others():
     c2w[0, :, 0, 3] = torch.tensor([0.0, 1.0, 3.0, 3.5, 10.0])
     cameras = Cameras(c2w, torch.eye(3).repeat(1, 5, 1, 1), torch.ones(1, 5), torch.ones(1, 5) * 2)
     expected = [[1, 2], [0, 2], [3, 1], [2, 1], [3, 2]]
-    assert nearest_views(cameras, 2)[0].tolist() == expected
+    assert find_nearest_views(cameras, 2)[0].tolist() == expected
 
 
 # Networks
@@ -335,7 +337,7 @@ def test_quats_and_scales_stand_for_the_camera_covariance_turned_into_the_world(
     cameras = camera_pair()
     cameras.c2w[0, :, :3, :3] = random_rotations(2).float()
     ones = torch.ones(1, 2, 4, 5)
-    gaussians = in_world(scales, ones, raw, scales, ones, scales[..., None, :], cameras)
+    gaussians = place_in_world(scales, ones, raw, scales, ones, scales[..., None, :], cameras)
 
     c2w = cameras.c2w[:, :, None, None, :3, :3].double()
     own = torch.from_numpy(Rotation.from_quat(raw.reshape(-1, 4)).as_matrix()).view(
@@ -343,7 +345,7 @@ def test_quats_and_scales_stand_for_the_camera_covariance_turned_into_the_world(
     )
     spread = own * scales[..., None, :]
     expected = c2w @ spread @ spread.transpose(-1, -2) @ c2w.transpose(-1, -2)
-    axes = rotations_from(gaussians.quats) * gaussians.scales[..., None, :]
+    axes = quats_to_rotations(gaussians.quats) * gaussians.scales[..., None, :]
     assert_close(axes @ axes.transpose(-1, -2), expected, "covariances")
 
 
@@ -374,8 +376,8 @@ def test_gaussians_move_with_the_cameras(name):
         after = network(name)(stereo_images(), replace(here, c2w=move @ here.c2w))
     assert relative_error(after.means, before.means @ turned.T + move[:3, 3]) < 1e-3
     assert relative_error(after.scales, before.scales) < 1e-3
-    rotations = turned @ rotations_from(before.quats)
-    assert (rotations_from(after.quats) - rotations).abs().quantile(0.99) < 1e-2
+    rotations = turned @ quats_to_rotations(before.quats)
+    assert (quats_to_rotations(after.quats) - rotations).abs().quantile(0.99) < 1e-2
 
 
 @pytest.mark.parametrize("name", NETWORKS)
@@ -428,7 +430,7 @@ def test_gaussians_belong_to_pixels_of_the_whole_image(name, coefficients):
 
 def test_depth_of_mvsplat_is_a_distance_and_depth_of_depthsplat_is_z():
     views = [off_centre(x, 64, 64) for x in (-0.2, 0.2)]
-    images, cameras, _ = batch_of(views, 16, 1.0, 100.0)
+    images, cameras, _ = create_batch(views, 16, 1.0, 100.0)
     for name in NETWORKS:
         with torch.no_grad():
             predicted = network(name)(images, cameras)
@@ -441,7 +443,7 @@ def test_depth_of_mvsplat_is_a_distance_and_depth_of_depthsplat_is_z():
 
 def test_cameras_without_a_depth_range_take_that_of_the_model():
     known, unknown = off_centre(0, 64, 64), off_centre(0.2, 64, 64, near=None, far=None)
-    _, cameras, _ = batch_of([known, unknown], 16, 1.0, 100.0)
+    _, cameras, _ = create_batch([known, unknown], 16, 1.0, 100.0)
     assert cameras.near.tolist() == [[0.5, 1.0]]
     assert cameras.far.tolist() == [[20.0, 100.0]]
 
@@ -469,14 +471,14 @@ def test_any_number_of_views_will_do(name, number):
 
 def test_crops_are_central_of_one_size_and_as_large_as_patches_allow():
     cameras = [replace(camera_at(), height=h, width=w) for h, w in ((270, 480), (300, 450))]
-    assert central_crops(cameras, 64) == [Crop(7, 16, 256, 448), Crop(22, 1, 256, 448)]
+    assert compute_central_crops(cameras, 64) == [Crop(7, 16, 256, 448), Crop(22, 1, 256, 448)]
 
 
 def test_of_a_wider_view_the_network_sees_what_it_sees_of_the_others():
     """Widening a camera keeps its rays, so the crop is the image as it was."""
     views = [off_centre(x, 64, 64) for x in (-0.2, 0.2)]
-    window = widened(views[0].camera, 0.25)
-    camera, left, top = window.wide, window.left, window.top
+    window = pad_camera(views[0].camera, 0.25)
+    camera, left, top = window.padded, window.left, window.top
     wide = view_of(Room(), camera)
     model = FeedForward(network("mvsplat"))
     narrow, mixed = model(views), model([wide, views[1]])

@@ -12,7 +12,7 @@ from pathlib import Path
 import pytest
 
 from gscompleter import InputError
-from gscompleter.io.files import check_output, output_folder, replacing
+from gscompleter.io.files import check_output, open_output_folder, replace_file
 
 
 def tree(folder: Path) -> dict[str, str]:
@@ -38,7 +38,7 @@ def write_results(folder: Path) -> None:
 
 
 def test_overwriting_replaces_our_entries_and_leaves_those_of_the_user(results):
-    with output_folder(results, overwrite=True) as folder:
+    with open_output_folder(results, overwrite=True) as folder:
         write_results(folder)
     assert tree(results) == {
         "completed.ply": "new",
@@ -53,7 +53,7 @@ def test_the_summary_leaves_first_and_arrives_last(results, monkeypatch):
     moved = []
     rename = os.rename
     monkeypatch.setattr(os, "rename", lambda a, b: (moved.append(Path(a)), rename(a, b)))
-    with output_folder(results, overwrite=True) as folder:
+    with open_output_folder(results, overwrite=True) as folder:
         write_results(folder)
     moved = moved[1:]  # the draft itself, into the folder
     assert len(moved) == 6
@@ -64,7 +64,7 @@ def test_the_summary_leaves_first_and_arrives_last(results, monkeypatch):
 @pytest.mark.parametrize("stop", [KeyboardInterrupt, RuntimeError, SystemExit])
 def test_whatever_stops_a_run_leaves_the_results_as_they_were(results, stop):
     before = tree(results)
-    with pytest.raises(stop), output_folder(results, overwrite=True) as folder:
+    with pytest.raises(stop), open_output_folder(results, overwrite=True) as folder:
         write_results(folder)
         raise stop
     assert tree(results) == before
@@ -86,7 +86,7 @@ def test_a_rename_that_fails_takes_all_others_back(results, monkeypatch, failing
     monkeypatch.setattr(os, "rename", fails_once)
     with (
         pytest.raises(InputError, match="Cannot write"),
-        output_folder(results, overwrite=True) as folder,
+        open_output_folder(results, overwrite=True) as folder,
     ):
         write_results(folder)
     assert tree(results) == before
@@ -94,7 +94,7 @@ def test_a_rename_that_fails_takes_all_others_back(results, monkeypatch, failing
 
 
 def test_a_full_disk_is_one_sentence_about_the_folder_asked_for(tmp_path):
-    with pytest.raises(InputError) as error, output_folder(tmp_path / "out") as folder:
+    with pytest.raises(InputError) as error, open_output_folder(tmp_path / "out") as folder:
         (folder / "a").write_text("half")
         raise OSError(errno.ENOSPC, "No space left on device")
     assert str(error.value).startswith(f"Cannot write {tmp_path / 'out'}: there is no space left")
@@ -105,8 +105,8 @@ def test_the_temporary_name_is_not_told_to_the_user(tmp_path):
     (tmp_path / "out").mkdir()
     with (
         pytest.raises(InputError) as error,
-        output_folder(tmp_path / "out") as folder,
-        replacing(folder / "missing" / "completed.ply"),
+        open_output_folder(tmp_path / "out") as folder,
+        replace_file(folder / "missing" / "completed.ply"),
     ):
         pass
     assert str(error.value).startswith(f"Cannot write {tmp_path / 'out'}/missing/completed.ply: ")
@@ -136,7 +136,7 @@ def test_a_folder_that_cannot_take_results_is_refused_before_any_computing(tmp_p
 def test_a_folder_of_results_alone_is_replaced_in_one_step(results, monkeypatch):
     (results / "mine.txt").unlink()
     monkeypatch.setattr(os, "rename", lambda *_: pytest.fail("nothing is moved by itself"))
-    with output_folder(results, overwrite=True) as folder:
+    with open_output_folder(results, overwrite=True) as folder:
         write_results(folder)
     assert tree(results) == {"completed.ply": "new", "images/new.png": "new", "summary.json": "new"}
     assert os.listdir(results.parent) == ["out"]
@@ -148,7 +148,7 @@ def test_where_folders_cannot_change_places_the_entries_are_renamed(results, mon
 
     (results / "mine.txt").unlink()
     monkeypatch.setattr("gscompleter.io.files._exchange", cannot)
-    with output_folder(results, overwrite=True) as folder:
+    with open_output_folder(results, overwrite=True) as folder:
         write_results(folder)
     assert tree(results) == {"completed.ply": "new", "images/new.png": "new", "summary.json": "new"}
     assert os.listdir(results.parent) == ["out"]
@@ -158,7 +158,7 @@ def test_the_working_directory_stays_the_folder_it_is(results, monkeypatch):
     (results / "mine.txt").unlink()
     monkeypatch.chdir(results)
     inode = results.stat().st_ino
-    with output_folder(".", overwrite=True) as folder:
+    with open_output_folder(".", overwrite=True) as folder:
         write_results(folder)
     assert results.stat().st_ino == inode
     assert Path("summary.json").read_text() == "new"
@@ -177,7 +177,7 @@ def test_what_cannot_be_put_back_is_not_thrown_away(results, monkeypatch):
         patched.setattr(os, "rename", fails_from_the_fourth_on)
         with (
             pytest.raises(InputError, match="Cannot write"),
-            output_folder(results, overwrite=True) as folder,
+            open_output_folder(results, overwrite=True) as folder,
         ):
             write_results(folder)
     check_output(results, overwrite=True)
@@ -192,7 +192,7 @@ def test_what_cannot_be_put_back_is_not_thrown_away(results, monkeypatch):
 
 def test_what_a_killed_run_left_does_not_make_a_folder_occupied(tmp_path):
     (tmp_path / "out" / ".gscompleter-0123").mkdir(parents=True)
-    with output_folder(tmp_path / "out") as folder:
+    with open_output_folder(tmp_path / "out") as folder:
         (folder / "summary.json").write_text("new")
     assert (tmp_path / "out" / "summary.json").read_text() == "new"
 
@@ -200,7 +200,7 @@ def test_what_a_killed_run_left_does_not_make_a_folder_occupied(tmp_path):
 def test_a_linked_folder_stays_a_link(tmp_path):
     (tmp_path / "real").mkdir()
     (tmp_path / "link").symlink_to(tmp_path / "real")
-    with output_folder(tmp_path / "link") as folder:
+    with open_output_folder(tmp_path / "link") as folder:
         (folder / "summary.json").write_text("new")
     assert (tmp_path / "link").is_symlink()
     assert tree(tmp_path / "real") == {"summary.json": "new"}
@@ -208,13 +208,13 @@ def test_a_linked_folder_stays_a_link(tmp_path):
 
 WRITES = """
 import os, signal, sys, time
-from gscompleter.interrupts import treat_stops_alike
-from gscompleter.io.files import output_folder, replacing
+from gscompleter.io.interrupts import handle_stop_signals
+from gscompleter.io.files import open_output_folder, replace_file
 
 for number in (signal.SIGTERM, signal.SIGHUP):
     signal.signal(number, signal.SIG_DFL)  # nohup and shells in the background ignore some
 signal.signal(signal.SIGINT, signal.default_int_handler)
-treat_stops_alike()
+handle_stop_signals()
 out, renames = sys.argv[1], int(sys.argv[2])
 rename = os.rename
 def waits(a, b):
@@ -278,11 +278,12 @@ def test_a_process_that_is_told_to_stop_cleans_up(tmp_path, results, number):
 @pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGHUP, signal.SIGINT])
 def test_an_interrupt_while_results_are_replaced_leaves_nothing_behind(results, number):
     code = (
-        "import os, shutil, sys\nfrom gscompleter.interrupts import treat_stops_alike\n"
-        "from gscompleter.io import unfinished\nfrom gscompleter.io.files import output_folder\n"
+        "import os, shutil, sys\nfrom gscompleter.io.interrupts import handle_stop_signals\n"
+        "from gscompleter.io import unfinished\nfrom gscompleter.io.files import "
+        "open_output_folder\n"
         "import signal\nsignal.signal(signal.SIGTERM, signal.SIG_DFL)\n"
         "signal.signal(signal.SIGHUP, signal.SIG_DFL)\n"
-        "signal.signal(signal.SIGINT, signal.default_int_handler)\ntreat_stops_alike()\n"
+        "signal.signal(signal.SIGINT, signal.default_int_handler)\nhandle_stop_signals()\n"
         "rmtree = shutil.rmtree\n"
         "def stopped(*words, **others):\n"
         "    os.kill(os.getpid(), int(sys.argv[2]))\n"
@@ -303,7 +304,7 @@ def test_an_interrupt_while_results_are_replaced_leaves_nothing_behind(results, 
 def test_the_draft_of_a_living_process_is_left_alone(tmp_path):
     with writing(tmp_path / "out"):
         check_output(tmp_path / "out")
-        with replacing(tmp_path / "other") as file:
+        with replace_file(tmp_path / "other") as file:
             file.write(b"done")
         assert len([p for p in tmp_path.iterdir() if p.name.startswith(".gscompleter-")]) == 1
     check_output(tmp_path / "out")
@@ -327,12 +328,12 @@ def test_what_was_killed_between_its_renames_is_finished_by_the_next_run(results
 
 def test_a_file_that_a_killed_process_left_is_removed_by_the_next(tmp_path):
     code = (
-        "import os, signal, sys\nfrom gscompleter.io.files import replacing\n"
+        "import os, signal, sys\nfrom gscompleter.io.files import replace_file\n"
         "with replacing(sys.argv[1]): os.kill(os.getpid(), signal.SIGKILL)\n"
     )
     subprocess.run([sys.executable, "-c", code, str(tmp_path / "a")], check=False)
     assert len(os.listdir(tmp_path)) == 1
-    with replacing(tmp_path / "b") as file:
+    with replace_file(tmp_path / "b") as file:
         file.write(b"done")
     assert os.listdir(tmp_path) == ["b"]
 
@@ -340,11 +341,11 @@ def test_a_file_that_a_killed_process_left_is_removed_by_the_next(tmp_path):
 def test_a_file_written_in_place_of_another_keeps_it_until_the_end(tmp_path):
     path = tmp_path / "scene.ply"
     path.write_bytes(b"old")
-    with pytest.raises(RuntimeError), replacing(path) as file:
+    with pytest.raises(RuntimeError), replace_file(path) as file:
         file.write(b"half")
         raise RuntimeError
     assert path.read_bytes() == b"old"
-    with replacing(path) as file:
+    with replace_file(path) as file:
         file.write(b"new")
         file.flush()
         assert path.read_bytes() == b"old"
@@ -353,5 +354,5 @@ def test_a_file_written_in_place_of_another_keeps_it_until_the_end(tmp_path):
 
 
 def test_a_folder_is_no_place_for_a_file(tmp_path):
-    with pytest.raises(InputError, match="that is a folder; name a file"), replacing(tmp_path):
+    with pytest.raises(InputError, match="that is a folder; name a file"), replace_file(tmp_path):
         pass

@@ -13,15 +13,24 @@ import pytest
 import torch
 
 from command import run
+from gscompleter.apps.report.film import (
+    FRAMES_PER_SECOND,
+    GAP_PIXELS,
+    choose_stops,
+    crop_to_even,
+    draw_corner_label,
+    render_frame,
+    render_frames,
+    write_comparison_video,
+)
+from gscompleter.apps.report.film_path import measure_roll, plan_camera_path
 from gscompleter.errors import InputError
-from gscompleter.geometry import baseline_between, rotation_between
-from gscompleter.io.video import check_writer, write_video
-from gscompleter.progress import shown_on
+from gscompleter.geometry import measure_baseline, measure_rotation, resize_camera
+from gscompleter.io.video import check_video_writer, write_video
+from gscompleter.progress import show_progress
 from gscompleter.render import load_renderer
-from gscompleter.reports.film import GAP, RATE, even, frame, frames, labelled, stops, write_film
-from gscompleter.reports.film_path import path_through, roll
-from gscompleter.stages.candidates import resized
-from gscompleter.types import Camera, Completion, DepthAffine, TargetCompletion, merge
+from gscompleter.state import Completion, TargetResult
+from gscompleter.types import Camera, DepthAffine, merge
 from scenes import Room, camera_at, half_a_room_of
 
 UP = torch.tensor([0.0, -1.0, 0.0])
@@ -54,7 +63,7 @@ def completion() -> Completion:
     target = camera_at(0.4, yaw=6, size=SIZE)
     drawn = load_renderer("reference").render(context, target)
     mask = torch.zeros(SIZE, SIZE, dtype=torch.bool)
-    made = TargetCompletion(target, drawn, drawn, mask, None, 0, False, DepthAffine(), right)
+    made = TargetResult(target, drawn, drawn, mask, None, 0, False, DepthAffine(), right)
     scene = merge([context, right])
     return Completion(scene, context, (view,), ((),), (made,), {"total": 0.0})
 
@@ -70,16 +79,16 @@ def decoded(path: Path) -> tuple[dict, np.ndarray]:
 
 def test_the_way_leads_from_stop_to_stop():
     cameras = [camera_at(size=SIZE), camera_at(1.0, yaw=20, size=SIZE), camera_at(1.0, 1.0)]
-    way = path_through(cameras, [], 12)
+    way = plan_camera_path(cameras, [], 12)
     assert len(way) == 25
     for number, stop in zip((0, 12, 24), cameras, strict=True):
-        assert baseline_between(way[number], stop) < 1e-5
-        assert rotation_between(way[number], stop) < 0.1
+        assert measure_baseline(way[number], stop) < 1e-5
+        assert measure_rotation(way[number], stop) < 0.1
 
 
 def test_the_camera_rests_at_each_stop_and_jerks_nowhere():
-    way = path_through([camera_at(x, size=SIZE) for x in (0.0, 1.0, 0.0)], [], 48)
-    steps = torch.tensor([baseline_between(a, b) for a, b in pairwise(way)])
+    way = plan_camera_path([camera_at(x, size=SIZE) for x in (0.0, 1.0, 0.0)], [], 48)
+    steps = torch.tensor([measure_baseline(a, b) for a, b in pairwise(way)])
     fastest = steps.max().item()
     assert fastest < 2 / 48  # twice as fast as on the average, at most
     assert max(steps[k].item() for k in (0, 47, 48, 95)) < 0.1 * fastest
@@ -88,14 +97,14 @@ def test_the_camera_rests_at_each_stop_and_jerks_nowhere():
 
 def test_the_horizon_stays_level_between_level_cameras():
     first, second = (pitched(camera_at(yaw=y, size=SIZE), 30) for y in (-40, 40))
-    way = path_through([first, second], [pitched(camera_at(yaw=0, size=SIZE), -20)], 24)
-    assert max(abs(roll(camera, UP)) for camera in way) < 1e-3
+    way = plan_camera_path([first, second], [pitched(camera_at(yaw=0, size=SIZE), -20)], 24)
+    assert max(abs(measure_roll(camera, UP)) for camera in way) < 1e-3
 
 
 def test_the_way_goes_around_what_was_photographed_and_not_through_it():
     photographs = [on_a_circle(degrees) for degrees in range(-90, 91, 15)]
     ends = [on_a_circle(-90), on_a_circle(90)]
-    around, straight = path_through(ends, photographs, 48), path_through(ends, [], 48)
+    around, straight = plan_camera_path(ends, photographs, 48), plan_camera_path(ends, [], 48)
     assert min(camera.center.norm().item() for camera in around) > 0.9
     assert min(camera.center.norm().item() for camera in straight) < 0.1
 
@@ -103,31 +112,31 @@ def test_the_way_goes_around_what_was_photographed_and_not_through_it():
 @pytest.mark.parametrize("size", [(48, 32), (256, 256), (200, 600), (640, 480)])
 def test_a_film_is_wide_enough(completion, size):
     width, height = size
-    target = resized(completion.targets[0].target, width, height)
+    target = resize_camera(completion.targets[0].target, width, height)
     result = replace(completion.targets[0], target=target)
-    lens = stops(replace(completion, targets=(result,)))[0]
-    assert 2 * lens.width + GAP >= 720
+    lens = choose_stops(replace(completion, targets=(result,)))[0]
+    assert 2 * lens.width + GAP_PIXELS >= 720
     assert lens.width / lens.height == pytest.approx(width / height, rel=0.02)
     assert max(lens.width, lens.height) <= max(640, 720 * max(height / width, 1))
 
 
 def test_sides_are_even():
-    camera = even(replace(camera_at(size=SIZE), width=33, height=31))
+    camera = crop_to_even(replace(camera_at(size=SIZE), width=33, height=31))
     assert (camera.width, camera.height) == (32, 30)
 
 
 def test_the_film_starts_at_the_nearest_photograph(completion):
     (view,) = completion.views
     far = replace(view, camera=camera_at(-2.0, size=SIZE))
-    first, target = stops(replace(completion, views=(far, view)))
+    first, target = choose_stops(replace(completion, views=(far, view)))
     assert torch.equal(first.c2w, view.camera.c2w)
     assert torch.equal(target.c2w, completion.targets[0].target.c2w)
 
 
 def test_a_frame_shows_before_and_after_side_by_side(completion):
-    picture = frame(completion, completion.views[0].camera, load_renderer("reference"))
-    assert picture.shape == (SIZE, 2 * SIZE + GAP, 3)
-    before, gap, after = np.split(picture, (SIZE, SIZE + GAP), axis=1)
+    picture = render_frame(completion, completion.views[0].camera, load_renderer("reference"))
+    assert picture.shape == (SIZE, 2 * SIZE + GAP_PIXELS, 3)
+    before, gap, after = np.split(picture, (SIZE, SIZE + GAP_PIXELS), axis=1)
     assert (gap == 255).all()
     below = slice(SIZE - 8, SIZE)  # of the labels
     known, hole = slice(0, SIZE // 2 - 4), slice(SIZE // 2 + 4, SIZE)
@@ -137,7 +146,7 @@ def test_a_frame_shows_before_and_after_side_by_side(completion):
 
 def test_a_label_can_be_read_on_black_and_on_white():
     for shade in (0, 255):
-        picture = labelled(np.full((256, 256, 3), shade, dtype=np.uint8), "before")
+        picture = draw_corner_label(np.full((256, 256, 3), shade, dtype=np.uint8), "before")
         changed = np.abs(picture.astype(int) - shade).max(axis=-1) > 0
         where = picture[changed]
         assert 0.001 < changed.mean() < 0.05
@@ -147,7 +156,7 @@ def test_a_label_can_be_read_on_black_and_on_white():
 
 def test_the_way_back_is_the_way_there(completion):
     cameras = [camera_at(x, size=SIZE) for x in (0.0, 0.1, 0.2, 0.3)]
-    drawn = list(frames(completion, cameras, load_renderer("reference")))
+    drawn = list(render_frames(completion, cameras, load_renderer("reference")))
     assert len(drawn) == 6
     assert all((a == b).all() for a, b in zip(drawn[1:], drawn[:0:-1], strict=True))
 
@@ -158,16 +167,16 @@ def test_the_file_holds_the_frames(tmp_path):
         np.stack([rows * 4, columns * 3, np.full_like(rows, 20 * k)], -1).astype(np.uint8)
         for k in range(10)
     ]
-    write_video(tmp_path / "a.mp4", shown, RATE)
+    write_video(tmp_path / "a.mp4", shown, FRAMES_PER_SECOND)
     meta, found = decoded(tmp_path / "a.mp4")
-    assert (meta["codec"], meta["fps"], meta["size"]) == ("h264", RATE, (64, 48))
+    assert (meta["codec"], meta["fps"], meta["size"]) == ("h264", FRAMES_PER_SECOND, (64, 48))
     assert meta["pix_fmt"].startswith("yuv420p")
     assert found.shape == (10, 48, 64, 3)
     assert np.abs(found.astype(int) - np.stack(shown)).mean() < 0.02 * 255
 
 
 def test_a_player_meets_the_index_first(tmp_path):
-    write_video(tmp_path / "a.mp4", [np.zeros((16, 16, 3), np.uint8)] * 3, RATE)
+    write_video(tmp_path / "a.mp4", [np.zeros((16, 16, 3), np.uint8)] * 3, FRAMES_PER_SECOND)
     content = (tmp_path / "a.mp4").read_bytes()
     assert 0 < content.index(b"moov") < content.index(b"mdat")
 
@@ -175,7 +184,7 @@ def test_a_player_meets_the_index_first(tmp_path):
 def test_a_film_that_cannot_be_written_says_so(tmp_path):
     picture = np.zeros((16, 16, 3), np.uint8)
     with pytest.raises(InputError, match="ffmpeg could not write"):
-        write_video(tmp_path / "no such folder" / "a.mp4", [picture] * 200, RATE)
+        write_video(tmp_path / "no such folder" / "a.mp4", [picture] * 200, FRAMES_PER_SECOND)
 
 
 def test_whoever_stops_it_leaves_no_ffmpeg_behind(tmp_path, monkeypatch):
@@ -195,13 +204,15 @@ def test_whoever_stops_it_leaves_no_ffmpeg_behind(tmp_path, monkeypatch):
         raise KeyboardInterrupt
 
     with pytest.raises(KeyboardInterrupt):
-        write_video(tmp_path / "a.mp4", stopped(), RATE)
+        write_video(tmp_path / "a.mp4", stopped(), FRAMES_PER_SECOND)
     assert started[-1].poll() is not None
 
 
 def test_no_film_without_a_target(completion, tmp_path):
-    nothing = replace(completion, drawn=completion.context, targets=())
-    write_film(tmp_path, nothing, [completion.views[0].camera], load_renderer("reference"))
+    nothing = replace(completion, rendered_scene=completion.context, targets=())
+    write_comparison_video(
+        tmp_path, nothing, [completion.views[0].camera], load_renderer("reference")
+    )
     assert list(tmp_path.iterdir()) == []
 
 
@@ -209,8 +220,8 @@ def test_the_same_completion_gives_the_same_bytes(completion, tmp_path):
     renderer, photographs = load_renderer("cpu"), [view.camera for view in completion.views]
     for name in ("a", "b"):
         (tmp_path / name).mkdir()
-        with shown_on(None):
-            write_film(tmp_path / name, completion, photographs, renderer)
+        with show_progress(None):
+            write_comparison_video(tmp_path / name, completion, photographs, renderer)
     first, second = ((tmp_path / name / "video.mp4").read_bytes() for name in ("a", "b"))
     assert first == second
     _, found = decoded(tmp_path / "a" / "video.mp4")
@@ -235,7 +246,7 @@ def test_without_the_extra_nothing_is_begun(room, tmp_path, monkeypatch, capsys)
     monkeypatch.setitem(sys.modules, "imageio_ffmpeg", None)
     monkeypatch.setattr("gscompleter.io.video.find_spec", lambda name: None)
     with pytest.raises(InputError, match="imageio-ffmpeg"):
-        check_writer()
+        check_video_writer()
     assert run(monkeypatch, "complete", room, *SMALL, "--video", "--out", tmp_path / "out") == 2
     said = capsys.readouterr().err
     assert "pip install gscompleter[film]" in said

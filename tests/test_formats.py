@@ -11,8 +11,7 @@ from PIL import Image
 from chunk_files import SIZE, VIEWS, example, pixels_of, row_of, save_chunk, save_dataset
 from command import run
 from gscompleter import InputError
-from gscompleter.data.cases import read_cases
-from gscompleter.data.datasets import open_clips
+from gscompleter.data.cases import open_clips, read_cases
 from gscompleter.data.formats import FORMATS, open_photographs, refuse_scenes_below
 from gscompleter.data.photographs import PosedPhotographs
 from gscompleter.data.real_estate import read_camera_file
@@ -55,13 +54,13 @@ def test_all_formats_give_the_same_views(tmp_path, resolution):
     truth = clips[0].views([1, 4], resolution)
     for clip in clips:
         assert isinstance(clip, PosedPhotographs)
-        assert (clip.name, len(clip), clip.reason_to_skip((SIZE, SIZE))) == ("room", 5, None)
+        assert (clip.name, len(clip), clip.find_skip_reason((SIZE, SIZE))) == ("room", 5, None)
         for view, true in zip(clip.views([1, 4], resolution), truth, strict=True):
             assert view.frame == true.frame
             assert torch.equal(view.image, true.image)
             assert torch.allclose(view.camera.c2w, true.camera.c2w, atol=1e-6)
             assert torch.allclose(view.camera.K, true.camera.K, atol=1e-4)
-        assert "64 × 64 and not 9 × 9" in (clip.reason_to_skip((9, 9)) or "")
+        assert "64 × 64 and not 9 × 9" in (clip.find_skip_reason((9, 9)) or "")
 
 
 def test_a_folder_of_scenes_or_camera_files_is_opened_in_order(tmp_path):
@@ -120,7 +119,7 @@ def test_a_missing_photograph_is_named_when_asked_for(tmp_path):
     assert len(clip.views([0, 1, 3])) == 3
     with pytest.raises(InputError, match=r"image of frame 2 of .*room.txt is missing; put .*66732"):
         clip.views([2])
-    assert clip.reason_to_skip((SIZE, SIZE)) == "frame 2: its image is missing"
+    assert clip.find_skip_reason((SIZE, SIZE)) == "frame 2: its image is missing"
     with pytest.raises(InputError, match="no frame 5 in .*room.txt"):
         clip.views([5])
 

@@ -9,19 +9,19 @@ from scipy.spatial.transform import Rotation
 
 from command import run
 from gscompleter.data.formats import open_photographs
-from gscompleter.data.origin import origin_of, told_from
+from gscompleter.data.local_origin import choose_scene_origin, shift_to_origin
 from gscompleter.errors import InputError
-from gscompleter.frames.beside import GivenSplat, camera_lists, in_common
-from gscompleter.frames.finding import SplatFrame
-from gscompleter.frames.fit import FrameFit, ImageFit, frame_fit
-from gscompleter.frames.placing import frame_of_splat
-from gscompleter.frames.similarity import moved_pose, similarity
-from gscompleter.frames.thinning import thinned
-from gscompleter.frames.trainers import WORLDS
-from gscompleter.frames.witnesses import witnesses
-from gscompleter.io.ply import load_ply, save_ply
 from gscompleter.render import load_renderer
-from gscompleter.splats.frames import moved
+from gscompleter.render.lod import thin_gaussians
+from gscompleter.splat_alignment.estimate import SplatAlignment
+from gscompleter.splat_alignment.fit import ImageFit, SplatFit, score_splat
+from gscompleter.splat_alignment.placing import align_splat
+from gscompleter.splat_alignment.sample_views import sample_views
+from gscompleter.splat_alignment.sidecars import InputSplat, find_camera_lists, match_names
+from gscompleter.splat_alignment.similarity import make_similarity, transform_pose
+from gscompleter.splat_alignment.trainer_frames import NERFSTUDIO_WORLDS
+from gscompleter.splats.ply import load_ply, save_ply
+from gscompleter.splats.transform import transform_gaussians
 from gscompleter.types import merge
 from scenes import Room, camera_at, gaussians_of, photographed, view_of
 
@@ -30,7 +30,7 @@ CAMERAS = [
     camera_at(x, y, z, yaw, size=192)
     for x, y, z, yaw in ((-0.6, 0, 0, 6), (0, -0.3, 0.2, 0), (0.6, 0.1, 0, -6), (0.2, 0.3, 0.4, 0))
 ]
-ARBITRARY = similarity(
+ARBITRARY = make_similarity(
     0.3, Rotation.from_rotvec([0.9, -1.7, 0.4]).as_matrix(), np.array([5.0, 3.0, -2.0])
 )
 UTM = np.array([482_000.25, 5_458_000.5, 120.0])
@@ -49,19 +49,19 @@ def room(tmp_path):
 
 
 def in_frame(splat, transform):
-    return moved(splat, torch.from_numpy(transform).float())
+    return transform_gaussians(splat, torch.from_numpy(transform).float())
 
 
 def found_for(path, scene, room, origin=(0.0, 0.0, 0.0)):
-    given = GivenSplat(path, scene, np.array(origin), room)
-    return frame_of_splat(given, open_photographs(room), (0, 1), RENDERER)
+    given = InputSplat(path, scene, np.array(origin), room)
+    return align_splat(given, open_photographs(room), (0, 1), RENDERER)
 
 
 def write_cameras(path, transform, room, count=4):
     """Write the camera list of a trainer that worked in the frame of `transform`."""
     entries = []
     for number, frame in enumerate(open_photographs(room).frames[:count]):
-        pose = moved_pose(frame.c2w, transform)
+        pose = transform_pose(frame.c2w, transform)
         position, rotation = pose[:3, 3].tolist(), pose[:3, :3].tolist()
         shape = {"width": 96, "height": 96, "fx": 86.4, "fy": 86.4}
         name = {"id": number, "img_name": frame.name.split("/")[-1].split(".")[0]}
@@ -112,13 +112,13 @@ def test_one_wrong_camera_in_the_list_changes_nothing(room, splat, tmp_path):
 
 def test_cameras_of_another_splat_are_not_looked_at(tmp_path, splat):
     (tmp_path / "cameras_small.json").write_text("[]")
-    given = GivenSplat(tmp_path / "splat.ply", splat, np.zeros(3), tmp_path)
-    assert camera_lists(given) == []
+    given = InputSplat(tmp_path / "splat.ply", splat, np.zeros(3), tmp_path)
+    assert find_camera_lists(given) == []
 
 
-@pytest.mark.parametrize("world", WORLDS)
+@pytest.mark.parametrize("world", NERFSTUDIO_WORLDS)
 def test_nerfstudios_transform_leads_from_the_reconstruction(room, splat, tmp_path, world):
-    turn = similarity(1.0, world, np.zeros(3))
+    turn = make_similarity(1.0, world, np.zeros(3))
     write_dataparser(room / "dataparser_transforms.json", ARBITRARY @ turn)
     found = found_for(tmp_path / "splat.ply", in_frame(splat, ARBITRARY), room)
     assert found.method == "dataparser"
@@ -133,23 +133,23 @@ def test_a_damaged_list_of_cameras_is_named_where_it_is_needed(room, splat, tmp_
 
 
 def test_names_agree_without_ending_and_where_folders_repeat_them_with_folders():
-    assert in_common(["a/1.jpg", "a/2.jpg"], ["1.png", "2", "3"]) == [
+    assert match_names(["a/1.jpg", "a/2.jpg"], ["1.png", "2", "3"]) == [
         ("a/1.jpg", "1.png"),
         ("a/2.jpg", "2"),
     ]
     rig = ["left/1.jpg", "left/2.jpg", "right/1.jpg", "right/2.jpg"]
-    assert in_common(rig, [name[:-4] for name in rig]) == [(name, name[:-4]) for name in rig]
-    assert in_common(rig, ["1", "2"]) == []
+    assert match_names(rig, [name[:-4] for name in rig]) == [(name, name[:-4]) for name in rig]
+    assert match_names(rig, ["1", "2"]) == []
 
 
 def test_a_remote_scene_takes_a_splat_in_a_frame_of_its_own(room, splat, tmp_path):
     put_on_map(room, UTM)
     origin = open_photographs(room).origin
-    centred = in_frame(splat, similarity(1.0, np.eye(3), np.array([3.0, 0.0, 1.0])))
-    assert not origin_of(centred, origin).any()
-    expected = similarity(1.0, np.eye(3), np.array([3.0, 0.0, 1.0]) + origin - UTM)
+    centred = in_frame(splat, make_similarity(1.0, np.eye(3), np.array([3.0, 0.0, 1.0])))
+    assert not choose_scene_origin(centred, origin).any()
+    expected = make_similarity(1.0, np.eye(3), np.array([3.0, 0.0, 1.0]) + origin - UTM)
 
-    to_splat = similarity(1.0, np.eye(3), np.array([3.0, 0.0, 1.0]) - UTM)
+    to_splat = make_similarity(1.0, np.eye(3), np.array([3.0, 0.0, 1.0]) - UTM)
     write_dataparser(tmp_path / "dataparser_transforms.json", to_splat, scale=1.0)
     found = found_for(tmp_path / "splat.ply", centred, room)
     assert found.method == "dataparser"
@@ -164,9 +164,9 @@ def test_a_remote_scene_takes_a_splat_in_a_frame_of_its_own(room, splat, tmp_pat
 
 def test_a_splat_in_the_map_of_its_photographs_is_told_from_their_origin(splat):
     origin = np.array([3000.0, 1000.0, 0.0])
-    there = in_frame(splat, similarity(1.0, np.eye(3), origin))
-    assert np.array_equal(origin_of(there, origin), origin)
-    told = told_from(origin, there, CAMERAS)
+    there = in_frame(splat, make_similarity(1.0, np.eye(3), origin))
+    assert np.array_equal(choose_scene_origin(there, origin), origin)
+    told = shift_to_origin(origin, there, CAMERAS)
     assert torch.allclose(told.means, splat.means, atol=1e-3)
 
 
@@ -175,8 +175,8 @@ def test_a_result_is_relative_to_an_origin_where_the_splat_lies_there(
     room, splat, place, tmp_path, monkeypatch, capsys
 ):
     put_on_map(room, (3000.0, 1000.0, 0.0))
-    here = similarity(1.0, np.eye(3), np.array(place)) @ ARBITRARY
-    to_splat = here @ similarity(1.0, np.eye(3), np.array((-3000.0, -1000.0, 0.0)))
+    here = make_similarity(1.0, np.eye(3), np.array(place)) @ ARBITRARY
+    to_splat = here @ make_similarity(1.0, np.eye(3), np.array((-3000.0, -1000.0, 0.0)))
     write_cameras(tmp_path / "cameras.json", to_splat, room)
     given, out = tmp_path / "splat.ply", tmp_path / "out"
     save_ply(given, in_frame(splat, here))
@@ -202,35 +202,35 @@ def test_floaters_kilometres_away_change_nothing(splat, room, tmp_path):
 
 
 def test_a_large_splat_is_thinned_to_one_that_looks_alike(splat, room):
-    views = witnesses(open_photographs(room), (0, 1))
-    fewer = thinned(splat, len(splat) // 4)
+    views = sample_views(open_photographs(room), (0, 1))
+    fewer = thin_gaussians(splat, len(splat) // 4)
     assert len(splat) // 5 < len(fewer) <= len(splat) // 4
     assert fewer.means.unique(dim=0).shape == fewer.means.shape
-    full, thin = (frame_fit(scene, views, RENDERER) for scene in (splat, fewer))
-    assert thin.covered == pytest.approx(full.covered, abs=0.05)
+    full, thin = (score_splat(scene, views, RENDERER) for scene in (splat, fewer))
+    assert thin.coverage == pytest.approx(full.coverage, abs=0.05)
     assert thin.margin > full.margin - 3
-    assert thinned(splat, len(splat)) is splat
+    assert thin_gaussians(splat, len(splat)) is splat
 
 
 def fit_of(*margins, psnr=15.0, covered=0.8, drift=0.1):
-    return FrameFit(tuple(ImageFit(psnr, margin, covered, drift) for margin in margins))
+    return SplatFit(tuple(ImageFit(psnr, margin, covered, drift) for margin in margins))
 
 
 def test_two_photographs_that_show_the_splat_are_enough_and_one_of_many_is_not():
-    assert fit_of(4.0, 4.0, 0.1, -1.0, 0.3, 0.2, 0.5, 0.1).fits
-    assert not fit_of(4.0, 0.1, 0.1, -1.0, 0.3, 0.2, 0.5, 0.1).fits
-    assert fit_of(4.0).fits
-    assert not fit_of().fits
+    assert fit_of(4.0, 4.0, 0.1, -1.0, 0.3, 0.2, 0.5, 0.1).is_match
+    assert not fit_of(4.0, 0.1, 0.1, -1.0, 0.3, 0.2, 0.5, 0.1).is_match
+    assert fit_of(4.0).is_match
+    assert not fit_of().is_match
 
 
 def test_little_of_a_flat_wall_is_no_sign():
-    assert fit_of(0.0, 0.0, psnr=35.0).fits
-    assert not fit_of(0.0, 0.0, psnr=35.0, covered=0.1).fits
+    assert fit_of(0.0, 0.0, psnr=35.0).is_match
+    assert not fit_of(0.0, 0.0, psnr=35.0, covered=0.1).is_match
 
 
 def test_details_that_are_off_are_told():
-    off = SplatFrame("given", np.eye(4), fit_of(5.0, 5.0, drift=4.2), fit_of())
-    assert off.sentence() == (
+    off = SplatAlignment("given", np.eye(4), fit_of(5.0, 5.0, drift=4.2), fit_of())
+    assert off.describe() == (
         "The splat fits the photographs as it is, at 15.0 dB; but details are off by 4.2 px in "
         "images of 320 px."
     )
@@ -245,14 +245,14 @@ def test_any_similarity_of_a_real_splat_is_found(shared, seed):
     generator = np.random.default_rng(seed)
     scale = (0.3, 1.2, 7.0)[seed % 3]
     turn = Rotation.random(random_state=generator).as_matrix()
-    truth = similarity(scale, turn, 5 * scale * generator.normal(size=3))
+    truth = make_similarity(scale, turn, 5 * scale * generator.normal(size=3))
     splat = load_ply(fox / "splat.ply")
-    given = GivenSplat(fox.parent / "s.ply", in_frame(splat, truth), np.zeros(3), fox / "images")
+    given = InputSplat(fox.parent / "s.ply", in_frame(splat, truth), np.zeros(3), fox / "images")
     photographs = open_photographs(fox)
-    found = frame_of_splat(given, photographs, (0, 3), RENDERER)
+    found = align_splat(given, photographs, (0, 3), RENDERER)
     assert found.method == "similarity"
     assert np.abs(np.linalg.inv(truth) @ found.transform - np.eye(4)).max() < 3e-3
-    plain = frame_fit(splat, witnesses(photographs, (0, 3)), RENDERER)
+    plain = score_splat(splat, sample_views(photographs, (0, 3)), RENDERER)
     assert found.fit.psnr == pytest.approx(plain.psnr, abs=0.2)
 
 
@@ -262,6 +262,6 @@ def test_a_real_splat_of_another_scene_is_refused(shared, name):
     fox = shared / "splats" / "fox"
     if not fox.is_dir():
         pytest.skip(f"needs the splat of another trainer, and there is no folder {fox}")
-    given = GivenSplat(fox / "splat.ply", load_ply(fox / "splat.ply"), np.zeros(3), fox)
+    given = InputSplat(fox / "splat.ply", load_ply(fox / "splat.ply"), np.zeros(3), fox)
     with pytest.raises(InputError, match="give the photographs and poses"):
-        frame_of_splat(given, open_photographs(shared / "data" / name), (0, 2), RENDERER)
+        align_splat(given, open_photographs(shared / "data" / name), (0, 2), RENDERER)

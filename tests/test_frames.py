@@ -10,29 +10,34 @@ from scipy.spatial.transform import Rotation
 
 from gscompleter.data.formats import open_photographs
 from gscompleter.errors import InputError
-from gscompleter.frames.beside import GivenSplat
-from gscompleter.frames.finding import Evidence, find_frame
-from gscompleter.frames.fit import frame_fit
-from gscompleter.frames.placing import frame_of_splat
-from gscompleter.frames.similarity import (
-    moved_camera,
-    moved_pose,
-    moved_view,
-    pose_of,
-    scale_of,
-    similarity,
-    similarity_between,
-)
-from gscompleter.frames.trainers import gsplat_cameras, nerfstudio, opensplat, trainers_frames
-from gscompleter.io.ply import load_ply
 from gscompleter.render import load_renderer
-from gscompleter.splats.frames import moved
+from gscompleter.splat_alignment.estimate import AlignmentData, estimate_alignment
+from gscompleter.splat_alignment.fit import score_splat
+from gscompleter.splat_alignment.placing import align_splat
+from gscompleter.splat_alignment.sidecars import InputSplat
+from gscompleter.splat_alignment.similarity import (
+    fit_pose_similarity,
+    get_pose,
+    get_scale,
+    make_similarity,
+    transform_camera,
+    transform_pose,
+    transform_view,
+)
+from gscompleter.splat_alignment.trainer_frames import (
+    compute_trainer_frames,
+    normalize_gsplat_cameras,
+    normalize_nerfstudio,
+    normalize_opensplat,
+)
+from gscompleter.splats.ply import load_ply
+from gscompleter.splats.transform import transform_gaussians
 from gscompleter.types import merge
 from scenes import Room, camera_at, gaussians_of, random_gaussians, view_of
 
 RENDERER = load_renderer("cpu")
 PLACES = ((-0.6, 0.0, 0.0, 6.0), (0.0, -0.3, 0.2, 0.0), (0.6, 0.1, 0.0, -6.0), (0.2, 0.3, 0.4, 0))
-ARBITRARY = similarity(
+ARBITRARY = make_similarity(
     0.3, Rotation.from_rotvec([0.9, -1.7, 0.4]).as_matrix(), np.array([5.0, 3.0, -2.0])
 )
 
@@ -51,7 +56,7 @@ def splat(views):
 
 
 def poses_of(views):
-    return np.stack([pose_of(view.camera) for view in views])
+    return np.stack([get_pose(view.camera) for view in views])
 
 
 def points_of(splat):
@@ -60,8 +65,8 @@ def points_of(splat):
 
 def find(views, splat, transform=None, **more):
     if transform is not None:
-        splat = moved(splat, torch.from_numpy(transform).float())
-    return find_frame(Evidence(splat, views, RENDERER), poses_of(views), **more)
+        splat = transform_gaussians(splat, torch.from_numpy(transform).float())
+    return estimate_alignment(AlignmentData(splat, views, RENDERER), poses_of(views), **more)
 
 
 def assert_takes_to(found, truth, tolerance):
@@ -76,7 +81,12 @@ def test_a_splat_in_the_frame_of_its_photographs_stays_as_given(views, splat):
 
 
 @pytest.mark.parametrize(
-    "trainer", [opensplat, gsplat_cameras, lambda poses: nerfstudio(poses, np.eye(3))]
+    "trainer",
+    [
+        normalize_opensplat,
+        normalize_gsplat_cameras,
+        lambda poses: normalize_nerfstudio(poses, np.eye(3)),
+    ],
 )
 def test_what_trainers_do_is_computed_from_the_cameras(views, splat, trainer):
     truth = trainer(poses_of(views))
@@ -87,7 +97,7 @@ def test_what_trainers_do_is_computed_from_the_cameras(views, splat, trainer):
 
 def test_principal_axes_of_the_points_are_found_whatever_their_signs(views, splat):
     poses, points = poses_of(views), points_of(splat)
-    *_, truth = (transform for _, transform in trainers_frames(poses, points))
+    *_, truth = (transform for _, transform in compute_trainer_frames(poses, points))
     found = find(views, splat, truth, points=points)
     assert found.method == "normalised"
     assert_takes_to(found.transform, truth, 1e-6)
@@ -127,44 +137,44 @@ def test_a_splat_that_is_one_point_is_refused(views):
 
 def test_a_photograph_in_another_exposure_fits_as_well(views, splat):
     darker = [replace(view, image=0.7 * view.image + 0.1) for view in views]
-    plain, even = (frame_fit(splat, some, RENDERER) for some in (views, darker))
-    assert plain.fits
+    plain, even = (score_splat(splat, some, RENDERER) for some in (views, darker))
+    assert plain.is_match
     assert even.margin == pytest.approx(plain.margin, abs=0.2)
 
 
 def test_opensplat_centres_the_cameras_within_one():
-    poses = np.stack([similarity(1.0, np.eye(3), np.array([x, 4.0, 0.0])) for x in (1.0, 3.0)])
+    poses = np.stack([make_similarity(1.0, np.eye(3), np.array([x, 4.0, 0.0])) for x in (1.0, 3.0)])
     expected = [[1, 0, 0, -2], [0, 1, 0, -4], [0, 0, 1, 0], [0, 0, 0, 1]]
-    assert np.allclose(opensplat(poses), expected)
+    assert np.allclose(normalize_opensplat(poses), expected)
 
 
 def test_nerfstudio_turns_up_to_z(views):
-    transform = nerfstudio(poses_of(views), np.eye(3))
+    transform = normalize_nerfstudio(poses_of(views), np.eye(3))
     up = transform[:3, :3] @ [0.0, -1.0, 0.0]
-    assert np.allclose(up / scale_of(transform), [0, 0, 1])
+    assert np.allclose(up / get_scale(transform), [0, 0, 1])
 
 
 def test_one_wrong_pose_among_four_moves_a_similarity_by_nothing(views):
     before = poses_of(views)
-    after = np.stack([moved_pose(pose, ARBITRARY) for pose in before])
-    assert_takes_to(similarity_between(list(before), list(after)), ARBITRARY, 1e-6)
-    after[3] = moved_pose(after[3], similarity(1.0, np.diag([1.0, -1, -1]), np.ones(3)))
-    assert_takes_to(similarity_between(list(before), list(after)), ARBITRARY, 1e-6)
+    after = np.stack([transform_pose(pose, ARBITRARY) for pose in before])
+    assert_takes_to(fit_pose_similarity(list(before), list(after)), ARBITRARY, 1e-6)
+    after[3] = transform_pose(after[3], make_similarity(1.0, np.diag([1.0, -1, -1]), np.ones(3)))
+    assert_takes_to(fit_pose_similarity(list(before), list(after)), ARBITRARY, 1e-6)
 
 
 def test_a_moved_camera_sees_the_moved_splat_as_before(views, splat):
-    scene = moved(splat, torch.from_numpy(ARBITRARY).float())
+    scene = transform_gaussians(splat, torch.from_numpy(ARBITRARY).float())
     before = RENDERER.render(splat, views[0].camera)
-    after = RENDERER.render(scene, moved_camera(views[0].camera, ARBITRARY))
+    after = RENDERER.render(scene, transform_camera(views[0].camera, ARBITRARY))
     assert (before.image - after.image).abs().mean() < 1e-2  # equal depths change order
     assert torch.allclose(before.depth * 0.3, after.depth, rtol=1e-2, atol=1e-2)
-    view = moved_view(views[0], ARBITRARY)
+    view = transform_view(views[0], ARBITRARY)
     assert view.camera.near == pytest.approx(0.3 * views[0].camera.near)
-    assert torch.equal(view.depth, views[0].depth * scale_of(ARBITRARY))
+    assert torch.equal(view.depth, views[0].depth * get_scale(ARBITRARY))
 
 
 def test_the_identity_changes_no_bit(views):
-    assert moved_view(views[0], np.eye(4)) is views[0]
+    assert transform_view(views[0], np.eye(4)) is views[0]
 
 
 @pytest.mark.parametrize("name", ["splat.ply", "splat_normalised.ply"])
@@ -172,8 +182,8 @@ def test_a_real_splat_is_found_in_both_of_its_frames(shared, name):
     fox = shared / "splats" / "fox"
     if not fox.is_dir():
         pytest.skip(f"needs the splat of another trainer, and there is no folder {fox}")
-    splat = GivenSplat(fox / name, load_ply(fox / name), np.zeros(3), fox)
-    found = frame_of_splat(splat, open_photographs(fox), (0, 3), RENDERER)
+    splat = InputSplat(fox / name, load_ply(fox / name), np.zeros(3), fox)
+    found = align_splat(splat, open_photographs(fox), (0, 3), RENDERER)
     truth = np.eye(4)
     if name != "splat.ply":
         truth = np.array(json.loads((fox / "colmap_to_normalised.json").read_text())["matrix"])

@@ -7,9 +7,9 @@ import torch
 
 from gscompleter.config import FreeSpaceConfig
 from gscompleter.geometry import project
-from gscompleter.stages import free_space
-from gscompleter.stages.free_space import respect_free_space, seen_through
-from gscompleter.types import Gaussians, Render, observed
+from gscompleter.guards import free_space
+from gscompleter.guards.free_space import find_in_free_space, respect_free_space
+from gscompleter.types import Gaussians, Render, make_observed
 from scenes import camera_at
 
 SIZE = 32
@@ -26,7 +26,7 @@ def floaters(depth: float) -> Gaussians:
     """Make small Gaussians in front of the target camera."""
     x = torch.linspace(-0.3, 0.3, 7)
     means = torch.stack([x, 0 * x, torch.full((7,), depth)], dim=-1)
-    return observed(
+    return make_observed(
         means,
         torch.tensor([1.0, 0, 0, 0]).repeat(7, 1),
         torch.full((7, 3), 0.01),
@@ -69,10 +69,10 @@ def test_a_gaussian_just_beyond_the_border_shows_and_is_judged_by_the_border(mon
     x = (-1.5 - SIZE / 2) / WITNESS.K[0, 0].item() - 0.5
     just_outside = torch.tensor([[x, 0.0, 1.0]])
     far_outside = torch.tensor([[x - 1.0, 0.0, 1.0]])
-    assert seen_through(just_outside, [WITNESS], [wall(4.0)]).all()
-    assert not seen_through(far_outside, [WITNESS], [wall(4.0)]).any()
+    assert find_in_free_space(just_outside, [WITNESS], [wall(4.0)]).all()
+    assert not find_in_free_space(far_outside, [WITNESS], [wall(4.0)]).any()
     monkeypatch.setattr(free_space, "BORDER", 0)
-    assert not seen_through(just_outside, [WITNESS], [wall(4.0)]).any()
+    assert not find_in_free_space(just_outside, [WITNESS], [wall(4.0)]).any()
 
 
 @pytest.mark.parametrize("unit", [0.001, 1000.0])
@@ -101,6 +101,6 @@ def test_nothing_stands_where_a_camera_stood():
     """No Gaussian is nearer to a camera than all that it sees, not even behind it."""
     behind = WITNESS.center + torch.tensor([[0.0, 0.0, -0.3], [0.0, 0.0, -0.6]])
     assert WITNESS.near == 0.5
-    assert seen_through(behind, [WITNESS], [wall(4.0)]).tolist() == [True, False]
+    assert find_in_free_space(behind, [WITNESS], [wall(4.0)]).tolist() == [True, False]
     unknown = replace(WITNESS, near=None)
-    assert not seen_through(behind, [unknown], [wall(4.0)]).any()
+    assert not find_in_free_space(behind, [unknown], [wall(4.0)]).any()

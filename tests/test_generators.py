@@ -8,34 +8,34 @@ import pytest
 import torch
 
 from gscompleter import InputError, load_generator, load_renderer
-from gscompleter.generators.harmonize import gains
+from gscompleter.evaluation.metrics.image import psnr
+from gscompleter.generators.exposure import match_exposures
 from gscompleter.generators.oracle import Oracle
-from gscompleter.generators.smooth import continued, distance_to_known
-from gscompleter.generators.warp import Warped, warp_photographs
-from gscompleter.generators.warp_inpaint import WarpInpaint, background_first, without_cracks
+from gscompleter.generators.smooth import compute_distance_to_known, continue_smoothly
+from gscompleter.generators.warp import WarpedImage, warp_photographs
+from gscompleter.generators.warp_inpaint import WarpInpaint, fill_background_first, remove_cracks
 from gscompleter.generators.warp_inpaint.exemplar import Sources, fill_by_patches
-from gscompleter.metrics.image import psnr
-from gscompleter.types import Camera, Render, SceneContext, View, merge
+from gscompleter.types import Camera, GeneratorInput, Render, View, merge
 from scenes import Room, answer, camera_at, gaussians_of, view_of
 
 SIZE = 96
 TARGET = camera_at(0.7, yaw=12, size=SIZE)
 
 
-def known_room(gain: float = 1.0) -> SceneContext:
+def known_room(gain: float = 1.0) -> GeneratorInput:
     """Two photographs and the scene they give, as seen by them and by the target."""
     views = [view_of(Room(), camera_at(x, size=SIZE)) for x in (-0.3, 0.1)]
     views[0] = replace(views[0], image=gain * views[0].image)
     scene = merge([gaussians_of(view) for view in views])
     renderer = load_renderer("cpu")
-    return SceneContext(
+    return GeneratorInput(
         tuple(views),
         tuple(renderer.render(scene, view.camera) for view in views),
         renderer.render(scene, TARGET),
     )
 
 
-def synthesized(context: SceneContext, seed: int = 0) -> torch.Tensor:
+def synthesized(context: GeneratorInput, seed: int = 0) -> torch.Tensor:
     return WarpInpaint(seed=seed)(context.views[1], TARGET, context)
 
 
@@ -48,10 +48,10 @@ def test_the_observed_part_is_sharper_than_the_render_and_the_hole_follows_its_b
     """The wave texture is predictable only near the border of the hole."""
     context, truth = known_room(), view_of(Room(), TARGET).image
     image = synthesized(context)
-    hole = context.at_target.alpha < 0.5
+    hole = context.target_render.alpha < 0.5
     assert hole.float().mean() > 0.1
-    assert within(~hole, image, truth) > within(~hole, context.at_target.image, truth) + 2
-    border = hole & (distance_to_known(~hole) <= 4)
+    assert within(~hole, image, truth) > within(~hole, context.target_render.image, truth) + 2
+    border = hole & (compute_distance_to_known(~hole) <= 4)
     flat = image[~hole].mean(dim=0).expand_as(image)
     assert within(border, image, truth) > within(border, flat, truth) + 1
 
@@ -60,14 +60,14 @@ def test_a_photograph_of_another_exposure_leaves_no_seam():
     """The farther photograph is 1.3 times as bright; shared surfaces show the ratio."""
     truth = view_of(Room(), TARGET).image
     even, uneven = known_room(), known_room(gain=1.3)
-    seen = even.at_target.alpha >= 0.5
+    seen = even.target_render.alpha >= 0.5
     expected, image = synthesized(even), synthesized(uneven)
     assert within(seen, image, truth) > within(seen, expected, truth) - 1
     _, gain_of_nearest = warped_gains(uneven)
     assert torch.equal(gain_of_nearest, torch.ones(3))
 
 
-def warped_gains(context: SceneContext) -> tuple[torch.Tensor, ...]:
+def warped_gains(context: GeneratorInput) -> tuple[torch.Tensor, ...]:
     return warp_photographs(context.views[1], TARGET, context).gains
 
 
@@ -79,7 +79,7 @@ def test_the_gain_between_two_exposures_is_found():
 def test_photographs_that_share_nothing_keep_their_exposure():
     bright, dark = torch.full((20, 20, 3), 0.8), torch.full((20, 20, 3), 0.4)
     left = torch.arange(20).expand(20, 20) < 10
-    first, second = gains([bright, dark], [left, ~left], reference=0)
+    first, second = match_exposures([bright, dark], [left, ~left], reference=0)
     assert torch.equal(first, torch.ones(3))
     assert torch.equal(second, torch.ones(3))
 
@@ -92,14 +92,16 @@ def test_what_was_photographed_but_is_missing_in_the_scene_is_shown():
     scene = scene[(scene.means - torch.tensor([-1.2, -0.3, 5.0])).norm(dim=-1) > 0.8]
     renderer = load_renderer("cpu")
     at_views = tuple(renderer.render(scene, view.camera) for view in views)
-    context = SceneContext(views, at_views, renderer.render(scene, target))
-    missing = context.at_target.alpha < 0.5
+    context = GeneratorInput(views, at_views, renderer.render(scene, target))
+    missing = context.target_render.alpha < 0.5
     missing[:, SIZE // 2 :] = False
     assert missing.sum() > 100
     truth = view_of(Room(), target).image
     image = WarpInpaint()(views[1], target, context)
     assert within(missing, image, truth) > 17
-    filled_only = continued(context.at_target.image, (context.at_target.alpha >= 0.5).float())
+    filled_only = continue_smoothly(
+        context.target_render.image, (context.target_render.alpha >= 0.5).float()
+    )
     assert within(missing, image, truth) > within(missing, filled_only, truth) + 3
 
 
@@ -107,7 +109,7 @@ def test_a_smooth_continuation_keeps_a_ramp_going_and_knows_its_border():
     ramp = torch.linspace(0, 1, 64)[:, None, None].expand(64, 64, 3).contiguous()
     weight = torch.ones(64, 64)
     weight[:, 40:] = 0
-    filled = continued(ramp, weight)
+    filled = continue_smoothly(ramp, weight)
     assert torch.equal(filled[:, :40], ramp[:, :40])
     assert (filled[8:-8, 40:48] - ramp[8:-8, 40:48]).abs().max() < 0.05
 
@@ -117,7 +119,7 @@ def test_a_smooth_continuation_takes_images_of_any_size(h, w):
     values = torch.rand(h, w, 4, generator=torch.Generator().manual_seed(0))
     weight = torch.ones(h, w)
     weight[:, w // 2 :] = 0
-    filled = continued(values, weight)
+    filled = continue_smoothly(values, weight)
     assert torch.equal(filled[:, : w // 2], values[:, : w // 2])
     assert torch.isfinite(filled).all()
     assert filled.min() >= values.min() - 1e-4
@@ -128,7 +130,7 @@ def test_an_image_of_odd_size_is_completed():
     target = replace(TARGET, width=SIZE - 7, height=SIZE - 15)
     context = known_room()
     scene = merge([gaussians_of(view) for view in context.views])
-    odd = replace(context, at_target=load_renderer("cpu").render(scene, target))
+    odd = replace(context, target_render=load_renderer("cpu").render(scene, target))
     image = WarpInpaint()(context.views[1], target, odd)
     assert image.shape == (SIZE - 15, SIZE - 7, 3)
     assert torch.isfinite(image).all()
@@ -138,7 +140,7 @@ def test_a_crack_is_no_hole():
     hole = torch.zeros(40, 40, dtype=torch.bool)
     hole[:, 10:13] = True
     hole[:, 30:] = True
-    assert torch.equal(without_cracks(hole, 4).any(dim=0), torch.arange(40) >= 30)
+    assert torch.equal(remove_cracks(hole, 4).any(dim=0), torch.arange(40) >= 30)
 
 
 def test_the_background_fills_what_an_object_uncovers():
@@ -149,7 +151,7 @@ def test_the_background_fills_what_an_object_uncovers():
     known = torch.ones(32, 48, dtype=torch.bool)
     known[:, 16:32] = False
     depth = torch.where(torch.arange(48) < 24, 1.0, 4.0).expand(32, 48).contiguous()
-    tone, log_depth = background_first(Warped(image, known, depth, ()))
+    tone, log_depth = fill_background_first(WarpedImage(image, known, depth, ()))
     middle = tone[16, 24]
     assert middle[2] > 5 * middle[0]
     assert log_depth[16, 24].exp() > 3
@@ -168,10 +170,10 @@ def test_the_unit_of_length_does_not_matter():
     for unit in (1e-3, 1e3):
         context = known_room()
         target = in_unit(TARGET, unit)
-        larger = SceneContext(
+        larger = GeneratorInput(
             tuple(replace(v, camera=in_unit(v.camera, unit)) for v in context.views),
-            tuple(replace(r, depth=unit * r.depth) for r in context.at_views),
-            replace(context.at_target, depth=unit * context.at_target.depth),
+            tuple(replace(r, depth=unit * r.depth) for r in context.view_renders),
+            replace(context.target_render, depth=unit * context.target_render.depth),
         )
         again = WarpInpaint()(larger.views[1], target, larger)
         assert (again - image).abs().mean() < 1e-3
@@ -200,20 +202,20 @@ def test_the_same_seed_gives_the_same_bytes_and_another_one_others():
 def test_a_target_without_a_hole_and_one_that_sees_nothing_are_answered():
     context = known_room()
     view = context.views[1]
-    seen = replace(context, at_target=context.at_views[1])
+    seen = replace(context, target_render=context.view_renders[1])
     image = WarpInpaint()(view, view.camera, seen)
     assert psnr(image, view.image) > 25
     black = Render(torch.zeros(SIZE, SIZE, 3), torch.zeros(SIZE, SIZE), torch.zeros(SIZE, SIZE))
-    image = WarpInpaint()(view, TARGET, replace(context, at_target=black))
+    image = WarpInpaint()(view, TARGET, replace(context, target_render=black))
     assert torch.allclose(image, view.image.mean(dim=(0, 1)).expand_as(image))
 
 
 def test_a_hole_too_small_for_the_coarse_levels_is_filled():
     context = known_room()
-    view, render = context.views[1], context.at_views[1]
+    view, render = context.views[1], context.view_renders[1]
     alpha = render.alpha.clone()
     alpha[40:42, 50:52] = 0
-    pierced = replace(context, at_target=replace(render, alpha=alpha))
+    pierced = replace(context, target_render=replace(render, alpha=alpha))
     image = WarpInpaint()(view, view.camera, pierced)
     assert (image - view.image)[40:42, 50:52].abs().mean() < 0.1
 
@@ -224,7 +226,7 @@ def test_stripes_continue_into_the_hole():
     known = torch.ones(96, 96, dtype=torch.bool)
     known[36:60, 36:60] = False
     flat_depth = torch.zeros(96, 96)
-    sources = Sources.stacked([stripes], [known], [torch.ones(96, 96)])
+    sources = Sources.stack_images([stripes], [known], [torch.ones(96, 96)])
     hollow = torch.where(known[..., None], stripes, torch.zeros_like(stripes))
     filled = fill_by_patches(hollow, known, flat_depth, sources, seed=0)
     assert torch.equal(filled[known], stripes[known])
@@ -240,7 +242,7 @@ def test_a_foreground_object_is_not_copied_behind_itself():
     depth[:, :32] = 1.0
     known = torch.ones(64, 96, dtype=torch.bool)
     known[:, 32:52] = False
-    sources = Sources.stacked([image], [known], [depth])
+    sources = Sources.stack_images([image], [known], [depth])
     behind = torch.full((64, 96), float(np.log(4.0)))
     filled = fill_by_patches(image, known, behind, sources, seed=0)
     right_half = filled[:, 42:52]
@@ -266,6 +268,8 @@ def test_photographs_of_another_size_than_the_target_are_used():
     small = camera_at(-0.3, size=SIZE // 2)
     view = view_of(Room(), small)
     render = load_renderer("cpu").render(gaussians_of(view), small)
-    mixed = SceneContext((view, context.views[1]), (render, context.at_views[1]), context.at_target)
+    mixed = GeneratorInput(
+        (view, context.views[1]), (render, context.view_renders[1]), context.target_render
+    )
     image = WarpInpaint()(View(view.image, small), TARGET, mixed)
     assert image.shape == (SIZE, SIZE, 3)

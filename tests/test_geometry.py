@@ -7,19 +7,19 @@ import torch
 from scipy.spatial.transform import Rotation
 
 from gscompleter.geometry import (
-    baseline_between,
-    distance_from_depth,
-    inside,
+    axis_angle_to_matrix,
+    depth_to_distance,
+    footprint_mask,
+    is_inside,
+    is_same_camera,
+    measure_baseline,
+    measure_rotation,
+    multiply_quats,
     project,
-    quats_from,
-    quats_product,
-    reaching,
-    rotation_about,
-    rotation_between,
-    rotations_from,
-    same_camera,
+    quats_to_rotations,
+    rotations_to_quats,
     sample,
-    share_of_turn,
+    slerp_rotation,
     unproject,
 )
 from gscompleter.render import load_renderer
@@ -44,31 +44,31 @@ def test_the_optical_axis_points_along_z_and_the_top_left_ray_up_and_left():
 
 def test_distance_is_depth_over_the_cosine_to_the_axis():
     camera = camera_at(size=2, focal=0.5)
-    distance = distance_from_depth(torch.full((2, 2), 4.0), camera)
+    distance = depth_to_distance(torch.full((2, 2), 4.0), camera)
     assert torch.allclose(distance, torch.full((2, 2), 4.0 * 1.5**0.5))
 
 
 def test_points_behind_the_camera_are_not_inside_its_image():
     camera = camera_at()
     pixels, z = project(torch.tensor([[0.0, 0, 3], [0, 0, -3], [9, 0, 3]]), camera)
-    assert inside(pixels, z, camera).tolist() == [True, False, False]
+    assert is_inside(pixels, z, camera).tolist() == [True, False, False]
 
 
 @pytest.mark.parametrize("angle", [0.0, 1e-3, 44.9, 90.0, 179.0])
 def test_rotation_is_the_full_angle_in_degrees(angle):
-    assert rotation_between(camera_at(), camera_at(yaw=angle)) == pytest.approx(angle, abs=1e-4)
+    assert measure_rotation(camera_at(), camera_at(yaw=angle)) == pytest.approx(angle, abs=1e-4)
 
 
 def test_baseline_is_the_distance_of_the_centres():
-    assert baseline_between(camera_at(x=1), camera_at(x=4, y=4, yaw=30)) == pytest.approx(5)
+    assert measure_baseline(camera_at(x=1), camera_at(x=4, y=4, yaw=30)) == pytest.approx(5)
 
 
 def test_the_same_camera_is_recognised_in_any_unit():
     for unit in (0.001, 1.0, 1000.0):
         camera = camera_at(0.3, 0, 0, yaw=10, unit=unit)
-        assert same_camera(camera, camera_at(0.3, 0, 0, yaw=10, unit=unit))
-        assert not same_camera(camera, camera_at(0.301, 0, 0, yaw=10, unit=unit))
-        assert not same_camera(camera, camera_at(0.3, 0, 0, yaw=10.1, unit=unit))
+        assert is_same_camera(camera, camera_at(0.3, 0, 0, yaw=10, unit=unit))
+        assert not is_same_camera(camera, camera_at(0.301, 0, 0, yaw=10, unit=unit))
+        assert not is_same_camera(camera, camera_at(0.3, 0, 0, yaw=10.1, unit=unit))
 
 
 def test_sampling_at_pixel_centres_returns_the_pixels():
@@ -82,7 +82,7 @@ def test_the_synthetic_room_shows_the_same_colour_from_everywhere():
     image_a, depth_a = cast(room, a)
     image_b, depth_b = cast(room, b)
     pixels, z = project(unproject(depth_a, a), b)
-    seen = inside(pixels, z, b)
+    seen = is_inside(pixels, z, b)
     agrees = seen & ((sample(depth_b[..., None], pixels)[..., 0] - z).abs() < 0.02 * z)
     difference = (sample(image_b, pixels) - image_a).abs().mean(-1)[agrees]
     assert agrees.float().mean() > 0.5
@@ -93,41 +93,43 @@ def test_a_rotation_is_its_quaternion():
     """Half turns, whose quaternions have a first component of 0, and any others."""
     half_turns = torch.eye(4)[1:]
     others = torch.randn(20, 4, generator=torch.Generator().manual_seed(0))
-    rotations = rotations_from(torch.cat([half_turns, others]))
-    quats = quats_from(rotations)
+    rotations = quats_to_rotations(torch.cat([half_turns, others]))
+    quats = rotations_to_quats(rotations)
     assert torch.allclose(quats.norm(dim=-1), torch.ones(23))
-    assert torch.allclose(rotations_from(quats), rotations, atol=1e-6)
+    assert torch.allclose(quats_to_rotations(quats), rotations, atol=1e-6)
 
 
 def test_a_product_of_quaternions_turns_by_the_second_and_then_by_the_first():
     first, second = torch.randn(2, 5, 4, generator=torch.Generator().manual_seed(0))
-    turned = rotations_from(quats_product(first, second))
-    assert torch.allclose(turned, rotations_from(first) @ rotations_from(second), atol=1e-6)
-    one_after_all = quats_product(first[0], second)
-    assert torch.allclose(one_after_all, quats_product(first[:1].expand(5, 4), second))
+    turned = quats_to_rotations(multiply_quats(first, second))
+    assert torch.allclose(turned, quats_to_rotations(first) @ quats_to_rotations(second), atol=1e-6)
+    one_after_all = multiply_quats(first[0], second)
+    assert torch.allclose(one_after_all, multiply_quats(first[:1].expand(5, 4), second))
 
 
 @pytest.mark.parametrize("angle", [0.0, 1e-7, 0.5, -2.0, math.pi])
 def test_a_turn_about_an_axis_is_its_rotation_vector(angle):
     axis = torch.tensor([2.0, -3.0, 6.0], dtype=torch.float64) / 7
     expected = torch.from_numpy(Rotation.from_rotvec(angle * axis.numpy()).as_matrix())
-    assert torch.allclose(rotation_about(axis, angle), expected, atol=1e-14)
+    assert torch.allclose(axis_angle_to_matrix(axis, angle), expected, atol=1e-14)
 
 
 @pytest.mark.parametrize("angle", [0.0, 1e-7, 0.5, 2.0, 3.1])
 def test_two_shares_of_a_turn_are_the_turn(angle):
     axis = torch.tensor([2.0, -3.0, 6.0], dtype=torch.float64) / 7
-    turn = rotation_about(axis, angle)
-    assert torch.allclose(share_of_turn(turn, 0.25), rotation_about(axis, angle / 4), atol=1e-14)
-    both = share_of_turn(turn, 0.25) @ share_of_turn(turn, 0.75)
+    turn = axis_angle_to_matrix(axis, angle)
+    assert torch.allclose(
+        slerp_rotation(turn, 0.25), axis_angle_to_matrix(axis, angle / 4), atol=1e-14
+    )
+    both = slerp_rotation(turn, 0.25) @ slerp_rotation(turn, 0.75)
     assert torch.allclose(both, turn, atol=1e-14)
 
 
 def test_of_the_two_ways_to_turn_the_shorter_one_is_shared():
     down = torch.tensor([0.0, 1.0, 0.0])
-    turn = rotation_about(down, math.radians(270))
-    expected = rotation_about(down, -math.radians(45))
-    assert torch.allclose(share_of_turn(turn, 0.5), expected, atol=1e-6)
+    turn = axis_angle_to_matrix(down, math.radians(270))
+    expected = axis_angle_to_matrix(down, -math.radians(45))
+    assert torch.allclose(slerp_rotation(turn, 0.5), expected, atol=1e-6)
 
 
 def test_what_a_camera_sees_within_a_mask_reaches_it():
@@ -141,6 +143,6 @@ def test_what_a_camera_sees_within_a_mask_reaches_it():
     render = load_renderer("cpu").render
     alone = [render(gaussians[k : k + 1], camera).alpha for k in range(len(gaussians))]
     seen = torch.stack([(alpha > 0)[mask].any() for alpha in alone])
-    found = reaching(gaussians, camera, mask)
+    found = footprint_mask(gaussians, camera, mask)
     assert (found | ~seen).all()
     assert 10 < seen.sum() <= found.sum() < len(gaussians) / 2

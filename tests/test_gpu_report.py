@@ -12,7 +12,7 @@ import pytest
 import torch
 
 import gpu
-from gpu_report import Found, Row, page
+from gpu_report import PartResult, Row, format_page
 
 BENCHMARKS = Path(__file__).resolve().parents[1] / "benchmarks"
 SMALL = gpu.Bench("cpu", ((64, 64), (64, 80)), ("plane-sweep", "mvsplat-re10k"), ("float32",), 1)
@@ -20,7 +20,7 @@ SMALL = gpu.Bench("cpu", ((64, 64), (64, 80)), ("plane-sweep", "mvsplat-re10k"),
 SCRIPT = """
 import sys, time, subprocess
 sys.path.append({benchmarks!r})
-from gpu_report import Part, Row, main, tried
+from gpu_report import Part, Row, main, try_rows
 
 def good():
     yield Row("speed", 12.5, "ms", "twice as fast")
@@ -85,7 +85,7 @@ def test_the_page_names_the_device_and_every_row(tmp_path):
     assert "## Works" in text
     assert "| speed | 12.5 ms; twice as fast |" in text
     assert "Fails" not in text
-    failed = page({}, {"it": Found("It", 1.0, (Row("x", note="why", failed=True),))})
+    failed = format_page({}, {"it": PartResult("It", 1.0, (Row("x", note="why", failed=True),))})
     assert "| x | **failed**: why |" in failed
 
 
@@ -134,12 +134,14 @@ def test_every_part_gives_rows(part):
 
 
 def test_every_reconstructor_completes_a_room_and_one_that_fails_is_a_row(monkeypatch):
-    rows = list(gpu.completions(SMALL))
+    rows = list(gpu.measure_completions(SMALL))
     assert [row.what for row in rows if not row.failed] == list(SMALL.models)
     known = gpu.model
-    monkeypatch.setattr(gpu, "model", lambda name, *a: known(name, *a) if "-" in name else 1 / 0)
+    monkeypatch.setattr(
+        gpu, "load_model", lambda name, *a: known(name, *a) if "-" in name else 1 / 0
+    )
     broken = gpu.Bench("cpu", SMALL.sizes, ("none", "plane-sweep"), repetitions=1)
-    failed, fine = gpu.completions(broken)
+    failed, fine = gpu.measure_completions(broken)
     assert failed.failed
     assert failed.note.startswith("ZeroDivisionError")
     assert not fine.failed
@@ -148,14 +150,14 @@ def test_every_reconstructor_completes_a_room_and_one_that_fails_is_a_row(monkey
 def test_the_tests_count_where_they_passed_and_only_there(tmp_path):
     (tmp_path / "test_it.py").write_text("def test_good(): pass\ndef test_bad(): assert 0\n")
     path = str(tmp_path / "test_it.py")
-    (passed,) = gpu.tested(path, "-k", "good", "-c", "/dev/null")
+    (passed,) = gpu.run_tests(path, "-k", "good", "-c", "/dev/null")
     assert not passed.failed
     assert "1 passed" in passed.note
-    named, whole = gpu.tested(path, "-c", "/dev/null")
+    named, whole = gpu.run_tests(path, "-c", "/dev/null")
     assert named.failed
     assert "test_bad" in named.note
     assert whole.failed
-    (nothing,) = gpu.tested(path, "-k", "no_such", "-c", "/dev/null")
+    (nothing,) = gpu.run_tests(path, "-k", "no_such", "-c", "/dev/null")
     assert nothing.failed
 
 
@@ -163,15 +165,15 @@ def test_pe_field_paints_with_any_model_of_its_kind():
     pytest.importorskip("diffusers", reason="needs gscompleter[diffusion]")
     pytest.importorskip("transformers", reason="needs gscompleter[diffusion]")
     import tiny_diffusion
-    from gscompleter.generators.diffusion.kontext import Kontext, Prompt
-    from gscompleter.generators.diffusion.rotary import with_per_head_positions
+    from gscompleter.models.diffusion.kontext import Kontext, Prompt
+    from gscompleter.models.diffusion.rotary import enable_per_head_positions
 
     def tiny(device: str) -> Kontext:
         pipeline = tiny_diffusion.kontext_pipeline()
-        with_per_head_positions(pipeline.transformer)
+        enable_per_head_positions(pipeline.transformer)
         prompt = Prompt(torch.zeros(1, 4, 32), torch.zeros(1, 24))
         return Kontext(pipeline, prompt, device, torch.float32)
 
-    (row,) = gpu.pe_field(SMALL, tiny)
+    (row,) = gpu.measure_pe_field(SMALL, tiny)
     assert row.what == "64x80, 4 steps"
     assert row.value > 0

@@ -13,11 +13,11 @@ import pytest
 import torch
 
 from gscompleter import InputError, load_ply, save_ply
-from gscompleter.io.image import MAX_PIXELS, decode_pixels, image_size, read_depth, read_image
+from gscompleter.io.image import MAX_PIXELS, decode_pixels, read_depth, read_image, read_image_size
 from gscompleter.io.json_file import read_json
-from gscompleter.weights.fitting import load_strictly
-from gscompleter.weights.published import PUBLISHED
-from gscompleter.weights.reading import check_kind, tensors_of_network
+from gscompleter.models.weights.fitting import load_strictly
+from gscompleter.models.weights.published import PUBLISHED
+from gscompleter.models.weights.reading import check_kind, extract_network_tensors
 from scenes import random_gaussians
 
 
@@ -110,7 +110,7 @@ def png(width: int, height: int) -> bytes:
 @pytest.mark.parametrize("size", [(10**9, 10**9), (2**31 - 1, 1), (40_000, 40_000)])
 def test_an_image_that_claims_too_many_pixels_is_refused_before_they_are_made(tmp_path, size):
     (tmp_path / "bomb.png").write_bytes(png(*size))
-    for call in (read_image, image_size):
+    for call in (read_image, read_image_size):
         assert f"{MAX_PIXELS:,} pixels" in sentence(call, tmp_path / "bomb.png")
     assert f"{MAX_PIXELS:,} pixels" in sentence(decode_pixels, png(*size), "frame 3")
 
@@ -188,7 +188,7 @@ MVSPLAT = PUBLISHED["mvsplat-re10k"]
 )
 def test_tensors_that_are_no_arrays_of_numbers_are_refused(tmp_path, tensor):
     content = {"state_dict": {"encoder.weight": tensor}}
-    told = sentence(tensors_of_network, content, tmp_path / "a.ckpt", MVSPLAT)
+    told = sentence(extract_network_tensors, content, tmp_path / "a.ckpt", MVSPLAT)
     assert "tensors without plain numbers (weight)" in told
 
 

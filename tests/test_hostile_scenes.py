@@ -17,9 +17,9 @@ import torch
 from chunk_files import example, save_chunk
 from driving_files import infos, write_drive, write_infos, write_swept_dgp
 from gscompleter import InputError
+from gscompleter.data.driving.restricted_pickle import load_plain
 from gscompleter.data.formats import open_photographs
-from gscompleter.data.restricted_pickle import load_plain
-from gscompleter.errors import LONGEST_MESSAGE
+from gscompleter.errors import MAX_MESSAGE_LENGTH
 from pose_files import WRITERS, write_photographs
 
 
@@ -27,7 +27,7 @@ def sentence(path: Path) -> str:
     """Read all of a scene, and return the message of the error."""
     with pytest.raises(InputError) as error:
         read(path)
-    assert len(str(error.value)) < LONGEST_MESSAGE
+    assert len(str(error.value)) < MAX_MESSAGE_LENGTH
     assert "\n" not in str(error.value)
     return str(error.value)
 

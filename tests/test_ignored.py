@@ -7,19 +7,19 @@ import torch
 
 from gscompleter import InputError
 from gscompleter.config import RefineConfig
+from gscompleter.data.driving.moving_objects import Box, build_upright_pose, mask_moving
+from gscompleter.data.driving.sparse_depth import compute_sparse_depth
 from gscompleter.data.formats import open_photographs
-from gscompleter.data.moving_objects import Box, covered, upright
-from gscompleter.data.photographs import without_masked
-from gscompleter.data.sparse_depth import sparse_depth
+from gscompleter.data.photographs import apply_masks
+from gscompleter.evaluation.metrics.scores import Truth, score
 from gscompleter.generators.warp import warp_photographs
 from gscompleter.geometry import unproject
+from gscompleter.guards.psnr import compute_squared_error, meet_error_budgets
 from gscompleter.io.image import write_image
-from gscompleter.metrics.scores import Truth, score
 from gscompleter.render import load_renderer
 from gscompleter.stages.context import init_context
-from gscompleter.stages.harm import do_no_harm, squared_error
-from gscompleter.stages.integration import refine_opacities
-from gscompleter.types import ErrorBudget, SceneContext, View, sh_from_rgb
+from gscompleter.stages.refine import refine_opacities
+from gscompleter.types import ErrorBudget, GeneratorInput, View, sh_from_rgb
 from scenes import Room, camera_at, gaussians_of, half_a_room_of, photographed, reconstruction_of
 from scenes import view_of as photograph_of
 
@@ -40,7 +40,7 @@ def with_something_red(view: View) -> View:
     """Take the photograph with a red object that is to be ignored."""
     mask = square()
     red = torch.tensor([1.0, 0.0, 0.0])
-    return replace(view, image=torch.where(mask[..., None], red, view.image), ignored=mask)
+    return replace(view, image=torch.where(mask[..., None], red, view.image), ignore_mask=mask)
 
 
 @pytest.mark.parametrize("aligned", [True, False])
@@ -67,10 +67,10 @@ def test_what_is_ignored_forbids_nothing():
     mask[:, SIZE // 2 :] = True
     wrong = replace(view, image=torch.where(mask[..., None], 0.0, view.image))
     frozen = RENDERER.freeze(context, CAMERA)
-    for photograph, kept in ((wrong, False), (replace(wrong, ignored=mask), True)):
-        before = photograph.compared(frozen.context.image)
-        allowed = 2 * squared_error(before, photograph.image).item() + 1e-3
-        mended = do_no_harm(added, [frozen], [[ErrorBudget(photograph, "mse", allowed)]])
+    for photograph, kept in ((wrong, False), (replace(wrong, ignore_mask=mask), True)):
+        before = photograph.fill_ignored(frozen.render.image)
+        allowed = 2 * compute_squared_error(before, photograph.image).item() + 1e-3
+        mended = meet_error_budgets(added, [frozen], [[ErrorBudget(photograph, "mse", allowed)]])
         assert torch.equal(mended.opacities, added.opacities) == kept
 
 
@@ -82,11 +82,11 @@ def test_refinement_asks_nothing_there():
     reference = photograph_of(ROOM, CAMERA)
 
     def refined(photographs: list[View]) -> torch.Tensor:
-        plan, config = frozen.plan(added), RefineConfig(iterations=3)
+        plan, config = frozen.vary_opacities(added), RefineConfig(iterations=3)
         plans = [plan] * len(photographs)
         return refine_opacities(added, plan, reference, plans, photographs, config)[0].opacities
 
-    assert torch.equal(refined([replace(odd, ignored=mask)]), refined([]))
+    assert torch.equal(refined([replace(odd, ignore_mask=mask)]), refined([]))
     assert not torch.equal(refined([odd]), refined([]))
 
 
@@ -95,10 +95,10 @@ def test_what_is_ignored_is_not_carried_over():
     views = (with_something_red(photograph_of(ROOM, CAMERA)),)
     scene = gaussians_of(photograph_of(ROOM, CAMERA))
     at_views = (RENDERER.render(scene, CAMERA),)
-    context = SceneContext(views, at_views, RENDERER.render(scene, target))
-    careless = replace(context, views=(replace(views[0], ignored=None),))
+    context = GeneratorInput(views, at_views, RENDERER.render(scene, target))
+    careless = replace(context, views=(replace(views[0], ignore_mask=None),))
 
-    def reds(known: SceneContext) -> int:
+    def reds(known: GeneratorInput) -> int:
         red, green, blue = warp_photographs(views[0], target, known).image.unbind(-1)
         return int((red - (green + blue) / 2 > 0.9).sum())
 
@@ -115,7 +115,7 @@ def test_scores_count_nothing_there():
         truth = Truth((photograph, photograph), photograph, (photograph,))
         return score(scene, scene, scene[:0], truth, RENDERER)[0]
 
-    plain, ignoring, counting = (scored(v) for v in (view, red, replace(red, ignored=None)))
+    plain, ignoring, counting = (scored(v) for v in (view, red, replace(red, ignore_mask=None)))
     assert counting.target_after.psnr < plain.target_after.psnr - 5
     assert ignoring.target_after.psnr == pytest.approx(plain.target_after.psnr, abs=1.0)
     assert ignoring.context_psnr[0].after == ignoring.target_after.psnr
@@ -124,7 +124,7 @@ def test_scores_count_nothing_there():
     assert counting.target_after.ssim < plain.target_after.ssim - 0.1
     moved = replace(red, depth=torch.where(square(), 5 * view.depth, view.depth))
     assert scored(moved).depth_observed == pytest.approx(ignoring.depth_observed)
-    assert scored(replace(moved, ignored=None)).depth_observed > ignoring.depth_observed + 0.1
+    assert scored(replace(moved, ignore_mask=None)).depth_observed > ignoring.depth_observed + 0.1
 
 
 def test_masks_of_files_are_ignored_where_asked(tmp_path):
@@ -138,22 +138,22 @@ def test_masks_of_files_are_ignored_where_asked(tmp_path):
     ]
     masked = replace(photographs, frames=tuple(frames))
     assert (photographs.has_masks, masked.has_masks) == (False, True)
-    (view,) = without_masked(masked.views([0]), masked)
-    assert torch.equal(view.ignored, square())
-    (plain,) = without_masked(photographs.views([0]), photographs)
-    assert plain.ignored is None
+    (view,) = apply_masks(masked.views([0]), masked)
+    assert torch.equal(view.ignore_mask, square())
+    (plain,) = apply_masks(photographs.views([0]), photographs)
+    assert plain.ignore_mask is None
     with pytest.raises(InputError, match="All of frame 1 of .* is masked"):
-        without_masked(masked.views([1]), masked)
+        apply_masks(masked.views([1]), masked)
 
 
 def box_at(center: tuple[float, ...], side: float, speed: float | None, turn: float = 0.0) -> Box:
-    pose = upright(torch.tensor(center, dtype=torch.float64).numpy(), turn)
+    pose = build_upright_pose(torch.tensor(center, dtype=torch.float64).numpy(), turn)
     return Box(pose, (side, side, side), speed)
 
 
 def test_a_box_covers_its_outline():
     """A cube with its front face 2 m ahead is widened to 1.1 m: 0.55 m to either side."""
-    mask = covered([box_at((0.0, 0.0, 2.55), 1.0, 3.0)], CAMERA, CAMERA.center.double().numpy())
+    mask = mask_moving([box_at((0.0, 0.0, 2.55), 1.0, 3.0)], CAMERA, CAMERA.center.double().numpy())
     half = 0.55 / 2.0 * 0.9 * SIZE
     rows, columns = torch.nonzero(torch.from_numpy(mask), as_tuple=True)
     for found in (rows, columns):
@@ -173,7 +173,7 @@ def test_a_box_covers_its_outline():
     ],
 )
 def test_boxes_that_stand_lie_behind_or_around(center, speed, share):
-    mask = covered([box_at(center, 1.0, speed, 0.7)], CAMERA, CAMERA.center.double().numpy())
+    mask = mask_moving([box_at(center, 1.0, speed, 0.7)], CAMERA, CAMERA.center.double().numpy())
     assert mask.mean() >= share
     assert share > 0 or not mask.any()
 
@@ -182,6 +182,6 @@ def test_the_nearest_point_of_a_pixel_tells_its_depth():
     wall = torch.full((SIZE, SIZE), 4.0)
     points = torch.cat([unproject(0.5 * (i + 2) * wall, CAMERA).reshape(-1, 3) for i in range(2)])
     behind = -points
-    depth = sparse_depth(torch.cat([points, behind])[::2], CAMERA)
+    depth = compute_sparse_depth(torch.cat([points, behind])[::2], CAMERA)
     assert (depth[:, ::2] - 4.0).abs().max() < 1e-5
     assert (depth[:, 1::2] == 0).all()

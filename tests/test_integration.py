@@ -6,13 +6,10 @@ import pytest
 import torch
 
 from gscompleter.config import HoleConfig, RefineConfig
-from gscompleter.masks import dilate
+from gscompleter.image_ops import dilate
 from gscompleter.render import load_renderer
-from gscompleter.stages.integration import (
-    hole_mask,
-    keep_in_holes,
-    refine_opacities,
-)
+from gscompleter.stages.filter_holes import compute_hole_mask, filter_holes
+from gscompleter.stages.refine import refine_opacities
 from gscompleter.types import View
 from scenes import Room, camera_at, gaussians_of, half_a_room_of, view_of
 
@@ -23,8 +20,10 @@ CAMERA = camera_at(size=SIZE)
 
 def test_a_hole_is_where_the_scene_covers_less_than_half_of_the_pixel():
     alpha = torch.tensor([[0.0, 0.49, 0.5, 1.0]])
-    assert hole_mask(alpha).tolist() == [[True, True, False, False]]
-    assert hole_mask(alpha, HoleConfig(max_alpha=0.3)).tolist() == [[True, False, False, False]]
+    assert compute_hole_mask(alpha).tolist() == [[True, True, False, False]]
+    assert compute_hole_mask(alpha, HoleConfig(max_alpha=0.3)).tolist() == [
+        [True, False, False, False]
+    ]
 
 
 def test_dilation_grows_the_mask_by_its_radius_on_every_side():
@@ -39,7 +38,7 @@ def test_pixel_aligned_gaussians_are_kept_by_their_pixel():
     view = view_of(ROOM, CAMERA)
     mask = torch.zeros(SIZE, SIZE, dtype=torch.bool)
     mask[:, :10] = True
-    kept = keep_in_holes(gaussians_of(view), torch.arange(SIZE * SIZE), mask, CAMERA)
+    kept = filter_holes(gaussians_of(view), torch.arange(SIZE * SIZE), mask, CAMERA)
     assert len(kept) == 10 * SIZE
 
 
@@ -49,8 +48,8 @@ def test_other_gaussians_are_kept_by_where_they_project():
     behind = replace(gaussians, means=-gaussians.means)
     mask = torch.zeros(SIZE, SIZE, dtype=torch.bool)
     mask[:, :10] = True
-    assert len(keep_in_holes(gaussians, None, mask, CAMERA)) == 10 * SIZE
-    assert len(keep_in_holes(behind, None, mask, CAMERA)) == 0
+    assert len(filter_holes(gaussians, None, mask, CAMERA)) == 10 * SIZE
+    assert len(filter_holes(behind, None, mask, CAMERA)) == 0
 
 
 def half_a_room():

@@ -2,7 +2,7 @@
 
 import torch
 
-from gscompleter.interpolation import fill_smoothly, smoothed
+from gscompleter.image_ops import fill_smoothly, smooth_masked
 
 
 def test_known_values_stay_and_a_constant_is_continued():
@@ -28,7 +28,7 @@ def test_nothing_known_is_zero():
 def test_means_are_those_of_the_pixels_of_the_mask_around():
     values = torch.rand(9, 13, 3, generator=torch.Generator().manual_seed(0))
     mask = torch.rand(9, 13, generator=torch.Generator().manual_seed(1)) < 0.4
-    found = smoothed(values, mask, 2)
+    found = smooth_masked(values, mask, 2)
     compared = 0
     for y in range(9):
         for x in range(13):

@@ -17,7 +17,8 @@ import torch
 from gscompleter import InputError, View
 from gscompleter.kernels import stereo
 from gscompleter.reconstructors.plane_sweep import PlaneSweep
-from gscompleter.render.cpu import MAX_SIDE, CpuRenderer, arrays_of, length_of
+from gscompleter.render.cpu import MAX_SIDE, CpuRenderer, to_arrays
+from gscompleter.render.viewpoint import check_lengths
 from scenes import camera_at, random_gaussians, unchecked
 
 ODD = [np.nan, np.inf, -np.inf, 3e38, -3e38, 1e19, -1e19, 1e-38, 0.0]
@@ -56,7 +57,7 @@ SWEEP = """
 import sys
 import numpy as np
 from gscompleter.kernels import stereo
-from gscompleter.reconstructors.plane_sweep.bands import every_plane
+from gscompleter.reconstructors.plane_sweep.depth_bands import make_full_bands
 image = np.random.default_rng(0).random((24, 20, 3)).astype(np.float32)
 planes = np.linspace(0, 1, 6).astype(np.float32)
 bands = every_plane((24, 20), 6)
@@ -107,15 +108,15 @@ def test_an_image_that_cannot_be_numbered_is_refused(size):
 
 
 def test_more_entries_than_can_be_numbered_are_refused(monkeypatch):
-    monkeypatch.setattr("gscompleter.render.cpu.MAX_ENTRIES", 10)
+    monkeypatch.setattr("gscompleter.render.viewpoint.MAX_ENTRIES", 10)
     with pytest.raises(InputError, match="use fewer or smaller Gaussians"):
         CpuRenderer().render(random_gaussians(100), camera_at(size=64))
 
 
 def test_fields_of_different_lengths_are_refused():
-    arrays = arrays_of(random_gaussians(5))
+    arrays = to_arrays(random_gaussians(5))
     with pytest.raises(ValueError, match=r"different lengths: \[3, 5\]"):
-        length_of(arrays._replace(opacities=np.ones(3, np.float32)))
+        check_lengths(arrays._replace(opacities=np.ones(3, np.float32)))
 
 
 @pytest.mark.parametrize("size", [(1, 40), (40, 1), (7, 7)])

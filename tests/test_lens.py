@@ -4,8 +4,14 @@ import cv2
 import numpy as np
 import pytest
 
-from gscompleter.data.colmap.lenses import MODELS, intrinsics_of
-from gscompleter.data.lens import Distortion, Pinhole, distort, undistorted, undistortion_map
+from gscompleter.data.colmap.lenses import MODELS, build_intrinsics
+from gscompleter.data.undistort import (
+    Distortion,
+    Pinhole,
+    compute_undistortion_map,
+    distort,
+    undistort_pinhole,
+)
 
 PINHOLE = Pinhole(fl_x=130.0, fl_y=127.5, cx=81.5, cy=59.0, width=160, height=120)
 
@@ -29,7 +35,7 @@ def opencv_matrix(pinhole: Pinhole) -> np.ndarray:
 
 @pytest.mark.parametrize("lens", LENSES.values(), ids=LENSES)
 def test_the_map_is_that_of_opencv_half_a_pixel_apart(lens):
-    new = undistorted(PINHOLE, lens)
+    new = undistort_pinhole(PINHOLE, lens)
     k1, k2, k3, k4 = (*lens.radial, 0.0, 0.0, 0.0, 0.0)[:4]
     if lens.projection == "equidistant":
         rectify, coefficients = cv2.fisheye.initUndistortRectifyMap, np.array([k1, k2, k3, k4])
@@ -45,13 +51,15 @@ def test_the_map_is_that_of_opencv_half_a_pixel_apart(lens):
         (PINHOLE.width, PINHOLE.height),
         cv2.CV_32FC1,
     )
-    assert np.allclose(undistortion_map(PINHOLE, lens, new), np.stack([x, y], -1), atol=1e-4)
+    assert np.allclose(
+        compute_undistortion_map(PINHOLE, lens, new), np.stack([x, y], -1), atol=1e-4
+    )
 
 
 @pytest.mark.parametrize("lens", LENSES.values(), ids=LENSES)
 def test_every_pixel_comes_from_the_photograph_and_little_of_it_is_lost(lens):
-    new = undistorted(PINHOLE, lens)
-    source = undistortion_map(PINHOLE, lens, new)
+    new = undistort_pinhole(PINHOLE, lens)
+    source = compute_undistortion_map(PINHOLE, lens, new)
     low, high = source.min(axis=(0, 1)), source.max(axis=(0, 1))
     size = np.array([PINHOLE.width, PINHOLE.height])
     assert (low >= -0.001).all()
@@ -72,11 +80,11 @@ def test_an_equidistant_fisheye_maps_angles_to_radii():
 
 
 def test_without_distortion_nothing_changes():
-    assert undistorted(PINHOLE, Distortion()) is PINHOLE
+    assert undistort_pinhole(PINHOLE, Distortion()) is PINHOLE
 
 
 def test_the_principal_point_stays_and_pixels_keep_their_shape():
-    new = undistorted(PINHOLE, LENSES["pincushion"])
+    new = undistort_pinhole(PINHOLE, LENSES["pincushion"])
     assert (new.cx, new.cy, new.width, new.height) == (81.5, 59.0, 160, 120)
     assert new.fl_x / new.fl_y == pytest.approx(130.0 / 127.5)
     assert new.fl_x > PINHOLE.fl_x
@@ -149,8 +157,10 @@ REFERENCE = {
 @pytest.mark.parametrize("name", REFERENCE)
 def test_every_lens_of_colmap_bends_as_colmap_says(name):
     parameters, expected = REFERENCE[name]
-    intrinsics = intrinsics_of(MODELS[name], (160, 120), list(map(float, parameters)), "the camera")
-    pinhole = intrinsics.at(160, 120)
+    intrinsics = build_intrinsics(
+        MODELS[name], (160, 120), list(map(float, parameters)), "the camera"
+    )
+    pinhole = intrinsics.compute_pinhole(160, 120)
     bent = distort(POINTS, intrinsics.distortion)
     pixels = bent * [pinhole.fl_x, pinhole.fl_y] + [pinhole.cx, pinhole.cy]
     assert np.allclose(pixels, expected, atol=1e-4)
@@ -163,10 +173,14 @@ def test_all_models_that_are_read_have_a_reference():
 @pytest.mark.parametrize("name", REFERENCE)
 def test_every_lens_of_colmap_is_removed(name):
     parameters, _ = REFERENCE[name]
-    intrinsics = intrinsics_of(MODELS[name], (160, 120), list(map(float, parameters)), "the camera")
-    new = undistorted(intrinsics.at(160, 120), intrinsics.distortion)
+    intrinsics = build_intrinsics(
+        MODELS[name], (160, 120), list(map(float, parameters)), "the camera"
+    )
+    new = undistort_pinhole(intrinsics.compute_pinhole(160, 120), intrinsics.distortion)
     assert new is not None
-    source = undistortion_map(intrinsics.at(160, 120), intrinsics.distortion, new)
+    source = compute_undistortion_map(
+        intrinsics.compute_pinhole(160, 120), intrinsics.distortion, new
+    )
     assert (source > -0.002).all()
     assert (source < [159.002, 119.002]).all()
 
@@ -181,4 +195,4 @@ def test_every_lens_of_colmap_is_removed(name):
     ids=str,
 )
 def test_a_lens_that_shows_nothing_has_no_pinhole_camera(lens):
-    assert undistorted(PINHOLE, lens) is None
+    assert undistort_pinhole(PINHOLE, lens) is None

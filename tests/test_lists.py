@@ -8,9 +8,10 @@ import numpy as np
 import pytest
 import torch
 
-from gscompleter.kernels import lists
+from gscompleter.kernels import tiles
 from gscompleter.kernels.rasterizer import DEPTH, NUM_SPLAT_COLUMNS, TILE
-from gscompleter.render.cpu import CpuRenderer, Splats, Viewpoint, by_use, pinhole_of
+from gscompleter.render.cpu import CpuRenderer, make_pinhole
+from gscompleter.render.viewpoint import Splats, Viewpoint, order_by_use
 from scenes import camera_at, random_gaussians
 
 RANDOM = np.random.default_rng(0)
@@ -41,9 +42,9 @@ def expected_list(splats: Splats, tile: int, tiles_x: int, limit: float) -> list
 @pytest.mark.parametrize("n", [0, 1, 700])
 def test_a_list_has_what_touches_its_tile_front_to_back(n, threads):
     size = 40
-    viewpoint, splats = Viewpoint(pinhole_of(camera_at(size=size)), threads), some_splats(n, size)
+    viewpoint, splats = Viewpoint(make_pinhole(camera_at(size=size)), threads), some_splats(n, size)
     limits = RANDOM.choice([np.inf, 4.0, -np.inf], viewpoint.tiles).astype(np.float32)
-    layer = viewpoint.enter(splats, limits)
+    layer = viewpoint.fill_lists(splats, limits)
     for tile in range(viewpoint.tiles):
         found = layer.entries[layer.tile_start[tile] : layer.tile_start[tile + 1]].tolist()
         assert found == expected_list(splats, tile, viewpoint.tiles_x, limits[tile])
@@ -51,15 +52,15 @@ def test_a_list_has_what_touches_its_tile_front_to_back(n, threads):
 
 def test_slots_number_the_entries_splat_by_splat():
     entries = RANDOM.integers(0, 50, 300).astype(np.int32)
-    slots, starts = lists.number_slots(entries, 51)
+    slots, starts = tiles.number_slots(entries, 51)
     assert np.array_equal(starts, np.searchsorted(np.sort(entries), np.arange(52)))
     assert np.array_equal(np.argsort(slots), np.argsort(entries, kind="stable"))
 
 
 def test_splats_in_the_order_of_their_use_are_the_same():
-    viewpoint, splats = Viewpoint(pinhole_of(camera_at(size=40)), 2), some_splats(300, 40)
-    layer = viewpoint.enter(splats, np.full(viewpoint.tiles, np.inf, np.float32))
-    ordered, order = by_use(layer)
+    viewpoint, splats = Viewpoint(make_pinhole(camera_at(size=40)), 2), some_splats(300, 40)
+    layer = viewpoint.fill_lists(splats, np.full(viewpoint.tiles, np.inf, np.float32))
+    ordered, order = order_by_use(layer)
     assert np.array_equal(order[ordered.entries], layer.entries)
     assert len(order) == len(np.unique(layer.entries))
     first = np.unique(ordered.entries, return_index=True)[1]
@@ -74,7 +75,7 @@ def test_gradients_are_summed_by_the_name_of_the_splat():
     gradients, written = RANDOM.random((200, 3), np.float32), RANDOM.random(200) < 0.7
     totals, wanted = np.zeros((30, 3), np.float32), np.zeros((30, 3))
     for begin, end in ((0, 7), (7, 20)):
-        lists.sum_by_name(begin, end, entries, rows, gradients, written, totals)
+        tiles.sum_by_gaussian(begin, end, entries, rows, gradients, written, totals)
     np.add.at(wanted, rows[entries[written]], gradients[written])
     assert np.allclose(totals, wanted, rtol=1e-5)
 
@@ -86,4 +87,4 @@ def test_an_image_too_wide_for_small_boxes_is_drawn_like_its_part():
     part, whole = (CpuRenderer().freeze(gaussians, c) for c in (camera, wide))
     assert part.layer.boxes.dtype == np.int16
     assert whole.layer.boxes.dtype == np.int32
-    assert torch.allclose(whole.context.image[:, :32], part.context.image, atol=2e-3)
+    assert torch.allclose(whole.render.image[:, :32], part.render.image, atol=2e-3)

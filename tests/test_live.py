@@ -20,21 +20,21 @@ from scipy.spatial.transform import Rotation
 
 from command import run
 from gscompleter import load_ply, save_ply
-from gscompleter.cli import parsed
-from gscompleter.commands import live
-from gscompleter.commands.options import LiveOptions
+from gscompleter.apps.commands import live
+from gscompleter.apps.commands.options import LiveOptions
+from gscompleter.apps.live.page import Page, PageServices, describe_outcome, run_request
+from gscompleter.apps.live.poses import camera_from_page, camera_to_page, compute_page_unit
+from gscompleter.apps.live.serving import start_server
+from gscompleter.apps.live.session import Session, complete_camera, undo_step
+from gscompleter.apps.live.splat import make_page_splat
+from gscompleter.cli import parse_command
 from gscompleter.completer import STAGES
 from gscompleter.config import CompleterConfig
 from gscompleter.errors import InputError
-from gscompleter.frames.similarity import similarity
-from gscompleter.geometry import rotation_between
-from gscompleter.live.page import Page, Subject, answer, outcome
-from gscompleter.live.poses import camera_of, pose_of, unit_of
-from gscompleter.live.serving import serving
-from gscompleter.live.session import Session, completed, undone
-from gscompleter.live.splat import splat_of
-from gscompleter.progress import stages_heard_by
-from gscompleter.splats.frames import moved
+from gscompleter.geometry import measure_rotation
+from gscompleter.progress import notify_of_stages
+from gscompleter.splat_alignment.similarity import make_similarity
+from gscompleter.splats.transform import transform_gaussians
 from gscompleter.types import merge
 from scenes import Room, camera_at, gaussians_of, photographed, random_gaussians, view_of
 
@@ -42,7 +42,7 @@ SIZE = 48
 CAMERAS = [camera_at(x, yaw=yaw, size=SIZE) for x, yaw in ((-0.3, 0), (0.1, 0), (0.4, 4))]
 HOLES = [camera_at(0.7, 0.1, 0.05, yaw=14, size=SIZE), camera_at(-0.7, yaw=-16, size=SIZE)]
 """Cameras at holes of the room, to the right and to the left of the photographs."""
-ELSEWHERE = similarity(
+ELSEWHERE = make_similarity(
     0.3, Rotation.from_rotvec([0.9, -1.7, 0.4]).as_matrix(), np.array([5.0, 3.0, -2.0])
 )
 QUIET = Console(quiet=True)
@@ -66,38 +66,38 @@ def ready(room, tmp_path_factory) -> live.Prepared:
 
 @pytest.fixture(scope="module")
 def begun(ready) -> Session:
-    return live.begin(ready)
+    return live.begin_session(ready)
 
 
 def test_undo_goes_back_and_the_same_camera_leads_to_the_same_scene(begun):
-    one, result = completed(begun, HOLES[0])
-    two, _ = completed(one, HOLES[1])
+    one, result = complete_camera(begun, HOLES[0])
+    two, _ = complete_camera(one, HOLES[1])
     assert result.hole_fraction > 0.1
-    assert len(begun.now.added) < len(one.now.added) < len(two.now.added)
-    assert undone(two) == one
-    assert undone(undone(two)) == begun
-    again, _ = completed(undone(two), HOLES[1])
+    assert len(begun.now.added) < len(one.latest.added) < len(two.latest.added)
+    assert undo_step(two) == one
+    assert undo_step(undo_step(two)) == begun
+    again, _ = complete_camera(undo_step(two), HOLES[1])
     for name in ("means", "scales", "quats", "opacities", "sh", "generated"):
-        assert torch.equal(getattr(again.now.scene, name), getattr(two.now.scene, name)), name
+        assert torch.equal(getattr(again.latest.scene, name), getattr(two.latest.scene, name)), name
 
 
 def test_there_is_nothing_to_undo_in_the_beginning(begun):
     with pytest.raises(InputError, match="nothing to undo"):
-        undone(begun)
+        undo_step(begun)
 
 
 def test_a_camera_that_adds_nothing_is_no_step(begun):
-    session, result = completed(begun, begun.now.views[0].camera)
+    session, result = complete_camera(begun, begun.now.views[0].camera)
     assert session is begun
-    assert outcome(result, 1.0) == "The target is a context view: nothing to complete."
+    assert describe_outcome(result, 1.0) == "The target is a context view: nothing to complete."
 
 
 def test_stages_are_heard_as_they_begin(begun):
     heard: list[str] = []
-    with stages_heard_by(heard.append):
-        completed(begun, HOLES[0])
+    with notify_of_stages(heard.append):
+        complete_camera(begun, HOLES[0])
     assert list(dict.fromkeys(heard)) == list(STAGES)
-    completed(begun, HOLES[0])
+    complete_camera(begun, HOLES[0])
     assert list(dict.fromkeys(heard)) == list(STAGES)
 
 
@@ -117,10 +117,10 @@ def test_what_is_saved_is_what_complete_writes(ready, begun, tmp_path, monkeypat
     saver = live.Saver(ready)
     with pytest.raises(InputError, match="nothing to save"):
         saver.save(begun)
-    session, _ = completed(begun, HOLES[0])
+    session, _ = complete_camera(begun, HOLES[0])
     assert str(ready.options.out) in saver.save(session)
     assert the_same_as_complete(monkeypatch, ready, tmp_path)
-    session, _ = completed(session, HOLES[1])
+    session, _ = complete_camera(session, HOLES[1])
     saver.save(session)  # replaces its own files
     assert len(json.loads((ready.options.out / "summary.json").read_text())["targets"]) == 2
     assert the_same_as_complete(monkeypatch, ready, tmp_path, "--overwrite")
@@ -139,16 +139,20 @@ def test_what_is_saved_of_a_splat_in_a_frame_of_its_own_is_too(tmp_path, monkeyp
     told = {"transform": (np.diag([1 / 0.3] * 3 + [1]) @ ELSEWHERE)[:3].tolist(), "scale": 0.3}
     (room / "dataparser_transforms.json").write_text(json.dumps(told))
     scene = merge([gaussians_of(view_of(Room(), camera)) for camera in CAMERAS[:2]])
-    save_ply(tmp_path / "splat.ply", moved(scene, torch.from_numpy(ELSEWHERE).float()))
+    save_ply(
+        tmp_path / "splat.ply", transform_gaussians(scene, torch.from_numpy(ELSEWHERE).float())
+    )
     options = options_for(room, tmp_path / "out", scene=tmp_path / "splat.ply")
     ready = live.prepare(options, QUIET)
     assert ready.task.method == "dataparser"
-    session = live.begin(ready)
-    target = session.place.read(HOLES[0])
-    session, result = completed(session, target)
+    session = live.begin_session(ready)
+    target = session.conversion.convert_to_result(HOLES[0])
+    session, result = complete_camera(session, target)
     assert len(result.added) > 0
-    assert torch.allclose(session.steps[0].told.c2w.float(), HOLES[0].c2w, atol=1e-6)
-    assert torch.equal(session.place.read(session.steps[0].told).c2w, result.target.c2w)
+    assert torch.allclose(session.steps[0].camera.c2w.float(), HOLES[0].c2w, atol=1e-6)
+    assert torch.equal(
+        session.conversion.convert_to_result(session.steps[0].camera).c2w, result.target.c2w
+    )
     live.Saver(ready).save(session)
     assert the_same_as_complete(monkeypatch, ready, tmp_path, "--scene", options.scene)
 
@@ -162,7 +166,7 @@ def test_an_antialiased_splat_is_named_so_and_saved_as_one(room, tmp_path):
     said = console.file.getvalue().replace("\n", " ")
     assert "antialiased Gaussians of SH degree 0" in said
     assert "The page renders antialiased Gaussians as classic ones" in said
-    session, _ = completed(live.begin(ready), HOLES[0])
+    session, _ = complete_camera(live.begin_session(ready), HOLES[0])
     live.Saver(ready).save(session)
     for name in ("context.ply", "completed.ply", "generated.ply"):
         assert load_ply(tmp_path / "out" / name).is_antialiased, name
@@ -175,28 +179,28 @@ def test_the_frames_that_were_chosen_are_named(room, tmp_path):
 
 
 def test_a_hole_is_found_where_something_is_missing(ready, begun):
-    camera = live.hole_of(ready, begun.now)
+    camera = live.find_next_target(ready, begun.now)
     assert camera is not None
-    _, result = completed(begun, camera)
+    _, result = complete_camera(begun, camera)
     assert result.hole_fraction > 0.05
 
 
 @pytest.mark.parametrize("unit", [1.0, 25.0])
 def test_a_camera_of_the_page_is_the_one_it_was_made_of(unit):
     camera = replace(camera_at(0.3, -0.2, 0.5, yaw=200, size=SIZE), near=0.5, far=8.0)
-    back = camera_of(pose_of(camera, unit), SIZE, SIZE, unit)
-    assert rotation_between(back, camera) < 1e-3
+    back = camera_from_page(camera_to_page(camera, unit), SIZE, SIZE, unit)
+    assert measure_rotation(back, camera) < 1e-3
     assert torch.allclose(back.center, camera.center, atol=1e-6)
     assert torch.allclose(back.K, camera.K, rtol=1e-5)
-    assert unit_of(camera) == pytest.approx(1.5)
-    assert pose_of(camera, unit).fov == pytest.approx(2 * math.atan(0.5 / 0.9))
+    assert compute_page_unit(camera) == pytest.approx(1.5)
+    assert camera_to_page(camera, unit).fov == pytest.approx(2 * math.atan(0.5 / 0.9))
 
 
 @pytest.mark.parametrize("unit", [1e-4, 1.0, 1e4])
 def test_a_splat_of_any_unit_survives_the_pages_precision(unit):
     gaussians = random_gaussians(100)
     scaled = replace(gaussians, means=unit * gaussians.means, scales=unit * gaussians.scales)
-    splat = splat_of(scaled)
+    splat = make_page_splat(scaled)
     axes = Rotation.from_quat(gaussians.quats.numpy(), scalar_first=True).as_matrix()
     true = axes @ (gaussians.scales.numpy()[:, :, None] ** 2 * axes.transpose(0, 2, 1))
     shown = splat.covariances.astype(np.float16).astype(np.float64) * (splat.size / unit) ** 2
@@ -205,7 +209,10 @@ def test_a_splat_of_any_unit_survives_the_pages_precision(unit):
 
 
 def test_a_tint_changes_colours_alone():
-    plain, tinted = splat_of(random_gaussians(10)), splat_of(random_gaussians(10), tinted=True)
+    plain, tinted = (
+        make_page_splat(random_gaussians(10)),
+        make_page_splat(random_gaussians(10), tinted=True),
+    )
     assert np.abs(plain.rgbs - tinted.rgbs).max() > 0.1
     assert np.array_equal(plain.covariances, tinted.covariances)
 
@@ -217,28 +224,28 @@ def test_an_error_is_a_sentence_and_ends_nothing(capsys):
     def broken() -> str:
         raise ZeroDivisionError("division by zero")
 
-    assert answer(mended) == "Name another one."
-    assert "the scene is unchanged" in answer(broken)
+    assert run_request(mended) == "Name another one."
+    assert "the scene is unchanged" in run_request(broken)
     assert "ZeroDivisionError" in capsys.readouterr().err
 
 
 @pytest.fixture
 def page(begun) -> Iterator[Page]:
-    subject = Subject(begun, begun.now.views, lambda _: None, lambda _: "Saved.")
+    subject = PageServices(begun, begun.now.views, lambda _: None, lambda _: "Saved.")
     page = Page(subject, "127.0.0.1", 0)
     yield page
     page.close()
 
 
 def test_what_was_generated_is_shown_tinted_or_hidden_and_undone(page, begun):
-    client, seen = Mock(spec=viser.ClientHandle), pose_of(HOLES[0], page._unit)
+    client, seen = Mock(spec=viser.ClientHandle), camera_to_page(HOLES[0], page._unit)
     assert "Completed" in page.complete(client, seen)
     assert len(page._targets) == 1
     shown = page._generated.buffer.copy()
     assert len(shown) == len(page.session.now.added)
-    page._look.value = "hide"
+    page._generated_mode.value = "hide"
     assert page._generated is None
-    page._look.value = "tint"
+    page._generated_mode.value = "tint"
     assert len(page._generated.buffer) == len(shown)
     assert not np.array_equal(page._generated.buffer, shown)
     assert "0 completions are left" in page.undo(client, seen)
@@ -249,12 +256,12 @@ def test_what_was_generated_is_shown_tinted_or_hidden_and_undone(page, begun):
 
 def test_photographs_near_a_camera_that_is_jumped_to_make_way(page):
     client = MagicMock(spec=viser.ClientHandle, camera=Mock())
-    first, second = (pose_of(view.camera, page._unit) for view in page.subject.photographs)
+    first, second = (camera_to_page(view.camera, page._unit) for view in page.subject.photographs)
     assert not page._photographs[0].visible  # where browsers begin
-    page._jump(client, second)
+    page._move_browser(client, second)
     assert np.array_equal(client.camera.position, second.position)
     assert not page._photographs[1].visible
-    page._jump(client, replace(first, position=first.position - 5))
+    page._move_browser(client, replace(first, position=first.position - 5))
     assert all(frustum.visible for frustum in page._photographs)
 
 
@@ -267,9 +274,9 @@ def test_one_thing_is_done_at_a_time(page):
     client = Mock(spec=viser.ClientHandle)
     client.camera = Mock(wxyz=np.array([1.0, 0, 0, 0]), position=np.zeros(3), fov=1.0)
     event = Mock(spec=viser.GuiEvent, client=client)
-    page._ask(page.undo, event)
+    page._submit(page.undo, event)
     assert client.add_notification.call_count == 0
-    page._ask(page.undo, event)
+    page._submit(page.undo, event)
     assert client.add_notification.call_count == 1
     assert page._requests.qsize() == 1
 
@@ -278,7 +285,7 @@ def test_a_port_that_is_taken_is_refused():
     with socket.create_server(("127.0.0.1", 0)) as taken:
         port = taken.getsockname()[1]
         with pytest.raises(InputError, match=f"port {port}"):
-            serving("127.0.0.1", port)
+            start_server("127.0.0.1", port)
 
 
 def test_without_viser_a_sentence_says_what_to_install(room, tmp_path, monkeypatch, capsys):
@@ -290,8 +297,8 @@ def test_without_viser_a_sentence_says_what_to_install(room, tmp_path, monkeypat
 
 def test_the_options_of_complete_are_those_of_live(room, tmp_path):
     words = ["live", str(room), "--out", str(tmp_path / "out"), "--config", "paper"]
-    options = parsed([*words, "--config.registration.iterations", "7", "--seed", "3"])
-    asked = live.as_complete(options)
+    options = parse_command([*words, "--config.registration.iterations", "7", "--seed", "3"])
+    asked = live.make_complete_options(options)
     paper = CompleterConfig.paper()
     registration = replace(paper.registration, iterations=7)
     assert asked.config == replace(paper, registration=registration)
@@ -302,7 +309,7 @@ def test_pages_from_elsewhere_are_refused():
     from websockets.exceptions import InvalidStatus
     from websockets.sync.client import connect
 
-    server = serving("127.0.0.1", 0)
+    server = start_server("127.0.0.1", 0)
     try:
         address = f"ws://127.0.0.1:{server.get_port()}"
         for origin in ("http://elsewhere.example", "http://127.0.0.1.elsewhere.example", "null"):

@@ -10,12 +10,12 @@ import torch.nn.functional as F
 from torch import Tensor
 
 from gscompleter.errors import InputError
-from gscompleter.metrics import lpips as module
-from gscompleter.metrics.lpips import (
+from gscompleter.evaluation.metrics import lpips as module
+from gscompleter.evaluation.metrics.lpips import (
     NETWORKS,
     WeightsNotAvailable,
+    compute_lpips,
     load_lpips,
-    lpips_if_available,
 )
 
 # Written out by hand from the papers: (number in the file, in, out, kernel) of each convolution.
@@ -202,14 +202,14 @@ def test_a_download_goes_to_the_cache_and_names_the_hash(
 
 def test_tables_get_a_reason_instead_of_a_number(tmp_path: Path):
     image, truth = images()
-    assert lpips_if_available(image, truth, "vgg", tmp_path) is None
+    assert compute_lpips(image, truth, "vgg", tmp_path) is None
 
 
 def test_tables_get_the_number_where_there_are_weights(weights: tuple[str, Path]):
     image, truth = images()
-    score = lpips_if_available(image, truth, *weights)
+    score = compute_lpips(image, truth, *weights)
     assert score == load_lpips(*weights)(image, truth).item()
-    module.cached_lpips.cache_clear()
+    module.load_cached_lpips.cache_clear()
 
 
 def test_another_file_under_the_name_is_refused(tmp_path: Path):

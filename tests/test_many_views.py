@@ -7,15 +7,27 @@ import pytest
 import torch
 
 from gscompleter import View, load_renderer
+from gscompleter.evaluation.metrics.image import psnr
 from gscompleter.geometry import project
 from gscompleter.kernels import stereo
-from gscompleter.matching.neighbours import CANDIDATES, COUNT, neighbours_among
-from gscompleter.matching.stereo_image import stereo_images
-from gscompleter.metrics.image import psnr
+from gscompleter.reconstructors.features.neighbours import (
+    NUM_COMPARED,
+    NUM_SOURCES,
+    find_neighbours,
+)
+from gscompleter.reconstructors.features.stereo_image import make_stereo_images
 from gscompleter.reconstructors.plane_sweep import PlaneSweep
-from gscompleter.reconstructors.plane_sweep.fusion import Layer, finest_pixels, free_pixels
-from gscompleter.reconstructors.plane_sweep.joint_fit import PASSES, fit_jointly, order_of
-from gscompleter.reconstructors.plane_sweep.rig import at_half_size, halved, rig_of
+from gscompleter.reconstructors.plane_sweep.fusion import (
+    Layer,
+    find_finest_pixels,
+    find_free_pixels,
+)
+from gscompleter.reconstructors.plane_sweep.joint_fit import (
+    STEPS_PER_VIEW,
+    fit_jointly,
+    shuffle_views,
+)
+from gscompleter.reconstructors.plane_sweep.rig import build_rig, halve_image, halve_transform
 from scenes import Room, camera_at, gaussians_of, view_of
 
 SIZE = 64
@@ -29,7 +41,7 @@ def row_of_views(count: int, size: int = SIZE) -> list[View]:
 
 def true_layers(views: list[View], measured: float = 1.0) -> tuple[list[Layer], dict]:
     """Layers of perfect stereo."""
-    rig = rig_of(views)
+    rig = build_rig(views)
     layers = []
     for view, image in zip(views, rig.images, strict=True):
         inverse = np.float32(rig.unit) / view.depth.numpy()
@@ -46,52 +58,55 @@ def found():
 
 
 def test_each_view_is_matched_with_the_ones_beside_it():
-    neighbours = neighbours_among(stereo_images(row_of_views(6))[0])
-    for number, others in enumerate(neighbours.of):
-        assert len(others) == COUNT
+    neighbours = find_neighbours(make_stereo_images(row_of_views(6))[0])
+    for number, others in enumerate(neighbours.neighbours_of):
+        assert len(others) == NUM_SOURCES
         assert number not in others
         assert all(abs(number - other) <= 2 for other in others)
-    assert neighbours.either_way(0) == sorted(
-        {*neighbours.of[0], *(i for i, others in enumerate(neighbours.of) if 0 in others)}
+    assert neighbours.find_partners(0) == sorted(
+        {
+            *neighbours.neighbours_of[0],
+            *(i for i, others in enumerate(neighbours.neighbours_of) if 0 in others),
+        }
     )
 
 
 def test_a_view_from_the_same_place_tells_no_depth_and_is_not_chosen():
     left, right = row_of_views(2)
-    neighbours = neighbours_among(stereo_images([left, left, right, right])[0])
-    for number, others in enumerate(neighbours.of):
+    neighbours = find_neighbours(make_stereo_images([left, left, right, right])[0])
+    for number, others in enumerate(neighbours.neighbours_of):
         assert others
         assert {number, number ^ 1}.isdisjoint(others)
 
 
 def test_the_work_grows_with_the_number_of_views_and_not_with_its_square(monkeypatch):
     swept, compared = [], []
-    costs = stereo.matching_costs
-    monkeypatch.setattr(stereo, "matching_costs", lambda *a: swept.append(1) or costs(*a))
+    costs = stereo.compute_matching_costs
+    monkeypatch.setattr(stereo, "compute_matching_costs", lambda *a: swept.append(1) or costs(*a))
     for count in (5, 10):
         views = [
             replace(v, camera=replace(v.camera, near=1.0, far=10.0))
             for v in row_of_views(count, size=16)
         ]
-        rig = rig_of(views)
-        PlaneSweep().layers(rig, views)
-        assert len(swept) == COUNT * count
-        assert len(rig.neighbours.matches) <= CANDIDATES * count
-        compared.append(len(order_of(count)))
+        rig = build_rig(views)
+        PlaneSweep().compute_layers(rig, views)
+        assert len(swept) == NUM_SOURCES * count
+        assert len(rig.neighbours.matches) <= NUM_COMPARED * count
+        compared.append(len(shuffle_views(count)))
         swept.clear()
-    assert compared == [PASSES * 5, PASSES * 10]
+    assert compared == [STEPS_PER_VIEW * 5, STEPS_PER_VIEW * 10]
 
 
 def test_a_pixel_of_a_halved_image_meets_the_same_place_in_the_other():
-    rig = rig_of(row_of_views(3, size=33))
-    small = halved(rig.images[0])
+    rig = build_rig(row_of_views(3, size=33))
+    small = halve_image(rig.images[0])
     assert small.size == (17, 17)
     np.testing.assert_allclose(
         small.image[3, 5], rig.images[0].image[6:8, 10:12].mean(axis=(0, 1)), rtol=1e-5
     )
     pixel, inverse = np.array([10.0, 6.0, 1.0]), 0.3
     whole = rig.transforms[0, 1] @ [*pixel, inverse]
-    half = at_half_size(rig.transforms[0, 1]) @ [*(pixel[:2] / 2), 1.0, inverse]
+    half = halve_transform(rig.transforms[0, 1]) @ [*(pixel[:2] / 2), 1.0, inverse]
     np.testing.assert_allclose(half[:2] / half[2], whole[:2] / whole[2] / 2, rtol=1e-4)
 
 
@@ -100,11 +115,11 @@ def test_what_another_view_sees_through_is_left_out():
     patch = np.s_[20:40, 20:40]
     layers[0].inverse[patch] *= 2.0
     layers[0].confidence[patch] = 0.0
-    free = free_pixels(layers, transforms)
+    free = find_free_pixels(layers, transforms)
     assert free[0][patch].mean() < 0.1
     # Measured or not, two views know better than one.
     layers[0].confidence[patch] = 1.0
-    assert free_pixels(layers, transforms)[0][patch].mean() < 0.1
+    assert find_free_pixels(layers, transforms)[0][patch].mean() < 0.1
     untouched = np.ones_like(free[0])
     untouched[patch] = False
     assert free[0][untouched].mean() > 0.95
@@ -112,7 +127,7 @@ def test_what_another_view_sees_through_is_left_out():
 
 def test_each_surface_is_kept_once():
     layers, transforms = true_layers(row_of_views(3))
-    kept = finest_pixels(layers, free_pixels(layers, transforms), transforms)
+    kept = find_finest_pixels(layers, find_free_pixels(layers, transforms), transforms)
     shares = [mask.mean() for mask in kept]
     assert shares[0] > 0.95
     assert sum(shares) < 1.6
@@ -122,7 +137,7 @@ def test_the_view_that_sees_a_surface_finest_keeps_it():
     far, near = (view_of(Room(), camera_at(z=z, size=SIZE)) for z in (0.0, 1.0))
     aside = view_of(Room(), camera_at(0.2, size=SIZE))
     layers, transforms = true_layers([far, near, aside])
-    kept = finest_pixels(layers, free_pixels(layers, transforms), transforms)
+    kept = find_finest_pixels(layers, find_free_pixels(layers, transforms), transforms)
     assert kept[1].mean() > 0.9
     middle = np.s_[24:40, 24:40]
     assert kept[0][middle].mean() < 0.1
@@ -131,7 +146,7 @@ def test_the_view_that_sees_a_surface_finest_keeps_it():
 def test_what_was_filled_in_gives_way_to_what_was_measured():
     layers, transforms = true_layers(row_of_views(3))
     layers[0].confidence[:] = 0.0
-    kept = finest_pixels(layers, free_pixels(layers, transforms), transforms)
+    kept = find_finest_pixels(layers, find_free_pixels(layers, transforms), transforms)
     assert kept[0].mean() < 0.4
     assert kept[1].mean() > 0.9
 
@@ -177,17 +192,19 @@ def test_the_joint_fit_brings_every_photograph_nearer_and_repeats_itself():
 
 
 def test_each_view_has_its_turn_as_often_as_the_others():
-    assert torch.bincount(torch.tensor(order_of(7))).tolist() == [PASSES] * 7
+    assert torch.bincount(torch.tensor(shuffle_views(7))).tolist() == [STEPS_PER_VIEW] * 7
 
 
 @pytest.mark.parametrize(
     ("count", "size", "expected"), [(3, 192, {96}), (3, 190, {190}), (2, 192, {96, 192})]
 )
 def test_large_images_are_matched_at_half_their_size_first(monkeypatch, count, size, expected):
-    matched, costs = set(), stereo.matching_costs
+    matched, costs = set(), stereo.compute_matching_costs
     monkeypatch.setattr(
-        stereo, "matching_costs", lambda image, *a: matched.add(len(image)) or costs(image, *a)
+        stereo,
+        "compute_matching_costs",
+        lambda image, *a: matched.add(len(image)) or costs(image, *a),
     )
-    depths = PlaneSweep().depths(row_of_views(count, size=size))
+    depths = PlaneSweep().estimate_depths(row_of_views(count, size=size))
     assert matched == expected
     assert {tuple(depth.depth.shape) for depth in depths} == {(size, size)}

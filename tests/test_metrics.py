@@ -12,23 +12,30 @@ from skimage.metrics import peak_signal_noise_ratio, structural_similarity
 from torch import Tensor
 
 from gscompleter.errors import InputError
-from gscompleter.masks import dilate
-from gscompleter.metrics.fid import fid
-from gscompleter.metrics.flip import flip_map
-from gscompleter.metrics.geometry import (
+from gscompleter.evaluation.metrics.fid import fid
+from gscompleter.evaluation.metrics.flip import compute_flip_map
+from gscompleter.evaluation.metrics.geometry import (
     Alignment,
-    abs_rel,
-    alignment,
-    cloud_distances,
-    num_known,
-    primitive_alignment,
+    compute_abs_rel,
+    compute_cloud_distances,
+    count_known,
+    measure_alignment,
+    measure_primitive_alignment,
 )
-from gscompleter.metrics.haarpsi import haarpsi
-from gscompleter.metrics.image import MAX_PSNR, gradient_energy_ratio, masked_psnr, psnr, ssim
-from gscompleter.metrics.scores import Truth, looks, score
+from gscompleter.evaluation.metrics.haarpsi import haarpsi
+from gscompleter.evaluation.metrics.image import (
+    MAX_PSNR,
+    compute_gradient_energy_ratio,
+    compute_masked_psnr,
+    psnr,
+    ssim,
+)
+from gscompleter.evaluation.metrics.scores import Truth, measure_perceptual_quality, score
+from gscompleter.image_ops import dilate
 from gscompleter.render import load_renderer
-from gscompleter.stages.integration import hole_mask, keep_in_holes
-from gscompleter.types import Camera, DepthAffine, Gaussians, TargetCompletion, merge
+from gscompleter.stages.filter_holes import compute_hole_mask, filter_holes
+from gscompleter.state import TargetResult
+from gscompleter.types import Camera, DepthAffine, Gaussians, merge
 from scenes import Room, camera_at, gaussians_of, scaled, view_of
 
 
@@ -111,17 +118,17 @@ def test_masked_psnr_sees_its_pixels_only():
     hole = torch.zeros(truth.shape[:2], dtype=torch.bool)
     hole[4:20, 10:30] = True
     difference = (image.double() - truth.double()).numpy()[hole.numpy()]
-    assert masked_psnr(image, truth, hole) == pytest.approx(
+    assert compute_masked_psnr(image, truth, hole) == pytest.approx(
         -10 * np.log10(np.mean(difference**2)), rel=1e-6
     )
     patched = torch.where(hole[..., None], truth, image)
-    assert masked_psnr(patched, truth, hole) == MAX_PSNR
-    assert masked_psnr(patched, truth, ~hole) == masked_psnr(image, truth, ~hole)
+    assert compute_masked_psnr(patched, truth, hole) == MAX_PSNR
+    assert compute_masked_psnr(patched, truth, ~hole) == compute_masked_psnr(image, truth, ~hole)
 
 
 def test_masked_psnr_of_no_pixel_is_none():
     image, truth = images()
-    assert masked_psnr(image, truth, torch.zeros(truth.shape[:2], dtype=torch.bool)) is None
+    assert compute_masked_psnr(image, truth, torch.zeros(truth.shape[:2], dtype=torch.bool)) is None
 
 
 # Metrics that do not reward blur
@@ -165,7 +172,7 @@ def test_blur_costs_by_haarpsi_and_takes_gradient_energy():
     everywhere = torch.ones(truth.shape[:2], dtype=torch.bool)
     softer = [truth, *(blurred(truth, sigma) for sigma in (0.5, 1.0, 2.0))]
     similar = [haarpsi(image, truth, everywhere) for image in softer]
-    energies = [gradient_energy_ratio(image, truth, everywhere) for image in softer]
+    energies = [compute_gradient_energy_ratio(image, truth, everywhere) for image in softer]
     assert similar[0] == pytest.approx(1.0)
     assert energies[0] == 1.0
     for values in (similar, energies):
@@ -177,21 +184,21 @@ def test_gradient_energy_by_hand():
     """A ramp of half the gradient has a quarter of the energy, and a constant none."""
     ramp = torch.linspace(0, 1, 12)[None, :, None].expand(10, 12, 3)
     everywhere = torch.ones(10, 12, dtype=torch.bool)
-    assert gradient_energy_ratio(ramp / 2, ramp, everywhere) == pytest.approx(0.25)
-    assert gradient_energy_ratio(ramp * 0 + 0.3, ramp, everywhere) == 0.0
-    assert gradient_energy_ratio(ramp, ramp * 0, everywhere) is None
+    assert compute_gradient_energy_ratio(ramp / 2, ramp, everywhere) == pytest.approx(0.25)
+    assert compute_gradient_energy_ratio(ramp * 0 + 0.3, ramp, everywhere) == 0.0
+    assert compute_gradient_energy_ratio(ramp, ramp * 0, everywhere) is None
     only_green = torch.stack([ramp[..., 0] * 0, ramp[..., 1], ramp[..., 2] * 0], dim=-1)
-    assert gradient_energy_ratio(only_green, ramp, everywhere) == pytest.approx(0.587**2)
+    assert compute_gradient_energy_ratio(only_green, ramp, everywhere) == pytest.approx(0.587**2)
 
 
 def test_the_border_of_a_hole_is_no_gradient():
     _, truth = images()
     hole = left_half(truth)
     outside_white = torch.where(hole[..., None], truth, 1.0)
-    assert gradient_energy_ratio(outside_white, truth, hole) == pytest.approx(1.0)
+    assert compute_gradient_energy_ratio(outside_white, truth, hole) == pytest.approx(1.0)
     thin = torch.zeros_like(hole)
     thin[5:7] = True
-    assert gradient_energy_ratio(truth, truth, thin) is None
+    assert compute_gradient_energy_ratio(truth, truth, thin) is None
 
 
 def test_looks_are_of_the_pixels_that_are_asked_for():
@@ -201,7 +208,8 @@ def test_looks_are_of_the_pixels_that_are_asked_for():
     inside = torch.arange(truth.shape[1]) < truth.shape[1] // 2 - 12
     outside = torch.arange(truth.shape[1]) > truth.shape[1] // 2 + 12
     bad, good = (
-        looks(damaged, truth, where.expand(truth.shape[:2])) for where in (inside, outside)
+        measure_perceptual_quality(damaged, truth, where.expand(truth.shape[:2]))
+        for where in (inside, outside)
     )
     assert bad.flip > 0.1
     assert bad.haarpsi < 0.5
@@ -209,15 +217,17 @@ def test_looks_are_of_the_pixels_that_are_asked_for():
     assert good.flip == pytest.approx(0.0, abs=1e-3)
     assert good.haarpsi == pytest.approx(1.0)
     assert good.gradient_energy == 1.0
-    nothing = looks(damaged, truth, torch.zeros(truth.shape[:2], dtype=torch.bool))
+    nothing = measure_perceptual_quality(
+        damaged, truth, torch.zeros(truth.shape[:2], dtype=torch.bool)
+    )
     assert (nothing.flip, nothing.haarpsi, nothing.gradient_energy) == (None, None, None)
 
 
 def test_flip_is_none_without_its_package(monkeypatch: pytest.MonkeyPatch):
     monkeypatch.setitem(sys.modules, "flip_evaluator", None)
     image, truth = images()
-    assert flip_map(image, truth) is None
-    assert looks(image, truth, left_half(truth)).flip is None
+    assert compute_flip_map(image, truth) is None
+    assert measure_perceptual_quality(image, truth, left_half(truth)).flip is None
 
 
 # Depth
@@ -231,16 +241,18 @@ def test_abs_rel_is_the_mean_relative_error_where_truth_is_known():
     where = torch.rand(12, 15, generator=generator) > 0.3
     d, t = depth.double().numpy(), truth.double().numpy()
     mask = where.numpy() & (t > 0)
-    assert abs_rel(depth, truth, where) == pytest.approx(np.mean(abs(d - t)[mask] / t[mask]))
-    assert num_known(truth, where) == mask.sum()
-    assert num_known(None, where) is None
+    assert compute_abs_rel(depth, truth, where) == pytest.approx(
+        np.mean(abs(d - t)[mask] / t[mask])
+    )
+    assert count_known(truth, where) == mask.sum()
+    assert count_known(None, where) is None
 
 
 def test_a_depth_ten_percent_too_great_has_an_abs_rel_of_a_tenth():
     truth = torch.linspace(1, 4, 12).reshape(3, 4)
     everywhere = torch.ones(3, 4, dtype=torch.bool)
-    assert abs_rel(1.1 * truth, truth, everywhere) == pytest.approx(0.1, abs=1e-6)
-    assert abs_rel(truth, 0 * truth, everywhere) is None
+    assert compute_abs_rel(1.1 * truth, truth, everywhere) == pytest.approx(0.1, abs=1e-6)
+    assert compute_abs_rel(truth, 0 * truth, everywhere) is None
 
 
 # Point sets
@@ -258,35 +270,35 @@ def test_chamfer_and_f_score_agree_with_brute_force(seed: int):
     a = torch.randn(150, 3, generator=generator)
     b = torch.randn(220, 3, generator=generator) * 1.2 + 0.2
     there, back = brute_force(a, b)
-    assert cloud_distances(a, b).chamfer == pytest.approx(
+    assert compute_cloud_distances(a, b).chamfer == pytest.approx(
         (there.mean() + back.mean()) / 2, rel=1e-12
     )
     for threshold in (0.2, 0.4, 0.8):
         precision, recall = (there <= threshold).mean(), (back <= threshold).mean()
         expected = 2 * precision * recall / (precision + recall)
-        assert cloud_distances(a, b).f_score(threshold) == pytest.approx(expected)
-        assert cloud_distances(b, a).f_score(threshold) == pytest.approx(expected)
+        assert compute_cloud_distances(a, b).compute_f_score(threshold) == pytest.approx(expected)
+        assert compute_cloud_distances(b, a).compute_f_score(threshold) == pytest.approx(expected)
 
 
 def test_a_plane_moved_along_its_normal_is_that_far_away():
     y, x = torch.meshgrid(torch.arange(20.0), torch.arange(20.0), indexing="ij")
     plane = torch.stack([x, y, torch.zeros_like(x)], dim=-1).reshape(-1, 3)
     moved = plane + torch.tensor([0.0, 0.0, 0.25])
-    assert cloud_distances(plane, moved).chamfer == pytest.approx(0.25)
-    assert cloud_distances(plane, moved).f_score(0.2) == 0.0
-    assert cloud_distances(plane, moved).f_score(0.3) == 1.0
+    assert compute_cloud_distances(plane, moved).chamfer == pytest.approx(0.25)
+    assert compute_cloud_distances(plane, moved).compute_f_score(0.2) == 0.0
+    assert compute_cloud_distances(plane, moved).compute_f_score(0.3) == 1.0
 
 
 def test_coinciding_points_are_at_distance_zero():
     points = torch.randn(50, 3, generator=torch.Generator().manual_seed(0)).repeat(20, 1)
-    assert cloud_distances(points, points[:50]).chamfer == 0.0
-    assert cloud_distances(points, points[:50]).f_score(1e-9) == 1.0
+    assert compute_cloud_distances(points, points[:50]).chamfer == 0.0
+    assert compute_cloud_distances(points, points[:50]).compute_f_score(1e-9) == 1.0
 
 
 def test_hundreds_of_thousands_of_points_are_no_trouble():
     generator = torch.Generator().manual_seed(0)
     a, b = (torch.rand(200_000, 3, generator=generator) for _ in range(2))
-    distances = cloud_distances(a, b)
+    distances = compute_cloud_distances(a, b)
     assert distances.a_to_b.shape == distances.b_to_a.shape == (200_000,)
     # A Poisson process of density n: mean nearest distance 0.554 n^(-1/3), more at the border.
     assert distances.chamfer == pytest.approx(0.554 * 200_000 ** (-1 / 3), rel=0.05)
@@ -298,9 +310,9 @@ def test_hundreds_of_thousands_of_points_are_no_trouble():
 def test_an_empty_or_endless_set_of_points_is_refused():
     points = torch.zeros(5, 3)
     with pytest.raises(InputError, match="points on both sides, got 5 and 0"):
-        cloud_distances(points, points[:0])
+        compute_cloud_distances(points, points[:0])
     with pytest.raises(InputError, match="finite"):
-        cloud_distances(points, points.log())
+        compute_cloud_distances(points, points.log())
 
 
 # Alignment of a completion with its context
@@ -314,16 +326,16 @@ def room_context(unit: float = 1.0) -> Gaussians:
     return gaussians_of(view_of(Room(unit=unit), camera_at(size=64, unit=unit)))
 
 
-def completed(context: Gaussians, added: Gaussians, target: Camera = TARGET) -> TargetCompletion:
+def completed(context: Gaussians, added: Gaussians, target: Camera = TARGET) -> TargetResult:
     """Make a result that added `added` to `context`."""
     before = RENDERER.render(context, target)
-    mask = hole_mask(before.alpha)
-    return TargetCompletion(target, before, before, mask, None, 0, False, DepthAffine(), added)
+    mask = compute_hole_mask(before.alpha)
+    return TargetResult(target, before, before, mask, None, 0, False, DepthAffine(), added)
 
 
 def filling(context: Gaussians, factor: float = 1.0, dilation: int = 3) -> Gaussians:
     """Make the true Gaussians of the dilated hole, with depths multiplied by `factor`."""
-    hole = dilate(hole_mask(RENDERER.render(context, TARGET).alpha), dilation)
+    hole = dilate(compute_hole_mask(RENDERER.render(context, TARGET).alpha), dilation)
     assert 0.05 < hole.double().mean() < 0.7
     view = view_of(Room(), TARGET)
     assert view.depth is not None
@@ -331,7 +343,7 @@ def filling(context: Gaussians, factor: float = 1.0, dilation: int = 3) -> Gauss
 
 
 def score_of(context: Gaussians, added: Gaussians, target: Camera = TARGET) -> Alignment:
-    return alignment(added, context, target, RENDERER)
+    return measure_alignment(added, context, target, RENDERER)
 
 
 def test_generated_gaussians_that_coincide_with_the_context_are_aligned():
@@ -347,7 +359,7 @@ def test_copies_of_part_of_the_context_are_aligned_wherever_their_border_is():
     context = room_context()
     part = torch.zeros(TARGET.height, TARGET.width, dtype=torch.bool)
     part[10:30, 12:26] = True
-    score = score_of(context, keep_in_holes(context, None, part, TARGET))
+    score = score_of(context, filter_holes(context, None, part, TARGET))
     assert score.abs_rel is not None
     assert score.chamfer is not None
     assert score.f_score is not None
@@ -404,9 +416,9 @@ def test_where_nothing_overlaps_there_is_no_alignment():
     assert nothing == Alignment(0.0, 0, None, None, None, None)
     unseen = replace(context, opacities=torch.full_like(context.opacities, 0.001))
     assert score_of(context, unseen) == nothing
-    assert primitive_alignment(unseen, context, TARGET, RENDERER) == nothing
+    assert measure_primitive_alignment(unseen, context, TARGET, RENDERER) == nothing
     behind = replace(context, means=context.means - 50 * TARGET.forward)
-    assert primitive_alignment(behind, context, TARGET, RENDERER) == nothing
+    assert measure_primitive_alignment(behind, context, TARGET, RENDERER) == nothing
 
 
 def test_all_that_was_lifted_is_compared_with_what_the_target_sees_of_the_context():
@@ -414,7 +426,7 @@ def test_all_that_was_lifted_is_compared_with_what_the_target_sees_of_the_contex
     covered = RENDERER.render(context, TARGET).depth_map()
     for factor in (1.0, 1.1, 0.8):
         lifted = gaussians_of(view, factor * view.depth)
-        found = primitive_alignment(lifted, context, TARGET, RENDERER)
+        found = measure_primitive_alignment(lifted, context, TARGET, RENDERER)
         assert found.pixels == covered.valid.sum()
         z, d = (factor * view.depth)[covered.valid], covered.depth[covered.valid]
         assert found.abs_rel == pytest.approx(((z - d).abs() / d).mean().item(), rel=1e-4)
@@ -426,7 +438,7 @@ def test_primitives_with_gaps_between_them_are_measured_like_all():
     context, view = room_context(), view_of(Room(), TARGET)
     lifted = gaussians_of(view, 1.1 * view.depth)
     few = lifted[::7]
-    whole, thin = (primitive_alignment(g, context, TARGET, RENDERER) for g in (lifted, few))
+    whole, thin = (measure_primitive_alignment(g, context, TARGET, RENDERER) for g in (lifted, few))
     assert thin.pixels == pytest.approx(whole.pixels / 7, rel=0.1)
     assert thin.abs_rel == pytest.approx(whole.abs_rel, rel=0.1)
     assert score_of(context, few).pixels < 0.5 * score_of(context, lifted).pixels
@@ -449,7 +461,7 @@ def test_scores_count_the_pixels_that_they_are_measured_over():
     assert scores.depth_hole_pixels == (known & seen.holes).sum() > 0
     assert scores.depth_observed_pixels == (known & ~seen.holes).sum() > 0
     assert scores.align_pixels == score_of(context, added).pixels
-    aligned = primitive_alignment(lifted, context, TARGET, RENDERER)
+    aligned = measure_primitive_alignment(lifted, context, TARGET, RENDERER)
     assert scores.registered_pixels == aligned.pixels > scores.align_pixels
     assert scores.registered_chamfer == aligned.relative_chamfer
     scores, _ = score(context, after, added, Truth((), replace(view, depth=None)), RENDERER)

@@ -5,13 +5,17 @@ from itertools import pairwise
 import torch
 
 from gscompleter import Camera
-from gscompleter.stages.overview import has_partner, medoids, select_overview
-from gscompleter.stages.selection import points_before
+from gscompleter.stages.select_context import (
+    find_medoids,
+    has_partner,
+    make_points_in_front,
+    select_overview,
+)
 from scenes import camera_at
 
 
 def points(cameras: list[Camera]) -> torch.Tensor:
-    return torch.cat([points_before(camera, 2.0, 4.0) for camera in cameras])
+    return torch.cat([make_points_in_front(camera, 2.0, 4.0) for camera in cameras])
 
 
 def test_of_a_walk_every_nth_photograph_is_taken():
@@ -26,9 +30,9 @@ def test_of_a_walk_every_nth_photograph_is_taken():
 
 def test_the_order_of_the_photographs_does_not_matter():
     cameras = [camera_at(0.1 * number, yaw=number) for number in range(12)]
-    places = [{0.1 * i for i in medoids(cameras, 4)}]
+    places = [{0.1 * i for i in find_medoids(cameras, 4)}]
     shuffled = cameras[5:] + cameras[:5]
-    places.append({0.1 * ((i + 5) % 12) for i in medoids(shuffled, 4)})
+    places.append({0.1 * ((i + 5) % 12) for i in find_medoids(shuffled, 4)})
     assert len(places[0] & places[1]) >= 2
 
 

@@ -6,31 +6,31 @@ from pathlib import Path
 import pytest
 
 import gscompleter
-from gscompleter.geometry import distance_from_depth
-from gscompleter.stages import alignment, anchor, context, integration, registration
+from gscompleter.geometry import depth_to_distance
+from gscompleter.stages import align_depth, context, refine, select_anchor, slide_along_rays
 from gscompleter.types import DepthAffine
 
 EQUATIONS = {
     5: (r"\Psi(\mathcal{V}_{\text{in}}; \Theta)", [context.init_context]),
-    6: (r"\Phi(\mathbf{I}_n, \mathbf{P}_t)", [anchor.synthesize]),
-    7: (r"\Psi(\mathcal{V}_{\text{pair}}; \Theta)", [anchor.lift]),
-    8: (r"(s \cdot D_{\text{pred}}^{\text{anc}}", [alignment.fit_affine, DepthAffine]),
-    9: (r"d_i^{\text{init}} = \frac", [distance_from_depth, registration.apply_affine]),
-    10: (r"\mathbf{c}_{\text{tgt}} + d_i \cdot \mathbf{r}_i", [registration.displace]),
+    6: (r"\Phi(\mathbf{I}_n, \mathbf{P}_t)", [select_anchor.synthesize]),
+    7: (r"\Psi(\mathcal{V}_{\text{pair}}; \Theta)", [select_anchor.lift]),
+    8: (r"(s \cdot D_{\text{pred}}^{\text{anc}}", [align_depth.fit_affine, DepthAffine]),
+    9: (r"d_i^{\text{init}} = \frac", [depth_to_distance, slide_along_rays.apply_affine]),
+    10: (r"\mathbf{c}_{\text{tgt}} + d_i \cdot \mathbf{r}_i", [slide_along_rays.move_along_rays]),
     11: (
         r"\lambda_s \mathcal{L}_{\text{stereo}}",
-        [registration.Objective, registration.register_along_rays],
+        [slide_along_rays.Objective, slide_along_rays.register_along_rays],
     ),
-    12: (r"\mathbf{A}_{\text{ctx}}(\mathbf{p}) < \tau", [integration.hole_mask]),
-    13: (r"\mathcal{L}_{\text{mv}} =", [integration.refine_opacities]),
+    12: (r"\mathbf{A}_{\text{ctx}}(\mathbf{p}) < \tau", [refine.compute_hole_mask]),
+    13: (r"\mathcal{L}_{\text{mv}} =", [refine.refine_opacities]),
 }
 """For each equation of the paper by number, a piece of it and the code that implements it."""
 
 SECTIONS = {
     "III-C": ("Feed-Forward Metric Context Initialization", [context]),
-    "III-D": ("Anchor-Guided Gaussian Initialization", [anchor]),
-    "III-E": ("Ray-Constrained Gaussian Registration", [alignment, registration]),
-    "III-F": (r"Multi-View Gaussian Integration \& Refinement", [integration]),
+    "III-D": ("Anchor-Guided Gaussian Initialization", [select_anchor]),
+    "III-E": ("Ray-Constrained Gaussian Registration", [align_depth, slide_along_rays]),
+    "III-F": (r"Multi-View Gaussian Integration \& Refinement", [refine]),
 }
 
 

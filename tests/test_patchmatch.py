@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from gscompleter.generators.warp_inpaint.exemplar import likelihood
+from gscompleter.generators.warp_inpaint.exemplar import compute_likelihood
 from gscompleter.kernels import patchmatch
 from gscompleter.kernels.patchmatch import RADIUS, SIDE
 
@@ -25,14 +25,14 @@ def matched(seed=0):
     padded = np.pad(weight, RADIUS)
     total = [padded[y : y + SIDE, x : x + SIDE].sum() for y, x in queries]
     sources = rng.random((2, H, W, 3), np.float32)
-    return image, patchmatch.Matched(
-        patchmatch.framed(image),
-        patchmatch.framed(np.repeat(weight[..., None], 3, axis=-1)),
+    return image, patchmatch.PatchProblem(
+        patchmatch.pad_border(image),
+        patchmatch.pad_border(np.repeat(weight[..., None], 3, axis=-1)),
         np.array(total, np.float32),
         queries,
         query_at,
         rng.random(len(queries), np.float32),
-        patchmatch.with_column_beside(sources),
+        patchmatch.pad_column(sources),
         inside,
         rng.random((2, H, W), np.float32),
     )
@@ -118,7 +118,7 @@ def test_what_only_costly_patches_tell_of_is_still_their_mean():
     _, found = matched()
     field, shift = at_random(found), np.zeros((len(found.queries), 3), np.float32)
     corner = (found.queries[:, 0] <= RADIUS) & (found.queries[:, 1] >= W - 1 - RADIUS)
-    votes = likelihood(np.where(corner, np.float32(1), np.float32(1e-4)))
+    votes = compute_likelihood(np.where(corner, np.float32(1), np.float32(1e-4)))
     colours = patchmatch.vote(found.query_at, votes, found.sources, field, shift)[0]
     alike = patchmatch.vote(found.query_at, np.ones_like(votes), found.sources, field, shift)[0]
     assert np.abs(colours[0, -1] - alike[0, -1]).max() < 1e-4 < alike[0, -1].max()

@@ -14,22 +14,22 @@ import pytest
 import torch
 
 from feed_forward_fixtures import rule_v1
-from gscompleter.generators.diffusion.pe_field import preview
-from gscompleter.generators.diffusion.position_ids import (
+from gscompleter.evaluation.metrics.image import psnr
+from gscompleter.models.diffusion.pe_field import preview
+from gscompleter.models.diffusion.position_ids import (
     LEVELS,
-    packed,
-    seen_from,
-    source_ids,
-    target_ids,
+    compute_source_ids,
+    compute_target_ids,
+    pack_cells,
+    project_to_target,
 )
-from gscompleter.generators.diffusion.published import PE_FIELD_TRANSFORMER
-from gscompleter.generators.diffusion.rotary import (
-    TRIPLE_OF_HEAD,
+from gscompleter.models.diffusion.published import PE_FIELD_TRANSFORMER
+from gscompleter.models.diffusion.rotary import (
+    POSITION_OF_HEAD,
     PerHeadRotary,
-    with_per_head_positions,
+    enable_per_head_positions,
 )
-from gscompleter.generators.diffusion.splat import forward_splat
-from gscompleter.metrics.image import psnr
+from gscompleter.models.diffusion.splat import splat_forward
 from gscompleter.types import Camera
 from parity import assert_close
 from scenes import Room, view_of
@@ -62,29 +62,29 @@ def authors_cameras() -> tuple[Camera, Camera]:
 
 
 def test_the_target_positions_are_the_authors():
-    found = target_ids(SIZE, GRID, torch.float32)
+    found = compute_target_ids(SIZE, GRID, torch.float32)
     assert_close(found, levels_of(IDS, "target_ids_{}"), "target_ids")
 
 
 def test_the_target_positions_rounded_to_bfloat16_are_the_authors_exactly():
-    assert torch.equal(target_ids(SIZE, GRID), levels_of(IDS, "target_ids_bf16_{}"))
+    assert torch.equal(compute_target_ids(SIZE, GRID), levels_of(IDS, "target_ids_bf16_{}"))
 
 
 def test_the_target_positions_at_1024_pixels_are_the_authors():
-    found = target_ids((1024, 1024), (64, 64), torch.float32)[::61]
+    found = compute_target_ids((1024, 1024), (64, 64), torch.float32)[::61]
     assert_close(found, levels_of(IDS, "target_ids_1024_{}_stride"), "target_ids_1024")
 
 
 def test_the_source_positions_are_the_authors():
     source, target = authors_cameras()
-    found = source_ids(IDS["depth"], source, target, GRID, GRID)
+    found = compute_source_ids(IDS["depth"], source, target, GRID, GRID)
     assert_close(found, levels_of(IDS, "source_ids_{}"), "source_ids")
 
 
 def test_the_target_positions_are_rounded_on_level_2_alone():
     """The authors' bfloat16 rounds by up to an eighth of a token at 1024 pixels."""
     exact, rounded = (
-        target_ids((1024, 1024), (64, 64), d) for d in (torch.float32, torch.bfloat16)
+        compute_target_ids((1024, 1024), (64, 64), d) for d in (torch.float32, torch.bfloat16)
     )
     assert torch.equal(exact[:, :15], rounded[:, :15])
     assert (exact - rounded).abs().max() == 0.125
@@ -92,7 +92,7 @@ def test_the_target_positions_are_rounded_on_level_2_alone():
 
 def test_pixels_and_depths_in_the_target_are_the_authors():
     source, target = authors_cameras()
-    pixels, z = seen_from(IDS["depth"], source, target)
+    pixels, z = project_to_target(IDS["depth"], source, target)
     assert_close(pixels, IDS["uv"][0], "uv")
     assert_close(z, IDS["z"][0], "z")
 
@@ -111,10 +111,10 @@ def centred_camera() -> Camera:
 @pytest.mark.parametrize("unit", [1.0, 1e-4, 1e4])
 def test_equal_cameras_and_one_depth_give_the_plain_grid_and_the_documented_offset(unit):
     camera, depth = centred_camera(), torch.full(SIZE, 2.0 * unit)
-    found = source_ids(depth, camera, camera, GRID, GRID)[:, :3]
+    found = compute_source_ids(depth, camera, camera, GRID, GRID)[:, :3]
     expected = torch.cat([torch.full((48, 1), 1.01), plain_ids() + 7.5 / 16], dim=1)
     assert_close(found, expected, "positions")
-    assert torch.equal(target_ids(SIZE, GRID)[:, 1:3], plain_ids())
+    assert torch.equal(compute_target_ids(SIZE, GRID)[:, 1:3], plain_ids())
 
 
 def test_a_camera_that_moves_by_one_token_moves_the_positions_by_one_token():
@@ -122,8 +122,10 @@ def test_a_camera_that_moves_by_one_token_moves_the_positions_by_one_token():
     camera, depth = centred_camera(), torch.full(SIZE, 2.0)
     c2w = torch.eye(4)
     c2w[0, 3] = 16 * 2.0 / 110
-    still = source_ids(depth, camera, camera, GRID, GRID).reshape(48, 21, 3)
-    moved = source_ids(depth, camera, replace(camera, c2w=c2w), GRID, GRID).reshape(48, 21, 3)
+    still = compute_source_ids(depth, camera, camera, GRID, GRID).reshape(48, 21, 3)
+    moved = compute_source_ids(depth, camera, replace(camera, c2w=c2w), GRID, GRID).reshape(
+        48, 21, 3
+    )
     assert_close(moved, still + torch.tensor([0.0, 0.0, -1.0]), "positions")
 
 
@@ -136,8 +138,8 @@ def test_the_number_of_pixels_of_the_target_does_not_matter():
         width=2 * camera.width,
         height=2 * camera.height,
     )
-    once = source_ids(depth, camera, camera, GRID, GRID).reshape(48, 21, 3)
-    twice = source_ids(depth, camera, finer, GRID, GRID).reshape(48, 21, 3)
+    once = compute_source_ids(depth, camera, camera, GRID, GRID).reshape(48, 21, 3)
+    twice = compute_source_ids(depth, camera, finer, GRID, GRID).reshape(48, 21, 3)
     assert_close(twice, once + torch.tensor([0, 0.25 / 16, 0.25 / 16]), "positions")
 
 
@@ -147,8 +149,8 @@ def test_a_target_that_sees_farther_to_the_left_counts_from_there():
     K = camera.K.clone()
     K[0, 2] += 32
     wider = replace(camera, K=K, width=camera.width + 32)
-    once = source_ids(depth, camera, camera, GRID, GRID).reshape(48, 21, 3)
-    moved = source_ids(depth, camera, wider, GRID, (6, 10)).reshape(48, 21, 3)
+    once = compute_source_ids(depth, camera, camera, GRID, GRID).reshape(48, 21, 3)
+    moved = compute_source_ids(depth, camera, wider, GRID, (6, 10)).reshape(48, 21, 3)
     assert_close(moved, once + torch.tensor([0.0, 0.0, 2.0]), "positions")
 
 
@@ -156,7 +158,7 @@ def test_what_lies_behind_the_target_is_finite_and_far_outside_of_its_image():
     camera, depth = centred_camera(), torch.full(SIZE, 2.0)
     c2w = torch.eye(4)
     c2w[2, 3] = 5.0
-    found = source_ids(depth, camera, replace(camera, c2w=c2w), GRID, GRID)
+    found = compute_source_ids(depth, camera, replace(camera, c2w=c2w), GRID, GRID)
     assert found.isfinite().all()
     outside = (found[:, 1:3] < 0) | (found[:, 1:3] > max(GRID))
     assert outside.any(dim=-1).all()
@@ -165,14 +167,14 @@ def test_what_lies_behind_the_target_is_finite_and_far_outside_of_its_image():
 def test_cells_follow_their_quarter():
     """The cells of one token, numbered row by row over the 4 x 4."""
     cells = torch.arange(16.0).reshape(4, 4, 1).expand(4, 4, 3)
-    order = packed(cells.contiguous(), 4).reshape(16, 3)[:, 0].int().tolist()
+    order = pack_cells(cells.contiguous(), 4).reshape(16, 3)[:, 0].int().tolist()
     assert order == [0, 1, 4, 5, 2, 3, 6, 7, 8, 9, 12, 13, 10, 11, 14, 15]
 
 
 def test_every_position_of_a_token_is_used_and_the_token_itself_by_each_group():
-    assert len(TRIPLE_OF_HEAD) == 24
-    assert set(TRIPLE_OF_HEAD) == set(range(sum(factor**2 for factor in LEVELS)))
-    assert TRIPLE_OF_HEAD.count(0) == 4
+    assert len(POSITION_OF_HEAD) == 24
+    assert set(POSITION_OF_HEAD) == set(range(sum(factor**2 for factor in LEVELS)))
+    assert POSITION_OF_HEAD.count(0) == 4
 
 
 def test_the_rotary_tables_are_the_authors():
@@ -204,7 +206,7 @@ def test_each_image_of_a_batch_has_tables_of_its_own():
 def test_the_picture_of_the_positions_is_the_authors():
     splat = stored("splat")
     image, expected = (splat[key][0].permute(1, 2, 0) for key in ("image", "warped"))
-    found = forward_splat(image, splat["uv"].reshape(*SIZE, 2), SIZE)
+    found = splat_forward(image, splat["uv"].reshape(*SIZE, 2), SIZE)
     assert_close(found, expected, "warped")
     assert (found.sum(dim=-1) == 0).any()
 
@@ -218,7 +220,7 @@ def tiny_transformer():
     assert shapes == {key: shape for key, (shape, _) in tiny["keys"].items()}
     weights = {key: rule_v1(key, torch.Size(shape)) for key, shape in shapes.items()}
     transformer.load_state_dict(weights, strict=True)
-    return with_per_head_positions(transformer)
+    return enable_per_head_positions(transformer)
 
 
 def repeated(level_0: torch.Tensor) -> torch.Tensor:
@@ -260,7 +262,7 @@ def test_every_published_tensor_fits_the_transformer_of_diffusers():
     published = json.loads((STORED / "keys.json").read_text())
     with torch.device("meta"):
         transformer = diffusers.FluxTransformer2DModel(**PE_FIELD_TRANSFORMER)
-    with_per_head_positions(transformer)
+    enable_per_head_positions(transformer)
     shapes = {key: list(value.shape) for key, value in transformer.state_dict().items()}
     assert len(shapes) == 1160
     assert shapes == published["keys"]
@@ -272,4 +274,4 @@ def test_a_transformer_of_other_heads_is_refused():
     config = json.loads((STORED / "tiny_config.json").read_text())["config"]
     config["num_attention_heads"] = 12
     with pytest.raises(ValueError, match="24 heads, got 12"):
-        with_per_head_positions(diffusers.FluxTransformer2DModel(**config))
+        enable_per_head_positions(diffusers.FluxTransformer2DModel(**config))

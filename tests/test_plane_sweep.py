@@ -8,14 +8,14 @@ import torch
 from skimage.data import stereo_motorcycle
 
 from gscompleter import InputError, View
-from gscompleter.commands.demo import (
+from gscompleter.apps.commands.demo import (
     BASELINE_M,
     FOCAL_PX,
     PRINCIPAL_POINT_DX_PX,
-    motorcycle_cameras,
+    get_motorcycle_cameras,
 )
 from gscompleter.geometry import project
-from gscompleter.matching.depth_range import depth_range_of, estimate_depth_range
+from gscompleter.reconstructors.features.depth_range import estimate_depth_range, get_depth_range
 from gscompleter.reconstructors.plane_sweep import PlaneSweep
 from gscompleter.types import DepthMap
 from scenes import Room, camera_at, view_of
@@ -148,11 +148,11 @@ def test_what_the_camera_knows_of_the_range_is_taken_and_the_rest_estimated():
         return [replace(v, camera=replace(v.camera, near=near, far=far)) for v in views]
 
     low, high = estimate_depth_range(views)
-    assert depth_range_of(known(0.25, None)) == (0.25, high)
-    assert depth_range_of(known(None, 90.0)) == (low, 90.0)
-    assert depth_range_of(known(None, 90.0), lambda _: (0.125, 3.0)) == (0.125, 90.0)
+    assert get_depth_range(known(0.25, None)) == (0.25, high)
+    assert get_depth_range(known(None, 90.0)) == (low, 90.0)
+    assert get_depth_range(known(None, 90.0), lambda _: (0.125, 3.0)) == (0.125, 90.0)
     with pytest.raises(InputError, match="near must be positive and less than far"):
-        depth_range_of(known(None, 90.0), lambda _: (99.0, 100.0))
+        get_depth_range(known(None, 90.0), lambda _: (99.0, 100.0))
 
 
 def test_too_few_views_no_baseline_and_an_empty_range_are_refused():
@@ -174,10 +174,10 @@ def test_the_motorcycle_at_a_quarter_of_its_size():
     scale = torch.tensor([[0.25], [0.25], [1.0]])
     cameras = [
         replace(c, K=c.K * scale, width=width, height=height, near=1.5, far=8.0)
-        for c in motorcycle_cameras(741, 500)
+        for c in get_motorcycle_cameras(741, 500)
     ]
     views = [View(i, c) for i, c in zip(images, cameras, strict=True)]
-    found = PlaneSweep().depths(views)[0]
+    found = PlaneSweep().estimate_depths(views)[0]
     disparity = disparity[::4, ::4]
     known = torch.from_numpy(np.isfinite(disparity))
     truth = torch.from_numpy(FOCAL_PX * BASELINE_M / (disparity + PRINCIPAL_POINT_DX_PX)).float()

@@ -10,11 +10,11 @@ import torch
 from PIL import Image
 
 from gscompleter import InputError, load_cameras
-from gscompleter.data.dataparser import read_dataparser_transforms
 from gscompleter.data.formats import FORMATS, open_photographs
+from gscompleter.data.local_origin import read_dataparser_transforms
 from gscompleter.data.photographs import Photographs
+from gscompleter.data.points import MIN_POINTS, add_depth_range, compute_depth_range
 from gscompleter.data.scene import write_cameras
-from gscompleter.data.sparse_points import MIN_POINTS, depth_range_of_points, with_depth_range
 from gscompleter.types import Camera
 from pose_files import (
     CAMERAS,
@@ -336,29 +336,29 @@ def test_planes_enclose_the_points_in_sight():
     points = depths[:, None] * torch.tensor([0.1, 0.0, 1.0])
     # Points behind the camera and beside the image are ignored.
     behind, beside = torch.tensor([[0.0, 0, -9]]), torch.tensor([[50.0, 0, 9]])
-    near, far = depth_range_of_points(torch.cat([points, behind, beside]), [camera])
+    near, far = compute_depth_range(torch.cat([points, behind, beside]), [camera])
     assert (near, far) == (pytest.approx(0.5 * 2.02), pytest.approx(2 * 3.98))
-    assert depth_range_of_points(points[: MIN_POINTS - 1], [camera]) is None
-    assert depth_range_of_points(points, []) is None
+    assert compute_depth_range(points[: MIN_POINTS - 1], [camera]) is None
+    assert compute_depth_range(points, []) is None
 
 
 def test_planes_of_points_fill_in_what_is_not_given(tmp_path):
     scene = binary(tmp_path / "room")
-    found = with_depth_range(open_photographs(scene), [0, 2])
+    found = add_depth_range(open_photographs(scene), [0, 2])
     depths = torch.cat([VIEWS[number].depth.flatten() for number in (0, 2)])
     assert found.near is not None
     assert found.far is not None
     assert 0.25 * depths.min() < found.near < depths.min()
     assert depths.max() < found.far < 3 * depths.max()
-    given = with_depth_range(open_photographs(scene, near=0.1), [0, 2])
+    given = add_depth_range(open_photographs(scene, near=0.1), [0, 2])
     assert (given.near, given.far) == (0.1, found.far)
-    beyond = with_depth_range(open_photographs(scene, near=1e3), [0, 2])
+    beyond = add_depth_range(open_photographs(scene, near=1e3), [0, 2])
     assert (beyond.near, beyond.far) == (1e3, None)
 
 
 def test_photographs_without_points_keep_their_planes(tmp_path):
     photographs = open_photographs(transforms(tmp_path / "room"))
-    assert with_depth_range(photographs, [0, 1]) is photographs
+    assert add_depth_range(photographs, [0, 1]) is photographs
 
 
 # COLMAP masks and lists of both kinds.

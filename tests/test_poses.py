@@ -11,18 +11,18 @@ import pytest
 from PIL import Image
 
 from command import run
-from gscompleter.data import structure_from_motion
 from gscompleter.data.formats import open_photographs
-from gscompleter.data.match_pairs import (
-    alike,
-    all_pairs,
-    in_order,
+from gscompleter.data.sfm import poses
+from gscompleter.data.sfm.match_pairs import (
+    compute_similarity,
     is_sequence,
-    likeness,
-    neighbours,
+    make_sort_key,
+    pair_all,
+    pair_neighbours,
+    pair_similar,
 )
-from gscompleter.data.structure_from_motion import FoundPoses, find_poses, photographs_in
-from gscompleter.data.upright import MAX_SIDE, write_upright
+from gscompleter.data.sfm.poses import FoundPoses, find_poses, list_photograph_files
+from gscompleter.data.sfm.upright import MAX_SIDE, write_upright
 from gscompleter.errors import InputError
 from gscompleter.io.image import write_image
 from scenes import Room, camera_at, view_of
@@ -63,7 +63,7 @@ def stand_in(monkeypatch: pytest.MonkeyPatch, tmp_path: Path, script: str) -> No
     """Replace the process that runs COLMAP by a script."""
     (tmp_path / "stand_in_mapping.py").write_text(script)
     monkeypatch.setenv("PYTHONPATH", str(tmp_path))
-    monkeypatch.setattr(structure_from_motion, "PROCESS", "stand_in_mapping")
+    monkeypatch.setattr(poses, "PROCESS", "stand_in_mapping")
 
 
 def test_the_cameras_of_a_room_are_found_up_to_a_similarity(tmp_path, monkeypatch, capsys):
@@ -182,18 +182,18 @@ def test_a_focal_length_that_was_held_is_told(tmp_path, monkeypatch):
 
 def test_lenses_that_no_camera_has_are_told():
     pycolmap = pytest.importorskip("pycolmap")
-    from gscompleter.data.mapping_process import _defect_of
+    from gscompleter.data.sfm.mapping_process import _find_camera_defect
 
     def camera(focal: float, distortion: float) -> object:
         return pycolmap.Camera(
             model="SIMPLE_RADIAL", width=640, height=193, params=[focal, 320, 96.5, distortion]
         )
 
-    assert _defect_of(camera(344, -0.1)) is None
-    assert _defect_of(camera(1488, 0)) is None  # a telephoto lens
-    assert "corners by 638 %" in _defect_of(camera(1549, 137))
-    assert "(2° across)" in _defect_of(camera(22530, 0))
-    assert "focal length of 0 px" in _defect_of(camera(0, 0))
+    assert _find_camera_defect(camera(344, -0.1)) is None
+    assert _find_camera_defect(camera(1488, 0)) is None  # a telephoto lens
+    assert "corners by 638 %" in _find_camera_defect(camera(1549, 137))
+    assert "(2° across)" in _find_camera_defect(camera(22530, 0))
+    assert "focal length of 0 px" in _find_camera_defect(camera(0, 0))
 
 
 def test_a_drive_is_placed_with_its_focal_length_held(shared, tmp_path):
@@ -203,7 +203,7 @@ def test_a_drive_is_placed_with_its_focal_length_held(shared, tmp_path):
     for source in list_photographs(shared, "kitti_city", 30)[20:]:
         shutil.copy(source, given)
     found = find_poses(given, tmp_path / "out")
-    assert found.registered == 10
+    assert found.num_registered == 10
     assert found.points > 300
     focal = float(open_photographs(tmp_path / "out").camera(0).K[0, 0])
     true = float(open_photographs(shared / "data" / "kitti_city").camera(0).K[0, 0])
@@ -218,7 +218,7 @@ def test_parts_that_do_not_connect_are_told():
 
 
 def test_a_model_among_placed_photographs_is_no_part():
-    parts = pytest.importorskip("gscompleter.data.mapping_process").parts
+    parts = pytest.importorskip("gscompleter.data.sfm.mapping_process").parts
     large, other, inside = set(range(12)), {20, 21, 22}, {3, 4, 5, 20}
     assert parts([large, inside, other, {7, 23}]) == [12, 3]
     assert parts([{1, 2}]) == [2]
@@ -253,12 +253,12 @@ def test_two_photographs_are_too_few(tmp_path):
 def test_a_folder_of_other_files_has_no_photographs(tmp_path):
     (tmp_path / "notes.txt").write_text("no photograph")
     with pytest.raises(InputError, match="There are 0 photographs"):
-        photographs_in(tmp_path)
+        list_photograph_files(tmp_path)
 
 
 def test_neighbours_are_those_of_the_numbers_however_they_are_written(tmp_path):
     folder = blank(tmp_path / "p", 12)
-    assert photographs_in(folder) == [f"{number}.png" for number in range(12)]
+    assert list_photograph_files(folder) == [f"{number}.png" for number in range(12)]
 
 
 def test_a_file_that_is_no_image_is_named(tmp_path):
@@ -270,7 +270,7 @@ def test_a_file_that_is_no_image_is_named(tmp_path):
 
 
 def test_a_missing_package_is_told_how_to_install(tmp_path, monkeypatch):
-    monkeypatch.setattr(structure_from_motion, "find_spec", lambda name: None)
+    monkeypatch.setattr(poses, "find_spec", lambda name: None)
     with pytest.raises(InputError, match=r"pip install 'gscompleter\[poses\]'"):
         find_poses(blank(tmp_path / "p", 3), tmp_path / "out")
 
@@ -320,7 +320,7 @@ def test_masks_hidden_files_and_our_own_results_are_no_photographs(tmp_path):
         blank(folder / name, 1)
     (folder / "out" / "summary.json").write_text("{}")
     Image.new("RGB", (64, 48)).save(folder / ".hidden.png")
-    assert photographs_in(folder) == ["0.png", "1.png", "2.png"]
+    assert list_photograph_files(folder) == ["0.png", "1.png", "2.png"]
 
 
 def test_photographs_alone_are_completed_and_their_cameras_kept(tmp_path, monkeypatch):
@@ -336,12 +336,12 @@ def test_photographs_alone_are_completed_and_their_cameras_kept(tmp_path, monkey
     shutil.rmtree(out)
     out.mkdir()
     (tmp_path / "colmap").rename(out / "colmap")
-    monkeypatch.setattr(structure_from_motion, "PROCESS", "nobody")
+    monkeypatch.setattr(poses, "PROCESS", "nobody")
     assert run(monkeypatch, *words, "--target", 4) == 0  # with the cameras that are there
 
 
 def test_names_are_sorted_as_people_count():
-    assert sorted(["10.jpg", "9.jpg", "b.jpg"], key=in_order) == ["9.jpg", "10.jpg", "b.jpg"]
+    assert sorted(["10.jpg", "9.jpg", "b.jpg"], key=make_sort_key) == ["9.jpg", "10.jpg", "b.jpg"]
 
 
 @pytest.mark.parametrize(
@@ -359,8 +359,8 @@ def test_names_with_a_number_are_a_sequence(names, counts):
 
 
 def test_neighbours_reach_ten_on_and_then_by_doubling():
-    assert {j for i, j in neighbours(40) if i == 0} == {*range(1, 11), 16, 32}
-    assert neighbours(3) == all_pairs(3) == {(0, 1), (0, 2), (1, 2)}
+    assert {j for i, j in pair_neighbours(40) if i == 0} == {*range(1, 11), 16, 32}
+    assert pair_neighbours(3) == pair_all(3) == {(0, 1), (0, 2), (1, 2)}
 
 
 def test_photographs_with_the_same_features_look_alike():
@@ -368,16 +368,16 @@ def test_photographs_with_the_same_features_look_alike():
     near, far = (generator.standard_normal((40, 128)).astype(np.float32) for _ in range(2))
     near, far = (x / np.linalg.norm(x, axis=1, keepdims=True) for x in (near, far))
     nothing = np.zeros((0, 128), np.float32)
-    shared = likeness([near, far, near[::-1].copy(), nothing])
+    shared = compute_similarity([near, far, near[::-1].copy(), nothing])
     assert shared[0, 2] == 40
-    assert alike(shared) == {(0, 2)}
+    assert pair_similar(shared) == {(0, 2)}
 
 
 @pytest.mark.slow
 def test_forty_real_photographs_are_all_placed(shared, tmp_path):
     pytest.importorskip("pycolmap")
     found = find_poses(shared / "data" / "fox" / "images", tmp_path / "fox")
-    assert found.registered == 40
+    assert found.num_registered == 40
     assert found.error < 0.5
 
 

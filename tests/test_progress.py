@@ -17,10 +17,10 @@ from gscompleter import progress, save_ply
 from gscompleter.progress import (
     Activity,
     Work,
-    expecting,
-    in_words,
-    preparing,
-    shown_on,
+    expect_stages,
+    format_seconds,
+    show_preparation,
+    show_progress,
     stage,
     track,
 )
@@ -70,7 +70,7 @@ def work_at_target() -> None:
 
 def test_a_log_has_a_line_for_each_stage():
     console = Console(file=io.StringIO(), width=200)
-    with shown_on(console):
+    with show_progress(console):
         work_at_target()
     lines = [line.split(":") for line in written(console).splitlines()]
     assert [line[0] for line in lines] == ["context", *["target 1 of 2"] * 2, "target 2 of 2"]
@@ -80,7 +80,7 @@ def test_a_log_has_a_line_for_each_stage():
 def test_a_log_is_told_again_what_takes_long(monkeypatch):
     monkeypatch.setattr(progress, "LOG_SECONDS", 0.05)
     console = Console(file=io.StringIO(), width=200)
-    with shown_on(console):
+    with show_progress(console):
         for number in track(range(3), "scores"):
             time.sleep(0.12 if number == 1 else 0)
     told = written(console).splitlines()
@@ -93,7 +93,7 @@ def test_a_log_is_told_again_what_takes_long(monkeypatch):
 def test_nothing_is_said_once_all_is_done(monkeypatch):
     monkeypatch.setattr(progress, "LOG_SECONDS", 0.02)
     console = Console(file=io.StringIO(), width=200)
-    with shown_on(console):
+    with show_progress(console):
         with stage("reading"):
             pass
         said = written(console)
@@ -104,18 +104,18 @@ def test_nothing_is_said_once_all_is_done(monkeypatch):
 def test_a_log_hears_of_preparations_only_where_they_take_long(monkeypatch):
     monkeypatch.setattr(progress, "LOG_SECONDS", 0.2)
     console = Console(file=io.StringIO(), width=200)
-    with shown_on(console):
-        with preparing("reading"):
+    with show_progress(console):
+        with show_preparation("reading"):
             pass
         assert written(console) == ""
-        with preparing("placing"):
+        with show_preparation("placing"):
             time.sleep(0.5)
     assert set(written(console).splitlines()) == {"placing"}
 
 
 def test_a_terminal_has_a_line_that_goes_away():
     console = terminal()
-    with shown_on(console), expecting([("context", 3.0), ("target", 7.0)]):
+    with show_progress(console), expect_stages([("context", 3.0), ("target", 7.0)]):
         work_at_target()
     said = written(console)
     shown = re.sub(r"\x1b\[[0-9;?]*[a-zA-Z]", "", said)
@@ -128,21 +128,21 @@ def test_a_terminal_has_a_line_that_goes_away():
 
 def test_a_terminal_has_its_cursor_back_after_an_interrupt():
     console = terminal()
-    with pytest.raises(KeyboardInterrupt), shown_on(console), stage("context"):
+    with pytest.raises(KeyboardInterrupt), show_progress(console), stage("context"):
         raise KeyboardInterrupt
     assert written(console).rfind("\x1b[?25h") > written(console).rfind("\x1b[?25l") >= 0
 
 
 def test_what_is_left_of_counted_steps_is_told_by_those_that_are_done(clock):
     work = Work([Activity("film", 10)])
-    assert work.left() is None
+    assert work.estimate_left() is None
     for _ in range(4):
         clock.pass_by(2.0)
-        work.going[0].stepped()
-    assert work.left() == pytest.approx(12.0)
+        work.running[0].count_step()
+    assert work.estimate_left() == pytest.approx(12.0)
     clock.pass_by(0.5)  # of a step that goes on
-    assert work.left() == pytest.approx(11.5)
-    assert work.share() == pytest.approx(0.4)
+    assert work.estimate_left() == pytest.approx(11.5)
+    assert work.estimate_fraction() == pytest.approx(0.4)
 
 
 def test_what_is_left_of_stages_follows_the_pace_of_those_that_are_over(clock):
@@ -150,16 +150,16 @@ def test_what_is_left_of_stages_follows_the_pace_of_those_that_are_over(clock):
     work.expect([("context", 10.0), ("target", 20.0), ("report", 2.0)])
     context = Activity("context")
     work.begin(context)
-    assert work.left() == pytest.approx(32.0)
+    assert work.estimate_left() == pytest.approx(32.0)
     clock.pass_by(15.0)  # half as long again
-    assert work.left() == pytest.approx(1.5 + 22.0)
+    assert work.estimate_left() == pytest.approx(1.5 + 22.0)
     work.end(context)
-    assert work.left() == pytest.approx(1.5 * 22.0)
+    assert work.estimate_left() == pytest.approx(1.5 * 22.0)
     work.begin(Activity("target", 2))
     clock.pass_by(6.0)
-    assert work.left() == pytest.approx(1.5 * 22.0 - 6.0)
+    assert work.estimate_left() == pytest.approx(1.5 * 22.0 - 6.0)
     work.begin(Activity("context"))  # of that target: it is no stage of its own
-    assert work.left() == pytest.approx(1.5 * 22.0 - 6.0)
+    assert work.estimate_left() == pytest.approx(1.5 * 22.0 - 6.0)
 
 
 def test_a_stage_that_is_left_out_takes_no_time(clock):
@@ -167,9 +167,9 @@ def test_a_stage_that_is_left_out_takes_no_time(clock):
     work.expect([("context", 10.0), ("target", 20.0), ("report", 2.0)])
     report = Activity("report")
     work.begin(report)
-    assert work.left() == pytest.approx(2.0)
+    assert work.estimate_left() == pytest.approx(2.0)
     work.end(report)
-    assert work.left() == 0.0
+    assert work.estimate_left() == 0.0
 
 
 def test_the_share_that_is_done_never_goes_back(clock):
@@ -179,14 +179,14 @@ def test_the_share_that_is_done_never_goes_back(clock):
     work.begin(context)
     clock.pass_by(10.0)
     work.expected = [("context", 1.0), ("target", 0.1)]
-    first = work.share()
+    first = work.estimate_fraction()
     work.expected = [("context", 1.0), ("target", 9.0)]
     work.end(context)
     assert first == pytest.approx(0.9, abs=0.01)
-    assert work.left() == pytest.approx(90.0)
-    assert work.share() == first
+    assert work.estimate_left() == pytest.approx(90.0)
+    assert work.estimate_fraction() == first
     clock.pass_by(890.0)
-    assert first < work.share() < 1
+    assert first < work.estimate_fraction() < 1
 
 
 def test_stages_that_were_not_timed_tell_the_share_that_is_done(clock):
@@ -199,11 +199,11 @@ def test_stages_that_were_not_timed_tell_the_share_that_is_done(clock):
             work.begin(target)
         activity = Activity(name)
         work.begin(activity)
-        shares.append(work.share())
+        shares.append(work.estimate_fraction())
         clock.pass_by(3.0)
         work.end(activity)
     assert shares == pytest.approx([0.0, 0.5, 0.625, 0.75])
-    assert work.share() == pytest.approx(1.0)
+    assert work.estimate_fraction() == pytest.approx(1.0)
 
 
 def test_steps_inside_of_a_stage_count_for_the_share(clock):
@@ -214,9 +214,9 @@ def test_steps_inside_of_a_stage_count_for_the_share(clock):
     work.begin(steps)
     for _ in range(5):
         clock.pass_by(1.0)
-        steps.stepped()
-    assert work.share() == pytest.approx(0.25 + 0.75 * 0.5)
-    assert work.left() == pytest.approx(5.0)
+        steps.count_step()
+    assert work.estimate_fraction() == pytest.approx(0.25 + 0.75 * 0.5)
+    assert work.estimate_left() == pytest.approx(5.0)
 
 
 def test_progress_on_a_given_splat_advances_over_the_stages(room, tmp_path, monkeypatch, capfd):
@@ -234,14 +234,14 @@ def test_progress_on_a_given_splat_advances_over_the_stages(room, tmp_path, monk
 def test_a_library_call_says_nothing(capfd):
     work_at_target()
     assert track([1, 2], "numbers") == [1, 2]
-    with shown_on(terminal()), shown_on(None):
+    with show_progress(terminal()), show_progress(None):
         work_at_target()
     assert capfd.readouterr() == ("", "")
 
 
 def test_a_loop_that_ends_early_is_over():
     console = Console(file=io.StringIO(), width=200)
-    with shown_on(console):
+    with show_progress(console):
         with stage("poses"):
             for number in track(range(5), "photographs"):
                 if number == 1:
@@ -252,7 +252,7 @@ def test_a_loop_that_ends_early_is_over():
 
 
 def test_times_in_words():
-    assert [in_words(s) for s in (0.4, 59.6, 125.0, 4830.0)] == [
+    assert [format_seconds(s) for s in (0.4, 59.6, 125.0, 4830.0)] == [
         "0 s",
         "1 min 0 s",
         "2 min 5 s",

@@ -8,21 +8,21 @@ import pytest
 
 from chunk_files import VIEWS, example, save_chunk
 from gscompleter import InputError
+from gscompleter.data.cases import open_clips
 from gscompleter.data.chunks import open_chunks
-from gscompleter.data.datasets import open_clips
 from gscompleter.data.formats import open_photographs
 from gscompleter.data.photographs import PosedPhotographs
-from gscompleter.runs.protocols import (
+from gscompleter.evaluation.protocols import (
     EvaluationIndex,
     Extrapolation,
     Split,
     StressTest,
-    index_of,
+    build_index,
     parse_protocol,
     read_evaluation_index,
     write_evaluation_index,
 )
-from gscompleter.runs.tasks import neighbours, tasks_of
+from gscompleter.evaluation.tasks import find_neighbours, make_tasks
 from gscompleter.types import View
 
 
@@ -40,12 +40,12 @@ class Frames(PosedPhotographs):
     def views(self, frames, resolution=None) -> list[View]:
         return [VIEWS[frame % len(VIEWS)] for frame in frames]
 
-    def reason_to_skip(self, size=None) -> None:
+    def find_skip_reason(self, size=None) -> None:
         return None
 
 
 def test_two_frames_are_extrapolated_to_a_third_in_both_directions():
-    index = index_of(
+    index = build_index(
         Extrapolation(10, stride=2), [Frames("a", 24), Frames("b", 21), Frames("c", 20)]
     )
     there = [((n, n + 10), (n + 20,)) for n in (0, 2)]
@@ -58,14 +58,14 @@ def test_two_frames_are_extrapolated_to_a_third_in_both_directions():
 
 
 def test_without_a_stride_no_two_starts_share_a_frame():
-    splits = Extrapolation(3).splits(Frames("a", 50))
+    splits = Extrapolation(3).select_splits(Frames("a", 50))
     used = [sorted({*split.context, *split.targets}) for split in splits[::2]]
     assert used == [[n, n + 3, n + 6] for n in range(0, 44, 7)]
 
 
 def test_the_stress_test_needs_a_hundred_frames():
-    assert StressTest().splits(Frames("a", 100)) == (Split((0, 30), (99,)),)
-    assert StressTest().splits(Frames("a", 99)) == ()
+    assert StressTest().select_splits(Frames("a", 100)) == (Split((0, 30), (99,)),)
+    assert StressTest().select_splits(Frames("a", 99)) == ()
 
 
 @pytest.mark.parametrize("text", ["n-10", "n-30-stride-5", "stress"])
@@ -87,31 +87,31 @@ def test_an_extrapolation_over_nothing_is_refused(text):
 
 
 def test_neighbours_exist_and_are_not_context():
-    assert neighbours(5, (0, 1), 10) == (4, 6)
-    assert neighbours(2, (0, 1), 10) == (3,)
-    assert neighbours(9, (0, 1), 10) == (8,)
-    assert neighbours(0, (2, 1), 10) == ()
+    assert find_neighbours(5, (0, 1), 10) == (4, 6)
+    assert find_neighbours(2, (0, 1), 10) == (3,)
+    assert find_neighbours(9, (0, 1), 10) == (8,)
+    assert find_neighbours(0, (2, 1), 10) == ()
 
 
 def test_a_case_has_one_target_and_loads_its_views():
     index = EvaluationIndex("x", {"a": (Split((0, 2), (3, 4)),)})
-    first, second = tasks_of(index, Frames("a", 5))
+    first, second = make_tasks(index, Frames("a", 5))
     assert (first.scene, first.name, first.targets) == ("a", "a 0+2>3", (3,))
     assert (first.neighbours, second.neighbours) == ((4,), (3,))
     assert second.targets == (4,)
     assert first.load(first.context) == [VIEWS[0], VIEWS[2]]
-    assert tasks_of(index, Frames("b", 5)) == []
+    assert make_tasks(index, Frames("b", 5)) == []
     with pytest.raises(InputError, match="The protocol x needs frame 4 of a, which has 4"):
-        tasks_of(index, Frames("a", 4))
+        make_tasks(index, Frames("a", 4))
 
 
 def test_an_index_is_read_back_as_it_was_written(tmp_path):
     clips = [Frames("a", 64), Frames('odd "ü" name', 30), Frames("short", 3)]
-    index = index_of(Extrapolation(10, 4), clips)
+    index = build_index(Extrapolation(10, 4), clips)
     write_evaluation_index(tmp_path / "index.json", index)
     assert read_evaluation_index(tmp_path / "index.json") == index
     assert parse_protocol(str(tmp_path / "index.json")) == index
-    again = index_of(index, clips)
+    again = build_index(index, clips)
     write_evaluation_index(tmp_path / "again.json", again)
     assert (tmp_path / "again.json").read_bytes() == (tmp_path / "index.json").read_bytes()
     assert sorted(os.listdir(tmp_path)) == ["again.json", "index.json"]
@@ -120,14 +120,14 @@ def test_an_index_is_read_back_as_it_was_written(tmp_path):
 
 
 def test_an_index_of_no_clips_is_an_index(tmp_path):
-    index = index_of(Extrapolation(10), [])
+    index = build_index(Extrapolation(10), [])
     write_evaluation_index(tmp_path / "index.json", index)
     assert read_evaluation_index(tmp_path / "index.json") == index
 
 
 def test_two_clips_of_one_name_are_refused():
     with pytest.raises(InputError, match="Two clips are called a"):
-        index_of(Extrapolation(10), [Frames("a", 30), Frames("a", 30)])
+        build_index(Extrapolation(10), [Frames("a", 30), Frames("a", 30)])
 
 
 @pytest.mark.parametrize(
@@ -160,7 +160,7 @@ def test_an_evaluation_index_that_is_missing_is_named(tmp_path):
 
 def test_cases_of_a_chunk_load_photographs_at_a_resolution(tmp_path):
     (clip,) = open_chunks(save_chunk(tmp_path / "000000.torch", example()))
-    there, back = tasks_of(parse_protocol("n-2"), clip, (32, 32))
+    there, back = make_tasks(parse_protocol("n-2"), clip, (32, 32))
     assert (there.name, back.name) == ("room 0+2>4", "room 4+2>0")
     (target,) = back.load(back.targets)
     assert target.image.shape == (32, 32, 3)
@@ -189,6 +189,6 @@ def test_the_scenes_of_the_development_cases_are_clips(shared):
     assert len({clip.name for clip in clips}) == len(clips) > 1
     clip = next(clip for clip in clips if clip.name == "re10k_0d4de33c")
     assert len(clip) == len(open_photographs(shared / "data" / "re10k_0d4de33c"))
-    assert clip.reason_to_skip() is None
-    (case, *_) = tasks_of(parse_protocol("n-4"), clip, (64, 64))
+    assert clip.find_skip_reason() is None
+    (case, *_) = make_tasks(parse_protocol("n-4"), clip, (64, 64))
     assert [view.frame for view in case.load(case.context)] == [0, 4]

@@ -7,19 +7,29 @@ from dataclasses import replace
 import pytest
 import torch
 
-from gscompleter.benchmark.crowding import crowded
+from gscompleter.apps.bench.crowding import multiply_gaussians
 from gscompleter.completer import GSCompleter
 from gscompleter.config import TrustConfig
-from gscompleter.frames.thinning import thinned
+from gscompleter.evaluation.metrics.image import psnr
 from gscompleter.memory import BYTES_PER_SPLAT
-from gscompleter.metrics.image import psnr
+from gscompleter.next_best_view.gain import thin_observations
 from gscompleter.render import load_renderer
-from gscompleter.render import proxy as proxies
-from gscompleter.render.proxy import LARGEST, REACH, proxy_of, run_by_run
-from gscompleter.splats.order import order_nearby
-from gscompleter.stages.exploration import thinned_evidence
-from gscompleter.stages.support import believed_alpha, gather_evidence, support, weight_sums
-from gscompleter.types import Evidence, Gaussians, merge
+from gscompleter.render import lod as proxies
+from gscompleter.render.lod import (
+    MAX_DEVIATION,
+    MAX_REACH,
+    build_proxy,
+    simplify_scene,
+    thin_gaussians,
+)
+from gscompleter.splats.morton import argsort_nearby
+from gscompleter.trust.photometric import (
+    compute_trust,
+    compute_trusted_alpha,
+    gather_observations,
+    sum_weights,
+)
+from gscompleter.types import Gaussians, PhotoObservations, merge
 from scenes import Room, camera_at, gaussians_of, random_gaussians, reconstruction_of, view_of
 
 RENDERER = load_renderer("cpu")
@@ -31,11 +41,11 @@ ROOM = merge([gaussians_of(view) for view in (VIEWS[0], VIEWS[2])])
 
 
 def in_order(scene: Gaussians) -> Gaussians:
-    return scene[order_nearby(scene)]
+    return scene[argsort_nearby(scene)]
 
 
-CROWD = in_order(crowded(ROOM, COPIES * len(ROOM)))
-PROXY = run_by_run(CROWD, CAMERAS)
+CROWD = in_order(multiply_gaussians(ROOM, COPIES * len(ROOM)))
+PROXY = simplify_scene(CROWD, CAMERAS)
 
 
 def pixel_at(scene: Gaussians) -> torch.Tensor:
@@ -45,16 +55,16 @@ def pixel_at(scene: Gaussians) -> torch.Tensor:
 
 
 def test_a_small_scene_is_its_own_proxy():
-    assert proxy_of(ROOM, CAMERAS) is None
+    assert build_proxy(ROOM, CAMERAS) is None
     completion = GSCompleter(KnowingReconstructor()).begin(VIEWS[::2], ROOM, VIEWS[1:2])
     assert completion.proxy is None
-    assert completion.drawn is completion.scene is completion.context is ROOM
+    assert completion.rendered_scene is completion.scene is completion.context is ROOM
 
 
 def test_a_crowd_is_drawn_with_few_and_looks_alike():
     assert len(PROXY.scene) < 2 * len(CROWD) / COPIES
     for camera in (*CAMERAS, TARGET):
-        drawn = (thinned(CROWD, len(PROXY.scene)), PROXY.scene, CROWD)
+        drawn = (thin_gaussians(CROWD, len(PROXY.scene)), PROXY.scene, CROWD)
         thin, ours, truth = (RENDERER.render(scene, camera) for scene in drawn)
         assert psnr(ours.image, truth.image) > psnr(thin.image, truth.image) + 3
         assert (ours.alpha - truth.alpha).abs().mean() < 0.01
@@ -62,28 +72,28 @@ def test_a_crowd_is_drawn_with_few_and_looks_alike():
 
 def test_an_antialiased_crowd_is_drawn_as_one():
     crowd = replace(CROWD, is_antialiased=True)
-    scene = run_by_run(crowd, CAMERAS).scene
+    scene = simplify_scene(crowd, CAMERAS).scene
     assert scene.is_antialiased
-    assert thinned(crowd, 1000).is_antialiased
+    assert thin_gaussians(crowd, 1000).is_antialiased
     ours, truth = (RENDERER.render(drawn, TARGET) for drawn in (scene, crowd))
     assert (ours.alpha - truth.alpha).abs().mean() < 0.01
 
 
 def test_runs_lie_within_half_a_pixel():
-    assert (PROXY.run.diff() >= 0).all()
-    first = torch.cat([torch.tensor([0]), 1 + PROXY.run.diff().nonzero()[:, 0]])
-    apart = (CROWD.means - CROWD.means[first][PROXY.run]).norm(dim=1)
-    pixel = pixel_at(CROWD[first])[PROXY.run]
-    assert (apart <= 1.001 * REACH * pixel).all()
-    shared = torch.bincount(PROXY.run)[PROXY.run] > 1
-    assert (CROWD.scales.amax(dim=1) <= 1.001 * LARGEST * pixel)[shared].all()
+    assert (PROXY.proxy_index.diff() >= 0).all()
+    first = torch.cat([torch.tensor([0]), 1 + PROXY.proxy_index.diff().nonzero()[:, 0]])
+    apart = (CROWD.means - CROWD.means[first][PROXY.proxy_index]).norm(dim=1)
+    pixel = pixel_at(CROWD[first])[PROXY.proxy_index]
+    assert (apart <= 1.001 * MAX_REACH * pixel).all()
+    shared = torch.bincount(PROXY.proxy_index)[PROXY.proxy_index] > 1
+    assert (CROWD.scales.amax(dim=1) <= 1.001 * MAX_DEVIATION * pixel)[shared].all()
 
 
 def test_what_is_large_or_alone_stays_to_the_bit():
     scene = in_order(random_gaussians(500, sh_degree=1))
-    huge = replace(scene, scales=scene.scales + 100 * LARGEST * pixel_at(scene)[:, None])
+    huge = replace(scene, scales=scene.scales + 100 * MAX_DEVIATION * pixel_at(scene)[:, None])
     for given in (huge, scene[::25]):
-        proxy = run_by_run(given, CAMERAS)
+        proxy = simplify_scene(given, CAMERAS)
         assert len(proxy.scene) == len(given)
         for name in ("means", "quats", "scales", "opacities", "sh"):
             assert torch.equal(getattr(proxy.scene, name), getattr(given, name)), name
@@ -91,11 +101,11 @@ def test_what_is_large_or_alone_stays_to_the_bit():
 
 def test_a_run_is_of_one_provenance():
     mixed = replace(CROWD, generated=(torch.arange(len(CROWD)) % 2).to(torch.uint8))
-    found = run_by_run(mixed, CAMERAS)
-    assert torch.equal(found.scene.generated[found.run], mixed.generated)
+    found = simplify_scene(mixed, CAMERAS)
+    assert torch.equal(found.scene.generated[found.proxy_index], mixed.generated)
     halves = replace(CROWD, generated=(torch.arange(len(CROWD)) > 2000).to(torch.uint8))
-    found = run_by_run(halves, CAMERAS)
-    assert torch.equal(found.scene.generated[found.run], halves.generated)
+    found = simplify_scene(halves, CAMERAS)
+    assert torch.equal(found.scene.generated[found.proxy_index], halves.generated)
     assert len(found.scene) <= len(PROXY.scene) + 1
 
 
@@ -103,7 +113,7 @@ def test_of_what_lies_at_one_place_the_mean_is_drawn_as_opaque_as_all():
     one = gaussians_of(VIEWS[0])[:1]
     pair = replace(merge([one, one]), opacities=torch.tensor([0.3, 0.6]))
     pair = replace(pair, sh=torch.tensor([[[0.0, 0.0, 0.0]], [[1.0, 1.0, 1.0]]]))
-    (found,) = (run_by_run(pair, CAMERAS).scene,)
+    (found,) = (simplify_scene(pair, CAMERAS).scene,)
     assert len(found) == 1
     assert torch.allclose(found.means, one.means)
     assert found.opacities.item() == pytest.approx(1 - 0.7 * 0.4, abs=1e-4)
@@ -115,7 +125,7 @@ def test_what_lies_aside_widens_it():
     one = gaussians_of(VIEWS[0])[:1]
     step = 0.4 * pixel_at(one)
     other = replace(one, means=one.means + torch.tensor([1.0, 0.0, 0.0]) * step)
-    found = run_by_run(merge([one, other]), CAMERAS).scene
+    found = simplify_scene(merge([one, other]), CAMERAS).scene
     assert len(found) == 1
     assert torch.allclose(found.means, (one.means + other.means) / 2)
     width, height, depth = (found.scales / one.scales)[0].tolist()
@@ -125,25 +135,27 @@ def test_what_lies_aside_widens_it():
 
 def test_where_there_is_little_room_fewer_are_drawn(monkeypatch):
     room = len(CAMERAS) * BYTES_PER_SPLAT * len(PROXY.scene) // 2
-    monkeypatch.setattr("gscompleter.memory.MAX_KEPT", room)
-    assert len(run_by_run(CROWD, CAMERAS).scene) <= len(PROXY.scene) // 2
+    monkeypatch.setattr("gscompleter.memory.MAX_FROZEN_BYTES", room)
+    assert len(simplify_scene(CROWD, CAMERAS).scene) <= len(PROXY.scene) // 2
 
 
 def test_the_same_runs_on_any_number_of_threads(monkeypatch):
     monkeypatch.setattr("numba.config.NUMBA_NUM_THREADS", 1)
-    again = run_by_run(CROWD, CAMERAS)
-    assert torch.equal(again.run, PROXY.run)
+    again = simplify_scene(CROWD, CAMERAS)
+    assert torch.equal(again.proxy_index, PROXY.proxy_index)
     assert torch.equal(again.scene.scales, PROXY.scene.scales)
 
 
-def evidence_of(scene: Gaussians) -> Evidence:
+def evidence_of(scene: Gaussians) -> PhotoObservations:
     frozen = [RENDERER.freeze(scene, camera) for camera in CAMERAS]
-    return gather_evidence(scene, VIEWS, frozen, TrustConfig())
+    return gather_observations(scene, VIEWS, frozen, TrustConfig())
 
 
 def trusted_alpha(scene: Gaussians) -> torch.Tensor:
     frozen = RENDERER.freeze(scene, TARGET)
-    return believed_alpha(frozen, support(evidence_of(scene), weight_sums(frozen), TARGET))
+    return compute_trusted_alpha(
+        frozen, compute_trust(evidence_of(scene), sum_weights(frozen), TARGET)
+    )
 
 
 def test_of_a_proxy_as_much_is_believed_as_of_the_scene():
@@ -161,7 +173,7 @@ def test_evidence_is_thinned_with_the_scene():
     rows = torch.arange(0, len(CROWD), COPIES)
     growth = torch.full((len(rows),), COPIES**0.5)
     whole = evidence_of(CROWD)
-    thin = thinned_evidence(whole, rows, growth)
+    thin = thin_observations(whole, rows, growth)
     assert thin.areas.shape == (len(VIEWS), len(rows))
     assert thin.areas.sum().item() == pytest.approx(whole.areas.sum().item(), rel=0.1)
 
@@ -175,11 +187,11 @@ def test_a_scene_is_completed_alike_whether_or_not_it_has_a_proxy(monkeypatch):
     paint = lambda nearest, target, context: view_of(Room(), target).image  # noqa: E731
     asked = (VIEWS[::2], TARGET, CROWD, VIEWS[1:2])
     whole = GSCompleter(KnowingReconstructor(), paint)(*asked)
-    monkeypatch.setattr(proxies, "WORTH", 0)
+    monkeypatch.setattr(proxies, "MIN_PROXY_GAUSSIANS", 0)
     found = GSCompleter(KnowingReconstructor(), paint)(*asked)
     assert found.proxy is not None
-    assert len(found.drawn_context) < 0.5 * len(CROWD)
-    kept = CROWD if found.removed is None else CROWD[~found.removed]
+    assert len(found.rendered_context) < 0.5 * len(CROWD)
+    kept = CROWD if found.pruned_mask is None else CROWD[~found.pruned_mask]
     assert torch.equal(found.scene.means, torch.cat([kept.means, found.added.means]))
     truth = view_of(Room(), TARGET).image
     ours, theirs = (psnr(RENDERER.render(c.scene, TARGET).image, truth) for c in (found, whole))
@@ -191,9 +203,9 @@ def test_a_scene_is_completed_alike_whether_or_not_it_has_a_proxy(monkeypatch):
 
 
 def test_a_scene_is_drawn_as_finely_as_the_targets_that_are_known(monkeypatch):
-    monkeypatch.setattr(proxies, "WORTH", 0)
+    monkeypatch.setattr(proxies, "MIN_PROXY_GAUSSIANS", 0)
     completer = GSCompleter(KnowingReconstructor())
     near = replace(TARGET, K=TARGET.K * torch.tensor([[4.0], [4.0], [1.0]]))
     coarse = completer.begin(VIEWS[::2], CROWD)
     fine = completer.begin(VIEWS[::2], CROWD, targets=[near])
-    assert len(coarse.drawn) < len(fine.drawn) <= len(CROWD)
+    assert len(coarse.rendered_scene) < len(fine.rendered_scene) <= len(CROWD)

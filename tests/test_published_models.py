@@ -8,10 +8,10 @@ import torch
 
 from command import run
 from gscompleter import InputError, load_reconstructor
+from gscompleter.models.feed_forward import FeedForward, MVSplat
+from gscompleter.models.feed_forward.build import build, create_network
+from gscompleter.models.weights import PUBLISHED
 from gscompleter.reconstructors import RECONSTRUCTORS
-from gscompleter.reconstructors.feed_forward import FeedForward, MVSplat
-from gscompleter.reconstructors.feed_forward.build import build, network_of
-from gscompleter.weights import PUBLISHED
 from scenes import Room, camera_at, photographed, view_of
 
 SIZE = 64
@@ -40,7 +40,7 @@ def mvsplat_file(mvsplat, tmp_path_factory) -> Path:
 def test_every_listed_model_has_a_network_of_the_published_size(name):
     published = PUBLISHED[name]
     with torch.device("meta"):
-        network = network_of(published)
+        network = create_network(published)
     assert sum(p.numel() for p in network.parameters()) == published.parameters
     assert network.config.image_size == published.image_size
     if published.near_far is not None:

@@ -6,7 +6,7 @@ import socket
 import pytest
 
 from gscompleter import InputError, load_splat
-from gscompleter.reading import check_plain, open_file, read_bytes, read_head, read_lines
+from gscompleter.io.reading import check_plain, open_file, read_bytes, read_head, read_lines
 from splat_files import made, plausible
 
 
@@ -42,11 +42,11 @@ def test_files_and_lines_that_are_too_long_are_refused(tmp_path):
     path = tmp_path / "a.txt"
     path.write_bytes(b"\xef\xbb\xbfab\ncdef\n")
     assert list(read_lines(path)) == ["ab\n", "cdef\n"]
-    assert list(read_lines(path, longest=5)) == ["ab\n", "cdef\n"]
+    assert list(read_lines(path, max_length=5)) == ["ab\n", "cdef\n"]
     with pytest.raises(InputError, match="a line of more than 4 characters"):
-        list(read_lines(path, longest=4))
+        list(read_lines(path, max_length=4))
     with pytest.raises(InputError, match="has 11 bytes, and at most 10 are read"):
-        list(read_lines(path, most=10))
+        list(read_lines(path, max_bytes=10))
     with pytest.raises(InputError, match="has 11 bytes, and at most 10 are read"):
         read_bytes(path, 10)
 

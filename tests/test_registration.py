@@ -9,9 +9,9 @@ from gscompleter.config import AlignmentConfig, CompleterConfig, RegistrationCon
 from gscompleter.geometry import project, slide
 from gscompleter.render import Renderer, load_renderer
 from gscompleter.render.cpu import CpuRenderer
-from gscompleter.render.reference import ReferenceView
+from gscompleter.render.reference import ReferenceFrozenScene
 from gscompleter.sky import SKY_DEPTH
-from gscompleter.stages.registration import Objective, apply_affine, displace, register
+from gscompleter.stages.slide_along_rays import Objective, apply_affine, move_along_rays, register
 from gscompleter.types import DepthAffine, DepthMap, Lift, View, merge
 from parity import assert_close
 from scenes import Room, camera_at, gaussians_of, scaled, view_of
@@ -110,7 +110,7 @@ class Plain(CpuRenderer):
     """A renderer without shortcuts, with the same kernels."""
 
     def freeze(self, context, camera):
-        return ReferenceView(CPU, context, camera)
+        return ReferenceFrozenScene(CPU, context, camera)
 
 
 @pytest.mark.parametrize(
@@ -167,7 +167,7 @@ def test_only_candidates_that_reach_what_is_compared_are_drawn(config, monkeypat
     # The paper's colour loss covers the whole target.
     assert 0 < max(drawn) <= (SIZE**2 if config.rgb_weight > 0 else 0.3 * SIZE**2)
     monkeypatch.setattr(
-        Objective, "reached_by", lambda _, candidates, *__: torch.ones(len(candidates)) > 0
+        Objective, "find_reached", lambda _, candidates, *__: torch.ones(len(candidates)) > 0
     )
     every = registered_to_a_corner()
     assert max(drawn) == SIZE**2
@@ -235,7 +235,7 @@ def test_the_papers_affine_and_distances_are_not_bounded():
     affine = DepthAffine(1.0, -100.0)
     moved = apply_affine(gaussians, affine, TARGET, "fixed", PAPER.min_ratio)
     assert torch.allclose(project(moved.means, TARGET)[1], z - 100.0, rtol=1e-4)
-    back = displace(gaussians, torch.full((len(gaussians), 1), -100.0), TARGET, PAPER)
+    back = move_along_rays(gaussians, torch.full((len(gaussians), 1), -100.0), TARGET, PAPER)
     distances = (gaussians.means - TARGET.center).norm(dim=-1)
     assert torch.allclose((back.means - TARGET.center).norm(dim=-1), 100.0 - distances, rtol=1e-4)
 
@@ -245,7 +245,7 @@ def test_the_sky_counts_in_the_papers_losses_alone(config, counts):
     view = view_of(ROOM, TARGET)
     depth = torch.full_like(view.depth, SKY_DEPTH * TARGET.far)
     at = load_renderer("cpu").render(gaussians_of(view, depth), TARGET)
-    objective = Objective.of(at, at, view, TARGET, config)
+    objective = Objective.from_renders(at, at, view, TARGET, config)
     assert bool(objective.target_depth.valid.any()) == counts
     assert bool(objective.anchor_depth.valid.any()) == counts
 

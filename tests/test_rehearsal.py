@@ -13,9 +13,10 @@ from numba.core.registry import CPUDispatcher
 from rich.console import Console
 
 from command import run
-from gscompleter import GSCompleter, compilation, kernels, rehearsal
+from gscompleter import GSCompleter, kernels
+from gscompleter.apps.warmup import compilation, rehearsal
 from gscompleter.kernels import compiled
-from gscompleter.progress import shown_on
+from gscompleter.progress import show_progress
 from scenes import Room, camera_at, view_of
 
 COMPLETE = """
@@ -53,11 +54,11 @@ def signatures() -> set[tuple[str, str]]:
 def marked(monkeypatch, tmp_path) -> list[str]:
     """Use an empty folder of marks, and rehearse parts by writing their names."""
     done: list[str] = []
-    monkeypatch.setattr(compiled, "cache_folder", lambda: tmp_path)
+    monkeypatch.setattr(compiled, "get_cache_folder", lambda: tmp_path)
     monkeypatch.setattr(compilation, "PARTS", ("cpu", "plane-sweep"))
     monkeypatch.setattr(rehearsal, "PARTS", dict.fromkeys(compilation.PARTS, done.append))
-    monkeypatch.setattr(compilation, "threads", lambda: 1)
-    monkeypatch.setattr(compilation, "_begun", {})
+    monkeypatch.setattr(compilation, "get_thread_count", lambda: 1)
+    monkeypatch.setattr(compilation, "_started", {})
     return done
 
 
@@ -101,7 +102,7 @@ def test_kernels_are_compiled_anew_for_another_processor(marked, monkeypatch):
 
 def test_one_line_says_so_before_it_happens(marked):
     console = Console(record=True, file=io.StringIO(), width=200)
-    with shown_on(console):
+    with show_progress(console):
         compilation.compile_kernels(["cpu"])
         compilation.compile_kernels(["cpu"])
     said = console.export_text()
@@ -123,7 +124,7 @@ def test_a_model_that_is_asked_for_is_begun_before_anything_is_known(tmp_path):
     """It runs in a process of its own, which stops its child."""
     begun = """
 from gscompleter import compilation
-from gscompleter.compilation import begin
+from gscompleter.apps.warmup.compilation import begin_compilation
 begin(["mvsplat"])
 begin(["plane-sweep", "another"])
 (process,) = compilation._begun.values()
@@ -146,25 +147,25 @@ def test_what_was_begun_is_waited_for_once(monkeypatch, marked):
         begun.append(subprocess.Popen([sys.executable, "-c", "pass", *names]))
         return begun[-1]
 
-    monkeypatch.setattr(compilation, "begun_apart", idle)
-    monkeypatch.setattr(compilation, "threads", lambda: 2)
-    compilation.begin(["plane-sweep"])
-    compilation.begin(["plane-sweep"])
+    monkeypatch.setattr(compilation, "start_rehearsal", idle)
+    monkeypatch.setattr(compilation, "get_thread_count", lambda: 2)
+    compilation.begin_compilation(["plane-sweep"])
+    compilation.begin_compilation(["plane-sweep"])
     assert compilation.compile_kernels(["cpu", "plane-sweep"]) > 0
     assert [(process.args[-1], process.returncode) for process in begun] == [("plane-sweep", 0)]
     assert marked == ["cpu"]
-    assert compilation._begun == {}
+    assert compilation._started == {}
 
 
 def test_one_process_alone_begins_nothing(monkeypatch, marked):
-    compilation.begin(["cpu", "plane-sweep"])
-    assert compilation._begun == {}
+    compilation.begin_compilation(["cpu", "plane-sweep"])
+    assert compilation._started == {}
 
 
 def test_a_part_that_fails_in_its_process_is_no_success(monkeypatch):
     with (
         pytest.raises(subprocess.CalledProcessError),
-        compilation.rehearsed_apart(["no such part"]),
+        compilation.rehearse_in_subprocess(["no such part"]),
     ):
         pass
 

@@ -17,9 +17,9 @@ from packaging.requirements import Requirement
 import gscompleter
 from command import run
 from gscompleter import __version__
-from gscompleter.commands.doctor import PURPOSES, installed, is_for
-from gscompleter.compilation import PARTS, compile_kernels
-from gscompleter.kernels.compiled import cache_folder
+from gscompleter.apps.commands.doctor import PURPOSES, find_installed_version, is_required_by
+from gscompleter.apps.warmup.compilation import PARTS, compile_kernels
+from gscompleter.kernels.compiled import get_cache_folder
 from release_check import (
     ROOT,
     built,
@@ -110,7 +110,7 @@ def borrow_kernels(package: Path) -> None:
     for source in (ours / "kernels").glob("*.py"):
         shutil.copystat(source, package / "kernels" / source.name)
     place, unfinished = package / "kernels" / "__pycache__", shutil.ignore_patterns("*.tmp.*")
-    shutil.copytree(cache_folder(), place, ignore=unfinished, dirs_exist_ok=True)
+    shutil.copytree(get_cache_folder(), place, ignore=unfinished, dirs_exist_ok=True)
 
 
 def test_doctor_says_what_every_extra_is_for():
@@ -153,13 +153,13 @@ def test_doctor_tells_of_what_is_missing_and_for_what(monkeypatch, capsys):
 
 
 def test_a_version_that_is_too_old_will_not_do():
-    assert installed(Requirement("numpy>=1.0")) is not None
-    assert installed(Requirement("numpy>=99")) is None
-    assert installed(Requirement("a-package-that-is-not-there")) is None
+    assert find_installed_version(Requirement("numpy>=1.0")) is not None
+    assert find_installed_version(Requirement("numpy>=99")) is None
+    assert find_installed_version(Requirement("a-package-that-is-not-there")) is None
 
 
 def test_an_extra_is_what_it_adds():
     always, added = Requirement("numpy"), Requirement("gsplat; extra == 'cuda'")
-    assert [is_for("", r) for r in (always, added)] == [True, False]
-    assert [is_for("cuda", r) for r in (always, added)] == [False, True]
-    assert not is_for("film", added)
+    assert [is_required_by("", r) for r in (always, added)] == [True, False]
+    assert [is_required_by("cuda", r) for r in (always, added)] == [False, True]
+    assert not is_required_by("film", added)

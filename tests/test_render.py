@@ -10,13 +10,13 @@ import torch
 
 import stand_in_gsplat
 from gscompleter import Gaussians, InputError, Render, load_renderer, merge
-from gscompleter.geometry import at_depths, z_depths
+from gscompleter.geometry import compute_z_depths, move_to_depths
 from gscompleter.kernels import rasterizer
 from gscompleter.render import choose_device
 from gscompleter.render.cpu import CpuRenderer
-from gscompleter.render.cuda import frozen_by
-from gscompleter.render.reference import ReferenceRenderer, ReferenceView
-from gscompleter.types import observed, sh_from_rgb
+from gscompleter.render.gsplat import freeze_with
+from gscompleter.render.reference import ReferenceFrozenScene, ReferenceRenderer
+from gscompleter.types import make_observed, sh_from_rgb
 from parity import assert_close
 from scenes import Room, camera_at, gaussians_of, random_gaussians, scaled, view_of
 
@@ -116,7 +116,7 @@ def test_cpu_and_reference_have_the_same_gradients(name):
 
 def one(mean, opacity=0.8, scale=0.05, colour=(1.0, 0.5, 0.25)) -> Gaussians:
     """Make a round Gaussian."""
-    return observed(
+    return make_observed(
         torch.tensor([mean]),
         torch.tensor([[1.0, 0, 0, 0]]),
         torch.full((1, 3), scale),
@@ -224,7 +224,7 @@ def test_a_composite_is_the_render_of_both_together(renderer, antialiased):
 
 def test_what_is_frozen_alone_is_its_own_render():
     context, _ = context_and_new()
-    frozen, alone = CPU.freeze(context, CAMERA).context, CPU.render(context, CAMERA)
+    frozen, alone = CPU.freeze(context, CAMERA).render, CPU.render(context, CAMERA)
     assert_same_render(frozen, alone)
 
 
@@ -233,13 +233,16 @@ def test_what_is_frozen_alone_is_its_own_render():
 def test_an_extended_view_is_the_frozen_view_of_both(renderer, antialiased):
     context, new = context_and_new(antialiased)
     last = replace(random_gaussians(50, seed=6), is_antialiased=antialiased)
-    extended = renderer.freeze(context, CAMERA).extended(new)
+    extended = renderer.freeze(context, CAMERA).extend(new)
     frozen = renderer.freeze(merge([context, new]), CAMERA)
     for ours, truth in (
-        (extended.context, frozen.context),
+        (extended.render, frozen.render),
         (extended.composite(last), frozen.composite(last)),
-        (extended.plan(last)(last.opacities), frozen.plan(last)(last.opacities)),
-        (extended.extended(last).context, frozen.extended(last).context),
+        (
+            extended.vary_opacities(last)(last.opacities),
+            frozen.vary_opacities(last)(last.opacities),
+        ),
+        (extended.extend(last).render, frozen.extend(last).render),
     ):
         for name in DRAWN:
             assert torch.equal(getattr(ours, name), getattr(truth, name)), name
@@ -252,7 +255,7 @@ def test_a_frozen_view_keeps_no_splat_that_no_tile_draws():
     frozen = CPU.freeze(opaque, CAMERA)
     assert len(frozen.layer.splats) < 0.8 * len(opaque)
     assert set(frozen.layer.entries) == set(range(len(frozen.layer.splats)))
-    assert_same_render(frozen.context, CPU.render(opaque, CAMERA))
+    assert_same_render(frozen.render, CPU.render(opaque, CAMERA))
 
 
 def test_tiles_find_their_splats_in_the_order_in_which_they_name_them():
@@ -269,10 +272,10 @@ def test_only_tiles_that_something_new_touches_are_drawn(monkeypatch):
     assert drawn.pop() == 9
     new = replace(random_gaussians(1), means=torch.tensor([[0.0, 0.0, 1.0]]))
     new = replace(new, scales=torch.full((1, 3), 0.02), opacities=torch.ones(1))
-    found = opacity_gradient(frozen.plan(new), new.opacities)[1]
+    found = opacity_gradient(frozen.vary_opacities(new), new.opacities)[1]
     assert drawn == [1, 1]
     assert found.abs() > 0
-    assert frozen.extended(replace(new, means=-new.means)).frame is frozen.frame
+    assert frozen.extend(replace(new, means=-new.means)).frame is frozen.frame
     assert drawn == [1, 1]
 
 
@@ -308,7 +311,7 @@ def opacity_gradient(function, opacities: torch.Tensor) -> tuple[Render, torch.T
 def test_a_plan_is_the_composite_with_other_opacities(renderer, antialiased):
     context, new = context_and_new(antialiased)
     frozen = renderer.freeze(context, CAMERA)
-    plan = frozen.plan(new)
+    plan = frozen.vary_opacities(new)
     for opacities in (new.opacities, 1 - new.opacities):
         planned, grad = opacity_gradient(plan, opacities)
         truth, expected = opacity_gradient(
@@ -324,26 +327,26 @@ def test_a_plan_of_depths_is_the_composite_at_these_depths(antialiased):
     context, new = context_and_new(antialiased)
     frozen, left = CPU.freeze(context, CAMERA), torch.zeros(48, 48, dtype=torch.bool)
     left[:, :16] = True
-    before = z_depths(new.means, CAMERA)
+    before = compute_z_depths(new.means, CAMERA)
     for ratio in (torch.ones(len(new)), torch.linspace(0.5, 2.0, len(new))):
         depths = before * ratio
         truth, expected = depth_gradient(
-            lambda values: frozen.composite(at_depths(new, CAMERA, values)), depths, left
+            lambda values: frozen.composite(move_to_depths(new, CAMERA, values)), depths, left
         )
         for where in (left, torch.ones_like(left)):
-            planned, grad = depth_gradient(frozen.plan_depths(new, where), depths, left)
+            planned, grad = depth_gradient(frozen.vary_depths(new, where), depths, left)
             assert_same_render(*(masked(render, where) for render in (planned, truth)))
             assert_close(grad, expected, "gradient of depths")
-        beside = frozen.plan_depths(new, left)(depths)
-        assert torch.equal(beside.image[:, 16:], frozen.context.image[:, 16:])
-    before_the_lens = frozen.plan_depths(new, torch.ones_like(left))(1e-3 * before)
-    assert torch.equal(before_the_lens.image, frozen.context.image)
+        beside = frozen.vary_depths(new, left)(depths)
+        assert torch.equal(beside.image[:, 16:], frozen.render.image[:, 16:])
+    before_the_lens = frozen.vary_depths(new, torch.ones_like(left))(1e-3 * before)
+    assert torch.equal(before_the_lens.image, frozen.render.image)
 
 
 @MODES
 def test_a_plan_of_colours_tells_what_the_composite_in_these_colours_lacks(antialiased):
     context, new = context_and_new(antialiased)
-    plans = [r.freeze(context, CAMERA).plan_colours(new) for r in (CPU, REFERENCE)]
+    plans = [r.freeze(context, CAMERA).vary_colors(new) for r in (CPU, REFERENCE)]
     generator = torch.Generator().manual_seed(0)
     photograph = torch.rand(48, 48, 3, generator=generator)
     for _ in range(2):
@@ -359,7 +362,7 @@ def test_a_plan_of_appearances_is_the_composite_that_looks_like_this(name):
     """In front of the context, within it and behind it, to the tolerance of full pixels."""
     _, new = context_and_new(SCENES[name].is_antialiased)
     frozen = CPU.freeze(SCENES[name], CAMERA)
-    plan, generator = frozen.plan_appearance(new, EVERYWHERE), torch.Generator().manual_seed(0)
+    plan, generator = frozen.vary_appearance(new, EVERYWHERE), torch.Generator().manual_seed(0)
     for share in (1.0, 0.5, 0.1):
         leaves = {
             "opacities": share * new.opacities,
@@ -393,14 +396,14 @@ def test_what_a_plan_compares_is_its_image(antialiased):
     wanted = torch.rand(CAMERA.height, CAMERA.width, 3, generator=generator)
     weights = torch.rand(CAMERA.height, CAMERA.width, generator=generator).sub(0.3).clamp_min(0)
     frozen = [r.freeze(context, CAMERA) for r in (CpuRenderer(1), CpuRenderer(3), REFERENCE)]
-    plans = [view.plan_appearance(new, EVERYWHERE) for view in frozen]
+    plans = [view.vary_appearance(new, EVERYWHERE) for view in frozen]
     leaves = {"opacities": 0.5 * new.opacities, "sh": 0.9 * new.sh}
 
     def full_error(opacities, sh):
         return (weights * (plans[0](opacities, sh) - wanted).square().sum(dim=-1)).sum()
 
     true_error, true_gradients = value_and_gradients(full_error, leaves)
-    errors = [plan.compared(wanted, weights) for plan in plans]
+    errors = [plan.make_error(wanted, weights) for plan in plans]
     assert errors[0](**leaves) == errors[1](**leaves)
     for compared in errors:
         error, grads = value_and_gradients(partial(tripled, compared), leaves)
@@ -417,13 +420,13 @@ def test_a_plan_of_appearances_has_fragments_only_where_it_is_asked_for(name):
     rows, columns = torch.meshgrid(torch.arange(48), torch.arange(48), indexing="ij")
     where = (rows - 16) ** 2 + (columns - 18) ** 2 < 100
     where[40, 41] = True
-    whole, part = (frozen.plan_appearance(new, asked) for asked in (EVERYWHERE, where))
+    whole, part = (frozen.vary_appearance(new, asked) for asked in (EVERYWHERE, where))
     appearance = 0.7 * new.opacities, 0.9 * new.sh
     assert_close(part(*appearance)[where], whole(*appearance)[where], "image", ROUNDING)
-    assert torch.equal(part(*appearance)[~where], frozen.context.image[~where])
+    assert torch.equal(part(*appearance)[~where], frozen.render.image[~where])
     wanted = torch.rand(48, 48, 3, generator=torch.Generator().manual_seed(0))
     leaves = dict(zip(("opacities", "sh"), appearance, strict=True))
-    errors = [plan.compared(wanted, where.float()) for plan in (whole, part)]
+    errors = [plan.make_error(wanted, where.float()) for plan in (whole, part)]
     (error, grads), (expected, true_gradients) = (value_and_gradients(t, leaves) for t in errors)
     assert_close(error, expected, "error", ROUNDING)
     for name in leaves:
@@ -461,7 +464,7 @@ def test_what_is_closed_by_something_solid_is_closed_at_the_same_splat():
     frozen, new = CPU.freeze(context, CAMERA), merge([placed(wall, 0.98), placed(wall, 1.01)])
     for opacity in (0.3, 0.9, 0.97):
         opacities = torch.full((len(new),), opacity)
-        planned = frozen.plan_appearance(new, EVERYWHERE)(opacities, new.sh)
+        planned = frozen.vary_appearance(new, EVERYWHERE)(opacities, new.sh)
         truth = frozen.composite(replace(new, opacities=opacities)).image
         assert_close(planned, truth, "image", FOLDED)
 
@@ -478,8 +481,8 @@ def test_what_looks_otherwise_costs_what_is_new_however_much_is_frozen():
     counts = []
     for context in (few, many):
         faint = replace(context, opacities=0.02 * context.opacities)
-        fragments = CPU.freeze(faint, CAMERA).plan_appearance(new, EVERYWHERE).fragments
-        counts.append(sum(len(piece.entries) - len(piece.folds) for piece in fragments))
+        fragments = CPU.freeze(faint, CAMERA).vary_appearance(new, EVERYWHERE).fragments
+        counts.append(sum(len(piece.entries) - len(piece.baked) for piece in fragments))
     assert counts[0] == counts[1] > 0
 
 
@@ -571,7 +574,7 @@ def check_frozen(view, plain, new: Gaussians, bound: float) -> None:
 
     leaves = {name: getattr(new, name) for name in PARAMETERS}
     pairs = [(composited(view), composited(plain), leaves)]
-    plans = view.plan(new), plain.plan(new)
+    plans = view.vary_opacities(new), plain.vary_opacities(new)
     for opacities in (new.opacities, 1 - new.opacities):
         ours, theirs = ((lambda ls, p=plan: p(ls["opacities"])) for plan in plans)
         pairs.append((ours, theirs, {"opacities": opacities}))
@@ -598,35 +601,35 @@ def test_a_frozen_view_that_drops_what_its_camera_does_not_see_draws_the_same(na
     beside = replace(SCENES[name], means=SCENES[name].means + torch.tensor([9.0, 0, 0]))
     context, new = merge([SCENES[name], beside]), random_gaussians(40, seed=5, sh_degree=1)
     new = replace(new, is_antialiased=context.is_antialiased)
-    view = frozen_by(SlowDrawing(), context, CAMERA)
-    assert 0 < len(view.seen) < len(context) / 2 + 1
-    assert view.seen.sh.shape[1] == 1
+    view = freeze_with(SlowDrawing(), context, CAMERA)
+    assert 0 < len(view.visible_scene) < len(context) / 2 + 1
+    assert view.visible_scene.sh.shape[1] == 1
     plain = REFERENCE.freeze(context, CAMERA)
     check_frozen(view, plain, new, 1e-5)
-    assert torch.equal(view.context.image, plain.context.image)
+    assert torch.equal(view.render.image, plain.render.image)
 
 
-@pytest.mark.parametrize("freeze", [CPU.freeze, partial(frozen_by, SlowDrawing())])
+@pytest.mark.parametrize("freeze", [CPU.freeze, partial(freeze_with, SlowDrawing())])
 @pytest.mark.parametrize("name", ["harmonics", "strange", "antialiased-harmonics"])
 def test_a_frozen_view_tells_what_it_shows_of_each_gaussian(name, freeze):
     context, new = SCENES[name][::2], SCENES[name][1::2]
-    view = freeze(context, CAMERA).extended(new[:0]).extended(new)
+    view = freeze(context, CAMERA).extend(new[:0]).extend(new)
     plain = REFERENCE.freeze(merge([context, new]), CAMERA)
     layers = torch.rand(
         (CAMERA.height, CAMERA.width, 3), generator=torch.Generator().manual_seed(0)
     )
-    ours, truth = view.sums(layers), plain.sums(layers)
+    ours, truth = view.sums(layers), plain.backproject(layers)
     assert (ours - truth).abs().max() <= ROUNDING * truth.abs().max()
     assert truth.count_nonzero() > 0
     values = torch.rand(len(truth), generator=torch.Generator().manual_seed(1))
-    ours, truth = view.blended(values), plain.blended(values)
+    ours, truth = view.splat(values), plain.splat(values)
     assert ours.shape == (CAMERA.height, CAMERA.width)
     assert (ours - truth).abs().max() <= ROUNDING * truth.abs().max()
 
 
 def test_a_frozen_view_of_nothing_draws_what_is_new():
     new = SCENES["random"]
-    view = frozen_by(SlowDrawing(), new[:0], CAMERA)
+    view = freeze_with(SlowDrawing(), new[:0], CAMERA)
     assert torch.equal(view.composite(new).image, REFERENCE.render(new, CAMERA).image)
 
 
@@ -642,12 +645,12 @@ def test_gsplat_is_called_so_that_frozen_views_draw_what_the_reference_does(name
     assert_close(ours.depth, truth.depth, "depth", 1e-5)
     assert_close(ours.image, truth.image, "image", 1e-5)
     view = cuda.freeze(context, CAMERA)
-    assert 0 < len(view.seen) < len(context)
+    assert 0 < len(view.visible_scene) < len(context)
     check_frozen(view, REFERENCE.freeze(context, CAMERA), new, 1e-4)
     more = replace(random_gaussians(30, seed=6), is_antialiased=context.is_antialiased)
-    check_frozen(view.extended(new), REFERENCE.freeze(merge([context, new]), CAMERA), more, 1e-4)
+    check_frozen(view.extend(new), REFERENCE.freeze(merge([context, new]), CAMERA), more, 1e-4)
     assert not cuda.render(new[:0], CAMERA).image.any()
-    assert len(cuda.freeze(new[:0], CAMERA).seen) == 0
+    assert len(cuda.freeze(new[:0], CAMERA).visible_scene) == 0
 
 
 on_a_gpu = pytest.mark.skipif(not torch.cuda.is_available(), reason="torch sees no GPU")
@@ -681,5 +684,5 @@ def test_a_frozen_view_on_a_gpu_draws_what_drawing_everything_anew_does(name):
     new = random_gaussians(200, seed=5, sh_degree=1).to("cuda")
     new = replace(new, is_antialiased=context.is_antialiased)
     view = cuda.freeze(context, camera)
-    assert 0 < len(view.seen) < len(context) / 2 + 1
-    check_frozen(view, ReferenceView(cuda, context, camera), new, 1e-3)
+    assert 0 < len(view.visible_scene) < len(context) / 2 + 1
+    check_frozen(view, ReferenceFrozenScene(cuda, context, camera), new, 1e-3)

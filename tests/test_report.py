@@ -14,19 +14,36 @@ import torch
 from PIL import Image
 
 from command import run
+from gscompleter.apps.report.camera_figure import project_to_drawing
+from gscompleter.apps.report.completion_page import render_completion_page
+from gscompleter.apps.report.depth_picture import (
+    NO_DEPTH_COLOR,
+    compute_depth_limits,
+    make_palette,
+    write_depth_image,
+)
+from gscompleter.apps.report.evaluation_page import render_evaluation_page
+from gscompleter.apps.report.figures import (
+    compute_ticks,
+    draw_color_scale,
+    draw_time_bars,
+    plot_depth_scatter,
+    plot_loss,
+)
+from gscompleter.apps.report.finished import AlignmentRow, TargetRow, read_completion_folder
+from gscompleter.apps.report.page import encode_data_uri, open_gallery
+from gscompleter.apps.report.plain_words import (
+    describe_motion,
+    format_change,
+    format_number,
+    format_percent,
+    list_target_notes,
+)
+from gscompleter.apps.report.record import MAX_SURROUNDING_VIEWS, select_most_changed
 from gscompleter.config import RegistrationConfig
 from gscompleter.errors import InputError
+from gscompleter.evaluation.metrics.coverage import RenderPair
 from gscompleter.io.image import read_pixels, write_image
-from gscompleter.metrics.coverage import Look
-from gscompleter.reports.camera_figure import projected
-from gscompleter.reports.completion_page import completion_page
-from gscompleter.reports.depth_picture import NONE, colours, limits_of, write_depth
-from gscompleter.reports.evaluation_page import evaluation_page
-from gscompleter.reports.figures import affine_scatter, colour_scale, loss_curve, ticks, time_bars
-from gscompleter.reports.finished import Affine, TargetRow, read_finished
-from gscompleter.reports.page import data_uri, gallery_of
-from gscompleter.reports.plain_words import about_target, gain, moved, percent, shown
-from gscompleter.reports.record import MAX_LOOKS, most_changed
 from gscompleter.types import DepthMap, Render
 
 VOID = {"meta", "img", "input", "link", "br", "hr"}
@@ -129,7 +146,7 @@ def test_what_summary_json_has_is_on_the_page(completed_room):
 
 def test_the_same_folder_gives_the_same_bytes(completed_room, out, monkeypatch, capsys):
     written = (completed_room / "report.html").read_bytes()
-    assert completion_page(completed_room).encode() == written
+    assert render_completion_page(completed_room).encode() == written
     (out / "report.html").unlink()
     assert run(monkeypatch, "report", out) == 0
     assert (out / "report.html").read_bytes() == written
@@ -154,7 +171,7 @@ def test_hostile_words_are_words(out):
     changed(
         out / "report.json", lambda kept: kept["targets"][0]["losses"].update({HOSTILE: [1, 2]})
     )
-    text = completion_page(out)
+    text = render_completion_page(out)
     page = Page(text)
     assert len(page.all("script")) == 1
     assert not any("onerror" in image for image in page.all("img"))
@@ -176,15 +193,25 @@ def test_numbers_that_are_none_are_dashes(out, nothing):
         out / "report.json",
         lambda kept: kept["targets"][0]["losses"].update(register=[float("nan"), 1.0, 0.5]),
     )
-    said = Page(completion_page(out)).said()
+    said = Page(render_completion_page(out)).said()
     assert "1: photograph 2 – – – – – –" in said
     assert re.search(r"\b(nan|inf|None|null)\b", said.replace("–", "")) is None
 
 
 def test_numbers_in_words():
-    assert [shown(v) for v in (1.234, None, float("nan"), float("inf"))] == ["1.23", "–", "–", "–"]
-    assert [percent(v) for v in (0.125, None)] == ["12.5 %", "–"]
-    assert [gain(2.0, 3.0), gain(3.0, 2.0), gain(1.0, 0.9999), gain(None, 2.0)] == [
+    assert [format_number(v) for v in (1.234, None, float("nan"), float("inf"))] == [
+        "1.23",
+        "–",
+        "–",
+        "–",
+    ]
+    assert [format_percent(v) for v in (0.125, None)] == ["12.5 %", "–"]
+    assert [
+        format_change(2.0, 3.0),
+        format_change(3.0, 2.0),
+        format_change(1.0, 0.9999),
+        format_change(None, 2.0),
+    ] == [
         "+1.00",
         "−1.00",
         "0.00",
@@ -195,7 +222,7 @@ def test_numbers_in_words():
 def test_a_missing_or_damaged_image_is_told_in_its_place(out):
     (out / "images" / "target1_after.png").unlink()
     (out / "images" / "target1_hole_mask.png").write_bytes(b"no image")
-    said = Page(completion_page(out)).said()
+    said = Page(render_completion_page(out)).said()
     assert "target1_after.png is missing or damaged." in said
     assert "target1_hole_mask.png is missing or damaged." in said
 
@@ -203,13 +230,13 @@ def test_a_missing_or_damaged_image_is_told_in_its_place(out):
 def test_a_completion_without_targets_says_so(out):
     changed(out / "summary.json", lambda summary: summary.update(targets=[]))
     changed(out / "report.json", lambda kept: kept.update(targets=[], around=[], photographs=[]))
-    assert "nothing was completed" in Page(completion_page(out)).said()
+    assert "nothing was completed" in Page(render_completion_page(out)).said()
 
 
 def test_the_viewer_is_linked_where_there_is_one(out):
-    assert "gscompleter view OUT" in Page(completion_page(out)).said()
+    assert "gscompleter view OUT" in Page(render_completion_page(out)).said()
     (out / "view.html").write_text("")
-    links = [link["href"] for link in Page(completion_page(out)).all("a")]
+    links = [link["href"] for link in Page(render_completion_page(out)).all("a")]
     assert links == ["view.html#camera=target-1", "view.html"]
 
 
@@ -277,7 +304,7 @@ def test_what_is_no_result_is_refused_in_a_sentence(out, monkeypatch, capsys, da
 
 
 def row(**values) -> TargetRow:
-    affine = Affine(1.0, 0.0, 0.9, values.pop("method", "ransac"), None)
+    affine = AlignmentRow(1.0, 0.0, 0.9, values.pop("method", "ransac"), None)
     named = {"notes": (), "added": 5, "anchor_fallback": False} | values
     scores = dict.fromkeys(("psnr_before", "psnr_after", "ssim_before", "ssim_after"))
     return TargetRow(frame=None, anchor=0, hole_fraction=0.1, affine=affine, **scores, **named)
@@ -298,66 +325,66 @@ def test_keys_of_the_last_release_are_read(completed_room, tmp_path):
 
     changed(old / "summary.json", rename)
     assert all(f'"{new}"' not in (old / "summary.json").read_text() for new in names["context"])
-    summary = read_finished(old).summary
+    summary = read_completion_folder(old).summary
     row, target = summary.context[0], summary.targets[0]
     assert (row.exposure_gain, row.dynamic_fraction) == ((2, 2, 2), 0.5)
     assert target.derived_from == 3
 
 
 def test_every_fallback_is_said_once():
-    assert about_target(row()) == []
-    assert about_target(row(notes=("It rained.",))) == ["It rained."]
-    assert len(about_target(row(anchor_fallback=True))) == 1
+    assert list_target_notes(row()) == []
+    assert list_target_notes(row(notes=("It rained.",))) == ["It rained."]
+    assert len(list_target_notes(row(anchor_fallback=True))) == 1
     said = "Every view is turned too far; the least-turned one is the anchor."
-    assert about_target(row(anchor_fallback=True, notes=(said,))) == [said]
-    assert "median" in about_target(row(method="median"))[0]
-    assert about_target(row(added=0)) == ["Nothing was added here."]
-    assert len(about_target(row(added=0, notes=("Nothing of it was added.",)))) == 1
+    assert list_target_notes(row(anchor_fallback=True, notes=(said,))) == [said]
+    assert "median" in list_target_notes(row(method="median"))[0]
+    assert list_target_notes(row(added=0)) == ["Nothing was added here."]
+    assert len(list_target_notes(row(added=0, notes=("Nothing of it was added.",)))) == 1
 
 
 def test_depths_become_colours_from_near_to_far_and_grey_where_there_are_none(tmp_path):
     depth = torch.tensor([[1.0, 2.0, 4.0], [8.0, 3.0, float("nan")]])
     valid = torch.tensor([[True, True, True], [True, False, True]])
     known = DepthMap(depth, valid)
-    write_depth(tmp_path / "depth.png", known, (1.0, 4.0))
+    write_depth_image(tmp_path / "depth.png", known, (1.0, 4.0))
     pixels = read_pixels(tmp_path / "depth.png")
-    palette = colours()
+    palette = make_palette()
     assert pixels[0, 0].tolist() == palette[1].tolist()
     assert pixels[0, 1].tolist() == palette[128].tolist()  # half way by the logarithm
     assert pixels[0, 2].tolist() == pixels[1, 0].tolist() == palette[255].tolist()
-    assert pixels[1, 1].tolist() == pixels[1, 2].tolist() == list(NONE)
+    assert pixels[1, 1].tolist() == pixels[1, 2].tolist() == list(NO_DEPTH_COLOR)
     brightness = palette[1:].astype(float) @ [0.2126, 0.7152, 0.0722]
     assert (np.diff(brightness) > -1).all()
-    near, far = limits_of([known])
+    near, far = compute_depth_limits([known])
     assert 1.0 <= near < 1.2
     assert 7.5 < far <= 8.0
-    assert limits_of([DepthMap(depth, torch.zeros_like(valid))]) is None
+    assert compute_depth_limits([DepthMap(depth, torch.zeros_like(valid))]) is None
 
 
 def test_masks_and_depths_stay_exact_in_a_page_and_pages_stay_small(tmp_path):
     write_image(tmp_path / "mask.png", torch.eye(8) > 0)
     mask = Image.open(tmp_path / "mask.png").convert("RGB")
-    assert data_uri(mask, exact=True).startswith("data:image/png;base64,")
-    assert gallery_of(tmp_path).scale == 1
+    assert encode_data_uri(mask, exact=True).startswith("data:image/png;base64,")
+    assert open_gallery(tmp_path).scale == 1
     Image.new("L", (6000, 4000)).save(tmp_path / "large.png")
-    large = gallery_of(tmp_path).photo("large.png", "")
+    large = open_gallery(tmp_path).embed_photo("large.png", "")
     assert 11e6 < large.width * large.height < 12.1e6
 
 
-def look(change: float) -> Look:
+def look(change: float) -> RenderPair:
     before = Render(torch.zeros(4, 4, 3), torch.ones(4, 4), torch.ones(4, 4))
-    return Look(before, Render(before.image + change, before.depth, before.alpha))
+    return RenderPair(before, Render(before.image + change, before.depth, before.alpha))
 
 
 def test_the_cameras_that_changed_most_are_kept():
     looks = [look(change) for change in (0.1, 0.0, 0.3, 0.2, 0.15, 0.05, 0.06, 0.07)]
-    kept = most_changed(looks)
-    assert len(kept) == MAX_LOOKS
+    kept = select_most_changed(looks)
+    assert len(kept) == MAX_SURROUNDING_VIEWS
     assert [k.after.image.mean().item() for k in kept] == sorted(
         (k.after.image.mean().item() for k in kept), reverse=True
     )
     assert kept[0] is looks[2]
-    assert most_changed(looks[1:2]) == []
+    assert select_most_changed(looks[1:2]) == []
 
 
 def test_the_record_keeps_what_the_affine_was_fitted_to(completed_room):
@@ -378,27 +405,27 @@ def test_the_record_keeps_what_the_affine_was_fitted_to(completed_room):
 
 
 def test_figures_of_nothing_are_none():
-    assert loss_curve("loss", []) is loss_curve("loss", [1.0]) is None
-    assert loss_curve("loss", [float("nan"), 1.0]) is None
-    assert affine_scatter([], 1.0, 0.0, "m") is None
-    assert affine_scatter([(1.0, 1.0, True)], float("nan"), 0.0, "m") is None
-    assert time_bars("seconds", {"lift": 0.0, "total": float("nan")}) is None
-    assert colour_scale((1.0, float("inf")), "m") is None
-    assert "polyline" in loss_curve("loss", [1.0, 1.0])
+    assert plot_loss("loss", []) is plot_loss("loss", [1.0]) is None
+    assert plot_loss("loss", [float("nan"), 1.0]) is None
+    assert plot_depth_scatter([], 1.0, 0.0, "m") is None
+    assert plot_depth_scatter([(1.0, 1.0, True)], float("nan"), 0.0, "m") is None
+    assert draw_time_bars("seconds", {"lift": 0.0, "total": float("nan")}) is None
+    assert draw_color_scale((1.0, float("inf")), "m") is None
+    assert "polyline" in plot_loss("loss", [1.0, 1.0])
 
 
 def test_ticks_are_round_and_within():
-    assert ticks(0.0, 10.0) == [0.0, 2.0, 4.0, 6.0, 8.0, 10.0]
-    assert ticks(0.013, 0.027) == pytest.approx([0.015, 0.02, 0.025])
+    assert compute_ticks(0.0, 10.0) == [0.0, 2.0, 4.0, 6.0, 8.0, 10.0]
+    assert compute_ticks(0.013, 0.027) == pytest.approx([0.015, 0.02, 0.025])
     for low, high in ((-3.2, 7.9), (1e-9, 3e-9), (4e6, 4.1e6)):
-        found = ticks(low, high)
+        found = compute_ticks(low, high)
         assert 2 <= len(found) <= 7
         room = 1e-6 * (high - low)
         assert low - room <= min(found) < max(found) <= high + room
 
 
 def test_what_is_up_is_drawn_above_and_what_is_near_below():
-    middle, up, toward = projected(
+    middle, up, toward = project_to_drawing(
         np.array([[0.0, 0, 0], [0, 1, 0], [0, 0, 1]]), yaw=0.0, pitch=30.0
     )
     assert up[1] < middle[1] < toward[1]
@@ -435,7 +462,7 @@ def evaluated(tmp_path) -> Path:
 def test_an_evaluation_has_a_page_with_its_tables_and_plots(evaluated, monkeypatch):
     assert run(monkeypatch, "report", evaluated, "--quiet") == 0
     text = (evaluated / "report.html").read_text()
-    assert text == evaluation_page(evaluated)
+    assert text == render_evaluation_page(evaluated)
     page, said = Page(text), Page(text).said()
     assert "full 24.50 reggs –" in said
     assert "full 2.00 1.00 reggs – 0.50" in said
@@ -449,10 +476,10 @@ def test_an_evaluation_has_a_page_with_its_tables_and_plots(evaluated, monkeypat
 def test_damaged_tables_are_refused(evaluated, name):
     (evaluated / name).write_text('{"methods": 5}')
     with pytest.raises(InputError, match="is damaged"):
-        evaluation_page(evaluated)
+        render_evaluation_page(evaluated)
 
 
 def test_that_something_moved_is_told_with_where():
-    assert moved({7: 0.0, 15: 0.0}) is None
-    said = moved({7: 0.0155, 15: 0.0, 23: 0.006})
+    assert describe_motion({7: 0.0, 15: 0.0}) is None
+    said = describe_motion({7: 0.0155, 15: 0.0, 23: 0.006})
     assert "1.6 % of frame 7, 0.6 % of frame 23" in said

@@ -18,28 +18,33 @@ import torch
 from chunk_files import as_tensor, example, save_chunk
 from command import run
 from gscompleter import GSCompleter, InputError, memory
-from gscompleter.baselines.reggs import RegGSConfig
 from gscompleter.completer import STAGES
 from gscompleter.data.cases import Case
-from gscompleter.io.image import read_image
-from gscompleter.metrics.image import psnr
-from gscompleter.reports.plots import plots
-from gscompleter.reports.summary import GEOMETRY, gain_of, gains_by_gap, summarize
-from gscompleter.reports.tables import tables
-from gscompleter.runs import methods as runs_methods
-from gscompleter.runs import runner
-from gscompleter.runs.memory import peak_memory
-from gscompleter.runs.methods import BASELINES, METHODS, check_methods, methods_named
-from gscompleter.runs.protocols import read_evaluation_index
-from gscompleter.runs.runner import RowCounts, RunConfig, evaluate
-from gscompleter.runs.store import (
+from gscompleter.evaluation import methods as runs_methods
+from gscompleter.evaluation import runner
+from gscompleter.evaluation.baselines.reggs import RegGSConfig
+from gscompleter.evaluation.memory import measure_peak_memory
+from gscompleter.evaluation.methods import BASELINES, METHODS, check_methods, expand_methods
+from gscompleter.evaluation.metrics.image import psnr
+from gscompleter.evaluation.plots import draw_plots
+from gscompleter.evaluation.protocols import read_evaluation_index
+from gscompleter.evaluation.runner import RowCounts, RunConfig, evaluate
+from gscompleter.evaluation.store import (
+    get_step_path,
+    get_task_folder,
     load_context,
     load_prediction,
     read_json,
-    step_path,
-    task_folder,
 )
-from gscompleter.runs.tasks import Task, task_of
+from gscompleter.evaluation.summary import (
+    GEOMETRY,
+    average_gains_by_gap,
+    compute_psnr_gain,
+    summarize_run,
+)
+from gscompleter.evaluation.tables import write_tables
+from gscompleter.evaluation.tasks import Task, make_case_task
+from gscompleter.io.image import read_image
 from scenes import Room, camera_at, photographed
 
 SIZE = 32
@@ -73,7 +78,7 @@ def scenes(tmp_path_factory) -> Path:
 
 
 def room(folder: Path, context: tuple[int, ...] = (0, 1)) -> Task:
-    return task_of(Case(folder, context, 2, (3,), (SIZE, SIZE), 0.5, 20.0))
+    return make_case_task(Case(folder, context, 2, (3,), (SIZE, SIZE), 0.5, 20.0))
 
 
 @pytest.fixture(scope="module")
@@ -86,12 +91,12 @@ def finished(tasks, tmp_path_factory) -> Path:
     """Return an uninterrupted run and its tables."""
     out = tmp_path_factory.mktemp("runs") / "out"
     assert evaluate(tasks, METHOD_NAMES, out, CONFIG) == RowCounts(8, 0, 0)
-    tables(out)
+    write_tables(out)
     return out
 
 
 def same_tables(out: Path, other: Path) -> None:
-    tables(out)
+    write_tables(out)
     for name in TABLES:
         assert (out / name).read_bytes() == (other / name).read_bytes(), name
 
@@ -126,9 +131,9 @@ def scores_of(out: Path, method: str) -> list[dict]:
 
 def test_what_was_added_and_all_that_was_lifted_are_compared_with_the_context(finished, tasks):
     for task, scores in zip(tasks, scores_of(finished, "full"), strict=True):
-        folder = task_folder(finished, task.name)
+        folder = get_task_folder(finished, task.name)
         context = load_context(folder / "context.npz", "cpu").gaussians
-        prediction = load_prediction(step_path(folder, "full", 1), context)
+        prediction = load_prediction(get_step_path(folder, "full", 1), context)
         assert len(prediction.registered) > len(prediction.added) > 0
         assert scores["align_f_score"] > 0.5
         assert scores["registered_f_score"] > 0.9
@@ -148,9 +153,11 @@ def test_geometry_of_few_pixels_is_left_out(finished):
         row["steps"][0]["scores"].update(
             depth_hole=(0.1, 0.2, 0.6, 9.0)[number], depth_hole_pixels=(500, 900, 700, 499)[number]
         )
-    summary = summarize(rows)
+    summary = summarize_run(rows)
     hole, median, pixels = (
-        summary.cell("full", column) for column in GEOMETRY if column.key.startswith("depth_hole")
+        summary.compute_cell("full", column)
+        for column in GEOMETRY
+        if column.key.startswith("depth_hole")
     )
     assert (hole.value, hole.count) == (pytest.approx(0.3), 3)
     assert (median.value, median.count) == (0.2, 3)
@@ -170,7 +177,7 @@ def test_rows_of_a_version_that_had_fewer_scores_still_make_tables(finished, tmp
             for key in [key for key in scores if key.endswith("pixels") or "registered" in key]:
                 del scores[key]
         path.write_text(json.dumps(row))
-    tables(out)
+    write_tables(out)
     before, now = (
         read_json(folder / "tables.json")["methods"]["full"] for folder in (finished, out)
     )
@@ -200,8 +207,8 @@ LIFE = """
 import os, signal, sys, threading, time
 from pathlib import Path
 from gscompleter.data.cases import read_cases
-from gscompleter.runs.runner import RunConfig, evaluate
-from gscompleter.runs.tasks import task_of
+from gscompleter.evaluation.runner import RunConfig, evaluate
+from gscompleter.evaluation.tasks import make_case_task
 
 cases, out, methods, iterations, *delays = sys.argv[1:]
 
@@ -258,12 +265,12 @@ def test_failures_and_scores_can_be_done_again(tasks, tmp_path, monkeypatch):
     assert evaluate(tasks[:1], methods, out, CONFIG) == RowCounts(1, 1, 0)
     assert evaluate(tasks[:1], methods, out, CONFIG) == RowCounts(0, 0, 2)
     monkeypatch.setitem(METHODS, "no-rc", original)
-    assert evaluate(tasks[:1], methods, out, CONFIG, again="failures") == RowCounts(1, 0, 1)
+    assert evaluate(tasks[:1], methods, out, CONFIG, rerun="failures") == RowCounts(1, 0, 1)
 
     monkeypatch.setitem(
         METHODS, "no-rc", defect
     )  # saved predictions are scored without running a method
-    assert evaluate(tasks[:1], methods, out, CONFIG, again="scores") == RowCounts(2, 0, 0)
+    assert evaluate(tasks[:1], methods, out, CONFIG, rerun="scores") == RowCounts(2, 0, 0)
 
 
 def test_pictures_are_saved_and_plots_are_drawn(finished):
@@ -272,12 +279,12 @@ def test_pictures_are_saved_and_plots_are_drawn(finished):
     before, after, truth = (read_image(box / f"{name}.png") for name in names)
     assert psnr(after, truth) > psnr(before, truth)
     assert read_image(box / "context" / "step-001.png").equal(before)
-    paths = plots(tables(finished), finished)
+    paths = draw_plots(write_tables(finished), finished)
     assert [path.name for path in paths] == ["gain_by_hole.png", "seconds.png"]
     for path in paths:
         ink = read_image(path) < 0.9
         assert ink.any(dim=-1).float().mean() > 0.005
-    again = plots(tables(finished), finished)
+    again = draw_plots(write_tables(finished), finished)
     assert again == paths
 
 
@@ -293,17 +300,17 @@ def test_time_and_memory_are_told_apart_from_scores(finished):
 
 def test_gains_by_distance_are_grouped_by_the_nearest_context_frame(finished):
     rows = [json.loads(p.read_text()) for p in sorted((finished / "tasks").glob("*/full.json"))]
-    assert list(gains_by_gap({"full": rows})) == [1]
+    assert list(average_gains_by_gap({"full": rows})) == [1]
     rows[1]["steps"][0]["frame"] = 6
-    gains = [gain_of(row["steps"][0]) for row in rows]
-    found = summarize(rows).gains
+    gains = [compute_psnr_gain(row["steps"][0]) for row in rows]
+    found = summarize_run(rows).gains
     assert {gap: cells["full"].value for gap, cells in found.items()} == pytest.approx(
         {1: gains[0], 5: gains[1]}
     )
 
 
 def test_fid_is_a_number_or_a_reason(finished, monkeypatch):
-    tables(finished, with_fid=True)
+    write_tables(finished, with_fid=True)
     text = (finished / "tables.md").read_text()
     reason = read_json(finished / "tables.json")["fid"]["reason"]
     if reason is None:
@@ -316,28 +323,28 @@ def test_fid_is_a_number_or_a_reason(finished, monkeypatch):
         calls.append([image.shape for image in images])
         return float(len(calls))
 
-    monkeypatch.setattr("gscompleter.reports.tables.fid", stand_in)
-    tables(finished, with_fid=True)
+    monkeypatch.setattr("gscompleter.evaluation.tables.fid", stand_in)
+    write_tables(finished, with_fid=True)
     assert calls == [[(SIZE, SIZE, 3)] * 2] * len(METHOD_NAMES)
     assert "| full | 2.00 |" in (finished / "tables.md").read_text()
-    tables(finished)
+    write_tables(finished)
     assert "FID: not requested" in (finished / "tables.md").read_text()
 
 
 def test_groups_of_methods():
-    assert methods_named(["full", "baselines", "reggs"])[0] == "full"
-    assert methods_named(["full", "baselines"])[1:] == tuple(BASELINES)
-    everything = methods_named(["all"])
+    assert expand_methods(["full", "baselines", "reggs"])[0] == "full"
+    assert expand_methods(["full", "baselines"])[1:] == tuple(BASELINES)
+    everything = expand_methods(["all"])
     assert {"context", "full", "paper", "unconstrained", "no-sa", *BASELINES} <= set(everything)
     assert set(everything) <= set(METHODS)
 
 
 def test_peak_memory_sees_what_was_let_go_of():
     # Fresh pages: memory released by earlier tests could be reused.
-    with peak_memory() as much, mmap.mmap(-1, 2**28) as pages:
+    with measure_peak_memory() as much, mmap.mmap(-1, 2**28) as pages:
         for page in range(0, 2**28, mmap.PAGESIZE):
             pages[page] = 1
-    with peak_memory() as nothing:
+    with measure_peak_memory() as nothing:
         pass
     if sys.platform == "linux":
         assert much.bytes - nothing.bytes > 2**27
@@ -374,11 +381,11 @@ def test_a_broken_case_is_a_row_with_its_reason(scenes, tasks, tmp_path, monkeyp
     monkeypatch.setitem(METHODS, "no-rc", defect)
     methods = ("context", "no-rc")
     assert evaluate([broken, tasks[0]], methods, out, CONFIG) == RowCounts(1, 3, 0)
-    summary = tables(out)
+    summary = write_tables(out)
     reasons = {(task, method): reason for task, method, reason in summary.failures}
     assert "no frame 9" in reasons[broken.name, "context"]
     assert reasons[tasks[0].name, "no-rc"] == "Frame 2: RuntimeError: out of memory"
-    assert (len(summary.tasks), summary.common) == (2, ())
+    assert (len(summary.tasks), summary.common_tasks) == (2, ())
     assert "RuntimeError" in (out / "tables.md").read_text()
 
 
@@ -399,7 +406,7 @@ def test_baselines_run(tasks, tmp_path, monkeypatch):
     assert (distill["added"], distill["anchor"], distill["scores"]["depth_rim"]) == (0, None, None)
     assert (reggs["added"], reggs["anchor"]) == (SIZE * SIZE, 0)
     assert reggs["scores"]["registered_pixels"] > 500
-    tables(out)
+    write_tables(out)
     (note,) = (n for n in read_json(out / "tables.json")["notes"] if n.startswith("reggs"))
     for name in ("tables.md", "tables.tex"):
         assert note in (out / name).read_text()
@@ -427,7 +434,7 @@ def test_wrong_runs_are_refused(finished, tasks, tmp_path):
     with pytest.raises(InputError, match="something other than a run"):
         evaluate(tasks, ["context"], tmp_path, CONFIG)
     with pytest.raises(InputError, match="holds no run"):
-        tables(tmp_path)
+        write_tables(tmp_path)
 
 
 def test_the_commands_run_end_to_end(scenes, tmp_path, monkeypatch, capsys):
@@ -532,18 +539,18 @@ def test_one_case_per_scene_is_the_first(scenes, tmp_path, monkeypatch, capsys):
 def test_full_is_what_the_completer_does_by_itself(tasks):
     task = tasks[0]
     views, (target,) = task.load(task.context), task.load(task.targets)
-    models = RunConfig().models([target])
-    state = models.completer().begin(views)
+    models = RunConfig().load_models([target])
+    state = models.make_completer().begin(views)
     alone = GSCompleter()(views, target.camera)
     predicted = METHODS["full"](state, target.camera, models)
     assert torch.equal(predicted.scene.means, alone.scene.means)
     assert torch.equal(predicted.scene.opacities, alone.scene.opacities)
-    reference = models.completer().reference(state, target.camera)
+    reference = models.make_completer().synthesize_reference(state, target.camera)
     assert torch.equal(reference.image, alone.targets[0].reference.image)
 
 
 def test_a_task_beyond_the_memory_is_a_row_that_says_so(tasks, tmp_path, monkeypatch):
-    monkeypatch.setattr(memory, "memory_bytes", lambda: 10**8)
+    monkeypatch.setattr(memory, "read_memory_bytes", lambda: 10**8)
     assert evaluate(tasks[:1], ("full",), tmp_path / "out", CONFIG) == RowCounts(0, 1, 0)
     (row,) = (tmp_path / "out" / "tasks").glob("*/full.json")
     assert "of memory, and there are 1 GB; choose a smaller" in read_json(row)["error"]

@@ -6,12 +6,12 @@ import pytest
 import torch
 
 from gscompleter import Camera
-from gscompleter.geometry import baseline_between
-from gscompleter.stages.selection import points_before, select_context
+from gscompleter.geometry import measure_baseline
+from gscompleter.stages.select_context import make_points_in_front, select_context
 from scenes import camera_at
 
 TARGET = camera_at(0.0)
-WALL = points_before(TARGET, 2.0, 4.0)
+WALL = make_points_in_front(TARGET, 2.0, 4.0)
 """Points two to four units in front of the target."""
 
 
@@ -29,7 +29,7 @@ def test_two_that_stand_in_one_place_are_no_pair():
     """The closest photograph exists twice; depth needs one from another place."""
     cameras = [camera_at(0.1), camera_at(0.1), camera_at(0.6)]
     first, second = (cameras[i] for i in chosen(cameras))
-    assert baseline_between(first, second) > 0.1
+    assert measure_baseline(first, second) > 0.1
 
 
 def test_a_photograph_that_looks_away_loses_to_one_farther_off():
@@ -45,7 +45,7 @@ def test_a_tele_photograph_of_a_corner_loses_to_one_that_shows_all():
 def test_every_target_gets_photographs_of_its_own():
     other = camera_at(0.0, yaw=120)
     cameras = [camera_at(x, yaw=yaw) for yaw in (0, 120) for x in (-0.3, -0.2, 0.2, 0.3)]
-    points = torch.cat([WALL, points_before(other, 2.0, 4.0)])
+    points = torch.cat([WALL, make_points_in_front(other, 2.0, 4.0)])
     found = select_context([TARGET, other], cameras, points, 4)
     assert sum(index < 4 for index in found) == 2
 

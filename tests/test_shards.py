@@ -10,22 +10,22 @@ from pathlib import Path
 import pytest
 
 from gscompleter import InputError
-from gscompleter.batch.places import FolderPlace
-from gscompleter.commands import evaluate as command
+from gscompleter.apps.commands import evaluate as command
 from gscompleter.config.generators import PEFieldSettings
 from gscompleter.data.cases import read_cases
-from gscompleter.reports.tables import tables
-from gscompleter.runs import store
-from gscompleter.runs.runner import (
-    Evaluating,
+from gscompleter.evaluation import store
+from gscompleter.evaluation.runner import (
     RowCounts,
     RunConfig,
-    deciding,
+    TaskRunner,
+    collect_settings,
     evaluate,
-    job_of,
+    make_task_job,
 )
-from gscompleter.runs.store import VERSION, claim, read_json, row_paths, write_json
-from gscompleter.runs.tasks import Task, task_of
+from gscompleter.evaluation.store import VERSION, claim, list_row_paths, read_json, write_json
+from gscompleter.evaluation.tables import write_tables
+from gscompleter.evaluation.tasks import Task, make_case_task
+from gscompleter.jobs.places import FolderPlace
 from scenes import Room, camera_at, photographed
 
 SIZE = 32
@@ -36,7 +36,7 @@ CLAIM = """
 import json, os, sys
 from pathlib import Path
 from gscompleter.errors import InputError
-from gscompleter.runs.store import claim
+from gscompleter.evaluation.store import claim
 
 out, count, kinds = Path(sys.argv[1]), int(sys.argv[2]), int(sys.argv[3])
 hold, start = os.pipe()
@@ -101,7 +101,7 @@ def test_without_hard_links_a_folder_is_claimed_too(tmp_path, monkeypatch):
 
 def test_a_file_that_another_process_made_first_stays(tmp_path):
     for content in ("first", "second"):
-        write_json(tmp_path / "run.json", content, first_stays=True)
+        write_json(tmp_path / "run.json", content, keep_existing=True)
     assert read_json(tmp_path / "run.json") == "first"
     assert os.listdir(tmp_path) == ["run.json"]
 
@@ -109,7 +109,7 @@ def test_a_file_that_another_process_made_first_stays(tmp_path):
 def test_a_folder_of_another_version_is_refused(tmp_path):
     (tmp_path / "run.json").write_text(json.dumps({"version": 2, "seed": 0}))
     sentence = "holds a run of version 2, and version 3 is needed; name another folder"
-    for use in (lambda: claim(tmp_path, {"seed": 0}), lambda: tables(tmp_path)):
+    for use in (lambda: claim(tmp_path, {"seed": 0}), lambda: write_tables(tmp_path)):
         with pytest.raises(InputError, match=sentence):
             use()
 
@@ -118,15 +118,15 @@ def test_a_folder_remembers_what_its_generator_was_told(tmp_path):
     def config(**settings) -> RunConfig:
         return RunConfig(generator="pe-field", generator_settings=PEFieldSettings(**settings))
 
-    claim(tmp_path, deciding(config(steps=4)))
-    claim(tmp_path, deciding(config(steps=4, offload=True)))  # which changes no number
+    claim(tmp_path, collect_settings(config(steps=4)))
+    claim(tmp_path, collect_settings(config(steps=4, offload=True)))  # which changes no number
     with pytest.raises(InputError, match="holds a run with generator_steps 4, and this run has 8"):
-        claim(tmp_path, deciding(config(steps=8)))
+        claim(tmp_path, collect_settings(config(steps=8)))
     with pytest.raises(InputError, match=r"run with generator_\w+ \d, and this run has None"):
-        claim(tmp_path, deciding(RunConfig(generator="pe-field")))
+        claim(tmp_path, collect_settings(RunConfig(generator="pe-field")))
     (tmp_path / "run.json").write_text("{")
     with pytest.raises(InputError, match=r"run.json is not JSON .* name another folder"):
-        claim(tmp_path, deciding(config(steps=4)))
+        claim(tmp_path, collect_settings(config(steps=4)))
 
 
 @pytest.fixture(scope="module")
@@ -144,7 +144,7 @@ def scenes(tmp_path_factory) -> Path:
 
 @pytest.fixture(scope="module")
 def tasks(scenes) -> list[Task]:
-    return [task_of(case) for case in read_cases(scenes / "cases.json")]
+    return [make_case_task(case) for case in read_cases(scenes / "cases.json")]
 
 
 @pytest.fixture(scope="module")
@@ -178,12 +178,12 @@ def test_three_shards_at_once_end_with_the_tables_of_one_run(scenes, finished, t
 
 
 def test_a_case_that_somebody_does_is_left_to_them(tasks, tmp_path):
-    out, job = tmp_path / "out", job_of(tasks[0])
-    evaluating = Evaluating(out, METHOD_NAMES, RunConfig())
-    with FolderPlace(out).claimed(f"claims/{job.name}"):
+    out, job = tmp_path / "out", make_task_job(tasks[0])
+    evaluating = TaskRunner(out, METHOD_NAMES, RunConfig())
+    with FolderPlace(out).hold_claim(f"claims/{job.name}"):
         assert evaluating(job).state == "elsewhere"
-    assert evaluating.ended(job) is None
-    assert row_paths(out) == []
+    assert evaluating.find_outcome(job) is None
+    assert list_row_paths(out) == []
 
 
 @pytest.mark.slow
@@ -206,7 +206,7 @@ def test_rows_that_come_while_tables_are_written_get_into_them(finished, tmp_pat
     """Another shard ends after the rows are read and before tables are written."""
     out, late = tmp_path / "out", tmp_path / "late.json"
     shutil.copytree(finished, out)
-    row = row_paths(out)[0]
+    row = list_row_paths(out)[0]
     row.rename(late)
     written = []
 
@@ -215,8 +215,8 @@ def test_rows_that_come_while_tables_are_written_get_into_them(finished, tmp_pat
         if len(written) == 1:
             late.rename(row)
 
-    monkeypatch.setattr(command, "draw", draw)
-    command.show(out, quiet=True, num_rows=6)
+    monkeypatch.setattr(command, "try_plots", draw)
+    command.write_and_print_tables(out, quiet=True, num_rows=6)
     assert written == [2, 3]
     same_tables(out, finished)
 
@@ -225,15 +225,15 @@ def test_a_shard_leaves_the_last_tables_to_the_others(finished, tmp_path, monkey
     """While rows are missing, another shard will write the tables after this one."""
     out = tmp_path / "out"
     shutil.copytree(finished, out)
-    row_paths(out)[0].unlink()
+    list_row_paths(out)[0].unlink()
     calls = []
 
     def draw(summary, out, quiet):
         calls.append(summary)
-        row_paths(out)[0].touch()
+        list_row_paths(out)[0].touch()
 
-    monkeypatch.setattr(command, "draw", draw)
-    command.show(out, quiet=True, num_rows=6)
+    monkeypatch.setattr(command, "try_plots", draw)
+    command.write_and_print_tables(out, quiet=True, num_rows=6)
     assert len(calls) == 1
 
 
@@ -242,5 +242,5 @@ def test_shards_one_after_the_other_add_up(finished, tasks, tmp_path):
     for number in (1, 0):
         counts = evaluate(tasks, METHOD_NAMES, out, RunConfig(), (number, 2))
         assert counts == RowCounts(4 if number == 0 else 2, 0, 0)
-    tables(out)
+    write_tables(out)
     same_tables(out, finished)

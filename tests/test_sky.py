@@ -10,13 +10,13 @@ import torch
 
 from gscompleter.data.formats import open_photographs
 from gscompleter.geometry import project
+from gscompleter.guards.free_space import respect_free_space
 from gscompleter.reconstructors.plane_sweep import PlaneSweep
-from gscompleter.reconstructors.plane_sweep.occlusion import Neighbour, hidden_from_others
-from gscompleter.reconstructors.plane_sweep.reconstructor import ranged
+from gscompleter.reconstructors.plane_sweep.occlusion import Neighbour, find_hidden
+from gscompleter.reconstructors.plane_sweep.reconstructor import set_depth_range
 from gscompleter.render import load_renderer
-from gscompleter.sky import SKY_DEPTH, is_sky, sky_behind, surfaces_in
-from gscompleter.stages.free_space import respect_free_space
-from gscompleter.stages.sky_in_holes import sky_into_holes
+from gscompleter.sky import SKY_DEPTH, extend_sky, is_sky, mask_out_sky
+from gscompleter.stages.extrapolate import extrapolate_sky
 from gscompleter.types import SH_C0, DepthMap, View, sh_from_rgb
 from scenes import (
     Room,
@@ -93,8 +93,8 @@ WHITE_ROOMS = {
 
 
 def has_sky(views: list[View]) -> bool:
-    views = ranged(views)
-    depths = PlaneSweep().depths(views)
+    views = set_depth_range(views)
+    depths = PlaneSweep().estimate_depths(views)
     return any(is_sky(d.depth, v.camera).any() for d, v in zip(depths, views, strict=True))
 
 
@@ -145,7 +145,7 @@ def test_a_hole_beside_the_sky_is_sky_if_it_shows_its_colour():
     valid[:, :6] = False
     view = View(image, camera)
     candidates = gaussians_of(view, torch.full((16, 16), 5.0))
-    moved = sky_into_holes(candidates, torch.arange(256), DepthMap(depth, valid), view)
+    moved = extrapolate_sky(candidates, torch.arange(256), DepthMap(depth, valid), view)
     z = (moved.means - camera.center)[:, 2].reshape(16, 16)
     assert is_sky(z[:8, 3:6], camera).all()
     z[:8, 3:6] = 5.0
@@ -156,7 +156,7 @@ def test_without_a_sky_no_candidate_moves():
     view = view_of(Room(), camera_at(size=16))
     candidates = gaussians_of(view)
     scene = DepthMap(view.depth, torch.ones(16, 16, dtype=torch.bool))
-    assert sky_into_holes(candidates, torch.arange(256), scene, view) is candidates
+    assert extrapolate_sky(candidates, torch.arange(256), scene, view) is candidates
 
 
 def test_the_sky_goes_on_behind_what_stands_before_it():
@@ -165,7 +165,7 @@ def test_the_sky_goes_on_behind_what_stands_before_it():
     sky = torch.ones(32, 32, dtype=torch.bool)
     sky[:, 4:28] = False
     image[~sky] = 0.1
-    gaussians, pixels = sky_behind(View(image, camera), sky, 0.6)
+    gaussians, pixels = extend_sky(View(image, camera), sky, 0.6)
     where = torch.zeros(32 * 32, dtype=torch.bool)
     where[pixels] = True
     assert where.reshape(32, 32)[:, 4:8].all()
@@ -193,7 +193,7 @@ def test_only_surfaces_are_compared_with_surfaces():
     depth[:8] = SKY_DEPTH * 10.0
     image = torch.full((16, 16, 3), 0.5)
     render = load_renderer("cpu").render(gaussians_of(View(image, camera), depth), camera)
-    valid = surfaces_in(render, camera).valid
+    valid = mask_out_sky(render, camera).valid
     assert not valid[:6].any()
     assert valid[10:].all()
 
@@ -203,6 +203,6 @@ def test_what_another_view_could_not_have_seen_is_hidden_by_nothing():
     there, back = np.eye(3, 4, dtype=np.float32), np.eye(3, 4, dtype=np.float32)
     there[0, 3], back[0, 3] = -10, 10
     near = Neighbour(np.full((32, 32), 0.5, np.float32), there, back)
-    hidden = hidden_from_others(np.full((32, 32), 0.1, np.float32), [near])
+    hidden = find_hidden(np.full((32, 32), 0.1, np.float32), [near])
     assert hidden[:, 6:].all()
     assert not hidden[:, :4].any()

@@ -21,11 +21,11 @@ import pytest
 import torch
 
 from command import run
-from gscompleter.cli import COMMANDS, parsed
-from gscompleter.commands.doctor import PURPOSES
-from gscompleter.config.settings import checked
+from gscompleter.apps.commands.doctor import PURPOSES
+from gscompleter.apps.viewer.packages import Libraries
+from gscompleter.cli import COMMANDS, parse_command
+from gscompleter.config.settings import validate
 from gscompleter.reconstructors.plane_sweep import PlaneSweep
-from gscompleter.viewer.packages import Libraries
 from scenes import camera_at, photographed
 
 ROOT = Path(__file__).resolve().parents[1]
@@ -98,7 +98,7 @@ def test_every_block_says_what_it_is():
 def understand_ours(words: list[str]) -> None:
     if words != ["--version"]:
         assert words[0] in COMMANDS, f"there is no command {words[0]}"
-        checked(parsed(words))
+        validate(parse_command(words))
 
 
 def understand_make(words: list[str]) -> None:
@@ -152,7 +152,7 @@ def options_of(command: str) -> set[str]:
         said: list[str] = []
         patch.setattr("sys.stdout.write", lambda text: said.append(text) or len(text))
         with pytest.raises(SystemExit):
-            parsed([command, "--help-all"])
+            parse_command([command, "--help-all"])
     return set(re.findall(r"--[a-z][\w.-]*", "".join(said)))
 
 
@@ -220,7 +220,9 @@ def scene(tmp_path_factory) -> Path:
 def sandbox(scene, completed_room, tmp_path, monkeypatch) -> Path:
     """A folder with all that the commands name."""
     monkeypatch.chdir(tmp_path)
-    monkeypatch.setattr("gscompleter.viewer.packages.load_libraries", lambda: Libraries({}, {}))
+    monkeypatch.setattr(
+        "gscompleter.apps.viewer.packages.load_libraries", lambda: Libraries({}, {})
+    )
     for name in ("SCENE", "scene"):
         shutil.copytree(scene, name)
     shutil.copytree(completed_room, "OUT")

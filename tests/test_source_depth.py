@@ -7,20 +7,20 @@ import pytest
 import torch
 
 from gscompleter import InputError
-from gscompleter.generators.diffusion import source_depth
-from gscompleter.generators.diffusion.source_depth import (
+from gscompleter.models.diffusion import source_depth
+from gscompleter.models.diffusion.source_depth import (
     MonocularDepth,
-    context_depth,
-    from_disparity,
+    compute_context_depth,
+    convert_disparity,
     load_monocular,
-    rescaled,
-    source_depth_named,
+    load_source_depth,
+    rescale_depth,
 )
 from gscompleter.types import Render
 from test_generators import known_room
 
 CONTEXT = known_room()
-VIEW, RENDER = CONTEXT.views[0], CONTEXT.at_views[0]
+VIEW, RENDER = CONTEXT.views[0], CONTEXT.view_renders[0]
 HOLED = torch.ones(96, 96, dtype=torch.bool)
 HOLED[30:60, 30:60] = False
 
@@ -31,7 +31,7 @@ def holed(unit: float = 1.0) -> Render:
 
 
 def test_the_scenes_own_depth_stays_and_its_holes_are_between_what_surrounds_them():
-    depth, valid = context_depth(VIEW, holed()), HOLED & (RENDER.alpha >= 0.5)
+    depth, valid = compute_context_depth(VIEW, holed()), HOLED & (RENDER.alpha >= 0.5)
     assert torch.equal(depth[valid], RENDER.depth[valid])
     assert depth.isfinite().all()
     assert depth.min() >= RENDER.depth[valid].min() - 1e-4
@@ -42,26 +42,26 @@ def test_the_scenes_own_depth_stays_and_its_holes_are_between_what_surrounds_the
 
 @pytest.mark.parametrize("unit", [1e-3, 1e3])
 def test_the_unit_of_length_does_not_matter(unit):
-    depth = context_depth(VIEW, holed())
-    assert torch.allclose(context_depth(VIEW, holed(unit)), unit * depth, rtol=1e-4)
+    depth = compute_context_depth(VIEW, holed())
+    assert torch.allclose(compute_context_depth(VIEW, holed(unit)), unit * depth, rtol=1e-4)
 
 
 def test_a_guess_in_another_unit_is_brought_to_the_scenes():
     true = RENDER.depth.clamp_min(0.1)
-    assert torch.allclose(rescaled(7.0 * true, holed()), true, rtol=1e-3)
+    assert torch.allclose(rescale_depth(7.0 * true, holed()), true, rtol=1e-3)
 
 
 def test_a_disparity_of_unknown_scale_and_shift_is_brought_to_the_scenes_depth():
     true = RENDER.depth.clamp_min(1.0)
     guess = 40 / true + 3
     guess[:20, :20] = 200.0  # a part of it is wrong
-    found = from_disparity(guess, replace(holed(), depth=true * HOLED))
+    found = convert_disparity(guess, replace(holed(), depth=true * HOLED))
     assert ((found - true) / true).abs()[21:, 21:].max() < 0.02
 
 
 def test_a_scene_nobody_sees_is_refused():
     with pytest.raises(InputError, match="sees nothing"):
-        context_depth(VIEW, replace(RENDER, alpha=torch.zeros(96, 96)))
+        compute_context_depth(VIEW, replace(RENDER, alpha=torch.zeros(96, 96)))
 
 
 def tiny_model(folder: Path) -> Path:
@@ -145,7 +145,7 @@ def test_other_networks_of_transformers_are_read_as_what_they_give(tiny, tmp_pat
         monkeypatch.setattr(
             source_depth, name, lambda *a, name=name, fit=fit: calls.append(name) or fit(*a)
         )
-    depth = source_depth_named(str(tiny(tmp_path)))(VIEW, holed())
+    depth = load_source_depth(str(tiny(tmp_path)))(VIEW, holed())
     assert calls == ["from_disparity" if tiny is tiny_dpt else "rescaled"]
     assert depth.shape == (96, 96)
     assert (depth > 0).all()
@@ -153,9 +153,9 @@ def test_other_networks_of_transformers_are_read_as_what_they_give(tiny, tmp_pat
 
 def test_a_network_of_which_it_is_not_known_what_it_gives_is_refused(tmp_path, monkeypatch):
     folder = str(tiny_model(tmp_path))
-    monkeypatch.setattr(source_depth, "METRIC", {"dpt": False})
+    monkeypatch.setattr(source_depth, "PREDICTS_DEPTH", {"dpt": False})
     with pytest.raises(InputError, match=r"unsupported kind depth_anything; choose one of dpt"):
-        source_depth_named(folder)
+        load_source_depth(folder)
 
 
 def test_a_network_that_lacks_a_tensor_is_refused(tmp_path):
@@ -165,17 +165,17 @@ def test_a_network_that_lacks_a_tensor_is_refused(tmp_path):
     weights.pop(sorted(weights)[0])
     safetensors.save_file(weights, file, metadata={"format": "pt"})
     with pytest.raises(InputError, match=r"its network lacks the tensor .*save_pretrained"):
-        source_depth_named(str(tmp_path))
+        load_source_depth(str(tmp_path))
 
 
 def test_the_depth_of_the_scene_and_the_published_network_have_names(monkeypatch):
-    assert source_depth_named("context") is context_depth
+    assert load_source_depth("context") is compute_context_depth
     calls = []
     monkeypatch.setattr(
-        source_depth, "load_monocular", lambda *names: calls.append(names) or context_depth
+        source_depth, "load_monocular", lambda *names: calls.append(names) or compute_context_depth
     )
-    source_depth_named("monocular", "cuda")
-    assert calls == [(source_depth.MONOCULAR, "cuda")]
+    load_source_depth("monocular", "cuda")
+    assert calls == [(source_depth.MONOCULAR_MODEL, "cuda")]
 
 
 def test_a_model_of_transformers_gives_a_depth_in_the_scenes_unit(tmp_path):

@@ -9,17 +9,17 @@ import torch.nn.functional as F
 
 from feed_forward_fixtures import rule_v1
 from gscompleter import InputError
-from gscompleter.reconstructors.feed_forward.sparse import (
+from gscompleter.models.feed_forward.sparse import (
     OFFSETS,
     Grid,
     convolve,
-    neighbours_between,
-    neighbours_within,
+    find_neighbours_between,
+    find_neighbours_within,
     unique_rows,
 )
-from gscompleter.reconstructors.feed_forward.sparse_unet import SparseUNet
-from gscompleter.reconstructors.feed_forward.volsplat import GaussianHead
-from gscompleter.reconstructors.feed_forward.voxels import voxelize
+from gscompleter.models.feed_forward.sparse_unet import SparseUNet
+from gscompleter.models.feed_forward.volsplat import GaussianHead
+from gscompleter.models.feed_forward.voxels import voxelize
 from parity import assert_close
 from volsplat_fixtures import FIXTURES, with_sparse_rule
 
@@ -69,22 +69,22 @@ def test_stride_1_is_the_dense_convolution_at_the_occupied_cells():
     grid, kernel = random_grid(), random(27, 4, 5, seed=2)
     features = random(len(grid), 4)
     expected = F.conv3d(dense(features, grid), dense_kernel(kernel), padding=1)
-    found = convolve(features, kernel, neighbours_within(grid))
+    found = convolve(features, kernel, find_neighbours_within(grid))
     assert torch.allclose(found, at(expected, grid), atol=1e-12)
 
 
 def test_stride_2_is_the_dense_convolution_at_the_parents_of_the_occupied_cells():
     grid, kernel = random_grid(), random(27, 4, 5, seed=2)
     features = random(len(grid), 4)
-    coarse = grid.coarser()
+    coarse = grid.coarsen()
     expected = F.conv3d(dense(features, grid), dense_kernel(kernel), padding=1, stride=2)
-    found = convolve(features, kernel, neighbours_between(grid, coarse))
+    found = convolve(features, kernel, find_neighbours_between(grid, coarse))
     assert torch.allclose(found, at(expected, coarse), atol=1e-12)
 
 
 def test_the_transposed_convolution_spreads_each_coarse_cell_to_the_fine_ones_around_its_corner():
     grid, kernel = random_grid(), random(27, 4, 5, seed=2)
-    coarse = grid.coarser()
+    coarse = grid.coarsen()
     features = random(len(coarse), 4)
     rows = {tuple(row): i for i, row in enumerate(grid.coordinates.tolist())}
     expected = random(len(grid), 5) * 0
@@ -93,18 +93,18 @@ def test_the_transposed_convolution_spreads_each_coarse_cell_to_the_fine_ones_ar
             fine = rows.get((batch, x + dx, y + dy, z + dz))
             if fine is not None:
                 expected[fine] += feature @ matrix
-    found = convolve(features, kernel, neighbours_between(grid, coarse).transposed())
+    found = convolve(features, kernel, find_neighbours_between(grid, coarse).transpose_pairs())
     assert torch.allclose(found, expected, atol=1e-12)
 
 
 def test_the_transposed_convolution_is_the_adjoint():
     """<conv(a), b> = <a, transposed conv(b)> with the matrices transposed."""
     grid, kernel = random_grid(seed=3), random(27, 4, 5, seed=2)
-    coarse = grid.coarser()
-    table = neighbours_between(grid, coarse)
+    coarse = grid.coarsen()
+    table = find_neighbours_between(grid, coarse)
     a, b = random(len(grid), 4, seed=4), random(len(coarse), 5, seed=5)
     there = (convolve(a, kernel, table) * b).sum()
-    back = (a * convolve(b, kernel.transpose(1, 2), table.transposed())).sum()
+    back = (a * convolve(b, kernel.transpose(1, 2), table.transpose_pairs())).sum()
     assert torch.allclose(there, back, rtol=1e-12)
 
 
@@ -112,40 +112,44 @@ def test_a_voxel_alone_meets_only_the_middle_matrix():
     grid, kernel = Grid(torch.tensor([[0, -7, 3, 1]])), random(27, 2, 3)
     assert [OFFSETS[13], OFFSETS[14], OFFSETS[16]] == [(0, 0, 0), (1, 0, 0), (0, 1, 0)]
     features = random(1, 2, seed=2)
-    assert torch.equal(convolve(features, kernel, neighbours_within(grid)), features @ kernel[13])
+    assert torch.equal(
+        convolve(features, kernel, find_neighbours_within(grid)), features @ kernel[13]
+    )
 
 
 def test_an_odd_voxel_alone_meets_the_matrix_of_the_offset_from_its_corner():
     """-7 is one above its parent -8, 3 one above 2; 1 is one above 0: offset (1, 1, 1)."""
     grid = Grid(torch.tensor([[0, -7, 3, 1]]))
-    coarse = grid.coarser()
+    coarse = grid.coarsen()
     assert coarse.coordinates.tolist() == [[0, -8, 2, 0]]
-    assert coarse.coarser().coordinates.tolist() == [[0, -8, 0, 0]]
+    assert coarse.coarsen().coordinates.tolist() == [[0, -8, 0, 0]]
     kernel, features = random(27, 2, 3), random(1, 2, seed=2)
-    found = convolve(features, kernel, neighbours_between(grid, coarse))
+    found = convolve(features, kernel, find_neighbours_between(grid, coarse))
     assert torch.equal(found, features @ kernel[OFFSETS.index((1, 1, 1))])
 
 
 def test_cells_at_opposite_borders_are_no_neighbours():
     """Numbers of cells run on from one row of the box to the next; the margin keeps them apart."""
     grid = Grid(torch.tensor([[0, 0, 0, 5], [0, 0, 1, 0], [1, 0, 0, 0]]))
-    table = neighbours_within(grid)
+    table = find_neighbours_within(grid)
     assert sum(len(rows) for rows in table.sources) == 3
 
 
 def test_scenes_of_one_batch_do_not_mix():
     grid, kernel = random_grid(), random(27, 4, 5, seed=2)
     features = random(len(grid), 4)
-    whole = convolve(features, kernel, neighbours_within(grid))
+    whole = convolve(features, kernel, find_neighbours_within(grid))
     second = grid.coordinates[:, 0] == 1
-    alone = convolve(features[second], kernel, neighbours_within(Grid(grid.coordinates[second])))
+    alone = convolve(
+        features[second], kernel, find_neighbours_within(Grid(grid.coordinates[second]))
+    )
     assert torch.allclose(whole[second], alone, atol=1e-12)
 
 
 def test_coordinates_beyond_32_bits_are_exact():
     far = 2**40
     grid = Grid(torch.tensor([[0, far, -3, 0], [0, far, -2, 0], [0, far + 1, -2, 1]]))
-    sources = neighbours_within(grid).sources
+    sources = find_neighbours_within(grid).sources
     assert len(sources[OFFSETS.index((0, 1, 0))]) == 1
     assert len(sources[OFFSETS.index((1, 0, 1))]) == 1
     assert len(sources[OFFSETS.index((1, 1, 1))]) == 1
@@ -154,19 +158,19 @@ def test_coordinates_beyond_32_bits_are_exact():
 def test_a_box_too_large_to_number_is_refused():
     corners = torch.tensor([[0, -(2**30), 0, 0], [0, 2**30, 2**30, 2**30]])
     with pytest.raises(InputError, match="larger voxels"):
-        neighbours_within(Grid(corners))
+        find_neighbours_within(Grid(corners))
 
 
 def test_rows_out_of_order_or_twice_are_refused():
     for rows in ([[0, 1, 0, 0], [0, 0, 0, 0]], [[0, 1, 0, 0], [0, 1, 0, 0]]):
         with pytest.raises(ValueError, match="unique"):
-            neighbours_within(Grid(torch.tensor(rows)))
+            find_neighbours_within(Grid(torch.tensor(rows)))
 
 
 def test_features_of_another_grid_are_refused():
     grid = random_grid()
     with pytest.raises(ValueError, match="cells"):
-        convolve(random(3, 4), random(27, 4, 5), neighbours_within(grid))
+        convolve(random(3, 4), random(27, 4, 5), find_neighbours_within(grid))
 
 
 def test_unique_rows_are_those_of_torch():
@@ -209,8 +213,8 @@ def small() -> dict[str, torch.Tensor]:
 
 def test_single_convolutions_agree_with_minkowski_engine(small):
     grid = Grid(small["coords"].long())
-    coarse = grid.coarser()
-    table = neighbours_between(grid, coarse)
+    coarse = grid.coarsen()
+    table = find_neighbours_between(grid, coarse)
     place = {tuple(row): i for i, row in enumerate(small["conv_s2_coords"].tolist())}
     order = [place[tuple(row)] for row in coarse.coordinates.tolist()]
     assert sorted(order) == list(range(len(place)))
@@ -218,7 +222,7 @@ def test_single_convolutions_agree_with_minkowski_engine(small):
     down = convolve(small["feats"], kernel, table)
     assert_close(down, small["conv_s2_out"][order], "conv_s2")
     kernel = rule_v1("up.kernel", torch.Size((27, 6, 4)))
-    up = convolve(down, kernel, table.transposed())
+    up = convolve(down, kernel, table.transpose_pairs())
     assert torch.equal(grid.coordinates, small["up_coords"].long())
     assert_close(up, small["up_out"], "up")
 

@@ -26,9 +26,14 @@ from gscompleter import (
     save_ply,
     save_splat,
 )
-from gscompleter.splats.frames import ABOUT_X, ABOUT_Z, half_turned, moved
-from gscompleter.splats.labels import place_of_labels
-from gscompleter.splats.order import near_together
+from gscompleter.splats.morton import sort_along_morton
+from gscompleter.splats.provenance import get_labels_path
+from gscompleter.splats.transform import (
+    HALF_TURN_X,
+    HALF_TURN_Z,
+    rotate_half_turn,
+    transform_gaussians,
+)
 from scenes import camera_at, random_gaussians, scaled
 from splat_files import (
     FORMATS_BUT_PLY,
@@ -94,7 +99,7 @@ def test_a_ply_comes_back_exactly(tmp_path, degree):
 
 @pytest.mark.parametrize("degree", [0, 1, 2, 3])
 def test_a_compressed_ply_rounds_no_more_than_its_bits(tmp_path, degree):
-    gaussians = near_together(plausible(600, degree))
+    gaussians = sort_along_morton(plausible(600, degree))
     save_splat(tmp_path / "scene.compressed.ply", gaussians)
     loaded = load_splat(tmp_path / "scene.compressed.ply")
     extent = (gaussians.means.amax(0) - gaussians.means.amin(0)).max()
@@ -197,7 +202,7 @@ def test_nodes_of_a_glb_place_their_gaussians(tmp_path):
         ]
     )
     place[:3, 3] = torch.tensor([1.0, 2, 3])
-    expected = half_turned(moved(gaussians, place), ABOUT_Z)
+    expected = rotate_half_turn(transform_gaussians(gaussians, place), HALF_TURN_Z)
     assert torch.allclose(loaded.means, expected.means, atol=1e-5)
     assert torch.allclose(covariances(loaded), covariances(expected), atol=1e-5)
     table["nodes"][1]["scale"] = [1, 2, 1]
@@ -215,20 +220,20 @@ def test_a_moved_scene_looks_the_same_to_a_camera_that_moved_with_it():
     place[:3, :3], place[:3, 3] = turn * 1.7, torch.tensor([3.0, -1.0, 2.0])
     c2w = place @ camera.c2w
     c2w[:3, :3] /= 1.7
-    there = CPU.render(moved(gaussians, place), replace(camera, c2w=c2w))
+    there = CPU.render(transform_gaussians(gaussians, place), replace(camera, c2w=c2w))
     assert torch.allclose(there.image, CPU.render(gaussians, camera).image, atol=2e-3)
 
 
-@pytest.mark.parametrize("signs", [ABOUT_X, ABOUT_Z])
+@pytest.mark.parametrize("signs", [HALF_TURN_X, HALF_TURN_Z])
 def test_half_a_turn_is_exact_and_the_same_as_the_rotation(signs):
     gaussians = plausible(50, 3)
-    turned = half_turned(gaussians, signs)
-    rotated = moved(gaussians, torch.diag(torch.tensor([*signs, 1.0])))
+    turned = rotate_half_turn(gaussians, signs)
+    rotated = transform_gaussians(gaussians, torch.diag(torch.tensor([*signs, 1.0])))
     assert torch.allclose(turned.means, rotated.means, atol=1e-6)
     assert torch.allclose(turned.sh, rotated.sh, atol=1e-5)
     assert torch.allclose(covariances(turned), covariances(rotated), atol=1e-6)
-    assert torch.equal(half_turned(turned, signs).sh, gaussians.sh)
-    assert torch.equal(half_turned(turned, signs).quats, gaussians.quats)
+    assert torch.equal(rotate_half_turn(turned, signs).sh, gaussians.sh)
+    assert torch.equal(rotate_half_turn(turned, signs).quats, gaussians.quats)
 
 
 # ------------------------------------------------------------------------------------ labels
@@ -242,7 +247,7 @@ def test_what_was_generated_is_known_after_every_conversion(tmp_path, name):
     loaded = load_splat(tmp_path / name)
     nearest = torch.cdist(loaded.means, gaussians.means).argmin(1)
     assert torch.equal(loaded.generated, labels[nearest])
-    assert place_of_labels(tmp_path / name).exists() == (name != "scene.ply")
+    assert get_labels_path(tmp_path / name).exists() == (name != "scene.ply")
 
 
 @pytest.mark.parametrize("antialiased", [False, True])
@@ -287,11 +292,11 @@ def test_labels_of_another_file_are_not_believed(tmp_path):
     gaussians = plausible(20, 0)
     save_splat(path, replace(gaussians, generated=torch.ones(20, dtype=torch.uint8)))
     save_splat(other, gaussians[:10])
-    labels = place_of_labels(path)
-    shutil.copy(labels, place_of_labels(other))
+    labels = get_labels_path(path)
+    shutil.copy(labels, get_labels_path(other))
     refused(other, "labels of another state")
     save_splat(other, gaussians[:10])
-    assert not place_of_labels(other).exists()
+    assert not get_labels_path(other).exists()
     for text in (
         "{}",
         '{"sha256": 1, "generated": [[1]]}',
@@ -455,7 +460,7 @@ def test_convert_writes_once_and_says_what_it_wrote(tmp_path, monkeypatch, capsy
     assert run(monkeypatch, "convert", source, out) == 0
     assert "30 Gaussians, 30 of them generated" in capsys.readouterr().out.replace("\n", " ")
     assert run(monkeypatch, "convert", source, out) == 2
-    assert "there already" in capsys.readouterr().err
+    assert "exists; name another file" in capsys.readouterr().err
     assert run(monkeypatch, "convert", source, out, "--overwrite", "--quiet") == 0
     assert run(monkeypatch, "convert", source, tmp_path / "b.glb") == 2
     assert run(monkeypatch, "convert", out, tmp_path / "c.ply") == 0
@@ -474,7 +479,7 @@ def test_convert_writes_the_plain_layout_of_all_gaussians(tmp_path, monkeypatch)
         assert run(monkeypatch, "convert", tmp_path / "completed.ply", out, *more) == 0
         assert len(load_splat(out)) == 30
         assert not load_splat(out).generated.any()
-        assert not place_of_labels(out).exists()
+        assert not get_labels_path(out).exists()
     save_ply(tmp_path / "expected.ply", given, provenance=False)
     assert (tmp_path / "x.ply").read_bytes() == (tmp_path / "expected.ply").read_bytes()
     names = plyfile.PlyData.read(str(tmp_path / "x.ply"))["vertex"].data.dtype.names
@@ -591,4 +596,4 @@ def test_what_a_third_party_writes_is_read(tmp_path, splat_transform, name):
 
 def test_merging_keeps_the_labels_of_both():
     parts = [plausible(5, 0), replace(plausible(5, 0), generated=torch.ones(5, dtype=torch.uint8))]
-    assert near_together(merge(parts)).generated.sum() == 5
+    assert sort_along_morton(merge(parts)).generated.sum() == 5

@@ -13,27 +13,27 @@ import torch
 
 from command import run
 from gscompleter import InputError
-from gscompleter.baselines.reggs import RegGSConfig
 from gscompleter.data.photographs import PosedPhotographs
-from gscompleter.geometry import slide
-from gscompleter.io.image import read_pixels
-from gscompleter.reports.plots import plots
-from gscompleter.reports.summary import SEQUENCE, gains_by_gap
-from gscompleter.reports.tables import tables
-from gscompleter.runs import methods, steps
-from gscompleter.runs.methods import METHODS
-from gscompleter.runs.protocols import ViewByView, parse_protocol
-from gscompleter.runs.runner import RowCounts, RunConfig, evaluate, prepare
-from gscompleter.runs.steps import (
-    Prepared,
+from gscompleter.evaluation import methods, steps
+from gscompleter.evaluation.baselines.reggs import RegGSConfig
+from gscompleter.evaluation.methods import METHODS
+from gscompleter.evaluation.plots import draw_plots
+from gscompleter.evaluation.protocols import ViewByView, parse_protocol
+from gscompleter.evaluation.runner import RowCounts, RunConfig, evaluate, prepare_task
+from gscompleter.evaluation.steps import (
+    PreparedTask,
     Progress,
     complete_task,
-    depth_scale,
-    metric_depth,
-    scale_drift,
+    compute_depth_scale,
+    compute_scale_drift,
+    get_metric_depth,
 )
-from gscompleter.runs.store import read_json
-from gscompleter.runs.tasks import Task, tasks_of
+from gscompleter.evaluation.store import read_json
+from gscompleter.evaluation.summary import SEQUENCE, average_gains_by_gap
+from gscompleter.evaluation.tables import write_tables
+from gscompleter.evaluation.tasks import Task, make_tasks
+from gscompleter.geometry import slide
+from gscompleter.io.image import read_pixels
 from gscompleter.types import View
 from scenes import Room, camera_at, gaussians_of, photographed, view_of
 
@@ -65,12 +65,12 @@ class Walk(PosedPhotographs):
                 raise InputError(f"The image of frame {frame} is damaged; download it again.")
         return [view_of(ROOM, CAMERAS[frame], frame) for frame in frames]
 
-    def reason_to_skip(self, size: tuple[int, int] | None = None) -> str | None:
+    def find_skip_reason(self, size: tuple[int, int] | None = None) -> str | None:
         return None
 
 
 def walk(protocol: ViewByView = ViewByView(1), **settings) -> Task:
-    (task,) = tasks_of(protocol, Walk(**settings))
+    (task,) = make_tasks(protocol, Walk(**settings))
     return task
 
 
@@ -101,8 +101,8 @@ def small_holes():
 
 
 @pytest.fixture(scope="module")
-def begun(tmp_path_factory) -> Prepared:
-    return prepare(walk(), tmp_path_factory.mktemp("walk"), CONFIG)
+def begun(tmp_path_factory) -> PreparedTask:
+    return prepare_task(walk(), tmp_path_factory.mktemp("walk"), CONFIG)
 
 
 @pytest.fixture(scope="module")
@@ -115,7 +115,7 @@ def finished(tmp_path_factory) -> Path:
     """Return an uninterrupted run and its tables."""
     out = tmp_path_factory.mktemp("runs") / "out"
     assert evaluate([SHORT], METHOD_NAMES, out, CONFIG) == RowCounts(3, 0, 0)
-    tables(out)
+    write_tables(out)
     return out
 
 
@@ -135,7 +135,7 @@ def without_cost(path: Path) -> bytes:
 
 
 def same_results(out: Path, other: Path) -> None:
-    tables(out)
+    write_tables(out)
     rows = sorted(path.relative_to(other) for path in (other / "tasks").glob("*/*.json"))
     assert rows
     for row in rows:
@@ -161,11 +161,11 @@ def test_a_sequence_begins_with_two_frames_and_goes_on_by_the_same_step():
 
 def test_a_clip_that_is_too_short_is_told_apart_from_one_that_is_not():
     protocol = ViewByView(2)
-    assert tasks_of(protocol, Walk("short", 4)) == []
-    short = protocol.reason_to_skip(Walk("short", 4))
+    assert make_tasks(protocol, Walk("short", 4)) == []
+    short = protocol.explain_skip(Walk("short", 4))
     assert short == "it has 4 frames, and sequence-2 needs 5"
-    assert protocol.reason_to_skip(Walk("walk", 5)) is None
-    assert [task.name for task in tasks_of(protocol, Walk("walk", 5))] == ["walk 0+2>4"]
+    assert protocol.explain_skip(Walk("walk", 5)) is None
+    assert [task.name for task in make_tasks(protocol, Walk("walk", 5))] == ["walk 0+2>4"]
 
 
 @pytest.mark.parametrize("text", ["sequence-4", "sequence-12-steps-6"])
@@ -190,7 +190,7 @@ def test_ours_improves_every_view_of_a_sequence_and_stays_metric(begun, ours):
         assert step.psnr_end > step.scores.target_after.psnr - 0.1
         # The median of some 50 pixels.
         assert step.depth_scale == pytest.approx(1.1, abs=0.15)
-    assert scale_drift([step.depth_scale for step in ours.steps]) < 0.15
+    assert compute_scale_drift([step.depth_scale for step in ours.steps]) < 0.15
     assert ours.steps[-1].psnr_end == ours.steps[-1].scores.target_after.psnr
     assert torch.equal(ours.scene.means[: len(begun.context)], begun.context.means)
 
@@ -240,11 +240,11 @@ def test_the_baseline_adds_all_that_it_lifts_and_the_context_adds_nothing(finish
 
 def test_the_depth_scale_is_how_much_too_far_what_fills_the_holes_stands(begun):
     view, renderer = begun.targets[0], begun.models.renderer
-    expected = metric_depth(view, view, begun.models)
+    expected = get_metric_depth(view, view, begun.models)
 
     def scale(ratio, holes):
         moved = slide(gaussians_of(view), view.camera, ratio.flatten(), "constant")
-        return depth_scale(moved, holes, view.camera, expected, renderer)
+        return compute_depth_scale(moved, holes, view.camera, expected, renderer)
 
     everywhere = torch.ones(SIZE, SIZE, dtype=torch.bool)
     true = scale(torch.ones(SIZE, SIZE), everywhere)
@@ -261,23 +261,23 @@ def test_the_depth_scale_is_how_much_too_far_what_fills_the_holes_stands(begun):
 def test_without_measured_depth_the_scale_is_relative_to_the_model(begun):
     truth = begun.targets[0].depth
     blind = replace(begun.targets[0], depth=None)
-    depth = metric_depth(blind, begun.views[0], begun.models)
+    depth = get_metric_depth(blind, begun.views[0], begun.models)
     assert 0.2 < depth.valid.float().mean() < 1
     assert ((depth.depth - truth).abs() / truth)[depth.valid].median() < 0.05
 
 
 def test_the_drift_is_that_between_the_largest_and_the_smallest_scale():
-    assert scale_drift([1.0, 1.1, 0.9]) == pytest.approx(math.log(1.1 / 0.9))
-    assert scale_drift([1.0]) is None
+    assert compute_scale_drift([1.0, 1.1, 0.9]) == pytest.approx(math.log(1.1 / 0.9))
+    assert compute_scale_drift([1.0]) is None
     drift = next(column for column in SEQUENCE if column.key == "scale_drift")
     row = {"steps": [{"depth_scale": scale} for scale in (1.0, None, 2.0)]}
-    assert drift.of_row(row) == pytest.approx(math.log(2))
+    assert drift.compute_row(row) == pytest.approx(math.log(2))
 
 
 def test_the_gain_of_a_step_counts_by_its_distance_to_what_is_known_by_then():
     scores = {"target_before": {"psnr": 10.0}, "target_after": {"psnr": 12.0}}
     steps = [{"frame": frame, "scores": scores} for frame in (8, 20, 22)]
-    found = gains_by_gap({"full": [{"task": {"context": [0, 4]}, "steps": steps}]})
+    found = average_gains_by_gap({"full": [{"task": {"context": [0, 4]}, "steps": steps}]})
     assert {gap: cells["full"].value for gap, cells in found.items()} == {2: 2, 4: 2, 12: 2}
 
 
@@ -347,7 +347,7 @@ def test_a_broken_frame_ends_a_sequence_and_keeps_the_steps_before(finished, tmp
     assert [psnr_of(step) for step in row["steps"]] == [psnr_of(step) for step in whole[:2]]
     assert "frame 1 is damaged" in lost["error"]
     assert lost["steps"] == []
-    plots(tables(out), out)
+    draw_plots(write_tables(out), out)
     content = read_json(out / "tables.json")
     assert (content["cases"], content["common"]) == (2, [])
     assert len(content["steps"]["walk 0+1>2..4"]["full"]) == 2
@@ -390,7 +390,7 @@ def test_the_tables_say_what_the_steps_say(finished):
     assert full["psnr"] == pytest.approx(sum(map(psnr_of, by_method["full"])) / 2)
     assert full["gain"] == pytest.approx(full["psnr"] - full["psnr_before"])
     assert full["psnr_end"] == sum(step["psnr_end"] for step in by_method["full"]) / 2
-    assert full["scale_drift"] == scale_drift([s["depth_scale"] for s in by_method["full"]])
+    assert full["scale_drift"] == compute_scale_drift([s["depth_scale"] for s in by_method["full"]])
     assert content["methods"]["context"]["gain"]["value"] == 0
     assert "seconds" not in json.dumps(content)
     timings = read_json(finished / "timings.json")
@@ -405,7 +405,7 @@ def test_a_damaged_row_is_named(finished, tmp_path):
     (row,) = (out / "tasks").glob("*/full.json")
     row.write_text("[]")
     with pytest.raises(InputError, match=r"full.json is no row of scores; delete it"):
-        tables(out)
+        write_tables(out)
 
 
 # The command

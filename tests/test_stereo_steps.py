@@ -8,27 +8,30 @@ import numpy as np
 import pytest
 import torch
 
-from gscompleter.kernels import stereo, variation
-from gscompleter.kernels.sharing import run
-from gscompleter.matching.features import features_of, matches
-from gscompleter.matching.stereo_image import (
+from gscompleter.evaluation.metrics.image import psnr
+from gscompleter.kernels import stereo, tgv
+from gscompleter.kernels.parallel import run
+from gscompleter.reconstructors.features.sift import detect_features, match_features
+from gscompleter.reconstructors.features.stereo_image import (
     StereoImage,
-    source_from_reference,
-    stereo_images,
+    compute_source_from_reference,
+    make_stereo_images,
 )
-from gscompleter.metrics.image import psnr
 from gscompleter.reconstructors.plane_sweep import PlaneSweep
 from gscompleter.reconstructors.plane_sweep.appearance import (
     OPACITY_STEPS,
-    fit_colours,
+    fit_colors,
     fit_opacities,
 )
-from gscompleter.reconstructors.plane_sweep.confidence import confidence_of, without_speckles
-from gscompleter.reconstructors.plane_sweep.epipolar import distances, rotated_to_matches
-from gscompleter.reconstructors.plane_sweep.occlusion import Neighbour, hidden_from_others
+from gscompleter.reconstructors.plane_sweep.confidence import compute_confidence, remove_speckles
+from gscompleter.reconstructors.plane_sweep.epipolar import (
+    compute_epipolar_distances,
+    rotate_to_matches,
+)
+from gscompleter.reconstructors.plane_sweep.occlusion import Neighbour, find_hidden
 from gscompleter.reconstructors.plane_sweep.surfaces import fit_surfaces
 from gscompleter.render import load_renderer
-from gscompleter.render.cpu import CpuView
+from gscompleter.render.cpu import CpuFrozenScene
 from gscompleter.types import View, merge
 from scenes import Room, camera_at, gaussians_of, view_of
 
@@ -49,7 +52,7 @@ def pitched(view: View, degrees: float) -> View:
 
 
 def median_error(views: list[View]) -> float:
-    found, truth = PlaneSweep().depths(views)[0].depth, views[0].depth
+    found, truth = PlaneSweep().estimate_depths(views)[0].depth, views[0].depth
     return ((found - truth).abs() / truth).median().item()
 
 
@@ -57,16 +60,16 @@ def median_error(views: list[View]) -> float:
 
 
 def matched_pair(views: list[View]) -> tuple[StereoImage, StereoImage, np.ndarray, np.ndarray]:
-    (left, right), _ = stereo_images(views)
-    return left, right, *matches(features_of(left), features_of(right))
+    (left, right), _ = make_stereo_images(views)
+    return left, right, *match_features(detect_features(left), detect_features(right))
 
 
 def test_a_pose_that_misses_its_epipolar_lines_is_turned_back():
     left, right = pair()
     reference, source, pixels, matched = matched_pair([left, pitched(right, 0.6)])
-    before, _ = distances(reference, source, pixels, matched)
-    turned = rotated_to_matches(reference, source, pixels, matched)
-    after, _ = distances(reference, turned, pixels, matched)
+    before, _ = compute_epipolar_distances(reference, source, pixels, matched)
+    turned = rotate_to_matches(reference, source, pixels, matched)
+    after, _ = compute_epipolar_distances(reference, turned, pixels, matched)
     assert np.median(np.abs(before)) > 1
     assert np.median(np.abs(after)) < 0.15
     assert np.array_equal(turned.center, source.center)
@@ -75,7 +78,7 @@ def test_a_pose_that_misses_its_epipolar_lines_is_turned_back():
 
 def test_a_right_pose_stays():
     reference, source, pixels, matched = matched_pair(pair())
-    turned = rotated_to_matches(reference, source, pixels, matched)
+    turned = rotate_to_matches(reference, source, pixels, matched)
     assert np.abs(turned.rotation - source.rotation).max() < 1e-3
 
 
@@ -83,14 +86,14 @@ def test_false_matches_do_not_turn_the_camera():
     reference, source, pixels, matched = matched_pair(pair())
     false = matched.copy()
     false[::3] += [3.0, 5.0]
-    turned = rotated_to_matches(reference, source, pixels, false)
+    turned = rotate_to_matches(reference, source, pixels, false)
     assert np.abs(turned.rotation - source.rotation).max() < 2e-3
 
 
 def test_few_matches_leave_the_pose():
     reference, source, pixels, matched = matched_pair(pair())
     for few in (0, 5):
-        assert rotated_to_matches(reference, source, pixels[:few], matched[:few]) is source
+        assert rotate_to_matches(reference, source, pixels[:few], matched[:few]) is source
 
 
 # Confidence and occlusion
@@ -102,7 +105,7 @@ def test_speckles_are_not_trusted_and_surfaces_are():
     agrees = np.ones((40, 40), bool)
     agrees[:, 30:] = False
     agrees[20, 35] = True
-    solid = without_speckles(index, agrees)
+    solid = remove_speckles(index, agrees)
     assert not solid[5:8, 5:8].any()
     assert not solid[:, 31:].any()
     assert solid[:, :29].sum() == 40 * 29 - 9
@@ -111,7 +114,7 @@ def test_speckles_are_not_trusted_and_surfaces_are():
 def test_confidence_grows_with_the_margin():
     index, agrees = np.full((10, 10), 3.0, np.float32), np.ones((10, 10), bool)
     margin = np.linspace(0, 80, 100, dtype=np.float32).reshape(10, 10)
-    confidence = confidence_of(index, margin, agrees)
+    confidence = compute_confidence(index, margin, agrees)
     assert (np.diff(confidence.ravel()) >= 0).all()
     assert confidence.min() == 0
     assert confidence.max() == 1
@@ -122,22 +125,22 @@ def test_an_unknown_gap_takes_the_farther_side():
     values[:, 20:] = 1.0
     known = np.ones((40, 30), bool)
     known[:, 12:20] = False
-    filled = stereo.background(values, known)
+    filled = stereo.fill_background(values, known)
     assert (filled[10:30, 12:20] == 1).all()
     assert np.array_equal(filled[known], values[known])
-    assert np.array_equal(stereo.background(values, np.zeros_like(known)), values)
+    assert np.array_equal(stereo.fill_background(values, np.zeros_like(known)), values)
 
 
 def test_what_only_one_view_sees_past_an_object_is_found_occluded():
     """The pillar in the room hides a strip of the back wall from the right camera."""
     views = pair()
-    (left, right), unit = stereo_images(views)
+    (left, right), unit = make_stereo_images(views)
     inverse = [(unit / view.depth).float().numpy() for view in views]
-    right_from_left = source_from_reference(left, right)
-    left_from_right = source_from_reference(right, left)
+    right_from_left = compute_source_from_reference(left, right)
+    left_from_right = compute_source_from_reference(right, left)
     visible, _ = stereo.reproject(*inverse, right_from_left, left_from_right)
     neighbour = Neighbour(inverse[1], right_from_left, left_from_right)
-    hidden = hidden_from_others(inverse[0], [neighbour])
+    hidden = find_hidden(inverse[0], [neighbour])
     assert hidden.sum() > 50
     assert not hidden[(visible >= 0) & (visible < 1.5)].any()
     assert not hidden[visible < 0].any()
@@ -189,12 +192,14 @@ def test_without_any_measurement_nothing_is_made_up():
     assert np.array_equal(found, measured)
 
 
-@pytest.mark.parametrize("iterations", [1, variation.AT_ONCE, 2 * variation.AT_ONCE + 3])
+@pytest.mark.parametrize(
+    "iterations", [1, tgv.ITERATIONS_PER_PASS, 2 * tgv.ITERATIONS_PER_PASS + 3]
+)
 @pytest.mark.parametrize("threads", [2, 3])
 def test_bands_of_rows_fit_the_surfaces_of_one(monkeypatch, threads, iterations):
     """To the bit, also at the seams, and with as many bands as threads."""
     rows, random, found, parts = (
-        threads * variation.LEAST_ROWS + 7,
+        threads * tgv.MIN_BAND_ROWS + 7,
         np.random.default_rng(0),
         [],
         [],
@@ -207,21 +212,21 @@ def test_bands_of_rows_fit_the_surfaces_of_one(monkeypatch, threads, iterations)
         parts.append(len(calls))
         return run(kernel, calls, threads)
 
-    monkeypatch.setattr(variation, "run", counted)
+    monkeypatch.setattr(tgv, "run", counted)
     for count in (1, threads):
         heights, gradients = np.zeros(shape, np.float32), np.zeros((2, *shape), np.float32)
-        variation.fit(heights, gradients, *given, threads=count)
+        tgv.fit(heights, gradients, *given, threads=count)
         found.append(np.concatenate([heights[None], gradients]))
     assert np.array_equal(*found)
     assert np.abs(found[0]).max() > 0
-    assert parts == [threads, threads - 1] * -(-iterations // variation.AT_ONCE)
+    assert parts == [threads, threads - 1] * -(-iterations // tgv.ITERATIONS_PER_PASS)
 
 
 def test_stereo_does_not_depend_on_the_number_of_threads(monkeypatch):
     views, depths = [view_of(Room(), camera_at(x)) for x in (-0.2, 0.2)], []
     for threads in (1, 3):
         monkeypatch.setattr(numba.config, "NUMBA_NUM_THREADS", threads)
-        depths.append(PlaneSweep().depths(views)[0].depth)
+        depths.append(PlaneSweep().estimate_depths(views)[0].depth)
     assert torch.equal(*depths)
 
 
@@ -234,7 +239,7 @@ def test_a_blank_wall_is_completed_as_a_plane():
             (seen[..., 2] > 4.9) & (seen[..., 0] + 1.2).abs().lt(0.7) & seen[..., 1].abs().lt(0.7)
         )
         views.append(replace(view, image=torch.where(wall[..., None], 0.5, view.image)))
-    found, truth = PlaneSweep().depths(views)[0].depth, views[0].depth
+    found, truth = PlaneSweep().estimate_depths(views)[0].depth, views[0].depth
     blank_wall = (views[0].image == 0.5).all(dim=-1)
     assert blank_wall.sum() > 200
     error = ((found - truth).abs() / truth)[blank_wall]
@@ -268,7 +273,7 @@ def test_what_photographs_object_to_fades_and_the_rest_stays():
 
 def test_a_step_on_the_opacities_draws_one_photograph(monkeypatch):
     views, centers = pair(), []
-    plan = CpuView.plan
+    plan = CpuFrozenScene.vary_opacities
 
     def counted(view, new):
         render = plan(view, new)
@@ -276,7 +281,7 @@ def test_a_step_on_the_opacities_draws_one_photograph(monkeypatch):
             centers.append(view.viewpoint.pinhole.center[0]) or render(opacities)
         )
 
-    monkeypatch.setattr(CpuView, "plan", counted)
+    monkeypatch.setattr(CpuFrozenScene, "vary_opacities", counted)
     fit_opacities(merge([gaussians_of(view) for view in views]), views, load_renderer("cpu"))
     assert len(centers) == OPACITY_STEPS
     assert centers[::2] == [views[0].camera.center[0]] * (OPACITY_STEPS // 2)
@@ -286,7 +291,7 @@ def test_a_step_on_the_opacities_draws_one_photograph(monkeypatch):
 def test_colours_get_back_what_drawing_blurs():
     views, renderer = pair(), load_renderer("cpu")
     scene = merge([gaussians_of(view) for view in views])
-    fitted = fit_colours(scene, views, renderer)
+    fitted = fit_colors(scene, views, renderer)
     assert torch.equal(fitted.opacities, scene.opacities)
     for view in views:
         before = psnr(renderer.render(scene, view.camera).image, view.image)
@@ -299,7 +304,9 @@ def test_an_unseen_view_profits_too(x):
     views, renderer = pair(), load_renderer("cpu")
     unseen = view_of(Room(), camera_at(x, size=SIZE))
     sweep = PlaneSweep()
-    plain = merge([sweep.splat(v, d) for v, d in zip(views, sweep.depths(views), strict=True)])
+    plain = merge(
+        [sweep.splat(v, d) for v, d in zip(views, sweep.estimate_depths(views), strict=True)]
+    )
     fitted = sweep(views).gaussians
     covered = renderer.render(plain, unseen.camera).alpha > 0.9
     scores = [

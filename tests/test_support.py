@@ -9,6 +9,7 @@ import pytest
 import torch
 
 from command import run
+from gscompleter.apps.report.completion import InputSplatFile, restore_file_order
 from gscompleter.completer import GSCompleter
 from gscompleter.config import (
     AlignmentConfig,
@@ -17,21 +18,26 @@ from gscompleter.config import (
     RegistrationConfig,
     TrustConfig,
 )
-from gscompleter.geometry import inside, project
-from gscompleter.io.ply import load_ply, save_ply
-from gscompleter.memory import needed_bytes
-from gscompleter.metrics.image import psnr
+from gscompleter.evaluation.metrics.image import psnr
+from gscompleter.geometry import is_inside, project
+from gscompleter.guards.mvs_hint import apply_stereo, render_stereo
+from gscompleter.guards.prune_occluders import find_unneeded
+from gscompleter.guards.psnr import compute_squared_error
+from gscompleter.memory import estimate_bytes
 from gscompleter.render import load_renderer
-from gscompleter.render.cpu import CpuView
-from gscompleter.render.proxy import WORTH
-from gscompleter.reports.completion import Brought, as_in_file
-from gscompleter.splats.order import order_nearby
-from gscompleter.stages.harm import squared_error
-from gscompleter.stages.reconciliation import Turns, hole_error, reconcile
-from gscompleter.stages.setting_aside import not_needed
-from gscompleter.stages.stereo import corrected, stereo_among
-from gscompleter.stages.support import believed_alpha, gather_evidence, support, weight_sums
-from gscompleter.types import Completion, ErrorBudget, SceneContext, merge, sh_from_rgb
+from gscompleter.render.cpu import CpuFrozenScene
+from gscompleter.render.lod import MIN_PROXY_GAUSSIANS
+from gscompleter.splats.morton import argsort_nearby
+from gscompleter.splats.ply import load_ply, save_ply
+from gscompleter.stages.fit_to_photos import PhotoSchedule, compute_hole_error, refine_appearance
+from gscompleter.state import Completion
+from gscompleter.trust.photometric import (
+    compute_trust,
+    compute_trusted_alpha,
+    gather_observations,
+    sum_weights,
+)
+from gscompleter.types import ErrorBudget, GeneratorInput, merge, sh_from_rgb
 from scenes import (
     Room,
     camera_at,
@@ -54,7 +60,7 @@ def shreds():
     """Make floaters in arbitrary colours in front of the target, unseen by photographs."""
     view = view_of(Room(), TARGET)
     found = gaussians_of(view, 0.8 * view.depth)
-    seen = [inside(*project(found.means, camera), camera) for camera in PHOTOGRAPHS]
+    seen = [is_inside(*project(found.means, camera), camera) for camera in PHOTOGRAPHS]
     found = found[~torch.stack(seen).any(0)]
     colours = torch.rand(len(found), 3, generator=torch.Generator().manual_seed(0))
     return replace(found, sh=sh_from_rgb(colours))
@@ -76,7 +82,7 @@ class KnowingReconstructor:
 
 
 def error_of(scene, view):
-    return squared_error(RENDERER.render(scene, view.camera).image, view.image).item()
+    return compute_squared_error(RENDERER.render(scene, view.camera).image, view.image).item()
 
 
 def knowing(config=CompleterConfig()):
@@ -85,9 +91,9 @@ def knowing(config=CompleterConfig()):
 
 
 def test_surfaces_are_supported_and_shreds_are_not():
-    evidence = gather_evidence(SCENE, VIEWS, frozen_at(VIEWS), TrustConfig())
-    sums = weight_sums(AT_TARGET)
-    found, drawn = support(evidence, sums, TARGET), sums > 0.1
+    evidence = gather_observations(SCENE, VIEWS, frozen_at(VIEWS), TrustConfig())
+    sums = sum_weights(AT_TARGET)
+    found, drawn = compute_trust(evidence, sums, TARGET), sums > 0.1
     assert found[drawn & ~ARE_SHREDS].median() > 0.8
     # A few overlap the border of a photograph.
     assert found[drawn & ARE_SHREDS].quantile(0.9) < 0.1
@@ -96,7 +102,7 @@ def test_surfaces_are_supported_and_shreds_are_not():
 @pytest.mark.parametrize("exposure", [0.8, 1.25])
 def test_another_exposure_is_no_contradiction(exposure):
     views = [replace(VIEWS[0], image=(exposure * VIEWS[0].image).clamp(0, 1)), VIEWS[1], VIEWS[2]]
-    evidence = gather_evidence(SCENE, views, frozen_at(views), TrustConfig())
+    evidence = gather_observations(SCENE, views, frozen_at(views), TrustConfig())
     assert evidence.agreement[0, evidence.areas[0] > 0].median() > 0.8
 
 
@@ -104,9 +110,9 @@ def test_a_photograph_of_something_else_contradicts():
     image = VIEWS[1].image.clone()
     image[:, : SIZE // 4] = 0.0
     views = [VIEWS[0], replace(VIEWS[1], image=image), VIEWS[2]]
-    evidence = gather_evidence(SCENE, views, frozen_at(views), TrustConfig())
+    evidence = gather_observations(SCENE, views, frozen_at(views), TrustConfig())
     pixels, z = project(SCENE.means, PHOTOGRAPHS[1])
-    shown = (evidence.areas[1] > 0) & inside(pixels, z, PHOTOGRAPHS[1])
+    shown = (evidence.areas[1] > 0) & is_inside(pixels, z, PHOTOGRAPHS[1])
     left = pixels[:, 0] < SIZE // 4 - 4
     right = pixels[:, 0] > SIZE // 4 + 4
     assert evidence.agreement[1, shown & left].mean() < 0.2
@@ -114,7 +120,7 @@ def test_a_photograph_of_something_else_contradicts():
 
 
 def test_sums_of_weights_make_up_the_alpha():
-    sums = weight_sums(AT_TARGET)
+    sums = sum_weights(AT_TARGET)
     alpha = RENDERER.render(SCENE, TARGET).alpha.sum()
     assert torch.isclose(sums.sum(), alpha, rtol=1e-3)
 
@@ -122,7 +128,7 @@ def test_sums_of_weights_make_up_the_alpha():
 def test_only_what_no_photograph_needs_is_set_aside():
     doubtful = ARE_SHREDS.clone()
     doubtful[1000:1100] = True
-    gone = not_needed(SCENE[doubtful], frozen_at(VIEWS, SCENE[~doubtful]), VIEWS)
+    gone = find_unneeded(SCENE[doubtful], frozen_at(VIEWS, SCENE[~doubtful]), VIEWS)
     taken = doubtful.masked_scatter(doubtful, gone)
     assert taken[ARE_SHREDS].float().mean() > 0.8
     assert not (taken & ~doubtful).any()
@@ -136,10 +142,10 @@ def test_shreds_give_way_to_what_belongs_there():
     truth = view_of(Room(), TARGET).image
     assert result.hole_fraction > 0.1
     assert psnr(result.after.image, truth) > psnr(result.before.image, truth) + 3
-    assert completion.set_aside is not None
-    assert completion.set_aside[ARE_SHREDS].float().mean() > 0.8
+    assert completion.pruned is not None
+    assert completion.pruned[ARE_SHREDS].float().mean() > 0.8
     kept = completion.scene[: completion.num_kept]
-    assert torch.equal(kept.means, SCENE.means[~completion.set_aside])
+    assert torch.equal(kept.means, SCENE.means[~completion.pruned])
     for view in VIEWS:
         before = psnr(RENDERER.render(SCENE, view.camera).image, view.image)
         after = psnr(RENDERER.render(completion.scene, view.camera).image, view.image)
@@ -164,11 +170,11 @@ def test_closing_a_hole_makes_up_for_nothing_that_was_good():
     completion = completer(VIEWS[::2], TARGET, half, witnesses=VIEWS[1:2])
     assert len(completion.targets[0].added) > 0
     gained = []
-    for view, (seen, *_) in zip(completion.photographs, completion.budgets, strict=True):
+    for view, (seen, *_) in zip(completion.photos, completion.budgets, strict=True):
         before, after = (RENDERER.render(g, view.camera) for g in (half, completion.scene))
         holes = before.alpha < 0.5
         assert holes.float().mean() > 0.05
-        assert torch.equal(seen.view.ignored, holes)
+        assert torch.equal(seen.view.ignore_mask, holes)
         errors = [
             (render.image.clamp(0, 1) - view.image).square().mean(dim=-1)
             for render in (before, after)
@@ -180,13 +186,13 @@ def test_closing_a_hole_makes_up_for_nothing_that_was_good():
 
 def test_what_is_added_is_drawn_only_where_it_counts(monkeypatch):
     """All over the photographs, and at the padded target, which is rendered last, in holes."""
-    asked, plan = [], CpuView.plan_appearance
+    asked, plan = [], CpuFrozenScene.vary_appearance
 
     def noted(self, new, where):
         asked.append((self, where))
         return plan(self, new, where)
 
-    monkeypatch.setattr(CpuView, "plan_appearance", noted)
+    monkeypatch.setattr(CpuFrozenScene, "vary_appearance", noted)
     half = SURFACES[SURFACES.means[:, 0] < 0.3]
     completion = knowing()(VIEWS[::2], TARGET, half, witnesses=VIEWS[1:2])
     *at_photographs, (at_target, holes) = asked
@@ -198,47 +204,47 @@ def test_what_is_added_is_drawn_only_where_it_counts(monkeypatch):
 
 def test_without_its_photographs_a_scene_is_taken_as_it_is():
     completion = knowing()(VIEWS[::2], TARGET, SCENE)
-    assert completion.set_aside is None
-    assert completion.evidence is None
+    assert completion.pruned is None
+    assert completion.observations is None
     assert completion.targets[0].hole_fraction < 0.05
 
 
 def test_unsupported_gaussians_may_be_kept():
     config = CompleterConfig(trust_settings=TrustConfig(prune=False))
     completion = knowing(config)(VIEWS[::2], TARGET, SCENE, witnesses=())
-    assert completion.set_aside is None
+    assert completion.pruned is None
     assert torch.equal(completion.scene.means[: len(SCENE)], SCENE.means)
 
 
 def test_the_paper_doubts_nothing():
     completion = knowing(CompleterConfig.paper())(VIEWS[::2], TARGET, SCENE, witnesses=())
-    assert completion.evidence is None
+    assert completion.observations is None
 
 
 def test_what_is_added_is_fitted_to_all_photographs_at_once():
     view = view_of(Room(), TARGET)
     hidden = gaussians_of(view)
-    seen = torch.stack([inside(*project(hidden.means, c), c) for c in PHOTOGRAPHS]).any(0)
+    seen = torch.stack([is_inside(*project(hidden.means, c), c) for c in PHOTOGRAPHS]).any(0)
     # Black Gaussians occlude the photographs.
     before = gaussians_of(VIEWS[1], 0.5 * VIEWS[1].depth)
     black = replace(before, sh=sh_from_rgb(torch.zeros(SIZE * SIZE, 3)))
     allowed = [error_of(SURFACES, v) for v in VIEWS]
     target = RENDERER.freeze(SURFACES, TARGET)
-    holes = target.context.alpha < 0.5
+    holes = target.render.alpha < 0.5
     new = merge([hidden[~seen], black])
-    added, losses = reconcile(
+    added, losses = refine_appearance(
         new,
         target,
         view,
         holes,
-        [RENDERER.freeze(SURFACES, v.camera).plan_appearance(new, v.counted) for v in VIEWS],
+        [RENDERER.freeze(SURFACES, v.camera).vary_appearance(new, v.valid_mask) for v in VIEWS],
         [ErrorBudget(v, "mse", error) for v, error in zip(VIEWS, allowed, strict=True)],
     )
     scene = merge([SURFACES, added])
     for photograph, error in zip(VIEWS, allowed, strict=True):
         assert error_of(scene, photograph) < 1.01 * error
-    after, before = (drawn.image for drawn in (RENDERER.render(scene, TARGET), target.context))
-    assert hole_error(after, view, holes) < 0.1 * hole_error(before, view, holes)
+    after, before = (drawn.image for drawn in (RENDERER.render(scene, TARGET), target.render))
+    assert compute_hole_error(after, view, holes) < 0.1 * compute_hole_error(before, view, holes)
     assert len(losses) == ReconcileConfig().iterations
 
 
@@ -250,30 +256,30 @@ def test_what_photographs_show_by_themselves_takes_the_place_of_what_is_doubted(
     scene = merge([SURFACES, replace(in_the_way, sh=black)])
     frozen, config = RENDERER.freeze(scene, camera), TrustConfig(color_sigma=0.03)
     evidence, drawn = (
-        gather_evidence(scene, VIEWS, frozen_at(VIEWS, scene), config),
-        frozen.context,
+        gather_observations(scene, VIEWS, frozen_at(VIEWS, scene), config),
+        frozen.render,
     )
-    found = support(evidence, weight_sums(frozen), camera)
-    believed = believed_alpha(frozen, found)
-    stereo = stereo_among(VIEWS, camera, drawn, KnowingReconstructor(), RENDERER, config)
-    context = SceneContext(tuple(VIEWS), (), drawn, believed=believed)
-    told = corrected(context, stereo)
+    found = compute_trust(evidence, sum_weights(frozen), camera)
+    believed = compute_trusted_alpha(frozen, found)
+    stereo = render_stereo(VIEWS, camera, drawn, KnowingReconstructor(), RENDERER, config)
+    context = GeneratorInput(tuple(VIEWS), (), drawn, trusted_alpha=believed)
+    told = apply_stereo(context, stereo)
     assert context.holes.float().mean() > 0.15
     assert told.holes.float().mean() < 0.75 * context.holes.float().mean()
     taken = context.holes & ~told.holes
-    error = (told.at_target.image - truth.image)[taken].abs().mean()
+    error = (told.target_render.image - truth.image)[taken].abs().mean()
     assert error < 0.5 * (drawn.image - truth.image)[taken].abs().mean()
-    assert torch.equal(told.at_target.image[~context.holes], drawn.image[~context.holes])
+    assert torch.equal(told.target_render.image[~context.holes], drawn.image[~context.holes])
 
 
 def test_one_photograph_makes_no_stereo():
     drawn = RENDERER.render(SCENE, TARGET)
     config = TrustConfig()
-    assert stereo_among(VIEWS[:1], TARGET, drawn, KnowingReconstructor(), RENDERER, config) is None
+    assert render_stereo(VIEWS[:1], TARGET, drawn, KnowingReconstructor(), RENDERER, config) is None
 
 
 def test_photographs_take_turns_and_the_worst_of_them_more_often():
-    turns = Turns([0.0, 0.0, 5.0, 0.0, 0.0])
+    turns = PhotoSchedule([0.0, 0.0, 5.0, 0.0, 0.0])
     asked = [number for _ in range(4) for number in turns.take(2)]
     assert set(asked) == set(range(5))
     assert asked.count(2) == 4
@@ -285,10 +291,10 @@ def complete(scene, splat, out, *more):
     return ["complete", scene, "--scene", splat, *asked, "--out", out, "--quiet", *more]
 
 
-@pytest.mark.parametrize("worth", [0, WORTH], ids=["sorted", "as-given"])
+@pytest.mark.parametrize("worth", [0, MIN_PROXY_GAUSSIANS], ids=["sorted", "as-given"])
 def test_the_command_sets_aside_and_strip_puts_back(tmp_path, monkeypatch, worth):
     """Restored to the byte, whether or not the scene was sorted in between."""
-    monkeypatch.setattr("gscompleter.commands.complete.WORTH", worth)
+    monkeypatch.setattr("gscompleter.apps.commands.complete.WORTH", worth)
     scene = photographed(tmp_path / "scene", [*PHOTOGRAPHS, TARGET])
     splat, out = tmp_path / "splat.ply", tmp_path / "out"
     save_ply(splat, SCENE)
@@ -302,21 +308,21 @@ def test_the_command_sets_aside_and_strip_puts_back(tmp_path, monkeypatch, worth
 
 
 def test_a_sorted_scene_is_the_same_in_the_order_of_its_file():
-    order = order_nearby(SCENE)
+    order = argsort_nearby(SCENE)
     sides = SCENE.means[order].diff(dim=0).norm(dim=1)
     assert sorted(order.tolist()) == list(range(len(SCENE)))
     assert (
         sides.median()
         < 0.2 * SCENE.means[torch.randperm(len(SCENE))].diff(dim=0).norm(dim=1).median()
     )
-    added, brought = SCENE[:3], Brought(Path("splat.ply"), order=order)
+    added, brought = SCENE[:3], InputSplatFile(Path("splat.ply"), file_order=order)
     for aside in (None, torch.arange(len(SCENE)) % 3 == 0):
         sorted_aside = None if aside is None else aside[order]
         context = SCENE[order]
         left = context if aside is None else context[~aside[order]]
         drawn = merge([left, added])
-        completion = Completion(drawn, context, (), (), (), {}, set_aside=sorted_aside)
-        context, left_out = as_in_file(completion, brought)
+        completion = Completion(drawn, context, (), (), (), {}, pruned=sorted_aside)
+        context, left_out = restore_file_order(completion, brought)
         assert torch.equal(context.means, SCENE.means)
         assert (left_out is None) if aside is None else torch.equal(left_out, aside)
 
@@ -333,16 +339,16 @@ def test_the_command_keeps_what_it_is_told_to(tmp_path, monkeypatch):
 def test_the_command_refuses_a_scene_that_does_not_fit(tmp_path, monkeypatch, capsys):
     scene = photographed(tmp_path / "scene", [*PHOTOGRAPHS, TARGET])
     save_ply(tmp_path / "splat.ply", SCENE)
-    there = needed_bytes(48 * 48, 3)
-    monkeypatch.setattr("gscompleter.memory.memory_bytes", lambda: there)
+    there = estimate_bytes(48 * 48, 3)
+    monkeypatch.setattr("gscompleter.memory.read_memory_bytes", lambda: there)
     assert run(monkeypatch, *complete(scene, tmp_path / "splat.ply", tmp_path / "out")) == 2
     assert f"The {len(SCENE):,} Gaussians of the scene and 3 photographs" in capsys.readouterr().err
     assert not (tmp_path / "out").exists()
 
 
-@pytest.mark.parametrize("worth", [0, WORTH], ids=["sorted", "as-given"])
+@pytest.mark.parametrize("worth", [0, MIN_PROXY_GAUSSIANS], ids=["sorted", "as-given"])
 def test_rows_of_another_program_come_back_whole(tmp_path, monkeypatch, worth):
-    monkeypatch.setattr("gscompleter.commands.complete.WORTH", worth)
+    monkeypatch.setattr("gscompleter.apps.commands.complete.WORTH", worth)
     scene = photographed(tmp_path / "scene", [*PHOTOGRAPHS, TARGET])
     splat, out = labelled(tmp_path / "splat.ply", SCENE), tmp_path / "out"
     assert run(monkeypatch, *complete(scene, splat, out)) == 0

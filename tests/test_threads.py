@@ -10,13 +10,19 @@ import numba
 import pytest
 import torch
 
-from gscompleter import threads
-from gscompleter.kernels.sharing import many_at_once, meanwhile, run, share, thread_pool
+from gscompleter import cpu_threads
+from gscompleter.kernels.parallel import (
+    get_thread_pool,
+    map_small_tasks,
+    run,
+    run_in_background,
+    share,
+)
 from scenes import camera_at, photographed
 
 COUNTS = """
 import sys
-from gscompleter.threads import bound_threads
+from gscompleter.cpu_threads import limit_threads
 bound_threads(int(sys.argv[1]) if sys.argv[1:] else None)
 import cv2, numba, torch
 print(torch.get_num_threads(), numba.config.NUMBA_NUM_THREADS, cv2.getNumThreads())
@@ -25,7 +31,9 @@ print(torch.get_num_threads(), numba.config.NUMBA_NUM_THREADS, cv2.getNumThreads
 
 def counted(*arguments: str, **told: str) -> list[int]:
     """Count the threads of torch, numba and OpenCV in a process with only these variables."""
-    environment = {k: v for k, v in os.environ.items() if k not in threads.LIBRARIES} | told
+    environment = {
+        k: v for k, v in os.environ.items() if k not in cpu_threads.THREAD_VARIABLES
+    } | told
     command = [sys.executable, "-c", COUNTS, *arguments]
     life = subprocess.run(command, env=environment, capture_output=True, text=True, check=True)
     return [int(word) for word in life.stdout.split()]
@@ -37,7 +45,7 @@ def test_every_library_takes_as_many_as_it_is_told():
 
 
 def test_what_the_environment_says_gives_way_to_what_is_told_and_to_nothing_else():
-    cores = threads.usable_cores()
+    cores = cpu_threads.count_available_cores()
     assert counted() == [cores, cores, cores]
     assert counted(OPENCV_FOR_THREADS_NUM="3") == [cores, cores, 3]
     assert counted("1", OPENCV_FOR_THREADS_NUM="3") == [1, 1, 1]
@@ -49,13 +57,13 @@ def test_what_the_environment_says_gives_way_to_what_is_told_and_to_nothing_else
 def test_a_container_is_granted_a_share_of_the_cores(tmp_path, said, cores):
     quota = tmp_path / "cpu.max"
     quota.write_text(said)
-    assert threads.granted(quota) == cores
-    assert threads.granted(tmp_path / "missing") == float("inf")
+    assert cpu_threads.read_quota(quota) == cores
+    assert cpu_threads.read_quota(tmp_path / "missing") == float("inf")
 
 
 def test_torch_has_its_threads_back_after_it_had_one():
     before = torch.get_num_threads()
-    with pytest.raises(KeyError), threads.torch_on_one_thread():
+    with pytest.raises(KeyError), cpu_threads.use_one_torch_thread():
         assert torch.get_num_threads() == 1
         raise KeyError
     assert torch.get_num_threads() == before
@@ -64,8 +72,8 @@ def test_torch_has_its_threads_back_after_it_had_one():
 def test_a_share_of_a_core_is_one_thread(tmp_path, monkeypatch):
     quota = tmp_path / "cpu.max"
     quota.write_text("20000 100000")
-    monkeypatch.setattr(threads, "QUOTA", quota)
-    assert threads.usable_cores() == 1
+    monkeypatch.setattr(cpu_threads, "QUOTA_FILE", quota)
+    assert cpu_threads.count_available_cores() == 1
 
 
 def test_the_bytes_of_a_completion_do_not_depend_on_the_threads(tmp_path):
@@ -86,14 +94,14 @@ def test_the_bytes_of_a_completion_do_not_depend_on_the_threads(tmp_path):
 @pytest.mark.parametrize("count", [1, 2])
 def test_meanwhile_something_else_is_made(monkeypatch, count):
     monkeypatch.setattr(numba.config, "NUMBA_NUM_THREADS", count)
-    with meanwhile(sorted, [2, 1]) as found:
+    with run_in_background(sorted, [2, 1]) as found:
         assert found() == [1, 2]
 
 
 @pytest.mark.parametrize("count", [1, 2])
 def test_what_fails_meanwhile_fails_for_who_asks(monkeypatch, count):
     monkeypatch.setattr(numba.config, "NUMBA_NUM_THREADS", count)
-    with pytest.raises(ZeroDivisionError), meanwhile(divmod, 1, 0) as found:
+    with pytest.raises(ZeroDivisionError), run_in_background(divmod, 1, 0) as found:
         found()
 
 
@@ -107,20 +115,20 @@ def test_many_are_made_at_once_each_on_a_thread_of_its_own(monkeypatch, count):
         share(lambda _begin, _end: found.append(threading.get_ident()), 8)
         return threading.get_ident(), set(found)
 
-    for own, used in many_at_once(threads_of, range(20)):
+    for own, used in map_small_tasks(threads_of, range(20)):
         assert used == {own}
 
 
 def test_many_at_once_come_in_their_order_and_fail_for_who_asks():
-    assert list(many_at_once(lambda a, b: a - b, [5, 6, 7], [1, 2, 3])) == [4, 4, 4]
+    assert list(map_small_tasks(lambda a, b: a - b, [5, 6, 7], [1, 2, 3])) == [4, 4, 4]
     with pytest.raises(ZeroDivisionError):
-        list(many_at_once(divmod, [1, 2], [1, 0]))
+        list(map_small_tasks(divmod, [1, 2], [1, 0]))
 
 
 def test_who_asks_works_where_others_keep_the_threads_busy(monkeypatch):
     monkeypatch.setattr(numba.config, "NUMBA_NUM_THREADS", 2)
     done = threading.Event()
-    busy = thread_pool(1, os.getpid()).submit(done.wait, 60)
+    busy = get_thread_pool(1, os.getpid()).submit(done.wait, 60)
     try:
         assert run(divmod, [(number, 3) for number in range(7)]) == [divmod(n, 3) for n in range(7)]
         with pytest.raises(ZeroDivisionError):

@@ -12,8 +12,8 @@ from PIL import Image
 from gscompleter import InputError, load_camera, load_cameras, load_views
 from gscompleter.data.formats import open_photographs
 from gscompleter.data.scene import write_cameras
-from gscompleter.geometry import inside, project, sample, unproject
-from gscompleter.io.files import output_folder
+from gscompleter.geometry import is_inside, project, sample, unproject
+from gscompleter.io.files import open_output_folder
 from scenes import camera_at
 
 OPENGL = np.diag([1.0, -1.0, -1.0, 1.0])
@@ -162,17 +162,17 @@ def test_a_folder_without_a_json_and_one_that_is_no_json_are_refused(tmp_path):
 
 def test_an_output_folder_appears_whole_or_not_at_all(tmp_path):
     out = tmp_path / "deep" / "out"
-    with pytest.raises(RuntimeError), output_folder(out) as folder:
+    with pytest.raises(RuntimeError), open_output_folder(out) as folder:
         (folder / "a.txt").write_text("half")
         raise RuntimeError
     assert not (tmp_path / "deep").exists()
-    with output_folder(out) as folder:
+    with open_output_folder(out) as folder:
         (folder / "a.txt").write_text("whole")
     assert (out / "a.txt").read_text() == "whole"
-    with pytest.raises(InputError, match="not empty"), output_folder(out):
+    with pytest.raises(InputError, match="not empty"), open_output_folder(out):
         pass
     (tmp_path / "file").write_text("")
-    with pytest.raises(InputError), output_folder(tmp_path / "file" / "out"):
+    with pytest.raises(InputError), open_output_folder(tmp_path / "file" / "out"):
         pass
 
 
@@ -191,7 +191,7 @@ def test_true_depth_carries_pixels_from_one_photograph_to_the_next(shared, name,
     """Axes, intrinsics and depth are right together or not at all."""
     a, b = load_views(shared / "data" / name, frames, (256, 256))
     pixels, z = project(unproject(a.depth, a.camera), b.camera)
-    seen = (a.depth > 0) & inside(pixels, z, b.camera)
+    seen = (a.depth > 0) & is_inside(pixels, z, b.camera)
     error = (sample(b.image, pixels) - a.image).abs().mean(-1)[seen].median()
     unmoved = (b.image - a.image).abs().mean(-1)[seen].median()
     assert seen.float().mean() > 0.3

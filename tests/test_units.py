@@ -8,9 +8,9 @@ from torch import Tensor
 
 from command import run
 from gscompleter import GSCompleter
-from gscompleter.metrics.image import psnr
+from gscompleter.evaluation.metrics.image import psnr
 from gscompleter.reconstructors.plane_sweep import PlaneSweep
-from gscompleter.reconstructors.plane_sweep.gaussians import normals_of
+from gscompleter.reconstructors.plane_sweep.gaussians import compute_normals
 from scenes import Room, camera_at, gaussians_of, photographed, scaled, view_of
 
 POSES = ((-0.3, 0), (0.1, 0), (0.7, 12))
@@ -42,9 +42,9 @@ def test_a_room_in_another_unit_is_completed_to_the_same_picture(unit, with_scen
 def test_normals_do_not_depend_on_the_unit(unit):
     view = view_of(Room(), camera_at(size=32))
     assert view.depth is not None
-    expected = normals_of(view.depth, view)
-    assert (normals_of(view.depth * unit, view) - expected).abs().max() < 1e-3
-    assert normals_of(view.depth * 2.0**-40, view).equal(expected)
+    expected = compute_normals(view.depth, view)
+    assert (compute_normals(view.depth * unit, view) - expected).abs().max() < 1e-3
+    assert compute_normals(view.depth * 2.0**-40, view).equal(expected)
 
 
 def test_the_reconstructor_alone_draws_small_scenes_too():

@@ -19,33 +19,33 @@ import pytest
 import torch
 
 from command import run
-from gscompleter.data.scene import write_cameras
-from gscompleter.errors import InputError
-from gscompleter.io.image import write_image
-from gscompleter.io.ply import save_ply
-from gscompleter.splats.formats import load_splat
-from gscompleter.types import Gaussians, merge
-from gscompleter.viewer import page as pages
-from gscompleter.viewer.exhibit import (
-    Exhibit,
-    Shot,
-    exhibit_of_completion,
-    exhibit_of_files,
+from gscompleter.apps.viewer import page as pages
+from gscompleter.apps.viewer.exhibit import (
+    ViewerCamera,
+    ViewerContent,
+    load_viewer_completion,
+    load_viewer_files,
 )
-from gscompleter.viewer.packages import (
+from gscompleter.apps.viewer.packages import (
     MODULES,
-    REGISTRY,
+    REGISTRY_VARIABLE,
     Libraries,
-    Package,
-    archive_of,
-    libraries_from,
+    NpmPackage,
+    extract_libraries,
+    get_archive,
+    get_archive_path,
     load_libraries,
-    place_of,
     read_lock,
     write_libraries,
 )
-from gscompleter.viewer.page import Page, make_page
-from gscompleter.viewer.server import serving
+from gscompleter.apps.viewer.page import Page, make_page
+from gscompleter.apps.viewer.server import make_page_server
+from gscompleter.data.scene import write_cameras
+from gscompleter.errors import InputError
+from gscompleter.io.image import write_image
+from gscompleter.splats.formats import load_splat
+from gscompleter.splats.ply import save_ply
+from gscompleter.types import Gaussians, merge
 from pose_files import CAMERAS, NAMES, write_colmap_binary, write_photographs
 from scenes import camera_at
 from viewer_pages import LEFT, SIDE, TARGET, room_exhibit, room_from
@@ -78,14 +78,14 @@ def gaussians_in(page: Page, layer: str, folder: Path) -> Gaussians:
 def registry(tmp_path, monkeypatch) -> Path:
     """The lock of a registry that is a folder, with a cache that is empty."""
     monkeypatch.setenv("GSCOMPLETER_HOME", str(tmp_path / "home"))
-    monkeypatch.setenv(REGISTRY, (tmp_path / "registry").as_uri())
+    monkeypatch.setenv(REGISTRY_VARIABLE, (tmp_path / "registry").as_uri())
     files: dict[str, dict[str, str]] = {}
     for package, file in MODULES.values():
         files.setdefault(package, {"LICENSE": f"of {package}"})[file] = f"// {package} {file}"
     files["three"]["build/three.module.min.js"] += ' import "./three.core.min.js";'
     entries = {"": {}}
     for name, contents in files.items():
-        archive = archive_in(tmp_path, Package(name, "1.2.3", ""))
+        archive = archive_in(tmp_path, NpmPackage(name, "1.2.3", ""))
         archive.parent.mkdir(parents=True)
         with tarfile.open(archive, "w:gz") as packed:
             for file, text in contents.items():
@@ -99,12 +99,12 @@ def registry(tmp_path, monkeypatch) -> Path:
     return lock
 
 
-def archive_in(folder: Path, package: Package) -> Path:
+def archive_in(folder: Path, package: NpmPackage) -> Path:
     """Get the path of an archive in the registry of a test."""
     return folder / "registry" / package.path
 
 
-def three_of(lock: Path) -> Package:
+def three_of(lock: Path) -> NpmPackage:
     return next(package for package in read_lock(lock) if package.name == "three")
 
 
@@ -117,7 +117,7 @@ def test_the_lock_pins_every_package_by_its_hash():
 
 
 def test_modules_and_licences_come_out_of_the_archives(registry):
-    libraries = libraries_from(registry)
+    libraries = extract_libraries(registry)
     assert libraries.modules.keys() == MODULES.keys()
     assert libraries.licences["three 1.2.3"] == "of three"
     assert 'import "three-core"' in libraries.modules["three"]
@@ -125,10 +125,10 @@ def test_modules_and_licences_come_out_of_the_archives(registry):
 
 def test_an_archive_is_fetched_once(registry):
     three = three_of(registry)
-    archive = archive_of(three)
+    archive = get_archive(three)
     archive_in(registry.parent, three).unlink()
-    assert place_of(three).read_bytes() == archive
-    assert archive_of(three) == archive
+    assert get_archive_path(three).read_bytes() == archive
+    assert get_archive(three) == archive
 
 
 def test_an_archive_that_was_tampered_with_is_refused_and_not_kept(registry):
@@ -136,39 +136,39 @@ def test_an_archive_that_was_tampered_with_is_refused_and_not_kept(registry):
     source = archive_in(registry.parent, three)
     source.write_bytes(source.read_bytes() + b"\0")
     with pytest.raises(InputError, match="is not three 1.2.3: its SHA-512 differs"):
-        archive_of(three)
-    assert not place_of(three).exists()
+        get_archive(three)
+    assert not get_archive_path(three).exists()
 
 
 def test_a_damaged_archive_in_the_cache_is_fetched_again(registry):
     three = three_of(registry)
-    archive = archive_of(three)
-    place_of(three).write_bytes(archive[:-9])
-    assert archive_of(three) == archive
-    assert place_of(three).read_bytes() == archive
+    archive = get_archive(three)
+    get_archive_path(three).write_bytes(archive[:-9])
+    assert get_archive(three) == archive
+    assert get_archive_path(three).read_bytes() == archive
 
 
 def test_without_a_connection_a_sentence_says_where_to_put_what(registry):
     three = three_of(registry)
     archive_in(registry.parent, three).unlink()
     with pytest.raises(InputError, match="cannot be reached") as refused:
-        archive_of(three)
+        get_archive(three)
     sentence = refused.value.args[0]  # in full, because folders of a test may be long
     assert three.path in sentence
-    assert str(place_of(three)) in sentence
+    assert str(get_archive_path(three)) in sentence
 
 
 def test_npm_says_where_packages_come_from_and_without_it_a_sentence_says_what_to_do(
     registry, tmp_path, monkeypatch
 ):
-    monkeypatch.delenv(REGISTRY)
+    monkeypatch.delenv(REGISTRY_VARIABLE)
     monkeypatch.setenv("PATH", str(tmp_path))
     with pytest.raises(InputError, match="from its wheel"):
-        archive_of(three_of(registry))
+        get_archive(three_of(registry))
     npm = tmp_path / "npm"
     npm.write_text(f"#!/bin/sh\necho {(tmp_path / 'registry').as_uri()}/\n")
     npm.chmod(0o755)
-    assert archive_of(three_of(registry)) == archive_in(tmp_path, three_of(registry)).read_bytes()
+    assert get_archive(three_of(registry)) == archive_in(tmp_path, three_of(registry)).read_bytes()
 
 
 def test_a_wheel_needs_no_connection_and_its_libraries_are_the_same_bytes(registry, tmp_path):
@@ -177,7 +177,7 @@ def test_a_wheel_needs_no_connection_and_its_libraries_are_the_same_bytes(regist
         write_libraries(path, registry)
     assert written[0].read_bytes() == written[1].read_bytes()
     built = load_libraries(lock=tmp_path / "nowhere", built=written[0])
-    assert built == libraries_from(registry)
+    assert built == extract_libraries(registry)
 
 
 # ---------------------------------------------------------------------------------- the page
@@ -191,7 +191,7 @@ def test_the_same_values_give_the_same_bytes():
 def test_a_page_holds_the_gaussians_whatever_their_unit(tmp_path, unit):
     camera = camera_at(size=32, unit=unit)
     observed, generated = room_from(camera, 0, unit), room_from(camera, 1, unit)
-    page = make_page(Exhibit("room", merge([observed, generated]), None), NONE)
+    page = make_page(ViewerContent("room", merge([observed, generated]), None), NONE)
     frame = content_of(page)["frame"]
     held = gaussians_in(page, "generated", tmp_path)
     means = held.means.double() * frame["unit"] + torch.tensor(frame["centre"])
@@ -224,8 +224,8 @@ def test_what_changed_is_held_beside_what_it_became(tmp_path):
 
 def test_text_from_outside_cannot_leave_its_place():
     evil = "</script><script>alert(1)</script><!--"
-    shot = Shot("target-1", evil, TARGET, notes=(evil,))
-    page = make_page(replace(room_exhibit(evil), shots=(shot,)), Libraries({}, {evil: evil}))
+    shot = ViewerCamera("target-1", evil, TARGET, notes=(evil,))
+    page = make_page(replace(room_exhibit(evil), cameras=(shot,)), Libraries({}, {evil: evil}))
     text = page.html.decode()
     assert evil not in text
     assert "alert(1)</script" not in text
@@ -237,7 +237,7 @@ def test_text_from_outside_cannot_leave_its_place():
 
 
 def test_our_program_writes_text_and_never_markup():
-    program = pages.asset("viewer.js")
+    program = pages.read_asset("viewer.js")
     assert "textContent" in program
     for way in ("innerHTML", "outerHTML", "insertAdjacentHTML", "document.write", "eval("):
         assert way not in program
@@ -268,12 +268,12 @@ def test_floaters_beyond_all_measure_are_left_out_and_counted():
     means = exhibit.after.means.clone()
     means[:3] = 1e9
     page = make_page(replace(exhibit, after=replace(exhibit.after, means=means), before=None), NONE)
-    assert page.left_out == 3
+    assert page.num_omitted == 3
     assert content_of(page)["counts"]["observed"] == SIDE * SIDE - 3
 
 
 def test_a_scene_without_cameras_has_one_that_sees_it():
-    exhibit = replace(room_exhibit(), shots=())
+    exhibit = replace(room_exhibit(), cameras=())
     (shot,) = content_of(make_page(exhibit, NONE))["shots"]
     assert shot["name"] == "overview"
     pose = np.array(shot["pose"]).reshape(4, 4)
@@ -296,7 +296,7 @@ def test_a_camera_looks_as_far_as_what_it_sees():
 def test_a_scene_alone_is_compared_with_what_was_observed(tmp_path):
     exhibit = room_exhibit()
     save_ply(tmp_path / "completed.ply", exhibit.after)
-    found = exhibit_of_files(tmp_path / "completed.ply", None, drop_nonfinite=False)
+    found = load_viewer_files(tmp_path / "completed.ply", None, drop_nonfinite=False)
     assert found.before is not None
     assert exhibit.before is not None
     assert torch.equal(found.before.means, exhibit.before.means)
@@ -305,7 +305,7 @@ def test_a_scene_alone_is_compared_with_what_was_observed(tmp_path):
 @pytest.mark.parametrize("generated", [0, 1])
 def test_a_scene_of_one_kind_is_compared_with_nothing(tmp_path, generated):
     save_ply(tmp_path / "a.ply", room_from(LEFT, generated))
-    found = exhibit_of_files(tmp_path / "a.ply", None, drop_nonfinite=False)
+    found = load_viewer_files(tmp_path / "a.ply", None, drop_nonfinite=False)
     assert found.before is None
     assert "before" not in content_of(make_page(found, NONE))["layers"]
 
@@ -337,13 +337,13 @@ def test_the_targets_of_a_completion_are_brought_into_the_frame_of_its_scenes(tm
     origin = np.array([5e6, -3e6, 1e3])
     transform = np.eye(4)
     transform[:3, 3] = -origin
-    exhibit = exhibit_of_completion(completion_in(tmp_path / "out", transform, origin), False)
-    (shot,) = exhibit.shots
+    exhibit = load_viewer_completion(completion_in(tmp_path / "out", transform, origin), False)
+    (shot,) = exhibit.cameras
     assert shot.name == "target-1"
     assert shot.notes == ("a <note>",)
     assert shot.thumbnail is not None
     assert (shot.camera.c2w - TARGET.c2w).abs().max() < 1e-5
-    assert "gone" in exhibit.remarks[0]
+    assert "gone" in exhibit.notes[0]
 
 
 def test_photographs_of_a_completion_are_jumped_to(tmp_path):
@@ -351,10 +351,10 @@ def test_photographs_of_a_completion_are_jumped_to(tmp_path):
     (folder / "gone").mkdir()
     write_image(folder / "gone" / "0.png", torch.rand(SIDE, SIDE, 3))
     write_cameras(folder / "gone" / "transforms.json", [LEFT], ["0.png"])
-    exhibit = exhibit_of_completion(folder, False)
-    assert [shot.name for shot in exhibit.shots] == ["target-1", "photograph-0"]
-    assert exhibit.shots[1].thumbnail is not None
-    assert exhibit.remarks == ()
+    exhibit = load_viewer_completion(folder, False)
+    assert [shot.name for shot in exhibit.cameras] == ["target-1", "photograph-0"]
+    assert exhibit.cameras[1].thumbnail is not None
+    assert exhibit.notes == ()
 
 
 def completion_of_photographs_in(folder: Path) -> Path:
@@ -370,20 +370,20 @@ def completion_of_photographs_in(folder: Path) -> Path:
 
 def test_photographs_whose_cameras_were_found_are_jumped_to(tmp_path):
     folder = completion_of_photographs_in(tmp_path / "out")
-    exhibit = exhibit_of_completion(folder, False)
-    assert [shot.name for shot in exhibit.shots] == ["target-1", "photograph-0"]
-    assert exhibit.shots[1].thumbnail is not None
-    assert (exhibit.shots[1].camera.c2w - CAMERAS[0].c2w).abs().max() < 1e-5
-    assert exhibit.remarks == ()
+    exhibit = load_viewer_completion(folder, False)
+    assert [shot.name for shot in exhibit.cameras] == ["target-1", "photograph-0"]
+    assert exhibit.cameras[1].thumbnail is not None
+    assert (exhibit.cameras[1].camera.c2w - CAMERAS[0].c2w).abs().max() < 1e-5
+    assert exhibit.notes == ()
 
     shutil.rmtree(folder / "colmap")
-    (remark,) = exhibit_of_completion(folder, False).remarks
+    (remark,) = load_viewer_completion(folder, False).notes
     assert str(folder / "colmap") in remark
 
 
 def test_a_folder_that_is_no_completion_is_refused(tmp_path):
     with pytest.raises(InputError, match=r"has no completed\.ply"):
-        exhibit_of_completion(tmp_path, False)
+        load_viewer_completion(tmp_path, False)
 
 
 # --------------------------------------------------------------------------- the command line
@@ -392,7 +392,7 @@ def test_a_folder_that_is_no_completion_is_refused(tmp_path):
 @pytest.fixture
 def packed(monkeypatch) -> None:
     """Let the command find its libraries."""
-    monkeypatch.setattr("gscompleter.viewer.packages.load_libraries", lambda: NONE)
+    monkeypatch.setattr("gscompleter.apps.viewer.packages.load_libraries", lambda: NONE)
 
 
 def test_a_page_is_saved_once(packed, tmp_path, monkeypatch, capsys):
@@ -502,7 +502,7 @@ def test_without_a_file_to_save_to_the_page_is_served_and_opened(
 @pytest.fixture
 def port() -> Iterator[int]:
     """The port of a server of a page with one part."""
-    with serving(Page(b"<!doctype html>", {"my page.1.js": b"gscPart()"}, 0)) as server:
+    with make_page_server(Page(b"<!doctype html>", {"my page.1.js": b"gscPart()"}, 0)) as server:
         thread = threading.Thread(target=server.serve_forever)
         thread.start()
         yield server.server_address[1]
@@ -543,4 +543,4 @@ def test_nothing_can_be_sent(port, method):
 
 def test_a_port_that_is_taken_gets_a_sentence(port):
     with pytest.raises(InputError, match=f"Port {port}"):
-        serving(Page(b"", {}, 0), port)
+        make_page_server(Page(b"", {}, 0), port)

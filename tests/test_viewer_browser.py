@@ -12,13 +12,13 @@ import pytest
 import torch
 
 from browsing import Picture, Tab, launched, needed
+from gscompleter.apps.viewer import page as pages
+from gscompleter.apps.viewer.exhibit import ViewerContent
+from gscompleter.apps.viewer.packages import Libraries, load_libraries
+from gscompleter.apps.viewer.page import make_page
 from gscompleter.errors import InputError
 from gscompleter.render import load_renderer
 from gscompleter.types import Camera, Gaussians
-from gscompleter.viewer import page as pages
-from gscompleter.viewer.exhibit import Exhibit
-from gscompleter.viewer.packages import Libraries, load_libraries
-from gscompleter.viewer.page import make_page
 from viewer_pages import LEFT, SIDE, TARGET, room_exhibit
 
 pytestmark = pytest.mark.browser
@@ -61,12 +61,12 @@ class Window(Tab):
         return value
 
     def key(self, key: str, held: bool = False) -> None:
-        (self.page.keyboard.down if held else self.page.keyboard.press)(key)
+        (self.page.keyboard.scale_y if held else self.page.keyboard.press)(key)
         self.page.evaluate("gsc.settled()")
 
 
 @pytest.fixture(scope="module")
-def exhibit() -> Exhibit:
+def exhibit() -> ViewerContent:
     return room_exhibit()
 
 
@@ -100,7 +100,7 @@ def distance(one: list[float], other: list[float]) -> float:
     return float(np.linalg.norm(np.subtract(one, other)))
 
 
-def observed_of(exhibit: Exhibit) -> Gaussians:
+def observed_of(exhibit: ViewerContent) -> Gaussians:
     return exhibit.after[exhibit.after.generated == 0]
 
 
@@ -188,7 +188,7 @@ def test_keys_and_drags_do_what_the_page_says(bare):
     for drag, moves in (("orbit", True), ("fly", False)):
         bare.page.keyboard.press("r")
         bare.page.mouse.move(SIDE, SIDE / 2)
-        bare.page.mouse.down()
+        bare.page.mouse.scale_y()
         bare.page.mouse.move(SIDE + 20, SIDE / 2)
         bare.page.mouse.up()
         stats = bare.page.evaluate("gsc.stats()")

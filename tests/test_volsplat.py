@@ -9,12 +9,12 @@ import torch
 
 from feed_forward_fixtures import Case, extra, published_shapes
 from gscompleter import GSCompleter, InputError
-from gscompleter.geometry import inside, project
-from gscompleter.reconstructors.feed_forward import FeedForward, VolSplat, VolSplatConfig
-from gscompleter.reconstructors.feed_forward.depth_predictor import DepthConfig
-from gscompleter.reconstructors.feed_forward.inputs import batch_of
-from gscompleter.reconstructors.feed_forward.volsplat import REACH, VoxelGaussians
-from gscompleter.stages.anchor import lift
+from gscompleter.geometry import is_inside, project
+from gscompleter.models.feed_forward import FeedForward, VolSplat, VolSplatConfig
+from gscompleter.models.feed_forward.depth_predictor import DepthConfig
+from gscompleter.models.feed_forward.inputs import create_batch
+from gscompleter.models.feed_forward.volsplat import MAX_VOXEL_OFFSET, VoxelGaussians
+from gscompleter.stages.select_anchor import lift
 from gscompleter.types import SH_C0, View
 from parity import assert_within
 from scenes import Room, camera_at, view_of
@@ -78,7 +78,7 @@ def test_voxels_agree_with_the_authors_code_in_more_cases(path):
 
 
 def predict(network: VolSplat) -> VoxelGaussians:
-    images, cameras, _ = batch_of(photographs(), SMALL.patch, SMALL.near, SMALL.far)
+    images, cameras, _ = create_batch(photographs(), SMALL.patch, SMALL.near, SMALL.far)
     with torch.no_grad():
         return network(images, cameras)
 
@@ -100,7 +100,7 @@ def test_a_gaussian_lies_within_reach_of_its_voxel(lower_precision):
         assert getattr(predicted, field).isfinite().all()
     centers = predicted.grid.coordinates[:, 1:] * SMALL.voxel_resolution
     away = (predicted.means - centers).abs().max().item() / SMALL.voxel_resolution
-    assert 0.5 < away < 0.5 + REACH + 1e-3
+    assert 0.5 < away < 0.5 + MAX_VOXEL_OFFSET + 1e-3
     assert len(predicted.means) < 2 * 64 * 64
 
 
@@ -150,7 +150,7 @@ def test_the_depth_maps_are_those_of_the_voxels():
 
 
 def test_several_scenes_at_once_are_refused():
-    images, cameras, _ = batch_of(photographs(), SMALL.patch, SMALL.near, SMALL.far)
+    images, cameras, _ = create_batch(photographs(), SMALL.patch, SMALL.near, SMALL.far)
     with pytest.raises(ValueError, match="one scene"):
         random_network()(images.repeat(2, 1, 1, 1, 1), cameras)
 
@@ -174,7 +174,7 @@ def test_all_that_the_target_sees_is_lifted():
     reconstructor = FeedForward(random_network())
     lifted = lift(reconstructor, reference, anchor)
     whole = reconstructor([reference, anchor]).gaussians
-    seen = inside(*project(whole.means, reference.camera), reference.camera)
+    seen = is_inside(*project(whole.means, reference.camera), reference.camera)
     assert lifted.pixel_index is None
     assert torch.equal(lifted.gaussians.means, whole.means[seen])
     assert 0 < len(lifted.gaussians) <= len(whole)

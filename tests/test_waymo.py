@@ -13,11 +13,11 @@ from PIL import Image
 
 from command import run
 from gscompleter import InputError
-from gscompleter.data.datasets import open_clips
+from gscompleter.data.cases import open_clips
+from gscompleter.data.driving.range_image import build_poses
 from gscompleter.data.formats import open_photographs
 from gscompleter.data.photographs import Photographs
-from gscompleter.data.range_image import poses_of
-from gscompleter.runs.store import read_json, row_paths
+from gscompleter.evaluation.store import list_row_paths, read_json
 from kitti_city_segment import kitti_city_segment
 from waymo_segment import (
     SEGMENT,
@@ -40,7 +40,7 @@ WALL = np.array([0.9, 0.3, -0.1, 12.0])
 
 def turned(yaw: float, pitch: float = 0.0, place: tuple[float, ...] = (0.0, 0.0, 0.0)):
     """Return a pose that is pitched, then yawed, in radians."""
-    return poses_of(np.array([0.0, pitch, yaw, *place]))
+    return build_poses(np.array([0.0, pitch, yaw, *place]))
 
 
 VEHICLES = [turned(0.4 + 0.02 * n, 0.01, tuple(PLACE + n * ALONG)) for n in range(3)]
@@ -135,7 +135,7 @@ def test_frames_come_camera_by_camera_and_clips_are_of_the_front_camera(tmp_path
     assert (every.format, every.name, list(every.names)) == ("waymo", SEGMENT, names)
     (clip,) = open_clips(root)
     assert list(clip.names) == names[:3]
-    assert clip.reason_to_skip() is None
+    assert clip.find_skip_reason() is None
     shades = [view.image[5, 5, 0].item() for view in every.views([0, 2, 5])]
     assert shades == pytest.approx([0, 20 / 255, 2 / 255], abs=4 / 255)
 
@@ -169,13 +169,15 @@ def test_lasers_tell_the_depth_of_a_wall(tmp_path, while_turning):
 
 def test_the_vehicle_moves_while_a_laser_turns(tmp_path):
     """Poses of the pixels that are two metres ahead move what is measured by as much."""
-    told = [open_photographs(segment(tmp_path / str(t), t)).frames[0].measured() for t in (0, 1)]
+    told = [
+        open_photographs(segment(tmp_path / str(t), t)).frames[0].laser_points() for t in (0, 1)
+    ]
     assert told[0] == pytest.approx(told[1], abs=2e-3)
     ahead = moments(True)
     for moment in ahead:
         moment.pixel_poses[..., 3:] += [2.0, 0.0, 0.0]
     root = write_segment(tmp_path / "ahead", ahead, CAMERAS, LASERS)
-    shift = open_photographs(root).frames[0].measured() - told[1]
+    shift = open_photographs(root).frames[0].laser_points() - told[1]
     from_roof = (ranges_to_wall(LASERS[0], VEHICLES[0], (20, 400)) > 0).sum()
     assert shift[:from_roof] == pytest.approx(np.array([[2.0, 0, 0]] * from_roof), abs=1e-6)
     assert np.abs(shift[from_roof:]).max() == 0
@@ -256,7 +258,7 @@ def test_a_real_road_is_evaluated(shared, tmp_path, monkeypatch, capsys):
     words = ("--protocol", "n-2", "--limit", 1, "--resolution", 36, 120, "--quiet")
     methods = ("--methods", "context", "full", "paper")
     assert run(monkeypatch, "evaluate", root, *words, *methods, "--out", tmp_path / "out") == 0
-    rows = [read_json(path) for path in row_paths(tmp_path / "out")]
+    rows = [read_json(path) for path in list_row_paths(tmp_path / "out")]
     assert sorted(row["method"] for row in rows) == ["context", "full", "paper"]
     assert {row["task"]["name"] for row in rows} == {f"{SEGMENT} 0+2>4"}
     scores = {row["method"]: row["steps"][0]["scores"] for row in rows}
@@ -273,7 +275,9 @@ def test_what_moves_on_a_real_road_does_not_count(shared, tmp_path, monkeypatch,
     words = (*words, "--methods", "context")
     for out, more in (("all", ()), ("ignoring", ("--use-masks",))):
         assert run(monkeypatch, "evaluate", root, *words, *more, "--out", tmp_path / out) == 0
-    found = [read_json(path) for out in ("all", "ignoring") for path in row_paths(tmp_path / out)]
+    found = [
+        read_json(path) for out in ("all", "ignoring") for path in list_row_paths(tmp_path / out)
+    ]
     every, ignoring = (row["steps"][0]["scores"] for row in found)
     assert ignoring["hole_fraction"] > every["hole_fraction"]
     bare = kitti_city_segment(shared, tmp_path / "bare", count=5)

@@ -27,9 +27,7 @@ from torch import Tensor, nn
 from gscompleter import reconstructors
 from gscompleter.cli import main
 from gscompleter.errors import InputError
-from gscompleter.reconstructors import Reconstructor, load_reconstructor
-from gscompleter.reconstructors.plane_sweep import PlaneSweep
-from gscompleter.weights import (
+from gscompleter.models.weights import (
     PUBLISHED,
     PublishedWeights,
     WeightsNotAvailable,
@@ -39,6 +37,8 @@ from gscompleter.weights import (
     place_of,
     read_state_dict,
 )
+from gscompleter.reconstructors import Reconstructor, load_reconstructor
+from gscompleter.reconstructors.plane_sweep import PlaneSweep
 
 DOCS = Path(__file__).resolve().parents[1] / "docs"
 COMMIT = "0123456789abcdef0123456789abcdef01234567"
@@ -144,7 +144,10 @@ def test_what_lies_on_the_hub_has_an_address_and_what_does_not_has_a_page():
         "depthsplat-gs-small-re10k-256x256-view2-cfeab6b1.pth"
     )
     assert MVSPLAT.url == MVSPLAT.source
-    assert [w.pinned_by for w in (DEPTHSPLAT, MVSPLAT)] == ["first 8 digits of SHA-256", "nothing"]
+    assert [w.integrity_check for w in (DEPTHSPLAT, MVSPLAT)] == [
+        "first 8 digits of SHA-256",
+        "nothing",
+    ]
     assert replace(MVSPLAT, sha256="0" * 64).pinned_by == "SHA-256"
 
 
@@ -173,7 +176,7 @@ def test_the_page_of_models_has_a_row_for_every_file():
             f"{weights.code_licence} / {weights.weights_licence}",
             weights.caution or "allowed",
             f"[{weights.file}]({weights.url})",
-            weights.pinned_by,
+            weights.integrity_check,
         ]
 
 

@@ -6,8 +6,8 @@ from dataclasses import replace
 
 import torch
 
+from gscompleter.apps.viewer.exhibit import ViewerCamera, ViewerContent
 from gscompleter.types import Camera, Gaussians, merge
-from gscompleter.viewer.exhibit import Exhibit, Shot
 from scenes import Room, camera_at, gaussians_of, view_of
 
 SIDE = 64
@@ -34,9 +34,9 @@ def room_from(camera: Camera, generated: int, unit: float = 1.0) -> Gaussians:
     return replace(gaussians, generated=torch.full_like(gaussians.generated, generated))
 
 
-def room_exhibit(title: str = "room") -> Exhibit:
+def room_exhibit(title: str = "room") -> ViewerContent:
     """Make the room as the left camera sees it, and completed for the target camera."""
     before = room_from(LEFT, 0)
     after = merge([before, room_from(TARGET, 1)])
-    shots = (Shot("target-1", "Target 1", TARGET), Shot("camera-1", "Left", LEFT))
-    return Exhibit(title, after, before, shots)
+    shots = (ViewerCamera("target-1", "Target 1", TARGET), ViewerCamera("camera-1", "Left", LEFT))
+    return ViewerContent(title, after, before, shots)

@@ -11,8 +11,8 @@ import torch
 from torch import Tensor, nn
 
 from feed_forward_fixtures import EVERY, STORED, Case, rule_v1
-from gscompleter.geometry import rotations_from
-from gscompleter.reconstructors.feed_forward.volsplat import VoxelGaussians
+from gscompleter.geometry import quats_to_rotations
+from gscompleter.models.feed_forward.volsplat import VoxelGaussians
 from parity import relative_error
 
 FIXTURES = STORED / "volsplat"
@@ -98,7 +98,7 @@ class VoxelPass:
 
     def outputs(self) -> dict[str, Tensor]:
         g = self.predicted
-        spread = rotations_from(g.quats) * g.scales[:, None, :]
+        spread = quats_to_rotations(g.quats) * g.scales[:, None, :]
         values = {
             "means": g.means,
             "covariances": spread @ spread.transpose(-1, -2),

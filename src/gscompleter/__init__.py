@@ -13,11 +13,12 @@ if TYPE_CHECKING:
     from gscompleter.data.scene import load_camera, load_cameras, load_views
     from gscompleter.errors import InputError
     from gscompleter.generators import load_generator
-    from gscompleter.io.ply import load_ply, save_ply
     from gscompleter.reconstructors import load_reconstructor
     from gscompleter.render import load_renderer
     from gscompleter.splats import load_splat, save_splat
-    from gscompleter.types import Camera, Completion, Gaussians, Render, View, merge
+    from gscompleter.splats.ply import load_ply, save_ply
+    from gscompleter.state import Completion
+    from gscompleter.types import Camera, Gaussians, Render, View, merge
 
 # Module of each public name, imported on first use, so that `import gscompleter` and
 # `gscompleter --help` do not wait for torch.

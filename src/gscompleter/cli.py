@@ -15,10 +15,10 @@ from typing import Annotated, Any, TextIO, Union
 import tyro
 
 from gscompleter import __version__
-from gscompleter.commands.batch import BatchOptions
-from gscompleter.commands.convert import ConvertOptions
-from gscompleter.commands.doctor import DoctorOptions
-from gscompleter.commands.options import (
+from gscompleter.apps.commands.batch import BatchOptions
+from gscompleter.apps.commands.convert import ConvertOptions
+from gscompleter.apps.commands.doctor import DoctorOptions
+from gscompleter.apps.commands.options import (
     BenchOptions,
     CleanOptions,
     CompleteOptions,
@@ -31,39 +31,39 @@ from gscompleter.commands.options import (
     RunOptions,
     TablesOptions,
 )
-from gscompleter.commands.poses import PosesOptions
-from gscompleter.commands.report import ReportOptions
-from gscompleter.commands.strip import StripOptions
-from gscompleter.commands.view import ViewOptions
-from gscompleter.commands.warmup import WarmupOptions
-from gscompleter.commands.words import read_words, sentence_of
-from gscompleter.compilation import begin
-from gscompleter.config.settings import checked
+from gscompleter.apps.commands.poses import PosesOptions
+from gscompleter.apps.commands.report import ReportOptions
+from gscompleter.apps.commands.strip import StripOptions
+from gscompleter.apps.commands.view import ViewOptions
+from gscompleter.apps.commands.warmup import WarmupOptions
+from gscompleter.apps.commands.words import format_error, parse_words
+from gscompleter.apps.warmup.compilation import begin_compilation
+from gscompleter.apps.warmup.garbage import freeze_objects
+from gscompleter.config.settings import validate
+from gscompleter.cpu_threads import limit_threads
 from gscompleter.errors import PROGRAM, InputError
-from gscompleter.garbage import staying
-from gscompleter.interrupts import treat_stops_alike
-from gscompleter.threads import bound_threads
+from gscompleter.io.interrupts import handle_stop_signals
 
 # Options, module and function of each command. The module is imported after the options are
 # validated, so that `--help` does not wait for torch.
 COMMANDS: dict[str, tuple[type, str, str]] = {
-    "complete": (CompleteOptions, "gscompleter.commands.complete", "run_completion"),
-    "batch": (BatchOptions, "gscompleter.commands.batch", "run_batch"),
-    "live": (LiveOptions, "gscompleter.commands.live", "run_live"),
-    "clean": (CleanOptions, "gscompleter.commands.clean", "run_clean"),
-    "demo": (DemoOptions, "gscompleter.commands.demo", "run_demo"),
-    "evaluate": (EvaluateOptions, "gscompleter.commands.evaluate", "run_evaluation"),
-    "tables": (TablesOptions, "gscompleter.commands.evaluate", "run_tables"),
-    "index": (IndexOptions, "gscompleter.commands.evaluate", "run_index"),
-    "bench": (BenchOptions, "gscompleter.commands.bench", "run_bench"),
-    "models": (ModelsOptions, "gscompleter.commands.models", "run_models"),
-    "convert": (ConvertOptions, "gscompleter.commands.convert", "run_convert"),
-    "poses": (PosesOptions, "gscompleter.commands.poses", "run_poses"),
-    "report": (ReportOptions, "gscompleter.commands.report", "run_report"),
-    "strip": (StripOptions, "gscompleter.commands.strip", "run_strip"),
-    "view": (ViewOptions, "gscompleter.commands.view", "run_view"),
-    "doctor": (DoctorOptions, "gscompleter.commands.doctor", "run_doctor"),
-    "warmup": (WarmupOptions, "gscompleter.commands.warmup", "run_warmup"),
+    "complete": (CompleteOptions, "gscompleter.apps.commands.complete", "run_completion"),
+    "batch": (BatchOptions, "gscompleter.apps.commands.batch", "run_batch"),
+    "live": (LiveOptions, "gscompleter.apps.commands.live", "run_live"),
+    "clean": (CleanOptions, "gscompleter.apps.commands.clean", "run_clean"),
+    "demo": (DemoOptions, "gscompleter.apps.commands.demo", "run_demo"),
+    "evaluate": (EvaluateOptions, "gscompleter.apps.commands.evaluate", "run_evaluation"),
+    "tables": (TablesOptions, "gscompleter.apps.commands.evaluate", "run_tables"),
+    "index": (IndexOptions, "gscompleter.apps.commands.evaluate", "run_index"),
+    "bench": (BenchOptions, "gscompleter.apps.commands.bench", "run_bench"),
+    "models": (ModelsOptions, "gscompleter.apps.commands.models", "run_models"),
+    "convert": (ConvertOptions, "gscompleter.apps.commands.convert", "run_convert"),
+    "poses": (PosesOptions, "gscompleter.apps.commands.poses", "run_poses"),
+    "report": (ReportOptions, "gscompleter.apps.commands.report", "run_report"),
+    "strip": (StripOptions, "gscompleter.apps.commands.strip", "run_strip"),
+    "view": (ViewOptions, "gscompleter.apps.commands.view", "run_view"),
+    "doctor": (DoctorOptions, "gscompleter.apps.commands.doctor", "run_doctor"),
+    "warmup": (WarmupOptions, "gscompleter.apps.commands.warmup", "run_warmup"),
 }
 
 Command: Any = Union[  # noqa: UP007  (of as many as there are)
@@ -82,9 +82,9 @@ def run() -> None:
     try:
         main()
     except BrokenPipeError:
-        if not is_closed(sys.stdout):
+        if not is_pipe_closed(sys.stdout):
             raise
-        drop(sys.stdout)
+        discard_output(sys.stdout)
         sys.exit(1)
     done.append(True)
 
@@ -96,7 +96,7 @@ def end_at_once(done: Sequence[bool]) -> None:
         try:
             stream.flush()
         except BrokenPipeError:
-            drop(stream)
+            discard_output(stream)
             code = 1
         except OSError:
             return  # Python reports it.
@@ -104,7 +104,7 @@ def end_at_once(done: Sequence[bool]) -> None:
         os._exit(code)
 
 
-def is_closed(stream: TextIO) -> bool:
+def is_pipe_closed(stream: TextIO) -> bool:
     """Return True if the reader of a pipe, such as `head`, has ended."""
     if not hasattr(select, "poll"):  # Windows
         return False
@@ -113,7 +113,7 @@ def is_closed(stream: TextIO) -> bool:
     return any(events & select.POLLERR for _, events in poll.poll(0))
 
 
-def drop(stream: TextIO) -> None:
+def discard_output(stream: TextIO) -> None:
     """Discard all further output of a stream."""
     os.dup2(os.open(os.devnull, os.O_WRONLY), stream.fileno())
 
@@ -126,23 +126,23 @@ def main() -> None:
     if words == ["--version"]:
         print(__version__)
         return
-    treat_stops_alike()
+    handle_stop_signals()
     # Without a last garbage collection of torch Python ends a second earlier.
     atexit.register(gc.freeze)
     # Damaged photographs are read or refused with a sentence; Pillow's warnings add nothing.
     warnings.filterwarnings("ignore", module="PIL")
     try:
-        with staying():
-            options = checked(parsed(words))
+        with freeze_objects():
+            options = validate(parse_command(words))
             if isinstance(options, ComputeOptions):
-                bound_threads(options.threads)
+                limit_threads(options.threads)
             if isinstance(options, RunOptions):
-                begin(options.models)
+                begin_compilation(options.models)
             _, module, function = COMMANDS[words[0]]
             command = getattr(import_module(module), function)
         command(options)
     except InputError as error:
-        print(f"{PROGRAM}{sentence_of(error)}", file=sys.stderr)
+        print(f"{PROGRAM}{format_error(error)}", file=sys.stderr)
         sys.exit(2)
     except KeyboardInterrupt as stop:
         goes_on = words[:1] in (["batch"], ["evaluate"])
@@ -151,6 +151,6 @@ def main() -> None:
         sys.exit(130)
 
 
-def parsed(words: Sequence[str]) -> Any:
-    """Parse the options of the command; raises as `read_words`."""
-    return read_words(words, Command, COMMANDS)
+def parse_command(words: Sequence[str]) -> Any:
+    """Parse the options of the command; raises as `parse_words`."""
+    return parse_words(words, Command, COMMANDS)

@@ -10,14 +10,14 @@ from reprlib import Repr
 
 PROGRAM = "gscompleter: "
 """Prefix of every error message."""
-LONGEST_MESSAGE = 300
+MAX_MESSAGE_LENGTH = 300
 """Most characters of an error message on the command line."""
-LONGEST_QUOTE = 60
+MAX_QUOTE_LENGTH = 60
 """Most characters of a value quoted in a sentence."""
-LONGEST_PATH = 250
+MAX_PATH_LENGTH = 250
 """Most characters of a quoted path."""
 
-POINTER = b"version https://git-lfs"
+LFS_POINTER = b"version https://git-lfs"
 
 
 class InputError(ValueError):
@@ -25,17 +25,17 @@ class InputError(ValueError):
 
     Its message is one sentence: what was given, what is needed, what to do. The command line prints
     it without a traceback and exits with code 2. It is shown on one line of at most
-    `LONGEST_MESSAGE` characters.
+    `MAX_MESSAGE_LENGTH` characters.
     """
 
     def __init__(self, message: str, argument: str | None = None) -> None:
         """Create the error; the command line adds the option named `argument` to its sentence."""
         super().__init__(message)
-        self.argument = None if argument is None else quoted(argument)
+        self.argument = None if argument is None else quote_value(argument)
 
     def __str__(self) -> str:
         option = 0 if self.argument is None else len(f" (--{self.argument}).")
-        return shortened(super().__str__(), LONGEST_MESSAGE - len(PROGRAM) - option)
+        return shorten_message(super().__str__(), MAX_MESSAGE_LENGTH - len(PROGRAM) - option)
 
 
 class OutputError(InputError):
@@ -51,15 +51,15 @@ def warn_deprecated(old: str, new: str) -> None:
     )
 
 
-def quoted(value: object, length: int | None = None) -> str:
+def quote_value(value: object, length: int | None = None) -> str:
     """Format a value for a sentence: on one line, with its middle left out if it is long.
 
-    Strings get no quotation marks; write `f"'{quoted(word)}'"` to add them. `length` limits the
+    Strings get no quotation marks; write `f"'{quote_value(word)}'"` to add them. `length` limits the
     characters; by default it depends on the type.
     """
     if length is None:
-        length = LONGEST_PATH if isinstance(value, os.PathLike) else LONGEST_QUOTE
-    text = str(value) if isinstance(value, (str, os.PathLike)) else _written(value)
+        length = MAX_PATH_LENGTH if isinstance(value, os.PathLike) else MAX_QUOTE_LENGTH
+    text = str(value) if isinstance(value, (str, os.PathLike)) else _format_value(value)
     # Only the ends of very long texts are processed.
     ends = text if len(text) <= 4 * length else text[: 2 * length] + text[-2 * length :]
     line = "".join(c if c.isprintable() else " " for c in ends)
@@ -69,30 +69,30 @@ def quoted(value: object, length: int | None = None) -> str:
     return f"{line[:half]}…{line[-half:]}"
 
 
-def shortened(message: str, most: int) -> str:
+def shorten_message(message: str, most: int) -> str:
     """Fit a message into one line of `most` characters.
 
     The longest words, such as paths, are shortened first, then the middle of the message, and URLs
     last.
     """
     line = " ".join(part.strip() for part in message.splitlines())
-    words = quoted(line, 100 * most).split(" ")
+    words = quote_value(line, 100 * most).split(" ")
     while (excess := len(" ".join(words)) - most) > 0:
         longest = max(range(len(words)), key=lambda i: len(words[i]) * ("://" not in words[i]))
-        length = max(len(words[longest]) - excess, LONGEST_QUOTE)
+        length = max(len(words[longest]) - excess, MAX_QUOTE_LENGTH)
         if length >= len(words[longest]):
             break
-        words[longest] = quoted(words[longest], length)
-    return quoted(" ".join(words), most)
+        words[longest] = quote_value(words[longest], length)
+    return quote_value(" ".join(words), most)
 
 
-def names_listed(names: Sequence[object], most: int, length: int | None = None) -> str:
+def join_names(names: Sequence[object], most: int, length: int | None = None) -> str:
     """List the first `most` names, as in "a, b and 7 more"."""
-    shown = ", ".join(quoted(name, length) for name in names[:most])
+    shown = ", ".join(quote_value(name, length) for name in names[:most])
     return f"{shown} and {len(names) - most} more" if len(names) > most else shown
 
 
-def numbers_listed(numbers: Iterable[int]) -> str:
+def join_numbers(numbers: Iterable[int]) -> str:
     """List the first three runs of numbers, as in "0-39, 52 and 12 others"."""
     found = sorted(set(numbers))
     starts = [0, *(i + 1 for i, (a, b) in enumerate(pairwise(found)) if b != a + 1), len(found)]
@@ -107,21 +107,22 @@ def refuse_pointer(path: Path) -> None:
     if not os.path.isfile(path):
         return
     with suppress(OSError), path.open("rb") as file:
-        if file.read(len(POINTER)) == POINTER:
+        if file.read(len(LFS_POINTER)) == LFS_POINTER:
             raise InputError(
-                f"{quoted(path)} is a git-lfs pointer, not the file itself; run `git lfs pull` in "
+                f"{quote_value(path)} is a git-lfs pointer, not the file itself; run `git lfs "
+                "pull` in "
                 "its repository to fetch it."
             )
 
 
 _REPR = Repr()
-_REPR.maxlevel, _REPR.maxstring, _REPR.maxother = 4, 4 * LONGEST_QUOTE, 4 * LONGEST_QUOTE
-_REPR.maxlist = _REPR.maxtuple = _REPR.maxdict = _REPR.maxset = LONGEST_QUOTE // 2
-_REPR.maxlong = 4 * LONGEST_QUOTE
+_REPR.maxlevel, _REPR.maxstring, _REPR.maxother = 4, 4 * MAX_QUOTE_LENGTH, 4 * MAX_QUOTE_LENGTH
+_REPR.maxlist = _REPR.maxtuple = _REPR.maxdict = _REPR.maxset = MAX_QUOTE_LENGTH // 2
+_REPR.maxlong = 4 * MAX_QUOTE_LENGTH
 
 
-def _written(value: object) -> str:
-    if isinstance(value, int) and value.bit_length() > 4 * LONGEST_QUOTE:
+def _format_value(value: object) -> str:
+    if isinstance(value, int) and value.bit_length() > 4 * MAX_QUOTE_LENGTH:
         return f"an integer of about {value.bit_length() * 0.30103:,.0f} digits"
     try:
         return _REPR.repr(value)

@@ -3,15 +3,16 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from dataclasses import replace
 from typing import Literal
 
 import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
-from torch.nn.functional import pad
+from torch.nn.functional import normalize, pad
 
-from gscompleter.types import Camera, Gaussians, Window
+from gscompleter.types import Camera, Gaussians, PaddedCamera
 
 FOOTPRINT = 3.4
 """Rendered radius of a Gaussian in standard deviations: beyond sqrt(2 log 255), alpha < 1/255."""
@@ -32,7 +33,7 @@ def project(
     return homogeneous[..., :2] / z.abs().clamp_min(torch.finfo(z.dtype).tiny)[..., None], z
 
 
-def inside(
+def is_inside(
     pixels: Float[Tensor, "*shape 2"], z: Float[Tensor, "*shape"], camera: Camera
 ) -> Bool[Tensor, "*shape"]:
     """Return True for projected points in front of the camera and within its image."""
@@ -53,7 +54,7 @@ def sample(
     return sampled[0, :, 0].T.reshape(*pixels.shape[:-1], -1)
 
 
-def distance_from_depth(depth: Float[Tensor, "h w"], camera: Camera) -> Float[Tensor, "h w"]:
+def depth_to_distance(depth: Float[Tensor, "h w"], camera: Camera) -> Float[Tensor, "h w"]:
     """Convert z-depth to the Euclidean distance along each pixel's ray (paper, Eq. 9)."""
     return depth * camera.z_rays().norm(dim=-1)
 
@@ -74,7 +75,9 @@ def slide(
     return replace(gaussians, means=means, scales=scales, encoded=None)
 
 
-def reaching(gaussians: Gaussians, camera: Camera, where: Bool[Tensor, "h w"]) -> Bool[Tensor, "n"]:
+def footprint_mask(
+    gaussians: Gaussians, camera: Camera, where: Bool[Tensor, "h w"]
+) -> Bool[Tensor, "n"]:
     """Return True for all Gaussians that `camera` sees in the mask `where`, and maybe others.
 
     A square of `FOOTPRINT` about each Gaussian is compared with a summed-area table of the mask.
@@ -93,17 +96,17 @@ def reaching(gaussians: Gaussians, camera: Camera, where: Bool[Tensor, "h w"]) -
     return (z > 0) & (count > 0)
 
 
-def at_depths(gaussians: Gaussians, camera: Camera, depths: Float[Tensor, "n"]) -> Gaussians:
+def move_to_depths(gaussians: Gaussians, camera: Camera, depths: Float[Tensor, "n"]) -> Gaussians:
     """Move Gaussians along the rays of `camera` to other z-depths, with a constant footprint."""
-    return slide(gaussians, camera, depths / z_depths(gaussians.means, camera), "constant")
+    return slide(gaussians, camera, depths / compute_z_depths(gaussians.means, camera), "constant")
 
 
-def z_depths(points: Float[Tensor, "n 3"], camera: Camera) -> Float[Tensor, "n"]:
+def compute_z_depths(points: Float[Tensor, "n 3"], camera: Camera) -> Float[Tensor, "n"]:
     """Compute the z-depths of world points in `camera`, in scene units."""
     return (points - camera.center) @ camera.forward
 
 
-def rotation_between(a: Camera, b: Camera) -> float:
+def measure_rotation(a: Camera, b: Camera) -> float:
     """Compute the angle of the rotation between two cameras, in degrees.
 
     The arctangent of sine and cosine is exact for small angles; the arccosine of the trace is not.
@@ -115,88 +118,156 @@ def rotation_between(a: Camera, b: Camera) -> float:
     return torch.rad2deg(torch.atan2(axis.norm() / 2, cos)).item()
 
 
-def baseline_between(a: Camera, b: Camera) -> float:
+def measure_baseline(a: Camera, b: Camera) -> float:
     """Compute the distance between the camera centres, in scene units."""
     return (a.center - b.center).norm().item()
 
 
-def widened(camera: Camera, margin: float) -> Window:
+def pad_camera(camera: Camera, margin: float) -> PaddedCamera:
     """Pad the image of `camera` on every side by `margin` of its size."""
-    return bordered(camera, round(margin * camera.width), round(margin * camera.height))
+    return pad_pixels(camera, round(margin * camera.width), round(margin * camera.height))
 
 
-def bordered(camera: Camera, left: int, top: int) -> Window:
+def pad_pixels(camera: Camera, left: int, top: int) -> PaddedCamera:
     """Pad the image of `camera` by `left` pixels on the left and right, `top` above and below."""
     K = camera.K.clone()
     K[0, 2] += left
     K[1, 2] += top
     wide = replace(camera, K=K, width=camera.width + 2 * left, height=camera.height + 2 * top)
-    return Window(camera, wide, left, top)
+    return PaddedCamera(camera, wide, left, top)
 
 
-def between(camera: Camera, wide: Camera) -> Window:
+def pad_like(camera: Camera, padded: Camera) -> PaddedCamera:
     """Pad the image of `camera` to the size of `padded`, centred."""
-    return bordered(camera, (wide.width - camera.width) // 2, (wide.height - camera.height) // 2)
+    return pad_pixels(
+        camera, (padded.width - camera.width) // 2, (padded.height - camera.height) // 2
+    )
 
 
-def same_camera(a: Camera, b: Camera) -> bool:
+def is_same_camera(a: Camera, b: Camera) -> bool:
     """Return True if two cameras see the same image, up to float rounding."""
     extent = max(a.center.abs().max().item(), b.center.abs().max().item())
     return (
         (a.width, a.height) == (b.width, b.height)
         and torch.allclose(a.K, b.K, rtol=1e-5, atol=1e-4)
-        and baseline_between(a, b) <= 1e-6 * extent
-        and rotation_between(a, b) <= 1e-3
+        and measure_baseline(a, b) <= 1e-6 * extent
+        and measure_rotation(a, b) <= 1e-3
     )
 
 
-def rotations_from(quats: Float[Tensor, "*n 4"]) -> Float[Tensor, "*n 3 3"]:
+def quats_to_rotations(quats: Float[Tensor, "*n 4"]) -> Float[Tensor, "*n 3 3"]:
     """Convert wxyz quaternions of any length but zero to rotation matrices."""
     w, x, y, z = torch.nn.functional.normalize(quats, dim=-1).unbind(-1)
-    return matrices(
+    return stack_matrices(
         [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)],
         [2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)],
         [2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)],
     )
 
 
-def quats_from(rotations: Float[Tensor, "*n 3 3"]) -> Float[Tensor, "*n 4"]:
+def rotations_to_quats(rotations: Float[Tensor, "*n 3 3"]) -> Float[Tensor, "*n 4"]:
     """Convert rotation matrices to unit wxyz quaternions, by the largest component."""
     r = rotations.flatten(-2).unbind(-1)
     w, x = 1 + r[0] + r[4] + r[8], 1 + r[0] - r[4] - r[8]
     y, z = 1 - r[0] + r[4] - r[8], 1 - r[0] - r[4] + r[8]
     a, b, c = r[7] - r[5], r[2] - r[6], r[3] - r[1]
     d, e, f = r[3] + r[1], r[2] + r[6], r[7] + r[5]
-    candidates = matrices([w, a, b, c], [a, x, d, e], [b, d, y, f], [c, e, f, z])
+    candidates = stack_matrices([w, a, b, c], [a, x, d, e], [b, d, y, f], [c, e, f, z])
     largest = torch.stack([w, x, y, z], dim=-1).argmax(-1)
     best = candidates.take_along_dim(largest[..., None, None], dim=-2)[..., 0, :]
     return torch.nn.functional.normalize(best, dim=-1)
 
 
-def quats_product(
+def multiply_quats(
     after: Float[Tensor, "*#n 4"], before: Float[Tensor, "*#n 4"]
 ) -> Float[Tensor, "*n 4"]:
     """Compose rotations given as wxyz quaternions: first `before`, then `after`."""
     w, x, y, z = after.unbind(-1)
-    left = matrices([w, -x, -y, -z], [x, w, -z, y], [y, z, w, -x], [z, -y, x, w])
+    left = stack_matrices([w, -x, -y, -z], [x, w, -z, y], [y, z, w, -x], [z, -y, x, w])
     return (left @ before[..., None])[..., 0]
 
 
-def rotation_about(axis: Float[Tensor, "3"], angle: float) -> Float[Tensor, "3 3"]:
+def axis_angle_to_matrix(axis: Float[Tensor, "3"], angle: float) -> Float[Tensor, "3 3"]:
     """Compute the rotation by `angle` radians about a unit `axis`."""
     real = torch.tensor([math.cos(angle / 2)], dtype=torch.float64, device=axis.device)
-    return rotations_from(torch.cat([real, math.sin(angle / 2) * axis.double()])).to(axis)
+    return quats_to_rotations(torch.cat([real, math.sin(angle / 2) * axis.double()])).to(axis)
 
 
-def share_of_turn(turn: Float[Tensor, "3 3"], share: float) -> Float[Tensor, "3 3"]:
+def slerp_rotation(rotation: Float[Tensor, "3 3"], share: float) -> Float[Tensor, "3 3"]:
     """Scale the angle of a rotation by `share`, taking the shorter way round."""
-    quat = quats_from(turn.double())
+    quat = rotations_to_quats(rotation.double())
     real, imaginary = (quat if quat[0] >= 0 else -quat).split([1, 3])
     length = imaginary.norm()
     axis = imaginary / length.clamp_min(torch.finfo(length.dtype).tiny)
-    return rotation_about(axis, share * 2 * torch.atan2(length, real[0]).item()).to(turn)
+    return axis_angle_to_matrix(axis, share * 2 * torch.atan2(length, real[0]).item()).to(rotation)
 
 
-def matrices(*rows: list[Float[Tensor, "*n"]]) -> Float[Tensor, "*n r c"]:
+def stack_matrices(*rows: list[Float[Tensor, "*n"]]) -> Float[Tensor, "*n r c"]:
     """Stack entries, given row by row, to matrices."""
     return torch.stack([torch.stack(row, dim=-1) for row in rows], dim=-2)
+
+
+def compute_field_of_view(camera: Camera) -> tuple[float, float]:
+    """Compute the horizontal and vertical field of view in radians."""
+    half = torch.tensor([camera.width, camera.height]) / 2 / camera.K.diagonal()[:2].cpu()
+    wide, high = (2 * torch.atan(half)).tolist()
+    return wide, high
+
+
+def estimate_up(cameras: Sequence[Camera]) -> Float[Tensor, "3"]:
+    """Estimate the unit up direction that most images share."""
+    ups = torch.stack([-camera.c2w[:3, 1] for camera in cameras])
+    likeness = (ups @ ups.T).sum(dim=1)
+    return normalize(ups[(ups @ ups[likeness.argmax()]) > 0].mean(dim=0), dim=0)
+
+
+def shrink_camera(camera: Camera, side: int) -> Camera:
+    """Reduce the image of a camera to at most `side` pixels on its longer side."""
+    factor = min(side / max(camera.width, camera.height), 1.0)
+    return resize_camera(
+        camera, *(max(round(factor * n), 1) for n in (camera.width, camera.height))
+    )
+
+
+def resize_camera(camera: Camera, width: int, height: int) -> Camera:
+    """Change the image size of a camera, in pixels."""
+    scale = torch.tensor([width / camera.width, height / camera.height, 1.0]).to(camera.K)
+    return replace(camera, K=scale[:, None] * camera.K, width=width, height=height)
+
+
+def select_spread_cameras(cameras: Sequence[Camera], count: int) -> list[int]:
+    """Select up to `count` cameras that are far apart (farthest point sampling); return indices."""
+    where = embed_cameras(cameras)
+    chosen = [0]
+    apart = (where - where[0]).norm(dim=1)
+    while len(chosen) < min(count, len(cameras)):
+        chosen.append(int(apart.argmax()))
+        apart = torch.minimum(apart, (where - where[chosen[-1]]).norm(dim=1))
+        apart[chosen] = -1.0
+    return chosen
+
+
+def embed_cameras(cameras: Sequence[Camera]) -> Float[Tensor, "n 6"]:
+    """Embed cameras as centres, relative to their extent, and viewing directions."""
+    centers = torch.stack([camera.center for camera in cameras])
+    extent = (centers - centers.mean(dim=0)).norm(dim=1).max().clamp_min(1e-30)
+    return torch.cat([centers / extent, torch.stack([c.forward for c in cameras])], dim=1)
+
+
+def compute_spacing(cameras: Sequence[Camera]) -> float:
+    """Compute the median distance to the nearest other camera, in scene units."""
+    centers = torch.stack([camera.center for camera in cameras]).double()
+    apart = (centers[:, None] - centers).norm(dim=-1)
+    apart.fill_diagonal_(torch.inf)
+    nearest = apart.amin(dim=1)
+    return nearest.median().item() if len(cameras) > 1 else 0.0
+
+
+def project_mask(
+    mask: Bool[Tensor, "h w"], gaussians: Gaussians, camera: Camera
+) -> Bool[Tensor, "n"]:
+    """Find Gaussians whose means project into `mask`."""
+    pixels, z = project(gaussians.means, camera)
+    seen = is_inside(pixels, z, camera)
+    x, y = pixels.where(seen[:, None], 0.0).long().unbind(-1)
+    return seen & mask[y, x]

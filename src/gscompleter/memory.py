@@ -7,7 +7,7 @@ import os
 from collections.abc import Sequence
 from pathlib import Path
 
-from gscompleter.errors import InputError, quoted
+from gscompleter.errors import InputError, quote_value
 
 PROGRAM_BYTES = 550 * 10**6
 """Bytes of the program itself, for images of any size."""
@@ -16,10 +16,10 @@ PROGRAM_BYTES = 550 * 10**6
 BYTES_PER_PIXEL = 2_500
 """Bytes per target pixel, for the costs of the anchor and of the target padded by a quarter."""
 # Measured on eight photographs instead of two, at 256 x 256 and 480 x 480.
-BYTES_PER_PIXEL_OF_A_VIEW = 250
+BYTES_PER_VIEW_PIXEL = 250
 """Further bytes per pixel of each image: the image, its Gaussians and its renders."""
 
-MAX_KEPT = 2 * 2**30
+MAX_FROZEN_BYTES = 2 * 2**30
 """Bytes of splats that the frozen views of an input splat may hold together."""
 COPIES = 4
 """Copies of a scene: in rendering order and in file order, with and without added Gaussians."""
@@ -27,45 +27,43 @@ FREEZING_BYTES = 60
 """Bytes per Gaussian while a view is frozen."""
 BYTES_PER_SPLAT = 52
 """Bytes per Gaussian in a frozen view."""
-BYTES_PER_PIXEL_OF_A_WITNESS = 400
+BYTES_PER_PHOTO_PIXEL = 400
 """Bytes per pixel of each photograph of an input splat, for the fit to it."""
 
-_LIMITS = ("/sys/fs/cgroup/memory.max", "/sys/fs/cgroup/memory/memory.limit_in_bytes")
+_LIMIT_FILES = ("/sys/fs/cgroup/memory.max", "/sys/fs/cgroup/memory/memory.limit_in_bytes")
 """Files with the memory limit of a container, for cgroup versions 2 and 1."""
 
 
 def check_memory(pixels: int, images: int) -> None:
     """Raise InputError if `images` of up to `pixels` pixels need more memory than there is."""
-    number = f"{quoted(f'{images:,}')} images of up to {quoted(f'{pixels:,}')} pixels"
+    number = f"{quote_value(f'{images:,}')} images of up to {quote_value(f'{pixels:,}')} pixels"
     remedy = "choose a smaller resolution, or fewer views"
-    _refuse_beyond_memory(needed_bytes(pixels, images), number, remedy, "resolution")
+    _check_available(estimate_bytes(pixels, images), number, remedy, "resolution")
 
 
-def needed_bytes(pixels: int, images: int) -> int:
+def estimate_bytes(pixels: int, images: int) -> int:
     """Estimate the peak memory of a completion. Arguments as in `check_memory`."""
-    return PROGRAM_BYTES + pixels * (BYTES_PER_PIXEL + images * BYTES_PER_PIXEL_OF_A_VIEW)
+    return PROGRAM_BYTES + pixels * (BYTES_PER_PIXEL + images * BYTES_PER_VIEW_PIXEL)
 
 
 def check_scene_memory(count: int, photographs: int, needed: int) -> None:
     """Raise InputError if `needed` bytes, for `count` Gaussians, exceed the memory."""
-    number = f"The {quoted(f'{count:,}')} Gaussians of the scene and {photographs} photographs"
+    number = f"The {quote_value(f'{count:,}')} Gaussians of the scene and {photographs} photographs"
     remedy = "crop the scene, or give a folder with fewer photographs"
-    _refuse_beyond_memory(needed, number, remedy)
+    _check_available(needed, number, remedy)
 
 
-def _refuse_beyond_memory(
-    needed: int, number: str, remedy: str, argument: str | None = None
-) -> None:
-    available = memory_bytes()
+def _check_available(needed: int, number: str, remedy: str, argument: str | None = None) -> None:
+    available = read_memory_bytes()
     if available is not None and needed > available:
         raise InputError(
-            f"{number} need about {gigabytes(needed)} of memory, and there are "
-            f"{gigabytes(available)}; {remedy}.",
+            f"{number} need about {format_whole_gigabytes(needed)} of memory, and there are "
+            f"{format_whole_gigabytes(available)}; {remedy}.",
             argument,
         )
 
 
-def scene_bytes(count: int, numbers: int, photographs: Sequence[int]) -> int:
+def estimate_scene_bytes(count: int, numbers: int, photographs: Sequence[int]) -> int:
     """Estimate the additional peak memory for an input splat.
 
     Args:
@@ -74,39 +72,39 @@ def scene_bytes(count: int, numbers: int, photographs: Sequence[int]) -> int:
         photographs: Pixels of each photograph, at working resolution.
     """
     number = len(photographs)
-    rendered = min(count, most_that_fit(number))
+    rendered = min(count, count_fitting_gaussians(number))
     views = number * rendered * BYTES_PER_SPLAT
     observed = 2 * 4 * number * rendered  # areas and agreement of every Gaussian
-    fitted = BYTES_PER_PIXEL_OF_A_WITNESS * sum(photographs)
+    fitted = BYTES_PER_PHOTO_PIXEL * sum(photographs)
     return count * (COPIES * 4 * numbers + FREEZING_BYTES) + views + observed + fitted
 
 
-def most_that_fit(number: int) -> int:
+def count_fitting_gaussians(number: int) -> int:
     """Compute how many Gaussians `number` frozen views can hold within `MAX_FROZEN_BYTES`."""
-    return MAX_KEPT // (number * BYTES_PER_SPLAT)
+    return MAX_FROZEN_BYTES // (number * BYTES_PER_SPLAT)
 
 
-def images_that_fit(pixels: int) -> int | None:
+def count_fitting_images(pixels: int) -> int | None:
     """Compute how many images of `pixels` fit into memory, or None if that is unknown.
 
     Other programs are ignored, so that the same command always selects the same photographs.
     """
-    available = memory_bytes()
+    available = read_memory_bytes()
     if available is None:
         return None
-    left = available - needed_bytes(pixels, 0)
-    return max(0, left // (pixels * BYTES_PER_PIXEL_OF_A_VIEW))
+    left = available - estimate_bytes(pixels, 0)
+    return max(0, left // (pixels * BYTES_PER_VIEW_PIXEL))
 
 
-def memory_bytes() -> int | None:
+def read_memory_bytes() -> int | None:
     """Return the memory of this machine or its container limit, or None if unknown."""
-    found = [limit for limit in map(_limit, _LIMITS) if limit is not None]
+    found = [limit for limit in map(_read_limit, _LIMIT_FILES) if limit is not None]
     with contextlib.suppress(AttributeError, OSError, ValueError):
         found.append(os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES"))
     return min(found, default=None)
 
 
-def _limit(path: str) -> int | None:
+def _read_limit(path: str) -> int | None:
     try:
         word = Path(path).read_text().strip()
     except OSError:
@@ -114,6 +112,6 @@ def _limit(path: str) -> int | None:
     return int(word) if word.isdecimal() else None  # cgroup 2 has "max" for no limit
 
 
-def gigabytes(number: int) -> str:
+def format_whole_gigabytes(number: int) -> str:
     """Format a number of bytes in whole GB, rounded up."""
-    return quoted(f"{-(-number // 10**9):,} GB")
+    return quote_value(f"{-(-number // 10**9):,} GB")

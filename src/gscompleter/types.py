@@ -9,16 +9,15 @@ opacities in [0, 1], spherical harmonics [n, k, 3] in the 3DGS basis. All values
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field, replace
-from functools import cached_property
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
 from typing import Any, Literal, TypeVar
 
 import torch
 from jaxtyping import Bool, Float, Int, Int64, Shaped, UInt8
 from torch import Tensor
 
-from gscompleter.coverage import COVERED
+from gscompleter.config.coverage import COVERED
 from gscompleter.errors import InputError
 
 SH_C0 = 0.28209479177387814
@@ -27,21 +26,23 @@ SH_C0 = 0.28209479177387814
 MAX_RIGID_ERROR = 1e-3
 """Largest entry of RᵀR - I that counts as rounding error of a rotation R."""
 
-M = TypeVar("M", bound="Movable")
+M = TypeVar("M", bound="TensorDataclass")
 
 
 @dataclass(frozen=True)
-class Movable:
+class TensorDataclass:
     """A value whose tensors all lie on one device."""
 
     def to(self: M, device: torch.device | str) -> M:
         """Return a copy on `device`."""
-        parts = {n: part for n, part in vars(self).items() if isinstance(part, (Tensor, Movable))}
+        parts = {
+            n: part for n, part in vars(self).items() if isinstance(part, (Tensor, TensorDataclass))
+        }
         return replace(self, **{name: part.to(device) for name, part in parts.items()})
 
 
 @dataclass(frozen=True)
-class Camera(Movable):
+class Camera(TensorDataclass):
     """A pinhole camera with OpenCV axes: x right, y down, z forward."""
 
     c2w: Float[Tensor, "4 4"]
@@ -57,8 +58,8 @@ class Camera(Movable):
 
     def __post_init__(self) -> None:
         """Raise InputError for an impossible camera; values on a GPU are not read."""
-        defect = _planes_defect(self.near, self.far) or (
-            _pose_defect(self.c2w) or _intrinsics_defect(self.K, self.width, self.height)
+        defect = _find_planes_defect(self.near, self.far) or (
+            _find_pose_defect(self.c2w) or _find_intrinsics_defect(self.K, self.width, self.height)
         )
         if defect is not None:
             raise InputError(f"There is no such camera: {defect}.")
@@ -96,7 +97,7 @@ class Camera(Movable):
         return pixels @ torch.linalg.inv(self.K).T @ self.c2w[:3, :3].T
 
 
-def _planes_defect(near: float | None, far: float | None) -> str | None:
+def _find_planes_defect(near: float | None, far: float | None) -> str | None:
     """Return a sentence part about impossible depth planes, or None."""
     for name, plane in (("near", near), ("far", far)):
         if plane is not None and not 0 < plane < math.inf:
@@ -106,7 +107,7 @@ def _planes_defect(near: float | None, far: float | None) -> str | None:
     return None
 
 
-def _pose_defect(c2w: Float[Tensor, "4 4"]) -> str | None:
+def _find_pose_defect(c2w: Float[Tensor, "4 4"]) -> str | None:
     """Return a sentence part about an impossible pose, or None; plain floats are fastest here."""
     if not isinstance(c2w, Tensor) or c2w.shape != (4, 4) or not c2w.is_floating_point():
         return "its pose is no tensor of 4 × 4 floats"
@@ -125,7 +126,7 @@ def _pose_defect(c2w: Float[Tensor, "4 4"]) -> str | None:
     return None
 
 
-def _intrinsics_defect(K: Float[Tensor, "3 3"], width: int, height: int) -> str | None:
+def _find_intrinsics_defect(K: Float[Tensor, "3 3"], width: int, height: int) -> str | None:
     """Return a sentence part about impossible intrinsics, or None."""
     if not isinstance(K, Tensor) or K.shape != (3, 3) or not K.is_floating_point():
         return "its K is no tensor of 3 × 3 floats"
@@ -140,11 +141,11 @@ def _intrinsics_defect(K: Float[Tensor, "3 3"], width: int, height: int) -> str 
 
 
 @dataclass(frozen=True)
-class Window:
+class PaddedCamera:
     """A target camera and the same camera with padding on every side."""
 
     target: Camera
-    wide: Camera
+    padded: Camera
     """The padded camera; its rays through the pixels of `target` are those of `target`."""
     left: int
     """Padding in pixels on the left and on the right each."""
@@ -152,13 +153,13 @@ class Window:
     """Padding in pixels at the top and at the bottom each."""
 
     def crop(self, image: Shaped[Tensor, "wide_h wide_w *c"]) -> Shaped[Tensor, "h w *c"]:
-        """Cut the padding off an image of `padded`."""
+        """Cut the padding off an image of `pad_depth`."""
         rows = slice(self.top, self.top + self.target.height)
         return image[rows, self.left : self.left + self.target.width]
 
 
 @dataclass(frozen=True)
-class View(Movable):
+class View(TensorDataclass):
     """A photograph (or a synthesized image) and its camera."""
 
     image: Float[Tensor, "h w 3"]
@@ -167,9 +168,9 @@ class View(Movable):
     """Frame number in the scene folder, or None if the view is not one of its frames."""
     depth: Float[Tensor, "h w"] | None = None
     """Measured z-depth in scene units, 0 if unknown. Only the evaluation reads it."""
-    ignored: Bool[Tensor, "h w"] | None = None
+    ignore_mask: Bool[Tensor, "h w"] | None = None
     """True where the image must not be used (user mask), or None if all of it may be used."""
-    contradicted: Bool[Tensor, "h w"] | None = None
+    dynamic_mask: Bool[Tensor, "h w"] | None = None
     """True where something moved between photographs; completion copies nothing from there."""
 
     def __post_init__(self) -> None:
@@ -184,7 +185,11 @@ class View(Movable):
             raise InputError(
                 "The image of a view is no tensor of floats of shape [h, w, 3]; convert it."
             )
-        maps = {"depth": self.depth, "ignore mask": self.ignored, "dynamic mask": self.contradicted}
+        maps = {
+            "depth": self.depth,
+            "ignore mask": self.ignore_mask,
+            "dynamic mask": self.dynamic_mask,
+        }
         for name, pixels in {"image": image, **maps}.items():
             if pixels is not None and tuple(pixels.shape[:2]) != size:
                 raise InputError(
@@ -193,29 +198,31 @@ class View(Movable):
                 )
 
     @property
-    def counted(self) -> Bool[Tensor, "h w"]:
+    def valid_mask(self) -> Bool[Tensor, "h w"]:
         """True where the image may be used."""
         everywhere = torch.ones_like(self.image[..., 0], dtype=torch.bool)
-        return everywhere if self.ignored is None else ~self.ignored
+        return everywhere if self.ignore_mask is None else ~self.ignore_mask
 
     @property
-    def trusted(self) -> Bool[Tensor, "h w"]:
+    def static_mask(self) -> Bool[Tensor, "h w"]:
         """True where completion may copy from the image: valid and not dynamic."""
-        return self.counted if self.contradicted is None else self.counted & ~self.contradicted
+        return (
+            self.valid_mask if self.dynamic_mask is None else self.valid_mask & ~self.dynamic_mask
+        )
 
-    def compared(self, image: Float[Tensor, "h w 3"]) -> Float[Tensor, "h w 3"]:
+    def fill_ignored(self, image: Float[Tensor, "h w 3"]) -> Float[Tensor, "h w 3"]:
         """Replace ignored pixels of a render by those of the photograph."""
-        if self.ignored is None:
+        if self.ignore_mask is None:
             return image
-        return torch.where(self.ignored[..., None], self.image, image)
+        return torch.where(self.ignore_mask[..., None], self.image, image)
 
-    def evened(self, gain: Float[Tensor, "3"]) -> View:
+    def normalize_exposure(self, gain: Float[Tensor, "3"]) -> View:
         """Divide the image by an exposure gain per channel."""
         return replace(self, image=(self.image / gain).clamp(0, 1))
 
 
 @dataclass(frozen=True)
-class Gaussians(Movable):
+class Gaussians(TensorDataclass):
     """A set of n 3D Gaussians in world coordinates, with their provenance."""
 
     means: Float[Tensor, "n 3"]
@@ -253,7 +260,7 @@ class Gaussians(Movable):
         return {1: 0, 4: 1, 9: 2, 16: 3}[self.sh.shape[1]]
 
 
-def observed(
+def make_observed(
     means: Float[Tensor, "n 3"],
     quats: Float[Tensor, "n 4"],
     scales: Float[Tensor, "n 3"],
@@ -309,9 +316,9 @@ class Render:
     alpha: Float[Tensor, "h w"]
     """Accumulated opacity, sum(w)."""
 
-    def cropped(self, window: Window) -> Render:
+    def crop(self, camera: PaddedCamera) -> Render:
         """Cut the padding off a render of the padded camera."""
-        return Render(window.crop(self.image), window.crop(self.depth), window.crop(self.alpha))
+        return Render(camera.crop(self.image), camera.crop(self.depth), camera.crop(self.alpha))
 
     def depth_map(self, min_alpha: float = COVERED) -> DepthMap:
         """Return the depth, valid where alpha is at least `min_alpha`."""
@@ -338,30 +345,18 @@ class Reconstruction:
     """View that each Gaussian comes from, or None if the model is not pixel-aligned."""
     pixel_index: Int[Tensor, "n"] | None = None
     """Row-major pixel of that view, or None if the model is not pixel-aligned."""
-    gains: Float[Tensor, "v 3"] | None = None
+    exposure_gains: Float[Tensor, "v 3"] | None = None
     """Exposure gain per channel of each view relative to the Gaussians, or None."""
 
 
 @dataclass(frozen=True)
-class InitialContext:
-    """The reconstructed context (stage 1) and its photographs."""
-
-    gaussians: Gaussians
-    views: tuple[View, ...]
-    """Photographs with the depth range of the scene, in the exposure of `gaussians`."""
-    gains: Float[Tensor, "v 3"] | None = None
-    """Exposure gain per channel of each original photograph relative to `gaussians`, or None."""
-    seconds: Mapping[str, float] = field(default_factory=dict)
-
-
-@dataclass(frozen=True)
-class SceneContext:
+class GeneratorInput:
     """Input of a generator Φ besides the target camera and its nearest view."""
 
     views: tuple[View, ...]
-    at_views: tuple[Render, ...]
+    view_renders: tuple[Render, ...]
     """Renders of the scene at the cameras of `views`, in their order."""
-    at_target: Render
+    target_render: Render
     """Render of the scene at the target camera."""
     max_alpha: float = COVERED
     """Pixels of the target with less alpha are holes."""
@@ -369,13 +364,13 @@ class SceneContext:
     """True if a learned Φ adapts its colours to those of the photographs."""
     source_depth: Literal["context", "monocular"] = "context"
     """Source of the photograph's depth for PE-Field, unless its own settings name one."""
-    believed: Float[Tensor, "h w"] | None = None
+    trusted_alpha: Float[Tensor, "h w"] | None = None
     """Alpha at the target weighted by trust, or None under full trust."""
 
     @property
     def holes(self) -> Bool[Tensor, "h w"]:
         """Hole mask at the target; Φ fills these pixels."""
-        alpha = self.at_target.alpha if self.believed is None else self.believed
+        alpha = self.target_render.alpha if self.trusted_alpha is None else self.trusted_alpha
         return alpha < self.max_alpha
 
 
@@ -403,9 +398,9 @@ class DepthAffine:
     """Estimator that was used; each is the fallback of the one before."""
     agreement: float | None = None
     """Fraction of the context visible at the target that agrees with it, or None if not checked."""
-    contradicted: bool = False
+    is_refitted_at_target: bool = False
     """True if the fit at the anchor was replaced by one at the target."""
-    refuted: bool = False
+    is_rejected: bool = False
     """True if the context visible at the target agrees neither with this fit nor with another."""
 
 
@@ -413,47 +408,11 @@ class DepthAffine:
 class DepthPairs:
     """A sample of the z-depths that an affine was fitted to, in scene units."""
 
-    seen_from: Literal["anchor", "target"]
+    fit_view: Literal["anchor", "target"]
     predicted: Float[Tensor, "n"]
     context: Float[Tensor, "n"]
-    agrees: Bool[Tensor, "n"]
+    inlier_mask: Bool[Tensor, "n"]
     """True for inliers of the affine."""
-
-
-@dataclass(frozen=True)
-class TargetCompletion:
-    """Result of one target camera. No stage reads it."""
-
-    target: Camera
-    before: Render
-    """The scene without what this target added, rendered at the target."""
-    after: Render
-    hole_mask: Bool[Tensor, "h w"]
-    """True where the scene had a hole, before dilation."""
-    reference: View | None
-    """The synthesized view, or None if nothing was synthesized."""
-    anchor: int
-    """Index of the anchor among the context views."""
-    anchor_fallback: bool
-    """True if every view exceeded the rotation limit, so that the smallest rotation won."""
-    affine: DepthAffine
-    added: Gaussians
-    losses: Mapping[str, Sequence[float]] = field(default_factory=dict)
-    """Loss per iteration of the optimizations `register` and `refine`."""
-    registered: Gaussians | None = None
-    """All registered Gaussians, hole or not; None without `GSCompleter.keep_registered`."""
-    notes: tuple[str, ...] = ()
-    support: Float[Tensor, "h w"] | None = None
-    """Alpha weighted by trust before this target, or None under full trust."""
-    pairs: DepthPairs | None = None
-    """Sample of the depths that the affine was fitted to, or None if none were compared."""
-    refused: str | None = None
-    """Sentence why the target cannot be completed, or None if it can."""
-
-    @property
-    def hole_fraction(self) -> float:
-        """Fraction of the image in holes."""
-        return self.hole_mask.float().mean().item()
 
 
 @dataclass(frozen=True)
@@ -461,12 +420,12 @@ class Proxy:
     """LOD proxy: m Gaussians rendered in place of the n Gaussians of a large scene."""
 
     scene: Gaussians
-    run: Int64[Tensor, "n"]
+    proxy_index: Int64[Tensor, "n"]
     """Proxy Gaussian that represents each of the n Gaussians."""
 
 
 @dataclass(frozen=True)
-class Evidence:
+class PhotoObservations:
     """Observations of m context Gaussians in k photographs, from which trust is computed."""
 
     means: Float[Tensor, "m 3"]
@@ -485,85 +444,3 @@ class ErrorBudget:
     """The photograph; its ignored pixels do not count."""
     metric: Literal["mse", "dssim"]
     limit: float
-
-
-@dataclass(frozen=True)
-class Completion:
-    """A scene during completion; steps return a new value, and the old one serves as undo."""
-
-    drawn: Gaussians
-    """The context or its LOD proxy, without pruned Gaussians, then all generated ones."""
-    context: Gaussians
-    """The scene before its first target."""
-    views: tuple[View, ...]
-    """Context photographs with the depth range of the scene, in the exposure of the context."""
-    budgets: tuple[tuple[ErrorBudget, ...], ...]
-    """Error budgets of each photograph in `photos`; the first excludes the holes of the context."""
-    targets: tuple[TargetCompletion, ...]
-    seconds: Mapping[str, float]
-    """Wall time of context, generate, lift, register, integrate and total."""
-    witnesses: tuple[View, ...] = ()
-    """Further photographs of the scene that must not get worse."""
-    bystanders: tuple[Camera, ...] = ()
-    """Further cameras whose free space stays empty; their images are not read."""
-    gains: Float[Tensor, "v 3"] | None = None
-    """Exposure gain of each original photograph relative to `views`, or None if not estimated."""
-    begun: tuple[Render, ...] = ()
-    """Renders of the context at `views` before any target."""
-    proxy: Proxy | None = None
-    """LOD proxy of a large context, or None if the context itself is rendered."""
-    evidence: Evidence | None = None
-    """Observations of the context in all photographs, or None under full trust."""
-    set_aside: Bool[Tensor, "m"] | None = None
-    """Rendered context Gaussians that were pruned, or None if none were."""
-
-    @property
-    def photographs(self) -> tuple[View, ...]:
-        """All photographs that the scene is compared with: `views`, then `check_views`."""
-        return (*self.views, *self.witnesses)
-
-    @property
-    def drawn_context(self) -> Gaussians:
-        """The context or its LOD proxy as it is rendered, pruned Gaussians included."""
-        return self.context if self.proxy is None else self.proxy.scene
-
-    @property
-    def num_kept(self) -> int:
-        """Number of context Gaussians, without pruned ones, at the start of `rendered_scene`."""
-        num_pruned = 0 if self.set_aside is None else int(self.set_aside.sum())
-        return len(self.drawn_context) - num_pruned
-
-    @property
-    def added(self) -> Gaussians:
-        """Generated Gaussians of all targets."""
-        return self.drawn[self.num_kept :]
-
-    @property
-    def removed(self) -> Bool[Tensor, "n"] | None:
-        """Pruned Gaussians as a mask over `context`, or None if there are none."""
-        pruned = self.set_aside
-        return pruned if pruned is None or self.proxy is None else pruned[self.proxy.run]
-
-    @property
-    def observed(self) -> Gaussians:
-        """The context bit for bit, without pruned Gaussians."""
-        removed = self.removed
-        return self.context if removed is None else self.context[~removed]
-
-    @cached_property
-    def scene(self) -> Gaussians:
-        """The context bit for bit, without pruned Gaussians, followed by all generated ones."""
-        if self.proxy is None:
-            return self.drawn
-        return merge([self.observed, self.added]) if len(self.added) else self.observed
-
-    @property
-    def next_number(self) -> int:
-        """Value of `generated` for the next target; ids of a given scene are continued."""
-        given = int(self.context.generated.max()) if len(self.context) else 0
-        return given + len(self.targets) + 1
-
-    def ranged(self, camera: Camera) -> Camera:
-        """Return the camera with the depth range of this completion."""
-        known = self.views[0].camera
-        return replace(camera, near=known.near, far=known.far)

@@ -8,10 +8,10 @@ from typing import Annotated, Any, Literal
 
 from annotated_types import Interval
 
+from gscompleter.config.coverage import COVERED
 from gscompleter.config.renamed import refuse_old_keys
-from gscompleter.config.settings import Count, Settings, Share, Weight, updated
-from gscompleter.coverage import COVERED
-from gscompleter.errors import InputError, quoted
+from gscompleter.config.settings import Count, Settings, Share, Weight, apply_changes
+from gscompleter.errors import InputError, quote_value
 
 Pixels = Annotated[int, Interval(ge=0, le=4096)]
 Step = Annotated[float, Interval(gt=0, le=10)]
@@ -196,7 +196,7 @@ class ReconcileConfig(Settings):
     sh_degree: Annotated[int, Interval(ge=0, le=3)] = 2
     """Highest degree of spherical harmonics of an added Gaussian, never above the scene's."""
 
-    def at_most(self, sh_degree: int) -> ReconcileConfig:
+    def limit_sh_degree(self, sh_degree: int) -> ReconcileConfig:
         """Limit the degree of spherical harmonics."""
         return replace(self, sh_degree=min(self.sh_degree, sh_degree))
 
@@ -326,7 +326,7 @@ ABLATIONS: dict[str, dict[str, Any]] = {
 """Changes to a config for each ablation of the paper."""
 
 
-def named_config(name: str) -> CompleterConfig:
+def get_named_config(name: str) -> CompleterConfig:
     """Return `default`, `paper`, or one of them with an ablation: `no-sa`, `paper/no-sa`.
 
     Raises:
@@ -338,11 +338,11 @@ def named_config(name: str) -> CompleterConfig:
     base, _, ablation = name.rpartition("/")
     if (base or "default") not in bases or ablation not in ABLATIONS:
         raise InputError(
-            f"There is no config '{quoted(name)}'; choose default, paper or one of "
+            f"There is no config '{quote_value(name)}'; choose default, paper or one of "
             f"{', '.join(ABLATIONS)} (paper/no-sa for an ablation of the paper's settings), or "
             "give a YAML file."
         )
-    return updated(bases[base or "default"], ABLATIONS[ablation])
+    return apply_changes(bases[base or "default"], ABLATIONS[ablation])
 
 
 def load_config(source: str) -> CompleterConfig:
@@ -353,10 +353,10 @@ def load_config(source: str) -> CompleterConfig:
     """
     path = Path(source)
     if path.suffix not in {".yaml", ".yml"}:
-        return named_config(source)
+        return get_named_config(source)
     from gscompleter.config.yaml_file import read_yaml
 
     changes = read_yaml(path)
-    base = named_config(str(changes.pop("base", "default")))
-    refuse_old_keys(changes, f"{quoted(source)}: ")
-    return updated(base, changes, f"{quoted(source)}: ")
+    base = get_named_config(str(changes.pop("base", "default")))
+    refuse_old_keys(changes, f"{quote_value(source)}: ")
+    return apply_changes(base, changes, f"{quote_value(source)}: ")

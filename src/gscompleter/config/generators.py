@@ -8,7 +8,7 @@ from typing import Annotated
 from annotated_types import Interval, MinLen
 
 from gscompleter.config.settings import Settings
-from gscompleter.errors import InputError, quoted
+from gscompleter.errors import InputError, quote_value
 
 Text = Annotated[str, MinLen(1)]
 Steps = Annotated[int, Interval(ge=1, le=1000)]
@@ -74,11 +74,11 @@ GENERATORS: dict[str, type[GeneratorSettings]] = {
 }
 
 
-def settings_class(name: str) -> type[GeneratorSettings]:
+def get_settings_class(name: str) -> type[GeneratorSettings]:
     """Return the class of a generator's settings, or raise InputError for an unknown name."""
     if name not in GENERATORS:
         raise InputError(
-            f"There is no generator '{quoted(name)}'; choose one of {', '.join(GENERATORS)}.",
+            f"There is no generator '{quote_value(name)}'; choose one of {', '.join(GENERATORS)}.",
             "generator",
         )
     return GENERATORS[name]

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterator, Mapping, Sequence
 from typing import Any
 
-from gscompleter.errors import InputError, quoted
+from gscompleter.errors import InputError, quote_value
 
 RENAMED = {
     "registration.affine.bridge": "alignment.align_at",
@@ -52,10 +52,12 @@ def refuse_old_keys(changes: Mapping[str, Any], where: str = "") -> None:
     Raises:
         InputError: There is one; the sentence begins with `where` and has the new name.
     """
-    for path in _paths(changes):
-        new = new_key(path)
+    for path in _iterate_paths(changes):
+        new = translate_key(path)
         if new is not None:
-            raise InputError(f"{where}{sentence_on_old(quoted(path), new, _values(new))}")
+            raise InputError(
+                f"{where}{describe_renamed(quote_value(path), new, _describe_values(new))}"
+            )
 
 
 def refuse_old_options(words: Sequence[str], prefix: str = "--config.") -> None:
@@ -67,35 +69,37 @@ def refuse_old_options(words: Sequence[str], prefix: str = "--config.") -> None:
     for word in words:
         option = word.partition("=")[0].replace("-", "_")
         stem = prefix.replace("-", "_")
-        new = new_key(option.removeprefix(stem)) if option.startswith(stem) else None
+        new = translate_key(option.removeprefix(stem)) if option.startswith(stem) else None
         if new is not None:
             name = f"{prefix}{new.replace('_', '-')}"
-            raise InputError(sentence_on_old(quoted(word.partition("=")[0]), name, _values(new)))
+            raise InputError(
+                describe_renamed(quote_value(word.partition("=")[0]), name, _describe_values(new))
+            )
 
 
-def new_key(path: str) -> str | None:
+def translate_key(path: str) -> str | None:
     """Return today's name of a setting, or None if the name is not an old one."""
     group, _, name = path.rpartition(".")
     if path in RENAMED or not group:
         return RENAMED.get(path)
-    new = new_key(group)
+    new = translate_key(group)
     return None if new is None else f"{new}.{name}"
 
 
-def sentence_on_old(old: str, new: str, values: str = "") -> str:
+def describe_renamed(old: str, new: str, values: str = "") -> str:
     """Write the sentence that names the new name of a setting."""
     return f"The setting {old} is now called {new}{values}; use the new name."
 
 
-def _values(new: str) -> str:
+def _describe_values(new: str) -> str:
     return f" ({NEW_VALUES[new]})" if new in NEW_VALUES else ""
 
 
-def _paths(changes: Mapping[str, Any], prefix: str = "") -> Iterator[str]:
+def _iterate_paths(changes: Mapping[str, Any], prefix: str = "") -> Iterator[str]:
     """Iterate over the settings in nested mappings, as `group.name`; an empty group is one."""
     for name, value in changes.items():
         path = f"{prefix}{name}"
         if isinstance(value, Mapping) and value and path.count(".") < 2:
-            yield from _paths(value, f"{path}.")
+            yield from _iterate_paths(value, f"{path}.")
         else:
             yield path

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Annotated, Any, ClassVar, TypeVar
 
 from annotated_types import Interval
 
-from gscompleter.errors import InputError, quoted
+from gscompleter.errors import InputError, quote_value
 
 if TYPE_CHECKING:
     from pydantic_core import ErrorDetails
@@ -35,25 +35,25 @@ class Settings:
     }
 
 
-def checked(settings: S, prefix: str = "") -> S:
+def validate(settings: S, prefix: str = "") -> S:
     """Validate types and ranges; InputErrors name `prefix` and the setting as their argument."""
     from pydantic import TypeAdapter
 
-    with told(settings, prefix=prefix):
+    with translate_errors(settings, prefix=prefix):
         return TypeAdapter(type(settings)).validate_python(settings, strict=True)
 
 
-def updated(settings: S, changes: Mapping[str, Any], where: str = "") -> S:
+def apply_changes(settings: S, changes: Mapping[str, Any], where: str = "") -> S:
     """Apply nested changes; the sentences of InputErrors begin with `where`."""
     from pydantic import TypeAdapter
 
-    text = json.dumps(merged(asdict(settings), changes))  # type: ignore[call-overload]
-    with told(settings, where):
+    text = json.dumps(merge_nested(asdict(settings), changes))  # type: ignore[call-overload]
+    with translate_errors(settings, where):
         return TypeAdapter(type(settings)).validate_json(text, strict=True)
 
 
 @contextmanager
-def told(settings: object, where: str = "", prefix: str = "") -> Iterator[None]:
+def translate_errors(settings: object, where: str = "", prefix: str = "") -> Iterator[None]:
     """Translate pydantic's errors into InputErrors."""
     from pydantic import ValidationError
 
@@ -62,27 +62,27 @@ def told(settings: object, where: str = "", prefix: str = "") -> Iterator[None]:
     except ValidationError as error:
         wrong = error.errors(include_url=False)[0]
         name = ".".join(part for part in wrong["loc"] if isinstance(part, str))
-        raise InputError(where + sentence_on(wrong, name, settings), prefix + name) from None
+        raise InputError(where + describe_invalid(wrong, name, settings), prefix + name) from None
 
 
-def merged(values: Mapping[str, Any], changes: Mapping[str, Any]) -> dict[str, Any]:
+def merge_nested(values: Mapping[str, Any], changes: Mapping[str, Any]) -> dict[str, Any]:
     """Merge nested mappings; `changes` win."""
     result = dict(values)
     for name, change in changes.items():
         nested = isinstance(change, Mapping) and isinstance(values.get(name), Mapping)
-        result[name] = merged(values[name], change) if nested else change
+        result[name] = merge_nested(values[name], change) if nested else change
     return result
 
 
-def sentence_on(wrong: ErrorDetails, name: str, settings: object) -> str:
+def describe_invalid(wrong: ErrorDetails, name: str, settings: object) -> str:
     """Write the sentence about the setting called `name`."""
     if wrong["type"] == "unexpected_keyword_argument":
         for part in wrong["loc"][:-1]:
             settings = getattr(settings, str(part))
         known = ", ".join(vars(settings))
-        return f"There is no setting '{quoted(name)}'; choose one of {known}."
+        return f"There is no setting '{quote_value(name)}'; choose one of {known}."
     given = wrong["input"]
-    shown = f"'{quoted(given)}'" if isinstance(given, str) else quoted(given)
+    shown = f"'{quote_value(given)}'" if isinstance(given, str) else quote_value(given)
     if wrong["type"] == "dataclass_type":
         return f"{name} is a group of settings, got {shown}."
     return f"{name} {re.sub(r'^[A-Z][a-z]+ should', 'must', wrong['msg'])}, got {shown}."

@@ -8,12 +8,12 @@ from typing import Any
 
 import yaml
 
-from gscompleter.errors import InputError, quoted
-from gscompleter.reading import read_bytes
+from gscompleter.errors import InputError, quote_value
+from gscompleter.io.reading import read_bytes
 
-LONGEST_FILE = 65_536
+MAX_CONFIG_BYTES = 65_536
 """Largest size of a settings file, in bytes."""
-LONGEST_REASON = 120
+MAX_REASON_LENGTH = 120
 """Most characters of PyYAML's reason in a sentence."""
 
 
@@ -29,7 +29,7 @@ class PlainLoader(yaml.SafeLoader):
 
 def read_yaml(path: Path) -> dict[str, Any]:
     """Read the mapping in a YAML file, limited to JSON values, or raise InputError."""
-    name, data = f"The config {quoted(path)}", read_bytes(path, LONGEST_FILE)
+    name, data = f"The config {quote_value(path)}", read_bytes(path, MAX_CONFIG_BYTES)
     try:
         content = json.loads(json.dumps(yaml.load(data.decode(), PlainLoader), default=str))
     except RecursionError as error:
@@ -37,7 +37,7 @@ def read_yaml(path: Path) -> dict[str, Any]:
     except Exception as error:  # PyYAML fails in many ways, KeyError and IndexError among them
         mark = getattr(error, "problem_mark", None)
         place = "" if mark is None else f" in line {mark.line + 1}"
-        reason = f"{quoted(getattr(error, 'problem', None) or str(error), LONGEST_REASON)}{place}"
+        reason = f"{quote_value(getattr(error, 'problem', None) or str(error), MAX_REASON_LENGTH)}{place}"
         raise InputError(f"{name} is not YAML: {reason}.") from error
     if content is None:
         return {}

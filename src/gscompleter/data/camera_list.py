@@ -15,24 +15,23 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float
 
-from gscompleter.data.frame import Frame, capital
-from gscompleter.data.image_folders import ImageFinder, with_photographs
-from gscompleter.data.intrinsics import Intrinsics
-from gscompleter.data.json_numbers import array_of, number_of, size_of, text_of
+from gscompleter.data.cameras import Intrinsics, find_pose_defect, make_rigid
+from gscompleter.data.frame import Frame, capitalize
+from gscompleter.data.image_folders import ImageFinder, keep_existing
+from gscompleter.data.json_fields import get_array, get_number, get_size, get_text
 from gscompleter.data.limits import MAX_IN_PIXELS
-from gscompleter.data.photographs import Photographs, photographs_of
-from gscompleter.data.poses import made_rigid, pose_defect
-from gscompleter.errors import InputError, quoted
-from gscompleter.io.json_file import begins_a_list, read_json
+from gscompleter.data.photographs import Photographs, build_photographs
+from gscompleter.errors import InputError, quote_value
+from gscompleter.io.json_file import is_json_list, read_json
 
 NAME = "cameras.json"
 ADVICE = "export the cameras again"
 
 
-def holds_camera_list(path: Path) -> bool:
+def has_camera_list(path: Path) -> bool:
     """Check whether `path` is a JSON list of cameras, or a folder with a `cameras.json`."""
     file = path / NAME if os.path.isdir(path) else path
-    return file.suffix == ".json" and os.path.isfile(file) and begins_a_list(file)
+    return file.suffix == ".json" and os.path.isfile(file) and is_json_list(file)
 
 
 def open_camera_list(path: Path) -> Iterator[Photographs]:
@@ -43,38 +42,42 @@ def open_camera_list(path: Path) -> Iterator[Photographs]:
     """
     file = path / NAME if os.path.isdir(path) else path
     finder = ImageFinder([file.parent])
-    frames = [finder.placed(frame) for frame in read_camera_list(file)]
-    there, notes = with_photographs(frames, str(file))
+    frames = [finder.locate(frame) for frame in read_camera_list(file)]
+    there, notes = keep_existing(frames, str(file))
     name = file.resolve().parent.name if file.name == NAME else file.stem
-    yield replace(photographs_of(name, str(file), there), notes=notes)
+    yield replace(build_photographs(name, str(file), there), notes=notes)
 
 
 def read_camera_list(path: Path) -> list[Frame]:
     """Read the cameras of a JSON list in its order, without photographs."""
     content = read_json(path, ADVICE)
     if not isinstance(content, list) or not content:
-        raise InputError(f"{quoted(path)} lists no cameras; a list of cameras is needed, {ADVICE}.")
-    return [_frame(entry, number, path) for number, entry in enumerate(content)]
+        raise InputError(
+            f"{quote_value(path)} lists no cameras; a list of cameras is needed, {ADVICE}."
+        )
+    return [_parse_frame(entry, number, path) for number, entry in enumerate(content)]
 
 
-def _frame(entry: Any, number: int, path: Path) -> Frame:
-    title = f"camera {number} of {quoted(path)}"
+def _parse_frame(entry: Any, number: int, path: Path) -> Frame:
+    title = f"camera {number} of {quote_value(path)}"
     if not isinstance(entry, dict):
-        raise InputError(f"{capital(title)} is no object with a position and a rotation; {ADVICE}.")
+        raise InputError(
+            f"{capitalize(title)} is no object with a position and a rotation; {ADVICE}."
+        )
     fx, fy = (
-        number_of(entry, key, title, 1 / MAX_IN_PIXELS, MAX_IN_PIXELS) for key in ("fx", "fy")
+        get_number(entry, key, title, 1 / MAX_IN_PIXELS, MAX_IN_PIXELS) for key in ("fx", "fy")
     )
-    name = text_of(entry, "img_name", title) or str(entry.get("id", number))
-    intrinsics = Intrinsics(size_of(entry, title), (fx, fy))
-    frame = Frame(name, title, _pose(entry, title), intrinsics, None)
-    defect = pose_defect(frame.c2w)
+    name = get_text(entry, "img_name", title) or str(entry.get("id", number))
+    intrinsics = Intrinsics(get_size(entry, title), (fx, fy))
+    frame = Frame(name, title, _parse_pose(entry, title), intrinsics, None)
+    defect = find_pose_defect(frame.c2w)
     if defect is not None:
-        raise frame.unusable(defect)
-    return replace(frame, c2w=made_rigid(frame.c2w))
+        raise frame.make_error(defect)
+    return replace(frame, c2w=make_rigid(frame.c2w))
 
 
-def _pose(entry: dict[str, Any], title: str) -> Float[np.ndarray, "4 4"]:
+def _parse_pose(entry: dict[str, Any], title: str) -> Float[np.ndarray, "4 4"]:
     c2w = np.eye(4)
-    c2w[:3, :3] = array_of(entry, "rotation", (3, 3), title)
-    c2w[:3, 3] = array_of(entry, "position", (3,), title)
+    c2w[:3, :3] = get_array(entry, "rotation", (3, 3), title)
+    c2w[:3, 3] = get_array(entry, "position", (3,), title)
     return c2w

@@ -9,15 +9,16 @@ file of cases is JSON: `{"resolution": [h, w], "cases": [{"scene", "context", "t
 from __future__ import annotations
 
 import os
-from collections.abc import Iterator
-from dataclasses import dataclass
+from collections.abc import Iterable, Iterator
+from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
 
-from gscompleter.data.formats import open_photographs
-from gscompleter.data.framing import Resolution
-from gscompleter.data.photographs import Photographs, without_masked
-from gscompleter.errors import InputError, quoted
+from gscompleter.data.ego_vehicle import attach_vehicle_detector
+from gscompleter.data.formats import FORMATS, detect_format, find_format, open_photographs
+from gscompleter.data.photographs import Photographs, PosedPhotographs, apply_masks
+from gscompleter.data.resize import Resolution
+from gscompleter.errors import InputError, quote_value
 from gscompleter.io.json_file import read_json
 from gscompleter.types import View
 
@@ -50,12 +51,12 @@ class Case:
     def load(self, frames: tuple[int, ...]) -> list[View]:
         """Load the photographs of `frames`."""
         scene = open_photographs(self.scene, near=self.near, far=self.far)
-        scene = scene if self.ego_mask else scene.with_ego_vehicle()
+        scene = scene if self.ego_mask else scene.keep_ego_vehicle()
         views = scene.views(frames, self.resolution)
-        return without_masked(views, scene, self.resolution) if self.ignore_masked else views
+        return apply_masks(views, scene, self.resolution) if self.ignore_masked else views
 
 
-def holds_cases(path: Path) -> bool:
+def has_cases(path: Path) -> bool:
     """Check whether `path` is a folder with a `cases.json`, or a JSON file with cases."""
     if os.path.isdir(path):
         return os.path.isfile(path / NAME)
@@ -87,27 +88,76 @@ def read_cases(path: Path) -> list[Case]:
     content = read_json(path, "name a file of cases")
     try:
         height, width = content["resolution"]
-        return [_case(row, (_whole(height), _whole(width)), path) for row in content["cases"]]
+        return [
+            _parse_case(row, (_check_whole(height), _check_whole(width)), path)
+            for row in content["cases"]
+        ]
     except (ValueError, KeyError, TypeError, OverflowError) as error:
         raise InputError(
-            f"{path} is no file of cases ({type(error).__name__}: {quoted(str(error))}); it needs "
+            f"{path} is no file of cases ({type(error).__name__}: {quote_value(str(error))}); it "
+            "needs "
             "resolution and cases, each with scene, context and target."
         ) from error
 
 
-def _case(row: Any, resolution: tuple[int, int], path: Path) -> Case:
+def _parse_case(row: Any, resolution: tuple[int, int], path: Path) -> Case:
     return Case(
         path.parent / row["scene"],
-        tuple(map(_whole, row["context"])),
-        _whole(row["target"]),
-        tuple(map(_whole, row.get("neighbours", ()))),
+        tuple(map(_check_whole, row["context"])),
+        _check_whole(row["target"]),
+        tuple(map(_check_whole, row.get("neighbours", ()))),
         resolution,
         None if row.get("near") is None else float(row["near"]),
         None if row.get("far") is None else float(row["far"]),
     )
 
 
-def _whole(value: Any) -> int:
+def _check_whole(value: Any) -> int:
     if type(value) is not int:
-        raise TypeError(f"{quoted(value)} is no whole number")
+        raise TypeError(f"{quote_value(value)} is no whole number")
     return value
+
+
+P = TypeVar("P", bound=PosedPhotographs)
+
+
+@dataclass(frozen=True)
+class SkippedScene:
+    """A scene that was left out, and why."""
+
+    name: str
+    reason: str
+
+
+def open_clips(path: Path | str) -> Iterator[Photographs]:
+    """Open the scenes in a file or folder of any format, a folder of such, or a `cases.json`.
+
+    For a vehicle with several cameras only the front camera is used. Scenes are read one at a time,
+    so damage raises an InputError while iterating.
+    """
+    path = Path(path)
+    if has_cases(path):
+        return open_cases(path)
+    inside = [] if find_format(path) or not os.path.isdir(path) else sorted(path.iterdir())
+    folders = [child for child in inside if child.is_dir() and find_format(child)]
+    scenes = [(FORMATS[detect_format(place)], place) for place in folders or [path]]
+    clips = (select_front_camera(clip) for format, place in scenes for clip in format.open(place))
+    return (replace(clip, frames=attach_vehicle_detector(clip.frames)) for clip in clips)
+
+
+def select_front_camera(clip: Photographs) -> Photographs:
+    """Keep the frames of the front camera if a vehicle has several cameras."""
+    if clip.front is None:
+        return clip
+    ahead = tuple(frame for frame in clip.frames if frame.sensor == clip.front)
+    return replace(clip, frames=ahead)
+
+
+def filter_usable(clips: Iterable[P], skipped: list[SkippedScene]) -> Iterator[P]:
+    """Yield the scenes that benchmarks keep, and append the others to `skipped`."""
+    for clip in clips:
+        reason = clip.find_skip_reason()
+        if reason is None:
+            yield clip
+        else:
+            skipped.append(SkippedScene(clip.name, reason))

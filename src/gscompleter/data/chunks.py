@@ -19,22 +19,22 @@ import torch
 from torch import Tensor
 
 from gscompleter.data.frame import Frame
-from gscompleter.data.photographs import Photographs, photographs_of
-from gscompleter.data.real_estate import intrinsics_and_pose
-from gscompleter.errors import InputError, quoted, refuse_pointer
+from gscompleter.data.photographs import Photographs, build_photographs
+from gscompleter.data.real_estate import parse_camera_row
+from gscompleter.errors import InputError, quote_value, refuse_pointer
 from gscompleter.io.json_file import read_json
-from gscompleter.reading import check_file
+from gscompleter.io.reading import check_file
 
 TEST = "test"
 """Folder of the test split of a data set."""
 INDEX = "index.json"
 
 
-def holds_chunks(path: Path) -> bool:
+def has_chunks(path: Path) -> bool:
     """Check whether `path` is a chunk, an index of chunks, or a folder with either."""
     if os.path.isfile(path):
         return path.suffix == ".torch" or path.name == INDEX
-    return _folder_of(path) is not None
+    return _find_folder(path) is not None
 
 
 def open_chunks(path: Path) -> Iterator[Photographs]:
@@ -44,24 +44,24 @@ def open_chunks(path: Path) -> Iterator[Photographs]:
     `test`, an index, or one chunk. Damage inside a chunk raises an InputError while iterating.
     """
     if path.suffix == ".torch":
-        return _scenes_of(path)
-    folder = path.parent if path.name == INDEX else _folder_of(path)
+        return _open_chunk(path)
+    folder = path.parent if path.name == INDEX else _find_folder(path)
     if folder is None:
         raise InputError(
             f"There are no chunks in {path}; name a folder with an {INDEX} or .torch files, a "
             f"folder with such a folder {TEST}, or a single .torch file."
         )
     if os.path.isfile(folder / INDEX):
-        return _indexed(folder / INDEX)
-    return (scene for chunk in sorted(folder.glob("*.torch")) for scene in _scenes_of(chunk))
+        return _open_index(folder / INDEX)
+    return (scene for chunk in sorted(folder.glob("*.torch")) for scene in _open_chunk(chunk))
 
 
-def _folder_of(path: Path) -> Path | None:
+def _find_folder(path: Path) -> Path | None:
     folders = (path, path / TEST)
     return next((f for f in folders if os.path.isfile(f / INDEX) or any(f.glob("*.torch"))), None)
 
 
-def _indexed(index: Path) -> Iterator[Photographs]:
+def _open_index(index: Path) -> Iterator[Photographs]:
     content = read_json(index, "download it again")
     if (
         not isinstance(content, dict)
@@ -75,31 +75,31 @@ def _indexed(index: Path) -> Iterator[Photographs]:
     return (
         scene
         for chunk in sorted(set(content.values()))
-        for scene in _checked(index.parent / chunk, content, index)
+        for scene in _open_listed_chunk(index.parent / chunk, content, index)
     )
 
 
-def _checked(path: Path, content: Mapping[str, str], index: Path) -> list[Photographs]:
+def _open_listed_chunk(path: Path, content: Mapping[str, str], index: Path) -> list[Photographs]:
     """Open the scenes of a chunk and compare their names with the index."""
-    scenes = list(_scenes_of(path))
+    scenes = list(_open_chunk(path))
     names = {scene.name for scene in scenes}
     listed = {name for name, chunk in content.items() if index.parent / chunk == path}
     for name in sorted(listed - names):
         raise InputError(
-            f"{index} lists the scene {quoted(name)} in {path}, which does not hold it; "
+            f"{index} lists the scene {quote_value(name)} in {path}, which does not hold it; "
             "write the index again, or download the chunk again."
         )
     for name in sorted(names - listed):
         raise InputError(
-            f"{path} holds the scene {quoted(name)}, which is absent from {index}; write the "
+            f"{path} holds the scene {quote_value(name)}, which is absent from {index}; write the "
             "index again, or name the chunk itself."
         )
     return scenes
 
 
-def _scenes_of(path: Path) -> Iterator[Photographs]:
+def _open_chunk(path: Path) -> Iterator[Photographs]:
     return (
-        _photographs(example, path, position) for position, example in enumerate(_load_chunk(path))
+        _parse_scene(example, path, position) for position, example in enumerate(_load_chunk(path))
     )
 
 
@@ -121,7 +121,7 @@ def _read_chunk(path: Path, _written: int) -> list[Any]:
         raise InputError(f"{path} cannot be read: {error.strerror}; make it readable.") from error
     # Damaged bytes can raise any exception.
     except Exception as error:
-        raise InputError(_cannot_load(path, error)) from error
+        raise InputError(_explain_load_error(path, error)) from error
     if not isinstance(content, list) or not content:
         raise InputError(
             f"{path} is no chunk: a list of scenes is needed, and it holds "
@@ -130,7 +130,7 @@ def _read_chunk(path: Path, _written: int) -> list[Any]:
     return content
 
 
-def _cannot_load(path: Path, error: Exception) -> str:
+def _explain_load_error(path: Path, error: Exception) -> str:
     if "GLOBAL" in str(error):
         return (
             f"{path} holds pickled Python objects, which are refused because loading them can "
@@ -141,16 +141,16 @@ def _cannot_load(path: Path, error: Exception) -> str:
     return f"{path} is truncated or no file of torch.save; download it again."
 
 
-def _photographs(example: Any, path: Path, position: int) -> Photographs:
+def _parse_scene(example: Any, path: Path, position: int) -> Photographs:
     """Check a scene without decoding its images."""
     entries = example if isinstance(example, dict) else {}
     name, cameras, images = (entries.get(key) for key in ("key", "cameras", "images"))
     if not isinstance(name, str) or not name:
         raise InputError(f"Scene {position} of {path} has no `key`; write the chunk again with it.")
-    called = f"scene {quoted(name)} of {path}"
+    called = f"scene {quote_value(name)} of {path}"
     if not (_is_dense(cameras, ndim=2) and cameras.is_floating_point() and cameras.shape[1] == 18):
         raise InputError(
-            f"The `cameras` of the {called} are {_described(cameras)}; floats of shape [n, 18] "
+            f"The `cameras` of the {called} are {_describe(cameras)}; floats of shape [n, 18] "
             "are needed."
         )
     if not isinstance(images, list) or len(images) == 0:
@@ -163,19 +163,19 @@ def _photographs(example: Any, path: Path, position: int) -> Photographs:
     for number, image in enumerate(images):
         if not _is_dense(image, ndim=1) or image.dtype != torch.uint8:
             raise InputError(
-                f"Image {number} of the {called} is {_described(image)}; the bytes of a JPEG or "
+                f"Image {number} of the {called} is {_describe(image)}; the bytes of a JPEG or "
                 "PNG file are needed, uint8 of one dimension."
             )
     frames = []
     for number, row in enumerate(cameras.detach().double().numpy()):
-        intrinsics, c2w = intrinsics_and_pose(row)
-        image = partial(_image_bytes, path, position, number)
+        intrinsics, c2w = parse_camera_row(row)
+        image = partial(_read_image_bytes, path, position, number)
         title = f"frame {number} of the {called}"
         frames.append(Frame(str(number), title, c2w, intrinsics, image))
-    return photographs_of(name, f"the {called}", frames)
+    return build_photographs(name, f"the {called}", frames)
 
 
-def _image_bytes(path: Path, position: int, number: int) -> bytes:
+def _read_image_bytes(path: Path, position: int, number: int) -> bytes:
     """Copy the bytes of one image, so that the chunk can leave memory."""
     data: bytes = _load_chunk(path)[position]["images"][number].detach().numpy().tobytes()
     return data
@@ -190,11 +190,11 @@ def _is_dense(value: Any, ndim: int) -> TypeGuard[Tensor]:
     return value.untyped_storage().nbytes() >= value.numel() * value.element_size()
 
 
-def _described(value: Any) -> str:
+def _describe(value: Any) -> str:
     if isinstance(value, Tensor):
         if value.is_nested:
             return "a nested tensor"
         kind = "" if _is_dense(value, value.ndim) else "sparse or empty "
-        shape = quoted(list(value.shape))
+        shape = quote_value(list(value.shape))
         return f"{kind}{str(value.dtype).removeprefix('torch.')} of shape {shape}"
     return f"of type {type(value).__name__}"

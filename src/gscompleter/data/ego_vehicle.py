@@ -18,9 +18,9 @@ import numpy as np
 from jaxtyping import Bool, Float, Int
 from numpy.lib.stride_tricks import sliding_window_view
 
+from gscompleter.data.cameras import find_pose_defect
 from gscompleter.data.frame import Frame
-from gscompleter.data.lens import Pinhole
-from gscompleter.data.poses import pose_defect
+from gscompleter.data.undistort import Pinhole
 from gscompleter.errors import InputError
 
 FEWEST, MOST = 6, 12
@@ -29,19 +29,19 @@ SIDE, MIN_SIDE = 256, 16
 """Longer side of the small copies, and smallest shorter side, in pixels."""
 MAX_TURN = 25.0
 """Largest deviation of the travel direction and the down axis from their means, in degrees."""
-STEADY = 0.8
+MIN_STEADY_SHARE = 0.8
 """Smallest share of the photographs within `MAX_TURN`."""
 MIN_GRADIENT = 2.5
 """Smallest brightness gradient of an edge, in 256ths per pixel."""
-PERSISTENT = 0.7
+MIN_STATIC_SHARE = 0.7
 """Smallest share of the photographs in which a static edge has the same direction."""
-ACROSS = 0.4
+MIN_CROSSING = 0.4
 """Smallest cosine between an edge normal and the ground's motion that would move the edge."""
 HORIZON = 0.1
 """First row of the ground below the vanishing point, as a share of the image height."""
 STRICT, LENIENT = 0.55, 0.4
 """Cost per column of an outline: to detect a vehicle, and to follow a faint outline."""
-STEEPEST = 4
+MAX_ROW_STEP = 4
 """Largest change of the outline from one column to the next, in rows."""
 BEND_COST = 0.1
 """Cost of each such row, relative to an edge that is static in every photograph."""
@@ -51,11 +51,11 @@ MIN_SUPPORT = 0.6
 """Smallest static share of the length of an outline."""
 MIN_AREA, MAX_AREA = 0.01, 0.5
 """Smallest and largest share of the image that a vehicle covers."""
-MAX_STAYING = 0.3
+MAX_STATIC_ELSEWHERE = 0.3
 """Largest static share of the edges elsewhere; above it the camera hardly moves."""
-CLEAR = 4
+CLEARANCE = 4
 """Rows between two outlines, and between an outline and other edges, in small copies."""
-DENT = 0.12
+MAX_DIP_WIDTH = 0.12
 """Largest width of a dip of the outline that is filled, as a share of the columns."""
 MARGIN = 1
 """Rows added above the outline, in pixels of the small copies."""
@@ -80,10 +80,12 @@ class EgoVehicle:
         if len(small) < FEWEST or min(small[0][1].shape) < MIN_SIDE:
             return None
         size = small[0][0].size()
-        if small[0][0].defect(*size) is not None:
+        if small[0][0].find_defect(*size) is not None:
             return None
         images = np.stack([image for _, image in small])
-        flow, first = ground_flow(motion, small[0][0].intrinsics.at(*size), images.shape[1:])
+        flow, first = predict_ground_flow(
+            motion, small[0][0].intrinsics.compute_pinhole(*size), images.shape[1:]
+        )
         return find_static_region(images, flow, first)
 
 
@@ -92,13 +94,13 @@ def read_small(frames: Sequence[Frame]) -> list[tuple[Frame, Float[np.ndarray, "
     found = []
     for frame in frames:
         with suppress(InputError):
-            found.append((frame, frame.small_pixels(SIDE)))
+            found.append((frame, frame.load_small_pixels(SIDE)))
     sizes = [image.shape for _, image in found]
     usual = max(dict.fromkeys(sizes), key=sizes.count, default=None)
     return [(frame, image) for frame, image in found if image.shape == usual]
 
 
-def looking_for_vehicle(frames: Sequence[Frame]) -> tuple[Frame, ...]:
+def attach_vehicle_detector(frames: Sequence[Frame]) -> tuple[Frame, ...]:
     """Attach a lazy vehicle detector to each frame."""
     cameras: dict[Hashable, list[Frame]] = {}
     for frame in frames:
@@ -111,19 +113,19 @@ def select_frames(
     frames: Sequence[Frame],
 ) -> tuple[list[Frame], Float[np.ndarray, "3"] | None]:
     """Select evenly spaced photographs and the travel direction in camera axes, or None."""
-    usable = [f for f in frames if pose_defect(f.c2w) is None and f.has_photograph()]
+    usable = [f for f in frames if find_pose_defect(f.c2w) is None and f.has_photograph()]
     if len(usable) < FEWEST:
         return [], None
     poses = np.stack([frame.c2w for frame in usable])
     steps = np.linalg.norm(np.diff(poses[:, :3, 3], axis=0), axis=1)
-    motion = steady_motion(poses, steps)
+    motion = estimate_motion(poses, steps)
     way = np.concatenate([[0.0], np.cumsum(steps)])
     places = np.searchsorted(way, np.linspace(0, way[-1], MOST))
     chosen = [usable[index] for index in dict.fromkeys(places.tolist())]
     return chosen, None if len(chosen) < FEWEST else motion
 
 
-def steady_motion(
+def estimate_motion(
     poses: Float[np.ndarray, "n 4 4"], steps: Float[np.ndarray, "n-1"]
 ) -> Float[np.ndarray, "3"] | None:
     """Estimate the travel direction in camera axes; None if it varies or the camera tilts.
@@ -134,20 +136,20 @@ def steady_motion(
         return None
     moving = steps > 0.1 * np.median(steps[steps > 0])
     moves = np.einsum("nji,nj->ni", poses[:-1, :3, :3], np.diff(poses[:, :3, 3], axis=0))
-    travel, down = mean_direction(moves[moving]), mean_direction(poses[:, :3, 1])
+    travel, down = average_directions(moves[moving]), average_directions(poses[:, :3, 1])
     return None if travel is None or down is None else travel
 
 
-def mean_direction(vectors: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "3"] | None:
+def average_directions(vectors: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "3"] | None:
     """Average directions; None if they are not steady."""
     units = vectors / np.linalg.norm(vectors, axis=1, keepdims=True)
     mean = np.median(units, axis=0)
     length = np.linalg.norm(mean)
     near = units @ mean >= length * np.cos(np.radians(MAX_TURN))
-    return mean / length if length > 0 and near.mean() >= STEADY else None
+    return mean / length if length > 0 and near.mean() >= MIN_STEADY_SHARE else None
 
 
-def ground_flow(
+def predict_ground_flow(
     motion: Float[np.ndarray, "3"], pinhole: Pinhole, shape: tuple[int, ...]
 ) -> tuple[Float[np.ndarray, "h w 2"], int]:
     """Predict the image motion of the static scene (unit x, y) and the first row of near ground.
@@ -156,7 +158,7 @@ def ground_flow(
     copies. Lens distortion, which turns these directions slightly, is ignored.
     """
     height, width = shape
-    small = pinhole.resized(width, height)
+    small = pinhole.resize(width, height)
     y, x = np.mgrid[:height, :width] + 0.5
     right = (x - small.cx) * motion[2] - small.fl_x * motion[0]
     down = (y - small.cy) * motion[2] - small.fl_y * motion[1]
@@ -171,11 +173,11 @@ def ground_flow(
 class Edges:
     """Edge statistics of the photographs of one camera, per pixel."""
 
-    occurring: Float[np.ndarray, "h w"]
+    edge_share: Float[np.ndarray, "h w"]
     """Share of the photographs with an edge there."""
-    staying: Float[np.ndarray, "h w"]
+    static_share: Float[np.ndarray, "h w"]
     """Share of the photographs with an edge of the same direction there."""
-    across: Float[np.ndarray, "h w"]
+    crossing: Float[np.ndarray, "h w"]
     """Cosine between the normal of the static edge and the motion of the ground."""
 
 
@@ -191,19 +193,19 @@ def find_static_region(
     edges, (height, width) = find_edges(images, flow), images.shape[1:]
     found, limit = np.full(width, height), np.full(width, height)
     while is_vehicle(edges, outline := trace_outline(edges, first, limit, STRICT)):
-        top = max(first, int(outline.min()) - CLEAR)
+        top = max(first, int(outline.min()) - CLEARANCE)
         fainter = trace_outline(edges, top, limit, LENIENT)
         found = np.minimum(found, np.minimum(outline, fainter))
-        limit = np.where(found < height, found - CLEAR, height)
+        limit = np.where(found < height, found - CLEARANCE, height)
     if (found == height).all():
         return None
-    filled = without_dents(found)
-    return below(np.where(filled < height, filled - MARGIN, height), height)
+    filled = fill_dips(found)
+    return fill_below(np.where(filled < height, filled - MARGIN, height), height)
 
 
-def without_dents(outline: Int[np.ndarray, "w"]) -> Int[np.ndarray, "w"]:
+def fill_dips(outline: Int[np.ndarray, "w"]) -> Int[np.ndarray, "w"]:
     """Fill narrow dips of an outline."""
-    window = np.ones((1, math.ceil(DENT * len(outline))), np.uint8)
+    window = np.ones((1, math.ceil(MAX_DIP_WIDTH * len(outline))), np.uint8)
     rows = np.pad(outline, len(outline) // 2, mode="edge").astype(np.float32)[None]
     filled = cv2.morphologyEx(rows, cv2.MORPH_OPEN, window)[0]
     return filled[len(outline) // 2 :][: len(outline)].astype(np.int64)
@@ -232,16 +234,18 @@ def trace_outline(
     to an edge that is static in every photograph; the lower image border has neither cost nor
     reward.
     """
-    height, width = edges.staying.shape
+    height, width = edges.static_share.shape
     rows = np.arange(height)[:, None]
-    reward = edges.staying * (0.5 + 0.5 * edges.across) - cost
+    reward = edges.static_share * (0.5 + 0.5 * edges.crossing) - cost
     reward = np.where((rows >= first) & (rows < limit), reward, -1.0)
     reward = np.concatenate([reward, np.zeros((1, width))])  # lower border: no vehicle
-    bends = np.array([0, *range(-STEEPEST, 0), *range(1, STEEPEST + 1)])  # argmax takes the first
+    bends = np.array(
+        [0, *range(-MAX_ROW_STEP, 0), *range(1, MAX_ROW_STEP + 1)]
+    )  # argmax takes the first
     total, came = reward[:, 0], np.zeros((height + 1, width), np.int64)
     for column in range(1, width):
-        padded = np.pad(total, STEEPEST, constant_values=-np.inf)
-        reached = sliding_window_view(padded, height + 1)[STEEPEST + bends]
+        padded = np.pad(total, MAX_ROW_STEP, constant_values=-np.inf)
+        reached = sliding_window_view(padded, height + 1)[MAX_ROW_STEP + bends]
         reached = reached - BEND_COST * np.abs(bends)[:, None]
         came[:, column] = np.arange(height + 1) + bends[reached.argmax(axis=0)]
         total = reached.max(axis=0) + reward[:, column]
@@ -254,27 +258,27 @@ def trace_outline(
 
 def is_vehicle(edges: Edges, outline: Int[np.ndarray, "w"]) -> bool:
     """Decide whether the region below an outline moves with the camera."""
-    height, width = edges.staying.shape
-    inside = below(outline, height)
+    height, width = edges.static_share.shape
+    inside = fill_below(outline, height)
     if not MIN_AREA <= inside.mean() <= MAX_AREA:
         return False
     columns = np.nonzero(outline < height)[0]
     rows = outline[columns]
-    kept = edges.staying >= PERSISTENT
-    across = kept & (edges.across >= ACROSS)
-    staying, staying_across = (near_rows(mask)[rows, columns] for mask in (kept, across))
+    kept = edges.static_share >= MIN_STATIC_SHARE
+    across = kept & (edges.crossing >= MIN_CROSSING)
+    staying, staying_across = (dilate_rows(mask)[rows, columns] for mask in (kept, across))
     if staying.mean() < MIN_SUPPORT or staying_across.sum() < MIN_WIDTH * width:
         return False
-    elsewhere = ~below(outline - CLEAR, height)
-    occurring = np.where(elsewhere, edges.occurring, 0)
-    return bool(occurring[kept].sum() <= MAX_STAYING * occurring.sum())
+    elsewhere = ~fill_below(outline - CLEARANCE, height)
+    occurring = np.where(elsewhere, edges.edge_share, 0)
+    return bool(occurring[kept].sum() <= MAX_STATIC_ELSEWHERE * occurring.sum())
 
 
-def near_rows(mask: Bool[np.ndarray, "h w"]) -> Bool[np.ndarray, "h w"]:
+def dilate_rows(mask: Bool[np.ndarray, "h w"]) -> Bool[np.ndarray, "h w"]:
     """Dilate a mask by one row upward and downward."""
     return cv2.dilate(mask.astype(np.uint8), np.ones((3, 1), np.uint8)) > 0
 
 
-def below(outline: Int[np.ndarray, "w"], height: int) -> Bool[np.ndarray, "h w"]:
+def fill_below(outline: Int[np.ndarray, "w"], height: int) -> Bool[np.ndarray, "h w"]:
     """Fill the region from each column's outline row downward."""
     return np.arange(height)[:, None] >= outline

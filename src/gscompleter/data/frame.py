@@ -10,18 +10,17 @@ from pathlib import Path
 import numpy as np
 from jaxtyping import Bool, Float, UInt8
 
-from gscompleter.data.intrinsics import FRACTIONS, Intrinsics, pinhole_defect
-from gscompleter.data.lens import Pinhole, undistorted
+from gscompleter.data.cameras import FRACTIONS, Intrinsics, find_pinhole_defect, find_pose_defect
+from gscompleter.data.driving.moving_objects import Box
 from gscompleter.data.limits import MAX_SIDE
-from gscompleter.data.moving_objects import Box
-from gscompleter.data.poses import pose_defect
-from gscompleter.errors import InputError, quoted
-from gscompleter.io.image import decode_pixels, image_size, read_brightness, read_pixels
+from gscompleter.data.undistort import Pinhole, undistort_pinhole
+from gscompleter.errors import InputError, quote_value
+from gscompleter.io.image import decode_pixels, read_brightness, read_image_size, read_pixels
 
 ENDINGS = ("", ".png", ".jpg", ".jpeg")
 """Image file endings tried for names without one."""
 
-DOWNSCALED = (2, 4, 8)
+DOWNSCALE_FACTORS = (2, 4, 8)
 """Downscaling factors of folders such as `images_4`."""
 
 
@@ -46,14 +45,14 @@ class Frame:
     """Mask image; black pixels are ignored."""
     sensor: str | None = None
     """Name of the vehicle's camera, or None for a single camera."""
-    measured: Callable[[], Float[np.ndarray, "n 3"]] | None = None
+    laser_points: Callable[[], Float[np.ndarray, "n 3"]] | None = None
     """Reads laser points of about that time, in the frame of the poses."""
     boxes: Callable[[], tuple[Box, ...]] | None = None
     """Reads boxes of objects at about that time, in the frame of the poses."""
     vehicle: Callable[[], Bool[np.ndarray, "h w"] | None] | None = None
     """Detects the vehicle that carries the camera, as a mask of any size; None to keep it."""
 
-    def stored(self) -> Path | bytes | None:
+    def find_stored(self) -> Path | bytes | None:
         """Return the image file or its bytes; None if there is none."""
         if isinstance(self.image, Path):
             return find_image(self.image)
@@ -65,10 +64,10 @@ class Frame:
             return find_image(self.image) is not None
         return self.image is not None
 
-    def stored_size(self) -> tuple[int, int] | None:
+    def read_stored_size(self) -> tuple[int, int] | None:
         """Read width and height of the photograph; None if there is none."""
-        stored = self.stored()
-        return None if stored is None else image_size(stored, capital(self.title))
+        stored = self.find_stored()
+        return None if stored is None else read_image_size(stored, capitalize(self.title))
 
     def size(self) -> tuple[int, int]:
         """Return width and height of the photograph, or else those of the camera file.
@@ -77,7 +76,7 @@ class Frame:
         """
         stated = None if self.intrinsics.size == FRACTIONS else self.intrinsics.size
         within = self.image is not None and not isinstance(self.image, Path)
-        size = stated if within and stated is not None else self.stored_size() or stated
+        size = stated if within and stated is not None else self.read_stored_size() or stated
         if size is None:
             raise InputError(
                 f"The size of {self.title} is not known, because it has no image and no `w` and "
@@ -85,54 +84,54 @@ class Frame:
             )
         return size
 
-    def needed(self) -> Path | bytes:
+    def require_stored(self) -> Path | bytes:
         """Return the image file or its bytes, or raise an InputError if there is none."""
-        stored = self.stored()
+        stored = self.find_stored()
         if stored is None:
-            place = "restore it" if self.image is None else f"put it at {quoted(self.image)}"
+            place = "restore it" if self.image is None else f"put it at {quote_value(self.image)}"
             raise InputError(
                 f"The image of {self.title} is missing; {place}, or choose another frame."
             )
         return stored
 
-    def pixels(self) -> UInt8[np.ndarray, "h w 3"]:
+    def load_pixels(self) -> UInt8[np.ndarray, "h w 3"]:
         """Read the photograph as it is stored."""
-        stored = self.needed()
+        stored = self.require_stored()
         if isinstance(stored, bytes):
-            return decode_pixels(stored, capital(self.title))
+            return decode_pixels(stored, capitalize(self.title))
         return read_pixels(stored)
 
-    def small_pixels(self, side: int) -> Float[np.ndarray, "h w"]:
+    def load_small_pixels(self, side: int) -> Float[np.ndarray, "h w"]:
         """Read brightness in [0, 255], shrunk to at most `side` pixels on the longer side."""
-        return read_brightness(self.needed(), side, capital(self.title))
+        return read_brightness(self.require_stored(), side, capitalize(self.title))
 
-    def defect(self, width: int, height: int) -> str | None:
+    def find_defect(self, width: int, height: int) -> str | None:
         """Describe why the camera is impossible at this photograph size; None if it is valid."""
         if max(width, height) > MAX_SIDE:
             return f"its {width} × {height} pixels have a side above {MAX_SIDE}"
-        if self.intrinsics.transposed(width, height):
+        if self.intrinsics.is_transposed(width, height):
             w, h = self.intrinsics.size or (width, height)
             return f"its image has {width} × {height} pixels, but its `w` and `h` are {w} × {h}"
-        pinhole = self.intrinsics.at(width, height)
-        defect = pose_defect(self.c2w) or pinhole_defect(pinhole)
-        if defect is None and undistorted(pinhole, self.intrinsics.distortion) is None:
+        pinhole = self.intrinsics.compute_pinhole(width, height)
+        defect = find_pose_defect(self.c2w) or find_pinhole_defect(pinhole)
+        if defect is None and undistort_pinhole(pinhole, self.intrinsics.distortion) is None:
             return "its distortion coefficients fold the image over itself"
         return defect
 
-    def pinholes(self, width: int, height: int) -> tuple[Pinhole, Pinhole]:
+    def compute_pinholes(self, width: int, height: int) -> tuple[Pinhole, Pinhole]:
         """Return the intrinsics at this photograph size, before and after undistortion."""
-        defect = self.defect(width, height)
+        defect = self.find_defect(width, height)
         if defect is not None:
-            raise self.unusable(defect)
-        pinhole = self.intrinsics.at(width, height)
-        new = undistorted(pinhole, self.intrinsics.distortion)
+            raise self.make_error(defect)
+        pinhole = self.intrinsics.compute_pinhole(width, height)
+        new = undistort_pinhole(pinhole, self.intrinsics.distortion)
         assert new is not None
         return pinhole, new
 
-    def unusable(self, defect: str) -> InputError:
+    def make_error(self, defect: str) -> InputError:
         """Build the error for a frame with this defect."""
         return InputError(
-            f"{capital(self.title)} cannot be used, because {defect}; correct it, or leave "
+            f"{capitalize(self.title)} cannot be used, because {defect}; correct it, or leave "
             "the frame out."
         )
 
@@ -145,11 +144,11 @@ def find_image(path: Path) -> Path | None:
     """
     folders = [path.parent]
     if path.parent.name == "images":
-        folders += [path.parent.with_name(f"{path.parent.name}_{n}") for n in DOWNSCALED]
+        folders += [path.parent.with_name(f"{path.parent.name}_{n}") for n in DOWNSCALE_FACTORS]
     candidates = [folder / (path.name + ending) for folder in folders for ending in ENDINGS]
     return next((candidate for candidate in candidates if os.path.isfile(candidate)), None)
 
 
-def capital(text: str) -> str:
+def capitalize(text: str) -> str:
     """Capitalize the first letter."""
     return text[:1].upper() + text[1:]

@@ -11,12 +11,12 @@ from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path, PurePosixPath
 
-from gscompleter.data.frame import DOWNSCALED, ENDINGS, Frame
-from gscompleter.errors import InputError, quoted
+from gscompleter.data.frame import DOWNSCALE_FACTORS, ENDINGS, Frame
+from gscompleter.errors import InputError, quote_value
 
 ORIGINALS = "input"
 """Folder of photographs before undistortion, as in the scripts of 3DGS."""
-FOLDERS = ("images", *(f"images_{n}" for n in DOWNSCALED), ORIGINALS)
+FOLDERS = ("images", *(f"images_{n}" for n in DOWNSCALE_FACTORS), ORIGINALS)
 """Usual folders of photographs, in search order."""
 MASKS = "masks"
 MAX_NAMED = 3
@@ -28,7 +28,7 @@ def find_path(folder: Path, relative: str) -> Path | None:
     return _Listings().find(folder, relative)
 
 
-def image_folders(roots: Sequence[Path], order: Sequence[str] = FOLDERS) -> list[Path]:
+def list_image_folders(roots: Sequence[Path], order: Sequence[str] = FOLDERS) -> list[Path]:
     """List the folders below `roots` (nearest first) that may hold photographs, likeliest first."""
     found = [find_path(root, name) for root in roots for name in order]
     return [folder for folder in found if folder is not None and folder.is_dir()] + list(roots)
@@ -39,43 +39,43 @@ class ImageFinder:
 
     def __init__(self, roots: Sequence[Path], order: Sequence[str] = FOLDERS) -> None:
         masks = [find_path(root, MASKS) for root in roots]
-        self.folders = image_folders(roots, order)
+        self.folders = list_image_folders(roots, order)
         self.masks = [folder for folder in masks if folder is not None]
         self.listings = _Listings()
 
-    def placed(self, frame: Frame) -> Frame:
+    def locate(self, frame: Frame) -> Frame:
         """Return the frame with the paths of its photograph and mask, if they exist."""
         name = PurePosixPath(frame.name)
         masks = (f"{name}.png", f"{name.parent / name.stem}.png")
         photographs = [frame.name + ending for ending in ENDINGS]
         return replace(
-            frame, image=self._file(self.folders, photographs), mask=self._file(self.masks, masks)
+            frame,
+            image=self._find_file(self.folders, photographs),
+            mask=self._find_file(self.masks, masks),
         )
 
-    def _file(self, folders: Sequence[Path], names: Sequence[str]) -> Path | None:
+    def _find_file(self, folders: Sequence[Path], names: Sequence[str]) -> Path | None:
         found = (self.listings.find(folder, name) for folder in folders for name in names)
         return next((path for path in found if path is not None and os.path.isfile(path)), None)
 
 
-def with_photographs(
-    frames: Sequence[Frame], title: str
-) -> tuple[tuple[Frame, ...], tuple[str, ...]]:
+def keep_existing(frames: Sequence[Frame], title: str) -> tuple[tuple[Frame, ...], tuple[str, ...]]:
     """Keep the frames whose photograph exists, sorted by name, and note the missing ones."""
     there = sorted((frame for frame in frames if frame.image), key=lambda frame: frame.name)
     missing = sorted(frame.name for frame in frames if not frame.image)
     if not there:
-        example = f" under names such as {quoted(missing[0])}" if missing else ""
+        example = f" under names such as {quote_value(missing[0])}" if missing else ""
         raise InputError(
             f"None of the {len(frames)} photographs of {title} is there; put them into a folder "
             f"`{FOLDERS[0]}` beside it{example}."
         )
-    return tuple(there), _note(missing, len(frames), title)
+    return tuple(there), _note_missing(missing, len(frames), title)
 
 
-def _note(missing: Sequence[str], total: int, title: str) -> tuple[str, ...]:
+def _note_missing(missing: Sequence[str], total: int, title: str) -> tuple[str, ...]:
     if not missing:
         return ()
-    names = ", ".join(quoted(name) for name in missing[:MAX_NAMED])
+    names = ", ".join(quote_value(name) for name in missing[:MAX_NAMED])
     rest = ", …" if len(missing) > MAX_NAMED else ""
     verb = "is" if len(missing) == 1 else "are"
     return (
@@ -88,24 +88,26 @@ class _Listings:
     """Cache of folder contents by case-folded name."""
 
     def __init__(self) -> None:
-        self.known: dict[Path, dict[str, str]] = {}
+        self.names_by_folder: dict[Path, dict[str, str]] = {}
 
     def find(self, folder: Path, relative: str) -> Path | None:
         if os.path.exists(folder / relative):
             return folder / relative
         found = folder
         for part in PurePosixPath(relative).parts:
-            name = self._entries(found).get(part.casefold())
+            name = self._list_entries(found).get(part.casefold())
             if name is None:
                 return None
             found = found / name
         return found
 
-    def _entries(self, folder: Path) -> dict[str, str]:
-        if folder not in self.known:
+    def _list_entries(self, folder: Path) -> dict[str, str]:
+        if folder not in self.names_by_folder:
             try:
                 names = os.listdir(folder)
             except (OSError, ValueError):
                 names = []
-            self.known[folder] = {name.casefold(): name for name in sorted(names, reverse=True)}
-        return self.known[folder]
+            self.names_by_folder[folder] = {
+                name.casefold(): name for name in sorted(names, reverse=True)
+            }
+        return self.names_by_folder[folder]

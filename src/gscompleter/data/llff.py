@@ -17,24 +17,32 @@ from tokenize import TokenError
 import numpy as np
 from jaxtyping import Float, Shaped
 
+from gscompleter.data.cameras import Intrinsics
 from gscompleter.data.frame import Frame
-from gscompleter.data.image_folders import image_folders
-from gscompleter.data.intrinsics import Intrinsics
+from gscompleter.data.image_folders import list_image_folders
 from gscompleter.data.limits import DEPTH_RANGE, MAX_SIDE
-from gscompleter.data.photographs import Photographs, photographs_of
-from gscompleter.data.sparse_points import with_room
-from gscompleter.errors import InputError, quoted
-from gscompleter.reading import check_file
+from gscompleter.data.photographs import Photographs, build_photographs
+from gscompleter.data.points import widen_depth_range
+from gscompleter.errors import InputError, quote_value
+from gscompleter.io.reading import check_file
 
 NAME = "poses_bounds.npy"
 IMAGES = (".jpg", ".jpeg", ".png")
 MAX_BYTES = 1 << 26
 """Largest array in bytes, about half a million cameras."""
 
-_NO_ARRAY = (ValueError, TypeError, EOFError, OverflowError, MemoryError, SyntaxError, TokenError)
+_ARRAY_ERRORS = (
+    ValueError,
+    TypeError,
+    EOFError,
+    OverflowError,
+    MemoryError,
+    SyntaxError,
+    TokenError,
+)
 
 
-def holds_llff(path: Path) -> bool:
+def has_llff(path: Path) -> bool:
     """Check whether `path` is a `poses_bounds.npy`, or a folder with one."""
     return os.path.isfile(path / NAME) or (path.name.endswith(NAME) and os.path.isfile(path))
 
@@ -47,15 +55,17 @@ def open_llff(path: Path) -> Iterator[Photographs]:
     """
     file = path / NAME if os.path.isdir(path) else path
     rows = _read_rows(file)
-    images = _photographs_beside(file, len(rows))
+    images = _find_photographs(file, len(rows))
     numbered = enumerate(zip(images, rows, strict=True))
-    frames = [_frame(image, row, f"row {n} of {quoted(file)}") for n, (image, row) in numbered]
-    near, far = with_room(float(rows[:, 15].min()), float(rows[:, 16].max()))
-    scene = photographs_of(file.resolve().parent.name, str(file), frames)
+    frames = [
+        _parse_frame(image, row, f"row {n} of {quote_value(file)}") for n, (image, row) in numbered
+    ]
+    near, far = widen_depth_range(float(rows[:, 15].min()), float(rows[:, 16].max()))
+    scene = build_photographs(file.resolve().parent.name, str(file), frames)
     yield replace(scene, near=near, far=far)
 
 
-def _frame(image: Path, row: Float[np.ndarray, "17"], title: str) -> Frame:
+def _parse_frame(image: Path, row: Float[np.ndarray, "17"], title: str) -> Frame:
     down, right, back, center, (height, width, focal) = row[:15].reshape(3, 5).T
     if not all(1 <= side <= MAX_SIDE and side == int(side) for side in (height, width)):
         raise InputError(
@@ -69,11 +79,11 @@ def _frame(image: Path, row: Float[np.ndarray, "17"], title: str) -> Frame:
 
 
 def _read_rows(path: Path) -> Float[np.ndarray, "n 17"]:
-    stored = _stored_array(path)
+    stored = _map_array(path)
     fitting = stored.ndim == 2 and stored.shape[1] == 17 and len(stored) > 0
     if not (fitting and stored.dtype.kind in "fiu" and stored.nbytes <= MAX_BYTES):
         raise InputError(
-            f"{quoted(path)} holds {stored.dtype} of shape {list(stored.shape)}, where a row "
+            f"{quote_value(path)} holds {stored.dtype} of shape {list(stored.shape)}, where a row "
             "of 17 numbers for each photograph is needed; run LLFF's imgs2poses again."
         )
     rows = np.array(stored, dtype=np.float64)
@@ -81,13 +91,13 @@ def _read_rows(path: Path) -> Float[np.ndarray, "n 17"]:
     near, far = rows[:, 15], rows[:, 16]
     if not ((near >= low) & (near < far) & (far <= high)).all():
         raise InputError(
-            f"The bounds in {quoted(path)} are no z-depths, nearest first, from {low:g} to "
+            f"The bounds in {quote_value(path)} are no z-depths, nearest first, from {low:g} to "
             f"{high:g}; run LLFF's imgs2poses again."
         )
     return rows
 
 
-def _stored_array(path: Path) -> Shaped[np.ndarray, "..."]:
+def _map_array(path: Path) -> Shaped[np.ndarray, "..."]:
     """Map the array; refuse one that claims more than the file holds."""
     check_file(path)
     try:
@@ -95,27 +105,30 @@ def _stored_array(path: Path) -> Shaped[np.ndarray, "..."]:
             warnings.simplefilter("ignore")
             return np.lib.format.open_memmap(path, mode="r")
     except OSError as error:
-        raise InputError(f"{quoted(path)} cannot be read: {error}; correct the path.") from error
-    except _NO_ARRAY as error:
         raise InputError(
-            f"{quoted(path)} is no array of numbers ({quoted(str(error))}); run LLFF's "
+            f"{quote_value(path)} cannot be read: {error}; correct the path."
+        ) from error
+    except _ARRAY_ERRORS as error:
+        raise InputError(
+            f"{quote_value(path)} is no array of numbers ({quote_value(str(error))}); run LLFF's "
             "imgs2poses again."
         ) from error
 
 
-def _photographs_beside(file: Path, count: int) -> list[Path]:
+def _find_photographs(file: Path, count: int) -> list[Path]:
     """List the photographs of the first folder with one for each row."""
-    folders = image_folders([file.parent])
-    found = [_images_in(folder) for folder in folders]
+    folders = list_image_folders([file.parent])
+    found = [_list_images(folder) for folder in folders]
     fitting = next((images for images in found if len(images) == count), None)
     if fitting is None:
         numbers = ", ".join(f"{len(i)} in {f.name}" for f, i in zip(folders, found, strict=True))
         raise InputError(
-            f"{quoted(file)} has {count} rows, one per photograph in order of their names, but "
+            f"{quote_value(file)} has {count} rows, one per photograph in order of their names, "
+            "but "
             f"there are {numbers}; put exactly these photographs into a folder `images` beside it."
         )
     return fitting
 
 
-def _images_in(folder: Path) -> list[Path]:
+def _list_images(folder: Path) -> list[Path]:
     return sorted(path for path in folder.iterdir() if path.suffix.lower() in IMAGES)

@@ -17,16 +17,15 @@ from jaxtyping import Bool, Float, Shaped
 from PIL import Image
 from torch import Tensor
 
+from gscompleter.data.cameras import compute_fov, find_pose_defect
+from gscompleter.data.driving.moving_objects import mask_moving
+from gscompleter.data.driving.sparse_depth import compute_sparse_depth
 from gscompleter.data.frame import Frame
-from gscompleter.data.framing import Resolution, framing, resize
-from gscompleter.data.intrinsics import opening_angle
-from gscompleter.data.lens import remap, undistortion_map
-from gscompleter.data.moving_objects import covered
-from gscompleter.data.origin import local_origin
-from gscompleter.data.poses import pose_defect
-from gscompleter.data.sparse_depth import sparse_depth
+from gscompleter.data.local_origin import choose_local_origin
+from gscompleter.data.resize import Resolution, compute_framing, resize
+from gscompleter.data.undistort import compute_undistortion_map, remap
 from gscompleter.errors import InputError
-from gscompleter.io.image import as_image, read_depth, read_pixels
+from gscompleter.io.image import convert_to_image, read_depth, read_pixels
 from gscompleter.types import Camera, View
 
 MAX_FOV = 100.0
@@ -34,7 +33,7 @@ MAX_FOV = 100.0
 MAX_TRANSLATION = 1e3
 """Largest camera coordinate that benchmarks keep, in scene units from the origin."""
 
-MAX_FROM_ZERO = 100.0
+MAX_MAP_COORDINATE = 100.0
 """Largest vehicle coordinate without a local origin, in metres."""
 
 
@@ -85,7 +84,7 @@ class PosedPhotographs(Protocol):
     def points(self) -> Float[Tensor, "n 3"] | None:
         """Load points on the scene's surfaces relative to `origin`; None if unknown."""
 
-    def reason_to_skip(self, size: tuple[int, int] | None = None) -> str | None:
+    def find_skip_reason(self, size: tuple[int, int] | None = None) -> str | None:
         """Explain why benchmarks skip the photographs, or return None.
 
         `size` is the height and width that every stored photograph must have.
@@ -129,12 +128,14 @@ class Photographs:
     def camera(self, frame: int, resolution: Resolution = None) -> Camera:
         """Return the camera of a frame, even without its photograph if the file gives the size."""
         found = self.frame(frame)
-        return self._camera(found, found.size(), resolution)
+        return self._build_camera(found, found.size(), resolution)
 
     def views(self, frames: Sequence[int], resolution: Resolution = None) -> list[View]:
         """Load photographs with cameras, and depth if available."""
         chosen = [self.frame(number) for number in frames]
-        return [self._view(frame, n, resolution) for n, frame in zip(frames, chosen, strict=True)]
+        return [
+            self._load_view(frame, n, resolution) for n, frame in zip(frames, chosen, strict=True)
+        ]
 
     def mask(self, frame: int, resolution: Resolution = None) -> Bool[Tensor, "h w"] | None:
         """Return True where the photograph's mask is black or a moving box lies, or None."""
@@ -142,10 +143,10 @@ class Photographs:
         masks = []
         if found.mask is not None:
             shown = read_pixels(found.mask).max(axis=-1)
-            masks.append(fitted(found, shown, found.size(), resolution) == 0)
+            masks.append(undistort_and_resize(found, shown, found.size(), resolution) == 0)
         if found.boxes is not None:
-            camera = self._camera(found, found.size(), resolution)
-            masks.append(covered(found.boxes(), camera, self.origin))
+            camera = self._build_camera(found, found.size(), resolution)
+            masks.append(mask_moving(found.boxes(), camera, self.origin))
         return torch.from_numpy(np.logical_or.reduce(masks)) if masks else None
 
     def points(self) -> Float[Tensor, "n 3"] | None:
@@ -154,7 +155,7 @@ class Photographs:
             return None
         return torch.from_numpy(self.sparse() - self.origin).float()
 
-    def with_ego_vehicle(self) -> Photographs:
+    def keep_ego_vehicle(self) -> Photographs:
         """Return a copy that keeps the vehicle that carries the camera in the scene."""
         return replace(self, frames=tuple(replace(f, vehicle=None) for f in self.frames))
 
@@ -163,11 +164,11 @@ class Photographs:
         """True if some frame has a mask or boxes."""
         return any(frame.mask is not None or frame.boxes is not None for frame in self.frames)
 
-    def reason_to_skip(self, size: tuple[int, int] | None = None) -> str | None:
+    def find_skip_reason(self, size: tuple[int, int] | None = None) -> str | None:
         """Explain why benchmarks skip the photographs; None if they are kept."""
         for number, frame in enumerate(self.frames):
-            reason = _oddity(frame, self.origin) or (
-                None if size is None else _size_to_skip(frame, size)
+            reason = _find_skip_reason(frame, self.origin) or (
+                None if size is None else _find_size_defect(frame, size)
             )
             if reason is not None:
                 return f"frame {number}: {reason}"
@@ -182,33 +183,35 @@ class Photographs:
             )
         return self.frames[number]
 
-    def _camera(self, frame: Frame, size: tuple[int, int], resolution: Resolution) -> Camera:
-        _, pinhole = frame.pinholes(*size)
-        final = framing(*size, resolution).camera(pinhole)
+    def _build_camera(self, frame: Frame, size: tuple[int, int], resolution: Resolution) -> Camera:
+        _, pinhole = frame.compute_pinholes(*size)
+        final = compute_framing(*size, resolution).apply_to_camera(pinhole)
         c2w = frame.c2w.copy()
         c2w[:3, 3] -= self.origin  # before rounding to float32
         pose = torch.from_numpy(c2w).float()
         return Camera(pose, final.K, final.width, final.height, self.near, self.far)
 
-    def _view(self, frame: Frame, number: int, resolution: Resolution) -> View:
-        pixels = frame.pixels()
+    def _load_view(self, frame: Frame, number: int, resolution: Resolution) -> View:
+        pixels = frame.load_pixels()
         size = pixels.shape[1], pixels.shape[0]
-        camera = self._camera(frame, size, resolution)
+        camera = self._build_camera(frame, size, resolution)
         depth = None
         if frame.depth is not None:
-            depth = torch.from_numpy(fitted(frame, read_depth(*frame.depth), size, resolution))
-        elif frame.measured is not None:
-            points = torch.from_numpy(frame.measured() - self.origin).float()
-            depth = sparse_depth(points, camera)
-        image = as_image(fitted(frame, pixels, size, resolution))
+            depth = torch.from_numpy(
+                undistort_and_resize(frame, read_depth(*frame.depth), size, resolution)
+            )
+        elif frame.laser_points is not None:
+            points = torch.from_numpy(frame.laser_points() - self.origin).float()
+            depth = compute_sparse_depth(points, camera)
+        image = convert_to_image(undistort_and_resize(frame, pixels, size, resolution))
         vehicle = None if frame.vehicle is None else frame.vehicle()
         if vehicle is None:
             return View(image, camera, number, depth)
-        ignored = fitted(frame, vehicle.astype(np.uint8), size, resolution) > 0
+        ignored = undistort_and_resize(frame, vehicle.astype(np.uint8), size, resolution) > 0
         return View(image, camera, number, depth, torch.from_numpy(ignored))
 
 
-def without_masked(
+def apply_masks(
     views: Sequence[View], photographs: PosedPhotographs, resolution: Resolution = None
 ) -> list[View]:
     """Mark masked pixels of views as ignored; refuses views without any other pixel."""
@@ -221,30 +224,32 @@ def without_masked(
                 f"All of frame {view.frame} of {photographs.name} is masked; choose another frame."
             )
         if mask is not None:
-            view = replace(view, ignored=mask if view.ignored is None else mask | view.ignored)
+            view = replace(
+                view, ignore_mask=mask if view.ignore_mask is None else mask | view.ignore_mask
+            )
         found.append(view)
     return found
 
 
-def photographs_of(
+def build_photographs(
     name: str, title: str, frames: Sequence[Frame], front: str | None = None
 ) -> Photographs:
     """Build photographs, with a local origin if the cameras are far from zero."""
-    valid = [frame.c2w for frame in frames if pose_defect(frame.c2w) is None]
-    return Photographs(name, title, tuple(frames), local_origin(valid), front=front)
+    valid = [frame.c2w for frame in frames if find_pose_defect(frame.c2w) is None]
+    return Photographs(name, title, tuple(frames), choose_local_origin(valid), front=front)
 
 
-def along_a_road(
+def build_drive(
     name: str, title: str, frames: Sequence[Frame], front: str | None = None
 ) -> Photographs:
     """Build the photographs of a vehicle, with the first camera as origin if far from zero."""
-    valid = (frame.c2w[:3, 3] for frame in frames if pose_defect(frame.c2w) is None)
+    valid = (frame.c2w[:3, 3] for frame in frames if find_pose_defect(frame.c2w) is None)
     first = next(valid, np.zeros(3))
-    origin = first.copy() if np.abs(first).max() > MAX_FROM_ZERO else np.zeros(3)
+    origin = first.copy() if np.abs(first).max() > MAX_MAP_COORDINATE else np.zeros(3)
     return Photographs(name, title, tuple(frames), origin, front=front)
 
 
-def fitted(
+def undistort_and_resize(
     frame: Frame,
     pixels: Shaped[np.ndarray, "h w *c"],
     size: tuple[int, int],
@@ -259,20 +264,20 @@ def fitted(
     if not colours:
         pixels = resize(pixels, size, Image.Resampling.NEAREST)
     if frame.intrinsics.distortion:
-        pinhole, new = frame.pinholes(*size)
-        source = undistortion_map(pinhole, frame.intrinsics.distortion, new)
+        pinhole, new = frame.compute_pinholes(*size)
+        source = compute_undistortion_map(pinhole, frame.intrinsics.distortion, new)
         pixels = remap(pixels, source, cv2.INTER_CUBIC if colours else cv2.INTER_NEAREST)
     filtering = Image.Resampling.LANCZOS if colours else Image.Resampling.NEAREST
-    return framing(*size, resolution).image(pixels, filtering)
+    return compute_framing(*size, resolution).apply_to_image(pixels, filtering)
 
 
-def _oddity(frame: Frame, origin: Float[np.ndarray, "3"]) -> str | None:
+def _find_skip_reason(frame: Frame, origin: Float[np.ndarray, "3"]) -> str | None:
     """Explain why benchmarks skip a frame; None if they keep it."""
     size = frame.intrinsics.size or frame.size()
-    defect = frame.defect(*size)
+    defect = frame.find_defect(*size)
     if defect is not None:
         return defect
-    fov = opening_angle(frame.pinholes(*size)[1])
+    fov = compute_fov(frame.compute_pinholes(*size)[1])
     if fov > MAX_FOV:
         return f"its opening angle of {fov:.1f}° is above {MAX_FOV:g}°"
     farthest = float(np.abs(frame.c2w[:3, 3] - origin).max())
@@ -281,9 +286,9 @@ def _oddity(frame: Frame, origin: Float[np.ndarray, "3"]) -> str | None:
     return None
 
 
-def _size_to_skip(frame: Frame, needed: tuple[int, int]) -> str | None:
+def _find_size_defect(frame: Frame, needed: tuple[int, int]) -> str | None:
     """Explain why the stored photograph is not of size `needed` (height, width); None if it is."""
-    found = frame.stored_size()
+    found = frame.read_stored_size()
     if found is None:
         return "its image is missing"
     if found == (needed[1], needed[0]):

@@ -9,24 +9,23 @@ from pathlib import Path
 import numpy as np
 from jaxtyping import Float
 
+from gscompleter.data.cameras import FRACTIONS, Intrinsics, invert_viewmat
 from gscompleter.data.frame import Frame
-from gscompleter.data.intrinsics import FRACTIONS, Intrinsics
-from gscompleter.data.photographs import Photographs, photographs_of
-from gscompleter.data.poses import c2w_of
+from gscompleter.data.photographs import Photographs, build_photographs
 from gscompleter.errors import InputError
-from gscompleter.reading import read_head, read_lines
+from gscompleter.io.reading import read_head, read_lines
 
 
-def holds_camera_files(path: Path) -> bool:
+def has_camera_files(path: Path) -> bool:
     """Check whether `path` is a RealEstate10K camera file, or a folder with some."""
     if os.path.isdir(path):
-        return bool(_camera_files(path))
+        return bool(_list_camera_files(path))
     return path.suffix == ".txt" and _is_camera_file(path)
 
 
 def open_camera_files(path: Path) -> Iterator[Photographs]:
     """Open the photographs of each camera file that `path` is or holds, sorted by name."""
-    files = _camera_files(path) if os.path.isdir(path) else [path]
+    files = _list_camera_files(path) if os.path.isdir(path) else [path]
     return (read_camera_file(file) for file in files)
 
 
@@ -45,11 +44,11 @@ def read_camera_file(path: Path) -> Photographs:
         raise InputError(
             f"{path} lists no frames; below the line with the address, each frame needs a line."
         )
-    frames = [_frame(line, number, path) for number, line in enumerate(lines)]
-    return photographs_of(path.stem, str(path), frames)
+    frames = [_parse_frame(line, number, path) for number, line in enumerate(lines)]
+    return build_photographs(path.stem, str(path), frames)
 
 
-def intrinsics_and_pose(
+def parse_camera_row(
     numbers: Float[np.ndarray, "18"],
 ) -> tuple[Intrinsics, Float[np.ndarray, "4 4"]]:
     """Split a row: fx, fy, cx, cy, two unused numbers, and the upper 3×4 of world-to-camera.
@@ -58,10 +57,10 @@ def intrinsics_and_pose(
     """
     fx, fy, cx, cy = numbers[:4].tolist()
     viewmat = np.vstack([numbers[6:].reshape(3, 4), [0, 0, 0, 1]])
-    return Intrinsics(FRACTIONS, (fx, fy), (cx, cy)), c2w_of(viewmat)
+    return Intrinsics(FRACTIONS, (fx, fy), (cx, cy)), invert_viewmat(viewmat)
 
 
-def _frame(line: str, number: int, path: Path) -> Frame:
+def _parse_frame(line: str, number: int, path: Path) -> Frame:
     timestamp, *words = line.split()
     try:
         if not (timestamp.isascii() and timestamp.isdigit() and len(words) == 18):
@@ -74,12 +73,12 @@ def _frame(line: str, number: int, path: Path) -> Frame:
         ) from error
     folder = path.with_suffix("")
     folder = folder if os.path.isdir(folder) else path.parent
-    intrinsics, c2w = intrinsics_and_pose(numbers)
+    intrinsics, c2w = parse_camera_row(numbers)
     title = f"frame {number} of {path}"
     return Frame(timestamp, title, c2w, intrinsics, folder / timestamp)
 
 
-def _camera_files(folder: Path) -> list[Path]:
+def _list_camera_files(folder: Path) -> list[Path]:
     return sorted(file for file in folder.glob("*.txt") if _is_camera_file(file))
 
 

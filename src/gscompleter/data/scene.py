@@ -10,12 +10,12 @@ import numpy as np
 
 from gscompleter.data.camera_files import read_cameras
 from gscompleter.data.formats import open_photographs
-from gscompleter.data.framing import Resolution
 from gscompleter.data.limits import check_planes
 from gscompleter.data.photographs import Photographs
+from gscompleter.data.resize import Resolution
 from gscompleter.data.transforms import OPENCV_FROM_OPENGL
 from gscompleter.errors import InputError
-from gscompleter.io.files import replacing
+from gscompleter.io.files import replace_file
 from gscompleter.types import Camera, View
 
 
@@ -113,16 +113,16 @@ def write_cameras(
     Raises:
         InputError: If the file cannot be written.
     """
-    frames = [_entry(camera) for camera in cameras]
+    frames = [_build_entry(camera) for camera in cameras]
     if file_paths is not None:
         pairs = zip(file_paths, frames, strict=True)
         frames = [{"file_path": file_path, **frame} for file_path, frame in pairs]
     content = {"camera_model": "PINHOLE", "frames": frames}
-    with replacing(path) as file:
+    with replace_file(path) as file:
         file.write((json.dumps(content, indent=1) + "\n").encode())
 
 
-def _entry(camera: Camera) -> dict[str, object]:
+def _build_entry(camera: Camera) -> dict[str, object]:
     K = camera.K.double()
     c2w = camera.c2w.detach().cpu().double().numpy() @ OPENCV_FROM_OPENGL
     return {

@@ -14,11 +14,11 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float
 
-from gscompleter.data.frame import Frame, capital
-from gscompleter.data.framing import Resolution
-from gscompleter.data.intrinsics import Intrinsics
-from gscompleter.data.json_numbers import array_of, optional_number
-from gscompleter.errors import InputError, quoted
+from gscompleter.data.cameras import Intrinsics
+from gscompleter.data.frame import Frame, capitalize
+from gscompleter.data.json_fields import get_array, get_optional_number
+from gscompleter.data.resize import Resolution
+from gscompleter.errors import InputError, quote_value
 
 DEFAULT_FOV = 60.0
 """SuperSplat's default field of view, in degrees."""
@@ -37,21 +37,24 @@ def is_supersplat(content: Any) -> bool:
     return isinstance(first, dict) and "target" in first and "rotation" not in first
 
 
-def poses_of(content: Any, path: Path, resolution: Resolution) -> list[Frame]:
+def parse_poses(content: Any, path: Path, resolution: Resolution) -> list[Frame]:
     """Read SuperSplat's poses as cameras in the frame of the splat; `resolution` must be given."""
     if resolution is None or isinstance(resolution, int):
         raise InputError(
-            f"The poses of SuperSplat in {quoted(path)} have no image size; give a resolution "
+            f"The poses of SuperSplat in {quote_value(path)} have no image size; give a resolution "
             "(height and width).",
             "resolution",
         )
-    poses = _poses(content)
+    poses = _find_poses(content)
     if not isinstance(poses, list) or not poses:
-        raise InputError(f"{quoted(path)} holds no poses; {ADVICE}.")
-    return [_frame(pose, f"pose {n} of {quoted(path)}", resolution) for n, pose in enumerate(poses)]
+        raise InputError(f"{quote_value(path)} holds no poses; {ADVICE}.")
+    return [
+        _parse_frame(pose, f"pose {n} of {quote_value(path)}", resolution)
+        for n, pose in enumerate(poses)
+    ]
 
 
-def _poses(content: Any) -> Any:
+def _find_poses(content: Any) -> Any:
     if isinstance(content, list):
         return content
     sets = content["poseSets"]
@@ -59,20 +62,22 @@ def _poses(content: Any) -> Any:
     return first.get("poses") if isinstance(first, dict) else None
 
 
-def _frame(pose: Any, title: str, resolution: tuple[int, int]) -> Frame:
+def _parse_frame(pose: Any, title: str, resolution: tuple[int, int]) -> Frame:
     if not isinstance(pose, dict):
-        raise InputError(f"{capital(title)} is no object with a position and a target; {ADVICE}.")
+        raise InputError(
+            f"{capitalize(title)} is no object with a position and a target; {ADVICE}."
+        )
     position, target = (
-        array_of(pose, key, (3,), title) * SPLAT_FROM_WORLD for key in ("position", "target")
+        get_array(pose, key, (3,), title) * SPLAT_FROM_WORLD for key in ("position", "target")
     )
     height, width = resolution
-    fov = optional_number(pose, "fov", title, *FOV_RANGE) or DEFAULT_FOV
+    fov = get_optional_number(pose, "fov", title, *FOV_RANGE) or DEFAULT_FOV
     focal = max(height, width) / 2 / math.tan(math.radians(fov) / 2)
     intrinsics = Intrinsics((width, height), (focal, focal))
-    return Frame(title, title, _upright(position, target), intrinsics, None)
+    return Frame(title, title, _build_upright_c2w(position, target), intrinsics, None)
 
 
-def _upright(
+def _build_upright_c2w(
     position: Float[np.ndarray, "3"], target: Float[np.ndarray, "3"]
 ) -> Float[np.ndarray, "4 4"]:
     """Build camera-to-world of an upright camera that points at a target; NaN along y."""

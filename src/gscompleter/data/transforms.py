@@ -12,16 +12,15 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float
 
-from gscompleter.data.frame import Frame, capital
-from gscompleter.data.intrinsics import Intrinsics
-from gscompleter.data.json_numbers import optional_number, text_of
-from gscompleter.data.lens import Distortion
+from gscompleter.data.cameras import Intrinsics, find_pose_defect, make_rigid
+from gscompleter.data.frame import Frame, capitalize
+from gscompleter.data.json_fields import get_optional_number, get_text
 from gscompleter.data.limits import DEPTH_RANGE, MAX_COEFFICIENT, MAX_IN_PIXELS, MAX_SIDE
-from gscompleter.data.photographs import Photographs, photographs_of
-from gscompleter.data.point_cloud import read_point_cloud
-from gscompleter.data.poses import made_rigid, pose_defect
-from gscompleter.errors import InputError, quoted
-from gscompleter.io.json_file import begins_a_list, read_json
+from gscompleter.data.photographs import Photographs, build_photographs
+from gscompleter.data.points import read_point_cloud
+from gscompleter.data.undistort import Distortion
+from gscompleter.errors import InputError, quote_value
+from gscompleter.io.json_file import is_json_list, read_json
 
 NAME = "transforms.json"
 SPLITS = tuple(f"transforms_{split}.json" for split in ("train", "val", "test"))
@@ -47,11 +46,11 @@ _INTRINSICS = (
 """Keys allowed at the top for all frames, or in a frame."""
 
 
-def holds_transforms(path: Path) -> bool:
+def has_transforms(path: Path) -> bool:
     """Check for a JSON object, or a folder with a `transforms.json`, whole or in parts."""
     if os.path.isdir(path):
-        return bool(_files(path))
-    return path.suffix == ".json" and os.path.isfile(path) and not begins_a_list(path)
+        return bool(_find_files(path))
+    return path.suffix == ".json" and os.path.isfile(path) and not is_json_list(path)
 
 
 def open_transforms(path: Path) -> Iterator[Photographs]:
@@ -61,23 +60,23 @@ def open_transforms(path: Path) -> Iterator[Photographs]:
     path, by their order in the file. Poses and points stay in the frame of the file:
     `applied_transform`, the exporter's change of COLMAP's frame, is not undone.
     """
-    files = _files(path) or [path / NAME]
+    files = _find_files(path) or [path / NAME]
     frames = [frame for file in files for frame in read_frames(file)]
     if all(frame.image is not None for frame in frames):
         frames = sorted(frames, key=lambda frame: frame.name)
     whole = len(files) == 1 and files[0].name not in (NAME, *SPLITS)
     title = str(files[0] if len(files) == 1 else path)
-    scene = photographs_of(_name_of(files[0], whole), title, frames)
-    yield replace(scene, sparse=_points_of(files))
+    scene = build_photographs(_name_scene(files[0], whole), title, frames)
+    yield replace(scene, sparse=_make_point_reader(files))
 
 
-def _name_of(file: Path, whole: bool) -> str:
+def _name_scene(file: Path, whole: bool) -> str:
     """Name the scene of a file: after its folder, or after a file with its own name."""
     folder = file.resolve().parent
     return file.stem if whole else (folder.parent if folder.name in HOMES else folder).name
 
 
-def _files(scene: Path) -> list[Path]:
+def _find_files(scene: Path) -> list[Path]:
     if not os.path.isdir(scene):
         return [scene]
     for folder in (scene / home for home in HOMES):
@@ -88,10 +87,10 @@ def _files(scene: Path) -> list[Path]:
     return []
 
 
-def _points_of(files: Sequence[Path]) -> partial[Float[np.ndarray, "n 3"]] | None:
+def _make_point_reader(files: Sequence[Path]) -> partial[Float[np.ndarray, "n 3"]] | None:
     """Return a reader of the points that a file names; None if there are none."""
     for file in files:
-        name = text_of(_read_transforms(file), "ply_file_path", str(file))
+        name = get_text(_read_transforms(file), "ply_file_path", str(file))
         if name is not None and os.path.isfile(file.parent / name):
             return partial(read_point_cloud, file.parent / name)
     return None
@@ -108,9 +107,9 @@ def read_frames(path: Path) -> list[Frame]:
     if not isinstance(entries, list) or not entries:
         raise InputError(f"{path} lists no frames; its `frames` has to be a list with cameras.")
     shared = {key: content[key] for key in _INTRINSICS if key in content}
-    unit = optional_number(content, "depth_unit_scale_factor", str(path), *DEPTH_RANGE)
+    unit = get_optional_number(content, "depth_unit_scale_factor", str(path), *DEPTH_RANGE)
     unit = 1e-3 if unit is None else unit
-    return [_frame(entry, i, shared, unit, path) for i, entry in enumerate(entries)]
+    return [_parse_frame(entry, i, shared, unit, path) for i, entry in enumerate(entries)]
 
 
 def _read_transforms(path: Path) -> dict[str, Any]:
@@ -120,33 +119,33 @@ def _read_transforms(path: Path) -> dict[str, Any]:
     return content
 
 
-def _frame(
+def _parse_frame(
     entry: Any, position: int, shared: Mapping[str, Any], depth_unit: float, path: Path
 ) -> Frame:
     title = f"frame {position} of {path}"
     if not isinstance(entry, dict):
-        raise InputError(f"{capital(title)} is not an object with a `transform_matrix`.")
+        raise InputError(f"{capitalize(title)} is not an object with a `transform_matrix`.")
     file_path, depth_path, mask_path = (
-        text_of(entry, key, title) for key in ("file_path", "depth_file_path", "mask_path")
+        get_text(entry, key, title) for key in ("file_path", "depth_file_path", "mask_path")
     )
     if file_path is not None:
-        title = f"frame {quoted(file_path)} of {path}"
+        title = f"frame {quote_value(file_path)} of {path}"
     frame = Frame(
         name=file_path or str(position),
         title=title,
-        c2w=_matrix(entry.get("transform_matrix"), title),
-        intrinsics=_intrinsics({**shared, **entry}, title),
+        c2w=_parse_matrix(entry.get("transform_matrix"), title),
+        intrinsics=_parse_intrinsics({**shared, **entry}, title),
         image=None if file_path is None else path.parent / file_path,
         depth=None if depth_path is None else (path.parent / depth_path, depth_unit),
         mask=None if mask_path is None else path.parent / mask_path,
     )
-    defect = pose_defect(frame.c2w)
+    defect = find_pose_defect(frame.c2w)
     if defect is not None:
-        raise frame.unusable(f"{defect} (`transform_matrix`)")
-    return replace(frame, c2w=made_rigid(frame.c2w) @ OPENCV_FROM_OPENGL)
+        raise frame.make_error(f"{defect} (`transform_matrix`)")
+    return replace(frame, c2w=make_rigid(frame.c2w) @ OPENCV_FROM_OPENGL)
 
 
-def _matrix(matrix: Any, title: str) -> Float[np.ndarray, "4 4"]:
+def _parse_matrix(matrix: Any, title: str) -> Float[np.ndarray, "4 4"]:
     if matrix is None:
         raise InputError(f"The `transform_matrix` of {title} is missing; add its camera-to-world.")
     try:
@@ -160,9 +159,9 @@ def _matrix(matrix: Any, title: str) -> Float[np.ndarray, "4 4"]:
     return np.vstack([pose[:3], [0, 0, 0, 1]]) if len(pose) == 3 else pose
 
 
-def _intrinsics(entry: Mapping[str, Any], title: str) -> Intrinsics:
+def _parse_intrinsics(entry: Mapping[str, Any], title: str) -> Intrinsics:
     def read_pair(*keys: str, low: float = -MAX_IN_PIXELS, high: float = MAX_IN_PIXELS) -> Pair:
-        x, y = (optional_number(entry, key, title, low, high) for key in keys)
+        x, y = (get_optional_number(entry, key, title, low, high) for key in keys)
         return x, y
 
     focal = read_pair("fl_x", "fl_y", low=1 / MAX_IN_PIXELS)
@@ -171,11 +170,11 @@ def _intrinsics(entry: Mapping[str, Any], title: str) -> Intrinsics:
         raise InputError(
             f"The focal length of {title} is missing; add `fl_x` and `fl_y`, or `camera_angle_x`."
         )
-    size = _size(read_pair("w", "h", low=1.0, high=float(MAX_SIDE)), title)
-    return Intrinsics(size, focal, read_pair("cx", "cy"), angle, _distortion(entry, title))
+    size = _parse_size(read_pair("w", "h", low=1.0, high=float(MAX_SIDE)), title)
+    return Intrinsics(size, focal, read_pair("cx", "cy"), angle, _parse_distortion(entry, title))
 
 
-def _size(size: Pair, title: str) -> tuple[int, int] | None:
+def _parse_size(size: Pair, title: str) -> tuple[int, int] | None:
     w, h = size
     if w is None or h is None:
         return None
@@ -186,17 +185,17 @@ def _size(size: Pair, title: str) -> tuple[int, int] | None:
     return int(w), int(h)
 
 
-def _distortion(entry: Mapping[str, Any], title: str) -> Distortion:
+def _parse_distortion(entry: Mapping[str, Any], title: str) -> Distortion:
     model = entry.get("camera_model")
     if model is None:
         model = "OPENCV_FISHEYE" if entry.get("is_fisheye") else "OPENCV"
     if model not in PERSPECTIVE_MODELS + FISHEYE_MODELS:
         raise InputError(
-            f"The camera model '{quoted(model)}' of {title} is not supported; undistort the "
+            f"The camera model '{quote_value(model)}' of {title} is not supported; undistort the "
             f"images first, or use one of {', '.join(PERSPECTIVE_MODELS + FISHEYE_MODELS)}."
         )
     k1, k2, k3, k4, p1, p2 = (
-        optional_number(entry, key, title, -MAX_COEFFICIENT, MAX_COEFFICIENT) or 0.0
+        get_optional_number(entry, key, title, -MAX_COEFFICIENT, MAX_COEFFICIENT) or 0.0
         for key in ("k1", "k2", "k3", "k4", "p1", "p2")
     )
     if model in FISHEYE_MODELS:

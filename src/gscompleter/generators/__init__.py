@@ -15,33 +15,33 @@ from gscompleter.config.generators import (
     OracleSettings,
     PEFieldSettings,
     WarpInpaintSettings,
-    settings_class,
+    get_settings_class,
 )
-from gscompleter.config.settings import checked
+from gscompleter.config.settings import validate
 from gscompleter.errors import InputError
-from gscompleter.types import Camera, SceneContext, View
+from gscompleter.types import Camera, GeneratorInput, View
 
 
 @dataclass(frozen=True)
-class Request:
+class GeneratorRequest:
     """Input of Φ for one image."""
 
     nearest: View
     """Photograph taken closest to `target`."""
     target: Camera
-    context: SceneContext
+    context: GeneratorInput
     """All photographs, and renders of the current scene."""
 
 
 @dataclass(frozen=True)
-class Synthesis:
+class GeneratorOutput:
     """Output of Φ for one image."""
 
     image: Float[Tensor, "h w 3"]
     """In [0, 1], of the size of the target."""
     notes: tuple[str, ...] = ()
     """Sentences about the image for a reader of the results."""
-    disagrees: bool = False
+    is_inconsistent: bool = False
     """True if the image does not show the scene of the photographs."""
 
 
@@ -50,38 +50,38 @@ class Generator(Protocol):
     """Interface of Φ."""
 
     @property
-    def takes_margin(self) -> bool:
+    def supports_padding(self) -> bool:
         """True if Φ can synthesize a padded target image."""
 
     @property
-    def at_once(self) -> int:
+    def max_batch_size(self) -> int:
         """Largest batch; with 1, each request sees what the previous ones added."""
 
-    def synthesize(self, requests: Sequence[Request]) -> list[Synthesis]:
+    def synthesize(self, requests: Sequence[GeneratorRequest]) -> list[GeneratorOutput]:
         """Synthesize one image per request, in order."""
 
 
-ImageFunction = Callable[[View, Camera, SceneContext], Tensor | Synthesis]
+ImageFunction = Callable[[View, Camera, GeneratorInput], Tensor | GeneratorOutput]
 """Simplest form of Φ: (nearest, target, context) -> image [h, w, 3] or `GeneratorOutput`."""
 
 
 @dataclass(frozen=True)
-class OneByOne:
+class FunctionGenerator:
     """A plain function as a generator, with padding and without batches."""
 
     function: ImageFunction
-    takes_margin: bool = True
-    at_once: int = 1
+    supports_padding: bool = True
+    max_batch_size: int = 1
 
-    def synthesize(self, requests: Sequence[Request]) -> list[Synthesis]:
+    def synthesize(self, requests: Sequence[GeneratorRequest]) -> list[GeneratorOutput]:
         """Call the function once per request."""
         answers = [self.function(r.nearest, r.target, r.context) for r in requests]
-        return [a if isinstance(a, Synthesis) else Synthesis(a) for a in answers]
+        return [a if isinstance(a, GeneratorOutput) else GeneratorOutput(a) for a in answers]
 
 
 def as_generator(phi: Generator | ImageFunction) -> Generator:
     """Return `phi`, wrapped as a `Generator` if it is a plain function."""
-    return phi if isinstance(phi, Generator) else OneByOne(phi)
+    return phi if isinstance(phi, Generator) else FunctionGenerator(phi)
 
 
 def load_generator(
@@ -104,34 +104,34 @@ def load_generator(
         InputError: The name is unknown, packages or weights are missing, or the settings do not
             fit.
     """
-    kind = settings_class(name)
+    kind = get_settings_class(name)
     if not isinstance(settings, kind | None):
         raise InputError(
             f"The generator {name!r} takes {kind.__name__}, got {type(settings).__name__}.",
             "generator",
         )
-    settings = checked(settings or kind(), "generator_")
+    settings = validate(settings or kind(), "generator_")
     if getattr(settings, "offload", False) and device == "cpu":
         raise InputError(
             "offload keeps parts of the generator off the GPU, and it runs on the CPU; leave it "
             "out, or choose the device cuda.",
             "generator_offload",
         )
-    return _made(settings, seed, photographs, device)
+    return _make_generator(settings, seed, photographs, device)
 
 
-def _made(
+def _make_generator(
     settings: GeneratorSettings, seed: int, photographs: Sequence[View], device: str
 ) -> Generator:
     match settings:
         case PEFieldSettings():
-            from gscompleter.generators.diffusion.pe_field import load_pe_field
+            from gscompleter.models.diffusion.pe_field import load_pe_field
 
             return load_pe_field(seed, device, settings)
         case DiffusersInpaintSettings():
-            from gscompleter.generators.diffusion.inpaint import load_diffusers_inpaint
+            from gscompleter.models.diffusion.inpaint import load_diffusers_inpaint
 
-            return OneByOne(load_diffusers_inpaint(seed, device, settings))
+            return FunctionGenerator(load_diffusers_inpaint(seed, device, settings))
         case OracleSettings():
             from gscompleter.generators.oracle import Oracle
 
@@ -139,5 +139,5 @@ def _made(
         case WarpInpaintSettings():
             from gscompleter.generators.warp_inpaint import WarpInpaint
 
-            return OneByOne(WarpInpaint(seed))
+            return FunctionGenerator(WarpInpaint(seed))
     raise TypeError(f"no generator is made from {type(settings).__name__}")

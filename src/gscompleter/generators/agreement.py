@@ -10,18 +10,18 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 
 from gscompleter.errors import InputError
-from gscompleter.generators import Synthesis
-from gscompleter.generators.robust import robust_affine
-from gscompleter.generators.warp import Warped
-from gscompleter.interpolation import smoothed
+from gscompleter.generators import GeneratorOutput
+from gscompleter.generators.exposure import fit_robust_affine
+from gscompleter.generators.warp import WarpedImage
+from gscompleter.image_ops import smooth_masked
 
-BLUR = 2
+BLUR_RADIUS = 2
 """Blur radius in pixels before colours are compared; edges may be a pixel off."""
 MAX_SHARE = 0.6
 """Largest residual of a consistent image, relative to that of a constant colour."""
 QUANTILE = 0.7
 """Quantile of the residuals; higher than the median, which may be a blank wall."""
-LEAST = 0.03
+MIN_LIMIT = 0.03
 """Residual that is always accepted, for colours in [0, 1]."""
 MAX_GAIN = 1.6
 """Largest gain of a colour shift; its inverse is the smallest."""
@@ -33,7 +33,7 @@ MIN_PIXELS = 200
 
 @dataclass(frozen=True)
 class Agreement:
-    """Comparison of an image with the photographs: `observed = gain * image + offset`."""
+    """Comparison of an image with the photographs: `kept_context = gain * image + offset`."""
 
     gain: Float[Tensor, "3"]
     offset: Float[Tensor, "3"]
@@ -42,7 +42,7 @@ class Agreement:
     limit: float
     """Largest residual of a consistent image."""
     share: float
-    agrees: bool
+    is_consistent: bool
     """True if the image is consistent with the photographs, or cannot be compared."""
     image: Float[Tensor, "h w 3"]
     """The image, corrected if it is consistent."""
@@ -53,13 +53,13 @@ class Agreement:
         return float((0.5 * self.gain + self.offset - 0.5).abs().max())
 
 
-def checked(
+def paint_consistently(
     paint: Callable[[int], Float[Tensor, "h w 3"]],
     seed: int,
-    observed: Warped,
+    observed: WarpedImage,
     retries: int = 0,
     correct_color: bool = True,
-) -> Synthesis:
+) -> GeneratorOutput:
     """Paint an image from a seed, compare it with the photographs and correct its colours.
 
     While it is inconsistent, up to `retries` further seeds are tried and the best image is kept.
@@ -68,19 +68,19 @@ def checked(
     found: list[Agreement] = []
     for attempt in range(retries + 1):
         image = paint(seed + attempt)
-        found.append(compare(image, observed.image, observed.known, correct_color))
-        if found[-1].agrees:
+        found.append(compare_with_observed(image, observed.image, observed.known, correct_color))
+        if found[-1].is_consistent:
             break
-    best = min(found, key=lambda one: (not one.agrees, one.residual))
+    best = min(found, key=lambda one: (not one.is_consistent, one.residual))
     if best.residual == float("inf"):
         raise InputError(
             f"The generator painted no finite image ({len(found)} seed(s) tried); check that its "
             "weights are correct, or choose another generator."
         )
-    return Synthesis(best.image, notes_on(best, len(found)), not best.agrees)
+    return GeneratorOutput(best.image, write_notes(best, len(found)), not best.is_consistent)
 
 
-def compare(
+def compare_with_observed(
     image: Float[Tensor, "h w 3"],
     observed: Float[Tensor, "h w 3"],
     known: Bool[Tensor, "h w"],
@@ -90,16 +90,16 @@ def compare(
     ones, zeros = torch.ones(3).to(image), torch.zeros(3).to(image)
     share = known.float().mean().item()
     if not image.isfinite().all():
-        return Agreement(ones, zeros, float("inf"), LEAST, share, False, image)
+        return Agreement(ones, zeros, float("inf"), MIN_LIMIT, share, False, image)
     if int(known.sum()) < MIN_PIXELS:
-        return Agreement(ones, zeros, 0.0, LEAST, share, True, image)
-    ours = smoothed(image, known, BLUR)[known]
-    theirs = smoothed(observed, known, BLUR)[known]
-    gain, offset = robust_affine(ours, theirs)
-    residual = quantile((gain * ours + offset - theirs).abs().mean(dim=-1), QUANTILE)
+        return Agreement(ones, zeros, 0.0, MIN_LIMIT, share, True, image)
+    ours = smooth_masked(image, known, BLUR_RADIUS)[known]
+    theirs = smooth_masked(observed, known, BLUR_RADIUS)[known]
+    gain, offset = fit_robust_affine(ours, theirs)
+    residual = compute_quantile((gain * ours + offset - theirs).abs().mean(dim=-1), QUANTILE)
     plain = theirs - theirs.median(dim=0).values
-    contrast = quantile(plain.abs().mean(dim=-1), QUANTILE)
-    limit = max(LEAST, MAX_SHARE * contrast)
+    contrast = compute_quantile(plain.abs().mean(dim=-1), QUANTILE)
+    limit = max(MIN_LIMIT, MAX_SHARE * contrast)
     plausible = bool(
         ((gain >= 1 / MAX_GAIN) & (gain <= MAX_GAIN)).all() and (offset.abs() <= MAX_OFFSET).all()
     )
@@ -110,15 +110,15 @@ def compare(
     return Agreement(gain, offset, residual, limit, share, agrees, corrected)
 
 
-def quantile(values: Float[Tensor, "n"], share: float) -> float:
+def compute_quantile(values: Float[Tensor, "n"], share: float) -> float:
     """Return the value below which a fraction `share` of the values lies."""
     return values.kthvalue(1 + int(share * (len(values) - 1))).values.item()
 
 
-def notes_on(found: Agreement, tried: int) -> tuple[str, ...]:
+def write_notes(found: Agreement, num_seeds: int) -> tuple[str, ...]:
     """Write notes on the comparison for a reader of the results."""
-    if not found.agrees:
-        seeds = "" if tried == 1 else f" (best of {tried} seeds)"
+    if not found.is_consistent:
+        seeds = "" if num_seeds == 1 else f" (best of {num_seeds} seeds)"
         if found.residual > found.limit:
             reason = f"colours differ by {found.residual:.3f}"
             limit = f"{found.limit:.3f} is the limit"
@@ -139,6 +139,6 @@ def notes_on(found: Agreement, tried: int) -> tuple[str, ...]:
             "The colours of the synthesized image were matched to those of the photographs "
             f"(mid-grey changed by {255 * found.shift:.1f} of 255)."
         )
-    if tried > 1:
-        notes.append(f"{tried} seeds were tried before the synthesized image agreed.")
+    if num_seeds > 1:
+        notes.append(f"{num_seeds} seeds were tried before the synthesized image agreed.")
     return tuple(notes)

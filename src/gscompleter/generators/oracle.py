@@ -9,8 +9,8 @@ from jaxtyping import Float
 from torch import Tensor
 
 from gscompleter.errors import InputError
-from gscompleter.generators import Request, Synthesis
-from gscompleter.geometry import same_camera
+from gscompleter.generators import GeneratorOutput, GeneratorRequest
+from gscompleter.geometry import is_same_camera
 from gscompleter.types import Camera, View
 
 
@@ -20,18 +20,18 @@ class Oracle:
 
     photographs: Sequence[View]
 
-    takes_margin: bool = False
+    supports_padding: bool = False
     """False, because a photograph cannot be extended."""
-    at_once: int = 1
+    max_batch_size: int = 1
 
-    def synthesize(self, requests: Sequence[Request]) -> list[Synthesis]:
+    def synthesize(self, requests: Sequence[GeneratorRequest]) -> list[GeneratorOutput]:
         """Return the photographs of the targets."""
-        return [Synthesis(self.photograph(request.target)) for request in requests]
+        return [GeneratorOutput(self.find_photograph(request.target)) for request in requests]
 
-    def photograph(self, target: Camera) -> Float[Tensor, "h w 3"]:
+    def find_photograph(self, target: Camera) -> Float[Tensor, "h w 3"]:
         """Find the photograph of `target`; raise InputError if there is none."""
         for photograph in self.photographs:
-            if same_camera(photograph.camera, target):
+            if is_same_camera(photograph.camera, target):
                 return photograph.image.to(target.K.device)
         raise InputError(
             f"The generator 'oracle' has {len(self.photographs)} photographs, none of them taken "

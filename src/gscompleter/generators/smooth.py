@@ -9,21 +9,21 @@ from jaxtyping import Bool, Float, Float32
 from numpy import ndarray
 from torch import Tensor
 
-from gscompleter.kernels.continuation import means, pyramid_of
+from gscompleter.kernels.pyramid_fill import build_pyramid, compute_means
 
-BLUR = 1.5
+BLUR_SIGMA = 1.5
 """Standard deviation of the blur of each pyramid level, in its pixels."""
-REACH = 0.7
+SIGMA_PER_DISTANCE = 0.7
 """Standard deviation of the averaging, relative to the distance to known pixels."""
 
 
-def distance_to_known(known: Bool[Tensor, "h w"]) -> Float[Tensor, "h w"]:
+def compute_distance_to_known(known: Bool[Tensor, "h w"]) -> Float[Tensor, "h w"]:
     """Compute the distance to the nearest known pixel, in pixels; one must be known."""
     away = cv2.distanceTransform((~known).numpy().astype(np.uint8), cv2.DIST_L2, 5)
     return torch.from_numpy(away)
 
 
-def continued(
+def continue_smoothly(
     values: Float[Tensor, "h w c"], weight: Float[Tensor, "h w"]
 ) -> Float[Tensor, "h w c"]:
     """Fill pixels of zero `weight` with weighted means over a radius that grows inwards."""
@@ -31,21 +31,21 @@ def continued(
     if not known.any():
         return torch.zeros_like(values)
     weighted = torch.cat([values * weight[..., None], weight[..., None]], dim=-1).numpy()
-    pyramid = pyramid_of(sum_pyramid(np.ascontiguousarray(weighted, np.float32)))
+    pyramid = build_pyramid(build_sum_pyramid(np.ascontiguousarray(weighted, np.float32)))
 
     pixels = np.argwhere(~known.numpy())
-    size = REACH * distance_to_known(known).numpy()[pixels[:, 0], pixels[:, 1]]
-    level = np.log2(np.maximum(size / BLUR, 1.0)).clip(0, len(pyramid.starts) - 1)
+    size = SIGMA_PER_DISTANCE * compute_distance_to_known(known).numpy()[pixels[:, 0], pixels[:, 1]]
+    level = np.log2(np.maximum(size / BLUR_SIGMA, 1.0)).clip(0, len(pyramid.starts) - 1)
     filled = values.clone()
-    filled[~known] = torch.from_numpy(means(pyramid, pixels, level)).to(values)
+    filled[~known] = torch.from_numpy(compute_means(pyramid, pixels, level)).to(values)
     return filled
 
 
-def sum_pyramid(weighted: Float32[ndarray, "h w c"]) -> list[Float32[ndarray, "_ _ c"]]:
+def build_sum_pyramid(weighted: Float32[ndarray, "h w c"]) -> list[Float32[ndarray, "_ _ c"]]:
     """Build a pyramid of blurred sums; each level has half the size of the previous one."""
     sums = []
     while True:
-        blurred = cv2.GaussianBlur(weighted, (0, 0), BLUR)
+        blurred = cv2.GaussianBlur(weighted, (0, 0), BLUR_SIGMA)
         sums.append(blurred.reshape(weighted.shape))
         if min(weighted.shape[:2]) <= 8:
             return sums

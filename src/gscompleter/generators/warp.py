@@ -8,25 +8,25 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
-from gscompleter.coverage import COVERED
-from gscompleter.generators.harmonize import gains
-from gscompleter.generators.smooth import continued
-from gscompleter.geometry import baseline_between, inside, project, sample, unproject
-from gscompleter.masks import dilate
-from gscompleter.types import Camera, Render, SceneContext, View
+from gscompleter.config.coverage import COVERED
+from gscompleter.generators.exposure import match_exposures
+from gscompleter.generators.smooth import continue_smoothly
+from gscompleter.geometry import is_inside, measure_baseline, project, sample, unproject
+from gscompleter.image_ops import dilate
+from gscompleter.types import Camera, GeneratorInput, Render, View
 
 DEPTH_TOLERANCE = 0.03
 """Relative depth error at which the weight of a photograph falls to 1/e."""
 SHARPNESS = 4.0
 """Exponent of the weights; larger values prefer the nearest photograph."""
-SHOWN = 1.0
+MIN_WEIGHT = 1.0
 """Smallest weight, before the exponent, of a photograph that observes a surface."""
-AROUND = 4
+DYNAMIC_MARGIN = 4
 """Pixels around a dynamic mask without trust in the rendered colour."""
 
 
 @dataclass(frozen=True)
-class Warped:
+class WarpedImage:
     """The known part of the target image."""
 
     image: Float[Tensor, "h w 3"]
@@ -37,9 +37,9 @@ class Warped:
     gains: tuple[Float[Tensor, "3"], ...]
     """Exposure gain applied to each photograph to match the nearest one."""
 
-    def to(self, device: torch.device | str) -> Warped:
+    def to(self, device: torch.device | str) -> WarpedImage:
         """Return a copy on `device`."""
-        return Warped(
+        return WarpedImage(
             self.image.to(device),
             self.known.to(device),
             self.depth.to(device),
@@ -47,7 +47,7 @@ class Warped:
         )
 
 
-def warp_photographs(nearest: View, target: Camera, context: SceneContext) -> Warped:
+def warp_photographs(nearest: View, target: Camera, context: GeneratorInput) -> WarpedImage:
     """Blend the colours of all photographs at the surfaces that the target observes.
 
     A photograph counts if the scene has the same depth from its camera, so that nothing occludes
@@ -55,22 +55,22 @@ def warp_photographs(nearest: View, target: Camera, context: SceneContext) -> Wa
     masks and their surroundings stay unknown unless another photograph shows them. All colours are
     matched to the exposure of `nearest`.
     """
-    scene = context.at_target
+    scene = context.target_render
     known = ~context.holes
     points = unproject(scene.depth, target)
     colours, weights = [], []
     dynamic = torch.zeros_like(known)
-    for view, render in zip(context.views, context.at_views, strict=True):
+    for view, render in zip(context.views, context.view_renders, strict=True):
         pixels, z = project(points, view.camera)
-        visible = _visibility(pixels, z, view, render)
-        shown = (visible * _closeness(points, target, view)) ** SHARPNESS
+        visible = _compute_visibility(pixels, z, view, render)
+        shown = (visible * _compute_closeness(points, target, view)) ** SHARPNESS
         colours.append(sample(view.image, pixels))
-        weights.append(shown * _trusted(view, pixels))
-        dynamic |= (shown > SHOWN**SHARPNESS) & _contradicted(view, pixels)
+        weights.append(shown * _sample_trusted(view, pixels))
+        dynamic |= (shown > MIN_WEIGHT**SHARPNESS) & _sample_dynamic(view, pixels)
 
-    baselines = [baseline_between(nearest.camera, view.camera) for view in context.views]
+    baselines = [measure_baseline(nearest.camera, view.camera) for view in context.views]
     reference = baselines.index(min(baselines))
-    factors = gains(colours, [known & (w > 1) for w in weights], reference)
+    factors = match_exposures(colours, [known & (w > 1) for w in weights], reference)
     total = torch.stack(weights).sum(dim=0)
     colour = torch.stack(
         [w[..., None] * c * g for w, c, g in zip(weights, colours, factors, strict=True)]
@@ -79,28 +79,28 @@ def warp_photographs(nearest: View, target: Camera, context: SceneContext) -> Wa
     rendered = scene.image / scene.alpha.clamp_min(context.max_alpha)[..., None]
     trust = (total / (total + 1e-4))[..., None]
     image = torch.lerp(rendered, colour / total.clamp_min(1e-12)[..., None], trust)
-    if context.believed is not None:
-        known = known | ((scene.alpha >= context.max_alpha) & (total > SHOWN**SHARPNESS))
-    known = known & ~(dilate(dynamic, AROUND) & (total < SHOWN**SHARPNESS))
-    return Warped(image.clamp(0, 1), known, scene.depth, tuple(factors))
+    if context.trusted_alpha is not None:
+        known = known | ((scene.alpha >= context.max_alpha) & (total > MIN_WEIGHT**SHARPNESS))
+    known = known & ~(dilate(dynamic, DYNAMIC_MARGIN) & (total < MIN_WEIGHT**SHARPNESS))
+    return WarpedImage(image.clamp(0, 1), known, scene.depth, tuple(factors))
 
 
-def with_unexplained(warped: Warped, target: Camera, context: SceneContext) -> Warped:
+def add_unexplained(warped: WarpedImage, target: Camera, context: GeneratorInput) -> WarpedImage:
     """Fill holes with photographed content that the scene lacks.
 
     Its depth is unknown, so the depth around the hole is continued. Only photographs whose own
     render is empty in that direction count; others show an occluder. Some pixel must be known.
     """
-    guess = depth_continued(warped).exp().to(warped.depth.device)
+    guess = continue_depth(warped).exp().to(warped.depth.device)
     points = unproject(guess, target)
     colour = torch.zeros_like(warped.image)
     total = torch.zeros_like(guess)
-    for view, render, gain in zip(context.views, context.at_views, warped.gains, strict=True):
+    for view, render, gain in zip(context.views, context.view_renders, warped.gains, strict=True):
         pixels, z = project(points, view.camera)
         empty = sample(render.alpha[..., None], pixels)[..., 0] < COVERED
-        unexplained = empty & inside(pixels, z, view.camera) & ~warped.known
-        unexplained = unexplained & _trusted(view, pixels)
-        weight = unexplained * _closeness(points, target, view) ** SHARPNESS
+        unexplained = empty & is_inside(pixels, z, view.camera) & ~warped.known
+        unexplained = unexplained & _sample_trusted(view, pixels)
+        weight = unexplained * _compute_closeness(points, target, view) ** SHARPNESS
         colour = colour + weight[..., None] * gain * sample(view.image, pixels)
         total = total + weight
     found = total > 0
@@ -113,24 +113,26 @@ def with_unexplained(warped: Warped, target: Camera, context: SceneContext) -> W
     )
 
 
-def background_first(warped: Warped) -> tuple[Float[Tensor, "h w 3"], Float[Tensor, "h w"]]:
+def fill_background_first(
+    warped: WarpedImage,
+) -> tuple[Float[Tensor, "h w 3"], Float[Tensor, "h w"]]:
     """Continue image and log-depth beyond the known pixels, preferring far pixels.
 
     A hole beside an object usually shows the background, so the weight is the squared depth.
     """
-    log_depth, weight, middle = _relative_depth(warped)
-    layers = continued(torch.cat([warped.image.cpu(), log_depth], dim=-1), weight)
+    log_depth, weight, middle = _compute_relative_depth(warped)
+    layers = continue_smoothly(torch.cat([warped.image.cpu(), log_depth], dim=-1), weight)
     return layers[..., :3], layers[..., 3] + middle
 
 
-def depth_continued(warped: Warped) -> Float[Tensor, "h w"]:
+def continue_depth(warped: WarpedImage) -> Float[Tensor, "h w"]:
     """Continue only the log-depth, as in `fill_background_first`."""
-    log_depth, weight, middle = _relative_depth(warped)
-    return continued(log_depth, weight)[..., 0] + middle
+    log_depth, weight, middle = _compute_relative_depth(warped)
+    return continue_smoothly(log_depth, weight)[..., 0] + middle
 
 
-def _relative_depth(
-    warped: Warped,
+def _compute_relative_depth(
+    warped: WarpedImage,
 ) -> tuple[Float[Tensor, "h w 1"], Float[Tensor, "h w"], Float[Tensor, ""]]:
     """Compute log-depth relative to the median, its weight and the log of the median."""
     known, depth = warped.known.cpu(), warped.depth.cpu()
@@ -139,30 +141,32 @@ def _relative_depth(
     return relative.log()[..., None], relative**2 * known, middle.log()
 
 
-def _visibility(
+def _compute_visibility(
     pixels: Float[Tensor, "h w 2"], z: Float[Tensor, "h w"], view: View, render: Render
 ) -> Float[Tensor, "h w"]:
     """Compute how well depth `z` matches the surface at `pixels` of a view, in [0, 1]."""
     layers = torch.stack([render.depth, render.alpha], dim=-1)
     depth, alpha = sample(layers, pixels).unbind(-1)
     error = (z - depth).abs() / (DEPTH_TOLERANCE * z.abs().clamp_min(1e-12))
-    visible = inside(pixels, z, view.camera) & (alpha >= COVERED)
+    visible = is_inside(pixels, z, view.camera) & (alpha >= COVERED)
     return torch.exp(-(error**2)) * visible
 
 
-def _trusted(view: View, pixels: Float[Tensor, "h w 2"]) -> Bool[Tensor, "h w"]:
+def _sample_trusted(view: View, pixels: Float[Tensor, "h w 2"]) -> Bool[Tensor, "h w"]:
     """Mark `pixels` whose whole neighbourhood in the photograph is trusted."""
-    return sample((~view.trusted)[..., None].float(), pixels)[..., 0] == 0
+    return sample((~view.static_mask)[..., None].float(), pixels)[..., 0] == 0
 
 
-def _contradicted(view: View, pixels: Float[Tensor, "h w 2"]) -> Bool[Tensor, "h w"]:
+def _sample_dynamic(view: View, pixels: Float[Tensor, "h w 2"]) -> Bool[Tensor, "h w"]:
     """Mark `pixels` in or beside the dynamic mask of a photograph."""
-    if view.contradicted is None:
+    if view.dynamic_mask is None:
         return torch.zeros_like(pixels[..., 0], dtype=torch.bool)
-    return sample(view.contradicted[..., None].float(), pixels)[..., 0] > 0
+    return sample(view.dynamic_mask[..., None].float(), pixels)[..., 0] > 0
 
 
-def _closeness(points: Float[Tensor, "h w 3"], target: Camera, view: View) -> Float[Tensor, "h w"]:
+def _compute_closeness(
+    points: Float[Tensor, "h w 3"], target: Camera, view: View
+) -> Float[Tensor, "h w"]:
     """Compute a weight that falls with the angle between the target's and view's rays."""
     to_target = torch.nn.functional.normalize(target.center - points, dim=-1)
     to_view = torch.nn.functional.normalize(view.camera.center - points, dim=-1)

@@ -11,25 +11,25 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import BinaryIO
 
-from gscompleter.errors import InputError, OutputError, quoted
-from gscompleter.interrupts import stops_deferred
+from gscompleter.errors import InputError, OutputError, quote_value
+from gscompleter.io.interrupts import defer_interrupts
 from gscompleter.io.unfinished import (
-    MARK,
-    abandoned,
+    UNFINISHED_PREFIX,
     create_file,
     create_folder,
+    lock_abandoned,
     remove,
     remove_abandoned,
 )
 
-SUMMARY = "summary.json"
+SUMMARY_FILE = "summary.json"
 """File that marks a folder as complete: it is removed first and written last."""
-TARGETS = "targets.json"
+TARGETS_FILE = "targets.json"
 """File of a completion with the target cameras."""
-CONTEXT, COMPLETED = "context.ply", "completed.ply"
+CONTEXT_FILE, COMPLETED_FILE = "context.ply", "completed.ply"
 """The scene of a completion before and after."""
 
-_REPLACED = f"{MARK}replaced"
+_REPLACED_FOLDER = f"{UNFINISHED_PREFIX}replaced"
 """Folder of a draft for replaced entries; it exists only once the draft is complete."""
 
 _REASONS = {
@@ -51,7 +51,7 @@ _DISK_ERRORS = {errno.ENOSPC, errno.EDQUOT, errno.EFBIG, errno.EROFS}
 
 
 @contextlib.contextmanager
-def replacing(path: Path | str, first_stays: bool = False) -> Iterator[BinaryIO]:
+def replace_file(path: Path | str, keep_existing: bool = False) -> Iterator[BinaryIO]:
     """Open a temporary file that is renamed to `path` once it is completely on the disk.
 
     An existing file survives every failure. With `first_stays`, a file that another process wrote
@@ -68,23 +68,23 @@ def replacing(path: Path | str, first_stays: bool = False) -> Iterator[BinaryIO]
         if target.is_dir():
             raise IsADirectoryError(errno.EISDIR, os.strerror(errno.EISDIR))
         remove_abandoned(target.parent)
-        with stops_deferred():
+        with defer_interrupts():
             temporary, opened = create_file(target.parent)
         with opened as file:
             yield file
             file.flush()
             os.fsync(file.fileno())
-            if not (first_stays and _linked(temporary, target)):
+            if not (keep_existing and _link(temporary, target)):
                 os.replace(temporary, target)
     except OSError as error:
-        raise OutputError(_cannot_write(path, error)) from error
+        raise OutputError(_describe_write_error(path, error)) from error
     finally:
         if temporary is not None:
             with contextlib.suppress(OSError):
                 temporary.unlink()
 
 
-def _linked(temporary: Path, target: Path) -> bool:
+def _link(temporary: Path, target: Path) -> bool:
     """Link the file to `target`, unless another process wrote that first.
 
     Returns:
@@ -107,12 +107,12 @@ def check_output(path: Path | str, overwrite: bool = False) -> None:
     Raises:
         InputError: `path` is a file, not empty while `overwrite` is off, or not writable.
     """
-    with stops_deferred():
+    with defer_interrupts():
         _Draft(Path(path), overwrite).close()
 
 
 @contextlib.contextmanager
-def output_folder(path: Path | str, overwrite: bool = False) -> Iterator[Path]:
+def open_output_folder(path: Path | str, overwrite: bool = False) -> Iterator[Path]:
     """Open a temporary folder whose content becomes `path` at once at the end.
 
     A new `path` is made by a rename. One with only results of the same names is exchanged in one
@@ -126,11 +126,11 @@ def output_folder(path: Path | str, overwrite: bool = False) -> Iterator[Path]:
     """
     draft: _Draft | None = None
     try:
-        with stops_deferred():
+        with defer_interrupts():
             draft = _Draft(Path(path), overwrite)
         try:
             yield draft.folder
-            with stops_deferred(f"{quoted(Path(path))} is complete"):
+            with defer_interrupts(f"{quote_value(Path(path))} is complete"):
                 draft.publish()
                 draft.close()
         except InputError as error:
@@ -140,9 +140,9 @@ def output_folder(path: Path | str, overwrite: bool = False) -> Iterator[Path]:
         except OSError as error:
             if error.errno not in _DISK_ERRORS:
                 raise
-            raise OutputError(_cannot_write(path, error)) from error
+            raise OutputError(_describe_write_error(path, error)) from error
     finally:
-        with stops_deferred():
+        with defer_interrupts():
             if draft is not None:
                 draft.close()
 
@@ -155,21 +155,21 @@ class _Draft:
         try:
             self.exists = self.target.is_dir()
         except OSError as error:
-            raise OutputError(_cannot_write(path, error)) from error
+            raise OutputError(_describe_write_error(path, error)) from error
         self.parents: list[Path] = []
         self.closed = False
         if self.exists:
             _finish_abandoned(self.target)
         _check_free(path, self.target, overwrite)
         try:
-            beside = not self.exists or _may_change_places(self.target)
+            beside = not self.exists or _can_exchange(self.target)
             home = self.target.parent if beside else self.target
             self._make_parents(home)
             remove_abandoned(home)
             self.folder, self.lock = create_folder(home)
         except OSError as error:
             self._remove_parents()
-            raise OutputError(_cannot_write(path, error)) from error
+            raise OutputError(_describe_write_error(path, error)) from error
 
     def _make_parents(self, folder: Path) -> None:
         missing = [p for p in (folder, *folder.parents) if not p.exists()]
@@ -188,18 +188,18 @@ class _Draft:
             if not self.exists:
                 os.rename(self.folder, self.target)
                 self.parents = []
-            elif not self._changed_places():
+            elif not self._try_exchange():
                 self._move_inside()
-                _finish(self.folder)
+                _finish_renames(self.folder)
         except OSError as error:
-            raise OutputError(_cannot_write(self.target, error)) from error
+            raise OutputError(_describe_write_error(self.target, error)) from error
 
-    def _changed_places(self) -> bool:
+    def _try_exchange(self) -> bool:
         """Exchange draft and target in one step, if only results would be lost."""
         if self.folder.parent != self.target.parent:
             return False
         others = set(os.listdir(self.target)) - set(os.listdir(self.folder))
-        if any(not name.startswith(MARK) for name in others):
+        if any(not name.startswith(UNFINISHED_PREFIX) for name in others):
             return False
         with contextlib.suppress(OSError):
             shutil.copymode(self.target, self.folder)
@@ -221,9 +221,9 @@ class _Draft:
         self.closed = True
         # Entries that could not be restored exist only here; the next run finishes the renames.
         with contextlib.suppress(FileNotFoundError, NotADirectoryError):
-            if not os.listdir(self.folder / _REPLACED):
-                os.rmdir(self.folder / _REPLACED)
-        if not (self.folder / _REPLACED).exists():
+            if not os.listdir(self.folder / _REPLACED_FOLDER):
+                os.rmdir(self.folder / _REPLACED_FOLDER)
+        if not (self.folder / _REPLACED_FOLDER).exists():
             remove(self.folder)
         os.close(self.lock)
         self._remove_parents()
@@ -231,19 +231,19 @@ class _Draft:
 
 def _finish_abandoned(target: Path) -> None:
     """Finish the renames of a killed run in `target`, and remove its other leftovers."""
-    with abandoned(target) as found:
+    with lock_abandoned(target) as found:
         for draft in found:
             with contextlib.suppress(OSError):
-                if (draft / _REPLACED).is_dir():
-                    _finish(draft)
+                if (draft / _REPLACED_FOLDER).is_dir():
+                    _finish_renames(draft)
                 remove(draft)
 
 
-def _finish(draft: Path) -> None:
+def _finish_renames(draft: Path) -> None:
     """Move the content of `draft` to its parent folder, or nothing; replaced entries are lost."""
-    target, replaced = draft.parent, draft / _REPLACED
-    entries = set(os.listdir(draft)) - {_REPLACED}
-    names = sorted(entries, key=lambda name: (name == SUMMARY, name))
+    target, replaced = draft.parent, draft / _REPLACED_FOLDER
+    entries = set(os.listdir(draft)) - {_REPLACED_FOLDER}
+    names = sorted(entries, key=lambda name: (name == SUMMARY_FILE, name))
     replaced.mkdir(exist_ok=True)
     old = [name for name in reversed(names) if os.path.lexists(target / name)]
     moves = [(target / name, replaced / name) for name in old]
@@ -251,7 +251,7 @@ def _finish(draft: Path) -> None:
     remove(replaced)
 
 
-def _may_change_places(folder: Path) -> bool:
+def _can_exchange(folder: Path) -> bool:
     """Return True if another folder can take the place of this one unnoticed."""
     here = Path.cwd()
     return (
@@ -290,20 +290,21 @@ def _check_free(path: Path, target: Path, overwrite: bool) -> None:
     """Raise InputError if `path` contains something that must not be overwritten."""
     if os.path.lexists(target) and not target.is_dir():
         raise InputError(
-            f"The output {quoted(path)} is a file, and a folder is needed; name another one."
+            f"The output {quote_value(path)} is a file, and a folder is needed; name another one."
         )
     try:
         entries = os.listdir(target) if target.is_dir() else []
     except OSError as error:
-        raise OutputError(_cannot_write(path, error)) from error
-    if not overwrite and any(not name.startswith(MARK) for name in entries):
+        raise OutputError(_describe_write_error(path, error)) from error
+    if not overwrite and any(not name.startswith(UNFINISHED_PREFIX) for name in entries):
         raise InputError(
-            f"The output folder {quoted(path)} is not empty; name another one, or overwrite the "
+            f"The output folder {quote_value(path)} is not empty; name another one, or overwrite "
+            "the "
             "results in it.",
             "overwrite",
         )
 
 
-def _cannot_write(path: Path | str, error: OSError) -> str:
+def _describe_write_error(path: Path | str, error: OSError) -> str:
     reason = _REASONS.get(error.errno or 0, f"{error.strerror or error}; choose another place")
-    return f"Cannot write {quoted(Path(path))}: {reason}."
+    return f"Cannot write {quote_value(Path(path))}: {reason}."

@@ -13,16 +13,16 @@ from jaxtyping import Bool, Float, UInt8
 from PIL import Image
 from torch import Tensor
 
-from gscompleter.errors import InputError, quoted, refuse_pointer
-from gscompleter.io.files import replacing
+from gscompleter.errors import InputError, quote_value, refuse_pointer
+from gscompleter.io.files import replace_file
 
-FORMATS = ("PNG", "JPEG", "TIFF", "WEBP", "BMP", "PPM", "GIF", "JPEG2000")
+IMAGE_FORMATS = ("PNG", "JPEG", "TIFF", "WEBP", "BMP", "PPM", "GIF", "JPEG2000")
 """Image formats that are read. Others in Pillow run programs or are no photographs."""
 
 MAX_PIXELS = 178_956_970
 """Largest number of pixels of an image, as in Pillow."""
 
-COMPRESSION = 3
+PNG_COMPRESSION = 3
 """zlib level of written PNGs: 6 % more bytes than level 6, in a third of its time."""
 
 _ORIENTATION = 0x0112
@@ -31,18 +31,20 @@ _ORIENTATION = 0x0112
 
 def read_image(path: Path | str) -> Float[Tensor, "h w 3"]:
     """Read an image in [0, 1]; transparent parts are composited over black."""
-    return as_image(read_pixels(path))
+    return convert_to_image(read_pixels(path))
 
 
 def write_image(
     path: Path | str, image: Float[Tensor, "h w 3"] | Float[Tensor, "h w"] | Bool[Tensor, "h w"]
 ) -> None:
     """Write colours, or a grey image or mask, as an 8-bit PNG."""
-    with replacing(path) as file:
-        Image.fromarray(as_pixels(image)).save(file, format="PNG", compress_level=COMPRESSION)
+    with replace_file(path) as file:
+        Image.fromarray(convert_to_pixels(image)).save(
+            file, format="PNG", compress_level=PNG_COMPRESSION
+        )
 
 
-def as_pixels(
+def convert_to_pixels(
     image: Float[Tensor, "h w 3"] | Float[Tensor, "h w"] | Bool[Tensor, "h w"],
 ) -> UInt8[np.ndarray, "h w 3"] | UInt8[np.ndarray, "h w"]:
     """Convert values in [0, 1] to 8 bits: clamped, rounded to the nearest, NaN as 0."""
@@ -50,21 +52,21 @@ def as_pixels(
     return (values * 255 + 0.5).floor().to(torch.uint8).numpy()
 
 
-def as_image(pixels: UInt8[np.ndarray, "h w 3"]) -> Float[Tensor, "h w 3"]:
+def convert_to_image(pixels: UInt8[np.ndarray, "h w 3"]) -> Float[Tensor, "h w 3"]:
     """Convert 8-bit pixels to colours in [0, 1]."""
     return torch.from_numpy(pixels.astype(np.float32) / 255)
 
 
-def image_size(stored: Path | bytes, name: str = "") -> tuple[int, int]:
+def read_image_size(stored: Path | bytes, name: str = "") -> tuple[int, int]:
     """Read width and height of an image file, or of its bytes; `name` is for errors."""
-    with _decoded(stored, name) if isinstance(stored, bytes) else _opened(stored) as image:
+    with _open_bytes(stored, name) if isinstance(stored, bytes) else _open_file(stored) as image:
         return image.size
 
 
-def is_turned(path: Path) -> bool:
+def has_orientation_tag(path: Path) -> bool:
     """Return True if the EXIF data of a photograph ask viewers to rotate it."""
     try:
-        with _opened(path) as image:
+        with _open_file(path) as image:
             return bool(image.getexif().get(_ORIENTATION, 1) != 1)
     except Exception:  # of any kind; reading the photograph reports it
         return False
@@ -78,16 +80,16 @@ def read_pixels(path: Path | str) -> UInt8[np.ndarray, "h w 3"]:
     Raises:
         InputError: The file is missing, truncated or not an image.
     """
-    with _opened(path) as image:
-        problem = f"The image {quoted(Path(path))} is damaged"
-        return _checked(lambda: _over_black(image), problem, "copy it again")
+    with _open_file(path) as image:
+        problem = f"The image {quote_value(Path(path))} is damaged"
+        return _run_decoder(lambda: _composite_over_black(image), problem, "copy it again")
 
 
 def decode_pixels(data: bytes, name: str) -> UInt8[np.ndarray, "h w 3"]:
     """Decode the bytes of an image file like `read_pixels`; `name` is for errors."""
-    with _decoded(data, name) as image:
-        problem = f"{quoted(name)} is damaged"
-        return _checked(lambda: _over_black(image), problem, "copy its file again")
+    with _open_bytes(data, name) as image:
+        problem = f"{quote_value(name)} is damaged"
+        return _run_decoder(lambda: _composite_over_black(image), problem, "copy its file again")
 
 
 def read_brightness(stored: Path | bytes, side: int, name: str = "") -> Float[np.ndarray, "h w"]:
@@ -95,16 +97,16 @@ def read_brightness(stored: Path | bytes, side: int, name: str = "") -> Float[np
 
     A JPEG is decoded no larger than necessary; `name` names bytes in errors.
     """
-    with _decoded(stored, name) if isinstance(stored, bytes) else _opened(stored) as image:
+    with _open_bytes(stored, name) if isinstance(stored, bytes) else _open_file(stored) as image:
         scale = min(1.0, side / max(image.size))
         size = max(round(image.width * scale), 1), max(round(image.height * scale), 1)
         image.draft("L", size)
-        problem = f"The image {quoted(name or str(stored))} is damaged"
-        return _checked(lambda: _shrunk(image, size), problem, "copy it again")
+        problem = f"The image {quote_value(name or str(stored))} is damaged"
+        return _run_decoder(lambda: _shrink(image, size), problem, "copy it again")
 
 
-def _shrunk(image: Image.Image, size: tuple[int, int]) -> Float[np.ndarray, "h w"]:
-    grey = Image.fromarray(_over_black(image)).convert("L")
+def _shrink(image: Image.Image, size: tuple[int, int]) -> Float[np.ndarray, "h w"]:
+    grey = Image.fromarray(_composite_over_black(image)).convert("L")
     return np.array(grey.resize(size, Image.Resampling.BOX), np.float32)
 
 
@@ -112,24 +114,26 @@ def read_depth(path: Path, unit: float) -> Float[np.ndarray, "h w"]:
     """Read z-depth from a 16-bit PNG or a `.npy` file, times `unit`; 0 where unknown."""
     if not os.path.isfile(path):
         raise InputError(
-            f"There is no depth map {quoted(path)}; restore it, or remove its `depth_file_path`."
+            f"There is no depth map {quote_value(path)}; restore it, or remove its "
+            "`depth_file_path`."
         )
-    problem = f"The depth map {quoted(path)} cannot be read"
-    values = _checked(lambda: _depth_values(path), problem, "copy it again")
+    problem = f"The depth map {quote_value(path)} cannot be read"
+    values = _run_decoder(lambda: _load_depth_values(path), problem, "copy it again")
     values = values[..., 0] if values.ndim == 3 and values.shape[-1] == 1 else values
     if values.ndim != 2 or values.dtype.kind not in "uif" or values.dtype == np.uint8:
         raise InputError(
-            f"{quoted(path)} is no depth map: a 16-bit grey PNG or an array [h, w] of numbers is "
-            f"needed, and it holds {values.dtype} of shape {quoted(list(values.shape))}."
+            f"{quote_value(path)} is no depth map: a 16-bit grey PNG or an array [h, w] of "
+            "numbers is "
+            f"needed, and it holds {values.dtype} of shape {quote_value(list(values.shape))}."
         )
     with np.errstate(over="ignore", invalid="ignore"):
         depth = (values.astype(np.float64) * unit).astype(np.float32)
     return np.where(np.isfinite(depth) & (depth > 0), depth, np.float32(0))
 
 
-def _depth_values(path: Path) -> np.ndarray:
+def _load_depth_values(path: Path) -> np.ndarray:
     if path.suffix != ".npy":
-        with Image.open(path, formats=FORMATS) as image:
+        with Image.open(path, formats=IMAGE_FORMATS) as image:
             return np.array(image)
     # A memory map cannot exceed the file, whatever size its header claims.
     values = np.lib.format.open_memmap(path, mode="r")
@@ -138,30 +142,30 @@ def _depth_values(path: Path) -> np.ndarray:
     return values
 
 
-def _checked(decode: Callable[[], np.ndarray], told: str, advice: str) -> np.ndarray:
+def _run_decoder(decode: Callable[[], np.ndarray], problem: str, advice: str) -> np.ndarray:
     """Run `decode` and turn any failure into an InputError."""
     try:
         return decode()
     except Exception as error:
-        raise InputError(f"{told} ({quoted(str(error))}); {advice}.") from error
+        raise InputError(f"{problem} ({quote_value(str(error))}); {advice}.") from error
 
 
-def _opened(path: Path | str) -> Image.Image:
+def _open_file(path: Path | str) -> Image.Image:
     path = Path(path)
     if not os.path.isfile(path):
-        raise InputError(f"There is no image {quoted(path)}; restore it or correct its path.")
+        raise InputError(f"There is no image {quote_value(path)}; restore it or correct its path.")
     refuse_pointer(path)
-    return _open(path, quoted(path), "a PNG or JPEG file is")
+    return _open(path, quote_value(path), "a PNG or JPEG file is")
 
 
-def _decoded(data: bytes, name: str) -> Image.Image:
-    return _open(io.BytesIO(data), quoted(name), "the bytes of a PNG or JPEG file are")
+def _open_bytes(data: bytes, name: str) -> Image.Image:
+    return _open(io.BytesIO(data), quote_value(name), "the bytes of a PNG or JPEG file are")
 
 
 def _open(file: Path | io.BytesIO, name: str, needed: str) -> Image.Image:
     Image.preinit()  # usual formats only; Pillow would load all of them
     try:
-        return Image.open(file, formats=FORMATS)
+        return Image.open(file, formats=IMAGE_FORMATS)
     except Image.DecompressionBombError as error:
         raise InputError(
             f"{name} claims more than {MAX_PIXELS:,} pixels; make it smaller."
@@ -170,7 +174,7 @@ def _open(file: Path | io.BytesIO, name: str, needed: str) -> Image.Image:
         raise InputError(f"{name} is not an image that can be read; {needed} needed.") from error
 
 
-def _over_black(image: Image.Image) -> UInt8[np.ndarray, "h w 3"]:
+def _composite_over_black(image: Image.Image) -> UInt8[np.ndarray, "h w 3"]:
     if image.mode == "F":
         raise ValueError("it holds floating-point values, not colours")
     if image.mode == "I" or image.mode.startswith("I;16"):
@@ -182,7 +186,7 @@ def _over_black(image: Image.Image) -> UInt8[np.ndarray, "h w 3"]:
     return np.array(image.convert("RGB"))
 
 
-def jpeg_of(image: Image.Image, quality: int) -> bytes:
+def encode_jpeg(image: Image.Image, quality: int) -> bytes:
     """Encode an image as JPEG, with a quality from 1 to 95."""
     file = io.BytesIO()
     image.save(file, format="JPEG", quality=quality)

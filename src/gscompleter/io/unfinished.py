@@ -21,16 +21,16 @@ try:
 except ImportError:  # not POSIX: no locks, and leftovers stay
     fcntl = None  # type: ignore[assignment]
 
-MARK = ".gscompleter-"
+UNFINISHED_PREFIX = ".gscompleter-"
 """Prefix of the names of unfinished entries."""
 
 
 def create_file(folder: Path) -> tuple[Path, BinaryIO]:
     """Create a file in `folder`, locked until it is closed."""
     while True:
-        path = folder / _new_name()
+        path = folder / _make_name()
         file = path.open("xb")
-        if locked(file.fileno(), wait=True) is not False and os.fstat(file.fileno()).st_nlink:
+        if acquire_lock(file.fileno(), wait=True) is not False and os.fstat(file.fileno()).st_nlink:
             return path, file
         file.close()  # another process removed it before it was locked
 
@@ -38,33 +38,33 @@ def create_file(folder: Path) -> tuple[Path, BinaryIO]:
 def create_folder(folder: Path) -> tuple[Path, int]:
     """Create a folder in `folder`; the returned descriptor locks it until it is closed."""
     while True:
-        path = folder / _new_name()
+        path = folder / _make_name()
         path.mkdir()
         with contextlib.suppress(FileNotFoundError):
             lock = os.open(path, os.O_RDONLY)
-            locked(lock, wait=True)
+            acquire_lock(lock, wait=True)
             if path.exists():
                 return path, lock
             os.close(lock)
 
 
 @contextlib.contextmanager
-def abandoned(folder: Path) -> Iterator[list[Path]]:
+def lock_abandoned(folder: Path) -> Iterator[list[Path]]:
     """Lock and list the leftovers of killed processes of this machine in `folder`."""
     found: list[Path] = []
     with contextlib.ExitStack() as locks:
-        for path in _made_here(folder):
+        for path in _list_own_entries(folder):
             with contextlib.suppress(OSError):
                 lock = os.open(path, os.O_RDONLY)
                 locks.callback(os.close, lock)
-                if locked(lock, wait=False):
+                if acquire_lock(lock, wait=False):
                     found.append(path)
         yield found
 
 
 def remove_abandoned(folder: Path) -> None:
     """Remove leftovers of killed processes in `folder`, as far as permitted."""
-    with abandoned(folder) as found:
+    with lock_abandoned(folder) as found:
         for path in found:
             remove(path)
 
@@ -77,21 +77,21 @@ def remove(path: Path) -> None:
         path.unlink()
 
 
-def _made_here(folder: Path) -> list[Path]:
+def _list_own_entries(folder: Path) -> list[Path]:
     with contextlib.suppress(OSError):
-        return [folder / name for name in os.listdir(folder) if name.startswith(_prefix())]
+        return [folder / name for name in os.listdir(folder) if name.startswith(_make_prefix())]
     return []
 
 
-def _prefix() -> str:
-    return f"{MARK}{re.sub(r'[^A-Za-z0-9]', '', socket.gethostname())[:32]}-"
+def _make_prefix() -> str:
+    return f"{UNFINISHED_PREFIX}{re.sub(r'[^A-Za-z0-9]', '', socket.gethostname())[:32]}-"
 
 
-def _new_name() -> str:
-    return f"{_prefix()}{secrets.token_hex(6)}"
+def _make_name() -> str:
+    return f"{_make_prefix()}{secrets.token_hex(6)}"
 
 
-def locked(descriptor: int, wait: bool) -> bool | None:
+def acquire_lock(descriptor: int, wait: bool) -> bool | None:
     """Lock a descriptor; False if another process holds it, None if locks are unsupported."""
     if fcntl is None:
         return None

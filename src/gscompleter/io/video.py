@@ -11,26 +11,26 @@ from pathlib import Path
 import numpy as np
 from jaxtyping import UInt8
 
-from gscompleter.errors import InputError, quoted
+from gscompleter.errors import InputError, quote_value
 
 QUALITY = 18
 """Constant rate factor of x264: 0 is lossless, 18 is visually lossless."""
-SAME_BYTES = (
+REPRODUCIBLE_OPTIONS = (
     *("-threads", "1", "-filter_threads", "1"),
     *("-fflags", "+bitexact", "-flags:v", "+bitexact", "-map_metadata", "-1"),
 )
 """Options for the same bytes on every run and machine."""
-COLOURS = (
+COLOR_OPTIONS = (
     "-vf",
     "scale=out_color_matrix=bt709:out_range=tv:flags=accurate_rnd+bitexact+bicubic,"
     "setparams=colorspace=bt709:color_primaries=bt709:color_trc=bt709",
 )
 """Options for the colour space that players assume, stored in the file."""
-FOR_PLAYERS = ("-pix_fmt", "yuv420p", "-movflags", "+faststart")
+PLAYER_OPTIONS = ("-pix_fmt", "yuv420p", "-movflags", "+faststart")
 """Options for a pixel format that all players know, and for an index at the start."""
 
 
-def check_writer() -> None:
+def check_video_writer() -> None:
     """Check that a video can be written, before anything is computed.
 
     Raises:
@@ -42,10 +42,10 @@ def check_writer() -> None:
             "`pip install gscompleter[film]`.",
             "video",
         )
-    ffmpeg()
+    find_ffmpeg()
 
 
-def ffmpeg() -> str:
+def find_ffmpeg() -> str:
     """Find the path of ffmpeg."""
     from imageio_ffmpeg import get_ffmpeg_exe
 
@@ -66,32 +66,34 @@ def write_video(path: Path, frames: Iterable[UInt8[np.ndarray, "h w 3"]], rate: 
     """
     iterator = iter(frames)
     first = next(iterator)
-    program = command(path, first.shape[1], first.shape[0], rate)
+    program = build_ffmpeg_command(path, first.shape[1], first.shape[0], rate)
     process = subprocess.Popen(program, stdin=subprocess.PIPE, stderr=subprocess.PIPE)
     try:
-        send(process, first)
+        send_frame(process, first)
         for frame in iterator:
-            send(process, frame)
+            send_frame(process, frame)
         _, messages = process.communicate()
     finally:  # also on an interrupt
         process.kill()
         process.wait()
     if process.returncode != 0:
-        raise InputError(f"ffmpeg could not write {quoted(path)}: {quoted(messages.decode(), 200)}")
+        raise InputError(
+            f"ffmpeg could not write {quote_value(path)}: {quote_value(messages.decode(), 200)}"
+        )
 
 
-def send(process: subprocess.Popen[bytes], frame: UInt8[np.ndarray, "h w 3"]) -> None:
+def send_frame(process: subprocess.Popen[bytes], frame: UInt8[np.ndarray, "h w 3"]) -> None:
     """Write a frame to ffmpeg; if it has ended, its exit code is checked later."""
     assert process.stdin is not None
     with suppress(BrokenPipeError):
         process.stdin.write(np.ascontiguousarray(frame).data)
 
 
-def command(path: Path, width: int, height: int, rate: int) -> list[str]:
+def build_ffmpeg_command(path: Path, width: int, height: int, rate: int) -> list[str]:
     """Build the command line of ffmpeg for 8-bit RGB frames from standard input."""
     return [
-        *(ffmpeg(), "-v", "error", "-y", "-nostdin"),
+        *(find_ffmpeg(), "-v", "error", "-y", "-nostdin"),
         *("-f", "rawvideo", "-pix_fmt", "rgb24", "-s", f"{width}x{height}", "-r", str(rate)),
         *("-i", "pipe:0", "-an", "-c:v", "libx264", "-preset", "medium", "-crf", str(QUALITY)),
-        *(*COLOURS, *FOR_PLAYERS, *SAME_BYTES, str(path)),
+        *(*COLOR_OPTIONS, *PLAYER_OPTIONS, *REPRODUCIBLE_OPTIONS, str(path)),
     ]

@@ -11,7 +11,7 @@ from numba.np import linalg
 
 
 @contextmanager
-def _without_blas():
+def _skip_blas_check():
     """Skip numba's search for BLAS, which imports SciPy: a third of its load time."""
     ensure_blas = getattr(linalg, "ensure_blas", None)
 
@@ -27,5 +27,5 @@ def _without_blas():
             linalg.ensure_blas = ensure_blas
 
 
-with _without_blas():
+with _skip_blas_check():
     import numba.np.arraymath  # noqa: F401

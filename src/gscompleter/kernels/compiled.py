@@ -7,29 +7,29 @@ from pathlib import Path
 import numba
 from llvmlite.binding import get_host_cpu_features, get_host_cpu_name
 
-from gscompleter.kernels import variation
+from gscompleter.kernels import tgv
 
 
 def is_compiled(part):
     """Return True if the current kernels of a part are compiled for this machine."""
-    return _mark(part).is_file()
+    return _get_marker(part).is_file()
 
 
-def note_compiled(part):
+def mark_compiled(part):
     """Mark the kernels of a part as compiled."""
-    _mark(part).touch()
+    _get_marker(part).touch()
 
 
-def cache_folder():
+def get_cache_folder():
     """Return the folder of numba's cache."""
-    return Path(variation.advance.stats.cache_path)
+    return Path(tgv.advance.stats.cache_path)
 
 
-def _mark(part):
-    return cache_folder() / f"{part}-{_state()}.compiled"
+def _get_marker(part):
+    return get_cache_folder() / f"{part}-{_hash_state()}.compiled"
 
 
-def _state():
+def _hash_state():
     sources = sorted(Path(__file__).parent.glob("*.py"))
     stamps = [(s.name, s.stat().st_mtime_ns, s.stat().st_size) for s in sources]
     machine = (get_host_cpu_name(), get_host_cpu_features().flatten())

@@ -8,7 +8,7 @@ from typing import NamedTuple
 import numpy as np
 from numba import njit
 
-from gscompleter.kernels.sharing import share
+from gscompleter.kernels.parallel import share
 
 RADIUS = 3
 """Radius of a patch of 2 * radius + 1 pixels; a compile-time constant for vectorised rows."""
@@ -18,7 +18,7 @@ LANES = 24
 """Values per row of a patch: 3 per pixel, with one pixel of padding to fill whole registers."""
 
 
-class Matched(NamedTuple):
+class PatchProblem(NamedTuple):
     """The image to complete, and the sources of its patches."""
 
     image: np.ndarray
@@ -31,11 +31,11 @@ class Matched(NamedTuple):
     """Pixels (y, x) whose patches are matched [q, 2]."""
     query_at: np.ndarray
     """Index of the query of each pixel, or -1 [h, w]."""
-    expected: np.ndarray
+    expected_log_depth: np.ndarray
     """float32 [q]: logarithm of the expected depth of each query."""
     sources: np.ndarray
     """float32 [s, H, W + 1, 3]: source images, padded by `pad_column`."""
-    usable: np.ndarray
+    usable_mask: np.ndarray
     """bool [s, H, W]: True for valid patch centres."""
     log_depth: np.ndarray
     """float32 [s, H, W]: logarithm of the source depths."""
@@ -64,12 +64,12 @@ def _hash(value):
     return value ^ (value >> np.uint64(31))
 
 
-def framed(image):
+def pad_border(image):
     """Pad `image` [h, w, 3] with zeros for the patches around its corners."""
     return np.pad(image, ((RADIUS, RADIUS), (RADIUS, RADIUS + 1), (0, 0)))
 
 
-def with_column_beside(images):
+def pad_column(images):
     """Pad images [s, H, W, 3] with a column of zeros on the right, as kernels read them."""
     return np.pad(images, ((0, 0), (0, 0), (0, 1), (0, 0)))
 
@@ -85,7 +85,7 @@ def _copy(image, y, x, patch):
 
 
 @njit(cache=True, inline="always")
-def _patch_cost(costs, patch, weight, total, sources, s, sy, sx, sums, bias):
+def _compute_patch_cost(costs, patch, weight, total, sources, s, sy, sx, sums, bias):
     """Compute the mean squared difference of `patch` and (s, sy, sx) after the best shift."""
     max_bias, bias_penalty = costs.max_bias, costs.bias_penalty
     numbers = sources.reshape(-1)
@@ -122,7 +122,7 @@ def _patch_cost(costs, patch, weight, total, sources, s, sy, sx, sums, bias):
 
 
 @njit(cache=True, fastmath={"contract"})
-def _prior(costs, nearer, dy, dx):
+def _compute_prior(costs, nearer, dy, dx):
     distance = np.float32(np.sqrt(float(dy**2 + dx**2)))
     nearer = max(nearer, np.float32(0))
     return costs.depth_penalty * min(nearer * nearer, np.float32(1)) + (
@@ -130,33 +130,33 @@ def _prior(costs, nearer, dy, dx):
     )
 
 
-def search(matched, costs, field, rounds, max_reach, seed):
+def search(problem, costs, field, rounds, max_reach, seed):
     """Improve the nearest source patch of every query, by propagation and random search.
 
     field: matches (source, y, x) [q, 3], all of them usable; updated in place.
     max_reach: radius of the random search at its start, in pixels.
     Returns the cost of every match [q] and its shift of colour [q, 3].
     """
-    count = len(matched.queries)
+    count = len(problem.queries)
     cost, shift = np.full(count, np.inf, np.float32), np.zeros((count, 3), np.float32)
     for number in range(rounds):
         chance = (number, max_reach, seed)
-        share(_improve, count, matched, costs, *chance, field.copy(), field, cost, shift)
+        share(_improve, count, problem, costs, *chance, field.copy(), field, cost, shift)
     return cost, shift
 
 
 @njit(cache=True, nogil=True, fastmath={"contract"})
-def _improve(begin, end, matched, costs, number, max_reach, seed, before, field, cost, shift):
+def _improve(begin, end, problem, costs, number, max_reach, seed, before, field, cost, shift):
     """Run pass `number` over the queries begin..end; `before` is the previous field."""
-    usable, query_at = matched.usable, matched.query_at
+    usable, query_at = problem.usable_mask, problem.query_at
     num_sources, H, W = usable.shape
     h, w = query_at.shape
     patch, weight = np.empty((SIDE, LANES), np.float32), np.empty((SIDE, LANES), np.float32)
     sums, bias = np.empty((2, LANES), np.float32), np.empty(3, np.float32)
     for i in range(begin, end):
-        y, x = matched.queries[i, 0], matched.queries[i, 1]
-        _copy(matched.image, y, x, patch)
-        _copy(matched.weight, y, x, weight)
+        y, x = problem.queries[i, 0], problem.queries[i, 1]
+        _copy(problem.image, y, x, patch)
+        _copy(problem.weight, y, x, weight)
         best = cost[i]
         state = _hash(
             np.uint64(seed) * np.uint64(0x9E3779B97F4A7C15)
@@ -200,12 +200,12 @@ def _improve(begin, end, matched, costs, number, max_reach, seed, before, field,
                 continue
             if trial >= 0 and s == field[i, 0] and sy == field[i, 1] and sx == field[i, 2]:
                 continue
-            nearer = matched.expected[i] - matched.log_depth[s, sy, sx]
-            prior = _prior(costs, nearer, sy - y, sx - x)
+            nearer = problem.expected[i] - problem.log_depth[s, sy, sx]
+            prior = _compute_prior(costs, nearer, sy - y, sx - x)
             if prior >= best:
                 continue
-            proposed = prior + _patch_cost(
-                costs, patch, weight, matched.total[i], matched.sources, s, sy, sx, sums, bias
+            proposed = prior + _compute_patch_cost(
+                costs, patch, weight, problem.total[i], problem.sources, s, sy, sx, sums, bias
             )
             if proposed < best:
                 best = proposed
@@ -231,7 +231,7 @@ def vote(query_at, vote_weight, sources, field, shift):
 
 
 @njit(cache=True, nogil=True, fastmath={"contract"})
-def _vote(begin, end, query_at, vote_weight, sources, field, shift, colours, totals):
+def _vote(begin, end, query_at, vote_weight, sources, field, shift, colors, totals):
     h, w = query_at.shape
     for y in range(max(begin - RADIUS, 0), min(end + RADIUS, h)):
         for x in range(w):
@@ -241,7 +241,7 @@ def _vote(begin, end, query_at, vote_weight, sources, field, shift, colours, tot
             a = vote_weight[q]
             s, sy, sx = field[q, 0], field[q, 1], field[q, 2]
             for dy in range(max(-RADIUS, begin - y), min(RADIUS, end - 1 - y) + 1):
-                source_row, sums = sources[s, sy + dy], colours[y + dy]
+                source_row, sums = sources[s, sy + dy], colors[y + dy]
                 for column in range(SIDE):
                     for c in range(3):
                         color = source_row[sx - RADIUS + column, c] + shift[q, c]

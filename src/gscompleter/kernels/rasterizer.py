@@ -47,7 +47,7 @@ SUM, SUM_S, SUM_T, SUM_SS, SUM_ST, SUM_TT, SUM_DEPTH, SUM_RED = range(8)
 """Gradient columns: sums of q = alpha dL/dalpha times 1, s, t, s², s t, t²; depth; colours."""
 NUM_GRADIENT_COLUMNS = 10
 
-OF_ALL, OF_OPACITY, OF_DEPTH, OF_COLOUR = range(4)
+WANT_ALL, WANT_OPACITY, WANT_DEPTH, WANT_COLOR = range(4)
 """Gradients to compute: all columns, or only SUM, SUM_DEPTH or the three colours."""
 
 
@@ -91,7 +91,7 @@ class Layer(NamedTuple):
     """Index of the splat [entries] int32."""
 
 
-class Frame(NamedTuple):
+class RasterFrame(NamedTuple):
     """A rendered image, and the state that the backward pass needs."""
 
     image: np.ndarray
@@ -124,44 +124,44 @@ class _Lanes:
     def __init__(self, builder, value):
         self.builder, self.value = builder, value
 
-    def _value_of(self, other):
-        return other.value if isinstance(other, _Lanes) else _constant(other)
+    def _unwrap(self, other):
+        return other.value if isinstance(other, _Lanes) else _make_constant(other)
 
     def __add__(self, other):
-        return _Lanes(self.builder, self.builder.fadd(self.value, self._value_of(other)))
+        return _Lanes(self.builder, self.builder.fadd(self.value, self._unwrap(other)))
 
     def __sub__(self, other):
-        return _Lanes(self.builder, self.builder.fsub(self.value, self._value_of(other)))
+        return _Lanes(self.builder, self.builder.fsub(self.value, self._unwrap(other)))
 
     def __mul__(self, other):
-        return _Lanes(self.builder, self.builder.fmul(self.value, self._value_of(other)))
+        return _Lanes(self.builder, self.builder.fmul(self.value, self._unwrap(other)))
 
     def __rtruediv__(self, other):
-        return _Lanes(self.builder, self.builder.fdiv(self._value_of(other), self.value))
+        return _Lanes(self.builder, self.builder.fdiv(self._unwrap(other), self.value))
 
     def __rsub__(self, other):
-        return _Lanes(self.builder, self.builder.fsub(self._value_of(other), self.value))
+        return _Lanes(self.builder, self.builder.fsub(self._unwrap(other), self.value))
 
-    def times(self, factor, plus):
+    def multiply_add(self, factor, plus):
         """Compute self * factor + plus with a single rounding, the same in both passes."""
         multiply_add = cgutils.get_or_insert_function(
             self.builder.module,
             ir.FunctionType(_FLOATS, [_FLOATS, _FLOATS, _FLOATS]),
             f"llvm.fmuladd.v{TILE}f32",
         )
-        arguments = [self.value, self._value_of(factor), self._value_of(plus)]
+        arguments = [self.value, self._unwrap(factor), self._unwrap(plus)]
         return _Lanes(self.builder, self.builder.call(multiply_add, arguments))
 
     def compare(self, relation, other):
         """Compare lane by lane; False for NaN."""
-        return self.builder.fcmp_ordered(relation, self.value, self._value_of(other))
+        return self.builder.fcmp_ordered(relation, self.value, self._unwrap(other))
 
     def where(self, mask, otherwise):
-        value = self.builder.select(mask, self.value, self._value_of(otherwise))
+        value = self.builder.select(mask, self.value, self._unwrap(otherwise))
         return _Lanes(self.builder, value)
 
 
-def _sums_of_lanes(builder, vectors):
+def _sum_lanes(builder, vectors):
     """Sum the lanes of each of up to sixteen vectors into one lane of the result."""
     values = [vector.value for vector in vectors]
     undefined = ir.Constant(_FLOATS, ir.Undefined)
@@ -182,7 +182,7 @@ def _sums_of_lanes(builder, vectors):
     return values[0]
 
 
-def _constant(value):
+def _make_constant(value):
     return ir.Constant(_FLOATS, [float(np.float32(value))] * TILE)
 
 
@@ -192,16 +192,16 @@ def _broadcast(builder, scalar, vector_type=_FLOATS):
     return builder.shuffle_vector(first, undefined, ir.Constant(_INTS, [0] * TILE))
 
 
-def _exp_of_negative(values):
+def _exp_negative(values):
     """Compute exp(-values) for values >= 0; beyond 80 it is practically 0."""
     builder = values.builder
     power = values * -_LOG2_E
     power = power.where(power.compare(">", -120.0), -120.0)
     whole = builder.fptosi(power.value, _INTS)
     fraction = power - _Lanes(builder, builder.sitofp(whole, _FLOATS))
-    polynomial = fraction.times(_EXP2[0], _EXP2[1])
+    polynomial = fraction.multiply_add(_EXP2[0], _EXP2[1])
     for coefficient in _EXP2[2:]:
-        polynomial = polynomial.times(fraction, coefficient)
+        polynomial = polynomial.multiply_add(fraction, coefficient)
     # The exponent of a float starts at bit 23 and is 127 for 2**0.
     exponent = builder.add(whole, ir.Constant(_INTS, [127] * TILE))
     scale = builder.shl(exponent, ir.Constant(_INTS, [23] * TILE))
@@ -216,17 +216,17 @@ class _Rows:
         self.data = context.make_array(array_type)(context, builder, array).data
         self.stride = vectors_per_row * TILE
 
-    def _pointer(self, row, index):
+    def _get_pointer(self, row, index):
         offset = self.builder.mul(row, ir.Constant(_LONG, self.stride))
         offset = self.builder.add(offset, ir.Constant(_LONG, index * TILE))
         pointer = self.builder.gep(self.data, [offset])
         return self.builder.bitcast(pointer, self.vector_type.as_pointer())
 
     def load(self, row, index):
-        return self.builder.load(self._pointer(row, index), align=4)
+        return self.builder.load(self._get_pointer(row, index), align=4)
 
     def store(self, row, index, value):
-        self.builder.store(value, self._pointer(row, index), align=4)
+        self.builder.store(value, self._get_pointer(row, index), align=4)
 
 
 class _Splat:
@@ -243,19 +243,19 @@ class _Splat:
         self.u_dx = self.dx * _Lanes(builder, _broadcast(builder, u))
         self.opacity = _Lanes(builder, _broadcast(builder, opacity))
 
-    def falloff(self, row):
+    def compute_falloff(self, row):
         """Return dy of a row, and alpha before and after capping, and its mask."""
         builder = self.builder
         dy = builder.fsub(builder.sitofp(row, _FLOAT), self.y)
         s = self.u_dx + _Lanes(builder, _broadcast(builder, builder.fmul(self.v, dy)))
         t = builder.fmul(self.w, dy)
-        sigma = s.times(s, plus=_Lanes(builder, _broadcast(builder, builder.fmul(t, t))))
-        raw = self.opacity * _exp_of_negative(sigma)
+        sigma = s.multiply_add(s, plus=_Lanes(builder, _broadcast(builder, builder.fmul(t, t))))
+        raw = self.opacity * _exp_negative(sigma)
         capped = raw.where(raw.compare("<=", MAX_ALPHA), MAX_ALPHA)
         return dy, raw, capped, raw.compare(">=", MIN_ALPHA)
 
 
-def _for_each_row(builder, rows, position, row_limit, body):
+def _loop_over_rows(builder, rows, position, row_limit, body):
     """Run `body(row)` for the rows whose limit is not below `position`."""
     begin, end = rows
     with cgutils.for_range(builder, end, start=begin, intp=_LONG) as loop:
@@ -267,16 +267,16 @@ def _for_each_row(builder, rows, position, row_limit, body):
 def _blend(splat, state, row):
     """Composite a splat over a row; return its weights, and masks of visible and passing lanes."""
     builder = splat.builder
-    _, _, alpha, visible = splat.falloff(row)
+    _, _, alpha, visible = splat.compute_falloff(row)
     alpha = alpha.where(visible, 0.0)
     before = _Lanes(builder, state.load(row, 0))
-    after = alpha.times(0.0 - before, plus=before)
+    after = alpha.multiply_add(0.0 - before, plus=before)
     passing = after.compare(">", MIN_TRANSMITTANCE)
     weight = (alpha * before).where(passing, 0.0)
     closed = before.where(before.compare("<", 0.0), 0.0 - before)
     state.store(row, 0, after.where(passing, closed).value)
     for index, channel in enumerate(splat.channels[: state.stride // TILE - 1], start=1):
-        total = weight.times(channel, plus=_Lanes(builder, state.load(row, index)))
+        total = weight.multiply_add(channel, plus=_Lanes(builder, state.load(row, index)))
         state.store(row, index, total.value)
     return weight, visible, passing
 
@@ -291,7 +291,7 @@ def _close_if_full(builder, passing, limits, row, filled):
 
 
 @intrinsic
-def _draw_rows(typing, begin, end, position, state, last, row_limit, splat):
+def _composite_rows(typing, begin, end, position, state, last, row_limit, splat):
     """Composite a splat over the rows begin..end of a tile; return how many it filled.
 
     state [16, 5, 16]: per row the transmittance, negative in full pixels, and sums of colour and
@@ -316,7 +316,7 @@ def _draw_rows(typing, begin, end, position, state, last, row_limit, splat):
             last.store(row, 0, builder.select(contributes, positions, last.load(row, 0)))
             _close_if_full(builder, passing, limits, row, filled)
 
-        _for_each_row(builder, (begin, end), position, limits, composite_row)
+        _loop_over_rows(builder, (begin, end), position, limits, composite_row)
         return builder.load(filled)
 
     return signature, generate
@@ -344,14 +344,14 @@ def _weigh_rows(typing, begin, end, place, state, row_limit, kept, splat):
                     kept.store(at, 0, weight.value)
                     _close_if_full(builder, passing, limits, row, filled)
                 with full_row:
-                    kept.store(at, 0, _constant(0.0))
+                    kept.store(at, 0, _make_constant(0.0))
         return builder.load(filled)
 
     return signature, generate
 
 
 @intrinsic
-def _spread_rows(typing, begin, end, place, state, kept, sums):
+def _sum_weighted_rows(typing, begin, end, place, state, kept, sums):
     """Sum kept weights times the colours in `state` [16, 4, 16], and kept weights, to `sums`."""
     signature = types.void(types.int64, types.int64, types.int64, state, kept, sums)
 
@@ -367,20 +367,22 @@ def _spread_rows(typing, begin, end, place, state, kept, sums):
             for index, total in enumerate(totals, start=1):
                 value = _Lanes(builder, builder.load(total))
                 if index < 4:
-                    value = weight.times(_Lanes(builder, state.load(loop.index, index)), plus=value)
+                    value = weight.multiply_add(
+                        _Lanes(builder, state.load(loop.index, index)), plus=value
+                    )
                 else:
                     value = value + weight
                 builder.store(value.value, total)
         out = _Rows(context, builder, signature.args[5], sums, _FLOATS, 1)
         columns = [_Lanes(builder, builder.load(total)) for total in totals]
-        out.store(ir.Constant(_LONG, 0), 0, _sums_of_lanes(builder, columns))
+        out.store(ir.Constant(_LONG, 0), 0, _sum_lanes(builder, columns))
         return context.get_dummy_value()
 
     return signature, generate
 
 
 @intrinsic
-def _fall_off(typing, row, falloffs, splat):
+def _compute_falloffs(typing, row, falloffs, splat):
     """Write the uncapped alphas of a splat in a row to `falloffs` [16]; 0 if invisible."""
     signature = types.void(types.int64, falloffs, splat)
 
@@ -388,14 +390,14 @@ def _fall_off(typing, row, falloffs, splat):
         row, falloffs, splat = arguments
         splat = _Splat(builder, *cgutils.unpack_tuple(builder, splat))
         out = _Rows(context, builder, signature.args[1], falloffs, _FLOATS, 1)
-        _, raw, _, visible = splat.falloff(row)
+        _, raw, _, visible = splat.compute_falloff(row)
         out.store(ir.Constant(_LONG, 0), 0, raw.where(visible, 0.0).value)
         return context.get_dummy_value()
 
     return signature, generate
 
 
-def _undraw(wanted):
+def _make_revert(wanted):
     """Make an intrinsic that reverts a splat, with sums for the `wanted` gradients."""
 
     @intrinsic
@@ -425,7 +427,7 @@ def _undraw(wanted):
             ]
 
             def revert(row):
-                dy, raw, alpha, visible = splat.falloff(row)
+                dy, raw, alpha, visible = splat.compute_falloff(row)
                 reached = builder.icmp_signed("<=", positions, last.load(row, 0))
                 contributes = builder.and_(visible, reached)
                 alpha = alpha.where(contributes, 0.0)
@@ -437,15 +439,17 @@ def _undraw(wanted):
                 weight = alpha * before
                 value = gradients[4]
                 for channel, gradient in zip(splat.channels, gradients[:4], strict=True):
-                    value = channel.times(gradient, plus=value)
+                    value = channel.multiply_add(gradient, plus=value)
                 state.store(row, 0, before.value)
-                state.store(row, 1, weight.times(value, plus=behind).value)
+                state.store(row, 1, weight.multiply_add(value, plus=behind).value)
                 if wanted == "nothing":
                     return
 
                 if wanted == "colour":
                     for total, gradient in zip(totals, gradients[:3], strict=True):
-                        value = weight.times(gradient, plus=_Lanes(builder, builder.load(total)))
+                        value = weight.multiply_add(
+                            gradient, plus=_Lanes(builder, builder.load(total))
+                        )
                         builder.store(value.value, total)
                     return
 
@@ -460,7 +464,7 @@ def _undraw(wanted):
                     value = _Lanes(builder, builder.load(total)) + term
                     builder.store(value.value, total)
 
-            _for_each_row(builder, (begin, end), position, limits, revert)
+            _loop_over_rows(builder, (begin, end), position, limits, revert)
 
             columns = [_Lanes(builder, builder.load(total)) for total in totals]
             if wanted == "all":
@@ -469,7 +473,7 @@ def _undraw(wanted):
                 columns = moments + columns[3:]
             if wanted != "nothing":
                 out = _Rows(context, builder, signature.args[6], sums, _FLOATS, 1)
-                out.store(ir.Constant(_LONG, 0), 0, _sums_of_lanes(builder, columns))
+                out.store(ir.Constant(_LONG, 0), 0, _sum_lanes(builder, columns))
             return context.get_dummy_value()
 
         return signature, generate
@@ -477,18 +481,18 @@ def _undraw(wanted):
     return undraw_rows
 
 
-_pass_rows = _undraw("nothing")
-_undraw_rows_for_opacity = _undraw("opacity")
-_undraw_rows_for_depth = _undraw("depth")
-_undraw_rows_for_colour = _undraw("colour")
-_undraw_rows = _undraw("all")
+_pass_rows = _make_revert("nothing")
+_revert_rows_for_opacity = _make_revert("opacity")
+_revert_rows_for_depth = _make_revert("depth")
+_revert_rows_for_color = _make_revert("colour")
+_revert_rows = _make_revert("all")
 
 
 # ---- 3 × 3 matrices as tuples of nine, row by row ---------------------------------------------
 
 
 @njit(cache=True, fastmath={"contract"})
-def _product(a, b):
+def _multiply(a, b):
     return (
         a[0] * b[0] + a[1] * b[3] + a[2] * b[6],
         a[0] * b[1] + a[1] * b[4] + a[2] * b[7],
@@ -503,12 +507,12 @@ def _product(a, b):
 
 
 @njit(cache=True, fastmath={"contract"})
-def _transposed(a):
+def _transpose(a):
     return (a[0], a[3], a[6], a[1], a[4], a[7], a[2], a[5], a[8])
 
 
 @njit(cache=True, fastmath={"contract"})
-def _applied(a, x, y, z):
+def _apply_matrix(a, x, y, z):
     return (
         a[0] * x + a[1] * y + a[2] * z,
         a[3] * x + a[4] * y + a[5] * z,
@@ -517,14 +521,14 @@ def _applied(a, x, y, z):
 
 
 @njit(cache=True, fastmath={"contract"}, error_model="numpy")
-def _unit(quats, i):
+def _normalize_quat(quats, i):
     w, x, y, z = quats[i, 0], quats[i, 1], quats[i, 2], quats[i, 3]
     factor = np.float32(1) / math.sqrt(w * w + x * x + y * y + z * z)
     return w * factor, x * factor, y * factor, z * factor, factor
 
 
 @njit(cache=True, fastmath={"contract"})
-def _rotation(w, x, y, z):
+def _compute_rotation(w, x, y, z):
     one, two = np.float32(1), np.float32(2)
     return (
         one - two * (y * y + z * z),
@@ -552,7 +556,7 @@ def _rotation_backward(w, x, y, z, d):
 
 
 @njit(cache=True, fastmath={"contract"})
-def _scaled_columns(a, x, y, z):
+def _scale_columns(a, x, y, z):
     return (
         a[0] * x,
         a[1] * y,
@@ -567,7 +571,7 @@ def _scaled_columns(a, x, y, z):
 
 
 @njit(cache=True, fastmath={"contract"}, error_model="numpy")
-def _tangent_limits(pinhole):
+def _compute_tangent_limits(pinhole):
     """Compute the range of x/z and of y/z at which the Jacobian is evaluated."""
     fx, fy, cx, cy = pinhole.intrinsics
     width, height = np.float32(pinhole.width), np.float32(pinhole.height)
@@ -581,7 +585,7 @@ def _tangent_limits(pinhole):
 
 
 @njit(cache=True, fastmath={"contract"})
-def _flattened(axes, jacobian):
+def _flatten(axes, jacobian):
     """Project the axes of a Gaussian (columns, in the camera) to a 2 × 3 matrix, by rows.
 
     jacobian: d pixel x / dx, d pixel x / dz, d pixel y / dy, d pixel y / dz.
@@ -609,7 +613,7 @@ _C3XX = np.float32(1.445305721320277)
 
 
 @njit(cache=True, fastmath={"contract"}, error_model="numpy")
-def _direction(center, means, i):
+def _compute_direction(center, means, i):
     """Compute the unit vector from the camera centre to the mean, and the inverse distance."""
     x, y, z = means[i, 0] - center[0], means[i, 1] - center[1], means[i, 2] - center[2]
     inverse = np.float32(1) / math.sqrt(x * x + y * y + z * z)
@@ -641,7 +645,7 @@ def _evaluate_basis(x, y, z, basis):
 
 
 @njit(cache=True, fastmath={"contract"})
-def _basis_slope(x, y, z, g):
+def _basis_backward(x, y, z, g):
     """Compute the gradient in the direction of the sum of g[k] times basis function k."""
     two, three, four = np.float32(2), np.float32(3), np.float32(4)
     six, eight = np.float32(6), np.float32(8)
@@ -680,14 +684,14 @@ def project(begin, end, gaussians, pinhole, splats, boxes, factors):
     means, quats, scales, opacities, sh = gaussians
     view, center, near = pinhole.rotation, pinhole.center, pinhole.near
     fx, fy, cx, cy = pinhole.intrinsics
-    least_x, largest_x, least_y, largest_y = _tangent_limits(pinhole)
+    least_x, largest_x, least_y, largest_y = _compute_tangent_limits(pinhole)
     width, height = np.float32(pinhole.width), np.float32(pinhole.height)
     basis = np.empty(sh.shape[1], np.float32)
     zero, half, one = np.float32(0), np.float32(0.5), np.float32(1)
     root_half = np.float32(math.sqrt(0.5))
     for i in range(begin, end):
         boxes[i, 0] = boxes[i, 1] = boxes[i, 2] = boxes[i, 3] = 0
-        x, y, z = _applied(
+        x, y, z = _apply_matrix(
             view, means[i, 0] - center[0], means[i, 1] - center[1], means[i, 2] - center[2]
         )
         # Conditions are written so that NaN fails them.
@@ -698,11 +702,14 @@ def project(begin, end, gaussians, pinhole, splats, boxes, factors):
         jacobian_x, jacobian_y = fx * inverse_z, fy * inverse_z
         clamped_x = min(max(tan_x, least_x), largest_x)
         clamped_y = min(max(tan_y, least_y), largest_y)
-        qw, qx, qy, qz, _ = _unit(quats, i)
-        axes = _scaled_columns(
-            _product(view, _rotation(qw, qx, qy, qz)), scales[i, 0], scales[i, 1], scales[i, 2]
+        qw, qx, qy, qz, _ = _normalize_quat(quats, i)
+        axes = _scale_columns(
+            _multiply(view, _compute_rotation(qw, qx, qy, qz)),
+            scales[i, 0],
+            scales[i, 1],
+            scales[i, 2],
         )
-        flat = _flattened(
+        flat = _flatten(
             axes, (jacobian_x, -jacobian_x * clamped_x, jacobian_y, -jacobian_y * clamped_y)
         )
 
@@ -744,7 +751,7 @@ def project(begin, end, gaussians, pinhole, splats, boxes, factors):
         splats[i, W] = root_half / deviation_y
         splats[i, DEPTH] = z
 
-        direction_x, direction_y, direction_z, _ = _direction(center, means, i)
+        direction_x, direction_y, direction_z, _ = _compute_direction(center, means, i)
         _evaluate_basis(direction_x, direction_y, direction_z, basis)
         for channel in range(3):
             color = half
@@ -757,7 +764,7 @@ def project(begin, end, gaussians, pinhole, splats, boxes, factors):
 
 
 @njit(cache=True)
-def _depth_at(splats, entries, place, begin, end, beyond):
+def _get_depth(splats, entries, place, begin, end, beyond):
     """Return the depth of an entry, or `beyond` for places outside begin..end."""
     if place < begin or place >= end:
         return beyond
@@ -778,17 +785,17 @@ def merge_lists(begin, end, context, new, used, full, tile_start, entries, depth
         c, n = c_start[tile], n_start[tile]
         c_end, n_end = c + used[tile, 0], n + used[tile, 1]
         place, depth = tile_start[tile], infinity
-        c_depth = _depth_at(c_splats, c_entries, c, c, c_end, infinity)
-        n_depth = _depth_at(n_splats, n_entries, n, n, n_end, infinity)
+        c_depth = _get_depth(c_splats, c_entries, c, c, c_end, infinity)
+        n_depth = _get_depth(n_splats, n_entries, n, n, n_end, infinity)
         while c < c_end and n < n_end:
             if c_depth <= n_depth:
                 depth, entries[place] = c_depth, c_entries[c]
                 c += 1
-                c_depth = _depth_at(c_splats, c_entries, c, c, c_end, infinity)
+                c_depth = _get_depth(c_splats, c_entries, c, c, c_end, infinity)
             else:
                 depth, entries[place] = n_depth, len(c_splats) + n_entries[n]
                 n += 1
-                n_depth = _depth_at(n_splats, n_entries, n, n, n_end, infinity)
+                n_depth = _get_depth(n_splats, n_entries, n, n, n_end, infinity)
             place += 1
         for rest in range(c, c_end):
             entries[place + rest - c] = c_entries[rest]
@@ -805,7 +812,7 @@ def merge_lists(begin, end, context, new, used, full, tile_start, entries, depth
 
 
 @njit(cache=True)
-def _aligned(size):
+def _allocate_aligned(size):
     """Allocate float32 values from a cache line on, so that no vector straddles two."""
     buffer = np.empty(size + TILE, np.float32)
     start = (-buffer.ctypes.data % 64) // 4
@@ -813,7 +820,7 @@ def _aligned(size):
 
 
 @njit(cache=True, fastmath={"contract"})
-def _placed(splats, opacities, boxes, i, left, top):
+def _place_in_tile(splats, opacities, boxes, i, left, top):
     """Return the rows of the tile at (left, top) that splat i touches, and the relative splat."""
     half = np.float32(0.5)
     return (
@@ -843,7 +850,7 @@ def composite(begin, end, tiles, context, new, frame):
     image, depths, alphas, transmittances, lasts, used, full = frame
     height, width = alphas.shape
     tiles_x = (width + TILE - 1) // TILE
-    state = _aligned(TILE * 5 * TILE).reshape((TILE, 5, TILE))
+    state = _allocate_aligned(TILE * 5 * TILE).reshape((TILE, 5, TILE))
     last = np.empty((TILE, TILE), np.int32)
     row_limit = np.empty(TILE, np.int32)
     infinity = np.float32(np.inf)
@@ -862,23 +869,23 @@ def composite(begin, end, tiles, context, new, frame):
         c_begin, c_end = c_start[tile], c_start[tile + 1]
         n_begin, n_end = n_start[tile], n_start[tile + 1]
         c, n = c_begin, n_begin
-        c_depth = _depth_at(c_splats, c_entries, c, c_begin, c_end, infinity)
-        n_depth = _depth_at(n_splats, n_entries, n, n_begin, n_end, infinity)
+        c_depth = _get_depth(c_splats, c_entries, c, c_begin, c_end, infinity)
+        n_depth = _get_depth(n_splats, n_entries, n, n_begin, n_end, infinity)
         while open_rows > 0 and (c < c_end or n < n_end):
             position = np.int32(c - c_begin + n - n_begin)
             if c_depth <= n_depth:
-                first, stop, splat = _placed(
+                first, stop, splat = _place_in_tile(
                     c_splats, c_opacities, c_boxes, c_entries[c], left, top
                 )
                 c += 1
-                c_depth = _depth_at(c_splats, c_entries, c, c_begin, c_end, infinity)
+                c_depth = _get_depth(c_splats, c_entries, c, c_begin, c_end, infinity)
             else:
-                first, stop, splat = _placed(
+                first, stop, splat = _place_in_tile(
                     n_splats, n_opacities, n_boxes, n_entries[n], left, top
                 )
                 n += 1
-                n_depth = _depth_at(n_splats, n_entries, n, n_begin, n_end, infinity)
-            open_rows -= _draw_rows(first, stop, position, state, last, row_limit, splat)
+                n_depth = _get_depth(n_splats, n_entries, n, n_begin, n_end, infinity)
+            open_rows -= _composite_rows(first, stop, position, state, last, row_limit, splat)
 
         used[tile, 0], used[tile, 1] = c - c_begin, n - n_begin
         full[tile] = open_rows == 0
@@ -896,10 +903,10 @@ def composite(begin, end, tiles, context, new, frame):
 
 
 @njit(cache=True, nogil=True)
-def _with_room(kept, used):
+def _grow_if_full(kept, used):
     if used + TILE <= len(kept):
         return kept
-    wider = _aligned(2 * kept.size).reshape((2 * len(kept), TILE))
+    wider = _allocate_aligned(2 * kept.size).reshape((2 * len(kept), TILE))
     # Slices assigned to slices take seconds to compile.
     for row in range(used):
         for column in range(TILE):
@@ -908,7 +915,7 @@ def _with_room(kept, used):
 
 
 @njit(cache=True, nogil=True, fastmath={"contract"}, error_model="numpy")
-def missed_colours(begin, end, tiles, context, new, photograph, slots, sums, written):
+def backproject_residual(begin, end, tiles, context, new, photograph, slots, sums, written):
     """Composite tiles[begin:end] and backproject the residual to the entries of `new`.
 
     A splat's weights stay in the cache until the image of its tile is finished.
@@ -918,8 +925,8 @@ def missed_colours(begin, end, tiles, context, new, photograph, slots, sums, wri
     n_splats, n_opacities, n_boxes, n_start, n_entries = new
     height, width = photograph.shape[:2]
     tiles_x = (width + TILE - 1) // TILE
-    state = _aligned(TILE * 4 * TILE).reshape((TILE, 4, TILE))
-    kept = _aligned(FIRST_ROWS * TILE).reshape((FIRST_ROWS, TILE))
+    state = _allocate_aligned(TILE * 4 * TILE).reshape((TILE, 4, TILE))
+    kept = _allocate_aligned(FIRST_ROWS * TILE).reshape((FIRST_ROWS, TILE))
     row_limit = np.empty(TILE, np.int32)
     totals = np.zeros(TILE, np.float32)
     infinity = np.float32(np.inf)
@@ -936,23 +943,25 @@ def missed_colours(begin, end, tiles, context, new, photograph, slots, sums, wri
 
         c, c_begin, c_end = c_start[tile], c_start[tile], c_start[tile + 1]
         n, n_begin, n_end = n_start[tile], n_start[tile], n_start[tile + 1]
-        c_depth = _depth_at(c_splats, c_entries, c, c_begin, c_end, infinity)
-        n_depth = _depth_at(n_splats, n_entries, n, n_begin, n_end, infinity)
+        c_depth = _get_depth(c_splats, c_entries, c, c_begin, c_end, infinity)
+        n_depth = _get_depth(n_splats, n_entries, n, n_begin, n_end, infinity)
         place = np.int64(0)  # with a plain 0, its callees are compiled twice
         while open_rows > 0 and (c < c_end or n < n_end):
-            kept = _with_room(kept, place)
+            kept = _grow_if_full(kept, place)
             if c_depth <= n_depth:
-                first, stop, splat = _placed(
+                first, stop, splat = _place_in_tile(
                     c_splats, c_opacities, c_boxes, c_entries[c], left, top
                 )
                 c += 1
-                c_depth = _depth_at(c_splats, c_entries, c, c_begin, c_end, infinity)
+                c_depth = _get_depth(c_splats, c_entries, c, c_begin, c_end, infinity)
                 # The next splat overwrites its weights.
                 open_rows -= _weigh_rows(first, stop, place, state, row_limit, kept, splat)
                 continue
-            first, stop, splat = _placed(n_splats, n_opacities, n_boxes, n_entries[n], left, top)
+            first, stop, splat = _place_in_tile(
+                n_splats, n_opacities, n_boxes, n_entries[n], left, top
+            )
             n += 1
-            n_depth = _depth_at(n_splats, n_entries, n, n_begin, n_end, infinity)
+            n_depth = _get_depth(n_splats, n_entries, n, n_begin, n_end, infinity)
             open_rows -= _weigh_rows(first, stop, place, state, row_limit, kept, splat)
             place += max(stop - first, 0)
 
@@ -967,7 +976,7 @@ def missed_colours(begin, end, tiles, context, new, photograph, slots, sums, wri
             i, slot = n_entries[entry], slots[entry]
             first = max(np.int64(n_boxes[i, 2]) - top, 0)
             stop = min(np.int64(n_boxes[i, 3]) - top, TILE)
-            _spread_rows(first, stop, place, state, kept, totals)
+            _sum_weighted_rows(first, stop, place, state, kept, totals)
             place += max(stop - first, 0)
             written[slot] = True
             for column in range(4):
@@ -976,7 +985,7 @@ def missed_colours(begin, end, tiles, context, new, photograph, slots, sums, wri
 
 @njit(cache=True, nogil=True, fastmath={"contract"}, error_model="numpy")
 def composite_backward(
-    begin, end, tiles, context, new, frame, slopes, slots, wanted, gradients, written
+    begin, end, tiles, context, new, frame, d_frame, slots, wanted, gradients, written
 ):
     """Traverse tiles[begin:end] back to front and sum the gradients of the entries of `new`.
 
@@ -986,10 +995,10 @@ def composite_backward(
     c_splats, c_opacities, c_boxes, c_start, c_entries = context
     n_splats, n_opacities, n_boxes, n_start, n_entries = new
     _, depths, alphas, transmittances, lasts, used, _ = frame
-    d_image, d_depth, d_alpha = slopes
+    d_image, d_depth, d_alpha = d_frame
     height, width = alphas.shape
     tiles_x = (width + TILE - 1) // TILE
-    state = _aligned(TILE * 7 * TILE).reshape((TILE, 7, TILE))
+    state = _allocate_aligned(TILE * 7 * TILE).reshape((TILE, 7, TILE))
     last = np.empty((TILE, TILE), np.int32)
     row_limit = np.empty(TILE, np.int32)
     sums = np.zeros(TILE, np.float32)
@@ -1020,37 +1029,39 @@ def composite_backward(
 
         c_begin = c_start[tile]
         c = c_begin + used[tile, 0]
-        c_depth = _depth_at(c_splats, c_entries, c - 1, c_begin, c, nothing)
-        n_depth = _depth_at(n_splats, n_entries, n - 1, n_begin, n, nothing)
+        c_depth = _get_depth(c_splats, c_entries, c - 1, c_begin, c, nothing)
+        n_depth = _get_depth(n_splats, n_entries, n - 1, n_begin, n, nothing)
         while n > n_begin:
             position = np.int32(c - c_begin + n - n_begin - 1)
             if c_depth > n_depth:
                 c -= 1
-                first, stop, splat = _placed(
+                first, stop, splat = _place_in_tile(
                     c_splats, c_opacities, c_boxes, c_entries[c], left, top
                 )
-                c_depth = _depth_at(c_splats, c_entries, c - 1, c_begin, c, nothing)
+                c_depth = _get_depth(c_splats, c_entries, c - 1, c_begin, c, nothing)
                 _pass_rows(first, stop, position, state, last, row_limit, sums, splat)
                 continue
             n -= 1
-            first, stop, splat = _placed(n_splats, n_opacities, n_boxes, n_entries[n], left, top)
-            n_depth = _depth_at(n_splats, n_entries, n - 1, n_begin, n, nothing)
+            first, stop, splat = _place_in_tile(
+                n_splats, n_opacities, n_boxes, n_entries[n], left, top
+            )
+            n_depth = _get_depth(n_splats, n_entries, n - 1, n_begin, n, nothing)
             slot = slots[n]
             written[slot] = True
-            if wanted == OF_OPACITY:
-                _undraw_rows_for_opacity(first, stop, position, state, last, row_limit, sums, splat)
+            if wanted == WANT_OPACITY:
+                _revert_rows_for_opacity(first, stop, position, state, last, row_limit, sums, splat)
                 gradients[slot, 0] = sums[0]
                 continue
-            if wanted == OF_DEPTH:
-                _undraw_rows_for_depth(first, stop, position, state, last, row_limit, sums, splat)
+            if wanted == WANT_DEPTH:
+                _revert_rows_for_depth(first, stop, position, state, last, row_limit, sums, splat)
                 gradients[slot, 0] = sums[0]
                 continue
-            if wanted == OF_COLOUR:
-                _undraw_rows_for_colour(first, stop, position, state, last, row_limit, sums, splat)
+            if wanted == WANT_COLOR:
+                _revert_rows_for_color(first, stop, position, state, last, row_limit, sums, splat)
                 for channel in range(3):
                     gradients[slot, channel] = sums[channel]
                 continue
-            _undraw_rows(first, stop, position, state, last, row_limit, sums, splat)
+            _revert_rows(first, stop, position, state, last, row_limit, sums, splat)
             u, v, w = splat[2], splat[3], splat[4]
             x, y, xx, xy, yy = sums[1], sums[2], sums[3], sums[4], sums[5]
             gradients[slot, SUM] = sums[0]
@@ -1091,15 +1102,15 @@ def _compensation_backward(flat, q):
 
 @njit(cache=True, nogil=True, fastmath={"contract"}, error_model="numpy")
 def project_backward(
-    begin, end, gaussians, pinhole, factors, splats, slot_start, gradients, written, slopes
+    begin, end, gaussians, pinhole, factors, splats, slot_start, gradients, written, d_gaussians
 ):
     """Write gradients of the Gaussians begin..end to `d_gaussians` from those of entries."""
     means, quats, scales, opacities, sh = gaussians
-    d_means, d_quats, d_scales, d_opacities, d_sh = slopes
+    d_means, d_quats, d_scales, d_opacities, d_sh = d_gaussians
     view, center = pinhole.rotation, pinhole.center
-    from_view = _transposed(view)
+    from_view = _transpose(view)
     fx, fy = pinhole.intrinsics[0], pinhole.intrinsics[1]
-    least_x, largest_x, least_y, largest_y = _tangent_limits(pinhole)
+    least_x, largest_x, least_y, largest_y = _compute_tangent_limits(pinhole)
     one, two, four = np.float32(1), np.float32(2), np.float32(4)
     sums = np.empty(NUM_GRADIENT_COLUMNS, np.float32)
     basis, d_basis = np.empty(sh.shape[1], np.float32), np.empty(sh.shape[1], np.float32)
@@ -1117,7 +1128,9 @@ def project_backward(
         d_opacities[i] = sums[SUM] / opacities[i]
 
         # Colour, which is cut off at zero
-        direction_x, direction_y, direction_z, inverse_distance = _direction(center, means, i)
+        direction_x, direction_y, direction_z, inverse_distance = _compute_direction(
+            center, means, i
+        )
         _evaluate_basis(direction_x, direction_y, direction_z, basis)
         d_basis[:] = 0
         for channel in range(3):
@@ -1126,10 +1139,10 @@ def project_backward(
                 for k in range(len(basis)):
                     d_sh[i, k, channel] = d_color * basis[k]
                     d_basis[k] += d_color * sh[i, k, channel]
-        d_dx, d_dy, d_dz = _basis_slope(direction_x, direction_y, direction_z, d_basis)
+        d_dx, d_dy, d_dz = _basis_backward(direction_x, direction_y, direction_z, d_basis)
         radial = direction_x * d_dx + direction_y * d_dy + direction_z * d_dz
 
-        x, y, z = _applied(
+        x, y, z = _apply_matrix(
             view, means[i, 0] - center[0], means[i, 1] - center[1], means[i, 2] - center[2]
         )
         inverse_z = one / z
@@ -1137,11 +1150,11 @@ def project_backward(
         jacobian_x, jacobian_y = fx * inverse_z, fy * inverse_z
         clamped_x = min(max(tan_x, least_x), largest_x)
         clamped_y = min(max(tan_y, least_y), largest_y)
-        qw, qx, qy, qz, unit_factor = _unit(quats, i)
-        rotation = _product(view, _rotation(qw, qx, qy, qz))
-        axes = _scaled_columns(rotation, scales[i, 0], scales[i, 1], scales[i, 2])
+        qw, qx, qy, qz, unit_factor = _normalize_quat(quats, i)
+        rotation = _multiply(view, _compute_rotation(qw, qx, qy, qz))
+        axes = _scale_columns(rotation, scales[i, 0], scales[i, 1], scales[i, 2])
         jacobian = (jacobian_x, -jacobian_x * clamped_x, jacobian_y, -jacobian_y * clamped_y)
-        flat = _flattened(axes, jacobian)
+        flat = _flatten(axes, jacobian)
 
         # dL/dΣ = 2 Uᵀ Q U with Q = [[ss, st], [st, tt]], and Σ = F Fᵀ: dL/dF = 4 Uᵀ Q (U F).
         u, v, w = splats[i, U], splats[i, V], splats[i, W]
@@ -1186,8 +1199,8 @@ def project_backward(
                 + d_axes[3 + k] * rotation[3 + k]
                 + d_axes[6 + k] * rotation[6 + k]
             )
-        d_rotation = _product(
-            from_view, _scaled_columns(d_axes, scales[i, 0], scales[i, 1], scales[i, 2])
+        d_rotation = _multiply(
+            from_view, _scale_columns(d_axes, scales[i, 0], scales[i, 1], scales[i, 2])
         )
         d_qw, d_qx, d_qy, d_qz = _rotation_backward(qw, qx, qy, qz, d_rotation)
         along = qw * d_qw + qx * d_qx + qy * d_qy + qz * d_qz
@@ -1205,7 +1218,7 @@ def project_backward(
             d_tan_y -= d_yz * jacobian_y
         d_z = sums[SUM_DEPTH] - (d_xx * xx + d_xz * xz + d_yy * yy + d_yz * yz) * inverse_z
         d_z -= (d_tan_x * tan_x + d_tan_y * tan_y) * inverse_z
-        d_x, d_y, d_z = _applied(from_view, d_tan_x * inverse_z, d_tan_y * inverse_z, d_z)
+        d_x, d_y, d_z = _apply_matrix(from_view, d_tan_x * inverse_z, d_tan_y * inverse_z, d_z)
         d_means[i, 0] = d_x + (d_dx - direction_x * radial) * inverse_distance
         d_means[i, 1] = d_y + (d_dy - direction_y * radial) * inverse_distance
         d_means[i, 2] = d_z + (d_dz - direction_z * radial) * inverse_distance
@@ -1236,9 +1249,9 @@ class Fragments(NamedTuple):
     """Entry of each fragment in its tile; baked layers are numbered after them [f] int32."""
     falloffs: np.ndarray
     """Alpha at opacity 1, alpha of frozen ones, unused for baked layers [f] float32."""
-    fold_start: np.ndarray
+    baked_start: np.ndarray
     """Start of the baked layers of each tile [t + 1] int64."""
-    folds: np.ndarray
+    baked: np.ndarray
     """Transmittance and colour of the baked layers [g, 4] float32."""
     solid: np.ndarray
     """Colours of the frozen splats with entries [s, 3] float32."""
@@ -1247,7 +1260,7 @@ class Fragments(NamedTuple):
 
 
 @njit(cache=True, fastmath={"contract"})
-def _within(boxes, i, left, top):
+def _clip_box(boxes, i, left, top):
     return (
         max(np.int64(boxes[i, 0]) - left, 0),
         min(np.int64(boxes[i, 1]) - left, TILE),
@@ -1257,25 +1270,25 @@ def _within(boxes, i, left, top):
 
 
 @njit(cache=True)
-def _most_fragments(tile, left, top, context, new):
+def _bound_fragments(tile, left, top, context, new):
     """Bound the number of entries and fragments of a tile."""
     _, c_opacities, c_boxes, c_start, c_entries = context
     _, _, n_boxes, n_start, n_entries = new
     entries = fragments = 0
     for place in range(n_start[tile], n_start[tile + 1]):
-        x_from, x_to, y_from, y_to = _within(n_boxes, n_entries[place], left, top)
+        x_from, x_to, y_from, y_to = _clip_box(n_boxes, n_entries[place], left, top)
         entries += 1
         fragments += (x_to - x_from) * (y_to - y_from)
     for place in range(c_start[tile], c_start[tile + 1]):
         if c_opacities[c_entries[place]] > SOLID:
-            x_from, x_to, y_from, y_to = _within(c_boxes, c_entries[place], left, top)
+            x_from, x_to, y_from, y_to = _clip_box(c_boxes, c_entries[place], left, top)
             entries += 1
             fragments += (x_to - x_from) * (y_to - y_from)
     return entries, fragments
 
 
 @njit(cache=True, fastmath={"contract"})
-def _covered(pixel, alpha, red, green, blue):
+def _cover(pixel, alpha, red, green, blue):
     """Composite a splat behind a pixel, whose transmittance becomes negative if it is full."""
     transmittance = pixel[0]
     after = transmittance * (np.float32(1) - alpha)
@@ -1286,7 +1299,7 @@ def _covered(pixel, alpha, red, green, blue):
 
 
 @njit(cache=True)
-def _by_pixel(
+def _sort_by_pixel(
     pixels, entries, falloffs, count, first_fold, behind, begin, starts, to_entries, to_falloffs
 ):
     """Sort the fragments of a tile by pixel, stably, and number baked layers from `behind`."""
@@ -1319,7 +1332,7 @@ def find_fragments(begin, end, tiles, context, new, new_slots, where, behind):
     n_splats, n_opacities, n_boxes, n_start, n_entries = new
     height, width, _ = behind.shape
     tiles_x = (width + TILE - 1) // TILE
-    state = _aligned(TILE * 5 * TILE).reshape((TILE, 5, TILE))
+    state = _allocate_aligned(TILE * 5 * TILE).reshape((TILE, 5, TILE))
     # `state` at the last fragment of each pixel, and one bit per pixel with a new fragment before
     known = np.empty((TILE, 4, TILE), np.float32)
     veiled, falloffs_of_row = np.empty(TILE, np.uint32), np.empty(TILE, np.float32)
@@ -1332,7 +1345,7 @@ def find_fragments(begin, end, tiles, context, new, new_slots, where, behind):
     for index in range(begin, end):
         tile = tiles[index]
         left, top = (tile % tiles_x) * TILE, (tile // tiles_x) * TILE
-        bounds = _most_fragments(tile, left, top, context, new)
+        bounds = _bound_fragments(tile, left, top, context, new)
         most_entries, most = most_entries + bounds[0], most + bounds[1]
         most_at_once = max(most_at_once, bounds[1])
     # Pages that are never written take no memory.
@@ -1370,27 +1383,29 @@ def find_fragments(begin, end, tiles, context, new, new_slots, where, behind):
         c_begin, c_end = c_start[tile], c_start[tile + 1]
         n_begin, n_end = n_start[tile], n_start[tile + 1]
         c, n = c_begin, n_begin
-        c_depth = _depth_at(c_splats, c_entries, c, c_begin, c_end, infinity)
-        n_depth = _depth_at(n_splats, n_entries, n, n_begin, n_end, infinity)
+        c_depth = _get_depth(c_splats, c_entries, c, c_begin, c_end, infinity)
+        n_depth = _get_depth(n_splats, n_entries, n, n_begin, n_end, infinity)
         while open_rows > 0 and (c < c_end or n < n_end):
             frozen = c_depth <= n_depth
             if frozen:
                 i = c_entries[c]
-                first, stop, splat = _placed(c_splats, c_opacities, c_boxes, i, left, top)
-                x_from, x_to, y_from, y_to = _within(c_boxes, i, left, top)
+                first, stop, splat = _place_in_tile(c_splats, c_opacities, c_boxes, i, left, top)
+                x_from, x_to, y_from, y_to = _clip_box(c_boxes, i, left, top)
                 c += 1
-                c_depth = _depth_at(c_splats, c_entries, c, c_begin, c_end, infinity)
+                c_depth = _get_depth(c_splats, c_entries, c, c_begin, c_end, infinity)
                 if c_opacities[i] <= SOLID:
-                    open_rows -= _draw_rows(first, stop, position, state, last, row_limit, splat)
+                    open_rows -= _composite_rows(
+                        first, stop, position, state, last, row_limit, splat
+                    )
                     continue
                 names[entry], slots[entry] = ~row_of_solid, -1
             else:
                 i = n_entries[n]
-                _, _, splat = _placed(n_splats, n_opacities, n_boxes, i, left, top)
-                x_from, x_to, y_from, y_to = _within(n_boxes, i, left, top)
+                _, _, splat = _place_in_tile(n_splats, n_opacities, n_boxes, i, left, top)
+                x_from, x_to, y_from, y_to = _clip_box(n_boxes, i, left, top)
                 names[entry], slots[entry] = i, new_slots[n]
                 n += 1
-                n_depth = _depth_at(n_splats, n_entries, n, n_begin, n_end, infinity)
+                n_depth = _get_depth(n_splats, n_entries, n, n_begin, n_end, infinity)
 
             begun = count
             red, green, blue = splat[6:9]
@@ -1399,9 +1414,11 @@ def find_fragments(begin, end, tiles, context, new, new_slots, where, behind):
                 if row_limit[row] < 0:
                     continue
                 if frozen and not veiled[row] & columns_of_splat:
-                    open_rows -= _draw_rows(row, row + 1, position, state, last, row_limit, splat)
+                    open_rows -= _composite_rows(
+                        row, row + 1, position, state, last, row_limit, splat
+                    )
                     continue
-                _fall_off(row, falloffs_of_row, splat)
+                _compute_falloffs(row, falloffs_of_row, splat)
                 for column in range(x_from, x_to):
                     falloff = falloffs_of_row[column]
                     if falloff == 0 or state[row, 0, column] < 0:
@@ -1432,7 +1449,7 @@ def find_fragments(begin, end, tiles, context, new, new_slots, where, behind):
                             state[row, 2, column],
                             state[row, 3, column],
                         )
-                        after = _covered(before, alpha, red, green, blue)
+                        after = _cover(before, alpha, red, green, blue)
                         for channel in range(4):
                             state[row, channel, column] = after[channel]
                             if own:
@@ -1446,7 +1463,7 @@ def find_fragments(begin, end, tiles, context, new, new_slots, where, behind):
 
         entry_start[index - begin + 1], fold_start[index - begin + 1] = entry, fold
         found = pixels, at_entries, at_falloffs, count, first_fold, entry - first_entry
-        _by_pixel(*found, place, pixel_start[index - begin], entries, falloffs)
+        _sort_by_pixel(*found, place, pixel_start[index - begin], entries, falloffs)
         place += count
         for row in range(rows):
             for column in range(columns):
@@ -1470,37 +1487,37 @@ def find_fragments(begin, end, tiles, context, new, new_slots, where, behind):
 
 
 @njit(cache=True)
-def _looks(fragments, index, opacities, colours):
+def _gather_appearance(fragments, index, opacities, colors):
     """Gather opacity and colour of each entry of a tile and its baked layers, and count entries."""
-    first, first_fold = fragments.entry_start[index], fragments.fold_start[index]
+    first, first_fold = fragments.entry_start[index], fragments.baked_start[index]
     count = fragments.entry_start[index + 1] - first
-    folds = fragments.fold_start[index + 1] - first_fold
+    folds = fragments.baked_start[index + 1] - first_fold
     appearance = np.empty((count + folds, 4), np.float32)
     for k in range(count):
         name = fragments.names[first + k]
         if name >= 0:
             appearance[k, 0] = opacities[name]
             for channel in range(3):
-                appearance[k, 1 + channel] = colours[name, channel]
+                appearance[k, 1 + channel] = colors[name, channel]
         else:
             appearance[k, 0] = np.float32(1)
             for channel in range(3):
                 appearance[k, 1 + channel] = fragments.solid[~name, channel]
     for k in range(folds):
         for column in range(4):
-            appearance[count + k, column] = fragments.folds[first_fold + k, column]
+            appearance[count + k, column] = fragments.baked[first_fold + k, column]
     return appearance, count
 
 
 @njit(cache=True, nogil=True, fastmath={"contract"}, error_model="numpy")
-def draw_fragments(fragments, opacities, colours, image):
+def render_fragments(fragments, opacities, colors, image):
     """Render the pixels that have fragments into `image`, without branching on baked layers."""
     tiles, _, _, _, starts, entries, falloffs, _, _, _, behind = fragments
     tiles_x = (behind.shape[1] + TILE - 1) // TILE
     zero, one = np.float32(0), np.float32(1)
     for index in range(len(tiles)):
         left, top = (tiles[index] % tiles_x) * TILE, (tiles[index] // tiles_x) * TILE
-        appearance, count = _looks(fragments, index, opacities, colours)
+        appearance, count = _gather_appearance(fragments, index, opacities, colors)
         for pixel in range(TILE * TILE):
             begin, end = starts[index, pixel], starts[index, pixel + 1]
             if begin == end:
@@ -1526,7 +1543,7 @@ def draw_fragments(fragments, opacities, colours, image):
 
 
 @njit(cache=True, nogil=True, fastmath={"contract"}, error_model="numpy")
-def compare_fragments(fragments, image, wanted, weights, slopes, errors):
+def compare_fragments(fragments, image, wanted, weights, d_image, errors):
     """Compute squared errors and gradients of the pixels that have fragments.
 
     d_image [h, w, 3] float32 is written, and errors [tiles] float64: summed over all channels.
@@ -1544,13 +1561,13 @@ def compare_fragments(fragments, image, wanted, weights, slopes, errors):
             weight = weights[y, x]
             for channel in range(3):
                 missed = image[y, x, channel] - wanted[y, x, channel]
-                slopes[y, x, channel] = two * weight * missed
+                d_image[y, x, channel] = two * weight * missed
                 error += weight * missed * missed
         errors[tiles[index]] = error
 
 
 @njit(cache=True, nogil=True, fastmath={"contract"}, error_model="numpy")
-def draw_fragments_backward(fragments, opacities, colours, image, d_image, gradients, written):
+def render_fragments_backward(fragments, opacities, colors, image, d_image, gradients, written):
     """Compute the gradients of the entries from those of the image, front to back.
 
     Content behind a fragment is the image less what precedes it. gradients [slots, 4]: opacity,
@@ -1561,7 +1578,7 @@ def draw_fragments_backward(fragments, opacities, colours, image, d_image, gradi
     zero, one = np.float32(0), np.float32(1)
     for index in range(len(tiles)):
         left, top = (tiles[index] % tiles_x) * TILE, (tiles[index] // tiles_x) * TILE
-        appearance, count = _looks(fragments, index, opacities, colours)
+        appearance, count = _gather_appearance(fragments, index, opacities, colors)
         d_appearance = np.zeros(appearance.shape, np.float32)  # Those of baked layers are not used.
         for pixel in range(TILE * TILE):
             begin, end = starts[index, pixel], starts[index, pixel + 1]
@@ -1602,30 +1619,30 @@ def draw_fragments_backward(fragments, opacities, colours, image, d_image, gradi
 
 
 @njit(cache=True, nogil=True, fastmath={"contract"}, error_model="numpy")
-def shade(begin, end, rows, center, means, sh, colours):
+def shade(begin, end, rows, center, means, sh, colors):
     """Compute the colours of the Gaussians rows[begin:end] as seen from `center`, from 0 up."""
     basis = np.empty(sh.shape[1], np.float32)
     half, zero = np.float32(0.5), np.float32(0)
     for index in range(begin, end):
         i = rows[index]
-        x, y, z, _ = _direction(center, means, i)
+        x, y, z, _ = _compute_direction(center, means, i)
         _evaluate_basis(x, y, z, basis)
         for channel in range(3):
             color = half
             for k in range(len(basis)):
                 color += basis[k] * sh[i, k, channel]
-            colours[i, channel] = max(color, zero)
+            colors[i, channel] = max(color, zero)
 
 
 @njit(cache=True, nogil=True, fastmath={"contract"}, error_model="numpy")
-def shade_backward(begin, end, rows, center, means, colours, d_colours, d_sh):
+def shade_backward(begin, end, rows, center, means, colors, d_colors, d_sh):
     """Compute gradients of the harmonics rows[begin:end]; colours cut off at 0 have none."""
     basis = np.empty(d_sh.shape[1], np.float32)
     for index in range(begin, end):
         i = rows[index]
-        x, y, z, _ = _direction(center, means, i)
+        x, y, z, _ = _compute_direction(center, means, i)
         _evaluate_basis(x, y, z, basis)
         for channel in range(3):
-            gradient = d_colours[i, channel] if colours[i, channel] > 0 else np.float32(0)
+            gradient = d_colors[i, channel] if colors[i, channel] > 0 else np.float32(0)
             for k in range(len(basis)):
                 d_sh[i, k, channel] = gradient * basis[k]

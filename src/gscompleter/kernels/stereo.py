@@ -9,13 +9,13 @@ from typing import NamedTuple
 import numpy as np
 from numba import njit
 
-from gscompleter.kernels.sharing import run, share
+from gscompleter.kernels.parallel import run, share
 
 UNSEEN = 255
 """Cost of a plane at which the pixel falls outside the other image."""
 TILE_ROWS, TILE_COLUMNS = 16, 64
 """Size of a tile, which is matched at once, within the cache."""
-FAR = np.int16(16000)
+INFEASIBLE = np.int16(16000)
 """Infeasible cost, half of the largest int16."""
 PATHS = 8
 """Number of paths of semi-global aggregation."""
@@ -36,7 +36,7 @@ class Bands(NamedTuple):
 
 
 @njit(cache=True, inline="always")
-def _first_cost(bands, y, x, width):
+def _get_first_cost(bands, y, x, width):
     row, column = y // TILE_ROWS, x // TILE_COLUMNS
     left = column * TILE_COLUMNS
     wide = min(TILE_COLUMNS, width - left)
@@ -53,7 +53,7 @@ def _clip(value, low, high):
 
 
 @njit(cache=True, fastmath={"contract"})
-def _box_sums(values, sums, column, rows, width, radius):
+def _sum_boxes(values, sums, column, rows, width, radius):
     """Sum `values` over (2 radius + 1)^2 windows."""
     for x in range(width + 2 * radius):
         column[x] = np.float32(0)
@@ -73,7 +73,9 @@ def _box_sums(values, sums, column, rows, width, radius):
             column[x] -= values[y, x]
 
 
-def matching_costs(reference, source, transform, inverse_depths, bands, radius, noise, detail):
+def compute_matching_costs(
+    reference, source, transform, inverse_depths, bands, radius, noise, detail
+):
     """Compute matching costs 0..254 of the reference pixels at the planes of their tiles.
 
     Normalised cross-correlation of windows over all colours, which ignores exposure, is mixed with
@@ -147,8 +149,8 @@ def _match_tiles(
                     total += own[c, y, x] * own[c, y, x]
                 product[y, x] = total
         for c in range(3):
-            _box_sums(own[c], own_mean[c], column, rows, cols, radius)
-        _box_sums(product, own_square, column, rows, cols, radius)
+            _sum_boxes(own[c], own_mean[c], column, rows, cols, radius)
+        _sum_boxes(product, own_square, column, rows, cols, radius)
         for y in range(rows):
             for x in range(cols):
                 for c in range(3):
@@ -196,12 +198,12 @@ def _match_tiles(
                             + w11 * source[iy + 1, ix + 1, c]
                         )
             for c in range(3):
-                _box_sums(other[c], other_mean[c], column, rows, cols, radius)
+                _sum_boxes(other[c], other_mean[c], column, rows, cols, radius)
             for y in range(tall):
                 for x in range(wide):
                     a, b, c = other[0, y, x], other[1, y, x], other[2, y, x]
                     product[y, x] = a * a + b * b + c * c
-            _box_sums(product, other_square, column, rows, cols, radius)
+            _sum_boxes(product, other_square, column, rows, cols, radius)
             for y in range(tall):
                 for x in range(wide):
                     product[y, x] = (
@@ -209,7 +211,7 @@ def _match_tiles(
                         + other[1, y, x] * own[1, y, x]
                         + other[2, y, x] * own[2, y, x]
                     )
-            _box_sums(product, cross, column, rows, cols, radius)
+            _sum_boxes(product, cross, column, rows, cols, radius)
             for y in range(rows):
                 place = first + y * cols * count + plane
                 _compare(y, own, own_mean, other, other_mean, other_square, cross, line)
@@ -233,7 +235,7 @@ def _step(cost, before, lowest, after, total, small, large):
     """Advance a path by one pixel and return its lowest cost there."""
     planes = cost.shape[0]
     ceiling = np.int16(lowest + large)
-    best = FAR
+    best = INFEASIBLE
     for k in range(planes):
         # `before` has a border of one plane on either side.
         beside = np.int16(min(before[k], before[k + 2]) + small)
@@ -242,19 +244,19 @@ def _step(cost, before, lowest, after, total, small, large):
         after[k + 1] = value
         total[k] = np.int16(total[k] + value)
         best = min(best, value)
-    after[0] = FAR
-    after[planes + 1] = FAR
+    after[0] = INFEASIBLE
+    after[planes + 1] = INFEASIBLE
     return best
 
 
 @njit(cache=True, inline="always")
-def _aligned(before, band_before, band, scratch):
+def _align_bands(before, band_before, band, scratch):
     """Realign the costs of another tile's band to the planes of this one; others are FAR."""
     if band_before[0] == band[0] and band_before[1] == band[1]:
         return before
     for plane in range(band[0] - 1, band[1] + 1):
         known = band_before[0] <= plane < band_before[1]
-        scratch[plane - band[0] + 1] = before[plane - band_before[0] + 1] if known else FAR
+        scratch[plane - band[0] + 1] = before[plane - band_before[0] + 1] if known else INFEASIBLE
     return scratch
 
 
@@ -281,7 +283,7 @@ def _sweep_half(costs, bands, large_x, large_y, large_d, large_u, small, down, t
             x = s if down else w - 1 - s
             column = x // TILE_COLUMNS
             low, high = bands.low[row, column], bands.high[row, column]
-            first = _first_cost(bands, y, x, w)
+            first = _get_first_cost(bands, y, x, w)
             end = first + high - low
             cost, out = costs[first:end], total[first:end]
             before, edge = nothing, 0
@@ -289,7 +291,7 @@ def _sweep_half(costs, bands, large_x, large_y, large_d, large_u, small, down, t
                 back = x - 1 if down else x + 1
                 edge, tile = min(x, back), back // TILE_COLUMNS
                 band = bands.low[row, tile], bands.high[row, tile]
-                before = _aligned(along[s % 2], band, (low, high), scratch)
+                before = _align_bands(along[s % 2], band, (low, high), scratch)
             low_along = _step(
                 cost, before, low_along, along[1 - s % 2], out, small, large_x[y, edge]
             )
@@ -301,13 +303,13 @@ def _sweep_half(costs, bands, large_x, large_y, large_d, large_u, small, down, t
                     tile = other // TILE_COLUMNS
                     band = bands.low[row_before, tile], bands.high[row_before, tile]
                     lowest, states = lows[then, path, other], rows[then, path, other]
-                    before = _aligned(states, band, (low, high), scratch)
+                    before = _align_bands(states, band, (low, high), scratch)
                 lows[now, path, x] = _step(
                     cost, before, lowest, rows[now, path, x], out, small, larges[path]
                 )
 
 
-def semi_global(costs, bands, large_x, large_y, large_d, large_u, small):
+def aggregate_semi_globally(costs, bands, large_x, large_y, large_d, large_u, small):
     """Aggregate costs along eight paths (Hirschmüller 2008), in the order of `bands`.
 
     Planes missing in the previous tile are reached by a jump.
@@ -325,7 +327,7 @@ def semi_global(costs, bands, large_x, large_y, large_d, large_u, small):
     return totals[0]
 
 
-def winners(totals, bands, h, w):
+def select_planes(totals, bands, h, w):
     """Select the best plane of every pixel, with fraction, and its margin over the second best.
 
     The second best is not adjacent to the best. Margins are in units of a cost, per path.
@@ -342,14 +344,14 @@ def _choose(begin, end, totals, bands, index, margin):
     for y in range(begin, end):
         for x in range(w):
             row, column = y // TILE_ROWS, x // TILE_COLUMNS
-            first = _first_cost(bands, y, x, w)
+            first = _get_first_cost(bands, y, x, w)
             planes = bands.high[row, column] - bands.low[row, column]
             total = totals[first : first + planes]
             best = 0
             for k in range(planes):
                 if total[k] < total[best]:
                     best = k
-            second = FAR
+            second = INFEASIBLE
             for k in range(planes):
                 if abs(k - best) > 2:
                     second = min(second, total[k])
@@ -415,7 +417,7 @@ def _carry(begin, end, depth, other, b_from_a, a_from_b, error, ratio):
             ratio[y, x] = value / max(expected, np.float32(1e-12))
 
 
-def background(values, known):
+def fill_background(values, known):
     """Fill unknown pixels with the second lowest known value in eight directions.
 
     Low inverse depths are far away, and one ray may miss a thin object in front.

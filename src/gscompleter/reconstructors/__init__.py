@@ -11,9 +11,9 @@ from typing import Protocol, runtime_checkable
 from jaxtyping import Bool
 from torch import Tensor
 
-from gscompleter.errors import InputError, quoted
+from gscompleter.errors import InputError, quote_value
+from gscompleter.models.weights.published import PUBLISHED
 from gscompleter.types import Reconstruction, View
-from gscompleter.weights.published import PUBLISHED
 
 
 @runtime_checkable
@@ -33,25 +33,25 @@ class Reconstructor(Protocol):
 class Lifter(Protocol):
     """Interface of a Ψ that can lift only some pixels of its first view."""
 
-    def lift(self, views: Sequence[View], wanted: Bool[Tensor, "h w"]) -> Reconstruction:
+    def lift(self, views: Sequence[View], pixel_mask: Bool[Tensor, "h w"]) -> Reconstruction:
         """Reconstruct `views`, with the Gaussians of `pixel_mask` in the first view only."""
 
 
-def reconstructed(
+def run_reconstructor(
     reconstructor: Reconstructor,
     views: Sequence[View],
-    wanted: Bool[Tensor, "h w"] | None = None,
+    pixel_mask: Bool[Tensor, "h w"] | None = None,
 ) -> Reconstruction:
     """Run Ψ on `views` and raise ValueError if its result is on another device.
 
     With `pixel_mask`, only these pixels of the first view need Gaussians; Ψ may return more.
     """
-    if wanted is not None and isinstance(reconstructor, Lifter):
-        found = reconstructor.lift(views, wanted)
+    if pixel_mask is not None and isinstance(reconstructor, Lifter):
+        found = reconstructor.lift(views, pixel_mask)
     else:
         found = reconstructor(views)
     device = views[0].image.device
-    for name, tensor in tensors_in(found, "the reconstruction"):
+    for name, tensor in iterate_tensors(found, "the reconstruction"):
         if tensor.device != device:
             raise ValueError(
                 f"the reconstructor returned {name} on {tensor.device}, and its views are on "
@@ -60,19 +60,19 @@ def reconstructed(
     return found
 
 
-def tensors_in(value: object, name: str) -> Iterator[tuple[str, Tensor]]:
+def iterate_tensors(value: object, name: str) -> Iterator[tuple[str, Tensor]]:
     """Yield every tensor inside nested dataclasses and tuples, with its attribute path."""
     if isinstance(value, Tensor):
         yield name, value
     elif isinstance(value, tuple):
         for i, item in enumerate(value):
-            yield from tensors_in(item, f"{name}[{i}]")
+            yield from iterate_tensors(item, f"{name}[{i}]")
     elif is_dataclass(value):
         for field in fields(value):
-            yield from tensors_in(getattr(value, field.name), f"{name}.{field.name}")
+            yield from iterate_tensors(getattr(value, field.name), f"{name}.{field.name}")
 
 
-def _plane_sweep(weights: Path | None, device: str) -> Reconstructor:
+def _load_plane_sweep(weights: Path | None, device: str) -> Reconstructor:
     from gscompleter.reconstructors.plane_sweep import PlaneSweep
 
     if weights is not None:
@@ -80,15 +80,19 @@ def _plane_sweep(weights: Path | None, device: str) -> Reconstructor:
     return PlaneSweep()
 
 
-def _feed_forward(name: str, weights: Path | None, device: str) -> Reconstructor:
-    from gscompleter.reconstructors.feed_forward.build import build
+def _load_feed_forward(name: str, weights: Path | None, device: str) -> Reconstructor:
+    from gscompleter.models.feed_forward.build import build
 
     return build(name, weights, device)
 
 
 RECONSTRUCTORS: dict[str, Callable[[Path | None, str], Reconstructor]] = {
-    "plane-sweep": _plane_sweep,
-    **{name: partial(_feed_forward, name) for name, w in PUBLISHED.items() if w.is_reconstructor},
+    "plane-sweep": _load_plane_sweep,
+    **{
+        name: partial(_load_feed_forward, name)
+        for name, w in PUBLISHED.items()
+        if w.is_reconstructor
+    },
 }
 """Builder of each reconstructor: (weights path or None for the default, device) -> Ψ."""
 
@@ -97,7 +101,7 @@ def check_reconstructor(name: str) -> None:
     """Raise InputError if no reconstructor has this name."""
     if name not in RECONSTRUCTORS:
         raise InputError(
-            f"There is no reconstructor '{quoted(name)}'; choose one of "
+            f"There is no reconstructor '{quote_value(name)}'; choose one of "
             f"{', '.join(RECONSTRUCTORS)}."
         )
 

@@ -11,14 +11,14 @@ import numpy as np
 from jaxtyping import Bool
 from torch import Tensor
 
-from gscompleter.matching.stereo_image import (
+from gscompleter.reconstructors.features.stereo_image import (
     StereoImage,
-    source_from_reference,
-    stereo_images,
+    compute_source_from_reference,
+    make_stereo_images,
 )
+from gscompleter.reconstructors.plane_sweep.depth_to_gaussians import Splatter
 from gscompleter.reconstructors.plane_sweep.fusion import Layer, Transforms
-from gscompleter.reconstructors.plane_sweep.reconstructor import ranged
-from gscompleter.reconstructors.plane_sweep.splatter import Splatter
+from gscompleter.reconstructors.plane_sweep.reconstructor import set_depth_range
 from gscompleter.types import DepthMap, Reconstruction, View
 
 
@@ -39,26 +39,26 @@ class FromDepth(Splatter):
 
     def __call__(self, views: Sequence[View]) -> Reconstruction:
         """Predict depths and build the scene; errors as in `PlaneSweep.__call__`."""
-        views = ranged(views)
-        images, unit = stereo_images(views)
+        views = set_depth_range(views)
+        images, unit = make_stereo_images(views)
         depths = self.model(views)
-        layers = [layer_of(*pair, unit) for pair in zip(images, depths, strict=True)]
-        return self.scene(views, depths, layers, transforms_among(images))
+        layers = [make_layer(*pair, unit) for pair in zip(images, depths, strict=True)]
+        return self.build_scene(views, depths, layers, compute_transforms(images))
 
-    def lift(self, views: Sequence[View], wanted: Bool[Tensor, "h w"]) -> Reconstruction:
+    def lift(self, views: Sequence[View], pixel_mask: Bool[Tensor, "h w"]) -> Reconstruction:
         """Lift the pixels of `pixel_mask` in the first view; errors as in `__call__`."""
-        views = ranged(views)
-        return self.wanted_of(views, self.model(views), wanted)
+        views = set_depth_range(views)
+        return self.lift_pixels(views, self.model(views), pixel_mask)
 
 
-def layer_of(image: StereoImage, depth: DepthMap, unit: float) -> Layer:
+def make_layer(image: StereoImage, depth: DepthMap, unit: float) -> Layer:
     """Convert a predicted depth map to inverse depth per widest baseline (`unit`)."""
     inverse = (unit / depth.depth.detach().cpu().double()).float().numpy()
     sure = depth.valid.float() if depth.confidence is None else depth.confidence
     return Layer(image, inverse, np.ascontiguousarray(sure.detach().cpu().float().numpy()))
 
 
-def transforms_among(images: Sequence[StereoImage]) -> Transforms:
+def compute_transforms(images: Sequence[StereoImage]) -> Transforms:
     """Compute the pixel transforms between all ordered pairs of images."""
     pairs = permutations(range(len(images)), 2)
-    return {(i, j): source_from_reference(images[i], images[j]) for i, j in pairs}
+    return {(i, j): compute_source_from_reference(images[i], images[j]) for i, j in pairs}

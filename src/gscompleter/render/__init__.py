@@ -16,8 +16,8 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
-from gscompleter.errors import InputError, quoted
-from gscompleter.kernels.sharing import many_at_once
+from gscompleter.errors import InputError, quote_value
+from gscompleter.kernels.parallel import map_small_tasks
 from gscompleter.types import Camera, Gaussians, Render
 
 OpacityRender = Callable[[Float[Tensor, "n"]], Render]
@@ -27,7 +27,7 @@ OpacityImage = Callable[[Float[Tensor, "n"]], Float[Tensor, "h w 3"]]
 """The image of an `OpacityRender`."""
 
 
-def image_of(plan: OpacityRender) -> OpacityImage:
+def restrict_to_image(plan: OpacityRender) -> OpacityImage:
     """Restrict an `OpacityRender` to its image."""
     return lambda opacities: plan(opacities).image
 
@@ -36,7 +36,7 @@ DepthRender = Callable[[Float[Tensor, "n"]], Render]
 """Renders a frozen scene with Gaussians that vary in z-depth [n] only."""
 
 
-LooksError = Callable[[Float[Tensor, "n"], Float[Tensor, "n k 3"]], Float[Tensor, ""]]
+AppearanceError = Callable[[Float[Tensor, "n"], Float[Tensor, "n k 3"]], Float[Tensor, ""]]
 """Squared error of an image at given opacities and harmonics; differentiable in both."""
 
 
@@ -49,64 +49,66 @@ class AppearanceRender(Protocol):
     ) -> Float[Tensor, "h w 3"]:
         """Render the image; differentiable."""
 
-    def compared(self, wanted: Float[Tensor, "h w 3"], weights: Float[Tensor, "h w"]) -> LooksError:
+    def make_error(
+        self, wanted: Float[Tensor, "h w 3"], weights: Float[Tensor, "h w"]
+    ) -> AppearanceError:
         """Make an error function: sum of `weights` (>= 0) times squared errors of all channels."""
 
 
-def in_colours(plan: AppearanceRender, sh: Float[Tensor, "n k 3"]) -> OpacityImage:
+def fix_harmonics(plan: AppearanceRender, sh: Float[Tensor, "n k 3"]) -> OpacityImage:
     """Fix the spherical harmonics of an `AppearanceRender`."""
     return lambda opacities: plan(opacities, sh)
 
 
-ColourSums = tuple[Float[Tensor, "n 3"], Float[Tensor, "n"]]
+ColorSums = tuple[Float[Tensor, "n 3"], Float[Tensor, "n"]]
 """Per Gaussian: compositing weight times an image [h, w, 3], and weight, summed over pixels."""
 
 
-ColourErrors = Callable[[Float[Tensor, "n 3"], Float[Tensor, "h w 3"]], ColourSums]
+ColorErrors = Callable[[Float[Tensor, "n 3"], Float[Tensor, "h w 3"]], ColorSums]
 """Backprojects the residual of a photograph [h, w, 3], at given colours [n, 3]."""
 
 
-def each_view(drawn: Gaussians) -> Callable[..., Iterable[Any]]:
+def get_view_map(scene: Gaussians) -> Callable[..., Iterable[Any]]:
     """Return a `map` over views of `scene`: on a CPU several at a time, elsewhere one by one."""
-    return many_at_once if drawn.means.device.type == "cpu" else map
+    return map_small_tasks if scene.means.device.type == "cpu" else map
 
 
 @runtime_checkable
-class FrozenView(Protocol):
+class FrozenScene(Protocol):
     """A scene prepared for one camera: whatever depends on these two alone is computed once.
 
     Optimisations, which render the same context a hundred times, pay only for what they vary.
     """
 
     @property
-    def context(self) -> Render:
+    def render(self) -> Render:
         """The render of the scene alone."""
 
-    def extended(self, new: Gaussians) -> FrozenView:
+    def extend(self, new: Gaussians) -> FrozenScene:
         """Add `new` to the frozen scene, after its Gaussians."""
 
-    def sums(self, layers: Float[Tensor, "h w 3"]) -> Float[Tensor, "n 3"]:
+    def backproject(self, image: Float[Tensor, "h w 3"]) -> Float[Tensor, "n 3"]:
         """Sum `image` over the compositing weights of each Gaussian: Σ_p w_ip image_p."""
 
-    def blended(self, values: Float[Tensor, "n"]) -> Float[Tensor, "h w"]:
+    def splat(self, values: Float[Tensor, "n"]) -> Float[Tensor, "h w"]:
         """Splat a value >= 0 per Gaussian: Σ_i w_ip value_i."""
 
     def composite(self, new: Gaussians) -> Render:
         """Render the scene with `new`; differentiable in `new`."""
 
-    def plan(self, new: Gaussians) -> OpacityRender:
+    def vary_opacities(self, new: Gaussians) -> OpacityRender:
         """Fix all of `new` but the opacities; the result is differentiable."""
 
-    def plan_appearance(self, new: Gaussians, where: Bool[Tensor, "h w"]) -> AppearanceRender:
+    def vary_appearance(self, new: Gaussians, where: Bool[Tensor, "h w"]) -> AppearanceRender:
         """Fix all of `new` but opacities and harmonics, and render it at least in the mask `where`.
 
         Differentiable in both. Takes longer to make than `vary_opacities`, but renders faster.
         """
 
-    def plan_colours(self, new: Gaussians) -> ColourErrors:
+    def vary_colors(self, new: Gaussians) -> ColorErrors:
         """Fix all of `new` but its colours, which the camera sees as given, from 0 up."""
 
-    def plan_depths(self, new: Gaussians, where: Bool[Tensor, "h w"]) -> DepthRender:
+    def vary_depths(self, new: Gaussians, where: Bool[Tensor, "h w"]) -> DepthRender:
         """Fix all of `new` but its z-depths, and render it at least in the mask `where`.
 
         Gaussians move along the camera's rays with constant footprint. The depth is differentiable.
@@ -120,7 +122,7 @@ class Renderer(Protocol):
     def render(self, gaussians: Gaussians, camera: Camera) -> Render:
         """Render `gaussians` from `camera`."""
 
-    def freeze(self, context: Gaussians, camera: Camera) -> FrozenView:
+    def freeze(self, context: Gaussians, camera: Camera) -> FrozenScene:
         """Prepare `context` for many renders from `camera`."""
 
 
@@ -139,10 +141,10 @@ def load_renderer(name: str) -> Renderer:
 
         return ReferenceRenderer()
     if name == "cuda":
-        from gscompleter.render.cuda import CudaRenderer
+        from gscompleter.render.gsplat import CudaRenderer
 
         return CudaRenderer()
-    raise InputError(f"There is no renderer '{quoted(name)}'; choose reference, cpu or cuda.")
+    raise InputError(f"There is no renderer '{quote_value(name)}'; choose reference, cpu or cuda.")
 
 
 def choose_device(device: Literal["auto", "cpu", "cuda"] = "auto") -> Literal["cpu", "cuda"]:

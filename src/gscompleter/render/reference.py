@@ -10,17 +10,17 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 from torch.utils.checkpoint import checkpoint
 
-from gscompleter.geometry import at_depths, rotations_from
-from gscompleter.render import AppearanceRender, ColourErrors, DepthRender, OpacityRender, Renderer
-from gscompleter.render.painting import (
-    DrawnAnew,
-    errors_by_slopes,
-    grey,
-    looking,
-    painted,
-    sums_by_slopes,
+from gscompleter.geometry import move_to_depths, quats_to_rotations
+from gscompleter.render import AppearanceRender, ColorErrors, DepthRender, OpacityRender, Renderer
+from gscompleter.render.redraw import (
+    FullRedraw,
+    backproject_by_autograd,
+    backproject_errors_by_autograd,
+    set_appearance,
+    set_colors,
+    to_grey,
 )
-from gscompleter.render.spherical_harmonics import colours_from
+from gscompleter.render.spherical_harmonics import evaluate_colors
 from gscompleter.types import Camera, Gaussians, Render, merge
 
 BLUR = 0.3
@@ -59,13 +59,13 @@ class ReferenceRenderer:
         depth = torch.where(seen, weighted_depth / torch.where(seen, alpha, 1), 0)
         return Render(color.view(*size, 3), depth.view(size), alpha.view(size))
 
-    def freeze(self, context: Gaussians, camera: Camera) -> ReferenceView:
+    def freeze(self, context: Gaussians, camera: Camera) -> ReferenceFrozenScene:
         """Prepare `context` for many renders from `camera`."""
-        return ReferenceView(self, context, camera)
+        return ReferenceFrozenScene(self, context, camera)
 
 
 @dataclass(frozen=True)
-class ReferenceView:
+class ReferenceFrozenScene:
     """A scene that is rendered from scratch every time, with any renderer."""
 
     renderer: Renderer
@@ -73,30 +73,30 @@ class ReferenceView:
     camera: Camera
 
     @cached_property
-    def context(self) -> Render:
+    def render(self) -> Render:
         """The render of the scene alone."""
         return self.renderer.render(self.scene, self.camera)
 
-    def extended(self, new: Gaussians) -> ReferenceView:
+    def extend(self, new: Gaussians) -> ReferenceFrozenScene:
         """Add `new` to the scene."""
         return replace(self, scene=merge([self.scene, new]))
 
-    def sums(self, layers: Float[Tensor, "h w 3"]) -> Float[Tensor, "n 3"]:
+    def backproject(self, image: Float[Tensor, "h w 3"]) -> Float[Tensor, "n 3"]:
         """Backproject `image` by autograd."""
-        return sums_by_slopes(self._painted, self.scene, layers)
+        return backproject_by_autograd(self._render_colors, self.scene, image)
 
-    def blended(self, values: Float[Tensor, "n"]) -> Float[Tensor, "h w"]:
+    def splat(self, values: Float[Tensor, "n"]) -> Float[Tensor, "h w"]:
         """Render the scene with the values as grey."""
-        return self._painted(grey(values))[..., 0]
+        return self._render_colors(to_grey(values))[..., 0]
 
-    def _painted(self, colours: Float[Tensor, "n 3"]) -> Float[Tensor, "h w 3"]:
-        return self.renderer.render(painted(self.scene, colours), self.camera).image
+    def _render_colors(self, colors: Float[Tensor, "n 3"]) -> Float[Tensor, "h w 3"]:
+        return self.renderer.render(set_colors(self.scene, colors), self.camera).image
 
     def composite(self, new: Gaussians) -> Render:
         """Render scene and `new`."""
         return self.renderer.render(merge([self.scene, new]), self.camera)
 
-    def plan(self, new: Gaussians) -> OpacityRender:
+    def vary_opacities(self, new: Gaussians) -> OpacityRender:
         """Fix all of `new` but the opacities."""
         fixed = replace(
             new,
@@ -107,21 +107,23 @@ class ReferenceView:
         )
         return lambda opacities: self.composite(replace(fixed, opacities=opacities))
 
-    def plan_appearance(self, new: Gaussians, where: Bool[Tensor, "h w"]) -> AppearanceRender:
+    def vary_appearance(self, new: Gaussians, where: Bool[Tensor, "h w"]) -> AppearanceRender:
         """Fix all of `new` but its appearance."""
-        return DrawnAnew(lambda *looks: self.composite(looking(new, *looks)).image)
+        return FullRedraw(lambda *looks: self.composite(set_appearance(new, *looks)).image)
 
-    def plan_colours(self, new: Gaussians) -> ColourErrors:
+    def vary_colors(self, new: Gaussians) -> ColorErrors:
         """Fix all of `new` but its colours."""
 
         def render(colors: Float[Tensor, "n 3"]) -> Float[Tensor, "h w 3"]:
-            return self.composite(painted(new, colors)).image
+            return self.composite(set_colors(new, colors)).image
 
-        return lambda colors, photograph: errors_by_slopes(render, new, colors, photograph)
+        return lambda colors, photograph: backproject_errors_by_autograd(
+            render, new, colors, photograph
+        )
 
-    def plan_depths(self, new: Gaussians, where: Bool[Tensor, "h w"]) -> DepthRender:
+    def vary_depths(self, new: Gaussians, where: Bool[Tensor, "h w"]) -> DepthRender:
         """Fix all of `new` but its depths."""
-        return lambda depths: self.composite(at_depths(new, self.camera, depths))
+        return lambda depths: self.composite(move_to_depths(new, self.camera, depths))
 
 
 @dataclass(frozen=True)
@@ -134,7 +136,7 @@ class Splats:
     """Inverse covariances, in px⁻²."""
     depths: Float[Tensor, "m"]
     opacities: Float[Tensor, "m"]
-    colours: Float[Tensor, "m 3"]
+    colors: Float[Tensor, "m 3"]
 
 
 def project(gaussians: Gaussians, camera: Camera) -> Splats:
@@ -149,22 +151,22 @@ def project(gaussians: Gaussians, camera: Camera) -> Splats:
     order = order[z[order] > max(camera.near_plane, 0.0)]
     gaussians, points = gaussians[order], points[order]
 
-    axes = rotations_from(gaussians.quats) * gaussians.scales[:, None, :]
-    flat = jacobians(points, K, camera.width, camera.height) @ camera_from_world @ axes
+    axes = quats_to_rotations(gaussians.quats) * gaussians.scales[:, None, :]
+    flat = compute_jacobians(points, K, camera.width, camera.height) @ camera_from_world @ axes
     covariances = flat @ flat.transpose(1, 2) + BLUR * torch.eye(2, dtype=dtype, device=device)
     opacities = gaussians.opacities
     if gaussians.is_antialiased:
-        opacities = opacities * compensations(flat, covariances)
+        opacities = opacities * compute_compensations(flat, covariances)
     return Splats(
         centers=points[:, :2] / points[:, 2:] * K.diagonal()[:2] + K[:2, 2],
-        precisions=inverses(covariances),
+        precisions=invert_symmetric(covariances),
         depths=points[:, 2],
         opacities=opacities,
-        colours=colours_from(gaussians.sh, gaussians.means, c2w[:3, 3]),
+        colors=evaluate_colors(gaussians.sh, gaussians.means, c2w[:3, 3]),
     )
 
 
-def jacobians(
+def compute_jacobians(
     points: Float[Tensor, "n 3"], K: Float[Tensor, "3 3"], width: int, height: int
 ) -> Float[Tensor, "n 2 3"]:
     """Compute the Jacobian of the projection at points in the camera, with clamped tangents."""
@@ -184,14 +186,14 @@ def jacobians(
     return torch.stack(rows, dim=1)
 
 
-def inverses(matrices: Float[Tensor, "n 2 2"]) -> Float[Tensor, "n 2 2"]:
+def invert_symmetric(matrices: Float[Tensor, "n 2 2"]) -> Float[Tensor, "n 2 2"]:
     """Invert symmetric matrices."""
     a, b, c = matrices[:, 0, 0], matrices[:, 0, 1], matrices[:, 1, 1]
     adjugates = torch.stack([c, -b, -b, a], dim=-1).view(-1, 2, 2)
     return adjugates / (a * c - b * b)[:, None, None]
 
 
-def compensations(
+def compute_compensations(
     flat: Float[Tensor, "n 2 3"], covariances: Float[Tensor, "n 2 2"]
 ) -> Float[Tensor, "n"]:
     """Compute the factors on opacities that compensate for the low-pass when antialiased.
@@ -221,4 +223,4 @@ def composite(
     behind = torch.cumprod(1 - alpha, dim=0)
     before = torch.cat([torch.ones_like(behind[:1]), behind[:-1]])
     weights = alpha * before
-    return weights.T @ splats.colours, weights.T @ splats.depths, weights.sum(dim=0)
+    return weights.T @ splats.colors, weights.T @ splats.depths, weights.sum(dim=0)

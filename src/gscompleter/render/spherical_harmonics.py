@@ -14,7 +14,7 @@ SH_C3 = (0.5900435899266435, 2.890611442640554, 0.4570457994644658, 0.3731763325
 SH_C3_CUBE = 1.445305721320277
 
 
-def colours_from(
+def evaluate_colors(
     sh: Float[Tensor, "n k 3"], means: Float[Tensor, "n 3"], center: Float[Tensor, "3"]
 ) -> Float[Tensor, "n 3"]:
     """Evaluate colours as seen from `center`: `max(0, 0.5 + sum of basis * sh)`.
@@ -24,11 +24,11 @@ def colours_from(
     if sh.shape[1] == 1:
         return (0.5 + SH_C0 * sh[:, 0]).clamp_min(0)
     directions = torch.nn.functional.normalize(means - center, dim=-1)
-    basis = sh_basis(directions, sh.shape[1])
+    basis = evaluate_sh_basis(directions, sh.shape[1])
     return (0.5 + torch.einsum("nk,nkc->nc", basis, sh)).clamp_min(0)
 
 
-def sh_basis(directions: Float[Tensor, "n 3"], k: int) -> Float[Tensor, "n k"]:
+def evaluate_sh_basis(directions: Float[Tensor, "n 3"], k: int) -> Float[Tensor, "n k"]:
     """Evaluate the first `k` (1, 4, 9 or 16) basis functions at unit `directions` (world)."""
     x, y, z = directions.unbind(-1)
     xx, yy, zz = x * x, y * y, z * z

@@ -8,26 +8,26 @@ from pathlib import Path
 
 import numpy as np
 
-from gscompleter.errors import InputError, quoted, refuse_pointer
-from gscompleter.io.ply import load_ply, save_ply, whole
-from gscompleter.reading import open_file
+from gscompleter.errors import InputError, quote_value, refuse_pointer
+from gscompleter.io.reading import open_file
 from gscompleter.splats.compressed_ply import (
-    is_compressed,
+    is_compressed_ply,
     read_compressed_ply,
     write_compressed_ply,
 )
 from gscompleter.splats.glb import is_glb, read_glb
 from gscompleter.splats.ksplat import read_ksplat
-from gscompleter.splats.labels import load_labels, save_labels
-from gscompleter.splats.order import near_together
+from gscompleter.splats.morton import sort_along_morton
+from gscompleter.splats.ply import load_ply, require_finite, save_ply
+from gscompleter.splats.provenance import load_labels, save_labels
 from gscompleter.splats.sog import META, is_sog, read_sog
 from gscompleter.splats.splat import read_splat, write_splat
 from gscompleter.splats.spz import is_spz, read_spz, write_spz
 from gscompleter.types import Gaussians
 
-ROUNDING = 1e-3
+OPACITY_TOLERANCE = 1e-3
 """Distance from [0, 1] up to which an opacity is clamped instead of refused."""
-HEAD = 8192
+HEAD_BYTES = 8192
 """Bytes read to detect a format; the header of a compressed .ply fits."""
 
 
@@ -36,30 +36,34 @@ class Format:
     """Functions that detect, read and write one file format."""
 
     extensions: tuple[str, ...]
-    begins: Callable[[bytes], bool] | None
+    recognizes: Callable[[bytes], bool] | None
     """Test on the first bytes of a file, or None if only the extension identifies the format."""
     read: Callable[[Path], Gaussians]
     write: Callable[[Path, Gaussians], None] | None = None
-    arrange: Callable[[Gaussians], Gaussians] | None = None
+    sort: Callable[[Gaussians], Gaussians] | None = None
     """Sorts Gaussians as the format needs them; None keeps their order."""
-    has_mode: bool = False
+    supports_antialiased: bool = False
     """True if the format can mark Gaussians as antialiased."""
 
 
 FORMATS = {
     "compressed-ply": Format(
         (".compressed.ply",),
-        is_compressed,
+        is_compressed_ply,
         read_compressed_ply,
         write_compressed_ply,
-        near_together,
-        has_mode=True,
+        sort_along_morton,
+        supports_antialiased=True,
     ),
     "ply": Format(
-        (".ply",), lambda head: head.startswith(b"ply"), load_ply, save_ply, has_mode=True
+        (".ply",),
+        lambda head: head.startswith(b"ply"),
+        load_ply,
+        save_ply,
+        supports_antialiased=True,
     ),
-    "spz": Format((".spz",), is_spz, read_spz, write_spz, has_mode=True),
-    "sog": Format((".sog", META), is_sog, read_sog, has_mode=True),
+    "spz": Format((".spz",), is_spz, read_spz, write_spz, supports_antialiased=True),
+    "sog": Format((".sog", META), is_sog, read_sog, supports_antialiased=True),
     "glb": Format((".glb",), is_glb, read_glb),
     "splat": Format((".splat",), None, read_splat, write_splat),
     "ksplat": Format((".ksplat",), None, read_ksplat),
@@ -82,26 +86,26 @@ def load_splat(path: Path | str, drop_nonfinite: bool = False) -> Gaussians:
         InputError: The file is missing, empty, truncated or damaged, or its format is unknown.
     """
     path = Path(path)
-    format_ = FORMATS[format_of(path)]
+    format_ = FORMATS[detect_splat_format(path)]
     if format_.read is load_ply:
         return load_ply(path, drop_nonfinite)
     with np.errstate(over="ignore", invalid="ignore"):  # infinite values are refused below
         gaussians = format_.read(path)
     if len(gaussians) == 0:
-        raise InputError(f"{quoted(path)} is empty: it holds no Gaussian.")
-    gaussians = within_ranges(gaussians, path)
+        raise InputError(f"{quote_value(path)} is empty: it holds no Gaussian.")
+    gaussians = validate_ranges(gaussians, path)
     labelled = replace(gaussians, generated=load_labels(path, len(gaussians)))
-    return whole(labelled, path, drop_nonfinite)
+    return require_finite(labelled, path, drop_nonfinite)
 
 
-def within_ranges(gaussians: Gaussians, path: Path) -> Gaussians:
+def validate_ranges(gaussians: Gaussians, path: Path) -> Gaussians:
     """Refuse negative scales and invalid opacities, and clamp opacities off by rounding."""
     opacities = gaussians.opacities
-    bad = (gaussians.scales < 0).any(1) | ((opacities - 0.5).abs() > 0.5 + ROUNDING)
+    bad = (gaussians.scales < 0).any(1) | ((opacities - 0.5).abs() > 0.5 + OPACITY_TOLERANCE)
     bad &= opacities.isfinite()  # others are refused as non-finite
     if bad.any():
         raise InputError(
-            f"{quoted(path)} has {int(bad.sum()):,} of {len(bad):,} Gaussians with a negative "
+            f"{quote_value(path)} has {int(bad.sum()):,} of {len(bad):,} Gaussians with a negative "
             "scale or an opacity outside of [0, 1]; export it again."
         )
     return replace(gaussians, opacities=opacities.clamp(0, 1))
@@ -117,24 +121,24 @@ def save_splat(path: Path | str, gaussians: Gaussians) -> None:
         InputError: The format is unknown or read-only, there are no Gaussians, or writing fails.
     """
     path = Path(path)
-    format_ = writable_format(path)
+    format_ = get_writable_format(path)
     if len(gaussians) == 0:
-        raise InputError(f"There is no Gaussian to write to {quoted(path)}.")
+        raise InputError(f"There is no Gaussian to write to {quote_value(path)}.")
     if format_.write is save_ply:
         save_ply(path, gaussians)
         return
     assert format_.write is not None
-    gaussians = whole(gaussians.to("cpu"), path, drop_nonfinite=False)
-    if format_.arrange is not None:
-        gaussians = format_.arrange(gaussians)
+    gaussians = require_finite(gaussians.to("cpu"), path, drop_nonfinite=False)
+    if format_.sort is not None:
+        gaussians = format_.sort(gaussians)
     format_.write(path, gaussians)
     save_labels(path, gaussians.generated)
 
 
-def loss_of_mode(path: Path, gaussians: Gaussians) -> str | None:
+def describe_mode_loss(path: Path, gaussians: Gaussians) -> str | None:
     """Describe that the format of `path` cannot mark antialiased Gaussians, or return None."""
-    format_ = writable_format(path)
-    if format_.has_mode or not gaussians.is_antialiased:
+    format_ = get_writable_format(path)
+    if format_.supports_antialiased or not gaussians.is_antialiased:
         return None
     return (
         f"A {format_.extensions[0]} file cannot mark Gaussians as antialiased: viewers will "
@@ -142,45 +146,48 @@ def loss_of_mode(path: Path, gaussians: Gaussians) -> str | None:
     )
 
 
-def format_of(path: Path) -> str:
+def detect_splat_format(path: Path) -> str:
     """Detect the format of a file or folder, by name."""
     if path.is_dir():
         if (path / META).is_file():
             return "sog"
-        raise InputError(f"{quoted(path)} is a folder without {META}; name a file of Gaussians.")
+        raise InputError(
+            f"{quote_value(path)} is a folder without {META}; name a file of Gaussians."
+        )
     with open_file(path) as file:
-        head = file.read(HEAD)
+        head = file.read(HEAD_BYTES)
     refuse_pointer(path)
     if not head:
-        raise InputError(f"{quoted(path)} is empty; a file of Gaussians is needed.")
+        raise InputError(f"{quote_value(path)} is empty; a file of Gaussians is needed.")
     for name, format_ in FORMATS.items():
-        if format_.begins is not None and format_.begins(head):
+        if format_.recognizes is not None and format_.recognizes(head):
             return name
-    named = _by_name(path)
-    if named is None or FORMATS[named].begins is not None:
+    named = _match_extension(path)
+    if named is None or FORMATS[named].recognizes is not None:
         raise InputError(
-            f"{quoted(path)} holds no Gaussians in a format that is known: {_known()}."
+            f"{quote_value(path)} holds no Gaussians in a format that is known: "
+            f"{_list_extensions()}."
         )
     return named
 
 
-def writable_format(path: Path) -> Format:
+def get_writable_format(path: Path) -> Format:
     """Get the format for the extension of `path`, which must be one that is written."""
-    name = _by_name(path)
+    name = _match_extension(path)
     if name is None or FORMATS[name].write is None:
         raise InputError(
-            f"{quoted(path)} cannot be written in the format of its extension; end it in "
+            f"{quote_value(path)} cannot be written in the format of its extension; end it in "
             f"{', '.join(f.extensions[0] for f in FORMATS.values() if f.write)}."
         )
     return FORMATS[name]
 
 
-def _by_name(path: Path) -> str | None:
+def _match_extension(path: Path) -> str | None:
     for name, format_ in FORMATS.items():
         if path.name.lower().endswith(format_.extensions):
             return name
     return None
 
 
-def _known() -> str:
+def _list_extensions() -> str:
     return ", ".join(f"*{extension}" for f in FORMATS.values() for extension in f.extensions)

@@ -20,29 +20,29 @@ from jaxtyping import Float
 from numpy import ndarray
 from torch import Tensor
 
-from gscompleter.errors import InputError, quoted
-from gscompleter.reading import read_bytes
-from gscompleter.splats.decoding import check_size, damaged, gaussians_of
-from gscompleter.splats.frames import ABOUT_Z, half_turned, moved
+from gscompleter.errors import InputError, quote_value
+from gscompleter.io.reading import read_bytes
+from gscompleter.splats.packing import build_gaussians, check_size, make_damage_error
+from gscompleter.splats.transform import HALF_TURN_Z, rotate_half_turn, transform_gaussians
 from gscompleter.types import Gaussians, merge
 
 MAGIC = b"glTF"
-CHUNK = struct.Struct("<II")
+CHUNK_HEADER = struct.Struct("<II")
 JSON, BINARY = 0x4E4F534A, 0x004E4942
 EXTENSION = "KHR_gaussian_splatting"
-COLOURS = "srgb_rec709_display"
+COLOR_SPACE = "srgb_rec709_display"
 """The colour space in which all splat trainers work."""
-KINDS = {5120: "<i1", 5121: "<u1", 5122: "<i2", 5123: "<u2", 5126: "<f4"}
+COMPONENT_TYPES = {5120: "<i1", 5121: "<u1", 5122: "<i2", 5123: "<u2", 5126: "<f4"}
 """numpy names of the component types."""
-WIDTHS = {"SCALAR": 1, "VEC3": 3, "VEC4": 4}
-FEWEST_BYTES = 8
+NUM_COMPONENTS = {"SCALAR": 1, "VEC3": 3, "VEC4": 4}
+MIN_GAUSSIAN_BYTES = 8
 """Lower bound on the bytes of a Gaussian; with fewer, the file repeats its data."""
-DEEPEST = 100
+MAX_NODE_DEPTH = 100
 """Largest depth of the node tree; a deeper one contains a cycle."""
 
 
 @dataclass(frozen=True)
-class Document:
+class GlbDocument:
     """The JSON and binary parts of a .glb."""
 
     path: Path
@@ -57,40 +57,45 @@ def is_glb(head: bytes) -> bool:
 
 def read_glb(path: Path) -> Gaussians:
     """Read all Gaussians of the scene in a .glb, in the axes of a .ply."""
-    document = _document(path, read_bytes(path))
+    document = _parse_document(path, read_bytes(path))
     try:
-        placed = list(_placed_primitives(document))
-        _check_repeats(document, [primitive for primitive, _ in placed])
-        parts = [moved(_decoded(document, primitive), place) for primitive, place in placed]
+        placed = list(_find_primitives(document))
+        _check_counts(document, [primitive for primitive, _ in placed])
+        parts = [
+            transform_gaussians(_decode_primitive(document, primitive), place)
+            for primitive, place in placed
+        ]
     except InputError:
         raise
     except (KeyError, IndexError, TypeError, ValueError, OverflowError, AttributeError) as error:
-        raise damaged(path, f"its JSON part is invalid ({quoted(str(error))})") from error
+        raise make_damage_error(
+            path, f"its JSON part is invalid ({quote_value(str(error))})"
+        ) from error
     if not parts:
-        raise InputError(f"{quoted(path)} holds no Gaussians: nothing in it uses {EXTENSION}.")
-    return half_turned(merge(parts), ABOUT_Z)
+        raise InputError(f"{quote_value(path)} holds no Gaussians: nothing in it uses {EXTENSION}.")
+    return rotate_half_turn(merge(parts), HALF_TURN_Z)
 
 
-def _document(path: Path, data: bytes) -> Document:
+def _parse_document(path: Path, data: bytes) -> GlbDocument:
     chunks: dict[int, bytes] = {}
     start = 12
-    while start + CHUNK.size <= len(data):
-        size, kind = CHUNK.unpack_from(data, start)
-        start += CHUNK.size
+    while start + CHUNK_HEADER.size <= len(data):
+        size, kind = CHUNK_HEADER.unpack_from(data, start)
+        start += CHUNK_HEADER.size
         check_size(path, len(data), start + size)
         chunks.setdefault(kind, data[start : start + size])
         start += size
     try:
         table = json.loads(chunks[JSON])
     except (KeyError, ValueError, RecursionError) as error:
-        raise damaged(path, "it has no description") from error
+        raise make_damage_error(path, "it has no description") from error
     if not isinstance(table, dict):
-        raise damaged(path, "its description is no table")
-    return Document(path, table, chunks.get(BINARY, b""))
+        raise make_damage_error(path, "its description is no table")
+    return GlbDocument(path, table, chunks.get(BINARY, b""))
 
 
-def _placed_primitives(
-    document: Document,
+def _find_primitives(
+    document: GlbDocument,
 ) -> Iterator[tuple[dict[str, Any], Float[Tensor, "4 4"]]]:
     """Find the primitives of Gaussians in the scene, each with its transform to the scene."""
     table = document.table
@@ -99,10 +104,10 @@ def _placed_primitives(
     waiting = [(index, torch.eye(4, dtype=torch.float64), 0) for index in roots]
     while waiting:
         index, above, depth = waiting.pop(0)
-        if depth > DEEPEST or len(waiting) > len(table["nodes"]):
-            raise damaged(document.path, "its nodes contain each other")
+        if depth > MAX_NODE_DEPTH or len(waiting) > len(table["nodes"]):
+            raise make_damage_error(document.path, "its nodes contain each other")
         node = table["nodes"][index]
-        place = above @ _place(document, node)
+        place = above @ _read_transform(document, node)
         waiting += [(child, place, depth + 1) for child in node.get("children", ())]
         if "mesh" in node:
             for primitive in table["meshes"][node["mesh"]]["primitives"]:
@@ -110,7 +115,7 @@ def _placed_primitives(
                     yield primitive, place.float()
 
 
-def _place(document: Document, node: dict[str, Any]) -> Float[Tensor, "4 4"]:
+def _read_transform(document: GlbDocument, node: dict[str, Any]) -> Float[Tensor, "4 4"]:
     """Read the transform of a node; only similarities are accepted."""
     if "matrix" in node:
         place = torch.tensor(node["matrix"], dtype=torch.float64).reshape(4, 4).T
@@ -137,23 +142,28 @@ def _place(document: Document, node: dict[str, Any]) -> Float[Tensor, "4 4"]:
     return place
 
 
-def _check_repeats(document: Document, primitives: list[dict[str, Any]]) -> None:
+def _check_counts(document: GlbDocument, primitives: list[dict[str, Any]]) -> None:
     accessors = [
         document.table["accessors"][primitive["attributes"]["POSITION"]] for primitive in primitives
     ]
-    if sum(int(a["count"]) for a in accessors) * FEWEST_BYTES > len(document.binary):
-        raise damaged(document.path, "it claims more Gaussians than fit into it")
+    if sum(int(a["count"]) for a in accessors) * MIN_GAUSSIAN_BYTES > len(document.binary):
+        raise make_damage_error(document.path, "it claims more Gaussians than fit into it")
 
 
-def _decoded(document: Document, primitive: dict[str, Any]) -> Gaussians:
+def _decode_primitive(document: GlbDocument, primitive: dict[str, Any]) -> Gaussians:
     """Decode the Gaussians of a primitive, in the frame of its node."""
     extension, attributes = primitive["extensions"][EXTENSION], primitive["attributes"]
     packed = ", ".join({**extension.get("extensions", {}), **primitive["extensions"]})
-    colours = extension.get("colorSpace", COLOURS)
-    if packed != EXTENSION or extension.get("kernel", "ellipse") != "ellipse" or colours != COLOURS:
+    colours = extension.get("colorSpace", COLOR_SPACE)
+    if (
+        packed != EXTENSION
+        or extension.get("kernel", "ellipse") != "ellipse"
+        or colours != COLOR_SPACE
+    ):
         raise InputError(
-            f"{document.path} stores Gaussians in an unknown way ({quoted(packed)}, "
-            f"{quoted(extension.get('kernel', 'ellipse'))}, {quoted(colours)}); export it as .ply."
+            f"{document.path} stores Gaussians in an unknown way ({quote_value(packed)}, "
+            f"{quote_value(extension.get('kernel', 'ellipse'))}, {quote_value(colours)}); export "
+            "it as .ply."
         )
 
     count = document.table["accessors"][attributes["POSITION"]]["count"]
@@ -163,8 +173,10 @@ def _decoded(document: Document, primitive: dict[str, Any]) -> Gaussians:
             raise InputError(f"{document.path} lacks the attribute {name} of its Gaussians.")
         accessor = document.table["accessors"][attributes[name]]
         if (accessor["type"], accessor["count"]) != (kind, count):
-            raise damaged(document.path, f"its attribute {name} has another size than it must have")
-        return _accessor(document, accessor)
+            raise make_damage_error(
+                document.path, f"its attribute {name} has another size than it must have"
+            )
+        return _read_accessor(document, accessor)
 
     degree = max(d for d in range(4) if d == 0 or f"{EXTENSION}:SH_DEGREE_{d}_COEF_0" in attributes)
     sh = [
@@ -172,7 +184,7 @@ def _decoded(document: Document, primitive: dict[str, Any]) -> Gaussians:
         for d in range(degree + 1)
         for i in range(2 * d + 1)
     ]
-    return gaussians_of(
+    return build_gaussians(
         named("POSITION"),
         np.roll(named(f"{EXTENSION}:ROTATION", "VEC4"), 1, axis=1),
         named(f"{EXTENSION}:SCALE"),
@@ -181,7 +193,7 @@ def _decoded(document: Document, primitive: dict[str, Any]) -> Gaussians:
     )
 
 
-def _accessor(document: Document, accessor: dict[str, Any]) -> Float[ndarray, "n k"]:
+def _read_accessor(document: GlbDocument, accessor: dict[str, Any]) -> Float[ndarray, "n k"]:
     """Read the numbers of an accessor from the binary part; integers may stand for fractions."""
     if "sparse" in accessor or "bufferView" not in accessor:
         raise InputError(f"{document.path} holds sparse attributes; export it as .ply.")
@@ -190,17 +202,20 @@ def _accessor(document: Document, accessor: dict[str, Any]) -> Float[ndarray, "n
         raise InputError(
             f"{document.path} holds its Gaussians compressed or in another file; export it as .ply."
         )
-    kind, width = np.dtype(KINDS[accessor["componentType"]]), WIDTHS[accessor["type"]]
+    kind, width = (
+        np.dtype(COMPONENT_TYPES[accessor["componentType"]]),
+        NUM_COMPONENTS[accessor["type"]],
+    )
     start = int(view.get("byteOffset", 0)) + int(accessor.get("byteOffset", 0))
     stride = int(view.get("byteStride", 0)) or width * kind.itemsize
     shape = (int(accessor["count"]), width)
     if stride < width * kind.itemsize:
-        raise damaged(document.path, "its attributes overlap")
+        raise make_damage_error(document.path, "its attributes overlap")
     # numpy refuses views that exceed the buffer.
     values = np.ndarray(shape, kind, document.binary, start, (stride, kind.itemsize))
     if kind.kind == "f":
         return values.astype(np.float32)
     if not accessor.get("normalized") and width != 3:
-        raise damaged(document.path, "its rotations or opacities are no fractions")
+        raise make_damage_error(document.path, "its rotations or opacities are no fractions")
     largest = np.iinfo(kind).max if accessor.get("normalized") else 1
     return np.maximum(values.astype(np.float32) / largest, -1 if largest > 1 else -np.inf)

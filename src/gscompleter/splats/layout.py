@@ -17,17 +17,17 @@ from jaxtyping import Bool, Int, UInt8
 from numpy import ndarray
 from torch import Tensor
 
-from gscompleter.io.files import replacing
-from gscompleter.io.ply import Element, blocks, read_header, rows_of, save_ply
+from gscompleter.io.files import replace_file
+from gscompleter.splats.ply import Element, iterate_blocks, make_rows, read_header, save_ply
 from gscompleter.types import Gaussians, merge
 
-LABEL = "generated"
-_COUNT = re.compile(rb"^(element\s+vertex\s+)\d+", re.M)
+LABEL_COLUMN = "generated"
+_COUNT_LINE = re.compile(rb"^(element\s+vertex\s+)\d+", re.M)
 _LABEL_LINE = re.compile(rb"^property\s+\w+\s+generated\s*?\n", re.M)
 
 
 @dataclass(frozen=True)
-class Layout:
+class PlyLayout:
     """A binary .ply whose first element contains Gaussians."""
 
     header: bytes
@@ -37,13 +37,13 @@ class Layout:
     vertex: Element
     rows: ndarray
     """One structured row per Gaussian, [n]."""
-    behind: bytes
+    trailer: bytes
     """Everything after the last row."""
 
     @property
     def is_labelled(self) -> bool:
         """True if there is a column `generated`."""
-        return LABEL in (self.rows.dtype.names or ())
+        return LABEL_COLUMN in (self.rows.dtype.names or ())
 
     @property
     def num_rest(self) -> int:
@@ -51,7 +51,7 @@ class Layout:
         return sum(name.startswith("f_rest_") for name in self.rows.dtype.names or ())
 
 
-def read_layout(path: Path) -> Layout | None:
+def read_layout(path: Path) -> PlyLayout | None:
     """Read the layout of a .ply, or None if it is ASCII or begins with another element."""
     with path.open("rb") as file:
         file_format, (vertex, *_) = read_header(file, path)
@@ -63,48 +63,50 @@ def read_layout(path: Path) -> Layout | None:
         byte_order = "<" if file_format == "binary_little_endian" else ">"
         rows = np.memmap(file, vertex.dtype(byte_order), "r", size, vertex.count)
         file.seek(size + rows.nbytes)
-        return Layout(header, byte_order, vertex, rows, file.read())
+        return PlyLayout(header, byte_order, vertex, rows, file.read())
 
 
-def given_layout(given: Path | None) -> Layout | None:
+def find_layout(given: Path | None) -> PlyLayout | None:
     """Read the layout of the file of a scene, or None if it is no binary .ply."""
     is_ply = given is not None and given.name.lower().endswith(".ply")
     return read_layout(given) if given is not None and is_ply else None
 
 
-def write_layout(path: Path, layout: Layout) -> None:
+def write_layout(path: Path, layout: PlyLayout) -> None:
     """Write a .ply, with the number of its rows in the header."""
     write_rows(path, layout, len(layout.rows), [layout.rows])
 
 
-def write_rows(path: Path, layout: Layout, count: int, rows: Iterable[ndarray]) -> None:
+def write_rows(path: Path, layout: PlyLayout, count: int, rows: Iterable[ndarray]) -> None:
     """Write a .ply with other `rows` of the same type, `count` in total, block by block."""
-    with replacing(path) as file:
-        file.write(_COUNT.sub(rb"\g<1>" + str(count).encode(), layout.header, count=1))
+    with replace_file(path) as file:
+        file.write(_COUNT_LINE.sub(rb"\g<1>" + str(count).encode(), layout.header, count=1))
         for part in rows:
             file.write(part.view(np.uint8).data)
-        file.write(layout.behind)
+        file.write(layout.trailer)
 
 
-def unlabelled(layout: Layout) -> Layout:
+def drop_generated(layout: PlyLayout) -> PlyLayout:
     """Remove the generated rows and the column `generated`."""
     if not layout.is_labelled:
         return layout
-    kept = [p for p in layout.vertex.properties if p.name != LABEL]
+    kept = [p for p in layout.vertex.properties if p.name != LABEL_COLUMN]
     vertex = Element("vertex", 0, kept)
-    given = layout.rows[layout.rows[LABEL] == 0]
+    given = layout.rows[layout.rows[LABEL_COLUMN] == 0]
     rows = np.zeros(len(given), vertex.dtype(layout.byte_order))
-    _fill(rows, given)
+    _copy_columns(rows, given)
     return replace(layout, header=_LABEL_LINE.sub(b"", layout.header), vertex=vertex, rows=rows)
 
 
-def with_rows(layout: Layout, others: Layout, places: Int[Tensor, "m"]) -> Layout | None:
+def insert_rows(
+    layout: PlyLayout, others: PlyLayout, row_numbers: Int[Tensor, "m"]
+) -> PlyLayout | None:
     """Insert the rows of `others` at the indices `row_numbers`; None if their columns differ."""
     if others.rows.dtype != layout.rows.dtype:
         return None
     total = len(layout.rows) + len(others.rows)
     taken = np.zeros(total, bool)
-    taken[places.numpy()] = True
+    taken[row_numbers.numpy()] = True
     rows = np.empty(total, layout.rows.dtype)
     rows[taken], rows[~taken] = others.rows, layout.rows
     return replace(layout, rows=rows)
@@ -123,38 +125,38 @@ def save_like(
     type, fewer SH coefficients than `added`, or rows that do not match `context`. `kept` marks the
     rows of `given` that the context has; None for all.
     """
-    context, layout = context.to("cpu"), given_layout(given)
+    context, layout = context.to("cpu"), find_layout(given)
     added = merge([context[:0], added.to("cpu")])
-    numbers = _rows_of(context, layout, kept) if layout and _can_hold(layout, added) else None
+    numbers = _match_rows(context, layout, kept) if layout and _can_hold(layout, added) else None
     if layout is None or numbers is None:
         save_ply(path, merge([context, added]), provenance=True)
         return
-    label = [] if layout.is_labelled else [(LABEL, "u1")]
+    label = [] if layout.is_labelled else [(LABEL_COLUMN, "u1")]
     dtype = np.dtype([*layout.rows.dtype.descr, *label])
 
     def labelled(values: ndarray, labels: UInt8[Tensor, "m"]) -> ndarray:
         rows = np.zeros(len(values), dtype)
-        _fill(rows, values)
-        rows[LABEL] = labels.numpy()
+        _copy_columns(rows, values)
+        rows[LABEL_COLUMN] = labels.numpy()
         return rows
 
     given_rows = (
-        labelled(_taken(layout.rows, numbers[block]), context.generated[block])
-        for block in blocks(len(context))
+        labelled(_take_rows(layout.rows, numbers[block]), context.generated[block])
+        for block in iterate_blocks(len(context))
     )
-    added_rows = labelled(rows_of(added, provenance=False), added.generated)
-    header = layout.header if layout.is_labelled else _labelled_header(layout)
+    added_rows = labelled(make_rows(added, provenance=False), added.generated)
+    header = layout.header if layout.is_labelled else _add_label_line(layout)
     count = len(context) + len(added)
     write_rows(path, replace(layout, header=header), count, chain(given_rows, [added_rows]))
 
 
-def _can_hold(layout: Layout, scene: Gaussians) -> bool:
-    labels = not layout.is_labelled or layout.rows.dtype[LABEL] == np.uint8
+def _can_hold(layout: PlyLayout, scene: Gaussians) -> bool:
+    labels = not layout.is_labelled or layout.rows.dtype[LABEL_COLUMN] == np.uint8
     return labels and layout.num_rest == 3 * (scene.sh.shape[1] - 1)
 
 
-def _rows_of(
-    context: Gaussians, layout: Layout, kept: Bool[Tensor, "n"] | None
+def _match_rows(
+    context: Gaussians, layout: PlyLayout, kept: Bool[Tensor, "n"] | None
 ) -> Int[ndarray, "m"] | None:
     """Find the rows of a file that its context was read from, or None if positions differ."""
     numbers = np.arange(len(layout.rows)) if kept is None else np.flatnonzero(kept.numpy())
@@ -163,35 +165,35 @@ def _rows_of(
     means = context.means.numpy()
     stands = all(
         np.array_equal(layout.rows[axis][numbers[block]].astype(np.float32), means[block, column])
-        for block in blocks(len(numbers))
+        for block in iterate_blocks(len(numbers))
         for column, axis in enumerate("xyz")
     )
     return numbers if stands else None
 
 
-def _fill(rows: ndarray, values: ndarray) -> None:
+def _copy_columns(rows: ndarray, values: ndarray) -> None:
     """Copy the columns that both tables have from `values` to `rows`."""
     if values.dtype.descr == rows.dtype.descr[: len(values.dtype.descr)]:
         # Copying column by column takes ten times as long with many columns.
-        _as_bytes(rows)[:, : values.dtype.itemsize] = _as_bytes(np.ascontiguousarray(values))
+        _view_bytes(rows)[:, : values.dtype.itemsize] = _view_bytes(np.ascontiguousarray(values))
         return
     for name in set(rows.dtype.names or ()) & set(values.dtype.names or ()):
         rows[name] = values[name]
 
 
-def _taken(rows: ndarray, numbers: Int[ndarray, "m"]) -> ndarray:
+def _take_rows(rows: ndarray, numbers: Int[ndarray, "m"]) -> ndarray:
     """Return `rows[numbers]`, copied as bytes, which is faster than column by column."""
-    return _as_bytes(rows)[numbers].view(rows.dtype)[:, 0]
+    return _view_bytes(rows)[numbers].view(rows.dtype)[:, 0]
 
 
-def _as_bytes(rows: ndarray) -> UInt8[ndarray, "n bytes"]:
+def _view_bytes(rows: ndarray) -> UInt8[ndarray, "n bytes"]:
     return rows.view(np.uint8).reshape(len(rows), rows.dtype.itemsize)
 
 
-def _labelled_header(layout: Layout) -> bytes:
+def _add_label_line(layout: PlyLayout) -> bytes:
     """Add a line for `generated` after the last vertex property of the header."""
     lines = layout.header.splitlines(keepends=True)
-    start = next(i for i, line in enumerate(lines) if _COUNT.match(line))
+    start = next(i for i, line in enumerate(lines) if _COUNT_LINE.match(line))
     after = [i for i, line in enumerate(lines) if i > start and line.startswith(b"element")]
     end = after[0] if after else len(lines) - 1
     last = max(i for i in range(start, end) if lines[i].startswith(b"property"))

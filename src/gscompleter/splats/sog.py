@@ -24,25 +24,25 @@ from jaxtyping import Float, UInt8
 from numpy import ndarray
 from PIL import Image
 
-from gscompleter.errors import InputError, quoted
-from gscompleter.reading import read_bytes
-from gscompleter.splats.decoding import (
+from gscompleter.errors import InputError, quote_value
+from gscompleter.io.reading import read_bytes
+from gscompleter.splats.packing import (
+    assemble_sh,
+    build_gaussians,
     check_growth,
-    damaged,
-    gaussians_of,
-    harmonics,
+    make_damage_error,
+    restore_largest,
 )
-from gscompleter.splats.packing import with_largest
 from gscompleter.types import SH_C0, Gaussians
 
 META = "meta.json"
-ZIP = b"PK\x03\x04"
-COEFFICIENTS = (0, 3, 8, 15)
+ZIP_MAGIC = b"PK\x03\x04"
+NUM_SH_REST = (0, 3, 8, 15)
 PALETTE_WIDTH = 64
 """Entries of the SH palette in each row of its image."""
-MOST_GROWTH = 256
+MAX_GROWTH = 256
 """Largest ratio of unpacked to packed size of an image. Real ones reach 10."""
-MOST_DEFLATED = 8
+MAX_ENTRY_GROWTH = 8
 """Largest ratio of unpacked to packed size of a zip entry; images do not shrink."""
 ZIP_ERRORS = (
     zipfile.BadZipFile,
@@ -57,68 +57,74 @@ ZIP_ERRORS = (
 
 
 @dataclass(frozen=True)
-class Parts:
+class SogFiles:
     """The files of a scene, in a folder or a bundle."""
 
     path: Path
     read: Callable[[str], bytes]
 
-    def pixels(self, name: object, needed: int) -> UInt8[ndarray, "h w 4"]:
+    def load_pixels(self, name: object, needed: int) -> UInt8[ndarray, "h w 4"]:
         """Read an image of at least `needed` pixels."""
-        data = self.read(_plain(self.path, name))
-        width, height = _webp_size(self.path, data)
-        check_growth(self.path, 4 * width * height, len(data), MOST_GROWTH)
+        data = self.read(_check_file_name(self.path, name))
+        width, height = _parse_webp_size(self.path, data)
+        check_growth(self.path, 4 * width * height, len(data), MAX_GROWTH)
         if width * height < needed:
-            raise damaged(self.path, f"{quoted(name)} has fewer pixels than there are Gaussians")
+            raise make_damage_error(
+                self.path, f"{quote_value(name)} has fewer pixels than there are Gaussians"
+            )
         try:
             return np.array(Image.open(io.BytesIO(data), formats=["WEBP"]).convert("RGBA"))
         except (OSError, ValueError, SyntaxError, MemoryError) as error:
-            raise damaged(self.path, f"{quoted(name)} is no image") from error
+            raise make_damage_error(self.path, f"{quote_value(name)} is no image") from error
 
 
 def is_sog(head: bytes) -> bool:
     """Return True if a file with the first bytes `head` is a bundle or a `meta.json`."""
-    return head.startswith(ZIP) or head.lstrip()[:1] == b"{"
+    return head.startswith(ZIP_MAGIC) or head.lstrip()[:1] == b"{"
 
 
 def read_sog(path: Path) -> Gaussians:
     """Read a bundle, a folder, or the folder of a `meta.json`."""
     if path.is_dir():
-        return _read(Parts(path, lambda name: read_bytes(path / name)))
+        return _read_files(SogFiles(path, lambda name: read_bytes(path / name)))
     data = read_bytes(path)
-    if not data.startswith(ZIP):
-        return _read(Parts(path, lambda name: read_bytes(path.parent / name)), path.name)
+    if not data.startswith(ZIP_MAGIC):
+        return _read_files(SogFiles(path, lambda name: read_bytes(path.parent / name)), path.name)
     try:
         with zipfile.ZipFile(io.BytesIO(data)) as bundle:
             if META not in bundle.namelist():
-                raise InputError(f"{quoted(path)} is no .sog: this archive has no {META} in it.")
-            return _read(Parts(path, lambda name: _entry(path, bundle, name)))
+                raise InputError(
+                    f"{quote_value(path)} is no .sog: this archive has no {META} in it."
+                )
+            return _read_files(SogFiles(path, lambda name: _read_entry(path, bundle, name)))
     except InputError:
         raise
     except ZIP_ERRORS as error:
-        raise damaged(path, "its bundle cannot be opened") from error
+        raise make_damage_error(path, "its bundle cannot be opened") from error
 
 
-def _entry(path: Path, bundle: zipfile.ZipFile, name: str) -> bytes:
+def _read_entry(path: Path, bundle: zipfile.ZipFile, name: str) -> bytes:
     try:
         entry = bundle.getinfo(name)
     except KeyError as error:
-        raise damaged(path, f"it has no {quoted(name)}") from error
+        raise make_damage_error(path, f"it has no {quote_value(name)}") from error
     if entry.compress_type not in (zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED):
-        raise damaged(path, f"its {quoted(name)} has an unsupported compression")
-    check_growth(path, entry.file_size, entry.compress_size, MOST_DEFLATED)
+        raise make_damage_error(path, f"its {quote_value(name)} has an unsupported compression")
+    check_growth(path, entry.file_size, entry.compress_size, MAX_ENTRY_GROWTH)
     with bundle.open(entry) as file:
         return file.read(entry.file_size)
 
 
-def _plain(path: Path, name: object) -> str:
+def _check_file_name(path: Path, name: object) -> str:
     """Check that `name` is a file directly beside `meta.json`."""
     if not isinstance(name, str) or not name or Path(name).name != name or not name.isprintable():
-        raise damaged(path, f"it names a file '{quoted(name)}' that is not beside it")
+        raise make_damage_error(
+            path, f"it names a file '{quote_value(name)}' that is not beside it"
+        )
     return name
 
 
-def _webp_size(path: Path, data: bytes) -> tuple[int, int]:
+def _parse_webp_size(path: Path, data: bytes) -> tuple[int, int]:
     """Parse width and height of a lossless WebP without decoding it."""
     if data[:4] == b"RIFF" and data[8:15] == b"WEBPVP8" and len(data) >= 30:
         if data[15:16] == b"L":
@@ -127,97 +133,103 @@ def _webp_size(path: Path, data: bytes) -> tuple[int, int]:
         if data[15:16] == b"X":
             width, height = (int.from_bytes(data[at : at + 3], "little") for at in (24, 27))
             return width + 1, height + 1
-    raise damaged(path, "one of its images is no lossless WebP")
+    raise make_damage_error(path, "one of its images is no lossless WebP")
 
 
-def _read(parts: Parts, meta: str = META) -> Gaussians:
+def _read_files(parts: SogFiles, meta: str = META) -> Gaussians:
     try:
         table = json.loads(parts.read(meta))
         if not isinstance(table, dict) or "means" not in table:
             raise InputError(f"{parts.path} is no .sog: its {meta} describes something else.")
         version = table.get("version", 1)
         if version not in (1, 2):
-            raise InputError(f"{parts.path} is .sog version {quoted(version)}; 1 and 2 are known.")
+            raise InputError(
+                f"{parts.path} is .sog version {quote_value(version)}; 1 and 2 are known."
+            )
         marked = table.get("model") == "antialiased" or table.get("antialias") is True
-        return replace(_decoded(parts, table, version), is_antialiased=marked)
+        return replace(_decode_scene(parts, table, version), is_antialiased=marked)
     except InputError:
         raise
     except (KeyError, IndexError, TypeError, ValueError, OverflowError, RecursionError) as error:
-        raise damaged(parts.path, f"its {meta} is invalid ({quoted(str(error))})") from error
+        raise make_damage_error(
+            parts.path, f"its {meta} is invalid ({quote_value(str(error))})"
+        ) from error
 
 
-def _decoded(parts: Parts, table: dict[str, Any], version: int) -> Gaussians:
+def _decode_scene(parts: SogFiles, table: dict[str, Any], version: int) -> Gaussians:
     count = int(table["count"] if version == 2 else table["means"]["shape"][0])
     if count < 0:
-        raise damaged(parts.path, f"it counts {count} Gaussians")
-    means = _means(parts, table["means"], count)
+        raise make_damage_error(parts.path, f"it counts {count} Gaussians")
+    means = _decode_means(parts, table["means"], count)
     (name,) = table["quats"]["files"]
-    packed = parts.pixels(name, count).reshape(-1, 4)[:count]
-    logs = _values(parts, table["scales"], count, version, 3)
-    rgba = _values(parts, table["sh0"], count, version, 4)
+    packed = parts.load_pixels(name, count).reshape(-1, 4)[:count]
+    logs = _decode_values(parts, table["scales"], count, version, 3)
+    rgba = _decode_values(parts, table["sh0"], count, version, 4)
     opacities = rgba[:, 3] if version == 2 else 1 / (1 + np.exp(-rgba[:, 3]))
-    rest = _rest(parts, table["shN"], count, version) if table.get("shN") else None
-    sh = harmonics(0.5 + SH_C0 * rgba[:, :3], rest)
-    return gaussians_of(means, _quats(packed), np.exp(logs), opacities, sh)
+    rest = _decode_sh_rest(parts, table["shN"], count, version) if table.get("shN") else None
+    sh = assemble_sh(0.5 + SH_C0 * rgba[:, :3], rest)
+    return build_gaussians(means, _decode_quats(packed), np.exp(logs), opacities, sh)
 
 
-def _means(parts: Parts, table: dict[str, Any], count: int) -> Float[ndarray, "n 3"]:
+def _decode_means(parts: SogFiles, table: dict[str, Any], count: int) -> Float[ndarray, "n 3"]:
     low, high = (
-        parts.pixels(name, count).reshape(-1, 4)[:count, :3].astype(np.float32)
+        parts.load_pixels(name, count).reshape(-1, 4)[:count, :3].astype(np.float32)
         for name in table["files"]
     )
     steps = (low + 256 * high) / 65535
-    logs = _between(table["mins"], table["maxs"], steps, 3)
+    logs = _interpolate(table["mins"], table["maxs"], steps, 3)
     return np.sign(logs) * np.expm1(np.abs(logs))
 
 
-def _between(
+def _interpolate(
     low: object, high: object, fractions: Float[ndarray, "n k"], k: int
 ) -> Float[ndarray, "n k"]:
     lowest, highest = (np.asarray(bound, np.float32).reshape(k) for bound in (low, high))
     return lowest + (highest - lowest) * fractions
 
 
-def _quats(packed: UInt8[ndarray, "n 4"]) -> Float[ndarray, "n 4"]:
+def _decode_quats(packed: UInt8[ndarray, "n 4"]) -> Float[ndarray, "n 4"]:
     smaller = (packed[:, :3].astype(np.float32) / 255 - 0.5) * np.float32(np.sqrt(2))
-    quats = with_largest(packed[:, 3] & 3, smaller)
+    quats = restore_largest(packed[:, 3] & 3, smaller)
     quats[packed[:, 3] < 252] = (1, 0, 0, 0)  # the identity, as in other readers
     return quats
 
 
-def _values(
-    parts: Parts, table: dict[str, Any], count: int, version: int, k: int
+def _decode_values(
+    parts: SogFiles, table: dict[str, Any], count: int, version: int, k: int
 ) -> Float[ndarray, "n k"]:
     """Decode the first `k` channels of an image; in version 2 the fourth is a fraction."""
     (name,) = table["files"]
-    packed = parts.pixels(name, count).reshape(-1, 4)[:count, :k]
+    packed = parts.load_pixels(name, count).reshape(-1, 4)[:count, :k]
     if version == 1:
-        return _between(table["mins"], table["maxs"], packed.astype(np.float32) / 255, k)
-    codes = _codebook(table)[packed[:, :3]]
+        return _interpolate(table["mins"], table["maxs"], packed.astype(np.float32) / 255, k)
+    codes = _get_codebook(table)[packed[:, :3]]
     return np.concatenate([codes, packed[:, 3:].astype(np.float32) / 255], axis=1)
 
 
-def _codebook(table: dict[str, Any]) -> Float[ndarray, "256"]:
+def _get_codebook(table: dict[str, Any]) -> Float[ndarray, "256"]:
     return np.asarray(table["codebook"], np.float32).reshape(256)
 
 
-def _rest(
-    parts: Parts, table: dict[str, Any], count: int, version: int
+def _decode_sh_rest(
+    parts: SogFiles, table: dict[str, Any], count: int, version: int
 ) -> Float[ndarray, "n k 3"] | None:
     """Decode SH of degree 1 and above from the palette."""
     centroids, labels = table["files"]
-    palette = parts.pixels(centroids, 1)
+    palette = parts.load_pixels(centroids, 1)
     k = palette.shape[1] // PALETTE_WIDTH
-    if k not in COEFFICIENTS[1:] or palette.shape[1] % PALETTE_WIDTH:
-        raise damaged(
-            parts.path, f"{quoted(centroids)} is no palette of harmonics of degree 1 to 3"
+    if k not in NUM_SH_REST[1:] or palette.shape[1] % PALETTE_WIDTH:
+        raise make_damage_error(
+            parts.path, f"{quote_value(centroids)} is no palette of harmonics of degree 1 to 3"
         )
     rows = palette[:, :, :3].reshape(-1, k, 3)
-    label = parts.pixels(labels, count).reshape(-1, 4)[:count].astype(np.int64)
+    label = parts.load_pixels(labels, count).reshape(-1, 4)[:count].astype(np.int64)
     number = label[:, 0] + 256 * label[:, 1]
     if count and number.max() >= len(rows):
-        raise damaged(parts.path, f"{quoted(labels)} names harmonics that are not in the palette")
+        raise make_damage_error(
+            parts.path, f"{quote_value(labels)} names harmonics that are not in the palette"
+        )
     if version == 2:
-        return _codebook(table)[rows][number]
+        return _get_codebook(table)[rows][number]
     low, high = float(table["mins"]), float(table["maxs"])
     return (low + (high - low) * rows.astype(np.float32) / 255)[number]

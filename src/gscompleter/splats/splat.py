@@ -10,10 +10,10 @@ from pathlib import Path
 
 import numpy as np
 
-from gscompleter.errors import InputError, quoted
-from gscompleter.io.files import replacing
-from gscompleter.reading import read_bytes
-from gscompleter.splats.decoding import gaussians_of, harmonics
+from gscompleter.errors import InputError, quote_value
+from gscompleter.io.files import replace_file
+from gscompleter.io.reading import read_bytes
+from gscompleter.splats.packing import assemble_sh, build_gaussians
 from gscompleter.types import SH_C0, Gaussians
 
 ROW = np.dtype([("mean", "<f4", 3), ("scale", "<f4", 3), ("rgba", "u1", 4), ("quat", "u1", 4)])
@@ -24,13 +24,14 @@ def read_splat(path: Path) -> Gaussians:
     data = read_bytes(path)
     if len(data) % ROW.itemsize:
         raise InputError(
-            f"{quoted(path)} is truncated or no .splat: its {len(data):,} bytes are no multiple of "
+            f"{quote_value(path)} is truncated or no .splat: its {len(data):,} bytes are no "
+            "multiple of "
             f"{ROW.itemsize}; fetch the file again."
         )
     rows = np.frombuffer(data, ROW)
     rgba = rows["rgba"].astype(np.float32) / 255
     quats = (rows["quat"].astype(np.float32) - 128) / 128
-    return gaussians_of(rows["mean"], quats, rows["scale"], rgba[:, 3], harmonics(rgba[:, :3]))
+    return build_gaussians(rows["mean"], quats, rows["scale"], rgba[:, 3], assemble_sh(rgba[:, :3]))
 
 
 def write_splat(path: Path, gaussians: Gaussians) -> None:
@@ -44,5 +45,5 @@ def write_splat(path: Path, gaussians: Gaussians) -> None:
     quats = gaussians.quats.numpy()
     unit = quats / np.linalg.norm(quats, axis=1, keepdims=True)
     rows["quat"] = np.clip(np.rint(unit * 128 + 128), 0, 255)
-    with replacing(path) as file:
+    with replace_file(path) as file:
         file.write(rows.view(np.uint8).data)

@@ -18,42 +18,43 @@ import numpy as np
 from jaxtyping import Float, Int, UInt8
 from numpy import ndarray
 
-from gscompleter.errors import InputError, quoted
-from gscompleter.io.files import replacing
-from gscompleter.io.ply import encode
-from gscompleter.reading import read_bytes
-from gscompleter.splats.decoding import (
+from gscompleter.errors import InputError, quote_value
+from gscompleter.io.files import replace_file
+from gscompleter.io.reading import read_bytes
+from gscompleter.splats.packing import (
+    assemble_sh,
+    build_gaussians,
     check_growth,
     check_size,
-    damaged,
-    gaussians_of,
-    harmonics,
+    drop_largest,
+    make_damage_error,
+    restore_largest,
 )
-from gscompleter.splats.frames import ABOUT_X, half_turned
-from gscompleter.splats.packing import with_largest, without_largest
+from gscompleter.splats.ply import encode
+from gscompleter.splats.transform import HALF_TURN_X, rotate_half_turn
 from gscompleter.types import SH_C0, Gaussians
 
 MAGIC = b"NGSP"
 GZIP = b"\x1f\x8b"
 HEADER = struct.Struct("<4sIIBBBB")
 """Magic, version, count, SH degree, fractional bits, flags, and the number of streams."""
-TABLE = struct.Struct("<I12x")
+TABLE_OFFSET = struct.Struct("<I12x")
 """In version 4, the offset of the table of stream sizes follows."""
-ANTIALIASED = 0x1
+ANTIALIASED_FLAG = 0x1
 """Flag of antialiased Gaussians."""
-COEFFICIENTS = (0, 3, 8, 15)
-MOST_GROWTH = 256
+NUM_SH_REST = (0, 3, 8, 15)
+MAX_GROWTH = 256
 """Largest ratio of unpacked to packed size. Real files reach 2."""
-LARGEST_WINDOW = 1 << 27
+MAX_WINDOW = 1 << 27
 """Largest window of zstd, in bytes, which it keeps in memory."""
-COLOUR_SCALE = 0.15
+COLOR_SCALE = 0.15
 """The constant SH coefficient is stored as `0.5 + 0.15 sh`."""
-MOST_FRACTIONAL_BITS = 16
+MAX_FRACTIONAL_BITS = 16
 """Largest number of fractional bits of a position."""
 
 
 @dataclass(frozen=True)
-class Header:
+class SpzHeader:
     """The header of a .spz."""
 
     version: int
@@ -61,13 +62,13 @@ class Header:
     degree: int
     fractional_bits: int
     flags: int
-    streams: int
+    num_streams: int
 
     @property
-    def sizes(self) -> list[int]:
+    def stream_sizes(self) -> list[int]:
         """Bytes of positions, opacities, colours, scales, rotations and SH."""
         rotation = 3 if self.version == 2 else 4
-        widths = [9, 1, 3, 3, rotation, 3 * COEFFICIENTS[self.degree]]
+        widths = [9, 1, 3, 3, rotation, 3 * NUM_SH_REST[self.degree]]
         return [width * self.count for width in widths]
 
 
@@ -80,129 +81,134 @@ def read_spz(path: Path) -> Gaussians:
     """Read a .spz of SH degree 0 to 3, in the axes of a .ply."""
     data = read_bytes(path)
     if data.startswith(GZIP):
-        header, streams = _from_gzip(path, data)
+        header, streams = _read_gzip(path, data)
     else:
-        header = _header(path, data)
+        header = _parse_header(path, data)
         plain = header.version < 4
-        streams = _split(path, header, data[HEADER.size :]) if plain else _from_zstd(path, data)
-    turned = half_turned(_decoded(header, streams), ABOUT_X)
-    return replace(turned, is_antialiased=bool(header.flags & ANTIALIASED))
+        streams = (
+            _split_streams(path, header, data[HEADER.size :]) if plain else _read_zstd(path, data)
+        )
+    turned = rotate_half_turn(_decode_streams(header, streams), HALF_TURN_X)
+    return replace(turned, is_antialiased=bool(header.flags & ANTIALIASED_FLAG))
 
 
-def _header(path: Path, data: bytes) -> Header:
+def _parse_header(path: Path, data: bytes) -> SpzHeader:
     check_size(path, len(data), HEADER.size)
     magic, version, count, degree, bits, flags, streams = HEADER.unpack_from(data)
     if magic != MAGIC:
-        raise InputError(f"{quoted(path)} is no .spz but other compressed data.")
+        raise InputError(f"{quote_value(path)} is no .spz but other compressed data.")
     if version not in (2, 3, 4):
         raise InputError(
-            f"{quoted(path)} is .spz version {version}; versions 2, 3 and 4 are known."
+            f"{quote_value(path)} is .spz version {version}; versions 2, 3 and 4 are known."
         )
     if count == 0:
-        raise InputError(f"{quoted(path)} is empty: it holds no Gaussian.")
-    if degree >= len(COEFFICIENTS) or bits > 24:
+        raise InputError(f"{quote_value(path)} is empty: it holds no Gaussian.")
+    if degree >= len(NUM_SH_REST) or bits > 24:
         raise InputError(
-            f"{quoted(path)} has harmonics of degree {degree} and {bits} fractional bits; a .spz "
+            f"{quote_value(path)} has harmonics of degree {degree} and {bits} fractional bits; a "
+            ".spz "
             "of degree 0 to 3 and at most 24 bits is needed."
         )
-    return Header(version, count, degree, bits, flags, streams)
+    return SpzHeader(version, count, degree, bits, flags, streams)
 
 
-def _from_gzip(path: Path, data: bytes) -> tuple[Header, list[bytes]]:
+def _read_gzip(path: Path, data: bytes) -> tuple[SpzHeader, list[bytes]]:
     unpacker = zlib.decompressobj(31)
     try:
-        header = _header(path, unpacker.decompress(data, HEADER.size))
+        header = _parse_header(path, unpacker.decompress(data, HEADER.size))
         if header.version > 3:
-            raise damaged(path, f"version {header.version} is no gzip stream")
-        size = sum(header.sizes)
-        check_growth(path, size, len(data), MOST_GROWTH)
+            raise make_damage_error(path, f"version {header.version} is no gzip stream")
+        size = sum(header.stream_sizes)
+        check_growth(path, size, len(data), MAX_GROWTH)
         body = unpacker.decompress(unpacker.unconsumed_tail, size)
         more = unpacker.decompress(unpacker.unconsumed_tail, 1)  # reads the checksum
     except zlib.error as error:
-        raise damaged(path, "it cannot be unpacked") from error
+        raise make_damage_error(path, "it cannot be unpacked") from error
     if not (more or unpacker.eof):
-        raise damaged(path, "it ends too early")
-    return header, _split(path, header, body)
+        raise make_damage_error(path, "it ends too early")
+    return header, _split_streams(path, header, body)
 
 
-def _split(path: Path, header: Header, body: bytes) -> list[bytes]:
-    check_size(path, len(body), sum(header.sizes))
-    ends = np.cumsum(header.sizes).tolist()
-    return [body[end - size : end] for end, size in zip(ends, header.sizes, strict=True)]
+def _split_streams(path: Path, header: SpzHeader, body: bytes) -> list[bytes]:
+    check_size(path, len(body), sum(header.stream_sizes))
+    ends = np.cumsum(header.stream_sizes).tolist()
+    return [body[end - size : end] for end, size in zip(ends, header.stream_sizes, strict=True)]
 
 
-def _from_zstd(path: Path, data: bytes) -> list[bytes]:
+def _read_zstd(path: Path, data: bytes) -> list[bytes]:
     """Decompress the attributes of version 4, each from its own stream."""
-    header = _header(path, data)
-    check_size(path, len(data), HEADER.size + TABLE.size)
-    (place,) = TABLE.unpack_from(data, HEADER.size)
-    start = place + 16 * header.streams
+    header = _parse_header(path, data)
+    check_size(path, len(data), HEADER.size + TABLE_OFFSET.size)
+    (place,) = TABLE_OFFSET.unpack_from(data, HEADER.size)
+    start = place + 16 * header.num_streams
     check_size(path, len(data), start)
-    check_growth(path, sum(header.sizes), len(data), MOST_GROWTH)
+    check_growth(path, sum(header.stream_sizes), len(data), MAX_GROWTH)
     needed = 6 if header.degree else 5
-    if header.streams < needed:
-        raise damaged(path, f"{header.streams} of {needed} attributes are there")
+    if header.num_streams < needed:
+        raise make_damage_error(path, f"{header.num_streams} of {needed} attributes are there")
     streams = []
-    for number, size in enumerate(header.sizes[:needed]):
+    for number, size in enumerate(header.stream_sizes[:needed]):
         packed, unpacked = struct.unpack_from("<QQ", data, place + 16 * number)
         check_size(path, len(data), start + packed)
         if unpacked != size:
-            raise damaged(path, "the sizes of its attributes do not fit the count of Gaussians")
-        streams.append(_unpacked(path, data[start : start + packed], size))
+            raise make_damage_error(
+                path, "the sizes of its attributes do not fit the count of Gaussians"
+            )
+        streams.append(_decompress(path, data[start : start + packed], size))
         start += packed
     return [*streams, b""][:6]
 
 
-def _unpacked(path: Path, data: bytes, size: int) -> bytes:
+def _decompress(path: Path, data: bytes, size: int) -> bytes:
     import zstandard  # only version 4 needs it
 
-    unpacker = zstandard.ZstdDecompressor(max_window_size=LARGEST_WINDOW)
+    unpacker = zstandard.ZstdDecompressor(max_window_size=MAX_WINDOW)
     try:
         body = unpacker.stream_reader(data).read(size)
     except (zstandard.ZstdError, MemoryError) as error:
-        raise damaged(path, "it cannot be unpacked") from error
+        raise make_damage_error(path, "it cannot be unpacked") from error
     check_size(path, len(body), size)
     return body
 
 
-def _decoded(header: Header, streams: list[bytes]) -> Gaussians:
+def _decode_streams(header: SpzHeader, streams: list[bytes]) -> Gaussians:
     """Decode the Gaussians, in the axes of the file."""
     positions, opacities, colours, scales, rotations, rest = (
         np.frombuffer(stream, np.uint8).reshape(header.count, len(stream) // header.count)
         for stream in streams
     )
-    colour = 0.5 + SH_C0 * (colours.astype(np.float32) / 255 - 0.5) / COLOUR_SCALE
+    colour = 0.5 + SH_C0 * (colours.astype(np.float32) / 255 - 0.5) / COLOR_SCALE
     higher = rest.astype(np.float32)
     higher -= 128
     higher /= 128
-    return gaussians_of(
-        np.ldexp(_signed(positions).astype(np.float32), -header.fractional_bits),
-        _first_three(rotations) if header.version == 2 else _smallest_three(rotations),
+    return build_gaussians(
+        np.ldexp(_decode_int24(positions).astype(np.float32), -header.fractional_bits),
+        _decode_quats_v2(rotations) if header.version == 2 else _decode_quats_v3(rotations),
         np.exp(scales.astype(np.float32) / 16 - 10),
         opacities[:, 0].astype(np.float32) / 255,
-        harmonics(colour, higher.reshape(header.count, COEFFICIENTS[header.degree], 3)),
+        assemble_sh(colour, higher.reshape(header.count, NUM_SH_REST[header.degree], 3)),
     )
 
 
-def _signed(positions: UInt8[ndarray, "n 9"]) -> Int[ndarray, "n 3"]:
+def _decode_int24(positions: UInt8[ndarray, "n 9"]) -> Int[ndarray, "n 3"]:
     """Decode three signed 24-bit numbers from each row of 9 bytes."""
     a, b, c = np.moveaxis(positions.reshape(-1, 3, 3).astype(np.int32), 2, 0)
     return ((a | (b << 8) | (c << 16)) ^ (1 << 23)) - (1 << 23)
 
 
-def _first_three(rotations: UInt8[ndarray, "n 3"]) -> Float[ndarray, "n 4"]:
+def _decode_quats_v2(rotations: UInt8[ndarray, "n 3"]) -> Float[ndarray, "n 4"]:
     xyz = rotations.astype(np.float32) / 127.5 - 1
     w = np.sqrt(np.maximum(0, 1 - np.square(xyz).sum(1, keepdims=True)))
     return np.concatenate([w, xyz], axis=1)
 
 
-def _smallest_three(rotations: UInt8[ndarray, "n 4"]) -> Float[ndarray, "n 4"]:
+def _decode_quats_v3(rotations: UInt8[ndarray, "n 4"]) -> Float[ndarray, "n 4"]:
     """Decode the number of the dropped component and three of 10 bits (xyzw, sign and size)."""
     packed = np.ascontiguousarray(rotations).view("<u4")[:, 0]
     fields = np.stack([packed >> np.uint32(shift) for shift in (20, 10, 0)], axis=1)
     sizes = (fields & np.uint32(511)).astype(np.float32) / 511 * np.float32(np.sqrt(0.5))
     smaller = np.where(fields & np.uint32(512), -sizes, sizes)
-    return np.roll(with_largest(packed >> np.uint32(30), smaller), 1, axis=1)
+    return np.roll(restore_largest(packed >> np.uint32(30), smaller), 1, axis=1)
 
 
 # --------------------------------------------------------------------------------- writing
@@ -210,57 +216,57 @@ def _smallest_three(rotations: UInt8[ndarray, "n 4"]) -> Float[ndarray, "n 4"]:
 
 def write_spz(path: Path, gaussians: Gaussians) -> None:
     """Write a .spz of version 3."""
-    content = packed_spz(path, gaussians)
-    with replacing(path) as file:
+    content = encode_spz(path, gaussians)
+    with replace_file(path) as file:
         file.write(content)
 
 
-def packed_spz(path: Path, gaussians: Gaussians) -> bytes:
+def encode_spz(path: Path, gaussians: Gaussians) -> bytes:
     """Encode a .spz of version 3 in the finest possible steps; `path` is for errors."""
-    turned = half_turned(gaussians, ABOUT_X)
-    bits = _fractional_bits(path, turned)
-    flags = ANTIALIASED if gaussians.is_antialiased else 0
+    turned = rotate_half_turn(gaussians, HALF_TURN_X)
+    bits = _choose_fractional_bits(path, turned)
+    flags = ANTIALIASED_FLAG if gaussians.is_antialiased else 0
     header = HEADER.pack(MAGIC, 3, len(turned), turned.sh_degree, bits, flags, 0)
-    constant = 0.5 + COLOUR_SCALE * turned.sh[:, 0].numpy()
+    constant = 0.5 + COLOR_SCALE * turned.sh[:, 0].numpy()
     rest = turned.sh[:, 1:].reshape(len(turned), -1).numpy()
     log_scales = encode(gaussians)[:, :3].numpy()
     body = b"".join(
         (
             header,
-            _packed_positions(turned.means.numpy(), bits),
-            _bytes(turned.opacities.numpy() * 255),
-            _bytes(constant * 255),
-            _bytes((log_scales + 10) * 16),
-            _packed_rotations(turned.quats.numpy()),
-            _bytes(rest * 128 + 128),
+            _pack_positions(turned.means.numpy(), bits),
+            _quantize_to_bytes(turned.opacities.numpy() * 255),
+            _quantize_to_bytes(constant * 255),
+            _quantize_to_bytes((log_scales + 10) * 16),
+            _pack_rotations(turned.quats.numpy()),
+            _quantize_to_bytes(rest * 128 + 128),
         )
     )
     return gzip.compress(body, compresslevel=6, mtime=0)
 
 
-def _fractional_bits(path: Path, gaussians: Gaussians) -> int:
+def _choose_fractional_bits(path: Path, gaussians: Gaussians) -> int:
     """Choose the fractional bits that the farthest coordinate leaves of 23."""
     farthest = gaussians.means.abs().max().item()
     bits = 23 - int(np.ceil(np.log2(farthest + 1)))
     if bits < 0:
         raise InputError(
-            f"{quoted(path)} cannot hold Gaussians {farthest:.3g} from the origin; remove the "
+            f"{quote_value(path)} cannot hold Gaussians {farthest:.3g} from the origin; remove the "
             "floaters or write a .ply."
         )
-    return min(bits, MOST_FRACTIONAL_BITS)
+    return min(bits, MAX_FRACTIONAL_BITS)
 
 
-def _bytes(values: Float[ndarray, "*n"]) -> bytes:
+def _quantize_to_bytes(values: Float[ndarray, "*n"]) -> bytes:
     return np.clip(np.rint(values), 0, 255).astype(np.uint8).tobytes()
 
 
-def _packed_positions(means: Float[ndarray, "n 3"], bits: int) -> bytes:
+def _pack_positions(means: Float[ndarray, "n 3"], bits: int) -> bytes:
     fixed = np.rint(means.astype(np.float64) * 2**bits).clip(-(2**23), 2**23 - 1).astype("<i4")
     return fixed.view(np.uint8).reshape(-1, 3, 4)[:, :, :3].tobytes()
 
 
-def _packed_rotations(quats: Float[ndarray, "n 4"]) -> bytes:
-    largest, smaller = without_largest(np.roll(quats, -1, axis=1))
+def _pack_rotations(quats: Float[ndarray, "n 4"]) -> bytes:
+    largest, smaller = drop_largest(np.roll(quats, -1, axis=1))
     sizes = np.rint(np.abs(smaller) / np.sqrt(0.5) * 511).clip(0, 511).astype(np.uint32)
     fields = sizes | np.where(smaller < 0, np.uint32(512), np.uint32(0)).astype(np.uint32)
     packed = largest.astype(np.uint32) << np.uint32(30)

@@ -11,16 +11,15 @@ from torch import Tensor
 from torch.nn.functional import avg_pool2d, max_pool2d
 
 from gscompleter.errors import InputError
-from gscompleter.geometry import z_depths
-from gscompleter.matching.depth_range import depth_range_of
-from gscompleter.reconstructors import Reconstructor, reconstructed
+from gscompleter.geometry import compute_z_depths, project_mask
+from gscompleter.reconstructors import Reconstructor, run_reconstructor
+from gscompleter.reconstructors.features.depth_range import get_depth_range
 from gscompleter.render import Renderer
-from gscompleter.stages.integration import falling_on
 from gscompleter.types import Camera, Gaussians, Reconstruction, View
 
 MIN_CONTRAST = 0.02
 """Brightness range in 5 x 5 smoothed pixels that counts as texture; colours are in [0, 1]."""
-MIN_VARIED = 0.01
+MIN_TEXTURED = 0.01
 """Smallest textured fraction of an image."""
 
 
@@ -28,8 +27,8 @@ def init_context(
     reconstructor: Reconstructor, views: Sequence[View]
 ) -> tuple[Gaussians, Float[Tensor, "v 3"] | None]:
     """Reconstruct `G_ctx = Ψ(V_in)`; also return exposure gains if estimated (paper, Eq. 5)."""
-    reconstruction = reconstructed(reconstructor, views)
-    return without_ignored(reconstruction, views), reconstruction.gains
+    reconstruction = run_reconstructor(reconstructor, views)
+    return drop_ignored(reconstruction, views), reconstruction.exposure_gains
 
 
 def check_texture(views: Sequence[View]) -> None:
@@ -49,7 +48,7 @@ def has_texture(image: Float[Tensor, "h w 3"]) -> bool:
     highest = max_pool2d(smooth, 5, stride=1)
     lowest = -max_pool2d(-smooth, 5, stride=1)
     varied = highest - lowest > MIN_CONTRAST
-    return varied.float().mean().item() >= MIN_VARIED
+    return varied.float().mean().item() >= MIN_TEXTURED
 
 
 def sort_by_frame(views: Sequence[View]) -> list[View]:
@@ -59,37 +58,39 @@ def sort_by_frame(views: Sequence[View]) -> list[View]:
     return sorted(views, key=lambda view: view.frame or 0)
 
 
-def without_ignored(made: Reconstruction, views: Sequence[View]) -> Gaussians:
+def drop_ignored(made: Reconstruction, views: Sequence[View]) -> Gaussians:
     """Drop Gaussians of ignored pixels; if Ψ is not pixel-aligned, those that project onto them."""
     gaussians = made.gaussians
     gone = torch.zeros(len(gaussians), dtype=torch.bool, device=gaussians.means.device)
     for number, view in enumerate(views):
-        if view.ignored is None:
+        if view.ignore_mask is None:
             continue
         if made.view_index is None or made.pixel_index is None:
-            gone |= falling_on(view.ignored, gaussians, view.camera)
+            gone |= project_mask(view.ignore_mask, gaussians, view.camera)
         else:
             own = made.view_index == number
-            gone[own] = view.ignored.flatten()[made.pixel_index[own]]
+            gone[own] = view.ignore_mask.flatten()[made.pixel_index[own]]
     return gaussians[~gone] if gone.any() else gaussians
 
 
-def exposed_alike(views: Sequence[View], gains: Float[Tensor, "v 3"] | None) -> tuple[View, ...]:
+def normalize_exposures(
+    views: Sequence[View], gains: Float[Tensor, "v 3"] | None
+) -> tuple[View, ...]:
     """Normalize photographs to the exposure of the context."""
-    return tuple(views) if gains is None else tuple(map(View.evened, views, gains))
+    return tuple(views) if gains is None else tuple(map(View.normalize_exposure, views, gains))
 
 
-def working_range(
+def find_depth_range(
     views: Sequence[View], scene: Gaussians | None, renderer: Renderer
 ) -> tuple[float, float]:
     """Find near and far plane in scene units: given, or from the input splat, or from features."""
     if scene is None:
-        return depth_range_of(views)
+        return get_depth_range(views)
     cameras = [view.camera for view in views]
-    return depth_range_of(views, lambda _: depth_range_of_scene(scene, cameras, renderer))
+    return get_depth_range(views, lambda _: measure_depth_range(scene, cameras, renderer))
 
 
-def depth_range_of_scene(
+def measure_depth_range(
     scene: Gaussians, cameras: Sequence[Camera], renderer: Renderer
 ) -> tuple[float, float]:
     """Measure near and far plane of an input splat from its rendered depths, in scene units.
@@ -101,7 +102,7 @@ def depth_range_of_scene(
     """
     depths = []
     for camera in cameras:
-        z = z_depths(scene.means, camera)
+        z = compute_z_depths(scene.means, camera)
         if not (z > 0).any():
             continue
         unit = z[z > 0].median().item()
@@ -112,11 +113,11 @@ def depth_range_of_scene(
             "No context camera sees the scene that was given; check that the .ply and the "
             "photographs share one world frame and one unit."
         )
-    low, high = percentiles(torch.cat(depths), 0.01, 0.99)
+    low, high = compute_percentiles(torch.cat(depths), 0.01, 0.99)
     return 0.5 * low, 2.0 * high
 
 
-def percentiles(values: torch.Tensor, *shares: float) -> list[float]:
+def compute_percentiles(values: torch.Tensor, *shares: float) -> list[float]:
     """Compute percentiles of any number of values (torch.quantile stops at 16 million)."""
     ordered = values.flatten().sort().values
     return [ordered[round(share * (len(ordered) - 1))].item() for share in shares]

@@ -17,11 +17,11 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float
 
-from gscompleter.data.colmap.lenses import intrinsics_of, model_called
-from gscompleter.data.colmap.records import PosedImage, portable
-from gscompleter.data.intrinsics import Intrinsics
-from gscompleter.errors import InputError, quoted, refuse_pointer
-from gscompleter.reading import open_file
+from gscompleter.data.cameras import Intrinsics
+from gscompleter.data.colmap.lenses import build_intrinsics, find_model
+from gscompleter.data.colmap.records import PosedImage, make_portable
+from gscompleter.errors import InputError, quote_value, refuse_pointer
+from gscompleter.io.reading import open_file
 
 MAX_NAME = 1024
 """Longest image name, in bytes."""
@@ -36,55 +36,55 @@ _SIGHTING = Struct("<II")
 
 def read_cameras(path: Path) -> dict[int, Intrinsics]:
     """Read the cameras of a cameras.bin by number."""
-    with _opened(path) as records:
-        count = records.count(_CAMERA.size)
-        return dict(_camera(records) for _ in range(count))
+    with _open_records(path) as records:
+        count = records.read_count(_CAMERA.size)
+        return dict(_read_camera(records) for _ in range(count))
 
 
 def read_images(path: Path) -> list[PosedImage]:
     """Read the images of an images.bin in its order, without features."""
-    with _opened(path) as records:
-        count = records.count(_IMAGE.size + 1 + _COUNT.size)
-        return [_image(records) for _ in range(count)]
+    with _open_records(path) as records:
+        count = records.read_count(_IMAGE.size + 1 + _COUNT.size)
+        return [_read_image(records) for _ in range(count)]
 
 
 def read_points(path: Path) -> Float[np.ndarray, "n 3"]:
     """Read the points of a points3D.bin in scene units, without tracks."""
     coordinates = array("d")
-    with _opened(path) as records:
-        for _ in range(records.count(_POINT.size + _COUNT.size)):
-            coordinates.extend(records.numbers(_POINT)[1:4])
-            records.skip(records.count(_SIGHTING.size) * _SIGHTING.size)
+    with _open_records(path) as records:
+        for _ in range(records.read_count(_POINT.size + _COUNT.size)):
+            coordinates.extend(records.read_numbers(_POINT)[1:4])
+            records.skip(records.read_count(_SIGHTING.size) * _SIGHTING.size)
     return np.array(coordinates, dtype=np.float64).reshape(-1, 3)
 
 
-def _camera(records: _Records) -> tuple[int, Intrinsics]:
-    number, model_number, width, height = records.numbers(_CAMERA)
-    title = f"camera {number} of {quoted(records.path)}"
-    model = model_called(model_number, title)
-    numbers = records.numbers(Struct(f"<{len(model.parameters)}d"))
-    return number, intrinsics_of(model, (width, height), numbers, title)
+def _read_camera(records: _Records) -> tuple[int, Intrinsics]:
+    number, model_number, width, height = records.read_numbers(_CAMERA)
+    title = f"camera {number} of {quote_value(records.path)}"
+    model = find_model(model_number, title)
+    numbers = records.read_numbers(Struct(f"<{len(model.parameters)}d"))
+    return number, build_intrinsics(model, (width, height), numbers, title)
 
 
-def _image(records: _Records) -> PosedImage:
-    _, *pose, camera = records.numbers(_IMAGE)
-    name = portable(records.text())
-    records.skip(records.count(_FEATURE.size) * _FEATURE.size)
+def _read_image(records: _Records) -> PosedImage:
+    _, *pose, camera = records.read_numbers(_IMAGE)
+    name = make_portable(records.read_string())
+    records.skip(records.read_count(_FEATURE.size) * _FEATURE.size)
     return PosedImage(name, camera, tuple(pose[:4]), tuple(pose[4:]))
 
 
 @contextmanager
-def _opened(path: Path) -> Iterator[_Records]:
+def _open_records(path: Path) -> Iterator[_Records]:
     refuse_pointer(path)
     try:
         with open_file(path) as file:
             if os.fstat(file.fileno()).st_size == 0:
-                raise InputError(f"{quoted(path)} is empty; export the model again.")
+                raise InputError(f"{quote_value(path)} is empty; export the model again.")
             with mmap.mmap(file.fileno(), 0, access=mmap.ACCESS_READ) as content:
                 yield _Records(content, path)
     except OSError as error:
         raise InputError(
-            f"{quoted(path)} cannot be read: {error.strerror}; correct the path."
+            f"{quote_value(path)} cannot be read: {error.strerror}; correct the path."
         ) from error
 
 
@@ -96,33 +96,34 @@ class _Records:
         self.path = path
         self.position = 0
 
-    def numbers(self, form: Struct) -> tuple[Any, ...]:
+    def read_numbers(self, form: Struct) -> tuple[Any, ...]:
         start = self.position
         self.skip(form.size)
         return form.unpack_from(self.content, start)
 
-    def count(self, smallest: int) -> int:
+    def read_count(self, smallest: int) -> int:
         """Read a count of records, each of at least `smallest` bytes."""
-        (count,) = self.numbers(_COUNT)
+        (count,) = self.read_numbers(_COUNT)
         if count * smallest > len(self.content) - self.position:
-            raise self._damaged()
+            raise self._make_error()
         return int(count)
 
-    def text(self) -> str:
+    def read_string(self) -> str:
         end = self.content.find(b"\0", self.position, self.position + MAX_NAME)
         if end < 0:
-            raise self._damaged()
+            raise self._make_error()
         text = os.fsdecode(self.content[self.position : end])
         self.position = end + 1
         return text
 
     def skip(self, size: int) -> None:
         if size > len(self.content) - self.position:
-            raise self._damaged()
+            raise self._make_error()
         self.position += size
 
-    def _damaged(self) -> InputError:
+    def _make_error(self) -> InputError:
         return InputError(
-            f"{quoted(self.path)} is truncated or no such file of COLMAP: it claims more than its "
+            f"{quote_value(self.path)} is truncated or no such file of COLMAP: it claims more "
+            "than its "
             f"{len(self.content):,} bytes hold; export the model again."
         )

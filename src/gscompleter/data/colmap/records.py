@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import Float
 
-from gscompleter.data.poses import c2w_of, rotation_of
+from gscompleter.data.cameras import compute_rotation, invert_viewmat
 
 
 @dataclass(frozen=True)
@@ -25,11 +25,11 @@ class PosedImage:
     def c2w(self) -> Float[np.ndarray, "4 4"]:
         """Compute camera-to-world in OpenCV axes; an invalid transform stays as it is."""
         viewmat = np.eye(4)
-        viewmat[:3, :3] = rotation_of(self.quaternion)
+        viewmat[:3, :3] = compute_rotation(self.quaternion)
         viewmat[:3, 3] = self.translation
-        return c2w_of(viewmat)
+        return invert_viewmat(viewmat)
 
 
-def portable(name: str) -> str:
+def make_portable(name: str) -> str:
     """Replace backslashes of Windows in an image name."""
     return name.replace("\\", "/")

@@ -12,21 +12,15 @@ from pathlib import Path
 import numpy as np
 from jaxtyping import Float
 
+from gscompleter.data.cameras import Intrinsics
 from gscompleter.data.colmap import binary, text
 from gscompleter.data.colmap.records import PosedImage
 from gscompleter.data.frame import Frame
-from gscompleter.data.image_folders import (
-    FOLDERS,
-    ORIGINALS,
-    ImageFinder,
-    find_path,
-    with_photographs,
-)
-from gscompleter.data.intrinsics import Intrinsics
-from gscompleter.data.photographs import Photographs, photographs_of
-from gscompleter.data.point_cloud import read_point_cloud
-from gscompleter.errors import InputError, quoted
-from gscompleter.io.image import is_turned
+from gscompleter.data.image_folders import FOLDERS, ORIGINALS, ImageFinder, find_path, keep_existing
+from gscompleter.data.photographs import Photographs, build_photographs
+from gscompleter.data.points import read_point_cloud
+from gscompleter.errors import InputError, quote_value
+from gscompleter.io.image import has_orientation_tag
 
 DISTORTED = "distorted"
 """Folder of the model with distortion, beside undistorted photographs (3DGS's scripts)."""
@@ -38,9 +32,9 @@ FILES = ("cameras", "images")
 _READERS = {".bin": binary, ".txt": text}
 
 
-def holds_colmap(path: Path) -> bool:
+def has_colmap(path: Path) -> bool:
     """Check whether `path` is a scene with a COLMAP model, a model, or its images file."""
-    return is_image_file(path) or bool(_models(path))
+    return is_image_file(path) or bool(_find_models(path))
 
 
 def open_colmap(path: Path) -> Iterator[Photographs]:
@@ -50,40 +44,40 @@ def open_colmap(path: Path) -> Iterator[Photographs]:
     that exist.
     """
     if is_image_file(path):
-        yield _scene(path.parent, path.parent, read_image_file(path), ())
+        yield _build_scene(path.parent, path.parent, read_image_file(path), ())
         return
-    yield _scene(path, *_largest(path))
+    yield _build_scene(path, *_select_largest(path))
 
 
-def read_cameras_of(path: Path) -> list[Frame]:
+def read_scene_cameras(path: Path) -> list[Frame]:
     """Read the cameras of a scene's largest model in its order, with existing photographs."""
-    model, frames, _ = _largest(path)
-    finder = _finder(_roots(path, model))
-    return [finder.placed(frame) for frame in frames]
+    model, frames, _ = _select_largest(path)
+    finder = _make_finder(_list_roots(path, model))
+    return [finder.locate(frame) for frame in frames]
 
 
-def _largest(path: Path) -> tuple[Path, list[Frame], tuple[str, ...]]:
+def _select_largest(path: Path) -> tuple[Path, list[Frame], tuple[str, ...]]:
     """Find the largest model of a scene: its folder, frames, and notes on others."""
-    models = _models(path)
+    models = _find_models(path)
     if not models:
         raise InputError(
-            f"There is no COLMAP model in {quoted(path)}; a folder sparse/0 with its cameras "
+            f"There is no COLMAP model in {quote_value(path)}; a folder sparse/0 with its cameras "
             "and images, as .bin or .txt, is needed."
         )
-    frames = [_frames_of(model) for model in models]
+    frames = [_read_model_frames(model) for model in models]
     best = max(range(len(models)), key=lambda number: len(frames[number]))
-    return models[best], frames[best], _choice(models, [len(f) for f in frames], best)
+    return models[best], frames[best], _note_choice(models, [len(f) for f in frames], best)
 
 
 def read_image_file(path: Path) -> list[Frame]:
     """Read the cameras of an images.txt or images.bin in its order, without photographs."""
-    cameras = _file(path.parent, "cameras")
+    cameras = _find_model_file(path.parent, "cameras")
     if cameras is None:
         raise InputError(
-            f"There is no cameras.txt or cameras.bin beside {quoted(path)}, and it holds "
+            f"There is no cameras.txt or cameras.bin beside {quote_value(path)}, and it holds "
             "poses only; copy it there from the same model."
         )
-    return _frames(cameras, path)
+    return _read_frames(cameras, path)
 
 
 def is_image_file(path: Path) -> bool:
@@ -92,54 +86,55 @@ def is_image_file(path: Path) -> bool:
     return name in {f"images{ending}" for ending in _READERS} and os.path.isfile(path)
 
 
-def _models(path: Path) -> list[Path]:
+def _find_models(path: Path) -> list[Path]:
     """List the model folders of a scene, all from the first matching home."""
     if not os.path.isdir(path):
         return []
     homes = [find_path(path, home) for home in HOMES]
-    found = ([f for f in (home, *_numbered(home)) if _is_model(f)] for home in homes if home)
+    found = ([f for f in (home, *_list_numbered(home)) if _is_model(f)] for home in homes if home)
     return next((models for models in found if models), [])
 
 
-def _numbered(home: Path) -> list[Path]:
+def _list_numbered(home: Path) -> list[Path]:
     names = os.listdir(home) if os.path.isdir(home) else []
     return [home / name for name in sorted(names) if name.isdecimal()]
 
 
 def _is_model(folder: Path) -> bool:
-    return all(_file(folder, name) is not None for name in FILES)
+    return all(_find_model_file(folder, name) is not None for name in FILES)
 
 
-def _file(folder: Path, name: str) -> Path | None:
+def _find_model_file(folder: Path, name: str) -> Path | None:
     """Find a file of a model, preferring binary; None if there is none."""
     found = (find_path(folder, name + ending) for ending in _READERS)
     return next((path for path in found if path is not None and os.path.isfile(path)), None)
 
 
-def _frames_of(model: Path) -> list[Frame]:
-    cameras, images = (_file(model, name) for name in FILES)
+def _read_model_frames(model: Path) -> list[Frame]:
+    cameras, images = (_find_model_file(model, name) for name in FILES)
     assert cameras is not None
     assert images is not None
-    return _frames(cameras, images)
+    return _read_frames(cameras, images)
 
 
-def _frames(cameras_file: Path, images_file: Path) -> list[Frame]:
+def _read_frames(cameras_file: Path, images_file: Path) -> list[Frame]:
     """Read the frames of a model in file order, without photographs."""
     cameras = _READERS[cameras_file.suffix.lower()].read_cameras(cameras_file)
     images = _READERS[images_file.suffix.lower()].read_images(images_file)
     if not images:
-        raise InputError(f"{quoted(images_file)} lists no images; export the model again.")
+        raise InputError(f"{quote_value(images_file)} lists no images; export the model again.")
     (name, times), *_ = Counter(image.name for image in images).most_common(1)
     if times > 1:
         raise InputError(
-            f"{quoted(images_file)} lists the image {quoted(name)} {times:,} times; export the "
+            f"{quote_value(images_file)} lists the image {quote_value(name)} {times:,} times; "
+            "export the "
             "model again."
         )
-    return [_frame(image, cameras, images_file) for image in images]
+    return [_make_frame(image, cameras, images_file) for image in images]
 
 
-def _frame(image: PosedImage, cameras: dict[int, Intrinsics], path: Path) -> Frame:
-    title = f"image {quoted(image.name)} of {quoted(path)}"
+def _make_frame(image: PosedImage, cameras: dict[int, Intrinsics], path: Path) -> Frame:
+    title = f"image {quote_value(image.name)} of {quote_value(path)}"
     if image.camera not in cameras:
         raise InputError(
             f"The {title} was taken by camera {image.camera}, which is not in the cameras file "
@@ -148,24 +143,24 @@ def _frame(image: PosedImage, cameras: dict[int, Intrinsics], path: Path) -> Fra
     return Frame(image.name, title, image.c2w(), cameras[image.camera], None)
 
 
-def _scene(
+def _build_scene(
     scene: Path, model: Path, frames: Sequence[Frame], notes: tuple[str, ...]
 ) -> Photographs:
-    roots = _roots(scene, model)
-    finder = _finder(roots)
-    there, missing = with_photographs([finder.placed(frame) for frame in frames], str(model))
-    notes += missing + _turned(there[0])
-    photographs = photographs_of(roots[-1].name, str(model), there)
-    return replace(photographs, notes=notes, sparse=_points_of(model))
+    roots = _list_roots(scene, model)
+    finder = _make_finder(roots)
+    there, missing = keep_existing([finder.locate(frame) for frame in frames], str(model))
+    notes += missing + _note_rotation(there[0])
+    photographs = build_photographs(roots[-1].name, str(model), there)
+    return replace(photographs, notes=notes, sparse=_make_point_reader(model))
 
 
-def _finder(roots: Sequence[Path]) -> ImageFinder:
+def _make_finder(roots: Sequence[Path]) -> ImageFinder:
     # Beside a model with distortion, `images` may hold undistorted photographs.
     lens = any(root.name.casefold() == DISTORTED for root in roots)
     return ImageFinder(roots, (ORIGINALS, *FOLDERS) if lens else FOLDERS)
 
 
-def _roots(scene: Path, model: Path) -> list[Path]:
+def _list_roots(scene: Path, model: Path) -> list[Path]:
     """List the folders from the model up to the scene; names decide if a model itself is given."""
     top, roots = Path(os.path.abspath(scene)), [Path(os.path.abspath(model))]
     while top in roots[-1].parents or _is_part(roots[-1]):
@@ -180,7 +175,7 @@ def _is_part(folder: Path) -> bool:
     return numbered or folder.name.casefold() in parts
 
 
-def _choice(models: list[Path], sizes: list[int], best: int) -> tuple[str, ...]:
+def _note_choice(models: list[Path], sizes: list[int], best: int) -> tuple[str, ...]:
     if len(models) == 1:
         return ()
     others = ", ".join(str(size) for number, size in enumerate(sizes) if number != best)
@@ -190,19 +185,20 @@ def _choice(models: list[Path], sizes: list[int], best: int) -> tuple[str, ...]:
     )
 
 
-def _turned(frame: Frame) -> tuple[str, ...]:
+def _note_rotation(frame: Frame) -> tuple[str, ...]:
     """Note that COLMAP ignores the EXIF rotation of photographs."""
-    if not isinstance(frame.image, Path) or not is_turned(frame.image):
+    if not isinstance(frame.image, Path) or not has_orientation_tag(frame.image):
         return ()
     return (
-        f"The EXIF rotation of the photographs, such as {quoted(frame.name)}, is ignored: they are "
+        f"The EXIF rotation of the photographs, such as {quote_value(frame.name)}, is ignored: "
+        "they are "
         "used as they are stored, like in COLMAP.",
     )
 
 
-def _points_of(model: Path) -> partial[Float[np.ndarray, "n 3"]] | None:
+def _make_point_reader(model: Path) -> partial[Float[np.ndarray, "n 3"]] | None:
     """Return a reader of the model's points; None if it has no file of points."""
-    path = _file(model, "points3D")
+    path = _find_model_file(model, "points3D")
     if path is not None:
         return partial(_READERS[path.suffix.lower()].read_points, path)
     # The script of 3DGS writes them as PLY.

@@ -13,16 +13,16 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
-from gscompleter.generators.smooth import distance_to_known
+from gscompleter.generators.smooth import compute_distance_to_known
 from gscompleter.generators.warp import (
-    Warped,
-    background_first,
+    WarpedImage,
+    add_unexplained,
+    fill_background_first,
     warp_photographs,
-    with_unexplained,
 )
 from gscompleter.generators.warp_inpaint.exemplar import Sources, fill_by_patches
-from gscompleter.interpolation import smoothed
-from gscompleter.types import Camera, SceneContext, View
+from gscompleter.image_ops import smooth_masked
+from gscompleter.types import Camera, GeneratorInput, View
 
 STRUCTURE_REACH = 0.15
 """Depth of structure in a hole, relative to the longer image side; its second half fades."""
@@ -39,39 +39,39 @@ class WarpInpaint:
     seed: int = 0
 
     def __call__(
-        self, nearest: View, target: Camera, context: SceneContext
+        self, nearest: View, target: Camera, context: GeneratorInput
     ) -> Float[Tensor, "h w 3"]:
         """Synthesize the complete image of `target`, in [0, 1]."""
         warped = warp_photographs(nearest, target, context)
         if not warped.known.any():
             # The target observes nothing, so there is no border to continue.
             return nearest.image.mean(dim=(0, 1)).expand(target.height, target.width, 3)
-        warped = with_unexplained(warped, target, context).to("cpu")
-        image = self.with_structure(*background_first(warped), warped, context)
+        warped = add_unexplained(warped, target, context).to("cpu")
+        image = self.add_structure(*fill_background_first(warped), warped, context)
         return image.clamp(0, 1).to(nearest.image.device)
 
-    def with_structure(
+    def add_structure(
         self,
         tone: Float[Tensor, "h w 3"],
         log_depth: Float[Tensor, "h w"],
-        warped: Warped,
-        context: SceneContext,
+        warped: WarpedImage,
+        context: GeneratorInput,
     ) -> Float[Tensor, "h w 3"]:
         """Add structure to the smooth image `tone` along the borders of its holes."""
         reach = STRUCTURE_REACH * max(warped.known.shape)
-        away = distance_to_known(warped.known)
-        undecided = without_cracks(~warped.known, CRACK_WIDTH) & (away <= reach)
+        away = compute_distance_to_known(warped.known)
+        undecided = remove_cracks(~warped.known, CRACK_WIDTH) & (away <= reach)
         if not undecided.any():
             return tone
-        sources = sources_of(context, warped)
+        sources = collect_sources(context, warped)
         patched = fill_by_patches(tone, ~undecided, log_depth, sources, self.seed)
         detail = patched - tone
-        detail = detail - smoothed(detail, undecided, TONE_RADIUS)
+        detail = detail - smooth_masked(detail, undecided, TONE_RADIUS)
         fading = (2 * (1 - away / reach)).clamp(0, 1)
         return torch.where(undecided[..., None], tone + fading[..., None] * detail, tone)
 
 
-def without_cracks(hole: Bool[Tensor, "h w"], width: int) -> Bool[Tensor, "h w"]:
+def remove_cracks(hole: Bool[Tensor, "h w"], width: int) -> Bool[Tensor, "h w"]:
     """Keep the parts of `hole` wider than `width` pixels; the image border is no limit."""
     kernel = np.ones((width + 1, width + 1), np.uint8)
     padded = np.pad(hole.numpy().astype(np.uint8), width + 1, mode="edge")
@@ -80,15 +80,15 @@ def without_cracks(hole: Bool[Tensor, "h w"], width: int) -> Bool[Tensor, "h w"]
     return torch.from_numpy(opened[inner, inner] > 0)
 
 
-def sources_of(context: SceneContext, warped: Warped) -> Sources:
+def collect_sources(context: GeneratorInput, warped: WarpedImage) -> Sources:
     """Collect patch sources: photographs of equal exposure, and the known target pixels."""
     photographs = [
         (gain * view.image.cpu()).clamp(0, 1)
         for view, gain in zip(context.views, warped.gains, strict=True)
     ]
-    trusted = [view.trusted.cpu() for view in context.views]
-    return Sources.stacked(
+    trusted = [view.static_mask.cpu() for view in context.views]
+    return Sources.stack_images(
         [*photographs, warped.image],
         [*trusted, warped.known],
-        [*(render.depth.cpu() for render in context.at_views), warped.depth],
+        [*(render.depth.cpu() for render in context.view_renders), warped.depth],
     )

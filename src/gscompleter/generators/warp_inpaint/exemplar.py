@@ -18,10 +18,10 @@ from numpy import ndarray
 from torch import Tensor
 from torch.nn.functional import avg_pool2d, pad
 
-from gscompleter.generators.smooth import distance_to_known
+from gscompleter.generators.smooth import compute_distance_to_known
+from gscompleter.image_ops import dilate
 from gscompleter.kernels import patchmatch
 from gscompleter.kernels.patchmatch import RADIUS, SIDE
-from gscompleter.masks import dilate
 
 MAX_BIAS = 0.1
 """Largest colour shift of a patch per channel."""
@@ -31,17 +31,17 @@ DEPTH_PENALTY = 0.02
 """Cost per squared log-depth of a source in front of the expected depth."""
 DISTANCE_PENALTY = 0.002
 """Cost of a source at the other end of the image."""
-FEWEST_ROUNDS = 2
+MIN_VOTE_ROUNDS = 2
 """Iterations of search and vote on the finest level."""
-MOST_ROUNDS = 10
+MAX_VOTE_ROUNDS = 10
 """Iterations on the coarsest level; sharp votes need more to agree."""
 COARSEST_PASSES, FINER_PASSES = 2, 1
 """Search passes per iteration, on the coarsest level and on finer ones."""
 VOTE_SHARPNESS = 8
 """Decay of a vote with its cost; at 1, averaged patches lose a quarter of their detail."""
-LEAST_LIKELY = 1e-6
+MIN_VOTE = 1e-6
 """Smallest weight of a vote."""
-CONFIDENCE = 0.85
+WEIGHT_DECAY = 0.85
 """Weight factor of an unknown pixel per pixel from the border of the hole."""
 MIN_SIZE = 80
 """Shorter side of the coarsest level, in pixels; coarser ones cost 0.3 dB."""
@@ -58,7 +58,7 @@ class Sources:
     log_depth: Float[Tensor, "s h w"]
 
     @staticmethod
-    def stacked(
+    def stack_images(
         images: list[Float[Tensor, "_ _ 3"]],
         valid: list[Bool[Tensor, "_ _"]],
         depths: list[Float[Tensor, "_ _"]],
@@ -110,22 +110,22 @@ def fill_by_patches(
     """
     levels = [Level(image, known, expected, sources)]
     while min(levels[-1].known.shape) // 2 >= MIN_SIZE:
-        levels.append(halved(levels[-1]))
+        levels.append(downsample_level(levels[-1]))
     filled, field = image, None
     for number, level in reversed(list(enumerate(levels))):
         share = number / max(len(levels) - 1, 1)
-        rounds = FEWEST_ROUNDS + round((MOST_ROUNDS - FEWEST_ROUNDS) * share)
-        filled, field = solve(level, field, rounds, seed + 7919 * number)
+        rounds = MIN_VOTE_ROUNDS + round((MAX_VOTE_ROUNDS - MIN_VOTE_ROUNDS) * share)
+        filled, field = search_and_vote(level, field, rounds, seed + 7919 * number)
     return filled
 
 
-def solve(
+def search_and_vote(
     level: Level, coarse_field: CoarseField | None, rounds: int, seed: int
 ) -> tuple[Float[Tensor, "h w 3"], Field | None]:
     """Alternate between searching the best patches and voting for the image."""
     h, w = level.known.shape
     known = level.known.numpy()
-    usable = usable_centres(level.sources.valid)
+    usable = find_usable_centres(level.sources.valid)
     near_hole = dilate(~level.known, RADIUS).numpy()
     if not usable.any() or known.all():
         return level.image, None
@@ -133,15 +133,15 @@ def solve(
     queries = np.argwhere(near_hole)
     query_at = np.full((h, w), -1, np.int64)
     query_at[near_hole] = np.arange(len(queries))
-    weight = trust(level.known)
+    weight = compute_pixel_weights(level.known)
     votes, shift = weight[near_hole], np.zeros((len(queries), 3), np.float32)
-    matches = initial_matches(queries, coarse_field, usable, seed)
-    images = patchmatch.with_column_beside(level.sources.images.numpy())
+    matches = init_matches(queries, coarse_field, usable, seed)
+    images = patchmatch.pad_column(level.sources.images.numpy())
     log_depth = np.ascontiguousarray(level.sources.log_depth.numpy())
-    frame = patchmatch.framed(np.repeat(weight[..., None], 3, axis=-1))
+    frame = patchmatch.pad_border(np.repeat(weight[..., None], 3, axis=-1))
     total = cv2.boxFilter(weight, -1, (SIDE, SIDE), normalize=False, borderType=cv2.BORDER_CONSTANT)
     target = (total[near_hole], queries, query_at, level.expected.numpy()[near_hole])
-    costs = costs_in(usable.shape[1:])
+    costs = make_costs(usable.shape[1:])
 
     def voted() -> Float32[ndarray, "p 3"]:
         return patchmatch.vote(query_at, votes, images, matches, shift)[0][~known]
@@ -153,44 +153,44 @@ def solve(
     if coarse_field is not None:
         reach, passes = FINE_REACH, FINER_PASSES
     for number in range(rounds):
-        matched = patchmatch.Matched(
-            patchmatch.framed(current), frame, *target, images, usable, log_depth
+        matched = patchmatch.PatchProblem(
+            patchmatch.pad_border(current), frame, *target, images, usable, log_depth
         )
         cost, shift = patchmatch.search(matched, costs, matches, passes, reach, seed + 31 * number)
-        votes = weight[near_hole] * likelihood(cost)
+        votes = weight[near_hole] * compute_likelihood(cost)
         current[~known] = voted()
     field = np.full((h, w, 3), -1, np.int64)
     field[near_hole] = matches
     return torch.from_numpy(current), field
 
 
-def likelihood(cost: Float32[ndarray, "q"]) -> Float32[ndarray, "q"]:
+def compute_likelihood(cost: Float32[ndarray, "q"]) -> Float32[ndarray, "q"]:
     """Convert costs to vote weights (Wexler et al. 2007, Sec. 3.2)."""
     usual = max(float(np.percentile(cost, 75)), 1e-6)
     likely = np.exp(-VOTE_SHARPNESS * cost / (2 * usual))
-    return np.maximum(likely, LEAST_LIKELY).astype(np.float32)
+    return np.maximum(likely, MIN_VOTE).astype(np.float32)
 
 
-def trust(known: Bool[Tensor, "h w"]) -> Float32[ndarray, "h w"]:
+def compute_pixel_weights(known: Bool[Tensor, "h w"]) -> Float32[ndarray, "h w"]:
     """Compute pixel weights for patch comparison, falling with the depth in the hole."""
-    away = distance_to_known(known).numpy()
-    return np.where(known, 1.0, np.maximum(CONFIDENCE**away, 0.05)).astype(np.float32)
+    away = compute_distance_to_known(known).numpy()
+    return np.where(known, 1.0, np.maximum(WEIGHT_DECAY**away, 0.05)).astype(np.float32)
 
 
-def costs_in(size: Sequence[int]) -> patchmatch.Costs:
+def make_costs(size: Sequence[int]) -> patchmatch.Costs:
     """Set up the matching costs for images of a size (height, width)."""
     weights = MAX_BIAS, BIAS_PENALTY, DEPTH_PENALTY, DISTANCE_PENALTY, math.hypot(*size)
     return patchmatch.Costs(*map(np.float32, weights))
 
 
-def usable_centres(valid: Bool[Tensor, "s h w"]) -> Bool[ndarray, "s h w"]:
+def find_usable_centres(valid: Bool[Tensor, "s h w"]) -> Bool[ndarray, "s h w"]:
     """Mark the pixels whose whole patch is valid and inside the image."""
     lacking = pad(~valid, (RADIUS,) * 4, value=True)
     inner = slice(RADIUS, -RADIUS)
     return np.stack([~dilate(v, RADIUS)[inner, inner].numpy() for v in lacking])
 
 
-def initial_matches(
+def init_matches(
     queries: Int64[ndarray, "q 2"],
     coarse_field: CoarseField | None,
     usable: Bool[ndarray, "s source_h source_w"],
@@ -199,7 +199,7 @@ def initial_matches(
     """Initialize matches from the coarse level, the nearest known patch, or at random."""
     own = len(usable) - 1
     if usable[own].any():
-        places = nearest_places(usable[own])[queries[:, 0], queries[:, 1]]
+        places = find_nearest(usable[own])[queries[:, 0], queries[:, 1]]
         matches = np.column_stack([np.full(len(queries), own), places])
     else:
         centres = np.argwhere(usable)
@@ -218,7 +218,7 @@ def initial_matches(
     return np.ascontiguousarray(matches)
 
 
-def nearest_places(mask: Bool[ndarray, "h w"]) -> Int64[ndarray, "h w 2"]:
+def find_nearest(mask: Bool[ndarray, "h w"]) -> Int64[ndarray, "h w 2"]:
     """Find row and column of the nearest pixel of `mask`, for every pixel."""
     _, labels = cv2.distanceTransformWithLabels(
         (~mask).astype(np.uint8), cv2.DIST_L2, 5, labelType=cv2.DIST_LABEL_PIXEL
@@ -229,26 +229,26 @@ def nearest_places(mask: Bool[ndarray, "h w"]) -> Int64[ndarray, "h w 2"]:
     return places[labels]
 
 
-def halved(level: Level) -> Level:
+def downsample_level(level: Level) -> Level:
     """Halve a level; averages leave out unknown pixels."""
     known = level.known.float()[..., None]
-    share = pooled(known)
-    guess = pooled(level.image * (1 - known)) / (1 - share).clamp_min(1e-6)
-    seen = pooled(level.image * known) / share.clamp_min(1e-6)
+    share = pool_pixels(known)
+    guess = pool_pixels(level.image * (1 - known)) / (1 - share).clamp_min(1e-6)
+    seen = pool_pixels(level.image * known) / share.clamp_min(1e-6)
     image = torch.where(share > 0.5, seen, guess)
-    expected = pooled(level.expected[..., None])[..., 0]
+    expected = pool_pixels(level.expected[..., None])[..., 0]
 
     valid = level.sources.valid.float()[..., None]
-    usable = pooled(valid)
+    usable = pool_pixels(valid)
     sources = Sources(
-        pooled(level.sources.images * valid) / usable.clamp_min(1e-6),
+        pool_pixels(level.sources.images * valid) / usable.clamp_min(1e-6),
         usable[..., 0] > 0.75,
-        (pooled(level.sources.log_depth[..., None] * valid) / usable.clamp_min(1e-6))[..., 0],
+        (pool_pixels(level.sources.log_depth[..., None] * valid) / usable.clamp_min(1e-6))[..., 0],
     )
     return Level(image, share[..., 0] > 0.5, expected, sources)
 
 
-def pooled(values: Float[Tensor, "*s h w c"]) -> Float[Tensor, "*s h2 w2 c"]:
+def pool_pixels(values: Float[Tensor, "*s h w c"]) -> Float[Tensor, "*s h2 w2 c"]:
     """Average 2 x 2 pixels."""
     channels_first = values.movedim(-1, -3)
     flat = channels_first.reshape(-1, *channels_first.shape[-3:]).contiguous()

@@ -7,7 +7,7 @@ from jaxtyping import Float32, Int16, UInt8
 
 from gscompleter.kernels import stereo
 from gscompleter.kernels.stereo import Bands
-from gscompleter.matching.stereo_image import StereoImage, contrast
+from gscompleter.reconstructors.features.stereo_image import StereoImage, compute_contrast
 
 SMALL_PENALTY = 25
 """Cost of a change by one plane between neighbouring pixels."""
@@ -26,10 +26,10 @@ def aggregate(
     def jump(
         a: Float32[np.ndarray, "r c 3"], b: Float32[np.ndarray, "r c 3"]
     ) -> Int16[np.ndarray, "r c"]:
-        penalty = LARGE_PENALTY / (1 + contrast(a, b) / np.float32(EDGE_CONTRAST))
+        penalty = LARGE_PENALTY / (1 + compute_contrast(a, b) / np.float32(EDGE_CONTRAST))
         return np.rint(np.maximum(penalty, 1.5 * SMALL_PENALTY)).astype(np.int16)
 
-    return stereo.semi_global(
+    return stereo.aggregate_semi_globally(
         costs,
         bands,
         jump(image[:, 1:], image[:, :-1]),

@@ -21,17 +21,17 @@ MAX_STEP = 2.0
 """Largest step between neighbouring pixels of one patch, in planes."""
 
 
-def confidence_of(index: Map, margin: Map, agrees: Mask) -> Map:
+def compute_confidence(index: Map, margin: Map, confirmed: Mask) -> Map:
     """Compute the confidence of each pixel's plane, in [0, 1].
 
     `margin` is the cost gap to the second best plane; `agrees` marks pixels that another view
     confirms.
     """
-    solid = without_speckles(index, agrees)
+    solid = remove_speckles(index, confirmed)
     return (solid * (margin / FULL_MARGIN).clip(0, 1)).astype(np.float32)
 
 
-def consistent(
+def find_consistent(
     inverse: Map,
     other: Float32[np.ndarray, "other_h other_w"],
     other_from_this: Float32[np.ndarray, "3 4"],
@@ -42,7 +42,7 @@ def consistent(
     return (error >= 0) & (error < MAX_RETURN_ERROR)
 
 
-def without_speckles(index: Map, mask: Mask) -> Mask:
+def remove_speckles(index: Map, mask: Mask) -> Mask:
     """Remove patches of similar depth smaller than `MIN_AREA` pixels from `mask`."""
     # OpenCV takes 16-bit fixed-point disparities; 0 marks masked pixels.
     scale = min(16.0, 30000.0 / max(float(index.max()), 1.0))

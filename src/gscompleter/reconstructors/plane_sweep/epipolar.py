@@ -13,8 +13,11 @@ import cv2
 import numpy as np
 from jaxtyping import Float
 
-from gscompleter.matching.features import Pixels
-from gscompleter.matching.stereo_image import StereoImage, source_from_reference
+from gscompleter.reconstructors.features.sift import Pixels
+from gscompleter.reconstructors.features.stereo_image import (
+    StereoImage,
+    compute_source_from_reference,
+)
 
 MIN_MATCHES = 20
 """Fewest matches for a correction; with fewer the pose is kept."""
@@ -24,18 +27,18 @@ ITERATIONS = 20
 """Iterations of reweighted least squares, which suppresses false matches."""
 
 
-def rotated_to_matches(
+def rotate_to_matches(
     reference: StereoImage, source: StereoImage, pixels: Pixels, matched: Pixels
 ) -> StereoImage:
     """Rotate `source` about its centre so that matches lie on their epipolar lines."""
     if len(pixels) == 0:
         return source
-    distance, normal = distances(reference, source, pixels, matched)
+    distance, normal = compute_epipolar_distances(reference, source, pixels, matched)
     near = np.abs(distance) < MAX_DISTANCE
     if near.sum() < MIN_MATCHES:
         return source
     distance, normal = distance[near], normal[near]
-    motion = motion_by_rotation(source, matched[near])
+    motion = compute_rotation_motion(source, matched[near])
     beside = (normal[:, :, None] * motion).sum(axis=1)
     along = normal[:, 0, None] * motion[:, 1] - normal[:, 1, None] * motion[:, 0]
     turn = np.zeros(3)
@@ -52,11 +55,11 @@ def rotated_to_matches(
     return replace(source, rotation=source.rotation @ rotation.T)
 
 
-def distances(
+def compute_epipolar_distances(
     reference: StereoImage, source: StereoImage, pixels: Pixels, matched: Pixels
 ) -> tuple[Float[np.ndarray, "m"], Float[np.ndarray, "m 2"]]:
     """Compute signed distances from the epipolar lines, in pixels, and the line normals."""
-    transform = source_from_reference(reference, source).astype(np.float64)
+    transform = compute_source_from_reference(reference, source).astype(np.float64)
     ones = np.ones((len(pixels), 1))
     at_infinity = np.concatenate([pixels, ones], axis=1) @ transform[:, :3].T
     lines = np.cross(at_infinity, transform[:, 3])
@@ -64,7 +67,7 @@ def distances(
     return (lines * np.concatenate([matched, ones], axis=1)).sum(axis=1), lines[:, :2]
 
 
-def motion_by_rotation(view: StereoImage, pixels: Pixels) -> Float[np.ndarray, "m 2 3"]:
+def compute_rotation_motion(view: StereoImage, pixels: Pixels) -> Float[np.ndarray, "m 2 3"]:
     """Compute the pixel motion per radian of rotation about each camera axis."""
     rays = np.concatenate([pixels, np.ones((len(pixels), 1))], axis=1) @ np.linalg.inv(view.K).T
     turned = np.cross(np.eye(3)[None], rays[:, None])

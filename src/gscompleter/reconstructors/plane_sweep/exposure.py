@@ -13,28 +13,28 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import Float, Float32, Int
 
-from gscompleter.reconstructors.plane_sweep.fusion import Layer, Transforms, meetings
+from gscompleter.reconstructors.plane_sweep.fusion import Layer, Transforms, compare_with_views
 
 DARKEST, BRIGHTEST = 0.05, 0.95
 """Range of usable colours: darker values are noise, brighter ones may be clipped."""
 MIN_SHARED = 0.01
 """Fraction of well exposed pixels that two photographs must share to be compared."""
-SAME_PATCH = 0.01
+CORRELATED_SHARE = 0.01
 """Fraction of a photograph's pixels whose errors are correlated."""
-SIDE = 128
+NUM_SAMPLED_ROWS = 128
 """Approximate number of rows and columns that are sampled in a photograph."""
 PAIR_NOISE = 0.02
 """Standard deviation of a pair's log-ratio, due to reflections and vignetting."""
 EXPOSURE, TINT = 0.3, 0.1
 """Prior standard deviations of the log-gains: common to all channels, and per channel."""
-HALF_A_STOP = 0.5 * math.log(2)
+MIN_LOG_SPREAD = 0.5 * math.log(2)
 """Smallest spread of the log-gains that is corrected; less is hardly visible."""
 
 Gains = Float[np.ndarray, "views 3"]
 
 
 @dataclass(frozen=True)
-class Ratio:
+class ColorRatio:
     """Log colour ratio of two photographs on the same surfaces."""
 
     pair: tuple[int, int]
@@ -44,16 +44,16 @@ class Ratio:
     """Inverse variance; 0 for a channel without data."""
 
 
-def gains_of(layers: Sequence[Layer], transforms: Transforms) -> Gains:
+def estimate_gains(layers: Sequence[Layer], transforms: Transforms) -> Gains:
     """Estimate how much brighter each photograph is than their mean, per channel.
 
     The log-gains have mean 0. All gains are exactly 1 if they differ by less than `MIN_LOG_SPREAD`.
     """
-    logs = log_gains(ratios_among(layers, transforms), len(layers))
-    return np.exp(logs) if np.ptp(logs, axis=0).max() > HALF_A_STOP else np.ones_like(logs)
+    logs = solve_log_gains(measure_ratios(layers, transforms), len(layers))
+    return np.exp(logs) if np.ptp(logs, axis=0).max() > MIN_LOG_SPREAD else np.ones_like(logs)
 
 
-def log_gains(ratios: Iterable[Ratio], count: int) -> Gains:
+def solve_log_gains(ratios: Iterable[ColorRatio], count: int) -> Gains:
     """Solve for the log-gains of `count` photographs by least squares with a prior."""
     usual = EXPOSURE**2 * np.ones((3, 3)) + TINT**2 * np.eye(3)
     precision = np.kron(np.eye(count), np.linalg.inv(usual))
@@ -66,39 +66,43 @@ def log_gains(ratios: Iterable[Ratio], count: int) -> Gains:
     return np.linalg.solve(precision, pull.reshape(-1)).reshape(count, 3)
 
 
-def ratios_among(layers: Sequence[Layer], transforms: Transforms) -> Iterator[Ratio]:
+def measure_ratios(layers: Sequence[Layer], transforms: Transforms) -> Iterator[ColorRatio]:
     """Yield the colour ratio of every ordered pair of photographs."""
-    measured = [layer.measured for layer in layers]
+    measured = [layer.measured_mask for layer in layers]
     for number, layer in enumerate(layers):
-        step = max(1, min(layer.image.size) // SIDE)
-        for meeting in meetings(number, layers, measured, transforms):
-            same = (meeting.same & layer.measured)[::step, ::step]
+        step = max(1, min(layer.image.size) // NUM_SAMPLED_ROWS)
+        for meeting in compare_with_views(number, layers, measured, transforms):
+            same = (meeting.same_surface_mask & layer.measured_mask)[::step, ::step]
             rows, columns = (step * at for at in np.nonzero(same))
             own = layer.image.image[rows, columns]
             there = transforms[number, meeting.other]
-            other = colours_at(layers[meeting.other], carried(layer, rows, columns, there))
-            yield ratio_between((number, meeting.other), own, other, same.size)
+            other = sample_colors(
+                layers[meeting.other], project_to_view(layer, rows, columns, there)
+            )
+            yield measure_ratio((number, meeting.other), own, other, same.size)
 
 
-def ratio_between(
+def measure_ratio(
     pair: tuple[int, int],
     own: Float[np.ndarray, "n 3"],
     other: Float[np.ndarray, "n 3"],
-    compared: int,
-) -> Ratio:
+    num_sampled: int,
+) -> ColorRatio:
     """Compute the median log-ratio of two photographs over `num_sampled` pixels."""
     log, weight = np.zeros(3), np.zeros(3)
     exposed = (np.minimum(own, other) > DARKEST) & (np.maximum(own, other) < BRIGHTEST)
-    for channel in np.flatnonzero(exposed.sum(axis=0) > MIN_SHARED * compared):
+    for channel in np.flatnonzero(exposed.sum(axis=0) > MIN_SHARED * num_sampled):
         valid = exposed[:, channel]
         logs = np.log(own[valid, channel] / other[valid, channel])
         log[channel] = np.median(logs)
         spread = 1.4826 * np.median(np.abs(logs - log[channel]))
-        weight[channel] = 1 / (PAIR_NOISE**2 + spread**2 * SAME_PATCH * compared / len(logs))
-    return Ratio(pair, log, weight)
+        weight[channel] = 1 / (
+            PAIR_NOISE**2 + spread**2 * CORRELATED_SHARE * num_sampled / len(logs)
+        )
+    return ColorRatio(pair, log, weight)
 
 
-def carried(
+def project_to_view(
     layer: Layer,
     rows: Int[np.ndarray, "n"],
     columns: Int[np.ndarray, "n"],
@@ -111,7 +115,7 @@ def carried(
     return moved[:, :2] / moved[:, 2:]
 
 
-def colours_at(layer: Layer, pixels: Float[np.ndarray, "n 2"]) -> Float[np.ndarray, "n 3"]:
+def sample_colors(layer: Layer, pixels: Float[np.ndarray, "n 2"]) -> Float[np.ndarray, "n 3"]:
     """Sample the colours of a photograph at the nearest pixels."""
     h, w = layer.image.size
     columns, rows = pixels.astype(int).clip(0, [w - 1, h - 1]).T

@@ -9,13 +9,13 @@ import numpy as np
 from jaxtyping import Float, Float32
 
 from gscompleter.kernels import stereo
-from gscompleter.matching.stereo_image import StereoImage
+from gscompleter.reconstructors.features.stereo_image import StereoImage
 from gscompleter.reconstructors.plane_sweep.confidence import MAX_RETURN_ERROR, Map, Mask
 from gscompleter.reconstructors.plane_sweep.occlusion import UNKNOWN
 
-SAME_DEPTH = 0.05
+MAX_DEPTH_DIFFERENCE = 0.05
 """Largest relative depth difference between two views of the same surface."""
-FINER = 0.9
+FINER_FOOTPRINT = 0.9
 """Footprint ratio below which another view is finer; otherwise the first view is kept."""
 
 
@@ -34,85 +34,94 @@ class Layer:
     """Confidence in [0, 1]; 0 for interpolated depths."""
 
     @property
-    def measured(self) -> Mask:
+    def measured_mask(self) -> Mask:
         """True at pixels with a measured depth."""
         return self.confidence > 0
 
 
-def free_pixels(layers: Sequence[Layer], transforms: Transforms) -> list[Mask]:
+def find_free_pixels(layers: Sequence[Layer], transforms: Transforms) -> list[Mask]:
     """Find the pixels of each view that are outside the free space of all other views."""
-    everywhere = [np.ones_like(layer.measured) for layer in layers]
+    everywhere = [np.ones_like(layer.measured_mask) for layer in layers]
     return [
-        in_free_space(layer, meetings(number, layers, everywhere, transforms))
+        find_unrefuted(layer, compare_with_views(number, layers, everywhere, transforms))
         for number, layer in enumerate(layers)
     ]
 
 
-def finest_pixels(
+def find_finest_pixels(
     layers: Sequence[Layer], free: Sequence[Mask], transforms: Transforms
 ) -> list[Mask]:
     """Find the `free` pixels of each view that no other view resolves better."""
     return [
         free[number]
-        & ~better_elsewhere(number, layers, meetings(number, layers, free, transforms), transforms)
+        & ~find_better_elsewhere(
+            number, layers, compare_with_views(number, layers, free, transforms), transforms
+        )
         for number in range(len(layers))
     ]
 
 
 @dataclass(frozen=True)
-class Meeting:
+class DepthComparison:
     """Pixels of one view compared with the measured depths of another view."""
 
     other: int
-    through: Mask
+    free_space_mask: Mask
     """True if the other view sees a surface behind the pixel."""
-    same: Mask
+    same_surface_mask: Mask
     """True if the other view measured the same surface."""
 
 
-def meetings(
+def compare_with_views(
     number: int, layers: Sequence[Layer], kept: Sequence[Mask], transforms: Transforms
-) -> Iterator[Meeting]:
+) -> Iterator[DepthComparison]:
     """Compare view `number` with the measured and `kept` pixels of each other view."""
     inverse = layers[number].inverse
     for other, layer in enumerate(layers):
         if other == number:
             continue
         there, back = transforms[number, other], transforms[other, number]
-        sure = np.where(layer.measured & kept[other], layer.inverse, UNKNOWN)
+        sure = np.where(layer.measured_mask & kept[other], layer.inverse, UNKNOWN)
         error, ratio = stereo.reproject(inverse, sure, there, back)
         known = (error >= 0) & (ratio > 1e-3)
         apart = error > MAX_RETURN_ERROR
-        through = known & apart & (ratio < 1 - SAME_DEPTH)
-        yield Meeting(other, through, known & ~apart & (np.abs(ratio - 1) < SAME_DEPTH))
+        through = known & apart & (ratio < 1 - MAX_DEPTH_DIFFERENCE)
+        yield DepthComparison(
+            other, through, known & ~apart & (np.abs(ratio - 1) < MAX_DEPTH_DIFFERENCE)
+        )
 
 
-def in_free_space(layer: Layer, met: Iterator[Meeting]) -> Mask:
+def find_unrefuted(layer: Layer, comparisons: Iterator[DepthComparison]) -> Mask:
     """Mark pixels that no view sees through, or that more views confirm than refute."""
     balance = np.zeros(layer.inverse.shape, np.int32)
     seen_through = np.zeros(layer.inverse.shape, bool)
-    for meeting in met:
-        balance += meeting.same.astype(np.int32) - meeting.through
-        seen_through |= meeting.through
-    return ~seen_through | (layer.measured & (balance > 0))
+    for meeting in comparisons:
+        balance += meeting.same_surface_mask.astype(np.int32) - meeting.free_space_mask
+        seen_through |= meeting.free_space_mask
+    return ~seen_through | (layer.measured_mask & (balance > 0))
 
 
-def better_elsewhere(
-    number: int, layers: Sequence[Layer], met: Iterator[Meeting], transforms: Transforms
+def find_better_elsewhere(
+    number: int,
+    layers: Sequence[Layer],
+    comparisons: Iterator[DepthComparison],
+    transforms: Transforms,
 ) -> Mask:
     """Mark interpolated or coarse pixels whose surface another view measured better."""
     layer = layers[number]
     own = 1 / layer.inverse / layer.image.K[0, 0]
     better = np.zeros(own.shape, bool)
-    for meeting in met:
-        ratio = depth_ratio(layer.inverse, transforms[number, meeting.other])
+    for meeting in comparisons:
+        ratio = compute_depth_ratio(layer.inverse, transforms[number, meeting.other])
         footprint = ratio / layer.inverse / layers[meeting.other].image.K[0, 0]
-        limit = own / FINER if meeting.other < number else own * FINER
-        better |= meeting.same & (~layer.measured | (footprint < limit))
+        limit = own / FINER_FOOTPRINT if meeting.other < number else own * FINER_FOOTPRINT
+        better |= meeting.same_surface_mask & (~layer.measured_mask | (footprint < limit))
     return better
 
 
-def depth_ratio(inverse: Map, transform: Float32[np.ndarray, "3 4"]) -> Float[np.ndarray, "h w"]:
+def compute_depth_ratio(
+    inverse: Map, transform: Float32[np.ndarray, "3 4"]
+) -> Float[np.ndarray, "h w"]:
     """Compute the z-depth of each surface in another view over that in its own view."""
     h, w = inverse.shape
     x, y = np.arange(w) + 0.5, np.arange(h)[:, None] + 0.5

@@ -6,8 +6,8 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from gscompleter.geometry import quats_from
-from gscompleter.types import Gaussians, View, observed, sh_from_rgb
+from gscompleter.geometry import rotations_to_quats
+from gscompleter.types import Gaussians, View, make_observed, sh_from_rgb
 
 THICKNESS = 0.15
 """Standard deviation along the normal, relative to that across the viewing ray."""
@@ -17,7 +17,7 @@ OPACITY = 0.98
 """Initial opacity of every disc."""
 
 
-def discs(
+def make_discs(
     view: View, depth: Float[Tensor, "h w"], normals: Float[Tensor, "h w 3"], sigma: float
 ) -> Gaussians:
     """Create one Gaussian per pixel of `view`, row by row, at z-depth `depth`.
@@ -44,16 +44,16 @@ def discs(
     sizes = torch.cat(
         [torch.ones_like(cosine), 1 / cosine, torch.full_like(cosine, THICKNESS)], dim=-1
     )
-    return observed(
+    return make_observed(
         means=means,
-        quats=quats_from(axes),
+        quats=rotations_to_quats(axes),
         scales=sizes * (sigma * pixel)[:, None],
         opacities=torch.full_like(pixel, OPACITY),
         sh=sh_from_rgb(view.image.reshape(-1, 3)),
     )
 
 
-def normals_of(depth: Float[Tensor, "h w"], view: View) -> Float[Tensor, "h w 3"]:
+def compute_normals(depth: Float[Tensor, "h w"], view: View) -> Float[Tensor, "h w 3"]:
     """Compute normals in camera axes, towards the camera, by one-sided differences."""
     camera = view.camera
     rays = camera.z_rays() @ camera.c2w[:3, :3]

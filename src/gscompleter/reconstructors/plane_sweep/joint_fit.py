@@ -12,15 +12,15 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from gscompleter.descent import Adam
+from gscompleter.optim import Adam
 from gscompleter.render import Renderer
 from gscompleter.types import Gaussians, View
 
-PASSES = 10
+STEPS_PER_VIEW = 10
 """Number of steps per photograph."""
 RATES = {"moved": 0.2, "quats": 0.0375, "grown": 0.1875, "logits": 0.75, "sh": 0.1125}
 """Initial Adam step sizes; positions are in units of the Gaussian's size."""
-LAST = 0.2
+FINAL_RATE = 0.2
 """Final step size relative to the initial one; the decay is linear."""
 BETAS = 0.9, 0.99
 """Adam decay rates, short because there are few steps."""
@@ -35,18 +35,18 @@ def fit_jointly(
     renderer: Renderer,
 ) -> Gaussians:
     """Minimize the squared image error, with renders scaled by each view's exposure gain."""
-    unknown = unknowns(gaussians)
+    unknown = init_parameters(gaussians)
     optimizer = Adam([(unknown[name], rate) for name, rate in RATES.items()], BETAS)
-    order = order_of(len(views))
+    order = shuffle_views(len(views))
     for step, number in enumerate(order):
-        view, fitted = views[number], moved_by(gaussians, unknown)
+        view, fitted = views[number], apply_parameters(gaussians, unknown)
         image = renderer.render(fitted, view.camera).image
-        left = 1 - (1 - LAST) * step / len(order)
+        left = 1 - (1 - FINAL_RATE) * step / len(order)
         optimizer.step((gains[number] * image - view.image).square().mean(), left)
-    return moved_by(gaussians, {name: value.detach() for name, value in unknown.items()})
+    return apply_parameters(gaussians, {name: value.detach() for name, value in unknown.items()})
 
 
-def unknowns(gaussians: Gaussians) -> dict[str, Tensor]:
+def init_parameters(gaussians: Gaussians) -> dict[str, Tensor]:
     """Initialize the optimized parameters, with the keys of `RATES`."""
     start = {
         "moved": torch.zeros_like(gaussians.means),
@@ -58,7 +58,7 @@ def unknowns(gaussians: Gaussians) -> dict[str, Tensor]:
     return {name: value.detach().clone().requires_grad_() for name, value in start.items()}
 
 
-def moved_by(gaussians: Gaussians, unknown: dict[str, Tensor]) -> Gaussians:
+def apply_parameters(gaussians: Gaussians, unknown: dict[str, Tensor]) -> Gaussians:
     """Apply the parameters to the Gaussians."""
     size = gaussians.scales.amax(dim=-1, keepdim=True)
     return replace(
@@ -71,8 +71,8 @@ def moved_by(gaussians: Gaussians, unknown: dict[str, Tensor]) -> Gaussians:
     )
 
 
-def order_of(count: int) -> list[int]:
+def shuffle_views(count: int) -> list[int]:
     """Create a random order in which each of `count` views occurs `STEPS_PER_VIEW` times."""
     generator = torch.Generator().manual_seed(0)
-    rounds = [torch.randperm(count, generator=generator) for _ in range(PASSES)]
+    rounds = [torch.randperm(count, generator=generator) for _ in range(STEPS_PER_VIEW)]
     return torch.cat(rounds).tolist()

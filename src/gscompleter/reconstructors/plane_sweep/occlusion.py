@@ -24,7 +24,7 @@ class Neighbour:
     this_from_other: Float32[np.ndarray, "3 4"]
 
 
-def hidden_from_others(background: Map, neighbours: Sequence[Neighbour]) -> Mask:
+def find_hidden(background: Map, neighbours: Sequence[Neighbour]) -> Mask:
     """Mark background surfaces that some view occludes and no view observes."""
     hidden = np.zeros(background.shape, bool)
     seen = np.zeros(background.shape, bool)

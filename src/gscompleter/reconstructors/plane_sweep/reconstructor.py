@@ -10,20 +10,29 @@ import torch
 from jaxtyping import Bool
 from torch import Tensor
 
-from gscompleter.kernels.sharing import side_by_side
-from gscompleter.matching.depth_range import depth_range_of
-from gscompleter.matching.stereo_image import StereoImage
+from gscompleter.kernels.parallel import map_in_parallel
+from gscompleter.reconstructors.features.depth_range import get_depth_range
+from gscompleter.reconstructors.features.stereo_image import StereoImage
 from gscompleter.reconstructors.plane_sweep.confidence import Mask
+from gscompleter.reconstructors.plane_sweep.depth_to_gaussians import Splatter
 from gscompleter.reconstructors.plane_sweep.fusion import Layer
-from gscompleter.reconstructors.plane_sweep.measuring import Measured, inverse_at, measured
-from gscompleter.reconstructors.plane_sweep.open_sky import skies, sky_above, sky_shown, without
-from gscompleter.reconstructors.plane_sweep.rig import Rig, rig_of
-from gscompleter.reconstructors.plane_sweep.splatter import Splatter
+from gscompleter.reconstructors.plane_sweep.rig import Rig, build_rig
+from gscompleter.reconstructors.plane_sweep.sky_mask import (
+    exclude_pixels,
+    find_skies,
+    find_sky,
+    transfer_sky,
+)
 from gscompleter.reconstructors.plane_sweep.surfaces import fit_surfaces
+from gscompleter.reconstructors.plane_sweep.sweep import (
+    Measurement,
+    compute_inverse_depth,
+    measure_depths,
+)
 from gscompleter.sky import SKY_DEPTH, is_sky
 from gscompleter.types import DepthMap, Reconstruction, View
 
-HALVED_FROM = 192
+MIN_HALVED_SIDE = 192
 """Shortest side, in pixels, from which three or more images are matched at half size."""
 
 
@@ -39,72 +48,74 @@ class PlaneSweep(Splatter):
         Raises:
             InputError: There are fewer than two views, no baseline, or the depth range is empty.
         """
-        views = ranged(views)
-        rig = rig_of(views)
-        layers = self.layers(rig, views)
-        return self.scene(views, depth_maps(layers, rig.unit, views), layers, rig.transforms)
+        views = set_depth_range(views)
+        rig = build_rig(views)
+        layers = self.compute_layers(rig, views)
+        return self.build_scene(
+            views, make_depth_maps(layers, rig.unit, views), layers, rig.transforms
+        )
 
-    def lift(self, views: Sequence[View], wanted: Bool[Tensor, "h w"]) -> Reconstruction:
+    def lift(self, views: Sequence[View], pixel_mask: Bool[Tensor, "h w"]) -> Reconstruction:
         """Lift the pixels of `pixel_mask` in the first view, a synthesized image.
 
         No photograph observes a hole, so its opacities are not fitted; its depth continues the
         surfaces around it, at full size. Colours are fitted to the image itself. The sky gets no
         depth.
         """
-        views = ranged(views)
-        rig = rig_of(views)
-        first, second = matched(rig, views)
-        open_there = sky_above(rig.images[1], second)
+        views = set_depth_range(views)
+        rig = build_rig(views)
+        first, second = match_views(rig, views)
+        open_there = find_sky(rig.images[1], second)
         layers = [
-            surfaces_of(rig.images[0], without(first, sky_shown(rig, open_there))),
-            as_measured(rig.images[1], without(second, open_there)),
+            complete_surfaces(rig.images[0], exclude_pixels(first, transfer_sky(rig, open_there))),
+            make_measured_layer(rig.images[1], exclude_pixels(second, open_there)),
         ]
-        return self.wanted_of(views, depth_maps(layers, rig.unit, views), wanted)
+        return self.lift_pixels(views, make_depth_maps(layers, rig.unit, views), pixel_mask)
 
-    def depths(self, views: Sequence[View]) -> list[DepthMap]:
+    def estimate_depths(self, views: Sequence[View]) -> list[DepthMap]:
         """Estimate z-depth and confidence of every pixel, in scene units."""
-        views = ranged(views)
-        rig = rig_of(views)
-        return depth_maps(self.layers(rig, views), rig.unit, views)
+        views = set_depth_range(views)
+        rig = build_rig(views)
+        return make_depth_maps(self.compute_layers(rig, views), rig.unit, views)
 
-    def layers(self, rig: Rig, views: Sequence[View]) -> list[Layer]:
+    def compute_layers(self, rig: Rig, views: Sequence[View]) -> list[Layer]:
         """Compute the completed inverse depth of each view."""
-        found = matched(rig, views)
-        seen = skies(rig, found)
-        surfaces = side_by_side(surfaces_of, rig.images, map(without, found, seen))
-        return list(map(before_sky, surfaces, found, seen))
+        found = match_views(rig, views)
+        seen = find_skies(rig, found)
+        surfaces = map_in_parallel(complete_surfaces, rig.images, map(exclude_pixels, found, seen))
+        return list(map(add_sky, surfaces, found, seen))
 
 
-def ranged(views: Sequence[View]) -> list[View]:
+def set_depth_range(views: Sequence[View]) -> list[View]:
     """Give all views the same depth range, estimated if unknown."""
-    near, far = depth_range_of(views)
+    near, far = get_depth_range(views)
     return [replace(v, camera=replace(v.camera, near=near, far=far)) for v in views]
 
 
-def matched(rig: Rig, views: Sequence[View]) -> list[Measured]:
+def match_views(rig: Rig, views: Sequence[View]) -> list[Measurement]:
     """Measure depth outside the ignored pixels, at half size for three or more large views."""
-    is_halved = len(views) > 2 and min(min(image.size) for image in rig.images) >= HALVED_FROM
-    found = measured(rig.halved() if is_halved else rig, *depth_range_of(views))
+    is_halved = len(views) > 2 and min(min(image.size) for image in rig.images) >= MIN_HALVED_SIDE
+    found = measure_depths(rig.halve() if is_halved else rig, *get_depth_range(views))
     return [
-        one if image.ignored is None else without(one, image.ignored)
+        one if image.ignore_mask is None else exclude_pixels(one, image.ignore_mask)
         for one, image in zip(found, rig.images, strict=True)
     ]
 
 
-def surfaces_of(image: StereoImage, found: Measured) -> Layer:
+def complete_surfaces(image: StereoImage, found: Measurement) -> Layer:
     """Fit surfaces to the measured depths of a view."""
-    full = found.at_size(image.size)
+    full = found.resize_to(image.size)
     heights = fit_surfaces(full.index, full.weight, image.image)
-    return Layer(image, inverse_at(full.planes, heights), full.confidence)
+    return Layer(image, compute_inverse_depth(full.planes, heights), full.confidence)
 
 
-def as_measured(image: StereoImage, found: Measured) -> Layer:
+def make_measured_layer(image: StereoImage, found: Measurement) -> Layer:
     """Convert the measured depths of a view without surface completion."""
-    full = found.at_size(image.size)
-    return Layer(image, inverse_at(full.planes, full.index), full.confidence)
+    full = found.resize_to(image.size)
+    return Layer(image, compute_inverse_depth(full.planes, full.index), full.confidence)
 
 
-def before_sky(layer: Layer, found: Measured, sky: Mask) -> Layer:
+def add_sky(layer: Layer, found: Measurement, sky: Mask) -> Layer:
     """Set the sky of a layer to the sky depth, with full confidence."""
     beyond = np.float32(found.planes[0] / SKY_DEPTH)
     inverse = np.where(sky, beyond, layer.inverse)
@@ -113,7 +124,7 @@ def before_sky(layer: Layer, found: Measured, sky: Mask) -> Layer:
     )
 
 
-def depth_maps(layers: Sequence[Layer], unit: float, views: Sequence[View]) -> list[DepthMap]:
+def make_depth_maps(layers: Sequence[Layer], unit: float, views: Sequence[View]) -> list[DepthMap]:
     """Convert layers to z-depths in scene units; the sky is not valid."""
     depths = []
     for layer, view in zip(layers, views, strict=True):

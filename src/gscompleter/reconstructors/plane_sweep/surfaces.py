@@ -11,9 +11,9 @@ import numpy as np
 import torch
 from jaxtyping import Float32
 
-from gscompleter.interpolation import fill_smoothly
-from gscompleter.kernels import variation
-from gscompleter.matching.stereo_image import contrast
+from gscompleter.image_ops import fill_smoothly
+from gscompleter.kernels import tgv
+from gscompleter.reconstructors.features.stereo_image import compute_contrast
 
 Image = Float32[np.ndarray, "h w 3"]
 Map = Float32[np.ndarray, "h w"]
@@ -27,7 +27,7 @@ BEND_PENALTY = 12.0
 """Cost of a gradient change by one plane per pixel."""
 EDGE_CONTRAST = 0.1
 """Colour difference at which the cost of a step falls to 1/e."""
-LEAST_PENALTY = 0.02
+MIN_STEP_SHARE = 0.02
 """Relative cost of a step at the strongest edge."""
 TOLERANCE = 0.15
 """Measurement error without cost, in planes."""
@@ -43,39 +43,39 @@ def fit_surfaces(measured: Map, confidence: Map, image: Image) -> Map:
         return measured
     levels: list[Level] = [(measured, confidence, image)]
     while len(levels) < LEVELS and min(levels[-1][0].shape) > 4:
-        levels.append(halved(*levels[-1]))
-    heights = beginning(*levels[-1][:2])
+        levels.append(halve_level(*levels[-1]))
+    heights = fill_unmeasured(*levels[-1][:2])
     gradients = np.zeros((2, *heights.shape), np.float32)
     for number, (data, weight, colours) in reversed(list(enumerate(levels))):
         if heights.shape != data.shape:
-            heights = doubled(heights, data.shape)
-            gradients = np.stack([doubled(part, data.shape) / 2 for part in gradients])
+            heights = upsample_bilinear(heights, data.shape)
+            gradients = np.stack([upsample_bilinear(part, data.shape) / 2 for part in gradients])
         # A coarse pixel covers 4 ** number fine ones, and its steps are 2 ** number times higher.
         scale = 2.0**number
-        across, down = (cost / np.float32(scale) for cost in step_costs(colours))
+        across, down = (cost / np.float32(scale) for cost in compute_step_costs(colours))
         bend, tolerance = np.float32(BEND_PENALTY / scale**2), np.float32(TOLERANCE)
         steps = ITERATIONS * 2**number
-        variation.fit(heights, gradients, data, weight, across, down, bend, tolerance, steps)
+        tgv.fit(heights, gradients, data, weight, across, down, bend, tolerance, steps)
     return heights
 
 
-def beginning(data: AnyMap, weight: AnyMap) -> AnyMap:
+def fill_unmeasured(data: AnyMap, weight: AnyMap) -> AnyMap:
     """Continue the measurements smoothly as a starting point."""
     return fill_smoothly(torch.from_numpy(data), torch.from_numpy(weight > 0)).numpy().copy()
 
 
-def step_costs(image: Image) -> tuple[Map, Map]:
+def compute_step_costs(image: Image) -> tuple[Map, Map]:
     """Compute the cost of a step to the right and lower neighbour; low at edges."""
 
     def cost(beside: Image) -> Map:
-        share = np.maximum(np.exp(-contrast(image, beside) / EDGE_CONTRAST), LEAST_PENALTY)
+        share = np.maximum(np.exp(-compute_contrast(image, beside) / EDGE_CONTRAST), MIN_STEP_SHARE)
         return (STEP_PENALTY * share).astype(np.float32)
 
     right, below = np.append(image[:, 1:], image[:, -1:], 1), np.append(image[1:], image[-1:], 0)
     return cost(right), cost(below)
 
 
-def halved(data: Map, weight: Map, image: Image) -> Level:
+def halve_level(data: Map, weight: Map, image: Image) -> Level:
     """Halve a pyramid level; measurements are averaged by weight."""
     h, w = data.shape
     size = (h + 1) // 2, (w + 1) // 2
@@ -91,6 +91,6 @@ def halved(data: Map, weight: Map, image: Image) -> Level:
     return mean, total / area, smaller
 
 
-def doubled(values: AnyMap, shape: tuple[int, ...]) -> AnyMap:
+def upsample_bilinear(values: AnyMap, shape: tuple[int, ...]) -> AnyMap:
     """Upsample bilinearly to `shape`."""
     return cv2.resize(values, (shape[1], shape[0]), interpolation=cv2.INTER_LINEAR)

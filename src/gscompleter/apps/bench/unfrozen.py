@@ -1,0 +1,24 @@
+"""Plain autograd over the same renderer, to measure the benefit of a frozen context."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+from gscompleter.render import Renderer
+from gscompleter.render.reference import ReferenceFrozenScene
+from gscompleter.types import Camera, Gaussians, Render
+
+
+@dataclass(frozen=True)
+class UnfrozenRenderer:
+    """A renderer that renders and differentiates the whole scene in every iteration."""
+
+    renderer: Renderer
+
+    def render(self, gaussians: Gaussians, camera: Camera) -> Render:
+        """Render as the wrapped renderer does."""
+        return self.renderer.render(gaussians, camera)
+
+    def freeze(self, context: Gaussians, camera: Camera) -> ReferenceFrozenScene:
+        """Return a scene that is rendered anew with every call."""
+        return ReferenceFrozenScene(self.renderer, context, camera)

@@ -1,0 +1,136 @@
+"""The command `clean`: remove floaters from a splat."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import torch
+from jaxtyping import Bool
+from rich.console import Console
+from torch import Tensor
+
+from gscompleter import __version__
+from gscompleter.apps.commands.options import CleanOptions
+from gscompleter.apps.commands.output import (
+    describe_opened,
+    describe_settings,
+    is_replaceable,
+    report_interrupts,
+)
+from gscompleter.apps.inputs.opening import (
+    Task,
+    apply_working_range,
+    check_context,
+    move_to_splat,
+    open_scene,
+    print_lines,
+    read_photographs,
+)
+from gscompleter.apps.inputs.plan import describe_opening
+from gscompleter.apps.report.completion import save_completed_splat
+from gscompleter.apps.warmup.compilation import compile_kernels
+from gscompleter.cleaning import find_superfluous
+from gscompleter.completer import Clock
+from gscompleter.errors import InputError, quote_value
+from gscompleter.evaluation.metrics.image import psnr
+from gscompleter.io.files import SUMMARY_FILE, check_output, open_output_folder
+from gscompleter.progress import show_preparation, show_progress, stage, track
+from gscompleter.render import Renderer, choose_device, load_renderer
+from gscompleter.splats.formats import load_splat
+from gscompleter.types import Gaussians
+
+
+def run_clean(options: CleanOptions) -> None:
+    """Clean the splat, and print a summary."""
+    with report_interrupts(options.out):
+        summary = clean_splat(options)
+        if not options.quiet:
+            print_cleaning(summary, options.out)
+
+
+def clean_splat(options: CleanOptions) -> dict[str, Any]:
+    """Clean the splat, write `options.out`, and return the summary."""
+    console = Console(stderr=True, quiet=options.quiet)
+    check_output(options.out, is_replaceable(options))
+    check_context(options)
+    device = choose_device(options.device)
+    renderer, clock = load_renderer(device), Clock(())
+    with show_progress(None if options.quiet else console):
+        opened = open_scene(options, console)
+        with show_preparation("reading photographs"):
+            task = read_photographs(options, opened, device)
+        with show_preparation("reading the scene"):
+            given = load_splat(options.scene, options.drop_nonfinite)
+        compile_kernels([device])
+        with show_preparation("aligning the scene"):
+            task = move_to_splat(task, given, options.scene, options, opened)
+        task = apply_working_range(task, renderer)
+        plan = f"compared with {len(task.views)} photographs on {device}"
+        plan += f", written to {quote_value(options.out)}"
+        print_lines(console, *describe_opening(options, opened, task), f"To do: {plan}.")
+        with open_output_folder(options.out, is_replaceable(options)) as folder:
+            with clock("clean"):
+                removed = find_superfluous(get_splat(task), task.views, renderer, options.config)
+            settings = describe_settings(options, options.config, targets={}, models={})
+            facts = {
+                "settings": settings,
+                "device": device,
+                **describe_opened(options, opened, task),
+            }
+            summary = facts | score_cleaning(task, removed, renderer) | {"seconds": clock.seconds}
+            with stage("writing"):
+                write_cleaned(folder, task, removed, {"version": __version__, **summary})
+    return summary
+
+
+def get_splat(task: Task) -> Gaussians:
+    """Return the input splat."""
+    assert task.scene is not None
+    return task.scene
+
+
+def score_cleaning(task: Task, taken: Bool[Tensor, "n"], renderer: Renderer) -> dict[str, Any]:
+    """Count the removed Gaussians, and compute PSNR (dB) before and after."""
+    given = get_splat(task)
+    rows = []
+    for view in track(task.views, "scores"):
+        before, after = (
+            psnr(renderer.render(scene, view.camera).image, view.image)
+            for scene in (given, given[~taken])
+        )
+        rows.append({"frame": view.frame, "psnr_before": before, "psnr_after": after})
+    removed = int(taken.sum())
+    counts = {"given": len(given), "kept": len(given) - removed, "removed": removed}
+    return {"photographs": rows, "gaussians": counts}
+
+
+def write_cleaned(
+    folder: Path, task: Task, taken: Bool[Tensor, "n"], summary: Mapping[str, Any]
+) -> None:
+    """Write the cleaned splat, the removed Gaussians and the summary."""
+    given = get_splat(task)
+    if taken.all():
+        raise InputError(
+            "Every Gaussian of the splat makes the photographs worse; check that they show the "
+            "same scene."
+        )
+    assert task.splat_file is not None
+    save_completed_splat(folder, given, taken, given[:0], task.splat_file)
+    (folder / SUMMARY_FILE).write_text(json.dumps(summary, indent=2) + "\n")
+
+
+def print_cleaning(summary: Mapping[str, Any], out: Path) -> None:
+    """Print the numbers of Gaussians and the change of PSNR."""
+    rows, counts = summary["photographs"], summary["gaussians"]
+    before, after = (
+        torch.tensor([row[f"psnr_{when}"] for row in rows]) for when in ("before", "after")
+    )
+    print(
+        f"{counts['removed']:,} of {counts['given']:,} Gaussians removed in "
+        f"{summary['seconds']['total']:.1f} s; mean PSNR of the photographs {before.mean():.2f} dB "
+        f"before, {after.mean():.2f} dB after, worst change {(after - before).min():+.3f} dB: "
+        f"{out / 'completed.ply'}"
+    )

@@ -1,0 +1,42 @@
+"""The engine selected by a command's options."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+
+from gscompleter.apps.commands.options import EngineOptions
+from gscompleter.cpu_threads import count_available_cores, limit_threads
+from gscompleter.errors import InputError, quote_value
+from gscompleter.jobs.engines import Engine
+from gscompleter.jobs.engines.local import LocalEngine, choose_num_workers
+from gscompleter.jobs.engines.ray import RayEngine
+from gscompleter.jobs.engines.submitit import SubmititEngine
+from gscompleter.jobs.places import is_address
+from gscompleter.jobs.rounds import run_in_this_process
+
+
+def parse_pairs(words: Sequence[str], option: str) -> dict[str, str]:
+    """Parse `NAME=VALUE` words."""
+    for word in words:
+        if not word.partition("=")[0] or "=" not in word:
+            raise InputError(
+                f"'{quote_value(word)}' is not NAME=VALUE, as in resolution=256.", option
+            )
+    return dict(tuple(word.split("=", 1)) for word in words)  # type: ignore[misc]
+
+
+def make_engine(options: EngineOptions, out: str) -> Engine:
+    """Create the engine. On this machine it also sets the threads, which workers inherit."""
+    if options.engine is None:
+        return run_in_this_process
+    threads = options.threads or 1
+    if options.engine == "ray":
+        return RayEngine(options.workers, threads, options.gpus, options.address)
+    if options.engine == "submitit":
+        kept = "submitit" if is_address(out) else f"{out}/submitit"
+        slurm = parse_pairs(options.slurm, "slurm")
+        return SubmititEngine(options.workers or 1, threads, options.gpus, Path(kept), slurm)
+    workers = options.workers or choose_num_workers()
+    limit_threads(options.threads or max(1, count_available_cores() // workers))
+    return LocalEngine(workers)

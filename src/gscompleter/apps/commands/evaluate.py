@@ -1,0 +1,262 @@
+"""The commands `evaluate`, `write_tables` and `index`."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Iterator, Sequence
+from dataclasses import replace
+from itertools import islice
+from pathlib import Path
+from typing import Any
+
+from rich.console import Console
+from rich.table import Table
+
+from gscompleter.apps.commands.engines import make_engine
+from gscompleter.apps.commands.options import (
+    LONG_SIDE,
+    EvaluateOptions,
+    IndexOptions,
+    Size,
+    TablesOptions,
+    parse_resolution,
+)
+from gscompleter.apps.report.evaluation_page import render_evaluation_page
+from gscompleter.apps.report.page import write_page
+from gscompleter.apps.warmup.compilation import compile_kernels
+from gscompleter.data.cases import Case, SkippedScene, filter_usable, open_clips, read_cases
+from gscompleter.data.formats import open_photographs
+from gscompleter.data.resize import check_resolution
+from gscompleter.errors import InputError, quote_value
+from gscompleter.evaluation.methods import expand_methods
+from gscompleter.evaluation.plots import PlotsNotAvailable, draw_plots
+from gscompleter.evaluation.protocols import (
+    ViewByView,
+    build_index,
+    parse_protocol,
+    write_evaluation_index,
+)
+from gscompleter.evaluation.runner import RunConfig, evaluate
+from gscompleter.evaluation.store import list_row_paths
+from gscompleter.evaluation.summary import RunSummary
+from gscompleter.evaluation.tables import format_score_cells, write_tables
+from gscompleter.evaluation.tasks import Task, make_case_task, make_tasks
+from gscompleter.jobs.shards import parse_shard
+from gscompleter.progress import show_preparation, show_progress
+from gscompleter.render import choose_device
+
+
+def run_evaluation(options: EvaluateOptions) -> None:
+    """Run and score the methods on the cases, and write the tables."""
+    if not options.paths:
+        raise InputError("No data is given; name a cases.json, or scenes with --protocol.")
+    console = Console(stderr=True, quiet=options.quiet, highlight=False)
+    methods = expand_methods(options.methods)
+    shard = parse_shard(options.shard, os.environ)
+    if options.resolution is not None:
+        check_resolution(parse_resolution(options.resolution))
+    skipped: list[SkippedScene] = []
+    notes: list[str] = []
+    shown = None if options.quiet else console
+    with show_progress(shown), show_preparation("reading cases"):
+        tasks = collect_tasks(options, skipped, notes)
+    for note in dict.fromkeys(notes):
+        console.print(note, markup=False, soft_wrap=True)
+    print_skipped(skipped, console)
+    config = RunConfig(
+        reconstructor=options.reconstructor,
+        weights=None if options.weights is None else str(options.weights),
+        generator=options.synthesis.name,
+        generator_settings=options.synthesis.make_settings(),
+        device=choose_device(options.device),
+        seed=options.seed,
+        source=describe_source(options),
+    )
+    engine = make_engine(options, str(options.out.resolve()))
+    with show_progress(shown):
+        compile_kernels((config.device, config.reconstructor, config.generator))
+        counts = evaluate(tasks, methods, options.out, config, shard, options.rerun, engine)
+        line = f"Scored {counts.done}, failed {counts.failed}, scored earlier {counts.skipped}."
+        console.print(line)
+        # A shard without cases has no tables.
+        if counts.done + counts.failed + counts.skipped > 0:
+            write_and_print_tables(options.out, options.quiet, num_rows=len(tasks) * len(methods))
+
+
+def describe_source(options: EvaluateOptions) -> dict[str, Any]:
+    """Describe the cases, as an output folder records them."""
+    size = get_resolution(options) if options.protocol else options.resolution
+    return {
+        "paths": [path.resolve().name for path in options.paths],
+        "protocols": list(options.protocol),
+        "resolution": list(size) if isinstance(size, tuple) else size,
+        **({"ignore_masked": True} if options.use_masks else {}),
+        **({"one_per_scene": True} if options.one_per_scene else {}),
+        **({} if options.ego_mask else {"ego_mask": False}),
+    }
+
+
+def run_tables(options: TablesOptions) -> None:
+    """Write the tables and plots of an evaluation, and print the tables."""
+    with show_progress(None if options.quiet else Console(stderr=True)):
+        write_and_print_tables(options.out, options.quiet, options.fid)
+
+
+def write_and_print_tables(
+    out: Path, quiet: bool, with_fid: bool = False, num_rows: int = 0
+) -> None:
+    """Write the tables, plots and page of an evaluation, and print the tables unless `quiet`.
+
+    It repeats this if other shards added rows meanwhile and all `num_rows` are there.
+    """
+    seen, there = None, list_row_times(out)
+    while seen is None or (there != seen and len(there) >= num_rows):
+        seen = there
+        with show_preparation("tables"):
+            summary = write_tables(out, with_fid)
+            try_plots(summary, out, quiet)
+            write_page(out, render_evaluation_page(out))
+        there = list_row_times(out)
+    if not quiet:
+        print_tables(summary, out)
+
+
+def list_row_times(out: Path) -> dict[Path, int]:
+    """Return the files of scores with their modification times."""
+    return {path: path.stat().st_mtime_ns for path in list_row_paths(out)}
+
+
+def try_plots(summary: RunSummary, out: Path, quiet: bool) -> None:
+    """Draw the plots, or print the missing requirement."""
+    try:
+        draw_plots(summary, out)
+    except PlotsNotAvailable as missing:
+        if not quiet:
+            Console(stderr=True).print(str(missing), highlight=False, markup=False)
+
+
+def run_index(options: IndexOptions) -> None:
+    """Write the evaluation index of a protocol for a data set."""
+    if options.out.exists() and not options.overwrite:
+        raise InputError(f"{options.out} exists; name another file, or use --overwrite.")
+    skipped: list[SkippedScene] = []
+    protocol = parse_protocol(options.protocol)
+    with (
+        show_progress(None if options.quiet else Console(stderr=True)),
+        show_preparation("reading clips"),
+    ):
+        index = build_index(protocol, filter_usable(open_clips(options.path), skipped))
+    index = replace(index, skipped=(*index.skipped, *(clip.name for clip in skipped)))
+    write_evaluation_index(options.out, index)
+    console = Console(quiet=options.quiet, highlight=False)
+    print_skipped(skipped, console)
+    targets = sum(len(split.targets) for splits in index.scenes.values() for split in splits)
+    console.print(
+        f"{targets} cases in {len(index.scenes)} scenes, {len(index.skipped)} scenes skipped: "
+        f"{options.out}",
+        soft_wrap=True,
+    )
+
+
+def get_resolution(options: EvaluateOptions) -> Size:
+    """Return the working size of scenes."""
+    return LONG_SIDE if options.resolution is None else options.resolution
+
+
+def collect_tasks(
+    options: EvaluateOptions, skipped: list[SkippedScene], notes: list[str]
+) -> list[Task]:
+    """Collect the tasks of the options, and append to `skipped` and `notes`."""
+    if not options.protocol:
+        files = [find_cases_file(path) for path in options.paths]
+        cases = [case for file in files for case in read_cases(file)]
+        if options.one_per_scene:
+            cases = select_first_cases(cases)
+        cases = cases[: options.limit]
+        notes += collect_scene_notes(cases)
+        if options.resolution is not None:
+            size = parse_resolution(options.resolution)
+            cases = [replace(case, resolution=size) for case in cases]
+        if options.use_masks:
+            cases = [replace(case, ignore_masked=True) for case in cases]
+        cases = [replace(case, ego_mask=options.ego_mask) for case in cases]
+        return [make_case_task(case) for case in cases]
+    return list(islice(iterate_tasks(options, skipped, notes), options.limit))
+
+
+def select_first_cases(cases: Sequence[Case]) -> list[Case]:
+    """Select the first case of each scene."""
+    first: dict[Path, Case] = {}
+    for case in cases:
+        first.setdefault(case.scene, case)
+    return list(first.values())
+
+
+def collect_scene_notes(cases: Sequence[Case]) -> Iterator[str]:
+    """Collect the notes on the scenes of cases. Scenes that cannot be opened have none."""
+    for scene in dict.fromkeys(case.scene for case in cases):
+        try:
+            yield from open_photographs(scene).notes
+        except InputError:
+            continue
+
+
+def iterate_tasks(
+    options: EvaluateOptions, skipped: list[SkippedScene], notes: list[str]
+) -> Iterator[Task]:
+    """Iterate over the tasks of the protocols, clip by clip."""
+    protocols = [parse_protocol(text) for text in options.protocol]
+    for path in options.paths:
+        for clip in filter_usable(open_clips(path), skipped):
+            notes += clip.notes
+            if options.use_masks and not clip.has_masks:
+                raise InputError(
+                    f"{clip.name} has neither masks nor boxes of moving objects; leave --use-masks "
+                    "out."
+                )
+            clip = clip if options.ego_mask else clip.keep_ego_vehicle()
+            for protocol in protocols:
+                if isinstance(protocol, ViewByView) and (reason := protocol.explain_skip(clip)):
+                    skipped.append(SkippedScene(clip.name, reason))
+                size = parse_resolution(get_resolution(options))
+                tasks = make_tasks(protocol, clip, size, options.use_masks)
+                yield from tasks[:1] if options.one_per_scene else tasks
+
+
+def find_cases_file(path: Path) -> Path:
+    """Find the cases.json that `path` is or contains."""
+    if not os.path.exists(path):
+        raise InputError(
+            f"There is no '{quote_value(path)}'; name a cases.json, or scenes with --protocol."
+        )
+    file = path / "cases.json" if os.path.isdir(path) else path
+    if file.suffix != ".json" or not os.path.isfile(file) or file.name == "transforms.json":
+        raise InputError(
+            f"{path} defines no context and target frames; add --protocol, as in --protocol n-10."
+        )
+    return file
+
+
+def print_skipped(skipped: Sequence[SkippedScene], console: Console) -> None:
+    """Print the skipped clips with the reasons."""
+    for clip in skipped:
+        console.print(f"Skipped {clip.name}: {clip.reason}.")
+
+
+def print_tables(summary: RunSummary, out: Path) -> None:
+    """Print the tables, transposed: one column per method."""
+    table = Table("", *summary.methods, box=None)
+    columns = summary.find_present_columns(summary.columns)
+    cells = format_score_cells(summary, columns)
+    for number, column in enumerate(columns, start=1):
+        table.add_row(column.title, *(row[number] for row in cells))
+    if summary.common_tasks:
+        table.add_row(
+            "seconds", *(f"{summary.compute_seconds(m)['total']:.1f}" for m in summary.methods)
+        )
+    console = Console(highlight=False)
+    console.print(table)
+    for case, method, reason in summary.failures:
+        console.print(f"Failed: {case}, {method}: {reason}", markup=False)
+    over = f"Over {len(summary.common_tasks)} of {len(summary.tasks)} cases"
+    console.print(f"{over}: {out / 'tables.md'}", soft_wrap=True)

@@ -1,0 +1,86 @@
+"""The command `models`: published weights as a table or JSON."""
+
+from __future__ import annotations
+
+import json
+import sys
+from dataclasses import asdict
+from pathlib import Path
+
+from rich.console import Console
+from rich.table import Table
+
+from gscompleter.apps.commands.options import ModelsOptions
+from gscompleter.models.weights.fetching import (
+    INSTALL,
+    find_cached,
+    get_cache_path,
+    is_hub_installed,
+)
+from gscompleter.models.weights.published import PUBLISHED, PublishedWeights
+
+MAX_LINE_WIDTH = 1000
+
+
+def run_models(options: ModelsOptions) -> None:
+    """Print the published weights and their location on this machine."""
+    found = {name: find_cached(weights) for name, weights in PUBLISHED.items()}
+    if options.json:
+        print(
+            json.dumps(
+                [describe_weights(PUBLISHED[name], path) for name, path in found.items()], indent=2
+            )
+        )
+    else:
+        print_models(found)
+
+
+def describe_weights(weights: PublishedWeights, path: Path | None) -> dict[str, object]:
+    """Describe weights and their location."""
+    return {
+        **asdict(weights),
+        "url": weights.url,
+        "pinned_by": weights.integrity_check,
+        "cached": None if path is None else str(path),
+        "place": str(get_cache_path(weights)),
+    }
+
+
+def print_models(found: dict[str, Path | None]) -> None:
+    """Print the table and its footnotes."""
+    table = Table(box=None)
+    for title in ("name", "model", "parameters", "views", "size", "code / weights", "cached"):
+        table.add_column(title, no_wrap=title == "name")
+    table.add_column("source", overflow="fold")
+    for name, path in found.items():
+        table.add_row(*format_cells(PUBLISHED[name], path))
+    # Rows are not wrapped in a file or a pipe.
+    console = Console(
+        width=None if sys.stdout.isatty() else MAX_LINE_WIDTH, markup=False, highlight=False
+    )
+    console.print(table)
+    cautions: dict[str, list[str]] = {}
+    for weights in PUBLISHED.values():
+        if weights.caution:
+            cautions.setdefault(weights.caution, []).append(weights.name)
+    print("\n(!) Whether commercial use is allowed is unclear:")
+    for caution, names in cautions.items():
+        print(f"    {', '.join(names)}: {caution}.")
+    if not is_hub_installed():
+        print(f"\nThe hub's cache was not searched, for lack of huggingface_hub: {INSTALL}")
+
+
+def format_cells(weights: PublishedWeights, path: Path | None) -> tuple[str, ...]:
+    """Format a row of the table."""
+    fewest, most = weights.views
+    count = weights.parameters
+    return (
+        weights.name,
+        weights.model if weights.gives == "Gaussians" else f"{weights.model}, {weights.gives} only",
+        "?" if count is None else f"{count / 1e6:.1f} M",
+        f"{fewest}" if fewest == most else f"{fewest}-{most}",
+        weights.size,
+        f"{weights.code_licence} / {weights.weights_licence}{' (!)' if weights.caution else ''}",
+        "no" if path is None else str(path),
+        weights.source,
+    )

@@ -1,0 +1,359 @@
+"""Options of the commands, from which the command line is derived. Nothing here needs torch."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Annotated, Literal
+
+import tyro
+from annotated_types import Interval
+
+from gscompleter.apps.commands.generator_options import GeneratorOptions
+from gscompleter.config import CompleterConfig
+from gscompleter.config.cleaning import CleaningConfig
+from gscompleter.config.settings import Seed, Settings
+from gscompleter.jobs.engines import EngineName
+
+Frame = Annotated[int, Interval(ge=0, lt=10**9)]
+Port = Annotated[int, Interval(ge=0, le=65535)]
+Device = Literal["auto", "cpu", "cuda"]
+Size = tuple[int, int] | int | Literal["full"]
+"""Height and width, the longest side, or `full` for the photographs' own size."""
+LONG_SIDE = 640
+"""Default length of a photograph's longer side, in pixels."""
+
+DEFAULT_NUM_TARGETS = 4
+"""Default number of target cameras that are searched for."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Options(Settings):
+    """Options of every command that writes something."""
+
+    quiet: bool = False
+    """Print errors only."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class ComputeOptions(Options):
+    """Options of every command that computes for long."""
+
+    threads: Annotated[int, Interval(ge=1, le=1024)] | None = None
+    """CPU threads to compute with; all available cores if not given. The result does not depend on
+    it."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class RunOptions(ComputeOptions):
+    """Options of every command that completes scenes."""
+
+    device: Device = "auto"
+    """Device to compute on; `auto` takes an NVIDIA GPU if there is one."""
+    seed: Seed = 0
+    """Seed of all random numbers. The same seed gives the same files on a CPU."""
+
+    @property
+    def models(self) -> tuple[str, ...]:
+        """Names of the models in use."""
+        return ()
+
+
+@dataclass(frozen=True, kw_only=True)
+class ModelOptions(RunOptions):
+    """Options of every command with a choice of models."""
+
+    reconstructor: str = "plane-sweep"
+    """Model that turns photographs into Gaussians: plane-sweep, which needs no weights, or one that
+    `gscompleter models` lists."""
+    weights: Path | None = None
+    """Weights file of the reconstructor; downloaded if not given."""
+    synthesis: Annotated[GeneratorOptions, tyro.conf.OmitArgPrefixes] = GeneratorOptions()
+
+    @property
+    def models(self) -> tuple[str, ...]:
+        """Names of the models in use."""
+        return self.reconstructor, self.synthesis.name
+
+
+@dataclass(frozen=True, kw_only=True)
+class SceneOptions(ComputeOptions):
+    """Options of every command that opens photographs with cameras."""
+
+    folder: Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="SCENE")]
+    """Folder of the photographs: COLMAP, nerfstudio, cameras.json, LLFF, KITTI, DGP, Waymo,
+    PandaSet, a pixelSplat chunk or a RealEstate10K camera file. If it has no cameras, COLMAP finds
+    them and they are kept in OUT/colmap."""
+    context: tuple[Frame, ...] | None = None
+    out: Path
+    format: str | None = None
+    """Format of SCENE: colmap, nerfstudio, cameras-json, llff, kitti, kitti-raw, dgp, waymo,
+    mmdet3d, pandaset, chunks or real-estate-10k. Detected if not given."""
+    scene: Path | None
+    resolution: Size = LONG_SIDE
+    """Working size: the longest side in pixels (photographs are never enlarged), or height and
+    width (photographs are scaled and cropped), or `full`."""
+    near: float | None = None
+    """Smallest depth in the scene, in the unit of its cameras; estimated if not given."""
+    far: float | None = None
+    """Largest depth in the scene, in the unit of its cameras; estimated if not given."""
+    drop_nonfinite: bool = False
+    """Drop Gaussians that contain NaN or infinity instead of refusing the file."""
+    overwrite: bool = False
+    """Replace the results of an earlier run in the output folder."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class CompletingOptions(SceneOptions, ModelOptions):
+    """Options of the commands that complete one scene."""
+
+    scene: Path | None = None
+    """File of Gaussians (a splat) to complete; its Gaussians are kept. If not given, the scene is
+    reconstructed from the photographs."""
+    no_prune: bool = False
+    """Keep Gaussians of the splat that cover a hole although no photograph shows them."""
+    config: Annotated[CompleterConfig, tyro.conf.FlagConversionOff] = CompleterConfig()
+    """Settings of the method. `--config NAME` selects default, paper, an ablation such as no-sa, or
+    a YAML file; the options here change single settings of it."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class CompleteOptions(CompletingOptions):
+    """Fill the parts of a scene that its photographs do not show, and write the result."""
+
+    context: tuple[Frame, ...] | None = None
+    """Frame numbers of the photographs to start from, counted in the order of their file paths. If
+    not given, those that help the targets most. Photographs of targets are never used."""
+    target: tuple[str, ...] = ()
+    """Cameras to complete the scene for: frame numbers, or a file of cameras (transforms.json,
+    cameras.json, COLMAP's images.txt, SuperSplat poses). If not given, cameras that see holes are
+    searched for and written to targets.json."""
+    auto: Annotated[int, Interval(ge=1, le=255)] | None = None
+    """Most cameras to search for if no target is given; 4 if no number follows."""
+    dry_run: bool = False
+    """Only search for cameras, write them to targets.json (to edit and to pass to --target), and
+    print the plan."""
+    out: Path
+    """Folder for the completed scene (completed.ply), the report (report.html), images and
+    summary.json."""
+    video: bool = False
+    """Also write video.mp4: a flight of six seconds through the holes, before and after side by
+    side."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class LiveOptions(CompletingOptions):
+    """Complete a scene in the browser: fly to a hole, press a button, and watch it close.
+
+    Every step can be undone. Saving writes the same files as `gscompleter complete`.
+    """
+
+    context: tuple[Frame, ...] | None = None
+    """Frame numbers of the photographs to start from, counted in the order of their file paths;
+    those that show most of the scene if not given."""
+    out: Path = Path("live")
+    """Output folder of the Save button."""
+    resolution: Size = (256, 256)
+    """Working size: height and width, the longest side in pixels, or `full`. Smaller is faster."""
+    port: Port = 0
+    """Port of the page; a free one if not given."""
+    host: str = "127.0.0.1"
+    """Address of the page. Anyone who can reach it can use it; the default is this computer
+    only."""
+    no_open: bool = False
+    """Print the address without opening a browser."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class CleanOptions(SceneOptions):
+    """Remove Gaussians of a splat that make its photographs worse or that none of them needs.
+
+    Nothing is generated, and no photograph loses more than 0.01 dB. `gscompleter strip` puts the
+    removed Gaussians back.
+    """
+
+    context: tuple[Frame, ...] | None = None
+    """Frame numbers of the photographs to compare with, counted in the order of their file paths;
+    all if not given. Gaussians that only other photographs need may be removed."""
+    out: Path
+    """Folder for completed.ply, removed.ply and summary.json."""
+    scene: Path
+    """File of Gaussians to clean."""
+    device: Device = "auto"
+    """Device to compute on."""
+    config: CleaningConfig = CleaningConfig()
+
+
+@dataclass(frozen=True, kw_only=True)
+class DemoOptions(RunOptions):
+    """Complete a stereo pair to the left and right of its cameras, and show before and after.
+
+    The photographs are the Middlebury motorcycle pair that scikit-image contains. Nothing is
+    downloaded.
+    """
+
+    out: Path = Path("demo")
+    """Folder for the scene, its completion and before_after.png."""
+    overwrite: bool = False
+    """Replace the results of an earlier run in the output folder."""
+
+    @property
+    def models(self) -> tuple[str, ...]:
+        """Names of the models in use."""
+        return ModelOptions().models
+
+
+@dataclass(frozen=True, kw_only=True)
+class EngineOptions(Options):
+    """Options of every command that can run on several machines."""
+
+    engine: EngineName | None
+    workers: Annotated[int, Interval(ge=1, le=100_000)] | None = None
+    """Number of workers; as many as fit if not given (one with SLURM)."""
+    threads: Annotated[int, Interval(ge=1, le=1024)] | None = None
+    """CPU threads of each worker; an equal share of the cores on this machine, one elsewhere if not
+    given."""
+    address: str | None = None
+    """Address of a running Ray cluster; a cluster is started here if not given."""
+    gpus: Annotated[float, Interval(ge=0, le=1024)] = 0.0
+    """GPUs per worker with Ray (also fractions) or SLURM."""
+    slurm: tuple[str, ...] = ()
+    """Parameters for SLURM with --engine submitit, as in --slurm partition=gpu time=120."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class EvaluateOptions(ModelOptions, EngineOptions):
+    """Run methods on cases with known target photographs, and score them.
+
+    Run the same command again to continue an interrupted evaluation. The tables are printed and
+    written at the end; `gscompleter tables OUT` writes them at any time.
+    """
+
+    paths: Annotated[tuple[Path, ...], tyro.conf.Positional, tyro.conf.arg(metavar="PATH")]
+    """A cases.json; or, with --protocol, scenes: folders with a transforms.json, folders of such
+    folders, pixelSplat chunks, RealEstate10K camera files, or drives (Waymo, nuScenes, KITTI, DDAD,
+    PandaSet; front camera)."""
+    out: Path
+    """Folder for the results; a folder of an earlier run is continued."""
+    protocol: tuple[str, ...] = ()
+    """Choice of context and target frames; one or several of: n-10 (frames n and n + 10 for n + 20,
+    then n + 20 and n + 10 for n, for n = 0, 21, 42, …); stress (0 and 30 for 99); sequence-4 or
+    sequence-4-steps-6 (start from frames 0 and 4, then complete 8, 12, … one after the other); or
+    the path of an evaluation index. A cases.json needs none."""
+    methods: tuple[str, ...] = ("context", "full", "paper")
+    """Methods to compare: context, full, paper, an ablation such as no-sa, densify-100,
+    densify-800, distill, reggs; or a group: ablations, baselines, all."""
+    rerun: Literal["nothing", "failures", "scores"] = "nothing"
+    """Cases of an earlier run to repeat: those that failed, or the scoring of all saved
+    predictions."""
+    shard: str | None = None
+    """Run every n-th case from the i-th on, given as i/n with i from 0; `auto` takes both from a
+    SLURM array. Processes without a shard share the work as well."""
+    engine: EngineName | None = None
+    """Engine that runs the cases; this process if not given."""
+    resolution: Size | None = None
+    """Working size as in `complete`; by default that of the cases."""
+    use_masks: bool = False
+    """Ignore image regions that the data set masks or marks as moving objects, in the methods and
+    in the scores."""
+    one_per_scene: bool = False
+    """Run only the first case of each scene, for each protocol. The paper has one case per
+    scene."""
+    ego_mask: bool = True
+    """Ignore image regions that stay the same while the camera moves, such as the bonnet of the car
+    that carries it, in the methods and in the scores."""
+    limit: Annotated[int, Interval(ge=1)] | None = None
+    """Most cases to run, over all shards."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class TablesOptions(Options):
+    """Print and write the tables of an evaluation, finished or not."""
+
+    out: Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="OUT")]
+    """Output folder of `evaluate`; tables and plots are written there."""
+    fid: bool = False
+    """Also compute the FID of each method."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class IndexOptions(Options):
+    """Write the frames that a protocol selects in a data set."""
+
+    path: Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="PATH")]
+    """Scenes as in `evaluate`."""
+    protocol: str
+    """Protocol as in `evaluate`."""
+    out: Path
+    """JSON file for the evaluation index."""
+    overwrite: bool = False
+    """Replace an existing file."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class BenchOptions(RunOptions):
+    """Measure how long completions take on this machine and how the time grows.
+
+    Every completion is a process of its own, start-up included; methods are compared within one
+    process. Times are also given relative to a yardstick: one forward and backward pass of the
+    renderer with 196,608 Gaussians at 256 x 256. Without a scene or cases the stereo pair of
+    `gscompleter demo` is measured.
+    """
+
+    folder: Annotated[Path | None, tyro.conf.Positional, tyro.conf.arg(metavar="SCENE")] = None
+    """Photographs with cameras as in `complete`; needs --context and --target."""
+    context: tuple[Frame, ...] = ()
+    """Frame numbers of the photographs to start from."""
+    target: tuple[Frame, ...] = ()
+    """Frame numbers to complete the scene for. Methods are compared on the first."""
+    resolution: tuple[int, int] = (256, 256)
+    """Working size, height and width, if --cases is not given."""
+    near: float | None = None
+    """Smallest depth in the scene, in the unit of its cameras; estimated if not given."""
+    far: float | None = None
+    """Largest depth in the scene, in the unit of its cameras; estimated if not given."""
+    cases: Path | None = None
+    """JSON file of cases and growth series instead of a scene, as benchmarks/performance.json.
+    Methods are compared on the first case."""
+    only: tuple[str, ...] = ()
+    """Names of the cases to measure; all if not given."""
+    methods: tuple[str, ...] = ("full", "autograd", "densify-800", "distill", "reggs")
+    """Methods to compare: full (ours), autograd (ours without a frozen context), densify-100,
+    densify-800, distill, reggs."""
+    growth: tuple[Literal["gaussians", "pixels", "views", "targets"], ...] = (
+        "gaussians",
+        "pixels",
+        "views",
+        "targets",
+    )
+    """Quantities to increase in the first case."""
+    repeats: Annotated[int, Interval(ge=1, le=1000)] = 5
+    """Number of repetitions."""
+    baseline_repeats: Annotated[int, Interval(ge=1, le=1000)] = 1
+    """Most repetitions of slow methods: all but full and autograd."""
+    quick: bool = False
+    """Run a quick check: the smallest case once, two iterations of the baselines, no growth."""
+    json: bool = False
+    """Print all measurements as JSON instead of tables."""
+    out: Path | None = None
+    """Folder for bench.json, tables.md and growth.png."""
+    overwrite: bool = False
+    """Replace the results of an earlier run in the output folder."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class ModelsOptions(Settings):
+    """List published model weights with their licences, and show which are downloaded."""
+
+    json: bool = False
+    """Print all details as JSON."""
+
+
+def get_max_targets(options: CompleteOptions) -> int:
+    """Return the number of targets to search for."""
+    return DEFAULT_NUM_TARGETS if options.auto is None else options.auto
+
+
+def parse_resolution(given: Size) -> tuple[int, int] | int | None:
+    """Return `--resolution` as the readers of photographs take it."""
+    return None if given == "full" else given

@@ -1,0 +1,116 @@
+"""Options of `complete` from a row of a manifest."""
+
+from __future__ import annotations
+
+import shlex
+from collections.abc import Iterator, Mapping
+from functools import cache
+from pathlib import Path
+from typing import Annotated, Any, Union, get_args, get_type_hints
+
+import tyro
+
+from gscompleter.apps.batch.manifest import FOLDER
+from gscompleter.apps.commands.options import CompleteOptions, LiveOptions
+from gscompleter.apps.commands.renamed import translate_name
+from gscompleter.apps.commands.words import format_error, parse_words
+from gscompleter.config.settings import validate
+from gscompleter.errors import InputError, quote_value
+
+COMPLETE = "complete"
+Command: Any = Union[  # noqa: UP007  (a command line has several)
+    Annotated[CompleteOptions, tyro.conf.subcommand(COMPLETE)],
+    Annotated[LiveOptions, tyro.conf.subcommand("live")],
+]
+RESERVED = ("out", "overwrite", "quiet", "threads", "dry-run", "help", "help-all")
+"""Options that a batch sets for all jobs."""
+YES, NO = ("true", "yes", "1"), ("false", "no", "0", "")
+"""Values of a flag in a CSV."""
+
+
+def parse_row(row: Mapping[str, Any], out: Path) -> CompleteOptions:
+    """Parse a row, or raise InputError; `out` is the output folder."""
+    if not isinstance(row.get(FOLDER), str):
+        raise InputError("The row has no folder; give it the folder of a scene.")
+    words = [COMPLETE, row[FOLDER], *row_to_words(row), "--out", str(out), "--overwrite", "--quiet"]
+    try:
+        options: CompleteOptions = validate(parse_words(words, Command, (COMPLETE,)))
+    except InputError as error:
+        raise InputError(format_error(error)) from error
+    return options
+
+
+def row_to_words(row: Mapping[str, Any], prefix: str = "") -> Iterator[str]:
+    """Convert a row to words of a command line."""
+    for key, value in row.items():
+        name = translate_name(f"{prefix}{key}".replace("_", "-"))
+        if name in RESERVED:
+            raise InputError(f"A row cannot set '{quote_value(name)}'; the batch sets it.")
+        if name == FOLDER or value is None:
+            continue
+        if isinstance(value, Mapping):
+            yield from row_to_words(value, f"{name}.")
+        elif name in list_flags():
+            yield from [f"--{name}"] if is_set(name, value) else []
+        else:
+            yield from (f"--{name}", *value_to_words(name, value))
+
+
+def value_to_words(name: str, value: Any) -> list[str]:
+    """Convert a value to words."""
+    if isinstance(value, list):
+        words = [str(item) for item in value]
+    elif isinstance(value, str) and name in list_multiple_options():
+        words = split_cell(value)
+    else:
+        words = [str(value)]
+    for word in words:
+        if word.startswith("-") and not is_number(word):
+            raise InputError(f"{name} cannot be '{quote_value(word)}', which begins with a dash.")
+    return words
+
+
+def split_cell(cell: str) -> list[str]:
+    """Split a cell into words like a shell."""
+    try:
+        return shlex.split(cell)
+    except ValueError as error:
+        raise InputError(f"'{quote_value(cell)}' has an unmatched quotation mark.") from error
+
+
+def is_set(name: str, value: Any) -> bool:
+    """Return True if a row sets a flag."""
+    text = str(value).lower()
+    if text not in (*YES, *NO):
+        raise InputError(f"{name} is '{quote_value(text)}'; it must be true or false.")
+    return text in YES
+
+
+def is_number(word: str) -> bool:
+    """Return True if a word is a number."""
+    try:
+        float(word)
+    except ValueError:
+        return False
+    return True
+
+
+@cache
+def list_flags() -> frozenset[str]:
+    """Return the options of `complete` without a value."""
+    return frozenset(name for name, kind in list_type_hints() if kind is bool)
+
+
+@cache
+def list_multiple_options() -> frozenset[str]:
+    """Return the options of `complete` with several values."""
+
+    def has_tuple(kind: Any) -> bool:
+        return "tuple" in str(kind).lower() or any(map(has_tuple, get_args(kind)))
+
+    return frozenset(name for name, kind in list_type_hints() if has_tuple(kind))
+
+
+def list_type_hints() -> list[tuple[str, Any]]:
+    """Return the options of `complete` with their types."""
+    return [(n.replace("_", "-"), kind) for n, kind in get_type_hints(CompleteOptions).items()]

@@ -1,0 +1,165 @@
+"""Summary of the input, printed before the work in four lines."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+
+from gscompleter.apps.commands.options import CompleteOptions, SceneOptions, get_max_targets
+from gscompleter.apps.inputs.opening import Opened, Task, estimate_splat_bytes
+from gscompleter.data.formats import FORMATS
+from gscompleter.data.frame import Frame
+from gscompleter.errors import join_names, quote_value
+from gscompleter.memory import estimate_bytes, format_whole_gigabytes, read_memory_bytes
+from gscompleter.splats.ply import note_infinite_opacities
+from gscompleter.types import Camera, Gaussians
+
+SOURCE_NAMES = {
+    "given": "as given",
+    "scene": "as the scene says",
+    "points": "by the sparse points",
+    "splat": "by the splat",
+    "features": "by matched features",
+}
+MAX_NAMED = 8
+SECONDS_PER_PIXEL = 2e-5
+"""Seconds of `plane-sweep` per pixel on two cores of 2.8 GHz. Measured: 18 to 24 µs from 256 x 256
+to 427 x 640 pixels (docs/performance.md)."""
+
+
+def describe_task(options: CompleteOptions, opened: Opened, task: Task) -> list[str]:
+    """Write the four lines; the cameras of `task` have the working depth range."""
+    device = task.views[0].image.device.type
+    return [
+        *describe_opening(options, opened, task),
+        f"To do: {describe_work(options, task, device)}.",
+        f"Budget: {describe_budget(options, task, device)}.",
+    ]
+
+
+def describe_opening(options: SceneOptions, opened: Opened, task: Task) -> list[str]:
+    """Write the lines on the opened scene."""
+    splat, note = "", None
+    if task.scene is not None and options.scene is not None:
+        splat = f"; {describe_splat(options.scene, task.scene)}"
+        note = note_infinite_opacities(task.scene)
+    return [
+        f"Opened: {quote_value(options.folder)}, {describe_photographs(opened)}{splat}.",
+        *([] if note is None else [note]),
+        f"Found: {describe_found(options, opened, task)}.",
+    ]
+
+
+def describe_photographs(opened: Opened) -> str:
+    """Describe the format, photographs, cameras and points of a scene."""
+    given = opened.photographs
+    count = f"{opened.num_photographs} photographs"
+    if opened.num_photographs != len(given):
+        count = f"{len(given)} of {count}"
+    points = given.points()
+    num_points = "no points" if points is None else f"{len(points):,} points"
+    name = "photographs without cameras" if opened.format == "photographs" else opened.format
+    return f"{name}, {count}, {describe_lenses(given.frames)}, {num_points}"
+
+
+def describe_lenses(frames: Sequence[Frame]) -> str:
+    """Describe the cameras and lenses."""
+    cameras = dict.fromkeys(frame.intrinsics for frame in frames)
+    lenses = dict.fromkeys(c.distortion.projection for c in cameras if c.distortion)
+    lens = f"{' and '.join(lenses)} lens distortion removed" if lenses else "no lens distortion"
+    return f"{len(cameras)} {'camera' if len(cameras) == 1 else 'cameras'} with {lens}"
+
+
+def describe_splat(path: Path, scene: Gaussians) -> str:
+    """Describe the input splat."""
+    mode = "antialiased " if scene.is_antialiased else ""
+    return f"{quote_value(path)}, {len(scene):,} {mode}Gaussians of SH degree {scene.sh_degree}"
+
+
+def describe_found(options: SceneOptions, opened: Opened, task: Task) -> str:
+    """Describe the frame, the depth range and the working size."""
+    format = FORMATS.get(opened.format)
+    unit = f" {format.unit}" if format is not None and format.unit is not None else ""
+    camera, depths = task.views[0].camera, task.depths
+    tellers = dict.fromkeys((SOURCE_NAMES[depths.near], SOURCE_NAMES[depths.far]))
+    depth = f"depths from {camera.near:.3g} to {camera.far:.3g}{unit} ({' and '.join(tellers)})"
+    return f"{task.frame_description.rstrip('.')}; {depth}; {describe_size(options, opened, task)}"
+
+
+def describe_size(options: SceneOptions, opened: Opened, task: Task) -> str:
+    """Describe the working size, and that of the photographs if it differs."""
+    frames = [view.frame for view in task.views if view.frame is not None]
+    own = list_sizes([opened.photographs.camera(frame) for frame in frames])
+    size = list_sizes([view.camera for view in task.views])
+    if own == size or not isinstance(options.resolution, int):
+        return f"worked at {size}"
+    return f"worked at {size} (the photographs have {own}; --resolution full keeps that)"
+
+
+def list_sizes(cameras: Sequence[Camera]) -> str:
+    """List the different image sizes."""
+    sizes = dict.fromkeys(f"{camera.width} x {camera.height}" for camera in cameras)
+    return ", ".join(sizes)
+
+
+def describe_work(options: CompleteOptions, task: Task, device: str) -> str:
+    """Describe the context, targets, models and output."""
+    chosen = " (chosen)" if options.context is None else ""
+    frames = [target.frame for target in task.targets if target.frame is not None]
+    others = len(task.targets) - len(frames)
+    targets = [list_frames(frames)] if frames else []
+    targets += [f"{others} cameras" if others > 1 else "a camera"] if others else []
+    targets = targets or [f"up to {get_max_targets(options)} cameras that are found"]
+    return (
+        f"context from {list_frames([view.frame for view in task.views])}{chosen}, completed for "
+        f"{' and '.join(targets)} by {options.reconstructor} and {options.synthesis.name} on "
+        f"{device}, written to {quote_value(options.out)}"
+    )
+
+
+def describe_budget(options: CompleteOptions, task: Task, device: str) -> str:
+    """Describe the number of context photographs, memory and time."""
+    return f"{describe_count(task)}{describe_memory(options, task)}{describe_time(options, task, device)}"
+
+
+def describe_count(task: Task) -> str:
+    """Describe the number of context photographs."""
+    budget = task.budget
+    if budget is None:
+        named = len(task.views)
+        return f"{named} {'photograph' if named == 1 else 'photographs'} for the context, as named"
+    limit = ""
+    if budget.limit < budget.wanted:
+        limit = f" (memory is too small for {budget.wanted})"
+    return (
+        f"at most {budget.limit} of {budget.usable:,} photographs for the context{limit} "
+        "(--context names others)"
+    )
+
+
+def describe_memory(options: CompleteOptions, task: Task) -> str:
+    """Estimate the memory."""
+    cameras = [view.camera for view in task.views] + [target.camera for target in task.targets]
+    pixels = max(camera.width * camera.height for camera in cameras)
+    images = len(task.views) + (len(task.targets) or get_max_targets(options))
+    needed = estimate_bytes(pixels, images)
+    if task.scene is not None and task.scene.means.device.type == "cpu":
+        needed += estimate_splat_bytes(task, task.scene)
+    there = read_memory_bytes()
+    of = "" if there is None else f" of {format_whole_gigabytes(there)}"
+    return f", up to {format_whole_gigabytes(needed)}{of} of memory"
+
+
+def describe_time(options: CompleteOptions, task: Task, device: str) -> str:
+    """Estimate the seconds of the context, for the default model on a CPU."""
+    if task.scene is not None or options.reconstructor != "plane-sweep" or device != "cpu":
+        return ""
+    pixels = sum(view.camera.width * view.camera.height for view in task.views)
+    seconds = max(1, round(SECONDS_PER_PIXEL * pixels))
+    return f", about {seconds:,} s to reconstruct the context on two cores of 2.8 GHz"
+
+
+def list_frames(frames: Sequence[int | None]) -> str:
+    """List frame numbers, shortened."""
+    names = join_names([str(frame) for frame in frames], MAX_NAMED)
+    return f"{'frame' if len(frames) == 1 else 'frames'} {names}"

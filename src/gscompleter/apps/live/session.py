@@ -1,0 +1,94 @@
+"""Immutable sessions: every step returns a new session, so undo returns to the one before."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from pathlib import Path
+from tempfile import TemporaryDirectory
+
+import numpy as np
+from jaxtyping import Float
+
+from gscompleter.completer import GSCompleter
+from gscompleter.data.local_origin import compute_frame_from_photographs
+from gscompleter.data.resize import Resolution
+from gscompleter.data.scene import load_cameras, write_cameras
+from gscompleter.errors import InputError
+from gscompleter.io.files import TARGETS_FILE
+from gscompleter.splat_alignment.similarity import transform_camera, transform_camera_exactly
+from gscompleter.state import Completion, TargetResult
+from gscompleter.types import Camera
+
+
+@dataclass(frozen=True)
+class FrameConversion:
+    """Conversion of cameras between the frames of the photographs and of the result.
+
+    Cameras go through a file before they are used, so that the saved file gives the very same
+    result.
+    """
+
+    result_from_photographs: Float[np.ndarray, "4 4"]
+    """Similarity from the frame of the photographs to that of the result."""
+    origin: Float[np.ndarray, "3"]
+    """Local origin of the coordinates, in the frame of the photographs."""
+    resolution: Resolution = None
+
+    def convert_to_photographs(self, camera: Camera) -> Camera:
+        """Convert a camera to the frame of the photographs, in float64."""
+        return transform_camera_exactly(camera, np.linalg.inv(self.result_from_photographs))
+
+    def convert_to_result(self, source: Camera) -> Camera:
+        """Convert a camera to the frame of the result, by way of a file."""
+        with TemporaryDirectory() as folder:
+            path = Path(folder) / TARGETS_FILE
+            write_cameras(path, [source])
+            (camera,) = load_cameras(path, self.resolution, origin=self.origin.tolist())
+        return transform_camera(
+            camera, self.result_from_photographs @ compute_frame_from_photographs(-self.origin)
+        )
+
+
+@dataclass(frozen=True)
+class CompletedStep:
+    """A completed target camera and the scene after it."""
+
+    camera: Camera
+    """Target camera in the frame of the photographs, as it is saved."""
+    completion: Completion
+
+
+@dataclass(frozen=True)
+class Session:
+    """A scene with all steps that are not undone."""
+
+    completer: GSCompleter
+    conversion: FrameConversion
+    initial: Completion
+    steps: tuple[CompletedStep, ...] = ()
+
+    @property
+    def latest(self) -> Completion:
+        """The completion after the last step."""
+        return self.steps[-1].completion if self.steps else self.initial
+
+
+def complete_camera(session: Session, camera: Camera) -> tuple[Session, TargetResult]:
+    """Complete the scene for a camera in the frame of the result.
+
+    Returns the same session if nothing was added.
+    """
+    told = session.conversion.convert_to_photographs(camera)
+    target = session.conversion.convert_to_result(told).to(session.latest.views[0].image.device)
+    completion = session.completer.advance(session.latest, target)
+    result = completion.targets[-1]
+    if not len(result.added):
+        return session, result
+    return replace(session, steps=(*session.steps, CompletedStep(told, completion))), result
+
+
+def undo_step(session: Session) -> Session:
+    """Remove the last step."""
+    if not session.steps:
+        raise InputError("There is nothing to undo; complete something first.")
+    return replace(session, steps=session.steps[:-1])

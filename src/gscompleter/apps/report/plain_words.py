@@ -1,0 +1,140 @@
+"""Notes on what differs from a usual completion, as sentences."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+
+from gscompleter.apps.report.finished import CompletionSummary, TargetRow
+
+FRAME_NOTES = {
+    "given": None,
+    "cameras": "The splat is in the frame of its cameras.json, not in that of the photographs.",
+    "dataparser": "The splat is in the frame of its trainer's dataparser.",
+    "normalised": "The splat is in a frame that its trainer normalised.",
+    "similarity": "The splat is in a frame of its own, aligned by matching features.",
+}
+NO_TARGET_NOTE = "No large hole was found around the photographs; nothing was completed."
+
+
+def describe_motion(shares: Mapping[int | None, float]) -> str | None:
+    """Describe the dynamic fractions of photographs by frame, or return None if all are 0."""
+    parts = [
+        f"{format_percent(share)} of frame {frame}" for frame, share in shares.items() if share > 0
+    ]
+    if not parts:
+        return None
+    return (
+        f"{', '.join(parts)} show something that moves; the completion does not use these regions."
+    )
+
+
+def describe_ignored(shares: Iterable[float]) -> str | None:
+    """Describe the ignored fractions of photographs, or return None if all are 0."""
+    most = max(shares, default=0.0)
+    if most == 0:
+        return None
+    return (
+        f"Up to {format_percent(most)} of a photograph stays the same while the camera moves, "
+        "like the "
+        "bonnet of a vehicle; it is ignored, also in scores (images/context*_ignored.png)."
+    )
+
+
+def describe_exposures(gains: Iterable[Sequence[float] | None]) -> str | None:
+    """Describe the exposure gains of photographs, or return None without any."""
+    factors = [factor for gain in gains for factor in gain or ()]
+    if not factors or min(factors) <= 0:
+        return None
+    return (
+        "The exposures of the context photographs differ by a factor of up to "
+        f"{max(factors) / min(factors):.2f}; the scene has the mean exposure, at which these "
+        "photographs are scored. Target photographs are scored as they are."
+    )
+
+
+def list_target_notes(row: TargetRow) -> list[str]:
+    """List the notes of a target, with fallbacks that no note mentions."""
+    text = " ".join(row.notes)
+    found = list(row.notes)
+    if row.anchor_fallback and "least-turned" not in text:
+        found.append("Every view is turned too far; the least-turned one is the anchor.")
+    if row.affine.method == "median" and "median" not in text:
+        found.append(
+            "RANSAC finds no reliable depth correction; the median depth ratio replaces it."
+        )
+    if row.added == 0 and "nothing" not in text.lower():
+        found.append("Nothing was added here.")
+    return found
+
+
+def list_scene_notes(summary: CompletionSummary) -> list[str]:
+    """List the notes on the whole completion."""
+    return [*describe_input(summary), *describe_scoring(summary), *describe_result(summary)]
+
+
+def describe_input(summary: CompletionSummary) -> Iterator[str]:
+    """Describe the photographs and the frame of the result."""
+    placed = FRAME_NOTES.get(summary.frame.method, "The splat is in a frame of its own.")
+    if placed is not None:
+        yield f"{placed} summary.json lists the transform from the photographs to the result."
+    if any(summary.frame.origin):
+        yield (
+            "The coordinates are much larger than the distances between the cameras, so the result "
+            "is relative to a local origin, which summary.json lists."
+        )
+    motion = describe_motion({row.frame: row.dynamic_fraction for row in summary.context})
+    if motion is not None:
+        yield motion
+    static = describe_ignored(row.ignored for row in summary.context)
+    if static is not None:
+        yield static
+    if summary.settings.get("context") is None:
+        yield (
+            f"{summary.scene.used} of {summary.scene.photographs} photographs were chosen as the "
+            "context; --context chooses others."
+        )
+
+
+def describe_scoring(summary: CompletionSummary) -> Iterator[str]:
+    """Describe how the images are scored."""
+    exposure = describe_exposures([row.exposure_gain for row in summary.context])
+    if exposure is not None:
+        yield exposure
+    if summary.settings.get("uses_target_photographs"):
+        yield (
+            "The generator uses the photographs of the targets, so the scores measure the geometry "
+            "and not the synthesized images."
+        )
+    if summary.targets and all(row.psnr_after is None for row in summary.targets):
+        yield "No target has a photograph, so there are no scores at targets."
+
+
+def describe_result(summary: CompletionSummary) -> Iterator[str]:
+    """Describe the completed scene."""
+    removed = summary.gaussians.get("removed")
+    if removed is not None:
+        yield (
+            f"{removed:,} Gaussians of the input splat were pruned because they covered holes; "
+            "regions that no photograph confirms count as holes."
+        )
+    if not summary.targets:
+        yield NO_TARGET_NOTE
+
+
+def format_number(value: float | None, digits: int = 2) -> str:
+    """Format a number, with a dash for None or an infinite one."""
+    return "–" if value is None or not math.isfinite(value) else f"{value:.{digits}f}"
+
+
+def format_percent(share: float | None, digits: int = 1) -> str:
+    """Format a fraction as a percentage."""
+    return "–" if share is None or not math.isfinite(share) else f"{100 * share:.{digits}f} %"
+
+
+def format_change(before: float | None, after: float | None, digits: int = 2) -> str:
+    """Format the change of a score with its sign."""
+    if before is None or after is None or not math.isfinite(after - before):
+        return "–"
+    rise = round(after - before, digits)
+    return f"{rise:+.{digits}f}".replace("-", "−") if rise else f"{0:.{digits}f}"

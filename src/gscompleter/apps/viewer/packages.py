@@ -1,0 +1,196 @@
+"""The JavaScript renderer of the viewer: npm packages pinned by their hashes.
+
+`package-lock.json` pins three.js, Spark (which renders Gaussians with it) and fflate (part of
+Spark). A wheel contains the result of `extract_libraries`; a source tree fetches the archives from
+npm's registry when a page is first made and caches them. Every archive is compared with its hash
+when it is opened. Only the standard library is used, because the build of the wheel runs this.
+"""
+
+from __future__ import annotations
+
+import base64
+import hashlib
+import io
+import json
+import os
+import shutil
+import subprocess
+import tarfile
+import urllib.request
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from urllib.parse import urlsplit
+
+from gscompleter.errors import InputError
+from gscompleter.io.cache import get_download_folder
+from gscompleter.io.files import replace_file
+
+LOCK_FILE = Path(__file__).with_name("package-lock.json")
+"""Pinned packages with addresses and hashes."""
+BUILT_LIBRARIES = Path(__file__).with_name("libraries.json")
+"""Libraries stored by the build of a wheel."""
+MODULES = {
+    "three": ("three", "build/three.module.min.js"),
+    "three-core": ("three", "build/three.core.min.js"),
+    "three/addons/postprocessing/Pass.js": ("three", "examples/jsm/postprocessing/Pass.js"),
+    "@sparkjsdev/spark": ("@sparkjsdev/spark", "dist/spark.module.min.js"),
+}
+"""Package and file of each module, by its import name."""
+CORE_IMPORT = ('"./three.core.min.js"', '"three-core"')
+"""Replacement for the one relative import: modules in a page have no folder."""
+LICENCE_FILE = "LICENSE"
+"""File of each package that is distributed with it."""
+MAX_ARCHIVE_BYTES = 64 << 20
+"""Largest archive in bytes; ours have up to 8 million."""
+REGISTRY_TIMEOUT = 30.0
+"""Timeout of the registry in seconds."""
+REGISTRY_VARIABLE = "npm_config_registry"
+"""Environment variable of npm with the address of the registry."""
+
+
+@dataclass(frozen=True)
+class NpmPackage:
+    """One npm package, as pinned by the lock."""
+
+    name: str
+    version: str
+    integrity: str
+    """`sha512-` and the hash in base64, as npm and browsers write it."""
+
+    @property
+    def file(self) -> str:
+        """Name of its archive in our cache."""
+        return f"{self.name.replace('/', '-').lstrip('@')}-{self.version}.tgz"
+
+    @property
+    def path(self) -> str:
+        """Path of its archive in every npm registry."""
+        return f"{self.name}/-/{self.name.rsplit('/', 1)[-1]}-{self.version}.tgz"
+
+    def is_intact(self, archive: bytes) -> bool:
+        """Return True if `archive` has the pinned hash."""
+        digest = base64.b64encode(hashlib.sha512(archive).digest()).decode()
+        return self.integrity == f"sha512-{digest}"
+
+
+@dataclass(frozen=True)
+class Libraries:
+    """JavaScript for a page."""
+
+    modules: Mapping[str, str]
+    """ES modules by import name."""
+    licences: Mapping[str, str]
+    """Licence texts by package name and version."""
+
+
+def load_libraries(lock: Path = LOCK_FILE, built: Path = BUILT_LIBRARIES) -> Libraries:
+    """Load the libraries of the wheel, or in a source tree those of the pinned archives.
+
+    Raises:
+        InputError: They cannot be fetched, or differ from their hashes.
+    """
+    if built.is_file():
+        return Libraries(**json.loads(built.read_text(encoding="utf-8")))
+    return extract_libraries(lock)
+
+
+def write_libraries(path: Path, lock: Path = LOCK_FILE) -> None:
+    """Write the libraries for a wheel; the same lock gives the same bytes."""
+    text = json.dumps(vars(extract_libraries(lock)), sort_keys=True, ensure_ascii=False)
+    with replace_file(path) as file:
+        file.write(text.encode())
+
+
+def extract_libraries(lock: Path) -> Libraries:
+    """Extract the modules and licences of the packages pinned in `lock`."""
+    packages = {package.name: package for package in read_lock(lock)}
+    archives = {name: get_archive(package) for name, package in packages.items()}
+    modules = {
+        name: read_archive_member(archives[package], file).replace(*CORE_IMPORT)
+        for name, (package, file) in MODULES.items()
+    }
+    licences = {
+        f"{p.name} {p.version}": read_archive_member(archives[name], LICENCE_FILE)
+        for name, p in packages.items()
+    }
+    return Libraries(modules, licences)
+
+
+def read_lock(lock: Path) -> list[NpmPackage]:
+    """Read the packages of an npm lock file (`lockfileVersion` 3), in order."""
+    entries = json.loads(lock.read_text(encoding="utf-8"))["packages"]
+    return [
+        NpmPackage(path.removeprefix("node_modules/"), e["version"], e["integrity"])
+        for path, e in entries.items()
+        if path
+    ]
+
+
+def get_archive(package: NpmPackage) -> bytes:
+    """Get the archive of a package from the cache, or fetch and cache it."""
+    place = get_archive_path(package)
+    if place.is_file():
+        archive = place.read_bytes()
+        if package.is_intact(archive):
+            return archive
+    archive = fetch_archive(package)
+    place.parent.mkdir(parents=True, exist_ok=True)
+    with replace_file(place) as file:
+        file.write(archive)
+    return archive
+
+
+def get_archive_path(package: NpmPackage) -> Path:
+    """Get the path of an archive in the cache; users may put it there by hand."""
+    return get_download_folder() / "viewer" / package.file
+
+
+def fetch_archive(package: NpmPackage) -> bytes:
+    """Fetch an archive from the npm registry and compare its hash."""
+    url = f"{find_registry(package)}/{package.path}"
+    try:
+        with urllib.request.urlopen(url, timeout=REGISTRY_TIMEOUT) as answer:
+            archive: bytes = answer.read(MAX_ARCHIVE_BYTES)
+    except (OSError, ValueError) as error:
+        raise InputError(
+            f"{describe_missing_package(package)}, and {urlsplit(url).netloc or 'its address'} "
+            "cannot be reached; "
+            f"fetch {url} and put it at {get_archive_path(package)}."
+        ) from error
+    if not package.is_intact(archive):
+        raise InputError(
+            f"The file at {url} is not {package.name} {package.version}: its SHA-512 differs, so "
+            "it was not used; try another connection."
+        )
+    return archive
+
+
+def find_registry(package: NpmPackage) -> str:
+    """Find the npm registry, from the environment variable or from npm itself."""
+    address, npm = os.environ.get(REGISTRY_VARIABLE), shutil.which("npm")
+    if not address and npm is not None:
+        command = [npm, "config", "get", "registry"]
+        answer = subprocess.run(command, capture_output=True, text=True, stdin=subprocess.DEVNULL)
+        address = answer.stdout.strip()
+    if not address:
+        raise InputError(
+            f"{describe_missing_package(package)}, and there is no npm to fetch it with; install "
+            "gscompleter "
+            f"from its wheel, which contains it, or set {REGISTRY_VARIABLE} to the address of a "
+            "registry."
+        )
+    return address.rstrip("/")
+
+
+def describe_missing_package(package: NpmPackage) -> str:
+    """Make the beginning of a sentence about a missing package."""
+    return f"The page needs {package.name} {package.version}, which is not on this machine"
+
+
+def read_archive_member(archive: bytes, name: str) -> str:
+    """Read a text file of an npm archive, below its folder `package`."""
+    with tarfile.open(fileobj=io.BytesIO(archive), mode="r:gz") as files:
+        file = files.extractfile(f"package/{name}")
+        assert file is not None
+        return file.read().decode()

@@ -1,0 +1,235 @@
+"""Makes one self-contained HTML file that loads nothing from the network.
+
+The page has the axes of three.js (x right, y up, z back), its origin at the centre of the scene,
+and a unit in which the scene has about the size `PAGE_EXTENT`, so that the few bits of a .spz suffice
+for scenes in millimetres and in kilometres.
+"""
+
+from __future__ import annotations
+
+import base64
+import html
+import json
+import math
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+from urllib.parse import quote
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from gscompleter.apps.viewer.exhibit import ViewerCamera, ViewerContent
+from gscompleter.apps.viewer.packages import Libraries
+from gscompleter.errors import InputError, quote_value
+from gscompleter.splats.spz import encode_spz
+from gscompleter.types import Camera, Gaussians
+
+ASSETS = Path(__file__).with_name("assets")
+"""Folder of our own page sources."""
+PAGE_EXTENT = 4.0
+"""Median distance of Gaussians from the centre, within a factor of 2, in page units."""
+MAX_DISTANCE = 4096.0
+"""Largest distance of a Gaussian from the centre, in page units; leaves ten fractional bits."""
+LARGEST_PAGE = 60_000_000
+"""Bytes of Gaussians up to which they are inside the page; otherwise in files beside it."""
+PART = 48_000_000
+"""Bytes of Gaussians per file, below the longest string of any browser."""
+THREE_FROM_OPENCV = torch.diag(torch.tensor([1.0, -1.0, -1.0, 1.0], dtype=torch.float64))
+"""Half a turn about x, for the axes of the world and of a camera."""
+MAX_LANDMARKS = 100_000
+"""Approximate number of Gaussians that determine the focus of a camera."""
+OVERVIEW_SIZE = (640, 480)
+"""Width and height of the camera for a scene without cameras."""
+OVERVIEW_FOCAL = 550.0
+"""Its focal length in pixels, for a field of view of 60 degrees."""
+OVERVIEW_DISTANCE = 2.5
+"""Its distance from the centre, relative to the median distance of Gaussians."""
+
+
+@dataclass(frozen=True)
+class PageFrame:
+    """The frame of the page."""
+
+    centre: Float[Tensor, "3"]
+    """Origin of the page, in the scene."""
+    unit: float
+    """Unit of the page in scene units, a power of two."""
+
+    def normalize(self, gaussians: Gaussians) -> Gaussians:
+        """Move Gaussians to the page's origin and unit; their axes stay."""
+        means = ((gaussians.means.double() - self.centre) / self.unit).float()
+        return replace(gaussians, means=means, scales=gaussians.scales / self.unit, encoded=None)
+
+    def compute_pose(self, camera: Camera) -> Float[Tensor, "4 4"]:
+        """Compute camera-to-world with three.js axes, in the page's origin and unit."""
+        c2w = camera.c2w.detach().cpu().double().clone()
+        c2w[:3, 3] = (c2w[:3, 3] - self.centre) / self.unit
+        return THREE_FROM_OPENCV @ c2w @ THREE_FROM_OPENCV
+
+
+@dataclass(frozen=True)
+class Page:
+    """Files to write or serve."""
+
+    html: bytes
+    parts: Mapping[str, bytes]
+    """Scripts with the Gaussians by file name; empty if the page contains them."""
+    num_omitted: int
+    """Gaussians of the scene after that are too far away to be shown."""
+
+
+def compute_page_frame(gaussians: Gaussians) -> PageFrame:
+    """Compute the page's frame from the median position and spread of Gaussians."""
+    means = gaussians.means.double().cpu()
+    centre = means.median(dim=0).values
+    spread = (means - centre).norm(dim=1).median().item()
+    return PageFrame(
+        centre, 2.0 ** math.floor(math.log2(spread / PAGE_EXTENT)) if spread > 0 else 1.0
+    )
+
+
+def make_page(viewer_content: ViewerContent, libraries: Libraries, name: str = "page") -> Page:
+    """Make the page; the same values give the same bytes.
+
+    `name` is the stem of the page's file, which names the files beside it.
+
+    Raises:
+        InputError: Nothing is left to show.
+    """
+    frame = compute_page_frame(viewer_content.after)
+    layers = {
+        key: frame.normalize(part.to("cpu")) for key, part in split_layers(viewer_content).items()
+    }
+    shown = {key: part[part.means.norm(dim=1) <= MAX_DISTANCE] for key, part in layers.items()}
+    packed = {key: encode_spz(Path(key), part) for key, part in shown.items() if len(part) > 0}
+    if not packed.keys() - {"before"}:
+        raise InputError(f"{quote_value(viewer_content.title)} has nothing that a page can show.")
+    means, layer_sources = sample_landmarks(layers), map_sources(packed)
+    sources = {key: packed[key] for key in sorted(set(layer_sources.values()))}
+    content = {
+        "title": viewer_content.title,
+        "frame": {"centre": frame.centre.tolist(), "unit": frame.unit},
+        "counts": {key: len(part) for key, part in shown.items()},
+        "layers": layer_sources,
+        "antialiased": {key: part.is_antialiased for key, part in layers.items()},
+        "parts": {key: len(compute_part_starts(source)) for key, source in sources.items()},
+        "shots": [describe_camera(shot, frame, means) for shot in list_cameras(viewer_content)],
+        **vars(libraries),
+    }
+    scripts, beside = place_scripts(list(generate_calls(sources)), name)
+    left_out = sum(len(layers[key]) - len(shown[key]) for key in ("observed", "generated"))
+    return Page(fill_template(content, scripts).encode(), beside, left_out)
+
+
+def split_layers(viewer_content: ViewerContent) -> dict[str, Gaussians]:
+    """Split the content into layers: before, and the observed and generated part of after."""
+    after, before = viewer_content.after, viewer_content.before
+    layers = {"observed": after[after.generated == 0], "generated": after[after.generated > 0]}
+    return layers if before is None else {"before": before, **layers}
+
+
+def map_sources(packed: Mapping[str, bytes]) -> dict[str, str]:
+    """Map layers to byte strings; "before" and "observed" share one if they are equal."""
+    sources = {key: key for key in packed}
+    if "before" in packed and packed["before"] == packed.get("observed"):
+        sources["before"] = "observed"
+    return sources
+
+
+def compute_part_starts(content: bytes) -> range:
+    """Compute the offsets at which the bytes of a source are split."""
+    return range(0, len(content), PART)
+
+
+def generate_calls(packed: Mapping[str, bytes]) -> Iterator[bytes]:
+    """Yield scripts that pass the bytes of each source to the page."""
+    for key, content in packed.items():
+        for start in compute_part_starts(content):
+            text = base64.b64encode(content[start : start + PART]).decode()
+            yield f'gscPart("{key}", "{text}");'.encode()
+
+
+def place_scripts(calls: list[bytes], name: str) -> tuple[list[str], dict[str, bytes]]:
+    """Make the script elements of the page, and the files of stem `name` that they refer to."""
+    if sum(map(len, calls)) <= LARGEST_PAGE:
+        return [f"<script>{call.decode()}</script>" for call in calls], {}
+    files = {f"{name}.{number}.js": call for number, call in enumerate(calls, start=1)}
+    return [f'<script src="{quote(file)}"></script>' for file in files], files
+
+
+def list_cameras(viewer_content: ViewerContent) -> tuple[ViewerCamera, ...]:
+    """List the cameras; a scene without any gets an overview."""
+    if viewer_content.cameras:
+        return viewer_content.cameras
+    means = viewer_content.after.means.cpu()
+    centre = means.median(dim=0).values
+    distance = OVERVIEW_DISTANCE * (means - centre).norm(dim=1).median()
+    c2w, K, (width, height) = torch.eye(4), torch.eye(3), OVERVIEW_SIZE
+    c2w[:3, 3] = centre - distance * torch.tensor([0.0, 0.0, 1.0])
+    K[0, 0] = K[1, 1] = OVERVIEW_FOCAL
+    K[:2, 2] = torch.tensor([width / 2, height / 2])
+    return (ViewerCamera("overview", "Overview", Camera(c2w, K, width, height)),)
+
+
+def sample_landmarks(layers: Mapping[str, Gaussians]) -> Float[Tensor, "n 3"]:
+    """Sample means of the scene after, in page origin and unit and scene axes."""
+    means = torch.cat([layers["observed"].means, layers["generated"].means])
+    return means[:: max(1, len(means) // MAX_LANDMARKS)].double()
+
+
+def describe_camera(
+    view_camera: ViewerCamera, frame: PageFrame, means: Float[Tensor, "n 3"]
+) -> dict[str, Any]:
+    """Describe a camera as the page reads it, focused on the landmarks `means`."""
+    K, pose = view_camera.camera.K.double(), frame.compute_pose(view_camera.camera)
+    picture = (
+        None if view_camera.thumbnail is None else base64.b64encode(view_camera.thumbnail).decode()
+    )
+    return {
+        "name": view_camera.name,
+        "title": view_camera.title,
+        "notes": view_camera.notes,
+        "pose": pose.flatten().tolist(),
+        "lens": [K[0, 0].item(), K[1, 1].item(), K[0, 2].item(), K[1, 2].item()],
+        "size": [view_camera.camera.width, view_camera.camera.height],
+        "focus": compute_focus_depth(view_camera.camera, pose, means),
+        "thumbnail": picture,
+    }
+
+
+def compute_focus_depth(
+    camera: Camera, pose: Float[Tensor, "4 4"], means: Float[Tensor, "n 3"]
+) -> float:
+    """Compute the median z-depth of the landmarks that a camera sees, in page units."""
+    flip = THREE_FROM_OPENCV[:3, :3]
+    x, y, z = ((means @ flip - pose[:3, 3]) @ pose[:3, :3] @ flip).unbind(1)
+    K = camera.K.double()
+    u, v = K[0, 0] * x / z + K[0, 2], K[1, 1] * y / z + K[1, 2]
+    seen = (z > 0) & (u > 0) & (u < camera.width) & (v > 0) & (v < camera.height)
+    return z[seen].median().item() if seen.any() else PAGE_EXTENT
+
+
+def fill_template(content: Mapping[str, Any], scripts: list[str]) -> str:
+    """Fill the template `viewer.html`.
+
+    External text is inserted as JSON without `<`, which no HTML parser can misread.
+    """
+    data = json.dumps(content, sort_keys=True).replace("<", "\\u003c")
+    texts = {
+        "title": html.escape(str(content["title"])),
+        "style": read_asset("viewer.css"),
+        "program": read_asset("viewer.js"),
+        "parts": "\n".join(scripts),
+        "data": data,
+    }
+    pieces = read_asset("viewer.html").split("{{")
+    named = (piece.split("}}", 1) for piece in pieces[1:])
+    return pieces[0] + "".join(texts[name] + rest for name, rest in named)
+
+
+def read_asset(name: str) -> str:
+    """Read one of our page sources."""
+    return (ASSETS / name).read_text(encoding="utf-8")

@@ -1,0 +1,137 @@
+"""Removal of floaters and superfluous Gaussians from a trained splat.
+
+An image is linear in the opacity of one Gaussian, so its squared error is quadratic, and one render
+predicts the error without each. A Gaussian is removable if some photographs gain several times the
+loss of others, or hardly any loses. A second pass with these faded protects walls behind floaters.
+Finally they are removed together; those that a photograph needs, at full or half size, are put
+back.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import replace
+
+import torch
+from jaxtyping import Bool, Float
+from torch import Tensor
+from torch.nn.functional import avg_pool2d
+
+from gscompleter.config.cleaning import CleaningConfig
+from gscompleter.guards.prune_occluders import compute_scene_error, exclude_needed
+from gscompleter.guards.psnr import add_psnr_loss, compute_mse_and_gradient
+from gscompleter.progress import track
+from gscompleter.render import OpacityRender, Renderer, restrict_to_image
+from gscompleter.trust.photometric import sum_weights
+from gscompleter.types import Gaussians, View
+
+FADED_OPACITY = 0.02
+"""Largest opacity of a faded Gaussian; at zero it would have no gradient."""
+MIN_ERROR = 1e-12
+"""Smallest mean squared error that fractions refer to."""
+
+
+def find_superfluous(
+    scene: Gaussians,
+    views: Sequence[View],
+    renderer: Renderer,
+    config: CleaningConfig = CleaningConfig(),
+) -> Bool[Tensor, "n"]:
+    """Find Gaussians that can be removed together; generated and unobserved ones stay."""
+    removable = torch.zeros_like(scene.generated, dtype=torch.bool)
+    removable = find_removable(scene, removable, views, renderer, config) & (scene.generated == 0)
+    removable = find_removable(scene, removable, views, renderer, config) & removable
+    checks = [*views, *map(halve_view, views)]
+    allowed = [
+        add_psnr_loss(compute_scene_error(scene, view, renderer).item(), config.tolerance)
+        for view in checks
+    ]
+    removed = exclude_needed(scene, removable, checks, allowed, renderer)
+    return keep_needed(scene, removed, checks, allowed, renderer)
+
+
+def find_removable(
+    scene: Gaussians,
+    faded: Bool[Tensor, "n"],
+    views: Sequence[View],
+    renderer: Renderer,
+    config: CleaningConfig,
+) -> Bool[Tensor, "n"]:
+    """Find Gaussians that can be removed one at a time while the others in `faded` are faint."""
+    generator = torch.Generator().manual_seed(0)
+    gained, lost = torch.zeros_like(scene.opacities), torch.zeros_like(scene.opacities)
+    equal_share = 0.0
+    for view in track(views, "Comparing photographs"):
+        change = predict_error_change(scene, faded, view, renderer, config.probes, generator)
+        gained += (-change).clamp_min(0)
+        lost += change.clamp_min(0)
+        equal_share += 1 / max(int((change != 0).sum()), 1) / len(views)
+    shown = gained + lost > 0
+    return shown & (lost < gained / config.min_ratio + config.idle * equal_share)
+
+
+def predict_error_change(
+    scene: Gaussians,
+    faded: Bool[Tensor, "n"],
+    view: View,
+    renderer: Renderer,
+    probes: int,
+    generator: torch.Generator,
+) -> Float[Tensor, "n"]:
+    """Predict the relative change of a photograph's squared error without each Gaussian."""
+    plan = renderer.freeze(scene[:0], view.camera).vary_opacities(scene)
+    full = scene.opacities
+    left = torch.where(faded, full.clamp_max(FADED_OPACITY), full)
+    error, gradient = compute_mse_and_gradient(restrict_to_image(plan), view, left)
+    square = estimate_squared_gradient(plan, left, probes, generator)
+    # Difference of the parabola between zero and full opacity, expanded at `left`.
+    return (square * (left**2 - (full - left) ** 2) - gradient * full) / max(error, MIN_ERROR)
+
+
+def estimate_squared_gradient(
+    plan: OpacityRender,
+    opacities: Float[Tensor, "n"],
+    probes: int,
+    generator: torch.Generator,
+) -> Float[Tensor, "n"]:
+    """Estimate the mean squared gradient of the image's colours in each opacity.
+
+    The estimate is unbiased: with random signs, products of different pixels cancel on average.
+    """
+    with torch.enable_grad():
+        variable = opacities.detach().clone().requires_grad_()
+        image = plan(variable).image
+        squares = torch.zeros_like(opacities)
+        for _ in range(probes):
+            signs = torch.randint(0, 2, image.shape, generator=generator).to(image) * 2 - 1
+            (gradient,) = torch.autograd.grad((signs * image).sum(), variable, retain_graph=True)
+            squares += gradient**2
+    return squares / probes / image.numel()
+
+
+def keep_needed(
+    scene: Gaussians,
+    removed: Bool[Tensor, "n"],
+    views: Sequence[View],
+    max_errors: Sequence[float],
+    renderer: Renderer,
+) -> Bool[Tensor, "n"]:
+    """Keep Gaussians visible in photographs that exceed their error limit without them.
+
+    This repeats until every photograph is within its limit.
+    """
+    before = None
+    while before is None or not torch.equal(removed, before):
+        before = removed
+        for view, error in zip(views, max_errors, strict=True):
+            if compute_scene_error(scene[~removed], view, renderer).item() > error:
+                removed = removed & ~(sum_weights(renderer.freeze(scene, view.camera)) > 0)
+    return removed
+
+
+def halve_view(view: View) -> View:
+    """Reduce a photograph to half its size."""
+    image = avg_pool2d(view.image.permute(2, 0, 1), 2).permute(1, 2, 0)
+    K = view.camera.K * view.camera.K.new_tensor([[0.5], [0.5], [1.0]])
+    camera = replace(view.camera, K=K, height=image.shape[0], width=image.shape[1])
+    return replace(view, image=image, camera=camera, depth=None, ignore_mask=None)

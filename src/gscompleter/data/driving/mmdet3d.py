@@ -1,0 +1,246 @@
+"""Infos of mmdetection3d 1.1, for nuScenes and for Waymo in KITTI's layout.
+
+A pickle lists samples: the vehicle pose, and image, intrinsics and pose of each camera. Consecutive
+samples of one drive make a scene.
+"""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Iterator, Mapping
+from contextlib import suppress
+from functools import partial
+from itertools import pairwise
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from jaxtyping import Float
+
+from gscompleter.data.cameras import Intrinsics
+from gscompleter.data.driving.moving_objects import Box, build_upright_pose
+from gscompleter.data.driving.restricted_pickle import load_plain
+from gscompleter.data.frame import Frame
+from gscompleter.data.json_fields import get_array, get_number, get_optional_number, get_text
+from gscompleter.data.limits import MAX_IN_PIXELS, MAX_SIDE
+from gscompleter.data.photographs import Photographs, build_drive
+from gscompleter.errors import InputError, quote_value
+from gscompleter.io.reading import open_file
+
+ADVICE = "write the infos again with mmdetection3d 1.1"
+FRONT = "CAM_FRONT"
+MAX_GAP = 1.5
+"""Largest gap between samples of a scene, in seconds; nuScenes has 0.5."""
+MAX_NUMBER = 1e12
+MAX_TIME = 1e12
+"""Largest time in seconds."""
+MICROSECONDS = 1e12
+"""Smallest time that is in microseconds."""
+STATIC_CLASSES = frozenset(("traffic_cone", "barrier"))
+"""Classes that do not move by themselves."""
+MAX_SNIFFED = 4096
+"""Bytes at either end of a pickle to detect infos."""
+
+
+def has_infos(path: Path) -> bool:
+    """Check whether `path` is a pickle of infos."""
+    if path.suffix != ".pkl" or not os.path.isfile(path):
+        return False
+    with suppress(InputError), open_file(path) as file:
+        head = file.read(MAX_SNIFFED)
+        file.seek(max(os.path.getsize(path) - MAX_SNIFFED, 0))
+        return b"data_list" in head + file.read() or b"metainfo" in head
+    return False
+
+
+def open_infos(path: Path) -> Iterator[Photographs]:
+    """Open the scenes of a pickle, named by drive and start time.
+
+    Frames are numbered camera by camera, the front camera first, and by time. Images are searched
+    beside the pickle and below it.
+    """
+    content = load_plain(path)
+    samples = content.get("data_list") if isinstance(content, dict) else None
+    if not isinstance(samples, list) or not samples:
+        raise InputError(f"{quote_value(path)} holds no infos with a `data_list`; {ADVICE}.")
+    kinds = _map_classes(content.get("metainfo"))
+    ordered = sorted(
+        (_Sample(path, kinds, *_check_sample(s, path)) for s in samples), key=_Sample.make_sort_key
+    )
+    return (_build_scene(path, scene) for scene in _split_scenes(ordered))
+
+
+class _Sample:
+    """Record of the vehicle at one time."""
+
+    def __init__(
+        self,
+        file: Path,
+        kinds: Mapping[int, str],
+        content: dict[str, Any],
+        images: dict[str, dict[str, Any]],
+        title: str,
+    ) -> None:
+        self.file, self.kinds, self.content, self.images = file, kinds, content, images
+        self.title = title
+        time = get_number(content, "timestamp", title, 0.0, MAX_TIME * 1e6)
+        self.time = time * 1e-6 if time >= MICROSECONDS else time
+        first = images.get(FRONT) or next(iter(images.values()))
+        file_name = os.path.basename(get_text(first, "img_path", title) or "")
+        self.drive = get_text(content, "context_name", title) or file_name.split("__")[0]
+
+    def make_sort_key(self) -> tuple[str, float]:
+        return self.drive, self.time
+
+    @property
+    def vehicle(self) -> Float[np.ndarray, "4 4"]:
+        return _get_numbers(self.content, "ego2global", (4, 4), self.title)
+
+    @property
+    def vehicle_from_laser(self) -> Float[np.ndarray, "4 4"]:
+        """Pose of the laser; identity for Waymo infos."""
+        lidar = self.content.get("lidar_points")
+        if not isinstance(lidar, dict) or "lidar2ego" not in lidar:
+            return np.eye(4)
+        return _get_numbers(lidar, "lidar2ego", (4, 4), self.title)
+
+
+def _check_sample(sample: Any, path: Path) -> tuple[dict[str, Any], dict[str, dict[str, Any]], str]:
+    """Return a sample, its images by camera, and its name in errors."""
+    title = f"a sample of {quote_value(path)}"
+    images = sample.get("images") if isinstance(sample, dict) else None
+    if not isinstance(images, dict):
+        raise InputError(f"An entry of {quote_value(path)} has no `images`; {ADVICE}.")
+    there = {
+        quote_value(name): image
+        for name, image in images.items()
+        if isinstance(name, str) and _is_posed(image)
+    }
+    if not there:
+        raise InputError(f"The images of {title} have no file or no pose; {ADVICE}.")
+    return sample, there, title
+
+
+def _is_posed(image: Any) -> bool:
+    needed = ("img_path", "cam2img", "lidar2cam")
+    return isinstance(image, dict) and all(image.get(key) is not None for key in needed)
+
+
+def _split_scenes(samples: list[_Sample]) -> Iterator[list[_Sample]]:
+    """Group consecutive samples of one drive."""
+    scene = samples[:1]
+    for before, after in pairwise(samples):
+        if after.drive != before.drive or after.time - before.time > MAX_GAP:
+            yield scene
+            scene = []
+        scene.append(after)
+    yield scene
+
+
+def _build_scene(path: Path, samples: list[_Sample]) -> Photographs:
+    cameras = {name: None for sample in samples for name in sample.images}
+    names = sorted(cameras, key=lambda name: (name != FRONT, name))
+    frames = [_make_frame(s, name) for name in names for s in samples if name in s.images]
+    called = f"{samples[0].drive}_{samples[0].time:.3f}"
+    return build_drive(called, str(path), frames, front=names[0])
+
+
+def _make_frame(sample: _Sample, camera: str) -> Frame:
+    image = sample.images[camera]
+    title = f"the photograph of {camera} at {sample.time:.3f} in {quote_value(sample.file)}"
+    file = get_text(image, "img_path", title)
+    assert file is not None
+    laser_from_camera = _invert(_get_numbers(image, "lidar2cam", (4, 4), title))
+    with np.errstate(over="ignore", invalid="ignore"):  # leaves a defect of the pose
+        # Through the laser frame: lidar2cam includes the vehicle's motion between the
+        # times of laser and camera.
+        c2w = sample.vehicle @ sample.vehicle_from_laser @ laser_from_camera
+    return Frame(
+        f"{camera}/{os.path.basename(file)}",
+        title,
+        c2w,
+        _parse_intrinsics(image, title),
+        _find_image(sample.file.parent, file, camera),
+        sensor=camera,
+        boxes=partial(_read_boxes, sample) if _has_speeds(sample) else None,
+    )
+
+
+def _invert(matrix: Float[np.ndarray, "4 4"]) -> Float[np.ndarray, "4 4"]:
+    """Invert a transform; NaN if singular, which counts as a defect of the pose."""
+    try:
+        return np.linalg.inv(matrix)
+    except np.linalg.LinAlgError:
+        return np.full((4, 4), np.nan)
+
+
+def _parse_intrinsics(image: Mapping[str, Any], title: str) -> Intrinsics:
+    rows = image["cam2img"]
+    wide = isinstance(rows, list) and all(isinstance(row, list) and len(row) == 4 for row in rows)
+    K = get_array(image, "cam2img", (3, 4) if wide else (3, 3), title)
+    if not np.isfinite(K).all() or np.abs(K).max() > MAX_IN_PIXELS:
+        raise InputError(f"The `cam2img` of {title} is impossible; {ADVICE}.")
+    sides = [
+        get_optional_number(image, key, title, 1.0, float(MAX_SIDE)) for key in ("width", "height")
+    ]
+    size = None if sides[0] is None or sides[1] is None else (int(sides[0]), int(sides[1]))
+    return Intrinsics(size, (K[0, 0], K[1, 1]), (K[0, 2], K[1, 2]))
+
+
+def _get_numbers(
+    entry: Mapping[str, Any], key: str, shape: tuple[int, ...], title: str
+) -> Float[np.ndarray, "*n"]:
+    """Read the nested list at `key`; checks magnitude, allows NaN."""
+    array = get_array(entry, key, shape, title)
+    if (np.abs(array) > MAX_NUMBER).any():
+        raise InputError(f"The `{key}` of {title} holds numbers beyond {MAX_NUMBER:g}; {ADVICE}.")
+    return array
+
+
+def _find_image(folder: Path, file: str, camera: str) -> Path:
+    """Find an image beside the pickle, or in the data set's folder of its camera."""
+    order = ("CAM_FRONT", "CAM_FRONT_LEFT", "CAM_FRONT_RIGHT", "CAM_SIDE_LEFT", "CAM_SIDE_RIGHT")
+    numbered = f"image_{order.index(camera)}" if camera in order else camera
+    places = [folder / file, folder / "samples" / camera / file, folder / camera / file]
+    places += [folder / part / numbered / file for part in ("training", "validation", "testing")]
+    return next((place for place in places if os.path.isfile(place)), places[0])
+
+
+def _map_classes(metainfo: Any) -> dict[int, str]:
+    kinds = metainfo.get("categories") if isinstance(metainfo, dict) else None
+    pairs = kinds.items() if isinstance(kinds, dict) else ()
+    return {n: kind for kind, n in pairs if isinstance(n, int) and isinstance(kind, str)}
+
+
+def _has_speeds(sample: _Sample) -> bool:
+    """Check whether objects have velocities, as in nuScenes."""
+    things = sample.content.get("instances")
+    return isinstance(things, list) and any(
+        isinstance(thing, dict) and "velocity" in thing for thing in things
+    )
+
+
+def _read_boxes(sample: _Sample) -> tuple[Box, ...]:
+    """Read the boxes of objects that may move; in the infos they are in the laser frame."""
+    title = f"a box in {quote_value(sample.file)}"
+    world = sample.vehicle @ sample.vehicle_from_laser
+    things = [thing for thing in sample.content["instances"] if isinstance(thing, dict)]
+    return tuple(
+        _parse_box(t, world, title) for t in things if _get_class(sample, t) not in STATIC_CLASSES
+    )
+
+
+def _get_class(sample: _Sample, thing: Mapping[str, Any]) -> str | None:
+    label = thing.get("bbox_label_3d")
+    return sample.kinds.get(label) if isinstance(label, int) else None
+
+
+def _parse_box(thing: Mapping[str, Any], world: Float[np.ndarray, "4 4"], title: str) -> Box:
+    center, sides, heading = np.split(_get_numbers(thing, "bbox_3d", (7,), title), [3, 6])
+    velocity = (
+        _get_numbers(thing, "velocity", (2,), title) if "velocity" in thing else np.full(2, np.nan)
+    )
+    speed = float(np.linalg.norm(velocity))
+    length, width, height = sides.tolist()
+    pose = world @ build_upright_pose(center, float(heading[0]))
+    return Box(pose, (length, width, height), speed if np.isfinite(speed) else None)

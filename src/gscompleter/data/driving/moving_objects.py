@@ -1,0 +1,93 @@
+"""Boxes around moving objects, and the pixels that they cover."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from dataclasses import dataclass
+from itertools import combinations, product
+
+import cv2
+import numpy as np
+from jaxtyping import Bool, Float
+
+from gscompleter.types import Camera
+
+MIN_SPEED = 0.5
+"""Smallest speed of a moving object, in metres per second."""
+MARGIN = 0.1
+"""Relative enlargement of a box, for shadows, mirrors and time offsets."""
+NEAREST = 0.1
+"""z-depth at which a box is clipped, in metres."""
+MAX_PIXELS = 1e5
+"""Largest pixel coordinate of a projected corner; rasterisers use integers."""
+
+
+@dataclass(frozen=True, eq=False)
+class Box:
+    """A box around one object."""
+
+    pose: Float[np.ndarray, "4 4"]
+    """Centre and axes, in the world frame."""
+    sides: tuple[float, float, float]
+    """Side lengths along its own axes, in metres."""
+    speed: float | None
+    """Speed in metres per second, or None if unknown."""
+
+    @property
+    def is_moving(self) -> bool:
+        """True if the object moves or its speed is unknown."""
+        return self.speed is None or not self.speed < MIN_SPEED
+
+    def compute_corners(self) -> Float[np.ndarray, "8 3"]:
+        """Compute the corners of the enlarged box in the world frame."""
+        signs = np.array(list(product((-0.5, 0.5), repeat=3)))
+        local = signs * np.array(self.sides) * (1 + MARGIN)
+        return local @ self.pose[:3, :3].T + self.pose[:3, 3]
+
+
+def build_upright_pose(center: Float[np.ndarray, "3"], heading: float) -> Float[np.ndarray, "4 4"]:
+    """Build the pose of an upright box (z up), rotated by `heading` radians."""
+    pose = np.eye(4)
+    cos, sin = np.cos(heading), np.sin(heading)
+    pose[:2, :2] = [[cos, -sin], [sin, cos]]
+    pose[:3, 3] = center
+    return pose
+
+
+def mask_moving(
+    boxes: Iterable[Box], camera: Camera, origin: Float[np.ndarray, "3"]
+) -> Bool[np.ndarray, "h w"]:
+    """Mask pixels covered by moving boxes, including occluders in front of them.
+
+    `boxes` are in the world frame of the files, `camera` in coordinates relative to `origin`.
+    """
+    mask = np.zeros((camera.height, camera.width), np.uint8)
+    for box in boxes:
+        outline = (
+            _compute_outline(box.compute_corners() - origin, camera) if box.is_moving else None
+        )
+        if outline is not None:
+            cv2.fillConvexPoly(mask, outline, 1)
+    return mask > 0
+
+
+def _compute_outline(corners: Float[np.ndarray, "8 3"], camera: Camera) -> np.ndarray | None:
+    """Compute the convex outline of a box in whole pixels; None if it is behind the camera."""
+    c2w, K = (matrix.double().cpu().numpy() for matrix in (camera.c2w, camera.K))
+    local = (corners - c2w[:3, 3]) @ c2w[:3, :3]
+    if not np.isfinite(local).all() or local[:, 2].max() <= NEAREST:
+        return None
+    shown = _clip_near(local)
+    pixels = (shown @ K.T)[:, :2] / shown[:, 2:]
+    # OpenCV puts the centre of the first pixel at (0, 0).
+    pixels = np.clip(pixels - 0.5, -MAX_PIXELS, MAX_PIXELS)
+    return cv2.convexHull(np.rint(pixels).astype(np.int32))
+
+
+def _clip_near(corners: Float[np.ndarray, "8 3"]) -> Float[np.ndarray, "n 3"]:
+    """Clip a box (camera axes) at `NEAREST`."""
+    kept = [corner for corner in corners if corner[2] > NEAREST]
+    for a, b in combinations(corners, 2):
+        if (a[2] > NEAREST) != (b[2] > NEAREST):
+            kept.append(a + (NEAREST - a[2]) / (b[2] - a[2]) * (b - a))
+    return np.array(kept)

@@ -1,0 +1,94 @@
+"""A local origin for scenes with large coordinates, such as those of maps.
+
+At 5,000,000 m float32 has steps of half a metre, which hides a stereo baseline. Poses are read in
+float64, so the origin can move before rounding.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import torch
+from jaxtyping import Float
+
+from gscompleter.data.cameras import find_pose_defect
+from gscompleter.data.json_fields import get_array, get_number
+from gscompleter.errors import InputError, quote_value
+from gscompleter.io.json_file import read_json
+from gscompleter.types import Camera, Gaussians
+
+MAX_REMOTENESS = 1e3
+"""Ratio of coordinates to camera spread above which a local origin is used."""
+MAX_STEP = 1e-3
+"""Coarsest float32 step of coordinates, relative to the camera spread."""
+
+
+def choose_local_origin(poses: Sequence[Float[np.ndarray, "4 4"]]) -> Float[np.ndarray, "3"]:
+    """Choose the coordinate origin: zero, or the first camera centre for remote cameras."""
+    if not poses:
+        return np.zeros(3)
+    centers = np.stack([pose[:3, 3] for pose in poses])
+    spread = np.abs(centers - centers[0]).max()
+    remote = spread > 0 and np.abs(centers).max() > MAX_REMOTENESS * spread
+    return centers[0] if remote else np.zeros(3)
+
+
+def compute_frame_from_photographs(origin: Float[np.ndarray, "3"]) -> Float[np.ndarray, "4 4"]:
+    """Build the transform from the photographs' frame to the frame with zero at `origin`."""
+    transform = np.eye(4)
+    transform[:3, 3] -= origin
+    return transform
+
+
+def choose_scene_origin(scene: Gaussians, origin: Float[np.ndarray, "3"]) -> Float[np.ndarray, "3"]:
+    """Choose a scene's origin: `origin` if the scene lies near it, else zero."""
+    if len(scene) == 0 or not origin.any():
+        return origin
+    middle = scene.means.median(dim=0).values.double().cpu().numpy()
+    there = np.abs(middle - origin).max() < 0.5 * np.abs(origin).max()
+    return origin if there else np.zeros(3)
+
+
+def shift_to_origin(
+    origin: Float[np.ndarray, "3"], scene: Gaussians, cameras: Sequence[Camera]
+) -> Gaussians:
+    """Express a scene relative to `origin` (scene units); refuses too coarse float32 steps."""
+    if not origin.any():
+        return scene
+    step = float(np.spacing(np.float32(np.abs(origin).max())))
+    centers = torch.stack([camera.center.cpu() for camera in cameras])
+    spread = (centers - centers[0]).norm(dim=-1).max().item()
+    if step > MAX_STEP * spread:
+        raise InputError(
+            f"The scene lies {np.abs(origin).max():g} units from its origin, where float32 has "
+            f"steps of {step:g}, and its cameras are {spread:g} apart; export the scene and its "
+            "photographs relative to a local origin."
+        )
+    means = scene.means.double() - torch.from_numpy(origin).to(scene.means.device)
+    return replace(scene, means=means.float())
+
+
+SCALE_RANGE = (1e-9, 1e9)
+
+
+def read_dataparser_transforms(path: Path) -> Float[np.ndarray, "4 4"]:
+    """Read the similarity from the reconstruction's frame to that of the trained scene.
+
+    The file holds a rigid 3×4 `transform` and a `scale` that multiplies its result.
+    """
+    content = read_json(path, "copy it from the folder of the nerfstudio run again")
+    if not isinstance(content, dict):
+        raise InputError(
+            f"{quote_value(path)} is no object with `transform` and `scale`; copy it again."
+        )
+    rigid = np.vstack([get_array(content, "transform", (3, 4), str(path)), [0, 0, 0, 1]])
+    defect = find_pose_defect(rigid)
+    if defect is not None:
+        raise InputError(
+            f"The `transform` of {quote_value(path)} cannot be used: {defect}; copy it again."
+        )
+    scale = get_number(content, "scale", str(path), *SCALE_RANGE)
+    return np.diag([scale, scale, scale, 1.0]) @ rigid

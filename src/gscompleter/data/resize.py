@@ -1,0 +1,87 @@
+"""Resizing of images and cameras to a resolution."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from jaxtyping import Shaped
+from PIL import Image
+
+from gscompleter.data.limits import MAX_SIDE
+from gscompleter.data.undistort import Pinhole
+from gscompleter.errors import InputError, quote_value
+
+Resolution = tuple[int, int] | int | None
+"""Target size of images.
+
+Height and width in pixels: resize to cover, then crop the centre. One number: shrink to at most
+this longer side. None: keep the size.
+"""
+
+
+@dataclass(frozen=True)
+class Framing:
+    """Resize to `scaled_size`, then crop `size` at `corner` (all x, y)."""
+
+    scaled_size: tuple[int, int]
+    corner: tuple[int, int]
+    size: tuple[int, int]
+
+    def apply_to_camera(self, pinhole: Pinhole) -> Pinhole:
+        """Return the camera of the framed image."""
+        return pinhole.resize(*self.scaled_size).crop(*self.corner, *self.size)
+
+    def apply_to_image(
+        self, image: Shaped[np.ndarray, "h w *c"], filtering: Image.Resampling
+    ) -> Shaped[np.ndarray, "h2 w2 *c"]:
+        """Resize and crop an image."""
+        left, top = self.corner
+        width, height = self.size
+        resized = resize(image, self.scaled_size, filtering)
+        return np.ascontiguousarray(resized[top : top + height, left : left + width])
+
+
+def compute_framing(width: int, height: int, resolution: Resolution) -> Framing:
+    """Compute the framing of a width × height image for a resolution."""
+    check_resolution(resolution)
+    if resolution is not None and not isinstance(resolution, int):
+        return compute_cover_framing(width, height, resolution)
+    scale = 1.0 if resolution is None else min(1.0, resolution / max(width, height))
+    size = max(round(width * scale), 1), max(round(height * scale), 1)
+    return Framing(size, (0, 0), size)
+
+
+def compute_cover_framing(width: int, height: int, resolution: tuple[int, int]) -> Framing:
+    """Compute the framing that covers `resolution` (height, width) and crops the centre."""
+    scale = max(resolution[0] / height, resolution[1] / width)
+    new_width = max(round(width * scale), resolution[1])
+    new_height = max(round(height * scale), resolution[0])
+    if max(new_width, new_height) > MAX_SIDE:
+        raise InputError(
+            f"An image of {width} × {height} pixels that covers {resolution[1]} × {resolution[0]} "
+            f"has a side above {MAX_SIDE}; choose a smaller resolution, or crop the image."
+        )
+    corner = (new_width - resolution[1]) // 2, (new_height - resolution[0]) // 2
+    return Framing((new_width, new_height), corner, (resolution[1], resolution[0]))
+
+
+def resize(
+    image: Shaped[np.ndarray, "h w *c"], size: tuple[int, int], filtering: Image.Resampling
+) -> Shaped[np.ndarray, "h2 w2 *c"]:
+    """Resize an image to `size` (width, height)."""
+    if image.shape[1::-1] == size:
+        return image
+    return np.array(Image.fromarray(image).resize(size, filtering))
+
+
+def check_resolution(resolution: Resolution) -> None:
+    """Raise an InputError if a side is not within 1 to `MAX_SIDE`."""
+    if resolution is None:
+        return
+    sides = (resolution,) if isinstance(resolution, int) else resolution
+    if not all(1 <= side <= MAX_SIDE for side in sides):
+        raise InputError(
+            f"The resolution {' × '.join(map(quote_value, sides))} is impossible; height and "
+            f"width have to be positive, and at most {MAX_SIDE}."
+        )

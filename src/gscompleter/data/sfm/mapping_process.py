@@ -1,0 +1,407 @@
+"""Structure from motion in a separate process, because COLMAP aborts on errors.
+
+The argument is the JSON file of a job. Output is one JSON object per line: `{"begin": phase,
+"steps": n}`, then about n times `{"step": 1}` and `{"end": phase}`, and at last `{"result": ...}`.
+COLMAP's own output goes to standard error.
+"""
+
+from __future__ import annotations
+
+import json
+import math
+import os
+import sys
+from collections import Counter
+from collections.abc import Iterator
+from contextlib import contextmanager
+from copy import deepcopy
+from dataclasses import dataclass
+from pathlib import Path
+from typing import IO, Any
+
+import numpy as np
+import pycolmap
+
+from gscompleter.data.sfm.match_pairs import (
+    MAX_EXHAUSTIVE,
+    Pairs,
+    compute_similarity,
+    is_sequence,
+    pair_all,
+    pair_neighbours,
+    pair_similar,
+    select_largest_features,
+)
+from gscompleter.data.sfm.upright import UprightCopy
+
+SEED = 0
+MAX_FEATURES = 4096
+"""Most features in a photograph."""
+BATCH = 50
+"""Pairs matched per step of the progress bar."""
+LENS = "SIMPLE_RADIAL"
+"""COLMAP's camera model: one focal length, one distortion coefficient."""
+GUESSED_FOCAL = 1.2
+"""Focal length in longer image sides, if EXIF lacks it."""
+MIN_MODEL = 3
+"""Fewest photographs of a disconnected part that is reported."""
+MIN_FOR_CENTRE = 10
+"""Fewest photographs per camera to refine its principal point."""
+MAX_OFF_CENTRE = 0.1
+"""Largest plausible distance of the principal point from the centre, in longer sides."""
+FOV = 10.0, 150.0
+"""Plausible range of the field of view along the longer side, in degrees."""
+MAX_SHIFT = 0.5
+"""Largest plausible shift of an image corner by distortion, relative to its radius."""
+FIXED_FOVS = (75.0, 60.0, 90.0, 45.0)
+"""Fields of view along the longer side, in degrees, to fix the focal length at, in order."""
+MAX_ROUNDS = 4
+"""Most rounds of mapping with a fixed focal length, each at the value last fitted."""
+FOCAL_TOLERANCE = 0.02
+"""Relative change of the focal length that counts as converged."""
+
+
+@dataclass(frozen=True)
+class Job:
+    """Input of the process."""
+
+    images: Path
+    work: Path
+    """Folder for the database and temporary files."""
+    model: Path
+    """Folder for the largest model; it does not exist yet."""
+    photographs: list[UprightCopy]
+    threads: int
+    min_photographs: int
+    """Fewest photographs in a model that end the search for a focal length."""
+    min_points: int
+    """Fewest points in a model that end the search."""
+
+    @property
+    def database(self) -> Path:
+        """Path of COLMAP's database."""
+        return self.work / "database.db"
+
+
+class ProgressWriter:
+    """Reporter of progress as JSON lines."""
+
+    def __init__(self, out: IO[str]) -> None:
+        self.out = out
+
+    @contextmanager
+    def phase(self, name: str, steps: int) -> Iterator[None]:
+        """Report the begin and end of a phase."""
+        self.write_line({"begin": name, "steps": steps})
+        yield
+        self.write_line({"end": name})
+
+    def step(self) -> None:
+        """Report one step."""
+        self.write_line({"step": 1})
+
+    def write_line(self, line: dict[str, Any]) -> None:
+        """Write one line."""
+        print(json.dumps(line), file=self.out, flush=True)
+
+
+def main() -> None:
+    """Run the job in the file that the command line names."""
+    progress = ProgressWriter(os.fdopen(os.dup(1), "w"))
+    os.dup2(2, 1)  # keeps output of COLMAP apart from ours
+    task = json.loads(Path(sys.argv[1]).read_text(encoding="utf-8"))
+    photographs = [UprightCopy(**one) for one in task["photographs"]]
+    images, work, model = (Path(task[name]) for name in ("images", "work", "model"))
+    job = Job(images, work, model, photographs, task["threads"], task["wanted"], task["min_points"])
+    pycolmap.logging.minloglevel = pycolmap.logging.Level.ERROR.value
+    pycolmap.set_random_seed(SEED)
+    find_features(job, progress)
+    match(job, select_pairs(job), progress)
+    progress.write_line({"result": map_all(job, progress)})
+
+
+def find_features(job: Job, progress: ProgressWriter) -> None:
+    """Extract SIFT features of all photographs; those of equal size and lens share a camera."""
+
+    def make_key(one: UprightCopy) -> tuple[int, int, str]:
+        return one.width, one.height, one.lens
+
+    extraction = pycolmap.FeatureExtractionOptions(num_threads=job.threads, use_gpu=False)
+    extraction.sift.max_num_features = MAX_FEATURES
+    cameras = {make_key(one): one for one in job.photographs}
+    numbers = {key: _add_camera(job, one) for key, one in cameras.items()}
+    with progress.phase("Finding features", len(job.photographs)):
+        for one in job.photographs:
+            pycolmap.extract_features(
+                job.database,
+                job.images,
+                [one.name],
+                reader_options=pycolmap.ImageReaderOptions(
+                    existing_camera_id=numbers[make_key(one)]
+                ),
+                extraction_options=extraction,
+                device=pycolmap.Device.cpu,
+            )
+            progress.step()
+
+
+def _add_camera(job: Job, one: UprightCopy) -> int:
+    focal = one.focal or GUESSED_FOCAL * max(one.width, one.height)
+    camera = pycolmap.Camera.create_from_model_name(1, LENS, focal, one.width, one.height)
+    camera.has_prior_focal_length = one.focal is not None
+    with pycolmap.Database.open(job.database) as database:
+        return int(database.write_camera(camera))
+
+
+def select_pairs(job: Job) -> Pairs:
+    """Choose the photographs to match: sequence neighbours, all pairs, or similar photographs."""
+    names = [one.name for one in job.photographs]
+    if is_sequence(names):
+        return pair_neighbours(len(names)) | pair_similar(
+            compute_similarity(_read_largest_features(job))
+        )
+    if len(names) <= MAX_EXHAUSTIVE:
+        return pair_all(len(names))
+    return pair_similar(compute_similarity(_read_largest_features(job)))
+
+
+def _read_largest_features(job: Job) -> list[np.ndarray]:
+    with pycolmap.Database.open(job.database) as database:
+        return [_read_features(database, one.name) for one in job.photographs]
+
+
+def _read_features(database: Any, name: str) -> np.ndarray:
+    number = database.read_image_with_name(name).image_id
+    scales = np.linalg.norm(database.read_keypoints(number)[:, 2:4], axis=1)
+    return select_largest_features(
+        scales, np.asarray(database.read_descriptors(number).data, dtype=np.float32)
+    )
+
+
+def match(job: Job, pairs: Pairs, progress: ProgressWriter) -> None:
+    """Match the features of all pairs and verify them with an essential matrix."""
+    matching = pycolmap.FeatureMatchingOptions(num_threads=job.threads, use_gpu=False)
+    verification = pycolmap.TwoViewGeometryOptions()
+    verification.ransac.random_seed = SEED
+    batches = list(_split_batches(sorted(pairs)))
+    listed = pycolmap.ImportedPairingOptions(match_list_path=job.work / "pairs.txt")
+    with progress.phase("Matching features", len(batches)):
+        for batch in batches:
+            names = [(job.photographs[i].name, job.photographs[j].name) for i, j in batch]
+            listed.match_list_path.write_text("".join(f"{a} {b}\n" for a, b in names))
+            pycolmap.match_image_pairs(
+                job.database, matching, listed, verification, pycolmap.Device.cpu
+            )
+            progress.step()
+
+
+def _split_batches(pairs: list[tuple[int, int]]) -> Iterator[list[tuple[int, int]]]:
+    return (pairs[i : i + BATCH] for i in range(0, len(pairs), BATCH))
+
+
+@dataclass(frozen=True)
+class Attempt:
+    """Models from one treatment of the focal length."""
+
+    models: list[Any]
+    """Disconnected models, the largest first."""
+    is_focal_fixed: bool = False
+    """True if the focal length was fixed at first."""
+
+    @property
+    def quality(self) -> tuple[bool, int, int]:
+        """Sort key: plausible lenses, then photographs, then points of the largest model."""
+        if not self.models:
+            return False, 0, 0
+        model = self.models[0]
+        return find_lens_defect(model) is None, model.num_reg_images(), model.num_points3D()
+
+
+def map_all(job: Job, progress: ProgressWriter) -> dict[str, Any]:
+    """Find cameras and points from the matches, and write the largest model.
+
+    Returns:
+        Its `registered` photographs by the names of their copies, the sizes of all `models`
+        (largest first), its number of `points`, its mean reprojection `error` in pixels, the
+        `find_defect` of its lens or None, and the `focal` length in pixels if it was fixed at first,
+        else None.
+    """
+    attempt = select_attempt(job, progress)
+    if not attempt.models:
+        return {"registered": [], "models": [], "points": 0, "error": 0.0}
+    largest_one = refine_principal_points(attempt.models[0])
+    job.model.mkdir(parents=True)
+    largest_one.write(job.model)
+    return {
+        "registered": sorted(largest_one.images[i].name for i in largest_one.reg_image_ids()),
+        "models": count_parts([set(model.reg_image_ids()) for model in attempt.models]),
+        "points": largest_one.num_points3D(),
+        "error": largest_one.compute_mean_reprojection_error(),
+        "defect": find_lens_defect(largest_one),
+        "focal": list_used_cameras(largest_one)[0].mean_focal_length()
+        if attempt.is_focal_fixed
+        else None,
+    }
+
+
+def select_attempt(job: Job, progress: ProgressWriter) -> Attempt:
+    """Return the first attempt that is good enough, or else the best."""
+    best = Attempt([])
+    for attempt in run_attempts(job, progress):
+        best = max(best, attempt, key=lambda one: one.quality)
+        is_plausible, photographs, points = best.quality
+        if is_plausible and photographs >= job.min_photographs and points >= job.min_points:
+            break
+    return best
+
+
+def run_attempts(job: Job, progress: ProgressWriter) -> Iterator[Attempt]:
+    """Map with a free focal length, then with each plausible fixed value."""
+    yield Attempt(_map_models(job, progress))
+    for focals in list_focals(job):
+        yield Attempt(map_with_fixed_focals(job, progress, focals), is_focal_fixed=True)
+
+
+def list_focals(job: Job) -> list[dict[int, float]]:
+    """List fixed focal lengths (pixels) by camera: from EXIF if all have it, then `FIXED_FOVS`."""
+    with pycolmap.Database.open(job.database) as database:
+        cameras = database.read_all_cameras()
+    in_exif = {one.camera_id: one.focal_length for one in cameras if one.has_prior_focal_length}
+    sides = {one.camera_id: max(one.width, one.height) for one in cameras}
+    return [
+        *([in_exif] if len(in_exif) == len(cameras) else []),
+        *(
+            {number: side / 2 / math.tan(math.radians(fov / 2)) for number, side in sides.items()}
+            for fov in FIXED_FOVS
+        ),
+    ]
+
+
+def map_with_fixed_focals(
+    job: Job, progress: ProgressWriter, focals: dict[int, float]
+) -> list[Any]:
+    """Map with fixed focal lengths, refine them, and repeat until they converge.
+
+    With a wrong focal length the mapper still connects photographs that it cannot connect with a
+    free one, and together they determine the right value.
+    """
+    best = list[Any]()
+    for _ in range(MAX_ROUNDS):
+        fix_focals(job, focals)
+        models = _map_models(job, progress, is_focal_fixed=True)
+        if not models or (best and models[0].num_reg_images() < best[0].num_reg_images()):
+            break
+        best = [refine_lenses(models[0], refine_extra_params=False), *models[1:]]
+        fitted = {one.camera_id: one.mean_focal_length() for one in list_used_cameras(best[0])}
+        if all(abs(fitted[n] / focals[n] - 1) < FOCAL_TOLERANCE for n in fitted):
+            break
+        focals = focals | fitted
+    return [refine_lenses(best[0]), *best[1:]] if best else []
+
+
+def fix_focals(job: Job, focals: dict[int, float]) -> None:
+    """Fix focal lengths (pixels) in the database, without distortion."""
+    with pycolmap.Database.open(job.database) as database:
+        for camera in database.read_all_cameras():
+            known = pycolmap.Camera.create_from_model_name(
+                camera.camera_id, LENS, focals[camera.camera_id], camera.width, camera.height
+            )
+            known.has_prior_focal_length = True
+            database.update_camera(known)
+
+
+def list_used_cameras(model: pycolmap.Reconstruction) -> list[pycolmap.Camera]:
+    """List the cameras of the model, that of most photographs first."""
+    numbers = Counter(model.images[i].camera_id for i in model.reg_image_ids())
+    return [model.cameras[number] for number, _ in numbers.most_common()]
+
+
+def find_lens_defect(model: pycolmap.Reconstruction) -> str | None:
+    """Describe the first implausible lens of the model; None if all are plausible."""
+    return next(filter(None, map(_find_camera_defect, list_used_cameras(model))), None)
+
+
+def _find_camera_defect(camera: pycolmap.Camera) -> str | None:
+    focal = camera.mean_focal_length()
+    if not (math.isfinite(focal) and focal > 0):
+        return f"a focal length of {focal:g} px"
+    fov = math.degrees(2 * math.atan(max(camera.width, camera.height) / 2 / focal))
+    corner = (camera.width**2 + camera.height**2) / 4 / focal**2
+    shift = camera.params[camera.extra_params_idxs()[0]] * corner
+    if FOV[0] <= fov <= FOV[1] and abs(shift) <= MAX_SHIFT:
+        return None
+    return (
+        f"a focal length of {focal:.0f} px ({fov:.0f}° across) and a distortion that moves corners "
+        f"by {100 * abs(shift):.0f} %"
+    )
+
+
+def count_parts(models: list[set[int]]) -> list[int]:
+    """Count the photographs of each disconnected model, largest first.
+
+    A second model among photographs that are already placed is no part.
+    """
+    sizes, placed = list[int](), set[int]()
+    for model in models:
+        if not sizes or len(model - placed) >= MIN_MODEL:
+            sizes.append(len(model))
+            placed |= model
+    return sizes
+
+
+def refine_principal_points(model: pycolmap.Reconstruction) -> pycolmap.Reconstruction:
+    """Refine the principal points if there are enough photographs.
+
+    The mapper leaves them at the image centres: few photographs cannot separate them from a
+    rotation, and neither can similar photographs, so the result is rejected if far from the centre.
+    """
+    numbers = Counter(model.images[i].camera_id for i in model.reg_image_ids())
+    if min(numbers.values()) < MIN_FOR_CENTRE:
+        return model
+    refined = refine_lenses(model, refine_principal_point=True)
+    return refined if all(map(_is_centred, list_used_cameras(refined))) else model
+
+
+def refine_lenses(model: pycolmap.Reconstruction, **options: bool) -> pycolmap.Reconstruction:
+    """Bundle-adjust a copy with free focal lengths; return the input if a lens gets implausible."""
+    refined = deepcopy(model)
+    adjustment = pycolmap.BundleAdjustmentOptions(print_summary=False, **options)
+    pycolmap.bundle_adjustment(refined, adjustment)
+    refined.update_point_3d_errors()
+    return refined if find_lens_defect(refined) is None else model
+
+
+def _is_centred(camera: pycolmap.Camera) -> bool:
+    x, y = camera.principal_point_x, camera.principal_point_y
+    off = math.hypot(x - camera.width / 2, y - camera.height / 2)
+    return bool(off <= MAX_OFF_CENTRE * max(camera.width, camera.height))
+
+
+def _map_models(job: Job, progress: ProgressWriter, is_focal_fixed: bool = False) -> list[Any]:
+    """Map the scene into disconnected models, the largest first."""
+
+    def count_first_pair() -> None:
+        progress.step()
+        progress.step()
+
+    options = pycolmap.IncrementalPipelineOptions(
+        num_threads=job.threads,
+        random_seed=SEED,
+        min_model_size=MIN_MODEL,
+        ba_refine_focal_length=not is_focal_fixed,
+        ba_refine_extra_params=not is_focal_fixed,
+    )
+    with progress.phase("Placing cameras", len(job.photographs)):
+        found = pycolmap.incremental_mapping(
+            job.database,
+            job.images,
+            job.work,
+            options,
+            initial_image_pair_callback=count_first_pair,
+            next_image_callback=progress.step,
+        )
+    return sorted(found.values(), key=lambda model: -model.num_reg_images())
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,295 @@
+"""Camera poses for photographs without poses, by COLMAP on the CPU.
+
+The output folder has COLMAP's standard layout: upright copies in `images`, the model in `sparse/0`.
+A `summary.json` records the input photographs, so that the next run can reuse the result. COLMAP
+runs in a separate process (`mapping_process`).
+"""
+
+from __future__ import annotations
+
+import json
+import math
+import os
+import subprocess
+import sys
+import tempfile
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import asdict, dataclass
+from importlib.util import find_spec
+from pathlib import Path
+from typing import IO, Any
+
+from gscompleter.cpu_threads import get_thread_count
+from gscompleter.data.frame import DOWNSCALE_FACTORS
+from gscompleter.data.image_folders import MASKS
+from gscompleter.data.sfm.match_pairs import make_sort_key
+from gscompleter.data.sfm.upright import UprightCopy, write_upright
+from gscompleter.errors import InputError, join_names, quote_value
+from gscompleter.io.files import SUMMARY_FILE, open_output_folder
+from gscompleter.io.json_file import read_json
+from gscompleter.progress import track
+
+ENDINGS = (".jpg", ".jpeg", ".png", ".tif", ".tiff", ".webp", ".bmp")
+"""Endings of photographs, in any case."""
+OTHER_FOLDERS = (MASKS, "depth", "depths", *(f"images_{n}" for n in DOWNSCALE_FACTORS))
+"""Folders that hold no photographs of the user."""
+POSES = "colmap"
+"""Output folder of a completion for the poses found for it."""
+MIN_PHOTOGRAPHS = 3
+"""Fewest photographs; two determine neither a focal length nor a wrong match."""
+MIN_SHARE = 0.25
+"""Smallest share of the photographs in a usable model."""
+WANTED_SHARE = 0.5
+"""Share of the photographs in a model below which other focal lengths are tried."""
+MIN_POINTS = 30
+"""Fewest points of a model; COLMAP needs as many in common with one photograph."""
+MAX_THREADS = 4
+MAX_NAMED = 5
+"""Most photographs that a note names."""
+PROCESS = "gscompleter.data.sfm.mapping_process"
+
+
+@dataclass(frozen=True)
+class FoundPoses:
+    """Result of structure from motion on a folder of photographs."""
+
+    photographs: int
+    """Number of input photographs."""
+    missing: tuple[str, ...]
+    """Photographs without a camera."""
+    models: tuple[int, ...]
+    """Cameras in each disconnected model, the largest and kept one first."""
+    points: int
+    """Points of the model."""
+    error: float
+    """Mean reprojection error, in pixels of the copies."""
+    focal: float | None = None
+    """Focal length in pixels of the copies if it had to be fixed at first, else None."""
+    reused: bool = False
+    """True if the result is from an earlier run."""
+
+    @property
+    def num_registered(self) -> int:
+        """Number of cameras found."""
+        return self.photographs - len(self.missing)
+
+    @property
+    def is_too_small(self) -> bool:
+        """True if the model has too few photographs or points."""
+        enough = max(MIN_PHOTOGRAPHS, MIN_SHARE * self.photographs)
+        return self.num_registered < enough or self.points < MIN_POINTS
+
+    @property
+    def notes(self) -> list[str]:
+        """Sentences for the user."""
+        notes, place = [], ""
+        if self.focal is not None:
+            notes.append(
+                f"{self.num_registered} of {self.photographs} cameras were found with a focal "
+                "length "
+                f"of {self.focal:.0f} px, fixed at plausible values first, because COLMAP failed "
+                "with a free one."
+            )
+        if len(self.models) > 1:
+            *others, last = map(str, self.models)
+            notes.append(
+                f"The photographs fall into {len(self.models)} parts that do not connect, with "
+                f"{', '.join(others)} and {last} cameras; the largest is kept."
+            )
+            place = " in it"
+        if self.missing:
+            names = join_names(self.missing, MAX_NAMED)
+            notes.append(f"No camera was found{place} for {names}; they are left out.")
+        return notes
+
+
+def find_poses(photographs: Path, out: Path, overwrite: bool = False) -> FoundPoses:
+    """Find the cameras of the `photographs` in a folder and write them to the folder `out`.
+
+    Raises:
+        InputError: If there are too few photographs, cameras or points, a photograph is damaged,
+            the lens is implausible, pycolmap is missing or fails, or `out` cannot be written.
+    """
+    names = list_photograph_files(photographs)
+    known = _compute_fingerprint(photographs, names)
+    earlier = _read_earlier(out, known)
+    if earlier is not None:
+        return earlier
+    check_pycolmap()
+    with open_output_folder(out, overwrite) as folder:
+        found = _run(photographs, names, folder)
+        content = {"found": asdict(found), "photographs": known}
+        (folder / SUMMARY_FILE).write_text(json.dumps(content, indent=1))
+    return found
+
+
+def has_photographs(path: Path) -> bool:
+    """Check whether `path` is a folder with photographs, with or without cameras."""
+    return os.path.isdir(path) and bool(_walk_photographs(path))
+
+
+def list_photograph_files(folder: Path) -> list[str]:
+    """List the photographs below a folder in natural order; at least `MIN_PHOTOGRAPHS`."""
+    if not os.path.isdir(folder):
+        raise InputError(f"There is no folder {quote_value(folder)}; name a folder of photographs.")
+    names = _walk_photographs(folder)
+    if len(names) < MIN_PHOTOGRAPHS:
+        raise InputError(
+            f"There are {len(names)} photographs ({', '.join(ENDINGS)}) in {quote_value(folder)}, "
+            "and "
+            f"at least {MIN_PHOTOGRAPHS} are needed to find their cameras; add more."
+        )
+    return names
+
+
+def check_pycolmap() -> None:
+    """Raise an InputError if pycolmap is not installed."""
+    if find_spec("pycolmap") is None:
+        raise InputError(
+            "Finding the cameras of photographs needs pycolmap, which is not installed; run "
+            "pip install 'gscompleter[poses]'."
+        )
+
+
+def _walk_photographs(folder: Path) -> list[str]:
+    found: list[Path] = []
+    for home, folders, files in os.walk(folder):
+        folders[:] = [name for name in folders if is_own(Path(home, name))]
+        shown = (Path(home, name) for name in files if not name.startswith("."))
+        found += [path.relative_to(folder) for path in shown if path.suffix.lower() in ENDINGS]
+    return sorted((path.as_posix() for path in found), key=make_sort_key)
+
+
+def is_own(folder: Path) -> bool:
+    """Check that a folder may hold photographs: not hidden, masks, depth, copies or our result."""
+    if folder.name.startswith(".") or folder.name.casefold() in OTHER_FOLDERS:
+        return False
+    return not os.path.isfile(folder / SUMMARY_FILE)
+
+
+def _compute_fingerprint(folder: Path, names: Sequence[str]) -> dict[str, list[int]]:
+    stats = {name: (folder / name).stat() for name in names}
+    return {name: [stat.st_size, stat.st_mtime_ns] for name, stat in stats.items()}
+
+
+def _read_earlier(out: Path, known: Mapping[str, list[int]]) -> FoundPoses | None:
+    """Read the earlier result for these photographs; None if missing or too small."""
+    if not os.path.isfile(out / SUMMARY_FILE) or not os.path.isdir(out / "sparse" / "0"):
+        return None
+    content = read_json(out / SUMMARY_FILE, "name another folder")
+    if not isinstance(content, dict) or content.get("photographs") != known:
+        return None
+    found = content["found"]
+    earlier = FoundPoses(
+        found["photographs"],
+        tuple(found["missing"]),
+        tuple(found["models"]),
+        found["points"],
+        found["error"],
+        found.get("focal"),
+        reused=True,
+    )
+    return None if earlier.is_too_small else earlier
+
+
+def _run(photographs: Path, names: Sequence[str], folder: Path) -> FoundPoses:
+    """Write `images` and `sparse/0` into `folder`."""
+    copies = [
+        write_upright(photographs, name, folder / "images")
+        for name in track(names, "Turning photographs upright")
+    ]
+    result = _map(copies, folder)
+    if not result["registered"]:
+        raise InputError(
+            f"COLMAP found no cameras for the {len(names)} photographs in "
+            f"{quote_value(str(photographs))}; add photographs of the same scene that overlap by "
+            "two thirds and are sharp."
+        )
+    registered = set(result["registered"])
+    found = FoundPoses(
+        len(names),
+        tuple(copy.source for copy in copies if copy.name not in registered),
+        tuple(result["models"]),
+        result["points"],
+        result["error"],
+        result["focal"],
+    )
+    refuse_failure(photographs, found, result["defect"])
+    return found
+
+
+def refuse_failure(photographs: Path, found: FoundPoses, defect: str | None) -> None:
+    """Raise an InputError for a model that is too small or has an implausible lens."""
+    if not found.is_too_small and defect is None:
+        return
+    lens = "" if defect is None else f", {defect}"
+    raise InputError(
+        f"COLMAP placed {found.num_registered} of {found.photographs} photographs in "
+        f"{quote_value(photographs, 40)}, with {found.points:,} points{lens}, which is no usable "
+        "model; add sharp photographs that overlap by two thirds, or name their cameras."
+    )
+
+
+def _map(copies: Sequence[UprightCopy], folder: Path) -> dict[str, Any]:
+    """Run `mapping_process` on the copies in `folder/images`."""
+    with tempfile.TemporaryDirectory(dir=folder) as work:
+        job = {
+            "images": str(folder / "images"),
+            "work": work,
+            "model": str(folder / "sparse" / "0"),
+            "photographs": [asdict(copy) for copy in copies],
+            "threads": min(MAX_THREADS, get_thread_count()),
+            "wanted": math.ceil(WANTED_SHARE * len(copies)),
+            "min_points": MIN_POINTS,
+        }
+        (Path(work) / "job.json").write_text(json.dumps(job), encoding="utf-8")
+        with (Path(work) / "complaints.txt").open("w+", errors="replace") as complaints:
+            return _run_process(Path(work) / "job.json", complaints)
+
+
+def _run_process(job: Path, complaints: IO[str]) -> dict[str, Any]:
+    process = subprocess.Popen(
+        [sys.executable, "-m", PROCESS, str(job)],
+        stdin=subprocess.DEVNULL,
+        stdout=subprocess.PIPE,
+        stderr=complaints,
+        text=True,
+    )
+    try:
+        phase, result = _follow(process)
+        process.wait()
+    finally:
+        process.kill()
+        process.wait()
+    if result is None:
+        raise InputError(_explain_failure(phase, process.returncode, complaints))
+    return result
+
+
+def _follow(process: subprocess.Popen[str]) -> tuple[str, dict[str, Any] | None]:
+    """Show the progress of a process; return the last phase and its result."""
+    assert process.stdout is not None
+    phase, result = "Starting", None
+    lines = (json.loads(line) for line in process.stdout)
+    for line in lines:
+        result = line.get("result", result)
+        if "begin" in line:
+            phase = line["begin"]
+            _show(lines, phase, line["steps"])
+    return phase, result
+
+
+def _show(lines: Iterator[dict[str, Any]], phase: str, steps: int) -> None:
+    for _ in track(range(steps), phase):
+        if "step" not in next(lines, {}):
+            return
+
+
+def _explain_failure(phase: str, code: int, complaints: IO[str]) -> str:
+    complaints.seek(0)
+    messages = [line.strip() for line in complaints if line.strip()]
+    reason = f": {quote_value(messages[-1], 200)}" if messages else f" with exit code {code}"
+    return (
+        f"COLMAP gave up while {phase[0].lower()}{phase[1:]}{reason}; leave out photographs that "
+        "may be damaged, and try again."
+    )

@@ -1,0 +1,221 @@
+"""Pinhole intrinsics, lens distortion and undistortion.
+
+Pixel coordinates put the centre of the top-left pixel at (0.5, 0.5). OpenCV puts it at (0, 0),
+which matters only when an image is passed to it.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import lru_cache
+from typing import Literal
+
+import cv2
+import numpy as np
+import torch
+from jaxtyping import Float, Shaped
+from torch import Tensor
+
+MAX_ZOOM_OUT = 0.5
+"""Smallest share of the central resolution that undistortion keeps."""
+MAX_ZOOM_IN = 4.0
+
+
+@dataclass(frozen=True)
+class Pinhole:
+    """Intrinsics of a pinhole camera, in pixels and float64."""
+
+    fl_x: float
+    fl_y: float
+    cx: float
+    cy: float
+    width: int
+    height: int
+
+    @property
+    def K(self) -> Float[Tensor, "3 3"]:
+        """Intrinsic matrix in pixels, float32."""
+        return torch.tensor(
+            [[self.fl_x, 0, self.cx], [0, self.fl_y, self.cy], [0, 0, 1]], dtype=torch.float64
+        ).float()
+
+    def resize(self, width: int, height: int) -> Pinhole:
+        """Return the camera of the image resized to width × height."""
+        x, y = width / self.width, height / self.height
+        return Pinhole(self.fl_x * x, self.fl_y * y, self.cx * x, self.cy * y, width, height)
+
+    def crop(self, left: int, top: int, width: int, height: int) -> Pinhole:
+        """Return the camera of the crop that begins at pixel (left, top)."""
+        return Pinhole(self.fl_x, self.fl_y, self.cx - left, self.cy - top, width, height)
+
+    def magnify(self, zoom: float) -> Pinhole:
+        """Magnify the image by `zoom` about the principal point, at the same size."""
+        return Pinhole(
+            self.fl_x * zoom, self.fl_y * zoom, self.cx, self.cy, self.width, self.height
+        )
+
+
+Projection = Literal["perspective", "equidistant", "field-of-view", "division", "unified"]
+"""Maps from directions to the image plane, before any polynomial:
+
+* perspective: pinhole.
+* equidistant: the radius is the angle to the axis (fisheye).
+* field-of-view: one angle ω; the radius is atan(2 r tan(ω/2)) / ω.
+* division: one number k; the radius is the ρ with ρ / (1 + k ρ²) = r.
+* unified: two numbers α and β; points are divided by α √(β r² + 1) + 1 - α.
+"""
+
+
+@dataclass(frozen=True)
+class Distortion:
+    """Lens distortion of points of the image plane at z = 1: a projection, then polynomials.
+
+    The polynomials are OpenCV's; with the equidistant projection they are its fisheye model.
+    """
+
+    projection: Projection = "perspective"
+    shape: tuple[float, ...] = ()
+    """Parameters of the projection."""
+    radial: tuple[float, ...] = ()
+    """Coefficients k1, k2, … of even powers of the radius, from the second on."""
+    tangential: tuple[float, float] = (0.0, 0.0)
+    """Coefficients p1 and p2."""
+    denominator: tuple[float, ...] = ()
+    """Coefficients k4, k5 and k6 of OpenCV's rational model, which divide the radial polynomial."""
+    prism: tuple[float, float] = (0.0, 0.0)
+    """Thin-prism coefficients s1 and s3, which multiply r² in x and y."""
+
+    def __bool__(self) -> bool:
+        """Return True if a photograph needs undistortion."""
+        polynomials = (*self.radial, *self.tangential, *self.denominator, *self.prism)
+        return self.projection != "perspective" or any(polynomials)
+
+
+def distort(points: Float[np.ndarray, "*n 2"], distortion: Distortion) -> Float[np.ndarray, "*n 2"]:
+    """Distort points of the image plane at z = 1; NaN outside the field of the lens."""
+    # Far outside the photograph, polynomials overflow and the division has no solution.
+    with np.errstate(all="ignore"):
+        return _apply_polynomials(_project(points, distortion), distortion)
+
+
+def _project(
+    points: Float[np.ndarray, "*n 2"], distortion: Distortion
+) -> Float[np.ndarray, "*n 2"]:
+    if distortion.projection == "perspective":
+        return points
+    r = np.linalg.norm(points, axis=-1)
+    small = r < 1e-6
+    scale = _compute_radius(np.where(small, 1e-6, r), distortion) / np.where(small, 1e-6, r)
+    return points * scale[..., None]
+
+
+def _compute_radius(r: Float[np.ndarray, "*n"], distortion: Distortion) -> Float[np.ndarray, "*n"]:
+    if distortion.projection == "equidistant":
+        return np.arctan(r)
+    if distortion.projection == "field-of-view":
+        (omega,) = distortion.shape
+        return np.arctan(2 * r * np.tan(omega / 2)) / omega
+    if distortion.projection == "division":
+        (k,) = distortion.shape
+        return 2 * r / (1 + np.sqrt(1 - 4 * k * r * r))
+    alpha, beta = distortion.shape
+    return r / (alpha * np.sqrt(beta * r * r + 1) + 1 - alpha)
+
+
+def _apply_polynomials(
+    points: Float[np.ndarray, "*n 2"], distortion: Distortion
+) -> Float[np.ndarray, "*n 2"]:
+    x, y = points[..., 0], points[..., 1]
+    r2 = x * x + y * y
+    radial = _evaluate_polynomial(r2, distortion.radial) / _evaluate_polynomial(
+        r2, distortion.denominator
+    )
+    (p1, p2), (s1, s3) = distortion.tangential, distortion.prism
+    return np.stack(
+        [
+            x * radial + 2 * p1 * x * y + p2 * (r2 + 2 * x * x) + s1 * r2,
+            y * radial + p1 * (r2 + 2 * y * y) + 2 * p2 * x * y + s3 * r2,
+        ],
+        axis=-1,
+    )
+
+
+def _evaluate_polynomial(
+    r2: Float[np.ndarray, "*n"], coefficients: tuple[float, ...]
+) -> Float[np.ndarray, "*n"]:
+    """Evaluate 1 + k1 r² + k2 r⁴ + … at r²."""
+    value = np.zeros_like(r2)
+    for k in reversed(coefficients):
+        value = r2 * (k + value)
+    return 1 + value
+
+
+@lru_cache(maxsize=16)
+def undistort_pinhole(pinhole: Pinhole, distortion: Distortion) -> Pinhole | None:
+    """Compute the pinhole camera of the undistorted photograph, of the same size.
+
+    It keeps the principal point and zooms until every pixel lies in the photograph and the borders
+    lose as little as possible. Fisheye lenses lose more, since the zoom stops at `MAX_ZOOM_OUT`.
+    Returns None if the coefficients fold the image, so that no zoom works.
+    """
+    if not distortion:
+        return pinhole
+    zoom, radius = None, np.zeros(())
+    for candidate in np.geomspace(MAX_ZOOM_IN, MAX_ZOOM_OUT, 400):
+        bent = distort(_compute_border(pinhole.magnify(float(candidate))), distortion)
+        # Zooming out must move every border point outwards: beyond the fold of a polynomial,
+        # points return into the photograph and show something else.
+        if not _is_within(pinhole, bent) or (np.linalg.norm(bent, axis=-1) < radius).any():
+            break
+        zoom, radius = float(candidate), np.linalg.norm(bent, axis=-1)
+    return None if zoom is None else pinhole.magnify(zoom)
+
+
+@lru_cache(maxsize=1)
+def compute_undistortion_map(
+    pinhole: Pinhole, distortion: Distortion, new: Pinhole
+) -> Float[np.ndarray, "h w 2"]:
+    """Compute the photograph position of each undistorted pixel, for `remap`."""
+    x, y = np.meshgrid(np.arange(new.width) + 0.5, np.arange(new.height) + 0.5)
+    pixels = _to_pixels(pinhole, distort(_to_plane(new, x, y), distortion))
+    # The nearest border fills pixels outside the field of the lens.
+    finite = np.nan_to_num(pixels - 0.5, nan=-1.0, posinf=-1.0, neginf=-1.0)
+    with np.errstate(over="ignore"):
+        return finite.astype(np.float32)
+
+
+def remap(
+    image: Shaped[np.ndarray, "h w *c"], source: Float[np.ndarray, "h w 2"], interpolation: int
+) -> Shaped[np.ndarray, "h w *c"]:
+    """Sample `image` at the positions `source`."""
+    x, y = np.ascontiguousarray(source[..., 0]), np.ascontiguousarray(source[..., 1])
+    return np.asarray(cv2.remap(image, x, y, interpolation, borderMode=cv2.BORDER_REPLICATE))
+
+
+def _compute_border(pinhole: Pinhole) -> Float[np.ndarray, "n 2"]:
+    """Compute the outermost pixel centres on the image plane at z = 1."""
+    x, y = np.arange(pinhole.width) + 0.5, np.arange(pinhole.height) + 0.5
+    rows = [_to_plane(pinhole, x, np.full_like(x, edge)) for edge in (y[0], y[-1])]
+    columns = [_to_plane(pinhole, np.full_like(y, edge), y) for edge in (x[0], x[-1])]
+    return np.concatenate(rows + columns)
+
+
+def _to_plane(
+    pinhole: Pinhole, x: Float[np.ndarray, "*n"], y: Float[np.ndarray, "*n"]
+) -> Float[np.ndarray, "*n 2"]:
+    return np.stack([(x - pinhole.cx) / pinhole.fl_x, (y - pinhole.cy) / pinhole.fl_y], axis=-1)
+
+
+def _to_pixels(pinhole: Pinhole, points: Float[np.ndarray, "*n 2"]) -> Float[np.ndarray, "*n 2"]:
+    return points * [pinhole.fl_x, pinhole.fl_y] + [pinhole.cx, pinhole.cy]
+
+
+def _is_within(pinhole: Pinhole, points: Float[np.ndarray, "*n 2"]) -> bool:
+    """Check whether all points fall on pixels of the photograph, within 0.001 pixels."""
+    x, y = np.moveaxis(_to_pixels(pinhole, points), -1, 0)
+    return bool(
+        (x.min() >= 0.499)
+        and (x.max() <= pinhole.width - 0.499)
+        and (y.min() >= 0.499)
+        and (y.max() <= pinhole.height - 0.499)
+    )

@@ -1,0 +1,187 @@
+"""Registration by one similarity, after RegGS (Cheng et al., 2025).
+
+Scale, rotation and translation of all lifted Gaussians are fitted to colour, depth and a mixture
+distance. RegGS also estimates the poses, which are known here.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+import torch
+from jaxtyping import Float
+from scipy.cluster.vq import kmeans2
+from torch import Tensor
+
+from gscompleter.evaluation.baselines.mixture_wasserstein import (
+    Mixture,
+    compute_mixture_wasserstein,
+    reduce_mixture,
+)
+from gscompleter.geometry import multiply_quats, quats_to_rotations
+from gscompleter.progress import track
+from gscompleter.render import Renderer
+from gscompleter.types import Camera, Gaussians, View
+
+
+@dataclass(frozen=True)
+class RegGSConfig:
+    """Settings of the registration; the defaults are those of RegGS."""
+
+    iterations: int = 400
+    scale_rate: float = 1e-3
+    rotation_rate: float = 2e-4
+    translation_rate: float = 2e-3
+    """Step size of the translation, in scene units."""
+    color_weight: float = 1.0
+    depth_weight: float = 0.1
+    mixture_weight: float = 0.1
+    components: int = 1000
+    """Clusters per set of Gaussians."""
+    patience: int = 10
+    """The mixture distance is dropped if it does not fall in this many steps."""
+
+
+@dataclass(frozen=True)
+class Similarity:
+    """Similarity of the lifted Gaussians: x -> R^T (scale-about-camera(x) - t)."""
+
+    scale: Float[Tensor, ""]
+    quaternion: Float[Tensor, "4"]
+    """Rotation R (wxyz) from the scene to the lifted Gaussians."""
+    translation: Float[Tensor, "3"]
+    """Translation t, in scene units."""
+
+    @property
+    def rotation(self) -> Float[Tensor, "3 3"]:
+        """Rotation matrix R."""
+        return quats_to_rotations(self.quaternion)
+
+
+@dataclass(frozen=True)
+class RegisteredScene:
+    """The registered Gaussians, and their similarity."""
+
+    gaussians: Gaussians
+    similarity: Similarity
+    losses: tuple[float, ...]
+
+
+def register_by_similarity(
+    lifted: Gaussians,
+    scene: Gaussians,
+    reference: View,
+    renderer: Renderer,
+    seed: int = 42,
+    config: RegGSConfig = RegGSConfig(),
+) -> RegisteredScene:
+    """Fit one similarity between `lifted` and `scene` at the camera of `reference`."""
+    camera = reference.camera
+    own = renderer.render(lifted, camera)
+    theirs = renderer.render(scene, camera)
+    both = own.depth_map().valid & theirs.depth_map().valid
+    ratio = own.depth.new_ones(())
+    if both.any():
+        ratio = theirs.depth[both].median() / own.depth[both].median()
+    scale = ratio.detach().clone().requires_grad_()
+    quaternion = scale.detach().new_tensor([1.0, 0.0, 0.0, 0.0]).requires_grad_()
+    translation = torch.zeros(3, device=scale.device, requires_grad=True)
+    optimizer = torch.optim.Adam(
+        [
+            {"params": [scale], "lr": config.scale_rate},
+            {"params": [quaternion], "lr": config.rotation_rate},
+            {"params": [translation], "lr": config.translation_rate},
+        ],
+        amsgrad=True,
+    )
+    small_lifted = cluster_gaussians(lifted, camera, config.components, seed)
+    small_scene = cluster_gaussians(scene, camera, config.components, seed)
+    best, best_loss = None, np.inf
+    losses: list[float] = []
+    distances: list[float] = []
+    compare_mixtures = config.mixture_weight > 0
+    for _ in track(range(config.iterations), "Registering"):
+        fit = Similarity(scale, quaternion, translation)
+        moved = renderer.render(move_scene(scene, fit), camera)
+        alpha = own.alpha.detach()
+        colour = ((moved.image - reference.image).abs() * alpha[..., None] ** 3).sum()
+        overlap = own.depth_map().valid & moved.depth_map().valid
+        depth = (moved.depth - scale * own.depth.detach())[overlap].abs().sum()
+        loss = config.color_weight * colour + config.depth_weight * depth
+        if compare_mixtures:
+            distance = compute_mixture_wasserstein(
+                scale_mixture(small_lifted, scale), rotate_mixture(small_scene, fit, camera)
+            )
+            recent = distances[-config.patience :]
+            if len(distances) >= config.patience and distance.item() >= max(recent):
+                compare_mixtures = False
+            else:
+                loss = loss + config.mixture_weight * distance
+            distances.append(distance.item())
+        if loss.item() < best_loss:
+            best_loss = loss.item()
+            best = Similarity(*(p.detach().clone() for p in (scale, quaternion, translation)))
+        optimizer.zero_grad()
+        loss.backward()
+        optimizer.step()
+        losses.append(loss.item())
+    similarity = best or Similarity(scale.detach(), quaternion.detach(), translation.detach())
+    return RegisteredScene(move_into_scene(lifted, similarity, camera), similarity, tuple(losses))
+
+
+def move_scene(scene: Gaussians, fit: Similarity) -> Gaussians:
+    """Move the scene to the lifted Gaussians, differentiable in `fit`."""
+    unit = torch.nn.functional.normalize(fit.quaternion, dim=0)
+    means = scene.means @ fit.rotation.T + fit.translation
+    return replace(scene, means=means, quats=multiply_quats(unit, scene.quats), encoded=None)
+
+
+def move_into_scene(lifted: Gaussians, fit: Similarity, camera: Camera) -> Gaussians:
+    """Scale the lifted Gaussians about their camera and move them to the scene."""
+    means = camera.center + fit.scale * (lifted.means - camera.center)
+    unit = torch.nn.functional.normalize(fit.quaternion, dim=0)
+    back = unit * unit.new_tensor([1.0, -1.0, -1.0, -1.0])
+    return replace(
+        lifted,
+        means=(means - fit.translation) @ fit.rotation,
+        quats=multiply_quats(back, lifted.quats),
+        scales=lifted.scales * fit.scale,
+        encoded=None,
+    )
+
+
+def cluster_gaussians(gaussians: Gaussians, camera: Camera, components: int, seed: int) -> Mixture:
+    """Merge the Gaussians into k-means clusters, in camera axes."""
+    rotation = camera.c2w[:3, :3]
+    axes = rotation.T @ quats_to_rotations(gaussians.quats)
+    spread = axes * gaussians.scales[:, None, :]
+    mixture = Mixture(
+        (gaussians.means - camera.center) @ rotation,
+        spread @ spread.transpose(-1, -2),
+        torch.softmax(gaussians.opacities, dim=0),
+    )
+    if len(gaussians) <= components:
+        return mixture
+    points = mixture.means.double().cpu().numpy()
+    _, labels = kmeans2(points, components, iter=10, minit="points", seed=seed)
+    return reduce_mixture(
+        mixture, torch.from_numpy(labels.astype(np.int64)).to(mixture.means.device)
+    )
+
+
+def scale_mixture(mixture: Mixture, scale: Float[Tensor, ""]) -> Mixture:
+    """Scale a mixture."""
+    return Mixture(scale * mixture.means, scale**2 * mixture.covariances, mixture.weights)
+
+
+def rotate_mixture(mixture: Mixture, fit: Similarity, camera: Camera) -> Mixture:
+    """Move a mixture in camera axes by the similarity of the scene."""
+    c2w = camera.c2w[:3, :3]
+    rotation = c2w.T @ fit.rotation @ c2w
+    offset = (fit.rotation @ camera.center + fit.translation - camera.center) @ c2w
+    return Mixture(
+        mixture.means @ rotation.T + offset,
+        rotation @ mixture.covariances @ rotation.T,
+        mixture.weights,
+    )

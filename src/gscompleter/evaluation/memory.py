@@ -1,0 +1,46 @@
+"""Peak memory of a computation."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Iterator
+from contextlib import contextmanager, suppress
+from pathlib import Path
+
+import torch
+
+
+class Peak:
+    """Result of `measure_peak_memory`, filled in when its body ends."""
+
+    bytes: int | None = None
+    """Peak memory in bytes, or None if the system does not report it."""
+
+
+@contextmanager
+def measure_peak_memory(device: torch.device | str = "cpu") -> Iterator[Peak]:
+    """Measure peak memory while the body runs: torch's on a GPU, the whole process's on a CPU."""
+    peak = Peak()
+    on_gpu = torch.device(device).type == "cuda"
+    if on_gpu:
+        torch.cuda.reset_peak_memory_stats()
+        yield peak
+        peak.bytes = torch.cuda.max_memory_allocated()
+        return
+    is_reset = False
+    with suppress(OSError):
+        Path("/proc/self/clear_refs").write_text("5")
+        is_reset = True
+    yield peak
+    if is_reset:
+        peak.bytes = read_process_peak()
+
+
+def read_process_peak() -> int | None:
+    """Read the peak resident memory of this process, or None if the system does not report it."""
+    try:
+        status = Path("/proc/self/status").read_text()
+    except OSError:
+        return None
+    most = re.search(r"VmHWM:\s*([0-9]+) kB", status)
+    return None if most is None else 1024 * int(most[1])

@@ -1,0 +1,199 @@
+"""Methods to compare by name; all share the initial scene and the reference image."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, replace
+
+import torch
+
+from gscompleter.completer import Clock, GSCompleter
+from gscompleter.config import ABLATIONS, get_named_config
+from gscompleter.errors import InputError, quote_value
+from gscompleter.evaluation.baselines.optimization import OptimizationConfig, optimize
+from gscompleter.evaluation.baselines.reggs import RegGSConfig, register_by_similarity
+from gscompleter.generators import Generator
+from gscompleter.reconstructors import Reconstructor
+from gscompleter.render import Renderer
+from gscompleter.stages.select_anchor import lift, select_anchor
+from gscompleter.state import Completion, InitialContext
+from gscompleter.types import Camera, Gaussians, merge
+
+
+@dataclass(frozen=True)
+class Models:
+    """The models that all methods share."""
+
+    reconstructor: Reconstructor
+    generator: Generator
+    renderer: Renderer
+    seed: int = 0
+    baseline_iterations: int | None = None
+    """Maximum number of iterations of the baselines; None keeps their own numbers."""
+
+    def make_completer(self, config: str = "default") -> GSCompleter:
+        """Return our method with the named config."""
+        return GSCompleter(
+            self.reconstructor, self.generator, self.renderer, get_named_config(config), self.seed
+        )
+
+    def limit_iterations(self, num_iterations: int) -> int:
+        """Limit a number of iterations to `baseline_iterations`."""
+        return (
+            num_iterations
+            if self.baseline_iterations is None
+            else min(num_iterations, self.baseline_iterations)
+        )
+
+
+@dataclass(frozen=True)
+class Prediction:
+    """The scene that a method leaves for one target."""
+
+    scene: Gaussians
+    """The scene after the method has run."""
+    added: Gaussians | None
+    """Gaussians that the method added, or None if it changed existing ones."""
+    seconds: Mapping[str, float]
+    """Wall time by stage, without the reconstruction of the context, and `total`."""
+    anchor: int | None = None
+    """Index of the anchor view, or None for a method that lifts nothing."""
+    anchor_fallback: bool = False
+    """True if all views were rotated too far and the least rotated one was chosen."""
+    notes: tuple[str, ...] = ()
+    """Fallbacks that were used, one sentence each."""
+    peak_bytes: int | None = None
+    """Peak memory in bytes, or None if the system does not report it."""
+    registered: Gaussians | None = None
+    """All lifted Gaussians after registration and before filtering; None if nothing is lifted."""
+
+
+Method = Callable[[Completion, Camera, Models], Prediction]
+"""Function of the current scene with its photographs, the target and the models."""
+
+
+def keep_scene(state: Completion, target: Camera, models: Models) -> Prediction:
+    """Return the scene unchanged."""
+    return Prediction(state.scene, state.scene[:0], {"total": 0.0})
+
+
+def make_completion_method(config: str) -> Method:
+    """Make a method of our completer with the named config."""
+
+    def method(state: Completion, target: Camera, models: Models) -> Prediction:
+        completer = replace(models.make_completer(config), keep_registered=True)
+        context = InitialContext(state.scene, state.views)
+        done = completer.advance(completer.begin_with(context), target)
+        (made,) = done.targets
+        notes = (made.anchor, made.anchor_fallback, made.notes)
+        return Prediction(done.scene, made.added, done.seconds, *notes, registered=made.registered)
+
+    return method
+
+
+def make_optimization_method(config: OptimizationConfig) -> Method:
+    """Make a method that optimizes the scene on the photographs and the reference."""
+
+    def method(state: Completion, target: Camera, models: Models) -> Prediction:
+        clock = Clock(())
+        with clock("generate"):
+            views = [*state.views, models.make_completer().synthesize_reference(state, target)]
+        budget = replace(config, iterations=models.limit_iterations(config.iterations))
+        with clock("optimize"):
+            fitted = optimize(state.scene, views, models.renderer, models.seed, budget)
+        return Prediction(fitted.gaussians, None, clock.seconds)
+
+    return method
+
+
+def complete_by_similarity(state: Completion, target: Camera, models: Models) -> Prediction:
+    """Add all lifted Gaussians, registered to the scene by one similarity (RegGS)."""
+    clock = Clock(())
+    with clock("generate"):
+        reference = models.make_completer().synthesize_reference(state, target)
+    with clock("lift"):
+        anchor = select_anchor(reference.camera, state.views)
+        lifted = lift(models.reconstructor, reference, state.views[anchor.index]).gaussians
+    with clock("register"):
+        config = RegGSConfig(iterations=models.limit_iterations(RegGSConfig.iterations))
+        added = register_by_similarity(
+            lifted, state.scene, reference, models.renderer, models.seed, config
+        ).gaussians
+    scene = merge([state.scene, added])
+    return Prediction(scene, added, clock.seconds, anchor.index, anchor.fallback, registered=added)
+
+
+def mark_target(prediction: Prediction, number: int, before: Gaussians) -> Prediction:
+    """Mark the Gaussians added to `before` as generated for target `number`."""
+    if prediction.added is None:
+        return prediction
+    generated = torch.full_like(prediction.added.generated, number)
+    added = replace(prediction.added, generated=generated)
+    return replace(prediction, added=added, scene=merge([before, added]))
+
+
+BASELINES: dict[str, Method] = {
+    "densify-100": make_optimization_method(OptimizationConfig(iterations=100)),
+    "densify-800": make_optimization_method(OptimizationConfig(iterations=800)),
+    "distill": make_optimization_method(OptimizationConfig(iterations=800, density_rounds=0)),
+    "reggs": complete_by_similarity,
+}
+"""Methods of others."""
+
+SCENE_CHANGING = ("densify-100", "densify-800", "distill")
+"""Methods that change existing Gaussians and therefore cannot run a sequence."""
+
+_ABLATIONS = {"unconstrained" if name == "3-dof" else name: name for name in ABLATIONS}
+# Method name to config name. Three degrees of freedom are no ablation: the paper compares the ray
+# constraint with them.
+
+SETTINGS: dict[str, str] = {
+    "full": "default",
+    "paper": "paper",
+    **_ABLATIONS,
+    **{f"paper/{title}": f"paper/{name}" for title, name in _ABLATIONS.items()},
+}
+"""Our methods, with the name of their config for `get_named_config`."""
+
+METHODS: dict[str, Method] = {
+    "context": keep_scene,
+    **{title: make_completion_method(name) for title, name in SETTINGS.items()},
+    **BASELINES,
+}
+"""All methods by name, in the order of the tables."""
+
+GROUPS: dict[str, tuple[str, ...]] = {
+    "ablations": tuple(_ABLATIONS),
+    "baselines": tuple(BASELINES),
+    "all": ("context", "full", "paper", *_ABLATIONS, *BASELINES),
+}
+"""Names that stand for several methods."""
+
+
+def expand_methods(names: Sequence[str]) -> tuple[str, ...]:
+    """Replace groups by their methods and drop duplicates; raise as `check_methods`."""
+    found = [method for name in names for method in GROUPS.get(name, (name,))]
+    chosen = tuple(dict.fromkeys(found))
+    check_methods(chosen)
+    return chosen
+
+
+def check_methods(names: Sequence[str], steps: int = 1) -> None:
+    """Raise InputError for no, unknown or repeated names and methods that cannot do `steps`."""
+    known = ", ".join([*GROUPS, *(name for name in METHODS if not name.startswith("paper/"))])
+    if not names:
+        raise InputError(f"No method was named; choose one or more of {known}.")
+    for name in names:
+        if name not in METHODS:
+            raise InputError(
+                f"There is no method '{quote_value(name)}'; choose one of {known} (paper/no-sa "
+                "for an "
+                "ablation of the paper's settings)."
+            )
+        if steps > 1 and name in SCENE_CHANGING:
+            raise InputError(
+                f"The method {name!r} changes existing Gaussians, and a sequence can only add new "
+                "ones; choose one of context, full, paper, an ablation of these, and reggs."
+            )
+    if len(set(names)) < len(names):
+        raise InputError(f"A method is named twice ({' '.join(names)}); name each once.")

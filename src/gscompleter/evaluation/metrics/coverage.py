@@ -1,0 +1,124 @@
+"""Coverage: share of pixels with alpha of at least 0.5, over held-out cameras.
+
+The cameras are random, close to the path of the context cameras and rotated by some degrees.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import asdict, dataclass
+
+import torch
+
+from gscompleter.config.coverage import COVERED
+from gscompleter.geometry import (
+    axis_angle_to_matrix,
+    compute_spacing,
+    measure_baseline,
+    shrink_camera,
+    slerp_rotation,
+)
+from gscompleter.next_best_view.candidates import move_camera
+from gscompleter.render import Renderer, get_view_map
+from gscompleter.render.lod import MAX_PREVIEW_GAUSSIANS, thin_gaussians
+from gscompleter.state import Completion
+from gscompleter.types import Camera, Render, merge
+
+NUM_CAMERAS = 32
+SIDE = 96
+"""Longer side of the rendered images, in pixels."""
+TURN_DEGREES = 5.0
+"""Standard deviation of yaw and pitch, in degrees."""
+
+
+@dataclass(frozen=True)
+class Coverage:
+    """Share of pixels that the scene covers, before and after completion."""
+
+    before: float
+    after: float
+    cameras: int
+    """Number of cameras."""
+
+    def as_summary(self) -> dict[str, float]:
+        """Return the entry of `summary.json`."""
+        return asdict(self)
+
+
+@dataclass(frozen=True)
+class RenderPair:
+    """Renders of one camera before and after completion."""
+
+    before: Render
+    after: Render
+
+
+def render_pairs(
+    completion: Completion, cameras: Sequence[Camera], renderer: Renderer
+) -> list[RenderPair]:
+    """Render the scene before and after completion in small images, from a thinned scene."""
+    begun = thin_gaussians(completion.rendered_context, MAX_PREVIEW_GAUSSIANS)
+    aside = completion.pruned is not None
+    kept = (
+        thin_gaussians(completion.rendered_scene[: completion.num_kept], MAX_PREVIEW_GAUSSIANS)
+        if aside
+        else begun
+    )
+    added = [thin_gaussians(result.added, MAX_PREVIEW_GAUSSIANS) for result in completion.targets]
+    new = merge([begun[:0], *added])
+
+    def render_pair(camera: Camera) -> RenderPair:
+        first = renderer.freeze(begun, camera)
+        last = renderer.freeze(kept, camera) if aside else first
+        return RenderPair(first.render, last.composite(new))
+
+    return list(get_view_map(new)(render_pair, [shrink_camera(camera, SIDE) for camera in cameras]))
+
+
+def compute_coverage(pairs: Sequence[RenderPair]) -> Coverage:
+    """Compute the coverage before and after completion."""
+    before, after = [look.before for look in pairs], [look.after for look in pairs]
+    return Coverage(compute_covered_share(before), compute_covered_share(after), len(pairs))
+
+
+def compute_covered_share(renders: Sequence[Render]) -> float:
+    """Compute the share of pixels of all renders that the scene covers."""
+    return torch.cat([r.alpha.flatten() >= COVERED for r in renders]).float().mean().item()
+
+
+def sample_held_out_cameras(
+    cameras: Sequence[Camera], seed: int, count: int = NUM_CAMERAS
+) -> list[Camera]:
+    """Sample cameras around the path of `cameras`; the same seed gives the same cameras."""
+    generator = torch.Generator().manual_seed(seed)
+    step = compute_spacing(cameras)
+    return [sample_held_out_camera(cameras, step, generator) for _ in range(count)]
+
+
+def sample_held_out_camera(
+    cameras: Sequence[Camera], step: float, generator: torch.Generator
+) -> Camera:
+    """Sample a camera between a random one of `cameras` and its nearest neighbour."""
+    first = cameras[int(torch.randint(len(cameras), (), generator=generator))]
+    share = torch.rand((), generator=generator).item()
+    shift = step * torch.randn(3, generator=generator) / 3**0.5
+    right, down = (TURN_DEGREES * torch.randn(2, generator=generator)).tolist()
+    between = interpolate_camera(first, find_nearest_camera(first, cameras), share)
+    turn = axis_angle_to_matrix(between.c2w[:3, 1], math.radians(right))
+    turn = axis_angle_to_matrix(between.c2w[:3, 0], math.radians(down)) @ turn
+    return move_camera(between, turn, shift.to(between.c2w))
+
+
+def find_nearest_camera(camera: Camera, cameras: Sequence[Camera]) -> Camera:
+    """Return the camera nearest to `camera`, or `camera` itself if there is no other."""
+    others = [other for other in cameras if other is not camera]
+    return min(others, key=lambda other: measure_baseline(camera, other), default=camera)
+
+
+def interpolate_camera(first: Camera, second: Camera, share: float) -> Camera:
+    """Interpolate from `first` to the pose of `second`."""
+    turn = second.c2w[:3, :3].double() @ first.c2w[:3, :3].double().T
+    return move_camera(
+        first, slerp_rotation(turn, share).to(first.c2w), share * (second.center - first.center)
+    )

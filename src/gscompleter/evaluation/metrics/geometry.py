@@ -1,0 +1,201 @@
+"""Geometric agreement of generated Gaussians with the context: AbsRel, Chamfer, F-score.
+
+The paper reports "the alignment error between the generated target primitives and the context
+primitives" without formulas or thresholds. Ours can rank methods and ablations but are not
+comparable with the numbers of the paper.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+from jaxtyping import Bool, Float
+from scipy.spatial import cKDTree
+from torch import Tensor
+
+from gscompleter.errors import InputError
+from gscompleter.geometry import is_inside, project, project_mask, sample
+from gscompleter.render import Renderer
+from gscompleter.stages.filter_holes import filter_holes
+from gscompleter.types import Camera, DepthMap, Gaussians
+
+MIN_OPACITY = 1 / 255
+"""Opacity below which renderers drop a Gaussian."""
+
+MATCH_DISTANCE = 0.05
+"""Largest distance of a match, as a share of the median context depth at the target."""
+
+
+def compute_abs_rel(
+    depth: Float[Tensor, "h w"], truth: Float[Tensor, "h w"] | None, where: Bool[Tensor, "h w"]
+) -> float | None:
+    """Compute mean(|depth - truth| / truth) over pixels of `where` with known truth; 0 is best.
+
+    No scale is fitted, because registration has to remove scale errors. None if no pixel is left.
+    """
+    if truth is None or not (known := where & (truth > 0)).any():
+        return None
+    d, t = depth[known].double(), truth[known].double()
+    return ((d - t).abs() / t).mean().item()
+
+
+def count_known(truth: Float[Tensor, "h w"] | None, where: Bool[Tensor, "h w"]) -> int | None:
+    """Count the pixels of `where` with positive truth; None without truth."""
+    return None if truth is None else int((where & (truth > 0)).sum())
+
+
+@dataclass(frozen=True)
+class CloudDistances:
+    """Nearest-neighbour distances from cloud A to cloud B and from B to A, in scene units."""
+
+    a_to_b: Float[np.ndarray, "n"]
+    b_to_a: Float[np.ndarray, "m"]
+
+    @property
+    def chamfer(self) -> float:
+        """Mean distance in scene units, not squared, so that floaters do not dominate."""
+        return float(self.a_to_b.mean() + self.b_to_a.mean()) / 2
+
+    def compute_f_score(self, threshold: float) -> float:
+        """Compute 2 P R / (P + R); 1 is best, and 0 if P = R = 0.
+
+        Precision P is the share of A within `threshold` (scene units) of B, recall R that of B near
+        A.
+        """
+        precision = float((self.a_to_b <= threshold).mean())
+        recall = float((self.b_to_a <= threshold).mean())
+        total = precision + recall
+        return 2 * precision * recall / total if total > 0 else 0.0
+
+
+def compute_cloud_distances(a: Float[Tensor, "n 3"], b: Float[Tensor, "m 3"]) -> CloudDistances:
+    """Compute exact nearest-neighbour distances between two point sets, both ways."""
+    return CloudDistances(compute_nearest_distances(a, b), compute_nearest_distances(b, a))
+
+
+def compute_nearest_distances(
+    points: Float[Tensor, "n 3"], others: Float[Tensor, "m 3"]
+) -> Float[np.ndarray, "n"]:
+    """Compute the Euclidean distance of each point to the nearest of `others`, in float64.
+
+    Raises:
+        InputError: A set is empty or holds a point that is not finite.
+    """
+    if len(points) == 0 or len(others) == 0:
+        raise InputError(
+            "Distances between point sets need points on both sides, "
+            f"got {len(points)} and {len(others)}."
+        )
+    queries, targets = (p.detach().cpu().double().numpy() for p in (points, others))
+    if not (np.isfinite(queries).all() and np.isfinite(targets).all()):
+        raise InputError("Distances between point sets need finite points; some are not.")
+    # Without balancing the tree stays fast if many points coincide.
+    distances, _ = cKDTree(targets, balanced_tree=False).query(queries, workers=-1)
+    return np.asarray(distances, dtype=np.float64)
+
+
+@dataclass(frozen=True)
+class Alignment:
+    """Agreement of generated Gaussians with the context where both overlap, or None."""
+
+    overlap: float
+    """Share of the target's pixels in the overlap."""
+    pixels: int
+    """Number of pixels in the overlap."""
+    scale: float | None
+    """Median z-depth of the context at the target, in scene units."""
+    abs_rel: float | None
+    """AbsRel of the generated z-depth against the context in the overlap."""
+    chamfer: float | None
+    """Chamfer distance in scene units."""
+    f_score: float | None
+
+    @property
+    def relative_chamfer(self) -> float | None:
+        """Chamfer distance as a share of `scale`, for averages over scenes."""
+        return self.chamfer / self.scale if self.chamfer is not None and self.scale else None
+
+
+@torch.no_grad()
+def measure_alignment(
+    added: Gaussians, context: Gaussians, target: Camera, renderer: Renderer
+) -> Alignment:
+    """Measure AbsRel, Chamfer distance and F-score of the added Gaussians against `context`.
+
+    The overlap is the set of target pixels that both cover when rendered alone, the rim of the
+    hole. AbsRel compares the two z-depths there. Cloud A has the means of added Gaussians in the
+    overlap, matched with the whole context; cloud B has the means of visible context Gaussians in
+    the overlap, matched with everything added. A perfect completion does not reach 0, because
+    Gaussians are spaced and depths mix at edges: compare methods on the same cases.
+    """
+    added, context = drop_transparent(added), drop_transparent(context)
+    generated = renderer.render(added, target).depth_map()
+    reference = renderer.render(context, target).depth_map()
+    overlap = generated.valid & reference.valid
+    error = compute_abs_rel(generated.depth, reference.depth, overlap)
+    return compare_clouds(added, context, target, reference, overlap, error)
+
+
+@torch.no_grad()
+def measure_primitive_alignment(
+    registered: Gaussians, context: Gaussians, target: Camera, renderer: Renderer
+) -> Alignment:
+    """Measure the same for all registered Gaussians, without filtering and rendering them.
+
+    A Gaussian counts if its mean projects to a pixel that the context covers; these pixels are the
+    overlap. AbsRel is the mean of |z - D| / D with the z-depth z of the mean and the rendered
+    context depth D. Renders would favour scattered Gaussians, which cover fewer and easier pixels.
+    """
+    registered, context = drop_transparent(registered), drop_transparent(context)
+    reference = renderer.render(context, target).depth_map()
+    points = registered[project_mask(reference.valid, registered, target)].means
+    pixels, z = project(points, target)
+    x, y = pixels.long().unbind(-1)
+    overlap = torch.zeros_like(reference.valid)
+    overlap[y, x] = True
+    expected = reference.depth[y, x].double()
+    error = ((z - expected).abs() / expected).mean().item() if len(points) else None
+    return compare_clouds(registered, context, target, reference, overlap, error)
+
+
+def compare_clouds(
+    generated: Gaussians,
+    context: Gaussians,
+    target: Camera,
+    reference: DepthMap,
+    overlap: Bool[Tensor, "h w"],
+    error: float | None,
+) -> Alignment:
+    """Add Chamfer distance and F-score over `overlap` to the AbsRel `error`."""
+    share, count = overlap.double().mean().item(), int(overlap.sum())
+    if count == 0:
+        return Alignment(share, count, None, None, None, None)
+    scale = reference.depth[reference.valid].double().median().item()
+    threshold = MATCH_DISTANCE * scale
+    points = filter_holes(generated, None, overlap, target).means
+    surface = filter_holes(context, None, overlap, target).means
+    surface = surface[find_on_surface(surface, reference.depth, target, threshold)]
+    if len(points) == 0 or len(surface) == 0:
+        return Alignment(share, count, scale, error, None, None)
+    distances = CloudDistances(
+        compute_nearest_distances(points, context.means),
+        compute_nearest_distances(surface, generated.means),
+    )
+    f_score = distances.compute_f_score(threshold)
+    return Alignment(share, count, scale, error, distances.chamfer, f_score)
+
+
+def drop_transparent(gaussians: Gaussians) -> Gaussians:
+    """Drop Gaussians that no renderer shows."""
+    return gaussians[gaussians.opacities >= MIN_OPACITY]
+
+
+def find_on_surface(
+    points: Float[Tensor, "n 3"], depth: Float[Tensor, "h w"], camera: Camera, tolerance: float
+) -> Bool[Tensor, "n"]:
+    """Find points whose z-depth is that of their pixel, within `tolerance` in scene units."""
+    pixels, z = project(points, camera)
+    at_pixel = sample(depth[..., None], pixels, "nearest")[..., 0]
+    return is_inside(pixels, z, camera) & ((z - at_pixel).abs() <= tolerance)

@@ -1,0 +1,91 @@
+"""HaarPSI (Reisenhofer et al., A Haar Wavelet-Based Perceptual Similarity Index, 2018).
+
+Haar wavelets differ where only one image has an edge, so blur is penalized.
+"""
+
+from __future__ import annotations
+
+import torch
+from jaxtyping import Bool, Float
+from torch import Tensor
+from torch.nn.functional import avg_pool2d, conv2d, pad
+
+C = 30.0
+"""Constant of the similarity, in units of 8-bit colours; fitted by the authors."""
+ALPHA = 4.2
+"""Steepness of the logistic function; fitted by the authors."""
+YIQ = ((0.299, 0.587, 0.114), (0.5959, -0.2746, -0.3213), (0.2115, -0.5227, 0.3112))
+"""Conversion from RGB to luminance and two chrominances."""
+
+
+def haarpsi(
+    image: Float[Tensor, "h w 3"],
+    truth: Float[Tensor, "h w 3"],
+    where: Bool[Tensor, "h w"] | None = None,
+) -> float | None:
+    """Compute HaarPSI of two images in [0, 1] over the pixels of `where`; 1 is best.
+
+    Images are halved first, as published; a pixel counts if half of its area is in `where`. None
+    without such a pixel.
+    """
+    of_image, of_truth = convert_to_yiq(image), convert_to_yiq(truth)
+    similarity, weight = compute_similarities(of_image, of_truth)
+    if where is not None:
+        inside = halve_image(where[None].double().cpu())[0] >= 0.5
+        similarity, weight = similarity[:, inside], weight[:, inside]
+    if similarity.numel() == 0:
+        return None
+    # Without any edge all pixels have the same weight.
+    tiny = torch.finfo(weight.dtype).eps
+    mean = ((ALPHA * similarity).sigmoid() * (weight + tiny)).sum() / (weight + tiny).sum()
+    return (mean.logit() / ALPHA).square().item()
+
+
+def convert_to_yiq(image: Float[Tensor, "h w 3"]) -> Float[Tensor, "3 half_h half_w"]:
+    """Convert to YIQ in units of 8-bit colours, at half the size."""
+    colours = 255 * image.clamp(0, 1).double().cpu()
+    return halve_image((colours @ colours.new_tensor(YIQ).T).movedim(-1, 0))
+
+
+def compute_similarities(
+    a: Float[Tensor, "3 h w"], b: Float[Tensor, "3 h w"]
+) -> tuple[Float[Tensor, "3 h w"], Float[Tensor, "3 h w"]]:
+    """Compare two finer scales of luminance, and chrominance; the coarsest scale gives weights."""
+    of_a, of_b = ([compute_wavelets(p[0], scale) for scale in (1, 2, 3)] for p in (a, b))
+    luminance = torch.stack(
+        [compare_values(x, y) for x, y in zip(of_a[:2], of_b[:2], strict=True)]
+    ).mean(0)
+    chrominance = compare_values(average_neighbours(a[1:]), average_neighbours(b[1:])).mean(
+        0, keepdim=True
+    )
+    weight = torch.maximum(of_a[2], of_b[2])
+    return (
+        torch.cat([luminance, chrominance]),
+        torch.cat([weight, weight.mean(0, keepdim=True)]),
+    )
+
+
+def compare_values(a: Float[Tensor, "*n"], b: Float[Tensor, "*n"]) -> Float[Tensor, "*n"]:
+    """Compute (2 a b + c) / (a² + b² + c), which is 1 for equal values."""
+    return (2 * a * b + C) / (a**2 + b**2 + C)
+
+
+def compute_wavelets(luminance: Float[Tensor, "h w"], scale: int) -> Float[Tensor, "2 h w"]:
+    """Compute magnitudes of Haar wavelets of 2^scale pixels, along columns and rows."""
+    size = 2**scale
+    step = luminance.new_full((size, size), 1 / size)
+    step[size // 2 :] *= -1
+    before, after = size // 2 - 1, size // 2
+    padded = pad(luminance[None, None], (before, after, before, after))
+    return conv2d(padded, torch.stack([step, step.T])[:, None])[0].abs()
+
+
+def average_neighbours(values: Float[Tensor, "c h w"]) -> Float[Tensor, "c h w"]:
+    """Compute magnitudes of the means of 2 x 2 pixels, one for every pixel."""
+    return avg_pool2d(pad(values, (0, 1, 0, 1)), 2, stride=1).abs()
+
+
+def halve_image(values: Float[Tensor, "c h w"]) -> Float[Tensor, "c half_h half_w"]:
+    """Average 2 x 2 pixels, with black beyond an odd side."""
+    h, w = values.shape[1:]
+    return avg_pool2d(pad(values, (0, w % 2, 0, h % 2)), 2)

@@ -1,0 +1,281 @@
+"""Scores of one method on one case, against held-out photographs and depths."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+from typing import Any
+
+import torch
+from jaxtyping import Bool, Float
+from torch import Tensor
+
+from gscompleter.evaluation.metrics.flip import compute_flip_map
+from gscompleter.evaluation.metrics.geometry import (
+    Alignment,
+    compute_abs_rel,
+    count_known,
+    measure_alignment,
+    measure_primitive_alignment,
+)
+from gscompleter.evaluation.metrics.haarpsi import haarpsi
+from gscompleter.evaluation.metrics.image import (
+    MAX_PSNR,
+    compute_gradient_energy_ratio,
+    compute_masked_psnr,
+    ssim,
+)
+from gscompleter.evaluation.metrics.lpips import compute_lpips
+from gscompleter.render import Renderer
+from gscompleter.stages.filter_holes import compute_hole_mask
+from gscompleter.types import Camera, Gaussians, Render, View
+
+Image = Float[Tensor, "h w 3"]
+
+MIN_PIXELS = 50
+"""Minimum number of pixels for a median of depths."""
+
+
+@dataclass(frozen=True)
+class Truth:
+    """Photographs to score against; their cameras have the depth range of the scene."""
+
+    views: tuple[View, ...]
+    target: View
+    neighbours: tuple[View, ...] = ()
+
+
+@dataclass(frozen=True)
+class Change:
+    """One score before and after completion."""
+
+    before: float
+    after: float
+
+
+@dataclass(frozen=True)
+class Quality:
+    """Scores of one image against its photograph."""
+
+    psnr: float
+    """PSNR in dB."""
+    ssim: float
+    lpips_vgg: float | None
+    """None if the weights are not on this machine."""
+    lpips_alex: float | None
+
+
+@dataclass(frozen=True)
+class PerceptualQuality:
+    """Scores of a part of an image that do not reward blur; None without a pixel."""
+
+    flip: float | None
+    """Mean of the FLIP map; None also if flip-evaluator is missing."""
+    haarpsi: float | None
+    gradient_energy: float | None
+    """Gradient energy over that of the photograph; None also if the photograph is flat."""
+
+
+@dataclass(frozen=True)
+class Scores:
+    """Scores of a completion against held-out photographs; None if the truth is missing."""
+
+    hole_fraction: float
+    """Share of the target's pixels that the context does not cover."""
+    target_before: Quality
+    target_after: Quality
+    hole_psnr: float | None
+    """PSNR in dB at the target in the hole, after completion."""
+    observed_psnr: Change | None
+    """PSNR in dB at the target over all other pixels."""
+    neighbours_psnr: Change | None
+    """Mean PSNR in dB over the neighbour views."""
+    context_psnr: tuple[Change, ...]
+    """PSNR in dB of each context view."""
+    context_ssim: tuple[Change, ...]
+    """SSIM of each context view."""
+    depth_observed: float | None
+    """AbsRel at the target against the true depth, where the context covers it."""
+    depth_hole: float | None
+    """The same in the filled hole."""
+    depth_observed_pixels: int | None = None
+    """Number of pixels of `depth_observed`."""
+    depth_hole_pixels: int | None = None
+    """Number of pixels of `depth_hole`."""
+    depth_rim: float | None = None
+    """Median relative depth difference of the added Gaussians to the context, where both cover."""
+    align_pixels: int | None = None
+    """Number of target pixels that both cover, for `depth_rim` and the next three."""
+    align_abs_rel: float | None = None
+    """AbsRel of the added Gaussians against the context (`geometry.measure_alignment`)."""
+    align_chamfer: float | None = None
+    """Their Chamfer distance as a share of the median depth at the target."""
+    align_f_score: float | None = None
+    registered_pixels: int | None = None
+    """Number of covered target pixels with a registered Gaussian, for the next three."""
+    registered_abs_rel: float | None = None
+    """AbsRel of all registered Gaussians against the context, before filtering."""
+    registered_chamfer: float | None = None
+    """Their Chamfer distance as a share of the median depth at the target."""
+    registered_f_score: float | None = None
+    hole_looks: PerceptualQuality | None = None
+    """At the target in the hole, after completion."""
+    observed_looks: PerceptualQuality | None = None
+    """At the target over all other pixels."""
+
+
+@dataclass(frozen=True)
+class TargetRenders:
+    """Renders at the target."""
+
+    before: Render
+    after: Render
+    holes: Bool[Tensor, "h w"]
+    """True in holes of the scene before completion."""
+
+
+@torch.no_grad()
+def score(
+    before: Gaussians,
+    after: Gaussians,
+    added: Gaussians | None,
+    truth: Truth,
+    renderer: Renderer,
+    registered: Gaussians | None = None,
+) -> tuple[Scores, TargetRenders]:
+    """Score a completion, and return the renders at the target.
+
+    `added` is None if existing Gaussians were changed; `registered` has all lifted Gaussians.
+    """
+    target = truth.target
+    was = renderer.render(before, target.camera)
+    now = renderer.render(after, target.camera)
+    counted = target.valid_mask
+    holes, covered = compute_hole_mask(was.alpha), now.depth_map().valid & counted
+    context = _render_views(before, after, truth.views, renderer)
+    beside = _render_views(before, after, truth.neighbours, renderer)
+    scores = Scores(
+        hole_fraction=holes.float().mean().item(),
+        target_before=measure_quality(was.image, target),
+        target_after=measure_quality(now.image, target),
+        hole_psnr=compute_masked_psnr(now.image, target.image, holes & counted),
+        observed_psnr=_measure_masked_change(was, now, target, ~holes & counted),
+        neighbours_psnr=average_changes(_measure_changes(beside, compute_view_psnr)),
+        context_psnr=_measure_changes(context, compute_view_psnr),
+        context_ssim=_measure_changes(context, compute_view_ssim),
+        depth_observed=compute_abs_rel(now.depth, target.depth, ~holes & covered),
+        depth_hole=compute_abs_rel(now.depth, target.depth, holes & covered),
+        depth_observed_pixels=count_known(target.depth, ~holes & covered),
+        depth_hole_pixels=count_known(target.depth, holes & covered),
+        hole_looks=measure_perceptual_quality(
+            target.fill_ignored(now.image), target.image, holes & counted
+        ),
+        observed_looks=measure_perceptual_quality(
+            target.fill_ignored(now.image), target.image, ~holes & counted
+        ),
+    )
+    if added is not None and len(added) > 0:
+        aligned = measure_alignment(added, before, target.camera, renderer)
+        scores = replace(
+            scores,
+            depth_rim=measure_seam_step(added, was, target.camera, renderer),
+            **name_alignment_scores("align", aligned),
+        )
+    if registered is not None and len(registered) > 0:
+        aligned = measure_primitive_alignment(registered, before, target.camera, renderer)
+        scores = replace(scores, **name_alignment_scores("registered", aligned))
+    return scores, TargetRenders(was, now, holes)
+
+
+def name_alignment_scores(name: str, aligned: Alignment) -> dict[str, Any]:
+    """Return the fields of `Scores` for an alignment, prefixed by `name`."""
+    return {
+        f"{name}_pixels": aligned.pixels,
+        f"{name}_abs_rel": aligned.abs_rel,
+        f"{name}_chamfer": aligned.relative_chamfer,
+        f"{name}_f_score": aligned.f_score,
+    }
+
+
+def measure_quality(image: Float[Tensor, "h w 3"], photograph: View) -> Quality:
+    """Compute PSNR, SSIM and, if the weights are available, LPIPS.
+
+    Ignored pixels of the photograph do not count for PSNR and count as equal for the others.
+    """
+    truth, compared = photograph.image, photograph.fill_ignored(image)
+    return Quality(
+        compute_view_psnr(image, photograph),
+        compute_view_ssim(image, photograph),
+        compute_lpips(compared, truth, "vgg"),
+        compute_lpips(compared, truth, "alex"),
+    )
+
+
+def compute_view_psnr(image: Float[Tensor, "h w 3"], photograph: View) -> float:
+    """Compute PSNR in dB over valid pixels of the photograph; `MAX_PSNR` if there are none."""
+    counted = compute_masked_psnr(image, photograph.image, photograph.valid_mask)
+    return MAX_PSNR if counted is None else counted
+
+
+def compute_view_ssim(image: Float[Tensor, "h w 3"], photograph: View) -> float:
+    """Compute SSIM, with ignored pixels of the photograph counted as equal."""
+    return ssim(photograph.fill_ignored(image), photograph.image)
+
+
+def measure_perceptual_quality(
+    image: Float[Tensor, "h w 3"], truth: Float[Tensor, "h w 3"], where: Bool[Tensor, "h w"]
+) -> PerceptualQuality:
+    """Compute FLIP, HaarPSI and the gradient energy ratio over the pixels of `where`."""
+    errors = compute_flip_map(image, truth)
+    return PerceptualQuality(
+        None if errors is None or not where.any() else errors[where.cpu()].mean().item(),
+        haarpsi(image, truth, where),
+        compute_gradient_energy_ratio(image, truth, where),
+    )
+
+
+def measure_seam_step(
+    added: Gaussians, context: Render, target: Camera, renderer: Renderer
+) -> float | None:
+    """Compute the median of |D_added - D_context| / D_context; None for too few pixels."""
+    alone = renderer.render(added, target).depth_map()
+    both = alone.valid & context.depth_map().valid
+    if both.sum() < MIN_PIXELS:
+        return None
+    return ((alone.depth - context.depth).abs() / context.depth)[both].median().item()
+
+
+def average_changes(changes: Sequence[Change]) -> Change | None:
+    """Average the scores before and after; None for an empty sequence."""
+    if not changes:
+        return None
+    n = len(changes)
+    return Change(sum(c.before for c in changes) / n, sum(c.after for c in changes) / n)
+
+
+def _measure_masked_change(
+    before: Render, after: Render, target: View, where: Bool[Tensor, "h w"]
+) -> Change | None:
+    was = compute_masked_psnr(before.image, target.image, where)
+    now = compute_masked_psnr(after.image, target.image, where)
+    return None if was is None or now is None else Change(was, now)
+
+
+def _render_views(
+    before: Gaussians, after: Gaussians, views: Sequence[View], renderer: Renderer
+) -> list[tuple[Image, Image, View]]:
+    """Render each view before and after, and add its photograph."""
+    return [
+        (
+            renderer.render(before, view.camera).image,
+            renderer.render(after, view.camera).image,
+            view,
+        )
+        for view in views
+    ]
+
+
+def _measure_changes(
+    renders: Sequence[tuple[Image, Image, View]], metric: Callable[[Image, View], float]
+) -> tuple[Change, ...]:
+    return tuple(Change(metric(was, view), metric(now, view)) for was, now, view in renders)

@@ -1,0 +1,322 @@
+"""Runs of methods over tasks: predict, save, then score the saved; a stopped run resumes."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from contextlib import nullcontext
+from dataclasses import asdict, dataclass, field, replace
+from functools import partial
+from pathlib import Path
+from typing import Any, Literal
+
+from gscompleter.config.generators import GeneratorSettings
+from gscompleter.errors import InputError
+from gscompleter.evaluation.methods import Models, check_methods
+from gscompleter.evaluation.steps import PreparedTask, Step, attempt, complete_task, load_or_compute
+from gscompleter.evaluation.store import (
+    VERSION,
+    SavedContext,
+    claim,
+    get_row_path,
+    get_task_folder,
+    load_context,
+    make_file_name,
+    read_json,
+    save_context,
+    write_json,
+)
+from gscompleter.evaluation.tasks import Task
+from gscompleter.generators import Generator, load_generator
+from gscompleter.jobs.engines import Engine
+from gscompleter.jobs.jobs import CLAIMS, Job, Outcome
+from gscompleter.jobs.places import FolderPlace
+from gscompleter.jobs.rounds import Rounds, run_in_this_process
+from gscompleter.jobs.shards import check_shard
+from gscompleter.memory import check_memory
+from gscompleter.progress import Activity, show_activity, show_progress, stage
+from gscompleter.reconstructors import Reconstructor, load_reconstructor
+from gscompleter.render import load_renderer
+from gscompleter.stages.context import normalize_exposures, sort_by_frame
+from gscompleter.types import View
+
+RETRIES = 2
+"""How often a task is repeated if its worker was killed."""
+
+
+@dataclass(frozen=True)
+class RunConfig:
+    """Settings that determine the numbers, together with the tasks."""
+
+    reconstructor: str = "plane-sweep"
+    weights: str | None = None
+    """File with the weights of the reconstructor; None selects the published ones."""
+    generator: str = "warp-inpaint"
+    generator_settings: GeneratorSettings | None = None
+    """Settings of the generator; None keeps its defaults."""
+    device: Literal["cpu", "cuda"] = "cpu"
+    seed: int = 0
+    baseline_iterations: int | None = None
+    """Maximum number of iterations of the baselines; None keeps their own numbers."""
+    source: Mapping[str, Any] = field(default_factory=dict)
+    """Origin of the tasks, so that no folder mixes two sources."""
+
+    def load_reconstructor(self) -> Reconstructor:
+        """Load Ψ; a model with weights is cached between tasks."""
+        weights = None if self.weights is None else Path(self.weights)
+        return load_reconstructor(self.reconstructor, weights, self.device)
+
+    def load_generator(self, targets: Sequence[View] = ()) -> Generator:
+        """Load Φ; a model with weights is cached between tasks."""
+        return load_generator(
+            self.generator, self.seed, targets, self.device, self.generator_settings
+        )
+
+    def load_models(self, targets: Sequence[View]) -> Models:
+        """Load the models of a task; only the generator `oracle` uses the images of `targets`."""
+        return Models(
+            self.load_reconstructor(),
+            self.load_generator(targets),
+            load_renderer(self.device),
+            self.seed,
+            self.baseline_iterations,
+        )
+
+
+Rerun = Literal["nothing", "failures", "scores"]
+"""Earlier results to redo: none, failed tasks, or all scores from saved predictions."""
+
+
+@dataclass(frozen=True)
+class RowCounts:
+    """Numbers of rows (pairs of a task and a method) after a call of `evaluate`."""
+
+    done: int
+    failed: int
+    """Rows of this call that hold an error."""
+    skipped: int
+    """Rows of earlier calls."""
+
+
+def evaluate(
+    tasks: Sequence[Task],
+    methods: Sequence[str],
+    out: Path,
+    config: RunConfig = RunConfig(),
+    shard: tuple[int, int] = (0, 1),
+    rerun: Rerun = "nothing",
+    engine: Engine = run_in_this_process,
+) -> RowCounts:
+    """Run methods on tasks and write a row of scores for each pair.
+
+    Existing rows and completed steps are kept. A failed task leaves rows with its error.
+
+    Args:
+        tasks: Tasks of all shards.
+        methods: Names of methods.
+        out: Folder of results: new, or of an earlier call or another shard.
+        config: Settings that determine the numbers; the same as in earlier calls.
+        shard: (i, n) selects the tasks i, i + n, i + 2n, ….
+        again: Results of an earlier call to redo.
+        engine: Runs the jobs; simultaneous calls share the tasks.
+
+    Raises:
+        InputError: Invalid name or shard, other content in `out`, or a full disk.
+    """
+    check_evaluation(tasks, methods, config, shard)
+    claim(out, collect_settings(config))
+    share = tasks[shard[0] :: shard[1]]
+    runner = TaskRunner(out, tuple(methods), config, rerun)
+    todo = {row: task for task in share for row in runner.find_missing_rows(task)}
+    jobs = [make_task_job(task) for task in {task.name: task for task in todo.values()}.values()]
+    rounds = Rounds(FolderPlace(out), runner, jobs, RETRIES)
+    activity = Activity("evaluating", len(todo))
+    with show_activity(activity) if todo else nullcontext():
+        for outcome in rounds.run(engine, runner):
+            for _ in runner.get_row_paths(outcome.job.options["task"]) & set(todo):
+                activity.count_step()
+    failed = sum(read_json(row).get("error") is not None for row in todo)
+    return RowCounts(len(todo) - failed, failed, len(share) * len(methods) - len(todo))
+
+
+def make_task_job(task: Task) -> Job:
+    """Make a job of a task, with all its methods."""
+    return Job(make_file_name(task.name), {"task": task})
+
+
+@dataclass(frozen=True)
+class TaskRunner:
+    """Runs the jobs of an evaluation and finds their results."""
+
+    out: Path
+    methods: tuple[str, ...]
+    config: RunConfig
+    rerun: Rerun = "nothing"
+
+    def get_row_paths(self, task: Task) -> set[Path]:
+        """Return the paths of the rows of a task."""
+        return {get_row_path(self.out, task.name, method) for method in self.methods}
+
+    def find_missing_rows(self, task: Task) -> dict[Path, str]:
+        """Return the rows of a task that have to be computed, with their methods."""
+        rows = {get_row_path(self.out, task.name, method): method for method in self.methods}
+        return {row: method for row, method in rows.items() if is_missing(row, self.rerun)}
+
+    def find_outcome(self, job: Job) -> Outcome | None:
+        """Return the outcome of a task that another process completed, or None."""
+        there = all(row.exists() for row in self.get_row_paths(job.options["task"]))
+        return Outcome(job, "done") if there else None
+
+    def give_up(self, job: Job, reason: str) -> Outcome:
+        """Write rows with the reason why there is no result."""
+        task = job.options["task"]
+        for row, method in self.find_missing_rows(task).items():
+            write_json(row, build_row(task, method, reason, get_task_folder(self.out, task.name)))
+        return Outcome(job, "failed", reason)
+
+    def __call__(self, job: Job) -> Outcome:
+        """Compute the missing rows of a task, unless another process does it."""
+        with FolderPlace(self.out).hold_claim(f"{CLAIMS}/{job.name}") as lost:
+            if lost is None:
+                return Outcome(job, "elsewhere")
+            self.run(job.options["task"])
+            return Outcome(job, "done")
+
+    def run(self, task: Task) -> None:
+        """Compute the missing rows of a task."""
+        prepared, folder = None, get_task_folder(self.out, task.name)
+        for row, method in self.find_missing_rows(task).items():
+            # Progress inside a task would flood a log.
+            with stage(f"{task.name}, {method}"), show_progress(None):
+                if prepared is None:
+                    prepared = attempt(partial(prepare_task, task, folder, self.config))
+                made = build_row(task, method, prepared, folder)
+            write_json(row, made)
+
+
+def is_missing(path: Path, rerun: Rerun) -> bool:
+    """Return True if a row has to be computed."""
+    if rerun == "scores" or not path.exists():
+        return True
+    return rerun == "failures" and read_json(path).get("error") is not None
+
+
+def prepare_task(task: Task, folder: Path, config: RunConfig) -> PreparedTask:
+    """Load the photographs of a task, and load or reconstruct its initial scene."""
+    views = sort_by_frame(load_task_views(task, task.context, config))
+    neighbours = load_task_views(task, task.neighbours, config)
+    targets, error = load_readable_targets(task, config)
+    if not targets:
+        raise InputError(str(error))
+    images = [*views, *targets]
+    check_memory(max(v.camera.width * v.camera.height for v in images), len(images))
+    models = config.load_models(targets)
+    context = load_or_reconstruct(folder / "context.npz", views, models)
+
+    def set_range(view: View) -> View:
+        return replace(view, camera=replace(view.camera, near=context.near, far=context.far))
+
+    return PreparedTask(
+        context.gaussians,
+        tuple(map(set_range, normalize_exposures(views, context.gains))),
+        tuple(map(set_range, targets)),
+        tuple(map(set_range, neighbours)),
+        models,
+        context.seconds,
+        error,
+    )
+
+
+def load_task_views(task: Task, frames: tuple[int, ...], config: RunConfig) -> list[View]:
+    """Load photographs and number them by their frames."""
+    return [
+        replace(view.to(config.device), frame=frame)
+        for view, frame in zip(task.load(frames), frames, strict=True)
+    ]
+
+
+def load_readable_targets(task: Task, config: RunConfig) -> tuple[list[View], str | None]:
+    """Load the targets up to the first damaged photograph, and return its error."""
+    targets: list[View] = []
+    for frame in task.targets:
+        loaded = attempt(partial(load_task_views, task, (frame,), config))
+        if isinstance(loaded, str):
+            return targets, f"Frame {frame}: {loaded}"
+        targets += loaded
+    return targets, None
+
+
+def load_or_reconstruct(path: Path, views: Sequence[View], models: Models) -> SavedContext:
+    """Load the scene saved at `path`, or reconstruct and save it."""
+    device = views[0].image.device if views else "cpu"
+
+    def save() -> None:
+        made = models.make_completer().reconstruct(views)
+        near, far = made.views[0].camera.near, made.views[0].camera.far
+        assert near is not None
+        assert far is not None
+        seconds = made.seconds["total"]
+        save_context(path, SavedContext(made.gaussians, near, far, seconds, made.exposure_gains))
+
+    return load_or_compute(path, lambda: load_context(path, device), save)
+
+
+def build_row(
+    task: Task, method: str, prepared: PreparedTask | str, folder: Path
+) -> dict[str, Any]:
+    """Build the row of a method on a task; `prepared` may be an error instead of a task."""
+    steps: tuple[Step, ...] = ()
+    error: str | None
+    if isinstance(prepared, str):
+        error, seconds = prepared, None
+    else:
+        progress = complete_task(prepared, method, folder)
+        steps, error, seconds = progress.steps, progress.error, prepared.seconds
+    return {
+        "version": VERSION,
+        "task": {
+            "name": task.name,
+            "context": list(task.context),
+            "targets": list(task.targets),
+            "neighbours": list(task.neighbours),
+        },
+        "method": method,
+        "error": error,
+        "reconstruct_seconds": seconds,
+        "steps": [asdict(step) for step in steps],
+    }
+
+
+def check_evaluation(
+    tasks: Sequence[Task], methods: Sequence[str], config: RunConfig, shard: tuple[int, int]
+) -> None:
+    """Raise InputError before anything is written if a run is impossible."""
+    check_methods(methods, max((len(task.targets) for task in tasks), default=0))
+    check_shard(shard)
+    check_tasks(tasks)
+    config.load_reconstructor()
+    config.load_generator()
+
+
+def check_tasks(tasks: Sequence[Task]) -> None:
+    """Raise InputError if there is no task, or if two tasks share a folder."""
+    if not tasks:
+        raise InputError(
+            "There is no case to run: no clip has the frames that the protocol needs; choose a "
+            "protocol with a smaller step, or other data."
+        )
+    names: dict[str, str] = {}
+    for task in tasks:
+        folder = make_file_name(task.name)
+        if folder in names:
+            raise InputError(
+                f"The cases {names[folder]} and {task.name} have the same name; rename a scene."
+            )
+        names[folder] = task.name
+
+
+def collect_settings(config: RunConfig) -> dict[str, Any]:
+    """Collect all settings that determine the numbers, named as on the command line."""
+    values = asdict(config)
+    settings = values.pop("generator_settings") or {}
+    settings.pop("offload", None)  # it changes where the model waits, not what it computes
+    return {**values, **{f"generator_{name}": value for name, value in settings.items()}}

@@ -1,0 +1,248 @@
+"""Steps of a method on a task: one target after the other, into the same scene.
+
+After each step the photograph of its target is known and may be the anchor of a later step. In the
+paper the generator gets it too (our `oracle`), so that only registration is compared.
+"""
+
+from __future__ import annotations
+
+import json
+import math
+from collections.abc import Callable, Sequence
+from dataclasses import asdict, dataclass, replace
+from functools import partial
+from pathlib import Path
+from typing import TypeVar
+
+from jaxtyping import Bool
+from torch import Tensor
+
+from gscompleter.errors import InputError, OutputError
+from gscompleter.evaluation.memory import measure_peak_memory
+from gscompleter.evaluation.methods import METHODS, Models, Prediction, mark_target
+from gscompleter.evaluation.metrics.scores import (
+    MIN_PIXELS,
+    Scores,
+    TargetRenders,
+    Truth,
+    compute_view_psnr,
+    score,
+)
+from gscompleter.evaluation.store import (
+    get_step_path,
+    get_truth_path,
+    load_prediction,
+    save_image,
+    save_prediction,
+)
+from gscompleter.render import Renderer
+from gscompleter.stages.select_anchor import lift
+from gscompleter.state import Completion, InitialContext
+from gscompleter.types import Camera, DepthMap, Gaussians, View
+
+T = TypeVar("T")
+
+
+@dataclass(frozen=True)
+class PreparedTask:
+    """A task with the data that all methods share; cameras have the depth range of the scene."""
+
+    context: Gaussians
+    """Gaussians that Ψ reconstructed from the views."""
+    views: tuple[View, ...]
+    targets: tuple[View, ...]
+    """Target photographs in order, up to the first that is damaged."""
+    neighbours: tuple[View, ...]
+    """Photographs beside the target, for scoring only."""
+    models: Models
+    seconds: float
+    """Wall time of the reconstruction."""
+    error: str | None = None
+    """Reason why there are no more targets, or None if all are readable."""
+
+
+@dataclass(frozen=True)
+class Step:
+    """Result of a method for one target."""
+
+    frame: int
+    anchor: int | None
+    """Anchor frame, or None for a method that lifts nothing."""
+    anchor_fallback: bool
+    scores: Scores
+    """Scores of the scene before and after the step."""
+    psnr_end: float | None
+    """PSNR at the target, in dB, of the final scene of the task; None while the task runs."""
+    depth_scale: float | None
+    """See `compute_depth_scale`; None in a task of one step or if too few pixels are covered."""
+    added: int
+    gaussians: int
+    """Number of Gaussians in the scene after the step."""
+    notes: tuple[str, ...]
+    seconds: dict[str, float]
+    """Wall time by stage, and `total`."""
+    peak_bytes: int | None
+    """Peak memory in bytes, or None if the system does not report it."""
+
+
+@dataclass(frozen=True)
+class Progress:
+    """The steps of a task so far."""
+
+    scene: Gaussians
+    """The context and all added Gaussians."""
+    views: tuple[View, ...]
+    steps: tuple[Step, ...] = ()
+    error: str | None = None
+    """Reason why the task stopped, or None."""
+
+
+def complete_task(task: PreparedTask, method: str, folder: Path) -> Progress:
+    """Complete targets in order until a step fails; saved steps in `folder` are read back."""
+    progress = Progress(task.context, task.views, error=task.error)
+    for target in task.targets:
+        following = attempt(partial(advance_task, progress, target, task, method, folder))
+        if isinstance(following, str):
+            progress = replace(progress, error=f"Frame {target.frame}: {following}")
+            break
+        progress = following
+    return add_final_psnr(progress, task.targets, task.models.renderer)
+
+
+def advance_task(
+    progress: Progress, target: View, task: PreparedTask, method: str, folder: Path
+) -> Progress:
+    """Complete one more target and save its prediction and images."""
+    number = len(progress.steps) + 1
+    state = task.models.make_completer().begin_with(InitialContext(progress.scene, progress.views))
+    path = get_step_path(folder, method, number)
+    prediction = load_or_predict(method, state, target.camera, number, task.models, path)
+    step, seen = score_step(prediction, state, target, task)
+    save_image(path.with_suffix(".png"), seen.after.image)
+    save_image(path.with_name(f"before-{number:03d}.png"), seen.before.image)
+    save_image(get_truth_path(folder, number), target.image)
+    return replace(
+        progress,
+        scene=prediction.scene,
+        views=(*progress.views, target),
+        steps=(*progress.steps, step),
+    )
+
+
+def load_or_predict(
+    method: str, state: Completion, target: Camera, number: int, models: Models, path: Path
+) -> Prediction:
+    """Load the prediction at `path`, or compute and save it."""
+
+    def save() -> None:
+        with measure_peak_memory(state.scene.means.device) as peak:
+            made = METHODS[method](state, target, models)
+        made = mark_target(made, number, state.scene)
+        save_prediction(path, replace(made, peak_bytes=peak.bytes))
+
+    return load_or_compute(path, lambda: load_prediction(path, state.scene), save)
+
+
+def load_or_compute(path: Path, load: Callable[[], T | None], save: Callable[[], None]) -> T:
+    """Load a result from `path`, after computing and saving it if it is missing.
+
+    It is always read back, so that a resumed run continues with the same tensors.
+    """
+    found = load()
+    if found is None:
+        save()
+        found = load()
+    if found is None:
+        raise OutputError(f"{path} cannot be read back; check the disk.")
+    return found
+
+
+def score_step(
+    prediction: Prediction, state: Completion, target: View, task: PreparedTask
+) -> tuple[Step, TargetRenders]:
+    """Score a step and render its target camera."""
+    truth = Truth(state.views, target, task.neighbours)
+    before, after = state.scene, prediction.scene
+    scores, seen = score(
+        before, after, prediction.added, truth, task.models.renderer, prediction.registered
+    )
+    anchor = None if prediction.anchor is None else state.views[prediction.anchor]
+    scale = None
+    if len(task.targets) > 1 and anchor is not None and prediction.added is not None:
+        expected = get_metric_depth(target, anchor, task.models)
+        scale = compute_depth_scale(
+            prediction.added, seen.holes, target.camera, expected, task.models.renderer
+        )
+    step = Step(
+        frame=get_frame_number(target),
+        anchor=None if anchor is None else get_frame_number(anchor),
+        anchor_fallback=prediction.anchor_fallback,
+        scores=scores,
+        psnr_end=None,
+        depth_scale=scale,
+        added=len(after) - len(before),
+        gaussians=len(after),
+        notes=prediction.notes,
+        seconds=dict(prediction.seconds),
+        peak_bytes=prediction.peak_bytes,
+    )
+    json.dumps(asdict(step), allow_nan=False)
+    return step, seen
+
+
+def get_frame_number(view: View) -> int:
+    """Return the frame number of a view."""
+    assert view.frame is not None
+    return view.frame
+
+
+def get_metric_depth(target: View, anchor: View, models: Models) -> DepthMap:
+    """Return the measured depth of `target`, or an estimate of Ψ if the data have none."""
+    if target.depth is not None:
+        return DepthMap(target.depth, target.depth > 0)
+    return lift(models.reconstructor, target, anchor).reference_depth
+
+
+def compute_depth_scale(
+    added: Gaussians,
+    holes: Bool[Tensor, "h w"],
+    target: Camera,
+    expected: DepthMap,
+    renderer: Renderer,
+) -> float | None:
+    """Compute the median of D_added / D_expected over the holes: 1 means metric scale.
+
+    D_added is the z-depth of `added` rendered alone. Only holes count, so that methods covering the
+    whole image are comparable. None for fewer than `MIN_PIXELS` pixels.
+    """
+    alone = renderer.render(added, target).depth_map()
+    both = holes & alone.valid & expected.valid
+    if both.sum() < MIN_PIXELS:
+        return None
+    return (alone.depth / expected.depth)[both].median().item()
+
+
+def compute_scale_drift(scales: Sequence[float]) -> float | None:
+    """Compute max(ln s) - min(ln s) of the depth scales s; None for fewer than two."""
+    return math.log(max(scales)) - math.log(min(scales)) if len(scales) > 1 else None
+
+
+def add_final_psnr(progress: Progress, targets: Sequence[View], renderer: Renderer) -> Progress:
+    """Set the PSNR of the final scene at each step."""
+    steps = []
+    for step, target in zip(progress.steps, targets, strict=False):  # the last may have failed
+        image = renderer.render(progress.scene, target.camera).image
+        steps.append(replace(step, psnr_end=compute_view_psnr(image, target)))
+    return replace(progress, steps=tuple(steps))
+
+
+def attempt(compute: Callable[[], T]) -> T | str:
+    """Return the result of `compute` or the reason of its failure; only OutputError is raised."""
+    try:
+        return compute()
+    except OutputError:
+        raise
+    except InputError as error:
+        return str(error)
+    except Exception as error:  # a defect of one task must not cost the others
+        return f"{type(error).__name__}: {' '.join(str(error).split())}"

@@ -1,0 +1,86 @@
+"""Free space (not in the paper): nothing is added in front of observed surfaces.
+
+In a hole only the lifted depth locates a Gaussian, but photographs exclude some positions: one in
+front of an observed surface slides back along its ray until no camera contradicts it.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Literal
+
+import torch
+from jaxtyping import Bool, Float
+from torch import Tensor
+
+from gscompleter.config import FreeSpaceConfig
+from gscompleter.geometry import compute_z_depths, project, slide
+from gscompleter.sky import compute_sky_depth, is_sky_visible
+from gscompleter.types import Camera, Gaussians, Render
+
+SLIDE_STEP = 0.04
+"""Step of a Gaussian along its ray, relative to its distance."""
+CLEARANCE = 0.01
+"""Distance behind an observed surface, relative to depth, that counts as occluded.
+A Gaussian there is invisible to the camera and still closes the hole."""
+BORDER = 3
+"""Pixels outside of an image at which a Gaussian is still visible."""
+
+
+def respect_free_space(
+    gaussians: Gaussians,
+    target: Camera,
+    cameras: Sequence[Camera],
+    renders: Sequence[Render],
+    footprint: Literal["constant", "fixed"],
+    config: FreeSpaceConfig = FreeSpaceConfig(),
+) -> tuple[Gaussians, Bool[Tensor, "n"]]:
+    """Slide Gaussians back along their target rays until they leave observed free space.
+
+    Returns:
+        The Gaussians, and a mask of those that found a position [n].
+    """
+    if config.num_steps == 0:
+        return gaussians, torch.ones_like(gaussians.opacities, dtype=torch.bool)
+    ratio = torch.ones_like(gaussians.opacities)
+    offsets = gaussians.means - target.center
+    waiting = torch.arange(len(gaussians), device=ratio.device)
+    for step in range(config.num_steps):
+        means = target.center + ratio[waiting, None] * offsets[waiting]
+        waiting = waiting[find_in_free_space(means, cameras, renders)]
+        if len(waiting) == 0:
+            break
+        ratio[waiting] = (1 + SLIDE_STEP) ** (step + 1)
+    if any(is_sky_visible(render, camera) for render, camera in zip(renders, cameras, strict=True)):
+        # Gaussians that find no position up to the sky become part of the sky.
+        behind = (
+            (1 + SLIDE_STEP)
+            * compute_sky_depth(target)
+            / compute_z_depths(gaussians.means[waiting], target)
+        )
+        means = target.center + behind[:, None] * offsets[waiting]
+        found = ~find_in_free_space(means, cameras, renders)
+        ratio[waiting[found]] = behind[found]
+        waiting = waiting[~found]
+    placed = torch.ones_like(ratio, dtype=torch.bool)
+    placed[waiting] = False
+    return slide(gaussians, target, ratio, footprint), placed
+
+
+def find_in_free_space(
+    points: Float[Tensor, "n 3"], cameras: Sequence[Camera], renders: Sequence[Render]
+) -> Bool[Tensor, "n"]:
+    """Find points in front of an observed surface, or inside the near distance of a camera."""
+    in_free_space = torch.zeros(len(points), dtype=torch.bool, device=points.device)
+    for camera, render in zip(cameras, renders, strict=True):
+        pixels, z = project(points, camera)
+        size = torch.tensor([camera.width, camera.height], device=pixels.device)
+        visible = (z > 0) & (pixels > -BORDER).all(-1) & (pixels < size + BORDER).all(-1)
+        nearest = torch.where(visible[:, None], pixels, 0.0).long().clamp_min(0)
+        x, y = torch.minimum(nearest, size - 1).unbind(-1)
+        scene = render.depth_map()
+        before = z < (1 + CLEARANCE) * scene.depth[y, x]
+        in_free_space |= visible & scene.valid[y, x] & before
+        if camera.near is not None:
+            in_free_space |= (points - camera.center).norm(dim=-1) < camera.near
+    return in_free_space

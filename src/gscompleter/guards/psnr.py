@@ -1,0 +1,247 @@
+"""PSNR and SSIM guard of stage 4: additions make no photograph worse."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from functools import cached_property
+from typing import Literal
+
+import torch
+from jaxtyping import Bool, Float
+from torch import Tensor
+from torch.nn.functional import pad
+
+from gscompleter.config import PsnrGuardConfig
+from gscompleter.cpu_threads import use_one_torch_thread
+from gscompleter.geometry import project_mask
+from gscompleter.image_ops import dilate
+from gscompleter.render import FrozenScene, OpacityImage, restrict_to_image
+from gscompleter.ssim import RADIUS, ssim_map
+from gscompleter.types import ErrorBudget, Gaussians, View
+
+NUM_HALVINGS = 16
+"""Rounds of halving opacities before Gaussians at the worst pixels are removed."""
+NUM_REMOVALS = 12
+"""Rounds of removal before a photograph loses all generated Gaussians that it sees."""
+MIN_PSNR_LOSS = 1e-4
+"""Smallest tolerated loss of PSNR in dB, for rounding."""
+PIXEL_RADIUS = 2
+"""Radius around the worst pixels within which Gaussians are removed, in pixels."""
+
+
+def set_error_budgets(
+    photograph: View,
+    image: Float[Tensor, "h w 3"],
+    holes: Bool[Tensor, "h w"],
+    tolerance: float,
+    ssim_tolerance: float,
+) -> tuple[ErrorBudget, ...]:
+    """Set the error budgets of a photograph.
+
+    Args:
+        photograph: Reference of the comparison.
+        image: Render of the context at its camera.
+        holes: Hole mask of the context there.
+        tolerance: Largest loss of PSNR in dB.
+        ssim_tolerance: Largest loss of SSIM.
+
+    Returns:
+        Budgets of the mean squared error without the holes, then over the whole photograph, then of
+        SSIM. The first exists so that closing a hole cannot compensate for an error elsewhere.
+    """
+
+    def budget(view: View, metric: Literal["mse", "dssim"]) -> ErrorBudget:
+        error = compute_pixel_errors(image.clamp(0, 1), ErrorBudget(view, metric, 0.0)).sum().item()
+        if metric == "mse":
+            return ErrorBudget(view, metric, add_psnr_loss(error, max(tolerance, MIN_PSNR_LOSS)))
+        return ErrorBudget(view, metric, error + ssim_tolerance)
+
+    budgets = [budget(replace(photograph, ignore_mask=holes | ~photograph.valid_mask), "mse")]
+    if holes.any():
+        budgets.append(budget(photograph, "mse"))
+    if min(photograph.image.shape[:2]) > 2 * RADIUS:
+        budgets.append(budget(photograph, "dssim"))
+    return tuple(budgets)
+
+
+def compute_pixel_errors(
+    image: Float[Tensor, "h w 3"], budget: ErrorBudget
+) -> Float[Tensor, "h w"]:
+    """Compute what each pixel adds to the error that a budget limits; differentiable."""
+    view = budget.view
+    masked = view.fill_ignored(image)
+    if budget.metric == "mse":
+        return (masked - view.image).square().mean(dim=-1) / view.valid_mask.numel()
+    inner = slice(RADIUS, -RADIUS)
+    dissimilar = (1 - ssim_map(masked, view.image).mean(dim=(0, 1)))[inner, inner]
+    return pad(dissimilar / dissimilar.numel(), (RADIUS,) * 4)
+
+
+@use_one_torch_thread()
+def meet_error_budgets(
+    added: Gaussians,
+    frozen_views: Sequence[FrozenScene],
+    budgets: Sequence[Sequence[ErrorBudget]],
+    config: PsnrGuardConfig = PsnrGuardConfig(),
+    images: Sequence[OpacityImage] | None = None,
+) -> Gaussians:
+    """Fade added Gaussians until every photograph is within its error budgets.
+
+    In a photograph over budget, opacities with a harmful gradient are halved, the most harmful
+    first and no more than needed. If that fails (two Gaussians may occlude each other), Gaussians
+    at the worst pixels are removed, finally all that the photograph sees.
+
+    Returns:
+        The Gaussians, or none of them if they lose more than `max_loss` of their opacity.
+    """
+    if config.max_drop is None or len(added) == 0:
+        return added
+    if images is None:
+        images = [restrict_to_image(frozen.vary_opacities(added)) for frozen in frozen_views]
+    before = [frozen.render.image for frozen in frozen_views]
+    checks = [Check(*each) for each in zip(budgets, before, images, strict=True)]
+    opacities, active = added.opacities, checks
+    for trial in range(NUM_HALVINGS + NUM_REMOVALS + 1):
+        worse = find_over_budget(active, opacities)
+        if not worse and len(active) < len(checks):  # Faded Gaussians may have occluded others.
+            worse = find_over_budget(checks, opacities)
+        if not worse:
+            break
+        lowered = [seen.choose_fading(trial, added) for seen in worse]
+        left = 0.5 if trial < NUM_HALVINGS else 0.0
+        opacities = torch.where(torch.stack(lowered).any(dim=0), left * opacities, opacities)
+        if is_mostly_faded(added.opacities, opacities, config):
+            return added[:0]
+        active = [seen.check for seen in worse] if trial + 1 < NUM_HALVINGS else checks
+    return replace(added, opacities=opacities, encoded=None)
+
+
+@dataclass(frozen=True)
+class Check:
+    """A photograph with its error budgets."""
+
+    budgets: Sequence[ErrorBudget]
+    image_before: Float[Tensor, "h w 3"]
+    render_image: OpacityImage
+    """Differentiable image in the opacities of the added Gaussians."""
+
+
+@dataclass(frozen=True)
+class CheckedRender:
+    """A photograph's render with given opacities."""
+
+    check: Check
+    opacities: Float[Tensor, "n"]
+    image: Float[Tensor, "h w 3"]
+
+    @staticmethod
+    def from_check(check: Check, opacities: Float[Tensor, "n"]) -> CheckedRender:
+        """Render the photograph of a check."""
+        return CheckedRender(check, *render_with_gradient(check.render_image, opacities))
+
+    @cached_property
+    def worst_budget(self) -> ErrorBudget:
+        """The budget that is exceeded most, relative to its limit."""
+        return max(
+            self.check.budgets, key=lambda one: self.compute_error(one) / max(one.limit, 1e-12)
+        )
+
+    @cached_property
+    def excess(self) -> float:
+        """Error above the limit of that budget."""
+        return self.compute_error(self.worst_budget) - self.worst_budget.limit
+
+    def compute_error(self, budget: ErrorBudget) -> float:
+        """Compute the error that a budget limits."""
+        return compute_pixel_errors(self.image.detach().clamp(0, 1), budget).sum().item()
+
+    def choose_fading(self, trial: int, added: Gaussians) -> Bool[Tensor, "n"]:
+        """Choose the Gaussians that lose opacity.
+
+        SSIM is not linear in opacities, so Gaussians at the worst pixels are chosen from the first
+        round on.
+        """
+        is_first_order = self.worst_budget.metric == "mse" and trial < NUM_HALVINGS
+        if not is_first_order and trial < NUM_HALVINGS + NUM_REMOVALS:
+            return self.find_at_worst_pixels(added)
+        gradient = compute_gradient(self.image, self.worst_budget, self.opacities)
+        if is_first_order:
+            return select_fewest(gradient * self.opacities.detach() / 2, self.excess)
+        return gradient != 0
+
+    def find_at_worst_pixels(self, added: Gaussians) -> Bool[Tensor, "n"]:
+        """Find Gaussians at the fewest pixels that account for the excess."""
+        images = (self.image.detach(), self.check.image_before)
+        after, before = (
+            compute_pixel_errors(image.clamp(0, 1), self.worst_budget) for image in images
+        )
+        relief = after - before
+        pixels = select_fewest(relief.flatten(), self.excess).view(relief.shape)
+        return project_mask(dilate(pixels, PIXEL_RADIUS), added, self.worst_budget.view.camera)
+
+
+def find_over_budget(checks: Sequence[Check], opacities: Float[Tensor, "n"]) -> list[CheckedRender]:
+    """Render all photographs and return those over budget."""
+    rendered = (CheckedRender.from_check(check, opacities) for check in checks)
+    return [render for render in rendered if render.excess > 0]
+
+
+def is_mostly_faded(
+    added: Float[Tensor, "n"], left: Float[Tensor, "n"], config: PsnrGuardConfig = PsnrGuardConfig()
+) -> bool:
+    """Return True if added Gaussians lost more than `max_opacity_loss` of their opacity."""
+    if config.max_opacity_loss is None or len(added) == 0:
+        return False
+    return 1 - (left.sum() / added.sum().clamp_min(1e-12)).item() > config.max_opacity_loss
+
+
+def select_fewest(relief: Float[Tensor, "n"], needed: float) -> Bool[Tensor, "n"]:
+    """Select the fewest entries whose relief sums to `needed`, or to half of all relief.
+
+    Relief is a first-order estimate, so the other half is re-evaluated after the change.
+    """
+    helpful = (relief > 0).nonzero()[:, 0]
+    most_first, order = relief[helpful].sort(descending=True, stable=True)
+    enough = min(needed, most_first.sum().item() / 2)
+    taken = helpful[order[most_first.cumsum(0) - most_first < enough]]
+    return torch.zeros_like(relief, dtype=torch.bool).index_fill(0, taken, True)
+
+
+def compute_mse_and_gradient(
+    render_image: OpacityImage, view: View, opacities: Float[Tensor, "n"]
+) -> tuple[float, Float[Tensor, "n"]]:
+    """Compute the squared error against a photograph and its gradient in the opacities."""
+    variable, image = render_with_gradient(render_image, opacities)
+    gradient = compute_gradient(image, ErrorBudget(view, "mse", 0.0), variable)
+    return compute_squared_error(view.fill_ignored(image.detach()), view.image).item(), gradient
+
+
+def render_with_gradient(
+    render_image: OpacityImage, opacities: Float[Tensor, "n"]
+) -> tuple[Float[Tensor, "n"], Float[Tensor, "h w 3"]]:
+    """Render with opacities as the variable of gradients."""
+    with torch.enable_grad():
+        variable = opacities.detach().clone().requires_grad_()
+        return variable, render_image(variable)
+
+
+def compute_gradient(
+    image: Float[Tensor, "h w 3"], budget: ErrorBudget, variable: Float[Tensor, "n"]
+) -> Float[Tensor, "n"]:
+    """Differentiate the error that a budget limits."""
+    with torch.enable_grad():
+        error = compute_pixel_errors(image, budget).sum()
+    return torch.autograd.grad(error, variable)[0]
+
+
+def compute_squared_error(
+    image: Float[Tensor, "h w 3"], photograph: Float[Tensor, "h w 3"]
+) -> Tensor:
+    """Compute the mean squared error of an image clipped to [0, 1]."""
+    return (image.clamp(0, 1) - photograph).square().mean()
+
+
+def add_psnr_loss(error: float, decibel: float) -> float:
+    """Compute the mean squared error after a loss of PSNR in dB."""
+    return error * 10 ** (decibel / 10)

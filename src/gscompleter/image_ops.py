@@ -1,0 +1,86 @@
+"""Smooth interpolation of values that are known in a part of an image."""
+
+from __future__ import annotations
+
+import cv2
+import torch
+from jaxtyping import Bool, Float
+from torch import Tensor
+from torch.nn.functional import avg_pool2d, interpolate, max_pool2d, pad
+
+
+def fill_smoothly(
+    values: Float[Tensor, "h w"], known: Bool[Tensor, "h w"], num_relaxations: int = 64
+) -> Float[Tensor, "h w"]:
+    """Interpolate smoothly outside the mask `known`: `push_pull`, relaxed towards a membrane.
+
+    If nothing is known, the result is zero.
+    """
+    weight = known.to(values.dtype)
+    filled = push_pull(values[..., None], weight)[..., 0]
+    for _ in range(num_relaxations):
+        filled = torch.where(known, values, average_four_neighbours(filled))
+    return filled
+
+
+def average_four_neighbours(values: Float[Tensor, "h w"]) -> Float[Tensor, "h w"]:
+    """Compute the mean of the four neighbours of each pixel, extending the border."""
+    padded = pad(values[None, None], (1, 1, 1, 1), mode="replicate")[0, 0]
+    total = padded[:-2, 1:-1] + padded[2:, 1:-1]
+    total += padded[1:-1, :-2]
+    total += padded[1:-1, 2:]
+    return total.div_(4)
+
+
+def push_pull(
+    values: Float[Tensor, "h w c"], weight: Float[Tensor, "h w"]
+) -> Float[Tensor, "h w c"]:
+    """Interpolate `values` into the pixels of zero `weight` through a pyramid of averages.
+
+    See Gortler et al., The Lumigraph, 1996. If all weights are zero, the result is 0.
+    """
+    weighted = (values * weight[..., None]).permute(2, 0, 1)[None]
+    filled = _fill(weighted, weight[None, None])
+    return filled[0].permute(1, 2, 0)
+
+
+def _fill(
+    weighted: Float[Tensor, "1 c h w"], weight: Float[Tensor, "1 1 h w"]
+) -> Float[Tensor, "1 c h w"]:
+    own = weighted / weight.clamp_min(1e-8)
+    size = (weight.shape[2], weight.shape[3])
+    if max(size) == 1 or bool((weight > 0).all()):
+        return own
+    coarse = _fill(
+        avg_pool2d(weighted, 2, ceil_mode=True, count_include_pad=False),
+        avg_pool2d(weight, 2, ceil_mode=True, count_include_pad=False),
+    )
+    below = interpolate(coarse, size=size, mode="bilinear", align_corners=False)
+    return torch.where(weight > 0, own, below)
+
+
+def smooth_masked(
+    values: Float[Tensor, "h w c"], mask: Bool[Tensor, "h w"], radius: int
+) -> Float[Tensor, "h w c"]:
+    """Average `values` over the pixels of `mask` in a square of 2 radius + 1 pixels."""
+    weight = mask.to(values.dtype)[..., None]
+    layers = torch.cat([values * weight, weight], dim=-1)
+    side = 2 * radius + 1
+    sums = cv2.boxFilter(
+        layers.cpu().numpy(), -1, (side, side), normalize=False, borderType=cv2.BORDER_CONSTANT
+    )
+    totals = torch.from_numpy(sums).to(values)
+    return totals[..., :-1] / totals[..., -1:].clamp_min(1e-8)
+
+
+def dilate(mask: Bool[Tensor, "h w"], radius: int) -> Bool[Tensor, "h w"]:
+    """Dilate `mask` by a square of 2 radius + 1 pixels."""
+    side, grown = 2 * radius + 1, mask[None, None].float()
+    for size, padding in (((1, side), (0, radius)), ((side, 1), (radius, 0))):
+        grown = max_pool2d(grown, size, stride=1, padding=padding)
+    return grown[0, 0] > 0
+
+
+def is_enclosed(mask: Bool[Tensor, "h w"]) -> bool:
+    """Return True if `mask` is not empty and does not touch the border of the image."""
+    return bool(mask.any()) and int(mask.sum()) == int(mask[1:-1, 1:-1].sum())

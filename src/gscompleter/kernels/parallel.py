@@ -1,0 +1,117 @@
+"""Kernels on several threads: each call works on a range of elements and writes only there.
+
+Numba's own threads spin on few cores, interfere with torch's or support one caller only, and its
+parallel kernels take two to five times as long to compile.
+"""
+
+import os
+import threading
+from concurrent.futures import ThreadPoolExecutor
+from contextlib import contextmanager
+from functools import lru_cache
+from itertools import pairwise
+
+import numba
+
+PIECES_PER_THREAD = 4
+"""Number of pieces per thread, which balances pieces of different cost."""
+
+
+class _Thread(threading.local):
+    """State of the calling thread."""
+
+    is_alone = False
+    """True if its kernels run on it alone."""
+
+
+_thread = _Thread()
+
+
+def _stay_alone():
+    _thread.is_alone = True
+
+
+def count_threads(threads):
+    """Return how many threads a kernel called here uses, if `threads` are available."""
+    return 1 if _thread.is_alone else threads or numba.config.NUMBA_NUM_THREADS
+
+
+def share(kernel, count, *arguments, threads=None):
+    """Run `kernel(begin, end, *arguments)` over range(count) on several threads.
+
+    `threads` defaults to NUMBA_NUM_THREADS; the result does not depend on it.
+    """
+    threads = count_threads(threads)
+    run(kernel, [(*piece, *arguments) for piece in split_into_pieces(count, threads)], threads)
+
+
+def split_into_pieces(count, threads):
+    """Split range(count) into pieces for `threads` threads."""
+    return split_range(count, threads * PIECES_PER_THREAD if threads > 1 else 1)
+
+
+def run(kernel, calls, threads=None):
+    """Run a kernel for each of `calls`, on this thread and idle ones, and return the results."""
+    threads = count_threads(threads)
+    if threads == 1 or len(calls) == 1:
+        return [kernel(*arguments) for arguments in calls]
+    results, waiting = [None] * len(calls), iter(enumerate(calls))
+
+    def work():
+        for number, arguments in waiting:
+            results[number] = kernel(*arguments)
+
+    pool = get_thread_pool(threads - 1, os.getpid())
+    helpers = [pool.submit(work) for _ in range(min(threads, len(calls)) - 1)]
+    try:
+        work()
+    finally:
+        for helper in helpers:
+            if not helper.cancel():
+                helper.result()
+    return results
+
+
+def map_in_parallel(function, *arguments):
+    """Map `function`, which may call kernels, over the arguments on several threads."""
+    threads = numba.config.NUMBA_NUM_THREADS
+    if threads == 1:
+        return list(map(function, *arguments))
+    with ThreadPoolExecutor(threads) as pool:
+        return list(pool.map(function, *arguments))
+
+
+def map_small_tasks(function, *arguments):
+    """Map `function` lazily over small tasks, each with its kernels on a single thread."""
+    threads = numba.config.NUMBA_NUM_THREADS
+    if threads == 1:
+        yield from map(function, *arguments)
+        return
+    with ThreadPoolExecutor(threads, initializer=_stay_alone) as pool:
+        yield from pool.map(function, *arguments)
+
+
+@contextmanager
+def run_in_background(function, *arguments):
+    """Run `function`, which may call kernels, on a thread beside the `with` block.
+
+    The block gets a function that waits for the result. With one thread, `function` runs only then.
+    """
+    if numba.config.NUMBA_NUM_THREADS == 1:
+        yield lambda: function(*arguments)
+        return
+    with ThreadPoolExecutor(1) as pool:
+        yield pool.submit(function, *arguments).result
+
+
+def split_range(count, pieces):
+    """Split range(count) into at most `pieces` contiguous ranges of about equal length."""
+    pieces = max(1, min(pieces, count))
+    bounds = [count * piece // pieces for piece in range(pieces + 1)]
+    return list(pairwise(bounds))
+
+
+@lru_cache(maxsize=8)
+def get_thread_pool(threads, process):
+    """Return the thread pool of a process; a forked one makes its own."""
+    return ThreadPoolExecutor(threads, thread_name_prefix="gscompleter")

@@ -1,0 +1,184 @@
+"""Splat lists of the tiles, front to back, and sums of gradients over their entries."""
+
+import numpy as np
+from llvmlite import ir
+from numba import njit, types
+from numba.extending import intrinsic
+
+from gscompleter.kernels.rasterizer import DEPTH, NUM_SPLAT_COLUMNS, TILE
+
+TILE_SHIFT = 4
+"""Binary logarithm of `TILE`."""
+
+
+# ---- From splats to lists ------------------------------------------------------------------------
+
+
+@intrinsic
+def _float_to_bits(typing, value):
+    """Reinterpret a float32 as uint32; positive numbers keep their order."""
+    return types.uint32(
+        types.float32
+    ), lambda context, builder, signature, arguments: builder.bitcast(arguments[0], ir.IntType(32))
+
+
+@njit(cache=True, nogil=True)
+def count_entries(begin, end, splats, boxes, depth_limits, tiles_x, counts):
+    """Add to `counts` [tiles] int32 how many of the splats begin..end touch each tile.
+
+    depth_limits [tiles] float32: depth behind which nothing is visible in a tile.
+    """
+    for i in range(begin, end):
+        for tile_y in range(boxes[i, 2] >> TILE_SHIFT, (boxes[i, 3] + TILE - 1) >> TILE_SHIFT):
+            left, right = boxes[i, 0] >> TILE_SHIFT, (boxes[i, 1] + TILE - 1) >> TILE_SHIFT
+            for tile in range(tile_y * tiles_x + left, tile_y * tiles_x + right):
+                if splats[i, DEPTH] <= depth_limits[tile]:
+                    counts[tile] += 1
+
+
+@njit(cache=True, nogil=True)
+def counts_to_offsets(counts):
+    """Turn counts [chunks, tiles] into offsets in place, and return the starts of the lists."""
+    chunks, tiles = counts.shape
+    tile_start = np.empty(tiles + 1, np.int64)
+    place = 0
+    for tile in range(tiles):
+        tile_start[tile] = place
+        for chunk in range(chunks):
+            size = counts[chunk, tile]
+            counts[chunk, tile] = place
+            place += size
+    tile_start[tiles] = place
+    return tile_start
+
+
+@njit(cache=True, nogil=True)
+def fill_entries(begin, end, splats, boxes, depth_limits, tiles_x, places, entries, keys):
+    """Enter the splats begin..end into the lists of the tiles they touch; see `count_entries`.
+
+    places [tiles] int32: next free entry of each tile; counted up.
+    entries, keys [e]: receive the index of the splat, int32, and the bits of its depth, uint32.
+    """
+    for i in range(begin, end):
+        for tile_y in range(boxes[i, 2] >> TILE_SHIFT, (boxes[i, 3] + TILE - 1) >> TILE_SHIFT):
+            left, right = boxes[i, 0] >> TILE_SHIFT, (boxes[i, 1] + TILE - 1) >> TILE_SHIFT
+            for tile in range(tile_y * tiles_x + left, tile_y * tiles_x + right):
+                if splats[i, DEPTH] <= depth_limits[tile]:
+                    place = places[tile]
+                    places[tile] = place + 1
+                    entries[place], keys[place] = i, _float_to_bits(splats[i, DEPTH])
+
+
+@njit(cache=True, nogil=True)
+def sort_lists(begin, end, tile_start, entries, keys):
+    """Sort the lists of the tiles begin..end front to back, by a stable radix sort of depths."""
+    largest = 0
+    for tile in range(begin, end):
+        largest = max(largest, tile_start[tile + 1] - tile_start[tile])
+    spare_entries, spare_keys = np.empty(largest, np.int32), np.empty(largest, np.uint32)
+    places = np.empty((4, 256), np.int64)
+    for tile in range(begin, end):
+        start, stop = tile_start[tile], tile_start[tile + 1]
+        size = stop - start
+        own_entries, own_keys = entries[start:stop], keys[start:stop]
+        places[:] = 0
+        for k in range(size):
+            for step in range(4):
+                places[step, (own_keys[k] >> np.uint32(8 * step)) & np.uint32(255)] += 1
+        for step in range(4):
+            shift, place, most = np.uint32(8 * step), 0, 0
+            for digit in range(256):
+                count = places[step, digit]
+                most = max(most, count)
+                places[step, digit] = place
+                place += count
+            if most == size:
+                continue
+            for k in range(size):
+                digit = (own_keys[k] >> shift) & np.uint32(255)
+                place = places[step, digit]
+                places[step, digit] = place + 1
+                spare_entries[place], spare_keys[place] = own_entries[k], own_keys[k]
+            for k in range(size):
+                own_entries[k], own_keys[k] = spare_entries[k], spare_keys[k]
+
+
+# ---- From lists to splats ------------------------------------------------------------------------
+
+
+@njit(cache=True, nogil=True)
+def number_slots(entries, count):
+    """Assign slots to the entries [e] so that the gradients of a splat are adjacent.
+
+    Returns the slot of each entry [e] int32, and the first slot of each splat [count + 1] int64.
+    """
+    slot_start = np.zeros(count + 1, np.int64)
+    for place in range(len(entries)):
+        slot_start[entries[place] + 1] += 1
+    slot = 0
+    for i in range(count + 1):
+        slot += slot_start[i]
+        slot_start[i] = slot
+    slots, taken = np.empty_like(entries), slot_start.copy()
+    for place in range(len(entries)):
+        i = entries[place]
+        slots[place] = taken[i]
+        taken[i] += 1
+    return slots, slot_start
+
+
+@njit(cache=True, nogil=True)
+def number_by_use(entries, count):
+    """Renumber `entries` by the first use of splats; return the used splats in order, and them."""
+    numbers = np.full(count, -1, np.int32)
+    order, renamed = np.empty(count, np.int32), np.empty_like(entries)
+    used = 0
+    for place in range(len(entries)):
+        i = entries[place]
+        if numbers[i] < 0:
+            numbers[i] = used
+            order[used] = i
+            used += 1
+        renamed[place] = numbers[i]
+    return order[:used], renamed
+
+
+@njit(cache=True, nogil=True)
+def copy_splats(begin, end, rows, splats, opacities, boxes, taken):
+    """Copy the splats of `rows` to the places begin..end of the arrays in `taken`."""
+    to_splats, to_opacities, to_boxes = taken
+    for place in range(begin, end):
+        i = rows[place]
+        for column in range(NUM_SPLAT_COLUMNS):
+            to_splats[place, column] = splats[i, column]
+        to_opacities[place] = opacities[i]
+        for side in range(4):
+            to_boxes[place, side] = boxes[i, side]
+
+
+@njit(cache=True, nogil=True, fastmath={"contract"}, error_model="numpy")
+def sum_entries(begin, end, slot_start, gradients, written, totals):
+    """Sum the gradients of the entries of each of the Gaussians begin..end into `totals` [n, c].
+
+    gradients [slots, c] float32 count if written [slots], from slot_start[i] to slot_start[i + 1].
+    """
+    for i in range(begin, end):
+        for column in range(gradients.shape[1]):
+            totals[i, column] = np.float32(0)
+        for slot in range(slot_start[i], slot_start[i + 1]):
+            if written[slot]:
+                for column in range(gradients.shape[1]):
+                    totals[i, column] += gradients[slot, column]
+
+
+@njit(cache=True, nogil=True, fastmath={"contract"})
+def sum_by_gaussian(begin, end, entries, rows, gradients, written, totals):
+    """Add the gradients of the entries of splats begin..end to those of their Gaussians.
+
+    gradients [e, c] float32 count if written [e]. rows [splats]: Gaussian of each splat.
+    """
+    for place in range(len(entries)):
+        i = entries[place]
+        if begin <= i < end and written[place]:
+            for column in range(gradients.shape[1]):
+                totals[rows[i], column] += gradients[place, column]

@@ -1,0 +1,85 @@
+"""Alignment of two sets of camera centres by a similarity (Umeyama 1991), with RANSAC."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from jaxtyping import Float, Int
+
+from gscompleter.errors import InputError
+
+Points = Float[np.ndarray, "n 3"]
+
+MIN_RANSAC_CAMERAS = 10
+"""Smallest number of cameras for which RANSAC rejects outliers."""
+NUM_RANSAC_SAMPLES = 10
+"""Number of random samples, each of half of the cameras."""
+RANSAC_SEED = 42
+"""Seed of the samples, as in the authors' code."""
+
+
+@dataclass(frozen=True)
+class Similarity:
+    """The transform `x' = scale * rotation @ x + shift`."""
+
+    scale: float
+    rotation: Float[np.ndarray, "3 3"]
+    shift: Float[np.ndarray, "3"]
+
+    def __call__(self, points: Points) -> Points:
+        """Transform points."""
+        return self.scale * points @ self.rotation.T + self.shift
+
+
+def fit_center_similarity(given: Points, found: Points) -> Similarity:
+    """Fit the similarity from `given` to `found` by least squares; it needs two distinct points."""
+    x, y = given.astype(np.float64), found.astype(np.float64)
+    middle_x, middle_y = x.mean(0), y.mean(0)
+    x, y = x - middle_x, y - middle_y
+    spread = (x**2).sum(1).mean()
+    if not spread > 0:
+        raise InputError(
+            f"All {len(x)} cameras stand in one place, so the scale is unknown; give photographs "
+            "taken from different positions."
+        )
+    u, values, v = np.linalg.svd(y.T @ x / len(x))
+    signs = np.array([1.0, 1.0, np.sign(np.linalg.det(u) * np.linalg.det(v))])
+    rotation = (u * signs) @ v
+    scale = float((values * signs).sum() / spread)
+    return Similarity(scale, rotation, middle_y - scale * rotation @ middle_x)
+
+
+def fit_robust_similarity(given: Points, found: Points) -> Similarity:
+    """Fit a similarity, with RANSAC from ten points on."""
+    every = fit_center_similarity(given, found)
+    if len(given) < MIN_RANSAC_CAMERAS:
+        return every
+    threshold = float(np.median(measure_nearest_distances(every(given), found)))
+    best, least = None, (0, np.inf)
+    for half in sample_halves(len(given)):
+        if np.ptp(given[half], axis=0).max() == 0:
+            continue
+        error = np.linalg.norm(
+            fit_center_similarity(given[half], found[half])(given) - found, axis=1
+        )
+        inliers = error <= threshold
+        count = int(inliers.sum())
+        mean = float(error[inliers].mean()) if count else np.inf
+        if (count, -mean) > (least[0], -least[1]):
+            best, least = inliers, (count, mean)
+    if best is None or least[0] < 3:
+        return every
+    return fit_center_similarity(given[best], found[best])
+
+
+def sample_halves(count: int) -> list[Int[np.ndarray, "_"]]:
+    """Sample random halves of `count` points."""
+    generator = np.random.default_rng(RANSAC_SEED)
+    size = max(3, (count + 1) // 2)
+    return [generator.choice(count, size, replace=False) for _ in range(NUM_RANSAC_SAMPLES)]
+
+
+def measure_nearest_distances(points: Points, others: Points) -> Float[np.ndarray, "n"]:
+    """Measure the distance from each point to the nearest of the others."""
+    return np.linalg.norm(points[:, None] - others, axis=-1).min(axis=1)

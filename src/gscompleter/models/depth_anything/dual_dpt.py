@@ -1,0 +1,106 @@
+"""The head of the any-view networks for depth and rays."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from itertools import pairwise
+
+from jaxtyping import Float
+from torch import Tensor, nn
+
+from gscompleter.models.depth_anything.dpt import HIDDEN, Dpt, ImageScratch, add_position_encoding
+from gscompleter.models.feed_forward.dpt import Coarsest, Fusion, fuse_levels
+from gscompleter.models.feed_forward.resampling import resize_bilinear
+
+NUM_LEVELS = 4
+"""Number of pyramid levels; rays come from the last one."""
+NORM_INDEX = 2
+"""Index of the norm in `RayLayers`."""
+
+Pyramid = Sequence[Float[Tensor, "n _ _ _"]]
+
+
+class ChannelNorm(nn.LayerNorm):
+    """Layer norm over the channels of each pixel."""
+
+    def forward(self, x: Float[Tensor, "n c h w"]) -> Float[Tensor, "n c h w"]:
+        """Normalise the channels."""
+        return super().forward(x.movedim(1, -1)).movedim(-1, 1)
+
+
+def create_five_convolutions(features: int) -> nn.Sequential:
+    """Create five consecutive convolutions."""
+    widths = pairwise([features, features // 2] * 3)
+    return nn.Sequential(*(nn.Conv2d(a, b, 3, 1, 1) for a, b in widths))
+
+
+class RayLayers(nn.Sequential):
+    """Output layers of a level. The four levels share one norm, which files store at the first."""
+
+    def __init__(self, channels: int, level: int) -> None:
+        first, last = nn.Conv2d(channels, HIDDEN, 3, 1, 1), nn.Conv2d(HIDDEN, 7, 1)
+        norm = nn.Identity() if level else ChannelNorm(HIDDEN)
+        super().__init__(first, nn.Identity(), norm, nn.Identity(), nn.ReLU(), last)
+
+    def apply_with_norm(
+        self, x: Float[Tensor, "n c h w"], norm: nn.Module
+    ) -> Float[Tensor, "n 7 h w"]:
+        """Apply the layers with the norm of another level."""
+        first, _, _, _, relu, last = self
+        return last(relu(norm(first(x))))
+
+
+class DualScratch(ImageScratch):
+    """Two fusions of the levels, for depth and for rays."""
+
+    def __init__(self, widths: Sequence[int], features: int) -> None:
+        super().__init__(widths, features, out=2)
+        self.refinenet1_aux = Fusion(features)
+        self.refinenet2_aux = Fusion(features)
+        self.refinenet3_aux = Fusion(features)
+        self.refinenet4_aux = Coarsest(features)
+        self.output_conv1_aux = nn.ModuleList(
+            create_five_convolutions(features) for _ in range(NUM_LEVELS)
+        )
+        last = [RayLayers(features // 2, level) for level in range(NUM_LEVELS)]
+        self.output_conv2_aux = nn.ModuleList(last)
+
+    def fuse_rays(self, pyramid: Pyramid, aspect: float) -> Float[Tensor, "n 7 h w"]:
+        """Fuse the maps, finest first, into rays; `aspect` is image width divided by height."""
+        fusions = (self.refinenet1_aux, self.refinenet2_aux, self.refinenet3_aux)
+        x = fuse_levels(self.project_levels(pyramid), *fusions, self.refinenet4_aux)
+        x = add_position_encoding(self.output_conv1_aux[-1](x), aspect)
+        shared, last = self.output_conv2_aux[0], self.output_conv2_aux[-1]
+        assert isinstance(shared, RayLayers)
+        assert isinstance(last, RayLayers)
+        return last.apply_with_norm(x, shared[NORM_INDEX])
+
+
+class DualDpt(Dpt):
+    """Head for depth at image resolution and rays at 4/7 of it."""
+
+    scratch: DualScratch
+
+    def __init__(self, channels: int, widths: Sequence[int], features: int) -> None:
+        super().__init__(channels, widths, coded=True)
+        self.norm = nn.LayerNorm(channels)
+        self.scratch = DualScratch(widths, features)
+
+    def normalize_patches(self, patches: Float[Tensor, "b v p c"]) -> Float[Tensor, "b v p c"]:
+        """Normalise the patches."""
+        return self.norm(patches)
+
+    def predict_depth(
+        self, pyramid: Pyramid, size: tuple[int, int]
+    ) -> tuple[Float[Tensor, "n h w"], Float[Tensor, "n h w"]]:
+        """Predict depth up to scale, and its confidence from 1 upwards."""
+        x = resize_bilinear(self.scratch.output_conv1(self.scratch(pyramid)), size)
+        raw = self.scratch.output_conv2(add_position_encoding(x, size[1] / size[0]))
+        return raw[:, 0].exp(), 1 + raw[:, 1].exp()
+
+    def predict_rays(
+        self, pyramid: Pyramid, size: tuple[int, int]
+    ) -> tuple[Float[Tensor, "n p q 6"], Float[Tensor, "n p q"]]:
+        """Predict direction, origin and confidence of each ray; unused with given cameras."""
+        raw = self.scratch.fuse_rays(pyramid, size[1] / size[0])
+        return raw[:, :6].movedim(1, -1), 1 + raw[:, 6].exp()

@@ -1,0 +1,118 @@
+"""The Gaussian head, and conversion of its output to Gaussians in the frame of its cameras."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from itertools import chain, pairwise
+
+import torch
+import torch.nn.functional as F
+from jaxtyping import Float
+from torch import Tensor, nn
+
+from gscompleter.geometry import multiply_quats, rotations_to_quats
+from gscompleter.models.depth_anything.dpt import Dpt, ImageScratch, add_position_encoding
+from gscompleter.models.depth_anything.harmonics import rotate_3dgs_sh
+from gscompleter.models.depth_anything.poses import Poses
+from gscompleter.models.depth_anything.vit import Tokens
+from gscompleter.models.feed_forward.dino import PATCH
+from gscompleter.models.feed_forward.gaussian_adapter import PixelGaussians, damp_sh
+from gscompleter.models.feed_forward.resampling import resize_bilinear
+
+SH = 9
+"""SH coefficients per colour (degree 2)."""
+CHANNELS = (2, 3, 4, 3 * SH, 1, 1)
+"""Channels of offset, scale, rotation, SH, depth offset, opacity."""
+SCALES = (1e-5, 30.0)
+"""Smallest and largest standard deviation, in tenths of the sum of pixel width and height."""
+
+
+def create_image_merger(features: int) -> nn.Sequential:
+    """Create the layers that add image features to the fused map."""
+    widths = pairwise([3, features // 8, features // 4, features // 2])
+    layers = [(nn.Conv2d(a, b, 3, 1, 1), nn.GELU()) for a, b in widths]
+    return nn.Sequential(*chain.from_iterable(layers))
+
+
+class GaussianDpt(Dpt):
+    """Head for the raw Gaussian channels of each pixel."""
+
+    scratch: ImageScratch
+
+    def __init__(self, channels: int, widths: Sequence[int], features: int) -> None:
+        super().__init__(channels, widths, coded=True)
+        self.scratch = ImageScratch(widths, features, sum(CHANNELS))
+        self.images_merger = create_image_merger(features)
+
+    def forward(
+        self, tokens: Sequence[Tokens], images: Float[Tensor, "b v 3 h w"]
+    ) -> Float[Tensor, "b v h w c"]:
+        """Predict raw channels from tokens and normalised images."""
+        size = (images.shape[3], images.shape[4])
+        pyramid = self.compute_pyramid(tokens, size[0] // PATCH, size[1] // PATCH)
+        x = resize_bilinear(self.scratch.output_conv1(self.scratch(pyramid)), size)
+        x = x + self.images_merger(images.flatten(0, 1))
+        raw = self.scratch.output_conv2(add_position_encoding(x, size[1] / size[0]))
+        return raw.movedim(1, -1).unflatten(0, images.shape[:2])
+
+
+def create_camera_gaussians(
+    raw: Float[Tensor, "b v h w c"],
+    depth: Float[Tensor, "b v h w"],
+    poses: Poses,
+    factors: Float[Tensor, "b"],
+) -> PixelGaussians:
+    """Create Gaussians in the frame of `poses`, with centres and depths multiplied by `factors`.
+
+    As in training, the predicted z-depth is used as distance along the ray.
+    """
+    offset, scale, rotation, sh, closer, opacity = raw.split(CHANNELS, dim=-1)
+    factor = factors[:, None, None, None]
+    distance = (depth + closer[..., 0]) * factor
+    turns = poses.c2w[..., :3, :3]
+    rays = F.normalize(
+        torch.einsum("bvij,bvhwj->bvhwi", turns, compute_offset_rays(offset, poses.K)), dim=-1
+    )
+    centers = factor[..., None] * poses.centers[:, :, None, None]
+    return PixelGaussians(
+        distance,
+        centers + rays * distance[..., None],
+        rotate_quats_as_trained(rotation, turns),
+        compute_pixel_scales(scale, poses.K) * distance[..., None],
+        opacity[..., 0].sigmoid(),
+        rotate_3dgs_sh(damp_sh(sh), turns),
+    )
+
+
+def compute_offset_rays(
+    offsets: Float[Tensor, "b v h w 2"], K: Float[Tensor, "b v 3 3"]
+) -> Float[Tensor, "b v h w 3"]:
+    """Compute directions in camera axes, `offsets` pixels from each pixel centre."""
+    h, w = offsets.shape[2:4]
+    x = torch.arange(w, device=offsets.device) + 0.5
+    y = torch.arange(h, device=offsets.device) + 0.5
+    points = torch.stack(torch.meshgrid(x, y, indexing="xy"), dim=-1) + offsets
+    points = F.pad(points, (0, 1), value=1.0)
+    return torch.einsum("bvij,bvhwj->bvhwi", torch.linalg.inv(K), points)
+
+
+def compute_pixel_scales(
+    scale: Float[Tensor, "b v h w 3"], K: Float[Tensor, "b v 3 3"]
+) -> Float[Tensor, "b v h w 3"]:
+    """Compute standard deviations at a distance of 1."""
+    low, high = SCALES
+    pixel = 0.1 * (1 / K[..., 0, 0] + 1 / K[..., 1, 1])
+    return (low + (high - low) * scale.sigmoid()) * pixel[..., None, None, None]
+
+
+def rotate_quats_as_trained(
+    raw: Float[Tensor, "b v h w 4"], turns: Float[Tensor, "b v 3 3"]
+) -> Float[Tensor, "b v h w 4"]:
+    """Rotate Gaussians with their cameras; returns wxyz quaternions.
+
+    As in training, quaternions are reordered to wxyz but rotated as if they were xyzw.
+    """
+    x, y, z, w = F.normalize(raw, dim=-1, eps=1e-8).unbind(-1)
+    misread = torch.stack([z, w, x, y], dim=-1)  # (w, x, y, z) misread as xyzw, in our order
+    rotated = multiply_quats(rotations_to_quats(turns)[:, :, None, None], misread)
+    return torch.where(rotated[..., :1] < 0, -rotated, rotated).roll(-1, -1)

@@ -1,0 +1,29 @@
+"""Rotation of spherical harmonics (SH) in the basis of 3DGS."""
+
+from __future__ import annotations
+
+from math import isqrt
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from gscompleter.models.feed_forward.spherical_harmonics import rotate_sh
+
+AXIS_PERMUTATION = ((0.0, 0.0, 1.0), (1.0, 0.0, 0.0), (0.0, 1.0, 0.0))
+"""Permutation of the axes of e3nn (pole along y) to those of 3DGS (pole along z)."""
+
+
+def rotate_3dgs_sh(
+    sh: Float[Tensor, "b v h w k 3"], turns: Float[Tensor, "b v 3 3"]
+) -> Float[Tensor, "b v h w k 3"]:
+    """Rotate SH of 3DGS such that `Y(R d) sh' = Y(d) sh` for all directions d."""
+    pole, signs = turns.new_tensor(AXIS_PERMUTATION), compute_order_signs(sh)
+    return signs * rotate_sh(signs * sh, pole.T @ turns @ pole)
+
+
+def compute_order_signs(sh: Float[Tensor, "*n k 3"]) -> Float[Tensor, "k 1"]:
+    """Return -1 for SH of odd order, 1 for the others."""
+    degrees = range(isqrt(sh.shape[-2]))
+    orders = [order for degree in degrees for order in range(-degree, degree + 1)]
+    return torch.tensor([(-1.0) ** order for order in orders]).to(sh)[:, None]

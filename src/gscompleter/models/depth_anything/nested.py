@@ -1,0 +1,92 @@
+"""The nested network: any-view depth, scaled to metres by the metric network."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import torch
+from jaxtyping import Bool, Float
+from torch import Tensor, nn
+
+from gscompleter.models.depth_anything.config import NestedConfig
+from gscompleter.models.depth_anything.metric import (
+    MIN_PIXELS,
+    MetricDepth,
+    MetricDepthAnything,
+    interpolate_quantile,
+    set_sky_depth,
+)
+from gscompleter.models.depth_anything.network import DepthAnything, Prediction
+from gscompleter.models.depth_anything.poses import Poses
+from gscompleter.models.feed_forward.cameras import disable_autocast
+
+MIN_METRES = 0.01
+"""Smallest depth of pixels that determine the scale, in metres."""
+MIN_DEPTH = 1e-3
+"""Smallest depth of pixels that determine the scale, in the unit of the any-view network."""
+MAX_SKY_DEPTH = 200.0
+"""Largest depth of the sky, in metres."""
+
+
+@dataclass(frozen=True)
+class NestedPrediction:
+    """Predictions of both networks for one scene."""
+
+    any_view: Prediction
+    metric: MetricDepth
+    scale: float
+    """Metres per unit of `any_view`."""
+
+    @property
+    def depth(self) -> Float[Tensor, "1 v h w"]:
+        """The z-depth in metres; the sky lies behind the foreground, at most at 200 m."""
+        return set_sky_depth(
+            self.any_view.depth * self.scale, self.metric.solid_mask, MAX_SKY_DEPTH
+        )
+
+    @property
+    def confidence(self) -> Float[Tensor, "1 v h w"]:
+        """The confidence, from 1 upwards; 1 in the sky."""
+        return self.any_view.confidence.where(self.metric.solid_mask, 1.0)
+
+
+class NestedDepthAnything(nn.Module):
+    """The nested network: 1690 M parameters."""
+
+    def __init__(self, config: NestedConfig) -> None:
+        super().__init__()
+        self.config = config
+        self.da3 = DepthAnything(config.any_view)
+        self.da3_metric = MetricDepthAnything(config.metric)
+
+    def forward(
+        self, images: Float[Tensor, "1 v 3 h w"], poses: Poses | None = None
+    ) -> NestedPrediction:
+        """Predict like `DepthAnything`, and the scale to metres."""
+        prediction = self.da3(images, poses)
+        metric = self.da3_metric(images)
+        with disable_autocast(images):
+            return NestedPrediction(prediction, metric, fit_metres_per_unit(prediction, metric))
+
+
+def fit_metres_per_unit(prediction: Prediction, metric: MetricDepth) -> float:
+    """Fit the scale from any-view to metric depth on the more confident half of the foreground."""
+    metres = metric.convert_to_metres(prediction.poses.K)
+    counts = select_scale_pixels(prediction, metric, metres)
+    if int(counts.sum()) <= MIN_PIXELS:
+        return 1.0
+    a, b = metres[counts].double(), prediction.depth[counts].double()
+    return float((a * b).sum() / (b * b).sum())
+
+
+def select_scale_pixels(
+    prediction: Prediction, metric: MetricDepth, metres: Float[Tensor, "b v h w"]
+) -> Bool[Tensor, "b v h w"]:
+    """Select the pixels that determine the scale."""
+    if not metric.solid_mask.any():
+        return torch.zeros_like(metric.solid_mask)
+    sure = prediction.confidence >= interpolate_quantile(
+        prediction.confidence[metric.solid_mask], 0.5
+    )
+    deep = (metres > MIN_METRES) & (prediction.depth > MIN_DEPTH)
+    return sure & deep & metric.solid_mask

@@ -1,0 +1,49 @@
+"""Estimation of the scene unit in metres from common features."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+import torch
+from jaxtyping import Float
+
+from gscompleter.errors import InputError
+from gscompleter.geometry import sample
+from gscompleter.reconstructors.features.depth_range import MIN_MATCHES
+from gscompleter.reconstructors.features.neighbours import find_neighbours
+from gscompleter.reconstructors.features.stereo_image import make_stereo_images
+from gscompleter.reconstructors.features.triangulation import triangulate
+from gscompleter.types import DepthMap, View
+
+
+def estimate_units_per_metre(views: Sequence[View], metres: Sequence[DepthMap]) -> float:
+    """Estimate scene units per metre: the median over features that two photographs share.
+
+    Raises:
+        InputError: Too few features have a depth in `metres`.
+    """
+    images, unit = make_stereo_images(views)
+    neighbours = find_neighbours(images)
+    ratios = [np.zeros(0)]
+    for i, j in neighbours.pairs:
+        a, b = neighbours.matches[i, j]
+        if len(a):
+            for one, two, at, to in ((i, j, a, b), (j, i, b, a)):
+                inverse, good = triangulate(images[one], images[two], at, to)
+                known = sample_depths(metres[one], at)
+                good &= known > 0
+                ratios.append(unit / (inverse[good] * known[good]))
+    found = np.concatenate(ratios)
+    if len(found) < MIN_MATCHES:
+        raise InputError(
+            f"The photographs share {len(found)} features of known depth, and the scale of the "
+            f"scene needs {MIN_MATCHES}; choose another reconstructor, or frames with more overlap."
+        )
+    return float(np.median(found))
+
+
+def sample_depths(depth: DepthMap, pixels: Float[np.ndarray, "k 2"]) -> Float[np.ndarray, "k"]:
+    """Sample z-depth at pixel coordinates; 0 if invalid."""
+    known = (depth.depth * depth.valid).cpu()[..., None]
+    return sample(known, torch.from_numpy(pixels).float(), "nearest")[..., 0].double().numpy()

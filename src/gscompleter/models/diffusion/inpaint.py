@@ -1,0 +1,187 @@
+"""Inpainting pipelines of diffusers, applied to photographs warped to the target."""
+
+from __future__ import annotations
+
+import inspect
+from dataclasses import dataclass, replace
+from functools import lru_cache
+from typing import Any
+
+import torch
+from jaxtyping import Bool, Float
+from torch import Tensor
+
+from gscompleter.config.generators import DiffusersInpaintSettings
+from gscompleter.errors import InputError
+from gscompleter.generators import GeneratorOutput
+from gscompleter.generators.agreement import paint_consistently
+from gscompleter.generators.warp import (
+    WarpedImage,
+    add_unexplained,
+    fill_background_first,
+    warp_photographs,
+)
+from gscompleter.image_ops import dilate
+from gscompleter.models.diffusion.complete import check_parts, load_language_models
+from gscompleter.models.diffusion.kontext import resize_antialiased
+from gscompleter.models.diffusion.placing import move_to_device, select_dtype
+from gscompleter.models.diffusion.published import (
+    Source,
+    announce,
+    check_packages,
+    convert_load_errors,
+    parse_source,
+)
+from gscompleter.types import Camera, GeneratorInput, View
+
+DEFAULT_SIDE = 512
+"""Default side length of the square image, in pixels."""
+BORDER_WIDTH = 4
+"""Width in pixels around a hole that is inpainted too, for smooth borders, but not kept."""
+
+
+@dataclass(frozen=True)
+class Painter:
+    """A loaded inpainting pipeline with its image sizes."""
+
+    pipeline: Any
+    side: int
+    """Side length of the square training images, in pixels."""
+    multiple: int
+    """Divisor of the side lengths of all images, in pixels."""
+
+    def compute_size(self, height: int, width: int) -> tuple[int, int]:
+        """Compute a size of about `side`² pixels with the aspect ratio of the image."""
+        scale = self.side / (height * width) ** 0.5
+        h, w = (max(1, round(scale * n / self.multiple)) for n in (height, width))
+        return h * self.multiple, w * self.multiple
+
+    def fill_hole(
+        self,
+        image: Float[Tensor, "h w 3"],
+        hole: Bool[Tensor, "h w"],
+        prompt: str,
+        seed: int,
+        steps: int | None,
+    ) -> Float[Tensor, "h w 3"]:
+        """Inpaint the hole; other pixels may change too."""
+        size = self.compute_size(*hole.shape)
+        mask = (resize_antialiased(hole[..., None].float(), size) > 0).float()
+        wanted: dict[str, Any] = {
+            "prompt": prompt,
+            "image": resize_antialiased(image, size).permute(2, 0, 1)[None].cpu(),
+            "mask_image": mask.permute(2, 0, 1)[None].cpu(),
+            "height": size[0],
+            "width": size[1],
+            "strength": 1.0,  # start from pure noise in the hole
+            "generator": torch.Generator().manual_seed(seed),
+            "output_type": "pt",
+        }
+        if steps is not None:
+            wanted["num_inference_steps"] = steps
+        known = inspect.signature(self.pipeline.__call__).parameters
+        painted = self.pipeline(**{k: v for k, v in wanted.items() if k in known}).images[0]
+        back = resize_antialiased(painted.float().permute(1, 2, 0), (hole.shape[0], hole.shape[1]))
+        return back.clamp(0, 1).to(image.device)
+
+
+@dataclass(frozen=True)
+class DiffusersInpaint:
+    """Generator Φ that inpaints warped photographs; see `load_painter`."""
+
+    painter: Painter
+    seed: int = 0
+    """Seed of the noise; results are reproducible per device."""
+    prompt: str = DiffusersInpaintSettings.prompt
+    """Text prompt for all images."""
+    steps: int | None = None
+    """Number of denoising steps, or None for the pipeline's default."""
+    retries: int = 0
+    """Number of further seeds to try if the image is inconsistent with the warped photographs."""
+
+    def __call__(self, nearest: View, target: Camera, context: GeneratorInput) -> GeneratorOutput:
+        """Synthesize the image at `target`; pixels outside the hole are warped photographs."""
+        observed = complete_warp(nearest, target, context)
+        hole = dilate(~observed.known, BORDER_WIDTH)
+
+        def paint(seed: int) -> Float[Tensor, "h w 3"]:
+            return self.painter.fill_hole(observed.image, hole, self.prompt, seed, self.steps)
+
+        compared = replace(observed, known=~hole)
+        correct = context.correct_color
+        painted = paint_consistently(paint, self.seed, compared, self.retries, correct)
+        known = observed.known[..., None]
+        return replace(painted, image=torch.where(known, observed.image, painted.image))
+
+
+def complete_warp(nearest: View, target: Camera, context: GeneratorInput) -> WarpedImage:
+    """Warp the photographs to the target and extrapolate their colours smoothly into the holes."""
+    warped = warp_photographs(nearest, target, context)
+    if not warped.known.any():
+        return replace(warped, image=nearest.image.mean(dim=(0, 1)).expand_as(warped.image))
+    warped = add_unexplained(warped, target, context)
+    tone, _ = fill_background_first(warped)
+    return replace(warped, image=tone.clamp(0, 1).to(warped.image.device))
+
+
+def load_diffusers_inpaint(
+    seed: int = 0,
+    device: str = "cpu",
+    settings: DiffusersInpaintSettings = DiffusersInpaintSettings(),
+) -> DiffusersInpaint:
+    """Create the generator from its settings; raises the errors of `load_painter`."""
+    painter = load_painter(settings.weights, device, settings.offload)
+    return DiffusersInpaint(painter, seed, settings.prompt, settings.steps, settings.retries)
+
+
+@lru_cache(maxsize=1)
+def load_painter(path: str | None, device: str = "cpu", offload: bool = False) -> Painter:
+    """Load an inpainting pipeline; the last one is cached.
+
+    Args:
+        path: A folder in the format of diffusers, or USER/NAME or USER/NAME@COMMIT on the hub.
+        device: cpu (float32) or cuda (bfloat16).
+        offload: Keep only the active part on the GPU; slower, and needs accelerate.
+
+    Raises:
+        InputError: Packages, the path, or an inpainting pipeline are missing.
+    """
+    check_packages("diffusers-inpaint")
+    if path is None:
+        raise InputError(
+            "The generator 'diffusers-inpaint' needs the path of a model; give a folder that "
+            "diffusers saved or USER/NAME on the Hugging Face hub.",
+            "generator_weights",
+        )
+    source = parse_source(path)
+    announce([source])
+    with convert_load_errors(source):
+        pipeline = load_inpainting_pipeline(source, select_dtype(device))
+    move_to_device(pipeline, device, offload)
+    return Painter(pipeline, *get_size_rules(pipeline))
+
+
+def load_inpainting_pipeline(source: Source, dtype: torch.dtype) -> Any:
+    """Load the pipeline of a folder or repository as an inpainting pipeline."""
+    from diffusers import AutoPipelineForInpainting, DiffusionPipeline
+
+    pipeline = DiffusionPipeline.from_pretrained(
+        source.location, dtype=dtype, **load_language_models(source, dtype), **source.load_arguments
+    )
+    check_parts(pipeline)
+    if {"image", "mask_image"} <= set(inspect.signature(pipeline.__call__).parameters):
+        return pipeline
+    return AutoPipelineForInpainting.from_pipe(pipeline)
+
+
+def get_size_rules(pipeline: Any) -> tuple[int, int]:
+    """Return the side length of training images and the divisor of side lengths, in pixels."""
+    latent = int(getattr(pipeline, "vae_scale_factor", 8))
+    unet = getattr(pipeline, "unet", None)
+    if unet is None:
+        return int(
+            getattr(pipeline, "default_sample_size", DEFAULT_SIDE // latent)
+        ) * latent, 2 * latent
+    side = unet.config.get("sample_size") or DEFAULT_SIDE // latent
+    side = max(side) if isinstance(side, (list, tuple)) else int(side)
+    return side * latent, latent * 2 ** (len(unet.config.block_out_channels) - 1)

@@ -1,0 +1,177 @@
+"""PE-Field: a diffusion transformer that reads the photograph at its target positions.
+
+The camera motion enters only by positions: each token of the photograph is placed where the
+target camera sees its content. Attention fills the holes.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from gscompleter.config.generators import PEFieldSettings
+from gscompleter.errors import InputError
+from gscompleter.generators import GeneratorOutput, GeneratorRequest
+from gscompleter.generators.agreement import paint_consistently
+from gscompleter.generators.warp import warp_photographs
+from gscompleter.geometry import is_same_camera
+from gscompleter.models.diffusion.kontext import Kontext, resize_antialiased
+from gscompleter.models.diffusion.loading import load_kontext
+from gscompleter.models.diffusion.position_ids import (
+    compute_source_ids,
+    compute_target_ids,
+    project_to_target,
+)
+from gscompleter.models.diffusion.source_depth import (
+    SourceDepth,
+    compute_context_depth,
+    load_source_depth,
+)
+from gscompleter.models.diffusion.splat import splat_forward
+from gscompleter.types import Camera, GeneratorInput, Render, View
+
+GUIDANCE = 3.5
+"""Scale of the distilled guidance."""
+
+
+@dataclass(frozen=True)
+class Condition:
+    """Input of the model for one target: the resized photograph, output size, and positions."""
+
+    photograph: Float[Tensor, "h w 3"]
+    size: tuple[int, int]
+    source_positions: Float[Tensor, "m 63"]
+    """Positions of the photograph's tokens in the target camera."""
+
+
+@dataclass(frozen=True)
+class PEField:
+    """The paper's generator Φ; see `load_kontext` for the model."""
+
+    model: Kontext
+    seed: int = 0
+    """Seed of the noise; results are reproducible per device."""
+    steps: int = PEFieldSettings.steps
+    """Number of denoising steps."""
+    depth: SourceDepth | None = None
+    """Source of the photograph's depth, or None to use the setting of the completer."""
+    device: str = "cpu"
+    ids_dtype: torch.dtype = torch.bfloat16
+    """Rounding of target positions; bfloat16 as in the authors' code."""
+    retries: int = 0
+    """Number of further seeds to try if an image is inconsistent with the photographs."""
+    max_batch_size: int = PEFieldSettings.batch_size
+    """Largest number of images denoised together."""
+
+    supports_padding: bool = True
+
+    def synthesize(self, requests: Sequence[GeneratorRequest]) -> list[GeneratorOutput]:
+        """Synthesize the images of `requests`, with colours adjusted to the photographs.
+
+        Raises:
+            InputError: The scene has no depth at the nearest photograph.
+        """
+        conditions = [self.create_condition(r.nearest, r.target, r.context) for r in requests]
+        first: dict[int, Tensor] = {}
+        for group in group_by_size(conditions, self.max_batch_size):
+            images = self.generate_images([conditions[i] for i in group], self.seed)
+            first.update(zip(group, images, strict=True))
+
+        def answer(i: int) -> GeneratorOutput:
+            nearest, target = requests[i].nearest, requests[i].target
+
+            def paint(seed: int) -> Float[Tensor, "h w 3"]:
+                image = (
+                    first[i]
+                    if seed == self.seed
+                    else self.generate_images([conditions[i]], seed)[0]
+                )
+                back = resize_antialiased(image, (target.height, target.width)).clamp(0, 1)
+                return back.to(nearest.image.device)
+
+            observed = warp_photographs(nearest, target, requests[i].context)
+            correct = requests[i].context.correct_color
+            return paint_consistently(paint, self.seed, observed, self.retries, correct)
+
+        return [answer(i) for i in range(len(requests))]
+
+    def create_condition(self, nearest: View, target: Camera, context: GeneratorInput) -> Condition:
+        """Create the model input for a target; raises the errors of `synthesize`."""
+        size = self.model.compute_size(target.height, target.width)
+        source_size = self.model.compute_size(nearest.camera.height, nearest.camera.width)
+        grids = self.model.compute_grid(source_size), self.model.compute_grid(size)
+        source = self.depth or load_source_depth(context.source_depth, self.device)
+        depth = source(nearest, find_render(nearest, context))
+        positions = compute_source_ids(depth, nearest.camera, target, *grids).cpu()
+        return Condition(resize_antialiased(nearest.image, source_size), size, positions)
+
+    def generate_images(
+        self, conditions: Sequence[Condition], seed: int
+    ) -> Float[Tensor, "b h w 3"]:
+        """Generate an image for each condition; all sizes must be equal."""
+        size = conditions[0].size
+        return self.model.generate(
+            torch.stack([one.photograph for one in conditions]),
+            size,
+            compute_target_ids(size, self.model.compute_grid(size), self.ids_dtype),
+            torch.stack([one.source_positions for one in conditions]),
+            seed,
+            self.steps,
+            GUIDANCE,
+        )
+
+
+def preview(
+    nearest: View,
+    target: Camera,
+    context: GeneratorInput,
+    depth: SourceDepth = compute_context_depth,
+) -> Float[Tensor, "h w 3"]:
+    """Splat the photograph to its positions in `target`, over black, for inspection.
+
+    Displaced pixels or torn surfaces indicate wrong depth or cameras; gaps next to the foreground
+    and a smear at the border are correct.
+    """
+    pixels, _ = project_to_target(
+        depth(nearest, find_render(nearest, context)), nearest.camera, target
+    )
+    return splat_forward(nearest.image, pixels, (target.height, target.width))
+
+
+def group_by_size(conditions: Sequence[Condition], max_size: int) -> list[list[int]]:
+    """Group the indices of conditions of equal size into batches of at most `most`."""
+    alike: dict[tuple[tuple[int, int], torch.Size], list[int]] = {}
+    for i, one in enumerate(conditions):
+        alike.setdefault((one.size, one.photograph.shape), []).append(i)
+    return [
+        indices[start : start + max_size]
+        for indices in alike.values()
+        for start in range(0, len(indices), max_size)
+    ]
+
+
+def find_render(view: View, context: GeneratorInput) -> Render:
+    """Find the render of the scene at `view`, one of the context views."""
+    for known, render in zip(context.views, context.view_renders, strict=True):
+        if known is view or is_same_camera(known.camera, view.camera):
+            return render
+    raise InputError("The nearest view is not a view of the scene; give one of its views.")
+
+
+def load_pe_field(
+    seed: int = 0, device: str = "cpu", settings: PEFieldSettings = PEFieldSettings()
+) -> PEField:
+    """Create PE-Field from its settings; raises InputError if packages or weights are missing."""
+    return PEField(
+        load_kontext(settings.weights, device, settings.offload),
+        seed,
+        settings.steps,
+        None if settings.depth is None else load_source_depth(settings.depth, device),
+        device,
+        retries=settings.retries,
+        max_batch_size=settings.batch_size,
+    )

@@ -1,0 +1,143 @@
+"""Depth of the photograph for PE-Field, positive everywhere."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import lru_cache
+from typing import Any, Protocol, runtime_checkable
+
+import torch
+from jaxtyping import Bool, Float
+from torch import Tensor
+
+from gscompleter.errors import InputError
+from gscompleter.generators.exposure import fit_robust_affine
+from gscompleter.generators.smooth import continue_smoothly
+from gscompleter.models.diffusion.complete import load_transformers_model
+from gscompleter.models.diffusion.published import (
+    announce,
+    check_packages,
+    convert_load_errors,
+    parse_source,
+)
+from gscompleter.types import Render, View
+
+MONOCULAR_MODEL = "depth-anything/Depth-Anything-V2-Small-hf"
+"""Published depth model. The authors use MoGe-2, which transformers does not support."""
+PREDICTS_DEPTH = {"depth_anything": False, "dpt": False, "glpn": True}
+"""Supported kinds of networks, and True for those that predict depth rather than disparity."""
+UNUSED_TENSORS = r"fusion_stage\.layers\.0\.residual_layer1\."
+"""Pattern of DPT's unused tensors in the first fusion layer; some files omit them."""
+
+
+@runtime_checkable
+class SourceDepth(Protocol):
+    """Function from a photograph and the render at its camera to z-depth in scene units."""
+
+    def __call__(self, photograph: View, render: Render) -> Float[Tensor, "h w"]:
+        """Compute z-depth."""
+        ...
+
+
+def compute_context_depth(photograph: View, render: Render) -> Float[Tensor, "h w"]:
+    """Return the depth of the scene, with smooth extrapolation where alpha is below 0.5.
+
+    Raises:
+        InputError: The camera sees nothing of the scene.
+    """
+    valid = find_valid_depth(render)
+    depth = torch.where(valid, render.depth, torch.ones_like(render.depth)).detach().cpu()
+    middle = depth[valid.cpu()].median()
+    log_depth = (depth / middle).log()[..., None]
+    filled = continue_smoothly(log_depth, valid.cpu().float())[..., 0].exp() * middle
+    return torch.where(valid, render.depth, filled.to(render.depth.device))
+
+
+def find_valid_depth(render: Render) -> Bool[Tensor, "h w"]:
+    """Return a mask of valid depth; raises InputError if it is empty."""
+    valid = render.depth_map().valid & (render.depth > 0)
+    if not valid.any():
+        raise InputError(
+            "The camera nearest to the target sees nothing of the scene, and PE-Field needs its "
+            "depth there; give a scene that the photographs show, or choose 'warp-inpaint'."
+        )
+    return valid
+
+
+@dataclass(frozen=True)
+class MonocularDepth:
+    """Depth of a monocular network, fitted to the scene."""
+
+    network: Any
+    processor: Any
+    device: str = "cpu"
+
+    def __call__(self, photograph: View, render: Render) -> Float[Tensor, "h w"]:
+        """Predict depth and fit it to the scene; raises the errors of `compute_context_depth`."""
+        size = (photograph.camera.height, photograph.camera.width)
+        pixels = (255 * photograph.image.clamp(0, 1)).round().byte().cpu().numpy()
+        inputs = self.processor(images=pixels, return_tensors="pt").to(self.device)
+        with torch.inference_mode():
+            answer = self.network(**inputs)
+        found = self.processor.post_process_depth_estimation(answer, target_sizes=[size])
+        guess = found[0]["predicted_depth"].float().clone().to(render.depth.device)
+        declared = getattr(self.network.config, "depth_estimation_type", None)
+        metric = (
+            PREDICTS_DEPTH[self.network.config.model_type]
+            if declared is None
+            else declared == "metric"
+        )
+        return rescale_depth(guess, render) if metric else convert_disparity(guess, render)
+
+
+def rescale_depth(guess: Float[Tensor, "h w"], render: Render) -> Float[Tensor, "h w"]:
+    """Scale depth by the median ratio to the depth of the scene."""
+    valid = find_valid_depth(render)
+    guess = guess.clamp_min(1e-6 * float(guess.abs().max().clamp_min(1e-12)))
+    return guess * (render.depth[valid] / guess[valid]).median()
+
+
+def convert_disparity(guess: Float[Tensor, "h w"], render: Render) -> Float[Tensor, "h w"]:
+    """Convert disparity to depth, with scale and shift fitted to the scene."""
+    valid = find_valid_depth(render)
+    middle = render.depth[valid].median()
+    inverse = middle / render.depth[valid]
+    spread, own_spread = compute_deviation(inverse), compute_deviation(guess[valid])
+    alike = (guess - guess[valid].median()) * (spread / own_spread.clamp_min(1e-12)) + 1.0
+    gain, offset = fit_robust_affine(alike[valid][:, None], inverse[:, None])
+    least = middle / (10 * render.depth[valid].max())
+    return middle / (gain * alike + offset).clamp_min(float(least))
+
+
+def compute_deviation(values: Float[Tensor, "n"]) -> Float[Tensor, ""]:
+    """Compute the median absolute deviation."""
+    return (values - values.median()).abs().median()
+
+
+def load_source_depth(name: str, device: str = "cpu") -> SourceDepth:
+    """Return `context`, `monocular` (the published model), or the model of a path."""
+    if name == "context":
+        return compute_context_depth
+    return load_monocular(MONOCULAR_MODEL if name == "monocular" else name, device)
+
+
+@lru_cache(maxsize=1)
+def load_monocular(path: str = MONOCULAR_MODEL, device: str = "cpu") -> MonocularDepth:
+    """Load a depth model of transformers from a folder, USER/NAME or USER/NAME@COMMIT."""
+    check_packages("pe-field")
+    source = parse_source(path, "transformers")
+    announce([source])
+    with convert_load_errors(source, "depth"):
+        from transformers import AutoImageProcessor, AutoModelForDepthEstimation
+
+        network = load_transformers_model(
+            AutoModelForDepthEstimation, source, "network", unused=UNUSED_TENSORS
+        )
+        processor = AutoImageProcessor.from_pretrained(source.location, **source.load_arguments)
+    kind = network.config.model_type
+    if kind not in PREDICTS_DEPTH:
+        raise InputError(
+            f"The depth network of {path} is of the unsupported kind {kind}; choose one of "
+            f"{', '.join(PREDICTS_DEPTH)}."
+        )
+    return MonocularDepth(network.eval().to(device), processor, device)

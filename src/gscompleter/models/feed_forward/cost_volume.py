@@ -1,0 +1,92 @@
+"""Plane-sweep cost volumes from feature maps."""
+
+from __future__ import annotations
+
+import torch
+import torch.nn.functional as F
+from jaxtyping import Float, Int
+from torch import Tensor
+
+from gscompleter.models.feed_forward.cameras import Cameras, disable_autocast
+
+MIN_DEPTH = 1e-3
+"""Smallest z-depth in a source view, in scene units; nearer points are clamped to it."""
+
+
+def space_evenly(
+    first: Float[Tensor, "n 1 h w"], last: Float[Tensor, "n 1 h w"], number: int
+) -> Float[Tensor, "n {number} h w"]:
+    """Space `number` candidates evenly from `first` to `last` at each pixel."""
+    steps = torch.linspace(0, 1, number, device=first.device)[:, None, None]
+    return first + steps * (last - first)
+
+
+def compute_cost_volume(
+    features: Float[Tensor, "n c h w"],
+    cameras: Cameras,
+    sources: Int[Tensor, "b v s"],
+    inverse_depths: Float[Tensor, "n d _ _"],
+    depth_chunk: int,
+) -> Float[Tensor, "n d h w"]:
+    """Correlate each view with its source views at candidate depths, averaged over the sources.
+
+    The n = b v views are ordered by scene; `sources` has indices within a scene. Candidates are
+    given per view or per pixel, and processed `depth_chunk` at a time to bound the memory.
+    """
+    n, _, h, w = features.shape
+    K = cameras.scale_intrinsics(h, w).flatten(0, 1)
+    transforms = cameras.compute_sources_from_views(sources).flatten(0, 1)
+    depths = (1 / inverse_depths).expand(n, -1, h, w)
+    first = torch.arange(len(sources), device=sources.device)[:, None, None] * sources.shape[1]
+    numbers = (first + sources).flatten(0, 1).tolist()
+    volumes = []
+    for view in range(n):
+        chunks = []
+        for chunk in depths[view].split(depth_chunk):
+            matches = [
+                correlate_features(features[view], features[source], K[view], transform, chunk)
+                for source, transform in zip(numbers[view], transforms[view], strict=True)
+            ]
+            chunks.append(torch.stack(matches).mean(0))
+        volumes.append(torch.cat(chunks))
+    return torch.stack(volumes)
+
+
+def correlate_features(
+    reference: Float[Tensor, "c h w"],
+    source: Float[Tensor, "c h w"],
+    K: Float[Tensor, "3 3"],
+    source_from_reference: Float[Tensor, "4 4"],
+    depths: Float[Tensor, "d h w"],
+) -> Float[Tensor, "d h w"]:
+    """Correlate the reference with the source sampled at `depths`; 0 outside the source."""
+    grid = compute_sampling_grid(K, source_from_reference, depths)
+    sampled = F.grid_sample(
+        source[None], grid.flatten(0, 1)[None], mode="bilinear", align_corners=True
+    )
+    return (reference[:, None] * sampled[0].unflatten(1, depths.shape[:2])).sum(0) / (
+        len(reference) ** 0.5
+    )
+
+
+def compute_sampling_grid(
+    K: Float[Tensor, "3 3"],
+    source_from_reference: Float[Tensor, "4 4"],
+    depths: Float[Tensor, "d h w"],
+) -> Float[Tensor, "d h w 2"]:
+    """Project the pixels of the reference at `depths` into the source, in [-1, 1].
+
+    As in training, pixel centres have integer coordinates and `K` serves for both views.
+    """
+    _, h, w = depths.shape
+    with disable_autocast(K):
+        x, y = torch.arange(w, device=K.device), torch.arange(h, device=K.device)
+        columns, rows = torch.meshgrid(x, y, indexing="xy")
+        pixels = torch.stack([columns, rows, torch.ones_like(rows)]).flatten(1).to(K)
+        rays = source_from_reference[:3, :3] @ torch.linalg.inv(K) @ pixels
+        shift = source_from_reference[:3, 3, None, None]
+        points = rays[:, None] * depths.flatten(1) + shift
+        image = (K @ points.flatten(1)).unflatten(1, depths.shape)
+        at = image[:2] / image[2:].clamp(min=MIN_DEPTH)
+        last = at.new_tensor([w - 1, h - 1]).view(2, 1, 1, 1)
+        return (2 * at / last - 1).permute(1, 2, 3, 0)

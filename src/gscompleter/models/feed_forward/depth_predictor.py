@@ -1,0 +1,245 @@
+"""The depth predictor that DepthSplat and VolSplat share: matching and monocular features."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Literal
+
+import torch
+from jaxtyping import Float, Int
+from torch import Tensor, nn
+
+from gscompleter.models.feed_forward.cameras import Cameras, find_nearest_views, list_other_views
+from gscompleter.models.feed_forward.cnn import ImageEncoder, normalize_images
+from gscompleter.models.feed_forward.cost_volume import compute_cost_volume, space_evenly
+from gscompleter.models.feed_forward.dino import PATCH, DinoV2
+from gscompleter.models.feed_forward.dpt import (
+    CHANNELS,
+    DptHead,
+    Layout,
+    create_padded_conv3x3,
+    create_padded_conv_block,
+)
+from gscompleter.models.feed_forward.resampling import enlarge, resize_bilinear
+from gscompleter.models.feed_forward.transformer import MultiViewTransformer
+from gscompleter.models.feed_forward.unet import UNet, create_conv3x3, create_refiner
+
+MAX_SOURCES = 2
+"""Number of nearest source views for more than three views; else all others are used."""
+
+
+@dataclass(frozen=True)
+class VitSizes:
+    """Sizes that depend on the vision transformer, and channels of its two DPT heads."""
+
+    channels: int
+    num_blocks: int
+    heads: int
+    feature_blocks: tuple[int, int, int, int]
+    """Indices of the blocks that provide features."""
+    widths: tuple[int, int, int, int]
+    """Channels of the four levels of the DPT heads, finest first."""
+    depth_features: int
+    gaussian_features: int
+
+
+VITS = {
+    "vits": VitSizes(384, 12, 6, (2, 5, 8, 11), (48, 96, 192, 384), 32, 64),
+    "vitb": VitSizes(768, 12, 12, (2, 5, 8, 11), (96, 192, 384, 768), 48, 96),
+    "vitl": VitSizes(1024, 24, 16, (4, 11, 17, 23), (128, 256, 512, 1024), 64, 128),
+}
+
+LAYOUTS: Mapping[tuple[int, int], Layout] = {
+    (4, 1): (("cnn0", "cnn1", "vit"), ("cnn2", "vit", "matching0", "disparity"), ("vit",)),
+    (2, 2): (
+        ("cnn0", "cnn1", "matching1", "disparity", "vit"),
+        ("cnn2", "vit", "matching0"),
+        ("vit",),
+    ),
+    (4, 2): (
+        ("cnn0", "vit"),
+        ("cnn1", "vit", "matching1", "disparity"),
+        ("cnn2", "vit", "matching0"),
+    ),
+    (8, 1): (("cnn0", "vit"), ("cnn1", "vit"), ("cnn2", "vit", "matching0", "disparity")),
+}
+"""Maps joined at 1/2, 1/4 and 1/8 resolution, by upsampling factor and number of scales."""
+
+
+@dataclass(frozen=True)
+class DepthConfig:
+    """Architecture of the depth predictor."""
+
+    vit: Literal["vits", "vitb", "vitl"] = "vits"
+    num_scales: Literal[1, 2] = 1
+    """Number of matching resolutions; each is twice the one before."""
+    upsample_factor: Literal[2, 4, 8] = 4
+    """Full resolution divided by the finest matching resolution."""
+    lowest_feature_resolution: Literal[4, 8] = 4
+    """Full resolution divided by that of the coarsest features."""
+    num_candidates: int = 128
+    """Number of inverse depths at the coarsest resolution; the next one has a quarter of it."""
+    depth_chunk: int = 16
+    """Number of candidates per step; smaller values need less memory."""
+
+    @property
+    def patch(self) -> int:
+        """Side lengths of the images must be multiples of this, in pixels."""
+        return 16 if self.lowest_feature_resolution == 4 else 64
+
+
+@dataclass(frozen=True)
+class DepthPrediction:
+    """z-depth in scene units and features of n = b v views, scene by scene."""
+
+    depth: Float[Tensor, "n 1 h w"]
+    certainty: Float[Tensor, "n 1 p q"]
+    """Probability of the best candidate, at the finest matching resolution."""
+    maps: Mapping[str, Float[Tensor, "n _ _ _"]]
+    vit_maps: list[Float[Tensor, "n _ _ _"]]
+
+
+class Pyramid(nn.Module):
+    """A feature map and, for two scales, one of twice the resolution with half the channels."""
+
+    def __init__(self, channels: int, num_scales: int) -> None:
+        super().__init__()
+        self.stages = nn.ModuleList([nn.Identity()])
+        if num_scales == 2:
+            half = channels // 2
+            upsampling = nn.ConvTranspose2d(channels, half, 2, 2)
+            self.stages.append(nn.Sequential(upsampling, nn.GELU(), create_conv3x3(half, half)))
+
+    def forward(self, x: Float[Tensor, "n c h w"]) -> list[Float[Tensor, "n _ _ _"]]:
+        """Compute the maps, coarsest first."""
+        return [stage(x) for stage in self.stages]
+
+
+class DepthPredictor(nn.Module):
+    """Depth from cost volumes and monocular features, coarse to fine."""
+
+    def __init__(self, config: DepthConfig) -> None:
+        super().__init__()
+        self.config = config
+        self.vit = VITS[config.vit]
+        self.backbone = ImageEncoder(1 if config.lowest_feature_resolution == 4 else 2, 2)
+        self.transformer = MultiViewTransformer()
+        self.pretrained = DinoV2(self.vit.channels, self.vit.num_blocks, self.vit.heads)
+        self.mv_pyramid = Pyramid(128, config.num_scales)
+        self.mono_pyramid = Pyramid(self.vit.channels, config.num_scales)
+        self.regressor = nn.ModuleList()
+        self.regressor_residual = nn.ModuleList()
+        self.depth_head = nn.ModuleList()
+        for scale in range(config.num_scales):
+            self.add_scale(scale)
+        features = self.vit.depth_features
+        self.upsampler = create_dpt_head(
+            config, features, with_disparity=True, out=create_residual_layers(features)
+        )
+
+    def add_scale(self, scale: int) -> None:
+        """Add the layers from the cost volume of `scale` (0 is coarsest) to probabilities."""
+        width, candidates = 128 // 2**scale, self.config.num_candidates // 4**scale
+        image_channels, vit_channels = CHANNELS[f"cnn{2 - scale}"], self.vit.channels // 2**scale
+        channels = candidates + image_channels + width + vit_channels
+        unet = UNet(width, levels=3 + scale, attention_level=2 + scale, pre_norm=True)
+        self.regressor.append(create_refiner(channels, width, unet))
+        self.regressor_residual.append(nn.Conv2d(channels, width, 1))
+        self.depth_head.append(create_padded_conv_block(width, 2 * width, candidates))
+
+    def forward(self, images: Float[Tensor, "b v 3 h w"], cameras: Cameras) -> DepthPrediction:
+        """Predict depth for at least two images in [0, 1], with sides divisible by `patch`."""
+        b, v = images.shape[:2]
+        few = v <= MAX_SOURCES + 1
+        sources = (
+            list_other_views(b, v, images.device)
+            if few
+            else find_nearest_views(cameras, MAX_SOURCES)
+        )
+        flat = normalize_images(images.flatten(0, 1))
+        encoded = self.backbone(flat)
+        matching = self.mv_pyramid(self.transformer(encoded[-1], sources))
+        vit_maps = self.compute_vit_features(flat)
+        deepest = resize_bilinear(vit_maps[-1], encoded[-1].shape[2:])
+        contexts = list(zip(encoded[::-1], matching, self.mono_pyramid(deepest), strict=False))
+
+        low, high = cameras.compute_inverse_range()
+        candidates = space_evenly(low, high, self.config.num_candidates)
+        disparity, probability = self.match_sources(0, contexts[0], cameras, sources, candidates)
+        for scale in range(1, self.config.num_scales):
+            number = self.config.num_candidates // 4**scale
+            interval = (high - low) / (self.config.num_candidates - 1) / 2**scale
+            candidates = sample_candidates(enlarge(disparity, 2), interval, number, low, high)
+            disparity, probability = self.match_sources(
+                scale, contexts[scale], cameras, sources, candidates
+            )
+
+        maps = {f"cnn{i}": x for i, x in enumerate(encoded)}
+        maps |= {f"matching{i}": x for i, x in enumerate(matching)}
+        residual = self.upsampler(vit_maps, {**maps, "disparity": disparity})
+        full = enlarge(disparity, self.config.upsample_factor) + residual
+        certainty = probability.amax(1, keepdim=True)
+        return DepthPrediction(1 / full.clamp(low, high), certainty, maps, vit_maps)
+
+    def compute_vit_features(
+        self, images: Float[Tensor, "n 3 h w"]
+    ) -> list[Float[Tensor, "n c p q"]]:
+        """Compute four feature maps of the vision transformer at 1/8 resolution."""
+        h, w = images.shape[2:]
+        patches = resize_bilinear(images, (h // PATCH * PATCH, w // PATCH * PATCH))
+        return [
+            resize_bilinear(x, (h // 8, w // 8))
+            for x in self.pretrained(patches, self.vit.feature_blocks)
+        ]
+
+    def match_sources(
+        self,
+        scale: int,
+        context: tuple[Float[Tensor, "n _ h w"], ...],
+        cameras: Cameras,
+        sources: Int[Tensor, "b v s"],
+        candidates: Float[Tensor, "n d _ _"],
+    ) -> tuple[Float[Tensor, "n 1 h w"], Float[Tensor, "n d h w"]]:
+        """Estimate inverse depth and the probability of each candidate from features `context`."""
+        _, to_match, _ = context
+        costs = compute_cost_volume(to_match, cameras, sources, candidates, self.config.depth_chunk)
+        joined = torch.cat([costs, *context], 1)
+        refined = self.regressor[scale](joined, sources.shape[1])
+        logits = self.depth_head[scale](refined + self.regressor_residual[scale](joined))
+        probability = logits.softmax(1)
+        return (probability * candidates).sum(1, keepdim=True), probability
+
+
+def create_dpt_head(
+    config: DepthConfig, features: int, with_disparity: bool, out: nn.Module | None = None
+) -> DptHead:
+    """Create a DPT head that fuses the maps of a `DepthPrediction`."""
+    vit = VITS[config.vit]
+    levels = LAYOUTS[config.upsample_factor, config.num_scales]
+    layout = [[name for name in names if with_disparity or name != "disparity"] for names in levels]
+    return DptHead(vit.channels, vit.widths, features, layout, out)
+
+
+def create_residual_layers(features: int) -> nn.Sequential:
+    """Create the layers that map fused features to a correction of inverse depth."""
+    return nn.Sequential(
+        create_padded_conv3x3(features, features // 2),
+        nn.GELU(),
+        create_padded_conv3x3(features // 2, 16),
+        nn.GELU(),
+        nn.Conv2d(16, 1, 1),
+    )
+
+
+def sample_candidates(
+    disparity: Float[Tensor, "n 1 h w"],
+    interval: Float[Tensor, "n 1 1 1"],
+    number: int,
+    low: Float[Tensor, "n 1 1 1"],
+    high: Float[Tensor, "n 1 1 1"],
+) -> Float[Tensor, "n {number} h w"]:
+    """Sample inverse depths around `disparity`; only the ends are clamped to [`low`, `high`]."""
+    start = (disparity - number // 2 * interval).clamp(low, high)
+    stop = (disparity + (number // 2 - 1) * interval).clamp(low, high)
+    return space_evenly(start, stop, number)

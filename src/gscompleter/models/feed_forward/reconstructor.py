@@ -1,0 +1,103 @@
+"""MVSplat, DepthSplat and VolSplat as reconstructors Ψ."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from gscompleter.geometry import compute_z_depths
+from gscompleter.models.feed_forward.depthsplat import DepthSplat
+from gscompleter.models.feed_forward.gaussian_adapter import PixelGaussians
+from gscompleter.models.feed_forward.inputs import Crop, create_batch
+from gscompleter.models.feed_forward.mvsplat import MVSplat
+from gscompleter.models.feed_forward.precision import check_precision, lower_precision
+from gscompleter.models.feed_forward.volsplat import VolSplat, VoxelGaussians
+from gscompleter.types import DepthMap, Gaussians, Reconstruction, View, make_observed
+
+MAX_COEFFICIENTS = 16
+"""SH coefficients up to degree 3, the most that renderers of 3DGS use."""
+
+
+@dataclass(frozen=True)
+class FeedForward:
+    """Gaussians per pixel, or per voxel, from one pass of a network.
+
+    The networks were trained on scenes in metres or of similar size. The Gaussians of DepthSplat
+    and VolSplat have sizes in that unit: scale a scene in millimetres to metres first.
+    """
+
+    network: MVSplat | DepthSplat | VolSplat
+    dtype: torch.dtype = torch.float32
+    """Precision of the network under autocast; bfloat16 and float16 need a GPU (untested)."""
+
+    def __post_init__(self) -> None:
+        check_precision(self.device, self.dtype)
+
+    @property
+    def device(self) -> torch.device:
+        """The device of the network."""
+        return next(self.network.parameters()).device
+
+    def __call__(self, views: Sequence[View]) -> Reconstruction:
+        """Reconstruct Gaussians and a z-depth map per view from central crops of equal size.
+
+        Raises:
+            InputError: Fewer than two views, images smaller than one patch, an empty depth range,
+                or a scene too large for the voxels of VolSplat.
+        """
+        config = self.network.config
+        images, cameras, crops = create_batch(views, config.patch, config.near, config.far)
+        # Not torch.inference_mode: later stages optimise these tensors.
+        with torch.no_grad(), lower_precision(self.device, self.dtype):
+            predicted = self.network(images.to(self.device), cameras.to(self.device))
+        if isinstance(predicted, VoxelGaussians):
+            return create_voxel_reconstruction(predicted, views, crops)
+        return create_pixel_reconstruction(predicted, views, crops)
+
+
+def create_pixel_reconstruction(
+    predicted: PixelGaussians, views: Sequence[View], crops: Sequence[Crop]
+) -> Reconstruction:
+    """Create the reconstruction of one scene; z-depths follow from the means."""
+    device = views[0].image.device
+    gaussians = flatten_gaussians(predicted).to(device)
+    per_view = crops[0].height * crops[0].width
+    depths = map(compute_depth_map, gaussians.means.split(per_view), views, crops)
+    pixels = [
+        crop.compute_pixel_indices(v.camera.width) for v, crop in zip(views, crops, strict=True)
+    ]
+    numbers = torch.arange(len(views), device=device).repeat_interleave(per_view)
+    return Reconstruction(gaussians, tuple(depths), numbers, torch.cat(pixels).to(device))
+
+
+def create_voxel_reconstruction(
+    predicted: VoxelGaussians, views: Sequence[View], crops: Sequence[Crop]
+) -> Reconstruction:
+    """Create the reconstruction of one scene, without source pixels."""
+    device = views[0].image.device
+    depths = [
+        crop.pad_depth(depth, view.camera)
+        for depth, view, crop in zip(predicted.depth.to(device), views, crops, strict=True)
+    ]
+    return Reconstruction(flatten_gaussians(predicted).to(device), tuple(depths))
+
+
+def flatten_gaussians(predicted: PixelGaussians | VoxelGaussians) -> Gaussians:
+    """Flatten the Gaussians view by view and row by row, with at most `MAX_COEFFICIENTS`."""
+    return make_observed(
+        predicted.means.flatten(0, -2),
+        predicted.quats.flatten(0, -2),
+        predicted.scales.flatten(0, -2),
+        predicted.opacities.flatten(),
+        predicted.sh[..., :MAX_COEFFICIENTS, :].flatten(0, -3),
+    )
+
+
+def compute_depth_map(means: Float[Tensor, "n 3"], view: View, crop: Crop) -> DepthMap:
+    """Compute the z-depth of the Gaussians of the crop, in the whole image."""
+    z = compute_z_depths(means, view.camera)
+    return crop.pad_depth(z.view(crop.height, crop.width), view.camera)

@@ -1,0 +1,121 @@
+"""Next-best view: score candidate cameras and choose among them.
+
+The gain is the image fraction of holes near observed pixels (farther away anything could be there)
+times the overlap with the anchor. Among similar gains, the camera nearest to the photographs wins.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import torch
+from jaxtyping import Bool, Float, Int64
+from torch import Tensor
+
+from gscompleter.config import NextBestViewConfig
+from gscompleter.geometry import (
+    compute_field_of_view,
+    measure_baseline,
+    measure_rotation,
+    unproject,
+)
+from gscompleter.image_ops import dilate, fill_smoothly
+from gscompleter.next_best_view.candidates import Candidate
+from gscompleter.render.lod import MAX_PREVIEW_GAUSSIANS, choose_thinned_rows, thin_gaussians
+from gscompleter.state import Completion
+from gscompleter.types import Camera, Gaussians, PhotoObservations, Render, make_observed, merge
+
+
+@dataclass(frozen=True)
+class Choice:
+    """A candidate with its score."""
+
+    candidate: Candidate
+    hole_fraction: float
+    """Fraction of its image in holes."""
+    gain: float
+    """Expected gain, as a fraction of its image."""
+
+    @property
+    def camera(self) -> Camera:
+        """Camera of the candidate."""
+        return self.candidate.camera
+
+
+def compute_gain(
+    holes: Bool[Tensor, "h w"], overlap: float, config: NextBestViewConfig = NextBestViewConfig()
+) -> float:
+    """Compute the gain of completing an image, as a fraction of the image.
+
+    `overlap` is the fraction of the observed part that the anchor sees, too.
+    """
+    radius = max(round(config.border_radius * max(holes.shape)), 1)
+    bordering = holes & dilate(~holes, radius)
+    return bordering.float().mean().item() * overlap
+
+
+def choose_best(
+    choices: Sequence[Choice],
+    photographs: Sequence[Camera],
+    step: float,
+    config: NextBestViewConfig = NextBestViewConfig(),
+) -> Choice | None:
+    """Choose the camera to complete next, or None if little is left; `step` is in scene units."""
+    most = max((choice.gain for choice in choices), default=0.0)
+    if most < config.min_gain:
+        return None
+    good = [choice for choice in choices if choice.gain >= config.enough * most]
+
+    def order(choice: Choice) -> tuple[int, float]:
+        return round(compute_remoteness(choice.camera, photographs, step)), -choice.gain
+
+    return min(good, key=order)
+
+
+def compute_remoteness(camera: Camera, photographs: Sequence[Camera], step: float) -> float:
+    """Compute the distance to the nearest photograph in steps; a quarter field of view is one."""
+    quarter = torch.rad2deg(torch.tensor(min(compute_field_of_view(camera)) / 4)).item()
+    return min(
+        measure_baseline(camera, other) / max(step, 1e-30)
+        + measure_rotation(camera, other) / quarter
+        for other in photographs
+    )
+
+
+def make_placeholders(render: Render, holes: Bool[Tensor, "h w"], camera: Camera) -> Gaussians:
+    """Make grey Gaussians that close holes at the smoothly extrapolated depth around them."""
+    seen = render.depth_map()
+    depth = fill_smoothly(seen.depth, seen.valid & ~holes)
+    means = unproject(depth, camera)[holes]
+    size = (0.7 * depth / camera.K[0, 0])[holes]
+    quats = torch.eye(4).to(means)[:1].repeat(len(means), 1)
+    return make_observed(
+        means,
+        quats,
+        size[:, None].repeat(1, 3),
+        torch.full_like(size, 0.99),
+        torch.zeros((len(means), 1, 3)).to(means),
+    )
+
+
+def simplify_completion(completion: Completion, most: int = MAX_PREVIEW_GAUSSIANS) -> Completion:
+    """Simplify a completion for small images, with its photo observations."""
+    context, observations = completion.rendered_context, completion.observations
+    pruned = completion.pruned
+    rows, growth = choose_thinned_rows(context, most)
+    context = thin_gaussians(context, most)
+    observations = None if observations is None else thin_observations(observations, rows, growth)
+    pruned = None if pruned is None else pruned[rows]
+    kept = context if pruned is None else context[~pruned]
+    rendered = merge([kept, thin_gaussians(completion.added, most)])
+    completion = replace(completion, proxy=None, observations=observations, pruned=pruned)
+    return replace(completion, rendered_scene=rendered, context=context)
+
+
+def thin_observations(
+    observations: PhotoObservations, rows: Int64[Tensor, "r"], growth: Float[Tensor, "r"]
+) -> PhotoObservations:
+    """Keep observations of some Gaussians, whose sizes grow by a factor."""
+    areas, agreement = observations.areas[:, rows] * growth**2, observations.agreement[:, rows]
+    return PhotoObservations(observations.means[rows], observations.centers, areas, agreement)

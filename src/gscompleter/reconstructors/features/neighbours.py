@@ -1,0 +1,100 @@
+"""Selection of the photographs that each photograph is matched with.
+
+Pairs are scored by shared features and triangulation angle (Schönberger et al., ECCV 2016). Only
+photographs with a similar position and direction are compared, for linear time.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from jaxtyping import Float
+
+from gscompleter.kernels.parallel import map_in_parallel
+from gscompleter.reconstructors.features.sift import Pixels, detect_features, match_features
+from gscompleter.reconstructors.features.stereo_image import StereoImage
+from gscompleter.reconstructors.features.triangulation import triangulate_valid
+
+NUM_SOURCES = 2
+"""Number of neighbours per photograph."""
+NUM_COMPARED = 6
+"""Number of photographs per photograph whose features are compared."""
+TURN_PER_TWO_STEPS = 15.0
+"""Rotation in degrees that counts as much as two steps between cameras."""
+BEST_ANGLE = 5.0
+"""Best triangulation angle, in degrees."""
+NARROWER_SIGMA, WIDER_SIGMA = 2.0, 10.0
+"""Standard deviations of the score below and above that angle, in degrees."""
+MIN_PAIR_SCORE = 1e-6
+"""Score of a pair without shared features: better than no neighbour."""
+
+Pair = tuple[int, int]
+Matches = dict[Pair, tuple[Pixels, Pixels]]
+"""Pixels of the same features in photographs i < j."""
+
+
+@dataclass(frozen=True)
+class Neighbours:
+    """Selected neighbours of all photographs."""
+
+    neighbours_of: tuple[tuple[int, ...], ...]
+    """Neighbours of each photograph, the best one first."""
+    matches: Matches
+    """Feature matches of all compared pairs."""
+
+    @property
+    def pairs(self) -> list[Pair]:
+        """Pairs i < j of neighbours."""
+        return sort_pairs((i, j) for i, others in enumerate(self.neighbours_of) for j in others)
+
+    def find_partners(self, number: int) -> list[int]:
+        """List the neighbours of a photograph and those it is a neighbour of."""
+        back = {other for other, chosen in enumerate(self.neighbours_of) if number in chosen}
+        return sorted(back | set(self.neighbours_of[number]))
+
+
+def find_neighbours(images: Sequence[StereoImage], count: int = NUM_SOURCES) -> Neighbours:
+    """Select up to `count` neighbours for each image."""
+    features = map_in_parallel(detect_features, images)
+    found = {(i, j): match_features(features[i], features[j]) for i, j in find_close_pairs(images)}
+    worth = np.zeros((len(images), len(images)))
+    for (i, j), pixels in found.items():
+        worth[i, j] = worth[j, i] = MIN_PAIR_SCORE + score_pair(images[i], images[j], *pixels)
+    ranked = (-worth).argsort(axis=1, kind="stable")[:, :count]
+    chosen = [tuple(int(j) for j in row if worth[i, j] > 0) for i, row in enumerate(ranked)]
+    return Neighbours(tuple(chosen), found)
+
+
+def find_close_pairs(images: Sequence[StereoImage]) -> list[Pair]:
+    """List pairs i < j with a baseline and a similar position and direction."""
+    centers = np.stack([image.center for image in images])
+    forward = np.stack([image.rotation[:, 2] for image in images])
+    apart = np.linalg.norm(centers[:, None] - centers[None], axis=-1)
+    turned = np.degrees(np.arccos((forward @ forward.T).clip(-1, 1)))
+    apart[apart == 0] = np.inf
+    step = np.median(apart.min(axis=1))
+    unlike = apart / step + 2 * turned / TURN_PER_TWO_STEPS
+    nearest = unlike.argsort(axis=1, kind="stable")[:, :NUM_COMPARED]
+    pairs = {(i, int(j)) for i, row in enumerate(nearest) for j in row if np.isfinite(unlike[i, j])}
+    return sort_pairs(pairs)
+
+
+def sort_pairs(pairs: Iterable[Pair]) -> list[Pair]:
+    """Sort pairs and remove duplicates, the smaller number first."""
+    return sorted({(min(pair), max(pair)) for pair in pairs})
+
+
+def score_pair(a: StereoImage, b: StereoImage, in_a: Pixels, in_b: Pixels) -> float:
+    """Score two photographs by the triangulation angles of their matches."""
+    if len(in_a) == 0:
+        return 0.0
+    baseline = float(np.linalg.norm(a.center - b.center))
+    return float(score_angle(baseline * triangulate_valid(a, b, in_a, in_b)).sum())
+
+
+def score_angle(ratio: Float[np.ndarray, "k"]) -> Float[np.ndarray, "k"]:
+    """Score triangulation angles, up to 1; `ratio` is baseline over depth."""
+    excess = np.degrees(2 * np.arctan(ratio / 2)) - BEST_ANGLE
+    return np.exp(-((excess / np.where(excess < 0, NARROWER_SIGMA, WIDER_SIGMA)) ** 2) / 2)

@@ -1,0 +1,102 @@
+"""Views as arrays for stereo, with lengths in units of the widest baseline."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+from jaxtyping import Bool, Float, Float32
+
+from gscompleter.errors import InputError
+from gscompleter.types import View
+
+MIN_SIDE = 8
+"""Smallest side of an image that stereo can match, in pixels."""
+
+
+@dataclass(frozen=True)
+class StereoImage:
+    """An image and its camera; lengths are in widest baselines."""
+
+    image: Float[np.ndarray, "h w 3"]
+    K: Float[np.ndarray, "3 3"]
+    rotation: Float[np.ndarray, "3 3"]
+    """Rotation from camera to world axes."""
+    center: Float[np.ndarray, "3"]
+    ignore_mask: Bool[np.ndarray, "h w"] | None = None
+    """True at pixels that are not matched, or None to match all."""
+
+    @property
+    def size(self) -> tuple[int, int]:
+        """Height and width in pixels."""
+        return self.image.shape[0], self.image.shape[1]
+
+
+def make_stereo_images(views: Sequence[View]) -> tuple[list[StereoImage], float]:
+    """Convert views to units of their widest baseline; return it in scene units too.
+
+    Camera offsets are rounded to 2^-16 baselines, so that a scaled scene gives identical results.
+    Raise InputError for fewer than two views, a tiny image, or no baseline.
+    """
+    if len(views) < 2:
+        raise InputError(
+            f"Stereo needs at least two views and got {len(views)}; give it another photograph."
+        )
+    for view in views:
+        if min(view.image.shape[:2]) < MIN_SIDE:
+            height, width = view.image.shape[:2]
+            raise InputError(
+                f"An image of {width} x {height} pixels was given, and stereo needs at least "
+                f"{MIN_SIDE} x {MIN_SIDE}; give a larger one."
+            )
+    centers = np.stack([view.camera.center.detach().cpu().double().numpy() for view in views])
+    unit = float(np.linalg.norm(centers[:, None] - centers[None], axis=-1).max())
+    if unit <= 2e-7 * float(np.linalg.norm(centers, axis=-1).max()):
+        raise InputError(
+            f"All {len(views)} cameras stand in one place, and depth needs a baseline between "
+            "them; give photographs taken from different positions."
+        )
+    offsets = np.round((centers - centers[0]) / unit * 2**16) / 2**16
+    return [
+        _make_stereo_image(view, offset) for view, offset in zip(views, offsets, strict=True)
+    ], unit
+
+
+def _make_stereo_image(view: View, center: Float[np.ndarray, "3"]) -> StereoImage:
+    camera = view.camera
+    return StereoImage(
+        np.ascontiguousarray(view.image.detach().cpu().float().numpy()),
+        camera.K.detach().cpu().double().numpy(),
+        camera.c2w[:3, :3].detach().cpu().double().numpy(),
+        center,
+        None if view.ignore_mask is None else view.ignore_mask.cpu().numpy(),
+    )
+
+
+def compute_contrast(
+    a: Float32[np.ndarray, "h w 3"], b: Float32[np.ndarray, "h w 3"]
+) -> Float32[np.ndarray, "h w"]:
+    """Compute the largest channel difference of each pixel of two images."""
+    return take_largest_channel(cv2.absdiff(a, b))
+
+
+def take_largest_channel(values: Float32[np.ndarray, "h w 3"]) -> Float32[np.ndarray, "h w"]:
+    """Compute the largest channel of each pixel."""
+    red, green, blue = cv2.split(values)
+    return cv2.max(cv2.max(red, green), blue)
+
+
+def compute_source_from_reference(
+    reference: StereoImage, source: StereoImage
+) -> Float[np.ndarray, "3 4"]:
+    """Compute [A | b], the transform from reference pixels to source pixels.
+
+    A pixel (x, y, 1) at inverse depth w maps to A (x, y, 1) + b w, whose third entry is the z-depth
+    ratio.
+    """
+    rotation = source.rotation.T @ reference.rotation
+    homography = source.K @ rotation @ np.linalg.inv(reference.K)
+    shift = source.K @ source.rotation.T @ (reference.center - source.center)
+    return np.concatenate([homography, shift[:, None]], axis=1).astype(np.float32)

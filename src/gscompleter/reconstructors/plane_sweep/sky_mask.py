@@ -1,0 +1,215 @@
+"""Detection of the sky from its surroundings.
+
+Stereo cannot measure a uniform sky. A ceiling or blank wall is uniform too, but its outline lies on
+one plane, not much farther than the rest. A sky therefore needs all of: no texture, no parallax, a
+wide and high region connected to the top of the image, and an outline of which a large part is far
+away. An undetected sky keeps the depth of its surroundings.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import replace
+
+import cv2
+import numpy as np
+from jaxtyping import Bool, Float32, Float64
+
+from gscompleter.reconstructors.features.stereo_image import (
+    StereoImage,
+    compute_contrast,
+    take_largest_channel,
+)
+from gscompleter.reconstructors.plane_sweep.rig import Rig
+from gscompleter.reconstructors.plane_sweep.sweep import Measurement
+
+Map = Float32[np.ndarray, "h w"]
+Mask = Bool[np.ndarray, "h w"]
+OtherMask = Bool[np.ndarray, "a b"]
+Plane = Float64[np.ndarray, "3"]
+
+MAX_SKY_GRADIENT = 0.012
+"""Largest colour gradient inside a sky, per pixel, for colours in [0, 1]."""
+MAX_SKY_DIFFERENCE = 0.06
+"""Largest colour difference of an edge pixel to the sky beside it."""
+EDGE_RADIUS = 3
+"""Distance in pixels at which an edge still raises the gradient of the sky."""
+OUTLINE_WIDTH = 3
+"""Width of the outline of a sky, in pixels."""
+MIN_WIDTH = 0.4
+"""Smallest fraction of the top image row that a sky covers."""
+MIN_HEIGHT = 0.1
+"""Smallest mean height of a sky over its columns, as a fraction of the image height."""
+MIN_UNBROKEN = 0.6
+"""Smallest fraction of a sky that is directly connected to the top of the image."""
+LOWEST, MIN_ABOVE = 0.55, 0.95
+"""Image height fraction, and the smallest fraction of a sky that lies above it."""
+MIN_OUTLINE = 64
+"""Fewest measured outline pixels for a decision."""
+END_SHARE = 0.05
+"""Fraction of the outline, the farthest, that must be close to infinity."""
+END_PLANES = 3.0
+"""Largest distance from infinity of that part, in planes of half a pixel of parallax."""
+FAR_PLANE_MARGIN, MAX_FAR_PLANE = 2.0, 10.0
+"""Alternative limit in planes beyond the far plane, and the largest sum that is far."""
+FAR_SHARE = 0.2
+"""Fraction of the outline, the farthest, that must be far away."""
+FAR_RATIO = 2.5
+"""Smallest depth of that part, in median depths of the measured scene."""
+MAX_ON_PLANE = 0.8
+"""Fraction of the outline on one plane from which the region is a ceiling or wall."""
+NEAR_PLANES, MAX_NEAR_ON_PLANE = 5.0, 0.9
+"""Planes from infinity of near outline pixels, and the same limit for these alone."""
+PLANE_TOLERANCE = 2.0
+"""Largest distance of a pixel from a plane it lies on, in sweep planes."""
+ROUNDS = 20
+"""Iterations of reweighted least squares."""
+MIN_SKY_AGREEMENT = 0.5
+"""Fraction of a sky that must also be sky in the other views."""
+
+
+def find_skies(rig: Rig, found: Sequence[Measurement]) -> list[Mask]:
+    """Find the sky of each view that the other views confirm."""
+    own = [find_sky(image, f) for image, f in zip(rig.images, found, strict=True)]
+    return [
+        sky if is_confirmed(number, sky, own, rig) else np.zeros_like(sky)
+        for number, sky in enumerate(own)
+    ]
+
+
+def transfer_sky(rig: Rig, sky_of_second: OtherMask) -> Mask:
+    """Find the sky of the first view of a pair in the directions of the second view's sky."""
+    first = rig.images[0]
+    return find_even_region(first) & (sample_at_infinity(first.size, sky_of_second, rig, 0, 1) == 1)
+
+
+def exclude_pixels(found: Measurement, exclude_mask: Mask) -> Measurement:
+    """Set the weight and confidence to 0 at the pixels of a mask, such as the sky."""
+    full = found.resize_to(exclude_mask.shape)
+    weight, confidence = (
+        np.where(exclude_mask, np.float32(0), share) for share in (full.weight, full.confidence)
+    )
+    return replace(full, weight=weight, confidence=confidence)
+
+
+def find_sky(image: StereoImage, found: Measurement) -> Mask:
+    """Find the uniform region at the top of the image if its outline is that of a sky."""
+    region = find_even_region(image)
+    return region if is_open(image, found, region) else np.zeros_like(region)
+
+
+def is_open(image: StereoImage, found: Measurement, region: Mask) -> bool:
+    """Test the outline of `region` for an open sky."""
+    full = found.resize_to(image.size)
+    measured = full.confidence > 0
+    outline = dilate_square(region, OUTLINE_WIDTH) & ~region & measured
+    if not is_overhead(region) or outline.sum() < MIN_OUTLINE:
+        return False
+    heights = full.index + full.planes[0] / (full.planes[1] - full.planes[0])
+    bright = bool(np.median(image.image[region]) > np.median(image.image[outline]))
+    far_plane = float(heights.min() - full.index.min())
+    if not bright or not is_distant(heights[outline], heights[measured & ~region], far_plane):
+        return False
+    near = outline & (heights > max(NEAR_PLANES, 2 * np.quantile(heights[outline], END_SHARE)))
+    return (
+        measure_planarity(outline, heights) < MAX_ON_PLANE
+        and measure_planarity(near, heights) < MAX_NEAR_ON_PLANE
+    )
+
+
+def is_overhead(region: Mask) -> bool:
+    """Test if `region` covers a large part of the top of the image."""
+    width, area = region[0].mean(), region.mean()
+    if width < MIN_WIDTH or area < MIN_HEIGHT * width:
+        return False
+    unbroken = np.logical_and.accumulate(region, axis=0).sum() / region.sum()
+    above = region[: round(LOWEST * len(region))].sum() / region.sum()
+    return bool(unbroken >= MIN_UNBROKEN and above >= MIN_ABOVE)
+
+
+def find_even_region(image: StereoImage) -> Mask:
+    """Find the uniform region connected to the top of the image, up to its edges."""
+    even = cv2.erode(
+        (compute_color_gradient(image) < MAX_SKY_GRADIENT).astype(np.uint8),
+        np.ones((3, 3), np.uint8),
+    )
+    _, labels = cv2.connectedComponents(even, connectivity=4)
+    top = labels[0][labels[0] > 0]
+    core = np.isin(labels, top)
+    return core | (
+        dilate_square(core, EDGE_RADIUS)
+        & (compute_color_difference(core, image) < MAX_SKY_DIFFERENCE)
+    )
+
+
+def compute_color_gradient(image: StereoImage) -> Map:
+    """Compute the largest colour gradient of each pixel."""
+    smooth = cv2.GaussianBlur(image.image.astype(np.float32), (0, 0), 1.0)
+    across, down = (
+        cv2.Sobel(smooth, cv2.CV_32F, *order, ksize=3, scale=1 / 8) for order in ((1, 0), (0, 1))
+    )
+    return take_largest_channel(cv2.magnitude(across, down))
+
+
+def compute_color_difference(core: Mask, image: StereoImage) -> Map:
+    """Compute the largest channel difference to the mean colour of `core` nearby."""
+    colour, weight = image.image.astype(np.float32), core.astype(np.float32)
+    size = (4 * EDGE_RADIUS + 1, 4 * EDGE_RADIUS + 1)
+    total = cv2.boxFilter(weight, -1, size)
+    mean = cv2.boxFilter(colour * weight[..., None], -1, size) / np.maximum(total, 1e-6)[..., None]
+    return compute_contrast(colour, mean)
+
+
+def is_distant(
+    outline: Float32[np.ndarray, "n"], measured: Float32[np.ndarray, "m"], far_plane: float
+) -> bool:
+    """Test if an outline is near infinity and far behind the scene (planes from infinity)."""
+    end, far = np.quantile(outline, [END_SHARE, FAR_SHARE])
+    is_far = end <= END_PLANES or (end <= far_plane + FAR_PLANE_MARGIN <= MAX_FAR_PLANE)
+    return bool(is_far and far * FAR_RATIO <= np.median(measured))
+
+
+def measure_planarity(outline: Mask, heights: Map) -> float:
+    """Compute the fraction of an outline on its best plane; 0 if there are too few pixels."""
+    if outline.sum() < MIN_OUTLINE:
+        return 0.0
+    rows, columns = np.nonzero(outline)
+    sites = np.stack([columns, rows, np.ones_like(rows)], axis=1).astype(np.float64)
+    values, weight = heights[outline].astype(np.float64), np.ones(len(rows))
+    for _ in range(ROUNDS):
+        weighted = sites * weight[:, None]
+        plane: Plane = np.linalg.lstsq(weighted.T @ sites, weighted.T @ values, rcond=None)[0]
+        weight = 1 / np.maximum(np.abs(sites @ plane - values), 0.1 * PLANE_TOLERANCE)
+    return float((np.abs(sites @ plane - values) < PLANE_TOLERANCE).mean())
+
+
+def is_confirmed(number: int, sky: Mask, others: Sequence[np.ndarray], rig: Rig) -> bool:
+    """Test if most of `sky` is sky in the other views that show its direction."""
+    shown = [
+        sample_at_infinity(sky.shape, other, rig, number, i)[sky]
+        for i, other in enumerate(others)
+        if i != number
+    ]
+    answers = np.concatenate(shown) if shown else np.zeros(0)
+    seen = answers >= 0
+    return bool(seen.any()) and float(answers[seen].mean()) > MIN_SKY_AGREEMENT
+
+
+def sample_at_infinity(
+    size: tuple[int, ...], mask: OtherMask, rig: Rig, this: int, other: int
+) -> Float32[np.ndarray, "h w"]:
+    """Sample the mask of another view in each pixel's direction; -1 if outside."""
+    x, y = np.arange(size[1]) + 0.5, np.arange(size[0])[:, None] + 0.5
+    turn = rig.transforms[this, other][:, :3]
+    u, v, w = (a * x + b * y + c for a, b, c in turn)
+    ahead = np.maximum(w, 1e-6)
+    column, row = np.floor(u / ahead), np.floor(v / ahead)
+    h, wide = mask.shape
+    seen = (w > 1e-6) & (column >= 0) & (column < wide) & (row >= 0) & (row < h)
+    at = row.clip(0, h - 1).astype(int), column.clip(0, wide - 1).astype(int)
+    return np.where(seen, mask[at], -1).astype(np.float32)
+
+
+def dilate_square(mask: Mask, radius: int) -> Mask:
+    """Dilate `mask` by a square of `radius` pixels."""
+    return cv2.dilate(mask.astype(np.uint8), np.ones((2 * radius + 1,) * 2, np.uint8)) > 0

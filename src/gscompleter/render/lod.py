@@ -1,0 +1,132 @@
+"""LOD proxies of large scenes.
+
+Gaussians within half a pixel of each other are merged, at the working resolution of all cameras.
+Completion uses the proxy; all output is made from the scene itself.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import replace
+
+import numpy as np
+import torch
+from jaxtyping import Float, Float32, Int, Int64, UInt8
+from numpy import ndarray
+from torch import Tensor
+
+from gscompleter.kernels import lod as kernels
+from gscompleter.kernels.parallel import share
+from gscompleter.kernels.rasterizer import GaussianArrays
+from gscompleter.memory import count_fitting_gaussians
+from gscompleter.render.cpu import to_arrays
+from gscompleter.render.viewpoint import to_float32
+from gscompleter.types import (
+    Camera,
+    Gaussians,
+    Proxy,
+)
+
+MIN_PROXY_GAUSSIANS = 500_000
+"""Gaussians from which on a proxy saves more time than it takes to build."""
+MAX_REACH = 0.5
+"""Largest distance of a Gaussian from the first of its run, in pixels."""
+MAX_DEVIATION = 2.0
+"""Largest standard deviation of a Gaussian that shares a run, in pixels."""
+MAX_GROWTH = 8.0
+"""Largest factor on both, if the proxy would be too large otherwise."""
+
+
+def build_proxy(scene: Gaussians, cameras: Sequence[Camera]) -> Proxy | None:
+    """Build the LOD proxy of a large `scene`, or None if it is small or on a GPU."""
+    if len(scene) < MIN_PROXY_GAUSSIANS or scene.means.is_cuda:
+        return None
+    return simplify_scene(scene, cameras)
+
+
+def simplify_scene(scene: Gaussians, cameras: Sequence[Camera]) -> Proxy:
+    """Merge runs of adjacent, close Gaussians of one provenance to one Gaussian each.
+
+    Runs are as few as frozen views of `cameras` can hold. A scene in random order has no runs.
+    """
+    given = to_arrays(scene)
+    given = given._replace(sh=given.sh.reshape(len(scene), -1))
+    start = find_run_starts(given.means, given.scales, scene.generated.numpy(), cameras)
+    found = [np.empty((len(start) - 1, *array.shape[1:]), np.float32) for array in given]
+    shares = np.empty(len(scene), np.float32)
+    share(kernels.merge_runs, len(start) - 1, start, given, shares, GaussianArrays(*found))
+    means, quats, scales, opacities, sh = map(torch.from_numpy, found)
+    first, sizes = torch.from_numpy(start[:-1]), torch.from_numpy(np.diff(start))
+    run = torch.arange(len(sizes)).repeat_interleave(sizes)
+    appearance = opacities, sh.unflatten(1, scene.sh.shape[1:]), scene.generated[first]
+    merged = Gaussians(means, quats, scales, *appearance, is_antialiased=scene.is_antialiased)
+    return Proxy(merged, run)
+
+
+def find_run_starts(
+    means: Float32[ndarray, "n 3"],
+    scales: Float32[ndarray, "n 3"],
+    generated: UInt8[ndarray, "n"],
+    cameras: Sequence[Camera],
+) -> Int64[ndarray, "bounds"]:
+    """Find the start of each run, and the end [m + 1]."""
+    centers = to_float32(torch.stack([camera.center for camera in cameras]))
+    focals = to_float32(torch.stack([camera.K[0, 0] for camera in cameras]))
+    begins = np.empty(len(means), np.bool_)
+    most, growth = count_fitting_gaussians(len(cameras)), 1.0
+    while True:
+        limits = np.float32(growth * MAX_REACH), np.float32(growth * MAX_DEVIATION)
+        seen = (means, scales, generated, centers, focals, *limits, begins)
+        share(kernels.mark_run_starts, -(-len(means) // kernels.BLOCK), *seen)
+        if np.count_nonzero(begins) <= most or growth >= MAX_GROWTH:
+            return np.append(np.flatnonzero(begins), len(means))
+        growth *= 2
+
+
+MAX_GAUSSIANS = 400_000
+"""Largest number kept: several per pixel of a small image."""
+SAMPLE_SIZE = 100_000
+"""Gaussians from which the distribution of sizes is estimated."""
+
+
+def thin_gaussians(scene: Gaussians, max_gaussians: int = MAX_GAUSSIANS) -> Gaussians:
+    """Reduce a scene to about `max_gaussians` Gaussians, enlarged to cover the same area.
+
+    Gaussians are kept with a probability proportional to their size. The choice depends on their
+    order
+    alone, and neighbours in the file are thinned evenly.
+    """
+    if len(scene) <= max_gaussians:
+        return scene
+    rows, growth = choose_thinned_rows(scene, max_gaussians)
+    chosen = replace(scene, encoded=None)[rows]
+    return replace(chosen, scales=chosen.scales * growth[:, None])
+
+
+def choose_thinned_rows(
+    scene: Gaussians, max_gaussians: int = MAX_GAUSSIANS
+) -> tuple[Int[Tensor, "m"], Float[Tensor, "m"]]:
+    """Select the rows to keep, and the factor by which their sizes grow."""
+    if len(scene) <= max_gaussians:
+        return torch.arange(len(scene), device=scene.means.device), torch.ones_like(scene.opacities)
+    chance = compute_keep_probabilities(scene, max_gaussians)
+    place = chance.double().cumsum(0).floor()
+    stays = place > torch.nn.functional.pad(place[:-1], (1, 0))
+    rows = torch.nonzero(stays)[:, 0]
+    return rows, chance[rows].rsqrt()
+
+
+def compute_keep_probabilities(scene: Gaussians, max_gaussians: int) -> Float[Tensor, "n"]:
+    """Compute keep probabilities proportional to projected size; their sum is at most the limit.
+
+    The largest 1 % is clamped: floaters and sky are large, few, and useless for matching.
+    """
+    cross_section = scene.scales.prod(dim=1) / scene.scales.amin(dim=1).clamp_min(1e-30)
+    size = (cross_section * scene.opacities).sqrt()
+    sample = size[:: max(1, len(size) // SAMPLE_SIZE)]
+    size = size.clamp(max=sample.quantile(0.99)).clamp_min(1e-30)
+    return (max_gaussians * (size / size.sum(dtype=torch.float64))).clamp(max=1).to(size)
+
+
+MAX_PREVIEW_GAUSSIANS = 25_000
+"""Gaussians of a simplified scene: several per pixel of the small images."""

@@ -1,0 +1,238 @@
+"""A camera and the compiled kernels that render for it, in the order in which they run."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+from itertools import accumulate, pairwise
+from typing import Any
+
+import numpy as np
+import torch
+from jaxtyping import Bool, Float32, Int32, Int64, Integer
+from numpy import ndarray
+from torch import Tensor
+from torch.nn.functional import max_pool2d
+
+from gscompleter.errors import InputError
+from gscompleter.kernels import rasterizer, tiles
+from gscompleter.kernels.parallel import run, share, split_range
+from gscompleter.kernels.rasterizer import (
+    TILE,
+    GaussianArrays,
+    Layer,
+    Pinhole,
+    RasterFrame,
+)
+
+MAX_ENTRIES = np.iinfo(np.int32).max
+"""Largest total length of the tiles' lists, which kernels number in 32 bits."""
+
+
+@dataclass(frozen=True)
+class Splats:
+    """Projected Gaussians, see `Layer`."""
+
+    columns: Float32[ndarray, "n 9"]
+    opacities: Float32[ndarray, "n"]
+    boxes: Integer[ndarray, "n 4"]
+    factors: Float32[ndarray, "n"] | None = None
+    """Factors on the opacities of antialiased Gaussians, or None for classic ones."""
+
+    def move_to_depths(self, depths: Float32[ndarray, "n"], near: np.float32) -> Splats:
+        """Move the splats to other z-depths; those not beyond `near` get empty boxes."""
+        columns = self.columns.copy()
+        columns[:, rasterizer.DEPTH] = depths
+        return replace(self, columns=columns).keep_only(depths > near)
+
+    def keep_only(self, which: Bool[ndarray, "n"]) -> Splats:
+        """Empty the boxes of all other splats."""
+        return replace(self, boxes=self.boxes * which[:, None])
+
+
+@dataclass(frozen=True)
+class BinnedSplats:
+    """Splats in the lists of the tiles, with the slots of their gradients."""
+
+    layer: Layer
+    slots: Int32[ndarray, "entries"]
+    """Slot of the gradient of each entry."""
+    slot_start: Int64[ndarray, "bounds"]
+    """First slot of each Gaussian, and the end [n + 1]."""
+
+
+SplatArrays = tuple[Float32[ndarray, "n 9"], Float32[ndarray, "n"], Integer[ndarray, "n 4"]]
+"""Splats, their opacities and their boxes, see `Layer`."""
+
+EntryGradients = tuple[Float32[ndarray, "entries columns"], Bool[ndarray, "entries"]]
+"""Gradients of the tiles' entries by slot, and True for slots that were written."""
+
+
+@dataclass(frozen=True)
+class Viewpoint:
+    """A camera and its rendering threads; calls the kernels in order."""
+
+    pinhole: Pinhole
+    threads: int
+
+    @property
+    def tiles_x(self) -> int:
+        """Number of tiles in a row."""
+        return -(-self.pinhole.width // TILE)
+
+    @property
+    def tiles(self) -> int:
+        """Number of tiles of the image."""
+        return self.tiles_x * -(-self.pinhole.height // TILE)
+
+    @property
+    def box_dtype(self) -> type[np.signedinteger]:
+        """Smallest type that holds pixel coordinates, to save memory."""
+        fits = max(self.pinhole.width, self.pinhole.height) <= np.iinfo(np.int16).max
+        return np.int16 if fits else np.int32
+
+    def bin(
+        self,
+        gaussians: GaussianArrays,
+        is_antialiased: bool,
+        depth_limits: Float32[ndarray, "tiles"],
+    ) -> BinnedSplats:
+        """Project, sort and enter Gaussians into the lists of the tiles."""
+        return assign_splat_slots(
+            self.fill_lists(self.project(gaussians, is_antialiased), depth_limits)
+        )
+
+    def project(self, gaussians: GaussianArrays, is_antialiased: bool) -> Splats:
+        """Project Gaussians to splats; invisible ones get empty boxes."""
+        n = check_lengths(gaussians)
+        columns = np.empty((n, rasterizer.NUM_SPLAT_COLUMNS), np.float32)
+        boxes = np.empty((n, 4), self.box_dtype)
+        factors = np.zeros(n, np.float32) if is_antialiased else None
+        self.share(rasterizer.project, n, gaussians, self.pinhole, columns, boxes, factors)
+        opacities = gaussians.opacities if factors is None else gaussians.opacities * factors
+        return Splats(columns, opacities, boxes, factors)
+
+    def fill_lists(self, splats: Splats, depth_limits: Float32[ndarray, "tiles"]) -> Layer:
+        """Enter splats into the lists of the tiles, and sort these."""
+        chunks = split_range(len(splats.columns), self.threads)
+        counts = np.zeros((len(chunks), self.tiles), np.int32)
+        seen = (splats.columns, splats.boxes, depth_limits, self.tiles_x)
+        counting = [(*chunk, *seen, count) for chunk, count in zip(chunks, counts, strict=True)]
+        run(tiles.count_entries, counting, self.threads)
+        total = int(counts.sum(dtype=np.int64))
+        if total > MAX_ENTRIES:
+            raise InputError(
+                f"The {len(splats.columns):,} Gaussians cover {total:,} tiles of the image, and at "
+                f"most {MAX_ENTRIES:,} can be rendered; use fewer or smaller Gaussians, or a "
+                "smaller image."
+            )
+        tile_start = tiles.counts_to_offsets(counts)
+        entries, keys = np.empty(total, np.int32), np.empty(total, np.uint32)
+        filling = [
+            (*chunk, *seen, places, entries, keys)
+            for chunk, places in zip(chunks, counts, strict=True)
+        ]
+        run(tiles.fill_entries, filling, self.threads)
+        self.share(tiles.sort_lists, self.tiles, tile_start, entries, keys)
+        return Layer(splats.columns, splats.opacities, splats.boxes, tile_start, entries)
+
+    def composite(self, context: Layer, frame: RasterFrame, new: Layer) -> RasterFrame:
+        """Composite a context, rendered to `frame`, with a new layer in the tiles that it touches."""
+        frame = RasterFrame(*(array.copy() for array in frame))
+        tiles = find_touched_tiles(new)
+        self.share(rasterizer.composite, len(tiles), tiles, context, new, frame)
+        return frame
+
+    def composite_backward(
+        self,
+        context: Layer,
+        new: BinnedSplats,
+        frame: RasterFrame,
+        d_frame: tuple[Tensor, ...],
+        wanted: int = rasterizer.WANT_ALL,
+    ) -> EntryGradients:
+        """Compute the gradients of new entries from those of image, depth and alpha."""
+        columns = {rasterizer.WANT_ALL: rasterizer.NUM_GRADIENT_COLUMNS, rasterizer.WANT_COLOR: 3}
+        values = np.empty((len(new.slots), columns.get(wanted, 1)), np.float32)
+        written = np.zeros(len(new.slots), np.bool_)
+        tiles = find_touched_tiles(new.layer)
+        composited = (tiles, context, new.layer, frame, tuple(map(to_float32, d_frame)))
+        received = (new.slots, wanted, values, written)
+        self.share(rasterizer.composite_backward, len(tiles), *composited, *received)
+        return values, written
+
+    def backproject_residual(
+        self, context: Layer, new: BinnedSplats, photograph: Float32[ndarray, "h w 3"]
+    ) -> Float32[ndarray, "n 4"]:
+        """Backproject the residual of a photograph; the fourth column sums the weights."""
+        values = np.empty((len(new.slots), 4), np.float32)
+        written = np.zeros(len(new.slots), np.bool_)
+        tiles = find_touched_tiles(new.layer)
+        composited = (tiles, context, new.layer, photograph, new.slots, values, written)
+        self.share(rasterizer.backproject_residual, len(tiles), *composited)
+        return self.sum_by_gaussian(new, (values, written))
+
+    def sum_by_gaussian(
+        self, new: BinnedSplats, gradients: EntryGradients
+    ) -> Float32[ndarray, "n columns"]:
+        """Sum the gradients of the entries of each Gaussian."""
+        totals = np.empty((len(new.slot_start) - 1, gradients[0].shape[1]), np.float32)
+        self.share(tiles.sum_entries, len(totals), new.slot_start, *gradients, totals)
+        return totals
+
+    def limit_to_mask(self, where: Bool[Tensor, "h w"]) -> Float32[ndarray, "tiles"]:
+        """Make depth limits that exclude all tiles outside a mask."""
+        tiles = max_pool2d(where[None].float(), TILE, ceil_mode=True).flatten() > 0
+        return np.where(tiles.cpu().numpy(), np.float32(np.inf), np.float32(-np.inf))
+
+    def share(self, kernel: Callable[..., None], count: int, *arguments: Any) -> None:
+        """Run `kernel(begin, end, *arguments)` over range(count) on the threads."""
+        share(kernel, count, *arguments, threads=self.threads)
+
+
+def find_touched_tiles(layer: Layer) -> Int64[ndarray, "touched"]:
+    """Find the tiles in which a layer has entries."""
+    return np.flatnonzero(np.diff(layer.tile_start))
+
+
+def compute_starts(sizes: Integer[ndarray, "tiles"]) -> Int64[ndarray, "bounds"]:
+    """Compute the starts of consecutive lists of these sizes, and the end."""
+    return np.concatenate([[0], np.cumsum(sizes, dtype=np.int64)])
+
+
+def order_by_use(layer: Layer) -> tuple[Layer, Int32[ndarray, "splats"]]:
+    """Reorder splats by first use and drop unused ones, for locality; also return their order."""
+    order, entries = tiles.number_by_use(layer.entries, len(layer.splats))
+    return Layer(*gather_splats([layer], [order]), layer.tile_start, entries), order
+
+
+def assign_splat_slots(layer: Layer) -> BinnedSplats:
+    """Give the entries of each splat adjacent slots."""
+    return BinnedSplats(layer, *tiles.number_slots(layer.entries, len(layer.splats)))
+
+
+def check_lengths(gaussians: GaussianArrays) -> int:
+    """Return the number of Gaussians; raise ValueError if the arrays differ in length."""
+    lengths = {len(array) for array in gaussians}
+    if len(lengths) > 1:
+        raise ValueError(f"the fields of Gaussians have different lengths: {sorted(lengths)}")
+    return lengths.pop()
+
+
+def to_float32(values: Tensor) -> Float32[ndarray, "..."]:
+    """Convert a tensor to a contiguous array, without copying if it is one already."""
+    return values.detach().to("cpu", torch.float32).contiguous().numpy()
+
+
+def gather_splats(layers: Sequence[Layer], rows: Sequence[Int32[ndarray, "_"]]) -> SplatArrays:
+    """Gather the splats, opacities and boxes of these rows of each layer."""
+    bounds = [0, *accumulate(map(len, rows))]
+    taken = (
+        np.empty((bounds[-1], rasterizer.NUM_SPLAT_COLUMNS), np.float32),
+        np.empty(bounds[-1], np.float32),
+        np.empty((bounds[-1], 4), layers[0].boxes.dtype),
+    )
+    for layer, row, (start, stop) in zip(layers, rows, pairwise(bounds), strict=True):
+        into = tuple(array[start:stop] for array in taken)
+        share(tiles.copy_splats, len(row), row, *layer[:3], into)
+    return taken

@@ -1,0 +1,144 @@
+"""Scores a splat against photographs: it is rendered at their cameras and compared."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from gscompleter.config.coverage import COVERED
+from gscompleter.geometry import compute_z_depths
+from gscompleter.render import Renderer, get_view_map
+from gscompleter.splat_alignment.flow_offset import measure_drift
+from gscompleter.types import Camera, Gaussians, Render, View
+
+GAIN_RANGE = (0.5, 2.0)
+"""Range of the exposure gain between a render and a photograph."""
+MIN_COVERAGE = 0.05
+"""Smallest share of covered pixels for a valid score."""
+MIN_MARGIN = 3.0
+"""Smallest margin in dB of a match: half of the photograph's variance is explained."""
+MIN_PSNR = 30.0
+"""PSNR in dB above which a flat photograph counts as a match, if half of it is covered."""
+MAX_DRIFT = 0.25
+"""Largest displacement of an exact alignment, in pixels of the small photographs.
+
+A scale error of 0.5 % causes 0.5.
+"""
+
+
+@dataclass(frozen=True)
+class ImageFit:
+    """Fit of the splat to one photograph."""
+
+    psnr: float
+    """PSNR in dB over the covered pixels, after matching the exposure."""
+    margin: float
+    """PSNR above that of the best flat image, in dB."""
+    coverage: float
+    drift: float
+    """Displacement of corners from render to photograph, in pixels; infinity if unknown."""
+
+    @property
+    def is_match(self) -> bool:
+        """True if the splat shows the content of the photograph."""
+        flat = self.psnr >= MIN_PSNR and self.coverage >= 0.5
+        return self.coverage >= MIN_COVERAGE and (self.margin >= MIN_MARGIN or flat)
+
+
+@dataclass(frozen=True)
+class SplatFit:
+    """Fit of the splat to several photographs.
+
+    Figures are medians over the better half of those that see the splat: it may not be trained on
+    all.
+    """
+
+    images: tuple[ImageFit, ...]
+
+    @property
+    def is_match(self) -> bool:
+        """True if the splat matches two photographs, or the only one."""
+        shown = sum(image.is_match for image in self.images)
+        return shown >= max(1, min(2, len(self.images)))
+
+    @property
+    def is_exact(self) -> bool:
+        """True if the splat fits and is displaced by at most `MAX_DRIFT`."""
+        return self.is_match and self.drift <= MAX_DRIFT
+
+    @property
+    def psnr(self) -> float:
+        """PSNR in dB; 0 if no photograph sees the splat."""
+        return self._compute_median("psnr", 0.0)
+
+    @property
+    def margin(self) -> float:
+        """PSNR above that of the best flat image, in dB."""
+        return self._compute_median("margin", 0.0)
+
+    @property
+    def drift(self) -> float:
+        """Displacement in pixels; infinity if unknown."""
+        return self._compute_median("drift", math.inf)
+
+    @property
+    def coverage(self) -> float:
+        """Mean share of the pixels that the splat covers, over all photographs."""
+        return sum(image.coverage for image in self.images) / max(len(self.images), 1)
+
+    def _compute_median(self, name: str, otherwise: float) -> float:
+        seen = [image for image in self.images if image.coverage >= MIN_COVERAGE]
+        seen.sort(key=lambda image: image.margin, reverse=True)
+        values = sorted(getattr(image, name) for image in seen[: math.ceil(len(seen) / 2)])
+        return values[len(values) // 2] if values else otherwise
+
+
+def score_splat(scene: Gaussians, views: Sequence[View], renderer: Renderer) -> SplatFit:
+    """Score `scene` against photographs whose cameras are in its frame."""
+
+    def fit(view: View) -> ImageFit:
+        return score_image(render_from(scene, view.camera, renderer), view.image)
+
+    return SplatFit(tuple(get_view_map(scene)(fit, views)))
+
+
+def render_from(scene: Gaussians, camera: Camera, renderer: Renderer) -> Render:
+    """Render `scene`, with a near plane derived from its own depths."""
+    z = compute_z_depths(scene.means, camera)
+    unit = z[z > 0].median().item() if (z > 0).any() else 1.0
+    with torch.no_grad():
+        return renderer.render(scene, replace(camera, near=0.1 * unit))
+
+
+def score_image(render: Render, photograph: Float[Tensor, "h w 3"]) -> ImageFit:
+    """Score a render against one photograph."""
+    where = render.alpha >= COVERED
+    covered = where.float().mean().item()
+    if covered < MIN_COVERAGE:
+        return ImageFit(0.0, 0.0, covered, math.inf)
+    truth = photograph[where].double()
+    rendered = match_exposure(render.image[where].double(), truth)
+    psnr = convert_to_psnr((rendered - truth).square().mean())
+    margin = psnr - convert_to_psnr((truth - truth.mean()).square().mean())
+    shown = photograph.double().index_put((where,), rendered)
+    before, after = (i.mean(dim=-1).cpu().numpy() for i in (shown, photograph.double()))
+    return ImageFit(psnr, margin, covered, measure_drift(before, after, where.cpu().numpy()))
+
+
+def match_exposure(
+    rendered: Float[Tensor, "n 3"], truth: Float[Tensor, "n 3"]
+) -> Float[Tensor, "n 3"]:
+    """Match the exposure of `truth` by one gain and one offset (least squares)."""
+    centred = rendered - rendered.mean()
+    gain = (centred * (truth - truth.mean())).sum() / centred.square().sum().clamp_min(1e-12)
+    return gain.clamp(*GAIN_RANGE) * centred + truth.mean()
+
+
+def convert_to_psnr(error: Float[Tensor, ""]) -> float:
+    """Convert a mean squared error to PSNR in dB, at most 100."""
+    return -10 * math.log10(max(error.item(), 1e-10))

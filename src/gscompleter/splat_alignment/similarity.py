@@ -1,0 +1,96 @@
+"""Similarities `x' = s R x + t` as 4x4 matrices, and cameras transformed by them."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import replace
+
+import numpy as np
+import torch
+from jaxtyping import Float
+
+from gscompleter.types import Camera, View
+
+Matrix = Float[np.ndarray, "4 4"]
+"""A similarity or a pose, in float64."""
+
+
+def make_similarity(
+    scale: float, rotation: Float[np.ndarray, "3 3"], shift: Float[np.ndarray, "3"]
+) -> Matrix:
+    """Make the matrix of `x' = scale * rotation @ x + shift`."""
+    matrix = np.eye(4)
+    matrix[:3, :3] = scale * rotation
+    matrix[:3, 3] = shift
+    return matrix
+
+
+def get_scale(transform: Matrix) -> float:
+    """Get the scale of a similarity."""
+    return float(np.cbrt(np.linalg.det(transform[:3, :3])))
+
+
+def get_rotation(transform: Matrix) -> Float[np.ndarray, "3 3"]:
+    """Get the rotation of a similarity."""
+    return transform[:3, :3] / get_scale(transform)
+
+
+def transform_pose(c2w: Matrix, transform: Matrix) -> Matrix:
+    """Transform a camera-to-world pose by a similarity."""
+    pose = np.eye(4)
+    pose[:3, :3] = get_rotation(transform) @ c2w[:3, :3]
+    pose[:3, 3] = transform[:3, :3] @ c2w[:3, 3] + transform[:3, 3]
+    return pose
+
+
+def transform_camera(camera: Camera, transform: Matrix) -> Camera:
+    """Transform a camera and its depth range; the identity returns the same object."""
+    if np.array_equal(transform, np.eye(4)):
+        return camera
+    factor = get_scale(transform)
+    c2w = torch.from_numpy(transform_pose(get_pose(camera), transform)).to(camera.c2w)
+    near = None if camera.near is None else camera.near * factor
+    far = None if camera.far is None else camera.far * factor
+    return replace(camera, c2w=c2w, near=near, far=far)
+
+
+def transform_camera_exactly(camera: Camera, transform: Matrix) -> Camera:
+    """Transform a camera in float64, for files: maps have large coordinates."""
+    return transform_camera(replace(camera, c2w=camera.c2w.double()), transform)
+
+
+def transform_view(view: View, transform: Matrix) -> View:
+    """Transform a photograph's camera and its measured depth."""
+    if np.array_equal(transform, np.eye(4)):
+        return view
+    depth = None if view.depth is None else view.depth * get_scale(transform)
+    return replace(view, camera=transform_camera(view.camera, transform), depth=depth)
+
+
+def get_pose(camera: Camera) -> Matrix:
+    """Get the camera-to-world transform as a float64 array."""
+    return camera.c2w.detach().cpu().double().numpy()
+
+
+def has_baseline(poses: Sequence[Matrix]) -> bool:
+    """Return True if there are two or more cameras, at different positions."""
+    centers = np.array([pose[:3, 3] for pose in poses]).reshape(-1, 3)
+    return len(poses) >= 2 and bool(np.ptp(centers, axis=0).max() > 1e-6 * np.abs(centers).max())
+
+
+def fit_pose_similarity(before: Sequence[Matrix], after: Sequence[Matrix]) -> Matrix:
+    """Fit the similarity between two sets of poses of the same cameras, robust to outliers.
+
+    The rotation is the one closest to most; scale and shift are medians. Both sets satisfy
+    `has_baseline`.
+    """
+    turns = np.stack([b[:3, :3] @ a[:3, :3].T for a, b in zip(before, after, strict=True)])
+    closeness = np.einsum("iab,jab->ij", turns, turns)
+    rotation = turns[np.median(closeness, axis=1).argmax()]
+    old, new = np.stack(before)[:, :3, 3], np.stack(after)[:, :3, 3]
+    apart = np.linalg.norm(old[:, None] - old, axis=-1)
+    # Every camera is far enough from at least one of the two that are farthest apart.
+    apart[apart < 0.3 * apart.max()] = np.nan
+    ratios = np.linalg.norm(new[:, None] - new, axis=-1) / apart
+    scale = float(np.median(np.nanmedian(ratios, axis=1)))
+    return make_similarity(scale, rotation, np.median(new - scale * old @ rotation.T, axis=0))

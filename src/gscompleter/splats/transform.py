@@ -1,0 +1,92 @@
+"""Gaussians transformed to another frame, including view-dependent colour.
+
+The axes of a .ply and of most formats are x right, y down, z forward. SPZ has x right, y up,
+z back, which is half a turn about x; glTF has x left, y up, z forward, half a turn about z.
+"""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from gscompleter.render.spherical_harmonics import evaluate_sh_basis
+from gscompleter.types import Gaussians
+
+HALF_TURN_X = (1.0, -1.0, -1.0)
+"""Signs of the axes after half a turn about x."""
+HALF_TURN_Z = (-1.0, -1.0, 1.0)
+"""Signs of the axes after half a turn about z."""
+
+
+def rotate_half_turn(gaussians: Gaussians, signs: tuple[float, float, float]) -> Gaussians:
+    """Rotate Gaussians by half a turn about an axis; exact, because only signs change."""
+    flip = torch.tensor(signs)
+    return replace(
+        gaussians,
+        means=gaussians.means * flip,
+        quats=gaussians.quats * torch.tensor((1.0, *signs)),
+        sh=gaussians.sh * _compute_sh_signs(signs, gaussians.sh.shape[1])[:, None],
+    )
+
+
+def _compute_sh_signs(signs: tuple[float, float, float], k: int) -> Float[Tensor, "k"]:
+    """Compute the sign of each SH basis function, all even or odd under half a turn."""
+    direction = torch.nn.functional.normalize(torch.tensor([[0.3, 0.5, 0.7]]), dim=1)
+    return (
+        evaluate_sh_basis(direction * torch.tensor(signs), k) / evaluate_sh_basis(direction, k)
+    )[0].round()
+
+
+def transform_gaussians(gaussians: Gaussians, similarity: Float[Tensor, "4 4"]) -> Gaussians:
+    """Transform Gaussians by a similarity `x' = s R x + t`."""
+    scale = torch.linalg.det(similarity[:3, :3]) ** (1 / 3)
+    rotation = similarity[:3, :3] / scale
+    return replace(
+        gaussians,
+        means=gaussians.means @ similarity[:3, :3].T + similarity[:3, 3],
+        quats=_multiply_quats(_matrix_to_quat(rotation), gaussians.quats),
+        scales=gaussians.scales * scale,
+        sh=_rotate_sh(gaussians.sh, rotation),
+        encoded=None,
+    )
+
+
+def _rotate_sh(
+    sh: Float[Tensor, "n k 3"], rotation: Float[Tensor, "3 3"]
+) -> Float[Tensor, "n k 3"]:
+    """Rotate SH by least squares, so that they show along `R d` what `sh` shows along d."""
+    k = sh.shape[1]
+    generator = torch.Generator().manual_seed(0)
+    directions = torch.nn.functional.normalize(
+        torch.randn(64, 3, generator=generator, dtype=torch.float64), dim=1
+    )
+    before = evaluate_sh_basis(directions, k)
+    after = evaluate_sh_basis(directions @ rotation.double().T, k)
+    return torch.einsum("ij,njc->nic", torch.linalg.lstsq(after, before).solution.to(sh), sh)
+
+
+def _matrix_to_quat(rotation: Float[Tensor, "3 3"]) -> Float[Tensor, "4"]:
+    """Convert a rotation to wxyz: the largest eigenvector of Bar-Itzhack's matrix."""
+    (a, b, c), (d, e, f), (g, h, i) = rotation.double().tolist()
+    matrix = torch.tensor(
+        [
+            [a + e + i, h - f, c - g, d - b],
+            [h - f, a - e - i, b + d, c + g],
+            [c - g, b + d, e - a - i, f + h],
+            [d - b, c + g, f + h, i - a - e],
+        ],
+        dtype=torch.float64,
+    )
+    return torch.linalg.eigh(matrix).eigenvectors[:, -1].to(rotation.dtype)
+
+
+def _multiply_quats(a: Float[Tensor, "4"], b: Float[Tensor, "n 4"]) -> Float[Tensor, "n 4"]:
+    """Compute the Hamilton product of wxyz quaternions: rotation `b` first, then `a`."""
+    vector = (
+        a[0] * b[:, 1:] + b[:, :1] * a[1:] + torch.linalg.cross(a[1:].expand(len(b), 3), b[:, 1:])
+    )
+    scalar = a[0] * b[:, :1] - b[:, 1:] @ a[1:, None]
+    return torch.cat([scalar, vector], dim=1)

@@ -1,0 +1,183 @@
+"""Stage 3, coarse: one affine depth correction for all lifted Gaussians (paper, Sec. III-E)."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import torch
+from jaxtyping import Bool, Float
+from torch import Tensor
+
+from gscompleter.config import AlignmentConfig, DepthAgreementConfig
+from gscompleter.types import DepthAffine, DepthMap, DepthPairs, Lift, Render
+
+MAX_TRIALS = 512
+"""Two-point hypotheses."""
+HYPOTHESES_PER_BATCH = 32
+"""Hypotheses that are scored together, so few that their residuals stay in the cache."""
+MAX_PIXELS = 8192
+"""Pixels that hypotheses are scored on; of more, a random sample is used."""
+RESIDUAL_THRESHOLD = 0.05
+"""Largest residual of an inlier, relative to the context depth."""
+MIN_INLIERS = 0.3
+"""Smallest inlier fraction of a reliable fit."""
+MIN_PIXELS = 64
+"""Fewest comparable pixels that a fit needs."""
+MIN_TARGET_COVERAGE = 0.01
+"""Fraction of its image that the target must see of the scene to reject an affine."""
+MIN_DEPTH_SPREAD = 0.05
+"""Smallest depth spread that separates scale and shift; below, only a scale is fitted."""
+
+
+def fit_affine(predicted: DepthMap, context: DepthMap, rng: torch.Generator) -> DepthAffine:
+    """Fit `context ≈ scale * predicted + shift` by RANSAC over valid pixels (paper, Eq. 8).
+
+    The fallback is the median ratio with shift 0, and the identity if nothing can be compared.
+    """
+    x, y = pair_depths(predicted, context)
+    if len(x) < MIN_PIXELS:
+        return DepthAffine()
+    if len(x) > MAX_PIXELS:
+        sample = torch.randperm(len(x), generator=rng)[:MAX_PIXELS].to(x.device)
+        x, y = x[sample], y[sample]
+
+    if compute_depth_spread(x) >= MIN_DEPTH_SPREAD:
+        scale, shift = fit_line_ransac(x, y, rng)
+        inliers = find_affine_inliers(x, y, scale, shift).double().mean().item()
+        if scale > 0 and inliers >= MIN_INLIERS:
+            return DepthAffine(scale, shift, inliers, "ransac")
+
+    scale = (y / x).median().item()
+    inliers = find_affine_inliers(x, y, scale, 0.0).double().mean().item()
+    return DepthAffine(scale, 0.0, inliers, "median")
+
+
+def pair_depths(
+    predicted: DepthMap, context: DepthMap
+) -> tuple[Float[Tensor, "n"], Float[Tensor, "n"]]:
+    """Return both z-depths at the pixels where both are valid."""
+    comparable = predicted.valid & context.valid & (predicted.depth > 0) & (context.depth > 0)
+    return predicted.depth[comparable].double(), context.depth[comparable].double()
+
+
+def compute_depth_spread(depth: Float[Tensor, "n"]) -> float:
+    """Compute (p95 - p5) / median of depths."""
+    low, median, high = depth.quantile(depth.new_tensor([0.05, 0.5, 0.95])).tolist()
+    return (high - low) / median
+
+
+def find_affine_inliers(
+    x: Float[Tensor, "n"], y: Float[Tensor, "n"], scale: float, shift: float
+) -> Bool[Tensor, "n"]:
+    """Find pixels with a small residual, relative to `y`."""
+    return (scale * x + shift - y).abs() < RESIDUAL_THRESHOLD * y
+
+
+def fit_line_ransac(
+    x: Float[Tensor, "n"], y: Float[Tensor, "n"], rng: torch.Generator
+) -> tuple[float, float]:
+    """Fit scale and shift to the most inliers of two-point hypotheses, then refit them.
+
+    Residuals are relative to depth, so that distant pixels do not dominate. Returns (0, 0) if no
+    hypothesis has a positive scale.
+    """
+    i, j = torch.randint(len(x), (2, MAX_TRIALS), generator=rng).to(x.device)
+    scales = (y[i] - y[j]) / torch.where(x[i] == x[j], torch.inf, x[i] - x[j])
+    shifts = y[i] - scales * x[i]
+    points = torch.stack([x / y, 1 / y])
+    counts = torch.cat(
+        [
+            ((batch @ points).sub_(1).abs_() < RESIDUAL_THRESHOLD).sum(dim=1)
+            for batch in torch.stack([scales, shifts], dim=1).split(HYPOTHESES_PER_BATCH)
+        ]
+    )
+    best = counts.where(scales > 0, -1).argmax()
+    if scales[best] <= 0:
+        return 0.0, 0.0
+
+    scale, shift = scales[best].item(), shifts[best].item()
+    for _ in range(3):
+        agree = find_affine_inliers(x, y, scale, shift)
+        weight = 1 / y[agree]
+        design = torch.stack([x[agree], torch.ones_like(x[agree])], dim=-1) * weight[:, None]
+        # Unlike lstsq, the normal equations are solved in closed form on any device.
+        normal = design.T @ design
+        # The second column is in inverse depths; scaling makes the condition independent of units.
+        even = torch.stack([torch.ones_like(x[0]), y.median()])
+        if torch.linalg.cond(normal * even * even[:, None]) > 1e12:
+            break
+        scale, shift = torch.linalg.solve(normal, design.T @ (y[agree] * weight)).tolist()
+    return scale, shift
+
+
+def align_depth(
+    lift: Lift,
+    at_target: Render,
+    at_anchor: Render,
+    rng: torch.Generator,
+    config: AlignmentConfig = AlignmentConfig(),
+    reject_below: float | None = DepthAgreementConfig.reject_below,
+) -> DepthAffine:
+    """Fit the affine depth correction at the anchor (the paper's bridge) or at the target.
+
+    The context has holes at the target, but the part that is visible there can contradict the
+    anchor.
+    """
+    if config.align_at == "none":
+        return DepthAffine()
+    if config.align_at == "target":
+        return fit_affine(lift.reference_depth, at_target.depth_map(), rng)
+    affine = fit_affine(lift.anchor_depth, at_anchor.depth_map(), rng)
+    return refit_at_target(
+        affine, lift.reference_depth, at_target.depth_map(), rng, config, reject_below
+    )
+
+
+def refit_at_target(
+    affine: DepthAffine,
+    predicted: DepthMap,
+    context: DepthMap,
+    rng: torch.Generator,
+    config: AlignmentConfig,
+    reject_below: float | None = DepthAgreementConfig.reject_below,
+) -> DepthAffine:
+    """Replace an affine that contradicts the context at the target by a fit at the target.
+
+    With little overlap or pose drift, Ψ's two depth maps differ in scale. If no fit at the target
+    is better, the paper's choice stays, and is rejected if hardly any depth agrees.
+    """
+    x, y = pair_depths(predicted, context)
+    if config.min_agreement is None or len(x) < MIN_PIXELS:
+        return affine
+    agree = find_affine_inliers(x, y, affine.scale, affine.shift).double().mean().item()
+    affine = replace(affine, agreement=agree)
+    if agree >= config.min_agreement:
+        return affine
+    refitted = fit_affine(predicted, context, rng)
+    if refitted.inliers >= max(MIN_INLIERS, 2 * agree):
+        return replace(refitted, agreement=refitted.inliers, is_refitted_at_target=True)
+    enough = len(x) >= MIN_TARGET_COVERAGE * context.depth.numel()
+    return replace(affine, is_rejected=enough and agree < (reject_below or 0.0))
+
+
+MAX_PAIRS = 1000
+"""Most pixels in the sample."""
+
+
+def sample_depth_pairs(
+    lift: Lift, at_target: Render, at_anchor: Render, affine: DepthAffine, config: AlignmentConfig
+) -> DepthPairs | None:
+    """Sample the depths that `affine` was fitted to; None if there are none."""
+    if config.align_at == "none":
+        return None
+    at_the_target = config.align_at == "target" or affine.is_refitted_at_target
+    predicted, render = lift.anchor_depth, at_anchor
+    if at_the_target:
+        predicted, render = lift.reference_depth, at_target
+    x, y = pair_depths(predicted, render.depth_map())
+    step = max(1, -(-len(x) // MAX_PAIRS))
+    x, y = x[::step], y[::step]
+    if len(x) == 0:
+        return None
+    agrees = find_affine_inliers(x, y, affine.scale, affine.shift)
+    return DepthPairs("target" if at_the_target else "anchor", x, y, agrees)

@@ -1,0 +1,63 @@
+"""Stage 4: keep Gaussians in holes and refine their opacities only (paper, Sec. III-F)."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import replace
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from gscompleter.config import RefineConfig
+from gscompleter.cpu_threads import use_one_torch_thread
+from gscompleter.optim import Adam
+from gscompleter.progress import track
+from gscompleter.render import OpacityRender
+from gscompleter.types import Gaussians, View
+
+
+def has_settled(losses: Sequence[float], min_fall: float) -> bool:
+    """Return True if the relative decrease of the last step is at most `min_fall`."""
+    return len(losses) > 1 and losses[-2] - losses[-1] <= min_fall * losses[-2]
+
+
+@use_one_torch_thread()
+def refine_opacities(
+    added: Gaussians,
+    at_target: OpacityRender,
+    reference: View,
+    at_views: Sequence[OpacityRender],
+    views: Sequence[View],
+    config: RefineConfig = RefineConfig(),
+) -> tuple[Gaussians, tuple[float, ...]]:
+    """Minimize Eq. 13 over the opacities of added Gaussians; also return the loss per iteration.
+
+    The context and all other parameters are fixed, so that nothing observed is forgotten.
+    """
+    if config.iterations == 0 or len(added) == 0:
+        return added, ()
+    plans = [(at_target, reference, config.target_weight)]
+    plans += [(plan, view, 1.0) for plan, view in zip(at_views, views, strict=True)]
+
+    logit = config.parametrization == "logit"
+    start = added.opacities.logit(eps=1e-4) if logit else added.opacities
+    parameters = start.clone().requires_grad_()
+    optimizer = Adam([(parameters, config.learning_rate)])
+
+    def opacities() -> Float[Tensor, "n"]:
+        return parameters.sigmoid() if logit else parameters.clamp(0, 1)
+
+    losses = []
+    for _ in track(range(config.iterations), "Refining"):
+        current = opacities()
+        terms = [
+            weight * (view.fill_ignored(plan(current).image) - view.image).abs().mean()
+            for plan, view, weight in plans
+        ]
+        loss = torch.stack(terms).sum()
+        losses.append(loss.item())
+        if config.rel_tol is not None and has_settled(losses, config.rel_tol):
+            break
+        optimizer.step(loss)
+    return replace(added, opacities=opacities().detach(), encoded=None), tuple(losses)

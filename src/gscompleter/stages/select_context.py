@@ -1,0 +1,225 @@
+"""Selection of context views for given targets.
+
+A photograph scores by the target's points that it shows, from similar directions; a pair also by
+its triangulation angle. The score of a set is that of its best pair, summed over points. Selection
+is greedy; of two further photographs that are needed to show new points, each counts half.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from gscompleter.geometry import embed_cameras, is_inside, project, select_spread_cameras
+from gscompleter.types import Camera
+
+MAX_POINTS = 1000
+"""Points that are scored for all targets together."""
+MAX_CANDIDATES = 32
+"""Photographs closest to the targets whose pairs are scored."""
+MIN_POINTS = 20
+"""Fewest visible points of a target; with fewer, a plane in the middle of the scene is used."""
+GRID_SIDE = 8
+"""Points of such a plane per image side."""
+PLANES = (0.1, 0.3, 0.5, 0.7, 0.9)
+"""Planes that represent an unknown scene, in normalized inverse depth from near to far."""
+HALF_SCORE_ANGLE = 5.0
+"""Angle between viewing directions at which the score of a photograph is halved, in degrees."""
+BEST_ANGLE = 0.5
+"""Best triangulation angle of a pair, in degrees: some pixels of parallax."""
+NARROW_FALLOFF, WIDE_FALLOFF = 0.3, 20.0
+"""Angles in degrees below and above it at which the score of a pair falls to a third."""
+MIN_PAIR_SCORE = 0.1
+"""Pair score below which no pair shows a point."""
+OUTSIDE_SCORE = 1e-3
+"""Score of a point outside of an image; it ranks photographs that show none."""
+
+
+def select_context(
+    targets: Sequence[Camera],
+    candidates: Sequence[Camera],
+    points: Float[Tensor, "n 3"],
+    count: int,
+) -> list[int]:
+    """Select up to `count` of the candidates; return sorted indices.
+
+    `points` are on or near surfaces, in world coordinates; at least one.
+    """
+    share = max(MAX_POINTS // len(targets), 1)
+    seen = [subsample(find_visible_points(target, points), share) for target in targets]
+    worth = torch.cat(
+        [score_cameras(t, candidates, p) for t, p in zip(targets, seen, strict=True)], dim=1
+    )
+    closest = worth.sum(1).argsort(descending=True, stable=True)[:MAX_CANDIDATES]
+    rays = compute_directions([candidates[i] for i in closest.tolist()], torch.cat(seen))
+    chosen = select_greedily(worth[closest], rays, count)
+    return sorted(closest[chosen].tolist())
+
+
+def select_greedily(
+    worth: Float[Tensor, "c p"], rays: Float[Tensor, "c p 3"], count: int
+) -> list[int]:
+    """Choose the best pair, then repeatedly the candidate that improves the pair scores most."""
+    if min(count, len(worth)) < 2:
+        return list(range(min(count, len(worth))))
+    pairs = torch.stack([score_pairs(i, worth, rays) for i in range(len(worth))])
+    first, second = divmod(int(pairs.sum(-1).argmax()), len(worth))
+    chosen, best = [first, second], pairs[first, second]
+    while len(chosen) < min(count, len(worth)):
+        now = (pairs[chosen].amax(0) - best).clamp_min(0).sum(-1)
+        later = (pairs.amax(0) * (best < MIN_PAIR_SCORE)).sum(-1) / 2
+        gains = torch.maximum(now, later) + OUTSIDE_SCORE * worth.sum(-1)
+        gains[chosen] = -1.0
+        added = int(gains.argmax())
+        best = torch.maximum(best, pairs[chosen, added].amax(0))
+        chosen.append(added)
+    return chosen
+
+
+def score_pairs(
+    one: int, worth: Float[Tensor, "c p"], rays: Float[Tensor, "c p 3"]
+) -> Float[Tensor, "c p"]:
+    """Score the pairs of candidate `one` with all others at each point."""
+    excess = compute_angles(rays[one], rays) - BEST_ANGLE
+    width = torch.where(excess < 0, NARROW_FALLOFF, WIDE_FALLOFF)
+    together = torch.minimum(worth[one], worth) * torch.exp(-((excess / width) ** 2))
+    same_place = (rays[one] == rays).all(-1)
+    return together.masked_fill(same_place, 0.0)
+
+
+def score_cameras(
+    target: Camera, candidates: Sequence[Camera], points: Float[Tensor, "p 3"]
+) -> Float[Tensor, "c p"]:
+    """Score each candidate at points that the target sees."""
+    apart = compute_angles(
+        compute_directions([target], points)[0], compute_directions(candidates, points)
+    )
+    shown = torch.stack([is_inside(*project(points, c), c) for c in candidates])
+    return torch.where(shown, 1.0, OUTSIDE_SCORE) / (1 + (apart / HALF_SCORE_ANGLE) ** 2)
+
+
+def find_visible_points(target: Camera, points: Float[Tensor, "n 3"]) -> Float[Tensor, "p 3"]:
+    """Return the points that a target sees, or points on a plane if there are few."""
+    seen = points[is_inside(*project(points, target), target)]
+    if len(seen) >= MIN_POINTS:
+        return seen
+    return make_plane_in_front(target, (points - target.center).norm(dim=-1).median().item())
+
+
+def make_points_in_front(target: Camera, near: float, far: float) -> Float[Tensor, "p 3"]:
+    """Make points on planes in front of a target, between two z-depths in scene units."""
+    inverse = [(1 - share) / near + share / far for share in PLANES]
+    return torch.cat([make_plane_in_front(target, 1 / value) for value in inverse])
+
+
+def make_plane_in_front(target: Camera, depth: float) -> Float[Tensor, "p 3"]:
+    """Make a grid of points at one z-depth, in scene units, over the image of a target."""
+    rays = target.z_rays()
+    rows, columns = (
+        torch.linspace(0, side - 1, GRID_SIDE).round().long()
+        for side in (target.height, target.width)
+    )
+    return target.center + depth * rays[rows][:, columns].reshape(-1, 3)
+
+
+def subsample(points: Float[Tensor, "n 3"], count: int) -> Float[Tensor, "m 3"]:
+    """Keep every n-th point, at most `count`."""
+    return points[:: -(-len(points) // count)]
+
+
+def compute_directions(
+    cameras: Sequence[Camera], points: Float[Tensor, "p 3"]
+) -> Float[Tensor, "c p 3"]:
+    """Compute unit vectors from each camera centre to each point."""
+    centers = torch.stack([camera.center for camera in cameras])
+    return torch.nn.functional.normalize((points - centers[:, None]).double(), dim=-1)
+
+
+def compute_angles(
+    a: Float[Tensor, "*#shape 3"], b: Float[Tensor, "*#shape 3"]
+) -> Float[Tensor, "*shape"]:
+    """Compute the angle between unit vectors in degrees, exact for small angles."""
+    return torch.rad2deg(2 * torch.asin(((a - b).norm(dim=-1) / 2).clamp_max(1.0)))
+
+
+MAX_OVERVIEW = 16
+"""Most cameras that represent all others."""
+NUM_ROUNDS = 20
+"""Most iterations of k-medoids."""
+MIN_SHARED_FRACTION = 0.3
+"""Smallest fraction of visible points that the other camera of a pair must see, too."""
+MAX_ANGLE = 30.0
+"""Largest triangulation angle of a pair, in degrees."""
+
+
+def summarize_cameras(cameras: Sequence[Camera]) -> list[Camera]:
+    """Select cameras that represent all others."""
+    return [cameras[index] for index in select_spread_cameras(cameras, MAX_OVERVIEW)]
+
+
+def select_overview(
+    cameras: Sequence[Camera], points: Float[Tensor, "n 3"], count: int
+) -> list[int]:
+    """Select up to `count` cameras that together see most of the scene; return sorted indices.
+
+    `points` are on or near surfaces, in world coordinates; at least one.
+    """
+    number = count
+    while True:
+        chosen = find_medoids(cameras, number)
+        alone = [i for i in chosen if not has_partner(i, chosen, cameras, points)]
+        found = sorted({*chosen, *(find_partner(i, cameras, points) for i in alone)})
+        if len(found) <= max(count, 2):
+            return found
+        number -= 1
+
+
+def find_medoids(cameras: Sequence[Camera], count: int) -> list[int]:
+    """Cluster cameras by k-medoids; return the sorted indices of the medoids."""
+    where = embed_cameras(cameras)
+    apart = torch.cdist(where, where)
+    chosen = select_spread_cameras(cameras, count)
+    for _ in range(NUM_ROUNDS):
+        groups = apart[:, chosen].argmin(dim=1)
+        members = [torch.nonzero(groups == group)[:, 0] for group in range(len(chosen))]
+        before, chosen = chosen, [find_medoid(apart, own) for own in members if len(own) > 0]
+        if chosen == before:
+            break
+    return sorted(set(chosen))
+
+
+def find_medoid(apart: Float[Tensor, "n n"], members: Tensor) -> int:
+    """Find the member with the smallest sum of squared distances to the others."""
+    return int(members[apart[members][:, members].square().sum(dim=1).argmin()])
+
+
+def has_partner(
+    index: int, chosen: Sequence[int], cameras: Sequence[Camera], points: Float[Tensor, "n 3"]
+) -> bool:
+    """Return True if another chosen camera shares enough points at usable angles."""
+    seen = subsample(find_visible_points(cameras[index], points), MAX_POINTS)
+    others = [cameras[other] for other in chosen if other != index]
+    return any(
+        compute_shared_fraction(cameras[index], other, seen) >= MIN_SHARED_FRACTION
+        for other in others
+    )
+
+
+def compute_shared_fraction(camera: Camera, other: Camera, points: Float[Tensor, "p 3"]) -> float:
+    """Compute the fraction of points that another camera sees at a usable triangulation angle."""
+    one, two = compute_directions([camera, other], points)
+    turn = compute_angles(one, two)
+    bearable = (turn > 0) & (turn < MAX_ANGLE)
+    return (bearable & is_inside(*project(points, other), other)).float().mean().item()
+
+
+def find_partner(index: int, cameras: Sequence[Camera], points: Float[Tensor, "n 3"]) -> int:
+    """Find the camera that makes the best stereo pair with another."""
+    seen = subsample(find_visible_points(cameras[index], points), MAX_POINTS)
+    worth = score_cameras(cameras[index], cameras, seen)
+    pairs = score_pairs(index, worth, compute_directions(cameras, seen)).sum(dim=-1)
+    pairs[index] = -1.0
+    return int(pairs.argmax())

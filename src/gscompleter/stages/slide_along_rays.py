@@ -1,0 +1,283 @@
+"""Stage 3, fine: Gaussians slide along rays to agree with the scene (paper, Sec. III-E)."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from typing import Literal
+
+import torch
+from jaxtyping import Bool, Float, Int
+from torch import Tensor
+
+from gscompleter.config import AlignmentConfig, DepthAgreementConfig, RegistrationConfig
+from gscompleter.config.coverage import COVERED
+from gscompleter.cpu_threads import use_one_torch_thread
+from gscompleter.geometry import compute_z_depths, footprint_mask, slide
+from gscompleter.image_ops import fill_smoothly
+from gscompleter.optim import Adam
+from gscompleter.progress import track
+from gscompleter.render import FrozenScene, Renderer
+from gscompleter.sky import mask_out_sky
+from gscompleter.stages.align_depth import align_depth
+from gscompleter.stages.extrapolate import extrapolate_sky
+from gscompleter.types import Camera, DepthAffine, DepthMap, Gaussians, Lift, Render, View
+
+OCCLUSION_TOLERANCE = 0.05
+"""Distance behind the context, relative to depth, that still counts as the same surface."""
+EXTRAPOLATION_TOLERANCE = 0.02
+"""Largest relative depth error of a pixel whose correction is extrapolated into holes."""
+
+
+@dataclass(frozen=True)
+class Registration:
+    """Registered Gaussians."""
+
+    gaussians: Gaussians
+    affine: DepthAffine
+    losses: tuple[float, ...]
+    """Value of Eq. 11 at each iteration."""
+
+
+@use_one_torch_thread()
+def register(
+    lift: Lift,
+    frozen_target: FrozenScene,
+    at_anchor: Render,
+    reference: View,
+    anchor: Camera,
+    renderer: Renderer,
+    rng: torch.Generator,
+    config: RegistrationConfig = RegistrationConfig(),
+    max_alpha: float = COVERED,
+    alignment: AlignmentConfig = AlignmentConfig(),
+    reject_below: float | None = DepthAgreementConfig.reject_below,
+) -> Registration:
+    """Register lifted Gaussians: all by one affine, then each along its ray.
+
+    Args:
+        lift: Candidates and the depth maps predicted together with them.
+        frozen_target: The scene frozen at the target camera.
+        at_anchor: The scene rendered at the anchor camera.
+        reference: The synthesized image and the target camera.
+        anchor: Camera of the anchor.
+        renderer: Draws the candidates under the anchor camera.
+        rng: Randomness of RANSAC.
+        config: Weights, steps and choices.
+        max_alpha: A pixel of the target that the scene covers by less is a hole.
+        alignment: Settings of the affine fit.
+        reject_below: As `DepthAgreementConfig`.
+    """
+    affine = align_depth(lift, frozen_target.render, at_anchor, rng, alignment, reject_below)
+    coarse = apply_affine(
+        lift.gaussians, affine, reference.camera, config.footprint, config.min_ratio
+    )
+    if affine.is_rejected or config.iterations == 0 or len(coarse) == 0:
+        return Registration(coarse, affine, ())
+    registered, losses = register_along_rays(
+        coarse, frozen_target, at_anchor, reference, anchor, renderer, config
+    )
+    if (
+        config.extrapolate_into_holes
+        and config.degrees_of_freedom == 1
+        and lift.pixel_index is not None
+    ):
+        scene = frozen_target.render.depth_map(max_alpha)
+        registered = extrapolate_into_holes(
+            coarse, registered, lift.pixel_index, scene, reference.camera, config
+        )
+        registered = extrapolate_sky(registered, lift.pixel_index, scene, reference)
+    return Registration(registered, affine, losses)
+
+
+def extrapolate_into_holes(
+    coarse: Gaussians,
+    registered: Gaussians,
+    pixel_index: Int[Tensor, "n"],
+    scene: DepthMap,
+    camera: Camera,
+    config: RegistrationConfig,
+) -> Gaussians:
+    """Extrapolate the correction d' / d of well registered Gaussians smoothly into holes."""
+    before = compute_z_depths(coarse.means, camera)
+    after = compute_z_depths(registered.means, camera)
+    error = (after / scene.depth.flatten()[pixel_index].clamp_min(1e-12) - 1).abs()
+    agrees = scene.valid.flatten()[pixel_index] & (error < EXTRAPOLATION_TOLERANCE)
+
+    correction = torch.zeros_like(scene.depth).flatten()
+    correction[pixel_index] = (after / before).log()
+    known = torch.zeros_like(scene.valid).flatten()
+    known[pixel_index] = agrees
+    shape = scene.valid.shape
+    filled = fill_smoothly(correction.view(shape), known.view(shape)).flatten()[pixel_index]
+    in_hole = ~scene.valid.flatten()[pixel_index]
+    ratio = torch.where(in_hole, filled, (after / before).log()).exp()
+    return slide(coarse, camera, ratio, config.footprint)
+
+
+def apply_affine(
+    gaussians: Gaussians,
+    affine: DepthAffine,
+    camera: Camera,
+    footprint: Literal["constant", "fixed"],
+    min_ratio: float | None = RegistrationConfig.min_ratio,
+) -> Gaussians:
+    """Move Gaussians along their rays to z-depth `scale * z + shift`, at least `min_ratio * z`.
+
+    The ray distance follows from the means, d' = d z'/z: the paper's Eq. 9 without a depth map.
+    """
+    z = compute_z_depths(gaussians.means, camera)
+    ratio = (affine.scale * z + affine.shift) / z
+    return slide(gaussians, camera, bound(ratio, min_ratio), footprint)
+
+
+def bound(ratio: Float[Tensor, "n"], least: float | None) -> Float[Tensor, "n"]:
+    """Bound distance ratios from below, unless `least` is None."""
+    return ratio if least is None else ratio.clamp_min(least)
+
+
+def register_along_rays(
+    coarse: Gaussians,
+    frozen_target: FrozenScene,
+    at_anchor: Render,
+    reference: View,
+    anchor: Camera,
+    renderer: Renderer,
+    config: RegistrationConfig,
+) -> tuple[Gaussians, tuple[float, ...]]:
+    """Minimize Eq. 11 over one distance per Gaussian; also return the loss per iteration.
+
+    Gaussians that reach no compared pixel have no gradient and are not rendered.
+    """
+    objective = Objective.from_renders(frozen_target.render, at_anchor, reference, anchor, config)
+    rows = objective.find_reached(coarse, reference.camera, anchor).nonzero()[:, 0]
+    seen = coarse[rows]
+    alone = make_renderer_alone(
+        seen, reference.camera, objective.target_depth.valid, renderer, config
+    )
+    parameters = torch.zeros(
+        (len(seen), config.degrees_of_freedom), device=coarse.means.device, requires_grad=True
+    )
+    optimizer = Adam([(parameters, config.learning_rate)], (config.beta1, config.beta2))
+    losses = []
+    for iteration in track(range(config.iterations), "Registering"):
+        left = 1 - iteration / config.iterations if config.lr_schedule == "linear" else 1.0
+        moved = move_along_rays(seen, parameters, reference.camera, config)
+        loss = objective(moved, frozen_target, alone, renderer.render(moved, anchor))
+        optimizer.step(loss, left)
+        losses.append(loss.item())
+    with torch.no_grad():
+        found = parameters.new_zeros((len(coarse), config.degrees_of_freedom))
+        found[rows] = parameters.detach()
+        return move_along_rays(coarse, found, reference.camera, config), tuple(losses)
+
+
+def move_along_rays(
+    coarse: Gaussians,
+    parameters: Float[Tensor, "n dof"],
+    camera: Camera,
+    config: RegistrationConfig,
+) -> Gaussians:
+    """Move Gaussians along their target rays (Eq. 10), or freely if `degrees_of_freedom` is 3."""
+    offsets = coarse.means - camera.center
+    distances = offsets.norm(dim=1, keepdim=True)
+    unit = distances if config.lr_unit == "distance" else torch.ones_like(distances)
+    if config.degrees_of_freedom == 3:
+        return replace(coarse, means=coarse.means + unit * parameters, encoded=None)
+    ratio = 1 + (unit * parameters / distances)[:, 0]
+    return slide(coarse, camera, bound(ratio, config.min_ratio), config.footprint)
+
+
+def make_renderer_alone(
+    coarse: Gaussians,
+    camera: Camera,
+    where: Bool[Tensor, "h w"],
+    renderer: Renderer,
+    config: RegistrationConfig,
+) -> Callable[[Gaussians], Render]:
+    """Return a renderer of moved Gaussians alone, at least inside `where`.
+
+    With a constant footprint their image does not change along rays, so only depth is rendered
+    again.
+    """
+    if config.degrees_of_freedom == 3 or config.footprint == "fixed":
+        return lambda moved: renderer.render(moved, camera)
+    plan = renderer.freeze(coarse[:0], camera).vary_depths(coarse, where)
+    return lambda moved: plan(compute_z_depths(moved.means, camera))
+
+
+def get_compared_depth(render: Render, camera: Camera, config: RegistrationConfig) -> DepthMap:
+    """Return the rendered depth that losses compare with, without the sky if `mask_sky` is set."""
+    return mask_out_sky(render, camera) if config.mask_sky else render.depth_map()
+
+
+@dataclass(frozen=True)
+class Objective:
+    """Loss `λ_d L_depth + λ_s L_stereo + λ_c L_rgb` (paper, Eq. 11), as means over the image."""
+
+    target_depth: DepthMap
+    anchor_depth: DepthMap
+    image: Float[Tensor, "h w 3"]
+    unit: float
+    """Divisor of depth residuals, in scene units."""
+    config: RegistrationConfig
+
+    @staticmethod
+    def from_renders(
+        at_target: Render,
+        at_anchor: Render,
+        reference: View,
+        anchor: Camera,
+        config: RegistrationConfig,
+    ) -> Objective:
+        """Create the objective from renders of the scene at target and anchor."""
+        anchor_depth = get_compared_depth(at_anchor, anchor, config)
+        seen = anchor_depth.depth[anchor_depth.valid]
+        relative = config.lr_unit == "distance" and len(seen) > 0
+        unit = seen.median().item() if relative else 1.0
+        target_depth = get_compared_depth(at_target, reference.camera, config)
+        return Objective(target_depth, anchor_depth, reference.image, unit, config)
+
+    def find_reached(self, candidates: Gaussians, target: Camera, anchor: Camera) -> Tensor:
+        """Find Gaussians that reach a compared pixel of the target or the anchor."""
+        counted = self.target_depth.valid
+        if self.config.rgb_weight > 0:
+            counted = torch.ones_like(counted)
+        at_target = footprint_mask(candidates, target, counted)
+        return at_target | footprint_mask(candidates, anchor, self.anchor_depth.valid)
+
+    def __call__(
+        self,
+        candidates: Gaussians,
+        frozen_target: FrozenScene,
+        alone: Callable[[Gaussians], Render],
+        at_anchor: Render,
+    ) -> Float[Tensor, ""]:
+        """Compute the loss; `alone` renders `candidates` at the target without the scene."""
+        c = self.config
+        loss = torch.zeros((), device=candidates.means.device)
+        if c.rendered_depth == "composite" or c.rgb_weight > 0:
+            together = frozen_target.composite(candidates)
+            loss = loss + c.rgb_weight * (together.image - self.image).abs().mean()
+        shown = together if c.rendered_depth == "composite" else alone(candidates)
+        loss = loss + c.depth_weight * self.compute_depth_error(
+            shown, self.target_depth, self.target_depth.valid & shown.depth_map().valid
+        )
+        return loss + c.stereo_weight * self.compute_depth_error(
+            at_anchor, self.anchor_depth, self.find_comparable(at_anchor)
+        )
+
+    def compute_depth_error(
+        self, shown: Render, expected: DepthMap, where: Tensor
+    ) -> Float[Tensor, ""]:
+        """Compute the L1 depth error inside `where`, in `unit`, averaged over the image."""
+        error = (shown.depth - expected.depth).abs() / self.unit
+        return torch.where(where, error, 0.0).mean()
+
+    def find_comparable(self, alone: Render) -> Tensor:
+        """Find anchor pixels that show the scene and unoccluded Gaussians."""
+        seen = self.anchor_depth.valid & alone.depth_map().valid
+        if not self.config.mask_occluded:
+            return seen
+        behind = alone.depth.detach() > self.anchor_depth.depth * (1 + OCCLUSION_TOLERANCE)
+        return seen & ~behind
