@@ -50,7 +50,7 @@ dist: $(VENV)/installed-test
 # The wheel and every extra in an empty environment of each Python; gigabytes and an hour.
 PYTHONS ?= python3.10 python3.11 python3.12 python3.13
 release-check: $(VENV)/installed-test
-	$(BIN)/python tests/release_check.py $(PYTHONS) --extras
+	$(BIN)/python tests/support/release_check.py $(PYTHONS) --extras
 
 # Compares methods on every case of a cases.json: make evaluate CASES=path/to/cases.json METHODS=all
 CASES ?= ../shared/data/cases.json
@@ -76,7 +76,7 @@ gpu:
 	@nvidia-smi -L 2>/dev/null | grep -q '^GPU' || { \
 		echo 'make gpu needs an NVIDIA GPU, and nvidia-smi finds none on this machine.' >&2; exit 2; }
 	@start=$$(date +%s) && timeout $(GPU_SECONDS) $(MAKE) --no-print-directory $(GPU_VENV)/installed && \
-		PYTHONPATH=src:tests PATH="$(CURDIR)/$(GPU_VENV)/bin:$$PATH" $(GPU_VENV)/bin/python benchmarks/gpu.py \
+		PYTHONPATH=src:tests/support PATH="$(CURDIR)/$(GPU_VENV)/bin:$$PATH" $(GPU_VENV)/bin/python benchmarks/gpu.py \
 		--seconds $$(($(GPU_SECONDS) + start - $$(date +%s)))
 
 $(GPU_VENV)/installed: pyproject.toml

@@ -9,7 +9,7 @@ from typing import Any
 
 from hatchling.builders.hooks.plugin.interface import BuildHookInterface
 
-PLACE = "gscompleter/viewer/libraries.json"
+PLACE = "gscompleter/apps/viewer/libraries.json"
 """Where `gscompleter.apps.viewer.packages` looks for it in the wheel."""
 
 

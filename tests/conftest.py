@@ -9,8 +9,9 @@ os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")
 import pytest
 from jaxtyping import install_import_hook
 
+from paths import DATA, PACKAGE
+
 # The whole package except `gscompleter.kernels`, whose functions numba compiles.
-PACKAGE = Path(__file__).resolve().parents[1] / "src" / "gscompleter"
 CHECKED = sorted(
     path.stem
     for path in PACKAGE.iterdir()
@@ -18,8 +19,6 @@ CHECKED = sorted(
     and path.stem not in ("__init__", "kernels")
 )
 install_import_hook([f"gscompleter.{name}" for name in CHECKED], "beartype.beartype")
-
-SHARED = Path(__file__).resolve().parents[2] / "shared"
 
 
 @pytest.fixture(scope="session")
@@ -45,7 +44,7 @@ def completed_room(room, tmp_path_factory) -> Path:
 
 @pytest.fixture
 def shared() -> Path:
-    """Return the folder of real photographs and files for development, or skip."""
-    if not SHARED.is_dir():
-        pytest.skip(f"needs the development data, and there is no folder {SHARED}")
-    return SHARED
+    """Return the folder of real photographs and files, or skip the test where it is absent."""
+    if not DATA.is_dir():
+        pytest.skip(f"needs real photographs, and there is no {DATA}; set GSCOMPLETER_DATA")
+    return DATA

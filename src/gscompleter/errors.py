@@ -54,8 +54,8 @@ def warn_deprecated(old: str, new: str) -> None:
 def quote_value(value: object, length: int | None = None) -> str:
     """Format a value for a sentence: on one line, with its middle left out if it is long.
 
-    Strings get no quotation marks; write `f"'{quote_value(word)}'"` to add them. `length` limits the
-    characters; by default it depends on the type.
+    Strings get no quotation marks; write `f"'{quote_value(word)}'"` to add them. `length` limits
+    the characters; by default it depends on the type.
     """
     if length is None:
         length = MAX_PATH_LENGTH if isinstance(value, os.PathLike) else MAX_QUOTE_LENGTH

@@ -1,1 +1,1 @@
-"""TODO."""
+"""Applications on the method: commands, reports, viewer, live, batch and bench."""

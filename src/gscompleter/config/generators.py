@@ -9,6 +9,7 @@ from annotated_types import Interval, MinLen
 
 from gscompleter.config.settings import Settings
 from gscompleter.errors import InputError, quote_value
+from gscompleter.plugins import load_plugins
 
 Text = Annotated[str, MinLen(1)]
 Steps = Annotated[int, Interval(ge=1, le=1000)]
@@ -76,9 +77,13 @@ GENERATORS: dict[str, type[GeneratorSettings]] = {
 
 def get_settings_class(name: str) -> type[GeneratorSettings]:
     """Return the class of a generator's settings, or raise InputError for an unknown name."""
-    if name not in GENERATORS:
-        raise InputError(
-            f"There is no generator '{quote_value(name)}'; choose one of {', '.join(GENERATORS)}.",
-            "generator",
-        )
-    return GENERATORS[name]
+    if name in GENERATORS:
+        return GENERATORS[name]
+    others = load_plugins("gscompleter.generators")
+    if name in others:
+        return GeneratorSettings
+    raise InputError(
+        f"There is no generator '{quote_value(name)}'; choose one of "
+        f"{', '.join(dict.fromkeys([*GENERATORS, *others]))}.",
+        "generator",
+    )

@@ -37,7 +37,8 @@ def read_yaml(path: Path) -> dict[str, Any]:
     except Exception as error:  # PyYAML fails in many ways, KeyError and IndexError among them
         mark = getattr(error, "problem_mark", None)
         place = "" if mark is None else f" in line {mark.line + 1}"
-        reason = f"{quote_value(getattr(error, 'problem', None) or str(error), MAX_REASON_LENGTH)}{place}"
+        problem = getattr(error, "problem", None) or str(error)
+        reason = quote_value(problem, MAX_REASON_LENGTH) + place
         raise InputError(f"{name} is not YAML: {reason}.") from error
     if content is None:
         return {}

@@ -9,16 +9,10 @@ from typing import Protocol, runtime_checkable
 from jaxtyping import Float
 from torch import Tensor
 
-from gscompleter.config.generators import (
-    DiffusersInpaintSettings,
-    GeneratorSettings,
-    OracleSettings,
-    PEFieldSettings,
-    WarpInpaintSettings,
-    get_settings_class,
-)
+from gscompleter.config.generators import GeneratorSettings, get_settings_class
 from gscompleter.config.settings import validate
 from gscompleter.errors import InputError
+from gscompleter.plugins import load_plugins
 from gscompleter.types import Camera, GeneratorInput, View
 
 
@@ -117,27 +111,31 @@ def load_generator(
             "out, or choose the device cuda.",
             "generator_offload",
         )
-    return _make_generator(settings, seed, photographs, device)
+    load = GENERATORS.get(name) or load_plugins(PLUGINS)[name]
+    return load(settings, seed, photographs, device)
 
 
-def _make_generator(
+def _load_warp_inpaint(
     settings: GeneratorSettings, seed: int, photographs: Sequence[View], device: str
 ) -> Generator:
-    match settings:
-        case PEFieldSettings():
-            from gscompleter.models.diffusion.pe_field import load_pe_field
+    from gscompleter.generators.warp_inpaint import WarpInpaint
 
-            return load_pe_field(seed, device, settings)
-        case DiffusersInpaintSettings():
-            from gscompleter.models.diffusion.inpaint import load_diffusers_inpaint
+    return FunctionGenerator(WarpInpaint(seed))
 
-            return FunctionGenerator(load_diffusers_inpaint(seed, device, settings))
-        case OracleSettings():
-            from gscompleter.generators.oracle import Oracle
 
-            return Oracle(photographs)
-        case WarpInpaintSettings():
-            from gscompleter.generators.warp_inpaint import WarpInpaint
+def _load_oracle(
+    settings: GeneratorSettings, seed: int, photographs: Sequence[View], device: str
+) -> Generator:
+    from gscompleter.generators.oracle import Oracle
 
-            return FunctionGenerator(WarpInpaint(seed))
-    raise TypeError(f"no generator is made from {type(settings).__name__}")
+    return Oracle(photographs)
+
+
+GENERATORS: dict[str, Callable[..., Generator]] = {
+    "warp-inpaint": _load_warp_inpaint,
+    "oracle": _load_oracle,
+}
+"""Loader of each built-in generator: (settings, seed, true images, device) -> Φ."""
+
+PLUGINS = "gscompleter.generators"
+"""Group of entry points that name further tables of this form."""

@@ -1,1 +1,1 @@
-"""TODO."""
+"""Safeguards beyond the paper, one file each."""

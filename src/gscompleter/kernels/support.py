@@ -107,7 +107,7 @@ def accumulate_trust(
 ):
     """Compute the trust of the Gaussians begin..end as seen from a camera; 1 if it sees nothing.
 
-    centers [k, 3], areas [k, n], agreement [k, n] float32: see `gscompleter.types.PhotoObservations`.
+    centers [k, 3], areas [k, n], agreement [k, n] float32, see `PhotoObservations`.
     sums [n] float32: compositing weights at the camera. place: its `CameraPose`.
     max_turn: angle at which the weight of a photograph has fallen to 1/e, in radians.
     enough: share of the area seen by the camera that a photograph has to see for full trust.

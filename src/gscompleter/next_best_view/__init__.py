@@ -1,1 +1,1 @@
-"""TODO."""
+"""Choice of target cameras: candidates, gains and a greedy plan."""

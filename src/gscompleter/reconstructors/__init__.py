@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import fields, is_dataclass
-from functools import partial
 from pathlib import Path
 from typing import Protocol, runtime_checkable
 
@@ -12,7 +11,7 @@ from jaxtyping import Bool
 from torch import Tensor
 
 from gscompleter.errors import InputError, quote_value
-from gscompleter.models.weights.published import PUBLISHED
+from gscompleter.plugins import load_plugins
 from gscompleter.types import Reconstruction, View
 
 
@@ -80,29 +79,26 @@ def _load_plane_sweep(weights: Path | None, device: str) -> Reconstructor:
     return PlaneSweep()
 
 
-def _load_feed_forward(name: str, weights: Path | None, device: str) -> Reconstructor:
-    from gscompleter.models.feed_forward.build import build
-
-    return build(name, weights, device)
-
-
 RECONSTRUCTORS: dict[str, Callable[[Path | None, str], Reconstructor]] = {
-    "plane-sweep": _load_plane_sweep,
-    **{
-        name: partial(_load_feed_forward, name)
-        for name, w in PUBLISHED.items()
-        if w.is_reconstructor
-    },
+    "plane-sweep": _load_plane_sweep
 }
-"""Builder of each reconstructor: (weights path or None for the default, device) -> Ψ."""
+"""Loader of each built-in reconstructor: (weights path or None for the default, device) -> Ψ."""
+
+PLUGINS = "gscompleter.reconstructors"
+"""Group of entry points that name further tables of this form."""
+
+
+def list_reconstructors() -> dict[str, Callable[[Path | None, str], Reconstructor]]:
+    """List the loaders of all reconstructors, by name."""
+    return RECONSTRUCTORS | load_plugins(PLUGINS)
 
 
 def check_reconstructor(name: str) -> None:
     """Raise InputError if no reconstructor has this name."""
-    if name not in RECONSTRUCTORS:
+    if name not in RECONSTRUCTORS and name not in list_reconstructors():
         raise InputError(
             f"There is no reconstructor '{quote_value(name)}'; choose one of "
-            f"{', '.join(RECONSTRUCTORS)}."
+            f"{', '.join(list_reconstructors())}."
         )
 
 
@@ -112,7 +108,7 @@ def load_reconstructor(
     """Load a reconstructor by name.
 
     Args:
-        name: A key of `RECONSTRUCTORS`.
+        name: A key of `list_reconstructors()`.
         weights: Path of the weights; None uses the published ones and downloads them if needed.
         device: Device of the network. `plane-sweep` always runs on the CPU.
 
@@ -120,4 +116,5 @@ def load_reconstructor(
         InputError: The name is unknown, or the weights are not needed, not available or do not fit.
     """
     check_reconstructor(name)
-    return RECONSTRUCTORS[name](None if weights is None else Path(weights), device)
+    load = RECONSTRUCTORS.get(name) or list_reconstructors()[name]
+    return load(None if weights is None else Path(weights), device)

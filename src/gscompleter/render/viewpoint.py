@@ -137,7 +137,7 @@ class Viewpoint:
         return Layer(splats.columns, splats.opacities, splats.boxes, tile_start, entries)
 
     def composite(self, context: Layer, frame: RasterFrame, new: Layer) -> RasterFrame:
-        """Composite a context, rendered to `frame`, with a new layer in the tiles that it touches."""
+        """Composite a context, rendered to `frame`, with a new layer in its tiles."""
         frame = RasterFrame(*(array.copy() for array in frame))
         tiles = find_touched_tiles(new)
         self.share(rasterizer.composite, len(tiles), tiles, context, new, frame)

@@ -53,7 +53,8 @@ class SplatAlignment:
 
     def describe(self) -> str:
         """Describe the alignment in a sentence."""
-        found = f"it fits the photographs at {self.fit.psnr:.1f} dB ({self.given_fit.psnr:.1f} dB as given)"
+        given = f"{self.given_fit.psnr:.1f} dB as given"
+        found = f"it fits the photographs at {self.fit.psnr:.1f} dB ({given})"
         where = {
             "given": f"The splat fits the photographs as it is, at {self.fit.psnr:.1f} dB",
             "cameras": f"The splat is in the frame of its trainer's camera list: {found}",

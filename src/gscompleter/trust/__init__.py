@@ -1,1 +1,1 @@
-"""TODO."""
+"""Trust in the Gaussians of the context, from the photographs."""

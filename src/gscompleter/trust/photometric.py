@@ -121,7 +121,7 @@ def compute_front_depth(
 ) -> Float[Tensor, "h w"]:
     """Compute the z-depth at which new Gaussians occlude most of `scene`, in scene units.
 
-    Untrusted Gaussians vary in depth; `FRONT_DEVIATIONS` deviations before the mean hide most of them.
+    Untrusted Gaussians vary in depth; `FRONT_DEVIATIONS` before the mean hide most of them.
     Nearer Gaussians would occlude the scene in photographs from the side.
     """
     render, z = frozen.render, compute_z_depths(scene.means, camera).clamp_min(0.0)

@@ -1,1 +1,1 @@
-"""TODO."""
+"""Manifests of many completions."""

@@ -118,7 +118,8 @@ def describe_plan(plan: Plan, out: Path) -> str:
             f"({plan.context_seconds:.0f} s)"
         )
     counted = "1 camera" if number == 1 else f"{number} cameras"
-    return f"To complete: {counted}, {duration}. Edit the cameras in {quote_value(out / TARGETS_FILE)}."
+    place = quote_value(out / TARGETS_FILE)
+    return f"To complete: {counted}, {duration}. Edit the cameras in {place}."
 
 
 def name_target(frame: int | None, near: int | None) -> str:

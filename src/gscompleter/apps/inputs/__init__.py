@@ -1,1 +1,1 @@
-"""TODO."""
+"""Photographs, splats and targets as a command line names them."""

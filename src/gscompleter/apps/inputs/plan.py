@@ -119,7 +119,8 @@ def describe_work(options: CompleteOptions, task: Task, device: str) -> str:
 
 def describe_budget(options: CompleteOptions, task: Task, device: str) -> str:
     """Describe the number of context photographs, memory and time."""
-    return f"{describe_count(task)}{describe_memory(options, task)}{describe_time(options, task, device)}"
+    needs = describe_memory(options, task) + describe_time(options, task, device)
+    return describe_count(task) + needs
 
 
 def describe_count(task: Task) -> str:

@@ -122,7 +122,7 @@ def render_completion_page(folder: Path) -> str:
             "pitch": PITCH,
             "scores": make_score_tables(summary),
             "bars": draw_time_bars("Seconds by stage", get_stage_seconds(summary)),
-            "total": f"{format_number(summary.seconds.get('total'), 1)} s in total on {summary.device}.",
+            "total": describe_total(summary),
             "settings": make_settings_table(summary),
             "viewer": viewer,
         },
@@ -273,7 +273,8 @@ def embed_ignored_images(
     """Embed the photographs that have ignored pixels."""
     for number, row in enumerate(summary.context, start=1):
         if row.ignored > 0:
-            caption = f"Photograph {row.frame}: {format_percent(row.ignored)} of the image is ignored (magenta)"
+            share = format_percent(row.ignored)
+            caption = f"Photograph {row.frame}: {share} of the image is ignored (magenta)"
             yield gallery.embed_photo(f"context{number}_ignored.png", caption), caption
 
 
@@ -296,6 +297,11 @@ def describe_cameras(found: FinishedCompletion) -> str:
     kept, count = len(record.photographs), record.num_photographs
     text = f"{count} photographs" if kept == count else f"{kept} of {count} photographs"
     return f"{text}, {len(record.context)} in the context. Drag the drawing to rotate it."
+
+
+def describe_total(summary: CompletionSummary) -> str:
+    """Describe the total time and the device."""
+    return f"{format_number(summary.seconds.get('total'), 1)} s in total on {summary.device}."
 
 
 def make_score_tables(summary: CompletionSummary) -> list[Table]:

@@ -1,1 +1,1 @@
-"""TODO."""
+"""Compilation of the kernels in advance."""

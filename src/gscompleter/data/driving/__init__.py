@@ -1,1 +1,1 @@
-"""TODO."""
+"""Driving data sets: rigs, poses, lidar and moving objects."""

@@ -1,1 +1,1 @@
-"""TODO."""
+"""Structure from motion: camera poses of photographs that have none."""

@@ -223,7 +223,7 @@ def map_all(job: Job, progress: ProgressWriter) -> dict[str, Any]:
     Returns:
         Its `registered` photographs by the names of their copies, the sizes of all `models`
         (largest first), its number of `points`, its mean reprojection `error` in pixels, the
-        `find_defect` of its lens or None, and the `focal` length in pixels if it was fixed at first,
+        `defect` of its lens or None, and the `focal` length in pixels if it was fixed at first,
         else None.
     """
     attempt = select_attempt(job, progress)

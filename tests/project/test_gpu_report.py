@@ -13,8 +13,9 @@ import torch
 
 import gpu
 from gpu_report import PartResult, Row, format_page
+from paths import ROOT
 
-BENCHMARKS = Path(__file__).resolve().parents[1] / "benchmarks"
+BENCHMARKS = ROOT / "benchmarks"
 SMALL = gpu.Bench("cpu", ((64, 64), (64, 80)), ("plane-sweep", "mvsplat-re10k"), ("float32",), 1)
 
 SCRIPT = """

@@ -5,6 +5,7 @@ from pathlib import Path
 
 import pytest
 import torch
+from test_generators import known_room
 
 from gscompleter import InputError
 from gscompleter.models.diffusion import source_depth
@@ -17,7 +18,6 @@ from gscompleter.models.diffusion.source_depth import (
     rescale_depth,
 )
 from gscompleter.types import Render
-from test_generators import known_room
 
 CONTEXT = known_room()
 VIEW, RENDER = CONTEXT.views[0], CONTEXT.view_renders[0]

@@ -8,7 +8,6 @@ from __future__ import annotations
 import subprocess
 import sys
 from dataclasses import replace
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -19,6 +18,7 @@ from gscompleter.kernels import stereo
 from gscompleter.reconstructors.plane_sweep import PlaneSweep
 from gscompleter.render.cpu import MAX_SIDE, CpuRenderer, to_arrays
 from gscompleter.render.viewpoint import check_lengths
+from paths import SUPPORT
 from scenes import camera_at, random_gaussians, unchecked
 
 ODD = [np.nan, np.inf, -np.inf, 3e38, -3e38, 1e19, -1e19, 1e-38, 0.0]
@@ -85,7 +85,7 @@ def lines_of(code: str, *words: object) -> list[str]:
 
 
 def test_the_rasteriser_bears_every_number():
-    assert lines_of(DRAW, Path(__file__).parent, *ODD) == [str(13 * len(ODD))]
+    assert lines_of(DRAW, SUPPORT, *ODD) == [str(13 * len(ODD))]
 
 
 def test_the_plane_sweep_bears_every_number():

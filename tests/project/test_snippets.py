@@ -26,9 +26,9 @@ from gscompleter.apps.viewer.packages import Libraries
 from gscompleter.cli import COMMANDS, parse_command
 from gscompleter.config.settings import validate
 from gscompleter.reconstructors.plane_sweep import PlaneSweep
+from paths import ROOT
 from scenes import camera_at, photographed
 
-ROOT = Path(__file__).resolve().parents[1]
 PAGES = [ROOT / "README.md", ROOT / "CONTRIBUTING.md", *sorted((ROOT / "docs").rglob("*.md"))]
 FRAMES = 11
 """Of the room that stands for SCENE: as many as the commands name."""

@@ -4,6 +4,7 @@ from dataclasses import replace
 
 import pytest
 import torch
+from test_contradiction import CAMERAS, ROOM, SIZE, photographed
 
 from command import run
 from gscompleter import GSCompleter
@@ -15,7 +16,6 @@ from gscompleter.evaluation.tasks import make_case_task
 from gscompleter.io.image import write_image
 from gscompleter.splats.ply import save_ply
 from scenes import camera_at, view_of
-from test_contradiction import CAMERAS, ROOM, SIZE, photographed
 
 TARGET = camera_at(0.5, -0.5, yaw=10, size=SIZE)
 

@@ -23,10 +23,11 @@ from gscompleter.jobs.jobs import Job, find_missing_jobs, run_claimed
 from gscompleter.jobs.places import FolderPlace, StorePlace, make_lease, open_place
 from gscompleter.jobs.rounds import BatchRows, Rounds, run_in_this_process
 from gscompleter.jobs.shards import parse_shard
+from paths import SUPPORT
 from scenes import camera_at, photographed
 from simulate_batch import Fleet, Replay, replay
 
-TESTS = Path(__file__).parent
+TESTS = SUPPORT
 SAME = ("completed.ply", "context.ply", "generated.ply", "targets.json")
 """Entries that do not depend on process or time; images/ do not either."""
 

@@ -4,7 +4,6 @@ import os
 import subprocess
 import sys
 from importlib import import_module
-from pathlib import Path
 from pkgutil import iter_modules
 
 import numba
@@ -13,6 +12,7 @@ import pytest
 from numba.core.registry import CPUDispatcher
 
 from gscompleter import kernels
+from paths import SUPPORT
 
 COMPLETE = """
 import hashlib, sys
@@ -49,7 +49,7 @@ def test_kernels_of_others_find_blas_all_the_same():
 
 def test_a_process_that_compiles_and_one_that_finds_it_done_give_the_same_bytes(tmp_path):
     environment = {**os.environ, "NUMBA_CACHE_DIR": str(tmp_path)}
-    command = [sys.executable, "-c", COMPLETE, str(Path(__file__).parent)]
+    command = [sys.executable, "-c", COMPLETE, str(SUPPORT)]
     outputs = []
     for _ in range(2):
         life = subprocess.run(command, env=environment, capture_output=True, text=True, check=True)

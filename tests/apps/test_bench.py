@@ -25,11 +25,12 @@ from gscompleter.config import CompleterConfig
 from gscompleter.errors import InputError
 from gscompleter.render import load_renderer
 from gscompleter.types import merge
+from paths import ROOT
 from scenes import Room, camera_at, gaussians_of, photographed, view_of
 
 SIZE = 64
 CAMERAS = (camera_at(-0.2, size=SIZE), camera_at(0.2, size=SIZE), camera_at(0.5, size=SIZE))
-PERFORMANCE = Path(__file__).resolve().parents[1] / "benchmarks" / "performance.json"
+PERFORMANCE = ROOT / "benchmarks" / "performance.json"
 CASE = BenchCase("room", Path("room"), (0, 1, 2, 3), (4, 5), (64, 96))
 
 

@@ -39,8 +39,9 @@ from gscompleter.models.weights import (
 )
 from gscompleter.reconstructors import Reconstructor, load_reconstructor
 from gscompleter.reconstructors.plane_sweep import PlaneSweep
+from paths import ROOT
 
-DOCS = Path(__file__).resolve().parents[1] / "docs"
+DOCS = ROOT / "docs"
 COMMIT = "0123456789abcdef0123456789abcdef01234567"
 
 DEPTHSPLAT = PUBLISHED["depthsplat-small-re10k"]

@@ -7,11 +7,11 @@ from __future__ import annotations
 
 import json
 from dataclasses import replace
-from pathlib import Path
 
 import numpy as np
 import pytest
 import torch
+from test_generators import TARGET, known_room
 
 from feed_forward_fixtures import rule_v1
 from gscompleter.evaluation.metrics.image import psnr
@@ -32,10 +32,10 @@ from gscompleter.models.diffusion.rotary import (
 from gscompleter.models.diffusion.splat import splat_forward
 from gscompleter.types import Camera
 from parity import assert_close
+from paths import FIXTURES
 from scenes import Room, view_of
-from test_generators import TARGET, known_room
 
-STORED = Path(__file__).parent / "fixtures" / "pefield"
+STORED = FIXTURES / "pefield"
 SIZE, GRID = (96, 128), (6, 8)
 
 

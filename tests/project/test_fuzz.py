@@ -3,12 +3,13 @@
 import re
 import subprocess
 import sys
-from pathlib import Path
+
+from paths import SUPPORT
 
 
 def test_mutated_inputs_end_in_a_sentence_or_a_result():
     """It runs in a process of its own, whose forks inherit no threads."""
-    script = Path(__file__).parent / "fuzz.py"
+    script = SUPPORT / "fuzz.py"
     # A machine that is busy with other tests is no hang.
     words = ["--count", "40", "--seed", "1", "--workers", "2", "--limit", "120"]
     command = [sys.executable, str(script), *words]

@@ -21,8 +21,9 @@ from gscompleter.geometry import multiply_quats, quats_to_rotations, rotations_t
 from gscompleter.models.feed_forward.cameras import Cameras
 from gscompleter.models.feed_forward.gaussian_adapter import PixelGaussians
 from parity import relative_error
+from paths import FIXTURES
 
-STORED = Path(__file__).parent / "fixtures" / "feed_forward"
+STORED = FIXTURES / "feed_forward"
 EXTRA = os.environ.get("GSC_EXTRA_FIXTURES")
 """Folder with additional fixtures in the same layout, all of which the tests use."""
 EVERY = 97

@@ -20,8 +20,7 @@ from pathlib import Path
 
 from gscompleter import __version__
 from gscompleter.apps.commands.doctor import PURPOSES
-
-ROOT = Path(__file__).resolve().parents[1]
+from paths import ROOT
 
 IMPORT_ALL = "import gscompleter; [getattr(gscompleter, name) for name in gscompleter.__all__]"
 """Every public name."""

@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 import torch
 from PIL import Image
+from test_pose_formats import check_room, write_cloud
 
 from command import run
 from gscompleter import InputError, load_cameras
@@ -31,7 +32,6 @@ from pose_files import (
     write_photographs,
 )
 from scenes import Room, camera_at, cast, view_of
-from test_pose_formats import check_room, write_cloud
 
 LAYOUTS = [
     ("sparse/0", "images"),

@@ -17,6 +17,7 @@ from gscompleter import GSCompleter, kernels
 from gscompleter.apps.warmup import compilation, rehearsal
 from gscompleter.kernels import compiled
 from gscompleter.progress import show_progress
+from paths import SUPPORT
 from scenes import Room, camera_at, view_of
 
 COMPLETE = """
@@ -74,7 +75,7 @@ rehearsed = signatures()
 complete()
 print(len(rehearsed), *sorted(signatures() - rehearsed), sep="\\n")
 """
-    command = [sys.executable, "-c", said, os.path.dirname(__file__)]
+    command = [sys.executable, "-c", said, str(SUPPORT)]
     life = subprocess.run(command, capture_output=True, text=True, check=True)
     number, *others = life.stdout.splitlines()
     assert int(number) > 15
@@ -175,6 +176,6 @@ def test_after_a_warmup_a_completion_compiles_nothing(tmp_path):
     environment = {**os.environ, "NUMBA_CACHE_DIR": str(tmp_path)}
     warm = [sys.executable, "-c", "from gscompleter.cli import main; main()", "warmup"]
     subprocess.run(warm, env=environment, check=True)
-    command = [sys.executable, "-c", COMPLETE, os.path.dirname(__file__)]
+    command = [sys.executable, "-c", COMPLETE, str(SUPPORT)]
     life = subprocess.run(command, env=environment, capture_output=True, text=True, check=True)
     assert life.stdout == "0\n"

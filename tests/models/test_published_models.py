@@ -11,7 +11,7 @@ from gscompleter import InputError, load_reconstructor
 from gscompleter.models.feed_forward import FeedForward, MVSplat
 from gscompleter.models.feed_forward.build import build, create_network
 from gscompleter.models.weights import PUBLISHED
-from gscompleter.reconstructors import RECONSTRUCTORS
+from gscompleter.reconstructors import list_reconstructors
 from scenes import Room, camera_at, photographed, view_of
 
 SIZE = 64
@@ -36,7 +36,7 @@ def mvsplat_file(mvsplat, tmp_path_factory) -> Path:
     return saved(tmp_path_factory.mktemp("weights") / "re10k.ckpt", mvsplat)
 
 
-@pytest.mark.parametrize("name", [name for name in RECONSTRUCTORS if name in PUBLISHED])
+@pytest.mark.parametrize("name", [name for name in list_reconstructors() if name in PUBLISHED])
 def test_every_listed_model_has_a_network_of_the_published_size(name):
     published = PUBLISHED[name]
     with torch.device("meta"):
@@ -49,9 +49,9 @@ def test_every_listed_model_has_a_network_of_the_published_size(name):
 
 def test_published_models_are_reconstructors_and_those_of_depth_alone_are_not():
     assert {"mvsplat-re10k", "mvsplat-acid", "depthsplat-small-re10k", "volsplat-re10k"} <= set(
-        RECONSTRUCTORS
+        list_reconstructors()
     )
-    assert "depthsplat-depth-base-352x640" not in RECONSTRUCTORS
+    assert "depthsplat-depth-base-352x640" not in list_reconstructors()
 
 
 def test_a_file_by_its_path_fills_the_network(mvsplat, mvsplat_file):

@@ -1,7 +1,6 @@
 """Other completion methods, for comparison."""
 
 from dataclasses import replace
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -35,9 +34,10 @@ from gscompleter.evaluation.baselines.reggs import (
 from gscompleter.evaluation.metrics.image import psnr
 from gscompleter.types import Gaussians, View, merge
 from parity import assert_close
+from paths import FIXTURES
 from scenes import Room, camera_at, gaussians_of, random_gaussians, view_of
 
-FIXTURE = Path(__file__).parent / "fixtures" / "reggs_mw2.npz"
+FIXTURE = FIXTURES / "reggs_mw2.npz"
 
 
 @pytest.fixture(scope="module")

@@ -2,6 +2,7 @@
 
 import pytest
 import torch
+from test_generators import TARGET, known_room
 
 from gscompleter import InputError
 from gscompleter.generators import GeneratorOutput, as_generator
@@ -10,7 +11,6 @@ from gscompleter.generators.warp import WarpedImage
 from gscompleter.generators.warp_inpaint import WarpInpaint
 from gscompleter.stages.select_anchor import synthesize
 from scenes import Room, camera_at, view_of
-from test_generators import TARGET, known_room
 
 TRUTH = view_of(Room(), camera_at(0.0)).image
 SEEN = torch.arange(96).expand(96, 96) < 60
