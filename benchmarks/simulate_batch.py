@@ -23,7 +23,7 @@ class Fleet:
     start_seconds: float
     """Time until the first job of a worker: process, imports, compiled kernels."""
     lost_per_hour: float
-    """How often a worker is killed per hour."""
+    """Number of kills per worker and hour."""
     retries: int = 2
 
 

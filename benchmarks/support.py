@@ -1,4 +1,4 @@
-"""How well trust finds errors of a trained splat, and how completion changes its PSNR.
+"""Measure trust against the errors of a trained splat, and the PSNR of completions.
 
     python benchmarks/support.py SCENE SPLAT TRAIN_TXT [--complete FRAME ...]
 

@@ -16,7 +16,7 @@ from gscompleter.types import GeneratorInput
 
 
 def mean_colour(nearest: gsc.View, target: gsc.Camera, context: GeneratorInput) -> torch.Tensor:
-    """What the scene shows, and the photograph's mean colour where it shows nothing."""
+    """Fill holes of the rendered scene with the photograph's mean colour."""
     seen = context.target_render
     fill = nearest.image.mean(dim=(0, 1))
     return (seen.image + (1 - seen.alpha)[..., None] * fill).clamp(0, 1)

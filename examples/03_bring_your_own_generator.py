@@ -1,4 +1,4 @@
-"""Bring your own Φ, checked against the photographs and told of in the report.
+"""Bring your own Φ, checked against the photographs and described in the report.
 
     python examples/03_bring_your_own_generator.py SCENE 0 4 8
 

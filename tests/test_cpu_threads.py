@@ -23,7 +23,7 @@ from scenes import camera_at, photographed
 COUNTS = """
 import sys
 from gscompleter.cpu_threads import limit_threads
-bound_threads(int(sys.argv[1]) if sys.argv[1:] else None)
+limit_threads(int(sys.argv[1]) if sys.argv[1:] else None)
 import cv2, numba, torch
 print(torch.get_num_threads(), numba.config.NUMBA_NUM_THREADS, cv2.getNumThreads())
 """

@@ -250,7 +250,7 @@ def test_a_file_that_names_no_cases_is_refused(tmp_path, monkeypatch, capsys, te
 @pytest.mark.parametrize(
     ("more", "sentence"),
     [
-        (["--context", 0, 1], "frames to start from"),
+        (["--context", 0, 1], "needs context frames"),
         (["--context", 0, 1, "--target", 9], "no frame 9"),
         (["--context", 0, 1, "--target", 2, "--only", "other"], "no case 'other'"),
         (["--context", 0, 1, "--target", 2, "--methods", "magic"], "no method 'magic'"),

@@ -58,7 +58,7 @@ def page(served) -> Iterator[Any]:
         page = browser.new_page(viewport={"width": 640, "height": 360})
         page.set_default_timeout(PATIENCE)
         asked: list[str] = []
-        page.create("request", lambda request: asked.append(request.url))
+        page.on("request", lambda request: asked.append(request.url))
         page.goto(served)
         wait_for(page, "Fly to a hole in the scene")
         yield page

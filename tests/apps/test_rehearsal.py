@@ -17,13 +17,13 @@ from gscompleter import GSCompleter, kernels
 from gscompleter.apps.warmup import compilation, rehearsal
 from gscompleter.kernels import compiled
 from gscompleter.progress import show_progress
-from paths import SUPPORT
+from paths import TESTS
 from scenes import Room, camera_at, view_of
 
 COMPLETE = """
 import sys
 import numba.core.event
-sys.path.insert(0, sys.argv[1])
+sys.path[:0] = [sys.argv[1], f"{sys.argv[1]}/../support"]
 from test_rehearsal import complete
 with numba.core.event.install_recorder("numba:compile") as found:
     complete()
@@ -67,7 +67,7 @@ def test_a_rehearsal_meets_every_kernel_of_a_completion():
     """It runs in a process of its own, because kernels may have run here before."""
     said = """
 import sys
-sys.path.insert(0, sys.argv[1])
+sys.path[:0] = [sys.argv[1], f"{sys.argv[1]}/../support"]
 from test_rehearsal import complete, rehearsal, signatures
 for name, rehearse in rehearsal.PARTS.items():
     rehearse(name)
@@ -75,7 +75,7 @@ rehearsed = signatures()
 complete()
 print(len(rehearsed), *sorted(signatures() - rehearsed), sep="\\n")
 """
-    command = [sys.executable, "-c", said, str(SUPPORT)]
+    command = [sys.executable, "-c", said, str(TESTS / "apps")]
     life = subprocess.run(command, capture_output=True, text=True, check=True)
     number, *others = life.stdout.splitlines()
     assert int(number) > 15
@@ -176,6 +176,6 @@ def test_after_a_warmup_a_completion_compiles_nothing(tmp_path):
     environment = {**os.environ, "NUMBA_CACHE_DIR": str(tmp_path)}
     warm = [sys.executable, "-c", "from gscompleter.cli import main; main()", "warmup"]
     subprocess.run(warm, env=environment, check=True)
-    command = [sys.executable, "-c", COMPLETE, str(SUPPORT)]
+    command = [sys.executable, "-c", COMPLETE, str(TESTS / "apps")]
     life = subprocess.run(command, env=environment, capture_output=True, text=True, check=True)
     assert life.stdout == "0\n"

@@ -87,16 +87,16 @@ def overlap(found: Tensor, truth: Tensor) -> float:
 
 def test_a_bonnet_is_found(clip):
     views = clip.views([0, 7])
-    assert views[0].ignored is not None
-    assert torch.equal(views[0].ignored, views[1].ignored)
-    assert overlap(views[0].ignored, bonnet()) > 0.85
-    assert (bonnet() & ~views[0].ignored).sum() < 0.02 * bonnet().sum()
+    assert views[0].ignore_mask is not None
+    assert torch.equal(views[0].ignore_mask, views[1].ignore_mask)
+    assert overlap(views[0].ignore_mask, bonnet()) > 0.85
+    assert (bonnet() & ~views[0].ignore_mask).sum() < 0.02 * bonnet().sum()
 
 
 def test_its_mask_follows_the_framing(clip):
     (whole,), (small,), (cropped,) = (clip.views([2], r) for r in (None, 64, (64, SIZE)))
-    assert overlap(small.ignored, whole.ignored[1::2, 1::2]) > 0.9
-    assert torch.equal(cropped.ignored, whole.ignored[32:96])
+    assert overlap(small.ignore_mask, whole.ignore_mask[1::2, 1::2]) > 0.9
+    assert torch.equal(cropped.ignore_mask, whole.ignore_mask[32:96])
 
 
 @pytest.mark.parametrize("paint", [untouched, with_even_road])
@@ -146,17 +146,19 @@ def test_damaged_photographs_are_passed_over(tmp_path):
 def test_it_can_be_switched_off(clip):
     assert CompleterConfig().ego_mask
     assert not CompleterConfig.paper().ego_mask
-    assert clip.keep_ego_vehicle().views([0])[0].ignored is None
+    assert clip.keep_ego_vehicle().views([0])[0].ignore_mask is None
     folder = clip.frames[0].image.parent
     case = Case(folder, (0, 1), 3, (), None)
     assert case.load((0,))[0].ignore_mask is not None
-    assert replace(case, ego_mask=False).load((0,))[0].ignored is None
+    assert replace(case, ego_mask=False).load((0,))[0].ignore_mask is None
 
 
 def test_evaluations_ignore_it(clip):
     (opened,) = open_clips(clip.frames[0].image.parent)
     task = make_tasks(parse_protocol("n-2"), opened)[0]
-    assert all(view.ignored is not None for view in pickle.loads(pickle.dumps(task.load))((0, 1)))
+    assert all(
+        view.ignore_mask is not None for view in pickle.loads(pickle.dumps(task.load))((0, 1))
+    )
 
 
 def test_nothing_is_matched_or_made_of_it(clip):
@@ -167,7 +169,7 @@ def test_nothing_is_matched_or_made_of_it(clip):
         assert not image.ignore_mask[rows, columns].any()
     scene, _ = init_context(load_reconstructor("plane-sweep"), views)
     plain, _ = init_context(
-        load_reconstructor("plane-sweep"), [replace(view, ignored=None) for view in views]
+        load_reconstructor("plane-sweep"), [replace(view, ignore_mask=None) for view in views]
     )
     # Nothing below the horizon is as far away as where a bonnet is matched.
     low = [s.means[s.means[:, 1] > 0.6] for s in (scene, plain)]
@@ -179,7 +181,9 @@ def test_what_is_fitted_takes_nothing_from_it(clip):
     """The colour of a bonnet must not be given to a road that another photograph shows there."""
     views = clip.views([2, 3, 4])
     magenta = torch.tensor([1.0, 0.0, 1.0])
-    painted = [replace(v, image=torch.where(v.ignored[..., None], magenta, v.image)) for v in views]
+    painted = [
+        replace(v, image=torch.where(v.ignore_mask[..., None], magenta, v.image)) for v in views
+    ]
     scene, _ = init_context(load_reconstructor("plane-sweep"), painted)
     red, green, blue = (0.5 + SH_C0 * scene.sh[:, 0]).T
     assert ((torch.minimum(red, blue) - green) > 0.6).float().mean() < 0.003
@@ -191,7 +195,7 @@ def test_it_is_told_and_shown(clip, tmp_path, monkeypatch, capsys):
     assert run(monkeypatch, "complete", folder, *given, "--out", out) == 0
     assert "stays the same while the camera moves" in capsys.readouterr().out
     summary = read_json(out / "summary.json", "")
-    share = clip.views([2])[0].ignored.float().mean().item()
+    share = clip.views([2])[0].ignore_mask.float().mean().item()
     assert [row["ignored"] for row in summary["context"]] == [pytest.approx(share)] * 2
     shown = read_image(out / "images" / "context1_ignored.png")
     assert ((shown - torch.tensor([1.0, 0.0, 1.0])).abs().amax(-1) == 0).float().mean() >= share

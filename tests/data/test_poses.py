@@ -218,7 +218,7 @@ def test_parts_that_do_not_connect_are_told():
 
 
 def test_a_model_among_placed_photographs_is_no_part():
-    parts = pytest.importorskip("gscompleter.data.sfm.mapping_process").parts
+    parts = pytest.importorskip("gscompleter.data.sfm.mapping_process").count_parts
     large, other, inside = set(range(12)), {20, 21, 22}, {3, 4, 5, 20}
     assert parts([large, inside, other, {7, 23}]) == [12, 3]
     assert parts([{1, 2}]) == [2]

@@ -4,7 +4,7 @@ from dataclasses import replace
 
 import pytest
 import torch
-from test_contradiction import CAMERAS, ROOM, SIZE, photographed
+from test_dynamic_masks import CAMERAS, ROOM, SIZE, photographed
 
 from command import run
 from gscompleter import GSCompleter

@@ -216,7 +216,7 @@ def test_photographs_that_were_completed_become_anchors(begun, tmp_path):
 
 def test_the_baseline_may_choose_them_too(begun, finished):
     turned = tuple(turned_away(view) for view in begun.views)
-    state = begun.models.completer().begin((*turned, begun.targets[0]), begun.context)
+    state = begun.models.make_completer().begin((*turned, begun.targets[0]), begun.context)
     for method in ("reggs", "full"):
         predicted = METHODS[method](state, begun.targets[1].camera, begun.models)
         assert state.views[predicted.anchor].frame == 2

@@ -73,7 +73,7 @@ def test_what_has_to_go_for_the_most_part_goes_altogether_and_soon(monkeypatch):
     monkeypatch.setattr(guard, "is_mostly_faded", counted)
     assert len(meet_error_budgets(harmful, [frozen], [[mse(view, allowed)]])) == 0
     assert trials == [*[False] * (len(trials) - 1), True]
-    assert len(trials) < psnr.NUM_HALVINGS
+    assert len(trials) < guard.NUM_HALVINGS
 
 
 def test_drawings_that_are_known_already_are_asked_instead():

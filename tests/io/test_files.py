@@ -225,12 +225,12 @@ def waits(a, b):
     renames -= 1
     rename(a, b)
 os.rename = waits
-with output_folder(out, overwrite=True) as folder:
+with open_output_folder(out, overwrite=True) as folder:
     os.mkdir(folder / "images")
     for name in ("completed.ply", "images/new.png", "summary.json"):
         (folder / name).write_text("new")
     if renames < 0:
-        with replacing(folder / "scene.ply") as file:
+        with replace_file(folder / "scene.ply") as file:
             file.write(b"half"); file.flush(); print("ready", flush=True); time.sleep(60)
 """
 
@@ -290,7 +290,7 @@ def test_an_interrupt_while_results_are_replaced_leaves_nothing_behind(results, 
         "    rmtree(*words, **others)\n"
         "shutil.rmtree = stopped\n"
         "try:\n"
-        "    with output_folder(sys.argv[1], overwrite=True) as folder:\n"
+        "    with open_output_folder(sys.argv[1], overwrite=True) as folder:\n"
         "        for name in os.listdir(sys.argv[1]): (folder / name).write_text('new')\n"
         "except KeyboardInterrupt as stop:\n    print(stop)\n"
     )
@@ -329,7 +329,7 @@ def test_what_was_killed_between_its_renames_is_finished_by_the_next_run(results
 def test_a_file_that_a_killed_process_left_is_removed_by_the_next(tmp_path):
     code = (
         "import os, signal, sys\nfrom gscompleter.io.files import replace_file\n"
-        "with replacing(sys.argv[1]): os.kill(os.getpid(), signal.SIGKILL)\n"
+        "with replace_file(sys.argv[1]): os.kill(os.getpid(), signal.SIGKILL)\n"
     )
     subprocess.run([sys.executable, "-c", code, str(tmp_path / "a")], check=False)
     assert len(os.listdir(tmp_path)) == 1

@@ -60,7 +60,7 @@ from gscompleter.kernels import stereo
 from gscompleter.reconstructors.plane_sweep.depth_bands import make_full_bands
 image = np.random.default_rng(0).random((24, 20, 3)).astype(np.float32)
 planes = np.linspace(0, 1, 6).astype(np.float32)
-bands = every_plane((24, 20), 6)
+bands = make_full_bands((24, 20), 6)
 ran, noise, detail = 0, np.float32(0.01), np.float32(0.4)
 for odd in map(float, sys.argv[1:]):
     for row in range(3):

@@ -40,7 +40,7 @@ def matched(seed=0):
 
 def at_random(found, seed=1):
     """Make a random usable match for each query."""
-    usable = np.argwhere(found.usable)
+    usable = np.argwhere(found.usable_mask)
     rows = np.random.default_rng(seed).integers(len(usable), size=len(found.queries))
     return np.ascontiguousarray(usable[rows])
 
@@ -79,7 +79,7 @@ def test_a_search_only_improves_matches_and_keeps_them_usable():
     begun = np.array([plain_cost(found, n, match)[0] for n, match in enumerate(before)])
     assert (cost <= begun * (1 + 1e-5)).all()
     assert (cost < 0.99 * begun).mean() > 0.5
-    assert found.usable[tuple(field.T)].all()
+    assert found.usable_mask[tuple(field.T)].all()
 
 
 def test_a_patch_that_lies_in_a_source_is_found():

@@ -155,7 +155,7 @@ def test_cameras_that_judge_coverage_are_the_same_for_the_same_seed():
 
 
 def test_nothing_is_added_before_what_a_bystander_sees(begun):
-    """What is lifted stands a fifth too near, and nothing mends that but who looks through it."""
+    """Lifted depths are a fifth too short, which only further cameras can detect."""
     config = CompleterConfig(
         alignment=AlignmentConfig(align_at="none"), registration=RegistrationConfig(iterations=0)
     )

@@ -1,4 +1,4 @@
-"""What `conftest.py` claims: while the tests run, every shape in an annotation is checked."""
+"""Check that every shape in an annotation is checked while the tests run, as `conftest.py` says."""
 
 from importlib.util import find_spec
 from pathlib import Path

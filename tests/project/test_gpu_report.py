@@ -137,7 +137,7 @@ def test_every_part_gives_rows(part):
 def test_every_reconstructor_completes_a_room_and_one_that_fails_is_a_row(monkeypatch):
     rows = list(gpu.measure_completions(SMALL))
     assert [row.what for row in rows if not row.failed] == list(SMALL.models)
-    known = gpu.model
+    known = gpu.load_model
     monkeypatch.setattr(
         gpu, "load_model", lambda name, *a: known(name, *a) if "-" in name else 1 / 0
     )

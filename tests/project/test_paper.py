@@ -7,7 +7,14 @@ import pytest
 
 import gscompleter
 from gscompleter.geometry import depth_to_distance
-from gscompleter.stages import align_depth, context, refine, select_anchor, slide_along_rays
+from gscompleter.stages import (
+    align_depth,
+    context,
+    filter_holes,
+    refine,
+    select_anchor,
+    slide_along_rays,
+)
 from gscompleter.types import DepthAffine
 
 EQUATIONS = {
@@ -21,7 +28,7 @@ EQUATIONS = {
         r"\lambda_s \mathcal{L}_{\text{stereo}}",
         [slide_along_rays.Objective, slide_along_rays.register_along_rays],
     ),
-    12: (r"\mathbf{A}_{\text{ctx}}(\mathbf{p}) < \tau", [refine.compute_hole_mask]),
+    12: (r"\mathbf{A}_{\text{ctx}}(\mathbf{p}) < \tau", [filter_holes.compute_hole_mask]),
     13: (r"\mathcal{L}_{\text{mv}} =", [refine.refine_opacities]),
 }
 """For each equation of the paper by number, a piece of it and the code that implements it."""

@@ -65,7 +65,7 @@ def extras() -> set[str]:
 def test_the_wheel_holds_the_package_the_viewer_and_the_licences(wheel):
     with ZipFile(wheel) as archive:
         names = set(archive.namelist())
-        libraries = json.loads(archive.read("gscompleter/viewer/libraries.json"))
+        libraries = json.loads(archive.read("gscompleter/apps/viewer/libraries.json"))
     sources = ROOT / "src"
     ours = {p.relative_to(sources).as_posix() for p in sources.rglob("*") if p.is_file()}
     ours = {name for name in ours if "__pycache__" not in name and ".egg-info" not in name}

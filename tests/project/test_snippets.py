@@ -31,7 +31,7 @@ from scenes import camera_at, photographed
 
 PAGES = [ROOT / "README.md", ROOT / "CONTRIBUTING.md", *sorted((ROOT / "docs").rglob("*.md"))]
 FRAMES = 11
-"""Of the room that stands for SCENE: as many as the commands name."""
+"""Number of photographs of the room that stands for SCENE, as many as the commands name."""
 SIDE = 32
 """Pixels of its photographs."""
 
@@ -59,7 +59,7 @@ PYTHON_NOT_RUN = {"docs/models.md": "needs published weights"}
 
 @dataclass(frozen=True)
 class Block:
-    """What stands between two lines of ```."""
+    """A block between two lines of ```."""
 
     page: Path
     line: int
@@ -131,7 +131,7 @@ UNDERSTOOD: dict[str, Callable[[list[str]], None]] = {
     "docker": understand_docker,
     "apptainer": lambda words: None,
 }
-"""How the words after a program are checked."""
+"""Checks of the words after each program."""
 
 
 @pytest.mark.parametrize("block", of("sh"), ids=lambda block: block.name)
@@ -179,7 +179,7 @@ def test_the_reference_has_a_term_for_each_option(command):
 
 
 def is_run(words: list[str]) -> bool:
-    """Whether these words after `gscompleter` can be run here."""
+    """Return True if these words after `gscompleter` can be run here."""
     return words[0] in COMMANDS and words[0] not in NOT_RUN and not set(words) & set(NEEDS_WEIGHTS)
 
 
@@ -235,7 +235,7 @@ def sandbox(scene, completed_room, tmp_path, monkeypatch) -> Path:
 
 @pytest.mark.parametrize("block", runnable())
 def test_commands_run(block, sandbox, monkeypatch, capsys):
-    """What would be served is saved, and what lies in OUT already is replaced."""
+    """Save instead of serving, and replace existing output."""
     for number, words in enumerate(ours(block)):
         serves = words[0] == "view" and "--save" not in words
         more = ["--save", f"page{number}.html"] if serves else []

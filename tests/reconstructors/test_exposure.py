@@ -96,7 +96,7 @@ def test_a_channel_that_is_black_tells_nothing_and_disturbs_no_other():
 
 
 def test_gains_are_found_through_stereo(made):
-    np.testing.assert_allclose(made.gains, GAINS, rtol=0.01)
+    np.testing.assert_allclose(made.exposure_gains, GAINS, rtol=0.01)
 
 
 def test_the_scene_has_one_exposure_and_shows_places_between_better(made, uneven):
@@ -112,7 +112,7 @@ def test_the_scene_has_one_exposure_and_shows_places_between_better(made, uneven
 
 def test_each_photograph_is_what_is_drawn_times_its_gain(made):
     renderer = load_renderer("cpu")
-    for view, gain in zip(photographs(), made.gains, strict=True):
+    for view, gain in zip(photographs(), made.exposure_gains, strict=True):
         image = renderer.render(made.gaussians, view.camera).image
         assert psnr(gain * image, view.image) > 26
         assert psnr(image, view.normalize_exposure(gain).image) > 26

@@ -558,11 +558,11 @@ def test_without_a_gpu_cuda_is_refused_and_auto_is_the_cpu():
 class SlowDrawing(ReferenceRenderer):
     """The reference in the place of gsplat: it tries out which Gaussians leave a trace."""
 
-    def visible(self, gaussians, camera):
+    def find_visible(self, gaussians, camera):
         traces = [self.render(gaussians[i : i + 1], camera).alpha for i in range(len(gaussians))]
         return torch.tensor([bool(trace.any()) for trace in traces], dtype=torch.bool)
 
-    def plan(self, gaussians, camera):
+    def vary_opacities(self, gaussians, camera):
         return lambda opacities: self.render(replace(gaussians, opacities=opacities), camera)
 
 
@@ -618,7 +618,7 @@ def test_a_frozen_view_tells_what_it_shows_of_each_gaussian(name, freeze):
     layers = torch.rand(
         (CAMERA.height, CAMERA.width, 3), generator=torch.Generator().manual_seed(0)
     )
-    ours, truth = view.sums(layers), plain.backproject(layers)
+    ours, truth = view.backproject(layers), plain.backproject(layers)
     assert (ours - truth).abs().max() <= ROUNDING * truth.abs().max()
     assert truth.count_nonzero() > 0
     values = torch.rand(len(truth), generator=torch.Generator().manual_seed(1))

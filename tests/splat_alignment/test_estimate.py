@@ -113,7 +113,7 @@ def test_a_moderate_mismatch_is_noticed_and_mended(views, splat):
     larger = np.diag([1.2, 1.2, 1.2, 1.0])
     found = find(views, splat, larger)
     assert found.method == "similarity"
-    assert found.fit.psnr > found.given.psnr + 2
+    assert found.fit.psnr > found.given_fit.psnr + 2
     assert_takes_to(found.transform, larger, 0.03)
 
 

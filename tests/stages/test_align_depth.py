@@ -88,7 +88,7 @@ def checked(
     config: AlignmentConfig = CONFIG,
     reject_below: float | None = 0.15,
 ):
-    """What becomes of an affine that fits the anchor, where the target sees `context`."""
+    """Check an affine that fits the anchor at a target with the depths `context`."""
     random = torch.Generator().manual_seed(0)
     through_anchor = DepthAffine(scale, 0.0, 0.9, "ransac")
     return refit_at_target(
@@ -98,7 +98,7 @@ def checked(
 
 def test_an_affine_that_the_target_contradicts_is_fitted_there():
     affine = checked(1.2, depths() / 5)
-    assert affine.contradicted
+    assert affine.is_refitted_at_target
     assert affine.scale == pytest.approx(0.2, rel=0.01)
     assert affine.inliers > 0.9
 
@@ -118,7 +118,7 @@ def unlike() -> torch.Tensor:
 
 def test_where_no_affine_fits_what_the_target_sees_the_one_of_the_anchor_is_refuted():
     affine = checked(1.0, unlike())
-    assert (affine.is_rejected, affine.contradicted, affine.scale) == (True, False, 1.0)
+    assert (affine.is_rejected, affine.is_refitted_at_target, affine.scale) == (True, False, 1.0)
     assert 0 < affine.agreement < 0.1
     assert not checked(1.0, unlike(), reject_below=None).is_rejected
 

@@ -59,7 +59,7 @@ def half_a_room():
 
 def refined_by(added, frozen, reference, views, config=RefineConfig()):
     """Refine `added` at one camera, which also took the photographs."""
-    plan = frozen.plan(added)
+    plan = frozen.vary_opacities(added)
     return refine_opacities(added, plan, reference, [plan] * len(views), views, config)
 
 

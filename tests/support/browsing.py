@@ -60,9 +60,9 @@ class Tab:
         self.page.set_default_timeout(PATIENCE)
         self.requests: list[str] = []
         self.errors: list[str] = []
-        self.page.create("request", lambda request: self.requests.append(request.url))
-        self.page.create("pageerror", lambda error: self.errors.append(str(error)))
-        self.page.create(
+        self.page.on("request", lambda request: self.requests.append(request.url))
+        self.page.on("pageerror", lambda error: self.errors.append(str(error)))
+        self.page.on(
             "console",
             lambda said: self.errors.append(said.text) if said.type == "error" else None,
         )

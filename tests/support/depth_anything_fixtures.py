@@ -241,7 +241,7 @@ def metric_errors(network: MetricDepthAnything, case: Case) -> dict[str, float]:
     for hook in hooks:
         hook.remove()
     found = between(outputs.of, network) | {"depth_before_sky": predicted.depth}
-    out = {"depth": set_sky_depth(predicted.depth, predicted.solid), "sky": predicted.sky}
+    out = {"depth": set_sky_depth(predicted.depth, predicted.solid_mask), "sky": predicted.sky}
     stride = int(case.values["mid_stride"])
     return errors_of(found, case, "mid", stride) | errors_of(out, case, "out", stride)
 

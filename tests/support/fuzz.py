@@ -1,6 +1,6 @@
 """Mutated inputs of every kind, and the reactions of the commands.
 
-python tests/fuzz.py --count 1500 --seed 0
+python tests/support/fuzz.py --count 1500 --seed 0
 
 Each mutation runs in a fork of one interpreter that has imported everything, with limits of time
 and memory. Findings are a traceback, a signal, an exit code other than 0 and 2, an error of more

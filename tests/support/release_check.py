@@ -1,6 +1,6 @@
 """The wheel in empty environments, one for each Python that is named: `make release-check`.
 
-    python tests/release_check.py python3.10 python3.13 [--extras]
+    python tests/support/release_check.py python3.10 python3.13 [--extras]
 
 Each gets the wheel and what pip finds for it, a few GB with the torch that pip chooses; then the
 commands run in another folder, with nothing on the PATH but the environment: no compiler, no Node.
@@ -29,7 +29,7 @@ import sys
 from importlib import import_module
 from importlib.metadata import distribution
 from gscompleter.apps.commands.doctor import list_requirements
-for name in {requirement.name for requirement in required(sys.argv[1])}:
+for name in {requirement.name for requirement in list_requirements(sys.argv[1])}:
     paths = [path.parts for path in distribution(name).files]
     folders = {parts[0] for parts in paths if parts[1:] == ("__init__.py",)}
     alone = {parts[0][:-3] for parts in paths if len(parts) == 1 and parts[0].endswith(".py")}
@@ -63,7 +63,7 @@ def install(programs: Path, *words: str) -> None:
 
 
 def ran(programs: Path, folder: Path, *words: object) -> str:
-    """What a program of an environment prints when it runs in `folder`, which is its home, too."""
+    """Run a program of an environment in `folder`, its home, and return its output."""
     alone = {"PATH": str(programs), "HOME": str(folder), "LANG": "C.UTF-8"}
     bounds = {name: value for name, value in os.environ.items() if name.endswith("_NUM_THREADS")}
     command = [str(programs / str(words[0])), *map(str, words[1:])]
@@ -104,7 +104,7 @@ def check_extras(programs: Path, wheel: Path, folder: Path) -> Iterator[str]:
 
 
 def check(python: str, wheel: Path, with_extras: bool) -> bool:
-    """Everything with one Python, told line by line. Returns whether all went well."""
+    """Check everything with one Python, print a line each, and return True if all passed."""
     with tempfile.TemporaryDirectory() as name:
         folder = Path(name) / "elsewhere"
         folder.mkdir()

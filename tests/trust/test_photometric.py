@@ -137,7 +137,7 @@ def test_only_what_no_photograph_needs_is_set_aside():
 
 
 def test_shreds_give_way_to_what_belongs_there():
-    completion = knowing()(VIEWS[::2], TARGET, SCENE, witnesses=VIEWS[1:2])
+    completion = knowing()(VIEWS[::2], TARGET, SCENE, check_views=VIEWS[1:2])
     (result,) = completion.targets
     truth = view_of(Room(), TARGET).image
     assert result.hole_fraction > 0.1
@@ -167,7 +167,7 @@ def test_closing_a_hole_makes_up_for_nothing_that_was_good():
     unmended = AlignmentConfig(align_at="none"), RegistrationConfig(iterations=0)
     config = CompleterConfig(alignment=unmended[0], registration=unmended[1])
     completer = GSCompleter(NearReconstructor(), paint, config=config)
-    completion = completer(VIEWS[::2], TARGET, half, witnesses=VIEWS[1:2])
+    completion = completer(VIEWS[::2], TARGET, half, check_views=VIEWS[1:2])
     assert len(completion.targets[0].added) > 0
     gained = []
     for view, (seen, *_) in zip(completion.photos, completion.budgets, strict=True):
@@ -194,7 +194,7 @@ def test_what_is_added_is_drawn_only_where_it_counts(monkeypatch):
 
     monkeypatch.setattr(CpuFrozenScene, "vary_appearance", noted)
     half = SURFACES[SURFACES.means[:, 0] < 0.3]
-    completion = knowing()(VIEWS[::2], TARGET, half, witnesses=VIEWS[1:2])
+    completion = knowing()(VIEWS[::2], TARGET, half, check_views=VIEWS[1:2])
     *at_photographs, (at_target, holes) = asked
     assert len(at_photographs) == len(completion.photographs)
     assert all(where.all() for _, where in at_photographs)
@@ -211,13 +211,13 @@ def test_without_its_photographs_a_scene_is_taken_as_it_is():
 
 def test_unsupported_gaussians_may_be_kept():
     config = CompleterConfig(trust_settings=TrustConfig(prune=False))
-    completion = knowing(config)(VIEWS[::2], TARGET, SCENE, witnesses=())
+    completion = knowing(config)(VIEWS[::2], TARGET, SCENE, check_views=())
     assert completion.pruned is None
     assert torch.equal(completion.scene.means[: len(SCENE)], SCENE.means)
 
 
 def test_the_paper_doubts_nothing():
-    completion = knowing(CompleterConfig.paper())(VIEWS[::2], TARGET, SCENE, witnesses=())
+    completion = knowing(CompleterConfig.paper())(VIEWS[::2], TARGET, SCENE, check_views=())
     assert completion.observations is None
 
 
@@ -294,7 +294,7 @@ def complete(scene, splat, out, *more):
 @pytest.mark.parametrize("worth", [0, MIN_PROXY_GAUSSIANS], ids=["sorted", "as-given"])
 def test_the_command_sets_aside_and_strip_puts_back(tmp_path, monkeypatch, worth):
     """Restored to the byte, whether or not the scene was sorted in between."""
-    monkeypatch.setattr("gscompleter.apps.commands.complete.WORTH", worth)
+    monkeypatch.setattr("gscompleter.apps.commands.complete.MIN_PROXY_GAUSSIANS", worth)
     scene = photographed(tmp_path / "scene", [*PHOTOGRAPHS, TARGET])
     splat, out = tmp_path / "splat.ply", tmp_path / "out"
     save_ply(splat, SCENE)
@@ -348,7 +348,7 @@ def test_the_command_refuses_a_scene_that_does_not_fit(tmp_path, monkeypatch, ca
 
 @pytest.mark.parametrize("worth", [0, MIN_PROXY_GAUSSIANS], ids=["sorted", "as-given"])
 def test_rows_of_another_program_come_back_whole(tmp_path, monkeypatch, worth):
-    monkeypatch.setattr("gscompleter.apps.commands.complete.WORTH", worth)
+    monkeypatch.setattr("gscompleter.apps.commands.complete.MIN_PROXY_GAUSSIANS", worth)
     scene = photographed(tmp_path / "scene", [*PHOTOGRAPHS, TARGET])
     splat, out = labelled(tmp_path / "splat.ply", SCENE), tmp_path / "out"
     assert run(monkeypatch, *complete(scene, splat, out)) == 0

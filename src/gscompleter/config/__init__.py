@@ -244,7 +244,7 @@ class NextBestViewConfig(Settings):
 class CompleterConfig(Settings):
     """Settings of a completion.
 
-    The defaults are ours where measurements favour them over the paper's (`docs/design.md`).
+    The defaults are ours where measurements favour them over the paper's (`docs/method.md`).
     """
 
     margin: Annotated[float, Interval(ge=0, le=4)] = 0.25

@@ -40,7 +40,7 @@ from gscompleter.stages.context import normalize_exposures, sort_by_frame
 from gscompleter.types import View
 
 RETRIES = 2
-"""How often a task is repeated if its worker was killed."""
+"""Number of times a task is repeated if its worker was killed."""
 
 
 @dataclass(frozen=True)

@@ -5,7 +5,9 @@ mathematics is limited to `contract`: reordered sums (`reassoc`) would round dif
 process that compiles a kernel and in those that load it from the cache.
 """
 
+import os
 from contextlib import contextmanager
+from pathlib import Path
 
 from numba.np import linalg
 
@@ -26,6 +28,25 @@ def _skip_blas_check():
         if ensure_blas is not None:
             linalg.ensure_blas = ensure_blas
 
+
+def _remove_stale_indices():
+    """Remove cache indices older than their source, or without one.
+
+    They would be compiled again in any case, but numba fails to read one that names a type that
+    the source no longer has.
+    """
+    here = Path(__file__).parent
+    folders = [
+        here / "__pycache__",
+        *Path(os.environ.get("NUMBA_CACHE_DIR", here)).glob("kernels_*"),
+    ]
+    for index in [index for folder in folders for index in folder.glob("*.nbi")]:
+        source = here / f"{index.name.split('.')[0]}.py"
+        if not source.is_file() or source.stat().st_mtime > index.stat().st_mtime:
+            index.unlink(missing_ok=True)
+
+
+_remove_stale_indices()
 
 with _skip_blas_check():
     import numba.np.arraymath  # noqa: F401

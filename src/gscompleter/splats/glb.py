@@ -168,7 +168,7 @@ def _decode_primitive(document: GlbDocument, primitive: dict[str, Any]) -> Gauss
 
     count = document.table["accessors"][attributes["POSITION"]]["count"]
 
-    def named(name: str, kind: str = "VEC3") -> Float[ndarray, "n k"]:
+    def read_attribute(name: str, kind: str = "VEC3") -> Float[ndarray, "n k"]:
         if name not in attributes:
             raise InputError(f"{document.path} lacks the attribute {name} of its Gaussians.")
         accessor = document.table["accessors"][attributes[name]]
@@ -180,15 +180,15 @@ def _decode_primitive(document: GlbDocument, primitive: dict[str, Any]) -> Gauss
 
     degree = max(d for d in range(4) if d == 0 or f"{EXTENSION}:SH_DEGREE_{d}_COEF_0" in attributes)
     sh = [
-        named(f"{EXTENSION}:SH_DEGREE_{d}_COEF_{i}")
+        read_attribute(f"{EXTENSION}:SH_DEGREE_{d}_COEF_{i}")
         for d in range(degree + 1)
         for i in range(2 * d + 1)
     ]
     return build_gaussians(
-        named("POSITION"),
-        np.roll(named(f"{EXTENSION}:ROTATION", "VEC4"), 1, axis=1),
-        named(f"{EXTENSION}:SCALE"),
-        named(f"{EXTENSION}:OPACITY", "SCALAR")[:, 0],
+        read_attribute("POSITION"),
+        np.roll(read_attribute(f"{EXTENSION}:ROTATION", "VEC4"), 1, axis=1),
+        read_attribute(f"{EXTENSION}:SCALE"),
+        read_attribute(f"{EXTENSION}:OPACITY", "SCALAR")[:, 0],
         np.stack(sh, axis=1),
     )
 

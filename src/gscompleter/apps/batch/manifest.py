@@ -50,16 +50,16 @@ def read_manifest(manifest: str, common: Mapping[str, Any]) -> list[Job]:
 def resolve_paths(row: Mapping[str, Any], base: str) -> dict[str, Any]:
     """Make the paths of a row absolute; addresses and invalid values stay."""
 
-    def joined(value: Any) -> Any:
+    def join(value: Any) -> Any:
         path = isinstance(value, str) and value and not is_address(value)
         return os.path.join(base, value) if path else value
 
-    result = {key: joined(value) if key in PATHS else value for key, value in row.items()}
+    result = {key: join(value) if key in PATHS else value for key, value in row.items()}
     target, config = result.get("target"), result.get("config")
     if isinstance(target, str) and not re.fullmatch(r"[\d\s]*", target):
-        result["target"] = [joined(target)]
+        result["target"] = [join(target)]
     if isinstance(config, str) and config.endswith((".yaml", ".yml")):
-        result["config"] = joined(config)
+        result["config"] = join(config)
     return result
 
 

@@ -66,7 +66,7 @@ class Sources:
         """Stack images of any size; depth is in scene units, 0 if unknown."""
         h, w = (max(image.shape[axis] for image in images) for axis in (0, 1))
 
-        def padded(values: Tensor) -> Tensor:
+        def pad_to_size(values: Tensor) -> Tensor:
             below, right = h - values.shape[0], w - values.shape[1]
             return pad(values, ((0, 0) * (values.dim() - 2)) + (0, right, 0, below))
 
@@ -74,9 +74,9 @@ class Sources:
         farthest = max(depth.max().item() for depth in depths)
         logs = [torch.where(d > 0, d, farthest).clamp_min(1e-30).log() for d in depths]
         return Sources(
-            torch.stack([padded(image) for image in images]),
-            torch.stack([padded(v) for v in valid]),
-            torch.stack([padded(log) for log in logs]),
+            torch.stack([pad_to_size(image) for image in images]),
+            torch.stack([pad_to_size(v) for v in valid]),
+            torch.stack([pad_to_size(log) for log in logs]),
         )
 
 
@@ -143,12 +143,12 @@ def search_and_vote(
     target = (total[near_hole], queries, query_at, level.expected.numpy()[near_hole])
     costs = make_costs(usable.shape[1:])
 
-    def voted() -> Float32[ndarray, "p 3"]:
+    def vote_colors() -> Float32[ndarray, "p 3"]:
         return patchmatch.vote(query_at, votes, images, matches, shift)[0][~known]
 
     current = level.image.numpy().copy()
     if coarse_field is not None:
-        current[~known] = voted()
+        current[~known] = vote_colors()
     reach, passes = max(usable.shape), COARSEST_PASSES
     if coarse_field is not None:
         reach, passes = FINE_REACH, FINER_PASSES
@@ -158,7 +158,7 @@ def search_and_vote(
         )
         cost, shift = patchmatch.search(matched, costs, matches, passes, reach, seed + 31 * number)
         votes = weight[near_hole] * compute_likelihood(cost)
-        current[~known] = voted()
+        current[~known] = vote_colors()
     field = np.full((h, w, 3), -1, np.int64)
     field[near_hole] = matches
     return torch.from_numpy(current), field

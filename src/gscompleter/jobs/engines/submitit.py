@@ -67,7 +67,7 @@ class SubmititEngine:
             )
         except (ValueError, NameError, TypeError) as error:
             raise InputError(
-                f"A --slurm parameter is invalid: {quote_value(str(error))}; correct it."
+                f"A parameter of SLURM is invalid: {quote_value(str(error))}; correct it."
             ) from error
         return executor
 
