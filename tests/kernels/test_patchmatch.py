@@ -56,7 +56,7 @@ def plain_cost(found, number, match):
     mean = (weight * error).sum(axis=(0, 1)) / weight[..., 0].sum()
     bias = mean.clip(-COSTS.max_bias, COSTS.max_bias)
     cost = (weight * (error - bias) ** 2).sum() / weight[..., 0].sum()
-    nearer = max(found.expected[number] - found.log_depth[s, sy, sx], 0)
+    nearer = max(found.expected_log_depth[number] - found.log_depth[s, sy, sx], 0)
     away = np.hypot(sy - y, sx - x) / COSTS.diagonal
     prior = COSTS.depth_penalty * min(nearer**2, 1) + COSTS.distance_penalty * min(away, 1)
     return cost + COSTS.bias_penalty * (bias**2).sum() + prior, bias

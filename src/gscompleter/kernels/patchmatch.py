@@ -200,7 +200,7 @@ def _improve(begin, end, problem, costs, number, max_reach, seed, before, field,
                 continue
             if trial >= 0 and s == field[i, 0] and sy == field[i, 1] and sx == field[i, 2]:
                 continue
-            nearer = problem.expected[i] - problem.log_depth[s, sy, sx]
+            nearer = problem.expected_log_depth[i] - problem.log_depth[s, sy, sx]
             prior = _compute_prior(costs, nearer, sy - y, sx - x)
             if prior >= best:
                 continue
