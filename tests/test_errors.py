@@ -10,7 +10,7 @@ from gscompleter.data.chunks import open_chunks
 from gscompleter.data.colmap.binary import read_images
 from gscompleter.data.points import read_point_cloud
 from gscompleter.data.sfm.upright import write_upright
-from gscompleter.errors import InputError, join_names, join_numbers, quote_value, warn_deprecated
+from gscompleter.errors import InputError, join_names, join_numbers, quote_value
 from gscompleter.io.image import read_pixels
 from gscompleter.models.weights.reading import check_kind
 
@@ -106,14 +106,3 @@ def test_every_reader_tells_a_pointer_of_git_lfs_in_the_same_words(tmp_path):
             f"{pointer} is a git-lfs pointer, not the file itself; run `git lfs pull` in its "
             "repository to fetch it."
         )
-
-
-def old_name() -> None:
-    """Act as a public function under an old name."""
-    warn_deprecated("witnesses=", "check_views=")
-
-
-def test_a_deprecated_name_warns_its_caller_and_names_the_new_one():
-    sentence = "witnesses= is deprecated and stops working in the next release; use check_views="
-    with pytest.warns(DeprecationWarning, match=sentence):
-        old_name()

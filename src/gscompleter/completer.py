@@ -14,6 +14,7 @@ from torch import Tensor
 
 from gscompleter.config import CompleterConfig
 from gscompleter.config.settings import validate
+from gscompleter.deprecation import accept_old_keywords
 from gscompleter.errors import InputError
 from gscompleter.generators import Generator, ImageFunction, as_generator, load_generator
 from gscompleter.geometry import (
@@ -173,6 +174,7 @@ class GSCompleter:
             self.renderer, partial(thin_gaussians, max_gaussians=MAX_PREVIEW_GAUSSIANS)
         )
 
+    @accept_old_keywords(witnesses="check_views")
     def __call__(
         self,
         views: Sequence[View],
@@ -207,6 +209,7 @@ class GSCompleter:
         check_any_completed(completion)
         return completion
 
+    @accept_old_keywords(witnesses="check_views")
     def begin(
         self,
         views: Sequence[View],

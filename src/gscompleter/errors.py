@@ -1,7 +1,6 @@
 """Errors for the user, and the sentences that they hold."""
 
 import os
-import warnings
 from collections.abc import Iterable, Sequence
 from contextlib import suppress
 from itertools import pairwise
@@ -40,15 +39,6 @@ class InputError(ValueError):
 
 class OutputError(InputError):
     """An error while writing results, which affects all of them."""
-
-
-def warn_deprecated(old: str, new: str) -> None:
-    """Warn the caller of a function that used an old name of the public interface."""
-    warnings.warn(
-        f"{old} is deprecated and stops working in the next release; use {new}.",
-        DeprecationWarning,
-        stacklevel=3,
-    )
 
 
 def quote_value(value: object, length: int | None = None) -> str:

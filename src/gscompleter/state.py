@@ -11,10 +11,12 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
+from typing import ClassVar
 
 from jaxtyping import Bool, Float
 from torch import Tensor
 
+from gscompleter.deprecation import RenamedMembers
 from gscompleter.types import (
     Camera,
     DepthAffine,
@@ -42,8 +44,13 @@ class InitialContext:
 
 
 @dataclass(frozen=True)
-class TargetResult:
+class TargetResult(RenamedMembers):
     """Result of one target camera. No stage reads it."""
+
+    old_names: ClassVar[Mapping[str, str]] = {
+        "support": "trusted_alpha",
+        "refused": "refusal",
+    }
 
     target: Camera
     before: Render
@@ -78,8 +85,24 @@ class TargetResult:
 
 
 @dataclass(frozen=True)
-class Completion:
+class Completion(RenamedMembers):
     """A scene during completion; steps return a new value, and the old one serves as undo."""
+
+    old_names: ClassVar[Mapping[str, str]] = {
+        "drawn": "rendered_scene",
+        "drawn_context": "rendered_context",
+        "observed": "kept_context",
+        "begun": "context_renders",
+        "witnesses": "check_views",
+        "bystanders": "free_space_cameras",
+        "photographs": "photos",
+        "gains": "exposure_gains",
+        "evidence": "observations",
+        "set_aside": "pruned",
+        "removed": "pruned_mask",
+        "next_number": "next_target_id",
+        "ranged": "with_depth_range",
+    }
 
     rendered_scene: Gaussians
     """The context or its LOD proxy, without pruned Gaussians, then all generated ones."""

@@ -4,13 +4,14 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from typing import Protocol, runtime_checkable
+from typing import TYPE_CHECKING, Any, Protocol, runtime_checkable
 
 from jaxtyping import Float
 from torch import Tensor
 
 from gscompleter.config.generators import GeneratorSettings, get_settings_class
 from gscompleter.config.settings import validate
+from gscompleter.deprecation import resolve_old_name
 from gscompleter.errors import InputError
 from gscompleter.plugins import load_plugins
 from gscompleter.types import Camera, GeneratorInput, View
@@ -139,3 +140,9 @@ GENERATORS: dict[str, Callable[..., Generator]] = {
 
 PLUGINS = "gscompleter.generators"
 """Group of entry points that name further tables of this form."""
+
+if not TYPE_CHECKING:
+
+    def __getattr__(name: str) -> Any:
+        old = {"Synthesis": "GeneratorOutput", "Request": "GeneratorRequest"}
+        return resolve_old_name(__name__, name, old)
