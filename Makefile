@@ -76,7 +76,7 @@ gpu:
 	@nvidia-smi -L 2>/dev/null | grep -q '^GPU' || { \
 		echo 'make gpu needs an NVIDIA GPU, and nvidia-smi finds none on this machine.' >&2; exit 2; }
 	@start=$$(date +%s) && timeout $(GPU_SECONDS) $(MAKE) --no-print-directory $(GPU_VENV)/installed && \
-		PYTHONPATH=src:tests/support PATH="$(CURDIR)/$(GPU_VENV)/bin:$$PATH" $(GPU_VENV)/bin/python benchmarks/gpu.py \
+		PYTHONPATH=src:tests/support:tests/render PATH="$(CURDIR)/$(GPU_VENV)/bin:$$PATH" $(GPU_VENV)/bin/python benchmarks/gpu.py \
 		--seconds $$(($(GPU_SECONDS) + start - $$(date +%s)))
 
 $(GPU_VENV)/installed: pyproject.toml

@@ -86,8 +86,8 @@ class KnowingGenerator:
 class KnowingTogether(KnowingGenerator):
     """The same generator, for two targets at a time."""
 
-    at_once = 2
-    takes_margin = True
+    max_batch_size = 2
+    supports_padding = True
 
     def __init__(self) -> None:
         super().__init__()

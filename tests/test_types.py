@@ -58,7 +58,7 @@ def test_a_rotation_may_be_rounded_and_planes_may_be_unknown():
         ({"image": np.zeros((32, 32, 3))}, "no tensor of floats"),
         ({"depth": torch.zeros(16, 32)}, "The depth of a view has the shape"),
         (
-            {"ignored": torch.zeros(1, 1, dtype=torch.bool)},
+            {"ignore_mask": torch.zeros(1, 1, dtype=torch.bool)},
             "The ignore mask of a view has the shape",
         ),
     ],

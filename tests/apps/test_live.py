@@ -73,7 +73,7 @@ def test_undo_goes_back_and_the_same_camera_leads_to_the_same_scene(begun):
     one, result = complete_camera(begun, HOLES[0])
     two, _ = complete_camera(one, HOLES[1])
     assert result.hole_fraction > 0.1
-    assert len(begun.now.added) < len(one.latest.added) < len(two.latest.added)
+    assert len(begun.latest.added) < len(one.latest.added) < len(two.latest.added)
     assert undo_step(two) == one
     assert undo_step(undo_step(two)) == begun
     again, _ = complete_camera(undo_step(two), HOLES[1])
@@ -87,7 +87,7 @@ def test_there_is_nothing_to_undo_in_the_beginning(begun):
 
 
 def test_a_camera_that_adds_nothing_is_no_step(begun):
-    session, result = complete_camera(begun, begun.now.views[0].camera)
+    session, result = complete_camera(begun, begun.latest.views[0].camera)
     assert session is begun
     assert describe_outcome(result, 1.0) == "The target is a context view: nothing to complete."
 
@@ -179,7 +179,7 @@ def test_the_frames_that_were_chosen_are_named(room, tmp_path):
 
 
 def test_a_hole_is_found_where_something_is_missing(ready, begun):
-    camera = live.find_next_target(ready, begun.now)
+    camera = live.find_next_target(ready, begun.latest)
     assert camera is not None
     _, result = complete_camera(begun, camera)
     assert result.hole_fraction > 0.05
@@ -231,7 +231,7 @@ def test_an_error_is_a_sentence_and_ends_nothing(capsys):
 
 @pytest.fixture
 def page(begun) -> Iterator[Page]:
-    subject = PageServices(begun, begun.now.views, lambda _: None, lambda _: "Saved.")
+    subject = PageServices(begun, begun.latest.views, lambda _: None, lambda _: "Saved.")
     page = Page(subject, "127.0.0.1", 0)
     yield page
     page.close()
@@ -242,7 +242,7 @@ def test_what_was_generated_is_shown_tinted_or_hidden_and_undone(page, begun):
     assert "Completed" in page.complete(client, seen)
     assert len(page._targets) == 1
     shown = page._generated.buffer.copy()
-    assert len(shown) == len(page.session.now.added)
+    assert len(shown) == len(page.session.latest.added)
     page._generated_mode.value = "hide"
     assert page._generated is None
     page._generated_mode.value = "tint"
@@ -266,7 +266,7 @@ def test_photographs_near_a_camera_that_is_jumped_to_make_way(page):
 
 
 def test_what_is_said_stays_text(page):
-    page.say("<b>A</b> & B\nmore")
+    page.show_message("<b>A</b> & B\nmore")
     assert "<b>&lt;b&gt;A&lt;/b&gt; &amp; B</b><br>more" in page._status.content
 
 

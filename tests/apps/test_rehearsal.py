@@ -124,11 +124,11 @@ def test_warmup_says_what_it_did(marked, monkeypatch, capsys):
 def test_a_model_that_is_asked_for_is_begun_before_anything_is_known(tmp_path):
     """It runs in a process of its own, which stops its child."""
     begun = """
-from gscompleter import compilation
+from gscompleter.apps.warmup import compilation
 from gscompleter.apps.warmup.compilation import begin_compilation
-begin(["mvsplat"])
-begin(["plane-sweep", "another"])
-(process,) = compilation._begun.values()
+begin_compilation(["mvsplat"])
+begin_compilation(["plane-sweep", "another"])
+(process,) = compilation._started.values()
 print(process.args[-1:], process.poll(), process.pid)
 """
     environment = {**os.environ, "NUMBA_CACHE_DIR": str(tmp_path), "NUMBA_NUM_THREADS": "2"}

@@ -211,7 +211,7 @@ def test_rows_that_come_while_tables_are_written_get_into_them(finished, tmp_pat
     written = []
 
     def draw(summary, out, quiet):
-        written.append(len(summary.common))
+        written.append(len(summary.common_tasks))
         if len(written) == 1:
             late.rename(row)
 

@@ -61,7 +61,7 @@ class Window(Tab):
         return value
 
     def key(self, key: str, held: bool = False) -> None:
-        (self.page.keyboard.scale_y if held else self.page.keyboard.press)(key)
+        (self.page.keyboard.down if held else self.page.keyboard.press)(key)
         self.page.evaluate("gsc.settled()")
 
 
@@ -188,7 +188,7 @@ def test_keys_and_drags_do_what_the_page_says(bare):
     for drag, moves in (("orbit", True), ("fly", False)):
         bare.page.keyboard.press("r")
         bare.page.mouse.move(SIDE, SIDE / 2)
-        bare.page.mouse.scale_y()
+        bare.page.mouse.down()
         bare.page.mouse.move(SIDE + 20, SIDE / 2)
         bare.page.mouse.up()
         stats = bare.page.evaluate("gsc.stats()")

@@ -284,4 +284,4 @@ def test_what_moves_on_a_real_road_does_not_count(shared, tmp_path, monkeypatch,
     (bare / "lidar_box").mkdir(exist_ok=True)
     words = (*words, "--use-masks", "--out", tmp_path / "bare-out")
     assert run(monkeypatch, "evaluate", bare, *words) == 2
-    assert "neither masks nor boxes of what moves" in capsys.readouterr().err
+    assert "neither masks nor boxes of moving objects" in capsys.readouterr().err

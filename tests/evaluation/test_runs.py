@@ -225,7 +225,7 @@ def live(delay):
     if delay != "never":
         threading.Thread(target=die, args=(written(), delay), daemon=True).start()
     config = RunConfig(baseline_iterations=int(iterations))
-    evaluate(list(map(task_of, read_cases(Path(cases)))), methods.split(), Path(out), config)
+    evaluate(list(map(make_case_task, read_cases(Path(cases)))), methods.split(), Path(out), config)
     os._exit(0)
 
 for delay in delays:

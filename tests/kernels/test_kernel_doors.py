@@ -67,11 +67,11 @@ for odd in map(float, sys.argv[1:]):
         for column in range(4):
             transform = np.eye(3, 4, dtype=np.float32)
             transform[row, column] = odd
-            stereo.matching_costs(image, image, transform, planes, bands, 2, noise, detail)
+            stereo.compute_matching_costs(image, image, transform, planes, bands, 2, noise, detail)
             stereo.reproject(image[..., 0], image[..., 1], transform, transform)
             ran += 1
     odd_planes = np.full(6, odd, np.float32)
-    stereo.matching_costs(image, image, transform, odd_planes, bands, 2, noise, detail)
+    stereo.compute_matching_costs(image, image, transform, odd_planes, bands, 2, noise, detail)
 print(ran)
 """
 

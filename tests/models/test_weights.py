@@ -31,10 +31,10 @@ from gscompleter.models.weights import (
     PUBLISHED,
     PublishedWeights,
     WeightsNotAvailable,
-    cached,
     fetch,
+    find_cached,
+    get_cache_path,
     load_strictly,
-    place_of,
     read_state_dict,
 )
 from gscompleter.reconstructors import Reconstructor, load_reconstructor
@@ -114,7 +114,7 @@ def test_names_are_model_size_and_data_and_files_carry_them():
 
 
 def test_files_that_are_fetched_by_hand_do_not_meet_in_one_place():
-    places = [place_of(w) for w in PUBLISHED.values() if not w.name.endswith("-6view")]
+    places = [get_cache_path(w) for w in PUBLISHED.values() if not w.name.endswith("-6view")]
     assert len(set(places)) == len(places)
 
 
@@ -149,7 +149,7 @@ def test_what_lies_on_the_hub_has_an_address_and_what_does_not_has_a_page():
         "first 8 digits of SHA-256",
         "nothing",
     ]
-    assert replace(MVSPLAT, sha256="0" * 64).pinned_by == "SHA-256"
+    assert replace(MVSPLAT, sha256="0" * 64).integrity_check == "SHA-256"
 
 
 def test_every_file_without_a_plain_licence_says_why():
@@ -196,7 +196,7 @@ def test_a_local_file_or_the_folder_that_holds_it_is_taken_as_it_is(tmp_path: Pa
 
 @pytest.mark.parametrize("weights", [MVSPLAT, DEPTHSPLAT], ids=lambda w: w.name)
 def test_a_file_put_into_the_cache_by_hand_is_used(weights: PublishedWeights, home: Path):
-    place = place_of(weights)
+    place = get_cache_path(weights)
     assert place == home / "weights" / weights.model.lower() / weights.file
     place.parent.mkdir(parents=True)
     place.write_bytes(b"anything")
@@ -208,14 +208,19 @@ def test_the_cache_is_in_the_home_folder_unless_the_environment_says_otherwise(
 ):
     monkeypatch.delenv("GSCOMPLETER_HOME")
     folder = Path.home() / ".cache" / "gscompleter" / "weights"
-    assert place_of(MVSPLAT) == folder / "mvsplat" / "re10k.ckpt"
+    assert get_cache_path(MVSPLAT) == folder / "mvsplat" / "re10k.ckpt"
 
 
 def test_what_lies_on_google_drive_has_to_be_fetched_by_hand():
     with pytest.raises(WeightsNotAvailable, match="no automatic download") as caught:
         fetch(MVSPLAT)
     sentence = sentence_of(caught)
-    for part in ("mvsplat-re10k", "re10k.ckpt", MVSPLAT.source, str(place_of(MVSPLAT).parent)):
+    for part in (
+        "mvsplat-re10k",
+        "re10k.ckpt",
+        MVSPLAT.source,
+        str(get_cache_path(MVSPLAT).parent),
+    ):
         assert part in sentence
 
 
@@ -227,7 +232,7 @@ def test_without_the_hubs_package_the_sentence_says_what_to_install(
         fetch(DEPTHSPLAT)
     sentence = sentence_of(caught)
     assert DEPTHSPLAT.url in sentence
-    assert str(place_of(DEPTHSPLAT).parent) in sentence
+    assert str(get_cache_path(DEPTHSPLAT).parent) in sentence
 
 
 def hub_cache(
@@ -251,16 +256,16 @@ def hub_cache(
 
 
 def test_what_is_in_the_hubs_cache_is_found_without_a_connection(tmp_path: Path):
-    assert cached(DEPTHSPLAT) is None
+    assert find_cached(DEPTHSPLAT) is None
     link = hub_cache(tmp_path / "hub", DEPTHSPLAT, b"weights")
-    assert fetch(DEPTHSPLAT, offline=True) == cached(DEPTHSPLAT) == link
+    assert fetch(DEPTHSPLAT, offline=True) == find_cached(DEPTHSPLAT) == link
     assert link.read_bytes() == b"weights"
 
 
 def test_another_commit_in_the_hubs_cache_is_not_taken_for_the_pinned_one(tmp_path: Path):
     hub_cache(tmp_path / "hub", DEPTHSPLAT, b"weights")
-    assert cached(replace(DEPTHSPLAT, revision=COMMIT)) is not None
-    assert cached(replace(DEPTHSPLAT, revision=COMMIT[::-1])) is None
+    assert find_cached(replace(DEPTHSPLAT, revision=COMMIT)) is not None
+    assert find_cached(replace(DEPTHSPLAT, revision=COMMIT[::-1])) is None
 
 
 @pytest.mark.parametrize("by_environment", [False, True])
@@ -343,7 +348,7 @@ def test_a_download_lands_in_the_hubs_cache_and_is_read(tmp_path: Path, serve: C
     serve(weights, (tmp_path / "original.pth").read_bytes())
     path = fetch(weights)
     assert path.is_relative_to(tmp_path / "hub")
-    assert cached(weights) == path
+    assert find_cached(weights) == path
     load_strictly(network(), read_state_dict(path, weights), path)
 
 
@@ -662,7 +667,7 @@ def models(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str], 
 def test_models_are_listed_with_licence_and_place(
     monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ):
-    place = place_of(MVSPLAT)
+    place = get_cache_path(MVSPLAT)
     place.parent.mkdir(parents=True)
     place.write_bytes(b"anything")
     lines = models(monkeypatch, capsys).splitlines()
@@ -679,9 +684,9 @@ def test_models_are_listed_with_licence_and_place(
 def test_models_without_the_hubs_package_say_that_its_cache_was_not_seen(
     monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ):
-    assert "huggingface_hub is missing" not in models(monkeypatch, capsys)
+    assert "for lack of huggingface_hub" not in models(monkeypatch, capsys)
     monkeypatch.setitem(sys.modules, "huggingface_hub", None)
-    assert "huggingface_hub is missing" in models(monkeypatch, capsys)
+    assert "for lack of huggingface_hub" in models(monkeypatch, capsys)
 
 
 def test_models_as_json_say_everything(
@@ -693,7 +698,7 @@ def test_models_as_json_say_everything(
     small = rows["depthsplat-small-re10k"]
     assert (small["cached"], small["sha256"], small["views"]) == (str(link), "cfeab6b1", [2, 2])
     assert rows["mvsplat-acid"]["cached"] is None
-    assert rows["mvsplat-acid"]["place"] == str(place_of(PUBLISHED["mvsplat-acid"]))
+    assert rows["mvsplat-acid"]["place"] == str(get_cache_path(PUBLISHED["mvsplat-acid"]))
 
 
 def test_models_do_not_wait_for_torch():

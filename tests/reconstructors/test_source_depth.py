@@ -140,13 +140,13 @@ def tiny_glpn(folder: Path) -> Path:
 def test_other_networks_of_transformers_are_read_as_what_they_give(tiny, tmp_path, monkeypatch):
     pytest.importorskip("diffusers", reason="needs gscompleter[diffusion]")
     calls = []
-    for name in ("rescaled", "from_disparity"):
+    for name in ("rescale_depth", "convert_disparity"):
         fit = getattr(source_depth, name)
         monkeypatch.setattr(
             source_depth, name, lambda *a, name=name, fit=fit: calls.append(name) or fit(*a)
         )
     depth = load_source_depth(str(tiny(tmp_path)))(VIEW, holed())
-    assert calls == ["from_disparity" if tiny is tiny_dpt else "rescaled"]
+    assert calls == ["convert_disparity" if tiny is tiny_dpt else "rescale_depth"]
     assert depth.shape == (96, 96)
     assert (depth > 0).all()
 

@@ -104,7 +104,7 @@ def test_principal_axes_of_the_points_are_found_whatever_their_signs(views, spla
 
 
 def test_the_file_that_nerfstudio_leaves_is_taken(views, splat):
-    found = find(views, splat, ARBITRARY, left=[("dataparser", ARBITRARY)])
+    found = find(views, splat, ARBITRARY, trainer_frames=[("dataparser", ARBITRARY)])
     assert found.method == "dataparser"
     assert np.array_equal(found.transform, ARBITRARY)
 

@@ -187,7 +187,7 @@ def test_a_result_is_relative_to_an_origin_where_the_splat_lies_there(
     moved_by = load_ply(given).means - load_ply(out / "context.ply").means
     assert np.allclose(moved_by, frame["origin"], atol=1e-3)
     assert any(frame["origin"]) == any(place)
-    told = f"the result is relative to {' '.join(map(str, frame['origin']))};"
+    told = f"origin at {' '.join(map(str, frame['origin']))};"
     assert (told in capsys.readouterr().out) == any(place)
 
 

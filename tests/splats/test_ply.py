@@ -280,7 +280,7 @@ def test_a_file_that_cannot_be_written_leaves_the_old_one(tmp_path):
     path = saved(tmp_path, random_gaussians(5))
     before = path.read_bytes()
     code = (
-        "import resource, sys; sys.path.insert(0, 'tests')\n"
+        "import resource, sys; sys.path.insert(0, 'tests/support')\n"
         "from scenes import random_gaussians; from gscompleter import save_ply, InputError\n"
         "gaussians = random_gaussians(5000)\n"
         "resource.setrlimit(resource.RLIMIT_FSIZE, (4096, 4096))\n"

@@ -196,10 +196,10 @@ def test_what_is_added_is_drawn_only_where_it_counts(monkeypatch):
     half = SURFACES[SURFACES.means[:, 0] < 0.3]
     completion = knowing()(VIEWS[::2], TARGET, half, check_views=VIEWS[1:2])
     *at_photographs, (at_target, holes) = asked
-    assert len(at_photographs) == len(completion.photographs)
+    assert len(at_photographs) == len(completion.photos)
     assert all(where.all() for _, where in at_photographs)
     assert holes.float().mean() > 0.1
-    assert (at_target.context.alpha < 0.5)[holes].float().mean() > 0.9
+    assert (at_target.render.alpha < 0.5)[holes].float().mean() > 0.9
 
 
 def test_without_its_photographs_a_scene_is_taken_as_it_is():

@@ -11,7 +11,7 @@ from torch import Tensor
 
 from gscompleter.config.generators import GeneratorSettings, get_settings_class
 from gscompleter.config.settings import validate
-from gscompleter.deprecation import resolve_old_name
+from gscompleter.deprecation import resolve_old_name, warn_deprecated
 from gscompleter.errors import InputError
 from gscompleter.plugins import load_plugins
 from gscompleter.types import Camera, GeneratorInput, View
@@ -74,9 +74,24 @@ class FunctionGenerator:
         return [a if isinstance(a, GeneratorOutput) else GeneratorOutput(a) for a in answers]
 
 
+@dataclass(frozen=True)
+class RenamedGenerator:
+    """A generator whose class has the old member names."""
+
+    synthesize: Callable[[Sequence[GeneratorRequest]], list[GeneratorOutput]]
+    supports_padding: bool
+    max_batch_size: int
+
+
 def as_generator(phi: Generator | ImageFunction) -> Generator:
-    """Return `phi`, wrapped as a `Generator` if it is a plain function."""
-    return phi if isinstance(phi, Generator) else FunctionGenerator(phi)
+    """Return `phi`, wrapped as a `Generator` if it is a plain function or has the old members."""
+    if isinstance(phi, Generator):
+        return phi
+    old: Any = phi
+    if hasattr(old, "takes_margin"):
+        warn_deprecated("Generator.takes_margin, at_once", "supports_padding, max_batch_size")
+        return RenamedGenerator(old.synthesize, old.takes_margin, old.at_once)
+    return FunctionGenerator(phi)
 
 
 def load_generator(
