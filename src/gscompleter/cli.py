@@ -15,10 +15,10 @@ from typing import Annotated, Any, TextIO, Union
 import tyro
 
 from gscompleter import __version__
-from gscompleter.apps.commands.batch import BatchOptions
 from gscompleter.apps.commands.convert import ConvertOptions
 from gscompleter.apps.commands.doctor import DoctorOptions
 from gscompleter.apps.commands.options import (
+    BatchOptions,
     BenchOptions,
     CleanOptions,
     CompleteOptions,

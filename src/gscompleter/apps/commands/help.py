@@ -16,9 +16,9 @@ from tyro.constructors import (
     StructTypeInfo,
 )
 
-from gscompleter.apps.commands.batch import BatchOptions
 from gscompleter.apps.commands.generator_options import GeneratorOptions, make_generator_field
 from gscompleter.apps.commands.options import (
+    BatchOptions,
     BenchOptions,
     CleanOptions,
     CompleteOptions,

@@ -222,6 +222,34 @@ class EngineOptions(Options):
 
 
 @dataclass(frozen=True, kw_only=True)
+class BatchOptions(EngineOptions):
+    """Complete many scenes, on several processes or machines.
+
+    Run the same command again, also on other machines, to continue. A scene that cannot be
+    completed is listed with its reason. OUT contains a folder per scene in jobs/, table.csv and
+    index.html.
+    """
+
+    manifest: Annotated[str, tyro.conf.Positional, tyro.conf.arg(metavar="MANIFEST")]
+    """Scenes to complete: a .csv or .jsonl file with a row per scene, whose columns are `folder`
+    (SCENE), `name` and options of `complete`; or a folder of scenes. Paths are relative to the
+    manifest, or addresses such as s3://bucket/scene."""
+    out: str
+    """Folder or address for the results; a folder of an earlier run is continued."""
+    engine: EngineName = "local"
+    """Engine that runs the jobs: processes of this machine, Ray, or SLURM (submitit)."""
+    retries: Annotated[int, Interval(ge=0, le=100)] = 2
+    """Further attempts for a job that was killed or that failed unexpectedly."""
+    rerun: Literal["nothing", "failures"] = "nothing"
+    """Jobs of an earlier run to repeat: none, or those that failed."""
+    each: tuple[str, ...] = ()
+    """Options of `complete` for every row that does not set them, as in --each resolution=256."""
+    shard: str | None = None
+    """Run every n-th job from the i-th on, given as i/n with i from 0; `auto` takes both from a
+    SLURM array."""
+
+
+@dataclass(frozen=True, kw_only=True)
 class EvaluateOptions(ModelOptions, EngineOptions):
     """Run methods on cases with known target photographs, and score them.
 
