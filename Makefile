@@ -53,7 +53,9 @@ release-check: $(VENV)/installed-test
 	$(BIN)/python tests/support/release_check.py $(PYTHONS) --extras
 
 # Compares methods on every case of a cases.json: make evaluate CASES=path/to/cases.json METHODS=all
-CASES ?= ../shared/data/cases.json
+# Real photographs; tests on them are skipped where there are none.
+export GSCOMPLETER_DATA ?= $(abspath ../shared)
+CASES ?= $(GSCOMPLETER_DATA)/data/cases.json
 METHODS ?= context full paper
 RESULTS ?= results
 evaluate: $(VENV)/installed-evaluation

@@ -29,7 +29,7 @@ class ViewerLibraries(BuildHookInterface[Any]):
             build_data["force_include"][str(packed)] = place
 
     def fetched(self) -> Path | None:
-        """A file of the libraries; None, with a warning, where they cannot be had."""
+        """Return a file of the libraries; None, with a warning, where they cannot be had."""
         sys.path.insert(0, str(Path(self.root) / "src"))
         from gscompleter.apps.viewer.packages import write_libraries
         from gscompleter.errors import InputError

@@ -1,6 +1,6 @@
 """The default reconstructor on many photographs at once, and on merged pairs of them.
 
-    python benchmarks/bench_many_views.py ../shared/data/fox --views 4 8 16 32
+    python benchmarks/bench_many_views.py $GSCOMPLETER_DATA/data/fox --views 4 8 16 32
 
 Scores at 256 x 256 are for the given photographs and for those halfway between two of them, each
 with its best exposure gain per channel.
@@ -9,6 +9,7 @@ with its best exposure gain per channel.
 from __future__ import annotations
 
 import argparse
+import os
 import time
 from collections.abc import Callable, Sequence
 from dataclasses import replace
@@ -25,6 +26,7 @@ from gscompleter.reconstructors.features.depth_range import get_depth_range
 from gscompleter.reconstructors.plane_sweep import PlaneSweep
 from gscompleter.types import Gaussians, View, merge
 
+DATA = Path(os.environ.get("GSCOMPLETER_DATA", "../shared"))
 SIZE = 256, 256
 
 
@@ -89,7 +91,7 @@ def print_row(
 
 def main() -> None:
     parser = argparse.ArgumentParser(description="Photographs to Gaussians, of many views.")
-    parser.add_argument("scenes", nargs="*", type=Path, default=[Path("../shared/data/fox")])
+    parser.add_argument("scenes", nargs="*", type=Path, default=[DATA / "data" / "fox"])
     parser.add_argument("--views", nargs="+", type=int, default=[4, 8, 16])
     given = parser.parse_args()
     columns = ("scene", "", "views", "s", "s a view", "1000 Gaussians")

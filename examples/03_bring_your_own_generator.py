@@ -27,7 +27,7 @@ class Telea:
     def __call__(
         self, nearest: gsc.View, target: gsc.Camera, context: GeneratorInput
     ) -> GeneratorOutput:
-        """The image [h, w, 3] in [0, 1], and sentences for `notes` of the target."""
+        """Return the image [h, w, 3] in [0, 1], and sentences for `notes` of the target."""
         warped = warp_photographs(nearest, target, context)
         pixels = (255 * warped.image).byte().cpu().numpy()
         hole = (~warped.known).byte().cpu().numpy()

@@ -57,7 +57,7 @@ def on_a_circle(degrees: float) -> Camera:
 
 @pytest.fixture(scope="module")
 def completion() -> Completion:
-    """A room whose right half was added at a target beside the only photograph."""
+    """Return a room whose right half was added at a target beside the only photograph."""
     camera = camera_at(size=SIZE)
     view, context, right = half_a_room_of(Room(), camera)
     target = camera_at(0.4, yaw=6, size=SIZE)

@@ -86,7 +86,7 @@ class Page(HTMLParser):
 
 @pytest.fixture
 def out(completed_room, tmp_path) -> Path:
-    """A copy of a completion that tests may change."""
+    """Return a copy of a completion that tests may change."""
     return Path(shutil.copytree(completed_room, tmp_path / "out"))
 
 

@@ -76,7 +76,7 @@ def gaussians_in(page: Page, layer: str, folder: Path) -> Gaussians:
 
 @pytest.fixture
 def registry(tmp_path, monkeypatch) -> Path:
-    """The lock of a registry that is a folder, with a cache that is empty."""
+    """Return the lock of a registry that is a folder, with a cache that is empty."""
     monkeypatch.setenv("GSCOMPLETER_HOME", str(tmp_path / "home"))
     monkeypatch.setenv(REGISTRY_VARIABLE, (tmp_path / "registry").as_uri())
     files: dict[str, dict[str, str]] = {}
@@ -501,7 +501,7 @@ def test_without_a_file_to_save_to_the_page_is_served_and_opened(
 
 @pytest.fixture
 def port() -> Iterator[int]:
-    """The port of a server of a page with one part."""
+    """Return the port of a server of a page with one part."""
     with make_page_server(Page(b"<!doctype html>", {"my page.1.js": b"gscPart()"}, 0)) as server:
         thread = threading.Thread(target=server.serve_forever)
         thread.start()

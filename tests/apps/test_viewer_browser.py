@@ -72,7 +72,7 @@ def exhibit() -> ViewerContent:
 
 @pytest.fixture(scope="module")
 def saved(exhibit, libraries, tmp_path_factory) -> Path:
-    """The page as a file, in a folder whose name needs to be escaped."""
+    """Return the page as a file, in a folder whose name needs to be escaped."""
     path = tmp_path_factory.mktemp("a folder #1") / "page.html"
     path.write_bytes(make_page(exhibit, libraries).html)
     return path

@@ -20,7 +20,7 @@ NOISE = torch.rand(96, 96, 3, generator=torch.Generator().manual_seed(0))
 
 
 def observed() -> WarpedImage:
-    """The left half of the true image; the right half is unknown."""
+    """Return the left half of the true image; the right half is unknown."""
     image = torch.where(SEEN[..., None], TRUTH, torch.zeros_like(TRUTH))
     return WarpedImage(image, SEEN, torch.ones(96, 96), ())
 

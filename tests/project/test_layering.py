@@ -24,7 +24,7 @@ def room_of(path: Path) -> str:
 
 
 def imported_rooms(path: Path) -> Iterator[str]:
-    """The rooms that a file imports from, anywhere in it."""
+    """Return the rooms that a file imports from, anywhere in it."""
     for node in ast.walk(ast.parse(path.read_text())):
         if isinstance(node, ast.ImportFrom) and node.module == "gscompleter":
             yield from (alias.name for alias in node.names if alias.name != "__version__")

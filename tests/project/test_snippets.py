@@ -78,7 +78,7 @@ class Block:
 
 
 def blocks() -> Iterator[Block]:
-    """The blocks of all pages."""
+    """Return the blocks of all pages."""
     for page in PAGES:
         text = page.read_text()
         for found in re.finditer(r"^```(\w*)\n(.*?)^```$", text, re.M | re.S):
@@ -147,7 +147,7 @@ def test_commands_are_understood(block):
 
 @cache
 def options_of(command: str) -> set[str]:
-    """The names of the options of a command."""
+    """Return the names of the options of a command."""
     with pytest.MonkeyPatch.context() as patch:
         said: list[str] = []
         patch.setattr("sys.stdout.write", lambda text: said.append(text) or len(text))
@@ -184,14 +184,14 @@ def is_run(words: list[str]) -> bool:
 
 
 def ours(block: Block) -> list[list[str]]:
-    """The commands of a block that are run."""
+    """Return the commands of a block that are run."""
     return [
         words for program, *words in block.commands if program == "gscompleter" and is_run(words)
     ]
 
 
 def runnable() -> list[object]:
-    """The blocks with commands that are run; those that complete something are slow."""
+    """Return the blocks with commands that are run; those that complete something are slow."""
     found = [block for block in of("sh") if ours(block)]
     quick = [all(words[0] in FAST for words in ours(block)) for block in found]
     return [
@@ -211,14 +211,14 @@ def test_every_command_is_run_or_there_is_a_reason():
 
 @pytest.fixture(scope="module")
 def scene(tmp_path_factory) -> Path:
-    """A room with as many small photographs as the commands name."""
+    """Return a room with as many small photographs as the commands name."""
     cameras = [camera_at(-0.3 + 0.1 * n, yaw=n, size=SIDE) for n in range(FRAMES)]
     return photographed(tmp_path_factory.mktemp("snippets") / "SCENE", cameras)
 
 
 @pytest.fixture
 def sandbox(scene, completed_room, tmp_path, monkeypatch) -> Path:
-    """A folder with all that the commands name."""
+    """Return a folder with all that the commands name."""
     monkeypatch.chdir(tmp_path)
     monkeypatch.setattr(
         "gscompleter.apps.viewer.packages.load_libraries", lambda: Libraries({}, {})
@@ -245,7 +245,7 @@ def test_commands_run(block, sandbox, monkeypatch, capsys):
 
 
 def grey(nearest, target, context) -> torch.Tensor:
-    """The least of generators."""
+    """Return the least of generators."""
     return torch.full((target.height, target.width, 3), 0.5)
 
 

@@ -25,12 +25,12 @@ GAINS = EXPOSURES / EXPOSURES.log().mean(dim=0).exp()
 
 
 def even_views(size: int = SIZE) -> list[View]:
-    """Views of the cameras in one exposure."""
+    """Return views of the cameras in one exposure."""
     return [view_of(Room(), camera_at(x, size=size)) for x in PLACES]
 
 
 def photographs(size: int = SIZE) -> list[View]:
-    """The same views with individual exposures, clipped at white."""
+    """Return the same views with individual exposures, clipped at white."""
     return [
         replace(view, image=(view.image * exposure).clamp(0, 1))
         for view, exposure in zip(even_views(size), EXPOSURES, strict=True)

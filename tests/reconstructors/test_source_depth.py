@@ -26,7 +26,7 @@ HOLED[30:60, 30:60] = False
 
 
 def holed(unit: float = 1.0) -> Render:
-    """The room with a square hole in it."""
+    """Return the room with a square hole in it."""
     return Render(RENDER.image, unit * RENDER.depth * HOLED, RENDER.alpha * HOLED)
 
 

@@ -43,7 +43,7 @@ def pair(baseline: float = 0.4) -> list[View]:
 
 
 def pitched(view: View, degrees: float) -> View:
-    """The photograph with a pose rotated about the camera's horizontal axis."""
+    """Return the photograph with a pose rotated about the camera's horizontal axis."""
     angle = np.deg2rad(degrees)
     turn = torch.eye(4)
     turn[1, 1] = turn[2, 2] = float(np.cos(angle))

@@ -51,7 +51,7 @@ def views():
 
 @pytest.fixture(scope="module")
 def splat(views):
-    """The room as two of the photographs show it."""
+    """Return the room as two of the photographs show it."""
     return merge([gaussians_of(view) for view in (views[0], views[2])])
 
 

@@ -38,7 +38,7 @@ UTM = np.array([482_000.25, 5_458_000.5, 120.0])
 
 @pytest.fixture(scope="module")
 def splat():
-    """The room as two of its photographs show it."""
+    """Return the room as two of its photographs show it."""
     return merge([gaussians_of(view_of(Room(), CAMERAS[i])) for i in (0, 2)])
 
 

@@ -54,7 +54,7 @@ def test_what_was_saved_is_loaded_exactly_where_the_file_holds_it_linearly(tmp_p
 
 
 def test_any_bits_of_scale_and_opacity_survive_a_round_trip(tmp_path):
-    """exp and log, sigmoid and logit are no exact inverses in float32; the file's values stay."""
+    """Exponential and logarithm are no exact inverses in float32; the file's values stay."""
     n = 4000
     encoded = torch.randn(n, 4, generator=torch.Generator().manual_seed(0)) * 6
     path = saved(tmp_path, random_gaussians(n))

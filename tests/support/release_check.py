@@ -43,7 +43,7 @@ for name in {requirement.name for requirement in list_requirements(sys.argv[1])}
 
 
 def built(kind: str, folder: Path, root: Path = ROOT) -> Path:
-    """The `wheel` or `sdist` that is built of the sources in `root`."""
+    """Return the `wheel` or `sdist` that is built of the sources in `root`."""
     command = [sys.executable, "-m", "hatchling", "build", "-t", kind, "-d", str(folder)]
     subprocess.run(command, cwd=root, check=True, capture_output=True)
     (archive,) = folder.iterdir()
@@ -51,7 +51,7 @@ def built(kind: str, folder: Path, root: Path = ROOT) -> Path:
 
 
 def environment(python: str, folder: Path) -> Path:
-    """An empty environment in `folder`: the folder of its programs."""
+    """Return an empty environment in `folder`: the folder of its programs."""
     subprocess.run([python, "-m", "venv", "--without-pip", str(folder)], check=True)
     return folder / "bin"
 
@@ -73,7 +73,7 @@ def ran(programs: Path, folder: Path, *words: object) -> str:
 
 
 def check_answers(programs: Path, folder: Path) -> None:
-    """The version, and what `doctor` finds."""
+    """Return the version, and what `doctor` finds."""
     assert ran(programs, folder, "gscompleter", "--version").strip() == __version__
     found = json.loads(ran(programs, folder, "gscompleter", "doctor", "--json"))
     there = {(one["kind"], one["name"]): one["there"] for one in found}
@@ -83,7 +83,7 @@ def check_answers(programs: Path, folder: Path) -> None:
 
 
 def check_completion(programs: Path, folder: Path, scene: Path, *words: object) -> None:
-    """A completion, and a page that shows it."""
+    """Return a completion, and a page that shows it."""
     out = folder / "out"
     ran(programs, folder, "gscompleter", "complete", scene, *words, "--out", out, "--quiet")
     assert json.loads((out / "summary.json").read_text())["gaussians"]["added"] > 0

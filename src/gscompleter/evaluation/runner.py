@@ -116,7 +116,7 @@ def evaluate(
         out: Folder of results: new, or of an earlier call or another shard.
         config: Settings that determine the numbers; the same as in earlier calls.
         shard: (i, n) selects the tasks i, i + n, i + 2n, ….
-        again: Results of an earlier call to redo.
+        rerun: Results of an earlier call to redo.
         engine: Runs the jobs; simultaneous calls share the tasks.
 
     Raises:

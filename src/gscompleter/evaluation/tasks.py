@@ -53,7 +53,7 @@ def make_tasks(
         protocol: Chooses the frames.
         clip: The photographs.
         resolution: As in `PosedPhotographs.views`.
-        ignore_masked: True to ignore masked pixels of the photographs.
+        use_masks: True to ignore masked pixels of the photographs.
     """
     load = partial(load_clip_views, clip, resolution, use_masks)
     tasks = []

@@ -17,9 +17,9 @@ from gscompleter.render import OpacityRender
 from gscompleter.types import Gaussians, View
 
 
-def has_settled(losses: Sequence[float], min_fall: float) -> bool:
-    """Return True if the relative decrease of the last step is at most `min_fall`."""
-    return len(losses) > 1 and losses[-2] - losses[-1] <= min_fall * losses[-2]
+def has_settled(losses: Sequence[float], rel_tol: float) -> bool:
+    """Return True if the relative decrease of the last step is at most `rel_tol`."""
+    return len(losses) > 1 and losses[-2] - losses[-1] <= rel_tol * losses[-2]
 
 
 @use_one_torch_thread()

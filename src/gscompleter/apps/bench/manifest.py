@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
@@ -141,7 +142,7 @@ def _parse_growth(content: Any, cases: Mapping[str, BenchCase]) -> dict[str, tup
 def _parse_case(row: Any, folder: Path) -> BenchCase:
     return BenchCase(
         str(row["name"]),
-        folder / row["scene"],
+        folder / os.path.expandvars(row["scene"]),
         _parse_frames(row["context"]),
         _parse_frames(row["targets"]),
         _parse_size(row["resolution"]),

@@ -117,6 +117,7 @@ class JobCompleter:
     retries: int
 
     def __call__(self, job: Job) -> Outcome:
+        """Complete the scene of `job`."""
         from gscompleter.jobs.jobs import run_claimed
         from gscompleter.jobs.places import open_place
 

@@ -25,7 +25,7 @@ def load_strictly(
     Args:
         model: The network.
         state_dict: Parameters and buffers by their names in the network.
-        where: Origin of the tensors, for error messages.
+        origin: Origin of the tensors, for error messages.
         variants: Function that returns the shapes of all networks, to name the one that fits.
 
     Raises:
