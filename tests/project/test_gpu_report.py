@@ -124,10 +124,7 @@ def test_limits_leave_time_for_what_comes_after_the_build():
     assert {part.needs for part in gpu.PARTS.values()} == {"build", None}
 
 
-@pytest.mark.parametrize(
-    "part",
-    ["measure_build", "agreement", "measure_renderer", "measure_stages", "measure_models"],
-)
+@pytest.mark.parametrize("part", ["build", "agreement", "renderer", "stages", "models"])
 def test_every_part_gives_rows(part):
     rows = list(getattr(gpu, f"measure_{part}")(SMALL))
     assert rows

@@ -83,14 +83,13 @@ class RenamedGenerator:
     max_batch_size: int
 
 
-def as_generator(phi: Generator | ImageFunction) -> Generator:
-    """Return `phi`, wrapped as a `Generator` if it is a plain function or has the old members."""
+def as_generator(phi: Any) -> Generator:
+    """Return a `Generator`, wrapping an `ImageFunction` or a class with the old member names."""
     if isinstance(phi, Generator):
         return phi
-    old: Any = phi
-    if hasattr(old, "takes_margin"):
+    if hasattr(phi, "takes_margin"):
         warn_deprecated("Generator.takes_margin, at_once", "supports_padding, max_batch_size")
-        return RenamedGenerator(old.synthesize, old.takes_margin, old.at_once)
+        return RenamedGenerator(phi.synthesize, phi.takes_margin, phi.at_once)
     return FunctionGenerator(phi)
 
 
