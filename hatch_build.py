@@ -1,4 +1,4 @@
-"""What the build adds: the viewer's JavaScript, so that `view` has to fetch nothing."""
+"""Add the JavaScript of the viewer to the build, so that `view` fetches nothing."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from typing import Any
 from hatchling.builders.hooks.plugin.interface import BuildHookInterface
 
 PLACE = "gscompleter/apps/viewer/libraries.json"
-"""Where `gscompleter.apps.viewer.packages` looks for it in the wheel."""
+"""Path in the wheel that `gscompleter.apps.viewer.packages` reads."""
 
 
 class ViewerLibraries(BuildHookInterface[Any]):
