@@ -74,12 +74,15 @@ GENERATORS: dict[str, type[GeneratorSettings]] = {
     "diffusers-inpaint": DiffusersInpaintSettings,
 }
 
+PLUGINS = "gscompleter.generators"
+"""Group of entry points that name tables of further generators, from name to loader."""
+
 
 def get_settings_class(name: str) -> type[GeneratorSettings]:
     """Return the class of a generator's settings, or raise InputError for an unknown name."""
     if name in GENERATORS:
         return GENERATORS[name]
-    others = load_plugins("gscompleter.generators")
+    others = load_plugins(PLUGINS)
     if name in others:
         return GeneratorSettings
     raise InputError(

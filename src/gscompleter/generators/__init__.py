@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any, Protocol, runtime_checkable
 from jaxtyping import Float
 from torch import Tensor
 
-from gscompleter.config.generators import GeneratorSettings, get_settings_class
+from gscompleter.config.generators import PLUGINS, GeneratorSettings, get_settings_class
 from gscompleter.config.settings import validate
 from gscompleter.deprecation import resolve_old_name, warn_deprecated
 from gscompleter.errors import InputError
@@ -151,9 +151,6 @@ GENERATORS: dict[str, Callable[..., Generator]] = {
     "oracle": _load_oracle,
 }
 """Loader of each built-in generator: (settings, seed, true images, device) -> Φ."""
-
-PLUGINS = "gscompleter.generators"
-"""Group of entry points that name further tables of this form."""
 
 if not TYPE_CHECKING:
 

@@ -40,7 +40,8 @@ def _remove_stale_indices():
         here / "__pycache__",
         *Path(os.environ.get("NUMBA_CACHE_DIR", here)).glob("kernels_*"),
     ]
-    for index in [index for folder in folders for index in folder.glob("*.nbi")]:
+    indices = [index for folder in folders for index in folder.glob("*.nbi")]
+    for index in indices:
         source = here / f"{index.name.split('.')[0]}.py"
         if not source.is_file() or source.stat().st_mtime > index.stat().st_mtime:
             index.unlink(missing_ok=True)
