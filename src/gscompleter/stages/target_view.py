@@ -63,10 +63,10 @@ class TargetView:
         return torch.where(self.empty, 0.0, weight)
 
     @property
-    def candidate_mask(self) -> Bool[Tensor, "h w"]:
-        """Pixels that are lifted: near empty pixels, or all as in the paper."""
+    def candidate_mask(self) -> Bool[Tensor, "h w"] | None:
+        """Pixels that are lifted: near empty pixels, or None for all of the pair (paper)."""
         radius = self.state.config.holes.candidate_radius
-        return torch.ones_like(self.empty) if radius is None else dilate(self.empty, radius)
+        return None if radius is None else dilate(self.empty, radius)
 
     @property
     def anchor_view(self) -> View:
