@@ -125,7 +125,9 @@ class GSCompleter:
         Raises:
             InputError: Too few views, no baseline, or no view sees the scene.
         """
-        config = self.config or CompleterConfig.for_input(scene is not None and bool(check_views))
+        config = self.config or CompleterConfig.for_input(
+            scene is not None and check_views is not None
+        )
         with record_seconds() as seconds, timed_stage("context"):
             made = init_context(
                 self.reconstructor, views, scene, check_views or (), targets, self.renderer

@@ -193,7 +193,8 @@ class Completion(RenamedMembers):
     @cached_property
     def scene(self) -> Gaussians:
         """The context, bit for bit where it was not recoloured, then all added Gaussians."""
-        return merge([self.recolored_context, *self.parts[1:]])
+        parts = [self.recolored_context, *self.parts[1:]]
+        return merge(parts) if len(parts) > 1 else parts[0]
 
     @property
     def recolored_context(self) -> Gaussians:

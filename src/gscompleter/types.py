@@ -430,7 +430,7 @@ class DepthAffine(RenamedMembers):
     """Fraction of the target image over which that was checked."""
     is_refitted_at_target: bool = False
     """True if the fit at the anchor was replaced by one at the target."""
-    pairs: DepthPairs = field(default_factory=lambda: DepthPairs.empty(), repr=False)
+    pairs: DepthPairs = field(default_factory=lambda: DepthPairs.empty(), repr=False, compare=False)
     """A sample of the compared depths, for the report."""
 
 

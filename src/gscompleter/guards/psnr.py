@@ -227,7 +227,8 @@ def is_mostly_faded(
     added: Float[Tensor, "n"], left: Float[Tensor, "n"], config: PsnrGuardConfig = PsnrGuardConfig()
 ) -> bool:
     """Return True if added Gaussians lost more than `max_opacity_loss` of their opacity."""
-    return 1 - (left.sum() / added.sum().clamp_min(1e-12)).item() > config.max_opacity_loss
+    lost = added.sum() - left.sum()
+    return lost.item() > config.max_opacity_loss * added.sum().item()
 
 
 def select_fewest(relief: Float[Tensor, "n"], needed: float) -> Bool[Tensor, "n"]:

@@ -7,7 +7,7 @@ everywhere, right or wrong, so there the photographs decide.
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Protocol
+from typing import Protocol, runtime_checkable
 
 import torch
 from jaxtyping import Float, Int
@@ -28,6 +28,7 @@ class HeldViews:
     """Weight of a pixel of each view, against one of the synthesized image."""
 
 
+@runtime_checkable
 class Trust(Protocol):
     """Trust in [0, 1] of each Gaussian of the context; added Gaussians always have 1."""
 
