@@ -73,6 +73,11 @@ def smooth_masked(
     return totals[..., :-1] / totals[..., -1:].clamp_min(1e-8)
 
 
+def blur_gaussian(values: Float[Tensor, "h w *c"], sigma: float) -> Float[Tensor, "h w *c"]:
+    """Blur an image by a Gaussian of standard deviation `sigma` in pixels."""
+    return torch.from_numpy(cv2.GaussianBlur(values.cpu().numpy(), (0, 0), sigma)).to(values)
+
+
 def dilate(mask: Bool[Tensor, "h w"], radius: int) -> Bool[Tensor, "h w"]:
     """Dilate `mask` by a square of 2 radius + 1 pixels."""
     side, grown = 2 * radius + 1, mask[None, None].float()

@@ -267,6 +267,7 @@ class CompleterConfig(Settings):
         return CompleterConfig(
             trust="photometric",
             guards=("image-agreement", "free-space", "psnr"),
+            margin=0.0,
             psnr_guard=PsnrGuardConfig(max_drop=0.0),
         )
 

@@ -38,6 +38,8 @@ class GeneratorOutput:
     """Sentences about the image for a reader of the results."""
     is_inconsistent: bool = False
     """True if the image does not show the scene of the photographs."""
+    is_photograph: bool = False
+    """True if the image is a true photograph, which may recolour all that it shows."""
 
 
 @runtime_checkable

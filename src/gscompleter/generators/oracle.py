@@ -26,7 +26,10 @@ class Oracle:
 
     def synthesize(self, requests: Sequence[GeneratorRequest]) -> list[GeneratorOutput]:
         """Return the photographs of the targets."""
-        return [GeneratorOutput(self.find_photograph(request.target)) for request in requests]
+        return [
+            GeneratorOutput(self.find_photograph(request.target), is_photograph=True)
+            for request in requests
+        ]
 
     def find_photograph(self, target: Camera) -> Float[Tensor, "h w 3"]:
         """Find the photograph of `target`; raise InputError if there is none."""

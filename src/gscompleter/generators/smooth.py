@@ -15,6 +15,15 @@ BLUR_SIGMA = 1.5
 """Standard deviation of the blur of each pyramid level, in its pixels."""
 SIGMA_PER_DISTANCE = 0.7
 """Standard deviation of the averaging, relative to the distance to known pixels."""
+MEANS_SIDE = 160
+"""Longer side of the small image in which trusted colours are averaged, in pixels."""
+FIRST_SIGMA, NUM_SCALES = 5.0, 5
+"""Standard deviation of the finest mean in that image, and number of scales, each of twice it."""
+COARSER_WEIGHT = 0.02
+"""Weight of each scale relative to the next finer one, so that it counts only where that is
+empty."""
+MIN_TRUST = 0.1
+"""Weight of a pixel without trust, relative to a trusted one."""
 
 
 def compute_distance_to_known(known: Bool[Tensor, "h w"]) -> Float[Tensor, "h w"]:
@@ -53,3 +62,23 @@ def build_sum_pyramid(weighted: Float32[ndarray, "h w c"]) -> list[Float32[ndarr
         # OpenCV averages at most four channels of odd sizes, so they are resized one by one.
         planes = [cv2.resize(p, half, interpolation=cv2.INTER_AREA) for p in cv2.split(blurred)]
         weighted = np.stack(planes, axis=-1)
+
+
+def average_trusted(
+    image: Float[Tensor, "h w 3"], trust: Float[Tensor, "h w"]
+) -> Float[Tensor, "h w 3"]:
+    """Average the colours of an image around each pixel by trust in [0, 1], at several scales.
+
+    Such a normalized convolution has no structure that could be wrong.
+    """
+    height, width = trust.shape
+    scale = min(1.0, MEANS_SIDE / max(height, width))
+    size = max(round(scale * width), 1), max(round(scale * height), 1)
+    weight = MIN_TRUST + (1 - MIN_TRUST) * trust.cpu().numpy()
+    layers = np.concatenate([image.cpu().numpy() * weight[..., None], weight[..., None]], axis=-1)
+    small = cv2.resize(layers, size, interpolation=cv2.INTER_AREA)
+    total = np.zeros_like(small)
+    for level in range(NUM_SCALES):
+        total += COARSER_WEIGHT**level * cv2.GaussianBlur(small, (0, 0), FIRST_SIGMA * 2**level)
+    means = cv2.resize(total[..., :3] / total[..., 3:], (width, height))
+    return torch.from_numpy(means).to(image)

@@ -19,6 +19,7 @@ from gscompleter.cpu_threads import use_one_torch_thread
 from gscompleter.kernels.parallel import map_in_parallel
 from gscompleter.render import ColorErrors, FrozenScene, Renderer
 from gscompleter.render.spherical_harmonics import evaluate_sh_basis
+from gscompleter.stages.synthesize import GeneratedView
 from gscompleter.stages.target_view import TargetView
 from gscompleter.state import Completion
 from gscompleter.timing import timed_stage
@@ -45,24 +46,26 @@ class Recolored:
 
 
 @timed_stage("integrate")
-def recolor(reference: View, view: TargetView) -> Recolored:
-    """Recolour what covers the target without being trusted, and trust it from there on."""
-    state, camera, weight = view.state, view.camera.padded, view.distrust
-    if not weight.any():
-        return Recolored(state, view.frozen, 0)
-    config, context = state.config.recolor, state.parts[0]
+def recolor(reference: GeneratedView, view: TargetView) -> Recolored:
+    """Recolour what covers the target without being trusted, and trust it from there on.
+
+    A true photograph may recolour all that it shows: other photographs hold what they show.
+    """
+    state, camera, context = view.state, view.camera.padded, view.state.parts[0]
     found = fit_colors(
         merge(state.parts),
         view.frozen,
         reference,
-        weight,
-        state.trust.hold(config.hold_weight),
+        torch.ones_like(view.distrust) if reference.is_photograph else view.distrust,
+        state.trust.held,
         view.scenes.renderer,
-        config,
+        state.config.recolor,
     )
+    if len(found.rows) == 0:
+        return Recolored(state, view.frozen, 0)
     generated = context.generated.index_fill(0, found.rows, state.next_target_id)
     context = replace(found.apply(context), generated=generated)
-    parts, trust = (context, *state.parts[1:]), state.trust.accept(view.frozen, camera, weight)
+    parts, trust = (context, *state.parts[1:]), state.trust.accept(view.frozen, camera, found.rows)
     frozen = view.scenes.freeze(parts, camera)
     return Recolored(replace(state, parts=parts, trust=trust), frozen, len(found.rows))
 

@@ -26,6 +26,8 @@ class GeneratedView(View):
     """One sentence each, for the results."""
     is_inconsistent: bool = False
     """True if the image is photometrically inconsistent with the photographs."""
+    is_photograph: bool = False
+    """True if the image is a true photograph."""
 
     def crop(self, camera: PaddedCamera) -> View:
         """Cut the padding off the image."""
@@ -55,5 +57,9 @@ def convert_output(output: GeneratorOutput, target: Camera) -> GeneratedView:
             f"got {tuple(output.image.shape)}"
         )
     return GeneratedView(
-        output.image, target, notes=output.notes, is_inconsistent=output.is_inconsistent
+        output.image,
+        target,
+        notes=output.notes,
+        is_inconsistent=output.is_inconsistent,
+        is_photograph=output.is_photograph,
     )

@@ -6,13 +6,12 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
 
-import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
 from gscompleter.config import HoleConfig
 from gscompleter.geometry import is_same_camera, shrink_camera
-from gscompleter.image_ops import dilate
+from gscompleter.image_ops import blur_gaussian, dilate
 from gscompleter.render import FrozenScene
 from gscompleter.render.cache import SceneRenderer
 from gscompleter.sky import mask_out_sky
@@ -20,10 +19,12 @@ from gscompleter.stages.select_anchor import AnchorChoice, compute_overlap, sele
 from gscompleter.state import Completion
 from gscompleter.types import Camera, GeneratorInput, PaddedCamera, Render, View
 
-FULL_TRUST = 0.85
+FULL_TRUST = 1.0
 """Mean trust of what a pixel shows from which on it is not recoloured."""
-NO_TRUST = 0.45
+NO_TRUST = 0.6
 """Mean trust up to which a pixel takes the synthesized colour."""
+DISTRUST_BLUR = 2 / 320
+"""Standard deviation of the blur of that weight, relative to the longer side of the image."""
 
 
 @dataclass(frozen=True)
@@ -55,12 +56,13 @@ class TargetView:
         """Hole mask M_hole of Eq. 12, before dilation: Gaussians are added here."""
         return compute_hole_mask(self.render.alpha, self.state.config.holes)
 
-    @property
+    @cached_property
     def distrust(self) -> Float[Tensor, "h w"]:
         """Weight in [0, 1] with which covered pixels take the synthesized colour."""
         trust = self.alpha / self.render.alpha.clamp_min(1e-6)
         weight = ((FULL_TRUST - trust) / (FULL_TRUST - NO_TRUST)).clamp(0, 1)
-        return torch.where(self.empty, 0.0, weight)
+        weight = blur_gaussian(weight.where(~self.empty, 0.0), DISTRUST_BLUR * max(weight.shape))
+        return weight.where(~self.empty, 0.0)
 
     @property
     def candidate_mask(self) -> Bool[Tensor, "h w"] | None:
@@ -107,7 +109,7 @@ class TargetView:
             return self.refusal
         if any(is_same_camera(self.camera.target, view.camera) for view in self.state.views):
             return "The target is a context view: nothing to complete."
-        if not self.camera.crop(self.holes).any():
+        if not self.camera.crop(self.holes | (self.distrust > 0)).any():
             return "The scene has no hole here: nothing to complete."
         return ""
 

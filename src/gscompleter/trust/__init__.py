@@ -10,7 +10,7 @@ from dataclasses import dataclass
 from typing import Protocol, runtime_checkable
 
 import torch
-from jaxtyping import Float, Int
+from jaxtyping import Float, Int, Int64
 from torch import Tensor
 
 from gscompleter.render import FrozenScene
@@ -27,6 +27,14 @@ class HeldViews:
     weights: Float[Tensor, "v"]
     """Weight of a pixel of each view, against one of the synthesized image."""
 
+    def add(self, camera: Camera, sums: Float[Tensor, "m"]) -> HeldViews:
+        """Hold one more view, with weight 1."""
+        return HeldViews(
+            torch.cat([self.centers, camera.center.to(self.centers)[None]]),
+            torch.cat([self.sums, sums[None]]),
+            torch.cat([self.weights, self.weights.new_ones(1)]),
+        )
+
 
 @runtime_checkable
 class Trust(Protocol):
@@ -35,14 +43,15 @@ class Trust(Protocol):
     def compute_alpha(self, frozen: FrozenScene, camera: Camera) -> Float[Tensor, "h w"]:
         """Render accumulated opacity with every Gaussian weighted by its trust."""
 
-    def accept(self, frozen: FrozenScene, camera: Camera, weight: Float[Tensor, "h w"]) -> Trust:
-        """Trust what a completed target shows as far as `weight`, like one more photograph."""
-
-    def hold(self, photo_weight: float) -> HeldViews:
-        """Return the photographs, with a weight, and completed targets, with weight 1."""
+    def accept(self, frozen: FrozenScene, camera: Camera, rows: Int64[Tensor, "r"]) -> Trust:
+        """Trust recoloured rows, and hold all colours in the direction of a completed target."""
 
     def thin(self, rows: Int[Tensor, "r"], growth: Float[Tensor, "r"]) -> Trust:
         """Restrict to rows that stand for their neighbours, each enlarged by a factor."""
+
+    @property
+    def held(self) -> HeldViews:
+        """Views in which recolouring keeps the colours of the context."""
 
 
 @dataclass(frozen=True)
@@ -53,16 +62,15 @@ class FullTrust:
         """Return the rendered alpha itself."""
         return frozen.render.alpha
 
-    def accept(
-        self, frozen: FrozenScene, camera: Camera, weight: Float[Tensor, "h w"]
-    ) -> FullTrust:
+    def accept(self, frozen: FrozenScene, camera: Camera, rows: Int64[Tensor, "r"]) -> FullTrust:
         """Return the same trust."""
         return self
-
-    def hold(self, photo_weight: float) -> HeldViews:
-        """Return no views, as nothing is ever recoloured."""
-        return HeldViews(torch.empty(0, 3), torch.empty(0, 0), torch.empty(0))
 
     def thin(self, rows: Int[Tensor, "r"], growth: Float[Tensor, "r"]) -> FullTrust:
         """Return the same trust."""
         return self
+
+    @property
+    def held(self) -> HeldViews:
+        """Return views of no Gaussian, so that none is recoloured."""
+        return HeldViews(torch.empty(0, 3), torch.empty(0, 0), torch.empty(0))

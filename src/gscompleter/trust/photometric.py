@@ -14,7 +14,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 import torch
-from jaxtyping import Float, Int
+from jaxtyping import Bool, Float, Int, Int64
 from torch import Tensor
 from torch.nn.functional import avg_pool2d, pad
 
@@ -58,17 +58,17 @@ class PhotometricTrust:
     """Trust of a Gaussian as far as photographs from similar directions confirm its colour."""
 
     observations: PhotoObservations
-    """In the photographs, then in completed targets."""
-    cameras: tuple[Camera, ...]
-    """Of the observations."""
-    num_photos: int
+    held: HeldViews
+    """The photographs, then completed targets."""
+    is_recolored: Bool[Tensor, "m"]
+    """True for Gaussians that a completed target recoloured; these are trusted."""
     config: TrustConfig
 
     def compute_weights(self, frozen: FrozenScene, camera: Camera) -> Float[Tensor, "n"]:
         """Compute the trust of every Gaussian; added and invisible ones have 1."""
         sums, count = sum_weights(frozen), len(self.observations.means)
         trust = compute_trust(self.observations, sums[:count], camera, self.config)
-        return pad(trust, (0, len(sums) - count), value=1.0)
+        return pad(torch.where(self.is_recolored, 1.0, trust), (0, len(sums) - count), value=1.0)
 
     def compute_alpha(self, frozen: FrozenScene, camera: Camera) -> Float[Tensor, "h w"]:
         """Render accumulated opacity with every Gaussian weighted by its trust."""
@@ -76,33 +76,23 @@ class PhotometricTrust:
         return torch.minimum(trusted, frozen.render.alpha)
 
     def accept(
-        self, frozen: FrozenScene, camera: Camera, weight: Float[Tensor, "h w"]
+        self, frozen: FrozenScene, camera: Camera, rows: Int64[Tensor, "r"]
     ) -> PhotometricTrust:
-        """Trust what a completed target shows as far as `weight`, like one more photograph."""
-        seen = self.observations
-        area, agreement = measure_agreement(frozen, seen.means, camera, weight)
-        more = PhotoObservations(
-            seen.means,
-            torch.cat([seen.centers, camera.center[None]]),
-            torch.cat([seen.areas, area[None]]),
-            torch.cat([seen.agreement, agreement[None]]),
+        """Trust recoloured rows, and hold all colours in the direction of a completed target."""
+        sums = sum_weights(frozen)[: len(self.is_recolored)]
+        return replace(
+            self,
+            held=self.held.add(camera, sums),
+            is_recolored=self.is_recolored.index_fill(0, rows, True),
         )
-        return replace(self, observations=more, cameras=(*self.cameras, camera))
-
-    def hold(self, photo_weight: float) -> HeldViews:
-        """Return the photographs, with a weight, and completed targets, with weight 1."""
-        seen = self.observations
-        pixels = torch.stack([compute_pixel_areas(seen.means, camera) for camera in self.cameras])
-        weights = torch.ones(len(pixels)).to(seen.means)
-        weights[: self.num_photos] = photo_weight
-        return HeldViews(seen.centers, seen.areas / pixels.clamp_min(1e-30), weights)
 
     def thin(self, rows: Int[Tensor, "r"], growth: Float[Tensor, "r"]) -> PhotometricTrust:
         """Restrict to rows that stand for their neighbours, each enlarged by a factor."""
         seen = self.observations
         areas, agreement = seen.areas[:, rows] * growth**2, seen.agreement[:, rows]
         thinned = PhotoObservations(seen.means[rows], seen.centers, areas, agreement)
-        return replace(self, observations=thinned)
+        held = replace(self.held, sums=self.held.sums[:, rows])
+        return replace(self, observations=thinned, held=held, is_recolored=self.is_recolored[rows])
 
 
 def load_trust(
@@ -117,7 +107,12 @@ def load_trust(
     cameras = tuple(view.camera for view in views)
     frozen, settings = scenes.freeze_at(parts, cameras), config.trust_settings
     observations = gather_observations(parts[0], views, frozen, settings)
-    return PhotometricTrust(observations, cameras, len(cameras), settings)
+    pixels = torch.stack([compute_pixel_areas(observations.means, camera) for camera in cameras])
+    sums = observations.areas / pixels.clamp_min(1e-30)
+    weights = sums.new_full((len(cameras),), config.recolor.hold_weight)
+    held = HeldViews(observations.centers, sums, weights)
+    is_recolored = torch.zeros(len(parts[0]), dtype=torch.bool, device=sums.device)
+    return PhotometricTrust(observations, held, is_recolored, settings)
 
 
 def compute_pixel_areas(means: Float[Tensor, "m 3"], camera: Camera) -> Float[Tensor, "m"]:

@@ -13,7 +13,7 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
-from gscompleter.generators.smooth import compute_distance_to_known
+from gscompleter.generators.smooth import average_trusted, compute_distance_to_known
 from gscompleter.generators.warp import (
     WarpedImage,
     add_unexplained,
@@ -41,7 +41,22 @@ class WarpInpaint:
     def __call__(
         self, nearest: View, target: Camera, context: GeneratorInput
     ) -> Float[Tensor, "h w 3"]:
-        """Synthesize the complete image of `target`, in [0, 1]."""
+        """Synthesize the complete image of `target`, in [0, 1].
+
+        What covers the target without being trusted gets smooth colours, which cannot be wrong in
+        structure.
+        """
+        image = self.fill_holes(nearest, target, context)
+        render, trusted_alpha = context.target_render, context.trusted_alpha
+        if trusted_alpha is None or trusted_alpha is render.alpha:
+            return image
+        means = average_trusted(render.image.clamp(0, 1), trusted_alpha)
+        return torch.where((render.alpha < context.max_alpha)[..., None], image, means)
+
+    def fill_holes(
+        self, nearest: View, target: Camera, context: GeneratorInput
+    ) -> Float[Tensor, "h w 3"]:
+        """Synthesize the image of `target` from warped photographs and patches."""
         warped = warp_photographs(nearest, target, context)
         if not warped.known.any():
             # The target observes nothing, so there is no border to continue.
