@@ -7,61 +7,51 @@ SCENE is what `gscompleter complete` takes; the numbers are two context frames a
 """
 
 import sys
-from dataclasses import replace
 
 import torch
 
 import gscompleter as gsc
-from gscompleter.stages.context import find_depth_range, init_context
-from gscompleter.stages.filter_holes import compute_hole_mask, filter_holes
-from gscompleter.stages.refine import refine_opacities
-from gscompleter.stages.select_anchor import lift, select_anchor, synthesize
-from gscompleter.stages.slide_along_rays import register
-from gscompleter.types import GeneratorInput
+from gscompleter.geometry import pad_camera
+from gscompleter.render.cache import SceneRenderer
+from gscompleter.stages.align_depth import align_depth
+from gscompleter.stages.filter_holes import filter_holes
+from gscompleter.stages.lift import lift
+from gscompleter.stages.refine import refine
+from gscompleter.stages.slide_along_rays import slide_along_rays
+from gscompleter.stages.synthesize import synthesize
+from gscompleter.stages.target_view import compute_hole_mask, render_target
 
 
 def main() -> None:
     scene, first, second, number = sys.argv[1], *map(int, sys.argv[2:5])
     psi, phi = gsc.load_reconstructor("plane-sweep"), gsc.load_generator("warp-inpaint")
-    renderer = gsc.load_renderer("cpu")
-
-    views = gsc.load_views(scene, frames=[first, second], resolution=256)
-    near, far = find_depth_range(views, None, renderer)
-    views = gsc.load_views(scene, frames=[first, second], resolution=256, near=near, far=far)
-    target = gsc.load_camera(scene, frame=number, resolution=256, near=near, far=far)
+    config = gsc.CompleterConfig.paper()
 
     # 1. Context: Gaussians of what was photographed.
-    context, _ = init_context(psi, views)
-    print(f"context: {len(context):,} Gaussians, depths from {near:.3g} to {far:.3g}")
+    views = gsc.load_views(scene, frames=[first, second], resolution=256)
+    state = gsc.GSCompleter(psi, phi, config=config).begin(views)
+    print(f"context: {len(state.context):,} Gaussians")
 
     # 2. Anchor and lift: an image at the target, and its stereo with the best photograph.
-    at_target = renderer.freeze(context, target)
-    at_views = [renderer.freeze(context, view.camera) for view in views]
-    seen = tuple(frozen.render for frozen in at_views)
-    reference = synthesize(phi, target, GeneratorInput(tuple(views), seen, at_target.render))
-    choice = select_anchor(target, views)
-    anchor = views[choice.index].camera
-    lifted = lift(psi, reference, views[choice.index])
-    print(f"anchor: context view {choice.index}; {len(lifted.gaussians):,} candidates")
+    target = state.with_depth_range(gsc.load_camera(scene, frame=number, resolution=256))
+    scenes = SceneRenderer(gsc.load_renderer("cpu"))
+    view = render_target(state, pad_camera(target, 0.0), scenes)
+    (image,) = synthesize(phi, [(target, view.make_generator_input())])
+    lifted = lift(psi, image, view)
+    print(f"anchor: context view {view.anchor.index}; {len(lifted.gaussians):,} candidates")
 
     # 3. Register: one affine for all depths, then each Gaussian along its ray.
-    rng = torch.Generator().manual_seed(0)
-    registered = register(lifted, at_target, seen[choice.index], reference, anchor, renderer, rng)
-    print(f"affine: {registered.affine}")
-    print(f"loss: {registered.losses[0]:.4f} to {registered.losses[-1]:.4f}")
+    affine = align_depth(lifted, view, torch.Generator().manual_seed(0))
+    moved = slide_along_rays(lifted, affine, image, view)
+    print(f"affine: {affine}")
+    print(f"loss: {moved.losses[0]:.4f} to {moved.losses[-1]:.4f}")
 
     # 4. Integrate: what lies in the hole, with opacities that suit all images.
-    holes = compute_hole_mask(at_target.render.alpha)
-    added = filter_holes(registered.gaussians, lifted.pixel_index, holes, target)
-    planned = [view.vary_opacities(added) for view in at_views]
-    added, _ = refine_opacities(added, at_target.vary_opacities(added), reference, planned, views)
-    left = compute_hole_mask(at_target.composite(added).alpha)
-    print(
-        f"holes: {holes.float().mean():.1%} of the target's pixels, {left.float().mean():.1%} left"
-    )
-
-    added = replace(added, generated=torch.ones_like(added.generated))
-    gsc.save_ply("completed.ply", gsc.merge([context, added]))
+    added = refine(filter_holes(moved, view), image, view).gaussians
+    left = compute_hole_mask(view.frozen.composite(added).alpha)
+    shares = view.empty.float().mean(), left.float().mean()
+    print("holes: {:.1%} of the target's pixels, {:.1%} left".format(*shares))
+    gsc.save_ply("completed.ply", gsc.merge([state.context, added]))
 
 
 if __name__ == "__main__":

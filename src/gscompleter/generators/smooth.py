@@ -77,8 +77,9 @@ def average_trusted(
     weight = MIN_TRUST + (1 - MIN_TRUST) * trust.cpu().numpy()
     layers = np.concatenate([image.cpu().numpy() * weight[..., None], weight[..., None]], axis=-1)
     small = cv2.resize(layers, size, interpolation=cv2.INTER_AREA)
-    total = np.zeros_like(small)
+    total: Float32[ndarray, "h w 4"] = np.zeros_like(small, np.float32)
     for level in range(NUM_SCALES):
-        total += COARSER_WEIGHT**level * cv2.GaussianBlur(small, (0, 0), FIRST_SIGMA * 2**level)
+        mean = cv2.GaussianBlur(small, (0, 0), FIRST_SIGMA * 2**level)
+        total += np.float32(COARSER_WEIGHT**level) * mean.astype(np.float32)
     means = cv2.resize(total[..., :3] / total[..., 3:], (width, height))
     return torch.from_numpy(means).to(image)
