@@ -24,17 +24,24 @@ from gscompleter.stages.align_depth import align_depth
 from gscompleter.stages.context import init_context
 from gscompleter.stages.filter_holes import filter_holes
 from gscompleter.stages.lift import lift
+from gscompleter.stages.new_photos import find_new_photos, recolor_to_photos
 from gscompleter.stages.recolor import recolor
 from gscompleter.stages.refine import refine
 from gscompleter.stages.slide_along_rays import slide_along_rays
 from gscompleter.stages.synthesize import GeneratedView, synthesize
 from gscompleter.stages.target_view import TargetView, render_target
-from gscompleter.state import Completion, Photo, TargetResult
+from gscompleter.state import (
+    NEW_PHOTO_ID,
+    Completion,
+    Photo,
+    TargetResult,
+    find_last_target_id,
+)
 from gscompleter.timing import record_seconds, timed_stage
 from gscompleter.trust.photometric import load_trust
 from gscompleter.types import Camera, Gaussians, PaddedCamera, View
 
-MAX_TARGET_ID = 255
+MAX_TARGET_ID = NEW_PHOTO_ID - 1
 """Largest target id: `generated` is one byte per Gaussian, and 0 means observed."""
 
 
@@ -134,9 +141,12 @@ class GSCompleter:
             )
             photos = tuple(Photo(view) for view in made.views)
             parts = (made.source.rendered,)
-            trust = load_trust(config, parts, made.views, self.scenes)
+            new = find_new_photos(config, parts, made.views, self.scenes)
+            known = [view for number, view in enumerate(made.views) if number not in new]
+            trust = load_trust(config, parts, known, self.scenes)
             state = Completion(config, made.source, parts, photos, len(views), trust)
             state = load_guards(config).begin(state, self.scenes)
+            state = recolor_to_photos(state, [made.views[i] for i in new], self.scenes)
         return replace(state, exposure_gains=made.exposure_gains, seconds=seconds)
 
     def advance(
@@ -166,7 +176,7 @@ class GSCompleter:
             kept = guards.place(filter_holes(moved, view), view)  # Eq. 12
             refined = refine(kept, image, view)  # Eq. 13
             added, rejected_by = guards.verify(Attempt(view, image, affine, refined))
-            recolored = recolor(image, view)
+            recolored = recolor(image, view, state.next_target_id)
             result = replace(
                 make_unchanged_result(view),
                 after=recolored.frozen.composite(added).crop(view.camera),
@@ -240,7 +250,7 @@ def make_unchanged_result(view: TargetView) -> TargetResult:
 
 def check_target_ids(scene: Gaussians | None, num_targets: int) -> None:
     """Raise InputError if `generated` cannot hold the ids of `num_targets` more targets."""
-    given = 0 if scene is None or len(scene) == 0 else int(scene.generated.max())
+    given = 0 if scene is None else find_last_target_id(scene)
     if given + num_targets > MAX_TARGET_ID:
         raise InputError(
             f"{num_targets} targets were given after {given} in the scene, and a .ply can tell "

@@ -23,6 +23,8 @@ from gscompleter.timing import add_seconds
 from gscompleter.trust import Trust
 from gscompleter.types import Camera, DepthAffine, ErrorBudget, Gaussians, Render, View, merge
 
+NEW_PHOTO_ID = 255
+"""Value of `generated` for Gaussians that were recoloured to a new photograph of the scene."""
 NOTHING_ADDED = "Nothing of it was added."
 
 REJECTIONS = {
@@ -169,6 +171,8 @@ class Completion(RenamedMembers):
     """Wall time of context, generate, lift, register, integrate and total."""
     exposure_gains: Float[Tensor, "v 3"] | None = None
     """Exposure gain of each original photograph relative to `views`, or None if not estimated."""
+    num_new_photos: int = 0
+    """Number of photographs that a given scene did not reproduce."""
 
     @property
     def views(self) -> tuple[View, ...]:
@@ -212,8 +216,7 @@ class Completion(RenamedMembers):
     @property
     def next_target_id(self) -> int:
         """Value of `generated` for the next target; ids of a given scene are continued."""
-        given = int(self.context.generated.max()) if len(self.context) else 0
-        return given + len(self.targets) + 1
+        return find_last_target_id(self.context) + len(self.targets) + 1
 
     def with_depth_range(self, camera: Camera) -> Camera:
         """Return the camera with the depth range of this completion."""
@@ -229,3 +232,9 @@ class Completion(RenamedMembers):
     def plus_seconds(self, seconds: Mapping[str, float]) -> Completion:
         """Add wall times stage by stage."""
         return replace(self, seconds=add_seconds(self.seconds, seconds))
+
+
+def find_last_target_id(scene: Gaussians) -> int:
+    """Find the largest target id in a scene; 0 if nothing was generated for a target."""
+    ids = scene.generated[scene.generated != NEW_PHOTO_ID]
+    return int(ids.max()) if len(ids) else 0

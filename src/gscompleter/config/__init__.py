@@ -181,6 +181,8 @@ class RecolorConfig(Settings):
     """Weight of small coefficients, relative to the weight of all observations of a Gaussian."""
     iterations: Count = 8
     """Rounds on the residual image."""
+    min_change: Share = 6 / 255
+    """Largest change of a colour, as the target sees it, that is not worth a change of the file."""
 
 
 @dataclass(frozen=True)

@@ -26,8 +26,6 @@ from gscompleter.timing import timed_stage
 from gscompleter.trust import HeldViews
 from gscompleter.types import Camera, Gaussians, View, merge
 
-MIN_CHANGE = 1 / 255
-"""Largest change of a colour, as the target sees it, that is not worth a change of the file."""
 MIN_WEIGHT = 1e-3
 """Summed weight, in pixels, up to which a Gaussian is not seen."""
 CHUNK = 4096
@@ -46,10 +44,11 @@ class Recolored:
 
 
 @timed_stage("integrate")
-def recolor(reference: GeneratedView, view: TargetView) -> Recolored:
+def recolor(reference: GeneratedView, view: TargetView, label: int) -> Recolored:
     """Recolour what covers the target without being trusted, and trust it from there on.
 
-    A true photograph may recolour all that it shows: other photographs hold what they show.
+    A true photograph may recolour all that it shows: other photographs hold what they show. `label`
+    marks the recoloured Gaussians as generated.
     """
     state, camera, context = view.state, view.camera.padded, view.state.parts[0]
     found = fit_colors(
@@ -63,7 +62,7 @@ def recolor(reference: GeneratedView, view: TargetView) -> Recolored:
     )
     if len(found.rows) == 0:
         return Recolored(state, view.frozen, 0)
-    generated = context.generated.index_fill(0, found.rows, state.next_target_id)
+    generated = context.generated.index_fill(0, found.rows, label)
     context = replace(found.apply(context), generated=generated)
     parts, trust = (context, *state.parts[1:]), state.trust.accept(view.frozen, camera, found.rows)
     frozen = view.scenes.freeze(parts, camera)
@@ -115,7 +114,7 @@ def fit_colors(
     wanted = torch.lerp(frozen.render.image, reference.image, weight[..., None])
     errors = renderer.freeze(scene[~is_open], reference.camera).vary_colors(scene[rows])
     steps = fit_steps(errors, wanted, colors, gains, config.iterations)
-    is_changed = (gains * steps).abs().amax(dim=1) > MIN_CHANGE
+    is_changed = (gains * steps).abs().amax(dim=1) > config.min_change
     delta = change[is_changed, :, None] * steps[is_changed, None]
     return ColorChange(rows[is_changed], delta.to(scene.sh))
 
