@@ -166,7 +166,7 @@ def test_one_process_alone_begins_nothing(monkeypatch, marked):
 def test_a_part_that_fails_in_its_process_is_no_success(monkeypatch):
     with (
         pytest.raises(subprocess.CalledProcessError),
-        compilation.rehearse_in_subprocess(["no such part"]),
+        compilation.wait_for([compilation.start_rehearsal(["no such part"])]),
     ):
         pass
 

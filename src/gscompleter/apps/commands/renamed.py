@@ -20,23 +20,22 @@ RENAMED = {
 
 
 def use_new_names(words: Sequence[str]) -> list[str]:
-    """Replace old option names in the words of a command line, and warn of each."""
-    return [use_new_name(word) if word.startswith("--") else word for word in words]
-
-
-def use_new_name(word: str) -> str:
-    """Replace an old option name such as `--film` or `--rerun=failures`, and warn of it."""
-    old, equals, value = word.partition("=")
-    return f"--{translate_name(old[2:])}{equals}{value}"
+    """Replace old names of options such as `--film` or `--rerun=failures`, and warn of each."""
+    renamed = []
+    for word in words:
+        old, equals, value = word.partition("=")
+        new = f"--{translate_name(old[2:])}" if old.startswith("--") else old
+        renamed.append(f"{new}{equals}{value}")
+    return renamed
 
 
 def translate_name(name: str) -> str:
     """Return today's name of an option without dashes, and warn of an old one."""
-    new = RENAMED.get(name.replace("_", "-"))
-    if new is None:
+    old = name.replace("_", "-")
+    if old not in RENAMED:
         return name
-    warn_renamed(name.replace("_", "-"), new)
-    return new
+    warn_renamed(old, RENAMED[old])
+    return RENAMED[old]
 
 
 @cache

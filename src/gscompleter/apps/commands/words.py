@@ -15,7 +15,6 @@ from typing import Any
 import tyro
 from tyro.constructors import ConstructorRegistry, StructTypeInfo
 
-from gscompleter.apps.commands.generator_options import make_generator_spec
 from gscompleter.apps.commands.help import HELP_ALL, Rule, asks_for_help, make_help_rule
 from gscompleter.apps.commands.options import DEFAULT_NUM_TARGETS
 from gscompleter.apps.commands.renamed import use_new_names
@@ -52,7 +51,11 @@ def parse_words(words: Sequence[str], command: Any, names: Collection[str]) -> A
         command,
         prog="gscompleter",
         description="Complete 3D Gaussian Splatting scenes: generate, then register.",
-        config=(tyro.conf.OmitSubcommandPrefixes, tyro.conf.FlagCreatePairsOff),
+        config=(
+            tyro.conf.DisallowNone,
+            tyro.conf.FlagCreatePairsOff,
+            tyro.conf.OmitSubcommandPrefixes,
+        ),
     )
     try:
         with redirect_stderr(printed):
@@ -64,10 +67,9 @@ def parse_words(words: Sequence[str], command: Any, names: Collection[str]) -> A
         options = list_options(
             lambda words: read(args=words, registry=make_registry(config)), words
         )
-        sentence = find_misspelling(words, options, names) or extract_sentence(
-            printed.getvalue(), words, names
-        )
-        raise InputError(sentence) from None
+        see = " ".join(["gscompleter", *(word for word in words[:1] if word in names)])
+        sentence = find_misspelling(words, options) or extract_sentence(printed.getvalue())
+        raise InputError(f"{sentence} (see {see} --help).") from None
 
 
 def check_command(words: Sequence[str], names: Collection[str]) -> None:
@@ -76,8 +78,7 @@ def check_command(words: Sequence[str], names: Collection[str]) -> None:
     if near and words[0] not in names:
         raise InputError(
             f"There is no command {quote_value(words[0])}; the nearest is {near[0]} (see "
-            "gscompleter "
-            "--help)."
+            "gscompleter --help)."
         )
 
 
@@ -92,23 +93,15 @@ def list_options(read: Callable[[Sequence[str]], Any], words: Sequence[str]) -> 
     return [*found, HELP_ALL]
 
 
-def find_misspelling(
-    words: Sequence[str], options: Sequence[str], names: Collection[str]
-) -> str | None:
+def find_misspelling(words: Sequence[str], options: Sequence[str]) -> str | None:
     """Write a sentence on an unknown option that is similar to a known one, if any."""
     given = [word.split("=")[0] for word in words if word.startswith("--")]
     for word in given:
         option = word.replace("_", "-")
         near = get_close_matches(option, options, 1, MIN_SIMILARITY)
         if near and near[0] != option:
-            see = f"(see {get_command_name(words, names)} --help)"
-            return f"There is no option {quote_value(word)}; the nearest is {near[0]} {see}."
+            return f"There is no option {quote_value(word)}; the nearest is {near[0]}"
     return None
-
-
-def get_command_name(words: Sequence[str], names: Collection[str]) -> str:
-    """Return the program with the command in `words`, if any."""
-    return " ".join(["gscompleter", *(word for word in words[:1] if word in names)])
 
 
 def check_once(words: Sequence[str]) -> None:
@@ -118,20 +111,18 @@ def check_once(words: Sequence[str]) -> None:
     if twice is not None:
         raise InputError(
             f"{quote_value(twice)} is given twice, and only one of them would count; name it "
-            "once, with "
-            "all its values after it."
+            "once, with all its values after it."
         )
 
 
 def insert_auto_count(words: Sequence[str]) -> list[str]:
     """Insert the default number after an `--auto` without one."""
-    alone = [
-        w == "--auto" and not n.isdecimal() for w, n in zip(words, [*words, ""][1:], strict=True)
-    ]
-    counted = [
-        (w, str(DEFAULT_NUM_TARGETS)) if a else (w,) for w, a in zip(words, alone, strict=True)
-    ]
-    return [word for pair in counted for word in pair]
+    counted = [*words]
+    if "--auto" in counted:
+        place = counted.index("--auto") + 1
+        if not counted[place:] or not counted[place].isdecimal():
+            counted.insert(place, str(DEFAULT_NUM_TARGETS))
+    return counted
 
 
 @dataclass(frozen=True)
@@ -160,14 +151,13 @@ def make_registry(config: CompleterConfig, *rules: Rule) -> ConstructorRegistry:
         return ConstructorRegistry.get_struct_spec(StructTypeInfo.make(info.type, config, False))
 
     registry = ConstructorRegistry()
-    registry.struct_rule(make_generator_spec)
     registry.struct_rule(config_flags)
     for rule in rules:
         registry.struct_rule(rule)
     return registry
 
 
-def extract_sentence(box: str, words: Sequence[str], names: Collection[str]) -> str:
+def extract_sentence(box: str) -> str:
     """Extract the sentence from tyro's boxed error message."""
 
     def is_empty(line: str) -> bool:
@@ -178,5 +168,4 @@ def extract_sentence(box: str, words: Sequence[str], names: Collection[str]) -> 
     sentence = " ".join(line.strip() for line in first_lines if not line.startswith(" " * 5))
     usage = lines.index("Argument helptext:") + 1 if "Argument helptext:" in lines else None
     needed = "" if usage is None else f"; give {lines[usage].strip()}"
-    command = get_command_name(words, names)
-    return f"{quote_value(sentence, 200).removesuffix('.')}{needed} (see {command} --help)."
+    return f"{quote_value(sentence, 200).removesuffix('.')}{needed}"
