@@ -17,7 +17,7 @@ import tyro
 from gscompleter import __version__
 from gscompleter.apps.commands import options, tool_options
 from gscompleter.apps.commands.words import format_error, parse_words
-from gscompleter.apps.warmup.compilation import begin_compilation, freeze_objects
+from gscompleter.apps.warmup.compilation import freeze_objects
 from gscompleter.config.settings import validate
 from gscompleter.cpu_threads import limit_threads
 from gscompleter.errors import PROGRAM, InputError
@@ -115,7 +115,6 @@ def main() -> None:
             given = validate(parse_command(words))
             if isinstance(given, options.ComputeOptions):
                 limit_threads(given.threads)
-            begin_compilation(list_models(given))
             _, module, function = COMMANDS[words[0]]
             module = f"gscompleter.apps.commands.{module}"
             command = getattr(import_module(module), function)
@@ -133,12 +132,3 @@ def main() -> None:
 def parse_command(words: Sequence[str]) -> Any:
     """Parse the options of the command; raises as `parse_words`."""
     return parse_words(words, Command, COMMANDS)
-
-
-def list_models(given: object) -> tuple[str, ...]:
-    """Return the names of the models that a command completes scenes with."""
-    if isinstance(given, options.DemoOptions):
-        given = options.ModelOptions()
-    if isinstance(given, options.ModelOptions):
-        return given.reconstructor, given.synthesis.name
-    return ()

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from statistics import fmean
@@ -11,14 +11,12 @@ from typing import Any
 from rich.console import Console
 from rich.table import Table
 
-from gscompleter.apps.commands.expected import expect_completion
 from gscompleter.apps.commands.exploring import (
     collect_cameras,
     complete_targets,
     name_target,
     plan_completion,
     print_plan,
-    render_looks_around,
     write_targets,
 )
 from gscompleter.apps.commands.options import CompleteOptions, get_max_targets
@@ -45,10 +43,8 @@ from gscompleter.apps.inputs.opening import (
 from gscompleter.apps.inputs.plan import describe_task
 from gscompleter.apps.report.completion import Surroundings, Target, write_report
 from gscompleter.apps.report.completion_page import render_completion_page
-from gscompleter.apps.report.film import VIDEO_FILE as FILM
-from gscompleter.apps.report.film import write_comparison_video
-from gscompleter.apps.report.page import REPORT_FILE as PAGE
-from gscompleter.apps.report.page import write_page
+from gscompleter.apps.report.film import VIDEO_FILE, write_comparison_video
+from gscompleter.apps.report.page import REPORT_FILE, write_page
 from gscompleter.apps.report.plain_words import (
     NO_TARGET_NOTE,
     describe_exposures,
@@ -59,12 +55,13 @@ from gscompleter.apps.warmup.compilation import SPLAT_PART, compile_kernels
 from gscompleter.completer import Clock, GSCompleter, add_seconds
 from gscompleter.config import CompleterConfig
 from gscompleter.config.generators import get_settings_class
+from gscompleter.evaluation.metrics.coverage import render_pairs, sample_held_out_cameras
 from gscompleter.generators import load_generator
-from gscompleter.io.files import check_output, open_output_folder
+from gscompleter.io.files import COMPLETED_FILE, check_output, open_output_folder
 from gscompleter.io.video import check_video_writer
 from gscompleter.kernels.parallel import run_in_background
 from gscompleter.next_best_view.planner import ViewPlanner
-from gscompleter.progress import show_preparation, show_progress, stage
+from gscompleter.progress import expect_stages, show_preparation, show_progress, stage
 from gscompleter.reconstructors import check_reconstructor, load_reconstructor
 from gscompleter.render import choose_device, load_renderer
 from gscompleter.render.lod import MIN_PROXY_GAUSSIANS
@@ -73,6 +70,24 @@ from gscompleter.splats.morton import argsort_nearby
 from gscompleter.state import Completion
 from gscompleter.types import Camera, View
 
+CONTEXT_STAGE = "context", 2.0
+TARGET_STAGES = ("generate", 1.0), ("lift", 1.0), ("register", 1.0), ("integrate", 2.0)
+"""Stages with their relative times."""
+
+
+@dataclass(frozen=True)
+class Prepared:
+    """Everything that is loaded before the first completion."""
+
+    options: CompleteOptions
+    opened: Opened
+    task: Task
+    explorer: ViewPlanner
+    cameras: Mapping[int, Camera]
+    """Cameras of all usable photographs by frame, in the frame of the result."""
+    seconds: Mapping[str, float]
+    """Wall time by stage so far."""
+
 
 def run_completion(options: CompleteOptions) -> None:
     """Complete the scene, and print a summary."""
@@ -80,65 +95,31 @@ def run_completion(options: CompleteOptions) -> None:
         if options.dry_run:
             plan_folder(options)
             return
-        summary, completion = complete_folder(options)
+        summary = complete_folder(options)
         if not options.quiet:
-            print_completion(summary, completion, options)
+            print_completion(summary, options)
 
 
-def complete_folder(options: CompleteOptions) -> tuple[dict[str, Any], Completion]:
+def complete_folder(options: CompleteOptions) -> dict[str, Any]:
     """Complete the scene, write `options.out`, and return the summary."""
     if options.video:
         check_video_writer()
     console = Console(stderr=True, quiet=options.quiet)
     with show_progress(None if options.quiet else console):
-        opened, task, explorer, before = prepare_completion(options, console)
-        print_lines(console, *describe_task(options, opened, task))
-        cameras = collect_cameras(options, opened, task)
-        expectation = expect_completion(options, task, task.views[0].image.device.type)
-        with open_output_folder(options.out, is_replaceable(options)) as folder, expectation:
-            completion, task = complete_targets(options, task, cameras, explorer)
-            completion = replace(completion, seconds=add_seconds(completion.seconds, before))
+        ready = prepare_completion(options, console)
+        print_lines(console, *describe_task(options, ready.opened, ready.task))
+        with (
+            open_output_folder(options.out, is_replaceable(options)) as folder,
+            expect_stages(list_stages(options, ready.task), is_timed=False),
+        ):
+            completion, task = complete_targets(options, ready.task, ready.cameras, ready.explorer)
             with stage("report"):
-                done = Done(opened, task, cameras, completion)
-                summary = write_done(folder, options, done, explorer)
+                summary = write_done(folder, replace(ready, task=task), completion)
                 write_targets(folder, task)
             if options.video:
-                photographs = list(cameras.values())
-                write_comparison_video(folder, completion, photographs, explorer.completer.renderer)
-    return summary, completion
-
-
-@dataclass(frozen=True)
-class Done:
-    """A finished completion and its input."""
-
-    opened: Opened
-    task: Task
-    cameras: Mapping[int, Camera]
-    """Cameras of all usable photographs by frame, in the frame of the result."""
-    completion: Completion
-
-
-def write_done(
-    folder: Path, options: CompleteOptions, done: Done, explorer: ViewPlanner
-) -> dict[str, Any]:
-    """Write all results but the targets and the video, and return the summary."""
-    task, cameras = done.task, tuple(done.cameras.values())
-    facts = describe_run(options, done.opened, task, task.views[0].image.device.type)
-    with run_in_background(
-        render_looks_around, options, done.completion, cameras, explorer
-    ) as looks:
-        summary = write_report(
-            folder,
-            done.completion,
-            task.targets,
-            explorer.completer,
-            facts,
-            task.splat_file,
-            lambda: Surroundings(tuple(looks()), cameras),
-            read_held_out(options, done.opened, task, done.cameras),
-        )
-    write_page(folder, render_completion_page(folder))
+                photographs = list(ready.cameras.values())
+                renderer = ready.explorer.completer.renderer
+                write_comparison_video(folder, completion, photographs, renderer)
     return summary
 
 
@@ -146,20 +127,45 @@ def plan_folder(options: CompleteOptions) -> None:
     """Write the targets and print the plan, without completing the scene."""
     console = Console(stderr=True, quiet=options.quiet)
     with show_progress(None if options.quiet else console):
-        opened, task, explorer, _ = prepare_completion(options, console)
-        print_lines(console, *describe_task(options, opened, task))
-        cameras = collect_cameras(options, opened, task)
+        ready = prepare_completion(options, console)
+        print_lines(console, *describe_task(options, ready.opened, ready.task))
         with open_output_folder(options.out, is_replaceable(options)) as folder:
-            plan = plan_completion(options, task, cameras, explorer)
+            plan = plan_completion(options, ready.task, ready.cameras, ready.explorer)
             write_targets(folder, plan.task)
     if not options.quiet:
         print_plan(options, plan)
 
 
-def prepare_completion(
-    options: CompleteOptions, console: Console
-) -> tuple[Opened, Task, ViewPlanner, Mapping[str, float]]:
-    """Open the scene and load the models; also returns the seconds that this took."""
+def list_stages(options: CompleteOptions, task: Task) -> list[tuple[str, float]]:
+    """List the stages after opening the scene with their relative times."""
+    count = len(task.targets) or get_max_targets(options)
+    ends = [("report", 2.0), *([("video", 2.0)] if options.video else [])]
+    return [CONTEXT_STAGE, *((CONTEXT_STAGE, *TARGET_STAGES) * count), *ends]
+
+
+def write_done(folder: Path, ready: Prepared, completion: Completion) -> dict[str, Any]:
+    """Write all results but the targets and the video, and return the summary."""
+    task, completer = ready.task, ready.explorer.completer
+    completion = replace(completion, seconds=add_seconds(completion.seconds, ready.seconds))
+    cameras = tuple(ready.cameras.values())
+    aside = sample_held_out_cameras(cameras, ready.options.seed)
+    with run_in_background(render_pairs, completion, aside, completer.renderer) as looks:
+        summary = write_report(
+            folder,
+            completion,
+            task.targets,
+            completer,
+            describe_run(ready.options, ready.opened, task),
+            task.splat_file,
+            lambda: Surroundings(tuple(looks()), cameras),
+            read_held_out(ready.options, ready.opened, task, ready.cameras),
+        )
+    write_page(folder, render_completion_page(folder))
+    return summary
+
+
+def prepare_completion(options: CompleteOptions, console: Console) -> Prepared:
+    """Open the scene and load the models."""
     check_output(options.out, is_replaceable(options))
     check_context(options)
     check_targets(options)
@@ -168,7 +174,7 @@ def prepare_completion(
     device = choose_device(options.device)
     opened = open_scene(options, console)
     if not options.config.ego_mask:
-        opened = opened.keep_ego_vehicle()
+        opened = replace(opened, photographs=opened.photographs.keep_ego_vehicle())
     with show_preparation("reading photographs"):
         task = read_task(options, opened, device)
     parts = device, options.reconstructor, options.synthesis.name
@@ -181,7 +187,8 @@ def prepare_completion(
     clock = Clock()
     with show_preparation("depth range"), clock("context"):
         task = apply_working_range(task, completer.renderer)
-    return opened, task, ViewPlanner(completer), clock.seconds
+    cameras = collect_cameras(options, opened, task)
+    return Prepared(options, opened, task, ViewPlanner(completer), cameras, clock.seconds)
 
 
 def add_splat(
@@ -200,18 +207,20 @@ def add_splat(
         return move_to_splat(task, given, path, options, opened, order)
 
 
-def describe_run(
-    options: CompleteOptions, opened: Opened, task: Task, device: str
-) -> dict[str, Any]:
+def describe_run(options: CompleteOptions, opened: Opened, task: Task) -> dict[str, Any]:
     """Describe the input and the settings for `summary.json`."""
     auto = None if options.target else get_max_targets(options)
     targets = {"target": list(options.target), "auto": auto}
+    models = {
+        "reconstructor": options.reconstructor,
+        "weights": None if options.weights is None else str(options.weights),
+        **options.synthesis.describe(),
+        "uses_target_photographs": options.synthesis.name == "oracle",
+    }
     return {
-        "settings": describe_settings(
-            options, get_stage_config(options), targets, describe_models(options)
-        ),
+        "settings": describe_settings(options, get_stage_config(options), targets, models),
         "seed": options.seed,
-        "device": device,
+        "device": task.device.type,
         **describe_opened(options, opened, task),
     }
 
@@ -223,12 +232,10 @@ def load_completer(options: CompleteOptions, targets: Sequence[Target], device: 
         for target in targets
         if target.photograph is not None
     ]
-    generator = options.synthesis
+    name, settings = options.synthesis.name, options.synthesis.make_settings()
     return GSCompleter(
         load_reconstructor(options.reconstructor, options.weights, device),
-        load_generator(
-            generator.name, options.seed, photographs, device, generator.make_settings()
-        ),
+        load_generator(name, options.seed, photographs, device, settings),
         load_renderer(device),
         get_stage_config(options),
         options.seed,
@@ -243,77 +250,66 @@ def get_stage_config(options: CompleteOptions) -> CompleterConfig:
     return replace(options.config, trust_settings=settings)
 
 
-def describe_models(options: CompleteOptions) -> dict[str, Any]:
-    """Describe the models for `summary.json`."""
-    return {
-        "reconstructor": options.reconstructor,
-        "weights": None if options.weights is None else str(options.weights),
-        **options.synthesis.describe(),
-        "uses_target_photographs": options.synthesis.name == "oracle",
-    }
-
-
-def print_completion(
-    summary: Mapping[str, Any], completion: Completion, options: CompleteOptions
-) -> None:
+def print_completion(summary: Mapping[str, Any], options: CompleteOptions) -> None:
     """Print the scores per camera, the notes, and the location of the results."""
-
-    def cell(value: float | None) -> str:
-        return "–" if value is None else f"{value:.2f}"
-
-    table = Table("camera", "hole", "PSNR before", "PSNR after", "added", box=None)
-    for row in summary["context"]:
-        name = f"context {row['frame']}"
-        table.add_row(name, "", cell(row["psnr_before"]), cell(row["psnr_after"]), "")
-    notes = []
-    for row, target in zip(summary["targets"], completion.targets, strict=True):
-        name = name_target(row["frame"], row["derived_from"])
-        notes += [f"{name}: {note}" for note in target.notes]
-        hole = f"{100 * row['hole_fraction']:.1f} %"
-        scores = cell(row["psnr_before"]), cell(row["psnr_after"])
-        table.add_row(name, hole, *scores, f"{len(target.added):,}")
     console = Console(highlight=False)
-    console.print(table)
-    for note in notes:
-        console.print(note)
-    gains = [row["exposure_gain"] for row in summary["context"]]
-    contradicted = {row["frame"]: row["dynamic_fraction"] for row in summary["context"]}
-    carried = describe_ignored(row["ignored"] for row in summary["context"])
-    for sentence in filter(
-        None, (describe_exposures(gains), describe_motion(contradicted), carried)
-    ):
+    console.print(make_score_table(summary))
+    for row in summary["targets"]:
+        for note in row["notes"]:
+            console.print(f"{name_target(row['frame'], row['derived_from'])}: {note}")
+    for sentence in describe_result(summary, options):
         console.print(sentence, soft_wrap=True)
+
+
+def make_score_table(summary: Mapping[str, Any]) -> Table:
+    """Make the table of PSNR before and after at each camera."""
+    table = Table("camera", "hole", "PSNR before", "PSNR after", "added", box=None)
+
+    def format_scores(row: Mapping[str, Any]) -> Iterable[str]:
+        scores = row["psnr_before"], row["psnr_after"]
+        return ("–" if score is None else f"{score:.2f}" for score in scores)
+
+    for row in summary["context"]:
+        table.add_row(f"context {row['frame']}", "", *format_scores(row), "")
+    for row in summary["targets"]:
+        name, hole = name_target(row["frame"], row["derived_from"]), row["hole_fraction"]
+        table.add_row(name, f"{100 * hole:.1f} %", *format_scores(row), f"{row['added']:,}")
+    return table
+
+
+def describe_result(summary: Mapping[str, Any], options: CompleteOptions) -> Iterator[str]:
+    """Write the sentences below the table."""
+    context = summary["context"]
+    notes = (
+        describe_exposures(row["exposure_gain"] for row in context),
+        describe_motion({row["frame"]: row["dynamic_fraction"] for row in context}),
+        describe_ignored(row["ignored"] for row in context),
+    )
+    yield from filter(None, notes)
     origin = summary["frame"]["origin"]
     if any(origin):
-        console.print(
+        yield (
             f"The coordinates are very large, so the result has its origin at "
-            f"{' '.join(map(str, origin))}; summary.json has the transform.",
-            soft_wrap=True,
+            f"{' '.join(map(str, origin))}; summary.json has the transform."
         )
     if not summary["targets"]:
-        console.print(NO_TARGET_NOTE)
+        yield NO_TARGET_NOTE
     elif options.video:
-        console.print(f"Video: {options.out / FILM}", soft_wrap=True)
-    covered = summary["coverage"]
-    console.print(
-        f"Coverage around the photographs: {100 * covered['before']:.1f} % before, "
-        f"{100 * covered['after']:.1f} % after.",
-        soft_wrap=True,
-    )
+        yield f"Video: {options.out / VIDEO_FILE}"
+    before, after = (100 * summary["coverage"][when] for when in ("before", "after"))
+    yield f"Coverage around the photographs: {before:.1f} % before, {after:.1f} % after."
     unused = summary["held_out"]
     if unused:
-        before = fmean(row["psnr_before"] for row in unused)
-        after = fmean(row["psnr_after"] for row in unused)
-        console.print(
-            f"Mean PSNR of {len(unused)} photographs that were not used: {before:.2f} dB before, "
-            f"{after:.2f} dB after.",
-            soft_wrap=True,
+        before, after = (
+            fmean(row[f"psnr_{when}"] for row in unused) for when in ("before", "after")
         )
-    counts = summary["gaussians"]
-    seconds = summary["seconds"]["total"]
-    console.print(
+        yield (
+            f"Mean PSNR of {len(unused)} photographs that were not used: {before:.2f} dB before, "
+            f"{after:.2f} dB after."
+        )
+    counts, seconds = summary["gaussians"], summary["seconds"]["total"]
+    yield (
         f"Added {counts['added']:,} Gaussians to {counts['context']:,} in {seconds:.1f} s: "
-        f"{options.out / 'completed.ply'}",
-        soft_wrap=True,
+        f"{options.out / COMPLETED_FILE}"
     )
-    console.print(f"Report: {options.out / PAGE}", soft_wrap=True)
+    yield f"Report: {options.out / REPORT_FILE}"

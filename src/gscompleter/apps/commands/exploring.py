@@ -1,4 +1,4 @@
-"""Next-best target cameras: found, completed or only planned, and written."""
+"""Target cameras: found if none are named, completed or only planned, and written."""
 
 from __future__ import annotations
 
@@ -11,17 +11,13 @@ from rich.console import Console
 from rich.table import Table
 
 from gscompleter.apps.commands.options import CompleteOptions, get_max_targets, parse_resolution
-from gscompleter.apps.inputs.opening import Opened, Task, collect_usable_cameras
+from gscompleter.apps.inputs.opening import Opened, Task
+from gscompleter.apps.inputs.selection import collect_usable_cameras
 from gscompleter.apps.report.completion import Target
 from gscompleter.completer import check_target_ids
 from gscompleter.data.local_origin import compute_frame_from_photographs
 from gscompleter.data.scene import write_cameras
 from gscompleter.errors import quote_value
-from gscompleter.evaluation.metrics.coverage import (
-    RenderPair,
-    render_pairs,
-    sample_held_out_cameras,
-)
 from gscompleter.io.files import TARGETS_FILE
 from gscompleter.next_best_view.gain import Choice
 from gscompleter.next_best_view.planner import ViewPlanner
@@ -36,13 +32,11 @@ LIFTED_VIEWS = 3
 
 @dataclass(frozen=True)
 class Plan:
-    """Targets and the estimated time of a completion."""
+    """Targets and the time of a completion."""
 
     task: Task
-    holes: tuple[float, ...]
+    holes: Sequence[float]
     """Hole fraction of each target, after completion of the previous ones."""
-    seconds: float | None
-    """Estimated seconds per target, or None if unknown."""
     context_seconds: float
 
 
@@ -50,23 +44,26 @@ def collect_cameras(options: CompleteOptions, opened: Opened, task: Task) -> dic
     """Return the cameras of all usable photographs by frame, in the frame of the result."""
     given = opened.photographs
     transform = task.frame @ compute_frame_from_photographs(-given.origin)
-    known, device = task.views[0].camera, task.views[0].image.device
+    known = task.views[0].camera
     cameras = collect_usable_cameras(given, range(len(given)), parse_resolution(options.resolution))
-    moved = {f: transform_camera(camera, transform).to(device) for f, camera in cameras.items()}
-    return {f: replace(c, near=known.near, far=known.far) for f, c in moved.items()}
+    return {
+        frame: replace(
+            transform_camera(camera, transform).to(task.device), near=known.near, far=known.far
+        )
+        for frame, camera in cameras.items()
+    }
 
 
 def complete_targets(
     options: CompleteOptions, task: Task, cameras: Mapping[int, Camera], explorer: ViewPlanner
 ) -> tuple[Completion, Task]:
     """Complete the scene for the targets of `task`, or for targets that it finds."""
-    completer = explorer.completer
+    completer, count = explorer.completer, get_max_targets(options)
     if task.targets:
-        targets = [target.camera.to(task.views[0].image.device) for target in task.targets]
-        return completer(task.views, targets, task.scene, task.check_views), task
-    check_target_ids(task.scene, get_max_targets(options))
+        return completer(task.views, task.target_cameras, task.scene, task.check_views), task
+    check_target_ids(task.scene, count)
     begun = completer.begin(task.views, task.scene, task.check_views)
-    completion, choices = explorer.explore(begun, list(cameras.values()), get_max_targets(options))
+    completion, choices = explorer.explore(begun, list(cameras.values()), count)
     return completion, replace(task, targets=make_targets(choices, list(cameras)))
 
 
@@ -75,50 +72,38 @@ def plan_completion(
 ) -> Plan:
     """Plan the completion without running it."""
     begun = explorer.completer.begin(task.views, task.scene, task.check_views)
+    context_seconds = begun.seconds["context"]
     if task.targets:
-        targets = [target.camera.to(task.views[0].image.device) for target in task.targets]
-        holes = explorer.compute_hole_fractions(begun, targets)
-    else:
-        choices = explorer.plan(begun, list(cameras.values()), get_max_targets(options))
-        task = replace(task, targets=make_targets(choices, list(cameras)))
-        holes = [choice.hole_fraction for choice in choices]
-    return Plan(
-        task, tuple(holes), estimate_target_seconds(options, begun), begun.seconds["context"]
-    )
-
-
-def estimate_target_seconds(options: CompleteOptions, begun: Completion) -> float | None:
-    """Estimate the seconds per target from the context's, or return None if unknown."""
-    if options.scene is not None or options.synthesis.name != "warp-inpaint":
-        return None
-    return LIFTED_VIEWS * begun.seconds["context"] / len(begun.views)
+        holes = explorer.compute_hole_fractions(begun, task.target_cameras)
+        return Plan(task, holes, context_seconds)
+    choices = explorer.plan(begun, list(cameras.values()), get_max_targets(options))
+    task = replace(task, targets=make_targets(choices, list(cameras)))
+    return Plan(task, [choice.hole_fraction for choice in choices], context_seconds)
 
 
 def print_plan(options: CompleteOptions, plan: Plan) -> None:
     """Print the targets, their holes and the estimated time."""
     table = Table("camera", "hole", box=None)
-    for number, (target, hole) in enumerate(zip(plan.task.targets, plan.holes, strict=True)):
-        table.add_row(
-            f"{number + 1}: {name_target(target.frame, target.derived_from)}", f"{100 * hole:.1f} %"
-        )
+    for number, (target, hole) in enumerate(zip(plan.task.targets, plan.holes, strict=True), 1):
+        name = name_target(target.frame, target.derived_from)
+        table.add_row(f"{number}: {name}", f"{100 * hole:.1f} %")
     console = Console(highlight=False)
     console.print(table)
-    console.print(describe_plan(plan, options.out), soft_wrap=True)
+    console.print(describe_plan(options, plan), soft_wrap=True)
 
 
-def describe_plan(plan: Plan, out: Path) -> str:
+def describe_plan(options: CompleteOptions, plan: Plan) -> str:
     """Write the sentence on the number of targets and the estimated time."""
     number = len(plan.holes)
     if number == 0:
         return "No camera has much to gain; there is nothing to complete."
     duration = "in a time that is not known in advance"
-    if plan.seconds is not None:
-        duration = (
-            f"in about {plan.seconds * number:.0f} s after the context "
-            f"({plan.context_seconds:.0f} s)"
-        )
+    if options.scene is None and options.synthesis.name == "warp-inpaint":
+        spent = plan.context_seconds
+        seconds = number * LIFTED_VIEWS * spent / len(plan.task.views)
+        duration = f"in about {seconds:.0f} s after the context ({spent:.0f} s)"
     counted = "1 camera" if number == 1 else f"{number} cameras"
-    place = quote_value(out / TARGETS_FILE)
+    place = quote_value(options.out / TARGETS_FILE)
     return f"To complete: {counted}, {duration}. Edit the cameras in {place}."
 
 
@@ -136,20 +121,7 @@ def make_targets(choices: Iterable[Choice], frames: Sequence[int]) -> list[Targe
 
 def write_targets(folder: Path, task: Task) -> None:
     """Write the target cameras in the frame of the photographs, as `--target` reads them."""
-    if not task.targets:
-        return
-    back = np.linalg.inv(task.frame)
-    write_cameras(
-        folder / TARGETS_FILE, [transform_camera_exactly(t.camera, back) for t in task.targets]
-    )
-
-
-def render_looks_around(
-    options: CompleteOptions,
-    completion: Completion,
-    cameras: Iterable[Camera],
-    explorer: ViewPlanner,
-) -> list[RenderPair]:
-    """Render the scene before and after at cameras around the photographs."""
-    aside = sample_held_out_cameras(list(cameras), options.seed)
-    return render_pairs(completion, aside, explorer.completer.renderer)
+    if task.targets:
+        back = np.linalg.inv(task.frame)
+        cameras = [transform_camera_exactly(target.camera, back) for target in task.targets]
+        write_cameras(folder / TARGETS_FILE, cameras)

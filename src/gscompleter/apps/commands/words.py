@@ -44,7 +44,6 @@ def parse_words(words: Sequence[str], command: Any, names: Collection[str]) -> A
     words = ["--help" if word == HELP_ALL else word for word in words]
     check_once(words)
     refuse_old_options(words)
-    check_command(words, names)
     printed, config = StringIO(), CompleterConfig()
     read = partial(
         tyro.cli,
@@ -68,18 +67,8 @@ def parse_words(words: Sequence[str], command: Any, names: Collection[str]) -> A
             lambda words: read(args=words, registry=make_registry(config)), words
         )
         see = " ".join(["gscompleter", *(word for word in words[:1] if word in names)])
-        sentence = find_misspelling(words, options) or extract_sentence(printed.getvalue())
+        sentence = find_misspelling(words, names, options) or extract_sentence(printed.getvalue())
         raise InputError(f"{sentence} (see {see} --help).") from None
-
-
-def check_command(words: Sequence[str], names: Collection[str]) -> None:
-    """Refuse an unknown command, and name the nearest one."""
-    near = get_close_matches(words[0], names, 1) if words else []
-    if near and words[0] not in names:
-        raise InputError(
-            f"There is no command {quote_value(words[0])}; the nearest is {near[0]} (see "
-            "gscompleter --help)."
-        )
 
 
 def list_options(read: Callable[[Sequence[str]], Any], words: Sequence[str]) -> list[str]:
@@ -93,14 +82,19 @@ def list_options(read: Callable[[Sequence[str]], Any], words: Sequence[str]) -> 
     return [*found, HELP_ALL]
 
 
-def find_misspelling(words: Sequence[str], options: Sequence[str]) -> str | None:
-    """Write a sentence on an unknown option that is similar to a known one, if any."""
-    given = [word.split("=")[0] for word in words if word.startswith("--")]
-    for word in given:
-        option = word.replace("_", "-")
-        near = get_close_matches(option, options, 1, MIN_SIMILARITY)
+def find_misspelling(
+    words: Sequence[str], names: Collection[str], options: Sequence[str]
+) -> str | None:
+    """Write a sentence on an unknown command or option that is similar to a known one, if any."""
+    near = get_close_matches(words[0], names, 1) if words else []
+    if near and words[0] not in names:
+        return f"There is no command {quote_value(words[0])}; the nearest is {near[0]}"
+    for word in words:
+        given = word.split("=")[0]
+        option = given.replace("_", "-")
+        near = get_close_matches(option, options, 1, MIN_SIMILARITY) if "--" in given[:2] else []
         if near and near[0] != option:
-            return f"There is no option {quote_value(word)}; the nearest is {near[0]}"
+            return f"There is no option {quote_value(given)}; the nearest is {near[0]}"
     return None
 
 

@@ -6,12 +6,11 @@ slow packages only where it needs them.
 
 from __future__ import annotations
 
-import atexit
 import gc
 import subprocess
 import sys
 import time
-from collections.abc import Collection, Iterable, Iterator, Sequence
+from collections.abc import Collection, Iterator, Sequence
 from contextlib import contextmanager
 
 from gscompleter.cpu_threads import get_thread_count
@@ -19,9 +18,8 @@ from gscompleter.cpu_threads import get_thread_count
 SPLAT_PART = "brought"
 """Part that only input splats need."""
 RENDERING_PARTS = "cpu", SPLAT_PART
-MODEL_PARTS = "warp-inpaint", "plane-sweep"
-"""Parts that another process compiles meanwhile, if there are several threads."""
-PARTS = *RENDERING_PARTS, *MODEL_PARTS
+"""Parts that one process compiles while another compiles the rest."""
+PARTS = *RENDERING_PARTS, "warp-inpaint", "plane-sweep"
 """All parts with kernels, in the order of compilation."""
 
 REHEARSAL_PROGRAM = """
@@ -37,9 +35,6 @@ with freeze_objects():
 COMPILING_STAGE = "compiling kernels for this machine, once"
 COMPILING_SECONDS = 30
 """Approximate seconds for all parts on one core."""
-
-Process = subprocess.Popen[bytes]
-_started: dict[str, Process] = {}
 
 
 @contextmanager
@@ -59,23 +54,6 @@ def freeze_objects() -> Iterator[None]:
             gc.enable()
 
 
-def begin_compilation(names: Iterable[str]) -> None:
-    """Start to compile missing kernels of these models in another process.
-
-    `compile_kernels` waits for it. It ends with this process at the latest.
-    """
-    wanted = [part for part in MODEL_PARTS if part in names and part not in _started]
-    if not wanted or get_thread_count() == 1:
-        return
-    from gscompleter.kernels.compiled import is_compiled
-
-    lacking = [part for part in wanted if not is_compiled(part)]
-    if lacking:
-        process = start_rehearsal(lacking)
-        atexit.register(kill_process, process)
-        _started.update(dict.fromkeys(lacking, process))
-
-
 def compile_kernels(names: Collection[str]) -> float | None:
     """Compile the missing kernels of these parts; return the seconds, or None if there are none."""
     from gscompleter.kernels.compiled import is_compiled
@@ -84,16 +62,13 @@ def compile_kernels(names: Collection[str]) -> float | None:
     missing = [name for name in PARTS if name in names and not is_compiled(name)]
     if not missing:
         return None
-    if any(name in RENDERING_PARTS for name in missing):
-        begin_compilation(missing)
-    apart = {name: _started.pop(name) for name in missing if name in _started}
-    here = [name for name in missing if name not in apart]
-    expected = COMPILING_SECONDS * len(missing) / len(PARTS) / (2 if here and apart else 1)
+    here, apart = split_parts(missing)
+    expected = COMPILING_SECONDS * len(missing) / len(PARTS) / (2 if apart else 1)
     start = time.perf_counter()
     with (
         expect_stages([(COMPILING_STAGE, expected)]),
         stage(COMPILING_STAGE),
-        wait_for(set(apart.values())),
+        rehearse_in_subprocess(apart),
         freeze_objects(),
     ):
         from gscompleter.apps.warmup.rehearsal import rehearse
@@ -103,26 +78,27 @@ def compile_kernels(names: Collection[str]) -> float | None:
     return time.perf_counter() - start
 
 
+def split_parts(names: Sequence[str]) -> tuple[list[str], list[str]]:
+    """Split the parts between this process and another, if there are several threads."""
+    rendering = [name for name in names if name in RENDERING_PARTS]
+    if not rendering or get_thread_count() == 1:
+        return [*names], []
+    return rendering, [name for name in names if name not in RENDERING_PARTS]
+
+
 @contextmanager
-def wait_for(processes: Collection[Process]) -> Iterator[None]:
-    """Wait at the end of the block for the success of processes."""
+def rehearse_in_subprocess(names: Sequence[str]) -> Iterator[None]:
+    """Compile parts in another process during the block, and wait for its end."""
+    if not names:
+        yield
+        return
+    command = [sys.executable, "-c", REHEARSAL_PROGRAM, *names]
+    # A session of its own ignores Ctrl-C; this process stops it.
+    process = subprocess.Popen(command, stdin=subprocess.DEVNULL, start_new_session=True)
     try:
         yield
-        for process in processes:
-            if process.wait() != 0:
-                raise subprocess.CalledProcessError(process.returncode, process.args)
+        if process.wait() != 0:
+            raise subprocess.CalledProcessError(process.returncode, process.args)
     finally:
-        for process in processes:
-            kill_process(process)
-
-
-def start_rehearsal(names: Sequence[str]) -> Process:
-    """Start a process that compiles parts. It ignores Ctrl-C; this process stops it."""
-    command = [sys.executable, "-c", REHEARSAL_PROGRAM, *names]
-    return subprocess.Popen(command, stdin=subprocess.DEVNULL, start_new_session=True)
-
-
-def kill_process(process: Process) -> None:
-    """Kill a process and wait for its end."""
-    process.kill()
-    process.wait()
+        process.kill()
+        process.wait()
