@@ -14,12 +14,7 @@ from torch import Tensor
 
 from gscompleter import __version__
 from gscompleter.apps.commands.options import CleanOptions
-from gscompleter.apps.commands.output import (
-    describe_opened,
-    describe_settings,
-    is_replaceable,
-    report_interrupts,
-)
+from gscompleter.apps.commands.output import describe_run, is_replaceable, report_interrupts
 from gscompleter.apps.inputs.opening import (
     apply_working_range,
     check_context,
@@ -62,12 +57,13 @@ def clean_splat(options: CleanOptions) -> dict[str, Any]:
         with show_preparation("reading photographs"):
             task = read_photographs(options, opened, device)
         with show_preparation("reading the scene"):
-            given = load_splat(options.scene, options.drop_nonfinite)
+            loaded = load_splat(options.scene, options.drop_nonfinite)
         compile_kernels([device])
         with show_preparation("aligning the scene"):
-            task = move_to_splat(task, given, options.scene, options, opened)
-        assert task.scene is not None and task.splat_file is not None
-        given = task.scene
+            task = move_to_splat(task, loaded, options.scene, options, opened)
+        given, splat_file = task.scene, task.splat_file
+        assert given is not None
+        assert splat_file is not None
         task = apply_working_range(task, renderer)
         plan = f"compared with {len(task.views)} photographs on {device}"
         plan += f", written to {quote_value(options.out)}"
@@ -77,9 +73,7 @@ def clean_splat(options: CleanOptions) -> dict[str, Any]:
                 removed = find_superfluous(given, task.views, renderer, options.config)
             summary = {
                 "version": __version__,
-                "settings": describe_settings(options, options.config, targets={}, models={}),
-                "device": device,
-                **describe_opened(options, opened, task),
+                **describe_run(options, opened, task, options.config),
                 **score_cleaning(given, task.views, removed, renderer),
                 "seconds": clock.seconds,
             }
@@ -89,7 +83,7 @@ def clean_splat(options: CleanOptions) -> dict[str, Any]:
                     "the same scene."
                 )
             with stage("writing"):
-                save_completed_splat(folder, given, removed, given[:0], task.splat_file)
+                save_completed_splat(folder, given, removed, given[:0], splat_file)
                 (folder / SUMMARY_FILE).write_text(json.dumps(summary, indent=2) + "\n")
     return summary
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Iterator, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from pathlib import Path
 from statistics import fmean
 from typing import Any
@@ -12,6 +12,7 @@ from rich.console import Console
 from rich.table import Table
 
 from gscompleter.apps.commands.exploring import (
+    Prepared,
     collect_cameras,
     complete_targets,
     name_target,
@@ -21,8 +22,7 @@ from gscompleter.apps.commands.exploring import (
 )
 from gscompleter.apps.commands.options import CompleteOptions, get_max_targets
 from gscompleter.apps.commands.output import (
-    describe_opened,
-    describe_settings,
+    describe_run,
     is_replaceable,
     read_held_out,
     report_interrupts,
@@ -53,7 +53,6 @@ from gscompleter.apps.report.plain_words import (
 )
 from gscompleter.apps.warmup.compilation import SPLAT_PART, compile_kernels
 from gscompleter.completer import Clock, GSCompleter, add_seconds
-from gscompleter.config import CompleterConfig
 from gscompleter.config.generators import get_settings_class
 from gscompleter.evaluation.metrics.coverage import render_pairs, sample_held_out_cameras
 from gscompleter.generators import load_generator
@@ -68,25 +67,11 @@ from gscompleter.render.lod import MIN_PROXY_GAUSSIANS
 from gscompleter.splats.formats import load_splat
 from gscompleter.splats.morton import argsort_nearby
 from gscompleter.state import Completion
-from gscompleter.types import Camera, View
+from gscompleter.types import View
 
 CONTEXT_STAGE = "context", 2.0
 TARGET_STAGES = ("generate", 1.0), ("lift", 1.0), ("register", 1.0), ("integrate", 2.0)
 """Stages with their relative times."""
-
-
-@dataclass(frozen=True)
-class Prepared:
-    """Everything that is loaded before the first completion."""
-
-    options: CompleteOptions
-    opened: Opened
-    task: Task
-    explorer: ViewPlanner
-    cameras: Mapping[int, Camera]
-    """Cameras of all usable photographs by frame, in the frame of the result."""
-    seconds: Mapping[str, float]
-    """Wall time by stage so far."""
 
 
 def run_completion(options: CompleteOptions) -> None:
@@ -112,13 +97,12 @@ def complete_folder(options: CompleteOptions) -> dict[str, Any]:
             open_output_folder(options.out, is_replaceable(options)) as folder,
             expect_stages(list_stages(options, ready.task), is_timed=False),
         ):
-            completion, task = complete_targets(options, ready.task, ready.cameras, ready.explorer)
+            completion, ready = complete_targets(ready)
             with stage("report"):
-                summary = write_done(folder, replace(ready, task=task), completion)
-                write_targets(folder, task)
+                summary = write_done(folder, ready, completion)
+                write_targets(folder, ready.task)
             if options.video:
-                photographs = list(ready.cameras.values())
-                renderer = ready.explorer.completer.renderer
+                photographs, renderer = list(ready.cameras.values()), ready.completer.renderer
                 write_comparison_video(folder, completion, photographs, renderer)
     return summary
 
@@ -130,7 +114,7 @@ def plan_folder(options: CompleteOptions) -> None:
         ready = prepare_completion(options, console)
         print_lines(console, *describe_task(options, ready.opened, ready.task))
         with open_output_folder(options.out, is_replaceable(options)) as folder:
-            plan = plan_completion(options, ready.task, ready.cameras, ready.explorer)
+            plan = plan_completion(ready)
             write_targets(folder, plan.task)
     if not options.quiet:
         print_plan(options, plan)
@@ -145,20 +129,21 @@ def list_stages(options: CompleteOptions, task: Task) -> list[tuple[str, float]]
 
 def write_done(folder: Path, ready: Prepared, completion: Completion) -> dict[str, Any]:
     """Write all results but the targets and the video, and return the summary."""
-    task, completer = ready.task, ready.explorer.completer
+    options, task, completer = ready.options, ready.task, ready.completer
     completion = replace(completion, seconds=add_seconds(completion.seconds, ready.seconds))
     cameras = tuple(ready.cameras.values())
-    aside = sample_held_out_cameras(cameras, ready.options.seed)
+    aside = sample_held_out_cameras(cameras, options.seed)
+    facts = describe_run(options, ready.opened, task, completer.config, describe_settings(options))
     with run_in_background(render_pairs, completion, aside, completer.renderer) as looks:
         summary = write_report(
             folder,
             completion,
             task.targets,
             completer,
-            describe_run(ready.options, ready.opened, task),
+            {**facts, "seed": options.seed},
             task.splat_file,
             lambda: Surroundings(tuple(looks()), cameras),
-            read_held_out(ready.options, ready.opened, task, ready.cameras),
+            read_held_out(options, ready.opened, task, ready.cameras),
         )
     write_page(folder, render_completion_page(folder))
     return summary
@@ -207,21 +192,15 @@ def add_splat(
         return move_to_splat(task, given, path, options, opened, order)
 
 
-def describe_run(options: CompleteOptions, opened: Opened, task: Task) -> dict[str, Any]:
-    """Describe the input and the settings for `summary.json`."""
-    auto = None if options.target else get_max_targets(options)
-    targets = {"target": list(options.target), "auto": auto}
-    models = {
+def describe_settings(options: CompleteOptions) -> dict[str, Any]:
+    """Describe the settings of targets and models for `summary.json`."""
+    return {
+        "target": list(options.target),
+        "auto": None if options.target else get_max_targets(options),
         "reconstructor": options.reconstructor,
         "weights": None if options.weights is None else str(options.weights),
         **options.synthesis.describe(),
         "uses_target_photographs": options.synthesis.name == "oracle",
-    }
-    return {
-        "settings": describe_settings(options, get_stage_config(options), targets, models),
-        "seed": options.seed,
-        "device": task.device.type,
-        **describe_opened(options, opened, task),
     }
 
 
@@ -233,21 +212,16 @@ def load_completer(options: CompleteOptions, targets: Sequence[Target], device: 
         if target.photograph is not None
     ]
     name, settings = options.synthesis.name, options.synthesis.make_settings()
+    config = options.config
+    if options.no_prune:
+        config = replace(config, trust_settings=replace(config.trust_settings, prune=False))
     return GSCompleter(
         load_reconstructor(options.reconstructor, options.weights, device),
         load_generator(name, options.seed, photographs, device, settings),
         load_renderer(device),
-        get_stage_config(options),
+        config,
         options.seed,
     )
-
-
-def get_stage_config(options: CompleteOptions) -> CompleterConfig:
-    """Return the settings, changed by options that have a name of their own."""
-    if not options.no_prune:
-        return options.config
-    settings = replace(options.config.trust_settings, prune=False)
-    return replace(options.config, trust_settings=settings)
 
 
 def print_completion(summary: Mapping[str, Any], options: CompleteOptions) -> None:

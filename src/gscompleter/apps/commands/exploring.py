@@ -14,7 +14,7 @@ from gscompleter.apps.commands.options import CompleteOptions, get_max_targets, 
 from gscompleter.apps.inputs.opening import Opened, Task
 from gscompleter.apps.inputs.selection import collect_usable_cameras
 from gscompleter.apps.report.completion import Target
-from gscompleter.completer import check_target_ids
+from gscompleter.completer import GSCompleter, check_target_ids
 from gscompleter.data.local_origin import compute_frame_from_photographs
 from gscompleter.data.scene import write_cameras
 from gscompleter.errors import quote_value
@@ -28,6 +28,35 @@ from gscompleter.types import Camera
 LIFTED_VIEWS = 3
 """Time to complete a target, relative to the reconstruction of one photograph. Measured: 1.8 to 3.3
 (docs/performance.md)."""
+
+
+@dataclass(frozen=True)
+class Prepared:
+    """Everything that is loaded before the first completion."""
+
+    options: CompleteOptions
+    opened: Opened
+    task: Task
+    explorer: ViewPlanner
+    cameras: Mapping[int, Camera]
+    """Cameras of all usable photographs by frame, in the frame of the result."""
+    seconds: Mapping[str, float]
+    """Wall time by stage so far."""
+
+    @property
+    def completer(self) -> GSCompleter:
+        """The completer with its models."""
+        return self.explorer.completer
+
+    def begin(self) -> Completion:
+        """Initialize the context."""
+        return self.completer.begin(self.task.views, self.task.scene, self.task.check_views)
+
+    def with_choices(self, choices: Iterable[Choice]) -> Prepared:
+        """Return a copy with chosen candidates as targets."""
+        frames = list(self.cameras)
+        targets = [Target(c.camera, derived_from=frames[c.candidate.base]) for c in choices]
+        return replace(self, task=replace(self.task, targets=targets))
 
 
 @dataclass(frozen=True)
@@ -54,31 +83,29 @@ def collect_cameras(options: CompleteOptions, opened: Opened, task: Task) -> dic
     }
 
 
-def complete_targets(
-    options: CompleteOptions, task: Task, cameras: Mapping[int, Camera], explorer: ViewPlanner
-) -> tuple[Completion, Task]:
-    """Complete the scene for the targets of `task`, or for targets that it finds."""
-    completer, count = explorer.completer, get_max_targets(options)
+def complete_targets(ready: Prepared) -> tuple[Completion, Prepared]:
+    """Complete the scene for the named targets, or for targets that it finds."""
+    task, count = ready.task, get_max_targets(ready.options)
     if task.targets:
-        return completer(task.views, task.target_cameras, task.scene, task.check_views), task
+        named = ready.completer(task.views, task.target_cameras, task.scene, task.check_views)
+        return named, ready
     check_target_ids(task.scene, count)
-    begun = completer.begin(task.views, task.scene, task.check_views)
-    completion, choices = explorer.explore(begun, list(cameras.values()), count)
-    return completion, replace(task, targets=make_targets(choices, list(cameras)))
+    cameras = list(ready.cameras.values())
+    completion, choices = ready.explorer.explore(ready.begin(), cameras, count)
+    return completion, ready.with_choices(choices)
 
 
-def plan_completion(
-    options: CompleteOptions, task: Task, cameras: Mapping[int, Camera], explorer: ViewPlanner
-) -> Plan:
+def plan_completion(ready: Prepared) -> Plan:
     """Plan the completion without running it."""
-    begun = explorer.completer.begin(task.views, task.scene, task.check_views)
+    begun = ready.begin()
     context_seconds = begun.seconds["context"]
-    if task.targets:
-        holes = explorer.compute_hole_fractions(begun, task.target_cameras)
-        return Plan(task, holes, context_seconds)
-    choices = explorer.plan(begun, list(cameras.values()), get_max_targets(options))
-    task = replace(task, targets=make_targets(choices, list(cameras)))
-    return Plan(task, [choice.hole_fraction for choice in choices], context_seconds)
+    if ready.task.targets:
+        holes = ready.explorer.compute_hole_fractions(begun, ready.task.target_cameras)
+        return Plan(ready.task, holes, context_seconds)
+    cameras = list(ready.cameras.values())
+    choices = ready.explorer.plan(begun, cameras, get_max_targets(ready.options))
+    holes = [choice.hole_fraction for choice in choices]
+    return Plan(ready.with_choices(choices).task, holes, context_seconds)
 
 
 def print_plan(options: CompleteOptions, plan: Plan) -> None:
@@ -112,11 +139,6 @@ def name_target(frame: int | None, near: int | None) -> str:
     if near is not None:
         return f"target near {near}"
     return "target" if frame is None else f"target {frame}"
-
-
-def make_targets(choices: Iterable[Choice], frames: Sequence[int]) -> list[Target]:
-    """Turn chosen candidates into targets."""
-    return [Target(c.camera, derived_from=frames[c.candidate.base]) for c in choices]
 
 
 def write_targets(folder: Path, task: Task) -> None:

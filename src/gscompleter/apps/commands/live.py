@@ -10,7 +10,8 @@ from typing import TYPE_CHECKING
 
 from rich.console import Console
 
-from gscompleter.apps.commands.complete import Prepared, prepare_completion, write_done
+from gscompleter.apps.commands.complete import prepare_completion, write_done
+from gscompleter.apps.commands.exploring import Prepared
 from gscompleter.apps.commands.options import (
     CompleteOptions,
     CompletingOptions,
@@ -86,10 +87,9 @@ def make_complete_options(options: LiveOptions) -> CompleteOptions:
 
 def begin_session(ready: Prepared) -> Session:
     """Start the session."""
-    task, completer = ready.task, ready.explorer.completer
     origin, resolution = ready.opened.photographs.origin, parse_resolution(ready.options.resolution)
-    begun = completer.begin(task.views, task.scene, task.check_views)
-    return Session(completer, FrameConversion(task.frame, origin, resolution), begun)
+    conversion = FrameConversion(ready.task.frame, origin, resolution)
+    return Session(ready.completer, conversion, ready.begin())
 
 
 def read_page_photographs(ready: Prepared) -> list[View]:

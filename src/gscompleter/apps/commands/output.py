@@ -7,6 +7,7 @@ from collections.abc import Iterator, Mapping
 from contextlib import contextmanager, suppress
 from dataclasses import asdict
 from pathlib import Path
+from types import MappingProxyType
 from typing import Any
 
 from gscompleter.apps.commands.options import SceneOptions, parse_resolution
@@ -24,15 +25,34 @@ MAX_HELD_OUT = 8
 """Most unused photographs to score."""
 
 
-def describe_opened(options: SceneOptions, opened: Opened, task: Task) -> dict[str, Any]:
-    """Describe the opened scene, its frame and its depth range."""
+def describe_run(
+    options: SceneOptions,
+    opened: Opened,
+    task: Task,
+    config: CompleterConfig | CleaningConfig,
+    settings: Mapping[str, Any] = MappingProxyType({}),
+) -> dict[str, Any]:
+    """Describe the input and all settings that determine the result, with further `settings`."""
     camera = task.views[0].camera
+    splat = None if options.scene is None else str(options.scene)
     return {
+        "settings": {
+            "folder": str(options.folder),
+            "format": options.format,
+            "context": None if options.context is None else list(options.context),
+            "scene": splat,
+            **settings,
+            "resolution": options.resolution,
+            "near": options.near,
+            "far": options.far,
+            "config": asdict(config),
+        },
+        "device": task.device.type,
         "scene": {
             "format": opened.format,
             "photographs": opened.num_photographs,
             "used": len(task.views),
-            "splat": None if options.scene is None else str(options.scene),
+            "splat": splat,
         },
         "frame": {
             "method": task.method,
@@ -40,27 +60,6 @@ def describe_opened(options: SceneOptions, opened: Opened, task: Task) -> dict[s
             "origin": task.origin.tolist(),
         },
         "depth_range": {"near": camera.near, "far": camera.far, "from": dict(task.depths)},
-    }
-
-
-def describe_settings(
-    options: SceneOptions,
-    config: CompleterConfig | CleaningConfig,
-    targets: Mapping[str, Any],
-    models: Mapping[str, Any],
-) -> dict[str, Any]:
-    """Describe all settings that determine the result."""
-    return {
-        "folder": str(options.folder),
-        "format": options.format,
-        "context": None if options.context is None else list(options.context),
-        **targets,
-        "scene": None if options.scene is None else str(options.scene),
-        **models,
-        "resolution": options.resolution,
-        "near": options.near,
-        "far": options.far,
-        "config": asdict(config),
     }
 
 

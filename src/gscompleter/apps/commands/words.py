@@ -92,8 +92,8 @@ def find_misspelling(
     for word in words:
         given = word.split("=")[0]
         option = given.replace("_", "-")
-        near = get_close_matches(option, options, 1, MIN_SIMILARITY) if "--" in given[:2] else []
-        if near and near[0] != option:
+        near = get_close_matches(option, options, 1, MIN_SIMILARITY)
+        if given.startswith("--") and near and near[0] != option:
             return f"There is no option {quote_value(given)}; the nearest is {near[0]}"
     return None
 
