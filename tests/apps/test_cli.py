@@ -21,8 +21,8 @@ import torch
 
 from command import run
 from gscompleter import load_ply, save_ply
-from gscompleter.apps.commands.renamed import warn_renamed
 from gscompleter.apps.commands.row_options import parse_row
+from gscompleter.apps.commands.words import warn_renamed
 from gscompleter.cli import parse_command
 from gscompleter.config import CompleterConfig
 from gscompleter.config.generators import (

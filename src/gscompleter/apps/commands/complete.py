@@ -3,24 +3,16 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Iterator, Mapping, Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 from statistics import fmean
 from typing import Any
 
+import numpy as np
 from rich.console import Console
 from rich.table import Table
 
-from gscompleter.apps.commands.exploring import (
-    Prepared,
-    collect_cameras,
-    complete_targets,
-    name_target,
-    plan_completion,
-    print_plan,
-    write_targets,
-)
-from gscompleter.apps.commands.options import CompleteOptions, get_max_targets
+from gscompleter.apps.commands.options import CompleteOptions, get_max_targets, parse_resolution
 from gscompleter.apps.commands.output import (
     describe_run,
     is_replaceable,
@@ -41,6 +33,7 @@ from gscompleter.apps.inputs.opening import (
     read_task,
 )
 from gscompleter.apps.inputs.plan import describe_task
+from gscompleter.apps.inputs.selection import collect_usable_cameras
 from gscompleter.apps.report.completion import Surroundings, Target, write_report
 from gscompleter.apps.report.completion_page import render_completion_page
 from gscompleter.apps.report.film import VIDEO_FILE, write_comparison_video
@@ -52,26 +45,73 @@ from gscompleter.apps.report.plain_words import (
     describe_motion,
 )
 from gscompleter.apps.warmup.compilation import SPLAT_PART, compile_kernels
-from gscompleter.completer import Clock, GSCompleter, add_seconds
+from gscompleter.completer import Clock, GSCompleter, add_seconds, check_target_ids
 from gscompleter.config.generators import get_settings_class
+from gscompleter.data.local_origin import compute_frame_from_photographs
+from gscompleter.data.scene import write_cameras
+from gscompleter.errors import quote_value
 from gscompleter.evaluation.metrics.coverage import render_pairs, sample_held_out_cameras
 from gscompleter.generators import load_generator
-from gscompleter.io.files import COMPLETED_FILE, check_output, open_output_folder
+from gscompleter.io.files import COMPLETED_FILE, TARGETS_FILE, check_output, open_output_folder
 from gscompleter.io.video import check_video_writer
 from gscompleter.kernels.parallel import run_in_background
+from gscompleter.next_best_view.gain import Choice
 from gscompleter.next_best_view.planner import ViewPlanner
 from gscompleter.progress import expect_stages, show_preparation, show_progress, stage
 from gscompleter.reconstructors import check_reconstructor, load_reconstructor
 from gscompleter.render import choose_device, load_renderer
 from gscompleter.render.lod import MIN_PROXY_GAUSSIANS
+from gscompleter.splat_alignment.similarity import transform_camera, transform_camera_exactly
 from gscompleter.splats.formats import load_splat
 from gscompleter.splats.morton import argsort_nearby
 from gscompleter.state import Completion
-from gscompleter.types import View
+from gscompleter.types import Camera, View
 
 CONTEXT_STAGE = "context", 2.0
 TARGET_STAGES = ("generate", 1.0), ("lift", 1.0), ("register", 1.0), ("integrate", 2.0)
 """Stages with their relative times."""
+LIFTED_VIEWS = 3
+"""Time to complete a target, relative to the reconstruction of one photograph. Measured: 1.8 to 3.3
+(docs/performance.md)."""
+
+
+@dataclass(frozen=True)
+class Prepared:
+    """Everything that is loaded before the first completion."""
+
+    options: CompleteOptions
+    opened: Opened
+    task: Task
+    explorer: ViewPlanner
+    cameras: Mapping[int, Camera]
+    """Cameras of all usable photographs by frame, in the frame of the result."""
+    seconds: Mapping[str, float]
+    """Wall time by stage so far."""
+
+    @property
+    def completer(self) -> GSCompleter:
+        """The completer with its models."""
+        return self.explorer.completer
+
+    def begin(self) -> Completion:
+        """Initialize the context."""
+        return self.completer.begin(self.task.views, self.task.scene, self.task.check_views)
+
+    def with_choices(self, choices: Iterable[Choice]) -> Prepared:
+        """Return a copy with chosen candidates as targets."""
+        frames = list(self.cameras)
+        targets = [Target(c.camera, derived_from=frames[c.candidate.base]) for c in choices]
+        return replace(self, task=replace(self.task, targets=targets))
+
+
+@dataclass(frozen=True)
+class Plan:
+    """Targets and the time of a completion."""
+
+    task: Task
+    holes: Sequence[float]
+    """Hole fraction of each target, after completion of the previous ones."""
+    context_seconds: float
 
 
 def run_completion(options: CompleteOptions) -> None:
@@ -287,3 +327,83 @@ def describe_result(summary: Mapping[str, Any], options: CompleteOptions) -> Ite
         f"{options.out / COMPLETED_FILE}"
     )
     yield f"Report: {options.out / REPORT_FILE}"
+
+
+def collect_cameras(options: CompleteOptions, opened: Opened, task: Task) -> dict[int, Camera]:
+    """Return the cameras of all usable photographs by frame, in the frame of the result."""
+    given = opened.photographs
+    transform = task.frame @ compute_frame_from_photographs(-given.origin)
+    known = task.views[0].camera
+    cameras = collect_usable_cameras(given, range(len(given)), parse_resolution(options.resolution))
+    return {
+        frame: replace(
+            transform_camera(camera, transform).to(task.device), near=known.near, far=known.far
+        )
+        for frame, camera in cameras.items()
+    }
+
+
+def complete_targets(ready: Prepared) -> tuple[Completion, Prepared]:
+    """Complete the scene for the named targets, or for targets that it finds."""
+    task, count = ready.task, get_max_targets(ready.options)
+    if task.targets:
+        named = ready.completer(task.views, task.target_cameras, task.scene, task.check_views)
+        return named, ready
+    check_target_ids(task.scene, count)
+    cameras = list(ready.cameras.values())
+    completion, choices = ready.explorer.explore(ready.begin(), cameras, count)
+    return completion, ready.with_choices(choices)
+
+
+def plan_completion(ready: Prepared) -> Plan:
+    """Plan the completion without running it."""
+    begun = ready.begin()
+    context_seconds = begun.seconds["context"]
+    if ready.task.targets:
+        holes = ready.explorer.compute_hole_fractions(begun, ready.task.target_cameras)
+        return Plan(ready.task, holes, context_seconds)
+    cameras = list(ready.cameras.values())
+    choices = ready.explorer.plan(begun, cameras, get_max_targets(ready.options))
+    holes = [choice.hole_fraction for choice in choices]
+    return Plan(ready.with_choices(choices).task, holes, context_seconds)
+
+
+def print_plan(options: CompleteOptions, plan: Plan) -> None:
+    """Print the targets, their holes and the estimated time."""
+    table = Table("camera", "hole", box=None)
+    for number, (target, hole) in enumerate(zip(plan.task.targets, plan.holes, strict=True), 1):
+        name = name_target(target.frame, target.derived_from)
+        table.add_row(f"{number}: {name}", f"{100 * hole:.1f} %")
+    console = Console(highlight=False)
+    console.print(table)
+    console.print(describe_plan(options, plan), soft_wrap=True)
+
+
+def describe_plan(options: CompleteOptions, plan: Plan) -> str:
+    """Write the sentence on the number of targets and the estimated time."""
+    number = len(plan.holes)
+    if number == 0:
+        return "No camera has much to gain; there is nothing to complete."
+    duration = "in a time that is not known in advance"
+    if options.scene is None and options.synthesis.name == "warp-inpaint":
+        spent = plan.context_seconds
+        seconds = number * LIFTED_VIEWS * spent / len(plan.task.views)
+        duration = f"in about {seconds:.0f} s after the context ({spent:.0f} s)"
+    counted = "1 camera" if number == 1 else f"{number} cameras"
+    place = quote_value(options.out / TARGETS_FILE)
+    return f"To complete: {counted}, {duration}. Edit the cameras in {place}."
+
+
+def name_target(frame: int | None, near: int | None) -> str:
+    """Name a target for tables."""
+    if near is not None:
+        return f"target near {near}"
+    return "target" if frame is None else f"target {frame}"
+
+
+def write_targets(folder: Path, task: Task) -> None:
+    """Write the target cameras in the frame of the photographs, as `--target` reads them."""
+    if task.targets:
+        back = np.linalg.inv(task.frame)
+        cameras = [transform_camera_exactly(target.camera, back) for target in task.targets]
+        write_cameras(folder / TARGETS_FILE, cameras)

@@ -61,11 +61,6 @@ ALL = StructFieldSpec("help_all", bool, False, "Show all options and exit.")
 Rule = Callable[[StructTypeInfo], StructConstructorSpec | None]
 
 
-def asks_for_help(words: Sequence[str]) -> bool:
-    """Return True if a command line asks for one of the two help pages."""
-    return any(word in (*HELP, HELP_ALL) for word in words)
-
-
 def make_help_rule(show_all: bool) -> Rule:
     """Return a rule by which tyro writes help pages. No option can be parsed with it."""
     entered: list[type] = []

@@ -10,8 +10,7 @@ from typing import TYPE_CHECKING
 
 from rich.console import Console
 
-from gscompleter.apps.commands.complete import prepare_completion, write_done
-from gscompleter.apps.commands.exploring import Prepared
+from gscompleter.apps.commands.complete import Prepared, prepare_completion, write_done
 from gscompleter.apps.commands.options import (
     CompleteOptions,
     CompletingOptions,

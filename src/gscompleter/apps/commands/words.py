@@ -3,11 +3,12 @@
 from __future__ import annotations
 
 import re
+import sys
 from collections.abc import Callable, Collection, Sequence
 from contextlib import redirect_stderr, redirect_stdout, suppress
 from dataclasses import dataclass
 from difflib import get_close_matches
-from functools import partial
+from functools import cache, partial
 from io import StringIO
 from itertools import dropwhile, takewhile
 from typing import Any
@@ -15,15 +16,24 @@ from typing import Any
 import tyro
 from tyro.constructors import ConstructorRegistry, StructTypeInfo
 
-from gscompleter.apps.commands.help import HELP_ALL, Rule, asks_for_help, make_help_rule
+from gscompleter.apps.commands.help import HELP, HELP_ALL, Rule, make_help_rule
 from gscompleter.apps.commands.options import DEFAULT_NUM_TARGETS
-from gscompleter.apps.commands.renamed import use_new_names
 from gscompleter.config import CompleterConfig, load_config
 from gscompleter.config.renamed import refuse_old_options
-from gscompleter.errors import InputError, quote_value
+from gscompleter.errors import PROGRAM, InputError, quote_value
 
 MIN_SIMILARITY = 0.75
 """Smallest similarity of an option to a misspelt one, from 0 to 1."""
+
+RENAMED = {
+    "keep-unsupported": "no-prune",
+    "generator-path": "generator-weights",
+    "generator-at-once": "generator-batch-size",
+    "film": "video",
+    "again": "rerun",
+    "ignore-masked": "use-masks",
+}
+"""Names of the last release with today's; they are accepted for one release."""
 
 
 def format_error(error: InputError) -> str:
@@ -39,8 +49,8 @@ def parse_words(words: Sequence[str], command: Any, names: Collection[str]) -> A
     It raises InputError for wrong words, and SystemExit after printing the help.
     """
     words = use_new_names(words)
-    show_all = HELP_ALL in words
-    helps = [make_help_rule(show_all)] if asks_for_help(words) else []
+    asked = any(word in (*HELP, HELP_ALL) for word in words)
+    helps = [make_help_rule(show_all=HELP_ALL in words)] if asked else []
     words = ["--help" if word == HELP_ALL else word for word in words]
     check_once(words)
     refuse_old_options(words)
@@ -163,3 +173,31 @@ def extract_sentence(box: str) -> str:
     usage = lines.index("Argument helptext:") + 1 if "Argument helptext:" in lines else None
     needed = "" if usage is None else f"; give {lines[usage].strip()}"
     return f"{quote_value(sentence, 200).removesuffix('.')}{needed}"
+
+
+def use_new_names(words: Sequence[str]) -> list[str]:
+    """Replace old names of options such as `--film` or `--rerun=failures`, and warn of each."""
+    renamed = []
+    for word in words:
+        old, equals, value = word.partition("=")
+        new = f"--{translate_name(old[2:])}" if old.startswith("--") else old
+        renamed.append(f"{new}{equals}{value}")
+    return renamed
+
+
+def translate_name(name: str) -> str:
+    """Return today's name of an option without dashes, and warn of an old one."""
+    old = name.replace("_", "-")
+    if old not in RENAMED:
+        return name
+    warn_renamed(old, RENAMED[old])
+    return RENAMED[old]
+
+
+@cache
+def warn_renamed(old: str, new: str) -> None:
+    """Print once per process that an option has a new name."""
+    print(
+        f"{PROGRAM}--{old} is now called --{new}; the old name stops working in the next release.",
+        file=sys.stderr,
+    )
