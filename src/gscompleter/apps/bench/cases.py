@@ -15,11 +15,13 @@ from annotated_types import Ge, MinLen
 from pydantic import TypeAdapter, ValidationError
 
 from gscompleter.data.formats import open_photographs
+from gscompleter.data.photographs import Photographs
 from gscompleter.errors import InputError, quote_value
 from gscompleter.evaluation.methods import Models
 from gscompleter.io.json_file import read_json
 from gscompleter.splats.ply import save_ply
-from gscompleter.types import Gaussians, View
+from gscompleter.state import Completion
+from gscompleter.types import Gaussians
 
 Whole = Annotated[int, Ge(0)]
 Frames = Annotated[tuple[Whole, ...], MinLen(1)]
@@ -52,10 +54,14 @@ class BenchCase:
         """Number of pixels of an image."""
         return self.resolution[0] * self.resolution[1]
 
-    def read_views(self, device: str) -> list[View]:
-        """Read the context photographs."""
-        photographs = open_photographs(self.scene, near=self.near, far=self.far)
-        return [view.to(device) for view in photographs.views(self.context, self.resolution)]
+    def open(self) -> Photographs:
+        """Open the scene."""
+        return open_photographs(self.scene, near=self.near, far=self.far)
+
+    def begin(self, models: Models, device: str) -> Completion:
+        """Reconstruct the context."""
+        views = self.open().views(self.context, self.resolution)
+        return models.make_completer().begin([view.to(device) for view in views])
 
 
 AXES: dict[str, str] = {
@@ -168,7 +174,7 @@ def read_manifest(path: Path) -> Manifest:
 def check_frames(cases: Sequence[BenchCase]) -> None:
     """Raise InputError if a scene cannot be opened or lacks a frame."""
     for case in cases:
-        photographs = open_photographs(case.scene, near=case.near, far=case.far)
+        photographs = case.open()
         for frame in (*case.context, *case.targets):
             photographs.camera(frame, case.resolution)
 
@@ -179,7 +185,7 @@ def write_input_splat(case: BenchCase, folder: Path, models: Models, device: str
         return None
     path = folder / f"{abs(hash(replace(case, targets=(0,)))):x}.ply"
     if not path.exists():
-        context = models.make_completer().begin(case.read_views(device)).context
+        context = case.begin(models, device).context
         save_ply(path, multiply_gaussians(context, case.gaussians, models.seed))
     return path
 

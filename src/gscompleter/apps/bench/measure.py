@@ -16,9 +16,7 @@ from typing import TypeVar
 import torch
 from torch import Tensor
 
-from gscompleter.apps.bench.cases import BenchCase
-from gscompleter.data.formats import open_photographs
-from gscompleter.errors import InputError, quote_value
+from gscompleter.errors import InputError
 from gscompleter.evaluation.memory import measure_peak_memory
 from gscompleter.evaluation.methods import BASELINES, METHODS, Method, Models, Prediction
 from gscompleter.io.files import SUMMARY_FILE
@@ -224,45 +222,21 @@ BENCH_METHODS: dict[str, Method] = {
 """Methods by name; the first one is ours, and times of others are multiples of its time."""
 
 
-def check_bench_methods(names: Sequence[str]) -> None:
-    """Raise InputError for an unknown method."""
-    for name in names:
-        if name not in BENCH_METHODS:
-            raise InputError(
-                f"There is no method '{quote_value(name)}' to compare; choose one of "
-                f"{', '.join(BENCH_METHODS)}.",
-                "methods",
-            )
+def measure_method(
+    name: str, state: Completion, target: Camera, models: Models, yardstick: Yardstick
+) -> Sample:
+    """Measure one run of a method on a target, with the seconds of its own stages."""
+    before = state.scene
 
+    def run() -> tuple[Prediction, int | None]:
+        with measure_peak_memory(before.means.device) as peak:
+            prediction = BENCH_METHODS[name](state, target, models)
+        return prediction, peak.bytes
 
-@dataclass(frozen=True)
-class Start:
-    """The state that all methods start from, and their target."""
-
-    state: Completion
-    target: Camera
-    models: Models
-
-    @staticmethod
-    def prepare(case: BenchCase, models: Models, device: str) -> Start:
-        """Reconstruct the scene of a case once for all methods, with its first target."""
-        photographs = open_photographs(case.scene, near=case.near, far=case.far)
-        target = photographs.camera(case.targets[0], case.resolution).to(device)
-        return Start(models.make_completer().begin(case.read_views(device)), target, models)
-
-    def measure(self, name: str, yardstick: Yardstick) -> Sample:
-        """Measure one run of a method, with the seconds of its own stages."""
-        before = self.state.scene
-
-        def run() -> tuple[Prediction, int | None]:
-            with measure_peak_memory(before.means.device) as peak:
-                prediction = BENCH_METHODS[name](self.state, self.target, self.models)
-            return prediction, peak.bytes
-
-        (found, peak_bytes), unit = yardstick.measure_beside(run)
-        own = sum(spent for stage, spent in found.seconds.items() if stage in OWN_STAGES)
-        counts = {"context": len(before), "added": len(found.scene) - len(before)}
-        return make_sample({**found.seconds, OWN: own}, unit, peak_bytes, counts)
+    (found, peak_bytes), unit = yardstick.measure_beside(run)
+    own = sum(spent for stage, spent in found.seconds.items() if stage in OWN_STAGES)
+    counts = {"context": len(before), "added": len(found.scene) - len(before)}
+    return make_sample({**found.seconds, OWN: own}, unit, peak_bytes, counts)
 
 
 @dataclass(frozen=True)

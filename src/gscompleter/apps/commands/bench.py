@@ -26,11 +26,10 @@ from gscompleter.apps.bench.measure import (
     PROCESS,
     BenchTask,
     Sample,
-    Start,
     Yardstick,
-    check_bench_methods,
     measure_command,
     measure_in_rounds,
+    measure_method,
 )
 from gscompleter.apps.bench.report import (
     Report,
@@ -102,7 +101,6 @@ class Bench:
 
 def run_bench(options: BenchOptions) -> None:
     """Measure the cases and methods, and print or write the tables."""
-    check_bench_methods(options.methods)
     if options.folder is not None and options.cases is not None:
         raise InputError("A scene and a file of cases are both named; name one.", "cases")
     if options.out is not None:
@@ -234,14 +232,16 @@ def make_case_tasks(bench: Bench, cases: Sequence[BenchCase]) -> dict[BenchCase 
 def make_method_tasks(bench: Bench, case: BenchCase) -> dict[BenchCase | str, BenchTask]:
     """Create the tasks that compare methods at the first target of `case`."""
     options = bench.options
-    start = Start.prepare(case, bench.models, bench.device)
+    state = case.begin(bench.models, bench.device)
+    target = case.open().camera(case.targets[0], case.resolution).to(bench.device)
+    start = state, target, bench.models, bench.yardstick
     if not options.quick:
         with stage("warming up"), show_progress(None):
-            start.measure("full", bench.yardstick)
+            measure_method("full", *start)
     tasks: dict[BenchCase | str, BenchTask] = {}
     for name in options.methods:
         repeats = bench.repeats if name in FAST_METHODS else bench.baseline_repeats
-        measure = partial(start.measure, name, bench.yardstick)
+        measure = partial(measure_method, name, *start)
         tasks[name] = BenchTask(f"method {name}", measure, OWN, repeats)
     return tasks
 

@@ -21,6 +21,7 @@ Threads = Annotated[int, Interval(ge=1, le=1024)]
 Repeats = Annotated[int, Interval(ge=1, le=1000)]
 Port = Annotated[int, Interval(ge=0, le=65535)]
 Axis = Literal["gaussians", "pixels", "views", "targets"]
+BenchMethod = Literal["full", "autograd", "densify-100", "densify-800", "distill", "reggs"]
 Device = Literal["auto", "cpu", "cuda"]
 Size = tuple[int, int] | int | Literal["full"]
 """Height and width, the longest side, or `full` for the photographs' own size."""
@@ -331,9 +332,8 @@ class BenchOptions(RunOptions):
     Methods are compared on the first case."""
     only: tuple[str, ...] = ()
     """Names of the cases to measure; all if not given."""
-    methods: tuple[str, ...] = ("full", "autograd", "densify-800", "distill", "reggs")
-    """Methods to compare: full (ours), autograd (ours without a frozen context), densify-100,
-    densify-800, distill, reggs."""
+    methods: tuple[BenchMethod, ...] = ("full", "autograd", "densify-800", "distill", "reggs")
+    """Methods to compare: full (ours), autograd (ours without a frozen context), or others."""
     growth: tuple[Axis, ...] = ("gaussians", "pixels", "views", "targets")
     """Quantities to increase in the first case."""
     repeats: Repeats = 5

@@ -99,11 +99,10 @@ def find_misspelling(
     near = get_close_matches(words[0], names, 1) if words else []
     if near and words[0] not in names:
         return f"There is no command {quote_value(words[0])}; the nearest is {near[0]}"
-    for word in words:
-        given = word.split("=")[0]
+    for given in (word.split("=")[0] for word in words if word.startswith("--")):
         option = given.replace("_", "-")
         near = get_close_matches(option, options, 1, MIN_SIMILARITY)
-        if given.startswith("--") and near and near[0] != option:
+        if near and near[0] != option:
             return f"There is no option {quote_value(given)}; the nearest is {near[0]}"
     return None
 
