@@ -298,4 +298,4 @@ def test_on_a_terminal_there_is_a_line_with_a_bar(room, tmp_path):
     said = os.read(mine, 2**20).decode(errors="ignore")
     assert "\x1b[?25l" in said
     assert "target 1 of 1: " in said
-    assert " left" in said
+    assert "%" in said

@@ -15,30 +15,9 @@ from typing import Annotated, Any, TextIO, Union
 import tyro
 
 from gscompleter import __version__
-from gscompleter.apps.commands.convert import ConvertOptions
-from gscompleter.apps.commands.doctor import DoctorOptions
-from gscompleter.apps.commands.options import (
-    BatchOptions,
-    BenchOptions,
-    CleanOptions,
-    CompleteOptions,
-    ComputeOptions,
-    DemoOptions,
-    EvaluateOptions,
-    IndexOptions,
-    LiveOptions,
-    ModelsOptions,
-    RunOptions,
-    TablesOptions,
-)
-from gscompleter.apps.commands.poses import PosesOptions
-from gscompleter.apps.commands.report import ReportOptions
-from gscompleter.apps.commands.strip import StripOptions
-from gscompleter.apps.commands.view import ViewOptions
-from gscompleter.apps.commands.warmup import WarmupOptions
+from gscompleter.apps.commands import options, tool_options
 from gscompleter.apps.commands.words import format_error, parse_words
-from gscompleter.apps.warmup.compilation import begin_compilation
-from gscompleter.apps.warmup.garbage import freeze_objects
+from gscompleter.apps.warmup.compilation import freeze_objects
 from gscompleter.config.settings import validate
 from gscompleter.cpu_threads import limit_threads
 from gscompleter.errors import PROGRAM, InputError
@@ -47,23 +26,23 @@ from gscompleter.io.interrupts import handle_stop_signals
 # Options, module and function of each command. The module is imported after the options are
 # validated, so that `--help` does not wait for torch.
 COMMANDS: dict[str, tuple[type, str, str]] = {
-    "complete": (CompleteOptions, "gscompleter.apps.commands.complete", "run_completion"),
-    "batch": (BatchOptions, "gscompleter.apps.commands.batch", "run_batch"),
-    "live": (LiveOptions, "gscompleter.apps.commands.live", "run_live"),
-    "clean": (CleanOptions, "gscompleter.apps.commands.clean", "run_clean"),
-    "demo": (DemoOptions, "gscompleter.apps.commands.demo", "run_demo"),
-    "evaluate": (EvaluateOptions, "gscompleter.apps.commands.evaluate", "run_evaluation"),
-    "tables": (TablesOptions, "gscompleter.apps.commands.evaluate", "run_tables"),
-    "index": (IndexOptions, "gscompleter.apps.commands.evaluate", "run_index"),
-    "bench": (BenchOptions, "gscompleter.apps.commands.bench", "run_bench"),
-    "models": (ModelsOptions, "gscompleter.apps.commands.models", "run_models"),
-    "convert": (ConvertOptions, "gscompleter.apps.commands.convert", "run_convert"),
-    "poses": (PosesOptions, "gscompleter.apps.commands.poses", "run_poses"),
-    "report": (ReportOptions, "gscompleter.apps.commands.report", "run_report"),
-    "strip": (StripOptions, "gscompleter.apps.commands.strip", "run_strip"),
-    "view": (ViewOptions, "gscompleter.apps.commands.view", "run_view"),
-    "doctor": (DoctorOptions, "gscompleter.apps.commands.doctor", "run_doctor"),
-    "warmup": (WarmupOptions, "gscompleter.apps.commands.warmup", "run_warmup"),
+    "complete": (options.CompleteOptions, "complete", "run_completion"),
+    "batch": (options.BatchOptions, "batch", "run_batch"),
+    "live": (options.LiveOptions, "live", "run_live"),
+    "clean": (options.CleanOptions, "clean", "run_clean"),
+    "demo": (options.DemoOptions, "demo", "run_demo"),
+    "evaluate": (options.EvaluateOptions, "evaluate", "run_evaluation"),
+    "tables": (options.TablesOptions, "evaluate", "run_tables"),
+    "index": (options.IndexOptions, "evaluate", "run_index"),
+    "bench": (options.BenchOptions, "bench", "run_bench"),
+    "models": (tool_options.ModelsOptions, "models", "run_models"),
+    "convert": (tool_options.ConvertOptions, "convert", "run_convert"),
+    "poses": (tool_options.PosesOptions, "poses", "run_poses"),
+    "report": (tool_options.ReportOptions, "report", "run_report"),
+    "strip": (tool_options.StripOptions, "convert", "run_strip"),
+    "view": (tool_options.ViewOptions, "view", "run_view"),
+    "doctor": (tool_options.DoctorOptions, "doctor", "run_doctor"),
+    "warmup": (tool_options.WarmupOptions, "warmup", "run_warmup"),
 }
 
 Command: Any = Union[  # noqa: UP007  (of as many as there are)
@@ -133,14 +112,13 @@ def main() -> None:
     warnings.filterwarnings("ignore", module="PIL")
     try:
         with freeze_objects():
-            options = validate(parse_command(words))
-            if isinstance(options, ComputeOptions):
-                limit_threads(options.threads)
-            if isinstance(options, RunOptions):
-                begin_compilation(options.models)
+            given = validate(parse_command(words))
+            if isinstance(given, options.ComputeOptions):
+                limit_threads(given.threads)
             _, module, function = COMMANDS[words[0]]
+            module = f"gscompleter.apps.commands.{module}"
             command = getattr(import_module(module), function)
-        command(options)
+        command(given)
     except InputError as error:
         print(f"{PROGRAM}{format_error(error)}", file=sys.stderr)
         sys.exit(2)

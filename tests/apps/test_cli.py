@@ -21,8 +21,8 @@ import torch
 
 from command import run
 from gscompleter import load_ply, save_ply
-from gscompleter.apps.commands.renamed import warn_renamed
 from gscompleter.apps.commands.row_options import parse_row
+from gscompleter.apps.commands.words import warn_renamed
 from gscompleter.cli import parse_command
 from gscompleter.config import CompleterConfig
 from gscompleter.config.generators import (
@@ -227,7 +227,7 @@ def refused(monkeypatch, capsys, out: Path, arguments, sentence: str) -> None:
         ({"target": ("abc",)}, "a target is the number of a frame, from 0 to "),
         ({"target": ("²",)}, "²"),
         ({"target": ("--2",)}, "--2"),
-        ({"target": ("9" * 5000,)}, "no frame 999"),
+        ({"target": ("9" * 5000,)}, "9' is no target"),
         ({"target": ("x" * 5000,)}, "xxx"),
         ({"context": ("0,1",)}, "'0,1'"),
         ({"context": ("²", 1)}, "'²'"),
@@ -390,8 +390,8 @@ def test_the_options_of_a_generator_are_its_settings(scene, tmp_path):
 @pytest.mark.parametrize(
     ("old", "new"),
     [
-        (("--keep-unsupported",), ("--no-prune",)),
-        (("--keep_unsupported",), ("--no-prune",)),
+        (("--keep-unsupported",), ("--no-recolor",)),
+        (("--keep_unsupported",), ("--no-recolor",)),
         (("--film",), ("--video",)),
         (("--generator-path", "a/b"), ("--generator-weights", "a/b")),
         (("--generator-path=a/b",), ("--generator-weights", "a/b")),
@@ -422,7 +422,7 @@ def test_old_option_names_of_other_commands_and_of_rows_work_too(tmp_path, capsy
     )
     row = {"folder": "scene", "keep_unsupported": "true", "film": "no"}
     options = parse_row(row, tmp_path)
-    assert (options.no_prune, options.video) == (True, False)
+    assert (options.no_recolor, options.video) == (True, False)
     assert capsys.readouterr().err.count("\n") == 4  # once each
 
 

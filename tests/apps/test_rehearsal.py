@@ -59,7 +59,6 @@ def marked(monkeypatch, tmp_path) -> list[str]:
     monkeypatch.setattr(compilation, "PARTS", ("cpu", "plane-sweep"))
     monkeypatch.setattr(rehearsal, "PARTS", dict.fromkeys(compilation.PARTS, done.append))
     monkeypatch.setattr(compilation, "get_thread_count", lambda: 1)
-    monkeypatch.setattr(compilation, "_started", {})
     return done
 
 
@@ -121,46 +120,13 @@ def test_warmup_says_what_it_did(marked, monkeypatch, capsys):
     assert marked == ["cpu", "plane-sweep"]
 
 
-def test_a_model_that_is_asked_for_is_begun_before_anything_is_known(tmp_path):
-    """It runs in a process of its own, which stops its child."""
-    begun = """
-from gscompleter.apps.warmup import compilation
-from gscompleter.apps.warmup.compilation import begin_compilation
-begin_compilation(["mvsplat"])
-begin_compilation(["plane-sweep", "another"])
-(process,) = compilation._started.values()
-print(process.args[-1:], process.poll(), process.pid)
-"""
-    environment = {**os.environ, "NUMBA_CACHE_DIR": str(tmp_path), "NUMBA_NUM_THREADS": "2"}
-    command = [sys.executable, "-c", begun]
-    environment["OMP_NUM_THREADS"] = "2"
-    life = subprocess.run(command, env=environment, capture_output=True, text=True, check=True)
-    name, state, pid = life.stdout.split()
-    assert (name, state, life.stderr) == ("['plane-sweep']", "None", "")
-    with pytest.raises(ProcessLookupError):
-        os.kill(int(pid), 0)
-
-
-def test_what_was_begun_is_waited_for_once(monkeypatch, marked):
-    begun: list[subprocess.Popen[bytes]] = []
-
-    def idle(names: list[str]) -> subprocess.Popen[bytes]:
-        begun.append(subprocess.Popen([sys.executable, "-c", "pass", *names]))
-        return begun[-1]
-
-    monkeypatch.setattr(compilation, "start_rehearsal", idle)
+def test_models_are_compiled_in_another_process_beside_the_renderer(monkeypatch):
+    names = ["cpu", "brought", "plane-sweep"]
     monkeypatch.setattr(compilation, "get_thread_count", lambda: 2)
-    compilation.begin_compilation(["plane-sweep"])
-    compilation.begin_compilation(["plane-sweep"])
-    assert compilation.compile_kernels(["cpu", "plane-sweep"]) > 0
-    assert [(process.args[-1], process.returncode) for process in begun] == [("plane-sweep", 0)]
-    assert marked == ["cpu"]
-    assert compilation._started == {}
-
-
-def test_one_process_alone_begins_nothing(monkeypatch, marked):
-    compilation.begin_compilation(["cpu", "plane-sweep"])
-    assert compilation._started == {}
+    assert compilation.split_parts(names) == (["cpu", "brought"], ["plane-sweep"])
+    assert compilation.split_parts(["plane-sweep"]) == (["plane-sweep"], [])
+    monkeypatch.setattr(compilation, "get_thread_count", lambda: 1)
+    assert compilation.split_parts(names) == (names, [])
 
 
 def test_a_part_that_fails_in_its_process_is_no_success(monkeypatch):

@@ -43,7 +43,7 @@ def test_without_the_packages_one_sentence_says_what_to_install(name, monkeypatc
 def test_a_setting_that_a_generator_does_not_know_is_refused(name, setting, way_out):
     ((key, value),) = setting.items()
     with pytest.raises(InputError) as caught:
-        GeneratorOptions(name, setting).make_settings()
+        GeneratorOptions(name, **{f"generator_{key}": value}).make_settings()
     assert f"{name!r} has no setting {key} ({value})" in str(caught.value)
     assert way_out in str(caught.value)
     assert caught.value.argument == f"generator_{key}"

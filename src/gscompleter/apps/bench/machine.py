@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 import platform
 import re
 from pathlib import Path
@@ -10,30 +9,24 @@ from pathlib import Path
 import torch
 
 from gscompleter import __version__
+from gscompleter.cpu_threads import count_available_cores
 from gscompleter.memory import read_memory_bytes
 
 
 def describe_machine(device: str) -> dict[str, str | int]:
     """Describe the versions and the hardware."""
     memory = read_memory_bytes()
-    found: dict[str, str | int] = {
+    return {
         "gscompleter": __version__,
         "processor": get_processor_name(),
-        "cores": count_usable_cores(),
+        "cores": count_available_cores(),
         "memory_gb": 0 if memory is None else round(memory / 1e9),
         "system": f"{platform.system()} {platform.release()}",
         "python": platform.python_version(),
         "torch": str(torch.__version__),
         "device": device,
+        **({"gpu": torch.cuda.get_device_name()} if device == "cuda" else {}),
     }
-    return {**found, "gpu": torch.cuda.get_device_name()} if device == "cuda" else found
-
-
-def count_usable_cores() -> int:
-    """Count the cores that this process may use."""
-    if hasattr(os, "sched_getaffinity"):
-        return len(os.sched_getaffinity(0))
-    return os.cpu_count() or 1
 
 
 def get_processor_name() -> str:

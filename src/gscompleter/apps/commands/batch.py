@@ -143,7 +143,7 @@ def complete_job(job: Job, place: Place) -> dict[str, Any]:
             download_inputs(job.options) as given,
             place.open_folder(f"{JOBS}/{job.name}") as folder,
         ):
-            summary, _ = complete_folder(parse_row(given, folder))
+            summary = complete_folder(parse_row(given, folder))
             meter.begin("deliver")
             thumbnail = make_batch_thumbnail(folder)
             size = sum(file.stat().st_size for file in folder.rglob("*") if file.is_file())

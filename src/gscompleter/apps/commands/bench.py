@@ -4,34 +4,41 @@ from __future__ import annotations
 
 import json
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import asdict, dataclass, replace
+from functools import partial
 from pathlib import Path
 from tempfile import TemporaryDirectory
 
 from rich.console import Console
 
-from gscompleter.apps.bench.comparison import (
-    OWN,
-    check_bench_methods,
-    measure_method,
-    prepare_start,
-)
-from gscompleter.apps.bench.completions import PROCESS, measure_command, write_input_splat
-from gscompleter.apps.bench.growth import Growth
-from gscompleter.apps.bench.machine import describe_machine
-from gscompleter.apps.bench.manifest import (
+from gscompleter.apps.bench.cases import (
     BenchCase,
     Manifest,
     check_frames,
     get_size,
-    make_series,
+    make_default_series,
     read_manifest,
+    write_input_splat,
 )
-from gscompleter.apps.bench.plots import plot_growth
-from gscompleter.apps.bench.report import Report, build_content, format_report
-from gscompleter.apps.bench.rounds import BenchTask, measure_in_rounds
-from gscompleter.apps.bench.samples import Sample, SampleSet
-from gscompleter.apps.bench.yardstick import Yardstick
+from gscompleter.apps.bench.machine import describe_machine
+from gscompleter.apps.bench.measure import (
+    OWN,
+    PROCESS,
+    BenchTask,
+    Sample,
+    Yardstick,
+    measure_command,
+    measure_in_rounds,
+    measure_method,
+)
+from gscompleter.apps.bench.report import (
+    Report,
+    Spread,
+    fit_growth,
+    format_report,
+    plot_growth,
+    summarize,
+)
 from gscompleter.apps.commands.demo import (
     BASELINE_M,
     get_motorcycle_cameras,
@@ -39,6 +46,7 @@ from gscompleter.apps.commands.demo import (
     write_motorcycle_scene,
 )
 from gscompleter.apps.commands.options import BenchOptions
+from gscompleter.apps.inputs.opening import print_lines
 from gscompleter.data.scene import write_cameras
 from gscompleter.errors import InputError, quote_value
 from gscompleter.evaluation.methods import Models
@@ -52,6 +60,7 @@ from gscompleter.render import choose_device, load_renderer
 BEYOND = (1.0, 1.25, 1.5, 1.75)
 """Distances of the demo's targets from its two cameras, in baselines."""
 QUICK_ITERATIONS = 2
+FAST_METHODS = ("full", "autograd")
 
 
 @dataclass(frozen=True)
@@ -65,52 +74,47 @@ class Bench:
     folder: Path
     """Folder for temporary scenes and results."""
 
+    @property
+    def repeats(self) -> int:
+        """Number of repetitions."""
+        return 1 if self.options.quick else self.options.repeats
+
+    @property
+    def baseline_repeats(self) -> int:
+        """Number of repetitions of slow methods."""
+        return min(self.repeats, self.options.baseline_repeats)
+
     def complete(self, case: BenchCase) -> Sample:
         """Complete a case in a process of its own."""
         out = self.folder / "completion"
         scene = write_input_splat(case, self.folder, self.models, self.device)
-        return measure_command(self.make_words(case, scene, out), out, self.yardstick)
-
-    def make_words(self, case: BenchCase, scene: Path | None, out: Path) -> list[str]:
-        """Write the command line that completes a case."""
-        planes = {"--near": case.near, "--far": case.far, "--scene": scene}
-        given = [(flag, value) for flag, value in planes.items() if value is not None]
-        return [
-            *("complete", str(case.scene), "--out", str(out), "--overwrite", "--quiet"),
-            *("--context", *map(str, case.context), "--target", *map(str, case.targets)),
-            *("--resolution", *map(str, case.resolution)),
-            *("--device", self.device, "--seed", str(self.options.seed)),
-            *(str(word) for pair in given for word in pair),
+        given = {"--near": case.near, "--far": case.far, "--scene": scene}
+        words = [
+            *("complete", case.scene, "--out", out, "--overwrite", "--quiet"),
+            *("--context", *case.context, "--target", *case.targets),
+            *("--resolution", *case.resolution),
+            *("--device", self.device, "--seed", self.options.seed),
+            *(word for pair in given.items() if pair[1] is not None for word in pair),
         ]
+        return measure_command([str(word) for word in words], out, self.yardstick)
 
 
 def run_bench(options: BenchOptions) -> None:
     """Measure the cases and methods, and print or write the tables."""
-    check_bench_options(options)
+    if options.folder is not None and options.cases is not None:
+        raise InputError("A scene and a file of cases are both named; name one.", "cases")
+    if options.out is not None:
+        check_output(options.out, options.overwrite)
     console = Console(stderr=True, quiet=options.quiet, highlight=False)
     with TemporaryDirectory(prefix="gscompleter-bench-") as temporary:
         manifest = select_cases(load_bench_manifest(options, Path(temporary)), options)
         with show_progress(None if options.quiet else console):
             with show_preparation("getting ready"):
                 bench = prepare_bench(options, Path(temporary))
-            report = run_measurements(bench, manifest, make_printer(console))
+            report = run_measurements(bench, manifest, partial(print_lines, console))
     if options.out is not None:
         write_bench(report, options.out, options.overwrite, console)
-    print(json.dumps(build_content(report), indent=1) if options.json else format_report(report))
-
-
-def check_bench_options(options: BenchOptions) -> None:
-    """Refuse impossible options."""
-    check_bench_methods(options.methods)
-    if options.folder is not None and options.cases is not None:
-        raise InputError("A scene and a file of cases are both named; name one.", "cases")
-    if options.out is not None:
-        check_output(options.out, options.overwrite)
-
-
-def make_printer(console: Console) -> Callable[[str], None]:
-    """Return a function that prints lines without markup."""
-    return lambda line: console.print(line, markup=False, soft_wrap=True)
+    print(format_json(report) if options.json else format_report(report))
 
 
 def load_bench_manifest(options: BenchOptions, folder: Path) -> Manifest:
@@ -119,9 +123,9 @@ def load_bench_manifest(options: BenchOptions, folder: Path) -> Manifest:
         return read_manifest(options.cases)
     if options.folder is not None:
         case = make_scene_case(options, options.folder)
-        return Manifest((case,), make_series(case))
+        return Manifest((case,), make_default_series(case))
     case = write_demo_case(options, folder / "motorcycle")
-    return Manifest((replace(case, targets=case.targets[:1]),), make_series(case))
+    return Manifest((replace(case, targets=case.targets[:1]),), make_default_series(case))
 
 
 def make_scene_case(options: BenchOptions, scene: Path) -> BenchCase:
@@ -183,107 +187,77 @@ def prepare_bench(options: BenchOptions, folder: Path) -> Bench:
     return Bench(options, device, models, Yardstick.create(renderer, device), folder)
 
 
-def run_measurements(bench: Bench, manifest: Manifest, tell: Callable[[str], None]) -> Report:
+def run_measurements(bench: Bench, manifest: Manifest, print_line: Callable[[str], None]) -> Report:
     """Run all measurements in rounds, after a first run that is not counted."""
-    growing = [case for found in manifest.growth.values() for case in found]
-    names = map_case_names([*manifest.cases, *growing])
-    if not bench.options.quick:
-        tell(f"{manifest.cases[0].name}: first run, not counted")
+    options, first = bench.options, manifest.cases[0]
+    if not options.quick:
+        print_line(f"{first.name}: first run, not counted")
         with stage("warming up"):
-            bench.complete(manifest.cases[0])
-    methods = make_method_tasks(bench, manifest.cases[0])
-    found = measure_in_rounds([*make_case_tasks(bench, names), *methods], tell)
-    growth = [
-        Growth(
-            axis,
-            tuple(get_size(axis, case) for case in cases),
-            tuple(replace(found[names[remove_case_name(case)]], name=case.name) for case in cases),
-        )
-        for axis, cases in manifest.growth.items()
-    ]
+            bench.complete(first)
+    growing = [case for series in manifest.growth.values() for case in series]
+    cases = make_case_tasks(bench, [*manifest.cases, *growing])
+    methods = make_method_tasks(bench, first) if options.methods else {}
+    samples = measure_in_rounds({**cases, **methods}, print_line)
+    yardsticks = [sample.yardstick for found in samples.values() for sample in found]
     return Report(
         describe_machine(bench.device),
-        describe_bench_settings(bench),
-        tuple(found[names[remove_case_name(case)]] for case in manifest.cases),
-        tuple(remove_method_prefix(found[task.name]) for task in methods),
-        tuple(growth),
+        {
+            "seed": options.seed,
+            "repeats": bench.repeats,
+            "baseline_repeats": bench.baseline_repeats,
+            "baseline_iterations": bench.models.baseline_iterations,
+        },
+        Spread.from_values(yardsticks),
+        [summarize(case.name, samples[case]) for case in manifest.cases],
+        [summarize(name, samples[name]) for name in dict.fromkeys(options.methods)],
+        [
+            fit_growth(
+                axis,
+                [get_size(axis, case) for case in series],
+                [summarize(case.name, samples[case]) for case in series],
+            )
+            for axis, series in manifest.growth.items()
+        ],
     )
 
 
-def map_case_names(cases: Sequence[BenchCase]) -> dict[BenchCase, str]:
-    """Map each different case to the first of its names."""
-    names: dict[BenchCase, str] = {}
-    for case in cases:
-        names.setdefault(remove_case_name(case), case.name)
-    return names
-
-
-def remove_case_name(case: BenchCase) -> BenchCase:
-    """Remove the name of a case."""
-    return replace(case, name="")
-
-
-def make_case_tasks(bench: Bench, names: dict[BenchCase, str]) -> list[BenchTask]:
-    """Create the tasks that complete cases through the command line."""
-    repeats = get_repeats(bench.options)
-
-    def task(case: BenchCase, name: str) -> BenchTask:
-        return BenchTask(name, lambda: bench.complete(case), PROCESS, repeats)
-
-    return [task(case, name) for case, name in names.items()]
-
-
-METHOD_PREFIX = "method "
-
-
-def make_method_tasks(bench: Bench, case: BenchCase) -> list[BenchTask]:
-    """Create the tasks that compare methods at the first target of `case`."""
-    if not bench.options.methods:
-        return []
-    start = prepare_start(case, bench.models, bench.device)
-    if not bench.options.quick:
-        with stage("warming up"), show_progress(None):
-            measure_method("full", start, bench.yardstick)
-
-    def task(name: str) -> BenchTask:
-        repeats = get_repeats(bench.options)
-        if name not in ("full", "autograd"):
-            repeats = min(repeats, bench.options.baseline_repeats)
-        return BenchTask(
-            METHOD_PREFIX + name, lambda: measure_method(name, start, bench.yardstick), OWN, repeats
-        )
-
-    return [task(name) for name in dict.fromkeys(bench.options.methods)]
-
-
-def remove_method_prefix(found: SampleSet) -> SampleSet:
-    """Remove the prefix from the name of a measurement."""
-    return replace(found, name=found.name.removeprefix(METHOD_PREFIX))
-
-
-def get_repeats(options: BenchOptions) -> int:
-    """Return the number of repetitions."""
-    return 1 if options.quick else options.repeats
-
-
-def describe_bench_settings(bench: Bench) -> dict[str, int | None]:
-    """Describe the settings that determine the numbers."""
-    options = bench.options
+def make_case_tasks(bench: Bench, cases: Sequence[BenchCase]) -> dict[BenchCase | str, BenchTask]:
+    """Create the task of each different case, through the command line."""
     return {
-        "seed": options.seed,
-        "repeats": get_repeats(options),
-        "baseline_repeats": min(get_repeats(options), options.baseline_repeats),
-        "baseline_iterations": bench.models.baseline_iterations,
+        case: BenchTask(case.name, partial(bench.complete, case), PROCESS, bench.repeats)
+        for case in dict.fromkeys(cases)
     }
+
+
+def make_method_tasks(bench: Bench, case: BenchCase) -> dict[BenchCase | str, BenchTask]:
+    """Create the tasks that compare methods at the first target of `case`."""
+    options = bench.options
+    state = case.begin(bench.models, bench.device)
+    target = case.open().camera(case.targets[0], case.resolution).to(bench.device)
+    start = state, target, bench.models, bench.yardstick
+    if not options.quick:
+        with stage("warming up"), show_progress(None):
+            measure_method("full", *start)
+    tasks: dict[BenchCase | str, BenchTask] = {}
+    for name in options.methods:
+        repeats = bench.repeats if name in FAST_METHODS else bench.baseline_repeats
+        measure = partial(measure_method, name, *start)
+        tasks[name] = BenchTask(f"method {name}", measure, OWN, repeats)
+    return tasks
+
+
+def format_json(report: Report) -> str:
+    """Format the report as JSON, in seconds, bytes and yardsticks (`ratios`)."""
+    return json.dumps(asdict(report), indent=1)
 
 
 def write_bench(report: Report, out: Path, overwrite: bool, console: Console) -> None:
     """Write bench.json, tables.md and growth.png."""
     with open_output_folder(out, overwrite) as folder:
-        (folder / "bench.json").write_text(json.dumps(build_content(report), indent=1) + "\n")
+        (folder / "bench.json").write_text(format_json(report) + "\n")
         (folder / "tables.md").write_text(format_report(report))
         if report.growth:
             try:
                 plot_growth(folder / "growth.png", report.growth)
             except PlotsNotAvailable as missing:
-                console.print(str(missing), markup=False)
+                print_lines(console, str(missing))

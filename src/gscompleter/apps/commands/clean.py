@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -14,14 +14,8 @@ from torch import Tensor
 
 from gscompleter import __version__
 from gscompleter.apps.commands.options import CleanOptions
-from gscompleter.apps.commands.output import (
-    describe_opened,
-    describe_settings,
-    is_replaceable,
-    report_interrupts,
-)
+from gscompleter.apps.commands.output import describe_run, is_replaceable, report_interrupts
 from gscompleter.apps.inputs.opening import (
-    Task,
     apply_working_range,
     check_context,
     move_to_splat,
@@ -40,7 +34,7 @@ from gscompleter.progress import show_preparation, show_progress, stage, track
 from gscompleter.render import Renderer, choose_device, load_renderer
 from gscompleter.splats.formats import load_splat
 from gscompleter.timing import record_seconds, timed_stage
-from gscompleter.types import Gaussians
+from gscompleter.types import Gaussians, View
 
 
 def run_clean(options: CleanOptions) -> None:
@@ -63,40 +57,43 @@ def clean_splat(options: CleanOptions) -> dict[str, Any]:
         with show_preparation("reading photographs"):
             task = read_photographs(options, opened, device)
         with show_preparation("reading the scene"):
-            given = load_splat(options.scene, options.drop_nonfinite)
+            loaded = load_splat(options.scene, options.drop_nonfinite)
         compile_kernels([device])
         with show_preparation("aligning the scene"):
-            task = move_to_splat(task, given, options.scene, options, opened)
+            task = move_to_splat(task, loaded, options.scene, options, opened)
+        given, splat_file = task.scene, task.splat_file
+        assert given is not None
+        assert splat_file is not None
         task = apply_working_range(task, renderer)
         plan = f"compared with {len(task.views)} photographs on {device}"
         plan += f", written to {quote_value(options.out)}"
         print_lines(console, *describe_opening(options, opened, task), f"To do: {plan}.")
         with open_output_folder(options.out, is_replaceable(options)) as folder:
             with record_seconds(()) as seconds, timed_stage("clean"):
-                removed = find_superfluous(get_splat(task), task.views, renderer, options.config)
-            settings = describe_settings(options, options.config, targets={}, models={})
-            facts = {
-                "settings": settings,
-                "device": device,
-                **describe_opened(options, opened, task),
+                removed = find_superfluous(given, task.views, renderer, options.config)
+            summary = {
+                "version": __version__,
+                **describe_run(options, opened, task, options.config),
+                **score_cleaning(given, task.views, removed, renderer),
+                "seconds": seconds,
             }
-            summary = facts | score_cleaning(task, removed, renderer) | {"seconds": seconds}
+            if removed.all():
+                raise InputError(
+                    "Every Gaussian of the splat makes the photographs worse; check that they show "
+                    "the same scene."
+                )
             with stage("writing"):
-                write_cleaned(folder, task, removed, {"version": __version__, **summary})
+                save_completed_splat(folder, given, removed, given[:0], splat_file)
+                (folder / SUMMARY_FILE).write_text(json.dumps(summary, indent=2) + "\n")
     return summary
 
 
-def get_splat(task: Task) -> Gaussians:
-    """Return the input splat."""
-    assert task.scene is not None
-    return task.scene
-
-
-def score_cleaning(task: Task, taken: Bool[Tensor, "n"], renderer: Renderer) -> dict[str, Any]:
+def score_cleaning(
+    given: Gaussians, views: Sequence[View], taken: Bool[Tensor, "n"], renderer: Renderer
+) -> dict[str, Any]:
     """Count the removed Gaussians, and compute PSNR (dB) before and after."""
-    given = get_splat(task)
     rows = []
-    for view in track(task.views, "scores"):
+    for view in track(views, "scores"):
         before, after = (
             psnr(renderer.render(scene, view.camera).image, view.image)
             for scene in (given, given[~taken])
@@ -105,21 +102,6 @@ def score_cleaning(task: Task, taken: Bool[Tensor, "n"], renderer: Renderer) -> 
     removed = int(taken.sum())
     counts = {"given": len(given), "kept": len(given) - removed, "removed": removed}
     return {"photographs": rows, "gaussians": counts}
-
-
-def write_cleaned(
-    folder: Path, task: Task, taken: Bool[Tensor, "n"], summary: Mapping[str, Any]
-) -> None:
-    """Write the cleaned splat, the removed Gaussians and the summary."""
-    given = get_splat(task)
-    if taken.all():
-        raise InputError(
-            "Every Gaussian of the splat makes the photographs worse; check that they show the "
-            "same scene."
-        )
-    assert task.splat_file is not None
-    save_completed_splat(folder, given, taken, given[:0], task.splat_file)
-    (folder / SUMMARY_FILE).write_text(json.dumps(summary, indent=2) + "\n")
 
 
 def print_cleaning(summary: Mapping[str, Any], out: Path) -> None:

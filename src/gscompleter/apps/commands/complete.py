@@ -2,29 +2,19 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from statistics import fmean
 from typing import Any
 
+import numpy as np
 from rich.console import Console
 from rich.table import Table
 
-from gscompleter.apps.commands.expected import expect_completion
-from gscompleter.apps.commands.exploring import (
-    collect_cameras,
-    complete_targets,
-    name_target,
-    plan_completion,
-    print_plan,
-    render_looks_around,
-    write_targets,
-)
-from gscompleter.apps.commands.options import CompleteOptions, get_max_targets
+from gscompleter.apps.commands.options import CompleteOptions, get_max_targets, parse_resolution
 from gscompleter.apps.commands.output import (
-    describe_opened,
-    describe_settings,
+    describe_run,
     is_replaceable,
     read_held_out,
     report_interrupts,
@@ -43,12 +33,11 @@ from gscompleter.apps.inputs.opening import (
     read_task,
 )
 from gscompleter.apps.inputs.plan import describe_task
+from gscompleter.apps.inputs.selection import collect_usable_cameras
 from gscompleter.apps.report.completion import Surroundings, Target, write_report
 from gscompleter.apps.report.completion_page import render_completion_page
-from gscompleter.apps.report.film import VIDEO_FILE as FILM
-from gscompleter.apps.report.film import write_comparison_video
-from gscompleter.apps.report.page import REPORT_FILE as PAGE
-from gscompleter.apps.report.page import write_page
+from gscompleter.apps.report.film import VIDEO_FILE, write_comparison_video
+from gscompleter.apps.report.page import REPORT_FILE, write_page
 from gscompleter.apps.report.plain_words import (
     NO_TARGET_NOTE,
     describe_exposures,
@@ -56,23 +45,75 @@ from gscompleter.apps.report.plain_words import (
     describe_motion,
 )
 from gscompleter.apps.warmup.compilation import SPLAT_PART, compile_kernels
-from gscompleter.completer import GSCompleter
+from gscompleter.completer import GSCompleter, check_target_ids
 from gscompleter.config import CompleterConfig
 from gscompleter.config.generators import get_settings_class
+from gscompleter.data.local_origin import compute_frame_from_photographs
+from gscompleter.data.scene import write_cameras
+from gscompleter.errors import quote_value
+from gscompleter.evaluation.metrics.coverage import render_pairs, sample_held_out_cameras
 from gscompleter.generators import load_generator
-from gscompleter.io.files import check_output, open_output_folder
+from gscompleter.io.files import COMPLETED_FILE, TARGETS_FILE, check_output, open_output_folder
 from gscompleter.io.video import check_video_writer
 from gscompleter.kernels.parallel import run_in_background
+from gscompleter.next_best_view.gain import Choice
 from gscompleter.next_best_view.planner import ViewPlanner
-from gscompleter.progress import show_preparation, show_progress, stage
+from gscompleter.progress import expect_stages, show_preparation, show_progress, stage
 from gscompleter.reconstructors import check_reconstructor, load_reconstructor
 from gscompleter.render import choose_device, load_renderer
 from gscompleter.render.lod import MIN_PROXY_GAUSSIANS
+from gscompleter.splat_alignment.similarity import transform_camera, transform_camera_exactly
 from gscompleter.splats.formats import load_splat
 from gscompleter.splats.morton import argsort_nearby
 from gscompleter.state import Completion
 from gscompleter.timing import add_seconds, record_seconds, timed_stage
 from gscompleter.types import Camera, View
+
+CONTEXT_STAGE = "context", 2.0
+TARGET_STAGES = ("generate", 1.0), ("lift", 1.0), ("register", 1.0), ("integrate", 2.0)
+"""Stages with their relative times."""
+LIFTED_VIEWS = 3
+"""Time to complete a target, relative to the reconstruction of one photograph. Measured: 1.8 to 3.3
+(docs/performance.md)."""
+
+
+@dataclass(frozen=True)
+class Prepared:
+    """Everything that is loaded before the first completion."""
+
+    options: CompleteOptions
+    opened: Opened
+    task: Task
+    explorer: ViewPlanner
+    cameras: Mapping[int, Camera]
+    """Cameras of all usable photographs by frame, in the frame of the result."""
+    seconds: Mapping[str, float]
+    """Wall time by stage so far."""
+
+    @property
+    def completer(self) -> GSCompleter:
+        """The completer with its models."""
+        return self.explorer.completer
+
+    def begin(self) -> Completion:
+        """Initialize the context."""
+        return self.completer.begin(self.task.views, self.task.scene, self.task.check_views)
+
+    def with_choices(self, choices: Iterable[Choice]) -> Prepared:
+        """Return a copy with chosen candidates as targets."""
+        frames = list(self.cameras)
+        targets = [Target(c.camera, derived_from=frames[c.candidate.base]) for c in choices]
+        return replace(self, task=replace(self.task, targets=targets))
+
+
+@dataclass(frozen=True)
+class Plan:
+    """Targets and the time of a completion."""
+
+    task: Task
+    holes: Sequence[float]
+    """Hole fraction of each target, after completion of the previous ones."""
+    context_seconds: float
 
 
 def run_completion(options: CompleteOptions) -> None:
@@ -81,65 +122,30 @@ def run_completion(options: CompleteOptions) -> None:
         if options.dry_run:
             plan_folder(options)
             return
-        summary, completion = complete_folder(options)
+        summary = complete_folder(options)
         if not options.quiet:
-            print_completion(summary, completion, options)
+            print_completion(summary, options)
 
 
-def complete_folder(options: CompleteOptions) -> tuple[dict[str, Any], Completion]:
+def complete_folder(options: CompleteOptions) -> dict[str, Any]:
     """Complete the scene, write `options.out`, and return the summary."""
     if options.video:
         check_video_writer()
     console = Console(stderr=True, quiet=options.quiet)
     with show_progress(None if options.quiet else console):
-        opened, task, explorer, before = prepare_completion(options, console)
-        print_lines(console, *describe_task(options, opened, task))
-        cameras = collect_cameras(options, opened, task)
-        expectation = expect_completion(options, task, task.views[0].image.device.type)
-        with open_output_folder(options.out, is_replaceable(options)) as folder, expectation:
-            completion, task = complete_targets(options, task, cameras, explorer)
-            completion = replace(completion, seconds=add_seconds(completion.seconds, before))
+        ready = prepare_completion(options, console)
+        print_lines(console, *describe_task(options, ready.opened, ready.task))
+        with (
+            open_output_folder(options.out, is_replaceable(options)) as folder,
+            expect_stages(list_stages(options, ready.task), is_timed=False),
+        ):
+            completion, ready = complete_targets(ready)
             with stage("report"):
-                done = Done(opened, task, cameras, completion)
-                summary = write_done(folder, options, done, explorer)
-                write_targets(folder, task)
+                summary = write_done(folder, ready, completion)
+                write_targets(folder, ready.task)
             if options.video:
-                photographs = list(cameras.values())
-                write_comparison_video(folder, completion, photographs, explorer.completer.renderer)
-    return summary, completion
-
-
-@dataclass(frozen=True)
-class Done:
-    """A finished completion and its input."""
-
-    opened: Opened
-    task: Task
-    cameras: Mapping[int, Camera]
-    """Cameras of all usable photographs by frame, in the frame of the result."""
-    completion: Completion
-
-
-def write_done(
-    folder: Path, options: CompleteOptions, done: Done, explorer: ViewPlanner
-) -> dict[str, Any]:
-    """Write all results but the targets and the video, and return the summary."""
-    task, cameras = done.task, tuple(done.cameras.values())
-    facts = describe_run(options, done.opened, task, task.views[0].image.device.type)
-    with run_in_background(
-        render_looks_around, options, done.completion, cameras, explorer
-    ) as looks:
-        summary = write_report(
-            folder,
-            done.completion,
-            task.targets,
-            explorer.completer,
-            facts,
-            task.splat_file,
-            lambda: Surroundings(tuple(looks()), cameras),
-            read_held_out(options, done.opened, task, done.cameras),
-        )
-    write_page(folder, render_completion_page(folder))
+                photographs, renderer = list(ready.cameras.values()), ready.completer.renderer
+                write_comparison_video(folder, completion, photographs, renderer)
     return summary
 
 
@@ -147,20 +153,48 @@ def plan_folder(options: CompleteOptions) -> None:
     """Write the targets and print the plan, without completing the scene."""
     console = Console(stderr=True, quiet=options.quiet)
     with show_progress(None if options.quiet else console):
-        opened, task, explorer, _ = prepare_completion(options, console)
-        print_lines(console, *describe_task(options, opened, task))
-        cameras = collect_cameras(options, opened, task)
+        ready = prepare_completion(options, console)
+        print_lines(console, *describe_task(options, ready.opened, ready.task))
         with open_output_folder(options.out, is_replaceable(options)) as folder:
-            plan = plan_completion(options, task, cameras, explorer)
+            plan = plan_completion(ready)
             write_targets(folder, plan.task)
     if not options.quiet:
         print_plan(options, plan)
 
 
-def prepare_completion(
-    options: CompleteOptions, console: Console
-) -> tuple[Opened, Task, ViewPlanner, Mapping[str, float]]:
-    """Open the scene and load the models; also returns the seconds that this took."""
+def list_stages(options: CompleteOptions, task: Task) -> list[tuple[str, float]]:
+    """List the stages after opening the scene with their relative times."""
+    count = len(task.targets) or get_max_targets(options)
+    ends = [("report", 2.0), *([("video", 2.0)] if options.video else [])]
+    return [CONTEXT_STAGE, *((CONTEXT_STAGE, *TARGET_STAGES) * count), *ends]
+
+
+def write_done(folder: Path, ready: Prepared, completion: Completion) -> dict[str, Any]:
+    """Write all results but the targets and the video, and return the summary."""
+    options, task, completer = ready.options, ready.task, ready.completer
+    completion = replace(completion, seconds=add_seconds(completion.seconds, ready.seconds))
+    cameras = tuple(ready.cameras.values())
+    aside = sample_held_out_cameras(cameras, options.seed)
+    facts = describe_run(
+        options, ready.opened, task, get_stage_config(options), describe_settings(options)
+    )
+    with run_in_background(render_pairs, completion, aside, completer.renderer) as looks:
+        summary = write_report(
+            folder,
+            completion,
+            task.targets,
+            completer,
+            {**facts, "seed": options.seed},
+            task.splat_file,
+            lambda: Surroundings(tuple(looks()), cameras),
+            read_held_out(options, ready.opened, task, ready.cameras),
+        )
+    write_page(folder, render_completion_page(folder))
+    return summary
+
+
+def prepare_completion(options: CompleteOptions, console: Console) -> Prepared:
+    """Open the scene and load the models."""
     check_output(options.out, is_replaceable(options))
     check_context(options)
     check_targets(options)
@@ -169,7 +203,7 @@ def prepare_completion(
     device = choose_device(options.device)
     opened = open_scene(options, console)
     if not options.config.ego_mask:
-        opened = opened.keep_ego_vehicle()
+        opened = replace(opened, photographs=opened.photographs.keep_ego_vehicle())
     with show_preparation("reading photographs"):
         task = read_task(options, opened, device)
     parts = device, options.reconstructor, options.synthesis.name
@@ -185,7 +219,8 @@ def prepare_completion(
         timed_stage("context"),
     ):
         task = apply_working_range(task, completer.renderer)
-    return opened, task, ViewPlanner(completer), seconds
+    cameras = collect_cameras(options, opened, task)
+    return Prepared(options, opened, task, ViewPlanner(completer), cameras, seconds)
 
 
 def add_splat(
@@ -204,19 +239,15 @@ def add_splat(
         return move_to_splat(task, given, path, options, opened, order)
 
 
-def describe_run(
-    options: CompleteOptions, opened: Opened, task: Task, device: str
-) -> dict[str, Any]:
-    """Describe the input and the settings for `summary.json`."""
-    auto = None if options.target else get_max_targets(options)
-    targets = {"target": list(options.target), "auto": auto}
+def describe_settings(options: CompleteOptions) -> dict[str, Any]:
+    """Describe the settings of targets and models for `summary.json`."""
     return {
-        "settings": describe_settings(
-            options, get_stage_config(options), targets, describe_models(options)
-        ),
-        "seed": options.seed,
-        "device": device,
-        **describe_opened(options, opened, task),
+        "target": list(options.target),
+        "auto": None if options.target else get_max_targets(options),
+        "reconstructor": options.reconstructor,
+        "weights": None if options.weights is None else str(options.weights),
+        **options.synthesis.describe(),
+        "uses_target_photographs": options.synthesis.name == "oracle",
     }
 
 
@@ -227,12 +258,10 @@ def load_completer(options: CompleteOptions, targets: Sequence[Target], device: 
         for target in targets
         if target.photograph is not None
     ]
-    generator = options.synthesis
+    name, settings = options.synthesis.name, options.synthesis.make_settings()
     return GSCompleter(
         load_reconstructor(options.reconstructor, options.weights, device),
-        load_generator(
-            generator.name, options.seed, photographs, device, generator.make_settings()
-        ),
+        load_generator(name, options.seed, photographs, device, settings),
         load_renderer(device),
         get_stage_config(options),
         options.seed,
@@ -241,80 +270,152 @@ def load_completer(options: CompleteOptions, targets: Sequence[Target], device: 
 
 def get_stage_config(options: CompleteOptions) -> CompleterConfig:
     """Return the settings, changed by options that have a name of their own."""
-    return options.config
+    config = options.config
+    if options.no_recolor:
+        return replace(config, recolor=replace(config.recolor, iterations=0))
+    return config
 
 
-def describe_models(options: CompleteOptions) -> dict[str, Any]:
-    """Describe the models for `summary.json`."""
+def print_completion(summary: Mapping[str, Any], options: CompleteOptions) -> None:
+    """Print the scores per camera, the notes, and the location of the results."""
+    console = Console(highlight=False)
+    console.print(make_score_table(summary))
+    for row in summary["targets"]:
+        for note in row["notes"]:
+            console.print(f"{name_target(row['frame'], row['derived_from'])}: {note}")
+    for sentence in describe_result(summary, options):
+        console.print(sentence, soft_wrap=True)
+
+
+def make_score_table(summary: Mapping[str, Any]) -> Table:
+    """Make the table of PSNR before and after at each camera."""
+    table = Table("camera", "hole", "PSNR before", "PSNR after", "added", box=None)
+
+    def format_scores(row: Mapping[str, Any]) -> Iterable[str]:
+        scores = row["psnr_before"], row["psnr_after"]
+        return ("–" if score is None else f"{score:.2f}" for score in scores)
+
+    for row in summary["context"]:
+        table.add_row(f"context {row['frame']}", "", *format_scores(row), "")
+    for row in summary["targets"]:
+        name, hole = name_target(row["frame"], row["derived_from"]), row["hole_fraction"]
+        table.add_row(name, f"{100 * hole:.1f} %", *format_scores(row), f"{row['added']:,}")
+    return table
+
+
+def describe_result(summary: Mapping[str, Any], options: CompleteOptions) -> Iterator[str]:
+    """Write the sentences below the table."""
+    context = summary["context"]
+    notes = (
+        describe_exposures(row["exposure_gain"] for row in context),
+        describe_motion({row["frame"]: row["dynamic_fraction"] for row in context}),
+        describe_ignored(row["ignored"] for row in context),
+    )
+    yield from filter(None, notes)
+    origin = summary["frame"]["origin"]
+    if any(origin):
+        yield (
+            f"The coordinates are very large, so the result has its origin at "
+            f"{' '.join(map(str, origin))}; summary.json has the transform."
+        )
+    if not summary["targets"]:
+        yield NO_TARGET_NOTE
+    elif options.video:
+        yield f"Video: {options.out / VIDEO_FILE}"
+    before, after = (100 * summary["coverage"][when] for when in ("before", "after"))
+    yield f"Coverage around the photographs: {before:.1f} % before, {after:.1f} % after."
+    unused = summary["held_out"]
+    if unused:
+        before, after = (
+            fmean(row[f"psnr_{when}"] for row in unused) for when in ("before", "after")
+        )
+        yield (
+            f"Mean PSNR of {len(unused)} photographs that were not used: {before:.2f} dB before, "
+            f"{after:.2f} dB after."
+        )
+    counts, seconds = summary["gaussians"], summary["seconds"]["total"]
+    yield (
+        f"Added {counts['added']:,} Gaussians to {counts['context']:,} in {seconds:.1f} s: "
+        f"{options.out / COMPLETED_FILE}"
+    )
+    yield f"Report: {options.out / REPORT_FILE}"
+
+
+def collect_cameras(options: CompleteOptions, opened: Opened, task: Task) -> dict[int, Camera]:
+    """Return the cameras of all usable photographs by frame, in the frame of the result."""
+    given = opened.photographs
+    transform = task.frame @ compute_frame_from_photographs(-given.origin)
+    known = task.views[0].camera
+    cameras = collect_usable_cameras(given, range(len(given)), parse_resolution(options.resolution))
     return {
-        "reconstructor": options.reconstructor,
-        "weights": None if options.weights is None else str(options.weights),
-        **options.synthesis.describe(),
-        "uses_target_photographs": options.synthesis.name == "oracle",
+        frame: replace(
+            transform_camera(camera, transform).to(task.device), near=known.near, far=known.far
+        )
+        for frame, camera in cameras.items()
     }
 
 
-def print_completion(
-    summary: Mapping[str, Any], completion: Completion, options: CompleteOptions
-) -> None:
-    """Print the scores per camera, the notes, and the location of the results."""
+def complete_targets(ready: Prepared) -> tuple[Completion, Prepared]:
+    """Complete the scene for the named targets, or for targets that it finds."""
+    task, count = ready.task, get_max_targets(ready.options)
+    if task.targets:
+        named = ready.completer(task.views, task.target_cameras, task.scene, task.check_views)
+        return named, ready
+    check_target_ids(task.scene, count)
+    cameras = list(ready.cameras.values())
+    completion, choices = ready.explorer.explore(ready.begin(), cameras, count)
+    return completion, ready.with_choices(choices)
 
-    def cell(value: float | None) -> str:
-        return "–" if value is None else f"{value:.2f}"
 
-    table = Table("camera", "hole", "PSNR before", "PSNR after", "added", box=None)
-    for row in summary["context"]:
-        name = f"context {row['frame']}"
-        table.add_row(name, "", cell(row["psnr_before"]), cell(row["psnr_after"]), "")
-    notes = []
-    for row, target in zip(summary["targets"], completion.targets, strict=True):
-        name = name_target(row["frame"], row["derived_from"])
-        notes += [f"{name}: {note}" for note in target.notes]
-        hole = f"{100 * row['hole_fraction']:.1f} %"
-        scores = cell(row["psnr_before"]), cell(row["psnr_after"])
-        table.add_row(name, hole, *scores, f"{len(target.added):,}")
+def plan_completion(ready: Prepared) -> Plan:
+    """Plan the completion without running it."""
+    begun = ready.begin()
+    context_seconds = begun.seconds["context"]
+    if ready.task.targets:
+        holes = ready.explorer.compute_hole_fractions(begun, ready.task.target_cameras)
+        return Plan(ready.task, holes, context_seconds)
+    cameras = list(ready.cameras.values())
+    choices = ready.explorer.plan(begun, cameras, get_max_targets(ready.options))
+    holes = [choice.hole_fraction for choice in choices]
+    return Plan(ready.with_choices(choices).task, holes, context_seconds)
+
+
+def print_plan(options: CompleteOptions, plan: Plan) -> None:
+    """Print the targets, their holes and the estimated time."""
+    table = Table("camera", "hole", box=None)
+    for number, (target, hole) in enumerate(zip(plan.task.targets, plan.holes, strict=True), 1):
+        name = name_target(target.frame, target.derived_from)
+        table.add_row(f"{number}: {name}", f"{100 * hole:.1f} %")
     console = Console(highlight=False)
     console.print(table)
-    for note in notes:
-        console.print(note)
-    gains = [row["exposure_gain"] for row in summary["context"]]
-    contradicted = {row["frame"]: row["dynamic_fraction"] for row in summary["context"]}
-    carried = describe_ignored(row["ignored"] for row in summary["context"])
-    for sentence in filter(
-        None, (describe_exposures(gains), describe_motion(contradicted), carried)
-    ):
-        console.print(sentence, soft_wrap=True)
-    origin = summary["frame"]["origin"]
-    if any(origin):
-        console.print(
-            f"The coordinates are very large, so the result has its origin at "
-            f"{' '.join(map(str, origin))}; summary.json has the transform.",
-            soft_wrap=True,
-        )
-    if not summary["targets"]:
-        console.print(NO_TARGET_NOTE)
-    elif options.video:
-        console.print(f"Video: {options.out / FILM}", soft_wrap=True)
-    covered = summary["coverage"]
-    console.print(
-        f"Coverage around the photographs: {100 * covered['before']:.1f} % before, "
-        f"{100 * covered['after']:.1f} % after.",
-        soft_wrap=True,
-    )
-    unused = summary["held_out"]
-    if unused:
-        before = fmean(row["psnr_before"] for row in unused)
-        after = fmean(row["psnr_after"] for row in unused)
-        console.print(
-            f"Mean PSNR of {len(unused)} photographs that were not used: {before:.2f} dB before, "
-            f"{after:.2f} dB after.",
-            soft_wrap=True,
-        )
-    counts = summary["gaussians"]
-    seconds = summary["seconds"]["total"]
-    console.print(
-        f"Added {counts['added']:,} Gaussians to {counts['context']:,} in {seconds:.1f} s: "
-        f"{options.out / 'completed.ply'}",
-        soft_wrap=True,
-    )
-    console.print(f"Report: {options.out / PAGE}", soft_wrap=True)
+    console.print(describe_plan(options, plan), soft_wrap=True)
+
+
+def describe_plan(options: CompleteOptions, plan: Plan) -> str:
+    """Write the sentence on the number of targets and the estimated time."""
+    number = len(plan.holes)
+    if number == 0:
+        return "No camera has much to gain; there is nothing to complete."
+    duration = "in a time that is not known in advance"
+    if options.scene is None and options.synthesis.name == "warp-inpaint":
+        spent = plan.context_seconds
+        seconds = number * LIFTED_VIEWS * spent / len(plan.task.views)
+        duration = f"in about {seconds:.0f} s after the context ({spent:.0f} s)"
+    counted = "1 camera" if number == 1 else f"{number} cameras"
+    place = quote_value(options.out / TARGETS_FILE)
+    return f"To complete: {counted}, {duration}. Edit the cameras in {place}."
+
+
+def name_target(frame: int | None, near: int | None) -> str:
+    """Name a target for tables."""
+    if near is not None:
+        return f"target near {near}"
+    return "target" if frame is None else f"target {frame}"
+
+
+def write_targets(folder: Path, task: Task) -> None:
+    """Write the target cameras in the frame of the photographs, as `--target` reads them."""
+    if task.targets:
+        back = np.linalg.inv(task.frame)
+        cameras = [transform_camera_exactly(target.camera, back) for target in task.targets]
+        write_cameras(folder / TARGETS_FILE, cameras)

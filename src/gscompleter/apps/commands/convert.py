@@ -1,74 +1,59 @@
-"""The command `convert`: the same Gaussians in another format."""
+"""The commands `convert` and `strip`: the same Gaussians in another file."""
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
 
-import tyro
+from rich.console import Console
 
-from gscompleter.config.settings import Settings
+from gscompleter.apps.commands.tool_options import ConvertOptions, StripOptions
 from gscompleter.errors import InputError
-
-if TYPE_CHECKING:
-    from gscompleter.types import Gaussians
-
-
-@dataclass(frozen=True, kw_only=True)
-class ConvertOptions(Settings):
-    """Convert a file of Gaussians to .ply, .compressed.ply, .spz or .splat, by the name of B.
-
-    It also reads .ksplat, .sog (a bundle or its folder) and .glb.
-    """
-
-    source: Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="A")]
-    """File to read, or the folder of a .sog."""
-    out: Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="B")]
-    """File to write."""
-    drop_nonfinite: bool = False
-    """Drop Gaussians that contain NaN or infinity instead of refusing the file."""
-    plain: bool = False
-    """Write no labels of generated Gaussians: no property `generated` in a .ply, which some
-    programs misread, and no file of labels beside other formats. All Gaussians are kept."""
-    overwrite: bool = False
-    """Replace an existing file."""
-    quiet: bool = False
-    """Print errors only."""
+from gscompleter.progress import show_preparation, show_progress
+from gscompleter.splats.formats import (
+    describe_mode_loss,
+    get_writable_format,
+    load_splat,
+    save_splat,
+)
+from gscompleter.splats.ply import note_infinite_opacities
+from gscompleter.splats.strip import strip
 
 
 def run_convert(options: ConvertOptions) -> None:
     """Convert A to B, and print the number of Gaussians."""
-    # Imported here so that `--help` does not wait for torch.
-    from rich.console import Console
-
-    from gscompleter.progress import show_preparation, show_progress
-    from gscompleter.splats.formats import (
-        describe_mode_loss,
-        get_writable_format,
-        load_splat,
-        save_splat,
-    )
-    from gscompleter.splats.ply import note_infinite_opacities
-
-    get_writable_format(options.out)
-    check_free(options.out, options.overwrite)
+    check_output_file(options.out, options.overwrite)
     with show_progress(None if options.quiet else Console(stderr=True)):
         with show_preparation("reading"):
             gaussians = load_splat(options.source, options.drop_nonfinite)
+        generated = gaussians.generated
+        written = replace(gaussians, generated=generated.new_zeros(len(gaussians)))
         with show_preparation("writing"):
-            save_splat(options.out, drop_labels(gaussians) if options.plain else gaussians)
+            save_splat(options.out, written if options.plain else gaussians)
     if not options.quiet:
-        generated = int((gaussians.generated > 0).sum())
         notes = note_infinite_opacities(gaussians), describe_mode_loss(options.out, gaussians)
         for note in filter(None, notes):
             print(note)
-        print(f"{len(gaussians):,} Gaussians, {generated:,} of them generated: {options.out}")
+        count = int((generated > 0).sum())
+        print(f"{len(gaussians):,} Gaussians, {count:,} of them generated: {options.out}")
 
 
-def drop_labels(gaussians: Gaussians) -> Gaussians:
-    """Drop the labels of generated Gaussians; all Gaussians stay."""
-    return replace(gaussians, generated=gaussians.generated.new_zeros(len(gaussians)))
+def run_strip(options: StripOptions) -> None:
+    """Write the original scene and print the number of Gaussians."""
+    check_output_file(options.out, options.overwrite)
+    with (
+        show_progress(None if options.quiet else Console(stderr=True)),
+        show_preparation("stripping"),
+    ):
+        given, generated = strip(options.completed, options.out)
+    if not options.quiet:
+        print(f"{given:,} Gaussians, {generated:,} generated ones removed: {options.out}")
+
+
+def check_output_file(path: Path, overwrite: bool) -> None:
+    """Refuse a name without a format, and an existing file unless `overwrite` is set."""
+    get_writable_format(path)
+    check_free(path, overwrite)
 
 
 def check_free(path: Path, overwrite: bool) -> None:

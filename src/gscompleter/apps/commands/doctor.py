@@ -2,16 +2,31 @@
 
 from __future__ import annotations
 
+import importlib.metadata
 import json
 from collections.abc import Iterator
 from dataclasses import asdict, dataclass
-from typing import TYPE_CHECKING
+from itertools import groupby
 
-from gscompleter.config.settings import Settings
+import torch
+from packaging.requirements import Requirement
+
+from gscompleter.apps.bench.machine import describe_machine
+from gscompleter.apps.commands.tool_options import DoctorOptions
+from gscompleter.apps.viewer.packages import (
+    BUILT_LIBRARIES,
+    LOCK_FILE,
+    get_archive_path,
+    read_lock,
+)
+from gscompleter.apps.warmup.compilation import PARTS
 from gscompleter.errors import InputError
-
-if TYPE_CHECKING:  # every command reads this file, and only this one needs it
-    from packaging.requirements import Requirement
+from gscompleter.evaluation.metrics import lpips
+from gscompleter.io.cache import get_download_folder
+from gscompleter.kernels.compiled import get_cache_folder, is_compiled
+from gscompleter.models.weights.fetching import find_cached
+from gscompleter.models.weights.published import PUBLISHED
+from gscompleter.render import choose_device, load_renderer
 
 DISTRIBUTION = "gscompleter"
 
@@ -32,18 +47,6 @@ PURPOSES = {
 """Purpose of each extra. Those for developers (`test`, `dev`, `docs`) are not listed."""
 
 
-@dataclass(frozen=True, kw_only=True)
-class DoctorOptions(Settings):
-    """Print what is installed (device, renderers, packages, extras, weights, caches).
-
-    For everything that is missing it prints the purpose and what to do. Nothing is downloaded or
-    changed. The default models need the packages only.
-    """
-
-    json: bool = False
-    """Print the result as JSON."""
-
-
 @dataclass(frozen=True)
 class Found:
     """One line of the result."""
@@ -60,19 +63,12 @@ def run_doctor(options: DoctorOptions) -> None:
     found = list(inspect_installation())
     if options.json:
         print(json.dumps([asdict(one) for one in found], indent=2))
-    else:
-        print_findings(found)
-
-
-def print_findings(found: list[Found]) -> None:
-    """Print the result, grouped by kind."""
+        return
     width = max(len(one.name) for one in found)
-    kinds = dict.fromkeys(one.kind for one in found)
-    for kind in kinds:
+    for kind, lines in groupby(found, lambda one: one.kind):
         print(f"{kind}:")
-        for one in found:
-            if one.kind == kind:
-                print(f"  {one.name:{width}}  {'' if one.there else 'missing: '}{one.told}")
+        for one in lines:
+            print(f"  {one.name:{width}}  {'' if one.there else 'missing: '}{one.told}")
 
 
 def inspect_installation() -> Iterator[Found]:
@@ -82,21 +78,19 @@ def inspect_installation() -> Iterator[Found]:
     yield from inspect_extras()
     yield from inspect_renderers()
     yield from inspect_weights()
-    yield from inspect_viewer()
-    yield from inspect_caches()
+    yield inspect_viewer()
+    yield Found("caches", "downloads", True, f"{get_download_folder()} (GSCOMPLETER_HOME)")
+    yield Found("caches", "kernels", True, f"{get_cache_folder()} (NUMBA_CACHE_DIR)")
+    yield Found("caches", "torch.hub", True, f"{torch.hub.get_dir()} (TORCH_HOME)")
 
 
 def inspect_machine() -> Iterator[Found]:
     """Inspect versions, processor, memory and device."""
-    # Imported here so that `--help` does not wait for torch.
-    from gscompleter.apps.bench.machine import describe_machine
-    from gscompleter.render import choose_device
-
-    facts = describe_machine(choose_device())
-    unit = {"memory_gb": ("memory", " GB")}
-    for name, value in facts.items():
-        shown, suffix = unit.get(name, (name, ""))
-        yield Found("machine", shown, True, f"{value}{suffix}")
+    for name, value in describe_machine(choose_device()).items():
+        if name == "memory_gb":
+            yield Found("machine", "memory", True, f"{value} GB")
+        else:
+            yield Found("machine", name, True, str(value))
 
 
 def inspect_packages() -> Iterator[Found]:
@@ -110,34 +104,28 @@ def inspect_packages() -> Iterator[Found]:
 def inspect_extras() -> Iterator[Found]:
     """Inspect the extras."""
     for extra, purpose in PURPOSES.items():
-        if not list_requirements(extra):
-            why = f"the installed version or this Python is older than this extra; for {purpose}"
-            yield Found("extras", extra, False, why)
-            continue
-        versions = {
-            requirement.name: find_installed_version(requirement)
-            for requirement in list_requirements(extra)
-        }
+        versions = {r.name: find_installed_version(r) for r in list_requirements(extra)}
         missing = [name for name, there in versions.items() if there is None]
-        listed = ", ".join(missing or [f"{name} {there}" for name, there in versions.items()])
-        remedy = f"; pip install '{DISTRIBUTION}[{extra}]'" if missing else ""
-        yield Found("extras", extra, not missing, f"{listed}, for {purpose}{remedy}")
+        if not versions:
+            told = f"the installed version or this Python is older than this extra; for {purpose}"
+        elif missing:
+            told = f"{', '.join(missing)}, for {purpose}; pip install '{DISTRIBUTION}[{extra}]'"
+        else:
+            listed = ", ".join(f"{name} {there}" for name, there in versions.items())
+            told = f"{listed}, for {purpose}"
+        yield Found("extras", extra, bool(versions) and not missing, told)
 
 
 def list_requirements(extra: str = "") -> list[Requirement]:
     """List the requirements of the package, or those that an extra adds."""
-    from importlib.metadata import PackageNotFoundError, requires
-
-    from packaging.requirements import Requirement
-
     try:
-        all_of_them = [Requirement(line) for line in requires(DISTRIBUTION) or []]
-    except PackageNotFoundError:
+        lines = importlib.metadata.requires(DISTRIBUTION) or []
+    except importlib.metadata.PackageNotFoundError:
         raise InputError(
             f"{DISTRIBUTION} is not installed, so its requirements are unknown; run "
             "`pip install .` in its source folder."
         ) from None
-    return [r for r in all_of_them if is_required_by(extra, r)]
+    return [r for r in map(Requirement, lines) if is_required_by(extra, r)]
 
 
 def is_required_by(extra: str, requirement: Requirement) -> bool:
@@ -149,21 +137,15 @@ def is_required_by(extra: str, requirement: Requirement) -> bool:
 
 def find_installed_version(requirement: Requirement) -> str | None:
     """Return the installed version if it satisfies the requirement."""
-    from importlib.metadata import PackageNotFoundError, version
-
     try:
-        there = version(requirement.name)
-    except PackageNotFoundError:
+        there = importlib.metadata.version(requirement.name)
+    except importlib.metadata.PackageNotFoundError:
         return None
     return there if requirement.specifier.contains(there, prereleases=True) else None
 
 
 def inspect_renderers() -> Iterator[Found]:
     """Inspect the renderers and the compiled kernels."""
-    from gscompleter.apps.warmup.compilation import PARTS
-    from gscompleter.kernels.compiled import is_compiled
-    from gscompleter.render import load_renderer
-
     for name in ("cpu", "cuda", "reference"):
         try:
             load_renderer(name)
@@ -171,55 +153,30 @@ def inspect_renderers() -> Iterator[Found]:
             yield Found("renderers", name, False, str(error))
         else:
             yield Found("renderers", name, True, "draws here")
-    missing = [part for part in PARTS if not is_compiled(part)]
+    compiled = all(is_compiled(part) for part in PARTS)
     lacking = "compiled by the first completion, or in advance by `gscompleter warmup`"
-    yield Found("renderers", "kernels", not missing, lacking if missing else "compiled")
+    yield Found("renderers", "kernels", compiled, "compiled" if compiled else lacking)
 
 
 def inspect_weights() -> Iterator[Found]:
     """Inspect the published weights of reconstructors and LPIPS."""
-    from gscompleter.evaluation.metrics.lpips import NETWORKS
-    from gscompleter.evaluation.metrics.lpips import get_weights_path as place_of_lpips
-    from gscompleter.models.weights.fetching import find_cached
-    from gscompleter.models.weights.published import PUBLISHED
-
     here = [name for name, published in PUBLISHED.items() if find_cached(published)]
     listed = ", ".join(here) or f"all {len(PUBLISHED)} that `gscompleter models` lists"
     yield Found("weights", "reconstructors", bool(here), f"{listed}, for --reconstructor")
-    for name, network in NETWORKS.items():
-        places = [place_of_lpips(file, None) for file in (network.backbone, network.linear)]
-        there = all(place.is_file() for place in places)
-        details = "for LPIPS in the tables of evaluate" + (
-            "" if there else "; load_lpips fetches it"
-        )
-        yield Found("weights", f"lpips-{name}", there, details)
+    for name, network in lpips.NETWORKS.items():
+        files = network.backbone, network.linear
+        there = all(lpips.get_weights_path(file, None).is_file() for file in files)
+        remedy = "" if there else "; load_lpips fetches it"
+        told = f"for LPIPS in the tables of evaluate{remedy}"
+        yield Found("weights", f"lpips-{name}", there, told)
 
 
-def inspect_viewer() -> Iterator[Found]:
+def inspect_viewer() -> Found:
     """Inspect the JavaScript libraries of the pages."""
-    from gscompleter.apps.viewer.packages import (
-        BUILT_LIBRARIES,
-        LOCK_FILE,
-        get_archive_path,
-        read_lock,
-    )
-
     if BUILT_LIBRARIES.is_file():
-        yield Found("viewer", "libraries", True, f"with the package, {BUILT_LIBRARIES}")
-        return
-    missing = [p for p in read_lock(LOCK_FILE) if not get_archive_path(p).is_file()]
-    names = ", ".join(package.name for package in missing)
-    lacking = f"{names}, fetched with npm's registry when `gscompleter view` is first run"
-    yield Found("viewer", "libraries", not missing, lacking if missing else "in the cache")
-
-
-def inspect_caches() -> Iterator[Found]:
-    """Inspect the cache folders."""
-    import torch
-
-    from gscompleter.io.cache import get_download_folder
-    from gscompleter.kernels.compiled import get_cache_folder as kernels_folder
-
-    yield Found("caches", "downloads", True, f"{get_download_folder()} (GSCOMPLETER_HOME)")
-    yield Found("caches", "kernels", True, f"{kernels_folder()} (NUMBA_CACHE_DIR)")
-    yield Found("caches", "torch.hub", True, f"{torch.hub.get_dir()} (TORCH_HOME)")
+        return Found("viewer", "libraries", True, f"with the package, {BUILT_LIBRARIES}")
+    missing = [p.name for p in read_lock(LOCK_FILE) if not get_archive_path(p).is_file()]
+    lacking = (
+        f"{', '.join(missing)}, fetched with npm's registry when `gscompleter view` first runs"
+    )
+    return Found("viewer", "libraries", not missing, lacking if missing else "in the cache")

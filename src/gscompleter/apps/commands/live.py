@@ -3,16 +3,14 @@
 from __future__ import annotations
 
 import webbrowser
-from collections.abc import Mapping
 from contextlib import suppress
-from dataclasses import dataclass, fields, replace
+from dataclasses import fields, replace
 from importlib.util import find_spec
 from typing import TYPE_CHECKING
 
 from rich.console import Console
 
-from gscompleter.apps.commands.complete import Done, prepare_completion, write_done
-from gscompleter.apps.commands.exploring import collect_cameras
+from gscompleter.apps.commands.complete import Prepared, prepare_completion, write_done
 from gscompleter.apps.commands.options import (
     CompleteOptions,
     CompletingOptions,
@@ -20,7 +18,7 @@ from gscompleter.apps.commands.options import (
     parse_resolution,
 )
 from gscompleter.apps.commands.output import is_replaceable, report_interrupts
-from gscompleter.apps.inputs.opening import Opened, Task, print_lines
+from gscompleter.apps.inputs.opening import print_lines
 from gscompleter.apps.inputs.plan import describe_opening
 from gscompleter.apps.live.session import FrameConversion, Session
 from gscompleter.apps.report.completion import Target
@@ -28,10 +26,8 @@ from gscompleter.data.scene import write_cameras
 from gscompleter.errors import InputError, quote_value
 from gscompleter.geometry import select_spread_cameras, shrink_camera
 from gscompleter.io.files import TARGETS_FILE, open_output_folder
-from gscompleter.next_best_view.planner import ViewPlanner
 from gscompleter.progress import show_progress
 from gscompleter.state import Completion
-from gscompleter.timing import add_seconds
 from gscompleter.types import Camera, View
 
 if TYPE_CHECKING:
@@ -47,22 +43,13 @@ ANTIALIASED_NOTE = (
 """Note on the page for antialiased scenes, which viser renders differently."""
 
 
-@dataclass(frozen=True)
-class Prepared:
-    """Everything that is loaded before the first completion."""
-
-    options: CompleteOptions
-    opened: Opened
-    task: Task
-    explorer: ViewPlanner
-    cameras: Mapping[int, Camera]
-    """Cameras of all usable photographs by frame, in the frame of the result."""
-    seconds: Mapping[str, float]
-
-
 def run_live(options: LiveOptions) -> None:
     """Serve the page until Ctrl-C."""
-    check_viser()
+    if find_spec("viser") is None:
+        raise InputError(
+            "The live page needs viser, which is not installed; run "
+            "pip install 'gscompleter[live]'."
+        )
     # Imported here because viser may be missing.
     from gscompleter.apps.live.page import Page, PageServices
 
@@ -70,44 +57,25 @@ def run_live(options: LiveOptions) -> None:
     with report_interrupts(options.out):
         with show_progress(None if options.quiet else console):
             ready = prepare(options, console)
-            session = begin_session(ready)
-            photographs = read_page_photographs(ready)
-        saver = Saver(ready)
-        subject = PageServices(
-            session, photographs, lambda now: find_next_target(ready, now), saver.save
-        )
-        page = Page(subject, options.host, options.port)
+            services = PageServices(
+                begin_session(ready),
+                read_page_photographs(ready),
+                lambda now: find_next_target(ready, now),
+                Saver(ready).save,
+            )
+        page = Page(services, options.host, options.port)
     serve_session(page, options)
-
-
-def check_viser() -> None:
-    """Refuse to continue without viser."""
-    if find_spec("viser") is None:
-        raise InputError(
-            "The live page needs viser, which is not installed; run "
-            "pip install 'gscompleter[live]'."
-        )
 
 
 def prepare(options: LiveOptions, console: Console) -> Prepared:
     """Open the scene as `complete` does."""
-    as_complete_options = make_complete_options(options)
-    opened, task, explorer, seconds = prepare_completion(as_complete_options, console)
-    print_lines(console, *describe_opening(as_complete_options, opened, task))
-    if task.scene is not None and task.scene.is_antialiased:
+    ready = prepare_completion(make_complete_options(options), console)
+    print_lines(console, *describe_opening(ready.options, ready.opened, ready.task))
+    if ready.task.scene is not None and ready.task.scene.is_antialiased:
         print_lines(console, ANTIALIASED_NOTE)
-    frames = list_context_frames(task)
-    as_complete_options = replace(
-        as_complete_options, context=frames, target=(str(options.out / TARGETS_FILE),)
-    )
-    return Prepared(
-        as_complete_options,
-        opened,
-        task,
-        explorer,
-        collect_cameras(as_complete_options, opened, task),
-        seconds,
-    )
+    target = (str(options.out / TARGETS_FILE),)
+    named = replace(ready.options, context=ready.task.context_frames, target=target)
+    return replace(ready, options=named)
 
 
 def make_complete_options(options: LiveOptions) -> CompleteOptions:
@@ -116,23 +84,17 @@ def make_complete_options(options: LiveOptions) -> CompleteOptions:
     return CompleteOptions(**shared)
 
 
-def list_context_frames(task: Task) -> tuple[int, ...]:
-    """Return the frame numbers of the context."""
-    return tuple(view.frame for view in task.views if view.frame is not None)
-
-
 def begin_session(ready: Prepared) -> Session:
     """Start the session."""
-    task, completer = ready.task, ready.explorer.completer
     origin, resolution = ready.opened.photographs.origin, parse_resolution(ready.options.resolution)
-    begun = completer.begin(task.views, task.scene, task.check_views)
-    return Session(completer, FrameConversion(task.frame, origin, resolution), begun)
+    conversion = FrameConversion(ready.task.frame, origin, resolution)
+    return Session(ready.completer, conversion, ready.begin())
 
 
 def read_page_photographs(ready: Prepared) -> list[View]:
     """Read small photographs for the page: the context and others far apart."""
-    cameras = [view.camera for view in ready.task.views]
-    known = dict(zip(list_context_frames(ready.task), cameras, strict=True))
+    context = [view.camera for view in ready.task.views]
+    known = dict(zip(ready.task.context_frames, context, strict=True))
     others = [frame for frame in ready.cameras if frame not in known]
     chosen = select_spread_cameras([ready.cameras[f] for f in others], MAX_SHOWN) if others else []
     views = []
@@ -163,18 +125,12 @@ class Saver:
         if not session.steps:
             raise InputError("There is nothing to save; complete a hole first.")
         with open_output_folder(options.out, self._wrote or is_replaceable(options)) as folder:
-            write_done(folder, options, finish_session(self._ready, session), self._ready.explorer)
+            targets = [Target(result.target) for result in session.latest.targets]
+            task = replace(self._ready.task, targets=targets)
+            write_done(folder, replace(self._ready, task=task), session.latest)
             write_cameras(folder / TARGETS_FILE, [step.camera for step in session.steps])
         self._wrote = True
         return f"Saved in {quote_value(options.out)}."
-
-
-def finish_session(ready: Prepared, session: Session) -> Done:
-    """Describe the session as a finished completion."""
-    now = session.latest
-    completion = replace(now, seconds=add_seconds(now.seconds, ready.seconds))
-    targets = [Target(result.target) for result in now.targets]
-    return Done(ready.opened, replace(ready.task, targets=targets), ready.cameras, completion)
 
 
 def serve_session(page: Page, options: LiveOptions) -> None:

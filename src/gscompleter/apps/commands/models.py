@@ -10,7 +10,7 @@ from pathlib import Path
 from rich.console import Console
 from rich.table import Table
 
-from gscompleter.apps.commands.options import ModelsOptions
+from gscompleter.apps.commands.tool_options import ModelsOptions
 from gscompleter.models.weights.fetching import (
     INSTALL,
     find_cached,
@@ -26,11 +26,8 @@ def run_models(options: ModelsOptions) -> None:
     """Print the published weights and their location on this machine."""
     found = {name: find_cached(weights) for name, weights in PUBLISHED.items()}
     if options.json:
-        print(
-            json.dumps(
-                [describe_weights(PUBLISHED[name], path) for name, path in found.items()], indent=2
-            )
-        )
+        rows = [describe_weights(PUBLISHED[name], path) for name, path in found.items()]
+        print(json.dumps(rows, indent=2))
     else:
         print_models(found)
 
@@ -54,11 +51,8 @@ def print_models(found: dict[str, Path | None]) -> None:
     table.add_column("source", overflow="fold")
     for name, path in found.items():
         table.add_row(*format_cells(PUBLISHED[name], path))
-    # Rows are not wrapped in a file or a pipe.
-    console = Console(
-        width=None if sys.stdout.isatty() else MAX_LINE_WIDTH, markup=False, highlight=False
-    )
-    console.print(table)
+    width = None if sys.stdout.isatty() else MAX_LINE_WIDTH  # a file or a pipe wraps no rows
+    Console(width=width, markup=False, highlight=False).print(table)
     cautions: dict[str, list[str]] = {}
     for weights in PUBLISHED.values():
         if weights.caution:

@@ -16,7 +16,12 @@ from gscompleter.config.settings import Seed, Settings
 from gscompleter.jobs.engines import EngineName
 
 Frame = Annotated[int, Interval(ge=0, lt=10**9)]
+Frames = Annotated[tuple[Frame, ...] | None, tyro.conf.arg(metavar="INT [INT ...]")]
+Threads = Annotated[int, Interval(ge=1, le=1024)]
+Repeats = Annotated[int, Interval(ge=1, le=1000)]
 Port = Annotated[int, Interval(ge=0, le=65535)]
+Axis = Literal["gaussians", "pixels", "views", "targets"]
+BenchMethod = Literal["full", "autograd", "densify-100", "densify-800", "distill", "reggs"]
 Device = Literal["auto", "cpu", "cuda"]
 Size = tuple[int, int] | int | Literal["full"]
 """Height and width, the longest side, or `full` for the photographs' own size."""
@@ -39,7 +44,7 @@ class Options(Settings):
 class ComputeOptions(Options):
     """Options of every command that computes for long."""
 
-    threads: Annotated[int, Interval(ge=1, le=1024)] | None = None
+    threads: Threads | None = None
     """CPU threads to compute with; all available cores if not given. The result does not depend on
     it."""
 
@@ -53,11 +58,6 @@ class RunOptions(ComputeOptions):
     seed: Seed = 0
     """Seed of all random numbers. The same seed gives the same files on a CPU."""
 
-    @property
-    def models(self) -> tuple[str, ...]:
-        """Names of the models in use."""
-        return ()
-
 
 @dataclass(frozen=True, kw_only=True)
 class ModelOptions(RunOptions):
@@ -70,11 +70,6 @@ class ModelOptions(RunOptions):
     """Weights file of the reconstructor; downloaded if not given."""
     synthesis: Annotated[GeneratorOptions, tyro.conf.OmitArgPrefixes] = GeneratorOptions()
 
-    @property
-    def models(self) -> tuple[str, ...]:
-        """Names of the models in use."""
-        return self.reconstructor, self.synthesis.name
-
 
 @dataclass(frozen=True, kw_only=True)
 class SceneOptions(ComputeOptions):
@@ -84,7 +79,7 @@ class SceneOptions(ComputeOptions):
     """Folder of the photographs: COLMAP, nerfstudio, cameras.json, LLFF, KITTI, DGP, Waymo,
     PandaSet, a pixelSplat chunk or a RealEstate10K camera file. If it has no cameras, COLMAP finds
     them and they are kept in OUT/colmap."""
-    context: tuple[Frame, ...] | None = None
+    context: Frames = None
     out: Path
     format: str | None = None
     """Format of SCENE: colmap, nerfstudio, cameras-json, llff, kitti, kitti-raw, dgp, waymo,
@@ -108,20 +103,20 @@ class CompletingOptions(SceneOptions, ModelOptions):
     """Options of the commands that complete one scene."""
 
     scene: Path | None = None
-    """File of Gaussians (a splat) to complete; its Gaussians are kept. If not given, the scene is
+    """File of Gaussians (a splat) to complete; all of them are kept. If not given, the scene is
     reconstructed from the photographs."""
-    no_prune: bool = False
-    """Keep Gaussians of the splat that cover a hole although no photograph shows them."""
+    no_recolor: bool = False
+    """Keep the colours of the splat, too; Gaussians are only added where it is empty."""
     config: Annotated[CompleterConfig, tyro.conf.FlagConversionOff] = CompleterConfig()
-    """Settings of the method. `--config NAME` selects default, paper, an ablation such as no-sa, or
-    a YAML file; the options here change single settings of it."""
+    """Settings of the method. `--config NAME` selects default, splat, paper, an ablation such as
+    no-sa, or a YAML file; the options here change single settings of it."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class CompleteOptions(CompletingOptions):
     """Fill the parts of a scene that its photographs do not show, and write the result."""
 
-    context: tuple[Frame, ...] | None = None
+    context: Frames = None
     """Frame numbers of the photographs to start from, counted in the order of their file paths. If
     not given, those that help the targets most. Photographs of targets are never used."""
     target: tuple[str, ...] = ()
@@ -148,7 +143,7 @@ class LiveOptions(CompletingOptions):
     Every step can be undone. Saving writes the same files as `gscompleter complete`.
     """
 
-    context: tuple[Frame, ...] | None = None
+    context: Frames = None
     """Frame numbers of the photographs to start from, counted in the order of their file paths;
     those that show most of the scene if not given."""
     out: Path = Path("live")
@@ -172,7 +167,7 @@ class CleanOptions(SceneOptions):
     removed Gaussians back.
     """
 
-    context: tuple[Frame, ...] | None = None
+    context: Frames = None
     """Frame numbers of the photographs to compare with, counted in the order of their file paths;
     all if not given. Gaussians that only other photographs need may be removed."""
     out: Path
@@ -197,11 +192,6 @@ class DemoOptions(RunOptions):
     overwrite: bool = False
     """Replace the results of an earlier run in the output folder."""
 
-    @property
-    def models(self) -> tuple[str, ...]:
-        """Names of the models in use."""
-        return ModelOptions().models
-
 
 @dataclass(frozen=True, kw_only=True)
 class EngineOptions(Options):
@@ -210,7 +200,7 @@ class EngineOptions(Options):
     engine: EngineName | None
     workers: Annotated[int, Interval(ge=1, le=100_000)] | None = None
     """Number of workers; as many as fit if not given (one with SLURM)."""
-    threads: Annotated[int, Interval(ge=1, le=1024)] | None = None
+    threads: Threads | None = None
     """CPU threads of each worker; an equal share of the cores on this machine, one elsewhere if not
     given."""
     address: str | None = None
@@ -219,6 +209,9 @@ class EngineOptions(Options):
     """GPUs per worker with Ray (also fractions) or SLURM."""
     slurm: tuple[str, ...] = ()
     """Parameters for SLURM with --engine submitit, as in --slurm partition=gpu time=120."""
+    shard: str | None = None
+    """Run every n-th job or case from the i-th on, given as i/n with i from 0; `auto` takes both
+    from a SLURM array. Processes without a shard share the work as well."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -244,9 +237,6 @@ class BatchOptions(EngineOptions):
     """Jobs of an earlier run to repeat: none, or those that failed."""
     each: tuple[str, ...] = ()
     """Options of `complete` for every row that does not set them, as in --each resolution=256."""
-    shard: str | None = None
-    """Run every n-th job from the i-th on, given as i/n with i from 0; `auto` takes both from a
-    SLURM array."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -274,9 +264,6 @@ class EvaluateOptions(ModelOptions, EngineOptions):
     rerun: Literal["nothing", "failures", "scores"] = "nothing"
     """Cases of an earlier run to repeat: those that failed, or the scoring of all saved
     predictions."""
-    shard: str | None = None
-    """Run every n-th case from the i-th on, given as i/n with i from 0; `auto` takes both from a
-    SLURM array. Processes without a shard share the work as well."""
     engine: EngineName | None = None
     """Engine that runs the cases; this process if not given."""
     resolution: Size | None = None
@@ -345,19 +332,13 @@ class BenchOptions(RunOptions):
     Methods are compared on the first case."""
     only: tuple[str, ...] = ()
     """Names of the cases to measure; all if not given."""
-    methods: tuple[str, ...] = ("full", "autograd", "densify-800", "distill", "reggs")
-    """Methods to compare: full (ours), autograd (ours without a frozen context), densify-100,
-    densify-800, distill, reggs."""
-    growth: tuple[Literal["gaussians", "pixels", "views", "targets"], ...] = (
-        "gaussians",
-        "pixels",
-        "views",
-        "targets",
-    )
+    methods: tuple[BenchMethod, ...] = ("full", "autograd", "densify-800", "distill", "reggs")
+    """Methods to compare: full (ours), autograd (ours without a frozen context), or others."""
+    growth: tuple[Axis, ...] = ("gaussians", "pixels", "views", "targets")
     """Quantities to increase in the first case."""
-    repeats: Annotated[int, Interval(ge=1, le=1000)] = 5
+    repeats: Repeats = 5
     """Number of repetitions."""
-    baseline_repeats: Annotated[int, Interval(ge=1, le=1000)] = 1
+    baseline_repeats: Repeats = 1
     """Most repetitions of slow methods: all but full and autograd."""
     quick: bool = False
     """Run a quick check: the smallest case once, two iterations of the baselines, no growth."""
@@ -367,14 +348,6 @@ class BenchOptions(RunOptions):
     """Folder for bench.json, tables.md and growth.png."""
     overwrite: bool = False
     """Replace the results of an earlier run in the output folder."""
-
-
-@dataclass(frozen=True, kw_only=True)
-class ModelsOptions(Settings):
-    """List published model weights with their licences, and show which are downloaded."""
-
-    json: bool = False
-    """Print all details as JSON."""
 
 
 def get_max_targets(options: CompleteOptions) -> int:

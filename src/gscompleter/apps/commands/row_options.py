@@ -12,8 +12,7 @@ import tyro
 
 from gscompleter.apps.batch.manifest import FOLDER
 from gscompleter.apps.commands.options import CompleteOptions, LiveOptions
-from gscompleter.apps.commands.renamed import translate_name
-from gscompleter.apps.commands.words import format_error, parse_words
+from gscompleter.apps.commands.words import format_error, parse_words, translate_name
 from gscompleter.config.settings import validate
 from gscompleter.errors import InputError, quote_value
 

@@ -3,11 +3,12 @@
 from __future__ import annotations
 
 import re
+import sys
 from collections.abc import Callable, Collection, Sequence
 from contextlib import redirect_stderr, redirect_stdout, suppress
 from dataclasses import dataclass
 from difflib import get_close_matches
-from functools import partial
+from functools import cache, partial
 from io import StringIO
 from itertools import dropwhile, takewhile
 from typing import Any
@@ -15,16 +16,25 @@ from typing import Any
 import tyro
 from tyro.constructors import ConstructorRegistry, StructTypeInfo
 
-from gscompleter.apps.commands.generator_options import make_generator_spec
-from gscompleter.apps.commands.help import HELP_ALL, Rule, asks_for_help, make_help_rule
+from gscompleter.apps.commands.help import HELP, HELP_ALL, Rule, make_help_rule
 from gscompleter.apps.commands.options import DEFAULT_NUM_TARGETS
-from gscompleter.apps.commands.renamed import use_new_names
 from gscompleter.config import CompleterConfig, load_config
 from gscompleter.config.renamed import refuse_old_options
-from gscompleter.errors import InputError, quote_value
+from gscompleter.errors import PROGRAM, InputError, quote_value
 
 MIN_SIMILARITY = 0.75
 """Smallest similarity of an option to a misspelt one, from 0 to 1."""
+
+RENAMED = {
+    "keep-unsupported": "no-recolor",
+    "no-prune": "no-recolor",
+    "generator-path": "generator-weights",
+    "generator-at-once": "generator-batch-size",
+    "film": "video",
+    "again": "rerun",
+    "ignore-masked": "use-masks",
+}
+"""Names of the last release with today's; they are accepted for one release."""
 
 
 def format_error(error: InputError) -> str:
@@ -40,19 +50,22 @@ def parse_words(words: Sequence[str], command: Any, names: Collection[str]) -> A
     It raises InputError for wrong words, and SystemExit after printing the help.
     """
     words = use_new_names(words)
-    show_all = HELP_ALL in words
-    helps = [make_help_rule(show_all)] if asks_for_help(words) else []
+    asked = any(word in (*HELP, HELP_ALL) for word in words)
+    helps = [make_help_rule(show_all=HELP_ALL in words)] if asked else []
     words = ["--help" if word == HELP_ALL else word for word in words]
     check_once(words)
     refuse_old_options(words)
-    check_command(words, names)
     printed, config = StringIO(), CompleterConfig()
     read = partial(
         tyro.cli,
         command,
         prog="gscompleter",
         description="Complete 3D Gaussian Splatting scenes: generate, then register.",
-        config=(tyro.conf.OmitSubcommandPrefixes, tyro.conf.FlagCreatePairsOff),
+        config=(
+            tyro.conf.DisallowNone,
+            tyro.conf.FlagCreatePairsOff,
+            tyro.conf.OmitSubcommandPrefixes,
+        ),
     )
     try:
         with redirect_stderr(printed):
@@ -64,21 +77,9 @@ def parse_words(words: Sequence[str], command: Any, names: Collection[str]) -> A
         options = list_options(
             lambda words: read(args=words, registry=make_registry(config)), words
         )
-        sentence = find_misspelling(words, options, names) or extract_sentence(
-            printed.getvalue(), words, names
-        )
-        raise InputError(sentence) from None
-
-
-def check_command(words: Sequence[str], names: Collection[str]) -> None:
-    """Refuse an unknown command, and name the nearest one."""
-    near = get_close_matches(words[0], names, 1) if words else []
-    if near and words[0] not in names:
-        raise InputError(
-            f"There is no command {quote_value(words[0])}; the nearest is {near[0]} (see "
-            "gscompleter "
-            "--help)."
-        )
+        see = " ".join(["gscompleter", *(word for word in words[:1] if word in names)])
+        sentence = find_misspelling(words, names, options) or extract_sentence(printed.getvalue())
+        raise InputError(f"{sentence} (see {see} --help).") from None
 
 
 def list_options(read: Callable[[Sequence[str]], Any], words: Sequence[str]) -> list[str]:
@@ -93,22 +94,18 @@ def list_options(read: Callable[[Sequence[str]], Any], words: Sequence[str]) -> 
 
 
 def find_misspelling(
-    words: Sequence[str], options: Sequence[str], names: Collection[str]
+    words: Sequence[str], names: Collection[str], options: Sequence[str]
 ) -> str | None:
-    """Write a sentence on an unknown option that is similar to a known one, if any."""
-    given = [word.split("=")[0] for word in words if word.startswith("--")]
-    for word in given:
-        option = word.replace("_", "-")
+    """Write a sentence on an unknown command or option that is similar to a known one, if any."""
+    near = get_close_matches(words[0], names, 1) if words else []
+    if near and words[0] not in names:
+        return f"There is no command {quote_value(words[0])}; the nearest is {near[0]}"
+    for given in (word.split("=")[0] for word in words if word.startswith("--")):
+        option = given.replace("_", "-")
         near = get_close_matches(option, options, 1, MIN_SIMILARITY)
         if near and near[0] != option:
-            see = f"(see {get_command_name(words, names)} --help)"
-            return f"There is no option {quote_value(word)}; the nearest is {near[0]} {see}."
+            return f"There is no option {quote_value(given)}; the nearest is {near[0]}"
     return None
-
-
-def get_command_name(words: Sequence[str], names: Collection[str]) -> str:
-    """Return the program with the command in `words`, if any."""
-    return " ".join(["gscompleter", *(word for word in words[:1] if word in names)])
 
 
 def check_once(words: Sequence[str]) -> None:
@@ -118,20 +115,18 @@ def check_once(words: Sequence[str]) -> None:
     if twice is not None:
         raise InputError(
             f"{quote_value(twice)} is given twice, and only one of them would count; name it "
-            "once, with "
-            "all its values after it."
+            "once, with all its values after it."
         )
 
 
 def insert_auto_count(words: Sequence[str]) -> list[str]:
     """Insert the default number after an `--auto` without one."""
-    alone = [
-        w == "--auto" and not n.isdecimal() for w, n in zip(words, [*words, ""][1:], strict=True)
-    ]
-    counted = [
-        (w, str(DEFAULT_NUM_TARGETS)) if a else (w,) for w, a in zip(words, alone, strict=True)
-    ]
-    return [word for pair in counted for word in pair]
+    counted = [*words]
+    if "--auto" in counted:
+        place = counted.index("--auto") + 1
+        if not counted[place:] or not counted[place].isdecimal():
+            counted.insert(place, str(DEFAULT_NUM_TARGETS))
+    return counted
 
 
 @dataclass(frozen=True)
@@ -161,14 +156,13 @@ def make_registry(config: CompleterConfig, *rules: Rule) -> ConstructorRegistry:
         return ConstructorRegistry.get_struct_spec(StructTypeInfo.make(info.type, config, False))
 
     registry = ConstructorRegistry()
-    registry.struct_rule(make_generator_spec)
     registry.struct_rule(config_flags)
     for rule in rules:
         registry.struct_rule(rule)
     return registry
 
 
-def extract_sentence(box: str, words: Sequence[str], names: Collection[str]) -> str:
+def extract_sentence(box: str) -> str:
     """Extract the sentence from tyro's boxed error message."""
 
     def is_empty(line: str) -> bool:
@@ -179,5 +173,32 @@ def extract_sentence(box: str, words: Sequence[str], names: Collection[str]) -> 
     sentence = " ".join(line.strip() for line in first_lines if not line.startswith(" " * 5))
     usage = lines.index("Argument helptext:") + 1 if "Argument helptext:" in lines else None
     needed = "" if usage is None else f"; give {lines[usage].strip()}"
-    command = get_command_name(words, names)
-    return f"{quote_value(sentence, 200).removesuffix('.')}{needed} (see {command} --help)."
+    return f"{quote_value(sentence, 200).removesuffix('.')}{needed}"
+
+
+def use_new_names(words: Sequence[str]) -> list[str]:
+    """Replace old names of options such as `--film` or `--rerun=failures`, and warn of each."""
+    renamed = []
+    for word in words:
+        old, equals, value = word.partition("=")
+        new = f"--{translate_name(old[2:])}" if old.startswith("--") else old
+        renamed.append(f"{new}{equals}{value}")
+    return renamed
+
+
+def translate_name(name: str) -> str:
+    """Return today's name of an option without dashes, and warn of an old one."""
+    old = name.replace("_", "-")
+    if old not in RENAMED:
+        return name
+    warn_renamed(old, RENAMED[old])
+    return RENAMED[old]
+
+
+@cache
+def warn_renamed(old: str, new: str) -> None:
+    """Print once per process that an option has a new name."""
+    print(
+        f"{PROGRAM}--{old} is now called --{new}; the old name stops working in the next release.",
+        file=sys.stderr,
+    )

@@ -22,18 +22,14 @@ SOURCE_NAMES = {
     "features": "by matched features",
 }
 MAX_NAMED = 8
-SECONDS_PER_PIXEL = 2e-5
-"""Seconds of `plane-sweep` per pixel on two cores of 2.8 GHz. Measured: 18 to 24 µs from 256 x 256
-to 427 x 640 pixels (docs/performance.md)."""
 
 
 def describe_task(options: CompleteOptions, opened: Opened, task: Task) -> list[str]:
     """Write the four lines; the cameras of `task` have the working depth range."""
-    device = task.views[0].image.device.type
     return [
         *describe_opening(options, opened, task),
-        f"To do: {describe_work(options, task, device)}.",
-        f"Budget: {describe_budget(options, task, device)}.",
+        f"To do: {describe_work(options, task)}.",
+        f"Budget: {task.context_note}, {describe_memory(options, task)}.",
     ]
 
 
@@ -81,15 +77,14 @@ def describe_found(options: SceneOptions, opened: Opened, task: Task) -> str:
     format = FORMATS.get(opened.format)
     unit = f" {format.unit}" if format is not None and format.unit is not None else ""
     camera, depths = task.views[0].camera, task.depths
-    tellers = dict.fromkeys((SOURCE_NAMES[depths.near], SOURCE_NAMES[depths.far]))
-    depth = f"depths from {camera.near:.3g} to {camera.far:.3g}{unit} ({' and '.join(tellers)})"
+    sources = dict.fromkeys(SOURCE_NAMES[depths[end]] for end in ("near", "far"))
+    depth = f"depths from {camera.near:.3g} to {camera.far:.3g}{unit} ({' and '.join(sources)})"
     return f"{task.frame_description.rstrip('.')}; {depth}; {describe_size(options, opened, task)}"
 
 
 def describe_size(options: SceneOptions, opened: Opened, task: Task) -> str:
     """Describe the working size, and that of the photographs if it differs."""
-    frames = [view.frame for view in task.views if view.frame is not None]
-    own = list_sizes([opened.photographs.camera(frame) for frame in frames])
+    own = list_sizes([opened.photographs.camera(frame) for frame in task.context_frames])
     size = list_sizes([view.camera for view in task.views])
     if own == size or not isinstance(options.resolution, int):
         return f"worked at {size}"
@@ -102,7 +97,7 @@ def list_sizes(cameras: Sequence[Camera]) -> str:
     return ", ".join(sizes)
 
 
-def describe_work(options: CompleteOptions, task: Task, device: str) -> str:
+def describe_work(options: CompleteOptions, task: Task) -> str:
     """Describe the context, targets, models and output."""
     chosen = " (chosen)" if options.context is None else ""
     frames = [target.frame for target in task.targets if target.frame is not None]
@@ -111,56 +106,25 @@ def describe_work(options: CompleteOptions, task: Task, device: str) -> str:
     targets += [f"{others} cameras" if others > 1 else "a camera"] if others else []
     targets = targets or [f"up to {get_max_targets(options)} cameras that are found"]
     return (
-        f"context from {list_frames([view.frame for view in task.views])}{chosen}, completed for "
+        f"context from {list_frames(task.context_frames)}{chosen}, completed for "
         f"{' and '.join(targets)} by {options.reconstructor} and {options.synthesis.name} on "
-        f"{device}, written to {quote_value(options.out)}"
-    )
-
-
-def describe_budget(options: CompleteOptions, task: Task, device: str) -> str:
-    """Describe the number of context photographs, memory and time."""
-    needs = describe_memory(options, task) + describe_time(options, task, device)
-    return describe_count(task) + needs
-
-
-def describe_count(task: Task) -> str:
-    """Describe the number of context photographs."""
-    budget = task.budget
-    if budget is None:
-        named = len(task.views)
-        return f"{named} {'photograph' if named == 1 else 'photographs'} for the context, as named"
-    limit = ""
-    if budget.limit < budget.wanted:
-        limit = f" (memory is too small for {budget.wanted})"
-    return (
-        f"at most {budget.limit} of {budget.usable:,} photographs for the context{limit} "
-        "(--context names others)"
+        f"{task.device.type}, written to {quote_value(options.out)}"
     )
 
 
 def describe_memory(options: CompleteOptions, task: Task) -> str:
     """Estimate the memory."""
-    cameras = [view.camera for view in task.views] + [target.camera for target in task.targets]
-    pixels = max(camera.width * camera.height for camera in cameras)
+    pixels = max(camera.width * camera.height for camera in task.cameras)
     images = len(task.views) + (len(task.targets) or get_max_targets(options))
     needed = estimate_bytes(pixels, images)
     if task.scene is not None and task.scene.means.device.type == "cpu":
         needed += estimate_splat_bytes(task, task.scene)
     there = read_memory_bytes()
     of = "" if there is None else f" of {format_whole_gigabytes(there)}"
-    return f", up to {format_whole_gigabytes(needed)}{of} of memory"
+    return f"up to {format_whole_gigabytes(needed)}{of} of memory"
 
 
-def describe_time(options: CompleteOptions, task: Task, device: str) -> str:
-    """Estimate the seconds of the context, for the default model on a CPU."""
-    if task.scene is not None or options.reconstructor != "plane-sweep" or device != "cpu":
-        return ""
-    pixels = sum(view.camera.width * view.camera.height for view in task.views)
-    seconds = max(1, round(SECONDS_PER_PIXEL * pixels))
-    return f", about {seconds:,} s to reconstruct the context on two cores of 2.8 GHz"
-
-
-def list_frames(frames: Sequence[int | None]) -> str:
+def list_frames(frames: Sequence[int]) -> str:
     """List frame numbers, shortened."""
     names = join_names([str(frame) for frame in frames], MAX_NAMED)
     return f"{'frame' if len(frames) == 1 else 'frames'} {names}"

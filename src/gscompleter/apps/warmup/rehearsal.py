@@ -82,9 +82,8 @@ def compute_trust_with(_: str) -> None:
     evidence = gather_observations(gaussians, [view], [frozen], config)
     compute_trust(evidence, sum_weights(frozen), view.camera, config)
     plan = frozen.vary_appearance(gaussians, view.valid_mask)
-    (
-        plan(*parameters).sum() + plan.make_error(view.image, view.image[..., 0])(*parameters)
-    ).backward()
+    error = plan.make_error(view.image, view.image[..., 0])(*parameters)
+    (plan(*parameters).sum() + error).backward()
 
 
 def make_wall_gaussians() -> Gaussians:
@@ -102,15 +101,9 @@ def reconstruct_with(reconstructor: str) -> None:
 def synthesize_with(generator: str) -> None:
     """Synthesize a third camera's image, half of which is a hole."""
     views = make_photographs()
-    depth, seen = (
-        torch.full((IMAGE_SIZE_PX, IMAGE_SIZE_PX), WALL_DEPTH),
-        torch.ones(IMAGE_SIZE_PX, IMAGE_SIZE_PX),
-    )
-    half = (
-        (torch.arange(IMAGE_SIZE_PX) < IMAGE_SIZE_PX // 2)
-        .expand(IMAGE_SIZE_PX, IMAGE_SIZE_PX)
-        .float()
-    )
+    seen = torch.ones(IMAGE_SIZE_PX, IMAGE_SIZE_PX)
+    depth, half = WALL_DEPTH * seen, seen.clone()
+    half[:, IMAGE_SIZE_PX // 2 :] = 0
     at_views = tuple(Render(view.image, depth, seen) for view in views)
     at_target = Render(views[1].image * half[..., None], depth * half, half)
     context = GeneratorInput(tuple(views), at_views, at_target)

@@ -1,0 +1,269 @@
+"""Time and memory of one completion or one method, next to a yardstick."""
+
+from __future__ import annotations
+
+import json
+import statistics
+import subprocess
+import sys
+import time
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+from tempfile import TemporaryDirectory
+from typing import TypeVar
+
+import torch
+from torch import Tensor
+
+from gscompleter.errors import InputError
+from gscompleter.evaluation.memory import measure_peak_memory
+from gscompleter.evaluation.methods import BASELINES, METHODS, Method, Models, Prediction
+from gscompleter.io.files import SUMMARY_FILE
+from gscompleter.progress import show_progress, track
+from gscompleter.render import Renderer
+from gscompleter.render.reference import ReferenceFrozenScene
+from gscompleter.state import Completion
+from gscompleter.types import Camera, Gaussians, Render, make_observed, merge, sh_from_rgb
+
+SIDE = 256
+"""Side of the yardstick's image, in pixels."""
+SHIFTS = (-0.2, 0.2, 0.4)
+"""Camera positions in metres to the right; each camera adds one Gaussian per pixel."""
+RUNS = 5
+"""Number of runs of which the median is taken."""
+GRADIENT_FIELDS = ("means", "quats", "scales", "opacities", "sh")
+"""Fields that have gradients."""
+
+PROCESS, REST = "process", "rest"
+"""Seconds of the whole process, and those outside the stages: start, imports, files, scores."""
+OWN_STAGES = ("register", "integrate", "optimize")
+"""Stages after generation and lifting, in which methods differ."""
+OWN = "own"
+"""Name of the sum of their seconds."""
+
+PROGRAM = """
+import sys
+from pathlib import Path
+from gscompleter.cli import run
+peak = Path(sys.argv.pop(1))
+try:
+    run()
+finally:
+    from gscompleter.evaluation.memory import read_process_peak
+    peak.write_text(str(read_process_peak() or ""))
+"""
+"""Program of a process. It reports its own peak, because a child inherits its parent's."""
+
+T = TypeVar("T")
+K = TypeVar("K")
+
+
+@dataclass(frozen=True)
+class Sample:
+    """One measurement."""
+
+    seconds: Mapping[str, float]
+    """Wall time by stage."""
+    yardstick: float
+    """Seconds of the yardstick, the mean of just before and just after."""
+    ratios: Mapping[str, float]
+    """Wall time by stage, in yardsticks."""
+    peak_bytes: int | None
+    """Peak memory, or None if the system does not report it."""
+    gaussians: Mapping[str, int]
+    """Numbers of Gaussians in the context and added."""
+
+
+def make_sample(
+    seconds: Mapping[str, float],
+    yardstick: float,
+    peak_bytes: int | None,
+    gaussians: Mapping[str, int],
+) -> Sample:
+    """Make a sample, with its times in yardsticks."""
+    ratios = {stage: spent / yardstick for stage, spent in seconds.items()}
+    return Sample(seconds, yardstick, ratios, peak_bytes, gaussians)
+
+
+@dataclass(frozen=True)
+class Yardstick:
+    """A fixed workload: rendering and gradients of 196,608 Gaussians in an image of 256 x 256.
+
+    It compares times of different machines and busy hours.
+    """
+
+    renderer: Renderer
+    gaussians: Gaussians
+    camera: Camera
+
+    @staticmethod
+    def create(renderer: Renderer, device: str) -> Yardstick:
+        """Create the yardstick on a device, and run it once to compile everything."""
+        scene = merge([make_surface(make_yardstick_camera(shift)) for shift in SHIFTS])
+        found = Yardstick(renderer, scene.to(device), make_yardstick_camera(SHIFTS[-1]).to(device))
+        found.render()
+        return found
+
+    def render(self) -> tuple[Tensor, ...]:
+        """Render one image and compute the gradients of its sum."""
+        varied = {name: getattr(self.gaussians, name).clone() for name in GRADIENT_FIELDS}
+        variables = [tensor.requires_grad_() for tensor in varied.values()]
+        image = self.renderer.render(replace(self.gaussians, **varied), self.camera).image
+        return torch.autograd.grad(image.sum(), variables)
+
+    def measure_seconds(self) -> float:
+        """Measure the median seconds of `RUNS` runs."""
+        return statistics.median(measure_call(self.render) for _ in range(RUNS))
+
+    def measure_beside(self, measure: Callable[[], T]) -> tuple[T, float]:
+        """Run `measure`, and return the mean yardstick of just before and just after."""
+        before = self.measure_seconds()
+        found = measure()
+        return found, (before + self.measure_seconds()) / 2
+
+
+def measure_call(work: Callable[[], object]) -> float:
+    """Measure the seconds of a call, including its work on a GPU."""
+    start = time.perf_counter()
+    work()
+    if torch.cuda.is_available():
+        torch.cuda.synchronize()
+    return time.perf_counter() - start
+
+
+def make_yardstick_camera(shift: float) -> Camera:
+    """Make a camera along z, `shift` metres to the right."""
+    K = torch.tensor([[1.2 * SIDE, 0, SIDE / 2], [0, 1.2 * SIDE, SIDE / 2], [0, 0, 1]])
+    c2w = torch.eye(4)
+    c2w[0, 3] = shift
+    return Camera(c2w, K, SIDE, SIDE, near=1.0, far=8.0)
+
+
+def make_surface(camera: Camera) -> Gaussians:
+    """Make one Gaussian per pixel of a camera, on a wavy surface 3 m away."""
+    x = torch.linspace(0, 12, SIDE)
+    depth = 3 + 0.5 * torch.sin(x)[None] * torch.cos(x)[:, None]
+    n = SIDE * SIDE
+    colors = torch.rand(n, 3, generator=torch.Generator().manual_seed(0))
+    return make_observed(
+        (camera.center + depth[..., None] * camera.z_rays()).reshape(-1, 3),
+        torch.tensor([1.0, 0, 0, 0]).repeat(n, 1),
+        (0.5 * depth / camera.K[0, 0]).reshape(-1, 1).repeat(1, 3),
+        torch.full((n,), 0.9),
+        sh_from_rgb(colors),
+    )
+
+
+def measure_command(words: Sequence[str], out: Path, yardstick: Yardstick) -> Sample:
+    """Measure one run of a command that writes to `out`, in a process of its own."""
+    (spent, peak_bytes), unit = yardstick.measure_beside(lambda: run_command(words))
+    summary = json.loads((out / SUMMARY_FILE).read_text())
+    stages = summary["seconds"]
+    seconds = {**stages, REST: spent - stages["total"], PROCESS: spent}
+    return make_sample(seconds, unit, peak_bytes, summary["gaussians"])
+
+
+def run_command(words: Sequence[str]) -> tuple[float, int | None]:
+    """Run `gscompleter` in a process; raise InputError if it rejects its input.
+
+    Returns:
+        Wall time in seconds with start-up and imports, and the peak resident memory in bytes, or
+        None if the system does not report it.
+    """
+    with TemporaryDirectory() as folder:
+        peak = Path(folder) / "peak"
+        start = time.perf_counter()
+        done = subprocess.run(
+            [sys.executable, "-c", PROGRAM, str(peak), *words],
+            stdout=subprocess.DEVNULL,
+            stderr=subprocess.PIPE,
+            text=True,
+        )
+        seconds = time.perf_counter() - start
+        if done.returncode == 2:
+            raise InputError(done.stderr.strip().removeprefix("gscompleter: "))
+        if done.returncode != 0:
+            raise RuntimeError(f"gscompleter {' '.join(words)} failed:\n{done.stderr}")
+        peak_bytes = peak.read_text()
+    return seconds, int(peak_bytes) if peak_bytes else None
+
+
+@dataclass(frozen=True)
+class UnfrozenRenderer:
+    """A renderer that renders and differentiates the whole scene in every iteration.
+
+    It measures the benefit of a frozen context.
+    """
+
+    renderer: Renderer
+
+    def render(self, gaussians: Gaussians, camera: Camera) -> Render:
+        """Render as the wrapped renderer does."""
+        return self.renderer.render(gaussians, camera)
+
+    def freeze(self, context: Gaussians, camera: Camera) -> ReferenceFrozenScene:
+        """Return a scene that is rendered anew with every call."""
+        return ReferenceFrozenScene(self.renderer, context, camera)
+
+
+def complete_with_autograd(state: Completion, target: Camera, models: Models) -> Prediction:
+    """Complete as `full` does, with the same objectives and iterations but no frozen context."""
+    return METHODS["full"](
+        state, target, replace(models, renderer=UnfrozenRenderer(models.renderer))
+    )
+
+
+BENCH_METHODS: dict[str, Method] = {
+    "full": METHODS["full"],
+    "autograd": complete_with_autograd,
+    **BASELINES,
+}
+"""Methods by name; the first one is ours, and times of others are multiples of its time."""
+
+
+def measure_method(
+    name: str, state: Completion, target: Camera, models: Models, yardstick: Yardstick
+) -> Sample:
+    """Measure one run of a method on a target, with the seconds of its own stages."""
+    before = state.scene
+
+    def run() -> tuple[Prediction, int | None]:
+        with measure_peak_memory(before.means.device) as peak:
+            prediction = BENCH_METHODS[name](state, target, models)
+        return prediction, peak.bytes
+
+    (found, peak_bytes), unit = yardstick.measure_beside(run)
+    own = sum(spent for stage, spent in found.seconds.items() if stage in OWN_STAGES)
+    counts = {"context": len(before), "added": len(found.scene) - len(before)}
+    return make_sample({**found.seconds, OWN: own}, unit, peak_bytes, counts)
+
+
+@dataclass(frozen=True)
+class BenchTask:
+    """A measurement that is repeated."""
+
+    name: str
+    measure: Callable[[], Sample]
+    stage: str
+    """Stage whose seconds the progress lines show."""
+    repeats: int
+
+
+def measure_in_rounds(
+    tasks: Mapping[K, BenchTask], print_line: Callable[[str], None]
+) -> dict[K, list[Sample]]:
+    """Run each task once per round until it has its repeats.
+
+    So a busy machine slows all of them alike. `print_line` receives progress lines.
+    """
+    samples: dict[K, list[Sample]] = {key: [] for key in tasks}
+    rounds = range(max((task.repeats for task in tasks.values()), default=0))
+    turns = [(key, task) for n in rounds for key, task in tasks.items() if n < task.repeats]
+    for number, (key, task) in enumerate(track(turns, "measuring"), start=1):
+        with show_progress(None):  # no progress lines inside a measurement
+            sample = task.measure()
+        samples[key].append(sample)
+        seconds, ratio = sample.seconds[task.stage], sample.ratios[task.stage]
+        print_line(f"{number}/{len(turns)} {task.name}: {seconds:.2f} s, {ratio:.1f} yardsticks")
+    return samples

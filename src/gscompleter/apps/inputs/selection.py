@@ -1,0 +1,130 @@
+"""Choice of photographs: for the context, for checks and for the depth range."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from gscompleter.apps.commands.options import (
+    CompleteOptions,
+    SceneOptions,
+    get_max_targets,
+    parse_resolution,
+)
+from gscompleter.apps.report.completion import Target
+from gscompleter.data.photographs import Photographs
+from gscompleter.data.resize import Resolution
+from gscompleter.errors import InputError
+from gscompleter.geometry import select_spread_cameras
+from gscompleter.memory import count_fitting_images
+from gscompleter.reconstructors.features.depth_range import estimate_depth_range
+from gscompleter.stages.select_context import (
+    make_points_in_front,
+    select_context,
+    select_overview,
+    summarize_cameras,
+)
+from gscompleter.types import Camera
+
+NUM_CONTEXT = 3
+"""Number of context photographs if targets but no context are named."""
+NUM_CONTEXT_WITH_SPLAT = 8
+"""Number of context photographs of an input splat, or if no targets are named either."""
+NUM_DEPTH_VIEWS, CHECK_VIEW_SIZE = 6, 320
+"""Photographs for depth range estimation, and the longer side of these and of check views."""
+
+
+def get_min_views(options: SceneOptions) -> int:
+    """Return the minimum number of photographs."""
+    return 2 if options.scene is None else 1
+
+
+def choose_context(
+    options: CompleteOptions, given: Photographs, targets: Sequence[Target]
+) -> tuple[tuple[int, ...], str]:
+    """Choose context frames for the targets, or for the whole scene without any.
+
+    Targets are never chosen, because their photographs score the result. The second value is
+    `Task.context_note`.
+    """
+    target_frames = {target.frame for target in targets}
+    others = [frame for frame in range(len(given)) if frame not in target_frames]
+    cameras = collect_usable_cameras(given, others, parse_resolution(options.resolution))
+    fewest = get_min_views(options)
+    if len(cameras) < fewest:
+        left = "photograph is" if len(cameras) == 1 else "photographs are"
+        raise InputError(
+            f"{len(cameras)} usable {left} left without the targets, and the context needs at "
+            f"least {fewest}; name fewer targets, or add photographs."
+        )
+    candidates, target_cameras = list(cameras.values()), [target.camera for target in targets]
+    usual = NUM_CONTEXT if targets and options.scene is None else NUM_CONTEXT_WITH_SPLAT
+    fit = count_fitting_images(max(c.width * c.height for c in [*candidates, *target_cameras]))
+    left_over = usual if fit is None else fit - (len(targets) or get_max_targets(options))
+    count = max(fewest, min(usual, left_over))
+    points = given.points()
+    if points is None or len(points) == 0:
+        goals = target_cameras or summarize_cameras(candidates)
+        points = sample_scene_points(given, goals, cameras)
+    if targets:
+        chosen = select_context(target_cameras, candidates, points, count)
+    else:
+        chosen = select_overview(candidates, points, count)
+    limit = "" if count == usual else f" (memory is too small for {usual})"
+    frames = list(cameras)
+    return tuple(frames[index] for index in chosen), (
+        f"at most {count} of {len(cameras):,} photographs for the context{limit} "
+        "(--context names others)"
+    )
+
+
+def collect_usable_cameras(
+    given: Photographs, frames: Sequence[int], resolution: Resolution
+) -> dict[int, Camera]:
+    """Return the valid cameras of frames that have a photograph."""
+    cameras = {}
+    for frame in frames:
+        try:
+            if given.has_photograph(frame):
+                cameras[frame] = given.camera(frame, resolution)
+        except InputError:
+            continue
+    return cameras
+
+
+def select_closest(
+    targets: Sequence[Camera], cameras: Mapping[int, Camera], count: int
+) -> list[int]:
+    """Select the frames whose cameras are nearest to a target, in ascending order."""
+    centers = torch.stack([target.center for target in targets])
+    distance = {
+        f: (centers - c.center.to(centers)).norm(dim=-1).min().item() for f, c in cameras.items()
+    }
+    return sorted(sorted(cameras, key=distance.__getitem__)[:count])
+
+
+def sample_scene_points(
+    given: Photographs, targets: Sequence[Camera], cameras: dict[int, Camera]
+) -> Float[Tensor, "n 3"]:
+    """Sample points in front of the targets within the known or estimated depth range."""
+    near, far = given.near, given.far
+    if near is None or far is None:
+        frames = select_closest(targets, cameras, NUM_DEPTH_VIEWS)
+        low, high = estimate_depth_range(given.views(frames, CHECK_VIEW_SIZE))
+        near, far = low if near is None else near, high if far is None else far
+    return torch.cat([make_points_in_front(target, near, far) for target in targets])
+
+
+def select_near_and_far(
+    wanted: Sequence[Camera], cameras: Mapping[int, Camera], count: int
+) -> list[int]:
+    """Select up to `count` frames: half nearest to `wanted`, the others spread over the rest."""
+    near = select_closest(wanted, cameras, count if len(cameras) <= count else count // 2)
+    rest = [frame for frame in cameras if frame not in near]
+    if not rest:
+        return near
+    far = select_spread_cameras([cameras[frame] for frame in rest], count - len(near))
+    return sorted([*near, *(rest[i] for i in far)])
