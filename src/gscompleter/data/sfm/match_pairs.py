@@ -15,8 +15,6 @@ from jaxtyping import Float, Int
 
 NEIGHBOURS = 10
 """Photographs before and after each one of a sequence to match it with."""
-MAX_EXHAUSTIVE = 60
-"""Most unordered photographs that are all matched with each other."""
 NUM_SIMILAR = 20
 """Most similar photographs to match each one with."""
 NUM_LARGEST_FEATURES = 256
