@@ -246,8 +246,8 @@ def list_focals(job: Job) -> list[dict[int, float]]:
         cameras = database.read_all_cameras()
     in_exif = {one.camera_id: one.focal_length for one in cameras if one.has_prior_focal_length}
     sides = {one.camera_id: max(one.width, one.height) for one in cameras}
-    factors = [1 / 2 / math.tan(math.radians(fov / 2)) for fov in FIXED_FOVS]
-    guessed = [{number: side * factor for number, side in sides.items()} for factor in factors]
+    tangents = [math.tan(math.radians(fov / 2)) for fov in FIXED_FOVS]
+    guessed = [{number: side / 2 / tan for number, side in sides.items()} for tan in tangents]
     return ([in_exif] if len(in_exif) == len(cameras) else []) + guessed
 
 
