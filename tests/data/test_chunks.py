@@ -22,14 +22,14 @@ from chunk_files import (
 from gscompleter import InputError
 from gscompleter.data.cases import SkippedScene, filter_usable, open_clips
 from gscompleter.data.chunks import open_chunks
-from gscompleter.data.photographs import PosedPhotographs
+from gscompleter.data.photographs import Photographs
 from gscompleter.data.real_estate import read_camera_file
 from gscompleter.geometry import project
 
 
 def test_a_chunk_gives_back_the_views_it_was_made_of(tmp_path):
     (clip,) = open_chunks(save_chunk(tmp_path / "000000.torch", example(form="PNG")))
-    assert isinstance(clip, PosedPhotographs)
+    assert isinstance(clip, Photographs)
     assert (clip.name, len(clip)) == ("room", 5)
     for number in (3, 0):
         (view,) = clip.views([number])

@@ -4,7 +4,7 @@ import json
 import math
 import shutil
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 
 import numpy as np
@@ -13,7 +13,8 @@ import torch
 
 from command import run
 from gscompleter import InputError
-from gscompleter.data.photographs import PosedPhotographs
+from gscompleter.data.frame import Frame
+from gscompleter.data.photographs import Photographs
 from gscompleter.evaluation import methods, steps
 from gscompleter.evaluation.baselines.reggs import RegGSConfig
 from gscompleter.evaluation.methods import METHODS
@@ -47,12 +48,14 @@ TABLES = ("tables.md", "tables.tex", "tables.json")
 
 
 @dataclass(frozen=True)
-class Walk(PosedPhotographs):
+class Walk(Photographs):
     """A walk through the room with unreadable frames."""
 
     names = ()
-    origin = np.zeros(3)
     name: str = "walk"
+    title: str = "walk"
+    frames: tuple[Frame, ...] = ()
+    origin: np.ndarray = field(default_factory=lambda: np.zeros(3))
     num_frames: int = len(PLACES)
     broken: tuple[int, ...] = ()
 

@@ -159,7 +159,10 @@ def test_what_cannot_be_put_back_is_not_thrown_away(results, monkeypatch):
         open_output_folder(results, overwrite=True) as folder,
     ):
         write_results(folder)
-    kept = {**tree(folder / ".gscompleter-replaced"), "mine.txt": (results / "mine.txt").read_text()}
+    kept = {
+        **tree(folder / ".gscompleter-replaced"),
+        "mine.txt": (results / "mine.txt").read_text(),
+    }
     assert kept == before
 
 

@@ -12,11 +12,11 @@ import os
 from collections.abc import Iterable, Iterator
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import Any
 
 from gscompleter.data.ego_vehicle import attach_vehicle_detector
 from gscompleter.data.formats import FORMATS, detect_format, find_format, open_photographs
-from gscompleter.data.photographs import Photographs, PosedPhotographs, apply_masks
+from gscompleter.data.photographs import Photographs, apply_masks
 from gscompleter.data.resize import Resolution
 from gscompleter.errors import InputError, quote_value
 from gscompleter.io.json_file import read_json
@@ -118,9 +118,6 @@ def _check_whole(value: Any) -> int:
     return value
 
 
-P = TypeVar("P", bound=PosedPhotographs)
-
-
 @dataclass(frozen=True)
 class SkippedScene:
     """A scene that was left out, and why."""
@@ -153,7 +150,9 @@ def select_front_camera(clip: Photographs) -> Photographs:
     return replace(clip, frames=ahead)
 
 
-def filter_usable(clips: Iterable[P], skipped: list[SkippedScene]) -> Iterator[P]:
+def filter_usable(
+    clips: Iterable[Photographs], skipped: list[SkippedScene]
+) -> Iterator[Photographs]:
     """Yield the scenes that benchmarks keep, and append the others to `skipped`."""
     for clip in clips:
         reason = clip.find_skip_reason()

@@ -4,13 +4,19 @@ from __future__ import annotations
 
 import os
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
 from jaxtyping import Bool, Float, UInt8
 
-from gscompleter.data.cameras import FRACTIONS, Intrinsics, find_pinhole_defect, find_pose_defect
+from gscompleter.data.cameras import (
+    FRACTIONS,
+    Intrinsics,
+    find_pinhole_defect,
+    find_pose_defect,
+    make_rigid,
+)
 from gscompleter.data.driving.moving_objects import Box
 from gscompleter.data.limits import MAX_SIDE
 from gscompleter.data.undistort import Pinhole, undistort_pinhole
@@ -127,6 +133,13 @@ class Frame:
         new = undistort_pinhole(pinhole, self.intrinsics.distortion)
         assert new is not None
         return pinhole, new
+
+    def with_rigid_pose(self, place: str = "") -> Frame:
+        """Return the frame with an exactly rigid pose; `place` in the file is for errors."""
+        defect = find_pose_defect(self.c2w)
+        if defect is not None:
+            raise self.make_error(f"{defect}{place}")
+        return replace(self, c2w=make_rigid(self.c2w))
 
     def make_error(self, defect: str) -> InputError:
         """Build the error for a frame with this defect."""

@@ -1,18 +1,31 @@
 """Validated access to values of JSON objects.
 
-All functions raise an InputError that names the key and `title`.
+Functions with a `title` raise an InputError that names the key and the title.
 """
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 import numpy as np
 from jaxtyping import Float
 
-from gscompleter.data.limits import MAX_PATH, MAX_SIDE
+from gscompleter.data.cameras import Intrinsics, compute_rotation
+from gscompleter.data.limits import MAX_COORDINATE, MAX_IN_PIXELS, MAX_PATH, MAX_SIDE
 from gscompleter.errors import InputError, quote_value
+
+
+def get_object(content: Any, key: str) -> dict[Any, Any]:
+    """Return the object at `key`; an empty one if there is none."""
+    value = content.get(key) if isinstance(content, dict) else None
+    return value if isinstance(value, dict) else {}
+
+
+def get_list(content: Any, key: str) -> list[Any]:
+    """Return the list at `key`; an empty one if there is none."""
+    value = content.get(key) if isinstance(content, dict) else None
+    return value if isinstance(value, list) else []
 
 
 def get_optional_number(
@@ -70,3 +83,36 @@ def get_array(
         size = " × ".join(map(str, shape))
         raise InputError(f"The `{key}` of {title} is no list of {size} numbers; correct it.")
     return array
+
+
+def get_focal(entry: Mapping[str, Any], title: str) -> tuple[float, float]:
+    """Return the focal lengths `fx` and `fy` in pixels."""
+    fx, fy = (
+        get_number(entry, key, title, 1 / MAX_IN_PIXELS, MAX_IN_PIXELS) for key in ("fx", "fy")
+    )
+    return fx, fy
+
+
+def get_intrinsics(entry: Mapping[str, Any], title: str) -> Intrinsics:
+    """Return the intrinsics `fx`, `fy`, `cx` and `cy` in pixels, without an image size."""
+    focal = get_focal(entry, title)
+    cx, cy = (get_number(entry, key, title, -MAX_IN_PIXELS, MAX_IN_PIXELS) for key in ("cx", "cy"))
+    return Intrinsics(None, focal, (cx, cy))
+
+
+def get_pose(
+    entry: Any, place: str, rotation: str, quaternion: Sequence[str], title: str
+) -> Float[np.ndarray, "4 4"]:
+    """Return a pose of x, y, z in the object `place` and a quaternion in the object `rotation`.
+
+    `quaternion` lists the keys of its numbers, the real part first.
+    """
+
+    def get_numbers(part: str, keys: Sequence[str]) -> list[float]:
+        numbers = get_object(entry, part)
+        return [get_number(numbers, key, title, -MAX_COORDINATE, MAX_COORDINATE) for key in keys]
+
+    pose = np.eye(4)
+    pose[:3, :3] = compute_rotation(get_numbers(rotation, quaternion))
+    pose[:3, 3] = get_numbers(place, "xyz")
+    return pose

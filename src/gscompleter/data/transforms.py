@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float
 
-from gscompleter.data.cameras import Intrinsics, find_pose_defect, make_rigid
+from gscompleter.data.cameras import Intrinsics
 from gscompleter.data.frame import Frame, capitalize
 from gscompleter.data.json_fields import get_optional_number, get_text
 from gscompleter.data.limits import DEPTH_RANGE, MAX_COEFFICIENT, MAX_IN_PIXELS, MAX_SIDE
@@ -139,10 +139,8 @@ def _parse_frame(
         depth=None if depth_path is None else (path.parent / depth_path, depth_unit),
         mask=None if mask_path is None else path.parent / mask_path,
     )
-    defect = find_pose_defect(frame.c2w)
-    if defect is not None:
-        raise frame.make_error(f"{defect} (`transform_matrix`)")
-    return replace(frame, c2w=make_rigid(frame.c2w) @ OPENCV_FROM_OPENGL)
+    frame = frame.with_rigid_pose(" (`transform_matrix`)")
+    return replace(frame, c2w=frame.c2w @ OPENCV_FROM_OPENGL)
 
 
 def _parse_matrix(matrix: Any, title: str) -> Float[np.ndarray, "4 4"]:

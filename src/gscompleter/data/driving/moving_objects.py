@@ -54,6 +54,12 @@ def build_upright_pose(center: Float[np.ndarray, "3"], heading: float) -> Float[
     return pose
 
 
+def convert_speed(velocity: Float[np.ndarray, "_"]) -> float | None:
+    """Convert a velocity to a speed; None if it is unknown (NaN)."""
+    speed = float(np.linalg.norm(velocity))
+    return speed if np.isfinite(speed) else None
+
+
 def mask_moving(
     boxes: Iterable[Box], camera: Camera, origin: Float[np.ndarray, "3"]
 ) -> Bool[np.ndarray, "h w"]:
@@ -63,10 +69,8 @@ def mask_moving(
     """
     mask = np.zeros((camera.height, camera.width), np.uint8)
     for box in boxes:
-        outline = (
-            _compute_outline(box.compute_corners() - origin, camera) if box.is_moving else None
-        )
-        if outline is not None:
+        outline = _compute_outline(box.compute_corners() - origin, camera)
+        if box.is_moving and outline is not None:
             cv2.fillConvexPoly(mask, outline, 1)
     return mask > 0
 

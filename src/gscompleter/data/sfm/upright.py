@@ -9,6 +9,7 @@ import re
 import shutil
 from dataclasses import dataclass
 from pathlib import Path
+
 from PIL import Image, ImageOps
 
 from gscompleter.errors import InputError, quote_value, refuse_pointer
@@ -95,8 +96,8 @@ def _write_copy(image: Image.Image, source: Path, target: Path) -> tuple[int, in
 def _compute_focal(exif: Image.Exif, width: int, height: int) -> float | None:
     """Compute the focal length in pixels from the 35 mm equivalent; None if there is none."""
     try:
-        millimetres = float(exif.get_ifd(EXIF).get(FOCAL_LENGTH_35))
-    except (TypeError, ValueError, ZeroDivisionError):  # broken values are common
+        millimetres = float(exif.get_ifd(EXIF)[FOCAL_LENGTH_35])
+    except (KeyError, TypeError, ValueError, ZeroDivisionError):  # broken values are common
         return None
     if not 1 <= millimetres <= 5000:
         return None
