@@ -18,8 +18,12 @@ import numpy as np
 from jaxtyping import Float
 
 from gscompleter.data.cameras import Intrinsics
-from gscompleter.data.colmap.lenses import build_intrinsics, find_model
-from gscompleter.data.colmap.records import PosedImage, make_portable
+from gscompleter.data.colmap.records import (
+    PosedImage,
+    build_intrinsics,
+    build_posed_image,
+    find_model,
+)
 from gscompleter.errors import InputError, quote_value, refuse_pointer
 from gscompleter.io.reading import open_file
 
@@ -68,9 +72,9 @@ def _read_camera(records: _Records) -> tuple[int, Intrinsics]:
 
 def _read_image(records: _Records) -> PosedImage:
     _, *pose, camera = records.read_numbers(_IMAGE)
-    name = make_portable(records.read_string())
+    name = records.read_string()
     records.skip(records.read_count(_FEATURE.size) * _FEATURE.size)
-    return PosedImage(name, camera, tuple(pose[:4]), tuple(pose[4:]))
+    return build_posed_image(name, camera, pose)
 
 
 @contextmanager
@@ -124,6 +128,5 @@ class _Records:
     def _make_error(self) -> InputError:
         return InputError(
             f"{quote_value(self.path)} is truncated or no such file of COLMAP: it claims more "
-            "than its "
-            f"{len(self.content):,} bytes hold; export the model again."
+            f"than its {len(self.content):,} bytes hold; export the model again."
         )
