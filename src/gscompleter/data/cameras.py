@@ -41,9 +41,9 @@ class Intrinsics:
         cx = w / 2 if self.center[0] is None else self.center[0]
         cy = h / 2 if self.center[1] is None else self.center[1]
         # With only one focal length, pixels are square.
-        known = fl_y if fl_x is None else fl_x
-        assert known is not None
-        fl_x, fl_y = known if fl_x is None else fl_x, known if fl_y is None else fl_y
+        fl_x, fl_y = fl_y if fl_x is None else fl_x, fl_x if fl_y is None else fl_y
+        assert fl_x is not None
+        assert fl_y is not None
         return Pinhole(fl_x, fl_y, cx, cy, w, h).resize(width, height)
 
     def is_transposed(self, width: int, height: int) -> bool:
@@ -122,10 +122,9 @@ def compute_rotation(quaternion: Sequence[float]) -> Float[np.ndarray, "3 3"]:
     with np.errstate(all="ignore"):
         q = q / np.abs(q).max()
         w, x, y, z = q / np.linalg.norm(q)
-    return np.array(
-        [
-            [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)],
-            [2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)],
-            [2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)],
-        ]
-    )
+    rows = [
+        [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)],
+        [2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)],
+        [2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)],
+    ]
+    return np.array(rows)

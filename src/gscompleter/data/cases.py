@@ -16,6 +16,7 @@ from typing import Any
 
 from gscompleter.data.ego_vehicle import attach_vehicle_detector
 from gscompleter.data.formats import FORMATS, detect_format, find_format, open_photographs
+from gscompleter.data.frame import Frame
 from gscompleter.data.photographs import Photographs, apply_masks
 from gscompleter.data.resize import Resolution
 from gscompleter.errors import InputError, quote_value
@@ -73,30 +74,23 @@ def open_cases(path: Path) -> Iterator[Photographs]:
     """
     cases = read_cases(path / NAME if os.path.isdir(path) else path)
     for scene in dict.fromkeys(case.scene for case in cases):
-        ours = [case for case in cases if case.scene == scene]
-        near = [case.near for case in ours if case.near is not None]
-        far = [case.far for case in ours if case.far is not None]
-        yield open_photographs(
-            scene,
-            near=min(near) if len(near) == len(ours) else None,
-            far=max(far) if len(far) == len(ours) else None,
-        )
+        nears = [case.near for case in cases if case.scene == scene]
+        fars = [case.far for case in cases if case.scene == scene]
+        near = None if None in nears else min(n for n in nears if n is not None)
+        far = None if None in fars else max(f for f in fars if f is not None)
+        yield open_photographs(scene, near=near, far=far)
 
 
 def read_cases(path: Path) -> list[Case]:
     """Read the cases of a file."""
     content = read_json(path, "name a file of cases")
     try:
-        height, width = content["resolution"]
-        return [
-            _parse_case(row, (_check_whole(height), _check_whole(width)), path)
-            for row in content["cases"]
-        ]
+        height, width = map(_check_whole, content["resolution"])
+        return [_parse_case(row, (height, width), path) for row in content["cases"]]
     except (ValueError, KeyError, TypeError, OverflowError) as error:
         raise InputError(
             f"{path} is no file of cases ({type(error).__name__}: {quote_value(str(error))}); it "
-            "needs "
-            "resolution and cases, each with scene, context and target."
+            "needs resolution and cases, each with scene, context and target."
         ) from error
 
 
@@ -138,16 +132,13 @@ def open_clips(path: Path | str) -> Iterator[Photographs]:
     inside = [] if find_format(path) or not os.path.isdir(path) else sorted(path.iterdir())
     folders = [child for child in inside if child.is_dir() and find_format(child)]
     scenes = [(FORMATS[detect_format(place)], place) for place in folders or [path]]
-    clips = (select_front_camera(clip) for format, place in scenes for clip in format.open(place))
-    return (replace(clip, frames=attach_vehicle_detector(clip.frames)) for clip in clips)
+    clips = (clip for format, place in scenes for clip in format.open(place))
+    return (replace(clip, frames=_select_front_frames(clip)) for clip in clips)
 
 
-def select_front_camera(clip: Photographs) -> Photographs:
-    """Keep the frames of the front camera if a vehicle has several cameras."""
-    if clip.front is None:
-        return clip
-    ahead = tuple(frame for frame in clip.frames if frame.sensor == clip.front)
-    return replace(clip, frames=ahead)
+def _select_front_frames(clip: Photographs) -> tuple[Frame, ...]:
+    ahead = (frame for frame in clip.frames if clip.front in (None, frame.sensor))
+    return attach_vehicle_detector(tuple(ahead))
 
 
 def filter_usable(

@@ -116,7 +116,9 @@ def detect_format(path: Path, name: str | None = None) -> str:
 
 def refuse_scenes_below(path: Path) -> None:
     """Refuse a folder without photographs whose subfolders hold scenes, and name them."""
-    if not os.path.isdir(path) or _has_image_folder(path) or _has_images(path):
+    if not os.path.isdir(path) or _has_image_folder(path):
+        return
+    if any(name.lower().endswith(ENDINGS) for name in os.listdir(path)):
         return
     found = list(_list_scenes_below(path, lambda folder: find_format(folder) is not None))
     if not found:
@@ -133,10 +135,6 @@ def refuse_scenes_below(path: Path) -> None:
 
 def _has_image_folder(path: Path) -> bool:
     return any(os.path.isdir(path / name) for name in FOLDERS)
-
-
-def _has_images(path: Path) -> bool:
-    return any(name.lower().endswith(ENDINGS) for name in os.listdir(path))
 
 
 def _list_scenes_below(

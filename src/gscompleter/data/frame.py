@@ -127,11 +127,10 @@ class Frame:
     def compute_pinholes(self, width: int, height: int) -> tuple[Pinhole, Pinhole]:
         """Return the intrinsics at this photograph size, before and after undistortion."""
         defect = self.find_defect(width, height)
-        if defect is not None:
-            raise self.make_error(defect)
         pinhole = self.intrinsics.compute_pinhole(width, height)
-        new = undistort_pinhole(pinhole, self.intrinsics.distortion)
-        assert new is not None
+        new = undistort_pinhole(pinhole, self.intrinsics.distortion) if defect is None else None
+        if new is None:
+            raise self.make_error(str(defect))
         return pinhole, new
 
     def with_rigid_pose(self, place: str = "") -> Frame:
@@ -157,8 +156,8 @@ def find_image(path: Path) -> Path | None:
     """
     folders = [path.parent]
     if path.parent.name == "images":
-        folders += [path.parent.with_name(f"{path.parent.name}_{n}") for n in DOWNSCALE_FACTORS]
-    candidates = [folder / (path.name + ending) for folder in folders for ending in ENDINGS]
+        folders += [path.parent.with_name(f"images_{n}") for n in DOWNSCALE_FACTORS]
+    candidates = (folder / (path.name + ending) for folder in folders for ending in ENDINGS)
     return next((candidate for candidate in candidates if os.path.isfile(candidate)), None)
 
 

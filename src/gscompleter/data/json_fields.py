@@ -75,14 +75,19 @@ def get_array(
     entry: Mapping[str, Any], key: str, shape: tuple[int, ...], title: str
 ) -> Float[np.ndarray, "*n"]:
     """Return the nested list of numbers at `key` as an array of this shape."""
-    try:
-        array = np.array(entry.get(key), dtype=np.float64)
-    except (ValueError, TypeError, OverflowError):
-        array = np.zeros(0)
+    array = convert_to_array(entry.get(key))
     if array.shape != shape:
         size = " × ".join(map(str, shape))
         raise InputError(f"The `{key}` of {title} is no list of {size} numbers; correct it.")
     return array
+
+
+def convert_to_array(value: Any) -> Float[np.ndarray, "*n"]:
+    """Convert nested lists of numbers to an array; an empty one if they are none."""
+    try:
+        return np.array(value, dtype=np.float64)
+    except (ValueError, TypeError, OverflowError):
+        return np.zeros(0)
 
 
 def get_focal(entry: Mapping[str, Any], title: str) -> tuple[float, float]:

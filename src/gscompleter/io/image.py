@@ -102,11 +102,8 @@ def read_brightness(stored: Path | bytes, side: int, name: str = "") -> Float[np
         size = max(round(image.width * scale), 1), max(round(image.height * scale), 1)
         image.draft("L", size)
         problem = f"The image {quote_value(name or str(stored))} is damaged"
-        return _run_decoder(lambda: _shrink(image, size), problem, "copy it again")
-
-
-def _shrink(image: Image.Image, size: tuple[int, int]) -> Float[np.ndarray, "h w"]:
-    grey = Image.fromarray(_composite_over_black(image)).convert("L")
+        pixels = _run_decoder(lambda: _composite_over_black(image), problem, "copy it again")
+    grey = Image.fromarray(pixels).convert("L")
     return np.array(grey.resize(size, Image.Resampling.BOX), np.float32)
 
 
@@ -122,9 +119,8 @@ def read_depth(path: Path, unit: float) -> Float[np.ndarray, "h w"]:
     values = values[..., 0] if values.ndim == 3 and values.shape[-1] == 1 else values
     if values.ndim != 2 or values.dtype.kind not in "uif" or values.dtype == np.uint8:
         raise InputError(
-            f"{quote_value(path)} is no depth map: a 16-bit grey PNG or an array [h, w] of "
-            "numbers is "
-            f"needed, and it holds {values.dtype} of shape {quote_value(list(values.shape))}."
+            f"{quote_value(path)} is no depth map: a 16-bit grey PNG or an array [h, w] of numbers "
+            f"is needed, and it holds {values.dtype} of shape {quote_value(list(values.shape))}."
         )
     with np.errstate(over="ignore", invalid="ignore"):
         depth = (values.astype(np.float64) * unit).astype(np.float32)

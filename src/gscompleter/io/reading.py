@@ -84,8 +84,7 @@ def read_lines(
                 if len(line) > max_length:
                     raise InputError(
                         f"{quote_value(path)} has a line of more than {max_length:,} characters, "
-                        "which "
-                        "its format does not allow; copy the file again."
+                        "which its format does not allow; copy the file again."
                     )
                 yield line
     except OSError as error:
