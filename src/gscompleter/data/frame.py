@@ -21,7 +21,7 @@ from gscompleter.data.driving.moving_objects import Box
 from gscompleter.data.limits import MAX_SIDE
 from gscompleter.data.undistort import Pinhole, undistort_pinhole
 from gscompleter.errors import InputError, quote_value
-from gscompleter.io.image import decode_pixels, read_brightness, read_image_size, read_pixels
+from gscompleter.io.image import read_brightness, read_image_size, read_pixels
 
 ENDINGS = ("", ".png", ".jpg", ".jpeg")
 """Image file endings tried for names without one."""
@@ -102,10 +102,7 @@ class Frame:
 
     def load_pixels(self) -> UInt8[np.ndarray, "h w 3"]:
         """Read the photograph as it is stored."""
-        stored = self.require_stored()
-        if isinstance(stored, bytes):
-            return decode_pixels(stored, capitalize(self.title))
-        return read_pixels(stored)
+        return read_pixels(self.require_stored(), capitalize(self.title))
 
     def load_small_pixels(self, side: int) -> Float[np.ndarray, "h w"]:
         """Read brightness in [0, 255], shrunk to at most `side` pixels on the longer side."""

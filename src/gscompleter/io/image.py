@@ -59,37 +59,34 @@ def convert_to_image(pixels: UInt8[np.ndarray, "h w 3"]) -> Float[Tensor, "h w 3
 
 def read_image_size(stored: Path | bytes, name: str = "") -> tuple[int, int]:
     """Read width and height of an image file, or of its bytes; `name` is for errors."""
-    with _open_bytes(stored, name) if isinstance(stored, bytes) else _open_file(stored) as image:
+    with _open(stored, name) as image:
         return image.size
 
 
 def has_orientation_tag(path: Path) -> bool:
     """Return True if the EXIF data of a photograph ask viewers to rotate it."""
     try:
-        with _open_file(path) as image:
+        with _open(path) as image:
             return bool(image.getexif().get(_ORIENTATION, 1) != 1)
     except Exception:  # of any kind; reading the photograph reports it
         return False
 
 
-def read_pixels(path: Path | str) -> UInt8[np.ndarray, "h w 3"]:
+def read_pixels(stored: Path | str | bytes, name: str = "") -> UInt8[np.ndarray, "h w 3"]:
     """Read an image in 8-bit colours, over black; 16-bit images are reduced.
 
     Orientation tags are ignored, because poses and intrinsics belong to the stored pixels.
 
+    Args:
+        stored: Path of an image file, or its bytes.
+        name: Name of bytes in errors.
+
     Raises:
         InputError: The file is missing, truncated or not an image.
     """
-    with _open_file(path) as image:
-        problem = f"The image {quote_value(Path(path))} is damaged"
+    with _open(stored, name) as image:
+        problem = f"{_name_image(stored, name)} is damaged"
         return _run_decoder(lambda: _composite_over_black(image), problem, "copy it again")
-
-
-def decode_pixels(data: bytes, name: str) -> UInt8[np.ndarray, "h w 3"]:
-    """Decode the bytes of an image file like `read_pixels`; `name` is for errors."""
-    with _open_bytes(data, name) as image:
-        problem = f"{quote_value(name)} is damaged"
-        return _run_decoder(lambda: _composite_over_black(image), problem, "copy its file again")
 
 
 def read_brightness(stored: Path | bytes, side: int, name: str = "") -> Float[np.ndarray, "h w"]:
@@ -97,11 +94,11 @@ def read_brightness(stored: Path | bytes, side: int, name: str = "") -> Float[np
 
     A JPEG is decoded no larger than necessary; `name` names bytes in errors.
     """
-    with _open_bytes(stored, name) if isinstance(stored, bytes) else _open_file(stored) as image:
+    with _open(stored, name) as image:
         scale = min(1.0, side / max(image.size))
         size = max(round(image.width * scale), 1), max(round(image.height * scale), 1)
         image.draft("L", size)
-        problem = f"The image {quote_value(name or str(stored))} is damaged"
+        problem = f"{_name_image(stored, name)} is damaged"
         pixels = _run_decoder(lambda: _composite_over_black(image), problem, "copy it again")
     grey = Image.fromarray(pixels).convert("L")
     return np.array(grey.resize(size, Image.Resampling.BOX), np.float32)
@@ -146,28 +143,33 @@ def _run_decoder(decode: Callable[[], np.ndarray], problem: str, advice: str) ->
         raise InputError(f"{problem} ({quote_value(str(error))}); {advice}.") from error
 
 
-def _open_file(path: Path | str) -> Image.Image:
-    path = Path(path)
-    if not os.path.isfile(path):
-        raise InputError(f"There is no image {quote_value(path)}; restore it or correct its path.")
-    refuse_pointer(path)
-    return _open(path, quote_value(path), "a PNG or JPEG file is")
+def _name_image(stored: Path | str | bytes, name: str) -> str:
+    return (
+        quote_value(name) if isinstance(stored, bytes) else f"The image {quote_value(Path(stored))}"
+    )
 
 
-def _open_bytes(data: bytes, name: str) -> Image.Image:
-    return _open(io.BytesIO(data), quote_value(name), "the bytes of a PNG or JPEG file are")
-
-
-def _open(file: Path | io.BytesIO, name: str, needed: str) -> Image.Image:
+def _open(stored: Path | str | bytes, name: str = "") -> Image.Image:
+    if not isinstance(stored, bytes):
+        path = Path(stored)
+        if not os.path.isfile(path):
+            raise InputError(
+                f"There is no image {quote_value(path)}; restore it or correct its path."
+            )
+        refuse_pointer(path)
     Image.preinit()  # usual formats only; Pillow would load all of them
+    file = io.BytesIO(stored) if isinstance(stored, bytes) else stored
     try:
         return Image.open(file, formats=IMAGE_FORMATS)
     except Image.DecompressionBombError as error:
         raise InputError(
-            f"{name} claims more than {MAX_PIXELS:,} pixels; make it smaller."
+            f"{_name_image(stored, name)} claims more than {MAX_PIXELS:,} pixels; make it smaller."
         ) from error
     except Exception as error:  # damaged files raise any kind
-        raise InputError(f"{name} is not an image that can be read; {needed} needed.") from error
+        raise InputError(
+            f"{_name_image(stored, name)} is not an image that can be read; a PNG or JPEG file is "
+            "needed."
+        ) from error
 
 
 def _composite_over_black(image: Image.Image) -> UInt8[np.ndarray, "h w 3"]:

@@ -44,7 +44,11 @@ def has_kitti(path: Path) -> bool:
     """Check whether `path` is a KITTI odometry sequence, or a file of poses."""
     if os.path.isdir(path):
         return os.path.isfile(path / CALIBRATION) and _find_poses(path) is not None
-    return path.suffix == ".txt" and os.path.isfile(path) and _is_pose_file(path)
+    if path.suffix != ".txt" or not os.path.isfile(path):
+        return False
+    line, _, _ = read_head(path, MAX_LINE).partition(b"\n")
+    first = _parse_matrix(line.decode("utf-8-sig", errors="replace"))
+    return first is not None and find_pose_defect(first) is None
 
 
 def open_kitti(path: Path) -> Iterator[Photographs]:
@@ -54,14 +58,24 @@ def open_kitti(path: Path) -> Iterator[Photographs]:
     poses, with calibration and photographs beside it or in ../sequences. The left colour camera (2)
     is preferred.
     """
-    poses = _find_poses(path) if os.path.isdir(path) else path
+    poses, folder = (_find_poses(path), path) if os.path.isdir(path) else (path, path.parent)
     if poses is None:
         raise InputError(f"There are no poses in {quote_value(path)}; put {POSES} into it.")
-    folder = path if os.path.isdir(path) else _find_sequence(path)
+    sequence = poses.resolve().parent.parent / "sequences" / poses.stem
+    if poses == path and os.path.isdir(sequence):
+        folder = sequence
     calibration = _find_calibration(folder, poses)
     images, camera = _find_camera_folder(folder)
-    intrinsics, first_from_camera = _read_camera(calibration, camera)
-    first_from_laser = _read_laser(calibration)
+    projections = _read_matrices(calibration)
+    if len(projections) <= camera:
+        raise InputError(
+            f"{quote_value(calibration)} has {len(projections)} projections, and the photographs "
+            f"are those of camera {camera}; a line P{camera} is needed."
+        )
+    title = str(calibration)
+    intrinsics, first_from_camera = _split_projection(projections[camera], camera, title)
+    laser = next((line for line in read_lines(calibration) if line.startswith("Tr")), "")
+    first_from_laser = _parse_matrix(laser.partition(":")[2])
     frames = []
     for number, first in enumerate(_read_matrices(poses)):
         name, title = f"{number:06d}", f"frame {number} of {quote_value(poses)}"
@@ -92,7 +106,12 @@ def open_kitti_raw(path: Path) -> Iterator[Photographs]:
     scale = float(np.cos(np.radians(readings[0][0])))
     frames = []
     for image, reading in zip(images, readings, strict=True):
-        laser = _compute_imu_pose(reading, scale) @ imu_from_laser
+        latitude, longitude, altitude, roll, pitch, yaw = reading.tolist()
+        east = scale * EARTH_RADIUS * np.radians(longitude)
+        north = scale * EARTH_RADIUS * np.log(np.tan(np.radians(90 + latitude) / 2))
+        # Map axes: east, north, up.
+        imu = build_poses(np.array([roll, pitch, yaw, east, north, altitude]))
+        laser = imu @ imu_from_laser
         c2w = laser @ laser_from_first @ first_from_camera
         title = f"photograph {image.stem} of {quote_value(path)}"
         lasers = _find_sweep(path / "velodyne_points" / "data" / f"{image.stem}.bin", laser)
@@ -105,17 +124,6 @@ def _find_sweep(
 ) -> Callable[[], Float[np.ndarray, "n 3"]] | None:
     """Return a reader of the points of a sweep; None if there is no file."""
     return partial(read_sweep, path, world_from_laser) if os.path.isfile(path) else None
-
-
-def _read_camera(calibration: Path, camera: int) -> tuple[Intrinsics, Float[np.ndarray, "4 4"]]:
-    """Read the intrinsics of a camera of a sequence and the transform from it to camera 0."""
-    projections = _read_matrices(calibration)
-    if len(projections) <= camera:
-        raise InputError(
-            f"{quote_value(calibration)} has {len(projections)} projections, and the photographs "
-            f"are those of camera {camera}; a line P{camera} is needed."
-        )
-    return _split_projection(projections[camera], camera, str(calibration))
 
 
 def _read_raw_camera(
@@ -146,12 +154,6 @@ def _split_projection(
     return Intrinsics(None, (fx, fy), (cx, cy)), transform
 
 
-def _read_laser(calibration: Path) -> Float[np.ndarray, "4 4"] | None:
-    """Read the transform from the laser frame to camera 0, if the file has it."""
-    lines = [line for line in read_lines(calibration) if line.startswith("Tr")]
-    return _parse_matrix(lines[0].partition(":")[2]) if lines else None
-
-
 def _read_matrices(path: Path) -> list[Float[np.ndarray, "4 4"]]:
     """Read the 3×4 matrices of a file, one per line, with or without labels such as `P0:`."""
     lines = [line for line in read_lines(path) if line.strip() and not line.startswith("Tr")]
@@ -177,14 +179,6 @@ def _parse_numbers(text: str) -> Float[np.ndarray, "n"] | None:
     except ValueError:
         return None
     return numbers if (np.abs(numbers) <= MAX_ENTRY).all() else None
-
-
-def _compute_imu_pose(reading: Float[np.ndarray, "6"], scale: float) -> Float[np.ndarray, "4 4"]:
-    """Compute the pose of the inertial sensor in map axes (east, north, up), in metres."""
-    latitude, longitude, altitude, roll, pitch, yaw = reading.tolist()
-    east = scale * EARTH_RADIUS * np.radians(longitude)
-    north = scale * EARTH_RADIUS * np.log(np.tan(np.radians(90 + latitude) / 2))
-    return build_poses(np.array([roll, pitch, yaw, east, north, altitude]))
 
 
 def _read_oxts(path: Path) -> Float[np.ndarray, "6"]:
@@ -230,11 +224,6 @@ def _find_poses(folder: Path) -> Path | None:
     return next((path for path in candidates if os.path.isfile(path)), None)
 
 
-def _find_sequence(poses: Path) -> Path:
-    folder = poses.resolve().parent.parent / "sequences" / poses.stem
-    return folder if os.path.isdir(folder) else poses.parent
-
-
 def _find_calibration(folder: Path, poses: Path) -> Path:
     renamed = poses.with_name(poses.name.replace("poses", "calib"))
     for path in (folder / CALIBRATION, renamed):
@@ -259,9 +248,3 @@ def _find_camera_folder(folder: Path) -> tuple[Path, int]:
 def _find_raw_camera(path: Path) -> str | None:
     folders = {camera: path / f"image_{camera}" / "data" for camera in RAW_CAMERAS}
     return next((c for c, folder in folders.items() if any(folder.glob("*.*"))), None)
-
-
-def _is_pose_file(path: Path) -> bool:
-    line, _, _ = read_head(path, MAX_LINE).partition(b"\n")
-    first = _parse_matrix(line.decode("utf-8-sig", errors="replace"))
-    return first is not None and find_pose_defect(first) is None

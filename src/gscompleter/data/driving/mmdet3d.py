@@ -68,10 +68,11 @@ def open_infos(path: Path) -> Iterator[Photographs]:
     beside the pickle and below it.
     """
     content = load_plain(path)
-    samples = content.get("data_list") if isinstance(content, dict) else None
-    if not isinstance(samples, list) or not samples:
+    samples = get_list(content, "data_list")
+    if not samples:
         raise InputError(f"{quote_value(path)} holds no infos with a `data_list`; {ADVICE}.")
-    kinds = _map_classes(content.get("metainfo"))
+    classes = get_object(content.get("metainfo"), "categories").items()
+    kinds = {n: kind for kind, n in classes if isinstance(n, int) and isinstance(kind, str)}
     ordered = sorted((_parse_sample(s, path) for s in samples), key=lambda s: (s.drive, s.time))
     return (_build_scene(path, scene, kinds) for scene in _split_scenes(ordered))
 
@@ -107,10 +108,12 @@ def _parse_sample(sample: Any, path: Path) -> _Sample:
     images = sample.get("images") if isinstance(sample, dict) else None
     if not isinstance(images, dict):
         raise InputError(f"An entry of {quote_value(path)} has no `images`; {ADVICE}.")
+    needed = ("img_path", "cam2img", "lidar2cam")
     posed = {
         quote_value(name): image
         for name, image in images.items()
-        if isinstance(name, str) and _is_posed(image)
+        if isinstance(name, str)
+        and all(get_object(images, name).get(n) is not None for n in needed)
     }
     if not posed:
         raise InputError(f"The images of {title} have no file or no pose; {ADVICE}.")
@@ -119,11 +122,6 @@ def _parse_sample(sample: Any, path: Path) -> _Sample:
     file = os.path.basename(get_text(first, "img_path", title) or "")
     drive = get_text(sample, "context_name", title) or file.split("__")[0]
     return _Sample(drive, time * 1e-6 if time >= MICROSECONDS else time, title, sample, posed)
-
-
-def _is_posed(image: Any) -> bool:
-    needed = ("img_path", "cam2img", "lidar2cam")
-    return isinstance(image, dict) and all(image.get(key) is not None for key in needed)
 
 
 def _split_scenes(samples: list[_Sample]) -> Iterator[list[_Sample]]:
@@ -152,11 +150,13 @@ def _make_frame(path: Path, sample: _Sample, camera: str, kinds: Mapping[int, st
     title = f"the photograph of {camera} at {sample.time:.3f} in {quote_value(path)}"
     file = get_text(image, "img_path", title)
     assert file is not None
-    laser_from_camera = _invert(_get_numbers(image, "lidar2cam", (4, 4), title))
-    with np.errstate(over="ignore", invalid="ignore"):  # leaves a defect of the pose
+    camera_from_laser = _get_numbers(image, "lidar2cam", (4, 4), title)
+    # NaN from singular or huge numbers is a defect of the pose.
+    with np.errstate(over="ignore", invalid="ignore"), suppress(np.linalg.LinAlgError):
         # Through the laser frame: lidar2cam includes the vehicle's motion between the
         # times of laser and camera.
-        c2w = sample.world_from_laser @ laser_from_camera
+        c2w = np.full((4, 4), np.nan)
+        c2w = sample.world_from_laser @ np.linalg.inv(camera_from_laser)
     things = [t for t in get_list(sample.content, "instances") if isinstance(t, dict)]
     has_speeds = any("velocity" in thing for thing in things)  # as in nuScenes
     return Frame(
@@ -168,14 +168,6 @@ def _make_frame(path: Path, sample: _Sample, camera: str, kinds: Mapping[int, st
         sensor=camera,
         boxes=partial(_read_boxes, path, sample, things, kinds) if has_speeds else None,
     )
-
-
-def _invert(matrix: Float[np.ndarray, "4 4"]) -> Float[np.ndarray, "4 4"]:
-    """Invert a transform; NaN if singular, which counts as a defect of the pose."""
-    try:
-        return np.linalg.inv(matrix)
-    except np.linalg.LinAlgError:
-        return np.full((4, 4), np.nan)
 
 
 def _parse_intrinsics(image: Mapping[str, Any], title: str) -> Intrinsics:
@@ -208,11 +200,6 @@ def _find_image(folder: Path, file: str, camera: str) -> Path:
     places = [folder / file, folder / "samples" / camera / file, folder / camera / file]
     places += [folder / part / numbered / file for part in ("training", "validation", "testing")]
     return next((place for place in places if os.path.isfile(place)), places[0])
-
-
-def _map_classes(metainfo: Any) -> dict[int, str]:
-    pairs = get_object(metainfo, "categories").items()
-    return {n: kind for kind, n in pairs if isinstance(n, int) and isinstance(kind, str)}
 
 
 def _read_boxes(

@@ -215,13 +215,17 @@ Attempt = tuple[list[Any], bool]
 
 
 def select_attempt(job: Job, progress: ProgressWriter) -> Attempt:
-    """Return the first attempt that is good enough, or else the best."""
-    best: Attempt = [], False
-    for attempt in run_attempts(job, progress):
-        best = max(best, attempt, key=lambda one: rate_models(one[0]))
+    """Map with a free focal length, then with each plausible fixed value, until it is good.
+
+    Returns the best attempt.
+    """
+    best: Attempt = _map_models(job, progress), False
+    for focals in list_focals(job):
         is_plausible, photographs, points = rate_models(best[0])
         if is_plausible and photographs >= job.min_photographs and points >= job.min_points:
             break
+        attempt = map_with_fixed_focals(job, progress, focals), True
+        best = max(best, attempt, key=lambda one: rate_models(one[0]))
     return best
 
 
@@ -231,13 +235,6 @@ def rate_models(models: list[Any]) -> tuple[bool, int, int]:
         return False, 0, 0
     model = models[0]
     return find_lens_defect(model) is None, model.num_reg_images(), model.num_points3D()
-
-
-def run_attempts(job: Job, progress: ProgressWriter) -> Iterator[Attempt]:
-    """Map with a free focal length, then with each plausible fixed value."""
-    yield _map_models(job, progress), False
-    for focals in list_focals(job):
-        yield map_with_fixed_focals(job, progress, focals), True
 
 
 def list_focals(job: Job) -> list[dict[int, float]]:

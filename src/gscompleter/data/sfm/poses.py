@@ -110,11 +110,16 @@ def find_poses(photographs: Path, out: Path, overwrite: bool = False) -> FoundPo
             the lens is implausible, pycolmap is missing or fails, or `out` cannot be written.
     """
     names = list_photograph_files(photographs)
-    known = _compute_fingerprint(photographs, names)
+    stats = {name: (photographs / name).stat() for name in names}
+    known = {name: [stat.st_size, stat.st_mtime_ns] for name, stat in stats.items()}
     earlier = _read_earlier(out, known)
     if earlier is not None:
         return earlier
-    check_pycolmap()
+    if find_spec("pycolmap") is None:
+        raise InputError(
+            "Finding the cameras of photographs needs pycolmap, which is not installed; run "
+            "pip install 'gscompleter[poses]'."
+        )
     with open_output_folder(out, overwrite) as folder:
         found = _run(photographs, names, folder)
         content = {"found": asdict(found), "photographs": known}
@@ -140,15 +145,6 @@ def list_photograph_files(folder: Path) -> list[str]:
     return names
 
 
-def check_pycolmap() -> None:
-    """Raise an InputError if pycolmap is not installed."""
-    if find_spec("pycolmap") is None:
-        raise InputError(
-            "Finding the cameras of photographs needs pycolmap, which is not installed; run "
-            "pip install 'gscompleter[poses]'."
-        )
-
-
 def _walk_photographs(folder: Path) -> list[str]:
     found: list[Path] = []
     for home, folders, files in os.walk(folder):
@@ -163,11 +159,6 @@ def is_own(folder: Path) -> bool:
     if folder.name.startswith(".") or folder.name.casefold() in OTHER_FOLDERS:
         return False
     return not os.path.isfile(folder / SUMMARY_FILE)
-
-
-def _compute_fingerprint(folder: Path, names: Sequence[str]) -> dict[str, list[int]]:
-    stats = {name: (folder / name).stat() for name in names}
-    return {name: [stat.st_size, stat.st_mtime_ns] for name, stat in stats.items()}
 
 
 def _read_earlier(out: Path, known: Mapping[str, list[int]]) -> FoundPoses | None:
