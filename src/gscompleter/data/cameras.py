@@ -16,6 +16,8 @@ from gscompleter.types import MAX_RIGID_ERROR
 FRACTIONS = (1, 1)
 """`Intrinsics.size` of values in image widths and heights."""
 
+FLOAT_NOISE = 1e-6
+"""Largest deviation from a rotation that is kept as it is."""
 SAME_ASPECT = 0.02
 """Relative difference of aspect ratios that rounding of sizes explains."""
 
@@ -56,13 +58,14 @@ class Intrinsics:
 def find_pinhole_defect(pinhole: Pinhole) -> str | None:
     """Describe why intrinsics are impossible; None if they are valid."""
     low, high = FOCAL_RANGE
-    for focal, side in ((pinhole.fl_x, pinhole.width), (pinhole.fl_y, pinhole.height)):
-        if not low <= focal / side <= high:
-            given = f"its focal length is {focal / side:g} times the size of the image"
+    w, h = pinhole.width, pinhole.height
+    for focal in (pinhole.fl_x / w, pinhole.fl_y / h):
+        if not low <= focal <= high:
+            given = f"its focal length is {focal:g} times the size of the image"
             return f"{given}, which is not within {low:g} to {high:g}"
-    for center, side in ((pinhole.cx, pinhole.width), (pinhole.cy, pinhole.height)):
-        if not abs(center / side) <= MAX_CENTER:
-            given = f"its principal point lies {center / side:g} image sizes from the corner"
+    for center in (pinhole.cx / w, pinhole.cy / h):
+        if not abs(center) <= MAX_CENTER:
+            given = f"its principal point lies {center:g} image sizes from the corner"
             return f"{given}, which is beyond {MAX_CENTER:g}"
     return None
 
@@ -79,10 +82,6 @@ def _compute_focal(focal: float | None, angle: float | None, length: int) -> flo
     if focal is not None or angle is None:
         return focal
     return length / 2 / math.tan(angle / 2)
-
-
-FLOAT_NOISE = 1e-6
-"""Largest deviation from a rotation that is kept as it is."""
 
 
 def find_pose_defect(pose: Float[np.ndarray, "4 4"]) -> str | None:

@@ -78,14 +78,11 @@ def _open_listed_chunk(path: Path, content: Mapping[str, str], index: Path) -> l
     scenes = list(_open_chunk(path))
     names = {scene.name for scene in scenes}
     listed = {name for name, chunk in content.items() if index.parent / chunk == path}
-    for name in sorted(listed - names):
+    if names != listed:
+        name = min(listed ^ names)
+        one, other = (index, path) if name in listed else (path, index)
         raise InputError(
-            f"{index} lists the scene {quote_value(name)} in {path}, which does not hold it; "
-            "write the index again, or download the chunk again."
-        )
-    for name in sorted(names - listed):
-        raise InputError(
-            f"{path} holds the scene {quote_value(name)}, which is absent from {index}; write the "
+            f"{one} lists the scene {quote_value(name)}, which is absent from {other}; write the "
             "index again, or name the chunk itself."
         )
     return scenes

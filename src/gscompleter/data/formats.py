@@ -116,25 +116,25 @@ def detect_format(path: Path, name: str | None = None) -> str:
 
 def refuse_scenes_below(path: Path) -> None:
     """Refuse a folder without photographs whose subfolders hold scenes, and name them."""
-    if not os.path.isdir(path) or _has_image_folder(path):
+
+    def has_image_folder(folder: Path) -> bool:
+        return any(os.path.isdir(folder / name) for name in FOLDERS)
+
+    if not os.path.isdir(path) or has_image_folder(path):
         return
     if any(name.lower().endswith(ENDINGS) for name in os.listdir(path)):
         return
     found = list(_list_scenes_below(path, lambda folder: find_format(folder) is not None))
-    if not found:
-        found = list(_list_scenes_below(path, _has_image_folder))
-        if len(found) < 2:
-            return
+    folders = found or list(_list_scenes_below(path, has_image_folder))
+    if not found and len(folders) < 2:
+        return
+    found = folders
     names = join_names([one.relative_to(path) for one in found], MAX_NAMED, 20)
     scenes = "one" if len(found) == 1 else f"{len(found)} scenes"
     raise InputError(
         f"{quote_value(path, 50)} is no scene itself, but holds {scenes} below it: {names}; "
         f"name one of them, as in {quote_value(found[0], 60)}."
     )
-
-
-def _has_image_folder(path: Path) -> bool:
-    return any(os.path.isdir(path / name) for name in FOLDERS)
 
 
 def _list_scenes_below(

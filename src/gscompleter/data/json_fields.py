@@ -53,12 +53,10 @@ def get_number(entry: Mapping[str, Any], key: str, title: str, low: float, high:
 
 def get_size(entry: Mapping[str, Any], title: str) -> tuple[int, int]:
     """Return `width` and `height` in pixels."""
-    width, height = (
-        get_number(entry, key, title, 1.0, float(MAX_SIDE)) for key in ("width", "height")
-    )
-    if width != int(width) or height != int(height):
+    size = [get_number(entry, key, title, 1.0, float(MAX_SIDE)) for key in ("width", "height")]
+    if any(side != int(side) for side in size):
         raise InputError(f"The `width` and `height` of {title} are no whole numbers; correct them.")
-    return int(width), int(height)
+    return int(size[0]), int(size[1])
 
 
 def get_text(entry: Mapping[str, Any], key: str, title: str) -> str | None:
@@ -92,10 +90,8 @@ def convert_to_array(value: Any) -> Float[np.ndarray, "*n"]:
 
 def get_focal(entry: Mapping[str, Any], title: str) -> tuple[float, float]:
     """Return the focal lengths `fx` and `fy` in pixels."""
-    fx, fy = (
-        get_number(entry, key, title, 1 / MAX_IN_PIXELS, MAX_IN_PIXELS) for key in ("fx", "fy")
-    )
-    return fx, fy
+    low, high = 1 / MAX_IN_PIXELS, MAX_IN_PIXELS
+    return get_number(entry, "fx", title, low, high), get_number(entry, "fy", title, low, high)
 
 
 def get_intrinsics(entry: Mapping[str, Any], title: str) -> Intrinsics:

@@ -80,16 +80,11 @@ def _read_image(records: _Records) -> PosedImage:
 @contextmanager
 def _open_records(path: Path) -> Iterator[_Records]:
     refuse_pointer(path)
-    try:
-        with open_file(path) as file:
-            if os.fstat(file.fileno()).st_size == 0:
-                raise InputError(f"{quote_value(path)} is empty; export the model again.")
-            with mmap.mmap(file.fileno(), 0, access=mmap.ACCESS_READ) as content:
-                yield _Records(content, path)
-    except OSError as error:
-        raise InputError(
-            f"{quote_value(path)} cannot be read: {error.strerror}; correct the path."
-        ) from error
+    with open_file(path) as file:
+        if os.fstat(file.fileno()).st_size == 0:
+            raise InputError(f"{quote_value(path)} is empty; export the model again.")
+        with mmap.mmap(file.fileno(), 0, access=mmap.ACCESS_READ) as content:
+            yield _Records(content, path)
 
 
 class _Records:

@@ -185,7 +185,7 @@ def _read_cameras(segment: Segment) -> dict[int, PosedLens]:
     }
 
 
-def _parse_intrinsics(numbers: Sequence[float | None], title: str) -> Intrinsics:
+def _parse_intrinsics(numbers: Sequence[Any], title: str) -> Intrinsics:
     known = [number for number in numbers if number is not None and np.isfinite(number)]
     if len(known) < len(numbers):
         raise InputError(f"A camera in {title} lacks intrinsics; {ADVICE}.")
