@@ -16,7 +16,6 @@ from typing import Any
 
 from gscompleter.data.ego_vehicle import attach_vehicle_detector
 from gscompleter.data.formats import FORMATS, detect_format, find_format, open_photographs
-from gscompleter.data.frame import Frame
 from gscompleter.data.photographs import Photographs, apply_masks
 from gscompleter.data.resize import Resolution
 from gscompleter.errors import InputError, quote_value
@@ -128,17 +127,14 @@ def open_clips(path: Path | str) -> Iterator[Photographs]:
     """
     path = Path(path)
     if has_cases(path):
-        return open_cases(path)
+        yield from open_cases(path)
+        return
     inside = [] if find_format(path) or not os.path.isdir(path) else sorted(path.iterdir())
     folders = [child for child in inside if child.is_dir() and find_format(child)]
     scenes = [(FORMATS[detect_format(place)], place) for place in folders or [path]]
-    clips = (clip for format, place in scenes for clip in format.open(place))
-    return (replace(clip, frames=_select_front_frames(clip)) for clip in clips)
-
-
-def _select_front_frames(clip: Photographs) -> tuple[Frame, ...]:
-    ahead = (frame for frame in clip.frames if clip.front in (None, frame.sensor))
-    return attach_vehicle_detector(tuple(ahead))
+    for clip in (clip for format, place in scenes for clip in format.open(place)):
+        ahead = [frame for frame in clip.frames if clip.front in (None, frame.sensor)]
+        yield replace(clip, frames=attach_vehicle_detector(ahead))
 
 
 def filter_usable(

@@ -144,7 +144,12 @@ def _build_scene(
     roots = _list_roots(scene, model)
     finder = _make_finder(roots)
     there, missing = keep_existing([finder.locate(frame) for frame in frames], str(model))
-    notes += missing + _note_rotation(there[0])
+    notes, first = notes + missing, there[0]
+    if isinstance(first.image, Path) and has_orientation_tag(first.image):
+        notes += (
+            f"The EXIF rotation of the photographs, such as {quote_value(first.name)}, is ignored: "
+            "they are used as they are stored, like in COLMAP.",
+        )
     photographs = build_photographs(roots[-1].name, str(model), there)
     return replace(photographs, notes=notes, sparse=_make_point_reader(model))
 
@@ -158,26 +163,13 @@ def _make_finder(roots: Sequence[Path]) -> ImageFinder:
 def _list_roots(scene: Path, model: Path) -> list[Path]:
     """List the folders from the model up to the scene; names decide if a model itself is given."""
     top, roots = Path(os.path.abspath(scene)), [Path(os.path.abspath(model))]
-    while top in roots[-1].parents or _is_part(roots[-1]):
-        roots.append(roots[-1].parent)
-    return roots
-
-
-def _is_part(folder: Path) -> bool:
-    """Check whether a folder is one of `HOMES` or a numbered model in it."""
     parts = {part for home in HOMES if home for part in home.split("/")}
-    numbered = folder.name.isdecimal() and folder.parent.name.casefold() in parts
-    return numbered or folder.name.casefold() in parts
-
-
-def _note_rotation(frame: Frame) -> tuple[str, ...]:
-    """Note that COLMAP ignores the EXIF rotation of photographs."""
-    if not isinstance(frame.image, Path) or not has_orientation_tag(frame.image):
-        return ()
-    return (
-        f"The EXIF rotation of the photographs, such as {quote_value(frame.name)}, is ignored: "
-        "they are used as they are stored, like in COLMAP.",
-    )
+    while True:
+        folder = roots[-1]
+        home = folder.parent if folder.name.isdecimal() else folder
+        if top not in folder.parents and home.name.casefold() not in parts:
+            return roots
+        roots.append(folder.parent)
 
 
 def _make_point_reader(model: Path) -> partial[Float[np.ndarray, "n 3"]] | None:

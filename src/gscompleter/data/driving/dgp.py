@@ -152,10 +152,5 @@ def _find_calibration_file(scene: Path, content: Any) -> Path:
 
 def _find_scene_file(path: Path) -> Path | None:
     files = sorted(path.glob("scene*.json")) if os.path.isdir(path) else [path]
-    return next((file for file in files if _is_scene(file)), None)
-
-
-def _is_scene(path: Path) -> bool:
-    if path.suffix != ".json" or not os.path.isfile(path):
-        return False
-    return b'"datum"' in read_head(path, MAX_SNIFFED)
+    files = [file for file in files if file.suffix == ".json" and os.path.isfile(file)]
+    return next((file for file in files if b'"datum"' in read_head(file, MAX_SNIFFED)), None)

@@ -332,7 +332,12 @@ def refine_principal_points(model: pycolmap.Reconstruction) -> pycolmap.Reconstr
     if min(_count_photographs(model).values()) < MIN_FOR_CENTRE:
         return model
     refined = refine_lenses(model, refine_principal_point=True)
-    return refined if all(map(_is_centred, list_used_cameras(refined))) else model
+    for camera in list_used_cameras(refined):
+        x, y = camera.principal_point_x, camera.principal_point_y
+        off = math.hypot(x - camera.width / 2, y - camera.height / 2)
+        if not off <= MAX_OFF_CENTRE * max(camera.width, camera.height):
+            return model
+    return refined
 
 
 def refine_lenses(model: pycolmap.Reconstruction, **options: bool) -> pycolmap.Reconstruction:
@@ -342,12 +347,6 @@ def refine_lenses(model: pycolmap.Reconstruction, **options: bool) -> pycolmap.R
     pycolmap.bundle_adjustment(refined, adjustment)
     refined.update_point_3d_errors()
     return refined if find_lens_defect(refined) is None else model
-
-
-def _is_centred(camera: pycolmap.Camera) -> bool:
-    x, y = camera.principal_point_x, camera.principal_point_y
-    off = math.hypot(x - camera.width / 2, y - camera.height / 2)
-    return bool(off <= MAX_OFF_CENTRE * max(camera.width, camera.height))
 
 
 def _map_models(job: Job, progress: ProgressWriter, is_focal_fixed: bool = False) -> list[Any]:
