@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import io
 import os
-from collections.abc import Callable
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 
 import numpy as np
@@ -85,8 +86,7 @@ def read_pixels(stored: Path | str | bytes, name: str = "") -> UInt8[np.ndarray,
         InputError: The file is missing, truncated or not an image.
     """
     with _open(stored, name) as image:
-        problem = f"{_name_image(stored, name)} is damaged"
-        return _run_decoder(lambda: _composite_over_black(image), problem, "copy it again")
+        return _composite_over_black(image)
 
 
 def read_brightness(stored: Path | bytes, side: int, name: str = "") -> Float[np.ndarray, "h w"]:
@@ -98,8 +98,7 @@ def read_brightness(stored: Path | bytes, side: int, name: str = "") -> Float[np
         scale = min(1.0, side / max(image.size))
         size = max(round(image.width * scale), 1), max(round(image.height * scale), 1)
         image.draft("L", size)
-        problem = f"{_name_image(stored, name)} is damaged"
-        pixels = _run_decoder(lambda: _composite_over_black(image), problem, "copy it again")
+        pixels = _composite_over_black(image)
     grey = Image.fromarray(pixels).convert("L")
     return np.array(grey.resize(size, Image.Resampling.BOX), np.float32)
 
@@ -111,8 +110,13 @@ def read_depth(path: Path, unit: float) -> Float[np.ndarray, "h w"]:
             f"There is no depth map {quote_value(path)}; restore it, or remove its "
             "`depth_file_path`."
         )
-    problem = f"The depth map {quote_value(path)} cannot be read"
-    values = _run_decoder(lambda: _load_depth_values(path), problem, "copy it again")
+    try:
+        values = _load_depth_values(path)
+    except Exception as error:  # damaged files raise any kind
+        raise InputError(
+            f"The depth map {quote_value(path)} cannot be read ({quote_value(str(error))}); copy "
+            "it again."
+        ) from error
     values = values[..., 0] if values.ndim == 3 and values.shape[-1] == 1 else values
     if values.ndim != 2 or values.dtype.kind not in "uif" or values.dtype == np.uint8:
         raise InputError(
@@ -135,41 +139,38 @@ def _load_depth_values(path: Path) -> np.ndarray:
     return values
 
 
-def _run_decoder(decode: Callable[[], np.ndarray], problem: str, advice: str) -> np.ndarray:
-    """Run `decode` and turn any failure into an InputError."""
-    try:
-        return decode()
-    except Exception as error:
-        raise InputError(f"{problem} ({quote_value(str(error))}); {advice}.") from error
-
-
-def _name_image(stored: Path | str | bytes, name: str) -> str:
-    return (
-        quote_value(name) if isinstance(stored, bytes) else f"The image {quote_value(Path(stored))}"
-    )
-
-
-def _open(stored: Path | str | bytes, name: str = "") -> Image.Image:
-    if not isinstance(stored, bytes):
-        path = Path(stored)
-        if not os.path.isfile(path):
+@contextmanager
+def _open(stored: Path | str | bytes, name: str = "") -> Iterator[Image.Image]:
+    """Open an image file, or its bytes; any failure while it is read becomes an InputError."""
+    file: Path | io.BytesIO
+    if isinstance(stored, bytes):
+        file, shown = io.BytesIO(stored), quote_value(name)
+    else:
+        file = Path(stored)
+        shown = f"The image {quote_value(file)}"
+        if not os.path.isfile(file):
             raise InputError(
-                f"There is no image {quote_value(path)}; restore it or correct its path."
+                f"There is no image {quote_value(file)}; restore it or correct its path."
             )
-        refuse_pointer(path)
+        refuse_pointer(file)
     Image.preinit()  # usual formats only; Pillow would load all of them
-    file = io.BytesIO(stored) if isinstance(stored, bytes) else stored
     try:
-        return Image.open(file, formats=IMAGE_FORMATS)
+        image = Image.open(file, formats=IMAGE_FORMATS)
     except Image.DecompressionBombError as error:
         raise InputError(
-            f"{_name_image(stored, name)} claims more than {MAX_PIXELS:,} pixels; make it smaller."
+            f"{shown} claims more than {MAX_PIXELS:,} pixels; make it smaller."
         ) from error
     except Exception as error:  # damaged files raise any kind
         raise InputError(
-            f"{_name_image(stored, name)} is not an image that can be read; a PNG or JPEG file is "
-            "needed."
+            f"{shown} is not an image that can be read; a PNG or JPEG file is needed."
         ) from error
+    with image:
+        try:
+            yield image
+        except Exception as error:
+            raise InputError(
+                f"{shown} is damaged ({quote_value(str(error))}); copy it again."
+            ) from error
 
 
 def _composite_over_black(image: Image.Image) -> UInt8[np.ndarray, "h w 3"]:

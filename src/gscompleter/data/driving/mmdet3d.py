@@ -90,17 +90,12 @@ class _Sample:
     """Images by camera."""
 
     @property
-    def vehicle_from_laser(self) -> Float[np.ndarray, "4 4"]:
-        """Pose of the laser; identity for Waymo infos."""
-        lidar = get_object(self.content, "lidar_points")
-        if "lidar2ego" not in lidar:
-            return np.eye(4)
-        return _get_numbers(lidar, "lidar2ego", (4, 4), self.title)
-
-    @property
     def world_from_laser(self) -> Float[np.ndarray, "4 4"]:
         vehicle = _get_numbers(self.content, "ego2global", (4, 4), self.title)
-        return vehicle @ self.vehicle_from_laser
+        lidar = get_object(self.content, "lidar_points")
+        if "lidar2ego" not in lidar:  # in Waymo's infos the laser frame is that of the vehicle
+            return vehicle
+        return vehicle @ _get_numbers(lidar, "lidar2ego", (4, 4), self.title)
 
 
 def _parse_sample(sample: Any, path: Path) -> _Sample:
