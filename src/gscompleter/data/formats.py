@@ -125,10 +125,10 @@ def refuse_scenes_below(path: Path) -> None:
     if any(name.lower().endswith(ENDINGS) for name in os.listdir(path)):
         return
     found = list(_list_scenes_below(path, lambda folder: find_format(folder) is not None))
-    folders = found or list(_list_scenes_below(path, has_image_folder))
-    if not found and len(folders) < 2:
-        return
-    found = folders
+    if not found:
+        found = list(_list_scenes_below(path, has_image_folder))
+        if len(found) < 2:
+            return
     names = join_names([one.relative_to(path) for one in found], MAX_NAMED, 20)
     scenes = "one" if len(found) == 1 else f"{len(found)} scenes"
     raise InputError(

@@ -24,16 +24,22 @@ MAX_NAMED = 3
 """Missing photographs that a note names."""
 
 
+def _list_entries(folder: Path) -> dict[str, str]:
+    """Map the case-folded names in a folder to the names."""
+    try:
+        return {name.casefold(): name for name in sorted(os.listdir(folder), reverse=True)}
+    except (OSError, ValueError):
+        return {}
+
+
 def find_path(
-    folder: Path,
-    relative: str,
-    list_entries: Callable[[Path], dict[str, str]] | None = None,
+    folder: Path, relative: str, list_entries: Callable[[Path], dict[str, str]] = _list_entries
 ) -> Path | None:
     """Find `relative` below `folder`, ignoring case; None if it does not exist."""
     if os.path.exists(folder / relative):
         return folder / relative
     for part in PurePosixPath(relative).parts:
-        name = (list_entries or _list_entries)(folder).get(part.casefold())
+        name = list_entries(folder).get(part.casefold())
         if name is None:
             return None
         folder = folder / name
@@ -92,11 +98,3 @@ def keep_existing(frames: Sequence[Frame], title: str) -> tuple[tuple[Frame, ...
         f"and {verb} left out."
     )
     return tuple(there), (note,)
-
-
-def _list_entries(folder: Path) -> dict[str, str]:
-    """Map the case-folded names in a folder to the names."""
-    try:
-        return {name.casefold(): name for name in sorted(os.listdir(folder), reverse=True)}
-    except (OSError, ValueError):
-        return {}

@@ -106,12 +106,7 @@ def open_kitti_raw(path: Path) -> Iterator[Photographs]:
     scale = float(np.cos(np.radians(readings[0][0])))
     frames = []
     for image, reading in zip(images, readings, strict=True):
-        latitude, longitude, altitude, roll, pitch, yaw = reading.tolist()
-        east = scale * EARTH_RADIUS * np.radians(longitude)
-        north = scale * EARTH_RADIUS * np.log(np.tan(np.radians(90 + latitude) / 2))
-        # Map axes: east, north, up.
-        imu = build_poses(np.array([roll, pitch, yaw, east, north, altitude]))
-        laser = imu @ imu_from_laser
+        laser = _compute_imu_pose(reading, scale) @ imu_from_laser
         c2w = laser @ laser_from_first @ first_from_camera
         title = f"photograph {image.stem} of {quote_value(path)}"
         lasers = _find_sweep(path / "velodyne_points" / "data" / f"{image.stem}.bin", laser)
@@ -179,6 +174,14 @@ def _parse_numbers(text: str) -> Float[np.ndarray, "n"] | None:
     except ValueError:
         return None
     return numbers if (np.abs(numbers) <= MAX_ENTRY).all() else None
+
+
+def _compute_imu_pose(reading: Float[np.ndarray, "6"], scale: float) -> Float[np.ndarray, "4 4"]:
+    """Compute the pose of the inertial sensor in map axes (east, north, up), in metres."""
+    latitude, longitude, altitude, roll, pitch, yaw = reading.tolist()
+    east = scale * EARTH_RADIUS * np.radians(longitude)
+    north = scale * EARTH_RADIUS * np.log(np.tan(np.radians(90 + latitude) / 2))
+    return build_poses(np.array([roll, pitch, yaw, east, north, altitude]))
 
 
 def _read_oxts(path: Path) -> Float[np.ndarray, "6"]:
