@@ -146,11 +146,10 @@ def _make_frame(path: Path, sample: _Sample, camera: str, kinds: Mapping[int, st
     file = get_text(image, "img_path", title)
     assert file is not None
     camera_from_laser = _get_numbers(image, "lidar2cam", (4, 4), title)
-    # NaN from singular or huge numbers is a defect of the pose.
+    c2w = np.full((4, 4), np.nan)  # stays where the pose is singular, which is a defect of it
     with np.errstate(over="ignore", invalid="ignore"), suppress(np.linalg.LinAlgError):
         # Through the laser frame: lidar2cam includes the vehicle's motion between the
         # times of laser and camera.
-        c2w = np.full((4, 4), np.nan)
         c2w = sample.world_from_laser @ np.linalg.inv(camera_from_laser)
     things = [t for t in get_list(sample.content, "instances") if isinstance(t, dict)]
     has_speeds = any("velocity" in thing for thing in things)  # as in nuScenes
