@@ -13,7 +13,7 @@ import pytest
 import torch
 
 from gscompleter import InputError, load_ply, save_ply
-from gscompleter.io.image import MAX_PIXELS, decode_pixels, read_depth, read_image, read_image_size
+from gscompleter.io.image import MAX_PIXELS, read_depth, read_image, read_image_size, read_pixels
 from gscompleter.io.json_file import read_json
 from gscompleter.models.weights.fitting import load_strictly
 from gscompleter.models.weights.published import PUBLISHED
@@ -112,7 +112,7 @@ def test_an_image_that_claims_too_many_pixels_is_refused_before_they_are_made(tm
     (tmp_path / "bomb.png").write_bytes(png(*size))
     for call in (read_image, read_image_size):
         assert f"{MAX_PIXELS:,} pixels" in sentence(call, tmp_path / "bomb.png")
-    assert f"{MAX_PIXELS:,} pixels" in sentence(decode_pixels, png(*size), "frame 3")
+    assert f"{MAX_PIXELS:,} pixels" in sentence(read_pixels, png(*size), "frame 3")
 
 
 @pytest.mark.parametrize("size", [(0, 5), (5, 0), (64, 64)])

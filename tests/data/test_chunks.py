@@ -22,14 +22,14 @@ from chunk_files import (
 from gscompleter import InputError
 from gscompleter.data.cases import SkippedScene, filter_usable, open_clips
 from gscompleter.data.chunks import open_chunks
-from gscompleter.data.photographs import PosedPhotographs
+from gscompleter.data.photographs import Photographs
 from gscompleter.data.real_estate import read_camera_file
 from gscompleter.geometry import project
 
 
 def test_a_chunk_gives_back_the_views_it_was_made_of(tmp_path):
     (clip,) = open_chunks(save_chunk(tmp_path / "000000.torch", example(form="PNG")))
-    assert isinstance(clip, PosedPhotographs)
+    assert isinstance(clip, Photographs)
     assert (clip.name, len(clip)) == ("room", 5)
     for number in (3, 0):
         (view,) = clip.views([number])
@@ -303,10 +303,10 @@ def test_an_index_that_disagrees_with_the_chunks_is_named(tmp_path):
     path = root / "test" / "index.json"
     listed = json.loads(path.read_text())
     path.write_text(json.dumps({**listed, "z": "000001.torch"}))
-    with pytest.raises(InputError, match=r"index.json lists the scene z in .*000001.torch"):
+    with pytest.raises(InputError, match=r"index.json lists the scene z, .*000001.torch"):
         list(open_chunks(root))
     path.write_text(json.dumps({"a": "000000.torch"}))
-    with pytest.raises(InputError, match=r"000000.torch holds the scene b, which is absent from"):
+    with pytest.raises(InputError, match=r"000000.torch lists the scene b, which is absent from"):
         list(open_chunks(root))
     path.write_text(json.dumps({"a": "000007.torch"}))
     with pytest.raises(InputError, match=r"000007.torch cannot be read: No such file"):

@@ -13,7 +13,7 @@ from command import run
 from gscompleter import InputError
 from gscompleter.data.cases import open_clips, read_cases
 from gscompleter.data.formats import FORMATS, open_photographs, refuse_scenes_below
-from gscompleter.data.photographs import PosedPhotographs
+from gscompleter.data.photographs import Photographs
 from gscompleter.data.real_estate import read_camera_file
 from gscompleter.data.scene import write_cameras
 from gscompleter.types import View
@@ -53,7 +53,7 @@ def test_all_formats_give_the_same_views(tmp_path, resolution):
     clips = [next(open_clips(path)) for path in (scene, chunk, beside, within)]
     truth = clips[0].views([1, 4], resolution)
     for clip in clips:
-        assert isinstance(clip, PosedPhotographs)
+        assert isinstance(clip, Photographs)
         assert (clip.name, len(clip), clip.find_skip_reason((SIZE, SIZE))) == ("room", 5, None)
         for view, true in zip(clip.views([1, 4], resolution), truth, strict=True):
             assert view.frame == true.frame
@@ -222,7 +222,7 @@ def test_opening_reads_cameras_only(tmp_path):
     for image in scene.glob("*.png"):
         image.write_bytes(b"not an image")
     photographs = open_photographs(scene)
-    assert isinstance(photographs, PosedPhotographs)
+    assert isinstance(photographs, Photographs)
     assert photographs.names == ("0.png", "1.png", "2.png", "3.png", "4.png")
     with pytest.raises(InputError, match=r"2.png is not an image"):
         photographs.views([2])

@@ -11,7 +11,7 @@ from gscompleter import InputError
 from gscompleter.data.cases import open_clips
 from gscompleter.data.chunks import open_chunks
 from gscompleter.data.formats import open_photographs
-from gscompleter.data.photographs import PosedPhotographs
+from gscompleter.data.photographs import Photographs
 from gscompleter.evaluation.protocols import (
     EvaluationIndex,
     Extrapolation,
@@ -26,13 +26,13 @@ from gscompleter.evaluation.tasks import find_neighbours, make_tasks
 from gscompleter.types import View
 
 
-class Frames(PosedPhotographs):
+class Frames(Photographs):
     """A clip with frame numbers only."""
 
     name, names, origin = "", (), np.zeros(3)
 
     def __init__(self, name: str, count: int) -> None:
-        self.name, self.count = name, count
+        vars(self).update(name=name, count=count)
 
     def __len__(self) -> int:
         return self.count

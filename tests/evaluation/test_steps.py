@@ -4,7 +4,7 @@ import json
 import math
 import shutil
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 
 import numpy as np
@@ -13,7 +13,8 @@ import torch
 
 from command import run
 from gscompleter import InputError
-from gscompleter.data.photographs import PosedPhotographs
+from gscompleter.data.frame import Frame
+from gscompleter.data.photographs import Photographs
 from gscompleter.evaluation import methods, steps
 from gscompleter.evaluation.baselines.reggs import RegGSConfig
 from gscompleter.evaluation.methods import METHODS
@@ -47,12 +48,14 @@ TABLES = ("tables.md", "tables.tex", "tables.json")
 
 
 @dataclass(frozen=True)
-class Walk(PosedPhotographs):
+class Walk(Photographs):
     """A walk through the room with unreadable frames."""
 
     names = ()
-    origin = np.zeros(3)
     name: str = "walk"
+    title: str = "walk"
+    frames: tuple[Frame, ...] = ()
+    origin: np.ndarray = field(default_factory=lambda: np.zeros(3))
     num_frames: int = len(PLACES)
     broken: tuple[int, ...] = ()
 
@@ -161,11 +164,13 @@ def test_a_sequence_begins_with_two_frames_and_goes_on_by_the_same_step():
 
 def test_a_clip_that_is_too_short_is_told_apart_from_one_that_is_not():
     protocol = ViewByView(2)
-    assert make_tasks(protocol, Walk("short", 4)) == []
-    short = protocol.explain_skip(Walk("short", 4))
+    assert make_tasks(protocol, Walk("short", num_frames=4)) == []
+    short = protocol.explain_skip(Walk("short", num_frames=4))
     assert short == "it has 4 frames, and sequence-2 needs 5"
-    assert protocol.explain_skip(Walk("walk", 5)) is None
-    assert [task.name for task in make_tasks(protocol, Walk("walk", 5))] == ["walk 0+2>4"]
+    assert protocol.explain_skip(Walk("walk", num_frames=5)) is None
+    assert [task.name for task in make_tasks(protocol, Walk("walk", num_frames=5))] == [
+        "walk 0+2>4"
+    ]
 
 
 @pytest.mark.parametrize("text", ["sequence-4", "sequence-12-steps-6"])

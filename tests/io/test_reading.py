@@ -6,7 +6,7 @@ import socket
 import pytest
 
 from gscompleter import InputError, load_splat
-from gscompleter.io.reading import check_plain, open_file, read_bytes, read_head, read_lines
+from gscompleter.io.reading import check_plain, read_bytes, read_head, read_lines
 from splat_files import made, plausible
 
 
@@ -26,7 +26,7 @@ def others(tmp_path):
 
 @pytest.mark.parametrize("kind", ["pipe", "folder", "device", "socket"])
 def test_what_is_no_file_is_never_opened(others, kind):
-    for reader in (open_file, read_bytes, lambda path: list(read_lines(path)), load_splat):
+    for reader in (read_bytes, lambda path: list(read_lines(path)), load_splat):
         with pytest.raises(InputError, match=f"{kind} is (not a file but )?a {kind}"):
             reader(others[kind])
     assert read_head(others[kind], 4) == b""

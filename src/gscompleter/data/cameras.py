@@ -16,6 +16,8 @@ from gscompleter.types import MAX_RIGID_ERROR
 FRACTIONS = (1, 1)
 """`Intrinsics.size` of values in image widths and heights."""
 
+FLOAT_NOISE = 1e-6
+"""Largest deviation from a rotation that is kept as it is."""
 SAME_ASPECT = 0.02
 """Relative difference of aspect ratios that rounding of sizes explains."""
 
@@ -41,9 +43,9 @@ class Intrinsics:
         cx = w / 2 if self.center[0] is None else self.center[0]
         cy = h / 2 if self.center[1] is None else self.center[1]
         # With only one focal length, pixels are square.
-        known = fl_y if fl_x is None else fl_x
-        assert known is not None
-        fl_x, fl_y = known if fl_x is None else fl_x, known if fl_y is None else fl_y
+        fl_x, fl_y = fl_y if fl_x is None else fl_x, fl_x if fl_y is None else fl_y
+        assert fl_x is not None
+        assert fl_y is not None
         return Pinhole(fl_x, fl_y, cx, cy, w, h).resize(width, height)
 
     def is_transposed(self, width: int, height: int) -> bool:
@@ -56,13 +58,14 @@ class Intrinsics:
 def find_pinhole_defect(pinhole: Pinhole) -> str | None:
     """Describe why intrinsics are impossible; None if they are valid."""
     low, high = FOCAL_RANGE
-    for focal, side in ((pinhole.fl_x, pinhole.width), (pinhole.fl_y, pinhole.height)):
-        if not low <= focal / side <= high:
-            given = f"its focal length is {focal / side:g} times the size of the image"
+    w, h = pinhole.width, pinhole.height
+    for focal in (pinhole.fl_x / w, pinhole.fl_y / h):
+        if not low <= focal <= high:
+            given = f"its focal length is {focal:g} times the size of the image"
             return f"{given}, which is not within {low:g} to {high:g}"
-    for center, side in ((pinhole.cx, pinhole.width), (pinhole.cy, pinhole.height)):
-        if not abs(center / side) <= MAX_CENTER:
-            given = f"its principal point lies {center / side:g} image sizes from the corner"
+    for center in (pinhole.cx / w, pinhole.cy / h):
+        if not abs(center) <= MAX_CENTER:
+            given = f"its principal point lies {center:g} image sizes from the corner"
             return f"{given}, which is beyond {MAX_CENTER:g}"
     return None
 
@@ -79,10 +82,6 @@ def _compute_focal(focal: float | None, angle: float | None, length: int) -> flo
     if focal is not None or angle is None:
         return focal
     return length / 2 / math.tan(angle / 2)
-
-
-FLOAT_NOISE = 1e-6
-"""Largest deviation from a rotation that is kept as it is."""
 
 
 def find_pose_defect(pose: Float[np.ndarray, "4 4"]) -> str | None:
@@ -122,10 +121,9 @@ def compute_rotation(quaternion: Sequence[float]) -> Float[np.ndarray, "3 3"]:
     with np.errstate(all="ignore"):
         q = q / np.abs(q).max()
         w, x, y, z = q / np.linalg.norm(q)
-    return np.array(
-        [
-            [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)],
-            [2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)],
-            [2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)],
-        ]
-    )
+    rows = [
+        [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)],
+        [2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)],
+        [2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)],
+    ]
+    return np.array(rows)

@@ -12,11 +12,11 @@ import os
 from collections.abc import Iterable, Iterator
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import Any
 
 from gscompleter.data.ego_vehicle import attach_vehicle_detector
 from gscompleter.data.formats import FORMATS, detect_format, find_format, open_photographs
-from gscompleter.data.photographs import Photographs, PosedPhotographs, apply_masks
+from gscompleter.data.photographs import Photographs, apply_masks
 from gscompleter.data.resize import Resolution
 from gscompleter.errors import InputError, quote_value
 from gscompleter.io.json_file import read_json
@@ -73,30 +73,23 @@ def open_cases(path: Path) -> Iterator[Photographs]:
     """
     cases = read_cases(path / NAME if os.path.isdir(path) else path)
     for scene in dict.fromkeys(case.scene for case in cases):
-        ours = [case for case in cases if case.scene == scene]
-        near = [case.near for case in ours if case.near is not None]
-        far = [case.far for case in ours if case.far is not None]
-        yield open_photographs(
-            scene,
-            near=min(near) if len(near) == len(ours) else None,
-            far=max(far) if len(far) == len(ours) else None,
-        )
+        nears = [case.near for case in cases if case.scene == scene]
+        fars = [case.far for case in cases if case.scene == scene]
+        near = None if None in nears else min(n for n in nears if n is not None)
+        far = None if None in fars else max(f for f in fars if f is not None)
+        yield open_photographs(scene, near=near, far=far)
 
 
 def read_cases(path: Path) -> list[Case]:
     """Read the cases of a file."""
     content = read_json(path, "name a file of cases")
     try:
-        height, width = content["resolution"]
-        return [
-            _parse_case(row, (_check_whole(height), _check_whole(width)), path)
-            for row in content["cases"]
-        ]
+        height, width = map(_check_whole, content["resolution"])
+        return [_parse_case(row, (height, width), path) for row in content["cases"]]
     except (ValueError, KeyError, TypeError, OverflowError) as error:
         raise InputError(
             f"{path} is no file of cases ({type(error).__name__}: {quote_value(str(error))}); it "
-            "needs "
-            "resolution and cases, each with scene, context and target."
+            "needs resolution and cases, each with scene, context and target."
         ) from error
 
 
@@ -118,9 +111,6 @@ def _check_whole(value: Any) -> int:
     return value
 
 
-P = TypeVar("P", bound=PosedPhotographs)
-
-
 @dataclass(frozen=True)
 class SkippedScene:
     """A scene that was left out, and why."""
@@ -137,23 +127,19 @@ def open_clips(path: Path | str) -> Iterator[Photographs]:
     """
     path = Path(path)
     if has_cases(path):
-        return open_cases(path)
+        yield from open_cases(path)
+        return
     inside = [] if find_format(path) or not os.path.isdir(path) else sorted(path.iterdir())
     folders = [child for child in inside if child.is_dir() and find_format(child)]
     scenes = [(FORMATS[detect_format(place)], place) for place in folders or [path]]
-    clips = (select_front_camera(clip) for format, place in scenes for clip in format.open(place))
-    return (replace(clip, frames=attach_vehicle_detector(clip.frames)) for clip in clips)
+    for clip in (clip for format, place in scenes for clip in format.open(place)):
+        ahead = [frame for frame in clip.frames if clip.front in (None, frame.sensor)]
+        yield replace(clip, frames=attach_vehicle_detector(ahead))
 
 
-def select_front_camera(clip: Photographs) -> Photographs:
-    """Keep the frames of the front camera if a vehicle has several cameras."""
-    if clip.front is None:
-        return clip
-    ahead = tuple(frame for frame in clip.frames if frame.sensor == clip.front)
-    return replace(clip, frames=ahead)
-
-
-def filter_usable(clips: Iterable[P], skipped: list[SkippedScene]) -> Iterator[P]:
+def filter_usable(
+    clips: Iterable[Photographs], skipped: list[SkippedScene]
+) -> Iterator[Photographs]:
     """Yield the scenes that benchmarks keep, and append the others to `skipped`."""
     for clip in clips:
         reason = clip.find_skip_reason()

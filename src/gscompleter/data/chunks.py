@@ -63,20 +63,14 @@ def _find_folder(path: Path) -> Path | None:
 
 def _open_index(index: Path) -> Iterator[Photographs]:
     content = read_json(index, "download it again")
-    if (
-        not isinstance(content, dict)
-        or not content
-        or not all(isinstance(chunk, str) for chunk in content.values())
-    ):
+    chunks = list(content.values()) if isinstance(content, dict) else []
+    if not chunks or not all(isinstance(chunk, str) for chunk in chunks):
         raise InputError(
             f"{index} is no index of chunks: it has to map the key of each scene to the name of "
             "its .torch file."
         )
-    return (
-        scene
-        for chunk in sorted(set(content.values()))
-        for scene in _open_listed_chunk(index.parent / chunk, content, index)
-    )
+    paths = (index.parent / chunk for chunk in sorted(set(chunks)))
+    return (scene for path in paths for scene in _open_listed_chunk(path, content, index))
 
 
 def _open_listed_chunk(path: Path, content: Mapping[str, str], index: Path) -> list[Photographs]:
@@ -84,23 +78,18 @@ def _open_listed_chunk(path: Path, content: Mapping[str, str], index: Path) -> l
     scenes = list(_open_chunk(path))
     names = {scene.name for scene in scenes}
     listed = {name for name, chunk in content.items() if index.parent / chunk == path}
-    for name in sorted(listed - names):
+    if names != listed:
+        name = min(listed ^ names)
+        one, other = (index, path) if name in listed else (path, index)
         raise InputError(
-            f"{index} lists the scene {quote_value(name)} in {path}, which does not hold it; "
-            "write the index again, or download the chunk again."
-        )
-    for name in sorted(names - listed):
-        raise InputError(
-            f"{path} holds the scene {quote_value(name)}, which is absent from {index}; write the "
+            f"{one} lists the scene {quote_value(name)}, which is absent from {other}; write the "
             "index again, or name the chunk itself."
         )
     return scenes
 
 
 def _open_chunk(path: Path) -> Iterator[Photographs]:
-    return (
-        _parse_scene(example, path, position) for position, example in enumerate(_load_chunk(path))
-    )
+    return (_parse_scene(example, path, n) for n, example in enumerate(_load_chunk(path)))
 
 
 def _load_chunk(path: Path) -> list[Any]:
@@ -119,8 +108,7 @@ def _read_chunk(path: Path, _written: int) -> list[Any]:
             content = torch.load(path, map_location="cpu", weights_only=True)
     except PermissionError as error:
         raise InputError(f"{path} cannot be read: {error.strerror}; make it readable.") from error
-    # Damaged bytes can raise any exception.
-    except Exception as error:
+    except Exception as error:  # damaged bytes raise anything
         raise InputError(_explain_load_error(path, error)) from error
     if not isinstance(content, list) or not content:
         raise InputError(
@@ -132,10 +120,9 @@ def _read_chunk(path: Path, _written: int) -> list[Any]:
 
 def _explain_load_error(path: Path, error: Exception) -> str:
     if "GLOBAL" in str(error):
-        return (
-            f"{path} holds pickled Python objects, which are refused because loading them can "
-            "run any code; save it again with tensors, strings, lists and dicts only."
-        )
+        problem = "holds pickled Python objects, which are refused because loading them can run"
+        advice = "save it again with tensors, strings, lists and dicts only"
+        return f"{path} {problem} any code; {advice}."
     if isinstance(error, MemoryError) or "allocate memory" in str(error):
         return f"{path} needs more memory than is available; split it, or download it again."
     return f"{path} is truncated or no file of torch.save; download it again."
@@ -191,10 +178,8 @@ def _is_dense(value: Any, ndim: int) -> TypeGuard[Tensor]:
 
 
 def _describe(value: Any) -> str:
-    if isinstance(value, Tensor):
-        if value.is_nested:
-            return "a nested tensor"
-        kind = "" if _is_dense(value, value.ndim) else "sparse or empty "
-        shape = quote_value(list(value.shape))
-        return f"{kind}{str(value.dtype).removeprefix('torch.')} of shape {shape}"
-    return f"of type {type(value).__name__}"
+    if not isinstance(value, Tensor) or value.is_nested:
+        return f"of type {type(value).__name__}"
+    kind = "" if _is_dense(value, value.ndim) else "sparse or empty "
+    shape = quote_value(list(value.shape))
+    return f"{kind}{str(value.dtype).removeprefix('torch.')} of shape {shape}"

@@ -61,6 +61,15 @@ MARGIN = 1
 """Rows added above the outline, in pixels of the small copies."""
 
 
+def attach_vehicle_detector(frames: Sequence[Frame]) -> tuple[Frame, ...]:
+    """Attach a lazy vehicle detector to each frame."""
+    cameras: dict[Hashable, list[Frame]] = {}
+    for frame in frames:
+        cameras.setdefault((frame.sensor, frame.intrinsics), []).append(frame)
+    seen = {camera: EgoVehicle(tuple(group)) for camera, group in cameras.items()}
+    return tuple(replace(f, vehicle=seen[f.sensor, f.intrinsics]) for f in frames)
+
+
 @dataclass(frozen=True, eq=False)
 class EgoVehicle:
     """Lazy detector of the vehicle in the photographs of one of its cameras."""
@@ -74,39 +83,32 @@ class EgoVehicle:
     @cached_property
     def _mask(self) -> Bool[np.ndarray, "h w"] | None:
         chosen, motion = select_frames(self.frames)
-        if motion is None:
+        first, images = (None, None) if motion is None else read_small(chosen)
+        if motion is None or first is None or images is None:
             return None
-        small = read_small(chosen)
-        if len(small) < FEWEST or min(small[0][1].shape) < MIN_SIDE:
+        size = first.size()
+        if first.find_defect(*size) is not None:
             return None
-        size = small[0][0].size()
-        if small[0][0].find_defect(*size) is not None:
-            return None
-        images = np.stack([image for _, image in small])
-        flow, first = predict_ground_flow(
-            motion, small[0][0].intrinsics.compute_pinhole(*size), images.shape[1:]
-        )
-        return find_static_region(images, flow, first)
+        pinhole = first.intrinsics.compute_pinhole(*size)
+        return find_static_region(images, *predict_ground_flow(motion, pinhole, images.shape[1:]))
 
 
-def read_small(frames: Sequence[Frame]) -> list[tuple[Frame, Float[np.ndarray, "h w"]]]:
-    """Read small copies of the readable photographs of the most common size."""
+def read_small(
+    frames: Sequence[Frame],
+) -> tuple[Frame, Float[np.ndarray, "n h w"]] | tuple[None, None]:
+    """Read small copies of the photographs of the most common size, and return their first frame.
+
+    Unreadable ones are left out; None if too few or too small ones remain.
+    """
     found = []
     for frame in frames:
         with suppress(InputError):
             found.append((frame, frame.load_small_pixels(SIDE)))
-    sizes = [image.shape for _, image in found]
-    usual = max(dict.fromkeys(sizes), key=sizes.count, default=None)
-    return [(frame, image) for frame, image in found if image.shape == usual]
-
-
-def attach_vehicle_detector(frames: Sequence[Frame]) -> tuple[Frame, ...]:
-    """Attach a lazy vehicle detector to each frame."""
-    cameras: dict[Hashable, list[Frame]] = {}
-    for frame in frames:
-        cameras.setdefault((frame.sensor, frame.intrinsics), []).append(frame)
-    seen = {camera: EgoVehicle(tuple(group)) for camera, group in cameras.items()}
-    return tuple(replace(f, vehicle=seen[f.sensor, f.intrinsics]) for f in frames)
+    shapes = [image.shape for _, image in found]
+    usual = max(dict.fromkeys(shapes), key=shapes.count, default=(0,))
+    if shapes.count(usual) < FEWEST or min(usual) < MIN_SIDE:
+        return None, None
+    return found[shapes.index(usual)][0], np.stack([i for _, i in found if i.shape == usual])
 
 
 def select_frames(
@@ -199,16 +201,11 @@ def find_static_region(
         limit = np.where(found < height, found - CLEARANCE, height)
     if (found == height).all():
         return None
-    filled = fill_dips(found)
+    dips = np.ones((1, math.ceil(MAX_DIP_WIDTH * width)), np.uint8)
+    rows = np.pad(found, width // 2, mode="edge").astype(np.float32)[None]
+    opened = cv2.morphologyEx(rows, cv2.MORPH_OPEN, dips)[0]
+    filled = opened[width // 2 :][:width].astype(np.int64)
     return fill_below(np.where(filled < height, filled - MARGIN, height), height)
-
-
-def fill_dips(outline: Int[np.ndarray, "w"]) -> Int[np.ndarray, "w"]:
-    """Fill narrow dips of an outline."""
-    window = np.ones((1, math.ceil(MAX_DIP_WIDTH * len(outline))), np.uint8)
-    rows = np.pad(outline, len(outline) // 2, mode="edge").astype(np.float32)[None]
-    filled = cv2.morphologyEx(rows, cv2.MORPH_OPEN, window)[0]
-    return filled[len(outline) // 2 :][: len(outline)].astype(np.int64)
 
 
 def find_edges(images: Float[np.ndarray, "n h w"], flow: Float[np.ndarray, "h w 2"]) -> Edges:
@@ -239,9 +236,8 @@ def trace_outline(
     reward = edges.static_share * (0.5 + 0.5 * edges.crossing) - cost
     reward = np.where((rows >= first) & (rows < limit), reward, -1.0)
     reward = np.concatenate([reward, np.zeros((1, width))])  # lower border: no vehicle
-    bends = np.array(
-        [0, *range(-MAX_ROW_STEP, 0), *range(1, MAX_ROW_STEP + 1)]
-    )  # argmax takes the first
+    # Argmax takes the first of equals: no bend.
+    bends = np.array([0, *range(-MAX_ROW_STEP, 0), *range(1, MAX_ROW_STEP + 1)])
     total, came = reward[:, 0], np.zeros((height + 1, width), np.int64)
     for column in range(1, width):
         padded = np.pad(total, MAX_ROW_STEP, constant_values=-np.inf)
@@ -266,17 +262,15 @@ def is_vehicle(edges: Edges, outline: Int[np.ndarray, "w"]) -> bool:
     rows = outline[columns]
     kept = edges.static_share >= MIN_STATIC_SHARE
     across = kept & (edges.crossing >= MIN_CROSSING)
-    staying, staying_across = (dilate_rows(mask)[rows, columns] for mask in (kept, across))
+    near = np.ones((3, 1), np.uint8)  # a row above and one below
+    staying, staying_across = (
+        cv2.dilate(mask.astype(np.uint8), near)[rows, columns] > 0 for mask in (kept, across)
+    )
     if staying.mean() < MIN_SUPPORT or staying_across.sum() < MIN_WIDTH * width:
         return False
     elsewhere = ~fill_below(outline - CLEARANCE, height)
     occurring = np.where(elsewhere, edges.edge_share, 0)
     return bool(occurring[kept].sum() <= MAX_STATIC_ELSEWHERE * occurring.sum())
-
-
-def dilate_rows(mask: Bool[np.ndarray, "h w"]) -> Bool[np.ndarray, "h w"]:
-    """Dilate a mask by one row upward and downward."""
-    return cv2.dilate(mask.astype(np.uint8), np.ones((3, 1), np.uint8)) > 0
 
 
 def fill_below(outline: Int[np.ndarray, "w"], height: int) -> Bool[np.ndarray, "h w"]:

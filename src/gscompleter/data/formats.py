@@ -12,12 +12,11 @@ from functools import cache
 from itertools import islice
 from pathlib import Path
 
-from gscompleter.data.camera_list import has_camera_list, open_camera_list
+from gscompleter.data.camera_files import has_camera_list, open_camera_list, refuse_other_exports
 from gscompleter.data.chunks import has_chunks, open_chunks
 from gscompleter.data.colmap.scene import has_colmap, open_colmap
 from gscompleter.data.driving.dgp import has_dgp, open_dgp
-from gscompleter.data.driving.kitti import has_kitti, open_kitti
-from gscompleter.data.driving.kitti_raw import has_kitti_raw, open_kitti_raw
+from gscompleter.data.driving.kitti import has_kitti, has_kitti_raw, open_kitti, open_kitti_raw
 from gscompleter.data.driving.mmdet3d import has_infos, open_infos
 from gscompleter.data.driving.pandaset import has_pandaset, open_pandaset
 from gscompleter.data.driving.waymo import has_waymo, open_waymo
@@ -25,7 +24,6 @@ from gscompleter.data.ego_vehicle import attach_vehicle_detector
 from gscompleter.data.image_folders import FOLDERS
 from gscompleter.data.limits import check_planes
 from gscompleter.data.llff import has_llff, open_llff
-from gscompleter.data.other_exports import refuse_other_exports
 from gscompleter.data.photographs import Photographs
 from gscompleter.data.real_estate import has_camera_files, open_camera_files
 from gscompleter.data.sfm.poses import ENDINGS, is_own
@@ -118,11 +116,17 @@ def detect_format(path: Path, name: str | None = None) -> str:
 
 def refuse_scenes_below(path: Path) -> None:
     """Refuse a folder without photographs whose subfolders hold scenes, and name them."""
-    if not os.path.isdir(path) or _has_image_folder(path) or _has_images(path):
+
+    def has_image_folder(folder: Path) -> bool:
+        return any(os.path.isdir(folder / name) for name in FOLDERS)
+
+    if not os.path.isdir(path) or has_image_folder(path):
+        return
+    if any(name.lower().endswith(ENDINGS) for name in os.listdir(path)):
         return
     found = list(_list_scenes_below(path, lambda folder: find_format(folder) is not None))
     if not found:
-        found = list(_list_scenes_below(path, _has_image_folder))
+        found = list(_list_scenes_below(path, has_image_folder))
         if len(found) < 2:
             return
     names = join_names([one.relative_to(path) for one in found], MAX_NAMED, 20)
@@ -131,14 +135,6 @@ def refuse_scenes_below(path: Path) -> None:
         f"{quote_value(path, 50)} is no scene itself, but holds {scenes} below it: {names}; "
         f"name one of them, as in {quote_value(found[0], 60)}."
     )
-
-
-def _has_image_folder(path: Path) -> bool:
-    return any(os.path.isdir(path / name) for name in FOLDERS)
-
-
-def _has_images(path: Path) -> bool:
-    return any(name.lower().endswith(ENDINGS) for name in os.listdir(path))
 
 
 def _list_scenes_below(

@@ -4,18 +4,24 @@ from __future__ import annotations
 
 import os
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
 from jaxtyping import Bool, Float, UInt8
 
-from gscompleter.data.cameras import FRACTIONS, Intrinsics, find_pinhole_defect, find_pose_defect
+from gscompleter.data.cameras import (
+    FRACTIONS,
+    Intrinsics,
+    find_pinhole_defect,
+    find_pose_defect,
+    make_rigid,
+)
 from gscompleter.data.driving.moving_objects import Box
 from gscompleter.data.limits import MAX_SIDE
 from gscompleter.data.undistort import Pinhole, undistort_pinhole
 from gscompleter.errors import InputError, quote_value
-from gscompleter.io.image import decode_pixels, read_brightness, read_image_size, read_pixels
+from gscompleter.io.image import read_brightness, read_image_size, read_pixels
 
 ENDINGS = ("", ".png", ".jpg", ".jpeg")
 """Image file endings tried for names without one."""
@@ -96,10 +102,7 @@ class Frame:
 
     def load_pixels(self) -> UInt8[np.ndarray, "h w 3"]:
         """Read the photograph as it is stored."""
-        stored = self.require_stored()
-        if isinstance(stored, bytes):
-            return decode_pixels(stored, capitalize(self.title))
-        return read_pixels(stored)
+        return read_pixels(self.require_stored(), capitalize(self.title))
 
     def load_small_pixels(self, side: int) -> Float[np.ndarray, "h w"]:
         """Read brightness in [0, 255], shrunk to at most `side` pixels on the longer side."""
@@ -121,12 +124,18 @@ class Frame:
     def compute_pinholes(self, width: int, height: int) -> tuple[Pinhole, Pinhole]:
         """Return the intrinsics at this photograph size, before and after undistortion."""
         defect = self.find_defect(width, height)
-        if defect is not None:
-            raise self.make_error(defect)
         pinhole = self.intrinsics.compute_pinhole(width, height)
-        new = undistort_pinhole(pinhole, self.intrinsics.distortion)
-        assert new is not None
+        new = undistort_pinhole(pinhole, self.intrinsics.distortion) if defect is None else None
+        if new is None:
+            raise self.make_error(str(defect))
         return pinhole, new
+
+    def with_rigid_pose(self, place: str = "") -> Frame:
+        """Return the frame with an exactly rigid pose; `place` in the file is for errors."""
+        defect = find_pose_defect(self.c2w)
+        if defect is not None:
+            raise self.make_error(f"{defect}{place}")
+        return replace(self, c2w=make_rigid(self.c2w))
 
     def make_error(self, defect: str) -> InputError:
         """Build the error for a frame with this defect."""
@@ -144,8 +153,8 @@ def find_image(path: Path) -> Path | None:
     """
     folders = [path.parent]
     if path.parent.name == "images":
-        folders += [path.parent.with_name(f"{path.parent.name}_{n}") for n in DOWNSCALE_FACTORS]
-    candidates = [folder / (path.name + ending) for folder in folders for ending in ENDINGS]
+        folders += [path.parent.with_name(f"images_{n}") for n in DOWNSCALE_FACTORS]
+    candidates = (folder / (path.name + ending) for folder in folders for ending in ENDINGS)
     return next((candidate for candidate in candidates if os.path.isfile(candidate)), None)
 
 

@@ -7,8 +7,9 @@ in any case.
 from __future__ import annotations
 
 import os
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import replace
+from functools import cache
 from pathlib import Path, PurePosixPath
 
 from gscompleter.data.frame import DOWNSCALE_FACTORS, ENDINGS, Frame
@@ -23,9 +24,26 @@ MAX_NAMED = 3
 """Missing photographs that a note names."""
 
 
-def find_path(folder: Path, relative: str) -> Path | None:
+def _list_entries(folder: Path) -> dict[str, str]:
+    """Map the case-folded names in a folder to the names."""
+    try:
+        return {name.casefold(): name for name in sorted(os.listdir(folder), reverse=True)}
+    except (OSError, ValueError):
+        return {}
+
+
+def find_path(
+    folder: Path, relative: str, list_entries: Callable[[Path], dict[str, str]] = _list_entries
+) -> Path | None:
     """Find `relative` below `folder`, ignoring case; None if it does not exist."""
-    return _Listings().find(folder, relative)
+    if os.path.exists(folder / relative):
+        return folder / relative
+    for part in PurePosixPath(relative).parts:
+        name = list_entries(folder).get(part.casefold())
+        if name is None:
+            return None
+        folder = folder / name
+    return folder
 
 
 def list_image_folders(roots: Sequence[Path], order: Sequence[str] = FOLDERS) -> list[Path]:
@@ -41,7 +59,7 @@ class ImageFinder:
         masks = [find_path(root, MASKS) for root in roots]
         self.folders = list_image_folders(roots, order)
         self.masks = [folder for folder in masks if folder is not None]
-        self.listings = _Listings()
+        self.list_entries = cache(_list_entries)
 
     def locate(self, frame: Frame) -> Frame:
         """Return the frame with the paths of its photograph and mask, if they exist."""
@@ -55,7 +73,8 @@ class ImageFinder:
         )
 
     def _find_file(self, folders: Sequence[Path], names: Sequence[str]) -> Path | None:
-        found = (self.listings.find(folder, name) for folder in folders for name in names)
+        places = ((folder, name) for folder in folders for name in names)
+        found = (find_path(folder, name, self.list_entries) for folder, name in places)
         return next((path for path in found if path is not None and os.path.isfile(path)), None)
 
 
@@ -69,45 +88,13 @@ def keep_existing(frames: Sequence[Frame], title: str) -> tuple[tuple[Frame, ...
             f"None of the {len(frames)} photographs of {title} is there; put them into a folder "
             f"`{FOLDERS[0]}` beside it{example}."
         )
-    return tuple(there), _note_missing(missing, len(frames), title)
-
-
-def _note_missing(missing: Sequence[str], total: int, title: str) -> tuple[str, ...]:
     if not missing:
-        return ()
+        return tuple(there), ()
     names = ", ".join(quote_value(name) for name in missing[:MAX_NAMED])
     rest = ", …" if len(missing) > MAX_NAMED else ""
     verb = "is" if len(missing) == 1 else "are"
-    return (
-        f"{len(missing)} of {total} photographs of {title} {verb} missing ({names}{rest}) and "
-        f"{verb} left out.",
+    note = (
+        f"{len(missing)} of {len(frames)} photographs of {title} {verb} missing ({names}{rest}) "
+        f"and {verb} left out."
     )
-
-
-class _Listings:
-    """Cache of folder contents by case-folded name."""
-
-    def __init__(self) -> None:
-        self.names_by_folder: dict[Path, dict[str, str]] = {}
-
-    def find(self, folder: Path, relative: str) -> Path | None:
-        if os.path.exists(folder / relative):
-            return folder / relative
-        found = folder
-        for part in PurePosixPath(relative).parts:
-            name = self._list_entries(found).get(part.casefold())
-            if name is None:
-                return None
-            found = found / name
-        return found
-
-    def _list_entries(self, folder: Path) -> dict[str, str]:
-        if folder not in self.names_by_folder:
-            try:
-                names = os.listdir(folder)
-            except (OSError, ValueError):
-                names = []
-            self.names_by_folder[folder] = {
-                name.casefold(): name for name in sorted(names, reverse=True)
-            }
-        return self.names_by_folder[folder]
+    return tuple(there), (note,)

@@ -12,7 +12,6 @@ import warnings
 from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
-from tokenize import TokenError
 
 import numpy as np
 from jaxtyping import Float, Shaped
@@ -31,16 +30,6 @@ IMAGES = (".jpg", ".jpeg", ".png")
 MAX_BYTES = 1 << 26
 """Largest array in bytes, about half a million cameras."""
 
-_ARRAY_ERRORS = (
-    ValueError,
-    TypeError,
-    EOFError,
-    OverflowError,
-    MemoryError,
-    SyntaxError,
-    TokenError,
-)
-
 
 def has_llff(path: Path) -> bool:
     """Check whether `path` is a `poses_bounds.npy`, or a folder with one."""
@@ -55,11 +44,9 @@ def open_llff(path: Path) -> Iterator[Photographs]:
     """
     file = path / NAME if os.path.isdir(path) else path
     rows = _read_rows(file)
+    titles = (f"row {number} of {quote_value(file)}" for number in range(len(rows)))
     images = _find_photographs(file, len(rows))
-    numbered = enumerate(zip(images, rows, strict=True))
-    frames = [
-        _parse_frame(image, row, f"row {n} of {quote_value(file)}") for n, (image, row) in numbered
-    ]
+    frames = list(map(_parse_frame, images, rows, titles))
     near, far = widen_depth_range(float(rows[:, 15].min()), float(rows[:, 16].max()))
     scene = build_photographs(file.resolve().parent.name, str(file), frames)
     yield replace(scene, near=near, far=far)
@@ -80,8 +67,8 @@ def _parse_frame(image: Path, row: Float[np.ndarray, "17"], title: str) -> Frame
 
 def _read_rows(path: Path) -> Float[np.ndarray, "n 17"]:
     stored = _map_array(path)
-    fitting = stored.ndim == 2 and stored.shape[1] == 17 and len(stored) > 0
-    if not (fitting and stored.dtype.kind in "fiu" and stored.nbytes <= MAX_BYTES):
+    fits = stored.ndim == 2 and stored.shape[1] == 17 and len(stored) > 0
+    if not (fits and stored.dtype.kind in "fiu" and stored.nbytes <= MAX_BYTES):
         raise InputError(
             f"{quote_value(path)} holds {stored.dtype} of shape {list(stored.shape)}, where a row "
             "of 17 numbers for each photograph is needed; run LLFF's imgs2poses again."
@@ -108,7 +95,7 @@ def _map_array(path: Path) -> Shaped[np.ndarray, "..."]:
         raise InputError(
             f"{quote_value(path)} cannot be read: {error}; correct the path."
         ) from error
-    except _ARRAY_ERRORS as error:
+    except Exception as error:  # damaged headers raise anything
         raise InputError(
             f"{quote_value(path)} is no array of numbers ({quote_value(str(error))}); run LLFF's "
             "imgs2poses again."
@@ -117,18 +104,14 @@ def _map_array(path: Path) -> Shaped[np.ndarray, "..."]:
 
 def _find_photographs(file: Path, count: int) -> list[Path]:
     """List the photographs of the first folder with one for each row."""
-    folders = list_image_folders([file.parent])
-    found = [_list_images(folder) for folder in folders]
-    fitting = next((images for images in found if len(images) == count), None)
-    if fitting is None:
-        numbers = ", ".join(f"{len(i)} in {f.name}" for f, i in zip(folders, found, strict=True))
-        raise InputError(
-            f"{quote_value(file)} has {count} rows, one per photograph in order of their names, "
-            "but "
-            f"there are {numbers}; put exactly these photographs into a folder `images` beside it."
-        )
-    return fitting
-
-
-def _list_images(folder: Path) -> list[Path]:
-    return sorted(path for path in folder.iterdir() if path.suffix.lower() in IMAGES)
+    numbers = []
+    for folder in list_image_folders([file.parent]):
+        images = sorted(path for path in folder.iterdir() if path.suffix.lower() in IMAGES)
+        if len(images) == count:
+            return images
+        numbers.append(f"{len(images)} in {folder.name}")
+    raise InputError(
+        f"{quote_value(file)} has {count} rows, one per photograph in order of their names, but "
+        f"there are {', '.join(numbers)}; put exactly these photographs into a folder `images` "
+        "beside it."
+    )

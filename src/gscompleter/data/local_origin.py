@@ -20,6 +20,7 @@ from gscompleter.errors import InputError, quote_value
 from gscompleter.io.json_file import read_json
 from gscompleter.types import Camera, Gaussians
 
+SCALE_RANGE = (1e-9, 1e9)
 MAX_REMOTENESS = 1e3
 """Ratio of coordinates to camera spread above which a local origin is used."""
 MAX_STEP = 1e-3
@@ -69,9 +70,6 @@ def shift_to_origin(
         )
     means = scene.means.double() - torch.from_numpy(origin).to(scene.means.device)
     return replace(scene, means=means.float())
-
-
-SCALE_RANGE = (1e-9, 1e9)
 
 
 def read_dataparser_transforms(path: Path) -> Float[np.ndarray, "4 4"]:

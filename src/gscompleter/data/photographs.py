@@ -8,7 +8,6 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
-from typing import Protocol, runtime_checkable
 
 import cv2
 import numpy as np
@@ -18,8 +17,8 @@ from PIL import Image
 from torch import Tensor
 
 from gscompleter.data.cameras import compute_fov, find_pose_defect
+from gscompleter.data.driving.lidar import compute_sparse_depth
 from gscompleter.data.driving.moving_objects import mask_moving
-from gscompleter.data.driving.sparse_depth import compute_sparse_depth
 from gscompleter.data.frame import Frame
 from gscompleter.data.local_origin import choose_local_origin
 from gscompleter.data.resize import Resolution, compute_framing, resize
@@ -37,69 +36,20 @@ MAX_MAP_COORDINATE = 100.0
 """Largest vehicle coordinate without a local origin, in metres."""
 
 
-@runtime_checkable
-class PosedPhotographs(Protocol):
+@dataclass(frozen=True, eq=False)
+class Photographs:
     """A named sequence of photographs with known cameras, numbered from 0.
 
     Its methods raise an InputError if a frame does not exist, cannot be read or is impossible.
     """
 
-    @property
-    def name(self) -> str:
-        """Name in evaluation indices."""
-
-    @property
-    def names(self) -> tuple[str, ...]:
-        """Names of the frames, in their order."""
-
-    @property
-    def origin(self) -> Float[np.ndarray, "3"]:
-        """Origin of the cameras' coordinates, in those of the files (float64)."""
-
-    def __len__(self) -> int:
-        """Count the frames."""
-
-    def has_photograph(self, frame: int) -> bool:
-        """Check whether the photograph of a frame exists."""
-
-    def camera(self, frame: int, resolution: Resolution = None) -> Camera:
-        """Return the camera of a frame, as in `views`."""
-
-    def views(self, frames: Sequence[int], resolution: Resolution = None) -> list[View]:
-        """Load photographs with cameras, and depth if available.
-
-        Undistorted images keep the size of the photograph and have no empty pixels (see
-        `lens.undistort_pinhole`). `ignore_mask` marks the vehicle that carries the camera, if it
-        is detected.
-
-        Args:
-            frames: Frame numbers.
-            resolution: Height and width to cover and crop to, or the most pixels of the longer
-                side; None keeps the size.
-        """
-
-    def mask(self, frame: int, resolution: Resolution = None) -> Bool[Tensor, "h w"] | None:
-        """Return True where the photograph's mask is black or a moving box lies, or None."""
-
-    def points(self) -> Float[Tensor, "n 3"] | None:
-        """Load points on the scene's surfaces relative to `origin`; None if unknown."""
-
-    def find_skip_reason(self, size: tuple[int, int] | None = None) -> str | None:
-        """Explain why benchmarks skip the photographs, or return None.
-
-        `size` is the height and width that every stored photograph must have.
-        """
-
-
-@dataclass(frozen=True, eq=False)
-class Photographs:
-    """`PosedPhotographs` as a list of frames, for all formats."""
-
     name: str
+    """Name in evaluation indices."""
     title: str
     """Name in error messages."""
     frames: tuple[Frame, ...]
     origin: Float[np.ndarray, "3"]
+    """Origin of the cameras' coordinates, in those of the files (float64)."""
     near: float | None = None
     """Smallest z-depth of the scene, in scene units, or None if unknown."""
     far: float | None = None
@@ -131,11 +81,19 @@ class Photographs:
         return self._build_camera(found, found.size(), resolution)
 
     def views(self, frames: Sequence[int], resolution: Resolution = None) -> list[View]:
-        """Load photographs with cameras, and depth if available."""
-        chosen = [self.frame(number) for number in frames]
-        return [
-            self._load_view(frame, n, resolution) for n, frame in zip(frames, chosen, strict=True)
-        ]
+        """Load photographs with cameras, and depth if available.
+
+        Undistorted images keep the size of the photograph and have no empty pixels (see
+        `undistort_pinhole`). `ignore_mask` marks the vehicle that carries the camera, if it is
+        detected.
+
+        Args:
+            frames: Frame numbers.
+            resolution: Height and width to cover and crop to, or the most pixels of the longer
+                side; None keeps the size.
+        """
+        chosen = [(self.frame(number), number) for number in frames]
+        return [self._load_view(frame, number, resolution) for frame, number in chosen]
 
     def mask(self, frame: int, resolution: Resolution = None) -> Bool[Tensor, "h w"] | None:
         """Return True where the photograph's mask is black or a moving box lies, or None."""
@@ -165,11 +123,14 @@ class Photographs:
         return any(frame.mask is not None or frame.boxes is not None for frame in self.frames)
 
     def find_skip_reason(self, size: tuple[int, int] | None = None) -> str | None:
-        """Explain why benchmarks skip the photographs; None if they are kept."""
+        """Explain why benchmarks skip the photographs; None if they are kept.
+
+        `size` is the height and width that every stored photograph must have.
+        """
         for number, frame in enumerate(self.frames):
-            reason = _find_skip_reason(frame, self.origin) or (
-                None if size is None else _find_size_defect(frame, size)
-            )
+            reason = _find_skip_reason(frame, self.origin)
+            if reason is None and size is not None:
+                reason = _find_size_defect(frame, size)
             if reason is not None:
                 return f"frame {number}: {reason}"
         return None
@@ -195,24 +156,23 @@ class Photographs:
         pixels = frame.load_pixels()
         size = pixels.shape[1], pixels.shape[0]
         camera = self._build_camera(frame, size, resolution)
-        depth = None
+        image = convert_to_image(undistort_and_resize(frame, pixels, size, resolution))
+        depth = ignored = None
         if frame.depth is not None:
-            depth = torch.from_numpy(
-                undistort_and_resize(frame, read_depth(*frame.depth), size, resolution)
-            )
+            values = undistort_and_resize(frame, read_depth(*frame.depth), size, resolution)
+            depth = torch.from_numpy(values)
         elif frame.laser_points is not None:
             points = torch.from_numpy(frame.laser_points() - self.origin).float()
             depth = compute_sparse_depth(points, camera)
-        image = convert_to_image(undistort_and_resize(frame, pixels, size, resolution))
         vehicle = None if frame.vehicle is None else frame.vehicle()
-        if vehicle is None:
-            return View(image, camera, number, depth)
-        ignored = undistort_and_resize(frame, vehicle.astype(np.uint8), size, resolution) > 0
-        return View(image, camera, number, depth, torch.from_numpy(ignored))
+        if vehicle is not None:
+            mask = undistort_and_resize(frame, vehicle.astype(np.uint8), size, resolution) > 0
+            ignored = torch.from_numpy(mask)
+        return View(image, camera, number, depth, ignored)
 
 
 def apply_masks(
-    views: Sequence[View], photographs: PosedPhotographs, resolution: Resolution = None
+    views: Sequence[View], photographs: Photographs, resolution: Resolution = None
 ) -> list[View]:
     """Mark masked pixels of views as ignored; refuses views without any other pixel."""
     found = []
@@ -223,11 +183,9 @@ def apply_masks(
             raise InputError(
                 f"All of frame {view.frame} of {photographs.name} is masked; choose another frame."
             )
-        if mask is not None:
-            view = replace(
-                view, ignore_mask=mask if view.ignore_mask is None else mask | view.ignore_mask
-            )
-        found.append(view)
+        if mask is not None and view.ignore_mask is not None:
+            mask = mask | view.ignore_mask
+        found.append(view if mask is None else replace(view, ignore_mask=mask))
     return found
 
 
@@ -272,7 +230,6 @@ def undistort_and_resize(
 
 
 def _find_skip_reason(frame: Frame, origin: Float[np.ndarray, "3"]) -> str | None:
-    """Explain why benchmarks skip a frame; None if they keep it."""
     size = frame.intrinsics.size or frame.size()
     defect = frame.find_defect(*size)
     if defect is not None:
@@ -281,13 +238,11 @@ def _find_skip_reason(frame: Frame, origin: Float[np.ndarray, "3"]) -> str | Non
     if fov > MAX_FOV:
         return f"its opening angle of {fov:.1f}° is above {MAX_FOV:g}°"
     farthest = float(np.abs(frame.c2w[:3, 3] - origin).max())
-    if farthest > MAX_TRANSLATION:
-        return f"its translation of {farthest:g} is above {MAX_TRANSLATION:g}"
-    return None
+    too_far = f"its translation of {farthest:g} is above {MAX_TRANSLATION:g}"
+    return too_far if farthest > MAX_TRANSLATION else None
 
 
 def _find_size_defect(frame: Frame, needed: tuple[int, int]) -> str | None:
-    """Explain why the stored photograph is not of size `needed` (height, width); None if it is."""
     found = frame.read_stored_size()
     if found is None:
         return "its image is missing"

@@ -16,9 +16,10 @@ from gscompleter.data.photographs import Photographs
 from gscompleter.data.resize import Resolution
 from gscompleter.errors import InputError, quote_value
 from gscompleter.io.reading import open_file
-from gscompleter.splats.ply import Element, read_header, read_vertices
+from gscompleter.splats.ply import read_header, read_vertices
 from gscompleter.types import Camera
 
+AXES = ("x", "y", "z")
 MIN_POINTS = 100
 """Fewest visible points that define a depth range."""
 PERCENTILES = (0.01, 0.99)
@@ -73,28 +74,17 @@ def _compute_visible_depths(points: Float[Tensor, "n 3"], camera: Camera) -> Flo
     return front[((pixels >= 0) & (pixels < size)).all(dim=1), 2]
 
 
-AXES = ("x", "y", "z")
-
-
 def read_point_cloud(path: Path) -> Float[np.ndarray, "n 3"]:
     """Read the vertices of a PLY file, in scene units."""
-    try:
-        with open_file(path) as file:
-            file_format, elements = read_header(file, path)
-            vertex = next((e for e in elements if e.name == "vertex"), None)
-            if vertex is None or not _is_table(vertex):
-                raise InputError(
-                    f"{quote_value(path)} holds no points with x, y and z; export them again."
-                )
-            ahead = elements[: elements.index(vertex)]
-            vertices = read_vertices(file, file_format, ahead, vertex, path)
-    except OSError as error:
-        raise InputError(
-            f"{quote_value(path)} cannot be read: {error.strerror}; correct the path."
-        ) from error
+    with open_file(path) as file:
+        file_format, elements = read_header(file, path)
+        vertex = next((e for e in elements if e.name == "vertex"), None)
+        names = [prop.name for prop in vertex.properties] if vertex else []
+        unique = len(set(names)) == len(names)
+        if vertex is None or not unique or not set(AXES) <= set(names) or vertex.has_lists:
+            raise InputError(
+                f"{quote_value(path)} holds no points with x, y and z; export them again."
+            )
+        ahead = elements[: elements.index(vertex)]
+        vertices = read_vertices(file, file_format, ahead, vertex, path)
     return np.stack([vertices[axis].astype(np.float64) for axis in AXES], axis=-1)
-
-
-def _is_table(vertex: Element) -> bool:
-    names = [prop.name for prop in vertex.properties]
-    return set(AXES) <= set(names) and len(set(names)) == len(names) and not vertex.has_lists

@@ -71,8 +71,8 @@ def _parse_frame(line: str, number: int, path: Path) -> Frame:
             f"Frame {number} of {path} is not a line of RealEstate10K, which has 19 numbers: "
             "timestamp, fx fy cx cy, 0 0, and 3 × 4 of world-to-camera; download it again."
         ) from error
-    folder = path.with_suffix("")
-    folder = folder if os.path.isdir(folder) else path.parent
+    own = path.with_suffix("")
+    folder = own if os.path.isdir(own) else path.parent
     intrinsics, c2w = parse_camera_row(numbers)
     title = f"frame {number} of {path}"
     return Frame(timestamp, title, c2w, intrinsics, folder / timestamp)

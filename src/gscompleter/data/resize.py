@@ -46,14 +46,13 @@ def compute_framing(width: int, height: int, resolution: Resolution) -> Framing:
     """Compute the framing of a width × height image for a resolution."""
     check_resolution(resolution)
     if resolution is not None and not isinstance(resolution, int):
-        return compute_cover_framing(width, height, resolution)
+        return _compute_cover_framing(width, height, resolution)
     scale = 1.0 if resolution is None else min(1.0, resolution / max(width, height))
     size = max(round(width * scale), 1), max(round(height * scale), 1)
     return Framing(size, (0, 0), size)
 
 
-def compute_cover_framing(width: int, height: int, resolution: tuple[int, int]) -> Framing:
-    """Compute the framing that covers `resolution` (height, width) and crops the centre."""
+def _compute_cover_framing(width: int, height: int, resolution: tuple[int, int]) -> Framing:
     scale = max(resolution[0] / height, resolution[1] / width)
     new_width = max(round(width * scale), resolution[1])
     new_height = max(round(height * scale), resolution[0])

@@ -28,7 +28,7 @@ def load_views(
 ) -> list[View]:
     """Load the photographs of a scene with their cameras, and true depth if available.
 
-    Lens distortion is removed, as in `PosedPhotographs.views`. If coordinates are so large that
+    Lens distortion is removed, as in `Photographs.views`. If coordinates are so large that
     float32 would lose the baselines, cameras are relative to `open_photographs(scene).origin`.
 
     Args:
@@ -37,7 +37,7 @@ def load_views(
         frames: Frame numbers, counted by sorted `file_path`; all frames if None. Only these are
             read.
         resolution: Height and width in pixels, or the most pixels of the longer side, as in
-            `PosedPhotographs.views`.
+            `Photographs.views`.
         near: Smallest z-depth of the scene, in scene units, if known.
         far: Largest z-depth of the scene, in scene units, if known.
 

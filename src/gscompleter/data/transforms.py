@@ -12,9 +12,9 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float
 
-from gscompleter.data.cameras import Intrinsics, find_pose_defect, make_rigid
+from gscompleter.data.cameras import Intrinsics
 from gscompleter.data.frame import Frame, capitalize
-from gscompleter.data.json_fields import get_optional_number, get_text
+from gscompleter.data.json_fields import convert_to_array, get_optional_number, get_text
 from gscompleter.data.limits import DEPTH_RANGE, MAX_COEFFICIENT, MAX_IN_PIXELS, MAX_SIDE
 from gscompleter.data.photographs import Photographs, build_photographs
 from gscompleter.data.points import read_point_cloud
@@ -64,27 +64,20 @@ def open_transforms(path: Path) -> Iterator[Photographs]:
     frames = [frame for file in files for frame in read_frames(file)]
     if all(frame.image is not None for frame in frames):
         frames = sorted(frames, key=lambda frame: frame.name)
-    whole = len(files) == 1 and files[0].name not in (NAME, *SPLITS)
-    title = str(files[0] if len(files) == 1 else path)
-    scene = build_photographs(_name_scene(files[0], whole), title, frames)
+    folder = files[0].resolve().parent
+    name = (folder.parent if folder.name in HOMES else folder).name
+    if len(files) == 1 and files[0].name not in (NAME, *SPLITS):
+        name = files[0].stem
+    scene = build_photographs(name, str(files[0] if len(files) == 1 else path), frames)
     yield replace(scene, sparse=_make_point_reader(files))
-
-
-def _name_scene(file: Path, whole: bool) -> str:
-    """Name the scene of a file: after its folder, or after a file with its own name."""
-    folder = file.resolve().parent
-    return file.stem if whole else (folder.parent if folder.name in HOMES else folder).name
 
 
 def _find_files(scene: Path) -> list[Path]:
     if not os.path.isdir(scene):
         return [scene]
-    for folder in (scene / home for home in HOMES):
-        for names in ((NAME,), SPLITS):
-            files = [folder / name for name in names if os.path.isfile(folder / name)]
-            if files:
-                return files
-    return []
+    groups = [[scene / home / n for n in names] for home in HOMES for names in ((NAME,), SPLITS)]
+    found = ([file for file in group if os.path.isfile(file)] for group in groups)
+    return next((files for files in found if files), [])
 
 
 def _make_point_reader(files: Sequence[Path]) -> partial[Float[np.ndarray, "n 3"]] | None:
@@ -133,25 +126,20 @@ def _parse_frame(
     frame = Frame(
         name=file_path or str(position),
         title=title,
-        c2w=_parse_matrix(entry.get("transform_matrix"), title),
+        c2w=_parse_matrix(entry, title),
         intrinsics=_parse_intrinsics({**shared, **entry}, title),
         image=None if file_path is None else path.parent / file_path,
         depth=None if depth_path is None else (path.parent / depth_path, depth_unit),
         mask=None if mask_path is None else path.parent / mask_path,
     )
-    defect = find_pose_defect(frame.c2w)
-    if defect is not None:
-        raise frame.make_error(f"{defect} (`transform_matrix`)")
-    return replace(frame, c2w=make_rigid(frame.c2w) @ OPENCV_FROM_OPENGL)
+    frame = frame.with_rigid_pose(" (`transform_matrix`)")
+    return replace(frame, c2w=frame.c2w @ OPENCV_FROM_OPENGL)
 
 
-def _parse_matrix(matrix: Any, title: str) -> Float[np.ndarray, "4 4"]:
-    if matrix is None:
+def _parse_matrix(entry: Mapping[str, Any], title: str) -> Float[np.ndarray, "4 4"]:
+    if entry.get("transform_matrix") is None:
         raise InputError(f"The `transform_matrix` of {title} is missing; add its camera-to-world.")
-    try:
-        pose = np.array(matrix, dtype=np.float64)
-    except (ValueError, TypeError, OverflowError):
-        pose = np.zeros(0)
+    pose = convert_to_array(entry["transform_matrix"])
     if pose.shape not in ((3, 4), (4, 4)):
         raise InputError(
             f"The `transform_matrix` of {title} is no 3×4 or 4×4 matrix of numbers; correct it."
@@ -170,19 +158,13 @@ def _parse_intrinsics(entry: Mapping[str, Any], title: str) -> Intrinsics:
         raise InputError(
             f"The focal length of {title} is missing; add `fl_x` and `fl_y`, or `camera_angle_x`."
         )
-    size = _parse_size(read_pair("w", "h", low=1.0, high=float(MAX_SIDE)), title)
-    return Intrinsics(size, focal, read_pair("cx", "cy"), angle, _parse_distortion(entry, title))
-
-
-def _parse_size(size: Pair, title: str) -> tuple[int, int] | None:
-    w, h = size
-    if w is None or h is None:
-        return None
-    if w != int(w) or h != int(h):
+    w, h = read_pair("w", "h", low=1.0, high=float(MAX_SIDE))
+    size = None if w is None or h is None else (int(w), int(h))
+    if size is not None and size != (w, h):
         raise InputError(
             f"The `w` and `h` of {title} are not whole numbers of pixels; correct them."
         )
-    return int(w), int(h)
+    return Intrinsics(size, focal, read_pair("cx", "cy"), angle, _parse_distortion(entry, title))
 
 
 def _parse_distortion(entry: Mapping[str, Any], title: str) -> Distortion:

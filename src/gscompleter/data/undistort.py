@@ -6,7 +6,7 @@ which matters only when an image is passed to it.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import lru_cache
 from typing import Literal
 
@@ -35,9 +35,8 @@ class Pinhole:
     @property
     def K(self) -> Float[Tensor, "3 3"]:
         """Intrinsic matrix in pixels, float32."""
-        return torch.tensor(
-            [[self.fl_x, 0, self.cx], [0, self.fl_y, self.cy], [0, 0, 1]], dtype=torch.float64
-        ).float()
+        rows = [[self.fl_x, 0, self.cx], [0, self.fl_y, self.cy], [0, 0, 1]]
+        return torch.tensor(rows, dtype=torch.float64).float()
 
     def resize(self, width: int, height: int) -> Pinhole:
         """Return the camera of the image resized to width × height."""
@@ -50,9 +49,7 @@ class Pinhole:
 
     def magnify(self, zoom: float) -> Pinhole:
         """Magnify the image by `zoom` about the principal point, at the same size."""
-        return Pinhole(
-            self.fl_x * zoom, self.fl_y * zoom, self.cx, self.cy, self.width, self.height
-        )
+        return replace(self, fl_x=self.fl_x * zoom, fl_y=self.fl_y * zoom)
 
 
 Projection = Literal["perspective", "equidistant", "field-of-view", "division", "unified"]
@@ -104,9 +101,8 @@ def _project(
     if distortion.projection == "perspective":
         return points
     r = np.linalg.norm(points, axis=-1)
-    small = r < 1e-6
-    scale = _compute_radius(np.where(small, 1e-6, r), distortion) / np.where(small, 1e-6, r)
-    return points * scale[..., None]
+    r = np.where(r < 1e-6, 1e-6, r)
+    return points * (_compute_radius(r, distortion) / r)[..., None]
 
 
 def _compute_radius(r: Float[np.ndarray, "*n"], distortion: Distortion) -> Float[np.ndarray, "*n"]:
@@ -127,27 +123,16 @@ def _apply_polynomials(
 ) -> Float[np.ndarray, "*n 2"]:
     x, y = points[..., 0], points[..., 1]
     r2 = x * x + y * y
-    radial = _evaluate_polynomial(r2, distortion.radial) / _evaluate_polynomial(
-        r2, distortion.denominator
+    # Both are 1 + k1 r² + k2 r⁴ + …
+    numerator, denominator = (
+        np.polynomial.polynomial.polyval(r2, (1.0, *coefficients))
+        for coefficients in (distortion.radial, distortion.denominator)
     )
+    radial = numerator / denominator
     (p1, p2), (s1, s3) = distortion.tangential, distortion.prism
-    return np.stack(
-        [
-            x * radial + 2 * p1 * x * y + p2 * (r2 + 2 * x * x) + s1 * r2,
-            y * radial + p1 * (r2 + 2 * y * y) + 2 * p2 * x * y + s3 * r2,
-        ],
-        axis=-1,
-    )
-
-
-def _evaluate_polynomial(
-    r2: Float[np.ndarray, "*n"], coefficients: tuple[float, ...]
-) -> Float[np.ndarray, "*n"]:
-    """Evaluate 1 + k1 r² + k2 r⁴ + … at r²."""
-    value = np.zeros_like(r2)
-    for k in reversed(coefficients):
-        value = r2 * (k + value)
-    return 1 + value
+    new_x = x * radial + 2 * p1 * x * y + p2 * (r2 + 2 * x * x) + s1 * r2
+    new_y = y * radial + p1 * (r2 + 2 * y * y) + 2 * p2 * x * y + s3 * r2
+    return np.stack([new_x, new_y], axis=-1)
 
 
 @lru_cache(maxsize=16)
@@ -212,10 +197,5 @@ def _to_pixels(pinhole: Pinhole, points: Float[np.ndarray, "*n 2"]) -> Float[np.
 
 def _is_within(pinhole: Pinhole, points: Float[np.ndarray, "*n 2"]) -> bool:
     """Check whether all points fall on pixels of the photograph, within 0.001 pixels."""
-    x, y = np.moveaxis(_to_pixels(pinhole, points), -1, 0)
-    return bool(
-        (x.min() >= 0.499)
-        and (x.max() <= pinhole.width - 0.499)
-        and (y.min() >= 0.499)
-        and (y.max() <= pinhole.height - 0.499)
-    )
+    pixels, size = _to_pixels(pinhole, points), np.array([pinhole.width, pinhole.height])
+    return bool(((pixels >= 0.499) & (pixels <= size - 0.499)).all())

@@ -15,7 +15,7 @@ from pathlib import Path
 from typing import Any, Protocol, runtime_checkable
 
 from gscompleter.completer import MAX_TARGET_ID
-from gscompleter.data.photographs import PosedPhotographs
+from gscompleter.data.photographs import Photographs
 from gscompleter.errors import InputError, quote_value
 from gscompleter.io.files import replace_file
 from gscompleter.io.json_file import read_json
@@ -42,7 +42,7 @@ class EvaluationProtocol(Protocol):
     def name(self) -> str:
         """Name of the protocol for `parse_protocol` and the tables."""
 
-    def select_splits(self, clip: PosedPhotographs) -> tuple[Split, ...]:
+    def select_splits(self, clip: Photographs) -> tuple[Split, ...]:
         """Return the splits of a clip; none if it is skipped."""
 
 
@@ -66,7 +66,7 @@ class Extrapolation:
         """Name of the protocol."""
         return f"n-{self.k}" + ("" if self.stride is None else f"-stride-{self.stride}")
 
-    def select_splits(self, clip: PosedPhotographs) -> tuple[Split, ...]:
+    def select_splits(self, clip: Photographs) -> tuple[Split, ...]:
         """Return the splits of a clip."""
         k, stride = self.k, self.stride or 2 * self.k + 1
         return tuple(
@@ -82,7 +82,7 @@ class StressTest:
 
     name: str = "stress"
 
-    def select_splits(self, clip: PosedPhotographs) -> tuple[Split, ...]:
+    def select_splits(self, clip: Photographs) -> tuple[Split, ...]:
         """Return the split of a clip; none if it is too short."""
         split = Split((0, 30), (99,))
         return (split,) if len(clip) > max(split.targets) else ()
@@ -98,7 +98,7 @@ class EvaluationIndex:
     skipped: tuple[str, ...] = ()
     """Scenes without a split: null in a published file, clips that are too short in ours."""
 
-    def select_splits(self, clip: PosedPhotographs) -> tuple[Split, ...]:
+    def select_splits(self, clip: Photographs) -> tuple[Split, ...]:
         """Return the splits of a clip; none if the index skips or lacks its scene."""
         return self.scenes.get(clip.name, ())
 
@@ -126,12 +126,12 @@ class ViewByView:
         """Name of the protocol."""
         return f"sequence-{self.k}" + ("" if self.steps is None else f"-steps-{self.steps}")
 
-    def select_splits(self, clip: PosedPhotographs) -> tuple[Split, ...]:
+    def select_splits(self, clip: Photographs) -> tuple[Split, ...]:
         """Return the split of a clip; none if it is too short."""
         targets = tuple(range(2 * self.k, len(clip), self.k))[: self.steps or MAX_TARGET_ID]
         return (Split((0, self.k), targets, is_sequence=True),) if targets else ()
 
-    def explain_skip(self, clip: PosedPhotographs) -> str | None:
+    def explain_skip(self, clip: Photographs) -> str | None:
         """Explain why a clip has no split, or return None if it has one."""
         needed = 2 * self.k + 1
         if len(clip) >= needed:
@@ -160,7 +160,7 @@ def parse_protocol(text: str) -> EvaluationProtocol:
     )
 
 
-def build_index(protocol: EvaluationProtocol, clips: Iterable[PosedPhotographs]) -> EvaluationIndex:
+def build_index(protocol: EvaluationProtocol, clips: Iterable[Photographs]) -> EvaluationIndex:
     """Write down the splits of each clip; raise InputError for equal names or a sequence."""
     if isinstance(protocol, ViewByView):
         raise InputError(

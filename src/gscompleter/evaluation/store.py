@@ -29,9 +29,8 @@ from torch import Tensor
 from gscompleter.errors import InputError, OutputError, quote_value
 from gscompleter.evaluation.methods import Prediction
 from gscompleter.io import json_file
-from gscompleter.io.files import replace_file
+from gscompleter.io.files import UNFINISHED_PREFIX, replace_file
 from gscompleter.io.image import write_image
-from gscompleter.io.unfinished import UNFINISHED_PREFIX
 from gscompleter.types import Gaussians, merge
 
 RUN = "run.json"

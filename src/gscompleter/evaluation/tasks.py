@@ -7,7 +7,7 @@ from dataclasses import dataclass
 from functools import partial
 
 from gscompleter.data.cases import Case
-from gscompleter.data.photographs import PosedPhotographs, apply_masks
+from gscompleter.data.photographs import Photographs, apply_masks
 from gscompleter.data.resize import Resolution
 from gscompleter.errors import InputError
 from gscompleter.evaluation.protocols import EvaluationProtocol, Split
@@ -43,7 +43,7 @@ def make_case_task(case: Case) -> Task:
 
 def make_tasks(
     protocol: EvaluationProtocol,
-    clip: PosedPhotographs,
+    clip: Photographs,
     resolution: Resolution = None,
     use_masks: bool = False,
 ) -> list[Task]:
@@ -52,7 +52,7 @@ def make_tasks(
     Args:
         protocol: Chooses the frames.
         clip: The photographs.
-        resolution: As in `PosedPhotographs.views`.
+        resolution: As in `Photographs.views`.
         use_masks: True to ignore masked pixels of the photographs.
     """
     load = partial(load_clip_views, clip, resolution, use_masks)
@@ -69,14 +69,14 @@ def make_tasks(
 
 
 def load_clip_views(
-    clip: PosedPhotographs, resolution: Resolution, use_masks: bool, frames: tuple[int, ...]
+    clip: Photographs, resolution: Resolution, use_masks: bool, frames: tuple[int, ...]
 ) -> list[View]:
     """Load photographs of a clip, with the arguments of `make_tasks`."""
     views = clip.views(frames, resolution)
     return apply_masks(views, clip, resolution) if use_masks else views
 
 
-def check_frames(protocol: EvaluationProtocol, split: Split, clip: PosedPhotographs) -> None:
+def check_frames(protocol: EvaluationProtocol, split: Split, clip: Photographs) -> None:
     """Raise InputError for a frame that the clip does not have."""
     for frame in (*split.context, *split.targets):
         if frame >= len(clip):

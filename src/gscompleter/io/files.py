@@ -3,9 +3,9 @@
 from __future__ import annotations
 
 import contextlib
-import ctypes
 import errno
 import os
+import secrets
 import shutil
 from collections.abc import Iterator
 from pathlib import Path
@@ -13,14 +13,6 @@ from typing import BinaryIO
 
 from gscompleter.errors import InputError, OutputError, quote_value
 from gscompleter.io.interrupts import defer_interrupts
-from gscompleter.io.unfinished import (
-    UNFINISHED_PREFIX,
-    create_file,
-    create_folder,
-    lock_abandoned,
-    remove,
-    remove_abandoned,
-)
 
 SUMMARY_FILE = "summary.json"
 """File that marks a folder as complete: it is removed first and written last."""
@@ -29,8 +21,10 @@ TARGETS_FILE = "targets.json"
 CONTEXT_FILE, COMPLETED_FILE = "context.ply", "completed.ply"
 """The scene of a completion before and after."""
 
+UNFINISHED_PREFIX = ".gscompleter-"
+"""Prefix of the names of unfinished entries, which are never taken for results."""
 _REPLACED_FOLDER = f"{UNFINISHED_PREFIX}replaced"
-"""Folder of a draft for replaced entries; it exists only once the draft is complete."""
+"""Folder of a draft for replaced entries."""
 
 _REASONS = {
     errno.ENOSPC: "there is no space left; free some or choose another place",
@@ -54,42 +48,33 @@ _DISK_ERRORS = {errno.ENOSPC, errno.EDQUOT, errno.EFBIG, errno.EROFS}
 def replace_file(path: Path | str, keep_existing: bool = False) -> Iterator[BinaryIO]:
     """Open a temporary file that is renamed to `path` once it is completely on the disk.
 
-    An existing file survives every failure. With `first_stays`, a file that another process wrote
-    at
-    `path` meanwhile is kept.
+    An existing file survives every failure. With `keep_existing`, a file that another process
+    wrote at `path` meanwhile is kept.
 
     Raises:
         InputError: The file cannot be written.
     """
     # The target of a symbolic link is replaced, not the link.
     target = Path(os.path.realpath(path))
-    temporary: Path | None = None
+    temporary = target.with_name(_make_name())
     try:
-        if target.is_dir():
+        if os.path.isdir(target):
             raise IsADirectoryError(errno.EISDIR, os.strerror(errno.EISDIR))
-        remove_abandoned(target.parent)
-        with defer_interrupts():
-            temporary, opened = create_file(target.parent)
-        with opened as file:
+        with temporary.open("xb") as file:
             yield file
             file.flush()
             os.fsync(file.fileno())
-            if not (keep_existing and _link(temporary, target)):
-                os.replace(temporary, target)
+        if not (keep_existing and _link(temporary, target)):
+            os.replace(temporary, target)
     except OSError as error:
         raise OutputError(_describe_write_error(path, error)) from error
     finally:
-        if temporary is not None:
-            with contextlib.suppress(OSError):
-                temporary.unlink()
+        with contextlib.suppress(OSError):
+            temporary.unlink()
 
 
 def _link(temporary: Path, target: Path) -> bool:
-    """Link the file to `target`, unless another process wrote that first.
-
-    Returns:
-        False if the file system has no hard links.
-    """
+    """Link the file to `target`, unless that exists; False if there are no hard links."""
     try:
         os.link(temporary, target)
     except FileExistsError:
@@ -107,168 +92,89 @@ def check_output(path: Path | str, overwrite: bool = False) -> None:
     Raises:
         InputError: `path` is a file, not empty while `overwrite` is off, or not writable.
     """
-    with defer_interrupts():
-        _Draft(Path(path), overwrite).close()
+    with _create_draft(Path(path), overwrite):
+        pass
 
 
 @contextlib.contextmanager
 def open_output_folder(path: Path | str, overwrite: bool = False) -> Iterator[Path]:
-    """Open a temporary folder whose content becomes `path` at once at the end.
+    """Open a temporary folder whose content becomes `path` at the end.
 
-    A new `path` is made by a rename. One with only results of the same names is exchanged in one
-    step.
-    Otherwise (a mount, a working directory, other files in it) entries are renamed one by one, the
-    summary last, and other files stay; if the process is killed, the next run finishes the renames.
-    After any exception, `path` and its parents are as before. An interrupt waits for the renames.
+    A new `path` is made by one rename. In an existing one, entries of the same names are replaced,
+    the summary last, and other files stay. After any exception, `path` and its parents are as
+    before. An interrupt waits for the renames.
 
     Raises:
         InputError: As in `check_output`, or the disk is full.
     """
-    draft: _Draft | None = None
-    try:
-        with defer_interrupts():
-            draft = _Draft(Path(path), overwrite)
+    with _create_draft(Path(path), overwrite) as draft:
         try:
-            yield draft.folder
+            yield draft
             with defer_interrupts(f"{quote_value(Path(path))} is complete"):
-                draft.publish()
-                draft.close()
+                _publish(draft, Path(path))
         except InputError as error:
             # The temporary name means nothing to the user.
-            whole = str(error.args[0]).replace(str(draft.folder), str(path))
+            whole = str(error.args[0]).replace(str(draft), str(path))
             raise type(error)(whole, error.argument) from error
         except OSError as error:
             if error.errno not in _DISK_ERRORS:
                 raise
             raise OutputError(_describe_write_error(path, error)) from error
+
+
+@contextlib.contextmanager
+def _create_draft(path: Path, overwrite: bool) -> Iterator[Path]:
+    """Create a folder for the content of `path`, in it or beside it, with missing parents.
+
+    At the end whatever was not published is removed.
+    """
+    target = Path(os.path.realpath(path))
+    _check_free(path, target, overwrite)
+    home = target if os.path.isdir(target) else target.parent
+    missing = [folder for folder in (home, *home.parents) if not os.path.exists(folder)]
+    draft = home / _make_name()
+    try:
+        _make_folder(draft, path)
+        yield draft
     finally:
-        with defer_interrupts():
-            if draft is not None:
-                draft.close()
-
-
-class _Draft:
-    """The unfinished content of an output folder, and the parent folders created for it."""
-
-    def __init__(self, path: Path, overwrite: bool) -> None:
-        self.target = Path(os.path.realpath(path))
-        try:
-            self.exists = self.target.is_dir()
-        except OSError as error:
-            raise OutputError(_describe_write_error(path, error)) from error
-        self.parents: list[Path] = []
-        self.closed = False
-        if self.exists:
-            _finish_abandoned(self.target)
-        _check_free(path, self.target, overwrite)
-        try:
-            beside = not self.exists or _can_exchange(self.target)
-            home = self.target.parent if beside else self.target
-            self._make_parents(home)
-            remove_abandoned(home)
-            self.folder, self.lock = create_folder(home)
-        except OSError as error:
-            self._remove_parents()
-            raise OutputError(_describe_write_error(path, error)) from error
-
-    def _make_parents(self, folder: Path) -> None:
-        missing = [p for p in (folder, *folder.parents) if not p.exists()]
-        for parent in reversed(missing):
-            parent.mkdir(exist_ok=True)
-            self.parents.append(parent)
-
-    def _remove_parents(self) -> None:
-        for parent in reversed(self.parents):
-            with contextlib.suppress(OSError):
-                parent.rmdir()
-
-    def publish(self) -> None:
-        """Rename everything to its final name, or nothing."""
-        try:
-            if not self.exists:
-                os.rename(self.folder, self.target)
-                self.parents = []
-            elif not self._try_exchange():
-                self._move_inside()
-                _finish_renames(self.folder)
-        except OSError as error:
-            raise OutputError(_describe_write_error(self.target, error)) from error
-
-    def _try_exchange(self) -> bool:
-        """Exchange draft and target in one step, if only results would be lost."""
-        if self.folder.parent != self.target.parent:
-            return False
-        others = set(os.listdir(self.target)) - set(os.listdir(self.folder))
-        if any(not name.startswith(UNFINISHED_PREFIX) for name in others):
-            return False
+        # Replaced entries that could not be put back exist only here.
         with contextlib.suppress(OSError):
-            shutil.copymode(self.target, self.folder)
-            _exchange(self.folder, self.target)
-            return True
-        return False
-
-    def _move_inside(self) -> None:
-        """Move the draft into the target, where the next run finds it if this one is killed."""
-        inside = self.target / self.folder.name
-        if inside != self.folder:
-            os.rename(self.folder, inside)
-            self.folder = inside
-
-    def close(self) -> None:
-        """Remove unpublished content, and empty parents that were created for it."""
-        if self.closed:
-            return
-        self.closed = True
-        # Entries that could not be restored exist only here; the next run finishes the renames.
-        with contextlib.suppress(FileNotFoundError, NotADirectoryError):
-            if not os.listdir(self.folder / _REPLACED_FOLDER):
-                os.rmdir(self.folder / _REPLACED_FOLDER)
-        if not (self.folder / _REPLACED_FOLDER).exists():
-            remove(self.folder)
-        os.close(self.lock)
-        self._remove_parents()
-
-
-def _finish_abandoned(target: Path) -> None:
-    """Finish the renames of a killed run in `target`, and remove its other leftovers."""
-    with lock_abandoned(target) as found:
-        for draft in found:
+            (draft / _REPLACED_FOLDER).rmdir()
+        if not os.path.exists(draft / _REPLACED_FOLDER):
+            shutil.rmtree(draft, ignore_errors=True)
+        for folder in missing:
             with contextlib.suppress(OSError):
-                if (draft / _REPLACED_FOLDER).is_dir():
-                    _finish_renames(draft)
-                remove(draft)
+                folder.rmdir()
 
 
-def _finish_renames(draft: Path) -> None:
-    """Move the content of `draft` to its parent folder, or nothing; replaced entries are lost."""
-    target, replaced = draft.parent, draft / _REPLACED_FOLDER
-    entries = set(os.listdir(draft)) - {_REPLACED_FOLDER}
-    names = sorted(entries, key=lambda name: (name == SUMMARY_FILE, name))
-    replaced.mkdir(exist_ok=True)
+def _make_folder(draft: Path, path: Path) -> None:
+    try:
+        draft.mkdir(parents=True)
+    except OSError as error:
+        raise OutputError(_describe_write_error(path, error)) from error
+
+
+def _publish(draft: Path, path: Path) -> None:
+    """Rename everything to its final name, or nothing."""
+    target = Path(os.path.realpath(path))
+    try:
+        if draft.parent == target:
+            _replace_entries(draft, target)
+        else:
+            os.rename(draft, target)
+    except OSError as error:
+        raise OutputError(_describe_write_error(path, error)) from error
+
+
+def _replace_entries(draft: Path, target: Path) -> None:
+    """Move the content of `draft` to `target`, or nothing; replaced entries are lost."""
+    replaced = draft / _REPLACED_FOLDER
+    names = sorted(os.listdir(draft), key=lambda name: (name == SUMMARY_FILE, name))
     old = [name for name in reversed(names) if os.path.lexists(target / name)]
     moves = [(target / name, replaced / name) for name in old]
+    replaced.mkdir()
     _rename_all(moves + [(draft / name, target / name) for name in names])
-    remove(replaced)
-
-
-def _can_exchange(folder: Path) -> bool:
-    """Return True if another folder can take the place of this one unnoticed."""
-    here = Path.cwd()
-    return (
-        hasattr(os, "geteuid")
-        and not os.path.ismount(folder)
-        and folder not in (here, *here.parents)
-        and os.access(folder.parent, os.W_OK | os.X_OK)
-        and folder.stat().st_uid == os.geteuid()
-    )
-
-
-def _exchange(one: Path, other: Path) -> None:
-    """Exchange two entries of a file system in one step (Linux)."""
-    here, exchange = -100, 2  # AT_FDCWD and RENAME_EXCHANGE of <fcntl.h> and <linux/fs.h>
-    rename = getattr(ctypes.CDLL(None, use_errno=True), "renameat2", None)
-    if rename is None or rename(here, bytes(one), here, bytes(other), exchange) != 0:
-        raise OSError(ctypes.get_errno() or errno.ENOSYS, "cannot exchange two folders")
+    shutil.rmtree(replaced, ignore_errors=True)
 
 
 def _rename_all(moves: list[tuple[Path, Path]]) -> None:
@@ -276,33 +182,36 @@ def _rename_all(moves: list[tuple[Path, Path]]) -> None:
     done: list[tuple[Path, Path]] = []
     try:
         for move in moves:
-            done.append(move)
             os.rename(*move)
+            done.append(move)
     except BaseException:
         for source, destination in reversed(done):
-            # An interrupt may have come before or after the last rename.
-            if not os.path.lexists(source):
-                os.rename(destination, source)
+            os.rename(destination, source)
         raise
 
 
 def _check_free(path: Path, target: Path, overwrite: bool) -> None:
     """Raise InputError if `path` contains something that must not be overwritten."""
-    if os.path.lexists(target) and not target.is_dir():
+    if os.path.lexists(target) and not os.path.isdir(target):
         raise InputError(
             f"The output {quote_value(path)} is a file, and a folder is needed; name another one."
         )
     try:
-        entries = os.listdir(target) if target.is_dir() else []
+        entries = os.listdir(target)
+    except (FileNotFoundError, NotADirectoryError):
+        return
     except OSError as error:
         raise OutputError(_describe_write_error(path, error)) from error
     if not overwrite and any(not name.startswith(UNFINISHED_PREFIX) for name in entries):
         raise InputError(
             f"The output folder {quote_value(path)} is not empty; name another one, or overwrite "
-            "the "
-            "results in it.",
+            "the results in it.",
             "overwrite",
         )
+
+
+def _make_name() -> str:
+    return f"{UNFINISHED_PREFIX}{secrets.token_hex(6)}"
 
 
 def _describe_write_error(path: Path | str, error: OSError) -> str:

@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import io
 import os
-from collections.abc import Callable
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 
 import numpy as np
@@ -59,37 +60,33 @@ def convert_to_image(pixels: UInt8[np.ndarray, "h w 3"]) -> Float[Tensor, "h w 3
 
 def read_image_size(stored: Path | bytes, name: str = "") -> tuple[int, int]:
     """Read width and height of an image file, or of its bytes; `name` is for errors."""
-    with _open_bytes(stored, name) if isinstance(stored, bytes) else _open_file(stored) as image:
+    with _open(stored, name) as image:
         return image.size
 
 
 def has_orientation_tag(path: Path) -> bool:
     """Return True if the EXIF data of a photograph ask viewers to rotate it."""
     try:
-        with _open_file(path) as image:
+        with _open(path) as image:
             return bool(image.getexif().get(_ORIENTATION, 1) != 1)
     except Exception:  # of any kind; reading the photograph reports it
         return False
 
 
-def read_pixels(path: Path | str) -> UInt8[np.ndarray, "h w 3"]:
+def read_pixels(stored: Path | str | bytes, name: str = "") -> UInt8[np.ndarray, "h w 3"]:
     """Read an image in 8-bit colours, over black; 16-bit images are reduced.
 
     Orientation tags are ignored, because poses and intrinsics belong to the stored pixels.
 
+    Args:
+        stored: Path of an image file, or its bytes.
+        name: Name of bytes in errors.
+
     Raises:
         InputError: The file is missing, truncated or not an image.
     """
-    with _open_file(path) as image:
-        problem = f"The image {quote_value(Path(path))} is damaged"
-        return _run_decoder(lambda: _composite_over_black(image), problem, "copy it again")
-
-
-def decode_pixels(data: bytes, name: str) -> UInt8[np.ndarray, "h w 3"]:
-    """Decode the bytes of an image file like `read_pixels`; `name` is for errors."""
-    with _open_bytes(data, name) as image:
-        problem = f"{quote_value(name)} is damaged"
-        return _run_decoder(lambda: _composite_over_black(image), problem, "copy its file again")
+    with _open(stored, name) as image:
+        return _composite_over_black(image)
 
 
 def read_brightness(stored: Path | bytes, side: int, name: str = "") -> Float[np.ndarray, "h w"]:
@@ -97,16 +94,12 @@ def read_brightness(stored: Path | bytes, side: int, name: str = "") -> Float[np
 
     A JPEG is decoded no larger than necessary; `name` names bytes in errors.
     """
-    with _open_bytes(stored, name) if isinstance(stored, bytes) else _open_file(stored) as image:
+    with _open(stored, name) as image:
         scale = min(1.0, side / max(image.size))
         size = max(round(image.width * scale), 1), max(round(image.height * scale), 1)
         image.draft("L", size)
-        problem = f"The image {quote_value(name or str(stored))} is damaged"
-        return _run_decoder(lambda: _shrink(image, size), problem, "copy it again")
-
-
-def _shrink(image: Image.Image, size: tuple[int, int]) -> Float[np.ndarray, "h w"]:
-    grey = Image.fromarray(_composite_over_black(image)).convert("L")
+        pixels = _composite_over_black(image)
+    grey = Image.fromarray(pixels).convert("L")
     return np.array(grey.resize(size, Image.Resampling.BOX), np.float32)
 
 
@@ -117,14 +110,18 @@ def read_depth(path: Path, unit: float) -> Float[np.ndarray, "h w"]:
             f"There is no depth map {quote_value(path)}; restore it, or remove its "
             "`depth_file_path`."
         )
-    problem = f"The depth map {quote_value(path)} cannot be read"
-    values = _run_decoder(lambda: _load_depth_values(path), problem, "copy it again")
+    try:
+        values = _load_depth_values(path)
+    except Exception as error:  # damaged files raise any kind
+        raise InputError(
+            f"The depth map {quote_value(path)} cannot be read ({quote_value(str(error))}); copy "
+            "it again."
+        ) from error
     values = values[..., 0] if values.ndim == 3 and values.shape[-1] == 1 else values
     if values.ndim != 2 or values.dtype.kind not in "uif" or values.dtype == np.uint8:
         raise InputError(
-            f"{quote_value(path)} is no depth map: a 16-bit grey PNG or an array [h, w] of "
-            "numbers is "
-            f"needed, and it holds {values.dtype} of shape {quote_value(list(values.shape))}."
+            f"{quote_value(path)} is no depth map: a 16-bit grey PNG or an array [h, w] of numbers "
+            f"is needed, and it holds {values.dtype} of shape {quote_value(list(values.shape))}."
         )
     with np.errstate(over="ignore", invalid="ignore"):
         depth = (values.astype(np.float64) * unit).astype(np.float32)
@@ -142,36 +139,38 @@ def _load_depth_values(path: Path) -> np.ndarray:
     return values
 
 
-def _run_decoder(decode: Callable[[], np.ndarray], problem: str, advice: str) -> np.ndarray:
-    """Run `decode` and turn any failure into an InputError."""
-    try:
-        return decode()
-    except Exception as error:
-        raise InputError(f"{problem} ({quote_value(str(error))}); {advice}.") from error
-
-
-def _open_file(path: Path | str) -> Image.Image:
-    path = Path(path)
-    if not os.path.isfile(path):
-        raise InputError(f"There is no image {quote_value(path)}; restore it or correct its path.")
-    refuse_pointer(path)
-    return _open(path, quote_value(path), "a PNG or JPEG file is")
-
-
-def _open_bytes(data: bytes, name: str) -> Image.Image:
-    return _open(io.BytesIO(data), quote_value(name), "the bytes of a PNG or JPEG file are")
-
-
-def _open(file: Path | io.BytesIO, name: str, needed: str) -> Image.Image:
+@contextmanager
+def _open(stored: Path | str | bytes, name: str = "") -> Iterator[Image.Image]:
+    """Open an image file, or its bytes; any failure while it is read becomes an InputError."""
+    file: Path | io.BytesIO
+    if isinstance(stored, bytes):
+        file, shown = io.BytesIO(stored), quote_value(name)
+    else:
+        file = Path(stored)
+        shown = f"The image {quote_value(file)}"
+        if not os.path.isfile(file):
+            raise InputError(
+                f"There is no image {quote_value(file)}; restore it or correct its path."
+            )
+        refuse_pointer(file)
     Image.preinit()  # usual formats only; Pillow would load all of them
     try:
-        return Image.open(file, formats=IMAGE_FORMATS)
+        image = Image.open(file, formats=IMAGE_FORMATS)
     except Image.DecompressionBombError as error:
         raise InputError(
-            f"{name} claims more than {MAX_PIXELS:,} pixels; make it smaller."
+            f"{shown} claims more than {MAX_PIXELS:,} pixels; make it smaller."
         ) from error
     except Exception as error:  # damaged files raise any kind
-        raise InputError(f"{name} is not an image that can be read; {needed} needed.") from error
+        raise InputError(
+            f"{shown} is not an image that can be read; a PNG or JPEG file is needed."
+        ) from error
+    with image:
+        try:
+            yield image
+        except Exception as error:
+            raise InputError(
+                f"{shown} is damaged ({quote_value(str(error))}); copy it again."
+            ) from error
 
 
 def _composite_over_black(image: Image.Image) -> UInt8[np.ndarray, "h w 3"]:

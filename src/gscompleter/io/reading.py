@@ -5,7 +5,7 @@ from __future__ import annotations
 import os
 import stat
 from collections.abc import Iterator
-from contextlib import suppress
+from contextlib import contextmanager, suppress
 from io import TextIOWrapper
 from pathlib import Path
 from typing import Any, BinaryIO
@@ -42,30 +42,29 @@ def check_file(path: Path) -> None:
         raise InputError(f"{quote_value(path)} is not a file but a {kind}; correct the path.")
 
 
-def open_file(path: Path) -> BinaryIO:
-    """Open a regular file for reading; raise InputError if that fails."""
+@contextmanager
+def open_file(path: Path) -> Iterator[BinaryIO]:
+    """Open a regular file; raise InputError if opening or reading it fails."""
     check_file(path)
     try:
-        return path.open("rb")
+        with path.open("rb") as file:
+            yield file
     except OSError as error:
         raise _make_read_error(path, error) from error
 
 
 def read_head(path: Path, count: int) -> bytes:
     """Read the first `count` bytes of a file, or none if it cannot be read."""
-    with suppress(InputError, OSError), open_file(path) as file:
+    with suppress(InputError), open_file(path) as file:
         return file.read(count)
     return b""
 
 
 def read_bytes(path: Path, max_bytes: int = MAX_BYTES) -> bytes:
     """Read a file of at most `max_bytes` bytes; raise InputError if that fails."""
-    try:
-        with open_file(path) as file:
-            _check_size(path, file, max_bytes)
-            return file.read()
-    except OSError as error:
-        raise _make_read_error(path, error) from error
+    with open_file(path) as file:
+        _check_size(path, file, max_bytes)
+        return file.read()
 
 
 def read_lines(
@@ -76,20 +75,16 @@ def read_lines(
     Lines have at most `max_length` characters, the file `max_bytes` bytes. `errors` as in
     `bytes.decode`.
     """
-    try:
-        with open_file(path) as file:
-            _check_size(path, file, max_bytes)
-            text = TextIOWrapper(file, encoding="utf-8-sig", errors=errors)
-            while line := text.readline(max_length + 1):
-                if len(line) > max_length:
-                    raise InputError(
-                        f"{quote_value(path)} has a line of more than {max_length:,} characters, "
-                        "which "
-                        "its format does not allow; copy the file again."
-                    )
-                yield line
-    except OSError as error:
-        raise _make_read_error(path, error) from error
+    with open_file(path) as file:
+        _check_size(path, file, max_bytes)
+        text = TextIOWrapper(file, encoding="utf-8-sig", errors=errors)
+        while line := text.readline(max_length + 1):
+            if len(line) > max_length:
+                raise InputError(
+                    f"{quote_value(path)} has a line of more than {max_length:,} characters, "
+                    "which its format does not allow; copy the file again."
+                )
+            yield line
 
 
 def check_plain(value: Any, path: Path, max_values: int) -> None:

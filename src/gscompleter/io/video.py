@@ -6,6 +6,7 @@ import subprocess
 from collections.abc import Iterable
 from contextlib import suppress
 from importlib.util import find_spec
+from itertools import chain
 from pathlib import Path
 
 import numpy as np
@@ -66,12 +67,19 @@ def write_video(path: Path, frames: Iterable[UInt8[np.ndarray, "h w 3"]], rate: 
     """
     iterator = iter(frames)
     first = next(iterator)
-    program = build_ffmpeg_command(path, first.shape[1], first.shape[0], rate)
-    process = subprocess.Popen(program, stdin=subprocess.PIPE, stderr=subprocess.PIPE)
+    size = f"{first.shape[1]}x{first.shape[0]}"
+    command = [
+        *(find_ffmpeg(), "-v", "error", "-y", "-nostdin"),
+        *("-f", "rawvideo", "-pix_fmt", "rgb24", "-s", size, "-r", str(rate)),
+        *("-i", "pipe:0", "-an", "-c:v", "libx264", "-preset", "medium", "-crf", str(QUALITY)),
+        *(*COLOR_OPTIONS, *PLAYER_OPTIONS, *REPRODUCIBLE_OPTIONS, str(path)),
+    ]
+    process = subprocess.Popen(command, stdin=subprocess.PIPE, stderr=subprocess.PIPE)
+    assert process.stdin is not None
     try:
-        send_frame(process, first)
-        for frame in iterator:
-            send_frame(process, frame)
+        for frame in chain([first], iterator):
+            with suppress(BrokenPipeError):  # if ffmpeg has ended, its exit code tells
+                process.stdin.write(np.ascontiguousarray(frame).data)
         _, messages = process.communicate()
     finally:  # also on an interrupt
         process.kill()
@@ -80,20 +88,3 @@ def write_video(path: Path, frames: Iterable[UInt8[np.ndarray, "h w 3"]], rate: 
         raise InputError(
             f"ffmpeg could not write {quote_value(path)}: {quote_value(messages.decode(), 200)}"
         )
-
-
-def send_frame(process: subprocess.Popen[bytes], frame: UInt8[np.ndarray, "h w 3"]) -> None:
-    """Write a frame to ffmpeg; if it has ended, its exit code is checked later."""
-    assert process.stdin is not None
-    with suppress(BrokenPipeError):
-        process.stdin.write(np.ascontiguousarray(frame).data)
-
-
-def build_ffmpeg_command(path: Path, width: int, height: int, rate: int) -> list[str]:
-    """Build the command line of ffmpeg for 8-bit RGB frames from standard input."""
-    return [
-        *(find_ffmpeg(), "-v", "error", "-y", "-nostdin"),
-        *("-f", "rawvideo", "-pix_fmt", "rgb24", "-s", f"{width}x{height}", "-r", str(rate)),
-        *("-i", "pipe:0", "-an", "-c:v", "libx264", "-preset", "medium", "-crf", str(QUALITY)),
-        *(*COLOR_OPTIONS, *PLAYER_OPTIONS, *REPRODUCIBLE_OPTIONS, str(path)),
-    ]

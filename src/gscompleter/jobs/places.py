@@ -21,8 +21,12 @@ from threading import Event, Thread
 from typing import Any, Protocol, runtime_checkable
 
 from gscompleter.errors import InputError, OutputError, quote_value
-from gscompleter.io.files import replace_file
-from gscompleter.io.unfinished import UNFINISHED_PREFIX, acquire_lock
+from gscompleter.io.files import UNFINISHED_PREFIX, replace_file
+
+try:
+    import fcntl
+except ImportError:  # not POSIX: no locks
+    fcntl = None  # type: ignore[assignment]
 
 LEASE_SECONDS = 90.0
 """Time without renewal after which a claim in a store expires; clocks must agree within it."""
@@ -151,7 +155,7 @@ class FolderPlace:
             raise make_write_error(target, error) from error
         try:
             # The last holder may have removed the file that has just been opened.
-            if acquire_lock(descriptor, wait=False) is False or not os.fstat(descriptor).st_nlink:
+            if acquire_lock(descriptor) is False or not os.fstat(descriptor).st_nlink:
                 yield None
                 return
             lost = parse_count(os.read(descriptor, 16))
@@ -170,9 +174,22 @@ class FolderPlace:
         except FileNotFoundError:
             return False
         try:
-            return acquire_lock(descriptor, wait=False) is False
+            return acquire_lock(descriptor) is False
         finally:
             os.close(descriptor)
+
+
+def acquire_lock(descriptor: int) -> bool | None:
+    """Lock a descriptor; False if another process holds it, None if locks are unsupported."""
+    if fcntl is None:
+        return None
+    try:
+        fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
+    except BlockingIOError:
+        return False
+    except OSError:
+        return None
+    return True
 
 
 def parse_count(content: bytes) -> int:

@@ -11,7 +11,7 @@ from typing import Literal
 import numpy as np
 from jaxtyping import Float
 
-from gscompleter.data.camera_list import has_camera_list, read_camera_list
+from gscompleter.data.camera_files import has_camera_list, read_camera_list
 from gscompleter.data.cameras import find_pose_defect
 from gscompleter.data.frame import Frame
 from gscompleter.data.local_origin import compute_frame_from_photographs, read_dataparser_transforms

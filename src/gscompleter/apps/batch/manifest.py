@@ -17,8 +17,8 @@ from pathlib import Path
 from typing import Any
 
 from gscompleter.errors import InputError, quote_value
+from gscompleter.io.files import UNFINISHED_PREFIX
 from gscompleter.io.reading import read_bytes
-from gscompleter.io.unfinished import UNFINISHED_PREFIX
 from gscompleter.jobs.jobs import Job, check_jobs, make_job_name
 from gscompleter.jobs.places import is_address, open_store
 

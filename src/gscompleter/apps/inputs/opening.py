@@ -28,13 +28,13 @@ from gscompleter.apps.inputs.selection import (
     select_near_and_far,
 )
 from gscompleter.apps.report.completion import InputSplatFile, Target
+from gscompleter.data.camera_files import refuse_other_exports
 from gscompleter.data.formats import find_format, open_photographs, refuse_scenes_below
 from gscompleter.data.local_origin import (
     choose_scene_origin,
     compute_frame_from_photographs,
     shift_to_origin,
 )
-from gscompleter.data.other_exports import refuse_other_exports
 from gscompleter.data.photographs import Photographs
 from gscompleter.data.points import add_depth_range
 from gscompleter.data.resize import Resolution

@@ -18,8 +18,12 @@ import numpy as np
 from jaxtyping import Float
 
 from gscompleter.data.cameras import Intrinsics
-from gscompleter.data.colmap.lenses import build_intrinsics, find_model
-from gscompleter.data.colmap.records import PosedImage, make_portable
+from gscompleter.data.colmap.records import (
+    PosedImage,
+    build_intrinsics,
+    build_posed_image,
+    find_model,
+)
 from gscompleter.errors import InputError, quote_value, refuse_pointer
 from gscompleter.io.reading import open_file
 
@@ -68,24 +72,19 @@ def _read_camera(records: _Records) -> tuple[int, Intrinsics]:
 
 def _read_image(records: _Records) -> PosedImage:
     _, *pose, camera = records.read_numbers(_IMAGE)
-    name = make_portable(records.read_string())
+    name = records.read_string()
     records.skip(records.read_count(_FEATURE.size) * _FEATURE.size)
-    return PosedImage(name, camera, tuple(pose[:4]), tuple(pose[4:]))
+    return build_posed_image(name, camera, pose)
 
 
 @contextmanager
 def _open_records(path: Path) -> Iterator[_Records]:
     refuse_pointer(path)
-    try:
-        with open_file(path) as file:
-            if os.fstat(file.fileno()).st_size == 0:
-                raise InputError(f"{quote_value(path)} is empty; export the model again.")
-            with mmap.mmap(file.fileno(), 0, access=mmap.ACCESS_READ) as content:
-                yield _Records(content, path)
-    except OSError as error:
-        raise InputError(
-            f"{quote_value(path)} cannot be read: {error.strerror}; correct the path."
-        ) from error
+    with open_file(path) as file:
+        if os.fstat(file.fileno()).st_size == 0:
+            raise InputError(f"{quote_value(path)} is empty; export the model again.")
+        with mmap.mmap(file.fileno(), 0, access=mmap.ACCESS_READ) as content:
+            yield _Records(content, path)
 
 
 class _Records:
@@ -124,6 +123,5 @@ class _Records:
     def _make_error(self) -> InputError:
         return InputError(
             f"{quote_value(self.path)} is truncated or no such file of COLMAP: it claims more "
-            "than its "
-            f"{len(self.content):,} bytes hold; export the model again."
+            f"than its {len(self.content):,} bytes hold; export the model again."
         )

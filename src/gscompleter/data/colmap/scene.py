@@ -12,9 +12,7 @@ from pathlib import Path
 import numpy as np
 from jaxtyping import Float
 
-from gscompleter.data.cameras import Intrinsics
 from gscompleter.data.colmap import binary, text
-from gscompleter.data.colmap.records import PosedImage
 from gscompleter.data.frame import Frame
 from gscompleter.data.image_folders import FOLDERS, ORIGINALS, ImageFinder, find_path, keep_existing
 from gscompleter.data.photographs import Photographs, build_photographs
@@ -64,9 +62,17 @@ def _select_largest(path: Path) -> tuple[Path, list[Frame], tuple[str, ...]]:
             f"There is no COLMAP model in {quote_value(path)}; a folder sparse/0 with its cameras "
             "and images, as .bin or .txt, is needed."
         )
-    frames = [_read_model_frames(model) for model in models]
+    files = [[_find_model_file(model, name) for name in FILES] for model in models]
+    frames = [_read_frames(cameras, images) for cameras, images in files if cameras and images]
     best = max(range(len(models)), key=lambda number: len(frames[number]))
-    return models[best], frames[best], _note_choice(models, [len(f) for f in frames], best)
+    notes: tuple[str, ...] = ()
+    if len(models) > 1:
+        others = ", ".join(str(len(f)) for number, f in enumerate(frames) if number != best)
+        notes = (
+            f"{len(models)} models lie in {models[best].parent}: {models[best].name} with "
+            f"{len(frames[best])} images is used; the others, with {others} images, are ignored.",
+        )
+    return models[best], frames[best], notes
 
 
 def read_image_file(path: Path) -> list[Frame]:
@@ -90,31 +96,22 @@ def _find_models(path: Path) -> list[Path]:
     """List the model folders of a scene, all from the first matching home."""
     if not os.path.isdir(path):
         return []
-    homes = [find_path(path, home) for home in HOMES]
-    found = ([f for f in (home, *_list_numbered(home)) if _is_model(f)] for home in homes if home)
+    homes = (find_path(path, home) for home in HOMES)
+    found = (_list_home(home) for home in homes if home)
     return next((models for models in found if models), [])
 
 
-def _list_numbered(home: Path) -> list[Path]:
+def _list_home(home: Path) -> list[Path]:
+    """List the models in a folder, which may be one itself."""
     names = os.listdir(home) if os.path.isdir(home) else []
-    return [home / name for name in sorted(names) if name.isdecimal()]
-
-
-def _is_model(folder: Path) -> bool:
-    return all(_find_model_file(folder, name) is not None for name in FILES)
+    folders = [home, *(home / name for name in sorted(names) if name.isdecimal())]
+    return [f for f in folders if all(_find_model_file(f, name) is not None for name in FILES)]
 
 
 def _find_model_file(folder: Path, name: str) -> Path | None:
     """Find a file of a model, preferring binary; None if there is none."""
     found = (find_path(folder, name + ending) for ending in _READERS)
     return next((path for path in found if path is not None and os.path.isfile(path)), None)
-
-
-def _read_model_frames(model: Path) -> list[Frame]:
-    cameras, images = (_find_model_file(model, name) for name in FILES)
-    assert cameras is not None
-    assert images is not None
-    return _read_frames(cameras, images)
 
 
 def _read_frames(cameras_file: Path, images_file: Path) -> list[Frame]:
@@ -127,20 +124,18 @@ def _read_frames(cameras_file: Path, images_file: Path) -> list[Frame]:
     if times > 1:
         raise InputError(
             f"{quote_value(images_file)} lists the image {quote_value(name)} {times:,} times; "
-            "export the "
-            "model again."
+            "export the model again."
         )
-    return [_make_frame(image, cameras, images_file) for image in images]
-
-
-def _make_frame(image: PosedImage, cameras: dict[int, Intrinsics], path: Path) -> Frame:
-    title = f"image {quote_value(image.name)} of {quote_value(path)}"
-    if image.camera not in cameras:
-        raise InputError(
-            f"The {title} was taken by camera {image.camera}, which is not in the cameras file "
-            "beside it; export the model again."
-        )
-    return Frame(image.name, title, image.c2w(), cameras[image.camera], None)
+    frames = []
+    for name, camera, c2w in images:
+        title = f"image {quote_value(name)} of {quote_value(images_file)}"
+        if camera not in cameras:
+            raise InputError(
+                f"The {title} was taken by camera {camera}, which is not in the cameras file "
+                "beside it; export the model again."
+            )
+        frames.append(Frame(name, title, c2w, cameras[camera], None))
+    return frames
 
 
 def _build_scene(
@@ -149,7 +144,12 @@ def _build_scene(
     roots = _list_roots(scene, model)
     finder = _make_finder(roots)
     there, missing = keep_existing([finder.locate(frame) for frame in frames], str(model))
-    notes += missing + _note_rotation(there[0])
+    notes, first = notes + missing, there[0]
+    if isinstance(first.image, Path) and has_orientation_tag(first.image):
+        notes += (
+            f"The EXIF rotation of the photographs, such as {quote_value(first.name)}, is ignored: "
+            "they are used as they are stored, like in COLMAP.",
+        )
     photographs = build_photographs(roots[-1].name, str(model), there)
     return replace(photographs, notes=notes, sparse=_make_point_reader(model))
 
@@ -163,37 +163,13 @@ def _make_finder(roots: Sequence[Path]) -> ImageFinder:
 def _list_roots(scene: Path, model: Path) -> list[Path]:
     """List the folders from the model up to the scene; names decide if a model itself is given."""
     top, roots = Path(os.path.abspath(scene)), [Path(os.path.abspath(model))]
-    while top in roots[-1].parents or _is_part(roots[-1]):
-        roots.append(roots[-1].parent)
-    return roots
-
-
-def _is_part(folder: Path) -> bool:
-    """Check whether a folder is one of `HOMES` or a numbered model in it."""
     parts = {part for home in HOMES if home for part in home.split("/")}
-    numbered = folder.name.isdecimal() and folder.parent.name.casefold() in parts
-    return numbered or folder.name.casefold() in parts
-
-
-def _note_choice(models: list[Path], sizes: list[int], best: int) -> tuple[str, ...]:
-    if len(models) == 1:
-        return ()
-    others = ", ".join(str(size) for number, size in enumerate(sizes) if number != best)
-    return (
-        f"{len(models)} models lie in {models[best].parent}: {models[best].name} with "
-        f"{sizes[best]} images is used; the others, with {others} images, are ignored.",
-    )
-
-
-def _note_rotation(frame: Frame) -> tuple[str, ...]:
-    """Note that COLMAP ignores the EXIF rotation of photographs."""
-    if not isinstance(frame.image, Path) or not has_orientation_tag(frame.image):
-        return ()
-    return (
-        f"The EXIF rotation of the photographs, such as {quote_value(frame.name)}, is ignored: "
-        "they are "
-        "used as they are stored, like in COLMAP.",
-    )
+    while True:
+        folder = roots[-1]
+        home = folder.parent if folder.name.isdecimal() else folder
+        if top not in folder.parents and home.name.casefold() not in parts:
+            return roots
+        roots.append(folder.parent)
 
 
 def _make_point_reader(model: Path) -> partial[Float[np.ndarray, "n 3"]] | None:

@@ -13,8 +13,12 @@ import numpy as np
 from jaxtyping import Float
 
 from gscompleter.data.cameras import Intrinsics
-from gscompleter.data.colmap.lenses import build_intrinsics, find_model
-from gscompleter.data.colmap.records import PosedImage, make_portable
+from gscompleter.data.colmap.records import (
+    PosedImage,
+    build_intrinsics,
+    build_posed_image,
+    find_model,
+)
 from gscompleter.errors import InputError, quote_value
 from gscompleter.io.reading import read_lines
 
@@ -72,9 +76,7 @@ def _parse_image(line: str, place: str) -> PosedImage:
         _, *pose = (float(word) for word in words)
         if len(pose) != 7:
             raise ValueError
-        return PosedImage(
-            make_portable(name.strip()), int(camera), tuple(pose[:4]), tuple(pose[4:])
-        )
+        return build_posed_image(name.strip(), int(camera), pose)
     except ValueError as error:
         form = "IMAGE_ID QW QX QY QZ TX TY TZ CAMERA_ID NAME"
         raise _make_error(place, line, form) from error

@@ -10,6 +10,7 @@ from __future__ import annotations
 import os
 import zipfile
 from collections.abc import Iterator, Mapping
+from dataclasses import replace
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -17,10 +18,17 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float
 
-from gscompleter.data.cameras import Intrinsics, compute_rotation
+from gscompleter.data.cameras import Intrinsics
+from gscompleter.data.driving.lidar import MAX_SWEEP, transform_finite
 from gscompleter.data.frame import Frame
-from gscompleter.data.json_fields import get_number, get_size, get_text
-from gscompleter.data.limits import MAX_COORDINATE, MAX_IN_PIXELS
+from gscompleter.data.json_fields import (
+    get_intrinsics,
+    get_list,
+    get_object,
+    get_pose,
+    get_size,
+    get_text,
+)
 from gscompleter.data.photographs import Photographs, build_photographs
 from gscompleter.errors import InputError, quote_value
 from gscompleter.io.json_file import read_json
@@ -30,8 +38,6 @@ CALIBRATIONS = "calibration"
 ADVICE = "download the scene again"
 MAX_SNIFFED = 1 << 26
 """Bytes read from a file to detect a scene."""
-MAX_SWEEP = 1 << 28
-"""Largest points of a lidar sweep, in bytes."""
 
 
 def has_dgp(path: Path) -> bool:
@@ -50,9 +56,7 @@ def open_dgp(path: Path) -> Iterator[Photographs]:
         raise InputError(f"There is no scene of DGP in {quote_value(path)}; name its scene.json.")
     content = read_json(file, ADVICE)
     cameras = _read_calibrations(file, content)
-    images = [
-        datum for datum in _get_list(content, "data") if "image" in _get_object(datum, "datum")
-    ]
+    images = [d for d in get_list(content, "data") if "image" in get_object(d, "datum")]
     sweeps = _map_sweeps(content)
     frames = sorted((_parse_frame(d, cameras, sweeps, file) for d in images), key=lambda f: f.name)
     if not frames:
@@ -64,7 +68,7 @@ def open_dgp(path: Path) -> Iterator[Photographs]:
 def _parse_frame(
     datum: Any, cameras: Mapping[str, Intrinsics], sweeps: Mapping[str, Any], file: Path
 ) -> Frame:
-    image, camera = _get_object(datum["datum"], "image"), _get_object(datum, "id").get("name")
+    image, camera = get_object(datum["datum"], "image"), get_object(datum, "id").get("name")
     name = get_text(image, "filename", str(file))
     title = f"image {quote_value(name)} of {quote_value(file)}"
     if name is None or not isinstance(camera, str) or camera not in cameras:
@@ -72,30 +76,29 @@ def _parse_frame(
             f"The {title} has no file name, or its camera {quote_value(camera)} is not in the "
             f"calibration; {ADVICE}."
         )
-    given = cameras[camera]
-    intrinsics = Intrinsics(get_size(image, title), given.focal, given.center)
-    sweep = _get_object(_get_object(sweeps.get(str(datum.get("key"))), "datum"), "point_cloud")
-    points = get_text(sweep, "filename", str(file))
-    pose = _parse_pose(_get_object(sweep, "pose"), str(file)) if points is not None else np.eye(4)
-    there = points is not None and os.path.isfile(file.parent / points)
-    return Frame(
-        name,
-        title,
-        _parse_pose(_get_object(image, "pose"), title),
-        intrinsics,
-        file.parent / name,
-        sensor=camera,
-        laser_points=partial(_read_points, file.parent / str(points), pose) if there else None,
-    )
+    intrinsics = replace(cameras[camera], size=get_size(image, title))
+    sweep = get_object(get_object(sweeps.get(str(datum.get("key"))), "datum"), "point_cloud")
+    points, read = get_text(sweep, "filename", str(file)), None
+    if points is not None:
+        pose = _get_pose(sweep, str(file))
+        exists = os.path.isfile(file.parent / points)
+        read = partial(_read_points, file.parent / points, pose) if exists else None
+    c2w, place = _get_pose(image, title), file.parent / name
+    return Frame(name, title, c2w, intrinsics, place, sensor=camera, laser_points=read)
+
+
+def _get_pose(entry: Mapping[str, Any], title: str) -> Float[np.ndarray, "4 4"]:
+    quaternion = ("qw", "qx", "qy", "qz")
+    return get_pose(entry.get("pose"), "translation", "rotation", quaternion, title)
 
 
 def _map_sweeps(content: Any) -> dict[str, Any]:
     """Map the key of each datum to the point cloud of its sample."""
-    data = {str(d.get("key")): d for d in _get_list(content, "data") if isinstance(d, dict)}
+    data = {str(d.get("key")): d for d in get_list(content, "data") if isinstance(d, dict)}
     found: dict[str, Any] = {}
-    for sample in _get_list(content, "samples"):
-        keys = [str(key) for key in _get_list(sample, "datum_keys")]
-        clouds = [k for k in keys if "point_cloud" in _get_object(data.get(k), "datum")]
+    for sample in get_list(content, "samples"):
+        keys = [str(key) for key in get_list(sample, "datum_keys")]
+        clouds = [k for k in keys if "point_cloud" in get_object(data.get(k), "datum")]
         found |= {key: data[clouds[0]] for key in keys if clouds}
     return found
 
@@ -103,68 +106,38 @@ def _map_sweeps(content: Any) -> dict[str, Any]:
 def _read_points(
     path: Path, world_from_laser: Float[np.ndarray, "4 4"]
 ) -> Float[np.ndarray, "n 3"]:
-    """Read the finite points of a sweep in the world frame."""
+    """Read the points of a sweep in the world frame: the first three columns of `data`."""
     try:
         with open_file(path) as file, zipfile.ZipFile(file) as archive:
-            points = _read_array(archive)
-        finite = points[np.isfinite(points).all(axis=1)]
+            if archive.getinfo("data.npy").file_size > MAX_SWEEP:
+                raise ValueError
+            with archive.open("data.npy") as member:
+                table = np.lib.format.read_array(member, allow_pickle=False)
+        if table.ndim != 2 or table.shape[1] < 3 or table.dtype.kind not in "fiu":
+            raise ValueError
+        return transform_finite(table[:, :3].astype(np.float64), world_from_laser)
     except InputError:
         raise
     except Exception as error:  # damaged archives and arrays raise anything
         raise InputError(f"{quote_value(path)} is no point cloud of DGP; {ADVICE}.") from error
-    return finite @ world_from_laser[:3, :3].T + world_from_laser[:3, 3]
-
-
-def _read_array(archive: zipfile.ZipFile) -> Float[np.ndarray, "n 3"]:
-    """Read the first three columns of `data`; raises a ValueError if unsuitable or too large."""
-    if archive.getinfo("data.npy").file_size > MAX_SWEEP:
-        raise ValueError
-    with archive.open("data.npy") as file:
-        table = np.lib.format.read_array(file, allow_pickle=False)
-    if table.ndim != 2 or table.shape[1] < 3 or table.dtype.kind not in "fiu":
-        raise ValueError
-    return table[:, :3].astype(np.float64)
-
-
-def _parse_pose(pose: Mapping[str, Any], title: str) -> Float[np.ndarray, "4 4"]:
-    def read_numbers(part: str, *keys: str) -> list[float]:
-        entry = _get_object(pose, part)
-        return [get_number(entry, key, title, -MAX_COORDINATE, MAX_COORDINATE) for key in keys]
-
-    c2w = np.eye(4)
-    c2w[:3, :3] = compute_rotation(read_numbers("rotation", "qw", "qx", "qy", "qz"))
-    c2w[:3, 3] = read_numbers("translation", "x", "y", "z")
-    return c2w
 
 
 def _read_calibrations(scene: Path, content: Any) -> dict[str, Intrinsics]:
     """Read the intrinsics by camera name, without image sizes."""
     file = _find_calibration_file(scene, content)
     calibration = read_json(file, ADVICE)
-    names, entries = _get_list(calibration, "names"), _get_list(calibration, "intrinsics")
+    names, entries = get_list(calibration, "names"), get_list(calibration, "intrinsics")
     # Entries of other sensors are zeros.
-    pairs = [(n, e) for n, e in zip(names, entries, strict=False) if _is_camera(n, e)]
     return {
-        name: _parse_intrinsics(entry, f"camera {quote_value(name)} of {quote_value(file)}")
-        for name, entry in pairs
+        name: get_intrinsics(entry, f"camera {quote_value(name)} of {quote_value(file)}")
+        for name, entry in zip(names, entries, strict=False)
+        if isinstance(name, str) and isinstance(entry, dict) and entry.get("fx") not in (None, 0)
     }
-
-
-def _is_camera(name: Any, entry: Any) -> bool:
-    return isinstance(name, str) and isinstance(entry, dict) and entry.get("fx") not in (None, 0)
-
-
-def _parse_intrinsics(entry: Mapping[str, Any], title: str) -> Intrinsics:
-    fx, fy = (
-        get_number(entry, key, title, 1 / MAX_IN_PIXELS, MAX_IN_PIXELS) for key in ("fx", "fy")
-    )
-    cx, cy = (get_number(entry, key, title, -MAX_IN_PIXELS, MAX_IN_PIXELS) for key in ("cx", "cy"))
-    return Intrinsics(None, (fx, fy), (cx, cy))
 
 
 def _find_calibration_file(scene: Path, content: Any) -> Path:
     """Find the calibration of the first sample: `calibration/KEY.json` or calibration.json."""
-    samples = _get_list(content, "samples")
+    samples = get_list(content, "samples")
     key = samples[0].get("calibration_key") if samples and isinstance(samples[0], dict) else None
     folder = scene.parent / CALIBRATIONS
     candidates = [folder / f"{key}.json", scene.with_name(f"{CALIBRATIONS}.json")]
@@ -179,20 +152,5 @@ def _find_calibration_file(scene: Path, content: Any) -> Path:
 
 def _find_scene_file(path: Path) -> Path | None:
     files = sorted(path.glob("scene*.json")) if os.path.isdir(path) else [path]
-    return next((file for file in files if _is_scene(file)), None)
-
-
-def _is_scene(path: Path) -> bool:
-    if path.suffix != ".json" or not os.path.isfile(path):
-        return False
-    return b'"datum"' in read_head(path, MAX_SNIFFED)
-
-
-def _get_list(content: Any, key: str) -> list[Any]:
-    value = content.get(key) if isinstance(content, dict) else None
-    return value if isinstance(value, list) else []
-
-
-def _get_object(content: Any, key: str) -> dict[str, Any]:
-    value = content.get(key) if isinstance(content, dict) else None
-    return value if isinstance(value, dict) else {}
+    files = [file for file in files if file.suffix == ".json" and os.path.isfile(file)]
+    return next((file for file in files if b'"datum"' in read_head(file, MAX_SNIFFED)), None)

@@ -7,8 +7,9 @@ samples of one drive make a scene.
 from __future__ import annotations
 
 import os
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import suppress
+from dataclasses import dataclass
 from functools import partial
 from itertools import pairwise
 from pathlib import Path
@@ -18,10 +19,17 @@ import numpy as np
 from jaxtyping import Float
 
 from gscompleter.data.cameras import Intrinsics
-from gscompleter.data.driving.moving_objects import Box, build_upright_pose
+from gscompleter.data.driving.moving_objects import Box, build_upright_pose, convert_speed
 from gscompleter.data.driving.restricted_pickle import load_plain
 from gscompleter.data.frame import Frame
-from gscompleter.data.json_fields import get_array, get_number, get_optional_number, get_text
+from gscompleter.data.json_fields import (
+    get_array,
+    get_list,
+    get_number,
+    get_object,
+    get_optional_number,
+    get_text,
+)
 from gscompleter.data.limits import MAX_IN_PIXELS, MAX_SIDE
 from gscompleter.data.photographs import Photographs, build_drive
 from gscompleter.errors import InputError, quote_value
@@ -60,70 +68,55 @@ def open_infos(path: Path) -> Iterator[Photographs]:
     beside the pickle and below it.
     """
     content = load_plain(path)
-    samples = content.get("data_list") if isinstance(content, dict) else None
-    if not isinstance(samples, list) or not samples:
+    samples = get_list(content, "data_list")
+    if not samples:
         raise InputError(f"{quote_value(path)} holds no infos with a `data_list`; {ADVICE}.")
-    kinds = _map_classes(content.get("metainfo"))
-    ordered = sorted(
-        (_Sample(path, kinds, *_check_sample(s, path)) for s in samples), key=_Sample.make_sort_key
-    )
-    return (_build_scene(path, scene) for scene in _split_scenes(ordered))
+    classes = get_object(content.get("metainfo"), "categories").items()
+    kinds = {n: kind for kind, n in classes if isinstance(n, int) and isinstance(kind, str)}
+    ordered = sorted((_parse_sample(s, path) for s in samples), key=lambda s: (s.drive, s.time))
+    return (_build_scene(path, scene, kinds) for scene in _split_scenes(ordered))
 
 
+@dataclass(frozen=True)
 class _Sample:
     """Record of the vehicle at one time."""
 
-    def __init__(
-        self,
-        file: Path,
-        kinds: Mapping[int, str],
-        content: dict[str, Any],
-        images: dict[str, dict[str, Any]],
-        title: str,
-    ) -> None:
-        self.file, self.kinds, self.content, self.images = file, kinds, content, images
-        self.title = title
-        time = get_number(content, "timestamp", title, 0.0, MAX_TIME * 1e6)
-        self.time = time * 1e-6 if time >= MICROSECONDS else time
-        first = images.get(FRONT) or next(iter(images.values()))
-        file_name = os.path.basename(get_text(first, "img_path", title) or "")
-        self.drive = get_text(content, "context_name", title) or file_name.split("__")[0]
-
-    def make_sort_key(self) -> tuple[str, float]:
-        return self.drive, self.time
+    drive: str
+    time: float
+    """Time in seconds."""
+    title: str
+    content: dict[str, Any]
+    images: dict[str, dict[str, Any]]
+    """Images by camera."""
 
     @property
-    def vehicle(self) -> Float[np.ndarray, "4 4"]:
-        return _get_numbers(self.content, "ego2global", (4, 4), self.title)
-
-    @property
-    def vehicle_from_laser(self) -> Float[np.ndarray, "4 4"]:
-        """Pose of the laser; identity for Waymo infos."""
-        lidar = self.content.get("lidar_points")
-        if not isinstance(lidar, dict) or "lidar2ego" not in lidar:
-            return np.eye(4)
-        return _get_numbers(lidar, "lidar2ego", (4, 4), self.title)
+    def world_from_laser(self) -> Float[np.ndarray, "4 4"]:
+        vehicle = _get_numbers(self.content, "ego2global", (4, 4), self.title)
+        lidar = get_object(self.content, "lidar_points")
+        if "lidar2ego" not in lidar:  # in Waymo's infos the laser frame is that of the vehicle
+            return vehicle
+        return vehicle @ _get_numbers(lidar, "lidar2ego", (4, 4), self.title)
 
 
-def _check_sample(sample: Any, path: Path) -> tuple[dict[str, Any], dict[str, dict[str, Any]], str]:
-    """Return a sample, its images by camera, and its name in errors."""
+def _parse_sample(sample: Any, path: Path) -> _Sample:
     title = f"a sample of {quote_value(path)}"
     images = sample.get("images") if isinstance(sample, dict) else None
     if not isinstance(images, dict):
         raise InputError(f"An entry of {quote_value(path)} has no `images`; {ADVICE}.")
-    there = {
+    needed = ("img_path", "cam2img", "lidar2cam")
+    posed = {
         quote_value(name): image
         for name, image in images.items()
-        if isinstance(name, str) and _is_posed(image)
+        if isinstance(name, str)
+        and all(get_object(images, name).get(n) is not None for n in needed)
     }
-    if not there:
+    if not posed:
         raise InputError(f"The images of {title} have no file or no pose; {ADVICE}.")
-    return sample, there, title
-
-
-def _is_posed(image: Any) -> bool:
-    needed = ("img_path", "cam2img", "lidar2cam")
-    return isinstance(image, dict) and all(image.get(key) is not None for key in needed)
+    time = get_number(sample, "timestamp", title, 0.0, MAX_TIME * 1e6)
+    first = posed.get(FRONT) or next(iter(posed.values()))
+    file = os.path.basename(get_text(first, "img_path", title) or "")
+    drive = get_text(sample, "context_name", title) or file.split("__")[0]
+    return _Sample(drive, time * 1e-6 if time >= MICROSECONDS else time, title, sample, posed)
 
 
 def _split_scenes(samples: list[_Sample]) -> Iterator[list[_Sample]]:
@@ -137,41 +130,38 @@ def _split_scenes(samples: list[_Sample]) -> Iterator[list[_Sample]]:
     yield scene
 
 
-def _build_scene(path: Path, samples: list[_Sample]) -> Photographs:
-    cameras = {name: None for sample in samples for name in sample.images}
+def _build_scene(path: Path, samples: list[_Sample], kinds: Mapping[int, str]) -> Photographs:
+    cameras = {name for sample in samples for name in sample.images}
     names = sorted(cameras, key=lambda name: (name != FRONT, name))
-    frames = [_make_frame(s, name) for name in names for s in samples if name in s.images]
+    frames = [
+        _make_frame(path, s, name, kinds) for name in names for s in samples if name in s.images
+    ]
     called = f"{samples[0].drive}_{samples[0].time:.3f}"
     return build_drive(called, str(path), frames, front=names[0])
 
 
-def _make_frame(sample: _Sample, camera: str) -> Frame:
+def _make_frame(path: Path, sample: _Sample, camera: str, kinds: Mapping[int, str]) -> Frame:
     image = sample.images[camera]
-    title = f"the photograph of {camera} at {sample.time:.3f} in {quote_value(sample.file)}"
+    title = f"the photograph of {camera} at {sample.time:.3f} in {quote_value(path)}"
     file = get_text(image, "img_path", title)
     assert file is not None
-    laser_from_camera = _invert(_get_numbers(image, "lidar2cam", (4, 4), title))
-    with np.errstate(over="ignore", invalid="ignore"):  # leaves a defect of the pose
+    camera_from_laser = _get_numbers(image, "lidar2cam", (4, 4), title)
+    c2w = np.full((4, 4), np.nan)  # stays where the pose is singular, which is a defect of it
+    with np.errstate(over="ignore", invalid="ignore"), suppress(np.linalg.LinAlgError):
         # Through the laser frame: lidar2cam includes the vehicle's motion between the
         # times of laser and camera.
-        c2w = sample.vehicle @ sample.vehicle_from_laser @ laser_from_camera
+        c2w = sample.world_from_laser @ np.linalg.inv(camera_from_laser)
+    things = [t for t in get_list(sample.content, "instances") if isinstance(t, dict)]
+    has_speeds = any("velocity" in thing for thing in things)  # as in nuScenes
     return Frame(
         f"{camera}/{os.path.basename(file)}",
         title,
         c2w,
         _parse_intrinsics(image, title),
-        _find_image(sample.file.parent, file, camera),
+        _find_image(path.parent, file, camera),
         sensor=camera,
-        boxes=partial(_read_boxes, sample) if _has_speeds(sample) else None,
+        boxes=partial(_read_boxes, path, sample, things, kinds) if has_speeds else None,
     )
-
-
-def _invert(matrix: Float[np.ndarray, "4 4"]) -> Float[np.ndarray, "4 4"]:
-    """Invert a transform; NaN if singular, which counts as a defect of the pose."""
-    try:
-        return np.linalg.inv(matrix)
-    except np.linalg.LinAlgError:
-        return np.full((4, 4), np.nan)
 
 
 def _parse_intrinsics(image: Mapping[str, Any], title: str) -> Intrinsics:
@@ -206,41 +196,21 @@ def _find_image(folder: Path, file: str, camera: str) -> Path:
     return next((place for place in places if os.path.isfile(place)), places[0])
 
 
-def _map_classes(metainfo: Any) -> dict[int, str]:
-    kinds = metainfo.get("categories") if isinstance(metainfo, dict) else None
-    pairs = kinds.items() if isinstance(kinds, dict) else ()
-    return {n: kind for kind, n in pairs if isinstance(n, int) and isinstance(kind, str)}
-
-
-def _has_speeds(sample: _Sample) -> bool:
-    """Check whether objects have velocities, as in nuScenes."""
-    things = sample.content.get("instances")
-    return isinstance(things, list) and any(
-        isinstance(thing, dict) and "velocity" in thing for thing in things
-    )
-
-
-def _read_boxes(sample: _Sample) -> tuple[Box, ...]:
+def _read_boxes(
+    path: Path, sample: _Sample, things: Sequence[dict[str, Any]], kinds: Mapping[int, str]
+) -> tuple[Box, ...]:
     """Read the boxes of objects that may move; in the infos they are in the laser frame."""
-    title = f"a box in {quote_value(sample.file)}"
-    world = sample.vehicle @ sample.vehicle_from_laser
-    things = [thing for thing in sample.content["instances"] if isinstance(thing, dict)]
-    return tuple(
-        _parse_box(t, world, title) for t in things if _get_class(sample, t) not in STATIC_CLASSES
-    )
-
-
-def _get_class(sample: _Sample, thing: Mapping[str, Any]) -> str | None:
-    label = thing.get("bbox_label_3d")
-    return sample.kinds.get(label) if isinstance(label, int) else None
+    title, world = f"a box in {quote_value(path)}", sample.world_from_laser
+    labels = [thing.get("bbox_label_3d") for thing in things]
+    classes = [kinds.get(label) if isinstance(label, int) else None for label in labels]
+    pairs = zip(things, classes, strict=True)
+    return tuple(_parse_box(t, world, title) for t, kind in pairs if kind not in STATIC_CLASSES)
 
 
 def _parse_box(thing: Mapping[str, Any], world: Float[np.ndarray, "4 4"], title: str) -> Box:
     center, sides, heading = np.split(_get_numbers(thing, "bbox_3d", (7,), title), [3, 6])
-    velocity = (
-        _get_numbers(thing, "velocity", (2,), title) if "velocity" in thing else np.full(2, np.nan)
-    )
-    speed = float(np.linalg.norm(velocity))
+    unknown = np.full(2, np.nan)
+    velocity = _get_numbers(thing, "velocity", (2,), title) if "velocity" in thing else unknown
     length, width, height = sides.tolist()
     pose = world @ build_upright_pose(center, float(heading[0]))
-    return Box(pose, (length, width, height), speed if np.isfinite(speed) else None)
+    return Box(pose, (length, width, height), convert_speed(velocity))

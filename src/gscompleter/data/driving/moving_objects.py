@@ -54,6 +54,12 @@ def build_upright_pose(center: Float[np.ndarray, "3"], heading: float) -> Float[
     return pose
 
 
+def convert_speed(velocity: Float[np.ndarray, "_"]) -> float | None:
+    """Convert a velocity to a speed; None if it is unknown (NaN)."""
+    speed = float(np.linalg.norm(velocity))
+    return speed if np.isfinite(speed) else None
+
+
 def mask_moving(
     boxes: Iterable[Box], camera: Camera, origin: Float[np.ndarray, "3"]
 ) -> Bool[np.ndarray, "h w"]:
@@ -63,10 +69,8 @@ def mask_moving(
     """
     mask = np.zeros((camera.height, camera.width), np.uint8)
     for box in boxes:
-        outline = (
-            _compute_outline(box.compute_corners() - origin, camera) if box.is_moving else None
-        )
-        if outline is not None:
+        outline = _compute_outline(box.compute_corners() - origin, camera)
+        if box.is_moving and outline is not None:
             cv2.fillConvexPoly(mask, outline, 1)
     return mask > 0
 
@@ -77,17 +81,13 @@ def _compute_outline(corners: Float[np.ndarray, "8 3"], camera: Camera) -> np.nd
     local = (corners - c2w[:3, 3]) @ c2w[:3, :3]
     if not np.isfinite(local).all() or local[:, 2].max() <= NEAREST:
         return None
-    shown = _clip_near(local)
-    pixels = (shown @ K.T)[:, :2] / shown[:, 2:]
+    # The box is clipped at `NEAREST`.
+    shown = [corner for corner in local if corner[2] > NEAREST]
+    for a, b in combinations(local, 2):
+        if (a[2] > NEAREST) != (b[2] > NEAREST):
+            shown.append(a + (NEAREST - a[2]) / (b[2] - a[2]) * (b - a))
+    points = np.array(shown)
+    pixels = (points @ K.T)[:, :2] / points[:, 2:]
     # OpenCV puts the centre of the first pixel at (0, 0).
     pixels = np.clip(pixels - 0.5, -MAX_PIXELS, MAX_PIXELS)
     return cv2.convexHull(np.rint(pixels).astype(np.int32))
-
-
-def _clip_near(corners: Float[np.ndarray, "8 3"]) -> Float[np.ndarray, "n 3"]:
-    """Clip a box (camera axes) at `NEAREST`."""
-    kept = [corner for corner in corners if corner[2] > NEAREST]
-    for a, b in combinations(corners, 2):
-        if (a[2] > NEAREST) != (b[2] > NEAREST):
-            kept.append(a + (NEAREST - a[2]) / (b[2] - a[2]) * (b - a))
-    return np.array(kept)

@@ -10,15 +10,9 @@ import os
 from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
 
-import numpy as np
-from jaxtyping import Float
-
-from gscompleter.data.cameras import Intrinsics, compute_rotation
 from gscompleter.data.frame import Frame
-from gscompleter.data.json_fields import get_number
-from gscompleter.data.limits import MAX_COORDINATE, MAX_IN_PIXELS
+from gscompleter.data.json_fields import get_intrinsics, get_pose
 from gscompleter.data.photographs import Photographs, build_drive
 from gscompleter.errors import InputError, quote_value
 from gscompleter.io.json_file import read_json
@@ -51,38 +45,15 @@ def open_pandaset(path: Path) -> Iterator[Photographs]:
     yield replace(found, notes=(NO_DEPTH,))
 
 
-def _read_frames(folder: Path) -> list[Frame]:
-    poses = read_json(folder / POSES, ADVICE)
+def _read_frames(folder: Path) -> Iterator[Frame]:
+    poses, lens = (read_json(folder / name, ADVICE) for name in (POSES, INTRINSICS))
     if not isinstance(poses, list):
         raise InputError(f"{quote_value(folder / POSES)} is no list of poses; {ADVICE}.")
-    intrinsics = _read_intrinsics(folder / INTRINSICS)
-    return [_make_frame(folder, number, pose, intrinsics) for number, pose in enumerate(poses)]
-
-
-def _make_frame(folder: Path, number: int, pose: Any, intrinsics: Intrinsics) -> Frame:
-    title = f"pose {number} of {quote_value(folder / POSES)}"
-    image = folder / f"{number:02d}"
-    name = f"{folder.name}/{image.name}"
-    return Frame(name, title, _parse_pose(pose, title), intrinsics, image, sensor=folder.name)
-
-
-def _parse_pose(pose: Any, title: str) -> Float[np.ndarray, "4 4"]:
-    def read_numbers(part: str, keys: str) -> list[float]:
-        entry = pose.get(part) if isinstance(pose, dict) else None
-        entry = entry if isinstance(entry, dict) else {}
-        return [get_number(entry, key, title, -MAX_COORDINATE, MAX_COORDINATE) for key in keys]
-
-    c2w = np.eye(4)
-    c2w[:3, :3] = compute_rotation(read_numbers("heading", "wxyz"))
-    c2w[:3, 3] = read_numbers("position", "xyz")
-    return c2w
-
-
-def _read_intrinsics(path: Path) -> Intrinsics:
-    content = read_json(path, ADVICE)
-    entry, title = content if isinstance(content, dict) else {}, quote_value(path)
-    fx, fy = (
-        get_number(entry, key, title, 1 / MAX_IN_PIXELS, MAX_IN_PIXELS) for key in ("fx", "fy")
-    )
-    cx, cy = (get_number(entry, key, title, -MAX_IN_PIXELS, MAX_IN_PIXELS) for key in ("cx", "cy"))
-    return Intrinsics(None, (fx, fy), (cx, cy))
+    entry = lens if isinstance(lens, dict) else {}
+    intrinsics = get_intrinsics(entry, quote_value(folder / INTRINSICS))
+    for number, pose in enumerate(poses):
+        title = f"pose {number} of {quote_value(folder / POSES)}"
+        c2w = get_pose(pose, "position", "heading", "wxyz", title)
+        image = folder / f"{number:02d}"
+        name = f"{folder.name}/{image.name}"
+        yield Frame(name, title, c2w, intrinsics, image, sensor=folder.name)

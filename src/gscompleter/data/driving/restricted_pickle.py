@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import io
 import pickle
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -69,10 +69,10 @@ class _Kind:
     def __setstate__(self, state: tuple[Any, ...]) -> None:
         self.order = state[1] if state[1] in ("<", ">", "=") else "="
 
-
-def _build_number(kind: _Kind, data: bytes) -> bool | int | float:
-    (value,) = np.frombuffer(data, np.dtype(kind.order + kind.code)).tolist()
-    return value
+    def build(self, data: bytes) -> bool | int | float:
+        """Build the Python number of these bytes."""
+        (value,) = np.frombuffer(data, np.dtype(self.order + self.code)).tolist()
+        return value
 
 
 def _encode(text: str, encoding: str) -> bytes:
@@ -82,35 +82,32 @@ def _encode(text: str, encoding: str) -> bytes:
 
 
 CONSTRUCTORS: dict[tuple[str, str], Callable[..., Any]] = {
-    ("numpy.core.multiarray", "scalar"): _build_number,
+    ("numpy.core.multiarray", "scalar"): _Kind.build,
     ("numpy", "dtype"): _Kind,
     ("_codecs", "encode"): _encode,
 }
 """Constructors for the accepted names."""
 
 
-def _guard(code: bytes, is_plain: Callable[[list[Any]], bool]) -> Callable[[Any], None]:
-    """Run an instruction only if the unpickler's stack is plain."""
+def _guard(code: bytes, part: slice, *types: type) -> Callable[[Any], None]:
+    """Run an instruction only if a part of the unpickler's stack has these types."""
     load: Callable[[Any], None] = pickle._Unpickler.dispatch[code[0]]
 
     def load_guarded(unpickler: Any) -> None:
-        if not is_plain(unpickler.stack):
+        if not all(isinstance(value, types) for value in unpickler.stack[part]):
             raise pickle.UnpicklingError("it holds a key or an object that is not plain")
         load(unpickler)
 
     return load_guarded
 
 
-def _has_plain_keys(keys: Sequence[Any]) -> bool:
-    return all(key is None or isinstance(key, (str, int, float)) for key in keys)
-
-
+_KEYS = (str, int, float, type(None))
 _Plain.dispatch = {
     **pickle._Unpickler.dispatch,
-    pickle.SETITEM[0]: _guard(pickle.SETITEM, lambda stack: _has_plain_keys(stack[-2:-1])),
-    pickle.SETITEMS[0]: _guard(pickle.SETITEMS, lambda stack: _has_plain_keys(stack[::2])),
-    pickle.DICT[0]: _guard(pickle.DICT, lambda stack: _has_plain_keys(stack[::2])),
-    pickle.BUILD[0]: _guard(pickle.BUILD, lambda stack: isinstance(stack[-2], _Kind)),
+    pickle.SETITEM[0]: _guard(pickle.SETITEM, slice(-2, -1), *_KEYS),
+    pickle.SETITEMS[0]: _guard(pickle.SETITEMS, slice(None, None, 2), *_KEYS),
+    pickle.DICT[0]: _guard(pickle.DICT, slice(None, None, 2), *_KEYS),
+    pickle.BUILD[0]: _guard(pickle.BUILD, slice(-2, -1), _Kind),
 }
 for _code in (pickle.EMPTY_SET, pickle.ADDITEMS, pickle.FROZENSET):
     del _Plain.dispatch[_code[0]]

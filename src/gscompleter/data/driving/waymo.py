@@ -1,5 +1,7 @@
 """Segments of the Waymo Open Dataset, version 2: a parquet file per component and segment.
 
+The files are read through pyarrow (`pip install 'gscompleter[waymo]'`).
+
 `camera_image/SEGMENT.parquet` holds the photographs, a row per camera and time, with the vehicle
 pose; `camera_calibration` the cameras. If present, `lidar`, `lidar_calibration`, `lidar_pose` and
 `vehicle_pose` give sparse depth, and `lidar_box` moving objects. Axes of vehicle and cameras are x
@@ -9,7 +11,7 @@ forward, y left, z up.
 from __future__ import annotations
 
 import os
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from functools import lru_cache, partial
 from pathlib import Path
@@ -19,21 +21,30 @@ import numpy as np
 from jaxtyping import Float
 
 from gscompleter.data.cameras import Intrinsics
-from gscompleter.data.driving.moving_objects import Box, build_upright_pose
-from gscompleter.data.driving.parquet import ADVICE, read_columns
-from gscompleter.data.driving.range_image import (
-    build_poses,
-    compute_inclinations,
-    compute_points,
-    transform_points,
-)
+from gscompleter.data.driving.lidar import build_poses, compute_points, transform_points
+from gscompleter.data.driving.moving_objects import Box, build_upright_pose, convert_speed
 from gscompleter.data.frame import Frame
 from gscompleter.data.limits import MAX_SIDE
 from gscompleter.data.photographs import Photographs, build_drive
 from gscompleter.data.undistort import Distortion
 from gscompleter.errors import InputError, quote_value
+from gscompleter.io.reading import check_file
 
+ADVICE = "download it again"
 IMAGES = "camera_image"
+COMPONENTS = {
+    IMAGES: "CameraImageComponent",
+    "camera_calibration": "CameraCalibrationComponent",
+    "lidar": "LiDARComponent",
+    "lidar_calibration": "LiDARCalibrationComponent",
+    "lidar_pose": "LiDARPoseComponent",
+    "vehicle_pose": "VehiclePoseComponent",
+    "lidar_box": "LiDARBoxComponent",
+}
+"""Prefixes of the columns of each component."""
+TIME, CAMERA, LASER = "key.frame_timestamp_micros", "key.camera_name", "key.laser_name"
+LENS = ("width", "height", *(f"intrinsic.{name}" for name in ("f_u", "f_v", "c_u", "c_v")))
+LENS_DISTORTION = tuple(f"intrinsic.{name}" for name in ("k1", "k2", "k3", "p1", "p2"))
 CAMERAS = {1: "FRONT", 2: "FRONT_LEFT", 3: "FRONT_RIGHT", 4: "SIDE_LEFT", 5: "SIDE_RIGHT"}
 """Camera names by their numbers in the tables."""
 SIGN = 3
@@ -43,11 +54,10 @@ CAMERA_FROM_OPENCV = np.array(
 )
 """Axis change from x right, y down, z forward to x forward, y left, z up."""
 
-Beams = tuple[Float[np.ndarray, "h"] | None, float, float]
+Beams = tuple[Float[np.ndarray, "h"] | None, float | None, float | None]
 """Beam elevations of a laser in radians, ascending, and their lower and upper end."""
-
-LENS = ("f_u", "f_v", "c_u", "c_v", "k1", "k2", "k3", "p1", "p2")
-TIME, CAMERA, LASER = "key.frame_timestamp_micros", "key.camera_name", "key.laser_name"
+PosedLens = tuple[Intrinsics, Float[np.ndarray, "4 4"]]
+"""Intrinsics of a camera, and its pose on the vehicle in Waymo's axes."""
 
 
 def has_waymo(path: Path) -> bool:
@@ -62,12 +72,8 @@ def open_waymo(path: Path) -> Iterator[Photographs]:
 
     Frames are numbered camera by camera, the front camera first, and by time.
     """
-    if os.path.isdir(path):
-        names = [file.stem for file in sorted((path / IMAGES).glob("*.parquet"))]
-        segments = [Segment(path, name) for name in names]
-    else:
-        segments = [Segment(path.parent.parent, path.stem)]
-    return map(_open_segment, segments)
+    files = sorted((path / IMAGES).glob("*.parquet")) if os.path.isdir(path) else [path]
+    return (_open_segment(Segment(file.parent.parent, file.stem)) for file in files)
 
 
 @dataclass(frozen=True)
@@ -87,89 +93,113 @@ class Segment:
         return all(os.path.isfile(self.get_path(component)) for component in components)
 
     def read_rows(
-        self, component: str, columns: dict[str, str], **where: int
-    ) -> Iterator[dict[str, Any]]:
-        """Read rows of a component as dicts with the keys of `columns`, filtered by `where`."""
-        keys = {{"time": TIME, "camera": CAMERA}[key]: value for key, value in where.items()}
-        found = read_columns(self.get_path(component), list(columns.values()), keys)
-        values = [found[column] for column in columns.values()]
-        return (dict(zip(columns, row, strict=True)) for row in zip(*values, strict=True))
+        self, component: str, columns: Sequence[str], where: Mapping[str, int] | None = None
+    ) -> Iterator[tuple[Any, ...]]:
+        """Read columns of a component, named without its prefix, row by row.
+
+        Only rows where the columns of `where` have these values are read. Lists of numbers become
+        arrays; null becomes None.
+        """
+        prefix = f"[{COMPONENTS[component]}]."
+        names = [name if name.startswith("key.") else prefix + name for name in columns]
+        table = _read_table(self.get_path(component), names, where or {})
+        values = [[_to_plain(value) for value in table.column(name)] for name in names]
+        return zip(*values, strict=True)
+
+
+def _read_table(path: Path, columns: Sequence[str], where: Mapping[str, int]) -> Any:
+    try:
+        import pyarrow
+        from pyarrow import dataset
+    except ImportError as error:
+        raise InputError(
+            f"{quote_value(path)} is a parquet file, and pyarrow is not installed; run "
+            "`pip install 'gscompleter[waymo]'`."
+        ) from error
+    check_file(path)
+    try:
+        table = dataset.dataset(path, format="parquet")
+        absent = [name for name in (*columns, *where) if name not in table.schema.names]
+        if absent:
+            raise InputError(
+                f"{quote_value(path)} has no column {quote_value(absent[0])}; {ADVICE}."
+            )
+        keep = None
+        for column, value in where.items():
+            same = dataset.field(column) == value
+            keep = same if keep is None else keep & same
+        return table.to_table(columns, filter=keep, use_threads=False)
+    except (pyarrow.ArrowException, OSError, UnicodeDecodeError) as error:
+        lines = str(error).strip().splitlines() or [type(error).__name__]
+        raise InputError(
+            f"{quote_value(path)} cannot be read ({quote_value(lines[0])}); {ADVICE}."
+        ) from error
+
+
+def _to_plain(scalar: Any) -> Any:
+    """Convert to a Python value, and a list of numbers to an array."""
+    if not scalar.is_valid:
+        return None
+    values = getattr(scalar, "values", None)
+    return scalar.as_py() if values is None else values.to_numpy(zero_copy_only=False)
 
 
 def _open_segment(segment: Segment) -> Photographs:
-    file = segment.get_path(IMAGES)
-    columns = {"time": TIME, "camera": CAMERA, "pose": "[CameraImageComponent].pose.transform"}
-    cameras = _read_cameras(segment)
-    rows = sorted(
-        (row for row in segment.read_rows(IMAGES, columns) if row["camera"] in CAMERAS),
-        key=lambda row: (row["camera"], row["time"]),
-    )
-    if not rows:
+    file, cameras = segment.get_path(IMAGES), _read_cameras(segment)
+    rows = segment.read_rows(IMAGES, (CAMERA, TIME, "pose.transform"))
+    shown = sorted((row for row in rows if row[0] in CAMERAS), key=lambda row: row[:2])
+    if not shown:
         raise InputError(f"{quote_value(file)} holds no photographs; {ADVICE}.")
-    frames = [_make_frame(segment, cameras, **row) for row in rows]
+    frames = [_make_frame(segment, cameras, *row) for row in shown]
     return build_drive(segment.name, str(file), frames, front=CAMERAS[1])
 
 
 def _make_frame(
-    segment: Segment,
-    cameras: dict[int, tuple[Intrinsics, Float[np.ndarray, "4 4"]]],
-    time: int,
-    camera: int,
-    pose: Any,
+    segment: Segment, cameras: dict[int, PosedLens], camera: int, time: int, pose: Any
 ) -> Frame:
-    title = (
-        f"the photograph of {CAMERAS[camera]} at {time} in {quote_value(segment.get_path(IMAGES))}"
-    )
+    file, name = quote_value(segment.get_path(IMAGES)), CAMERAS[camera]
+    title = f"the photograph of {name} at {time} in {file}"
     if camera not in cameras:
         raise InputError(f"The camera of {title} has no calibration; {ADVICE}.")
     intrinsics, vehicle_from_camera = cameras[camera]
     measured = segment.has_components("lidar", "lidar_calibration", "vehicle_pose")
     boxed = segment.has_components("lidar_box", "vehicle_pose")
     return Frame(
-        f"{CAMERAS[camera]}/{time}",
+        f"{name}/{time}",
         title,
         _parse_matrix(pose, title) @ vehicle_from_camera @ CAMERA_FROM_OPENCV,
         intrinsics,
         partial(_read_image, segment, time, camera),
-        sensor=CAMERAS[camera],
+        sensor=name,
         laser_points=partial(_read_points, segment, time) if measured else None,
         boxes=partial(_read_boxes, segment, time) if boxed else None,
     )
 
 
-def _read_cameras(segment: Segment) -> dict[int, tuple[Intrinsics, Float[np.ndarray, "4 4"]]]:
-    """Read intrinsics and pose on the vehicle (Waymo axes) of each camera."""
-    prefix = "[CameraCalibrationComponent]"
-    columns = {"camera": CAMERA, **{key: f"{prefix}.intrinsic.{key}" for key in LENS}}
-    columns |= {"width": f"{prefix}.width", "height": f"{prefix}.height"}
-    columns |= {"pose": f"{prefix}.extrinsic.transform"}
+def _read_cameras(segment: Segment) -> dict[int, PosedLens]:
+    columns = (CAMERA, "extrinsic.transform", *LENS, *LENS_DISTORTION)
     title = str(segment.get_path("camera_calibration"))
     return {
-        row["camera"]: (_parse_intrinsics(row, title), _parse_matrix(row["pose"], title))
-        for row in segment.read_rows("camera_calibration", columns)
+        camera: (_parse_intrinsics(numbers, title), _parse_matrix(pose, title))
+        for camera, pose, *numbers in segment.read_rows("camera_calibration", columns)
     }
 
 
-def _parse_intrinsics(row: dict[str, Any], title: str) -> Intrinsics:
-    values = {key: value for key, value in row.items() if key != "pose"}
-    if any(value is None or not np.isfinite(value) for value in values.values()):
+def _parse_intrinsics(numbers: Sequence[Any], title: str) -> Intrinsics:
+    known = [number for number in numbers if number is not None and np.isfinite(number)]
+    if len(known) < len(numbers):
         raise InputError(f"A camera in {title} lacks intrinsics; {ADVICE}.")
-    size = (row["width"], row["height"])
+    width, height, f_u, f_v, c_u, c_v, k1, k2, k3, p1, p2 = known
+    size = (int(width), int(height))
     if not all(1 <= side <= MAX_SIDE for side in size):
         raise InputError(f"A camera in {title} has images of {size} pixels; {ADVICE}.")
-    return Intrinsics(
-        size,
-        (row["f_u"], row["f_v"]),
-        (row["c_u"], row["c_v"]),
-        distortion=Distortion(
-            radial=(row["k1"], row["k2"], row["k3"]), tangential=(row["p1"], row["p2"])
-        ),
-    )
+    distortion = Distortion(radial=(k1, k2, k3), tangential=(p1, p2))
+    return Intrinsics(size, (f_u, f_v), (c_u, c_v), distortion=distortion)
 
 
 def _read_image(segment: Segment, time: int, camera: int) -> bytes:
-    columns = {"image": "[CameraImageComponent].image"}
-    found = [row["image"] for row in segment.read_rows(IMAGES, columns, time=time, camera=camera)]
+    columns, where = ("image",), {TIME: time, CAMERA: camera}
+    found = [image for (image,) in segment.read_rows(IMAGES, columns, where)]
     if len(found) != 1 or not isinstance(found[0], bytes):
         raise InputError(
             f"{quote_value(segment.get_path(IMAGES))} has no image of {CAMERAS[camera]} at "
@@ -184,109 +214,85 @@ def _read_points(segment: Segment, time: int) -> Float[np.ndarray, "n 3"]:
 
     The roof laser rotates while the vehicle drives; `lidar_pose` has the vehicle pose per pixel.
     """
-    vehicle = _read_vehicle_pose(segment, time)
-    prefix = "[LiDARComponent].range_image_return1"
-    columns = {"laser": LASER, "values": f"{prefix}.values", "shape": f"{prefix}.shape"}
-    lasers, turning = _read_lasers(segment), _read_pixel_poses(segment, time)
+    vehicle, lasers = _read_vehicle_pose(segment, time), _read_lasers(segment)
+    turning = segment.has_components("lidar_pose")
+    poses = _read_range_images(segment, "lidar_pose", time) if turning else {}
     points = [np.zeros((0, 3))]
-    for row in segment.read_rows("lidar", columns, time=time):
-        laser, image = row["laser"], _reshape_image(row, segment.get_path("lidar"))
-        if image is None:
-            continue
-        ranges, poses = image[..., 0], turning.get(laser, vehicle)
-        if laser not in lasers or not _is_consistent(ranges, lasers[laser][0], poses):
+    for laser, image in _read_range_images(segment, "lidar", time).items():
+        ranges = image[..., 0]
+        beams, extrinsic = lasers.get(laser, ((None, None, None), np.eye(4)))
+        elevations = _compute_elevations(beams, len(ranges))
+        pose = build_poses(poses[laser]) if laser in poses else vehicle
+        if elevations is None or (pose.ndim > 2 and pose.shape[:2] != ranges.shape):
             raise InputError(
                 f"Laser {laser} of {quote_value(segment.get_path('lidar'))} does not fit its "
-                "calibration or "
-                f"its poses; {ADVICE}."
+                f"calibration or its poses; {ADVICE}."
             )
-        points.append(_compute_hits(ranges, *lasers[laser], poses))
+        hit = np.isfinite(ranges) & (ranges > 0)
+        local = compute_points(ranges, elevations, extrinsic)[hit]
+        points.append(transform_points(local, pose if pose.ndim == 2 else pose[hit]))
     return np.concatenate(points)
 
 
-def _is_consistent(ranges: np.ndarray, beams: Beams, poses: np.ndarray) -> bool:
-    """Check that the range image has one beam per row and one pose per pixel, if any."""
+def _compute_elevations(beams: Beams, height: int) -> Float[np.ndarray, "h"] | None:
+    """Compute the elevation of each row in radians, highest first; None if `beams` do not fit."""
     values, low, high = beams
-    known = low is not None and high is not None if values is None else len(values) == len(ranges)
-    return known and (poses.ndim == 2 or poses.shape[:2] == ranges.shape)
-
-
-def _compute_hits(
-    ranges: Float[np.ndarray, "h w"],
-    beams: Beams,
-    extrinsic: Float[np.ndarray, "4 4"],
-    vehicle: Float[np.ndarray, "h w 4 4"] | Float[np.ndarray, "4 4"],
-) -> Float[np.ndarray, "n 3"]:
-    """Compute hit points in the world frame; `vehicle` is one pose or one per pixel."""
-    local = compute_points(ranges, compute_inclinations(*beams, len(ranges)), extrinsic)
-    hit = np.isfinite(ranges) & (ranges > 0)
-    return transform_points(local[hit], vehicle if vehicle.ndim == 2 else vehicle[hit])
+    if values is not None:
+        return values[::-1] if len(values) == height else None
+    if low is None or high is None:
+        return None
+    return (low + (np.arange(height) + 0.5) / height * (high - low))[::-1]
 
 
 def _read_vehicle_pose(segment: Segment, time: int) -> Float[np.ndarray, "4 4"]:
     title = str(segment.get_path("vehicle_pose"))
-    columns = {"pose": "[VehiclePoseComponent].world_from_vehicle.transform"}
-    found = [
-        _parse_matrix(row["pose"], title)
-        for row in segment.read_rows("vehicle_pose", columns, time=time)
-    ]
-    if len(found) != 1:
-        raise InputError(f"{title} has {len(found)} poses at {time}; {ADVICE}.")
-    return found[0]
+    columns = ("world_from_vehicle.transform",)
+    rows = list(segment.read_rows("vehicle_pose", columns, {TIME: time}))
+    if len(rows) != 1:
+        raise InputError(f"{title} has {len(rows)} poses at {time}; {ADVICE}.")
+    return _parse_matrix(rows[0][0], title)
 
 
 def _read_lasers(segment: Segment) -> dict[int, tuple[Beams, Float[np.ndarray, "4 4"]]]:
-    prefix = "[LiDARCalibrationComponent]"
-    columns = {"laser": LASER, "pose": f"{prefix}.extrinsic.transform"}
-    columns |= {key: f"{prefix}.beam_inclination.{key}" for key in ("values", "min", "max")}
+    """Read the beams of each laser, and its pose on the vehicle."""
+    beams = (f"beam_inclination.{name}" for name in ("values", "min", "max"))
+    rows = segment.read_rows("lidar_calibration", (LASER, "extrinsic.transform", *beams))
     title = str(segment.get_path("lidar_calibration"))
     return {
-        row["laser"]: ((row["values"], row["min"], row["max"]), _parse_matrix(row["pose"], title))
-        for row in segment.read_rows("lidar_calibration", columns)
+        laser: ((values, low, high), _parse_matrix(pose, title))
+        for laser, pose, values, low, high in rows
     }
 
 
-def _read_pixel_poses(segment: Segment, time: int) -> dict[int, Float[np.ndarray, "h w 4 4"]]:
-    """Read vehicle poses per pixel of each range image, if present."""
-    if not segment.has_components("lidar_pose"):
-        return {}
-    prefix = "[LiDARPoseComponent].range_image_return1"
-    columns = {"laser": LASER, "values": f"{prefix}.values", "shape": f"{prefix}.shape"}
-    images = {
-        row["laser"]: _reshape_image(row, segment.get_path("lidar_pose"))
-        for row in segment.read_rows("lidar_pose", columns, time=time)
-    }
-    return {laser: build_poses(image) for laser, image in images.items() if image is not None}
-
-
-def _reshape_image(row: dict[str, Any], file: Path) -> Float[np.ndarray, "h w c"] | None:
-    values, shape = row["values"], row["shape"]
-    if values is None or shape is None:
-        return None
-    if len(shape) != 3 or any(side < 1 for side in shape) or len(values) != np.prod(shape):
-        raise InputError(f"A range image in {quote_value(file)} is damaged; {ADVICE}.")
-    return np.asarray(values, dtype=np.float64).reshape(shape)
+def _read_range_images(
+    segment: Segment, component: str, time: int
+) -> dict[int, Float[np.ndarray, "h w c"]]:
+    """Read the range image of the first returns, or the poses of its pixels, by laser."""
+    columns = (LASER, "range_image_return1.values", "range_image_return1.shape")
+    found = {}
+    for laser, values, shape in segment.read_rows(component, columns, {TIME: time}):
+        if values is None or shape is None:
+            continue
+        if len(shape) != 3 or any(side < 1 for side in shape) or len(values) != np.prod(shape):
+            file = quote_value(segment.get_path(component))
+            raise InputError(f"A range image in {file} is damaged; {ADVICE}.")
+        found[laser] = np.asarray(values, dtype=np.float64).reshape(shape)
+    return found
 
 
 def _read_boxes(segment: Segment, time: int) -> tuple[Box, ...]:
     """Read the boxes of objects around the vehicle, except signs."""
     vehicle = _read_vehicle_pose(segment, time)
-    prefix = "[LiDARBoxComponent]"
-    columns = {"type": f"{prefix}.type", "heading": f"{prefix}.box.heading"}
-    columns |= {f"center_{axis}": f"{prefix}.box.center.{axis}" for axis in "xyz"}
-    columns |= {f"size_{axis}": f"{prefix}.box.size.{axis}" for axis in "xyz"}
-    columns |= {f"speed_{axis}": f"{prefix}.speed.{axis}" for axis in "xyz"}
-    rows = segment.read_rows("lidar_box", columns, time=time)
-    return tuple(_parse_box(row, vehicle) for row in rows if row["type"] != SIGN)
-
-
-def _parse_box(row: dict[str, Any], vehicle: Float[np.ndarray, "4 4"]) -> Box:
-    def read(key: str) -> Float[np.ndarray, "3"]:
-        return np.array([row[f"{key}_{axis}"] for axis in "xyz"], dtype=np.float64)
-
-    speed, (length, width, height) = float(np.linalg.norm(read("speed"))), read("size").tolist()
-    pose = vehicle @ build_upright_pose(read("center"), np.float64(row["heading"]))
-    return Box(pose, (length, width, height), speed if np.isfinite(speed) else None)
+    vectors = ("box.center", "box.size", "speed")
+    columns = ["type", "box.heading", *(f"{name}.{axis}" for name in vectors for axis in "xyz")]
+    boxes = []
+    for kind, heading, *numbers in segment.read_rows("lidar_box", columns, {TIME: time}):
+        if kind != SIGN:
+            center, sides, velocity = np.array(numbers, dtype=np.float64).reshape(3, 3)
+            pose = vehicle @ build_upright_pose(center, np.float64(heading))
+            length, width, height = sides.tolist()
+            boxes.append(Box(pose, (length, width, height), convert_speed(velocity)))
+    return tuple(boxes)
 
 
 def _parse_matrix(values: Any, title: str) -> Float[np.ndarray, "4 4"]:

@@ -1,6 +1,6 @@
 """Structure from motion in a separate process, because COLMAP aborts on errors.
 
-The argument is the JSON file of a job. Output is one JSON object per line: `{"begin": phase,
+The argument is the JSON file of a `Job`. Output is one JSON object per line: `{"begin": phase,
 "steps": n}`, then about n times `{"step": 1}` and `{"end": phase}`, and at last `{"result": ...}`.
 COLMAP's own output goes to standard error.
 """
@@ -23,7 +23,6 @@ import numpy as np
 import pycolmap
 
 from gscompleter.data.sfm.match_pairs import (
-    MAX_EXHAUSTIVE,
     Pairs,
     compute_similarity,
     is_sequence,
@@ -37,6 +36,8 @@ from gscompleter.data.sfm.upright import UprightCopy
 SEED = 0
 MAX_FEATURES = 4096
 """Most features in a photograph."""
+MAX_EXHAUSTIVE = 60
+"""Most unordered photographs that are all matched with each other."""
 BATCH = 50
 """Pairs matched per step of the progress bar."""
 LENS = "SIMPLE_RADIAL"
@@ -63,24 +64,24 @@ FOCAL_TOLERANCE = 0.02
 
 @dataclass(frozen=True)
 class Job:
-    """Input of the process."""
+    """Input of the process: folders, photographs, and when to stop searching a focal length."""
 
-    images: Path
-    work: Path
+    images: str
+    work: str
     """Folder for the database and temporary files."""
-    model: Path
+    model: str
     """Folder for the largest model; it does not exist yet."""
     photographs: list[UprightCopy]
     threads: int
     min_photographs: int
-    """Fewest photographs in a model that end the search for a focal length."""
+    """Fewest photographs in a model that end the search."""
     min_points: int
     """Fewest points in a model that end the search."""
 
     @property
     def database(self) -> Path:
         """Path of COLMAP's database."""
-        return self.work / "database.db"
+        return Path(self.work) / "database.db"
 
 
 class ProgressWriter:
@@ -89,6 +90,14 @@ class ProgressWriter:
     def __init__(self, out: IO[str]) -> None:
         self.out = out
 
+    def write_line(self, line: dict[str, Any]) -> None:
+        """Write one line."""
+        print(json.dumps(line), file=self.out, flush=True)
+
+    def step(self) -> None:
+        """Report one step."""
+        self.write_line({"step": 1})
+
     @contextmanager
     def phase(self, name: str, steps: int) -> Iterator[None]:
         """Report the begin and end of a phase."""
@@ -96,23 +105,14 @@ class ProgressWriter:
         yield
         self.write_line({"end": name})
 
-    def step(self) -> None:
-        """Report one step."""
-        self.write_line({"step": 1})
-
-    def write_line(self, line: dict[str, Any]) -> None:
-        """Write one line."""
-        print(json.dumps(line), file=self.out, flush=True)
-
 
 def main() -> None:
     """Run the job in the file that the command line names."""
     progress = ProgressWriter(os.fdopen(os.dup(1), "w"))
     os.dup2(2, 1)  # keeps output of COLMAP apart from ours
     task = json.loads(Path(sys.argv[1]).read_text(encoding="utf-8"))
-    photographs = [UprightCopy(**one) for one in task["photographs"]]
-    images, work, model = (Path(task[name]) for name in ("images", "work", "model"))
-    job = Job(images, work, model, photographs, task["threads"], task["wanted"], task["min_points"])
+    copies = [UprightCopy(**one) for one in task.pop("photographs")]
+    job = Job(photographs=copies, **task)
     pycolmap.logging.minloglevel = pycolmap.logging.Level.ERROR.value
     pycolmap.set_random_seed(SEED)
     find_features(job, progress)
@@ -122,23 +122,18 @@ def main() -> None:
 
 def find_features(job: Job, progress: ProgressWriter) -> None:
     """Extract SIFT features of all photographs; those of equal size and lens share a camera."""
-
-    def make_key(one: UprightCopy) -> tuple[int, int, str]:
-        return one.width, one.height, one.lens
-
     extraction = pycolmap.FeatureExtractionOptions(num_threads=job.threads, use_gpu=False)
     extraction.sift.max_num_features = MAX_FEATURES
-    cameras = {make_key(one): one for one in job.photographs}
+    cameras = {(one.width, one.height, one.lens): one for one in job.photographs}
     numbers = {key: _add_camera(job, one) for key, one in cameras.items()}
     with progress.phase("Finding features", len(job.photographs)):
         for one in job.photographs:
+            number = numbers[one.width, one.height, one.lens]
             pycolmap.extract_features(
                 job.database,
                 job.images,
                 [one.name],
-                reader_options=pycolmap.ImageReaderOptions(
-                    existing_camera_id=numbers[make_key(one)]
-                ),
+                reader_options=pycolmap.ImageReaderOptions(existing_camera_id=number),
                 extraction_options=extraction,
                 device=pycolmap.Device.cpu,
             )
@@ -156,18 +151,12 @@ def _add_camera(job: Job, one: UprightCopy) -> int:
 def select_pairs(job: Job) -> Pairs:
     """Choose the photographs to match: sequence neighbours, all pairs, or similar photographs."""
     names = [one.name for one in job.photographs]
-    if is_sequence(names):
-        return pair_neighbours(len(names)) | pair_similar(
-            compute_similarity(_read_largest_features(job))
-        )
-    if len(names) <= MAX_EXHAUSTIVE:
+    neighbours = pair_neighbours(len(names)) if is_sequence(names) else set()
+    if not neighbours and len(names) <= MAX_EXHAUSTIVE:
         return pair_all(len(names))
-    return pair_similar(compute_similarity(_read_largest_features(job)))
-
-
-def _read_largest_features(job: Job) -> list[np.ndarray]:
     with pycolmap.Database.open(job.database) as database:
-        return [_read_features(database, one.name) for one in job.photographs]
+        features = [_read_features(database, name) for name in names]
+    return neighbours | pair_similar(compute_similarity(features))
 
 
 def _read_features(database: Any, name: str) -> np.ndarray:
@@ -183,38 +172,16 @@ def match(job: Job, pairs: Pairs, progress: ProgressWriter) -> None:
     matching = pycolmap.FeatureMatchingOptions(num_threads=job.threads, use_gpu=False)
     verification = pycolmap.TwoViewGeometryOptions()
     verification.ransac.random_seed = SEED
-    batches = list(_split_batches(sorted(pairs)))
-    listed = pycolmap.ImportedPairingOptions(match_list_path=job.work / "pairs.txt")
-    with progress.phase("Matching features", len(batches)):
-        for batch in batches:
-            names = [(job.photographs[i].name, job.photographs[j].name) for i, j in batch]
-            listed.match_list_path.write_text("".join(f"{a} {b}\n" for a, b in names))
+    listed = pycolmap.ImportedPairingOptions(match_list_path=Path(job.work) / "pairs.txt")
+    lines = [f"{job.photographs[i].name} {job.photographs[j].name}\n" for i, j in sorted(pairs)]
+    starts = range(0, len(lines), BATCH)
+    with progress.phase("Matching features", len(starts)):
+        for start in starts:
+            listed.match_list_path.write_text("".join(lines[start : start + BATCH]))
             pycolmap.match_image_pairs(
                 job.database, matching, listed, verification, pycolmap.Device.cpu
             )
             progress.step()
-
-
-def _split_batches(pairs: list[tuple[int, int]]) -> Iterator[list[tuple[int, int]]]:
-    return (pairs[i : i + BATCH] for i in range(0, len(pairs), BATCH))
-
-
-@dataclass(frozen=True)
-class Attempt:
-    """Models from one treatment of the focal length."""
-
-    models: list[Any]
-    """Disconnected models, the largest first."""
-    is_focal_fixed: bool = False
-    """True if the focal length was fixed at first."""
-
-    @property
-    def quality(self) -> tuple[bool, int, int]:
-        """Sort key: plausible lenses, then photographs, then points of the largest model."""
-        if not self.models:
-            return False, 0, 0
-        model = self.models[0]
-        return find_lens_defect(model) is None, model.num_reg_images(), model.num_points3D()
 
 
 def map_all(job: Job, progress: ProgressWriter) -> dict[str, Any]:
@@ -226,40 +193,48 @@ def map_all(job: Job, progress: ProgressWriter) -> dict[str, Any]:
         `defect` of its lens or None, and the `focal` length in pixels if it was fixed at first,
         else None.
     """
-    attempt = select_attempt(job, progress)
-    if not attempt.models:
+    models, is_focal_fixed = select_attempt(job, progress)
+    if not models:
         return {"registered": [], "models": [], "points": 0, "error": 0.0}
-    largest_one = refine_principal_points(attempt.models[0])
-    job.model.mkdir(parents=True)
-    largest_one.write(job.model)
+    largest = refine_principal_points(models[0])
+    Path(job.model).mkdir(parents=True)
+    largest.write(job.model)
+    focal = list_used_cameras(largest)[0].mean_focal_length()
     return {
-        "registered": sorted(largest_one.images[i].name for i in largest_one.reg_image_ids()),
-        "models": count_parts([set(model.reg_image_ids()) for model in attempt.models]),
-        "points": largest_one.num_points3D(),
-        "error": largest_one.compute_mean_reprojection_error(),
-        "defect": find_lens_defect(largest_one),
-        "focal": list_used_cameras(largest_one)[0].mean_focal_length()
-        if attempt.is_focal_fixed
-        else None,
+        "registered": sorted(largest.images[i].name for i in largest.reg_image_ids()),
+        "models": count_parts([set(model.reg_image_ids()) for model in models]),
+        "points": largest.num_points3D(),
+        "error": largest.compute_mean_reprojection_error(),
+        "defect": find_lens_defect(largest),
+        "focal": focal if is_focal_fixed else None,
     }
 
 
+Attempt = tuple[list[Any], bool]
+"""Disconnected models, the largest first; and True if the focal length was fixed at first."""
+
+
 def select_attempt(job: Job, progress: ProgressWriter) -> Attempt:
-    """Return the first attempt that is good enough, or else the best."""
-    best = Attempt([])
-    for attempt in run_attempts(job, progress):
-        best = max(best, attempt, key=lambda one: one.quality)
-        is_plausible, photographs, points = best.quality
+    """Map with a free focal length, then with each plausible fixed value, until it is good.
+
+    Returns the best attempt.
+    """
+    best: Attempt = _map_models(job, progress), False
+    for focals in list_focals(job):
+        is_plausible, photographs, points = rate_models(best[0])
         if is_plausible and photographs >= job.min_photographs and points >= job.min_points:
             break
+        attempt = map_with_fixed_focals(job, progress, focals), True
+        best = max(best, attempt, key=lambda one: rate_models(one[0]))
     return best
 
 
-def run_attempts(job: Job, progress: ProgressWriter) -> Iterator[Attempt]:
-    """Map with a free focal length, then with each plausible fixed value."""
-    yield Attempt(_map_models(job, progress))
-    for focals in list_focals(job):
-        yield Attempt(map_with_fixed_focals(job, progress, focals), is_focal_fixed=True)
+def rate_models(models: list[Any]) -> tuple[bool, int, int]:
+    """Rate the largest model: plausible lenses, then photographs, then points."""
+    if not models:
+        return False, 0, 0
+    model = models[0]
+    return find_lens_defect(model) is None, model.num_reg_images(), model.num_points3D()
 
 
 def list_focals(job: Job) -> list[dict[int, float]]:
@@ -268,13 +243,9 @@ def list_focals(job: Job) -> list[dict[int, float]]:
         cameras = database.read_all_cameras()
     in_exif = {one.camera_id: one.focal_length for one in cameras if one.has_prior_focal_length}
     sides = {one.camera_id: max(one.width, one.height) for one in cameras}
-    return [
-        *([in_exif] if len(in_exif) == len(cameras) else []),
-        *(
-            {number: side / 2 / math.tan(math.radians(fov / 2)) for number, side in sides.items()}
-            for fov in FIXED_FOVS
-        ),
-    ]
+    tangents = [math.tan(math.radians(fov / 2)) for fov in FIXED_FOVS]
+    guessed = [{number: side / 2 / tan for number, side in sides.items()} for tan in tangents]
+    return ([in_exif] if len(in_exif) == len(cameras) else []) + guessed
 
 
 def map_with_fixed_focals(
@@ -312,8 +283,11 @@ def fix_focals(job: Job, focals: dict[int, float]) -> None:
 
 def list_used_cameras(model: pycolmap.Reconstruction) -> list[pycolmap.Camera]:
     """List the cameras of the model, that of most photographs first."""
-    numbers = Counter(model.images[i].camera_id for i in model.reg_image_ids())
-    return [model.cameras[number] for number, _ in numbers.most_common()]
+    return [model.cameras[number] for number, _ in _count_photographs(model).most_common()]
+
+
+def _count_photographs(model: pycolmap.Reconstruction) -> Counter[int]:
+    return Counter(model.images[i].camera_id for i in model.reg_image_ids())
 
 
 def find_lens_defect(model: pycolmap.Reconstruction) -> str | None:
@@ -355,11 +329,15 @@ def refine_principal_points(model: pycolmap.Reconstruction) -> pycolmap.Reconstr
     The mapper leaves them at the image centres: few photographs cannot separate them from a
     rotation, and neither can similar photographs, so the result is rejected if far from the centre.
     """
-    numbers = Counter(model.images[i].camera_id for i in model.reg_image_ids())
-    if min(numbers.values()) < MIN_FOR_CENTRE:
+    if min(_count_photographs(model).values()) < MIN_FOR_CENTRE:
         return model
     refined = refine_lenses(model, refine_principal_point=True)
-    return refined if all(map(_is_centred, list_used_cameras(refined))) else model
+    for camera in list_used_cameras(refined):
+        x, y = camera.principal_point_x, camera.principal_point_y
+        off = math.hypot(x - camera.width / 2, y - camera.height / 2)
+        if not off <= MAX_OFF_CENTRE * max(camera.width, camera.height):
+            return model
+    return refined
 
 
 def refine_lenses(model: pycolmap.Reconstruction, **options: bool) -> pycolmap.Reconstruction:
@@ -371,19 +349,8 @@ def refine_lenses(model: pycolmap.Reconstruction, **options: bool) -> pycolmap.R
     return refined if find_lens_defect(refined) is None else model
 
 
-def _is_centred(camera: pycolmap.Camera) -> bool:
-    x, y = camera.principal_point_x, camera.principal_point_y
-    off = math.hypot(x - camera.width / 2, y - camera.height / 2)
-    return bool(off <= MAX_OFF_CENTRE * max(camera.width, camera.height))
-
-
 def _map_models(job: Job, progress: ProgressWriter, is_focal_fixed: bool = False) -> list[Any]:
     """Map the scene into disconnected models, the largest first."""
-
-    def count_first_pair() -> None:
-        progress.step()
-        progress.step()
-
     options = pycolmap.IncrementalPipelineOptions(
         num_threads=job.threads,
         random_seed=SEED,
@@ -393,12 +360,7 @@ def _map_models(job: Job, progress: ProgressWriter, is_focal_fixed: bool = False
     )
     with progress.phase("Placing cameras", len(job.photographs)):
         found = pycolmap.incremental_mapping(
-            job.database,
-            job.images,
-            job.work,
-            options,
-            initial_image_pair_callback=count_first_pair,
-            next_image_callback=progress.step,
+            job.database, job.images, job.work, options, next_image_callback=progress.step
         )
     return sorted(found.values(), key=lambda model: -model.num_reg_images())
 

@@ -15,8 +15,6 @@ from jaxtyping import Float, Int
 
 NEIGHBOURS = 10
 """Photographs before and after each one of a sequence to match it with."""
-MAX_EXHAUSTIVE = 60
-"""Most unordered photographs that are all matched with each other."""
 NUM_SIMILAR = 20
 """Most similar photographs to match each one with."""
 NUM_LARGEST_FEATURES = 256
@@ -65,23 +63,16 @@ def select_largest_features(
     return chosen / np.maximum(np.linalg.norm(chosen, axis=1, keepdims=True), 1e-9)
 
 
-def count_shared_features(
-    one: Float[np.ndarray, "k 128"], other: Float[np.ndarray, "l 128"]
-) -> int:
-    """Count the mutual best matches above `MIN_COSINE`."""
-    if len(one) == 0 or len(other) == 0:
-        return 0
-    cosines = one @ other.T
-    best, back = cosines.argmax(axis=1), cosines.argmax(axis=0)
-    here = np.arange(len(one))
-    return int(np.count_nonzero((back[best] == here) & (cosines[here, best] > MIN_COSINE)))
-
-
 def compute_similarity(features: Sequence[Float[np.ndarray, "_ 128"]]) -> Int[np.ndarray, "n n"]:
-    """Count the shared features of all pairs."""
+    """Count the shared features of all pairs: mutual best matches above `MIN_COSINE`."""
     shared = np.zeros((len(features), len(features)), dtype=np.int64)
     for i, j in pair_all(len(features)):
-        shared[i, j] = shared[j, i] = count_shared_features(features[i], features[j])
+        if len(features[i]) > 0 and len(features[j]) > 0:
+            cosines = features[i] @ features[j].T
+            best, back = cosines.argmax(axis=1), cosines.argmax(axis=0)
+            here = np.arange(len(best))
+            mutual = (back[best] == here) & (cosines[here, best] > MIN_COSINE)
+            shared[i, j] = shared[j, i] = np.count_nonzero(mutual)
     return shared
 
 

@@ -86,9 +86,8 @@ class FoundPoses:
         if self.focal is not None:
             notes.append(
                 f"{self.num_registered} of {self.photographs} cameras were found with a focal "
-                "length "
-                f"of {self.focal:.0f} px, fixed at plausible values first, because COLMAP failed "
-                "with a free one."
+                f"length of {self.focal:.0f} px, fixed at plausible values first, because COLMAP "
+                "failed with a free one."
             )
         if len(self.models) > 1:
             *others, last = map(str, self.models)
@@ -111,11 +110,16 @@ def find_poses(photographs: Path, out: Path, overwrite: bool = False) -> FoundPo
             the lens is implausible, pycolmap is missing or fails, or `out` cannot be written.
     """
     names = list_photograph_files(photographs)
-    known = _compute_fingerprint(photographs, names)
+    stats = {name: (photographs / name).stat() for name in names}
+    known = {name: [stat.st_size, stat.st_mtime_ns] for name, stat in stats.items()}
     earlier = _read_earlier(out, known)
     if earlier is not None:
         return earlier
-    check_pycolmap()
+    if find_spec("pycolmap") is None:
+        raise InputError(
+            "Finding the cameras of photographs needs pycolmap, which is not installed; run "
+            "pip install 'gscompleter[poses]'."
+        )
     with open_output_folder(out, overwrite) as folder:
         found = _run(photographs, names, folder)
         content = {"found": asdict(found), "photographs": known}
@@ -136,19 +140,9 @@ def list_photograph_files(folder: Path) -> list[str]:
     if len(names) < MIN_PHOTOGRAPHS:
         raise InputError(
             f"There are {len(names)} photographs ({', '.join(ENDINGS)}) in {quote_value(folder)}, "
-            "and "
-            f"at least {MIN_PHOTOGRAPHS} are needed to find their cameras; add more."
+            f"and at least {MIN_PHOTOGRAPHS} are needed to find their cameras; add more."
         )
     return names
-
-
-def check_pycolmap() -> None:
-    """Raise an InputError if pycolmap is not installed."""
-    if find_spec("pycolmap") is None:
-        raise InputError(
-            "Finding the cameras of photographs needs pycolmap, which is not installed; run "
-            "pip install 'gscompleter[poses]'."
-        )
 
 
 def _walk_photographs(folder: Path) -> list[str]:
@@ -167,11 +161,6 @@ def is_own(folder: Path) -> bool:
     return not os.path.isfile(folder / SUMMARY_FILE)
 
 
-def _compute_fingerprint(folder: Path, names: Sequence[str]) -> dict[str, list[int]]:
-    stats = {name: (folder / name).stat() for name in names}
-    return {name: [stat.st_size, stat.st_mtime_ns] for name, stat in stats.items()}
-
-
 def _read_earlier(out: Path, known: Mapping[str, list[int]]) -> FoundPoses | None:
     """Read the earlier result for these photographs; None if missing or too small."""
     if not os.path.isfile(out / SUMMARY_FILE) or not os.path.isdir(out / "sparse" / "0"):
@@ -180,15 +169,8 @@ def _read_earlier(out: Path, known: Mapping[str, list[int]]) -> FoundPoses | Non
     if not isinstance(content, dict) or content.get("photographs") != known:
         return None
     found = content["found"]
-    earlier = FoundPoses(
-        found["photographs"],
-        tuple(found["missing"]),
-        tuple(found["models"]),
-        found["points"],
-        found["error"],
-        found.get("focal"),
-        reused=True,
-    )
+    missing, models = tuple(found["missing"]), tuple(found["models"])
+    earlier = FoundPoses(**{**found, "missing": missing, "models": models, "reused": True})
     return None if earlier.is_too_small else earlier
 
 
@@ -205,29 +187,17 @@ def _run(photographs: Path, names: Sequence[str], folder: Path) -> FoundPoses:
             f"{quote_value(str(photographs))}; add photographs of the same scene that overlap by "
             "two thirds and are sharp."
         )
-    registered = set(result["registered"])
-    found = FoundPoses(
-        len(names),
-        tuple(copy.source for copy in copies if copy.name not in registered),
-        tuple(result["models"]),
-        result["points"],
-        result["error"],
-        result["focal"],
-    )
-    refuse_failure(photographs, found, result["defect"])
+    missing = tuple(copy.source for copy in copies if copy.name not in result["registered"])
+    models, points = tuple(result["models"]), result["points"]
+    found = FoundPoses(len(names), missing, models, points, result["error"], result["focal"])
+    if found.is_too_small or result["defect"] is not None:
+        lens = "" if result["defect"] is None else f", {result['defect']}"
+        raise InputError(
+            f"COLMAP placed {found.num_registered} of {found.photographs} photographs in "
+            f"{quote_value(photographs, 40)}, with {points:,} points{lens}, which is no usable "
+            "model; add sharp photographs that overlap by two thirds, or name their cameras."
+        )
     return found
-
-
-def refuse_failure(photographs: Path, found: FoundPoses, defect: str | None) -> None:
-    """Raise an InputError for a model that is too small or has an implausible lens."""
-    if not found.is_too_small and defect is None:
-        return
-    lens = "" if defect is None else f", {defect}"
-    raise InputError(
-        f"COLMAP placed {found.num_registered} of {found.photographs} photographs in "
-        f"{quote_value(photographs, 40)}, with {found.points:,} points{lens}, which is no usable "
-        "model; add sharp photographs that overlap by two thirds, or name their cameras."
-    )
 
 
 def _map(copies: Sequence[UprightCopy], folder: Path) -> dict[str, Any]:
@@ -239,7 +209,7 @@ def _map(copies: Sequence[UprightCopy], folder: Path) -> dict[str, Any]:
             "model": str(folder / "sparse" / "0"),
             "photographs": [asdict(copy) for copy in copies],
             "threads": min(MAX_THREADS, get_thread_count()),
-            "wanted": math.ceil(WANTED_SHARE * len(copies)),
+            "min_photographs": math.ceil(WANTED_SHARE * len(copies)),
             "min_points": MIN_POINTS,
         }
         (Path(work) / "job.json").write_text(json.dumps(job), encoding="utf-8")
@@ -248,48 +218,37 @@ def _map(copies: Sequence[UprightCopy], folder: Path) -> dict[str, Any]:
 
 
 def _run_process(job: Path, complaints: IO[str]) -> dict[str, Any]:
+    """Run the process and show its progress; return its result."""
+    command = [sys.executable, "-m", PROCESS, str(job)]
     process = subprocess.Popen(
-        [sys.executable, "-m", PROCESS, str(job)],
-        stdin=subprocess.DEVNULL,
-        stdout=subprocess.PIPE,
-        stderr=complaints,
-        text=True,
+        command, stdin=subprocess.DEVNULL, stdout=subprocess.PIPE, stderr=complaints, text=True
     )
+    assert process.stdout is not None
+    phase, result = "starting", None
     try:
-        phase, result = _follow(process)
+        lines = (json.loads(line) for line in process.stdout)
+        for line in lines:
+            result = line.get("result", result)
+            if "begin" in line:
+                phase = line["begin"]
+                _show_phase(lines, phase, line["steps"])
         process.wait()
     finally:
         process.kill()
         process.wait()
     if result is None:
-        raise InputError(_explain_failure(phase, process.returncode, complaints))
+        complaints.seek(0)
+        messages = [line.strip() for line in complaints if line.strip()]
+        code = f" with exit code {process.returncode}"
+        reason = f": {quote_value(messages[-1], 200)}" if messages else code
+        raise InputError(
+            f"COLMAP gave up while {phase[0].lower()}{phase[1:]}{reason}; leave out photographs "
+            "that may be damaged, and try again."
+        )
     return result
 
 
-def _follow(process: subprocess.Popen[str]) -> tuple[str, dict[str, Any] | None]:
-    """Show the progress of a process; return the last phase and its result."""
-    assert process.stdout is not None
-    phase, result = "Starting", None
-    lines = (json.loads(line) for line in process.stdout)
-    for line in lines:
-        result = line.get("result", result)
-        if "begin" in line:
-            phase = line["begin"]
-            _show(lines, phase, line["steps"])
-    return phase, result
-
-
-def _show(lines: Iterator[dict[str, Any]], phase: str, steps: int) -> None:
+def _show_phase(lines: Iterator[dict[str, Any]], phase: str, steps: int) -> None:
     for _ in track(range(steps), phase):
         if "step" not in next(lines, {}):
             return
-
-
-def _explain_failure(phase: str, code: int, complaints: IO[str]) -> str:
-    complaints.seek(0)
-    messages = [line.strip() for line in complaints if line.strip()]
-    reason = f": {quote_value(messages[-1], 200)}" if messages else f" with exit code {code}"
-    return (
-        f"COLMAP gave up while {phase[0].lower()}{phase[1:]}{reason}; leave out photographs that "
-        "may be damaged, and try again."
-    )

@@ -9,7 +9,6 @@ import re
 import shutil
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
 from PIL import Image, ImageOps
 
@@ -49,54 +48,37 @@ def write_upright(root: Path, source: str, folder: Path) -> UprightCopy:
     A small upright 8-bit JPEG or PNG is copied byte for byte; a format that COLMAP may not read
     becomes a PNG.
     """
-    check_file(root / source)
-    refuse_pointer(root / source)
+    path = root / source
+    check_file(path)
+    refuse_pointer(path)
     try:
-        with Image.open(root / source, formats=IMAGE_FORMATS) as image:
+        with Image.open(path, formats=IMAGE_FORMATS) as image:
             exif = image.getexif()
-            name = _name_copy(source, image.format)
-            target = _reserve_path(folder / name, root / source)
-            width, height = _write_copy(image, exif, root / source, target)
-            return UprightCopy(
-                name,
-                source,
-                width,
-                height,
-                _compute_focal(exif, width, height),
-                _describe_lens(exif),
-            )
+            # In COLMAP's lists a space ends a name, and # begins a comment.
+            ending = "" if image.format in ("JPEG", "PNG") else ".png"
+            name = re.sub(r"[\s#]", "_", source) + ending
+            width, height = _write_copy(image, path, folder / name)
+            focal = _compute_focal(exif, width, height)
+            return UprightCopy(name, source, width, height, focal, _describe_lens(exif))
     except InputError:
         raise
-    # Damaged files raise anything.
-    except Exception as error:
+    except Exception as error:  # damaged files raise anything
         raise InputError(
-            f"{quote_value(root / source)} cannot be read as an image "
-            f"({quote_value(str(error))}); copy it "
+            f"{quote_value(path)} cannot be read as an image ({quote_value(str(error))}); copy it "
             "again, or take it out of the folder."
         ) from error
 
 
-def _name_copy(source: str, format: str | None) -> str:
-    """Name the copy; in COLMAP's lists a space ends a name, and # begins a comment."""
-    return re.sub(r"[\s#]", "_", source) + ("" if format in ("JPEG", "PNG") else ".png")
-
-
-def _reserve_path(target: Path, source: Path) -> Path:
-    """Create the folder of the copy; refuse a name that is taken."""
+def _write_copy(image: Image.Image, source: Path, target: Path) -> tuple[int, int]:
+    """Write the copy, and return its width and height; refuse a name that is taken."""
     if target.exists():
         raise InputError(
             f"The copy of {quote_value(source)} would be called {target.name} like that of another "
             "photograph; rename one of them."
         )
     target.parent.mkdir(parents=True, exist_ok=True)
-    return target
-
-
-def _write_copy(
-    image: Image.Image, exif: Image.Exif, source: Path, target: Path
-) -> tuple[int, int]:
     plain = image.format in ("JPEG", "PNG") and image.mode in ("RGB", "L")
-    upright = exif.get(ORIENTATION, 1) == 1
+    upright = image.getexif().get(ORIENTATION, 1) == 1
     if plain and upright and max(image.size) <= MAX_SIDE:
         image.load()  # detects truncated files
         shutil.copyfile(source, target)
@@ -106,35 +88,24 @@ def _write_copy(
     copy = ImageOps.exif_transpose(image).convert("RGB")
     copy.thumbnail((MAX_SIDE, MAX_SIDE), Image.Resampling.LANCZOS)
     copy.info.clear()  # removes the orientation, which is applied already
-    if image.format == "JPEG":
-        copy.save(target, format="JPEG", quality=QUALITY, subsampling=0)
-    else:
-        copy.save(target, format="PNG")
+    options = {"quality": QUALITY, "subsampling": 0} if image.format == "JPEG" else {}
+    copy.save(target, format="JPEG" if image.format == "JPEG" else "PNG", **options)
     return copy.size
 
 
 def _compute_focal(exif: Image.Exif, width: int, height: int) -> float | None:
     """Compute the focal length in pixels from the 35 mm equivalent; None if there is none."""
-    millimetres = _parse_number(exif.get_ifd(EXIF).get(FOCAL_LENGTH_35))
-    if millimetres is None or not 1 <= millimetres <= 5000:
+    try:
+        millimetres = float(exif.get_ifd(EXIF)[FOCAL_LENGTH_35])
+    except (KeyError, TypeError, ValueError, ZeroDivisionError):  # broken values are common
+        return None
+    if not 1 <= millimetres <= 5000:
         return None
     return millimetres / FULL_FRAME_DIAGONAL * float(width**2 + height**2) ** 0.5
 
 
 def _describe_lens(exif: Image.Exif) -> str:
     detail = exif.get_ifd(EXIF)
-    values = (
-        exif.get(MAKE),
-        exif.get(MODEL),
-        detail.get(FOCAL_LENGTH),
-        detail.get(FOCAL_LENGTH_35),
-    )
+    values = [exif.get(MAKE), exif.get(MODEL)]
+    values += [detail.get(FOCAL_LENGTH), detail.get(FOCAL_LENGTH_35)]
     return " ".join(str(value) for value in values if value is not None)
-
-
-def _parse_number(value: Any) -> float | None:
-    """Convert an EXIF value; broken ones are common and give None."""
-    try:
-        return float(value)
-    except (TypeError, ValueError, ZeroDivisionError):
-        return None
