@@ -1,0 +1,218 @@
+"""Stage 4, second form: covered but not trusted Gaussians get new colours by direction."""
+
+from dataclasses import replace
+
+import pytest
+import torch
+from torch.nn.functional import normalize, pad
+
+from gscompleter.config import CompleterConfig, RecolorConfig
+from gscompleter.render import load_renderer
+from gscompleter.render.cache import SceneRenderer
+from gscompleter.render.cpu import CpuRenderer
+from gscompleter.render.spherical_harmonics import evaluate_sh_basis
+from gscompleter.stages.recolor import fit_colors
+from gscompleter.state import ContextScene
+from gscompleter.trust import HeldViews
+from gscompleter.trust.photometric import load_trust, sum_weights
+from gscompleter.types import View
+from scenes import Room, camera_at, gaussians_of, view_of
+from target_views import begin_with
+
+SIZE = 40
+ROOM = Room()
+RENDERER = load_renderer("cpu")
+PHOTOS = [view_of(ROOM, camera_at(x, yaw=yaw, size=SIZE)) for x, yaw in ((0, 0), (0.3, -5))]
+TARGET = camera_at(x=1.6, yaw=-25, size=SIZE)
+NEXT = camera_at(x=-1.6, yaw=25, size=SIZE)
+LEFT = torch.zeros(SIZE, SIZE)
+LEFT[:, : SIZE // 2] = 1
+CONFIG = RecolorConfig(min_change=1 / 255)
+
+
+def splat(k: int = 16):
+    """Return the room as its first photograph shows it, with k harmonics."""
+    scene = gaussians_of(PHOTOS[0])
+    return replace(scene, sh=pad(scene.sh, (0, 0, 0, k - 1)))
+
+
+def hold(scene, config=CONFIG) -> HeldViews:
+    settings = replace(CompleterConfig.splat(), recolor=config)
+    return load_trust(settings, (scene,), PHOTOS, SceneRenderer(RENDERER)).held
+
+
+def darker(scene, camera) -> View:
+    """Synthesize the scene with half of its light."""
+    return View(0.5 * RENDERER.render(scene, camera).image, camera)
+
+
+def recolored(scene, camera=TARGET, weight=LEFT, held=None, config=CONFIG, renderer=RENDERER):
+    held = hold(scene, config) if held is None else held
+    frozen, wanted = renderer.freeze(scene, camera), darker(scene, camera)
+    return fit_colors(scene, frozen, wanted, weight, held, renderer, config)
+
+
+def move(scene, after, camera) -> torch.Tensor:
+    """Compute how far the image of a camera changes."""
+    images = [RENDERER.render(state, camera).image for state in (scene, after)]
+    return (images[1] - images[0]).abs().mean(dim=2)
+
+
+def iterate_in_full(scene, camera, weight, config):
+    """Solve all harmonics of all Gaussians at once in each iteration, view by view."""
+    frozen, wanted = RENDERER.freeze(scene, camera), darker(scene, camera).image
+    centers = [*(view.camera.center for view in PHOTOS), camera.center]
+    bases = [evaluate_sh_basis(normalize(scene.means - c, dim=-1), 16).double() for c in centers]
+    sums = [sum_weights(RENDERER.freeze(scene, view.camera)).double() for view in PHOTOS]
+    sums.append(sum_weights(frozen).double())
+    matrix = config.ridge * torch.eye(16).double() * sum(sums)[:, None, None].clamp_min(1e-9)
+    sums = [*(config.hold_weight * each for each in sums[:-1]), sums[-1]]
+    for basis, each in zip(bases, sums, strict=True):
+        matrix += each[:, None, None] * basis[:, :, None] * basis[:, None, :]
+    delta, render = torch.zeros_like(scene.sh).double(), frozen.render.image
+    for _ in range(config.iterations):
+        state = RENDERER.freeze(replace(scene, sh=scene.sh + delta.float()), camera)
+        missing = weight[..., None] * (wanted - render) + render - state.render.image
+        at_target = torch.einsum("nk,nkc->nc", bases[-1], delta)
+        right = state.backproject(missing).double() + sums[-1][:, None] * at_target
+        delta = torch.linalg.solve(matrix, bases[-1][:, :, None] * right[:, None])
+    return delta
+
+
+def test_the_image_follows_the_synthesized_one_where_its_weight_is_one():
+    scene = splat()
+    after = recolored(scene).apply(scene)
+    wanted = darker(scene, TARGET).image
+    image = RENDERER.render(after, TARGET).image
+    before = RENDERER.render(scene, TARGET).image
+    inner = LEFT.bool() & (RENDERER.render(scene, TARGET).alpha > 0.9)
+    inner[:, SIZE // 2 - 3 :] = False
+    assert (image - wanted)[inner].abs().mean() < 0.5 * (before - wanted)[inner].abs().mean()
+    assert move(scene, after, TARGET)[:, SIZE // 2 + 3 :].max() < 2 * CONFIG.min_change
+
+
+def test_the_photographs_keep_their_colours():
+    scene = splat()
+    free = HeldViews(torch.zeros(0, 3), torch.zeros(0, len(scene)), torch.zeros(0))
+    for view in PHOTOS:
+        held = move(scene, recolored(scene).apply(scene), view.camera).mean()
+        loose = move(scene, recolored(scene, held=free).apply(scene), view.camera).mean()
+        assert held < 0.004
+        assert loose > 10 * held
+
+
+def test_it_equals_the_iteration_over_all_harmonics():
+    scene, everywhere = splat(), torch.ones(SIZE, SIZE)
+    found = recolored(scene, weight=everywhere)
+    delta = iterate_in_full(scene, TARGET, everywhere, CONFIG)
+    assert len(found.rows) > 500
+    assert (found.delta - delta[found.rows]).abs().max() < 1e-3
+    basis = evaluate_sh_basis(normalize(scene.means - TARGET.center, dim=-1), 16).double()
+    others = torch.ones(len(scene), dtype=torch.bool)
+    others[found.rows] = False
+    seen = torch.einsum("nk,nkc->nc", basis, delta)[others]
+    assert seen.abs().max() < 1.02 * CONFIG.min_change
+
+
+def test_only_colours_of_covering_gaussians_change():
+    scene = splat()
+    found = recolored(scene)
+    after = found.apply(scene)
+    covers = RENDERER.freeze(scene, TARGET).backproject(LEFT[..., None].expand(-1, -1, 3))[:, 0] > 0
+    assert covers[found.rows].all()
+    others = torch.ones(len(scene), dtype=torch.bool)
+    others[found.rows] = False
+    assert torch.equal(after.sh[others], scene.sh[others])
+    assert (after.sh != scene.sh).any(dim=(1, 2)).sum() == len(found.rows) > 0
+    for name in ("means", "quats", "scales", "opacities", "generated"):
+        assert getattr(after, name) is getattr(scene, name)
+
+
+@pytest.mark.parametrize(
+    ("weight", "config"), [(0 * LEFT, CONFIG), (LEFT, replace(CONFIG, iterations=0))]
+)
+def test_full_trust_or_no_iteration_changes_nothing(weight, config):
+    scene = splat()
+    found = recolored(scene, weight=weight, config=config)
+    assert len(found.rows) == 0
+    assert torch.equal(found.apply(scene).sh, scene.sh)
+
+
+@pytest.mark.parametrize("k", [1, 4, 9])
+def test_the_degree_of_the_scene_is_kept(k):
+    """A colour without direction moves only as far as the photographs let it."""
+    scene = splat(k)
+    after = recolored(scene).apply(scene)
+    assert after.sh.shape[1] == k
+    full = move(splat(), recolored(splat()).apply(splat()), TARGET).mean()
+    seen = move(scene, after, TARGET).mean()
+    assert 0 < seen <= 1.01 * full
+    assert k > 1 or seen < 0.5 * full
+
+
+def test_the_next_target_keeps_what_the_last_one_changed():
+    scene = splat()
+    held = hold(scene)
+    after = recolored(scene, held=held).apply(scene)
+    both = held.add(TARGET, sum_weights(RENDERER.freeze(after, TARGET)))
+    assert len(both.centers) == len(both.sums) == len(PHOTOS) + 1
+    kept, lost = (
+        move(after, recolored(after, NEXT, held=views).apply(after), TARGET).mean()
+        for views in (both, held)
+    )
+    assert kept < 0.9 * lost
+
+
+def test_a_smaller_change_than_the_least_is_not_made():
+    scene = splat()
+    coarse = replace(CONFIG, min_change=0.1)
+    many, few = (set(recolored(scene, config=c).rows.tolist()) for c in (CONFIG, coarse))
+    assert 0 < len(few) < len(many)
+    assert few < many
+
+
+def test_photographs_are_held_by_their_summed_weights():
+    scene = splat()
+    held = hold(scene, RecolorConfig(hold_weight=7.0))
+    assert (held.weights == 7).all()
+    for view, sums in zip(PHOTOS, held.sums, strict=True):
+        expected = sum_weights(RENDERER.freeze(scene, view.camera))
+        assert torch.allclose(sums, expected, rtol=1e-4, atol=1e-4)
+
+
+def test_the_number_of_threads_does_not_matter():
+    scene = splat()
+    one, two = (recolored(scene, renderer=CpuRenderer(threads)) for threads in (1, 2))
+    threads = torch.get_num_threads()
+    torch.set_num_threads(3 - min(threads, 2))
+    try:
+        other = recolored(scene)
+    finally:
+        torch.set_num_threads(threads)
+    for found in (two, other):
+        assert torch.equal(one.rows, found.rows)
+        assert torch.equal(one.delta, found.delta)
+
+
+def test_gaussians_follow_their_proxy():
+    scene = splat()
+    found = recolored(scene)
+    index = torch.arange(len(scene)).repeat_interleave(2)
+    source = ContextScene(scene[index], scene, index)
+    ids = scene.generated.index_fill(0, found.rows, 3)
+    state = replace(
+        begin_with(scene[index], PHOTOS),
+        source=source,
+        parts=(replace(found.apply(scene), generated=ids),),
+    )
+    after = state.recolored_context
+    assert torch.allclose(after.sh, found.apply(scene).sh[index], atol=1e-6)
+    assert torch.equal(after.generated, ids[index])
+    assert torch.equal(after.sh[~state.recolored_mask], scene[index].sh[~state.recolored_mask])
+
+
+def test_the_reference_renderer_recolours_alike():
+    scene = splat()
+    found = recolored(scene), recolored(scene, renderer=load_renderer("reference"))
+    images = [RENDERER.render(each.apply(scene), TARGET).image for each in found]
+    assert (images[0] - images[1]).abs().max() < 0.01
