@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 
-from gscompleter.apps.report.finished import CompletionSummary, TargetRow
+from gscompleter.apps.report.schema import AlignmentRow, CompletionSummary
 
 FRAME_NOTES = {
     "given": None,
@@ -13,6 +13,13 @@ FRAME_NOTES = {
     "dataparser": "The splat is in the frame of its trainer's dataparser.",
     "normalised": "The splat is in a frame that its trainer normalised.",
     "similarity": "The splat is in a frame of its own, aligned by matching features.",
+}
+ALIGNMENTS = {
+    "ransac": "RANSAC fits scene depth = {scale} × lifted depth {shift}; {inliers} of the pixels "
+    "agree",
+    "median": "The median depth ratio is used: scene depth = {scale} × lifted depth; "
+    "{inliers} of the pixels agree",
+    "identity": "The lifted depths are used unchanged",
 }
 NO_TARGET_NOTE = "No large hole was found around the photographs; nothing was completed."
 
@@ -53,19 +60,18 @@ def describe_exposures(gains: Iterable[Sequence[float] | None]) -> str | None:
     )
 
 
-def list_target_notes(row: TargetRow) -> list[str]:
-    """List the notes of a target, with fallbacks that no note mentions."""
-    text = " ".join(row.notes)
-    found = list(row.notes)
-    if row.anchor_fallback and "least-turned" not in text:
-        found.append("Every view is turned too far; the least-turned one is the anchor.")
-    if row.affine.method == "median" and "median" not in text:
-        found.append(
-            "RANSAC finds no reliable depth correction; the median depth ratio replaces it."
-        )
-    if row.added == 0 and "nothing" not in text.lower():
-        found.append("Nothing was added here.")
-    return found
+def describe_alignment(affine: AlignmentRow, unit: str) -> str:
+    """Describe the depth alignment of a target."""
+    sign = "−" if affine.shift < 0 else "+"
+    text = ALIGNMENTS.get(affine.method, "The depths are aligned by an unknown method").format(
+        scale=format_number(affine.scale, 3),
+        shift=f"{sign} {format_number(abs(affine.shift), 3)} {unit}",
+        inliers=format_percent(affine.inliers, 0),
+    )
+    if affine.agreement is None:
+        return f"{text}."
+    share = format_percent(affine.agreement, 0)
+    return f"{text}. At the target, {share} of the visible scene agree."
 
 
 def list_scene_notes(summary: CompletionSummary) -> list[str]:
