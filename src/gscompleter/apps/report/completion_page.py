@@ -10,6 +10,7 @@ from pathlib import Path
 from statistics import fmean
 from typing import Any
 
+from gscompleter import __version__
 from gscompleter.apps.report.charts import (
     Plot,
     fit_drawing,
@@ -66,7 +67,7 @@ def render_completion_page(folder: Path) -> str:
     Raises:
         InputError: if the folder has no completion, a damaged one, or one of another version.
     """
-    summary = read_summary(folder)
+    summary = read_summary(folder, __version__)
     record, unit = read_record(folder, summary), find_length_unit(summary)
     gallery = open_gallery(folder / "images")
 

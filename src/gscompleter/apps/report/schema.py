@@ -8,7 +8,6 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Literal, TypeVar
 
-from gscompleter import __version__
 from gscompleter.errors import InputError, quote_value
 from gscompleter.evaluation.metrics.coverage import Coverage
 from gscompleter.io.files import SUMMARY_FILE
@@ -189,18 +188,18 @@ class CompletionRecord:
     added_points: tuple[Vector, ...]
 
 
-def read_summary(folder: Path) -> CompletionSummary:
-    """Read `summary.json`; InputError if it is missing, damaged or of another version."""
+def read_summary(folder: Path, only_version: str | None = None) -> CompletionSummary:
+    """Read `summary.json`; InputError if it is missing, damaged or not of `only_version`."""
     path = folder / SUMMARY_FILE
     check_results(folder, SUMMARY_FILE)
-    content = read_json(path, ADVICE)
+    content = with_new_keys(read_json(path, ADVICE))
     version = content.get("version") if isinstance(content, dict) else None
-    if isinstance(version, str) and version != __version__:
+    if isinstance(version, str) and only_version not in (None, version):
         raise InputError(
             f"{quote_value(path)} was written by version {quote_value(version)}, and this is "
-            f"{__version__}; use that version, or {ADVICE}."
+            f"{only_version}; use that version, or {ADVICE}."
         )
-    return parse_content(CompletionSummary, with_new_keys(content), path, ADVICE)
+    return parse_content(CompletionSummary, content, path, ADVICE)
 
 
 def read_record(folder: Path, summary: CompletionSummary) -> CompletionRecord:
