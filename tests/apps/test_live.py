@@ -22,11 +22,20 @@ from command import run
 from gscompleter import load_ply, save_ply
 from gscompleter.apps.commands import live
 from gscompleter.apps.commands.options import LiveOptions
-from gscompleter.apps.live.page import Page, PageServices, describe_outcome, run_request
-from gscompleter.apps.live.poses import camera_from_page, camera_to_page, compute_page_unit
-from gscompleter.apps.live.serving import start_server
+from gscompleter.apps.live.conversion import (
+    camera_from_page,
+    camera_to_page,
+    compute_page_unit,
+    make_page_splat,
+)
+from gscompleter.apps.live.page import (
+    Page,
+    PageServices,
+    describe_outcome,
+    run_request,
+    start_server,
+)
 from gscompleter.apps.live.session import Session, complete_camera, undo_step
-from gscompleter.apps.live.splat import make_page_splat
 from gscompleter.cli import parse_command
 from gscompleter.completer import STAGES
 from gscompleter.config import CompleterConfig

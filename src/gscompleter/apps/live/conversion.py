@@ -1,4 +1,4 @@
-"""Conversion between cameras of the page and cameras of the scene.
+"""Conversion between the scene and the page: cameras, and Gaussians without view-dependent colour.
 
 Both have OpenCV axes. Page units are scaled so that the photographed surfaces are a few units away,
 as the controls and clipping planes of the page expect.
@@ -14,10 +14,11 @@ import torch
 from jaxtyping import Float
 
 from gscompleter.geometry import quats_to_rotations, rotations_to_quats
-from gscompleter.types import Camera
+from gscompleter.types import SH_C0, Camera, Gaussians
 
 SCENE_DISTANCE = 3.0
 """Distance of the middle of the depth range, in page units."""
+TINT_FACTORS = (1.0, 0.45, 0.9)
 
 
 @dataclass(frozen=True)
@@ -54,3 +55,34 @@ def camera_from_page(pose: PagePose, height: int, width: int, unit: float) -> Ca
     focal = height / 2 / math.tan(pose.fov / 2)
     K = torch.tensor([[focal, 0.0, width / 2], [0.0, focal, height / 2], [0.0, 0.0, 1.0]])
     return Camera(c2w.float(), K, width, height)
+
+
+@dataclass(frozen=True)
+class PageSplat:
+    """Gaussians in a unit of their own: the median of their largest scales.
+
+    The page keeps covariances in float16, in which those of a scene in kilometres would vanish.
+    """
+
+    centers: Float[np.ndarray, "n 3"]
+    covariances: Float[np.ndarray, "n 3 3"]
+    rgbs: Float[np.ndarray, "n 3"]
+    opacities: Float[np.ndarray, "n 1"]
+    size: float
+    """Length of the unit, in scene units."""
+
+
+def make_page_splat(gaussians: Gaussians, tinted: bool = False) -> PageSplat:
+    """Convert one or more Gaussians for the page."""
+    gaussians = gaussians.to("cpu")
+    size = gaussians.scales.amax(dim=1).median().item()
+    axes = quats_to_rotations(gaussians.quats) * (gaussians.scales / size)[:, None, :]
+    rgbs = (0.5 + SH_C0 * gaussians.sh[:, 0]).clamp(0, 1)
+    tint = torch.tensor(TINT_FACTORS if tinted else (1.0, 1.0, 1.0))
+    return PageSplat(
+        (gaussians.means / size).numpy(),
+        (axes @ axes.transpose(1, 2)).numpy(),
+        (rgbs * tint).numpy(),
+        gaussians.opacities[:, None].clamp(0, 1).numpy(),
+        size,
+    )
