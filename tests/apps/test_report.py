@@ -452,29 +452,38 @@ def test_the_drawing_stands_upright():
     assert np.allclose(fit_upright_axes(np.stack([rolled])) @ rolled[:, 1], [0, -1, 0])
 
 
-TABLES = {
-    "cases": 2,
-    "common": ["a"],
-    "methods": {
-        "full": {"finished": 1, "psnr": {"value": 24.5, "cases": 1}},
-        "reggs": {"finished": 1, "psnr": {"value": None, "cases": 0}},
-    },
-    "gain_by_distance": {"1": {"full": 2.0, "reggs": None}, "2": {"full": 1.0, "reggs": 0.5}},
-    "notes": [f"reggs is not the paper's {HOSTILE}"],
-    "fid": {"values": {}, "reason": "not requested"},
-    "failures": [{"case": "b", "method": "reggs", "reason": HOSTILE}],
-}
-TIMINGS = {
-    "full": {"seconds": {"lift": 1.0, "total": 2.0}, "peak_bytes": 2**30},
-    "reggs": {"seconds": {"total": 4.0}, "peak_bytes": None},
-    "steps": {},
-}
+TABLES = f"""Means over the 1 of 2 cases that all methods finished.
+
+### Images
+
+| method | PSNR |
+| --- | ---: |
+| full | 24.50 |
+| reggs | – |
+
+reggs is not the paper's {HOSTILE}
+
+FID: not requested.
+
+### Failed
+
+| case | method | reason |
+| --- | ---: | ---: |
+| b | reggs | {HOSTILE} or \\| |
+"""
+TIMINGS = """Median seconds of a step.
+
+| method | lift | total | memory |
+| --- | ---: | ---: | ---: |
+| full | 1.00 | 2.00 | 1.00 |
+| reggs | – | 4.00 | – |
+"""
 
 
 @pytest.fixture
 def evaluated(tmp_path) -> Path:
-    (tmp_path / "tables.json").write_text(json.dumps(TABLES))
-    (tmp_path / "timings.json").write_text(json.dumps(TIMINGS))
+    (tmp_path / "tables.md").write_text(TABLES)
+    (tmp_path / "timings.md").write_text(TIMINGS)
     Image.new("RGB", (40, 30), "white").save(tmp_path / "seconds.png")
     return tmp_path
 
@@ -484,18 +493,19 @@ def test_an_evaluation_has_a_page_with_its_tables_and_plots(evaluated, monkeypat
     text = (evaluated / "report.html").read_text()
     assert text == render_evaluation_page(evaluated)
     page, said = Page(text), Page(text).said()
-    assert "full 24.50 reggs –" in said
-    assert "full 2.00 1.00 reggs – 0.50" in said
+    assert "Images method PSNR full 24.50 reggs –" in said
     assert "full 1.00 2.00 1.00 reggs – 4.00 –" in said
-    assert len(page.all("img")) == len(page.all("script")) == 1
+    assert "or | Plots" in said
+    assert [len(page.all(tag)) for tag in ("img", "script", "table")] == [1, 1, 3]
     assert "<script>alert(1)</script>" in said
     assert "reggs is not the paper's" in said
+    assert "FID: not requested." in said
 
 
-@pytest.mark.parametrize("name", ["tables.json", "timings.json"])
-def test_damaged_tables_are_refused(evaluated, name):
-    (evaluated / name).write_text('{"methods": 5}')
-    with pytest.raises(InputError, match="is damaged"):
+@pytest.mark.parametrize("name", ["tables.md", "timings.md"])
+def test_missing_tables_are_told(evaluated, name):
+    (evaluated / name).unlink()
+    with pytest.raises(InputError, match=name):
         render_evaluation_page(evaluated)
 
 

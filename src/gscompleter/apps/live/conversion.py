@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 import torch
@@ -57,32 +58,21 @@ def camera_from_page(pose: PagePose, height: int, width: int, unit: float) -> Ca
     return Camera(c2w.float(), K, width, height)
 
 
-@dataclass(frozen=True)
-class PageSplat:
-    """Gaussians in a unit of their own: the median of their largest scales.
+def make_page_splat(gaussians: Gaussians, unit: float, tinted: bool) -> dict[str, Any]:
+    """Convert one or more Gaussians for the page, which scales them back by `scale`.
 
-    The page keeps covariances in float16, in which those of a scene in kilometres would vanish.
+    The page keeps covariances in float16, in which those of a scene in kilometres would vanish, so
+    their unit is the median of the largest scales.
     """
-
-    centers: Float[np.ndarray, "n 3"]
-    covariances: Float[np.ndarray, "n 3 3"]
-    rgbs: Float[np.ndarray, "n 3"]
-    opacities: Float[np.ndarray, "n 1"]
-    size: float
-    """Length of the unit, in scene units."""
-
-
-def make_page_splat(gaussians: Gaussians, tinted: bool = False) -> PageSplat:
-    """Convert one or more Gaussians for the page."""
     gaussians = gaussians.to("cpu")
     size = gaussians.scales.amax(dim=1).median().item()
     axes = quats_to_rotations(gaussians.quats) * (gaussians.scales / size)[:, None, :]
     rgbs = (0.5 + SH_C0 * gaussians.sh[:, 0]).clamp(0, 1)
     tint = torch.tensor(TINT_FACTORS if tinted else (1.0, 1.0, 1.0))
-    return PageSplat(
-        (gaussians.means / size).numpy(),
-        (axes @ axes.transpose(1, 2)).numpy(),
-        (rgbs * tint).numpy(),
-        gaussians.opacities[:, None].clamp(0, 1).numpy(),
-        size,
-    )
+    return {
+        "centers": (gaussians.means / size).numpy(),
+        "covariances": (axes @ axes.transpose(1, 2)).numpy(),
+        "rgbs": (rgbs * tint).numpy(),
+        "opacities": gaussians.opacities[:, None].clamp(0, 1).numpy(),
+        "scale": size * unit,
+    }

@@ -221,10 +221,8 @@ class Page:
     def _show(self, name: str, gaussians: Gaussians, tinted: bool) -> Any:
         if len(gaussians) == 0:
             return None
-        splat = make_page_splat(gaussians, tinted)
-        arrays = splat.centers, splat.covariances, splat.rgbs, splat.opacities
-        size = splat.size * self._unit
-        return self.server.scene.add_gaussian_splats(name, *arrays, scale=size)
+        splat = make_page_splat(gaussians, self._unit, tinted)
+        return self.server.scene.add_gaussian_splats(name, **splat)
 
     def _show_photographs(self) -> None:
         for number, view in enumerate(self.subject.photographs):

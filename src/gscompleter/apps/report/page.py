@@ -66,6 +66,10 @@ class Gallery:
         image = scale_image(image, self.scale, exact)
         return Picture(alt, *image.size, uri=encode_image(image, exact))
 
+    def has(self, name: str) -> bool:
+        """Return True if there is a file of this name."""
+        return (self.folder / name).is_file()
+
     def embed_slider(self, name: str, label: str, exact: bool = False) -> Slider:
         """Embed an image before and after."""
         before, after = (

@@ -119,14 +119,6 @@ class SceneRow:
 
 
 @dataclass(frozen=True)
-class DepthRange:
-    """Near and far plane in scene units."""
-
-    near: float | None = None
-    far: float | None = None
-
-
-@dataclass(frozen=True)
 class CompletionSummary:
     """The parts of `summary.json` that pages show."""
 
@@ -136,7 +128,8 @@ class CompletionSummary:
     device: str
     scene: SceneRow
     frame: ResultFrame
-    depth_range: DepthRange
+    depth_range: Mapping[str, Any]
+    """Near and far plane in scene units."""
     coverage: Coverage
     context: tuple[ContextRow, ...]
     targets: tuple[TargetRow, ...]

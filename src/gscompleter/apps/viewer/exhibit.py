@@ -12,7 +12,6 @@ from PIL import Image
 from gscompleter.apps.report.schema import CompletionSummary, read_summary
 from gscompleter.data.camera_files import read_cameras
 from gscompleter.data.formats import open_photographs
-from gscompleter.data.frame import Frame
 from gscompleter.data.local_origin import compute_frame_from_photographs
 from gscompleter.data.resize import Resolution
 from gscompleter.data.scene import load_cameras
@@ -54,6 +53,13 @@ class SceneTransform:
     """Subtracted from camera positions in float64, before rounding."""
     transform: Float[np.ndarray, "4 4"]
     """Applied to cameras relative to `origin`."""
+
+    @classmethod
+    def from_photographs(
+        cls, transform: Float[np.ndarray, "4 4"], origin: Float[np.ndarray, "3"]
+    ) -> SceneTransform:
+        """Make the transform from the frame of the photographs, with a local origin."""
+        return cls(origin, transform @ compute_frame_from_photographs(-origin))
 
     def load(self, path: Path, resolution: Resolution = None) -> list[Camera]:
         """Load the cameras of a file into the frame of the scene."""
@@ -113,9 +119,8 @@ def load_viewer_completion(folder: Path, drop_nonfinite: bool) -> ViewerContent:
         load_splat(folder / name, drop_nonfinite) for name in (CONTEXT_FILE, COMPLETED_FILE)
     )
     summary = read_summary(folder)
-    origin = np.array(summary.frame.origin)
-    transform = np.array(summary.frame.transform) @ compute_frame_from_photographs(-origin)
-    place = SceneTransform(origin, transform)
+    transform, origin = np.array(summary.frame.transform), np.array(summary.frame.origin)
+    place = SceneTransform.from_photographs(transform, origin)
     cameras, remarks = load_target_cameras(folder, summary, place), list[str]()
     source = locate_photographs(folder, summary)
     try:
@@ -161,7 +166,7 @@ def load_context_cameras(
             f"photograph-{number}",
             f"Photograph {number}",
             transform_camera(photographs.camera(number), transform),
-            make_frame_thumbnail(photographs.frame(number)),
+            make_thumbnail(photographs.frame(number).find_stored()),
         )
         for number in [row.frame for row in summary.context if row.frame is not None]
     ]
@@ -189,22 +194,16 @@ def load_file_cameras(
             f"camera-{number}",
             Path(frame.name).name or f"Camera {number}",
             camera,
-            make_frame_thumbnail(frame),
+            make_thumbnail(frame.find_stored()),
         )
         for number, (frame, camera) in enumerate(cameras, start=1)
     ]
 
 
-def make_frame_thumbnail(frame: Frame) -> bytes | None:
-    """Make a thumbnail of a frame's photograph; None if it is not in a file."""
-    stored = frame.find_stored()
-    return make_thumbnail(stored) if isinstance(stored, Path) else None
-
-
-def make_thumbnail(path: Path) -> bytes | None:
+def make_thumbnail(stored: Path | bytes | None) -> bytes | None:
     """Make a small JPEG of an image file; None if there is no file."""
-    if not path.is_file():
+    if not isinstance(stored, Path) or not stored.is_file():
         return None
-    image = Image.fromarray(read_pixels(path))
+    image = Image.fromarray(read_pixels(stored))
     image.thumbnail((THUMBNAIL_SIDE, THUMBNAIL_SIDE))
     return encode_jpeg(image, THUMBNAIL_QUALITY)

@@ -58,11 +58,6 @@ class NpmPackage:
     """`sha512-` and the hash in base64, as npm and browsers write it."""
 
     @property
-    def file(self) -> str:
-        """Name of its archive in our cache."""
-        return f"{self.name.replace('/', '-').lstrip('@')}-{self.version}.tgz"
-
-    @property
     def path(self) -> str:
         """Path of its archive in every npm registry."""
         return f"{self.name}/-/{self.name.rsplit('/', 1)[-1]}-{self.version}.tgz"
@@ -140,7 +135,7 @@ def get_archive(package: NpmPackage) -> bytes:
 
 def get_archive_path(package: NpmPackage) -> Path:
     """Get the path of an archive in the cache; users may put it there by hand."""
-    return get_download_folder() / "viewer" / package.file
+    return get_download_folder() / "viewer" / Path(package.path).name
 
 
 def fetch_archive(package: NpmPackage) -> bytes:

@@ -26,6 +26,7 @@ from torch import Tensor
 from gscompleter.apps.viewer.exhibit import ViewerCamera, ViewerContent
 from gscompleter.apps.viewer.packages import Libraries
 from gscompleter.errors import InputError, quote_value
+from gscompleter.geometry import is_inside, project
 from gscompleter.splats.spz import encode_spz
 from gscompleter.types import Camera, Gaussians
 
@@ -65,11 +66,11 @@ class PageFrame:
         means = ((gaussians.means.double() - self.centre) / self.unit).float()
         return replace(gaussians, means=means, scales=gaussians.scales / self.unit, encoded=None)
 
-    def compute_pose(self, camera: Camera) -> Float[Tensor, "4 4"]:
-        """Compute camera-to-world with three.js axes, in the page's origin and unit."""
+    def move_camera(self, camera: Camera) -> Camera:
+        """Move a camera to the page's origin and unit, in float64; its axes stay."""
         c2w = camera.c2w.detach().cpu().double().clone()
         c2w[:3, 3] = (c2w[:3, 3] - self.centre) / self.unit
-        return THREE_FROM_OPENCV @ c2w @ THREE_FROM_OPENCV
+        return replace(camera, c2w=c2w, K=camera.K.double())
 
 
 @dataclass(frozen=True)
@@ -181,30 +182,19 @@ def describe_camera(
     view_camera: ViewerCamera, frame: PageFrame, means: Float[Tensor, "n 3"]
 ) -> dict[str, Any]:
     """Describe a camera as the page reads it, focused on the landmarks `means`."""
-    camera, thumbnail = view_camera.camera, view_camera.thumbnail
-    K, pose = camera.K.double(), frame.compute_pose(camera)
+    camera, thumbnail = frame.move_camera(view_camera.camera), view_camera.thumbnail
+    K, (pixels, depths) = camera.K, project(means, camera)
+    seen = depths[is_inside(pixels, depths, camera)]
     return {
         "name": view_camera.name,
         "title": view_camera.title,
         "notes": view_camera.notes,
-        "pose": pose.flatten().tolist(),
+        "pose": (THREE_FROM_OPENCV @ camera.c2w @ THREE_FROM_OPENCV).flatten().tolist(),
         "lens": [K[0, 0].item(), K[1, 1].item(), K[0, 2].item(), K[1, 2].item()],
         "size": [camera.width, camera.height],
-        "focus": compute_focus_depth(camera, pose, means),
+        "focus": seen.median().item() if len(seen) else PAGE_EXTENT,
         "thumbnail": None if thumbnail is None else base64.b64encode(thumbnail).decode(),
     }
-
-
-def compute_focus_depth(
-    camera: Camera, pose: Float[Tensor, "4 4"], means: Float[Tensor, "n 3"]
-) -> float:
-    """Compute the median z-depth of the landmarks that a camera sees, in page units."""
-    flip = THREE_FROM_OPENCV[:3, :3]
-    x, y, z = ((means @ flip - pose[:3, 3]) @ pose[:3, :3] @ flip).unbind(1)
-    K = camera.K.double()
-    u, v = K[0, 0] * x / z + K[0, 2], K[1, 1] * y / z + K[1, 2]
-    seen = (z > 0) & (u > 0) & (u < camera.width) & (v > 0) & (v < camera.height)
-    return z[seen].median().item() if seen.any() else PAGE_EXTENT
 
 
 def fill_template(content: Mapping[str, Any], scripts: list[str]) -> str:
