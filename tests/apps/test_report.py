@@ -24,6 +24,7 @@ from gscompleter.apps.report.charts import (
     plot_loss,
     write_depth_image,
 )
+from gscompleter.apps.report.completion import MAX_SURROUNDING_VIEWS, select_most_changed
 from gscompleter.apps.report.completion_page import render_completion_page
 from gscompleter.apps.report.evaluation_page import render_evaluation_page
 from gscompleter.apps.report.page import encode_image, open_gallery
@@ -33,7 +34,6 @@ from gscompleter.apps.report.plain_words import (
     format_number,
     format_percent,
 )
-from gscompleter.apps.report.record import MAX_SURROUNDING_VIEWS, select_most_changed
 from gscompleter.apps.report.schema import PairsRow, read_summary
 from gscompleter.config import RegistrationConfig
 from gscompleter.errors import InputError

@@ -20,8 +20,7 @@ from PIL import Image, ImageDraw, ImageFont
 from torch import Tensor
 from torch.nn.functional import normalize
 
-from gscompleter.apps.report.completion import render_before_after
-from gscompleter.apps.report.record import MAX_PHOTOGRAPHS, thin_evenly
+from gscompleter.apps.report.completion import MAX_PHOTOGRAPHS, render_before_after, thin_evenly
 from gscompleter.evaluation.metrics.coverage import interpolate_camera
 from gscompleter.geometry import (
     embed_cameras,

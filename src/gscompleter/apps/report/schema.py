@@ -192,7 +192,7 @@ def read_summary(folder: Path, only_version: str | None = None) -> CompletionSum
             f"{quote_value(path)} was written by version {quote_value(version)}, and this is "
             f"{only_version}; use that version, or {ADVICE}."
         )
-    return parse_content(CompletionSummary, content, path, ADVICE)
+    return parse_content(CompletionSummary, content, path)
 
 
 def read_record(folder: Path, summary: CompletionSummary) -> CompletionRecord:
@@ -202,7 +202,7 @@ def read_record(folder: Path, summary: CompletionSummary) -> CompletionRecord:
         raise InputError(
             f"{quote_value(folder)} has no {RECORD_FILE}, which the report needs; {ADVICE}."
         )
-    record = parse_content(CompletionRecord, read_json(path, ADVICE), path, ADVICE)
+    record = parse_content(CompletionRecord, read_json(path, ADVICE), path)
     sizes = (len(summary.targets), len(summary.context))
     if sizes != (len(record.targets), len(record.context)):
         raise InputError(
@@ -236,8 +236,8 @@ def check_results(folder: Path, name: str) -> None:
         )
 
 
-def parse_content(kind: type[T], content: Any, path: Path, advice: str) -> T:
-    """Validate the content of a JSON file; raise an InputError with `advice` if it does not fit."""
+def parse_content(kind: type[T], content: Any, path: Path) -> T:
+    """Validate the content of a JSON file; raise an InputError if it does not fit."""
     from pydantic import TypeAdapter, ValidationError
 
     try:
@@ -247,5 +247,5 @@ def parse_content(kind: type[T], content: Any, path: Path, advice: str) -> T:
         place = ".".join(map(str, wrong["loc"])) or "its content"
         raise InputError(
             f"{quote_value(path)} is damaged ({quote_value(place)}: {quote_value(wrong['msg'])}); "
-            f"{advice}."
+            f"{ADVICE}."
         ) from None
