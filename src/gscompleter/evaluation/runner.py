@@ -36,7 +36,8 @@ from gscompleter.memory import check_memory
 from gscompleter.progress import Activity, show_activity, show_progress, stage
 from gscompleter.reconstructors import Reconstructor, load_reconstructor
 from gscompleter.render import load_renderer
-from gscompleter.stages.context import normalize_exposures, sort_by_frame
+from gscompleter.stages.context import normalize_exposures, reconstruct_context, sort_by_frame
+from gscompleter.timing import record_seconds
 from gscompleter.types import View
 
 RETRIES = 2
@@ -250,12 +251,13 @@ def load_or_reconstruct(path: Path, views: Sequence[View], models: Models) -> Sa
     device = views[0].image.device if views else "cpu"
 
     def save() -> None:
-        made = models.make_completer().reconstruct(views)
+        with record_seconds() as seconds:
+            made = reconstruct_context(models.reconstructor, views)
         near, far = made.views[0].camera.near, made.views[0].camera.far
         assert near is not None
         assert far is not None
-        seconds = made.seconds["total"]
-        save_context(path, SavedContext(made.gaussians, near, far, seconds, made.exposure_gains))
+        scene, gains = made.source.gaussians, made.exposure_gains
+        save_context(path, SavedContext(scene, near, far, seconds["total"], gains))
 
     return load_or_compute(path, lambda: load_context(path, device), save)
 

@@ -36,8 +36,8 @@ from gscompleter.evaluation.store import (
     save_prediction,
 )
 from gscompleter.render import Renderer
-from gscompleter.stages.select_anchor import lift
-from gscompleter.state import Completion, InitialContext
+from gscompleter.stages.lift import lift_pair
+from gscompleter.state import Completion
 from gscompleter.types import Camera, DepthMap, Gaussians, View
 
 T = TypeVar("T")
@@ -114,7 +114,7 @@ def advance_task(
 ) -> Progress:
     """Complete one more target and save its prediction and images."""
     number = len(progress.steps) + 1
-    state = task.models.make_completer().begin_with(InitialContext(progress.scene, progress.views))
+    state = task.models.make_completer().begin(progress.views, progress.scene)
     path = get_step_path(folder, method, number)
     prediction = load_or_predict(method, state, target.camera, number, task.models, path)
     step, seen = score_step(prediction, state, target, task)
@@ -200,7 +200,7 @@ def get_metric_depth(target: View, anchor: View, models: Models) -> DepthMap:
     """Return the measured depth of `target`, or an estimate of Ψ if the data have none."""
     if target.depth is not None:
         return DepthMap(target.depth, target.depth > 0)
-    return lift(models.reconstructor, target, anchor).reference_depth
+    return lift_pair(models.reconstructor, target, anchor).reference_depth
 
 
 def compute_depth_scale(

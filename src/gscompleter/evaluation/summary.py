@@ -9,11 +9,11 @@ from functools import reduce
 from pathlib import Path
 from typing import Any
 
-from gscompleter.completer import STAGES
 from gscompleter.errors import InputError
 from gscompleter.evaluation.methods import METHODS
 from gscompleter.evaluation.steps import compute_scale_drift
 from gscompleter.evaluation.store import check_run, list_row_paths, read_json
+from gscompleter.timing import STAGES
 
 RunRow = dict[str, Any]
 """Output of `evaluate` for a task and a method."""

@@ -75,13 +75,13 @@ class Session:
 def complete_camera(session: Session, camera: Camera) -> tuple[Session, TargetResult]:
     """Complete the scene for a camera in the frame of the result.
 
-    Returns the same session if nothing was added.
+    Returns the same session if nothing was added or recoloured.
     """
     told = session.conversion.convert_to_photographs(camera)
     target = session.conversion.convert_to_result(told).to(session.latest.views[0].image.device)
     completion = session.completer.advance(session.latest, target)
     result = completion.targets[-1]
-    if not len(result.added):
+    if not len(result.added) and not result.num_recolored:
         return session, result
     return replace(session, steps=(*session.steps, CompletedStep(told, completion))), result
 

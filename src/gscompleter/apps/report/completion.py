@@ -40,7 +40,7 @@ from gscompleter.splats.layout import save_like
 from gscompleter.splats.ply import save_ply
 from gscompleter.splats.provenance import REMOVED_FILE, save_removed
 from gscompleter.state import Completion, TargetResult
-from gscompleter.types import Camera, DepthPairs, Gaussians, Render, View
+from gscompleter.types import Camera, DepthPairs, Gaussians, Render, View, merge
 
 GENERATED_FILE = "generated.ply"
 MAX_PHOTOGRAPHS = 200
@@ -133,9 +133,9 @@ def render_before_after(
     """Render the context and the completed scene."""
     with torch.no_grad():
         frozen = renderer.freeze(completion.context, camera)
-        if completion.pruned is None:
+        if completion.recolored_context is completion.context:
             after = frozen.composite(completion.added)
-        else:  # some of the context was pruned
+        else:
             after = renderer.render(completion.scene, camera)
     return BeforeAfter(frozen.render, after, photograph)
 
@@ -208,12 +208,11 @@ def compute_mask_fraction(mask: Bool[Tensor, "h w"] | None) -> float:
 
 
 def count_gaussians(completion: Completion) -> dict[str, int]:
-    """Count the Gaussians of the context, the added and, of an input splat, the pruned ones."""
+    """Count the Gaussians of the context, the added and, of a splat, the recoloured ones."""
     found = {"context": len(completion.context), "added": len(completion.added)}
-    if completion.observations is None:
+    if completion.config.trust == "full":
         return found
-    removed = completion.pruned_mask
-    return found | {"removed": 0 if removed is None else int(removed.sum())}
+    return found | {"recolored": int(completion.recolored_mask.sum())}
 
 
 def write_report(
@@ -282,7 +281,8 @@ def make_record(
 def make_target_record(result: TargetResult, limits: Limits | None) -> TargetRecord:
     """Collect the data of a target."""
     losses = {name: round_values(torch.tensor(values)) for name, values in result.losses.items()}
-    pairs = None if result.pairs is None else make_pairs(result.pairs)
+    compared = result.affine.pairs
+    pairs = make_pairs(compared) if len(compared.predicted) else None
     return TargetRecord(make_pose(result.target), limits, losses, pairs)
 
 
@@ -324,49 +324,55 @@ def round_values(values: Tensor) -> tuple[Any, ...]:
 
 
 def write_scenes(folder: Path, completion: Completion, input_splat: InputSplatFile | None) -> None:
-    """Write the three scenes, and the pruned Gaussians of an input splat."""
-    added = completion.added
-    writing = [partial(save_ply, folder / GENERATED_FILE, added, provenance=True)]
+    """Write the three scenes, and the originals of recoloured Gaussians of an input splat."""
+    added, context = completion.added, completion.context
     if input_splat is None:
-        context = completion.context
         completed = partial(save_ply, folder / COMPLETED_FILE, completion.scene, provenance=True)
     else:
-        context, pruned = restore_file_order(completion, input_splat)
-        completed = partial(save_completed_splat, folder, context, pruned, added, input_splat)
-    writing += [partial(save_ply, folder / CONTEXT_FILE, context), completed]
+        context, changed = restore_file_order(completion, input_splat)
+        recolored = completion.recolored_context[completion.recolored_mask]
+        generated = merge([recolored, added])
+        completed = partial(save_completed_splat, folder, context, changed, generated, input_splat)
+    writing = [
+        completed,
+        partial(save_ply, folder / CONTEXT_FILE, context),
+        partial(save_ply, folder / GENERATED_FILE, added, provenance=True),
+    ]
     map_in_parallel(lambda write: write(), writing)
 
 
 def restore_file_order(
     completion: Completion, input_splat: InputSplatFile
-) -> tuple[Gaussians, Bool[Tensor, "n"] | None]:
-    """Sort the context and its pruned mask in the order of the input file."""
-    context, pruned = completion.context, completion.pruned_mask
+) -> tuple[Gaussians, Bool[Tensor, "n"]]:
+    """Sort the context and the mask of recoloured Gaussians in the order of the input file."""
+    context, changed = completion.context, completion.recolored_mask
     if input_splat.file_order is None:
-        return context, pruned
+        return context, changed
     places = input_splat.file_order.argsort().to(context.means.device)
-    return context[places], None if pruned is None else pruned[places]
+    return context[places], changed[places]
 
 
 def save_completed_splat(
     folder: Path,
     context: Gaussians,
-    pruned: Bool[Tensor, "n"] | None,
-    added: Gaussians,
+    changed: Bool[Tensor, "n"],
+    generated: Gaussians,
     input_splat: InputSplatFile,
 ) -> None:
-    """Write `completed.ply` in the layout of the input splat, and `removed.ply`."""
+    """Write `completed.ply` in the layout of the input splat, and the originals of the changed.
+
+    Recoloured Gaussians stand among the generated ones, after all that kept its bits.
+    """
     kept = input_splat.context_mask
-    if pruned is None or not pruned.any():
-        save_like(folder / COMPLETED_FILE, context, added, input_splat.path, kept)
+    if not changed.any():
+        save_like(folder / COMPLETED_FILE, context, generated, input_splat.path, kept)
         return
-    rows = torch.nonzero(pruned.cpu())[:, 0]
-    removed = context[pruned].to("cpu")
-    save_removed(folder / REMOVED_FILE, removed, rows, input_splat.path, kept)
-    stays, left = ~pruned.cpu(), context[~pruned]
+    rows = torch.nonzero(changed.cpu())[:, 0]
+    save_removed(folder / REMOVED_FILE, context[changed].to("cpu"), rows, input_splat.path, kept)
+    stays = ~changed.cpu()
     if kept is not None:
         stays = torch.zeros_like(kept).masked_scatter(kept, stays)
-    save_like(folder / COMPLETED_FILE, left, added, input_splat.path, stays)
+    save_like(folder / COMPLETED_FILE, context[~changed], generated, input_splat.path, stays)
 
 
 def write_pictures(
@@ -377,7 +383,7 @@ def write_pictures(
         "before": images.before.image,
         "after": images.after.image,
         "hole_mask": result.hole_mask.float(),
-        "support": result.trusted_alpha,
+        "support": None if result.trusted_alpha is result.before.alpha else result.trusted_alpha,
         "reference": None if result.reference is None else result.reference.image,
         "truth": None if images.photograph is None else images.photograph.image,
     }

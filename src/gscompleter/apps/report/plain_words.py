@@ -29,9 +29,9 @@ ORACLE_NOTE = (
     "The generator uses the photographs of the targets, so the scores measure the geometry and not "
     "the synthesized images."
 )
-PRUNED_NOTE = (
-    "Gaussians of the input splat were pruned because they covered holes; regions that no "
-    "photograph confirms count as holes."
+RECOLORED_NOTE = (
+    "Gaussians of the input splat got new colours, because no photograph confirms theirs; "
+    "removed.ply has them as they were."
 )
 NO_SCORES_NOTE = "No target has a photograph, so there are no scores at targets."
 NO_TARGET_NOTE = "No large hole was found around the photographs; nothing was completed."
@@ -91,7 +91,7 @@ def list_scene_notes(summary: CompletionSummary) -> list[str]:
     """List the notes on the whole completion."""
     context, targets, scene = summary.context, summary.targets, summary.scene
     placed = FRAME_NOTES.get(summary.frame.method, "The splat is in a frame of its own.")
-    removed = summary.gaussians.get("removed")
+    recolored = summary.gaussians.get("recolored")
     notes = [
         placed and f"{placed} summary.json lists the transform from the photographs to the result.",
         ORIGIN_NOTE if any(summary.frame.origin) else None,
@@ -104,7 +104,7 @@ def list_scene_notes(summary: CompletionSummary) -> list[str]:
         describe_exposures(row.exposure_gain for row in context),
         ORACLE_NOTE if summary.settings.get("uses_target_photographs") else None,
         NO_SCORES_NOTE if targets and all(row.psnr_after is None for row in targets) else None,
-        None if removed is None else f"{removed:,} {PRUNED_NOTE}",
+        f"{recolored:,} {RECOLORED_NOTE}" if recolored else None,
         None if targets else NO_TARGET_NOTE,
     ]
     return [note for note in notes if note is not None]

@@ -18,7 +18,7 @@ from torch import Tensor
 from gscompleter.errors import InputError
 from gscompleter.geometry import is_inside, project, project_mask, sample
 from gscompleter.render import Renderer
-from gscompleter.stages.filter_holes import filter_holes
+from gscompleter.stages.filter_holes import select_in_mask
 from gscompleter.types import Camera, DepthMap, Gaussians
 
 MIN_OPACITY = 1 / 255
@@ -174,8 +174,8 @@ def compare_clouds(
         return Alignment(share, count, None, None, None, None)
     scale = reference.depth[reference.valid].double().median().item()
     threshold = MATCH_DISTANCE * scale
-    points = filter_holes(generated, None, overlap, target).means
-    surface = filter_holes(context, None, overlap, target).means
+    points = select_in_mask(generated, None, overlap, target).means
+    surface = select_in_mask(context, None, overlap, target).means
     surface = surface[find_on_surface(surface, reference.depth, target, threshold)]
     if len(points) == 0 or len(surface) == 0:
         return Alignment(share, count, scale, error, None, None)
