@@ -14,12 +14,7 @@ from gscompleter import (
     load_ply,
     load_renderer,
 )
-from gscompleter.apps.report.completion import (
-    Target,
-    render_before_after,
-    render_context_views,
-    write_report,
-)
+from gscompleter.apps.report.completion import Target, write_report
 from gscompleter.config import PsnrGuardConfig
 from gscompleter.evaluation.metrics.image import psnr
 from gscompleter.generators import GeneratorOutput
@@ -341,21 +336,6 @@ class Counting(CpuRenderer):
         return super().freeze(context, camera)
 
 
-def test_a_report_freezes_the_completed_scene_no_more():
-    """The renders before and after are exact, and only the context is rendered again."""
-    renderer = Counting()
-    completer = GSCompleter(KnowingReconstructor(), KnowingGenerator(), renderer)
-    done = completer(photographs(), cameras()[1])
-    assert len(done.added) > 0
-    renderer.frozen.clear()
-    found = render_context_views(done, completer)
-    assert renderer.frozen == []
-    for images, view in zip(found, done.views, strict=True):
-        drawn = render_before_after(done, view.camera, view, CpuRenderer())
-        assert images.photograph is drawn.photograph
-        for seen, again in ((images.before, drawn.before), (images.after, drawn.after)):
-            assert torch.equal(seen.image, again.image)
-            assert torch.equal(seen.alpha, again.alpha)
 
 
 def test_photographs_are_frozen_once_however_many_targets_there_are():

@@ -17,13 +17,14 @@ from gscompleter.apps.report.film import (
     FRAMES_PER_SECOND,
     GAP_PIXELS,
     choose_stops,
-    crop_to_even,
     draw_corner_label,
+    fit_to_video,
+    measure_roll,
+    plan_camera_path,
     render_frame,
     render_frames,
     write_comparison_video,
 )
-from gscompleter.apps.report.film_path import measure_roll, plan_camera_path
 from gscompleter.errors import InputError
 from gscompleter.geometry import measure_baseline, measure_rotation, resize_camera
 from gscompleter.io.video import check_video_writer, write_video
@@ -121,8 +122,8 @@ def test_a_film_is_wide_enough(completion, size):
 
 
 def test_sides_are_even():
-    camera = crop_to_even(replace(camera_at(size=SIZE), width=33, height=31))
-    assert (camera.width, camera.height) == (32, 30)
+    camera = fit_to_video(resize_camera(camera_at(size=SIZE), 601, 401))
+    assert (camera.width, camera.height) == (600, 400)
 
 
 def test_the_film_starts_at_the_nearest_photograph(completion):

@@ -22,11 +22,20 @@ from command import run
 from gscompleter import load_ply, save_ply
 from gscompleter.apps.commands import live
 from gscompleter.apps.commands.options import LiveOptions
-from gscompleter.apps.live.page import Page, PageServices, describe_outcome, run_request
-from gscompleter.apps.live.poses import camera_from_page, camera_to_page, compute_page_unit
-from gscompleter.apps.live.serving import start_server
+from gscompleter.apps.live.conversion import (
+    camera_from_page,
+    camera_to_page,
+    compute_page_unit,
+    make_page_splat,
+)
+from gscompleter.apps.live.page import (
+    Page,
+    PageServices,
+    describe_outcome,
+    run_request,
+    start_server,
+)
 from gscompleter.apps.live.session import Session, complete_camera, undo_step
-from gscompleter.apps.live.splat import make_page_splat
 from gscompleter.cli import parse_command
 from gscompleter.config import CompleterConfig
 from gscompleter.errors import InputError
@@ -200,21 +209,21 @@ def test_a_camera_of_the_page_is_the_one_it_was_made_of(unit):
 def test_a_splat_of_any_unit_survives_the_pages_precision(unit):
     gaussians = random_gaussians(100)
     scaled = replace(gaussians, means=unit * gaussians.means, scales=unit * gaussians.scales)
-    splat = make_page_splat(scaled)
+    splat = make_page_splat(scaled, 1.0, tinted=False)
     axes = Rotation.from_quat(gaussians.quats.numpy(), scalar_first=True).as_matrix()
     true = axes @ (gaussians.scales.numpy()[:, :, None] ** 2 * axes.transpose(0, 2, 1))
-    shown = splat.covariances.astype(np.float16).astype(np.float64) * (splat.size / unit) ** 2
+    shown = (
+        splat["covariances"].astype(np.float16).astype(np.float64) * (splat["scale"] / unit) ** 2
+    )
     assert np.abs(shown - true).max() < 1e-3 * np.abs(true).max()
-    assert np.allclose(splat.centers * splat.size, scaled.means, rtol=1e-5)
+    assert np.allclose(splat["centers"] * splat["scale"], scaled.means, rtol=1e-5)
 
 
 def test_a_tint_changes_colours_alone():
-    plain, tinted = (
-        make_page_splat(random_gaussians(10)),
-        make_page_splat(random_gaussians(10), tinted=True),
-    )
-    assert np.abs(plain.rgbs - tinted.rgbs).max() > 0.1
-    assert np.array_equal(plain.covariances, tinted.covariances)
+    gaussians = random_gaussians(10)
+    plain, tinted = (make_page_splat(gaussians, 1.0, tinted=tint) for tint in (False, True))
+    assert np.abs(plain["rgbs"] - tinted["rgbs"]).max() > 0.1
+    assert np.array_equal(plain["covariances"], tinted["covariances"])
 
 
 def test_an_error_is_a_sentence_and_ends_nothing(capsys):

@@ -14,32 +14,27 @@ import torch
 from PIL import Image
 
 from command import run
-from gscompleter.apps.report.camera_figure import project_to_drawing
-from gscompleter.apps.report.completion_page import render_completion_page
-from gscompleter.apps.report.depth_picture import (
+from gscompleter.apps.report.charts import (
     NO_DEPTH_COLOR,
     compute_depth_limits,
+    compute_ticks,
+    fit_upright_axes,
     make_palette,
+    plot_depth_pairs,
+    plot_loss,
     write_depth_image,
 )
+from gscompleter.apps.report.completion import MAX_SURROUNDING_VIEWS, select_most_changed
+from gscompleter.apps.report.completion_page import render_completion_page
 from gscompleter.apps.report.evaluation_page import render_evaluation_page
-from gscompleter.apps.report.figures import (
-    compute_ticks,
-    draw_color_scale,
-    draw_time_bars,
-    plot_depth_scatter,
-    plot_loss,
-)
-from gscompleter.apps.report.finished import AlignmentRow, TargetRow, read_completion_folder
-from gscompleter.apps.report.page import encode_data_uri, open_gallery
+from gscompleter.apps.report.page import encode_image, open_gallery
 from gscompleter.apps.report.plain_words import (
     describe_motion,
     format_change,
     format_number,
     format_percent,
-    list_target_notes,
 )
-from gscompleter.apps.report.record import MAX_SURROUNDING_VIEWS, select_most_changed
+from gscompleter.apps.report.schema import PairsRow, read_summary
 from gscompleter.config import RegistrationConfig
 from gscompleter.errors import InputError
 from gscompleter.evaluation.metrics.coverage import RenderPair
@@ -186,7 +181,6 @@ def test_numbers_that_are_none_are_dashes(out, nothing):
         row.update({key: nothing for key in row if key.startswith(("psnr", "ssim"))})
         row["affine"]["agreement"] = None
         summary["context"][0]["psnr_after"] = nothing
-        summary["seconds"]["lift"] = float("nan")
 
     changed(out / "summary.json", forget)
     changed(
@@ -303,13 +297,6 @@ def test_what_is_no_result_is_refused_in_a_sentence(out, monkeypatch, capsys, da
         assert (out / "report.html").read_bytes() == before
 
 
-def row(**values) -> TargetRow:
-    affine = AlignmentRow(1.0, 0.0, 0.9, values.pop("method", "ransac"), None)
-    named = {"notes": (), "added": 5, "anchor_fallback": False} | values
-    scores = dict.fromkeys(("psnr_before", "psnr_after", "ssim_before", "ssim_after"))
-    return TargetRow(frame=None, anchor=0, hole_fraction=0.1, affine=affine, **scores, **named)
-
-
 def test_keys_of_the_last_release_are_read(completed_room, tmp_path):
     names = {
         "context": {"exposure_gain": "gain", "dynamic_fraction": "contradicted"},
@@ -325,21 +312,33 @@ def test_keys_of_the_last_release_are_read(completed_room, tmp_path):
 
     changed(old / "summary.json", rename)
     assert all(f'"{new}"' not in (old / "summary.json").read_text() for new in names["context"])
-    summary = read_completion_folder(old).summary
+    summary = read_summary(old)
     row, target = summary.context[0], summary.targets[0]
     assert (row.exposure_gain, row.dynamic_fraction) == ((2, 2, 2), 0.5)
     assert target.derived_from == 3
 
 
-def test_every_fallback_is_said_once():
-    assert list_target_notes(row()) == []
-    assert list_target_notes(row(notes=("It rained.",))) == ["It rained."]
-    assert len(list_target_notes(row(anchor_fallback=True))) == 1
-    said = "Every view is turned too far; the least-turned one is the anchor."
-    assert list_target_notes(row(anchor_fallback=True, notes=(said,))) == [said]
-    assert "median" in list_target_notes(row(method="median"))[0]
-    assert list_target_notes(row(added=0)) == ["Nothing was added here."]
-    assert len(list_target_notes(row(added=0, notes=("Nothing of it was added.",)))) == 1
+def test_notes_of_a_target_are_shown_and_nothing_added_is_said(out):
+    changed(out / "summary.json", lambda s: s["targets"][0].update(added=0, notes=["It rained."]))
+    said = Page(render_completion_page(out)).said()
+    assert "It rained." in said
+    assert "Nothing was added here." not in said
+    changed(out / "summary.json", lambda s: s["targets"][0].update(notes=[]))
+    assert "Nothing was added here." in Page(render_completion_page(out)).said()
+
+
+@pytest.mark.parametrize(
+    ("method", "sentence"),
+    [
+        ("ransac", "RANSAC fits scene depth"),
+        ("median", "The median depth ratio is used"),
+        ("identity", "The lifted depths are used unchanged."),
+    ],
+)
+def test_the_fit_of_the_depths_is_said(out, method, sentence):
+    fit = {"method": method, "agreement": None}
+    changed(out / "summary.json", lambda s: s["targets"][0]["affine"].update(fit))
+    assert sentence in Page(render_completion_page(out)).said()
 
 
 def test_depths_become_colours_from_near_to_far_and_grey_where_there_are_none(tmp_path):
@@ -364,10 +363,10 @@ def test_depths_become_colours_from_near_to_far_and_grey_where_there_are_none(tm
 def test_masks_and_depths_stay_exact_in_a_page_and_pages_stay_small(tmp_path):
     write_image(tmp_path / "mask.png", torch.eye(8) > 0)
     mask = Image.open(tmp_path / "mask.png").convert("RGB")
-    assert encode_data_uri(mask, exact=True).startswith("data:image/png;base64,")
+    assert encode_image(mask, exact=True).startswith("data:image/png;base64,")
     assert open_gallery(tmp_path).scale == 1
     Image.new("L", (6000, 4000)).save(tmp_path / "large.png")
-    large = open_gallery(tmp_path).embed_photo("large.png", "")
+    large = open_gallery(tmp_path).embed("large.png", "")
     assert 11e6 < large.width * large.height < 12.1e6
 
 
@@ -404,14 +403,34 @@ def test_the_record_keeps_what_the_affine_was_fitted_to(completed_room):
     assert len(kept["photographs"]) == kept["num_photographs"] == 3
 
 
-def test_figures_of_nothing_are_none():
+def test_plots_of_nothing_are_none():
     assert plot_loss("loss", []) is plot_loss("loss", [1.0]) is None
     assert plot_loss("loss", [float("nan"), 1.0]) is None
-    assert plot_depth_scatter([], 1.0, 0.0, "m") is None
-    assert plot_depth_scatter([(1.0, 1.0, True)], float("nan"), 0.0, "m") is None
-    assert draw_time_bars("seconds", {"lift": 0.0, "total": float("nan")}) is None
-    assert draw_color_scale((1.0, float("inf")), "m") is None
-    assert "polyline" in plot_loss("loss", [1.0, 1.0])
+    assert plot_depth_pairs(PairsRow("anchor", (), (), ()), 1.0, 0.0, "m") is None
+    pair = PairsRow("anchor", (1.0,), (1.0,), (True,))
+    assert plot_depth_pairs(pair, float("nan"), 0.0, "m") is None
+
+
+def points_of(line: str) -> np.ndarray:
+    return np.array([pair.split(",") for pair in line.split()], dtype=float)
+
+
+def test_the_loss_is_drawn_from_left_to_right_and_from_above_to_below():
+    plot = plot_loss("loss", [3.0, 2.0, 1.0])
+    points = points_of(plot.lines["curve"])
+    assert (np.diff(points, axis=0) > 0).all()  # y points down
+    assert (points[0] > (plot.x.start, plot.y.end)).all()
+    assert (points[-1] < (plot.x.end, plot.y.start)).all()
+
+
+def test_the_line_of_the_fit_ends_at_the_axes():
+    pairs = PairsRow("anchor", (1.0, 2.0, 3.0), (2.0, 4.0, 5.0), (True, True, False))
+    plot = plot_depth_pairs(pairs, 2.0, 0.0, "m")
+    (x1, y1), (x2, y2) = points_of(plot.lines["fit"])
+    assert plot.x.start <= x1 < x2 <= plot.x.end
+    assert plot.y.end - 0.1 <= y2 < y1 <= plot.y.start + 0.1
+    assert plot.dots["inlier"].count("M") == 2
+    assert plot.dots["outlier"].count("M") == 1
 
 
 def test_ticks_are_round_and_within():
@@ -424,37 +443,47 @@ def test_ticks_are_round_and_within():
         assert low - room <= min(found) < max(found) <= high + room
 
 
-def test_what_is_up_is_drawn_above_and_what_is_near_below():
-    middle, up, toward = project_to_drawing(
-        np.array([[0.0, 0, 0], [0, 1, 0], [0, 0, 1]]), yaw=0.0, pitch=30.0
-    )
-    assert up[1] < middle[1] < toward[1]
-    assert up[0] == middle[0] == pytest.approx(toward[0])
+def test_the_drawing_stands_upright():
+    level, rolled = np.eye(4)[:3], np.eye(4)[:3]
+    rolled[:2, :2] = [[0, -1], [1, 0]]  # by 90 degrees
+    right, up, _ = fit_upright_axes(np.stack([level, level]))
+    assert np.allclose(right, [1, 0, 0])
+    assert np.allclose(up, [0, -1, 0])  # y points down in the world
+    assert np.allclose(fit_upright_axes(np.stack([rolled])) @ rolled[:, 1], [0, -1, 0])
 
 
-TABLES = {
-    "cases": 2,
-    "common": ["a"],
-    "methods": {
-        "full": {"finished": 1, "psnr": {"value": 24.5, "cases": 1}},
-        "reggs": {"finished": 1, "psnr": {"value": None, "cases": 0}},
-    },
-    "gain_by_distance": {"1": {"full": 2.0, "reggs": None}, "2": {"full": 1.0, "reggs": 0.5}},
-    "notes": [f"reggs is not the paper's {HOSTILE}"],
-    "fid": {"values": {}, "reason": "not requested"},
-    "failures": [{"case": "b", "method": "reggs", "reason": HOSTILE}],
-}
-TIMINGS = {
-    "full": {"seconds": {"lift": 1.0, "total": 2.0}, "peak_bytes": 2**30},
-    "reggs": {"seconds": {"total": 4.0}, "peak_bytes": None},
-    "steps": {},
-}
+TABLES = f"""Means over the 1 of 2 cases that all methods finished.
+
+### Images
+
+| method | PSNR |
+| --- | ---: |
+| full | 24.50 |
+| reggs | – |
+
+reggs is not the paper's {HOSTILE}
+
+FID: not requested.
+
+### Failed
+
+| case | method | reason |
+| --- | ---: | ---: |
+| b | reggs | {HOSTILE} or \\| |
+"""
+TIMINGS = """Median seconds of a step.
+
+| method | lift | total | memory |
+| --- | ---: | ---: | ---: |
+| full | 1.00 | 2.00 | 1.00 |
+| reggs | – | 4.00 | – |
+"""
 
 
 @pytest.fixture
 def evaluated(tmp_path) -> Path:
-    (tmp_path / "tables.json").write_text(json.dumps(TABLES))
-    (tmp_path / "timings.json").write_text(json.dumps(TIMINGS))
+    (tmp_path / "tables.md").write_text(TABLES)
+    (tmp_path / "timings.md").write_text(TIMINGS)
     Image.new("RGB", (40, 30), "white").save(tmp_path / "seconds.png")
     return tmp_path
 
@@ -464,18 +493,19 @@ def test_an_evaluation_has_a_page_with_its_tables_and_plots(evaluated, monkeypat
     text = (evaluated / "report.html").read_text()
     assert text == render_evaluation_page(evaluated)
     page, said = Page(text), Page(text).said()
-    assert "full 24.50 reggs –" in said
-    assert "full 2.00 1.00 reggs – 0.50" in said
+    assert "Images method PSNR full 24.50 reggs –" in said
     assert "full 1.00 2.00 1.00 reggs – 4.00 –" in said
-    assert len(page.all("img")) == len(page.all("script")) == 1
+    assert "or | Plots" in said
+    assert [len(page.all(tag)) for tag in ("img", "script", "table")] == [1, 1, 3]
     assert "<script>alert(1)</script>" in said
     assert "reggs is not the paper's" in said
+    assert "FID: not requested." in said
 
 
-@pytest.mark.parametrize("name", ["tables.json", "timings.json"])
-def test_damaged_tables_are_refused(evaluated, name):
-    (evaluated / name).write_text('{"methods": 5}')
-    with pytest.raises(InputError, match="is damaged"):
+@pytest.mark.parametrize("name", ["tables.md", "timings.md"])
+def test_missing_tables_are_told(evaluated, name):
+    (evaluated / name).unlink()
+    with pytest.raises(InputError, match=name):
         render_evaluation_page(evaluated)
 
 

@@ -19,6 +19,14 @@ import pytest
 import torch
 
 from command import run
+from gscompleter.apps.report.schema import (
+    AlignmentRow,
+    CompletionSummary,
+    ContextRow,
+    ResultFrame,
+    SceneRow,
+    TargetRow,
+)
 from gscompleter.apps.viewer import page as pages
 from gscompleter.apps.viewer.exhibit import (
     ViewerCamera,
@@ -42,6 +50,7 @@ from gscompleter.apps.viewer.page import Page, make_page
 from gscompleter.apps.viewer.server import make_page_server
 from gscompleter.data.scene import write_cameras
 from gscompleter.errors import InputError
+from gscompleter.evaluation.metrics.coverage import Coverage
 from gscompleter.io.image import write_image
 from gscompleter.splats.formats import load_splat
 from gscompleter.splats.ply import save_ply
@@ -156,19 +165,6 @@ def test_without_a_connection_a_sentence_says_where_to_put_what(registry):
     sentence = refused.value.args[0]  # in full, because folders of a test may be long
     assert three.path in sentence
     assert str(get_archive_path(three)) in sentence
-
-
-def test_npm_says_where_packages_come_from_and_without_it_a_sentence_says_what_to_do(
-    registry, tmp_path, monkeypatch
-):
-    monkeypatch.delenv(REGISTRY_VARIABLE)
-    monkeypatch.setenv("PATH", str(tmp_path))
-    with pytest.raises(InputError, match="from its wheel"):
-        get_archive(three_of(registry))
-    npm = tmp_path / "npm"
-    npm.write_text(f"#!/bin/sh\necho {(tmp_path / 'registry').as_uri()}/\n")
-    npm.chmod(0o755)
-    assert get_archive(three_of(registry)) == archive_in(tmp_path, three_of(registry)).read_bytes()
 
 
 def test_a_wheel_needs_no_connection_and_its_libraries_are_the_same_bytes(registry, tmp_path):
@@ -322,13 +318,24 @@ def completion_in(folder: Path, transform: np.ndarray, origin: np.ndarray) -> Pa
     back = np.linalg.inv(transform)
     c2w = torch.from_numpy(back) @ TARGET.c2w.double()
     write_cameras(folder / "targets.json", [replace(TARGET, c2w=c2w)])
-    summary = {
-        "settings": {"folder": str(folder / "gone")},
-        "frame": {"transform": transform.tolist(), "origin": origin.tolist()},
-        "context": [{"frame": 0}],
-        "targets": [{"notes": ["a <note>"]}],
-    }
-    (folder / "summary.json").write_text(json.dumps(summary))
+    scores = [None] * 4
+    fit = AlignmentRow(1.0, 0.0, 1.0, "ransac")
+    row = TargetRow(None, *scores, 0, False, 0.5, fit, 1, notes=("a <note>",))
+    summary = CompletionSummary(
+        version="0.0.1",
+        settings={"folder": str(folder / "gone")},
+        seed=0,
+        device="cpu",
+        scene=SceneRow("nerfstudio", 1, 1),
+        frame=ResultFrame("similarity", tuple(map(tuple, transform.tolist())), tuple(origin)),
+        depth_range={},
+        coverage=Coverage(0.5, 1.0, 32),
+        context=(ContextRow(0, *scores),),
+        targets=(row,),
+        gaussians={"context": 1, "added": 1},
+        seconds={},
+    )
+    (folder / "summary.json").write_text(json.dumps(summary, default=vars))
     return folder
 
 
@@ -361,7 +368,7 @@ def completion_of_photographs_in(folder: Path) -> Path:
     """Write an output folder of `complete` for photographs without cameras, and move it."""
     completion_in(folder, np.eye(4), np.zeros(3))
     summary = json.loads((folder / "summary.json").read_text())
-    summary["scene"] = {"format": "photographs"}
+    summary["scene"]["format"] = "photographs"
     (folder / "summary.json").write_text(json.dumps(summary))
     write_photographs(folder / "colmap" / "images")
     write_colmap_binary(folder / "colmap" / "sparse" / "0")

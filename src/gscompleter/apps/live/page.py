@@ -3,10 +3,12 @@
 from __future__ import annotations
 
 import html
+import re
+import socket
 import time
 import traceback
-from collections.abc import Callable, Sequence
-from contextlib import redirect_stdout
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager, redirect_stdout
 from dataclasses import dataclass
 from functools import partial
 from io import StringIO
@@ -16,17 +18,17 @@ from typing import Any
 
 import numpy as np
 import viser
+from websockets.asyncio import server as websockets
 
-from gscompleter.apps.live.poses import (
+from gscompleter.apps.live.conversion import (
     SCENE_DISTANCE,
     PagePose,
     camera_from_page,
     camera_to_page,
     compute_page_unit,
+    make_page_splat,
 )
-from gscompleter.apps.live.serving import start_server
 from gscompleter.apps.live.session import Session, complete_camera, undo_step
-from gscompleter.apps.live.splat import make_page_splat
 from gscompleter.errors import InputError
 from gscompleter.geometry import compute_spacing, estimate_up
 from gscompleter.progress import notify_of_stages
@@ -34,6 +36,8 @@ from gscompleter.state import NOTHING_ADDED, Completion, TargetResult
 from gscompleter.timing import STAGES
 from gscompleter.types import Camera, Gaussians, View
 
+LOCAL_HOSTS = ("127.0.0.1", "localhost")
+LOCAL_ORIGIN = re.compile(r"http://(127\.0\.0\.1|localhost)(:\d+)?")
 MAX_FRUSTUM_LENGTH, MAX_SPACING_FRACTION = 0.1, 0.2
 """Largest length of a camera pyramid, in page units and as a fraction of camera spacing."""
 CLEARANCE_LENGTHS = 6.0
@@ -146,13 +150,6 @@ class Page:
         scene.set_up_direction(estimate_up([v.camera for v in self.subject.photographs]).numpy())
         self._set_initial_camera(camera_to_page(self._first, self._unit))
         self._status = gui.add_html("")
-        self._add_buttons()
-        self._show("/observed", self.session.latest.context, tinted=False)
-        self._show_photographs()
-        self.show_message(WELCOME)
-
-    def _add_buttons(self) -> None:
-        gui = self.server.gui
         for label, job in (
             ("Complete what I see", self.complete),
             ("Find a hole", self.find),
@@ -162,9 +159,13 @@ class Page:
             gui.add_button(label).on_click(partial(self._submit, job))
         self._generated_mode = gui.add_dropdown("Generated", ("show", "tint", "hide"))
         self._generated_mode.on_update(lambda _: self._show_generated())
-        cameras = gui.add_checkbox("Cameras", initial_value=True)
-        cameras.on_update(lambda _: self._show_cameras(cameras.value))
+        cameras = scene.add_frame("/cameras", show_axes=False)
+        show_cameras = gui.add_checkbox("Cameras", initial_value=True)
+        show_cameras.on_update(lambda _: setattr(cameras, "visible", show_cameras.value))
         gui.add_markdown(CONTROLS_HELP)
+        self._show("/observed", self.session.latest.context, tinted=False)
+        self._show_photographs()
+        self.show_message(WELCOME)
 
     def _submit(self, job: Job, event: viser.GuiEvent[Any]) -> None:
         """Queue a request, or refuse it while another runs."""
@@ -204,10 +205,9 @@ class Page:
             self._show_generated()
             for frustum in self._targets:
                 frustum.remove()
-            cameras = [step.completion.targets[-1].target for step in self.session.steps]
             self._targets = [
-                self._add_frustum(f"/cameras/target {number}", camera, TARGET_COLOR)
-                for number, camera in enumerate(cameras, start=1)
+                self._add_frustum(f"/cameras/target {number}", result.target, TARGET_COLOR)
+                for number, result in enumerate(now.targets, start=1)
             ]
 
     def _show_generated(self) -> None:
@@ -221,18 +221,10 @@ class Page:
     def _show(self, name: str, gaussians: Gaussians, tinted: bool) -> Any:
         if len(gaussians) == 0:
             return None
-        splat = make_page_splat(gaussians, tinted)
-        return self.server.scene.add_gaussian_splats(
-            name,
-            splat.centers,
-            splat.covariances,
-            splat.rgbs,
-            splat.opacities,
-            scale=splat.size * self._unit,
-        )
+        splat = make_page_splat(gaussians, self._unit, tinted)
+        return self.server.scene.add_gaussian_splats(name, **splat)
 
     def _show_photographs(self) -> None:
-        self._cameras = self.server.scene.add_frame("/cameras", show_axes=False)
         for number, view in enumerate(self.subject.photographs):
             frustum = self._add_frustum(
                 f"/cameras/photograph {number}", view.camera, PHOTOGRAPH_COLOR, view
@@ -241,9 +233,6 @@ class Page:
             frustum.on_click(lambda event, pose=pose: self._move_browser(event.client, pose))
             self._photographs.append(frustum)
         self._hide_near_photographs(camera_to_page(self._first, self._unit))
-
-    def _show_cameras(self, visible: bool) -> None:
-        self._cameras.visible = visible
 
     def _add_frustum(
         self, name: str, camera: Camera, color: tuple[int, int, int], view: View | None = None
@@ -298,3 +287,33 @@ def describe_outcome(result: TargetResult, seconds: float) -> str:
         f"{100 * result.hole_fraction:.1f} % of the image."
     )
     return "\n".join((text, *result.notes))
+
+
+def start_server(host: str, port: int) -> viser.ViserServer:
+    """Start a server, which runs in threads of its own."""
+    try:
+        socket.create_server((host, port)).close()
+    except OSError as error:
+        raise InputError(
+            f"{host} cannot use port {port} ({error.strerror}); choose another port.",
+            "port",
+        ) from error
+    with redirect_stdout(StringIO()), refuse_foreign_origins(host):  # viser prints a box
+        return viser.ViserServer(host, port, verbose=False)
+
+
+@contextmanager
+def refuse_foreign_origins(host: str) -> Iterator[None]:
+    """Make servers started inside refuse pages of other origins if `host` is this machine.
+
+    Any page in a browser may connect to this machine; only its `Origin` shows its source.
+    websockets can check it, but viser has no option for that. Programs send no origin and may
+    connect.
+    """
+    plain = websockets.serve
+    if host in LOCAL_HOSTS:
+        websockets.serve = partial(plain, origins=[LOCAL_ORIGIN, None])  # type: ignore[misc, assignment]
+    try:
+        yield
+    finally:
+        websockets.serve = plain  # type: ignore[misc]

@@ -9,13 +9,13 @@ from tempfile import TemporaryDirectory
 import numpy as np
 from jaxtyping import Float
 
+from gscompleter.apps.viewer.exhibit import SceneTransform
 from gscompleter.completer import GSCompleter
-from gscompleter.data.local_origin import compute_frame_from_photographs
 from gscompleter.data.resize import Resolution
-from gscompleter.data.scene import load_cameras, write_cameras
+from gscompleter.data.scene import write_cameras
 from gscompleter.errors import InputError
 from gscompleter.io.files import TARGETS_FILE
-from gscompleter.splat_alignment.similarity import transform_camera, transform_camera_exactly
+from gscompleter.splat_alignment.similarity import transform_camera_exactly
 from gscompleter.state import Completion, TargetResult
 from gscompleter.types import Camera
 
@@ -40,13 +40,12 @@ class FrameConversion:
 
     def convert_to_result(self, source: Camera) -> Camera:
         """Convert a camera to the frame of the result, by way of a file."""
+        place = SceneTransform.from_photographs(self.result_from_photographs, self.origin)
         with TemporaryDirectory() as folder:
             path = Path(folder) / TARGETS_FILE
             write_cameras(path, [source])
-            (camera,) = load_cameras(path, self.resolution, origin=self.origin.tolist())
-        return transform_camera(
-            camera, self.result_from_photographs @ compute_frame_from_photographs(-self.origin)
-        )
+            (camera,) = place.load(path, self.resolution)
+        return camera
 
 
 @dataclass(frozen=True)
@@ -76,13 +75,13 @@ class Session:
 def complete_camera(session: Session, camera: Camera) -> tuple[Session, TargetResult]:
     """Complete the scene for a camera in the frame of the result.
 
-    Returns the same session if nothing was added.
+    Returns the same session if nothing was added or recoloured.
     """
     told = session.conversion.convert_to_photographs(camera)
     target = session.conversion.convert_to_result(told).to(session.latest.views[0].image.device)
     completion = session.completer.advance(session.latest, target)
     result = completion.targets[-1]
-    if not len(result.added):
+    if not len(result.added) and not result.num_recolored:
         return session, result
     return replace(session, steps=(*session.steps, CompletedStep(told, completion))), result
 

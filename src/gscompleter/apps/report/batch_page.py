@@ -2,19 +2,22 @@
 
 from __future__ import annotations
 
-import base64
 import csv
 import io
 from collections.abc import Callable, Iterable, Mapping, Sequence
-from dataclasses import dataclass
 from pathlib import Path
 from statistics import fmean, median
 from typing import Any
 
 from PIL import Image
 
-from gscompleter.apps.report.page import JPEG_QUALITY, REPORT_FILE, Picture, render_template
-from gscompleter.apps.report.plain_words import format_number
+from gscompleter.apps.report.page import (
+    JPEG_QUALITY,
+    REPORT_FILE,
+    Picture,
+    encode_uri,
+    render_template,
+)
 from gscompleter.errors import InputError
 from gscompleter.io.image import encode_jpeg, read_pixels
 from gscompleter.jobs.jobs import JOBS, THUMBNAILS, Job, read_row
@@ -43,19 +46,7 @@ TABLE_COLUMNS = (
     "result_bytes",
     "peak_bytes",
 )
-PAGE_COLUMNS = ("PSNR before", "PSNR after", "covered before", "covered after", "added", "seconds")
 IMAGE_ENDINGS = ("before", "after")
-
-
-@dataclass(frozen=True)
-class JobRow:
-    """A finished job on the page."""
-
-    name: str
-    cells: tuple[str, ...]
-    link: str
-    """Address of its report, relative to the page."""
-    picture: Picture | None
 
 
 def average_scores(summary: Mapping[str, Any]) -> dict[str, Any]:
@@ -119,50 +110,24 @@ def render_batch_page(
 ) -> str:
     """Render the page of a batch."""
     good = [row for row in rows if row["state"] == "done"]
-    bad = [f"{row['job']}: {row['reason']}" for row in rows if row["state"] == "failed"]
+    gains = [r["psnr_after"] - r["psnr_before"] for r in good if r["psnr_after"] is not None]
+    seconds = [row["seconds"] for row in good]
     return render_template(
         "batch.html",
         {
-            "facts": list_batch_facts(good, len(bad)),
-            "failures": bad,
             "jobs": [
-                make_page_row(row, find_picture(row["job"]) if number < MAX_THUMBNAILS else None)
+                (row, find_picture(row["job"]) if number < MAX_THUMBNAILS else None)
                 for number, row in enumerate(good)
             ],
-            "head": PAGE_COLUMNS,
+            "failures": [f"{r['job']}: {r['reason']}" for r in rows if r["state"] == "failed"],
+            "gain": median(gains) if gains else None,
+            "seconds": median(seconds) if seconds else None,
+            "hours": sum(seconds) / 3600,
+            "folder": JOBS,
+            "report": REPORT_FILE,
             "table": TABLE_FILE,
         },
     )
-
-
-def list_batch_facts(good: Sequence[Mapping[str, Any]], failed: int) -> list[tuple[str, str]]:
-    """List the numbers at the head of the page."""
-    gains = [r["psnr_after"] - r["psnr_before"] for r in good if r["psnr_after"] is not None]
-    seconds = [row["seconds"] for row in good]
-    return [
-        ("done", str(len(good))),
-        ("failed", str(failed)),
-        ("median ΔPSNR", f"{format_number(median(gains))} dB" if gains else "–"),
-        ("median time", f"{format_number(median(seconds))} s" if seconds else "–"),
-        ("total time", f"{format_number(sum(seconds) / 3600)} h" if seconds else "–"),
-    ]
-
-
-def make_page_row(row: Mapping[str, Any], picture: Picture | None) -> JobRow:
-    """Format the row of a finished job."""
-
-    def share(key: str) -> str:
-        return "–" if row.get(key) is None else f"{100 * row[key]:.1f} %"
-
-    cells = (
-        format_number(row.get("psnr_before")),
-        format_number(row.get("psnr_after")),
-        share("coverage_before"),
-        share("coverage_after"),
-        f"{row['added']:,}" if row.get("added") is not None else "–",
-        format_number(row.get("seconds")),
-    )
-    return JobRow(row["job"], cells, f"{JOBS}/{row['job']}/{REPORT_FILE}", picture)
 
 
 def read_thumbnail(place: Place, name: str) -> Picture | None:
@@ -172,5 +137,5 @@ def read_thumbnail(place: Place, name: str) -> Picture | None:
         return None
     with Image.open(io.BytesIO(content)) as image:
         width, height = image.size
-    uri = f"data:image/jpeg;base64,{base64.b64encode(content).decode()}"
+    uri = encode_uri("image/jpeg", content)
     return Picture(f"{name}, before and after", width, height, uri)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -14,24 +14,42 @@ from jaxtyping import Bool, Float, Int64
 from torch import Tensor
 
 from gscompleter import __version__
-from gscompleter.apps.report.depth_picture import compute_depth_limits, write_depth_image
-from gscompleter.apps.report.record import Limits, make_record, select_most_changed, write_record
+from gscompleter.apps.report.charts import compute_depth_limits, write_depth_image
+from gscompleter.apps.report.schema import (
+    RECORD_FILE,
+    SCORES,
+    AlignmentRow,
+    CompletionRecord,
+    ContextRow,
+    HeldOutRow,
+    Limits,
+    PairsRow,
+    PoseRow,
+    TargetRecord,
+    TargetRow,
+    Vector,
+)
 from gscompleter.completer import GSCompleter
 from gscompleter.evaluation.metrics.coverage import RenderPair, compute_coverage
 from gscompleter.evaluation.metrics.image import compute_masked_psnr, ssim
-from gscompleter.io.files import COMPLETED_FILE, CONTEXT_FILE
+from gscompleter.io.files import COMPLETED_FILE, CONTEXT_FILE, SUMMARY_FILE
 from gscompleter.io.image import write_image
 from gscompleter.kernels.parallel import map_in_parallel
 from gscompleter.render import Renderer, get_view_map
 from gscompleter.splats.layout import save_like
 from gscompleter.splats.ply import save_ply
-from gscompleter.splats.provenance import REMOVED_FILE as REMOVED
-from gscompleter.splats.provenance import save_removed
+from gscompleter.splats.provenance import REMOVED_FILE, save_removed
 from gscompleter.state import Completion, TargetResult
-from gscompleter.types import Camera, Gaussians, Render, View, merge
+from gscompleter.types import Camera, DepthPairs, Gaussians, Render, View, merge
 
 GENERATED_FILE = "generated.ply"
-
+MAX_PHOTOGRAPHS = 200
+MAX_POINTS = 600
+"""Largest number of points to keep, of the context and of the added Gaussians each."""
+MAX_SURROUNDING_VIEWS = 6
+MIN_SURFACE_OPACITY = 0.3
+MIN_COLOR_CHANGE = 0.002
+"""Smallest mean colour difference, in [0, 1], of a changed image."""
 IGNORED_COLOR = (1.0, 0.0, 1.0)
 
 Scores = dict[str, float | None]
@@ -99,16 +117,14 @@ class BeforeAfter:
 
     def compute_scores(self) -> Scores:
         """Compute PSNR (dB) and SSIM over the valid pixels, or None without a photograph."""
-        images, truth = {"before": self.before.image, "after": self.after.image}, self.photograph
-        if truth is None:
-            return {f"{name}_{when}": None for name in ("psnr", "ssim") for when in images}
-        return {
-            **{
-                f"psnr_{w}": compute_masked_psnr(i, truth.image, truth.valid_mask)
-                for w, i in images.items()
-            },
-            **{f"ssim_{w}": ssim(truth.fill_ignored(i), truth.image) for w, i in images.items()},
-        }
+        scores: Scores = dict.fromkeys(SCORES)
+        truth = self.photograph
+        if truth is not None:
+            for when, render in (("before", self.before), ("after", self.after)):
+                image = render.image
+                scores[f"psnr_{when}"] = compute_masked_psnr(image, truth.image, truth.valid_mask)
+                scores[f"ssim_{when}"] = ssim(truth.fill_ignored(image), truth.image)
+        return scores
 
 
 def render_before_after(
@@ -124,18 +140,6 @@ def render_before_after(
     return BeforeAfter(frozen.render, after, photograph)
 
 
-def render_context_views(completion: Completion, completer: GSCompleter) -> list[BeforeAfter]:
-    """Render the context views, from the cache of `completer` unless it used an LOD proxy."""
-    views = completion.views
-    if completion.source.rendered is not completion.context:
-        return [render_before_after(completion, v.camera, v, completer.renderer) for v in views]
-    cameras = [view.camera for view in views]
-    after = completer.scenes.freeze_at(completion.parts, cameras)
-    before = [completer.renderer.render(completion.context, camera) for camera in cameras]
-    seen = zip(before, after, views, strict=True)
-    return [BeforeAfter(first, last.render, view) for first, last, view in seen]
-
-
 def score_held_out(
     completion: Completion, photographs: Sequence[HeldOut], renderer: Renderer
 ) -> list[dict[str, Any]]:
@@ -144,71 +148,58 @@ def score_held_out(
     def score(held_out: HeldOut) -> dict[str, Any]:
         view = held_out.view
         scores = render_before_after(completion, view.camera, view, renderer).compute_scores()
-        return {"frame": view.frame, **scores, "is_check": held_out.is_check}
+        return asdict(HeldOutRow(view.frame, **scores, is_check=held_out.is_check))
 
     return list(get_view_map(completion.added)(score, photographs))
 
 
 def build_summary(
-    completion: Completion,
-    targets: Sequence[Target],
-    scores: Sequence[Scores],
-    run_info: Mapping[str, Any],
+    completion: Completion, targets: Sequence[Target], scores: Sequence[Scores]
 ) -> dict[str, Any]:
-    """Build summary.json from the facts of the run and the scores of context and targets."""
-    count = len(completion.views)
+    """Build the results in summary.json from the scores of context and targets."""
+    views, results = completion.views, completion.targets
+    gains = completion.exposure_gains
+    gain_rows = [None] * len(views) if gains is None else map(tuple, gains.tolist())
+    context = map(make_context_row, views, scores[: len(views)], gain_rows)
+    anchors = [views[result.anchor].frame for result in results]
+    at_targets = map(make_target_row, targets, results, scores[len(views) :], anchors)
     return {
-        "version": __version__,
-        **run_info,
-        "context": [
-            {
-                "frame": view.frame,
-                **scored,
-                "exposure_gain": gain,
-                "dynamic_fraction": compute_mask_fraction(view.dynamic_mask),
-                "ignored": compute_mask_fraction(view.ignore_mask),
-            }
-            for view, scored, gain in zip(
-                completion.views, scores[:count], list_exposure_gains(completion), strict=True
-            )
-        ],
-        "targets": [
-            {
-                "frame": target.frame,
-                "derived_from": target.derived_from,
-                "anchor": completion.views[result.anchor].frame,
-                "anchor_fallback": result.anchor_fallback,
-                "hole_fraction": result.hole_fraction,
-                "affine": {
-                    key: getattr(result.affine, key)
-                    for key in ("scale", "shift", "inliers", "method", "agreement")
-                },
-                **scored,
-                # the property of completed.ply that marks the Gaussians of this target
-                "target_id": int(result.added.generated[0]) if len(result.added) else None,
-                "added": len(result.added),
-                "notes": list(result.notes),
-                "refused": result.refusal,
-            }
-            for target, result, scored in zip(
-                targets, completion.targets, scores[count:], strict=True
-            )
-        ],
+        "context": [asdict(row) for row in context],
+        "targets": [asdict(row) for row in at_targets],
         "gaussians": count_gaussians(completion),
         "seconds": dict(completion.seconds),
     }
 
 
-def list_exposure_gains(completion: Completion) -> list[list[float] | None]:
-    """List the exposure gains per photograph and channel; None if they were not normalized."""
-    if completion.exposure_gains is None:
-        return [None] * len(completion.views)
-    return completion.exposure_gains.tolist()
+def make_context_row(view: View, scores: Scores, exposure_gain: Vector | None) -> ContextRow:
+    """Make the row of a context photograph."""
+    return ContextRow(
+        view.frame,
+        **scores,
+        exposure_gain=exposure_gain,
+        dynamic_fraction=compute_mask_fraction(view.dynamic_mask),
+        ignored=compute_mask_fraction(view.ignore_mask),
+    )
 
 
-def summarize_coverage(measured: Surroundings) -> dict[str, Any]:
-    """Summarize the coverage of the surrounding views, if there are any."""
-    return {"coverage": compute_coverage(measured.views).as_summary()} if measured.views else {}
+def make_target_row(
+    target: Target, result: TargetResult, scores: Scores, anchor: int | None
+) -> TargetRow:
+    """Make the row of a target; `anchor` is a frame."""
+    fit, added = result.affine, result.added
+    return TargetRow(
+        target.frame,
+        **scores,
+        anchor=anchor,
+        anchor_fallback=result.anchor_fallback,
+        hole_fraction=result.hole_fraction,
+        affine=AlignmentRow(fit.scale, fit.shift, fit.inliers, fit.method, fit.agreement),
+        added=len(added),
+        derived_from=target.derived_from,
+        target_id=int(added.generated[0]) if len(added) else None,
+        notes=result.notes,
+        refused=result.refusal,
+    )
 
 
 def compute_mask_fraction(mask: Bool[Tensor, "h w"] | None) -> float:
@@ -242,89 +233,112 @@ def write_report(
     Raises:
         InputError: if a file cannot be written.
     """
-    context_images = render_context_views(completion, completer)
-    target_images = [
-        render_before_after(completion, result.target, target.view, completer.renderer)
-        for target, result in zip(targets, completion.targets, strict=True)
-    ]
-    scores = map_in_parallel(BeforeAfter.compute_scores, [*context_images, *target_images])
-    unused = score_held_out(completion, held_out, completer.renderer)
+    renderer, views = completer.renderer, completion.views
+    results = list(zip(targets, completion.targets, strict=True))
+    seen = [(v.camera, v) for v in views] + [(r.target, t.view) for t, r in results]
+    images = [render_before_after(completion, camera, view, renderer) for camera, view in seen]
+    scores = map_in_parallel(BeforeAfter.compute_scores, images)
+    unused = score_held_out(completion, held_out, renderer)
     write_scenes(folder, completion, input_splat)
     pictured = folder / "images"
     pictured.mkdir()
-    results = zip(completion.targets, target_images, strict=True)
-    write_ignored(pictured, completion.views)
-    limits = [write_pictures(pictured, n, *pair) for n, pair in enumerate(results, start=1)]
-    surroundings = render_surroundings()
-    shown = select_most_changed(surroundings.views)
-    write_surrounding_views(pictured, shown)
-    write_record(folder, make_record(completion, limits, shown, surroundings.photographs))
-    facts = {**run_info, **summarize_coverage(surroundings), "held_out": unused}
-    summary = build_summary(completion, targets, scores, facts)
-    (folder / "summary.json").write_text(json.dumps(summary, indent=2) + "\n")
+    write_images(pictured, paint_ignored(views))
+    pairs = zip(completion.targets, images[len(views) :], strict=True)
+    limits = [write_pictures(pictured, number, *pair) for number, pair in enumerate(pairs, start=1)]
+    around = render_surroundings()
+    shown = select_most_changed(around.views)
+    write_images(pictured, name_surrounding_images(shown))
+    record = make_record(completion, limits, shown, around.photographs)
+    (folder / RECORD_FILE).write_text(
+        json.dumps(record, default=vars, separators=(",", ":")) + "\n"
+    )
+    coverage = {"coverage": asdict(compute_coverage(around.views))} if around.views else {}
+    summary = {"version": __version__, **run_info, **coverage, "held_out": unused}
+    summary |= build_summary(completion, targets, scores)
+    (folder / SUMMARY_FILE).write_text(json.dumps(summary, indent=2) + "\n")
     return summary
+
+
+def make_record(
+    completion: Completion,
+    limits: Sequence[Limits | None],
+    around: Sequence[RenderPair],
+    photographs: Sequence[Camera],
+) -> CompletionRecord:
+    """Collect the data of a completion."""
+    shown = thin_evenly(photographs, MAX_PHOTOGRAPHS)
+    return CompletionRecord(
+        context=tuple(make_pose(view.camera) for view in completion.views),
+        photographs=tuple(make_pose(camera) for camera in shown),
+        num_photographs=len(photographs),
+        targets=tuple(map(make_target_record, completion.targets, limits)),
+        around=tuple(compute_coverage([look]) for look in around),
+        scene_points=sample_points(completion.context),
+        added_points=sample_points(completion.added),
+    )
+
+
+def make_target_record(result: TargetResult, limits: Limits | None) -> TargetRecord:
+    """Collect the data of a target."""
+    losses = {name: round_values(torch.tensor(values)) for name, values in result.losses.items()}
+    compared = result.affine.pairs
+    pairs = make_pairs(compared) if len(compared.predicted) else None
+    return TargetRecord(make_pose(result.target), limits, losses, pairs)
+
+
+def make_pairs(pairs: DepthPairs) -> PairsRow:
+    """Round depth pairs."""
+    predicted, context = round_values(pairs.predicted), round_values(pairs.context)
+    return PairsRow(pairs.fit_view, predicted, context, tuple(pairs.inlier_mask.tolist()))
+
+
+def make_pose(camera: Camera) -> PoseRow:
+    """Convert a camera to its pose and field of view."""
+    a, b, c = camera.c2w[:3]
+    wide, high = camera.width / 2 / camera.K[0, 0].item(), camera.height / 2 / camera.K[1, 1].item()
+    return PoseRow((round_values(a), round_values(b), round_values(c)), (wide, high))
+
+
+def sample_points(gaussians: Gaussians) -> tuple[Vector, ...]:
+    """Sample means of opaque Gaussians, in the frame of the .ply."""
+    opaque = gaussians.means[gaussians.opacities >= MIN_SURFACE_OPACITY]
+    order = torch.randperm(len(opaque), generator=torch.Generator().manual_seed(0))
+    return tuple(map(round_values, opaque[order[:MAX_POINTS].to(opaque.device)].cpu()))
+
+
+def select_most_changed(looks: Sequence[RenderPair]) -> list[RenderPair]:
+    """Select the views whose images changed most, in descending order."""
+    changes = [(look.after.image - look.before.image).abs().mean().item() for look in looks]
+    order = sorted(range(len(looks)), key=changes.__getitem__, reverse=True)
+    return [looks[i] for i in order[:MAX_SURROUNDING_VIEWS] if changes[i] >= MIN_COLOR_CHANGE]
+
+
+def thin_evenly(items: Sequence[Camera], most: int) -> Sequence[Camera]:
+    """Take every n-th item so that at most `most` are left."""
+    return items[:: max(1, -(-len(items) // most))]
+
+
+def round_values(values: Tensor) -> tuple[Any, ...]:
+    """Round numbers [n] to six significant digits."""
+    return tuple(float(f"{value:.6g}") for value in values.detach().cpu().double().tolist())
 
 
 def write_scenes(folder: Path, completion: Completion, input_splat: InputSplatFile | None) -> None:
     """Write the three scenes, and the originals of recoloured Gaussians of an input splat."""
+    added, context = completion.added, completion.context
     if input_splat is None:
-        save_reconstructed_scenes(folder, completion)
-        return
-    context, changed = restore_file_order(completion, input_splat)
-    recolored = completion.recolored_context[completion.recolored_mask]
-    generated = merge([recolored, completion.added])
-    writing = (
+        completed = partial(save_ply, folder / COMPLETED_FILE, completion.scene, provenance=True)
+    else:
+        context, changed = restore_file_order(completion, input_splat)
+        recolored = completion.recolored_context[completion.recolored_mask]
+        generated = merge([recolored, added])
+        completed = partial(save_completed_splat, folder, context, changed, generated, input_splat)
+    writing = [
+        completed,
         partial(save_ply, folder / CONTEXT_FILE, context),
-        partial(save_completed_splat, folder, context, changed, generated, input_splat),
-        partial(save_ply, folder / GENERATED_FILE, completion.added, provenance=True),
-    )
+        partial(save_ply, folder / GENERATED_FILE, added, provenance=True),
+    ]
     map_in_parallel(lambda write: write(), writing)
-
-
-def write_pictures(
-    folder: Path, number: int, result: TargetResult, images: BeforeAfter
-) -> Limits | None:
-    """Write the images of a target; return the limits of its depth colours."""
-    named = collect_images(result, images)
-    write_images({folder / f"target{number}_{name}.png": named[name] for name in named})
-    depths = {"before": images.before.depth_map(), "after": images.after.depth_map()}
-    limits = compute_depth_limits(list(depths.values()))
-    if limits is not None:
-        for when, depth in depths.items():
-            write_depth_image(folder / f"target{number}_depth_{when}.png", depth, limits)
-    return limits
-
-
-def write_ignored(folder: Path, views: Sequence[View]) -> None:
-    """Write each photograph that has ignored pixels, with these painted over."""
-    painted = {}
-    for number, view in enumerate(views, start=1):
-        if view.ignore_mask is not None:
-            colour = view.image.new_tensor(IGNORED_COLOR)
-            image = torch.where(view.ignore_mask[..., None], colour, view.image)
-            painted[folder / f"context{number}_ignored.png"] = image
-    write_images(painted)
-
-
-def write_surrounding_views(folder: Path, views: Sequence[RenderPair]) -> None:
-    """Write the surrounding views before and after."""
-    seen = {}
-    for number, look in enumerate(views, start=1):
-        seen[folder / f"around{number}_before.png"] = look.before.image
-        seen[folder / f"around{number}_after.png"] = look.after.image
-    write_images(seen)
-
-
-def write_images(images: Mapping[Path, Tensor]) -> None:
-    """Write images in parallel: colour [h, w, 3], grey or masks [h, w]."""
-    map_in_parallel(write_image, images.keys(), images.values())
-
-
-def save_reconstructed_scenes(folder: Path, completion: Completion) -> None:
-    """Write the three scenes of a reconstructed context in parallel; they fit into memory."""
-    paths = [folder / name for name in (CONTEXT_FILE, COMPLETED_FILE, GENERATED_FILE)]
-    scenes = completion.context, completion.scene, completion.added
-    map_in_parallel(save_ply, paths, scenes, (None, True, True))
 
 
 def restore_file_order(
@@ -354,27 +368,59 @@ def save_completed_splat(
         save_like(folder / COMPLETED_FILE, context, generated, input_splat.path, kept)
         return
     rows = torch.nonzero(changed.cpu())[:, 0]
-    save_removed(folder / REMOVED, context[changed].to("cpu"), rows, input_splat.path, kept)
+    save_removed(folder / REMOVED_FILE, context[changed].to("cpu"), rows, input_splat.path, kept)
     stays = ~changed.cpu()
     if kept is not None:
         stays = torch.zeros_like(kept).masked_scatter(kept, stays)
     save_like(folder / COMPLETED_FILE, context[~changed], generated, input_splat.path, stays)
 
 
-def collect_images(result: TargetResult, images: BeforeAfter) -> dict[str, Tensor]:
-    """Collect the images of a target by name: colour [h, w, 3] or masks [h, w]."""
-    found = {
+def write_pictures(
+    folder: Path, number: int, result: TargetResult, images: BeforeAfter
+) -> Limits | None:
+    """Write the images of a target; return the limits of its depth colours."""
+    named = {
         "before": images.before.image,
         "after": images.after.image,
         "hole_mask": result.hole_mask.float(),
+        "support": None if result.trusted_alpha is result.before.alpha else result.trusted_alpha,
+        "reference": None if result.reference is None else result.reference.image,
+        "truth": None if images.photograph is None else images.photograph.image,
     }
-    if result.trusted_alpha is not result.before.alpha:
-        found["support"] = result.trusted_alpha
-    if result.reference is not None:
-        found["reference"] = result.reference.image
-    if images.photograph is not None:
-        found["truth"] = images.photograph.image
-    return found
+    known = {f"target{number}_{name}": i for name, i in named.items() if i is not None}
+    write_images(folder, known)
+    depths = {"before": images.before.depth_map(), "after": images.after.depth_map()}
+    limits = compute_depth_limits(list(depths.values()))
+    if limits is not None:
+        for when, depth in depths.items():
+            write_depth_image(folder / f"target{number}_depth_{when}.png", depth, limits)
+    return limits
+
+
+def paint_ignored(views: Sequence[View]) -> dict[str, Float[Tensor, "h w 3"]]:
+    """Paint over the ignored pixels of each photograph that has some."""
+    return {
+        f"context{number}_ignored": torch.where(
+            view.ignore_mask[..., None], view.image.new_tensor(IGNORED_COLOR), view.image
+        )
+        for number, view in enumerate(views, start=1)
+        if view.ignore_mask is not None
+    }
+
+
+def name_surrounding_images(looks: Sequence[RenderPair]) -> dict[str, Float[Tensor, "h w 3"]]:
+    """Name the images of surrounding views."""
+    named = {}
+    for number, look in enumerate(looks, start=1):
+        named[f"around{number}_before"] = look.before.image
+        named[f"around{number}_after"] = look.after.image
+    return named
+
+
+def write_images(folder: Path, images: Mapping[str, Tensor]) -> None:
+    """Write images by name in parallel: colour [h, w, 3], grey or masks [h, w]."""
+    paths = [folder / f"{name}.png" for name in images]
+    map_in_parallel(write_image, paths, images.values())
 
 
 def join_images(

@@ -8,7 +8,7 @@ from __future__ import annotations
 import base64
 import hashlib
 import io
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import cache
 from importlib.resources import files
@@ -19,6 +19,7 @@ from markupsafe import Markup
 from PIL import Image
 
 from gscompleter import __version__
+from gscompleter.apps.report.plain_words import format_change, format_number, format_percent
 from gscompleter.errors import InputError
 from gscompleter.io.files import replace_file
 from gscompleter.io.image import encode_jpeg, read_image_size, read_pixels
@@ -50,44 +51,32 @@ class Slider:
 
 
 @dataclass(frozen=True)
-class Table:
-    """A table of text; the first cell of a row is its head."""
-
-    caption: str
-    head: Sequence[str]
-    rows: Sequence[Sequence[str]]
-
-
-@dataclass(frozen=True)
 class Gallery:
     """Images of a folder, embedded at one scale."""
 
     folder: Path
     scale: float = 1.0
 
-    def embed_photo(self, name: str, alt: str) -> Picture:
-        """Embed an image in full colour as a JPEG."""
-        return self._embed(name, alt, exact=False)
-
-    def embed_exact(self, name: str, alt: str) -> Picture:
-        """Embed a mask, depth image or plot as a PNG."""
-        return self._embed(name, alt, exact=True)
-
-    def embed_slider(self, name: str, label: str, exact: bool = False) -> Slider:
-        """Embed an image before and after."""
-        before, after = (
-            self._embed(f"{name}_{when}.png", f"{label}, {when}", exact)
-            for when in ("before", "after")
-        )
-        return Slider(before, after, label)
-
-    def _embed(self, name: str, alt: str, exact: bool) -> Picture:
+    def embed(self, name: str, alt: str, exact: bool = False) -> Picture:
+        """Embed an image as a JPEG, or a mask, depth image or plot (`exact`) as a PNG."""
         try:
             image = Image.fromarray(read_pixels(self.folder / name))
         except InputError:
             return Picture(alt, missing=f"{name} is missing or damaged.")
         image = scale_image(image, self.scale, exact)
-        return Picture(alt, *image.size, uri=encode_data_uri(image, exact))
+        return Picture(alt, *image.size, uri=encode_image(image, exact))
+
+    def has(self, name: str) -> bool:
+        """Return True if there is a file of this name."""
+        return (self.folder / name).is_file()
+
+    def embed_slider(self, name: str, label: str, exact: bool = False) -> Slider:
+        """Embed an image before and after."""
+        before, after = (
+            self.embed(f"{name}_{when}.png", f"{label}, {when}", exact)
+            for when in ("before", "after")
+        )
+        return Slider(before, after, label)
 
 
 def open_gallery(folder: Path) -> Gallery:
@@ -110,20 +99,19 @@ def scale_image(image: Image.Image, scale: float, exact: bool) -> Image.Image:
     return image.resize(size, Image.Resampling.NEAREST if exact else Image.Resampling.LANCZOS)
 
 
-def encode_data_uri(image: Image.Image, exact: bool) -> str:
-    """Encode an image as a data URI: PNG if `exact`, else JPEG."""
-    kind, content = (
-        ("png", encode_png(image)) if exact else ("jpeg", encode_jpeg(image, JPEG_QUALITY))
-    )
-    return f"data:image/{kind};base64,{base64.b64encode(content).decode()}"
-
-
-def encode_png(image: Image.Image) -> bytes:
-    """Encode an image as PNG, with a palette for up to 256 colours."""
+def encode_image(image: Image.Image, exact: bool) -> str:
+    """Encode an image as a data URI: a JPEG, or a PNG if `exact`, with a palette if it can."""
+    if not exact:
+        return encode_uri("image/jpeg", encode_jpeg(image, JPEG_QUALITY))
     file = io.BytesIO()
-    colours = image.getcolors(256)
-    (image.quantize(256) if colours else image).save(file, format="PNG", compress_level=6)
-    return file.getvalue()
+    image = image.quantize(256) if image.getcolors(256) else image
+    image.save(file, format="PNG", compress_level=6)
+    return encode_uri("image/png", file.getvalue())
+
+
+def encode_uri(kind: str, content: bytes) -> str:
+    """Encode the content of a file as a data URI."""
+    return f"data:{kind};base64,{base64.b64encode(content).decode()}"
 
 
 def render_template(template: str, values: Mapping[str, object]) -> str:
@@ -131,9 +119,8 @@ def render_template(template: str, values: Mapping[str, object]) -> str:
     style, script = read_template("style.css"), read_template("script.js")
     digest = base64.b64encode(hashlib.sha256(script.encode()).digest()).decode()
     shared = {"style": Markup(style), "script": Markup(script), "digest": digest}
-    return (
-        create_environment().get_template(template).render(version=__version__, **shared, **values)
-    )
+    page = create_environment().get_template(template)
+    return page.render(version=__version__, **shared, **values)
 
 
 def write_page(folder: Path, page: str) -> None:
@@ -145,13 +132,20 @@ def write_page(folder: Path, page: str) -> None:
 @cache
 def create_environment() -> Environment:
     """Create the template environment: escapes all text, refuses unknown names."""
-    return Environment(
+    environment = Environment(
         loader=FunctionLoader(read_template),
         autoescape=True,
         undefined=StrictUndefined,
         trim_blocks=True,
         lstrip_blocks=True,
     )
+    environment.filters |= {
+        "number": format_number,
+        "percent": format_percent,
+        "change": format_change,
+        "count": "{:,}".format,
+    }
+    return environment
 
 
 def read_template(name: str) -> str:

@@ -3,9 +3,9 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 
-from gscompleter.apps.report.finished import CompletionSummary, TargetRow
+from gscompleter.apps.report.schema import AlignmentRow, CompletionSummary
 
 FRAME_NOTES = {
     "given": None,
@@ -14,6 +14,26 @@ FRAME_NOTES = {
     "normalised": "The splat is in a frame that its trainer normalised.",
     "similarity": "The splat is in a frame of its own, aligned by matching features.",
 }
+ALIGNMENTS = {
+    "ransac": "RANSAC fits scene depth = {scale} × lifted depth {shift}; {inliers} of the pixels "
+    "agree",
+    "median": "The median depth ratio is used: scene depth = {scale} × lifted depth; "
+    "{inliers} of the pixels agree",
+    "identity": "The lifted depths are used unchanged",
+}
+ORIGIN_NOTE = (
+    "The coordinates are much larger than the distances between the cameras, so the result is "
+    "relative to a local origin, which summary.json lists."
+)
+ORACLE_NOTE = (
+    "The generator uses the photographs of the targets, so the scores measure the geometry and not "
+    "the synthesized images."
+)
+RECOLORED_NOTE = (
+    "Gaussians of the input splat got new colours, because no photograph confirms theirs; "
+    "removed.ply has them as they were."
+)
+NO_SCORES_NOTE = "No target has a photograph, so there are no scores at targets."
 NO_TARGET_NOTE = "No large hole was found around the photographs; nothing was completed."
 
 
@@ -36,8 +56,8 @@ def describe_ignored(shares: Iterable[float]) -> str | None:
         return None
     return (
         f"Up to {format_percent(most)} of a photograph stays the same while the camera moves, "
-        "like the "
-        "bonnet of a vehicle; it is ignored, also in scores (images/context*_ignored.png)."
+        "like the bonnet of a vehicle; it is ignored, also in scores "
+        "(images/context*_ignored.png)."
     )
 
 
@@ -53,73 +73,41 @@ def describe_exposures(gains: Iterable[Sequence[float] | None]) -> str | None:
     )
 
 
-def list_target_notes(row: TargetRow) -> list[str]:
-    """List the notes of a target, with fallbacks that no note mentions."""
-    text = " ".join(row.notes)
-    found = list(row.notes)
-    if row.anchor_fallback and "least-turned" not in text:
-        found.append("Every view is turned too far; the least-turned one is the anchor.")
-    if row.affine.method == "median" and "median" not in text:
-        found.append(
-            "RANSAC finds no reliable depth correction; the median depth ratio replaces it."
-        )
-    if row.added == 0 and "nothing" not in text.lower():
-        found.append("Nothing was added here.")
-    return found
+def describe_alignment(affine: AlignmentRow, unit: str) -> str:
+    """Describe the depth alignment of a target."""
+    sign = "−" if affine.shift < 0 else "+"
+    text = ALIGNMENTS.get(affine.method, "The depths are aligned by an unknown method").format(
+        scale=format_number(affine.scale, 3),
+        shift=f"{sign} {format_number(abs(affine.shift), 3)} {unit}",
+        inliers=format_percent(affine.inliers, 0),
+    )
+    if affine.agreement is None:
+        return f"{text}."
+    share = format_percent(affine.agreement, 0)
+    return f"{text}. At the target, {share} of the visible scene agree."
 
 
 def list_scene_notes(summary: CompletionSummary) -> list[str]:
     """List the notes on the whole completion."""
-    return [*describe_input(summary), *describe_scoring(summary), *describe_result(summary)]
-
-
-def describe_input(summary: CompletionSummary) -> Iterator[str]:
-    """Describe the photographs and the frame of the result."""
+    context, targets, scene = summary.context, summary.targets, summary.scene
     placed = FRAME_NOTES.get(summary.frame.method, "The splat is in a frame of its own.")
-    if placed is not None:
-        yield f"{placed} summary.json lists the transform from the photographs to the result."
-    if any(summary.frame.origin):
-        yield (
-            "The coordinates are much larger than the distances between the cameras, so the result "
-            "is relative to a local origin, which summary.json lists."
-        )
-    motion = describe_motion({row.frame: row.dynamic_fraction for row in summary.context})
-    if motion is not None:
-        yield motion
-    static = describe_ignored(row.ignored for row in summary.context)
-    if static is not None:
-        yield static
-    if summary.settings.get("context") is None:
-        yield (
-            f"{summary.scene.used} of {summary.scene.photographs} photographs were chosen as the "
-            "context; --context chooses others."
-        )
-
-
-def describe_scoring(summary: CompletionSummary) -> Iterator[str]:
-    """Describe how the images are scored."""
-    exposure = describe_exposures([row.exposure_gain for row in summary.context])
-    if exposure is not None:
-        yield exposure
-    if summary.settings.get("uses_target_photographs"):
-        yield (
-            "The generator uses the photographs of the targets, so the scores measure the geometry "
-            "and not the synthesized images."
-        )
-    if summary.targets and all(row.psnr_after is None for row in summary.targets):
-        yield "No target has a photograph, so there are no scores at targets."
-
-
-def describe_result(summary: CompletionSummary) -> Iterator[str]:
-    """Describe the completed scene."""
-    removed = summary.gaussians.get("removed")
-    if removed is not None:
-        yield (
-            f"{removed:,} Gaussians of the input splat were pruned because they covered holes; "
-            "regions that no photograph confirms count as holes."
-        )
-    if not summary.targets:
-        yield NO_TARGET_NOTE
+    recolored = summary.gaussians.get("recolored")
+    notes = [
+        placed and f"{placed} summary.json lists the transform from the photographs to the result.",
+        ORIGIN_NOTE if any(summary.frame.origin) else None,
+        describe_motion({row.frame: row.dynamic_fraction for row in context}),
+        describe_ignored(row.ignored for row in context),
+        f"{scene.used} of {scene.photographs} photographs were chosen as the context; --context "
+        "chooses others."
+        if summary.settings.get("context") is None
+        else None,
+        describe_exposures(row.exposure_gain for row in context),
+        ORACLE_NOTE if summary.settings.get("uses_target_photographs") else None,
+        NO_SCORES_NOTE if targets and all(row.psnr_after is None for row in targets) else None,
+        f"{recolored:,} {RECOLORED_NOTE}" if recolored else None,
+        None if targets else NO_TARGET_NOTE,
+    ]
+    return [note for note in notes if note is not None]
 
 
 def format_number(value: float | None, digits: int = 2) -> str:

@@ -13,8 +13,6 @@ import hashlib
 import io
 import json
 import os
-import shutil
-import subprocess
 import tarfile
 import urllib.request
 from collections.abc import Mapping
@@ -43,10 +41,11 @@ LICENCE_FILE = "LICENSE"
 """File of each package that is distributed with it."""
 MAX_ARCHIVE_BYTES = 64 << 20
 """Largest archive in bytes; ours have up to 8 million."""
-REGISTRY_TIMEOUT = 30.0
+TIMEOUT = 30.0
 """Timeout of the registry in seconds."""
+REGISTRY = "https://registry.npmjs.org"
 REGISTRY_VARIABLE = "npm_config_registry"
-"""Environment variable of npm with the address of the registry."""
+"""Environment variable of npm with the address of another registry."""
 
 
 @dataclass(frozen=True)
@@ -57,11 +56,6 @@ class NpmPackage:
     version: str
     integrity: str
     """`sha512-` and the hash in base64, as npm and browsers write it."""
-
-    @property
-    def file(self) -> str:
-        """Name of its archive in our cache."""
-        return f"{self.name.replace('/', '-').lstrip('@')}-{self.version}.tgz"
 
     @property
     def path(self) -> str:
@@ -130,10 +124,8 @@ def read_lock(lock: Path) -> list[NpmPackage]:
 def get_archive(package: NpmPackage) -> bytes:
     """Get the archive of a package from the cache, or fetch and cache it."""
     place = get_archive_path(package)
-    if place.is_file():
-        archive = place.read_bytes()
-        if package.is_intact(archive):
-            return archive
+    if place.is_file() and package.is_intact(archive := place.read_bytes()):
+        return archive
     archive = fetch_archive(package)
     place.parent.mkdir(parents=True, exist_ok=True)
     with replace_file(place) as file:
@@ -143,49 +135,28 @@ def get_archive(package: NpmPackage) -> bytes:
 
 def get_archive_path(package: NpmPackage) -> Path:
     """Get the path of an archive in the cache; users may put it there by hand."""
-    return get_download_folder() / "viewer" / package.file
+    return get_download_folder() / "viewer" / Path(package.path).name
 
 
 def fetch_archive(package: NpmPackage) -> bytes:
     """Fetch an archive from the npm registry and compare its hash."""
-    url = f"{find_registry(package)}/{package.path}"
+    registry = os.environ.get(REGISTRY_VARIABLE) or REGISTRY
+    url, name = f"{registry.rstrip('/')}/{package.path}", f"{package.name} {package.version}"
     try:
-        with urllib.request.urlopen(url, timeout=REGISTRY_TIMEOUT) as answer:
+        with urllib.request.urlopen(url, timeout=TIMEOUT) as answer:
             archive: bytes = answer.read(MAX_ARCHIVE_BYTES)
     except (OSError, ValueError) as error:
         raise InputError(
-            f"{describe_missing_package(package)}, and {urlsplit(url).netloc or 'its address'} "
-            "cannot be reached; "
-            f"fetch {url} and put it at {get_archive_path(package)}."
+            f"The page needs {name}, which is not on this machine, and "
+            f"{urlsplit(url).netloc or 'its address'} cannot be reached; install gscompleter from "
+            f"its wheel, which contains it, or put {url} at {get_archive_path(package)}."
         ) from error
     if not package.is_intact(archive):
         raise InputError(
-            f"The file at {url} is not {package.name} {package.version}: its SHA-512 differs, so "
-            "it was not used; try another connection."
+            f"The file at {url} is not {name}: its SHA-512 differs, so it was not used; try "
+            "another connection."
         )
     return archive
-
-
-def find_registry(package: NpmPackage) -> str:
-    """Find the npm registry, from the environment variable or from npm itself."""
-    address, npm = os.environ.get(REGISTRY_VARIABLE), shutil.which("npm")
-    if not address and npm is not None:
-        command = [npm, "config", "get", "registry"]
-        answer = subprocess.run(command, capture_output=True, text=True, stdin=subprocess.DEVNULL)
-        address = answer.stdout.strip()
-    if not address:
-        raise InputError(
-            f"{describe_missing_package(package)}, and there is no npm to fetch it with; install "
-            "gscompleter "
-            f"from its wheel, which contains it, or set {REGISTRY_VARIABLE} to the address of a "
-            "registry."
-        )
-    return address.rstrip("/")
-
-
-def describe_missing_package(package: NpmPackage) -> str:
-    """Make the beginning of a sentence about a missing package."""
-    return f"The page needs {package.name} {package.version}, which is not on this machine"
 
 
 def read_archive_member(archive: bytes, name: str) -> str:

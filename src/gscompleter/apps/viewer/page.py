@@ -11,7 +11,9 @@ import base64
 import html
 import json
 import math
-from collections.abc import Iterator, Mapping
+import re
+from collections import Counter
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -24,6 +26,7 @@ from torch import Tensor
 from gscompleter.apps.viewer.exhibit import ViewerCamera, ViewerContent
 from gscompleter.apps.viewer.packages import Libraries
 from gscompleter.errors import InputError, quote_value
+from gscompleter.geometry import is_inside, project
 from gscompleter.splats.spz import encode_spz
 from gscompleter.types import Camera, Gaussians
 
@@ -63,11 +66,11 @@ class PageFrame:
         means = ((gaussians.means.double() - self.centre) / self.unit).float()
         return replace(gaussians, means=means, scales=gaussians.scales / self.unit, encoded=None)
 
-    def compute_pose(self, camera: Camera) -> Float[Tensor, "4 4"]:
-        """Compute camera-to-world with three.js axes, in the page's origin and unit."""
+    def move_camera(self, camera: Camera) -> Camera:
+        """Move a camera to the page's origin and unit, in float64; its axes stay."""
         c2w = camera.c2w.detach().cpu().double().clone()
         c2w[:3, 3] = (c2w[:3, 3] - self.centre) / self.unit
-        return THREE_FROM_OPENCV @ c2w @ THREE_FROM_OPENCV
+        return replace(camera, c2w=c2w, K=camera.K.double())
 
 
 @dataclass(frozen=True)
@@ -104,22 +107,26 @@ def make_page(viewer_content: ViewerContent, libraries: Libraries, name: str = "
         key: frame.normalize(part.to("cpu")) for key, part in split_layers(viewer_content).items()
     }
     shown = {key: part[part.means.norm(dim=1) <= MAX_DISTANCE] for key, part in layers.items()}
-    packed = {key: encode_spz(Path(key), part) for key, part in shown.items() if len(part) > 0}
-    if not packed.keys() - {"before"}:
+    sources = {key: encode_spz(Path(key), part) for key, part in shown.items() if len(part) > 0}
+    if not sources.keys() - {"before"}:
         raise InputError(f"{quote_value(viewer_content.title)} has nothing that a page can show.")
-    means, layer_sources = sample_landmarks(layers), map_sources(packed)
-    sources = {key: packed[key] for key in sorted(set(layer_sources.values()))}
+    layer_sources = {key: key for key in sources}
+    if sources.get("before") == sources.get("observed", b""):
+        del sources["before"]
+        layer_sources["before"] = "observed"
+    parts = split_sources(sources)
+    means = sample_landmarks(layers)
     content = {
         "title": viewer_content.title,
         "frame": {"centre": frame.centre.tolist(), "unit": frame.unit},
         "counts": {key: len(part) for key, part in shown.items()},
         "layers": layer_sources,
         "antialiased": {key: part.is_antialiased for key, part in layers.items()},
-        "parts": {key: len(compute_part_starts(source)) for key, source in sources.items()},
+        "parts": Counter(key for key, _ in parts),
         "shots": [describe_camera(shot, frame, means) for shot in list_cameras(viewer_content)],
         **vars(libraries),
     }
-    scripts, beside = place_scripts(list(generate_calls(sources)), name)
+    scripts, beside = place_scripts(parts, name)
     left_out = sum(len(layers[key]) - len(shown[key]) for key in ("observed", "generated"))
     return Page(fill_template(content, scripts).encode(), beside, left_out)
 
@@ -131,32 +138,23 @@ def split_layers(viewer_content: ViewerContent) -> dict[str, Gaussians]:
     return layers if before is None else {"before": before, **layers}
 
 
-def map_sources(packed: Mapping[str, bytes]) -> dict[str, str]:
-    """Map layers to byte strings; "before" and "observed" share one if they are equal."""
-    sources = {key: key for key in packed}
-    if "before" in packed and packed["before"] == packed.get("observed"):
-        sources["before"] = "observed"
-    return sources
+def split_sources(sources: Mapping[str, bytes]) -> list[tuple[str, bytes]]:
+    """Split the bytes of each source into parts."""
+    return [
+        (key, content[start : start + PART])
+        for key, content in sorted(sources.items())
+        for start in range(0, len(content), PART)
+    ]
 
 
-def compute_part_starts(content: bytes) -> range:
-    """Compute the offsets at which the bytes of a source are split."""
-    return range(0, len(content), PART)
-
-
-def generate_calls(packed: Mapping[str, bytes]) -> Iterator[bytes]:
-    """Yield scripts that pass the bytes of each source to the page."""
-    for key, content in packed.items():
-        for start in compute_part_starts(content):
-            text = base64.b64encode(content[start : start + PART]).decode()
-            yield f'gscPart("{key}", "{text}");'.encode()
-
-
-def place_scripts(calls: list[bytes], name: str) -> tuple[list[str], dict[str, bytes]]:
+def place_scripts(
+    parts: Sequence[tuple[str, bytes]], name: str
+) -> tuple[list[str], dict[str, bytes]]:
     """Make the script elements of the page, and the files of stem `name` that they refer to."""
+    calls = [f'gscPart("{key}", "{base64.b64encode(part).decode()}");' for key, part in parts]
     if sum(map(len, calls)) <= LARGEST_PAGE:
-        return [f"<script>{call.decode()}</script>" for call in calls], {}
-    files = {f"{name}.{number}.js": call for number, call in enumerate(calls, start=1)}
+        return [f"<script>{call}</script>" for call in calls], {}
+    files = {f"{name}.{number}.js": call.encode() for number, call in enumerate(calls, start=1)}
     return [f'<script src="{quote(file)}"></script>' for file in files], files
 
 
@@ -184,32 +182,19 @@ def describe_camera(
     view_camera: ViewerCamera, frame: PageFrame, means: Float[Tensor, "n 3"]
 ) -> dict[str, Any]:
     """Describe a camera as the page reads it, focused on the landmarks `means`."""
-    K, pose = view_camera.camera.K.double(), frame.compute_pose(view_camera.camera)
-    picture = (
-        None if view_camera.thumbnail is None else base64.b64encode(view_camera.thumbnail).decode()
-    )
+    camera, thumbnail = frame.move_camera(view_camera.camera), view_camera.thumbnail
+    K, (pixels, depths) = camera.K, project(means, camera)
+    seen = depths[is_inside(pixels, depths, camera)]
     return {
         "name": view_camera.name,
         "title": view_camera.title,
         "notes": view_camera.notes,
-        "pose": pose.flatten().tolist(),
+        "pose": (THREE_FROM_OPENCV @ camera.c2w @ THREE_FROM_OPENCV).flatten().tolist(),
         "lens": [K[0, 0].item(), K[1, 1].item(), K[0, 2].item(), K[1, 2].item()],
-        "size": [view_camera.camera.width, view_camera.camera.height],
-        "focus": compute_focus_depth(view_camera.camera, pose, means),
-        "thumbnail": picture,
+        "size": [camera.width, camera.height],
+        "focus": seen.median().item() if len(seen) else PAGE_EXTENT,
+        "thumbnail": None if thumbnail is None else base64.b64encode(thumbnail).decode(),
     }
-
-
-def compute_focus_depth(
-    camera: Camera, pose: Float[Tensor, "4 4"], means: Float[Tensor, "n 3"]
-) -> float:
-    """Compute the median z-depth of the landmarks that a camera sees, in page units."""
-    flip = THREE_FROM_OPENCV[:3, :3]
-    x, y, z = ((means @ flip - pose[:3, 3]) @ pose[:3, :3] @ flip).unbind(1)
-    K = camera.K.double()
-    u, v = K[0, 0] * x / z + K[0, 2], K[1, 1] * y / z + K[1, 2]
-    seen = (z > 0) & (u > 0) & (u < camera.width) & (v > 0) & (v < camera.height)
-    return z[seen].median().item() if seen.any() else PAGE_EXTENT
 
 
 def fill_template(content: Mapping[str, Any], scripts: list[str]) -> str:
@@ -217,17 +202,14 @@ def fill_template(content: Mapping[str, Any], scripts: list[str]) -> str:
 
     External text is inserted as JSON without `<`, which no HTML parser can misread.
     """
-    data = json.dumps(content, sort_keys=True).replace("<", "\\u003c")
     texts = {
         "title": html.escape(str(content["title"])),
         "style": read_asset("viewer.css"),
         "program": read_asset("viewer.js"),
         "parts": "\n".join(scripts),
-        "data": data,
+        "data": json.dumps(content, sort_keys=True).replace("<", "\\u003c"),
     }
-    pieces = read_asset("viewer.html").split("{{")
-    named = (piece.split("}}", 1) for piece in pieces[1:])
-    return pieces[0] + "".join(texts[name] + rest for name, rest in named)
+    return re.sub(r"\{\{(\w+)\}\}", lambda name: texts[name[1]], read_asset("viewer.html"))
 
 
 def read_asset(name: str) -> str:

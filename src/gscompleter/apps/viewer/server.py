@@ -13,8 +13,6 @@ ADDRESS = "127.0.0.1"
 """Network interface of the server."""
 HOST_NAMES = (ADDRESS, "localhost")
 """Accepted host names; any other one may be a DNS rebinding attack by a website."""
-MEDIA_TYPES = {".html": "text/html; charset=utf-8", ".js": "text/javascript; charset=utf-8"}
-"""Media types by file extension."""
 
 
 def make_page_server(page: Page, port: int = 0) -> ThreadingHTTPServer:
@@ -38,39 +36,29 @@ def make_handler(files: Mapping[str, bytes]) -> type[BaseHTTPRequestHandler]:
 
     class Handler(BaseHTTPRequestHandler):
         def do_GET(self) -> None:
-            self.answer(with_body=True)
-
-        def do_HEAD(self) -> None:
-            self.answer(with_body=False)
-
-        def answer(self, with_body: bool) -> None:
             path = unquote(urlsplit(self.path).path)
-            if parse_host(self.headers.get("Host", "")) not in HOST_NAMES:
+            if self.headers.get("Host", "").rsplit(":", 1)[0].lower() not in HOST_NAMES:
                 self.send_error(421, "This server answers to 127.0.0.1 and localhost only")
             elif path not in files:
                 self.send_error(404)
             else:
-                self.send(path, files[path], with_body)
+                self.send(files[path], "javascript" if path.endswith(".js") else "html")
 
-        def send(self, path: str, content: bytes, with_body: bool) -> None:
+        def do_HEAD(self) -> None:
+            self.do_GET()
+
+        def send(self, content: bytes, kind: str) -> None:
             self.send_response(200)
-            self.send_header(
-                "Content-Type", MEDIA_TYPES[".js" if path.endswith(".js") else ".html"]
-            )
+            self.send_header("Content-Type", f"text/{kind}; charset=utf-8")
             self.send_header("Content-Length", str(len(content)))
             self.send_header("X-Content-Type-Options", "nosniff")
             self.send_header("Cross-Origin-Resource-Policy", "same-origin")
             self.send_header("Cache-Control", "no-store")
             self.end_headers()
-            if with_body:
+            if self.command == "GET":
                 self.wfile.write(content)
 
         def log_message(self, format: str, *args: object) -> None:
             """Log nothing."""
 
     return Handler
-
-
-def parse_host(header: str) -> str:
-    """Parse the host name of a Host header, without its port."""
-    return header.rsplit(":", 1)[0].lower()

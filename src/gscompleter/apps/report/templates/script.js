@@ -30,6 +30,7 @@ for (const space of document.querySelectorAll(".turning")) {
       else part.setAttribute("points", drawn.map((point) => point.join(",")).join(" "));
     }
   };
+  draw();
   ranges.yaw.addEventListener("input", draw);
   ranges.pitch.addEventListener("input", draw);
   let last = null;

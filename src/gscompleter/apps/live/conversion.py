@@ -1,4 +1,4 @@
-"""Conversion between cameras of the page and cameras of the scene.
+"""Conversion between the scene and the page: cameras, and Gaussians without view-dependent colour.
 
 Both have OpenCV axes. Page units are scaled so that the photographed surfaces are a few units away,
 as the controls and clipping planes of the page expect.
@@ -8,16 +8,18 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 import torch
 from jaxtyping import Float
 
 from gscompleter.geometry import quats_to_rotations, rotations_to_quats
-from gscompleter.types import Camera
+from gscompleter.types import SH_C0, Camera, Gaussians
 
 SCENE_DISTANCE = 3.0
 """Distance of the middle of the depth range, in page units."""
+TINT_FACTORS = (1.0, 0.45, 0.9)
 
 
 @dataclass(frozen=True)
@@ -54,3 +56,23 @@ def camera_from_page(pose: PagePose, height: int, width: int, unit: float) -> Ca
     focal = height / 2 / math.tan(pose.fov / 2)
     K = torch.tensor([[focal, 0.0, width / 2], [0.0, focal, height / 2], [0.0, 0.0, 1.0]])
     return Camera(c2w.float(), K, width, height)
+
+
+def make_page_splat(gaussians: Gaussians, unit: float, tinted: bool) -> dict[str, Any]:
+    """Convert one or more Gaussians for the page, which scales them back by `scale`.
+
+    The page keeps covariances in float16, in which those of a scene in kilometres would vanish, so
+    their unit is the median of the largest scales.
+    """
+    gaussians = gaussians.to("cpu")
+    size = gaussians.scales.amax(dim=1).median().item()
+    axes = quats_to_rotations(gaussians.quats) * (gaussians.scales / size)[:, None, :]
+    rgbs = (0.5 + SH_C0 * gaussians.sh[:, 0]).clamp(0, 1)
+    tint = torch.tensor(TINT_FACTORS if tinted else (1.0, 1.0, 1.0))
+    return {
+        "centers": (gaussians.means / size).numpy(),
+        "covariances": (axes @ axes.transpose(1, 2)).numpy(),
+        "rgbs": (rgbs * tint).numpy(),
+        "opacities": gaussians.opacities[:, None].clamp(0, 1).numpy(),
+        "scale": size * unit,
+    }

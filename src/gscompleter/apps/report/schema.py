@@ -1,0 +1,251 @@
+"""Rows of `summary.json` and `report.json`, which a completion writes and pages read."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, Literal, TypeVar
+
+from gscompleter.errors import InputError, quote_value
+from gscompleter.evaluation.metrics.coverage import Coverage
+from gscompleter.io.files import SUMMARY_FILE
+from gscompleter.io.json_file import read_json
+
+RECORD_FILE = "report.json"
+ADVICE = "complete the scene again"
+RENAMED = {
+    "gain": "exposure_gain",
+    "contradicted": "dynamic_fraction",
+    "near": "derived_from",
+    "generated": "target_id",
+}
+"""Keys of the last release in rows of `summary.json`, with the new ones; read for one release."""
+
+SCORES = ("psnr_before", "psnr_after", "ssim_before", "ssim_after")
+
+T = TypeVar("T")
+Limits = tuple[float, float]
+"""z-depths at the ends of the colours, in scene units."""
+Vector = tuple[float, float, float]
+Row = tuple[float, float, float, float]
+"""Row of a transform."""
+
+
+@dataclass(frozen=True)
+class AlignmentRow:
+    """Depth alignment of a target."""
+
+    scale: float
+    shift: float
+    inliers: float
+    method: str
+    agreement: float | None = None
+
+
+@dataclass(frozen=True)
+class ScoreRow:
+    """PSNR (dB) and SSIM of a camera against its photograph; None without one."""
+
+    frame: int | None
+    psnr_before: float | None
+    psnr_after: float | None
+    ssim_before: float | None
+    ssim_after: float | None
+
+
+@dataclass(frozen=True)
+class ContextRow(ScoreRow):
+    """A photograph of the context."""
+
+    exposure_gain: Vector | None = None
+    """Exposure gain per channel; None if exposures were not normalized."""
+    dynamic_fraction: float = 0.0
+    """Fraction of the image in the dynamic mask."""
+    ignored: float = 0.0
+    """Fraction of ignored pixels, which stay the same while the camera moves."""
+
+
+@dataclass(frozen=True)
+class HeldOutRow(ScoreRow):
+    """A photograph that only scores the result."""
+
+    is_check: bool = False
+
+
+@dataclass(frozen=True)
+class TargetRow(ScoreRow):
+    """Result at a target."""
+
+    anchor: int | None
+    """Frame of the anchor."""
+    anchor_fallback: bool
+    hole_fraction: float
+    affine: AlignmentRow
+    added: int
+    derived_from: int | None = None
+    target_id: int | None = None
+    """Value of `generated` of its Gaussians in completed.ply; None if nothing was added."""
+    notes: tuple[str, ...] = ()
+    refused: str | None = None
+    """Sentence why the target cannot be completed, or None if it can."""
+
+    @property
+    def name(self) -> str:
+        """Name of the target beside its number."""
+        if self.derived_from is not None:
+            return f"near photograph {self.derived_from}"
+        return "a given camera" if self.frame is None else f"photograph {self.frame}"
+
+
+@dataclass(frozen=True)
+class ResultFrame:
+    """Transform from the photographs to the .ply."""
+
+    method: str
+    transform: tuple[Row, Row, Row, Row]
+    origin: Vector
+
+
+@dataclass(frozen=True)
+class SceneRow:
+    """The opened scene."""
+
+    format: str
+    photographs: int
+    used: int
+    splat: str | None = None
+
+
+@dataclass(frozen=True)
+class CompletionSummary:
+    """The parts of `summary.json` that pages show."""
+
+    version: str
+    settings: Mapping[str, Any]
+    seed: int
+    device: str
+    scene: SceneRow
+    frame: ResultFrame
+    depth_range: Mapping[str, Any]
+    """Near and far plane in scene units."""
+    coverage: Coverage
+    context: tuple[ContextRow, ...]
+    targets: tuple[TargetRow, ...]
+    gaussians: Mapping[str, int]
+    seconds: Mapping[str, float]
+    held_out: tuple[HeldOutRow, ...] = ()
+
+
+@dataclass(frozen=True)
+class PoseRow:
+    """Pose and field of view of a camera, in the frame of the .ply."""
+
+    c2w: tuple[Row, Row, Row]
+    opening: tuple[float, float]
+    """Tangents of half the field of view, horizontally and vertically."""
+
+
+@dataclass(frozen=True)
+class PairsRow:
+    """Depth pairs of the alignment, in scene units."""
+
+    seen_from: Literal["anchor", "target"]
+    predicted: tuple[float, ...]
+    context: tuple[float, ...]
+    agrees: tuple[bool, ...]
+
+
+@dataclass(frozen=True)
+class TargetRecord:
+    """Data of a target."""
+
+    camera: PoseRow
+    depth_limits: Limits | None
+    losses: Mapping[str, tuple[float, ...]]
+    pairs: PairsRow | None
+
+
+@dataclass(frozen=True)
+class CompletionRecord:
+    """All of `report.json`: what a report shows besides the summary and the images."""
+
+    context: tuple[PoseRow, ...]
+    photographs: tuple[PoseRow, ...]
+    num_photographs: int
+    targets: tuple[TargetRecord, ...]
+    around: tuple[Coverage, ...]
+    """Coverage of each surrounding view."""
+    scene_points: tuple[Vector, ...]
+    added_points: tuple[Vector, ...]
+
+
+def read_summary(folder: Path, only_version: str | None = None) -> CompletionSummary:
+    """Read `summary.json`; InputError if it is missing, damaged or not of `only_version`."""
+    path = folder / SUMMARY_FILE
+    check_results(folder, SUMMARY_FILE)
+    content = with_new_keys(read_json(path, ADVICE))
+    version = content.get("version") if isinstance(content, dict) else None
+    if isinstance(version, str) and only_version not in (None, version):
+        raise InputError(
+            f"{quote_value(path)} was written by version {quote_value(version)}, and this is "
+            f"{only_version}; use that version, or {ADVICE}."
+        )
+    return parse_content(CompletionSummary, content, path)
+
+
+def read_record(folder: Path, summary: CompletionSummary) -> CompletionRecord:
+    """Read `report.json`; InputError if it is missing, damaged or does not fit the summary."""
+    path = folder / RECORD_FILE
+    if not os.path.isfile(path):
+        raise InputError(
+            f"{quote_value(folder)} has no {RECORD_FILE}, which the report needs; {ADVICE}."
+        )
+    record = parse_content(CompletionRecord, read_json(path, ADVICE), path)
+    sizes = (len(summary.targets), len(summary.context))
+    if sizes != (len(record.targets), len(record.context)):
+        raise InputError(
+            f"{SUMMARY_FILE} and {RECORD_FILE} in {quote_value(folder)} list different numbers of "
+            f"cameras; {ADVICE}."
+        )
+    return record
+
+
+def with_new_keys(content: Any) -> Any:
+    """Return the content of a summary with today's keys for those of the last release."""
+    if not isinstance(content, dict):
+        return content
+    groups = [key for key in ("context", "targets") if isinstance(content.get(key), list)]
+    return content | {key: [rename_keys(row) for row in content[key]] for key in groups}
+
+
+def rename_keys(row: Any) -> Any:
+    """Rename the keys of a row."""
+    return {RENAMED.get(k, k): v for k, v in row.items()} if isinstance(row, dict) else row
+
+
+def check_results(folder: Path, name: str) -> None:
+    """Raise an InputError unless `folder` holds the file `name`."""
+    if not os.path.isdir(folder):
+        raise InputError(f"There is no folder {quote_value(folder)}; name one with results.")
+    if not os.path.isfile(folder / name):
+        raise InputError(
+            f"{quote_value(folder)} has no {name}; name the output folder of a completion or an "
+            "evaluation."
+        )
+
+
+def parse_content(kind: type[T], content: Any, path: Path) -> T:
+    """Validate the content of a JSON file; raise an InputError if it does not fit."""
+    from pydantic import TypeAdapter, ValidationError
+
+    try:
+        return TypeAdapter(kind).validate_python(content)
+    except ValidationError as error:
+        wrong = error.errors(include_url=False)[0]
+        place = ".".join(map(str, wrong["loc"])) or "its content"
+        raise InputError(
+            f"{quote_value(path)} is damaged ({quote_value(place)}: {quote_value(wrong['msg'])}); "
+            f"{ADVICE}."
+        ) from None
