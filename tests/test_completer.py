@@ -336,8 +336,6 @@ class Counting(CpuRenderer):
         return super().freeze(context, camera)
 
 
-
-
 def test_photographs_are_frozen_once_however_many_targets_there_are():
     """Additions extend the frozen scenes; such small photographs are not shrunk further."""
     views, (_, target) = photographs(), cameras()
