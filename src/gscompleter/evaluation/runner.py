@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping, Sequence
 from contextlib import nullcontext
 from dataclasses import asdict, dataclass, field, replace
@@ -27,11 +28,10 @@ from gscompleter.evaluation.store import (
 )
 from gscompleter.evaluation.tasks import Task
 from gscompleter.generators import Generator, load_generator
-from gscompleter.jobs.engines import Engine
-from gscompleter.jobs.jobs import CLAIMS, Job, Outcome
+from gscompleter.jobs.jobs import Job, describe_loss
 from gscompleter.jobs.places import FolderPlace
-from gscompleter.jobs.rounds import Rounds, run_in_this_process
 from gscompleter.jobs.shards import check_shard
+from gscompleter.jobs.workers import Engine, run_jobs
 from gscompleter.memory import check_memory
 from gscompleter.progress import Activity, show_activity, show_progress, stage
 from gscompleter.reconstructors import Reconstructor, load_reconstructor
@@ -104,7 +104,7 @@ def evaluate(
     config: RunConfig = RunConfig(),
     shard: tuple[int, int] = (0, 1),
     rerun: Rerun = "nothing",
-    engine: Engine = run_in_this_process,
+    engine: Engine | None = None,
 ) -> RowCounts:
     """Run methods on tasks and write a row of scores for each pair.
 
@@ -117,7 +117,7 @@ def evaluate(
         config: Settings that determine the numbers; the same as in earlier calls.
         shard: (i, n) selects the tasks i, i + n, i + 2n, ….
         rerun: Results of an earlier call to redo.
-        engine: Runs the jobs; simultaneous calls share the tasks.
+        engine: Starts workers; None uses this process. Simultaneous calls share the tasks.
 
     Raises:
         InputError: Invalid name or shard, other content in `out`, or a full disk.
@@ -125,16 +125,24 @@ def evaluate(
     check_evaluation(tasks, methods, config, shard)
     claim(out, collect_settings(config))
     share = tasks[shard[0] :: shard[1]]
-    runner = TaskRunner(out, tuple(methods), config, rerun)
+    # Workers that are killed are counted; a killed command is simply run again.
+    runner = TaskRunner(out, tuple(methods), config, math.inf if engine is None else RETRIES)
+    for task in share:
+        for row in runner.find_rows(task):
+            if rerun == "scores" or (rerun == "failures" and has_failed(row)):
+                row.unlink(missing_ok=True)
     todo = {row: task for task in share for row in runner.find_missing_rows(task)}
     jobs = [make_task_job(task) for task in {task.name: task for task in todo.values()}.values()]
-    rounds = Rounds(FolderPlace(out), runner, jobs, RETRIES)
     activity = Activity("evaluating", len(todo))
+
+    def list_done() -> set[str]:
+        return {job.name for job in jobs if not runner.find_missing_rows(job.options["task"])}
+
     with show_activity(activity) if todo else nullcontext():
-        for outcome in rounds.run(engine, runner):
-            for _ in runner.get_row_paths(outcome.job.options["task"]) & set(todo):
+        for job in run_jobs(FolderPlace(out), jobs, runner, list_done, engine, RETRIES):
+            for _ in set(runner.find_rows(job.options["task"])) & set(todo):
                 activity.count_step()
-    failed = sum(read_json(row).get("error") is not None for row in todo)
+    failed = sum(map(has_failed, todo))
     return RowCounts(len(todo) - failed, failed, len(share) * len(methods) - len(todo))
 
 
@@ -143,47 +151,41 @@ def make_task_job(task: Task) -> Job:
     return Job(make_file_name(task.name), {"task": task})
 
 
+def has_failed(row: Path) -> bool:
+    """Return True if a row exists and holds an error."""
+    return row.exists() and read_json(row).get("error") is not None
+
+
 @dataclass(frozen=True)
 class TaskRunner:
-    """Runs the jobs of an evaluation and finds their results."""
+    """Runs the jobs of an evaluation and writes their rows."""
 
     out: Path
     methods: tuple[str, ...]
     config: RunConfig
-    rerun: Rerun = "nothing"
+    max_losses: float = math.inf
+    """Number of killed processes after which a task is given up."""
 
-    def get_row_paths(self, task: Task) -> set[Path]:
-        """Return the paths of the rows of a task."""
-        return {get_row_path(self.out, task.name, method) for method in self.methods}
+    def find_rows(self, task: Task) -> dict[Path, str]:
+        """Return the paths of the rows of a task, with their methods."""
+        return {get_row_path(self.out, task.name, method): method for method in self.methods}
 
     def find_missing_rows(self, task: Task) -> dict[Path, str]:
         """Return the rows of a task that have to be computed, with their methods."""
-        rows = {get_row_path(self.out, task.name, method): method for method in self.methods}
-        return {row: method for row, method in rows.items() if is_missing(row, self.rerun)}
+        return {row: m for row, m in self.find_rows(task).items() if not row.exists()}
 
-    def find_outcome(self, job: Job) -> Outcome | None:
-        """Return the outcome of a task that another process completed, or None."""
-        there = all(row.exists() for row in self.get_row_paths(job.options["task"]))
-        return Outcome(job, "done") if there else None
-
-    def give_up(self, job: Job, reason: str) -> Outcome:
-        """Write rows with the reason why there is no result."""
-        task = job.options["task"]
-        for row, method in self.find_missing_rows(task).items():
-            write_json(row, build_row(task, method, reason, get_task_folder(self.out, task.name)))
-        return Outcome(job, "failed", reason)
-
-    def __call__(self, job: Job) -> Outcome:
+    def __call__(self, job: Job) -> None:
         """Compute the missing rows of a task, unless another process does it."""
-        with FolderPlace(self.out).hold_claim(f"{CLAIMS}/{job.name}") as lost:
-            if lost is None:
-                return Outcome(job, "elsewhere")
-            self.run(job.options["task"])
-            return Outcome(job, "done")
+        task = job.options["task"]
+        if not self.find_missing_rows(task):
+            return
+        with FolderPlace(self.out).hold_claim(job.claim) as lost:
+            if lost is not None:
+                self.run(task, describe_loss(lost) if lost > self.max_losses else None)
 
-    def run(self, task: Task) -> None:
-        """Compute the missing rows of a task."""
-        prepared, folder = None, get_task_folder(self.out, task.name)
+    def run(self, task: Task, prepared: PreparedTask | str | None) -> None:
+        """Compute the missing rows of a task; `prepared` may be an error."""
+        folder = get_task_folder(self.out, task.name)
         for row, method in self.find_missing_rows(task).items():
             # Progress inside a task would flood a log.
             with stage(f"{task.name}, {method}"), show_progress(None):
@@ -191,13 +193,6 @@ class TaskRunner:
                     prepared = attempt(partial(prepare_task, task, folder, self.config))
                 made = build_row(task, method, prepared, folder)
             write_json(row, made)
-
-
-def is_missing(path: Path, rerun: Rerun) -> bool:
-    """Return True if a row has to be computed."""
-    if rerun == "scores" or not path.exists():
-        return True
-    return rerun == "failures" and read_json(path).get("error") is not None
 
 
 def prepare_task(task: Task, folder: Path, config: RunConfig) -> PreparedTask:
