@@ -37,9 +37,9 @@ from gscompleter.evaluation.store import (
     read_json,
 )
 from gscompleter.evaluation.summary import (
+    GAIN,
     GEOMETRY,
     average_gains_by_gap,
-    compute_psnr_gain,
     summarize_run,
 )
 from gscompleter.evaluation.tables import write_tables
@@ -302,7 +302,7 @@ def test_gains_by_distance_are_grouped_by_the_nearest_context_frame(finished):
     rows = [json.loads(p.read_text()) for p in sorted((finished / "tasks").glob("*/full.json"))]
     assert list(average_gains_by_gap({"full": rows})) == [1]
     rows[1]["steps"][0]["frame"] = 6
-    gains = [compute_psnr_gain(row["steps"][0]) for row in rows]
+    gains = [GAIN.get_value(row["steps"][0]) for row in rows]
     found = summarize_run(rows).gains
     assert {gap: cells["full"].value for gap, cells in found.items()} == pytest.approx(
         {1: gains[0], 5: gains[1]}

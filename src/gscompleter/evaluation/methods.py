@@ -39,11 +39,7 @@ class Models:
 
     def limit_iterations(self, num_iterations: int) -> int:
         """Limit a number of iterations to `baseline_iterations`."""
-        return (
-            num_iterations
-            if self.baseline_iterations is None
-            else min(num_iterations, self.baseline_iterations)
-        )
+        return min(num_iterations, self.baseline_iterations or num_iterations)
 
 
 @dataclass(frozen=True)
@@ -101,7 +97,7 @@ def make_optimization_method(config: OptimizationConfig) -> Method:
         budget = replace(config, iterations=models.limit_iterations(config.iterations))
         with clock("optimize"):
             fitted = optimize(state.scene, views, models.renderer, models.seed, budget)
-        return Prediction(fitted.gaussians, None, clock.seconds)
+        return Prediction(fitted, None, clock.seconds)
 
     return method
 
@@ -118,7 +114,7 @@ def complete_by_similarity(state: Completion, target: Camera, models: Models) ->
         config = RegGSConfig(iterations=models.limit_iterations(RegGSConfig.iterations))
         added = register_by_similarity(
             lifted, state.scene, reference, models.renderer, models.seed, config
-        ).gaussians
+        )
     scene = merge([state.scene, added])
     return Prediction(scene, added, clock.seconds, anchor.index, anchor.fallback, registered=added)
 

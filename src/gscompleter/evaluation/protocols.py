@@ -12,7 +12,7 @@ import re
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Protocol, runtime_checkable
+from typing import Any
 
 from gscompleter.completer import MAX_TARGET_ID
 from gscompleter.data.photographs import PosedPhotographs
@@ -32,18 +32,6 @@ class Split:
     targets: tuple[int, ...]
     is_sequence: bool = False
     """True if all targets are completed into one scene, one after the other."""
-
-
-@runtime_checkable
-class EvaluationProtocol(Protocol):
-    """A deterministic rule that chooses frames."""
-
-    @property
-    def name(self) -> str:
-        """Name of the protocol for `parse_protocol` and the tables."""
-
-    def select_splits(self, clip: PosedPhotographs) -> tuple[Split, ...]:
-        """Return the splits of a clip; none if it is skipped."""
 
 
 @dataclass(frozen=True)
@@ -81,6 +69,7 @@ class StressTest:
     """Frames 0, 30 → 99: most of the target is outside the context."""
 
     name: str = "stress"
+    """Name of the protocol."""
 
     def select_splits(self, clip: PosedPhotographs) -> tuple[Split, ...]:
         """Return the split of a clip; none if it is too short."""
@@ -139,6 +128,9 @@ class ViewByView:
         return f"it has {len(clip)} frames, and {self.name} needs {needed}"
 
 
+EvaluationProtocol = Extrapolation | StressTest | EvaluationIndex | ViewByView
+"""A deterministic rule that chooses frames."""
+
 _PATTERNS: dict[str, type[Extrapolation | ViewByView]] = {
     "n-([0-9]{1,6})(?:-stride-([0-9]{1,6}))?": Extrapolation,
     "sequence-([0-9]{1,6})(?:-steps-([0-9]{1,6}))?": ViewByView,
@@ -190,8 +182,7 @@ def read_evaluation_index(path: Path | str) -> EvaluationIndex:
     if content["version"] != VERSION:
         raise InputError(
             f"{path} is of version {quote_value(content['version'])} and version {VERSION} can be "
-            "read; "
-            "update gscompleter, or write the index again."
+            "read; update gscompleter, or write the index again."
         )
     name, scenes = content.get("protocol"), content.get("scenes")
     if not isinstance(name, str) or not isinstance(scenes, dict):
@@ -206,14 +197,10 @@ def write_evaluation_index(path: Path | str, index: EvaluationIndex) -> None:
         for name, splits in index.scenes.items()
     }
     scenes |= dict.fromkeys(index.skipped)
-    rows = [f"  {json.dumps(name)}: {json.dumps(splits)}" for name, splits in scenes.items()]
-    text = (
-        f'{{\n "version": {VERSION},\n "protocol": {json.dumps(index.name)},\n "scenes": {{\n'
-        + ",\n".join(rows)
-        + "\n }\n}\n"
-    )
+    rows = ",\n".join(f"  {json.dumps(name)}: {json.dumps(s)}" for name, s in scenes.items())
+    head = f' "version": {VERSION},\n "protocol": {json.dumps(index.name)},\n "scenes": '
     with replace_file(path) as file:
-        file.write(text.encode())
+        file.write(f"{{\n{head}{{\n{rows}\n }}\n}}\n".encode())
 
 
 def _parse_index(name: str, content: Mapping[str, Any], path: Path) -> EvaluationIndex:
@@ -231,21 +218,15 @@ def _parse_splits(entry: Any, scene: str, path: Path) -> tuple[Split, ...]:
     if not rows or not all(isinstance(row, dict) for row in rows):
         raise InputError(
             f"The entry of the scene {scene} in {path} is {quote_value(entry)}; context and "
-            "target, "
-            "or null, are needed."
+            "target, or null, are needed."
         )
-    return tuple(
-        Split(_parse_frames(row, "context", scene, path), _parse_frames(row, "target", scene, path))
-        for row in rows
-    )
-
-
-def _parse_frames(row: dict[str, Any], key: str, scene: str, path: Path) -> tuple[int, ...]:
-    frames = row.get(key)
-    whole = isinstance(frames, list) and all(type(f) is int and f >= 0 for f in frames)
-    if not whole or not frames:
-        raise InputError(
-            f"The `{key}` of the scene {scene} in {path} is {quote_value(frames)}; a list of frame "
-            "numbers, at least one, is needed."
-        )
-    return tuple(frames)
+    for row in rows:
+        for key in ("context", "target"):
+            frames = row.get(key)
+            whole = isinstance(frames, list) and all(type(f) is int and f >= 0 for f in frames)
+            if not whole or not frames:
+                raise InputError(
+                    f"The `{key}` of the scene {scene} in {path} is {quote_value(frames)}; a list "
+                    "of frame numbers, at least one, is needed."
+                )
+    return tuple(Split(tuple(row["context"]), tuple(row["target"])) for row in rows)

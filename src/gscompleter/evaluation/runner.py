@@ -13,7 +13,7 @@ from typing import Any, Literal
 from gscompleter.config.generators import GeneratorSettings
 from gscompleter.errors import InputError
 from gscompleter.evaluation.methods import Models, check_methods
-from gscompleter.evaluation.steps import PreparedTask, Step, attempt, complete_task, load_or_compute
+from gscompleter.evaluation.steps import PreparedTask, attempt, complete_task, load_or_compute
 from gscompleter.evaluation.store import (
     VERSION,
     SavedContext,
@@ -27,14 +27,14 @@ from gscompleter.evaluation.store import (
     write_json,
 )
 from gscompleter.evaluation.tasks import Task
-from gscompleter.generators import Generator, load_generator
+from gscompleter.generators import load_generator
 from gscompleter.jobs.jobs import Job, describe_loss
 from gscompleter.jobs.places import FolderPlace
 from gscompleter.jobs.shards import check_shard
 from gscompleter.jobs.workers import Engine, run_jobs
 from gscompleter.memory import check_memory
 from gscompleter.progress import Activity, show_activity, show_progress, stage
-from gscompleter.reconstructors import Reconstructor, load_reconstructor
+from gscompleter.reconstructors import load_reconstructor
 from gscompleter.render import load_renderer
 from gscompleter.stages.context import normalize_exposures, sort_by_frame
 from gscompleter.types import View
@@ -60,22 +60,17 @@ class RunConfig:
     source: Mapping[str, Any] = field(default_factory=dict)
     """Origin of the tasks, so that no folder mixes two sources."""
 
-    def load_reconstructor(self) -> Reconstructor:
-        """Load Ψ; a model with weights is cached between tasks."""
-        weights = None if self.weights is None else Path(self.weights)
-        return load_reconstructor(self.reconstructor, weights, self.device)
-
-    def load_generator(self, targets: Sequence[View] = ()) -> Generator:
-        """Load Φ; a model with weights is cached between tasks."""
-        return load_generator(
-            self.generator, self.seed, targets, self.device, self.generator_settings
-        )
-
     def load_models(self, targets: Sequence[View]) -> Models:
-        """Load the models of a task; only the generator `oracle` uses the images of `targets`."""
+        """Load the models of a task; those with weights are cached between tasks.
+
+        Only the generator `oracle` uses the images of `targets`.
+        """
+        weights = None if self.weights is None else Path(self.weights)
         return Models(
-            self.load_reconstructor(),
-            self.load_generator(targets),
+            load_reconstructor(self.reconstructor, weights, self.device),
+            load_generator(
+                self.generator, self.seed, targets, self.device, self.generator_settings
+            ),
             load_renderer(self.device),
             self.seed,
             self.baseline_iterations,
@@ -122,7 +117,10 @@ def evaluate(
     Raises:
         InputError: Invalid name or shard, other content in `out`, or a full disk.
     """
-    check_evaluation(tasks, methods, config, shard)
+    check_methods(methods, max((len(task.targets) for task in tasks), default=0))
+    check_shard(shard)
+    check_tasks(tasks)
+    config.load_models(())
     claim(out, collect_settings(config))
     share = tasks[shard[0] :: shard[1]]
     # Workers that are killed are counted; a killed command is simply run again.
@@ -199,7 +197,14 @@ def prepare_task(task: Task, folder: Path, config: RunConfig) -> PreparedTask:
     """Load the photographs of a task, and load or reconstruct its initial scene."""
     views = sort_by_frame(load_task_views(task, task.context, config))
     neighbours = load_task_views(task, task.neighbours, config)
-    targets, error = load_readable_targets(task, config)
+    targets: list[View] = []
+    error = None
+    for frame in task.targets:
+        loaded = attempt(partial(load_task_views, task, (frame,), config))
+        if isinstance(loaded, str):
+            error = f"Frame {frame}: {loaded}"
+            break
+        targets += loaded
     if not targets:
         raise InputError(str(error))
     images = [*views, *targets]
@@ -229,17 +234,6 @@ def load_task_views(task: Task, frames: tuple[int, ...], config: RunConfig) -> l
     ]
 
 
-def load_readable_targets(task: Task, config: RunConfig) -> tuple[list[View], str | None]:
-    """Load the targets up to the first damaged photograph, and return its error."""
-    targets: list[View] = []
-    for frame in task.targets:
-        loaded = attempt(partial(load_task_views, task, (frame,), config))
-        if isinstance(loaded, str):
-            return targets, f"Frame {frame}: {loaded}"
-        targets += loaded
-    return targets, None
-
-
 def load_or_reconstruct(path: Path, views: Sequence[View], models: Models) -> SavedContext:
     """Load the scene saved at `path`, or reconstruct and save it."""
     device = views[0].image.device if views else "cpu"
@@ -259,37 +253,18 @@ def build_row(
     task: Task, method: str, prepared: PreparedTask | str, folder: Path
 ) -> dict[str, Any]:
     """Build the row of a method on a task; `prepared` may be an error instead of a task."""
-    steps: tuple[Step, ...] = ()
-    error: str | None
-    if isinstance(prepared, str):
-        error, seconds = prepared, None
-    else:
+    found: dict[str, Any] = {"error": prepared, "reconstruct_seconds": None, "steps": []}
+    if not isinstance(prepared, str):
         progress = complete_task(prepared, method, folder)
-        steps, error, seconds = progress.steps, progress.error, prepared.seconds
-    return {
-        "version": VERSION,
-        "task": {
-            "name": task.name,
-            "context": list(task.context),
-            "targets": list(task.targets),
-            "neighbours": list(task.neighbours),
-        },
-        "method": method,
-        "error": error,
-        "reconstruct_seconds": seconds,
-        "steps": [asdict(step) for step in steps],
-    }
-
-
-def check_evaluation(
-    tasks: Sequence[Task], methods: Sequence[str], config: RunConfig, shard: tuple[int, int]
-) -> None:
-    """Raise InputError before anything is written if a run is impossible."""
-    check_methods(methods, max((len(task.targets) for task in tasks), default=0))
-    check_shard(shard)
-    check_tasks(tasks)
-    config.load_reconstructor()
-    config.load_generator()
+        steps = [asdict(step) for step in progress.steps]
+        found = {
+            "error": progress.error,
+            "reconstruct_seconds": prepared.seconds,
+            "steps": steps,
+        }
+    keys = ("name", "context", "targets", "neighbours")
+    named = {key: getattr(task, key) for key in keys}
+    return {"version": VERSION, "task": named, "method": method, **found}
 
 
 def check_tasks(tasks: Sequence[Task]) -> None:

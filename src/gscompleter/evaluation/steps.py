@@ -106,7 +106,11 @@ def complete_task(task: PreparedTask, method: str, folder: Path) -> Progress:
             progress = replace(progress, error=f"Frame {target.frame}: {following}")
             break
         progress = following
-    return add_final_psnr(progress, task.targets, task.models.renderer)
+    steps = []
+    for step, target in zip(progress.steps, task.targets, strict=False):  # the last may have failed
+        image = task.models.renderer.render(progress.scene, target.camera).image
+        steps.append(replace(step, psnr_end=compute_view_psnr(image, target)))
+    return replace(progress, steps=tuple(steps))
 
 
 def advance_task(
@@ -116,31 +120,21 @@ def advance_task(
     number = len(progress.steps) + 1
     state = task.models.make_completer().begin_with(InitialContext(progress.scene, progress.views))
     path = get_step_path(folder, method, number)
-    prediction = load_or_predict(method, state, target.camera, number, task.models, path)
+
+    def save() -> None:
+        with measure_peak_memory(state.scene.means.device) as peak:
+            made = METHODS[method](state, target.camera, task.models)
+        made = mark_target(made, number, state.scene)
+        save_prediction(path, replace(made, peak_bytes=peak.bytes))
+
+    prediction = load_or_compute(path, lambda: load_prediction(path, state.scene), save)
     step, seen = score_step(prediction, state, target, task)
     save_image(path.with_suffix(".png"), seen.after.image)
     save_image(path.with_name(f"before-{number:03d}.png"), seen.before.image)
     save_image(get_truth_path(folder, number), target.image)
-    return replace(
-        progress,
-        scene=prediction.scene,
-        views=(*progress.views, target),
-        steps=(*progress.steps, step),
+    return Progress(
+        prediction.scene, (*progress.views, target), (*progress.steps, step), progress.error
     )
-
-
-def load_or_predict(
-    method: str, state: Completion, target: Camera, number: int, models: Models, path: Path
-) -> Prediction:
-    """Load the prediction at `path`, or compute and save it."""
-
-    def save() -> None:
-        with measure_peak_memory(state.scene.means.device) as peak:
-            made = METHODS[method](state, target, models)
-        made = mark_target(made, number, state.scene)
-        save_prediction(path, replace(made, peak_bytes=peak.bytes))
-
-    return load_or_compute(path, lambda: load_prediction(path, state.scene), save)
 
 
 def load_or_compute(path: Path, load: Callable[[], T | None], save: Callable[[], None]) -> T:
@@ -173,9 +167,10 @@ def score_step(
         scale = compute_depth_scale(
             prediction.added, seen.holes, target.camera, expected, task.models.renderer
         )
+    assert target.frame is not None
     step = Step(
-        frame=get_frame_number(target),
-        anchor=None if anchor is None else get_frame_number(anchor),
+        frame=target.frame,
+        anchor=None if anchor is None else anchor.frame,
         anchor_fallback=prediction.anchor_fallback,
         scores=scores,
         psnr_end=None,
@@ -188,12 +183,6 @@ def score_step(
     )
     json.dumps(asdict(step), allow_nan=False)
     return step, seen
-
-
-def get_frame_number(view: View) -> int:
-    """Return the frame number of a view."""
-    assert view.frame is not None
-    return view.frame
 
 
 def get_metric_depth(target: View, anchor: View, models: Models) -> DepthMap:
@@ -225,15 +214,6 @@ def compute_depth_scale(
 def compute_scale_drift(scales: Sequence[float]) -> float | None:
     """Compute max(ln s) - min(ln s) of the depth scales s; None for fewer than two."""
     return math.log(max(scales)) - math.log(min(scales)) if len(scales) > 1 else None
-
-
-def add_final_psnr(progress: Progress, targets: Sequence[View], renderer: Renderer) -> Progress:
-    """Set the PSNR of the final scene at each step."""
-    steps = []
-    for step, target in zip(progress.steps, targets, strict=False):  # the last may have failed
-        image = renderer.render(progress.scene, target.camera).image
-        steps.append(replace(step, psnr_end=compute_view_psnr(image, target)))
-    return replace(progress, steps=tuple(steps))
 
 
 def attempt(compute: Callable[[], T]) -> T | str:

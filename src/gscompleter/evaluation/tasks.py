@@ -10,7 +10,7 @@ from gscompleter.data.cases import Case
 from gscompleter.data.photographs import PosedPhotographs, apply_masks
 from gscompleter.data.resize import Resolution
 from gscompleter.errors import InputError
-from gscompleter.evaluation.protocols import EvaluationProtocol, Split
+from gscompleter.evaluation.protocols import EvaluationProtocol
 from gscompleter.types import View
 
 
@@ -58,7 +58,12 @@ def make_tasks(
     load = partial(load_clip_views, clip, resolution, use_masks)
     tasks = []
     for split in protocol.select_splits(clip):
-        check_frames(protocol, split, clip)
+        for frame in (*split.context, *split.targets):
+            if frame >= len(clip):
+                raise InputError(
+                    f"The protocol {protocol.name} needs frame {frame} of {clip.name}, which "
+                    f"has {len(clip)} frames; use the index of this data set."
+                )
         if split.is_sequence:
             tasks.append(Task(clip.name, split.context, split.targets, load))
             continue
@@ -76,20 +81,7 @@ def load_clip_views(
     return apply_masks(views, clip, resolution) if use_masks else views
 
 
-def check_frames(protocol: EvaluationProtocol, split: Split, clip: PosedPhotographs) -> None:
-    """Raise InputError for a frame that the clip does not have."""
-    for frame in (*split.context, *split.targets):
-        if frame >= len(clip):
-            raise InputError(
-                f"The protocol {protocol.name} needs frame {frame} of {clip.name}, which "
-                f"has {len(clip)} frames; use the index of this data set."
-            )
-
-
 def find_neighbours(target: int, context: Sequence[int], num_frames: int) -> tuple[int, ...]:
     """Return the frames before and after `target` that exist and are not context."""
-    return tuple(
-        frame
-        for frame in (target - 1, target + 1)
-        if 0 <= frame < num_frames and frame not in context
-    )
+    beside = (target - 1, target + 1)
+    return tuple(frame for frame in beside if 0 <= frame < num_frames and frame not in context)

@@ -44,28 +44,19 @@ class OptimizationConfig:
     """Opacity below which Gaussians are pruned."""
 
 
-@dataclass(frozen=True)
-class OptimizedScene:
-    """The fitted scene."""
-
-    gaussians: Gaussians
-    losses: tuple[float, ...]
-
-
 def optimize(
     scene: Gaussians,
     views: Sequence[View],
     renderer: Renderer,
     seed: int = 0,
     config: OptimizationConfig = OptimizationConfig(),
-) -> OptimizedScene:
+) -> Gaussians:
     """Fit all attributes of `scene` to `views`; `seed` sets their order and the splitting."""
     random = torch.Generator().manual_seed(seed)
     extent = compute_extent([view.camera for view in views])
     state = Parameters.from_scene(scene, config, extent)
     gradients = counts = torch.zeros_like(scene.opacities)
     rounds = list_density_rounds(config)
-    losses: list[float] = []
     order: list[int] = []
     for number in track(range(1, config.iterations + 1), "Optimising"):
         order = order or torch.randperm(len(views), generator=random).tolist()
@@ -76,7 +67,6 @@ def optimize(
         loss = loss + config.dssim_weight * (1 - ssim_map(image, view.image).mean())
         state.optimizer.zero_grad()
         loss.backward()
-        losses.append(loss.item())
         gradient, seen = compute_image_gradients(gaussians.means, state.means.grad, view.camera)
         gradients, counts = gradients + gradient, counts + seen
         state.optimizer.step()
@@ -86,7 +76,7 @@ def optimize(
             state = Parameters.from_scene(dense, config, extent)
             gradients = counts = torch.zeros_like(dense.opacities)
     with torch.no_grad():  # so that the result is detached from the parameters
-        return OptimizedScene(state.make_gaussians()[:], tuple(losses))
+        return state.make_gaussians()[:]
 
 
 def list_density_rounds(config: OptimizationConfig) -> set[int]:

@@ -59,15 +59,6 @@ class Similarity:
         return quats_to_rotations(self.quaternion)
 
 
-@dataclass(frozen=True)
-class RegisteredScene:
-    """The registered Gaussians, and their similarity."""
-
-    gaussians: Gaussians
-    similarity: Similarity
-    losses: tuple[float, ...]
-
-
 def register_by_similarity(
     lifted: Gaussians,
     scene: Gaussians,
@@ -75,7 +66,7 @@ def register_by_similarity(
     renderer: Renderer,
     seed: int = 42,
     config: RegGSConfig = RegGSConfig(),
-) -> RegisteredScene:
+) -> Gaussians:
     """Fit one similarity between `lifted` and `scene` at the camera of `reference`."""
     camera = reference.camera
     own = renderer.render(lifted, camera)
@@ -87,18 +78,13 @@ def register_by_similarity(
     scale = ratio.detach().clone().requires_grad_()
     quaternion = scale.detach().new_tensor([1.0, 0.0, 0.0, 0.0]).requires_grad_()
     translation = torch.zeros(3, device=scale.device, requires_grad=True)
-    optimizer = torch.optim.Adam(
-        [
-            {"params": [scale], "lr": config.scale_rate},
-            {"params": [quaternion], "lr": config.rotation_rate},
-            {"params": [translation], "lr": config.translation_rate},
-        ],
-        amsgrad=True,
-    )
+    rates = (config.scale_rate, config.rotation_rate, config.translation_rate)
+    parameters = (scale, quaternion, translation)
+    groups = [{"params": [p], "lr": rate} for p, rate in zip(parameters, rates, strict=True)]
+    optimizer = torch.optim.Adam(groups, amsgrad=True)
     small_lifted = cluster_gaussians(lifted, camera, config.components, seed)
     small_scene = cluster_gaussians(scene, camera, config.components, seed)
     best, best_loss = None, np.inf
-    losses: list[float] = []
     distances: list[float] = []
     compare_mixtures = config.mixture_weight > 0
     for _ in track(range(config.iterations), "Registering"):
@@ -121,13 +107,12 @@ def register_by_similarity(
             distances.append(distance.item())
         if loss.item() < best_loss:
             best_loss = loss.item()
-            best = Similarity(*(p.detach().clone() for p in (scale, quaternion, translation)))
+            best = Similarity(*(p.detach().clone() for p in parameters))
         optimizer.zero_grad()
         loss.backward()
         optimizer.step()
-        losses.append(loss.item())
     similarity = best or Similarity(scale.detach(), quaternion.detach(), translation.detach())
-    return RegisteredScene(move_into_scene(lifted, similarity, camera), similarity, tuple(losses))
+    return move_into_scene(lifted, similarity, camera)
 
 
 def move_scene(scene: Gaussians, fit: Similarity) -> Gaussians:
