@@ -22,8 +22,7 @@ from gscompleter.jobs import jobs as batch
 from gscompleter.jobs.engines import LocalEngine, SubmititEngine
 from gscompleter.jobs.jobs import Job, find_missing_jobs, run_claimed
 from gscompleter.jobs.places import FolderPlace, StorePlace, open_place
-from gscompleter.jobs.shards import parse_shard
-from gscompleter.jobs.workers import run_jobs
+from gscompleter.jobs.workers import parse_shard, run_jobs
 from paths import SUPPORT
 from scenes import camera_at, photographed
 from simulate_batch import Fleet, Replay, replay

@@ -14,6 +14,7 @@ from gscompleter.apps.commands import evaluate as command
 from gscompleter.config.generators import PEFieldSettings
 from gscompleter.data.cases import read_cases
 from gscompleter.evaluation import store
+from gscompleter.evaluation.protocols import Task, make_case_task
 from gscompleter.evaluation.runner import (
     RowCounts,
     RunConfig,
@@ -24,7 +25,6 @@ from gscompleter.evaluation.runner import (
 )
 from gscompleter.evaluation.store import VERSION, claim, list_row_paths, read_json, write_json
 from gscompleter.evaluation.tables import write_tables
-from gscompleter.evaluation.tasks import Task, make_case_task
 from gscompleter.jobs.places import FolderPlace
 from scenes import Room, camera_at, photographed
 

@@ -8,13 +8,6 @@ import torch
 from skimage.metrics import structural_similarity
 
 from gscompleter import load_renderer
-from gscompleter.evaluation.baselines.mixture_wasserstein import (
-    Mixture,
-    compute_matrix_root,
-    compute_mixture_wasserstein,
-    compute_pairwise_costs,
-    reduce_mixture,
-)
 from gscompleter.evaluation.baselines.optimization import (
     OptimizationConfig,
     compute_image_gradients,
@@ -23,11 +16,16 @@ from gscompleter.evaluation.baselines.optimization import (
     ssim_map,
 )
 from gscompleter.evaluation.baselines.reggs import (
+    Mixture,
     RegGSConfig,
     Similarity,
     cluster_gaussians,
+    compute_matrix_root,
+    compute_mixture_wasserstein,
+    compute_pairwise_costs,
     move_into_scene,
     move_scene,
+    reduce_mixture,
     register_by_similarity,
     rotate_mixture,
 )

@@ -13,7 +13,6 @@ from torch import Tensor
 
 from gscompleter.errors import InputError
 from gscompleter.evaluation.metrics.fid import fid
-from gscompleter.evaluation.metrics.flip import compute_flip_map
 from gscompleter.evaluation.metrics.geometry import (
     Alignment,
     compute_abs_rel,
@@ -23,7 +22,6 @@ from gscompleter.evaluation.metrics.geometry import (
     measure_alignment,
     measure_primitive_alignment,
 )
-from gscompleter.evaluation.metrics.haarpsi import haarpsi
 from gscompleter.evaluation.metrics.image import (
     MAX_PSNR,
     compute_gradient_energy_ratio,
@@ -31,6 +29,7 @@ from gscompleter.evaluation.metrics.image import (
     psnr,
     ssim,
 )
+from gscompleter.evaluation.metrics.perceptual import compute_flip_map, haarpsi
 from gscompleter.evaluation.metrics.scores import Truth, measure_perceptual_quality, score
 from gscompleter.image_ops import dilate
 from gscompleter.render import load_renderer

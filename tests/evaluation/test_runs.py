@@ -27,7 +27,7 @@ from gscompleter.evaluation.memory import measure_peak_memory
 from gscompleter.evaluation.methods import BASELINES, METHODS, check_methods, expand_methods
 from gscompleter.evaluation.metrics.image import psnr
 from gscompleter.evaluation.plots import draw_plots
-from gscompleter.evaluation.protocols import read_evaluation_index
+from gscompleter.evaluation.protocols import Task, make_case_task, read_evaluation_index
 from gscompleter.evaluation.runner import RowCounts, RunConfig, evaluate
 from gscompleter.evaluation.store import (
     get_step_path,
@@ -43,7 +43,6 @@ from gscompleter.evaluation.summary import (
     summarize_run,
 )
 from gscompleter.evaluation.tables import write_tables
-from gscompleter.evaluation.tasks import Task, make_case_task
 from gscompleter.io.image import read_image
 from scenes import Room, camera_at, photographed
 
@@ -208,7 +207,7 @@ import os, signal, sys, threading, time
 from pathlib import Path
 from gscompleter.data.cases import read_cases
 from gscompleter.evaluation.runner import RunConfig, evaluate
-from gscompleter.evaluation.tasks import make_case_task
+from gscompleter.evaluation.protocols import make_case_task
 
 cases, out, methods, iterations, *delays = sys.argv[1:]
 

@@ -18,7 +18,7 @@ from gscompleter.evaluation import methods, steps
 from gscompleter.evaluation.baselines.reggs import RegGSConfig
 from gscompleter.evaluation.methods import METHODS
 from gscompleter.evaluation.plots import draw_plots
-from gscompleter.evaluation.protocols import ViewByView, parse_protocol
+from gscompleter.evaluation.protocols import Task, make_tasks, parse_protocol
 from gscompleter.evaluation.runner import RowCounts, RunConfig, evaluate, prepare_task
 from gscompleter.evaluation.steps import (
     PreparedTask,
@@ -31,7 +31,6 @@ from gscompleter.evaluation.steps import (
 from gscompleter.evaluation.store import read_json
 from gscompleter.evaluation.summary import SEQUENCE, average_gains_by_gap
 from gscompleter.evaluation.tables import write_tables
-from gscompleter.evaluation.tasks import Task, make_tasks
 from gscompleter.geometry import slide
 from gscompleter.io.image import read_pixels
 from gscompleter.types import View
@@ -69,12 +68,12 @@ class Walk(PosedPhotographs):
         return None
 
 
-def walk(protocol: ViewByView = ViewByView(1), **settings) -> Task:
-    (task,) = make_tasks(protocol, Walk(**settings))
+def walk(protocol: str = "sequence-1", **settings) -> Task:
+    (task,) = make_tasks(parse_protocol(protocol), Walk(**settings))
     return task
 
 
-SHORT = walk(ViewByView(1, steps=2))
+SHORT = walk("sequence-1-steps-2")
 FOLDER = "walk-0+1-to-2..3"
 
 
@@ -152,15 +151,15 @@ def psnr_of(step: dict, when: str = "after") -> float:
 
 
 def test_a_sequence_begins_with_two_frames_and_goes_on_by_the_same_step():
-    task = walk(ViewByView(4), name="fox", num_frames=43)
+    task = walk("sequence-4", name="fox", num_frames=43)
     assert (task.context, task.targets) == ((0, 4), tuple(range(8, 41, 4)))
     assert task.name == "fox 0+4>8..40"
-    assert walk(ViewByView(4, steps=1), name="fox", num_frames=43).name == "fox 0+4>8"
+    assert walk("sequence-4-steps-1", name="fox", num_frames=43).name == "fox 0+4>8"
     assert len(walk(name="long", num_frames=999).targets) == 255
 
 
 def test_a_clip_that_is_too_short_is_told_apart_from_one_that_is_not():
-    protocol = ViewByView(2)
+    protocol = parse_protocol("sequence-2")
     assert make_tasks(protocol, Walk("short", 4)) == []
     short = protocol.explain_skip(Walk("short", 4))
     assert short == "it has 4 frames, and sequence-2 needs 5"
@@ -175,7 +174,7 @@ def test_a_sequence_is_called_what_it_was_asked_for_as(text):
 
 @pytest.mark.parametrize("text", ["sequence-0", "sequence-4-steps-0", "sequence-4-steps-256"])
 def test_a_sequence_of_nothing_or_too_much_is_refused(text):
-    with pytest.raises(InputError, match="impossible; give"):
+    with pytest.raises(InputError, match="is impossible"):
         parse_protocol(text)
 
 

@@ -76,8 +76,8 @@ def test_cameras_are_found_until_little_is_left_and_the_scene_covers_more(begun)
     assert all(choice.gain >= 0.01 for choice in choices)
     aside = sample_held_out_cameras(cameras(), seed=0)
     found = compute_coverage(render_pairs(completion, aside, load_renderer("cpu")))
-    assert found.before < 0.95
-    assert found.after - found.before > 0.4 * (1 - found.before)
+    assert found["before"] < 0.95
+    assert found["after"] - found["before"] > 0.4 * (1 - found["before"])
 
 
 def test_the_second_camera_is_chosen_in_the_scene_that_the_first_left(begun):

@@ -13,6 +13,7 @@ from typing import Any, Literal
 from gscompleter.config.generators import GeneratorSettings
 from gscompleter.errors import InputError
 from gscompleter.evaluation.methods import Models, check_methods
+from gscompleter.evaluation.protocols import Task
 from gscompleter.evaluation.steps import PreparedTask, attempt, complete_task, load_or_compute
 from gscompleter.evaluation.store import (
     VERSION,
@@ -26,12 +27,10 @@ from gscompleter.evaluation.store import (
     save_context,
     write_json,
 )
-from gscompleter.evaluation.tasks import Task
 from gscompleter.generators import load_generator
 from gscompleter.jobs.jobs import Job, describe_loss
 from gscompleter.jobs.places import FolderPlace
-from gscompleter.jobs.shards import check_shard
-from gscompleter.jobs.workers import Engine, run_jobs
+from gscompleter.jobs.workers import Engine, check_shard, run_jobs
 from gscompleter.memory import check_memory
 from gscompleter.progress import Activity, show_activity, show_progress, stage
 from gscompleter.reconstructors import load_reconstructor

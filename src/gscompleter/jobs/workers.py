@@ -6,12 +6,14 @@ lost worker is started again; the claim of its job has counted the attempt.
 
 from __future__ import annotations
 
+import re
 import time
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import AbstractContextManager
 from dataclasses import dataclass
 from typing import Any, Protocol, runtime_checkable
 
+from gscompleter.errors import InputError, quote_value
 from gscompleter.jobs.jobs import Job
 from gscompleter.jobs.places import FolderPlace, Place
 
@@ -24,6 +26,9 @@ LOSSES = (
     *("TaskCancelledError", "ObjectLostError", "UncompletedJobError", "FailedJobError"),
 )
 """Names of the errors of local, Ray and SLURM workers that were killed."""
+
+SLURM_VARIABLES = ("SLURM_ARRAY_TASK_ID", "SLURM_ARRAY_TASK_MIN", "SLURM_ARRAY_TASK_COUNT")
+"""SLURM variables: number of this task of an array, of the first task, and of tasks."""
 
 Perform = Callable[[Job], None]
 """Runs a job in any process and writes its row, unless it has one or is claimed elsewhere."""
@@ -133,3 +138,42 @@ def divide_jobs(jobs: Sequence[Job], count: int, place: Place) -> list[list[Job]
         [job for share in (*shares[first:], *shares[:first]) for job in share]
         for first in range(len(shares))
     ]
+
+
+def parse_shard(text: str | None, environment: Mapping[str, str]) -> tuple[int, int]:
+    """Parse `i/n` (the jobs i, i + n, …), or `auto` in a SLURM array; None means all jobs."""
+    if text is None:
+        return 0, 1
+    if text == "auto":
+        return parse_slurm_shard(environment)
+    match = re.fullmatch(r"([0-9]{1,6})/([0-9]{1,6})", text)
+    if match is None:
+        raise InputError(
+            f"The shard is '{quote_value(text)}'; give it as i/n, as in 0/4 for the first of four, "
+            "or auto in an array of SLURM.",
+            "shard",
+        )
+    return check_shard((int(match[1]), int(match[2])))
+
+
+def parse_slurm_shard(environment: Mapping[str, str]) -> tuple[int, int]:
+    """Return the shard of a SLURM task; the numbers of the array have to be consecutive."""
+    numbers = [environment.get(name, "") for name in SLURM_VARIABLES]
+    if not all(number.isdecimal() for number in numbers):
+        raise InputError(
+            f"{SLURM_VARIABLES[0]} and {SLURM_VARIABLES[2]} are not set, so this is no SLURM "
+            "array; give the shard as i/n.",
+            "shard",
+        )
+    task, first, count = map(int, numbers)
+    return check_shard((task - first, count))
+
+
+def check_shard(shard: tuple[int, int]) -> tuple[int, int]:
+    """Return the shard, or raise InputError if it is impossible."""
+    number, count = shard
+    if not 0 <= number < count:
+        raise InputError(
+            f"There is no shard {number}/{count}; of n shards the first is 0/n, the last (n-1)/n."
+        )
+    return shard

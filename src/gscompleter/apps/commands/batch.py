@@ -30,8 +30,7 @@ from gscompleter.jobs.jobs import (
     run_claimed,
 )
 from gscompleter.jobs.places import Place, is_address, open_place
-from gscompleter.jobs.shards import parse_shard
-from gscompleter.jobs.workers import run_jobs
+from gscompleter.jobs.workers import parse_shard, run_jobs
 from gscompleter.progress import (
     Activity,
     notify_of_stages,

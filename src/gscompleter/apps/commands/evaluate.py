@@ -31,8 +31,11 @@ from gscompleter.errors import InputError, quote_value
 from gscompleter.evaluation.methods import expand_methods
 from gscompleter.evaluation.plots import PlotsNotAvailable, draw_plots
 from gscompleter.evaluation.protocols import (
-    ViewByView,
+    FrameRule,
+    Task,
     build_index,
+    make_case_task,
+    make_tasks,
     parse_protocol,
     write_evaluation_index,
 )
@@ -40,8 +43,7 @@ from gscompleter.evaluation.runner import RunConfig, evaluate
 from gscompleter.evaluation.store import list_row_paths
 from gscompleter.evaluation.summary import RunSummary
 from gscompleter.evaluation.tables import format_score_cells, write_tables
-from gscompleter.evaluation.tasks import Task, make_case_task, make_tasks
-from gscompleter.jobs.shards import parse_shard
+from gscompleter.jobs.workers import parse_shard
 from gscompleter.progress import show_preparation, show_progress
 from gscompleter.render import choose_device
 
@@ -198,7 +200,7 @@ def iterate_tasks(
                 )
             clip = clip if options.ego_mask else clip.keep_ego_vehicle()
             for protocol in protocols:
-                if isinstance(protocol, ViewByView) and (reason := protocol.explain_skip(clip)):
+                if isinstance(protocol, FrameRule) and (reason := protocol.explain_skip(clip)):
                     skipped.append(SkippedScene(clip.name, reason))
                 tasks = make_tasks(protocol, clip, parse_resolution(given), options.use_masks)
                 yield from tasks[:1] if options.one_per_scene else tasks

@@ -206,7 +206,7 @@ def list_exposure_gains(completion: Completion) -> list[list[float] | None]:
 
 def summarize_coverage(measured: Surroundings) -> dict[str, Any]:
     """Summarize the coverage of the surrounding views, if there are any."""
-    return {"coverage": compute_coverage(measured.views).as_summary()} if measured.views else {}
+    return {"coverage": compute_coverage(measured.views)} if measured.views else {}
 
 
 def compute_mask_fraction(mask: Bool[Tensor, "h w"] | None) -> float:

@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 
 import torch
 
@@ -33,20 +33,6 @@ TURN_DEGREES = 5.0
 
 
 @dataclass(frozen=True)
-class Coverage:
-    """Share of pixels that the scene covers, before and after completion."""
-
-    before: float
-    after: float
-    cameras: int
-    """Number of cameras."""
-
-    def as_summary(self) -> dict[str, float]:
-        """Return the entry of `summary.json`."""
-        return asdict(self)
-
-
-@dataclass(frozen=True)
 class RenderPair:
     """Renders of one camera before and after completion."""
 
@@ -59,27 +45,29 @@ def render_pairs(
 ) -> list[RenderPair]:
     """Render the scene before and after completion in small images, from a thinned scene."""
     begun = thin_gaussians(completion.rendered_context, MAX_PREVIEW_GAUSSIANS)
-    aside = completion.pruned is not None
-    kept = (
-        thin_gaussians(completion.rendered_scene[: completion.num_kept], MAX_PREVIEW_GAUSSIANS)
-        if aside
-        else begun
-    )
+    kept = begun
+    if completion.pruned is not None:
+        kept = completion.rendered_scene[: completion.num_kept]
+        kept = thin_gaussians(kept, MAX_PREVIEW_GAUSSIANS)
     added = [thin_gaussians(result.added, MAX_PREVIEW_GAUSSIANS) for result in completion.targets]
     new = merge([begun[:0], *added])
 
     def render_pair(camera: Camera) -> RenderPair:
         first = renderer.freeze(begun, camera)
-        last = renderer.freeze(kept, camera) if aside else first
+        last = first if kept is begun else renderer.freeze(kept, camera)
         return RenderPair(first.render, last.composite(new))
 
     return list(get_view_map(new)(render_pair, [shrink_camera(camera, SIDE) for camera in cameras]))
 
 
-def compute_coverage(pairs: Sequence[RenderPair]) -> Coverage:
-    """Compute the coverage before and after completion."""
-    before, after = [look.before for look in pairs], [look.after for look in pairs]
-    return Coverage(compute_covered_share(before), compute_covered_share(after), len(pairs))
+def compute_coverage(pairs: Sequence[RenderPair]) -> dict[str, float | int]:
+    """Compute the coverage before and after completion, and count the cameras."""
+    before, after = [pair.before for pair in pairs], [pair.after for pair in pairs]
+    return {
+        "before": compute_covered_share(before),
+        "after": compute_covered_share(after),
+        "cameras": len(pairs),
+    }
 
 
 def compute_covered_share(renders: Sequence[Render]) -> float:
@@ -104,16 +92,12 @@ def sample_held_out_camera(
     share = torch.rand((), generator=generator).item()
     shift = step * torch.randn(3, generator=generator) / 3**0.5
     right, down = (TURN_DEGREES * torch.randn(2, generator=generator)).tolist()
-    between = interpolate_camera(first, find_nearest_camera(first, cameras), share)
+    others = [other for other in cameras if other is not first]
+    nearest = min(others, key=lambda other: measure_baseline(first, other), default=first)
+    between = interpolate_camera(first, nearest, share)
     turn = axis_angle_to_matrix(between.c2w[:3, 1], math.radians(right))
     turn = axis_angle_to_matrix(between.c2w[:3, 0], math.radians(down)) @ turn
     return move_camera(between, turn, shift.to(between.c2w))
-
-
-def find_nearest_camera(camera: Camera, cameras: Sequence[Camera]) -> Camera:
-    """Return the camera nearest to `camera`, or `camera` itself if there is no other."""
-    others = [other for other in cameras if other is not camera]
-    return min(others, key=lambda other: measure_baseline(camera, other), default=camera)
 
 
 def interpolate_camera(first: Camera, second: Camera, share: float) -> Camera:

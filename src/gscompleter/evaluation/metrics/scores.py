@@ -10,7 +10,6 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
-from gscompleter.evaluation.metrics.flip import compute_flip_map
 from gscompleter.evaluation.metrics.geometry import (
     Alignment,
     compute_abs_rel,
@@ -18,7 +17,6 @@ from gscompleter.evaluation.metrics.geometry import (
     measure_alignment,
     measure_primitive_alignment,
 )
-from gscompleter.evaluation.metrics.haarpsi import haarpsi
 from gscompleter.evaluation.metrics.image import (
     MAX_PSNR,
     compute_gradient_energy_ratio,
@@ -26,6 +24,7 @@ from gscompleter.evaluation.metrics.image import (
     ssim,
 )
 from gscompleter.evaluation.metrics.lpips import compute_lpips
+from gscompleter.evaluation.metrics.perceptual import compute_flip_map, haarpsi
 from gscompleter.render import Renderer
 from gscompleter.stages.filter_holes import compute_hole_mask
 from gscompleter.types import Camera, Gaussians, Render, View
