@@ -164,7 +164,7 @@ def test_density_control_clones_splits_and_prunes():
     scene = replace(scene, scales=scales, opacities=opacities)
     crowded = torch.tensor([True, True, False, False, False, False])
     random = torch.Generator().manual_seed(0)
-    dense = control_density(scene, crowded, 1.0, random, OptimizationConfig())
+    dense = control_density(scene, crowded, 1.0, random)
     # Six, one of them twice, one as two halves, one gone.
     assert len(dense) == 7
     assert (dense.means == scene.means[0]).all(-1).sum() == 2

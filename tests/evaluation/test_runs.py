@@ -21,7 +21,7 @@ from gscompleter import GSCompleter, InputError, memory
 from gscompleter.completer import STAGES
 from gscompleter.data.cases import Case
 from gscompleter.evaluation import methods as runs_methods
-from gscompleter.evaluation import runner
+from gscompleter.evaluation import store
 from gscompleter.evaluation.baselines.reggs import RegGSConfig
 from gscompleter.evaluation.memory import measure_peak_memory
 from gscompleter.evaluation.methods import BASELINES, METHODS, check_methods, expand_methods
@@ -351,17 +351,17 @@ def test_peak_memory_sees_what_was_let_go_of():
 
 def test_a_run_goes_on_where_it_was_stopped(finished, tasks, tmp_path, monkeypatch):
     out = tmp_path / "out"
-    original = runner.write_json
+    original = store.write_json
 
     def stopped(path, content):
         if path.parent.name.startswith("wide") and path.name == "full.json":
             raise KeyboardInterrupt
         original(path, content)
 
-    monkeypatch.setattr(runner, "write_json", stopped)
+    monkeypatch.setattr(store, "write_json", stopped)
     with pytest.raises(KeyboardInterrupt):
         evaluate(tasks, METHOD_NAMES, out, CONFIG)
-    monkeypatch.setattr(runner, "write_json", original)
+    monkeypatch.setattr(store, "write_json", original)
     (wide,) = (out / "tasks").glob("wide*")
     (wide / "context.npz").write_bytes(b"half")
     (wide / "full" / "step-001.npz").unlink()

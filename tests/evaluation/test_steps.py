@@ -14,9 +14,11 @@ import torch
 from command import run
 from gscompleter import InputError
 from gscompleter.data.photographs import PosedPhotographs
-from gscompleter.evaluation import methods, steps
+from gscompleter.evaluation import methods, steps, store
 from gscompleter.evaluation.baselines.reggs import RegGSConfig
 from gscompleter.evaluation.methods import METHODS
+from gscompleter.evaluation.metrics import scores
+from gscompleter.evaluation.metrics.scores import compute_depth_scale
 from gscompleter.evaluation.plots import draw_plots
 from gscompleter.evaluation.protocols import Task, make_tasks, parse_protocol
 from gscompleter.evaluation.runner import RowCounts, RunConfig, evaluate, prepare_task
@@ -24,7 +26,6 @@ from gscompleter.evaluation.steps import (
     PreparedTask,
     Progress,
     complete_task,
-    compute_depth_scale,
     compute_scale_drift,
     get_metric_depth,
 )
@@ -95,7 +96,7 @@ def few_clusters():
 def small_holes():
     """Accept the small holes of this room, of about 45 to 60 pixels."""
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(steps, "MIN_PIXELS", 40)
+        patch.setattr(scores, "MIN_PIXELS", 40)
         yield
 
 
@@ -285,7 +286,7 @@ def test_the_gain_of_a_step_counts_by_its_distance_to_what_is_known_by_then():
 
 def test_a_stopped_sequence_goes_on_after_its_last_whole_step(finished, tmp_path, monkeypatch):
     out = tmp_path / "out"
-    original = steps.save_prediction
+    original = store.save_prediction
 
     def stopped(path, prediction):
         original(path, prediction)
@@ -293,7 +294,7 @@ def test_a_stopped_sequence_goes_on_after_its_last_whole_step(finished, tmp_path
             path.write_bytes(path.read_bytes()[:100])
             raise KeyboardInterrupt
 
-    monkeypatch.setattr(steps, "save_prediction", stopped)
+    monkeypatch.setattr(store, "save_prediction", stopped)
     method = "full"
     with pytest.raises(KeyboardInterrupt):
         evaluate([SHORT], METHOD_NAMES, out, CONFIG)
@@ -307,7 +308,7 @@ def test_a_stopped_sequence_goes_on_after_its_last_whole_step(finished, tmp_path
         saved.append(f"{path.parent.name} {path.stem}")
         original(path, prediction)
 
-    monkeypatch.setattr(steps, "save_prediction", recorded)
+    monkeypatch.setattr(store, "save_prediction", recorded)
     assert evaluate([SHORT], METHOD_NAMES, out, CONFIG) == RowCounts(1, 0, 2)
     assert saved == ["reggs step-002"]
     same_results(out, finished)

@@ -12,21 +12,10 @@ from typing import Any, Literal
 
 from gscompleter.config.generators import GeneratorSettings
 from gscompleter.errors import InputError
+from gscompleter.evaluation import store
 from gscompleter.evaluation.methods import Models, check_methods
 from gscompleter.evaluation.protocols import Task
 from gscompleter.evaluation.steps import PreparedTask, attempt, complete_task, load_or_compute
-from gscompleter.evaluation.store import (
-    VERSION,
-    SavedContext,
-    claim,
-    get_row_path,
-    get_task_folder,
-    load_context,
-    make_file_name,
-    read_json,
-    save_context,
-    write_json,
-)
 from gscompleter.generators import load_generator
 from gscompleter.jobs.jobs import Job, describe_loss
 from gscompleter.jobs.places import FolderPlace
@@ -120,7 +109,7 @@ def evaluate(
     check_shard(shard)
     check_tasks(tasks)
     config.load_models(())
-    claim(out, collect_settings(config))
+    store.claim(out, collect_settings(config))
     share = tasks[shard[0] :: shard[1]]
     # Workers that are killed are counted; a killed command is simply run again.
     runner = TaskRunner(out, tuple(methods), config, math.inf if engine is None else RETRIES)
@@ -145,12 +134,12 @@ def evaluate(
 
 def make_task_job(task: Task) -> Job:
     """Make a job of a task, with all its methods."""
-    return Job(make_file_name(task.name), {"task": task})
+    return Job(store.make_file_name(task.name), {"task": task})
 
 
 def has_failed(row: Path) -> bool:
     """Return True if a row exists and holds an error."""
-    return row.exists() and read_json(row).get("error") is not None
+    return row.exists() and store.read_json(row).get("error") is not None
 
 
 @dataclass(frozen=True)
@@ -165,7 +154,7 @@ class TaskRunner:
 
     def find_rows(self, task: Task) -> dict[Path, str]:
         """Return the paths of the rows of a task, with their methods."""
-        return {get_row_path(self.out, task.name, method): method for method in self.methods}
+        return {store.get_row_path(self.out, task.name, method): method for method in self.methods}
 
     def find_missing_rows(self, task: Task) -> dict[Path, str]:
         """Return the rows of a task that have to be computed, with their methods."""
@@ -182,14 +171,14 @@ class TaskRunner:
 
     def run(self, task: Task, prepared: PreparedTask | str | None) -> None:
         """Compute the missing rows of a task; `prepared` may be an error."""
-        folder = get_task_folder(self.out, task.name)
+        folder = store.get_task_folder(self.out, task.name)
         for row, method in self.find_missing_rows(task).items():
             # Progress inside a task would flood a log.
             with stage(f"{task.name}, {method}"), show_progress(None):
                 if prepared is None:
                     prepared = attempt(partial(prepare_task, task, folder, self.config))
                 made = build_row(task, method, prepared, folder)
-            write_json(row, made)
+            store.write_json(row, made)
 
 
 def prepare_task(task: Task, folder: Path, config: RunConfig) -> PreparedTask:
@@ -233,7 +222,7 @@ def load_task_views(task: Task, frames: tuple[int, ...], config: RunConfig) -> l
     ]
 
 
-def load_or_reconstruct(path: Path, views: Sequence[View], models: Models) -> SavedContext:
+def load_or_reconstruct(path: Path, views: Sequence[View], models: Models) -> store.SavedContext:
     """Load the scene saved at `path`, or reconstruct and save it."""
     device = views[0].image.device if views else "cpu"
 
@@ -243,9 +232,11 @@ def load_or_reconstruct(path: Path, views: Sequence[View], models: Models) -> Sa
         assert near is not None
         assert far is not None
         seconds = made.seconds["total"]
-        save_context(path, SavedContext(made.gaussians, near, far, seconds, made.exposure_gains))
+        store.save_context(
+            path, store.SavedContext(made.gaussians, near, far, seconds, made.exposure_gains)
+        )
 
-    return load_or_compute(path, lambda: load_context(path, device), save)
+    return load_or_compute(path, lambda: store.load_context(path, device), save)
 
 
 def build_row(
@@ -263,7 +254,7 @@ def build_row(
         }
     keys = ("name", "context", "targets", "neighbours")
     named = {key: getattr(task, key) for key in keys}
-    return {"version": VERSION, "task": named, "method": method, **found}
+    return {"version": store.VERSION, "task": named, "method": method, **found}
 
 
 def check_tasks(tasks: Sequence[Task]) -> None:
@@ -275,7 +266,7 @@ def check_tasks(tasks: Sequence[Task]) -> None:
         )
     names: dict[str, str] = {}
     for task in tasks:
-        folder = make_file_name(task.name)
+        folder = store.make_file_name(task.name)
         if folder in names:
             raise InputError(
                 f"The cases {names[folder]} and {task.name} have the same name; rename a scene."

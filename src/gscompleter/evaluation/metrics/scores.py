@@ -27,7 +27,7 @@ from gscompleter.evaluation.metrics.lpips import compute_lpips
 from gscompleter.evaluation.metrics.perceptual import compute_flip_map, haarpsi
 from gscompleter.render import Renderer
 from gscompleter.stages.filter_holes import compute_hole_mask
-from gscompleter.types import Camera, Gaussians, Render, View
+from gscompleter.types import Camera, DepthMap, Gaussians, Render, View
 
 Image = Float[Tensor, "h w 3"]
 
@@ -237,10 +237,29 @@ def measure_seam_step(
 ) -> float | None:
     """Compute the median of |D_added - D_context| / D_context; None for too few pixels."""
     alone = renderer.render(added, target).depth_map()
-    both = alone.valid & context.depth_map().valid
-    if both.sum() < MIN_PIXELS:
-        return None
-    return ((alone.depth - context.depth).abs() / context.depth)[both].median().item()
+    steps = (alone.depth - context.depth).abs() / context.depth
+    return compute_median(steps, alone.valid & context.depth_map().valid)
+
+
+def compute_depth_scale(
+    added: Gaussians,
+    holes: Bool[Tensor, "h w"],
+    target: Camera,
+    expected: DepthMap,
+    renderer: Renderer,
+) -> float | None:
+    """Compute the median of D_added / D_expected over the holes: 1 means metric scale.
+
+    D_added is the z-depth of `added` rendered alone. Only holes count, so that methods covering the
+    whole image are comparable. None for too few pixels.
+    """
+    alone = renderer.render(added, target).depth_map()
+    return compute_median(alone.depth / expected.depth, holes & alone.valid & expected.valid)
+
+
+def compute_median(values: Float[Tensor, "h w"], where: Bool[Tensor, "h w"]) -> float | None:
+    """Compute the median over the pixels of `where`; None for fewer than `MIN_PIXELS`."""
+    return None if where.sum() < MIN_PIXELS else values[where].median().item()
 
 
 def compare(
