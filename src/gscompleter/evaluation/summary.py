@@ -20,6 +20,9 @@ RunRow = dict[str, Any]
 StepRow = dict[str, Any]
 """A `steps.Step` as JSON."""
 
+Reduction = Callable[[Sequence[float]], Any]
+"""Reduces several numbers to one, or to None."""
+
 MIN_PIXELS = 500
 """Smallest number of pixels over which a geometry score counts."""
 
@@ -35,8 +38,8 @@ class Column:
     """Place of the number in a step or its scores, with dots; a list of views is reduced too."""
     minus: str | None = None
     """Place of a number that is subtracted."""
-    reduce_steps: Callable[[Sequence[float]], float | None] = statistics.fmean
-    reduce_tasks: Callable[[Sequence[float]], float] = statistics.fmean
+    reduce_steps: Reduction = statistics.fmean
+    reduce_tasks: Reduction = statistics.fmean
     pixels: str | None = None
     """Place of the number of pixels, of which `MIN_PIXELS` are needed."""
 
@@ -74,6 +77,17 @@ PSNR_BEFORE = Column("psnr_before", "PSNR before", 2, BEFORE)
 PSNR = Column("psnr", "PSNR", 2, AFTER)
 GAIN = Column("gain", "ΔPSNR", 2, AFTER, BEFORE)
 
+
+def _make_gain(key: str, title: str, path: str, reduce: Reduction = statistics.fmean) -> Column:
+    """Make a column of changes by the completion."""
+    return Column(key, title, 2, f"{path}.after", f"{path}.before", reduce, reduce)
+
+
+def _make_median(key: str, title: str, path: str, digits: int = 0) -> Column:
+    """Make a column of medians over the tasks."""
+    return Column(key, title, digits, path, reduce_tasks=statistics.median)
+
+
 IMAGES = (
     PSNR,
     GAIN,
@@ -84,32 +98,12 @@ IMAGES = (
     Column("hole_psnr", "PSNR (hole)", 2, "hole_psnr"),
     Column("observed_psnr", "PSNR (observed)", 2, "observed_psnr.after"),
     Column("neighbours", "PSNR (neighbour views)", 2, "neighbours_psnr.after"),
-    Column(
-        "neighbours_gain",
-        "ΔPSNR (neighbour views)",
-        2,
-        "neighbours_psnr.after",
-        "neighbours_psnr.before",
-    ),
+    _make_gain("neighbours_gain", "ΔPSNR (neighbour views)", "neighbours_psnr"),
     Column("context", "PSNR (context)", 2, "context_psnr.after"),
     Column("context_ssim", "SSIM (context)", 3, "context_ssim.after"),
-    Column(
-        "context_change",
-        "min ΔPSNR (context)",
-        2,
-        "context_psnr.after",
-        "context_psnr.before",
-        min,
-        min,
-    ),
+    _make_gain("context_change", "min ΔPSNR (context)", "context_psnr", min),
 )
 """PSNR in dB at the target, in its hole and observed part, at neighbour and context views."""
-
-
-def _make_median(key: str, title: str, path: str, digits: int = 0) -> Column:
-    """Make a column of medians over the tasks."""
-    return Column(key, title, digits, path, reduce_tasks=statistics.median)
-
 
 PERCEPTUAL = (
     Column("hole_flip", "FLIP (hole)", 3, "hole_looks.flip"),
@@ -189,11 +183,6 @@ FEW_PIXELS_NOTE = (
     "pixels are medians over all cases."
 )
 
-NO_PIXELS_NOTE = (
-    "Some rows are from an earlier version, which counted no pixels, so their geometry is left "
-    "out; score the run again to add it."
-)
-
 
 @dataclass(frozen=True)
 class TableCell:
@@ -235,13 +224,9 @@ class RunSummary:
     @property
     def notes(self) -> list[str]:
         """Notes on the tables."""
-        scores = [s["scores"] for rows in self.rows.values() for row in rows for s in row["steps"]]
-        geometry = {
-            FEW_PIXELS_NOTE: bool(self.find_present_columns((*GEOMETRY, *ADDED, *LIFTED))),
-            NO_PIXELS_NOTE: any("align_pixels" not in found for found in scores),
-        }
+        has_geometry = self.find_present_columns((*GEOMETRY, *ADDED, *LIFTED))
         of_methods = [METHOD_NOTES[method] for method in self.methods if method in METHOD_NOTES]
-        return [*(note for note, holds in geometry.items() if holds), *of_methods]
+        return [FEW_PIXELS_NOTE, *of_methods] if has_geometry else of_methods
 
     @property
     def num_steps(self) -> int:

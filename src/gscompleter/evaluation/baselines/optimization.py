@@ -20,7 +20,6 @@ from gscompleter.render import Renderer
 from gscompleter.ssim import ssim_map
 from gscompleter.types import Camera, Gaussians, View, merge
 
-
 POSITION_RATE, ROTATION_RATE, SCALE_RATE = 1.6e-4, 1e-3, 5e-3
 """Step sizes; that of positions is in camera extents."""
 OPACITY_RATE, COLOR_RATE = 0.05, 2.5e-3

@@ -28,6 +28,12 @@ MAX_ITERATIONS = 100
 """Largest number of updates of both potentials."""
 TOLERANCE = 1e-5
 """Largest change of a converged potential."""
+RATES = (1e-3, 2e-4, 2e-3)
+"""Step sizes of scale, rotation, and translation (in scene units), as in RegGS."""
+DEPTH_WEIGHT = 0.1
+"""Weight of the depths in the loss, relative to the colours."""
+PATIENCE = 10
+"""The mixture distance is dropped if it does not fall in this many steps."""
 
 
 @dataclass(frozen=True)
@@ -35,17 +41,9 @@ class RegGSConfig:
     """Settings of the registration; the defaults are those of RegGS."""
 
     iterations: int = 400
-    scale_rate: float = 1e-3
-    rotation_rate: float = 2e-4
-    translation_rate: float = 2e-3
-    """Step size of the translation, in scene units."""
-    color_weight: float = 1.0
-    depth_weight: float = 0.1
     mixture_weight: float = 0.1
     components: int = 1000
     """Clusters per set of Gaussians."""
-    patience: int = 10
-    """The mixture distance is dropped if it does not fall in this many steps."""
 
 
 @dataclass(frozen=True)
@@ -83,9 +81,8 @@ def register_by_similarity(
     scale = ratio.detach().clone().requires_grad_()
     quaternion = scale.detach().new_tensor([1.0, 0.0, 0.0, 0.0]).requires_grad_()
     translation = torch.zeros(3, device=scale.device, requires_grad=True)
-    rates = (config.scale_rate, config.rotation_rate, config.translation_rate)
     parameters = (scale, quaternion, translation)
-    groups = [{"params": [p], "lr": rate} for p, rate in zip(parameters, rates, strict=True)]
+    groups = [{"params": [p], "lr": rate} for p, rate in zip(parameters, RATES, strict=True)]
     optimizer = torch.optim.Adam(groups, amsgrad=True)
     small_lifted = cluster_gaussians(lifted, camera, config.components, seed)
     small_scene = cluster_gaussians(scene, camera, config.components, seed)
@@ -99,13 +96,16 @@ def register_by_similarity(
         colour = ((moved.image - reference.image).abs() * alpha[..., None] ** 3).sum()
         overlap = own.depth_map().valid & moved.depth_map().valid
         depth = (moved.depth - scale * own.depth.detach())[overlap].abs().sum()
-        loss = config.color_weight * colour + config.depth_weight * depth
+        loss = colour + DEPTH_WEIGHT * depth
         if compare_mixtures:
-            distance = compute_mixture_wasserstein(
-                scale_mixture(small_lifted, scale), rotate_mixture(small_scene, fit, camera)
+            scaled = Mixture(
+                scale * small_lifted.means,
+                scale**2 * small_lifted.covariances,
+                small_lifted.weights,
             )
-            recent = distances[-config.patience :]
-            if len(distances) >= config.patience and distance.item() >= max(recent):
+            distance = compute_mixture_wasserstein(scaled, rotate_mixture(small_scene, fit, camera))
+            recent = distances[-PATIENCE:]
+            if len(distances) >= PATIENCE and distance.item() >= max(recent):
                 compare_mixtures = False
             else:
                 loss = loss + config.mixture_weight * distance
@@ -158,11 +158,6 @@ def cluster_gaussians(gaussians: Gaussians, camera: Camera, components: int, see
     return reduce_mixture(
         mixture, torch.from_numpy(labels.astype(np.int64)).to(mixture.means.device)
     )
-
-
-def scale_mixture(mixture: Mixture, scale: Float[Tensor, ""]) -> Mixture:
-    """Scale a mixture."""
-    return Mixture(scale * mixture.means, scale**2 * mixture.covariances, mixture.weights)
 
 
 def rotate_mixture(mixture: Mixture, fit: Similarity, camera: Camera) -> Mixture:
