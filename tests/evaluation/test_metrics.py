@@ -485,9 +485,6 @@ def test_fid_hands_over_batches_of_channels_first(monkeypatch: pytest.MonkeyPatc
         def __init__(self, feature: int, normalize: bool) -> None:
             assert (feature, normalize) == (2048, True)
 
-        def to(self, device: str) -> "Metric":
-            return self
-
         def update(self, batch: Tensor, real: bool) -> None:
             seen.append((tuple(batch.shape), real))
 

@@ -9,7 +9,6 @@ import os
 import re
 import time
 from collections.abc import Iterator, Sequence
-from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -31,20 +30,10 @@ from gscompleter.jobs.jobs import (
 )
 from gscompleter.jobs.places import Place, is_address, open_place
 from gscompleter.jobs.workers import parse_shard, run_jobs
-from gscompleter.progress import (
-    Activity,
-    notify_of_stages,
-    show_activity,
-    show_preparation,
-    show_progress,
-    stage,
-)
+from gscompleter.progress import Activity, show_activity, show_preparation, show_progress
 
 COUNTERS = Path("/proc/self/io")
 """File in which Linux counts the bytes that this process reads and writes, cached or not."""
-
-Cost = dict[str, float]
-"""Cost of a stage: seconds, bytes, and `cpu_seconds`, the sum over all threads."""
 
 
 def run_batch(options: BatchOptions) -> None:
@@ -129,42 +118,26 @@ def complete_job(job: Job, place: Place) -> dict[str, Any]:
     from gscompleter.evaluation.memory import measure_peak_memory
 
     warnings.filterwarnings("ignore", module="PIL")  # as the command line has it
-    with measure_peak_memory() as peak, measure_costs() as stages:
+    before = read_counters()
+    with measure_peak_memory() as peak:
         with (
             download_inputs(job.options) as given,
             place.open_folder(f"{JOBS}/{job.name}") as folder,
         ):
             summary, _ = complete_folder(parse_row(given, folder))
-            with stage("deliver"):
-                thumbnail = make_batch_thumbnail(folder)
+            thumbnail = make_batch_thumbnail(folder)
             size = sum(file.stat().st_size for file in folder.rglob("*") if file.is_file())
         if thumbnail is not None:
             place.write(f"{THUMBNAILS}/{job.name}.jpg", thumbnail)
-    total = {key: sum(cost[key] for cost in stages.values()) for key in read_counters()}
-    costs = {"stages": stages, **total, "result_bytes": size, "peak_bytes": peak.bytes}
-    return {**average_scores(summary), **costs}
+    costs = {name: count - before[name] for name, count in read_counters().items()}
+    return {**average_scores(summary), **costs, "result_bytes": size, "peak_bytes": peak.bytes}
 
 
-@contextmanager
-def measure_costs() -> Iterator[dict[str, Cost]]:
-    """Measure the costs of the body by the stage that started last, from `open` on."""
-    stages: dict[str, Cost] = {}
-    name, start = "open", read_counters()
+def read_counters() -> dict[str, float]:
+    """Read the clocks and the byte counters of this process; 0 if the system has no counters.
 
-    def begin(following: str) -> None:
-        nonlocal name, start
-        now, cost = read_counters(), stages.setdefault(name, dict.fromkeys(start, 0))
-        for key in cost:
-            cost[key] += now[key] - start[key]
-        name, start = following, now
-
-    with notify_of_stages(begin):
-        yield stages
-    begin("")
-
-
-def read_counters() -> Cost:
-    """Read the clocks and the byte counters of this process; 0 if the system has no counters."""
+    `cpu_seconds` is the sum over all threads, which does not depend on how busy the machine is.
+    """
     counters = COUNTERS.read_text() if COUNTERS.is_file() else ""
     found = {name: int(count) for name, count in re.findall(r"^(\w+): (\d+)$", counters, re.M)}
     return {

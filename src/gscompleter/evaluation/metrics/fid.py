@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 
-import torch
 from jaxtyping import Float
 from torch import Tensor
 
@@ -14,7 +13,6 @@ from gscompleter.errors import InputError
 def fid(
     images: Sequence[Float[Tensor, "h w 3"]],
     truths: Sequence[Float[Tensor, "h w 3"]],
-    device: torch.device | str = "cpu",
 ) -> float:
     """Compute |μ - μ'|² + tr(Σ + Σ' - 2 (Σ Σ')^½) of Inception features; 0 is best.
 
@@ -29,7 +27,7 @@ def fid(
         # Imported here because the package imports torchvision.
         from torchmetrics.image.fid import FrechetInceptionDistance
 
-        metric = FrechetInceptionDistance(feature=2048, normalize=True).to(device)
+        metric = FrechetInceptionDistance(feature=2048, normalize=True)
     except ImportError as error:
         raise InputError(
             f"FID needs torchmetrics and torch-fidelity ({error}); "
@@ -44,6 +42,6 @@ def fid(
         if len(found) < 2:
             raise InputError(f"FID needs at least two {side}, got {len(found)}.")
         for image in found:
-            batch = image.clamp(0, 1).permute(2, 0, 1)[None].float().to(device)
+            batch = image.clamp(0, 1).permute(2, 0, 1)[None].float()
             metric.update(batch, real=found is truths)
     return float(metric.compute())
