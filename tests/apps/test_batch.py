@@ -21,7 +21,7 @@ from gscompleter.errors import OutputError
 from gscompleter.jobs import jobs as batch
 from gscompleter.jobs.engines import LocalEngine, SubmititEngine
 from gscompleter.jobs.jobs import Job, find_missing_jobs, run_claimed
-from gscompleter.jobs.places import FolderPlace, StorePlace, open_place
+from gscompleter.jobs.places import open_place
 from gscompleter.jobs.workers import parse_shard, run_jobs
 from paths import SUPPORT
 from scenes import camera_at, photographed
@@ -102,7 +102,7 @@ def test_a_job_ends_as_a_row_with_its_reason(tmp_path, monkeypatch):
     monkeypatch.setattr(batch, "RETRY_SECONDS", 0.0)
     ends = ("sentence", "defect", "defect once", None)
     jobs = [Job(str(end), {"ends": end}) for end in ends]
-    place, perform = FolderPlace(tmp_path), Writing(str(tmp_path), retries=2)
+    place, perform = open_place(tmp_path), Writing(str(tmp_path), retries=2)
     for job in jobs:
         perform(job)
     rows = {job.name: batch.read_row(place, job.name) for job in jobs}
@@ -142,7 +142,7 @@ class Full:
 
 
 def test_an_error_of_a_worker_ends_the_run(tmp_path):
-    place = FolderPlace(tmp_path)
+    place = open_place(tmp_path)
     with pytest.raises(OutputError, match="no space left"):
         list(run_jobs(place, [Job("one")], Full(), lambda: set(), LocalEngine(1)))
 
@@ -161,7 +161,7 @@ def test_attempts_of_earlier_runs_count(tmp_path):
 
 
 def test_what_somebody_else_does_is_waited_for(tmp_path):
-    place, job = FolderPlace(tmp_path), Job("one")
+    place, job = open_place(tmp_path), Job("one")
     with place.hold_claim(job.claim):
         assert place.is_held(job.claim)
         Writing(str(tmp_path))(job)
@@ -176,7 +176,7 @@ def test_what_somebody_else_does_is_waited_for(tmp_path):
 
 
 def test_a_full_disk_ends_the_run_and_loses_nothing(tmp_path, monkeypatch):
-    place = FolderPlace(tmp_path)
+    place = open_place(tmp_path)
     run_claimed(Job("first"), place, lambda: {"size": 1}, retries=2)
 
     def full() -> dict[str, int]:
@@ -193,7 +193,7 @@ def test_a_full_disk_ends_the_run_and_loses_nothing(tmp_path, monkeypatch):
 
 
 def test_done_with_other_options_is_refused_and_failed_is_done_again(tmp_path):
-    place = FolderPlace(tmp_path)
+    place = open_place(tmp_path)
     perform = Writing(str(tmp_path))
     perform(Job("good"))
     perform(Job("bad", {"ends": "sentence"}))
@@ -210,7 +210,7 @@ def test_done_with_other_options_is_refused_and_failed_is_done_again(tmp_path):
 
 def test_a_store_counts_who_begins_and_locks_nobody_out(tmp_path):
     place = open_place(f"file://{tmp_path}/out")
-    assert isinstance(place, StorePlace)
+    assert not place.has_locks
     place.write("claims/one", b".")
     with place.hold_claim("claims/one") as lost:
         assert lost == 1

@@ -18,7 +18,7 @@ from gscompleter.evaluation.protocols import Task
 from gscompleter.evaluation.steps import PreparedTask, attempt, complete_task, load_or_compute
 from gscompleter.generators import load_generator
 from gscompleter.jobs.jobs import Job, describe_loss
-from gscompleter.jobs.places import FolderPlace
+from gscompleter.jobs.places import open_place
 from gscompleter.jobs.workers import Engine, check_shard, run_jobs
 from gscompleter.memory import check_memory
 from gscompleter.progress import Activity, show_activity, show_progress, stage
@@ -125,7 +125,7 @@ def evaluate(
         return {job.name for job in jobs if not runner.find_missing_rows(job.options["task"])}
 
     with show_activity(activity) if todo else nullcontext():
-        for job in run_jobs(FolderPlace(out), jobs, runner, list_done, engine, RETRIES):
+        for job in run_jobs(open_place(out), jobs, runner, list_done, engine, RETRIES):
             for _ in set(runner.find_rows(job.options["task"])) & set(todo):
                 activity.count_step()
     failed = sum(map(has_failed, todo))
@@ -165,7 +165,7 @@ class TaskRunner:
         task = job.options["task"]
         if not self.find_missing_rows(task):
             return
-        with FolderPlace(self.out).hold_claim(job.claim) as lost:
+        with open_place(self.out).hold_claim(job.claim) as lost:
             if lost is not None:
                 self.run(task, describe_loss(lost) if lost > self.max_losses else None)
 

@@ -12,7 +12,6 @@ tasks/TASK/METHOD/before-001.png    render at the first target before completion
 from __future__ import annotations
 
 import json
-import os
 import re
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -30,7 +29,7 @@ from gscompleter.evaluation.methods import Prediction
 from gscompleter.io import json_file
 from gscompleter.io.files import replace_file
 from gscompleter.io.image import write_image
-from gscompleter.jobs.places import FolderPlace, make_folder
+from gscompleter.jobs.places import convert_write_errors, open_place
 from gscompleter.types import Gaussians, merge
 
 RUN, TASKS = "run.json", "tasks"
@@ -81,9 +80,9 @@ def claim(out: Path, settings: Mapping[str, Any]) -> None:
     """
     wanted = json.loads(json.dumps({"version": VERSION, **settings}))
     if not (out / RUN).is_file():
-        # Listed at once: another process may be creating the run.
-        entries = FolderPlace(out).list_names("") if out.is_dir() else set()
-        if (entries and RUN not in entries) or (os.path.lexists(out) and not out.is_dir()):
+        # Listed at once, as another process may be creating the run.
+        entries = open_place(out).list_names("")
+        if entries and RUN not in entries:
             raise InputError(f"{out} holds something other than a run; name another folder.")
         write_json(out / RUN, wanted, keep_existing=True)
     found = read_settings(out)
@@ -203,6 +202,12 @@ def load_arrays(path: Path) -> Arrays | None:
             return dict(saved)
     except (OSError, ValueError, EOFError, BadZipFile):
         return None  # an incomplete file is computed again
+
+
+def make_folder(folder: Path) -> None:
+    """Create a folder; raise OutputError if that fails."""
+    with convert_write_errors(folder):
+        folder.mkdir(parents=True, exist_ok=True)
 
 
 def write_arrays(path: Path, arrays: Arrays) -> None:

@@ -1,7 +1,7 @@
-"""Places for the files of a batch: a local folder, or one of a store that fsspec reaches.
+"""The place of a batch's files: a local folder, or one of a store that fsspec reaches.
 
-Both write whole files. In a folder one process at a time holds a claim: a lock that the kernel
-releases if the process is killed. A store has no locks, so processes share its jobs by shards only.
+In a folder one process at a time holds a claim: a lock that the kernel releases if the process is
+killed. A store has no locks, so processes share its jobs by shards only.
 """
 
 from __future__ import annotations
@@ -18,13 +18,6 @@ from typing import Any
 from gscompleter.errors import InputError, OutputError, quote_value
 from gscompleter.io.files import replace_file
 from gscompleter.io.unfinished import UNFINISHED_PREFIX, acquire_lock
-
-
-def open_place(out: str) -> Place:
-    """Open a path or an address such as `s3://bucket/folder`."""
-    if is_address(out):
-        return StorePlace(out.rstrip("/"), open_store(out))
-    return FolderPlace(Path(out))
 
 
 def is_address(text: str) -> bool:
@@ -44,62 +37,101 @@ def open_store(address: str) -> Any:
         ) from error
 
 
+def open_place(out: str | Path) -> Place:
+    """Open a path or an address."""
+    from fsspec.implementations.local import LocalFileSystem
+
+    if is_address(str(out)):
+        return Place(str(out).rstrip("/"), open_store(str(out)), has_locks=False)
+    return Place(os.path.abspath(out), LocalFileSystem(), has_locks=True)
+
+
 @dataclass(frozen=True)
-class FolderPlace:
-    """A folder of a file system; paths in it are relative, with slashes."""
+class Place:
+    """A folder whose files are written whole; paths in it are relative, with slashes."""
 
-    root: Path
+    name: str
+    """Path or address."""
+    store: Any
+    """A file system of fsspec."""
+    has_locks: bool
+    """True for a local folder."""
 
-    @property
-    def name(self) -> str:
-        """Path of the folder."""
-        return str(self.root)
+    def locate(self, path: str) -> str:
+        """Return the path or address of a file."""
+        return f"{self.name}/{path}".rstrip("/")
 
     def read(self, path: str) -> bytes | None:
         """Read a file, or return None if it does not exist."""
         try:
-            return (self.root / path).read_bytes()
+            return bytes(self.store.cat_file(self.locate(path)))
         except (FileNotFoundError, NotADirectoryError):
             return None
 
     def write(self, path: str, content: bytes) -> None:
-        """Write a file atomically; raise OutputError if that fails."""
-        make_folder((self.root / path).parent)
-        with replace_file(self.root / path) as file:
-            file.write(content)
+        """Write a file whole; raise OutputError if that fails."""
+        self._make_parent(path)
+        if self.has_locks:
+            with replace_file(self.locate(path)) as file:
+                file.write(content)
+        else:
+            with convert_write_errors(self.locate(path)):
+                self.store.pipe_file(self.locate(path), content)
 
     def remove(self, path: str) -> None:
         """Remove a file if it exists."""
-        (self.root / path).unlink(missing_ok=True)
+        with contextlib.suppress(FileNotFoundError):
+            self.store.rm_file(self.locate(path))
 
     def list_names(self, folder: str) -> set[str]:
         """List the names in a folder, without unfinished files; empty if it does not exist."""
+        # Listings of stores are cached, and other processes may have written since.
+        self.store.invalidate_cache()
         try:
-            names = os.listdir(self.root / folder)
+            found = self.store.ls(self.locate(folder), detail=False)
         except FileNotFoundError:
             return set()
         except OSError as error:
+            reason = error.strerror or error
             raise InputError(
-                f"{quote_value(self.root / folder)} cannot be read: {error.strerror}; name another."
+                f"{quote_value(self.locate(folder))} cannot be read: {reason}; name another."
             ) from error
+        names = {name.rstrip("/").rsplit("/", 1)[-1] for name in found}
         return {name for name in names if not name.startswith(UNFINISHED_PREFIX)}
 
     @contextlib.contextmanager
     def open_folder(self, path: str) -> Iterator[Path]:
-        """Yield the folder itself; `complete` writes it atomically."""
-        make_folder((self.root / path).parent)
-        yield self.root / path
+        """Yield a folder that is written whole, or one that is uploaded when the body ends."""
+        if self.has_locks:
+            self._make_parent(path)
+            yield Path(self.locate(path))
+            return
+        with TemporaryDirectory(prefix="gscompleter-") as temporary:
+            made = Path(temporary) / "result"
+            yield made
+            for file in sorted(p for p in made.rglob("*") if p.is_file()):
+                target = f"{path}/{file.relative_to(made).as_posix()}"
+                self._make_parent(target)
+                with convert_write_errors(self.locate(path)):
+                    self.store.put_file(str(file), self.locate(target))
 
     @contextlib.contextmanager
     def hold_claim(self, path: str) -> Iterator[int | None]:
         """Hold a claim; yield the number of holders killed before, or None if it is held.
 
-        The file has one byte per holder. Without locks in the file system all processes get it.
+        The file has one byte per holder. Without locks all processes get the claim.
         """
-        target = self.root / path
-        make_folder(target.parent)
-        with convert_write_errors(target):
-            descriptor = os.open(target, os.O_RDWR | os.O_CREAT | os.O_APPEND, 0o666)
+        if not self.has_locks:
+            lost = len(self.read(path) or b"")
+            self.write(path, b"." * (lost + 1))
+            try:
+                yield lost
+            finally:
+                self.remove(path)
+            return
+        self._make_parent(path)
+        with convert_write_errors(self.locate(path)):
+            descriptor = os.open(self.locate(path), os.O_RDWR | os.O_CREAT | os.O_APPEND, 0o666)
         try:
             # The last holder may have removed the file that has just been opened.
             if acquire_lock(descriptor, wait=False) is False or not os.fstat(descriptor).st_nlink:
@@ -107,100 +139,27 @@ class FolderPlace:
                 return
             try:
                 lost = os.fstat(descriptor).st_size
-                with convert_write_errors(target):
+                with convert_write_errors(self.locate(path)):
                     os.write(descriptor, b".")
                 yield lost
             finally:
-                target.unlink(missing_ok=True)
+                self.remove(path)
         finally:
             os.close(descriptor)
 
     def is_held(self, path: str) -> bool:
         """Return True if any process holds the claim."""
+        if not self.has_locks:
+            return False
         try:
-            with (self.root / path).open("rb") as file:
+            with Path(self.locate(path)).open("rb") as file:
                 return acquire_lock(file.fileno(), wait=False) is False
         except FileNotFoundError:
             return False
 
-
-@dataclass(frozen=True)
-class StorePlace:
-    """A folder of a store, with the methods of `FolderPlace`."""
-
-    name: str
-    store: Any
-    """A file system of fsspec."""
-
-    def read(self, path: str) -> bytes | None:
-        """Read an object, or return None if it does not exist."""
-        try:
-            return bytes(self.store.cat_file(self._resolve(path)))
-        except FileNotFoundError:
-            return None
-
-    def write(self, path: str, content: bytes) -> None:
-        """Write an object; raise OutputError if that fails."""
-        with convert_write_errors(self._resolve(path)):
-            self._make_parent(path)
-            self.store.pipe_file(self._resolve(path), content)
-
-    def remove(self, path: str) -> None:
-        """Remove an object if it exists."""
-        with contextlib.suppress(FileNotFoundError):
-            self.store.rm_file(self._resolve(path))
-
-    def list_names(self, folder: str) -> set[str]:
-        """List the names in a folder; empty if it does not exist."""
-        # Listings are cached, and other processes may have written since.
-        self.store.invalidate_cache()
-        try:
-            found = self.store.ls(self._resolve(folder), detail=False)
-        except FileNotFoundError:
-            return set()
-        return {name.rstrip("/").rsplit("/", 1)[-1] for name in found}
-
-    @contextlib.contextmanager
-    def open_folder(self, path: str) -> Iterator[Path]:
-        """Yield a temporary folder, and upload its files when the body ends."""
-        with TemporaryDirectory(prefix="gscompleter-") as temporary:
-            made = Path(temporary) / "result"
-            yield made
-            with convert_write_errors(self._resolve(path)):
-                for file in sorted(p for p in made.rglob("*") if p.is_file()):
-                    target = f"{path}/{file.relative_to(made).as_posix()}"
-                    self._make_parent(target)
-                    self.store.put_file(str(file), self._resolve(target))
-
-    @contextlib.contextmanager
-    def hold_claim(self, path: str) -> Iterator[int]:
-        """Count a process that begins; yield the number of those that were killed."""
-        lost = len(self.read(path) or b"")
-        self.write(path, b"." * (lost + 1))
-        try:
-            yield lost
-        finally:
-            self.remove(path)
-
-    def is_held(self, path: str) -> bool:
-        """Return False: nobody holds a claim in a store."""
-        return False
-
     def _make_parent(self, path: str) -> None:
-        self.store.makedirs(self._resolve(path).rsplit("/", 1)[0], exist_ok=True)
-
-    def _resolve(self, path: str) -> str:
-        return f"{self.name}/{path}".rstrip("/")
-
-
-Place = FolderPlace | StorePlace
-"""The folder of a batch."""
-
-
-def make_folder(folder: Path) -> None:
-    """Create a folder; raise OutputError if that fails."""
-    with convert_write_errors(folder):
-        folder.mkdir(parents=True, exist_ok=True)
+        with convert_write_errors(self.locate(path)):
+            self.store.makedirs(self.locate(path).rsplit("/", 1)[0], exist_ok=True)
 
 
 @contextlib.contextmanager

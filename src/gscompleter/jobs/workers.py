@@ -15,7 +15,7 @@ from typing import Any, Protocol, runtime_checkable
 
 from gscompleter.errors import InputError, quote_value
 from gscompleter.jobs.jobs import Job
-from gscompleter.jobs.places import FolderPlace, Place
+from gscompleter.jobs.places import Place
 
 POLL_SECONDS = 0.2
 """Interval between checks of the workers and of the rows."""
@@ -130,9 +130,9 @@ def run_on_workers(
 
 
 def divide_jobs(jobs: Sequence[Job], count: int, place: Place) -> list[list[Job]]:
-    """Divide jobs among workers; in a folder, where jobs are claimed, each has all of them."""
+    """Divide jobs among workers; with locks, each then also has those of the others."""
     shares = [list(jobs[i::count]) for i in range(min(count, len(jobs)))]
-    if not isinstance(place, FolderPlace):
+    if not place.has_locks:
         return shares
     return [
         [job for share in (*shares[first:], *shares[:first]) for job in share]
