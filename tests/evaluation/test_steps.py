@@ -162,9 +162,9 @@ def test_a_sequence_begins_with_two_frames_and_goes_on_by_the_same_step():
 def test_a_clip_that_is_too_short_is_told_apart_from_one_that_is_not():
     protocol = parse_protocol("sequence-2")
     assert make_tasks(protocol, Walk("short", 4)) == []
-    short = protocol.explain_skip(Walk("short", 4))
+    short = explain_skip(protocol, Walk("short", 4))
     assert short == "it has 4 frames, and sequence-2 needs 5"
-    assert protocol.explain_skip(Walk("walk", 5)) is None
+    assert explain_skip(protocol, Walk("walk", 5)) is None
     assert [task.name for task in make_tasks(protocol, Walk("walk", 5))] == ["walk 0+2>4"]
 
 

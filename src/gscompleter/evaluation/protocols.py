@@ -53,12 +53,6 @@ class FrameRule:
         """Return the splits of a clip; none if it is too short."""
         return self.split(len(clip))
 
-    def explain_skip(self, clip: PosedPhotographs) -> str | None:
-        """Explain why a clip has no sequence, or return None."""
-        if len(clip) >= (self.sequence_frames or 0):
-            return None
-        return f"it has {len(clip)} frames, and {self.name} needs {self.sequence_frames}"
-
 
 @dataclass(frozen=True)
 class EvaluationIndex:
@@ -105,6 +99,14 @@ def parse_protocol(text: str) -> EvaluationProtocol:
         f"There is no protocol '{quote_value(text)}'; give n-K for a number of frames K (as n-10), "
         "stress, sequence-K (as sequence-4), or the path of an evaluation index."
     )
+
+
+def explain_skip(protocol: EvaluationProtocol, clip: PosedPhotographs) -> str | None:
+    """Explain why a clip has no sequence, or return None."""
+    needed = protocol.sequence_frames if isinstance(protocol, FrameRule) else None
+    if needed is None or len(clip) >= needed:
+        return None
+    return f"it has {len(clip)} frames, and {protocol.name} needs {needed}"
 
 
 def extrapolate(k: int, stride: int, num_frames: int) -> tuple[Split, ...]:

@@ -28,21 +28,11 @@ from gscompleter.data.cases import SkippedScene, filter_usable, open_clips, read
 from gscompleter.data.formats import open_photographs
 from gscompleter.data.resize import check_resolution
 from gscompleter.errors import InputError, quote_value
+from gscompleter.evaluation import plots, protocols, tables
 from gscompleter.evaluation.methods import expand_methods
-from gscompleter.evaluation.plots import PlotsNotAvailable, draw_plots
-from gscompleter.evaluation.protocols import (
-    FrameRule,
-    Task,
-    build_index,
-    make_case_task,
-    make_tasks,
-    parse_protocol,
-    write_evaluation_index,
-)
 from gscompleter.evaluation.runner import RunConfig, evaluate
 from gscompleter.evaluation.store import list_row_paths
 from gscompleter.evaluation.summary import RunSummary
-from gscompleter.evaluation.tables import format_score_cells, write_tables
 from gscompleter.jobs.workers import parse_shard
 from gscompleter.progress import show_preparation, show_progress
 from gscompleter.render import choose_device
@@ -117,7 +107,7 @@ def write_and_print_tables(
     while seen is None or (there != seen and len(there) >= num_rows):
         seen = there
         with show_preparation("tables"):
-            summary = write_tables(out, with_fid)
+            summary = tables.write_tables(out, with_fid)
             try_plots(summary, out, quiet)
             write_page(out, render_evaluation_page(out))
         there = list_row_times(out)
@@ -133,8 +123,8 @@ def list_row_times(out: Path) -> dict[Path, int]:
 def try_plots(summary: RunSummary, out: Path, quiet: bool) -> None:
     """Draw the plots, or print the missing requirement."""
     try:
-        draw_plots(summary, out)
-    except PlotsNotAvailable as missing:
+        plots.draw_plots(summary, out)
+    except plots.PlotsNotAvailable as missing:
         Console(stderr=True, quiet=quiet).print(str(missing), highlight=False, markup=False)
 
 
@@ -143,12 +133,12 @@ def run_index(options: IndexOptions) -> None:
     if options.out.exists() and not options.overwrite:
         raise InputError(f"{options.out} exists; name another file, or use --overwrite.")
     skipped: list[SkippedScene] = []
-    protocol = parse_protocol(options.protocol)
+    rule = protocols.parse_protocol(options.protocol)
     shown = None if options.quiet else Console(stderr=True)
     with show_progress(shown), show_preparation("reading clips"):
-        index = build_index(protocol, filter_usable(open_clips(options.path), skipped))
+        index = protocols.build_index(rule, filter_usable(open_clips(options.path), skipped))
     index = replace(index, skipped=(*index.skipped, *(clip.name for clip in skipped)))
-    write_evaluation_index(options.out, index)
+    protocols.write_evaluation_index(options.out, index)
     console = Console(quiet=options.quiet, highlight=False)
     print_skipped(skipped, console)
     targets = sum(len(split.targets) for splits in index.scenes.values() for split in splits)
@@ -161,7 +151,7 @@ def run_index(options: IndexOptions) -> None:
 
 def collect_tasks(
     options: EvaluateOptions, skipped: list[SkippedScene], notes: list[str]
-) -> list[Task]:
+) -> list[protocols.Task]:
     """Collect the tasks of the options, and append to `skipped` and `notes`."""
     if options.protocol:
         return list(islice(iterate_tasks(options, skipped, notes), options.limit))
@@ -181,15 +171,15 @@ def collect_tasks(
         replace(case, ignore_masked=use_masks or case.ignore_masked, ego_mask=ego_mask)
         for case in cases
     ]
-    return [make_case_task(case) for case in cases]
+    return [protocols.make_case_task(case) for case in cases]
 
 
 def iterate_tasks(
     options: EvaluateOptions, skipped: list[SkippedScene], notes: list[str]
-) -> Iterator[Task]:
+) -> Iterator[protocols.Task]:
     """Iterate over the tasks of the protocols, clip by clip."""
-    protocols = [parse_protocol(text) for text in options.protocol]
-    given = LONG_SIDE if options.resolution is None else options.resolution
+    rules = [protocols.parse_protocol(text) for text in options.protocol]
+    size = parse_resolution(LONG_SIDE if options.resolution is None else options.resolution)
     for path in options.paths:
         for clip in filter_usable(open_clips(path), skipped):
             notes += clip.notes
@@ -199,10 +189,10 @@ def iterate_tasks(
                     "out."
                 )
             clip = clip if options.ego_mask else clip.keep_ego_vehicle()
-            for protocol in protocols:
-                if isinstance(protocol, FrameRule) and (reason := protocol.explain_skip(clip)):
+            for rule in rules:
+                if reason := protocols.explain_skip(rule, clip):
                     skipped.append(SkippedScene(clip.name, reason))
-                tasks = make_tasks(protocol, clip, parse_resolution(given), options.use_masks)
+                tasks = protocols.make_tasks(rule, clip, size, options.use_masks)
                 yield from tasks[:1] if options.one_per_scene else tasks
 
 
@@ -230,7 +220,7 @@ def print_tables(summary: RunSummary, out: Path) -> None:
     """Print the tables, transposed: one column per method."""
     table = Table("", *summary.methods, box=None)
     columns = summary.find_present_columns(summary.columns)
-    cells = format_score_cells(summary, columns)
+    cells = tables.format_score_cells(summary, columns)
     for number, column in enumerate(columns, start=1):
         table.add_row(column.title, *(row[number] for row in cells))
     if summary.common_tasks:
