@@ -6,6 +6,7 @@ import contextlib
 import multiprocessing
 import os
 import signal
+import time
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from multiprocessing.connection import Connection
@@ -25,6 +26,8 @@ PIXELS, IMAGES = 640 * 480, 8
 """Size of a typical completion, for the default number of workers."""
 STOP_SECONDS = 20.0
 """Time that stopped workers have to release their claims."""
+GRACE_SECONDS = 1.0
+"""Time that a worker has to write a finished result after its parent was killed."""
 STORE_BYTES = 200 * 10**6
 """Memory for return values in a local Ray cluster; they are small, as results are files."""
 
@@ -108,6 +111,7 @@ def stop_with_parent() -> None:
     parent = multiprocessing.parent_process()
     assert parent is not None
     parent.join()
+    time.sleep(GRACE_SECONDS)
     os.kill(os.getpid(), signal.SIGTERM)
 
 
