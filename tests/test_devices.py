@@ -42,8 +42,8 @@ from gscompleter.models.feed_forward.depthsplat import VARIANTS
 from gscompleter.reconstructors import Reconstructor, iterate_tensors, run_reconstructor
 from gscompleter.reconstructors.from_depth import FromDepth
 from gscompleter.stages.context import init_context, measure_depth_range
-from gscompleter.stages.filter_holes import filter_holes
-from gscompleter.stages.select_anchor import lift
+from gscompleter.stages.filter_holes import select_in_mask
+from gscompleter.stages.lift import lift_pair
 from gscompleter.types import Lift, Reconstruction, View
 from scenes import Room, camera_at, gaussians_of, view_of
 
@@ -103,7 +103,7 @@ def test_networks_reconstruct_where_the_views_lie_and_run_where_they_lie_themsel
     there = [view.to(DEVICE) for view in pair]
     check_there(run_reconstructor(FeedForward(network), there))
     moved = FeedForward(network.to(DEVICE))
-    check_there(lift(moved, *there))
+    check_there(lift_pair(moved, *there))
     assert not any(
         isinstance(tensor, There)
         for _, tensor in iterate_tensors(run_reconstructor(moved, pair), "it")
@@ -127,7 +127,7 @@ def test_depth_anything_reconstructs_where_the_views_lie(elsewhere, gaussians):
 
     check_there(run_reconstructor(psi(), there))
     network.to(DEVICE)
-    check_there(lift(psi(), *there))
+    check_there(lift_pair(psi(), *there))
     assert not any(
         isinstance(tensor, There)
         for _, tensor in iterate_tensors(run_reconstructor(psi(), pair), "it")
@@ -188,17 +188,17 @@ def test_a_model_that_leaves_a_tensor_on_the_cpu_is_named_with_it(views, name):
         )
         return replace(whole, **{name: left})
 
-    for stage in (lambda: init_context(careless, views), lambda: lift(careless, *views)):
+    for stage in (lambda: init_context(careless, views), lambda: lift_pair(careless, *views)):
         with pytest.raises(ValueError, match=f"returned the reconstruction.{name}.* on cpu"):
             stage()
 
 
 def test_a_mixture_of_devices_is_an_error_as_on_a_gpu(views):
-    found = lift(SWEEP, views[0], views[1])
+    found = lift_pair(SWEEP, views[0], views[1])
     mask = torch.ones(SIZE, SIZE, dtype=torch.bool, device=DEVICE)
     assert isinstance(found, Lift)
     with pytest.raises(MixedError):
-        filter_holes(found.gaussians, found.pixel_index.cpu(), mask, views[0].camera)
+        select_in_mask(found.gaussians, found.pixel_index.cpu(), mask, views[0].camera)
     there = views[0].image
     for mixed in (
         lambda: there + VIEWS[0].image,

@@ -9,7 +9,7 @@ back.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import replace
 
 import torch
@@ -18,8 +18,12 @@ from torch import Tensor
 from torch.nn.functional import avg_pool2d
 
 from gscompleter.config.cleaning import CleaningConfig
-from gscompleter.guards.prune_occluders import compute_scene_error, exclude_needed
-from gscompleter.guards.psnr import add_psnr_loss, compute_mse_and_gradient
+from gscompleter.guards.psnr import (
+    add_psnr_loss,
+    compute_mse_and_gradient,
+    compute_squared_error,
+    select_fewest,
+)
 from gscompleter.progress import track
 from gscompleter.render import OpacityRender, Renderer, restrict_to_image
 from gscompleter.trust.photometric import sum_weights
@@ -29,6 +33,10 @@ FADED_OPACITY = 0.02
 """Largest opacity of a faded Gaussian; at zero it would have no gradient."""
 MIN_ERROR = 1e-12
 """Smallest mean squared error that fractions refer to."""
+MAX_TRIALS = 16
+"""Rounds of putting back what a photograph needs most, before it gets back all that it sees."""
+GRADIENT_OPACITY = 0.1
+"""Opacity factor at which gradients of missing Gaussians are evaluated; at 0 there are none."""
 
 
 def find_superfluous(
@@ -135,3 +143,70 @@ def halve_view(view: View) -> View:
     K = view.camera.K * view.camera.K.new_tensor([[0.5], [0.5], [1.0]])
     camera = replace(view.camera, K=K, height=image.shape[0], width=image.shape[1])
     return replace(view, image=image, camera=camera, depth=None, ignore_mask=None)
+
+
+def exclude_needed(
+    scene: Gaussians,
+    removable: Bool[Tensor, "n"],
+    views: Sequence[View],
+    max_errors: Sequence[float],
+    renderer: Renderer,
+) -> Bool[Tensor, "n"]:
+    """Remove needed Gaussians from a mask until every photograph is within its MSE limit."""
+    candidates, rest = scene[removable], scene[~removable]
+
+    def plans() -> Iterator[OpacityRender]:
+        # One at a time, to save memory.
+        return (renderer.freeze(rest, view.camera).vary_opacities(candidates) for view in views)
+
+    unneeded = find_removable_together(candidates.opacities, plans, views, max_errors)
+    return removable.masked_scatter(removable, unneeded)
+
+
+def find_removable_together(
+    opacities: Float[Tensor, "n"],
+    plans: Callable[[], Iterable[OpacityRender]],
+    views: Sequence[View],
+    max_errors: Sequence[float],
+) -> Bool[Tensor, "n"]:
+    """Find Gaussians that can be missing together without any photograph exceeding its limit.
+
+    Restored Gaussians may change other photographs, so all are checked until nothing changes.
+    """
+    missing = torch.ones_like(opacities, dtype=torch.bool)
+    before = None
+    while before is None or not torch.equal(missing, before):
+        before = missing
+        for plan, view, error in zip(plans(), views, max_errors, strict=True):
+            missing = missing & ~find_needed(plan, opacities, missing, view, error)
+    return missing
+
+
+def find_needed(
+    plan: OpacityRender,
+    opacities: Float[Tensor, "n"],
+    missing: Bool[Tensor, "n"],
+    view: View,
+    max_error: float,
+) -> Bool[Tensor, "n"]:
+    """Find the missing Gaussians that a photograph needs back to be within its limit."""
+    back = torch.zeros_like(missing)
+    for _ in range(MAX_TRIALS):
+        absent = missing & ~back
+        image = view.fill_ignored(plan(torch.where(absent, 0.0, opacities)).image)
+        error = compute_squared_error(image, view.image).item()
+        if error <= max_error or not absent.any():
+            return back
+        _, gradient = compute_mse_and_gradient(
+            restrict_to_image(plan), view, torch.where(absent, GRADIENT_OPACITY, 1.0) * opacities
+        )
+        back = back | select_fewest(
+            torch.where(absent, -gradient * opacities, 0.0), error - max_error
+        )
+    return back | (missing & (gradient != 0))
+
+
+def compute_scene_error(scene: Gaussians, view: View, renderer: Renderer) -> Float[Tensor, ""]:
+    """Compute the mean squared error of the scene against a photograph."""
+    image = renderer.render(scene, view.camera).image
+    return compute_squared_error(view.fill_ignored(image), view.image)

@@ -13,75 +13,133 @@ from dataclasses import dataclass, field, replace
 from functools import cached_property
 from typing import ClassVar
 
-from jaxtyping import Bool, Float
+import torch
+from jaxtyping import Bool, Float, Int64, Shaped
 from torch import Tensor
 
+from gscompleter.config import CompleterConfig
 from gscompleter.deprecation import RenamedMembers
-from gscompleter.types import (
-    Camera,
-    DepthAffine,
-    DepthPairs,
-    ErrorBudget,
-    Gaussians,
-    PhotoObservations,
-    Proxy,
-    Render,
-    View,
-    merge,
-)
+from gscompleter.timing import add_seconds
+from gscompleter.trust import Trust
+from gscompleter.types import Camera, DepthAffine, ErrorBudget, Gaussians, Render, View, merge
+
+NOTHING_ADDED = "Nothing of it was added."
+
+REJECTIONS = {
+    "depth-agreement": (
+        "Only {agreement:.0%} of the scene that the target sees agrees with the depths of the "
+        "synthesized image, and no other fit is better."
+    ),
+    "psnr": "Most of the Gaussians that were generated here make photographs worse.",
+}
+"""Sentence of each guard that rejected a target."""
 
 
 @dataclass(frozen=True)
-class InitialContext:
-    """The reconstructed context (stage 1) and its photographs."""
+class ContextScene:
+    """The n Gaussians of the context and the m <= n that are rendered in their place (LOD)."""
 
     gaussians: Gaussians
-    views: tuple[View, ...]
-    """Photographs with the depth range of the scene, in the exposure of `gaussians`."""
-    exposure_gains: Float[Tensor, "v 3"] | None = None
-    """Exposure gain per channel of each original photograph relative to `gaussians`, or None."""
-    seconds: Mapping[str, float] = field(default_factory=dict)
+    """As Ψ made them or as the user's file holds them."""
+    rendered: Gaussians
+    """The m Gaussians that the stages render; `gaussians` itself for small scenes and on GPUs."""
+    proxy_index: Int64[Tensor, "n"]
+    """Rendered Gaussian that stands for each Gaussian; empty if `rendered is gaussians`."""
+
+    @staticmethod
+    def whole(gaussians: Gaussians) -> ContextScene:
+        """Return a context that is rendered as it is."""
+        return ContextScene(gaussians, gaussians, torch.empty(0, dtype=torch.int64))
+
+    def expand(self, values: Shaped[Tensor, "m *c"]) -> Shaped[Tensor, "n *c"]:
+        """Map values of rendered Gaussians to the Gaussians they stand for."""
+        return values if self.rendered is self.gaussians else values[self.proxy_index]
+
+
+@dataclass(frozen=True)
+class Photo:
+    """A photograph of the scene with its error budgets."""
+
+    view: View
+    """With the depth range of the scene, in the exposure of the context."""
+    budgets: tuple[ErrorBudget, ...] = ()
+    """Largest errors that additions may cause; none if no guard sets them."""
 
 
 @dataclass(frozen=True)
 class TargetResult(RenamedMembers):
     """Result of one target camera. No stage reads it."""
 
-    old_names: ClassVar[Mapping[str, str]] = {
-        "support": "trusted_alpha",
-        "refused": "refusal",
-    }
+    old_names: ClassVar[Mapping[str, str]] = {"support": "trusted_alpha", "refused": "refusal"}
 
     target: Camera
     before: Render
-    """The scene without what this target added, rendered at the target."""
+    """The scene without what this target changed, rendered at the target."""
     after: Render
     hole_mask: Bool[Tensor, "h w"]
-    """True where the scene had a hole, before dilation."""
-    reference: View | None
-    """The synthesized view, or None if nothing was synthesized."""
+    """True where the scene had a hole or was not trusted, before dilation."""
+    trusted_alpha: Float[Tensor, "h w"]
+    """Accumulated opacity weighted by trust, from which `hole_mask` follows."""
     anchor: int
     """Index of the anchor among the context views."""
     anchor_fallback: bool
     """True if every view exceeded the rotation limit, so that the smallest rotation won."""
-    affine: DepthAffine
     added: Gaussians
+    reference: View | None = None
+    """The synthesized view, or None if there was nothing to complete."""
+    affine: DepthAffine = DepthAffine()
     losses: Mapping[str, Sequence[float]] = field(default_factory=dict)
-    """Loss per iteration of the optimizations `register` and `refine`."""
+    """Loss per iteration of `register` (Eq. 11) and `refine` (Eq. 13)."""
     registered: Gaussians | None = None
     """All registered Gaussians, hole or not; None without `GSCompleter.keep_registered`."""
-    notes: tuple[str, ...] = ()
-    trusted_alpha: Float[Tensor, "h w"] | None = None
-    """Alpha weighted by trust before this target, or None under full trust."""
-    pairs: DepthPairs | None = None
-    """Sample of the depths that the affine was fitted to, or None if none were compared."""
+    num_recolored: int = 0
+    """Number of rendered context Gaussians that got new colours."""
+    synthesis_notes: tuple[str, ...] = ()
+    """Sentences of the generator about its image."""
+    rejected_by: str = ""
+    """Name of the guard that removed everything; empty if none did."""
     refusal: str | None = None
     """Sentence why the target cannot be completed, or None if it can."""
+    skip_reason: str = ""
+    """Sentence why there was nothing to complete; empty if there was."""
 
     @property
     def hole_fraction(self) -> float:
         """Fraction of the image in holes."""
         return self.hole_mask.float().mean().item()
+
+    @property
+    def notes(self) -> tuple[str, ...]:
+        """Sentences about fallbacks and rejections, for a reader of the results."""
+        if self.skip_reason:
+            return (self.skip_reason,)
+        rejection = REJECTIONS.get(self.rejected_by, "").format(agreement=self.affine.agreement)
+        sentences = (
+            *self.synthesis_notes,
+            *self._describe_fallbacks(),
+            rejection,
+            NOTHING_ADDED if self.rejected_by else "",
+        )
+        return tuple(filter(None, sentences))
+
+    def _describe_fallbacks(self) -> tuple[str, ...]:
+        """Return one sentence for each fallback that was taken, empty for others."""
+        methods = {
+            "median": "RANSAC finds no reliable depth correction; the median depth ratio "
+            "replaces it.",
+            "identity": "There is nothing to fit a depth correction to; the predicted depths are "
+            "used.",
+        }
+        return (
+            "Every view is turned too far; the least-turned one is the anchor."
+            if self.anchor_fallback
+            else "",
+            "The depths that fit the anchor contradict the scene at the target; they are fitted at "
+            "the target instead."
+            if self.affine.is_refitted_at_target
+            else "",
+            methods.get(self.affine.method, ""),
+        )
 
 
 @dataclass(frozen=True)
@@ -89,86 +147,67 @@ class Completion(RenamedMembers):
     """A scene during completion; steps return a new value, and the old one serves as undo."""
 
     old_names: ClassVar[Mapping[str, str]] = {
-        "drawn": "rendered_scene",
-        "drawn_context": "rendered_context",
-        "observed": "kept_context",
-        "begun": "context_renders",
-        "witnesses": "check_views",
         "bystanders": "free_space_cameras",
-        "photographs": "photos",
         "gains": "exposure_gains",
-        "evidence": "observations",
-        "set_aside": "pruned",
-        "removed": "pruned_mask",
         "next_number": "next_target_id",
         "ranged": "with_depth_range",
     }
 
-    rendered_scene: Gaussians
-    """The context or its LOD proxy, without pruned Gaussians, then all generated ones."""
-    context: Gaussians
-    """The scene before its first target."""
-    views: tuple[View, ...]
-    """Context photographs with the depth range of the scene, in the exposure of the context."""
-    budgets: tuple[tuple[ErrorBudget, ...], ...]
-    """Error budgets of each photograph in `photos`; the first excludes the holes of the context."""
-    targets: tuple[TargetResult, ...]
-    seconds: Mapping[str, float]
-    """Wall time of context, generate, lift, register, integrate and total."""
-    check_views: tuple[View, ...] = ()
-    """Further photographs of the scene that must not get worse."""
+    config: CompleterConfig
+    source: ContextScene
+    parts: tuple[Gaussians, ...]
+    """What is rendered: the context, recoloured in part, then one part per target."""
+    photos: tuple[Photo, ...]
+    """Context photographs, then check photographs."""
+    num_context: int
+    trust: Trust
+    """Trust in `parts[0]`; added Gaussians have full trust."""
+    targets: tuple[TargetResult, ...] = ()
     free_space_cameras: tuple[Camera, ...] = ()
     """Further cameras whose free space stays empty; their images are not read."""
+    seconds: Mapping[str, float] = field(default_factory=dict)
+    """Wall time of context, generate, lift, register, integrate and total."""
     exposure_gains: Float[Tensor, "v 3"] | None = None
     """Exposure gain of each original photograph relative to `views`, or None if not estimated."""
-    context_renders: tuple[Render, ...] = ()
-    """Renders of the context at `views` before any target."""
-    proxy: Proxy | None = None
-    """LOD proxy of a large context, or None if the context itself is rendered."""
-    observations: PhotoObservations | None = None
-    """Observations of the context in all photographs, or None under full trust."""
-    pruned: Bool[Tensor, "m"] | None = None
-    """Rendered context Gaussians that were pruned, or None if none were."""
 
     @property
-    def photos(self) -> tuple[View, ...]:
-        """All photographs that the scene is compared with: `views`, then `check_views`."""
-        return (*self.views, *self.check_views)
+    def views(self) -> tuple[View, ...]:
+        """Context photographs."""
+        return tuple(photo.view for photo in self.photos[: self.num_context])
 
     @property
-    def rendered_context(self) -> Gaussians:
-        """The context or its LOD proxy as it is rendered, pruned Gaussians included."""
-        return self.context if self.proxy is None else self.proxy.scene
-
-    @property
-    def num_kept(self) -> int:
-        """Number of context Gaussians, without pruned ones, at the start of `rendered_scene`."""
-        num_pruned = 0 if self.pruned is None else int(self.pruned.sum())
-        return len(self.rendered_context) - num_pruned
+    def context(self) -> Gaussians:
+        """The scene before its first target, bit for bit."""
+        return self.source.gaussians
 
     @property
     def added(self) -> Gaussians:
         """Generated Gaussians of all targets."""
-        return self.rendered_scene[self.num_kept :]
+        return merge([self.parts[0][:0], *self.parts[1:]])
 
     @property
-    def pruned_mask(self) -> Bool[Tensor, "n"] | None:
-        """Pruned Gaussians as a mask over `context`, or None if there are none."""
-        pruned = self.pruned
-        return pruned if pruned is None or self.proxy is None else pruned[self.proxy.proxy_index]
-
-    @property
-    def kept_context(self) -> Gaussians:
-        """The context bit for bit, without pruned Gaussians."""
-        removed = self.pruned_mask
-        return self.context if removed is None else self.context[~removed]
+    def recolored_mask(self) -> Bool[Tensor, "n"]:
+        """True for Gaussians of `context` that got new colours."""
+        return self.source.expand(self.parts[0].generated != self.source.rendered.generated)
 
     @cached_property
     def scene(self) -> Gaussians:
-        """The context bit for bit, without pruned Gaussians, followed by all generated ones."""
-        if self.proxy is None:
-            return self.rendered_scene
-        return merge([self.kept_context, self.added]) if len(self.added) else self.kept_context
+        """The context, bit for bit where it was not recoloured, then all added Gaussians."""
+        parts = [self.recolored_context, *self.parts[1:]]
+        return merge(parts) if len(parts) > 1 else parts[0]
+
+    @property
+    def recolored_context(self) -> Gaussians:
+        """The context with the new colours and target ids of recoloured Gaussians."""
+        before, after, given = self.source.rendered, self.parts[0], self.source.gaussians
+        if after is before:
+            return given
+        changed = self.recolored_mask
+        sh = torch.where(
+            changed[:, None, None], given.sh + self.source.expand(after.sh - before.sh), given.sh
+        )
+        generated = torch.where(changed, self.source.expand(after.generated), given.generated)
+        return replace(given, sh=sh, generated=generated)
 
     @property
     def next_target_id(self) -> int:
@@ -178,5 +217,15 @@ class Completion(RenamedMembers):
 
     def with_depth_range(self, camera: Camera) -> Camera:
         """Return the camera with the depth range of this completion."""
-        known = self.views[0].camera
+        known = self.photos[0].view.camera
         return replace(camera, near=known.near, far=known.far)
+
+    def extended(self, result: TargetResult, seconds: Mapping[str, float]) -> Completion:
+        """Append the result of one more target, and what it added."""
+        parts = (*self.parts, result.added) if len(result.added) else self.parts
+        targets = (*self.targets, result)
+        return replace(self, parts=parts, targets=targets).plus_seconds(seconds)
+
+    def plus_seconds(self, seconds: Mapping[str, float]) -> Completion:
+        """Add wall times stage by stage."""
+        return replace(self, seconds=add_seconds(self.seconds, seconds))

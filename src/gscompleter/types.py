@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from typing import TYPE_CHECKING, Any, ClassVar, Literal, TypeVar
 
 import torch
@@ -416,7 +416,6 @@ class DepthAffine(RenamedMembers):
 
     old_names: ClassVar[Mapping[str, str]] = {
         "contradicted": "is_refitted_at_target",
-        "refuted": "is_rejected",
     }
 
     scale: float = 1.0
@@ -427,10 +426,12 @@ class DepthAffine(RenamedMembers):
     """Estimator that was used; each is the fallback of the one before."""
     agreement: float | None = None
     """Fraction of the context visible at the target that agrees with it, or None if not checked."""
+    coverage: float = 0.0
+    """Fraction of the target image over which that was checked."""
     is_refitted_at_target: bool = False
     """True if the fit at the anchor was replaced by one at the target."""
-    is_rejected: bool = False
-    """True if the context visible at the target agrees neither with this fit nor with another."""
+    pairs: DepthPairs = field(default_factory=lambda: DepthPairs.empty(), repr=False, compare=False)
+    """A sample of the compared depths, for the report."""
 
 
 @dataclass(frozen=True)
@@ -443,6 +444,11 @@ class DepthPairs:
     inlier_mask: Bool[Tensor, "n"]
     """True for inliers of the affine."""
 
+    @staticmethod
+    def empty() -> DepthPairs:
+        """Return no pairs."""
+        return DepthPairs("anchor", torch.empty(0), torch.empty(0), torch.empty(0).bool())
+
 
 @dataclass(frozen=True)
 class Proxy:
@@ -451,18 +457,6 @@ class Proxy:
     scene: Gaussians
     proxy_index: Int64[Tensor, "n"]
     """Proxy Gaussian that represents each of the n Gaussians."""
-
-
-@dataclass(frozen=True)
-class PhotoObservations:
-    """Observations of m context Gaussians in k photographs, from which trust is computed."""
-
-    means: Float[Tensor, "m 3"]
-    centers: Float[Tensor, "k 3"]
-    areas: Float[Tensor, "k m"]
-    """Visible area of each Gaussian in each photograph, in squared scene units."""
-    agreement: Float[Tensor, "k m"]
-    """Photometric consistency at each Gaussian, in [0, 1]; 0 if it is not visible."""
 
 
 @dataclass(frozen=True)

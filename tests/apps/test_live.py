@@ -28,13 +28,13 @@ from gscompleter.apps.live.serving import start_server
 from gscompleter.apps.live.session import Session, complete_camera, undo_step
 from gscompleter.apps.live.splat import make_page_splat
 from gscompleter.cli import parse_command
-from gscompleter.completer import STAGES
 from gscompleter.config import CompleterConfig
 from gscompleter.errors import InputError
 from gscompleter.geometry import measure_rotation
 from gscompleter.progress import notify_of_stages
 from gscompleter.splat_alignment.similarity import make_similarity
 from gscompleter.splats.transform import transform_gaussians
+from gscompleter.timing import STAGES
 from gscompleter.types import merge
 from scenes import Room, camera_at, gaussians_of, photographed, random_gaussians, view_of
 

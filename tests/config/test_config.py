@@ -31,7 +31,7 @@ def test_the_papers_numbers():
     assert get_named_config("paper/dilation").holes.dilation == 3
     assert (paper.refine.iterations, paper.refine.learning_rate) == (30, 0.08)
     assert (paper.refine.target_weight, paper.refine.num_views) == (0.1, 2)
-    assert paper.psnr_guard.max_drop is None
+    assert paper.guards == ()
     assert not paper.registration.mask_sky
     assert paper.registration.min_ratio is None
     assert paper.anchor.min_baseline == 0
@@ -55,7 +55,7 @@ def test_a_yaml_file_names_only_what_differs(tmp_path):
     file.write_text("base: paper\nholes: {dilation: 5}\nalignment: {align_at: none}\n")
     config = load_config(str(file))
     assert config.holes == HoleConfig(dilation=5, candidate_radius=None)
-    assert config.alignment == AlignmentConfig("none", min_agreement=None)
+    assert config.alignment == AlignmentConfig("none", min_agreement=0.0)
     assert config.registration.lr_unit == "scene"
 
 

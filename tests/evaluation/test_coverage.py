@@ -6,13 +6,15 @@ import pytest
 import torch
 
 from gscompleter import CompleterConfig, GSCompleter, load_renderer
-from gscompleter.config import FreeSpaceConfig, HoleConfig, RegistrationConfig
+from gscompleter.config import HoleConfig
 from gscompleter.config.coverage import COVERED
 from gscompleter.generators.warp import warp_photographs
 from gscompleter.geometry import project
-from gscompleter.stages.slide_along_rays import register
+from gscompleter.stages.align_depth import align_depth
+from gscompleter.stages.slide_along_rays import slide_along_rays
 from gscompleter.types import DepthMap, Gaussians, Lift, Reconstruction, Render, merge
 from scenes import Room, camera_at, gaussians_of, view_of
+from target_views import observe
 
 SIZE = 48
 TARGET, ANCHOR = camera_at(0.3, size=SIZE), camera_at(-0.3, size=SIZE)
@@ -57,8 +59,8 @@ def test_a_pixel_covered_by_less_than_max_alpha_is_a_hole_that_is_painted_and_ke
         assert torch.equal(painted[0], context.holes)
         return view_of(Room(), target).image
 
-    config = CompleterConfig(
-        margin=0.0, holes=HoleConfig(max_alpha, dilation=0), free_space=FreeSpaceConfig(num_steps=0)
+    config = CompleterConfig(margin=0.0, holes=HoleConfig(max_alpha, dilation=0)).without_guard(
+        "free-space"
     )
     views = [view_of(Room(), camera_at(x, size=SIZE), i) for i, x in enumerate((-0.3, 0.0))]
     (result,) = GSCompleter(room_of, phi, config=config)(views, TARGET, thin_scene()).targets
@@ -74,7 +76,7 @@ def test_a_pixel_covered_by_less_than_max_alpha_is_a_hole_that_is_painted_and_ke
 
 def test_the_depth_of_a_thin_pixel_is_followed_by_default_and_carried_into_where_it_is_a_hole():
     """The thin square is 10 % too far; its surroundings are correct."""
-    renderer, scene = load_renderer("cpu"), thin_scene(1.1)
+    scene = thin_scene(1.1)
     truth = REFERENCE.depth
     everywhere = DepthMap(truth, torch.ones_like(THIN))
     anchor = view_of(Room(), ANCHOR)
@@ -86,17 +88,10 @@ def test_the_depth_of_a_thin_pixel_is_followed_by_default_and_carried_into_where
     )
 
     def error(max_alpha: float) -> float:
-        found = register(
-            candidates,
-            renderer.freeze(scene, TARGET),
-            renderer.render(scene, ANCHOR),
-            REFERENCE,
-            ANCHOR,
-            renderer,
-            torch.Generator().manual_seed(0),
-            RegistrationConfig(),
-            max_alpha,
-        )
+        config = CompleterConfig(holes=HoleConfig(max_alpha))
+        view = observe(scene, [anchor], TARGET, config)
+        affine = align_depth(candidates, view, torch.Generator().manual_seed(0))
+        found = slide_along_rays(candidates, affine, REFERENCE, view)
         _, z = project(found.gaussians.means, TARGET)
         return ((z.reshape(SIZE, SIZE) / truth - 1).abs()[INNER]).median().item()
 

@@ -33,7 +33,8 @@ from gscompleter.evaluation.metrics.perceptual import compute_flip_map, haarpsi
 from gscompleter.evaluation.metrics.scores import Truth, measure_perceptual_quality, score
 from gscompleter.image_ops import dilate
 from gscompleter.render import load_renderer
-from gscompleter.stages.filter_holes import compute_hole_mask, filter_holes
+from gscompleter.stages.filter_holes import select_in_mask
+from gscompleter.stages.target_view import compute_hole_mask
 from gscompleter.types import Camera, Gaussians, View, merge
 from scenes import Room, camera_at, gaussians_of, scaled, view_of
 
@@ -359,7 +360,7 @@ def test_copies_of_part_of_the_context_are_aligned_wherever_their_border_is():
     context = room_context()
     part = torch.zeros(TARGET.height, TARGET.width, dtype=torch.bool)
     part[10:30, 12:26] = True
-    score = score_of(context, filter_holes(context, None, part, TARGET))
+    score = score_of(context, select_in_mask(context, None, part, TARGET))
     assert score.abs_rel is not None
     assert score.chamfer is not None
     assert score.f_score is not None

@@ -18,13 +18,18 @@ import torch
 from chunk_files import as_tensor, example, save_chunk
 from command import run
 from gscompleter import GSCompleter, InputError, memory
-from gscompleter.completer import STAGES
 from gscompleter.data.cases import Case
 from gscompleter.evaluation import methods as runs_methods
 from gscompleter.evaluation import store
 from gscompleter.evaluation.baselines.reggs import RegGSConfig
 from gscompleter.evaluation.memory import measure_peak_memory
-from gscompleter.evaluation.methods import BASELINES, METHODS, check_methods, expand_methods
+from gscompleter.evaluation.methods import (
+    BASELINES,
+    METHODS,
+    check_methods,
+    expand_methods,
+    synthesize_reference,
+)
 from gscompleter.evaluation.metrics.image import psnr
 from gscompleter.evaluation.plots import draw_plots
 from gscompleter.evaluation.protocols import Task, make_case_task, read_evaluation_index
@@ -44,6 +49,7 @@ from gscompleter.evaluation.summary import (
 )
 from gscompleter.evaluation.tables import write_tables
 from gscompleter.io.image import read_image
+from gscompleter.timing import STAGES
 from scenes import Room, camera_at, photographed
 
 SIZE = 32
@@ -542,7 +548,7 @@ def test_full_is_what_the_completer_does_by_itself(tasks):
     predicted = METHODS["full"](state, target.camera, models)
     assert torch.equal(predicted.scene.means, alone.scene.means)
     assert torch.equal(predicted.scene.opacities, alone.scene.opacities)
-    reference = models.make_completer().synthesize_reference(state, target.camera)
+    reference = synthesize_reference(state, target.camera, models)
     assert torch.equal(reference.image, alone.targets[0].reference.image)
 
 

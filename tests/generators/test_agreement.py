@@ -9,7 +9,7 @@ from gscompleter.generators import GeneratorOutput, as_generator
 from gscompleter.generators.agreement import compare_with_observed, paint_consistently
 from gscompleter.generators.warp import WarpedImage
 from gscompleter.generators.warp_inpaint import WarpInpaint
-from gscompleter.stages.select_anchor import synthesize
+from gscompleter.stages.synthesize import synthesize
 from scenes import Room, camera_at, view_of
 
 TRUTH = view_of(Room(), camera_at(0.0)).image

@@ -7,7 +7,7 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 
 from gscompleter import GSCompleter
-from gscompleter.config import CompleterConfig, DynamicMasksConfig
+from gscompleter.config import CompleterConfig
 from gscompleter.geometry import project, sample, unproject
 from gscompleter.guards.dynamic_masks import find_dynamic_masks
 from gscompleter.state import Completion, TargetResult
@@ -41,9 +41,10 @@ def photographed() -> tuple[list[View], list[Bool[Tensor, "h w"]]]:
 
 
 @cache
-def beginning(min_difference: float | None) -> Completion:
+def beginning(is_checked: bool) -> Completion:
     """Return the scene of these photographs without targets."""
-    config = CompleterConfig(dynamic_masks=DynamicMasksConfig(min_difference))
+    config = CompleterConfig()
+    config = config if is_checked else config.without_guard("dynamic-masks")
     return GSCompleter(config=config).begin(photographed()[0])
 
 
@@ -65,7 +66,7 @@ def is_red(colours: Float[Tensor, "*n 3"]) -> Bool[Tensor, "*n"]:
 
 def test_what_moved_is_found_in_both_photographs():
     views, reds = photographed()
-    begun = beginning(0.12)
+    begun = beginning(True)
     for k, (view, red) in enumerate(zip(begun.views, reds, strict=True)):
         assert view.dynamic_mask is not None
         found, other = view.dynamic_mask, 1 - k
@@ -103,14 +104,14 @@ def test_of_three_photographs_most_decide():
     assert (both[1] & behind).sum() >= 0.8 * behind.sum()
 
 
-def completed(min_difference: float | None) -> TargetResult:
+def completed(is_checked: bool) -> TargetResult:
     """Complete a hole behind an occluder, next to something red, from farther to the left."""
-    target, begun = camera_at(-0.4, -0.1, size=SIZE), beginning(min_difference)
+    target, begun = camera_at(-0.4, -0.1, size=SIZE), beginning(is_checked)
     return GSCompleter().advance(begun, target).targets[0]
 
 
 def test_holes_are_not_painted_with_what_moved():
-    wary, credulous = completed(0.12), completed(None)
+    wary, credulous = completed(True), completed(False)
     assert wary.reference is not None
     assert credulous.reference is not None
     truth = is_red(cast(ROOM, wary.target)[0])
@@ -125,9 +126,10 @@ def test_holes_are_not_painted_with_what_moved():
 
 
 def test_the_context_stays_as_it_is():
-    with_check, without = beginning(0.12), beginning(None)
+    with_check, without = beginning(True), beginning(False)
     assert torch.equal(with_check.context.means, without.context.means)
     assert torch.equal(with_check.context.sh, without.context.sh)
-    assert [b.limit for b in with_check.budgets[0]] == [b.limit for b in without.budgets[0]]
+    limits = [[b.limit for b in state.photos[0].budgets] for state in (with_check, without)]
+    assert limits[0] == limits[1]
     assert all(view.dynamic_mask is None for view in without.views)
-    assert CompleterConfig.paper().dynamic_masks.min_color_difference is None
+    assert CompleterConfig.paper().guards == ()

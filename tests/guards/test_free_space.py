@@ -86,17 +86,6 @@ def test_the_unit_of_the_scene_does_not_matter(unit):
     assert torch.allclose(place(unit) / unit, place(1.0), rtol=1e-4)
 
 
-@pytest.mark.parametrize("behind", [4.0, 8.0 * WITNESS.far], ids=["a wall", "the sky"])
-def test_without_steps_nothing_is_checked(behind):
-    """Neither a surface nor the sky behind the Gaussians moves them."""
-    candidates, config = floaters(2.0), FreeSpaceConfig(num_steps=0)
-    moved, placed = respect_free_space(
-        candidates, TARGET, [WITNESS], [wall(behind)], "constant", config
-    )
-    assert placed.all()
-    assert moved is candidates
-
-
 def test_nothing_stands_where_a_camera_stood():
     """No Gaussian is nearer to a camera than all that it sees, not even behind it."""
     behind = WITNESS.center + torch.tensor([[0.0, 0.0, -0.3], [0.0, 0.0, -0.6]])

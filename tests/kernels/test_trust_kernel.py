@@ -10,8 +10,13 @@ from gscompleter.config import TrustConfig
 from gscompleter.geometry import compute_z_depths
 from gscompleter.kernels.support import BLOCK, MIN_ANGLE_WEIGHT
 from gscompleter.render.cpu import CpuRenderer
-from gscompleter.trust.photometric import FULL_TRUST_FRACTION, compute_trust, gather_observations
-from gscompleter.types import PhotoObservations, View
+from gscompleter.trust.photometric import (
+    FULL_TRUST_FRACTION,
+    PhotoObservations,
+    compute_trust,
+    gather_observations,
+)
+from gscompleter.types import View
 from scenes import camera_at, random_gaussians
 
 

@@ -14,7 +14,7 @@ from gscompleter.models.feed_forward import FeedForward, VolSplat, VolSplatConfi
 from gscompleter.models.feed_forward.depth_predictor import DepthConfig
 from gscompleter.models.feed_forward.inputs import create_batch
 from gscompleter.models.feed_forward.volsplat import MAX_VOXEL_OFFSET, VoxelGaussians
-from gscompleter.stages.select_anchor import lift
+from gscompleter.stages.lift import lift_pair
 from gscompleter.types import SH_C0, View
 from parity import assert_within
 from scenes import Room, camera_at, view_of
@@ -172,7 +172,7 @@ def test_places_that_cannot_be_counted_are_refused():
 def test_all_that_the_target_sees_is_lifted():
     reference, anchor = photographs()
     reconstructor = FeedForward(random_network())
-    lifted = lift(reconstructor, reference, anchor)
+    lifted = lift_pair(reconstructor, reference, anchor)
     whole = reconstructor([reference, anchor]).gaussians
     seen = is_inside(*project(whole.means, reference.camera), reference.camera)
     assert lifted.pixel_index is None

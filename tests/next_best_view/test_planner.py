@@ -91,7 +91,9 @@ def test_the_second_camera_is_chosen_in_the_scene_that_the_first_left(begun):
 
 
 def test_nothing_is_found_where_nothing_is_left(begun):
-    completion, choices = explorer(min_gain=1.0).explore(begun, cameras(), 3)
+    greedy = replace(begun.config, next_best_view=NextBestViewConfig(min_gain=1.0))
+    begun = replace(begun, config=greedy)
+    completion, choices = explorer().explore(begun, cameras(), 3)
     assert choices == ()
     assert completion.scene is begun.scene
     assert completion.targets == ()
@@ -132,11 +134,11 @@ def test_stand_ins_close_the_hole_and_hide_nothing():
 
 def test_a_miniature_covers_what_the_scene_covers(begun):
     small = simplify_completion(begun, 3000)
-    assert len(small.rendered_scene) <= 3000 < len(begun.rendered_scene)
+    assert len(small.parts[0]) <= 3000 < len(begun.parts[0])
     renderer = load_renderer("cpu")
     aside = sample_held_out_cameras(cameras(), seed=3, count=8)
     shares = [
-        compute_covered_share([renderer.render(completion.scene, camera) for camera in aside])
+        compute_covered_share([renderer.render(completion.parts[0], camera) for camera in aside])
         for completion in (begun, small)
     ]
     assert shares[1] == pytest.approx(shares[0], abs=0.02)
@@ -159,7 +161,7 @@ def test_nothing_is_added_before_what_a_bystander_sees(begun):
     config = CompleterConfig(
         alignment=AlignmentConfig(align_at="none"), registration=RegistrationConfig(iterations=0)
     )
-    completer = replace(knowing(), config=config)
+    completer, begun = knowing(), replace(begun, config=config)
     target = camera_at(0.7, yaw=12, size=SIZE)
     aside = [camera_at(x, yaw=yaw, size=SIZE) for x, yaw in ((0.5, 4), (-0.6, -4))]
     watched = add_free_space_cameras(begun, [*cameras(), *aside])

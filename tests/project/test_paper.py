@@ -10,17 +10,19 @@ from gscompleter.geometry import depth_to_distance
 from gscompleter.stages import (
     align_depth,
     context,
-    filter_holes,
+    lift,
     refine,
     select_anchor,
     slide_along_rays,
+    synthesize,
+    target_view,
 )
 from gscompleter.types import DepthAffine
 
 EQUATIONS = {
     5: (r"\Psi(\mathcal{V}_{\text{in}}; \Theta)", [context.init_context]),
-    6: (r"\Phi(\mathbf{I}_n, \mathbf{P}_t)", [select_anchor.synthesize]),
-    7: (r"\Psi(\mathcal{V}_{\text{pair}}; \Theta)", [select_anchor.lift]),
+    6: (r"\Phi(\mathbf{I}_n, \mathbf{P}_t)", [synthesize.synthesize]),
+    7: (r"\Psi(\mathcal{V}_{\text{pair}}; \Theta)", [lift.lift_pair]),
     8: (r"(s \cdot D_{\text{pred}}^{\text{anc}}", [align_depth.fit_affine, DepthAffine]),
     9: (r"d_i^{\text{init}} = \frac", [depth_to_distance, slide_along_rays.apply_affine]),
     10: (r"\mathbf{c}_{\text{tgt}} + d_i \cdot \mathbf{r}_i", [slide_along_rays.move_along_rays]),
@@ -28,7 +30,7 @@ EQUATIONS = {
         r"\lambda_s \mathcal{L}_{\text{stereo}}",
         [slide_along_rays.Objective, slide_along_rays.register_along_rays],
     ),
-    12: (r"\mathbf{A}_{\text{ctx}}(\mathbf{p}) < \tau", [filter_holes.compute_hole_mask]),
+    12: (r"\mathbf{A}_{\text{ctx}}(\mathbf{p}) < \tau", [target_view.compute_hole_mask]),
     13: (r"\mathcal{L}_{\text{mv}} =", [refine.refine_opacities]),
 }
 """For each equation of the paper by number, a piece of it and the code that implements it."""

@@ -12,7 +12,6 @@ from gscompleter.completer import GSCompleter
 from gscompleter.config import TrustConfig
 from gscompleter.evaluation.metrics.image import psnr
 from gscompleter.memory import BYTES_PER_SPLAT
-from gscompleter.next_best_view.gain import thin_observations
 from gscompleter.render import load_renderer
 from gscompleter.render import lod as proxies
 from gscompleter.render.lod import (
@@ -24,12 +23,11 @@ from gscompleter.render.lod import (
 )
 from gscompleter.splats.morton import argsort_nearby
 from gscompleter.trust.photometric import (
-    compute_trust,
-    compute_trusted_alpha,
+    PhotometricTrust,
+    PhotoObservations,
     gather_observations,
-    sum_weights,
 )
-from gscompleter.types import Gaussians, PhotoObservations, merge
+from gscompleter.types import Gaussians, merge
 from scenes import Room, camera_at, gaussians_of, random_gaussians, reconstruction_of, view_of
 
 RENDERER = load_renderer("cpu")
@@ -57,8 +55,7 @@ def pixel_at(scene: Gaussians) -> torch.Tensor:
 def test_a_small_scene_is_its_own_proxy():
     assert build_proxy(ROOM, CAMERAS) is None
     completion = GSCompleter(KnowingReconstructor()).begin(VIEWS[::2], ROOM, VIEWS[1:2])
-    assert completion.proxy is None
-    assert completion.rendered_scene is completion.scene is completion.context is ROOM
+    assert completion.parts[0] is completion.scene is completion.context is ROOM
 
 
 def test_a_crowd_is_drawn_with_few_and_looks_alike():
@@ -151,11 +148,12 @@ def evidence_of(scene: Gaussians) -> PhotoObservations:
     return gather_observations(scene, VIEWS, frozen, TrustConfig())
 
 
+def trust_in(scene: Gaussians) -> PhotometricTrust:
+    return PhotometricTrust(evidence_of(scene), tuple(CAMERAS), len(CAMERAS), TrustConfig())
+
+
 def trusted_alpha(scene: Gaussians) -> torch.Tensor:
-    frozen = RENDERER.freeze(scene, TARGET)
-    return compute_trusted_alpha(
-        frozen, compute_trust(evidence_of(scene), sum_weights(frozen), TARGET)
-    )
+    return trust_in(scene).compute_alpha(RENDERER.freeze(scene, TARGET), TARGET)
 
 
 def test_of_a_proxy_as_much_is_believed_as_of_the_scene():
@@ -173,7 +171,7 @@ def test_evidence_is_thinned_with_the_scene():
     rows = torch.arange(0, len(CROWD), COPIES)
     growth = torch.full((len(rows),), COPIES**0.5)
     whole = evidence_of(CROWD)
-    thin = thin_observations(whole, rows, growth)
+    thin = trust_in(CROWD).thin(rows, growth).observations
     assert thin.areas.shape == (len(VIEWS), len(rows))
     assert thin.areas.sum().item() == pytest.approx(whole.areas.sum().item(), rel=0.1)
 
@@ -189,10 +187,8 @@ def test_a_scene_is_completed_alike_whether_or_not_it_has_a_proxy(monkeypatch):
     whole = GSCompleter(KnowingReconstructor(), paint)(*asked)
     monkeypatch.setattr(proxies, "MIN_PROXY_GAUSSIANS", 0)
     found = GSCompleter(KnowingReconstructor(), paint)(*asked)
-    assert found.proxy is not None
-    assert len(found.rendered_context) < 0.5 * len(CROWD)
-    kept = CROWD if found.pruned_mask is None else CROWD[~found.pruned_mask]
-    assert torch.equal(found.scene.means, torch.cat([kept.means, found.added.means]))
+    assert len(found.source.rendered) < 0.5 * len(CROWD)
+    assert torch.equal(found.scene.means, torch.cat([CROWD.means, found.added.means]))
     truth = view_of(Room(), TARGET).image
     ours, theirs = (psnr(RENDERER.render(c.scene, TARGET).image, truth) for c in (found, whole))
     assert ours > psnr(RENDERER.render(CROWD, TARGET).image, truth) + 3
@@ -208,4 +204,4 @@ def test_a_scene_is_drawn_as_finely_as_the_targets_that_are_known(monkeypatch):
     near = replace(TARGET, K=TARGET.K * torch.tensor([[4.0], [4.0], [1.0]]))
     coarse = completer.begin(VIEWS[::2], CROWD)
     fine = completer.begin(VIEWS[::2], CROWD, targets=[near])
-    assert len(coarse.rendered_scene) < len(fine.rendered_scene) <= len(CROWD)
+    assert len(coarse.parts[0]) < len(fine.parts[0]) <= len(CROWD)

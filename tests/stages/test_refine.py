@@ -8,8 +8,9 @@ import torch
 from gscompleter.config import HoleConfig, RefineConfig
 from gscompleter.image_ops import dilate
 from gscompleter.render import load_renderer
-from gscompleter.stages.filter_holes import compute_hole_mask, filter_holes
+from gscompleter.stages.filter_holes import select_in_mask
 from gscompleter.stages.refine import refine_opacities
+from gscompleter.stages.target_view import compute_hole_mask
 from gscompleter.types import View
 from scenes import Room, camera_at, gaussians_of, half_a_room_of, view_of
 
@@ -38,7 +39,7 @@ def test_pixel_aligned_gaussians_are_kept_by_their_pixel():
     view = view_of(ROOM, CAMERA)
     mask = torch.zeros(SIZE, SIZE, dtype=torch.bool)
     mask[:, :10] = True
-    kept = filter_holes(gaussians_of(view), torch.arange(SIZE * SIZE), mask, CAMERA)
+    kept = select_in_mask(gaussians_of(view), torch.arange(SIZE * SIZE), mask, CAMERA)
     assert len(kept) == 10 * SIZE
 
 
@@ -48,8 +49,8 @@ def test_other_gaussians_are_kept_by_where_they_project():
     behind = replace(gaussians, means=-gaussians.means)
     mask = torch.zeros(SIZE, SIZE, dtype=torch.bool)
     mask[:, :10] = True
-    assert len(filter_holes(gaussians, None, mask, CAMERA)) == 10 * SIZE
-    assert len(filter_holes(behind, None, mask, CAMERA)) == 0
+    assert len(select_in_mask(gaussians, None, mask, CAMERA)) == 10 * SIZE
+    assert len(select_in_mask(behind, None, mask, CAMERA)) == 0
 
 
 def half_a_room():

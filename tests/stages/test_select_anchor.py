@@ -4,7 +4,9 @@ import pytest
 import torch
 
 from gscompleter.config import AnchorConfig, CompleterConfig
-from gscompleter.stages.select_anchor import find_nearest_view, lift, select_anchor, synthesize
+from gscompleter.stages.lift import lift_pair
+from gscompleter.stages.select_anchor import find_nearest_view, select_anchor
+from gscompleter.stages.synthesize import synthesize
 from gscompleter.types import Camera, DepthMap, GeneratorInput, Reconstruction, Render, View, merge
 from scenes import Room, camera_at, gaussians_of, view_of
 
@@ -78,17 +80,18 @@ def test_the_generator_is_asked_with_the_nearest_view():
         asked.append(nearest)
         return torch.full((target.height, target.width, 3), 0.25)
 
-    reference = synthesize(generator, TARGET, context_of(far, near))
+    (reference,) = synthesize(generator, [(TARGET, context_of(far, near))])
     assert asked[0] is near
     assert reference.camera is TARGET
     assert (reference.image == 0.25).all()
 
 
 def test_a_generator_that_returns_another_size_or_nan_is_refused():
+    inputs = [(TARGET, context_of(view(1, 0)))]
     with pytest.raises(ValueError, match="shape"):
-        synthesize(lambda *_: torch.zeros(8, 8, 3), TARGET, context_of(view(1, 0)))
+        synthesize(lambda *_: torch.zeros(8, 8, 3), inputs)
     with pytest.raises(ValueError, match="finite"):
-        synthesize(lambda *_: torch.full((96, 96, 3), torch.nan), TARGET, context_of(view(1, 0)))
+        synthesize(lambda *_: torch.full((96, 96, 3), torch.nan), inputs)
 
 
 def two_views_reconstructed(aligned: bool):
@@ -110,7 +113,7 @@ def two_views_reconstructed(aligned: bool):
 
 def test_of_a_pixel_aligned_pair_only_the_references_gaussians_are_lifted():
     reference, anchor = view(0, 0), view(0.4, 0)
-    lifted = lift(two_views_reconstructed(aligned=True), reference, anchor)
+    lifted = lift_pair(two_views_reconstructed(aligned=True), reference, anchor)
     assert len(lifted.gaussians) == 96 * 96
     assert torch.equal(lifted.pixel_index, torch.arange(96 * 96))
     truth = gaussians_of(view_of(Room(), reference.camera))
@@ -119,7 +122,7 @@ def test_of_a_pixel_aligned_pair_only_the_references_gaussians_are_lifted():
 
 def test_of_another_reconstructor_all_that_the_target_sees_is_lifted():
     reference, anchor = view(0, 0), view(0.4, 0)
-    lifted = lift(two_views_reconstructed(aligned=False), reference, anchor)
+    lifted = lift_pair(two_views_reconstructed(aligned=False), reference, anchor)
     assert lifted.pixel_index is None
     assert 96 * 96 < len(lifted.gaussians) < 2 * 96 * 96
 

@@ -11,10 +11,18 @@ from gscompleter.render import Renderer, load_renderer
 from gscompleter.render.cpu import CpuRenderer
 from gscompleter.render.reference import ReferenceFrozenScene
 from gscompleter.sky import SKY_DEPTH
-from gscompleter.stages.slide_along_rays import Objective, apply_affine, move_along_rays, register
-from gscompleter.types import DepthAffine, DepthMap, Lift, View, merge
+from gscompleter.stages.align_depth import align_depth
+from gscompleter.stages.slide_along_rays import (
+    Objective,
+    apply_affine,
+    move_along_rays,
+    slide_along_rays,
+)
+from gscompleter.stages.target_view import TargetView
+from gscompleter.types import DepthAffine, DepthMap, Gaussians, Lift, View, merge
 from parity import assert_close
 from scenes import Room, camera_at, gaussians_of, scaled, view_of
+from target_views import observe
 
 SIZE = 48
 ROOM = Room()
@@ -41,6 +49,26 @@ def lifted(reference: View, anchor: View, error: torch.Tensor | float) -> Lift:
     )
 
 
+@dataclass(frozen=True)
+class Registered:
+    gaussians: Gaussians
+    losses: tuple[float, ...]
+    affine: DepthAffine
+
+
+def register(lift: Lift, reference: View, view: TargetView) -> Registered:
+    """Register lifted Gaussians to the scene of a target."""
+    affine = align_depth(lift, view, torch.Generator().manual_seed(0))
+    moved = slide_along_rays(lift, affine, reference, view)
+    return Registered(moved.gaussians, moved.losses, affine)
+
+
+def with_registration(
+    config: RegistrationConfig, alignment: AlignmentConfig = AlignmentConfig()
+) -> CompleterConfig:
+    return CompleterConfig(registration=config, alignment=alignment)
+
+
 def registered(
     error: torch.Tensor | float,
     config: RegistrationConfig,
@@ -53,17 +81,8 @@ def registered(
     reference, anchor_view = view_of(room, target), view_of(room, anchor)
     others = [view_of(room, camera_at(x, size=SIZE, unit=unit)) for x in (-0.2, 0.0, 0.4)]
     context = merge([gaussians_of(view) for view in others])
-    result = register(
-        lifted(reference, anchor_view, error),
-        renderer.freeze(context, target),
-        renderer.render(context, anchor),
-        reference,
-        anchor,
-        renderer,
-        torch.Generator().manual_seed(0),
-        config,
-    )
-    return result, reference
+    seen = observe(context, [anchor_view], target, with_registration(config), renderer)
+    return register(lifted(reference, anchor_view, error), reference, seen), reference
 
 
 def depth_error(result, reference: View) -> float:
@@ -159,9 +178,8 @@ def test_only_candidates_that_reach_what_is_compared_are_drawn(config, monkeypat
         pixels = torch.arange(SIZE * SIZE).view(SIZE, SIZE)[: SIZE // 4, : SIZE // 4].flatten()
         corner, drawn[:] = gaussians_of(anchor)[pixels], []
         lift = lifted(reference, anchor, bumpy())
-        scene = CPU.freeze(corner, TARGET), CPU.render(corner, ANCHOR)
-        generator = torch.Generator().manual_seed(0)
-        return register(lift, *scene, reference, ANCHOR, Counting(), generator, config)
+        seen = observe(corner, [anchor], TARGET, with_registration(config), Counting())
+        return register(lift, reference, seen)
 
     fewer = registered_to_a_corner()
     # The paper's colour loss covers the whole target.
@@ -179,10 +197,8 @@ def test_only_candidates_that_reach_what_is_compared_are_drawn(config, monkeypat
 def test_where_nothing_is_compared_candidates_stay():
     reference, anchor = view_of(ROOM, TARGET), view_of(ROOM, ANCHOR)
     nothing = gaussians_of(anchor)[:0]
-    lift, scene = lifted(reference, anchor, 1.0), CPU.freeze(nothing, TARGET)
-    generator = torch.Generator().manual_seed(0)
-    at_anchor = CPU.render(nothing, ANCHOR)
-    result = register(lift, scene, at_anchor, reference, ANCHOR, CPU, generator)
+    lift = lifted(reference, anchor, 1.0)
+    result = register(lift, reference, observe(nothing, [anchor], TARGET))
     assert_close(result.gaussians.means, lift.gaussians.means, "means", 1e-6)
     assert set(result.losses) == {0.0}
 
@@ -276,17 +292,9 @@ def test_a_surface_hidden_from_the_anchor_is_not_pulled_onto_what_hides_it():
 
     def moved(mask_occluded: bool) -> float:
         config = RegistrationConfig(mask_occluded=mask_occluded, rgb_weight=0.0)
-        result = register(
-            candidates,
-            nothing_else,
-            renderer.render(panel, ANCHOR),
-            reference,
-            ANCHOR,
-            renderer,
-            torch.Generator(),
-            config,
-            alignment=AlignmentConfig(align_at="none"),
-        )
+        chosen = with_registration(config, AlignmentConfig(align_at="none"))
+        seen = observe(panel, [View(colours[1], ANCHOR)], TARGET, chosen)
+        result = register(candidates, reference, replace(seen, frozen=nothing_else))
         return (result.gaussians.means[:, 2] - 4.0).abs().mean().item()
 
     assert moved(mask_occluded=False) > 0.2

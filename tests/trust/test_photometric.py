@@ -14,30 +14,24 @@ from gscompleter.completer import GSCompleter
 from gscompleter.config import (
     AlignmentConfig,
     CompleterConfig,
-    ReconcileConfig,
     RegistrationConfig,
     TrustConfig,
 )
 from gscompleter.evaluation.metrics.image import psnr
 from gscompleter.geometry import is_inside, project
-from gscompleter.guards.mvs_hint import apply_stereo, render_stereo
-from gscompleter.guards.prune_occluders import find_unneeded
 from gscompleter.guards.psnr import compute_squared_error
 from gscompleter.memory import estimate_bytes
 from gscompleter.render import load_renderer
-from gscompleter.render.cpu import CpuFrozenScene
 from gscompleter.render.lod import MIN_PROXY_GAUSSIANS
 from gscompleter.splats.morton import argsort_nearby
 from gscompleter.splats.ply import load_ply, save_ply
-from gscompleter.stages.fit_to_photos import PhotoSchedule, compute_hole_error, refine_appearance
-from gscompleter.state import Completion
+from gscompleter.trust import FullTrust
 from gscompleter.trust.photometric import (
     compute_trust,
-    compute_trusted_alpha,
     gather_observations,
     sum_weights,
 )
-from gscompleter.types import ErrorBudget, GeneratorInput, merge, sh_from_rgb
+from gscompleter.types import merge, sh_from_rgb
 from scenes import (
     Room,
     camera_at,
@@ -47,6 +41,7 @@ from scenes import (
     reconstruction_of,
     view_of,
 )
+from target_views import begin_with
 
 RENDERER = load_renderer("cpu")
 SIZE = 64
@@ -85,7 +80,7 @@ def error_of(scene, view):
     return compute_squared_error(RENDERER.render(scene, view.camera).image, view.image).item()
 
 
-def knowing(config=CompleterConfig()):
+def knowing(config=None):
     paint = lambda nearest, target, context: view_of(Room(), target).image  # noqa: E731
     return GSCompleter(KnowingReconstructor(), paint, config=config)
 
@@ -125,27 +120,19 @@ def test_sums_of_weights_make_up_the_alpha():
     assert torch.isclose(sums.sum(), alpha, rtol=1e-3)
 
 
-def test_only_what_no_photograph_needs_is_set_aside():
-    doubtful = ARE_SHREDS.clone()
-    doubtful[1000:1100] = True
-    gone = find_unneeded(SCENE[doubtful], frozen_at(VIEWS, SCENE[~doubtful]), VIEWS)
-    taken = doubtful.masked_scatter(doubtful, gone)
-    assert taken[ARE_SHREDS].float().mean() > 0.8
-    assert not (taken & ~doubtful).any()
-    for view in VIEWS:
-        assert error_of(SCENE[~taken], view) <= error_of(SCENE, view) * (1 + 1e-6)
-
-
 def test_shreds_give_way_to_what_belongs_there():
     completion = knowing()(VIEWS[::2], TARGET, SCENE, check_views=VIEWS[1:2])
     (result,) = completion.targets
     truth = view_of(Room(), TARGET).image
     assert result.hole_fraction > 0.1
     assert psnr(result.after.image, truth) > psnr(result.before.image, truth) + 3
-    assert completion.pruned is not None
-    assert completion.pruned[ARE_SHREDS].float().mean() > 0.8
-    kept = completion.scene[: completion.num_kept]
-    assert torch.equal(kept.means, SCENE.means[~completion.pruned])
+    changed = completion.recolored_mask
+    assert changed[ARE_SHREDS].float().mean() > 0.5
+    assert (completion.scene.generated[: len(SCENE)][changed] == 1).all()
+    same = completion.recolored_context
+    for name in ("means", "quats", "scales", "opacities"):
+        assert torch.equal(getattr(same, name), getattr(SCENE, name)), name
+    assert torch.equal(same.sh[~changed], SCENE.sh[~changed])
     for view in VIEWS:
         before = psnr(RENDERER.render(SCENE, view.camera).image, view.image)
         after = psnr(RENDERER.render(completion.scene, view.camera).image, view.image)
@@ -165,12 +152,13 @@ def test_closing_a_hole_makes_up_for_nothing_that_was_good():
     half = SURFACES[SURFACES.means[:, 0] < 0.3]
     paint = lambda nearest, target, context: view_of(Room(), target).image  # noqa: E731
     unmended = AlignmentConfig(align_at="none"), RegistrationConfig(iterations=0)
-    config = CompleterConfig(alignment=unmended[0], registration=unmended[1])
+    config = replace(CompleterConfig.splat(), alignment=unmended[0], registration=unmended[1])
     completer = GSCompleter(NearReconstructor(), paint, config=config)
     completion = completer(VIEWS[::2], TARGET, half, check_views=VIEWS[1:2])
     assert len(completion.targets[0].added) > 0
     gained = []
-    for view, (seen, *_) in zip(completion.photos, completion.budgets, strict=True):
+    for photo in completion.photos:
+        view, (seen, *_) = photo.view, photo.budgets
         before, after = (RENDERER.render(g, view.camera) for g in (half, completion.scene))
         holes = before.alpha < 0.5
         assert holes.float().mean() > 0.05
@@ -184,115 +172,26 @@ def test_closing_a_hole_makes_up_for_nothing_that_was_good():
     assert max(gained) > 0
 
 
-def test_what_is_added_is_drawn_only_where_it_counts(monkeypatch):
-    """All over the photographs, and at the padded target, which is rendered last, in holes."""
-    asked, plan = [], CpuFrozenScene.vary_appearance
-
-    def noted(self, new, where):
-        asked.append((self, where))
-        return plan(self, new, where)
-
-    monkeypatch.setattr(CpuFrozenScene, "vary_appearance", noted)
-    half = SURFACES[SURFACES.means[:, 0] < 0.3]
-    completion = knowing()(VIEWS[::2], TARGET, half, check_views=VIEWS[1:2])
-    *at_photographs, (at_target, holes) = asked
-    assert len(at_photographs) == len(completion.photos)
-    assert all(where.all() for _, where in at_photographs)
-    assert holes.float().mean() > 0.1
-    assert (at_target.render.alpha < 0.5)[holes].float().mean() > 0.9
-
-
 def test_without_its_photographs_a_scene_is_taken_as_it_is():
     completion = knowing()(VIEWS[::2], TARGET, SCENE)
-    assert completion.pruned is None
-    assert completion.observations is None
+    assert not completion.recolored_mask.any()
+    assert completion.trust == FullTrust()
     assert completion.targets[0].hole_fraction < 0.05
-
-
-def test_unsupported_gaussians_may_be_kept():
-    config = CompleterConfig(trust_settings=TrustConfig(prune=False))
-    completion = knowing(config)(VIEWS[::2], TARGET, SCENE, check_views=())
-    assert completion.pruned is None
-    assert torch.equal(completion.scene.means[: len(SCENE)], SCENE.means)
 
 
 def test_the_paper_doubts_nothing():
     completion = knowing(CompleterConfig.paper())(VIEWS[::2], TARGET, SCENE, check_views=())
-    assert completion.observations is None
-
-
-def test_what_is_added_is_fitted_to_all_photographs_at_once():
-    view = view_of(Room(), TARGET)
-    hidden = gaussians_of(view)
-    seen = torch.stack([is_inside(*project(hidden.means, c), c) for c in PHOTOGRAPHS]).any(0)
-    # Black Gaussians occlude the photographs.
-    before = gaussians_of(VIEWS[1], 0.5 * VIEWS[1].depth)
-    black = replace(before, sh=sh_from_rgb(torch.zeros(SIZE * SIZE, 3)))
-    allowed = [error_of(SURFACES, v) for v in VIEWS]
-    target = RENDERER.freeze(SURFACES, TARGET)
-    holes = target.render.alpha < 0.5
-    new = merge([hidden[~seen], black])
-    added, losses = refine_appearance(
-        new,
-        target,
-        view,
-        holes,
-        [RENDERER.freeze(SURFACES, v.camera).vary_appearance(new, v.valid_mask) for v in VIEWS],
-        [ErrorBudget(v, "mse", error) for v, error in zip(VIEWS, allowed, strict=True)],
-    )
-    scene = merge([SURFACES, added])
-    for photograph, error in zip(VIEWS, allowed, strict=True):
-        assert error_of(scene, photograph) < 1.01 * error
-    after, before = (drawn.image for drawn in (RENDERER.render(scene, TARGET), target.render))
-    assert compute_hole_error(after, view, holes) < 0.1 * compute_hole_error(before, view, holes)
-    assert len(losses) == ReconcileConfig().iterations
-
-
-def test_what_photographs_show_by_themselves_takes_the_place_of_what_is_doubted():
-    camera = camera_at(0.15, size=SIZE)
-    truth = view_of(Room(), camera)
-    in_the_way = gaussians_of(truth, 0.8 * truth.depth)[: SIZE * SIZE // 4]
-    black = sh_from_rgb(torch.zeros(len(in_the_way), 3))
-    scene = merge([SURFACES, replace(in_the_way, sh=black)])
-    frozen, config = RENDERER.freeze(scene, camera), TrustConfig(color_sigma=0.03)
-    evidence, drawn = (
-        gather_observations(scene, VIEWS, frozen_at(VIEWS, scene), config),
-        frozen.render,
-    )
-    found = compute_trust(evidence, sum_weights(frozen), camera)
-    believed = compute_trusted_alpha(frozen, found)
-    stereo = render_stereo(VIEWS, camera, drawn, KnowingReconstructor(), RENDERER, config)
-    context = GeneratorInput(tuple(VIEWS), (), drawn, trusted_alpha=believed)
-    told = apply_stereo(context, stereo)
-    assert context.holes.float().mean() > 0.15
-    assert told.holes.float().mean() < 0.75 * context.holes.float().mean()
-    taken = context.holes & ~told.holes
-    error = (told.target_render.image - truth.image)[taken].abs().mean()
-    assert error < 0.5 * (drawn.image - truth.image)[taken].abs().mean()
-    assert torch.equal(told.target_render.image[~context.holes], drawn.image[~context.holes])
-
-
-def test_one_photograph_makes_no_stereo():
-    drawn = RENDERER.render(SCENE, TARGET)
-    config = TrustConfig()
-    assert render_stereo(VIEWS[:1], TARGET, drawn, KnowingReconstructor(), RENDERER, config) is None
-
-
-def test_photographs_take_turns_and_the_worst_of_them_more_often():
-    turns = PhotoSchedule([0.0, 0.0, 5.0, 0.0, 0.0])
-    asked = [number for _ in range(4) for number in turns.take(2)]
-    assert set(asked) == set(range(5))
-    assert asked.count(2) == 4
+    assert completion.trust == FullTrust()
 
 
 def complete(scene, splat, out, *more):
     asked = ["--context", "0", "2", "--target", "3", "--near", "0.5", "--far", "20"]
-    asked += ["--resolution", "48", "--config.reconcile.iterations", "10"]
+    asked += ["--resolution", "48"]
     return ["complete", scene, "--scene", splat, *asked, "--out", out, "--quiet", *more]
 
 
 @pytest.mark.parametrize("worth", [0, MIN_PROXY_GAUSSIANS], ids=["sorted", "as-given"])
-def test_the_command_sets_aside_and_strip_puts_back(tmp_path, monkeypatch, worth):
+def test_the_command_recolours_and_strip_puts_back(tmp_path, monkeypatch, worth):
     """Restored to the byte, whether or not the scene was sorted in between."""
     monkeypatch.setattr("gscompleter.apps.commands.complete.MIN_PROXY_GAUSSIANS", worth)
     scene = photographed(tmp_path / "scene", [*PHOTOGRAPHS, TARGET])
@@ -315,25 +214,14 @@ def test_a_sorted_scene_is_the_same_in_the_order_of_its_file():
         sides.median()
         < 0.2 * SCENE.means[torch.randperm(len(SCENE))].diff(dim=0).norm(dim=1).median()
     )
-    added, brought = SCENE[:3], InputSplatFile(Path("splat.ply"), file_order=order)
-    for aside in (None, torch.arange(len(SCENE)) % 3 == 0):
-        sorted_aside = None if aside is None else aside[order]
-        context = SCENE[order]
-        left = context if aside is None else context[~aside[order]]
-        drawn = merge([left, added])
-        completion = Completion(drawn, context, (), (), (), {}, pruned=sorted_aside)
-        context, left_out = restore_file_order(completion, brought)
-        assert torch.equal(context.means, SCENE.means)
-        assert (left_out is None) if aside is None else torch.equal(left_out, aside)
-
-
-def test_the_command_keeps_what_it_is_told_to(tmp_path, monkeypatch):
-    scene = photographed(tmp_path / "scene", [*PHOTOGRAPHS, TARGET])
-    splat, out = tmp_path / "splat.ply", tmp_path / "out"
-    save_ply(splat, SCENE)
-    assert run(monkeypatch, *complete(scene, splat, out, "--no-prune")) == 0
-    assert not (out / "removed.ply").exists()
-    assert torch.equal(load_ply(out / "completed.ply").means[: len(SCENE)], SCENE.means)
+    given = InputSplatFile(Path("splat.ply"), file_order=order)
+    state = begin_with(SCENE[order], VIEWS)
+    is_changed = torch.arange(len(SCENE)) % 3 == 0
+    ids = is_changed[order].to(torch.uint8)
+    state = replace(state, parts=(replace(state.parts[0], generated=ids),))
+    context, changed = restore_file_order(state, given)
+    assert torch.equal(context.means, SCENE.means)
+    assert torch.equal(changed, is_changed)
 
 
 def test_the_command_refuses_a_scene_that_does_not_fit(tmp_path, monkeypatch, capsys):

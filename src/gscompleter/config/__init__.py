@@ -50,18 +50,17 @@ class AlignmentConfig(Settings):
 
     align_at: Literal["anchor", "target", "none"] = "anchor"
     """View at which depths are compared. `target` and `none` are ablations of the paper."""
-    min_agreement: Share | None = 0.3
+    min_agreement: Share = 0.3
     """Smallest share of observed pixels at the target that must agree with the fit at the anchor;
-    below it, a fit at the target may replace it. None never replaces it (paper)."""
+    below it, a fit at the target may replace it (paper: 0, it never does)."""
 
 
 @dataclass(frozen=True)
 class DepthAgreementConfig(Settings):
-    """Rejection of targets whose lifted depths disagree with the scene."""
+    """Guard `depth-agreement`: reject targets whose lifted depths disagree with the scene."""
 
-    reject_below: Share | None = 0.15
-    """Add nothing if no fit is found and fewer observed pixels than this share agree. None never
-    rejects (paper)."""
+    reject_below: Share = 0.15
+    """Add nothing if no fit is found and fewer observed pixels than this share agree."""
 
 
 @dataclass(frozen=True)
@@ -110,10 +109,10 @@ class RegistrationConfig(Settings):
 
 @dataclass(frozen=True)
 class FreeSpaceConfig(Settings):
-    """Removal of new Gaussians from space that photographs show to be empty."""
+    """Guard `free-space`: keep new Gaussians out of space that photographs show to be empty."""
 
-    num_steps: Annotated[int, Interval(ge=0, le=1000)] = 48
-    """Steps by which a Gaussian slides back before it is dropped; 0 disables the check (paper)."""
+    num_steps: Annotated[int, Interval(ge=1, le=1000)] = 48
+    """Steps by which a Gaussian slides back before it is dropped."""
 
 
 @dataclass(frozen=True)
@@ -135,11 +134,11 @@ class HoleConfig(Settings):
 
 @dataclass(frozen=True)
 class DynamicMasksConfig(Settings):
-    """Detection of regions that moved between photographs; not for an input splat."""
+    """Guard `dynamic-masks`: copy nothing from regions that moved between photographs."""
 
-    min_color_difference: Annotated[float, Interval(gt=0, le=1)] | None = 0.12
+    min_color_difference: Annotated[float, Interval(gt=0, le=1)] = 0.12
     """Colour difference, in [0, 1], above which two photographs of a surface show different
-    things. None disables the check (paper)."""
+    things."""
 
 
 @dataclass(frozen=True)
@@ -152,8 +151,6 @@ class TrustConfig(Settings):
     angle_sigma: Annotated[float, Interval(gt=0, le=180)] = 20.0
     """Angle between the rays of a photograph and of the camera, in degrees, at which the weight of
     that photograph drops to 1/e."""
-    prune: bool = True
-    """Prune occluders: Gaussians in front of a hole that no photograph shows or needs."""
 
 
 @dataclass(frozen=True)
@@ -175,44 +172,27 @@ class RefineConfig(Settings):
 
 
 @dataclass(frozen=True)
-class ReconcileConfig(Settings):
-    """Refinement against all photographs of an input splat, if `trust` is photometric."""
+class RecolorConfig(Settings):
+    """Recolouring of Gaussians that cover the target but are not trusted there."""
 
-    iterations: Count = 60
-    """Iterations of Adam; 0 keeps the lifted colours and opacities."""
-    views_per_step: Annotated[int, Interval(ge=1, le=1000)] = 4
-    """Photographs per iteration, in addition to the synthesized image."""
-    photograph_weight: Weight = 20.0
-    """Weight of a photograph's relative error above its budget, against the relative error in the
-    holes."""
-    opacity_step: Step = 0.25
-    """Learning rate of Adam for the logits of opacities."""
-    color_step: Step = 0.04
-    """Learning rate of Adam for spherical harmonics."""
-    beta1: Memory = 0.7
-    """Adam's decay rate of gradients, usually 0.9. Each iteration uses other photographs."""
-    beta2: Memory = 0.95
-    """Adam's decay rate of squared gradients, usually 0.999."""
-    sh_degree: Annotated[int, Interval(ge=0, le=3)] = 2
-    """Highest degree of spherical harmonics of an added Gaussian, never above the scene's."""
-
-    def limit_sh_degree(self, sh_degree: int) -> ReconcileConfig:
-        """Limit the degree of spherical harmonics."""
-        return replace(self, sh_degree=min(self.sh_degree, sh_degree))
+    hold_weight: Weight = 50.0
+    """Weight of a photograph, in whose direction colours are held, against the target's."""
+    ridge: Weight = 0.02
+    """Weight of small coefficients, relative to the weight of all observations of a Gaussian."""
+    iterations: Count = 8
+    """Rounds on the residual image."""
 
 
 @dataclass(frozen=True)
 class PsnrGuardConfig(Settings):
-    """Error budget of the photographs, within which added Gaussians must stay."""
+    """Guard `psnr`: the error budget of the photographs, within which additions must stay."""
 
-    max_drop: Annotated[float, Interval(ge=0, le=100)] | None = 0.018
-    """Largest loss of PSNR of any context view, in dB over the whole image. None disables the check
-    (paper); with photometric trust it is always 0."""
+    max_drop: Annotated[float, Interval(ge=0, le=100)] = 0.018
+    """Largest loss of PSNR of any photograph, in dB over the whole image."""
     max_ssim_drop: Share = 0.0009
     """Largest loss of SSIM of any photograph."""
-    max_opacity_loss: Share | None = 0.75
-    """Add nothing if the added Gaussians lose more than this share of their opacity, or if the
-    synthesized image disagrees with the photographs. None always adds them (paper)."""
+    max_opacity_loss: Share = 0.75
+    """Add nothing if the added Gaussians lose more than this share of their opacity."""
 
 
 @dataclass(frozen=True)
@@ -240,47 +220,66 @@ class NextBestViewConfig(Settings):
     """Share of the best gain that is enough for a nearer camera to be preferred."""
 
 
+GuardName = Literal["dynamic-masks", "image-agreement", "depth-agreement", "free-space", "psnr"]
+
+
 @dataclass(frozen=True)
 class CompleterConfig(Settings):
-    """Settings of a completion.
+    """Settings of a completion; `paper()`, the defaults and `splat()` are three values of it.
 
     The defaults are ours where measurements favour them over the paper's (`docs/method.md`).
     """
 
+    trust: Literal["full", "photometric"] = "full"
+    """Trust in the scene: `full` takes it as it is (paper), `photometric` counts a Gaussian as far
+    as photographs confirm it."""
+    guards: tuple[GuardName, ...] = (
+        "dynamic-masks",
+        "image-agreement",
+        "depth-agreement",
+        "free-space",
+        "psnr",
+    )
+    """Safeguards beyond the paper, in the order in which they are asked (paper: none)."""
     margin: Annotated[float, Interval(ge=0, le=4)] = 0.25
     """Padding of the target image on every side, relative to its size, if a hole reaches its
     border, so that nearby cameras see no new hole there (paper: 0)."""
     ego_mask: bool = True
     """Ignore image regions that stay the same while the camera moves, such as the bonnet of the
     car that carries it (paper: use all pixels)."""
-    trust: Literal["full", "photometric"] = "photometric"
-    """Trust in the splat of `--scene`: `photometric` counts a Gaussian as far as photographs
-    confirm it, `full` takes all as they are (paper)."""
     synthesis: SynthesisConfig = SynthesisConfig()
     anchor: AnchorConfig = AnchorConfig()
     alignment: AlignmentConfig = AlignmentConfig()
-    depth_agreement: DepthAgreementConfig = DepthAgreementConfig()
     registration: RegistrationConfig = RegistrationConfig()
-    free_space: FreeSpaceConfig = FreeSpaceConfig()
     holes: HoleConfig = HoleConfig()
-    dynamic_masks: DynamicMasksConfig = DynamicMasksConfig()
-    trust_settings: TrustConfig = TrustConfig()
     refine: RefineConfig = RefineConfig()
-    reconcile: ReconcileConfig = ReconcileConfig()
+    recolor: RecolorConfig = RecolorConfig()
+    trust_settings: TrustConfig = TrustConfig()
+    dynamic_masks: DynamicMasksConfig = DynamicMasksConfig()
+    depth_agreement: DepthAgreementConfig = DepthAgreementConfig()
+    free_space: FreeSpaceConfig = FreeSpaceConfig()
     psnr_guard: PsnrGuardConfig = PsnrGuardConfig()
     next_best_view: NextBestViewConfig = NextBestViewConfig()
+
+    @staticmethod
+    def splat() -> CompleterConfig:
+        """Return the settings for a splat that comes with further photographs."""
+        return CompleterConfig(
+            trust="photometric",
+            guards=("image-agreement", "free-space", "psnr"),
+            psnr_guard=PsnrGuardConfig(max_drop=0.0),
+        )
 
     @staticmethod
     def paper() -> CompleterConfig:
         """Return the settings of the paper; `docs/paper.md` lists the remaining differences."""
         return CompleterConfig(
+            guards=(),
             margin=0.0,
             ego_mask=False,
-            trust="full",
             synthesis=SynthesisConfig(correct_color=False, source_depth="monocular"),
             anchor=AnchorConfig(min_baseline=0.0, min_overlap=0.0),
-            alignment=AlignmentConfig(min_agreement=None),
-            depth_agreement=DepthAgreementConfig(reject_below=None),
+            alignment=AlignmentConfig(min_agreement=0.0),
             registration=RegistrationConfig(
                 iterations=50,
                 learning_rate=0.01,
@@ -296,12 +295,18 @@ class CompleterConfig(Settings):
                 min_ratio=None,
                 extrapolate_into_holes=False,
             ),
-            free_space=FreeSpaceConfig(num_steps=0),
             refine=RefineConfig(iterations=30, rel_tol=None, learning_rate=0.08),
             holes=HoleConfig(dilation=0, candidate_radius=None),
-            psnr_guard=PsnrGuardConfig(max_drop=None, max_opacity_loss=None),
-            dynamic_masks=DynamicMasksConfig(min_color_difference=None),
         )
+
+    @staticmethod
+    def for_input(is_splat: bool) -> CompleterConfig:
+        """Return the preset for a splat with further photographs, or for any other input."""
+        return CompleterConfig.splat() if is_splat else CompleterConfig()
+
+    def without_guard(self, name: GuardName) -> CompleterConfig:
+        """Return the same settings without one guard."""
+        return replace(self, guards=tuple(guard for guard in self.guards if guard != name))
 
 
 _NO_DA: dict[str, Any] = {"align_at": "none"}
@@ -314,7 +319,7 @@ ABLATIONS: dict[str, dict[str, Any]] = {
     "no-rc": {"registration": _NO_RC},  # no optimisation of distances
     "no-da-rc": {"alignment": _NO_DA, "registration": _NO_RC},
     "none": {"anchor": _NO_SA, "alignment": _NO_DA, "registration": _NO_RC},
-    "no-mv": {"refine": {"iterations": 0}, "psnr_guard": {"max_drop": None}},  # opacities as lifted
+    "no-mv": {"refine": {"iterations": 0}},  # opacities as lifted; without the guard `psnr`, too
     "3-dof": {"registration": {"degrees_of_freedom": 3}},
     "target-aligned": {"alignment": {"align_at": "target"}},
     "no-dilation": {"holes": {"dilation": 0}},
@@ -326,37 +331,48 @@ ABLATIONS: dict[str, dict[str, Any]] = {
 """Changes to a config for each ablation of the paper."""
 
 
-def get_named_config(name: str) -> CompleterConfig:
-    """Return `default`, `paper`, or one of them with an ablation: `no-sa`, `paper/no-sa`.
+def get_named_config(name: str, is_splat: bool = False) -> CompleterConfig:
+    """Return `default`, `splat` or `paper`, or one of them with an ablation: `paper/no-sa`.
+
+    `default` follows the input: it is `splat` for a splat that comes with further photographs.
 
     Raises:
         InputError: The name is unknown.
     """
-    bases = {"default": CompleterConfig(), "paper": CompleterConfig.paper()}
+    bases = {
+        "default": CompleterConfig.for_input(is_splat),
+        "splat": CompleterConfig.splat(),
+        "paper": CompleterConfig.paper(),
+    }
     if name in bases:
         return bases[name]
     base, _, ablation = name.rpartition("/")
     if (base or "default") not in bases or ablation not in ABLATIONS:
         raise InputError(
-            f"There is no config '{quote_value(name)}'; choose default, paper or one of "
+            f"There is no config '{quote_value(name)}'; choose default, splat, paper or one of "
             f"{', '.join(ABLATIONS)} (paper/no-sa for an ablation of the paper's settings), or "
             "give a YAML file."
         )
-    return apply_changes(bases[base or "default"], ABLATIONS[ablation])
+    config = apply_changes(bases[base or "default"], ABLATIONS[ablation])
+    return config.without_guard("psnr") if ablation == "no-mv" else config
 
 
-def load_config(source: str) -> CompleterConfig:
+def load_config(source: str, is_splat: bool = False) -> CompleterConfig:
     """Return a config by name, or read the changes to its `base` from a YAML file.
+
+    Args:
+        source: Name of a config, or path of a YAML file.
+        is_splat: True if the config is for a splat that comes with further photographs.
 
     Raises:
         InputError: The file cannot be read, or it has an unknown setting or an invalid value.
     """
     path = Path(source)
     if path.suffix not in {".yaml", ".yml"}:
-        return get_named_config(source)
+        return get_named_config(source, is_splat)
     from gscompleter.config.yaml_file import read_yaml
 
     changes = read_yaml(path)
-    base = get_named_config(str(changes.pop("base", "default")))
+    base = get_named_config(str(changes.pop("base", "default")), is_splat)
     refuse_old_keys(changes, f"{quote_value(source)}: ")
     return apply_changes(base, changes, f"{quote_value(source)}: ")

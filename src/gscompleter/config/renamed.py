@@ -22,10 +22,8 @@ RENAMED = {
     "support.doubts": "trust",
     "support.max_difference": "trust_settings.color_sigma",
     "support.max_turn": "trust_settings.angle_sigma",
-    "support.keep_unsupported": "trust_settings.prune",
     "support": "trust_settings",
     "refine.min_fall": "refine.rel_tol",
-    "reconcile.colour_step": "reconcile.color_step",
     "harm.tolerance": "psnr_guard.max_drop",
     "harm.ssim_tolerance": "psnr_guard.max_ssim_drop",
     "harm.max_loss": "psnr_guard.max_opacity_loss",
@@ -37,11 +35,13 @@ RENAMED = {
 }
 """Old names of settings and groups of settings with today's."""
 
+REMOVED = ("reconcile", "support.keep_unsupported", "trust_settings.prune")
+"""Settings and groups that have no successor: untrusted Gaussians are recoloured instead."""
+
 NEW_VALUES = {
     "registration.lr_schedule": "linear or constant",
     "registration.lr_unit": "distance or scene",
     "trust": "full or photometric",
-    "trust_settings.prune": "true to remove occluders",
 }
 """Values of the settings whose meaning changed with their name."""
 
@@ -53,6 +53,7 @@ def refuse_old_keys(changes: Mapping[str, Any], where: str = "") -> None:
         InputError: There is one; the sentence begins with `where` and has the new name.
     """
     for path in _iterate_paths(changes):
+        refuse_removed(path, f"{where}{quote_value(path)}")
         new = translate_key(path)
         if new is not None:
             raise InputError(
@@ -69,12 +70,24 @@ def refuse_old_options(words: Sequence[str], prefix: str = "--config.") -> None:
     for word in words:
         option = word.partition("=")[0].replace("-", "_")
         stem = prefix.replace("-", "_")
-        new = translate_key(option.removeprefix(stem)) if option.startswith(stem) else None
+        if not option.startswith(stem):
+            continue
+        refuse_removed(option.removeprefix(stem), quote_value(word.partition("=")[0]))
+        new = translate_key(option.removeprefix(stem))
         if new is not None:
             name = f"{prefix}{new.replace('_', '-')}"
             raise InputError(
                 describe_renamed(quote_value(word.partition("=")[0]), name, _describe_values(new))
             )
+
+
+def refuse_removed(path: str, named: str) -> None:
+    """Raise InputError if a setting has no successor."""
+    if any(path == gone or path.startswith(f"{gone}.") for gone in REMOVED):
+        raise InputError(
+            f"The setting {named} is gone, as untrusted Gaussians of a splat are recoloured and "
+            "none is removed; leave it out."
+        )
 
 
 def translate_key(path: str) -> str | None:

@@ -7,7 +7,7 @@ from dataclasses import dataclass, replace
 
 import torch
 
-from gscompleter.completer import Clock, GSCompleter
+from gscompleter.completer import GSCompleter
 from gscompleter.config import ABLATIONS, get_named_config
 from gscompleter.errors import InputError, quote_value
 from gscompleter.evaluation.baselines.optimization import OptimizationConfig, optimize
@@ -15,9 +15,11 @@ from gscompleter.evaluation.baselines.reggs import RegGSConfig, register_by_simi
 from gscompleter.generators import Generator
 from gscompleter.reconstructors import Reconstructor
 from gscompleter.render import Renderer
-from gscompleter.stages.select_anchor import lift, select_anchor
-from gscompleter.state import Completion, InitialContext
-from gscompleter.types import Camera, Gaussians, merge
+from gscompleter.stages.lift import lift_pair
+from gscompleter.stages.select_anchor import select_anchor
+from gscompleter.state import Completion
+from gscompleter.timing import record_seconds, timed_stage
+from gscompleter.types import Camera, Gaussians, View, merge
 
 
 @dataclass(frozen=True)
@@ -78,8 +80,7 @@ def make_completion_method(config: str) -> Method:
 
     def method(state: Completion, target: Camera, models: Models) -> Prediction:
         completer = replace(models.make_completer(config), keep_registered=True)
-        context = InitialContext(state.scene, state.views)
-        done = completer.advance(completer.begin_with(context), target)
+        done = completer.advance(completer.begin(state.views, state.scene), target)
         (made,) = done.targets
         notes = (made.anchor, made.anchor_fallback, made.notes)
         return Prediction(done.scene, made.added, done.seconds, *notes, registered=made.registered)
@@ -91,32 +92,37 @@ def make_optimization_method(config: OptimizationConfig) -> Method:
     """Make a method that optimizes the scene on the photographs and the reference."""
 
     def method(state: Completion, target: Camera, models: Models) -> Prediction:
-        clock = Clock(())
-        with clock("generate"):
-            views = [*state.views, models.make_completer().synthesize_reference(state, target)]
         budget = replace(config, iterations=models.limit_iterations(config.iterations))
-        with clock("optimize"):
-            fitted = optimize(state.scene, views, models.renderer, models.seed, budget)
-        return Prediction(fitted, None, clock.seconds)
+        with record_seconds(()) as seconds:
+            views = [*state.views, synthesize_reference(state, target, models)]
+            with timed_stage("optimize"):
+                fitted = optimize(state.scene, views, models.renderer, models.seed, budget)
+        return Prediction(fitted, None, seconds)
 
     return method
 
 
+def synthesize_reference(state: Completion, target: Camera, models: Models) -> View:
+    """Synthesize the image at a target, without padding, even if there is no hole."""
+    completer = models.make_completer()
+    view = completer.observe(state, target)
+    return completer.synthesize([view])[0].crop(view.camera)
+
+
 def complete_by_similarity(state: Completion, target: Camera, models: Models) -> Prediction:
     """Add all lifted Gaussians, registered to the scene by one similarity (RegGS)."""
-    clock = Clock(())
-    with clock("generate"):
-        reference = models.make_completer().synthesize_reference(state, target)
-    with clock("lift"):
+    config = RegGSConfig(iterations=models.limit_iterations(RegGSConfig.iterations))
+    with record_seconds(()) as seconds:
+        reference = synthesize_reference(state, target, models)
         anchor = select_anchor(reference.camera, state.views)
-        lifted = lift(models.reconstructor, reference, state.views[anchor.index]).gaussians
-    with clock("register"):
-        config = RegGSConfig(iterations=models.limit_iterations(RegGSConfig.iterations))
-        added = register_by_similarity(
-            lifted, state.scene, reference, models.renderer, models.seed, config
-        )
+        with timed_stage("lift"):
+            pair = lift_pair(models.reconstructor, reference, state.views[anchor.index])
+        with timed_stage("register"):
+            added = register_by_similarity(
+                pair.gaussians, state.scene, reference, models.renderer, models.seed, config
+            )
     scene = merge([state.scene, added])
-    return Prediction(scene, added, clock.seconds, anchor.index, anchor.fallback, registered=added)
+    return Prediction(scene, added, seconds, anchor.index, anchor.fallback, registered=added)
 
 
 def mark_target(prediction: Prediction, number: int, before: Gaussians) -> Prediction:

@@ -24,7 +24,8 @@ from gscompleter.memory import check_memory
 from gscompleter.progress import Activity, show_activity, show_progress, stage
 from gscompleter.reconstructors import load_reconstructor
 from gscompleter.render import load_renderer
-from gscompleter.stages.context import normalize_exposures, sort_by_frame
+from gscompleter.stages.context import normalize_exposures, reconstruct_context, sort_by_frame
+from gscompleter.timing import record_seconds
 from gscompleter.types import View
 
 RETRIES = 2
@@ -227,14 +228,14 @@ def load_or_reconstruct(path: Path, views: Sequence[View], models: Models) -> st
     device = views[0].image.device if views else "cpu"
 
     def save() -> None:
-        made = models.make_completer().reconstruct(views)
+        with record_seconds() as seconds:
+            made = reconstruct_context(models.reconstructor, views)
         near, far = made.views[0].camera.near, made.views[0].camera.far
         assert near is not None
         assert far is not None
-        seconds = made.seconds["total"]
-        store.save_context(
-            path, store.SavedContext(made.gaussians, near, far, seconds, made.exposure_gains)
-        )
+        scene, gains = made.source.gaussians, made.exposure_gains
+        found = store.SavedContext(scene, near, far, seconds["total"], gains)
+        store.save_context(path, found)
 
     return load_or_compute(path, lambda: store.load_context(path, device), save)
 

@@ -19,8 +19,8 @@ from gscompleter.evaluation import store
 from gscompleter.evaluation.memory import measure_peak_memory
 from gscompleter.evaluation.methods import METHODS, Models, Prediction, mark_target
 from gscompleter.evaluation.metrics import scores as scoring
-from gscompleter.stages.select_anchor import lift
-from gscompleter.state import Completion, InitialContext
+from gscompleter.stages.lift import lift_pair
+from gscompleter.state import Completion
 from gscompleter.types import DepthMap, Gaussians, View
 
 T = TypeVar("T")
@@ -101,7 +101,7 @@ def advance_task(
 ) -> Progress:
     """Complete one more target and save its prediction and images."""
     number = len(progress.steps) + 1
-    state = task.models.make_completer().begin_with(InitialContext(progress.scene, progress.views))
+    state = task.models.make_completer().begin(progress.views, progress.scene)
     path = store.get_step_path(folder, method, number)
 
     def save() -> None:
@@ -172,7 +172,7 @@ def get_metric_depth(target: View, anchor: View, models: Models) -> DepthMap:
     """Return the measured depth of `target`, or an estimate of Ψ if the data have none."""
     if target.depth is not None:
         return DepthMap(target.depth, target.depth > 0)
-    return lift(models.reconstructor, target, anchor).reference_depth
+    return lift_pair(models.reconstructor, target, anchor).reference_depth
 
 
 def compute_scale_drift(scales: Sequence[float]) -> float | None:

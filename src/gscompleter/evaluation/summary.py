@@ -8,11 +8,11 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
-from gscompleter.completer import STAGES
 from gscompleter.errors import InputError
 from gscompleter.evaluation.methods import METHODS
 from gscompleter.evaluation.steps import compute_scale_drift
 from gscompleter.evaluation.store import list_row_paths, read_json, read_settings
+from gscompleter.timing import STAGES
 
 RunRow = dict[str, Any]
 """Output of `evaluate` for a task and a method."""

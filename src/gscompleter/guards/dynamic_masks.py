@@ -9,7 +9,7 @@ both.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from itertools import product
 
 import cv2
@@ -30,7 +30,10 @@ from gscompleter.geometry import (
     shrink_camera,
     unproject,
 )
+from gscompleter.guards import Guard
 from gscompleter.image_ops import dilate
+from gscompleter.render.cache import SceneRenderer
+from gscompleter.state import Completion
 from gscompleter.types import Camera, Render, View
 
 IMAGE_SIDE = 192
@@ -104,14 +107,29 @@ class Comparison:
     """True where it shows another colour."""
 
 
+class DynamicMasks(Guard):
+    """Copy nothing from regions that moved between photographs."""
+
+    name = "dynamic-masks"
+
+    def begin(self, state: Completion, scenes: SceneRenderer) -> Completion:
+        """Add a dynamic mask to each context photograph."""
+        frozen = scenes.freeze_at(state.parts, [view.camera for view in state.views])
+        renders = [scene.render for scene in frozen]
+        masks = find_dynamic_masks(state.views, renders, state.config.dynamic_masks)
+        masked = tuple(
+            replace(photo, view=replace(photo.view, dynamic_mask=mask)) if mask.any() else photo
+            for photo, mask in zip(state.photos, masks, strict=False)
+        )
+        return replace(state, photos=(*masked, *state.photos[len(masked) :]))
+
+
 def find_dynamic_masks(
     views: Sequence[View],
     renders: Sequence[Render],
     config: DynamicMasksConfig = DynamicMasksConfig(),
 ) -> list[Bool[Tensor, "_ _"]]:
     """Compute a dynamic mask for each photograph by comparison with its neighbours."""
-    if config.min_color_difference is None:
-        return [torch.zeros_like(view.valid_mask) for view in views]
     photos = [shrink_photo(view, render) for view, render in zip(views, renders, strict=True)]
     votes = [torch.zeros_like(photo.valid_mask, dtype=torch.int32) for photo in photos]
     for one, other in pair_with_neighbours([view.camera for view in views]):

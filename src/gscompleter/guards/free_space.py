@@ -7,6 +7,7 @@ front of an observed surface slides back along its ray until no camera contradic
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import replace
 from typing import Literal
 
 import torch
@@ -14,8 +15,10 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 
 from gscompleter.config import FreeSpaceConfig
-from gscompleter.geometry import compute_z_depths, project, slide
+from gscompleter.geometry import compute_z_depths, project, shrink_camera, slide
+from gscompleter.guards import Guard
 from gscompleter.sky import compute_sky_depth, is_sky_visible
+from gscompleter.stages.target_view import TargetView
 from gscompleter.types import Camera, Gaussians, Render
 
 SLIDE_STEP = 0.04
@@ -25,6 +28,34 @@ CLEARANCE = 0.01
 A Gaussian there is invisible to the camera and still closes the hole."""
 BORDER = 3
 """Pixels outside of an image at which a Gaussian is still visible."""
+
+
+class FreeSpace(Guard):
+    """Keep added Gaussians out of space that cameras of the scene see through."""
+
+    name = "free-space"
+
+    def place(self, candidates: Gaussians, view: TargetView) -> Gaussians:
+        """Slide candidates back until no photograph or completed target sees through them."""
+        state = view.state
+        completed = [result.target for result in state.targets if len(result.added)]
+        side = state.config.next_best_view.image_size
+        small = [shrink_camera(c, side) for c in (*state.free_space_cameras, *completed)]
+        cameras = [photo.camera for photo in state.views]
+        renders = [
+            replace(frozen.render, alpha=state.trust.compute_alpha(frozen, camera))
+            for frozen, camera in zip(view.at(state.views), cameras, strict=True)
+        ]
+        renders += [frozen.render for frozen in view.scenes.freeze_small(state.parts, small)]
+        placed, is_placed = respect_free_space(
+            candidates,
+            view.camera.padded,
+            [*cameras, *small],
+            renders,
+            state.config.registration.footprint,
+            state.config.free_space,
+        )
+        return placed[is_placed]
 
 
 def respect_free_space(
@@ -40,8 +71,6 @@ def respect_free_space(
     Returns:
         The Gaussians, and a mask of those that found a position [n].
     """
-    if config.num_steps == 0:
-        return gaussians, torch.ones_like(gaussians.opacities, dtype=torch.bool)
     ratio = torch.ones_like(gaussians.opacities)
     offsets = gaussians.means - target.center
     waiting = torch.arange(len(gaussians), device=ratio.device)

@@ -15,9 +15,13 @@ from torch.nn.functional import pad
 from gscompleter.config import PsnrGuardConfig
 from gscompleter.cpu_threads import use_one_torch_thread
 from gscompleter.geometry import project_mask
+from gscompleter.guards import Attempt, Guard
 from gscompleter.image_ops import dilate
 from gscompleter.render import FrozenScene, OpacityImage, restrict_to_image
+from gscompleter.render.cache import SceneRenderer
 from gscompleter.ssim import RADIUS, ssim_map
+from gscompleter.stages.target_view import compute_hole_mask
+from gscompleter.state import Completion
 from gscompleter.types import ErrorBudget, Gaussians, View
 
 NUM_HALVINGS = 16
@@ -28,6 +32,40 @@ MIN_PSNR_LOSS = 1e-4
 """Smallest tolerated loss of PSNR in dB, for rounding."""
 PIXEL_RADIUS = 2
 """Radius around the worst pixels within which Gaussians are removed, in pixels."""
+
+
+class PsnrGuard(Guard):
+    """Let no photograph get worse than its error budgets."""
+
+    name = "psnr"
+
+    def begin(self, state: Completion, scenes: SceneRenderer) -> Completion:
+        """Set the error budgets of all photographs, before any target."""
+        config = state.config
+        frozen = scenes.freeze_at(state.parts, [photo.view.camera for photo in state.photos])
+        budgets = [
+            set_error_budgets(
+                photo.view,
+                scene.render.image,
+                compute_hole_mask(scene.render.alpha, config.holes),
+                config.psnr_guard.max_drop,
+                config.psnr_guard.max_ssim_drop,
+            )
+            for photo, scene in zip(state.photos, frozen, strict=True)
+        ]
+        photos = zip(state.photos, budgets, strict=True)
+        return replace(state, photos=tuple(replace(p, budgets=limits) for p, limits in photos))
+
+    def verify(self, added: Gaussians, attempt: Attempt) -> Gaussians:
+        """Fade added Gaussians until every photograph is within its budgets."""
+        state, plans = attempt.view.state, attempt.refined.plans
+        return meet_error_budgets(
+            added,
+            attempt.view.at([photo.view for photo in state.photos]),
+            [photo.budgets for photo in state.photos],
+            [restrict_to_image(plan) for plan in plans],
+            state.config.psnr_guard,
+        )
 
 
 def set_error_budgets(
@@ -83,8 +121,8 @@ def meet_error_budgets(
     added: Gaussians,
     frozen_views: Sequence[FrozenScene],
     budgets: Sequence[Sequence[ErrorBudget]],
+    images: Sequence[OpacityImage],
     config: PsnrGuardConfig = PsnrGuardConfig(),
-    images: Sequence[OpacityImage] | None = None,
 ) -> Gaussians:
     """Fade added Gaussians until every photograph is within its error budgets.
 
@@ -95,10 +133,8 @@ def meet_error_budgets(
     Returns:
         The Gaussians, or none of them if they lose more than `max_loss` of their opacity.
     """
-    if config.max_drop is None or len(added) == 0:
+    if len(added) == 0:
         return added
-    if images is None:
-        images = [restrict_to_image(frozen.vary_opacities(added)) for frozen in frozen_views]
     before = [frozen.render.image for frozen in frozen_views]
     checks = [Check(*each) for each in zip(budgets, before, images, strict=True)]
     opacities, active = added.opacities, checks
@@ -191,9 +227,8 @@ def is_mostly_faded(
     added: Float[Tensor, "n"], left: Float[Tensor, "n"], config: PsnrGuardConfig = PsnrGuardConfig()
 ) -> bool:
     """Return True if added Gaussians lost more than `max_opacity_loss` of their opacity."""
-    if config.max_opacity_loss is None or len(added) == 0:
-        return False
-    return 1 - (left.sum() / added.sum().clamp_min(1e-12)).item() > config.max_opacity_loss
+    lost = added.sum() - left.sum()
+    return lost.item() > config.max_opacity_loss * added.sum().item()
 
 
 def select_fewest(relief: Float[Tensor, "n"], needed: float) -> Bool[Tensor, "n"]:

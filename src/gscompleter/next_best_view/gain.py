@@ -10,7 +10,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import torch
-from jaxtyping import Bool, Float, Int64
+from jaxtyping import Bool
 from torch import Tensor
 
 from gscompleter.config import NextBestViewConfig
@@ -23,8 +23,8 @@ from gscompleter.geometry import (
 from gscompleter.image_ops import dilate, fill_smoothly
 from gscompleter.next_best_view.candidates import Candidate
 from gscompleter.render.lod import MAX_PREVIEW_GAUSSIANS, choose_thinned_rows, thin_gaussians
-from gscompleter.state import Completion
-from gscompleter.types import Camera, Gaussians, PhotoObservations, Render, make_observed, merge
+from gscompleter.state import Completion, ContextScene
+from gscompleter.types import Camera, Gaussians, Render, make_observed
 
 
 @dataclass(frozen=True)
@@ -100,22 +100,9 @@ def make_placeholders(render: Render, holes: Bool[Tensor, "h w"], camera: Camera
 
 
 def simplify_completion(completion: Completion, most: int = MAX_PREVIEW_GAUSSIANS) -> Completion:
-    """Simplify a completion for small images, with its photo observations."""
-    context, observations = completion.rendered_context, completion.observations
-    pruned = completion.pruned
-    rows, growth = choose_thinned_rows(context, most)
-    context = thin_gaussians(context, most)
-    observations = None if observations is None else thin_observations(observations, rows, growth)
-    pruned = None if pruned is None else pruned[rows]
-    kept = context if pruned is None else context[~pruned]
-    rendered = merge([kept, thin_gaussians(completion.added, most)])
-    completion = replace(completion, proxy=None, observations=observations, pruned=pruned)
-    return replace(completion, rendered_scene=rendered, context=context)
-
-
-def thin_observations(
-    observations: PhotoObservations, rows: Int64[Tensor, "r"], growth: Float[Tensor, "r"]
-) -> PhotoObservations:
-    """Keep observations of some Gaussians, whose sizes grow by a factor."""
-    areas, agreement = observations.areas[:, rows] * growth**2, observations.agreement[:, rows]
-    return PhotoObservations(observations.means[rows], observations.centers, areas, agreement)
+    """Simplify a completion for small images, with its trust."""
+    rows, growth = choose_thinned_rows(completion.parts[0], most)
+    context = thin_gaussians(completion.parts[0], most)
+    parts = (context, thin_gaussians(completion.added, most))
+    trust = completion.trust.thin(rows, growth)
+    return replace(completion, source=ContextScene.whole(context), parts=parts, trust=trust)

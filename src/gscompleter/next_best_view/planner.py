@@ -9,8 +9,7 @@ from functools import partial
 from jaxtyping import Bool
 from torch import Tensor
 
-from gscompleter.completer import Clock, GSCompleter
-from gscompleter.config import NextBestViewConfig
+from gscompleter.completer import GSCompleter
 from gscompleter.geometry import (
     compute_spacing,
     is_same_camera,
@@ -28,10 +27,11 @@ from gscompleter.next_best_view.gain import (
 from gscompleter.progress import stage, track
 from gscompleter.render import get_view_map
 from gscompleter.render.antialiasing import adapt_to_mode
-from gscompleter.stages.filter_holes import compute_hole_mask
 from gscompleter.stages.select_anchor import compute_overlap, select_anchor
+from gscompleter.stages.target_view import compute_hole_mask
 from gscompleter.state import Completion
-from gscompleter.types import Camera, Render, merge
+from gscompleter.timing import record_seconds
+from gscompleter.types import Camera, Render
 
 MAX_FREE_SPACE_CAMERAS = 40
 """Most cameras of photographs, besides the context views, whose free space is kept empty."""
@@ -55,11 +55,6 @@ class ViewPlanner:
 
     completer: GSCompleter
 
-    @property
-    def config(self) -> NextBestViewConfig:
-        """Settings of the planner."""
-        return self.completer.config.next_best_view
-
     def explore(
         self, completion: Completion, cameras: Sequence[Camera], count: int
     ) -> tuple[Completion, tuple[Choice, ...]]:
@@ -70,15 +65,16 @@ class ViewPlanner:
             cameras: Cameras of all photographs of the scene, used for the context or not.
             count: Largest number of targets; there are fewer if little is left to gain.
         """
-        clock, begun = Clock(()), completion.seconds["total"]
-        completion = add_free_space_cameras(completion, cameras)
-        completion, choices = self.complete_greedily(
-            completion, cameras, count, self.completer.advance
-        )
-        completed = completion.seconds["total"]
-        spent = begun + clock.seconds["total"]
-        seconds = {**completion.seconds, "explore": spent - completed, "total": spent}
-        return replace(completion, seconds=seconds), choices
+        before = completion.seconds["total"]
+        with record_seconds() as seconds:
+            completion = add_free_space_cameras(completion, cameras)
+            completion, choices = self.complete_greedily(
+                completion, cameras, count, self.completer.advance
+            )
+        total = before + seconds["total"]
+        explore = total - completion.seconds["total"]
+        recorded = {**completion.seconds, "explore": explore, "total": total}
+        return replace(completion, seconds=recorded), choices
 
     def plan(
         self, completion: Completion, cameras: Sequence[Camera], count: int
@@ -114,12 +110,13 @@ class ViewPlanner:
         chosen: list[Choice] = []
         for _ in track(range(count), "target"):
             choices = self.score_candidates(completion, remaining)
-            choice = choose_best(choices, [v.camera for v in completion.views], step, self.config)
+            config = completion.config.next_best_view
+            choice = choose_best(choices, [v.camera for v in completion.views], step, config)
             if choice is None:
                 break
             completion = complete(completion, choice.camera)
             chosen.append(choice)
-            left = [c.candidate for c in choices if c.gain >= self.config.min_gain]
+            left = [c.candidate for c in choices if c.gain >= config.min_gain]
             remaining = [candidate for candidate in left if candidate is not choice.candidate]
         return completion, tuple(chosen)
 
@@ -127,12 +124,13 @@ class ViewPlanner:
         self, completion: Completion, cameras: Sequence[Camera]
     ) -> tuple[list[Candidate], float]:
         """Propose candidate cameras; also return the step length in scene units."""
-        bases = select_spread_cameras(cameras, self.config.bases)
+        config = completion.config.next_best_view
+        bases = select_spread_cameras(cameras, config.bases)
         near = [completion.with_depth_range(cameras[index]) for index in bases]
         step = compute_spacing(near)
         small = simplify_completion(completion)
         renders = [self.render_small_view(small, camera).render for camera in near]
-        found = propose_candidates(near, renders, step, self.config)
+        found = propose_candidates(near, renders, step, config)
         return [replace(candidate, base=bases[candidate.base]) for candidate in found], step
 
     def score_candidates(
@@ -142,7 +140,7 @@ class ViewPlanner:
         small = simplify_completion(completion)
         anchors = [self.render_small_view(small, view.camera) for view in small.views]
         choose = partial(self.score_candidate, small, anchors)
-        choices = get_view_map(small.rendered_scene)(choose, candidates_left)
+        choices = get_view_map(small.parts[0])(choose, candidates_left)
         counted = zip(track(candidates_left, "finding targets"), choices, strict=True)
         return [choice for _, choice in counted]
 
@@ -150,42 +148,35 @@ class ViewPlanner:
         self, completion: Completion, anchors: Sequence[SmallView], candidate: Candidate
     ) -> Choice:
         """Score one candidate; its gain is 0 if it is too close to a surface."""
+        config, views = completion.config, completion.views
         small_view = self.render_small_view(completion, candidate.camera)
         hole = small_view.holes.float().mean().item()
-        if is_close(small_view.render, candidate.nearest, self.config):
+        if is_close(small_view.render, candidate.nearest, config.next_best_view):
             return Choice(candidate, hole, 0.0)
         overlaps = [
             compute_overlap(small_view.camera, small_view.render, anchor.camera, anchor.render)
             for anchor in anchors
         ]
-        config, views = self.completer.config.anchor, completion.views
-        anchor = select_anchor(candidate.camera, views, config, overlaps).index
-        return Choice(
-            candidate, hole, compute_gain(small_view.holes, overlaps[anchor], self.config)
-        )
+        anchor = select_anchor(candidate.camera, views, config.anchor, overlaps).index
+        gain = compute_gain(small_view.holes, overlaps[anchor], config.next_best_view)
+        return Choice(candidate, hole, gain)
 
     def render_small_view(self, completion: Completion, camera: Camera) -> SmallView:
         """Render the scene at a camera in a small image."""
-        camera = shrink_camera(completion.with_depth_range(camera), self.config.image_size)
-        frozen = self.completer.renderer.freeze(completion.rendered_scene, camera)
-        render, trusted = (
-            frozen.render,
-            self.completer.compute_trusted_alpha(completion, frozen, camera),
-        )
-        alpha = render.alpha if trusted is None else trusted
-        return SmallView(camera, render, compute_hole_mask(alpha, self.completer.config.holes))
+        config = completion.config
+        camera = completion.with_depth_range(camera)
+        camera = shrink_camera(camera, config.next_best_view.image_size)
+        frozen = self.completer.scenes.freeze(completion.parts, camera)
+        alpha = completion.trust.compute_alpha(frozen, camera)
+        return SmallView(camera, frozen.render, compute_hole_mask(alpha, config.holes))
 
     def add_placeholders(self, completion: Completion, camera: Camera) -> Completion:
         """Close the holes at a camera by grey placeholders."""
-        view = self.render_small_view(
-            completion, self.completer.pad_target(completion, camera).padded
-        )
-        scene, placeholders = (
-            completion.rendered_scene,
-            make_placeholders(view.render, view.holes, view.camera),
-        )
-        added = adapt_to_mode(scene, placeholders, view.camera)
-        return replace(completion, rendered_scene=merge([scene, added]))
+        padded = self.completer.pad_target(completion, camera).padded
+        view = self.render_small_view(completion, padded)
+        placeholders = make_placeholders(view.render, view.holes, view.camera)
+        added = adapt_to_mode(completion.parts[0], placeholders, view.camera)
+        return replace(completion, parts=(*completion.parts, added))
 
 
 def add_free_space_cameras(completion: Completion, cameras: Sequence[Camera]) -> Completion:
@@ -199,7 +190,7 @@ def add_free_space_cameras(completion: Completion, cameras: Sequence[Camera]) ->
         for c in cameras
         if not any(is_same_camera(c, t) for t in taken)
     ]
-    if completion.observations is not None or not others:
+    if completion.config.trust == "photometric" or not others:
         return completion
     chosen = select_spread_cameras(others, MAX_FREE_SPACE_CAMERAS)
     return replace(completion, free_space_cameras=tuple(others[index] for index in chosen))

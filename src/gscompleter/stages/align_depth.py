@@ -8,7 +8,9 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
-from gscompleter.config import AlignmentConfig, DepthAgreementConfig
+from gscompleter.config import AlignmentConfig
+from gscompleter.stages.target_view import TargetView
+from gscompleter.timing import timed_stage
 from gscompleter.types import DepthAffine, DepthMap, DepthPairs, Lift, Render
 
 MAX_TRIALS = 512
@@ -23,8 +25,6 @@ MIN_INLIERS = 0.3
 """Smallest inlier fraction of a reliable fit."""
 MIN_PIXELS = 64
 """Fewest comparable pixels that a fit needs."""
-MIN_TARGET_COVERAGE = 0.01
-"""Fraction of its image that the target must see of the scene to reject an affine."""
 MIN_DEPTH_SPREAD = 0.05
 """Smallest depth spread that separates scale and shift; below, only a scale is fitted."""
 
@@ -110,13 +110,21 @@ def fit_line_ransac(
     return scale, shift
 
 
-def align_depth(
+@timed_stage("register")
+def align_depth(lift: Lift, view: TargetView, rng: torch.Generator) -> DepthAffine:
+    """Fit the affine depth correction of a lifted target, with a sample of compared depths."""
+    config = view.state.config.alignment
+    affine = fit_alignment(lift, view.render, view.anchor_render, rng, config)
+    pairs = sample_depth_pairs(lift, view.render, view.anchor_render, affine, config)
+    return replace(affine, pairs=pairs)
+
+
+def fit_alignment(
     lift: Lift,
     at_target: Render,
     at_anchor: Render,
     rng: torch.Generator,
     config: AlignmentConfig = AlignmentConfig(),
-    reject_below: float | None = DepthAgreementConfig.reject_below,
 ) -> DepthAffine:
     """Fit the affine depth correction at the anchor (the paper's bridge) or at the target.
 
@@ -128,9 +136,7 @@ def align_depth(
     if config.align_at == "target":
         return fit_affine(lift.reference_depth, at_target.depth_map(), rng)
     affine = fit_affine(lift.anchor_depth, at_anchor.depth_map(), rng)
-    return refit_at_target(
-        affine, lift.reference_depth, at_target.depth_map(), rng, config, reject_below
-    )
+    return refit_at_target(affine, lift.reference_depth, at_target.depth_map(), rng, config)
 
 
 def refit_at_target(
@@ -139,25 +145,23 @@ def refit_at_target(
     context: DepthMap,
     rng: torch.Generator,
     config: AlignmentConfig,
-    reject_below: float | None = DepthAgreementConfig.reject_below,
 ) -> DepthAffine:
     """Replace an affine that contradicts the context at the target by a fit at the target.
 
     With little overlap or pose drift, Ψ's two depth maps differ in scale. If no fit at the target
-    is better, the paper's choice stays, and is rejected if hardly any depth agrees.
+    is better, the paper's choice stays.
     """
     x, y = pair_depths(predicted, context)
-    if config.min_agreement is None or len(x) < MIN_PIXELS:
+    if len(x) < MIN_PIXELS:
         return affine
     agree = find_affine_inliers(x, y, affine.scale, affine.shift).double().mean().item()
-    affine = replace(affine, agreement=agree)
+    affine = replace(affine, agreement=agree, coverage=len(x) / context.depth.numel())
     if agree >= config.min_agreement:
         return affine
     refitted = fit_affine(predicted, context, rng)
-    if refitted.inliers >= max(MIN_INLIERS, 2 * agree):
-        return replace(refitted, agreement=refitted.inliers, is_refitted_at_target=True)
-    enough = len(x) >= MIN_TARGET_COVERAGE * context.depth.numel()
-    return replace(affine, is_rejected=enough and agree < (reject_below or 0.0))
+    if refitted.inliers < max(MIN_INLIERS, 2 * agree):
+        return affine
+    return replace(refitted, agreement=refitted.inliers, is_refitted_at_target=True)
 
 
 MAX_PAIRS = 1000
@@ -166,10 +170,10 @@ MAX_PAIRS = 1000
 
 def sample_depth_pairs(
     lift: Lift, at_target: Render, at_anchor: Render, affine: DepthAffine, config: AlignmentConfig
-) -> DepthPairs | None:
-    """Sample the depths that `affine` was fitted to; None if there are none."""
+) -> DepthPairs:
+    """Sample the depths that `affine` was fitted to."""
     if config.align_at == "none":
-        return None
+        return DepthPairs.empty()
     at_the_target = config.align_at == "target" or affine.is_refitted_at_target
     predicted, render = lift.anchor_depth, at_anchor
     if at_the_target:
@@ -177,7 +181,5 @@ def sample_depth_pairs(
     x, y = pair_depths(predicted, render.depth_map())
     step = max(1, -(-len(x) // MAX_PAIRS))
     x, y = x[::step], y[::step]
-    if len(x) == 0:
-        return None
     agrees = find_affine_inliers(x, y, affine.scale, affine.shift)
     return DepthPairs("target" if at_the_target else "anchor", x, y, agrees)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
 
 import torch
 from jaxtyping import Float
@@ -15,6 +15,8 @@ from gscompleter.geometry import compute_z_depths, project_mask
 from gscompleter.reconstructors import Reconstructor, run_reconstructor
 from gscompleter.reconstructors.features.depth_range import get_depth_range
 from gscompleter.render import Renderer
+from gscompleter.render.lod import build_proxy
+from gscompleter.state import ContextScene
 from gscompleter.types import Camera, Gaussians, Reconstruction, View
 
 MIN_CONTRAST = 0.02
@@ -23,12 +25,100 @@ MIN_TEXTURED = 0.01
 """Smallest textured fraction of an image."""
 
 
+COLOR_TOLERANCE = 0.01
+"""Largest tolerated excess of a colour beyond [0, 1], as resampling causes it."""
+
+
+@dataclass(frozen=True)
+class InitialContext:
+    """The context (stage 1) and its photographs, with the depth range of the scene."""
+
+    source: ContextScene
+    views: tuple[View, ...]
+    """Context photographs, then check photographs, in the exposure of the context."""
+    exposure_gains: Float[Tensor, "v 3"] | None = None
+    """Exposure gain per channel of each original photograph relative to the context, or None."""
+
+
 def init_context(
+    reconstructor: Reconstructor,
+    views: Sequence[View],
+    scene: Gaussians | None,
+    check_views: Sequence[View],
+    targets: Sequence[Camera],
+    renderer: Renderer,
+) -> InitialContext:
+    """Reconstruct the context from photographs, or take the scene that was given (Eq. 5)."""
+    if len(views) < (2 if scene is None else 1):
+        raise InputError(
+            f"{len(views)} context view was given, and stereo needs at least 2; name more "
+            "frames, or give a scene."
+        )
+    views = sort_by_frame(views)
+    check_colors([*views, *check_views])
+    if scene is None:
+        return reconstruct_context(reconstructor, views)
+    return take_scene(scene, views, check_views, targets, renderer)
+
+
+def reconstruct_context(reconstructor: Reconstructor, views: Sequence[View]) -> InitialContext:
+    """Reconstruct `G_ctx = Ψ(V_in)` from posed photographs (paper, Eq. 5)."""
+    check_texture(views)
+    views = set_depth_range(views, *get_depth_range(views))
+    gaussians, gains = reconstruct(reconstructor, views)
+    return InitialContext(ContextScene.whole(gaussians), normalize_exposures(views, gains), gains)
+
+
+def take_scene(
+    scene: Gaussians,
+    views: Sequence[View],
+    check_views: Sequence[View],
+    targets: Sequence[Camera],
+    renderer: Renderer,
+) -> InitialContext:
+    """Take a given scene as the context; a large one is rendered through an LOD proxy.
+
+    The proxy is made fine enough for all photographs and targets.
+    """
+    check_finite(scene)
+    photos = [*views, *check_views]
+    proxy = build_proxy(scene, [*targets, *(view.camera for view in photos)])
+    source = ContextScene.whole(scene)
+    if proxy is not None:
+        source = ContextScene(scene, proxy.scene, proxy.proxy_index)
+    near, far = find_depth_range(views, source.rendered, renderer)
+    return InitialContext(source, tuple(set_depth_range(photos, near, far)))
+
+
+def reconstruct(
     reconstructor: Reconstructor, views: Sequence[View]
 ) -> tuple[Gaussians, Float[Tensor, "v 3"] | None]:
-    """Reconstruct `G_ctx = Ψ(V_in)`; also return exposure gains if estimated (paper, Eq. 5)."""
+    """Run Ψ without ignored pixels; also return exposure gains if it estimated them."""
     reconstruction = run_reconstructor(reconstructor, views)
     return drop_ignored(reconstruction, views), reconstruction.exposure_gains
+
+
+def set_depth_range(views: Sequence[View], near: float, far: float) -> list[View]:
+    """Set the depth range of all cameras, in scene units."""
+    return [replace(view, camera=replace(view.camera, near=near, far=far)) for view in views]
+
+
+def check_colors(views: Sequence[View]) -> None:
+    """Raise InputError for colours outside of [0, 1]."""
+    for number, view in enumerate(views):
+        low, high = (float(bound) for bound in view.image.aminmax())
+        if not (low >= -COLOR_TOLERANCE and high <= 1 + COLOR_TOLERANCE):  # nor NaN
+            raise InputError(
+                f"The image of view {number} has values from {low:g} to {high:g}; colours in "
+                "[0, 1] are needed."
+            )
+
+
+def check_finite(scene: Gaussians) -> None:
+    """Raise InputError for NaN or infinity in a scene."""
+    parts = (scene.means, scene.quats, scene.scales, scene.opacities)
+    if not all(bool(part.isfinite().all()) for part in parts):
+        raise InputError("The scene holds NaN or infinity; remove such Gaussians.")
 
 
 def check_texture(views: Sequence[View]) -> None:

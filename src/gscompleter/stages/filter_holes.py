@@ -1,23 +1,30 @@
-"""Stage 4: keep Gaussians in holes and refine their opacities only (paper, Sec. III-F)."""
+"""Stage 4: keep Gaussians in holes (paper, Sec. III-F)."""
 
 from __future__ import annotations
 
-from jaxtyping import Bool, Float, Int
+from dataclasses import replace
+
+import torch
+from jaxtyping import Bool, Int
 from torch import Tensor
 
-from gscompleter.config import HoleConfig
 from gscompleter.geometry import project_mask
+from gscompleter.image_ops import dilate
+from gscompleter.stages.slide_along_rays import Registration
+from gscompleter.stages.target_view import TargetView
+from gscompleter.timing import timed_stage
 from gscompleter.types import Camera, Gaussians
 
 
-def compute_hole_mask(
-    alpha: Float[Tensor, "h w"], config: HoleConfig = HoleConfig()
-) -> Bool[Tensor, "h w"]:
-    """Return True where alpha is below the threshold, before dilation (paper, Eq. 12)."""
-    return alpha < config.max_alpha
+@timed_stage("integrate")
+def filter_holes(moved: Registration, view: TargetView) -> Gaussians:
+    """Keep registered Gaussians inside the dilated hole mask, labelled with the target's id."""
+    mask = dilate(view.empty, view.state.config.holes.dilation)
+    kept = select_in_mask(moved.gaussians, moved.pixel_index, mask, view.camera.padded)
+    return replace(kept, generated=torch.full_like(kept.generated, view.state.next_target_id))
 
 
-def filter_holes(
+def select_in_mask(
     registered: Gaussians,
     pixel_index: Int[Tensor, "n"] | None,
     mask: Bool[Tensor, "h w"],

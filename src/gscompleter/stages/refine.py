@@ -1,9 +1,9 @@
-"""Stage 4: keep Gaussians in holes and refine their opacities only (paper, Sec. III-F)."""
+"""Stage 4: refine the opacities of added Gaussians, and nothing else (paper, Eq. 13)."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
 
 import torch
 from jaxtyping import Float
@@ -11,10 +11,42 @@ from torch import Tensor
 
 from gscompleter.config import RefineConfig
 from gscompleter.cpu_threads import use_one_torch_thread
+from gscompleter.geometry import measure_baseline
 from gscompleter.optim import Adam
 from gscompleter.progress import track
 from gscompleter.render import OpacityRender
-from gscompleter.types import Gaussians, View
+from gscompleter.stages.target_view import TargetView
+from gscompleter.timing import timed_stage
+from gscompleter.types import Camera, Gaussians, View
+
+
+@dataclass(frozen=True)
+class Refined:
+    """Added Gaussians with refined opacities."""
+
+    gaussians: Gaussians
+    plans: tuple[OpacityRender, ...]
+    """Differentiable render at each photograph of the scene."""
+    losses: tuple[float, ...]
+    """Value of Eq. 13 at each iteration."""
+
+
+@timed_stage("integrate")
+def refine(kept: Gaussians, reference: View, view: TargetView) -> Refined:
+    """Refine the opacities of added Gaussians against the image and the nearest photographs."""
+    photos, config = [photo.view for photo in view.state.photos], view.state.config.refine
+    plans = tuple(frozen.vary_opacities(kept) for frozen in view.at(photos))
+    near = sort_by_distance(reference.camera, view.state.views)[: config.num_views]
+    at_target = view.frozen.vary_opacities(kept)
+    refined, losses = refine_opacities(
+        kept, at_target, reference, [plans[i] for i in near], [photos[i] for i in near], config
+    )
+    return Refined(refined, plans, losses)
+
+
+def sort_by_distance(camera: Camera, views: Sequence[View]) -> list[int]:
+    """Sort indices of `views` by their distance to `camera`."""
+    return sorted(range(len(views)), key=lambda i: measure_baseline(camera, views[i].camera))
 
 
 def has_settled(losses: Sequence[float], rel_tol: float) -> bool:

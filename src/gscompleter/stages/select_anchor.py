@@ -1,22 +1,11 @@
-"""Stage 2: synthesize, select the stereo anchor, lift the pair (paper, Sec. III-D)."""
+"""Stage 2: select the stereo anchor of a target (paper, Sec. III-D, Fig. 3)."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
 
-import torch
-from jaxtyping import Bool
-from torch import Tensor
-
 from gscompleter.config import AnchorConfig
-from gscompleter.generators import (
-    Generator,
-    GeneratorOutput,
-    GeneratorRequest,
-    ImageFunction,
-    as_generator,
-)
 from gscompleter.geometry import (
     is_inside,
     measure_baseline,
@@ -25,14 +14,7 @@ from gscompleter.geometry import (
     sample,
     unproject,
 )
-from gscompleter.reconstructors import Reconstructor, run_reconstructor
-from gscompleter.types import (
-    Camera,
-    GeneratorInput,
-    Lift,
-    Render,
-    View,
-)
+from gscompleter.types import Camera, Render, View
 
 SURFACE_TOLERANCE = 0.1
 """Tolerated distance behind the anchor's depth map, relative to depth, for the same surface."""
@@ -88,69 +70,6 @@ def select_anchor(
     if not enough:
         return AnchorChoice(max(overlapping, key=overlaps.__getitem__), fallback=False)
     return AnchorChoice(max(enough, key=baselines.__getitem__), fallback=False)
-
-
-@dataclass(frozen=True)
-class GeneratedView(View):
-    """The image synthesized at the target, with the notes of its generator."""
-
-    notes: tuple[str, ...] = ()
-    """One sentence each, for the results."""
-    is_inconsistent: bool = False
-    """True if the image is photometrically inconsistent with the photographs."""
-
-
-def synthesize(
-    generator: Generator | ImageFunction, target: Camera, context: GeneratorInput
-) -> GeneratedView:
-    """Synthesize `Ĩ_t = Φ(I_n, P_t)`, conditioned on the nearest view (paper, Eq. 6)."""
-    return synthesize_all(generator, [(target, context)])[0]
-
-
-def synthesize_all(
-    generator: Generator | ImageFunction, inputs: Sequence[tuple[Camera, GeneratorInput]]
-) -> list[GeneratedView]:
-    """Synthesize the images of several targets in one call of Φ."""
-    requests = [
-        GeneratorRequest(context.views[find_nearest_view(target, context.views)], target, context)
-        for target, context in inputs
-    ]
-    outputs = as_generator(generator).synthesize(requests)
-    return [convert_output(output, r.target) for output, r in zip(outputs, requests, strict=True)]
-
-
-def convert_output(output: GeneratorOutput, target: Camera) -> GeneratedView:
-    """Convert the output of a generator to a view, after checking its size and values."""
-    expected = (target.height, target.width, 3)
-    if tuple(output.image.shape) != expected or not torch.isfinite(output.image).all():
-        raise ValueError(
-            f"the generator must return a finite image of shape {expected}, "
-            f"got {tuple(output.image.shape)}"
-        )
-    return GeneratedView(
-        output.image, target, notes=output.notes, is_inconsistent=output.is_inconsistent
-    )
-
-
-def lift(
-    reconstructor: Reconstructor,
-    reference: View,
-    anchor: View,
-    pixel_mask: Bool[Tensor, "h w"] | None = None,
-) -> Lift:
-    """Lift `Ψ((Ĩ_t, P_t), (I_s, P_s))` and keep the target's Gaussians (paper, Eq. 7).
-
-    These are all that the target sees if Ψ is not pixel-aligned, else those inside `pixel_mask`.
-    """
-    pair = run_reconstructor(reconstructor, [reference, anchor], pixel_mask)
-    reference_depth, anchor_depth = pair.depths
-    if pair.view_index is None or pair.pixel_index is None:
-        seen = is_inside(*project(pair.gaussians.means, reference.camera), reference.camera)
-        return Lift(pair.gaussians[seen], reference_depth, anchor_depth, None)
-    own = pair.view_index == 0
-    if pixel_mask is not None:
-        own &= pixel_mask.flatten()[pair.pixel_index.where(own, 0)]
-    return Lift(pair.gaussians[own], reference_depth, anchor_depth, pair.pixel_index[own])
 
 
 def compute_overlap(camera: Camera, render: Render, anchor: Camera, at_anchor: Render) -> float:

@@ -10,8 +10,7 @@ import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
-from gscompleter.config import AlignmentConfig, DepthAgreementConfig, RegistrationConfig
-from gscompleter.config.coverage import COVERED
+from gscompleter.config import RegistrationConfig
 from gscompleter.cpu_threads import use_one_torch_thread
 from gscompleter.geometry import compute_z_depths, footprint_mask, slide
 from gscompleter.image_ops import fill_smoothly
@@ -19,8 +18,9 @@ from gscompleter.optim import Adam
 from gscompleter.progress import track
 from gscompleter.render import FrozenScene, Renderer
 from gscompleter.sky import mask_out_sky
-from gscompleter.stages.align_depth import align_depth
 from gscompleter.stages.extrapolate import extrapolate_sky
+from gscompleter.stages.target_view import TargetView
+from gscompleter.timing import timed_stage
 from gscompleter.types import Camera, DepthAffine, DepthMap, Gaussians, Lift, Render, View
 
 OCCLUSION_TOLERANCE = 0.05
@@ -34,60 +34,40 @@ class Registration:
     """Registered Gaussians."""
 
     gaussians: Gaussians
-    affine: DepthAffine
+    pixel_index: Int[Tensor, "n"] | None
+    """Row-major pixel of the reference that each Gaussian comes from, or None if unknown."""
     losses: tuple[float, ...]
     """Value of Eq. 11 at each iteration."""
 
 
+@timed_stage("register")
 @use_one_torch_thread()
-def register(
-    lift: Lift,
-    frozen_target: FrozenScene,
-    at_anchor: Render,
-    reference: View,
-    anchor: Camera,
-    renderer: Renderer,
-    rng: torch.Generator,
-    config: RegistrationConfig = RegistrationConfig(),
-    max_alpha: float = COVERED,
-    alignment: AlignmentConfig = AlignmentConfig(),
-    reject_below: float | None = DepthAgreementConfig.reject_below,
+def slide_along_rays(
+    lift: Lift, affine: DepthAffine, reference: View, view: TargetView
 ) -> Registration:
-    """Register lifted Gaussians: all by one affine, then each along its ray.
-
-    Args:
-        lift: Candidates and the depth maps predicted together with them.
-        frozen_target: The scene frozen at the target camera.
-        at_anchor: The scene rendered at the anchor camera.
-        reference: The synthesized image and the target camera.
-        anchor: Camera of the anchor.
-        renderer: Draws the candidates under the anchor camera.
-        rng: Randomness of RANSAC.
-        config: Weights, steps and choices.
-        max_alpha: A pixel of the target that the scene covers by less is a hole.
-        alignment: Settings of the affine fit.
-        reject_below: As `DepthAgreementConfig`.
-    """
-    affine = align_depth(lift, frozen_target.render, at_anchor, rng, alignment, reject_below)
+    """Register lifted Gaussians: all by one affine (Eq. 9), then each along its ray (Eq. 10)."""
+    config, pixel_index = view.state.config.registration, lift.pixel_index
     coarse = apply_affine(
         lift.gaussians, affine, reference.camera, config.footprint, config.min_ratio
     )
-    if affine.is_rejected or config.iterations == 0 or len(coarse) == 0:
-        return Registration(coarse, affine, ())
+    if config.iterations == 0 or len(coarse) == 0:
+        return Registration(coarse, pixel_index, ())
     registered, losses = register_along_rays(
-        coarse, frozen_target, at_anchor, reference, anchor, renderer, config
+        coarse,
+        view.frozen,
+        view.anchor_render,
+        reference,
+        view.anchor_view.camera,
+        view.scenes.renderer,
+        config,
     )
-    if (
-        config.extrapolate_into_holes
-        and config.degrees_of_freedom == 1
-        and lift.pixel_index is not None
-    ):
-        scene = frozen_target.render.depth_map(max_alpha)
+    if config.extrapolate_into_holes and config.degrees_of_freedom == 1 and pixel_index is not None:
+        scene = view.render.depth_map(view.state.config.holes.max_alpha)
         registered = extrapolate_into_holes(
-            coarse, registered, lift.pixel_index, scene, reference.camera, config
+            coarse, registered, pixel_index, scene, reference.camera, config
         )
-        registered = extrapolate_sky(registered, lift.pixel_index, scene, reference)
-    return Registration(registered, affine, losses)
+        registered = extrapolate_sky(registered, pixel_index, scene, reference)
+    return Registration(registered, pixel_index, losses)
 
 
 def extrapolate_into_holes(

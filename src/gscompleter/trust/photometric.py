@@ -10,14 +10,15 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
+from dataclasses import dataclass, replace
 
 import numpy as np
 import torch
-from jaxtyping import Float
+from jaxtyping import Float, Int
 from torch import Tensor
-from torch.nn.functional import avg_pool2d
+from torch.nn.functional import avg_pool2d, pad
 
-from gscompleter.config import TrustConfig
+from gscompleter.config import CompleterConfig, TrustConfig
 from gscompleter.cpu_threads import use_one_torch_thread
 from gscompleter.generators.exposure import fit_robust_affine
 from gscompleter.geometry import compute_z_depths
@@ -25,8 +26,10 @@ from gscompleter.kernels import support as kernels
 from gscompleter.kernels.parallel import map_in_parallel, share
 from gscompleter.kernels.support import CameraPose
 from gscompleter.render import FrozenScene, get_view_map
+from gscompleter.render.cache import SceneRenderer
 from gscompleter.render.viewpoint import to_float32
-from gscompleter.types import Camera, Gaussians, PhotoObservations, Render, View
+from gscompleter.trust import FullTrust, HeldViews, Trust
+from gscompleter.types import Camera, Gaussians, Render, View
 
 BLUR_RADIUS = 0.01
 """Radius of box filters, relative to the longer side; it tolerates edges off by a pixel."""
@@ -36,8 +39,91 @@ EXACT_DIFFERENCE = 0.02
 """Median colour difference up to which a scene counts as exact."""
 FULL_TRUST_FRACTION = 0.5
 """Fraction of a Gaussian's area in a camera that a photograph has to show for full trust."""
-FRONT_DEVIATIONS = 0.5
-"""Standard deviations of depth by which new Gaussians are put in front of untrusted ones."""
+
+
+@dataclass(frozen=True)
+class PhotoObservations:
+    """Observations of m context Gaussians in k photographs, from which trust is computed."""
+
+    means: Float[Tensor, "m 3"]
+    centers: Float[Tensor, "k 3"]
+    areas: Float[Tensor, "k m"]
+    """Visible area of each Gaussian in each photograph, in squared scene units."""
+    agreement: Float[Tensor, "k m"]
+    """Photometric consistency at each Gaussian, in [0, 1]; 0 if it is not visible."""
+
+
+@dataclass(frozen=True)
+class PhotometricTrust:
+    """Trust of a Gaussian as far as photographs from similar directions confirm its colour."""
+
+    observations: PhotoObservations
+    """In the photographs, then in completed targets."""
+    cameras: tuple[Camera, ...]
+    """Of the observations."""
+    num_photos: int
+    config: TrustConfig
+
+    def compute_weights(self, frozen: FrozenScene, camera: Camera) -> Float[Tensor, "n"]:
+        """Compute the trust of every Gaussian; added and invisible ones have 1."""
+        sums, count = sum_weights(frozen), len(self.observations.means)
+        trust = compute_trust(self.observations, sums[:count], camera, self.config)
+        return pad(trust, (0, len(sums) - count), value=1.0)
+
+    def compute_alpha(self, frozen: FrozenScene, camera: Camera) -> Float[Tensor, "h w"]:
+        """Render accumulated opacity with every Gaussian weighted by its trust."""
+        trusted = blur(frozen.splat(self.compute_weights(frozen, camera)))
+        return torch.minimum(trusted, frozen.render.alpha)
+
+    def accept(
+        self, frozen: FrozenScene, camera: Camera, weight: Float[Tensor, "h w"]
+    ) -> PhotometricTrust:
+        """Trust what a completed target shows as far as `weight`, like one more photograph."""
+        seen = self.observations
+        area, agreement = measure_agreement(frozen, seen.means, camera, weight)
+        more = PhotoObservations(
+            seen.means,
+            torch.cat([seen.centers, camera.center[None]]),
+            torch.cat([seen.areas, area[None]]),
+            torch.cat([seen.agreement, agreement[None]]),
+        )
+        return replace(self, observations=more, cameras=(*self.cameras, camera))
+
+    def hold(self, photo_weight: float) -> HeldViews:
+        """Return the photographs, with a weight, and completed targets, with weight 1."""
+        seen = self.observations
+        pixels = torch.stack([compute_pixel_areas(seen.means, camera) for camera in self.cameras])
+        weights = torch.ones(len(pixels)).to(seen.means)
+        weights[: self.num_photos] = photo_weight
+        return HeldViews(seen.centers, seen.areas / pixels.clamp_min(1e-30), weights)
+
+    def thin(self, rows: Int[Tensor, "r"], growth: Float[Tensor, "r"]) -> PhotometricTrust:
+        """Restrict to rows that stand for their neighbours, each enlarged by a factor."""
+        seen = self.observations
+        areas, agreement = seen.areas[:, rows] * growth**2, seen.agreement[:, rows]
+        thinned = PhotoObservations(seen.means[rows], seen.centers, areas, agreement)
+        return replace(self, observations=thinned)
+
+
+def load_trust(
+    config: CompleterConfig,
+    parts: tuple[Gaussians, ...],
+    views: Sequence[View],
+    scenes: SceneRenderer,
+) -> Trust:
+    """Load the trust that a config names, from all photographs of the scene."""
+    if config.trust == "full":
+        return FullTrust()
+    cameras = tuple(view.camera for view in views)
+    frozen, settings = scenes.freeze_at(parts, cameras), config.trust_settings
+    observations = gather_observations(parts[0], views, frozen, settings)
+    return PhotometricTrust(observations, cameras, len(cameras), settings)
+
+
+def compute_pixel_areas(means: Float[Tensor, "m 3"], camera: Camera) -> Float[Tensor, "m"]:
+    """Compute the area of a pixel at each Gaussian, in squared scene units."""
+    z = compute_z_depths(means, camera).clamp_min(0.0)
+    return z**2 / (camera.K[0, 0] * camera.K[1, 1])
 
 
 def gather_observations(
@@ -48,21 +134,29 @@ def gather_observations(
         differences = map_in_parallel(compute_color_difference, [f.render for f in frozen], views)
     usual = torch.stack([d.median() for d in differences]).median().item()
     scale = config.color_sigma * max(1.0, usual / EXACT_DIFFERENCE)
-    means = to_float32(rendered.means)
-    areas, agreement = np.empty((2, len(views), len(means)), np.float32)
+    areas, agreement = torch.empty((2, len(views), len(rendered))).to(rendered.means)
 
     def gather(k: int) -> None:
         agrees = torch.exp(-((differences[k] / scale) ** 2))
-        layers = torch.stack([torch.ones_like(agrees), agrees, torch.zeros_like(agrees)], dim=-1)
-        seen = (to_float32(frozen[k].backproject(layers)), means, convert_camera(views[k].camera))
-        share(kernels.measure_photo_agreement, len(means), *seen, areas[k], agreement[k])
+        measured = measure_agreement(frozen[k], rendered.means, views[k].camera, agrees)
+        areas[k], agreement[k] = measured
 
     for _ in get_view_map(rendered)(gather, range(len(views))):
         pass
-    arrays = (torch.from_numpy(array).to(rendered.means) for array in (areas, agreement))
-    return PhotoObservations(
-        rendered.means, torch.stack([view.camera.center for view in views]), *arrays
-    )
+    centers = torch.stack([view.camera.center for view in views])
+    return PhotoObservations(rendered.means, centers, areas, agreement)
+
+
+def measure_agreement(
+    frozen: FrozenScene, means: Float[Tensor, "m 3"], camera: Camera, agrees: Float[Tensor, "h w"]
+) -> tuple[Float[Tensor, "m"], Float[Tensor, "m"]]:
+    """Measure visible area [m] and mean agreement [m] of the first m Gaussians at a camera."""
+    layers = torch.stack([torch.ones_like(agrees), agrees, torch.zeros_like(agrees)], dim=-1)
+    sums = to_float32(frozen.backproject(layers)[: len(means)])
+    area, agreement = np.empty((2, len(means)), np.float32)
+    seen = (sums, to_float32(means), convert_camera(camera))
+    share(kernels.measure_photo_agreement, len(means), *seen, area, agreement)
+    return torch.from_numpy(area).to(means), torch.from_numpy(agreement).to(means)
 
 
 def compute_color_difference(render: Render, view: View) -> Float[Tensor, "h w"]:
@@ -98,44 +192,9 @@ def convert_camera(camera: Camera) -> CameraPose:
     return CameraPose(to_float32(camera.center), to_float32(camera.forward), np.float32(focal))
 
 
-def compute_observed_fraction(
-    observations: PhotoObservations, sums: Float[Tensor, "m"], camera: Camera
-) -> Float[Tensor, "m"]:
-    """Compute the largest fraction of each Gaussian's area at `camera` that a photograph shows."""
-    needed = sums * compute_pixel_areas(observations.means, camera)
-    return observations.areas.amax(dim=0) / needed.clamp_min(1e-20)
-
-
 def sum_weights(frozen: FrozenScene) -> Float[Tensor, "n"]:
     """Sum the compositing weights of each Gaussian over the image."""
     return frozen.backproject(torch.ones_like(frozen.render.image))[:, 0]
-
-
-def compute_trusted_alpha(frozen: FrozenScene, trust: Float[Tensor, "n"]) -> Float[Tensor, "h w"]:
-    """Render accumulated opacity with every Gaussian weighted by its trust."""
-    return torch.minimum(blur(frozen.splat(trust)), frozen.render.alpha)
-
-
-def compute_front_depth(
-    scene: Gaussians, frozen: FrozenScene, camera: Camera
-) -> Float[Tensor, "h w"]:
-    """Compute the z-depth at which new Gaussians occlude most of `scene`, in scene units.
-
-    Untrusted Gaussians vary in depth; `FRONT_DEVIATIONS` before the mean hide most of them.
-    Nearer Gaussians would occlude the scene in photographs from the side.
-    """
-    render, z = frozen.render, compute_z_depths(scene.means, camera).clamp_min(0.0)
-    unit = render.depth.max().clamp_min(1e-12)
-    squares = frozen.splat((z / unit).clamp_max(2.0) ** 2)
-    mean = render.depth / unit
-    spread = (squares / render.alpha.clamp_min(1e-6) - mean**2).clamp_min(0.0).sqrt()
-    return unit * (mean - FRONT_DEVIATIONS * spread).clamp_min(0.1 * mean)
-
-
-def compute_pixel_areas(means: Float[Tensor, "n 3"], camera: Camera) -> Float[Tensor, "n"]:
-    """Compute the area of a pixel at each Gaussian, in squared scene units."""
-    z = compute_z_depths(means, camera)
-    return z.clamp_min(0.0) ** 2 / (camera.K[0, 0] * camera.K[1, 1])
 
 
 def blur(values: Float[Tensor, "h w"]) -> Float[Tensor, "h w"]:

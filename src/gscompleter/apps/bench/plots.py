@@ -8,8 +8,8 @@ from typing import TYPE_CHECKING
 
 from gscompleter.apps.bench.completions import PROCESS, REST
 from gscompleter.apps.bench.growth import Growth
-from gscompleter.completer import STAGES
 from gscompleter.evaluation.plots import create_plot_figure, get_curve_style, write_figure
+from gscompleter.timing import STAGES
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes

@@ -10,8 +10,8 @@ from gscompleter.apps.bench.comparison import OWN
 from gscompleter.apps.bench.completions import PROCESS, REST
 from gscompleter.apps.bench.growth import Growth
 from gscompleter.apps.bench.samples import SampleSet, Spread
-from gscompleter.completer import STAGES
 from gscompleter.evaluation.tables import format_markdown
+from gscompleter.timing import STAGES
 
 COLUMNS = (*STAGES, "total", REST, PROCESS)
 """Columns of the seconds of a case; stages that did not run are omitted."""

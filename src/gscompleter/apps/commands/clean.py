@@ -33,13 +33,13 @@ from gscompleter.apps.inputs.plan import describe_opening
 from gscompleter.apps.report.completion import save_completed_splat
 from gscompleter.apps.warmup.compilation import compile_kernels
 from gscompleter.cleaning import find_superfluous
-from gscompleter.completer import Clock
 from gscompleter.errors import InputError, quote_value
 from gscompleter.evaluation.metrics.image import psnr
 from gscompleter.io.files import SUMMARY_FILE, check_output, open_output_folder
 from gscompleter.progress import show_preparation, show_progress, stage, track
 from gscompleter.render import Renderer, choose_device, load_renderer
 from gscompleter.splats.formats import load_splat
+from gscompleter.timing import record_seconds, timed_stage
 from gscompleter.types import Gaussians
 
 
@@ -57,7 +57,7 @@ def clean_splat(options: CleanOptions) -> dict[str, Any]:
     check_output(options.out, is_replaceable(options))
     check_context(options)
     device = choose_device(options.device)
-    renderer, clock = load_renderer(device), Clock(())
+    renderer = load_renderer(device)
     with show_progress(None if options.quiet else console):
         opened = open_scene(options, console)
         with show_preparation("reading photographs"):
@@ -72,7 +72,7 @@ def clean_splat(options: CleanOptions) -> dict[str, Any]:
         plan += f", written to {quote_value(options.out)}"
         print_lines(console, *describe_opening(options, opened, task), f"To do: {plan}.")
         with open_output_folder(options.out, is_replaceable(options)) as folder:
-            with clock("clean"):
+            with record_seconds(()) as seconds, timed_stage("clean"):
                 removed = find_superfluous(get_splat(task), task.views, renderer, options.config)
             settings = describe_settings(options, options.config, targets={}, models={})
             facts = {
@@ -80,7 +80,7 @@ def clean_splat(options: CleanOptions) -> dict[str, Any]:
                 "device": device,
                 **describe_opened(options, opened, task),
             }
-            summary = facts | score_cleaning(task, removed, renderer) | {"seconds": clock.seconds}
+            summary = facts | score_cleaning(task, removed, renderer) | {"seconds": seconds}
             with stage("writing"):
                 write_cleaned(folder, task, removed, {"version": __version__, **summary})
     return summary

@@ -56,7 +56,7 @@ from gscompleter.apps.report.plain_words import (
     describe_motion,
 )
 from gscompleter.apps.warmup.compilation import SPLAT_PART, compile_kernels
-from gscompleter.completer import Clock, GSCompleter, add_seconds
+from gscompleter.completer import GSCompleter
 from gscompleter.config import CompleterConfig
 from gscompleter.config.generators import get_settings_class
 from gscompleter.generators import load_generator
@@ -71,6 +71,7 @@ from gscompleter.render.lod import MIN_PROXY_GAUSSIANS
 from gscompleter.splats.formats import load_splat
 from gscompleter.splats.morton import argsort_nearby
 from gscompleter.state import Completion
+from gscompleter.timing import add_seconds, record_seconds, timed_stage
 from gscompleter.types import Camera, View
 
 
@@ -178,10 +179,13 @@ def prepare_completion(
         task = add_splat(task, options.scene, options, opened, parts)
     with show_preparation("loading models"):
         completer = load_completer(options, task.targets, device)
-    clock = Clock()
-    with show_preparation("depth range"), clock("context"):
+    with (
+        show_preparation("depth range"),
+        record_seconds() as seconds,
+        timed_stage("context"),
+    ):
         task = apply_working_range(task, completer.renderer)
-    return opened, task, ViewPlanner(completer), clock.seconds
+    return opened, task, ViewPlanner(completer), seconds
 
 
 def add_splat(
@@ -237,10 +241,7 @@ def load_completer(options: CompleteOptions, targets: Sequence[Target], device: 
 
 def get_stage_config(options: CompleteOptions) -> CompleterConfig:
     """Return the settings, changed by options that have a name of their own."""
-    if not options.no_prune:
-        return options.config
-    settings = replace(options.config.trust_settings, prune=False)
-    return replace(options.config, trust_settings=settings)
+    return options.config
 
 
 def describe_models(options: CompleteOptions) -> dict[str, Any]:

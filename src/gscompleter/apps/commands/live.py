@@ -24,7 +24,6 @@ from gscompleter.apps.inputs.opening import Opened, Task, print_lines
 from gscompleter.apps.inputs.plan import describe_opening
 from gscompleter.apps.live.session import FrameConversion, Session
 from gscompleter.apps.report.completion import Target
-from gscompleter.completer import add_seconds
 from gscompleter.data.scene import write_cameras
 from gscompleter.errors import InputError, quote_value
 from gscompleter.geometry import select_spread_cameras, shrink_camera
@@ -32,6 +31,7 @@ from gscompleter.io.files import TARGETS_FILE, open_output_folder
 from gscompleter.next_best_view.planner import ViewPlanner
 from gscompleter.progress import show_progress
 from gscompleter.state import Completion
+from gscompleter.timing import add_seconds
 from gscompleter.types import Camera, View
 
 if TYPE_CHECKING:

@@ -148,7 +148,8 @@ def load_named_config(words: Sequence[str]) -> tuple[CompleterConfig, Sequence[s
     named, others = tyro.cli(
         NamedConfig, prog="gscompleter", args=words, return_unknown_args=True, add_help=False
     )
-    return load_config(named.config), others
+    is_splat = any(word.partition("=")[0] == "--scene" for word in others)
+    return load_config(named.config, is_splat), others
 
 
 def make_registry(config: CompleterConfig, *rules: Rule) -> ConstructorRegistry:

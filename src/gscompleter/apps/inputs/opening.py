@@ -22,7 +22,6 @@ from gscompleter.apps.commands.options import (
     parse_resolution,
 )
 from gscompleter.apps.report.completion import InputSplatFile, Target
-from gscompleter.completer import set_depth_range
 from gscompleter.data.formats import find_format, open_photographs, refuse_scenes_below
 from gscompleter.data.local_origin import (
     choose_scene_origin,
@@ -53,7 +52,7 @@ from gscompleter.splat_alignment.similarity import transform_camera, transform_v
 from gscompleter.splats.formats import FORMATS as SPLAT_FORMATS
 from gscompleter.splats.formats import detect_splat_format
 from gscompleter.splats.ply import find_finite_rows
-from gscompleter.stages.context import find_depth_range
+from gscompleter.stages.context import find_depth_range, set_depth_range
 from gscompleter.stages.select_context import (
     make_points_in_front,
     select_context,
@@ -267,7 +266,7 @@ def select_near_and_far(
 def apply_working_range(task: Task, renderer: Renderer) -> Task:
     """Set the depth range of the photographs."""
     near, far = find_depth_range(task.views, task.scene, renderer)
-    return replace(task, views=[set_depth_range(view, near, far) for view in task.views])
+    return replace(task, views=set_depth_range(task.views, near, far))
 
 
 def mask_drawable_rows(path: Path) -> Bool[Tensor, "n"] | None:

@@ -27,11 +27,11 @@ from gscompleter.apps.live.poses import (
 from gscompleter.apps.live.serving import start_server
 from gscompleter.apps.live.session import Session, complete_camera, undo_step
 from gscompleter.apps.live.splat import make_page_splat
-from gscompleter.completer import NOTHING_ADDED, STAGES
 from gscompleter.errors import InputError
 from gscompleter.geometry import compute_spacing, estimate_up
 from gscompleter.progress import notify_of_stages
-from gscompleter.state import Completion, TargetResult
+from gscompleter.state import NOTHING_ADDED, Completion, TargetResult
+from gscompleter.timing import STAGES
 from gscompleter.types import Camera, Gaussians, View
 
 MAX_FRUSTUM_LENGTH, MAX_SPACING_FRACTION = 0.1, 0.2
@@ -199,8 +199,8 @@ class Page:
         """Show all parts of the session that differ from `before`."""
         with self.server.atomic():
             now = self.session.latest
-            if before.latest.num_kept != now.num_kept:
-                self._show("/observed", now.kept_context, tinted=False)
+            if before.latest.parts[0] is not now.parts[0]:
+                self._show("/observed", now.recolored_context, tinted=False)
             self._show_generated()
             for frustum in self._targets:
                 frustum.remove()
@@ -291,7 +291,7 @@ def format_progress(stage: str) -> str:
 
 def describe_outcome(result: TargetResult, seconds: float) -> str:
     """Describe a completion: one sentence, then one line per note."""
-    if not len(result.added):
+    if not len(result.added) and not result.num_recolored:
         return "\n".join(result.notes or (NOTHING_ADDED,))
     text = (
         f"Completed in {seconds:.1f} s: {len(result.added):,} Gaussians are added in a hole of "

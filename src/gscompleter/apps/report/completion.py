@@ -16,7 +16,7 @@ from torch import Tensor
 from gscompleter import __version__
 from gscompleter.apps.report.depth_picture import compute_depth_limits, write_depth_image
 from gscompleter.apps.report.record import Limits, make_record, select_most_changed, write_record
-from gscompleter.completer import GSCompleter, get_renders
+from gscompleter.completer import GSCompleter
 from gscompleter.evaluation.metrics.coverage import RenderPair, compute_coverage
 from gscompleter.evaluation.metrics.image import compute_masked_psnr, ssim
 from gscompleter.io.files import COMPLETED_FILE, CONTEXT_FILE
@@ -28,7 +28,7 @@ from gscompleter.splats.ply import save_ply
 from gscompleter.splats.provenance import REMOVED_FILE as REMOVED
 from gscompleter.splats.provenance import save_removed
 from gscompleter.state import Completion, TargetResult
-from gscompleter.types import Camera, Gaussians, Render, View
+from gscompleter.types import Camera, Gaussians, Render, View, merge
 
 GENERATED_FILE = "generated.ply"
 
@@ -117,9 +117,9 @@ def render_before_after(
     """Render the context and the completed scene."""
     with torch.no_grad():
         frozen = renderer.freeze(completion.context, camera)
-        if completion.pruned is None:
+        if completion.recolored_context is completion.context:
             after = frozen.composite(completion.added)
-        else:  # some of the context was pruned
+        else:
             after = renderer.render(completion.scene, camera)
     return BeforeAfter(frozen.render, after, photograph)
 
@@ -127,11 +127,13 @@ def render_before_after(
 def render_context_views(completion: Completion, completer: GSCompleter) -> list[BeforeAfter]:
     """Render the context views, from the cache of `completer` unless it used an LOD proxy."""
     views = completion.views
-    if completion.proxy is not None:
+    if completion.source.rendered is not completion.context:
         return [render_before_after(completion, v.camera, v, completer.renderer) for v in views]
-    after = get_renders(completer.freeze_at(completion, views))
-    seen = zip(completion.context_renders, after, views, strict=True)
-    return [BeforeAfter(first, last, view) for first, last, view in seen]
+    cameras = [view.camera for view in views]
+    after = completer.scenes.freeze_at(completion.parts, cameras)
+    before = [completer.renderer.render(completion.context, camera) for camera in cameras]
+    seen = zip(before, after, views, strict=True)
+    return [BeforeAfter(first, last.render, view) for first, last, view in seen]
 
 
 def score_held_out(
@@ -215,12 +217,11 @@ def compute_mask_fraction(mask: Bool[Tensor, "h w"] | None) -> float:
 
 
 def count_gaussians(completion: Completion) -> dict[str, int]:
-    """Count the Gaussians of the context, the added and, of an input splat, the pruned ones."""
+    """Count the Gaussians of the context, the added and, of a splat, the recoloured ones."""
     found = {"context": len(completion.context), "added": len(completion.added)}
-    if completion.observations is None:
+    if completion.config.trust == "full":
         return found
-    removed = completion.pruned_mask
-    return found | {"removed": 0 if removed is None else int(removed.sum())}
+    return found | {"recolored": int(completion.recolored_mask.sum())}
 
 
 def write_report(
@@ -265,14 +266,16 @@ def write_report(
 
 
 def write_scenes(folder: Path, completion: Completion, input_splat: InputSplatFile | None) -> None:
-    """Write the three scenes, and the pruned Gaussians of an input splat."""
+    """Write the three scenes, and the originals of recoloured Gaussians of an input splat."""
     if input_splat is None:
         save_reconstructed_scenes(folder, completion)
         return
-    context, aside = restore_file_order(completion, input_splat)
+    context, changed = restore_file_order(completion, input_splat)
+    recolored = completion.recolored_context[completion.recolored_mask]
+    generated = merge([recolored, completion.added])
     writing = (
         partial(save_ply, folder / CONTEXT_FILE, context),
-        partial(save_completed_splat, folder, context, aside, completion.added, input_splat),
+        partial(save_completed_splat, folder, context, changed, generated, input_splat),
         partial(save_ply, folder / GENERATED_FILE, completion.added, provenance=True),
     )
     map_in_parallel(lambda write: write(), writing)
@@ -326,34 +329,36 @@ def save_reconstructed_scenes(folder: Path, completion: Completion) -> None:
 
 def restore_file_order(
     completion: Completion, input_splat: InputSplatFile
-) -> tuple[Gaussians, Bool[Tensor, "n"] | None]:
-    """Sort the context and its pruned mask in the order of the input file."""
-    context, aside = completion.context, completion.pruned_mask
+) -> tuple[Gaussians, Bool[Tensor, "n"]]:
+    """Sort the context and the mask of recoloured Gaussians in the order of the input file."""
+    context, changed = completion.context, completion.recolored_mask
     if input_splat.file_order is None:
-        return context, aside
+        return context, changed
     places = input_splat.file_order.argsort().to(context.means.device)
-    return context[places], None if aside is None else aside[places]
+    return context[places], changed[places]
 
 
 def save_completed_splat(
     folder: Path,
     context: Gaussians,
-    pruned: Bool[Tensor, "n"] | None,
-    added: Gaussians,
+    changed: Bool[Tensor, "n"],
+    generated: Gaussians,
     input_splat: InputSplatFile,
 ) -> None:
-    """Write `completed.ply` in the layout of the input splat, and `pruned_mask.ply`."""
+    """Write `completed.ply` in the layout of the input splat, and the originals of the changed.
+
+    Recoloured Gaussians stand among the generated ones, after all that kept its bits.
+    """
     kept = input_splat.context_mask
-    if pruned is None or not pruned.any():
-        save_like(folder / COMPLETED_FILE, context, added, input_splat.path, kept)
+    if not changed.any():
+        save_like(folder / COMPLETED_FILE, context, generated, input_splat.path, kept)
         return
-    rows = torch.nonzero(pruned.cpu())[:, 0]
-    removed = context[pruned].to("cpu")
-    save_removed(folder / REMOVED, removed, rows, input_splat.path, kept)
-    stays, left = ~pruned.cpu(), context[~pruned]
+    rows = torch.nonzero(changed.cpu())[:, 0]
+    save_removed(folder / REMOVED, context[changed].to("cpu"), rows, input_splat.path, kept)
+    stays = ~changed.cpu()
     if kept is not None:
         stays = torch.zeros_like(kept).masked_scatter(kept, stays)
-    save_like(folder / COMPLETED_FILE, left, added, input_splat.path, stays)
+    save_like(folder / COMPLETED_FILE, context[~changed], generated, input_splat.path, stays)
 
 
 def collect_images(result: TargetResult, images: BeforeAfter) -> dict[str, Tensor]:
@@ -363,7 +368,7 @@ def collect_images(result: TargetResult, images: BeforeAfter) -> dict[str, Tenso
         "after": images.after.image,
         "hole_mask": result.hole_mask.float(),
     }
-    if result.trusted_alpha is not None:
+    if result.trusted_alpha is not result.before.alpha:
         found["support"] = result.trusted_alpha
     if result.reference is not None:
         found["reference"] = result.reference.image

@@ -111,7 +111,8 @@ def make_record(
 def make_target_record(result: TargetResult, limits: Limits | None) -> TargetRecord:
     """Collect the data of a target."""
     losses = {name: round_values(torch.tensor(values)) for name, values in result.losses.items()}
-    pairs = None if result.pairs is None else make_pairs_record(result.pairs)
+    compared = result.affine.pairs
+    pairs = make_pairs_record(compared) if len(compared.predicted) else None
     return TargetRecord(make_camera_pose(result.target), limits, losses, pairs)
 
 

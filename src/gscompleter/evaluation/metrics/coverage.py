@@ -44,17 +44,14 @@ def render_pairs(
     completion: Completion, cameras: Sequence[Camera], renderer: Renderer
 ) -> list[RenderPair]:
     """Render the scene before and after completion in small images, from a thinned scene."""
-    begun = thin_gaussians(completion.rendered_context, MAX_PREVIEW_GAUSSIANS)
-    kept = begun
-    if completion.pruned is not None:
-        kept = completion.rendered_scene[: completion.num_kept]
-        kept = thin_gaussians(kept, MAX_PREVIEW_GAUSSIANS)
+    begun = thin_gaussians(completion.source.rendered, MAX_PREVIEW_GAUSSIANS)
+    kept = thin_gaussians(completion.parts[0], MAX_PREVIEW_GAUSSIANS)
     added = [thin_gaussians(result.added, MAX_PREVIEW_GAUSSIANS) for result in completion.targets]
     new = merge([begun[:0], *added])
 
     def render_pair(camera: Camera) -> RenderPair:
         first = renderer.freeze(begun, camera)
-        last = first if kept is begun else renderer.freeze(kept, camera)
+        last = renderer.freeze(kept, camera)
         return RenderPair(first.render, last.composite(new))
 
     return list(get_view_map(new)(render_pair, [shrink_camera(camera, SIDE) for camera in cameras]))

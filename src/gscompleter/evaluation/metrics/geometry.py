@@ -18,7 +18,7 @@ from torch import Tensor
 from gscompleter.errors import InputError
 from gscompleter.geometry import is_inside, project, project_mask, sample
 from gscompleter.render import Renderer
-from gscompleter.stages.filter_holes import filter_holes
+from gscompleter.stages.filter_holes import select_in_mask
 from gscompleter.types import Camera, DepthMap, Gaussians
 
 MIN_OPACITY = 1 / 255
@@ -157,8 +157,8 @@ def compare_clouds(
         return Alignment(share, count, None, None, None, None)
     scale = reference.depth[reference.valid].double().median().item()
     threshold = MATCH_DISTANCE * scale
-    points = filter_holes(generated, None, overlap, target).means
-    surface = filter_holes(context, None, overlap, target).means
+    points = select_in_mask(generated, None, overlap, target).means
+    surface = select_in_mask(context, None, overlap, target).means
     pixels, z = project(surface, target)
     at_pixel = sample(reference.depth[..., None], pixels, "nearest")[..., 0]
     surface = surface[is_inside(pixels, z, target) & ((z - at_pixel).abs() <= threshold)]

@@ -26,7 +26,7 @@ from gscompleter.evaluation.metrics.image import (
 from gscompleter.evaluation.metrics.lpips import compute_lpips
 from gscompleter.evaluation.metrics.perceptual import compute_flip_map, haarpsi
 from gscompleter.render import Renderer
-from gscompleter.stages.filter_holes import compute_hole_mask
+from gscompleter.stages.target_view import compute_hole_mask
 from gscompleter.types import Camera, DepthMap, Gaussians, Render, View
 
 Image = Float[Tensor, "h w 3"]

@@ -1,0 +1,31 @@
+"""Agreement guards (not in the paper): reject images and depths that contradict the scene."""
+
+from __future__ import annotations
+
+from gscompleter.guards import Attempt, Guard
+from gscompleter.types import Gaussians
+
+MIN_TARGET_COVERAGE = 0.01
+"""Fraction of its image that the target must see of the scene for its depths to be judged."""
+
+
+class ImageAgreement(Guard):
+    """Reject a synthesized image that contradicts the photographs."""
+
+    name = "image-agreement"
+
+    def verify(self, added: Gaussians, attempt: Attempt) -> Gaussians:
+        """Drop everything if Φ found its image inconsistent with the photographs."""
+        return added[:0] if attempt.reference.is_inconsistent else added
+
+
+class DepthAgreement(Guard):
+    """Reject lifted depths with which hardly any of the visible scene agrees."""
+
+    name = "depth-agreement"
+
+    def verify(self, added: Gaussians, attempt: Attempt) -> Gaussians:
+        """Drop everything if too few depths at the target agree with the affine correction."""
+        affine, least = attempt.affine, attempt.view.state.config.depth_agreement.reject_below
+        is_checked = affine.coverage >= MIN_TARGET_COVERAGE
+        return added[:0] if is_checked and (affine.agreement or 0.0) < least else added

@@ -1,0 +1,70 @@
+"""A cache of frozen scenes; as a scene grows, they are extended by what was added."""
+
+from __future__ import annotations
+
+from collections.abc import Hashable, Sequence
+from itertools import takewhile
+
+from gscompleter.render import FrozenScene, Renderer, get_view_map
+from gscompleter.render.lod import MAX_PREVIEW_GAUSSIANS, thin_gaussians
+from gscompleter.types import Camera, Gaussians
+
+Parts = tuple[Gaussians, ...]
+"""What is rendered: the context, then one part per target."""
+
+
+class SceneRenderer:
+    """Freezes scenes at cameras and remembers them; the results equal scenes frozen anew.
+
+    A scene is a tuple of parts, which are compared by identity.
+    """
+
+    def __init__(self, renderer: Renderer) -> None:
+        self.renderer = renderer
+        self._views: dict[Hashable, tuple[Parts, FrozenScene]] = {}
+        self._thinned: list[tuple[Gaussians, Gaussians]] = []
+
+    def freeze(self, parts: Parts, camera: Camera) -> FrozenScene:
+        """Freeze a scene at a camera that is not visited again."""
+        return self._update(parts, camera, (), None)
+
+    def freeze_at(self, parts: Parts, cameras: Sequence[Camera]) -> tuple[FrozenScene, ...]:
+        """Freeze a scene at cameras, or reuse and extend what was frozen there before."""
+        keys = [make_camera_key(camera) for camera in cameras]
+        known = [self._views.get(key, ((), None)) for key in keys]
+
+        def update(camera: Camera, before: tuple[Parts, FrozenScene | None]) -> FrozenScene:
+            return self._update(parts, camera, *before)
+
+        frozen = tuple(get_view_map(parts[0])(update, cameras, known))
+        self._views.update((key, (parts, view)) for key, view in zip(keys, frozen, strict=True))
+        return frozen
+
+    def freeze_small(self, parts: Parts, cameras: Sequence[Camera]) -> tuple[FrozenScene, ...]:
+        """Freeze a simplified scene at cameras of small images."""
+        self._thinned = [self._thin(part) for part in parts]
+        return self.freeze_at(tuple(thin for _, thin in self._thinned), cameras)
+
+    def _update(
+        self, parts: Parts, camera: Camera, known: Parts, frozen: FrozenScene | None
+    ) -> FrozenScene:
+        """Extend a frozen scene if the new one begins with its parts, else freeze anew."""
+        shared = len(
+            list(takewhile(lambda pair: pair[0] is pair[1], zip(known, parts, strict=False)))
+        )
+        if frozen is None or shared < len(known):
+            frozen, shared = self.renderer.freeze(parts[0], camera), 1
+        for part in parts[shared:]:
+            frozen = frozen.extend(part)
+        return frozen
+
+    def _thin(self, part: Gaussians) -> tuple[Gaussians, Gaussians]:
+        """Simplify a part, or find it among those simplified before."""
+        known = [pair for pair in self._thinned if pair[0] is part]
+        return known[0] if known else (part, thin_gaussians(part, MAX_PREVIEW_GAUSSIANS))
+
+
+def make_camera_key(camera: Camera) -> Hashable:
+    """Make a key that is equal for cameras with equal images."""
+    numbers = (*camera.c2w.flatten().tolist(), *camera.K.flatten().tolist())
+    return (*numbers, camera.width, camera.height, camera.near_plane)

@@ -1,0 +1,166 @@
+"""Stage 4 where the scene is covered, but not trusted: recolour by direction (not in the paper).
+
+In a trained splat the wrong parts of an image are opaque Gaussians seen from a new side. Colour is
+all that depends on the side, so their spherical harmonics are fitted to the synthesized image in
+the direction of the target, and held in the directions of photographs and of earlier targets.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import torch
+from jaxtyping import Float, Float64, Int64
+from torch import Tensor
+from torch.nn.functional import normalize
+
+from gscompleter.config import RecolorConfig
+from gscompleter.cpu_threads import use_one_torch_thread
+from gscompleter.kernels.parallel import map_in_parallel
+from gscompleter.render import ColorErrors, FrozenScene, Renderer
+from gscompleter.render.spherical_harmonics import evaluate_sh_basis
+from gscompleter.stages.target_view import TargetView
+from gscompleter.state import Completion
+from gscompleter.timing import timed_stage
+from gscompleter.trust import HeldViews
+from gscompleter.types import Camera, Gaussians, View, merge
+
+MIN_CHANGE = 1 / 255
+"""Largest change of a colour, as the target sees it, that is not worth a change of the file."""
+MIN_WEIGHT = 1e-3
+"""Summed weight, in pixels, up to which a Gaussian is not seen."""
+CHUNK = 4096
+"""Gaussians that are solved for at a time, which bounds the memory."""
+
+
+@dataclass(frozen=True)
+class Recolored:
+    """The scene after recolouring."""
+
+    state: Completion
+    frozen: FrozenScene
+    """The scene frozen at the padded target."""
+    count: int
+    """Number of rendered Gaussians with new colours."""
+
+
+@timed_stage("integrate")
+def recolor(reference: View, view: TargetView) -> Recolored:
+    """Recolour what covers the target without being trusted, and trust it from there on."""
+    state, camera, weight = view.state, view.camera.padded, view.distrust
+    if not weight.any():
+        return Recolored(state, view.frozen, 0)
+    config, context = state.config.recolor, state.parts[0]
+    found = fit_colors(
+        merge(state.parts),
+        view.frozen,
+        reference,
+        weight,
+        state.trust.hold(config.hold_weight),
+        view.scenes.renderer,
+        config,
+    )
+    generated = context.generated.index_fill(0, found.rows, state.next_target_id)
+    context = replace(found.apply(context), generated=generated)
+    parts, trust = (context, *state.parts[1:]), state.trust.accept(view.frozen, camera, weight)
+    frozen = view.scenes.freeze(parts, camera)
+    return Recolored(replace(state, parts=parts, trust=trust), frozen, len(found.rows))
+
+
+@dataclass(frozen=True)
+class ColorChange:
+    """Changes of the spherical harmonics of c Gaussians of a scene."""
+
+    rows: Int64[Tensor, "c"]
+    delta: Float[Tensor, "c k 3"]
+
+    def apply(self, scene: Gaussians) -> Gaussians:
+        """Change the colours; whatever is not in `rows` keeps its bits."""
+        return replace(scene, sh=scene.sh.index_add(0, self.rows, self.delta))
+
+
+def fit_colors(
+    scene: Gaussians,
+    frozen: FrozenScene,
+    reference: View,
+    weight: Float[Tensor, "h w"],
+    held: HeldViews,
+    renderer: Renderer,
+    config: RecolorConfig = RecolorConfig(),
+) -> ColorChange:
+    """Fit colours towards `reference`, as far as its weight and the held views allow.
+
+    Args:
+        scene: The m Gaussians of the context, whose colours may change, and then others.
+        frozen: `scene`, frozen at the camera of `reference`.
+        reference: The synthesized image.
+        weight: Weight of `reference` per pixel, in [0, 1]; the rest is the render of `scene`.
+        held: Views in which the m Gaussians keep their colours.
+        renderer: Renderer of `frozen`.
+        config: Settings of the fit.
+    """
+    layers = torch.stack([torch.ones_like(weight), weight, torch.zeros_like(weight)], dim=-1)
+    sums, open_sums, _ = frozen.backproject(layers).unbind(-1)
+    is_open = open_sums > MIN_WEIGHT
+    is_open[held.sums.shape[1] :] = False
+    rows = torch.nonzero(is_open)[:, 0]
+    if len(rows) == 0 or config.iterations == 0:
+        return ColorChange(rows[:0], scene.sh[:0])
+    basis, change = solve_directions(scene, rows, sums[rows], reference.camera, held, config.ridge)
+    colors = 0.5 + torch.einsum("nk,nkc->nc", basis, scene.sh[rows].double())
+    gains = (basis * change).sum(dim=1, keepdim=True)
+    wanted = torch.lerp(frozen.render.image, reference.image, weight[..., None])
+    errors = renderer.freeze(scene[~is_open], reference.camera).vary_colors(scene[rows])
+    steps = fit_steps(errors, wanted, colors, gains, config.iterations)
+    is_changed = (gains * steps).abs().amax(dim=1) > MIN_CHANGE
+    delta = change[is_changed, :, None] * steps[is_changed, None]
+    return ColorChange(rows[is_changed], delta.to(scene.sh))
+
+
+def solve_directions(
+    scene: Gaussians,
+    rows: Int64[Tensor, "c"],
+    sums: Float[Tensor, "c"],
+    camera: Camera,
+    held: HeldViews,
+    ridge: float,
+) -> tuple[Float64[Tensor, "c k"], Float64[Tensor, "c k"]]:
+    """Return the basis b at `camera` and the cheapest change of harmonics, A⁻¹ b, of some rows.
+
+    A = Σ_v weight_v sum_v b_v b_vᵀ + ridge (sum + Σ_v sum_v) I over the held views v.
+    """
+    k, centers = scene.sh.shape[1], torch.cat([held.centers, camera.center.to(held.centers)[None]])
+
+    def solve(chunk: Int64[Tensor, "_"], own: Float[Tensor, "_"]) -> Float64[Tensor, "2 _ k"]:
+        rays = normalize(scene.means[chunk, None].double() - centers.double(), dim=-1)
+        basis = evaluate_sh_basis(rays.flatten(0, 1), k).unflatten(0, rays.shape[:2])
+        views, seen = basis[:, :-1], held.sums[:, chunk].double().T
+        cost = views.mT @ (views * (seen * held.weights)[..., None])
+        cost.diagonal(dim1=1, dim2=2).add_(ridge * (own + seen.sum(dim=1))[:, None])
+        change = torch.cholesky_solve(basis[:, -1, :, None], torch.linalg.cholesky(cost))
+        return torch.stack([basis[:, -1], change[..., 0]])
+
+    with use_one_torch_thread():
+        parts = map_in_parallel(solve, rows.split(CHUNK), sums.split(CHUNK))
+    basis, change = torch.cat(parts, dim=1)
+    return basis, change
+
+
+def fit_steps(
+    errors: ColorErrors,
+    wanted: Float[Tensor, "h w 3"],
+    colors: Float64[Tensor, "c 3"],
+    gains: Float64[Tensor, "c 1"],
+    iterations: int,
+) -> Float64[Tensor, "c 3"]:
+    """Minimize Σ (wanted - image)² + gains s² over s; Gaussians have the colours + gains s.
+
+    Each iteration minimizes an upper bound in which every s stands alone: weights of a pixel sum to
+    at most 1.
+    """
+    steps = torch.zeros_like(colors)
+    for _ in range(iterations):
+        missing, sums = errors((colors + gains * steps).to(wanted), wanted)
+        stiffness = sums[:, None] * gains
+        steps = (missing + stiffness * steps) / (1 + stiffness)
+    return steps

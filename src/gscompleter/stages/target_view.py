@@ -1,0 +1,154 @@
+"""The scene as a target camera sees it, before anything is added."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from functools import cached_property
+
+import torch
+from jaxtyping import Bool, Float
+from torch import Tensor
+
+from gscompleter.config import HoleConfig
+from gscompleter.geometry import is_same_camera, shrink_camera
+from gscompleter.image_ops import dilate
+from gscompleter.render import FrozenScene
+from gscompleter.render.cache import SceneRenderer
+from gscompleter.sky import mask_out_sky
+from gscompleter.stages.select_anchor import AnchorChoice, compute_overlap, select_anchor
+from gscompleter.state import Completion
+from gscompleter.types import Camera, GeneratorInput, PaddedCamera, Render, View
+
+FULL_TRUST = 0.85
+"""Mean trust of what a pixel shows from which on it is not recoloured."""
+NO_TRUST = 0.45
+"""Mean trust up to which a pixel takes the synthesized colour."""
+
+
+@dataclass(frozen=True)
+class TargetView:
+    """The scene as the padded target camera sees it."""
+
+    state: Completion
+    scenes: SceneRenderer
+    """Freezes the scene at further cameras, and remembers what it froze."""
+    camera: PaddedCamera
+    frozen: FrozenScene
+    """The scene frozen at the padded camera."""
+    alpha: Float[Tensor, "h w"]
+    """Accumulated opacity at the padded camera, weighted by trust."""
+    anchor: AnchorChoice
+
+    @property
+    def render(self) -> Render:
+        """Render of the scene at the padded camera."""
+        return self.frozen.render
+
+    @cached_property
+    def holes(self) -> Bool[Tensor, "h w"]:
+        """Pixels that Φ fills: empty or not trusted."""
+        return compute_hole_mask(self.alpha, self.state.config.holes)
+
+    @cached_property
+    def empty(self) -> Bool[Tensor, "h w"]:
+        """Hole mask M_hole of Eq. 12, before dilation: Gaussians are added here."""
+        return compute_hole_mask(self.render.alpha, self.state.config.holes)
+
+    @property
+    def distrust(self) -> Float[Tensor, "h w"]:
+        """Weight in [0, 1] with which covered pixels take the synthesized colour."""
+        trust = self.alpha / self.render.alpha.clamp_min(1e-6)
+        weight = ((FULL_TRUST - trust) / (FULL_TRUST - NO_TRUST)).clamp(0, 1)
+        return torch.where(self.empty, 0.0, weight)
+
+    @property
+    def candidate_mask(self) -> Bool[Tensor, "h w"] | None:
+        """Pixels that are lifted: near empty pixels, or None for all of the pair (paper)."""
+        radius = self.state.config.holes.candidate_radius
+        return None if radius is None else dilate(self.empty, radius)
+
+    @property
+    def anchor_view(self) -> View:
+        """Context view that forms the stereo pair with the target."""
+        return self.state.views[self.anchor.index]
+
+    @cached_property
+    def view_renders(self) -> tuple[Render, ...]:
+        """Renders of the scene at the context views."""
+        return tuple(frozen.render for frozen in self.at(self.state.views))
+
+    @property
+    def anchor_render(self) -> Render:
+        """Render of the scene at the anchor."""
+        return self.view_renders[self.anchor.index]
+
+    def at(self, views: Sequence[View]) -> tuple[FrozenScene, ...]:
+        """Freeze the same scene at photographs."""
+        return self.scenes.freeze_at(self.state.parts, [view.camera for view in views])
+
+    @cached_property
+    def refusal(self) -> str | None:
+        """Sentence why the target cannot be completed, or None if it can."""
+        before, least = self.render.crop(self.camera), self.state.config.holes.min_covered
+        covered = mask_out_sky(before, self.camera.target).valid.float().mean().item()
+        if covered >= least:
+            return None
+        return (
+            f"The target sees surfaces of the scene in {covered:.1%} of its image, and at least "
+            f"{least:.0%} are needed; move it closer to the photographs, or turn it towards what "
+            "they show."
+        )
+
+    @property
+    def skip_reason(self) -> str:
+        """Sentence why there is nothing to complete; empty if there is."""
+        if self.refusal:
+            return self.refusal
+        if any(is_same_camera(self.camera.target, view.camera) for view in self.state.views):
+            return "The target is a context view: nothing to complete."
+        if not self.camera.crop(self.holes).any():
+            return "The scene has no hole here: nothing to complete."
+        return ""
+
+    def make_generator_input(self) -> GeneratorInput:
+        """Collect the input of Φ."""
+        config = self.state.config
+        return GeneratorInput(
+            self.state.views,
+            self.view_renders,
+            self.render,
+            config.holes.max_alpha,
+            config.synthesis.correct_color,
+            config.synthesis.source_depth,
+            self.alpha,
+        )
+
+
+def compute_hole_mask(
+    alpha: Float[Tensor, "h w"], config: HoleConfig = HoleConfig()
+) -> Bool[Tensor, "h w"]:
+    """Return True where alpha is below the threshold, before dilation (paper, Eq. 12)."""
+    return alpha < config.max_alpha
+
+
+def render_target(state: Completion, camera: PaddedCamera, scenes: SceneRenderer) -> TargetView:
+    """Render the scene at a padded target and select its stereo anchor."""
+    frozen = scenes.freeze(state.parts, camera.padded)
+    alpha = state.trust.compute_alpha(frozen, camera.padded)
+    return TargetView(
+        state, scenes, camera, frozen, alpha, choose_anchor(state, camera.target, scenes)
+    )
+
+
+def choose_anchor(state: Completion, target: Camera, scenes: SceneRenderer) -> AnchorChoice:
+    """Select the anchor by rotation, baseline and, beyond the paper, overlap in small images."""
+    config, views = state.config.anchor, state.views
+    if config.min_overlap == 0:
+        return select_anchor(target, views, config)
+    side = state.config.next_best_view.image_size
+    cameras = [shrink_camera(c, side) for c in (target, *(view.camera for view in views))]
+    seen, *at_views = (f.render for f in scenes.freeze_small(state.parts, cameras))
+    pairs = zip(cameras[1:], at_views, strict=True)
+    overlaps = [compute_overlap(cameras[0], seen, camera, render) for camera, render in pairs]
+    return select_anchor(target, views, config, overlaps)

@@ -1,0 +1,37 @@
+"""A scene as a target sees it, for tests of single stages."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+from gscompleter.config import CompleterConfig
+from gscompleter.geometry import pad_camera
+from gscompleter.render import Renderer, load_renderer
+from gscompleter.render.cache import SceneRenderer
+from gscompleter.stages.target_view import TargetView, render_target
+from gscompleter.state import Completion, ContextScene, Photo
+from gscompleter.trust import FullTrust, Trust
+from gscompleter.types import Camera, Gaussians, View
+
+
+def begin_with(
+    context: Gaussians,
+    views: Sequence[View],
+    config: CompleterConfig = CompleterConfig(),
+    trust: Trust = FullTrust(),
+) -> Completion:
+    """Begin a completion of `context` without guards."""
+    photos = tuple(map(Photo, views))
+    return Completion(config, ContextScene.whole(context), (context,), photos, len(photos), trust)
+
+
+def observe(
+    context: Gaussians,
+    views: Sequence[View],
+    target: Camera,
+    config: CompleterConfig = CompleterConfig(),
+    renderer: Renderer | None = None,
+) -> TargetView:
+    """Render `context` at a target without padding."""
+    scenes = SceneRenderer(renderer or load_renderer("cpu"))
+    return render_target(begin_with(context, views, config), pad_camera(target, 0.0), scenes)
