@@ -20,7 +20,7 @@ from gscompleter.evaluation.methods import METHODS
 from gscompleter.evaluation.metrics import scores
 from gscompleter.evaluation.metrics.scores import compute_depth_scale
 from gscompleter.evaluation.plots import draw_plots
-from gscompleter.evaluation.protocols import Task, make_tasks, parse_protocol
+from gscompleter.evaluation.protocols import Task, explain_skip, make_tasks, parse_protocol
 from gscompleter.evaluation.runner import RowCounts, RunConfig, evaluate, prepare_task
 from gscompleter.evaluation.steps import (
     PreparedTask,
