@@ -357,10 +357,10 @@ def test_a_run_goes_on_where_it_was_stopped(finished, tasks, tmp_path, monkeypat
     out = tmp_path / "out"
     original = store.write_json
 
-    def stopped(path, content):
+    def stopped(path, content, keep_existing=False):
         if path.parent.name.startswith("wide") and path.name == "full.json":
             raise KeyboardInterrupt
-        original(path, content)
+        original(path, content, keep_existing)
 
     monkeypatch.setattr(store, "write_json", stopped)
     with pytest.raises(KeyboardInterrupt):
