@@ -5,24 +5,24 @@ import os
 import signal
 import subprocess
 import sys
+import threading
 import time
+from dataclasses import dataclass
 from pathlib import Path
 
 import pytest
 
-from batch_jobs import Writing, engine_named, outcomes, plain_jobs
+from batch_jobs import Writing, engine_named, plain_jobs, run_all
 from command import run
 from gscompleter import InputError
 from gscompleter.apps.batch.manifest import read_manifest
 from gscompleter.apps.commands.row_options import parse_row
 from gscompleter.errors import OutputError
 from gscompleter.jobs import jobs as batch
-from gscompleter.jobs.engines.local import LocalEngine
-from gscompleter.jobs.engines.submitit import SubmititEngine
+from gscompleter.jobs.engines import LocalEngine, SubmititEngine
 from gscompleter.jobs.jobs import Job, find_missing_jobs, run_claimed
-from gscompleter.jobs.places import FolderPlace, StorePlace, make_lease, open_place
-from gscompleter.jobs.rounds import BatchRows, Rounds, run_in_this_process
-from gscompleter.jobs.shards import parse_shard
+from gscompleter.jobs.places import open_place
+from gscompleter.jobs.workers import parse_shard, run_jobs
 from paths import SUPPORT
 from scenes import camera_at, photographed
 from simulate_batch import Fleet, Replay, replay
@@ -38,6 +38,11 @@ def until(condition, seconds: float = 120.0) -> None:
     while not condition():
         assert time.monotonic() < end, "what was waited for never came"
         time.sleep(0.02)
+
+
+def row_of(out: Path, name: str) -> dict:
+    """Read the row of a job."""
+    return json.loads((out / "rows" / f"{name}.json").read_text())
 
 
 def lines(folder: Path) -> dict[str, list[str]]:
@@ -97,7 +102,7 @@ def test_a_job_ends_as_a_row_with_its_reason(tmp_path, monkeypatch):
     monkeypatch.setattr(batch, "RETRY_SECONDS", 0.0)
     ends = ("sentence", "defect", "defect once", None)
     jobs = [Job(str(end), {"ends": end}) for end in ends]
-    place, perform = FolderPlace(tmp_path), Writing(str(tmp_path), retries=2)
+    place, perform = open_place(tmp_path), Writing(str(tmp_path), retries=2)
     for job in jobs:
         perform(job)
     rows = {job.name: batch.read_row(place, job.name) for job in jobs}
@@ -112,40 +117,66 @@ def test_a_job_ends_as_a_row_with_its_reason(tmp_path, monkeypatch):
 
 def test_a_job_that_kills_its_worker_is_given_up_and_the_others_are_done(tmp_path):
     jobs = [Job("bad", {"ends": "always killed"}), Job("shy", {"ends": "killed once"}), Job("good")]
-    found = {o.job.name: o for o in outcomes(tmp_path, jobs, LocalEngine(1), retries=1)}
-    assert [found[name].state for name in ("bad", "shy", "good")] == ["failed", "done", "done"]
-    assert "lost 2 times" in found["bad"].reason or "killed 2 times" in found["bad"].reason
+    assert sorted(run_all(tmp_path, jobs, LocalEngine(1), retries=1)) == ["bad", "good", "shy"]
+    found = {job.name: row_of(tmp_path, job.name) for job in jobs}
+    assert [found[name]["state"] for name in ("bad", "shy", "good")] == ["failed", "done", "done"]
+    assert "killed 2 times" in found["bad"]["reason"]
     assert len(lines(tmp_path / "begun")["bad"]) == 2
+
+
+def test_in_a_store_workers_have_shares_and_a_killed_one_is_counted(tmp_path):
+    jobs = [Job("bad", {"ends": "always killed"}), *plain_jobs(4, 0.0)]
+    assert len(run_all(f"file://{tmp_path}", jobs, LocalEngine(2), retries=1)) == 5
+    assert row_of(tmp_path, "bad")["state"] == "failed"
+    assert {name: len(pids) for name, pids in lines(tmp_path / "ended").items()} == {
+        job.name: 1 for job in plain_jobs(4, 0.0)
+    }
+
+
+@dataclass(frozen=True)
+class Full:
+    """Runs a job on a full disk."""
+
+    def __call__(self, job: Job) -> None:
+        raise OutputError("Cannot write it: there is no space left.")
+
+
+def test_an_error_of_a_worker_ends_the_run(tmp_path):
+    place = open_place(tmp_path)
+    with pytest.raises(OutputError, match="no space left"):
+        list(run_jobs(place, [Job("one")], Full(), lambda: set(), LocalEngine(1)))
 
 
 def test_attempts_of_earlier_runs_count(tmp_path):
     claims = tmp_path / "claims"
     claims.mkdir()
-    (claims / "bad").write_text("3")  # as after three killed processes
-    outcome = Writing(str(tmp_path), retries=2)(Job("bad"))
-    assert outcome.state == "failed"
-    assert "killed 3 times" in outcome.reason
+    (claims / "bad").write_text("...")  # as after three killed processes
+    Writing(str(tmp_path), retries=2)(Job("bad"))
+    assert row_of(tmp_path, "bad")["state"] == "failed"
+    assert "killed 3 times" in row_of(tmp_path, "bad")["reason"]
     assert not (tmp_path / "begun").exists()
-    (claims / "fair").write_text("2")
-    assert Writing(str(tmp_path), retries=2)(Job("fair")).state == "done"
+    (claims / "fair").write_text("..")
+    Writing(str(tmp_path), retries=2)(Job("fair"))
+    assert row_of(tmp_path, "fair")["state"] == "done"
 
 
 def test_what_somebody_else_does_is_waited_for(tmp_path):
-    place, job = FolderPlace(tmp_path), Job("one")
-
-    rounds = Rounds(place, BatchRows(place), [], retries=0)
-    with place.hold_claim("claims/one"):
-        assert place.is_held("claims/one")
-        assert Writing(str(tmp_path))(job).state == "elsewhere"
-        rounds.elsewhere.append(job)
-        assert list(rounds.collect_from_others()) == []
-        assert rounds.elsewhere == [job]
-    assert not place.is_held("claims/one")
-    assert [o.state for o in rounds.run(run_in_this_process, Writing(str(tmp_path)))] == ["done"]
+    place, job = open_place(tmp_path), Job("one")
+    with place.hold_claim(job.claim):
+        assert place.is_held(job.claim)
+        Writing(str(tmp_path))(job)
+        assert not (tmp_path / "rows").exists()
+        other = threading.Thread(target=run_all, args=(tmp_path, [job], None))
+        other.start()
+        time.sleep(0.5)
+        assert not (tmp_path / "begun").exists()
+    other.join()
+    assert not place.is_held(job.claim)
+    assert row_of(tmp_path, "one")["state"] == "done"
 
 
 def test_a_full_disk_ends_the_run_and_loses_nothing(tmp_path, monkeypatch):
-    place = FolderPlace(tmp_path)
+    place = open_place(tmp_path)
     run_claimed(Job("first"), place, lambda: {"size": 1}, retries=2)
 
     def full() -> dict[str, int]:
@@ -157,11 +188,12 @@ def test_a_full_disk_ends_the_run_and_loses_nothing(tmp_path, monkeypatch):
         "second"
     ]
     assert os.listdir(tmp_path / "claims") == []
-    assert run_claimed(Job("second"), place, lambda: {"size": 1}, retries=2).state == "done"
+    run_claimed(Job("second"), place, lambda: {"size": 1}, retries=2)
+    assert row_of(tmp_path, "second")["state"] == "done"
 
 
 def test_done_with_other_options_is_refused_and_failed_is_done_again(tmp_path):
-    place = FolderPlace(tmp_path)
+    place = open_place(tmp_path)
     perform = Writing(str(tmp_path))
     perform(Job("good"))
     perform(Job("bad", {"ends": "sentence"}))
@@ -172,22 +204,18 @@ def test_done_with_other_options_is_refused_and_failed_is_done_again(tmp_path):
     perform(Job("bad", {"ends": "sentence"}))
     mended = Job("bad", {})
     assert find_missing_jobs([mended], place, False) == [mended]
-    assert perform(mended).state == "done"
+    perform(mended)
+    assert row_of(tmp_path, "bad")["state"] == "done"
 
 
-def test_in_a_store_one_holds_a_claim_until_it_is_not_renewed(tmp_path):
+def test_a_store_counts_who_begins_and_locks_nobody_out(tmp_path):
     place = open_place(f"file://{tmp_path}/out")
-    assert isinstance(place, StorePlace)
+    assert not place.has_locks
+    place.write("claims/one", b".")
     with place.hold_claim("claims/one") as lost:
-        assert lost == 0
-        assert place.is_held("claims/one")
-        with place.hold_claim("claims/one") as other:
-            assert other is None
-    assert not place.is_held("claims/one")
-    old = json.loads(make_lease("someone", 1)) | {"renewed": time.time() - 1000}
-    place.write("claims/two", json.dumps(old).encode())
-    with place.hold_claim("claims/two") as lost:
-        assert lost == 2
+        assert lost == 1
+        assert place.read("claims/one") == b".."
+        assert not place.is_held("claims/one")
     assert place.list_names("claims") == set()
 
 
@@ -301,7 +329,8 @@ def test_a_batch_does_what_complete_does_and_tells_of_what_is_broken(
     assert "There is no " in rows["nowhere"]["reason"]
     assert "--targt" in rows["typo"]["reason"]
     assert rows["room-0"]["psnr_after"] > rows["room-0"]["psnr_before"]
-    assert {"open", "context", "lift", "report"} <= set(rows["room-0"]["stages"])
+    for cost in ("seconds", "cpu_seconds", "written_bytes", "result_bytes"):
+        assert rows["room-0"][cost] > 0
     table = (out / "table.csv").read_text().splitlines()
     assert len(table) == 5
     page = (out / "index.html").read_text()
@@ -323,14 +352,15 @@ def test_a_store_gets_the_same_results_and_needs_no_folder_here(manifest, tmp_pa
     [job] = [j for j in read_manifest(str(manifest), {}) if j.name == "room-0"]
     room = {**job.options, "folder": f"file://{job.options['folder']}"}
     here, there = tmp_path / "here", tmp_path / "there"
-    assert JobCompleter(str(here), 0)(job).state == "done"
-    outcome = JobCompleter(f"file://{there}", 0)(Job("room-0", room))
-    assert outcome.state == "done", outcome.reason
+    JobCompleter(str(here), 0)(job)
+    JobCompleter(f"file://{there}", 0)(Job("room-0", room))
+    for out in (here, there):
+        assert row_of(out, "room-0")["state"] == "done", row_of(out, "room-0")["reason"]
     same_results(here, there / "jobs", "room-0")
     missing_there = {**room, "folder": f"file://{tmp_path}/nothing"}
-    outcome = JobCompleter(f"file://{there}", 0)(Job("gone", missing_there))
-    assert outcome.state == "failed"
-    assert "There is nothing at" in outcome.reason
+    JobCompleter(f"file://{there}", 0)(Job("gone", missing_there))
+    assert row_of(there, "gone")["state"] == "failed"
+    assert "There is nothing at" in row_of(there, "gone")["reason"]
 
 
 def test_a_folder_of_something_else_is_refused(tmp_path, manifest, monkeypatch, capsys):
@@ -345,7 +375,8 @@ def test_ray_does_what_is_told_and_tells_of_lost_workers(tmp_path, monkeypatch):
     pytest.importorskip("ray")
     monkeypatch.setenv("PYTHONPATH", os.pathsep.join(p for p in sys.path if p))
     jobs = [Job("bad", {"ends": "always killed"}), *plain_jobs(3, 0.0)]
-    found = {o.job.name: o.state for o in outcomes(tmp_path, jobs, engine_named("ray", 1), 0)}
+    names = run_all(tmp_path, jobs, engine_named("ray", 1), 0)
+    found = {name: row_of(tmp_path, name)["state"] for name in names}
     assert found == {"bad": "failed", "job-000": "done", "job-001": "done", "job-002": "done"}
 
 
@@ -355,7 +386,8 @@ def test_submitit_does_the_shares_and_a_lost_one_is_done_again(tmp_path, monkeyp
     monkeypatch.setenv("PYTHONPATH", os.pathsep.join(p for p in sys.path if p))
     jobs = [Job("shy", {"ends": "killed once"}), *plain_jobs(4, 0.0)]
     engine = SubmititEngine(2, 1, 0.0, tmp_path / "submitit", {})
-    found = {o.job.name: o.state for o in outcomes(tmp_path, jobs, engine, retries=1)}
+    names = run_all(tmp_path, jobs, engine, retries=1)
+    found = {name: row_of(tmp_path, name)["state"] for name in names}
     assert found == dict.fromkeys((job.name for job in jobs), "done")
     assert {name: len(pids) for name, pids in lines(tmp_path / "ended").items()} == {
         job.name: 1 for job in jobs

@@ -18,8 +18,7 @@ from gscompleter.data.cases import Case, open_clips
 from gscompleter.data.formats import open_photographs
 from gscompleter.data.photographs import Photographs
 from gscompleter.data.scene import write_cameras
-from gscompleter.evaluation.protocols import parse_protocol
-from gscompleter.evaluation.tasks import make_tasks
+from gscompleter.evaluation.protocols import make_tasks, parse_protocol
 from gscompleter.io.image import read_image, write_image
 from gscompleter.io.json_file import read_json
 from gscompleter.reconstructors import load_reconstructor

@@ -13,16 +13,15 @@ from torch import Tensor
 
 from gscompleter.errors import InputError
 from gscompleter.evaluation.metrics.fid import fid
-from gscompleter.evaluation.metrics.flip import compute_flip_map
 from gscompleter.evaluation.metrics.geometry import (
     Alignment,
     compute_abs_rel,
-    compute_cloud_distances,
+    compute_f_score,
+    compute_nearest_distances,
     count_known,
     measure_alignment,
     measure_primitive_alignment,
 )
-from gscompleter.evaluation.metrics.haarpsi import haarpsi
 from gscompleter.evaluation.metrics.image import (
     MAX_PSNR,
     compute_gradient_energy_ratio,
@@ -30,13 +29,13 @@ from gscompleter.evaluation.metrics.image import (
     psnr,
     ssim,
 )
+from gscompleter.evaluation.metrics.perceptual import compute_flip_map, haarpsi
 from gscompleter.evaluation.metrics.scores import Truth, measure_perceptual_quality, score
 from gscompleter.image_ops import dilate
 from gscompleter.render import load_renderer
 from gscompleter.stages.filter_holes import select_in_mask
 from gscompleter.stages.target_view import compute_hole_mask
-from gscompleter.state import TargetResult
-from gscompleter.types import Camera, DepthAffine, Gaussians, merge
+from gscompleter.types import Camera, Gaussians, View, merge
 from scenes import Room, camera_at, gaussians_of, scaled, view_of
 
 
@@ -143,6 +142,11 @@ def left_half(image: Tensor) -> Tensor:
     return (torch.arange(image.shape[1]) < image.shape[1] // 2).expand(image.shape[:2])
 
 
+def photograph_of(image: Tensor) -> View:
+    height, width = image.shape[:2]
+    return View(image, replace(camera_at(), height=height, width=width))
+
+
 def test_haarpsi_is_that_of_piq():
     """Compare with values of piq for the same images, in float64."""
     generator = torch.Generator().manual_seed(0)
@@ -208,8 +212,9 @@ def test_looks_are_of_the_pixels_that_are_asked_for():
     damaged = torch.where(left_half(truth)[..., None], blurred(truth, 2.0), truth)
     inside = torch.arange(truth.shape[1]) < truth.shape[1] // 2 - 12
     outside = torch.arange(truth.shape[1]) > truth.shape[1] // 2 + 12
+    photograph = photograph_of(truth)
     bad, good = (
-        measure_perceptual_quality(damaged, truth, where.expand(truth.shape[:2]))
+        measure_perceptual_quality(damaged, photograph, where.expand(truth.shape[:2]))
         for where in (inside, outside)
     )
     assert bad.flip > 0.1
@@ -218,9 +223,8 @@ def test_looks_are_of_the_pixels_that_are_asked_for():
     assert good.flip == pytest.approx(0.0, abs=1e-3)
     assert good.haarpsi == pytest.approx(1.0)
     assert good.gradient_energy == 1.0
-    nothing = measure_perceptual_quality(
-        damaged, truth, torch.zeros(truth.shape[:2], dtype=torch.bool)
-    )
+    nowhere = torch.zeros(truth.shape[:2], dtype=torch.bool)
+    nothing = measure_perceptual_quality(damaged, photograph, nowhere)
     assert (nothing.flip, nothing.haarpsi, nothing.gradient_energy) == (None, None, None)
 
 
@@ -228,7 +232,7 @@ def test_flip_is_none_without_its_package(monkeypatch: pytest.MonkeyPatch):
     monkeypatch.setitem(sys.modules, "flip_evaluator", None)
     image, truth = images()
     assert compute_flip_map(image, truth) is None
-    assert measure_perceptual_quality(image, truth, left_half(truth)).flip is None
+    assert measure_perceptual_quality(image, photograph_of(truth), left_half(truth)).flip is None
 
 
 # Depth
@@ -265,55 +269,58 @@ def brute_force(a: Tensor, b: Tensor) -> tuple[np.ndarray, np.ndarray]:
     return distances.min(1), distances.min(0)
 
 
+def distances(a: Tensor, b: Tensor) -> tuple[np.ndarray, np.ndarray]:
+    return compute_nearest_distances(a, b), compute_nearest_distances(b, a)
+
+
 @pytest.mark.parametrize("seed", range(3))
-def test_chamfer_and_f_score_agree_with_brute_force(seed: int):
+def test_distances_and_f_score_agree_with_brute_force(seed: int):
     generator = torch.Generator().manual_seed(seed)
     a = torch.randn(150, 3, generator=generator)
     b = torch.randn(220, 3, generator=generator) * 1.2 + 0.2
     there, back = brute_force(a, b)
-    assert compute_cloud_distances(a, b).chamfer == pytest.approx(
-        (there.mean() + back.mean()) / 2, rel=1e-12
-    )
+    for found, expected in zip(distances(a, b), (there, back), strict=True):
+        assert found == pytest.approx(expected, rel=1e-12)
     for threshold in (0.2, 0.4, 0.8):
         precision, recall = (there <= threshold).mean(), (back <= threshold).mean()
         expected = 2 * precision * recall / (precision + recall)
-        assert compute_cloud_distances(a, b).compute_f_score(threshold) == pytest.approx(expected)
-        assert compute_cloud_distances(b, a).compute_f_score(threshold) == pytest.approx(expected)
+        assert compute_f_score(*distances(a, b), threshold) == pytest.approx(expected)
+        assert compute_f_score(*distances(b, a), threshold) == pytest.approx(expected)
 
 
 def test_a_plane_moved_along_its_normal_is_that_far_away():
     y, x = torch.meshgrid(torch.arange(20.0), torch.arange(20.0), indexing="ij")
     plane = torch.stack([x, y, torch.zeros_like(x)], dim=-1).reshape(-1, 3)
     moved = plane + torch.tensor([0.0, 0.0, 0.25])
-    assert compute_cloud_distances(plane, moved).chamfer == pytest.approx(0.25)
-    assert compute_cloud_distances(plane, moved).compute_f_score(0.2) == 0.0
-    assert compute_cloud_distances(plane, moved).compute_f_score(0.3) == 1.0
+    assert compute_nearest_distances(plane, moved) == pytest.approx(0.25)
+    assert compute_f_score(*distances(plane, moved), 0.2) == 0.0
+    assert compute_f_score(*distances(plane, moved), 0.3) == 1.0
 
 
 def test_coinciding_points_are_at_distance_zero():
     points = torch.randn(50, 3, generator=torch.Generator().manual_seed(0)).repeat(20, 1)
-    assert compute_cloud_distances(points, points[:50]).chamfer == 0.0
-    assert compute_cloud_distances(points, points[:50]).compute_f_score(1e-9) == 1.0
+    assert compute_nearest_distances(points, points[:50]).max() == 0.0
+    assert compute_f_score(*distances(points, points[:50]), 1e-9) == 1.0
 
 
 def test_hundreds_of_thousands_of_points_are_no_trouble():
     generator = torch.Generator().manual_seed(0)
     a, b = (torch.rand(200_000, 3, generator=generator) for _ in range(2))
-    distances = compute_cloud_distances(a, b)
-    assert distances.a_to_b.shape == distances.b_to_a.shape == (200_000,)
+    found = compute_nearest_distances(a, b)
+    assert found.shape == (200_000,)
     # A Poisson process of density n: mean nearest distance 0.554 n^(-1/3), more at the border.
-    assert distances.chamfer == pytest.approx(0.554 * 200_000 ** (-1 / 3), rel=0.05)
+    assert found.mean() == pytest.approx(0.554 * 200_000 ** (-1 / 3), rel=0.05)
     few = torch.arange(0, 200_000, 4_000)
     expected = torch.cdist(a[few].double(), b.double()).amin(1)
-    assert distances.a_to_b[few] == pytest.approx(expected.numpy(), abs=1e-6)
+    assert found[few] == pytest.approx(expected.numpy(), abs=1e-6)
 
 
 def test_an_empty_or_endless_set_of_points_is_refused():
     points = torch.zeros(5, 3)
     with pytest.raises(InputError, match="points on both sides, got 5 and 0"):
-        compute_cloud_distances(points, points[:0])
+        compute_nearest_distances(points, points[:0])
     with pytest.raises(InputError, match="finite"):
-        compute_cloud_distances(points, points.log())
+        compute_nearest_distances(points, points.log())
 
 
 # Alignment of a completion with its context
@@ -325,13 +332,6 @@ RENDERER = load_renderer("cpu")
 
 def room_context(unit: float = 1.0) -> Gaussians:
     return gaussians_of(view_of(Room(unit=unit), camera_at(size=64, unit=unit)))
-
-
-def completed(context: Gaussians, added: Gaussians, target: Camera = TARGET) -> TargetResult:
-    """Make a result that added `added` to `context`."""
-    before = RENDERER.render(context, target)
-    mask = compute_hole_mask(before.alpha)
-    return TargetResult(target, before, before, mask, None, 0, False, DepthAffine(), added)
 
 
 def filling(context: Gaussians, factor: float = 1.0, dilation: int = 3) -> Gaussians:
@@ -485,9 +485,6 @@ def test_fid_hands_over_batches_of_channels_first(monkeypatch: pytest.MonkeyPatc
     class Metric:
         def __init__(self, feature: int, normalize: bool) -> None:
             assert (feature, normalize) == (2048, True)
-
-        def to(self, device: str) -> "Metric":
-            return self
 
         def update(self, batch: Tensor, real: bool) -> None:
             seen.append((tuple(batch.shape), real))

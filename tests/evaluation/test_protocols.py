@@ -14,15 +14,14 @@ from gscompleter.data.formats import open_photographs
 from gscompleter.data.photographs import Photographs
 from gscompleter.evaluation.protocols import (
     EvaluationIndex,
-    Extrapolation,
     Split,
-    StressTest,
     build_index,
+    find_neighbours,
+    make_tasks,
     parse_protocol,
     read_evaluation_index,
     write_evaluation_index,
 )
-from gscompleter.evaluation.tasks import find_neighbours, make_tasks
 from gscompleter.types import View
 
 
@@ -46,7 +45,7 @@ class Frames(Photographs):
 
 def test_two_frames_are_extrapolated_to_a_third_in_both_directions():
     index = build_index(
-        Extrapolation(10, stride=2), [Frames("a", 24), Frames("b", 21), Frames("c", 20)]
+        parse_protocol("n-10-stride-2"), [Frames("a", 24), Frames("b", 21), Frames("c", 20)]
     )
     there = [((n, n + 10), (n + 20,)) for n in (0, 2)]
     back = [((n + 20, n + 10), (n,)) for n in (0, 2)]
@@ -58,14 +57,14 @@ def test_two_frames_are_extrapolated_to_a_third_in_both_directions():
 
 
 def test_without_a_stride_no_two_starts_share_a_frame():
-    splits = Extrapolation(3).select_splits(Frames("a", 50))
+    splits = parse_protocol("n-3").select_splits(Frames("a", 50))
     used = [sorted({*split.context, *split.targets}) for split in splits[::2]]
     assert used == [[n, n + 3, n + 6] for n in range(0, 44, 7)]
 
 
 def test_the_stress_test_needs_a_hundred_frames():
-    assert StressTest().select_splits(Frames("a", 100)) == (Split((0, 30), (99,)),)
-    assert StressTest().select_splits(Frames("a", 99)) == ()
+    assert parse_protocol("stress").select_splits(Frames("a", 100)) == (Split((0, 30), (99,)),)
+    assert parse_protocol("stress").select_splits(Frames("a", 99)) == ()
 
 
 @pytest.mark.parametrize("text", ["n-10", "n-30-stride-5", "stress"])
@@ -107,7 +106,7 @@ def test_a_case_has_one_target_and_loads_its_views():
 
 def test_an_index_is_read_back_as_it_was_written(tmp_path):
     clips = [Frames("a", 64), Frames('odd "ü" name', 30), Frames("short", 3)]
-    index = build_index(Extrapolation(10, 4), clips)
+    index = build_index(parse_protocol("n-10-stride-4"), clips)
     write_evaluation_index(tmp_path / "index.json", index)
     assert read_evaluation_index(tmp_path / "index.json") == index
     assert parse_protocol(str(tmp_path / "index.json")) == index
@@ -120,14 +119,14 @@ def test_an_index_is_read_back_as_it_was_written(tmp_path):
 
 
 def test_an_index_of_no_clips_is_an_index(tmp_path):
-    index = build_index(Extrapolation(10), [])
+    index = build_index(parse_protocol("n-10"), [])
     write_evaluation_index(tmp_path / "index.json", index)
     assert read_evaluation_index(tmp_path / "index.json") == index
 
 
 def test_two_clips_of_one_name_are_refused():
     with pytest.raises(InputError, match="Two clips are called a"):
-        build_index(Extrapolation(10), [Frames("a", 30), Frames("a", 30)])
+        build_index(parse_protocol("n-10"), [Frames("a", 30), Frames("a", 30)])
 
 
 @pytest.mark.parametrize(

@@ -13,26 +13,25 @@ import torch
 
 from command import run
 from gscompleter import InputError
-from gscompleter.data.frame import Frame
 from gscompleter.data.photographs import Photographs
-from gscompleter.evaluation import methods, steps
+from gscompleter.evaluation import methods, steps, store
 from gscompleter.evaluation.baselines.reggs import RegGSConfig
 from gscompleter.evaluation.methods import METHODS
+from gscompleter.evaluation.metrics import scores
+from gscompleter.evaluation.metrics.scores import compute_depth_scale
 from gscompleter.evaluation.plots import draw_plots
-from gscompleter.evaluation.protocols import ViewByView, parse_protocol
+from gscompleter.evaluation.protocols import Task, explain_skip, make_tasks, parse_protocol
 from gscompleter.evaluation.runner import RowCounts, RunConfig, evaluate, prepare_task
 from gscompleter.evaluation.steps import (
     PreparedTask,
     Progress,
     complete_task,
-    compute_depth_scale,
     compute_scale_drift,
     get_metric_depth,
 )
 from gscompleter.evaluation.store import read_json
 from gscompleter.evaluation.summary import SEQUENCE, average_gains_by_gap
 from gscompleter.evaluation.tables import write_tables
-from gscompleter.evaluation.tasks import Task, make_tasks
 from gscompleter.geometry import slide
 from gscompleter.io.image import read_pixels
 from gscompleter.types import View
@@ -72,12 +71,12 @@ class Walk(Photographs):
         return None
 
 
-def walk(protocol: ViewByView = ViewByView(1), **settings) -> Task:
-    (task,) = make_tasks(protocol, Walk(**settings))
+def walk(protocol: str = "sequence-1", **settings) -> Task:
+    (task,) = make_tasks(parse_protocol(protocol), Walk(**settings))
     return task
 
 
-SHORT = walk(ViewByView(1, steps=2))
+SHORT = walk("sequence-1-steps-2")
 FOLDER = "walk-0+1-to-2..3"
 
 
@@ -99,7 +98,7 @@ def few_clusters():
 def small_holes():
     """Accept the small holes of this room, of about 45 to 60 pixels."""
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(steps, "MIN_PIXELS", 40)
+        patch.setattr(scores, "MIN_PIXELS", 40)
         yield
 
 
@@ -155,22 +154,20 @@ def psnr_of(step: dict, when: str = "after") -> float:
 
 
 def test_a_sequence_begins_with_two_frames_and_goes_on_by_the_same_step():
-    task = walk(ViewByView(4), name="fox", num_frames=43)
+    task = walk("sequence-4", name="fox", num_frames=43)
     assert (task.context, task.targets) == ((0, 4), tuple(range(8, 41, 4)))
     assert task.name == "fox 0+4>8..40"
-    assert walk(ViewByView(4, steps=1), name="fox", num_frames=43).name == "fox 0+4>8"
+    assert walk("sequence-4-steps-1", name="fox", num_frames=43).name == "fox 0+4>8"
     assert len(walk(name="long", num_frames=999).targets) == 255
 
 
 def test_a_clip_that_is_too_short_is_told_apart_from_one_that_is_not():
-    protocol = ViewByView(2)
-    assert make_tasks(protocol, Walk("short", num_frames=4)) == []
-    short = protocol.explain_skip(Walk("short", num_frames=4))
+    protocol = parse_protocol("sequence-2")
+    assert make_tasks(protocol, Walk("short", 4)) == []
+    short = explain_skip(protocol, Walk("short", 4))
     assert short == "it has 4 frames, and sequence-2 needs 5"
-    assert protocol.explain_skip(Walk("walk", num_frames=5)) is None
-    assert [task.name for task in make_tasks(protocol, Walk("walk", num_frames=5))] == [
-        "walk 0+2>4"
-    ]
+    assert explain_skip(protocol, Walk("walk", 5)) is None
+    assert [task.name for task in make_tasks(protocol, Walk("walk", 5))] == ["walk 0+2>4"]
 
 
 @pytest.mark.parametrize("text", ["sequence-4", "sequence-12-steps-6"])
@@ -180,7 +177,7 @@ def test_a_sequence_is_called_what_it_was_asked_for_as(text):
 
 @pytest.mark.parametrize("text", ["sequence-0", "sequence-4-steps-0", "sequence-4-steps-256"])
 def test_a_sequence_of_nothing_or_too_much_is_refused(text):
-    with pytest.raises(InputError, match="impossible; give"):
+    with pytest.raises(InputError, match="is impossible"):
         parse_protocol(text)
 
 
@@ -291,7 +288,7 @@ def test_the_gain_of_a_step_counts_by_its_distance_to_what_is_known_by_then():
 
 def test_a_stopped_sequence_goes_on_after_its_last_whole_step(finished, tmp_path, monkeypatch):
     out = tmp_path / "out"
-    original = steps.save_prediction
+    original = store.save_prediction
 
     def stopped(path, prediction):
         original(path, prediction)
@@ -299,7 +296,7 @@ def test_a_stopped_sequence_goes_on_after_its_last_whole_step(finished, tmp_path
             path.write_bytes(path.read_bytes()[:100])
             raise KeyboardInterrupt
 
-    monkeypatch.setattr(steps, "save_prediction", stopped)
+    monkeypatch.setattr(store, "save_prediction", stopped)
     method = "full"
     with pytest.raises(KeyboardInterrupt):
         evaluate([SHORT], METHOD_NAMES, out, CONFIG)
@@ -313,7 +310,7 @@ def test_a_stopped_sequence_goes_on_after_its_last_whole_step(finished, tmp_path
         saved.append(f"{path.parent.name} {path.stem}")
         original(path, prediction)
 
-    monkeypatch.setattr(steps, "save_prediction", recorded)
+    monkeypatch.setattr(store, "save_prediction", recorded)
     assert evaluate([SHORT], METHOD_NAMES, out, CONFIG) == RowCounts(1, 0, 2)
     assert saved == ["reggs step-002"]
     same_results(out, finished)

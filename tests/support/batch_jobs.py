@@ -13,12 +13,10 @@ from pathlib import Path
 from typing import Any
 
 from gscompleter.errors import InputError
-from gscompleter.jobs.engines import Engine
-from gscompleter.jobs.engines.local import LocalEngine
-from gscompleter.jobs.engines.ray import RayEngine
-from gscompleter.jobs.jobs import JOBS, Job, Outcome, find_missing_jobs, run_claimed
-from gscompleter.jobs.places import FolderPlace
-from gscompleter.jobs.rounds import BatchRows, Rounds
+from gscompleter.jobs.engines import LocalEngine, RayEngine
+from gscompleter.jobs.jobs import JOBS, Job, find_missing_jobs, list_done_jobs, run_claimed
+from gscompleter.jobs.places import open_place
+from gscompleter.jobs.workers import Engine, run_jobs
 
 
 @dataclass(frozen=True)
@@ -28,15 +26,15 @@ class Writing:
     out: str
     retries: int = 2
 
-    def __call__(self, job: Job) -> Outcome:
-        place = FolderPlace(Path(self.out))
-        return run_claimed(job, place, lambda: self.written(job), self.retries)
+    def __call__(self, job: Job) -> None:
+        run_claimed(job, open_place(self.out), lambda: self.written(job), self.retries)
 
     def written(self, job: Job) -> dict[str, Any]:
-        noted(Path(self.out) / "begun" / job.name)
+        folder = Path(self.out.removeprefix("file://"))
+        noted(folder / "begun" / job.name)
         time.sleep(job.options.get("seconds", 0.0))
         ends = job.options.get("ends")
-        times = len((Path(self.out) / "begun" / job.name).read_text().split())
+        times = len((folder / "begun" / job.name).read_text().split())
         if ends == "always killed" or (ends == "killed once" and times == 1):
             os.kill(os.getpid(), signal.SIGKILL)
         if ends == "sentence":
@@ -44,8 +42,8 @@ class Writing:
         if ends == "defect" or (ends == "defect once" and times == 1):
             raise KeyError("a defect")
         content = hashlib.sha256(job.name.encode()).hexdigest().encode()
-        FolderPlace(Path(self.out)).write(f"{JOBS}/{job.name}/result", content)
-        noted(Path(self.out) / "ended" / job.name)
+        open_place(self.out).write(f"{JOBS}/{job.name}/result", content)
+        noted(folder / "ended" / job.name)
         return {"size": len(content)}
 
 
@@ -56,13 +54,14 @@ def noted(path: Path) -> None:
         file.write(f"{os.getpid()}\n")
 
 
-def outcomes(out: Path, jobs: Sequence[Job], engine: Engine, retries: int = 2) -> list[Outcome]:
-    """Run the jobs without a row and yield their outcomes."""
-    place = FolderPlace(out)
-    rounds = Rounds(
-        place, BatchRows(place), find_missing_jobs(jobs, place, rerun_failed=False), retries
-    )
-    return list(rounds.run(engine, Writing(str(out), retries)))
+def run_all(
+    out: Path | str, jobs: Sequence[Job], engine: Engine | None, retries: int = 2
+) -> list[str]:
+    """Run the jobs without a row, and return their names in the order in which they ended."""
+    place, perform = open_place(str(out)), Writing(str(out), retries)
+    left = find_missing_jobs(jobs, place, rerun_failed=False)
+    ended = run_jobs(place, left, perform, lambda: list_done_jobs(place), engine, retries)
+    return [job.name for job in ended]
 
 
 def engine_named(name: str, workers: int) -> Engine:
@@ -76,4 +75,4 @@ def plain_jobs(count: int, seconds: float) -> list[Job]:
 if __name__ == "__main__":
     engine, out, count, seconds, workers = sys.argv[1:]
     jobs = plain_jobs(int(count), float(seconds))
-    outcomes(Path(out), jobs, engine_named(engine, int(workers)))
+    run_all(Path(out), jobs, engine_named(engine, int(workers)))

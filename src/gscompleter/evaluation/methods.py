@@ -41,11 +41,7 @@ class Models:
 
     def limit_iterations(self, num_iterations: int) -> int:
         """Limit a number of iterations to `baseline_iterations`."""
-        return (
-            num_iterations
-            if self.baseline_iterations is None
-            else min(num_iterations, self.baseline_iterations)
-        )
+        return min(num_iterations, self.baseline_iterations or num_iterations)
 
 
 @dataclass(frozen=True)
@@ -101,7 +97,7 @@ def make_optimization_method(config: OptimizationConfig) -> Method:
             views = [*state.views, synthesize_reference(state, target, models)]
             with timed_stage("optimize"):
                 fitted = optimize(state.scene, views, models.renderer, models.seed, budget)
-        return Prediction(fitted.gaussians, None, seconds)
+        return Prediction(fitted, None, seconds)
 
     return method
 
@@ -124,7 +120,7 @@ def complete_by_similarity(state: Completion, target: Camera, models: Models) ->
         with timed_stage("register"):
             added = register_by_similarity(
                 pair.gaussians, state.scene, reference, models.renderer, models.seed, config
-            ).gaussians
+            )
     scene = merge([state.scene, added])
     return Prediction(scene, added, seconds, anchor.index, anchor.fallback, registered=added)
 

@@ -9,13 +9,7 @@ from typing import TYPE_CHECKING, Any
 from gscompleter.config import ABLATIONS
 from gscompleter.errors import InputError
 from gscompleter.evaluation.store import make_file_name
-from gscompleter.evaluation.summary import (
-    RunSummary,
-    StepRow,
-    compute_psnr_gain,
-    get_psnr_after,
-    rank_stage,
-)
+from gscompleter.evaluation.summary import GAIN, PSNR, RunSummary, StepRow, rank_stage
 from gscompleter.io.files import replace_file
 
 if TYPE_CHECKING:
@@ -23,6 +17,13 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 MARKERS = "osD^vP*X<>"
+
+STEP_CURVES: tuple[tuple[str, Callable[[StepRow], float | None]], ...] = (
+    ("PSNR after the step (dB)", PSNR.get_value),
+    ("depth scale", lambda step: step["depth_scale"]),
+    ("seconds", lambda step: step["seconds"]["total"]),
+)
+"""Curves of a sequence: title and value of a step."""
 
 
 class PlotsNotAvailable(InputError):  # noqa: N818  (a state of affairs, told in a sentence)
@@ -48,13 +49,6 @@ def draw_plots(summary: RunSummary, out: Path) -> list[Path]:
     return [*paths, save_plot(out / "seconds.png", draw_seconds, summary, height)]
 
 
-STEP_CURVES: tuple[tuple[str, Callable[[StepRow], float | None]], ...] = (
-    ("PSNR after the step (dB)", get_psnr_after),
-    ("depth scale", lambda step: step["depth_scale"]),
-    ("seconds", lambda step: step["seconds"]["total"]),
-)
-
-
 def save_curves(path: Path, steps: Mapping[str, Sequence[StepRow]]) -> Path:
     """Plot the steps of each method in one sequence."""
     figure = create_plot_figure(7.0)
@@ -63,9 +57,8 @@ def save_curves(path: Path, steps: Mapping[str, Sequence[StepRow]]) -> Path:
         for number, (method, found) in enumerate(steps.items()):
             known = [(s["frame"], v) for s in found if (v := of(s)) is not None]
             if known:
-                axes.plot(
-                    *zip(*known, strict=True), label=method, linewidth=1, **get_curve_style(number)
-                )
+                x, y = zip(*known, strict=True)
+                axes.plot(x, y, label=method, linewidth=1, **get_curve_style(number))
         axes.set_ylabel(title)
         axes.grid(alpha=0.3)
     if any(step["seconds"]["total"] > 0 for found in steps.values() for step in found):
@@ -106,52 +99,42 @@ def create_plot_figure(height: float) -> Figure:
 def select_plot_methods(methods: Sequence[str]) -> list[str]:
     """Select the methods for the plots: not the context, and no ablations beside other methods."""
     ablations = {*ABLATIONS, "unconstrained", *(f"paper/{name}" for name in ABLATIONS)}
-    others = [name for name in methods if name != "context" and name not in ablations]
-    return others or [name for name in methods if name != "context"] or list(methods)
+    completing = [name for name in methods if name != "context"]
+    others = [name for name in completing if name not in ablations]
+    return others or completing or list(methods)
 
 
 def draw_gain_by_hole(axes: Axes, summary: RunSummary) -> None:
     """Plot the ΔPSNR of each step against the hole fraction."""
     for number, method in enumerate(select_plot_methods(summary.methods)):
         steps = [step for row in summary.rows[method] for step in row["steps"]]
-        axes.plot(
-            [100 * step["scores"]["hole_fraction"] for step in steps],
-            [compute_psnr_gain(step) for step in steps],
-            linestyle="none",
-            label=method,
-            **get_curve_style(number),
-        )
+        holes = [100 * step["scores"]["hole_fraction"] for step in steps]
+        gains: Any = list(map(GAIN.get_value, steps))
+        axes.plot(holes, gains, linestyle="none", label=method, **get_curve_style(number))
     _finish_gain(axes, "hole at the target (% of its pixels)")
 
 
 def draw_gain_by_distance(axes: Axes, summary: RunSummary) -> None:
     """Plot the mean ΔPSNR against the frames to the nearest context frame."""
     for number, method in enumerate(select_plot_methods(summary.methods)):
-        gains = {
-            gap: value
-            for gap, cells in summary.gains.items()
-            if (value := cells[method].value) is not None
-        }
-        axes.plot(
-            list(gains), list(gains.values()), linewidth=1, label=method, **get_curve_style(number)
-        )
+        found = {gap: cells[method].value for gap, cells in summary.gains.items()}
+        gains = {gap: value for gap, value in found.items() if value is not None}
+        style = get_curve_style(number)
+        axes.plot(list(gains), list(gains.values()), linewidth=1, label=method, **style)
     axes.set_xticks(list(summary.gains))
     _finish_gain(axes, "frames from the target to the nearest context frame")
 
 
 def draw_seconds(axes: Axes, summary: RunSummary) -> None:
     """Draw one bar per method with the median seconds of each stage."""
-    seconds = {method: summary.compute_seconds(method) for method in summary.methods}
-    stages = sorted(
-        {s for found in seconds.values() for s in found if s != "total"}, key=rank_stage
-    )
-    left = [0.0] * len(summary.methods)
-    places = range(len(summary.methods))
-    for stage in stages:
-        widths = [seconds[method].get(stage, 0.0) for method in summary.methods]
-        axes.barh(places, widths, left=left, label=stage, height=0.7)
+    seconds = [summary.compute_seconds(method) for method in summary.methods]
+    stages = {stage for found in seconds for stage in found} - {"total"}
+    left = [0.0] * len(seconds)
+    for stage in sorted(stages, key=rank_stage):
+        widths = [found.get(stage, 0.0) for found in seconds]
+        axes.barh(range(len(seconds)), widths, left=left, label=stage, height=0.7)
         left = [start + width for start, width in zip(left, widths, strict=True)]
-    axes.set_yticks(places, summary.methods)
+    axes.set_yticks(range(len(seconds)), summary.methods)
     axes.invert_yaxis()
     axes.set_xlabel("median seconds per step")
 

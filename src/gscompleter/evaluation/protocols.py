@@ -1,4 +1,4 @@
-"""Evaluation protocols: which frames of a clip are context and which are targets.
+"""Evaluation protocols, which choose context and target frames, and the tasks that they make.
 
 There are published indices (`{scene: {"context", "target"} or null}`), the extrapolation `n-k`, a
 stress test, and `sequence-k`, which completes its targets one after the other into one scene.
@@ -9,16 +9,20 @@ from __future__ import annotations
 import json
 import os
 import re
-from collections.abc import Iterable, Mapping
-from dataclasses import dataclass
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from dataclasses import dataclass, field
+from functools import partial
 from pathlib import Path
-from typing import Any, Protocol, runtime_checkable
+from typing import Any
 
 from gscompleter.completer import MAX_TARGET_ID
-from gscompleter.data.photographs import Photographs
+from gscompleter.data.cases import Case
+from gscompleter.data.photographs import Photographs, apply_masks
+from gscompleter.data.resize import Resolution
 from gscompleter.errors import InputError, quote_value
 from gscompleter.io.files import replace_file
 from gscompleter.io.json_file import read_json
+from gscompleter.types import View
 
 VERSION = 1
 """Version of the files that `write_evaluation_index` writes."""
@@ -34,58 +38,20 @@ class Split:
     """True if all targets are completed into one scene, one after the other."""
 
 
-@runtime_checkable
-class EvaluationProtocol(Protocol):
-    """A deterministic rule that chooses frames."""
-
-    @property
-    def name(self) -> str:
-        """Name of the protocol for `parse_protocol` and the tables."""
-
-    def select_splits(self, clip: Photographs) -> tuple[Split, ...]:
-        """Return the splits of a clip; none if it is skipped."""
-
-
 @dataclass(frozen=True)
-class Extrapolation:
-    """Frames n, n + k → n + 2k and n + 2k, n + k → n, for n = 0, stride, 2 stride, …."""
+class FrameRule:
+    """A protocol that chooses frames by their number in a clip."""
 
-    k: int
-    stride: int | None = None
-    """Step of n; None means 2k + 1, so that the cases share no frame."""
-
-    def __post_init__(self) -> None:
-        if self.k < 1 or (self.stride is not None and self.stride < 1):
-            raise InputError(
-                f"An extrapolation over {self.k} frames with a stride of {self.stride} is "
-                "impossible; both have to be at least 1."
-            )
-
-    @property
-    def name(self) -> str:
-        """Name of the protocol."""
-        return f"n-{self.k}" + ("" if self.stride is None else f"-stride-{self.stride}")
+    name: str
+    """Name of the protocol for `parse_protocol` and the tables."""
+    split: Callable[[int], tuple[Split, ...]] = field(compare=False)
+    """Function that returns the splits of a clip with so many frames."""
+    sequence_frames: int | None = None
+    """Smallest number of frames of a sequence; None if targets are completed separately."""
 
     def select_splits(self, clip: Photographs) -> tuple[Split, ...]:
-        """Return the splits of a clip."""
-        k, stride = self.k, self.stride or 2 * self.k + 1
-        return tuple(
-            split
-            for n in range(0, len(clip) - 2 * k, stride)
-            for split in (Split((n, n + k), (n + 2 * k,)), Split((n + 2 * k, n + k), (n,)))
-        )
-
-
-@dataclass(frozen=True)
-class StressTest:
-    """Frames 0, 30 → 99: most of the target is outside the context."""
-
-    name: str = "stress"
-
-    def select_splits(self, clip: Photographs) -> tuple[Split, ...]:
-        """Return the split of a clip; none if it is too short."""
-        split = Split((0, 30), (99,))
-        return (split,) if len(clip) > max(split.targets) else ()
+        """Return the splits of a clip; none if it is too short."""
+        return self.split(len(clip))
 
 
 @dataclass(frozen=True)
@@ -103,55 +69,30 @@ class EvaluationIndex:
         return self.scenes.get(clip.name, ())
 
 
-@dataclass(frozen=True)
-class ViewByView:
-    """Frames 0, k → 2k, 3k, 4k, …: targets completed one after the other into one scene."""
-
-    k: int
-    """Step between frames."""
-    steps: int | None = None
-    """Maximum number of targets; None takes all frames of the clip, up to `MAX_TARGET_ID`."""
-
-    def __post_init__(self) -> None:
-        if self.k < 1:
-            raise InputError("A sequence of every 0th frame is impossible; give at least 1.")
-        if self.steps is not None and not 1 <= self.steps <= MAX_TARGET_ID:
-            raise InputError(
-                f"A sequence of {self.steps} steps is impossible; give 1 to {MAX_TARGET_ID}, the "
-                "number of targets that a .ply can tell apart."
-            )
-
-    @property
-    def name(self) -> str:
-        """Name of the protocol."""
-        return f"sequence-{self.k}" + ("" if self.steps is None else f"-steps-{self.steps}")
-
-    def select_splits(self, clip: Photographs) -> tuple[Split, ...]:
-        """Return the split of a clip; none if it is too short."""
-        targets = tuple(range(2 * self.k, len(clip), self.k))[: self.steps or MAX_TARGET_ID]
-        return (Split((0, self.k), targets, is_sequence=True),) if targets else ()
-
-    def explain_skip(self, clip: Photographs) -> str | None:
-        """Explain why a clip has no split, or return None if it has one."""
-        needed = 2 * self.k + 1
-        if len(clip) >= needed:
-            return None
-        return f"it has {len(clip)} frames, and {self.name} needs {needed}"
-
-
-_PATTERNS: dict[str, type[Extrapolation | ViewByView]] = {
-    "n-([0-9]{1,6})(?:-stride-([0-9]{1,6}))?": Extrapolation,
-    "sequence-([0-9]{1,6})(?:-steps-([0-9]{1,6}))?": ViewByView,
-}
+EvaluationProtocol = FrameRule | EvaluationIndex
+"""A deterministic rule that chooses frames."""
 
 
 def parse_protocol(text: str) -> EvaluationProtocol:
     """Parse a protocol: `n-10`, `n-10-stride-5`, `stress`, `sequence-4` or the path of an index."""
-    for pattern, kind in _PATTERNS.items():
-        if match := re.fullmatch(pattern, text):
-            return kind(*(int(number) for number in match.groups() if number is not None))
+    number = "([0-9]{1,6})"
+    if match := re.fullmatch(f"n-{number}(?:-stride-{number})?", text):
+        k, stride = int(match[1]), int(match[2] or 2 * int(match[1]) + 1)
+        if k < 1 or stride < 1:
+            raise InputError(
+                f"The protocol {text} is impossible; its numbers have to be at least 1."
+            )
+        return FrameRule(text, partial(extrapolate, k, stride))
+    if match := re.fullmatch(f"sequence-{number}(?:-steps-{number})?", text):
+        k, steps = int(match[1]), int(match[2] or MAX_TARGET_ID)
+        if k < 1 or not 1 <= steps <= MAX_TARGET_ID:
+            raise InputError(
+                f"The protocol {text} is impossible; give every frame or fewer, and 1 to "
+                f"{MAX_TARGET_ID} steps, the number of targets that a .ply can tell apart."
+            )
+        return FrameRule(text, partial(split_sequence, k, steps), 2 * k + 1)
     if text == "stress":
-        return StressTest()
+        return FrameRule(text, split_stress_test)
     if os.path.isfile(text):
         return read_evaluation_index(text)
     raise InputError(
@@ -160,9 +101,37 @@ def parse_protocol(text: str) -> EvaluationProtocol:
     )
 
 
+def explain_skip(protocol: EvaluationProtocol, clip: Photographs) -> str | None:
+    """Explain why a clip has no sequence, or return None."""
+    needed = protocol.sequence_frames if isinstance(protocol, FrameRule) else None
+    if needed is None or len(clip) >= needed:
+        return None
+    return f"it has {len(clip)} frames, and {protocol.name} needs {needed}"
+
+
+def extrapolate(k: int, stride: int, num_frames: int) -> tuple[Split, ...]:
+    """Choose n, n + k → n + 2k and n + 2k, n + k → n, for n = 0, stride, 2 stride, …."""
+    return tuple(
+        split
+        for n in range(0, num_frames - 2 * k, stride)
+        for split in (Split((n, n + k), (n + 2 * k,)), Split((n + 2 * k, n + k), (n,)))
+    )
+
+
+def split_stress_test(num_frames: int) -> tuple[Split, ...]:
+    """Choose 0, 30 → 99: most of the target is outside the context."""
+    return (Split((0, 30), (99,)),) if num_frames > 99 else ()
+
+
+def split_sequence(k: int, steps: int, num_frames: int) -> tuple[Split, ...]:
+    """Choose 0, k → 2k, 3k, 4k, …: targets completed one after the other into one scene."""
+    targets = tuple(range(2 * k, num_frames, k))[:steps]
+    return (Split((0, k), targets, is_sequence=True),) if targets else ()
+
+
 def build_index(protocol: EvaluationProtocol, clips: Iterable[Photographs]) -> EvaluationIndex:
     """Write down the splits of each clip; raise InputError for equal names or a sequence."""
-    if isinstance(protocol, ViewByView):
+    if isinstance(protocol, FrameRule) and protocol.sequence_frames is not None:
         raise InputError(
             f"{protocol.name} has no index, because its targets depend on each other; give the "
             "protocol to `evaluate` instead."
@@ -190,8 +159,7 @@ def read_evaluation_index(path: Path | str) -> EvaluationIndex:
     if content["version"] != VERSION:
         raise InputError(
             f"{path} is of version {quote_value(content['version'])} and version {VERSION} can be "
-            "read; "
-            "update gscompleter, or write the index again."
+            "read; update gscompleter, or write the index again."
         )
     name, scenes = content.get("protocol"), content.get("scenes")
     if not isinstance(name, str) or not isinstance(scenes, dict):
@@ -206,14 +174,10 @@ def write_evaluation_index(path: Path | str, index: EvaluationIndex) -> None:
         for name, splits in index.scenes.items()
     }
     scenes |= dict.fromkeys(index.skipped)
-    rows = [f"  {json.dumps(name)}: {json.dumps(splits)}" for name, splits in scenes.items()]
-    text = (
-        f'{{\n "version": {VERSION},\n "protocol": {json.dumps(index.name)},\n "scenes": {{\n'
-        + ",\n".join(rows)
-        + "\n }\n}\n"
-    )
+    rows = ",\n".join(f"  {json.dumps(name)}: {json.dumps(s)}" for name, s in scenes.items())
+    head = f' "version": {VERSION},\n "protocol": {json.dumps(index.name)},\n "scenes": '
     with replace_file(path) as file:
-        file.write(text.encode())
+        file.write(f"{{\n{head}{{\n{rows}\n }}\n}}\n".encode())
 
 
 def _parse_index(name: str, content: Mapping[str, Any], path: Path) -> EvaluationIndex:
@@ -231,21 +195,88 @@ def _parse_splits(entry: Any, scene: str, path: Path) -> tuple[Split, ...]:
     if not rows or not all(isinstance(row, dict) for row in rows):
         raise InputError(
             f"The entry of the scene {scene} in {path} is {quote_value(entry)}; context and "
-            "target, "
-            "or null, are needed."
+            "target, or null, are needed."
         )
-    return tuple(
-        Split(_parse_frames(row, "context", scene, path), _parse_frames(row, "target", scene, path))
-        for row in rows
-    )
+    for row in rows:
+        for key in ("context", "target"):
+            frames = row.get(key)
+            whole = isinstance(frames, list) and all(type(f) is int and f >= 0 for f in frames)
+            if not whole or not frames:
+                raise InputError(
+                    f"The `{key}` of the scene {scene} in {path} is {quote_value(frames)}; a list "
+                    "of frame numbers, at least one, is needed."
+                )
+    return tuple(Split(tuple(row["context"]), tuple(row["target"])) for row in rows)
 
 
-def _parse_frames(row: dict[str, Any], key: str, scene: str, path: Path) -> tuple[int, ...]:
-    frames = row.get(key)
-    whole = isinstance(frames, list) and all(type(f) is int and f >= 0 for f in frames)
-    if not whole or not frames:
-        raise InputError(
-            f"The `{key}` of the scene {scene} in {path} is {quote_value(frames)}; a list of frame "
-            "numbers, at least one, is needed."
-        )
-    return tuple(frames)
+@dataclass(frozen=True)
+class Task:
+    """A scene with its context and target frames."""
+
+    scene: str
+    """Name of the clip."""
+    context: tuple[int, ...]
+    targets: tuple[int, ...]
+    """Target frames, completed in this order into one scene."""
+    load: Callable[[tuple[int, ...]], list[View]]
+    """Function that loads the photographs of frames."""
+    neighbours: tuple[int, ...] = ()
+    """Frames beside the target, for scoring only."""
+
+    @property
+    def name(self) -> str:
+        """Unique name of the task in a run, as in tables."""
+        first, last = self.targets[0], self.targets[-1]
+        span = f"{first}" if first == last else f"{first}..{last}"
+        return f"{self.scene} {'+'.join(map(str, self.context))}>{span}"
+
+
+def make_case_task(case: Case) -> Task:
+    """Make a task of a case of a `cases.json`."""
+    return Task(case.scene.name, case.context, (case.target,), case.load, case.neighbours)
+
+
+def make_tasks(
+    protocol: EvaluationProtocol,
+    clip: Photographs,
+    resolution: Resolution = None,
+    use_masks: bool = False,
+) -> list[Task]:
+    """Make the tasks of a clip: one per target, or one per sequence.
+
+    Args:
+        protocol: Chooses the frames.
+        clip: The photographs.
+        resolution: As in `Photographs.views`.
+        use_masks: True to ignore masked pixels of the photographs.
+    """
+    load = partial(load_clip_views, clip, resolution, use_masks)
+    tasks = []
+    for split in protocol.select_splits(clip):
+        for frame in (*split.context, *split.targets):
+            if frame >= len(clip):
+                raise InputError(
+                    f"The protocol {protocol.name} needs frame {frame} of {clip.name}, which "
+                    f"has {len(clip)} frames; use the index of this data set."
+                )
+        if split.is_sequence:
+            tasks.append(Task(clip.name, split.context, split.targets, load))
+            continue
+        for target in split.targets:
+            beside = find_neighbours(target, split.context, len(clip))
+            tasks.append(Task(clip.name, split.context, (target,), load, beside))
+    return tasks
+
+
+def load_clip_views(
+    clip: Photographs, resolution: Resolution, use_masks: bool, frames: tuple[int, ...]
+) -> list[View]:
+    """Load photographs of a clip, with the arguments of `make_tasks`."""
+    views = clip.views(frames, resolution)
+    return apply_masks(views, clip, resolution) if use_masks else views
+
+
+def find_neighbours(target: int, context: Sequence[int], num_frames: int) -> tuple[int, ...]:
+    """Return the frames before and after `target` that exist and are not context."""
+    beside = (target - 1, target + 1)
+    return tuple(frame for frame in beside if 0 <= frame < num_frames and frame not in context)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping, Sequence
 from contextlib import nullcontext
 from dataclasses import asdict, dataclass, field, replace
@@ -11,30 +12,17 @@ from typing import Any, Literal
 
 from gscompleter.config.generators import GeneratorSettings
 from gscompleter.errors import InputError
+from gscompleter.evaluation import store
 from gscompleter.evaluation.methods import Models, check_methods
-from gscompleter.evaluation.steps import PreparedTask, Step, attempt, complete_task, load_or_compute
-from gscompleter.evaluation.store import (
-    VERSION,
-    SavedContext,
-    claim,
-    get_row_path,
-    get_task_folder,
-    load_context,
-    make_file_name,
-    read_json,
-    save_context,
-    write_json,
-)
-from gscompleter.evaluation.tasks import Task
-from gscompleter.generators import Generator, load_generator
-from gscompleter.jobs.engines import Engine
-from gscompleter.jobs.jobs import CLAIMS, Job, Outcome
-from gscompleter.jobs.places import FolderPlace
-from gscompleter.jobs.rounds import Rounds, run_in_this_process
-from gscompleter.jobs.shards import check_shard
+from gscompleter.evaluation.protocols import Task
+from gscompleter.evaluation.steps import PreparedTask, attempt, complete_task, load_or_compute
+from gscompleter.generators import load_generator
+from gscompleter.jobs.jobs import Job, describe_loss
+from gscompleter.jobs.places import open_place
+from gscompleter.jobs.workers import Engine, check_shard, run_jobs
 from gscompleter.memory import check_memory
 from gscompleter.progress import Activity, show_activity, show_progress, stage
-from gscompleter.reconstructors import Reconstructor, load_reconstructor
+from gscompleter.reconstructors import load_reconstructor
 from gscompleter.render import load_renderer
 from gscompleter.stages.context import normalize_exposures, reconstruct_context, sort_by_frame
 from gscompleter.timing import record_seconds
@@ -61,22 +49,17 @@ class RunConfig:
     source: Mapping[str, Any] = field(default_factory=dict)
     """Origin of the tasks, so that no folder mixes two sources."""
 
-    def load_reconstructor(self) -> Reconstructor:
-        """Load Ψ; a model with weights is cached between tasks."""
-        weights = None if self.weights is None else Path(self.weights)
-        return load_reconstructor(self.reconstructor, weights, self.device)
-
-    def load_generator(self, targets: Sequence[View] = ()) -> Generator:
-        """Load Φ; a model with weights is cached between tasks."""
-        return load_generator(
-            self.generator, self.seed, targets, self.device, self.generator_settings
-        )
-
     def load_models(self, targets: Sequence[View]) -> Models:
-        """Load the models of a task; only the generator `oracle` uses the images of `targets`."""
+        """Load the models of a task; those with weights are cached between tasks.
+
+        Only the generator `oracle` uses the images of `targets`.
+        """
+        weights = None if self.weights is None else Path(self.weights)
         return Models(
-            self.load_reconstructor(),
-            self.load_generator(targets),
+            load_reconstructor(self.reconstructor, weights, self.device),
+            load_generator(
+                self.generator, self.seed, targets, self.device, self.generator_settings
+            ),
             load_renderer(self.device),
             self.seed,
             self.baseline_iterations,
@@ -105,7 +88,7 @@ def evaluate(
     config: RunConfig = RunConfig(),
     shard: tuple[int, int] = (0, 1),
     rerun: Rerun = "nothing",
-    engine: Engine = run_in_this_process,
+    engine: Engine | None = None,
 ) -> RowCounts:
     """Run methods on tasks and write a row of scores for each pair.
 
@@ -118,94 +101,99 @@ def evaluate(
         config: Settings that determine the numbers; the same as in earlier calls.
         shard: (i, n) selects the tasks i, i + n, i + 2n, ….
         rerun: Results of an earlier call to redo.
-        engine: Runs the jobs; simultaneous calls share the tasks.
+        engine: Starts workers; None uses this process. Simultaneous calls share the tasks.
 
     Raises:
         InputError: Invalid name or shard, other content in `out`, or a full disk.
     """
-    check_evaluation(tasks, methods, config, shard)
-    claim(out, collect_settings(config))
+    check_methods(methods, max((len(task.targets) for task in tasks), default=0))
+    check_shard(shard)
+    check_tasks(tasks)
+    config.load_models(())
+    store.claim(out, collect_settings(config))
     share = tasks[shard[0] :: shard[1]]
-    runner = TaskRunner(out, tuple(methods), config, rerun)
+    # Workers that are killed are counted; a killed command is simply run again.
+    runner = TaskRunner(out, tuple(methods), config, math.inf if engine is None else RETRIES)
+    for task in share:
+        for row in runner.find_rows(task):
+            if rerun == "scores" or (rerun == "failures" and has_failed(row)):
+                row.unlink(missing_ok=True)
     todo = {row: task for task in share for row in runner.find_missing_rows(task)}
     jobs = [make_task_job(task) for task in {task.name: task for task in todo.values()}.values()]
-    rounds = Rounds(FolderPlace(out), runner, jobs, RETRIES)
     activity = Activity("evaluating", len(todo))
+
+    def list_done() -> set[str]:
+        return {job.name for job in jobs if not runner.find_missing_rows(job.options["task"])}
+
     with show_activity(activity) if todo else nullcontext():
-        for outcome in rounds.run(engine, runner):
-            for _ in runner.get_row_paths(outcome.job.options["task"]) & set(todo):
+        for job in run_jobs(open_place(out), jobs, runner, list_done, engine, RETRIES):
+            for _ in set(runner.find_rows(job.options["task"])) & set(todo):
                 activity.count_step()
-    failed = sum(read_json(row).get("error") is not None for row in todo)
+    failed = sum(map(has_failed, todo))
     return RowCounts(len(todo) - failed, failed, len(share) * len(methods) - len(todo))
 
 
 def make_task_job(task: Task) -> Job:
     """Make a job of a task, with all its methods."""
-    return Job(make_file_name(task.name), {"task": task})
+    return Job(store.make_file_name(task.name), {"task": task})
+
+
+def has_failed(row: Path) -> bool:
+    """Return True if a row exists and holds an error."""
+    return row.exists() and store.read_json(row).get("error") is not None
 
 
 @dataclass(frozen=True)
 class TaskRunner:
-    """Runs the jobs of an evaluation and finds their results."""
+    """Runs the jobs of an evaluation and writes their rows."""
 
     out: Path
     methods: tuple[str, ...]
     config: RunConfig
-    rerun: Rerun = "nothing"
+    max_losses: float = math.inf
+    """Number of killed processes after which a task is given up."""
 
-    def get_row_paths(self, task: Task) -> set[Path]:
-        """Return the paths of the rows of a task."""
-        return {get_row_path(self.out, task.name, method) for method in self.methods}
+    def find_rows(self, task: Task) -> dict[Path, str]:
+        """Return the paths of the rows of a task, with their methods."""
+        return {store.get_row_path(self.out, task.name, method): method for method in self.methods}
 
     def find_missing_rows(self, task: Task) -> dict[Path, str]:
         """Return the rows of a task that have to be computed, with their methods."""
-        rows = {get_row_path(self.out, task.name, method): method for method in self.methods}
-        return {row: method for row, method in rows.items() if is_missing(row, self.rerun)}
+        return {row: m for row, m in self.find_rows(task).items() if not row.exists()}
 
-    def find_outcome(self, job: Job) -> Outcome | None:
-        """Return the outcome of a task that another process completed, or None."""
-        there = all(row.exists() for row in self.get_row_paths(job.options["task"]))
-        return Outcome(job, "done") if there else None
-
-    def give_up(self, job: Job, reason: str) -> Outcome:
-        """Write rows with the reason why there is no result."""
-        task = job.options["task"]
-        for row, method in self.find_missing_rows(task).items():
-            write_json(row, build_row(task, method, reason, get_task_folder(self.out, task.name)))
-        return Outcome(job, "failed", reason)
-
-    def __call__(self, job: Job) -> Outcome:
+    def __call__(self, job: Job) -> None:
         """Compute the missing rows of a task, unless another process does it."""
-        with FolderPlace(self.out).hold_claim(f"{CLAIMS}/{job.name}") as lost:
-            if lost is None:
-                return Outcome(job, "elsewhere")
-            self.run(job.options["task"])
-            return Outcome(job, "done")
+        task = job.options["task"]
+        if not self.find_missing_rows(task):
+            return
+        with open_place(self.out).hold_claim(job.claim) as lost:
+            if lost is not None:
+                self.run(task, describe_loss(lost) if lost > self.max_losses else None)
 
-    def run(self, task: Task) -> None:
-        """Compute the missing rows of a task."""
-        prepared, folder = None, get_task_folder(self.out, task.name)
+    def run(self, task: Task, prepared: PreparedTask | str | None) -> None:
+        """Compute the missing rows of a task; `prepared` may be an error."""
+        folder = store.get_task_folder(self.out, task.name)
         for row, method in self.find_missing_rows(task).items():
             # Progress inside a task would flood a log.
             with stage(f"{task.name}, {method}"), show_progress(None):
                 if prepared is None:
                     prepared = attempt(partial(prepare_task, task, folder, self.config))
                 made = build_row(task, method, prepared, folder)
-            write_json(row, made)
-
-
-def is_missing(path: Path, rerun: Rerun) -> bool:
-    """Return True if a row has to be computed."""
-    if rerun == "scores" or not path.exists():
-        return True
-    return rerun == "failures" and read_json(path).get("error") is not None
+            store.write_json(row, made)
 
 
 def prepare_task(task: Task, folder: Path, config: RunConfig) -> PreparedTask:
     """Load the photographs of a task, and load or reconstruct its initial scene."""
     views = sort_by_frame(load_task_views(task, task.context, config))
     neighbours = load_task_views(task, task.neighbours, config)
-    targets, error = load_readable_targets(task, config)
+    targets: list[View] = []
+    error = None
+    for frame in task.targets:
+        loaded = attempt(partial(load_task_views, task, (frame,), config))
+        if isinstance(loaded, str):
+            error = f"Frame {frame}: {loaded}"
+            break
+        targets += loaded
     if not targets:
         raise InputError(str(error))
     images = [*views, *targets]
@@ -235,18 +223,7 @@ def load_task_views(task: Task, frames: tuple[int, ...], config: RunConfig) -> l
     ]
 
 
-def load_readable_targets(task: Task, config: RunConfig) -> tuple[list[View], str | None]:
-    """Load the targets up to the first damaged photograph, and return its error."""
-    targets: list[View] = []
-    for frame in task.targets:
-        loaded = attempt(partial(load_task_views, task, (frame,), config))
-        if isinstance(loaded, str):
-            return targets, f"Frame {frame}: {loaded}"
-        targets += loaded
-    return targets, None
-
-
-def load_or_reconstruct(path: Path, views: Sequence[View], models: Models) -> SavedContext:
+def load_or_reconstruct(path: Path, views: Sequence[View], models: Models) -> store.SavedContext:
     """Load the scene saved at `path`, or reconstruct and save it."""
     device = views[0].image.device if views else "cpu"
 
@@ -257,46 +234,28 @@ def load_or_reconstruct(path: Path, views: Sequence[View], models: Models) -> Sa
         assert near is not None
         assert far is not None
         scene, gains = made.source.gaussians, made.exposure_gains
-        save_context(path, SavedContext(scene, near, far, seconds["total"], gains))
+        found = store.SavedContext(scene, near, far, seconds["total"], gains)
+        store.save_context(path, found)
 
-    return load_or_compute(path, lambda: load_context(path, device), save)
+    return load_or_compute(path, lambda: store.load_context(path, device), save)
 
 
 def build_row(
     task: Task, method: str, prepared: PreparedTask | str, folder: Path
 ) -> dict[str, Any]:
     """Build the row of a method on a task; `prepared` may be an error instead of a task."""
-    steps: tuple[Step, ...] = ()
-    error: str | None
-    if isinstance(prepared, str):
-        error, seconds = prepared, None
-    else:
+    found: dict[str, Any] = {"error": prepared, "reconstruct_seconds": None, "steps": []}
+    if not isinstance(prepared, str):
         progress = complete_task(prepared, method, folder)
-        steps, error, seconds = progress.steps, progress.error, prepared.seconds
-    return {
-        "version": VERSION,
-        "task": {
-            "name": task.name,
-            "context": list(task.context),
-            "targets": list(task.targets),
-            "neighbours": list(task.neighbours),
-        },
-        "method": method,
-        "error": error,
-        "reconstruct_seconds": seconds,
-        "steps": [asdict(step) for step in steps],
-    }
-
-
-def check_evaluation(
-    tasks: Sequence[Task], methods: Sequence[str], config: RunConfig, shard: tuple[int, int]
-) -> None:
-    """Raise InputError before anything is written if a run is impossible."""
-    check_methods(methods, max((len(task.targets) for task in tasks), default=0))
-    check_shard(shard)
-    check_tasks(tasks)
-    config.load_reconstructor()
-    config.load_generator()
+        steps = [asdict(step) for step in progress.steps]
+        found = {
+            "error": progress.error,
+            "reconstruct_seconds": prepared.seconds,
+            "steps": steps,
+        }
+    keys = ("name", "context", "targets", "neighbours")
+    named = {key: getattr(task, key) for key in keys}
+    return {"version": store.VERSION, "task": named, "method": method, **found}
 
 
 def check_tasks(tasks: Sequence[Task]) -> None:
@@ -308,7 +267,7 @@ def check_tasks(tasks: Sequence[Task]) -> None:
         )
     names: dict[str, str] = {}
     for task in tasks:
-        folder = make_file_name(task.name)
+        folder = store.make_file_name(task.name)
         if folder in names:
             raise InputError(
                 f"The cases {names[folder]} and {task.name} have the same name; rename a scene."

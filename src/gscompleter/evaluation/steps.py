@@ -14,31 +14,14 @@ from functools import partial
 from pathlib import Path
 from typing import TypeVar
 
-from jaxtyping import Bool
-from torch import Tensor
-
 from gscompleter.errors import InputError, OutputError
+from gscompleter.evaluation import store
 from gscompleter.evaluation.memory import measure_peak_memory
 from gscompleter.evaluation.methods import METHODS, Models, Prediction, mark_target
-from gscompleter.evaluation.metrics.scores import (
-    MIN_PIXELS,
-    Scores,
-    TargetRenders,
-    Truth,
-    compute_view_psnr,
-    score,
-)
-from gscompleter.evaluation.store import (
-    get_step_path,
-    get_truth_path,
-    load_prediction,
-    save_image,
-    save_prediction,
-)
-from gscompleter.render import Renderer
+from gscompleter.evaluation.metrics import scores as scoring
 from gscompleter.stages.lift import lift_pair
 from gscompleter.state import Completion
-from gscompleter.types import Camera, DepthMap, Gaussians, View
+from gscompleter.types import DepthMap, Gaussians, View
 
 T = TypeVar("T")
 
@@ -69,12 +52,12 @@ class Step:
     anchor: int | None
     """Anchor frame, or None for a method that lifts nothing."""
     anchor_fallback: bool
-    scores: Scores
+    scores: scoring.Scores
     """Scores of the scene before and after the step."""
     psnr_end: float | None
     """PSNR at the target, in dB, of the final scene of the task; None while the task runs."""
     depth_scale: float | None
-    """See `compute_depth_scale`; None in a task of one step or if too few pixels are covered."""
+    """See `scores.compute_depth_scale`; None in a task of one step or for too few pixels."""
     added: int
     gaussians: int
     """Number of Gaussians in the scene after the step."""
@@ -106,7 +89,11 @@ def complete_task(task: PreparedTask, method: str, folder: Path) -> Progress:
             progress = replace(progress, error=f"Frame {target.frame}: {following}")
             break
         progress = following
-    return add_final_psnr(progress, task.targets, task.models.renderer)
+    steps = []
+    for step, target in zip(progress.steps, task.targets, strict=False):  # the last may have failed
+        image = task.models.renderer.render(progress.scene, target.camera).image
+        steps.append(replace(step, psnr_end=scoring.compute_view_psnr(image, target)))
+    return replace(progress, steps=tuple(steps))
 
 
 def advance_task(
@@ -115,32 +102,22 @@ def advance_task(
     """Complete one more target and save its prediction and images."""
     number = len(progress.steps) + 1
     state = task.models.make_completer().begin(progress.views, progress.scene)
-    path = get_step_path(folder, method, number)
-    prediction = load_or_predict(method, state, target.camera, number, task.models, path)
-    step, seen = score_step(prediction, state, target, task)
-    save_image(path.with_suffix(".png"), seen.after.image)
-    save_image(path.with_name(f"before-{number:03d}.png"), seen.before.image)
-    save_image(get_truth_path(folder, number), target.image)
-    return replace(
-        progress,
-        scene=prediction.scene,
-        views=(*progress.views, target),
-        steps=(*progress.steps, step),
-    )
-
-
-def load_or_predict(
-    method: str, state: Completion, target: Camera, number: int, models: Models, path: Path
-) -> Prediction:
-    """Load the prediction at `path`, or compute and save it."""
+    path = store.get_step_path(folder, method, number)
 
     def save() -> None:
         with measure_peak_memory(state.scene.means.device) as peak:
-            made = METHODS[method](state, target, models)
+            made = METHODS[method](state, target.camera, task.models)
         made = mark_target(made, number, state.scene)
-        save_prediction(path, replace(made, peak_bytes=peak.bytes))
+        store.save_prediction(path, replace(made, peak_bytes=peak.bytes))
 
-    return load_or_compute(path, lambda: load_prediction(path, state.scene), save)
+    prediction = load_or_compute(path, lambda: store.load_prediction(path, state.scene), save)
+    step, seen = score_step(prediction, state, target, task)
+    store.save_image(path.with_suffix(".png"), seen.after.image)
+    store.save_image(path.with_name(f"before-{number:03d}.png"), seen.before.image)
+    store.save_image(store.get_truth_path(folder, number), target.image)
+    return Progress(
+        prediction.scene, (*progress.views, target), (*progress.steps, step), progress.error
+    )
 
 
 def load_or_compute(path: Path, load: Callable[[], T | None], save: Callable[[], None]) -> T:
@@ -159,25 +136,26 @@ def load_or_compute(path: Path, load: Callable[[], T | None], save: Callable[[],
 
 def score_step(
     prediction: Prediction, state: Completion, target: View, task: PreparedTask
-) -> tuple[Step, TargetRenders]:
+) -> tuple[Step, scoring.TargetRenders]:
     """Score a step and render its target camera."""
-    truth = Truth(state.views, target, task.neighbours)
+    truth = scoring.Truth(state.views, target, task.neighbours)
     before, after = state.scene, prediction.scene
-    scores, seen = score(
+    found, seen = scoring.score(
         before, after, prediction.added, truth, task.models.renderer, prediction.registered
     )
     anchor = None if prediction.anchor is None else state.views[prediction.anchor]
     scale = None
     if len(task.targets) > 1 and anchor is not None and prediction.added is not None:
         expected = get_metric_depth(target, anchor, task.models)
-        scale = compute_depth_scale(
+        scale = scoring.compute_depth_scale(
             prediction.added, seen.holes, target.camera, expected, task.models.renderer
         )
+    assert target.frame is not None
     step = Step(
-        frame=get_frame_number(target),
-        anchor=None if anchor is None else get_frame_number(anchor),
+        frame=target.frame,
+        anchor=None if anchor is None else anchor.frame,
         anchor_fallback=prediction.anchor_fallback,
-        scores=scores,
+        scores=found,
         psnr_end=None,
         depth_scale=scale,
         added=len(after) - len(before),
@@ -190,12 +168,6 @@ def score_step(
     return step, seen
 
 
-def get_frame_number(view: View) -> int:
-    """Return the frame number of a view."""
-    assert view.frame is not None
-    return view.frame
-
-
 def get_metric_depth(target: View, anchor: View, models: Models) -> DepthMap:
     """Return the measured depth of `target`, or an estimate of Ψ if the data have none."""
     if target.depth is not None:
@@ -203,37 +175,9 @@ def get_metric_depth(target: View, anchor: View, models: Models) -> DepthMap:
     return lift_pair(models.reconstructor, target, anchor).reference_depth
 
 
-def compute_depth_scale(
-    added: Gaussians,
-    holes: Bool[Tensor, "h w"],
-    target: Camera,
-    expected: DepthMap,
-    renderer: Renderer,
-) -> float | None:
-    """Compute the median of D_added / D_expected over the holes: 1 means metric scale.
-
-    D_added is the z-depth of `added` rendered alone. Only holes count, so that methods covering the
-    whole image are comparable. None for fewer than `MIN_PIXELS` pixels.
-    """
-    alone = renderer.render(added, target).depth_map()
-    both = holes & alone.valid & expected.valid
-    if both.sum() < MIN_PIXELS:
-        return None
-    return (alone.depth / expected.depth)[both].median().item()
-
-
 def compute_scale_drift(scales: Sequence[float]) -> float | None:
     """Compute max(ln s) - min(ln s) of the depth scales s; None for fewer than two."""
     return math.log(max(scales)) - math.log(min(scales)) if len(scales) > 1 else None
-
-
-def add_final_psnr(progress: Progress, targets: Sequence[View], renderer: Renderer) -> Progress:
-    """Set the PSNR of the final scene at each step."""
-    steps = []
-    for step, target in zip(progress.steps, targets, strict=False):  # the last may have failed
-        image = renderer.render(progress.scene, target.camera).image
-        steps.append(replace(step, psnr_end=compute_view_psnr(image, target)))
-    return replace(progress, steps=tuple(steps))
 
 
 def attempt(compute: Callable[[], T]) -> T | str:

@@ -11,11 +11,9 @@ tasks/TASK/METHOD/before-001.png    render at the first target before completion
 
 from __future__ import annotations
 
-import contextlib
 import json
-import os
 import re
-from collections.abc import Iterator, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -26,25 +24,20 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from gscompleter.errors import InputError, OutputError, quote_value
+from gscompleter.errors import InputError, quote_value
 from gscompleter.evaluation.methods import Prediction
 from gscompleter.io import json_file
-from gscompleter.io.files import UNFINISHED_PREFIX, replace_file
+from gscompleter.io.files import replace_file
 from gscompleter.io.image import write_image
+from gscompleter.jobs.places import convert_write_errors, open_place
 from gscompleter.types import Gaussians, merge
 
-RUN = "run.json"
-"""Name of the file with the settings of a run."""
-
-TASKS = "tasks"
-"""Name of the folder that holds the tasks."""
-
+RUN, TASKS = "run.json", "tasks"
+"""Names of the file with the settings of a run, and of the folder that holds the tasks."""
 VERSION = 3
 """Version of the files of a run."""
-
 REGISTERED_PREFIX = "registered_"
 """Prefix of the arrays of registered Gaussians in the file of a prediction."""
-
 _FIELDS = ("means", "quats", "scales", "opacities", "sh", "generated")
 
 Arrays = dict[str, np.ndarray]
@@ -86,8 +79,10 @@ def claim(out: Path, settings: Mapping[str, Any]) -> None:
     If several processes claim it simultaneously, one creates it and the others compare.
     """
     wanted = json.loads(json.dumps({"version": VERSION, **settings}))
-    if not is_run(out):
-        if has_other_content(out):
+    if not (out / RUN).is_file():
+        # Listed at once, as another process may be creating the run.
+        entries = open_place(out).list_names("")
+        if entries and RUN not in entries:
             raise InputError(f"{out} holds something other than a run; name another folder.")
         write_json(out / RUN, wanted, keep_existing=True)
     found = read_settings(out)
@@ -99,39 +94,18 @@ def claim(out: Path, settings: Mapping[str, Any]) -> None:
             )
 
 
-def check_run(out: Path) -> None:
-    """Raise InputError if `out` holds no run, or one of another version."""
-    if not is_run(out):
-        raise InputError(f"{out} holds no run; name a folder that `evaluate` wrote.")
-    read_settings(out)
-
-
 def read_settings(out: Path) -> dict[str, Any]:
-    """Read the settings of a run; raise InputError if they are damaged or of another version."""
+    """Read the settings of a run; raise InputError if `out` holds none of this version."""
+    if not (out / RUN).is_file():
+        raise InputError(f"{out} holds no run; name a folder that `evaluate` wrote.")
     found = read_json(out / RUN, "name another folder")
     version = found.get("version") if isinstance(found, dict) else None
     if version != VERSION:
         raise InputError(
             f"{out} holds a run of version {quote_value(version)}, and version {VERSION} is "
-            "needed; "
-            "name another folder and run it again."
+            "needed; name another folder and run it again."
         )
     return dict(found)
-
-
-def is_run(out: Path) -> bool:
-    """Return True if `out` is the folder of a run."""
-    return (out / RUN).is_file()
-
-
-def has_other_content(out: Path) -> bool:
-    """Return True if `out` exists and is neither empty, unfinished, nor a run."""
-    if not os.path.lexists(out):
-        return False
-    if not out.is_dir():
-        return True
-    entries = {name for name in os.listdir(out) if not name.startswith(UNFINISHED_PREFIX)}
-    return bool(entries) and RUN not in entries and not is_run(out)
 
 
 @dataclass(frozen=True)
@@ -168,19 +142,18 @@ def load_context(path: Path, device: torch.device | str) -> SavedContext | None:
 
 def save_prediction(path: Path, prediction: Prediction) -> None:
     """Write the added Gaussians, or the whole scene if it was changed, and the registered ones."""
-    registered = prediction.registered
-    whole = prediction.added is None
+    changed, registered = prediction.added, prediction.registered
+    numbers = {"anchor": prediction.anchor, "peak_bytes": prediction.peak_bytes}
     write_arrays(
         path,
         {
-            **_to_arrays(prediction.scene if prediction.added is None else prediction.added),
-            "whole": np.array(whole),
+            **_to_arrays(prediction.scene if changed is None else changed),
+            "whole": np.array(changed is None),
             "stages": np.array(list(prediction.seconds), dtype=np.str_),
             "seconds": np.array(list(prediction.seconds.values()), dtype=np.float64),
-            "anchor": _encode_optional(prediction.anchor),
             "anchor_fallback": np.array(prediction.anchor_fallback),
             "notes": np.array(prediction.notes, dtype=np.str_),
-            "peak_bytes": _encode_optional(prediction.peak_bytes),
+            **{k: np.array(-1 if n is None else n, dtype=np.int64) for k, n in numbers.items()},
             **({} if registered is None else _to_arrays(registered, REGISTERED_PREFIX)),
         },
     )
@@ -191,30 +164,22 @@ def load_prediction(path: Path, before: Gaussians) -> Prediction | None:
     arrays = load_arrays(path)
     if arrays is None:
         return None
-    changed = _to_gaussians(arrays, before.means.device)
+    device, registered = before.means.device, None
+    if f"{REGISTERED_PREFIX}means" in arrays:
+        registered = _to_gaussians(arrays, device, REGISTERED_PREFIX)
+    changed = _to_gaussians(arrays, device)
     whole = bool(arrays["whole"])
+    anchor, peak = int(arrays["anchor"]), int(arrays["peak_bytes"])
     return Prediction(
         scene=changed if whole else merge([before, changed]),
         added=None if whole else changed,
         seconds=dict(zip(arrays["stages"].tolist(), arrays["seconds"].tolist(), strict=True)),
-        anchor=_decode_optional(arrays["anchor"]),
+        anchor=None if anchor < 0 else anchor,
         anchor_fallback=bool(arrays["anchor_fallback"]),
         notes=tuple(arrays["notes"].tolist()),
-        peak_bytes=_decode_optional(arrays["peak_bytes"]),
-        registered=(
-            _to_gaussians(arrays, before.means.device, REGISTERED_PREFIX)
-            if f"{REGISTERED_PREFIX}means" in arrays
-            else None
-        ),
+        peak_bytes=None if peak < 0 else peak,
+        registered=registered,
     )
-
-
-def _encode_optional(number: int | None) -> np.ndarray:
-    return np.array(-1 if number is None else number, dtype=np.int64)
-
-
-def _decode_optional(number: np.ndarray) -> int | None:
-    return None if number < 0 else int(number)
 
 
 def _to_arrays(gaussians: Gaussians, prefix: str = "") -> Arrays:
@@ -239,38 +204,32 @@ def load_arrays(path: Path) -> Arrays | None:
         return None  # an incomplete file is computed again
 
 
+def make_folder(folder: Path) -> None:
+    """Create a folder; raise OutputError if that fails."""
+    with convert_write_errors(folder):
+        folder.mkdir(parents=True, exist_ok=True)
+
+
 def write_arrays(path: Path, arrays: Arrays) -> None:
     """Write arrays atomically; raise OutputError if that fails."""
-    with _convert_errors(path), replace_file(path) as file:
+    make_folder(path.parent)
+    with replace_file(path) as file:
         np.savez(file, **arrays)  # type: ignore[arg-type]
 
 
 def write_json(path: Path, content: Any, keep_existing: bool = False) -> None:
     """Write JSON atomically; the arguments are those of `replace_file`."""
-    with _convert_errors(path), replace_file(path, keep_existing) as file:
+    make_folder(path.parent)
+    with replace_file(path, keep_existing) as file:
         file.write((json.dumps(content, indent=1) + "\n").encode())
 
 
 def save_image(path: Path, image: Float[Tensor, "h w 3"]) -> None:
     """Write an image; raise OutputError if that fails."""
-    with _convert_errors(path):
-        write_image(path, image)
+    make_folder(path.parent)
+    write_image(path, image)
 
 
 def read_json(path: Path, advice: str = "delete it and run again") -> Any:
     """Read a JSON file of results."""
     return json_file.read_json(path, advice)
-
-
-@contextlib.contextmanager
-def _convert_errors(path: Path) -> Iterator[None]:
-    """Create the folder of `path` and turn write errors into OutputError, which ends the run."""
-    try:
-        path.parent.mkdir(parents=True, exist_ok=True)
-        yield
-    except InputError as error:
-        raise OutputError(str(error)) from error
-    except OSError as error:
-        raise OutputError(
-            f"Cannot write {path}: {error.strerror}; choose another place."
-        ) from error

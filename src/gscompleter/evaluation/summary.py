@@ -5,34 +5,55 @@ from __future__ import annotations
 import statistics
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
-from functools import reduce
 from pathlib import Path
 from typing import Any
 
 from gscompleter.errors import InputError
 from gscompleter.evaluation.methods import METHODS
 from gscompleter.evaluation.steps import compute_scale_drift
-from gscompleter.evaluation.store import check_run, list_row_paths, read_json
+from gscompleter.evaluation.store import list_row_paths, read_json, read_settings
 from gscompleter.timing import STAGES
 
 RunRow = dict[str, Any]
 """Output of `evaluate` for a task and a method."""
 
 StepRow = dict[str, Any]
-"""A `steps.StepRow` as JSON."""
+"""A `steps.Step` as JSON."""
+
+Reduction = Callable[[Sequence[float]], Any]
+"""Reduces several numbers to one, or to None."""
+
+MIN_PIXELS = 500
+"""Smallest number of pixels over which a geometry score counts."""
 
 
 @dataclass(frozen=True)
 class Column:
-    """A column of a table."""
+    """A column of a table: a number of each step, reduced over steps and then over tasks."""
 
     key: str
     title: str
     digits: int
-    get_value: Callable[[StepRow], float | None]
-    """Value of a step; None without ground truth."""
-    reduce_steps: Callable[[Sequence[float]], float | None] = statistics.fmean
-    reduce_tasks: Callable[[Sequence[float]], float] = statistics.fmean
+    path: str
+    """Place of the number in a step or its scores, with dots; a list of views is reduced too."""
+    minus: str | None = None
+    """Place of a number that is subtracted."""
+    reduce_steps: Reduction = statistics.fmean
+    reduce_tasks: Reduction = statistics.fmean
+    pixels: str | None = None
+    """Place of the number of pixels, of which `MIN_PIXELS` are needed."""
+
+    def get_value(self, step: StepRow) -> float | int | None:
+        """Return the number of a step; None without ground truth or in rows of earlier versions."""
+        if self.pixels is not None and (find_number(step, self.pixels) or 0) < MIN_PIXELS:
+            return None
+        value = find_number(step, self.path)
+        if value is None or self.minus is None:
+            return self.reduce_steps(value) if isinstance(value, list) else value
+        less = find_number(step, self.minus)
+        if isinstance(value, list):
+            return self.reduce_steps([a - b for a, b in zip(value, less, strict=True)])
+        return float(value - less)
 
     def compute_row(self, row: RunRow) -> float | None:
         """Compute the value of a task, or None if no step has one."""
@@ -40,89 +61,58 @@ class Column:
         return self.reduce_steps(values) if values else None
 
 
-def get_psnr_before(step: StepRow) -> float:
-    """Return the PSNR at the target before a step, in dB."""
-    return float(step["scores"]["target_before"]["psnr"])
+def find_number(step: StepRow, path: str) -> Any:
+    """Return the number at a place in a step or its scores, one per view, or None."""
+    found: Any = {**step, **step.get("scores", {})}
+    for key in path.split("."):
+        if isinstance(found, list):
+            found = [view[key] for view in found]
+        else:
+            found = None if found is None else found.get(key)
+    return found
 
 
-def get_psnr_after(step: StepRow) -> float:
-    """Return the PSNR at the target after a step, in dB."""
-    return float(step["scores"]["target_after"]["psnr"])
+BEFORE, AFTER = "target_before.psnr", "target_after.psnr"
+PSNR_BEFORE = Column("psnr_before", "PSNR before", 2, BEFORE)
+PSNR = Column("psnr", "PSNR", 2, AFTER)
+GAIN = Column("gain", "ΔPSNR", 2, AFTER, BEFORE)
 
 
-def compute_psnr_gain(step: StepRow) -> float:
-    """Compute the ΔPSNR at the target of a step, in dB."""
-    return get_psnr_after(step) - get_psnr_before(step)
+def _make_gain(key: str, title: str, path: str, reduce: Reduction = statistics.fmean) -> Column:
+    """Make a column of changes by the completion."""
+    return Column(key, title, 2, f"{path}.after", f"{path}.before", reduce, reduce)
 
 
-def _make_score_getter(*path: str) -> Callable[[StepRow], float | None]:
-    """Make a getter of a score by its path; None if missing, as in rows of earlier versions."""
-    return lambda step: reduce(
-        lambda found, key: None if found is None else found.get(key), path, step["scores"]
-    )
+def _make_median(key: str, title: str, path: str, digits: int = 0) -> Column:
+    """Make a column of medians over the tasks."""
+    return Column(key, title, digits, path, reduce_tasks=statistics.median)
 
-
-def _make_change_getter(key: str) -> Callable[[StepRow], float | None]:
-    def change(step: StepRow) -> float | None:
-        both = step["scores"][key]
-        return None if both is None else both["after"] - both["before"]
-
-    return change
-
-
-def _find_worst_change(step: StepRow) -> float:
-    return min(view["after"] - view["before"] for view in step["scores"]["context_psnr"])
-
-
-def _make_view_mean(key: str) -> Callable[[StepRow], float]:
-    return lambda step: statistics.fmean(view["after"] for view in step["scores"][key])
-
-
-def _make_step_getter(key: str) -> Callable[[StepRow], float | None]:
-    return lambda step: step[key]
-
-
-GAIN = Column("gain", "ΔPSNR", 2, compute_psnr_gain)
 
 IMAGES = (
-    Column("psnr", "PSNR", 2, get_psnr_after),
+    PSNR,
     GAIN,
-    Column("lowest_gain", "min ΔPSNR", 2, compute_psnr_gain, min, min),
-    Column("ssim", "SSIM", 3, _make_score_getter("target_after", "ssim")),
-    Column("lpips_vgg", "LPIPS (VGG)", 3, _make_score_getter("target_after", "lpips_vgg")),
-    Column("lpips_alex", "LPIPS (Alex)", 3, _make_score_getter("target_after", "lpips_alex")),
-    Column("hole_psnr", "PSNR (hole)", 2, _make_score_getter("hole_psnr")),
-    Column("observed_psnr", "PSNR (observed)", 2, _make_score_getter("observed_psnr", "after")),
-    Column(
-        "neighbours", "PSNR (neighbour views)", 2, _make_score_getter("neighbours_psnr", "after")
-    ),
-    Column("neighbours_gain", "ΔPSNR (neighbour views)", 2, _make_change_getter("neighbours_psnr")),
-    Column("context", "PSNR (context)", 2, _make_view_mean("context_psnr")),
-    Column("context_ssim", "SSIM (context)", 3, _make_view_mean("context_ssim")),
-    Column("context_change", "min ΔPSNR (context)", 2, _find_worst_change, min, min),
+    Column("lowest_gain", "min ΔPSNR", 2, AFTER, BEFORE, min, min),
+    Column("ssim", "SSIM", 3, "target_after.ssim"),
+    Column("lpips_vgg", "LPIPS (VGG)", 3, "target_after.lpips_vgg"),
+    Column("lpips_alex", "LPIPS (Alex)", 3, "target_after.lpips_alex"),
+    Column("hole_psnr", "PSNR (hole)", 2, "hole_psnr"),
+    Column("observed_psnr", "PSNR (observed)", 2, "observed_psnr.after"),
+    Column("neighbours", "PSNR (neighbour views)", 2, "neighbours_psnr.after"),
+    _make_gain("neighbours_gain", "ΔPSNR (neighbour views)", "neighbours_psnr"),
+    Column("context", "PSNR (context)", 2, "context_psnr.after"),
+    Column("context_ssim", "SSIM (context)", 3, "context_ssim.after"),
+    _make_gain("context_change", "min ΔPSNR (context)", "context_psnr", min),
 )
 """PSNR in dB at the target, in its hole and observed part, at neighbour and context views."""
 
 PERCEPTUAL = (
-    Column("hole_flip", "FLIP (hole)", 3, _make_score_getter("hole_looks", "flip")),
-    Column("observed_flip", "FLIP (observed)", 3, _make_score_getter("observed_looks", "flip")),
-    Column("hole_haarpsi", "HaarPSI (hole)", 3, _make_score_getter("hole_looks", "haarpsi")),
-    Column(
-        "observed_haarpsi", "HaarPSI (observed)", 3, _make_score_getter("observed_looks", "haarpsi")
-    ),
-    Column(
-        "hole_gradients",
-        "gradient energy (hole)",
-        2,
-        _make_score_getter("hole_looks", "gradient_energy"),
-        reduce_tasks=statistics.median,
-    ),
-    Column(
-        "observed_gradients",
-        "gradient energy (observed)",
-        2,
-        _make_score_getter("observed_looks", "gradient_energy"),
-        reduce_tasks=statistics.median,
+    Column("hole_flip", "FLIP (hole)", 3, "hole_looks.flip"),
+    Column("observed_flip", "FLIP (observed)", 3, "observed_looks.flip"),
+    Column("hole_haarpsi", "HaarPSI (hole)", 3, "hole_looks.haarpsi"),
+    Column("observed_haarpsi", "HaarPSI (observed)", 3, "observed_looks.haarpsi"),
+    _make_median("hole_gradients", "gradient energy (hole)", "hole_looks.gradient_energy", 2),
+    _make_median(
+        "observed_gradients", "gradient energy (observed)", "observed_looks.gradient_energy", 2
     ),
 )
 """Scores at the target that do not reward blur.
@@ -131,35 +121,21 @@ The best FLIP is 0 and the best HaarPSI 1; a gradient energy of 1 is as sharp as
 energy is a median over the tasks, since a flat photograph gives arbitrary ratios.
 """
 
-MIN_PIXELS = 500
-"""Smallest number of pixels over which a geometry score counts."""
-
-
-def _make_measured_getter(key: str, pixels: str) -> Callable[[StepRow], float | None]:
-    """Make a getter of the score `key`; None if it has too few `pixels`."""
-    number, count = _make_score_getter(key), _make_score_getter(pixels)
-    return lambda step: number(step) if (count(step) or 0) >= MIN_PIXELS else None
-
 
 def _make_mean_and_median(key: str, title: str, digits: int, pixels: str) -> tuple[Column, Column]:
     """Make columns of the mean and median over the tasks with enough pixels."""
-    mean = Column(key, title, digits, _make_measured_getter(key, pixels))
+    mean = Column(key, title, digits, key, pixels=pixels)
     median = replace(
         mean, key=f"{key}_median", title=f"{title} (median)", reduce_tasks=statistics.median
     )
     return mean, median
 
 
-def _make_pixel_column(key: str, title: str) -> Column:
-    """Make a column of the median number of pixels over all tasks."""
-    return Column(key, title, 0, _make_score_getter(key), reduce_tasks=statistics.median)
-
-
 GEOMETRY = (
     *_make_mean_and_median("depth_observed", "AbsRel observed", 3, "depth_observed_pixels"),
-    _make_pixel_column("depth_observed_pixels", "pixels observed"),
+    _make_median("depth_observed_pixels", "pixels observed", "depth_observed_pixels"),
     *_make_mean_and_median("depth_hole", "AbsRel in holes", 3, "depth_hole_pixels"),
-    _make_pixel_column("depth_hole_pixels", "pixels in holes"),
+    _make_median("depth_hole_pixels", "pixels in holes", "depth_hole_pixels"),
 )
 
 ADDED = (
@@ -167,7 +143,7 @@ ADDED = (
     *_make_mean_and_median("align_abs_rel", "AbsRel to context", 4, "align_pixels"),
     *_make_mean_and_median("align_chamfer", "Chamfer to context", 4, "align_pixels"),
     *_make_mean_and_median("align_f_score", "F-score to context", 3, "align_pixels"),
-    _make_pixel_column("align_pixels", "pixels of overlap"),
+    _make_median("align_pixels", "pixels of overlap", "align_pixels"),
 )
 """Added Gaussians against the context; lengths are relative to the depth."""
 
@@ -175,15 +151,15 @@ LIFTED = (
     *_make_mean_and_median("registered_abs_rel", "AbsRel of all lifted", 4, "registered_pixels"),
     *_make_mean_and_median("registered_chamfer", "Chamfer of all lifted", 4, "registered_pixels"),
     *_make_mean_and_median("registered_f_score", "F-score of all lifted", 3, "registered_pixels"),
-    _make_pixel_column("registered_pixels", "pixels of all lifted"),
+    _make_median("registered_pixels", "pixels of all lifted", "registered_pixels"),
 )
 """The same for all lifted Gaussians after registration, before the hole filter."""
 
 SEQUENCE = (
-    Column("psnr_before", "PSNR before", 2, get_psnr_before),
-    Column("psnr_end", "PSNR at the end", 2, _make_step_getter("psnr_end")),
-    Column("depth_scale", "depth scale", 3, _make_step_getter("depth_scale")),
-    Column("scale_drift", "scale drift", 3, _make_step_getter("depth_scale"), compute_scale_drift),
+    PSNR_BEFORE,
+    Column("psnr_end", "PSNR at the end", 2, "psnr_end"),
+    Column("depth_scale", "depth scale", 3, "depth_scale"),
+    Column("scale_drift", "scale drift", 3, "depth_scale", reduce_steps=compute_scale_drift),
 )
 
 GROUPS = {
@@ -205,11 +181,6 @@ METHOD_NOTES = {
 FEW_PIXELS_NOTE = (
     f"A geometry score counts if it is measured over at least {MIN_PIXELS} pixels; the columns of "
     "pixels are medians over all cases."
-)
-
-NO_PIXELS_NOTE = (
-    "Some rows are from an earlier version, which counted no pixels, so their geometry is left "
-    "out; score the run again to add it."
 )
 
 
@@ -243,11 +214,7 @@ class RunSummary:
     @property
     def groups(self) -> dict[str, tuple[Column, ...]]:
         """Columns that may have a value, by the title of their table."""
-        return {
-            title: columns
-            for title, columns in GROUPS.items()
-            if columns is not SEQUENCE or self.sequences
-        }
+        return {t: columns for t, columns in GROUPS.items() if t != "Sequences" or self.sequences}
 
     @property
     def columns(self) -> tuple[Column, ...]:
@@ -257,13 +224,9 @@ class RunSummary:
     @property
     def notes(self) -> list[str]:
         """Notes on the tables."""
-        scores = [s["scores"] for rows in self.rows.values() for row in rows for s in row["steps"]]
-        geometry = {
-            FEW_PIXELS_NOTE: bool(self.find_present_columns((*GEOMETRY, *ADDED, *LIFTED))),
-            NO_PIXELS_NOTE: any("align_pixels" not in found for found in scores),
-        }
+        has_geometry = self.find_present_columns((*GEOMETRY, *ADDED, *LIFTED))
         of_methods = [METHOD_NOTES[method] for method in self.methods if method in METHOD_NOTES]
-        return [*(note for note, holds in geometry.items() if holds), *of_methods]
+        return [FEW_PIXELS_NOTE, *of_methods] if has_geometry else of_methods
 
     @property
     def num_steps(self) -> int:
@@ -297,9 +260,15 @@ class RunSummary:
         return max((peak for peak in peaks if peak is not None), default=None)
 
 
+def make_cell(numbers: Iterable[float | None], column: Column) -> TableCell:
+    """Reduce the known numbers as `column` says."""
+    values = [value for value in numbers if value is not None]
+    return TableCell(column.reduce_tasks(values) if values else None, len(values))
+
+
 def read_rows(out: Path) -> list[RunRow]:
     """Read the rows of a run in the order of tasks and methods."""
-    check_run(out)
+    read_settings(out)
     rows = [read_row(path) for path in list_row_paths(out)]
     if not rows:
         raise InputError(
@@ -338,19 +307,18 @@ def _rank_name(name: str, order: Sequence[str]) -> tuple[int, str]:
 def summarize_run(rows: Sequence[RunRow]) -> RunSummary:
     """Average over the tasks that all methods finished, for a fair comparison."""
     methods = tuple(sorted({row["method"] for row in rows}, key=rank_method))
-    tasks = tuple(sorted({row["task"]["name"] for row in rows}))
-    by_task: dict[str, dict[str, RunRow]] = {name: {} for name in tasks}
-    for row in rows:
-        by_task[row["task"]["name"]][row["method"]] = row
+    by_task: dict[str, dict[str, RunRow]] = {}
+    for row in sorted(rows, key=lambda row: row["task"]["name"]):
+        by_task.setdefault(row["task"]["name"], {})[row["method"]] = row
     done = {
         name: {m: row for m, row in found.items() if row["error"] is None}
         for name, found in by_task.items()
     }
-    common = tuple(name for name in tasks if len(done[name]) == len(methods))
+    common = tuple(name for name, found in done.items() if len(found) == len(methods))
     chosen = {method: tuple(done[name][method] for name in common) for method in methods}
     return RunSummary(
         methods,
-        tasks,
+        tuple(by_task),
         common,
         chosen,
         {
@@ -364,12 +332,6 @@ def summarize_run(rows: Sequence[RunRow]) -> RunSummary:
     )
 
 
-def make_cell(numbers: Iterable[float | None], column: Column) -> TableCell:
-    """Reduce the known numbers as `column` says."""
-    values = [value for value in numbers if value is not None]
-    return TableCell(column.reduce_tasks(values) if values else None, len(values))
-
-
 def list_steps_with_gaps(row: RunRow) -> Iterator[tuple[int, StepRow]]:
     """Yield each step with the frames from its target to the nearest known frame: k of n-k."""
     known = list(row["task"]["context"])
@@ -380,17 +342,12 @@ def list_steps_with_gaps(row: RunRow) -> Iterator[tuple[int, StepRow]]:
 
 def average_gains_by_gap(rows: Mapping[str, Sequence[RunRow]]) -> dict[int, dict[str, TableCell]]:
     """Average the ΔPSNR of each method by distance to the known views."""
-    found = {
-        method: [pair for row in chosen for pair in list_steps_with_gaps(row)]
-        for method, chosen in rows.items()
-    }
-    gaps = sorted({gap for pairs in found.values() for gap, _ in pairs})
+    gains: dict[int, dict[str, list[float | None]]] = {}
+    for method, chosen in rows.items():
+        for gap, step in (pair for row in chosen for pair in list_steps_with_gaps(row)):
+            of_gap = gains.setdefault(gap, {method: [] for method in rows})
+            of_gap[method].append(GAIN.get_value(step))
     return {
-        gap: {
-            method: make_cell(
-                (compute_psnr_gain(step) for there, step in pairs if there == gap), GAIN
-            )
-            for method, pairs in found.items()
-        }
-        for gap in gaps
+        gap: {method: make_cell(values, GAIN) for method, values in gains[gap].items()}
+        for gap in sorted(gains)
     }

@@ -6,8 +6,7 @@ Score files contain no timings, so an interrupted and resumed run gives the same
 from __future__ import annotations
 
 import json
-from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -17,12 +16,12 @@ from gscompleter.evaluation.store import get_step_path, get_task_folder, get_tru
 from gscompleter.evaluation.summary import (
     IMAGES,
     PERCEPTUAL,
+    PSNR,
+    PSNR_BEFORE,
     Column,
     RunSummary,
     StepRow,
     TableCell,
-    get_psnr_after,
-    get_psnr_before,
     rank_stage,
     read_rows,
     summarize_run,
@@ -32,21 +31,15 @@ from gscompleter.io.image import read_image
 
 LPIPS_MISSING = (
     "LPIPS: weights not available. `gscompleter.evaluation.metrics.lpips.load_lpips()` downloads "
-    "them; then "
-    "score the run again to add the column.\n"
+    "them; then score the run again to add the column.\n"
 )
 FLIP_MISSING = (
     "FLIP: not installed. Run `pip install 'gscompleter[evaluation]'`; then score the run again to "
     "add the columns.\n"
 )
 
-
-@dataclass(frozen=True)
-class FidScores:
-    """Fréchet inception distance of each method, or the reason why there is none."""
-
-    values: dict[str, float]
-    reason: str | None = None
+Fids = dict[str, Any]
+"""`values`: the Fréchet inception distance of each method; `reason`: why there is none."""
 
 
 def write_tables(out: Path, with_fid: bool = False) -> RunSummary:
@@ -60,13 +53,15 @@ def write_tables(out: Path, with_fid: bool = False) -> RunSummary:
         InputError: if `out` has no run, no rows, or a damaged one.
     """
     summary = summarize_run(read_rows(out))
-    fids = compute_fid_scores(out, summary) if with_fid else FidScores({}, "not requested")
+    fids = {"values": {}, "reason": "not requested"}
+    if with_fid:
+        fids = compute_fids(out, summary)
     texts = {
         "tables.md": format_score_markdown(summary, fids),
         "tables.tex": format_score_latex(summary),
-        "tables.json": _serialize_json(collect_score_content(summary, fids)),
+        "tables.json": json.dumps(collect_score_content(summary, fids), indent=1) + "\n",
         "timings.md": format_timing_markdown(summary),
-        "timings.json": _serialize_json(collect_timing_content(summary)),
+        "timings.json": json.dumps(collect_timing_content(summary), indent=1) + "\n",
     }
     for name, text in texts.items():
         with replace_file(out / name) as file:
@@ -74,22 +69,22 @@ def write_tables(out: Path, with_fid: bool = False) -> RunSummary:
     return summary
 
 
-def compute_fid_scores(out: Path, summary: RunSummary) -> FidScores:
+def compute_fids(out: Path, summary: RunSummary) -> Fids:
     """Compute the FID of each method at the targets against the photographs."""
     steps = [
         (get_task_folder(out, row["task"]["name"]), number)
         for row in summary.rows[summary.methods[0]]
         for number in range(1, len(row["steps"]) + 1)
     ]
+    values = {}
     try:
         truths = [read_image(get_truth_path(folder, number)) for folder, number in steps]
-        values = {}
         for method in summary.methods:
             paths = [get_step_path(folder, method, n).with_suffix(".png") for folder, n in steps]
             values[method] = fid([read_image(path) for path in paths], truths)
     except InputError as error:
-        return FidScores({}, f"not available ({error})")
-    return FidScores(values)
+        return {"values": {}, "reason": f"not available ({error})"}
+    return {"values": values, "reason": None}
 
 
 def format_score(value: float | None, digits: int) -> str:
@@ -112,22 +107,44 @@ def format_score_cells(summary: RunSummary, columns: Sequence[Column]) -> list[l
     ]
 
 
+def format_score_tables(
+    summary: RunSummary, write: Callable[[Sequence[str], Sequence[Sequence[str]]], str]
+) -> dict[str, str]:
+    """Format the tables of scores that have a value, by title."""
+    groups = {t: summary.find_present_columns(columns) for t, columns in summary.groups.items()}
+    return {
+        title: write(["method", *(c.title for c in columns)], format_score_cells(summary, columns))
+        for title, columns in groups.items()
+        if columns
+    }
+
+
 def format_markdown(head: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
     """Format a Markdown table with numbers aligned to the right."""
     lines = [head, ["---", *["---:"] * (len(head) - 1)], *rows]
     return "".join("| " + " | ".join(line) + " |\n" for line in lines)
 
 
-def format_score_markdown(summary: RunSummary, fids: FidScores) -> str:
+def format_latex(head: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
+    """Format a LaTeX table with booktabs."""
+    body = [" & ".join(row).replace("_", r"\_").replace("–", "--") + r" \\" for row in rows]
+    begin = rf"\begin{{tabular}}{{l{'r' * (len(head) - 1)}}}"
+    lines = [begin, r"\toprule", " & ".join(head) + r" \\", r"\midrule", *body]
+    return "\n".join([*lines, r"\bottomrule", r"\end{tabular}"])
+
+
+def format_score_latex(summary: RunSummary) -> str:
+    """Format the tables of scores for LaTeX."""
+    scope = f"{len(summary.common_tasks)} of {len(summary.tasks)}"
+    blocks = [f"% Over the {scope} cases that all methods finished."]
+    blocks += [f"% {note}" for note in summary.notes]
+    return "\n".join([*blocks, *format_score_tables(summary, format_latex).values()]) + "\n"
+
+
+def format_score_markdown(summary: RunSummary, fids: Fids) -> str:
     """Format scores, notes, failures and the steps of sequences."""
-    parts = [describe_scope(summary)]
-    for title, columns in summary.groups.items():
-        chosen = summary.find_present_columns(columns)
-        if chosen:
-            head = ["method", *(column.title for column in chosen)]
-            parts.append(
-                f"### {title}\n\n" + format_markdown(head, format_score_cells(summary, chosen))
-            )
+    tables = format_score_tables(summary, format_markdown)
+    parts = [describe_scope(summary), *(f"### {t}\n\n{table}" for t, table in tables.items())]
     parts += [f"{note}\n" for note in summary.notes]
     if not any(column.key.startswith("lpips") for column in summary.find_present_columns(IMAGES)):
         parts.append(LPIPS_MISSING)
@@ -139,7 +156,10 @@ def format_score_markdown(summary: RunSummary, fids: FidScores) -> str:
     if summary.failures:
         rows = [[cell.replace("|", "\\|") for cell in failure] for failure in summary.failures]
         parts.append("### Failed\n\n" + format_markdown(["case", "method", "reason"], rows))
-    parts += [format_step_markdown(name, steps) for name, steps in summary.sequences.items()]
+    head = ["method", "frame", "anchor", "before", "after", "end", "depth scale", "added"]
+    for name, by_method in summary.sequences.items():
+        rows = [[m, *format_step_cells(step)] for m, steps in by_method.items() for step in steps]
+        parts.append(f"### {name}\n\n" + format_markdown(head, rows))
     return "\n".join(parts)
 
 
@@ -147,9 +167,8 @@ def describe_scope(summary: RunSummary) -> str:
     """Describe which cases the numbers cover."""
     text = (
         f"Means over the {len(summary.common_tasks)} of {len(summary.tasks)} cases that all "
-        "methods "
-        "finished. A number in brackets is the number of cases with the score, if some have "
-        "none.\n"
+        "methods finished. A number in brackets is the number of cases with the score, if some "
+        "have none.\n"
     )
     if not summary.sequences:
         return text
@@ -160,11 +179,11 @@ def describe_scope(summary: RunSummary) -> str:
     )
 
 
-def format_fid_markdown(summary: RunSummary, fids: FidScores) -> str:
+def format_fid_markdown(summary: RunSummary, fids: Fids) -> str:
     """Format the FID of each method, or the reason why there is none."""
-    if fids.reason is not None:
-        return f"FID: {fids.reason}.\n"
-    rows = [[method, f"{value:.2f}"] for method, value in fids.values.items()]
+    if fids["reason"] is not None:
+        return f"FID: {fids['reason']}.\n"
+    rows = [[method, f"{value:.2f}"] for method, value in fids["values"].items()]
     return (
         f"### FID\n\n{summary.num_steps} images against as many photographs; FID is biased for "
         "few images.\n\n" + format_markdown(["method", "FID"], rows)
@@ -174,11 +193,10 @@ def format_fid_markdown(summary: RunSummary, fids: FidScores) -> str:
 def format_gain_markdown(summary: RunSummary) -> str:
     """Format the ΔPSNR by distance from the known views."""
     counts = {gap: max(c.count for c in cells.values()) for gap, cells in summary.gains.items()}
-    head = ["method", *(f"{gap} ({counts[gap]})" for gap in summary.gains)]
-    gains = summary.gains.items()
+    head = ["method", *(f"{gap} ({count})" for gap, count in counts.items())]
     rows = [
-        [method, *(format_cell(cells[method], 2, counts[gap]) for gap, cells in gains)]
-        for method in summary.methods
+        [m, *(format_cell(cells[m], 2, counts[gap]) for gap, cells in summary.gains.items())]
+        for m in summary.methods
     ]
     return (
         "### ΔPSNR by distance\n\nMean ΔPSNR in dB by the frames between the target and the "
@@ -187,18 +205,9 @@ def format_gain_markdown(summary: RunSummary) -> str:
     )
 
 
-def format_step_markdown(name: str, by_method: Mapping[str, Sequence[StepRow]]) -> str:
-    """Format the steps of a task."""
-    head = ["method", "frame", "anchor", "before", "after", "end", "depth scale", "added"]
-    rows = [
-        [method, *format_step_cells(step)] for method, steps in by_method.items() for step in steps
-    ]
-    return f"### {name}\n\n" + format_markdown(head, rows)
-
-
 def format_step_cells(step: StepRow) -> list[str]:
     """Format a step as cells of a table."""
-    numbers = [get_psnr_before(step), get_psnr_after(step), step["psnr_end"]]
+    numbers = [PSNR_BEFORE.get_value(step), PSNR.get_value(step), step["psnr_end"]]
     return [
         str(step["frame"]),
         "–" if step["anchor"] is None else str(step["anchor"]),
@@ -208,33 +217,7 @@ def format_step_cells(step: StepRow) -> list[str]:
     ]
 
 
-def format_score_latex(summary: RunSummary) -> str:
-    """Format the tables of scores for LaTeX with booktabs."""
-    blocks = [
-        f"% Over the {len(summary.common_tasks)} of {len(summary.tasks)} cases that all methods "
-        "finished."
-    ]
-    blocks += [f"% {note}" for note in summary.notes]
-    for group in summary.groups.values():
-        columns = summary.find_present_columns(group)
-        if columns:
-            blocks.append(_format_tabular(summary, columns))
-    return "\n".join(blocks) + "\n"
-
-
-def _format_tabular(summary: RunSummary, columns: Sequence[Column]) -> str:
-    lines = [
-        rf"\begin{{tabular}}{{l{'r' * len(columns)}}}",
-        r"\toprule",
-        " & ".join(["method", *(column.title for column in columns)]) + r" \\",
-        r"\midrule",
-    ]
-    for row in format_score_cells(summary, columns):
-        lines.append(" & ".join(row).replace("_", r"\_").replace("–", "--") + r" \\")
-    return "\n".join([*lines, r"\bottomrule", r"\end{tabular}"])
-
-
-def collect_score_content(summary: RunSummary, fids: FidScores) -> dict[str, Any]:
+def collect_score_content(summary: RunSummary, fids: Fids) -> dict[str, Any]:
     """Return all scores with full precision, for JSON."""
     content: dict[str, Any] = {
         "cases": len(summary.tasks),
@@ -255,7 +238,7 @@ def collect_score_content(summary: RunSummary, fids: FidScores) -> dict[str, Any
             for gap, cells in summary.gains.items()
         },
         "notes": summary.notes,
-        "fid": {"values": fids.values, "reason": fids.reason},
+        "fid": fids,
         "failures": [
             dict(zip(("case", "method", "reason"), failure, strict=True))
             for failure in summary.failures
@@ -282,25 +265,18 @@ def _collect_steps(
 
 def format_timing_markdown(summary: RunSummary) -> str:
     """Format median seconds by stage and peak memory."""
-    stages = sorted(
-        {s for m in summary.methods for s in summary.compute_seconds(m)}, key=rank_stage
-    )
+    seconds = {method: summary.compute_seconds(method) for method in summary.methods}
+    stages = sorted({stage for found in seconds.values() for stage in found}, key=rank_stage)
     rows = []
-    for method in summary.methods:
-        seconds, peak = summary.compute_seconds(method), summary.find_peak_bytes(method)
+    for method, found in seconds.items():
+        peak = summary.find_peak_bytes(method)
         memory = None if peak is None else peak / 2**30
-        rows.append(
-            [
-                method,
-                *(format_score(seconds.get(stage), 2) for stage in stages),
-                format_score(memory, 2),
-            ]
-        )
+        cells = [*(found.get(stage) for stage in stages), memory]
+        rows.append([method, *(format_score(number, 2) for number in cells)])
     return (
         f"Median seconds of a step over the {len(summary.common_tasks)} cases that all methods "
-        "finished, "
-        "and peak memory (GiB). The total excludes the reconstruction of the context, which all "
-        "methods share.\n\n" + format_markdown(["method", *stages, "memory"], rows)
+        "finished, and peak memory (GiB). The total excludes the reconstruction of the context, "
+        "which all methods share.\n\n" + format_markdown(["method", *stages, "memory"], rows)
     )
 
 
@@ -316,7 +292,3 @@ def collect_timing_content(summary: RunSummary) -> dict[str, Any]:
     if summary.sequences:
         content["steps"] = _collect_steps(summary, lambda step: step["seconds"])
     return content
-
-
-def _serialize_json(content: dict[str, Any]) -> str:
-    return json.dumps(content, indent=1) + "\n"

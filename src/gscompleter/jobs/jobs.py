@@ -1,4 +1,4 @@
-"""Jobs, their outcomes, and how each is run once, by the first process that claims it.
+"""Jobs, their rows, and how each is run once, by the first process that claims it.
 
 batch.json          kind and version of the folder
 jobs/NAME/          output of `complete`
@@ -14,7 +14,7 @@ import re
 import time
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
-from typing import Any, Literal
+from typing import Any
 
 from gscompleter.errors import InputError, OutputError, quote_value
 from gscompleter.jobs.places import Place
@@ -30,6 +30,9 @@ RETRY_SECONDS = 1.0
 LONGEST_NAME = 120
 """Maximum number of characters of a job name."""
 
+Row = dict[str, Any]
+"""Outcome of a job: its state is `done` or `failed`."""
+
 
 @dataclass(frozen=True)
 class Job:
@@ -39,97 +42,59 @@ class Job:
     """Unique name, of its folder and its row."""
     options: Mapping[str, Any] = field(default_factory=dict)
 
+    @property
+    def claim(self) -> str:
+        """Path of its claim."""
+        return f"{CLAIMS}/{self.name}"
 
-State = Literal["done", "failed", "elsewhere", "lost"]
-"""Outcome of a job: row written (done, failed), run by another process, or worker killed."""
-
-
-@dataclass(frozen=True)
-class Outcome:
-    """Outcome of one attempt to run a job."""
-
-    job: Job
-    state: State
-    reason: str | None = None
-    """One sentence if the job failed."""
-
-
-Perform = Callable[[Job], Outcome]
-"""Runs a job, in any process."""
-
-
-@dataclass(frozen=True)
-class Attempts:
-    """Result of the attempts at a job."""
-
-    result: Mapping[str, Any] | None
-    """Return value of the work, or None if it failed."""
-    number: int
-    """Number of attempts in all runs together."""
-    reason: str | None = None
+    @property
+    def row(self) -> str:
+        """Path of its row."""
+        return f"{ROWS}/{self.name}.json"
 
 
 def run_claimed(
     job: Job, place: Place, work: Callable[[], Mapping[str, Any]], retries: int
-) -> Outcome:
+) -> None:
     """Claim a job, run it and write its row, unless it has a row or another process runs it.
 
     `work` returns further entries of the row. It is repeated after a killed process or any error
     other than InputError, at most `retries` times.
     """
-    with place.hold_claim(f"{CLAIMS}/{job.name}") as lost:
-        if lost is None:
-            return Outcome(job, "elsewhere")
-        row = read_finished_row(place, job)
-        if row is None:
-            row = make_job_row(job, run_with_retries(work, lost, retries))
-            write_row(place, job.name, row)
-        return Outcome(job, row["state"], row["reason"])
+    if read_row(place, job.name) is not None:
+        return
+    with place.hold_claim(job.claim) as lost:
+        if lost is not None and read_row(place, job.name) is None:
+            row = {"version": VERSION, "job": job.name, "options": dict(job.options)}
+            row |= run_with_retries(work, lost, retries)
+            place.write(job.row, (json.dumps(row, indent=1) + "\n").encode())
 
 
-def run_with_retries(work: Callable[[], Mapping[str, Any]], lost: int, retries: int) -> Attempts:
-    """Run `work` with retries; `lost` attempts have already been killed."""
-    reason = f"its process was killed {lost} times, perhaps because memory ran out"
+def run_with_retries(work: Callable[[], Mapping[str, Any]], lost: int, retries: int) -> Row:
+    """Run `work` with retries and return its part of a row; `lost` attempts have been killed."""
+    reason = describe_loss(lost)
     for number in range(lost + 1, retries + 2):
         try:
-            return Attempts(work(), number)
+            return {"state": "done", "reason": None, "attempts": number, **work()}
         except OutputError:
             raise
         except InputError as error:
-            return Attempts(None, number, str(error))
+            return {"state": "failed", "reason": str(error), "attempts": number}
         except Exception as error:  # one broken job must not stop the others
             reason = f"{type(error).__name__}: {' '.join(str(error).split())}"
         if number <= retries:
             time.sleep(RETRY_SECONDS * number)
-    return Attempts(None, max(lost, retries + 1), reason)
+    return {"state": "failed", "reason": reason, "attempts": max(lost, retries + 1)}
 
 
-def make_job_row(job: Job, attempts: Attempts) -> dict[str, Any]:
-    """Build the row of a job."""
-    return {
-        "version": VERSION,
-        "job": job.name,
-        "options": dict(job.options),
-        "state": "done" if attempts.reason is None else "failed",
-        "reason": attempts.reason,
-        "attempts": attempts.number,
-        **(attempts.result or {}),
-    }
+def describe_loss(lost: int) -> str:
+    """Describe why a job whose processes were killed has no result."""
+    return f"its process was killed {lost} times, perhaps because memory ran out"
 
 
-def get_job_row_path(name: str) -> str:
-    """Return the path of the row of a job."""
-    return f"{ROWS}/{name}.json"
-
-
-def write_row(place: Place, name: str, row: Mapping[str, Any]) -> None:
-    """Write the row of a job; raise OutputError if that fails."""
-    place.write(get_job_row_path(name), (json.dumps(row, indent=1) + "\n").encode())
-
-
-def read_row(place: Place, name: str) -> dict[str, Any] | None:
+def read_row(place: Place, name: str) -> Row | None:
     """Read the row of a job, or return None if there is no complete one."""
-    content = place.read(get_job_row_path(name))
+    content = place.read(Job(name).row)
     try:
         row = None if content is None else json.loads(content)
     except ValueError:
@@ -137,35 +102,32 @@ def read_row(place: Place, name: str) -> dict[str, Any] | None:
     return row if isinstance(row, dict) and row.get("version") == VERSION else None
 
 
-def read_finished_row(place: Place, job: Job) -> dict[str, Any] | None:
-    """Read the row of a job that is done, or failed with the same options as now."""
-    row = read_row(place, job.name)
-    if row is None or (row["state"] == "failed" and row["options"] != dict(job.options)):
-        return None
-    return row
-
-
 def find_missing_jobs(jobs: Sequence[Job], place: Place, rerun_failed: bool) -> list[Job]:
-    """Return jobs without a row or with a failed one to repeat (new options, or `rerun`).
+    """Return jobs without a row, and remove the failed rows to repeat (new options, or `rerun`).
 
     Raises:
         InputError: A job was done with other options.
     """
     existing, left = place.list_names(ROWS), []
     for job in jobs:
-        row = read_row(place, job.name) if f"{job.name}.json" in existing else None
-        if row is not None and row["state"] == "failed" and rerun_failed:
-            place.remove(get_job_row_path(job.name))
-            row = None
-        if row is not None and row["state"] == "done" and row["options"] != dict(job.options):
+        is_there = f"{job.name}.json" in existing
+        row = read_row(place, job.name) if is_there else None
+        is_other = row is not None and row["options"] != dict(job.options)
+        if row is not None and row["state"] == "done" and is_other:
             raise InputError(
                 f"{quote_value(place.name)} holds the job {quote_value(job.name)} done with other "
-                "options; "
-                "give the row another name, or name another folder."
+                "options; give the row another name, or name another folder."
             )
-        if row is None or row["options"] != dict(job.options):
+        if row is None or (row["state"] == "failed" and (rerun_failed or is_other)):
             left.append(job)
+            if is_there:
+                place.remove(job.row)
     return left
+
+
+def list_done_jobs(place: Place) -> set[str]:
+    """List the names of the jobs with a row."""
+    return {name.removesuffix(".json") for name in place.list_names(ROWS)}
 
 
 def make_job_name(name: str) -> str:

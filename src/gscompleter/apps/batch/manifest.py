@@ -12,7 +12,7 @@ import json
 import os
 import re
 from collections import Counter
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import Any
 
@@ -29,6 +29,9 @@ PATHS = (FOLDER, "scene", "weights")
 LONGEST_FILE = 2 * 10**9
 """Maximum number of bytes of a manifest."""
 
+Options = dict[str, Any]
+"""Options of `complete` by name."""
+
 
 def read_manifest(manifest: str, common: Mapping[str, Any]) -> list[Job]:
     """Read the jobs of a `.csv` or `.jsonl` file or a folder of scenes, by path or address.
@@ -42,12 +45,15 @@ def read_manifest(manifest: str, common: Mapping[str, Any]) -> list[Job]:
         {**here, **(row if is_address(manifest) else resolve_paths(row, base))}
         for row in read_rows(manifest)
     ]
-    jobs = [Job(name, row) for name, row in zip(name_jobs(rows), map(drop_name, rows), strict=True)]
+    jobs = [
+        Job(name, {key: value for key, value in row.items() if key != NAME})
+        for name, row in zip(name_jobs(rows), rows, strict=True)
+    ]
     check_jobs(jobs)
     return jobs
 
 
-def resolve_paths(row: Mapping[str, Any], base: str) -> dict[str, Any]:
+def resolve_paths(row: Mapping[str, Any], base: str) -> Options:
     """Make the paths of a row absolute; addresses and invalid values stay."""
 
     def join(value: Any) -> Any:
@@ -63,10 +69,13 @@ def resolve_paths(row: Mapping[str, Any], base: str) -> dict[str, Any]:
     return result
 
 
-def read_rows(manifest: str) -> list[dict[str, Any]]:
+def read_rows(manifest: str) -> list[Options]:
     """Read the rows of a manifest as they are."""
     if not is_address(manifest) and os.path.isdir(manifest):
-        return [{FOLDER: os.path.abspath(folder)} for folder in list_scenes(Path(manifest))]
+        names = (UNFINISHED_PREFIX, ".")
+        folders = [p for p in Path(manifest).iterdir() if p.is_dir()]
+        shown = sorted(p for p in folders if not p.name.startswith(names))
+        return [{FOLDER: os.path.abspath(folder)} for folder in shown]
     if manifest.endswith(".csv"):
         return list(parse_csv(read_manifest_text(manifest), manifest))
     if manifest.endswith((".jsonl", ".ndjson")):
@@ -77,17 +86,7 @@ def read_rows(manifest: str) -> list[dict[str, Any]]:
         return [{FOLDER: store.unstrip_protocol(e["name"])} for e in found]
     raise InputError(
         f"The manifest {quote_value(manifest)} is neither a .csv or .jsonl file nor a folder of "
-        "scenes; "
-        "correct the path."
-    )
-
-
-def list_scenes(folder: Path) -> list[Path]:
-    """List the visible folders in a folder by name."""
-    return sorted(
-        p
-        for p in folder.iterdir()
-        if p.is_dir() and not p.name.startswith((UNFINISHED_PREFIX, "."))
+        "scenes; correct the path."
     )
 
 
@@ -108,7 +107,7 @@ def read_manifest_text(manifest: str) -> str:
         ) from error
 
 
-def parse_csv(text: str, manifest: str) -> Iterator[dict[str, Any]]:
+def parse_csv(text: str, manifest: str) -> Iterator[Options]:
     """Parse the rows of a CSV file with a header."""
     try:
         for row in csv.DictReader(io.StringIO(text, newline=""), strict=True):
@@ -122,43 +121,37 @@ def parse_csv(text: str, manifest: str) -> Iterator[dict[str, Any]]:
         ) from error
 
 
-def parse_json_lines(text: str, manifest: str) -> Iterator[dict[str, Any]]:
+def parse_json_lines(text: str, manifest: str) -> Iterator[Options]:
     """Parse JSON lines."""
     for number, line in enumerate(text.splitlines(), start=1):
         if not line.strip():
             continue
+        place = f"Line {number} of the manifest {quote_value(manifest)}"
         try:
             row = json.loads(line)
         except (ValueError, RecursionError) as error:
             raise InputError(
-                f"Line {number} of the manifest {quote_value(manifest)} is not JSON "
-                f"({quote_value(str(error))}); correct it."
+                f"{place} is not JSON ({quote_value(str(error))}); correct it."
             ) from error
         if not isinstance(row, dict):
             raise InputError(
-                f"Line {number} of the manifest {quote_value(manifest)} is not a JSON object; "
-                "write it "
-                'as {"folder": "scene", "target": [6]}.'
+                f'{place} is not a JSON object; write it as {{"folder": "scene", "target": [6]}}.'
             )
         yield row
 
 
-def name_jobs(rows: Iterable[Mapping[str, Any]]) -> list[str]:
+def name_jobs(rows: list[Options]) -> Iterator[str]:
     """Name the jobs by their `name` or scene folder, numbered if several share a folder."""
-    rows = list(rows)
-    given = [make_job_name(str(row[NAME])) if NAME in row else None for row in rows]
-    scenes = [make_job_name(os.path.basename(str(row.get(FOLDER, "")).rstrip("/"))) for row in rows]
-    count, seen = (
-        Counter(s for s, n in zip(scenes, given, strict=True) if n is None),
-        Counter[str](),
-    )
-    names = []
-    for name, scene in zip(given, scenes, strict=True):
-        seen[scene] += name is None
-        names.append(name or (scene if count[scene] == 1 else f"{scene}-{seen[scene]}"))
-    return names
-
-
-def drop_name(row: Mapping[str, Any]) -> dict[str, Any]:
-    """Drop the name of a row."""
-    return {key: value for key, value in row.items() if key != NAME}
+    scenes = [
+        None
+        if NAME in row
+        else make_job_name(os.path.basename(str(row.get(FOLDER, "")).rstrip("/")))
+        for row in rows
+    ]
+    count, seen = Counter(scenes), Counter[str]()
+    for row, scene in zip(rows, scenes, strict=True):
+        if scene is None:
+            yield make_job_name(str(row[NAME]))
+        else:
+            seen[scene] += 1
+            yield scene if count[scene] == 1 else f"{scene}-{seen[scene]}"

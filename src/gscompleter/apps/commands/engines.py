@@ -8,28 +8,31 @@ from pathlib import Path
 from gscompleter.apps.commands.options import EngineOptions
 from gscompleter.cpu_threads import count_available_cores, limit_threads
 from gscompleter.errors import InputError, quote_value
-from gscompleter.jobs.engines import Engine
-from gscompleter.jobs.engines.local import LocalEngine, choose_num_workers
-from gscompleter.jobs.engines.ray import RayEngine
-from gscompleter.jobs.engines.submitit import SubmititEngine
+from gscompleter.jobs.engines import LocalEngine, RayEngine, SubmititEngine, choose_num_workers
 from gscompleter.jobs.places import is_address
-from gscompleter.jobs.rounds import run_in_this_process
+from gscompleter.jobs.workers import Engine
 
 
 def parse_pairs(words: Sequence[str], option: str) -> dict[str, str]:
     """Parse `NAME=VALUE` words."""
+    pairs = {}
     for word in words:
-        if not word.partition("=")[0] or "=" not in word:
+        name, sign, value = word.partition("=")
+        if not name or not sign:
             raise InputError(
                 f"'{quote_value(word)}' is not NAME=VALUE, as in resolution=256.", option
             )
-    return dict(tuple(word.split("=", 1)) for word in words)  # type: ignore[misc]
+        pairs[name] = value
+    return pairs
 
 
-def make_engine(options: EngineOptions, out: str) -> Engine:
-    """Create the engine. On this machine it also sets the threads, which workers inherit."""
+def make_engine(options: EngineOptions, out: str) -> Engine | None:
+    """Create the engine, or None for this process.
+
+    On this machine it also sets the threads, which workers inherit.
+    """
     if options.engine is None:
-        return run_in_this_process
+        return None
     threads = options.threads or 1
     if options.engine == "ray":
         return RayEngine(options.workers, threads, options.gpus, options.address)

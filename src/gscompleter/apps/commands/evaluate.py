@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 from collections.abc import Iterator, Sequence
+from contextlib import suppress
 from dataclasses import replace
 from itertools import islice
 from pathlib import Path
@@ -17,31 +18,22 @@ from gscompleter.apps.commands.options import (
     LONG_SIDE,
     EvaluateOptions,
     IndexOptions,
-    Size,
     TablesOptions,
     parse_resolution,
 )
 from gscompleter.apps.report.evaluation_page import render_evaluation_page
 from gscompleter.apps.report.page import write_page
 from gscompleter.apps.warmup.compilation import compile_kernels
-from gscompleter.data.cases import Case, SkippedScene, filter_usable, open_clips, read_cases
+from gscompleter.data.cases import SkippedScene, filter_usable, open_clips, read_cases
 from gscompleter.data.formats import open_photographs
 from gscompleter.data.resize import check_resolution
 from gscompleter.errors import InputError, quote_value
+from gscompleter.evaluation import plots, protocols, tables
 from gscompleter.evaluation.methods import expand_methods
-from gscompleter.evaluation.plots import PlotsNotAvailable, draw_plots
-from gscompleter.evaluation.protocols import (
-    ViewByView,
-    build_index,
-    parse_protocol,
-    write_evaluation_index,
-)
 from gscompleter.evaluation.runner import RunConfig, evaluate
 from gscompleter.evaluation.store import list_row_paths
 from gscompleter.evaluation.summary import RunSummary
-from gscompleter.evaluation.tables import format_score_cells, write_tables
-from gscompleter.evaluation.tasks import Task, make_case_task, make_tasks
-from gscompleter.jobs.shards import parse_shard
+from gscompleter.jobs.workers import parse_shard
 from gscompleter.progress import show_preparation, show_progress
 from gscompleter.render import choose_device
 
@@ -85,7 +77,9 @@ def run_evaluation(options: EvaluateOptions) -> None:
 
 def describe_source(options: EvaluateOptions) -> dict[str, Any]:
     """Describe the cases, as an output folder records them."""
-    size = get_resolution(options) if options.protocol else options.resolution
+    size = options.resolution
+    if size is None and options.protocol:
+        size = LONG_SIDE
     return {
         "paths": [path.resolve().name for path in options.paths],
         "protocols": list(options.protocol),
@@ -113,7 +107,7 @@ def write_and_print_tables(
     while seen is None or (there != seen and len(there) >= num_rows):
         seen = there
         with show_preparation("tables"):
-            summary = write_tables(out, with_fid)
+            summary = tables.write_tables(out, with_fid)
             try_plots(summary, out, quiet)
             write_page(out, render_evaluation_page(out))
         there = list_row_times(out)
@@ -129,10 +123,9 @@ def list_row_times(out: Path) -> dict[Path, int]:
 def try_plots(summary: RunSummary, out: Path, quiet: bool) -> None:
     """Draw the plots, or print the missing requirement."""
     try:
-        draw_plots(summary, out)
-    except PlotsNotAvailable as missing:
-        if not quiet:
-            Console(stderr=True).print(str(missing), highlight=False, markup=False)
+        plots.draw_plots(summary, out)
+    except plots.PlotsNotAvailable as missing:
+        Console(stderr=True, quiet=quiet).print(str(missing), highlight=False, markup=False)
 
 
 def run_index(options: IndexOptions) -> None:
@@ -140,14 +133,12 @@ def run_index(options: IndexOptions) -> None:
     if options.out.exists() and not options.overwrite:
         raise InputError(f"{options.out} exists; name another file, or use --overwrite.")
     skipped: list[SkippedScene] = []
-    protocol = parse_protocol(options.protocol)
-    with (
-        show_progress(None if options.quiet else Console(stderr=True)),
-        show_preparation("reading clips"),
-    ):
-        index = build_index(protocol, filter_usable(open_clips(options.path), skipped))
+    rule = protocols.parse_protocol(options.protocol)
+    shown = None if options.quiet else Console(stderr=True)
+    with show_progress(shown), show_preparation("reading clips"):
+        index = protocols.build_index(rule, filter_usable(open_clips(options.path), skipped))
     index = replace(index, skipped=(*index.skipped, *(clip.name for clip in skipped)))
-    write_evaluation_index(options.out, index)
+    protocols.write_evaluation_index(options.out, index)
     console = Console(quiet=options.quiet, highlight=False)
     print_skipped(skipped, console)
     targets = sum(len(split.targets) for splits in index.scenes.values() for split in splits)
@@ -158,54 +149,37 @@ def run_index(options: IndexOptions) -> None:
     )
 
 
-def get_resolution(options: EvaluateOptions) -> Size:
-    """Return the working size of scenes."""
-    return LONG_SIDE if options.resolution is None else options.resolution
-
-
 def collect_tasks(
     options: EvaluateOptions, skipped: list[SkippedScene], notes: list[str]
-) -> list[Task]:
+) -> list[protocols.Task]:
     """Collect the tasks of the options, and append to `skipped` and `notes`."""
-    if not options.protocol:
-        files = [find_cases_file(path) for path in options.paths]
-        cases = [case for file in files for case in read_cases(file)]
-        if options.one_per_scene:
-            cases = select_first_cases(cases)
-        cases = cases[: options.limit]
-        notes += collect_scene_notes(cases)
-        if options.resolution is not None:
-            size = parse_resolution(options.resolution)
-            cases = [replace(case, resolution=size) for case in cases]
-        if options.use_masks:
-            cases = [replace(case, ignore_masked=True) for case in cases]
-        cases = [replace(case, ego_mask=options.ego_mask) for case in cases]
-        return [make_case_task(case) for case in cases]
-    return list(islice(iterate_tasks(options, skipped, notes), options.limit))
-
-
-def select_first_cases(cases: Sequence[Case]) -> list[Case]:
-    """Select the first case of each scene."""
-    first: dict[Path, Case] = {}
-    for case in cases:
-        first.setdefault(case.scene, case)
-    return list(first.values())
-
-
-def collect_scene_notes(cases: Sequence[Case]) -> Iterator[str]:
-    """Collect the notes on the scenes of cases. Scenes that cannot be opened have none."""
+    if options.protocol:
+        return list(islice(iterate_tasks(options, skipped, notes), options.limit))
+    cases = [case for path in options.paths for case in read_cases(find_cases_file(path))]
+    if options.one_per_scene:
+        first = {case.scene: case for case in reversed(cases)}
+        cases = [first[scene] for scene in dict.fromkeys(case.scene for case in cases)]
+    cases = cases[: options.limit]
     for scene in dict.fromkeys(case.scene for case in cases):
-        try:
-            yield from open_photographs(scene).notes
-        except InputError:
-            continue
+        with suppress(InputError):  # a row of the table says why a scene cannot be opened
+            notes += open_photographs(scene).notes
+    if options.resolution is not None:
+        size = parse_resolution(options.resolution)
+        cases = [replace(case, resolution=size) for case in cases]
+    use_masks, ego_mask = options.use_masks, options.ego_mask
+    cases = [
+        replace(case, ignore_masked=use_masks or case.ignore_masked, ego_mask=ego_mask)
+        for case in cases
+    ]
+    return [protocols.make_case_task(case) for case in cases]
 
 
 def iterate_tasks(
     options: EvaluateOptions, skipped: list[SkippedScene], notes: list[str]
-) -> Iterator[Task]:
+) -> Iterator[protocols.Task]:
     """Iterate over the tasks of the protocols, clip by clip."""
-    protocols = [parse_protocol(text) for text in options.protocol]
+    rules = [protocols.parse_protocol(text) for text in options.protocol]
+    size = parse_resolution(LONG_SIDE if options.resolution is None else options.resolution)
     for path in options.paths:
         for clip in filter_usable(open_clips(path), skipped):
             notes += clip.notes
@@ -215,11 +189,10 @@ def iterate_tasks(
                     "out."
                 )
             clip = clip if options.ego_mask else clip.keep_ego_vehicle()
-            for protocol in protocols:
-                if isinstance(protocol, ViewByView) and (reason := protocol.explain_skip(clip)):
+            for rule in rules:
+                if reason := protocols.explain_skip(rule, clip):
                     skipped.append(SkippedScene(clip.name, reason))
-                size = parse_resolution(get_resolution(options))
-                tasks = make_tasks(protocol, clip, size, options.use_masks)
+                tasks = protocols.make_tasks(rule, clip, size, options.use_masks)
                 yield from tasks[:1] if options.one_per_scene else tasks
 
 
@@ -247,13 +220,12 @@ def print_tables(summary: RunSummary, out: Path) -> None:
     """Print the tables, transposed: one column per method."""
     table = Table("", *summary.methods, box=None)
     columns = summary.find_present_columns(summary.columns)
-    cells = format_score_cells(summary, columns)
+    cells = tables.format_score_cells(summary, columns)
     for number, column in enumerate(columns, start=1):
         table.add_row(column.title, *(row[number] for row in cells))
     if summary.common_tasks:
-        table.add_row(
-            "seconds", *(f"{summary.compute_seconds(m)['total']:.1f}" for m in summary.methods)
-        )
+        seconds = [summary.compute_seconds(method)["total"] for method in summary.methods]
+        table.add_row("seconds", *(f"{total:.1f}" for total in seconds))
     console = Console(highlight=False)
     console.print(table)
     for case, method, reason in summary.failures:

@@ -23,7 +23,10 @@ Command: Any = Union[  # noqa: UP007  (a command line has several)
 ]
 RESERVED = ("out", "overwrite", "quiet", "threads", "dry-run", "help", "help-all")
 """Options that a batch sets for all jobs."""
-YES, NO = ("true", "yes", "1"), ("false", "no", "0", "")
+FLAG_VALUES = {
+    **dict.fromkeys(("true", "yes", "1"), True),
+    **dict.fromkeys(("false", "no", "0", ""), False),
+}
 """Values of a flag in a CSV."""
 
 
@@ -43,46 +46,39 @@ def row_to_words(row: Mapping[str, Any], prefix: str = "") -> Iterator[str]:
     """Convert a row to words of a command line."""
     for key, value in row.items():
         name = translate_name(f"{prefix}{key}".replace("_", "-"))
+        kind = list_type_hints().get(name)
         if name in RESERVED:
             raise InputError(f"A row cannot set '{quote_value(name)}'; the batch sets it.")
         if name == FOLDER or value is None:
             continue
         if isinstance(value, Mapping):
             yield from row_to_words(value, f"{name}.")
-        elif name in list_flags():
-            yield from [f"--{name}"] if is_set(name, value) else []
+        elif kind is bool:
+            yield from [f"--{name}"] if parse_flag(name, value) else []
         else:
-            yield from (f"--{name}", *value_to_words(name, value))
+            yield from (f"--{name}", *value_to_words(name, value, has_tuple(kind)))
 
 
-def value_to_words(name: str, value: Any) -> list[str]:
-    """Convert a value to words."""
-    if isinstance(value, list):
-        words = [str(item) for item in value]
-    elif isinstance(value, str) and name in list_multiple_options():
-        words = split_cell(value)
-    else:
-        words = [str(value)]
+def value_to_words(name: str, value: Any, is_multiple: bool) -> list[str]:
+    """Convert a value to words; a text is split like a shell if it can have several."""
+    words = [str(item) for item in value] if isinstance(value, list) else [str(value)]
+    if isinstance(value, str) and is_multiple:
+        try:
+            words = shlex.split(value)
+        except ValueError as error:
+            raise InputError(f"'{quote_value(value)}' has an unmatched quotation mark.") from error
     for word in words:
         if word.startswith("-") and not is_number(word):
             raise InputError(f"{name} cannot be '{quote_value(word)}', which begins with a dash.")
     return words
 
 
-def split_cell(cell: str) -> list[str]:
-    """Split a cell into words like a shell."""
-    try:
-        return shlex.split(cell)
-    except ValueError as error:
-        raise InputError(f"'{quote_value(cell)}' has an unmatched quotation mark.") from error
-
-
-def is_set(name: str, value: Any) -> bool:
+def parse_flag(name: str, value: Any) -> bool:
     """Return True if a row sets a flag."""
     text = str(value).lower()
-    if text not in (*YES, *NO):
+    if text not in FLAG_VALUES:
         raise InputError(f"{name} is '{quote_value(text)}'; it must be true or false.")
-    return text in YES
+    return FLAG_VALUES[text]
 
 
 def is_number(word: str) -> bool:
@@ -94,22 +90,12 @@ def is_number(word: str) -> bool:
     return True
 
 
-@cache
-def list_flags() -> frozenset[str]:
-    """Return the options of `complete` without a value."""
-    return frozenset(name for name, kind in list_type_hints() if kind is bool)
+def has_tuple(kind: Any) -> bool:
+    """Return True if an option of this type has several values."""
+    return "tuple" in str(kind).lower() or any(map(has_tuple, get_args(kind)))
 
 
 @cache
-def list_multiple_options() -> frozenset[str]:
-    """Return the options of `complete` with several values."""
-
-    def has_tuple(kind: Any) -> bool:
-        return "tuple" in str(kind).lower() or any(map(has_tuple, get_args(kind)))
-
-    return frozenset(name for name, kind in list_type_hints() if has_tuple(kind))
-
-
-def list_type_hints() -> list[tuple[str, Any]]:
+def list_type_hints() -> dict[str, Any]:
     """Return the options of `complete` with their types."""
-    return [(n.replace("_", "-"), kind) for n, kind in get_type_hints(CompleteOptions).items()]
+    return {n.replace("_", "-"): kind for n, kind in get_type_hints(CompleteOptions).items()}

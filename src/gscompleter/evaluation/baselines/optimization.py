@@ -20,6 +20,16 @@ from gscompleter.render import Renderer
 from gscompleter.ssim import ssim_map
 from gscompleter.types import Camera, Gaussians, View, merge
 
+POSITION_RATE, ROTATION_RATE, SCALE_RATE = 1.6e-4, 1e-3, 5e-3
+"""Step sizes; that of positions is in camera extents."""
+OPACITY_RATE, COLOR_RATE = 0.05, 2.5e-3
+DSSIM_WEIGHT = 0.2
+"""Weight of 1 - SSIM in the loss; the rest is L1."""
+DENSE_SHARE = 0.01
+"""Largest size of a cloned Gaussian, in camera extents; larger ones are split."""
+MIN_OPACITY = 0.005
+"""Opacity below which Gaussians are pruned."""
+
 
 @dataclass(frozen=True)
 class OptimizationConfig:
@@ -28,28 +38,8 @@ class OptimizationConfig:
     iterations: int = 800
     density_rounds: int = 10
     """Rounds of cloning, splitting and pruning; 0 for `distill`."""
-    position_rate: float = 1.6e-4
-    """Step size of positions, in camera extents."""
-    color_rate: float = 2.5e-3
-    opacity_rate: float = 0.05
-    scale_rate: float = 5e-3
-    rotation_rate: float = 1e-3
-    dssim_weight: float = 0.2
-    """Weight of 1 - SSIM in the loss; the rest is L1."""
     gradient_threshold: float = 2e-4
     """Mean image gradient, per half image width, from which Gaussians are added."""
-    dense_share: float = 0.01
-    """Largest size of a cloned Gaussian, in camera extents; larger ones are split."""
-    min_opacity: float = 0.005
-    """Opacity below which Gaussians are pruned."""
-
-
-@dataclass(frozen=True)
-class OptimizedScene:
-    """The fitted scene."""
-
-    gaussians: Gaussians
-    losses: tuple[float, ...]
 
 
 def optimize(
@@ -58,80 +48,58 @@ def optimize(
     renderer: Renderer,
     seed: int = 0,
     config: OptimizationConfig = OptimizationConfig(),
-) -> OptimizedScene:
+) -> Gaussians:
     """Fit all attributes of `scene` to `views`; `seed` sets their order and the splitting."""
     random = torch.Generator().manual_seed(seed)
     extent = compute_extent([view.camera for view in views])
-    state = Parameters.from_scene(scene, config, extent)
+    state = Parameters(scene, extent)
     gradients = counts = torch.zeros_like(scene.opacities)
-    rounds = list_density_rounds(config)
-    losses: list[float] = []
+    # Rounds of density control, evenly over the first 80 % of the iterations.
+    last, count = 0.8 * config.iterations, config.density_rounds
+    rounds = {math.ceil(last * (i + 1) / count) for i in range(count)}
     order: list[int] = []
     for number in track(range(1, config.iterations + 1), "Optimising"):
         order = order or torch.randperm(len(views), generator=random).tolist()
         view = views[order.pop()]
         gaussians = state.make_gaussians()
         image = view.fill_ignored(renderer.render(gaussians, view.camera).image)
-        loss = (1 - config.dssim_weight) * (image - view.image).abs().mean()
-        loss = loss + config.dssim_weight * (1 - ssim_map(image, view.image).mean())
+        loss = (1 - DSSIM_WEIGHT) * (image - view.image).abs().mean()
+        loss = loss + DSSIM_WEIGHT * (1 - ssim_map(image, view.image).mean())
         state.optimizer.zero_grad()
         loss.backward()
-        losses.append(loss.item())
-        gradient, seen = compute_image_gradients(gaussians.means, state.means.grad, view.camera)
+        gradient, seen = compute_image_gradients(gaussians.means, state.leaves[0].grad, view.camera)
         gradients, counts = gradients + gradient, counts + seen
         state.optimizer.step()
         if number in rounds:
             crowded = gradients / counts.clamp_min(1) >= config.gradient_threshold
-            dense = control_density(state.make_gaussians(), crowded, extent, random, config)
-            state = Parameters.from_scene(dense, config, extent)
+            dense = control_density(state.make_gaussians(), crowded, extent, random)
+            state = Parameters(dense, extent)
             gradients = counts = torch.zeros_like(dense.opacities)
     with torch.no_grad():  # so that the result is detached from the parameters
-        return OptimizedScene(state.make_gaussians()[:], tuple(losses))
+        return state.make_gaussians()[:]
 
 
-def list_density_rounds(config: OptimizationConfig) -> set[int]:
-    """List the iterations with density control, evenly over the first 80 %."""
-    last = 0.8 * config.iterations
-    return {math.ceil(last * (i + 1) / config.density_rounds) for i in range(config.density_rounds)}
-
-
-@dataclass(frozen=True)
 class Parameters:
-    """Optimized parameters of 3DGS: log-scales and opacity logits."""
+    """Optimized parameters of 3DGS: means, quats, log-scales, opacity logits and SH.
 
-    means: Tensor
-    quats: Tensor
-    log_scales: Tensor
-    logits: Tensor
-    sh: Tensor
-    generated: Tensor
-    is_antialiased: bool
-    optimizer: torch.optim.Adam
+    Adam restarts with each round of density control.
+    """
 
-    @staticmethod
-    def from_scene(scene: Gaussians, config: OptimizationConfig, extent: float) -> Parameters:
-        """Create the parameters; Adam restarts after each round of density control."""
-        rates = (
-            (scene.means, config.position_rate * extent),
-            (scene.quats, config.rotation_rate),
-            (scene.scales.clamp_min(1e-12).log(), config.scale_rate),
-            (scene.opacities.logit(eps=1e-4), config.opacity_rate),
-            (scene.sh, config.color_rate),
-        )
-        leaves = [value.detach().clone().requires_grad_() for value, _ in rates]
-        groups = [
-            {"params": [leaf], "lr": rate} for leaf, (_, rate) in zip(leaves, rates, strict=True)
-        ]
-        optimizer = torch.optim.Adam(groups, eps=1e-15)
-        means, quats, log_scales, logits, sh = leaves
-        kept = scene.generated, scene.is_antialiased
-        return Parameters(means, quats, log_scales, logits, sh, *kept, optimizer)
+    def __init__(self, scene: Gaussians, extent: float) -> None:
+        self.scene = scene
+        log_scales = scene.scales.clamp_min(1e-12).log()
+        values = (scene.means, scene.quats, log_scales, scene.opacities.logit(eps=1e-4), scene.sh)
+        rates = (POSITION_RATE * extent, ROTATION_RATE, SCALE_RATE, OPACITY_RATE, COLOR_RATE)
+        self.leaves = [value.detach().clone().requires_grad_() for value in values]
+        both = zip(self.leaves, rates, strict=True)
+        groups = [{"params": [leaf], "lr": rate} for leaf, rate in both]
+        self.optimizer = torch.optim.Adam(groups, eps=1e-15)
 
     def make_gaussians(self) -> Gaussians:
         """Assemble the scene, differentiable in the parameters."""
-        scales, opacities = self.log_scales.exp(), self.logits.sigmoid()
-        leaves = self.means, self.quats, scales, opacities, self.sh, self.generated
-        return Gaussians(*leaves, is_antialiased=self.is_antialiased)
+        means, quats, log_scales, logits, sh = self.leaves
+        leaves = means, quats, log_scales.exp(), logits.sigmoid(), sh, self.scene.generated
+        return Gaussians(*leaves, is_antialiased=self.scene.is_antialiased)
 
 
 def compute_extent(cameras: Sequence[Camera]) -> float:
@@ -161,11 +129,10 @@ def control_density(
     crowded: Bool[Tensor, "n"],
     extent: float,
     random: torch.Generator,
-    config: OptimizationConfig,
 ) -> Gaussians:
     """Clone small `crowded` Gaussians, split large ones and prune faint ones."""
     with torch.no_grad():
-        large = scene.scales.amax(dim=-1) > config.dense_share * extent
+        large = scene.scales.amax(dim=-1) > DENSE_SHARE * extent
         clones, parents = scene[crowded & ~large], scene[crowded & large]
         kept = scene[~(crowded & large)]
         children = []
@@ -175,4 +142,4 @@ def control_density(
             moved = parents.means + (quats_to_rotations(parents.quats) @ offset[..., None])[..., 0]
             children.append(replace(parents, means=moved, scales=parents.scales / 1.6))
         dense = merge([kept, clones, *children])
-        return dense[dense.opacities >= config.min_opacity]
+        return dense[dense.opacities >= MIN_OPACITY]

@@ -1,28 +1,39 @@
 """Registration by one similarity, after RegGS (Cheng et al., 2025).
 
-Scale, rotation and translation of all lifted Gaussians are fitted to colour, depth and a mixture
-distance. RegGS also estimates the poses, which are known here.
+Scale, rotation and translation of all lifted Gaussians are fitted to colour, depth and the entropic
+Mixture-2-Wasserstein distance (Delon and Desolneux, 2020). RegGS also estimates the poses, which
+are known here.
 """
 
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
 import torch
-from jaxtyping import Float
+from jaxtyping import Float, Int
 from scipy.cluster.vq import kmeans2
 from torch import Tensor
+from torch.autograd.function import once_differentiable
 
-from gscompleter.evaluation.baselines.mixture_wasserstein import (
-    Mixture,
-    compute_mixture_wasserstein,
-    reduce_mixture,
-)
 from gscompleter.geometry import multiply_quats, quats_to_rotations
 from gscompleter.progress import track
 from gscompleter.render import Renderer
 from gscompleter.types import Camera, Gaussians, View
+
+EPSILON = 0.1
+"""Entropic regularization, in squared units of length."""
+MAX_ITERATIONS = 100
+"""Largest number of updates of both potentials."""
+TOLERANCE = 1e-5
+"""Largest change of a converged potential."""
+RATES = (1e-3, 2e-4, 2e-3)
+"""Step sizes of scale, rotation, and translation (in scene units), as in RegGS."""
+DEPTH_WEIGHT = 0.1
+"""Weight of the depths in the loss, relative to the colours."""
+PATIENCE = 10
+"""The mixture distance is dropped if it does not fall in this many steps."""
 
 
 @dataclass(frozen=True)
@@ -30,17 +41,9 @@ class RegGSConfig:
     """Settings of the registration; the defaults are those of RegGS."""
 
     iterations: int = 400
-    scale_rate: float = 1e-3
-    rotation_rate: float = 2e-4
-    translation_rate: float = 2e-3
-    """Step size of the translation, in scene units."""
-    color_weight: float = 1.0
-    depth_weight: float = 0.1
     mixture_weight: float = 0.1
     components: int = 1000
     """Clusters per set of Gaussians."""
-    patience: int = 10
-    """The mixture distance is dropped if it does not fall in this many steps."""
 
 
 @dataclass(frozen=True)
@@ -59,15 +62,6 @@ class Similarity:
         return quats_to_rotations(self.quaternion)
 
 
-@dataclass(frozen=True)
-class RegisteredScene:
-    """The registered Gaussians, and their similarity."""
-
-    gaussians: Gaussians
-    similarity: Similarity
-    losses: tuple[float, ...]
-
-
 def register_by_similarity(
     lifted: Gaussians,
     scene: Gaussians,
@@ -75,7 +69,7 @@ def register_by_similarity(
     renderer: Renderer,
     seed: int = 42,
     config: RegGSConfig = RegGSConfig(),
-) -> RegisteredScene:
+) -> Gaussians:
     """Fit one similarity between `lifted` and `scene` at the camera of `reference`."""
     camera = reference.camera
     own = renderer.render(lifted, camera)
@@ -87,18 +81,12 @@ def register_by_similarity(
     scale = ratio.detach().clone().requires_grad_()
     quaternion = scale.detach().new_tensor([1.0, 0.0, 0.0, 0.0]).requires_grad_()
     translation = torch.zeros(3, device=scale.device, requires_grad=True)
-    optimizer = torch.optim.Adam(
-        [
-            {"params": [scale], "lr": config.scale_rate},
-            {"params": [quaternion], "lr": config.rotation_rate},
-            {"params": [translation], "lr": config.translation_rate},
-        ],
-        amsgrad=True,
-    )
+    parameters = (scale, quaternion, translation)
+    groups = [{"params": [p], "lr": rate} for p, rate in zip(parameters, RATES, strict=True)]
+    optimizer = torch.optim.Adam(groups, amsgrad=True)
     small_lifted = cluster_gaussians(lifted, camera, config.components, seed)
     small_scene = cluster_gaussians(scene, camera, config.components, seed)
     best, best_loss = None, np.inf
-    losses: list[float] = []
     distances: list[float] = []
     compare_mixtures = config.mixture_weight > 0
     for _ in track(range(config.iterations), "Registering"):
@@ -108,26 +96,28 @@ def register_by_similarity(
         colour = ((moved.image - reference.image).abs() * alpha[..., None] ** 3).sum()
         overlap = own.depth_map().valid & moved.depth_map().valid
         depth = (moved.depth - scale * own.depth.detach())[overlap].abs().sum()
-        loss = config.color_weight * colour + config.depth_weight * depth
+        loss = colour + DEPTH_WEIGHT * depth
         if compare_mixtures:
-            distance = compute_mixture_wasserstein(
-                scale_mixture(small_lifted, scale), rotate_mixture(small_scene, fit, camera)
+            scaled = Mixture(
+                scale * small_lifted.means,
+                scale**2 * small_lifted.covariances,
+                small_lifted.weights,
             )
-            recent = distances[-config.patience :]
-            if len(distances) >= config.patience and distance.item() >= max(recent):
+            distance = compute_mixture_wasserstein(scaled, rotate_mixture(small_scene, fit, camera))
+            recent = distances[-PATIENCE:]
+            if len(distances) >= PATIENCE and distance.item() >= max(recent):
                 compare_mixtures = False
             else:
                 loss = loss + config.mixture_weight * distance
             distances.append(distance.item())
         if loss.item() < best_loss:
             best_loss = loss.item()
-            best = Similarity(*(p.detach().clone() for p in (scale, quaternion, translation)))
+            best = Similarity(*(p.detach().clone() for p in parameters))
         optimizer.zero_grad()
         loss.backward()
         optimizer.step()
-        losses.append(loss.item())
     similarity = best or Similarity(scale.detach(), quaternion.detach(), translation.detach())
-    return RegisteredScene(move_into_scene(lifted, similarity, camera), similarity, tuple(losses))
+    return move_into_scene(lifted, similarity, camera)
 
 
 def move_scene(scene: Gaussians, fit: Similarity) -> Gaussians:
@@ -170,11 +160,6 @@ def cluster_gaussians(gaussians: Gaussians, camera: Camera, components: int, see
     )
 
 
-def scale_mixture(mixture: Mixture, scale: Float[Tensor, ""]) -> Mixture:
-    """Scale a mixture."""
-    return Mixture(scale * mixture.means, scale**2 * mixture.covariances, mixture.weights)
-
-
 def rotate_mixture(mixture: Mixture, fit: Similarity, camera: Camera) -> Mixture:
     """Move a mixture in camera axes by the similarity of the scene."""
     c2w = camera.c2w[:3, :3]
@@ -185,3 +170,83 @@ def rotate_mixture(mixture: Mixture, fit: Similarity, camera: Camera) -> Mixture
         rotation @ mixture.covariances @ rotation.T,
         mixture.weights,
     )
+
+
+@dataclass(frozen=True)
+class Mixture:
+    """A mixture of Gaussians; the weights sum to 1."""
+
+    means: Float[Tensor, "n 3"]
+    covariances: Float[Tensor, "n 3 3"]
+    weights: Float[Tensor, "n"]
+
+
+def reduce_mixture(mixture: Mixture, clusters: Int[Tensor, "n"]) -> Mixture:
+    """Merge each cluster into one component with its mean and covariance."""
+    count = int(clusters.max()) + 1
+    weight = mixture.weights.new_zeros(count).index_add(0, clusters, mixture.weights)
+    filled = weight > 0
+    share = mixture.weights / weight[clusters]
+    means = mixture.means.new_zeros(count, 3)
+    means = means.index_add(0, clusters, share[:, None] * mixture.means)
+    offset = mixture.means - means[clusters]
+    spread = mixture.covariances + offset[:, :, None] * offset[:, None, :]
+    covariances = mixture.means.new_zeros(count, 3, 3)
+    covariances = covariances.index_add(0, clusters, share[:, None, None] * spread)
+    weights = weight[filled] / weight[filled].sum()
+    return Mixture(means[filled], covariances[filled], weights)
+
+
+def compute_pairwise_costs(a: Mixture, b: Mixture) -> Float[Tensor, "n m"]:
+    """Compute squared 2-Wasserstein distances between components.
+
+    |μ_i - μ_j|² + tr Σ_i + tr Σ_j - 2 tr (Σ_i^½ Σ_j Σ_i^½)^½
+    """
+    offsets = a.means[:, None] - b.means[None]
+    root = compute_matrix_root(a.covariances)
+    middle = root[:, None] @ b.covariances[None] @ root[:, None]
+    traces = torch.diagonal(a.covariances, dim1=-2, dim2=-1).sum(-1)[:, None]
+    traces = traces + torch.diagonal(b.covariances, dim1=-2, dim2=-1).sum(-1)[None]
+    crossed = torch.diagonal(compute_matrix_root(middle), dim1=-2, dim2=-1).sum(-1)
+    return offsets.square().sum(-1) + traces - 2 * crossed
+
+
+def compute_matrix_root(matrices: Float[Tensor, "*n 3 3"]) -> Float[Tensor, "*n 3 3"]:
+    """Compute square roots of positive matrices, differentiable at equal eigenvalues."""
+    identity = torch.eye(3, dtype=matrices.dtype, device=matrices.device)
+    return _MatrixRoot.apply(matrices + 1e-6 * identity)
+
+
+class _MatrixRoot(torch.autograd.Function):
+    """R with R R = M by eigenvalues; the gradient solves dM = R dR + dR R."""
+
+    @staticmethod
+    def forward(ctx: Any, matrices: Tensor) -> Tensor:
+        values, vectors = torch.linalg.eigh(matrices)
+        roots = values.clamp_min(0).sqrt()
+        ctx.save_for_backward(roots, vectors)
+        return vectors @ (roots[..., None] * vectors.transpose(-1, -2))
+
+    @staticmethod
+    @once_differentiable
+    def backward(ctx: Any, gradient: Tensor) -> Tensor:
+        roots, vectors = ctx.saved_tensors
+        sums = (roots[..., :, None] + roots[..., None, :]).clamp_min(1e-6)
+        inner = (vectors.transpose(-1, -2) @ gradient @ vectors) / sums
+        return vectors @ inner @ vectors.transpose(-1, -2)
+
+
+def compute_mixture_wasserstein(a: Mixture, b: Mixture) -> Float[Tensor, ""]:
+    """Compute Σ plan * cost by Sinkhorn iterations; the largest plan entry is 1 as in RegGS."""
+    cost = compute_pairwise_costs(a, b)
+    log_a, log_b = (a.weights + 1e-10).log(), (b.weights + 1e-10).log()
+    log_kernel = -cost / EPSILON
+    log_u, log_v = torch.zeros_like(log_a), torch.zeros_like(log_b)
+    for _ in range(MAX_ITERATIONS):
+        log_u = log_a - torch.logsumexp(log_kernel + log_v[None], dim=1)
+        before = log_v
+        log_v = log_b - torch.logsumexp(log_kernel + log_u[:, None], dim=0)
+        if (log_v - before).abs().max() < TOLERANCE:
+            break
+    log_plan = log_u[:, None] + log_kernel + log_v[None]
+    return ((log_plan - log_plan.max()).exp() * cost).sum()

@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 
 import torch
 
@@ -41,10 +41,6 @@ class Coverage:
     cameras: int
     """Number of cameras."""
 
-    def as_summary(self) -> dict[str, float]:
-        """Return the entry of `summary.json`."""
-        return asdict(self)
-
 
 @dataclass(frozen=True)
 class RenderPair:
@@ -72,8 +68,8 @@ def render_pairs(
 
 
 def compute_coverage(pairs: Sequence[RenderPair]) -> Coverage:
-    """Compute the coverage before and after completion."""
-    before, after = [look.before for look in pairs], [look.after for look in pairs]
+    """Compute the coverage before and after completion, and count the cameras."""
+    before, after = [pair.before for pair in pairs], [pair.after for pair in pairs]
     return Coverage(compute_covered_share(before), compute_covered_share(after), len(pairs))
 
 
@@ -99,16 +95,12 @@ def sample_held_out_camera(
     share = torch.rand((), generator=generator).item()
     shift = step * torch.randn(3, generator=generator) / 3**0.5
     right, down = (TURN_DEGREES * torch.randn(2, generator=generator)).tolist()
-    between = interpolate_camera(first, find_nearest_camera(first, cameras), share)
+    others = [other for other in cameras if other is not first]
+    nearest = min(others, key=lambda other: measure_baseline(first, other), default=first)
+    between = interpolate_camera(first, nearest, share)
     turn = axis_angle_to_matrix(between.c2w[:3, 1], math.radians(right))
     turn = axis_angle_to_matrix(between.c2w[:3, 0], math.radians(down)) @ turn
     return move_camera(between, turn, shift.to(between.c2w))
-
-
-def find_nearest_camera(camera: Camera, cameras: Sequence[Camera]) -> Camera:
-    """Return the camera nearest to `camera`, or `camera` itself if there is no other."""
-    others = [other for other in cameras if other is not camera]
-    return min(others, key=lambda other: measure_baseline(camera, other), default=camera)
 
 
 def interpolate_camera(first: Camera, second: Camera, share: float) -> Camera:

@@ -46,33 +46,16 @@ def count_known(truth: Float[Tensor, "h w"] | None, where: Bool[Tensor, "h w"]) 
     return None if truth is None else int((where & (truth > 0)).sum())
 
 
-@dataclass(frozen=True)
-class CloudDistances:
-    """Nearest-neighbour distances from cloud A to cloud B and from B to A, in scene units."""
+def compute_f_score(
+    a_to_b: Float[np.ndarray, "n"], b_to_a: Float[np.ndarray, "m"], threshold: float
+) -> float:
+    """Compute 2 P R / (P + R) of two point sets; 1 is best, and 0 if P = R = 0.
 
-    a_to_b: Float[np.ndarray, "n"]
-    b_to_a: Float[np.ndarray, "m"]
-
-    @property
-    def chamfer(self) -> float:
-        """Mean distance in scene units, not squared, so that floaters do not dominate."""
-        return float(self.a_to_b.mean() + self.b_to_a.mean()) / 2
-
-    def compute_f_score(self, threshold: float) -> float:
-        """Compute 2 P R / (P + R); 1 is best, and 0 if P = R = 0.
-
-        Precision P is the share of A within `threshold` (scene units) of B, recall R that of B near
-        A.
-        """
-        precision = float((self.a_to_b <= threshold).mean())
-        recall = float((self.b_to_a <= threshold).mean())
-        total = precision + recall
-        return 2 * precision * recall / total if total > 0 else 0.0
-
-
-def compute_cloud_distances(a: Float[Tensor, "n 3"], b: Float[Tensor, "m 3"]) -> CloudDistances:
-    """Compute exact nearest-neighbour distances between two point sets, both ways."""
-    return CloudDistances(compute_nearest_distances(a, b), compute_nearest_distances(b, a))
+    Precision P is the share of A within `threshold` (scene units) of B, recall R that of B near A.
+    """
+    precision, recall = float((a_to_b <= threshold).mean()), float((b_to_a <= threshold).mean())
+    total = precision + recall
+    return 2 * precision * recall / total if total > 0 else 0.0
 
 
 def compute_nearest_distances(
@@ -176,26 +159,18 @@ def compare_clouds(
     threshold = MATCH_DISTANCE * scale
     points = select_in_mask(generated, None, overlap, target).means
     surface = select_in_mask(context, None, overlap, target).means
-    surface = surface[find_on_surface(surface, reference.depth, target, threshold)]
+    pixels, z = project(surface, target)
+    at_pixel = sample(reference.depth[..., None], pixels, "nearest")[..., 0]
+    surface = surface[is_inside(pixels, z, target) & ((z - at_pixel).abs() <= threshold)]
     if len(points) == 0 or len(surface) == 0:
         return Alignment(share, count, scale, error, None, None)
-    distances = CloudDistances(
-        compute_nearest_distances(points, context.means),
-        compute_nearest_distances(surface, generated.means),
-    )
-    f_score = distances.compute_f_score(threshold)
-    return Alignment(share, count, scale, error, distances.chamfer, f_score)
+    there = compute_nearest_distances(points, context.means)
+    back = compute_nearest_distances(surface, generated.means)
+    # Distances are not squared, so that floaters do not dominate.
+    chamfer = float(there.mean() + back.mean()) / 2
+    return Alignment(share, count, scale, error, chamfer, compute_f_score(there, back, threshold))
 
 
 def drop_transparent(gaussians: Gaussians) -> Gaussians:
     """Drop Gaussians that no renderer shows."""
     return gaussians[gaussians.opacities >= MIN_OPACITY]
-
-
-def find_on_surface(
-    points: Float[Tensor, "n 3"], depth: Float[Tensor, "h w"], camera: Camera, tolerance: float
-) -> Bool[Tensor, "n"]:
-    """Find points whose z-depth is that of their pixel, within `tolerance` in scene units."""
-    pixels, z = project(points, camera)
-    at_pixel = sample(depth[..., None], pixels, "nearest")[..., 0]
-    return is_inside(pixels, z, camera) & ((z - at_pixel).abs() <= tolerance)

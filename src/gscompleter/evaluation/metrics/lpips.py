@@ -9,7 +9,6 @@ github.com/richzhang/PerceptualSimilarity (w). Only files with the published SHA
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import lru_cache
 from pathlib import Path
@@ -25,46 +24,6 @@ from gscompleter.models.weights.reading import check_kind, check_sha256, read_te
 
 NetworkName = Literal["vgg", "alex"]
 
-
-@dataclass(frozen=True)
-class WeightsFile:
-    """A published file of weights."""
-
-    name: str
-    url: str
-    sha256: str
-    cache: str
-    """Folder of the file in the cache of torch.hub."""
-
-
-@dataclass(frozen=True)
-class Network:
-    """A backbone, the layers that are compared, and its files."""
-
-    layers: tuple[tuple[int, int, int, int] | str, ...]
-    """Convolutions as (channels, kernel, stride, padding), `relu` and `pool`."""
-    pool: int
-    """Side of the max-pooling windows; their stride is 2 pixels."""
-    taps: tuple[int, int, int, int, int]
-    """Layers whose output is compared."""
-    channels: tuple[int, int, int, int, int]
-    """Channels of these outputs."""
-    min_side: int
-    """Smallest image side for which the last tap has a pixel."""
-    backbone: WeightsFile
-    linear: WeightsFile
-
-
-def make_vgg_layers() -> tuple[tuple[int, int, int, int] | str, ...]:
-    """Return the layers of VGG16: blocks of 3 x 3 convolutions, each followed by pooling."""
-    layers: list[tuple[int, int, int, int] | str] = []
-    for channels, depth in ((64, 2), (128, 2), (256, 3), (512, 3), (512, 3)):
-        for _ in range(depth):
-            layers += [(channels, 3, 1, 1), "relu"]
-        layers.append("pool")
-    return tuple(layers)
-
-
 TORCHVISION = "https://download.pytorch.org/models/"
 # The address names a commit, so its content cannot change.
 LINEAR = (
@@ -72,51 +31,75 @@ LINEAR = (
     "082bb24f84c091ea94de2867d34c4544f68e0963/lpips/weights/v0.1/"
 )
 
+
+@dataclass(frozen=True)
+class WeightsFile:
+    """A published file of weights."""
+
+    name: str
+    site: str
+    """Address without the name."""
+    sha256: str
+
+    @property
+    def url(self) -> str:
+        """Address of the file."""
+        return self.site + self.name
+
+
+@dataclass(frozen=True)
+class Network:
+    """A backbone and its files."""
+
+    convolutions: tuple[tuple[int, int, int, int], ...]
+    """Channels, kernel, stride and padding of each; a ReLU follows."""
+    pooled: tuple[int, ...]
+    """Convolutions before which the image is halved by max-pooling."""
+    pool: int
+    """Side of the pooling windows, in pixels."""
+    taps: tuple[int, ...]
+    """The five convolutions whose features are compared."""
+    min_side: int
+    """Smallest image side for which the last tap has a pixel."""
+    backbone: WeightsFile
+    linear: WeightsFile
+
+
 # The names of the backbones contain the first digits of their SHA-256. Those of the linear weights
 # are not published; several independent projects record the same values.
 NETWORKS: dict[str, Network] = {
     "vgg": Network(
-        layers=make_vgg_layers(),
+        tuple(
+            (channels, 3, 1, 1)
+            for channels, depth in ((64, 2), (128, 2), (256, 3), (512, 3), (512, 3))
+            for _ in range(depth)
+        ),
+        pooled=(2, 4, 7, 10),
         pool=2,
-        taps=(3, 8, 15, 22, 29),
-        channels=(64, 128, 256, 512, 512),
+        taps=(1, 3, 6, 9, 12),
         min_side=16,
         backbone=WeightsFile(
             "vgg16-397923af.pth",
-            TORCHVISION + "vgg16-397923af.pth",
+            TORCHVISION,
             "397923af8e79cdbb6a7127f12361acd7a2f83e06b05044ddf496e83de57a5bf0",
-            "checkpoints",
         ),
         linear=WeightsFile(
-            "vgg.pth",
-            LINEAR + "vgg.pth",
-            "a78928a0af1e5f0fcb1f3b9e8f8c3a2a5a3de244d830ad5c1feddc79b8432868",
-            "checkpoints/lpips_v0.1",
+            "vgg.pth", LINEAR, "a78928a0af1e5f0fcb1f3b9e8f8c3a2a5a3de244d830ad5c1feddc79b8432868"
         ),
     ),
     "alex": Network(
-        layers=(
-            *((64, 11, 4, 2), "relu", "pool"),
-            *((192, 5, 1, 2), "relu", "pool"),
-            *((384, 3, 1, 1), "relu"),
-            *((256, 3, 1, 1), "relu"),
-            *((256, 3, 1, 1), "relu"),
-        ),
+        ((64, 11, 4, 2), (192, 5, 1, 2), (384, 3, 1, 1), (256, 3, 1, 1), (256, 3, 1, 1)),
+        pooled=(1, 2),
         pool=3,
-        taps=(1, 4, 7, 9, 11),
-        channels=(64, 192, 384, 256, 256),
+        taps=(0, 1, 2, 3, 4),
         min_side=31,
         backbone=WeightsFile(
             "alexnet-owt-7be5be79.pth",
-            TORCHVISION + "alexnet-owt-7be5be79.pth",
+            TORCHVISION,
             "7be5be791159472b1fbf3c69796f7cb30dca7ad8466c2df70058c37116cdee02",
-            "checkpoints",
         ),
         linear=WeightsFile(
-            "alex.pth",
-            LINEAR + "alex.pth",
-            "df73285e35b22355a2df87cdb6b70b343713b667eddbda73e1977e0c860835c0",
-            "checkpoints/lpips_v0.1",
+            "alex.pth", LINEAR, "df73285e35b22355a2df87cdb6b70b343713b667eddbda73e1977e0c860835c0"
         ),
     ),
 }
@@ -131,11 +114,20 @@ class Lpips(nn.Module):
     def __init__(self, network: Network) -> None:
         super().__init__()
         self.network = network
-        self.features = build_backbone(network)
-        for i, channels in enumerate(network.channels):
-            # w_l. The published names count a dropout layer, which is used in training only.
-            model = nn.Sequential(nn.Identity(), nn.Conv2d(channels, 1, 1, bias=False))
-            self.add_module(f"lin{i}", nn.ModuleDict({"model": model}))
+        self.taps: list[int] = []
+        layers: list[nn.Module] = []  # numbered as in torchvision
+        channels = 3
+        for number, (out, kernel, stride, padding) in enumerate(network.convolutions):
+            if number in network.pooled:
+                layers.append(nn.MaxPool2d(network.pool, stride=2))
+            layers += [nn.Conv2d(channels, out, kernel, stride, padding), nn.ReLU()]
+            channels = out
+            if number in network.taps:
+                # w_l. The published names count a dropout layer, which is used in training only.
+                model = nn.Sequential(nn.Identity(), nn.Conv2d(channels, 1, 1, bias=False))
+                self.add_module(f"lin{len(self.taps)}", nn.ModuleDict({"model": model}))
+                self.taps.append(len(layers) - 1)
+        self.features = nn.Sequential(*layers)
         # ImageNet's mean and deviation, for colours in [-1, 1].
         statistics = {"shift": (-0.030, -0.088, -0.188), "scale": (0.458, 0.448, 0.450)}
         for name, values in statistics.items():
@@ -151,14 +143,10 @@ class Lpips(nn.Module):
                 f"LPIPS needs images of at least {self.network.min_side} pixels per side, "
                 f"got {height} x {width}."
             )
-        pairs = zip(
-            self.compute_unit_features(image.clamp(0, 1)),
-            self.compute_unit_features(truth),
-            strict=True,
-        )
+        both = (self.compute_unit_features(x) for x in (image.clamp(0, 1), truth))
         terms = [
             self.get_submodule(f"lin{i}.model")((a - b).square()).mean()
-            for i, (a, b) in enumerate(pairs)
+            for i, (a, b) in enumerate(zip(*both, strict=True))
         ]
         return torch.stack(terms).sum()
 
@@ -169,29 +157,12 @@ class Lpips(nn.Module):
         x = image.to(self.shift).permute(2, 0, 1) * 2 - 1
         x = ((x - self.shift) / self.scale)[None]
         found = []
-        for i, layer in enumerate(self.features):
+        for number, layer in enumerate(self.features):
             x = layer(x)
-            if i in self.network.taps:
+            if number in self.taps:
                 length = x.square().sum(dim=1, keepdim=True).sqrt()
                 found.append(x / (length + 1e-10))
         return found
-
-
-def build_backbone(network: Network) -> nn.Sequential:
-    """Build the layers up to the last tap, numbered as in torchvision."""
-    modules: list[nn.Module] = []
-    channels = 3
-    for layer in network.layers[: network.taps[-1] + 1]:
-        if layer == "relu":
-            modules.append(nn.ReLU())
-        elif layer == "pool":
-            modules.append(nn.MaxPool2d(network.pool, stride=2))
-        else:
-            assert not isinstance(layer, str)
-            out, kernel, stride, padding = layer
-            modules.append(nn.Conv2d(channels, out, kernel, stride, padding))
-            channels = out
-    return nn.Sequential(*modules)
 
 
 def load_lpips(
@@ -208,29 +179,33 @@ def load_lpips(
 
     Raises:
         WeightsNotAvailable: A file is missing and cannot be downloaded.
-        InputError: A file is not the published one, or the network is unknown.
+        InputError: A file is not the published one.
     """
-    if network not in NETWORKS:
-        raise InputError(f"There is no LPIPS network {network!r}; choose {' or '.join(NETWORKS)}.")
     wanted = NETWORKS[network]
-    files = (wanted.backbone, wanted.linear)
-    paths = [locate_weights(file, wanted, folder, download and folder is None) for file in files]
-    of_backbone, of_linear = map(read_weights, paths, files)
+    weights: dict[str, Tensor] = {}
+    for file in (wanted.backbone, wanted.linear):
+        path = locate_weights(file, wanted, folder, download and folder is None)
+        check_kind(path, file.name)
+        check_sha256(path, file.sha256, file.name)
+        weights |= read_tensors(path, file.name)
     metric = Lpips(wanted)
     # The file also holds the classifier, which the metric does not use.
-    weights = {k: v for k, v in of_backbone.items() if k.startswith("features.")} | dict(of_linear)
+    weights = {k: v for k, v in weights.items() if not k.startswith("classifier.")}
     try:
         metric.load_state_dict(weights, strict=True)
     except RuntimeError as error:
         raise InputError(
-            f"{paths[0]} and {paths[1]} do not fit the LPIPS network {network}: {error}"
+            f"The weights in {path.parent} do not fit the LPIPS network {network}: {error}"
         ) from error
     return metric.eval().requires_grad_(False)
 
 
 def get_weights_path(file: WeightsFile, folder: Path | None) -> Path:
     """Return the expected path of a file, in `folder` or in the cache of torch.hub."""
-    return (Path(torch.hub.get_dir()) / file.cache if folder is None else folder) / file.name
+    if folder is not None:
+        return folder / file.name
+    cache = "checkpoints" if file.site == TORCHVISION else "checkpoints/lpips_v0.1"
+    return Path(torch.hub.get_dir()) / cache / file.name
 
 
 def locate_weights(
@@ -253,16 +228,6 @@ def locate_weights(
     places = " and ".join(dict.fromkeys(str(get_weights_path(f, folder).parent) for f in files))
     needed = " and ".join(f.url for f in files)
     raise WeightsNotAvailable(f"LPIPS lacks {path.name}{failure}; put {needed} into {places}.")
-
-
-def read_weights(path: Path, file: WeightsFile) -> Mapping[str, Tensor]:
-    """Read the tensors of a file; raise InputError if it is not the published one."""
-    check_kind(path, file.name)
-    check_sha256(path, file.sha256, file.name)
-    weights = read_tensors(path, file.name)
-    if not isinstance(weights, Mapping):
-        raise InputError(f"{path} holds no named weights; fetch it again.")
-    return weights
 
 
 load_cached_lpips = lru_cache(maxsize=2)(load_lpips)

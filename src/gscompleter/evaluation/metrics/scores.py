@@ -10,7 +10,6 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
-from gscompleter.evaluation.metrics.flip import compute_flip_map
 from gscompleter.evaluation.metrics.geometry import (
     Alignment,
     compute_abs_rel,
@@ -18,7 +17,6 @@ from gscompleter.evaluation.metrics.geometry import (
     measure_alignment,
     measure_primitive_alignment,
 )
-from gscompleter.evaluation.metrics.haarpsi import haarpsi
 from gscompleter.evaluation.metrics.image import (
     MAX_PSNR,
     compute_gradient_energy_ratio,
@@ -26,9 +24,10 @@ from gscompleter.evaluation.metrics.image import (
     ssim,
 )
 from gscompleter.evaluation.metrics.lpips import compute_lpips
+from gscompleter.evaluation.metrics.perceptual import compute_flip_map, haarpsi
 from gscompleter.render import Renderer
 from gscompleter.stages.target_view import compute_hole_mask
-from gscompleter.types import Camera, Gaussians, Render, View
+from gscompleter.types import Camera, DepthMap, Gaussians, Render, View
 
 Image = Float[Tensor, "h w 3"]
 
@@ -147,42 +146,39 @@ def score(
 
     `added` is None if existing Gaussians were changed; `registered` has all lifted Gaussians.
     """
-    target = truth.target
-    was = renderer.render(before, target.camera)
-    now = renderer.render(after, target.camera)
-    counted = target.valid_mask
-    holes, covered = compute_hole_mask(was.alpha), now.depth_map().valid & counted
-    context = _render_views(before, after, truth.views, renderer)
-    beside = _render_views(before, after, truth.neighbours, renderer)
+    target, camera = truth.target, truth.target.camera
+    was, now = renderer.render(before, camera), renderer.render(after, camera)
+    holes, counted = compute_hole_mask(was.alpha), target.valid_mask
+    covered = now.depth_map().valid & counted
+    context, beside = (
+        [[renderer.render(scene, view.camera).image for scene in (before, after)] for view in views]
+        for views in (truth.views, truth.neighbours)
+    )
+    observed = [
+        compute_masked_psnr(render.image, target.image, ~holes & counted) for render in (was, now)
+    ]
     scores = Scores(
         hole_fraction=holes.float().mean().item(),
         target_before=measure_quality(was.image, target),
         target_after=measure_quality(now.image, target),
         hole_psnr=compute_masked_psnr(now.image, target.image, holes & counted),
-        observed_psnr=_measure_masked_change(was, now, target, ~holes & counted),
-        neighbours_psnr=average_changes(_measure_changes(beside, compute_view_psnr)),
-        context_psnr=_measure_changes(context, compute_view_psnr),
-        context_ssim=_measure_changes(context, compute_view_ssim),
+        observed_psnr=None if None in observed else Change(*observed),  # type: ignore[arg-type]
+        neighbours_psnr=average_changes(compare(beside, truth.neighbours, compute_view_psnr)),
+        context_psnr=compare(context, truth.views, compute_view_psnr),
+        context_ssim=compare(context, truth.views, compute_view_ssim),
         depth_observed=compute_abs_rel(now.depth, target.depth, ~holes & covered),
         depth_hole=compute_abs_rel(now.depth, target.depth, holes & covered),
         depth_observed_pixels=count_known(target.depth, ~holes & covered),
         depth_hole_pixels=count_known(target.depth, holes & covered),
-        hole_looks=measure_perceptual_quality(
-            target.fill_ignored(now.image), target.image, holes & counted
-        ),
-        observed_looks=measure_perceptual_quality(
-            target.fill_ignored(now.image), target.image, ~holes & counted
-        ),
+        hole_looks=measure_perceptual_quality(now.image, target, holes),
+        observed_looks=measure_perceptual_quality(now.image, target, ~holes),
     )
     if added is not None and len(added) > 0:
-        aligned = measure_alignment(added, before, target.camera, renderer)
-        scores = replace(
-            scores,
-            depth_rim=measure_seam_step(added, was, target.camera, renderer),
-            **name_alignment_scores("align", aligned),
-        )
+        aligned = measure_alignment(added, before, camera, renderer)
+        step = measure_seam_step(added, was, camera, renderer)
+        scores = replace(scores, depth_rim=step, **name_alignment_scores("align", aligned))
     if registered is not None and len(registered) > 0:
-        aligned = measure_primitive_alignment(registered, before, target.camera, renderer)
+        aligned = measure_primitive_alignment(registered, before, camera, renderer)
         scores = replace(scores, **name_alignment_scores("registered", aligned))
     return scores, TargetRenders(was, now, holes)
 
@@ -197,7 +193,7 @@ def name_alignment_scores(name: str, aligned: Alignment) -> dict[str, Any]:
     }
 
 
-def measure_quality(image: Float[Tensor, "h w 3"], photograph: View) -> Quality:
+def measure_quality(image: Image, photograph: View) -> Quality:
     """Compute PSNR, SSIM and, if the weights are available, LPIPS.
 
     Ignored pixels of the photograph do not count for PSNR and count as equal for the others.
@@ -211,21 +207,23 @@ def measure_quality(image: Float[Tensor, "h w 3"], photograph: View) -> Quality:
     )
 
 
-def compute_view_psnr(image: Float[Tensor, "h w 3"], photograph: View) -> float:
+def compute_view_psnr(image: Image, photograph: View) -> float:
     """Compute PSNR in dB over valid pixels of the photograph; `MAX_PSNR` if there are none."""
     counted = compute_masked_psnr(image, photograph.image, photograph.valid_mask)
     return MAX_PSNR if counted is None else counted
 
 
-def compute_view_ssim(image: Float[Tensor, "h w 3"], photograph: View) -> float:
+def compute_view_ssim(image: Image, photograph: View) -> float:
     """Compute SSIM, with ignored pixels of the photograph counted as equal."""
     return ssim(photograph.fill_ignored(image), photograph.image)
 
 
 def measure_perceptual_quality(
-    image: Float[Tensor, "h w 3"], truth: Float[Tensor, "h w 3"], where: Bool[Tensor, "h w"]
+    image: Image, photograph: View, where: Bool[Tensor, "h w"]
 ) -> PerceptualQuality:
-    """Compute FLIP, HaarPSI and the gradient energy ratio over the pixels of `where`."""
+    """Compute FLIP, HaarPSI and the gradient energy ratio over the valid pixels of `where`."""
+    image, truth = photograph.fill_ignored(image), photograph.image
+    where = where & photograph.valid_mask
     errors = compute_flip_map(image, truth)
     return PerceptualQuality(
         None if errors is None or not where.any() else errors[where.cpu()].mean().item(),
@@ -239,10 +237,39 @@ def measure_seam_step(
 ) -> float | None:
     """Compute the median of |D_added - D_context| / D_context; None for too few pixels."""
     alone = renderer.render(added, target).depth_map()
-    both = alone.valid & context.depth_map().valid
-    if both.sum() < MIN_PIXELS:
-        return None
-    return ((alone.depth - context.depth).abs() / context.depth)[both].median().item()
+    steps = (alone.depth - context.depth).abs() / context.depth
+    return compute_median(steps, alone.valid & context.depth_map().valid)
+
+
+def compute_depth_scale(
+    added: Gaussians,
+    holes: Bool[Tensor, "h w"],
+    target: Camera,
+    expected: DepthMap,
+    renderer: Renderer,
+) -> float | None:
+    """Compute the median of D_added / D_expected over the holes: 1 means metric scale.
+
+    D_added is the z-depth of `added` rendered alone. Only holes count, so that methods covering the
+    whole image are comparable. None for too few pixels.
+    """
+    alone = renderer.render(added, target).depth_map()
+    return compute_median(alone.depth / expected.depth, holes & alone.valid & expected.valid)
+
+
+def compute_median(values: Float[Tensor, "h w"], where: Bool[Tensor, "h w"]) -> float | None:
+    """Compute the median over the pixels of `where`; None for fewer than `MIN_PIXELS`."""
+    return None if where.sum() < MIN_PIXELS else values[where].median().item()
+
+
+def compare(
+    pairs: Sequence[Sequence[Image]],
+    views: Sequence[View],
+    metric: Callable[[Image, View], float],
+) -> tuple[Change, ...]:
+    """Compute a metric for each view, whose renders before and after are `pairs`."""
+    both = zip(pairs, views, strict=True)
+    return tuple(Change(metric(was, view), metric(now, view)) for (was, now), view in both)
 
 
 def average_changes(changes: Sequence[Change]) -> Change | None:
@@ -251,31 +278,3 @@ def average_changes(changes: Sequence[Change]) -> Change | None:
         return None
     n = len(changes)
     return Change(sum(c.before for c in changes) / n, sum(c.after for c in changes) / n)
-
-
-def _measure_masked_change(
-    before: Render, after: Render, target: View, where: Bool[Tensor, "h w"]
-) -> Change | None:
-    was = compute_masked_psnr(before.image, target.image, where)
-    now = compute_masked_psnr(after.image, target.image, where)
-    return None if was is None or now is None else Change(was, now)
-
-
-def _render_views(
-    before: Gaussians, after: Gaussians, views: Sequence[View], renderer: Renderer
-) -> list[tuple[Image, Image, View]]:
-    """Render each view before and after, and add its photograph."""
-    return [
-        (
-            renderer.render(before, view.camera).image,
-            renderer.render(after, view.camera).image,
-            view,
-        )
-        for view in views
-    ]
-
-
-def _measure_changes(
-    renders: Sequence[tuple[Image, Image, View]], metric: Callable[[Image, View], float]
-) -> tuple[Change, ...]:
-    return tuple(Change(metric(was, view), metric(now, view)) for was, now, view in renders)

@@ -1,6 +1,7 @@
-"""HaarPSI (Reisenhofer et al., A Haar Wavelet-Based Perceptual Similarity Index, 2018).
+"""HaarPSI and FLIP, which do not reward blur.
 
-Haar wavelets differ where only one image has an edge, so blur is penalized.
+HaarPSI (Reisenhofer et al., A Haar Wavelet-Based Perceptual Similarity Index, 2018) compares Haar
+wavelets, which differ where only one image has an edge. FLIP is NVIDIA's flip-evaluator.
 """
 
 from __future__ import annotations
@@ -89,3 +90,16 @@ def halve_image(values: Float[Tensor, "c h w"]) -> Float[Tensor, "c half_h half_
     """Average 2 x 2 pixels, with black beyond an odd side."""
     h, w = values.shape[1:]
     return avg_pool2d(pad(values, (0, w % 2, 0, h % 2)), 2)
+
+
+def compute_flip_map(
+    image: Float[Tensor, "h w 3"], truth: Float[Tensor, "h w 3"]
+) -> Float[Tensor, "h w"] | None:
+    """Compute the FLIP error per pixel of two sRGB images; None if the package is missing."""
+    try:
+        import flip_evaluator
+    except ImportError:
+        return None
+    both = (x.clamp(0, 1).float().cpu().contiguous().numpy() for x in (truth, image))
+    errors, _, _ = flip_evaluator.evaluate(*both, "LDR", applyMagma=False, computeMeanError=False)
+    return torch.from_numpy(errors[..., 0].copy())

@@ -1,0 +1,263 @@
+"""Engines, which start workers: local processes, Ray tasks, or SLURM jobs through submitit."""
+
+from __future__ import annotations
+
+import contextlib
+import multiprocessing
+import os
+import signal
+import time
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from multiprocessing.connection import Connection
+from pathlib import Path
+from threading import Thread
+from typing import Any, Literal
+
+from gscompleter.cpu_threads import count_available_cores, limit_threads
+from gscompleter.errors import InputError, quote_value
+from gscompleter.io.interrupts import handle_stop_signals
+from gscompleter.jobs.workers import Pool, Share
+from gscompleter.memory import estimate_bytes, read_memory_bytes
+
+EngineName = Literal["local", "ray", "submitit"]
+
+PIXELS, IMAGES = 640 * 480, 8
+"""Size of a typical completion, for the default number of workers."""
+STOP_SECONDS = 20.0
+"""Time that stopped workers have to release their claims."""
+GRACE_SECONDS = 1.0
+"""Time that a worker has to write a finished result after its parent was killed."""
+STORE_BYTES = 200 * 10**6
+"""Memory for return values in a local Ray cluster; they are small, as results are files."""
+
+
+def choose_num_workers() -> int:
+    """Return the number of cores, limited by the memory of a typical completion."""
+    there = read_memory_bytes()
+    fitting = count_available_cores() if there is None else there // estimate_bytes(PIXELS, IMAGES)
+    return max(1, min(count_available_cores(), fitting))
+
+
+@dataclass(frozen=True)
+class LocalEngine:
+    """Workers that are local processes."""
+
+    workers: int
+
+    @contextlib.contextmanager
+    def open(self) -> Iterator[Pool]:
+        """Open a pool of processes, which end with this one."""
+        started: list[LocalWorker] = []
+
+        def start(shares: Sequence[Share]) -> list[LocalWorker]:
+            workers = [LocalWorker(share) for share in shares]
+            started.extend(workers)
+            return workers
+
+        try:
+            yield Pool(self.workers, start)
+        finally:
+            for worker in started:
+                worker.process.terminate()
+            for worker in started:
+                worker.process.join(STOP_SECONDS)
+                worker.process.kill()
+
+
+class WorkerLostError(Exception):
+    """A local worker was killed."""
+
+
+class LocalWorker:
+    """A process that runs a share."""
+
+    def __init__(self, share: Share) -> None:
+        context = multiprocessing.get_context("spawn")
+        self.found: Exception | None = None
+        self.receiver, sender = context.Pipe(duplex=False)
+        self.process = context.Process(target=run_process, args=(share, sender))
+        self.process.start()
+        sender.close()
+
+    def done(self) -> bool:
+        """Return True if the process has ended."""
+        return not self.process.is_alive()
+
+    def exception(self) -> Exception | None:
+        """Return an error if the process was killed, or None."""
+        try:
+            self.found = self.receiver.recv()
+        except EOFError:
+            return WorkerLostError(f"a worker ended with exit code {self.process.exitcode}")
+        return None
+
+    def result(self) -> Exception | None:
+        """Return the result of the share."""
+        return self.found
+
+
+def run_process(share: Share, sender: Connection) -> None:
+    """Run a share in this process; Ctrl-C is for the parent, which then stops this one."""
+    signal.signal(signal.SIGINT, signal.SIG_IGN)
+    handle_stop_signals()
+    Thread(target=stop_with_parent, daemon=True).start()
+    with contextlib.suppress(KeyboardInterrupt):
+        sender.send(share())
+
+
+def stop_with_parent() -> None:
+    """End this process when its parent is gone; its job then releases its claim."""
+    parent = multiprocessing.parent_process()
+    assert parent is not None
+    parent.join()
+    time.sleep(GRACE_SECONDS)
+    os.kill(os.getpid(), signal.SIGTERM)
+
+
+@dataclass(frozen=True)
+class RayEngine:
+    """Workers that are Ray tasks."""
+
+    workers: int | None
+    """Number of simultaneous tasks; None uses all of the cluster."""
+    threads: int
+    gpus: float = 0.0
+    """GPUs per task, possibly a fraction."""
+    address: str | None = None
+    """Address of a cluster; None starts one on this machine."""
+
+    @contextlib.contextmanager
+    def open(self) -> Iterator[Pool]:
+        """Connect to Ray, or start a local cluster, and open a pool of tasks."""
+        ray, started = import_ray(), []
+        self._connect(ray)
+        # A lost task is not repeated by Ray, so that its attempts are counted.
+        task = ray.remote(run_task).options(
+            num_cpus=self.threads, num_gpus=self.gpus, max_retries=0
+        )
+
+        def start(shares: Sequence[Share]) -> list[Any]:
+            tasks = [task.remote(share, self.threads) for share in shares]
+            started.extend(tasks)
+            return [reference.future() for reference in tasks]
+
+        try:
+            cores = int(ray.cluster_resources().get("CPU", 1) // self.threads)
+            yield Pool(self.workers or max(1, cores), start)
+            started.clear()
+        finally:
+            for reference in started:
+                ray.cancel(reference)
+            if started:
+                ray.wait(started, num_returns=len(started), timeout=STOP_SECONDS)
+            ray.shutdown()
+
+    def _connect(self, ray: Any) -> None:
+        cpus = None if self.workers is None else self.workers * self.threads
+        here = {"num_cpus": cpus, "include_dashboard": False, "object_store_memory": STORE_BYTES}
+        options = {"address": self.address} if self.address else {"address": "local", **here}
+        handlers = {number: signal.getsignal(number) for number in (signal.SIGTERM, signal.SIGINT)}
+        try:
+            ray.init(log_to_driver=False, logging_level="ERROR", **options)
+        except (ConnectionError, ValueError, RuntimeError) as error:
+            raise InputError(
+                f"There is no cluster of Ray at {quote_value(self.address)}: "
+                f"{quote_value(str(error))}.",
+                "address",
+            ) from error
+        for number, handler in handlers.items():  # Ray has replaced them by its own
+            signal.signal(number, handler)
+
+
+def import_ray() -> Any:
+    """Import Ray; raise InputError if it is not installed."""
+    os.environ.setdefault("RAY_USAGE_STATS_ENABLED", "0")
+    # Suppresses Ray's notice about future versions on standard error.
+    os.environ.setdefault("RAY_ACCEL_ENV_VAR_OVERRIDE_ON_ZERO", "0")
+    try:
+        import ray
+    except ImportError as error:
+        raise InputError(
+            "The engine ray needs a package; install it with `pip install 'gscompleter[ray]'`."
+        ) from error
+    return ray
+
+
+def run_task(share: Share, threads: int) -> Exception | None:
+    """Run a share in a Ray task."""
+    limit_threads(threads)  # before the first job imports libraries that read it
+    return share()
+
+
+@dataclass(frozen=True)
+class SubmititEngine:
+    """Workers that are SLURM jobs, or local processes without SLURM."""
+
+    workers: int
+    threads: int
+    gpus: float
+    folder: Path
+    """Folder for submitit's files and the output of the jobs."""
+    parameters: Mapping[str, str]
+    """Further SLURM parameters such as `partition` and `time`."""
+
+    @contextlib.contextmanager
+    def open(self) -> Iterator[Pool]:
+        """Open a pool of SLURM jobs."""
+        executor, started = self._make_executor(), []
+
+        def start(shares: Sequence[Share]) -> list[Any]:
+            with executor.batch():
+                sent = [executor.submit(SlurmTask(self.threads), share) for share in shares]
+            started.extend(sent)
+            return sent
+
+        try:
+            yield Pool(self.workers, start)
+        finally:
+            for job in started:
+                with contextlib.suppress(Exception):  # it may have ended
+                    job.cancel()
+
+    def _make_executor(self) -> Any:
+        try:
+            import submitit
+        except ImportError as error:
+            raise InputError(
+                "The engine submitit needs a package; install it with `pip install submitit`."
+            ) from error
+        executor = submitit.AutoExecutor(folder=str(self.folder))
+        further: dict[str, Any] = {f"slurm_{k}": v for k, v in self.parameters.items()}
+        if executor.cluster == "local":
+            further = {"timeout_min": 24 * 60}
+        try:
+            executor.update_parameters(
+                cpus_per_task=self.threads,
+                gpus_per_node=int(self.gpus),
+                name="gscompleter",
+                **further,
+            )
+        except (ValueError, NameError, TypeError) as error:
+            raise InputError(
+                f"A parameter of SLURM is invalid: {quote_value(str(error))}; correct it."
+            ) from error
+        return executor
+
+
+@dataclass(frozen=True)
+class SlurmTask:
+    """Runs a share in a SLURM job."""
+
+    threads: int
+
+    def __call__(self, share: Share) -> Exception | None:
+        """Run the share."""
+        handle_stop_signals()
+        return run_task(share, self.threads)
+
+    def checkpoint(self, share: Share) -> Any:
+        """Resubmit the share if SLURM preempts the job; jobs with a row are skipped."""
+        import submitit
+
+        return submitit.helpers.DelayedSubmission(self, share)
