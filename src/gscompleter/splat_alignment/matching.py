@@ -12,7 +12,7 @@ from jaxtyping import Float
 
 from gscompleter.config.coverage import COVERED
 from gscompleter.geometry import unproject
-from gscompleter.reconstructors.features.sift import Features, detect_features, match_features
+from gscompleter.reconstructors.features.matches import Features, detect_features, match_features
 from gscompleter.reconstructors.features.stereo_image import StereoImage
 from gscompleter.render import Renderer
 from gscompleter.splat_alignment.fit import render_from

@@ -13,9 +13,13 @@ import numpy as np
 from jaxtyping import Float
 
 from gscompleter.kernels.parallel import map_in_parallel
-from gscompleter.reconstructors.features.sift import Pixels, detect_features, match_features
+from gscompleter.reconstructors.features.matches import (
+    Pixels,
+    detect_features,
+    match_features,
+    triangulate_valid,
+)
 from gscompleter.reconstructors.features.stereo_image import StereoImage
-from gscompleter.reconstructors.features.triangulation import triangulate_valid
 
 NUM_SOURCES = 2
 """Number of neighbours per photograph."""
