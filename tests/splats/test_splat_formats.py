@@ -26,8 +26,8 @@ from gscompleter import (
     save_ply,
     save_splat,
 )
+from gscompleter.splats.formats import get_labels_path
 from gscompleter.splats.morton import sort_along_morton
-from gscompleter.splats.provenance import get_labels_path
 from gscompleter.splats.transform import (
     HALF_TURN_X,
     HALF_TURN_Z,

@@ -21,8 +21,14 @@ from numpy import ndarray
 from torch import Tensor
 
 from gscompleter.errors import InputError, quote_value
+from gscompleter.geometry import quats_to_rotations
 from gscompleter.io.reading import read_bytes
-from gscompleter.splats.packing import build_gaussians, check_size, make_damage_error
+from gscompleter.splats.packing import (
+    build_gaussians,
+    check_size,
+    make_damage_error,
+    refuse_invalid,
+)
 from gscompleter.splats.transform import HALF_TURN_Z, rotate_half_turn, transform_gaussians
 from gscompleter.types import Gaussians, merge
 
@@ -58,19 +64,13 @@ def is_glb(head: bytes) -> bool:
 def read_glb(path: Path) -> Gaussians:
     """Read all Gaussians of the scene in a .glb, in the axes of a .ply."""
     document = _parse_document(path, read_bytes(path))
-    try:
+    with refuse_invalid(path, "JSON part"):
         placed = list(_find_primitives(document))
         _check_counts(document, [primitive for primitive, _ in placed])
         parts = [
             transform_gaussians(_decode_primitive(document, primitive), place)
             for primitive, place in placed
         ]
-    except InputError:
-        raise
-    except (KeyError, IndexError, TypeError, ValueError, OverflowError, AttributeError) as error:
-        raise make_damage_error(
-            path, f"its JSON part is invalid ({quote_value(str(error))})"
-        ) from error
     if not parts:
         raise InputError(f"{quote_value(path)} holds no Gaussians: nothing in it uses {EXTENSION}.")
     return rotate_half_turn(merge(parts), HALF_TURN_Z)
@@ -122,13 +122,7 @@ def _read_transform(document: GlbDocument, node: dict[str, Any]) -> Float[Tensor
     else:
         x, y, z, w = (float(value) for value in node.get("rotation", (0, 0, 0, 1)))
         place = torch.eye(4, dtype=torch.float64)
-        place[:3, :3] = torch.tensor(
-            [
-                [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)],
-                [2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)],
-                [2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)],
-            ]
-        )
+        place[:3, :3] = quats_to_rotations(torch.tensor([w, x, y, z], dtype=torch.float64))
         place[:3, :3] *= torch.tensor(node.get("scale", (1, 1, 1)), dtype=torch.float64)
         place[:3, 3] = torch.tensor(node.get("translation", (0, 0, 0)), dtype=torch.float64)
     linear = place[:3, :3]

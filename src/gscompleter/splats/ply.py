@@ -12,7 +12,7 @@ from __future__ import annotations
 import io
 import os
 import re
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import BinaryIO
@@ -38,6 +38,7 @@ _SCALARS = {
     **dict.fromkeys(("float", "float32"), "f4"),
     **dict.fromkeys(("double", "float64"), "f8"),
 }
+_KINDS = {"<f4": "float", "<u4": "uint", "|u1": "uchar"}
 _COUNTS = {name: kind for name, kind in _SCALARS.items() if kind[0] in "iu"}
 _BYTE_ORDERS = {"ascii": "", "binary_little_endian": "<", "binary_big_endian": ">"}
 
@@ -440,17 +441,22 @@ def save_ply(path: Path | str, gaussians: Gaussians, provenance: bool | None = N
     if provenance is None:
         provenance = bool((gaussians.generated > 0).any())
     gaussians = gaussians.to("cpu")
-    kinds = {"<f4": "float", "|u1": "uchar"}
-    lines = ["ply", "format binary_little_endian 1.0"]
-    lines += [MODE_COMMENT] if gaussians.is_antialiased else []
-    lines += [f"element vertex {len(gaussians)}"]
     dtype = make_rows(gaussians[:0], provenance).dtype
-    lines += [f"property {kinds[dtype[name].str]} {name}" for name in dtype.names or ()]
-    header = "\n".join([*lines, "end_header", ""])
+    header = make_header({"vertex": (len(gaussians), dtype)}, gaussians.is_antialiased)
     with replace_file(path) as file:
-        file.write(header.encode("ascii"))
+        file.write(header)
         for block in iterate_blocks(len(gaussians)):
             file.write(make_rows(gaussians[block], provenance).view(np.uint8).data)
+
+
+def make_header(elements: Mapping[str, tuple[int, np.dtype]], is_antialiased: bool) -> bytes:
+    """Make the header of a binary .ply from the number and type of the rows of each element."""
+    lines = ["ply", "format binary_little_endian 1.0"]
+    lines += [MODE_COMMENT] if is_antialiased else []
+    for name, (count, dtype) in elements.items():
+        lines.append(f"element {name} {count}")
+        lines += [f"property {_KINDS[dtype[column].str]} {column}" for column in dtype.names or ()]
+    return "\n".join([*lines, "end_header", ""]).encode("ascii")
 
 
 def make_rows(gaussians: Gaussians, provenance: bool) -> np.ndarray:

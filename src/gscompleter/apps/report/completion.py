@@ -25,8 +25,8 @@ from gscompleter.kernels.parallel import map_in_parallel
 from gscompleter.render import Renderer, get_view_map
 from gscompleter.splats.layout import save_like
 from gscompleter.splats.ply import save_ply
-from gscompleter.splats.provenance import REMOVED_FILE as REMOVED
-from gscompleter.splats.provenance import save_removed
+from gscompleter.splats.strip import REMOVED_FILE as REMOVED
+from gscompleter.splats.strip import save_removed
 from gscompleter.state import Completion, TargetResult
 from gscompleter.types import Camera, Gaussians, Render, View
 
