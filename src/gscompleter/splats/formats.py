@@ -10,6 +10,7 @@ import hashlib
 import json
 from collections.abc import Callable
 from dataclasses import dataclass, replace
+from itertools import groupby
 from pathlib import Path
 
 import numpy as np
@@ -157,6 +158,18 @@ def describe_mode_loss(path: Path, gaussians: Gaussians) -> str | None:
     )
 
 
+def note_infinite_opacities(gaussians: Gaussians) -> str | None:
+    """Describe the number of infinite opacity logits in a sentence, or return None."""
+    logits = None if gaussians.encoded is None else gaussians.encoded[:, 3]
+    if logits is None or logits.sum().isfinite():
+        return None
+    opaque, clear = int(logits.isposinf().sum()), int(logits.isneginf().sum())
+    return (
+        f"{opaque:,} of {len(gaussians):,} Gaussians have an opacity logit of +infinity and "
+        f"{clear:,} of -infinity; they are rendered as opaque and as transparent."
+    )
+
+
 def detect_splat_format(path: Path) -> str:
     """Detect the format of a file or folder, by name."""
     if path.is_dir():
@@ -175,9 +188,9 @@ def detect_splat_format(path: Path) -> str:
             return name
     named = _match_extension(path)
     if named is None or FORMATS[named].recognizes is not None:
+        known = ", ".join(f"*{ending}" for f in FORMATS.values() for ending in f.extensions)
         raise InputError(
-            f"{quote_value(path)} holds no Gaussians in a format that is known: "
-            f"{_list_extensions()}."
+            f"{quote_value(path)} holds no Gaussians in a format that is known: {known}."
         )
     return named
 
@@ -200,10 +213,6 @@ def _match_extension(path: Path) -> str | None:
     return None
 
 
-def _list_extensions() -> str:
-    return ", ".join(f"*{extension}" for f in FORMATS.values() for extension in f.extensions)
-
-
 def get_labels_path(path: Path) -> Path:
     """Get the path of the labels file for a splat file."""
     return path.with_name(f"{path.name}.generated.json")
@@ -216,10 +225,7 @@ def save_labels(path: Path, generated: UInt8[Tensor, "n"]) -> None:
         with contextlib.suppress(FileNotFoundError):
             place.unlink()
         return
-    labels = generated.numpy()
-    starts = np.flatnonzero(np.diff(labels, prepend=labels[0] ^ 1))
-    counts = np.diff(starts, append=len(labels))
-    runs = [[int(labels[s]), int(c)] for s, c in zip(starts, counts, strict=True)]
+    runs = [[label, len(list(run))] for label, run in groupby(generated.tolist())]
     with replace_file(place) as file:
         file.write(json.dumps({"sha256": _hash_file(path), "generated": runs}).encode())
 
@@ -250,8 +256,4 @@ def _is_complete(runs: Int64[ndarray, "m 2"], count: int) -> bool:
 
 
 def _hash_file(path: Path) -> str:
-    digest = hashlib.sha256()
-    with path.open("rb") as file:
-        while block := file.read(1 << 20):
-            digest.update(block)
-    return digest.hexdigest()
+    return hashlib.sha256(path.read_bytes()).hexdigest()

@@ -20,6 +20,7 @@ from typing import BinaryIO
 import numpy as np
 import torch
 from jaxtyping import Bool, Float
+from numpy.lib.recfunctions import require_fields, unstructured_to_structured
 from torch import Tensor
 
 from gscompleter.errors import InputError, quote_value, refuse_pointer
@@ -130,8 +131,7 @@ def read_header(file: BinaryIO, path: Path) -> tuple[str, list[Element]]:
         except (IndexError, KeyError, ValueError) as error:
             raise InputError(
                 f"{path} has a broken header: the line '{quote_value(' '.join(words))}' is "
-                "invalid; "
-                "export it again."
+                "invalid; export it again."
             ) from error
     if file_format not in _BYTE_ORDERS:
         raise InputError(
@@ -232,12 +232,9 @@ def _read_ascii_vertices(
         raise InputError(
             f"{path} holds rows that are not {width} numbers each; write it anew."
         ) from error
-    vertices = np.empty(vertex.count, vertex.dtype("="))
     # Values out of range become infinite or wrong; relevant ones are checked later.
     with np.errstate(over="ignore", invalid="ignore"):
-        for column, prop in enumerate(vertex.properties):
-            vertices[prop.name] = table[:, column]
-    return vertices
+        return unstructured_to_structured(table, vertex.dtype("="))
 
 
 def _make_truncation_error(
@@ -245,8 +242,7 @@ def _make_truncation_error(
 ) -> InputError:
     return InputError(
         f"{path} is truncated: {found:,} of {quote_value(f'{expected:,}')} {quote_value(what)}s "
-        "are there; "
-        "fetch or write the file again."
+        "are there; fetch or write the file again."
     )
 
 
@@ -254,9 +250,8 @@ def load_ply(path: Path | str, drop_nonfinite: bool = False) -> Gaussians:
     """Load the Gaussians of a 3DGS .ply of SH degree 0 to 3.
 
     With `drop_nonfinite`, Gaussians with NaN, infinity or a zero quaternion are dropped; otherwise
-    the
-    file is refused. Infinite opacity logits are valid: converters write them for opacities of 1 and
-    0.
+    the file is refused. Infinite opacity logits are valid: converters write them for opacities of 1
+    and 0.
 
     Raises:
         InputError: The file is missing, no 3DGS .ply, empty, truncated or has invalid values.
@@ -384,18 +379,6 @@ def find_finite(gaussians: Gaussians) -> Bool[Tensor, "n"]:
     return good
 
 
-def note_infinite_opacities(gaussians: Gaussians) -> str | None:
-    """Describe the number of infinite opacity logits in a sentence, or return None."""
-    logits = None if gaussians.encoded is None else gaussians.encoded[:, 3]
-    if logits is None or logits.sum().isfinite():
-        return None
-    opaque, clear = int(logits.isposinf().sum()), int(logits.isneginf().sum())
-    return (
-        f"{opaque:,} of {len(gaussians):,} Gaussians have an opacity logit of +infinity and "
-        f"{clear:,} of -infinity; they are rendered as opaque and as transparent."
-    )
-
-
 def iterate_blocks(count: int) -> Iterator[slice]:
     """Yield slices of `BLOCK_ROWS` rows from 0 to `count`."""
     return (slice(start, start + BLOCK_ROWS) for start in range(0, count, BLOCK_ROWS))
@@ -432,8 +415,7 @@ def save_ply(path: Path | str, gaussians: Gaussians, provenance: bool | None = N
     """Write a standard 3DGS .ply, with `uchar generated` after the standard properties.
 
     `provenance` decides if `generated` is written; the default is yes if anything was generated.
-    Some
-    readers (such as gsply 0.4) misread rows that end in a byte; False writes the plain layout.
+    Some readers (such as gsply 0.4) misread rows that end in a byte; False writes the plain layout.
 
     Raises:
         InputError: The file cannot be written; an existing one is kept.
@@ -461,26 +443,21 @@ def make_header(elements: Mapping[str, tuple[int, np.dtype]], is_antialiased: bo
 
 def make_rows(gaussians: Gaussians, provenance: bool) -> np.ndarray:
     """Make one row per Gaussian in the standard layout, with or without `generated`."""
-    num_rest = 3 * (gaussians.sh.shape[1] - 1)
-    rest = tuple(f"f_rest_{i}" for i in range(num_rest))
-    names = (*_MEANS, *_NORMALS, *_DC, *rest, "opacity", *_SCALES, *_QUATS)
-    layout = [(name, "<f4") for name in names]
-    if provenance:
-        layout.append(("generated", "u1"))
-    vertices = np.zeros(len(gaussians), layout)
-
-    def put(columns: tuple[str, ...], values: Tensor) -> None:
-        table = values.detach().float().numpy()
-        for column, name in enumerate(columns):
-            vertices[name] = table[:, column]
-
+    rest = gaussians.sh[:, 1:].transpose(1, 2).flatten(1)
     encoded = encode(gaussians)
-    put(_MEANS, gaussians.means)
-    put(_DC, gaussians.sh[:, 0])
-    put(rest, gaussians.sh[:, 1:].transpose(1, 2).reshape(len(gaussians), num_rest))
-    put(_SCALES, encoded[:, :3])
-    put(("opacity",), encoded[:, 3:])
-    put(_QUATS, gaussians.quats)
+    columns = {
+        _MEANS: gaussians.means,
+        _NORMALS: torch.zeros_like(gaussians.means),
+        _DC: gaussians.sh[:, 0],
+        tuple(f"f_rest_{i}" for i in range(rest.shape[1])): rest,
+        ("opacity",): encoded[:, 3:],
+        _SCALES: encoded[:, :3],
+        _QUATS: gaussians.quats,
+    }
+    dtype = [(name, "<f4") for names in columns for name in names]
+    table = torch.cat(list(columns.values()), dim=1).detach().float().numpy()
+    rows = np.ascontiguousarray(table, "<f4").view(dtype)[:, 0]
     if provenance:
-        vertices["generated"] = gaussians.generated.numpy()
-    return vertices
+        rows = require_fields(rows, [*dtype, ("generated", "u1")])
+        rows["generated"] = gaussians.generated.numpy()
+    return rows

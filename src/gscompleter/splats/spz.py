@@ -30,7 +30,9 @@ from gscompleter.splats.packing import (
     check_size,
     drop_largest,
     make_damage_error,
+    pack_fractions,
     restore_largest,
+    unpack_fractions,
 )
 from gscompleter.splats.ply import encode
 from gscompleter.splats.transform import HALF_TURN_X, rotate_half_turn
@@ -48,6 +50,8 @@ MAX_WINDOW = 1 << 27
 """Largest window of zstd, in bytes, which it keeps in memory."""
 COLOR_SCALE = 0.15
 """The constant SH coefficient is stored as `0.5 + 0.15 sh`."""
+SIGN_SIZE_BITS = (1, 9) * 3
+"""Bits of sign and size of three components of a rotation."""
 MAX_FRACTIONAL_BITS = 16
 """Largest number of fractional bits of a position."""
 
@@ -203,9 +207,9 @@ def _decode_quats_v2(rotations: UInt8[ndarray, "n 3"]) -> Float[ndarray, "n 4"]:
 def _decode_quats_v3(rotations: UInt8[ndarray, "n 4"]) -> Float[ndarray, "n 4"]:
     """Decode the number of the dropped component and three of 10 bits (xyzw, sign and size)."""
     packed = np.ascontiguousarray(rotations).view("<u4")[:, 0]
-    fields = np.stack([packed >> np.uint32(shift) for shift in (20, 10, 0)], axis=1)
-    sizes = (fields & np.uint32(511)).astype(np.float32) / 511 * np.float32(np.sqrt(0.5))
-    smaller = np.where(fields & np.uint32(512), -sizes, sizes)
+    fields = unpack_fractions(packed, SIGN_SIZE_BITS)
+    sizes = fields[:, 1::2] * np.float32(np.sqrt(0.5))
+    smaller = np.where(fields[:, ::2] > 0, -sizes, sizes)
     return np.roll(restore_largest(packed >> np.uint32(30), smaller), 1, axis=1)
 
 
@@ -265,9 +269,6 @@ def _pack_positions(means: Float[ndarray, "n 3"], bits: int) -> bytes:
 
 def _pack_rotations(quats: Float[ndarray, "n 4"]) -> bytes:
     largest, smaller = drop_largest(np.roll(quats, -1, axis=1))
-    sizes = np.rint(np.abs(smaller) / np.sqrt(0.5) * 511).clip(0, 511).astype(np.uint32)
-    fields = sizes | np.where(smaller < 0, np.uint32(512), np.uint32(0)).astype(np.uint32)
-    packed = largest.astype(np.uint32) << np.uint32(30)
-    for column, shift in enumerate((20, 10, 0)):
-        packed |= fields[:, column] << np.uint32(shift)
+    fields = np.stack([smaller < 0, np.abs(smaller) / np.sqrt(0.5)], axis=2).reshape(-1, 6)
+    packed = (largest.astype(np.uint32) << np.uint32(30)) | pack_fractions(fields, SIGN_SIZE_BITS)
     return packed.astype("<u4").tobytes()

@@ -47,9 +47,9 @@ def run_convert(options: ConvertOptions) -> None:
         describe_mode_loss,
         get_writable_format,
         load_splat,
+        note_infinite_opacities,
         save_splat,
     )
-    from gscompleter.splats.ply import note_infinite_opacities
 
     get_writable_format(options.out)
     check_free(options.out, options.overwrite)

@@ -23,8 +23,7 @@ from gscompleter.io.files import COMPLETED_FILE, CONTEXT_FILE, SUMMARY_FILE, TAR
 from gscompleter.io.image import encode_jpeg, read_pixels
 from gscompleter.io.json_file import read_json
 from gscompleter.splat_alignment.similarity import transform_camera
-from gscompleter.splats.formats import load_splat
-from gscompleter.splats.ply import note_infinite_opacities
+from gscompleter.splats.formats import load_splat, note_infinite_opacities
 from gscompleter.splats.sog import META
 from gscompleter.types import Camera, Gaussians
 
