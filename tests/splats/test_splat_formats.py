@@ -224,6 +224,11 @@ def test_a_moved_scene_looks_the_same_to_a_camera_that_moved_with_it():
     assert torch.allclose(there.image, CPU.render(gaussians, camera).image, atol=2e-3)
 
 
+def test_the_identity_leaves_every_bit_of_the_harmonics():
+    gaussians = plausible(500, 3)
+    assert torch.equal(transform_gaussians(gaussians, torch.eye(4)).sh, gaussians.sh)
+
+
 @pytest.mark.parametrize("signs", [HALF_TURN_X, HALF_TURN_Z])
 def test_half_a_turn_is_exact_and_the_same_as_the_rotation(signs):
     gaussians = plausible(50, 3)

@@ -73,6 +73,16 @@ def test_a_file_of_another_program_comes_back(tmp_path, monkeypatch):
     assert stripped(monkeypatch, tmp_path / "completed.ply") == given.read_bytes()
 
 
+def test_removed_rows_of_a_file_with_further_elements_come_back(tmp_path, monkeypatch):
+    given = foreign(tmp_path / "given.ply")
+    scene, rows = load_ply(given), torch.tensor([1, 3])
+    kept = torch.ones(len(scene), dtype=torch.bool)
+    kept[rows] = False
+    save_like(tmp_path / "completed.ply", scene[kept], added(sh_degree=1), given, kept)
+    save_removed(tmp_path / "removed.ply", scene[rows], rows, given)
+    assert stripped(monkeypatch, tmp_path / "completed.ply") == given.read_bytes()
+
+
 @pytest.mark.parametrize("comment", ["SplatRenderMode: mip", "antialiased 1"])
 @pytest.mark.parametrize("aside", [0, 7])
 def test_an_antialiased_scene_is_completed_as_one_and_comes_back(

@@ -109,14 +109,14 @@ def localize_pose(frame: Frame, origin: Float[np.ndarray, "3"]) -> Matrix:
 
 def find_camera_lists(splat: InputSplat) -> list[Path]:
     """Find the camera lists whose name matches the splat, the best match first."""
-    found = []
-    for folder in splat.list_folders():
-        files = sorted(
-            folder.glob(f"{CAMERA_LIST_PREFIX}*.json"), key=lambda file: (-len(file.stem), file)
-        )
-        tails = [file.stem.removeprefix(CAMERA_LIST_PREFIX) for file in files]
-        found += [f for f, tail in zip(files, tails, strict=True) if splat.path.stem.endswith(tail)]
-    return [file for file in found if has_camera_list(file)]
+    pattern = f"{CAMERA_LIST_PREFIX}*.json"
+    return [
+        file
+        for folder in splat.list_folders()
+        for file in sorted(folder.glob(pattern), key=lambda file: (-len(file.stem), file))
+        if splat.path.stem.endswith(file.stem.removeprefix(CAMERA_LIST_PREFIX))
+        and has_camera_list(file)
+    ]
 
 
 def fit_named_cameras(ours: Mapping[str, Matrix], theirs: Mapping[str, Matrix]) -> Matrix | None:
@@ -128,9 +128,9 @@ def fit_named_cameras(ours: Mapping[str, Matrix], theirs: Mapping[str, Matrix]) 
     pairs = match_names(list(ours), list(theirs))
     pairs = pairs[:: max(1, len(pairs) // MAX_PAIRS)]
     before, after = [ours[a] for a, _ in pairs], [theirs[b] for _, b in pairs]
-    return (
-        fit_pose_similarity(before, after) if has_baseline(before) and has_baseline(after) else None
-    )
+    if not has_baseline(before) or not has_baseline(after):
+        return None
+    return fit_pose_similarity(before, after)
 
 
 def match_names(ours: Sequence[str], theirs: Sequence[str]) -> list[tuple[str, str]]:
@@ -178,12 +178,10 @@ def normalize_opensplat(poses: Poses) -> Matrix:
 def normalize_nerfstudio(poses: Poses, world: Float[np.ndarray, "3 3"]) -> Matrix:
     """Rotate the mean up direction to z after the rotation `world`, then scale like OpenSplat."""
     up = -(poses[:, :3, 1] @ world.T).mean(axis=0)
-    upright = make_similarity(
-        1.0, align_directions(up, np.array([0.0, 0.0, 1.0])) @ world, np.zeros(3)
-    )
-    return (
-        normalize_opensplat(np.stack([transform_pose(pose, upright) for pose in poses])) @ upright
-    )
+    turn = align_directions(up, np.array([0.0, 0.0, 1.0])) @ world
+    upright = make_similarity(1.0, turn, np.zeros(3))
+    turned = np.stack([transform_pose(pose, upright) for pose in poses])
+    return normalize_opensplat(turned) @ upright
 
 
 def normalize_gsplat_cameras(poses: Poses) -> Matrix:

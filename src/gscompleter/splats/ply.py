@@ -122,8 +122,8 @@ def read_header(file: BinaryIO, path: Path) -> tuple[str, list[Element]]:
         try:
             if words[0] == "format":
                 file_format = words[1]
-            elif words[0] == "element":
-                elements.append(Element(words[1], _parse_count(words[2])))
+            elif words[0] == "element" and words[2].isdecimal():
+                elements.append(Element(words[1], int(words[2])))
             elif words[0] == "property":
                 elements[-1].properties.append(_parse_property(words[1:]))
             else:
@@ -148,12 +148,6 @@ def read_mode(file: BinaryIO) -> bool:
     lines = file.read(end).decode("latin-1").splitlines()
     modes = [found[1].lower() for line in lines if (found := _MODE_LINE.fullmatch(line.strip()))]
     return bool(modes) and modes[-1] in _ANTIALIASED
-
-
-def _parse_count(word: str) -> int:
-    if not word.isdecimal():
-        raise ValueError(word)
-    return int(word)
 
 
 def _parse_property(words: list[str]) -> Property:

@@ -140,11 +140,10 @@ class Splatter:
         self, views: Sequence[View], depths: Sequence[DepthMap]
     ) -> list[tuple[int, Gaussians, Int[Tensor, "n"]]]:
         """List view number, Gaussians and pixels of the sky behind each view's objects."""
-        shown = [is_sky(d.depth, v.camera) for v, d in zip(views, depths, strict=True)]
         return [
             (i, *extend_sky(view, sky, self.disc_sigma))
-            for i, (view, sky) in enumerate(zip(views, shown, strict=True))
-            if sky.any()
+            for i, (view, depth) in enumerate(zip(views, depths, strict=True))
+            if (sky := is_sky(depth.depth, view.camera)).any()
         ]
 
 
