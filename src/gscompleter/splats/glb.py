@@ -148,18 +148,13 @@ def _decode_primitive(document: GlbDocument, primitive: dict[str, Any]) -> Gauss
     """Decode the Gaussians of a primitive, in the frame of its node."""
     extension, attributes = primitive["extensions"][EXTENSION], primitive["attributes"]
     packed = ", ".join({**extension.get("extensions", {}), **primitive["extensions"]})
+    kernel = extension.get("kernel", "ellipse")
     colours = extension.get("colorSpace", COLOR_SPACE)
-    if (
-        packed != EXTENSION
-        or extension.get("kernel", "ellipse") != "ellipse"
-        or colours != COLOR_SPACE
-    ):
+    if (packed, kernel, colours) != (EXTENSION, "ellipse", COLOR_SPACE):
         raise InputError(
             f"{document.path} stores Gaussians in an unknown way ({quote_value(packed)}, "
-            f"{quote_value(extension.get('kernel', 'ellipse'))}, {quote_value(colours)}); export "
-            "it as .ply."
+            f"{quote_value(kernel)}, {quote_value(colours)}); export it as .ply."
         )
-
     count = document.table["accessors"][attributes["POSITION"]]["count"]
 
     def read_attribute(name: str, kind: str = "VEC3") -> Float[ndarray, "n k"]:
@@ -167,9 +162,8 @@ def _decode_primitive(document: GlbDocument, primitive: dict[str, Any]) -> Gauss
             raise InputError(f"{document.path} lacks the attribute {name} of its Gaussians.")
         accessor = document.table["accessors"][attributes[name]]
         if (accessor["type"], accessor["count"]) != (kind, count):
-            raise make_damage_error(
-                document.path, f"its attribute {name} has another size than it must have"
-            )
+            defect = f"its attribute {name} has another size than it must have"
+            raise make_damage_error(document.path, defect)
         return _read_accessor(document, accessor)
 
     degree = max(d for d in range(4) if d == 0 or f"{EXTENSION}:SH_DEGREE_{d}_COEF_0" in attributes)
@@ -196,10 +190,8 @@ def _read_accessor(document: GlbDocument, accessor: dict[str, Any]) -> Float[nda
         raise InputError(
             f"{document.path} holds its Gaussians compressed or in another file; export it as .ply."
         )
-    kind, width = (
-        np.dtype(COMPONENT_TYPES[accessor["componentType"]]),
-        NUM_COMPONENTS[accessor["type"]],
-    )
+    kind = np.dtype(COMPONENT_TYPES[accessor["componentType"]])
+    width = NUM_COMPONENTS[accessor["type"]]
     start = int(view.get("byteOffset", 0)) + int(accessor.get("byteOffset", 0))
     stride = int(view.get("byteStride", 0)) or width * kind.itemsize
     shape = (int(accessor["count"]), width)
