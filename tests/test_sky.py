@@ -12,7 +12,7 @@ from gscompleter.data.formats import open_photographs
 from gscompleter.geometry import project
 from gscompleter.guards.free_space import respect_free_space
 from gscompleter.reconstructors.plane_sweep import PlaneSweep
-from gscompleter.reconstructors.plane_sweep.occlusion import Neighbour, find_hidden
+from gscompleter.reconstructors.plane_sweep.consistency import find_hidden
 from gscompleter.reconstructors.plane_sweep.reconstructor import set_depth_range
 from gscompleter.render import load_renderer
 from gscompleter.sky import SKY_DEPTH, extend_sky, is_sky, mask_out_sky
@@ -202,7 +202,7 @@ def test_what_another_view_could_not_have_seen_is_hidden_by_nothing():
     """Four columns leave the other image at the depth that it shows in their direction."""
     there, back = np.eye(3, 4, dtype=np.float32), np.eye(3, 4, dtype=np.float32)
     there[0, 3], back[0, 3] = -10, 10
-    near = Neighbour(np.full((32, 32), 0.5, np.float32), there, back)
+    near = np.full((32, 32), 0.5, np.float32), there, back
     hidden = find_hidden(np.full((32, 32), 0.1, np.float32), [near])
     assert hidden[:, 6:].all()
     assert not hidden[:, :4].any()

@@ -57,7 +57,7 @@ SWEEP = """
 import sys
 import numpy as np
 from gscompleter.kernels import stereo
-from gscompleter.reconstructors.plane_sweep.depth_bands import make_full_bands
+from gscompleter.reconstructors.plane_sweep.sweep import make_full_bands
 image = np.random.default_rng(0).random((24, 20, 3)).astype(np.float32)
 planes = np.linspace(0, 1, 6).astype(np.float32)
 bands = make_full_bands((24, 20), 6)

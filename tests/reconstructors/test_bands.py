@@ -10,15 +10,17 @@ from gscompleter.evaluation.metrics.image import compute_gradient_energy_ratio
 from gscompleter.kernels import stereo
 from gscompleter.kernels.stereo import TILE_COLUMNS, TILE_ROWS
 from gscompleter.reconstructors.plane_sweep import PlaneSweep, sweep
-from gscompleter.reconstructors.plane_sweep.depth_bands import (
+from gscompleter.reconstructors.plane_sweep.rig import build_rig
+from gscompleter.reconstructors.plane_sweep.sweep import (
+    compute_costs,
+    compute_plane_index,
     compute_tile_grid,
     make_bands,
     make_full_bands,
     make_guided_bands,
+    place_planes,
+    sweep_view,
 )
-from gscompleter.reconstructors.plane_sweep.matching import compute_costs, place_planes
-from gscompleter.reconstructors.plane_sweep.rig import build_rig
-from gscompleter.reconstructors.plane_sweep.sweep import compute_plane_index, sweep_view
 from gscompleter.render import load_renderer
 from gscompleter.types import sh_from_rgb
 from scenes import Room, camera_at, view_of

@@ -8,9 +8,8 @@ import torch
 
 from gscompleter import GSCompleter, View, load_renderer
 from gscompleter.evaluation.metrics.image import psnr
-from gscompleter.reconstructors.plane_sweep import PlaneSweep, depth_to_gaussians
-from gscompleter.reconstructors.plane_sweep.exposure import estimate_gains
-from gscompleter.reconstructors.plane_sweep.fusion import Layer
+from gscompleter.reconstructors.plane_sweep import PlaneSweep, gaussians
+from gscompleter.reconstructors.plane_sweep.fusion import Layer, estimate_gains
 from gscompleter.reconstructors.plane_sweep.rig import build_rig
 from gscompleter.stages.context import init_context
 from scenes import Room, camera_at, view_of
@@ -59,9 +58,7 @@ def made():
 def uneven():
     """Reconstruction of the same photographs without exposure correction."""
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(
-            depth_to_gaussians, "estimate_gains", lambda layers, _: np.ones((len(layers), 3))
-        )
+        patch.setattr(gaussians, "estimate_gains", lambda layers, _: np.ones((len(layers), 3)))
         return PlaneSweep()(photographs())
 
 

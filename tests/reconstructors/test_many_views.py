@@ -17,15 +17,11 @@ from gscompleter.reconstructors.features.neighbours import (
 )
 from gscompleter.reconstructors.features.stereo_image import make_stereo_images
 from gscompleter.reconstructors.plane_sweep import PlaneSweep
+from gscompleter.reconstructors.plane_sweep.fit import STEPS_PER_VIEW, fit_jointly, shuffle_views
 from gscompleter.reconstructors.plane_sweep.fusion import (
     Layer,
     find_finest_pixels,
     find_free_pixels,
-)
-from gscompleter.reconstructors.plane_sweep.joint_fit import (
-    STEPS_PER_VIEW,
-    fit_jointly,
-    shuffle_views,
 )
 from gscompleter.reconstructors.plane_sweep.rig import build_rig, halve_image, halve_transform
 from scenes import Room, camera_at, gaussians_of, view_of

@@ -11,24 +11,20 @@ import torch
 from gscompleter.evaluation.metrics.image import psnr
 from gscompleter.kernels import stereo, tgv
 from gscompleter.kernels.parallel import run
-from gscompleter.reconstructors.features.sift import detect_features, match_features
+from gscompleter.reconstructors.features.matches import detect_features, match_features
 from gscompleter.reconstructors.features.stereo_image import (
     StereoImage,
     compute_source_from_reference,
     make_stereo_images,
 )
 from gscompleter.reconstructors.plane_sweep import PlaneSweep
-from gscompleter.reconstructors.plane_sweep.appearance import (
-    OPACITY_STEPS,
-    fit_colors,
-    fit_opacities,
+from gscompleter.reconstructors.plane_sweep.consistency import (
+    compute_confidence,
+    find_hidden,
+    remove_speckles,
 )
-from gscompleter.reconstructors.plane_sweep.confidence import compute_confidence, remove_speckles
-from gscompleter.reconstructors.plane_sweep.epipolar import (
-    compute_epipolar_distances,
-    rotate_to_matches,
-)
-from gscompleter.reconstructors.plane_sweep.occlusion import Neighbour, find_hidden
+from gscompleter.reconstructors.plane_sweep.fit import OPACITY_STEPS, fit_colors, fit_opacities
+from gscompleter.reconstructors.plane_sweep.rig import compute_epipolar_distances, rotate_to_matches
 from gscompleter.reconstructors.plane_sweep.surfaces import fit_surfaces
 from gscompleter.render import load_renderer
 from gscompleter.render.cpu import CpuFrozenScene
@@ -139,8 +135,7 @@ def test_what_only_one_view_sees_past_an_object_is_found_occluded():
     right_from_left = compute_source_from_reference(left, right)
     left_from_right = compute_source_from_reference(right, left)
     visible, _ = stereo.reproject(*inverse, right_from_left, left_from_right)
-    neighbour = Neighbour(inverse[1], right_from_left, left_from_right)
-    hidden = find_hidden(inverse[0], [neighbour])
+    hidden = find_hidden(inverse[0], [(inverse[1], right_from_left, left_from_right)])
     assert hidden.sum() > 50
     assert not hidden[(visible >= 0) & (visible < 1.5)].any()
     assert not hidden[visible < 0].any()

@@ -11,10 +11,8 @@ from scipy.spatial.transform import Rotation
 from gscompleter.data.formats import open_photographs
 from gscompleter.errors import InputError
 from gscompleter.render import load_renderer
-from gscompleter.splat_alignment.estimate import AlignmentData, estimate_alignment
+from gscompleter.splat_alignment.estimate import AlignmentData, align_splat, estimate_alignment
 from gscompleter.splat_alignment.fit import score_splat
-from gscompleter.splat_alignment.placing import align_splat
-from gscompleter.splat_alignment.sidecars import InputSplat
 from gscompleter.splat_alignment.similarity import (
     fit_pose_similarity,
     get_pose,
@@ -25,6 +23,7 @@ from gscompleter.splat_alignment.similarity import (
     transform_view,
 )
 from gscompleter.splat_alignment.trainer_frames import (
+    InputSplat,
     compute_trainer_frames,
     normalize_gsplat_cameras,
     normalize_nerfstudio,
@@ -97,7 +96,7 @@ def test_what_trainers_do_is_computed_from_the_cameras(views, splat, trainer):
 
 def test_principal_axes_of_the_points_are_found_whatever_their_signs(views, splat):
     poses, points = poses_of(views), points_of(splat)
-    *_, truth = (transform for _, transform in compute_trainer_frames(poses, points))
+    *_, truth = compute_trainer_frames(poses, points)
     found = find(views, splat, truth, points=points)
     assert found.method == "normalised"
     assert_takes_to(found.transform, truth, 1e-6)

@@ -13,13 +13,15 @@ from gscompleter.data.local_origin import choose_scene_origin, shift_to_origin
 from gscompleter.errors import InputError
 from gscompleter.render import load_renderer
 from gscompleter.render.lod import thin_gaussians
-from gscompleter.splat_alignment.estimate import SplatAlignment
+from gscompleter.splat_alignment.estimate import SplatAlignment, align_splat, sample_views
 from gscompleter.splat_alignment.fit import ImageFit, SplatFit, score_splat
-from gscompleter.splat_alignment.placing import align_splat
-from gscompleter.splat_alignment.sample_views import sample_views
-from gscompleter.splat_alignment.sidecars import InputSplat, find_camera_lists, match_names
 from gscompleter.splat_alignment.similarity import make_similarity, transform_pose
-from gscompleter.splat_alignment.trainer_frames import NERFSTUDIO_WORLDS
+from gscompleter.splat_alignment.trainer_frames import (
+    NERFSTUDIO_WORLDS,
+    InputSplat,
+    find_camera_lists,
+    match_names,
+)
 from gscompleter.splats.ply import load_ply, save_ply
 from gscompleter.splats.transform import transform_gaussians
 from gscompleter.types import merge

@@ -13,7 +13,7 @@ import torch
 from gsply import plyread
 
 from gscompleter import Gaussians, InputError, load_ply, merge, save_ply
-from gscompleter.splats.ply import note_infinite_opacities
+from gscompleter.splats.formats import note_infinite_opacities
 from scenes import random_gaussians
 
 FIELDS = ("means", "quats", "scales", "opacities", "sh", "generated", "encoded")

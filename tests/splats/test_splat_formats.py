@@ -26,8 +26,8 @@ from gscompleter import (
     save_ply,
     save_splat,
 )
+from gscompleter.splats.formats import get_labels_path
 from gscompleter.splats.morton import sort_along_morton
-from gscompleter.splats.provenance import get_labels_path
 from gscompleter.splats.transform import (
     HALF_TURN_X,
     HALF_TURN_Z,
@@ -222,6 +222,11 @@ def test_a_moved_scene_looks_the_same_to_a_camera_that_moved_with_it():
     c2w[:3, :3] /= 1.7
     there = CPU.render(transform_gaussians(gaussians, place), replace(camera, c2w=c2w))
     assert torch.allclose(there.image, CPU.render(gaussians, camera).image, atol=2e-3)
+
+
+def test_the_identity_leaves_every_bit_of_the_harmonics():
+    gaussians = plausible(500, 3)
+    assert torch.equal(transform_gaussians(gaussians, torch.eye(4)).sh, gaussians.sh)
 
 
 @pytest.mark.parametrize("signs", [HALF_TURN_X, HALF_TURN_Z])

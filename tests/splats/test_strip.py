@@ -11,7 +11,7 @@ import torch
 from command import run
 from gscompleter import Gaussians, load_ply, load_splat, merge, save_ply, save_splat
 from gscompleter.splats.layout import save_like
-from gscompleter.splats.provenance import save_removed
+from gscompleter.splats.strip import save_removed
 from scenes import labelled, random_gaussians
 
 
@@ -70,6 +70,16 @@ def test_a_file_of_another_program_comes_back(tmp_path, monkeypatch):
     for field in ("means", "quats", "scales", "opacities", "sh", "generated"):
         assert torch.allclose(getattr(loaded, field), getattr(scene, field), rtol=1e-5)
     assert len(plyfile.PlyData.read(str(tmp_path / "completed.ply"))["eyes"].data) == 1
+    assert stripped(monkeypatch, tmp_path / "completed.ply") == given.read_bytes()
+
+
+def test_removed_rows_of_a_file_with_further_elements_come_back(tmp_path, monkeypatch):
+    given = foreign(tmp_path / "given.ply")
+    scene, rows = load_ply(given), torch.tensor([1, 3])
+    kept = torch.ones(len(scene), dtype=torch.bool)
+    kept[rows] = False
+    save_like(tmp_path / "completed.ply", scene[kept], added(sh_degree=1), given, kept)
+    save_removed(tmp_path / "removed.ply", scene[rows], rows, given)
     assert stripped(monkeypatch, tmp_path / "completed.ply") == given.read_bytes()
 
 

@@ -82,14 +82,12 @@ def compute_matching_costs(
     the difference of the two pixels from their windows' means, which is sharper at edges. Planes
     outside the source cost UNSEEN.
 
-    transform [3, 4]: from reference to source. radius: of the windows, in pixels.
-    noise: standard deviation of image noise; weaker texture does not correlate.
-    detail: share of the second term.
+    transform [3, 4]: from reference to source. radius: of the windows, in pixels. noise: standard
+    deviation of image noise; weaker texture does not correlate. detail: share of the second term.
     """
     costs = np.empty(bands.start[-1], np.uint8)
-    settings = (radius, noise, detail)
-    images = (reference, source, transform, inverse_depths)
-    share(_match_tiles, bands.low.size, *images, bands, *settings, costs)
+    images = (reference, source, transform, inverse_depths, bands)
+    share(_match_tiles, bands.low.size, *images, radius, noise, detail, costs)
     return costs
 
 
@@ -312,8 +310,7 @@ def _sweep_half(costs, bands, large_x, large_y, large_d, large_u, small, down, t
 def aggregate_semi_globally(costs, bands, large_x, large_y, large_d, large_u, small):
     """Aggregate costs along eight paths (Hirschmüller 2008), in the order of `bands`.
 
-    Planes missing in the previous tile are reached by a jump.
-    small: penalty of a step by one plane.
+    Planes missing in the previous tile are reached by a jump. small: penalty of one plane.
     large_x [h, w - 1], large_y [h - 1, w], large_d and large_u [h - 1, w - 1]: penalties of a jump
     between a pixel and its right, lower and lower right neighbour, and along the other diagonal;
     int16, at most 3000, so that sums do not overflow.

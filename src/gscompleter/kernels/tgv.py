@@ -34,36 +34,18 @@ def fit(heights, gradients, data, weight, across, down, bend, tolerance, iterati
     given = data, weight, across, down, bend, tolerance
     bands = split_range(h, min(count_threads(threads), h // MIN_BAND_ROWS))
     if len(bands) == 1:
-        advance(0, 0, h, 0, iterations, *state, *given)
+        advance(0, 0, h, 0, iterations, state, given)
         return
     for begin in range(0, iterations, ITERATIONS_PER_PASS):
         count = min(ITERATIONS_PER_PASS, iterations - begin)
         inner = [(top, int(top > 0), end, -int(end < h)) for top, end in bands]
         seams = [(top, -1, top, 1) for top, _ in bands[1:]]
         for parts in (inner, seams):
-            run(advance, [(*part, count, *state, *given) for part in parts], threads)
+            run(advance, [(*part, count, state, given) for part in parts], threads)
 
 
 @njit(cache=True, nogil=True, fastmath={"contract"}, error_model="numpy")
-def advance(
-    top,
-    top_step,
-    end,
-    end_step,
-    iterations,
-    heights,
-    gradients,
-    ahead,
-    gradients_ahead,
-    steps,
-    bends,
-    data,
-    weight,
-    across,
-    down,
-    bend,
-    tolerance,
-):
+def advance(top, top_step, end, end_step, iterations, state, given):
     """Run iterations on a range of rows whose ends move by a step each time.
 
     Ends may not move in more than `ITERATIONS_PER_PASS` iterations. An end that moves away leaves
@@ -77,24 +59,15 @@ def advance(
                 y = front - number
                 first, last = top + number * top_step, end + number * end_step
                 if first - (top_step > 0) <= y < last - (end_step > 0):
-                    _raise_duals(y, ahead, gradients_ahead, steps, bends, across, down, bend)
+                    _raise_duals(y, state, given)
                 if first <= y < last:
-                    _lower_primals(
-                        y,
-                        heights,
-                        gradients,
-                        ahead,
-                        gradients_ahead,
-                        steps,
-                        bends,
-                        data,
-                        weight,
-                        tolerance,
-                    )
+                    _lower_primals(y, state, given)
 
 
 @njit(cache=True, nogil=True, fastmath={"contract"}, error_model="numpy")
-def _raise_duals(y, ahead, gradients_ahead, steps, bends, across, down, bend):
+def _raise_duals(y, state, given):
+    _, _, ahead, gradients_ahead, steps, bends = state
+    _, _, across, down, bend, _ = given
     h, w = ahead.shape
     one = np.float32(1)
     for x in range(w):
@@ -118,9 +91,9 @@ def _raise_duals(y, ahead, gradients_ahead, steps, bends, across, down, bend):
 
 
 @njit(cache=True, nogil=True, fastmath={"contract"}, error_model="numpy")
-def _lower_primals(
-    y, heights, gradients, ahead, gradients_ahead, steps, bends, data, weight, tolerance
-):
+def _lower_primals(y, state, given):
+    heights, gradients, ahead, gradients_ahead, steps, bends = state
+    data, weight, _, _, _, tolerance = given
     two, none = np.float32(2), np.float32(0)
     for x in range(heights.shape[1]):
         push = steps[0, y, x] + steps[1, y, x]

@@ -16,9 +16,10 @@ from gscompleter.reconstructors.features.stereo_image import (
     compute_source_from_reference,
     make_stereo_images,
 )
-from gscompleter.reconstructors.plane_sweep.depth_to_gaussians import Splatter
-from gscompleter.reconstructors.plane_sweep.fusion import Layer, Transforms
+from gscompleter.reconstructors.plane_sweep.fusion import Layer
+from gscompleter.reconstructors.plane_sweep.gaussians import Splatter
 from gscompleter.reconstructors.plane_sweep.reconstructor import set_depth_range
+from gscompleter.reconstructors.plane_sweep.rig import Transforms
 from gscompleter.types import DepthMap, Reconstruction, View
 
 

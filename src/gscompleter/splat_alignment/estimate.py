@@ -3,20 +3,26 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterable, Sequence
+from contextlib import suppress
 from dataclasses import dataclass, replace
+from itertools import chain
 from typing import Literal
 
 import numpy as np
+import torch
 
+from gscompleter.data.photographs import Photographs
 from gscompleter.errors import InputError
+from gscompleter.reconstructors.features.depth_range import estimate_depth_range
 from gscompleter.render import Renderer
 from gscompleter.render.lod import build_proxy, thin_gaussians
 from gscompleter.splat_alignment.fit import SplatFit, score_splat
-from gscompleter.splat_alignment.matching import extract_photo_features
-from gscompleter.splat_alignment.refinement import refine_similarity
-from gscompleter.splat_alignment.sample_views import LONG_SIDE, estimate_points
-from gscompleter.splat_alignment.search import search_similarities
+from gscompleter.splat_alignment.matching import (
+    extract_photo_features,
+    refine_similarity,
+    search_similarities,
+)
 from gscompleter.splat_alignment.similarity import (
     Matrix,
     get_pose,
@@ -24,12 +30,22 @@ from gscompleter.splat_alignment.similarity import (
     transform_camera,
     transform_view,
 )
-from gscompleter.splat_alignment.trainer_frames import Points, Poses, compute_trainer_frames
+from gscompleter.splat_alignment.trainer_frames import (
+    InputSplat,
+    Points,
+    Poses,
+    collect_poses,
+    compute_trainer_frames,
+    read_trainer_frames,
+)
 from gscompleter.types import Gaussians, View
 
+NUM_SAMPLE_VIEWS = 8
+"""Number of sample photographs."""
+LONG_SIDE = 320
+"""Their longer side in pixels: enough for features and for a blur of one pixel."""
 MIN_IMPROVEMENT = 2.0
 """Gain in dB by which a frame must fit better than a simpler one; blur alone can cause 1 dB."""
-
 DRIFT_WARNING = 2.0
 """Displacement in pixels of the small photographs from which the user is warned."""
 
@@ -91,6 +107,42 @@ class AlignmentData:
         return score_splat(self.restrict_to(transform).scene, views, self.renderer)
 
 
+def align_splat(
+    splat: InputSplat, photographs: Photographs, frames: Sequence[int], renderer: Renderer
+) -> SplatAlignment:
+    """Estimate the transform from photographs to splat, relative to their origins.
+
+    The photographs numbered `frames` are used in any case.
+
+    Raises:
+        InputError: No frame fits, or one of `frames` cannot be read.
+    """
+    views = [view.to(splat.scene.means.device) for view in sample_views(photographs, frames)]
+    points = photographs.points()
+    return estimate_alignment(
+        AlignmentData(splat.scene, views, renderer),
+        np.stack([pose for _, pose in collect_poses(photographs)]),
+        None if points is None else points.double().numpy(),
+        read_trainer_frames(splat, photographs),
+    )
+
+
+def sample_views(photographs: Photographs, frames: Sequence[int]) -> list[View]:
+    """Load the first of `frames` and further photographs spread over all.
+
+    Raises:
+        InputError: One of `frames` cannot be read; other unreadable photographs are skipped.
+    """
+    named = list(frames)[: NUM_SAMPLE_VIEWS // 2]
+    spread = np.linspace(0, len(photographs) - 1, NUM_SAMPLE_VIEWS).round().astype(int).tolist()
+    others = [frame for frame in dict.fromkeys(spread) if frame not in named]
+    views = photographs.views(named, LONG_SIDE)
+    for frame in others[: NUM_SAMPLE_VIEWS - len(views)]:
+        with suppress(InputError):
+            views += photographs.views([frame], LONG_SIDE)
+    return views
+
+
 def estimate_alignment(
     data: AlignmentData,
     poses: Poses,
@@ -101,48 +153,41 @@ def estimate_alignment(
 
     Frames are tried from the simplest on, up to the first that is exact. One that fits is replaced
     only by one that fits better by `MIN_IMPROVEMENT`. `poses` are camera-to-world of all
-    photographs,
-    `points` sparse points in their frame.
+    photographs, `points` sparse points in their frame.
 
     Raises:
         InputError: No frame fits.
     """
     given = data.score_transform(np.eye(4))
     best = SplatAlignment("given", np.eye(4), given, given)
-    if given.is_exact:
-        return best
     if not given.is_match:
-        best = select_known_frame(data, best, propose_frames(poses, points, trainer_frames))
+        best = select_known_frame(data, best, poses, points, trainer_frames)
     if best.fit.is_match:
         return best if best.fit.is_exact else polish(data, best)
-    found = search_alignment(data, points, best.given_fit)
+    found = search_alignment(data, points, given)
     if found is None:
         raise InputError(
             f"The splat does not show what the photographs show: at their cameras it covers "
-            f"{100 * best.given_fit.coverage:.0f} % of the pixels and matches them at "
-            f"{best.given_fit.psnr:.1f} dB, and no other frame was found; give the photographs and "
-            "poses that the splat was trained on."
+            f"{100 * given.coverage:.0f} % of the pixels and matches them at {given.psnr:.1f} dB, "
+            "and no other frame was found; give the photographs and poses that the splat was "
+            "trained on."
         )
     return found
 
 
-def propose_frames(
-    poses: Poses, points: Points | None, trainer_frames: Iterable[FrameProposal]
-) -> Iterator[FrameProposal]:
-    """Yield frames that are known without the images, the simplest first."""
-    yield from trainer_frames
-    for _, transform in compute_trainer_frames(poses, points):
-        yield "normalised", transform
-
-
 def select_known_frame(
-    data: AlignmentData, best: SplatAlignment, others: Iterable[FrameProposal]
+    data: AlignmentData,
+    best: SplatAlignment,
+    poses: Poses,
+    points: Points | None,
+    trainer_frames: Iterable[FrameProposal],
 ) -> SplatAlignment:
-    """Select the best of `best` and `others`, stopping at the first that is exact."""
-    for method, transform in others:
+    """Select the best of `best` and the trainers' frames, stopping at the first that is exact."""
+    normalised = compute_trainer_frames(poses, points)
+    for method, transform in chain(trainer_frames, (("normalised", t) for t in normalised)):
         fit = data.score_transform(transform)
         if is_better(fit, best.fit):
-            best = SplatAlignment(method, transform, fit, best.given_fit)
+            best = replace(best, method=method, transform=transform, fit=fit)
         if best.fit.is_exact:
             break
     return best
@@ -163,11 +208,9 @@ def polish(data: AlignmentData, found: SplatAlignment) -> SplatAlignment:
     if transform is None:
         return found
     fit = data.score_transform(transform)
-    return (
-        SplatAlignment("similarity", transform, fit, found.given_fit)
-        if is_better(fit, found.fit)
-        else found
-    )
+    if not is_better(fit, found.fit):
+        return found
+    return SplatAlignment("similarity", transform, fit, found.given_fit)
 
 
 def search_alignment(
@@ -187,3 +230,13 @@ def search_alignment(
         if fit.is_match:
             return SplatAlignment("similarity", transform, fit, given)
     return None
+
+
+def estimate_points(views: Sequence[View]) -> Points:
+    """Estimate scene points without a sparse cloud: a grid at the median depth of each view."""
+    near, far = estimate_depth_range(views)
+    depth = float(np.sqrt(near * far))
+    rays = [view.camera.z_rays()[::16, ::16].reshape(-1, 3) for view in views]
+    pairs = zip(views, rays, strict=True)
+    points = torch.cat([view.camera.center + depth * ray for view, ray in pairs])
+    return points.double().cpu().numpy()

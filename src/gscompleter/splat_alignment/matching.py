@@ -1,9 +1,14 @@
-"""Matches features of photographs with renders of the splat."""
+"""Finds a similarity by features: photographs are matched with renders of the splat.
+
+The splat is rendered from all directions until some photographs match; the similarity is refined
+by renders at their cameras.
+"""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
+from functools import partial
 
 import cv2
 import numpy as np
@@ -12,32 +17,46 @@ from jaxtyping import Float
 
 from gscompleter.config.coverage import COVERED
 from gscompleter.geometry import unproject
-from gscompleter.reconstructors.features.sift import Features, detect_features, match_features
+from gscompleter.reconstructors.features.matches import Features, detect_features, match_features
 from gscompleter.reconstructors.features.stereo_image import StereoImage
-from gscompleter.render import Renderer
+from gscompleter.render import Renderer, get_view_map
 from gscompleter.splat_alignment.fit import render_from
-from gscompleter.splat_alignment.similarity import Matrix, get_pose
+from gscompleter.splat_alignment.similarity import (
+    Matrix,
+    fit_pose_similarity,
+    get_pose,
+    has_baseline,
+    make_similarity,
+    transform_camera,
+)
+from gscompleter.splat_alignment.trainer_frames import Points, align_directions
 from gscompleter.types import Camera, Gaussians, View
 
 MIN_INLIERS = 15
 """Fewest matches that must agree with a pose."""
 MAX_REPROJECTION_ERROR = 3.0
 """Largest reprojection error of an inlier, in pixels."""
+NUM_DIRECTIONS = 40
+"""Directions around the splat, about 30° apart; features tolerate half of that and any roll."""
+SCALE_FACTORS = (1.0, 0.6, 1.7)
+"""Trial factors on the size of the splat, which far Gaussians and floaters blur."""
+NUM_ROUNDS = 2
+"""Iterations of the refinement, each with renders at the cameras of the previous one."""
+MAX_SHIFT = 0.25
+"""Median change of the reprojected points, in pixels, at which the iteration stops."""
 
-
-@dataclass(frozen=True)
-class PhotoFeatures:
-    """A photograph's camera and features."""
-
-    camera: Camera
-    features: Features
+CenterRadius = tuple[Float[np.ndarray, "3"], float]
+"""Centre and radius of points."""
+PhotoFeatures = tuple[Camera, Features]
+"""A photograph's camera and features."""
 
 
 @dataclass(frozen=True)
 class LocatedPhoto:
     """A photograph whose pose in the splat was found."""
 
-    photograph: PhotoFeatures
+    camera: Camera
+    """Its camera in the photographs' frame."""
     pose: Matrix
     """Camera-to-world in the splat's frame."""
     points: Float[np.ndarray, "m 3"]
@@ -46,9 +65,133 @@ class LocatedPhoto:
     """Pixels of the points in the photograph."""
 
 
+def search_similarities(
+    scene: Gaussians, photographs: Sequence[PhotoFeatures], points: Points, renderer: Renderer
+) -> Iterator[Matrix]:
+    """Yield similarities from photographs to splat by which some photographs match."""
+    seer = photographs[len(photographs) // 2][0]
+    if len(scene) == 0:
+        return
+    solid = scene.means[scene.opacities >= scene.opacities.median()].detach().cpu().double().numpy()
+    goal = compute_center_radius(solid)
+    if goal[1] == 0:  # most of it is one point: all directions are alike
+        return
+    for transform in generate_starts(get_pose(seer), compute_center_radius(points), goal):
+        found = locate_photos(scene, transform_camera(seer, transform), photographs, renderer)
+        answer = fit_similarity(found)
+        if answer is not None:
+            yield answer
+
+
+def generate_starts(pose: Matrix, start: CenterRadius, goal: CenterRadius) -> Iterator[Matrix]:
+    """Yield similarities that map `place` to `goal` (centre, radius), from all directions."""
+    (center, radius), (new_center, new_radius) = start, goal
+    for zoom in SCALE_FACTORS:
+        scale = zoom * new_radius / max(radius, 1e-12)
+        for direction in sample_directions(NUM_DIRECTIONS):
+            turn = align_directions(pose[:3, 2], direction)
+            yield make_similarity(scale, turn, new_center - scale * turn @ center)
+
+
+def compute_center_radius(points: Points) -> CenterRadius:
+    """Compute centre and radius of points as medians, which ignore floaters."""
+    center = np.median(points, axis=0)
+    return center, float(np.median(np.linalg.norm(points - center, axis=1)))
+
+
+def sample_directions(count: int) -> Float[np.ndarray, "n 3"]:
+    """Sample unit vectors on a golden spiral over the sphere."""
+    z = 1 - (2 * np.arange(count) + 1) / count
+    angle = np.pi * (1 + np.sqrt(5)) * np.arange(count)
+    ring = np.sqrt(1 - z * z)
+    return np.stack([ring * np.cos(angle), ring * np.sin(angle), z], axis=1)
+
+
+def refine_similarity(
+    scene: Gaussians, photographs: Sequence[PhotoFeatures], transform: Matrix, renderer: Renderer
+) -> Matrix | None:
+    """Refine a similarity (photographs to splat) by features; None if too few match."""
+    for _ in range(NUM_ROUNDS):
+        cameras = [transform_camera(camera, transform) for camera, _ in photographs]
+        alone = [[photograph] for photograph in photographs]
+        places = get_view_map(scene)(
+            partial(locate_photos, scene, renderer=renderer), cameras, alone
+        )
+        found = [place for these in places for place in these]
+        better = fit_similarity(found)
+        if better is None:
+            return None
+        moved = np.median([_compute_shift(place, transform, better) for place in found])
+        transform = better
+        if moved <= MAX_SHIFT:
+            break
+    return transform
+
+
+def fit_similarity(found: Sequence[LocatedPhoto]) -> Matrix | None:
+    """Fit photographs' frame to splat's frame by located photographs; None if too few."""
+    before = [get_pose(place.camera) for place in found]
+    if not has_baseline(before):
+        return None
+    start = fit_pose_similarity(before, [place.pose for place in found])
+    return minimize_reprojection(found, start) if np.linalg.det(start[:3, :3]) > 0 else None
+
+
+def minimize_reprojection(found: Sequence[LocatedPhoto], start: Matrix) -> Matrix:
+    """Minimize the robust reprojection error over similarities.
+
+    The seven unknowns move the splat's points in the photographs' frame: logarithm of the scale,
+    rotation vector, and shift in units of the points' spread.
+    """
+    # Imported here, because it takes half a second and few splats need it.
+    from scipy.optimize import least_squares
+    from scipy.spatial.transform import Rotation
+
+    points = [transform_back(place, start) for place in found]
+    center = np.median(np.concatenate(points), axis=0)
+    unit = float(np.median(np.linalg.norm(np.concatenate(points) - center, axis=1)))
+
+    def change(unknowns: Float[np.ndarray, "7"]) -> Matrix:
+        turn = np.exp(unknowns[0]) * Rotation.from_rotvec(unknowns[1:4]).as_matrix()
+        return make_similarity(1.0, turn, center + unit * unknowns[4:] - turn @ center)
+
+    def errors(unknowns: Float[np.ndarray, "7"]) -> Float[np.ndarray, "m"]:
+        moved = change(unknowns)
+        pairs = zip(found, points, strict=True)
+        return np.concatenate(
+            [_compute_residuals(p @ moved[:3, :3].T + moved[:3, 3], f) for f, p in pairs]
+        )
+
+    answer = least_squares(errors, np.zeros(7), loss="cauchy", f_scale=0.3 * MAX_REPROJECTION_ERROR)
+    return start @ np.linalg.inv(change(answer.x))
+
+
+def transform_back(photo: LocatedPhoto, transform: Matrix) -> Float[np.ndarray, "m 3"]:
+    """Transform the inlier points of a photograph to the photographs' frame."""
+    back = np.linalg.inv(transform)
+    return photo.points @ back[:3, :3].T + back[:3, 3]
+
+
+def _compute_shift(photo: LocatedPhoto, before: Matrix, after: Matrix) -> float:
+    """Compute the median change of the reprojection error between two similarities, in pixels."""
+    seen = [_compute_residuals(transform_back(photo, m), photo) for m in (before, after)]
+    return float(np.median(np.abs(seen[1] - seen[0])))
+
+
+def _compute_residuals(
+    points: Float[np.ndarray, "m 3"], photo: LocatedPhoto
+) -> Float[np.ndarray, "k"]:
+    """Compute the reprojection errors along x and y, in pixels."""
+    pose = get_pose(photo.camera)
+    local = (points - pose[:3, 3]) @ pose[:3, :3]
+    homogeneous = local @ photo.camera.K.detach().cpu().double().numpy().T
+    ahead = np.maximum(homogeneous[:, 2:], 1e-9 * np.abs(homogeneous).max())
+    return np.clip(homogeneous[:, :2] / ahead - photo.pixels, -1e4, 1e4).ravel()
+
+
 def extract_photo_features(views: Sequence[View]) -> list[PhotoFeatures]:
     """Extract the features of all views."""
-    return [PhotoFeatures(view.camera, extract_view_features(view)) for view in views]
+    return [(view.camera, extract_view_features(view)) for view in views]
 
 
 def extract_view_features(view: View) -> Features:
@@ -75,21 +218,22 @@ def _locate_photo(
     features: Features, places: Float[np.ndarray, "h w 3"], photograph: PhotoFeatures
 ) -> LocatedPhoto | None:
     """Estimate a photograph's pose by PnP against a render; None with too few inliers."""
-    rendered, pixels = match_features(features, photograph.features)
+    camera, own_features = photograph
+    rendered, pixels = match_features(features, own_features)
     columns, rows = np.floor(rendered).astype(int).T
     points = places[rows.clip(0, len(places) - 1), columns.clip(0, places.shape[1] - 1)]
     known = np.isfinite(points).all(axis=1)
     points, pixels = points[known], pixels[known]
     if len(points) < MIN_INLIERS:
         return None
-    K = photograph.camera.K.detach().cpu().double().numpy()
+    K = camera.K.detach().cpu().double().numpy()
     answer = cv2.solvePnPRansac(
         points, pixels, K, None, iterationsCount=300, reprojectionError=MAX_REPROJECTION_ERROR
     )
     if not answer[0] or answer[3] is None or len(answer[3]) < MIN_INLIERS:
         return None
     chosen = answer[3].ravel()
-    return LocatedPhoto(photograph, _make_c2w(answer[1], answer[2]), points[chosen], pixels[chosen])
+    return LocatedPhoto(camera, _make_c2w(answer[1], answer[2]), points[chosen], pixels[chosen])
 
 
 def _make_c2w(rotation: Float[np.ndarray, "3 1"], shift: Float[np.ndarray, "3 1"]) -> Matrix:

@@ -30,15 +30,10 @@ def get_scale(transform: Matrix) -> float:
     return float(np.cbrt(np.linalg.det(transform[:3, :3])))
 
 
-def get_rotation(transform: Matrix) -> Float[np.ndarray, "3 3"]:
-    """Get the rotation of a similarity."""
-    return transform[:3, :3] / get_scale(transform)
-
-
 def transform_pose(c2w: Matrix, transform: Matrix) -> Matrix:
     """Transform a camera-to-world pose by a similarity."""
     pose = np.eye(4)
-    pose[:3, :3] = get_rotation(transform) @ c2w[:3, :3]
+    pose[:3, :3] = (transform[:3, :3] / get_scale(transform)) @ c2w[:3, :3]
     pose[:3, 3] = transform[:3, :3] @ c2w[:3, 3] + transform[:3, 3]
     return pose
 

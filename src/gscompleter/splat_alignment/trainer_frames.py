@@ -1,16 +1,43 @@
-"""Normalisations that splat trainers apply to a scene, computed from cameras and points.
+"""Frames that splat trainers leave behind or normalise a scene to.
 
-Each function takes poses (OpenCV axes) and returns transforms from their frame to the trainer's.
+Trainers store their cameras or the transform of the scene beside a splat. Without these files the
+known normalisations are computed from cameras and points: each function takes poses (OpenCV axes)
+and returns transforms from their frame to the trainer's.
 """
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections import Counter
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path, PurePosixPath
+from typing import Literal
 
 import numpy as np
 from jaxtyping import Float
 
-from gscompleter.splat_alignment.similarity import Matrix, make_similarity, transform_pose
+from gscompleter.data.camera_files import has_camera_list, read_camera_list
+from gscompleter.data.cameras import find_pose_defect
+from gscompleter.data.frame import Frame
+from gscompleter.data.local_origin import compute_frame_from_photographs, read_dataparser_transforms
+from gscompleter.data.photographs import Photographs
+from gscompleter.splat_alignment.similarity import (
+    Matrix,
+    fit_pose_similarity,
+    has_baseline,
+    make_similarity,
+    transform_pose,
+)
+from gscompleter.types import Gaussians
+
+DATAPARSER_FILE = "dataparser_transforms.json"
+"""File of a nerfstudio run with the transform that it applied to the scene."""
+CAMERA_LIST_PREFIX = "cameras"
+"""Prefix of camera lists; the rest may match the splat: `cameras_2.json` for `splat_2.ply`."""
+ITERATION_PREFIX = "iteration_"
+"""Prefix of the folders of Inria's trainer, two levels below its cameras.json."""
+MAX_PAIRS = 200
+"""Photographs by which two camera lists are compared."""
 
 Poses = Float[np.ndarray, "n 4 4"]
 Points = Float[np.ndarray, "p 3"]
@@ -23,20 +50,121 @@ NERFSTUDIO_WORLDS = (
 """Rotations from COLMAP's world that nerfstudio applies first: none, today's, the former."""
 
 
-def compute_trainer_frames(
-    poses: Poses, points: Points | None = None
-) -> Iterator[tuple[str, Matrix]]:
-    """Yield the name and transform of every known normalisation.
+@dataclass(frozen=True)
+class InputSplat:
+    """An input splat, and the folders where its trainer may have left files."""
+
+    path: Path
+    scene: Gaussians
+    origin: Float[np.ndarray, "3"]
+    """Origin of the coordinates of `scene`, in the frame of its file."""
+    photographs: Path
+    """Folder of the photographs, or a file in it."""
+
+    def list_folders(self) -> list[Path]:
+        """List the folders where trainers leave files, the nearest to the splat first."""
+        near = self.path.resolve().parent
+        model = [near.parent.parent] if near.name.startswith(ITERATION_PREFIX) else []
+        scene = self.photographs if self.photographs.is_dir() else self.photographs.parent
+        return list(dict.fromkeys([near, *model, scene.resolve()]))
+
+
+def read_trainer_frames(
+    splat: InputSplat, photographs: Photographs
+) -> Iterator[tuple[Literal["cameras", "dataparser"], Matrix]]:
+    """Yield transforms from the photographs' frame to the splat's, as found in trainers' files.
+
+    Both frames are relative to their origins. The transform of nerfstudio starts from the world of
+    the reconstruction, which one of the `NERFSTUDIO_WORLDS` turns into that of its transforms.json.
+    """
+    to_photographs = np.linalg.inv(compute_frame_from_photographs(photographs.origin))
+    to_splat = compute_frame_from_photographs(splat.origin)
+    ours = dict(collect_poses(photographs))
+    for file in find_camera_lists(splat):
+        theirs = {f.name: localize_pose(f, splat.origin) for f in read_camera_list(file)}
+        transform = fit_named_cameras(ours, theirs)
+        if transform is not None:
+            yield "cameras", transform
+    for folder in splat.list_folders():
+        if (folder / DATAPARSER_FILE).is_file():
+            transform = read_dataparser_transforms(folder / DATAPARSER_FILE)
+            for world in NERFSTUDIO_WORLDS:
+                original = make_similarity(1.0, world.T, np.zeros(3))
+                yield "dataparser", to_splat @ transform @ original @ to_photographs
+
+
+def collect_poses(photographs: Photographs) -> list[tuple[str, Matrix]]:
+    """Collect names and valid poses of the photographs, relative to their origin."""
+    return [
+        (frame.name, localize_pose(frame, photographs.origin))
+        for frame in photographs.frames
+        if find_pose_defect(frame.c2w) is None
+    ]
+
+
+def localize_pose(frame: Frame, origin: Float[np.ndarray, "3"]) -> Matrix:
+    """Compute the pose of a frame relative to `origin`."""
+    return compute_frame_from_photographs(origin) @ frame.c2w
+
+
+def find_camera_lists(splat: InputSplat) -> list[Path]:
+    """Find the camera lists whose name matches the splat, the best match first."""
+    pattern = f"{CAMERA_LIST_PREFIX}*.json"
+    return [
+        file
+        for folder in splat.list_folders()
+        for file in sorted(folder.glob(pattern), key=lambda file: (-len(file.stem), file))
+        if splat.path.stem.endswith(file.stem.removeprefix(CAMERA_LIST_PREFIX))
+        and has_camera_list(file)
+    ]
+
+
+def fit_named_cameras(ours: Mapping[str, Matrix], theirs: Mapping[str, Matrix]) -> Matrix | None:
+    """Fit the similarity from the poses `ours` to those of the same names in `theirs`.
+
+    Returns:
+        None if fewer than two names match, or all cameras have one position.
+    """
+    pairs = match_names(list(ours), list(theirs))
+    pairs = pairs[:: max(1, len(pairs) // MAX_PAIRS)]
+    before, after = [ours[a] for a, _ in pairs], [theirs[b] for _, b in pairs]
+    if not has_baseline(before) or not has_baseline(after):
+        return None
+    return fit_pose_similarity(before, after)
+
+
+def match_names(ours: Sequence[str], theirs: Sequence[str]) -> list[tuple[str, str]]:
+    """Match names that differ only in extension, or in folder if base names are unique."""
+    for spelled in (drop_extension, lambda name: PurePosixPath(name).stem):
+        a, b = index_unique(ours, spelled), index_unique(theirs, spelled)
+        if len(a.keys() & b.keys()) >= 2:
+            return [(a[name], b[name]) for name in a if name in b]
+    return []
+
+
+def index_unique(names: Sequence[str], normalize: Callable[[str], str]) -> dict[str, str]:
+    """Index names by their normalized form; ambiguous ones are dropped."""
+    count = Counter(map(normalize, names))
+    return {normalize(name): name for name in names if count[normalize(name)] == 1}
+
+
+def drop_extension(name: str) -> str:
+    """Drop the extension: `images/0001` for `images/0001.jpg`."""
+    path = PurePosixPath(name)
+    return str(path.with_name(path.stem)) if path.name else name
+
+
+def compute_trainer_frames(poses: Poses, points: Points | None = None) -> Iterator[Matrix]:
+    """Yield the transform of every known normalisation.
 
     `poses` are those of all photographs, `points` the sparse points that the trainer started from.
     """
-    yield "OpenSplat", normalize_opensplat(poses)
+    yield normalize_opensplat(poses)
     for world in NERFSTUDIO_WORLDS:
-        yield "nerfstudio", normalize_nerfstudio(poses, world)
-    yield "gsplat", normalize_gsplat_cameras(poses)
+        yield normalize_nerfstudio(poses, world)
+    yield normalize_gsplat_cameras(poses)
     if points is not None and len(points) > 3:
-        for transform in align_gsplat_axes(normalize_gsplat_cameras(poses), points):
-            yield "gsplat", transform
+        yield from align_gsplat_axes(normalize_gsplat_cameras(poses), points)
 
 
 def normalize_opensplat(poses: Poses) -> Matrix:
@@ -50,12 +178,10 @@ def normalize_opensplat(poses: Poses) -> Matrix:
 def normalize_nerfstudio(poses: Poses, world: Float[np.ndarray, "3 3"]) -> Matrix:
     """Rotate the mean up direction to z after the rotation `world`, then scale like OpenSplat."""
     up = -(poses[:, :3, 1] @ world.T).mean(axis=0)
-    upright = make_similarity(
-        1.0, align_directions(up, np.array([0.0, 0.0, 1.0])) @ world, np.zeros(3)
-    )
-    return (
-        normalize_opensplat(np.stack([transform_pose(pose, upright) for pose in poses])) @ upright
-    )
+    turn = align_directions(up, np.array([0.0, 0.0, 1.0])) @ world
+    upright = make_similarity(1.0, turn, np.zeros(3))
+    turned = np.stack([transform_pose(pose, upright) for pose in poses])
+    return normalize_opensplat(turned) @ upright
 
 
 def normalize_gsplat_cameras(poses: Poses) -> Matrix:

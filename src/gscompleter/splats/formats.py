@@ -1,14 +1,27 @@
-"""The table of splat formats: read by the first bytes of a file, written by its extension."""
+"""The table of splat formats: read by the first bytes of a file, written by its extension.
+
+The labels of generated Gaussians are a column of a .ply; other formats have a file beside them.
+"""
 
 from __future__ import annotations
 
+import contextlib
+import hashlib
+import json
 from collections.abc import Callable
 from dataclasses import dataclass, replace
+from itertools import groupby
 from pathlib import Path
 
 import numpy as np
+import torch
+from jaxtyping import Int64, UInt8
+from numpy import ndarray
+from torch import Tensor
 
 from gscompleter.errors import InputError, quote_value, refuse_pointer
+from gscompleter.io.files import replace_file
+from gscompleter.io.json_file import read_json
 from gscompleter.io.reading import open_file
 from gscompleter.splats.compressed_ply import (
     is_compressed_ply,
@@ -19,7 +32,6 @@ from gscompleter.splats.glb import is_glb, read_glb
 from gscompleter.splats.ksplat import read_ksplat
 from gscompleter.splats.morton import sort_along_morton
 from gscompleter.splats.ply import load_ply, require_finite, save_ply
-from gscompleter.splats.provenance import load_labels, save_labels
 from gscompleter.splats.sog import META, is_sog, read_sog
 from gscompleter.splats.splat import read_splat, write_splat
 from gscompleter.splats.spz import is_spz, read_spz, write_spz
@@ -146,6 +158,18 @@ def describe_mode_loss(path: Path, gaussians: Gaussians) -> str | None:
     )
 
 
+def note_infinite_opacities(gaussians: Gaussians) -> str | None:
+    """Describe the number of infinite opacity logits in a sentence, or return None."""
+    logits = None if gaussians.encoded is None else gaussians.encoded[:, 3]
+    if logits is None or logits.sum().isfinite():
+        return None
+    opaque, clear = int(logits.isposinf().sum()), int(logits.isneginf().sum())
+    return (
+        f"{opaque:,} of {len(gaussians):,} Gaussians have an opacity logit of +infinity and "
+        f"{clear:,} of -infinity; they are rendered as opaque and as transparent."
+    )
+
+
 def detect_splat_format(path: Path) -> str:
     """Detect the format of a file or folder, by name."""
     if path.is_dir():
@@ -164,9 +188,9 @@ def detect_splat_format(path: Path) -> str:
             return name
     named = _match_extension(path)
     if named is None or FORMATS[named].recognizes is not None:
+        known = ", ".join(f"*{ending}" for f in FORMATS.values() for ending in f.extensions)
         raise InputError(
-            f"{quote_value(path)} holds no Gaussians in a format that is known: "
-            f"{_list_extensions()}."
+            f"{quote_value(path)} holds no Gaussians in a format that is known: {known}."
         )
     return named
 
@@ -189,5 +213,47 @@ def _match_extension(path: Path) -> str | None:
     return None
 
 
-def _list_extensions() -> str:
-    return ", ".join(f"*{extension}" for f in FORMATS.values() for extension in f.extensions)
+def get_labels_path(path: Path) -> Path:
+    """Get the path of the labels file for a splat file."""
+    return path.with_name(f"{path.name}.generated.json")
+
+
+def save_labels(path: Path, generated: UInt8[Tensor, "n"]) -> None:
+    """Write the labels of the file at `path` beside it; remove them if nothing was generated."""
+    place = get_labels_path(path)
+    if not (generated > 0).any():
+        with contextlib.suppress(FileNotFoundError):
+            place.unlink()
+        return
+    runs = [[label, len(list(run))] for label, run in groupby(generated.tolist())]
+    with replace_file(place) as file:
+        file.write(json.dumps({"sha256": _hash_file(path), "generated": runs}).encode())
+
+
+def load_labels(path: Path, count: int) -> UInt8[Tensor, "n"]:
+    """Load the labels of the `count` Gaussians in the file at `path`; zeros if there are none."""
+    place = get_labels_path(path)
+    if not path.is_file() or not place.exists():
+        return torch.zeros(count, dtype=torch.uint8)
+    table = read_json(place, "remove it to go on without labels")
+    try:
+        runs = np.array(table["generated"], dtype=np.int64).reshape(-1, 2)
+        fits = table["sha256"] == _hash_file(path) and _is_complete(runs, count)
+    except (KeyError, TypeError, ValueError, OverflowError) as error:
+        raise InputError(f"{place} holds no labels; remove it to go on without them.") from error
+    if not fits:
+        raise InputError(
+            f"{place} holds the labels of another state of {path.name}; remove it to go on "
+            "without them."
+        )
+    return torch.from_numpy(np.repeat(runs[:, 0].astype(np.uint8), runs[:, 1]))
+
+
+def _is_complete(runs: Int64[ndarray, "m 2"], count: int) -> bool:
+    """Return True if the runs are valid labels of exactly `count` Gaussians."""
+    in_range = ((runs >= 0) & (runs <= [255, count])).all()
+    return bool(in_range) and sum(runs[:, 1].tolist()) == count
+
+
+def _hash_file(path: Path) -> str:
+    return hashlib.sha256(path.read_bytes()).hexdigest()

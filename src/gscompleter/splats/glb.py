@@ -21,8 +21,14 @@ from numpy import ndarray
 from torch import Tensor
 
 from gscompleter.errors import InputError, quote_value
+from gscompleter.geometry import quats_to_rotations
 from gscompleter.io.reading import read_bytes
-from gscompleter.splats.packing import build_gaussians, check_size, make_damage_error
+from gscompleter.splats.packing import (
+    build_gaussians,
+    check_size,
+    make_damage_error,
+    refuse_invalid,
+)
 from gscompleter.splats.transform import HALF_TURN_Z, rotate_half_turn, transform_gaussians
 from gscompleter.types import Gaussians, merge
 
@@ -58,19 +64,13 @@ def is_glb(head: bytes) -> bool:
 def read_glb(path: Path) -> Gaussians:
     """Read all Gaussians of the scene in a .glb, in the axes of a .ply."""
     document = _parse_document(path, read_bytes(path))
-    try:
+    with refuse_invalid(path, "JSON part"):
         placed = list(_find_primitives(document))
         _check_counts(document, [primitive for primitive, _ in placed])
         parts = [
             transform_gaussians(_decode_primitive(document, primitive), place)
             for primitive, place in placed
         ]
-    except InputError:
-        raise
-    except (KeyError, IndexError, TypeError, ValueError, OverflowError, AttributeError) as error:
-        raise make_damage_error(
-            path, f"its JSON part is invalid ({quote_value(str(error))})"
-        ) from error
     if not parts:
         raise InputError(f"{quote_value(path)} holds no Gaussians: nothing in it uses {EXTENSION}.")
     return rotate_half_turn(merge(parts), HALF_TURN_Z)
@@ -122,13 +122,7 @@ def _read_transform(document: GlbDocument, node: dict[str, Any]) -> Float[Tensor
     else:
         x, y, z, w = (float(value) for value in node.get("rotation", (0, 0, 0, 1)))
         place = torch.eye(4, dtype=torch.float64)
-        place[:3, :3] = torch.tensor(
-            [
-                [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)],
-                [2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)],
-                [2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)],
-            ]
-        )
+        place[:3, :3] = quats_to_rotations(torch.tensor([w, x, y, z], dtype=torch.float64))
         place[:3, :3] *= torch.tensor(node.get("scale", (1, 1, 1)), dtype=torch.float64)
         place[:3, 3] = torch.tensor(node.get("translation", (0, 0, 0)), dtype=torch.float64)
     linear = place[:3, :3]
@@ -154,18 +148,13 @@ def _decode_primitive(document: GlbDocument, primitive: dict[str, Any]) -> Gauss
     """Decode the Gaussians of a primitive, in the frame of its node."""
     extension, attributes = primitive["extensions"][EXTENSION], primitive["attributes"]
     packed = ", ".join({**extension.get("extensions", {}), **primitive["extensions"]})
+    kernel = extension.get("kernel", "ellipse")
     colours = extension.get("colorSpace", COLOR_SPACE)
-    if (
-        packed != EXTENSION
-        or extension.get("kernel", "ellipse") != "ellipse"
-        or colours != COLOR_SPACE
-    ):
+    if (packed, kernel, colours) != (EXTENSION, "ellipse", COLOR_SPACE):
         raise InputError(
             f"{document.path} stores Gaussians in an unknown way ({quote_value(packed)}, "
-            f"{quote_value(extension.get('kernel', 'ellipse'))}, {quote_value(colours)}); export "
-            "it as .ply."
+            f"{quote_value(kernel)}, {quote_value(colours)}); export it as .ply."
         )
-
     count = document.table["accessors"][attributes["POSITION"]]["count"]
 
     def read_attribute(name: str, kind: str = "VEC3") -> Float[ndarray, "n k"]:
@@ -173,9 +162,8 @@ def _decode_primitive(document: GlbDocument, primitive: dict[str, Any]) -> Gauss
             raise InputError(f"{document.path} lacks the attribute {name} of its Gaussians.")
         accessor = document.table["accessors"][attributes[name]]
         if (accessor["type"], accessor["count"]) != (kind, count):
-            raise make_damage_error(
-                document.path, f"its attribute {name} has another size than it must have"
-            )
+            defect = f"its attribute {name} has another size than it must have"
+            raise make_damage_error(document.path, defect)
         return _read_accessor(document, accessor)
 
     degree = max(d for d in range(4) if d == 0 or f"{EXTENSION}:SH_DEGREE_{d}_COEF_0" in attributes)
@@ -202,10 +190,8 @@ def _read_accessor(document: GlbDocument, accessor: dict[str, Any]) -> Float[nda
         raise InputError(
             f"{document.path} holds its Gaussians compressed or in another file; export it as .ply."
         )
-    kind, width = (
-        np.dtype(COMPONENT_TYPES[accessor["componentType"]]),
-        NUM_COMPONENTS[accessor["type"]],
-    )
+    kind = np.dtype(COMPONENT_TYPES[accessor["componentType"]])
+    width = NUM_COMPONENTS[accessor["type"]]
     start = int(view.get("byteOffset", 0)) + int(accessor.get("byteOffset", 0))
     stride = int(view.get("byteStride", 0)) or width * kind.itemsize
     shape = (int(accessor["count"]), width)

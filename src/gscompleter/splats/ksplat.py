@@ -9,8 +9,8 @@ scales and rotations are half floats, and SH are half floats or (level 2) bytes.
 from __future__ import annotations
 
 import struct
-from dataclasses import dataclass
 from pathlib import Path
+from typing import NamedTuple
 
 import numpy as np
 from jaxtyping import Float
@@ -18,20 +18,27 @@ from numpy import ndarray
 
 from gscompleter.errors import InputError, quote_value
 from gscompleter.io.reading import read_bytes
-from gscompleter.splats.packing import assemble_sh, build_gaussians, check_size, make_damage_error
+from gscompleter.splats.packing import (
+    NUM_SH_REST,
+    assemble_sh,
+    build_gaussians,
+    check_size,
+    make_damage_error,
+)
 from gscompleter.types import Gaussians, merge
 
 HEADER, SECTION_HEADER = 4096, 1024
-NUM_SH_REST = (0, 3, 8, 15)
-"""SH coefficients per channel above degree 0, by degree."""
+HEADER_FIELDS = struct.Struct("<BBxxI12xH14xff")
+SECTION_FIELDS = struct.Struct("<IIIIfHxxI4xIIH")
 DEFAULT_STEPS = 32767
 """Default number of steps from the centre of a bucket to its side."""
 
 
-@dataclass(frozen=True)
-class KsplatHeader:
+class KsplatHeader(NamedTuple):
     """The header of the file, valid for all sections."""
 
+    major: int
+    minor: int
     num_sections: int
     level: int
     """0: float32; 1: 16 bits; 2: 16 bits, with SH in bytes."""
@@ -41,11 +48,10 @@ class KsplatHeader:
     """SH value of byte 255 at level 2."""
 
 
-@dataclass(frozen=True)
-class KsplatSection:
+class KsplatSection(NamedTuple):
     """The header of a section."""
 
-    count: int
+    num_rows: int
     capacity: int
     """Rows that the section has space for."""
     bucket_size: int
@@ -54,12 +60,17 @@ class KsplatSection:
     """Side length of a bucket, in scene units."""
     bucket_bytes: int
     num_steps: int
-    """Steps from the centre of a bucket to its side."""
+    """Steps from the centre of a bucket to its side; 0 stands for the default."""
     num_full: int
     """Full buckets, which come first."""
     num_partial: int
     """Partly filled buckets."""
     degree: int
+
+    @property
+    def rows_offset(self) -> int:
+        """Offset of the rows of Gaussians in the section, in bytes."""
+        return self.num_partial * 4 + self.num_buckets * self.bucket_bytes
 
 
 def read_ksplat(path: Path) -> Gaussians:
@@ -73,10 +84,9 @@ def read_ksplat(path: Path) -> Gaussians:
         section = _parse_section(path, data, HEADER + number * SECTION_HEADER)
         rows = _make_row_dtype(header.level, section.degree)
         start = end
-        end += section.num_partial * 4 + section.num_buckets * section.bucket_bytes
-        end += section.capacity * rows.itemsize
+        end += section.rows_offset + section.capacity * rows.itemsize
         check_size(path, len(data), end)
-        if section.count:
+        if section.num_rows:
             parts.append(_decode_section(path, data[start:end], header, section, rows))
     if not parts:
         raise InputError(f"{quote_value(path)} is empty: it holds no Gaussian.")
@@ -85,38 +95,20 @@ def read_ksplat(path: Path) -> Gaussians:
 
 def _parse_header(path: Path, data: bytes) -> KsplatHeader:
     check_size(path, len(data), HEADER)
-    major, minor, sections = struct.unpack_from("<BBxxI", data)
-    (level,) = struct.unpack_from("<H", data, 20)
-    lowest, highest = struct.unpack_from("<ff", data, 36)
-    if major != 0 or minor < 1 or level > 2:
+    header = KsplatHeader(*HEADER_FIELDS.unpack_from(data))
+    if header.major != 0 or header.minor < 1 or header.level > 2:
         raise InputError(
-            f"{quote_value(path)} is .ksplat version {major}.{minor} with compression {level}, "
-            "which "
-            "cannot be read; convert it to .ply."
+            f"{quote_value(path)} is .ksplat version {header.major}.{header.minor} with "
+            f"compression {header.level}, which cannot be read; convert it to .ply."
         )
-    return KsplatHeader(sections, level, lowest or -1.5, highest or 1.5)
+    return header._replace(sh_min=header.sh_min or -1.5, sh_max=header.sh_max or 1.5)
 
 
 def _parse_section(path: Path, data: bytes, offset: int) -> KsplatSection:
-    count, capacity, bucket_size, buckets, block, bucket_bytes = struct.unpack_from(
-        "<IIIIfH", data, offset
-    )
-    (steps,) = struct.unpack_from("<I", data, offset + 24)
-    full, partial, degree = struct.unpack_from("<IIH", data, offset + 32)
-    if degree >= len(NUM_SH_REST) or count > capacity:
+    section = KsplatSection(*SECTION_FIELDS.unpack_from(data, offset))
+    if section.degree >= len(NUM_SH_REST) or section.num_rows > section.capacity:
         raise make_damage_error(path, "a section contradicts itself")
-    return KsplatSection(
-        count,
-        capacity,
-        bucket_size,
-        buckets,
-        block,
-        bucket_bytes,
-        steps or DEFAULT_STEPS,
-        full,
-        partial,
-        degree,
-    )
+    return section._replace(num_steps=section.num_steps or DEFAULT_STEPS)
 
 
 def _make_row_dtype(level: int, degree: int) -> np.dtype:
@@ -135,29 +127,22 @@ def _make_row_dtype(level: int, degree: int) -> np.dtype:
 def _decode_section(
     path: Path, data: bytes, header: KsplatHeader, section: KsplatSection, row: np.dtype
 ) -> Gaussians:
-    start = section.num_partial * 4 + section.num_buckets * section.bucket_bytes
-    rows = np.frombuffer(data, row, section.count, start)
+    rows = np.frombuffer(data, row, section.num_rows, section.rows_offset)
     rest = rows["rest"].astype(np.float64)
     if header.level == 2:
         rest = header.sh_min + rest / 255 * (header.sh_max - header.sh_min)
+    means = rows["mean"].astype(np.float64)
+    if header.level > 0:
+        step = section.bucket_side / 2 / section.num_steps
+        means = (means - section.num_steps) * step + _lookup_centers(path, data, section)
     rgba = rows["rgba"].astype(np.float32) / 255
     return build_gaussians(
-        _decode_means(path, data, header, section, rows),
+        means,
         rows["quat"].astype(np.float32),
         rows["scale"].astype(np.float32),
         rgba[:, 3],
         assemble_sh(rgba[:, :3], _reorder_sh(rest, section.degree)),
     )
-
-
-def _decode_means(
-    path: Path, data: bytes, header: KsplatHeader, section: KsplatSection, rows: ndarray
-) -> Float[ndarray, "n 3"]:
-    positions = rows["mean"].astype(np.float64)
-    if header.level == 0:
-        return positions
-    step = section.bucket_side / 2 / section.num_steps
-    return (positions - section.num_steps) * step + _lookup_centers(path, data, section)
 
 
 def _lookup_centers(path: Path, data: bytes, section: KsplatSection) -> Float[ndarray, "n 3"]:
@@ -166,7 +151,7 @@ def _lookup_centers(path: Path, data: bytes, section: KsplatSection) -> Float[nd
         raise make_damage_error(path, "its buckets are too small for their centres")
     partial = np.frombuffer(data, "<u4", section.num_partial).astype(np.int64)
     ends = np.cumsum(partial) + section.num_full * section.bucket_size
-    numbers = np.arange(section.count)
+    numbers = np.arange(section.num_rows)
     full = section.num_full * section.bucket_size
     of_partial = section.num_full + np.searchsorted(ends, numbers, side="right")
     bucket = np.where(numbers < full, numbers // max(section.bucket_size, 1), of_partial)

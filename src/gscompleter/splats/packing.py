@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
 from pathlib import Path
 
 import numpy as np
@@ -12,17 +14,34 @@ from numpy import ndarray
 from gscompleter.errors import InputError, quote_value
 from gscompleter.types import SH_C0, Gaussians, make_observed
 
+NUM_SH_REST = (0, 3, 8, 15)
+"""SH coefficients per channel above degree 0, by degree."""
+MIN_ALLOWED_BYTES = 1 << 20
+"""Unpacked size in bytes that is allowed for any file, however small."""
+MAX_GROWTH = 256
+"""Largest ratio of unpacked to packed size. Real files reach 2, real images 10."""
 
-def unpack_fraction(packed: UInt32[ndarray, "*n"], shift: int, bits: int) -> Float[ndarray, "*n"]:
-    """Unpack `bits` bits of each number from bit `shift` on, as a fraction in [0, 1]."""
-    most = (1 << bits) - 1
-    return ((packed >> np.uint32(shift)) & np.uint32(most)).astype(np.float32) / np.float32(most)
+
+def unpack_fractions(packed: UInt32[ndarray, "n"], widths: Sequence[int]) -> Float[ndarray, "n k"]:
+    """Unpack fields of `widths` bits, the last one in the lowest bits, as fractions in [0, 1]."""
+    fractions = np.empty((len(packed), len(widths)), np.float32)
+    shift = 0
+    for column, bits in reversed(list(enumerate(widths))):
+        most = (1 << bits) - 1
+        field = (packed >> np.uint32(shift)) & np.uint32(most)
+        fractions[:, column] = field.astype(np.float32) / np.float32(most)
+        shift += bits
+    return fractions
 
 
-def quantize(fractions: Float[ndarray, "*n"], bits: int) -> UInt32[ndarray, "*n"]:
-    """Quantize fractions to integers of `bits` bits; the inverse of `unpack_fraction`."""
-    most = (1 << bits) - 1
-    return np.rint(np.clip(fractions, 0, 1) * most).astype(np.uint32)
+def pack_fractions(fractions: Float[ndarray, "n k"], widths: Sequence[int]) -> UInt32[ndarray, "n"]:
+    """Quantize fractions to fields of `widths` bits; the inverse of `unpack_fractions`."""
+    packed = np.zeros(len(fractions), np.uint32)
+    for column, bits in enumerate(widths):
+        most = (1 << bits) - 1
+        field = np.rint(np.clip(fractions[:, column], 0, 1) * most).astype(np.uint32)
+        packed = (packed << np.uint32(bits)) | field
+    return packed
 
 
 def restore_largest(
@@ -48,17 +67,12 @@ def drop_largest(
     return largest, np.take_along_axis(unit, places, axis=1)
 
 
-MIN_ALLOWED_BYTES = 1 << 20
-"""Unpacked size in bytes that is allowed for any file, however small."""
-
-
-def check_growth(path: Path, unpacked: int, packed: int, max_growth: int) -> None:
+def check_growth(path: Path, unpacked: int, packed: int, max_growth: int = MAX_GROWTH) -> None:
     """Raise InputError if a file claims to unpack to over `max_growth` times its size in bytes."""
     if unpacked > MIN_ALLOWED_BYTES + max_growth * packed:
         raise InputError(
             f"{quote_value(path)} is damaged: its {packed:,} bytes claim to hold {unpacked:,}; "
-            "fetch "
-            "the file again."
+            "fetch the file again."
         )
 
 
@@ -67,14 +81,24 @@ def check_size(path: Path, found: int, needed: int) -> None:
     if found < needed:
         raise InputError(
             f"{quote_value(path)} is truncated: {found:,} of {needed:,} bytes are there; fetch or "
-            "write "
-            "the file again."
+            "write the file again."
         )
 
 
 def make_damage_error(path: Path, defect: str) -> InputError:
     """Make the error for a file that contradicts itself."""
     return InputError(f"{quote_value(path)} is damaged: {defect}; fetch or write the file again.")
+
+
+@contextmanager
+def refuse_invalid(path: Path, part: str) -> Iterator[None]:
+    """Raise InputError for what goes wrong while values of JSON, in `part` of a file, are read."""
+    try:
+        yield
+    except InputError:
+        raise
+    except (LookupError, TypeError, ValueError, OverflowError, AttributeError, RecursionError) as e:
+        raise make_damage_error(path, f"its {part} is invalid ({quote_value(str(e))})") from e
 
 
 def build_gaussians(

@@ -12,7 +12,7 @@ from __future__ import annotations
 import io
 import os
 import re
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import BinaryIO
@@ -20,6 +20,7 @@ from typing import BinaryIO
 import numpy as np
 import torch
 from jaxtyping import Bool, Float
+from numpy.lib.recfunctions import require_fields, unstructured_to_structured
 from torch import Tensor
 
 from gscompleter.errors import InputError, quote_value, refuse_pointer
@@ -38,6 +39,7 @@ _SCALARS = {
     **dict.fromkeys(("float", "float32"), "f4"),
     **dict.fromkeys(("double", "float64"), "f8"),
 }
+_KINDS = {"<f4": "float", "<u4": "uint", "|u1": "uchar"}
 _COUNTS = {name: kind for name, kind in _SCALARS.items() if kind[0] in "iu"}
 _BYTE_ORDERS = {"ascii": "", "binary_little_endian": "<", "binary_big_endian": ">"}
 
@@ -120,8 +122,8 @@ def read_header(file: BinaryIO, path: Path) -> tuple[str, list[Element]]:
         try:
             if words[0] == "format":
                 file_format = words[1]
-            elif words[0] == "element":
-                elements.append(Element(words[1], _parse_count(words[2])))
+            elif words[0] == "element" and words[2].isdecimal():
+                elements.append(Element(words[1], int(words[2])))
             elif words[0] == "property":
                 elements[-1].properties.append(_parse_property(words[1:]))
             else:
@@ -129,8 +131,7 @@ def read_header(file: BinaryIO, path: Path) -> tuple[str, list[Element]]:
         except (IndexError, KeyError, ValueError) as error:
             raise InputError(
                 f"{path} has a broken header: the line '{quote_value(' '.join(words))}' is "
-                "invalid; "
-                "export it again."
+                "invalid; export it again."
             ) from error
     if file_format not in _BYTE_ORDERS:
         raise InputError(
@@ -147,12 +148,6 @@ def read_mode(file: BinaryIO) -> bool:
     lines = file.read(end).decode("latin-1").splitlines()
     modes = [found[1].lower() for line in lines if (found := _MODE_LINE.fullmatch(line.strip()))]
     return bool(modes) and modes[-1] in _ANTIALIASED
-
-
-def _parse_count(word: str) -> int:
-    if not word.isdecimal():
-        raise ValueError(word)
-    return int(word)
 
 
 def _parse_property(words: list[str]) -> Property:
@@ -231,12 +226,9 @@ def _read_ascii_vertices(
         raise InputError(
             f"{path} holds rows that are not {width} numbers each; write it anew."
         ) from error
-    vertices = np.empty(vertex.count, vertex.dtype("="))
     # Values out of range become infinite or wrong; relevant ones are checked later.
     with np.errstate(over="ignore", invalid="ignore"):
-        for column, prop in enumerate(vertex.properties):
-            vertices[prop.name] = table[:, column]
-    return vertices
+        return unstructured_to_structured(table, vertex.dtype("="))
 
 
 def _make_truncation_error(
@@ -244,8 +236,7 @@ def _make_truncation_error(
 ) -> InputError:
     return InputError(
         f"{path} is truncated: {found:,} of {quote_value(f'{expected:,}')} {quote_value(what)}s "
-        "are there; "
-        "fetch or write the file again."
+        "are there; fetch or write the file again."
     )
 
 
@@ -253,9 +244,8 @@ def load_ply(path: Path | str, drop_nonfinite: bool = False) -> Gaussians:
     """Load the Gaussians of a 3DGS .ply of SH degree 0 to 3.
 
     With `drop_nonfinite`, Gaussians with NaN, infinity or a zero quaternion are dropped; otherwise
-    the
-    file is refused. Infinite opacity logits are valid: converters write them for opacities of 1 and
-    0.
+    the file is refused. Infinite opacity logits are valid: converters write them for opacities of 1
+    and 0.
 
     Raises:
         InputError: The file is missing, no 3DGS .ply, empty, truncated or has invalid values.
@@ -383,18 +373,6 @@ def find_finite(gaussians: Gaussians) -> Bool[Tensor, "n"]:
     return good
 
 
-def note_infinite_opacities(gaussians: Gaussians) -> str | None:
-    """Describe the number of infinite opacity logits in a sentence, or return None."""
-    logits = None if gaussians.encoded is None else gaussians.encoded[:, 3]
-    if logits is None or logits.sum().isfinite():
-        return None
-    opaque, clear = int(logits.isposinf().sum()), int(logits.isneginf().sum())
-    return (
-        f"{opaque:,} of {len(gaussians):,} Gaussians have an opacity logit of +infinity and "
-        f"{clear:,} of -infinity; they are rendered as opaque and as transparent."
-    )
-
-
 def iterate_blocks(count: int) -> Iterator[slice]:
     """Yield slices of `BLOCK_ROWS` rows from 0 to `count`."""
     return (slice(start, start + BLOCK_ROWS) for start in range(0, count, BLOCK_ROWS))
@@ -431,8 +409,7 @@ def save_ply(path: Path | str, gaussians: Gaussians, provenance: bool | None = N
     """Write a standard 3DGS .ply, with `uchar generated` after the standard properties.
 
     `provenance` decides if `generated` is written; the default is yes if anything was generated.
-    Some
-    readers (such as gsply 0.4) misread rows that end in a byte; False writes the plain layout.
+    Some readers (such as gsply 0.4) misread rows that end in a byte; False writes the plain layout.
 
     Raises:
         InputError: The file cannot be written; an existing one is kept.
@@ -440,41 +417,41 @@ def save_ply(path: Path | str, gaussians: Gaussians, provenance: bool | None = N
     if provenance is None:
         provenance = bool((gaussians.generated > 0).any())
     gaussians = gaussians.to("cpu")
-    kinds = {"<f4": "float", "|u1": "uchar"}
-    lines = ["ply", "format binary_little_endian 1.0"]
-    lines += [MODE_COMMENT] if gaussians.is_antialiased else []
-    lines += [f"element vertex {len(gaussians)}"]
     dtype = make_rows(gaussians[:0], provenance).dtype
-    lines += [f"property {kinds[dtype[name].str]} {name}" for name in dtype.names or ()]
-    header = "\n".join([*lines, "end_header", ""])
+    header = make_header({"vertex": (len(gaussians), dtype)}, gaussians.is_antialiased)
     with replace_file(path) as file:
-        file.write(header.encode("ascii"))
+        file.write(header)
         for block in iterate_blocks(len(gaussians)):
             file.write(make_rows(gaussians[block], provenance).view(np.uint8).data)
 
 
+def make_header(elements: Mapping[str, tuple[int, np.dtype]], is_antialiased: bool) -> bytes:
+    """Make the header of a binary .ply from the number and type of the rows of each element."""
+    lines = ["ply", "format binary_little_endian 1.0"]
+    lines += [MODE_COMMENT] if is_antialiased else []
+    for name, (count, dtype) in elements.items():
+        lines.append(f"element {name} {count}")
+        lines += [f"property {_KINDS[dtype[column].str]} {column}" for column in dtype.names or ()]
+    return "\n".join([*lines, "end_header", ""]).encode("ascii")
+
+
 def make_rows(gaussians: Gaussians, provenance: bool) -> np.ndarray:
     """Make one row per Gaussian in the standard layout, with or without `generated`."""
-    num_rest = 3 * (gaussians.sh.shape[1] - 1)
-    rest = tuple(f"f_rest_{i}" for i in range(num_rest))
-    names = (*_MEANS, *_NORMALS, *_DC, *rest, "opacity", *_SCALES, *_QUATS)
-    layout = [(name, "<f4") for name in names]
-    if provenance:
-        layout.append(("generated", "u1"))
-    vertices = np.zeros(len(gaussians), layout)
-
-    def put(columns: tuple[str, ...], values: Tensor) -> None:
-        table = values.detach().float().numpy()
-        for column, name in enumerate(columns):
-            vertices[name] = table[:, column]
-
+    rest = gaussians.sh[:, 1:].transpose(1, 2).flatten(1)
     encoded = encode(gaussians)
-    put(_MEANS, gaussians.means)
-    put(_DC, gaussians.sh[:, 0])
-    put(rest, gaussians.sh[:, 1:].transpose(1, 2).reshape(len(gaussians), num_rest))
-    put(_SCALES, encoded[:, :3])
-    put(("opacity",), encoded[:, 3:])
-    put(_QUATS, gaussians.quats)
+    columns = {
+        _MEANS: gaussians.means,
+        _NORMALS: torch.zeros_like(gaussians.means),
+        _DC: gaussians.sh[:, 0],
+        tuple(f"f_rest_{i}" for i in range(rest.shape[1])): rest,
+        ("opacity",): encoded[:, 3:],
+        _SCALES: encoded[:, :3],
+        _QUATS: gaussians.quats,
+    }
+    dtype = [(name, "<f4") for names in columns for name in names]
+    table = torch.cat(list(columns.values()), dim=1).detach().float().numpy()
+    rows = np.ascontiguousarray(table, "<f4").view(dtype)[:, 0]
     if provenance:
-        vertices["generated"] = gaussians.generated.numpy()
-    return vertices
+        rows = require_fields(rows, [*dtype, ("generated", "u1")])
+        rows["generated"] = gaussians.generated.numpy()
+    return rows

@@ -27,21 +27,20 @@ from PIL import Image
 from gscompleter.errors import InputError, quote_value
 from gscompleter.io.reading import read_bytes
 from gscompleter.splats.packing import (
+    NUM_SH_REST,
     assemble_sh,
     build_gaussians,
     check_growth,
     make_damage_error,
+    refuse_invalid,
     restore_largest,
 )
 from gscompleter.types import SH_C0, Gaussians
 
 META = "meta.json"
 ZIP_MAGIC = b"PK\x03\x04"
-NUM_SH_REST = (0, 3, 8, 15)
 PALETTE_WIDTH = 64
 """Entries of the SH palette in each row of its image."""
-MAX_GROWTH = 256
-"""Largest ratio of unpacked to packed size of an image. Real ones reach 10."""
 MAX_ENTRY_GROWTH = 8
 """Largest ratio of unpacked to packed size of a zip entry; images do not shrink."""
 ZIP_ERRORS = (
@@ -67,7 +66,7 @@ class SogFiles:
         """Read an image of at least `needed` pixels."""
         data = self.read(_check_file_name(self.path, name))
         width, height = _parse_webp_size(self.path, data)
-        check_growth(self.path, 4 * width * height, len(data), MAX_GROWTH)
+        check_growth(self.path, 4 * width * height, len(data))
         if width * height < needed:
             raise make_damage_error(
                 self.path, f"{quote_value(name)} has fewer pixels than there are Gaussians"
@@ -137,7 +136,7 @@ def _parse_webp_size(path: Path, data: bytes) -> tuple[int, int]:
 
 
 def _read_files(parts: SogFiles, meta: str = META) -> Gaussians:
-    try:
+    with refuse_invalid(parts.path, meta):
         table = json.loads(parts.read(meta))
         if not isinstance(table, dict) or "means" not in table:
             raise InputError(f"{parts.path} is no .sog: its {meta} describes something else.")
@@ -148,12 +147,6 @@ def _read_files(parts: SogFiles, meta: str = META) -> Gaussians:
             )
         marked = table.get("model") == "antialiased" or table.get("antialias") is True
         return replace(_decode_scene(parts, table, version), is_antialiased=marked)
-    except InputError:
-        raise
-    except (KeyError, IndexError, TypeError, ValueError, OverflowError, RecursionError) as error:
-        raise make_damage_error(
-            parts.path, f"its {meta} is invalid ({quote_value(str(error))})"
-        ) from error
 
 
 def _decode_scene(parts: SogFiles, table: dict[str, Any], version: int) -> Gaussians:

@@ -25,8 +25,7 @@ def read_splat(path: Path) -> Gaussians:
     if len(data) % ROW.itemsize:
         raise InputError(
             f"{quote_value(path)} is truncated or no .splat: its {len(data):,} bytes are no "
-            "multiple of "
-            f"{ROW.itemsize}; fetch the file again."
+            f"multiple of {ROW.itemsize}; fetch the file again."
         )
     rows = np.frombuffer(data, ROW)
     rgba = rows["rgba"].astype(np.float32) / 255

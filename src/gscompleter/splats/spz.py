@@ -11,8 +11,9 @@ from __future__ import annotations
 import gzip
 import struct
 import zlib
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from pathlib import Path
+from typing import NamedTuple
 
 import numpy as np
 from jaxtyping import Float, Int, UInt8
@@ -22,13 +23,16 @@ from gscompleter.errors import InputError, quote_value
 from gscompleter.io.files import replace_file
 from gscompleter.io.reading import read_bytes
 from gscompleter.splats.packing import (
+    NUM_SH_REST,
     assemble_sh,
     build_gaussians,
     check_growth,
     check_size,
     drop_largest,
     make_damage_error,
+    pack_fractions,
     restore_largest,
+    unpack_fractions,
 )
 from gscompleter.splats.ply import encode
 from gscompleter.splats.transform import HALF_TURN_X, rotate_half_turn
@@ -42,23 +46,22 @@ TABLE_OFFSET = struct.Struct("<I12x")
 """In version 4, the offset of the table of stream sizes follows."""
 ANTIALIASED_FLAG = 0x1
 """Flag of antialiased Gaussians."""
-NUM_SH_REST = (0, 3, 8, 15)
-MAX_GROWTH = 256
-"""Largest ratio of unpacked to packed size. Real files reach 2."""
 MAX_WINDOW = 1 << 27
 """Largest window of zstd, in bytes, which it keeps in memory."""
 COLOR_SCALE = 0.15
 """The constant SH coefficient is stored as `0.5 + 0.15 sh`."""
+SIGN_SIZE_BITS = (1, 9) * 3
+"""Bits of sign and size of three components of a rotation."""
 MAX_FRACTIONAL_BITS = 16
 """Largest number of fractional bits of a position."""
 
 
-@dataclass(frozen=True)
-class SpzHeader:
+class SpzHeader(NamedTuple):
     """The header of a .spz."""
 
+    magic: bytes
     version: int
-    count: int
+    num_gaussians: int
     degree: int
     fractional_bits: int
     flags: int
@@ -69,7 +72,7 @@ class SpzHeader:
         """Bytes of positions, opacities, colours, scales, rotations and SH."""
         rotation = 3 if self.version == 2 else 4
         widths = [9, 1, 3, 3, rotation, 3 * NUM_SH_REST[self.degree]]
-        return [width * self.count for width in widths]
+        return [width * self.num_gaussians for width in widths]
 
 
 def is_spz(head: bytes) -> bool:
@@ -84,32 +87,32 @@ def read_spz(path: Path) -> Gaussians:
         header, streams = _read_gzip(path, data)
     else:
         header = _parse_header(path, data)
-        plain = header.version < 4
-        streams = (
-            _split_streams(path, header, data[HEADER.size :]) if plain else _read_zstd(path, data)
-        )
+        if header.version < 4:
+            streams = _split_streams(path, header, data[HEADER.size :])
+        else:
+            streams = _read_zstd(path, header, data)
     turned = rotate_half_turn(_decode_streams(header, streams), HALF_TURN_X)
     return replace(turned, is_antialiased=bool(header.flags & ANTIALIASED_FLAG))
 
 
 def _parse_header(path: Path, data: bytes) -> SpzHeader:
     check_size(path, len(data), HEADER.size)
-    magic, version, count, degree, bits, flags, streams = HEADER.unpack_from(data)
-    if magic != MAGIC:
+    header = SpzHeader(*HEADER.unpack_from(data))
+    if header.magic != MAGIC:
         raise InputError(f"{quote_value(path)} is no .spz but other compressed data.")
-    if version not in (2, 3, 4):
+    if header.version not in (2, 3, 4):
         raise InputError(
-            f"{quote_value(path)} is .spz version {version}; versions 2, 3 and 4 are known."
+            f"{quote_value(path)} is .spz version {header.version}; versions 2, 3 and 4 are known."
         )
-    if count == 0:
+    if header.num_gaussians == 0:
         raise InputError(f"{quote_value(path)} is empty: it holds no Gaussian.")
-    if degree >= len(NUM_SH_REST) or bits > 24:
+    if header.degree >= len(NUM_SH_REST) or header.fractional_bits > 24:
         raise InputError(
-            f"{quote_value(path)} has harmonics of degree {degree} and {bits} fractional bits; a "
-            ".spz "
-            "of degree 0 to 3 and at most 24 bits is needed."
+            f"{quote_value(path)} has harmonics of degree {header.degree} and "
+            f"{header.fractional_bits} fractional bits; a .spz of degree 0 to 3 and at most 24 "
+            "bits is needed."
         )
-    return SpzHeader(version, count, degree, bits, flags, streams)
+    return header
 
 
 def _read_gzip(path: Path, data: bytes) -> tuple[SpzHeader, list[bytes]]:
@@ -119,7 +122,7 @@ def _read_gzip(path: Path, data: bytes) -> tuple[SpzHeader, list[bytes]]:
         if header.version > 3:
             raise make_damage_error(path, f"version {header.version} is no gzip stream")
         size = sum(header.stream_sizes)
-        check_growth(path, size, len(data), MAX_GROWTH)
+        check_growth(path, size, len(data))
         body = unpacker.decompress(unpacker.unconsumed_tail, size)
         more = unpacker.decompress(unpacker.unconsumed_tail, 1)  # reads the checksum
     except zlib.error as error:
@@ -135,14 +138,13 @@ def _split_streams(path: Path, header: SpzHeader, body: bytes) -> list[bytes]:
     return [body[end - size : end] for end, size in zip(ends, header.stream_sizes, strict=True)]
 
 
-def _read_zstd(path: Path, data: bytes) -> list[bytes]:
+def _read_zstd(path: Path, header: SpzHeader, data: bytes) -> list[bytes]:
     """Decompress the attributes of version 4, each from its own stream."""
-    header = _parse_header(path, data)
     check_size(path, len(data), HEADER.size + TABLE_OFFSET.size)
     (place,) = TABLE_OFFSET.unpack_from(data, HEADER.size)
     start = place + 16 * header.num_streams
     check_size(path, len(data), start)
-    check_growth(path, sum(header.stream_sizes), len(data), MAX_GROWTH)
+    check_growth(path, sum(header.stream_sizes), len(data))
     needed = 6 if header.degree else 5
     if header.num_streams < needed:
         raise make_damage_error(path, f"{header.num_streams} of {needed} attributes are there")
@@ -173,9 +175,9 @@ def _decompress(path: Path, data: bytes, size: int) -> bytes:
 
 def _decode_streams(header: SpzHeader, streams: list[bytes]) -> Gaussians:
     """Decode the Gaussians, in the axes of the file."""
+    n = header.num_gaussians
     positions, opacities, colours, scales, rotations, rest = (
-        np.frombuffer(stream, np.uint8).reshape(header.count, len(stream) // header.count)
-        for stream in streams
+        np.frombuffer(stream, np.uint8).reshape(n, len(stream) // n) for stream in streams
     )
     colour = 0.5 + SH_C0 * (colours.astype(np.float32) / 255 - 0.5) / COLOR_SCALE
     higher = rest.astype(np.float32)
@@ -186,7 +188,7 @@ def _decode_streams(header: SpzHeader, streams: list[bytes]) -> Gaussians:
         _decode_quats_v2(rotations) if header.version == 2 else _decode_quats_v3(rotations),
         np.exp(scales.astype(np.float32) / 16 - 10),
         opacities[:, 0].astype(np.float32) / 255,
-        assemble_sh(colour, higher.reshape(header.count, NUM_SH_REST[header.degree], 3)),
+        assemble_sh(colour, higher.reshape(n, NUM_SH_REST[header.degree], 3)),
     )
 
 
@@ -205,9 +207,9 @@ def _decode_quats_v2(rotations: UInt8[ndarray, "n 3"]) -> Float[ndarray, "n 4"]:
 def _decode_quats_v3(rotations: UInt8[ndarray, "n 4"]) -> Float[ndarray, "n 4"]:
     """Decode the number of the dropped component and three of 10 bits (xyzw, sign and size)."""
     packed = np.ascontiguousarray(rotations).view("<u4")[:, 0]
-    fields = np.stack([packed >> np.uint32(shift) for shift in (20, 10, 0)], axis=1)
-    sizes = (fields & np.uint32(511)).astype(np.float32) / 511 * np.float32(np.sqrt(0.5))
-    smaller = np.where(fields & np.uint32(512), -sizes, sizes)
+    fields = unpack_fractions(packed, SIGN_SIZE_BITS)
+    sizes = fields[:, 1::2] * np.float32(np.sqrt(0.5))
+    smaller = np.where(fields[:, ::2] > 0, -sizes, sizes)
     return np.roll(restore_largest(packed >> np.uint32(30), smaller), 1, axis=1)
 
 
@@ -267,9 +269,6 @@ def _pack_positions(means: Float[ndarray, "n 3"], bits: int) -> bytes:
 
 def _pack_rotations(quats: Float[ndarray, "n 4"]) -> bytes:
     largest, smaller = drop_largest(np.roll(quats, -1, axis=1))
-    sizes = np.rint(np.abs(smaller) / np.sqrt(0.5) * 511).clip(0, 511).astype(np.uint32)
-    fields = sizes | np.where(smaller < 0, np.uint32(512), np.uint32(0)).astype(np.uint32)
-    packed = largest.astype(np.uint32) << np.uint32(30)
-    for column, shift in enumerate((20, 10, 0)):
-        packed |= fields[:, column] << np.uint32(shift)
+    fields = np.stack([smaller < 0, np.abs(smaller) / np.sqrt(0.5)], axis=2).reshape(-1, 6)
+    packed = (largest.astype(np.uint32) << np.uint32(30)) | pack_fractions(fields, SIGN_SIZE_BITS)
     return packed.astype("<u4").tobytes()

@@ -14,9 +14,9 @@ from gscompleter.splats.formats import (
     describe_mode_loss,
     get_writable_format,
     load_splat,
+    note_infinite_opacities,
     save_splat,
 )
-from gscompleter.splats.ply import note_infinite_opacities
 from gscompleter.splats.strip import strip
 
 

@@ -49,9 +49,9 @@ from gscompleter.memory import (
     estimate_scene_bytes,
 )
 from gscompleter.render import Renderer, load_renderer
-from gscompleter.splat_alignment.placing import align_splat
-from gscompleter.splat_alignment.sidecars import InputSplat
+from gscompleter.splat_alignment.estimate import align_splat
 from gscompleter.splat_alignment.similarity import transform_camera, transform_view
+from gscompleter.splat_alignment.trainer_frames import InputSplat
 from gscompleter.splats.formats import FORMATS as SPLAT_FORMATS
 from gscompleter.splats.formats import detect_splat_format
 from gscompleter.splats.ply import find_finite_rows

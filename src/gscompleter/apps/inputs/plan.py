@@ -11,7 +11,7 @@ from gscompleter.data.formats import FORMATS
 from gscompleter.data.frame import Frame
 from gscompleter.errors import join_names, quote_value
 from gscompleter.memory import estimate_bytes, format_whole_gigabytes, read_memory_bytes
-from gscompleter.splats.ply import note_infinite_opacities
+from gscompleter.splats.formats import note_infinite_opacities
 from gscompleter.types import Camera, Gaussians
 
 SOURCE_NAMES = {

@@ -38,7 +38,7 @@ from gscompleter.kernels.parallel import map_in_parallel
 from gscompleter.render import Renderer, get_view_map
 from gscompleter.splats.layout import save_like
 from gscompleter.splats.ply import save_ply
-from gscompleter.splats.provenance import REMOVED_FILE, save_removed
+from gscompleter.splats.strip import REMOVED_FILE, save_removed
 from gscompleter.state import Completion, TargetResult
 from gscompleter.types import Camera, DepthPairs, Gaussians, Render, View, merge
 

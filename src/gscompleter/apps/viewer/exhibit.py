@@ -20,8 +20,7 @@ from gscompleter.errors import InputError, quote_value
 from gscompleter.io.files import COMPLETED_FILE, CONTEXT_FILE, TARGETS_FILE
 from gscompleter.io.image import encode_jpeg, read_pixels
 from gscompleter.splat_alignment.similarity import transform_camera
-from gscompleter.splats.formats import load_splat
-from gscompleter.splats.ply import note_infinite_opacities
+from gscompleter.splats.formats import load_splat, note_infinite_opacities
 from gscompleter.splats.sog import META
 from gscompleter.types import Camera, Gaussians
 

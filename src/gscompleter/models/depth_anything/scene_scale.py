@@ -11,9 +11,9 @@ from jaxtyping import Float
 from gscompleter.errors import InputError
 from gscompleter.geometry import sample
 from gscompleter.reconstructors.features.depth_range import MIN_MATCHES
+from gscompleter.reconstructors.features.matches import triangulate
 from gscompleter.reconstructors.features.neighbours import find_neighbours
 from gscompleter.reconstructors.features.stereo_image import make_stereo_images
-from gscompleter.reconstructors.features.triangulation import triangulate
 from gscompleter.types import DepthMap, View
 
 

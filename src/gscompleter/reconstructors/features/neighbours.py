@@ -10,12 +10,15 @@ from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from jaxtyping import Float
 
 from gscompleter.kernels.parallel import map_in_parallel
-from gscompleter.reconstructors.features.sift import Pixels, detect_features, match_features
+from gscompleter.reconstructors.features.matches import (
+    Pixels,
+    detect_features,
+    match_features,
+    triangulate_valid,
+)
 from gscompleter.reconstructors.features.stereo_image import StereoImage
-from gscompleter.reconstructors.features.triangulation import triangulate_valid
 
 NUM_SOURCES = 2
 """Number of neighbours per photograph."""
@@ -87,14 +90,10 @@ def sort_pairs(pairs: Iterable[Pair]) -> list[Pair]:
 
 
 def score_pair(a: StereoImage, b: StereoImage, in_a: Pixels, in_b: Pixels) -> float:
-    """Score two photographs by the triangulation angles of their matches."""
+    """Score two photographs by the triangulation angles of their matches, each up to 1."""
     if len(in_a) == 0:
         return 0.0
-    baseline = float(np.linalg.norm(a.center - b.center))
-    return float(score_angle(baseline * triangulate_valid(a, b, in_a, in_b)).sum())
-
-
-def score_angle(ratio: Float[np.ndarray, "k"]) -> Float[np.ndarray, "k"]:
-    """Score triangulation angles, up to 1; `ratio` is baseline over depth."""
+    ratio = float(np.linalg.norm(a.center - b.center)) * triangulate_valid(a, b, in_a, in_b)
     excess = np.degrees(2 * np.arctan(ratio / 2)) - BEST_ANGLE
-    return np.exp(-((excess / np.where(excess < 0, NARROWER_SIGMA, WIDER_SIGMA)) ** 2) / 2)
+    sigma = np.where(excess < 0, NARROWER_SIGMA, WIDER_SIGMA)
+    return float(np.exp(-((excess / sigma) ** 2) / 2).sum())

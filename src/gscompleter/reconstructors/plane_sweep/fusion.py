@@ -1,26 +1,46 @@
-"""Fusion of many depth maps: each surface once, and nothing in observed free space."""
+"""Fusion of depth maps: each surface once, nothing in observed free space, in one exposure.
+
+Each pair of photographs gives a colour ratio per channel on the surfaces that both observe; least
+squares over all pairs gives the exposure gains.
+"""
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping, Sequence
+import math
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from jaxtyping import Float, Float32
+from jaxtyping import Float, Int
 
 from gscompleter.kernels import stereo
 from gscompleter.reconstructors.features.stereo_image import StereoImage
-from gscompleter.reconstructors.plane_sweep.confidence import MAX_RETURN_ERROR, Map, Mask
-from gscompleter.reconstructors.plane_sweep.occlusion import UNKNOWN
+from gscompleter.reconstructors.plane_sweep.consistency import MAX_RETURN_ERROR, UNKNOWN, Map, Mask
+from gscompleter.reconstructors.plane_sweep.rig import Transform, Transforms
 
 MAX_DEPTH_DIFFERENCE = 0.05
 """Largest relative depth difference between two views of the same surface."""
 FINER_FOOTPRINT = 0.9
 """Footprint ratio below which another view is finer; otherwise the first view is kept."""
 
+DARKEST, BRIGHTEST = 0.05, 0.95
+"""Range of usable colours: darker values are noise, brighter ones may be clipped."""
+MIN_SHARED = 0.01
+"""Fraction of well exposed pixels that two photographs must share to be compared."""
+CORRELATED_SHARE = 0.01
+"""Fraction of a photograph's pixels whose errors are correlated."""
+NUM_SAMPLED_ROWS = 128
+"""Approximate number of rows and columns that are sampled in a photograph."""
+PAIR_NOISE = 0.02
+"""Standard deviation of a pair's log-ratio, due to reflections and vignetting."""
+EXPOSURE, TINT = 0.3, 0.1
+"""Prior standard deviations of the log-gains: common to all channels, and per channel."""
+MIN_LOG_SPREAD = 0.5 * math.log(2)
+"""Smallest spread of the log-gains that is corrected; less is hardly visible."""
 
-Transforms = Mapping[tuple[int, int], Float32[np.ndarray, "3 4"]]
-"""`transforms[i, j]` is j_from_i: pixels of view i with inverse depth -> pixels of view j."""
+Gains = Float[np.ndarray, "views 3"]
+ColorRatio = tuple[Float[np.ndarray, "3"], Float[np.ndarray, "3"]]
+"""Logarithm of a photograph's colours over another's, and its inverse variance; 0 without data."""
 
 
 @dataclass(frozen=True)
@@ -37,28 +57,6 @@ class Layer:
     def measured_mask(self) -> Mask:
         """True at pixels with a measured depth."""
         return self.confidence > 0
-
-
-def find_free_pixels(layers: Sequence[Layer], transforms: Transforms) -> list[Mask]:
-    """Find the pixels of each view that are outside the free space of all other views."""
-    everywhere = [np.ones_like(layer.measured_mask) for layer in layers]
-    return [
-        find_unrefuted(layer, compare_with_views(number, layers, everywhere, transforms))
-        for number, layer in enumerate(layers)
-    ]
-
-
-def find_finest_pixels(
-    layers: Sequence[Layer], free: Sequence[Mask], transforms: Transforms
-) -> list[Mask]:
-    """Find the `free` pixels of each view that no other view resolves better."""
-    return [
-        free[number]
-        & ~find_better_elsewhere(
-            number, layers, compare_with_views(number, layers, free, transforms), transforms
-        )
-        for number in range(len(layers))
-    ]
 
 
 @dataclass(frozen=True)
@@ -86,12 +84,20 @@ def compare_with_views(
         known = (error >= 0) & (ratio > 1e-3)
         apart = error > MAX_RETURN_ERROR
         through = known & apart & (ratio < 1 - MAX_DEPTH_DIFFERENCE)
-        yield DepthComparison(
-            other, through, known & ~apart & (np.abs(ratio - 1) < MAX_DEPTH_DIFFERENCE)
-        )
+        same = known & ~apart & (np.abs(ratio - 1) < MAX_DEPTH_DIFFERENCE)
+        yield DepthComparison(other, through, same)
 
 
-def find_unrefuted(layer: Layer, comparisons: Iterator[DepthComparison]) -> Mask:
+def find_free_pixels(layers: Sequence[Layer], transforms: Transforms) -> list[Mask]:
+    """Find the pixels of each view that are outside the free space of all other views."""
+    everywhere = [np.ones_like(layer.measured_mask) for layer in layers]
+    return [
+        find_unrefuted(layer, compare_with_views(number, layers, everywhere, transforms))
+        for number, layer in enumerate(layers)
+    ]
+
+
+def find_unrefuted(layer: Layer, comparisons: Iterable[DepthComparison]) -> Mask:
     """Mark pixels that no view sees through, or that more views confirm than refute."""
     balance = np.zeros(layer.inverse.shape, np.int32)
     seen_through = np.zeros(layer.inverse.shape, bool)
@@ -101,17 +107,24 @@ def find_unrefuted(layer: Layer, comparisons: Iterator[DepthComparison]) -> Mask
     return ~seen_through | (layer.measured_mask & (balance > 0))
 
 
+def find_finest_pixels(
+    layers: Sequence[Layer], free: Sequence[Mask], transforms: Transforms
+) -> list[Mask]:
+    """Find the `free` pixels of each view that no other view resolves better."""
+    return [
+        mask & ~find_better_elsewhere(number, layers, free, transforms)
+        for number, mask in enumerate(free)
+    ]
+
+
 def find_better_elsewhere(
-    number: int,
-    layers: Sequence[Layer],
-    comparisons: Iterator[DepthComparison],
-    transforms: Transforms,
+    number: int, layers: Sequence[Layer], free: Sequence[Mask], transforms: Transforms
 ) -> Mask:
     """Mark interpolated or coarse pixels whose surface another view measured better."""
     layer = layers[number]
     own = 1 / layer.inverse / layer.image.K[0, 0]
     better = np.zeros(own.shape, bool)
-    for meeting in comparisons:
+    for meeting in compare_with_views(number, layers, free, transforms):
         ratio = compute_depth_ratio(layer.inverse, transforms[number, meeting.other])
         footprint = ratio / layer.inverse / layers[meeting.other].image.K[0, 0]
         limit = own / FINER_FOOTPRINT if meeting.other < number else own * FINER_FOOTPRINT
@@ -119,11 +132,81 @@ def find_better_elsewhere(
     return better
 
 
-def compute_depth_ratio(
-    inverse: Map, transform: Float32[np.ndarray, "3 4"]
-) -> Float[np.ndarray, "h w"]:
+def compute_depth_ratio(inverse: Map, transform: Transform) -> Float[np.ndarray, "h w"]:
     """Compute the z-depth of each surface in another view over that in its own view."""
     h, w = inverse.shape
     x, y = np.arange(w) + 0.5, np.arange(h)[:, None] + 0.5
     a, b, c, d = transform[2]
     return a * x + b * y + c + d * inverse
+
+
+def estimate_gains(layers: Sequence[Layer], transforms: Transforms) -> Gains:
+    """Estimate how much brighter each photograph is than their mean, per channel.
+
+    The log-gains have mean 0. All gains are exactly 1 for two photographs, and if they differ by
+    less than `MIN_LOG_SPREAD`.
+    """
+    if len(layers) == 2:
+        return np.ones((2, 3))
+    logs = solve_log_gains(measure_ratios(layers, transforms), len(layers))
+    return np.exp(logs) if np.ptp(logs, axis=0).max() > MIN_LOG_SPREAD else np.ones_like(logs)
+
+
+def solve_log_gains(ratios: Iterable[tuple[list[int], ColorRatio]], count: int) -> Gains:
+    """Solve for the log-gains of `count` photographs by least squares with a prior."""
+    usual = EXPOSURE**2 * np.ones((3, 3)) + TINT**2 * np.eye(3)
+    precision = np.kron(np.eye(count), np.linalg.inv(usual))
+    pull = np.zeros((count, 3))
+    for pair, (log, weight) in ratios:
+        apart = np.zeros(count)
+        apart[pair] = 1, -1
+        precision += np.kron(np.outer(apart, apart), np.diag(weight))
+        pull += np.outer(apart, weight * log)
+    return np.linalg.solve(precision, pull.reshape(-1)).reshape(count, 3)
+
+
+def measure_ratios(
+    layers: Sequence[Layer], transforms: Transforms
+) -> Iterator[tuple[list[int], ColorRatio]]:
+    """Yield the colour ratio of every ordered pair of photographs."""
+    measured = [layer.measured_mask for layer in layers]
+    for number, layer in enumerate(layers):
+        step = max(1, min(layer.image.size) // NUM_SAMPLED_ROWS)
+        for meeting in compare_with_views(number, layers, measured, transforms):
+            same = (meeting.same_surface_mask & layer.measured_mask)[::step, ::step]
+            rows, columns = (step * at for at in np.nonzero(same))
+            own = layer.image.image[rows, columns]
+            there = transforms[number, meeting.other]
+            other = sample_colors(layer, rows, columns, layers[meeting.other].image, there)
+            yield [number, meeting.other], measure_ratio(own, other, same.size)
+
+
+def measure_ratio(
+    own: Float[np.ndarray, "n 3"], other: Float[np.ndarray, "n 3"], num_sampled: int
+) -> ColorRatio:
+    """Compute the median log-ratio of two photographs over `num_sampled` pixels."""
+    log, weight = np.zeros(3), np.zeros(3)
+    exposed = (np.minimum(own, other) > DARKEST) & (np.maximum(own, other) < BRIGHTEST)
+    for channel in np.flatnonzero(exposed.sum(axis=0) > MIN_SHARED * num_sampled):
+        valid = exposed[:, channel]
+        logs = np.log(own[valid, channel] / other[valid, channel])
+        log[channel] = np.median(logs)
+        spread = 1.4826 * np.median(np.abs(logs - log[channel]))
+        variance = spread**2 * CORRELATED_SHARE * num_sampled / len(logs)
+        weight[channel] = 1 / (PAIR_NOISE**2 + variance)
+    return log, weight
+
+
+def sample_colors(
+    layer: Layer,
+    rows: Int[np.ndarray, "n"],
+    columns: Int[np.ndarray, "n"],
+    other: StereoImage,
+    transform: Transform,
+) -> Float[np.ndarray, "n 3"]:
+    """Sample the colours of another photograph at the surfaces of some pixels of a layer."""
+    inverse = layer.inverse[rows, columns]
+    moved = np.stack([columns + 0.5, rows + 0.5, np.ones(len(rows)), inverse], 1) @ transform.T
+    h, w = other.size
+    x, y = (moved[:, :2] / moved[:, 2:]).astype(int).clip(0, [w - 1, h - 1]).T
+    return other.image[y, x]

@@ -1,20 +1,155 @@
-"""One disc-shaped Gaussian per pixel, oriented like the surface."""
+"""Gaussians from per-pixel depths: discs oriented like the surface, fitted to the photographs."""
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+from dataclasses import dataclass, field, replace
+
 import torch
-from jaxtyping import Float
+from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from gscompleter.geometry import rotations_to_quats
-from gscompleter.types import Gaussians, View, make_observed, sh_from_rgb
+from gscompleter.reconstructors.plane_sweep.consistency import Mask
+from gscompleter.reconstructors.plane_sweep.fit import fit_colors, fit_jointly, fit_opacities
+from gscompleter.reconstructors.plane_sweep.fusion import (
+    Layer,
+    estimate_gains,
+    find_finest_pixels,
+    find_free_pixels,
+)
+from gscompleter.reconstructors.plane_sweep.rig import Transforms
+from gscompleter.render import Renderer, load_renderer
+from gscompleter.sky import extend_sky, is_sky, restore_sky_colors
+from gscompleter.types import (
+    DepthMap,
+    Gaussians,
+    Reconstruction,
+    View,
+    make_observed,
+    merge,
+    sh_from_rgb,
+)
 
+MIN_ALPHA = 0.7
+"""Alpha below which a removed pixel is restored to close a gap."""
 THICKNESS = 0.15
 """Standard deviation along the normal, relative to that across the viewing ray."""
 MAX_STRETCH = 3.0
 """Largest elongation of a disc on a slanted surface, relative to a frontal one."""
 OPACITY = 0.98
 """Initial opacity of every disc."""
+
+
+@dataclass(frozen=True)
+class Splatter:
+    """Base of reconstructors that splat depth maps and fit the Gaussians."""
+
+    disc_sigma: float = 0.6
+    """Standard deviation of a Gaussian across the viewing ray, in pixels."""
+    renderer: Renderer = field(default_factory=lambda: load_renderer("cpu"))
+
+    def build_scene(
+        self,
+        views: Sequence[View],
+        depths: Sequence[DepthMap],
+        layers: Sequence[Layer],
+        transforms: Transforms,
+    ) -> Reconstruction:
+        """Build the Gaussians of `views` and fit them to the photographs.
+
+        Two views keep all pixels. With more views each surface is kept once, from the view that
+        resolves it best; observed free space stays empty, and clearly different exposures are
+        normalized to their mean. `depths` are in scene units, `layers` are the same per widest
+        baseline.
+        """
+        gains = torch.from_numpy(estimate_gains(layers, transforms)).float()
+        device = views[0].image.device
+        normalized = list(map(View.normalize_exposure, views, gains.to(device)))
+        parts = [self.splat(view, depth) for view, depth in zip(normalized, depths, strict=True)]
+        every, on_cpu = merge(parts).to("cpu"), [view.to("cpu") for view in views]
+        counted = flatten_masks([view.valid_mask for view in on_cpu])
+        chosen = self.select_pixels(every, on_cpu, layers, transforms) & counted
+        behind = self.extend_skies(normalized, depths)
+        made = merge([every[chosen], *(gaussians.to("cpu") for _, gaussians, _ in behind)])
+        known = [self.replace_ignored(made, *pair) for pair in zip(on_cpu, gains, strict=True)]
+        fitted = restore_sky_colors(made, self.fit_gaussians(made, known, gains), on_cpu[0].camera)
+        rows = torch.cat([torch.arange(len(part)) for part in parts])[chosen]
+        numbers = torch.cat([torch.full((len(part),), i) for i, part in enumerate(parts)])[chosen]
+        more = [torch.full((len(pixels),), i) for i, _, pixels in behind]
+        return Reconstruction(
+            fitted.to(device),
+            tuple(depths),
+            torch.cat([numbers, *more]).to(device),
+            torch.cat([rows, *(pixels.cpu() for _, _, pixels in behind)]).to(device),
+            None if (gains == 1).all() else gains.to(device),
+        )
+
+    def lift_pixels(
+        self, views: Sequence[View], depths: Sequence[DepthMap], pixel_mask: Bool[Tensor, "h w"]
+    ) -> Reconstruction:
+        """Lift the pixels of `pixel_mask` in the first view and fit their colours to it."""
+        rows = torch.nonzero(pixel_mask.reshape(-1))[:, 0]
+        blurred = self.splat(views[0], depths[0])[rows]
+        gaussians = fit_colors(blurred.to("cpu"), [views[0].to("cpu")], self.renderer)
+        return Reconstruction(
+            gaussians.to(rows.device), tuple(depths), torch.zeros_like(rows), rows
+        )
+
+    def select_pixels(
+        self,
+        gaussians: Gaussians,
+        views: Sequence[View],
+        layers: Sequence[Layer],
+        transforms: Transforms,
+    ) -> Bool[Tensor, "n"]:
+        """Select the pixels that form the scene, over all views in turn."""
+        if len(views) == 2:
+            return torch.ones(len(gaussians), dtype=torch.bool)
+        free = find_free_pixels(layers, transforms)
+        kept = flatten_masks(find_finest_pixels(layers, free, transforms))
+        start = 0
+        for view, mask in zip(views, free, strict=True):
+            alpha = self.renderer.render(gaussians[kept], view.camera).alpha
+            gap = torch.from_numpy(mask) & (alpha < MIN_ALPHA)
+            kept[start : start + gap.numel()] |= gap.reshape(-1)
+            start += gap.numel()
+        return kept
+
+    def replace_ignored(self, made: Gaussians, view: View, gain: Float[Tensor, "3"]) -> View:
+        """Replace ignored pixels by the render, so that nothing is fitted to them."""
+        if view.ignore_mask is None:
+            return view
+        image = self.renderer.render(made, view.camera).image * gain
+        return replace(view, image=torch.where(view.ignore_mask[..., None], image, view.image))
+
+    def fit_gaussians(
+        self, gaussians: Gaussians, views: Sequence[View], gains: Float[Tensor, "views 3"]
+    ) -> Gaussians:
+        """Fit the Gaussians to views that are brighter by `gains`."""
+        if len(views) == 2:
+            faded = fit_opacities(gaussians, views, self.renderer)
+            return fit_colors(faded, views, self.renderer)
+        return fit_jointly(gaussians, views, gains, self.renderer)
+
+    def splat(self, view: View, depth: DepthMap) -> Gaussians:
+        """Create one disc per pixel of `view`."""
+        return make_discs(view, depth.depth, compute_normals(depth.depth, view), self.disc_sigma)
+
+    def extend_skies(
+        self, views: Sequence[View], depths: Sequence[DepthMap]
+    ) -> list[tuple[int, Gaussians, Int[Tensor, "n"]]]:
+        """List view number, Gaussians and pixels of the sky behind each view's objects."""
+        return [
+            (i, *extend_sky(view, sky, self.disc_sigma))
+            for i, (view, depth) in enumerate(zip(views, depths, strict=True))
+            if (sky := is_sky(depth.depth, view.camera)).any()
+        ]
+
+
+def flatten_masks(masks: Sequence[Mask | Tensor]) -> Bool[Tensor, "n"]:
+    """Flatten and concatenate the masks of all views."""
+    return torch.cat([torch.as_tensor(mask).reshape(-1) for mask in masks])
 
 
 def make_discs(

@@ -13,16 +13,11 @@ from torch import Tensor
 from gscompleter.kernels.parallel import map_in_parallel
 from gscompleter.reconstructors.features.depth_range import get_depth_range
 from gscompleter.reconstructors.features.stereo_image import StereoImage
-from gscompleter.reconstructors.plane_sweep.confidence import Mask
-from gscompleter.reconstructors.plane_sweep.depth_to_gaussians import Splatter
+from gscompleter.reconstructors.plane_sweep.consistency import Mask
 from gscompleter.reconstructors.plane_sweep.fusion import Layer
+from gscompleter.reconstructors.plane_sweep.gaussians import Splatter
 from gscompleter.reconstructors.plane_sweep.rig import Rig, build_rig
-from gscompleter.reconstructors.plane_sweep.sky_mask import (
-    exclude_pixels,
-    find_skies,
-    find_sky,
-    transfer_sky,
-)
+from gscompleter.reconstructors.plane_sweep.sky_mask import find_skies, find_sky, transfer_sky
 from gscompleter.reconstructors.plane_sweep.surfaces import fit_surfaces
 from gscompleter.reconstructors.plane_sweep.sweep import (
     Measurement,
@@ -67,8 +62,8 @@ class PlaneSweep(Splatter):
         first, second = match_views(rig, views)
         open_there = find_sky(rig.images[1], second)
         layers = [
-            complete_surfaces(rig.images[0], exclude_pixels(first, transfer_sky(rig, open_there))),
-            make_measured_layer(rig.images[1], exclude_pixels(second, open_there)),
+            make_layer(rig.images[0], first.exclude(transfer_sky(rig, open_there))),
+            make_layer(rig.images[1], second.exclude(open_there), is_completed=False),
         ]
         return self.lift_pixels(views, make_depth_maps(layers, rig.unit, views), pixel_mask)
 
@@ -82,7 +77,7 @@ class PlaneSweep(Splatter):
         """Compute the completed inverse depth of each view."""
         found = match_views(rig, views)
         seen = find_skies(rig, found)
-        surfaces = map_in_parallel(complete_surfaces, rig.images, map(exclude_pixels, found, seen))
+        surfaces = map_in_parallel(make_layer, rig.images, map(Measurement.exclude, found, seen))
         return list(map(add_sky, surfaces, found, seen))
 
 
@@ -97,31 +92,23 @@ def match_views(rig: Rig, views: Sequence[View]) -> list[Measurement]:
     is_halved = len(views) > 2 and min(min(image.size) for image in rig.images) >= MIN_HALVED_SIDE
     found = measure_depths(rig.halve() if is_halved else rig, *get_depth_range(views))
     return [
-        one if image.ignore_mask is None else exclude_pixels(one, image.ignore_mask)
+        one if image.ignore_mask is None else one.exclude(image.ignore_mask)
         for one, image in zip(found, rig.images, strict=True)
     ]
 
 
-def complete_surfaces(image: StereoImage, found: Measurement) -> Layer:
-    """Fit surfaces to the measured depths of a view."""
+def make_layer(image: StereoImage, found: Measurement, is_completed: bool = True) -> Layer:
+    """Convert the measured depths of a view to a layer, completed by surfaces or as measured."""
     full = found.resize_to(image.size)
-    heights = fit_surfaces(full.index, full.weight, image.image)
-    return Layer(image, compute_inverse_depth(full.planes, heights), full.confidence)
-
-
-def make_measured_layer(image: StereoImage, found: Measurement) -> Layer:
-    """Convert the measured depths of a view without surface completion."""
-    full = found.resize_to(image.size)
-    return Layer(image, compute_inverse_depth(full.planes, full.index), full.confidence)
+    index = fit_surfaces(full.index, full.weight, image.image) if is_completed else full.index
+    return Layer(image, compute_inverse_depth(full.planes, index), full.confidence)
 
 
 def add_sky(layer: Layer, found: Measurement, sky: Mask) -> Layer:
     """Set the sky of a layer to the sky depth, with full confidence."""
     beyond = np.float32(found.planes[0] / SKY_DEPTH)
     inverse = np.where(sky, beyond, layer.inverse)
-    return replace(
-        layer, inverse=inverse, confidence=np.where(sky, np.float32(1), layer.confidence)
-    )
+    return Layer(layer.image, inverse, np.where(sky, np.float32(1), layer.confidence))
 
 
 def make_depth_maps(layers: Sequence[Layer], unit: float, views: Sequence[View]) -> list[DepthMap]:

@@ -1,23 +1,39 @@
-"""Images of the views and the transforms between them."""
+"""Images of the views and the transforms between them, with small errors of the poses corrected.
+
+A pose error of one pixel puts a match beside its epipolar line; a small rotation of one camera
+moves the lines back onto the feature matches. Motion along a line cannot be separated from depth,
+so it is kept small, and depths keep the scale of the given poses.
+"""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from itertools import combinations
 
+import cv2
 import numpy as np
-from jaxtyping import Float32
+from jaxtyping import Float, Float32
 
+from gscompleter.reconstructors.features.matches import Pixels
 from gscompleter.reconstructors.features.neighbours import Neighbours, find_neighbours
 from gscompleter.reconstructors.features.stereo_image import (
     StereoImage,
     compute_source_from_reference,
     make_stereo_images,
 )
-from gscompleter.reconstructors.plane_sweep.epipolar import rotate_to_matches
-from gscompleter.reconstructors.plane_sweep.fusion import Transforms
 from gscompleter.types import View
+
+MIN_MATCHES = 20
+"""Fewest matches for a correction; with fewer the pose is kept."""
+MAX_DISTANCE = 8.0
+"""Largest distance of a valid match from its epipolar line, in pixels."""
+ITERATIONS = 20
+"""Iterations of reweighted least squares, which suppresses false matches."""
+
+Transform = Float32[np.ndarray, "3 4"]
+Transforms = Mapping[tuple[int, int], Transform]
+"""`transforms[i, j]` is j_from_i: pixels of view i with inverse depth -> pixels of view j."""
 
 
 @dataclass(frozen=True)
@@ -61,7 +77,53 @@ def halve_image(image: StereoImage) -> StereoImage:
     return replace(image, image=pixels.astype(np.float32), K=K, ignore_mask=ignored)
 
 
-def halve_transform(transform: Float32[np.ndarray, "3 4"]) -> Float32[np.ndarray, "3 4"]:
+def halve_transform(transform: Transform) -> Transform:
     """Convert a transform between two views to their halved images."""
     half, twice = np.diag([0.5, 0.5, 1.0]), np.diag([2.0, 2.0, 1.0, 1.0])
     return (half @ transform @ twice).astype(np.float32)
+
+
+def rotate_to_matches(
+    reference: StereoImage, source: StereoImage, pixels: Pixels, matched: Pixels
+) -> StereoImage:
+    """Rotate `source` about its centre so that matches lie on their epipolar lines."""
+    distance, normal = compute_epipolar_distances(reference, source, pixels, matched)
+    near = np.abs(distance) < MAX_DISTANCE
+    if near.sum() < MIN_MATCHES:
+        return source
+    distance, normal = distance[near], normal[near]
+    motion = compute_rotation_motion(source, matched[near])
+    beside = (normal[:, :, None] * motion).sum(axis=1)
+    along = normal[:, 0, None] * motion[:, 1] - normal[:, 1, None] * motion[:, 0]
+    turn = np.zeros(3)
+    for _ in range(ITERATIONS):
+        miss = distance - beside @ turn
+        spread = max(1.4826 * float(np.median(np.abs(miss))), 0.05)
+        weight = 1 / (1 + (miss / spread) ** 2)
+        cost = (beside.T * weight) @ beside
+        # A squared motion along the lines costs as much as a squared distance from them.
+        cost += weight.mean() * (along.T @ along)
+        cost += 1e-9 * np.trace(cost) * np.eye(3)
+        turn = np.linalg.solve(cost, (beside.T * weight) @ distance)
+    rotation, _ = cv2.Rodrigues(turn)
+    return replace(source, rotation=source.rotation @ rotation.T)
+
+
+def compute_epipolar_distances(
+    reference: StereoImage, source: StereoImage, pixels: Pixels, matched: Pixels
+) -> tuple[Float[np.ndarray, "m"], Float[np.ndarray, "m 2"]]:
+    """Compute signed distances from the epipolar lines, in pixels, and the line normals."""
+    transform = compute_source_from_reference(reference, source).astype(np.float64)
+    ones = np.ones((len(pixels), 1))
+    at_infinity = np.concatenate([pixels, ones], axis=1) @ transform[:, :3].T
+    lines = np.cross(at_infinity, transform[:, 3])
+    lines /= np.maximum(np.linalg.norm(lines[:, :2], axis=1, keepdims=True), 1e-12)
+    return (lines * np.concatenate([matched, ones], axis=1)).sum(axis=1), lines[:, :2]
+
+
+def compute_rotation_motion(view: StereoImage, pixels: Pixels) -> Float[np.ndarray, "m 2 3"]:
+    """Compute the pixel motion per radian of rotation about each camera axis."""
+    rays = np.concatenate([pixels, np.ones((len(pixels), 1))], axis=1) @ np.linalg.inv(view.K).T
+    turned = np.cross(np.eye(3)[None], rays[:, None])
+    motion = turned[..., :2] - rays[:, None, :2] * turned[..., 2:]
+    return (motion @ view.K[:2, :2].T).transpose(0, 2, 1)

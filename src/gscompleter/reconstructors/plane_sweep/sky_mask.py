@@ -9,7 +9,6 @@ away. An undetected sky keeps the depth of its surroundings.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import replace
 
 import cv2
 import numpy as np
@@ -81,15 +80,6 @@ def transfer_sky(rig: Rig, sky_of_second: OtherMask) -> Mask:
     """Find the sky of the first view of a pair in the directions of the second view's sky."""
     first = rig.images[0]
     return find_even_region(first) & (sample_at_infinity(first.size, sky_of_second, rig, 0, 1) == 1)
-
-
-def exclude_pixels(found: Measurement, exclude_mask: Mask) -> Measurement:
-    """Set the weight and confidence to 0 at the pixels of a mask, such as the sky."""
-    full = found.resize_to(exclude_mask.shape)
-    weight, confidence = (
-        np.where(exclude_mask, np.float32(0), share) for share in (full.weight, full.confidence)
-    )
-    return replace(full, weight=weight, confidence=confidence)
 
 
 def find_sky(image: StereoImage, found: Measurement) -> Mask:

@@ -1,4 +1,4 @@
-"""Stereo depth of each view, before surfaces are fitted."""
+"""Stereo depth of each view by a plane sweep, before surfaces are fitted."""
 
 from __future__ import annotations
 
@@ -6,24 +6,61 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 
+import cv2
 import numpy as np
-from jaxtyping import Float32
+import torch
+from jaxtyping import Bool, Float, Float32, Int, Int16, UInt8
 
 from gscompleter.kernels import stereo
-from gscompleter.reconstructors.plane_sweep.aggregation import aggregate
-from gscompleter.reconstructors.plane_sweep.confidence import compute_confidence, find_consistent
-from gscompleter.reconstructors.plane_sweep.depth_bands import make_full_bands, make_guided_bands
-from gscompleter.reconstructors.plane_sweep.matching import compute_costs, place_planes
-from gscompleter.reconstructors.plane_sweep.occlusion import UNKNOWN, Neighbour, find_hidden
-from gscompleter.reconstructors.plane_sweep.rig import Rig
+from gscompleter.kernels.stereo import TILE_COLUMNS, TILE_ROWS, Bands
+from gscompleter.reconstructors.features.stereo_image import StereoImage, compute_contrast
+from gscompleter.reconstructors.plane_sweep.consistency import (
+    UNKNOWN,
+    Neighbour,
+    compute_confidence,
+    find_consistent,
+    find_hidden,
+)
+from gscompleter.reconstructors.plane_sweep.rig import Rig, Transform
 
 Map = Float32[np.ndarray, "_ _"]
 Planes = Float32[np.ndarray, "d"]
 """Inverse depths from far to near, evenly spaced."""
+Source = tuple[StereoImage, Transform]
+"""Another view, and the transform from reference pixels to its pixels."""
+
 MIN_GUIDED_SIDE = 192
 """Shortest image side, in pixels, from which a half-size sweep narrows the search."""
 BACKGROUND_WEIGHT = np.float32(0.3)
 """Weight of a background depth at pixels occluded in the other views."""
+
+MAX_PLANE_MOTION = 0.5
+"""Largest image motion between neighbouring planes, in pixels."""
+MIN_PLANES, MAX_PLANES = 48, 256
+"""Smallest and largest number of planes."""
+
+MEDIAN_SIZE = 5
+"""Size in pixels of the median filter that removes outliers from a first guess."""
+GUESS_MARGIN = 1
+"""Margin in pixels of the first guess by which a band includes surrounding depths."""
+EXTRA_PLANES = 3
+"""Extra planes on both sides of the guessed range."""
+
+RADIUS = 2
+"""Radius of the correlation window, in pixels."""
+NOISE = np.float32(0.015)
+"""Standard deviation of the image noise; weaker texture does not correlate."""
+PIXEL_WEIGHT = np.float32(0.4)
+"""Weight of the per-pixel difference in the cost; the rest is window correlation."""
+UNSEEN_COST = np.uint8(140)
+"""Cost, from 0 to 254, of a plane at which no other view observes the pixel."""
+
+SMALL_PENALTY = 25
+"""Cost of a change by one plane between neighbouring pixels."""
+LARGE_PENALTY = 300
+"""Cost of a larger jump between neighbouring pixels of the same colour."""
+EDGE_CONTRAST = np.float32(0.06)
+"""Colour difference at which the penalty of a jump is halved."""
 
 
 @dataclass(frozen=True)
@@ -60,21 +97,47 @@ class Measurement:
         index, weight, confidence = (
             repeat_pixels(values, size) for values in (self.index, self.weight, self.confidence)
         )
-        return replace(self, index=index, weight=weight, confidence=confidence)
+        return Measurement(self.planes, index, weight, confidence)
+
+    def exclude(self, mask: Bool[np.ndarray, "h w"]) -> Measurement:
+        """Set weight and confidence to 0 at the pixels of a full-size mask, such as the sky."""
+        full = self.resize_to(mask.shape)
+        none = np.float32(0)
+        weight, confidence = (np.where(mask, none, w) for w in (full.weight, full.confidence))
+        return replace(full, weight=weight, confidence=confidence)
 
 
 def measure_depths(rig: Rig, near: float, far: float) -> list[Measurement]:
     """Measure the depth of each view, between two z-depths in scene units."""
     sweeps = sweep_views(rig, near / rig.unit, far / rig.unit)
-    confidences = compute_confidences(sweeps, rig)
-    sure = [
-        np.where(confidence > 0, sweep.inverse, UNKNOWN)
-        for sweep, confidence in zip(sweeps, confidences, strict=True)
-    ]
+    inverses = [sweep.inverse for sweep in sweeps]
+    confidences = []
+    for i, sweep in enumerate(sweeps):
+        checks = [find_consistent(sweep.inverse, other) for other in pair_up(i, inverses, rig)]
+        confidences.append(compute_confidence(sweep.index, sweep.margin, np.any(checks, axis=0)))
+    sure = [np.where(c > 0, w, UNKNOWN) for c, w in zip(confidences, inverses, strict=True)]
     return [
-        add_background(i, sweep, confidence, sure, rig)
+        add_background(sweep, confidence, pair_up(i, sure, rig))
         for i, (sweep, confidence) in enumerate(zip(sweeps, confidences, strict=True))
     ]
+
+
+def pair_up(number: int, inverses: Sequence[Map], rig: Rig) -> list[Neighbour]:
+    """List the views that view `number` is compared with, with their inverse depths."""
+    return [
+        (inverses[i], rig.transforms[number, i], rig.transforms[i, number])
+        for i in rig.neighbours.find_partners(number)
+    ]
+
+
+def add_background(sweep: Sweep, confidence: Map, neighbours: Sequence[Neighbour]) -> Measurement:
+    """Give pixels that are occluded in the confident depths of others the background depth."""
+    background = stereo.fill_background(sweep.index, confidence > 0)
+    behind = compute_inverse_depth(sweep.planes, background)
+    occluded = (confidence == 0) & find_hidden(behind, neighbours)
+    weight = np.where(occluded, BACKGROUND_WEIGHT, confidence)
+    index = np.where(occluded, background, sweep.index)
+    return Measurement(sweep.planes, index, weight, confidence)
 
 
 def sweep_views(rig: Rig, near: float, far: float) -> list[Sweep]:
@@ -89,9 +152,8 @@ def sweep_views(rig: Rig, near: float, far: float) -> list[Sweep]:
 def sweep_view(number: int, rig: Rig, near: float, far: float, guess: Sweep | None = None) -> Sweep:
     """Find the best planes of one view, near the half-size `guess` if there is one."""
     image = rig.images[number]
-    sources = [
-        (rig.images[i], rig.transforms[number, i]) for i in rig.neighbours.neighbours_of[number]
-    ]
+    others = rig.neighbours.neighbours_of[number]
+    sources = [(rig.images[i], rig.transforms[number, i]) for i in others]
     planes = place_planes(image, sources, near, far)
     bands = make_full_bands(image.size, len(planes))
     if guess is not None:
@@ -104,33 +166,124 @@ def sweep_view(number: int, rig: Rig, near: float, far: float, guess: Sweep | No
     return Sweep(planes, index, margin)
 
 
-def compute_confidences(sweeps: Sequence[Sweep], rig: Rig) -> list[Map]:
-    """Compute the confidence of each view; 0 for pixels that no other view confirms."""
-    inverses = [sweep.inverse for sweep in sweeps]
-    confidences = []
-    for i, sweep in enumerate(sweeps):
-        agrees = np.zeros(inverses[i].shape, bool)
-        for j in rig.neighbours.find_partners(i):
-            there, back = rig.transforms[i, j], rig.transforms[j, i]
-            agrees |= find_consistent(inverses[i], inverses[j], there, back)
-        confidences.append(compute_confidence(sweep.index, sweep.margin, agrees))
-    return confidences
+def place_planes(
+    reference: StereoImage, sources: Sequence[Source], near: float, far: float
+) -> Planes:
+    """Space inverse depths evenly from far to near, without planes outside all sources."""
+    h, w = reference.size
+    x, y = np.meshgrid(np.linspace(0.5, w - 0.5, 9), np.linspace(0.5, h - 0.5, 9))
+    pixels = np.stack([x, y, np.ones_like(x)], axis=-1).reshape(-1, 3)
+    samples = np.linspace(1 / far, 1 / near, 257)
+    motion = np.zeros(256)
+    overlap = np.zeros(257)
+    for source, float_transform in sources:
+        transform = float_transform.astype(np.float64)
+        moved = (pixels @ transform[:, :3].T)[None] + samples[:, None, None] * transform[:, 3]
+        ratio = moved[..., 2]
+        at = moved[..., :2] / np.maximum(ratio, 1e-3)[..., None]
+        H, W = source.size
+        seen = (ratio > 1e-3) & (at >= 0).all(-1) & (at[..., 0] < W) & (at[..., 1] < H)
+        steps = np.linalg.norm(np.diff(at, axis=0), axis=-1)
+        motion = np.maximum(motion, compute_quantiles(steps, seen[1:] & seen[:-1], 0.8))
+        overlap = np.maximum(overlap, seen.mean(axis=1))
+    useful = np.flatnonzero(overlap >= 0.02)
+    last = max(int(useful[-1]), 8) if len(useful) else 256
+    wanted = float(motion[:last].sum()) / MAX_PLANE_MOTION
+    planes = int(np.clip(np.ceil(wanted), MIN_PLANES, MAX_PLANES))
+    return np.linspace(samples[0], samples[last], planes).astype(np.float32)
 
 
-def add_background(
-    number: int, sweep: Sweep, confidence: Map, sure: Sequence[Map], rig: Rig
-) -> Measurement:
-    """Give pixels occluded in the other views (inverse depths `sure`) the background depth."""
-    background = stereo.fill_background(sweep.index, confidence > 0)
-    neighbours = [
-        Neighbour(sure[i], rig.transforms[number, i], rig.transforms[i, number])
-        for i in rig.neighbours.find_partners(number)
+def compute_quantiles(
+    values: Float[np.ndarray, "r c"], valid: Bool[np.ndarray, "r c"], share: float
+) -> Float[np.ndarray, "r"]:
+    """Compute a quantile of the `valid` values of each row; 0 for rows without any."""
+    known = torch.from_numpy(np.where(valid, values, np.nan))
+    return known.nanquantile(share, dim=1).nan_to_num().numpy()
+
+
+def make_full_bands(size: tuple[int, int], planes: int) -> Bands:
+    """Create bands with all planes for an image of `size` (height, width)."""
+    shape = compute_tile_grid(size)
+    return make_bands(np.zeros(shape, int), np.full(shape, planes), size)
+
+
+def make_guided_bands(guess: Map, shrinkage: int, size: tuple[int, int], planes: int) -> Bands:
+    """Create bands around the planes `guess` of an image `1 / shrinkage` the size.
+
+    `size` is the height and width of the full image, `planes` the number of planes.
+    """
+    likely = cv2.medianBlur(guess, MEDIAN_SIZE)
+    window = np.ones((2 * GUESS_MARGIN + 1, 2 * GUESS_MARGIN + 1), np.uint8)
+    lowest = reduce_tiles(np.minimum, cv2.erode(likely, window), shrinkage, size)
+    highest = reduce_tiles(np.maximum, cv2.dilate(likely, window), shrinkage, size)
+    low = (np.floor(lowest).astype(int) - EXTRA_PLANES).clip(0, planes - 1)
+    high = (np.ceil(highest).astype(int) + EXTRA_PLANES + 1).clip(1, planes)
+    return make_bands(low, high, size)
+
+
+def reduce_tiles(
+    extreme: np.ufunc, values: Map, shrinkage: int, size: tuple[int, int]
+) -> Float32[np.ndarray, "r c"]:
+    """Reduce the values of each tile with `extreme` (minimum or maximum)."""
+    tops, lefts = (
+        np.arange(count) * side // shrinkage
+        for count, side in zip(compute_tile_grid(size), (TILE_ROWS, TILE_COLUMNS), strict=True)
+    )
+    return extreme.reduceat(extreme.reduceat(values, tops, axis=0), lefts, axis=1)
+
+
+def compute_tile_grid(size: tuple[int, int]) -> tuple[int, int]:
+    """Count the rows and columns of tiles."""
+    return -(-size[0] // TILE_ROWS), -(-size[1] // TILE_COLUMNS)
+
+
+def make_bands(
+    low: Int[np.ndarray, "r c"], high: Int[np.ndarray, "r c"], size: tuple[int, int]
+) -> Bands:
+    """Build one band per tile, from plane `low` up to but excluding `high`."""
+    rows, columns = compute_tile_grid(size)
+    heights = np.diff(np.append(np.arange(rows) * TILE_ROWS, size[0]))
+    widths = np.diff(np.append(np.arange(columns) * TILE_COLUMNS, size[1]))
+    costs = heights[:, None] * widths * (high - low)
+    start = np.append(0, np.cumsum(costs, dtype=np.int64))
+    return Bands(low.astype(np.int32), high.astype(np.int32), start)
+
+
+def compute_costs(
+    reference: StereoImage, sources: Sequence[Source], planes: Planes, bands: Bands
+) -> UInt8[np.ndarray, "cells"]:
+    """Compute costs (0 to 254) of the planes in `bands`; the best source view counts."""
+    costs = [
+        stereo.compute_matching_costs(
+            reference.image, source.image, transform, planes, bands, RADIUS, NOISE, PIXEL_WEIGHT
+        )
+        for source, transform in sources
     ]
-    behind = compute_inverse_depth(sweep.planes, background)
-    occluded = (confidence == 0) & find_hidden(behind, neighbours)
-    weight = np.where(occluded, BACKGROUND_WEIGHT, confidence)
-    index = np.where(occluded, background, sweep.index)
-    return Measurement(sweep.planes, index, weight, confidence)
+    best = np.minimum.reduce(costs)
+    return np.where(best == stereo.UNSEEN, UNSEEN_COST, best)
+
+
+def aggregate(
+    costs: UInt8[np.ndarray, "cells"], bands: Bands, reference: StereoImage
+) -> Int16[np.ndarray, "cells"]:
+    """Sum the costs along eight paths through the image; jumps are cheap at image edges."""
+    image = reference.image
+
+    def jump(
+        a: Float32[np.ndarray, "r c 3"], b: Float32[np.ndarray, "r c 3"]
+    ) -> Int16[np.ndarray, "r c"]:
+        penalty = LARGE_PENALTY / (1 + compute_contrast(a, b) / EDGE_CONTRAST)
+        return np.rint(np.maximum(penalty, 1.5 * SMALL_PENALTY)).astype(np.int16)
+
+    return stereo.aggregate_semi_globally(
+        costs,
+        bands,
+        jump(image[:, 1:], image[:, :-1]),
+        jump(image[1:], image[:-1]),
+        jump(image[1:, 1:], image[:-1, :-1]),
+        jump(image[:-1, 1:], image[1:, :-1]),
+        np.int16(SMALL_PENALTY),
+    )
 
 
 def compute_inverse_depth(planes: Planes, index: Map) -> Map:

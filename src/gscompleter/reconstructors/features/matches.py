@@ -1,0 +1,85 @@
+"""SIFT features (Lowe 2004), their matches in two photographs, and the depth of the matches."""
+
+from __future__ import annotations
+
+from functools import lru_cache
+
+import cv2
+import numpy as np
+from jaxtyping import Bool, Float
+
+from gscompleter.reconstructors.features.stereo_image import (
+    StereoImage,
+    compute_source_from_reference,
+)
+
+Features = tuple[Float[np.ndarray, "_ 2"], Float[np.ndarray, "_ 128"]]
+"""Pixels (the centre of the top-left one is (0.5, 0.5)) and descriptors."""
+Pixels = Float[np.ndarray, "m 2"]
+
+CACHE_SIZE = 32
+"""Images whose features are cached, because each target matches them again."""
+MAX_ERROR = 3.0
+"""Largest distance of a match from its epipolar line, in pixels; poses are noisy."""
+MIN_PARALLAX = 1.0
+"""Smallest parallax that gives a depth, in pixels."""
+
+
+def detect_features(view: StereoImage) -> Features:
+    """Detect the features of a view outside its ignored pixels."""
+    grey = cv2.cvtColor((view.image * 255).clip(0, 255).astype(np.uint8), cv2.COLOR_RGB2GRAY)
+    pixels, descriptors = _detect_features(grey.tobytes(), grey.shape)
+    if view.ignore_mask is None:
+        return pixels, descriptors
+    columns, rows = pixels.astype(int).T
+    counted = ~view.ignore_mask[rows, columns]
+    return pixels[counted], descriptors[counted]
+
+
+@lru_cache(CACHE_SIZE)
+def _detect_features(grey: bytes, size: tuple[int, int]) -> Features:
+    detector = cv2.SIFT.create(2000, contrastThreshold=0.02)
+    image = np.frombuffer(grey, np.uint8).reshape(size)
+    keypoints, descriptors = detector.detectAndCompute(image, None)
+    if descriptors is None:
+        return np.zeros((0, 2)), np.zeros((0, 128))
+    return np.array([k.pt for k in keypoints], np.float64) + 0.5, descriptors.astype(np.float64)
+
+
+def match_features(a: Features, b: Features) -> tuple[Pixels, Pixels]:
+    """Match mutual nearest neighbours that pass the ratio test."""
+    if len(a[0]) < 2 or len(b[0]) < 2:
+        return np.zeros((0, 2)), np.zeros((0, 2))
+    squares = (a[1] ** 2).sum(1)[:, None] + (b[1] ** 2).sum(1)[None] - 2 * a[1] @ b[1].T
+    forward, backward = squares.argmin(1), squares.argmin(0)
+    best, second = np.partition(squares, 1, axis=1)[:, :2].T
+    i = np.flatnonzero((backward[forward] == np.arange(len(a[0]))) & (best < 0.64 * second))
+    return a[0][i], b[0][forward[i]]
+
+
+def triangulate_valid(
+    reference: StereoImage, source: StereoImage, pixels: Pixels, matched: Pixels
+) -> Float[np.ndarray, "k"]:
+    """Triangulate the valid matches; return inverse z-depth in `reference`."""
+    inverse, good = triangulate(reference, source, pixels, matched)
+    return inverse[good]
+
+
+def triangulate(
+    reference: StereoImage, source: StereoImage, pixels: Pixels, matched: Pixels
+) -> tuple[Float[np.ndarray, "n"], Bool[np.ndarray, "n"]]:
+    """Triangulate all matches; return inverse z-depth in `reference` and a validity mask."""
+    transform = compute_source_from_reference(reference, source).astype(np.float64)
+    at_infinity = np.concatenate([pixels, np.ones((len(pixels), 1))], 1) @ transform[:, :3].T
+    b = transform[:, 3]
+    # Solve matched * (A p + b w)_2 = (A p + b w)_xy for w by least squares.
+    factor = b[:2] - matched * b[2]
+    offset = matched * at_infinity[:, 2:] - at_infinity[:, :2]
+    inverse = (factor * offset).sum(1) / np.maximum((factor * factor).sum(1), 1e-12)
+    at_depth = at_infinity + inverse[:, None] * b
+    ahead = (at_depth[:, 2] > 1e-6) & (at_infinity[:, 2] > 1e-6)
+    scale = np.where(ahead, at_depth[:, 2], 1.0)[:, None]
+    error = np.linalg.norm(at_depth[:, :2] / scale - matched, axis=1)
+    start = at_infinity[:, :2] / np.where(ahead, at_infinity[:, 2], 1.0)[:, None]
+    parallax = np.linalg.norm(start - matched, axis=1)
+    return inverse, ahead & (inverse > 0) & (error < MAX_ERROR) & (parallax > MIN_PARALLAX)
