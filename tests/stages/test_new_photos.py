@@ -18,7 +18,7 @@ from scenes import Room, camera_at, gaussians_of, view_of
 SIZE = 64
 RENDERER = load_renderer("cpu")
 PHOTOS = [view_of(Room(), camera_at(x, size=SIZE), k) for k, x in enumerate((-0.3, 0.0, 0.3))]
-ASIDE = view_of(Room(), camera_at(0.5, yaw=25, size=SIZE), 3)
+ASIDE = view_of(Room(), camera_at(0.5, yaw=50, size=SIZE), 3)
 
 
 def make_wrong_scene() -> Gaussians:

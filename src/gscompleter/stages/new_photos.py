@@ -19,12 +19,14 @@ from gscompleter.progress import track
 from gscompleter.render.cache import Parts, SceneRenderer
 from gscompleter.stages.recolor import recolor
 from gscompleter.stages.synthesize import GeneratedView
-from gscompleter.stages.target_view import render_target
+from gscompleter.stages.target_view import TargetView, render_target
 from gscompleter.state import NEW_PHOTO_ID, Completion
 from gscompleter.types import View
 
 MAX_DROP = 6.0
 """PSNR in dB below the best third of the photographs from which on a photograph is new."""
+MAX_DISTRUST, MIN_KNOWN = 0.5, 0.05
+"""Distrust up to which a pixel is compared in exposure, and smallest fraction of such pixels."""
 MAX_PHOTOS = 32
 """Most new photographs that are used; of more, those far apart."""
 
@@ -36,22 +38,27 @@ def find_new_photos(
     if config.trust == "full":
         return []
     frozen = scenes.freeze_at(parts, [view.camera for view in views])
-    images = [scene.render.image.clamp(0, 1) for scene in frozen]
-    errors = torch.stack(
-        [
-            (match_exposure(view, image).image - image)[view.valid_mask].square().mean()
-            for view, image in zip(views, images, strict=True)
-        ]
-    )
+    pairs = zip(frozen, views, strict=True)
+    errors = torch.stack([compute_error(scene.render.image, view) for scene, view in pairs])
     good = errors.sort().values[len(errors) // 6]  # the median of the best third
     return torch.nonzero(errors > good * 10 ** (MAX_DROP / 10))[:, 0].tolist()
 
 
-def match_exposure(view: View, image: Float[Tensor, "h w 3"]) -> View:
-    """Match the exposure of a photograph to that of an image."""
-    valid = view.valid_mask
-    gain, offset = fit_robust_affine(view.image[valid], image[valid])
-    return replace(view, image=(gain * view.image + offset).clamp(0, 1))
+def compute_error(image: Float[Tensor, "h w 3"], view: View) -> Float[Tensor, ""]:
+    """Compute the mean squared error of a render, fitted to the exposure of a photograph."""
+    shown, photo = image.clamp(0, 1)[view.valid_mask], view.image[view.valid_mask]
+    gain, offset = fit_robust_affine(shown, photo)
+    return (gain * shown + offset - photo).square().mean()
+
+
+def match_exposure(photo: View, view: TargetView) -> Float[Tensor, "h w 3"]:
+    """Match the exposure of a photograph to the scene where the scene is trusted."""
+    image = view.render.image.clamp(0, 1)
+    known = photo.valid_mask & ~view.holes & (view.distrust < MAX_DISTRUST)
+    if int(known.sum()) < MIN_KNOWN * known.numel():
+        return photo.image
+    gain, offset = fit_robust_affine(photo.image[known], image[known])
+    return (gain * photo.image + offset).clamp(0, 1)
 
 
 def recolor_to_photos(
@@ -61,8 +68,9 @@ def recolor_to_photos(
     chosen = select_spread_cameras([photo.camera for photo in photos], MAX_PHOTOS) if photos else []
     for index in track(sorted(chosen), "Learning new photographs"):
         view = render_target(state, pad_camera(photos[index].camera, 0.0), scenes)
-        matched = match_exposure(photos[index], view.render.image.clamp(0, 1))
-        wanted = torch.where(matched.valid_mask[..., None], matched.image, view.render.image)
-        reference = GeneratedView(wanted, matched.camera, is_photograph=True)
+        photo = photos[index]
+        wanted = match_exposure(photo, view)
+        wanted = torch.where(photo.valid_mask[..., None], wanted, view.render.image)
+        reference = GeneratedView(wanted, photo.camera, is_photograph=True)
         state = recolor(reference, view, NEW_PHOTO_ID).state
     return replace(state, num_new_photos=len(photos))
