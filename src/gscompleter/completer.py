@@ -38,7 +38,6 @@ from gscompleter.reconstructors import Reconstructor, load_reconstructor
 from gscompleter.render import (
     FrozenScene,
     Renderer,
-    fix_harmonics,
     get_view_map,
     load_renderer,
     restrict_to_image,
@@ -55,7 +54,6 @@ from gscompleter.stages.context import (
     sort_by_frame,
 )
 from gscompleter.stages.filter_holes import compute_hole_mask, filter_holes
-from gscompleter.stages.fit_to_photos import refine_appearance
 from gscompleter.stages.frozen_views import SceneRenderer
 from gscompleter.stages.refine import refine_opacities
 from gscompleter.stages.select_anchor import (
@@ -525,30 +523,17 @@ class GSCompleter:
         completion, config = target_view.completion, self.config
         budgets = completion.budgets
         frozen = self.freeze_at(completion, completion.photos)
-        if completion.observations is None:
-            nearest = sort_by_distance(reference.camera, completion.views)[
-                : config.refine.num_views
-            ]
-            near_views = [completion.views[i] for i in nearest]
-            planned = [view.vary_opacities(kept) for view in frozen]
-            near = [planned[i] for i in nearest]
-            at_target = target_view.frozen.vary_opacities(kept)
-            refined, losses = refine_opacities(
-                kept, at_target, reference, near, near_views, config.refine
-            )
-            images = [restrict_to_image(plan) for plan in planned]
-        else:
-            holes, degree = self.find_holes(target_view), completion.context.sh_degree
-            settings = config.reconcile.limit_sh_degree(degree)
-            valid_masks = [view.valid_mask for view in completion.photos]
-            plans = list(
-                get_view_map(kept)(lambda v, c: v.vary_appearance(kept, c), frozen, valid_masks)
-            )
-            first_budgets = [first for first, *_ in budgets]
-            refined, losses = refine_appearance(
-                kept, target_view.frozen, reference, holes, plans, first_budgets, settings
-            )
-            images = [fix_harmonics(plan, refined.sh) for plan in plans]
+        nearest = sort_by_distance(reference.camera, completion.views)[: config.refine.num_views]
+        planned = [view.vary_opacities(kept) for view in frozen]
+        refined, losses = refine_opacities(
+            kept,
+            target_view.frozen.vary_opacities(kept),
+            reference,
+            [planned[i] for i in nearest],
+            [completion.views[i] for i in nearest],
+            config.refine,
+        )
+        images = [restrict_to_image(plan) for plan in planned]
         return meet_error_budgets(refined, frozen, budgets, config.psnr_guard, images), losses
 
     def observe(

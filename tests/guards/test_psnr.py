@@ -17,7 +17,7 @@ from gscompleter.guards.psnr import (
     select_fewest,
     set_error_budgets,
 )
-from gscompleter.render import fix_harmonics, load_renderer
+from gscompleter.render import load_renderer, restrict_to_image
 from gscompleter.types import ErrorBudget, View, merge
 from scenes import Room, camera_at, gaussians_of, half_a_room_of, view_of
 
@@ -83,15 +83,15 @@ def test_drawings_that_are_known_already_are_asked_instead():
     frozen = load_renderer("cpu").freeze(context, CAMERA)
     allowed = add_psnr_loss(compute_squared_error(frozen.render.image, view.image).item(), 0.05)
     asked: list[torch.Tensor] = []
-    folded = fix_harmonics(frozen.vary_appearance(harmful, view.valid_mask), harmful.sh)
+    planned = restrict_to_image(frozen.vary_opacities(harmful))
 
     def draw(opacities: torch.Tensor) -> torch.Tensor:
         asked.append(opacities)
-        return folded(opacities)
+        return planned(opacities)
 
     mended = meet_error_budgets(harmful, [frozen], [[mse(view, allowed)]], MENDED, [draw])
     assert len(asked) > 2
-    assert compute_squared_error(folded(mended.opacities), view.image).item() <= allowed
+    assert compute_squared_error(planned(mended.opacities), view.image).item() <= allowed
     expected = meet_error_budgets(harmful, [frozen], [[mse(view, allowed)]], MENDED)
     assert (mended.opacities - expected.opacities).abs().mean() < 1e-3
 

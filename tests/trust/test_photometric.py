@@ -14,7 +14,6 @@ from gscompleter.completer import GSCompleter
 from gscompleter.config import (
     AlignmentConfig,
     CompleterConfig,
-    ReconcileConfig,
     RegistrationConfig,
     TrustConfig,
 )
@@ -25,11 +24,9 @@ from gscompleter.guards.prune_occluders import find_unneeded
 from gscompleter.guards.psnr import compute_squared_error
 from gscompleter.memory import estimate_bytes
 from gscompleter.render import load_renderer
-from gscompleter.render.cpu import CpuFrozenScene
 from gscompleter.render.lod import MIN_PROXY_GAUSSIANS
 from gscompleter.splats.morton import argsort_nearby
 from gscompleter.splats.ply import load_ply, save_ply
-from gscompleter.stages.fit_to_photos import PhotoSchedule, compute_hole_error, refine_appearance
 from gscompleter.state import Completion
 from gscompleter.trust.photometric import (
     compute_trust,
@@ -37,7 +34,7 @@ from gscompleter.trust.photometric import (
     gather_observations,
     sum_weights,
 )
-from gscompleter.types import ErrorBudget, GeneratorInput, merge, sh_from_rgb
+from gscompleter.types import GeneratorInput, merge, sh_from_rgb
 from scenes import (
     Room,
     camera_at,
@@ -184,24 +181,6 @@ def test_closing_a_hole_makes_up_for_nothing_that_was_good():
     assert max(gained) > 0
 
 
-def test_what_is_added_is_drawn_only_where_it_counts(monkeypatch):
-    """All over the photographs, and at the padded target, which is rendered last, in holes."""
-    asked, plan = [], CpuFrozenScene.vary_appearance
-
-    def noted(self, new, where):
-        asked.append((self, where))
-        return plan(self, new, where)
-
-    monkeypatch.setattr(CpuFrozenScene, "vary_appearance", noted)
-    half = SURFACES[SURFACES.means[:, 0] < 0.3]
-    completion = knowing()(VIEWS[::2], TARGET, half, check_views=VIEWS[1:2])
-    *at_photographs, (at_target, holes) = asked
-    assert len(at_photographs) == len(completion.photos)
-    assert all(where.all() for _, where in at_photographs)
-    assert holes.float().mean() > 0.1
-    assert (at_target.render.alpha < 0.5)[holes].float().mean() > 0.9
-
-
 def test_without_its_photographs_a_scene_is_taken_as_it_is():
     completion = knowing()(VIEWS[::2], TARGET, SCENE)
     assert completion.pruned is None
@@ -219,33 +198,6 @@ def test_unsupported_gaussians_may_be_kept():
 def test_the_paper_doubts_nothing():
     completion = knowing(CompleterConfig.paper())(VIEWS[::2], TARGET, SCENE, check_views=())
     assert completion.observations is None
-
-
-def test_what_is_added_is_fitted_to_all_photographs_at_once():
-    view = view_of(Room(), TARGET)
-    hidden = gaussians_of(view)
-    seen = torch.stack([is_inside(*project(hidden.means, c), c) for c in PHOTOGRAPHS]).any(0)
-    # Black Gaussians occlude the photographs.
-    before = gaussians_of(VIEWS[1], 0.5 * VIEWS[1].depth)
-    black = replace(before, sh=sh_from_rgb(torch.zeros(SIZE * SIZE, 3)))
-    allowed = [error_of(SURFACES, v) for v in VIEWS]
-    target = RENDERER.freeze(SURFACES, TARGET)
-    holes = target.render.alpha < 0.5
-    new = merge([hidden[~seen], black])
-    added, losses = refine_appearance(
-        new,
-        target,
-        view,
-        holes,
-        [RENDERER.freeze(SURFACES, v.camera).vary_appearance(new, v.valid_mask) for v in VIEWS],
-        [ErrorBudget(v, "mse", error) for v, error in zip(VIEWS, allowed, strict=True)],
-    )
-    scene = merge([SURFACES, added])
-    for photograph, error in zip(VIEWS, allowed, strict=True):
-        assert error_of(scene, photograph) < 1.01 * error
-    after, before = (drawn.image for drawn in (RENDERER.render(scene, TARGET), target.render))
-    assert compute_hole_error(after, view, holes) < 0.1 * compute_hole_error(before, view, holes)
-    assert len(losses) == ReconcileConfig().iterations
 
 
 def test_what_photographs_show_by_themselves_takes_the_place_of_what_is_doubted():
@@ -276,13 +228,6 @@ def test_one_photograph_makes_no_stereo():
     drawn = RENDERER.render(SCENE, TARGET)
     config = TrustConfig()
     assert render_stereo(VIEWS[:1], TARGET, drawn, KnowingReconstructor(), RENDERER, config) is None
-
-
-def test_photographs_take_turns_and_the_worst_of_them_more_often():
-    turns = PhotoSchedule([0.0, 0.0, 5.0, 0.0, 0.0])
-    asked = [number for _ in range(4) for number in turns.take(2)]
-    assert set(asked) == set(range(5))
-    assert asked.count(2) == 4
 
 
 def complete(scene, splat, out, *more):

@@ -17,7 +17,7 @@ from torch import Tensor
 
 from gscompleter.kernels import lod as kernels
 from gscompleter.kernels.parallel import share
-from gscompleter.kernels.rasterizer import GaussianArrays
+from gscompleter.kernels.project import GaussianArrays
 from gscompleter.memory import count_fitting_gaussians
 from gscompleter.render.cpu import to_arrays
 from gscompleter.render.viewpoint import to_float32

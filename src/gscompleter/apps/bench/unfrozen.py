@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 from gscompleter.render import Renderer
-from gscompleter.render.reference import ReferenceFrozenScene
+from gscompleter.render.redraw import RedrawnScene
 from gscompleter.types import Camera, Gaussians, Render
 
 
@@ -19,6 +19,6 @@ class UnfrozenRenderer:
         """Render as the wrapped renderer does."""
         return self.renderer.render(gaussians, camera)
 
-    def freeze(self, context: Gaussians, camera: Camera) -> ReferenceFrozenScene:
+    def freeze(self, context: Gaussians, camera: Camera) -> RedrawnScene:
         """Return a scene that is rendered anew with every call."""
-        return ReferenceFrozenScene(self.renderer, context, camera)
+        return RedrawnScene(self.renderer, context, camera)
