@@ -9,35 +9,9 @@ from typing import NamedTuple
 import numpy as np
 from numba import njit
 
-from gscompleter.kernels.project import (
-    BLUE,
-    DEPTH,
-    GREEN,
-    RED,
-    SUM,
-    SUM_DEPTH,
-    SUM_S,
-    SUM_SS,
-    SUM_ST,
-    SUM_T,
-    SUM_TT,
-    U,
-    V,
-    W,
-    X,
-    Y,
-)
-from gscompleter.kernels.simd import (
-    TILE,
-    composite_rows,
-    pass_rows,
-    revert_rows,
-    revert_rows_for_color,
-    revert_rows_for_depth,
-    revert_rows_for_opacity,
-    sum_weighted_rows,
-    weigh_rows,
-)
+from gscompleter.kernels import project, simd
+from gscompleter.kernels.project import DEPTH
+from gscompleter.kernels.simd import TILE
 
 FIRST_ROWS = 1 << 14
 """Initial number of rows for weights, enough for a tile full of small splats."""
@@ -137,6 +111,22 @@ def _allocate_aligned(size):
     return buffer[start : start + size]
 
 
+@njit(cache=True)
+def _locate(tile, height, width):
+    """Return left and top pixel of a tile, and its rows and columns inside the image."""
+    tiles_x = (width + TILE - 1) // TILE
+    left, top = (tile % tiles_x) * TILE, (tile // tiles_x) * TILE
+    return left, top, min(TILE, height - top), min(TILE, width - left)
+
+
+@njit(cache=True)
+def _open_pixels(state, columns):
+    """Reset the pixels of a tile. Those beyond the border of the image are full from the start."""
+    state[:] = 0
+    state[:, 0, :columns] = 1
+    state[:, 0, columns:] = -1
+
+
 @njit(cache=True, fastmath={"contract"})
 def _place_in_tile(splats, opacities, boxes, i, left, top):
     """Return the rows of the tile at (left, top) that splat i touches, and the relative splat."""
@@ -145,15 +135,15 @@ def _place_in_tile(splats, opacities, boxes, i, left, top):
         max(np.int64(boxes[i, 2]) - top, 0),
         min(np.int64(boxes[i, 3]) - top, TILE),
         (
-            splats[i, X] - np.float32(left) - half,
-            splats[i, Y] - np.float32(top) - half,
-            splats[i, U],
-            splats[i, V],
-            splats[i, W],
+            splats[i, project.X] - np.float32(left) - half,
+            splats[i, project.Y] - np.float32(top) - half,
+            splats[i, project.U],
+            splats[i, project.V],
+            splats[i, project.W],
             opacities[i],
-            splats[i, RED],
-            splats[i, GREEN],
-            splats[i, BLUE],
+            splats[i, project.RED],
+            splats[i, project.GREEN],
+            splats[i, project.BLUE],
             splats[i, DEPTH],
         ),
     )
@@ -167,19 +157,14 @@ def composite(begin, end, tiles, context, new, frame):
     n_splats, n_opacities, n_boxes, n_start, n_entries = new
     image, depths, alphas, transmittances, lasts, used, full = frame
     height, width = alphas.shape
-    tiles_x = (width + TILE - 1) // TILE
     state = _allocate_aligned(TILE * 5 * TILE).reshape((TILE, 5, TILE))
     last = np.empty((TILE, TILE), np.int32)
     row_limit = np.empty(TILE, np.int32)
     infinity = np.float32(np.inf)
     for index in range(begin, end):
         tile = tiles[index]
-        left, top = (tile % tiles_x) * TILE, (tile // tiles_x) * TILE
-        rows, columns = min(TILE, height - top), min(TILE, width - left)
-        state[:] = 0
-        state[:, 0, :columns] = 1
-        # Pixels beyond the border of the image are full from the start.
-        state[:, 0, columns:] = -1
+        left, top, rows, columns = _locate(tile, height, width)
+        _open_pixels(state, columns)
         last[:] = -1
         row_limit[:] = np.iinfo(np.int32).max
         open_rows = rows
@@ -203,7 +188,7 @@ def composite(begin, end, tiles, context, new, frame):
                 )
                 n += 1
                 n_depth = _get_depth(n_splats, n_entries, n, n_begin, n_end, infinity)
-            open_rows -= composite_rows(first, stop, position, state, last, row_limit, splat)
+            open_rows -= simd.composite_rows(first, stop, position, state, last, row_limit, splat)
 
         used[tile, 0], used[tile, 1] = c - c_begin, n - n_begin
         full[tile] = open_rows == 0
@@ -242,7 +227,6 @@ def backproject_residual(begin, end, tiles, context, new, photograph, slots, sum
     c_splats, c_opacities, c_boxes, c_start, c_entries = context
     n_splats, n_opacities, n_boxes, n_start, n_entries = new
     height, width = photograph.shape[:2]
-    tiles_x = (width + TILE - 1) // TILE
     state = _allocate_aligned(TILE * 4 * TILE).reshape((TILE, 4, TILE))
     kept = _allocate_aligned(FIRST_ROWS * TILE).reshape((FIRST_ROWS, TILE))
     row_limit = np.empty(TILE, np.int32)
@@ -250,12 +234,8 @@ def backproject_residual(begin, end, tiles, context, new, photograph, slots, sum
     infinity = np.float32(np.inf)
     for index in range(begin, end):
         tile = tiles[index]
-        left, top = (tile % tiles_x) * TILE, (tile // tiles_x) * TILE
-        rows, columns = min(TILE, height - top), min(TILE, width - left)
-        state[:] = 0
-        state[:, 0, :columns] = 1
-        # Pixels beyond the border of the image are full from the start.
-        state[:, 0, columns:] = -1
+        left, top, rows, columns = _locate(tile, height, width)
+        _open_pixels(state, columns)
         row_limit[:] = 0
         open_rows = rows
 
@@ -273,14 +253,14 @@ def backproject_residual(begin, end, tiles, context, new, photograph, slots, sum
                 c += 1
                 c_depth = _get_depth(c_splats, c_entries, c, c_begin, c_end, infinity)
                 # The next splat overwrites its weights.
-                open_rows -= weigh_rows(first, stop, place, state, row_limit, kept, splat)
+                open_rows -= simd.weigh_rows(first, stop, place, state, row_limit, kept, splat)
                 continue
             first, stop, splat = _place_in_tile(
                 n_splats, n_opacities, n_boxes, n_entries[n], left, top
             )
             n += 1
             n_depth = _get_depth(n_splats, n_entries, n, n_begin, n_end, infinity)
-            open_rows -= weigh_rows(first, stop, place, state, row_limit, kept, splat)
+            open_rows -= simd.weigh_rows(first, stop, place, state, row_limit, kept, splat)
             place += max(stop - first, 0)
 
         for row in range(rows):
@@ -294,7 +274,7 @@ def backproject_residual(begin, end, tiles, context, new, photograph, slots, sum
             i, slot = n_entries[entry], slots[entry]
             first = max(np.int64(n_boxes[i, 2]) - top, 0)
             stop = min(np.int64(n_boxes[i, 3]) - top, TILE)
-            sum_weighted_rows(first, stop, place, state, kept, totals)
+            simd.sum_weighted_rows(first, stop, place, state, kept, totals)
             place += max(stop - first, 0)
             written[slot] = True
             for column in range(4):
@@ -315,7 +295,6 @@ def composite_backward(
     _, depths, alphas, transmittances, lasts, used, _ = frame
     d_image, d_depth, d_alpha = d_frame
     height, width = alphas.shape
-    tiles_x = (width + TILE - 1) // TILE
     state = _allocate_aligned(TILE * 7 * TILE).reshape((TILE, 7, TILE))
     last = np.empty((TILE, TILE), np.int32)
     row_limit = np.empty(TILE, np.int32)
@@ -327,8 +306,7 @@ def composite_backward(
         n = n_begin + used[tile, 1]
         if n == n_begin:
             continue
-        left, top = (tile % tiles_x) * TILE, (tile // tiles_x) * TILE
-        rows, columns = min(TILE, height - top), min(TILE, width - left)
+        left, top, rows, columns = _locate(tile, height, width)
         state[:] = 0
         last[:] = -1
         row_limit[:] = -1
@@ -357,7 +335,7 @@ def composite_backward(
                     c_splats, c_opacities, c_boxes, c_entries[c], left, top
                 )
                 c_depth = _get_depth(c_splats, c_entries, c - 1, c_begin, c, nothing)
-                pass_rows(first, stop, position, state, last, row_limit, sums, splat)
+                simd.pass_rows(first, stop, position, state, last, row_limit, sums, splat)
                 continue
             n -= 1
             first, stop, splat = _place_in_tile(
@@ -366,27 +344,26 @@ def composite_backward(
             n_depth = _get_depth(n_splats, n_entries, n - 1, n_begin, n, nothing)
             slot = slots[n]
             written[slot] = True
+            rows_of_splat = first, stop, position, state, last, row_limit, sums, splat
             if wanted == WANT_OPACITY:
-                revert_rows_for_opacity(first, stop, position, state, last, row_limit, sums, splat)
-                gradients[slot, 0] = sums[0]
+                simd.revert_rows_for_opacity(*rows_of_splat)
+            elif wanted == WANT_DEPTH:
+                simd.revert_rows_for_depth(*rows_of_splat)
+            elif wanted == WANT_COLOR:
+                simd.revert_rows_for_color(*rows_of_splat)
+            else:
+                simd.revert_rows(*rows_of_splat)
+            if wanted != WANT_ALL:
+                for column in range(gradients.shape[1]):
+                    gradients[slot, column] = sums[column]
                 continue
-            if wanted == WANT_DEPTH:
-                revert_rows_for_depth(first, stop, position, state, last, row_limit, sums, splat)
-                gradients[slot, 0] = sums[0]
-                continue
-            if wanted == WANT_COLOR:
-                revert_rows_for_color(first, stop, position, state, last, row_limit, sums, splat)
-                for channel in range(3):
-                    gradients[slot, channel] = sums[channel]
-                continue
-            revert_rows(first, stop, position, state, last, row_limit, sums, splat)
             u, v, w = splat[2], splat[3], splat[4]
             x, y, xx, xy, yy = sums[1], sums[2], sums[3], sums[4], sums[5]
-            gradients[slot, SUM] = sums[0]
-            gradients[slot, SUM_S] = u * x + v * y
-            gradients[slot, SUM_T] = w * y
-            gradients[slot, SUM_SS] = u * (u * xx + v * xy) + v * (u * xy + v * yy)
-            gradients[slot, SUM_ST] = w * (u * xy + v * yy)
-            gradients[slot, SUM_TT] = w * w * yy
+            gradients[slot, project.SUM] = sums[0]
+            gradients[slot, project.SUM_S] = u * x + v * y
+            gradients[slot, project.SUM_T] = w * y
+            gradients[slot, project.SUM_SS] = u * (u * xx + v * xy) + v * (u * xy + v * yy)
+            gradients[slot, project.SUM_ST] = w * (u * xy + v * yy)
+            gradients[slot, project.SUM_TT] = w * w * yy
             for channel in range(4):
-                gradients[slot, SUM_DEPTH + channel] = sums[6 + channel]
+                gradients[slot, project.SUM_DEPTH + channel] = sums[6 + channel]

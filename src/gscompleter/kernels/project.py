@@ -81,11 +81,12 @@ def _apply_matrix(a, x, y, z):
 def _normalize_quat(quats, i):
     w, x, y, z = quats[i, 0], quats[i, 1], quats[i, 2], quats[i, 3]
     factor = np.float32(1) / math.sqrt(w * w + x * x + y * y + z * z)
-    return w * factor, x * factor, y * factor, z * factor, factor
+    return (w * factor, x * factor, y * factor, z * factor), factor
 
 
 @njit(cache=True, fastmath={"contract"})
-def _compute_rotation(w, x, y, z):
+def _compute_rotation(quat):
+    w, x, y, z = quat
     one, two = np.float32(1), np.float32(2)
     return (
         one - two * (y * y + z * z),
@@ -101,8 +102,9 @@ def _compute_rotation(w, x, y, z):
 
 
 @njit(cache=True, fastmath={"contract"})
-def _rotation_backward(w, x, y, z, d):
+def _rotation_backward(quat, d):
     """Compute the gradient of a unit quaternion from that of its rotation matrix."""
+    w, x, y, z = quat
     two = np.float32(2)
     return (
         two * (x * (d[7] - d[5]) + y * (d[2] - d[6]) + z * (d[3] - d[1])),
@@ -113,7 +115,8 @@ def _rotation_backward(w, x, y, z, d):
 
 
 @njit(cache=True, fastmath={"contract"})
-def _scale_columns(a, x, y, z):
+def _scale_columns(a, scales, i):
+    x, y, z = scales[i, 0], scales[i, 1], scales[i, 2]
     return (
         a[0] * x,
         a[1] * y,
@@ -142,11 +145,18 @@ def _compute_tangent_limits(pinhole):
 
 
 @njit(cache=True, fastmath={"contract"})
-def _flatten(axes, jacobian):
-    """Project the axes of a Gaussian (columns, in the camera) to a 2 × 3 matrix, by rows.
+def _compute_jacobian(fx, fy, tan_x, tan_y, inverse_z, limits):
+    """Return d pixel x / dx, d pixel x / dz, d pixel y / dy, d pixel y / dz."""
+    least_x, largest_x, least_y, largest_y = limits
+    xx, yy = fx * inverse_z, fy * inverse_z
+    clamped_x = min(max(tan_x, least_x), largest_x)
+    clamped_y = min(max(tan_y, least_y), largest_y)
+    return xx, -xx * clamped_x, yy, -yy * clamped_y
 
-    jacobian: d pixel x / dx, d pixel x / dz, d pixel y / dy, d pixel y / dz.
-    """
+
+@njit(cache=True, fastmath={"contract"})
+def _flatten(axes, jacobian):
+    """Project the axes of a Gaussian (columns, in the camera) to a 2 × 3 matrix, by rows."""
     xx, xz, yy, yz = jacobian
     return (
         xx * axes[0] + xz * axes[6],
@@ -241,7 +251,7 @@ def project(begin, end, gaussians, pinhole, splats, boxes, factors):
     means, quats, scales, opacities, sh = gaussians
     view, center, near = pinhole.rotation, pinhole.center, pinhole.near
     fx, fy, cx, cy = pinhole.intrinsics
-    least_x, largest_x, least_y, largest_y = _compute_tangent_limits(pinhole)
+    limits = _compute_tangent_limits(pinhole)
     width, height = np.float32(pinhole.width), np.float32(pinhole.height)
     basis = np.empty(sh.shape[1], np.float32)
     zero, half, one = np.float32(0), np.float32(0.5), np.float32(1)
@@ -254,21 +264,10 @@ def project(begin, end, gaussians, pinhole, splats, boxes, factors):
         # Conditions are written so that NaN fails them.
         if not (z > near and z < np.inf and opacities[i] >= MIN_ALPHA):
             continue
-        inverse_z = one / z
-        tan_x, tan_y = x * inverse_z, y * inverse_z
-        jacobian_x, jacobian_y = fx * inverse_z, fy * inverse_z
-        clamped_x = min(max(tan_x, least_x), largest_x)
-        clamped_y = min(max(tan_y, least_y), largest_y)
-        qw, qx, qy, qz, _ = _normalize_quat(quats, i)
-        axes = _scale_columns(
-            _multiply(view, _compute_rotation(qw, qx, qy, qz)),
-            scales[i, 0],
-            scales[i, 1],
-            scales[i, 2],
-        )
-        flat = _flatten(
-            axes, (jacobian_x, -jacobian_x * clamped_x, jacobian_y, -jacobian_y * clamped_y)
-        )
+        tan_x, tan_y = x * (one / z), y * (one / z)
+        quat, _ = _normalize_quat(quats, i)
+        axes = _scale_columns(_multiply(view, _compute_rotation(quat)), scales, i)
+        flat = _flatten(axes, _compute_jacobian(fx, fy, tan_x, tan_y, one / z, limits))
 
         # The determinant of F Fᵀ + blur is summed from squares: nothing cancels, however thin
         # the splat is. In double precision nothing overflows either.
@@ -353,7 +352,7 @@ def project_backward(
     view, center = pinhole.rotation, pinhole.center
     from_view = _transpose(view)
     fx, fy = pinhole.intrinsics[0], pinhole.intrinsics[1]
-    least_x, largest_x, least_y, largest_y = _compute_tangent_limits(pinhole)
+    limits = _compute_tangent_limits(pinhole)
     one, two, four = np.float32(1), np.float32(2), np.float32(4)
     sums = np.empty(NUM_GRADIENT_COLUMNS, np.float32)
     basis, d_basis = np.empty(sh.shape[1], np.float32), np.empty(sh.shape[1], np.float32)
@@ -390,13 +389,10 @@ def project_backward(
         )
         inverse_z = one / z
         tan_x, tan_y = x * inverse_z, y * inverse_z
-        jacobian_x, jacobian_y = fx * inverse_z, fy * inverse_z
-        clamped_x = min(max(tan_x, least_x), largest_x)
-        clamped_y = min(max(tan_y, least_y), largest_y)
-        qw, qx, qy, qz, unit_factor = _normalize_quat(quats, i)
-        rotation = _multiply(view, _compute_rotation(qw, qx, qy, qz))
-        axes = _scale_columns(rotation, scales[i, 0], scales[i, 1], scales[i, 2])
-        jacobian = (jacobian_x, -jacobian_x * clamped_x, jacobian_y, -jacobian_y * clamped_y)
+        quat, unit_factor = _normalize_quat(quats, i)
+        rotation = _multiply(view, _compute_rotation(quat))
+        axes = _scale_columns(rotation, scales, i)
+        jacobian = _compute_jacobian(fx, fy, tan_x, tan_y, inverse_z, limits)
         flat = _flatten(axes, jacobian)
 
         # dL/dΣ = 2 Uᵀ Q U with Q = [[ss, st], [st, tt]], and Σ = F Fᵀ: dL/dF = 4 Uᵀ Q (U F).
@@ -442,23 +438,20 @@ def project_backward(
                 + d_axes[3 + k] * rotation[3 + k]
                 + d_axes[6 + k] * rotation[6 + k]
             )
-        d_rotation = _multiply(
-            from_view, _scale_columns(d_axes, scales[i, 0], scales[i, 1], scales[i, 2])
-        )
-        d_qw, d_qx, d_qy, d_qz = _rotation_backward(qw, qx, qy, qz, d_rotation)
-        along = qw * d_qw + qx * d_qx + qy * d_qy + qz * d_qz
-        d_quats[i, 0] = (d_qw - qw * along) * unit_factor
-        d_quats[i, 1] = (d_qx - qx * along) * unit_factor
-        d_quats[i, 2] = (d_qy - qy * along) * unit_factor
-        d_quats[i, 3] = (d_qz - qz * along) * unit_factor
+        d_rotation = _multiply(from_view, _scale_columns(d_axes, scales, i))
+        d_quat = _rotation_backward(quat, d_rotation)
+        along = quat[0] * d_quat[0] + quat[1] * d_quat[1]
+        along = along + quat[2] * d_quat[2] + quat[3] * d_quat[3]
+        for k in range(4):
+            d_quats[i, k] = (d_quat[k] - quat[k] * along) * unit_factor
 
         # J and the centre of the splat depend on the mean. A clamped tangent does not.
         d_tan_x = two * fx * u * sums[SUM_S]
         d_tan_y = two * fy * (v * sums[SUM_S] + w * sums[SUM_T])
-        if clamped_x == tan_x:
-            d_tan_x -= d_xz * jacobian_x
-        if clamped_y == tan_y:
-            d_tan_y -= d_yz * jacobian_y
+        if limits[0] <= tan_x <= limits[1]:
+            d_tan_x -= d_xz * xx
+        if limits[2] <= tan_y <= limits[3]:
+            d_tan_y -= d_yz * yy
         d_z = sums[SUM_DEPTH] - (d_xx * xx + d_xz * xz + d_yy * yy + d_yz * yz) * inverse_z
         d_z -= (d_tan_x * tan_x + d_tan_y * tan_y) * inverse_z
         d_x, d_y, d_z = _apply_matrix(from_view, d_tan_x * inverse_z, d_tan_y * inverse_z, d_z)

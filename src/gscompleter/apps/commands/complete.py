@@ -11,7 +11,6 @@ from typing import Any
 from rich.console import Console
 from rich.table import Table
 
-from gscompleter.apps.commands.expected import expect_completion
 from gscompleter.apps.commands.exploring import (
     collect_cameras,
     complete_targets,
@@ -94,8 +93,7 @@ def complete_folder(options: CompleteOptions) -> tuple[dict[str, Any], Completio
         opened, task, explorer, before = prepare_completion(options, console)
         print_lines(console, *describe_task(options, opened, task))
         cameras = collect_cameras(options, opened, task)
-        expectation = expect_completion(options, task, task.views[0].image.device.type)
-        with open_output_folder(options.out, is_replaceable(options)) as folder, expectation:
+        with open_output_folder(options.out, is_replaceable(options)) as folder:
             completion, task = complete_targets(options, task, cameras, explorer)
             completion = replace(completion, seconds=add_seconds(completion.seconds, before))
             with stage("report"):
