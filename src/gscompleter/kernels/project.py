@@ -184,12 +184,13 @@ def _compute_direction(center, means, i):
     """Compute the unit vector from the camera centre to the mean, and the inverse distance."""
     x, y, z = means[i, 0] - center[0], means[i, 1] - center[1], means[i, 2] - center[2]
     inverse = np.float32(1) / math.sqrt(x * x + y * y + z * z)
-    return x * inverse, y * inverse, z * inverse, inverse
+    return (x * inverse, y * inverse, z * inverse), inverse
 
 
 @njit(cache=True, fastmath={"contract"})
-def _evaluate_basis(x, y, z, basis):
+def _evaluate_basis(direction, basis):
     """Evaluate 1, 4, 9 or 16 basis functions at a unit direction."""
+    x, y, z = direction
     two, three, four = np.float32(2), np.float32(3), np.float32(4)
     xx, yy, zz = x * x, y * y, z * z
     basis[0] = _C0
@@ -212,8 +213,9 @@ def _evaluate_basis(x, y, z, basis):
 
 
 @njit(cache=True, fastmath={"contract"})
-def _basis_backward(x, y, z, g):
+def _basis_backward(direction, g):
     """Compute the gradient in the direction of the sum of g[k] times basis function k."""
+    x, y, z = direction
     two, three, four = np.float32(2), np.float32(3), np.float32(4)
     six, eight = np.float32(6), np.float32(8)
     xx, yy, zz, xy, xz, yz = x * x, y * y, z * z, x * y, x * z, y * z
@@ -307,8 +309,8 @@ def project(begin, end, gaussians, pinhole, splats, boxes, factors):
         splats[i, W] = root_half / deviation_y
         splats[i, DEPTH] = z
 
-        direction_x, direction_y, direction_z, _ = _compute_direction(center, means, i)
-        _evaluate_basis(direction_x, direction_y, direction_z, basis)
+        direction, _ = _compute_direction(center, means, i)
+        _evaluate_basis(direction, basis)
         for channel in range(3):
             color = half
             for k in range(len(basis)):
@@ -362,10 +364,8 @@ def project_backward(begin, end, gaussians, pinhole, factors, splats, sums, d_ga
         d_opacities[i] = sums[i, SUM] / opacities[i]
 
         # Colour, which is cut off at zero
-        direction_x, direction_y, direction_z, inverse_distance = _compute_direction(
-            center, means, i
-        )
-        _evaluate_basis(direction_x, direction_y, direction_z, basis)
+        direction, inverse_distance = _compute_direction(center, means, i)
+        _evaluate_basis(direction, basis)
         d_basis[:] = 0
         for channel in range(3):
             if splats[i, RED + channel] > 0:
@@ -373,8 +373,8 @@ def project_backward(begin, end, gaussians, pinhole, factors, splats, sums, d_ga
                 for k in range(len(basis)):
                     d_sh[i, k, channel] = d_color * basis[k]
                     d_basis[k] += d_color * sh[i, k, channel]
-        d_dx, d_dy, d_dz = _basis_backward(direction_x, direction_y, direction_z, d_basis)
-        radial = direction_x * d_dx + direction_y * d_dy + direction_z * d_dz
+        turn = _basis_backward(direction, d_basis)
+        radial = direction[0] * turn[0] + direction[1] * turn[1] + direction[2] * turn[2]
 
         x, y, z = _apply_matrix(
             view, means[i, 0] - center[0], means[i, 1] - center[1], means[i, 2] - center[2]
@@ -446,7 +446,6 @@ def project_backward(begin, end, gaussians, pinhole, factors, splats, sums, d_ga
             d_tan_y -= d_yz * yy
         d_z = sums[i, SUM_DEPTH] - (d_xx * xx + d_xz * xz + d_yy * yy + d_yz * yz) * inverse_z
         d_z -= (d_tan_x * tan_x + d_tan_y * tan_y) * inverse_z
-        d_x, d_y, d_z = _apply_matrix(from_view, d_tan_x * inverse_z, d_tan_y * inverse_z, d_z)
-        d_means[i, 0] = d_x + (d_dx - direction_x * radial) * inverse_distance
-        d_means[i, 1] = d_y + (d_dy - direction_y * radial) * inverse_distance
-        d_means[i, 2] = d_z + (d_dz - direction_z * radial) * inverse_distance
+        d_mean = _apply_matrix(from_view, d_tan_x * inverse_z, d_tan_y * inverse_z, d_z)
+        for k in range(3):
+            d_means[i, k] = d_mean[k] + (turn[k] - direction[k] * radial) * inverse_distance

@@ -25,8 +25,6 @@ from gscompleter.render.viewpoint import (
     BinnedSplats,
     Splats,
     Viewpoint,
-    assign_splat_slots,
-    compute_starts,
     gather_splats,
     order_by_use,
     to_float32,
@@ -83,7 +81,8 @@ class CpuFrozenScene:
     @cached_property
     def render(self) -> Render:
         """The render of the context alone."""
-        return to_render(self.frame)
+        frame = self.frame
+        return Render(*map(torch.from_numpy, (frame.image, frame.depth, frame.alpha)))
 
     def extend(self, new: Gaussians) -> CpuFrozenScene:
         """Freeze context and `new` together, in that order."""
@@ -95,7 +94,7 @@ class CpuFrozenScene:
         frame = self.viewpoint.composite(self.layer, self.frame, added)
         used = np.zeros_like(frame.used)
         used[:, 0] = frame.used.sum(axis=1)
-        tile_start = compute_starts(used[:, 0])
+        tile_start = np.concatenate([[0], np.cumsum(used[:, 0], dtype=np.int64)])
         entries = np.empty(tile_start[-1], np.int32)
         depth_limits = np.empty(self.viewpoint.tiles, np.float32)
         walked = (self.layer, added, frame.used, frame.full)
@@ -125,14 +124,18 @@ class CpuFrozenScene:
         splats = self.layer.splats.copy()
         splats[:, project.RED] = np.maximum(to_float32(values)[self.rows], 0)
         nothing = freeze_nothing(self.viewpoint)
-        layer = self.layer._replace(splats=splats)
-        frame = self.viewpoint.composite(nothing.layer, nothing.frame, layer)
-        return torch.from_numpy(frame.image[..., 0].copy())
+        _, render = nothing.composite_layer(self.layer._replace(splats=splats))
+        return render.image[..., 0].clone()
 
     def composite(self, new: Gaussians) -> Render:
         """Render context and `new`; only `new` is projected, sorted and binned."""
         tensors = (getattr(new, name).to("cpu", torch.float32) for name in GaussianArrays._fields)
         return Render(*_Composite.apply(self, new.is_antialiased, *tensors))
+
+    def composite_layer(self, new: Layer) -> tuple[RasterFrame, Render]:
+        """Composite the context and a new layer."""
+        frame = self.viewpoint.composite(self.layer, self.frame, new)
+        return frame, Render(*map(torch.from_numpy, (frame.image, frame.depth, frame.alpha)))
 
     def vary_opacities(self, new: Gaussians) -> OpacityRender:
         """Project, sort and bin `new` once, with boxes that hold for every opacity."""
@@ -178,9 +181,8 @@ class _Composite(torch.autograd.Function):
     ) -> tuple[Tensor, ...]:
         gaussians = GaussianArrays(*map(to_float32, tensors))
         splats = view.viewpoint.project(gaussians, is_antialiased)
-        binned = assign_splat_slots(view.viewpoint.fill_lists(splats, view.depth_limits))
-        frame = view.viewpoint.composite(view.layer, view.frame, binned.layer)
-        render = to_render(frame)
+        binned = view.viewpoint.enter(splats, view.depth_limits)
+        frame, render = view.composite_layer(binned.layer)
         ctx.scene = (view, splats.factors, binned, frame)
         # Torch raises an error if a saved tensor is written to before the backward pass.
         ctx.save_for_backward(*tensors, render.depth, render.alpha)
@@ -208,8 +210,7 @@ class _VaryOpacities(torch.autograd.Function):
     ) -> tuple[Tensor, ...]:
         seen = to_float32(opacities) * binned.layer.opacities  # those of opaque Gaussians
         layer = binned.layer._replace(opacities=seen)
-        frame = view.viewpoint.composite(view.layer, view.frame, layer)
-        render = to_render(frame)
+        frame, render = view.composite_layer(layer)
         ctx.scene = (view, replace(binned, layer=layer), frame)
         ctx.save_for_backward(opacities, render.depth, render.alpha)
         return render.image, render.depth, render.alpha
@@ -234,9 +235,8 @@ class _VaryDepths(torch.autograd.Function):
         ctx: Any, view: CpuFrozenScene, splats: Splats, limits: Any, depths: Tensor
     ) -> tuple[Tensor, ...]:
         moved = splats.move_to_depths(to_float32(depths), view.viewpoint.pinhole.near)
-        binned = assign_splat_slots(view.viewpoint.fill_lists(moved, limits))
-        frame = view.viewpoint.composite(view.layer, view.frame, binned.layer)
-        render = to_render(frame)
+        binned = view.viewpoint.enter(moved, limits)
+        frame, render = view.composite_layer(binned.layer)
         ctx.scene = (view, binned, frame)
         ctx.save_for_backward(render.depth, render.alpha)
         ctx.mark_non_differentiable(render.image, render.alpha)
@@ -248,12 +248,8 @@ class _VaryDepths(torch.autograd.Function):
         view, binned, frame = ctx.scene
         composited = (view.layer, binned, frame, d_frame)
         gradients = view.viewpoint.composite_backward(*composited, composite.WANT_DEPTH)
-        return (
-            None,
-            None,
-            None,
-            torch.from_numpy(view.viewpoint.sum_by_gaussian(binned, gradients)[:, 0]),
-        )
+        sums = view.viewpoint.sum_by_gaussian(binned, gradients)[:, 0]
+        return None, None, None, torch.from_numpy(sums)
 
 
 def freeze_nothing(viewpoint: Viewpoint) -> CpuFrozenScene:
@@ -343,8 +339,3 @@ def to_opaque_arrays(gaussians: Gaussians) -> GaussianArrays:
     """Convert Gaussians at opacity 1, which makes their boxes hold for every opacity."""
     arrays = to_arrays(gaussians)
     return arrays._replace(opacities=np.ones_like(arrays.opacities))
-
-
-def to_render(frame: RasterFrame) -> Render:
-    """Convert a frame to tensors that share its memory."""
-    return Render(*map(torch.from_numpy, (frame.image, frame.depth, frame.alpha)))

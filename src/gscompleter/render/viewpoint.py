@@ -57,9 +57,6 @@ class BinnedSplats:
     """First slot of each Gaussian, and the end [n + 1]."""
 
 
-SplatArrays = tuple[Float32[ndarray, "n 9"], Float32[ndarray, "n"], Integer[ndarray, "n 4"]]
-"""Splats, their opacities and their boxes, see `Layer`."""
-
 EntryGradients = tuple[Float32[ndarray, "entries columns"], Bool[ndarray, "entries"]]
 """Gradients of the tiles' entries by slot, and True for slots that were written."""
 
@@ -94,9 +91,12 @@ class Viewpoint:
         depth_limits: Float32[ndarray, "tiles"],
     ) -> BinnedSplats:
         """Project, sort and enter Gaussians into the lists of the tiles."""
-        return assign_splat_slots(
-            self.fill_lists(self.project(gaussians, is_antialiased), depth_limits)
-        )
+        return self.enter(self.project(gaussians, is_antialiased), depth_limits)
+
+    def enter(self, splats: Splats, depth_limits: Float32[ndarray, "tiles"]) -> BinnedSplats:
+        """Enter splats into the lists of the tiles, and give those of each splat adjacent slots."""
+        layer = self.fill_lists(splats, depth_limits)
+        return BinnedSplats(layer, *tiles.number_slots(layer.entries, len(layer.splats)))
 
     def project(self, gaussians: GaussianArrays, is_antialiased: bool) -> Splats:
         """Project Gaussians to splats; invisible ones get empty boxes."""
@@ -191,20 +191,10 @@ def find_touched_tiles(layer: Layer) -> Int64[ndarray, "touched"]:
     return np.flatnonzero(np.diff(layer.tile_start))
 
 
-def compute_starts(sizes: Integer[ndarray, "tiles"]) -> Int64[ndarray, "bounds"]:
-    """Compute the starts of consecutive lists of these sizes, and the end."""
-    return np.concatenate([[0], np.cumsum(sizes, dtype=np.int64)])
-
-
 def order_by_use(layer: Layer) -> tuple[Layer, Int32[ndarray, "splats"]]:
     """Reorder splats by first use and drop unused ones, for locality; also return their order."""
     order, entries = tiles.number_by_use(layer.entries, len(layer.splats))
     return Layer(*gather_splats([layer], [order]), layer.tile_start, entries), order
-
-
-def assign_splat_slots(layer: Layer) -> BinnedSplats:
-    """Give the entries of each splat adjacent slots."""
-    return BinnedSplats(layer, *tiles.number_slots(layer.entries, len(layer.splats)))
 
 
 def check_lengths(gaussians: GaussianArrays) -> int:
@@ -220,7 +210,9 @@ def to_float32(values: Tensor) -> Float32[ndarray, "..."]:
     return values.detach().to("cpu", torch.float32).contiguous().numpy()
 
 
-def gather_splats(layers: Sequence[Layer], rows: Sequence[Int32[ndarray, "_"]]) -> SplatArrays:
+def gather_splats(
+    layers: Sequence[Layer], rows: Sequence[Int32[ndarray, "_"]]
+) -> tuple[Float32[ndarray, "n 9"], Float32[ndarray, "n"], Integer[ndarray, "n 4"]]:
     """Gather the splats, opacities and boxes of these rows of each layer."""
     bounds = [0, *accumulate(map(len, rows))]
     taken = (
