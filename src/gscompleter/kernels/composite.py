@@ -13,9 +13,6 @@ from gscompleter.kernels import project, simd
 from gscompleter.kernels.project import DEPTH
 from gscompleter.kernels.simd import TILE
 
-FIRST_ROWS = 1 << 14
-"""Initial number of rows for weights, enough for a tile full of small splats."""
-
 WANT_ALL, WANT_OPACITY, WANT_DEPTH, WANT_COLOR = range(4)
 """Gradients to compute: all columns, or only SUM, SUM_DEPTH or the three colours."""
 
@@ -205,18 +202,6 @@ def composite(begin, end, tiles, context, new, frame):
                 lasts[y, x] = last[row, column]
 
 
-@njit(cache=True, nogil=True)
-def _grow_if_full(kept, used):
-    if used + TILE <= len(kept):
-        return kept
-    wider = _allocate_aligned(2 * kept.size).reshape((2 * len(kept), TILE))
-    # Slices assigned to slices take seconds to compile.
-    for row in range(used):
-        for column in range(TILE):
-            wider[row, column] = kept[row, column]
-    return wider
-
-
 @njit(cache=True, nogil=True, fastmath={"contract"}, error_model="numpy")
 def backproject_residual(begin, end, tiles, context, new, photograph, slots, sums, written):
     """Composite tiles[begin:end] and backproject the residual to the entries of `new`.
@@ -228,7 +213,11 @@ def backproject_residual(begin, end, tiles, context, new, photograph, slots, sum
     n_splats, n_opacities, n_boxes, n_start, n_entries = new
     height, width = photograph.shape[:2]
     state = _allocate_aligned(TILE * 4 * TILE).reshape((TILE, 4, TILE))
-    kept = _allocate_aligned(FIRST_ROWS * TILE).reshape((FIRST_ROWS, TILE))
+    most = 1
+    for index in range(begin, end):
+        most = max(most, n_start[tiles[index] + 1] - n_start[tiles[index]] + 1)
+    # Rows of weights, up to TILE for each splat; those never written take no memory.
+    kept = _allocate_aligned(most * TILE * TILE).reshape((most * TILE, TILE))
     row_limit = np.empty(TILE, np.int32)
     totals = np.zeros(TILE, np.float32)
     infinity = np.float32(np.inf)
@@ -245,7 +234,6 @@ def backproject_residual(begin, end, tiles, context, new, photograph, slots, sum
         n_depth = _get_depth(n_splats, n_entries, n, n_begin, n_end, infinity)
         place = np.int64(0)  # with a plain 0, its callees are compiled twice
         while open_rows > 0 and (c < c_end or n < n_end):
-            kept = _grow_if_full(kept, place)
             if c_depth <= n_depth:
                 first, stop, splat = _place_in_tile(
                     c_splats, c_opacities, c_boxes, c_entries[c], left, top

@@ -318,9 +318,6 @@ def project(begin, end, gaussians, pinhole, splats, boxes, factors):
             splats[i, RED + channel] = max(color, zero)
 
 
-# ---- From gradients of entries to gradients of Gaussians ---------------------------------------
-
-
 @njit(cache=True, fastmath={"contract"}, error_model="numpy")
 def _compensation_backward(flat, q):
     """Compute the gradient of the flattened axes from that of log sqrt(P / D).

@@ -81,8 +81,7 @@ class CpuFrozenScene:
     @cached_property
     def render(self) -> Render:
         """The render of the context alone."""
-        frame = self.frame
-        return Render(*map(torch.from_numpy, (frame.image, frame.depth, frame.alpha)))
+        return to_render(self.frame)
 
     def extend(self, new: Gaussians) -> CpuFrozenScene:
         """Freeze context and `new` together, in that order."""
@@ -135,7 +134,7 @@ class CpuFrozenScene:
     def composite_layer(self, new: Layer) -> tuple[RasterFrame, Render]:
         """Composite the context and a new layer."""
         frame = self.viewpoint.composite(self.layer, self.frame, new)
-        return frame, Render(*map(torch.from_numpy, (frame.image, frame.depth, frame.alpha)))
+        return frame, to_render(frame)
 
     def vary_opacities(self, new: Gaussians) -> OpacityRender:
         """Project, sort and bin `new` once, with boxes that hold for every opacity."""
@@ -339,3 +338,8 @@ def to_opaque_arrays(gaussians: Gaussians) -> GaussianArrays:
     """Convert Gaussians at opacity 1, which makes their boxes hold for every opacity."""
     arrays = to_arrays(gaussians)
     return arrays._replace(opacities=np.ones_like(arrays.opacities))
+
+
+def to_render(frame: RasterFrame) -> Render:
+    """Convert a frame to tensors that share its memory."""
+    return Render(*map(torch.from_numpy, (frame.image, frame.depth, frame.alpha)))
