@@ -14,8 +14,7 @@ import torch
 from jaxtyping import Bool, Float, Int64
 from torch import Tensor
 
-from gscompleter.errors import InputError
-from gscompleter.render import OpacityRender, Renderer
+from gscompleter.render import OpacityRender, Renderer, choose_device
 from gscompleter.render.redraw import RedrawnScene, set_colors
 from gscompleter.render.spherical_harmonics import evaluate_colors
 from gscompleter.types import Camera, Gaussians, Render, merge
@@ -41,15 +40,7 @@ class CudaRenderer:
     """
 
     def __post_init__(self) -> None:
-        if not torch.cuda.is_available():
-            raise InputError("The cuda renderer needs a GPU, and torch sees none; use cpu.")
-        try:
-            import gsplat  # noqa: F401
-        except ImportError as error:
-            raise InputError(
-                "The cuda renderer needs gsplat, which is not installed; "
-                "run `pip install gscompleter[cuda]`."
-            ) from error
+        choose_device("cuda")
 
     def render(self, gaussians: Gaussians, camera: Camera) -> Render:
         """Render `gaussians` from `camera`."""
