@@ -168,8 +168,6 @@ def _flatten(axes, jacobian):
     )
 
 
-# ---- View-dependent colour -----------------------------------------------------------------------
-
 # Spherical harmonics in the basis and with the signs of 3DGS, see render/spherical_harmonics.py.
 _C0, _C1 = np.float32(0.28209479177387814), np.float32(0.4886025119029199)
 _C2XY, _C2Z = np.float32(1.0925484305920792), np.float32(0.31539156525252005)
@@ -238,9 +236,6 @@ def _basis_backward(direction, g):
         dz += _C3XYZ * xy * g[10] + three * _C3Z * (two * zz - xx - yy) * g[12]
         dz += _C3XX * (xx - yy) * g[14] - eight * _C3B * (yz * g[11] + xz * g[13])
     return dx, dy, dz
-
-
-# ---- From Gaussians to splats --------------------------------------------------------------------
 
 
 @njit(cache=True, nogil=True, fastmath={"contract"}, error_model="numpy")
@@ -342,8 +337,10 @@ def _compensation_backward(flat, q):
 
 
 @njit(cache=True, nogil=True, fastmath={"contract"}, error_model="numpy")
-def project_backward(begin, end, gaussians, pinhole, factors, splats, sums, d_gaussians):
-    """Write gradients of the Gaussians begin..end to `d_gaussians` from `sums` over entries."""
+def project_backward(
+    begin, end, gaussians, pinhole, factors, splats, slot_start, gradients, written, d_gaussians
+):
+    """Write gradients of the Gaussians begin..end to `d_gaussians` from those of entries."""
     means, quats, scales, opacities, sh = gaussians
     d_means, d_quats, d_scales, d_opacities, d_sh = d_gaussians
     view, center = pinhole.rotation, pinhole.center
@@ -351,14 +348,19 @@ def project_backward(begin, end, gaussians, pinhole, factors, splats, sums, d_ga
     fx, fy = pinhole.intrinsics[0], pinhole.intrinsics[1]
     limits = _compute_tangent_limits(pinhole)
     one, two, four = np.float32(1), np.float32(2), np.float32(4)
+    sums = np.empty(NUM_GRADIENT_COLUMNS, np.float32)
     basis, d_basis = np.empty(sh.shape[1], np.float32), np.empty(sh.shape[1], np.float32)
     for i in range(begin, end):
-        is_zero = True
-        for column in range(NUM_GRADIENT_COLUMNS):
-            is_zero &= sums[i, column] == 0
-        if is_zero:
+        any_written = False
+        sums[:] = 0
+        for slot in range(slot_start[i], slot_start[i + 1]):
+            if written[slot]:
+                any_written = True
+                for column in range(NUM_GRADIENT_COLUMNS):
+                    sums[column] += gradients[slot, column]
+        if not any_written:
             continue
-        d_opacities[i] = sums[i, SUM] / opacities[i]
+        d_opacities[i] = sums[SUM] / opacities[i]
 
         # Colour, which is cut off at zero
         direction, inverse_distance = _compute_direction(center, means, i)
@@ -366,7 +368,7 @@ def project_backward(begin, end, gaussians, pinhole, factors, splats, sums, d_ga
         d_basis[:] = 0
         for channel in range(3):
             if splats[i, RED + channel] > 0:
-                d_color = sums[i, SUM_RED + channel]
+                d_color = sums[SUM_RED + channel]
                 for k in range(len(basis)):
                     d_sh[i, k, channel] = d_color * basis[k]
                     d_basis[k] += d_color * sh[i, k, channel]
@@ -386,7 +388,7 @@ def project_backward(begin, end, gaussians, pinhole, factors, splats, sums, d_ga
 
         # dL/dΣ = 2 Uᵀ Q U with Q = [[ss, st], [st, tt]], and Σ = F Fᵀ: dL/dF = 4 Uᵀ Q (U F).
         u, v, w = splats[i, U], splats[i, V], splats[i, W]
-        ss, st, tt = sums[i, SUM_SS], sums[i, SUM_ST], sums[i, SUM_TT]
+        ss, st, tt = sums[SUM_SS], sums[SUM_ST], sums[SUM_TT]
         s0 = u * flat[0] + v * flat[3]
         s1 = u * flat[1] + v * flat[4]
         s2 = u * flat[2] + v * flat[5]
@@ -398,7 +400,7 @@ def project_backward(begin, end, gaussians, pinhole, factors, splats, sums, d_ga
         d_y1 = four * (v * a1 + w * b1)
         d_y2 = four * (v * a2 + w * b2)
         if factors is not None:
-            more = _compensation_backward(flat, sums[i, SUM])
+            more = _compensation_backward(flat, sums[SUM])
             d_x0, d_x1, d_x2 = d_x0 + more[0], d_x1 + more[1], d_x2 + more[2]
             d_y0, d_y1, d_y2 = d_y0 + more[3], d_y1 + more[4], d_y2 + more[5]
 
@@ -435,13 +437,13 @@ def project_backward(begin, end, gaussians, pinhole, factors, splats, sums, d_ga
             d_quats[i, k] = (d_quat[k] - quat[k] * along) * unit_factor
 
         # J and the centre of the splat depend on the mean. A clamped tangent does not.
-        d_tan_x = two * fx * u * sums[i, SUM_S]
-        d_tan_y = two * fy * (v * sums[i, SUM_S] + w * sums[i, SUM_T])
+        d_tan_x = two * fx * u * sums[SUM_S]
+        d_tan_y = two * fy * (v * sums[SUM_S] + w * sums[SUM_T])
         if limits[0] <= tan_x <= limits[1]:
             d_tan_x -= d_xz * xx
         if limits[2] <= tan_y <= limits[3]:
             d_tan_y -= d_yz * yy
-        d_z = sums[i, SUM_DEPTH] - (d_xx * xx + d_xz * xz + d_yy * yy + d_yz * yz) * inverse_z
+        d_z = sums[SUM_DEPTH] - (d_xx * xx + d_xz * xz + d_yy * yy + d_yz * yz) * inverse_z
         d_z -= (d_tan_x * tan_x + d_tan_y * tan_y) * inverse_z
         d_mean = _apply_matrix(from_view, d_tan_x * inverse_z, d_tan_y * inverse_z, d_z)
         for k in range(3):

@@ -193,10 +193,10 @@ class _Composite(torch.autograd.Function):
         view, factors, binned, frame = ctx.scene
         gaussians = GaussianArrays(*map(to_float32, ctx.saved_tensors[:5]))
         gradients = view.viewpoint.composite_backward(view.layer, binned, frame, d_frame)
-        sums = view.viewpoint.sum_by_gaussian(binned, gradients)
         result = GaussianArrays(*map(np.zeros_like, gaussians))
         seen = (gaussians, view.viewpoint.pinhole, factors, binned.layer.splats)
-        view.viewpoint.share(project.project_backward, len(sums), *seen, sums, result)
+        received = (binned.slot_start, *gradients, result)
+        view.viewpoint.share(project.project_backward, len(result.means), *seen, *received)
         return None, None, *map(torch.from_numpy, result)
 
 
