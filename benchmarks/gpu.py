@@ -30,7 +30,7 @@ from gpu_report import Part, Row, main, shorten, try_rows
 from gscompleter import Gaussians, GSCompleter, View, load_renderer
 from gscompleter.models.diffusion.pe_field import PEField
 from gscompleter.render import FrozenScene, Renderer
-from gscompleter.render.reference import ReferenceFrozenScene
+from gscompleter.render.redraw import RedrawnScene
 from gscompleter.types import Camera, GeneratorInput, merge
 from scenes import Room, camera_at, gaussians_of, view_of
 
@@ -122,7 +122,7 @@ def measure_renderer(bench: Bench) -> Iterator[Row]:
         context, camera = bench.make_scene(views), bench.make_target(size)
         new = bench.make_scene([view_of(Room(), camera.to("cpu"))])
         shown = f"{size[0]}x{size[1]}, {len(context):,} frozen and {len(new):,} new"
-        plain = ReferenceFrozenScene(bench.renderer, context, camera)
+        plain = RedrawnScene(bench.renderer, context, camera)
         frozen = bench.renderer.freeze(context, camera)
         for step, make in (("composite", make_composite_step), ("opacities", make_opacity_step)):
             anew = measure_median_seconds(make(plain, new), bench.repetitions)

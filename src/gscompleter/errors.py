@@ -99,9 +99,8 @@ def refuse_pointer(path: Path) -> None:
     with suppress(OSError), path.open("rb") as file:
         if file.read(len(LFS_POINTER)) == LFS_POINTER:
             raise InputError(
-                f"{quote_value(path)} is a git-lfs pointer, not the file itself; run `git lfs "
-                "pull` in "
-                "its repository to fetch it."
+                f"{quote_value(path)} is a git-lfs pointer, not the file itself; run "
+                "`git lfs pull` in its repository to fetch it."
             )
 
 

@@ -2,7 +2,6 @@
 
 import io
 import os
-import re
 import subprocess
 import sys
 from importlib import import_module
@@ -106,8 +105,7 @@ def test_one_line_says_so_before_it_happens(marked):
         compilation.compile_kernels(["cpu"])
         compilation.compile_kernels(["cpu"])
     said = console.export_text()
-    assert re.match(r"compiling kernels for this machine, once: \d+%, about ", said)
-    assert said.count("\n") == 1
+    assert said == "compiling kernels for this machine, once\n"
 
 
 def test_warmup_says_what_it_did(marked, monkeypatch, capsys):

@@ -9,7 +9,8 @@ import pytest
 import torch
 
 from gscompleter.kernels import tiles
-from gscompleter.kernels.rasterizer import DEPTH, NUM_SPLAT_COLUMNS, TILE
+from gscompleter.kernels.project import DEPTH, NUM_SPLAT_COLUMNS
+from gscompleter.kernels.simd import TILE
 from gscompleter.render.cpu import CpuRenderer, make_pinhole
 from gscompleter.render.viewpoint import Splats, Viewpoint, order_by_use
 from scenes import camera_at, random_gaussians

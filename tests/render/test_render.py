@@ -4,18 +4,18 @@ import sys
 from dataclasses import dataclass, replace
 from functools import partial
 
-import numpy as np
 import pytest
 import torch
 
 import stand_in_gsplat
 from gscompleter import Gaussians, InputError, Render, load_renderer, merge
 from gscompleter.geometry import compute_z_depths, move_to_depths
-from gscompleter.kernels import rasterizer
+from gscompleter.kernels import composite
 from gscompleter.render import choose_device
 from gscompleter.render.cpu import CpuRenderer
 from gscompleter.render.gsplat import freeze_with
-from gscompleter.render.reference import ReferenceFrozenScene, ReferenceRenderer
+from gscompleter.render.redraw import RedrawnScene
+from gscompleter.render.reference import ReferenceRenderer
 from gscompleter.types import make_observed, sh_from_rgb
 from parity import assert_close
 from scenes import Room, camera_at, gaussians_of, random_gaussians, scaled, view_of
@@ -28,8 +28,6 @@ PARAMETERS = ("means", "quats", "scales", "opacities", "sh")
 ROUNDING = 1e-5
 """Largest difference of drawings and of gradients, of the largest value. At most 5.1e-6 was
 measured, and 6.4e-6 with kernels compiled without fused multiplications."""
-FOLDED = 3e-4
-"""The same for renders of fragments: a pixel may be full a few faint splats later."""
 
 
 def in_dtype(gaussians: Gaussians, dtype: torch.dtype) -> Gaussians:
@@ -294,7 +292,7 @@ def count_tiles(monkeypatch) -> list[int]:
         return counted
 
     for name in ("composite", "composite_backward"):
-        monkeypatch.setattr(rasterizer, name, counting(getattr(rasterizer, name)))
+        monkeypatch.setattr(composite, name, counting(getattr(composite, name)))
     return drawn
 
 
@@ -355,135 +353,6 @@ def test_a_plan_of_colours_tells_what_the_composite_in_these_colours_lacks(antia
         assert_close(sums, true_sums, "what is missing")
         assert_close(weights, true_weights, "weights")
         assert true_weights.max() > 1
-
-
-@pytest.mark.parametrize("name", ["random", "harmonics", "room", "antialiased-room"])
-def test_a_plan_of_appearances_is_the_composite_that_looks_like_this(name):
-    """In front of the context, within it and behind it, to the tolerance of full pixels."""
-    _, new = context_and_new(SCENES[name].is_antialiased)
-    frozen = CPU.freeze(SCENES[name], CAMERA)
-    plan, generator = frozen.vary_appearance(new, EVERYWHERE), torch.Generator().manual_seed(0)
-    for share in (1.0, 0.5, 0.1):
-        leaves = {
-            "opacities": share * new.opacities,
-            "sh": torch.randn(len(new), 4, 3, generator=generator),
-        }
-        planned, grads = image_gradients(plan, leaves)
-        truth, expected = image_gradients(
-            lambda opacities, sh: frozen.composite(replace(new, opacities=opacities, sh=sh)).image,
-            leaves,
-        )
-        assert_close(planned, truth, "image", FOLDED)
-        assert_close(
-            grads["opacities"], expected["opacities"], "gradient of opacities", 10 * FOLDED
-        )
-        assert_close(grads["sh"], expected["sh"], "gradient of harmonics", FOLDED)
-
-
-def image_gradients(function, values: dict[str, torch.Tensor]):
-    leaves = {name: value.clone().requires_grad_() for name, value in values.items()}
-    image = function(**leaves)
-    weight = torch.linspace(0, 1, image.numel()).view_as(image)
-    grads = torch.autograd.grad((image * weight).sum(), list(leaves.values()))
-    return image.detach(), dict(zip(leaves, grads, strict=True))
-
-
-@MODES
-def test_what_a_plan_compares_is_its_image(antialiased):
-    """Weights are 0 in places, and pixels without new fragments count all the same."""
-    context, new = context_and_new(antialiased)
-    generator = torch.Generator().manual_seed(0)
-    wanted = torch.rand(CAMERA.height, CAMERA.width, 3, generator=generator)
-    weights = torch.rand(CAMERA.height, CAMERA.width, generator=generator).sub(0.3).clamp_min(0)
-    frozen = [r.freeze(context, CAMERA) for r in (CpuRenderer(1), CpuRenderer(3), REFERENCE)]
-    plans = [view.vary_appearance(new, EVERYWHERE) for view in frozen]
-    leaves = {"opacities": 0.5 * new.opacities, "sh": 0.9 * new.sh}
-
-    def full_error(opacities, sh):
-        return (weights * (plans[0](opacities, sh) - wanted).square().sum(dim=-1)).sum()
-
-    true_error, true_gradients = value_and_gradients(full_error, leaves)
-    errors = [plan.make_error(wanted, weights) for plan in plans]
-    assert errors[0](**leaves) == errors[1](**leaves)
-    for compared in errors:
-        error, grads = value_and_gradients(partial(tripled, compared), leaves)
-        assert_close(error / 3, true_error, "error", 1e-4)
-        for name in leaves:
-            assert_close(grads[name] / 3, true_gradients[name], f"gradient of {name}", 1e-3)
-
-
-@pytest.mark.parametrize("name", ["random", "room", "antialiased-room"])
-def test_a_plan_of_appearances_has_fragments_only_where_it_is_asked_for(name):
-    """In a disk and a pixel all is as in a mask of the image; the rest is the frozen scene."""
-    _, new = context_and_new(SCENES[name].is_antialiased)
-    frozen = CPU.freeze(SCENES[name], CAMERA)
-    rows, columns = torch.meshgrid(torch.arange(48), torch.arange(48), indexing="ij")
-    where = (rows - 16) ** 2 + (columns - 18) ** 2 < 100
-    where[40, 41] = True
-    whole, part = (frozen.vary_appearance(new, asked) for asked in (EVERYWHERE, where))
-    appearance = 0.7 * new.opacities, 0.9 * new.sh
-    assert_close(part(*appearance)[where], whole(*appearance)[where], "image", ROUNDING)
-    assert torch.equal(part(*appearance)[~where], frozen.render.image[~where])
-    wanted = torch.rand(48, 48, 3, generator=torch.Generator().manual_seed(0))
-    leaves = dict(zip(("opacities", "sh"), appearance, strict=True))
-    errors = [plan.make_error(wanted, where.float()) for plan in (whole, part)]
-    (error, grads), (expected, true_gradients) = (value_and_gradients(t, leaves) for t in errors)
-    assert_close(error, expected, "error", ROUNDING)
-    for name in leaves:
-        assert_close(grads[name], true_gradients[name], f"gradient of {name}", ROUNDING)
-    of_pixels, of_part = fragments_of(whole), fragments_of(part)
-    assert torch.equal(of_part, of_pixels * where)
-    assert 0 < of_part.sum() < of_pixels.sum() / 4
-
-
-def fragments_of(plan) -> torch.Tensor:
-    """Count the fragments of each pixel [h, w]."""
-    side = rasterizer.TILE
-    counts = torch.zeros(CAMERA.height // side, CAMERA.width // side, side, side, dtype=torch.long)
-    for piece in plan.fragments:
-        found = torch.from_numpy(np.diff(piece.pixel_start)).view(-1, side, side)
-        counts.view(-1, side, side)[torch.from_numpy(piece.tiles)] = found
-    return counts.transpose(1, 2).reshape(CAMERA.height, CAMERA.width)
-
-
-def tripled(function, **leaves):
-    return 3 * function(**leaves)
-
-
-def value_and_gradients(function, values: dict[str, torch.Tensor]):
-    leaves = {name: value.clone().requires_grad_() for name, value in values.items()}
-    value = function(**leaves)
-    grads = torch.autograd.grad(value, list(leaves.values()))
-    return value.detach(), dict(zip(leaves, grads, strict=True))
-
-
-def test_what_is_closed_by_something_solid_is_closed_at_the_same_splat():
-    """Three walls, one behind the other, of which one pixel drops the one that fills it."""
-    wall = gaussians_of(view_of(Room(), camera_at(size=64)))
-    context = merge([placed(wall, 1.0), placed(wall, 1.02)])
-    frozen, new = CPU.freeze(context, CAMERA), merge([placed(wall, 0.98), placed(wall, 1.01)])
-    for opacity in (0.3, 0.9, 0.97):
-        opacities = torch.full((len(new),), opacity)
-        planned = frozen.vary_appearance(new, EVERYWHERE)(opacities, new.sh)
-        truth = frozen.composite(replace(new, opacities=opacities)).image
-        assert_close(planned, truth, "image", FOLDED)
-
-
-def placed(gaussians: Gaussians, share: float) -> Gaussians:
-    """Move the Gaussians to a share of their distance from the world's origin."""
-    return replace(gaussians, means=share * gaussians.means)
-
-
-def test_what_looks_otherwise_costs_what_is_new_however_much_is_frozen():
-    """Faint splats fill the image: ten times as many of them leave the fragments as many."""
-    _, new = context_and_new()
-    few, many = (random_gaussians(count, seed=7) for count in (200, 2000))
-    counts = []
-    for context in (few, many):
-        faint = replace(context, opacities=0.02 * context.opacities)
-        fragments = CPU.freeze(faint, CAMERA).vary_appearance(new, EVERYWHERE).fragments
-        counts.append(sum(len(piece.entries) - len(piece.baked) for piece in fragments))
-    assert counts[0] == counts[1] > 0
 
 
 def masked(render: Render, where: torch.Tensor) -> Render:
@@ -685,4 +554,4 @@ def test_a_frozen_view_on_a_gpu_draws_what_drawing_everything_anew_does(name):
     new = replace(new, is_antialiased=context.is_antialiased)
     view = cuda.freeze(context, camera)
     assert 0 < len(view.visible_scene) < len(context) / 2 + 1
-    check_frozen(view, ReferenceFrozenScene(cuda, context, camera), new, 1e-3)
+    check_frozen(view, RedrawnScene(cuda, context, camera), new, 1e-3)

@@ -9,7 +9,7 @@ from gscompleter.config import AlignmentConfig, CompleterConfig, RegistrationCon
 from gscompleter.geometry import project, slide
 from gscompleter.render import Renderer, load_renderer
 from gscompleter.render.cpu import CpuRenderer
-from gscompleter.render.reference import ReferenceFrozenScene
+from gscompleter.render.redraw import RedrawnScene
 from gscompleter.sky import SKY_DEPTH
 from gscompleter.stages.align_depth import align_depth
 from gscompleter.stages.slide_along_rays import (
@@ -129,7 +129,7 @@ class Plain(CpuRenderer):
     """A renderer without shortcuts, with the same kernels."""
 
     def freeze(self, context, camera):
-        return ReferenceFrozenScene(CPU, context, camera)
+        return RedrawnScene(CPU, context, camera)
 
 
 @pytest.mark.parametrize(

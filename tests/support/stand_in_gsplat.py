@@ -1,4 +1,4 @@
-"""The part of gsplat 1.5 that `render/cuda.py` calls, on the reference renderer and a CPU.
+"""The part of gsplat 1.5 that `render/gsplat.py` calls, on the reference renderer and a CPU.
 
 Names, shapes and results are gsplat's, as far as they are used. So it tests how gsplat is called,
 not gsplat itself.
@@ -7,6 +7,7 @@ not gsplat itself.
 from __future__ import annotations
 
 from dataclasses import replace
+from importlib.machinery import ModuleSpec
 from types import ModuleType
 from typing import Any
 
@@ -115,5 +116,6 @@ def rasterize_to_pixels(
 def module() -> ModuleType:
     """Make a module named gsplat of it."""
     made = ModuleType("gsplat")
+    made.__spec__ = ModuleSpec("gsplat", None)
     made.rasterization, made.rasterize_to_pixels = rasterization, rasterize_to_pixels
     return made

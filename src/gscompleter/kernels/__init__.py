@@ -1,8 +1,9 @@
 """Compiled loops (numba) on plain arrays, independent of the types of the package.
 
-The cache notices edits of one file only, so each file holds all that its kernels inline. Fast
-mathematics is limited to `contract`: reordered sums (`reassoc`) would round differently in the
-process that compiles a kernel and in those that load it from the cache.
+Kernels work on a range (begin, end) of elements, write to their own outputs and release the
+interpreter lock. Results do not depend on how ranges are split among threads. Fast mathematics is
+limited to `contract`: reordered sums (`reassoc`) would round differently in the process that
+compiles a kernel and in those that load it from the cache.
 """
 
 import os
@@ -30,21 +31,17 @@ def _skip_blas_check():
 
 
 def _remove_stale_indices():
-    """Remove cache indices older than their source, or without one.
+    """Remove cache indices that are older than any kernel's source.
 
-    They would be compiled again in any case, but numba fails to read one that names a type that
-    the source no longer has.
+    numba itself notices edits of a kernel's own file, but not of those that it inlines.
     """
     here = Path(__file__).parent
-    folders = [
-        here / "__pycache__",
-        *Path(os.environ.get("NUMBA_CACHE_DIR", here)).glob("kernels_*"),
-    ]
-    indices = [index for folder in folders for index in folder.glob("*.nbi")]
-    for index in indices:
-        source = here / f"{index.name.split('.')[0]}.py"
-        if not source.is_file() or source.stat().st_mtime > index.stat().st_mtime:
-            index.unlink(missing_ok=True)
+    newest = max(source.stat().st_mtime for source in here.glob("*.py"))
+    caches = Path(os.environ.get("NUMBA_CACHE_DIR", here)).glob("kernels_*")
+    for folder in (here / "__pycache__", *caches):
+        for index in folder.glob("*.nbi"):
+            if index.stat().st_mtime < newest:
+                index.unlink(missing_ok=True)
 
 
 _remove_stale_indices()

@@ -17,23 +17,17 @@ PIECES_PER_THREAD = 4
 """Number of pieces per thread, which balances pieces of different cost."""
 
 
-class _Thread(threading.local):
-    """State of the calling thread."""
-
-    is_alone = False
-    """True if its kernels run on it alone."""
-
-
-_thread = _Thread()
+_thread = threading.local()
 
 
 def _stay_alone():
+    """Run the kernels of the calling thread on it alone."""
     _thread.is_alone = True
 
 
 def count_threads(threads):
     """Return how many threads a kernel called here uses, if `threads` are available."""
-    return 1 if _thread.is_alone else threads or numba.config.NUMBA_NUM_THREADS
+    return 1 if hasattr(_thread, "is_alone") else threads or numba.config.NUMBA_NUM_THREADS
 
 
 def share(kernel, count, *arguments, threads=None):

@@ -4,9 +4,7 @@ import math
 from typing import NamedTuple
 
 import numpy as np
-from llvmlite import ir
-from numba import njit, types
-from numba.extending import intrinsic
+from numba import njit
 
 BLOCK = 256
 """Gaussians per block."""
@@ -35,13 +33,6 @@ class CameraPose(NamedTuple):
     """Product of fx and fy, in squared pixels."""
 
 
-@intrinsic
-def _bits_to_float(typing, bits):
-    return types.float32(
-        types.int32
-    ), lambda context, builder, signature, arguments: builder.bitcast(arguments[0], ir.FloatType())
-
-
 @njit(cache=True, fastmath={"contract"})
 def _acos(x):
     one = np.float32(1)
@@ -59,7 +50,7 @@ def _exp_negative(x):
     whole = np.int32(power)
     rest = power - np.float32(whole)
     series = _E0 + rest * (_E1 + rest * (_E2 + rest * (_E3 + rest * (_E4 + rest * _E5))))
-    return series * _bits_to_float(np.int32((whole + 127) << 23))
+    return series * np.int32((whole + 127) << 23).view(np.float32)
 
 
 @njit(cache=True, fastmath={"contract"}, error_model="numpy")

@@ -1,25 +1,16 @@
 """Splat lists of the tiles, front to back, and sums of gradients over their entries."""
 
 import numpy as np
-from llvmlite import ir
-from numba import njit, types
-from numba.extending import intrinsic
+from numba import njit
 
-from gscompleter.kernels.rasterizer import DEPTH, NUM_SPLAT_COLUMNS, TILE
+from gscompleter.kernels.project import DEPTH, NUM_SPLAT_COLUMNS
+from gscompleter.kernels.simd import TILE
 
 TILE_SHIFT = 4
 """Binary logarithm of `TILE`."""
 
 
 # ---- From splats to lists ------------------------------------------------------------------------
-
-
-@intrinsic
-def _float_to_bits(typing, value):
-    """Reinterpret a float32 as uint32; positive numbers keep their order."""
-    return types.uint32(
-        types.float32
-    ), lambda context, builder, signature, arguments: builder.bitcast(arguments[0], ir.IntType(32))
 
 
 @njit(cache=True, nogil=True)
@@ -66,7 +57,7 @@ def fill_entries(begin, end, splats, boxes, depth_limits, tiles_x, places, entri
                 if splats[i, DEPTH] <= depth_limits[tile]:
                     place = places[tile]
                     places[tile] = place + 1
-                    entries[place], keys[place] = i, _float_to_bits(splats[i, DEPTH])
+                    entries[place], keys[place] = i, np.float32(splats[i, DEPTH]).view(np.uint32)
 
 
 @njit(cache=True, nogil=True)

@@ -36,30 +36,6 @@ DepthRender = Callable[[Float[Tensor, "n"]], Render]
 """Renders a frozen scene with Gaussians that vary in z-depth [n] only."""
 
 
-AppearanceError = Callable[[Float[Tensor, "n"], Float[Tensor, "n k 3"]], Float[Tensor, ""]]
-"""Squared error of an image at given opacities and harmonics; differentiable in both."""
-
-
-@runtime_checkable
-class AppearanceRender(Protocol):
-    """A frozen scene with Gaussians that vary in opacity and spherical harmonics only."""
-
-    def __call__(
-        self, opacities: Float[Tensor, "n"], sh: Float[Tensor, "n k 3"]
-    ) -> Float[Tensor, "h w 3"]:
-        """Render the image; differentiable."""
-
-    def make_error(
-        self, wanted: Float[Tensor, "h w 3"], weights: Float[Tensor, "h w"]
-    ) -> AppearanceError:
-        """Make an error function: sum of `weights` (>= 0) times squared errors of all channels."""
-
-
-def fix_harmonics(plan: AppearanceRender, sh: Float[Tensor, "n k 3"]) -> OpacityImage:
-    """Fix the spherical harmonics of an `AppearanceRender`."""
-    return lambda opacities: plan(opacities, sh)
-
-
 ColorSums = tuple[Float[Tensor, "n 3"], Float[Tensor, "n"]]
 """Per Gaussian: compositing weight times an image [h, w, 3], and weight, summed over pixels."""
 
@@ -98,12 +74,6 @@ class FrozenScene(Protocol):
 
     def vary_opacities(self, new: Gaussians) -> OpacityRender:
         """Fix all of `new` but the opacities; the result is differentiable."""
-
-    def vary_appearance(self, new: Gaussians, where: Bool[Tensor, "h w"]) -> AppearanceRender:
-        """Fix all of `new` but opacities and harmonics, and render it at least in the mask `where`.
-
-        Differentiable in both. Takes longer to make than `vary_opacities`, but renders faster.
-        """
 
     def vary_colors(self, new: Gaussians) -> ColorErrors:
         """Fix all of `new` but its colours, which the camera sees as given, from 0 up."""

@@ -15,17 +15,16 @@ from torch import Tensor
 from torch.autograd.function import once_differentiable
 
 from gscompleter.errors import InputError
-from gscompleter.kernels import rasterizer, tiles
+from gscompleter.kernels import composite, project, tiles
+from gscompleter.kernels.composite import Layer, RasterFrame
 from gscompleter.kernels.parallel import run, split_range
-from gscompleter.kernels.rasterizer import TILE, GaussianArrays, Layer, Pinhole, RasterFrame
+from gscompleter.kernels.project import GaussianArrays, Pinhole
+from gscompleter.kernels.simd import TILE
 from gscompleter.render import ColorErrors, ColorSums, DepthRender, OpacityRender
-from gscompleter.render.fragments import BakedScene, bake_scene
 from gscompleter.render.viewpoint import (
     BinnedSplats,
     Splats,
     Viewpoint,
-    assign_splat_slots,
-    compute_starts,
     gather_splats,
     order_by_use,
     to_float32,
@@ -94,12 +93,12 @@ class CpuFrozenScene:
         frame = self.viewpoint.composite(self.layer, self.frame, added)
         used = np.zeros_like(frame.used)
         used[:, 0] = frame.used.sum(axis=1)
-        tile_start = compute_starts(used[:, 0])
+        tile_start = np.concatenate([[0], np.cumsum(used[:, 0], dtype=np.int64)])
         entries = np.empty(tile_start[-1], np.int32)
         depth_limits = np.empty(self.viewpoint.tiles, np.float32)
         walked = (self.layer, added, frame.used, frame.full)
         merged = (tile_start, entries, depth_limits)
-        self.viewpoint.share(rasterizer.merge_lists, len(used), *walked, *merged)
+        self.viewpoint.share(composite.merge_lists, len(used), *walked, *merged)
         layer, kept = join_layers(self.layer, added, tile_start, entries)
         rows = np.concatenate([self.rows[kept[0]], order[kept[1]] + np.int32(self.count)])
         frame = frame._replace(used=used)
@@ -110,7 +109,7 @@ class CpuFrozenScene:
         nothing, itself = freeze_nothing(self.viewpoint).layer, assign_own_slots(self.layer)
         frame = self.frame._replace(used=np.ascontiguousarray(self.frame.used[:, ::-1]))
         d_frame = (image, torch.zeros_like(image[..., 0]), torch.zeros_like(image[..., 0]))
-        composited = (nothing, itself, frame, d_frame, rasterizer.WANT_COLOR)
+        composited = (nothing, itself, frame, d_frame, composite.WANT_COLOR)
         gradients = self.viewpoint.composite_backward(*composited)
         totals = np.zeros((self.count, 3), np.float32)
         named = (self.layer.entries, self.rows, *gradients, totals)
@@ -122,16 +121,20 @@ class CpuFrozenScene:
     def splat(self, values: Float[Tensor, "n"]) -> Float[Tensor, "h w"]:
         """Composite the frozen lists once more, with the values as red."""
         splats = self.layer.splats.copy()
-        splats[:, rasterizer.RED] = np.maximum(to_float32(values)[self.rows], 0)
+        splats[:, project.RED] = np.maximum(to_float32(values)[self.rows], 0)
         nothing = freeze_nothing(self.viewpoint)
-        layer = self.layer._replace(splats=splats)
-        frame = self.viewpoint.composite(nothing.layer, nothing.frame, layer)
-        return torch.from_numpy(frame.image[..., 0].copy())
+        _, render = nothing.composite_layer(self.layer._replace(splats=splats))
+        return render.image[..., 0].clone()
 
     def composite(self, new: Gaussians) -> Render:
         """Render context and `new`; only `new` is projected, sorted and binned."""
         tensors = (getattr(new, name).to("cpu", torch.float32) for name in GaussianArrays._fields)
         return Render(*_Composite.apply(self, new.is_antialiased, *tensors))
+
+    def composite_layer(self, new: Layer) -> tuple[RasterFrame, Render]:
+        """Composite the context and a new layer."""
+        frame = self.viewpoint.composite(self.layer, self.frame, new)
+        return frame, to_render(frame)
 
     def vary_opacities(self, new: Gaussians) -> OpacityRender:
         """Project, sort and bin `new` once, with boxes that hold for every opacity."""
@@ -142,19 +145,12 @@ class CpuFrozenScene:
 
         return render
 
-    def vary_appearance(self, new: Gaussians, where: Bool[Tensor, "h w"]) -> BakedScene:
-        """Project, sort and bin `new` once, and bake the context around it."""
-        arrays = to_opaque_arrays(new)
-        limits = np.minimum(self.viewpoint.limit_to_mask(where), self.depth_limits)
-        binned = self.viewpoint.bin(arrays, new.is_antialiased, limits)
-        return bake_scene(self.viewpoint, self.layer, self.frame, binned, arrays.means, where)
-
     def vary_colors(self, new: Gaussians) -> ColorErrors:
         """Project, sort and bin `new` once."""
         binned = self.viewpoint.bin(to_arrays(new), new.is_antialiased, self.depth_limits)
 
         def errors(colors: Float[Tensor, "n 3"], photograph: Float[Tensor, "h w 3"]) -> ColorSums:
-            binned.layer.splats[:, rasterizer.RED :] = np.maximum(to_float32(colors), 0)
+            binned.layer.splats[:, project.RED :] = np.maximum(to_float32(colors), 0)
             sums = self.viewpoint.backproject_residual(self.layer, binned, to_float32(photograph))
             return torch.from_numpy(sums[:, :3]), torch.from_numpy(sums[:, 3])
 
@@ -184,9 +180,8 @@ class _Composite(torch.autograd.Function):
     ) -> tuple[Tensor, ...]:
         gaussians = GaussianArrays(*map(to_float32, tensors))
         splats = view.viewpoint.project(gaussians, is_antialiased)
-        binned = assign_splat_slots(view.viewpoint.fill_lists(splats, view.depth_limits))
-        frame = view.viewpoint.composite(view.layer, view.frame, binned.layer)
-        render = to_render(frame)
+        binned = view.viewpoint.enter(splats, view.depth_limits)
+        frame, render = view.composite_layer(binned.layer)
         ctx.scene = (view, splats.factors, binned, frame)
         # Torch raises an error if a saved tensor is written to before the backward pass.
         ctx.save_for_backward(*tensors, render.depth, render.alpha)
@@ -199,10 +194,9 @@ class _Composite(torch.autograd.Function):
         gaussians = GaussianArrays(*map(to_float32, ctx.saved_tensors[:5]))
         gradients = view.viewpoint.composite_backward(view.layer, binned, frame, d_frame)
         result = GaussianArrays(*map(np.zeros_like, gaussians))
-        seen = (gaussians, view.viewpoint.pinhole, factors)
-        composited = (*seen, binned.layer.splats, binned.slot_start)
-        n = len(gaussians.means)
-        view.viewpoint.share(rasterizer.project_backward, n, *composited, *gradients, result)
+        seen = (gaussians, view.viewpoint.pinhole, factors, binned.layer.splats)
+        received = (binned.slot_start, *gradients, result)
+        view.viewpoint.share(project.project_backward, len(result.means), *seen, *received)
         return None, None, *map(torch.from_numpy, result)
 
 
@@ -215,8 +209,7 @@ class _VaryOpacities(torch.autograd.Function):
     ) -> tuple[Tensor, ...]:
         seen = to_float32(opacities) * binned.layer.opacities  # those of opaque Gaussians
         layer = binned.layer._replace(opacities=seen)
-        frame = view.viewpoint.composite(view.layer, view.frame, layer)
-        render = to_render(frame)
+        frame, render = view.composite_layer(layer)
         ctx.scene = (view, replace(binned, layer=layer), frame)
         ctx.save_for_backward(opacities, render.depth, render.alpha)
         return render.image, render.depth, render.alpha
@@ -227,7 +220,7 @@ class _VaryOpacities(torch.autograd.Function):
         view, binned, frame = ctx.scene
         opacities = to_float32(ctx.saved_tensors[0])
         composited = (view.layer, binned, frame, d_frame)
-        gradients = view.viewpoint.composite_backward(*composited, rasterizer.WANT_OPACITY)
+        gradients = view.viewpoint.composite_backward(*composited, composite.WANT_OPACITY)
         sums = view.viewpoint.sum_by_gaussian(binned, gradients)[:, 0]
         result = np.divide(sums, opacities, out=np.zeros_like(sums), where=sums != 0)
         return None, None, torch.from_numpy(result)
@@ -241,9 +234,8 @@ class _VaryDepths(torch.autograd.Function):
         ctx: Any, view: CpuFrozenScene, splats: Splats, limits: Any, depths: Tensor
     ) -> tuple[Tensor, ...]:
         moved = splats.move_to_depths(to_float32(depths), view.viewpoint.pinhole.near)
-        binned = assign_splat_slots(view.viewpoint.fill_lists(moved, limits))
-        frame = view.viewpoint.composite(view.layer, view.frame, binned.layer)
-        render = to_render(frame)
+        binned = view.viewpoint.enter(moved, limits)
+        frame, render = view.composite_layer(binned.layer)
         ctx.scene = (view, binned, frame)
         ctx.save_for_backward(render.depth, render.alpha)
         ctx.mark_non_differentiable(render.image, render.alpha)
@@ -254,13 +246,9 @@ class _VaryDepths(torch.autograd.Function):
     def backward(ctx: Any, *d_frame: Tensor) -> tuple[Tensor | None, ...]:
         view, binned, frame = ctx.scene
         composited = (view.layer, binned, frame, d_frame)
-        gradients = view.viewpoint.composite_backward(*composited, rasterizer.WANT_DEPTH)
-        return (
-            None,
-            None,
-            None,
-            torch.from_numpy(view.viewpoint.sum_by_gaussian(binned, gradients)[:, 0]),
-        )
+        gradients = view.viewpoint.composite_backward(*composited, composite.WANT_DEPTH)
+        sums = view.viewpoint.sum_by_gaussian(binned, gradients)[:, 0]
+        return None, None, None, torch.from_numpy(sums)
 
 
 def freeze_nothing(viewpoint: Viewpoint) -> CpuFrozenScene:
@@ -276,7 +264,7 @@ def freeze_nothing(viewpoint: Viewpoint) -> CpuFrozenScene:
         full=np.zeros(viewpoint.tiles, np.bool_),
     )
     layer = Layer(
-        np.empty((0, rasterizer.NUM_SPLAT_COLUMNS), np.float32),
+        np.empty((0, project.NUM_SPLAT_COLUMNS), np.float32),
         np.empty(0, np.float32),
         np.empty((0, 4), viewpoint.box_dtype),
         np.zeros(viewpoint.tiles + 1, np.int64),

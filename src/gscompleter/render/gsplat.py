@@ -14,17 +14,8 @@ import torch
 from jaxtyping import Bool, Float, Int64
 from torch import Tensor
 
-from gscompleter.errors import InputError
-from gscompleter.geometry import move_to_depths
-from gscompleter.render import AppearanceRender, ColorErrors, DepthRender, OpacityRender, Renderer
-from gscompleter.render.redraw import (
-    FullRedraw,
-    backproject_by_autograd,
-    backproject_errors_by_autograd,
-    set_appearance,
-    set_colors,
-    to_grey,
-)
+from gscompleter.render import OpacityRender, Renderer, choose_device
+from gscompleter.render.redraw import RedrawnScene, set_colors
 from gscompleter.render.spherical_harmonics import evaluate_colors
 from gscompleter.types import Camera, Gaussians, Render, merge
 
@@ -49,15 +40,7 @@ class CudaRenderer:
     """
 
     def __post_init__(self) -> None:
-        if not torch.cuda.is_available():
-            raise InputError("The cuda renderer needs a GPU, and torch sees none; use cpu.")
-        try:
-            import gsplat  # noqa: F401
-        except ImportError as error:
-            raise InputError(
-                "The cuda renderer needs gsplat, which is not installed; "
-                "run `pip install gscompleter[cuda]`."
-            ) from error
+        choose_device("cuda")
 
     def render(self, gaussians: Gaussians, camera: Camera) -> Render:
         """Render `gaussians` from `camera`."""
@@ -139,25 +122,17 @@ class CudaRenderer:
 
 
 @dataclass(frozen=True)
-class CudaFrozenScene:
+class CudaFrozenScene(RedrawnScene):
     """A frozen scene that keeps only Gaussians visible to its camera.
 
     Each composite still projects and sorts all of them, since new ones may lie anywhere in between.
     """
 
     renderer: CullingRenderer
-    scene: Gaussians
-    camera: Camera
     rows: Int64[Tensor, "m"]
     """Index in the context of each Gaussian of `scene`."""
     count: int
     """Number of Gaussians of the context."""
-
-    @cached_property
-    def render(self) -> Render:
-        """The render of the context alone."""
-        with torch.no_grad():
-            return self.renderer.render(self.scene, self.camera)
 
     @cached_property
     def visible_rows(self) -> Int64[Tensor, "seen"]:
@@ -180,48 +155,19 @@ class CudaFrozenScene:
         return replace(self, scene=merge([self.visible_scene, new]), rows=rows, count=count)
 
     def backproject(self, image: Float[Tensor, "h w 3"]) -> Float[Tensor, "n 3"]:
-        """Backproject `image` by autograd."""
+        """Sum `image` over the compositing weights; they are 0 for invisible Gaussians."""
         sums = image.new_zeros((self.count, 3))
-        return sums.index_copy(
-            0,
-            self.rows[self.visible_rows],
-            backproject_by_autograd(self._render_colors, self.visible_scene, image),
-        )
+        return sums.index_copy(0, self.rows[self.visible_rows], super().backproject(image))
 
     def splat(self, values: Float[Tensor, "n"]) -> Float[Tensor, "h w"]:
         """Render the visible Gaussians with the values as grey."""
-        return self._render_colors(to_grey(values[self.rows[self.visible_rows]]))[..., 0]
-
-    def _render_colors(self, colors: Float[Tensor, "seen 3"]) -> Float[Tensor, "h w 3"]:
-        return self.renderer.render(set_colors(self.visible_scene, colors), self.camera).image
-
-    def composite(self, new: Gaussians) -> Render:
-        """Render context and `new`."""
-        return self.renderer.render(merge([self.visible_scene, new]), self.camera)
+        return super().splat(values[self.rows[self.visible_rows]])
 
     def vary_opacities(self, new: Gaussians) -> OpacityRender:
         """Fix all of `new` but the opacities, with boxes that hold for every opacity."""
         opaque = replace(new, opacities=torch.ones_like(new.opacities))
         render = self.renderer.vary_opacities(merge([self.visible_scene, opaque]), self.camera)
         return lambda opacities: render(torch.cat([self.visible_scene.opacities, opacities]))
-
-    def vary_appearance(self, new: Gaussians, where: Bool[Tensor, "h w"]) -> AppearanceRender:
-        """Fix all of `new` but its appearance; each render is a full redraw."""
-        return FullRedraw(lambda *looks: self.composite(set_appearance(new, *looks)).image)
-
-    def vary_colors(self, new: Gaussians) -> ColorErrors:
-        """Fix all of `new` but its colours; each render is a full redraw."""
-
-        def render(colors: Float[Tensor, "n 3"]) -> Float[Tensor, "h w 3"]:
-            return self.composite(set_colors(new, colors)).image
-
-        return lambda colors, photograph: backproject_errors_by_autograd(
-            render, new, colors, photograph
-        )
-
-    def vary_depths(self, new: Gaussians, where: Bool[Tensor, "h w"]) -> DepthRender:
-        """Fix all of `new` but its depths; each render is a full redraw."""
-        return lambda depths: self.composite(move_to_depths(new, self.camera, depths))
 
 
 def freeze_with(renderer: CullingRenderer, context: Gaussians, camera: Camera) -> CudaFrozenScene:

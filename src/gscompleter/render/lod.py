@@ -17,15 +17,11 @@ from torch import Tensor
 
 from gscompleter.kernels import lod as kernels
 from gscompleter.kernels.parallel import share
-from gscompleter.kernels.rasterizer import GaussianArrays
+from gscompleter.kernels.project import GaussianArrays
 from gscompleter.memory import count_fitting_gaussians
 from gscompleter.render.cpu import to_arrays
 from gscompleter.render.viewpoint import to_float32
-from gscompleter.types import (
-    Camera,
-    Gaussians,
-    Proxy,
-)
+from gscompleter.types import Camera, Gaussians, Proxy
 
 MIN_PROXY_GAUSSIANS = 500_000
 """Gaussians from which on a proxy saves more time than it takes to build."""
@@ -93,8 +89,7 @@ def thin_gaussians(scene: Gaussians, max_gaussians: int = MAX_GAUSSIANS) -> Gaus
     """Reduce a scene to about `max_gaussians` Gaussians, enlarged to cover the same area.
 
     Gaussians are kept with a probability proportional to their size. The choice depends on their
-    order
-    alone, and neighbours in the file are thinned evenly.
+    order alone, and neighbours in the file are thinned evenly.
     """
     if len(scene) <= max_gaussians:
         return scene

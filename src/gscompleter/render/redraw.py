@@ -1,16 +1,81 @@
-"""Renders of Gaussians in other colours, which expose their compositing weights."""
+"""A frozen scene that is redrawn at each call, for renderers that have nothing faster."""
 
 from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass, replace
+from functools import cached_property
 
 import torch
-from jaxtyping import Float
+from jaxtyping import Bool, Float
 from torch import Tensor
 
-from gscompleter.render import AppearanceError, ColorSums
-from gscompleter.types import Gaussians, sh_from_rgb
+from gscompleter.geometry import move_to_depths
+from gscompleter.render import ColorErrors, ColorSums, DepthRender, OpacityRender, Renderer
+from gscompleter.types import Camera, Gaussians, Render, merge, sh_from_rgb
+
+ColorRender = Callable[[Float[Tensor, "n 3"]], Float[Tensor, "h w 3"]]
+"""Renders an image of Gaussians in given colours."""
+
+
+@dataclass(frozen=True)
+class RedrawnScene:
+    """A `FrozenScene` of any renderer, by rendering and autograd alone."""
+
+    renderer: Renderer
+    scene: Gaussians
+    camera: Camera
+
+    @cached_property
+    def render(self) -> Render:
+        """The render of the scene alone."""
+        with torch.no_grad():
+            return self.renderer.render(self.scene, self.camera)
+
+    @property
+    def visible_scene(self) -> Gaussians:
+        """The Gaussians to render together with new ones."""
+        return self.scene
+
+    def extend(self, new: Gaussians) -> RedrawnScene:
+        """Add `new` to the scene."""
+        return replace(self, scene=merge([self.scene, new]))
+
+    def backproject(self, image: Float[Tensor, "h w 3"]) -> Float[Tensor, "n 3"]:
+        """Sum `image` over the compositing weights of each visible Gaussian."""
+        return backproject(self._render_colors, self.visible_scene, image)
+
+    def splat(self, values: Float[Tensor, "n"]) -> Float[Tensor, "h w"]:
+        """Render the visible Gaussians with the values as grey."""
+        return self._render_colors(values[:, None].expand(-1, 3))[..., 0]
+
+    def _render_colors(self, colors: Float[Tensor, "n 3"]) -> Float[Tensor, "h w 3"]:
+        return self.renderer.render(set_colors(self.visible_scene, colors), self.camera).image
+
+    def composite(self, new: Gaussians) -> Render:
+        """Render the visible Gaussians and `new`."""
+        return self.renderer.render(merge([self.visible_scene, new]), self.camera)
+
+    def vary_opacities(self, new: Gaussians) -> OpacityRender:
+        """Fix all of `new` but the opacities."""
+        return lambda opacities: self.composite(replace(new, opacities=opacities))
+
+    def vary_colors(self, new: Gaussians) -> ColorErrors:
+        """Fix all of `new` but its colours."""
+
+        def render(colors: Float[Tensor, "n 3"]) -> Float[Tensor, "h w 3"]:
+            return self.composite(set_colors(new, colors)).image
+
+        def errors(colors: Float[Tensor, "n 3"], photograph: Float[Tensor, "h w 3"]) -> ColorSums:
+            missing = photograph - render(colors).detach()
+            weights = backproject(render, new, torch.ones_like(missing))[:, 0]
+            return backproject(render, new, missing), weights
+
+        return errors
+
+    def vary_depths(self, new: Gaussians, where: Bool[Tensor, "h w"]) -> DepthRender:
+        """Fix all of `new` but its depths."""
+        return lambda depths: self.composite(move_to_depths(new, self.camera, depths))
 
 
 def set_colors(gaussians: Gaussians, colors: Float[Tensor, "n 3"]) -> Gaussians:
@@ -18,63 +83,14 @@ def set_colors(gaussians: Gaussians, colors: Float[Tensor, "n 3"]) -> Gaussians:
     return replace(gaussians, sh=sh_from_rgb(colors), encoded=None)
 
 
-def to_grey(values: Float[Tensor, "n"]) -> Float[Tensor, "n 3"]:
-    """Repeat each value in three channels."""
-    return values[:, None].expand(-1, 3)
-
-
-def set_appearance(
-    gaussians: Gaussians, opacities: Float[Tensor, "n"], sh: Float[Tensor, "n k 3"]
-) -> Gaussians:
-    """Replace the opacities and spherical harmonics of Gaussians."""
-    return replace(gaussians, opacities=opacities, sh=sh, encoded=None)
-
-
-@dataclass(frozen=True)
-class FullRedraw:
-    """An `AppearanceRender` that redraws the whole image at each call."""
-
-    render: Callable[[Float[Tensor, "n"], Float[Tensor, "n k 3"]], Float[Tensor, "h w 3"]]
-
-    def __call__(
-        self, opacities: Float[Tensor, "n"], sh: Float[Tensor, "n k 3"]
-    ) -> Float[Tensor, "h w 3"]:
-        """Render the image; differentiable."""
-        return self.render(opacities, sh)
-
-    def make_error(
-        self, wanted: Float[Tensor, "h w 3"], weights: Float[Tensor, "h w"]
-    ) -> AppearanceError:
-        """Make an error function: sum of `weights` (>= 0) times squared errors of all channels."""
-
-        def error(opacities: Float[Tensor, "n"], sh: Float[Tensor, "n k 3"]) -> Float[Tensor, ""]:
-            return (weights * (self.render(opacities, sh) - wanted).square().sum(dim=-1)).sum()
-
-        return error
-
-
-def backproject_by_autograd(
-    render: Callable[[Float[Tensor, "n 3"]], Float[Tensor, "h w 3"]],
-    gaussians: Gaussians,
-    image: Float[Tensor, "h w 3"],
+def backproject(
+    render: ColorRender, gaussians: Gaussians, image: Float[Tensor, "h w 3"]
 ) -> Float[Tensor, "n 3"]:
-    """Sum `image` over the compositing weights of `gaussians`, by autograd through `render`.
+    """Sum `image` over the compositing weights of the Gaussians that `render` colours.
 
     A compositing weight is the gradient of a pixel in the colour of the Gaussian.
     """
     with torch.enable_grad():
-        colors = gaussians.means.new_full((len(gaussians), 3), 0.5).requires_grad_()
+        colors = torch.full_like(gaussians.means, 0.5).requires_grad_()
         (gradient,) = torch.autograd.grad((image * render(colors)).sum(), colors)
     return gradient
-
-
-def backproject_errors_by_autograd(
-    render: Callable[[Float[Tensor, "n 3"]], Float[Tensor, "h w 3"]],
-    gaussians: Gaussians,
-    colors: Float[Tensor, "n 3"],
-    photograph: Float[Tensor, "h w 3"],
-) -> ColorSums:
-    """Implement `ColorErrors` by autograd; arguments as in `backproject_by_autograd`."""
-    missing = photograph - render(colors).detach()
-    weights = backproject_by_autograd(render, gaussians, torch.ones_like(missing))[:, 0]
-    return backproject_by_autograd(render, gaussians, missing), weights

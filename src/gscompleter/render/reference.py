@@ -2,26 +2,17 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
-from functools import cached_property
+from dataclasses import dataclass
 
 import torch
-from jaxtyping import Bool, Float
+from jaxtyping import Float
 from torch import Tensor
 from torch.utils.checkpoint import checkpoint
 
-from gscompleter.geometry import move_to_depths, quats_to_rotations
-from gscompleter.render import AppearanceRender, ColorErrors, DepthRender, OpacityRender, Renderer
-from gscompleter.render.redraw import (
-    FullRedraw,
-    backproject_by_autograd,
-    backproject_errors_by_autograd,
-    set_appearance,
-    set_colors,
-    to_grey,
-)
+from gscompleter.geometry import quats_to_rotations
+from gscompleter.render.redraw import RedrawnScene
 from gscompleter.render.spherical_harmonics import evaluate_colors
-from gscompleter.types import Camera, Gaussians, Render, merge
+from gscompleter.types import Camera, Gaussians, Render
 
 BLUR = 0.3
 """Low-pass of about a pixel, added to the 2D variances, in px²."""
@@ -59,71 +50,9 @@ class ReferenceRenderer:
         depth = torch.where(seen, weighted_depth / torch.where(seen, alpha, 1), 0)
         return Render(color.view(*size, 3), depth.view(size), alpha.view(size))
 
-    def freeze(self, context: Gaussians, camera: Camera) -> ReferenceFrozenScene:
+    def freeze(self, context: Gaussians, camera: Camera) -> RedrawnScene:
         """Prepare `context` for many renders from `camera`."""
-        return ReferenceFrozenScene(self, context, camera)
-
-
-@dataclass(frozen=True)
-class ReferenceFrozenScene:
-    """A scene that is rendered from scratch every time, with any renderer."""
-
-    renderer: Renderer
-    scene: Gaussians
-    camera: Camera
-
-    @cached_property
-    def render(self) -> Render:
-        """The render of the scene alone."""
-        return self.renderer.render(self.scene, self.camera)
-
-    def extend(self, new: Gaussians) -> ReferenceFrozenScene:
-        """Add `new` to the scene."""
-        return replace(self, scene=merge([self.scene, new]))
-
-    def backproject(self, image: Float[Tensor, "h w 3"]) -> Float[Tensor, "n 3"]:
-        """Backproject `image` by autograd."""
-        return backproject_by_autograd(self._render_colors, self.scene, image)
-
-    def splat(self, values: Float[Tensor, "n"]) -> Float[Tensor, "h w"]:
-        """Render the scene with the values as grey."""
-        return self._render_colors(to_grey(values))[..., 0]
-
-    def _render_colors(self, colors: Float[Tensor, "n 3"]) -> Float[Tensor, "h w 3"]:
-        return self.renderer.render(set_colors(self.scene, colors), self.camera).image
-
-    def composite(self, new: Gaussians) -> Render:
-        """Render scene and `new`."""
-        return self.renderer.render(merge([self.scene, new]), self.camera)
-
-    def vary_opacities(self, new: Gaussians) -> OpacityRender:
-        """Fix all of `new` but the opacities."""
-        fixed = replace(
-            new,
-            means=new.means.detach(),
-            quats=new.quats.detach(),
-            scales=new.scales.detach(),
-            sh=new.sh.detach(),
-        )
-        return lambda opacities: self.composite(replace(fixed, opacities=opacities))
-
-    def vary_appearance(self, new: Gaussians, where: Bool[Tensor, "h w"]) -> AppearanceRender:
-        """Fix all of `new` but its appearance."""
-        return FullRedraw(lambda *looks: self.composite(set_appearance(new, *looks)).image)
-
-    def vary_colors(self, new: Gaussians) -> ColorErrors:
-        """Fix all of `new` but its colours."""
-
-        def render(colors: Float[Tensor, "n 3"]) -> Float[Tensor, "h w 3"]:
-            return self.composite(set_colors(new, colors)).image
-
-        return lambda colors, photograph: backproject_errors_by_autograd(
-            render, new, colors, photograph
-        )
-
-    def vary_depths(self, new: Gaussians, where: Bool[Tensor, "h w"]) -> DepthRender:
-        """Fix all of `new` but its depths."""
-        return lambda depths: self.composite(move_to_depths(new, self.camera, depths))
+        return RedrawnScene(self, context, camera)
 
 
 @dataclass(frozen=True)

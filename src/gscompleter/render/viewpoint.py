@@ -15,15 +15,11 @@ from torch import Tensor
 from torch.nn.functional import max_pool2d
 
 from gscompleter.errors import InputError
-from gscompleter.kernels import rasterizer, tiles
+from gscompleter.kernels import composite, project, tiles
+from gscompleter.kernels.composite import WANT_ALL, WANT_COLOR, Layer, RasterFrame
 from gscompleter.kernels.parallel import run, share, split_range
-from gscompleter.kernels.rasterizer import (
-    TILE,
-    GaussianArrays,
-    Layer,
-    Pinhole,
-    RasterFrame,
-)
+from gscompleter.kernels.project import GaussianArrays, Pinhole
+from gscompleter.kernels.simd import TILE
 
 MAX_ENTRIES = np.iinfo(np.int32).max
 """Largest total length of the tiles' lists, which kernels number in 32 bits."""
@@ -42,7 +38,7 @@ class Splats:
     def move_to_depths(self, depths: Float32[ndarray, "n"], near: np.float32) -> Splats:
         """Move the splats to other z-depths; those not beyond `near` get empty boxes."""
         columns = self.columns.copy()
-        columns[:, rasterizer.DEPTH] = depths
+        columns[:, project.DEPTH] = depths
         return replace(self, columns=columns).keep_only(depths > near)
 
     def keep_only(self, which: Bool[ndarray, "n"]) -> Splats:
@@ -60,9 +56,6 @@ class BinnedSplats:
     slot_start: Int64[ndarray, "bounds"]
     """First slot of each Gaussian, and the end [n + 1]."""
 
-
-SplatArrays = tuple[Float32[ndarray, "n 9"], Float32[ndarray, "n"], Integer[ndarray, "n 4"]]
-"""Splats, their opacities and their boxes, see `Layer`."""
 
 EntryGradients = tuple[Float32[ndarray, "entries columns"], Bool[ndarray, "entries"]]
 """Gradients of the tiles' entries by slot, and True for slots that were written."""
@@ -98,17 +91,20 @@ class Viewpoint:
         depth_limits: Float32[ndarray, "tiles"],
     ) -> BinnedSplats:
         """Project, sort and enter Gaussians into the lists of the tiles."""
-        return assign_splat_slots(
-            self.fill_lists(self.project(gaussians, is_antialiased), depth_limits)
-        )
+        return self.enter(self.project(gaussians, is_antialiased), depth_limits)
+
+    def enter(self, splats: Splats, depth_limits: Float32[ndarray, "tiles"]) -> BinnedSplats:
+        """Enter splats into the lists of the tiles, and give those of each splat adjacent slots."""
+        layer = self.fill_lists(splats, depth_limits)
+        return BinnedSplats(layer, *tiles.number_slots(layer.entries, len(layer.splats)))
 
     def project(self, gaussians: GaussianArrays, is_antialiased: bool) -> Splats:
         """Project Gaussians to splats; invisible ones get empty boxes."""
         n = check_lengths(gaussians)
-        columns = np.empty((n, rasterizer.NUM_SPLAT_COLUMNS), np.float32)
+        columns = np.empty((n, project.NUM_SPLAT_COLUMNS), np.float32)
         boxes = np.empty((n, 4), self.box_dtype)
         factors = np.zeros(n, np.float32) if is_antialiased else None
-        self.share(rasterizer.project, n, gaussians, self.pinhole, columns, boxes, factors)
+        self.share(project.project, n, gaussians, self.pinhole, columns, boxes, factors)
         opacities = gaussians.opacities if factors is None else gaussians.opacities * factors
         return Splats(columns, opacities, boxes, factors)
 
@@ -140,7 +136,7 @@ class Viewpoint:
         """Composite a context, rendered to `frame`, with a new layer in its tiles."""
         frame = RasterFrame(*(array.copy() for array in frame))
         tiles = find_touched_tiles(new)
-        self.share(rasterizer.composite, len(tiles), tiles, context, new, frame)
+        self.share(composite.composite, len(tiles), tiles, context, new, frame)
         return frame
 
     def composite_backward(
@@ -149,16 +145,16 @@ class Viewpoint:
         new: BinnedSplats,
         frame: RasterFrame,
         d_frame: tuple[Tensor, ...],
-        wanted: int = rasterizer.WANT_ALL,
+        wanted: int = WANT_ALL,
     ) -> EntryGradients:
         """Compute the gradients of new entries from those of image, depth and alpha."""
-        columns = {rasterizer.WANT_ALL: rasterizer.NUM_GRADIENT_COLUMNS, rasterizer.WANT_COLOR: 3}
+        columns = {WANT_ALL: project.NUM_GRADIENT_COLUMNS, WANT_COLOR: 3}
         values = np.empty((len(new.slots), columns.get(wanted, 1)), np.float32)
         written = np.zeros(len(new.slots), np.bool_)
         tiles = find_touched_tiles(new.layer)
         composited = (tiles, context, new.layer, frame, tuple(map(to_float32, d_frame)))
         received = (new.slots, wanted, values, written)
-        self.share(rasterizer.composite_backward, len(tiles), *composited, *received)
+        self.share(composite.composite_backward, len(tiles), *composited, *received)
         return values, written
 
     def backproject_residual(
@@ -169,7 +165,7 @@ class Viewpoint:
         written = np.zeros(len(new.slots), np.bool_)
         tiles = find_touched_tiles(new.layer)
         composited = (tiles, context, new.layer, photograph, new.slots, values, written)
-        self.share(rasterizer.backproject_residual, len(tiles), *composited)
+        self.share(composite.backproject_residual, len(tiles), *composited)
         return self.sum_by_gaussian(new, (values, written))
 
     def sum_by_gaussian(
@@ -195,20 +191,10 @@ def find_touched_tiles(layer: Layer) -> Int64[ndarray, "touched"]:
     return np.flatnonzero(np.diff(layer.tile_start))
 
 
-def compute_starts(sizes: Integer[ndarray, "tiles"]) -> Int64[ndarray, "bounds"]:
-    """Compute the starts of consecutive lists of these sizes, and the end."""
-    return np.concatenate([[0], np.cumsum(sizes, dtype=np.int64)])
-
-
 def order_by_use(layer: Layer) -> tuple[Layer, Int32[ndarray, "splats"]]:
     """Reorder splats by first use and drop unused ones, for locality; also return their order."""
     order, entries = tiles.number_by_use(layer.entries, len(layer.splats))
     return Layer(*gather_splats([layer], [order]), layer.tile_start, entries), order
-
-
-def assign_splat_slots(layer: Layer) -> BinnedSplats:
-    """Give the entries of each splat adjacent slots."""
-    return BinnedSplats(layer, *tiles.number_slots(layer.entries, len(layer.splats)))
 
 
 def check_lengths(gaussians: GaussianArrays) -> int:
@@ -224,11 +210,13 @@ def to_float32(values: Tensor) -> Float32[ndarray, "..."]:
     return values.detach().to("cpu", torch.float32).contiguous().numpy()
 
 
-def gather_splats(layers: Sequence[Layer], rows: Sequence[Int32[ndarray, "_"]]) -> SplatArrays:
+def gather_splats(
+    layers: Sequence[Layer], rows: Sequence[Int32[ndarray, "_"]]
+) -> tuple[Float32[ndarray, "n 9"], Float32[ndarray, "n"], Integer[ndarray, "n 4"]]:
     """Gather the splats, opacities and boxes of these rows of each layer."""
     bounds = [0, *accumulate(map(len, rows))]
     taken = (
-        np.empty((bounds[-1], rasterizer.NUM_SPLAT_COLUMNS), np.float32),
+        np.empty((bounds[-1], project.NUM_SPLAT_COLUMNS), np.float32),
         np.empty(bounds[-1], np.float32),
         np.empty((bounds[-1], 4), layers[0].boxes.dtype),
     )

@@ -22,7 +22,7 @@ from gscompleter.evaluation.methods import BASELINES, METHODS, Method, Models, P
 from gscompleter.io.files import SUMMARY_FILE
 from gscompleter.progress import show_progress, track
 from gscompleter.render import Renderer
-from gscompleter.render.reference import ReferenceFrozenScene
+from gscompleter.render.redraw import RedrawnScene
 from gscompleter.state import Completion
 from gscompleter.types import Camera, Gaussians, Render, make_observed, merge, sh_from_rgb
 
@@ -202,9 +202,9 @@ class UnfrozenRenderer:
         """Render as the wrapped renderer does."""
         return self.renderer.render(gaussians, camera)
 
-    def freeze(self, context: Gaussians, camera: Camera) -> ReferenceFrozenScene:
+    def freeze(self, context: Gaussians, camera: Camera) -> RedrawnScene:
         """Return a scene that is rendered anew with every call."""
-        return ReferenceFrozenScene(self.renderer, context, camera)
+        return RedrawnScene(self.renderer, context, camera)
 
 
 def complete_with_autograd(state: Completion, target: Camera, models: Models) -> Prediction:

@@ -58,7 +58,7 @@ from gscompleter.io.video import check_video_writer
 from gscompleter.kernels.parallel import run_in_background
 from gscompleter.next_best_view.gain import Choice
 from gscompleter.next_best_view.planner import ViewPlanner
-from gscompleter.progress import expect_stages, show_preparation, show_progress, stage
+from gscompleter.progress import show_preparation, show_progress, stage
 from gscompleter.reconstructors import check_reconstructor, load_reconstructor
 from gscompleter.render import choose_device, load_renderer
 from gscompleter.render.lod import MIN_PROXY_GAUSSIANS
@@ -69,9 +69,6 @@ from gscompleter.state import Completion
 from gscompleter.timing import add_seconds, record_seconds, timed_stage
 from gscompleter.types import Camera, View
 
-CONTEXT_STAGE = "context", 2.0
-TARGET_STAGES = ("generate", 1.0), ("lift", 1.0), ("register", 1.0), ("integrate", 2.0)
-"""Stages with their relative times."""
 LIFTED_VIEWS = 3
 """Time to complete a target, relative to the reconstruction of one photograph. Measured: 1.8 to 3.3
 (docs/performance.md)."""
@@ -135,10 +132,7 @@ def complete_folder(options: CompleteOptions) -> dict[str, Any]:
     with show_progress(None if options.quiet else console):
         ready = prepare_completion(options, console)
         print_lines(console, *describe_task(options, ready.opened, ready.task))
-        with (
-            open_output_folder(options.out, is_replaceable(options)) as folder,
-            expect_stages(list_stages(options, ready.task), is_timed=False),
-        ):
+        with open_output_folder(options.out, is_replaceable(options)) as folder:
             completion, ready = complete_targets(ready)
             with stage("report"):
                 summary = write_done(folder, ready, completion)
@@ -162,22 +156,13 @@ def plan_folder(options: CompleteOptions) -> None:
         print_plan(options, plan)
 
 
-def list_stages(options: CompleteOptions, task: Task) -> list[tuple[str, float]]:
-    """List the stages after opening the scene with their relative times."""
-    count = len(task.targets) or get_max_targets(options)
-    ends = [("report", 2.0), *([("video", 2.0)] if options.video else [])]
-    return [CONTEXT_STAGE, *((CONTEXT_STAGE, *TARGET_STAGES) * count), *ends]
-
-
 def write_done(folder: Path, ready: Prepared, completion: Completion) -> dict[str, Any]:
     """Write all results but the targets and the video, and return the summary."""
     options, task, completer = ready.options, ready.task, ready.completer
     completion = replace(completion, seconds=add_seconds(completion.seconds, ready.seconds))
     cameras = tuple(ready.cameras.values())
     aside = sample_held_out_cameras(cameras, options.seed)
-    facts = describe_run(
-        options, ready.opened, task, get_stage_config(options), describe_settings(options)
-    )
+    facts = describe_run(options, ready.opened, task, completion.config, describe_settings(options))
     with run_in_background(render_pairs, completion, aside, completer.renderer) as looks:
         summary = write_report(
             folder,

@@ -33,8 +33,6 @@ with freeze_objects():
 """Program of the second process. numba compiles a tenth faster in the block."""
 
 COMPILING_STAGE = "compiling kernels for this machine, once"
-COMPILING_SECONDS = 30
-"""Approximate seconds for all parts on one core."""
 
 
 @contextmanager
@@ -57,16 +55,14 @@ def freeze_objects() -> Iterator[None]:
 def compile_kernels(names: Collection[str]) -> float | None:
     """Compile the missing kernels of these parts; return the seconds, or None if there are none."""
     from gscompleter.kernels.compiled import is_compiled
-    from gscompleter.progress import expect_stages, stage
+    from gscompleter.progress import stage
 
     missing = [name for name in PARTS if name in names and not is_compiled(name)]
     if not missing:
         return None
     here, apart = split_parts(missing)
-    expected = COMPILING_SECONDS * len(missing) / len(PARTS) / (2 if apart else 1)
     start = time.perf_counter()
     with (
-        expect_stages([(COMPILING_STAGE, expected)]),
         stage(COMPILING_STAGE),
         rehearse_in_subprocess(apart),
         freeze_objects(),

@@ -1,0 +1,382 @@
+"""Splats over the rows of a tile: vectors of 16 pixels in LLVM's intermediate language.
+
+LLVM does not find these vectors itself, so the loops over rows are intrinsics.
+
+A splat's falloff is `alpha = opacity * exp(-(s² + t²))` with whitened coordinates
+`s = u dx + v dy`, `t = w dy` of the offset (dx, dy) from its centre, and `U = [[u, v], [0, w]]`,
+`UᵀU = ½ Σ⁻¹` for the 2D covariance Σ. Unlike Σ⁻¹ it does not cancel for thin oblique splats.
+"""
+
+import numpy as np
+from llvmlite import ir
+from numba import types
+from numba.core import cgutils
+from numba.extending import intrinsic
+
+TILE = 16
+"""Side of a tile in pixels, and the number of lanes of a vector."""
+
+MIN_ALPHA = np.float32(1 / 255)
+MAX_ALPHA = np.float32(0.999)
+MIN_TRANSMITTANCE = np.float32(1e-4)
+
+_FLOAT, _INT, _LONG = ir.FloatType(), ir.IntType(32), ir.IntType(64)
+_FLOATS, _INTS = ir.VectorType(_FLOAT, TILE), ir.VectorType(_INT, TILE)
+
+# Least squares polynomial of 2**x on [-1, 0], highest power first: relative error 2e-7.
+_EXP2 = (0.000938116473, 0.00918687438, 0.055278135, 0.240171588, 0.693142171, 0.999999923)
+_LOG2_E = 1.4426950408889634
+
+
+class _Lanes:
+    """Sixteen float32 values of a function under construction."""
+
+    def __init__(self, builder, value):
+        self.builder, self.value = builder, value
+
+    def _unwrap(self, other):
+        return other.value if isinstance(other, _Lanes) else _make_constant(other)
+
+    def __add__(self, other):
+        return _Lanes(self.builder, self.builder.fadd(self.value, self._unwrap(other)))
+
+    def __sub__(self, other):
+        return _Lanes(self.builder, self.builder.fsub(self.value, self._unwrap(other)))
+
+    def __mul__(self, other):
+        return _Lanes(self.builder, self.builder.fmul(self.value, self._unwrap(other)))
+
+    def __rtruediv__(self, other):
+        return _Lanes(self.builder, self.builder.fdiv(self._unwrap(other), self.value))
+
+    def __rsub__(self, other):
+        return _Lanes(self.builder, self.builder.fsub(self._unwrap(other), self.value))
+
+    def multiply_add(self, factor, plus):
+        """Compute self * factor + plus with a single rounding, the same in both passes."""
+        multiply_add = cgutils.get_or_insert_function(
+            self.builder.module,
+            ir.FunctionType(_FLOATS, [_FLOATS, _FLOATS, _FLOATS]),
+            f"llvm.fmuladd.v{TILE}f32",
+        )
+        arguments = [self.value, self._unwrap(factor), self._unwrap(plus)]
+        return _Lanes(self.builder, self.builder.call(multiply_add, arguments))
+
+    def compare(self, relation, other):
+        """Compare lane by lane; False for NaN."""
+        return self.builder.fcmp_ordered(relation, self.value, self._unwrap(other))
+
+    def where(self, mask, otherwise):
+        value = self.builder.select(mask, self.value, self._unwrap(otherwise))
+        return _Lanes(self.builder, value)
+
+
+def _sum_lanes(builder, vectors):
+    """Sum the lanes of each of up to sixteen vectors into one lane of the result."""
+    values = [vector.value for vector in vectors]
+    undefined = ir.Constant(_FLOATS, ir.Undefined)
+    width = TILE
+    while width > 1:
+        half = width // 2
+        low = [lane for lane in range(2 * TILE) if lane % width < half]
+        high = [lane for lane in range(2 * TILE) if lane % width >= half]
+        values += [undefined] * (len(values) % 2)
+        values = [
+            builder.fadd(
+                builder.shuffle_vector(first, second, ir.Constant(_INTS, low)),
+                builder.shuffle_vector(first, second, ir.Constant(_INTS, high)),
+            )
+            for first, second in zip(values[::2], values[1::2], strict=True)
+        ]
+        width = half
+    return values[0]
+
+
+def _make_constant(value):
+    return ir.Constant(_FLOATS, [float(np.float32(value))] * TILE)
+
+
+def _broadcast(builder, scalar, vector_type=_FLOATS):
+    undefined = ir.Constant(vector_type, ir.Undefined)
+    first = builder.insert_element(undefined, scalar, ir.Constant(_INT, 0))
+    return builder.shuffle_vector(first, undefined, ir.Constant(_INTS, [0] * TILE))
+
+
+def _exp_negative(values):
+    """Compute exp(-values) for values >= 0; beyond 80 it is practically 0."""
+    builder = values.builder
+    power = values * -_LOG2_E
+    power = power.where(power.compare(">", -120.0), -120.0)
+    whole = builder.fptosi(power.value, _INTS)
+    fraction = power - _Lanes(builder, builder.sitofp(whole, _FLOATS))
+    polynomial = fraction.multiply_add(_EXP2[0], _EXP2[1])
+    for coefficient in _EXP2[2:]:
+        polynomial = polynomial.multiply_add(fraction, coefficient)
+    # The exponent of a float starts at bit 23 and is 127 for 2**0.
+    exponent = builder.add(whole, ir.Constant(_INTS, [127] * TILE))
+    scale = builder.shl(exponent, ir.Constant(_INTS, [23] * TILE))
+    return polynomial * _Lanes(builder, builder.bitcast(scale, _FLOATS))
+
+
+class _Rows:
+    """Rows of a tile's arrays, each of them several vectors."""
+
+    def __init__(self, context, builder, array_type, array, vector_type, vectors_per_row):
+        self.builder, self.vector_type = builder, vector_type
+        self.data = context.make_array(array_type)(context, builder, array).data
+        self.stride = vectors_per_row * TILE
+
+    def _get_pointer(self, row, index):
+        offset = self.builder.mul(row, ir.Constant(_LONG, self.stride))
+        offset = self.builder.add(offset, ir.Constant(_LONG, index * TILE))
+        pointer = self.builder.gep(self.data, [offset])
+        return self.builder.bitcast(pointer, self.vector_type.as_pointer())
+
+    def load(self, row, index):
+        return self.builder.load(self._get_pointer(row, index), align=4)
+
+    def store(self, row, index, value):
+        self.builder.store(value, self._get_pointer(row, index), align=4)
+
+
+class _Splat:
+    """A splat relative to its tile, as the intrinsics receive it."""
+
+    def __init__(self, builder, x, y, u, v, w, opacity, red, green, blue, depth):
+        self.builder = builder
+        self.y, self.v, self.w = y, v, w
+        self.channels = [
+            _Lanes(builder, _broadcast(builder, value)) for value in (red, green, blue, depth)
+        ]
+        lane_numbers = ir.Constant(_FLOATS, [float(lane) for lane in range(TILE)])
+        self.dx = _Lanes(builder, builder.fsub(lane_numbers, _broadcast(builder, x)))
+        self.u_dx = self.dx * _Lanes(builder, _broadcast(builder, u))
+        self.opacity = _Lanes(builder, _broadcast(builder, opacity))
+
+    def compute_falloff(self, row):
+        """Return dy of a row, and alpha before and after capping, and its mask."""
+        builder = self.builder
+        dy = builder.fsub(builder.sitofp(row, _FLOAT), self.y)
+        s = self.u_dx + _Lanes(builder, _broadcast(builder, builder.fmul(self.v, dy)))
+        t = builder.fmul(self.w, dy)
+        sigma = s.multiply_add(s, plus=_Lanes(builder, _broadcast(builder, builder.fmul(t, t))))
+        raw = self.opacity * _exp_negative(sigma)
+        capped = raw.where(raw.compare("<=", MAX_ALPHA), MAX_ALPHA)
+        return dy, raw, capped, raw.compare(">=", MIN_ALPHA)
+
+
+def _loop_over_rows(builder, rows, position, row_limit, body):
+    """Run `body(row)` for the rows whose limit is not below `position`."""
+    begin, end = rows
+    with cgutils.for_range(builder, end, start=begin, intp=_LONG) as loop:
+        limit = builder.load(builder.gep(row_limit, [loop.index]))
+        with builder.if_then(builder.icmp_signed("<=", position, limit)):
+            body(loop.index)
+
+
+def _blend(splat, state, row):
+    """Composite a splat over a row; return its weights, and masks of visible and passing lanes."""
+    builder = splat.builder
+    _, _, alpha, visible = splat.compute_falloff(row)
+    alpha = alpha.where(visible, 0.0)
+    before = _Lanes(builder, state.load(row, 0))
+    after = alpha.multiply_add(0.0 - before, plus=before)
+    passing = after.compare(">", MIN_TRANSMITTANCE)
+    weight = (alpha * before).where(passing, 0.0)
+    closed = before.where(before.compare("<", 0.0), 0.0 - before)
+    state.store(row, 0, after.where(passing, closed).value)
+    for index, channel in enumerate(splat.channels[: state.stride // TILE - 1], start=1):
+        total = weight.multiply_add(channel, plus=_Lanes(builder, state.load(row, index)))
+        state.store(row, index, total.value)
+    return weight, visible, passing
+
+
+def _close_if_full(builder, passing, limits, row, filled):
+    """Set the limit of a row to -1 and count it once it has no transmittance left."""
+    any_passing = builder.bitcast(passing, ir.IntType(TILE))
+    none = builder.icmp_unsigned("==", any_passing, ir.Constant(ir.IntType(TILE), 0))
+    with builder.if_then(none, likely=False):
+        builder.store(ir.Constant(_INT, -1), builder.gep(limits, [row]))
+        builder.store(builder.add(builder.load(filled), ir.Constant(_LONG, 1)), filled)
+
+
+@intrinsic
+def composite_rows(typing, begin, end, position, state, last, row_limit, splat):
+    """Composite a splat over the rows begin..end of a tile; return how many it filled.
+
+    state [16, 5, 16]: per row the transmittance, negative in full pixels, and sums of colour and
+    depth.
+    last [16, 16] int32: position of the last contribution. row_limit [16] int32: -1 in full rows.
+    splat: x and y relative to the first pixel centre, u, v, w, opacity, red, green, blue and depth.
+    """
+    signature = types.int64(types.int64, types.int64, types.int32, state, last, row_limit, splat)
+
+    def generate(context, builder, signature, arguments):
+        begin, end, position, state, last, row_limit, splat = arguments
+        splat = _Splat(builder, *cgutils.unpack_tuple(builder, splat))
+        state = _Rows(context, builder, signature.args[3], state, _FLOATS, 5)
+        last = _Rows(context, builder, signature.args[4], last, _INTS, 1)
+        limits = context.make_array(signature.args[5])(context, builder, row_limit).data
+        positions = _broadcast(builder, position, _INTS)
+        filled = cgutils.alloca_once_value(builder, ir.Constant(_LONG, 0))
+
+        def composite_row(row):
+            _, visible, passing = _blend(splat, state, row)
+            contributes = builder.and_(visible, passing)
+            last.store(row, 0, builder.select(contributes, positions, last.load(row, 0)))
+            _close_if_full(builder, passing, limits, row, filled)
+
+        _loop_over_rows(builder, (begin, end), position, limits, composite_row)
+        return builder.load(filled)
+
+    return signature, generate
+
+
+@intrinsic
+def weigh_rows(typing, begin, end, place, state, row_limit, kept, splat):
+    """Composite a splat, without depth, over rows and store its weights in `kept` at `place`."""
+    signature = types.int64(types.int64, types.int64, types.int64, state, row_limit, kept, splat)
+
+    def generate(context, builder, signature, arguments):
+        begin, end, place, state, row_limit, kept, splat = arguments
+        splat = _Splat(builder, *cgutils.unpack_tuple(builder, splat))
+        state = _Rows(context, builder, signature.args[3], state, _FLOATS, 4)
+        limits = context.make_array(signature.args[4])(context, builder, row_limit).data
+        kept = _Rows(context, builder, signature.args[5], kept, _FLOATS, 1)
+        filled = cgutils.alloca_once_value(builder, ir.Constant(_LONG, 0))
+        with cgutils.for_range(builder, end, start=begin, intp=_LONG) as loop:
+            row, at = loop.index, builder.add(place, builder.sub(loop.index, begin))
+            limit = builder.load(builder.gep(limits, [row]))
+            is_open = builder.icmp_signed(">=", limit, ir.Constant(_INT, 0))
+            with builder.if_else(is_open) as (open_row, full_row):
+                with open_row:
+                    weight, _, passing = _blend(splat, state, row)
+                    kept.store(at, 0, weight.value)
+                    _close_if_full(builder, passing, limits, row, filled)
+                with full_row:
+                    kept.store(at, 0, _make_constant(0.0))
+        return builder.load(filled)
+
+    return signature, generate
+
+
+@intrinsic
+def sum_weighted_rows(typing, begin, end, place, state, kept, sums):
+    """Sum kept weights times the colours in `state` [16, 4, 16], and kept weights, to `sums`."""
+    signature = types.void(types.int64, types.int64, types.int64, state, kept, sums)
+
+    def generate(context, builder, signature, arguments):
+        begin, end, place, state, kept, sums = arguments
+        state = _Rows(context, builder, signature.args[3], state, _FLOATS, 4)
+        kept = _Rows(context, builder, signature.args[4], kept, _FLOATS, 1)
+        zeros = ir.Constant(_FLOATS, [0.0] * TILE)
+        totals = [cgutils.alloca_once_value(builder, zeros) for _ in range(4)]
+        with cgutils.for_range(builder, end, start=begin, intp=_LONG) as loop:
+            at = builder.add(place, builder.sub(loop.index, begin))
+            weight = _Lanes(builder, kept.load(at, 0))
+            for index, total in enumerate(totals, start=1):
+                value = _Lanes(builder, builder.load(total))
+                if index < 4:
+                    value = weight.multiply_add(
+                        _Lanes(builder, state.load(loop.index, index)), plus=value
+                    )
+                else:
+                    value = value + weight
+                builder.store(value.value, total)
+        out = _Rows(context, builder, signature.args[5], sums, _FLOATS, 1)
+        columns = [_Lanes(builder, builder.load(total)) for total in totals]
+        out.store(ir.Constant(_LONG, 0), 0, _sum_lanes(builder, columns))
+        return context.get_dummy_value()
+
+    return signature, generate
+
+
+def _make_revert(wanted):
+    """Make an intrinsic that reverts a splat, with sums for the `wanted` gradients."""
+
+    @intrinsic
+    def undraw_rows(typing, begin, end, position, state, last, row_limit, sums, splat):
+        """Revert the rows begin..end of a splat, back to front.
+
+        state [16, 7, 16]: per row the transmittance and the sum of weight times gradient behind the
+        splat, and dL/d of red, green, blue, depth sum and alpha. sums [16] receives the sums of q,
+        q dx, q dy, q dx², q dx dy, q dy² (q = alpha dL/dalpha), and of weight times dL/d depth,
+        red, green and blue.
+        """
+        signature = types.void(
+            types.int64, types.int64, types.int32, state, last, row_limit, sums, splat
+        )
+
+        def generate(context, builder, signature, arguments):
+            begin, end, position, state, last, row_limit, sums, splat = arguments
+            splat = _Splat(builder, *cgutils.unpack_tuple(builder, splat))
+            state = _Rows(context, builder, signature.args[3], state, _FLOATS, 7)
+            last = _Rows(context, builder, signature.args[4], last, _INTS, 1)
+            limits = context.make_array(signature.args[5])(context, builder, row_limit).data
+            positions = _broadcast(builder, position, _INTS)
+            count = {"nothing": 0, "opacity": 1, "depth": 1, "colour": 3, "all": 7}[wanted]
+            totals = [
+                cgutils.alloca_once_value(builder, ir.Constant(_FLOATS, [0.0] * TILE))
+                for _ in range(count)
+            ]
+
+            def revert(row):
+                dy, raw, alpha, visible = splat.compute_falloff(row)
+                reached = builder.icmp_signed("<=", positions, last.load(row, 0))
+                contributes = builder.and_(visible, reached)
+                alpha = alpha.where(contributes, 0.0)
+                gradients = [_Lanes(builder, state.load(row, index)) for index in range(2, 7)]
+                behind = _Lanes(builder, state.load(row, 1))
+
+                opening = 1.0 / (1.0 - alpha)
+                before = _Lanes(builder, state.load(row, 0)) * opening
+                weight = alpha * before
+                value = gradients[4]
+                for channel, gradient in zip(splat.channels, gradients[:4], strict=True):
+                    value = channel.multiply_add(gradient, plus=value)
+                state.store(row, 0, before.value)
+                state.store(row, 1, weight.multiply_add(value, plus=behind).value)
+                if wanted == "nothing":
+                    return
+
+                if wanted == "colour":
+                    for total, gradient in zip(totals, gradients[:3], strict=True):
+                        value = weight.multiply_add(
+                            gradient, plus=_Lanes(builder, builder.load(total))
+                        )
+                        builder.store(value.value, total)
+                    return
+
+                q = (before * value - behind * opening) * alpha
+                q = q.where(raw.compare("<=", MAX_ALPHA), 0.0)
+                terms = [weight * gradients[3]] if wanted == "depth" else [q]
+                if wanted == "all":
+                    dys = _Lanes(builder, _broadcast(builder, dy))
+                    terms += [q * dys, q * dys * dys]
+                    terms += [weight * gradients[index] for index in (3, 0, 1, 2)]
+                for total, term in zip(totals, terms, strict=True):
+                    value = _Lanes(builder, builder.load(total)) + term
+                    builder.store(value.value, total)
+
+            _loop_over_rows(builder, (begin, end), position, limits, revert)
+
+            columns = [_Lanes(builder, builder.load(total)) for total in totals]
+            if wanted == "all":
+                q, q_dy, q_dy2 = columns[:3]
+                moments = [q, q * splat.dx, q_dy, q * splat.dx * splat.dx, q_dy * splat.dx, q_dy2]
+                columns = moments + columns[3:]
+            if wanted != "nothing":
+                out = _Rows(context, builder, signature.args[6], sums, _FLOATS, 1)
+                out.store(ir.Constant(_LONG, 0), 0, _sum_lanes(builder, columns))
+            return context.get_dummy_value()
+
+        return signature, generate
+
+    return undraw_rows
+
+
+pass_rows = _make_revert("nothing")
+revert_rows_for_opacity = _make_revert("opacity")
+revert_rows_for_depth = _make_revert("depth")
+revert_rows_for_color = _make_revert("colour")
+revert_rows = _make_revert("all")
