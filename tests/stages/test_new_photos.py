@@ -32,6 +32,8 @@ def make_wrong_scene() -> Gaussians:
 
 
 SCENE = make_wrong_scene()
+PHOTOS = [replace(v, image=RENDERER.render(SCENE, v.camera).image.clamp(0, 1)) for v in PHOTOS]
+"""What the scene was trained on, it reproduces."""
 
 
 def find(views: list[View], config: CompleterConfig) -> list[int]:
@@ -60,8 +62,7 @@ def test_the_scene_is_recoloured_to_a_new_photograph_and_no_other_gets_worse(exp
     before, after = (RENDERER.render(scene, ASIDE.camera).image for scene in (SCENE, done.scene))
     assert psnr(after, ASIDE.image) > psnr(before, ASIDE.image) + 3
     for view in PHOTOS:
-        images = [RENDERER.render(scene, view.camera).image for scene in (SCENE, done.scene)]
-        assert psnr(images[1], view.image) > psnr(images[0], view.image) - 0.02
+        assert psnr(RENDERER.render(done.scene, view.camera).image, view.image) > 60
     assert set(done.scene.generated.unique().tolist()) == {0, NEW_PHOTO_ID}
     assert done.next_target_id == 1
     assert torch.equal(done.context.sh, SCENE.sh)

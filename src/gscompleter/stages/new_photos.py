@@ -25,6 +25,8 @@ from gscompleter.types import View
 
 MAX_DROP = 6.0
 """PSNR in dB below the best third of the photographs from which on a photograph is new."""
+MIN_ERROR = 1e-4
+"""Mean squared error up to which a photograph is reproduced, 40 dB."""
 MAX_DISTRUST, MIN_KNOWN = 0.5, 0.05
 """Distrust up to which a pixel is compared in exposure, and smallest fraction of such pixels."""
 MAX_PHOTOS = 32
@@ -40,7 +42,7 @@ def find_new_photos(
     frozen = scenes.freeze_at(parts, [view.camera for view in views])
     pairs = zip(frozen, views, strict=True)
     errors = torch.stack([compute_error(scene.render.image, view) for scene, view in pairs])
-    good = errors.sort().values[len(errors) // 6]  # the median of the best third
+    good = errors.sort().values[len(errors) // 6].clamp_min(MIN_ERROR)  # median of the best third
     return torch.nonzero(errors > good * 10 ** (MAX_DROP / 10))[:, 0].tolist()
 
 
