@@ -428,7 +428,7 @@ def test_depths_that_the_scene_contradicts_are_reported_and_not_added(tmp_path):
 
 
 def test_a_splat_is_not_compared_in_depth():
-    """Where it is wrong, right depths differ from it."""
+    """Right depths differ from it in wrong places."""
     context, target = photographs(), cameras()[1]
     completer = GSCompleter(Confused(), KnowingGenerator())
     scene = completer.begin(context).context

@@ -21,7 +21,7 @@ from gscompleter.reconstructors import Reconstructor, load_reconstructor
 from gscompleter.render import Renderer, load_renderer
 from gscompleter.render.cache import SceneRenderer
 from gscompleter.stages.align_depth import align_depth
-from gscompleter.stages.context import init_context
+from gscompleter.stages.context import choose_config, init_context
 from gscompleter.stages.filter_holes import filter_holes
 from gscompleter.stages.lift import lift
 from gscompleter.stages.new_photos import find_new_photos, recolor_to_photos
@@ -132,9 +132,7 @@ class GSCompleter:
         Raises:
             InputError: Too few views, no baseline, or no view sees the scene.
         """
-        config = self.config or CompleterConfig.for_input(
-            scene is not None and check_views is not None
-        )
+        config = choose_config(self.config, scene, check_views)
         with record_seconds() as seconds, timed_stage("context"):
             made = init_context(
                 self.reconstructor, views, scene, check_views or (), targets, self.renderer

@@ -51,7 +51,7 @@ class ContextScene:
     @staticmethod
     def whole(gaussians: Gaussians) -> ContextScene:
         """Return a context that is rendered as it is."""
-        return ContextScene(gaussians, gaussians, torch.empty(0, dtype=torch.int64))
+        return ContextScene(gaussians, gaussians, gaussians.means.new_empty(0).long())
 
     def expand(self, values: Shaped[Tensor, "m *c"]) -> Shaped[Tensor, "n *c"]:
         """Map values of rendered Gaussians to the Gaussians they stand for."""
@@ -158,7 +158,7 @@ class Completion(RenamedMembers):
     config: CompleterConfig
     source: ContextScene
     parts: tuple[Gaussians, ...]
-    """What is rendered: the context, recoloured in part, then one part per target."""
+    """Gaussians to render: the context, recoloured in part, then one part per target."""
     photos: tuple[Photo, ...]
     """Context photographs, then check photographs."""
     num_context: int

@@ -220,7 +220,7 @@ def test_rows_that_were_dropped_stay_out_of_the_users_layout(scene, chosen, tmp_
     damaged.means[[2, 9]] = torch.nan
     save_ply(tmp_path / "ours.ply", damaged)
     given = foreign(tmp_path / "ours.ply", tmp_path / "given.ply")
-    more = ("--scene", given, "--drop-nonfinite")
+    more = ("--scene", given, "--drop-nonfinite", "--no-recolor")
     assert run(monkeypatch, *complete(scene, tmp_path / "out", *SMALL, *more)) == 0
     rows = plyfile.PlyData.read(str(tmp_path / "out" / "completed.ply"))["vertex"].data
     labels = rows["label"][rows["generated"] == 0].tolist()
@@ -234,7 +234,7 @@ def test_a_splat_with_infinite_logits_keeps_its_bytes(scene, chosen, tmp_path, m
     data["vertex"].data["opacity"][[3, 8]] = np.inf, -np.inf
     data.write(str(given))
     out, back = tmp_path / "out", tmp_path / "back.ply"
-    aloud = [word for word in SMALL if word != "--quiet"]
+    aloud = [*(word for word in SMALL if word != "--quiet"), "--no-recolor"]
     assert run(monkeypatch, *complete(scene, out, *aloud, "--scene", given)) == 0
     said = capsys.readouterr().err
     assert said.count("Gaussians have an opacity logit of +infinity and 1 of -infinity") == 1

@@ -31,8 +31,9 @@ from gscompleter.io.video import check_video_writer, write_video
 from gscompleter.progress import show_progress
 from gscompleter.render import load_renderer
 from gscompleter.state import Completion, TargetResult
-from gscompleter.types import Camera, DepthAffine, merge
+from gscompleter.types import Camera
 from scenes import Room, camera_at, half_a_room_of
+from target_views import begin_with
 
 UP = torch.tensor([0.0, -1.0, 0.0])
 SIZE = 32
@@ -64,9 +65,8 @@ def completion() -> Completion:
     target = camera_at(0.4, yaw=6, size=SIZE)
     drawn = load_renderer("reference").render(context, target)
     mask = torch.zeros(SIZE, SIZE, dtype=torch.bool)
-    made = TargetResult(target, drawn, drawn, mask, None, 0, False, DepthAffine(), right)
-    scene = merge([context, right])
-    return Completion(scene, context, (view,), ((),), (made,), {"total": 0.0})
+    made = TargetResult(target, drawn, drawn, mask, drawn.alpha, 0, False, right)
+    return begin_with(context, [view]).extended(made, {"total": 0.0})
 
 
 def decoded(path: Path) -> tuple[dict, np.ndarray]:

@@ -151,7 +151,8 @@ def test_what_is_saved_of_a_splat_in_a_frame_of_its_own_is_too(tmp_path, monkeyp
     save_ply(
         tmp_path / "splat.ply", transform_gaussians(scene, torch.from_numpy(ELSEWHERE).float())
     )
-    options = options_for(room, tmp_path / "out", scene=tmp_path / "splat.ply")
+    config = CompleterConfig.splat()
+    options = options_for(room, tmp_path / "out", scene=tmp_path / "splat.ply", config=config)
     ready = live.prepare(options, QUIET)
     assert ready.task.method == "dataparser"
     session = live.begin_session(ready)

@@ -24,7 +24,7 @@ from gscompleter.io.json_file import read_json
 from gscompleter.reconstructors import load_reconstructor
 from gscompleter.reconstructors.features.matches import detect_features
 from gscompleter.reconstructors.features.stereo_image import make_stereo_images
-from gscompleter.stages.context import init_context
+from gscompleter.stages.context import reconstruct
 from gscompleter.types import SH_C0, Camera
 from scenes import camera_at, open_street
 
@@ -166,8 +166,8 @@ def test_nothing_is_matched_or_made_of_it(clip):
         columns, rows = detect_features(image)[0].astype(int).T
         assert len(rows)
         assert not image.ignore_mask[rows, columns].any()
-    scene, _ = init_context(load_reconstructor("plane-sweep"), views)
-    plain, _ = init_context(
+    scene, _ = reconstruct(load_reconstructor("plane-sweep"), views)
+    plain, _ = reconstruct(
         load_reconstructor("plane-sweep"), [replace(view, ignore_mask=None) for view in views]
     )
     # Nothing below the horizon is as far away as where a bonnet is matched.
@@ -183,7 +183,7 @@ def test_what_is_fitted_takes_nothing_from_it(clip):
     painted = [
         replace(v, image=torch.where(v.ignore_mask[..., None], magenta, v.image)) for v in views
     ]
-    scene, _ = init_context(load_reconstructor("plane-sweep"), painted)
+    scene, _ = reconstruct(load_reconstructor("plane-sweep"), painted)
     red, green, blue = (0.5 + SH_C0 * scene.sh[:, 0]).T
     assert ((torch.minimum(red, blue) - green) > 0.6).float().mean() < 0.003
 

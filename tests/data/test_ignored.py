@@ -16,8 +16,8 @@ from gscompleter.generators.warp import warp_photographs
 from gscompleter.geometry import unproject
 from gscompleter.guards.psnr import compute_squared_error, meet_error_budgets
 from gscompleter.io.image import write_image
-from gscompleter.render import load_renderer
-from gscompleter.stages.context import init_context
+from gscompleter.render import load_renderer, restrict_to_image
+from gscompleter.stages.context import reconstruct
 from gscompleter.stages.refine import refine_opacities
 from gscompleter.types import ErrorBudget, GeneratorInput, View, sh_from_rgb
 from scenes import Room, camera_at, gaussians_of, half_a_room_of, photographed, reconstruction_of
@@ -49,7 +49,7 @@ def test_nothing_is_made_of_what_is_ignored(aligned):
     views[0] = with_something_red(views[0])
     made = reconstruction_of(views, [view.depth for view in views])
     unaligned = replace(made, view_index=None, pixel_index=None)
-    scene, _ = init_context(lambda _: made if aligned else unaligned, views)
+    scene, _ = reconstruct(lambda _: made if aligned else unaligned, views)
     red = sh_from_rgb(torch.tensor([[1.0, 0.0, 0.0]]))
     assert ((made.gaussians.sh - red).abs().amax((1, 2)) < 1e-5).sum() == square().sum()
     assert ((scene.sh - red).abs().amax((1, 2)) > 1e-5).all()
@@ -70,7 +70,9 @@ def test_what_is_ignored_forbids_nothing():
     for photograph, kept in ((wrong, False), (replace(wrong, ignore_mask=mask), True)):
         before = photograph.fill_ignored(frozen.render.image)
         allowed = 2 * compute_squared_error(before, photograph.image).item() + 1e-3
-        mended = meet_error_budgets(added, [frozen], [[ErrorBudget(photograph, "mse", allowed)]])
+        image = restrict_to_image(frozen.vary_opacities(added))
+        budgets = [[ErrorBudget(photograph, "mse", allowed)]]
+        mended = meet_error_budgets(added, [frozen], budgets, [image])
         assert torch.equal(mended.opacities, added.opacities) == kept
 
 

@@ -13,6 +13,7 @@ import torch
 
 from command import run
 from gscompleter import InputError
+from gscompleter.data.frame import Frame
 from gscompleter.data.photographs import Photographs
 from gscompleter.evaluation import methods, steps, store
 from gscompleter.evaluation.baselines.reggs import RegGSConfig
@@ -158,16 +159,18 @@ def test_a_sequence_begins_with_two_frames_and_goes_on_by_the_same_step():
     assert (task.context, task.targets) == ((0, 4), tuple(range(8, 41, 4)))
     assert task.name == "fox 0+4>8..40"
     assert walk("sequence-4-steps-1", name="fox", num_frames=43).name == "fox 0+4>8"
-    assert len(walk(name="long", num_frames=999).targets) == 255
+    assert len(walk(name="long", num_frames=999).targets) == 254
 
 
 def test_a_clip_that_is_too_short_is_told_apart_from_one_that_is_not():
     protocol = parse_protocol("sequence-2")
-    assert make_tasks(protocol, Walk("short", 4)) == []
-    short = explain_skip(protocol, Walk("short", 4))
+    assert make_tasks(protocol, Walk("short", num_frames=4)) == []
+    short = explain_skip(protocol, Walk("short", num_frames=4))
     assert short == "it has 4 frames, and sequence-2 needs 5"
-    assert explain_skip(protocol, Walk("walk", 5)) is None
-    assert [task.name for task in make_tasks(protocol, Walk("walk", 5))] == ["walk 0+2>4"]
+    assert explain_skip(protocol, Walk("walk", num_frames=5)) is None
+    assert [task.name for task in make_tasks(protocol, Walk("walk", num_frames=5))] == [
+        "walk 0+2>4"
+    ]
 
 
 @pytest.mark.parametrize("text", ["sequence-4", "sequence-12-steps-6"])
@@ -175,7 +178,7 @@ def test_a_sequence_is_called_what_it_was_asked_for_as(text):
     assert parse_protocol(text).name == text
 
 
-@pytest.mark.parametrize("text", ["sequence-0", "sequence-4-steps-0", "sequence-4-steps-256"])
+@pytest.mark.parametrize("text", ["sequence-0", "sequence-4-steps-0", "sequence-4-steps-255"])
 def test_a_sequence_of_nothing_or_too_much_is_refused(text):
     with pytest.raises(InputError, match="is impossible"):
         parse_protocol(text)

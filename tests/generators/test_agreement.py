@@ -155,5 +155,5 @@ class Talking:
 
 def test_the_stage_takes_the_notes_of_a_generator_that_has_some():
     context = known_room()
-    assert synthesize(as_generator(Talking()), TARGET, context).notes == ("Painted grey.",)
-    assert synthesize(as_generator(WarpInpaint()), TARGET, context).notes == ()
+    assert synthesize(as_generator(Talking()), [(TARGET, context)])[0].notes == ("Painted grey.",)
+    assert synthesize(as_generator(WarpInpaint()), [(TARGET, context)])[0].notes == ()

@@ -9,11 +9,12 @@ import torch
 
 from gscompleter.apps.bench.cases import multiply_gaussians
 from gscompleter.completer import GSCompleter
-from gscompleter.config import TrustConfig
+from gscompleter.config import CompleterConfig, TrustConfig
 from gscompleter.evaluation.metrics.image import psnr
 from gscompleter.memory import BYTES_PER_SPLAT
 from gscompleter.render import load_renderer
 from gscompleter.render import lod as proxies
+from gscompleter.render.cache import SceneRenderer
 from gscompleter.render.lod import (
     MAX_DEVIATION,
     MAX_REACH,
@@ -22,10 +23,11 @@ from gscompleter.render.lod import (
     thin_gaussians,
 )
 from gscompleter.splats.morton import argsort_nearby
+from gscompleter.trust import Trust
 from gscompleter.trust.photometric import (
-    PhotometricTrust,
     PhotoObservations,
     gather_observations,
+    load_trust,
 )
 from gscompleter.types import Gaussians, merge
 from scenes import Room, camera_at, gaussians_of, random_gaussians, reconstruction_of, view_of
@@ -148,8 +150,8 @@ def evidence_of(scene: Gaussians) -> PhotoObservations:
     return gather_observations(scene, VIEWS, frozen, TrustConfig())
 
 
-def trust_in(scene: Gaussians) -> PhotometricTrust:
-    return PhotometricTrust(evidence_of(scene), tuple(CAMERAS), len(CAMERAS), TrustConfig())
+def trust_in(scene: Gaussians) -> Trust:
+    return load_trust(CompleterConfig.splat(), (scene,), VIEWS, SceneRenderer(RENDERER))
 
 
 def trusted_alpha(scene: Gaussians) -> torch.Tensor:

@@ -33,7 +33,7 @@ def make_wrong_scene() -> Gaussians:
 
 SCENE = make_wrong_scene()
 PHOTOS = [replace(v, image=RENDERER.render(SCENE, v.camera).image.clamp(0, 1)) for v in PHOTOS]
-"""What the scene was trained on, it reproduces."""
+"""The photographs that the scene was trained on: it reproduces them."""
 
 
 def find(views: list[View], config: CompleterConfig) -> list[int]:

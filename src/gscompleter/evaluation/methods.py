@@ -80,7 +80,8 @@ def make_completion_method(config: str) -> Method:
 
     def method(state: Completion, target: Camera, models: Models) -> Prediction:
         completer = replace(models.make_completer(config), keep_registered=True)
-        done = completer.advance(completer.begin(state.views, state.scene), target)
+        views = [replace(view, dynamic_mask=None) for view in state.views]  # another config's
+        done = completer.advance(completer.begin(views, state.scene), target)
         (made,) = done.targets
         notes = (made.anchor, made.anchor_fallback, made.notes)
         return Prediction(done.scene, made.added, done.seconds, *notes, registered=made.registered)
@@ -105,8 +106,9 @@ def make_optimization_method(config: OptimizationConfig) -> Method:
 def synthesize_reference(state: Completion, target: Camera, models: Models) -> View:
     """Synthesize the image at a target, without padding, even if there is no hole."""
     completer = models.make_completer()
-    view = completer.observe(state, target)
-    return completer.synthesize([view])[0].crop(view.camera)
+    with timed_stage("generate"):
+        view = completer.observe(state, target)
+        return completer.synthesize([view])[0].crop(view.camera)
 
 
 def complete_by_similarity(state: Completion, target: Camera, models: Models) -> Prediction:

@@ -23,7 +23,7 @@ from gscompleter.types import DepthAffine, Gaussians
 
 @dataclass(frozen=True)
 class Attempt:
-    """What guards may judge an addition by."""
+    """An addition, and everything that guards may judge it by."""
 
     view: TargetView
     reference: GeneratedView

@@ -10,7 +10,7 @@ from gscompleter.render.lod import MAX_PREVIEW_GAUSSIANS, thin_gaussians
 from gscompleter.types import Camera, Gaussians
 
 Parts = tuple[Gaussians, ...]
-"""What is rendered: the context, then one part per target."""
+"""Gaussians to render: the context, then one part per target."""
 
 
 class SceneRenderer:

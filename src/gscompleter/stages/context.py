@@ -10,6 +10,7 @@ from jaxtyping import Float
 from torch import Tensor
 from torch.nn.functional import avg_pool2d, max_pool2d
 
+from gscompleter.config import CompleterConfig
 from gscompleter.errors import InputError
 from gscompleter.geometry import compute_z_depths, project_mask
 from gscompleter.reconstructors import Reconstructor, run_reconstructor
@@ -38,6 +39,21 @@ class InitialContext:
     """Context photographs, then check photographs, in the exposure of the context."""
     exposure_gains: Float[Tensor, "v 3"] | None = None
     """Exposure gain per channel of each original photograph relative to the context, or None."""
+
+
+def choose_config(
+    config: CompleterConfig | None, scene: Gaussians | None, check_views: Sequence[View] | None
+) -> CompleterConfig:
+    """Choose the preset that fits the input, unless settings are given.
+
+    A scene that was completed before is not recoloured again: one file keeps the originals of one
+    run.
+    """
+    is_splat = scene is not None and check_views is not None
+    config = config or CompleterConfig.for_input(is_splat)
+    if scene is not None and bool((scene.generated > 0).any()):
+        config = replace(config, recolor=replace(config.recolor, iterations=0))
+    return config
 
 
 def init_context(

@@ -1,4 +1,4 @@
-"""Stage 4: refine the opacities of added Gaussians, and nothing else (paper, Eq. 13)."""
+"""Stage 4: refine the opacities of added Gaussians, and nothing else (paper, Sec. III-F)."""
 
 from __future__ import annotations
 

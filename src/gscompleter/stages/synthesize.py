@@ -37,7 +37,7 @@ class GeneratedView(View):
 def synthesize(
     generator: Generator | ImageFunction, inputs: Sequence[tuple[Camera, GeneratorInput]]
 ) -> list[GeneratedView]:
-    """Synthesize `Ĩ_t = Φ(I_n, P_t)` for targets in one call of Φ, each given its nearest view."""
+    """Synthesize `Ĩ_t = Φ(I_n, P_t)` for targets in one call of Φ (paper, Eq. 6)."""
     if not inputs:
         return []
     requests = [

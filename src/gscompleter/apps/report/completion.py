@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import shutil
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, dataclass
 from functools import partial
@@ -361,10 +362,13 @@ def save_completed_splat(
 ) -> None:
     """Write `completed.ply` in the layout of the input splat, and the originals of the changed.
 
-    Recoloured Gaussians stand among the generated ones, after all that kept its bits.
+    Recoloured Gaussians stand among the generated ones, after all that kept its bits. The originals
+    of an earlier run are kept with those that it recoloured.
     """
-    kept = input_splat.context_mask
+    kept, earlier = input_splat.context_mask, input_splat.path.with_name(REMOVED_FILE)
     if not changed.any():
+        if bool((context.generated > 0).any()) and earlier.is_file():
+            shutil.copyfile(earlier, folder / REMOVED_FILE)
         save_like(folder / COMPLETED_FILE, context, generated, input_splat.path, kept)
         return
     rows = torch.nonzero(changed.cpu())[:, 0]
@@ -379,11 +383,12 @@ def write_pictures(
     folder: Path, number: int, result: TargetResult, images: BeforeAfter
 ) -> Limits | None:
     """Write the images of a target; return the limits of its depth colours."""
+    alpha = result.trusted_alpha
     named = {
         "before": images.before.image,
         "after": images.after.image,
         "hole_mask": result.hole_mask.float(),
-        "support": None if result.trusted_alpha is result.before.alpha else result.trusted_alpha,
+        "support": None if torch.equal(alpha, images.before.alpha) else alpha,
         "reference": None if result.reference is None else result.reference.image,
         "truth": None if images.photograph is None else images.photograph.image,
     }
