@@ -30,7 +30,7 @@ from gscompleter.geometry import measure_baseline, measure_rotation, resize_came
 from gscompleter.io.video import check_video_writer, write_video
 from gscompleter.progress import show_progress
 from gscompleter.render import load_renderer
-from gscompleter.state import Completion, TargetResult
+from gscompleter.state import Completion, Photo, TargetResult
 from gscompleter.types import Camera
 from scenes import Room, camera_at, half_a_room_of
 from target_views import begin_with
@@ -129,7 +129,9 @@ def test_sides_are_even():
 def test_the_film_starts_at_the_nearest_photograph(completion):
     (view,) = completion.views
     far = replace(view, camera=camera_at(-2.0, size=SIZE))
-    first, target = choose_stops(replace(completion, views=(far, view)))
+    first, target = choose_stops(
+        replace(completion, photos=(Photo(far), Photo(view)), num_context=2)
+    )
     assert torch.equal(first.c2w, view.camera.c2w)
     assert torch.equal(target.c2w, completion.targets[0].target.c2w)
 

@@ -388,7 +388,7 @@ def write_pictures(
         "before": images.before.image,
         "after": images.after.image,
         "hole_mask": result.hole_mask.float(),
-        "support": None if torch.equal(alpha, images.before.alpha) else alpha,
+        "support": None if torch.equal(alpha, result.before.alpha) else alpha,
         "reference": None if result.reference is None else result.reference.image,
         "truth": None if images.photograph is None else images.photograph.image,
     }
