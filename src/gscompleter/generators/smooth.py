@@ -10,6 +10,7 @@ from numpy import ndarray
 from torch import Tensor
 
 from gscompleter.kernels.pyramid_fill import build_pyramid, compute_means
+from gscompleter.types import Render
 
 BLUR_SIGMA = 1.5
 """Standard deviation of the blur of each pyramid level, in its pixels."""
@@ -64,22 +65,20 @@ def build_sum_pyramid(weighted: Float32[ndarray, "h w c"]) -> list[Float32[ndarr
         weighted = np.stack(planes, axis=-1)
 
 
-def average_trusted(
-    image: Float[Tensor, "h w 3"], trust: Float[Tensor, "h w"]
-) -> Float[Tensor, "h w 3"]:
-    """Average the colours of an image around each pixel by trust in [0, 1], at several scales.
+def average_trusted(render: Render, trust: Float[Tensor, "h w"]) -> Float[Tensor, "h w 3"]:
+    """Average the colours of a render around each pixel by trust in [0, 1], at several scales.
 
     Such a normalized convolution has no structure that could be wrong.
     """
     height, width = trust.shape
     scale = min(1.0, MEANS_SIDE / max(height, width))
     size = max(round(scale * width), 1), max(round(scale * height), 1)
-    weight = MIN_TRUST + (1 - MIN_TRUST) * trust.cpu().numpy()
-    layers = np.concatenate([image.cpu().numpy() * weight[..., None], weight[..., None]], axis=-1)
+    shown = torch.cat([render.image.clamp(0, 1), render.alpha[..., None]], dim=-1)
+    layers = ((MIN_TRUST + (1 - MIN_TRUST) * trust)[..., None] * shown).cpu().numpy()
     small = cv2.resize(layers, size, interpolation=cv2.INTER_AREA)
     total: Float32[ndarray, "h w 4"] = np.zeros_like(small, np.float32)
     for level in range(NUM_SCALES):
         mean = cv2.GaussianBlur(small, (0, 0), FIRST_SIGMA * 2**level)
         total += np.float32(COARSER_WEIGHT**level) * mean.astype(np.float32)
-    means = cv2.resize(total[..., :3] / total[..., 3:], (width, height))
-    return torch.from_numpy(means).to(image)
+    means = cv2.resize(total[..., :3] / np.maximum(total[..., 3:], 1e-6), (width, height))
+    return torch.from_numpy(means).to(render.image).clamp(0, 1)

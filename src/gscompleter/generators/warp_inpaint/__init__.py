@@ -43,15 +43,12 @@ class WarpInpaint:
     ) -> Float[Tensor, "h w 3"]:
         """Synthesize the complete image of `target`, in [0, 1].
 
-        What covers the target without being trusted gets smooth colours, which cannot be wrong in
-        structure.
+        A scene that is not fully trusted gets smooth colours, which cannot be wrong in structure.
         """
-        image = self.fill_holes(nearest, target, context)
         render, trusted_alpha = context.target_render, context.trusted_alpha
         if trusted_alpha is None or trusted_alpha is render.alpha:
-            return image
-        means = average_trusted(render.image.clamp(0, 1), trusted_alpha)
-        return torch.where((render.alpha < context.max_alpha)[..., None], image, means)
+            return self.fill_holes(nearest, target, context)
+        return average_trusted(render, trusted_alpha / render.alpha.clamp_min(1e-6))
 
     def fill_holes(
         self, nearest: View, target: Camera, context: GeneratorInput
