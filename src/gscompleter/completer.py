@@ -34,7 +34,6 @@ from gscompleter.state import (
     NEW_PHOTO_ID,
     Completion,
     Photo,
-    TargetResult,
     find_last_target_id,
 )
 from gscompleter.timing import record_seconds, timed_stage
@@ -166,7 +165,7 @@ class GSCompleter:
         with record_seconds() as seconds:
             view = self.observe(state, target, reference)
             if view.skip_reason:
-                return state.extended(make_unchanged_result(view), seconds)
+                return state.extended(view.make_unchanged_result(), seconds)
             image = reference or self.synthesize([view])[0]  # Eq. 6
             lifted = lift(self.reconstructor, image, view)  # Eq. 7
             affine = align_depth(lifted, view, rng)  # Eq. 8
@@ -176,7 +175,7 @@ class GSCompleter:
             added, rejected_by = guards.verify(Attempt(view, image, affine, refined))
             recolored = recolor(image, view, state.next_target_id)
             result = replace(
-                make_unchanged_result(view),
+                view.make_unchanged_result(),
                 after=recolored.frozen.composite(added).crop(view.camera),
                 added=added,
                 reference=image.crop(view.camera),
@@ -210,7 +209,7 @@ class GSCompleter:
         A reference that was synthesized in advance determines the padding by its camera.
         """
         camera = self.pad_target(state, target)
-        if reference is not None:
+        if reference:
             return render_target(state, pad_like(camera.target, reference.camera), self.scenes)
         view = render_target(state, camera, self.scenes)
         if is_enclosed(view.camera.crop(view.holes)):
@@ -229,26 +228,9 @@ class GSCompleter:
         return synthesize(self.generator, inputs)
 
 
-def make_unchanged_result(view: TargetView) -> TargetResult:
-    """Return the result of a target at which nothing was changed."""
-    before = view.render.crop(view.camera)
-    return TargetResult(
-        target=view.camera.target,
-        before=before,
-        after=before,
-        hole_mask=view.camera.crop(view.holes),
-        trusted_alpha=view.camera.crop(view.alpha),
-        anchor=view.anchor.index,
-        anchor_fallback=view.anchor.fallback,
-        added=view.state.parts[0][:0],
-        refusal=view.refusal,
-        skip_reason=view.skip_reason,
-    )
-
-
 def check_target_ids(scene: Gaussians | None, num_targets: int) -> None:
     """Raise InputError if `generated` cannot hold the ids of `num_targets` more targets."""
-    given = 0 if scene is None else find_last_target_id(scene)
+    given = find_last_target_id(scene) if scene else 0
     if given + num_targets > MAX_TARGET_ID:
         raise InputError(
             f"{num_targets} targets were given after {given} in the scene, and a .ply can tell "

@@ -455,8 +455,8 @@ class Proxy:
     """LOD proxy: m Gaussians rendered in place of the n Gaussians of a large scene."""
 
     scene: Gaussians
-    proxy_index: Int64[Tensor, "n"]
-    """Proxy Gaussian that represents each of the n Gaussians."""
+    proxy_index: Int64[Tensor, "_n"]
+    """Proxy Gaussian that represents each of the n Gaussians; empty for a scene itself."""
 
 
 @dataclass(frozen=True)

@@ -55,7 +55,7 @@ def pixel_at(scene: Gaussians) -> torch.Tensor:
 
 
 def test_a_small_scene_is_its_own_proxy():
-    assert build_proxy(ROOM, CAMERAS) is None
+    assert build_proxy(ROOM, CAMERAS).scene is ROOM
     completion = GSCompleter(KnowingReconstructor()).begin(VIEWS[::2], ROOM, VIEWS[1:2])
     assert completion.parts[0] is completion.scene is completion.context is ROOM
 

@@ -110,6 +110,5 @@ def find_in_free_space(
         scene = render.depth_map()
         before = z < (1 + CLEARANCE) * scene.depth[y, x]
         in_free_space |= visible & scene.valid[y, x] & before
-        if camera.near is not None:
-            in_free_space |= (points - camera.center).norm(dim=-1) < camera.near
+        in_free_space |= (points - camera.center).norm(dim=-1) < (camera.near or 0.0)
     return in_free_space

@@ -112,7 +112,7 @@ class ViewPlanner:
             choices = self.score_candidates(completion, remaining)
             config = completion.config.next_best_view
             choice = choose_best(choices, [v.camera for v in completion.views], step, config)
-            if choice is None:
+            if not choice:
                 break
             completion = complete(completion, choice.camera)
             chosen.append(choice)

@@ -33,10 +33,10 @@ MAX_GROWTH = 8.0
 """Largest factor on both, if the proxy would be too large otherwise."""
 
 
-def build_proxy(scene: Gaussians, cameras: Sequence[Camera]) -> Proxy | None:
-    """Build the LOD proxy of a large `scene`, or None if it is small or on a GPU."""
+def build_proxy(scene: Gaussians, cameras: Sequence[Camera]) -> Proxy:
+    """Build the LOD proxy of a large `scene`; one that is small or on a GPU is its own."""
     if len(scene) < MIN_PROXY_GAUSSIANS or scene.means.is_cuda:
-        return None
+        return Proxy(scene, torch.arange(0, device=scene.means.device))
     return simplify_scene(scene, cameras)
 
 

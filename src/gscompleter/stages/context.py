@@ -51,7 +51,7 @@ def choose_config(
     """
     is_splat = scene is not None and check_views is not None
     config = config or CompleterConfig.for_input(is_splat)
-    if scene is not None and bool((scene.generated > 0).any()):
+    if scene and bool((scene.generated > 0).any()):
         config = replace(config, recolor=replace(config.recolor, iterations=0))
     return config
 
@@ -99,9 +99,7 @@ def take_scene(
     check_finite(scene)
     photos = [*views, *check_views]
     proxy = build_proxy(scene, [*targets, *(view.camera for view in photos)])
-    source = ContextScene.whole(scene)
-    if proxy is not None:
-        source = ContextScene(scene, proxy.scene, proxy.proxy_index)
+    source = ContextScene(scene, proxy.scene, proxy.proxy_index)
     near, far = find_depth_range(views, source.rendered, renderer)
     return InitialContext(source, tuple(set_depth_range(photos, near, far)))
 
@@ -159,7 +157,7 @@ def has_texture(image: Float[Tensor, "h w 3"]) -> bool:
 
 def sort_by_frame(views: Sequence[View]) -> list[View]:
     """Sort views by frame number, so that their order does not matter; keep it if one has none."""
-    if any(view.frame is None for view in views):
+    if None in [view.frame for view in views]:
         return list(views)
     return sorted(views, key=lambda view: view.frame or 0)
 
@@ -169,13 +167,12 @@ def drop_ignored(made: Reconstruction, views: Sequence[View]) -> Gaussians:
     gaussians = made.gaussians
     gone = torch.zeros(len(gaussians), dtype=torch.bool, device=gaussians.means.device)
     for number, view in enumerate(views):
-        if view.ignore_mask is None:
-            continue
+        ignored = ~view.valid_mask
         if made.view_index is None or made.pixel_index is None:
-            gone |= project_mask(view.ignore_mask, gaussians, view.camera)
+            gone |= project_mask(ignored, gaussians, view.camera)
         else:
             own = made.view_index == number
-            gone[own] = view.ignore_mask.flatten()[made.pixel_index[own]]
+            gone[own] = ignored.flatten()[made.pixel_index[own]]
     return gaussians[~gone] if gone.any() else gaussians
 
 

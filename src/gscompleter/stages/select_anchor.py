@@ -64,8 +64,7 @@ def select_anchor(
     overlapping = [i for i in possible if rotations[i] < config.max_rotation]
     if not overlapping:
         return AnchorChoice(min(possible, key=rotations.__getitem__), fallback=True)
-    if overlaps is None:
-        return AnchorChoice(max(overlapping, key=baselines.__getitem__), fallback=False)
+    overlaps = overlaps or [1.0] * len(views)
     enough = [i for i in overlapping if overlaps[i] >= config.min_overlap]
     if not enough:
         return AnchorChoice(max(overlapping, key=overlaps.__getitem__), fallback=False)

@@ -112,7 +112,7 @@ def apply_affine(
 
 
 def bound(ratio: Float[Tensor, "n"], least: float | None) -> Float[Tensor, "n"]:
-    """Bound distance ratios from below, unless `least` is None."""
+    """Bound distance ratios from below, if a bound is given."""
     return ratio if least is None else ratio.clamp_min(least)
 
 

@@ -16,7 +16,7 @@ from gscompleter.render import FrozenScene
 from gscompleter.render.cache import SceneRenderer
 from gscompleter.sky import mask_out_sky
 from gscompleter.stages.select_anchor import AnchorChoice, compute_overlap, select_anchor
-from gscompleter.state import Completion
+from gscompleter.state import Completion, TargetResult
 from gscompleter.types import Camera, GeneratorInput, PaddedCamera, Render, View
 
 FULL_TRUST = 1.0
@@ -112,6 +112,22 @@ class TargetView:
         if not self.camera.crop(self.holes | (self.distrust > 0)).any():
             return "The scene has no hole here: nothing to complete."
         return ""
+
+    def make_unchanged_result(self) -> TargetResult:
+        """Return the result of a target at which nothing was changed."""
+        before = self.render.crop(self.camera)
+        return TargetResult(
+            target=self.camera.target,
+            before=before,
+            after=before,
+            hole_mask=self.camera.crop(self.holes),
+            trusted_alpha=self.camera.crop(self.alpha),
+            anchor=self.anchor.index,
+            anchor_fallback=self.anchor.fallback,
+            added=self.state.parts[0][:0],
+            refusal=self.refusal,
+            skip_reason=self.skip_reason,
+        )
 
     def make_generator_input(self) -> GeneratorInput:
         """Collect the input of Φ."""
