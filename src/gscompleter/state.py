@@ -94,6 +94,8 @@ class TargetResult(RenamedMembers):
     """Loss per iteration of `register` (Eq. 11) and `refine` (Eq. 13)."""
     registered: Gaussians | None = None
     """All registered Gaussians, hole or not; None without `GSCompleter.keep_registered`."""
+    target_id: int = 0
+    """Value of `generated` for what this target added or recoloured."""
     num_recolored: int = 0
     """Number of rendered context Gaussians that got new colours."""
     synthesis_notes: tuple[str, ...] = ()

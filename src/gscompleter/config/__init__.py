@@ -222,7 +222,14 @@ class NextBestViewConfig(Settings):
     """Share of the best gain that is enough for a nearer camera to be preferred."""
 
 
-GuardName = Literal["dynamic-masks", "image-agreement", "depth-agreement", "free-space", "psnr"]
+GuardName = Literal[
+    "dynamic-masks",
+    "image-agreement",
+    "depth-agreement",
+    "free-space",
+    "psnr",
+    "contribution",
+]
 
 
 @dataclass(frozen=True)
@@ -241,6 +248,7 @@ class CompleterConfig(Settings):
         "depth-agreement",
         "free-space",
         "psnr",
+        "contribution",
     )
     """Safeguards beyond the paper, in the order in which they are asked (paper: none)."""
     margin: Annotated[float, Interval(ge=0, le=4)] = 0.25
@@ -268,7 +276,7 @@ class CompleterConfig(Settings):
         """Return the settings for a splat that comes with further photographs."""
         return CompleterConfig(
             trust="photometric",
-            guards=("image-agreement", "free-space", "psnr"),
+            guards=("image-agreement", "free-space", "psnr", "contribution"),
             margin=0.0,
             psnr_guard=PsnrGuardConfig(max_drop=0.0),
         )

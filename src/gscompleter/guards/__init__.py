@@ -82,6 +82,7 @@ GUARDS = {
     "depth-agreement": "gscompleter.guards.agreement:DepthAgreement",
     "free-space": "gscompleter.guards.free_space:FreeSpace",
     "psnr": "gscompleter.guards.psnr:PsnrGuard",
+    "contribution": "gscompleter.guards.contribution:Contribution",
 }
 """Module and class of each guard, imported when a preset names it."""
 

@@ -127,6 +127,7 @@ class TargetView:
             added=self.state.parts[0][:0],
             refusal=self.refusal,
             skip_reason=self.skip_reason,
+            target_id=self.state.next_target_id,
         )
 
     def make_generator_input(self) -> GeneratorInput:

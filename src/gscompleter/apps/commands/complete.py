@@ -43,6 +43,7 @@ from gscompleter.apps.report.plain_words import (
     describe_exposures,
     describe_ignored,
     describe_motion,
+    describe_new_photographs,
 )
 from gscompleter.apps.warmup.compilation import SPLAT_PART, compile_kernels
 from gscompleter.completer import GSCompleter, check_target_ids
@@ -295,6 +296,7 @@ def describe_result(summary: Mapping[str, Any], options: CompleteOptions) -> Ite
         describe_exposures(row["exposure_gain"] for row in context),
         describe_motion({row["frame"]: row["dynamic_fraction"] for row in context}),
         describe_ignored(row["ignored"] for row in context),
+        describe_new_photographs(summary.get("new_photographs")),
     )
     yield from filter(None, notes)
     origin = summary["frame"]["origin"]
@@ -309,7 +311,7 @@ def describe_result(summary: Mapping[str, Any], options: CompleteOptions) -> Ite
         yield f"Video: {options.out / VIDEO_FILE}"
     before, after = (100 * summary["coverage"][when] for when in ("before", "after"))
     yield f"Coverage around the photographs: {before:.1f} % before, {after:.1f} % after."
-    unused = summary["held_out"]
+    unused = [row for row in summary["held_out"] if not row["is_check"]]
     if unused:
         before, after = (
             fmean(row[f"psnr_{when}"] for row in unused) for when in ("before", "after")
@@ -320,7 +322,9 @@ def describe_result(summary: Mapping[str, Any], options: CompleteOptions) -> Ite
         )
     counts, seconds = summary["gaussians"], summary["seconds"]["total"]
     yield (
-        f"Added {counts['added']:,} Gaussians to {counts['context']:,} in {seconds:.1f} s: "
+        f"Added {counts['added']:,} Gaussians to {counts['context']:,}"
+        f"{', recoloured ' + format(counts['recolored'], ',') if 'recolored' in counts else ''}"
+        f" in {seconds:.1f} s: "
         f"{options.out / COMPLETED_FILE}"
     )
     yield f"Report: {options.out / REPORT_FILE}"

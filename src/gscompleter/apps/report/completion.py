@@ -168,6 +168,7 @@ def build_summary(
         "context": [asdict(row) for row in context],
         "targets": [asdict(row) for row in at_targets],
         "gaussians": count_gaussians(completion),
+        **count_new_photographs(completion),
         "seconds": dict(completion.seconds),
     }
 
@@ -197,7 +198,8 @@ def make_target_row(
         affine=AlignmentRow(fit.scale, fit.shift, fit.inliers, fit.method, fit.agreement),
         added=len(added),
         derived_from=target.derived_from,
-        target_id=int(added.generated[0]) if len(added) else None,
+        recolored=result.num_recolored,
+        target_id=result.target_id if len(added) or result.num_recolored else None,
         notes=result.notes,
         refused=result.refusal,
     )
@@ -206,6 +208,13 @@ def make_target_row(
 def compute_mask_fraction(mask: Bool[Tensor, "h w"] | None) -> float:
     """Compute the fraction of True pixels; 0 without a mask."""
     return 0.0 if mask is None else mask.float().mean().item()
+
+
+def count_new_photographs(completion: Completion) -> dict[str, int]:
+    """Count the photographs that a splat was not trained on; empty under full trust."""
+    if completion.config.trust == "full":
+        return {}
+    return {"new_photographs": completion.num_new_photos}
 
 
 def count_gaussians(completion: Completion) -> dict[str, int]:

@@ -73,6 +73,22 @@ def describe_exposures(gains: Iterable[Sequence[float] | None]) -> str | None:
     )
 
 
+def describe_new_photographs(count: int | None) -> str | None:
+    """Describe what photographs beyond those of the training bring to a splat."""
+    if count is None:
+        return None
+    if count == 0:
+        return (
+            "The splat reproduces all photographs. Where it is wrong from elsewhere, only smooth "
+            "colours are known: little is to be gained without new photographs of the place or a "
+            "learned generator."
+        )
+    return (
+        f"The splat was not trained on {count} of the photographs; it is recoloured to them, which "
+        "helps most."
+    )
+
+
 def describe_alignment(affine: AlignmentRow, unit: str) -> str:
     """Describe the depth alignment of a target."""
     sign = "−" if affine.shift < 0 else "+"
@@ -104,6 +120,7 @@ def list_scene_notes(summary: CompletionSummary) -> list[str]:
         describe_exposures(row.exposure_gain for row in context),
         ORACLE_NOTE if summary.settings.get("uses_target_photographs") else None,
         NO_SCORES_NOTE if targets and all(row.psnr_after is None for row in targets) else None,
+        describe_new_photographs(summary.new_photographs),
         f"{recolored:,} {RECOLORED_NOTE}" if recolored else None,
         None if targets else NO_TARGET_NOTE,
     ]

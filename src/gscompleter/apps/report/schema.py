@@ -84,9 +84,10 @@ class TargetRow(ScoreRow):
     hole_fraction: float
     affine: AlignmentRow
     added: int
+    recolored: int = 0
     derived_from: int | None = None
     target_id: int | None = None
-    """Value of `generated` of its Gaussians in completed.ply; None if nothing was added."""
+    """Value of `generated` of its Gaussians in completed.ply; None if nothing was changed."""
     notes: tuple[str, ...] = ()
     refused: str | None = None
     """Sentence why the target cannot be completed, or None if it can."""
@@ -136,6 +137,8 @@ class CompletionSummary:
     gaussians: Mapping[str, int]
     seconds: Mapping[str, float]
     held_out: tuple[HeldOutRow, ...] = ()
+    new_photographs: int | None = None
+    """Photographs that a splat was not trained on; None if the scene was reconstructed."""
 
 
 @dataclass(frozen=True)

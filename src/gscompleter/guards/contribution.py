@@ -1,0 +1,36 @@
+"""Contribution guard (not in the paper): drop additions that no image shows."""
+
+from __future__ import annotations
+
+import torch
+from jaxtyping import Bool
+from torch import Tensor
+
+from gscompleter.guards import Attempt, Guard
+from gscompleter.render import FrozenScene
+from gscompleter.types import Gaussians
+
+MIN_WEIGHT = 0.002
+"""Summed compositing weight up to which no pixel shows a Gaussian by more than this share."""
+
+
+class Contribution(Guard):
+    """Drop added Gaussians that are hidden, transparent or outside of every image."""
+
+    name = "contribution"
+
+    def verify(self, added: Gaussians, attempt: Attempt) -> Gaussians:
+        """Keep what the target or a photograph shows."""
+        view = attempt.view
+        photos = [photo.view for photo in view.state.photos]
+        shown = torch.zeros(len(added), dtype=torch.bool, device=added.means.device)
+        for frozen in (view.frozen, *view.at(photos)):
+            shown |= find_shown(added, frozen)
+        return added[shown]
+
+
+def find_shown(added: Gaussians, frozen: FrozenScene) -> Bool[Tensor, "n"]:
+    """Find Gaussians with enough summed weight in the image of a frozen scene."""
+    together = frozen.extend(added)
+    sums = together.backproject(torch.ones_like(together.render.image))[:, 0]
+    return sums[len(sums) - len(added) :] > MIN_WEIGHT
