@@ -31,6 +31,7 @@ FILES = ("LICENSE", "CITATION.cff")
 STAGES = (
     "select_context",
     "context",
+    "target_view",
     "synthesize",
     "select_anchor",
     "lift",
@@ -39,6 +40,8 @@ STAGES = (
     "extrapolate",
     "filter_holes",
     "refine",
+    "recolor",
+    "new_photos",
 )
 """Modules of `stages/` in the paper's order; those that do not exist are left out."""
 LINK = re.compile(r"(?<=\]\()[^)\s]+(?=\))")

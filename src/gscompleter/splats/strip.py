@@ -34,7 +34,7 @@ from gscompleter.splats.ply import load_ply, read_header, save_ply
 from gscompleter.types import Gaussians, merge
 
 REMOVED_FILE = "removed.ply"
-"""Name of the file of pruned Gaussians, beside the completed scene."""
+"""Name of the file of replaced originals, beside the completed scene."""
 
 
 def strip(path: Path, out: Path) -> tuple[int, int]:
@@ -103,7 +103,7 @@ def save_removed(
     given: Path | None = None,
     kept: Bool[Tensor, "m"] | None = None,
 ) -> None:
-    """Write pruned Gaussians with their ascending row numbers in the input scene.
+    """Write replaced originals with their ascending row numbers in the input scene.
 
     The rows of a binary .ply `given` are copied with all of their properties. `kept` marks the rows
     of `given` that the scene has; None for all.
@@ -122,7 +122,7 @@ def save_removed(
 
 
 def load_removed(path: Path) -> tuple[Gaussians, Int[Tensor, "n"]]:
-    """Load pruned Gaussians and their row numbers in the input scene."""
+    """Load replaced originals and their row numbers in the input scene."""
     removed = load_ply(path)
     with path.open("rb") as file:
         _, (vertex, *others) = read_header(file, path)
@@ -142,7 +142,7 @@ def load_removed(path: Path) -> tuple[Gaussians, Int[Tensor, "n"]]:
 
 
 def reinsert(kept: Gaussians, removed: Gaussians, rows: Int[Tensor, "n"], path: Path) -> Gaussians:
-    """Insert pruned Gaussians at their rows; `path` names their file in errors."""
+    """Insert replaced originals at their rows; `path` names their file in errors."""
     total = len(kept) + len(removed)
     if len(rows) and int(rows.max()) >= total:
         raise InputError(

@@ -47,10 +47,13 @@ class Recolored:
 def recolor(reference: GeneratedView, view: TargetView, label: int) -> Recolored:
     """Recolour what covers the target without being trusted, and trust it from there on.
 
-    A true photograph may recolour all that it shows: other photographs hold what they show. `label`
-    marks the recoloured Gaussians as generated.
+    A true photograph may recolour all that it shows: other photographs hold what they show. An image
+    that is inconsistent with the photographs recolours nothing. `label` marks the recoloured
+    Gaussians as generated.
     """
     state, camera, context = view.state, view.camera.padded, view.state.parts[0]
+    if reference.is_inconsistent:
+        return Recolored(state, view.frozen, 0)
     found = fit_colors(
         merge(state.parts),
         view.frozen,

@@ -123,7 +123,7 @@ class CompleteOptions(CompletingOptions):
     """Cameras to complete the scene for: frame numbers, or a file of cameras (transforms.json,
     cameras.json, COLMAP's images.txt, SuperSplat poses). If not given, cameras that see holes are
     searched for and written to targets.json."""
-    auto: Annotated[int, Interval(ge=1, le=255)] | None = None
+    auto: Annotated[int, Interval(ge=1, le=254)] | None = None
     """Most cameras to search for if no target is given; 4 if no number follows."""
     dry_run: bool = False
     """Only search for cameras, write them to targets.json (to edit and to pass to --target), and
