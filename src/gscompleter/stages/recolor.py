@@ -47,8 +47,8 @@ class Recolored:
 def recolor(reference: GeneratedView, view: TargetView, label: int) -> Recolored:
     """Recolour what covers the target without being trusted, and trust it from there on.
 
-    A true photograph may recolour all that it shows: other photographs hold what they show. An image
-    that is inconsistent with the photographs recolours nothing. `label` marks the recoloured
+    A true photograph may recolour all that it shows, since other photographs hold what they show;
+    an image that is inconsistent with them recolours nothing. `label` marks the recoloured
     Gaussians as generated.
     """
     state, camera, context = view.state, view.camera.padded, view.state.parts[0]

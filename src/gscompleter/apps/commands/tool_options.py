@@ -57,7 +57,7 @@ class ConvertOptions(Options):
 
 @dataclass(frozen=True, kw_only=True)
 class StripOptions(Options):
-    """Undo a completion: remove generated Gaussians and put the originals of recoloured ones back."""
+    """Undo a completion: remove what was generated and put the originals back."""
 
     completed: Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="COMPLETED")]
     """Completed scene. Gaussians of a removed.ply beside it are put back."""
