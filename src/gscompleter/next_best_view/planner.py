@@ -120,7 +120,7 @@ class ViewPlanner:
             chosen.append(choice)
             left = [c.candidate for c in choices if c.gain >= config.min_gain]
             remaining = [candidate for candidate in left if candidate is not choice.candidate]
-            if completion.config.trust != "full":  # what an attempt leaves stays
+            if completion.config.trust != "full":  # one attempt for each place
                 remaining = [c for c in remaining if not choice.is_near(c, step)]
         return completion, tuple(chosen)
 
