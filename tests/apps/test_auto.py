@@ -128,6 +128,21 @@ def test_a_scene_that_was_brought_is_explored_with_its_doubts(
     assert "To complete: 1 camera, in a time that is not known in advance." in shown
 
 
+def test_of_a_splat_the_trusted_share_is_said_and_written(
+    scene, completed, tmp_path, monkeypatch, capsys
+):
+    out = tmp_path / "out"
+    given = ("--scene", completed / "context.ply", "--context", 0, 2, 4)
+    said = [word for word in QUICK if word != "--quiet"]
+    assert run(monkeypatch, "complete", scene, "--out", out, *given, "--auto", 1, *said) == 0
+    coverage = summary_of(out)["coverage"]
+    assert set(coverage) == {"before", "after", "cameras"}
+    shares = f"{100 * coverage['before']:.1f} % before, {100 * coverage['after']:.1f} % after."
+    sentence = f"Trusted around the photographs: {shares}"
+    assert sentence in " ".join(capsys.readouterr().out.split())
+    assert sentence in (out / "report.html").read_text()
+
+
 def test_a_dry_run_shows_what_named_targets_would_cost(scene, tmp_path, monkeypatch):
     out = tmp_path / "out"
     words = ("complete", scene, "--out", out, "--target", 4, "--dry-run", *QUICK)

@@ -93,6 +93,28 @@ def test_cameras_that_are_spread_are_no_neighbours():
     assert sorted(select_spread_cameras(cameras, 99)) == list(range(6))
 
 
+def test_beside_photographs_is_level_between_them_and_towards_the_same_scene():
+    cameras = [camera_at(x, yaw=yaw) for x, yaw in ((-0.3, 0), (0.1, 10), (0.7, 12))]
+    found = propose_candidates(cameras, [seen_by(c) for c in cameras], 0.3, stays_beside=True)
+    assert [c.base for c in found] == [index for index in range(3) for _ in range(5)]
+    for candidate in found:
+        camera, base = candidate.camera, cameras[candidate.base]
+        assert camera.center[1].item() == pytest.approx(base.center[1].item(), abs=1e-5)
+        assert tilted(camera) < 1e-5
+        assert measure_rotation(camera, base) < 10
+        assert measure_baseline(camera, base) < 0.31
+    between = found[4].camera
+    assert torch.allclose(between.center, (cameras[0].center + cameras[1].center) / 2, atol=1e-6)
+    assert measure_rotation(between, cameras[1]) == pytest.approx(5, abs=1e-2)
+
+
+def test_beside_a_single_photograph_there_is_nothing_between():
+    camera = camera_at()
+    found = propose_candidates([camera], [seen_by(camera)], 0.3, stays_beside=True)
+    assert len(found) == 4
+    assert min(measure_baseline(c.camera, camera) for c in found) > 0.29
+
+
 @pytest.mark.parametrize("unit", [1e-4, 1e4])
 def test_the_unit_of_the_scene_changes_no_candidate(unit):
     places = ((-0.3, 0), (0.1, 10), (0.7, 12))

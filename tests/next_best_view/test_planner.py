@@ -7,18 +7,24 @@ import torch
 
 from gscompleter import CompleterConfig, GSCompleter
 from gscompleter.config import AlignmentConfig, NextBestViewConfig, RegistrationConfig
+from gscompleter.config.coverage import COVERED
 from gscompleter.evaluation.metrics.coverage import (
     compute_coverage,
     compute_covered_share,
     render_pairs,
     sample_held_out_cameras,
 )
-from gscompleter.next_best_view.gain import compute_gain, make_placeholders, simplify_completion
+from gscompleter.next_best_view.gain import (
+    compute_gain,
+    compute_remoteness,
+    make_placeholders,
+    simplify_completion,
+)
 from gscompleter.next_best_view.planner import ViewPlanner, add_free_space_cameras
 from gscompleter.render import load_renderer
 from gscompleter.stages.select_anchor import compute_overlap
 from gscompleter.state import Completion
-from gscompleter.types import Camera, Gaussians, Render, View
+from gscompleter.types import Camera, Gaussians, Render, View, merge
 from scenes import Room, camera_at, cast, gaussians_of, view_of
 from test_completer import KnowingGenerator, KnowingReconstructor, knowing
 
@@ -40,6 +46,19 @@ def begun() -> Completion:
     return explorer().completer.begin(photographs())
 
 
+@pytest.fixture(scope="module")
+def opaque() -> Completion:
+    """Begin with a splat that is opaque where the photographs see nothing."""
+    unseen = view_of(Room(), camera_at(0.7, yaw=25, size=SIZE))
+    scene = gaussians_of(photographs()[0])
+    for view in (photographs()[1], replace(unseen, image=1 - unseen.image)):
+        holes = load_renderer("cpu").render(scene, view.camera).alpha < COVERED
+        scene = merge([scene, gaussians_of(view)[holes.flatten()]])
+    splat = replace(CompleterConfig.splat(), next_best_view=NextBestViewConfig(image_size=48))
+    completer = GSCompleter(KnowingReconstructor(), KnowingGenerator(), config=splat)
+    return completer.begin(photographs(), scene, [])
+
+
 def cameras():
     return [view.camera for view in photographs()]
 
@@ -47,12 +66,21 @@ def cameras():
 def test_holes_count_where_they_border_on_what_was_observed():
     holes = torch.zeros(40, 40, dtype=torch.bool)
     holes[:, 20:] = True
+    near, none = NextBestViewConfig(border_radius=0.1), torch.zeros(40, 40)
+    wide = NextBestViewConfig(border_radius=1.0)
+    assert compute_gain(holes, none, 1.0, near) == pytest.approx(4 / 40)
+    assert compute_gain(holes, none, 0.5, near) == pytest.approx(2 / 40)
+    assert compute_gain(holes, none, 1.0, wide) == pytest.approx(0.5)
+    assert compute_gain(torch.ones_like(holes), none, 1.0) == 0.0
+    assert compute_gain(torch.zeros_like(holes), none, 1.0) == 0.0
+
+
+def test_what_is_covered_without_trust_counts_outside_of_holes():
+    holes, distrust = torch.zeros(40, 40, dtype=torch.bool), torch.full((40, 40), 0.2)
+    assert compute_gain(holes, distrust, 0.5) == pytest.approx(0.5 * 0.2**2)
+    holes[:, 20:] = True
     near = NextBestViewConfig(border_radius=0.1)
-    assert compute_gain(holes, 1.0, near) == pytest.approx(4 / 40)
-    assert compute_gain(holes, 0.5, near) == pytest.approx(2 / 40)
-    assert compute_gain(holes, 1.0, NextBestViewConfig(border_radius=1.0)) == pytest.approx(0.5)
-    assert compute_gain(torch.ones_like(holes), 1.0) == 0.0
-    assert compute_gain(torch.zeros_like(holes), 1.0) == 0.0
+    assert compute_gain(holes, distrust, 1.0, near) == pytest.approx(0.5 * 0.2**2 + 4 / 40)
 
 
 def test_overlap_is_what_the_anchor_sees_too():
@@ -88,6 +116,40 @@ def test_the_second_camera_is_chosen_in_the_scene_that_the_first_left(begun):
     )
     assert before.gain == first.gain
     assert after.gain < 0.5 * before.gain
+
+
+def test_a_splat_is_completed_where_it_is_opaque_and_not_trusted(opaque):
+    _, (choice,) = explorer().explore(opaque, cameras(), 1)
+    alpha = load_renderer("cpu").render(opaque.parts[0], choice.camera).alpha
+    assert choice.gain > 0.05 > 1.5 * (alpha < COVERED).float().mean()
+    assert choice.camera.center[0] > 0.1
+
+
+def test_no_place_of_a_splat_is_tried_twice(opaque):
+    def refuse(completion: Completion, camera: Camera) -> Completion:
+        tried.append(camera)
+        return completion
+
+    tried: list[Camera] = []
+    searching = explorer()
+    _, step = searching.find_candidates(opaque, cameras())
+    searching.complete_greedily(opaque, cameras(), 10, refuse)
+    assert 2 <= len(tried) < 10
+    for number, camera in enumerate(tried[1:], start=1):
+        assert compute_remoteness(camera, tried[:number], step) > 1
+
+
+def test_coverage_of_a_splat_is_what_is_trusted_and_includes_what_was_recoloured(opaque):
+    renderer = load_renderer("cpu")
+    aside = [camera_at(0.7, yaw=yaw, size=SIZE) for yaw in (15, 25)]
+    found = compute_coverage(render_pairs(opaque, aside, renderer))
+    seen = [renderer.render(opaque.parts[0], camera) for camera in aside]
+    assert found.before == found.after < compute_covered_share(seen) - 0.1
+    frozen, rows = renderer.freeze(opaque.parts[0], aside[0]), torch.arange(len(opaque.parts[0]))
+    trusted = replace(opaque, trust=opaque.trust.accept(frozen, aside[0], rows))
+    then = compute_coverage(render_pairs(trusted, aside, renderer))
+    assert then.before == found.before
+    assert then.after == pytest.approx(compute_covered_share(seen), abs=0.01)
 
 
 def test_nothing_is_found_where_nothing_is_left(begun):

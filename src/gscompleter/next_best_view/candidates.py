@@ -2,6 +2,7 @@
 
 Each camera is translated in six directions, turned in four, and moved on four orbits. Steps are so
 short that most of what a candidate sees was observed; horizons stay as level as in photographs.
+Around a trained splat, candidates stand beside and between photographs and look at the same scene.
 """
 
 from __future__ import annotations
@@ -17,14 +18,18 @@ from gscompleter.config import NextBestViewConfig
 from gscompleter.geometry import (
     axis_angle_to_matrix,
     compute_field_of_view,
+    embed_cameras,
     estimate_up,
     project,
     resize_camera,
+    slerp_rotation,
 )
 from gscompleter.types import Camera, Render
 
 FREE_SPACE_MARGIN = 0.1
 """Distance in front of a surface, relative to depth, from which a point is in free space."""
+MOVES_ASIDE = (0, 1, 10, 11)
+"""Moves of `make_moves` to the right and left, straight and around what the camera looks at."""
 MIN_COVERAGE = 0.05
 """Fraction of its image that must show the scene for a camera to have a known depth."""
 
@@ -45,19 +50,25 @@ def propose_candidates(
     renders: Sequence[Render],
     step: float,
     config: NextBestViewConfig = NextBestViewConfig(),
+    stays_beside: bool = False,
 ) -> list[Candidate]:
     """Propose the moves of each base camera that end in free space.
 
     `renders` show the scene at `bases`. `step` is the longest move in scene units, 0 if unknown.
+    With `stays_beside`, cameras move aside or halfway to the most similar base only.
     """
     depths, nearest = compute_depth_quantiles(renders, 0.5), compute_depth_quantiles(renders, 0.05)
-    up = estimate_up(bases)
+    up, places = estimate_up(bases), embed_cameras(bases)
+    similar = torch.cdist(places, places).argsort(dim=1)[:, 1:2].tolist()
     found = []
     for index, (base, depth) in enumerate(zip(bases, depths, strict=True)):
         longest = config.max_step * depth
         away = make_moves(
             base, depth, min(step, longest) if step > 0 else longest, config.yaw_fraction, up
         )
+        if stays_beside:
+            between = [interpolate_camera(base, bases[other], 0.5) for other in similar[index]]
+            away = [*(away[move] for move in MOVES_ASIDE), *between]
         found += [Candidate(camera, index, nearest[index]) for camera in away]
     small = [resize_camera(b, *r.alpha.T.shape) for b, r in zip(bases, renders, strict=True)]
     return [c for c in found if is_in_free_space(c.camera.center, small, renders)]
@@ -103,6 +114,14 @@ def move_camera(camera: Camera, turn: Float[Tensor, "3 3"], shift: Float[Tensor,
     c2w[:3, :3] = turn @ camera.c2w[:3, :3]
     c2w[:3, 3] += shift
     return replace(camera, c2w=c2w)
+
+
+def interpolate_camera(first: Camera, second: Camera, share: float) -> Camera:
+    """Interpolate from `first` to the pose of `second`."""
+    turn = second.c2w[:3, :3].double() @ first.c2w[:3, :3].double().T
+    return move_camera(
+        first, slerp_rotation(turn, share).to(first.c2w), share * (second.center - first.center)
+    )
 
 
 def is_in_free_space(

@@ -1,7 +1,8 @@
 """Next-best view: score candidate cameras and choose among them.
 
 The gain is the image fraction of holes near observed pixels (farther away anything could be there)
-times the overlap with the anchor. Among similar gains, the camera nearest to the photographs wins.
+and of distrust elsewhere, times the overlap with the anchor. Among similar gains, the camera
+nearest to the photographs wins.
 """
 
 from __future__ import annotations
@@ -10,7 +11,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import torch
-from jaxtyping import Bool
+from jaxtyping import Bool, Float
 from torch import Tensor
 
 from gscompleter.config import NextBestViewConfig
@@ -42,17 +43,25 @@ class Choice:
         """Camera of the candidate."""
         return self.candidate.camera
 
+    def is_near(self, other: Candidate, step: float) -> bool:
+        """Return True if another candidate is at most one step away, as in `choose_best`."""
+        return compute_remoteness(other.camera, [self.camera], step) <= 1
+
 
 def compute_gain(
-    holes: Bool[Tensor, "h w"], overlap: float, config: NextBestViewConfig = NextBestViewConfig()
+    holes: Bool[Tensor, "h w"],
+    distrust: Float[Tensor, "h w"],
+    overlap: float,
+    config: NextBestViewConfig = NextBestViewConfig(),
 ) -> float:
     """Compute the gain of completing an image, as a fraction of the image.
 
-    `overlap` is the fraction of the observed part that the anchor sees, too.
+    Pixels outside of `holes` count by the square of their `distrust` in [0, 1], since a little of
+    it is everywhere. `overlap` is the fraction of the observed part that the anchor sees, too.
     """
     radius = max(round(config.border_radius * max(holes.shape)), 1)
     bordering = holes & dilate(~holes, radius)
-    return bordering.float().mean().item() * overlap
+    return torch.where(holes, bordering.float(), distrust**2).mean().item() * overlap
 
 
 def choose_best(

@@ -6,7 +6,7 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 
-from jaxtyping import Bool
+from jaxtyping import Bool, Float
 from torch import Tensor
 
 from gscompleter.completer import GSCompleter
@@ -28,7 +28,7 @@ from gscompleter.progress import stage, track
 from gscompleter.render import get_view_map
 from gscompleter.render.antialiasing import adapt_to_mode
 from gscompleter.stages.select_anchor import compute_overlap, select_anchor
-from gscompleter.stages.target_view import compute_hole_mask
+from gscompleter.stages.target_view import compute_distrust, compute_hole_mask
 from gscompleter.state import Completion
 from gscompleter.timing import record_seconds
 from gscompleter.types import Camera, Render
@@ -47,6 +47,8 @@ class SmallView:
     camera: Camera
     render: Render
     holes: Bool[Tensor, "h w"]
+    distrust: Float[Tensor, "h w"]
+    """Weight in [0, 1] with which covered pixels would be recoloured; 0 under full trust."""
 
 
 @dataclass(frozen=True)
@@ -118,6 +120,8 @@ class ViewPlanner:
             chosen.append(choice)
             left = [c.candidate for c in choices if c.gain >= config.min_gain]
             remaining = [candidate for candidate in left if candidate is not choice.candidate]
+            if completion.config.trust != "full":  # one attempt for each place
+                remaining = [c for c in remaining if not choice.is_near(c, step)]
         return completion, tuple(chosen)
 
     def find_candidates(
@@ -130,7 +134,7 @@ class ViewPlanner:
         step = compute_spacing(near)
         small = simplify_completion(completion)
         renders = [self.render_small_view(small, camera).render for camera in near]
-        found = propose_candidates(near, renders, step, config)
+        found = propose_candidates(near, renders, step, config, completion.config.trust != "full")
         return [replace(candidate, base=bases[candidate.base]) for candidate in found], step
 
     def score_candidates(
@@ -158,7 +162,8 @@ class ViewPlanner:
             for anchor in anchors
         ]
         anchor = select_anchor(candidate.camera, views, config.anchor, overlaps).index
-        gain = compute_gain(small_view.holes, overlaps[anchor], config.next_best_view)
+        unsure = small_view.holes, small_view.distrust
+        gain = compute_gain(*unsure, overlaps[anchor], config.next_best_view)
         return Choice(candidate, hole, gain)
 
     def render_small_view(self, completion: Completion, camera: Camera) -> SmallView:
@@ -168,7 +173,8 @@ class ViewPlanner:
         camera = shrink_camera(camera, config.next_best_view.image_size)
         frozen = self.completer.scenes.freeze(completion.parts, camera)
         alpha = completion.trust.compute_alpha(frozen, camera)
-        return SmallView(camera, frozen.render, compute_hole_mask(alpha, config.holes))
+        distrust = compute_distrust(alpha, frozen.render.alpha)
+        return SmallView(camera, frozen.render, compute_hole_mask(alpha, config.holes), distrust)
 
     def add_placeholders(self, completion: Completion, camera: Camera) -> Completion:
         """Close the holes at a camera by grey placeholders."""

@@ -59,8 +59,7 @@ class TargetView:
     @cached_property
     def distrust(self) -> Float[Tensor, "h w"]:
         """Weight in [0, 1] with which covered pixels take the synthesized colour."""
-        trust = self.alpha / self.render.alpha.clamp_min(1e-6)
-        weight = ((FULL_TRUST - trust) / (FULL_TRUST - NO_TRUST)).clamp(0, 1)
+        weight = compute_distrust(self.alpha, self.render.alpha)
         weight = blur_gaussian(weight.where(~self.empty, 0.0), DISTRUST_BLUR * max(weight.shape))
         return weight.where(~self.empty, 0.0)
 
@@ -142,6 +141,14 @@ class TargetView:
             config.synthesis.source_depth,
             self.alpha,
         )
+
+
+def compute_distrust(
+    trusted_alpha: Float[Tensor, "h w"], alpha: Float[Tensor, "h w"]
+) -> Float[Tensor, "h w"]:
+    """Compute a weight in [0, 1] that falls with the mean trust of what a pixel shows."""
+    trust = trusted_alpha / alpha.clamp_min(1e-6)
+    return ((FULL_TRUST - trust) / (FULL_TRUST - NO_TRUST)).clamp(0, 1)
 
 
 def compute_hole_mask(

@@ -310,7 +310,8 @@ def describe_result(summary: Mapping[str, Any], options: CompleteOptions) -> Ite
     elif options.video:
         yield f"Video: {options.out / VIDEO_FILE}"
     before, after = (100 * summary["coverage"][when] for when in ("before", "after"))
-    yield f"Coverage around the photographs: {before:.1f} % before, {after:.1f} % after."
+    share = "Trusted" if summary["settings"]["config"]["trust"] == "photometric" else "Coverage"
+    yield f"{share} around the photographs: {before:.1f} % before, {after:.1f} % after."
     unused = [row for row in summary["held_out"] if not row["is_check"]]
     if unused:
         before, after = (

@@ -21,7 +21,6 @@ from torch import Tensor
 from torch.nn.functional import normalize
 
 from gscompleter.apps.report.completion import MAX_PHOTOGRAPHS, render_before_after, thin_evenly
-from gscompleter.evaluation.metrics.coverage import interpolate_camera
 from gscompleter.geometry import (
     embed_cameras,
     estimate_up,
@@ -31,6 +30,7 @@ from gscompleter.geometry import (
 )
 from gscompleter.io.image import convert_to_pixels
 from gscompleter.io.video import write_video
+from gscompleter.next_best_view.candidates import interpolate_camera
 from gscompleter.progress import track
 from gscompleter.render import Renderer
 from gscompleter.state import Completion

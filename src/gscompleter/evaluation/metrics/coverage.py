@@ -1,13 +1,15 @@
-"""Coverage: share of pixels with alpha of at least 0.5, over held-out cameras.
+"""Coverage: share of pixels with trusted alpha of at least 0.5, over held-out cameras.
 
-The cameras are random, close to the path of the context cameras and rotated by some degrees.
+The cameras are random, close to the path of the context cameras and rotated by some degrees. Under
+full trust, trusted alpha is alpha. Of a trained splat, which is opaque everywhere, it counts what
+photographs confirm; what was added or recoloured is trusted afterwards.
 """
 
 from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import torch
 
@@ -17,12 +19,13 @@ from gscompleter.geometry import (
     compute_spacing,
     measure_baseline,
     shrink_camera,
-    slerp_rotation,
 )
-from gscompleter.next_best_view.candidates import move_camera
-from gscompleter.render import Renderer, get_view_map
-from gscompleter.render.lod import MAX_PREVIEW_GAUSSIANS, thin_gaussians
+from gscompleter.next_best_view.candidates import interpolate_camera, move_camera
+from gscompleter.render import FrozenScene, Renderer, get_view_map
+from gscompleter.render.lod import MAX_PREVIEW_GAUSSIANS, choose_thinned_rows, thin_gaussians
 from gscompleter.state import Completion
+from gscompleter.trust import Trust
+from gscompleter.trust.photometric import PhotometricTrust
 from gscompleter.types import Camera, Render, merge
 
 NUM_CAMERAS = 32
@@ -34,7 +37,7 @@ TURN_DEGREES = 5.0
 
 @dataclass(frozen=True)
 class Coverage:
-    """Share of pixels that the scene covers, before and after completion."""
+    """Share of pixels that the scene covers with trust, before and after completion."""
 
     before: float
     after: float
@@ -44,7 +47,7 @@ class Coverage:
 
 @dataclass(frozen=True)
 class RenderPair:
-    """Renders of one camera before and after completion."""
+    """Renders of one camera before and after completion, with trusted alpha."""
 
     before: Render
     after: Render
@@ -58,13 +61,22 @@ def render_pairs(
     kept = thin_gaussians(completion.parts[0], MAX_PREVIEW_GAUSSIANS)
     added = [thin_gaussians(result.added, MAX_PREVIEW_GAUSSIANS) for result in completion.targets]
     new = merge([begun[:0], *added])
+    trust = completion.trust.thin(*choose_thinned_rows(completion.parts[0], MAX_PREVIEW_GAUSSIANS))
+    at_first = trust
+    if isinstance(trust, PhotometricTrust):
+        at_first = replace(trust, is_recolored=torch.zeros_like(trust.is_recolored))
 
     def render_pair(camera: Camera) -> RenderPair:
-        first = renderer.freeze(begun, camera)
-        last = renderer.freeze(kept, camera)
-        return RenderPair(first.render, last.composite(new))
+        first = render_trusted(renderer.freeze(begun, camera), at_first, camera)
+        last = renderer.freeze(kept, camera).extend(new)
+        return RenderPair(first, render_trusted(last, trust, camera))
 
     return list(get_view_map(new)(render_pair, [shrink_camera(camera, SIDE) for camera in cameras]))
+
+
+def render_trusted(frozen: FrozenScene, trust: Trust, camera: Camera) -> Render:
+    """Render a frozen scene with its alpha weighted by trust."""
+    return replace(frozen.render, alpha=trust.compute_alpha(frozen, camera))
 
 
 def compute_coverage(pairs: Sequence[RenderPair]) -> Coverage:
@@ -74,7 +86,7 @@ def compute_coverage(pairs: Sequence[RenderPair]) -> Coverage:
 
 
 def compute_covered_share(renders: Sequence[Render]) -> float:
-    """Compute the share of pixels of all renders that the scene covers."""
+    """Compute the share of pixels of all renders whose alpha is high enough."""
     return torch.cat([r.alpha.flatten() >= COVERED for r in renders]).float().mean().item()
 
 
@@ -101,11 +113,3 @@ def sample_held_out_camera(
     turn = axis_angle_to_matrix(between.c2w[:3, 1], math.radians(right))
     turn = axis_angle_to_matrix(between.c2w[:3, 0], math.radians(down)) @ turn
     return move_camera(between, turn, shift.to(between.c2w))
-
-
-def interpolate_camera(first: Camera, second: Camera, share: float) -> Camera:
-    """Interpolate from `first` to the pose of `second`."""
-    turn = second.c2w[:3, :3].double() @ first.c2w[:3, :3].double().T
-    return move_camera(
-        first, slerp_rotation(turn, share).to(first.c2w), share * (second.center - first.center)
-    )
