@@ -299,3 +299,25 @@ def test_a_surface_hidden_from_the_anchor_is_not_pulled_onto_what_hides_it():
 
     assert moved(mask_occluded=False) > 0.2
     assert moved(mask_occluded=True) < 1e-3
+
+
+def test_in_holes_a_splat_is_continued_at_the_depth_around_them():
+    """Lifted depths are half of the true ones; the scene lacks the middle of the target."""
+    reference, anchor = view_of(ROOM, TARGET), view_of(ROOM, ANCHOR)
+    x = torch.arange(SIZE)
+    middle = ((x[None] - SIZE // 2).abs() < 4) & ((x[:, None] - SIZE // 2).abs() < 4)
+    scene = gaussians_of(reference)[~middle.flatten()]
+    near = Lift(
+        gaussians_of(reference, 0.5 * reference.depth),
+        everywhere(0.5 * reference.depth),
+        everywhere(anchor.depth),
+        torch.arange(SIZE * SIZE),
+    )
+    config = CompleterConfig(
+        registration=RegistrationConfig(hole_depth="scene"),
+        alignment=AlignmentConfig(align_at="none"),
+    )
+    result = register(near, reference, observe(scene, [anchor], TARGET, config))
+    _, z = project(result.gaussians.means, TARGET)
+    error = (z.view(SIZE, SIZE) / reference.depth - 1).abs()[middle]
+    assert error.median() < 0.1

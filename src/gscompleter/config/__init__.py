@@ -102,6 +102,9 @@ class RegistrationConfig(Settings):
     min_ratio: Annotated[float, Interval(gt=0, le=1)] | None = 0.1
     """Smallest factor by which a distance may shrink, so that nothing passes the camera. None sets
     no limit (paper)."""
+    hole_depth: Literal["lifted", "scene"] = "lifted"
+    """Depth in holes: of the lifted Gaussians, or continued smoothly from the trusted scene around.
+    A smooth image has no texture that stereo could use."""
     extrapolate_into_holes: bool = True
     """Move pixels in a hole like the observed pixels around it, which avoids a depth step at the
     seam. The paper keeps their affine alignment."""
@@ -278,6 +281,7 @@ class CompleterConfig(Settings):
             trust="photometric",
             guards=("image-agreement", "free-space", "psnr", "contribution"),
             margin=0.0,
+            registration=RegistrationConfig(hole_depth="scene"),
             psnr_guard=PsnrGuardConfig(max_drop=0.0),
         )
 

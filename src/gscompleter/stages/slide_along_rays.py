@@ -12,7 +12,7 @@ from torch import Tensor
 
 from gscompleter.config import RegistrationConfig
 from gscompleter.cpu_threads import use_one_torch_thread
-from gscompleter.geometry import compute_z_depths, footprint_mask, slide
+from gscompleter.geometry import compute_z_depths, footprint_mask, move_to_depths, slide
 from gscompleter.image_ops import fill_smoothly
 from gscompleter.optim import Adam
 from gscompleter.progress import track
@@ -61,6 +61,9 @@ def slide_along_rays(
         view.scenes.renderer,
         config,
     )
+    if config.hole_depth == "scene" and pixel_index is not None:
+        depth = fill_smoothly(view.render.depth, ~view.holes).flatten()[pixel_index]
+        return Registration(move_to_depths(coarse, reference.camera, depth), pixel_index, losses)
     if config.extrapolate_into_holes and config.degrees_of_freedom == 1 and pixel_index is not None:
         scene = view.render.depth_map(view.state.config.holes.max_alpha)
         registered = extrapolate_into_holes(

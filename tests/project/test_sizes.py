@@ -1,0 +1,41 @@
+"""The method stays short enough to be read in one sitting."""
+
+import re
+from collections.abc import Iterator
+from pathlib import Path
+
+from paths import ROOT
+
+PACKAGE = ROOT / "src" / "gscompleter"
+METHOD = ("completer.py", "stages", "guards", "trust", "next_best_view")
+CORE = (
+    *("__init__.py", "types.py", "geometry.py", "image_ops.py", "optim.py", "sky.py", "errors.py"),
+    *("progress.py", "timing.py", "memory.py", "cpu_threads.py", "state.py", "cleaning.py"),
+    *("ssim.py", "plugins.py", "deprecation.py", "config", "render", *METHOD),
+)
+KERNELS = ("simd", "project", "composite", "tiles", "lod", "support", "parallel", "compiled")
+
+
+def files_of(names: tuple[str, ...]) -> Iterator[Path]:
+    for name in names:
+        path = PACKAGE / name
+        yield from sorted(path.rglob("*.py")) if path.is_dir() else (path,)
+
+
+def count_lines(names: tuple[str, ...]) -> int:
+    return sum(len(path.read_text().splitlines()) for path in files_of(names))
+
+
+def test_the_completer_is_short():
+    assert count_lines(("completer.py",)) <= 250
+
+
+def test_the_method_seldom_asks_what_is_missing():
+    texts = [path.read_text() for path in files_of(METHOD)]
+    found = [line for text in texts for line in text.splitlines()]
+    assert sum(bool(re.search(r"is (not )?None", line)) for line in found) <= 15
+
+
+def test_the_core_is_short():
+    kernels = tuple(f"kernels/{name}.py" for name in KERNELS)
+    assert count_lines((*CORE, *kernels)) <= 10_000
