@@ -186,7 +186,7 @@ class Completion(RenamedMembers):
         """The scene before its first target, bit for bit."""
         return self.source.gaussians
 
-    @property
+    @cached_property
     def added(self) -> Gaussians:
         """Generated Gaussians of all targets."""
         return merge([self.parts[0][:0], *self.parts[1:]])
@@ -202,7 +202,7 @@ class Completion(RenamedMembers):
         parts = [self.recolored_context, *self.parts[1:]]
         return merge(parts) if len(parts) > 1 else parts[0]
 
-    @property
+    @cached_property
     def recolored_context(self) -> Gaussians:
         """The context with the new colours and target ids of recoloured Gaussians."""
         before, after, given = self.source.rendered, self.parts[0], self.source.gaussians

@@ -8,6 +8,7 @@ from torch import Tensor
 
 from gscompleter.guards import Attempt, Guard
 from gscompleter.render import FrozenScene
+from gscompleter.trust.photometric import sum_weights
 from gscompleter.types import Gaussians
 
 MIN_WEIGHT = 0.002
@@ -22,15 +23,13 @@ class Contribution(Guard):
     def verify(self, added: Gaussians, attempt: Attempt) -> Gaussians:
         """Keep what the target or a photograph shows."""
         view = attempt.view
-        photos = [photo.view for photo in view.state.photos]
         shown = torch.zeros(len(added), dtype=torch.bool, device=added.means.device)
-        for frozen in (view.frozen, *view.at(photos)):
+        for frozen in (view.frozen, *view.frozen_photos):
             shown |= find_shown(added, frozen)
         return added[shown]
 
 
 def find_shown(added: Gaussians, frozen: FrozenScene) -> Bool[Tensor, "n"]:
     """Find Gaussians with enough summed weight in the image of a frozen scene."""
-    together = frozen.extend(added)
-    sums = together.backproject(torch.ones_like(together.render.image))[:, 0]
+    sums = sum_weights(frozen.extend(added))
     return sums[len(sums) - len(added) :] > MIN_WEIGHT

@@ -61,7 +61,7 @@ class PsnrGuard(Guard):
         state, plans = attempt.view.state, attempt.refined.plans
         return meet_error_budgets(
             added,
-            attempt.view.at([photo.view for photo in state.photos]),
+            attempt.view.frozen_photos,
             [photo.budgets for photo in state.photos],
             [restrict_to_image(plan) for plan in plans],
             state.config.psnr_guard,

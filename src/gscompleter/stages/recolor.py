@@ -52,13 +52,14 @@ def recolor(reference: GeneratedView, view: TargetView, label: int) -> Recolored
     Gaussians as generated.
     """
     state, camera, context = view.state, view.camera.padded, view.state.parts[0]
-    if reference.is_inconsistent:
+    weight = torch.ones_like(view.alpha) if reference.is_photograph else view.distrust
+    if reference.is_inconsistent or not weight.any():
         return Recolored(state, view.frozen, 0)
     found = fit_colors(
         merge(state.parts),
         view.frozen,
         reference,
-        torch.ones_like(view.distrust) if reference.is_photograph else view.distrust,
+        weight,
         state.trust.held,
         view.scenes.renderer,
         state.config.recolor,

@@ -34,12 +34,12 @@ class Refined:
 @timed_stage("integrate")
 def refine(kept: Gaussians, reference: View, view: TargetView) -> Refined:
     """Refine the opacities of added Gaussians against the image and the nearest photographs."""
-    photos, config = [photo.view for photo in view.state.photos], view.state.config.refine
-    plans = tuple(frozen.vary_opacities(kept) for frozen in view.at(photos))
-    near = sort_by_distance(reference.camera, view.state.views)[: config.num_views]
+    views, config = view.state.views, view.state.config.refine
+    plans = tuple(frozen.vary_opacities(kept) for frozen in view.frozen_photos)
+    near = sort_by_distance(reference.camera, views)[: config.num_views]
     at_target = view.frozen.vary_opacities(kept)
     refined, losses = refine_opacities(
-        kept, at_target, reference, [plans[i] for i in near], [photos[i] for i in near], config
+        kept, at_target, reference, [plans[i] for i in near], [views[i] for i in near], config
     )
     return Refined(refined, plans, losses)
 

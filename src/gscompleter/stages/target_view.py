@@ -79,6 +79,11 @@ class TargetView:
         """Renders of the scene at the context views."""
         return tuple(frozen.render for frozen in self.at(self.state.views))
 
+    @cached_property
+    def frozen_photos(self) -> tuple[FrozenScene, ...]:
+        """The same scene frozen at all photographs."""
+        return self.at([photo.view for photo in self.state.photos])
+
     @property
     def anchor_render(self) -> Render:
         """Render of the scene at the anchor."""

@@ -40,8 +40,6 @@ VIDEO_FILE = "video.mp4"
 FRAMES_PER_SECOND = 24
 ONE_WAY_SECONDS = 3.0
 """Duration of one direction."""
-ONE_WAY_FRAMES = round(FRAMES_PER_SECOND * ONE_WAY_SECONDS)
-"""Frames rendered if there are few targets."""
 MIN_LEG_SECONDS = 0.75
 MAX_TARGETS = 6
 MAX_SIDE = 640
