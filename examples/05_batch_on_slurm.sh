@@ -12,7 +12,7 @@
 #SBATCH --requeue
 #SBATCH --signal=B:TERM@60
 
-# A minute before the time is over the job in hand is given back, so that it costs no attempt.
+# A minute before the time is over the workers are stopped, and remove what is unfinished.
 trap 'kill -TERM "$worker"; wait "$worker"' TERM
 gscompleter batch "$1" --out "$2" --shard auto --workers 2 --threads 2 &
 worker=$!

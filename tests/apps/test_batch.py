@@ -5,7 +5,6 @@ import os
 import signal
 import subprocess
 import sys
-import threading
 import time
 from dataclasses import dataclass
 from pathlib import Path
@@ -20,8 +19,7 @@ from gscompleter.apps.commands.row_options import parse_row
 from gscompleter.errors import OutputError
 from gscompleter.jobs import jobs as batch
 from gscompleter.jobs.engines import LocalEngine, SubmititEngine
-from gscompleter.jobs.jobs import Job, find_missing_jobs, run_claimed
-from gscompleter.jobs.places import open_place
+from gscompleter.jobs.jobs import Job, find_missing_jobs, run_job
 from gscompleter.jobs.workers import parse_shard, run_jobs
 from paths import SUPPORT
 from scenes import camera_at, photographed
@@ -67,13 +65,22 @@ def killed_and_started_again(engine: str, out: Path, count: int, seconds: float)
     until(lambda: len(lines(out / "ended")) >= count // 2)
     driver.kill()
     driver.wait()
+    until(lambda: not any(map(is_alive, lines(out / "begun").values())))
     assert started(engine, out, count, seconds, 2).wait() == 0
     ended = lines(out / "ended")
     assert sorted(ended) == [job.name for job in plain_jobs(count, seconds)]
     assert {name: len(pids) for name, pids in ended.items()} == dict.fromkeys(ended, 1)
     assert len(list((out / "rows").glob("*.json"))) == count
     assert max(len(pids) for pids in lines(out / "begun").values()) > 1  # a worker was killed
-    assert not list((out / "claims").glob("*"))
+
+
+def is_alive(pids: list[str]) -> bool:
+    """Return True if the last process that began a job still exists."""
+    status = Path(f"/proc/{pids[-1]}/status")
+    try:
+        return "State:\tZ" not in status.read_text()
+    except OSError:
+        return False
 
 
 def test_what_is_killed_goes_on_and_every_job_is_done_once(tmp_path):
@@ -88,24 +95,14 @@ def test_of_two_hundred_jobs_each_is_done_once_whatever_is_killed(engine, tmp_pa
     killed_and_started_again(engine, tmp_path, 200, 0.2)
 
 
-def test_three_runs_at_once_share_the_work(tmp_path):
-    runs = [started("local", tmp_path, 9, 0.2, 1) for _ in range(3)]
-    assert [one.wait() for one in runs] == [0, 0, 0]
-    ended = lines(tmp_path / "ended")
-    assert {name: len(pids) for name, pids in ended.items()} == {
-        job.name: 1 for job in plain_jobs(9, 0.2)
-    }
-    assert len({pids[0] for pids in ended.values()}) > 1
-
-
 def test_a_job_ends_as_a_row_with_its_reason(tmp_path, monkeypatch):
     monkeypatch.setattr(batch, "RETRY_SECONDS", 0.0)
     ends = ("sentence", "defect", "defect once", None)
     jobs = [Job(str(end), {"ends": end}) for end in ends]
-    place, perform = open_place(tmp_path), Writing(str(tmp_path), retries=2)
+    perform = Writing(tmp_path, retries=2)
     for job in jobs:
         perform(job)
-    rows = {job.name: batch.read_row(place, job.name) for job in jobs}
+    rows = {job.name: row_of(tmp_path, job.name) for job in jobs}
     states = {name: (row["state"], row["reason"], row["attempts"]) for name, row in rows.items()}
     assert states == {
         "sentence": ("failed", "The scene is broken; mend it.", 1),
@@ -124,15 +121,6 @@ def test_a_job_that_kills_its_worker_is_given_up_and_the_others_are_done(tmp_pat
     assert len(lines(tmp_path / "begun")["bad"]) == 2
 
 
-def test_in_a_store_workers_have_shares_and_a_killed_one_is_counted(tmp_path):
-    jobs = [Job("bad", {"ends": "always killed"}), *plain_jobs(4, 0.0)]
-    assert len(run_all(f"file://{tmp_path}", jobs, LocalEngine(2), retries=1)) == 5
-    assert row_of(tmp_path, "bad")["state"] == "failed"
-    assert {name: len(pids) for name, pids in lines(tmp_path / "ended").items()} == {
-        job.name: 1 for job in plain_jobs(4, 0.0)
-    }
-
-
 @dataclass(frozen=True)
 class Full:
     """Runs a job on a full disk."""
@@ -142,81 +130,70 @@ class Full:
 
 
 def test_an_error_of_a_worker_ends_the_run(tmp_path):
-    place = open_place(tmp_path)
     with pytest.raises(OutputError, match="no space left"):
-        list(run_jobs(place, [Job("one")], Full(), lambda: set(), LocalEngine(1)))
+        list(run_jobs([Job("one")], Full(), lambda job: False, LocalEngine(1)))
 
 
-def test_attempts_of_earlier_runs_count(tmp_path):
-    claims = tmp_path / "claims"
-    claims.mkdir()
-    (claims / "bad").write_text("...")  # as after three killed processes
-    Writing(str(tmp_path), retries=2)(Job("bad"))
-    assert row_of(tmp_path, "bad")["state"] == "failed"
-    assert "killed 3 times" in row_of(tmp_path, "bad")["reason"]
-    assert not (tmp_path / "begun").exists()
-    (claims / "fair").write_text("..")
-    Writing(str(tmp_path), retries=2)(Job("fair"))
-    assert row_of(tmp_path, "fair")["state"] == "done"
+@dataclass(frozen=True)
+class Deadly:
+    """Kills its process, whatever it is told."""
+
+    def __call__(self, job: Job) -> None:
+        os.kill(os.getpid(), signal.SIGKILL)
 
 
-def test_what_somebody_else_does_is_waited_for(tmp_path):
-    place, job = open_place(tmp_path), Job("one")
-    with place.hold_claim(job.claim):
-        assert place.is_held(job.claim)
-        Writing(str(tmp_path))(job)
-        assert not (tmp_path / "rows").exists()
-        other = threading.Thread(target=run_all, args=(tmp_path, [job], None))
-        other.start()
-        time.sleep(0.5)
-        assert not (tmp_path / "begun").exists()
-    other.join()
-    assert not place.is_held(job.claim)
-    assert row_of(tmp_path, "one")["state"] == "done"
+def test_workers_that_cannot_even_list_a_failure_end_the_run():
+    with pytest.raises(RuntimeError, match="exit code -9"):
+        list(run_jobs([Job("one")], Deadly(), lambda job: False, LocalEngine(1)))
+
+
+def test_an_interrupt_stops_the_workers_and_leaves_nothing_unfinished(tmp_path):
+    driver = started("local", tmp_path, 4, 60.0, 2)
+    until(lambda: len(lines(tmp_path / "begun")) == 2)
+    driver.send_signal(signal.SIGINT)
+    assert driver.wait(timeout=30) != 0
+    assert not any(map(is_alive, lines(tmp_path / "begun").values()))
+    assert os.listdir(tmp_path) == ["begun"]
+
+
+def test_shards_add_up_and_each_job_is_done_once(tmp_path):
+    jobs = plain_jobs(5, 0.0)
+    for number in (1, 0):
+        run_all(tmp_path, jobs[number::2], None)
+    assert {name: len(pids) for name, pids in lines(tmp_path / "ended").items()} == {
+        job.name: 1 for job in jobs
+    }
+    assert find_missing_jobs(jobs, tmp_path, False) == []
 
 
 def test_a_full_disk_ends_the_run_and_loses_nothing(tmp_path, monkeypatch):
-    place = open_place(tmp_path)
-    run_claimed(Job("first"), place, lambda: {"size": 1}, retries=2)
+    run_job(Job("first"), tmp_path, lambda: {"size": 1}, retries=2)
 
     def full() -> dict[str, int]:
         raise OutputError("Cannot write it: there is no space left.")
 
     with pytest.raises(OutputError, match="no space left"):
-        run_claimed(Job("second"), place, full, retries=2)
-    assert [job.name for job in find_missing_jobs([Job("first"), Job("second")], place, False)] == [
-        "second"
-    ]
-    assert os.listdir(tmp_path / "claims") == []
-    run_claimed(Job("second"), place, lambda: {"size": 1}, retries=2)
+        run_job(Job("second"), tmp_path, full, retries=2)
+    assert [
+        job.name for job in find_missing_jobs([Job("first"), Job("second")], tmp_path, False)
+    ] == ["second"]
+    run_job(Job("second"), tmp_path, lambda: {"size": 1}, retries=2)
     assert row_of(tmp_path, "second")["state"] == "done"
 
 
 def test_done_with_other_options_is_refused_and_failed_is_done_again(tmp_path):
-    place = open_place(tmp_path)
-    perform = Writing(str(tmp_path))
+    perform = Writing(tmp_path)
     perform(Job("good"))
     perform(Job("bad", {"ends": "sentence"}))
     with pytest.raises(InputError, match="job good done with other options"):
-        find_missing_jobs([Job("good", {"seconds": 1})], place, False)
-    assert find_missing_jobs([Job("bad", {"ends": "sentence"})], place, False) == []
-    assert len(find_missing_jobs([Job("bad", {"ends": "sentence"})], place, True)) == 1
+        find_missing_jobs([Job("good", {"seconds": 1})], tmp_path, False)
+    assert find_missing_jobs([Job("bad", {"ends": "sentence"})], tmp_path, False) == []
+    assert len(find_missing_jobs([Job("bad", {"ends": "sentence"})], tmp_path, True)) == 1
     perform(Job("bad", {"ends": "sentence"}))
     mended = Job("bad", {})
-    assert find_missing_jobs([mended], place, False) == [mended]
+    assert find_missing_jobs([mended], tmp_path, False) == [mended]
     perform(mended)
     assert row_of(tmp_path, "bad")["state"] == "done"
-
-
-def test_a_store_counts_who_begins_and_locks_nobody_out(tmp_path):
-    place = open_place(f"file://{tmp_path}/out")
-    assert not place.has_locks
-    place.write("claims/one", b".")
-    with place.hold_claim("claims/one") as lost:
-        assert lost == 1
-        assert place.read("claims/one") == b".."
-        assert not place.is_held("claims/one")
-    assert place.list_names("claims") == set()
 
 
 @pytest.mark.parametrize(
@@ -247,9 +224,9 @@ def test_manifests_of_all_kinds_name_the_same_jobs(tmp_path):
         '{"folder": "scenes/one", "target": [4, 6], "video": true, "config": {"holes": '
         '{"max_alpha": 0.4}}}\n{"folder": "scenes/two scenes"}\n'
     )
-    by_csv = read_manifest(str(tmp_path / "m.csv"), {})
-    by_json = read_manifest(str(tmp_path / "m.jsonl"), {})
-    by_folder = read_manifest(str(tmp_path / "scenes"), {})
+    by_csv = read_manifest(tmp_path / "m.csv", {})
+    by_json = read_manifest(tmp_path / "m.jsonl", {})
+    by_folder = read_manifest(tmp_path / "scenes", {})
     for jobs in (by_csv, by_json, by_folder):
         assert [job.name for job in jobs] == ["one", "two-scenes"]
     options = [[parse_row(j.options, tmp_path / "o") for j in jobs] for jobs in (by_csv, by_json)]
@@ -264,10 +241,10 @@ def test_rows_of_one_scene_get_numbers_and_equal_names_are_refused(tmp_path):
     manifest = tmp_path / "m.jsonl"
     rows = [{"folder": "room"}, {"folder": "room", "seed": 1}, {"folder": "room", "name": "a/b"}]
     manifest.write_text("\n".join(map(json.dumps, rows)))
-    assert [j.name for j in read_manifest(str(manifest), {})] == ["room-1", "room-2", "a-b"]
+    assert [j.name for j in read_manifest(manifest, {})] == ["room-1", "room-2", "a-b"]
     manifest.write_text("\n".join(map(json.dumps, [{"name": "x"}, {"name": "x"}])))
     with pytest.raises(InputError, match="Two jobs have the name x"):
-        read_manifest(str(manifest), {})
+        read_manifest(manifest, {})
 
 
 @pytest.mark.parametrize(
@@ -329,12 +306,12 @@ def test_a_batch_does_what_complete_does_and_tells_of_what_is_broken(
     assert "There is no " in rows["nowhere"]["reason"]
     assert "--targt" in rows["typo"]["reason"]
     assert rows["room-0"]["psnr_after"] > rows["room-0"]["psnr_before"]
-    for cost in ("seconds", "cpu_seconds", "written_bytes", "result_bytes"):
+    for cost in ("seconds", "cpu_seconds", "result_bytes"):
         assert rows["room-0"][cost] > 0
     table = (out / "table.csv").read_text().splitlines()
     assert len(table) == 5
     page = (out / "index.html").read_text()
-    assert page.count("data:image/jpeg") == 2
+    assert page.count("data:image/jpeg") == 4
     assert 'href="jobs/room-0/report.html"' in page
     assert (out / "jobs" / "room-0" / "report.html").is_file()
     before = {p: p.stat().st_mtime_ns for p in out.rglob("*.ply")}
@@ -343,24 +320,6 @@ def test_a_batch_does_what_complete_does_and_tells_of_what_is_broken(
     errors = capsys.readouterr().err
     assert "Done 0, failed 0, done earlier 4, 2 of them failed (--rerun failures repeats" in errors
     assert {p: p.stat().st_mtime_ns for p in out.rglob("*.ply")} == before
-
-
-def test_a_store_gets_the_same_results_and_needs_no_folder_here(manifest, tmp_path):
-    """Run the work of a worker in this process."""
-    from gscompleter.apps.commands.batch import JobCompleter
-
-    [job] = [j for j in read_manifest(str(manifest), {}) if j.name == "room-0"]
-    room = {**job.options, "folder": f"file://{job.options['folder']}"}
-    here, there = tmp_path / "here", tmp_path / "there"
-    JobCompleter(str(here), 0)(job)
-    JobCompleter(f"file://{there}", 0)(Job("room-0", room))
-    for out in (here, there):
-        assert row_of(out, "room-0")["state"] == "done", row_of(out, "room-0")["reason"]
-    same_results(here, there / "jobs", "room-0")
-    missing_there = {**room, "folder": f"file://{tmp_path}/nothing"}
-    JobCompleter(f"file://{there}", 0)(Job("gone", missing_there))
-    assert row_of(there, "gone")["state"] == "failed"
-    assert "There is nothing at" in row_of(there, "gone")["reason"]
 
 
 def test_a_folder_of_something_else_is_refused(tmp_path, manifest, monkeypatch, capsys):

@@ -5,6 +5,7 @@ import os
 import shutil
 import subprocess
 import sys
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
@@ -15,6 +16,7 @@ from gscompleter.config.generators import PEFieldSettings
 from gscompleter.data.cases import read_cases
 from gscompleter.evaluation.protocols import Task, make_case_task
 from gscompleter.evaluation.runner import (
+    RETRIES,
     RowCounts,
     RunConfig,
     TaskRunner,
@@ -24,7 +26,6 @@ from gscompleter.evaluation.runner import (
 )
 from gscompleter.evaluation.store import VERSION, claim, list_row_paths, read_json, write_json
 from gscompleter.evaluation.tables import write_tables
-from gscompleter.jobs.places import open_place
 from scenes import Room, camera_at, photographed
 
 SIZE = 32
@@ -176,24 +177,6 @@ def test_three_shards_at_once_end_with_the_tables_of_one_run(scenes, finished, t
     three_at_once(scenes, tmp_path / "out", finished)
 
 
-def test_a_case_that_somebody_does_is_left_to_them(tasks, tmp_path):
-    out, job = tmp_path / "out", make_task_job(tasks[0])
-    evaluating = TaskRunner(out, METHOD_NAMES, RunConfig())
-    with open_place(out).hold_claim(f"claims/{job.name}"):
-        evaluating(job)
-    assert list_row_paths(out) == []
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("more", [(), ("--engine", "local", "--workers", "2")])
-def test_without_shards_the_work_is_shared_too(scenes, finished, tmp_path, more):
-    out = tmp_path / "out"
-    runs = [started(scenes, out, "0/1", *more) for _ in range(2)]
-    assert [one.wait() for one in runs] == [0, 0]
-    same_tables(out, finished)
-    assert os.listdir(out / "claims") == []
-
-
 @pytest.mark.slow
 def test_three_shards_at_once_end_so_ten_times_out_of_ten(scenes, finished, tmp_path):
     for number in range(10):
@@ -233,6 +216,21 @@ def test_a_shard_leaves_the_last_tables_to_the_others(finished, tmp_path, monkey
     monkeypatch.setattr(command, "try_plots", draw)
     command.write_and_print_tables(out, quiet=True, num_rows=6)
     assert len(calls) == 1
+
+
+@pytest.mark.slow
+def test_workers_end_with_the_tables_of_one_run(scenes, finished, tmp_path):
+    more = ("--engine", "local", "--workers", "2")
+    assert started(scenes, tmp_path / "out", "0/1", *more).wait() == 0
+    same_tables(tmp_path / "out", finished)
+
+
+def test_a_case_whose_workers_were_killed_is_given_up(tasks, tmp_path):
+    job = replace(make_task_job(tasks[0]), lost=RETRIES + 1)
+    TaskRunner(tmp_path, METHOD_NAMES, RunConfig())(job)
+    errors = [read_json(row)["error"] for row in list_row_paths(tmp_path)]
+    assert len(errors) == len(METHOD_NAMES)
+    assert all("killed 3 times" in error for error in errors)
 
 
 def test_shards_one_after_the_other_add_up(finished, tasks, tmp_path):

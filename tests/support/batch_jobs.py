@@ -9,13 +9,14 @@ import sys
 import time
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import Any
 
 from gscompleter.errors import InputError
+from gscompleter.io.files import replace_file
 from gscompleter.jobs.engines import LocalEngine, RayEngine
-from gscompleter.jobs.jobs import JOBS, Job, find_missing_jobs, list_done_jobs, run_claimed
-from gscompleter.jobs.places import open_place
+from gscompleter.jobs.jobs import JOBS, Job, find_missing_jobs, has_row, make_folder, run_job
 from gscompleter.jobs.workers import Engine, run_jobs
 
 
@@ -23,14 +24,14 @@ from gscompleter.jobs.workers import Engine, run_jobs
 class Writing:
     """Runs a job for `seconds`, and ends it as `ends` names."""
 
-    out: str
+    out: Path
     retries: int = 2
 
     def __call__(self, job: Job) -> None:
-        run_claimed(job, open_place(self.out), lambda: self.written(job), self.retries)
+        run_job(job, self.out, lambda: self.written(job), self.retries)
 
     def written(self, job: Job) -> dict[str, Any]:
-        folder = Path(self.out.removeprefix("file://"))
+        folder = self.out
         noted(folder / "begun" / job.name)
         time.sleep(job.options.get("seconds", 0.0))
         ends = job.options.get("ends")
@@ -42,7 +43,9 @@ class Writing:
         if ends == "defect" or (ends == "defect once" and times == 1):
             raise KeyError("a defect")
         content = hashlib.sha256(job.name.encode()).hexdigest().encode()
-        open_place(self.out).write(f"{JOBS}/{job.name}/result", content)
+        make_folder(folder / JOBS / job.name)
+        with replace_file(folder / JOBS / job.name / "result") as file:
+            file.write(content)
         noted(folder / "ended" / job.name)
         return {"size": len(content)}
 
@@ -54,13 +57,10 @@ def noted(path: Path) -> None:
         file.write(f"{os.getpid()}\n")
 
 
-def run_all(
-    out: Path | str, jobs: Sequence[Job], engine: Engine | None, retries: int = 2
-) -> list[str]:
+def run_all(out: Path, jobs: Sequence[Job], engine: Engine | None, retries: int = 2) -> list[str]:
     """Run the jobs without a row, and return their names in the order in which they ended."""
-    place, perform = open_place(str(out)), Writing(str(out), retries)
-    left = find_missing_jobs(jobs, place, rerun_failed=False)
-    ended = run_jobs(place, left, perform, lambda: list_done_jobs(place), engine, retries)
+    left = find_missing_jobs(jobs, out, rerun_failed=False)
+    ended = run_jobs(left, Writing(out, retries), partial(has_row, out=out), engine, retries)
     return [job.name for job in ended]
 
 

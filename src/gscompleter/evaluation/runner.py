@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Mapping, Sequence
 from contextlib import nullcontext
 from dataclasses import asdict, dataclass, field, replace
@@ -18,7 +17,6 @@ from gscompleter.evaluation.protocols import Task
 from gscompleter.evaluation.steps import PreparedTask, attempt, complete_task, load_or_compute
 from gscompleter.generators import load_generator
 from gscompleter.jobs.jobs import Job, describe_loss
-from gscompleter.jobs.places import open_place
 from gscompleter.jobs.workers import Engine, check_shard, run_jobs
 from gscompleter.memory import check_memory
 from gscompleter.progress import Activity, show_activity, show_progress, stage
@@ -112,8 +110,7 @@ def evaluate(
     config.load_models(())
     store.claim(out, collect_settings(config))
     share = tasks[shard[0] :: shard[1]]
-    # Workers that are killed are counted; a killed command is simply run again.
-    runner = TaskRunner(out, tuple(methods), config, math.inf if engine is None else RETRIES)
+    runner = TaskRunner(out, tuple(methods), config)
     for task in share:
         for row in runner.find_rows(task):
             if rerun == "scores" or (rerun == "failures" and has_failed(row)):
@@ -122,11 +119,11 @@ def evaluate(
     jobs = [make_task_job(task) for task in {task.name: task for task in todo.values()}.values()]
     activity = Activity("evaluating", len(todo))
 
-    def list_done() -> set[str]:
-        return {job.name for job in jobs if not runner.find_missing_rows(job.options["task"])}
+    def has_rows(job: Job) -> bool:
+        return not runner.find_missing_rows(job.options["task"])
 
     with show_activity(activity) if todo else nullcontext():
-        for job in run_jobs(open_place(out), jobs, runner, list_done, engine, RETRIES):
+        for job in run_jobs(jobs, runner, has_rows, engine, RETRIES):
             for _ in set(runner.find_rows(job.options["task"])) & set(todo):
                 activity.count_step()
     failed = sum(map(has_failed, todo))
@@ -150,8 +147,6 @@ class TaskRunner:
     out: Path
     methods: tuple[str, ...]
     config: RunConfig
-    max_losses: float = math.inf
-    """Number of killed processes after which a task is given up."""
 
     def find_rows(self, task: Task) -> dict[Path, str]:
         """Return the paths of the rows of a task, with their methods."""
@@ -162,13 +157,9 @@ class TaskRunner:
         return {row: m for row, m in self.find_rows(task).items() if not row.exists()}
 
     def __call__(self, job: Job) -> None:
-        """Compute the missing rows of a task, unless another process does it."""
-        task = job.options["task"]
-        if not self.find_missing_rows(task):
-            return
-        with open_place(self.out).hold_claim(job.claim) as lost:
-            if lost is not None:
-                self.run(task, describe_loss(lost) if lost > self.max_losses else None)
+        """Compute the missing rows of a task; one that was often killed is given up."""
+        given_up = describe_loss(job.lost) if job.lost > RETRIES else None
+        self.run(job.options["task"], given_up)
 
     def run(self, task: Task, prepared: PreparedTask | str | None) -> None:
         """Compute the missing rows of a task; `prepared` may be an error."""

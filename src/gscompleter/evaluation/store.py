@@ -29,7 +29,8 @@ from gscompleter.evaluation.methods import Prediction
 from gscompleter.io import json_file
 from gscompleter.io.files import replace_file
 from gscompleter.io.image import write_image
-from gscompleter.jobs.places import convert_write_errors, open_place
+from gscompleter.jobs.jobs import list_names, make_folder
+from gscompleter.jobs.jobs import write_json as write_json
 from gscompleter.types import Gaussians, merge
 
 RUN, TASKS = "run.json", "tasks"
@@ -81,7 +82,7 @@ def claim(out: Path, settings: Mapping[str, Any]) -> None:
     wanted = json.loads(json.dumps({"version": VERSION, **settings}))
     if not (out / RUN).is_file():
         # Listed at once, as another process may be creating the run.
-        entries = open_place(out).list_names("")
+        entries = list_names(out)
         if entries and RUN not in entries:
             raise InputError(f"{out} holds something other than a run; name another folder.")
         write_json(out / RUN, wanted, keep_existing=True)
@@ -204,24 +205,11 @@ def load_arrays(path: Path) -> Arrays | None:
         return None  # an incomplete file is computed again
 
 
-def make_folder(folder: Path) -> None:
-    """Create a folder; raise OutputError if that fails."""
-    with convert_write_errors(folder):
-        folder.mkdir(parents=True, exist_ok=True)
-
-
 def write_arrays(path: Path, arrays: Arrays) -> None:
     """Write arrays atomically; raise OutputError if that fails."""
     make_folder(path.parent)
     with replace_file(path) as file:
         np.savez(file, **arrays)  # type: ignore[arg-type]
-
-
-def write_json(path: Path, content: Any, keep_existing: bool = False) -> None:
-    """Write JSON atomically; the arguments are those of `replace_file`."""
-    make_folder(path.parent)
-    with replace_file(path, keep_existing) as file:
-        file.write((json.dumps(content, indent=1) + "\n").encode())
 
 
 def save_image(path: Path, image: Float[Tensor, "h w 3"]) -> None:

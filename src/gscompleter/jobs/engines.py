@@ -17,7 +17,8 @@ from typing import Any, Literal
 from gscompleter.cpu_threads import count_available_cores, limit_threads
 from gscompleter.errors import InputError, quote_value
 from gscompleter.io.interrupts import handle_stop_signals
-from gscompleter.jobs.workers import Pool, Share
+from gscompleter.jobs.jobs import Job
+from gscompleter.jobs.workers import Engine, Pool, Share
 from gscompleter.memory import estimate_bytes, read_memory_bytes
 
 EngineName = Literal["local", "ray", "submitit"]
@@ -25,7 +26,7 @@ EngineName = Literal["local", "ray", "submitit"]
 PIXELS, IMAGES = 640 * 480, 8
 """Size of a typical completion, for the default number of workers."""
 STOP_SECONDS = 20.0
-"""Time that stopped workers have to release their claims."""
+"""Time that stopped workers have to remove what they have not finished."""
 GRACE_SECONDS = 1.0
 """Time that a worker has to write a finished result after its parent was killed."""
 STORE_BYTES = 200 * 10**6
@@ -40,7 +41,7 @@ def choose_num_workers() -> int:
 
 
 @dataclass(frozen=True)
-class LocalEngine:
+class LocalEngine(Engine):
     """Workers that are local processes."""
 
     workers: int
@@ -48,66 +49,79 @@ class LocalEngine:
     @contextlib.contextmanager
     def open(self) -> Iterator[Pool]:
         """Open a pool of processes, which end with this one."""
-        started: list[LocalWorker] = []
+        workers: list[LocalWorker] = []
 
-        def start(shares: Sequence[Share]) -> list[LocalWorker]:
-            workers = [LocalWorker(share) for share in shares]
-            started.extend(workers)
-            return workers
+        def start(share: Share) -> LocalWorker:
+            idle = [worker for worker in workers if worker.is_idle()]
+            if not idle:
+                idle = [LocalWorker()]
+                workers.extend(idle)
+            idle[0].start(share)
+            return idle[0]
 
         try:
             yield Pool(self.workers, start)
         finally:
-            for worker in started:
+            for worker in workers:
                 worker.process.terminate()
-            for worker in started:
+            for worker in workers:
                 worker.process.join(STOP_SECONDS)
                 worker.process.kill()
 
 
-class WorkerLostError(Exception):
-    """A local worker was killed."""
-
-
 class LocalWorker:
-    """A process that runs a share."""
+    """A process that runs one share after the other, and the future of the running one."""
 
-    def __init__(self, share: Share) -> None:
+    def __init__(self) -> None:
         context = multiprocessing.get_context("spawn")
-        self.found: Exception | None = None
-        self.receiver, sender = context.Pipe(duplex=False)
-        self.process = context.Process(target=run_process, args=(share, sender))
+        self.connection, theirs = context.Pipe()
+        self.process = context.Process(target=run_process, args=(theirs,))
         self.process.start()
-        sender.close()
+        theirs.close()
+        self.is_running = False
+        self.error: Exception | None = None
+
+    def is_idle(self) -> bool:
+        """Return True if a share can be started."""
+        return not self.is_running and self.process.is_alive()
+
+    def start(self, share: Share) -> None:
+        """Start a share."""
+        self.is_running = True
+        self.connection.send(share)
 
     def done(self) -> bool:
-        """Return True if the process has ended."""
-        return not self.process.is_alive()
+        """Return True if the share has been run, or the process has ended."""
+        return self.connection.poll()
 
     def exception(self) -> Exception | None:
         """Return an error if the process was killed, or None."""
+        self.is_running = False
         try:
-            self.found = self.receiver.recv()
-        except EOFError:
-            return WorkerLostError(f"a worker ended with exit code {self.process.exitcode}")
+            self.error = self.connection.recv()
+        except (EOFError, OSError):
+            self.process.join()
+            return RuntimeError(f"a worker ended with exit code {self.process.exitcode}")
         return None
 
     def result(self) -> Exception | None:
         """Return the result of the share."""
-        return self.found
+        return self.error
 
 
-def run_process(share: Share, sender: Connection) -> None:
-    """Run a share in this process; Ctrl-C is for the parent, which then stops this one."""
+def run_process(connection: Connection) -> None:
+    """Run shares in this process; Ctrl-C is for the parent, which then stops this one."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     handle_stop_signals()
     Thread(target=stop_with_parent, daemon=True).start()
-    with contextlib.suppress(KeyboardInterrupt):
-        sender.send(share())
+    with contextlib.suppress(KeyboardInterrupt, EOFError):
+        while True:
+            share: Share = connection.recv()
+            connection.send(share())
 
 
 def stop_with_parent() -> None:
-    """End this process when its parent is gone; its job then releases its claim."""
+    """End this process when its parent is gone."""
     parent = multiprocessing.parent_process()
     assert parent is not None
     parent.join()
@@ -116,7 +130,7 @@ def stop_with_parent() -> None:
 
 
 @dataclass(frozen=True)
-class RayEngine:
+class RayEngine(Engine):
     """Workers that are Ray tasks."""
 
     workers: int | None
@@ -130,17 +144,17 @@ class RayEngine:
     @contextlib.contextmanager
     def open(self) -> Iterator[Pool]:
         """Connect to Ray, or start a local cluster, and open a pool of tasks."""
-        ray, started = import_ray(), []
+        ray = import_ray()
         self._connect(ray)
         # A lost task is not repeated by Ray, so that its attempts are counted.
         task = ray.remote(run_task).options(
             num_cpus=self.threads, num_gpus=self.gpus, max_retries=0
         )
+        started: list[Any] = []
 
-        def start(shares: Sequence[Share]) -> list[Any]:
-            tasks = [task.remote(share, self.threads) for share in shares]
-            started.extend(tasks)
-            return [reference.future() for reference in tasks]
+        def start(share: Share) -> Any:
+            started.append(task.remote(share, self.threads))
+            return started[-1].future()
 
         try:
             cores = int(ray.cluster_resources().get("CPU", 1) // self.threads)
@@ -185,13 +199,13 @@ def import_ray() -> Any:
 
 
 def run_task(share: Share, threads: int) -> Exception | None:
-    """Run a share in a Ray task."""
+    """Run a share in a Ray task or a SLURM job."""
     limit_threads(threads)  # before the first job imports libraries that read it
     return share()
 
 
 @dataclass(frozen=True)
-class SubmititEngine:
+class SubmititEngine(Engine):
     """Workers that are SLURM jobs, or local processes without SLURM."""
 
     workers: int
@@ -202,16 +216,18 @@ class SubmititEngine:
     parameters: Mapping[str, str]
     """Further SLURM parameters such as `partition` and `time`."""
 
+    def divide(self, jobs: Sequence[Job]) -> list[list[Job]]:
+        """Divide jobs into one share for each worker."""
+        return [list(jobs[i :: self.workers]) for i in range(min(self.workers, len(jobs)))]
+
     @contextlib.contextmanager
     def open(self) -> Iterator[Pool]:
         """Open a pool of SLURM jobs."""
         executor, started = self._make_executor(), []
 
-        def start(shares: Sequence[Share]) -> list[Any]:
-            with executor.batch():
-                sent = [executor.submit(SlurmTask(self.threads), share) for share in shares]
-            started.extend(sent)
-            return sent
+        def start(share: Share) -> Any:
+            started.append(executor.submit(SlurmTask(self.threads), share))
+            return started[-1]
 
         try:
             yield Pool(self.workers, start)

@@ -1,34 +1,29 @@
-"""Jobs, their rows, and how each is run once, by the first process that claims it.
+"""Jobs, and their rows in the folder of a batch.
 
 batch.json          kind and version of the folder
 jobs/NAME/          output of `complete`
 rows/NAME.json      outcome of the job: state, reason, scores, cost; written last
-thumbnails/NAME.jpg first target before and after completion
-claims/NAME         exists while a process runs the job, or after one was killed by it
 """
 
 from __future__ import annotations
 
 import json
-import re
 import time
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
+from pathlib import Path
 from typing import Any
 
 from gscompleter.errors import InputError, OutputError, quote_value
-from gscompleter.jobs.places import Place
+from gscompleter.io.files import UNFINISHED_PREFIX, replace_file
+from gscompleter.io.json_file import read_json
 
-BATCH = "batch.json"
-"""Name of the file that marks the folder of a batch."""
-JOBS, ROWS, CLAIMS, THUMBNAILS = "jobs", "rows", "claims", "thumbnails"
-"""Folders of a batch."""
-VERSION = 1
-"""Version of the files of a batch."""
+BATCH, JOBS, ROWS = "batch.json", "jobs", "rows"
+"""File that marks the folder of a batch, and its folders."""
+CONTENT = {"version": 1, "kind": "batch"}
+"""Content of batch.json."""
 RETRY_SECONDS = 1.0
 """Delay before the first retry after an error not caused by the input; doubled for the next."""
-LONGEST_NAME = 120
-"""Maximum number of characters of a job name."""
 
 Row = dict[str, Any]
 """Outcome of a job: its state is `done` or `failed`."""
@@ -41,33 +36,19 @@ class Job:
     name: str
     """Unique name, of its folder and its row."""
     options: Mapping[str, Any] = field(default_factory=dict)
-
-    @property
-    def claim(self) -> str:
-        """Path of its claim."""
-        return f"{CLAIMS}/{self.name}"
-
-    @property
-    def row(self) -> str:
-        """Path of its row."""
-        return f"{ROWS}/{self.name}.json"
+    lost: int = 0
+    """Number of workers that were killed while they ran it."""
 
 
-def run_claimed(
-    job: Job, place: Place, work: Callable[[], Mapping[str, Any]], retries: int
-) -> None:
-    """Claim a job, run it and write its row, unless it has a row or another process runs it.
+def run_job(job: Job, out: Path, work: Callable[[], Mapping[str, Any]], retries: int) -> None:
+    """Run a job and write its row, unless it has one.
 
-    `work` returns further entries of the row. It is repeated after a killed process or any error
+    `work` returns further entries of the row. It is repeated after a killed worker or any error
     other than InputError, at most `retries` times.
     """
-    if read_row(place, job.name) is not None:
-        return
-    with place.hold_claim(job.claim) as lost:
-        if lost is not None and read_row(place, job.name) is None:
-            row = {"version": VERSION, "job": job.name, "options": dict(job.options)}
-            row |= run_with_retries(work, lost, retries)
-            place.write(job.row, (json.dumps(row, indent=1) + "\n").encode())
+    if not has_row(job, out):
+        row = {"job": job.name, "options": dict(job.options)}
+        write_json(get_row_path(job, out), row | run_with_retries(work, job.lost, retries))
 
 
 def run_with_retries(work: Callable[[], Mapping[str, Any]], lost: int, retries: int) -> Row:
@@ -88,78 +69,85 @@ def run_with_retries(work: Callable[[], Mapping[str, Any]], lost: int, retries: 
 
 
 def describe_loss(lost: int) -> str:
-    """Describe why a job whose processes were killed has no result."""
+    """Describe why a job whose workers were killed has no result."""
     return f"its process was killed {lost} times, perhaps because memory ran out"
 
 
-def read_row(place: Place, name: str) -> Row | None:
-    """Read the row of a job, or return None if there is no complete one."""
-    content = place.read(Job(name).row)
-    try:
-        row = None if content is None else json.loads(content)
-    except ValueError:
+def get_row_path(job: Job, out: Path) -> Path:
+    """Return the path of the row of a job."""
+    return out / ROWS / f"{job.name}.json"
+
+
+def has_row(job: Job, out: Path) -> bool:
+    """Return True if the job has ended, done or failed."""
+    return get_row_path(job, out).is_file()
+
+
+def read_row(job: Job, out: Path) -> Row | None:
+    """Read the row of a job, or return None if there is none."""
+    if not has_row(job, out):
         return None
-    return row if isinstance(row, dict) and row.get("version") == VERSION else None
+    return dict(read_json(get_row_path(job, out), "delete it and run again"))
 
 
-def find_missing_jobs(jobs: Sequence[Job], place: Place, rerun_failed: bool) -> list[Job]:
+def find_missing_jobs(jobs: Sequence[Job], out: Path, rerun_failed: bool) -> list[Job]:
     """Return jobs without a row, and remove the failed rows to repeat (new options, or `rerun`).
 
     Raises:
         InputError: A job was done with other options.
     """
-    existing, left = place.list_names(ROWS), []
+    left = []
     for job in jobs:
-        is_there = f"{job.name}.json" in existing
-        row = read_row(place, job.name) if is_there else None
+        row = read_row(job, out)
         is_other = row is not None and row["options"] != dict(job.options)
         if row is not None and row["state"] == "done" and is_other:
             raise InputError(
-                f"{quote_value(place.name)} holds the job {quote_value(job.name)} done with other "
+                f"{quote_value(out)} holds the job {quote_value(job.name)} done with other "
                 "options; give the row another name, or name another folder."
             )
         if row is None or (row["state"] == "failed" and (rerun_failed or is_other)):
             left.append(job)
-            if is_there:
-                place.remove(job.row)
+            get_row_path(job, out).unlink(missing_ok=True)
     return left
 
 
-def list_done_jobs(place: Place) -> set[str]:
-    """List the names of the jobs with a row."""
-    return {name.removesuffix(".json") for name in place.list_names(ROWS)}
-
-
-def make_job_name(name: str) -> str:
-    """Turn a name into a valid file name."""
-    return re.sub(r"[^\w.+-]+", "-", name).strip(".")[:LONGEST_NAME] or "job"
-
-
-def claim_folder(place: Place) -> None:
-    """Make `place` the folder of a batch, or raise InputError if it holds something else."""
-    content = json.dumps({"version": VERSION, "kind": "batch"}).encode() + b"\n"
+def claim_folder(out: Path) -> None:
+    """Make `out` the folder of a batch, or raise InputError if it holds something else."""
     # Order matters: every run writes this file before all others.
-    others = place.list_names("")
-    if others and place.read(BATCH) is None:
-        raise InputError(
-            f"{quote_value(place.name)} holds something other than a batch; name another."
-        )
-    if place.read(BATCH) is None:
-        place.write(BATCH, content)
-    if place.read(BATCH) != content:
-        raise InputError(
-            f"{quote_value(place.name)} holds a batch of another version; name another folder."
-        )
+    if list_names(out) and not (out / BATCH).is_file():
+        raise InputError(f"{quote_value(out)} holds something other than a batch; name another.")
+    if not (out / BATCH).is_file():
+        write_json(out / BATCH, CONTENT)
+    if read_json(out / BATCH, "name another folder") != CONTENT:
+        raise InputError(f"{quote_value(out)} holds a batch of another version; name another.")
 
 
-def check_jobs(jobs: Sequence[Job]) -> None:
-    """Raise InputError if there is no job, or if two have the same name."""
-    if not jobs:
-        raise InputError("The manifest names no job; give it a row for each scene.")
-    seen: set[str] = set()
-    for job in jobs:
-        if job.name in seen:
-            raise InputError(
-                f"Two jobs have the name {quote_value(job.name)}; give each row a name of its own."
-            )
-        seen.add(job.name)
+def list_names(folder: Path) -> set[str]:
+    """List the names in a folder, without unfinished files; empty if it does not exist."""
+    try:
+        names = {path.name for path in folder.iterdir()}
+    except FileNotFoundError:
+        return set()
+    except OSError as error:
+        raise InputError(
+            f"{quote_value(folder)} cannot be read: {error.strerror}; name another."
+        ) from error
+    return {name for name in names if not name.startswith(UNFINISHED_PREFIX)}
+
+
+def make_folder(folder: Path) -> None:
+    """Create a folder with its parents; raise OutputError if that fails."""
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise OutputError(
+            f"Cannot write {quote_value(folder)}: {error.strerror}; free some space or choose "
+            "another place."
+        ) from error
+
+
+def write_json(path: Path, content: Any, keep_existing: bool = False) -> None:
+    """Write JSON atomically; the arguments are those of `replace_file`."""
+    make_folder(path.parent)
+    with replace_file(path, keep_existing) as file:
+        file.write((json.dumps(content, indent=1) + "\n").encode())

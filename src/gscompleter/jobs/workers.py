@@ -1,37 +1,30 @@
-"""Workers that share jobs until each has a row, from this or another process.
+"""Workers that run jobs until each has a row.
 
-A worker runs its own share of the jobs first, and then those of the others that nobody claims. A
-lost worker is started again; the claim of its job has counted the attempt.
+A worker runs its share of the jobs in order. If it is killed, it was at the first job without a
+row: the loss of that job is counted, and the rest of the share is run again.
 """
 
 from __future__ import annotations
 
 import re
 import time
+from abc import ABC, abstractmethod
+from collections import deque
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import AbstractContextManager
-from dataclasses import dataclass
-from typing import Any, Protocol, runtime_checkable
+from dataclasses import dataclass, replace
+from typing import Any
 
 from gscompleter.errors import InputError, quote_value
 from gscompleter.jobs.jobs import Job
-from gscompleter.jobs.places import Place
 
-POLL_SECONDS = 0.2
+POLL_SECONDS = 0.1
 """Interval between checks of the workers and of the rows."""
-ELSEWHERE_SECONDS = 1.0
-"""Interval between checks of jobs that other commands run."""
-LOSSES = (
-    *("WorkerLostError", "WorkerCrashedError", "NodeDiedError", "OutOfMemoryError"),
-    *("TaskCancelledError", "ObjectLostError", "UncompletedJobError", "FailedJobError"),
-)
-"""Names of the errors of local, Ray and SLURM workers that were killed."""
-
 SLURM_VARIABLES = ("SLURM_ARRAY_TASK_ID", "SLURM_ARRAY_TASK_MIN", "SLURM_ARRAY_TASK_COUNT")
 """SLURM variables: number of this task of an array, of the first task, and of tasks."""
 
 Perform = Callable[[Job], None]
-"""Runs a job in any process and writes its row, unless it has one or is claimed elsewhere."""
+"""Runs a job in any process and writes its row, unless it has one."""
 
 
 @dataclass(frozen=True)
@@ -56,88 +49,90 @@ class Pool:
     """The workers of an engine."""
 
     size: int
-    start: Callable[[Sequence[Share]], Sequence[Any]]
-    """Starts a worker per share; returns their futures, with `done()`, `exception()`, `result()`"""
+    """Number of shares that run simultaneously."""
+    start: Callable[[Share], Any]
+    """Starts a share; returns its future, with `done()`, `exception()` and `result()`."""
 
 
-@runtime_checkable
-class Engine(Protocol):
+class Engine(ABC):
     """Starts workers somewhere."""
 
+    @abstractmethod
     def open(self) -> AbstractContextManager[Pool]:
         """Open a pool; its workers are stopped at the end of the block."""
-        ...
+
+    def divide(self, jobs: Sequence[Job]) -> list[list[Job]]:
+        """Divide jobs into shares."""
+        return [[job] for job in jobs]
 
 
 def run_jobs(
-    place: Place,
     jobs: Sequence[Job],
     perform: Perform,
-    list_done: Callable[[], set[str]],
+    has_row: Callable[[Job], bool],
     engine: Engine | None = None,
     retries: int = 0,
 ) -> Iterator[Job]:
     """Run jobs until each has a row, and yield them in the order in which they end.
 
     Args:
-        place: The folder of the claims.
         jobs: Jobs without a row.
-        perform: Runs one of them.
-        list_done: Lists the names of jobs that have a row.
+        perform: Runs one of them; the row of a job lost more than `retries` times is a failure.
+        has_row: Returns True if a job has its row.
         engine: Starts the workers; None runs the jobs in this process.
         retries: Number of times that a job may cost its worker.
     """
-    left = {job.name: job for job in jobs}
-
-    def pop_done() -> Iterator[Job]:
-        for name in [name for name in list_done() if name in left]:
-            yield left.pop(name)
-
-    while left:
-        waiting = list(left.values())
-        for _ in (
-            map(perform, waiting)
-            if engine is None
-            else run_on_workers(engine, place, waiting, perform, retries)
-        ):
-            yield from pop_done()
-        yield from pop_done()
-        while left and all(place.is_held(job.claim) for job in left.values()):
-            time.sleep(ELSEWHERE_SECONDS)
-            yield from pop_done()
+    if engine is not None:
+        yield from run_on_workers(jobs, perform, has_row, engine, retries)
+        return
+    for job in jobs:
+        perform(job)
+        yield job
 
 
 def run_on_workers(
-    engine: Engine, place: Place, jobs: Sequence[Job], perform: Perform, retries: int
-) -> Iterator[None]:
-    """Run jobs on the workers of an engine, and yield regularly until all workers have ended."""
-    losses = 0
+    jobs: Sequence[Job],
+    perform: Perform,
+    has_row: Callable[[Job], bool],
+    engine: Engine,
+    retries: int,
+) -> Iterator[Job]:
+    """Run jobs on the workers of an engine; the arguments are those of `run_jobs`."""
+    waiting, running = deque(engine.divide(jobs)), dict[Any, list[Job]]()
     with engine.open() as pool:
-        shares = [Share(perform, found) for found in divide_jobs(jobs, pool.size, place)]
-        running = dict(zip(pool.start(shares), shares, strict=True))
-        while running:
+        while waiting or running:
+            while waiting and len(running) < pool.size:
+                share = waiting.popleft()
+                running[pool.start(Share(perform, tuple(share)))] = share
             time.sleep(POLL_SECONDS)
-            for future in [future for future in running if future.done()]:
-                share, error = running.pop(future), future.exception()
-                if error is None:
-                    error = future.result()
-                elif type(error).__name__ in LOSSES and losses < (retries + 1) * len(jobs):
-                    losses, error = losses + 1, None
-                    running[pool.start([share])[0]] = share
-                if error is not None:
-                    raise error
-            yield
+            ended = [future for future in running if future.done()]
+            for share in running.values():
+                while share and has_row(share[0]):
+                    yield share.pop(0)
+            for future in ended:
+                share = running.pop(future)
+                if (killed := future.exception()) is None:
+                    yield from finish_share(share, future.result())
+                elif share:
+                    waiting.append(count_loss(share, killed, retries))
 
 
-def divide_jobs(jobs: Sequence[Job], count: int, place: Place) -> list[list[Job]]:
-    """Divide jobs among workers; with locks, each then also has those of the others."""
-    shares = [list(jobs[i::count]) for i in range(min(count, len(jobs)))]
-    if not place.has_locks:
-        return shares
-    return [
-        [job for share in (*shares[first:], *shares[:first]) for job in share]
-        for first in range(len(shares))
-    ]
+def finish_share(share: list[Job], error: Exception | None) -> list[Job]:
+    """Return the last jobs of a share that was run, or raise the error that ends the run."""
+    if error is not None:
+        raise error
+    return share
+
+
+def count_loss(share: list[Job], killed: Exception, retries: int) -> list[Job]:
+    """Count the loss of a worker for the first job of its share.
+
+    It raises `killed` if even a worker that only had to list the job as failed was lost.
+    """
+    first = replace(share[0], lost=share[0].lost + 1)
+    if first.lost > retries + 1:
+        raise killed
+    return [first, *share[1:]]
 
 
 def parse_shard(text: str | None, environment: Mapping[str, str]) -> tuple[int, int]:

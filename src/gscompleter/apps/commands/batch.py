@@ -10,6 +10,7 @@ import re
 import time
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -18,46 +19,40 @@ from rich.console import Console
 from gscompleter.apps.batch.manifest import read_manifest
 from gscompleter.apps.commands.engines import make_engine, parse_pairs
 from gscompleter.apps.commands.options import BatchOptions
+from gscompleter.errors import InputError, quote_value
 from gscompleter.jobs.jobs import (
     JOBS,
-    THUMBNAILS,
     Job,
     claim_folder,
     find_missing_jobs,
-    list_done_jobs,
+    has_row,
+    make_folder,
     read_row,
-    run_claimed,
+    run_job,
 )
-from gscompleter.jobs.places import Place, is_address, open_place
 from gscompleter.jobs.workers import parse_shard, run_jobs
 from gscompleter.progress import Activity, show_activity, show_preparation, show_progress
-
-COUNTERS = Path("/proc/self/io")
-"""File in which Linux counts the bytes that this process reads and writes, cached or not."""
 
 
 def run_batch(options: BatchOptions) -> None:
     """Complete the scenes of a manifest, and write the table and the page."""
+    if re.match(r"\w\w+:/", str(options.out)):
+        raise InputError(f"{quote_value(options.out)} is an address; name a folder.", "out")
     number, count = parse_shard(options.shard, os.environ)
     console = Console(stderr=True, quiet=options.quiet, highlight=False)
     with show_progress(None if options.quiet else console):
         with show_preparation("reading the manifest"):
             jobs = read_manifest(options.manifest, parse_pairs(options.each, "each"))
-            # Absolute, for workers elsewhere.
-            out = options.out if is_address(options.out) else os.path.abspath(options.out)
-            place = open_place(out)
-            engine = make_engine(options, place.name)
-            claim_folder(place)
+            out = options.out.resolve()  # absolute, for workers elsewhere
+            engine = make_engine(options, out)
+            claim_folder(out)
             share = jobs[number::count]
-            left = find_missing_jobs(share, place, options.rerun == "failures")
-        perform = JobCompleter(out, options.retries)
-        ended = run_jobs(
-            place, left, perform, lambda: list_done_jobs(place), engine, options.retries
-        )
-        count_jobs(ended, len(left))
+            left = find_missing_jobs(share, out, options.rerun == "failures")
+        perform, is_done = JobCompleter(out, options.retries), partial(has_row, out=out)
+        count_jobs(run_jobs(left, perform, is_done, engine, options.retries), len(left))
         with show_preparation("table"):
-            write_batch_results(place, jobs)
-    sentence = f"{summarize_rows(place, share, left)} All results: {options.out}/index.html"
+            write_batch_results(out, jobs)
+    sentence = f"{summarize_rows(out, share, left)} All results: {options.out}/index.html"
     console.print(sentence, markup=False, soft_wrap=True)
 
 
@@ -73,10 +68,10 @@ def count_jobs(ended: Iterator[Job], total: int) -> None:
             activity.name = f"completing ({activity.num_done / minutes:.1f} a minute)"
 
 
-def summarize_rows(place: Place, share: Sequence[Job], left: Sequence[Job]) -> str:
+def summarize_rows(out: Path, share: Sequence[Job], left: Sequence[Job]) -> str:
     """Summarize the rows of a share, of which `left` were run now."""
     names = {job.name for job in left}
-    rows = [(job.name in names, read_row(place, job.name)) for job in share]
+    rows = [(job.name in names, read_row(job, out)) for job in share]
     failed = [is_new for is_new, row in rows if row is not None and row["state"] == "failed"]
     before = f"done earlier {len(share) - len(left)}"
     if not all(failed):
@@ -84,65 +79,49 @@ def summarize_rows(place: Place, share: Sequence[Job], left: Sequence[Job]) -> s
     return f"Done {len(left) - sum(failed)}, failed {sum(failed)}, {before}."
 
 
-def write_batch_results(place: Place, jobs: Sequence[Job]) -> None:
+def write_batch_results(out: Path, jobs: Sequence[Job]) -> None:
     """Write the table and the page, repeatedly while other shards add rows."""
     from gscompleter.apps.report.batch_page import write_overview
 
     seen = None
-    while seen != (there := list_done_jobs(place)):
+    while seen != (there := [job for job in jobs if has_row(job, out)]):
         seen = there
-        write_overview(place, [job for job in jobs if job.name in there])
+        write_overview(out, there)
 
 
 @dataclass(frozen=True)
 class JobCompleter:
     """A callable that completes the scene of a job, in any process."""
 
-    out: str
+    out: Path
     retries: int
 
     def __call__(self, job: Job) -> None:
         """Complete the scene of `job` and write its row."""
-        place = open_place(self.out)
-        run_claimed(job, place, lambda: complete_job(job, place), self.retries)
+        run_job(job, self.out, lambda: complete_job(job, self.out / JOBS), self.retries)
 
 
-def complete_job(job: Job, place: Place) -> dict[str, Any]:
-    """Complete the scene of a job and return its row."""
+def complete_job(job: Job, jobs: Path) -> dict[str, Any]:
+    """Complete the scene of a job in a folder of `jobs`, and return its part of a row.
+
+    `cpu_seconds` is the sum over all threads, which does not depend on how busy the machine is.
+    """
     import warnings
 
     from gscompleter.apps.commands.complete import complete_folder
     from gscompleter.apps.commands.row_options import parse_row
-    from gscompleter.apps.inputs.fetching import download_inputs
-    from gscompleter.apps.report.batch_page import average_scores, make_batch_thumbnail
+    from gscompleter.apps.report.batch_page import average_scores
     from gscompleter.evaluation.memory import measure_peak_memory
 
     warnings.filterwarnings("ignore", module="PIL")  # as the command line has it
-    before = read_counters()
+    start, cpu_start = time.monotonic(), time.process_time()
+    make_folder(jobs)
     with measure_peak_memory() as peak:
-        with (
-            download_inputs(job.options) as given,
-            place.open_folder(f"{JOBS}/{job.name}") as folder,
-        ):
-            summary = complete_folder(parse_row(given, folder))
-            thumbnail = make_batch_thumbnail(folder)
-            size = sum(file.stat().st_size for file in folder.rglob("*") if file.is_file())
-        if thumbnail is not None:
-            place.write(f"{THUMBNAILS}/{job.name}.jpg", thumbnail)
-    costs = {name: count - before[name] for name, count in read_counters().items()}
-    return {**average_scores(summary), **costs, "result_bytes": size, "peak_bytes": peak.bytes}
-
-
-def read_counters() -> dict[str, float]:
-    """Read the clocks and the byte counters of this process; 0 if the system has no counters.
-
-    `cpu_seconds` is the sum over all threads, which does not depend on how busy the machine is.
-    """
-    counters = COUNTERS.read_text() if COUNTERS.is_file() else ""
-    found = {name: int(count) for name, count in re.findall(r"^(\w+): (\d+)$", counters, re.M)}
+        summary = complete_folder(parse_row(job.options, jobs / job.name))
     return {
-        "seconds": time.monotonic(),
-        "cpu_seconds": time.process_time(),
-        "read_bytes": found.get("rchar", 0),
-        "written_bytes": found.get("wchar", 0),
+        **average_scores(summary),
+        "seconds": time.monotonic() - start,
+        "cpu_seconds": time.process_time() - cpu_start,
+        "result_bytes": sum(f.stat().st_size for f in (jobs / job.name).rglob("*") if f.is_file()),
+        "peak_bytes": peak.bytes,
     }

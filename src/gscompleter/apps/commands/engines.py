@@ -9,7 +9,6 @@ from gscompleter.apps.commands.options import EngineOptions
 from gscompleter.cpu_threads import count_available_cores, limit_threads
 from gscompleter.errors import InputError, quote_value
 from gscompleter.jobs.engines import LocalEngine, RayEngine, SubmititEngine, choose_num_workers
-from gscompleter.jobs.places import is_address
 from gscompleter.jobs.workers import Engine
 
 
@@ -26,7 +25,7 @@ def parse_pairs(words: Sequence[str], option: str) -> dict[str, str]:
     return pairs
 
 
-def make_engine(options: EngineOptions, out: str) -> Engine | None:
+def make_engine(options: EngineOptions, out: Path) -> Engine | None:
     """Create the engine, or None for this process.
 
     On this machine it also sets the threads, which workers inherit.
@@ -37,9 +36,8 @@ def make_engine(options: EngineOptions, out: str) -> Engine | None:
     if options.engine == "ray":
         return RayEngine(options.workers, threads, options.gpus, options.address)
     if options.engine == "submitit":
-        kept = "submitit" if is_address(out) else f"{out}/submitit"
-        slurm = parse_pairs(options.slurm, "slurm")
-        return SubmititEngine(options.workers or 1, threads, options.gpus, Path(kept), slurm)
+        slurm, folder = parse_pairs(options.slurm, "slurm"), out / "submitit"
+        return SubmititEngine(options.workers or 1, threads, options.gpus, folder, slurm)
     workers = options.workers or choose_num_workers()
     limit_threads(options.threads or max(1, count_available_cores() // workers))
     return LocalEngine(workers)

@@ -64,7 +64,7 @@ def run_evaluation(options: EvaluateOptions) -> None:
         seed=options.seed,
         source=describe_source(options),
     )
-    engine = make_engine(options, str(options.out.resolve()))
+    engine = make_engine(options, options.out.resolve())
     with show_progress(shown):
         compile_kernels((config.device, config.reconstructor, config.generator))
         counts = evaluate(tasks, methods, options.out, config, shard, options.rerun, engine)

@@ -211,24 +211,23 @@ class EngineOptions(Options):
     """Parameters for SLURM with --engine submitit, as in --slurm partition=gpu time=120."""
     shard: str | None = None
     """Run every n-th job or case from the i-th on, given as i/n with i from 0; `auto` takes both
-    from a SLURM array. Processes without a shard share the work as well."""
+    from a SLURM array. Several commands on one folder each need a shard."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class BatchOptions(EngineOptions):
     """Complete many scenes, on several processes or machines.
 
-    Run the same command again, also on other machines, to continue. A scene that cannot be
-    completed is listed with its reason. OUT contains a folder per scene in jobs/, table.csv and
-    index.html.
+    Run the same command again to continue. A scene that cannot be completed is listed with its
+    reason. OUT contains a folder per scene in jobs/, table.csv and index.html.
     """
 
-    manifest: Annotated[str, tyro.conf.Positional, tyro.conf.arg(metavar="MANIFEST")]
+    manifest: Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="MANIFEST")]
     """Scenes to complete: a .csv or .jsonl file with a row per scene, whose columns are `folder`
     (SCENE), `name` and options of `complete`; or a folder of scenes. Paths are relative to the
-    manifest, or addresses such as s3://bucket/scene."""
-    out: str
-    """Folder or address for the results; a folder of an earlier run is continued."""
+    manifest."""
+    out: Path
+    """Folder for the results; a folder of an earlier run is continued."""
     engine: EngineName = "local"
     """Engine that runs the jobs: processes of this machine, Ray, or SLURM (submitit)."""
     retries: Annotated[int, Interval(ge=0, le=100)] = 2
