@@ -5,14 +5,14 @@ from __future__ import annotations
 import json
 import math
 import os
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Annotated
 
 import torch
 from annotated_types import Ge, MinLen
-from pydantic import TypeAdapter, ValidationError
+from pydantic import TypeAdapter
 
 from gscompleter.data.formats import open_photographs
 from gscompleter.data.photographs import Photographs
@@ -54,6 +54,10 @@ class BenchCase:
         """Number of pixels of an image."""
         return self.resolution[0] * self.resolution[1]
 
+    def __str__(self) -> str:
+        """Return the name."""
+        return self.name
+
     def open(self) -> Photographs:
         """Open the scene."""
         return open_photographs(self.scene, near=self.near, far=self.far)
@@ -64,14 +68,8 @@ class BenchCase:
         return models.make_completer().begin([view.to(device) for view in views])
 
 
-AXES: dict[str, str] = {
-    "gaussians": "gaussians",
-    "pixels": "resolution",
-    "views": "context",
-    "targets": "targets",
-}
+AXES = {"gaussians": "gaussians", "pixels": "resolution", "views": "context", "targets": "targets"}
 """Axes of growth, with the field of a case that each one changes."""
-
 GAUSSIANS = (250_000, 500_000, 1_000_000, 2_000_000)
 """Default numbers of Gaussians of the input splats."""
 SIDES = (0.5, 0.5**0.5, 1.0, 2**0.5, 2.0)
@@ -88,32 +86,27 @@ class GrowthValues:
     views: tuple[Frames, ...] = ()
     targets: tuple[Frames, ...] = ()
 
-    def make_series(self, base: BenchCase) -> dict[str, tuple[BenchCase, ...]]:
-        """Vary a case along each axis that has values, and name the results by their sizes."""
-        series = {}
-        for axis, changed in AXES.items():
-            cases = [replace(base, **{changed: value}) for value in getattr(self, axis)]
-            names = [f"{base.name}, {get_size(axis, case):,} {axis}" for case in cases]
-            series[axis] = tuple(replace(c, name=n) for c, n in zip(cases, names, strict=True))
-        return {axis: cases for axis, cases in series.items() if cases}
-
 
 @dataclass(frozen=True)
-class ManifestFile:
-    """Content of a file of cases."""
+class Manifest:
+    """All cases to measure; the first one is also used to compare methods."""
 
     cases: Annotated[tuple[BenchCase, ...], MinLen(1)]
     growth: GrowthValues | None = None
 
-
-@dataclass(frozen=True)
-class Manifest:
-    """All cases to measure."""
-
-    cases: tuple[BenchCase, ...]
-    """The first one is also used to compare methods."""
-    growth: Mapping[str, tuple[BenchCase, ...]] = field(default_factory=dict)
-    """Cases by axis, which differ only in its field."""
+    def make_series(self, axes: Sequence[str]) -> dict[str, dict[int, BenchCase]]:
+        """Vary a case, with its first target, along each of `axes`: cases by axis and size."""
+        if self.growth is None:
+            return {}
+        (case,) = (case for case in self.cases if case.name == self.growth.case)
+        base, series = replace(case, targets=case.targets[:1]), {}
+        for axis in axes:
+            cases = [replace(base, **{AXES[axis]: value}) for value in getattr(self.growth, axis)]
+            series[axis] = {
+                get_size(axis, c): replace(c, name=f"{case.name}, {get_size(axis, c):,} {axis}")
+                for c in cases
+            }
+        return {axis: cases for axis, cases in series.items() if cases}
 
 
 def get_size(axis: str, case: BenchCase) -> int:
@@ -124,51 +117,42 @@ def get_size(axis: str, case: BenchCase) -> int:
     return value if isinstance(value, int) else len(value)
 
 
-def make_default_series(case: BenchCase) -> dict[str, tuple[BenchCase, ...]]:
-    """Make series of doubled sizes from a case with its first target."""
+def make_default_growth(case: BenchCase) -> GrowthValues:
+    """Make series of doubled sizes from a case."""
     height, width = case.resolution
-    views, targets = make_prefixes(case.context, 2), make_prefixes(case.targets, 1)
-    values = GrowthValues(
+    return GrowthValues(
         case.name,
         GAUSSIANS,
         tuple((round(side * height), round(side * width)) for side in SIDES),
-        views if len(views) > 1 else (),
-        targets if len(targets) > 1 else (),
+        make_prefixes(case.context, 2),
+        make_prefixes(case.targets, 1),
     )
-    return values.make_series(replace(case, targets=case.targets[:1]))
 
 
 def make_prefixes(frames: Frames, fewest: int) -> tuple[Frames, ...]:
-    """Return the first `fewest` frames, the first twice as many, and so on."""
+    """Return the first `fewest` frames, the first twice as many, and so on, if several fit."""
     counts = [fewest * 2**n for n in range(len(frames).bit_length())]
-    return tuple(frames[:count] for count in counts if count <= len(frames))
+    prefixes = tuple(frames[:count] for count in counts if count <= len(frames))
+    return prefixes if len(prefixes) > 1 else ()
 
 
 def read_manifest(path: Path) -> Manifest:
     """Read a manifest from a JSON file; paths are relative to its folder."""
     text = json.dumps(read_json(path, "name a file of cases to measure"))
     try:
-        found = TypeAdapter(ManifestFile).validate_json(text, strict=True)
-        by_name = {case.name: case for case in found.cases}
-        if len(by_name) < len(found.cases):
-            raise ValueError("two cases have the same name")
-        cases = {
-            name: replace(case, scene=path.parent / os.path.expandvars(case.scene))
-            for name, case in by_name.items()
-        }
-        growth = found.growth
-        series = {} if growth is None else growth.make_series(cases[growth.case])
-    except (ValueError, KeyError) as error:
-        wrong = str(error)
-        if isinstance(error, ValidationError):
-            first = error.errors()[0]
-            wrong = f"{'.'.join(map(str, first['loc']))}: {first['msg']}"
+        found = TypeAdapter(Manifest).validate_json(text, strict=True)
+        names = [case.name for case in found.cases]
+        if len(set(names)) < len(names) or (found.growth and found.growth.case not in names):
+            raise ValueError("two cases have the same name, or that of the growth has none")
+    except ValueError as error:
         raise InputError(
-            f"{quote_value(path)} names no cases to measure ({quote_value(wrong)}); it needs "
+            f"{quote_value(path)} names no cases to measure ({quote_value(str(error))}); it needs "
             "cases, each with name, scene, context, targets and resolution.",
             "cases",
         ) from error
-    return Manifest(tuple(cases.values()), series)
+    scenes = [path.parent / os.path.expandvars(case.scene) for case in found.cases]
+    cases = [replace(case, scene=scene) for case, scene in zip(found.cases, scenes, strict=True)]
+    return replace(found, cases=tuple(cases))
 
 
 def check_frames(cases: Sequence[BenchCase]) -> None:
@@ -183,7 +167,7 @@ def write_input_splat(case: BenchCase, folder: Path, models: Models, device: str
     """Write the input splat of a case to `folder` once; None if the context is reconstructed."""
     if case.gaussians is None:
         return None
-    path = folder / f"{abs(hash(replace(case, targets=(0,)))):x}.ply"
+    path = folder / f"{abs(hash(case)):x}.ply"
     if not path.exists():
         context = case.begin(models, device).context
         save_ply(path, multiply_gaussians(context, case.gaussians, models.seed))

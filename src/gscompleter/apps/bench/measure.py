@@ -14,7 +14,6 @@ from tempfile import TemporaryDirectory
 from typing import TypeVar
 
 import torch
-from torch import Tensor
 
 from gscompleter.errors import InputError
 from gscompleter.evaluation.memory import measure_peak_memory
@@ -55,72 +54,62 @@ finally:
 """
 """Program of a process. It reports its own peak, because a child inherits its parent's."""
 
+Yardstick = Callable[[], object]
 T = TypeVar("T")
 K = TypeVar("K")
 
 
 @dataclass(frozen=True)
 class Sample:
-    """One measurement."""
+    """One measurement: wall time by stage, the last of which is compared with others.
 
-    seconds: Mapping[str, float]
-    """Wall time by stage."""
-    yardstick: float
-    """Seconds of the yardstick, the mean of just before and just after."""
-    ratios: Mapping[str, float]
-    """Wall time by stage, in yardsticks."""
-    peak_bytes: int | None
-    """Peak memory, or None if the system does not report it."""
-    gaussians: Mapping[str, int]
-    """Numbers of Gaussians in the context and added."""
-
-
-def make_sample(
-    seconds: Mapping[str, float],
-    yardstick: float,
-    peak_bytes: int | None,
-    gaussians: Mapping[str, int],
-) -> Sample:
-    """Make a sample, with its times in yardsticks."""
-    ratios = {stage: spent / yardstick for stage, spent in seconds.items()}
-    return Sample(seconds, yardstick, ratios, peak_bytes, gaussians)
-
-
-@dataclass(frozen=True)
-class Yardstick:
-    """A fixed workload: rendering and gradients of 196,608 Gaussians in an image of 256 x 256.
-
-    It compares times of different machines and busy hours.
+    Memory is None if the system does not report it. Gaussians are those of the context and added.
     """
 
-    renderer: Renderer
-    gaussians: Gaussians
-    camera: Camera
+    seconds: Mapping[str, float]
+    yardstick: float
+    peak_bytes: int | None
+    gaussians: Mapping[str, int]
 
-    @staticmethod
-    def create(renderer: Renderer, device: str) -> Yardstick:
-        """Create the yardstick on a device, and run it once to compile everything."""
-        scene = merge([make_surface(make_yardstick_camera(shift)) for shift in SHIFTS])
-        found = Yardstick(renderer, scene.to(device), make_yardstick_camera(SHIFTS[-1]).to(device))
-        found.render()
-        return found
+    @property
+    def whole(self) -> float:
+        """Seconds that are compared with others."""
+        return [*self.seconds.values()][-1]
 
-    def render(self) -> tuple[Tensor, ...]:
-        """Render one image and compute the gradients of its sum."""
-        varied = {name: getattr(self.gaussians, name).clone() for name in GRADIENT_FIELDS}
+    @property
+    def ratio(self) -> float:
+        """These seconds, in yardsticks."""
+        return self.whole / self.yardstick
+
+
+def make_yardstick(renderer: Renderer, device: str) -> Yardstick:
+    """Make a fixed workload: one forward and backward pass of 196,608 Gaussians.
+
+    It compares times of different machines and busy hours. Its first run compiles everything.
+    """
+    cameras = [make_yardstick_camera(shift).to(device) for shift in SHIFTS]
+    scene = merge([make_surface(camera) for camera in cameras])
+
+    def render() -> None:
+        varied = {name: getattr(scene, name).clone() for name in GRADIENT_FIELDS}
         variables = [tensor.requires_grad_() for tensor in varied.values()]
-        image = self.renderer.render(replace(self.gaussians, **varied), self.camera).image
-        return torch.autograd.grad(image.sum(), variables)
+        image = renderer.render(replace(scene, **varied), cameras[-1]).image
+        torch.autograd.grad(image.sum(), variables)
 
-    def measure_seconds(self) -> float:
-        """Measure the median seconds of `RUNS` runs."""
-        return statistics.median(measure_call(self.render) for _ in range(RUNS))
+    render()
+    return render
 
-    def measure_beside(self, measure: Callable[[], T]) -> tuple[T, float]:
-        """Run `measure`, and return the mean yardstick of just before and just after."""
-        before = self.measure_seconds()
-        found = measure()
-        return found, (before + self.measure_seconds()) / 2
+
+def measure_beside(yardstick: Yardstick, measure: Callable[[], T]) -> tuple[T, float]:
+    """Run `measure`, and return the mean yardstick of just before and just after."""
+    before = measure_median_seconds(yardstick)
+    found = measure()
+    return found, (before + measure_median_seconds(yardstick)) / 2
+
+
+def measure_median_seconds(work: Yardstick) -> float:
+    """Measure the median seconds of `RUNS` runs."""
+    return statistics.median(measure_call(work) for _ in range(RUNS))
 
 
 def measure_call(work: Callable[[], object]) -> float:
@@ -157,11 +146,11 @@ def make_surface(camera: Camera) -> Gaussians:
 
 def measure_command(words: Sequence[str], out: Path, yardstick: Yardstick) -> Sample:
     """Measure one run of a command that writes to `out`, in a process of its own."""
-    (spent, peak_bytes), unit = yardstick.measure_beside(lambda: run_command(words))
+    (spent, peak_bytes), unit = measure_beside(yardstick, lambda: run_command(words))
     summary = json.loads((out / SUMMARY_FILE).read_text())
     stages = summary["seconds"]
     seconds = {**stages, REST: spent - stages["total"], PROCESS: spent}
-    return make_sample(seconds, unit, peak_bytes, summary["gaussians"])
+    return Sample(seconds, unit, peak_bytes, summary["gaussians"])
 
 
 def run_command(words: Sequence[str]) -> tuple[float, int | None]:
@@ -191,10 +180,7 @@ def run_command(words: Sequence[str]) -> tuple[float, int | None]:
 
 @dataclass(frozen=True)
 class UnfrozenRenderer:
-    """A renderer that renders and differentiates the whole scene in every iteration.
-
-    It measures the benefit of a frozen context.
-    """
+    """A renderer that renders and differentiates the whole scene in every iteration."""
 
     renderer: Renderer
 
@@ -233,37 +219,28 @@ def measure_method(
             prediction = BENCH_METHODS[name](state, target, models)
         return prediction, peak.bytes
 
-    (found, peak_bytes), unit = yardstick.measure_beside(run)
+    (found, peak_bytes), unit = measure_beside(yardstick, run)
     own = sum(spent for stage, spent in found.seconds.items() if stage in OWN_STAGES)
     counts = {"context": len(before), "added": len(found.scene) - len(before)}
-    return make_sample({**found.seconds, OWN: own}, unit, peak_bytes, counts)
-
-
-@dataclass(frozen=True)
-class BenchTask:
-    """A measurement that is repeated."""
-
-    name: str
-    measure: Callable[[], Sample]
-    stage: str
-    """Stage whose seconds the progress lines show."""
-    repeats: int
+    return Sample({**found.seconds, OWN: own}, unit, peak_bytes, counts)
 
 
 def measure_in_rounds(
-    tasks: Mapping[K, BenchTask], print_line: Callable[[str], None]
+    tasks: Mapping[K, tuple[Callable[[], Sample], int]], print_line: Callable[[str], None]
 ) -> dict[K, list[Sample]]:
-    """Run each task once per round until it has its repeats.
+    """Run each task once per round until it has its repeats, so that a busy hour slows all alike.
 
-    So a busy machine slows all of them alike. `print_line` receives progress lines.
+    Args:
+        tasks: Measurements, with their repeats.
+        print_line: Receives progress lines.
     """
     samples: dict[K, list[Sample]] = {key: [] for key in tasks}
-    rounds = range(max((task.repeats for task in tasks.values()), default=0))
-    turns = [(key, task) for n in rounds for key, task in tasks.items() if n < task.repeats]
-    for number, (key, task) in enumerate(track(turns, "measuring"), start=1):
+    rounds = range(max((repeats for _, repeats in tasks.values()), default=0))
+    turns = [key for n in rounds for key, (_, repeats) in tasks.items() if n < repeats]
+    for number, key in enumerate(track(turns, "measuring"), start=1):
         with show_progress(None):  # no progress lines inside a measurement
-            sample = task.measure()
-        samples[key].append(sample)
-        seconds, ratio = sample.seconds[task.stage], sample.ratios[task.stage]
-        print_line(f"{number}/{len(turns)} {task.name}: {seconds:.2f} s, {ratio:.1f} yardsticks")
+            found = tasks[key][0]()
+        samples[key].append(found)
+        times = f"{found.whole:.2f} s, {found.ratio:.1f} yardsticks"
+        print_line(f"{number}/{len(turns)} {key}: {times}")
     return samples

@@ -1,77 +1,54 @@
-"""Statistics of measurements as JSON, tables in Markdown and curves."""
+"""Statistics of measurements, and their tables in Markdown."""
 
 from __future__ import annotations
 
 import statistics
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 
 from gscompleter.apps.bench.measure import OWN, PROCESS, REST, Sample
-from gscompleter.evaluation.plots import create_plot_figure, get_curve_style, write_figure
 from gscompleter.evaluation.tables import format_markdown
 from gscompleter.timing import STAGES
 
-if TYPE_CHECKING:
-    from matplotlib.axes import Axes
-
-COLUMNS = (*STAGES, "total", REST, PROCESS)
-"""Columns of the seconds of a case; stages that did not run are omitted."""
+CASE_COLUMNS = (*STAGES, "total", REST, PROCESS)
 METHOD_COLUMNS = ("generate", "lift", "register", "integrate", "optimize", OWN)
-SHARED_COLUMNS = "in yardsticks", "peak (GB)"
-"""Columns of all tables after the seconds."""
-CURVES = (*STAGES, REST, PROCESS)
-
-
-@dataclass(frozen=True)
-class Spread:
-    """Statistics of several measurements of one quantity."""
-
-    median: float
-    low: float
-    high: float
-
-    @staticmethod
-    def from_values(values: Sequence[float]) -> Spread:
-        """Compute the statistics of values."""
-        return Spread(statistics.median(values), min(values), max(values))
+"""Columns of seconds; stages that did not run are omitted."""
+PEAK = "peak"
+"""Key of the exponent of the peak memory."""
 
 
 @dataclass(frozen=True)
 class Measured:
-    """All samples of one case or method, with their statistics."""
+    """All samples of one case or method, with medians."""
 
     name: str
-    gaussians: Mapping[str, int]
-    """Numbers of Gaussians; the seed makes all samples equal."""
+    seconds: Mapping[str, float]
+    """Wall time by stage."""
+    ratio: float
+    """Wall time in yardsticks."""
     peak_bytes: int | None
     """Largest peak memory, or None if unknown."""
-    seconds: Mapping[str, Spread]
-    """Wall time by stage."""
-    ratios: Mapping[str, Spread]
-    """Wall time by stage, in yardsticks."""
+    gaussians: Mapping[str, int]
+    """Numbers of Gaussians; the seed makes all samples equal."""
     samples: Sequence[Sample]
 
 
 def summarize(name: str, samples: Sequence[Sample]) -> Measured:
-    """Compute the statistics of samples."""
-    known = [sample.peak_bytes for sample in samples if sample.peak_bytes is not None]
+    """Compute the medians of samples."""
     return Measured(
         name,
+        {
+            stage: statistics.median([sample.seconds[stage] for sample in samples])
+            for stage in samples[0].seconds
+        },
+        statistics.median([sample.ratio for sample in samples]),
+        max((s.peak_bytes for s in samples if s.peak_bytes is not None), default=None),
         samples[0].gaussians,
-        max(known, default=None),
-        summarize_stages([sample.seconds for sample in samples]),
-        summarize_stages([sample.ratios for sample in samples]),
         samples,
     )
-
-
-def summarize_stages(values: Sequence[Mapping[str, float]]) -> dict[str, Spread]:
-    """Compute the statistics of each stage."""
-    return {stage: Spread.from_values([v[stage] for v in values]) for stage in values[0]}
 
 
 @dataclass(frozen=True)
@@ -79,25 +56,21 @@ class Growth:
     """Measurements along an axis."""
 
     axis: str
-    sizes: Sequence[int]
-    slopes: Mapping[str, float | None]
-    """Exponent p of seconds ~ size^p by stage."""
-    memory_slope: float | None
-    """Exponent of the peak memory."""
-    points: Sequence[Measured]
-    """One for each size."""
+    exponents: Mapping[str, float | None]
+    """Exponent p of seconds ~ size^p by stage, and of the peak memory."""
+    points: Mapping[int, Measured]
+    """Measurements by size."""
 
 
-def fit_growth(axis: str, sizes: Sequence[int], points: Sequence[Measured]) -> Growth:
+def fit_growth(axis: str, points: Mapping[int, Measured]) -> Growth:
     """Fit a power law to the medians of each stage."""
-    slopes = {stage: fit_exponent(sizes, get_medians(points, stage)) for stage in points[0].seconds}
-    memory = fit_exponent(sizes, [float(point.peak_bytes or 0) for point in points])
-    return Growth(axis, sizes, slopes, memory, points)
-
-
-def get_medians(points: Sequence[Measured], stage: str) -> list[float]:
-    """Return the median seconds of a stage at each size."""
-    return [point.seconds[stage].median for point in points]
+    found, sizes = [*points.values()], [*points]
+    exponents = {
+        stage: fit_exponent(sizes, [point.seconds[stage] for point in found])
+        for stage in found[0].seconds
+    }
+    exponents[PEAK] = fit_exponent(sizes, [float(point.peak_bytes or 0) for point in found])
+    return Growth(axis, exponents, points)
 
 
 def fit_exponent(sizes: Sequence[int], values: Sequence[float]) -> float | None:
@@ -116,8 +89,8 @@ class Report:
     machine: Mapping[str, str | int]
     settings: Mapping[str, Any]
     """Seed, repeats, and maximum number of iterations of the baselines."""
-    yardstick: Spread
-    """Seconds of the yardstick over all measurements."""
+    yardstick: float
+    """Median seconds of the yardstick."""
     cases: Sequence[Measured]
     methods: Sequence[Measured]
     """Measurements on the first target of the first case; ours is the first if present."""
@@ -126,7 +99,11 @@ class Report:
 
 def format_report(report: Report) -> str:
     """Format machine, cases, methods and growth as Markdown."""
-    parts = [format_machine(report)]
+    machine = [f"{name.replace('_', ' ')} {value}" for name, value in report.machine.items()]
+    parts = [
+        f"{', '.join(machine)}. Medians of {report.settings['repeats']}, of yardsticks also "
+        f"smallest to largest; seconds. The yardstick took {report.yardstick:.3f} s.\n"
+    ]
     if report.cases:
         parts += ["### Cases\n", format_case_table(report.cases)]
     if report.methods:
@@ -136,97 +113,54 @@ def format_report(report: Report) -> str:
     return "\n".join(parts)
 
 
-def format_machine(report: Report) -> str:
-    """Describe the machine and the measurements."""
-    machine = [f"{name.replace('_', ' ')} {value}" for name, value in report.machine.items()]
-    return (
-        f"{', '.join(machine)}. "
-        f"Medians (smallest to largest) of {report.settings['repeats']}; seconds. "
-        f"The yardstick took {format_spread(report.yardstick)} s.\n"
-    )
-
-
 def format_case_table(cases: Sequence[Measured]) -> str:
     """Format seconds by stage, memory and Gaussians, one row per case."""
-    columns = select_columns(cases, COLUMNS)
+    columns = select_columns(cases, CASE_COLUMNS)
     rows = [
-        [
-            *(case.name, *format_cells(case, columns, PROCESS)),
-            *(f"{case.gaussians[part]:,}" for part in ("context", "added")),
-        ]
+        [*format_cells(case, columns), *(f"{case.gaussians[k]:,}" for k in ("context", "added"))]
         for case in cases
     ]
-    return format_markdown(["case", *columns, *SHARED_COLUMNS, "Gaussians", "added"], rows)
+    return format_table("case", columns, rows, "Gaussians", "added")
 
 
 def format_method_table(methods: Sequence[Measured]) -> str:
-    """Format seconds by stage and the ratio to the first method, one row per method."""
+    """Format seconds by stage, and multiples of the first method, one row per method."""
     columns, first = select_columns(methods, METHOD_COLUMNS), methods[0]
     rows = [
-        [
-            *(method.name, *format_cells(method, columns, OWN)),
-            f"{method.ratios[OWN].median / first.ratios[OWN].median:.3g}",
-        ]
-        for method in methods
+        [*format_cells(method, columns), f"{method.ratio / first.ratio:.3g}"] for method in methods
     ]
-    return format_markdown(["method", *columns, *SHARED_COLUMNS, f"times {first.name}"], rows)
+    return format_table("method", columns, rows, f"times {first.name}")
 
 
 def format_growth_table(series: Growth) -> str:
-    """Format seconds by stage, one row per size, with the exponents in the last row."""
-    columns = select_columns(series.points, COLUMNS)
-    rows = [
-        [f"{size:,}", *format_cells(point, columns, PROCESS)]
-        for size, point in zip(series.sizes, series.points, strict=True)
-    ]
-    powers = [*(series.slopes[column] for column in columns), None, series.memory_slope]
-    rows.append(["exponent", *("–" if power is None else f"{power:.2f}" for power in powers)])
-    return format_markdown([series.axis, *columns, *SHARED_COLUMNS], rows)
+    """Format seconds and memory, one row per size, and then the exponents."""
+    points = [*series.points.values()]
+    columns = select_columns(points, CASE_COLUMNS)
+    powers = [*(series.exponents[column] for column in columns), None, series.exponents[PEAK]]
+    last = ["exponent", *("–" if power is None else f"{power:.2f}" for power in powers)]
+    rows = [format_cells(point, columns) for point in points]
+    return format_table(series.axis, columns, [*rows, last])
+
+
+def format_table(
+    first: str, columns: Sequence[str], rows: Sequence[Sequence[str]], *last: str
+) -> str:
+    """Format rows of `format_cells` with further cells, whose columns are `last`."""
+    return format_markdown([first, *columns, "in yardsticks", "peak (GB)", *last], rows)
 
 
 def select_columns(found: Sequence[Measured], columns: Sequence[str]) -> list[str]:
     """Select the columns with a positive time."""
-    present = {stage for one in found for stage, spent in one.seconds.items() if spent.high > 0}
-    return [column for column in columns if column in present]
+    return [c for c in columns if any(one.seconds.get(c, 0.0) > 0 for one in found)]
 
 
-def format_cells(found: Measured, columns: Sequence[str], whole: str) -> list[str]:
-    """Format the seconds of each column, the yardsticks of the stage `whole`, and the memory."""
-    seconds = [found.seconds.get(column) for column in columns]
+def format_cells(found: Measured, columns: Sequence[str]) -> list[str]:
+    """Format the name, the seconds of each column, the yardsticks, and the memory."""
+    ratios = [sample.ratio for sample in found.samples]
+    spread = f" ({min(ratios):.1f}–{max(ratios):.1f})" if len(ratios) > 1 else ""
     return [
-        *("–" if spread is None else format_spread(spread) for spread in seconds),
-        format_spread(found.ratios[whole], 1),
+        found.name,
+        *(f"{found.seconds[c]:.2f}" if c in found.seconds else "–" for c in columns),
+        f"{found.ratio:.1f}{spread}",
         "–" if found.peak_bytes is None else f"{found.peak_bytes / 1e9:.2f}",
     ]
-
-
-def format_spread(spread: Spread, digits: int = 2) -> str:
-    """Format the median, with the range if there are several values."""
-    median = f"{spread.median:.{digits}f}"
-    if spread.low == spread.high:
-        return median
-    return f"{median} ({spread.low:.{digits}f}–{spread.high:.{digits}f})"
-
-
-def plot_growth(path: Path, growth: Sequence[Growth]) -> Path:
-    """Write a PNG with one panel per series; raise PlotsNotAvailable without matplotlib."""
-    figure = create_plot_figure(3.2 * len(growth))
-    panels = figure.subplots(len(growth), squeeze=False)[:, 0]
-    for axes, series in zip(panels, growth, strict=True):
-        plot_series(axes, series)
-    figure.legend(*panels[0].get_legend_handles_labels(), loc="outside right upper")
-    return write_figure(figure, path)
-
-
-def plot_series(axes: Axes, series: Growth) -> None:
-    """Plot the median seconds of each stage against size, with logarithmic axes."""
-    for number, stage in enumerate(CURVES):
-        if stage in series.slopes:
-            medians, style = get_medians(series.points, stage), get_curve_style(number)
-            axes.plot(series.sizes, medians, label=stage, linewidth=1, **style)
-    axes.set_xscale("log")
-    axes.set_yscale("log")
-    found = series.slopes[PROCESS]
-    axes.set_xlabel(series.axis if found is None else f"{series.axis} (process: {found:.2f})")
-    axes.set_ylabel("seconds")
-    axes.grid(alpha=0.3)

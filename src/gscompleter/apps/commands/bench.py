@@ -7,7 +7,9 @@ from collections.abc import Callable, Sequence
 from dataclasses import asdict, dataclass, replace
 from functools import partial
 from pathlib import Path
+from statistics import median
 from tempfile import TemporaryDirectory
+from typing import Any
 
 from rich.console import Console
 
@@ -15,28 +17,23 @@ from gscompleter.apps.bench.cases import (
     BenchCase,
     Manifest,
     check_frames,
-    get_size,
-    make_default_series,
+    make_default_growth,
     read_manifest,
     write_input_splat,
 )
 from gscompleter.apps.bench.machine import describe_machine
 from gscompleter.apps.bench.measure import (
-    OWN,
-    PROCESS,
-    BenchTask,
     Sample,
     Yardstick,
+    make_yardstick,
     measure_command,
     measure_in_rounds,
     measure_method,
 )
 from gscompleter.apps.bench.report import (
     Report,
-    Spread,
     fit_growth,
     format_report,
-    plot_growth,
     summarize,
 )
 from gscompleter.apps.commands.demo import (
@@ -48,9 +45,8 @@ from gscompleter.apps.commands.demo import (
 from gscompleter.apps.commands.options import BenchOptions
 from gscompleter.apps.inputs.opening import print_lines
 from gscompleter.data.scene import write_cameras
-from gscompleter.errors import InputError, quote_value
+from gscompleter.errors import InputError
 from gscompleter.evaluation.methods import Models
-from gscompleter.evaluation.plots import PlotsNotAvailable
 from gscompleter.generators import load_generator
 from gscompleter.io.files import check_output, open_output_folder
 from gscompleter.progress import show_preparation, show_progress, stage
@@ -61,6 +57,10 @@ BEYOND = (1.0, 1.25, 1.5, 1.75)
 """Distances of the demo's targets from its two cameras, in baselines."""
 QUICK_ITERATIONS = 2
 FAST_METHODS = ("full", "autograd")
+"""Methods that are repeated; others take minutes."""
+
+Series = dict[str, dict[int, BenchCase]]
+"""Cases by axis and size, which differ only in the field of the axis."""
 
 
 @dataclass(frozen=True)
@@ -78,11 +78,6 @@ class Bench:
     def repeats(self) -> int:
         """Number of repetitions."""
         return 1 if self.options.quick else self.options.repeats
-
-    @property
-    def baseline_repeats(self) -> int:
-        """Number of repetitions of slow methods."""
-        return min(self.repeats, self.options.baseline_repeats)
 
     def complete(self, case: BenchCase) -> Sample:
         """Complete a case in a process of its own."""
@@ -107,36 +102,34 @@ def run_bench(options: BenchOptions) -> None:
         check_output(options.out, options.overwrite)
     console = Console(stderr=True, quiet=options.quiet, highlight=False)
     with TemporaryDirectory(prefix="gscompleter-bench-") as temporary:
-        manifest = select_cases(load_bench_manifest(options, Path(temporary)), options)
+        cases, series = select_cases(load_manifest(options, Path(temporary)), options)
         with show_progress(None if options.quiet else console):
             with show_preparation("getting ready"):
                 bench = prepare_bench(options, Path(temporary))
-            report = run_measurements(bench, manifest, partial(print_lines, console))
+            report = run_measurements(bench, cases, series, console)
+    text, tables = json.dumps(asdict(report), indent=1), format_report(report)
     if options.out is not None:
-        write_bench(report, options.out, options.overwrite, console)
-    print(format_json(report) if options.json else format_report(report))
+        with open_output_folder(options.out, options.overwrite) as folder:
+            (folder / "bench.json").write_text(text + "\n")
+            (folder / "tables.md").write_text(tables)
+    print(text if options.json else tables)
 
 
-def load_bench_manifest(options: BenchOptions, folder: Path) -> Manifest:
+def load_manifest(options: BenchOptions, folder: Path) -> Manifest:
     """Collect the cases of a file, a scene or the demo's pair."""
     if options.cases is not None:
         return read_manifest(options.cases)
-    if options.folder is not None:
-        case = make_scene_case(options, options.folder)
-        return Manifest((case,), make_default_series(case))
-    case = write_demo_case(options, folder / "motorcycle")
-    return Manifest((replace(case, targets=case.targets[:1]),), make_default_series(case))
-
-
-def make_scene_case(options: BenchOptions, scene: Path) -> BenchCase:
-    """Create the case of a scene."""
+    if options.folder is None:
+        case = write_demo_case(options, folder / "motorcycle")
+        return Manifest((replace(case, targets=case.targets[:1]),), make_default_growth(case))
     if not options.context or not options.target:
         raise InputError(
             "A scene needs context frames and targets; name them, as in --context 0 4 --target 8.",
         )
-    name = scene.resolve().name
-    planes = options.near, options.far
-    return BenchCase(name, scene, options.context, options.target, options.resolution, *planes)
+    name, planes = options.folder.resolve().name, (options.near, options.far)
+    frames = options.context, options.target
+    case = BenchCase(name, options.folder, *frames, options.resolution, *planes)
+    return Manifest((case,), make_default_growth(case))
 
 
 def write_demo_case(options: BenchOptions, folder: Path) -> BenchCase:
@@ -155,22 +148,13 @@ def write_demo_case(options: BenchOptions, folder: Path) -> BenchCase:
     return BenchCase("motorcycle", folder, (0, 1), targets, options.resolution)
 
 
-def select_cases(manifest: Manifest, options: BenchOptions) -> Manifest:
-    """Select the cases of the options, and check their frames."""
-    cases = [case for case in manifest.cases if not options.only or case.name in options.only]
-    unknown = set(options.only) - {case.name for case in cases}
-    if unknown:
-        known = ", ".join(case.name for case in manifest.cases)
-        raise InputError(
-            f"There is no case '{quote_value(min(unknown))}' to measure; choose one of {known}.",
-            "only",
-        )
-    axes: set[str] = set() if options.quick else {*options.growth}
-    growth = {axis: found for axis, found in manifest.growth.items() if axis in axes}
+def select_cases(manifest: Manifest, options: BenchOptions) -> tuple[list[BenchCase], Series]:
+    """Select the cases and series of the options, and check their frames."""
+    cases, series = [*manifest.cases], manifest.make_series(options.growth)
     if options.quick:
-        cases = [min(cases, key=lambda case: (case.gaussians or 0, case.pixels))]
-    check_frames([*cases, *(case for found in growth.values() for case in found)])
-    return Manifest(tuple(cases), growth)
+        cases, series = [min(cases, key=lambda case: (case.gaussians or 0, case.pixels))], {}
+    check_frames([*cases, *(case for found in series.values() for case in found.values())])
+    return cases, series
 
 
 def prepare_bench(options: BenchOptions, folder: Path) -> Bench:
@@ -184,80 +168,53 @@ def prepare_bench(options: BenchOptions, folder: Path) -> Bench:
         options.seed,
         QUICK_ITERATIONS if options.quick else None,
     )
-    return Bench(options, device, models, Yardstick.create(renderer, device), folder)
+    return Bench(options, device, models, make_yardstick(renderer, device), folder)
 
 
-def run_measurements(bench: Bench, manifest: Manifest, print_line: Callable[[str], None]) -> Report:
+def run_measurements(
+    bench: Bench, cases: Sequence[BenchCase], series: Series, console: Console
+) -> Report:
     """Run all measurements in rounds, after a first run that is not counted."""
-    options, first = bench.options, manifest.cases[0]
-    if not options.quick:
-        print_line(f"{first.name}: first run, not counted")
+    if not bench.options.quick:
         with stage("warming up"):
-            bench.complete(first)
-    growing = [case for series in manifest.growth.values() for case in series]
-    cases = make_case_tasks(bench, [*manifest.cases, *growing])
-    methods = make_method_tasks(bench, first) if options.methods else {}
-    samples = measure_in_rounds({**cases, **methods}, print_line)
-    yardsticks = [sample.yardstick for found in samples.values() for sample in found]
+            bench.complete(cases[0])
+    growing = [case for found in series.values() for case in found.values()]
+    tasks: dict[Any, tuple[Callable[[], Sample], int]] = {
+        **{case: (partial(bench.complete, case), bench.repeats) for case in (*cases, *growing)},
+        **make_method_tasks(bench, cases[0]),
+    }
+    samples = measure_in_rounds(tasks, partial(print_lines, console))
     return Report(
         describe_machine(bench.device),
         {
-            "seed": options.seed,
+            "seed": bench.options.seed,
             "repeats": bench.repeats,
-            "baseline_repeats": bench.baseline_repeats,
             "baseline_iterations": bench.models.baseline_iterations,
         },
-        Spread.from_values(yardsticks),
-        [summarize(case.name, samples[case]) for case in manifest.cases],
-        [summarize(name, samples[name]) for name in dict.fromkeys(options.methods)],
+        median(one.yardstick for found in samples.values() for one in found),
+        [summarize(case.name, samples[case]) for case in cases],
+        [summarize(name, samples[name]) for name in dict.fromkeys(bench.options.methods)],
         [
-            fit_growth(
-                axis,
-                [get_size(axis, case) for case in series],
-                [summarize(case.name, samples[case]) for case in series],
-            )
-            for axis, series in manifest.growth.items()
+            fit_growth(axis, {n: summarize(f"{n:,}", samples[case]) for n, case in found.items()})
+            for axis, found in series.items()
         ],
     )
 
 
-def make_case_tasks(bench: Bench, cases: Sequence[BenchCase]) -> dict[BenchCase | str, BenchTask]:
-    """Create the task of each different case, through the command line."""
-    return {
-        case: BenchTask(case.name, partial(bench.complete, case), PROCESS, bench.repeats)
-        for case in dict.fromkeys(cases)
-    }
-
-
-def make_method_tasks(bench: Bench, case: BenchCase) -> dict[BenchCase | str, BenchTask]:
+def make_method_tasks(bench: Bench, case: BenchCase) -> dict[str, tuple[Callable[[], Sample], int]]:
     """Create the tasks that compare methods at the first target of `case`."""
-    options = bench.options
+    if not bench.options.methods:
+        return {}
     state = case.begin(bench.models, bench.device)
     target = case.open().camera(case.targets[0], case.resolution).to(bench.device)
     start = state, target, bench.models, bench.yardstick
-    if not options.quick:
+    if not bench.options.quick:
         with stage("warming up"), show_progress(None):
             measure_method("full", *start)
-    tasks: dict[BenchCase | str, BenchTask] = {}
-    for name in options.methods:
-        repeats = bench.repeats if name in FAST_METHODS else bench.baseline_repeats
-        measure = partial(measure_method, name, *start)
-        tasks[name] = BenchTask(f"method {name}", measure, OWN, repeats)
-    return tasks
-
-
-def format_json(report: Report) -> str:
-    """Format the report as JSON, in seconds, bytes and yardsticks (`ratios`)."""
-    return json.dumps(asdict(report), indent=1)
-
-
-def write_bench(report: Report, out: Path, overwrite: bool, console: Console) -> None:
-    """Write bench.json, tables.md and growth.png."""
-    with open_output_folder(out, overwrite) as folder:
-        (folder / "bench.json").write_text(format_json(report) + "\n")
-        (folder / "tables.md").write_text(format_report(report))
-        if report.growth:
-            try:
-                plot_growth(folder / "growth.png", report.growth)
-            except PlotsNotAvailable as missing:
-                print_lines(console, str(missing))
+    return {
+        name: (
+            partial(measure_method, name, *start),
+            bench.repeats if name in FAST_METHODS else 1,
+        )
+        for name in bench.options.methods
+    }

@@ -329,22 +329,18 @@ class BenchOptions(RunOptions):
     cases: Path | None = None
     """JSON file of cases and growth series instead of a scene, as benchmarks/performance.json.
     Methods are compared on the first case."""
-    only: tuple[str, ...] = ()
-    """Names of the cases to measure; all if not given."""
     methods: tuple[BenchMethod, ...] = ("full", "autograd", "densify-800", "distill", "reggs")
     """Methods to compare: full (ours), autograd (ours without a frozen context), or others."""
     growth: tuple[Axis, ...] = ("gaussians", "pixels", "views", "targets")
     """Quantities to increase in the first case."""
     repeats: Repeats = 5
-    """Number of repetitions."""
-    baseline_repeats: Repeats = 1
-    """Most repetitions of slow methods: all but full and autograd."""
+    """Number of repetitions; slow methods, all but full and autograd, run once."""
     quick: bool = False
     """Run a quick check: the smallest case once, two iterations of the baselines, no growth."""
     json: bool = False
     """Print all measurements as JSON instead of tables."""
     out: Path | None = None
-    """Folder for bench.json, tables.md and growth.png."""
+    """Folder for bench.json and tables.md."""
     overwrite: bool = False
     """Replace the results of an earlier run in the output folder."""
 
