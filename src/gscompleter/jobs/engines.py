@@ -3,15 +3,14 @@
 from __future__ import annotations
 
 import contextlib
+import importlib
 import multiprocessing
 import os
 import signal
-import time
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from multiprocessing.connection import Connection
 from pathlib import Path
-from threading import Thread
 from typing import Any, Literal
 
 from gscompleter.cpu_threads import count_available_cores, limit_threads
@@ -27,8 +26,8 @@ PIXELS, IMAGES = 640 * 480, 8
 """Size of a typical completion, for the default number of workers."""
 STOP_SECONDS = 20.0
 """Time that stopped workers have to remove what they have not finished."""
-GRACE_SECONDS = 1.0
-"""Time that a worker has to write a finished result after its parent was killed."""
+RAY_VARIABLES = {"RAY_USAGE_STATS_ENABLED": "0", "RAY_ACCEL_ENV_VAR_OVERRIDE_ON_ZERO": "0"}
+"""Variables against messages to Ray's makers, and of Ray on standard error."""
 STORE_BYTES = 200 * 10**6
 """Memory for return values in a local Ray cluster; they are small, as results are files."""
 
@@ -110,23 +109,27 @@ class LocalWorker:
 
 
 def run_process(connection: Connection) -> None:
-    """Run shares in this process; Ctrl-C is for the parent, which then stops this one."""
+    """Run shares in this process until the parent is gone or stops it.
+
+    Ctrl-C is for the parent. What is running when the parent is killed is still finished.
+    """
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     handle_stop_signals()
-    Thread(target=stop_with_parent, daemon=True).start()
-    with contextlib.suppress(KeyboardInterrupt, EOFError):
+    with contextlib.suppress(KeyboardInterrupt, EOFError, ConnectionError):
         while True:
             share: Share = connection.recv()
             connection.send(share())
 
 
-def stop_with_parent() -> None:
-    """End this process when its parent is gone."""
-    parent = multiprocessing.parent_process()
-    assert parent is not None
-    parent.join()
-    time.sleep(GRACE_SECONDS)
-    os.kill(os.getpid(), signal.SIGTERM)
+def import_engine(package: str, extra: str) -> Any:
+    """Import the package of an engine; raise InputError if it is not installed."""
+    try:
+        return importlib.import_module(package)
+    except ImportError as error:
+        raise InputError(
+            f"The engine {package} needs a package; install it with "
+            f"`pip install 'gscompleter[{extra}]'`."
+        ) from error
 
 
 @dataclass(frozen=True)
@@ -144,7 +147,7 @@ class RayEngine(Engine):
     @contextlib.contextmanager
     def open(self) -> Iterator[Pool]:
         """Connect to Ray, or start a local cluster, and open a pool of tasks."""
-        ray = import_ray()
+        ray = import_engine("ray", "ray")
         self._connect(ray)
         # A lost task is not repeated by Ray, so that its attempts are counted.
         task = ray.remote(run_task).options(
@@ -168,6 +171,8 @@ class RayEngine(Engine):
             ray.shutdown()
 
     def _connect(self, ray: Any) -> None:
+        for name, value in RAY_VARIABLES.items():
+            os.environ.setdefault(name, value)
         cpus = None if self.workers is None else self.workers * self.threads
         here = {"num_cpus": cpus, "include_dashboard": False, "object_store_memory": STORE_BYTES}
         options = {"address": self.address} if self.address else {"address": "local", **here}
@@ -182,20 +187,6 @@ class RayEngine(Engine):
             ) from error
         for number, handler in handlers.items():  # Ray has replaced them by its own
             signal.signal(number, handler)
-
-
-def import_ray() -> Any:
-    """Import Ray; raise InputError if it is not installed."""
-    os.environ.setdefault("RAY_USAGE_STATS_ENABLED", "0")
-    # Suppresses Ray's notice about future versions on standard error.
-    os.environ.setdefault("RAY_ACCEL_ENV_VAR_OVERRIDE_ON_ZERO", "0")
-    try:
-        import ray
-    except ImportError as error:
-        raise InputError(
-            "The engine ray needs a package; install it with `pip install 'gscompleter[ray]'`."
-        ) from error
-    return ray
 
 
 def run_task(share: Share, threads: int) -> Exception | None:
@@ -237,12 +228,7 @@ class SubmititEngine(Engine):
                     job.cancel()
 
     def _make_executor(self) -> Any:
-        try:
-            import submitit
-        except ImportError as error:
-            raise InputError(
-                "The engine submitit needs a package; install it with `pip install submitit`."
-            ) from error
+        submitit = import_engine("submitit", "slurm")
         executor = submitit.AutoExecutor(folder=str(self.folder))
         further: dict[str, Any] = {f"slurm_{k}": v for k, v in self.parameters.items()}
         if executor.cluster == "local":

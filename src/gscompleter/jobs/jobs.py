@@ -20,13 +20,8 @@ from gscompleter.io.json_file import read_json
 
 BATCH, JOBS, ROWS = "batch.json", "jobs", "rows"
 """File that marks the folder of a batch, and its folders."""
-CONTENT = {"version": 1, "kind": "batch"}
-"""Content of batch.json."""
 RETRY_SECONDS = 1.0
 """Delay before the first retry after an error not caused by the input; doubled for the next."""
-
-Row = dict[str, Any]
-"""Outcome of a job: its state is `done` or `failed`."""
 
 
 @dataclass(frozen=True)
@@ -51,7 +46,9 @@ def run_job(job: Job, out: Path, work: Callable[[], Mapping[str, Any]], retries:
         write_json(get_row_path(job, out), row | run_with_retries(work, job.lost, retries))
 
 
-def run_with_retries(work: Callable[[], Mapping[str, Any]], lost: int, retries: int) -> Row:
+def run_with_retries(
+    work: Callable[[], Mapping[str, Any]], lost: int, retries: int
+) -> dict[str, Any]:
     """Run `work` with retries and return its part of a row; `lost` attempts have been killed."""
     reason = describe_loss(lost)
     for number in range(lost + 1, retries + 2):
@@ -83,7 +80,7 @@ def has_row(job: Job, out: Path) -> bool:
     return get_row_path(job, out).is_file()
 
 
-def read_row(job: Job, out: Path) -> Row | None:
+def read_row(job: Job, out: Path) -> dict[str, Any] | None:
     """Read the row of a job, or return None if there is none."""
     if not has_row(job, out):
         return None
@@ -116,10 +113,7 @@ def claim_folder(out: Path) -> None:
     # Order matters: every run writes this file before all others.
     if list_names(out) and not (out / BATCH).is_file():
         raise InputError(f"{quote_value(out)} holds something other than a batch; name another.")
-    if not (out / BATCH).is_file():
-        write_json(out / BATCH, CONTENT)
-    if read_json(out / BATCH, "name another folder") != CONTENT:
-        raise InputError(f"{quote_value(out)} holds a batch of another version; name another.")
+    write_json(out / BATCH, {"version": 1, "kind": "batch"}, keep_existing=True)
 
 
 def list_names(folder: Path) -> set[str]:

@@ -82,22 +82,11 @@ def run_jobs(
         engine: Starts the workers; None runs the jobs in this process.
         retries: Number of times that a job may cost its worker.
     """
-    if engine is not None:
-        yield from run_on_workers(jobs, perform, has_row, engine, retries)
+    if engine is None:
+        for job in jobs:
+            perform(job)
+            yield job
         return
-    for job in jobs:
-        perform(job)
-        yield job
-
-
-def run_on_workers(
-    jobs: Sequence[Job],
-    perform: Perform,
-    has_row: Callable[[Job], bool],
-    engine: Engine,
-    retries: int,
-) -> Iterator[Job]:
-    """Run jobs on the workers of an engine; the arguments are those of `run_jobs`."""
     waiting, running = deque(engine.divide(jobs)), dict[Any, list[Job]]()
     with engine.open() as pool:
         while waiting or running:
@@ -111,24 +100,23 @@ def run_on_workers(
                     yield share.pop(0)
             for future in ended:
                 share = running.pop(future)
-                if (killed := future.exception()) is None:
-                    yield from finish_share(share, future.result())
-                elif share:
-                    waiting.append(count_loss(share, killed, retries))
+                if rest := collect_rest(future, share, retries):
+                    waiting.append(rest)
+                else:
+                    yield from share
 
 
-def finish_share(share: list[Job], error: Exception | None) -> list[Job]:
-    """Return the last jobs of a share that was run, or raise the error that ends the run."""
-    if error is not None:
-        raise error
-    return share
+def collect_rest(future: Any, share: list[Job], retries: int) -> list[Job]:
+    """Return what a killed worker left of its share, with the loss of the first job counted.
 
-
-def count_loss(share: list[Job], killed: Exception, retries: int) -> list[Job]:
-    """Count the loss of a worker for the first job of its share.
-
-    It raises `killed` if even a worker that only had to list the job as failed was lost.
+    It raises the error of a worker, which ends the run, and the loss of one that only had to list
+    a job as failed.
     """
+    killed = future.exception()
+    if killed is None and (error := future.result()) is not None:
+        raise error
+    if killed is None or not share:
+        return []
     first = replace(share[0], lost=share[0].lost + 1)
     if first.lost > retries + 1:
         raise killed
@@ -136,11 +124,22 @@ def count_loss(share: list[Job], killed: Exception, retries: int) -> list[Job]:
 
 
 def parse_shard(text: str | None, environment: Mapping[str, str]) -> tuple[int, int]:
-    """Parse `i/n` (the jobs i, i + n, …), or `auto` in a SLURM array; None means all jobs."""
+    """Parse `i/n` (the jobs i, i + n, …), or `auto` in a SLURM array; None means all jobs.
+
+    The numbers of the array have to be consecutive.
+    """
     if text is None:
         return 0, 1
     if text == "auto":
-        return parse_slurm_shard(environment)
+        numbers = [environment.get(name, "") for name in SLURM_VARIABLES]
+        if not all(number.isdecimal() for number in numbers):
+            raise InputError(
+                f"{SLURM_VARIABLES[0]} and {SLURM_VARIABLES[2]} are not set, so this is no SLURM "
+                "array; give the shard as i/n.",
+                "shard",
+            )
+        task, first, count = map(int, numbers)
+        return check_shard((task - first, count))
     match = re.fullmatch(r"([0-9]{1,6})/([0-9]{1,6})", text)
     if match is None:
         raise InputError(
@@ -149,19 +148,6 @@ def parse_shard(text: str | None, environment: Mapping[str, str]) -> tuple[int, 
             "shard",
         )
     return check_shard((int(match[1]), int(match[2])))
-
-
-def parse_slurm_shard(environment: Mapping[str, str]) -> tuple[int, int]:
-    """Return the shard of a SLURM task; the numbers of the array have to be consecutive."""
-    numbers = [environment.get(name, "") for name in SLURM_VARIABLES]
-    if not all(number.isdecimal() for number in numbers):
-        raise InputError(
-            f"{SLURM_VARIABLES[0]} and {SLURM_VARIABLES[2]} are not set, so this is no SLURM "
-            "array; give the shard as i/n.",
-            "shard",
-        )
-    task, first, count = map(int, numbers)
-    return check_shard((task - first, count))
 
 
 def check_shard(shard: tuple[int, int]) -> tuple[int, int]:

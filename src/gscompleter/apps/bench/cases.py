@@ -54,10 +54,6 @@ class BenchCase:
         """Number of pixels of an image."""
         return self.resolution[0] * self.resolution[1]
 
-    def __str__(self) -> str:
-        """Return the name."""
-        return self.name
-
     def open(self) -> Photographs:
         """Open the scene."""
         return open_photographs(self.scene, near=self.near, far=self.far)

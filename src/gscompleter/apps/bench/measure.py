@@ -72,14 +72,9 @@ class Sample:
     gaussians: Mapping[str, int]
 
     @property
-    def whole(self) -> float:
-        """Seconds that are compared with others."""
-        return [*self.seconds.values()][-1]
-
-    @property
     def ratio(self) -> float:
-        """These seconds, in yardsticks."""
-        return self.whole / self.yardstick
+        """Seconds of the last stage, in yardsticks."""
+        return [*self.seconds.values()][-1] / self.yardstick
 
 
 def make_yardstick(renderer: Renderer, device: str) -> Yardstick:
@@ -226,21 +221,17 @@ def measure_method(
 
 
 def measure_in_rounds(
-    tasks: Mapping[K, tuple[Callable[[], Sample], int]], print_line: Callable[[str], None]
+    tasks: Mapping[K, tuple[Callable[[], Sample], int]],
 ) -> dict[K, list[Sample]]:
-    """Run each task once per round until it has its repeats, so that a busy hour slows all alike.
+    """Run measurements in rounds until each has its repeats, so that a busy hour slows all alike.
 
     Args:
         tasks: Measurements, with their repeats.
-        print_line: Receives progress lines.
     """
     samples: dict[K, list[Sample]] = {key: [] for key in tasks}
     rounds = range(max((repeats for _, repeats in tasks.values()), default=0))
     turns = [key for n in rounds for key, (_, repeats) in tasks.items() if n < repeats]
-    for number, key in enumerate(track(turns, "measuring"), start=1):
+    for key in track(turns, "measuring"):
         with show_progress(None):  # no progress lines inside a measurement
-            found = tasks[key][0]()
-        samples[key].append(found)
-        times = f"{found.whole:.2f} s, {found.ratio:.1f} yardsticks"
-        print_line(f"{number}/{len(turns)} {key}: {times}")
+            samples[key].append(tasks[key][0]())
     return samples

@@ -8,7 +8,8 @@ from __future__ import annotations
 import os
 import re
 import time
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
+from contextlib import nullcontext
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
@@ -49,23 +50,14 @@ def run_batch(options: BatchOptions) -> None:
             share = jobs[number::count]
             left = find_missing_jobs(share, out, options.rerun == "failures")
         perform, is_done = JobCompleter(out, options.retries), partial(has_row, out=out)
-        count_jobs(run_jobs(left, perform, is_done, engine, options.retries), len(left))
+        activity = Activity("completing", len(left))
+        with show_activity(activity) if left else nullcontext():
+            for _ in run_jobs(left, perform, is_done, engine, options.retries):
+                activity.count_step()
         with show_preparation("table"):
             write_batch_results(out, jobs)
     sentence = f"{summarize_rows(out, share, left)} All results: {options.out}/index.html"
     console.print(sentence, markup=False, soft_wrap=True)
-
-
-def count_jobs(ended: Iterator[Job], total: int) -> None:
-    """Show the progress and the rate until all jobs have ended."""
-    if not total:
-        return
-    activity = Activity("completing", total)
-    with show_activity(activity):
-        for _ in ended:
-            activity.count_step()
-            minutes = (activity.last_step_time - activity.start_time) / 60
-            activity.name = f"completing ({activity.num_done / minutes:.1f} a minute)"
 
 
 def summarize_rows(out: Path, share: Sequence[Job], left: Sequence[Job]) -> str:

@@ -43,7 +43,6 @@ from gscompleter.apps.commands.demo import (
     write_motorcycle_scene,
 )
 from gscompleter.apps.commands.options import BenchOptions
-from gscompleter.apps.inputs.opening import print_lines
 from gscompleter.data.scene import write_cameras
 from gscompleter.errors import InputError
 from gscompleter.evaluation.methods import Models
@@ -74,11 +73,6 @@ class Bench:
     folder: Path
     """Folder for temporary scenes and results."""
 
-    @property
-    def repeats(self) -> int:
-        """Number of repetitions."""
-        return 1 if self.options.quick else self.options.repeats
-
     def complete(self, case: BenchCase) -> Sample:
         """Complete a case in a process of its own."""
         out = self.folder / "completion"
@@ -100,13 +94,14 @@ def run_bench(options: BenchOptions) -> None:
         raise InputError("A scene and a file of cases are both named; name one.", "cases")
     if options.out is not None:
         check_output(options.out, options.overwrite)
-    console = Console(stderr=True, quiet=options.quiet, highlight=False)
+    if options.quick:
+        options = replace(options, repeats=1, growth=())
     with TemporaryDirectory(prefix="gscompleter-bench-") as temporary:
         cases, series = select_cases(load_manifest(options, Path(temporary)), options)
-        with show_progress(None if options.quiet else console):
+        with show_progress(None if options.quiet else Console(stderr=True)):
             with show_preparation("getting ready"):
                 bench = prepare_bench(options, Path(temporary))
-            report = run_measurements(bench, cases, series, console)
+            report = run_measurements(bench, cases, series)
     text, tables = json.dumps(asdict(report), indent=1), format_report(report)
     if options.out is not None:
         with open_output_folder(options.out, options.overwrite) as folder:
@@ -152,7 +147,7 @@ def select_cases(manifest: Manifest, options: BenchOptions) -> tuple[list[BenchC
     """Select the cases and series of the options, and check their frames."""
     cases, series = [*manifest.cases], manifest.make_series(options.growth)
     if options.quick:
-        cases, series = [min(cases, key=lambda case: (case.gaussians or 0, case.pixels))], {}
+        cases = [min(cases, key=lambda case: (case.gaussians or 0, case.pixels))]
     check_frames([*cases, *(case for found in series.values() for case in found.values())])
     return cases, series
 
@@ -171,24 +166,20 @@ def prepare_bench(options: BenchOptions, folder: Path) -> Bench:
     return Bench(options, device, models, make_yardstick(renderer, device), folder)
 
 
-def run_measurements(
-    bench: Bench, cases: Sequence[BenchCase], series: Series, console: Console
-) -> Report:
+def run_measurements(bench: Bench, cases: Sequence[BenchCase], series: Series) -> Report:
     """Run all measurements in rounds, after a first run that is not counted."""
     if not bench.options.quick:
         with stage("warming up"):
             bench.complete(cases[0])
-    growing = [case for found in series.values() for case in found.values()]
-    tasks: dict[Any, tuple[Callable[[], Sample], int]] = {
-        **{case: (partial(bench.complete, case), bench.repeats) for case in (*cases, *growing)},
-        **make_method_tasks(bench, cases[0]),
-    }
-    samples = measure_in_rounds(tasks, partial(print_lines, console))
+    tasks: dict[Any, tuple[Callable[[], Sample], int]] = {}
+    for case in [*cases, *(case for found in series.values() for case in found.values())]:
+        tasks[case] = partial(bench.complete, case), bench.options.repeats
+    samples = measure_in_rounds(tasks | make_method_tasks(bench, cases[0]))
     return Report(
         describe_machine(bench.device),
         {
             "seed": bench.options.seed,
-            "repeats": bench.repeats,
+            "repeats": bench.options.repeats,
             "baseline_iterations": bench.models.baseline_iterations,
         },
         median(one.yardstick for found in samples.values() for one in found),
@@ -214,7 +205,7 @@ def make_method_tasks(bench: Bench, case: BenchCase) -> dict[str, tuple[Callable
     return {
         name: (
             partial(measure_method, name, *start),
-            bench.repeats if name in FAST_METHODS else 1,
+            bench.options.repeats if name in FAST_METHODS else 1,
         )
         for name in bench.options.methods
     }

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 import shlex
 from collections.abc import Iterator, Mapping
 from functools import cache
@@ -23,10 +24,7 @@ Command: Any = Union[  # noqa: UP007  (a command line has several)
 ]
 RESERVED = ("out", "overwrite", "quiet", "threads", "dry-run", "help", "help-all")
 """Options that a batch sets for all jobs."""
-FLAG_VALUES = {
-    **dict.fromkeys(("true", "yes", "1"), True),
-    **dict.fromkeys(("false", "no", "0", ""), False),
-}
+TRUE, FALSE = ("true", "yes", "1"), ("false", "no", "0", "")
 """Values of a flag in a CSV."""
 
 
@@ -68,7 +66,7 @@ def value_to_words(name: str, value: Any, is_multiple: bool) -> list[str]:
         except ValueError as error:
             raise InputError(f"'{quote_value(value)}' has an unmatched quotation mark.") from error
     for word in words:
-        if word.startswith("-") and not is_number(word):
+        if re.match(r"-(?![\d.])", word):
             raise InputError(f"{name} cannot be '{quote_value(word)}', which begins with a dash.")
     return words
 
@@ -76,18 +74,9 @@ def value_to_words(name: str, value: Any, is_multiple: bool) -> list[str]:
 def parse_flag(name: str, value: Any) -> bool:
     """Return True if a row sets a flag."""
     text = str(value).lower()
-    if text not in FLAG_VALUES:
+    if text not in TRUE + FALSE:
         raise InputError(f"{name} is '{quote_value(text)}'; it must be true or false.")
-    return FLAG_VALUES[text]
-
-
-def is_number(word: str) -> bool:
-    """Return True if a word is a number."""
-    try:
-        float(word)
-    except ValueError:
-        return False
-    return True
+    return text in TRUE
 
 
 def has_tuple(kind: Any) -> bool:
