@@ -21,8 +21,7 @@ class Peak:
 def measure_peak_memory(device: torch.device | str = "cpu") -> Iterator[Peak]:
     """Measure peak memory while the body runs: torch's on a GPU, the whole process's on a CPU."""
     peak = Peak()
-    on_gpu = torch.device(device).type == "cuda"
-    if on_gpu:
+    if torch.device(device).type == "cuda":
         torch.cuda.reset_peak_memory_stats()
         yield peak
         peak.bytes = torch.cuda.max_memory_allocated()
@@ -32,8 +31,7 @@ def measure_peak_memory(device: torch.device | str = "cpu") -> Iterator[Peak]:
         Path("/proc/self/clear_refs").write_text("5")
         is_reset = True
     yield peak
-    if is_reset:
-        peak.bytes = read_process_peak()
+    peak.bytes = read_process_peak() if is_reset else None
 
 
 def read_process_peak() -> int | None:

@@ -98,11 +98,9 @@ class Manifest:
         base, series = replace(case, targets=case.targets[:1]), {}
         for axis in axes:
             cases = [replace(base, **{AXES[axis]: value}) for value in getattr(self.growth, axis)]
-            series[axis] = {
-                get_size(axis, c): replace(c, name=f"{case.name}, {get_size(axis, c):,} {axis}")
-                for c in cases
-            }
-        return {axis: cases for axis, cases in series.items() if cases}
+            if cases:
+                series[axis] = {get_size(axis, case): case for case in cases}
+        return series
 
 
 def get_size(axis: str, case: BenchCase) -> int:
