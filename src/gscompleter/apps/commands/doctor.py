@@ -32,7 +32,7 @@ DISTRIBUTION = "gscompleter"
 
 PURPOSES = {
     "cuda": "rendering on an NVIDIA GPU",
-    "evaluation": "the plots of evaluate, tables and bench",
+    "evaluation": "the plots of evaluate and tables",
     "models": "downloading published weights from the Hugging Face hub",
     "diffusion": "--generator pe-field and diffusers-inpaint",
     "poses": "photographs whose cameras are not known",
