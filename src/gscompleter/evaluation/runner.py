@@ -199,7 +199,7 @@ def prepare_task(task: Task, folder: Path, config: RunConfig) -> PreparedTask:
     images = [*views, *targets]
     check_memory(max(v.camera.width * v.camera.height for v in images), len(images))
     models = config.load_models(targets)
-    context = load_or_reconstruct(folder / "context.npz", views, models)
+    context = load_or_reconstruct(folder / "context.pt", views, models)
 
     def set_range(view: View) -> View:
         return replace(view, camera=replace(view.camera, near=context.near, far=context.far))
@@ -230,11 +230,16 @@ def load_or_reconstruct(path: Path, views: Sequence[View], models: Models) -> st
     def save() -> None:
         with record_seconds() as seconds:
             made = reconstruct_context(models.reconstructor, views)
-        near, far = made.views[0].camera.near, made.views[0].camera.far
-        assert near is not None
-        assert far is not None
-        scene, gains = made.source.gaussians, made.exposure_gains
-        found = store.SavedContext(scene, near, far, seconds["total"], gains)
+        camera = made.views[0].camera
+        assert camera.near is not None
+        assert camera.far is not None
+        found = store.SavedContext(
+            made.source.gaussians,
+            float(camera.near),
+            float(camera.far),
+            seconds["total"],
+            made.exposure_gains,
+        )
         store.save_context(path, found)
 
     return load_or_compute(path, lambda: store.load_context(path, device), save)

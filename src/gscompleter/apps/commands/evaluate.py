@@ -32,7 +32,7 @@ from gscompleter.evaluation import plots, protocols, tables
 from gscompleter.evaluation.methods import expand_methods
 from gscompleter.evaluation.runner import RunConfig, evaluate
 from gscompleter.evaluation.store import list_row_paths
-from gscompleter.evaluation.summary import RunSummary
+from gscompleter.evaluation.tables import RunSummary
 from gscompleter.jobs.workers import parse_shard
 from gscompleter.progress import show_preparation, show_progress
 from gscompleter.render import choose_device
@@ -219,9 +219,8 @@ def print_skipped(skipped: Sequence[SkippedScene], console: Console) -> None:
 def print_tables(summary: RunSummary, out: Path) -> None:
     """Print the tables, transposed: one column per method."""
     table = Table("", *summary.methods, box=None)
-    columns = summary.find_present_columns(summary.columns)
-    cells = tables.format_score_cells(summary, columns)
-    for number, column in enumerate(columns, start=1):
+    cells = tables.format_score_cells(summary, summary.columns)
+    for number, column in enumerate(summary.columns, start=1):
         table.add_row(column.title, *(row[number] for row in cells))
     if summary.common_tasks:
         seconds = [summary.compute_seconds(method)["total"] for method in summary.methods]

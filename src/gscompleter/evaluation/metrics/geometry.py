@@ -15,7 +15,6 @@ from jaxtyping import Bool, Float
 from scipy.spatial import cKDTree
 from torch import Tensor
 
-from gscompleter.errors import InputError
 from gscompleter.geometry import is_inside, project, project_mask, sample
 from gscompleter.render import Renderer
 from gscompleter.stages.filter_holes import select_in_mask
@@ -61,44 +60,23 @@ def compute_f_score(
 def compute_nearest_distances(
     points: Float[Tensor, "n 3"], others: Float[Tensor, "m 3"]
 ) -> Float[np.ndarray, "n"]:
-    """Compute the Euclidean distance of each point to the nearest of `others`, in float64.
-
-    Raises:
-        InputError: A set is empty or holds a point that is not finite.
-    """
-    if len(points) == 0 or len(others) == 0:
-        raise InputError(
-            "Distances between point sets need points on both sides, "
-            f"got {len(points)} and {len(others)}."
-        )
+    """Compute the Euclidean distance of each point to the nearest of `others`, in float64."""
     queries, targets = (p.detach().cpu().double().numpy() for p in (points, others))
-    if not (np.isfinite(queries).all() and np.isfinite(targets).all()):
-        raise InputError("Distances between point sets need finite points; some are not.")
     # Without balancing the tree stays fast if many points coincide.
-    distances, _ = cKDTree(targets, balanced_tree=False).query(queries, workers=-1)
-    return np.asarray(distances, dtype=np.float64)
+    return cKDTree(targets, balanced_tree=False).query(queries, workers=-1)[0]
 
 
 @dataclass(frozen=True)
 class Alignment:
     """Agreement of generated Gaussians with the context where both overlap, or None."""
 
-    overlap: float
-    """Share of the target's pixels in the overlap."""
     pixels: int
-    """Number of pixels in the overlap."""
-    scale: float | None
-    """Median z-depth of the context at the target, in scene units."""
-    abs_rel: float | None
+    """Number of the target's pixels in the overlap."""
+    abs_rel: float | None = None
     """AbsRel of the generated z-depth against the context in the overlap."""
-    chamfer: float | None
-    """Chamfer distance in scene units."""
-    f_score: float | None
-
-    @property
-    def relative_chamfer(self) -> float | None:
-        """Chamfer distance as a share of `scale`, for averages over scenes."""
-        return self.chamfer / self.scale if self.chamfer is not None and self.scale else None
+    chamfer: float | None = None
+    """Chamfer distance as a share of the median depth of the context, for averages over scenes."""
+    f_score: float | None = None
 
 
 @torch.no_grad()
@@ -152,9 +130,9 @@ def compare_clouds(
     error: float | None,
 ) -> Alignment:
     """Add Chamfer distance and F-score over `overlap` to the AbsRel `error`."""
-    share, count = overlap.double().mean().item(), int(overlap.sum())
+    count = int(overlap.sum())
     if count == 0:
-        return Alignment(share, count, None, None, None, None)
+        return Alignment(0)
     scale = reference.depth[reference.valid].double().median().item()
     threshold = MATCH_DISTANCE * scale
     points = select_in_mask(generated, None, overlap, target).means
@@ -163,12 +141,12 @@ def compare_clouds(
     at_pixel = sample(reference.depth[..., None], pixels, "nearest")[..., 0]
     surface = surface[is_inside(pixels, z, target) & ((z - at_pixel).abs() <= threshold)]
     if len(points) == 0 or len(surface) == 0:
-        return Alignment(share, count, scale, error, None, None)
+        return Alignment(count, error)
     there = compute_nearest_distances(points, context.means)
     back = compute_nearest_distances(surface, generated.means)
     # Distances are not squared, so that floaters do not dominate.
-    chamfer = float(there.mean() + back.mean()) / 2
-    return Alignment(share, count, scale, error, chamfer, compute_f_score(there, back, threshold))
+    chamfer = float(there.mean() + back.mean()) / 2 / scale
+    return Alignment(count, error, chamfer, compute_f_score(there, back, threshold))
 
 
 def drop_transparent(gaussians: Gaussians) -> Gaussians:

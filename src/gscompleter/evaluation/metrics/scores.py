@@ -23,7 +23,7 @@ from gscompleter.evaluation.metrics.image import (
     compute_masked_psnr,
     ssim,
 )
-from gscompleter.evaluation.metrics.lpips import compute_lpips
+from gscompleter.evaluation.metrics.learned import compute_lpips
 from gscompleter.evaluation.metrics.perceptual import compute_flip_map, haarpsi
 from gscompleter.render import Renderer
 from gscompleter.stages.target_view import compute_hole_mask
@@ -60,7 +60,7 @@ class Quality:
     """PSNR in dB."""
     ssim: float
     lpips_vgg: float | None
-    """None if the weights are not on this machine."""
+    """None if it is not available."""
     lpips_alex: float | None
 
 
@@ -185,12 +185,7 @@ def score(
 
 def name_alignment_scores(name: str, aligned: Alignment) -> dict[str, Any]:
     """Return the fields of `Scores` for an alignment, prefixed by `name`."""
-    return {
-        f"{name}_pixels": aligned.pixels,
-        f"{name}_abs_rel": aligned.abs_rel,
-        f"{name}_chamfer": aligned.relative_chamfer,
-        f"{name}_f_score": aligned.f_score,
-    }
+    return {f"{name}_{key}": value for key, value in vars(aligned).items()}
 
 
 def measure_quality(image: Image, photograph: View) -> Quality:
