@@ -137,14 +137,15 @@ def run_index(options: IndexOptions) -> None:
     shown = None if options.quiet else Console(stderr=True)
     with show_progress(shown), show_preparation("reading clips"):
         index = protocols.build_index(rule, filter_usable(open_clips(options.path), skipped))
-    index = replace(index, skipped=(*index.skipped, *(clip.name for clip in skipped)))
+    index = replace(index, scenes={**index.scenes, **{clip.name: () for clip in skipped}})
     protocols.write_evaluation_index(options.out, index)
     console = Console(quiet=options.quiet, highlight=False)
     print_skipped(skipped, console)
-    targets = sum(len(split.targets) for splits in index.scenes.values() for split in splits)
+    targets = [len(split.targets) for splits in index.scenes.values() for split in splits]
+    used = [name for name, splits in index.scenes.items() if splits]
     console.print(
-        f"{targets} cases in {len(index.scenes)} scenes, {len(index.skipped)} scenes skipped: "
-        f"{options.out}",
+        f"{sum(targets)} cases in {len(used)} scenes, {len(index.scenes) - len(used)} scenes "
+        f"skipped: {options.out}",
         soft_wrap=True,
     )
 
@@ -190,9 +191,10 @@ def iterate_tasks(
                 )
             clip = clip if options.ego_mask else clip.keep_ego_vehicle()
             for rule in rules:
-                if reason := protocols.explain_skip(rule, clip):
-                    skipped.append(SkippedScene(clip.name, reason))
                 tasks = protocols.make_tasks(rule, clip, size, options.use_masks)
+                if not tasks and isinstance(rule, protocols.FrameRule):
+                    reason = f"{rule.name} chooses none of its {len(clip)} frames"
+                    skipped.append(SkippedScene(clip.name, reason))
                 yield from tasks[:1] if options.one_per_scene else tasks
 
 
