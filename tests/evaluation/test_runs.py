@@ -384,7 +384,7 @@ def test_wrong_runs_are_refused(finished, tasks, tmp_path):
         check_methods(["full", "full"])
     with pytest.raises(InputError, match="no shard 2/2"):
         evaluate(tasks, ["context"], tmp_path / "out", CONFIG, (2, 2))
-    with pytest.raises(InputError, match="same name"):
+    with pytest.raises(InputError, match="Two cases are called box"):
         evaluate([tasks[0]] * 2, ["context"], tmp_path / "out", CONFIG)
     with pytest.raises(InputError, match="no case to run"):
         evaluate([], ["context"], tmp_path / "out", CONFIG)

@@ -331,20 +331,15 @@ def test_a_picture_shows_what_the_camera_of_a_step_sees(finished):
     assert psnr == pytest.approx(psnr_of(row["steps"][1]), abs=0.1)
 
 
-def test_a_broken_frame_ends_a_sequence_and_keeps_the_steps_before(finished, tmp_path):
-    out, (row_there,) = tmp_path / "out", (finished / "tasks").glob("*/full.json")
-    broken, hopeless = walk(broken=(4,)), walk(name="lost", broken=(1,))
-    assert evaluate([broken, hopeless], ["full"], out, CONFIG) == RowCounts(0, 2, 0)
-    rows = {path.parent.name: read_json(path) for path in (out / "tasks").glob("*/*.json")}
-    row, lost = rows["walk-0+1-to-2..4"], rows["lost-0+1-to-2..4"]
-    assert row["error"] == "Frame 4: The image of frame 4 is damaged; download it again."
-    whole = read_json(row_there)["steps"]
-    assert [psnr_of(step) for step in row["steps"]] == [psnr_of(step) for step in whole[:2]]
-    assert "frame 1 is damaged" in lost["error"]
-    assert lost["steps"] == []
+def test_a_broken_frame_costs_its_sequence(tmp_path):
+    out = tmp_path / "out"
+    assert evaluate([walk(broken=(4,))], ["full"], out, CONFIG) == RowCounts(0, 1, 0)
+    (row,) = map(read_json, (out / "tasks").glob("*/*.json"))
+    assert row["error"] == "The image of frame 4 is damaged; download it again."
+    assert row["steps"] == []
     assert draw_plots(write_tables(out), out) == []
     content = read_json(out / "tables.json")
-    assert (content["cases"], content["common"]) == (2, [])
+    assert (content["cases"], content["common"]) == (1, [])
     assert "frame 4 is damaged" in (out / "tables.md").read_text()
 
 

@@ -122,11 +122,9 @@ def save_context(path: Path, context: SavedContext) -> None:
     save_tensors(path, {**vars(context), "gaussians": collect_tensors(context.gaussians)})
 
 
-def load_context(path: Path, device: torch.device | str) -> SavedContext | None:
-    """Read the initial scene of a task, or return None if there is no complete file."""
+def load_context(path: Path, device: torch.device | str) -> SavedContext:
+    """Read the initial scene of a task."""
     saved = load_tensors(path, device)
-    if saved is None:
-        return None
     return SavedContext(**{**saved, "gaussians": Gaussians(**saved["gaussians"])})
 
 
@@ -143,11 +141,9 @@ def save_prediction(path: Path, prediction: Prediction) -> None:
     save_tensors(path, content)
 
 
-def load_prediction(path: Path, before: Gaussians) -> Prediction | None:
-    """Read the prediction for the scene `before`, or return None if there is no complete file."""
+def load_prediction(path: Path, before: Gaussians) -> Prediction:
+    """Read the prediction for the scene `before`."""
     saved = load_tensors(path, before.means.device)
-    if saved is None:
-        return None
     for name in ("scene", "added", "registered"):
         saved[name] = None if saved[name] is None else Gaussians(**saved[name])
     if saved["scene"] is None:
@@ -171,11 +167,14 @@ def save_tensors(path: Path, content: Mapping[str, Any]) -> None:
         torch.save(dict(content), file)
 
 
-def load_tensors(path: Path, device: torch.device | str) -> dict[str, Any] | None:
-    """Read what `save_tensors` wrote, or return None if there is no complete file."""
-    if not is_zipfile(path):
-        return None  # an incomplete file is computed again
+def load_tensors(path: Path, device: torch.device | str) -> dict[str, Any]:
+    """Read what `save_tensors` wrote."""
     return dict(torch.load(path, map_location=device, weights_only=True))
+
+
+def is_complete(path: Path) -> bool:
+    """Return True if a file of tensors exists and has its end."""
+    return is_zipfile(path)
 
 
 def make_folder(folder: Path) -> None:
