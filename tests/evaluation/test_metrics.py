@@ -13,11 +13,10 @@ from torch import Tensor
 
 from gscompleter.errors import InputError
 from gscompleter.evaluation.metrics.geometry import (
-    Alignment,
-    compute_abs_rel,
+    Agreement,
+    compare_depths,
     compute_f_score,
     compute_nearest_distances,
-    count_known,
     measure_alignment,
     measure_primitive_alignment,
 )
@@ -251,18 +250,17 @@ def test_abs_rel_is_the_mean_relative_error_where_truth_is_known():
     where = torch.rand(12, 15, generator=generator) > 0.3
     d, t = depth.double().numpy(), truth.double().numpy()
     mask = where.numpy() & (t > 0)
-    assert compute_abs_rel(depth, truth, where) == pytest.approx(
-        np.mean(abs(d - t)[mask] / t[mask])
-    )
-    assert count_known(truth, where) == mask.sum()
-    assert count_known(None, where) is None
+    found = compare_depths(depth, truth, where)
+    assert found.abs_rel == pytest.approx(np.mean(abs(d - t)[mask] / t[mask]))
+    assert found.pixels == mask.sum()
 
 
 def test_a_depth_ten_percent_too_great_has_an_abs_rel_of_a_tenth():
     truth = torch.linspace(1, 4, 12).reshape(3, 4)
     everywhere = torch.ones(3, 4, dtype=torch.bool)
-    assert compute_abs_rel(1.1 * truth, truth, everywhere) == pytest.approx(0.1, abs=1e-6)
-    assert compute_abs_rel(truth, 0 * truth, everywhere) is None
+    found = compare_depths(1.1 * truth, truth, everywhere)
+    assert found.abs_rel == pytest.approx(0.1, abs=1e-6)
+    assert compare_depths(truth, 0 * truth, everywhere) == Agreement(0)
 
 
 # Point sets
@@ -340,7 +338,7 @@ def filling(context: Gaussians, factor: float = 1.0, dilation: int = 3) -> Gauss
     return gaussians_of(view, factor * view.depth)[hole.flatten()]
 
 
-def score_of(context: Gaussians, added: Gaussians, target: Camera = TARGET) -> Alignment:
+def score_of(context: Gaussians, added: Gaussians, target: Camera = TARGET) -> Agreement:
     return measure_alignment(added, context, target, RENDERER)
 
 
@@ -409,7 +407,7 @@ def test_alignment_in_another_unit_of_length_is_the_same():
 def test_where_nothing_overlaps_there_is_no_alignment():
     context = room_context()
     nothing = score_of(context, context[:0])
-    assert nothing == Alignment(0, None, None, None)
+    assert nothing == Agreement(0, None, None, None)
     unseen = replace(context, opacities=torch.full_like(context.opacities, 0.001))
     assert score_of(context, unseen) == nothing
     assert measure_primitive_alignment(unseen, context, TARGET, RENDERER) == nothing
@@ -449,19 +447,19 @@ def test_scores_count_the_pixels_that_they_are_measured_over():
     scores, seen = score(
         context[:0], context, context, Truth((), view), RENDERER
     )  # everything is a hole that the context fills
-    assert (scores.depth_observed, scores.depth_observed_pixels) == (None, 0)
-    assert scores.depth_hole_pixels == seen.after.depth_map().valid.sum() > 500
+    assert scores.depth_observed == Agreement(0)
+    assert scores.depth_hole.pixels == seen.after.depth_map().valid.sum() > 500
     after = merge([context, added])
     scores, seen = score(context, after, added, truth, RENDERER, lifted)
     known = seen.after.depth_map().valid & (depth > 0)
-    assert scores.depth_hole_pixels == (known & seen.holes).sum() > 0
-    assert scores.depth_observed_pixels == (known & ~seen.holes).sum() > 0
-    assert scores.align_pixels == score_of(context, added).pixels
+    assert scores.depth_hole.pixels == (known & seen.holes).sum() > 0
+    assert scores.depth_observed.pixels == (known & ~seen.holes).sum() > 0
+    assert scores.added == score_of(context, added)
     aligned = measure_primitive_alignment(lifted, context, TARGET, RENDERER)
-    assert scores.registered_pixels == aligned.pixels > scores.align_pixels
-    assert scores.registered_chamfer == aligned.chamfer
+    assert scores.registered == aligned
+    assert aligned.pixels > scores.added.pixels
     scores, _ = score(context, after, added, Truth((), replace(view, depth=None)), RENDERER)
-    assert scores.depth_hole_pixels is scores.registered_pixels is None
+    assert scores.depth_hole is scores.depth_observed is scores.registered is None
 
 
 # Learned features

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import statistics
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -70,14 +70,17 @@ def _make_gain(key: str, title: str, path: str, reduce: Reduction = statistics.f
     return Column(key, title, 2, f"{path}.after", f"{path}.before", reduce, reduce)
 
 
-def _make_median(key: str, title: str, digits: int, path: str, pixels: str | None = None) -> Column:
+def _make_median(key: str, title: str, digits: int, path: str) -> Column:
     """Make a column of medians over the tasks."""
-    return Column(key, title, digits, path, reduce_tasks=statistics.median, pixels=pixels)
+    return Column(key, title, digits, path, reduce_tasks=statistics.median)
 
 
-def _make_alignment(name: str, key: str, title: str, digits: int) -> Column:
-    """Make a column of medians of Gaussians against the context."""
-    return _make_median(f"{key}_median", f"{title} (median)", digits, key, f"{name}_pixels")
+def _make_geometry(
+    key: str, title: str, path: str, digits: int = 4, reduce: Reduction = statistics.median
+) -> Column:
+    """Make a column of a number of an `Agreement`."""
+    pixels = f"{path.split('.')[0]}.pixels"
+    return Column(key, title, digits, path, reduce_tasks=reduce, pixels=pixels)
 
 
 BEFORE, AFTER = "target_before.psnr", "target_after.psnr"
@@ -108,37 +111,39 @@ GROUPS = {
         Column("observed_flip", "FLIP (observed)", 3, "observed_looks.flip"),
         Column("hole_haarpsi", "HaarPSI (hole)", 3, "hole_looks.haarpsi"),
         Column("observed_haarpsi", "HaarPSI (observed)", 3, "observed_looks.haarpsi"),
-        *(
-            _make_median(
-                f"{part}_gradients",
-                f"gradient energy ({part})",
-                2,
-                f"{part}_looks.gradient_energy",
-            )
-            for part in ("hole", "observed")
+        _make_median("hole_gradients", "gradient energy (hole)", 2, "hole_looks.gradient_energy"),
+        _make_median(
+            "observed_gradients", "gradient energy (observed)", 2, "observed_looks.gradient_energy"
         ),
     ),
     "Geometry": (
-        Column(
-            "depth_observed", "AbsRel observed", 3, "depth_observed", pixels="depth_observed_pixels"
+        _make_geometry(
+            "depth_observed", "AbsRel observed", "depth_observed.abs_rel", 3, statistics.fmean
         ),
-        Column("depth_hole", "AbsRel in holes", 3, "depth_hole", pixels="depth_hole_pixels"),
-        _make_median(
-            "depth_hole_median", "AbsRel in holes (median)", 3, "depth_hole", "depth_hole_pixels"
-        ),
+        _make_geometry("depth_hole", "AbsRel in holes", "depth_hole.abs_rel", 3, statistics.fmean),
+        _make_geometry("depth_hole_median", "AbsRel in holes (median)", "depth_hole.abs_rel", 3),
     ),
-    # Lengths are relative to the depth.
+    # All are medians over the cases; lengths are relative to the depth.
     "Geometry of added Gaussians": (
-        _make_alignment("align", "depth_rim", "depth step at seam", 4),
-        _make_alignment("align", "align_abs_rel", "AbsRel to context", 4),
-        _make_alignment("align", "align_chamfer", "Chamfer to context", 4),
-        _make_alignment("align", "align_f_score", "F-score to context", 3),
+        replace(
+            _make_median("depth_rim_median", "depth step at seam (median)", 4, "seam_step"),
+            pixels="added.pixels",
+        ),
+        _make_geometry("align_abs_rel_median", "AbsRel to context (median)", "added.abs_rel"),
+        _make_geometry("align_chamfer_median", "Chamfer to context (median)", "added.chamfer"),
+        _make_geometry("align_f_score_median", "F-score to context (median)", "added.f_score", 3),
     ),
     # The same after registration, before the hole filter.
     "Geometry of all lifted Gaussians": (
-        _make_alignment("registered", "registered_abs_rel", "AbsRel of all lifted", 4),
-        _make_alignment("registered", "registered_chamfer", "Chamfer of all lifted", 4),
-        _make_alignment("registered", "registered_f_score", "F-score of all lifted", 3),
+        _make_geometry(
+            "registered_abs_rel_median", "AbsRel of all lifted (median)", "registered.abs_rel"
+        ),
+        _make_geometry(
+            "registered_chamfer_median", "Chamfer of all lifted (median)", "registered.chamfer"
+        ),
+        _make_geometry(
+            "registered_f_score_median", "F-score of all lifted (median)", "registered.f_score", 3
+        ),
     ),
     "Sequences": (
         PSNR_BEFORE,

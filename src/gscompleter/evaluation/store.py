@@ -33,7 +33,7 @@ from gscompleter.types import Gaussians, merge
 
 RUN, TASKS = "run.json", "tasks"
 """Names of the file with the settings of a run, and of the folder that holds the tasks."""
-VERSION = 3
+VERSION = 4
 """Version of the files of a run."""
 FIELDS = ("means", "quats", "scales", "opacities", "sh", "generated")
 """Tensors of Gaussians that are saved."""

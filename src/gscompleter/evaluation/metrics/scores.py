@@ -3,17 +3,15 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, replace
-from typing import Any
+from dataclasses import dataclass
 
 import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
 from gscompleter.evaluation.metrics.geometry import (
-    Alignment,
-    compute_abs_rel,
-    count_known,
+    Agreement,
+    compare_depths,
     measure_alignment,
     measure_primitive_alignment,
 )
@@ -93,34 +91,20 @@ class Scores:
     """PSNR in dB of each context view."""
     context_ssim: tuple[Change, ...]
     """SSIM of each context view."""
-    depth_observed: float | None
-    """AbsRel at the target against the true depth, where the context covers it."""
-    depth_hole: float | None
-    """The same in the filled hole."""
-    depth_observed_pixels: int | None = None
-    """Number of pixels of `depth_observed`."""
-    depth_hole_pixels: int | None = None
-    """Number of pixels of `depth_hole`."""
-    depth_rim: float | None = None
-    """Median relative depth difference of the added Gaussians to the context, where both cover."""
-    align_pixels: int | None = None
-    """Number of target pixels that both cover, for `depth_rim` and the next three."""
-    align_abs_rel: float | None = None
-    """AbsRel of the added Gaussians against the context (`geometry.measure_alignment`)."""
-    align_chamfer: float | None = None
-    """Their Chamfer distance as a share of the median depth at the target."""
-    align_f_score: float | None = None
-    registered_pixels: int | None = None
-    """Number of covered target pixels with a registered Gaussian, for the next three."""
-    registered_abs_rel: float | None = None
-    """AbsRel of all registered Gaussians against the context, before filtering."""
-    registered_chamfer: float | None = None
-    """Their Chamfer distance as a share of the median depth at the target."""
-    registered_f_score: float | None = None
-    hole_looks: PerceptualQuality | None = None
+    hole_looks: PerceptualQuality
     """At the target in the hole, after completion."""
-    observed_looks: PerceptualQuality | None = None
+    observed_looks: PerceptualQuality
     """At the target over all other pixels."""
+    depth_observed: Agreement | None
+    """Depth at the target against the true depth, where the context covers it."""
+    depth_hole: Agreement | None
+    """The same in the filled hole."""
+    seam_step: float | None
+    """Median relative depth difference of the added Gaussians to the context, where both cover."""
+    added: Agreement | None
+    """Added Gaussians against the context (`geometry.measure_alignment`)."""
+    registered: Agreement | None
+    """All registered Gaussians against the context, before filtering."""
 
 
 @dataclass(frozen=True)
@@ -157,6 +141,11 @@ def score(
     observed = [
         compute_masked_psnr(render.image, target.image, ~holes & counted) for render in (was, now)
     ]
+    depths: list[Agreement | None] = [None, None]
+    if target.depth is not None:
+        depths = [
+            compare_depths(now.depth, target.depth, part & covered) for part in (~holes, holes)
+        ]
     scores = Scores(
         hole_fraction=holes.float().mean().item(),
         target_before=measure_quality(was.image, target),
@@ -166,26 +155,19 @@ def score(
         neighbours_psnr=average_changes(compare(beside, truth.neighbours, compute_view_psnr)),
         context_psnr=compare(context, truth.views, compute_view_psnr),
         context_ssim=compare(context, truth.views, compute_view_ssim),
-        depth_observed=compute_abs_rel(now.depth, target.depth, ~holes & covered),
-        depth_hole=compute_abs_rel(now.depth, target.depth, holes & covered),
-        depth_observed_pixels=count_known(target.depth, ~holes & covered),
-        depth_hole_pixels=count_known(target.depth, holes & covered),
         hole_looks=measure_perceptual_quality(now.image, target, holes),
         observed_looks=measure_perceptual_quality(now.image, target, ~holes),
+        depth_observed=depths[0],
+        depth_hole=depths[1],
+        seam_step=measure_seam_step(added, was, camera, renderer) if added else None,
+        added=measure_alignment(added, before, camera, renderer) if added else None,
+        registered=(
+            measure_primitive_alignment(registered, before, camera, renderer)
+            if registered
+            else None
+        ),
     )
-    if added is not None and len(added) > 0:
-        aligned = measure_alignment(added, before, camera, renderer)
-        step = measure_seam_step(added, was, camera, renderer)
-        scores = replace(scores, depth_rim=step, **name_alignment_scores("align", aligned))
-    if registered is not None and len(registered) > 0:
-        aligned = measure_primitive_alignment(registered, before, camera, renderer)
-        scores = replace(scores, **name_alignment_scores("registered", aligned))
     return scores, TargetRenders(was, now, holes)
-
-
-def name_alignment_scores(name: str, aligned: Alignment) -> dict[str, Any]:
-    """Return the fields of `Scores` for an alignment, prefixed by `name`."""
-    return {f"{name}_{key}": value for key, value in vars(aligned).items()}
 
 
 def measure_quality(image: Image, photograph: View) -> Quality:
