@@ -31,7 +31,7 @@ from gscompleter.evaluation.metrics.learned import compute_fid, compute_lpips, l
 from gscompleter.evaluation.metrics.perceptual import compute_flip_map, haarpsi
 from gscompleter.evaluation.metrics.scores import (
     Truth,
-    measure_perceptual_quality,
+    measure_part,
     measure_quality,
     score,
 )
@@ -218,7 +218,7 @@ def test_looks_are_of_the_pixels_that_are_asked_for():
     outside = torch.arange(truth.shape[1]) > truth.shape[1] // 2 + 12
     photograph = photograph_of(truth)
     bad, good = (
-        measure_perceptual_quality(damaged, photograph, where.expand(truth.shape[:2]))
+        measure_part(damaged, photograph, where.expand(truth.shape[:2]))
         for where in (inside, outside)
     )
     assert bad.flip > 0.1
@@ -228,7 +228,7 @@ def test_looks_are_of_the_pixels_that_are_asked_for():
     assert good.haarpsi == pytest.approx(1.0)
     assert good.gradient_energy == 1.0
     nowhere = torch.zeros(truth.shape[:2], dtype=torch.bool)
-    nothing = measure_perceptual_quality(damaged, photograph, nowhere)
+    nothing = measure_part(damaged, photograph, nowhere)
     assert (nothing.flip, nothing.haarpsi, nothing.gradient_energy) == (None, None, None)
 
 
@@ -236,7 +236,7 @@ def test_flip_is_none_without_its_package(monkeypatch: pytest.MonkeyPatch):
     monkeypatch.setitem(sys.modules, "flip_evaluator", None)
     image, truth = images()
     assert compute_flip_map(image, truth) is None
-    assert measure_perceptual_quality(image, photograph_of(truth), left_half(truth)).flip is None
+    assert measure_part(image, photograph_of(truth), left_half(truth)).flip is None
 
 
 # Depth

@@ -46,7 +46,9 @@ class Column:
         value = find_number(step, self.path)
         if value is not None and self.minus is not None:
             value = np.subtract(value, find_number(step, self.minus)).tolist()
-        return self.reduce_steps(value) if isinstance(value, list) else value
+        if isinstance(value, list):
+            return self.reduce_steps(value) if value else None
+        return value
 
     def compute_row(self, row: RunRow) -> float | None:
         """Compute the value of a task, or None if no step has one."""
@@ -96,8 +98,8 @@ GROUPS = {
         Column("ssim", "SSIM", 3, "target_after.ssim"),
         Column("lpips_vgg", "LPIPS (VGG)", 3, "target_after.lpips_vgg"),
         Column("lpips_alex", "LPIPS (Alex)", 3, "target_after.lpips_alex"),
-        Column("hole_psnr", "PSNR (hole)", 2, "hole_psnr"),
-        Column("observed_psnr", "PSNR (observed)", 2, "observed_psnr.after"),
+        Column("hole_psnr", "PSNR (hole)", 2, "hole.psnr"),
+        Column("observed_psnr", "PSNR (observed)", 2, "observed.psnr"),
         Column("neighbours", "PSNR (neighbour views)", 2, "neighbours_psnr.after"),
         _make_gain("neighbours_gain", "ΔPSNR (neighbour views)", "neighbours_psnr"),
         Column("context", "PSNR (context)", 2, "context_psnr.after"),
@@ -107,13 +109,13 @@ GROUPS = {
     # 0 is the best FLIP, 1 the best HaarPSI, and 1 the gradient energy of the photograph. That is a
     # median, since a flat photograph gives arbitrary ratios.
     "Perceptual quality": (
-        Column("hole_flip", "FLIP (hole)", 3, "hole_looks.flip"),
-        Column("observed_flip", "FLIP (observed)", 3, "observed_looks.flip"),
-        Column("hole_haarpsi", "HaarPSI (hole)", 3, "hole_looks.haarpsi"),
-        Column("observed_haarpsi", "HaarPSI (observed)", 3, "observed_looks.haarpsi"),
-        _make_median("hole_gradients", "gradient energy (hole)", 2, "hole_looks.gradient_energy"),
+        Column("hole_flip", "FLIP (hole)", 3, "hole.flip"),
+        Column("observed_flip", "FLIP (observed)", 3, "observed.flip"),
+        Column("hole_haarpsi", "HaarPSI (hole)", 3, "hole.haarpsi"),
+        Column("observed_haarpsi", "HaarPSI (observed)", 3, "observed.haarpsi"),
+        _make_median("hole_gradients", "gradient energy (hole)", 2, "hole.gradient_energy"),
         _make_median(
-            "observed_gradients", "gradient energy (observed)", 2, "observed_looks.gradient_energy"
+            "observed_gradients", "gradient energy (observed)", 2, "observed.gradient_energy"
         ),
     ),
     "Geometry": (

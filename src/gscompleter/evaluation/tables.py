@@ -103,11 +103,6 @@ class RunSummary:
         notes = {FEW_PIXELS_NOTE: has_geometry, REGGS_NOTE: "reggs" in self.methods}
         return [note for note, is_needed in notes.items() if is_needed]
 
-    @property
-    def num_steps(self) -> int:
-        """Number of steps in the common tasks."""
-        return sum(len(row["steps"]) for row in self.rows[self.methods[0]])
-
     def list_values(self, method: str, column: Column) -> list[float | None]:
         """List the value of each common task, in their order for all methods."""
         return [column.compute_row(row) for row in self.rows[method]]
@@ -143,20 +138,15 @@ class RunSummary:
 def read_rows(out: Path) -> list[RunRow]:
     """Read the rows of a run."""
     read_settings(out)
-    rows = [read_row(path) for path in list_row_paths(out)]
+    rows = {path: read_json(path) for path in list_row_paths(out)}
     if not rows:
         raise InputError(
             f"The run in {out} has no finished case; run `gscompleter evaluate` first."
         )
-    return rows
-
-
-def read_row(path: Path) -> RunRow:
-    """Read the row of a task and a method."""
-    row = read_json(path)
-    if not isinstance(row, dict) or not {"task", "method", "steps", "error"} <= row.keys():
-        raise InputError(f"{path} is no row of scores; delete it and run again.")
-    return row
+    for path, row in rows.items():
+        if not isinstance(row, dict) or not {"task", "method", "steps", "error"} <= row.keys():
+            raise InputError(f"{path} is no row of scores; delete it and run again.")
+    return list(rows.values())
 
 
 def rank_method(method: str) -> tuple[int, str]:
@@ -312,17 +302,10 @@ def format_score_markdown(summary: RunSummary, fids: Fids) -> str:
 
 def describe_scope(summary: RunSummary) -> str:
     """Describe which cases the numbers cover."""
-    text = (
+    return (
         f"Means over the {len(summary.common_tasks)} of {len(summary.tasks)} cases that all "
-        "methods finished. A number in brackets is the number of cases with the score, if some "
-        "have none.\n"
-    )
-    if not summary.sequences:
-        return text
-    return text + (
-        f"They have {summary.num_steps} steps in total: means are over the steps of each case, "
-        "then over the cases. A depth scale of 1 is metric; its drift over a sequence is "
-        "max(ln s) - min(ln s).\n"
+        "methods finished; of a sequence, means over its steps come first. A number in brackets "
+        "is the number of cases with the score, if some have none.\n"
     )
 
 
@@ -331,10 +314,8 @@ def format_fid_markdown(summary: RunSummary, fids: Fids) -> str:
     if isinstance(fids, str):
         return f"FID: {fids}\n"
     rows = [[method, f"{value:.2f}"] for method, value in fids.items()]
-    return (
-        f"### FID\n\n{summary.num_steps} images against as many photographs; FID is biased for "
-        "few images.\n\n" + format_markdown(["method", "FID"], rows)
-    )
+    note = "At the targets, against their photographs; FID is biased for few images."
+    return f"### FID\n\n{note}\n\n" + format_markdown(["method", "FID"], rows)
 
 
 def format_step_cells(step: StepRow) -> list[str]:

@@ -63,9 +63,11 @@ class Quality:
 
 
 @dataclass(frozen=True)
-class PerceptualQuality:
-    """Scores of a part of an image that do not reward blur; None without a pixel."""
+class PartQuality:
+    """Scores of a part of an image, most of which do not reward blur; None without a pixel."""
 
+    psnr: float | None
+    """PSNR in dB."""
     flip: float | None
     """Mean of the FLIP map; None also if flip-evaluator is missing."""
     haarpsi: float | None
@@ -81,20 +83,16 @@ class Scores:
     """Share of the target's pixels that the context does not cover."""
     target_before: Quality
     target_after: Quality
-    hole_psnr: float | None
-    """PSNR in dB at the target in the hole, after completion."""
-    observed_psnr: Change | None
-    """PSNR in dB at the target over all other pixels."""
-    neighbours_psnr: Change | None
-    """Mean PSNR in dB over the neighbour views."""
+    hole: PartQuality
+    """At the target in the hole, after completion."""
+    observed: PartQuality
+    """At the target over all other pixels."""
+    neighbours_psnr: tuple[Change, ...]
+    """PSNR in dB of each neighbour view."""
     context_psnr: tuple[Change, ...]
     """PSNR in dB of each context view."""
     context_ssim: tuple[Change, ...]
     """SSIM of each context view."""
-    hole_looks: PerceptualQuality
-    """At the target in the hole, after completion."""
-    observed_looks: PerceptualQuality
-    """At the target over all other pixels."""
     depth_observed: Agreement | None
     """Depth at the target against the true depth, where the context covers it."""
     depth_hole: Agreement | None
@@ -132,15 +130,12 @@ def score(
     """
     target, camera = truth.target, truth.target.camera
     was, now = renderer.render(before, camera), renderer.render(after, camera)
-    holes, counted = compute_hole_mask(was.alpha), target.valid_mask
-    covered = now.depth_map().valid & counted
+    holes = compute_hole_mask(was.alpha)
+    covered = now.depth_map().valid & target.valid_mask
     context, beside = (
         [[renderer.render(scene, view.camera).image for scene in (before, after)] for view in views]
         for views in (truth.views, truth.neighbours)
     )
-    observed = [
-        compute_masked_psnr(render.image, target.image, ~holes & counted) for render in (was, now)
-    ]
     depths: list[Agreement | None] = [None, None]
     if target.depth is not None:
         depths = [
@@ -150,13 +145,11 @@ def score(
         hole_fraction=holes.float().mean().item(),
         target_before=measure_quality(was.image, target),
         target_after=measure_quality(now.image, target),
-        hole_psnr=compute_masked_psnr(now.image, target.image, holes & counted),
-        observed_psnr=None if None in observed else Change(*observed),  # type: ignore[arg-type]
-        neighbours_psnr=average_changes(compare(beside, truth.neighbours, compute_view_psnr)),
+        hole=measure_part(now.image, target, holes),
+        observed=measure_part(now.image, target, ~holes),
+        neighbours_psnr=compare(beside, truth.neighbours, compute_view_psnr),
         context_psnr=compare(context, truth.views, compute_view_psnr),
         context_ssim=compare(context, truth.views, compute_view_ssim),
-        hole_looks=measure_perceptual_quality(now.image, target, holes),
-        observed_looks=measure_perceptual_quality(now.image, target, ~holes),
         depth_observed=depths[0],
         depth_hole=depths[1],
         seam_step=measure_seam_step(added, was, camera, renderer) if added else None,
@@ -195,17 +188,16 @@ def compute_view_ssim(image: Image, photograph: View) -> float:
     return ssim(photograph.fill_ignored(image), photograph.image)
 
 
-def measure_perceptual_quality(
-    image: Image, photograph: View, where: Bool[Tensor, "h w"]
-) -> PerceptualQuality:
-    """Compute FLIP, HaarPSI and the gradient energy ratio over the valid pixels of `where`."""
-    image, truth = photograph.fill_ignored(image), photograph.image
+def measure_part(image: Image, photograph: View, where: Bool[Tensor, "h w"]) -> PartQuality:
+    """Score an image over the valid pixels of `where`."""
+    compared, truth = photograph.fill_ignored(image), photograph.image
     where = where & photograph.valid_mask
-    errors = compute_flip_map(image, truth)
-    return PerceptualQuality(
+    errors = compute_flip_map(compared, truth)
+    return PartQuality(
+        compute_masked_psnr(image, truth, where),
         None if errors is None or not where.any() else errors[where.cpu()].mean().item(),
-        haarpsi(image, truth, where),
-        compute_gradient_energy_ratio(image, truth, where),
+        haarpsi(compared, truth, where),
+        compute_gradient_energy_ratio(compared, truth, where),
     )
 
 
@@ -247,11 +239,3 @@ def compare(
     """Compute a metric for each view, whose renders before and after are `pairs`."""
     both = zip(pairs, views, strict=True)
     return tuple(Change(metric(was, view), metric(now, view)) for (was, now), view in both)
-
-
-def average_changes(changes: Sequence[Change]) -> Change | None:
-    """Average the scores before and after; None for an empty sequence."""
-    if not changes:
-        return None
-    n = len(changes)
-    return Change(sum(c.before for c in changes) / n, sum(c.after for c in changes) / n)
