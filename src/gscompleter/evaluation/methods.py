@@ -185,9 +185,8 @@ def check_methods(names: Sequence[str], steps: int = 1) -> None:
     for name in names:
         if name not in METHODS:
             raise InputError(
-                f"There is no method '{quote_value(name)}'; choose one of {known} (paper/no-sa "
-                "for an "
-                "ablation of the paper's settings)."
+                f"There is no method '{quote_value(name)}'; choose one of {known} (paper/no-sa for "
+                "an ablation of the paper's settings)."
             )
         if steps > 1 and name in SCENE_CHANGING:
             raise InputError(

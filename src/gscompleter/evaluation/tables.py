@@ -1,4 +1,4 @@
-"""Tables of a run: scores in one set of files, timings in another.
+"""Tables of a run: scores in three formats, and timings in a file of their own.
 
 Score files contain no timings, so an interrupted and resumed run gives the same bytes.
 """
@@ -188,7 +188,7 @@ def summarize_run(rows: Sequence[RunRow]) -> RunSummary:
 
 
 def write_tables(out: Path, with_fid: bool = False) -> RunSummary:
-    """Write tables.md, .tex and .json, and timings.md and .json of a run.
+    """Write tables.md, tables.tex, tables.json and timings.md of a run.
 
     Args:
         out: Folder of the run.
@@ -204,7 +204,6 @@ def write_tables(out: Path, with_fid: bool = False) -> RunSummary:
         "tables.tex": format_score_latex(summary),
         "tables.json": json.dumps(collect_score_content(summary, fids), indent=1) + "\n",
         "timings.md": format_timing_markdown(summary),
-        "timings.json": json.dumps(collect_timing_content(summary), indent=1) + "\n",
     }
     for name, text in texts.items():
         with replace_file(out / name) as file:
@@ -369,14 +368,3 @@ def format_timing_markdown(summary: RunSummary) -> str:
         "finished, and peak memory (GiB). The total excludes the reconstruction of the context, "
         "which all methods share.\n\n" + format_markdown(["method", *stages, "memory"], rows)
     )
-
-
-def collect_timing_content(summary: RunSummary) -> dict[str, Any]:
-    """Return all timings with full precision, for JSON."""
-    return {
-        method: {
-            "seconds": summary.compute_seconds(method),
-            "peak_bytes": summary.find_peak_bytes(method),
-        }
-        for method in summary.methods
-    }
