@@ -258,7 +258,7 @@ def test_pictures_are_saved_and_plots_are_drawn(finished):
     assert psnr(after, truth) > psnr(before, truth)
     assert read_image(box / "context" / "step-001.png").equal(before)
     paths = draw_plots(write_tables(finished), finished)
-    assert [path.name for path in paths] == ["gain_by_hole.png", "seconds.png"]
+    assert [path.name for path in paths] == ["gain_by_hole.png"]
     for path in paths:
         ink = read_image(path) < 0.9
         assert ink.any(dim=-1).float().mean() > 0.005

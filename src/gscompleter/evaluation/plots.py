@@ -1,15 +1,15 @@
-"""Plots of a run: ΔPSNR by hole size, and time by stage."""
+"""Plot of a run: ΔPSNR by hole size."""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from gscompleter.config import ABLATIONS
 from gscompleter.errors import InputError
 from gscompleter.evaluation.columns import GAIN
-from gscompleter.evaluation.tables import RunSummary, rank_stage
+from gscompleter.evaluation.tables import RunSummary
 from gscompleter.io.files import replace_file
 
 if TYPE_CHECKING:
@@ -24,24 +24,13 @@ class PlotsNotAvailable(InputError):  # noqa: N818  (a state of affairs, told in
 
 
 def draw_plots(summary: RunSummary, out: Path) -> list[Path]:
-    """Draw `gain_by_hole.png` and `seconds.png` into `out`, if any case has all methods."""
+    """Draw `gain_by_hole.png` into `out`, if any case has all methods."""
     if not summary.common_tasks:
         return []
-    height = 1.5 + 0.28 * len(summary.methods)
-    return [
-        save_plot(out / "gain_by_hole.png", draw_gain_by_hole, summary),
-        save_plot(out / "seconds.png", draw_seconds, summary, height),
-    ]
-
-
-def save_plot(
-    path: Path, draw: Callable[[Axes, RunSummary], None], summary: RunSummary, height: float = 4.5
-) -> Path:
-    """Write a plot 8 inches wide as a PNG."""
-    figure = create_plot_figure(height)
-    draw(figure.add_subplot(), summary)
+    figure = create_plot_figure(4.5)
+    draw_gain_by_hole(figure.add_subplot(), summary)
     figure.legend(loc="outside right upper", fontsize="small")
-    return write_figure(figure, path)
+    return [write_figure(figure, out / "gain_by_hole.png")]
 
 
 def write_figure(figure: Figure, path: Path) -> Path:
@@ -52,7 +41,7 @@ def write_figure(figure: Figure, path: Path) -> Path:
 
 
 def create_plot_figure(height: float) -> Figure:
-    """Create an empty figure; raise `PlotsNotAvailable` without matplotlib."""
+    """Create an empty figure, 8 inches wide; raise `PlotsNotAvailable` without matplotlib."""
     try:
         from matplotlib.figure import Figure
     except ImportError as error:
@@ -81,20 +70,6 @@ def draw_gain_by_hole(axes: Axes, summary: RunSummary) -> None:
     axes.set_xlabel("hole at the target (% of its pixels)")
     axes.set_ylabel("ΔPSNR at the target (dB)")
     axes.grid(alpha=0.3)
-
-
-def draw_seconds(axes: Axes, summary: RunSummary) -> None:
-    """Draw one bar per method with the median seconds of each stage."""
-    seconds = [summary.compute_seconds(method) for method in summary.methods]
-    stages = {stage for found in seconds for stage in found} - {"total"}
-    left = [0.0] * len(seconds)
-    for stage in sorted(stages, key=rank_stage):
-        widths = [found.get(stage, 0.0) for found in seconds]
-        axes.barh(range(len(seconds)), widths, left=left, label=stage, height=0.7)
-        left = [start + width for start, width in zip(left, widths, strict=True)]
-    axes.set_yticks(range(len(seconds)), summary.methods)
-    axes.invert_yaxis()
-    axes.set_xlabel("median seconds per step")
 
 
 def get_curve_style(number: int) -> dict[str, Any]:

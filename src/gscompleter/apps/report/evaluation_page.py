@@ -15,7 +15,6 @@ from gscompleter.io.reading import read_bytes
 TABLES_FILE, TIMINGS_FILE = "tables.md", "timings.md"
 PLOT_CAPTIONS = {
     "gain_by_hole": "ΔPSNR at the target by hole size",
-    "seconds": "Median seconds of a step by stage",
 }
 
 
