@@ -101,7 +101,7 @@ $(VENV)/installed: pyproject.toml | $(VENV)/torch
 	touch $@
 
 $(VENV)/installed-evaluation: pyproject.toml | $(VENV)/torch
-	$(PIP) -e '.[evaluation]'
+	$(PIP) $(TORCH_INDEX) $(TORCH) -e '.[evaluation]'
 	touch $@ $(VENV)/installed
 
 $(VENV)/installed-test: pyproject.toml | $(VENV)/torch

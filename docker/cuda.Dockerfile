@@ -15,7 +15,7 @@ ENV NUMBA_CACHE_DIR=/var/cache/gscompleter/kernels \
 COPY dist/*.whl /tmp/
 # The build of torch has to be of the CUDA version of the image.
 RUN python3 -m venv /opt/gscompleter \
-    && pip install torch --index-url https://download.pytorch.org/whl/cu128 \
+    && pip install torch torchvision --index-url https://download.pytorch.org/whl/cu128 \
     && pip install "gscompleter[cuda,evaluation,film,models,poses] @ file://$(ls /tmp/*.whl)" \
     && rm /tmp/*.whl
 RUN gscompleter warmup \

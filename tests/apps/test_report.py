@@ -484,7 +484,7 @@ TIMINGS = """Median seconds of a step.
 def evaluated(tmp_path) -> Path:
     (tmp_path / "tables.md").write_text(TABLES)
     (tmp_path / "timings.md").write_text(TIMINGS)
-    Image.new("RGB", (40, 30), "white").save(tmp_path / "seconds.png")
+    Image.new("RGB", (40, 30), "white").save(tmp_path / "gain_by_hole.png")
     return tmp_path
 
 

@@ -108,7 +108,7 @@ def test_a_file_that_another_process_made_first_stays(tmp_path):
 
 def test_a_folder_of_another_version_is_refused(tmp_path):
     (tmp_path / "run.json").write_text(json.dumps({"version": 2, "seed": 0}))
-    sentence = "holds a run of version 2, and version 3 is needed; name another folder"
+    sentence = "holds a run of version 2, and version 4 is needed; name another folder"
     for use in (lambda: claim(tmp_path, {"seed": 0}), lambda: write_tables(tmp_path)):
         with pytest.raises(InputError, match=sentence):
             use()

@@ -56,14 +56,10 @@ class Prediction:
     """Wall time by stage, without the reconstruction of the context, and `total`."""
     anchor: int | None = None
     """Index of the anchor view, or None for a method that lifts nothing."""
-    anchor_fallback: bool = False
-    """True if all views were rotated too far and the least rotated one was chosen."""
-    notes: tuple[str, ...] = ()
-    """Fallbacks that were used, one sentence each."""
-    peak_bytes: int | None = None
-    """Peak memory in bytes, or None if the system does not report it."""
     registered: Gaussians | None = None
     """All lifted Gaussians after registration and before filtering; None if nothing is lifted."""
+    peak_bytes: int | None = None
+    """Peak memory in bytes, or None if the system does not report it."""
 
 
 Method = Callable[[Completion, Camera, Models], Prediction]
@@ -83,8 +79,7 @@ def make_completion_method(config: str) -> Method:
         views = [replace(view, dynamic_mask=None) for view in state.views]  # another config's
         done = completer.advance(completer.begin(views, state.scene), target)
         (made,) = done.targets
-        notes = (made.anchor, made.anchor_fallback, made.notes)
-        return Prediction(done.scene, made.added, done.seconds, *notes, registered=made.registered)
+        return Prediction(done.scene, made.added, done.seconds, made.anchor, made.registered)
 
     return method
 
@@ -124,7 +119,7 @@ def complete_by_similarity(state: Completion, target: Camera, models: Models) ->
                 pair.gaussians, state.scene, reference, models.renderer, models.seed, config
             )
     scene = merge([state.scene, added])
-    return Prediction(scene, added, seconds, anchor.index, anchor.fallback, registered=added)
+    return Prediction(scene, added, seconds, anchor.index, registered=added)
 
 
 def mark_target(prediction: Prediction, number: int, before: Gaussians) -> Prediction:
@@ -190,9 +185,8 @@ def check_methods(names: Sequence[str], steps: int = 1) -> None:
     for name in names:
         if name not in METHODS:
             raise InputError(
-                f"There is no method '{quote_value(name)}'; choose one of {known} (paper/no-sa "
-                "for an "
-                "ablation of the paper's settings)."
+                f"There is no method '{quote_value(name)}'; choose one of {known} (paper/no-sa for "
+                "an ablation of the paper's settings)."
             )
         if steps > 1 and name in SCENE_CHANGING:
             raise InputError(

@@ -1,15 +1,15 @@
-"""Plots of a run: ΔPSNR by hole size and distance, time by stage, steps of sequences."""
+"""Plot of a run: ΔPSNR by hole size."""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from gscompleter.config import ABLATIONS
 from gscompleter.errors import InputError
-from gscompleter.evaluation.store import make_file_name
-from gscompleter.evaluation.summary import GAIN, PSNR, RunSummary, StepRow, rank_stage
+from gscompleter.evaluation.columns import GAIN
+from gscompleter.evaluation.tables import RunSummary
 from gscompleter.io.files import replace_file
 
 if TYPE_CHECKING:
@@ -18,64 +18,19 @@ if TYPE_CHECKING:
 
 MARKERS = "osD^vP*X<>"
 
-STEP_CURVES: tuple[tuple[str, Callable[[StepRow], float | None]], ...] = (
-    ("PSNR after the step (dB)", PSNR.get_value),
-    ("depth scale", lambda step: step["depth_scale"]),
-    ("seconds", lambda step: step["seconds"]["total"]),
-)
-"""Curves of a sequence: title and value of a step."""
-
 
 class PlotsNotAvailable(InputError):  # noqa: N818  (a state of affairs, told in a sentence)
     """Error for a missing matplotlib."""
 
 
 def draw_plots(summary: RunSummary, out: Path) -> list[Path]:
-    """Draw the plots of a run that have data into `out`.
-
-    Writes `gain_by_hole.png`, `gain_by_distance.png`, `seconds.png`, and `sequence_TASK.png` for
-    each sequence. The first two omit ablations if other methods are compared.
-    """
-    paths = [
-        save_curves(out / f"sequence_{make_file_name(name)}.png", steps)
-        for name, steps in summary.sequences.items()
-    ]
+    """Draw `gain_by_hole.png` into `out`, if any case has all methods."""
     if not summary.common_tasks:
-        return paths
-    paths.append(save_plot(out / "gain_by_hole.png", draw_gain_by_hole, summary))
-    if len(summary.gains) > 1:
-        paths.append(save_plot(out / "gain_by_distance.png", draw_gain_by_distance, summary))
-    height = 1.5 + 0.28 * len(summary.methods)
-    return [*paths, save_plot(out / "seconds.png", draw_seconds, summary, height)]
-
-
-def save_curves(path: Path, steps: Mapping[str, Sequence[StepRow]]) -> Path:
-    """Plot the steps of each method in one sequence."""
-    figure = create_plot_figure(7.0)
-    panels = figure.subplots(len(STEP_CURVES), sharex=True)
-    for axes, (title, of) in zip(panels, STEP_CURVES, strict=True):
-        for number, (method, found) in enumerate(steps.items()):
-            known = [(s["frame"], v) for s in found if (v := of(s)) is not None]
-            if known:
-                x, y = zip(*known, strict=True)
-                axes.plot(x, y, label=method, linewidth=1, **get_curve_style(number))
-        axes.set_ylabel(title)
-        axes.grid(alpha=0.3)
-    if any(step["seconds"]["total"] > 0 for found in steps.values() for step in found):
-        panels[-1].set_yscale("log")
-    panels[-1].set_xlabel("frame")
-    figure.legend(*panels[0].get_legend_handles_labels(), loc="outside right upper")
-    return write_figure(figure, path)
-
-
-def save_plot(
-    path: Path, draw: Callable[[Axes, RunSummary], None], summary: RunSummary, height: float = 4.5
-) -> Path:
-    """Write a plot 8 inches wide as a PNG."""
-    figure = create_plot_figure(height)
-    draw(figure.add_subplot(), summary)
+        return []
+    figure = create_plot_figure(4.5)
+    draw_gain_by_hole(figure.add_subplot(), summary)
     figure.legend(loc="outside right upper", fontsize="small")
-    return write_figure(figure, path)
+    return [write_figure(figure, out / "gain_by_hole.png")]
 
 
 def write_figure(figure: Figure, path: Path) -> Path:
@@ -86,7 +41,7 @@ def write_figure(figure: Figure, path: Path) -> Path:
 
 
 def create_plot_figure(height: float) -> Figure:
-    """Create an empty figure; raise `PlotsNotAvailable` without matplotlib."""
+    """Create an empty figure, 8 inches wide; raise `PlotsNotAvailable` without matplotlib."""
     try:
         from matplotlib.figure import Figure
     except ImportError as error:
@@ -97,7 +52,7 @@ def create_plot_figure(height: float) -> Figure:
 
 
 def select_plot_methods(methods: Sequence[str]) -> list[str]:
-    """Select the methods for the plots: not the context, and no ablations beside other methods."""
+    """Select the methods for the plot: not the context, and no ablations beside other methods."""
     ablations = {*ABLATIONS, "unconstrained", *(f"paper/{name}" for name in ABLATIONS)}
     completing = [name for name in methods if name != "context"]
     others = [name for name in completing if name not in ablations]
@@ -111,42 +66,13 @@ def draw_gain_by_hole(axes: Axes, summary: RunSummary) -> None:
         holes = [100 * step["scores"]["hole_fraction"] for step in steps]
         gains: Any = list(map(GAIN.get_value, steps))
         axes.plot(holes, gains, linestyle="none", label=method, **get_curve_style(number))
-    _finish_gain(axes, "hole at the target (% of its pixels)")
-
-
-def draw_gain_by_distance(axes: Axes, summary: RunSummary) -> None:
-    """Plot the mean ΔPSNR against the frames to the nearest context frame."""
-    for number, method in enumerate(select_plot_methods(summary.methods)):
-        found = {gap: cells[method].value for gap, cells in summary.gains.items()}
-        gains = {gap: value for gap, value in found.items() if value is not None}
-        style = get_curve_style(number)
-        axes.plot(list(gains), list(gains.values()), linewidth=1, label=method, **style)
-    axes.set_xticks(list(summary.gains))
-    _finish_gain(axes, "frames from the target to the nearest context frame")
-
-
-def draw_seconds(axes: Axes, summary: RunSummary) -> None:
-    """Draw one bar per method with the median seconds of each stage."""
-    seconds = [summary.compute_seconds(method) for method in summary.methods]
-    stages = {stage for found in seconds for stage in found} - {"total"}
-    left = [0.0] * len(seconds)
-    for stage in sorted(stages, key=rank_stage):
-        widths = [found.get(stage, 0.0) for found in seconds]
-        axes.barh(range(len(seconds)), widths, left=left, label=stage, height=0.7)
-        left = [start + width for start, width in zip(left, widths, strict=True)]
-    axes.set_yticks(range(len(seconds)), summary.methods)
-    axes.invert_yaxis()
-    axes.set_xlabel("median seconds per step")
+    axes.axhline(0, color="black", linewidth=0.8)
+    axes.set_xlabel("hole at the target (% of its pixels)")
+    axes.set_ylabel("ΔPSNR at the target (dB)")
+    axes.grid(alpha=0.3)
 
 
 def get_curve_style(number: int) -> dict[str, Any]:
     """Return the style of a curve by its number."""
     marker = MARKERS[number % len(MARKERS)]
     return {"color": f"C{number % 10}", "marker": marker, "markersize": 5, "alpha": 0.8}
-
-
-def _finish_gain(axes: Axes, label: str) -> None:
-    axes.axhline(0, color="black", linewidth=0.8)
-    axes.set_xlabel(label)
-    axes.set_ylabel("ΔPSNR at the target (dB)")
-    axes.grid(alpha=0.3)

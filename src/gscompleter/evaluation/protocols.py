@@ -13,7 +13,10 @@ from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import partial
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Literal
+
+from annotated_types import Ge, MinLen
+from pydantic import Field, TypeAdapter, ValidationError
 
 from gscompleter.completer import MAX_TARGET_ID
 from gscompleter.data.cases import Case
@@ -27,13 +30,15 @@ from gscompleter.types import View
 VERSION = 1
 """Version of the files that `write_evaluation_index` writes."""
 
+Frames = Annotated[tuple[Annotated[int, Ge(0)], ...], MinLen(1)]
+
 
 @dataclass(frozen=True)
 class Split:
     """Context and target frames of one clip."""
 
-    context: tuple[int, ...]
-    targets: tuple[int, ...]
+    context: Frames
+    targets: Annotated[Frames, Field(alias="target")]
     is_sequence: bool = False
     """True if all targets are completed into one scene, one after the other."""
 
@@ -46,8 +51,6 @@ class FrameRule:
     """Name of the protocol for `parse_protocol` and the tables."""
     split: Callable[[int], tuple[Split, ...]] = field(compare=False)
     """Function that returns the splits of a clip with so many frames."""
-    sequence_frames: int | None = None
-    """Smallest number of frames of a sequence; None if targets are completed separately."""
 
     def select_splits(self, clip: Photographs) -> tuple[Split, ...]:
         """Return the splits of a clip; none if it is too short."""
@@ -61,8 +64,7 @@ class EvaluationIndex:
     name: str
     """Name of the protocol; the stem of a published file."""
     scenes: Mapping[str, tuple[Split, ...]]
-    skipped: tuple[str, ...] = ()
-    """Scenes without a split: null in a published file, clips that are too short in ours."""
+    """Splits by scene; empty if it is null in a published file, or too short in ours."""
 
     def select_splits(self, clip: Photographs) -> tuple[Split, ...]:
         """Return the splits of a clip; none if the index skips or lacks its scene."""
@@ -71,6 +73,15 @@ class EvaluationIndex:
 
 EvaluationProtocol = FrameRule | EvaluationIndex
 """A deterministic rule that chooses frames."""
+
+
+@dataclass(frozen=True)
+class IndexFile:
+    """Content of an evaluation index; a published one has the scenes alone."""
+
+    version: Literal[1]
+    protocol: str
+    scenes: dict[str, Split | Annotated[tuple[Split, ...], MinLen(1)] | None]
 
 
 def parse_protocol(text: str) -> EvaluationProtocol:
@@ -87,10 +98,10 @@ def parse_protocol(text: str) -> EvaluationProtocol:
         k, steps = int(match[1]), int(match[2] or MAX_TARGET_ID)
         if k < 1 or not 1 <= steps <= MAX_TARGET_ID:
             raise InputError(
-                f"The protocol {text} is impossible; give every frame or fewer, and 1 to "
-                f"{MAX_TARGET_ID} steps, the number of targets that a .ply can tell apart."
+                f"The protocol {text} is impossible; its numbers have to be at least 1, and steps "
+                f"at most {MAX_TARGET_ID}, the number of targets that a .ply can tell apart."
             )
-        return FrameRule(text, partial(split_sequence, k, steps), 2 * k + 1)
+        return FrameRule(text, partial(split_sequence, k, steps))
     if text == "stress":
         return FrameRule(text, split_stress_test)
     if os.path.isfile(text):
@@ -99,14 +110,6 @@ def parse_protocol(text: str) -> EvaluationProtocol:
         f"There is no protocol '{quote_value(text)}'; give n-K for a number of frames K (as n-10), "
         "stress, sequence-K (as sequence-4), or the path of an evaluation index."
     )
-
-
-def explain_skip(protocol: EvaluationProtocol, clip: Photographs) -> str | None:
-    """Explain why a clip has no sequence, or return None."""
-    needed = protocol.sequence_frames if isinstance(protocol, FrameRule) else None
-    if needed is None or len(clip) >= needed:
-        return None
-    return f"it has {len(clip)} frames, and {protocol.name} needs {needed}"
 
 
 def extrapolate(k: int, stride: int, num_frames: int) -> tuple[Split, ...]:
@@ -131,82 +134,50 @@ def split_sequence(k: int, steps: int, num_frames: int) -> tuple[Split, ...]:
 
 def build_index(protocol: EvaluationProtocol, clips: Iterable[Photographs]) -> EvaluationIndex:
     """Write down the splits of each clip; raise InputError for equal names or a sequence."""
-    if isinstance(protocol, FrameRule) and protocol.sequence_frames is not None:
-        raise InputError(
-            f"{protocol.name} has no index, because its targets depend on each other; give the "
-            "protocol to `evaluate` instead."
-        )
     scenes: dict[str, tuple[Split, ...]] = {}
     for clip in clips:
         if clip.name in scenes:
             raise InputError(f"Two clips are called {clip.name}; rename one of them.")
         scenes[clip.name] = protocol.select_splits(clip)
-    chosen = {name: splits for name, splits in scenes.items() if splits}
-    return EvaluationIndex(protocol.name, chosen, tuple(n for n in scenes if not scenes[n]))
+    if any(split.is_sequence for splits in scenes.values() for split in splits):
+        raise InputError(
+            f"{protocol.name} has no index, because its targets depend on each other; give the "
+            "protocol to `evaluate` instead."
+        )
+    return EvaluationIndex(protocol.name, scenes)
 
 
 def read_evaluation_index(path: Path | str) -> EvaluationIndex:
     """Read an evaluation index, published or of `write_evaluation_index`."""
     path = Path(path)
     content = read_json(path, "download it again")
-    if not isinstance(content, dict):
+    if not isinstance(content, dict) or "version" not in content:
+        content = {"version": VERSION, "protocol": path.stem, "scenes": content}
+    try:
+        file = TypeAdapter(IndexFile).validate_json(json.dumps(content), strict=True)
+    except ValidationError as error:
+        wrong = error.errors(include_url=False)[0]
+        place = quote_value(".".join(map(str, wrong["loc"])))
         raise InputError(
-            f"{path} is no evaluation index: it has to map the name of each scene to its context "
-            "and target frames, or to null."
-        )
-    if "version" not in content:
-        return _parse_index(path.stem, content, path)
-    if content["version"] != VERSION:
-        raise InputError(
-            f"{path} is of version {quote_value(content['version'])} and version {VERSION} can be "
-            "read; update gscompleter, or write the index again."
-        )
-    name, scenes = content.get("protocol"), content.get("scenes")
-    if not isinstance(name, str) or not isinstance(scenes, dict):
-        raise InputError(f"{path} is damaged: `protocol` and `scenes` are needed; write it again.")
-    return _parse_index(name, scenes, path)
+            f"{path} is no evaluation index of version {VERSION} ({place}: {wrong['msg']}); it has "
+            "to map the name of each scene to its context and target frames, or to null."
+        ) from None
+    scenes = {
+        name: (found,) if isinstance(found, Split) else found or ()
+        for name, found in file.scenes.items()
+    }
+    return EvaluationIndex(file.protocol, scenes)
 
 
 def write_evaluation_index(path: Path | str, index: EvaluationIndex) -> None:
     """Write an index atomically, in the format that `read_evaluation_index` reads."""
-    scenes: dict[str, list[dict[str, list[int]]] | None] = {
-        name: [{"context": list(s.context), "target": list(s.targets)} for s in splits]
+    scenes = {
+        name: [{"context": s.context, "target": s.targets} for s in splits] or None
         for name, splits in index.scenes.items()
     }
-    scenes |= dict.fromkeys(index.skipped)
-    rows = ",\n".join(f"  {json.dumps(name)}: {json.dumps(s)}" for name, s in scenes.items())
-    head = f' "version": {VERSION},\n "protocol": {json.dumps(index.name)},\n "scenes": '
+    content = {"version": VERSION, "protocol": index.name, "scenes": scenes}
     with replace_file(path) as file:
-        file.write(f"{{\n{head}{{\n{rows}\n }}\n}}\n".encode())
-
-
-def _parse_index(name: str, content: Mapping[str, Any], path: Path) -> EvaluationIndex:
-    scenes = {
-        scene: _parse_splits(entry, scene, path)
-        for scene, entry in content.items()
-        if entry is not None
-    }
-    return EvaluationIndex(name, scenes, tuple(s for s, entry in content.items() if entry is None))
-
-
-def _parse_splits(entry: Any, scene: str, path: Path) -> tuple[Split, ...]:
-    """Parse the entry of a scene: one split in a published file, a list of splits in ours."""
-    rows = entry if isinstance(entry, list) else [entry]
-    if not rows or not all(isinstance(row, dict) for row in rows):
-        raise InputError(
-            f"The entry of the scene {scene} in {path} is {quote_value(entry)}; context and "
-            "target, or null, are needed."
-        )
-    for row in rows:
-        for key in ("context", "target"):
-            frames = row.get(key)
-            whole = isinstance(frames, list) and all(type(f) is int and f >= 0 for f in frames)
-            if not whole or not frames:
-                raise InputError(
-                    f"The `{key}` of the scene {scene} in {path} is {quote_value(frames)}; a list "
-                    "of frame numbers, at least one, is needed."
-                )
-    return tuple(Split(tuple(row["context"]), tuple(row["target"])) for row in rows)
+        file.write((json.dumps(content, indent=1) + "\n").encode())
 
 
 @dataclass(frozen=True)

@@ -6,6 +6,7 @@ from collections.abc import Mapping, Sequence
 from contextlib import nullcontext
 from dataclasses import asdict, dataclass, field, replace
 from functools import partial
+from itertools import pairwise
 from pathlib import Path
 from typing import Any, Literal
 
@@ -14,7 +15,7 @@ from gscompleter.errors import InputError
 from gscompleter.evaluation import store
 from gscompleter.evaluation.methods import Models, check_methods
 from gscompleter.evaluation.protocols import Task
-from gscompleter.evaluation.steps import PreparedTask, attempt, complete_task, load_or_compute
+from gscompleter.evaluation.steps import PreparedTask, attempt, complete_task
 from gscompleter.generators import load_generator
 from gscompleter.jobs.jobs import Job, describe_loss
 from gscompleter.jobs.workers import Engine, check_shard, run_jobs
@@ -176,21 +177,12 @@ class TaskRunner:
 def prepare_task(task: Task, folder: Path, config: RunConfig) -> PreparedTask:
     """Load the photographs of a task, and load or reconstruct its initial scene."""
     views = sort_by_frame(load_task_views(task, task.context, config))
+    targets = load_task_views(task, task.targets, config)
     neighbours = load_task_views(task, task.neighbours, config)
-    targets: list[View] = []
-    error = None
-    for frame in task.targets:
-        loaded = attempt(partial(load_task_views, task, (frame,), config))
-        if isinstance(loaded, str):
-            error = f"Frame {frame}: {loaded}"
-            break
-        targets += loaded
-    if not targets:
-        raise InputError(str(error))
     images = [*views, *targets]
     check_memory(max(v.camera.width * v.camera.height for v in images), len(images))
     models = config.load_models(targets)
-    context = load_or_reconstruct(folder / "context.npz", views, models)
+    context = load_or_reconstruct(folder / "context.pt", views, models)
 
     def set_range(view: View) -> View:
         return replace(view, camera=replace(view.camera, near=context.near, far=context.far))
@@ -202,7 +194,6 @@ def prepare_task(task: Task, folder: Path, config: RunConfig) -> PreparedTask:
         tuple(map(set_range, neighbours)),
         models,
         context.seconds,
-        error,
     )
 
 
@@ -216,19 +207,18 @@ def load_task_views(task: Task, frames: tuple[int, ...], config: RunConfig) -> l
 
 def load_or_reconstruct(path: Path, views: Sequence[View], models: Models) -> store.SavedContext:
     """Load the scene saved at `path`, or reconstruct and save it."""
-    device = views[0].image.device if views else "cpu"
-
-    def save() -> None:
+    if not store.is_complete(path):
         with record_seconds() as seconds:
             made = reconstruct_context(models.reconstructor, views)
-        near, far = made.views[0].camera.near, made.views[0].camera.far
-        assert near is not None
-        assert far is not None
-        scene, gains = made.source.gaussians, made.exposure_gains
-        found = store.SavedContext(scene, near, far, seconds["total"], gains)
+        camera, source = made.views[0].camera, made.source
+        assert camera.near is not None
+        assert camera.far is not None
+        near, far = float(camera.near), float(camera.far)
+        found = store.SavedContext(
+            source.gaussians, near, far, seconds["total"], made.exposure_gains
+        )
         store.save_context(path, found)
-
-    return load_or_compute(path, lambda: store.load_context(path, device), save)
+    return store.load_context(path, views[0].image.device)
 
 
 def build_row(
@@ -239,13 +229,8 @@ def build_row(
     if not isinstance(prepared, str):
         progress = complete_task(prepared, method, folder)
         steps = [asdict(step) for step in progress.steps]
-        found = {
-            "error": progress.error,
-            "reconstruct_seconds": prepared.seconds,
-            "steps": steps,
-        }
-    keys = ("name", "context", "targets", "neighbours")
-    named = {key: getattr(task, key) for key in keys}
+        found = {"error": progress.error, "reconstruct_seconds": prepared.seconds, "steps": steps}
+    named = {key: getattr(task, key) for key in ("name", "context", "targets", "neighbours")}
     return {"version": store.VERSION, "task": named, "method": method, **found}
 
 
@@ -256,14 +241,10 @@ def check_tasks(tasks: Sequence[Task]) -> None:
             "There is no case to run: no clip has the frames that the protocol needs; choose a "
             "protocol with a smaller step, or other data."
         )
-    names: dict[str, str] = {}
-    for task in tasks:
-        folder = store.make_file_name(task.name)
-        if folder in names:
-            raise InputError(
-                f"The cases {names[folder]} and {task.name} have the same name; rename a scene."
-            )
-        names[folder] = task.name
+    names = sorted(store.make_file_name(task.name) for task in tasks)
+    for name, following in pairwise(names):
+        if name == following:
+            raise InputError(f"Two cases are called {name}; rename a scene.")
 
 
 def collect_settings(config: RunConfig) -> dict[str, Any]:

@@ -34,14 +34,12 @@ class PreparedTask:
     """Gaussians that Ψ reconstructed from the views."""
     views: tuple[View, ...]
     targets: tuple[View, ...]
-    """Target photographs in order, up to the first that is damaged."""
+    """Target photographs in order."""
     neighbours: tuple[View, ...]
     """Photographs beside the target, for scoring only."""
     models: Models
     seconds: float
     """Wall time of the reconstruction."""
-    error: str | None = None
-    """Reason why there are no more targets, or None if all are readable."""
 
 
 @dataclass(frozen=True)
@@ -51,7 +49,6 @@ class Step:
     frame: int
     anchor: int | None
     """Anchor frame, or None for a method that lifts nothing."""
-    anchor_fallback: bool
     scores: scoring.Scores
     """Scores of the scene before and after the step."""
     psnr_end: float | None
@@ -61,7 +58,6 @@ class Step:
     added: int
     gaussians: int
     """Number of Gaussians in the scene after the step."""
-    notes: tuple[str, ...]
     seconds: dict[str, float]
     """Wall time by stage, and `total`."""
     peak_bytes: int | None
@@ -82,7 +78,7 @@ class Progress:
 
 def complete_task(task: PreparedTask, method: str, folder: Path) -> Progress:
     """Complete targets in order until a step fails; saved steps in `folder` are read back."""
-    progress = Progress(task.context, task.views, error=task.error)
+    progress = Progress(task.context, task.views)
     for target in task.targets:
         following = attempt(partial(advance_task, progress, target, task, method, folder))
         if isinstance(following, str):
@@ -103,35 +99,18 @@ def advance_task(
     number = len(progress.steps) + 1
     state = task.models.make_completer().begin(progress.views, progress.scene)
     path = store.get_step_path(folder, method, number)
-
-    def save() -> None:
+    if not store.is_complete(path):
         with measure_peak_memory(state.scene.means.device) as peak:
             made = METHODS[method](state, target.camera, task.models)
         made = mark_target(made, number, state.scene)
         store.save_prediction(path, replace(made, peak_bytes=peak.bytes))
-
-    prediction = load_or_compute(path, lambda: store.load_prediction(path, state.scene), save)
+    # Always read back, so that a resumed run continues with the same tensors.
+    prediction = store.load_prediction(path, state.scene)
     step, seen = score_step(prediction, state, target, task)
     store.save_image(path.with_suffix(".png"), seen.after.image)
     store.save_image(path.with_name(f"before-{number:03d}.png"), seen.before.image)
     store.save_image(store.get_truth_path(folder, number), target.image)
-    return Progress(
-        prediction.scene, (*progress.views, target), (*progress.steps, step), progress.error
-    )
-
-
-def load_or_compute(path: Path, load: Callable[[], T | None], save: Callable[[], None]) -> T:
-    """Load a result from `path`, after computing and saving it if it is missing.
-
-    It is always read back, so that a resumed run continues with the same tensors.
-    """
-    found = load()
-    if found is None:
-        save()
-        found = load()
-    if found is None:
-        raise OutputError(f"{path} cannot be read back; check the disk.")
-    return found
+    return Progress(prediction.scene, (*progress.views, target), (*progress.steps, step))
 
 
 def score_step(
@@ -154,13 +133,11 @@ def score_step(
     step = Step(
         frame=target.frame,
         anchor=None if anchor is None else anchor.frame,
-        anchor_fallback=prediction.anchor_fallback,
         scores=found,
         psnr_end=None,
         depth_scale=scale,
         added=len(after) - len(before),
         gaussians=len(after),
-        notes=prediction.notes,
         seconds=dict(prediction.seconds),
         peak_bytes=prediction.peak_bytes,
     )

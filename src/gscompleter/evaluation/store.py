@@ -1,10 +1,10 @@
 """The folder of a run: its files and how they are written (atomically) and read.
 
 run.json                            settings that determine the numbers
-tasks/TASK/context.npz              initial scene of all methods
+tasks/TASK/context.pt               initial scene of all methods
 tasks/TASK/truth-001.png            photograph of the first target
 tasks/TASK/METHOD.json              row of a method: its steps and its error
-tasks/TASK/METHOD/step-001.npz      prediction for the first target
+tasks/TASK/METHOD/step-001.pt       prediction for the first target
 tasks/TASK/METHOD/step-001.png      render at the first target after completion
 tasks/TASK/METHOD/before-001.png    render at the first target before completion
 """
@@ -17,9 +17,8 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
-from zipfile import BadZipFile
+from zipfile import is_zipfile
 
-import numpy as np
 import torch
 from jaxtyping import Float
 from torch import Tensor
@@ -35,13 +34,10 @@ from gscompleter.types import Gaussians, merge
 
 RUN, TASKS = "run.json", "tasks"
 """Names of the file with the settings of a run, and of the folder that holds the tasks."""
-VERSION = 3
+VERSION = 4
 """Version of the files of a run."""
-REGISTERED_PREFIX = "registered_"
-"""Prefix of the arrays of registered Gaussians in the file of a prediction."""
-_FIELDS = ("means", "quats", "scales", "opacities", "sh", "generated")
-
-Arrays = dict[str, np.ndarray]
+FIELDS = ("means", "quats", "scales", "opacities", "sh", "generated")
+"""Tensors of Gaussians that are saved."""
 
 
 def make_file_name(name: str) -> str:
@@ -61,7 +57,7 @@ def get_row_path(out: Path, task: str, method: str) -> Path:
 
 def get_step_path(folder: Path, method: str, number: int) -> Path:
     """Return the path of the prediction of step `number`, counted from 1."""
-    return folder / make_file_name(method) / f"step-{number:03d}.npz"
+    return folder / make_file_name(method) / f"step-{number:03d}.pt"
 
 
 def get_truth_path(folder: Path, number: int) -> Path:
@@ -124,92 +120,62 @@ class SavedContext:
 
 def save_context(path: Path, context: SavedContext) -> None:
     """Write the initial scene of a task."""
-    numbers = np.array([context.seconds, context.near, context.far], dtype=np.float64)
-    arrays = {**_to_arrays(context.gaussians), "seconds_near_far": numbers}
-    if context.gains is not None:
-        arrays["gains"] = context.gains.cpu().numpy()
-    write_arrays(path, arrays)
+    save_tensors(path, {**vars(context), "gaussians": collect_tensors(context.gaussians)})
 
 
-def load_context(path: Path, device: torch.device | str) -> SavedContext | None:
-    """Read the initial scene of a task, or return None if there is no complete file."""
-    arrays = load_arrays(path)
-    if arrays is None:
-        return None
-    seconds, near, far = arrays["seconds_near_far"].tolist()
-    gains = torch.from_numpy(arrays["gains"]).to(device) if "gains" in arrays else None
-    return SavedContext(_to_gaussians(arrays, device), near, far, seconds, gains)
+def load_context(path: Path, device: torch.device | str) -> SavedContext:
+    """Read the initial scene of a task."""
+    saved = load_tensors(path, device)
+    return SavedContext(**{**saved, "gaussians": Gaussians(**saved["gaussians"])})
 
 
 def save_prediction(path: Path, prediction: Prediction) -> None:
     """Write the added Gaussians, or the whole scene if it was changed, and the registered ones."""
     changed, registered = prediction.added, prediction.registered
-    numbers = {"anchor": prediction.anchor, "peak_bytes": prediction.peak_bytes}
-    write_arrays(
-        path,
-        {
-            **_to_arrays(prediction.scene if changed is None else changed),
-            "whole": np.array(changed is None),
-            "stages": np.array(list(prediction.seconds), dtype=np.str_),
-            "seconds": np.array(list(prediction.seconds.values()), dtype=np.float64),
-            "anchor_fallback": np.array(prediction.anchor_fallback),
-            "notes": np.array(prediction.notes, dtype=np.str_),
-            **{k: np.array(-1 if n is None else n, dtype=np.int64) for k, n in numbers.items()},
-            **({} if registered is None else _to_arrays(registered, REGISTERED_PREFIX)),
-        },
-    )
+    content = {
+        **vars(prediction),
+        "seconds": dict(prediction.seconds),
+        "scene": collect_tensors(prediction.scene) if changed is None else None,
+        "added": None if changed is None else collect_tensors(changed),
+        "registered": None if registered is None else collect_tensors(registered),
+    }
+    save_tensors(path, content)
 
 
-def load_prediction(path: Path, before: Gaussians) -> Prediction | None:
-    """Read the prediction for the scene `before`, or return None if there is no complete file."""
-    arrays = load_arrays(path)
-    if arrays is None:
-        return None
-    device, registered = before.means.device, None
-    if f"{REGISTERED_PREFIX}means" in arrays:
-        registered = _to_gaussians(arrays, device, REGISTERED_PREFIX)
-    changed = _to_gaussians(arrays, device)
-    whole = bool(arrays["whole"])
-    anchor, peak = int(arrays["anchor"]), int(arrays["peak_bytes"])
-    return Prediction(
-        scene=changed if whole else merge([before, changed]),
-        added=None if whole else changed,
-        seconds=dict(zip(arrays["stages"].tolist(), arrays["seconds"].tolist(), strict=True)),
-        anchor=None if anchor < 0 else anchor,
-        anchor_fallback=bool(arrays["anchor_fallback"]),
-        notes=tuple(arrays["notes"].tolist()),
-        peak_bytes=None if peak < 0 else peak,
-        registered=registered,
-    )
+def load_prediction(path: Path, before: Gaussians) -> Prediction:
+    """Read the prediction for the scene `before`."""
+    saved = load_tensors(path, before.means.device)
+    for name in ("scene", "added", "registered"):
+        saved[name] = None if saved[name] is None else Gaussians(**saved[name])
+    if saved["scene"] is None:
+        saved["scene"] = merge([before, saved["added"]])
+    return Prediction(**saved)
 
 
-def _to_arrays(gaussians: Gaussians, prefix: str = "") -> Arrays:
-    return {f"{prefix}{name}": getattr(gaussians, name).detach().cpu().numpy() for name in _FIELDS}
+def collect_tensors(gaussians: Gaussians) -> dict[str, Tensor]:
+    """Copy the tensors to the CPU, in torch's own layout, on which rounding of sums depends."""
+    tensors = {name: getattr(gaussians, name).detach().cpu() for name in FIELDS}
+    return {
+        name: tensor.clone(memory_format=torch.contiguous_format)
+        for name, tensor in tensors.items()
+    }
 
 
-def _to_gaussians(
-    arrays: Mapping[str, np.ndarray], device: torch.device | str, prefix: str = ""
-) -> Gaussians:
-    """Copy arrays to tensors with torch's own memory layout, on which rounding of sums depends."""
-    found = (arrays[f"{prefix}{name}"] for name in _FIELDS)
-    tensors: list[Any] = [torch.from_numpy(array).clone().to(device) for array in found]
-    return Gaussians(*tensors)
-
-
-def load_arrays(path: Path) -> Arrays | None:
-    """Read the arrays of a file, or return None if there is no complete file."""
-    try:
-        with np.load(path, allow_pickle=False) as saved:
-            return dict(saved)
-    except (OSError, ValueError, EOFError, BadZipFile):
-        return None  # an incomplete file is computed again
-
-
-def write_arrays(path: Path, arrays: Arrays) -> None:
-    """Write arrays atomically; raise OutputError if that fails."""
+def save_tensors(path: Path, content: Mapping[str, Any]) -> None:
+    """Write tensors and plain values atomically; raise OutputError if that fails."""
     make_folder(path.parent)
     with replace_file(path) as file:
-        np.savez(file, **arrays)  # type: ignore[arg-type]
+        torch.save(dict(content), file)
+
+
+def load_tensors(path: Path, device: torch.device | str) -> dict[str, Any]:
+    """Read what `save_tensors` wrote."""
+    return dict(torch.load(path, map_location=device, weights_only=True))
+
+
+def is_complete(path: Path) -> bool:
+    """Return True if a file of tensors exists and has its end."""
+    return is_zipfile(path)
 
 
 def save_image(path: Path, image: Float[Tensor, "h w 3"]) -> None:

@@ -1,4 +1,4 @@
-"""Tables of a run: scores in one set of files, timings in another.
+"""Tables of a run: scores in three formats, and timings in a file of their own.
 
 Score files contain no timings, so an interrupted and resumed run gives the same bytes.
 """
@@ -6,44 +6,189 @@ Score files contain no timings, so an interrupted and resumed run gives the same
 from __future__ import annotations
 
 import json
-from collections.abc import Callable, Sequence
+import statistics
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from functools import cached_property
 from pathlib import Path
 from typing import Any
 
 from gscompleter.errors import InputError
-from gscompleter.evaluation.metrics.fid import fid
-from gscompleter.evaluation.store import get_step_path, get_task_folder, get_truth_path
-from gscompleter.evaluation.summary import (
-    IMAGES,
-    PERCEPTUAL,
+from gscompleter.evaluation.columns import (
+    GROUPS,
+    MIN_PIXELS,
     PSNR,
     PSNR_BEFORE,
     Column,
-    RunSummary,
+    RunRow,
     StepRow,
-    TableCell,
-    rank_stage,
-    read_rows,
-    summarize_run,
+)
+from gscompleter.evaluation.methods import METHODS
+from gscompleter.evaluation.metrics.learned import compute_fid
+from gscompleter.evaluation.store import (
+    get_step_path,
+    get_task_folder,
+    get_truth_path,
+    list_row_paths,
+    read_json,
+    read_settings,
 )
 from gscompleter.io.files import replace_file
 from gscompleter.io.image import read_image
+from gscompleter.timing import STAGES
 
-LPIPS_MISSING = (
-    "LPIPS: weights not available. `gscompleter.evaluation.metrics.lpips.load_lpips()` downloads "
-    "them; then score the run again to add the column.\n"
-)
-FLIP_MISSING = (
-    "FLIP: not installed. Run `pip install 'gscompleter[evaluation]'`; then score the run again to "
-    "add the columns.\n"
-)
+Fids = dict[str, float] | str
+"""The Fréchet inception distance of each method, or the reason why there is none."""
 
-Fids = dict[str, Any]
-"""`values`: the Fréchet inception distance of each method; `reason`: why there is none."""
+FEW_PIXELS_NOTE = f"A geometry score counts if it is measured over at least {MIN_PIXELS} pixels."
+REGGS_NOTE = (
+    "reggs gets our metric lift and the true poses. RegGS in its paper gets neither, so this "
+    "row is not comparable with that paper."
+)
+ABSENT_NOTES = {
+    "lpips_vgg": (
+        "LPIPS: not available. It needs `pip install 'gscompleter[evaluation]'` and, the first "
+        "time, a connection; then score the run again to add the columns."
+    ),
+    "hole_flip": (
+        "FLIP: not installed. Run `pip install 'gscompleter[evaluation]'`; then score the run "
+        "again to add the columns."
+    ),
+}
+"""Reasons why the group of a column is absent."""
+
+
+@dataclass(frozen=True)
+class TableCell:
+    """A reduced value over the tasks that have one."""
+
+    value: float | None
+    count: int
+
+
+@dataclass(frozen=True)
+class RunSummary:
+    """All data of the tables."""
+
+    methods: tuple[str, ...]
+    tasks: tuple[str, ...]
+    common_tasks: tuple[str, ...]
+    """Tasks that all methods finished."""
+    rows: Mapping[str, tuple[RunRow, ...]]
+    """Rows of the common tasks in their order, by method."""
+    sequences: Mapping[str, Mapping[str, Sequence[StepRow]]]
+    """Finished steps by task of several steps and by method."""
+    finished: Mapping[str, int]
+    """Number of finished tasks by method."""
+    failures: tuple[tuple[str, str, str], ...]
+    """Task, method, reason."""
+
+    @cached_property
+    def groups(self) -> dict[str, list[Column]]:
+        """Columns in which any method has a value, by the title of their table."""
+        groups = {title: list(filter(self.has_value, found)) for title, found in GROUPS.items()}
+        if not self.sequences:
+            del groups["Sequences"]
+        return {title: columns for title, columns in groups.items() if columns}
+
+    @property
+    def columns(self) -> list[Column]:
+        """Columns of all groups."""
+        return [column for group in self.groups.values() for column in group]
+
+    @property
+    def notes(self) -> list[str]:
+        """Notes on the tables."""
+        has_geometry = any(title.startswith("Geometry") for title in self.groups)
+        notes = {FEW_PIXELS_NOTE: has_geometry, REGGS_NOTE: "reggs" in self.methods}
+        return [note for note, is_needed in notes.items() if is_needed]
+
+    def list_values(self, method: str, column: Column) -> list[float | None]:
+        """List the value of each common task, in their order for all methods."""
+        return [column.compute_row(row) for row in self.rows[method]]
+
+    def compute_cell(self, method: str, column: Column) -> TableCell:
+        """Reduce the known values of the tasks as `column` says."""
+        values = [v for v in self.list_values(method, column) if v is not None]
+        return TableCell(column.reduce_tasks(values) if values else None, len(values))
+
+    def has_value(self, column: Column) -> bool:
+        """Return True if any method has a value."""
+        return any(self.compute_cell(method, column).count for method in self.methods)
+
+    def compute_seconds(self, method: str) -> dict[str, float]:
+        """Compute the median wall time over the steps by stage.
+
+        `reconstruct` is Ψ on the photographs, once per task; `total` does not include it.
+        """
+        rows = self.rows[method]
+        if not rows:
+            return {}
+        steps = [step["seconds"] for row in rows for step in row["steps"]]
+        stages = sorted({stage for step in steps for stage in step}, key=rank_stage)
+        medians = {s: statistics.median(step.get(s, 0.0) for step in steps) for s in stages}
+        return {"reconstruct": statistics.median(r["reconstruct_seconds"] for r in rows), **medians}
+
+    def find_peak_bytes(self, method: str) -> int | None:
+        """Return the peak memory of all steps, or None if it is unknown."""
+        peaks = (step["peak_bytes"] for row in self.rows[method] for step in row["steps"])
+        return max((peak for peak in peaks if peak is not None), default=None)
+
+
+def read_rows(out: Path) -> list[RunRow]:
+    """Read the rows of a run."""
+    read_settings(out)
+    rows = {path: read_json(path) for path in list_row_paths(out)}
+    if not rows:
+        raise InputError(
+            f"The run in {out} has no finished case; run `gscompleter evaluate` first."
+        )
+    for path, row in rows.items():
+        if not isinstance(row, dict) or not {"task", "method", "steps", "error"} <= row.keys():
+            raise InputError(f"{path} is no row of scores; delete it and run again.")
+    return list(rows.values())
+
+
+def rank_method(method: str) -> tuple[int, str]:
+    """Return the sort key of a method in tables."""
+    return rank_name(method, list(METHODS))
+
+
+def rank_stage(stage: str) -> tuple[int, str]:
+    """Return the sort key of a stage in running order."""
+    return rank_name(stage, ["reconstruct", *STAGES, "optimize"])
+
+
+def rank_name(name: str, order: Sequence[str]) -> tuple[int, str]:
+    """Return the sort key of a name: its place in `order`, unknown names last."""
+    return (order.index(name) if name in order else len(order), name)
+
+
+def summarize_run(rows: Sequence[RunRow]) -> RunSummary:
+    """Average over the tasks that all methods finished, for a fair comparison."""
+    rows = sorted(rows, key=lambda row: (row["task"]["name"], rank_method(row["method"])))
+    found = {(row["task"]["name"], row["method"]): row for row in rows}
+    methods = tuple(sorted({method for _, method in found}, key=rank_method))
+    tasks = tuple(dict.fromkeys(task for task, _ in found))
+    done = {pair: row for pair, row in found.items() if row["error"] is None}
+    common = tuple(task for task in tasks if all((task, method) in done for method in methods))
+    sequences: dict[str, dict[str, Sequence[StepRow]]] = {}
+    for (task, method), row in found.items():
+        if len(row["task"]["targets"]) > 1:
+            sequences.setdefault(task, {})[method] = row["steps"]
+    return RunSummary(
+        methods,
+        tasks,
+        common,
+        {method: tuple(done[task, method] for task in common) for method in methods},
+        sequences,
+        {method: sum(of == method for _, of in done) for method in methods},
+        tuple((*pair, row["error"]) for pair, row in found.items() if pair not in done),
+    )
 
 
 def write_tables(out: Path, with_fid: bool = False) -> RunSummary:
-    """Write tables.md, .tex and .json, and timings.md and .json of a run.
+    """Write tables.md, tables.tex, tables.json and timings.md of a run.
 
     Args:
         out: Folder of the run.
@@ -53,15 +198,12 @@ def write_tables(out: Path, with_fid: bool = False) -> RunSummary:
         InputError: if `out` has no run, no rows, or a damaged one.
     """
     summary = summarize_run(read_rows(out))
-    fids = {"values": {}, "reason": "not requested"}
-    if with_fid:
-        fids = compute_fids(out, summary)
+    fids: Fids = compute_fids(out, summary) if with_fid else "not requested."
     texts = {
         "tables.md": format_score_markdown(summary, fids),
         "tables.tex": format_score_latex(summary),
         "tables.json": json.dumps(collect_score_content(summary, fids), indent=1) + "\n",
         "timings.md": format_timing_markdown(summary),
-        "timings.json": json.dumps(collect_timing_content(summary), indent=1) + "\n",
     }
     for name, text in texts.items():
         with replace_file(out / name) as file:
@@ -81,10 +223,10 @@ def compute_fids(out: Path, summary: RunSummary) -> Fids:
         truths = [read_image(get_truth_path(folder, number)) for folder, number in steps]
         for method in summary.methods:
             paths = [get_step_path(folder, method, n).with_suffix(".png") for folder, n in steps]
-            values[method] = fid([read_image(path) for path in paths], truths)
+            values[method] = compute_fid([read_image(path) for path in paths], truths)
     except InputError as error:
-        return {"values": {}, "reason": f"not available ({error})"}
-    return {"values": values, "reason": None}
+        return str(error)
+    return values
 
 
 def format_score(value: float | None, digits: int) -> str:
@@ -111,11 +253,9 @@ def format_score_tables(
     summary: RunSummary, write: Callable[[Sequence[str], Sequence[Sequence[str]]], str]
 ) -> dict[str, str]:
     """Format the tables of scores that have a value, by title."""
-    groups = {t: summary.find_present_columns(columns) for t, columns in summary.groups.items()}
     return {
         title: write(["method", *(c.title for c in columns)], format_score_cells(summary, columns))
-        for title, columns in groups.items()
-        if columns
+        for title, columns in summary.groups.items()
     }
 
 
@@ -144,15 +284,11 @@ def format_score_latex(summary: RunSummary) -> str:
 def format_score_markdown(summary: RunSummary, fids: Fids) -> str:
     """Format scores, notes, failures and the steps of sequences."""
     tables = format_score_tables(summary, format_markdown)
+    present = {column.key for column in summary.columns}
     parts = [describe_scope(summary), *(f"### {t}\n\n{table}" for t, table in tables.items())]
     parts += [f"{note}\n" for note in summary.notes]
-    if not any(column.key.startswith("lpips") for column in summary.find_present_columns(IMAGES)):
-        parts.append(LPIPS_MISSING)
-    if not any(column.key.endswith("flip") for column in summary.find_present_columns(PERCEPTUAL)):
-        parts.append(FLIP_MISSING)
+    parts += [f"{note}\n" for key, note in ABSENT_NOTES.items() if key not in present]
     parts.append(format_fid_markdown(summary, fids))
-    if len(summary.gains) > 1:
-        parts.append(format_gain_markdown(summary))
     if summary.failures:
         rows = [[cell.replace("|", "\\|") for cell in failure] for failure in summary.failures]
         parts.append("### Failed\n\n" + format_markdown(["case", "method", "reason"], rows))
@@ -165,44 +301,20 @@ def format_score_markdown(summary: RunSummary, fids: Fids) -> str:
 
 def describe_scope(summary: RunSummary) -> str:
     """Describe which cases the numbers cover."""
-    text = (
+    return (
         f"Means over the {len(summary.common_tasks)} of {len(summary.tasks)} cases that all "
-        "methods finished. A number in brackets is the number of cases with the score, if some "
-        "have none.\n"
-    )
-    if not summary.sequences:
-        return text
-    return text + (
-        f"They have {summary.num_steps} steps in total: means are over the steps of each case, "
-        "then over the cases. A depth scale of 1 is metric; its drift over a sequence is "
-        "max(ln s) - min(ln s).\n"
+        "methods finished; of a sequence, means over its steps come first. A number in brackets "
+        "is the number of cases with the score, if some have none.\n"
     )
 
 
 def format_fid_markdown(summary: RunSummary, fids: Fids) -> str:
     """Format the FID of each method, or the reason why there is none."""
-    if fids["reason"] is not None:
-        return f"FID: {fids['reason']}.\n"
-    rows = [[method, f"{value:.2f}"] for method, value in fids["values"].items()]
-    return (
-        f"### FID\n\n{summary.num_steps} images against as many photographs; FID is biased for "
-        "few images.\n\n" + format_markdown(["method", "FID"], rows)
-    )
-
-
-def format_gain_markdown(summary: RunSummary) -> str:
-    """Format the ΔPSNR by distance from the known views."""
-    counts = {gap: max(c.count for c in cells.values()) for gap, cells in summary.gains.items()}
-    head = ["method", *(f"{gap} ({count})" for gap, count in counts.items())]
-    rows = [
-        [m, *(format_cell(cells[m], 2, counts[gap]) for gap, cells in summary.gains.items())]
-        for m in summary.methods
-    ]
-    return (
-        "### ΔPSNR by distance\n\nMean ΔPSNR in dB by the frames between the target and the "
-        "nearest context frame (k of n-k), with the number of cases.\n\n"
-        + format_markdown(head, rows)
-    )
+    if isinstance(fids, str):
+        return f"FID: {fids}\n"
+    rows = [[method, f"{value:.2f}"] for method, value in fids.items()]
+    note = "At the targets, against their photographs; FID is biased for few images."
+    return f"### FID\n\n{note}\n\n" + format_markdown(["method", "FID"], rows)
 
 
 def format_step_cells(step: StepRow) -> list[str]:
@@ -219,48 +331,26 @@ def format_step_cells(step: StepRow) -> list[str]:
 
 def collect_score_content(summary: RunSummary, fids: Fids) -> dict[str, Any]:
     """Return all scores with full precision, for JSON."""
-    content: dict[str, Any] = {
+    has_fids = not isinstance(fids, str)
+    return {
         "cases": len(summary.tasks),
         "common": list(summary.common_tasks),
-        "methods": {
-            method: {
-                "finished": summary.finished[method],
-                **{
-                    column.key: {"value": cell.value, "cases": cell.count}
-                    for column in summary.columns
-                    for cell in [summary.compute_cell(method, column)]
-                },
-            }
-            for method in summary.methods
-        },
-        "gain_by_distance": {
-            str(gap): {method: cell.value for method, cell in cells.items()}
-            for gap, cells in summary.gains.items()
-        },
+        "methods": {method: collect_method_scores(summary, method) for method in summary.methods},
         "notes": summary.notes,
-        "fid": fids,
+        "fid": {"values": fids if has_fids else {}, "reason": None if has_fids else fids},
         "failures": [
             dict(zip(("case", "method", "reason"), failure, strict=True))
             for failure in summary.failures
         ],
     }
-    if summary.sequences:
-        content["steps"] = _collect_steps(summary, drop_cost)
-    return content
 
 
-def drop_cost(step: StepRow) -> StepRow:
-    """Drop the values of a step that differ from run to run."""
-    return {key: step[key] for key in step if key not in ("seconds", "peak_bytes")}
-
-
-def _collect_steps(
-    summary: RunSummary, get_value: Callable[[StepRow], Any]
-) -> dict[str, dict[str, list[Any]]]:
-    return {
-        name: {method: [get_value(step) for step in steps] for method, steps in by_method.items()}
-        for name, by_method in summary.sequences.items()
-    }
+def collect_method_scores(summary: RunSummary, method: str) -> dict[str, Any]:
+    """Return the number of finished tasks and all scores of a method, for JSON."""
+    columns = [column for group in GROUPS.values() for column in group]
+    cells = {column.key: summary.compute_cell(method, column) for column in columns}
+    scores = {key: {"value": cell.value, "cases": cell.count} for key, cell in cells.items()}
+    return {"finished": summary.finished[method], **scores}
 
 
 def format_timing_markdown(summary: RunSummary) -> str:
@@ -278,17 +368,3 @@ def format_timing_markdown(summary: RunSummary) -> str:
         "finished, and peak memory (GiB). The total excludes the reconstruction of the context, "
         "which all methods share.\n\n" + format_markdown(["method", *stages, "memory"], rows)
     )
-
-
-def collect_timing_content(summary: RunSummary) -> dict[str, Any]:
-    """Return all timings with full precision, for JSON, and the seconds of sequence steps."""
-    content: dict[str, Any] = {
-        method: {
-            "seconds": summary.compute_seconds(method),
-            "peak_bytes": summary.find_peak_bytes(method),
-        }
-        for method in summary.methods
-    }
-    if summary.sequences:
-        content["steps"] = _collect_steps(summary, lambda step: step["seconds"])
-    return content

@@ -21,7 +21,6 @@ from gscompleter.apps.viewer.packages import (
 )
 from gscompleter.apps.warmup.compilation import PARTS
 from gscompleter.errors import InputError
-from gscompleter.evaluation.metrics import lpips
 from gscompleter.io.cache import get_download_folder
 from gscompleter.kernels.compiled import get_cache_folder, is_compiled
 from gscompleter.models.weights.fetching import find_cached
@@ -32,11 +31,10 @@ DISTRIBUTION = "gscompleter"
 
 PURPOSES = {
     "cuda": "rendering on an NVIDIA GPU",
-    "evaluation": "the plots of evaluate and tables",
+    "evaluation": "the plots of evaluate and tables, FLIP, LPIPS and FID",
     "models": "downloading published weights from the Hugging Face hub",
     "diffusion": "--generator pe-field and diffusers-inpaint",
     "poses": "photographs whose cameras are not known",
-    "fid": "tables --fid",
     "live": "completing in the browser with gscompleter live",
     "browser": "the picture of the viewer (examples/04_picture_of_the_viewer.py)",
     "film": "complete --video",
@@ -159,16 +157,10 @@ def inspect_renderers() -> Iterator[Found]:
 
 
 def inspect_weights() -> Iterator[Found]:
-    """Inspect the published weights of reconstructors and LPIPS."""
+    """Inspect the published weights of reconstructors."""
     here = [name for name, published in PUBLISHED.items() if find_cached(published)]
     listed = ", ".join(here) or f"all {len(PUBLISHED)} that `gscompleter models` lists"
     yield Found("weights", "reconstructors", bool(here), f"{listed}, for --reconstructor")
-    for name, network in lpips.NETWORKS.items():
-        files = network.backbone, network.linear
-        there = all(lpips.get_weights_path(file, None).is_file() for file in files)
-        remedy = "" if there else "; load_lpips fetches it"
-        told = f"for LPIPS in the tables of evaluate{remedy}"
-        yield Found("weights", f"lpips-{name}", there, told)
 
 
 def inspect_viewer() -> Found:

@@ -32,7 +32,7 @@ from gscompleter.evaluation import plots, protocols, tables
 from gscompleter.evaluation.methods import expand_methods
 from gscompleter.evaluation.runner import RunConfig, evaluate
 from gscompleter.evaluation.store import list_row_paths
-from gscompleter.evaluation.summary import RunSummary
+from gscompleter.evaluation.tables import RunSummary
 from gscompleter.jobs.workers import parse_shard
 from gscompleter.progress import show_preparation, show_progress
 from gscompleter.render import choose_device
@@ -137,14 +137,15 @@ def run_index(options: IndexOptions) -> None:
     shown = None if options.quiet else Console(stderr=True)
     with show_progress(shown), show_preparation("reading clips"):
         index = protocols.build_index(rule, filter_usable(open_clips(options.path), skipped))
-    index = replace(index, skipped=(*index.skipped, *(clip.name for clip in skipped)))
+    index = replace(index, scenes={**index.scenes, **{clip.name: () for clip in skipped}})
     protocols.write_evaluation_index(options.out, index)
     console = Console(quiet=options.quiet, highlight=False)
     print_skipped(skipped, console)
-    targets = sum(len(split.targets) for splits in index.scenes.values() for split in splits)
+    targets = [len(split.targets) for splits in index.scenes.values() for split in splits]
+    used = [name for name, splits in index.scenes.items() if splits]
     console.print(
-        f"{targets} cases in {len(index.scenes)} scenes, {len(index.skipped)} scenes skipped: "
-        f"{options.out}",
+        f"{sum(targets)} cases in {len(used)} scenes, {len(index.scenes) - len(used)} scenes "
+        f"skipped: {options.out}",
         soft_wrap=True,
     )
 
@@ -190,9 +191,10 @@ def iterate_tasks(
                 )
             clip = clip if options.ego_mask else clip.keep_ego_vehicle()
             for rule in rules:
-                if reason := protocols.explain_skip(rule, clip):
-                    skipped.append(SkippedScene(clip.name, reason))
                 tasks = protocols.make_tasks(rule, clip, size, options.use_masks)
+                if not tasks and isinstance(rule, protocols.FrameRule):
+                    reason = f"{rule.name} chooses none of its {len(clip)} frames"
+                    skipped.append(SkippedScene(clip.name, reason))
                 yield from tasks[:1] if options.one_per_scene else tasks
 
 
@@ -219,9 +221,8 @@ def print_skipped(skipped: Sequence[SkippedScene], console: Console) -> None:
 def print_tables(summary: RunSummary, out: Path) -> None:
     """Print the tables, transposed: one column per method."""
     table = Table("", *summary.methods, box=None)
-    columns = summary.find_present_columns(summary.columns)
-    cells = tables.format_score_cells(summary, columns)
-    for number, column in enumerate(columns, start=1):
+    cells = tables.format_score_cells(summary, summary.columns)
+    for number, column in enumerate(summary.columns, start=1):
         table.add_row(column.title, *(row[number] for row in cells))
     if summary.common_tasks:
         seconds = [summary.compute_seconds(method)["total"] for method in summary.methods]

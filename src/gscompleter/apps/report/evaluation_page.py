@@ -15,8 +15,6 @@ from gscompleter.io.reading import read_bytes
 TABLES_FILE, TIMINGS_FILE = "tables.md", "timings.md"
 PLOT_CAPTIONS = {
     "gain_by_hole": "ΔPSNR at the target by hole size",
-    "gain_by_distance": "ΔPSNR at the target by distance from the context",
-    "seconds": "Median seconds of a step by stage",
 }
 
 
@@ -68,8 +66,6 @@ def split_row(line: str) -> list[str]:
 def embed_plots(folder: Path) -> Iterator[tuple[Picture, str]]:
     """Embed the plots that exist."""
     gallery = open_gallery(folder)
-    steps = [path.stem for path in sorted(folder.glob("sequence_*.png"))]
-    captions = {name: f"Steps of {name.removeprefix('sequence_')}" for name in steps}
-    for name, caption in (PLOT_CAPTIONS | captions).items():
+    for name, caption in PLOT_CAPTIONS.items():
         if os.path.isfile(folder / f"{name}.png"):
             yield gallery.embed(f"{name}.png", caption, exact=True), caption

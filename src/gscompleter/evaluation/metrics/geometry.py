@@ -15,7 +15,6 @@ from jaxtyping import Bool, Float
 from scipy.spatial import cKDTree
 from torch import Tensor
 
-from gscompleter.errors import InputError
 from gscompleter.geometry import is_inside, project, project_mask, sample
 from gscompleter.render import Renderer
 from gscompleter.stages.filter_holes import select_in_mask
@@ -28,22 +27,31 @@ MATCH_DISTANCE = 0.05
 """Largest distance of a match, as a share of the median context depth at the target."""
 
 
-def compute_abs_rel(
-    depth: Float[Tensor, "h w"], truth: Float[Tensor, "h w"] | None, where: Bool[Tensor, "h w"]
-) -> float | None:
+@dataclass(frozen=True)
+class Agreement:
+    """Agreement of depths, and of Gaussians with the context, where both overlap; None for none."""
+
+    pixels: int
+    """Number of the target's pixels in the overlap."""
+    abs_rel: float | None = None
+    """AbsRel of the z-depth."""
+    chamfer: float | None = None
+    """Chamfer distance as a share of the median depth of the context, for averages over scenes."""
+    f_score: float | None = None
+
+
+def compare_depths(
+    depth: Float[Tensor, "h w"], truth: Float[Tensor, "h w"], where: Bool[Tensor, "h w"]
+) -> Agreement:
     """Compute mean(|depth - truth| / truth) over pixels of `where` with known truth; 0 is best.
 
-    No scale is fitted, because registration has to remove scale errors. None if no pixel is left.
+    No scale is fitted, because registration has to remove scale errors.
     """
-    if truth is None or not (known := where & (truth > 0)).any():
-        return None
+    known = where & (truth > 0)
+    if not known.any():
+        return Agreement(0)
     d, t = depth[known].double(), truth[known].double()
-    return ((d - t).abs() / t).mean().item()
-
-
-def count_known(truth: Float[Tensor, "h w"] | None, where: Bool[Tensor, "h w"]) -> int | None:
-    """Count the pixels of `where` with positive truth; None without truth."""
-    return None if truth is None else int((where & (truth > 0)).sum())
+    return Agreement(int(known.sum()), ((d - t).abs() / t).mean().item())
 
 
 def compute_f_score(
@@ -61,50 +69,16 @@ def compute_f_score(
 def compute_nearest_distances(
     points: Float[Tensor, "n 3"], others: Float[Tensor, "m 3"]
 ) -> Float[np.ndarray, "n"]:
-    """Compute the Euclidean distance of each point to the nearest of `others`, in float64.
-
-    Raises:
-        InputError: A set is empty or holds a point that is not finite.
-    """
-    if len(points) == 0 or len(others) == 0:
-        raise InputError(
-            "Distances between point sets need points on both sides, "
-            f"got {len(points)} and {len(others)}."
-        )
+    """Compute the Euclidean distance of each point to the nearest of `others`, in float64."""
     queries, targets = (p.detach().cpu().double().numpy() for p in (points, others))
-    if not (np.isfinite(queries).all() and np.isfinite(targets).all()):
-        raise InputError("Distances between point sets need finite points; some are not.")
     # Without balancing the tree stays fast if many points coincide.
-    distances, _ = cKDTree(targets, balanced_tree=False).query(queries, workers=-1)
-    return np.asarray(distances, dtype=np.float64)
-
-
-@dataclass(frozen=True)
-class Alignment:
-    """Agreement of generated Gaussians with the context where both overlap, or None."""
-
-    overlap: float
-    """Share of the target's pixels in the overlap."""
-    pixels: int
-    """Number of pixels in the overlap."""
-    scale: float | None
-    """Median z-depth of the context at the target, in scene units."""
-    abs_rel: float | None
-    """AbsRel of the generated z-depth against the context in the overlap."""
-    chamfer: float | None
-    """Chamfer distance in scene units."""
-    f_score: float | None
-
-    @property
-    def relative_chamfer(self) -> float | None:
-        """Chamfer distance as a share of `scale`, for averages over scenes."""
-        return self.chamfer / self.scale if self.chamfer is not None and self.scale else None
+    return cKDTree(targets, balanced_tree=False).query(queries, workers=-1)[0]
 
 
 @torch.no_grad()
 def measure_alignment(
     added: Gaussians, context: Gaussians, target: Camera, renderer: Renderer
-) -> Alignment:
+) -> Agreement:
     """Measure AbsRel, Chamfer distance and F-score of the added Gaussians against `context`.
 
     The overlap is the set of target pixels that both cover when rendered alone, the rim of the
@@ -117,14 +91,14 @@ def measure_alignment(
     generated = renderer.render(added, target).depth_map()
     reference = renderer.render(context, target).depth_map()
     overlap = generated.valid & reference.valid
-    error = compute_abs_rel(generated.depth, reference.depth, overlap)
+    error = compare_depths(generated.depth, reference.depth, overlap).abs_rel
     return compare_clouds(added, context, target, reference, overlap, error)
 
 
 @torch.no_grad()
 def measure_primitive_alignment(
     registered: Gaussians, context: Gaussians, target: Camera, renderer: Renderer
-) -> Alignment:
+) -> Agreement:
     """Measure the same for all registered Gaussians, without filtering and rendering them.
 
     A Gaussian counts if its mean projects to a pixel that the context covers; these pixels are the
@@ -150,11 +124,11 @@ def compare_clouds(
     reference: DepthMap,
     overlap: Bool[Tensor, "h w"],
     error: float | None,
-) -> Alignment:
+) -> Agreement:
     """Add Chamfer distance and F-score over `overlap` to the AbsRel `error`."""
-    share, count = overlap.double().mean().item(), int(overlap.sum())
+    count = int(overlap.sum())
     if count == 0:
-        return Alignment(share, count, None, None, None, None)
+        return Agreement(0)
     scale = reference.depth[reference.valid].double().median().item()
     threshold = MATCH_DISTANCE * scale
     points = select_in_mask(generated, None, overlap, target).means
@@ -163,12 +137,12 @@ def compare_clouds(
     at_pixel = sample(reference.depth[..., None], pixels, "nearest")[..., 0]
     surface = surface[is_inside(pixels, z, target) & ((z - at_pixel).abs() <= threshold)]
     if len(points) == 0 or len(surface) == 0:
-        return Alignment(share, count, scale, error, None, None)
+        return Agreement(count, error)
     there = compute_nearest_distances(points, context.means)
     back = compute_nearest_distances(surface, generated.means)
     # Distances are not squared, so that floaters do not dominate.
-    chamfer = float(there.mean() + back.mean()) / 2
-    return Alignment(share, count, scale, error, chamfer, compute_f_score(there, back, threshold))
+    chamfer = float(there.mean() + back.mean()) / 2 / scale
+    return Agreement(count, error, chamfer, compute_f_score(there, back, threshold))
 
 
 def drop_transparent(gaussians: Gaussians) -> Gaussians:

@@ -20,9 +20,7 @@ YIQ = ((0.299, 0.587, 0.114), (0.5959, -0.2746, -0.3213), (0.2115, -0.5227, 0.31
 
 
 def haarpsi(
-    image: Float[Tensor, "h w 3"],
-    truth: Float[Tensor, "h w 3"],
-    where: Bool[Tensor, "h w"] | None = None,
+    image: Float[Tensor, "h w 3"], truth: Float[Tensor, "h w 3"], where: Bool[Tensor, "h w"]
 ) -> float | None:
     """Compute HaarPSI of two images in [0, 1] over the pixels of `where`; 1 is best.
 
@@ -31,11 +29,10 @@ def haarpsi(
     """
     of_image, of_truth = convert_to_yiq(image), convert_to_yiq(truth)
     similarity, weight = compute_similarities(of_image, of_truth)
-    if where is not None:
-        inside = halve_image(where[None].double().cpu())[0] >= 0.5
-        similarity, weight = similarity[:, inside], weight[:, inside]
-    if similarity.numel() == 0:
+    inside = halve_image(where[None].double().cpu())[0] >= 0.5
+    if not inside.any():
         return None
+    similarity, weight = similarity[:, inside], weight[:, inside]
     # Without any edge all pixels have the same weight.
     tiny = torch.finfo(weight.dtype).eps
     mean = ((ALPHA * similarity).sigmoid() * (weight + tiny)).sum() / (weight + tiny).sum()

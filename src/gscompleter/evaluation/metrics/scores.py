@@ -3,17 +3,15 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, replace
-from typing import Any
+from dataclasses import dataclass
 
 import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
 from gscompleter.evaluation.metrics.geometry import (
-    Alignment,
-    compute_abs_rel,
-    count_known,
+    Agreement,
+    compare_depths,
     measure_alignment,
     measure_primitive_alignment,
 )
@@ -23,7 +21,7 @@ from gscompleter.evaluation.metrics.image import (
     compute_masked_psnr,
     ssim,
 )
-from gscompleter.evaluation.metrics.lpips import compute_lpips
+from gscompleter.evaluation.metrics.learned import compute_lpips
 from gscompleter.evaluation.metrics.perceptual import compute_flip_map, haarpsi
 from gscompleter.render import Renderer
 from gscompleter.stages.target_view import compute_hole_mask
@@ -60,14 +58,16 @@ class Quality:
     """PSNR in dB."""
     ssim: float
     lpips_vgg: float | None
-    """None if the weights are not on this machine."""
+    """None if it is not available."""
     lpips_alex: float | None
 
 
 @dataclass(frozen=True)
-class PerceptualQuality:
-    """Scores of a part of an image that do not reward blur; None without a pixel."""
+class PartQuality:
+    """Scores of a part of an image, most of which do not reward blur; None without a pixel."""
 
+    psnr: float | None
+    """PSNR in dB."""
     flip: float | None
     """Mean of the FLIP map; None also if flip-evaluator is missing."""
     haarpsi: float | None
@@ -83,44 +83,26 @@ class Scores:
     """Share of the target's pixels that the context does not cover."""
     target_before: Quality
     target_after: Quality
-    hole_psnr: float | None
-    """PSNR in dB at the target in the hole, after completion."""
-    observed_psnr: Change | None
-    """PSNR in dB at the target over all other pixels."""
-    neighbours_psnr: Change | None
-    """Mean PSNR in dB over the neighbour views."""
+    hole: PartQuality
+    """At the target in the hole, after completion."""
+    observed: PartQuality
+    """At the target over all other pixels."""
+    neighbours_psnr: tuple[Change, ...]
+    """PSNR in dB of each neighbour view."""
     context_psnr: tuple[Change, ...]
     """PSNR in dB of each context view."""
     context_ssim: tuple[Change, ...]
     """SSIM of each context view."""
-    depth_observed: float | None
-    """AbsRel at the target against the true depth, where the context covers it."""
-    depth_hole: float | None
+    depth_observed: Agreement | None
+    """Depth at the target against the true depth, where the context covers it."""
+    depth_hole: Agreement | None
     """The same in the filled hole."""
-    depth_observed_pixels: int | None = None
-    """Number of pixels of `depth_observed`."""
-    depth_hole_pixels: int | None = None
-    """Number of pixels of `depth_hole`."""
-    depth_rim: float | None = None
+    seam_step: float | None
     """Median relative depth difference of the added Gaussians to the context, where both cover."""
-    align_pixels: int | None = None
-    """Number of target pixels that both cover, for `depth_rim` and the next three."""
-    align_abs_rel: float | None = None
-    """AbsRel of the added Gaussians against the context (`geometry.measure_alignment`)."""
-    align_chamfer: float | None = None
-    """Their Chamfer distance as a share of the median depth at the target."""
-    align_f_score: float | None = None
-    registered_pixels: int | None = None
-    """Number of covered target pixels with a registered Gaussian, for the next three."""
-    registered_abs_rel: float | None = None
-    """AbsRel of all registered Gaussians against the context, before filtering."""
-    registered_chamfer: float | None = None
-    """Their Chamfer distance as a share of the median depth at the target."""
-    registered_f_score: float | None = None
-    hole_looks: PerceptualQuality | None = None
-    """At the target in the hole, after completion."""
-    observed_looks: PerceptualQuality | None = None
-    """At the target over all other pixels."""
+    added: Agreement | None
+    """Added Gaussians against the context (`geometry.measure_alignment`)."""
+    registered: Agreement | None
+    """All registered Gaussians against the context, before filtering."""
 
 
 @dataclass(frozen=True)
@@ -148,49 +130,37 @@ def score(
     """
     target, camera = truth.target, truth.target.camera
     was, now = renderer.render(before, camera), renderer.render(after, camera)
-    holes, counted = compute_hole_mask(was.alpha), target.valid_mask
-    covered = now.depth_map().valid & counted
+    holes = compute_hole_mask(was.alpha)
+    covered = now.depth_map().valid & target.valid_mask
     context, beside = (
         [[renderer.render(scene, view.camera).image for scene in (before, after)] for view in views]
         for views in (truth.views, truth.neighbours)
     )
-    observed = [
-        compute_masked_psnr(render.image, target.image, ~holes & counted) for render in (was, now)
-    ]
+    depths: list[Agreement | None] = [None, None]
+    if target.depth is not None:
+        depths = [
+            compare_depths(now.depth, target.depth, part & covered) for part in (~holes, holes)
+        ]
     scores = Scores(
         hole_fraction=holes.float().mean().item(),
         target_before=measure_quality(was.image, target),
         target_after=measure_quality(now.image, target),
-        hole_psnr=compute_masked_psnr(now.image, target.image, holes & counted),
-        observed_psnr=None if None in observed else Change(*observed),  # type: ignore[arg-type]
-        neighbours_psnr=average_changes(compare(beside, truth.neighbours, compute_view_psnr)),
+        hole=measure_part(now.image, target, holes),
+        observed=measure_part(now.image, target, ~holes),
+        neighbours_psnr=compare(beside, truth.neighbours, compute_view_psnr),
         context_psnr=compare(context, truth.views, compute_view_psnr),
         context_ssim=compare(context, truth.views, compute_view_ssim),
-        depth_observed=compute_abs_rel(now.depth, target.depth, ~holes & covered),
-        depth_hole=compute_abs_rel(now.depth, target.depth, holes & covered),
-        depth_observed_pixels=count_known(target.depth, ~holes & covered),
-        depth_hole_pixels=count_known(target.depth, holes & covered),
-        hole_looks=measure_perceptual_quality(now.image, target, holes),
-        observed_looks=measure_perceptual_quality(now.image, target, ~holes),
+        depth_observed=depths[0],
+        depth_hole=depths[1],
+        seam_step=measure_seam_step(added, was, camera, renderer) if added else None,
+        added=measure_alignment(added, before, camera, renderer) if added else None,
+        registered=(
+            measure_primitive_alignment(registered, before, camera, renderer)
+            if registered
+            else None
+        ),
     )
-    if added is not None and len(added) > 0:
-        aligned = measure_alignment(added, before, camera, renderer)
-        step = measure_seam_step(added, was, camera, renderer)
-        scores = replace(scores, depth_rim=step, **name_alignment_scores("align", aligned))
-    if registered is not None and len(registered) > 0:
-        aligned = measure_primitive_alignment(registered, before, camera, renderer)
-        scores = replace(scores, **name_alignment_scores("registered", aligned))
     return scores, TargetRenders(was, now, holes)
-
-
-def name_alignment_scores(name: str, aligned: Alignment) -> dict[str, Any]:
-    """Return the fields of `Scores` for an alignment, prefixed by `name`."""
-    return {
-        f"{name}_pixels": aligned.pixels,
-        f"{name}_abs_rel": aligned.abs_rel,
-        f"{name}_chamfer": aligned.relative_chamfer,
-        f"{name}_f_score": aligned.f_score,
-    }
 
 
 def measure_quality(image: Image, photograph: View) -> Quality:
@@ -218,17 +188,16 @@ def compute_view_ssim(image: Image, photograph: View) -> float:
     return ssim(photograph.fill_ignored(image), photograph.image)
 
 
-def measure_perceptual_quality(
-    image: Image, photograph: View, where: Bool[Tensor, "h w"]
-) -> PerceptualQuality:
-    """Compute FLIP, HaarPSI and the gradient energy ratio over the valid pixels of `where`."""
-    image, truth = photograph.fill_ignored(image), photograph.image
+def measure_part(image: Image, photograph: View, where: Bool[Tensor, "h w"]) -> PartQuality:
+    """Score an image over the valid pixels of `where`."""
+    compared, truth = photograph.fill_ignored(image), photograph.image
     where = where & photograph.valid_mask
-    errors = compute_flip_map(image, truth)
-    return PerceptualQuality(
+    errors = compute_flip_map(compared, truth)
+    return PartQuality(
+        compute_masked_psnr(image, truth, where),
         None if errors is None or not where.any() else errors[where.cpu()].mean().item(),
-        haarpsi(image, truth, where),
-        compute_gradient_energy_ratio(image, truth, where),
+        haarpsi(compared, truth, where),
+        compute_gradient_energy_ratio(compared, truth, where),
     )
 
 
@@ -270,11 +239,3 @@ def compare(
     """Compute a metric for each view, whose renders before and after are `pairs`."""
     both = zip(pairs, views, strict=True)
     return tuple(Change(metric(was, view), metric(now, view)) for (was, now), view in both)
-
-
-def average_changes(changes: Sequence[Change]) -> Change | None:
-    """Average the scores before and after; None for an empty sequence."""
-    if not changes:
-        return None
-    n = len(changes)
-    return Change(sum(c.before for c in changes) / n, sum(c.after for c in changes) / n)

@@ -1,0 +1,157 @@
+"""Columns of the tables: which numbers of a row they show, and how these are averaged."""
+
+from __future__ import annotations
+
+import statistics
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+
+from gscompleter.evaluation.steps import compute_scale_drift
+
+RunRow = dict[str, Any]
+"""Output of `evaluate` for a task and a method."""
+StepRow = dict[str, Any]
+"""A `steps.Step` as JSON."""
+
+Reduction = Callable[[Sequence[float]], Any]
+"""Reduces several numbers to one, or to None."""
+
+MIN_PIXELS = 500
+"""Smallest number of pixels over which a geometry score counts."""
+
+
+@dataclass(frozen=True)
+class Column:
+    """A column of a table: a number of each step, reduced over steps and then over tasks."""
+
+    key: str
+    title: str
+    digits: int
+    path: str
+    """Place of the number in a step or its scores, with dots; a list of views is reduced too."""
+    minus: str | None = None
+    """Place of a number that is subtracted."""
+    reduce_steps: Reduction = statistics.fmean
+    reduce_tasks: Reduction = statistics.fmean
+    pixels: str | None = None
+    """Place of the number of pixels, of which `MIN_PIXELS` are needed."""
+
+    def get_value(self, step: StepRow) -> float | None:
+        """Return the number of a step; None without ground truth."""
+        if self.pixels is not None and (find_number(step, self.pixels) or 0) < MIN_PIXELS:
+            return None
+        value = find_number(step, self.path)
+        if value is not None and self.minus is not None:
+            value = np.subtract(value, find_number(step, self.minus)).tolist()
+        if isinstance(value, list):
+            return self.reduce_steps(value) if value else None
+        return value
+
+    def compute_row(self, row: RunRow) -> float | None:
+        """Compute the value of a task, or None if no step has one."""
+        values = [value for step in row["steps"] if (value := self.get_value(step)) is not None]
+        return self.reduce_steps(values) if values else None
+
+
+def find_number(step: StepRow, path: str) -> Any:
+    """Return the number at a place in a step or its scores, one per view, or None."""
+    found: Any = step if path in step else step["scores"]
+    for key in path.split("."):
+        if isinstance(found, list):
+            found = [view[key] for view in found]
+        else:
+            found = None if found is None else found[key]
+    return found
+
+
+def _make_gain(key: str, title: str, path: str, reduce: Reduction = statistics.fmean) -> Column:
+    """Make a column of changes by the completion."""
+    return Column(key, title, 2, f"{path}.after", f"{path}.before", reduce, reduce)
+
+
+def _make_median(key: str, title: str, digits: int, path: str) -> Column:
+    """Make a column of medians over the tasks."""
+    return Column(key, title, digits, path, reduce_tasks=statistics.median)
+
+
+def _make_geometry(
+    key: str, title: str, path: str, digits: int = 4, reduce: Reduction = statistics.median
+) -> Column:
+    """Make a column of a number of an `Agreement`."""
+    pixels = f"{path.split('.')[0]}.pixels"
+    return Column(key, title, digits, path, reduce_tasks=reduce, pixels=pixels)
+
+
+BEFORE, AFTER = "target_before.psnr", "target_after.psnr"
+PSNR_BEFORE = Column("psnr_before", "PSNR before", 2, BEFORE)
+PSNR = Column("psnr", "PSNR", 2, AFTER)
+GAIN = Column("gain", "ΔPSNR", 2, AFTER, BEFORE)
+
+GROUPS = {
+    "Images": (
+        PSNR,
+        GAIN,
+        Column("lowest_gain", "min ΔPSNR", 2, AFTER, BEFORE, min, min),
+        Column("ssim", "SSIM", 3, "target_after.ssim"),
+        Column("lpips_vgg", "LPIPS (VGG)", 3, "target_after.lpips_vgg"),
+        Column("lpips_alex", "LPIPS (Alex)", 3, "target_after.lpips_alex"),
+        Column("hole_psnr", "PSNR (hole)", 2, "hole.psnr"),
+        Column("observed_psnr", "PSNR (observed)", 2, "observed.psnr"),
+        Column("neighbours", "PSNR (neighbour views)", 2, "neighbours_psnr.after"),
+        _make_gain("neighbours_gain", "ΔPSNR (neighbour views)", "neighbours_psnr"),
+        Column("context", "PSNR (context)", 2, "context_psnr.after"),
+        Column("context_ssim", "SSIM (context)", 3, "context_ssim.after"),
+        _make_gain("context_change", "min ΔPSNR (context)", "context_psnr", min),
+    ),
+    # 0 is the best FLIP, 1 the best HaarPSI, and 1 the gradient energy of the photograph. That is a
+    # median, since a flat photograph gives arbitrary ratios.
+    "Perceptual quality": (
+        Column("hole_flip", "FLIP (hole)", 3, "hole.flip"),
+        Column("observed_flip", "FLIP (observed)", 3, "observed.flip"),
+        Column("hole_haarpsi", "HaarPSI (hole)", 3, "hole.haarpsi"),
+        Column("observed_haarpsi", "HaarPSI (observed)", 3, "observed.haarpsi"),
+        _make_median("hole_gradients", "gradient energy (hole)", 2, "hole.gradient_energy"),
+        _make_median(
+            "observed_gradients", "gradient energy (observed)", 2, "observed.gradient_energy"
+        ),
+    ),
+    "Geometry": (
+        _make_geometry(
+            "depth_observed", "AbsRel observed", "depth_observed.abs_rel", 3, statistics.fmean
+        ),
+        _make_geometry("depth_hole", "AbsRel in holes", "depth_hole.abs_rel", 3, statistics.fmean),
+        _make_geometry("depth_hole_median", "AbsRel in holes (median)", "depth_hole.abs_rel", 3),
+    ),
+    # All are medians over the cases; lengths are relative to the depth.
+    "Geometry of added Gaussians": (
+        replace(
+            _make_median("depth_rim_median", "depth step at seam (median)", 4, "seam_step"),
+            pixels="added.pixels",
+        ),
+        _make_geometry("align_abs_rel_median", "AbsRel to context (median)", "added.abs_rel"),
+        _make_geometry("align_chamfer_median", "Chamfer to context (median)", "added.chamfer"),
+        _make_geometry("align_f_score_median", "F-score to context (median)", "added.f_score", 3),
+    ),
+    # The same after registration, before the hole filter.
+    "Geometry of all lifted Gaussians": (
+        _make_geometry(
+            "registered_abs_rel_median", "AbsRel of all lifted (median)", "registered.abs_rel"
+        ),
+        _make_geometry(
+            "registered_chamfer_median", "Chamfer of all lifted (median)", "registered.chamfer"
+        ),
+        _make_geometry(
+            "registered_f_score_median", "F-score of all lifted (median)", "registered.f_score", 3
+        ),
+    ),
+    "Sequences": (
+        PSNR_BEFORE,
+        Column("psnr_end", "PSNR at the end", 2, "psnr_end"),
+        Column("depth_scale", "depth scale", 3, "depth_scale"),
+        Column("scale_drift", "scale drift", 3, "depth_scale", reduce_steps=compute_scale_drift),
+    ),
+}
+"""Columns by the title of their table; PSNR is in dB."""
