@@ -125,10 +125,10 @@ def test_poses_of_supersplat_show_the_room_upright(tmp_path, project):
     ("content", "sentence"),
     [
         ([], "lists no cameras"),
-        ([3], "Camera 0 of .* is no object"),
+        ([3], "`fx` of camera 0 .* missing"),
         ([{"position": [0, 0, 0]}], "`fx` of camera 0 .* missing"),
         ({"poseSets": []}, "holds no poses"),
-        ({"poseSets": [{"poses": [3]}]}, "Pose 0 of .* is no object"),
+        ({"poseSets": [{"poses": [3]}]}, "`position` of pose 0 .* 3 numbers"),
         ([{"position": [0, 0, 0], "target": [0, 0]}], "`target` of pose 0 .* 3 numbers"),
         ([{"position": [0, 0, 0], "target": [0, 9, 0]}], "NaN"),
         ([{"position": [0, 0, 0], "target": [0, 0, 1], "fov": 180}], "`fov` of pose 0"),

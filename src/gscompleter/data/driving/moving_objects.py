@@ -10,6 +10,7 @@ import cv2
 import numpy as np
 from jaxtyping import Bool, Float
 
+from gscompleter.data.driving.lidar import build_poses, transform_points
 from gscompleter.types import Camera
 
 MIN_SPEED = 0.5
@@ -28,36 +29,32 @@ class Box:
 
     pose: Float[np.ndarray, "4 4"]
     """Centre and axes, in the world frame."""
-    sides: tuple[float, float, float]
+    sides: Float[np.ndarray, "3"]
     """Side lengths along its own axes, in metres."""
-    speed: float | None
-    """Speed in metres per second, or None if unknown."""
+    speed: float
+    """Speed in metres per second, or NaN if unknown."""
 
     @property
     def is_moving(self) -> bool:
         """True if the object moves or its speed is unknown."""
-        return self.speed is None or not self.speed < MIN_SPEED
+        return not self.speed < MIN_SPEED
 
     def compute_corners(self) -> Float[np.ndarray, "8 3"]:
         """Compute the corners of the enlarged box in the world frame."""
         signs = np.array(list(product((-0.5, 0.5), repeat=3)))
-        local = signs * np.array(self.sides) * (1 + MARGIN)
-        return local @ self.pose[:3, :3].T + self.pose[:3, 3]
+        return transform_points(signs * self.sides * (1 + MARGIN), self.pose)
 
 
-def build_upright_pose(center: Float[np.ndarray, "3"], heading: float) -> Float[np.ndarray, "4 4"]:
-    """Build the pose of an upright box (z up), rotated by `heading` radians."""
-    pose = np.eye(4)
-    cos, sin = np.cos(heading), np.sin(heading)
-    pose[:2, :2] = [[cos, -sin], [sin, cos]]
-    pose[:3, 3] = center
-    return pose
-
-
-def convert_speed(velocity: Float[np.ndarray, "_"]) -> float | None:
-    """Convert a velocity to a speed; None if it is unknown (NaN)."""
-    speed = float(np.linalg.norm(velocity))
-    return speed if np.isfinite(speed) else None
+def build_box(
+    vehicle: Float[np.ndarray, "4 4"],
+    center: Float[np.ndarray, "3"],
+    sides: Float[np.ndarray, "3"],
+    heading: float,
+    velocity: Float[np.ndarray, "_"],
+) -> Box:
+    """Build the upright box (z up) at `center` on a vehicle, rotated by `heading` radians."""
+    pose = vehicle @ build_poses(np.array([0.0, 0.0, heading, *center]))
+    return Box(pose, sides, float(np.linalg.norm(velocity)))
 
 
 def mask_moving(

@@ -21,10 +21,10 @@ import numpy as np
 from jaxtyping import Float
 
 from gscompleter.data.cameras import Intrinsics
-from gscompleter.data.driving.lidar import build_poses, compute_points, transform_points
-from gscompleter.data.driving.moving_objects import Box, build_upright_pose, convert_speed
+from gscompleter.data.driving.lidar import build_poses, transform_points
+from gscompleter.data.driving.moving_objects import Box, build_box
 from gscompleter.data.frame import Frame
-from gscompleter.data.limits import MAX_SIDE
+from gscompleter.data.limits import MAX_SIDE, require
 from gscompleter.data.photographs import Photographs, build_drive
 from gscompleter.data.undistort import Distortion
 from gscompleter.errors import InputError, quote_value
@@ -43,8 +43,8 @@ COMPONENTS = {
 }
 """Prefixes of the columns of each component."""
 TIME, CAMERA, LASER = "key.frame_timestamp_micros", "key.camera_name", "key.laser_name"
-LENS = ("width", "height", *(f"intrinsic.{name}" for name in ("f_u", "f_v", "c_u", "c_v")))
-LENS_DISTORTION = tuple(f"intrinsic.{name}" for name in ("k1", "k2", "k3", "p1", "p2"))
+INTRINSICS = ("f_u", "f_v", "c_u", "c_v", "k1", "k2", "k3", "p1", "p2")
+LENS = ("width", "height", *(f"intrinsic.{name}" for name in INTRINSICS))
 CAMERAS = {1: "FRONT", 2: "FRONT_LEFT", 3: "FRONT_RIGHT", 4: "SIDE_LEFT", 5: "SIDE_RIGHT"}
 """Camera names by their numbers in the tables."""
 SIGN = 3
@@ -54,8 +54,6 @@ CAMERA_FROM_OPENCV = np.array(
 )
 """Axis change from x right, y down, z forward to x forward, y left, z up."""
 
-Beams = tuple[Float[np.ndarray, "h"] | None, float | None, float | None]
-"""Beam elevations of a laser in radians, ascending, and their lower and upper end."""
 PosedLens = tuple[Intrinsics, Float[np.ndarray, "4 4"]]
 """Intrinsics of a camera, and its pose on the vehicle in Waymo's axes."""
 
@@ -102,33 +100,25 @@ class Segment:
         """
         prefix = f"[{COMPONENTS[component]}]."
         names = [name if name.startswith("key.") else prefix + name for name in columns]
-        table = _read_table(self.get_path(component), names, where or {})
+        filters = [(column, "==", value) for column, value in (where or {}).items()]
+        table = _read_table(self.get_path(component), names, filters)
         values = [[_to_plain(value) for value in table.column(name)] for name in names]
         return zip(*values, strict=True)
 
 
-def _read_table(path: Path, columns: Sequence[str], where: Mapping[str, int]) -> Any:
+def _read_table(path: Path, columns: list[str], filters: list[tuple[str, str, int]]) -> Any:
     try:
         import pyarrow
-        from pyarrow import dataset
+        from pyarrow import parquet
     except ImportError as error:
         raise InputError(
             f"{quote_value(path)} is a parquet file, and pyarrow is not installed; run "
             "`pip install 'gscompleter[waymo]'`."
         ) from error
     check_file(path)
+    options = {"partitioning": None, "use_threads": False}
     try:
-        table = dataset.dataset(path, format="parquet")
-        absent = [name for name in (*columns, *where) if name not in table.schema.names]
-        if absent:
-            raise InputError(
-                f"{quote_value(path)} has no column {quote_value(absent[0])}; {ADVICE}."
-            )
-        keep = None
-        for column, value in where.items():
-            same = dataset.field(column) == value
-            keep = same if keep is None else keep & same
-        return table.to_table(columns, filter=keep, use_threads=False)
+        return parquet.read_table(path, columns=columns, filters=filters or None, **options)
     except (pyarrow.ArrowException, OSError, UnicodeDecodeError) as error:
         lines = str(error).strip().splitlines() or [type(error).__name__]
         raise InputError(
@@ -148,8 +138,7 @@ def _open_segment(segment: Segment) -> Photographs:
     file, cameras = segment.get_path(IMAGES), _read_cameras(segment)
     rows = segment.read_rows(IMAGES, (CAMERA, TIME, "pose.transform"))
     shown = sorted((row for row in rows if row[0] in CAMERAS), key=lambda row: row[:2])
-    if not shown:
-        raise InputError(f"{quote_value(file)} holds no photographs; {ADVICE}.")
+    require(shown, f"{quote_value(file)} holds no photographs; {ADVICE}.")
     frames = [_make_frame(segment, cameras, *row) for row in shown]
     return build_drive(segment.name, str(file), frames, front=CAMERAS[1])
 
@@ -159,8 +148,7 @@ def _make_frame(
 ) -> Frame:
     file, name = quote_value(segment.get_path(IMAGES)), CAMERAS[camera]
     title = f"the photograph of {name} at {time} in {file}"
-    if camera not in cameras:
-        raise InputError(f"The camera of {title} has no calibration; {ADVICE}.")
+    require(camera in cameras, f"The camera of {title} has no calibration; {ADVICE}.")
     intrinsics, vehicle_from_camera = cameras[camera]
     measured = segment.has_components("lidar", "lidar_calibration", "vehicle_pose")
     boxed = segment.has_components("lidar_box", "vehicle_pose")
@@ -177,35 +165,29 @@ def _make_frame(
 
 
 def _read_cameras(segment: Segment) -> dict[int, PosedLens]:
-    columns = (CAMERA, "extrinsic.transform", *LENS, *LENS_DISTORTION)
+    """Read the cameras by their numbers."""
+    columns, found = (CAMERA, "extrinsic.transform", *LENS), {}
     title = str(segment.get_path("camera_calibration"))
-    return {
-        camera: (_parse_intrinsics(numbers, title), _parse_matrix(pose, title))
-        for camera, pose, *numbers in segment.read_rows("camera_calibration", columns)
-    }
-
-
-def _parse_intrinsics(numbers: Sequence[Any], title: str) -> Intrinsics:
-    known = [number for number in numbers if number is not None and np.isfinite(number)]
-    if len(known) < len(numbers):
-        raise InputError(f"A camera in {title} lacks intrinsics; {ADVICE}.")
-    width, height, f_u, f_v, c_u, c_v, k1, k2, k3, p1, p2 = known
-    size = (int(width), int(height))
-    if not all(1 <= side <= MAX_SIDE for side in size):
-        raise InputError(f"A camera in {title} has images of {size} pixels; {ADVICE}.")
-    distortion = Distortion(radial=(k1, k2, k3), tangential=(p1, p2))
-    return Intrinsics(size, (f_u, f_v), (c_u, c_v), distortion=distortion)
+    for camera, pose, *numbers in segment.read_rows("camera_calibration", columns):
+        lens = np.array(numbers, dtype=np.float64)  # null becomes NaN
+        require(
+            np.isfinite(lens).all() and (lens[:2] >= 1).all() and (lens[:2] <= MAX_SIDE).all(),
+            f"Camera {camera} in {title} has no size or no intrinsics; {ADVICE}.",
+        )
+        width, height, f_u, f_v, c_u, c_v, k1, k2, k3, p1, p2 = lens.tolist()
+        distortion = Distortion(radial=(k1, k2, k3), tangential=(p1, p2))
+        size = (int(width), int(height))
+        intrinsics = Intrinsics(size, (f_u, f_v), (c_u, c_v), distortion=distortion)
+        found[camera] = intrinsics, _parse_matrix(pose, title)
+    return found
 
 
 def _read_image(segment: Segment, time: int, camera: int) -> bytes:
-    columns, where = ("image",), {TIME: time, CAMERA: camera}
-    found = [image for (image,) in segment.read_rows(IMAGES, columns, where)]
-    if len(found) != 1 or not isinstance(found[0], bytes):
-        raise InputError(
-            f"{quote_value(segment.get_path(IMAGES))} has no image of {CAMERAS[camera]} at "
-            f"{time}; {ADVICE}."
-        )
-    return found[0]
+    found = list(segment.read_rows(IMAGES, ("image",), {TIME: time, CAMERA: camera}))
+    title = f"{CAMERAS[camera]} at {time} in {quote_value(segment.get_path(IMAGES))}"
+    require(len(found) == 1 and found[0][0], f"The image of {title} is missing; {ADVICE}.")
+    image: bytes = found[0][0]
+    return image
 
 
 @lru_cache(maxsize=2)
@@ -219,49 +201,57 @@ def _read_points(segment: Segment, time: int) -> Float[np.ndarray, "n 3"]:
     poses = _read_range_images(segment, "lidar_pose", time) if turning else {}
     points = [np.zeros((0, 3))]
     for laser, image in _read_range_images(segment, "lidar", time).items():
+        title = f"laser {laser} of {quote_value(segment.get_path('lidar'))}"
+        require(laser in lasers, f"The {title} has no calibration; {ADVICE}.")
         ranges = image[..., 0]
-        beams, extrinsic = lasers.get(laser, ((None, None, None), np.eye(4)))
-        elevations = _compute_elevations(beams, len(ranges))
-        pose = build_poses(poses[laser]) if laser in poses else vehicle
-        if elevations is None or (pose.ndim > 2 and pose.shape[:2] != ranges.shape):
-            raise InputError(
-                f"Laser {laser} of {quote_value(segment.get_path('lidar'))} does not fit its "
-                f"calibration or its poses; {ADVICE}."
-            )
         hit = np.isfinite(ranges) & (ranges > 0)
-        local = compute_points(ranges, elevations, extrinsic)[hit]
-        points.append(transform_points(local, pose if pose.ndim == 2 else pose[hit]))
+        local = _compute_points(title, ranges, *lasers[laser])[hit]
+        pose = build_poses(poses[laser])[hit] if laser in poses else vehicle
+        points.append(transform_points(local, pose))
     return np.concatenate(points)
 
 
-def _compute_elevations(beams: Beams, height: int) -> Float[np.ndarray, "h"] | None:
-    """Compute the elevation of each row in radians, highest first; None if `beams` do not fit."""
-    values, low, high = beams
-    if values is not None:
-        return values[::-1] if len(values) == height else None
-    if low is None or high is None:
-        return None
-    return (low + (np.arange(height) + 0.5) / height * (high - low))[::-1]
+def _compute_points(
+    title: str,
+    ranges: Float[np.ndarray, "h w"],
+    extrinsic: Float[np.ndarray, "4 4"],
+    beams: Float[np.ndarray, "_"] | None,
+    low: float | None,
+    high: float | None,
+) -> Float[np.ndarray, "h w 3"]:
+    """Compute the points (metres) of a range image in the vehicle frame.
+
+    It has one row per beam, the highest first, and one column per direction. Columns begin behind
+    the laser and turn clockwise as seen from above. `beams` are the elevations in radians,
+    ascending, by default evenly spaced from `low` to `high`; `extrinsic` is the pose of the laser.
+    """
+    height, width = ranges.shape
+    if beams is None and low is not None and high is not None:
+        beams = low + (np.arange(height) + 0.5) / height * (high - low)
+    if beams is None or len(beams) != height:
+        raise InputError(f"The {title} does not fit its calibration; {ADVICE}.")
+    yaw = np.arctan2(extrinsic[1, 0], extrinsic[0, 0])
+    azimuths = np.pi * (1 - 2 * (np.arange(width) + 0.5) / width) - yaw
+    level, up = np.cos(beams[::-1, None]), np.sin(beams[::-1, None])
+    up = np.broadcast_to(up, ranges.shape)
+    rays = np.stack([level * np.cos(azimuths), level * np.sin(azimuths), up], axis=-1)
+    return transform_points(ranges[..., None] * rays, extrinsic)
 
 
 def _read_vehicle_pose(segment: Segment, time: int) -> Float[np.ndarray, "4 4"]:
-    title = str(segment.get_path("vehicle_pose"))
+    title = quote_value(segment.get_path("vehicle_pose"))
     columns = ("world_from_vehicle.transform",)
     rows = list(segment.read_rows("vehicle_pose", columns, {TIME: time}))
-    if len(rows) != 1:
-        raise InputError(f"{title} has {len(rows)} poses at {time}; {ADVICE}.")
+    require(len(rows) == 1, f"{title} has {len(rows)} poses at {time}; {ADVICE}.")
     return _parse_matrix(rows[0][0], title)
 
 
-def _read_lasers(segment: Segment) -> dict[int, tuple[Beams, Float[np.ndarray, "4 4"]]]:
-    """Read the beams of each laser, and its pose on the vehicle."""
+def _read_lasers(segment: Segment) -> dict[int, tuple[Any, ...]]:
+    """Read the pose of each laser on the vehicle, its beams, and their lower and upper end."""
     beams = (f"beam_inclination.{name}" for name in ("values", "min", "max"))
     rows = segment.read_rows("lidar_calibration", (LASER, "extrinsic.transform", *beams))
-    title = str(segment.get_path("lidar_calibration"))
-    return {
-        laser: ((values, low, high), _parse_matrix(pose, title))
-        for laser, pose, values, low, high in rows
-    }
+    title = quote_value(segment.get_path("lidar_calibration"))
+    return {laser: (_parse_matrix(pose, title), *rest) for laser, pose, *rest in rows}
 
 
 def _read_range_images(
@@ -269,14 +259,12 @@ def _read_range_images(
 ) -> dict[int, Float[np.ndarray, "h w c"]]:
     """Read the range image of the first returns, or the poses of its pixels, by laser."""
     columns = (LASER, "range_image_return1.values", "range_image_return1.shape")
-    found = {}
+    title, found = quote_value(segment.get_path(component)), {}
     for laser, values, shape in segment.read_rows(component, columns, {TIME: time}):
-        if values is None or shape is None:
-            continue
-        if len(shape) != 3 or any(side < 1 for side in shape) or len(values) != np.prod(shape):
-            file = quote_value(segment.get_path(component))
-            raise InputError(f"A range image in {file} is damaged; {ADVICE}.")
-        found[laser] = np.asarray(values, dtype=np.float64).reshape(shape)
+        if values is not None and shape is not None:
+            fits = len(shape) == 3 and min(shape) > 0 and len(values) == np.prod(shape)
+            require(fits, f"A range image in {title} is damaged; {ADVICE}.")
+            found[laser] = np.asarray(values, dtype=np.float64).reshape(shape)
     return found
 
 
@@ -287,15 +275,13 @@ def _read_boxes(segment: Segment, time: int) -> tuple[Box, ...]:
     columns = ["type", "box.heading", *(f"{name}.{axis}" for name in vectors for axis in "xyz")]
     boxes = []
     for kind, heading, *numbers in segment.read_rows("lidar_box", columns, {TIME: time}):
+        center, sides, velocity = np.array(numbers, dtype=np.float64).reshape(3, 3)
         if kind != SIGN:
-            center, sides, velocity = np.array(numbers, dtype=np.float64).reshape(3, 3)
-            pose = vehicle @ build_upright_pose(center, np.float64(heading))
-            length, width, height = sides.tolist()
-            boxes.append(Box(pose, (length, width, height), convert_speed(velocity)))
+            boxes.append(build_box(vehicle, center, sides, np.float64(heading), velocity))
     return tuple(boxes)
 
 
 def _parse_matrix(values: Any, title: str) -> Float[np.ndarray, "4 4"]:
-    if values is None or len(values) != 16 or not np.isfinite(values).all():
-        raise InputError(f"A transform in {title} is damaged; {ADVICE}.")
+    fits = values is not None and len(values) == 16 and np.isfinite(values).all()
+    require(fits, f"A transform in {title} is damaged; {ADVICE}.")
     return np.asarray(values, dtype=np.float64).reshape(4, 4)
