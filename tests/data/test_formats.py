@@ -195,9 +195,9 @@ def test_scenes_below_a_folder_are_named(tmp_path, monkeypatch, capsys):
     (parent / "out" / "summary.json").write_text("{}")  # a result of ours
     assert run(monkeypatch, "complete", parent, "--out", out, "--quiet") == 2
     said = capsys.readouterr().err
-    assert "is no scene itself, but holds 2 scenes below it: a, group/b; name one of them" in said
+    assert "is no scene itself, but holds 2 scene(s) below it: a, group/b; name one of them" in said
     assert len(said) < 300
-    with pytest.raises(InputError, match="holds 2 scenes below it: a, group/b"):
+    with pytest.raises(InputError, match=r"holds 2 scene\(s\) below it: a, group/b"):
         open_photographs(parent)
     assert not out.exists()
 
@@ -205,7 +205,7 @@ def test_scenes_below_a_folder_are_named(tmp_path, monkeypatch, capsys):
 def test_several_folders_of_photographs_without_cameras_are_named(tmp_path):
     for name in "abcdef":
         write_photographs(tmp_path / name / "images")
-    with pytest.raises(InputError, match="6 scenes below it: a, b, c, d and 2 more; name one"):
+    with pytest.raises(InputError, match=r"6 scene\(s\) below it: a, b, c, d and 2 more; name one"):
         open_photographs(tmp_path)
 
 

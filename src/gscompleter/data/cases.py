@@ -73,10 +73,9 @@ def open_cases(path: Path) -> Iterator[Photographs]:
     """
     cases = read_cases(path / NAME if os.path.isdir(path) else path)
     for scene in dict.fromkeys(case.scene for case in cases):
-        nears = [case.near for case in cases if case.scene == scene]
-        fars = [case.far for case in cases if case.scene == scene]
-        near = None if None in nears else min(n for n in nears if n is not None)
-        far = None if None in fars else max(f for f in fars if f is not None)
+        nears, fars = zip(*((c.near, c.far) for c in cases if c.scene == scene), strict=True)
+        near = None if None in nears else min(nears)
+        far = None if None in fars else max(fars)
         yield open_photographs(scene, near=near, far=far)
 
 

@@ -116,11 +116,10 @@ def _parse_scene(example: Any, path: Path, position: int) -> Photographs:
     called = f"scene {quote_value(name)} of {path}"
     if not (_is_dense(cameras, ndim=2) and cameras.is_floating_point() and cameras.shape[1] == 18):
         raise InputError(f"The `cameras` of the {called} are no floats of shape [n, 18].")
-    are_files = isinstance(images, list) and all(
-        _is_dense(image, ndim=1) and image.dtype == torch.uint8 for image in images
-    )
+    files = images if isinstance(images, list) else []
     require(
-        are_files and len(images) == len(cameras) > 0,
+        len(files) == len(cameras) > 0
+        and all(_is_dense(file, ndim=1) and file.dtype == torch.uint8 for file in files),
         f"The `images` of the {called} are no list of uint8 tensors, the bytes of a JPEG or PNG "
         f"file for each of {len(cameras)} cameras.",
     )
