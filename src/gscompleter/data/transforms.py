@@ -46,12 +46,6 @@ ANGLE_RANGE = (1e-5, 3.14159)
 
 Pair = tuple[float | None, float | None]
 
-INTRINSICS = (
-    *("camera_model", "is_fisheye", "w", "h", "fl_x", "fl_y", "cx", "cy"),
-    *("camera_angle_x", "camera_angle_y", "k1", "k2", "k3", "k4", "p1", "p2"),
-)
-"""Keys allowed at the top for all frames, or in a frame."""
-
 
 def has_transforms(path: Path) -> bool:
     """Check for a JSON object, or a folder with a `transforms.json`, whole or in parts."""
@@ -105,13 +99,12 @@ def read_frames(path: Path) -> list[Frame]:
     content = read_json(path, ADVICE)
     entries = get_part(content, "frames", list)
     require(entries, f"{path} lists no frames; its `frames` has to be a list with cameras.")
-    shared = {key: content[key] for key in INTRINSICS if key in content}
     unit = get_optional_number(content, "depth_unit_scale_factor", str(path), *DEPTH_RANGE) or 1e-3
-    return [_parse_frame(entry, i, shared, unit, path) for i, entry in enumerate(entries)]
+    return [_parse_frame(entry, i, content, unit, path) for i, entry in enumerate(entries)]
 
 
 def _parse_frame(
-    entry: Any, position: int, shared: Mapping[str, Any], depth_unit: float, path: Path
+    entry: Any, position: int, content: Mapping[str, Any], depth_unit: float, path: Path
 ) -> Frame:
     title = f"frame {position} of {path}"
     file_path = get_text(entry, "file_path", title)
@@ -128,7 +121,7 @@ def _parse_frame(
         name=file_path or str(position),
         title=title,
         c2w=np.vstack([c2w, [0, 0, 0, 1]]) if len(c2w) == 3 else c2w,
-        intrinsics=_parse_intrinsics({**shared, **entry}, title),
+        intrinsics=_parse_intrinsics({**content, **entry}, title),
         image=locate("file_path"),
         depth=None if depth is None else (depth, depth_unit),
         mask=locate("mask_path"),

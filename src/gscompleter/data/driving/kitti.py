@@ -203,30 +203,30 @@ def _parse_numbers(text: str) -> Numbers:
 def _find_poses(folder: Path) -> Path | None:
     sequence = folder.resolve()
     candidates = (folder / POSES, sequence.parent.parent / "poses" / f"{sequence.name}.txt")
-    return next((path for path in candidates if os.path.isfile(path)), None)
+    return next(filter(os.path.isfile, candidates), None)
 
 
 def _find_calibration(folder: Path, poses: Path) -> Path:
     renamed = poses.with_name(poses.name.replace("poses", "calib"))
-    for path in (folder / CALIBRATION, renamed):
-        if os.path.isfile(path) and path != poses:
-            return path
-    raise InputError(
+    found = [f for f in (folder / CALIBRATION, renamed) if os.path.isfile(f) and f != poses]
+    require(
+        found,
         f"{quote_value(poses)} holds poses only, and there is no {CALIBRATION} in "
-        f"{quote_value(folder)}; copy it there from the same sequence."
+        f"{quote_value(folder)}; copy it there from the same sequence.",
     )
+    return found[0]
 
 
 def _find_camera_folder(folder: Path) -> tuple[Path, int]:
-    for name, camera in CAMERAS.items():
-        if os.path.isdir(folder / name):
-            return folder / name, camera
-    raise InputError(
+    found = [name for name in CAMERAS if os.path.isdir(folder / name)]
+    require(
+        found,
         f"There are no photographs in {quote_value(folder)}; a folder image_2 or image_0 of the "
-        "same sequence is needed."
+        "same sequence is needed.",
     )
+    return folder / found[0], CAMERAS[found[0]]
 
 
 def _find_raw_camera(path: Path) -> str | None:
-    folders = {camera: path / f"image_{camera}" / "data" for camera in RAW_CAMERAS}
-    return next((c for c, folder in folders.items() if any(folder.glob("*.*"))), None)
+    shown = (c for c in RAW_CAMERAS if any((path / f"image_{c}" / "data").glob("*.*")))
+    return next(shown, None)

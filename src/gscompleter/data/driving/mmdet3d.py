@@ -25,8 +25,7 @@ from gscompleter.data.frame import Frame
 from gscompleter.data.json_fields import get_array, get_number, get_part, get_size, get_text
 from gscompleter.data.limits import require
 from gscompleter.data.photographs import Photographs, build_drive
-from gscompleter.errors import InputError, quote_value
-from gscompleter.io.reading import open_file
+from gscompleter.errors import quote_value
 
 ADVICE = "write the infos again with mmdetection3d 1.1"
 FRONT = "CAM_FRONT"
@@ -38,21 +37,13 @@ MICROSECONDS = 1e12
 """Smallest time that is in microseconds."""
 MAX_TIME = 1e18
 """Largest time in either unit."""
-MAX_SNIFFED = 4096
-"""Bytes at either end of a pickle to detect infos."""
 
 Pose = Float[np.ndarray, "4 4"]
 
 
 def has_infos(path: Path) -> bool:
-    """Check whether `path` is a pickle of infos."""
-    if path.suffix != ".pkl" or not os.path.isfile(path):
-        return False
-    with suppress(InputError), open_file(path) as file:
-        head = file.read(MAX_SNIFFED)
-        file.seek(max(os.path.getsize(path) - MAX_SNIFFED, 0))
-        return b"data_list" in head + file.read() or b"metainfo" in head
-    return False
+    """Check whether `path` is a pickle."""
+    return path.suffix == ".pkl" and os.path.isfile(path)
 
 
 def open_infos(path: Path) -> Iterator[Photographs]:

@@ -32,16 +32,6 @@ from gscompleter.io.reading import check_file
 
 ADVICE = "download it again"
 IMAGES = "camera_image"
-COMPONENTS = {
-    IMAGES: "CameraImageComponent",
-    "camera_calibration": "CameraCalibrationComponent",
-    "lidar": "LiDARComponent",
-    "lidar_calibration": "LiDARCalibrationComponent",
-    "lidar_pose": "LiDARPoseComponent",
-    "vehicle_pose": "VehiclePoseComponent",
-    "lidar_box": "LiDARBoxComponent",
-}
-"""Prefixes of the columns of each component."""
 TIME, CAMERA, LASER = "key.frame_timestamp_micros", "key.camera_name", "key.laser_name"
 INTRINSICS = ("f_u", "f_v", "c_u", "c_v", "k1", "k2", "k3", "p1", "p2")
 LENS = ("width", "height", *(f"intrinsic.{name}" for name in INTRINSICS))
@@ -98,15 +88,24 @@ class Segment:
         Only rows where the columns of `where` have these values are read. Lists of numbers become
         arrays; null becomes None.
         """
-        prefix = f"[{COMPONENTS[component]}]."
-        names = [name if name.startswith("key.") else prefix + name for name in columns]
-        filters = [(column, "==", value) for column, value in (where or {}).items()]
-        table = _read_table(self.get_path(component), names, filters)
+        path = self.get_path(component)
+        pyarrow, parquet = _import_pyarrow(path)
+        check_file(path)
+        filters = [(column, "==", value) for column, value in (where or {}).items()] or None
+        try:
+            stored = {name.rpartition("].")[2]: name for name in parquet.read_schema(path).names}
+            names = [stored.get(column, column) for column in columns]
+            table = parquet.read_table(path, columns=names, filters=filters, partitioning=None)
+        except (pyarrow.ArrowException, OSError, UnicodeDecodeError) as error:
+            lines = str(error).strip().splitlines() or [type(error).__name__]
+            raise InputError(
+                f"{quote_value(path)} cannot be read ({quote_value(lines[0])}); {ADVICE}."
+            ) from error
         values = [[_to_plain(value) for value in table.column(name)] for name in names]
         return zip(*values, strict=True)
 
 
-def _read_table(path: Path, columns: list[str], filters: list[tuple[str, str, int]]) -> Any:
+def _import_pyarrow(path: Path) -> tuple[Any, Any]:
     try:
         import pyarrow
         from pyarrow import parquet
@@ -115,15 +114,7 @@ def _read_table(path: Path, columns: list[str], filters: list[tuple[str, str, in
             f"{quote_value(path)} is a parquet file, and pyarrow is not installed; run "
             "`pip install 'gscompleter[waymo]'`."
         ) from error
-    check_file(path)
-    options = {"partitioning": None, "use_threads": False}
-    try:
-        return parquet.read_table(path, columns=columns, filters=filters or None, **options)
-    except (pyarrow.ArrowException, OSError, UnicodeDecodeError) as error:
-        lines = str(error).strip().splitlines() or [type(error).__name__]
-        raise InputError(
-            f"{quote_value(path)} cannot be read ({quote_value(lines[0])}); {ADVICE}."
-        ) from error
+    return pyarrow, parquet
 
 
 def _to_plain(scalar: Any) -> Any:
