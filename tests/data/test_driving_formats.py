@@ -16,8 +16,8 @@ from scipy.spatial.transform import Rotation
 
 from gscompleter import InputError
 from gscompleter.data.cases import open_clips
-from gscompleter.data.driving.lidar import read_sweep
 from gscompleter.data.driving.restricted_pickle import load_plain
+from gscompleter.data.driving.vehicle import read_sweep
 from gscompleter.data.formats import open_photographs
 from gscompleter.geometry import project
 

@@ -8,8 +8,7 @@ import torch
 
 from gscompleter import InputError
 from gscompleter.config import RefineConfig
-from gscompleter.data.driving.lidar import compute_sparse_depth
-from gscompleter.data.driving.moving_objects import Box, build_box, mask_moving
+from gscompleter.data.driving.vehicle import Box, build_box, compute_sparse_depth, mask_moving
 from gscompleter.data.formats import open_photographs
 from gscompleter.data.photographs import apply_masks
 from gscompleter.evaluation.metrics.scores import Truth, score

@@ -19,7 +19,7 @@ import numpy as np
 from jaxtyping import Float
 
 from gscompleter.data.cameras import Intrinsics
-from gscompleter.data.driving.lidar import MAX_SWEEP, transform_finite
+from gscompleter.data.driving.vehicle import MAX_SWEEP, transform_finite
 from gscompleter.data.frame import Frame
 from gscompleter.data.json_fields import (
     get_intrinsics,

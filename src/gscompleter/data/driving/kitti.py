@@ -21,7 +21,7 @@ import numpy as np
 from jaxtyping import Float
 
 from gscompleter.data.cameras import Intrinsics, find_pose_defect
-from gscompleter.data.driving.lidar import build_poses, read_sweep
+from gscompleter.data.driving.vehicle import build_poses, read_sweep
 from gscompleter.data.frame import Frame
 from gscompleter.data.limits import MAX_NUMBER, require
 from gscompleter.data.photographs import Photographs, build_drive, build_photographs

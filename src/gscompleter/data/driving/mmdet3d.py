@@ -19,8 +19,8 @@ import numpy as np
 from jaxtyping import Float
 
 from gscompleter.data.cameras import Intrinsics
-from gscompleter.data.driving.moving_objects import Box, build_box
 from gscompleter.data.driving.restricted_pickle import load_plain
+from gscompleter.data.driving.vehicle import Box, build_box
 from gscompleter.data.frame import Frame
 from gscompleter.data.json_fields import get_array, get_number, get_part, get_size, get_text
 from gscompleter.data.limits import require

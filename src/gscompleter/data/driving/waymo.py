@@ -21,8 +21,7 @@ import numpy as np
 from jaxtyping import Float
 
 from gscompleter.data.cameras import Intrinsics
-from gscompleter.data.driving.lidar import build_poses, transform_points
-from gscompleter.data.driving.moving_objects import Box, build_box
+from gscompleter.data.driving.vehicle import Box, build_box, build_poses, transform_points
 from gscompleter.data.frame import Frame
 from gscompleter.data.limits import MAX_SIDE, require
 from gscompleter.data.photographs import Photographs, build_drive
