@@ -289,7 +289,6 @@ def test_a_sequence_of_pandaset_begins_with_its_front_camera(tmp_path):
     assert center == pytest.approx([*POSE["position"].values()], abs=1e-6)
     (clip,) = open_clips(tmp_path / "002")
     assert len(clip) == 2
-    assert any("pandas pickles" in note for note in clip.notes)
 
 
 def test_a_sequence_of_pandaset_with_damaged_poses_is_refused(tmp_path):

@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import os
 from collections.abc import Iterator
-from dataclasses import replace
 from pathlib import Path
 
 from gscompleter.data.frame import Frame
@@ -21,10 +20,6 @@ from gscompleter.io.json_file import read_json
 FRONT = "front_camera"
 POSES = "poses.json"
 ADVICE = "copy the sequence again"
-NO_DEPTH = (
-    "The point clouds and boxes of PandaSet are not read, because they are pandas pickles, which "
-    "can run any code."
-)
 
 
 def has_pandaset(path: Path) -> bool:
@@ -41,8 +36,7 @@ def open_pandaset(path: Path) -> Iterator[Photographs]:
     cameras = sorted(files, key=lambda file: (file.parent.name != FRONT, file))
     frames = [frame for file in cameras for frame in _read_frames(file)]
     require(frames, f"There are no poses in {quote_value(path)}; {ADVICE}.")
-    found = build_drive(path.resolve().name, str(path), frames, front=FRONT)
-    yield replace(found, notes=(NO_DEPTH,))
+    yield build_drive(path.resolve().name, str(path), frames, front=FRONT)
 
 
 def _read_frames(file: Path) -> Iterator[Frame]:

@@ -12,7 +12,6 @@ from __future__ import annotations
 
 import os
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass
 from functools import lru_cache, partial
 from pathlib import Path
 from typing import Any
@@ -60,48 +59,40 @@ def open_waymo(path: Path) -> Iterator[Photographs]:
     Frames are numbered camera by camera, the front camera first, and by time.
     """
     files = sorted((path / IMAGES).glob("*.parquet")) if os.path.isdir(path) else [path]
-    return (_open_segment(Segment(file.parent.parent, file.stem)) for file in files)
+    return (_open_segment(file) for file in files)
 
 
-@dataclass(frozen=True)
-class Segment:
-    """Twenty seconds of one drive."""
+def _locate(segment: Path, component: str) -> Path:
+    """Return the file of a component; `segment` is that of the photographs."""
+    return segment.parent.parent / component / segment.name
 
-    root: Path
-    """Folder with a subfolder per component."""
-    name: str
 
-    def get_path(self, component: str) -> Path:
-        """Return the path of a component."""
-        return self.root / component / f"{self.name}.parquet"
+def _has_components(segment: Path, *components: str) -> bool:
+    return all(os.path.isfile(_locate(segment, component)) for component in components)
 
-    def has_components(self, *components: str) -> bool:
-        """Check whether all these components exist."""
-        return all(os.path.isfile(self.get_path(component)) for component in components)
 
-    def read_rows(
-        self, component: str, columns: Sequence[str], where: Mapping[str, int] | None = None
-    ) -> Iterator[tuple[Any, ...]]:
-        """Read columns of a component, named without its prefix, row by row.
+def _read_rows(
+    path: Path, columns: Sequence[str], where: Mapping[str, int] | None = None
+) -> Iterator[tuple[Any, ...]]:
+    """Read columns of a file, named without their prefix, row by row.
 
-        Only rows where the columns of `where` have these values are read. Lists of numbers become
-        arrays; null becomes None.
-        """
-        path = self.get_path(component)
-        pyarrow, parquet = _import_pyarrow(path)
-        check_file(path)
-        filters = [(column, "==", value) for column, value in (where or {}).items()] or None
-        try:
-            stored = {name.rpartition("].")[2]: name for name in parquet.read_schema(path).names}
-            names = [stored.get(column, column) for column in columns]
-            table = parquet.read_table(path, columns=names, filters=filters, partitioning=None)
-        except (pyarrow.ArrowException, OSError, UnicodeDecodeError) as error:
-            lines = str(error).strip().splitlines() or [type(error).__name__]
-            raise InputError(
-                f"{quote_value(path)} cannot be read ({quote_value(lines[0])}); {ADVICE}."
-            ) from error
-        values = [[_to_plain(value) for value in table.column(name)] for name in names]
-        return zip(*values, strict=True)
+    Only rows where the columns of `where` have these values are read. Lists of numbers become
+    arrays; null becomes None.
+    """
+    pyarrow, parquet = _import_pyarrow(path)
+    check_file(path)
+    filters = [(column, "==", value) for column, value in (where or {}).items()] or None
+    try:
+        stored = {name.rpartition("].")[2]: name for name in parquet.read_schema(path).names}
+        names = [stored.get(column, column) for column in columns]
+        table = parquet.read_table(path, columns=names, filters=filters, partitioning=None)
+    except (pyarrow.ArrowException, OSError, UnicodeDecodeError) as error:
+        lines = str(error).strip().splitlines() or [type(error).__name__]
+        raise InputError(
+            f"{quote_value(path)} cannot be read ({quote_value(lines[0])}); {ADVICE}."
+        ) from error
+    values = [[_to_plain(value) for value in table.column(name)] for name in names]
+    return zip(*values, strict=True)
 
 
 def _import_pyarrow(path: Path) -> tuple[Any, Any]:
@@ -124,24 +115,24 @@ def _to_plain(scalar: Any) -> Any:
     return scalar.as_py() if values is None else values.to_numpy(zero_copy_only=False)
 
 
-def _open_segment(segment: Segment) -> Photographs:
-    file, cameras = segment.get_path(IMAGES), _read_cameras(segment)
-    rows = segment.read_rows(IMAGES, (CAMERA, TIME, "pose.transform"))
+def _open_segment(segment: Path) -> Photographs:
+    cameras = _read_cameras(_locate(segment, "camera_calibration"))
+    rows = _read_rows(segment, (CAMERA, TIME, "pose.transform"))
     shown = sorted((row for row in rows if row[0] in CAMERAS), key=lambda row: row[:2])
-    require(shown, f"{quote_value(file)} holds no photographs; {ADVICE}.")
+    require(shown, f"{quote_value(segment)} holds no photographs; {ADVICE}.")
     frames = [_make_frame(segment, cameras, *row) for row in shown]
-    return build_drive(segment.name, str(file), frames, front=CAMERAS[1])
+    return build_drive(segment.stem, str(segment), frames, front=CAMERAS[1])
 
 
 def _make_frame(
-    segment: Segment, cameras: dict[int, PosedLens], camera: int, time: int, pose: Any
+    segment: Path, cameras: dict[int, PosedLens], camera: int, time: int, pose: Any
 ) -> Frame:
-    file, name = quote_value(segment.get_path(IMAGES)), CAMERAS[camera]
-    title = f"the photograph of {name} at {time} in {file}"
+    name = CAMERAS[camera]
+    title = f"the photograph of {name} at {time} in {quote_value(segment)}"
     require(camera in cameras, f"The camera of {title} has no calibration; {ADVICE}.")
     intrinsics, vehicle_from_camera = cameras[camera]
-    measured = segment.has_components("lidar", "lidar_calibration", "vehicle_pose")
-    boxed = segment.has_components("lidar_box", "vehicle_pose")
+    measured = _has_components(segment, "lidar", "lidar_calibration", "vehicle_pose")
+    boxed = _has_components(segment, "lidar_box", "vehicle_pose")
     return Frame(
         f"{name}/{time}",
         title,
@@ -154,11 +145,10 @@ def _make_frame(
     )
 
 
-def _read_cameras(segment: Segment) -> dict[int, PosedLens]:
+def _read_cameras(path: Path) -> dict[int, PosedLens]:
     """Read the cameras by their numbers."""
-    columns, found = (CAMERA, "extrinsic.transform", *LENS), {}
-    title = str(segment.get_path("camera_calibration"))
-    for camera, pose, *numbers in segment.read_rows("camera_calibration", columns):
+    title, found = quote_value(path), {}
+    for camera, pose, *numbers in _read_rows(path, (CAMERA, "extrinsic.transform", *LENS)):
         lens = np.array(numbers, dtype=np.float64)  # null becomes NaN
         require(
             np.isfinite(lens).all() and (lens[:2] >= 1).all() and (lens[:2] <= MAX_SIDE).all(),
@@ -172,31 +162,33 @@ def _read_cameras(segment: Segment) -> dict[int, PosedLens]:
     return found
 
 
-def _read_image(segment: Segment, time: int, camera: int) -> bytes:
-    found = list(segment.read_rows(IMAGES, ("image",), {TIME: time, CAMERA: camera}))
-    title = f"{CAMERAS[camera]} at {time} in {quote_value(segment.get_path(IMAGES))}"
+def _read_image(segment: Path, time: int, camera: int) -> bytes:
+    found = list(_read_rows(segment, ("image",), {TIME: time, CAMERA: camera}))
+    title = f"{CAMERAS[camera]} at {time} in {quote_value(segment)}"
     require(len(found) == 1 and found[0][0], f"The image of {title} is missing; {ADVICE}.")
     image: bytes = found[0][0]
     return image
 
 
 @lru_cache(maxsize=2)
-def _read_points(segment: Segment, time: int) -> Float[np.ndarray, "n 3"]:
+def _read_points(segment: Path, time: int) -> Float[np.ndarray, "n 3"]:
     """Read the first laser returns in the world frame, in metres.
 
     The roof laser rotates while the vehicle drives; `lidar_pose` has the vehicle pose per pixel.
     """
-    vehicle, lasers = _read_vehicle_pose(segment, time), _read_lasers(segment)
-    turning = segment.has_components("lidar_pose")
-    poses = _read_range_images(segment, "lidar_pose", time) if turning else {}
+    vehicle = _read_vehicle_pose(_locate(segment, "vehicle_pose"), time)
+    lasers = _read_lasers(_locate(segment, "lidar_calibration"))
+    measured, turning = _locate(segment, "lidar"), _locate(segment, "lidar_pose")
+    poses = _read_range_images(turning, time) if os.path.isfile(turning) else {}
     points = [np.zeros((0, 3))]
-    for laser, image in _read_range_images(segment, "lidar", time).items():
-        title = f"laser {laser} of {quote_value(segment.get_path('lidar'))}"
-        require(laser in lasers, f"The {title} has no calibration; {ADVICE}.")
-        ranges = image[..., 0]
+    for laser, image in _read_range_images(measured, time).items():
+        title = f"laser {laser} of {quote_value(measured)}"
+        ranges, moving = image[..., 0], poses.get(laser)
+        fits = laser in lasers and (moving is None or moving.shape == (*ranges.shape, 6))
+        require(fits, f"The {title} does not fit its calibration or its poses; {ADVICE}.")
         hit = np.isfinite(ranges) & (ranges > 0)
         local = _compute_points(title, ranges, *lasers[laser])[hit]
-        pose = build_poses(poses[laser])[hit] if laser in poses else vehicle
+        pose = vehicle if moving is None else build_poses(moving[hit])
         points.append(transform_points(local, pose))
     return np.concatenate(points)
 
@@ -228,43 +220,37 @@ def _compute_points(
     return transform_points(ranges[..., None] * rays, extrinsic)
 
 
-def _read_vehicle_pose(segment: Segment, time: int) -> Float[np.ndarray, "4 4"]:
-    title = quote_value(segment.get_path("vehicle_pose"))
-    columns = ("world_from_vehicle.transform",)
-    rows = list(segment.read_rows("vehicle_pose", columns, {TIME: time}))
-    require(len(rows) == 1, f"{title} has {len(rows)} poses at {time}; {ADVICE}.")
-    return _parse_matrix(rows[0][0], title)
+def _read_vehicle_pose(path: Path, time: int) -> Float[np.ndarray, "4 4"]:
+    rows = list(_read_rows(path, ("world_from_vehicle.transform",), {TIME: time}))
+    require(len(rows) == 1, f"{quote_value(path)} has {len(rows)} poses at {time}; {ADVICE}.")
+    return _parse_matrix(rows[0][0], quote_value(path))
 
 
-def _read_lasers(segment: Segment) -> dict[int, tuple[Any, ...]]:
+def _read_lasers(path: Path) -> dict[int, tuple[Any, ...]]:
     """Read the pose of each laser on the vehicle, its beams, and their lower and upper end."""
     beams = (f"beam_inclination.{name}" for name in ("values", "min", "max"))
-    rows = segment.read_rows("lidar_calibration", (LASER, "extrinsic.transform", *beams))
-    title = quote_value(segment.get_path("lidar_calibration"))
-    return {laser: (_parse_matrix(pose, title), *rest) for laser, pose, *rest in rows}
+    rows = _read_rows(path, (LASER, "extrinsic.transform", *beams))
+    return {laser: (_parse_matrix(pose, quote_value(path)), *rest) for laser, pose, *rest in rows}
 
 
-def _read_range_images(
-    segment: Segment, component: str, time: int
-) -> dict[int, Float[np.ndarray, "h w c"]]:
+def _read_range_images(path: Path, time: int) -> dict[int, Float[np.ndarray, "h w c"]]:
     """Read the range image of the first returns, or the poses of its pixels, by laser."""
-    columns = (LASER, "range_image_return1.values", "range_image_return1.shape")
-    title, found = quote_value(segment.get_path(component)), {}
-    for laser, values, shape in segment.read_rows(component, columns, {TIME: time}):
+    columns, found = (LASER, "range_image_return1.values", "range_image_return1.shape"), {}
+    for laser, values, shape in _read_rows(path, columns, {TIME: time}):
         if values is not None and shape is not None:
             fits = len(shape) == 3 and min(shape) > 0 and len(values) == np.prod(shape)
-            require(fits, f"A range image in {title} is damaged; {ADVICE}.")
+            require(fits, f"A range image in {quote_value(path)} is damaged; {ADVICE}.")
             found[laser] = np.asarray(values, dtype=np.float64).reshape(shape)
     return found
 
 
-def _read_boxes(segment: Segment, time: int) -> tuple[Box, ...]:
+def _read_boxes(segment: Path, time: int) -> tuple[Box, ...]:
     """Read the boxes of objects around the vehicle, except signs."""
-    vehicle = _read_vehicle_pose(segment, time)
+    vehicle = _read_vehicle_pose(_locate(segment, "vehicle_pose"), time)
     vectors = ("box.center", "box.size", "speed")
     columns = ["type", "box.heading", *(f"{name}.{axis}" for name in vectors for axis in "xyz")]
-    boxes = []
-    for kind, heading, *numbers in segment.read_rows("lidar_box", columns, {TIME: time}):
+    rows, boxes = _read_rows(_locate(segment, "lidar_box"), columns, {TIME: time}), []
+    for kind, heading, *numbers in rows:
         center, sides, velocity = np.array(numbers, dtype=np.float64).reshape(3, 3)
         if kind != SIGN:
             boxes.append(build_box(vehicle, center, sides, np.float64(heading), velocity))
