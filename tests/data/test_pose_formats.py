@@ -314,6 +314,22 @@ def test_kitti_says_what_is_missing(tmp_path):
         open_photographs(scene)
 
 
+@pytest.mark.parametrize(
+    ("file", "text", "sentence"),
+    [
+        ("poses.txt", "", "poses.txt holds no poses"),
+        ("poses.txt", "1 2 3\n", "poses.txt has no line 0 of 12 numbers"),
+        ("calib.txt", "", "calib.txt has no line 2 of 12 numbers"),
+        ("calib.txt", "P2: 1 0 0 0 0 1 0 0 1 0 1 0\n", "not that of a rectified camera"),
+    ],
+)
+def test_a_damaged_sequence_of_kitti_is_refused(tmp_path, file, text, sentence):
+    scene = kitti(tmp_path / "room")
+    (scene / file).write_text(text)
+    with pytest.raises(InputError, match=sentence):
+        open_photographs(scene)
+
+
 def test_dgp_says_what_is_missing(tmp_path):
     scene = dgp(tmp_path / "room")
     path = scene / "scene_1.json"

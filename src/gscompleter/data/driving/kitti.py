@@ -51,7 +51,7 @@ def has_kitti(path: Path) -> bool:
         return False
     line, _, _ = read_head(path, MAX_LINE).partition(b"\n")
     first = _parse_numbers(line.decode("utf-8-sig", errors="replace"))
-    return len(first) == 12 and find_pose_defect(_get_matrix({"": first}, "", path)) is None
+    return len(first) == 12 and find_pose_defect(_complete(first)) is None
 
 
 def open_kitti(path: Path) -> Iterator[Photographs]:
@@ -75,6 +75,7 @@ def open_kitti(path: Path) -> Iterator[Photographs]:
     intrinsics, first_from_camera = _split_projection(projection, calibration)
     lasers = [_get_matrix(entries, label, calibration) for label in entries if label[:2] == "Tr"]
     frames, rows = [], _read_entries(poses)
+    require(rows, f"{quote_value(poses)} holds no poses; copy it again.")
     for number, row in enumerate(rows):
         name, title = f"{number:06d}", f"frame {number} of {quote_value(poses)}"
         first = _get_matrix(rows, row, poses)
@@ -187,8 +188,12 @@ def _get_entry(entries: Mapping[str, Numbers], label: str, count: int, path: Pat
 
 
 def _get_matrix(entries: Mapping[str, Numbers], label: str, path: Path) -> Pose:
-    """Return a matrix of which the file holds the upper 3×4."""
-    return np.vstack([_get_entry(entries, label, 12, path).reshape(3, 4), [0, 0, 0, 1]])
+    return _complete(_get_entry(entries, label, 12, path))
+
+
+def _complete(numbers: Numbers) -> Pose:
+    """Complete the upper 3×4 of a matrix."""
+    return np.vstack([numbers.reshape(3, 4), [0, 0, 0, 1]])
 
 
 def _parse_numbers(text: str) -> Numbers:
