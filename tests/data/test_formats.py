@@ -79,24 +79,6 @@ def test_a_data_set_of_chunks_is_opened_by_its_folder_or_index(tmp_path):
         assert [clip.name for clip in open_clips(path)] == ["a", "b", "c"]
 
 
-def test_cases_are_opened_with_the_planes_that_enclose_theirs(tmp_path):
-    save_scene(tmp_path / "p")
-    save_scene(tmp_path / "q")
-    rows = [
-        {"scene": "q", "context": [0, 1], "target": 2, "near": 1.0, "far": 9.0},
-        {"scene": "p", "context": [0, 1], "target": 2, "near": 1.0, "far": 9.0},
-        {"scene": "q", "context": [1, 2], "target": 3, "near": 0.5, "far": 8.0},
-        {"scene": "p", "context": [1, 2], "target": 3},
-    ]
-    (tmp_path / "cases.json").write_text(json.dumps({"resolution": [32, 32], "cases": rows}))
-    for path in (tmp_path, tmp_path / "cases.json"):
-        q, p = open_clips(path)
-        assert (q.name, p.name) == ("q", "p")
-        (camera,) = [view.camera for view in q.views([0])]
-        assert (camera.near, camera.far) == (0.5, 9.0)
-        assert p.views([0])[0].camera.near is None
-
-
 def test_what_is_no_clip_is_told_what_would_be_one(tmp_path):
     (tmp_path / "a.json").write_text("{}")
     (tmp_path / "a.png").write_bytes(b"")
@@ -110,7 +92,7 @@ def test_what_is_no_clip_is_told_what_would_be_one(tmp_path):
         open_clips(tmp_path / "missing")
     (tmp_path / "a.json").write_text("{")
     with pytest.raises(InputError, match="is not JSON"):
-        open_clips(tmp_path / "a.json")
+        next(open_clips(tmp_path / "a.json"))
 
 
 def test_a_missing_photograph_is_named_when_asked_for(tmp_path):
