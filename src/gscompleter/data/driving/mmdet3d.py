@@ -124,7 +124,7 @@ def _make_frame(path: Path, camera: str, time: float, image: Any, world_from_las
     file = get_text(image, "img_path", title) or ""
     camera_from_laser = get_array(image, "lidar2cam", title, (4, 4))
     c2w = np.full((4, 4), np.nan)  # stays where the pose is singular, which is a defect of it
-    with suppress(np.linalg.LinAlgError):
+    with np.errstate(all="ignore"), suppress(np.linalg.LinAlgError):
         # Through the laser frame: lidar2cam includes the vehicle's motion between the
         # times of laser and camera.
         c2w = world_from_laser @ np.linalg.inv(camera_from_laser)
