@@ -48,10 +48,7 @@ def open_chunks(path: Path) -> Iterator[Photographs]:
         return _open_chunk(path)
     folder = path.parent if path.name == INDEX else _find_folder(path)
     if folder is None:
-        raise InputError(
-            f"There are no chunks in {path}; name a folder with an {INDEX} or .torch files, a "
-            f"folder with such a folder {TEST}, or a single .torch file."
-        )
+        raise InputError(f"There are no chunks in {path}; name a .torch file, or a folder of such.")
     files = _list_chunks(folder / INDEX) or sorted(folder.glob("*.torch"))
     return (scene for file in files for scene in _open_chunk(file))
 

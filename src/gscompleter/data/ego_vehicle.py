@@ -69,7 +69,7 @@ def attach_vehicle_detector(frames: Sequence[Frame]) -> tuple[Frame, ...]:
     return tuple(replace(f, vehicle=seen[f.sensor, f.intrinsics]) for f in frames)
 
 
-@lru_cache(maxsize=16)
+@lru_cache(maxsize=64)
 def detect_vehicle(frames: tuple[Frame, ...]) -> Bool[np.ndarray, "h w"] | None:
     """Mask the vehicle in a small copy of the photographs of one of its cameras, if it is seen."""
     usable = [f for f in frames if find_pose_defect(f.c2w) is None and f.has_photograph()]

@@ -39,11 +39,11 @@ def add_depth_range(
     if points is None:
         return photographs
     found = compute_depth_range(points, [photographs.camera(f, resolution) for f in frames])
-    near, far = found or (None, None)
-    near = near if photographs.near is None else photographs.near
-    far = far if photographs.far is None else photographs.far
-    empty = near is not None and far is not None and near >= far
-    return photographs if empty else replace(photographs, near=near, far=far)
+    if found is None:
+        return photographs
+    near = found[0] if photographs.near is None else photographs.near
+    far = found[1] if photographs.far is None else photographs.far
+    return photographs if near >= far else replace(photographs, near=near, far=far)
 
 
 def compute_depth_range(
