@@ -94,12 +94,6 @@ def test_infos_with_something_else_in_a_place_are_refused(tmp_path, place, value
     sentence(write_infos(tmp_path, replaced(PLACES[place], value)))
 
 
-@pytest.mark.parametrize("value", [None, [[1], [1, 2]], [[]], {}, {"car": [1]}, {1: 2}], ids=str)
-def test_categories_of_infos_may_be_anything(tmp_path, value):
-    read(write_infos(tmp_path, replaced(("metainfo", "categories"), value)))
-    read(write_infos(tmp_path, replaced(("data_list", 0, "instances", 0, "bbox_label_3d"), value)))
-
-
 @pytest.mark.parametrize("value", [endless(), repeated(9), deep(70)], ids=["own", "wide", "deep"])
 @pytest.mark.parametrize("place", [("data_list", 0, "ego2global"), ("metainfo",), ("other",)])
 def test_infos_without_end_are_refused_before_they_are_walked(tmp_path, place, value):
@@ -115,12 +109,9 @@ def test_a_key_that_overflows_the_stack_when_it_is_hashed_is_no_key(tmp_path):
         load_plain(path)
 
 
-@pytest.mark.parametrize(
-    "code", [b"\x80\x02\x8f.", b"\x80\x02cnumpy\ndtype\n}X\x01\0\0\0aK\x01sb."]
-)
-def test_a_pickle_makes_no_sets_and_changes_no_class(tmp_path, code):
+def test_a_pickle_changes_no_class(tmp_path):
     path = tmp_path / "infos.pkl"
-    path.write_bytes(code)
+    path.write_bytes(b"\x80\x02cnumpy\ndtype\n}X\x01\0\0\0aK\x01sb.")
     with pytest.raises(InputError, match="is no pickle of plain values"):
         load_plain(path)
 
@@ -174,7 +165,7 @@ def test_a_chunk_that_claims_more_than_there_is_room_for_is_refused(tmp_path):
     claimed = data.replace(b"M" + count.to_bytes(2, "little"), b"\x8a\x06" + b"\xff" * 5 + b"\x7f")
     assert claimed != data
     path.write_bytes(claimed)
-    assert "needs more memory" in sentence(path)
+    assert "or too large" in sentence(path)
 
 
 def test_cameras_that_were_trained_are_read(tmp_path):

@@ -208,6 +208,10 @@ def test_an_invalid_pose_gives_no_view(tmp_path):
 # Damaged chunks.
 
 
+NO_CAMERAS = r"`cameras` of the scene room of .*000000.torch are no floats of shape \[n, 18\]"
+NO_IMAGES = r"`images` of the scene room of .*000000.torch are no list of uint8 tensors"
+
+
 def without(key):
     return {k: v for k, v in example().items() if k != key}
 
@@ -216,25 +220,22 @@ def without(key):
     ("bad", "sentence"),
     [
         (without("key"), "Scene 0 of .*000000.torch has no `key`"),
-        (without("cameras"), "`cameras` of the scene room of .*000000.torch are of type NoneType"),
-        (without("images"), "`images` of the scene room of .*000000.torch are no list"),
+        (without("cameras"), NO_CAMERAS),
+        (without("images"), NO_IMAGES),
         ({**example(), "key": 3}, "Scene 0 of .* has no `key`"),
         ([1, 2], "Scene 0 of .* has no `key`"),
-        ({**example(), "cameras": torch.zeros(5, 12)}, r"room of .* float32 of shape \[5, 12\]"),
-        ({**example(), "cameras": torch.zeros(90)}, r"room of .* float32 of shape \[90\]"),
-        ({**example(), "cameras": torch.zeros(5, 18).long()}, "room of .* are int64 of shape"),
-        ({**example(), "cameras": [1.0]}, "room of .* of type list"),
-        ({**example(), "cameras": torch.zeros(4, 18)}, "room of .* 5 images and 4 cameras"),
-        ({**example(), "cameras": torch.zeros(5, 18).to_sparse()}, "room of .* sparse or empty"),
-        ({**example(), "cameras": torch.zeros(5, 18, device="meta")}, "room of .* sparse or empty"),
-        ({**example(), "images": [torch.zeros(9).byte().to_sparse()] * 5}, "is sparse or empty"),
-        ({**example(), "images": []}, "`images` of the scene room of .* are no list with images"),
-        ({**example(), "images": torch.zeros(5)}, "`images` of the scene room of .* are no list"),
-        (
-            {**example(), "images": [torch.zeros(2, 2)] * 5},
-            r"Image 0 of the scene room of .* is float32 of shape \[2, 2\]",
-        ),
-        ({**example(), "images": ["x"] * 5}, "Image 0 of the scene room of .* is of type str"),
+        ({**example(), "cameras": torch.zeros(5, 12)}, NO_CAMERAS),
+        ({**example(), "cameras": torch.zeros(90)}, NO_CAMERAS),
+        ({**example(), "cameras": torch.zeros(5, 18).long()}, NO_CAMERAS),
+        ({**example(), "cameras": [1.0]}, NO_CAMERAS),
+        ({**example(), "cameras": torch.zeros(4, 18)}, "for each of 4 cameras"),
+        ({**example(), "cameras": torch.zeros(5, 18).to_sparse()}, NO_CAMERAS),
+        ({**example(), "cameras": torch.zeros(5, 18, device="meta")}, NO_CAMERAS),
+        ({**example(), "images": [torch.zeros(9).byte().to_sparse()] * 5}, NO_IMAGES),
+        ({**example(), "images": []}, NO_IMAGES),
+        ({**example(), "images": torch.zeros(5)}, NO_IMAGES),
+        ({**example(), "images": [torch.zeros(2, 2)] * 5}, NO_IMAGES),
+        ({**example(), "images": ["x"] * 5}, NO_IMAGES),
     ],
 )
 def test_a_scene_that_is_wrong_is_named(tmp_path, bad, sentence):
@@ -285,7 +286,7 @@ def test_files_that_are_no_chunks_are_named(tmp_path):
     cuts = {f"cut{n}.torch": whole[:n] for n in (0, 1, 100, len(whole) // 2, len(whole) - 10)}
     for name, data in {**cuts, "text.torch": b"hello world"}.items():
         (tmp_path / name).write_bytes(data)
-        with pytest.raises(InputError, match=f"{name} is truncated or no file of torch.save"):
+        with pytest.raises(InputError, match=f"{name} is truncated, no file of torch.save, or too"):
             list(open_chunks(tmp_path / name))
     (tmp_path / "p.torch").write_text("version https://git-lfs.github.com/spec/v1\noid sha256:0\n")
     with pytest.raises(InputError, match="p.torch is a git-lfs pointer"):
@@ -294,21 +295,13 @@ def test_files_that_are_no_chunks_are_named(tmp_path):
     with pytest.raises(InputError, match="a list of scenes is needed, and it holds dict"):
         list(open_chunks(tmp_path / "dict.torch"))
     torch.save([], tmp_path / "empty.torch")
-    with pytest.raises(InputError, match="a list of scenes is needed, and it holds none"):
+    with pytest.raises(InputError, match="a list of scenes is needed, and it holds list"):
         list(open_chunks(tmp_path / "empty.torch"))
 
 
-def test_an_index_that_disagrees_with_the_chunks_is_named(tmp_path):
+def test_a_missing_chunk_of_an_index_is_named(tmp_path):
     root = save_dataset(tmp_path / "data")
-    path = root / "test" / "index.json"
-    listed = json.loads(path.read_text())
-    path.write_text(json.dumps({**listed, "z": "000001.torch"}))
-    with pytest.raises(InputError, match=r"index.json lists the scene z, .*000001.torch"):
-        list(open_chunks(root))
-    path.write_text(json.dumps({"a": "000000.torch"}))
-    with pytest.raises(InputError, match=r"000000.torch lists the scene b, which is absent from"):
-        list(open_chunks(root))
-    path.write_text(json.dumps({"a": "000007.torch"}))
+    (root / "test" / "index.json").write_text(json.dumps({"a": "000007.torch"}))
     with pytest.raises(InputError, match=r"000007.torch cannot be read: No such file"):
         list(open_chunks(root))
 

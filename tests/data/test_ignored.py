@@ -2,13 +2,13 @@
 
 from dataclasses import replace
 
+import numpy as np
 import pytest
 import torch
 
 from gscompleter import InputError
 from gscompleter.config import RefineConfig
-from gscompleter.data.driving.lidar import compute_sparse_depth
-from gscompleter.data.driving.moving_objects import Box, build_upright_pose, mask_moving
+from gscompleter.data.driving.vehicle import Box, build_box, compute_sparse_depth, mask_moving
 from gscompleter.data.formats import open_photographs
 from gscompleter.data.photographs import apply_masks
 from gscompleter.evaluation.metrics.scores import Truth, score
@@ -149,9 +149,9 @@ def test_masks_of_files_are_ignored_where_asked(tmp_path):
         apply_masks(masked.views([1]), masked)
 
 
-def box_at(center: tuple[float, ...], side: float, speed: float | None, turn: float = 0.0) -> Box:
-    pose = build_upright_pose(torch.tensor(center, dtype=torch.float64).numpy(), turn)
-    return Box(pose, (side, side, side), speed)
+def box_at(center: tuple[float, ...], side: float, speed: float, turn: float = 0.0) -> Box:
+    velocity = np.array([speed, 0.0])
+    return build_box(np.eye(4), np.array(center), np.full(3, side), turn, velocity)
 
 
 def test_a_box_covers_its_outline():
@@ -169,7 +169,7 @@ def test_a_box_covers_its_outline():
     ("center", "speed", "share"),
     [
         ((0.0, 0.0, 3.0), 0.2, 0.0),
-        ((0.0, 0.0, 3.0), None, 0.03),
+        ((0.0, 0.0, 3.0), np.nan, 0.03),
         ((0.0, 0.0, -3.0), 3.0, 0.0),
         ((0.0, 0.0, 0.2), 3.0, 0.99),
         ((1e7, 0.0, 3.0), 3.0, 0.0),

@@ -71,7 +71,7 @@ def to(**values):
         (to(k1=1e300), "`k1` of frame 0.png"),
         (to(w=10**9), "`w` of frame 0.png"),
         (to(camera_angle_x=1e-300), "`camera_angle_x` of frame 0.png"),
-        (at(0, 1e300), "pose holds 1e+300"),
+        (at(0, 1e300), "`transform_matrix` of frame 0.png"),
         (at(2, -1e10), "pose holds 1e+10"),
         (to(camera_model="X" * 100_000), "camera model 'XXX"),
         (to(file_path="0" * 100_000), "`file_path` of frame 0"),

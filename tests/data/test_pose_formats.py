@@ -125,10 +125,10 @@ def test_poses_of_supersplat_show_the_room_upright(tmp_path, project):
     ("content", "sentence"),
     [
         ([], "lists no cameras"),
-        ([3], "Camera 0 of .* is no object"),
+        ([3], "`fx` of camera 0 .* missing"),
         ([{"position": [0, 0, 0]}], "`fx` of camera 0 .* missing"),
         ({"poseSets": []}, "holds no poses"),
-        ({"poseSets": [{"poses": [3]}]}, "Pose 0 of .* is no object"),
+        ({"poseSets": [{"poses": [3]}]}, "`position` of pose 0 .* 3 numbers"),
         ([{"position": [0, 0, 0], "target": [0, 0]}], "`target` of pose 0 .* 3 numbers"),
         ([{"position": [0, 0, 0], "target": [0, 9, 0]}], "NaN"),
         ([{"position": [0, 0, 0], "target": [0, 0, 1], "fov": 180}], "`fov` of pose 0"),
@@ -269,10 +269,10 @@ def test_rows_of_llff_need_as_many_photographs(tmp_path):
     [
         (np.zeros((5, 15)), r"shape \[5, 15\], where a row of 17"),
         (np.zeros((0, 17)), r"shape \[0, 17\]"),
-        (np.zeros((5, 17), dtype=complex), "complex128"),
+        (np.zeros((5, 17), dtype=complex), "is no array of real numbers"),
         (np.zeros((5, 17)), "are no z-depths, nearest first"),
-        (np.array([["a"]]), "where a row of 17"),
-        (np.array([None]), "is no array of numbers"),
+        (np.array([["a"]]), "is no array of real numbers"),
+        (np.array([None]), "is no array of real numbers"),
     ],
 )
 def test_a_wrong_array_of_llff_is_refused(tmp_path, array, sentence):
@@ -288,7 +288,7 @@ def test_an_array_of_llff_that_claims_more_than_its_file_is_refused(tmp_path):
     for claim in (b"(5000000000, 17)", b"(6, 17)"):
         (scene / "poses_bounds.npy").write_bytes(content.replace(b"(5, 17)" + b" " * 12, claim))
         if claim in (scene / "poses_bounds.npy").read_bytes():
-            with pytest.raises(InputError, match="is no array of numbers"):
+            with pytest.raises(InputError, match="is no array of real numbers"):
                 open_photographs(scene)
 
 
@@ -311,6 +311,22 @@ def test_kitti_says_what_is_missing(tmp_path):
     with pytest.raises(InputError, match=r"poses only, and there is no calib.txt"):
         open_photographs(scene / "poses.txt")
     with pytest.raises(InputError, match="no posed photographs"):
+        open_photographs(scene)
+
+
+@pytest.mark.parametrize(
+    ("file", "text", "sentence"),
+    [
+        ("poses.txt", "", "poses.txt holds no poses"),
+        ("poses.txt", "1 2 3\n", "poses.txt has no line 0 of 12 numbers"),
+        ("calib.txt", "", "calib.txt has no line 2 of 12 numbers"),
+        ("calib.txt", "P2: 1 0 0 0 0 1 0 0 1 0 1 0\n", "not that of a rectified camera"),
+    ],
+)
+def test_a_damaged_sequence_of_kitti_is_refused(tmp_path, file, text, sentence):
+    scene = kitti(tmp_path / "room")
+    (scene / file).write_text(text)
+    with pytest.raises(InputError, match=sentence):
         open_photographs(scene)
 
 

@@ -230,9 +230,9 @@ def projective_pose() -> np.ndarray:
         (turned(20) @ np.diag([-1, 1, 1, 1]), "reflection"),
         (np.full((4, 4), math.nan), "NaN"),
         (np.zeros((4, 4)), "not a rigid transform"),
-        (np.eye(3), "no 3×4 or 4×4 matrix"),
-        ("identity", "no 3×4 or 4×4 matrix"),
-        ([[1, 0, 0, 0], [0, 1], [0, 0, 1, 0]], "no 3×4 or 4×4 matrix"),
+        (np.eye(3), "no list of 3 × 4 or 4 × 4 numbers"),
+        ("identity", "no list of 3 × 4 or 4 × 4 numbers"),
+        ([[1, 0, 0, 0], [0, 1], [0, 0, 1, 0]], "no list of 3 × 4 or 4 × 4 numbers"),
     ],
 )
 def test_a_pose_that_is_no_rigid_transform_is_refused(tmp_path, pose, sentence):
@@ -270,7 +270,7 @@ def test_a_slightly_inexact_rotation_becomes_exact(tmp_path):
     [
         (lambda c: c.update(frames=[]), "lists no frames"),
         (lambda c: c.update(frames={"a": 1}), "lists no frames"),
-        (lambda c: c.update(frames=["a.png"]), "not an object"),
+        (lambda c: c.update(frames=["a.png"]), "`transform_matrix` of frame 0"),
         (lambda c: c.update(fl_x=0), "`fl_x` .* is 0; a number from"),
         (lambda c: c.update(fl_y=-3.0), "`fl_y` .* is -3.0; a number from"),
         (lambda c: c.update(fl_x=math.nan), "`fl_x` .* is nan; a number from"),

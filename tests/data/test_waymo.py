@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import builtins
 import io
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -14,7 +15,7 @@ from PIL import Image
 from command import run
 from gscompleter import InputError
 from gscompleter.data.cases import open_clips
-from gscompleter.data.driving.lidar import build_poses
+from gscompleter.data.driving.vehicle import build_poses
 from gscompleter.data.formats import open_photographs
 from gscompleter.data.photographs import Photographs
 from gscompleter.evaluation.store import list_row_paths, read_json
@@ -181,6 +182,13 @@ def test_the_vehicle_moves_while_a_laser_turns(tmp_path):
     from_roof = (ranges_to_wall(LASERS[0], VEHICLES[0], (20, 400)) > 0).sum()
     assert shift[:from_roof] == pytest.approx(np.array([[2.0, 0, 0]] * from_roof), abs=1e-6)
     assert np.abs(shift[from_roof:]).max() == 0
+
+
+def test_poses_of_pixels_that_are_not_those_of_the_laser_are_refused(tmp_path):
+    cut = [replace(moment, pixel_poses=moment.pixel_poses[:-1]) for moment in moments(True)]
+    root = write_segment(tmp_path, cut, CAMERAS, LASERS)
+    with pytest.raises(InputError, match="does not fit its calibration or its poses"):
+        open_photographs(root).views([0])
 
 
 def test_boxes_mask_what_moves(tmp_path):

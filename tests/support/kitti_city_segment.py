@@ -9,7 +9,7 @@ from pathlib import Path
 
 import numpy as np
 
-from gscompleter.data.driving.lidar import build_poses
+from gscompleter.data.driving.vehicle import build_poses
 from gscompleter.data.formats import open_photographs
 from waymo_segment import OPENCV_FROM_CAMERA, Laser, Moment, RigCamera, Seen, write_segment
 

@@ -16,6 +16,7 @@ import math
 import os
 from collections.abc import Iterator
 from dataclasses import replace
+from itertools import product
 from pathlib import Path
 from typing import Any
 
@@ -29,16 +30,17 @@ from gscompleter.data.colmap.scene import (
     read_image_file,
     read_scene_cameras,
 )
-from gscompleter.data.frame import Frame, capitalize
+from gscompleter.data.frame import Frame
 from gscompleter.data.image_folders import ImageFinder, keep_existing
 from gscompleter.data.json_fields import (
     get_array,
     get_focal,
-    get_list,
     get_optional_number,
+    get_part,
     get_size,
     get_text,
 )
+from gscompleter.data.limits import require
 from gscompleter.data.photographs import Photographs, build_photographs
 from gscompleter.data.resize import Resolution
 from gscompleter.data.transforms import NAME as TRANSFORMS
@@ -57,18 +59,23 @@ SPLAT_FROM_WORLD = np.array([-1.0, -1.0, 1.0])
 """Axis factors from SuperSplat's world to the splat: 180° about z."""
 
 HEAD = 4096
-EXPORT_ADVICE = {
-    "Metashape": "export its cameras as COLMAP, which Metashape does since 2.2",
-    "RealityScan": "export its registration as COLMAP",
-    "Polycam": "turn it into nerfstudio's transforms.json by ns-process-data polycam",
-}
-PROJECTS = {
-    ".psx": "Metashape",
-    ".psz": "Metashape",
-    ".rspj": "RealityScan",
-    ".rcproj": "RealityScan",
-}
-POLYCAM_CAMERAS = ("cameras", "corrected_cameras")
+"""Bytes at the start of a file that tell its program."""
+METASHAPE = ("Metashape", "export its cameras as COLMAP, which Metashape does since 2.2")
+REALITYSCAN = ("RealityScan", "export its registration as COLMAP")
+POLYCAM = ("Polycam", "turn it into nerfstudio's transforms.json by ns-process-data polycam")
+EXPORTS = (
+    (".psx", b"", METASHAPE),
+    (".psz", b"", METASHAPE),
+    (".xml", b"<chunk", METASHAPE),
+    (".rspj", b"", REALITYSCAN),
+    (".rcproj", b"", REALITYSCAN),
+    (".csv", b"#name,", REALITYSCAN),
+    (".csv", b"#cameras", REALITYSCAN),
+    (".json", b'"t_00"', POLYCAM),
+)
+"""Endings of files that are not read, what their first bytes hold, the program and what to do."""
+PLACES = ("*", "*cameras/*.json", "keyframes/*cameras/*.json")
+"""Places of such files in a folder; the last two are Polycam's."""
 
 
 def read_cameras(path: Path, resolution: Resolution = None) -> list[Frame]:
@@ -108,33 +115,26 @@ def open_camera_list(path: Path) -> Iterator[Photographs]:
 def read_camera_list(path: Path) -> list[Frame]:
     """Read the cameras of a `cameras.json` in its order, without photographs."""
     content = read_json(path, ADVICE)
-    if not isinstance(content, list) or not content:
-        raise InputError(
-            f"{quote_value(path)} lists no cameras; a list of cameras is needed, {ADVICE}."
-        )
+    require(
+        isinstance(content, list) and content,
+        f"{quote_value(path)} lists no cameras; a list of cameras is needed, {ADVICE}.",
+    )
     return [_parse_camera(entry, number, path) for number, entry in enumerate(content)]
 
 
 def _parse_camera(entry: Any, number: int, path: Path) -> Frame:
-    title = f"camera {number} of {quote_value(path)}"
-    if not isinstance(entry, dict):
-        raise InputError(
-            f"{capitalize(title)} is no object with a position and a rotation; {ADVICE}."
-        )
-    focal = get_focal(entry, title)
+    title, c2w = f"camera {number} of {quote_value(path)}", np.eye(4)
+    focal, size = get_focal(entry, title), get_size(entry, title)
     name = get_text(entry, "img_name", title) or str(entry.get("id", number))
-    intrinsics = Intrinsics(get_size(entry, title), focal)
-    c2w = np.eye(4)
-    c2w[:3, :3] = get_array(entry, "rotation", (3, 3), title)
-    c2w[:3, 3] = get_array(entry, "position", (3,), title)
-    return Frame(name, title, c2w, intrinsics, None).with_rigid_pose()
+    c2w[:3, :3] = get_array(entry, "rotation", title, (3, 3))
+    c2w[:3, 3] = get_array(entry, "position", title, (3,))
+    return Frame(name, title, c2w, Intrinsics(size, focal), None).with_rigid_pose()
 
 
 def _is_supersplat(content: Any) -> bool:
-    if isinstance(content, dict):
-        return "poseSets" in content
-    first = content[0] if isinstance(content, list) and content else None
-    return isinstance(first, dict) and "target" in first and "rotation" not in first
+    first = content[0] if isinstance(content, list) and content else content
+    keys = first if isinstance(first, dict) else {}
+    return "poseSets" in keys or ("target" in keys and "rotation" not in keys)
 
 
 def _parse_supersplat(content: Any, path: Path, resolution: Resolution) -> list[Frame]:
@@ -145,22 +145,17 @@ def _parse_supersplat(content: Any, path: Path, resolution: Resolution) -> list[
             "(height and width).",
             "resolution",
         )
-    sets = get_list(content, "poseSets")
-    poses = content if isinstance(content, list) else get_list(sets[0] if sets else None, "poses")
-    if not poses:
-        raise InputError(f"{quote_value(path)} holds no poses; {ADVICE}.")
-    titles = (f"pose {number} of {quote_value(path)}" for number in range(len(poses)))
-    pairs = zip(poses, titles, strict=True)
+    if isinstance(content, dict):
+        sets = get_part(content, "poseSets", list)
+        content = get_part(sets[0] if sets else None, "poses", list)
+    require(content, f"{quote_value(path)} holds no poses; {ADVICE}.")
+    pairs = ((pose, f"pose {n} of {quote_value(path)}") for n, pose in enumerate(content))
     return [_parse_supersplat_pose(pose, title, resolution) for pose, title in pairs]
 
 
 def _parse_supersplat_pose(pose: Any, title: str, resolution: tuple[int, int]) -> Frame:
-    if not isinstance(pose, dict):
-        raise InputError(
-            f"{capitalize(title)} is no object with a position and a target; {ADVICE}."
-        )
     position, target = (
-        get_array(pose, key, (3,), title) * SPLAT_FROM_WORLD for key in ("position", "target")
+        get_array(pose, key, title, (3,)) * SPLAT_FROM_WORLD for key in ("position", "target")
     )
     height, width = resolution
     fov = get_optional_number(pose, "fov", title, *FOV_RANGE) or DEFAULT_FOV
@@ -185,34 +180,10 @@ def _build_upright_c2w(
 
 def refuse_other_exports(path: Path) -> None:
     """Raise an InputError with advice if `path` holds cameras of an unsupported program."""
-    files = sorted(path.iterdir()) if os.path.isdir(path) else [path]
-    found = "Polycam" if _is_polycam(path) else None
-    for file in files:
-        if found is None and os.path.isfile(file):
-            found, path = _detect_program(file), file
-    if found is not None:
-        raise InputError(
-            f"{quote_value(path)} holds cameras of {found}, which cannot be read; "
-            f"{EXPORT_ADVICE[found]}, or name a folder of the photographs alone."
+    inside = [file for place in PLACES for file in sorted(path.glob(place))]
+    for file, (ending, mark, (program, advice)) in product([path, *inside], EXPORTS):
+        require(
+            file.suffix.lower() != ending or mark not in read_head(file, HEAD),
+            f"{quote_value(file)} holds cameras of {program}, which cannot be read; {advice}, or "
+            "name a folder of the photographs alone.",
         )
-
-
-def _detect_program(file: Path) -> str | None:
-    ending = file.suffix.lower()
-    head = _read_text_head(file) if ending in (".xml", ".csv") else b""
-    if ending == ".xml" and b"<document" in head and b"<chunk" in head:
-        return "Metashape"
-    if ending == ".csv" and head.startswith((b"#name,", b"#cameras")):
-        return "RealityScan"
-    return PROJECTS.get(ending)
-
-
-def _is_polycam(path: Path) -> bool:
-    """Check for Polycam's raw data, or the keyframes in it."""
-    homes = (path / home / kind for home in ("", "keyframes") for kind in POLYCAM_CAMERAS)
-    cameras = (file for home in homes for file in sorted(home.glob("*.json"))[:1])
-    return any(b'"t_00"' in _read_text_head(file) for file in cameras)
-
-
-def _read_text_head(file: Path) -> bytes:
-    return read_head(file, HEAD).removeprefix(b"\xef\xbb\xbf")

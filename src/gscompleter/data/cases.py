@@ -22,8 +22,6 @@ from gscompleter.errors import InputError, quote_value
 from gscompleter.io.json_file import read_json
 from gscompleter.types import View
 
-NAME = "cases.json"
-
 
 @dataclass(frozen=True)
 class Case:
@@ -54,30 +52,6 @@ class Case:
         scene = scene if self.ego_mask else scene.keep_ego_vehicle()
         views = scene.views(frames, self.resolution)
         return apply_masks(views, scene, self.resolution) if self.ignore_masked else views
-
-
-def has_cases(path: Path) -> bool:
-    """Check whether `path` is a folder with a `cases.json`, or a JSON file with cases."""
-    if os.path.isdir(path):
-        return os.path.isfile(path / NAME)
-    if path.suffix != ".json" or not os.path.isfile(path):
-        return False
-    content = read_json(path, "name a file of cases or cameras")
-    return isinstance(content, dict) and "cases" in content
-
-
-def open_cases(path: Path) -> Iterator[Photographs]:
-    """Open each scene of a file or folder of cases once, in their order.
-
-    Near and far enclose those of all cases of the scene, or are None if one case lacks them.
-    """
-    cases = read_cases(path / NAME if os.path.isdir(path) else path)
-    for scene in dict.fromkeys(case.scene for case in cases):
-        nears = [case.near for case in cases if case.scene == scene]
-        fars = [case.far for case in cases if case.scene == scene]
-        near = None if None in nears else min(n for n in nears if n is not None)
-        far = None if None in fars else max(f for f in fars if f is not None)
-        yield open_photographs(scene, near=near, far=far)
 
 
 def read_cases(path: Path) -> list[Case]:
@@ -120,14 +94,12 @@ class SkippedScene:
 
 
 def open_clips(path: Path | str) -> Iterator[Photographs]:
-    """Open the scenes in a file or folder of any format, a folder of such, or a `cases.json`.
+    """Open the scenes in a file or folder of any format, or a folder of such.
 
     For a vehicle with several cameras only the front camera is used. Scenes are read one at a time,
     so damage raises an InputError while iterating.
     """
     path = Path(path)
-    if has_cases(path):
-        return open_cases(path)
     inside = [] if find_format(path) or not os.path.isdir(path) else sorted(path.iterdir())
     folders = [child for child in inside if child.is_dir() and find_format(child)]
     scenes = [(FORMATS[detect_format(place)], place) for place in folders or [path]]

@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import os
 import warnings
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator
 from functools import lru_cache, partial
 from pathlib import Path
 from typing import Any, TypeGuard
@@ -19,6 +19,7 @@ import torch
 from torch import Tensor
 
 from gscompleter.data.frame import Frame
+from gscompleter.data.limits import require
 from gscompleter.data.photographs import Photographs, build_photographs
 from gscompleter.data.real_estate import parse_camera_row
 from gscompleter.errors import InputError, quote_value, refuse_pointer
@@ -47,13 +48,9 @@ def open_chunks(path: Path) -> Iterator[Photographs]:
         return _open_chunk(path)
     folder = path.parent if path.name == INDEX else _find_folder(path)
     if folder is None:
-        raise InputError(
-            f"There are no chunks in {path}; name a folder with an {INDEX} or .torch files, a "
-            f"folder with such a folder {TEST}, or a single .torch file."
-        )
-    if os.path.isfile(folder / INDEX):
-        return _open_index(folder / INDEX)
-    return (scene for chunk in sorted(folder.glob("*.torch")) for scene in _open_chunk(chunk))
+        raise InputError(f"There are no chunks in {path}; name a .torch file, or a folder of such.")
+    files = _list_chunks(folder / INDEX) or sorted(folder.glob("*.torch"))
+    return (scene for file in files for scene in _open_chunk(file))
 
 
 def _find_folder(path: Path) -> Path | None:
@@ -61,31 +58,18 @@ def _find_folder(path: Path) -> Path | None:
     return next((f for f in folders if os.path.isfile(f / INDEX) or any(f.glob("*.torch"))), None)
 
 
-def _open_index(index: Path) -> Iterator[Photographs]:
+def _list_chunks(index: Path) -> list[Path]:
+    """List the chunks of an index; none if it does not exist."""
+    if not os.path.isfile(index):
+        return []
     content = read_json(index, "download it again")
     chunks = list(content.values()) if isinstance(content, dict) else []
-    if not chunks or not all(isinstance(chunk, str) for chunk in chunks):
-        raise InputError(
-            f"{index} is no index of chunks: it has to map the key of each scene to the name of "
-            "its .torch file."
-        )
-    paths = (index.parent / chunk for chunk in sorted(set(chunks)))
-    return (scene for path in paths for scene in _open_listed_chunk(path, content, index))
-
-
-def _open_listed_chunk(path: Path, content: Mapping[str, str], index: Path) -> list[Photographs]:
-    """Open the scenes of a chunk and compare their names with the index."""
-    scenes = list(_open_chunk(path))
-    names = {scene.name for scene in scenes}
-    listed = {name for name, chunk in content.items() if index.parent / chunk == path}
-    if names != listed:
-        name = min(listed ^ names)
-        one, other = (index, path) if name in listed else (path, index)
-        raise InputError(
-            f"{one} lists the scene {quote_value(name)}, which is absent from {other}; write the "
-            "index again, or name the chunk itself."
-        )
-    return scenes
+    require(
+        chunks and all(isinstance(chunk, str) for chunk in chunks),
+        f"{index} is no index of chunks: it has to map the key of each scene to the name of its "
+        ".torch file.",
+    )
+    return [index.parent / chunk for chunk in sorted(set(chunks))]
 
 
 def _open_chunk(path: Path) -> Iterator[Photographs]:
@@ -109,23 +93,15 @@ def _read_chunk(path: Path, _written: int) -> list[Any]:
     except PermissionError as error:
         raise InputError(f"{path} cannot be read: {error.strerror}; make it readable.") from error
     except Exception as error:  # damaged bytes raise anything
-        raise InputError(_explain_load_error(path, error)) from error
-    if not isinstance(content, list) or not content:
-        raise InputError(
-            f"{path} is no chunk: a list of scenes is needed, and it holds "
-            f"{'none' if content == [] else type(content).__name__}."
-        )
+        held = "is truncated, no file of torch.save, or too large; download it again"
+        if "GLOBAL" in str(error):
+            held = "holds pickled Python objects, which are refused because they can run any code"
+        raise InputError(f"{path} {held}.") from error
+    require(
+        isinstance(content, list) and content,
+        f"{path} is no chunk: a list of scenes is needed, and it holds {type(content).__name__}.",
+    )
     return content
-
-
-def _explain_load_error(path: Path, error: Exception) -> str:
-    if "GLOBAL" in str(error):
-        problem = "holds pickled Python objects, which are refused because loading them can run"
-        advice = "save it again with tensors, strings, lists and dicts only"
-        return f"{path} {problem} any code; {advice}."
-    if isinstance(error, MemoryError) or "allocate memory" in str(error):
-        return f"{path} needs more memory than is available; split it, or download it again."
-    return f"{path} is truncated or no file of torch.save; download it again."
 
 
 def _parse_scene(example: Any, path: Path, position: int) -> Photographs:
@@ -136,23 +112,14 @@ def _parse_scene(example: Any, path: Path, position: int) -> Photographs:
         raise InputError(f"Scene {position} of {path} has no `key`; write the chunk again with it.")
     called = f"scene {quote_value(name)} of {path}"
     if not (_is_dense(cameras, ndim=2) and cameras.is_floating_point() and cameras.shape[1] == 18):
-        raise InputError(
-            f"The `cameras` of the {called} are {_describe(cameras)}; floats of shape [n, 18] "
-            "are needed."
-        )
-    if not isinstance(images, list) or len(images) == 0:
-        raise InputError(f"The `images` of the {called} are no list with images in it.")
-    if len(images) != len(cameras):
-        raise InputError(
-            f"The {called} has {len(images)} images and {len(cameras)} cameras; each image "
-            "needs one camera, so download the chunk again."
-        )
-    for number, image in enumerate(images):
-        if not _is_dense(image, ndim=1) or image.dtype != torch.uint8:
-            raise InputError(
-                f"Image {number} of the {called} is {_describe(image)}; the bytes of a JPEG or "
-                "PNG file are needed, uint8 of one dimension."
-            )
+        raise InputError(f"The `cameras` of the {called} are no floats of shape [n, 18].")
+    files = images if isinstance(images, list) else []
+    require(
+        len(files) == len(cameras) > 0
+        and all(_is_dense(file, ndim=1) and file.dtype == torch.uint8 for file in files),
+        f"The `images` of the {called} are no list of uint8 tensors, the bytes of a JPEG or PNG "
+        f"file for each of {len(cameras)} cameras.",
+    )
     frames = []
     for number, row in enumerate(cameras.detach().double().numpy()):
         intrinsics, c2w = parse_camera_row(row)
@@ -175,11 +142,3 @@ def _is_dense(value: Any, ndim: int) -> TypeGuard[Tensor]:
     if value.layout != torch.strided or value.is_meta or value.is_quantized:
         return False
     return value.untyped_storage().nbytes() >= value.numel() * value.element_size()
-
-
-def _describe(value: Any) -> str:
-    if not isinstance(value, Tensor) or value.is_nested:
-        return f"of type {type(value).__name__}"
-    kind = "" if _is_dense(value, value.ndim) else "sparse or empty "
-    shape = quote_value(list(value.shape))
-    return f"{kind}{str(value.dtype).removeprefix('torch.')} of shape {shape}"

@@ -11,12 +11,11 @@ import math
 from collections.abc import Hashable, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, replace
-from functools import cached_property
+from functools import lru_cache, partial
 
 import cv2
 import numpy as np
 from jaxtyping import Bool, Float, Int
-from numpy.lib.stride_tricks import sliding_window_view
 
 from gscompleter.data.cameras import find_pose_defect
 from gscompleter.data.frame import Frame
@@ -62,69 +61,50 @@ MARGIN = 1
 
 
 def attach_vehicle_detector(frames: Sequence[Frame]) -> tuple[Frame, ...]:
-    """Attach a lazy vehicle detector to each frame."""
+    """Attach a lazy vehicle detector to each frame; those of one camera share it."""
     cameras: dict[Hashable, list[Frame]] = {}
     for frame in frames:
         cameras.setdefault((frame.sensor, frame.intrinsics), []).append(frame)
-    seen = {camera: EgoVehicle(tuple(group)) for camera, group in cameras.items()}
+    seen = {camera: partial(detect_vehicle, tuple(group)) for camera, group in cameras.items()}
     return tuple(replace(f, vehicle=seen[f.sensor, f.intrinsics]) for f in frames)
 
 
-@dataclass(frozen=True, eq=False)
-class EgoVehicle:
-    """Lazy detector of the vehicle in the photographs of one of its cameras."""
-
-    frames: tuple[Frame, ...]
-
-    def __call__(self) -> Bool[np.ndarray, "h w"] | None:
-        """Return True on the vehicle in a small copy of the stored photograph, or None."""
-        return self._mask
-
-    @cached_property
-    def _mask(self) -> Bool[np.ndarray, "h w"] | None:
-        chosen, motion = select_frames(self.frames)
-        first, images = (None, None) if motion is None else read_small(chosen)
-        if motion is None or first is None or images is None:
-            return None
-        size = first.size()
-        if first.find_defect(*size) is not None:
-            return None
-        pinhole = first.intrinsics.compute_pinhole(*size)
-        return find_static_region(images, *predict_ground_flow(motion, pinhole, images.shape[1:]))
-
-
-def read_small(
-    frames: Sequence[Frame],
-) -> tuple[Frame, Float[np.ndarray, "n h w"]] | tuple[None, None]:
-    """Read small copies of the photographs of the most common size, and return their first frame.
-
-    Unreadable ones are left out; None if too few or too small ones remain.
-    """
-    found = []
-    for frame in frames:
-        with suppress(InputError):
-            found.append((frame, frame.load_small_pixels(SIDE)))
-    shapes = [image.shape for _, image in found]
-    usual = max(dict.fromkeys(shapes), key=shapes.count, default=(0,))
-    if shapes.count(usual) < FEWEST or min(usual) < MIN_SIDE:
-        return None, None
-    return found[shapes.index(usual)][0], np.stack([i for _, i in found if i.shape == usual])
-
-
-def select_frames(
-    frames: Sequence[Frame],
-) -> tuple[list[Frame], Float[np.ndarray, "3"] | None]:
-    """Select evenly spaced photographs and the travel direction in camera axes, or None."""
+@lru_cache(maxsize=64)
+def detect_vehicle(frames: tuple[Frame, ...]) -> Bool[np.ndarray, "h w"] | None:
+    """Mask the vehicle in a small copy of the photographs of one of its cameras, if it is seen."""
     usable = [f for f in frames if find_pose_defect(f.c2w) is None and f.has_photograph()]
     if len(usable) < FEWEST:
-        return [], None
+        return None
     poses = np.stack([frame.c2w for frame in usable])
     steps = np.linalg.norm(np.diff(poses[:, :3, 3], axis=0), axis=1)
     motion = estimate_motion(poses, steps)
+    small = {} if motion is None else read_small(select_evenly(usable, steps))
+    if motion is None or len(small) < FEWEST:
+        return None
+    first, images = next(iter(small)), np.stack(list(small.values()))
+    size = first.size()
+    if first.find_defect(*size) is not None:
+        return None
+    pinhole = first.intrinsics.compute_pinhole(*size)
+    return find_static_region(images, *predict_ground_flow(motion, pinhole, images.shape[1:]))
+
+
+def select_evenly(frames: Sequence[Frame], steps: Float[np.ndarray, "_"]) -> list[Frame]:
+    """Select photographs that are evenly spaced along the way, of which `steps` are the parts."""
     way = np.concatenate([[0.0], np.cumsum(steps)])
     places = np.searchsorted(way, np.linspace(0, way[-1], MOST))
-    chosen = [usable[index] for index in dict.fromkeys(places.tolist())]
-    return chosen, None if len(chosen) < FEWEST else motion
+    return [frames[index] for index in dict.fromkeys(places.tolist())]
+
+
+def read_small(frames: Sequence[Frame]) -> dict[Frame, Float[np.ndarray, "h w"]]:
+    """Read small copies of the photographs that have the size of the first readable one."""
+    found = {}
+    for frame in frames:
+        with suppress(InputError):
+            found[frame] = frame.load_small_pixels(SIDE)
+    shape = next((image.shape for image in found.values()), (0, 0))
+    is_large = min(shape) >= MIN_SIDE
+    return {frame: image for frame, image in found.items() if is_large and image.shape == shape}
 
 
 def estimate_motion(
@@ -232,24 +212,21 @@ def trace_outline(
     reward.
     """
     height, width = edges.static_share.shape
-    rows = np.arange(height)[:, None]
+    rows = np.arange(height + 1)
     reward = edges.static_share * (0.5 + 0.5 * edges.crossing) - cost
-    reward = np.where((rows >= first) & (rows < limit), reward, -1.0)
+    reward = np.where((rows[:-1, None] >= first) & (rows[:-1, None] < limit), reward, -1.0)
     reward = np.concatenate([reward, np.zeros((1, width))])  # lower border: no vehicle
-    # Argmax takes the first of equals: no bend.
-    bends = np.array([0, *range(-MAX_ROW_STEP, 0), *range(1, MAX_ROW_STEP + 1)])
-    total, came = reward[:, 0], np.zeros((height + 1, width), np.int64)
+    steps = np.abs(rows[:, None] - rows)
+    bends = np.where(steps <= MAX_ROW_STEP, BEND_COST * steps, np.inf)
+    total, came = reward[:, 0], []
     for column in range(1, width):
-        padded = np.pad(total, MAX_ROW_STEP, constant_values=-np.inf)
-        reached = sliding_window_view(padded, height + 1)[MAX_ROW_STEP + bends]
-        reached = reached - BEND_COST * np.abs(bends)[:, None]
-        came[:, column] = np.arange(height + 1) + bends[reached.argmax(axis=0)]
-        total = reached.max(axis=0) + reward[:, column]
-    outline = np.empty(width, np.int64)
-    outline[-1] = total.argmax()
-    for column in range(width - 1, 0, -1):
-        outline[column - 1] = came[outline[column], column]
-    return outline
+        reached = total - bends
+        came.append(reached.argmax(axis=1))
+        total = reached.max(axis=1) + reward[:, column]
+    outline = [int(total.argmax())]
+    for before in reversed(came):
+        outline.append(int(before[outline[-1]]))
+    return np.array(outline[::-1])
 
 
 def is_vehicle(edges: Edges, outline: Int[np.ndarray, "w"]) -> bool:

@@ -6,7 +6,7 @@ A format is a module of this package and a line in `FORMATS`.
 from __future__ import annotations
 
 import os
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass, replace
 from functools import cache
 from itertools import islice
@@ -22,7 +22,7 @@ from gscompleter.data.driving.pandaset import has_pandaset, open_pandaset
 from gscompleter.data.driving.waymo import has_waymo, open_waymo
 from gscompleter.data.ego_vehicle import attach_vehicle_detector
 from gscompleter.data.image_folders import FOLDERS
-from gscompleter.data.limits import check_planes
+from gscompleter.data.limits import check_planes, require
 from gscompleter.data.llff import has_llff, open_llff
 from gscompleter.data.photographs import Photographs
 from gscompleter.data.real_estate import has_camera_files, open_camera_files
@@ -43,8 +43,6 @@ class Format:
     """Unit of the coordinates, or None if the format does not define it."""
 
 
-SCENE_DEPTH = 2
-"""Levels of subfolders searched for scenes that an error message names."""
 MAX_NAMED = 4
 """Most scenes that the message names."""
 
@@ -82,13 +80,12 @@ def open_photographs(
     check_planes(near, far)
     path = Path(path)
     found = detect_format(path, format)
-    scenes = list(islice(FORMATS[found].open(path), 2))
-    if len(scenes) > 1:
-        raise InputError(
-            f"{quote_value(path)} holds several scenes, such as {quote_value(scenes[0].name)} and "
-            f"{quote_value(scenes[1].name)}; name a file or folder with one of them."
-        )
-    (scene,) = scenes
+    scene, *others = islice(FORMATS[found].open(path), 2)
+    names = " and ".join(quote_value(one.name) for one in (scene, *others))
+    require(
+        not others,
+        f"{quote_value(path)} holds several scenes, such as {names}; name a path with one of them.",
+    )
     near, far = scene.near if near is None else near, scene.far if far is None else far
     check_planes(near, far)
     sparse = None if scene.sparse is None else cache(scene.sparse)
@@ -98,19 +95,18 @@ def open_photographs(
 
 def detect_format(path: Path, name: str | None = None) -> str:
     """Return the given format name after checking it, or detect the format of `path`."""
-    if name is not None and name not in FORMATS:
-        raise InputError(
-            f"There is no format '{quote_value(name)}'; choose one of {', '.join(FORMATS)}."
-        )
-    if not os.path.exists(path):
-        raise InputError(f"There is no {quote_value(path)}; {describe_formats()}.")
+    formats = ", ".join(FORMATS)
+    advice = f"name photographs with cameras, in one of these formats (docs/formats.md): {formats}"
+    require(
+        name is None or name in FORMATS,
+        f"There is no format '{quote_value(name)}'; choose one of {formats}.",
+    )
+    require(os.path.exists(path), f"There is no {quote_value(path)}; {advice}.")
     found = find_format(path) if name is None else name
     if found is None:
         refuse_other_exports(path)
         refuse_scenes_below(path)
-        raise InputError(
-            f"There are no posed photographs in {quote_value(path)}; {describe_formats()}."
-        )
+        raise InputError(f"There are no posed photographs in {quote_value(path)}; {advice}.")
     return found
 
 
@@ -124,40 +120,21 @@ def refuse_scenes_below(path: Path) -> None:
         return
     if any(name.lower().endswith(ENDINGS) for name in os.listdir(path)):
         return
-    found = list(_list_scenes_below(path, lambda folder: find_format(folder) is not None))
-    if not found:
-        found = list(_list_scenes_below(path, has_image_folder))
-        if len(found) < 2:
-            return
-    names = join_names([one.relative_to(path) for one in found], MAX_NAMED, 20)
-    scenes = "one" if len(found) == 1 else f"{len(found)} scenes"
-    raise InputError(
-        f"{quote_value(path, 50)} is no scene itself, but holds {scenes} below it: {names}; "
-        f"name one of them, as in {quote_value(found[0], 60)}."
+    near = [folder for folder in sorted(path.iterdir()) if folder.is_dir() and is_own(folder)]
+    inside = [child for folder in near for child in sorted(folder.iterdir()) if child.is_dir()]
+    below = sorted(near + [folder for folder in inside if is_own(folder)])
+    posed = [folder for folder in below if find_format(folder)]
+    plain = [folder for folder in below if has_image_folder(folder)]
+    found = posed or (plain if len(plain) > 1 else [])
+    found = [folder for folder in found if folder.parent not in found]
+    names = join_names([folder.relative_to(path) for folder in found], MAX_NAMED, 20)
+    require(
+        not found,
+        f"{quote_value(path, 50)} is no scene itself, but holds {len(found)} scene(s) below it: "
+        f"{names}; name one of them.",
     )
-
-
-def _list_scenes_below(
-    path: Path, is_scene: Callable[[Path], bool], depth: int = SCENE_DEPTH
-) -> Iterator[Path]:
-    """List the scenes at most `depth` folders down, sorted; skips our own results."""
-    for folder in sorted(path.iterdir()):
-        if not folder.is_dir() or not is_own(folder):
-            continue
-        if is_scene(folder):
-            yield folder
-        elif depth > 1:
-            yield from _list_scenes_below(folder, is_scene, depth - 1)
 
 
 def find_format(path: Path) -> str | None:
     """Detect the first format that fits a file or folder; None if none does."""
     return next((name for name, format in FORMATS.items() if format.detect(path)), None)
-
-
-def describe_formats() -> str:
-    """Describe the accepted formats for error messages."""
-    return (
-        "name photographs with cameras, in one of these formats (docs/formats.md): "
-        f"{', '.join(FORMATS)}"
-    )

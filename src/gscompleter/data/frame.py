@@ -17,7 +17,7 @@ from gscompleter.data.cameras import (
     find_pose_defect,
     make_rigid,
 )
-from gscompleter.data.driving.moving_objects import Box
+from gscompleter.data.driving.vehicle import Box
 from gscompleter.data.limits import MAX_SIDE
 from gscompleter.data.undistort import Pinhole, undistort_pinhole
 from gscompleter.errors import InputError, quote_value

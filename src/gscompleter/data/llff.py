@@ -8,18 +8,17 @@ the scene.
 from __future__ import annotations
 
 import os
-import warnings
 from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
-from jaxtyping import Float, Shaped
+from jaxtyping import Float
 
 from gscompleter.data.cameras import Intrinsics
 from gscompleter.data.frame import Frame
 from gscompleter.data.image_folders import list_image_folders
-from gscompleter.data.limits import DEPTH_RANGE, MAX_SIDE
+from gscompleter.data.limits import DEPTH_RANGE, MAX_SIDE, require
 from gscompleter.data.photographs import Photographs, build_photographs
 from gscompleter.data.points import widen_depth_range
 from gscompleter.errors import InputError, quote_value
@@ -27,8 +26,7 @@ from gscompleter.io.reading import check_file
 
 NAME = "poses_bounds.npy"
 IMAGES = (".jpg", ".jpeg", ".png")
-MAX_BYTES = 1 << 26
-"""Largest array in bytes, about half a million cameras."""
+ADVICE = "run LLFF's imgs2poses again"
 
 
 def has_llff(path: Path) -> bool:
@@ -54,11 +52,12 @@ def open_llff(path: Path) -> Iterator[Photographs]:
 
 def _parse_frame(image: Path, row: Float[np.ndarray, "17"], title: str) -> Frame:
     down, right, back, center, (height, width, focal) = row[:15].reshape(3, 5).T
-    if not all(1 <= side <= MAX_SIDE and side == int(side) for side in (height, width)):
-        raise InputError(
-            f"The {title} has an image of {width:g} × {height:g}; whole numbers of pixels from 1 "
-            f"to {MAX_SIDE} are needed, so run LLFF's imgs2poses again."
-        )
+    sides = np.array([height, width])
+    require(
+        ((sides >= 1) & (sides <= MAX_SIDE) & (sides % 1 == 0)).all(),
+        f"The {title} has an image of {width:g} × {height:g}; whole numbers of pixels from 1 to "
+        f"{MAX_SIDE} are needed, so {ADVICE}.",
+    )
     c2w = np.eye(4)
     c2w[:3] = np.stack([right, down, -back, center], axis=1)
     intrinsics = Intrinsics((int(width), int(height)), (float(focal), float(focal)))
@@ -66,40 +65,25 @@ def _parse_frame(image: Path, row: Float[np.ndarray, "17"], title: str) -> Frame
 
 
 def _read_rows(path: Path) -> Float[np.ndarray, "n 17"]:
-    stored = _map_array(path)
-    fits = stored.ndim == 2 and stored.shape[1] == 17 and len(stored) > 0
-    if not (fits and stored.dtype.kind in "fiu" and stored.nbytes <= MAX_BYTES):
-        raise InputError(
-            f"{quote_value(path)} holds {stored.dtype} of shape {list(stored.shape)}, where a row "
-            "of 17 numbers for each photograph is needed; run LLFF's imgs2poses again."
-        )
-    rows = np.array(stored, dtype=np.float64)
-    low, high = DEPTH_RANGE
-    near, far = rows[:, 15], rows[:, 16]
-    if not ((near >= low) & (near < far) & (far <= high)).all():
-        raise InputError(
-            f"The bounds in {quote_value(path)} are no z-depths, nearest first, from {low:g} to "
-            f"{high:g}; run LLFF's imgs2poses again."
-        )
-    return rows
-
-
-def _map_array(path: Path) -> Shaped[np.ndarray, "..."]:
-    """Map the array; refuse one that claims more than the file holds."""
     check_file(path)
     try:
-        with warnings.catch_warnings():
-            warnings.simplefilter("ignore")
-            return np.lib.format.open_memmap(path, mode="r")
-    except OSError as error:
-        raise InputError(
-            f"{quote_value(path)} cannot be read: {error}; correct the path."
-        ) from error
+        # Mapping refuses an array that claims more than the file holds.
+        stored = np.lib.format.open_memmap(path, mode="r")
+        rows = stored.astype(np.float64, casting="same_kind")
     except Exception as error:  # damaged headers raise anything
-        raise InputError(
-            f"{quote_value(path)} is no array of numbers ({quote_value(str(error))}); run LLFF's "
-            "imgs2poses again."
-        ) from error
+        raise InputError(f"{quote_value(path)} is no array of real numbers; {ADVICE}.") from error
+    require(
+        rows.ndim == 2 and rows.shape[1] == 17 and len(rows) > 0,
+        f"{quote_value(path)} has the shape {list(rows.shape)}, where a row of 17 numbers for each "
+        f"photograph is needed; {ADVICE}.",
+    )
+    (low, high), near, far = DEPTH_RANGE, rows[:, 15], rows[:, 16]
+    require(
+        ((near >= low) & (near < far) & (far <= high)).all(),
+        f"The bounds in {quote_value(path)} are no z-depths, nearest first, from {low:g} to "
+        f"{high:g}; {ADVICE}.",
+    )
+    return rows
 
 
 def _find_photographs(file: Path, count: int) -> list[Path]:

@@ -16,7 +16,7 @@ from jaxtyping import Float
 
 from gscompleter.data.cameras import find_pose_defect
 from gscompleter.data.json_fields import get_array, get_number
-from gscompleter.errors import InputError, quote_value
+from gscompleter.data.limits import require
 from gscompleter.io.json_file import read_json
 from gscompleter.types import Camera, Gaussians
 
@@ -62,12 +62,12 @@ def shift_to_origin(
     step = float(np.spacing(np.float32(np.abs(origin).max())))
     centers = torch.stack([camera.center.cpu() for camera in cameras])
     spread = (centers - centers[0]).norm(dim=-1).max().item()
-    if step > MAX_STEP * spread:
-        raise InputError(
-            f"The scene lies {np.abs(origin).max():g} units from its origin, where float32 has "
-            f"steps of {step:g}, and its cameras are {spread:g} apart; export the scene and its "
-            "photographs relative to a local origin."
-        )
+    require(
+        step <= MAX_STEP * spread,
+        f"The scene lies {np.abs(origin).max():g} units from its origin, where float32 has steps "
+        f"of {step:g}, and its cameras are {spread:g} apart; export the scene and its photographs "
+        "relative to a local origin.",
+    )
     means = scene.means.double() - torch.from_numpy(origin).to(scene.means.device)
     return replace(scene, means=means.float())
 
@@ -78,15 +78,8 @@ def read_dataparser_transforms(path: Path) -> Float[np.ndarray, "4 4"]:
     The file holds a rigid 3×4 `transform` and a `scale` that multiplies its result.
     """
     content = read_json(path, "copy it from the folder of the nerfstudio run again")
-    if not isinstance(content, dict):
-        raise InputError(
-            f"{quote_value(path)} is no object with `transform` and `scale`; copy it again."
-        )
-    rigid = np.vstack([get_array(content, "transform", (3, 4), str(path)), [0, 0, 0, 1]])
+    rigid = np.vstack([get_array(content, "transform", str(path), (3, 4)), [0, 0, 0, 1]])
     defect = find_pose_defect(rigid)
-    if defect is not None:
-        raise InputError(
-            f"The `transform` of {quote_value(path)} cannot be used: {defect}; copy it again."
-        )
+    require(not defect, f"The `transform` of {path} cannot be used: {defect}; copy it again.")
     scale = get_number(content, "scale", str(path), *SCALE_RANGE)
     return np.diag([scale, scale, scale, 1.0]) @ rigid

@@ -17,8 +17,7 @@ from PIL import Image
 from torch import Tensor
 
 from gscompleter.data.cameras import compute_fov, find_pose_defect
-from gscompleter.data.driving.lidar import compute_sparse_depth
-from gscompleter.data.driving.moving_objects import mask_moving
+from gscompleter.data.driving.vehicle import compute_sparse_depth, mask_moving
 from gscompleter.data.frame import Frame
 from gscompleter.data.local_origin import choose_local_origin
 from gscompleter.data.resize import Resolution, compute_framing, resize

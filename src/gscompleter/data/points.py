@@ -15,6 +15,7 @@ from gscompleter.data.limits import DEPTH_RANGE
 from gscompleter.data.photographs import Photographs
 from gscompleter.data.resize import Resolution
 from gscompleter.errors import InputError, quote_value
+from gscompleter.geometry import is_inside, project
 from gscompleter.io.reading import open_file
 from gscompleter.splats.ply import read_header, read_vertices
 from gscompleter.types import Camera
@@ -38,11 +39,11 @@ def add_depth_range(
     if points is None:
         return photographs
     found = compute_depth_range(points, [photographs.camera(f, resolution) for f in frames])
-    near, far = found or (None, None)
-    near = near if photographs.near is None else photographs.near
-    far = far if photographs.far is None else photographs.far
-    empty = near is not None and far is not None and near >= far
-    return photographs if empty else replace(photographs, near=near, far=far)
+    if found is None:
+        return photographs
+    near = found[0] if photographs.near is None else photographs.near
+    far = found[1] if photographs.far is None else photographs.far
+    return photographs if near >= far else replace(photographs, near=near, far=far)
 
 
 def compute_depth_range(
@@ -52,7 +53,11 @@ def compute_depth_range(
 
     Returns None for too few points. Hidden points count too; the percentiles tolerate them.
     """
-    depths = torch.cat([torch.zeros(0), *(_compute_visible_depths(points, c) for c in cameras)])
+    seen = [torch.zeros(0)]
+    for camera in cameras:
+        pixels, z = project(points, camera)
+        seen.append(z[is_inside(pixels, z, camera)])
+    depths = torch.cat(seen)
     if len(depths) < MIN_POINTS:
         return None
     low, high = np.quantile(depths.double().numpy(), PERCENTILES).tolist()
@@ -63,15 +68,6 @@ def compute_depth_range(
 def widen_depth_range(nearest: float, farthest: float) -> tuple[float, float]:
     """Widen a depth range (scene units) for surfaces without points."""
     return NEAR_FACTOR * nearest, FAR_FACTOR * farthest
-
-
-def _compute_visible_depths(points: Float[Tensor, "n 3"], camera: Camera) -> Float[Tensor, "m"]:
-    """Compute the z-depths of the points that project into the image."""
-    local = (points - camera.center) @ camera.c2w[:3, :3]
-    front = local[local[:, 2] > 0]
-    pixels = (front @ camera.K.T)[:, :2] / front[:, 2:]
-    size = torch.tensor([camera.width, camera.height])
-    return front[((pixels >= 0) & (pixels < size)).all(dim=1), 2]
 
 
 def read_point_cloud(path: Path) -> Float[np.ndarray, "n 3"]:

@@ -11,6 +11,7 @@ from jaxtyping import Float
 
 from gscompleter.data.cameras import FRACTIONS, Intrinsics, invert_viewmat
 from gscompleter.data.frame import Frame
+from gscompleter.data.limits import require
 from gscompleter.data.photographs import Photographs, build_photographs
 from gscompleter.errors import InputError
 from gscompleter.io.reading import read_head, read_lines
@@ -36,14 +37,8 @@ def read_camera_file(path: Path) -> Photographs:
     cy in image widths and heights, two unused numbers, and the upper 3×4 of world-to-camera. The
     image is named after the timestamp and lies in a folder named after the file, or beside it.
     """
-    try:
-        lines = [line for line in read_lines(path, errors="strict") if line.strip()][1:]
-    except UnicodeDecodeError as error:
-        raise InputError(f"{path} is not a text file; name a camera file.") from error
-    if not lines:
-        raise InputError(
-            f"{path} lists no frames; below the line with the address, each frame needs a line."
-        )
+    lines = [line for line in read_lines(path) if line.strip()][1:]
+    require(lines, f"{path} lists no frames; below the address, each frame needs a line.")
     frames = [_parse_frame(line, number, path) for number, line in enumerate(lines)]
     return build_photographs(path.stem, str(path), frames)
 

@@ -10,11 +10,10 @@ import numpy as np
 
 from gscompleter.data.camera_files import read_cameras
 from gscompleter.data.formats import open_photographs
-from gscompleter.data.limits import check_planes
+from gscompleter.data.limits import check_planes, require
 from gscompleter.data.photographs import Photographs
 from gscompleter.data.resize import Resolution
 from gscompleter.data.transforms import OPENCV_FROM_OPENGL
-from gscompleter.errors import InputError
 from gscompleter.io.files import replace_file
 from gscompleter.types import Camera, View
 
@@ -63,11 +62,11 @@ def load_camera(
         InputError: If the scene or frame is missing or impossible, or none of several is chosen.
     """
     photographs = open_photographs(scene, near=near, far=far)
-    if frame is None and len(photographs) > 1:
-        raise InputError(
-            f"{photographs.title} has {len(photographs)} frames; choose one, from 0 to "
-            f"{len(photographs) - 1}."
-        )
+    require(
+        frame is not None or len(photographs) == 1,
+        f"{photographs.title} has {len(photographs)} frames; choose one, from 0 to "
+        f"{len(photographs) - 1}.",
+    )
     return photographs.camera(frame or 0, resolution)
 
 
@@ -80,14 +79,10 @@ def load_cameras(
 ) -> list[Camera]:
     """Load all cameras of a file in its order, without photographs.
 
-    Args:
-        path: A JSON file in the layout of nerfstudio's `transforms.json`, Inria's `cameras.json` or
-            SuperSplat's poses; a folder with a `transforms.json` or a COLMAP model; or the
-            images.txt or images.bin of such a model.
-        resolution: As in `load_views`; SuperSplat's poses need height and width.
-        near: As in `load_views`.
-        far: As in `load_views`.
-        origin: Origin of the scene's coordinates, `open_photographs(scene).origin`, in scene units.
+    `path` is a JSON file in the layout of nerfstudio's `transforms.json`, Inria's `cameras.json` or
+    SuperSplat's poses, which need a height and width; a folder with a `transforms.json` or a COLMAP
+    model; or the images.txt or images.bin of such a model. `origin` is that of the scene's
+    coordinates, `open_photographs(scene).origin`; the rest is as in `load_views`.
 
     Raises:
         InputError: If the file or one of its cameras is missing or impossible.
@@ -123,14 +118,8 @@ def write_cameras(
 
 
 def _build_entry(camera: Camera) -> dict[str, object]:
-    K = camera.K.double()
+    (fl_x, _, cx), (_, fl_y, cy), _ = camera.K.double().tolist()
     c2w = camera.c2w.detach().cpu().double().numpy() @ OPENCV_FROM_OPENGL
-    return {
-        "fl_x": K[0, 0].item(),
-        "fl_y": K[1, 1].item(),
-        "cx": K[0, 2].item(),
-        "cy": K[1, 2].item(),
-        "w": camera.width,
-        "h": camera.height,
-        "transform_matrix": c2w.tolist(),
-    }
+    intrinsics = {"fl_x": fl_x, "fl_y": fl_y, "cx": cx, "cy": cy}
+    size = {"w": camera.width, "h": camera.height}
+    return {**intrinsics, **size, "transform_matrix": c2w.tolist()}

@@ -13,16 +13,23 @@ import numpy as np
 from jaxtyping import Float
 
 from gscompleter.data.cameras import Intrinsics
-from gscompleter.data.frame import Frame, capitalize
-from gscompleter.data.json_fields import convert_to_array, get_optional_number, get_text
-from gscompleter.data.limits import DEPTH_RANGE, MAX_COEFFICIENT, MAX_IN_PIXELS, MAX_SIDE
+from gscompleter.data.frame import Frame
+from gscompleter.data.json_fields import (
+    get_array,
+    get_optional_number,
+    get_part,
+    get_size,
+    get_text,
+)
+from gscompleter.data.limits import DEPTH_RANGE, MAX_COEFFICIENT, MAX_IN_PIXELS, require
 from gscompleter.data.photographs import Photographs, build_photographs
 from gscompleter.data.points import read_point_cloud
 from gscompleter.data.undistort import Distortion
-from gscompleter.errors import InputError, quote_value
+from gscompleter.errors import quote_value
 from gscompleter.io.json_file import is_json_list, read_json
 
 NAME = "transforms.json"
+ADVICE = "export the scene again"
 SPLITS = tuple(f"transforms_{split}.json" for split in ("train", "val", "test"))
 """Files of a scene in parts, as in NeRF's synthetic scenes."""
 HOMES = ("", "nerfstudio")
@@ -38,12 +45,6 @@ ANGLE_RANGE = (1e-5, 3.14159)
 """Range of fields of view in radians, below π."""
 
 Pair = tuple[float | None, float | None]
-
-_INTRINSICS = (
-    *("camera_model", "is_fisheye", "w", "h", "fl_x", "fl_y", "cx", "cy"),
-    *("camera_angle_x", "camera_angle_y", "k1", "k2", "k3", "k4", "p1", "p2"),
-)
-"""Keys allowed at the top for all frames, or in a frame."""
 
 
 def has_transforms(path: Path) -> bool:
@@ -83,7 +84,7 @@ def _find_files(scene: Path) -> list[Path]:
 def _make_point_reader(files: Sequence[Path]) -> partial[Float[np.ndarray, "n 3"]] | None:
     """Return a reader of the points that a file names; None if there are none."""
     for file in files:
-        name = get_text(_read_transforms(file), "ply_file_path", str(file))
+        name = get_text(read_json(file, ADVICE), "ply_file_path", str(file))
         if name is not None and os.path.isfile(file.parent / name):
             return partial(read_point_cloud, file.parent / name)
     return None
@@ -95,56 +96,38 @@ def read_frames(path: Path) -> list[Frame]:
     Poses within `MAX_RIGID_ERROR` of a rigid transform get the nearest rotation, unless they are
     within `FLOAT_NOISE` of it.
     """
-    content = _read_transforms(path)
-    entries = content.get("frames")
-    if not isinstance(entries, list) or not entries:
-        raise InputError(f"{path} lists no frames; its `frames` has to be a list with cameras.")
-    shared = {key: content[key] for key in _INTRINSICS if key in content}
-    unit = get_optional_number(content, "depth_unit_scale_factor", str(path), *DEPTH_RANGE)
-    unit = 1e-3 if unit is None else unit
-    return [_parse_frame(entry, i, shared, unit, path) for i, entry in enumerate(entries)]
-
-
-def _read_transforms(path: Path) -> dict[str, Any]:
-    content = read_json(path, "export the scene again")
-    if not isinstance(content, dict):
-        raise InputError(f"{path} is no transforms.json: it has to be an object with `frames`.")
-    return content
+    content = read_json(path, ADVICE)
+    entries = get_part(content, "frames", list)
+    require(entries, f"{path} lists no frames; its `frames` has to be a list with cameras.")
+    unit = get_optional_number(content, "depth_unit_scale_factor", str(path), *DEPTH_RANGE) or 1e-3
+    return [_parse_frame(entry, i, content, unit, path) for i, entry in enumerate(entries)]
 
 
 def _parse_frame(
-    entry: Any, position: int, shared: Mapping[str, Any], depth_unit: float, path: Path
+    entry: Any, position: int, content: Mapping[str, Any], depth_unit: float, path: Path
 ) -> Frame:
     title = f"frame {position} of {path}"
-    if not isinstance(entry, dict):
-        raise InputError(f"{capitalize(title)} is not an object with a `transform_matrix`.")
-    file_path, depth_path, mask_path = (
-        get_text(entry, key, title) for key in ("file_path", "depth_file_path", "mask_path")
-    )
+    file_path = get_text(entry, "file_path", title)
     if file_path is not None:
         title = f"frame {quote_value(file_path)} of {path}"
+
+    def locate(key: str) -> Path | None:
+        name = get_text(entry, key, title)
+        return None if name is None else path.parent / name
+
+    depth = locate("depth_file_path")
+    c2w = get_array(entry, "transform_matrix", title, (3, 4), (4, 4))
     frame = Frame(
         name=file_path or str(position),
         title=title,
-        c2w=_parse_matrix(entry, title),
-        intrinsics=_parse_intrinsics({**shared, **entry}, title),
-        image=None if file_path is None else path.parent / file_path,
-        depth=None if depth_path is None else (path.parent / depth_path, depth_unit),
-        mask=None if mask_path is None else path.parent / mask_path,
+        c2w=np.vstack([c2w, [0, 0, 0, 1]]) if len(c2w) == 3 else c2w,
+        intrinsics=_parse_intrinsics({**content, **entry}, title),
+        image=locate("file_path"),
+        depth=None if depth is None else (depth, depth_unit),
+        mask=locate("mask_path"),
     )
     frame = frame.with_rigid_pose(" (`transform_matrix`)")
     return replace(frame, c2w=frame.c2w @ OPENCV_FROM_OPENGL)
-
-
-def _parse_matrix(entry: Mapping[str, Any], title: str) -> Float[np.ndarray, "4 4"]:
-    if entry.get("transform_matrix") is None:
-        raise InputError(f"The `transform_matrix` of {title} is missing; add its camera-to-world.")
-    pose = convert_to_array(entry["transform_matrix"])
-    if pose.shape not in ((3, 4), (4, 4)):
-        raise InputError(
-            f"The `transform_matrix` of {title} is no 3×4 or 4×4 matrix of numbers; correct it."
-        )
-    return np.vstack([pose[:3], [0, 0, 0, 1]]) if len(pose) == 3 else pose
 
 
 def _parse_intrinsics(entry: Mapping[str, Any], title: str) -> Intrinsics:
@@ -154,37 +137,32 @@ def _parse_intrinsics(entry: Mapping[str, Any], title: str) -> Intrinsics:
 
     focal = read_pair("fl_x", "fl_y", low=1 / MAX_IN_PIXELS)
     angle = read_pair("camera_angle_x", "camera_angle_y", low=ANGLE_RANGE[0], high=ANGLE_RANGE[1])
-    if focal == angle == (None, None):
-        raise InputError(
-            f"The focal length of {title} is missing; add `fl_x` and `fl_y`, or `camera_angle_x`."
-        )
-    w, h = read_pair("w", "h", low=1.0, high=float(MAX_SIDE))
-    size = None if w is None or h is None else (int(w), int(h))
-    if size is not None and size != (w, h):
-        raise InputError(
-            f"The `w` and `h` of {title} are not whole numbers of pixels; correct them."
-        )
+    require(
+        any(focal + angle),
+        f"The focal length of {title} is missing; add `fl_x` and `fl_y`, or `camera_angle_x`.",
+    )
+    has_size = all(entry.get(key) is not None for key in "wh")
+    size = get_size(entry, title, "w", "h") if has_size else None
     return Intrinsics(size, focal, read_pair("cx", "cy"), angle, _parse_distortion(entry, title))
 
 
 def _parse_distortion(entry: Mapping[str, Any], title: str) -> Distortion:
-    model = entry.get("camera_model")
-    if model is None:
-        model = "OPENCV_FISHEYE" if entry.get("is_fisheye") else "OPENCV"
-    if model not in PERSPECTIVE_MODELS + FISHEYE_MODELS:
-        raise InputError(
-            f"The camera model '{quote_value(model)}' of {title} is not supported; undistort the "
-            f"images first, or use one of {', '.join(PERSPECTIVE_MODELS + FISHEYE_MODELS)}."
-        )
+    default = "OPENCV_FISHEYE" if entry.get("is_fisheye") else "OPENCV"
+    model = default if entry.get("camera_model") is None else entry["camera_model"]
+    require(
+        model in PERSPECTIVE_MODELS + FISHEYE_MODELS,
+        f"The camera model '{quote_value(model)}' of {title} is not supported; undistort the "
+        f"images first, or use one of {', '.join(PERSPECTIVE_MODELS + FISHEYE_MODELS)}.",
+    )
     k1, k2, k3, k4, p1, p2 = (
         get_optional_number(entry, key, title, -MAX_COEFFICIENT, MAX_COEFFICIENT) or 0.0
         for key in ("k1", "k2", "k3", "k4", "p1", "p2")
     )
     if model in FISHEYE_MODELS:
         return Distortion("equidistant", radial=(k1, k2, k3, k4))
-    if k4:
-        raise InputError(
-            f"The coefficient k4 of {title} belongs to fisheye lenses, and its camera model is "
-            f"{model}; set it to 0, or undistort the images first."
-        )
+    require(
+        k4 == 0,
+        f"The coefficient k4 of {title} belongs to fisheye lenses, and its camera model is "
+        f"{model}; set it to 0, or undistort the images first.",
+    )
     return Distortion(radial=(k1, k2, k3), tangential=(p1, p2))

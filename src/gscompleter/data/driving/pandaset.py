@@ -8,22 +8,18 @@ from __future__ import annotations
 
 import os
 from collections.abc import Iterator
-from dataclasses import replace
 from pathlib import Path
 
 from gscompleter.data.frame import Frame
 from gscompleter.data.json_fields import get_intrinsics, get_pose
+from gscompleter.data.limits import require
 from gscompleter.data.photographs import Photographs, build_drive
-from gscompleter.errors import InputError, quote_value
+from gscompleter.errors import quote_value
 from gscompleter.io.json_file import read_json
 
 FRONT = "front_camera"
-INTRINSICS, POSES = "intrinsics.json", "poses.json"
+POSES = "poses.json"
 ADVICE = "copy the sequence again"
-NO_DEPTH = (
-    "The point clouds and boxes of PandaSet are not read, because they are pandas pickles, which "
-    "can run any code."
-)
 
 
 def has_pandaset(path: Path) -> bool:
@@ -36,24 +32,19 @@ def open_pandaset(path: Path) -> Iterator[Photographs]:
 
     Frames are numbered camera by camera, the front camera first, and by time.
     """
-    folders = sorted((path / "camera").iterdir(), key=lambda f: (f.name != FRONT, f.name))
-    cameras = [folder for folder in folders if os.path.isfile(folder / POSES)]
-    frames = [frame for folder in cameras for frame in _read_frames(folder)]
-    if not frames:
-        raise InputError(f"There are no poses in {quote_value(path)}; {ADVICE}.")
-    found = build_drive(path.resolve().name, str(path), frames, front=FRONT)
-    yield replace(found, notes=(NO_DEPTH,))
+    files = (path / "camera").glob(f"*/{POSES}")
+    cameras = sorted(files, key=lambda file: (file.parent.name != FRONT, file))
+    frames = [frame for file in cameras for frame in _read_frames(file)]
+    require(frames, f"There are no poses in {quote_value(path)}; {ADVICE}.")
+    yield build_drive(path.resolve().name, str(path), frames, front=FRONT)
 
 
-def _read_frames(folder: Path) -> Iterator[Frame]:
-    poses, lens = (read_json(folder / name, ADVICE) for name in (POSES, INTRINSICS))
-    if not isinstance(poses, list):
-        raise InputError(f"{quote_value(folder / POSES)} is no list of poses; {ADVICE}.")
-    entry = lens if isinstance(lens, dict) else {}
-    intrinsics = get_intrinsics(entry, quote_value(folder / INTRINSICS))
+def _read_frames(file: Path) -> Iterator[Frame]:
+    poses, lens, camera = read_json(file, ADVICE), file.with_name("intrinsics.json"), file.parent
+    require(isinstance(poses, list), f"{quote_value(file)} is no list of poses; {ADVICE}.")
+    intrinsics = get_intrinsics(read_json(lens, ADVICE), quote_value(lens))
     for number, pose in enumerate(poses):
-        title = f"pose {number} of {quote_value(folder / POSES)}"
-        c2w = get_pose(pose, "position", "heading", "wxyz", title)
-        image = folder / f"{number:02d}"
-        name = f"{folder.name}/{image.name}"
-        yield Frame(name, title, c2w, intrinsics, image, sensor=folder.name)
+        title = f"pose {number} of {quote_value(file)}"
+        c2w, image = get_pose(pose, "position", "heading", "wxyz", title), camera / f"{number:02d}"
+        name = f"{camera.name}/{image.name}"
+        yield Frame(name, title, c2w, intrinsics, image, sensor=camera.name)

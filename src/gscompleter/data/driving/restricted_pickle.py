@@ -25,27 +25,47 @@ NUMBERS = frozenset(["b1", "i1", "i2", "i4", "i8", "u1", "u2", "u4", "u8", "f2",
 
 
 def load_plain(path: Path) -> Any:
-    """Load the plain value in a pickle; anything else raises an InputError."""
+    """Load the plain value in a pickle, with lists for tuples; refuses anything else."""
     refuse_pointer(path)
+    data = read_bytes(path, MAX_BYTES)
     try:
-        data = read_bytes(path, MAX_BYTES)
         value = _Plain(io.BytesIO(data)).load()
-        check_plain(value, path, MAX_REPEATS * len(data))
-        return value
-    except InputError:
-        raise
     except Exception as error:  # damaged pickles raise anything
         raise InputError(
             f"{quote_value(path)} is no pickle of plain values ({type(error).__name__}: "
             f"{quote_value(str(error))}); write it again with lists and numbers only."
         ) from error
+    check_plain(value, path, MAX_REPEATS * len(data))
+    return value
+
+
+class _Kind:
+    """Stand-in for a NumPy dtype of a single number."""
+
+    def __init__(self, code: str, *_: Any) -> None:
+        if code not in NUMBERS:
+            raise pickle.UnpicklingError(f"it holds NumPy values of the kind {quote_value(code)}")
+        self.code, self.order = code, "="
+
+    def build(self, data: bytes) -> bool | int | float:
+        """Build the Python number of these bytes."""
+        (value,) = np.frombuffer(data, np.dtype(self.order + self.code)).tolist()
+        return value
+
+
+CONSTRUCTORS: dict[tuple[str, str], Callable[..., Any]] = {
+    ("numpy.core.multiarray", "scalar"): _Kind.build,
+    ("numpy", "dtype"): _Kind,
+    ("_codecs", "encode"): str.encode,
+}
+"""Constructors for the accepted names."""
 
 
 # The unpickler in C allocates any size that a few bytes claim; the one in Python does not.
 class _Plain(pickle._Unpickler):
-    """Unpickler that knows three names, and dictionaries with plain keys only.
+    """Unpickler that knows three names, and makes lists of tuples.
 
-    Hashing nested tuples overflows the stack of the process; sets would need it too.
+    As keys of a dictionary, nested tuples would overflow the stack of the process.
     """
 
     def find_class(self, module: str, name: str) -> Callable[..., Any]:
@@ -54,60 +74,28 @@ class _Plain(pickle._Unpickler):
             raise pickle.UnpicklingError(f"it names {module}.{name}")
         return found
 
-    def persistent_load(self, pid: Any) -> Any:
-        raise pickle.UnpicklingError("it refers to external objects")
+
+def _load_order(unpickler: Any) -> None:
+    """Set the byte order of a kind of number, the second of the values on the stack."""
+    order, kind = unpickler.stack.pop()[1], unpickler.stack[-1]
+    if not isinstance(kind, _Kind) or order not in ("<", ">", "=", "|"):
+        raise pickle.UnpicklingError("it changes an object")
+    kind.order = order
 
 
-class _Kind:
-    """Stand-in for a NumPy dtype of a single number."""
-
-    def __init__(self, code: str, align: bool = False, copy: bool = False) -> None:
-        if code not in NUMBERS:
-            raise pickle.UnpicklingError(f"it holds NumPy values of the kind {quote_value(code)}")
-        self.code, self.order = code, "="
-
-    def __setstate__(self, state: tuple[Any, ...]) -> None:
-        self.order = state[1] if state[1] in ("<", ">", "=") else "="
-
-    def build(self, data: bytes) -> bool | int | float:
-        """Build the Python number of these bytes."""
-        (value,) = np.frombuffer(data, np.dtype(self.order + self.code)).tolist()
-        return value
-
-
-def _encode(text: str, encoding: str) -> bytes:
-    if encoding != "latin1":
-        raise pickle.UnpicklingError(f"it uses the encoding {quote_value(encoding)}")
-    return text.encode("latin1")
-
-
-CONSTRUCTORS: dict[tuple[str, str], Callable[..., Any]] = {
-    ("numpy.core.multiarray", "scalar"): _Kind.build,
-    ("numpy", "dtype"): _Kind,
-    ("_codecs", "encode"): _encode,
-}
-"""Constructors for the accepted names."""
-
-
-def _guard(code: bytes, part: slice, *types: type) -> Callable[[Any], None]:
-    """Run an instruction only if a part of the unpickler's stack has these types."""
+def _make_list_loader(code: bytes) -> Callable[[Any], None]:
     load: Callable[[Any], None] = pickle._Unpickler.dispatch[code[0]]
 
-    def load_guarded(unpickler: Any) -> None:
-        if not all(isinstance(value, types) for value in unpickler.stack[part]):
-            raise pickle.UnpicklingError("it holds a key or an object that is not plain")
+    def load_list(unpickler: Any) -> None:
         load(unpickler)
+        unpickler.stack[-1] = list(unpickler.stack[-1])
 
-    return load_guarded
+    return load_list
 
 
-_KEYS = (str, int, float, type(None))
+_TUPLES = (pickle.EMPTY_TUPLE, pickle.TUPLE, pickle.TUPLE1, pickle.TUPLE2, pickle.TUPLE3)
 _Plain.dispatch = {
     **pickle._Unpickler.dispatch,
-    pickle.SETITEM[0]: _guard(pickle.SETITEM, slice(-2, -1), *_KEYS),
-    pickle.SETITEMS[0]: _guard(pickle.SETITEMS, slice(None, None, 2), *_KEYS),
-    pickle.DICT[0]: _guard(pickle.DICT, slice(None, None, 2), *_KEYS),
-    pickle.BUILD[0]: _guard(pickle.BUILD, slice(-2, -1), _Kind),
+    **{code[0]: _make_list_loader(code) for code in _TUPLES},
+    pickle.BUILD[0]: _load_order,
 }
-for _code in (pickle.EMPTY_SET, pickle.ADDITEMS, pickle.FROZENSET):
-    del _Plain.dispatch[_code[0]]

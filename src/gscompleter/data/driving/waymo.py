@@ -12,7 +12,6 @@ from __future__ import annotations
 
 import os
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass
 from functools import lru_cache, partial
 from pathlib import Path
 from typing import Any
@@ -21,10 +20,9 @@ import numpy as np
 from jaxtyping import Float
 
 from gscompleter.data.cameras import Intrinsics
-from gscompleter.data.driving.lidar import build_poses, compute_points, transform_points
-from gscompleter.data.driving.moving_objects import Box, build_upright_pose, convert_speed
+from gscompleter.data.driving.vehicle import Box, build_box, build_poses, transform_points
 from gscompleter.data.frame import Frame
-from gscompleter.data.limits import MAX_SIDE
+from gscompleter.data.limits import MAX_SIDE, require
 from gscompleter.data.photographs import Photographs, build_drive
 from gscompleter.data.undistort import Distortion
 from gscompleter.errors import InputError, quote_value
@@ -32,19 +30,9 @@ from gscompleter.io.reading import check_file
 
 ADVICE = "download it again"
 IMAGES = "camera_image"
-COMPONENTS = {
-    IMAGES: "CameraImageComponent",
-    "camera_calibration": "CameraCalibrationComponent",
-    "lidar": "LiDARComponent",
-    "lidar_calibration": "LiDARCalibrationComponent",
-    "lidar_pose": "LiDARPoseComponent",
-    "vehicle_pose": "VehiclePoseComponent",
-    "lidar_box": "LiDARBoxComponent",
-}
-"""Prefixes of the columns of each component."""
 TIME, CAMERA, LASER = "key.frame_timestamp_micros", "key.camera_name", "key.laser_name"
-LENS = ("width", "height", *(f"intrinsic.{name}" for name in ("f_u", "f_v", "c_u", "c_v")))
-LENS_DISTORTION = tuple(f"intrinsic.{name}" for name in ("k1", "k2", "k3", "p1", "p2"))
+INTRINSICS = ("f_u", "f_v", "c_u", "c_v", "k1", "k2", "k3", "p1", "p2")
+LENS = ("width", "height", *(f"intrinsic.{name}" for name in INTRINSICS))
 CAMERAS = {1: "FRONT", 2: "FRONT_LEFT", 3: "FRONT_RIGHT", 4: "SIDE_LEFT", 5: "SIDE_RIGHT"}
 """Camera names by their numbers in the tables."""
 SIGN = 3
@@ -54,8 +42,6 @@ CAMERA_FROM_OPENCV = np.array(
 )
 """Axis change from x right, y down, z forward to x forward, y left, z up."""
 
-Beams = tuple[Float[np.ndarray, "h"] | None, float | None, float | None]
-"""Beam elevations of a laser in radians, ascending, and their lower and upper end."""
 PosedLens = tuple[Intrinsics, Float[np.ndarray, "4 4"]]
 """Intrinsics of a camera, and its pose on the vehicle in Waymo's axes."""
 
@@ -73,67 +59,52 @@ def open_waymo(path: Path) -> Iterator[Photographs]:
     Frames are numbered camera by camera, the front camera first, and by time.
     """
     files = sorted((path / IMAGES).glob("*.parquet")) if os.path.isdir(path) else [path]
-    return (_open_segment(Segment(file.parent.parent, file.stem)) for file in files)
+    return (_open_segment(file) for file in files)
 
 
-@dataclass(frozen=True)
-class Segment:
-    """Twenty seconds of one drive."""
-
-    root: Path
-    """Folder with a subfolder per component."""
-    name: str
-
-    def get_path(self, component: str) -> Path:
-        """Return the path of a component."""
-        return self.root / component / f"{self.name}.parquet"
-
-    def has_components(self, *components: str) -> bool:
-        """Check whether all these components exist."""
-        return all(os.path.isfile(self.get_path(component)) for component in components)
-
-    def read_rows(
-        self, component: str, columns: Sequence[str], where: Mapping[str, int] | None = None
-    ) -> Iterator[tuple[Any, ...]]:
-        """Read columns of a component, named without its prefix, row by row.
-
-        Only rows where the columns of `where` have these values are read. Lists of numbers become
-        arrays; null becomes None.
-        """
-        prefix = f"[{COMPONENTS[component]}]."
-        names = [name if name.startswith("key.") else prefix + name for name in columns]
-        table = _read_table(self.get_path(component), names, where or {})
-        values = [[_to_plain(value) for value in table.column(name)] for name in names]
-        return zip(*values, strict=True)
+def _locate(segment: Path, component: str) -> Path:
+    """Return the file of a component; `segment` is that of the photographs."""
+    return segment.parent.parent / component / segment.name
 
 
-def _read_table(path: Path, columns: Sequence[str], where: Mapping[str, int]) -> Any:
-    try:
-        import pyarrow
-        from pyarrow import dataset
-    except ImportError as error:
-        raise InputError(
-            f"{quote_value(path)} is a parquet file, and pyarrow is not installed; run "
-            "`pip install 'gscompleter[waymo]'`."
-        ) from error
+def _has_components(segment: Path, *components: str) -> bool:
+    return all(os.path.isfile(_locate(segment, component)) for component in components)
+
+
+def _read_rows(
+    path: Path, columns: Sequence[str], where: Mapping[str, int] | None = None
+) -> Iterator[tuple[Any, ...]]:
+    """Read columns of a file, named without their prefix, row by row.
+
+    Only rows where the columns of `where` have these values are read. Lists of numbers become
+    arrays; null becomes None.
+    """
+    pyarrow, parquet = _import_pyarrow(path)
     check_file(path)
+    filters = [(column, "==", value) for column, value in (where or {}).items()] or None
     try:
-        table = dataset.dataset(path, format="parquet")
-        absent = [name for name in (*columns, *where) if name not in table.schema.names]
-        if absent:
-            raise InputError(
-                f"{quote_value(path)} has no column {quote_value(absent[0])}; {ADVICE}."
-            )
-        keep = None
-        for column, value in where.items():
-            same = dataset.field(column) == value
-            keep = same if keep is None else keep & same
-        return table.to_table(columns, filter=keep, use_threads=False)
+        stored = {name.rpartition("].")[2]: name for name in parquet.read_schema(path).names}
+        names = [stored.get(column, column) for column in columns]
+        table = parquet.read_table(path, columns=names, filters=filters, partitioning=None)
     except (pyarrow.ArrowException, OSError, UnicodeDecodeError) as error:
         lines = str(error).strip().splitlines() or [type(error).__name__]
         raise InputError(
             f"{quote_value(path)} cannot be read ({quote_value(lines[0])}); {ADVICE}."
         ) from error
+    values = [[_to_plain(value) for value in table.column(name)] for name in names]
+    return zip(*values, strict=True)
+
+
+def _import_pyarrow(path: Path) -> tuple[Any, Any]:
+    try:
+        import pyarrow
+        from pyarrow import parquet
+    except ImportError as error:
+        raise InputError(
+            f"{quote_value(path)} is a parquet file, and pyarrow is not installed; run "
+            "`pip install 'gscompleter[waymo]'`."
+        ) from error
+    return pyarrow, parquet
 
 
 def _to_plain(scalar: Any) -> Any:
@@ -144,26 +115,24 @@ def _to_plain(scalar: Any) -> Any:
     return scalar.as_py() if values is None else values.to_numpy(zero_copy_only=False)
 
 
-def _open_segment(segment: Segment) -> Photographs:
-    file, cameras = segment.get_path(IMAGES), _read_cameras(segment)
-    rows = segment.read_rows(IMAGES, (CAMERA, TIME, "pose.transform"))
+def _open_segment(segment: Path) -> Photographs:
+    cameras = _read_cameras(_locate(segment, "camera_calibration"))
+    rows = _read_rows(segment, (CAMERA, TIME, "pose.transform"))
     shown = sorted((row for row in rows if row[0] in CAMERAS), key=lambda row: row[:2])
-    if not shown:
-        raise InputError(f"{quote_value(file)} holds no photographs; {ADVICE}.")
+    require(shown, f"{quote_value(segment)} holds no photographs; {ADVICE}.")
     frames = [_make_frame(segment, cameras, *row) for row in shown]
-    return build_drive(segment.name, str(file), frames, front=CAMERAS[1])
+    return build_drive(segment.stem, str(segment), frames, front=CAMERAS[1])
 
 
 def _make_frame(
-    segment: Segment, cameras: dict[int, PosedLens], camera: int, time: int, pose: Any
+    segment: Path, cameras: dict[int, PosedLens], camera: int, time: int, pose: Any
 ) -> Frame:
-    file, name = quote_value(segment.get_path(IMAGES)), CAMERAS[camera]
-    title = f"the photograph of {name} at {time} in {file}"
-    if camera not in cameras:
-        raise InputError(f"The camera of {title} has no calibration; {ADVICE}.")
+    name = CAMERAS[camera]
+    title = f"the photograph of {name} at {time} in {quote_value(segment)}"
+    require(camera in cameras, f"The camera of {title} has no calibration; {ADVICE}.")
     intrinsics, vehicle_from_camera = cameras[camera]
-    measured = segment.has_components("lidar", "lidar_calibration", "vehicle_pose")
-    boxed = segment.has_components("lidar_box", "vehicle_pose")
+    measured = _has_components(segment, "lidar", "lidar_calibration", "vehicle_pose")
+    boxed = _has_components(segment, "lidar_box", "vehicle_pose")
     return Frame(
         f"{name}/{time}",
         title,
@@ -176,126 +145,119 @@ def _make_frame(
     )
 
 
-def _read_cameras(segment: Segment) -> dict[int, PosedLens]:
-    columns = (CAMERA, "extrinsic.transform", *LENS, *LENS_DISTORTION)
-    title = str(segment.get_path("camera_calibration"))
-    return {
-        camera: (_parse_intrinsics(numbers, title), _parse_matrix(pose, title))
-        for camera, pose, *numbers in segment.read_rows("camera_calibration", columns)
-    }
-
-
-def _parse_intrinsics(numbers: Sequence[Any], title: str) -> Intrinsics:
-    known = [number for number in numbers if number is not None and np.isfinite(number)]
-    if len(known) < len(numbers):
-        raise InputError(f"A camera in {title} lacks intrinsics; {ADVICE}.")
-    width, height, f_u, f_v, c_u, c_v, k1, k2, k3, p1, p2 = known
-    size = (int(width), int(height))
-    if not all(1 <= side <= MAX_SIDE for side in size):
-        raise InputError(f"A camera in {title} has images of {size} pixels; {ADVICE}.")
-    distortion = Distortion(radial=(k1, k2, k3), tangential=(p1, p2))
-    return Intrinsics(size, (f_u, f_v), (c_u, c_v), distortion=distortion)
-
-
-def _read_image(segment: Segment, time: int, camera: int) -> bytes:
-    columns, where = ("image",), {TIME: time, CAMERA: camera}
-    found = [image for (image,) in segment.read_rows(IMAGES, columns, where)]
-    if len(found) != 1 or not isinstance(found[0], bytes):
-        raise InputError(
-            f"{quote_value(segment.get_path(IMAGES))} has no image of {CAMERAS[camera]} at "
-            f"{time}; {ADVICE}."
+def _read_cameras(path: Path) -> dict[int, PosedLens]:
+    """Read the cameras by their numbers."""
+    title, found = quote_value(path), {}
+    for camera, pose, *numbers in _read_rows(path, (CAMERA, "extrinsic.transform", *LENS)):
+        lens = np.array(numbers, dtype=np.float64)  # null becomes NaN
+        require(
+            np.isfinite(lens).all() and (lens[:2] >= 1).all() and (lens[:2] <= MAX_SIDE).all(),
+            f"Camera {camera} in {title} has no size or no intrinsics; {ADVICE}.",
         )
-    return found[0]
+        width, height, f_u, f_v, c_u, c_v, k1, k2, k3, p1, p2 = lens.tolist()
+        distortion = Distortion(radial=(k1, k2, k3), tangential=(p1, p2))
+        size = (int(width), int(height))
+        intrinsics = Intrinsics(size, (f_u, f_v), (c_u, c_v), distortion=distortion)
+        found[camera] = intrinsics, _parse_matrix(pose, title)
+    return found
+
+
+def _read_image(segment: Path, time: int, camera: int) -> bytes:
+    found = list(_read_rows(segment, ("image",), {TIME: time, CAMERA: camera}))
+    title = f"{CAMERAS[camera]} at {time} in {quote_value(segment)}"
+    require(len(found) == 1 and found[0][0], f"The image of {title} is missing; {ADVICE}.")
+    image: bytes = found[0][0]
+    return image
 
 
 @lru_cache(maxsize=2)
-def _read_points(segment: Segment, time: int) -> Float[np.ndarray, "n 3"]:
+def _read_points(segment: Path, time: int) -> Float[np.ndarray, "n 3"]:
     """Read the first laser returns in the world frame, in metres.
 
     The roof laser rotates while the vehicle drives; `lidar_pose` has the vehicle pose per pixel.
     """
-    vehicle, lasers = _read_vehicle_pose(segment, time), _read_lasers(segment)
-    turning = segment.has_components("lidar_pose")
-    poses = _read_range_images(segment, "lidar_pose", time) if turning else {}
+    vehicle = _read_vehicle_pose(_locate(segment, "vehicle_pose"), time)
+    lasers = _read_lasers(_locate(segment, "lidar_calibration"))
+    measured, turning = _locate(segment, "lidar"), _locate(segment, "lidar_pose")
+    poses = _read_range_images(turning, time) if os.path.isfile(turning) else {}
     points = [np.zeros((0, 3))]
-    for laser, image in _read_range_images(segment, "lidar", time).items():
-        ranges = image[..., 0]
-        beams, extrinsic = lasers.get(laser, ((None, None, None), np.eye(4)))
-        elevations = _compute_elevations(beams, len(ranges))
-        pose = build_poses(poses[laser]) if laser in poses else vehicle
-        if elevations is None or (pose.ndim > 2 and pose.shape[:2] != ranges.shape):
-            raise InputError(
-                f"Laser {laser} of {quote_value(segment.get_path('lidar'))} does not fit its "
-                f"calibration or its poses; {ADVICE}."
-            )
+    for laser, image in _read_range_images(measured, time).items():
+        title = f"laser {laser} of {quote_value(measured)}"
+        ranges, moving = image[..., 0], poses.get(laser)
+        fits = laser in lasers and (moving is None or moving.shape == (*ranges.shape, 6))
+        require(fits, f"The {title} does not fit its calibration or its poses; {ADVICE}.")
         hit = np.isfinite(ranges) & (ranges > 0)
-        local = compute_points(ranges, elevations, extrinsic)[hit]
-        points.append(transform_points(local, pose if pose.ndim == 2 else pose[hit]))
+        local = _compute_points(title, ranges, *lasers[laser])[hit]
+        pose = vehicle if moving is None else build_poses(moving[hit])
+        points.append(transform_points(local, pose))
     return np.concatenate(points)
 
 
-def _compute_elevations(beams: Beams, height: int) -> Float[np.ndarray, "h"] | None:
-    """Compute the elevation of each row in radians, highest first; None if `beams` do not fit."""
-    values, low, high = beams
-    if values is not None:
-        return values[::-1] if len(values) == height else None
-    if low is None or high is None:
-        return None
-    return (low + (np.arange(height) + 0.5) / height * (high - low))[::-1]
+def _compute_points(
+    title: str,
+    ranges: Float[np.ndarray, "h w"],
+    extrinsic: Float[np.ndarray, "4 4"],
+    beams: Float[np.ndarray, "_"] | None,
+    low: float | None,
+    high: float | None,
+) -> Float[np.ndarray, "h w 3"]:
+    """Compute the points (metres) of a range image in the vehicle frame.
+
+    It has one row per beam, the highest first, and one column per direction. Columns begin behind
+    the laser and turn clockwise as seen from above. `beams` are the elevations in radians,
+    ascending, by default evenly spaced from `low` to `high`; `extrinsic` is the pose of the laser.
+    """
+    height, width = ranges.shape
+    if beams is None and low is not None and high is not None:
+        beams = low + (np.arange(height) + 0.5) / height * (high - low)
+    if beams is None or len(beams) != height:
+        raise InputError(f"The {title} does not fit its calibration; {ADVICE}.")
+    yaw = np.arctan2(extrinsic[1, 0], extrinsic[0, 0])
+    azimuths = np.pi * (1 - 2 * (np.arange(width) + 0.5) / width) - yaw
+    level, up = np.cos(beams[::-1, None]), np.sin(beams[::-1, None])
+    up = np.broadcast_to(up, ranges.shape)
+    rays = np.stack([level * np.cos(azimuths), level * np.sin(azimuths), up], axis=-1)
+    return transform_points(ranges[..., None] * rays, extrinsic)
 
 
-def _read_vehicle_pose(segment: Segment, time: int) -> Float[np.ndarray, "4 4"]:
-    title = str(segment.get_path("vehicle_pose"))
-    columns = ("world_from_vehicle.transform",)
-    rows = list(segment.read_rows("vehicle_pose", columns, {TIME: time}))
-    if len(rows) != 1:
-        raise InputError(f"{title} has {len(rows)} poses at {time}; {ADVICE}.")
-    return _parse_matrix(rows[0][0], title)
+def _read_vehicle_pose(path: Path, time: int) -> Float[np.ndarray, "4 4"]:
+    rows = list(_read_rows(path, ("world_from_vehicle.transform",), {TIME: time}))
+    require(len(rows) == 1, f"{quote_value(path)} has {len(rows)} poses at {time}; {ADVICE}.")
+    return _parse_matrix(rows[0][0], quote_value(path))
 
 
-def _read_lasers(segment: Segment) -> dict[int, tuple[Beams, Float[np.ndarray, "4 4"]]]:
-    """Read the beams of each laser, and its pose on the vehicle."""
+def _read_lasers(path: Path) -> dict[int, tuple[Any, ...]]:
+    """Read the pose of each laser on the vehicle, its beams, and their lower and upper end."""
     beams = (f"beam_inclination.{name}" for name in ("values", "min", "max"))
-    rows = segment.read_rows("lidar_calibration", (LASER, "extrinsic.transform", *beams))
-    title = str(segment.get_path("lidar_calibration"))
-    return {
-        laser: ((values, low, high), _parse_matrix(pose, title))
-        for laser, pose, values, low, high in rows
-    }
+    rows = _read_rows(path, (LASER, "extrinsic.transform", *beams))
+    return {laser: (_parse_matrix(pose, quote_value(path)), *rest) for laser, pose, *rest in rows}
 
 
-def _read_range_images(
-    segment: Segment, component: str, time: int
-) -> dict[int, Float[np.ndarray, "h w c"]]:
+def _read_range_images(path: Path, time: int) -> dict[int, Float[np.ndarray, "h w c"]]:
     """Read the range image of the first returns, or the poses of its pixels, by laser."""
-    columns = (LASER, "range_image_return1.values", "range_image_return1.shape")
-    found = {}
-    for laser, values, shape in segment.read_rows(component, columns, {TIME: time}):
-        if values is None or shape is None:
-            continue
-        if len(shape) != 3 or any(side < 1 for side in shape) or len(values) != np.prod(shape):
-            file = quote_value(segment.get_path(component))
-            raise InputError(f"A range image in {file} is damaged; {ADVICE}.")
-        found[laser] = np.asarray(values, dtype=np.float64).reshape(shape)
+    columns, found = (LASER, "range_image_return1.values", "range_image_return1.shape"), {}
+    for laser, values, shape in _read_rows(path, columns, {TIME: time}):
+        if values is not None and shape is not None:
+            fits = len(shape) == 3 and min(shape) > 0 and len(values) == np.prod(shape)
+            require(fits, f"A range image in {quote_value(path)} is damaged; {ADVICE}.")
+            found[laser] = np.asarray(values, dtype=np.float64).reshape(shape)
     return found
 
 
-def _read_boxes(segment: Segment, time: int) -> tuple[Box, ...]:
+def _read_boxes(segment: Path, time: int) -> tuple[Box, ...]:
     """Read the boxes of objects around the vehicle, except signs."""
-    vehicle = _read_vehicle_pose(segment, time)
+    vehicle = _read_vehicle_pose(_locate(segment, "vehicle_pose"), time)
     vectors = ("box.center", "box.size", "speed")
     columns = ["type", "box.heading", *(f"{name}.{axis}" for name in vectors for axis in "xyz")]
-    boxes = []
-    for kind, heading, *numbers in segment.read_rows("lidar_box", columns, {TIME: time}):
+    rows, boxes = _read_rows(_locate(segment, "lidar_box"), columns, {TIME: time}), []
+    for kind, heading, *numbers in rows:
+        center, sides, velocity = np.array(numbers, dtype=np.float64).reshape(3, 3)
         if kind != SIGN:
-            center, sides, velocity = np.array(numbers, dtype=np.float64).reshape(3, 3)
-            pose = vehicle @ build_upright_pose(center, np.float64(heading))
-            length, width, height = sides.tolist()
-            boxes.append(Box(pose, (length, width, height), convert_speed(velocity)))
+            boxes.append(build_box(vehicle, center, sides, np.float64(heading), velocity))
     return tuple(boxes)
 
 
 def _parse_matrix(values: Any, title: str) -> Float[np.ndarray, "4 4"]:
-    if values is None or len(values) != 16 or not np.isfinite(values).all():
-        raise InputError(f"A transform in {title} is damaged; {ADVICE}.")
+    fits = values is not None and len(values) == 16 and np.isfinite(values).all()
+    require(fits, f"A transform in {title} is damaged; {ADVICE}.")
     return np.asarray(values, dtype=np.float64).reshape(4, 4)
