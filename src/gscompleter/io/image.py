@@ -26,7 +26,7 @@ MAX_PIXELS = 178_956_970
 PNG_COMPRESSION = 3
 """zlib level of written PNGs: 6 % more bytes than level 6, in a third of its time."""
 
-_ORIENTATION = 0x0112
+ORIENTATION = 0x0112
 """EXIF tag of the orientation; 1 is upright."""
 
 
@@ -60,15 +60,15 @@ def convert_to_image(pixels: UInt8[np.ndarray, "h w 3"]) -> Float[Tensor, "h w 3
 
 def read_image_size(stored: Path | bytes, name: str = "") -> tuple[int, int]:
     """Read width and height of an image file, or of its bytes; `name` is for errors."""
-    with _open(stored, name) as image:
+    with open_image(stored, name) as image:
         return image.size
 
 
 def has_orientation_tag(path: Path) -> bool:
     """Return True if the EXIF data of a photograph ask viewers to rotate it."""
     try:
-        with _open(path) as image:
-            return bool(image.getexif().get(_ORIENTATION, 1) != 1)
+        with open_image(path) as image:
+            return bool(image.getexif().get(ORIENTATION, 1) != 1)
     except Exception:  # of any kind; reading the photograph reports it
         return False
 
@@ -85,7 +85,7 @@ def read_pixels(stored: Path | str | bytes, name: str = "") -> UInt8[np.ndarray,
     Raises:
         InputError: The file is missing, truncated or not an image.
     """
-    with _open(stored, name) as image:
+    with open_image(stored, name) as image:
         return _composite_over_black(image)
 
 
@@ -94,7 +94,7 @@ def read_brightness(stored: Path | bytes, side: int, name: str = "") -> Float[np
 
     A JPEG is decoded no larger than necessary; `name` names bytes in errors.
     """
-    with _open(stored, name) as image:
+    with open_image(stored, name) as image:
         scale = min(1.0, side / max(image.size))
         size = max(round(image.width * scale), 1), max(round(image.height * scale), 1)
         image.draft("L", size)
@@ -140,7 +140,7 @@ def _load_depth_values(path: Path) -> np.ndarray:
 
 
 @contextmanager
-def _open(stored: Path | str | bytes, name: str = "") -> Iterator[Image.Image]:
+def open_image(stored: Path | str | bytes, name: str = "") -> Iterator[Image.Image]:
     """Open an image file, or its bytes; any failure while it is read becomes an InputError."""
     file: Path | io.BytesIO
     if isinstance(stored, bytes):

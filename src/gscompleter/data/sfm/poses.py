@@ -13,11 +13,12 @@ import os
 import subprocess
 import sys
 import tempfile
-from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import asdict, dataclass
+from collections.abc import Iterable, Mapping, Sequence
+from contextlib import ExitStack
+from dataclasses import asdict, dataclass, replace
 from importlib.util import find_spec
 from pathlib import Path
-from typing import IO, Any
+from typing import Any
 
 from gscompleter.cpu_threads import get_thread_count
 from gscompleter.data.frame import DOWNSCALE_FACTORS
@@ -27,7 +28,7 @@ from gscompleter.data.sfm.upright import UprightCopy, write_upright
 from gscompleter.errors import InputError, join_names, quote_value
 from gscompleter.io.files import SUMMARY_FILE, open_output_folder
 from gscompleter.io.json_file import read_json
-from gscompleter.progress import track
+from gscompleter.progress import stage, track
 
 ENDINGS = (".jpg", ".jpeg", ".png", ".tif", ".tiff", ".webp", ".bmp")
 """Endings of photographs, in any case."""
@@ -47,6 +48,8 @@ MAX_THREADS = 4
 MAX_NAMED = 5
 """Most photographs that a note names."""
 PROCESS = "gscompleter.data.sfm.mapping_process"
+PHASE = "phase: "
+"""Begin of the lines of `mapping_process` that name a phase."""
 
 
 @dataclass(frozen=True)
@@ -55,10 +58,8 @@ class FoundPoses:
 
     photographs: int
     """Number of input photographs."""
-    missing: tuple[str, ...]
+    missing: list[str]
     """Photographs without a camera."""
-    models: tuple[int, ...]
-    """Cameras in each disconnected model, the largest and kept one first."""
     points: int
     """Points of the model."""
     error: float
@@ -74,31 +75,18 @@ class FoundPoses:
         return self.photographs - len(self.missing)
 
     @property
-    def is_too_small(self) -> bool:
-        """True if the model has too few photographs or points."""
-        enough = max(MIN_PHOTOGRAPHS, MIN_SHARE * self.photographs)
-        return self.num_registered < enough or self.points < MIN_POINTS
-
-    @property
     def notes(self) -> list[str]:
         """Sentences for the user."""
-        notes, place = [], ""
+        notes = []
         if self.focal is not None:
             notes.append(
                 f"{self.num_registered} of {self.photographs} cameras were found with a focal "
                 f"length of {self.focal:.0f} px, fixed at plausible values first, because COLMAP "
                 "failed with a free one."
             )
-        if len(self.models) > 1:
-            *others, last = map(str, self.models)
-            notes.append(
-                f"The photographs fall into {len(self.models)} parts that do not connect, with "
-                f"{', '.join(others)} and {last} cameras; the largest is kept."
-            )
-            place = " in it"
         if self.missing:
             names = join_names(self.missing, MAX_NAMED)
-            notes.append(f"No camera was found{place} for {names}; they are left out.")
+            notes.append(f"No camera was found for {names}; they are left out.")
         return notes
 
 
@@ -122,9 +110,19 @@ def find_poses(photographs: Path, out: Path, overwrite: bool = False) -> FoundPo
         )
     with open_output_folder(out, overwrite) as folder:
         found = _run(photographs, names, folder)
-        content = {"found": asdict(found), "photographs": known}
+        content = {"poses": asdict(found), "photographs": known}
         (folder / SUMMARY_FILE).write_text(json.dumps(content, indent=1))
     return found
+
+
+def _read_earlier(out: Path, known: Mapping[str, list[int]]) -> FoundPoses | None:
+    """Read the earlier result for these photographs; None if there is none."""
+    if not os.path.isfile(out / SUMMARY_FILE) or not os.path.isdir(out / "sparse" / "0"):
+        return None
+    content = read_json(out / SUMMARY_FILE, "name another folder")
+    if content.keys() != {"poses", "photographs"} or content["photographs"] != known:
+        return None
+    return replace(FoundPoses(**content["poses"]), reused=True)
 
 
 def has_photographs(path: Path) -> bool:
@@ -161,19 +159,6 @@ def is_own(folder: Path) -> bool:
     return not os.path.isfile(folder / SUMMARY_FILE)
 
 
-def _read_earlier(out: Path, known: Mapping[str, list[int]]) -> FoundPoses | None:
-    """Read the earlier result for these photographs; None if missing or too small."""
-    if not os.path.isfile(out / SUMMARY_FILE) or not os.path.isdir(out / "sparse" / "0"):
-        return None
-    content = read_json(out / SUMMARY_FILE, "name another folder")
-    if not isinstance(content, dict) or content.get("photographs") != known:
-        return None
-    found = content["found"]
-    missing, models = tuple(found["missing"]), tuple(found["models"])
-    earlier = FoundPoses(**{**found, "missing": missing, "models": models, "reused": True})
-    return None if earlier.is_too_small else earlier
-
-
 def _run(photographs: Path, names: Sequence[str], folder: Path) -> FoundPoses:
     """Write `images` and `sparse/0` into `folder`."""
     copies = [
@@ -187,21 +172,22 @@ def _run(photographs: Path, names: Sequence[str], folder: Path) -> FoundPoses:
             f"{quote_value(str(photographs))}; add photographs of the same scene that overlap by "
             "two thirds and are sharp."
         )
-    missing = tuple(copy.source for copy in copies if copy.name not in result["registered"])
-    models, points = tuple(result["models"]), result["points"]
-    found = FoundPoses(len(names), missing, models, points, result["error"], result["focal"])
-    if found.is_too_small or result["defect"] is not None:
-        lens = "" if result["defect"] is None else f", {result['defect']}"
+    missing = [copy.source for copy in copies if copy.name not in result["registered"]]
+    found = FoundPoses(len(names), missing, result["points"], result["error"], result["focal"])
+    enough = max(MIN_PHOTOGRAPHS, MIN_SHARE * len(names))
+    is_large = found.num_registered >= enough and found.points >= MIN_POINTS
+    if not (is_large and result["is_plausible"]):
+        lens = "" if result["is_plausible"] else " and an implausible lens"
         raise InputError(
             f"COLMAP placed {found.num_registered} of {found.photographs} photographs in "
-            f"{quote_value(photographs, 40)}, with {points:,} points{lens}, which is no usable "
-            "model; add sharp photographs that overlap by two thirds, or name their cameras."
+            f"{quote_value(photographs, 40)}, with {found.points:,} points{lens}, which is no "
+            "usable model; add sharp photographs that overlap by two thirds, or name their cameras."
         )
     return found
 
 
 def _map(copies: Sequence[UprightCopy], folder: Path) -> dict[str, Any]:
-    """Run `mapping_process` on the copies in `folder/images`."""
+    """Run `mapping_process` on the copies in `folder/images`; return its result."""
     with tempfile.TemporaryDirectory(dir=folder) as work:
         job = {
             "images": str(folder / "images"),
@@ -210,45 +196,46 @@ def _map(copies: Sequence[UprightCopy], folder: Path) -> dict[str, Any]:
             "photographs": [asdict(copy) for copy in copies],
             "threads": min(MAX_THREADS, get_thread_count()),
             "min_photographs": math.ceil(WANTED_SHARE * len(copies)),
-            "min_points": MIN_POINTS,
         }
         (Path(work) / "job.json").write_text(json.dumps(job), encoding="utf-8")
-        with (Path(work) / "complaints.txt").open("w+", errors="replace") as complaints:
-            return _run_process(Path(work) / "job.json", complaints)
+        _run_process(Path(work) / "job.json")
+        return json.loads((Path(work) / "result.json").read_text(encoding="utf-8"))
 
 
-def _run_process(job: Path, complaints: IO[str]) -> dict[str, Any]:
-    """Run the process and show its progress; return its result."""
-    command = [sys.executable, "-m", PROCESS, str(job)]
+def _run_process(job: Path) -> None:
+    """Run the process and show its phases; refuse the photographs if it fails."""
     process = subprocess.Popen(
-        command, stdin=subprocess.DEVNULL, stdout=subprocess.PIPE, stderr=complaints, text=True
+        [sys.executable, "-m", PROCESS, str(job)],
+        stdin=subprocess.DEVNULL,
+        stdout=subprocess.PIPE,
+        stderr=subprocess.STDOUT,
+        text=True,
+        errors="replace",
     )
     assert process.stdout is not None
-    phase, result = "starting", None
     try:
-        lines = (json.loads(line) for line in process.stdout)
-        for line in lines:
-            result = line.get("result", result)
-            if "begin" in line:
-                phase = line["begin"]
-                _show_phase(lines, phase, line["steps"])
+        phase, complaint = _follow(process.stdout)
         process.wait()
     finally:
         process.kill()
         process.wait()
-    if result is None:
-        complaints.seek(0)
-        messages = [line.strip() for line in complaints if line.strip()]
-        code = f" with exit code {process.returncode}"
-        reason = f": {quote_value(messages[-1], 200)}" if messages else code
+    if process.returncode != 0:
+        reason = quote_value(complaint, 200) or f"exit code {process.returncode}"
         raise InputError(
-            f"COLMAP gave up while {phase[0].lower()}{phase[1:]}{reason}; leave out photographs "
-            "that may be damaged, and try again."
+            f"COLMAP gave up while {phase.lower()}: {reason}; leave out photographs that may be "
+            "damaged, and try again."
         )
-    return result
 
 
-def _show_phase(lines: Iterator[dict[str, Any]], phase: str, steps: int) -> None:
-    for _ in track(range(steps), phase):
-        if "step" not in next(lines, {}):
-            return
+def _follow(lines: Iterable[str]) -> tuple[str, str]:
+    """Show the phases of the process; return its last phase and other line."""
+    phase, complaint = "Starting", ""
+    with ExitStack() as shown:
+        for line in lines:
+            if line.startswith(PHASE):
+                phase, complaint = line.removeprefix(PHASE).strip(), ""
+                shown.close()
+                shown.enter_context(stage(phase))
+            else:
+                complaint = line.strip() or complaint
+    return phase, complaint
