@@ -247,7 +247,9 @@ def test_a_truncated_image_is_named(tmp_path):
     one = example()
     one["images"][2] = one["images"][2][:-400]
     (clip,) = open_chunks(save_chunk(tmp_path / "000000.torch", one))
-    with pytest.raises(InputError, match="Frame 2 of the scene room of .*000000.torch is damaged"):
+    with pytest.raises(
+        InputError, match="Frame 2 of the scene room of .*000000.torch is not an image"
+    ):
         clip.views([2])
 
 

@@ -27,9 +27,9 @@ from torch import Tensor
 from gscompleter.errors import InputError, quote_value
 from gscompleter.evaluation.methods import Prediction
 from gscompleter.io import json_file
-from gscompleter.io.files import replace_file
+from gscompleter.io.files import convert_write_errors, replace_file
 from gscompleter.io.image import write_image
-from gscompleter.jobs.places import convert_write_errors, open_place
+from gscompleter.jobs.places import open_place
 from gscompleter.types import Gaussians, merge
 
 RUN, TASKS = "run.json", "tasks"

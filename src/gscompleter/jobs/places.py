@@ -7,7 +7,6 @@ killed. A store has no locks, so processes share its jobs by shards only.
 from __future__ import annotations
 
 import contextlib
-import errno
 import os
 from collections.abc import Iterator
 from dataclasses import dataclass
@@ -15,8 +14,8 @@ from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Any
 
-from gscompleter.errors import InputError, OutputError, quote_value
-from gscompleter.io.files import UNFINISHED_PREFIX, replace_file
+from gscompleter.errors import InputError, quote_value
+from gscompleter.io.files import UNFINISHED_PREFIX, convert_write_errors, replace_file
 
 try:
     import fcntl
@@ -177,16 +176,3 @@ def acquire_lock(descriptor: int) -> bool | None:
     except OSError:
         return None
     return True
-
-
-@contextlib.contextmanager
-def convert_write_errors(path: Path | str) -> Iterator[None]:
-    """Turn an OSError of the body into OutputError, which ends the run."""
-    try:
-        yield
-    except OSError as error:
-        full = error.errno in (errno.ENOSPC, errno.EDQUOT)
-        reason = "there is no space left" if full else error.strerror or error
-        raise OutputError(
-            f"Cannot write {quote_value(path)}: {reason}; free some space or choose another place."
-        ) from error
