@@ -18,7 +18,7 @@ from jaxtyping import Float, Shaped
 
 from gscompleter.data.cameras import Intrinsics
 from gscompleter.data.frame import Frame
-from gscompleter.data.image_folders import list_image_folders
+from gscompleter.data.image_folders import ImageFinder
 from gscompleter.data.limits import DEPTH_RANGE, MAX_SIDE
 from gscompleter.data.photographs import Photographs, build_photographs
 from gscompleter.data.points import widen_depth_range
@@ -105,7 +105,7 @@ def _map_array(path: Path) -> Shaped[np.ndarray, "..."]:
 def _find_photographs(file: Path, count: int) -> list[Path]:
     """List the photographs of the first folder with one for each row."""
     numbers = []
-    for folder in list_image_folders([file.parent]):
+    for folder in ImageFinder([file.parent]).folders:
         images = sorted(path for path in folder.iterdir() if path.suffix.lower() in IMAGES)
         if len(images) == count:
             return images

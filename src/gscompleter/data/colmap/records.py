@@ -110,7 +110,5 @@ def build_intrinsics(
         denominator=select("d1", "d2", "d3"),
         prism=(values.get("s1", 0.0), values.get("s3", 0.0)),
     )
-    focal = select("f", "f") or select("fx", "fy")
-    return Intrinsics(
-        size, (focal[0], focal[1]), (values["cx"], values["cy"]), (None, None), distortion
-    )
+    focal = values.get("fx", values.get("f")), values.get("fy", values.get("f"))
+    return Intrinsics(size, focal, (values["cx"], values["cy"]), distortion=distortion)
