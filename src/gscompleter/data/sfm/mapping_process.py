@@ -1,7 +1,6 @@
 """Structure from motion in a separate process, because COLMAP aborts on errors.
 
-The argument is the JSON file of a `Job`. Lines of output that begin with "phase: " name the phase
-that begins; others are COLMAP's. The result is `result.json` in the job's folder `work`.
+Standard input is a `Job` as JSON. The last line of the output is the result, as JSON too.
 """
 
 from __future__ import annotations
@@ -60,7 +59,7 @@ class Job:
     images: str
     """Folder of the photographs."""
     work: str
-    """Folder for the database, the result and temporary files."""
+    """Folder for the database and temporary files."""
     model: str
     """Folder for the largest model; it does not exist yet."""
     photographs: list[UprightCopy]
@@ -75,24 +74,19 @@ class Job:
 
 
 def main() -> None:
-    """Run the job in the file that the command line names."""
-    task = json.loads(Path(sys.argv[1]).read_text(encoding="utf-8"))
+    """Run the job that standard input holds."""
+    task = json.load(sys.stdin)
     copies = [UprightCopy(**one) for one in task.pop("photographs")]
     job = Job(photographs=copies, **task)
     pycolmap.logging.minloglevel = pycolmap.logging.Level.ERROR.value
     pycolmap.set_random_seed(SEED)
     find_features(job)
     match(job, select_pairs(job))
-    (Path(job.work) / "result.json").write_text(json.dumps(map_photographs(job)))
-
-
-def _begin(phase: str) -> None:
-    print(f"phase: {phase}", flush=True)
+    print(json.dumps(map_photographs(job)))
 
 
 def find_features(job: Job) -> None:
     """Extract SIFT features of all photographs; those of equal size and lens share a camera."""
-    _begin("Finding features")
     extraction = pycolmap.FeatureExtractionOptions(num_threads=job.threads, use_gpu=False)
     extraction.sift.max_num_features = MAX_FEATURES
     cameras = {(one.width, one.height, one.lens): one for one in job.photographs}
@@ -137,7 +131,6 @@ def _read_features(database: Any, name: str) -> np.ndarray:
 
 def match(job: Job, pairs: Pairs) -> None:
     """Match the features of all pairs and verify them with an essential matrix."""
-    _begin("Matching features")
     names = [one.name for one in job.photographs]
     listed = pycolmap.ImportedPairingOptions(match_list_path=Path(job.work) / "pairs.txt")
     listed.match_list_path.write_text("".join(f"{names[i]} {names[j]}\n" for i, j in sorted(pairs)))
@@ -155,7 +148,6 @@ def map_photographs(job: Job) -> dict[str, Any]:
         reprojection `error` in pixels, True if its lenses are plausible (`is_plausible`), and the
         `focal` length in pixels if it was fixed at first, else None.
     """
-    _begin("Placing cameras")
     model, is_focal_fixed = select_model(job)
     if model is None:
         return {"registered": []}

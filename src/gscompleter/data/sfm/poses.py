@@ -13,8 +13,7 @@ import os
 import subprocess
 import sys
 import tempfile
-from collections.abc import Iterable, Mapping, Sequence
-from contextlib import ExitStack
+from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass, replace
 from importlib.util import find_spec
 from pathlib import Path
@@ -48,8 +47,6 @@ MAX_THREADS = 4
 MAX_NAMED = 5
 """Most photographs that a note names."""
 PROCESS = "gscompleter.data.sfm.mapping_process"
-PHASE = "phase: "
-"""Begin of the lines of `mapping_process` that name a phase."""
 
 
 @dataclass(frozen=True)
@@ -188,7 +185,7 @@ def _run(photographs: Path, names: Sequence[str], folder: Path) -> FoundPoses:
 
 def _map(copies: Sequence[UprightCopy], folder: Path) -> dict[str, Any]:
     """Run `mapping_process` on the copies in `folder/images`; return its result."""
-    with tempfile.TemporaryDirectory(dir=folder) as work:
+    with tempfile.TemporaryDirectory(dir=folder) as work, stage("Finding cameras"):
         job = {
             "images": str(folder / "images"),
             "work": work,
@@ -197,45 +194,18 @@ def _map(copies: Sequence[UprightCopy], folder: Path) -> dict[str, Any]:
             "threads": min(MAX_THREADS, get_thread_count()),
             "min_photographs": math.ceil(WANTED_SHARE * len(copies)),
         }
-        (Path(work) / "job.json").write_text(json.dumps(job), encoding="utf-8")
-        _run_process(Path(work) / "job.json")
-        return json.loads((Path(work) / "result.json").read_text(encoding="utf-8"))
-
-
-def _run_process(job: Path) -> None:
-    """Run the process and show its phases; refuse the photographs if it fails."""
-    process = subprocess.Popen(
-        [sys.executable, "-m", PROCESS, str(job)],
-        stdin=subprocess.DEVNULL,
-        stdout=subprocess.PIPE,
-        stderr=subprocess.STDOUT,
-        text=True,
-        errors="replace",
-    )
-    assert process.stdout is not None
-    try:
-        phase, complaint = _follow(process.stdout)
-        process.wait()
-    finally:
-        process.kill()
-        process.wait()
-    if process.returncode != 0:
-        reason = quote_value(complaint, 200) or f"exit code {process.returncode}"
+        done = subprocess.run(
+            [sys.executable, "-m", PROCESS],
+            input=json.dumps(job),
+            capture_output=True,
+            encoding="utf-8",
+            errors="replace",
+            check=False,
+        )
+    if done.returncode != 0:
+        complaint = quote_value(done.stderr.strip().rpartition("\n")[2], 200)
         raise InputError(
-            f"COLMAP gave up while {phase.lower()}: {reason}; leave out photographs that may be "
+            f"COLMAP gave up ({complaint or done.returncode}); leave out photographs that may be "
             "damaged, and try again."
         )
-
-
-def _follow(lines: Iterable[str]) -> tuple[str, str]:
-    """Show the phases of the process; return its last phase and other line."""
-    phase, complaint = "Starting", ""
-    with ExitStack() as shown:
-        for line in lines:
-            if line.startswith(PHASE):
-                phase, complaint = line.removeprefix(PHASE).strip(), ""
-                shown.close()
-                shown.enter_context(stage(phase))
-            else:
-                complaint = line.strip() or complaint
-    return phase, complaint
+    return json.loads(done.stdout.splitlines()[-1])
