@@ -20,8 +20,7 @@ from gscompleter.data.sfm.match_pairs import (
     pair_neighbours,
     pair_similar,
 )
-from gscompleter.data.sfm.poses import find_poses, list_photograph_files
-from gscompleter.data.sfm.upright import MAX_SIDE, write_upright
+from gscompleter.data.sfm.poses import MAX_SIDE, find_poses, list_photograph_files, write_upright
 from gscompleter.errors import InputError
 from gscompleter.io.image import write_image
 from scenes import Room, camera_at, view_of

@@ -132,10 +132,9 @@ def _read_array(path: Path) -> np.ndarray:
 @contextmanager
 def open_image(stored: Path | str | bytes, name: str = "") -> Iterator[Image.Image]:
     """Open an image file, or its bytes; any failure while it is read becomes an InputError."""
-    if isinstance(stored, bytes):
-        file, shown = io.BytesIO(stored), quote_value(name)
-    else:
-        file, shown = Path(stored), f"The image {quote_value(Path(stored))}"
+    file = io.BytesIO(stored) if isinstance(stored, bytes) else Path(stored)
+    shown = quote_value(name) if isinstance(file, io.BytesIO) else f"The image {quote_value(file)}"
+    if isinstance(file, Path):
         check_file(file)
         refuse_pointer(file)
     Image.preinit()  # usual formats only; Pillow would load all of them

@@ -12,7 +12,7 @@ from pathlib import Path
 import numpy as np
 from jaxtyping import Float
 
-from gscompleter.data.colmap import binary, text
+from gscompleter.data.colmap.model_files import read_cameras, read_images, read_points
 from gscompleter.data.frame import Frame
 from gscompleter.data.image_folders import FOLDERS, ORIGINALS, ImageFinder, find_path, keep_existing
 from gscompleter.data.photographs import Photographs, build_photographs
@@ -25,7 +25,8 @@ DISTORTED = "distorted"
 HOMES = ("sparse", "colmap/sparse", f"{DISTORTED}/sparse", "")
 """Folders that are models or hold numbered ones, in search order."""
 
-_READERS = {".bin": binary, ".txt": text}
+ENDINGS = (".bin", ".txt")
+"""Endings of the files of a model, the preferred one first."""
 
 
 def has_colmap(path: Path) -> bool:
@@ -71,7 +72,7 @@ def _select_largest(path: Path) -> tuple[Path, list[Frame], tuple[str, ...]]:
 def is_image_file(path: Path) -> bool:
     """Check whether `path` is the images file of a COLMAP model."""
     name = path.name.casefold()
-    return name in {f"images{ending}" for ending in _READERS} and os.path.isfile(path)
+    return name in {f"images{ending}" for ending in ENDINGS} and os.path.isfile(path)
 
 
 def _find_models(path: Path) -> list[Path]:
@@ -94,7 +95,7 @@ def _list_home(home: Path) -> list[Path]:
 
 def _find_model_file(folder: Path, name: str) -> Path | None:
     """Find a file of a model, preferring binary; None if there is none."""
-    found = (find_path(folder, name + ending) for ending in _READERS)
+    found = (find_path(folder, name + ending) for ending in ENDINGS)
     return next((path for path in found if path is not None and os.path.isfile(path)), None)
 
 
@@ -109,8 +110,8 @@ def read_image_file(path: Path) -> list[Frame]:
             f"There is no cameras.txt or cameras.bin beside {quote_value(path)}, and it holds "
             "poses only; copy it there from the same model."
         )
-    cameras = _READERS[cameras_file.suffix.lower()].read_cameras(cameras_file)
-    images = _READERS[path.suffix.lower()].read_images(path)
+    cameras = read_cameras(cameras_file)
+    images = read_images(path)
     if not images:
         raise InputError(f"{quote_value(path)} lists no images; export the model again.")
     (name, times), *_ = Counter(image.name for image in images).most_common(1)
@@ -169,7 +170,7 @@ def _make_point_reader(model: Path) -> partial[Float[np.ndarray, "n 3"]] | None:
     """Return a reader of the model's points; None if it has no file of points."""
     path = _find_model_file(model, "points3D")
     if path is not None:
-        return partial(_READERS[path.suffix.lower()].read_points, path)
+        return partial(read_points, path)
     # The script of 3DGS writes them as PLY.
     cloud = find_path(model, "points3D.ply")
     return None if cloud is None else partial(read_point_cloud, cloud)

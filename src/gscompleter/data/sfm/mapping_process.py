@@ -25,7 +25,7 @@ from gscompleter.data.sfm.match_pairs import (
     pair_similar,
     select_largest_features,
 )
-from gscompleter.data.sfm.upright import UprightCopy
+from gscompleter.data.sfm.poses import UprightCopy
 
 SEED = 0
 MAX_FEATURES = 4096
