@@ -113,11 +113,11 @@ def _create_draft(path: Path, overwrite: bool) -> Iterator[Path]:
 
 
 def _check_free(path: Path, overwrite: bool) -> None:
-    """Raise InputError if `path` contains something that must not be overwritten."""
-    others = list[str]()
+    """Raise an error if `path` is a file or contains something that must not be overwritten."""
+    names = list[str]()
     with suppress(FileNotFoundError):
-        others = [name for name in os.listdir(path) if not name.startswith(UNFINISHED_PREFIX)]
-    if others and not overwrite:
+        names = os.listdir(path)
+    if not overwrite and any(not name.startswith(UNFINISHED_PREFIX) for name in names):
         raise InputError(
             f"The output folder {quote_value(path)} is not empty; name another one, or overwrite "
             "the results in it.",

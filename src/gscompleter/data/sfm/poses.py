@@ -117,12 +117,7 @@ class FoundPoses:
 
 
 def find_poses(photographs: Path, out: Path, overwrite: bool = False) -> FoundPoses:
-    """Find the cameras of the `photographs` in a folder and write them to the folder `out`.
-
-    Raises:
-        InputError: If there are too few photographs, cameras or points, a photograph is damaged,
-            the lens is implausible, pycolmap is missing or fails, or `out` cannot be written.
-    """
+    """Find the cameras of the `photographs` in a folder and write them to the folder `out`."""
     names = list_photograph_files(photographs)
     stats = {name: (photographs / name).stat() for name in names}
     known = {name: [stat.st_size, stat.st_mtime_ns] for name, stat in stats.items()}
