@@ -141,7 +141,8 @@ def _read_earlier(out: Path, known: Mapping[str, list[int]]) -> FoundPoses | Non
     if not os.path.isfile(out / SUMMARY_FILE) or not os.path.isdir(out / "sparse" / "0"):
         return None
     content = read_json(out / SUMMARY_FILE, "name another folder")
-    if content.keys() != {"poses", "photographs"} or content["photographs"] != known:
+    is_ours = isinstance(content, dict) and content.keys() == {"poses", "photographs"}
+    if not is_ours or content["photographs"] != known:
         return None
     return replace(FoundPoses(**content["poses"]), reused=True)
 
