@@ -7,9 +7,9 @@ import pytest
 from gscompleter import load_ply, load_splat
 from gscompleter.apps.commands.words import format_error
 from gscompleter.data.chunks import open_chunks
-from gscompleter.data.colmap.binary import read_images
+from gscompleter.data.colmap.model_files import read_images
 from gscompleter.data.points import read_point_cloud
-from gscompleter.data.sfm.upright import write_upright
+from gscompleter.data.sfm.poses import write_upright
 from gscompleter.errors import InputError, join_names, join_numbers, quote_value
 from gscompleter.io.image import read_pixels
 from gscompleter.models.weights.reading import check_kind

@@ -27,7 +27,7 @@ from gscompleter.apps.report.film import (
 )
 from gscompleter.errors import InputError
 from gscompleter.geometry import measure_baseline, measure_rotation, resize_camera
-from gscompleter.io.video import check_video_writer, write_video
+from gscompleter.io.video import find_ffmpeg, write_video
 from gscompleter.progress import show_progress
 from gscompleter.render import load_renderer
 from gscompleter.state import Completion, Photo, TargetResult
@@ -247,9 +247,8 @@ def test_a_completion_writes_a_film_where_it_is_asked(room, tmp_path, monkeypatc
 
 def test_without_the_extra_nothing_is_begun(room, tmp_path, monkeypatch, capsys):
     monkeypatch.setitem(sys.modules, "imageio_ffmpeg", None)
-    monkeypatch.setattr("gscompleter.io.video.find_spec", lambda name: None)
     with pytest.raises(InputError, match="imageio-ffmpeg"):
-        check_video_writer()
+        find_ffmpeg()
     assert run(monkeypatch, "complete", room, *SMALL, "--video", "--out", tmp_path / "out") == 2
     said = capsys.readouterr().err
     assert "pip install gscompleter[film]" in said

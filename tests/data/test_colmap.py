@@ -14,7 +14,7 @@ from test_pose_formats import check_room, write_cloud
 
 from command import run
 from gscompleter import InputError, load_cameras
-from gscompleter.data.colmap.records import MODELS, build_intrinsics
+from gscompleter.data.colmap.model_files import MODELS, build_intrinsics
 from gscompleter.data.colmap.scene import _list_roots
 from gscompleter.data.formats import open_photographs
 from gscompleter.data.points import add_depth_range
@@ -153,7 +153,7 @@ def test_missing_photographs_are_left_out_and_named(tmp_path, monkeypatch, capsy
     check_room(photographs, [0, 2, 4])
     (note,) = photographs.notes
     assert "2 of 5 photographs of" in note
-    assert "are missing (1.png, 3.png) and are left out" in note
+    assert "are missing and left out: 1.png, 3.png" in note
     where = ("--context", 0, 1, "--target", 2, "--out", tmp_path / "out")
     assert run(monkeypatch, "complete", tmp_path, *where) == 0
     said = "".join(capsys.readouterr().err.split())
@@ -346,21 +346,21 @@ def packed(path: Path, form: str, offset: int, *values: float) -> None:
 @pytest.mark.parametrize(
     ("name", "form", "offset", "value", "sentence"),
     [
-        ("cameras.bin", "<Q", 0, 10**18, "claims more than its"),
-        ("cameras.bin", "<Q", 0, 2**64 - 1, "claims more than its"),
+        ("cameras.bin", "<Q", 0, 10**18, "is empty, truncated or"),
+        ("cameras.bin", "<Q", 0, 2**64 - 1, "is empty, truncated or"),
         ("cameras.bin", "<I", 8, 8, "taken by camera 7, which is not in the cameras file"),
         ("cameras.bin", "<Q", 16, 10**12, "The size of camera 7"),
         ("cameras.bin", "<Q", 24, 0, "The size of camera 7"),
         ("cameras.bin", "<d", 32, float("nan"), "parameter fx of camera 7 .* is nan"),
         ("cameras.bin", "<d", 32, 0.0, "focal length is 0 times the size"),
-        ("images.bin", "<Q", 0, 2**63, "claims more than its"),
+        ("images.bin", "<Q", 0, 2**63, "is empty, truncated or"),
         ("images.bin", "<Q", 0, 0, "lists no images"),
-        ("images.bin", "<Q", 78, 2**61, "claims more than its"),
+        ("images.bin", "<Q", 78, 2**61, "is empty, truncated or"),
         ("images.bin", "<d", 12, float("inf"), "pose holds NaN"),
         ("images.bin", "<4d", 12, 0.0, "pose holds NaN"),
         ("images.bin", "<d", 44, 1e300, "above 1e"),
-        ("points3D.bin", "<Q", 0, 10**15, "claims more than its"),
-        ("points3D.bin", "<Q", 51, 10**15, "claims more than its"),
+        ("points3D.bin", "<Q", 0, 10**15, "is empty, truncated or"),
+        ("points3D.bin", "<Q", 51, 10**15, "is empty, truncated or"),
     ],
 )
 def test_binary_files_are_believed_as_far_as_they_go(tmp_path, name, form, offset, value, sentence):
@@ -381,7 +381,7 @@ def test_truncated_and_empty_files_are_refused(tmp_path, name):
     whole = (model / name).read_bytes()
     for length in (0, 3, 20, len(whole) // 2, len(whole) - 1):
         (model / name).write_bytes(whole[:length])
-        with pytest.raises(InputError, match=f"{name} is (empty|truncated)"):
+        with pytest.raises(InputError, match=f"{name} is empty, truncated"):
             open_photographs(tmp_path).points()
 
 

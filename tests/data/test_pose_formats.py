@@ -175,7 +175,7 @@ def test_photographs_of_a_list_that_are_missing_are_left_out_and_named(tmp_path)
     check_room(photographs, [0, 2, 3, 4])
     (note,) = photographs.notes
     assert note.startswith("1 of 5 photographs of")
-    assert "is missing (1) and is left out" in note
+    assert "are missing and left out: 1" in note
     shutil.rmtree(scene / "images")
     with pytest.raises(InputError, match="None of the 5 photographs .* folder `images`"):
         open_photographs(scene)

@@ -39,7 +39,7 @@ class Frames(Photographs):
     def views(self, frames, resolution=None) -> list[View]:
         return [VIEWS[frame % len(VIEWS)] for frame in frames]
 
-    def find_skip_reason(self, size=None) -> None:
+    def find_skip_reason(self) -> None:
         return None
 
 

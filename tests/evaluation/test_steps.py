@@ -68,7 +68,7 @@ class Walk(Photographs):
                 raise InputError(f"The image of frame {frame} is damaged; download it again.")
         return [view_of(ROOM, CAMERAS[frame], frame) for frame in frames]
 
-    def find_skip_reason(self, size: tuple[int, int] | None = None) -> str | None:
+    def find_skip_reason(self) -> str | None:
         return None
 
 

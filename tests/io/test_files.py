@@ -97,7 +97,7 @@ def test_a_full_disk_is_one_sentence_about_the_folder_asked_for(tmp_path):
     with pytest.raises(InputError) as error, open_output_folder(tmp_path / "out") as folder:
         (folder / "a").write_text("half")
         raise OSError(errno.ENOSPC, "No space left on device")
-    assert str(error.value).startswith(f"Cannot write {tmp_path / 'out'}: there is no space left")
+    assert str(error.value).startswith(f"Cannot write {tmp_path / 'out'}: No space left")
     assert os.listdir(tmp_path) == []
 
 
@@ -123,11 +123,11 @@ def test_checking_leaves_nothing_behind_and_does_not_touch_what_is_there(tmp_pat
 def test_a_folder_that_cannot_take_results_is_refused_before_any_computing(tmp_path, results):
     with pytest.raises(InputError, match="is not empty; .* overwrite"):
         check_output(results)
-    with pytest.raises(InputError, match="is a file, and a folder is needed"):
+    with pytest.raises(InputError, match="Cannot write .*mine.txt: Not a directory"):
         check_output(results / "mine.txt", overwrite=True)
-    with pytest.raises(InputError, match="a part of that path is a file"):
+    with pytest.raises(InputError, match="deeper: Not a directory"):
         check_output(results / "mine.txt" / "deeper", overwrite=True)
-    with pytest.raises(InputError, match="too long"):
+    with pytest.raises(InputError, match="name too long"):
         check_output(tmp_path / ("a" * 300))
     with pytest.raises(InputError, match="Cannot write /proc/"):
         check_output("/proc/gscompleter")
@@ -159,11 +159,8 @@ def test_what_cannot_be_put_back_is_not_thrown_away(results, monkeypatch):
         open_output_folder(results, overwrite=True) as folder,
     ):
         write_results(folder)
-    kept = {
-        **tree(folder / ".gscompleter-replaced"),
-        "mine.txt": (results / "mine.txt").read_text(),
-    }
-    assert kept == before
+    (replaced,) = results.glob(".gscompleter-*")
+    assert {**tree(replaced), "mine.txt": (results / "mine.txt").read_text()} == before
 
 
 def test_what_a_killed_run_left_does_not_make_a_folder_occupied(tmp_path):
@@ -295,5 +292,5 @@ def test_a_file_written_in_place_of_another_keeps_it_until_the_end(tmp_path):
 
 
 def test_a_folder_is_no_place_for_a_file(tmp_path):
-    with pytest.raises(InputError, match="that is a folder; name a file"), replace_file(tmp_path):
+    with pytest.raises(InputError, match="Is a directory"), replace_file(tmp_path):
         pass

@@ -27,7 +27,7 @@ def others(tmp_path):
 @pytest.mark.parametrize("kind", ["pipe", "folder", "device", "socket"])
 def test_what_is_no_file_is_never_opened(others, kind):
     for reader in (read_bytes, lambda path: list(read_lines(path)), load_splat):
-        with pytest.raises(InputError, match=f"{kind} is (not a file but )?a {kind}"):
+        with pytest.raises(InputError, match=f"{kind} is (no regular file|a {kind})"):
             reader(others[kind])
     assert read_head(others[kind], 4) == b""
 
@@ -67,5 +67,5 @@ def test_a_folder_of_sog_opens_files_alone(tmp_path, others, part, kind):
     folder = made(tmp_path, "splat", plausible(40, 1))
     (folder / part).unlink()
     (folder / part).symlink_to(others[kind])
-    with pytest.raises(InputError, match=f"not a file but a {kind}|is a folder without meta.json"):
+    with pytest.raises(InputError, match="no regular file|is a folder without meta.json"):
         load_splat(folder)

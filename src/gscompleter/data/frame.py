@@ -66,14 +66,7 @@ class Frame:
 
     def has_photograph(self) -> bool:
         """Check whether the photograph exists, without opening container files."""
-        if isinstance(self.image, Path):
-            return find_image(self.image) is not None
-        return self.image is not None
-
-    def read_stored_size(self) -> tuple[int, int] | None:
-        """Read width and height of the photograph; None if there is none."""
-        stored = self.find_stored()
-        return None if stored is None else read_image_size(stored, capitalize(self.title))
+        return callable(self.image) or self.find_stored() is not None
 
     def size(self) -> tuple[int, int]:
         """Return width and height of the photograph, or else those of the camera file.
@@ -81,8 +74,10 @@ class Frame:
         A photograph inside a container file is not opened if the camera file gives its size.
         """
         stated = None if self.intrinsics.size == FRACTIONS else self.intrinsics.size
-        within = self.image is not None and not isinstance(self.image, Path)
-        size = stated if within and stated is not None else self.read_stored_size() or stated
+        if stated is not None and callable(self.image):
+            return stated
+        stored = self.find_stored()
+        size = stated if stored is None else read_image_size(stored, capitalize(self.title))
         if size is None:
             raise InputError(
                 f"The size of {self.title} is not known, because it has no image and no `w` and "
@@ -124,10 +119,11 @@ class Frame:
     def compute_pinholes(self, width: int, height: int) -> tuple[Pinhole, Pinhole]:
         """Return the intrinsics at this photograph size, before and after undistortion."""
         defect = self.find_defect(width, height)
+        if defect is not None:
+            raise self.make_error(defect)
         pinhole = self.intrinsics.compute_pinhole(width, height)
-        new = undistort_pinhole(pinhole, self.intrinsics.distortion) if defect is None else None
-        if new is None:
-            raise self.make_error(str(defect))
+        new = undistort_pinhole(pinhole, self.intrinsics.distortion)
+        assert new is not None
         return pinhole, new
 
     def with_rigid_pose(self, place: str = "") -> Frame:

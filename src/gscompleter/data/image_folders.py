@@ -13,7 +13,7 @@ from functools import cache
 from pathlib import Path, PurePosixPath
 
 from gscompleter.data.frame import DOWNSCALE_FACTORS, ENDINGS, Frame
-from gscompleter.errors import InputError, quote_value
+from gscompleter.errors import InputError, join_names, quote_value
 
 ORIGINALS = "input"
 """Folder of photographs before undistortion, as in the scripts of 3DGS."""
@@ -46,18 +46,17 @@ def find_path(
     return folder
 
 
-def list_image_folders(roots: Sequence[Path], order: Sequence[str] = FOLDERS) -> list[Path]:
-    """List the folders below `roots` (nearest first) that may hold photographs, likeliest first."""
-    found = [find_path(root, name) for root in roots for name in order]
-    return [folder for folder in found if folder is not None and folder.is_dir()] + list(roots)
-
-
 class ImageFinder:
-    """Finder of the photographs and masks of one scene that lists each folder once."""
+    """Finder of the photographs and masks of one scene that lists each folder once.
+
+    `roots` are the nearest first, and `order` are the folders in them, the likeliest first.
+    """
 
     def __init__(self, roots: Sequence[Path], order: Sequence[str] = FOLDERS) -> None:
         masks = [find_path(root, MASKS) for root in roots]
-        self.folders = list_image_folders(roots, order)
+        folders = [find_path(root, name) for root in roots for name in order]
+        self.folders = [folder for folder in folders if folder is not None and folder.is_dir()]
+        self.folders += roots
         self.masks = [folder for folder in masks if folder is not None]
         self.list_entries = cache(_list_entries)
 
@@ -90,11 +89,8 @@ def keep_existing(frames: Sequence[Frame], title: str) -> tuple[tuple[Frame, ...
         )
     if not missing:
         return tuple(there), ()
-    names = ", ".join(quote_value(name) for name in missing[:MAX_NAMED])
-    rest = ", …" if len(missing) > MAX_NAMED else ""
-    verb = "is" if len(missing) == 1 else "are"
     note = (
-        f"{len(missing)} of {len(frames)} photographs of {title} {verb} missing ({names}{rest}) "
-        f"and {verb} left out."
+        f"{len(missing)} of {len(frames)} photographs of {title} are missing and left out: "
+        f"{join_names(missing, MAX_NAMED)}."
     )
     return tuple(there), (note,)

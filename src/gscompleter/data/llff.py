@@ -17,7 +17,7 @@ from jaxtyping import Float
 
 from gscompleter.data.cameras import Intrinsics
 from gscompleter.data.frame import Frame
-from gscompleter.data.image_folders import list_image_folders
+from gscompleter.data.image_folders import ImageFinder
 from gscompleter.data.limits import DEPTH_RANGE, MAX_SIDE, require
 from gscompleter.data.photographs import Photographs, build_photographs
 from gscompleter.data.points import widen_depth_range
@@ -89,7 +89,7 @@ def _read_rows(path: Path) -> Float[np.ndarray, "n 17"]:
 def _find_photographs(file: Path, count: int) -> list[Path]:
     """List the photographs of the first folder with one for each row."""
     numbers = []
-    for folder in list_image_folders([file.parent]):
+    for folder in ImageFinder([file.parent]).folders:
         images = sorted(path for path in folder.iterdir() if path.suffix.lower() in IMAGES)
         if len(images) == count:
             return images

@@ -91,8 +91,7 @@ class Photographs:
             resolution: Height and width to cover and crop to, or the most pixels of the longer
                 side; None keeps the size.
         """
-        chosen = [(self.frame(number), number) for number in frames]
-        return [self._load_view(frame, number, resolution) for frame, number in chosen]
+        return [self._load_view(number, resolution) for number in frames]
 
     def mask(self, frame: int, resolution: Resolution = None) -> Bool[Tensor, "h w"] | None:
         """Return True where the photograph's mask is black or a moving box lies, or None."""
@@ -121,18 +120,11 @@ class Photographs:
         """True if some frame has a mask or boxes."""
         return any(frame.mask is not None or frame.boxes is not None for frame in self.frames)
 
-    def find_skip_reason(self, size: tuple[int, int] | None = None) -> str | None:
-        """Explain why benchmarks skip the photographs; None if they are kept.
-
-        `size` is the height and width that every stored photograph must have.
-        """
-        for number, frame in enumerate(self.frames):
-            reason = _find_skip_reason(frame, self.origin)
-            if reason is None and size is not None:
-                reason = _find_size_defect(frame, size)
-            if reason is not None:
-                return f"frame {number}: {reason}"
-        return None
+    def find_skip_reason(self) -> str | None:
+        """Explain why benchmarks skip the photographs; None if they are kept."""
+        reasons = (_find_skip_reason(frame, self.origin) for frame in self.frames)
+        found = ((number, reason) for number, reason in enumerate(reasons) if reason is not None)
+        return next((f"frame {number}: {reason}" for number, reason in found), None)
 
     def frame(self, number: int) -> Frame:
         """Return the frame of that number."""
@@ -151,7 +143,8 @@ class Photographs:
         pose = torch.from_numpy(c2w).float()
         return Camera(pose, final.K, final.width, final.height, self.near, self.far)
 
-    def _load_view(self, frame: Frame, number: int, resolution: Resolution) -> View:
+    def _load_view(self, number: int, resolution: Resolution) -> View:
+        frame = self.frame(number)
         pixels = frame.load_pixels()
         size = pixels.shape[1], pixels.shape[0]
         camera = self._build_camera(frame, size, resolution)
@@ -200,10 +193,11 @@ def build_drive(
     name: str, title: str, frames: Sequence[Frame], front: str | None = None
 ) -> Photographs:
     """Build the photographs of a vehicle, with the first camera as origin if far from zero."""
+    built = build_photographs(name, title, frames, front)
     valid = (frame.c2w[:3, 3] for frame in frames if find_pose_defect(frame.c2w) is None)
     first = next(valid, np.zeros(3))
-    origin = first.copy() if np.abs(first).max() > MAX_MAP_COORDINATE else np.zeros(3)
-    return Photographs(name, title, tuple(frames), origin, front=front)
+    is_far = np.abs(first).max() > MAX_MAP_COORDINATE
+    return replace(built, origin=first.copy() if is_far else np.zeros(3))
 
 
 def undistort_and_resize(
@@ -239,12 +233,3 @@ def _find_skip_reason(frame: Frame, origin: Float[np.ndarray, "3"]) -> str | Non
     farthest = float(np.abs(frame.c2w[:3, 3] - origin).max())
     too_far = f"its translation of {farthest:g} is above {MAX_TRANSLATION:g}"
     return too_far if farthest > MAX_TRANSLATION else None
-
-
-def _find_size_defect(frame: Frame, needed: tuple[int, int]) -> str | None:
-    found = frame.read_stored_size()
-    if found is None:
-        return "its image is missing"
-    if found == (needed[1], needed[0]):
-        return None
-    return f"its image is {found[1]} × {found[0]} and not {needed[0]} × {needed[1]}"

@@ -45,24 +45,20 @@ class Framing:
 def compute_framing(width: int, height: int, resolution: Resolution) -> Framing:
     """Compute the framing of a width × height image for a resolution."""
     check_resolution(resolution)
-    if resolution is not None and not isinstance(resolution, int):
-        return _compute_cover_framing(width, height, resolution)
-    scale = 1.0 if resolution is None else min(1.0, resolution / max(width, height))
-    size = max(round(width * scale), 1), max(round(height * scale), 1)
-    return Framing(size, (0, 0), size)
-
-
-def _compute_cover_framing(width: int, height: int, resolution: tuple[int, int]) -> Framing:
-    scale = max(resolution[0] / height, resolution[1] / width)
-    new_width = max(round(width * scale), resolution[1])
-    new_height = max(round(height * scale), resolution[0])
-    if max(new_width, new_height) > MAX_SIDE:
+    if resolution is None or isinstance(resolution, int):
+        scale = 1.0 if resolution is None else min(1.0, resolution / max(width, height))
+        size = max(round(width * scale), 1), max(round(height * scale), 1)
+        return Framing(size, (0, 0), size)
+    new_height, new_width = resolution
+    scale = max(new_height / height, new_width / width)
+    scaled = max(round(width * scale), new_width), max(round(height * scale), new_height)
+    if max(scaled) > MAX_SIDE:
         raise InputError(
-            f"An image of {width} × {height} pixels that covers {resolution[1]} × {resolution[0]} "
-            f"has a side above {MAX_SIDE}; choose a smaller resolution, or crop the image."
+            f"An image of {width} × {height} pixels that covers {new_width} × {new_height} has a "
+            f"side above {MAX_SIDE}; choose a smaller resolution, or crop the image."
         )
-    corner = (new_width - resolution[1]) // 2, (new_height - resolution[0]) // 2
-    return Framing((new_width, new_height), corner, (resolution[1], resolution[0]))
+    corner = (scaled[0] - new_width) // 2, (scaled[1] - new_height) // 2
+    return Framing(scaled, corner, (new_width, new_height))
 
 
 def resize(
@@ -76,9 +72,7 @@ def resize(
 
 def check_resolution(resolution: Resolution) -> None:
     """Raise an InputError if a side is not within 1 to `MAX_SIDE`."""
-    if resolution is None:
-        return
-    sides = (resolution,) if isinstance(resolution, int) else resolution
+    sides = (resolution,) if isinstance(resolution, int) else resolution or ()
     if not all(1 <= side <= MAX_SIDE for side in sides):
         raise InputError(
             f"The resolution {' × '.join(map(quote_value, sides))} is impossible; height and "

@@ -92,17 +92,10 @@ def distort(points: Float[np.ndarray, "*n 2"], distortion: Distortion) -> Float[
     """Distort points of the image plane at z = 1; NaN outside the field of the lens."""
     # Far outside the photograph, polynomials overflow and the division has no solution.
     with np.errstate(all="ignore"):
-        return _apply_polynomials(_project(points, distortion), distortion)
-
-
-def _project(
-    points: Float[np.ndarray, "*n 2"], distortion: Distortion
-) -> Float[np.ndarray, "*n 2"]:
-    if distortion.projection == "perspective":
-        return points
-    r = np.linalg.norm(points, axis=-1)
-    r = np.where(r < 1e-6, 1e-6, r)
-    return points * (_compute_radius(r, distortion) / r)[..., None]
+        if distortion.projection != "perspective":
+            r = np.maximum(np.linalg.norm(points, axis=-1), 1e-6)
+            points = points * (_compute_radius(r, distortion) / r)[..., None]
+        return _apply_polynomials(points, distortion)
 
 
 def _compute_radius(r: Float[np.ndarray, "*n"], distortion: Distortion) -> Float[np.ndarray, "*n"]:

@@ -3,9 +3,8 @@
 from __future__ import annotations
 
 import io
-import os
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from pathlib import Path
 
 import numpy as np
@@ -16,6 +15,7 @@ from torch import Tensor
 
 from gscompleter.errors import InputError, quote_value, refuse_pointer
 from gscompleter.io.files import replace_file
+from gscompleter.io.reading import check_file
 
 IMAGE_FORMATS = ("PNG", "JPEG", "TIFF", "WEBP", "BMP", "PPM", "GIF", "JPEG2000")
 """Image formats that are read. Others in Pillow run programs or are no photographs."""
@@ -26,7 +26,7 @@ MAX_PIXELS = 178_956_970
 PNG_COMPRESSION = 3
 """zlib level of written PNGs: 6 % more bytes than level 6, in a third of its time."""
 
-_ORIENTATION = 0x0112
+ORIENTATION = 0x0112
 """EXIF tag of the orientation; 1 is upright."""
 
 
@@ -60,32 +60,24 @@ def convert_to_image(pixels: UInt8[np.ndarray, "h w 3"]) -> Float[Tensor, "h w 3
 
 def read_image_size(stored: Path | bytes, name: str = "") -> tuple[int, int]:
     """Read width and height of an image file, or of its bytes; `name` is for errors."""
-    with _open(stored, name) as image:
+    with open_image(stored, name) as image:
         return image.size
 
 
 def has_orientation_tag(path: Path) -> bool:
     """Return True if the EXIF data of a photograph ask viewers to rotate it."""
-    try:
-        with _open(path) as image:
-            return bool(image.getexif().get(_ORIENTATION, 1) != 1)
-    except Exception:  # of any kind; reading the photograph reports it
-        return False
+    with suppress(InputError), open_image(path) as image:
+        return bool(image.getexif().get(ORIENTATION, 1) != 1)
+    return False  # reading the photograph reports the error
 
 
 def read_pixels(stored: Path | str | bytes, name: str = "") -> UInt8[np.ndarray, "h w 3"]:
     """Read an image in 8-bit colours, over black; 16-bit images are reduced.
 
-    Orientation tags are ignored, because poses and intrinsics belong to the stored pixels.
-
-    Args:
-        stored: Path of an image file, or its bytes.
-        name: Name of bytes in errors.
-
-    Raises:
-        InputError: The file is missing, truncated or not an image.
+    Orientation tags are ignored, because poses and intrinsics belong to the stored pixels. `name`
+    names bytes in errors.
     """
-    with _open(stored, name) as image:
+    with open_image(stored, name) as image:
         return _composite_over_black(image)
 
 
@@ -94,7 +86,7 @@ def read_brightness(stored: Path | bytes, side: int, name: str = "") -> Float[np
 
     A JPEG is decoded no larger than necessary; `name` names bytes in errors.
     """
-    with _open(stored, name) as image:
+    with open_image(stored, name) as image:
         scale = min(1.0, side / max(image.size))
         size = max(round(image.width * scale), 1), max(round(image.height * scale), 1)
         image.draft("L", size)
@@ -105,18 +97,7 @@ def read_brightness(stored: Path | bytes, side: int, name: str = "") -> Float[np
 
 def read_depth(path: Path, unit: float) -> Float[np.ndarray, "h w"]:
     """Read z-depth from a 16-bit PNG or a `.npy` file, times `unit`; 0 where unknown."""
-    if not os.path.isfile(path):
-        raise InputError(
-            f"There is no depth map {quote_value(path)}; restore it, or remove its "
-            "`depth_file_path`."
-        )
-    try:
-        values = _load_depth_values(path)
-    except Exception as error:  # damaged files raise any kind
-        raise InputError(
-            f"The depth map {quote_value(path)} cannot be read ({quote_value(str(error))}); copy "
-            "it again."
-        ) from error
+    values = _read_array(path) if path.suffix == ".npy" else _read_values(path)
     values = values[..., 0] if values.ndim == 3 and values.shape[-1] == 1 else values
     if values.ndim != 2 or values.dtype.kind not in "uif" or values.dtype == np.uint8:
         raise InputError(
@@ -128,49 +109,43 @@ def read_depth(path: Path, unit: float) -> Float[np.ndarray, "h w"]:
     return np.where(np.isfinite(depth) & (depth > 0), depth, np.float32(0))
 
 
-def _load_depth_values(path: Path) -> np.ndarray:
-    if path.suffix != ".npy":
-        with Image.open(path, formats=IMAGE_FORMATS) as image:
-            return np.array(image)
-    # A memory map cannot exceed the file, whatever size its header claims.
-    values = np.lib.format.open_memmap(path, mode="r")
-    if not 0 < values.size <= MAX_PIXELS:
-        raise ValueError(f"it claims {values.size:,} values")
+def _read_values(path: Path) -> np.ndarray:
+    with open_image(path) as image:
+        return np.array(image)
+
+
+def _read_array(path: Path) -> np.ndarray:
+    check_file(path)
+    try:
+        # A memory map cannot exceed the file, whatever size its header claims.
+        values = np.lib.format.open_memmap(path, mode="r")
+        if not 0 < values.size <= MAX_PIXELS:
+            raise ValueError(f"it claims {values.size:,} values")
+    except Exception as error:  # damaged files raise any kind
+        raise InputError(
+            f"The depth map {quote_value(path)} cannot be read ({quote_value(str(error))}); copy "
+            "it again."
+        ) from error
     return values
 
 
 @contextmanager
-def _open(stored: Path | str | bytes, name: str = "") -> Iterator[Image.Image]:
+def open_image(stored: Path | str | bytes, name: str = "") -> Iterator[Image.Image]:
     """Open an image file, or its bytes; any failure while it is read becomes an InputError."""
-    file: Path | io.BytesIO
-    if isinstance(stored, bytes):
-        file, shown = io.BytesIO(stored), quote_value(name)
-    else:
-        file = Path(stored)
-        shown = f"The image {quote_value(file)}"
-        if not os.path.isfile(file):
-            raise InputError(
-                f"There is no image {quote_value(file)}; restore it or correct its path."
-            )
+    file = io.BytesIO(stored) if isinstance(stored, bytes) else Path(stored)
+    shown = quote_value(name) if isinstance(file, io.BytesIO) else f"The image {quote_value(file)}"
+    if isinstance(file, Path):
+        check_file(file)
         refuse_pointer(file)
     Image.preinit()  # usual formats only; Pillow would load all of them
     try:
-        image = Image.open(file, formats=IMAGE_FORMATS)
-    except Image.DecompressionBombError as error:
-        raise InputError(
-            f"{shown} claims more than {MAX_PIXELS:,} pixels; make it smaller."
-        ) from error
+        with Image.open(file, formats=IMAGE_FORMATS) as image:
+            yield image
     except Exception as error:  # damaged files raise any kind
         raise InputError(
-            f"{shown} is not an image that can be read; a PNG or JPEG file is needed."
+            f"{shown} is not an image that can be read ({quote_value(str(error), 120)}); copy it "
+            "again."
         ) from error
-    with image:
-        try:
-            yield image
-        except Exception as error:
-            raise InputError(
-                f"{shown} is damaged ({quote_value(str(error))}); copy it again."
-            ) from error
 
 
 def _composite_over_black(image: Image.Image) -> UInt8[np.ndarray, "h w 3"]:

@@ -22,11 +22,8 @@ def handle_stop_signals() -> None:
 
 
 @contextmanager
-def defer_interrupts(state: str = "") -> Iterator[None]:
-    """Defer KeyboardInterrupt to the end of the block, in the main thread.
-
-    `state` is its message, if it differs from the usual one.
-    """
+def defer_interrupts(state: str) -> Iterator[None]:
+    """Defer KeyboardInterrupt, with the message `state`, to the end of a block."""
     came: list[int] = []
 
     def remember(number: int, _: FrameType | None) -> None:
@@ -43,4 +40,4 @@ def defer_interrupts(state: str = "") -> Iterator[None]:
         for number in handled:
             signal.signal(number, signal.default_int_handler)
     if came:
-        raise KeyboardInterrupt(*([state] if state else []))
+        raise KeyboardInterrupt(state)

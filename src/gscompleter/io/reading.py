@@ -21,13 +21,6 @@ MAX_LINE = 4096
 MAX_DEPTH = 64
 """Deepest nesting of lists and dictionaries, the most dimensions that numpy supports."""
 
-_KINDS = {
-    stat.S_IFDIR: "folder",
-    stat.S_IFIFO: "pipe",
-    stat.S_IFSOCK: "socket",
-    stat.S_IFCHR: "device",
-    stat.S_IFBLK: "device",
-}
 _HOLDERS = (list, tuple, dict, set, frozenset)
 
 
@@ -38,8 +31,7 @@ def check_file(path: Path) -> None:
     except (OSError, ValueError) as error:  # ValueError: a name that no file can have
         raise _make_read_error(path, error) from error
     if not stat.S_ISREG(mode):
-        kind = _KINDS.get(stat.S_IFMT(mode), "device")
-        raise InputError(f"{quote_value(path)} is not a file but a {kind}; correct the path.")
+        raise InputError(f"{quote_value(path)} is no regular file; correct the path.")
 
 
 @contextmanager

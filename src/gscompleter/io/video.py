@@ -5,7 +5,6 @@ from __future__ import annotations
 import subprocess
 from collections.abc import Iterable
 from contextlib import suppress
-from importlib.util import find_spec
 from itertools import chain
 from pathlib import Path
 
@@ -16,46 +15,30 @@ from gscompleter.errors import InputError, quote_value
 
 QUALITY = 18
 """Constant rate factor of x264: 0 is lossless, 18 is visually lossless."""
-REPRODUCIBLE_OPTIONS = (
-    *("-threads", "1", "-filter_threads", "1"),
-    *("-fflags", "+bitexact", "-flags:v", "+bitexact", "-map_metadata", "-1"),
-)
-"""Options for the same bytes on every run and machine."""
-COLOR_OPTIONS = (
+OPTIONS = (
+    # The colour space that players assume, stored in the file.
     "-vf",
     "scale=out_color_matrix=bt709:out_range=tv:flags=accurate_rnd+bitexact+bicubic,"
     "setparams=colorspace=bt709:color_primaries=bt709:color_trc=bt709",
+    # A pixel format that all players know, and an index at the start.
+    *("-pix_fmt", "yuv420p", "-movflags", "+faststart"),
+    # The same bytes on every run and machine.
+    *("-threads", "1", "-filter_threads", "1"),
+    *("-fflags", "+bitexact", "-flags:v", "+bitexact", "-map_metadata", "-1"),
 )
-"""Options for the colour space that players assume, stored in the file."""
-PLAYER_OPTIONS = ("-pix_fmt", "yuv420p", "-movflags", "+faststart")
-"""Options for a pixel format that all players know, and for an index at the start."""
-
-
-def check_video_writer() -> None:
-    """Check that a video can be written, before anything is computed.
-
-    Raises:
-        InputError: imageio-ffmpeg is missing, or has no ffmpeg for this machine.
-    """
-    if find_spec("imageio_ffmpeg") is None:
-        raise InputError(
-            "A film is written through imageio-ffmpeg, which is not installed; run "
-            "`pip install gscompleter[film]`.",
-            "video",
-        )
-    find_ffmpeg()
+"""Options of ffmpeg for the output."""
 
 
 def find_ffmpeg() -> str:
-    """Find the path of ffmpeg."""
-    from imageio_ffmpeg import get_ffmpeg_exe
-
+    """Find the path of ffmpeg; raise InputError if there is none for this machine."""
     try:
+        from imageio_ffmpeg import get_ffmpeg_exe
+
         return get_ffmpeg_exe()
-    except RuntimeError as error:
+    except (ImportError, RuntimeError) as error:
         raise InputError(
-            "imageio-ffmpeg has no ffmpeg for this machine; install one, and name it in "
-            "IMAGEIO_FFMPEG_EXE.",
+            "A film is written through imageio-ffmpeg, which is not installed or has no ffmpeg for "
+            "this machine; run `pip install gscompleter[film]`.",
             "video",
         ) from error
 
@@ -72,7 +55,7 @@ def write_video(path: Path, frames: Iterable[UInt8[np.ndarray, "h w 3"]], rate: 
         *(find_ffmpeg(), "-v", "error", "-y", "-nostdin"),
         *("-f", "rawvideo", "-pix_fmt", "rgb24", "-s", size, "-r", str(rate)),
         *("-i", "pipe:0", "-an", "-c:v", "libx264", "-preset", "medium", "-crf", str(QUALITY)),
-        *(*COLOR_OPTIONS, *PLAYER_OPTIONS, *REPRODUCIBLE_OPTIONS, str(path)),
+        *(*OPTIONS, str(path)),
     ]
     process = subprocess.Popen(command, stdin=subprocess.PIPE, stderr=subprocess.PIPE)
     assert process.stdin is not None

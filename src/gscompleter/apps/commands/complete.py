@@ -55,7 +55,7 @@ from gscompleter.errors import quote_value
 from gscompleter.evaluation.metrics.coverage import render_pairs, sample_held_out_cameras
 from gscompleter.generators import load_generator
 from gscompleter.io.files import COMPLETED_FILE, TARGETS_FILE, check_output, open_output_folder
-from gscompleter.io.video import check_video_writer
+from gscompleter.io.video import find_ffmpeg
 from gscompleter.kernels.parallel import run_in_background
 from gscompleter.next_best_view.gain import Choice
 from gscompleter.next_best_view.planner import ViewPlanner
@@ -128,7 +128,7 @@ def run_completion(options: CompleteOptions) -> None:
 def complete_folder(options: CompleteOptions) -> dict[str, Any]:
     """Complete the scene, write `options.out`, and return the summary."""
     if options.video:
-        check_video_writer()
+        find_ffmpeg()
     console = Console(stderr=True, quiet=options.quiet)
     with show_progress(None if options.quiet else console):
         ready = prepare_completion(options, console)

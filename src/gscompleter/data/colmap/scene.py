@@ -12,7 +12,7 @@ from pathlib import Path
 import numpy as np
 from jaxtyping import Float
 
-from gscompleter.data.colmap import binary, text
+from gscompleter.data.colmap.model_files import read_cameras, read_images, read_points
 from gscompleter.data.frame import Frame
 from gscompleter.data.image_folders import FOLDERS, ORIGINALS, ImageFinder, find_path, keep_existing
 from gscompleter.data.photographs import Photographs, build_photographs
@@ -24,15 +24,14 @@ DISTORTED = "distorted"
 """Folder of the model with distortion, beside undistorted photographs (3DGS's scripts)."""
 HOMES = ("sparse", "colmap/sparse", f"{DISTORTED}/sparse", "")
 """Folders that are models or hold numbered ones, in search order."""
-FILES = ("cameras", "images")
-"""Required files of a model; `rigs` and `frames` (COLMAP 3.12) add nothing to the poses."""
 
-_READERS = {".bin": binary, ".txt": text}
+ENDINGS = (".bin", ".txt")
+"""Endings of the files of a model, the preferred one first."""
 
 
 def has_colmap(path: Path) -> bool:
     """Check whether `path` is a scene with a COLMAP model, a model, or its images file."""
-    return is_image_file(path) or bool(_find_models(path))
+    return bool(_find_models(path))
 
 
 def open_colmap(path: Path) -> Iterator[Photographs]:
@@ -41,10 +40,7 @@ def open_colmap(path: Path) -> Iterator[Photographs]:
     The model with most images is used. Frames are numbered by the sorted names of the photographs
     that exist.
     """
-    if is_image_file(path):
-        yield _build_scene(path.parent, path.parent, read_image_file(path), ())
-        return
-    yield _build_scene(path, *_select_largest(path))
+    yield _build_scene(path.parent if is_image_file(path) else path, *_select_largest(path))
 
 
 def read_scene_cameras(path: Path) -> list[Frame]:
@@ -56,86 +52,84 @@ def read_scene_cameras(path: Path) -> list[Frame]:
 
 def _select_largest(path: Path) -> tuple[Path, list[Frame], tuple[str, ...]]:
     """Find the largest model of a scene: its folder, frames, and notes on others."""
-    models = _find_models(path)
-    if not models:
+    found = [(images.parent, read_image_file(images)) for images in _find_models(path)]
+    if not found:
         raise InputError(
             f"There is no COLMAP model in {quote_value(path)}; a folder sparse/0 with its cameras "
             "and images, as .bin or .txt, is needed."
         )
-    files = [[_find_model_file(model, name) for name in FILES] for model in models]
-    frames = [_read_frames(cameras, images) for cameras, images in files if cameras and images]
-    best = max(range(len(models)), key=lambda number: len(frames[number]))
-    notes: tuple[str, ...] = ()
-    if len(models) > 1:
-        others = ", ".join(str(len(f)) for number, f in enumerate(frames) if number != best)
-        notes = (
-            f"{len(models)} models lie in {models[best].parent}: {models[best].name} with "
-            f"{len(frames[best])} images is used; the others, with {others} images, are ignored.",
-        )
-    return models[best], frames[best], notes
-
-
-def read_image_file(path: Path) -> list[Frame]:
-    """Read the cameras of an images.txt or images.bin in its order, without photographs."""
-    cameras = _find_model_file(path.parent, "cameras")
-    if cameras is None:
-        raise InputError(
-            f"There is no cameras.txt or cameras.bin beside {quote_value(path)}, and it holds "
-            "poses only; copy it there from the same model."
-        )
-    return _read_frames(cameras, path)
+    model, frames = max(found, key=lambda one: len(one[1]))
+    if len(found) == 1:
+        return model, frames, ()
+    others = ", ".join(str(len(frames)) for other, frames in found if other != model)
+    note = (
+        f"{len(found)} models lie in {model.parent}: {model.name} with {len(frames)} images is "
+        f"used; the others, with {others} images, are ignored."
+    )
+    return model, frames, (note,)
 
 
 def is_image_file(path: Path) -> bool:
     """Check whether `path` is the images file of a COLMAP model."""
     name = path.name.casefold()
-    return name in {f"images{ending}" for ending in _READERS} and os.path.isfile(path)
+    return name in {f"images{ending}" for ending in ENDINGS} and os.path.isfile(path)
 
 
 def _find_models(path: Path) -> list[Path]:
-    """List the model folders of a scene, all from the first matching home."""
+    """List the images files of a scene's models, all from the first matching home."""
+    if is_image_file(path):
+        return [path]
     if not os.path.isdir(path):
         return []
     homes = (find_path(path, home) for home in HOMES)
-    found = (_list_home(home) for home in homes if home)
+    found = (_list_home(home) for home in homes if home and os.path.isdir(home))
     return next((models for models in found if models), [])
 
 
 def _list_home(home: Path) -> list[Path]:
-    """List the models in a folder, which may be one itself."""
-    names = os.listdir(home) if os.path.isdir(home) else []
-    folders = [home, *(home / name for name in sorted(names) if name.isdecimal())]
-    return [f for f in folders if all(_find_model_file(f, name) is not None for name in FILES)]
+    """List the images files of the models in a folder, which may be one itself."""
+    numbered = sorted(name for name in os.listdir(home) if name.isdecimal())
+    found = [_find_model_file(folder, "images") for folder in (home, *map(home.joinpath, numbered))]
+    return [images for images in found if images and _find_model_file(images.parent, "cameras")]
 
 
 def _find_model_file(folder: Path, name: str) -> Path | None:
     """Find a file of a model, preferring binary; None if there is none."""
-    found = (find_path(folder, name + ending) for ending in _READERS)
+    found = (find_path(folder, name + ending) for ending in ENDINGS)
     return next((path for path in found if path is not None and os.path.isfile(path)), None)
 
 
-def _read_frames(cameras_file: Path, images_file: Path) -> list[Frame]:
-    """Read the frames of a model in file order, without photographs."""
-    cameras = _READERS[cameras_file.suffix.lower()].read_cameras(cameras_file)
-    images = _READERS[images_file.suffix.lower()].read_images(images_file)
+def read_image_file(path: Path) -> list[Frame]:
+    """Read the cameras of an images.txt or images.bin in its order, without photographs.
+
+    `rigs` and `frames` (COLMAP 3.12) beside it add nothing to the poses.
+    """
+    cameras_file = _find_model_file(path.parent, "cameras")
+    if cameras_file is None:
+        raise InputError(
+            f"There is no cameras.txt or cameras.bin beside {quote_value(path)}, and it holds "
+            "poses only; copy it there from the same model."
+        )
+    cameras = read_cameras(cameras_file)
+    images = read_images(path)
     if not images:
-        raise InputError(f"{quote_value(images_file)} lists no images; export the model again.")
+        raise InputError(f"{quote_value(path)} lists no images; export the model again.")
     (name, times), *_ = Counter(image.name for image in images).most_common(1)
     if times > 1:
         raise InputError(
-            f"{quote_value(images_file)} lists the image {quote_value(name)} {times:,} times; "
-            "export the model again."
+            f"{quote_value(path)} lists the image {quote_value(name)} {times:,} times; export the "
+            "model again."
         )
-    frames = []
-    for name, camera, c2w in images:
-        title = f"image {quote_value(name)} of {quote_value(images_file)}"
-        if camera not in cameras:
-            raise InputError(
-                f"The {title} was taken by camera {camera}, which is not in the cameras file "
-                "beside it; export the model again."
-            )
-        frames.append(Frame(name, title, c2w, cameras[camera], None))
-    return frames
+    lacking = {image.camera for image in images} - cameras.keys()
+    if lacking:
+        raise InputError(
+            f"Images in {quote_value(path)} were taken by camera {min(lacking)}, which is not in "
+            "the cameras file beside it; export the model again."
+        )
+    return [
+        Frame(name, f"image {quote_value(name)} of {quote_value(path)}", c2w, cameras[camera], None)
+        for name, camera, c2w in images
+    ]
 
 
 def _build_scene(
@@ -176,7 +170,7 @@ def _make_point_reader(model: Path) -> partial[Float[np.ndarray, "n 3"]] | None:
     """Return a reader of the model's points; None if it has no file of points."""
     path = _find_model_file(model, "points3D")
     if path is not None:
-        return partial(_READERS[path.suffix.lower()].read_points, path)
+        return partial(read_points, path)
     # The script of 3DGS writes them as PLY.
     cloud = find_path(model, "points3D.ply")
     return None if cloud is None else partial(read_point_cloud, cloud)

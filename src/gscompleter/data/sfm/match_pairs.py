@@ -8,10 +8,10 @@ from __future__ import annotations
 
 import re
 from collections.abc import Sequence
-from pathlib import PurePosixPath
+from itertools import combinations
 
 import numpy as np
-from jaxtyping import Float, Int
+from jaxtyping import Float
 
 NEIGHBOURS = 10
 """Photographs before and after each one of a sequence to match it with."""
@@ -34,14 +34,9 @@ def make_sort_key(name: str) -> tuple[str, ...]:
 
 
 def is_sequence(names: Sequence[str]) -> bool:
-    """Check whether the names share a folder and differ only in their last number."""
-
-    def strip_number(name: str) -> tuple[str, str]:
-        path = PurePosixPath(name)
-        return str(path.parent), re.sub(r"\d+(?=\D*$)", "#", path.name, count=1)
-
-    forms = {strip_number(name) for name in names}
-    return len(forms) == 1 and "#" in next(iter(forms))[1]
+    """Check whether the names differ only in the last number of the file name."""
+    forms = {re.sub(r"\d+(?=[^\d/]*$)", "#", name) for name in names}
+    return len(forms) == 1 and not forms & set(names)
 
 
 def pair_neighbours(count: int) -> Pairs:
@@ -52,7 +47,7 @@ def pair_neighbours(count: int) -> Pairs:
 
 def pair_all(count: int) -> Pairs:
     """Pair each photograph with each other."""
-    return {(i, j) for j in range(count) for i in range(j)}
+    return set(combinations(range(count), 2))
 
 
 def select_largest_features(
@@ -63,21 +58,21 @@ def select_largest_features(
     return chosen / np.maximum(np.linalg.norm(chosen, axis=1, keepdims=True), 1e-9)
 
 
-def compute_similarity(features: Sequence[Float[np.ndarray, "_ 128"]]) -> Int[np.ndarray, "n n"]:
-    """Count the shared features of all pairs: mutual best matches above `MIN_COSINE`."""
+def pair_similar(features: Sequence[Float[np.ndarray, "_ 128"]]) -> Pairs:
+    """Pair each photograph with those that share most features with it."""
     shared = np.zeros((len(features), len(features)), dtype=np.int64)
     for i, j in pair_all(len(features)):
-        if len(features[i]) > 0 and len(features[j]) > 0:
-            cosines = features[i] @ features[j].T
-            best, back = cosines.argmax(axis=1), cosines.argmax(axis=0)
-            here = np.arange(len(best))
-            mutual = (back[best] == here) & (cosines[here, best] > MIN_COSINE)
-            shared[i, j] = shared[j, i] = np.count_nonzero(mutual)
-    return shared
-
-
-def pair_similar(shared: Int[np.ndarray, "n n"]) -> Pairs:
-    """Pair each photograph with those that share most features with it."""
+        shared[i, j] = shared[j, i] = _count_shared(features[i], features[j])
     order = np.argsort(-shared, axis=1, kind="stable")[:, :NUM_SIMILAR]
     found = ((i, int(j)) for i, row in enumerate(order) for j in row if shared[i, j] >= MIN_SHARED)
     return {(min(pair), max(pair)) for pair in found}
+
+
+def _count_shared(a: Float[np.ndarray, "m 128"], b: Float[np.ndarray, "n 128"]) -> int:
+    """Count the mutual best matches above `MIN_COSINE`."""
+    if len(a) == 0 or len(b) == 0:
+        return 0
+    cosines = a @ b.T
+    best, back = cosines.argmax(axis=1), cosines.argmax(axis=0)
+    is_mutual = back[best] == np.arange(len(a))
+    return int(np.count_nonzero(is_mutual & (cosines.max(axis=1) > MIN_COSINE)))

@@ -1,6 +1,7 @@
 """Camera poses for photographs without poses, by COLMAP on the CPU.
 
-The output folder has COLMAP's standard layout: upright copies in `images`, the model in `sparse/0`.
+The output folder has COLMAP's standard layout: copies in `images`, the model in `sparse/0`. COLMAP
+ignores the EXIF orientation, so the pixels of the copies are rotated.
 A `summary.json` records the input photographs, so that the next run can reuse the result. COLMAP
 runs in a separate process (`mapping_process`).
 """
@@ -10,24 +11,28 @@ from __future__ import annotations
 import json
 import math
 import os
+import re
+import shutil
 import subprocess
 import sys
 import tempfile
-from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import asdict, dataclass
+from collections.abc import Mapping, Sequence
+from dataclasses import asdict, dataclass, replace
 from importlib.util import find_spec
 from pathlib import Path
-from typing import IO, Any
+from typing import Any
+
+from PIL import Image, ImageOps
 
 from gscompleter.cpu_threads import get_thread_count
 from gscompleter.data.frame import DOWNSCALE_FACTORS
 from gscompleter.data.image_folders import MASKS
 from gscompleter.data.sfm.match_pairs import make_sort_key
-from gscompleter.data.sfm.upright import UprightCopy, write_upright
 from gscompleter.errors import InputError, join_names, quote_value
 from gscompleter.io.files import SUMMARY_FILE, open_output_folder
+from gscompleter.io.image import ORIENTATION, open_image
 from gscompleter.io.json_file import read_json
-from gscompleter.progress import track
+from gscompleter.progress import stage, track
 
 ENDINGS = (".jpg", ".jpeg", ".png", ".tif", ".tiff", ".webp", ".bmp")
 """Endings of photographs, in any case."""
@@ -43,10 +48,34 @@ WANTED_SHARE = 0.5
 """Share of the photographs in a model below which other focal lengths are tried."""
 MIN_POINTS = 30
 """Fewest points of a model; COLMAP needs as many in common with one photograph."""
+MAX_SIDE = 1600
+"""Longest side of a copy in pixels; SIFT finds no better features in larger ones."""
+QUALITY = 95
+"""JPEG quality of rotated or shrunk copies."""
+FULL_FRAME_DIAGONAL = 43.2666
+"""Diagonal of 36 x 24 mm, the reference of EXIF's "focal length in 35 mm film"."""
+MAKE, MODEL = 0x010F, 0x0110
+EXIF, FOCAL_LENGTH, FOCAL_LENGTH_35 = 0x8769, 0x920A, 0xA405
 MAX_THREADS = 4
 MAX_NAMED = 5
 """Most photographs that a note names."""
 PROCESS = "gscompleter.data.sfm.mapping_process"
+
+
+@dataclass(frozen=True)
+class UprightCopy:
+    """An upright copy of a photograph, and known data of its camera."""
+
+    name: str
+    """File, relative to the folder of copies."""
+    source: str
+    """Source file, relative to the folder of photographs."""
+    width: int
+    height: int
+    focal: float | None
+    """Focal length in pixels of the copy from EXIF, or None."""
+    lens: str
+    """Key of camera, lens and zoom from EXIF."""
 
 
 @dataclass(frozen=True)
@@ -55,10 +84,8 @@ class FoundPoses:
 
     photographs: int
     """Number of input photographs."""
-    missing: tuple[str, ...]
+    missing: list[str]
     """Photographs without a camera."""
-    models: tuple[int, ...]
-    """Cameras in each disconnected model, the largest and kept one first."""
     points: int
     """Points of the model."""
     error: float
@@ -74,41 +101,23 @@ class FoundPoses:
         return self.photographs - len(self.missing)
 
     @property
-    def is_too_small(self) -> bool:
-        """True if the model has too few photographs or points."""
-        enough = max(MIN_PHOTOGRAPHS, MIN_SHARE * self.photographs)
-        return self.num_registered < enough or self.points < MIN_POINTS
-
-    @property
     def notes(self) -> list[str]:
         """Sentences for the user."""
-        notes, place = [], ""
+        notes = []
         if self.focal is not None:
             notes.append(
                 f"{self.num_registered} of {self.photographs} cameras were found with a focal "
                 f"length of {self.focal:.0f} px, fixed at plausible values first, because COLMAP "
                 "failed with a free one."
             )
-        if len(self.models) > 1:
-            *others, last = map(str, self.models)
-            notes.append(
-                f"The photographs fall into {len(self.models)} parts that do not connect, with "
-                f"{', '.join(others)} and {last} cameras; the largest is kept."
-            )
-            place = " in it"
         if self.missing:
             names = join_names(self.missing, MAX_NAMED)
-            notes.append(f"No camera was found{place} for {names}; they are left out.")
+            notes.append(f"No camera was found for {names}; they are left out.")
         return notes
 
 
 def find_poses(photographs: Path, out: Path, overwrite: bool = False) -> FoundPoses:
-    """Find the cameras of the `photographs` in a folder and write them to the folder `out`.
-
-    Raises:
-        InputError: If there are too few photographs, cameras or points, a photograph is damaged,
-            the lens is implausible, pycolmap is missing or fails, or `out` cannot be written.
-    """
+    """Find the cameras of the `photographs` in a folder and write them to the folder `out`."""
     names = list_photograph_files(photographs)
     stats = {name: (photographs / name).stat() for name in names}
     known = {name: [stat.st_size, stat.st_mtime_ns] for name, stat in stats.items()}
@@ -122,9 +131,20 @@ def find_poses(photographs: Path, out: Path, overwrite: bool = False) -> FoundPo
         )
     with open_output_folder(out, overwrite) as folder:
         found = _run(photographs, names, folder)
-        content = {"found": asdict(found), "photographs": known}
+        content = {"poses": asdict(found), "photographs": known}
         (folder / SUMMARY_FILE).write_text(json.dumps(content, indent=1))
     return found
+
+
+def _read_earlier(out: Path, known: Mapping[str, list[int]]) -> FoundPoses | None:
+    """Read the earlier result for these photographs; None if there is none."""
+    if not os.path.isfile(out / SUMMARY_FILE) or not os.path.isdir(out / "sparse" / "0"):
+        return None
+    content = read_json(out / SUMMARY_FILE, "name another folder")
+    is_ours = isinstance(content, dict) and content.keys() == {"poses", "photographs"}
+    if not is_ours or content["photographs"] != known:
+        return None
+    return replace(FoundPoses(**content["poses"]), reused=True)
 
 
 def has_photographs(path: Path) -> bool:
@@ -161,19 +181,6 @@ def is_own(folder: Path) -> bool:
     return not os.path.isfile(folder / SUMMARY_FILE)
 
 
-def _read_earlier(out: Path, known: Mapping[str, list[int]]) -> FoundPoses | None:
-    """Read the earlier result for these photographs; None if missing or too small."""
-    if not os.path.isfile(out / SUMMARY_FILE) or not os.path.isdir(out / "sparse" / "0"):
-        return None
-    content = read_json(out / SUMMARY_FILE, "name another folder")
-    if not isinstance(content, dict) or content.get("photographs") != known:
-        return None
-    found = content["found"]
-    missing, models = tuple(found["missing"]), tuple(found["models"])
-    earlier = FoundPoses(**{**found, "missing": missing, "models": models, "reused": True})
-    return None if earlier.is_too_small else earlier
-
-
 def _run(photographs: Path, names: Sequence[str], folder: Path) -> FoundPoses:
     """Write `images` and `sparse/0` into `folder`."""
     copies = [
@@ -187,22 +194,84 @@ def _run(photographs: Path, names: Sequence[str], folder: Path) -> FoundPoses:
             f"{quote_value(str(photographs))}; add photographs of the same scene that overlap by "
             "two thirds and are sharp."
         )
-    missing = tuple(copy.source for copy in copies if copy.name not in result["registered"])
-    models, points = tuple(result["models"]), result["points"]
-    found = FoundPoses(len(names), missing, models, points, result["error"], result["focal"])
-    if found.is_too_small or result["defect"] is not None:
-        lens = "" if result["defect"] is None else f", {result['defect']}"
+    missing = [copy.source for copy in copies if copy.name not in result["registered"]]
+    found = FoundPoses(len(names), missing, result["points"], result["error"], result["focal"])
+    enough = max(MIN_PHOTOGRAPHS, MIN_SHARE * len(names))
+    is_large = found.num_registered >= enough and found.points >= MIN_POINTS
+    if not (is_large and result["is_plausible"]):
+        lens = "" if result["is_plausible"] else " and an implausible lens"
         raise InputError(
             f"COLMAP placed {found.num_registered} of {found.photographs} photographs in "
-            f"{quote_value(photographs, 40)}, with {points:,} points{lens}, which is no usable "
-            "model; add sharp photographs that overlap by two thirds, or name their cameras."
+            f"{quote_value(photographs, 40)}, with {found.points:,} points{lens}, which is no "
+            "usable model; add sharp photographs that overlap by two thirds, or name their cameras."
         )
     return found
 
 
+def write_upright(root: Path, source: str, folder: Path) -> UprightCopy:
+    """Write an upright copy of the photograph `root`/`source` to the same place in `folder`.
+
+    A small upright 8-bit JPEG or PNG is copied byte for byte; a format that COLMAP may not read
+    becomes a PNG.
+    """
+    path = root / source
+    with open_image(path) as image:
+        exif, kind = image.getexif(), image.format
+        is_known = kind in ("JPEG", "PNG")
+        is_upright = exif.get(ORIENTATION, 1) == 1 and max(image.size) <= MAX_SIDE
+        is_ready = is_known and is_upright and image.mode in ("RGB", "L")
+        if not is_ready:  # decodes a JPEG at half or a quarter of its size if that is enough
+            image.draft("RGB", (MAX_SIDE, MAX_SIDE))
+        copy = ImageOps.exif_transpose(image).convert("RGB")
+        focal, lens = _read_focal(exif), _describe_lens(exif)
+    copy.thumbnail((MAX_SIDE, MAX_SIDE), Image.Resampling.LANCZOS)
+    # In COLMAP's lists a space ends a name, and # begins a comment.
+    name = re.sub(r"[\s#]", "_", source) + ("" if is_known else ".png")
+    target = _prepare_target(folder / name, path)
+    if is_ready:
+        shutil.copyfile(path, target)
+    else:
+        _save(copy, target, "JPEG" if kind == "JPEG" else "PNG")
+    diagonal = math.hypot(*copy.size)
+    return UprightCopy(name, source, *copy.size, focal and focal * diagonal, lens)
+
+
+def _prepare_target(target: Path, source: Path) -> Path:
+    """Make the folder of a copy; refuse a name that is taken."""
+    if target.exists():
+        raise InputError(
+            f"The copy of {quote_value(source)} would be called {target.name} like that of another "
+            "photograph; rename one of them."
+        )
+    target.parent.mkdir(parents=True, exist_ok=True)
+    return target
+
+
+def _save(image: Image.Image, target: Path, kind: str) -> None:
+    image.info.clear()  # removes the orientation, which is applied already
+    options = {"quality": QUALITY, "subsampling": 0} if kind == "JPEG" else {}
+    image.save(target, format=kind, **options)
+
+
+def _read_focal(exif: Image.Exif) -> float | None:
+    """Read the focal length in image diagonals from the 35 mm equivalent; None if there is none."""
+    try:
+        millimetres = float(exif.get_ifd(EXIF)[FOCAL_LENGTH_35])
+    except (KeyError, TypeError, ValueError, ZeroDivisionError):  # broken values are common
+        return None
+    return millimetres / FULL_FRAME_DIAGONAL if 1 <= millimetres <= 5000 else None
+
+
+def _describe_lens(exif: Image.Exif) -> str:
+    detail = exif.get_ifd(EXIF)
+    values = [exif.get(MAKE), exif.get(MODEL)]
+    values += [detail.get(FOCAL_LENGTH), detail.get(FOCAL_LENGTH_35)]
+    return " ".join(map(str, values))
+
+
 def _map(copies: Sequence[UprightCopy], folder: Path) -> dict[str, Any]:
-    """Run `mapping_process` on the copies in `folder/images`."""
-    with tempfile.TemporaryDirectory(dir=folder) as work:
+    """Run `mapping_process` on the copies in `folder/images`; return its result."""
+    with tempfile.TemporaryDirectory(dir=folder) as work, stage("Finding cameras"):
         job = {
             "images": str(folder / "images"),
             "work": work,
@@ -210,45 +279,19 @@ def _map(copies: Sequence[UprightCopy], folder: Path) -> dict[str, Any]:
             "photographs": [asdict(copy) for copy in copies],
             "threads": min(MAX_THREADS, get_thread_count()),
             "min_photographs": math.ceil(WANTED_SHARE * len(copies)),
-            "min_points": MIN_POINTS,
         }
-        (Path(work) / "job.json").write_text(json.dumps(job), encoding="utf-8")
-        with (Path(work) / "complaints.txt").open("w+", errors="replace") as complaints:
-            return _run_process(Path(work) / "job.json", complaints)
-
-
-def _run_process(job: Path, complaints: IO[str]) -> dict[str, Any]:
-    """Run the process and show its progress; return its result."""
-    command = [sys.executable, "-m", PROCESS, str(job)]
-    process = subprocess.Popen(
-        command, stdin=subprocess.DEVNULL, stdout=subprocess.PIPE, stderr=complaints, text=True
-    )
-    assert process.stdout is not None
-    phase, result = "starting", None
-    try:
-        lines = (json.loads(line) for line in process.stdout)
-        for line in lines:
-            result = line.get("result", result)
-            if "begin" in line:
-                phase = line["begin"]
-                _show_phase(lines, phase, line["steps"])
-        process.wait()
-    finally:
-        process.kill()
-        process.wait()
-    if result is None:
-        complaints.seek(0)
-        messages = [line.strip() for line in complaints if line.strip()]
-        code = f" with exit code {process.returncode}"
-        reason = f": {quote_value(messages[-1], 200)}" if messages else code
-        raise InputError(
-            f"COLMAP gave up while {phase[0].lower()}{phase[1:]}{reason}; leave out photographs "
-            "that may be damaged, and try again."
+        done = subprocess.run(
+            [sys.executable, "-m", PROCESS],
+            input=json.dumps(job),
+            capture_output=True,
+            encoding="utf-8",
+            errors="replace",
+            check=False,
         )
-    return result
-
-
-def _show_phase(lines: Iterator[dict[str, Any]], phase: str, steps: int) -> None:
-    for _ in track(range(steps), phase):
-        if "step" not in next(lines, {}):
-            return
+    if done.returncode != 0:
+        complaint = quote_value(done.stderr.strip().rpartition("\n")[2], 200)
+        raise InputError(
+            f"COLMAP gave up ({complaint or done.returncode}); leave out photographs that may be "
+            "damaged, and try again."
+        )
+    return json.loads(done.stdout.splitlines()[-1])
