@@ -9,7 +9,7 @@ from typing import Annotated, Any, Literal
 from annotated_types import Interval
 
 from gscompleter.config.coverage import COVERED
-from gscompleter.config.renamed import refuse_old_keys
+from gscompleter.config.renamed import list_paths, refuse_old_keys
 from gscompleter.config.settings import Count, Settings, Share, Weight, apply_changes
 from gscompleter.errors import InputError, quote_value
 
@@ -389,5 +389,5 @@ def load_config(source: str, is_splat: bool = False) -> CompleterConfig:
 
     changes = read_yaml(path)
     base = get_named_config(str(changes.pop("base", "default")), is_splat)
-    refuse_old_keys(changes, f"{quote_value(source)}: ")
+    refuse_old_keys(list_paths(changes), f"{quote_value(source)}: ")
     return apply_changes(base, changes, f"{quote_value(source)}: ")

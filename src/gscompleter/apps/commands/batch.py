@@ -8,7 +8,7 @@ from __future__ import annotations
 import os
 import re
 import time
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -30,7 +30,7 @@ from gscompleter.jobs.jobs import (
 )
 from gscompleter.jobs.places import Place, is_address, open_place
 from gscompleter.jobs.workers import parse_shard, run_jobs
-from gscompleter.progress import Activity, show_activity, show_preparation, show_progress
+from gscompleter.progress import show_preparation, show_progress, track
 
 COUNTERS = Path("/proc/self/io")
 """File in which Linux counts the bytes that this process reads and writes, cached or not."""
@@ -54,23 +54,12 @@ def run_batch(options: BatchOptions) -> None:
         ended = run_jobs(
             place, left, perform, lambda: list_done_jobs(place), engine, options.retries
         )
-        count_jobs(ended, len(left))
+        for _ in track(ended, "completing", len(left)):
+            pass
         with show_preparation("table"):
             write_batch_results(place, jobs)
     sentence = f"{summarize_rows(place, share, left)} All results: {options.out}/index.html"
     console.print(sentence, markup=False, soft_wrap=True)
-
-
-def count_jobs(ended: Iterator[Job], total: int) -> None:
-    """Show the progress and the rate until all jobs have ended."""
-    if not total:
-        return
-    activity = Activity("completing", total)
-    with show_activity(activity):
-        for _ in ended:
-            activity.count_step()
-            minutes = (activity.last_step_time - activity.start_time) / 60
-            activity.name = f"completing ({activity.num_done / minutes:.1f} a minute)"
 
 
 def summarize_rows(place: Place, share: Sequence[Job], left: Sequence[Job]) -> str:

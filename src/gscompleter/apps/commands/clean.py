@@ -14,7 +14,7 @@ from torch import Tensor
 
 from gscompleter import __version__
 from gscompleter.apps.commands.options import CleanOptions
-from gscompleter.apps.commands.output import describe_run, is_replaceable, report_interrupts
+from gscompleter.apps.commands.output import describe_run, is_replaceable
 from gscompleter.apps.inputs.opening import (
     apply_working_range,
     check_context,
@@ -25,7 +25,7 @@ from gscompleter.apps.inputs.opening import (
 )
 from gscompleter.apps.inputs.plan import describe_opening
 from gscompleter.apps.report.completion import save_completed_splat
-from gscompleter.apps.warmup.compilation import compile_kernels
+from gscompleter.apps.warmup import compile_kernels
 from gscompleter.cleaning import find_superfluous
 from gscompleter.errors import InputError, quote_value
 from gscompleter.evaluation.metrics.image import psnr
@@ -39,10 +39,9 @@ from gscompleter.types import Gaussians, View
 
 def run_clean(options: CleanOptions) -> None:
     """Clean the splat, and print a summary."""
-    with report_interrupts(options.out):
-        summary = clean_splat(options)
-        if not options.quiet:
-            print_cleaning(summary, options.out)
+    summary = clean_splat(options)
+    if not options.quiet:
+        print_cleaning(summary, options.out)
 
 
 def clean_splat(options: CleanOptions) -> dict[str, Any]:

@@ -17,7 +17,6 @@ from gscompleter.apps.commands.output import (
     describe_run,
     is_replaceable,
     read_held_out,
-    report_interrupts,
 )
 from gscompleter.apps.inputs.opening import (
     Opened,
@@ -45,7 +44,7 @@ from gscompleter.apps.report.plain_words import (
     describe_motion,
     describe_new_photographs,
 )
-from gscompleter.apps.warmup.compilation import SPLAT_PART, compile_kernels
+from gscompleter.apps.warmup import SPLAT_PART, compile_kernels
 from gscompleter.completer import GSCompleter, check_target_ids
 from gscompleter.config import CompleterConfig
 from gscompleter.config.generators import get_settings_class
@@ -116,13 +115,12 @@ class Plan:
 
 def run_completion(options: CompleteOptions) -> None:
     """Complete the scene, and print a summary."""
-    with report_interrupts(options.out):
-        if options.dry_run:
-            plan_folder(options)
-            return
-        summary = complete_folder(options)
-        if not options.quiet:
-            print_completion(summary, options)
+    if options.dry_run:
+        plan_folder(options)
+        return
+    summary = complete_folder(options)
+    if not options.quiet:
+        print_completion(summary, options)
 
 
 def complete_folder(options: CompleteOptions) -> dict[str, Any]:

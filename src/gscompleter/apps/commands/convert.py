@@ -7,7 +7,7 @@ from pathlib import Path
 
 from rich.console import Console
 
-from gscompleter.apps.commands.tool_options import ConvertOptions, StripOptions
+from gscompleter.apps.commands.options import ConvertOptions, StripOptions
 from gscompleter.errors import InputError
 from gscompleter.progress import show_preparation, show_progress
 from gscompleter.splats.formats import (

@@ -12,14 +12,14 @@ import torch
 from packaging.requirements import Requirement
 
 from gscompleter.apps.bench.machine import describe_machine
-from gscompleter.apps.commands.tool_options import DoctorOptions
+from gscompleter.apps.commands.options import DoctorOptions
 from gscompleter.apps.viewer.packages import (
     BUILT_LIBRARIES,
     LOCK_FILE,
     get_archive_path,
     read_lock,
 )
-from gscompleter.apps.warmup.compilation import PARTS
+from gscompleter.apps.warmup import PARTS
 from gscompleter.errors import InputError
 from gscompleter.evaluation.metrics import lpips
 from gscompleter.io.cache import get_download_folder

@@ -23,7 +23,7 @@ from gscompleter.apps.commands.options import (
 )
 from gscompleter.apps.report.evaluation_page import render_evaluation_page
 from gscompleter.apps.report.page import write_page
-from gscompleter.apps.warmup.compilation import compile_kernels
+from gscompleter.apps.warmup import compile_kernels
 from gscompleter.data.cases import SkippedScene, filter_usable, open_clips, read_cases
 from gscompleter.data.formats import open_photographs
 from gscompleter.data.resize import check_resolution

@@ -10,7 +10,7 @@ from pathlib import Path
 from rich.console import Console
 from rich.table import Table
 
-from gscompleter.apps.commands.tool_options import ModelsOptions
+from gscompleter.apps.commands.options import ModelsOptions
 from gscompleter.models.weights.fetching import (
     INSTALL,
     find_cached,

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from rich.console import Console
 
-from gscompleter.apps.commands.tool_options import PosesOptions
+from gscompleter.apps.commands.options import PosesOptions
 from gscompleter.data.sfm.poses import find_poses
 from gscompleter.progress import show_progress
 

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 from rich.console import Console
 
-from gscompleter.apps.commands.tool_options import WarmupOptions
-from gscompleter.apps.warmup.compilation import PARTS, compile_kernels
+from gscompleter.apps.commands.options import WarmupOptions
+from gscompleter.apps.warmup import PARTS, compile_kernels
 from gscompleter.kernels.compiled import get_cache_folder
 from gscompleter.progress import show_progress
 

@@ -4,11 +4,10 @@ from __future__ import annotations
 
 import re
 import sys
-from collections.abc import Callable, Collection, Sequence
-from contextlib import redirect_stderr, redirect_stdout, suppress
+from collections.abc import Collection, Sequence
+from contextlib import redirect_stderr
 from dataclasses import dataclass
-from difflib import get_close_matches
-from functools import cache, partial
+from functools import cache
 from io import StringIO
 from itertools import dropwhile, takewhile
 from typing import Any
@@ -19,11 +18,8 @@ from tyro.constructors import ConstructorRegistry, StructTypeInfo
 from gscompleter.apps.commands.help import HELP, HELP_ALL, Rule, make_help_rule
 from gscompleter.apps.commands.options import DEFAULT_NUM_TARGETS
 from gscompleter.config import CompleterConfig, load_config
-from gscompleter.config.renamed import refuse_old_options
+from gscompleter.config.renamed import refuse_old_keys
 from gscompleter.errors import PROGRAM, InputError, quote_value
-
-MIN_SIMILARITY = 0.75
-"""Smallest similarity of an option to a misspelt one, from 0 to 1."""
 
 RENAMED = {
     "keep-unsupported": "no-recolor",
@@ -35,6 +31,9 @@ RENAMED = {
     "ignore-masked": "use-masks",
 }
 """Names of the last release with today's; they are accepted for one release."""
+
+HINTS = {"Argument helptext:": "give", "Perhaps you meant:": "the nearest is"}
+"""Titles in tyro's messages before the option that is meant."""
 
 
 def format_error(error: InputError) -> str:
@@ -50,62 +49,43 @@ def parse_words(words: Sequence[str], command: Any, names: Collection[str]) -> A
     It raises InputError for wrong words, and SystemExit after printing the help.
     """
     words = use_new_names(words)
+    if words and words[0] not in names and words[0] not in (*HELP, HELP_ALL):
+        raise InputError(
+            f"There is no command {quote_value(words[0])}; choose one of {', '.join(names)} "
+            "(see gscompleter --help)."
+        )
     asked = any(word in (*HELP, HELP_ALL) for word in words)
     helps = [make_help_rule(show_all=HELP_ALL in words)] if asked else []
     words = ["--help" if word == HELP_ALL else word for word in words]
     check_once(words)
-    refuse_old_options(words)
-    printed, config = StringIO(), CompleterConfig()
-    read = partial(
-        tyro.cli,
-        command,
-        prog="gscompleter",
-        description="Complete 3D Gaussian Splatting scenes: generate, then register.",
-        config=(
-            tyro.conf.DisallowNone,
-            tyro.conf.FlagCreatePairsOff,
-            tyro.conf.OmitSubcommandPrefixes,
-        ),
-    )
+    refuse_old_keys([name for word in words for name in find_setting(word)])
+    printed = StringIO()
     try:
         with redirect_stderr(printed):
             config, words = load_named_config(insert_auto_count(words))
-            return read(args=words, registry=make_registry(config, *helps))
+            return tyro.cli(
+                command,
+                prog="gscompleter",
+                description="Complete 3D Gaussian Splatting scenes: generate, then register.",
+                args=words,
+                config=(
+                    tyro.conf.DisallowNone,
+                    tyro.conf.FlagCreatePairsOff,
+                    tyro.conf.OmitSubcommandPrefixes,
+                ),
+                registry=make_registry(config, *helps),
+            )
     except SystemExit as stop:
         if not stop.code:
             raise
-        options = list_options(
-            lambda words: read(args=words, registry=make_registry(config)), words
-        )
-        see = " ".join(["gscompleter", *(word for word in words[:1] if word in names)])
-        sentence = find_misspelling(words, names, options) or extract_sentence(printed.getvalue())
-        raise InputError(f"{sentence} (see {see} --help).") from None
+        see = " ".join(["gscompleter", *words[:1]])
+        raise InputError(f"{extract_sentence(printed.getvalue())} (see {see} --help).") from None
 
 
-def list_options(read: Callable[[Sequence[str]], Any], words: Sequence[str]) -> list[str]:
-    """List the options of the command in `words`."""
-    if not words or words[0].startswith("--"):
-        return ["--help", "--version"]
-    help_text = StringIO()
-    with redirect_stdout(help_text), suppress(SystemExit):
-        read([*words[:1], "--help"])
-    found = re.findall(r"^[ │]*(?:-h, )?(--[a-z][\w.-]*)", help_text.getvalue(), re.MULTILINE)
-    return [*found, HELP_ALL]
-
-
-def find_misspelling(
-    words: Sequence[str], names: Collection[str], options: Sequence[str]
-) -> str | None:
-    """Write a sentence on an unknown command or option that is similar to a known one, if any."""
-    near = get_close_matches(words[0], names, 1) if words else []
-    if near and words[0] not in names:
-        return f"There is no command {quote_value(words[0])}; the nearest is {near[0]}"
-    for given in (word.split("=")[0] for word in words if word.startswith("--")):
-        option = given.replace("_", "-")
-        near = get_close_matches(option, options, 1, MIN_SIMILARITY)
-        if near and near[0] != option:
-            return f"There is no option {quote_value(given)}; the nearest is {near[0]}"
-    return None
+def find_setting(word: str) -> list[str]:
+    """Return the name of the setting that an option `--config.NAME` changes, if it is one."""
+    found = re.match(r"--config\.([\w.-]+)", word)
+    return [found[1].replace("-", "_")] if found else []
 
 
 def check_once(words: Sequence[str]) -> None:
@@ -163,42 +143,32 @@ def make_registry(config: CompleterConfig, *rules: Rule) -> ConstructorRegistry:
 
 
 def extract_sentence(box: str) -> str:
-    """Extract the sentence from tyro's boxed error message."""
-
-    def is_empty(line: str) -> bool:
-        return not line.strip("─- ")
-
+    """Extract the sentence from tyro's boxed error message, with the option that is meant."""
     lines = [line[2:].rstrip("│ ") for line in box.splitlines()[1:]]
-    first_lines = takewhile(lambda line: not is_empty(line), dropwhile(is_empty, lines))
-    sentence = " ".join(line.strip() for line in first_lines if not line.startswith(" " * 5))
-    usage = lines.index("Argument helptext:") + 1 if "Argument helptext:" in lines else None
-    needed = "" if usage is None else f"; give {lines[usage].strip()}"
-    return f"{quote_value(sentence, 200).removesuffix('.')}{needed}"
+    text = dropwhile(lambda line: not line.strip("─- "), lines)
+    paragraph = takewhile(lambda line: line.strip("─- "), text)
+    sentence = " ".join(line.strip() for line in paragraph if not line.startswith(" " * 5))
+    hint = ""
+    for title, words in HINTS.items():
+        if title in lines:
+            hint = f"; {words} {lines[lines.index(title) + 1].strip()}"
+    return f"{quote_value(sentence, 200).removesuffix('.')}{hint}"
 
 
 def use_new_names(words: Sequence[str]) -> list[str]:
     """Replace old names of options such as `--film` or `--rerun=failures`, and warn of each."""
-    renamed = []
-    for word in words:
-        old, equals, value = word.partition("=")
-        new = f"--{translate_name(old[2:])}" if old.startswith("--") else old
-        renamed.append(f"{new}{equals}{value}")
-    return renamed
-
-
-def translate_name(name: str) -> str:
-    """Return today's name of an option without dashes, and warn of an old one."""
-    old = name.replace("_", "-")
-    if old not in RENAMED:
-        return name
-    warn_renamed(old, RENAMED[old])
-    return RENAMED[old]
+    return [re.sub(r"^--([\w-]+)", lambda name: f"--{translate_name(name[1])}", w) for w in words]
 
 
 @cache
-def warn_renamed(old: str, new: str) -> None:
-    """Print once per process that an option has a new name."""
+def translate_name(name: str) -> str:
+    """Return today's name of an option without dashes; warn of an old one once per process."""
+    old = name.replace("_", "-")
+    if old not in RENAMED:
+        return name
     print(
-        f"{PROGRAM}--{old} is now called --{new}; the old name stops working in the next release.",
+        f"{PROGRAM}--{old} is now called --{RENAMED[old]}; the old name stops working in the next "
+        "release.",
         file=sys.stderr,
     )
+    return RENAMED[old]
