@@ -432,7 +432,8 @@ def test_help_has_every_option_and_one_for_the_settings(monkeypatch, capsys, com
     positive = known - {"--ego-mask", "--synthesis"}
     assert positive - shown <= {"--config"}
     assert run(monkeypatch, command, "--help-all") == 0
-    full = set(re.findall(r"^(?:  |│ )(?:-h, )?(--[a-z.-]+)", capsys.readouterr().out, re.MULTILINE))
+    said = capsys.readouterr().out
+    full = set(re.findall(r"^(?:  |│ )(?:-h, )?(--[a-z.-]+)", said, re.MULTILINE))
     assert shown - {"--config"} <= full
     assert not any(option.startswith("--config.") for option in shown)
 

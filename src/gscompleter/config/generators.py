@@ -17,7 +17,7 @@ Steps = Annotated[int, Interval(ge=1, le=1000)]
 
 @dataclass(frozen=True)
 class GeneratorSettings(Settings):
-    """Settings of a generator that has none."""
+    """Settings of a generator; each is an option that the class `GeneratorOptions` explains."""
 
 
 @dataclass(frozen=True)
@@ -35,12 +35,8 @@ class DiffusionSettings(GeneratorSettings):
     """Settings of a generator with weights."""
 
     weights: Text | None = None
-    """Weights: a folder saved by diffusers, or USER/NAME or USER/NAME@COMMIT on the Hugging Face
-    hub. By default the published ones of pe-field; diffusers-inpaint needs this option."""
     retries: Annotated[int, Interval(ge=0, le=100)] = 0
-    """Further seeds to try if the image disagrees with the photographs."""
     offload: bool = False
-    """Keep only the active part of the model on the GPU, which needs less GPU memory."""
 
 
 @dataclass(frozen=True)
@@ -48,13 +44,8 @@ class PEFieldSettings(DiffusionSettings):
     """The paper's diffusion transformer."""
 
     steps: Steps = 4
-    """Denoising steps. The paper uses 4, its authors' demo 28."""
     depth: Text | None = None
-    """Depth of the photograph: context (rendered from the scene), monocular (a published network),
-    or the folder or hub id of another network. By default context, or monocular with the config
-    `paper`."""
     batch_size: Annotated[int, Interval(ge=1, le=1000)] = 4
-    """Most target images to denoise together. Fewer need less memory."""
 
 
 @dataclass(frozen=True)
@@ -62,9 +53,7 @@ class DiffusersInpaintSettings(DiffusionSettings):
     """Any inpainting pipeline of diffusers."""
 
     steps: Steps | None = None
-    """Denoising steps; the pipeline's own number if not given."""
     prompt: Text = "a photograph"
-    """Text prompt."""
 
 
 GENERATORS: dict[str, type[GeneratorSettings]] = {

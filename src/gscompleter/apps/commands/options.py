@@ -53,8 +53,7 @@ class ComputeOptions(Options):
     """Options of every command that computes for long."""
 
     threads: Threads | None = None
-    """CPU threads to compute with; all available cores if not given. The result does not depend on
-    it."""
+    """CPU threads to compute with; all available cores if not given."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -144,14 +143,10 @@ class CompleteOptions(CompletingOptions):
 
 @dataclass(frozen=True, kw_only=True)
 class LiveOptions(CompletingOptions):
-    """Complete a scene in the browser: fly to a hole, press a button, and watch it close.
-
-    Every step can be undone. Saving writes the same files as `gscompleter complete`.
-    """
+    """Complete a scene in the browser: fly to a hole, press a button, and watch it close."""
 
     context: Frames = None
-    """Frame numbers of the photographs to start from, counted in the order of their file paths;
-    those that show most of the scene if not given."""
+    """Frame numbers of the photographs to start from; those that show most if not given."""
     out: Path = Path("live")
     """Output folder of the Save button."""
     resolution: Size = (256, 256)
@@ -159,8 +154,7 @@ class LiveOptions(CompletingOptions):
     port: Port = 0
     """Port of the page; a free one if not given."""
     host: str = "127.0.0.1"
-    """Address of the page. Anyone who can reach it can use it; the default is this computer
-    only."""
+    """Address of the page. Anyone who can reach it can use it."""
     no_open: bool = False
     """Print the address without opening a browser."""
 
@@ -187,11 +181,7 @@ class CleanOptions(SceneOptions):
 
 @dataclass(frozen=True, kw_only=True)
 class DemoOptions(RunOptions, WritingOptions):
-    """Complete a stereo pair to the left and right of its cameras, and show before and after.
-
-    The photographs are the Middlebury motorcycle pair that scikit-image contains. Nothing is
-    downloaded.
-    """
+    """Complete the stereo pair that scikit-image contains, and show before and after."""
 
     out: Path = Path("demo")
     """Folder for the scene, its completion and before_after.png."""
@@ -205,8 +195,7 @@ class EngineOptions(Options):
     workers: Annotated[int, Interval(ge=1, le=100_000)] | None = None
     """Number of workers; as many as fit if not given (one with SLURM)."""
     threads: Threads | None = None
-    """CPU threads of each worker; an equal share of the cores on this machine, one elsewhere if not
-    given."""
+    """CPU threads of each worker; an equal share of this machine's cores, or one elsewhere."""
     address: str | None = None
     """Address of a running Ray cluster; a cluster is started here if not given."""
     gpus: Annotated[float, Interval(ge=0, le=1024)] = 0.0
@@ -234,7 +223,7 @@ class BatchOptions(EngineOptions):
     out: str
     """Folder or address for the results; a folder of an earlier run is continued."""
     engine: EngineName = "local"
-    """Engine that runs the jobs: processes of this machine, Ray, or SLURM (submitit)."""
+    """Engine that runs the jobs: processes of this machine, Ray, or SLURM."""
     retries: Annotated[int, Interval(ge=0, le=100)] = 2
     """Further attempts for a job that was killed or that failed unexpectedly."""
     rerun: Literal["nothing", "failures"] = "nothing"
@@ -273,14 +262,11 @@ class EvaluateOptions(ModelOptions, EngineOptions):
     resolution: Size | None = None
     """Working size as in `complete`; by default that of the cases."""
     use_masks: bool = False
-    """Ignore image regions that the data set masks or marks as moving objects, in the methods and
-    in the scores."""
+    """Ignore what the data set masks or marks as moving, in the methods and in the scores."""
     one_per_scene: bool = False
-    """Run only the first case of each scene, for each protocol. The paper has one case per
-    scene."""
+    """Run only the first case of each scene and protocol, as the paper does."""
     ego_mask: bool = True
-    """Ignore image regions that stay the same while the camera moves, such as the bonnet of the car
-    that carries it, in the methods and in the scores."""
+    """Ignore what stays the same while the camera moves, such as the bonnet of its car."""
     limit: Annotated[int, Interval(ge=1)] | None = None
     """Most cases to run, over all shards."""
 
@@ -437,20 +423,12 @@ class ViewOptions(WritingOptions):
 
 @dataclass(frozen=True, kw_only=True)
 class WarmupOptions(ComputeOptions):
-    """Compile all kernels for this machine, for container images and cluster nodes.
-
-    They are stored in numba's cache, beside the package or in NUMBA_CACHE_DIR, and are valid for
-    one type of processor.
-    """
+    """Compile all kernels for this type of processor into numba's cache (NUMBA_CACHE_DIR)."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class DoctorOptions(Settings):
-    """Print what is installed (device, renderers, packages, extras, weights, caches).
-
-    For everything that is missing it prints the purpose and what to do. Nothing is downloaded or
-    changed. The default models need the packages only.
-    """
+    """Print what is installed, and for what is missing its purpose and what to do."""
 
     json: bool = False
     """Print the result as JSON."""
