@@ -145,9 +145,7 @@ def inspect_weights() -> Iterator[Found]:
     for name, network in lpips.NETWORKS.items():
         files = [lpips.get_weights_path(f, None) for f in (network.backbone, network.linear)]
         there = all(file.is_file() for file in files)
-        yield Found(
-            "weights", f"lpips-{name}", there, "for LPIPS in evaluate, fetched by load_lpips"
-        )
+        yield Found("weights", f"lpips-{name}", there, "for LPIPS, fetched by load_lpips")
 
 
 def inspect_viewer() -> Found:

@@ -1,25 +1,44 @@
-"""Parser of the command line."""
+"""Parser of the command line, and its help pages."""
 
 from __future__ import annotations
 
 import re
 import sys
-from collections.abc import Collection, Sequence
+from collections.abc import Callable, Collection, Sequence
 from contextlib import redirect_stderr
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cache
+from inspect import get_annotations
 from io import StringIO
 from itertools import dropwhile, takewhile
-from typing import Any
+from typing import Annotated, Any
 
 import tyro
-from tyro.constructors import ConstructorRegistry, StructTypeInfo
+from tyro.constructors import (
+    ConstructorRegistry,
+    StructConstructorSpec,
+    StructFieldSpec,
+    StructTypeInfo,
+)
 
-from gscompleter.apps.commands.help import HELP, HELP_ALL, Rule, make_help_rule
 from gscompleter.apps.commands.options import DEFAULT_NUM_TARGETS
 from gscompleter.config import CompleterConfig, load_config
 from gscompleter.config.renamed import refuse_old_keys
+from gscompleter.config.settings import Settings
 from gscompleter.errors import PROGRAM, InputError, quote_value
+
+HELP = ("-h", "--help")
+HELP_ALL = "--help-all"
+
+CONFIG = StructFieldSpec(
+    "config",
+    str,
+    "default",
+    "Settings of the method: default, paper, an ablation such as no-sa, or a YAML file. Single "
+    f"settings are changed by options such as --config.holes.dilation 5; {HELP_ALL} lists them.",
+)
+
+Rule = Callable[[StructTypeInfo], StructConstructorSpec | None]
 
 RENAMED = {
     "keep-unsupported": "no-recolor",
@@ -58,7 +77,8 @@ def parse_words(words: Sequence[str], command: Any, names: Collection[str]) -> A
     helps = [make_help_rule(show_all=HELP_ALL in words)] if asked else []
     words = ["--help" if word == HELP_ALL else word for word in words]
     check_once(words)
-    refuse_old_keys([name for word in words for name in find_setting(word)])
+    settings = [word[9:].split("=")[0] for word in words if word.startswith("--config.")]
+    refuse_old_keys([name.replace("-", "_") for name in settings])
     printed = StringIO()
     try:
         with redirect_stderr(printed):
@@ -80,12 +100,6 @@ def parse_words(words: Sequence[str], command: Any, names: Collection[str]) -> A
             raise
         see = " ".join(["gscompleter", *words[:1]])
         raise InputError(f"{extract_sentence(printed.getvalue())} (see {see} --help).") from None
-
-
-def find_setting(word: str) -> list[str]:
-    """Return the name of the setting that an option `--config.NAME` changes, if it is one."""
-    found = re.match(r"--config\.([\w.-]+)", word)
-    return [found[1].replace("-", "_")] if found else []
 
 
 def check_once(words: Sequence[str]) -> None:
@@ -140,6 +154,44 @@ def make_registry(config: CompleterConfig, *rules: Rule) -> ConstructorRegistry:
     for rule in rules:
         registry.struct_rule(rule)
     return registry
+
+
+def make_help_rule(show_all: bool) -> Rule:
+    """Return a rule by which tyro writes help pages. No option can be parsed with it."""
+    entered: list[type] = []
+
+    def rule(info: StructTypeInfo) -> StructConstructorSpec | None:
+        kind: Any = info.type
+        if not isinstance(kind, type) or not issubclass(kind, Settings) or kind in entered:
+            return None
+        entered.append(kind)
+        spec = ConstructorRegistry.get_struct_spec(info)
+        entered.remove(kind)
+        if not isinstance(spec, StructConstructorSpec):
+            return None
+        own = get_annotations(kind)
+        fields = sorted(spec.fields, key=lambda field: field.name not in own)
+        return replace(spec, fields=tuple(tidy_field(field, show_all) for field in fields))
+
+    return rule
+
+
+def tidy_field(field: StructFieldSpec, show_all: bool) -> StructFieldSpec:
+    """Join the lines of a help text, and hide a default that says nothing.
+
+    Unless `show_all` is set, the settings of the method become one option.
+    """
+    if isinstance(field.default, CompleterConfig) and not show_all:
+        return CONFIG
+
+    def text() -> str | None:
+        found = field.helptext() if callable(field.helptext) else field.helptext
+        return None if found is None else " ".join(found.split())
+
+    kind: Any = field.type
+    if field.default is None or field.default is False or field.default == ():
+        kind = Annotated[kind, tyro.conf.arg(help_behavior_hint="")]
+    return replace(field, helptext=text, type=kind)
 
 
 def extract_sentence(box: str) -> str:
