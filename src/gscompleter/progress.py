@@ -121,8 +121,8 @@ _listener: ContextVar[Callable[[str], None] | None] = ContextVar("listener", def
 
 @contextmanager
 def show_progress(console: Console | None) -> Iterator[None]:
-    """Show activities of the block on `console`; None hides them."""
-    display = None if console is None else Display(console)
+    """Show activities of the block on `console`; None or a quiet one hides them."""
+    display = None if console is None or console.quiet else Display(console)
     token = _display.set(display)
     try:
         yield

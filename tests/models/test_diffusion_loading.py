@@ -4,8 +4,7 @@ import pytest
 
 from command import run
 from gscompleter import InputError, load_generator
-from gscompleter.apps.commands.generator_options import GeneratorOptions
-from gscompleter.config.generators import PEFieldSettings, get_settings_class
+from gscompleter.config.generators import GeneratorOptions, PEFieldSettings, get_settings_class
 from gscompleter.models.diffusion import published
 from gscompleter.models.diffusion.loading import find_sources
 from gscompleter.models.diffusion.published import (

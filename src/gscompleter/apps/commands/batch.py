@@ -40,7 +40,7 @@ def run_batch(options: BatchOptions) -> None:
     """Complete the scenes of a manifest, and write the table and the page."""
     number, count = parse_shard(options.shard, os.environ)
     console = Console(stderr=True, quiet=options.quiet, highlight=False)
-    with show_progress(None if options.quiet else console):
+    with show_progress(console):
         with show_preparation("reading the manifest"):
             jobs = read_manifest(options.manifest, parse_pairs(options.each, "each"))
             # Absolute, for workers elsewhere.

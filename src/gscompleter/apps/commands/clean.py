@@ -51,7 +51,7 @@ def clean_splat(options: CleanOptions) -> dict[str, Any]:
     check_context(options)
     device = choose_device(options.device)
     renderer = load_renderer(device)
-    with show_progress(None if options.quiet else console):
+    with show_progress(console):
         opened = open_scene(options, console)
         with show_preparation("reading photographs"):
             task = read_photographs(options, opened, device)

@@ -128,7 +128,7 @@ def complete_folder(options: CompleteOptions) -> dict[str, Any]:
     if options.video:
         check_video_writer()
     console = Console(stderr=True, quiet=options.quiet)
-    with show_progress(None if options.quiet else console):
+    with show_progress(console):
         ready = prepare_completion(options, console)
         print_lines(console, *describe_task(options, ready.opened, ready.task))
         with open_output_folder(options.out, is_replaceable(options)) as folder:
@@ -145,7 +145,7 @@ def complete_folder(options: CompleteOptions) -> dict[str, Any]:
 def plan_folder(options: CompleteOptions) -> None:
     """Write the targets and print the plan, without completing the scene."""
     console = Console(stderr=True, quiet=options.quiet)
-    with show_progress(None if options.quiet else console):
+    with show_progress(console):
         ready = prepare_completion(options, console)
         print_lines(console, *describe_task(options, ready.opened, ready.task))
         with open_output_folder(options.out, is_replaceable(options)) as folder:
@@ -183,14 +183,14 @@ def prepare_completion(options: CompleteOptions, console: Console) -> Prepared:
     check_context(options)
     check_targets(options)
     check_reconstructor(options.reconstructor)
-    get_settings_class(options.synthesis.name)
+    get_settings_class(options.synthesis.generator)
     device = choose_device(options.device)
     opened = open_scene(options, console)
     if not options.config.ego_mask:
         opened = replace(opened, photographs=opened.photographs.keep_ego_vehicle())
     with show_preparation("reading photographs"):
         task = read_task(options, opened, device)
-    parts = device, options.reconstructor, options.synthesis.name
+    parts = device, options.reconstructor, options.synthesis.generator
     if options.scene is None:
         compile_kernels(parts)
     else:
@@ -231,7 +231,7 @@ def describe_settings(options: CompleteOptions) -> dict[str, Any]:
         "reconstructor": options.reconstructor,
         "weights": None if options.weights is None else str(options.weights),
         **options.synthesis.describe(),
-        "uses_target_photographs": options.synthesis.name == "oracle",
+        "uses_target_photographs": options.synthesis.generator == "oracle",
     }
 
 
@@ -242,7 +242,7 @@ def load_completer(options: CompleteOptions, targets: Sequence[Target], device: 
         for target in targets
         if target.photograph is not None
     ]
-    name, settings = options.synthesis.name, options.synthesis.make_settings()
+    name, settings = options.synthesis.generator, options.synthesis.make_settings()
     return GSCompleter(
         load_reconstructor(options.reconstructor, options.weights, device),
         load_generator(name, options.seed, photographs, device, settings),
@@ -385,7 +385,7 @@ def describe_plan(options: CompleteOptions, plan: Plan) -> str:
     if number == 0:
         return "No camera has much to gain; there is nothing to complete."
     duration = "in a time that is not known in advance"
-    if options.scene is None and options.synthesis.name == "warp-inpaint":
+    if options.scene is None and options.synthesis.generator == "warp-inpaint":
         spent = plan.context_seconds
         seconds = number * LIFTED_VIEWS * spent / len(plan.task.views)
         duration = f"in about {seconds:.0f} s after the context ({spent:.0f} s)"

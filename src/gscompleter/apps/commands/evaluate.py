@@ -50,8 +50,7 @@ def run_evaluation(options: EvaluateOptions) -> None:
         check_resolution(parse_resolution(options.resolution))
     skipped: list[SkippedScene] = []
     notes: list[str] = []
-    shown = None if options.quiet else console
-    with show_progress(shown), show_preparation("reading cases"):
+    with show_progress(console), show_preparation("reading cases"):
         tasks = collect_tasks(options, skipped, notes)
     for note in dict.fromkeys(notes):
         console.print(note, markup=False, soft_wrap=True)
@@ -59,14 +58,14 @@ def run_evaluation(options: EvaluateOptions) -> None:
     config = RunConfig(
         reconstructor=options.reconstructor,
         weights=None if options.weights is None else str(options.weights),
-        generator=options.synthesis.name,
+        generator=options.synthesis.generator,
         generator_settings=options.synthesis.make_settings(),
         device=choose_device(options.device),
         seed=options.seed,
         source=describe_source(options),
     )
     engine = make_engine(options, str(options.out.resolve()))
-    with show_progress(shown):
+    with show_progress(console):
         compile_kernels((config.device, config.reconstructor, config.generator))
         counts = evaluate(tasks, methods, options.out, config, shard, options.rerun, engine)
         line = f"Scored {counts.done}, failed {counts.failed}, scored earlier {counts.skipped}."
@@ -91,7 +90,7 @@ def describe_source(options: EvaluateOptions) -> dict[str, Any]:
 
 def run_tables(options: TablesOptions) -> None:
     """Write the tables and plots of an evaluation, and print the tables."""
-    with show_progress(None if options.quiet else Console(stderr=True)):
+    with show_progress(Console(stderr=True, quiet=options.quiet)):
         write_and_print_tables(options.out, options.quiet, options.fid)
 
 
@@ -127,8 +126,10 @@ def run_index(options: IndexOptions) -> None:
     check_free(options.out, options.overwrite)
     skipped: list[SkippedScene] = []
     rule = protocols.parse_protocol(options.protocol)
-    shown = None if options.quiet else Console(stderr=True)
-    with show_progress(shown), show_preparation("reading clips"):
+    with (
+        show_progress(Console(stderr=True, quiet=options.quiet)),
+        show_preparation("reading clips"),
+    ):
         index = protocols.build_index(rule, filter_usable(open_clips(options.path), skipped))
     index = replace(index, skipped=(*index.skipped, *(clip.name for clip in skipped)))
     protocols.write_evaluation_index(options.out, index)

@@ -54,7 +54,7 @@ def run_live(options: LiveOptions) -> None:
     from gscompleter.apps.live.page import Page, PageServices
 
     console = Console(stderr=True, quiet=options.quiet)
-    with show_progress(None if options.quiet else console):
+    with show_progress(console):
         ready = prepare(options, console)
         services = PageServices(
             begin_session(ready),

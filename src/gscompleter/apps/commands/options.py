@@ -9,9 +9,9 @@ from typing import Annotated, Literal
 import tyro
 from annotated_types import Interval
 
-from gscompleter.apps.commands.generator_options import GeneratorOptions
 from gscompleter.config import CompleterConfig
 from gscompleter.config.cleaning import CleaningConfig
+from gscompleter.config.generators import GeneratorOptions
 from gscompleter.config.settings import Seed, Settings
 from gscompleter.jobs.engines import EngineName
 

@@ -11,7 +11,7 @@ from gscompleter.progress import show_progress
 
 def run_poses(options: PosesOptions) -> None:
     """Find and write the cameras, and print their number and error."""
-    with show_progress(None if options.quiet else Console(stderr=True)):
+    with show_progress(Console(stderr=True, quiet=options.quiet)):
         found = find_poses(options.photographs, options.out, options.overwrite)
     if options.quiet:
         return

@@ -12,7 +12,7 @@ from gscompleter.progress import show_progress
 
 def run_warmup(options: WarmupOptions) -> None:
     """Compile missing kernels, and print the time and the folder."""
-    with show_progress(None if options.quiet else Console(stderr=True)):
+    with show_progress(Console(stderr=True, quiet=options.quiet)):
         seconds = compile_kernels(list(PARTS))
     if not options.quiet:
         done = " already" if seconds is None else f", in {seconds:.1f} s"
