@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Annotated, Any, Literal
+from typing import Annotated, Any, Literal, get_args
 
 from annotated_types import Interval
 
@@ -236,14 +236,7 @@ class CompleterConfig(Settings):
     trust: Literal["full", "photometric"] = "full"
     """Trust in the scene: `full` takes it as it is (paper), `photometric` counts a Gaussian as far
     as photographs confirm it."""
-    guards: tuple[GuardName, ...] = (
-        "dynamic-masks",
-        "image-agreement",
-        "depth-agreement",
-        "free-space",
-        "psnr",
-        "contribution",
-    )
+    guards: tuple[GuardName, ...] = get_args(GuardName)
     """Safeguards beyond the paper, in the order in which they are asked (paper: none)."""
     margin: Annotated[float, Interval(ge=0, le=4)] = 0.25
     """Padding of the target image on every side, relative to its size, if a hole reaches its

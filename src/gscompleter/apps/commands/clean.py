@@ -38,14 +38,7 @@ from gscompleter.types import Gaussians, View
 
 
 def run_clean(options: CleanOptions) -> None:
-    """Clean the splat, and print a summary."""
-    summary = clean_splat(options)
-    if not options.quiet:
-        print_cleaning(summary, options.out)
-
-
-def clean_splat(options: CleanOptions) -> dict[str, Any]:
-    """Clean the splat, write `options.out`, and return the summary."""
+    """Clean the splat, write the result, and print a summary."""
     console = Console(stderr=True, quiet=options.quiet)
     check_output(options.out, is_replaceable(options))
     check_context(options)
@@ -84,7 +77,8 @@ def clean_splat(options: CleanOptions) -> dict[str, Any]:
             with stage("writing"):
                 save_completed_splat(folder, given, removed, given[:0], splat_file)
                 (folder / SUMMARY_FILE).write_text(json.dumps(summary, indent=2) + "\n")
-    return summary
+    if not options.quiet:
+        print_cleaning(summary, options.out)
 
 
 def score_cleaning(

@@ -113,8 +113,7 @@ class CompletingOptions(SceneOptions, ModelOptions):
     no_recolor: bool = False
     """Keep the colours of the splat, too; Gaussians are only added where it is empty."""
     config: Annotated[CompleterConfig, tyro.conf.FlagConversionOff] = CompleterConfig()
-    """Settings of the method. `--config NAME` selects default, splat, paper, an ablation such as
-    no-sa, or a YAML file; the options here change single settings of it."""
+    """Settings of the method, which change those of `--config NAME`."""
 
 
 @dataclass(frozen=True, kw_only=True)
