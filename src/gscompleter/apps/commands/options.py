@@ -87,6 +87,8 @@ class SceneOptions(ComputeOptions, WritingOptions):
     PandaSet, a pixelSplat chunk or a RealEstate10K camera file. If it has no cameras, COLMAP finds
     them and they are kept in OUT/colmap."""
     context: Frames = None
+    """Frame numbers of the photographs to work with, counted in the order of their file paths. If
+    not given, those that help most; photographs of targets are never used. `clean` takes all."""
     out: Path
     format: str | None = None
     """Format of SCENE: colmap, nerfstudio, cameras-json, llff, kitti, kitti-raw, dgp, waymo,
@@ -120,9 +122,6 @@ class CompletingOptions(SceneOptions, ModelOptions):
 class CompleteOptions(CompletingOptions):
     """Fill the parts of a scene that its photographs do not show, and write the result."""
 
-    context: Frames = None
-    """Frame numbers of the photographs to start from, counted in the order of their file paths. If
-    not given, those that help the targets most. Photographs of targets are never used."""
     target: tuple[str, ...] = ()
     """Cameras to complete the scene for: frame numbers, or a file of cameras (transforms.json,
     cameras.json, COLMAP's images.txt, SuperSplat poses). If not given, cameras that see holes are
@@ -144,8 +143,6 @@ class CompleteOptions(CompletingOptions):
 class LiveOptions(CompletingOptions):
     """Complete a scene in the browser: fly to a hole, press a button, and watch it close."""
 
-    context: Frames = None
-    """Frame numbers of the photographs to start from; those that show most if not given."""
     out: Path = Path("live")
     """Output folder of the Save button."""
     resolution: Size = (256, 256)
@@ -166,9 +163,6 @@ class CleanOptions(SceneOptions):
     removed Gaussians back.
     """
 
-    context: Frames = None
-    """Frame numbers of the photographs to compare with, counted in the order of their file paths;
-    all if not given. Gaussians that only other photographs need may be removed."""
     out: Path
     """Folder for completed.ply, removed.ply and summary.json."""
     scene: Path
