@@ -33,7 +33,6 @@ def test_a_quote_stays_on_its_line_and_shows_no_control_characters():
 
 
 def test_integers_that_python_refuses_to_write_are_described():
-    assert quote_value(10**5000) == "an integer of about 5,000 digits"
     assert quote_value([10**5000]) == "a list that cannot be written out"
 
 

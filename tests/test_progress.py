@@ -55,7 +55,7 @@ def test_a_log_has_a_line_for_each_stage():
 def test_a_log_counts_what_takes_long(monkeypatch):
     """A line of its own for each step that is `LOG_SECONDS` after the last line."""
     clock = iter(range(100))
-    monkeypatch.setattr(progress.time, "monotonic", lambda: 6.0 * next(clock))
+    monkeypatch.setattr(progress.time, "monotonic", lambda: 12.0 * next(clock))
     console = Console(file=io.StringIO(), width=200)
     with show_progress(console):
         for _ in track(range(3), "scores"):

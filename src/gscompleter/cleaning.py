@@ -9,7 +9,7 @@ back.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Sequence
 from dataclasses import replace
 
 import torch
@@ -26,7 +26,6 @@ from gscompleter.guards.psnr import (
 )
 from gscompleter.progress import track
 from gscompleter.render import OpacityRender, Renderer, restrict_to_image
-from gscompleter.trust.photometric import sum_weights
 from gscompleter.types import Gaussians, View
 
 FADED_OPACITY = 0.02
@@ -54,8 +53,7 @@ def find_superfluous(
         add_psnr_loss(compute_scene_error(scene, view, renderer).item(), config.tolerance)
         for view in checks
     ]
-    removed = exclude_needed(scene, removable, checks, allowed, renderer)
-    return keep_needed(scene, removed, checks, allowed, renderer)
+    return exclude_needed(scene, removable, checks, allowed, renderer)
 
 
 def find_removable(
@@ -117,26 +115,6 @@ def estimate_squared_gradient(
     return squares / probes / image.numel()
 
 
-def keep_needed(
-    scene: Gaussians,
-    removed: Bool[Tensor, "n"],
-    views: Sequence[View],
-    max_errors: Sequence[float],
-    renderer: Renderer,
-) -> Bool[Tensor, "n"]:
-    """Keep Gaussians visible in photographs that exceed their error limit without them.
-
-    This repeats until every photograph is within its limit.
-    """
-    before = None
-    while before is None or not torch.equal(removed, before):
-        before = removed
-        for view, error in zip(views, max_errors, strict=True):
-            if compute_scene_error(scene[~removed], view, renderer).item() > error:
-                removed = removed & ~(sum_weights(renderer.freeze(scene, view.camera)) > 0)
-    return removed
-
-
 def halve_view(view: View) -> View:
     """Reduce a photograph to half its size."""
     image = avg_pool2d(view.image.permute(2, 0, 1), 2).permute(1, 2, 0)
@@ -152,34 +130,18 @@ def exclude_needed(
     max_errors: Sequence[float],
     renderer: Renderer,
 ) -> Bool[Tensor, "n"]:
-    """Remove needed Gaussians from a mask until every photograph is within its MSE limit."""
-    candidates, rest = scene[removable], scene[~removable]
-
-    def plans() -> Iterator[OpacityRender]:
-        # One at a time, to save memory.
-        return (renderer.freeze(rest, view.camera).vary_opacities(candidates) for view in views)
-
-    unneeded = find_removable_together(candidates.opacities, plans, views, max_errors)
-    return removable.masked_scatter(removable, unneeded)
-
-
-def find_removable_together(
-    opacities: Float[Tensor, "n"],
-    plans: Callable[[], Iterable[OpacityRender]],
-    views: Sequence[View],
-    max_errors: Sequence[float],
-) -> Bool[Tensor, "n"]:
-    """Find Gaussians that can be missing together without any photograph exceeding its limit.
+    """Remove needed Gaussians from a mask until every photograph is within its MSE limit.
 
     Restored Gaussians may change other photographs, so all are checked until nothing changes.
     """
-    missing = torch.ones_like(opacities, dtype=torch.bool)
-    before = None
+    candidates, rest = scene[removable], scene[~removable]
+    missing, before = torch.ones_like(candidates.opacities, dtype=torch.bool), None
     while before is None or not torch.equal(missing, before):
         before = missing
-        for plan, view, error in zip(plans(), views, max_errors, strict=True):
-            missing = missing & ~find_needed(plan, opacities, missing, view, error)
-    return missing
+        for view, error in zip(views, max_errors, strict=True):
+            plan = renderer.freeze(rest, view.camera).vary_opacities(candidates)
+            missing = missing & ~find_needed(plan, candidates.opacities, missing, view, error)
+    return removable.masked_scatter(removable, missing)
 
 
 def find_needed(

@@ -23,8 +23,7 @@ class InputError(ValueError):
     """An error in the input, which the user can correct.
 
     Its message is one sentence: what was given, what is needed, what to do. The command line prints
-    it without a traceback and exits with code 2. It is shown on one line of at most
-    `MAX_MESSAGE_LENGTH` characters.
+    it on one line and exits with code 2.
     """
 
     def __init__(self, message: str, argument: str | None = None) -> None:
@@ -34,7 +33,8 @@ class InputError(ValueError):
 
     def __str__(self) -> str:
         option = 0 if self.argument is None else len(f" (--{self.argument}).")
-        return shorten_message(super().__str__(), MAX_MESSAGE_LENGTH - len(PROGRAM) - option)
+        line = " ".join(part.strip() for part in super().__str__().splitlines())
+        return quote_value(line, MAX_MESSAGE_LENGTH - len(PROGRAM) - option)
 
 
 class OutputError(InputError):
@@ -57,23 +57,6 @@ def quote_value(value: object, length: int | None = None) -> str:
         return line
     half = (length - 1) // 2
     return f"{line[:half]}…{line[-half:]}"
-
-
-def shorten_message(message: str, most: int) -> str:
-    """Fit a message into one line of `most` characters.
-
-    The longest words, such as paths, are shortened first, then the middle of the message, and URLs
-    last.
-    """
-    line = " ".join(part.strip() for part in message.splitlines())
-    words = quote_value(line, 100 * most).split(" ")
-    while (excess := len(" ".join(words)) - most) > 0:
-        longest = max(range(len(words)), key=lambda i: len(words[i]) * ("://" not in words[i]))
-        length = max(len(words[longest]) - excess, MAX_QUOTE_LENGTH)
-        if length >= len(words[longest]):
-            break
-        words[longest] = quote_value(words[longest], length)
-    return quote_value(" ".join(words), most)
 
 
 def join_names(names: Sequence[object], most: int, length: int | None = None) -> str:
@@ -107,12 +90,9 @@ def refuse_pointer(path: Path) -> None:
 _REPR = Repr()
 _REPR.maxlevel, _REPR.maxstring, _REPR.maxother = 4, 4 * MAX_QUOTE_LENGTH, 4 * MAX_QUOTE_LENGTH
 _REPR.maxlist = _REPR.maxtuple = _REPR.maxdict = _REPR.maxset = MAX_QUOTE_LENGTH // 2
-_REPR.maxlong = 4 * MAX_QUOTE_LENGTH
 
 
 def _format_value(value: object) -> str:
-    if isinstance(value, int) and value.bit_length() > 4 * MAX_QUOTE_LENGTH:
-        return f"an integer of about {value.bit_length() * 0.30103:,.0f} digits"
     try:
         return _REPR.repr(value)
     except (ValueError, RecursionError):  # integers of more than 4,300 digits are among them

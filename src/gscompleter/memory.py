@@ -36,9 +36,9 @@ _LIMIT_FILES = ("/sys/fs/cgroup/memory.max", "/sys/fs/cgroup/memory/memory.limit
 
 def check_memory(pixels: int, images: int) -> None:
     """Raise InputError if `images` of up to `pixels` pixels need more memory than there is."""
-    number = f"{quote_value(f'{images:,}')} images of up to {quote_value(f'{pixels:,}')} pixels"
+    number = f"{images:,} images of up to {quote_value(f'{pixels:,}')} pixels"
     remedy = "choose a smaller resolution, or fewer views"
-    _check_available(estimate_bytes(pixels, images), number, remedy, "resolution")
+    check_bytes(estimate_bytes(pixels, images), number, remedy, "resolution")
 
 
 def estimate_bytes(pixels: int, images: int) -> int:
@@ -48,12 +48,12 @@ def estimate_bytes(pixels: int, images: int) -> int:
 
 def check_scene_memory(count: int, photographs: int, needed: int) -> None:
     """Raise InputError if `needed` bytes, for `count` Gaussians, exceed the memory."""
-    number = f"The {quote_value(f'{count:,}')} Gaussians of the scene and {photographs} photographs"
-    remedy = "crop the scene, or give a folder with fewer photographs"
-    _check_available(needed, number, remedy)
+    number = f"The {count:,} Gaussians of the scene and {photographs} photographs"
+    check_bytes(needed, number, "crop the scene, or give a folder with fewer photographs")
 
 
-def _check_available(needed: int, number: str, remedy: str, argument: str | None = None) -> None:
+def check_bytes(needed: int, number: str, remedy: str, argument: str | None = None) -> None:
+    """Raise InputError if `needed` bytes, for what `number` says, exceed the memory."""
     available = read_memory_bytes()
     if available is not None and needed > available:
         raise InputError(
@@ -98,18 +98,13 @@ def count_fitting_images(pixels: int) -> int | None:
 
 def read_memory_bytes() -> int | None:
     """Return the memory of this machine or its container limit, or None if unknown."""
-    found = [limit for limit in map(_read_limit, _LIMIT_FILES) if limit is not None]
-    with contextlib.suppress(AttributeError, OSError, ValueError):
+    found = []
+    for file in filter(os.path.isfile, _LIMIT_FILES):
+        word = Path(file).read_text().strip()
+        found += [int(word)] if word.isdecimal() else []  # cgroup 2 has "max" for no limit
+    with contextlib.suppress(AttributeError, OSError, ValueError):  # not on Windows
         found.append(os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES"))
     return min(found, default=None)
-
-
-def _read_limit(path: str) -> int | None:
-    try:
-        word = Path(path).read_text().strip()
-    except OSError:
-        return None
-    return int(word) if word.isdecimal() else None  # cgroup 2 has "max" for no limit
 
 
 def format_whole_gigabytes(number: int) -> str:

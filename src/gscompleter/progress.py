@@ -3,10 +3,10 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Iterable, Iterator, Sequence
-from contextlib import AbstractContextManager, contextmanager
+from collections.abc import Callable, Iterable, Iterator, Sized
+from contextlib import AbstractContextManager, contextmanager, nullcontext
 from contextvars import ContextVar
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from typing import TYPE_CHECKING, TypeVar
 
 if TYPE_CHECKING:
@@ -27,11 +27,6 @@ class Activity:
     total: int | None = None
     """Number of steps; None for a stage."""
     num_done: int = 0
-    is_preparation: bool = False
-    """True if a log does not show it."""
-    start_time: float = field(default_factory=time.monotonic)
-    last_step_time: float = field(default_factory=time.monotonic)
-    """Time of the last finished step, in seconds."""
 
     def format_label(self) -> str:
         """Return the name, with the number of the current step."""
@@ -39,20 +34,13 @@ class Activity:
             return self.name
         return f"{self.name} {min(self.num_done + 1, self.total)} of {self.total}"
 
-    def count_step(self) -> None:
-        """Count a finished step."""
-        self.num_done, self.last_step_time = self.num_done + 1, time.monotonic()
-        display = _display.get()
-        if display is not None:
-            display.update(LOG_SECONDS)
-
 
 class Display:
     """The running activities on a console, the outermost first."""
 
     def __init__(self, console: Console) -> None:
+        self.has_bars = console.is_terminal and not console.is_dumb_terminal
         self._console = console
-        self._has_bars = console.is_terminal and not console.is_dumb_terminal
         self._bars: Progress | None = None
         self._running: list[Activity] = []
         self._line, self._line_time = "", 0.0
@@ -60,21 +48,20 @@ class Display:
     @contextmanager
     def show(self, activity: Activity) -> Iterator[None]:
         """Show an activity during the block."""
-        if self._has_bars and not self._running:
+        if self.has_bars and not self._running:
             self._bars = start_bars(self._console)
+        depth = len(self._running)
         self._running.append(activity)
         try:
             self.update()
             yield
         finally:
-            if activity in self._running:  # with all inside it
-                del self._running[self._running.index(activity) :]
+            del self._running[depth:]
             if not self._running:
                 self.stop()
 
     def stop(self) -> None:
-        """End all activities, and remove the live lines."""
-        self._running.clear()
+        """Remove the live lines."""
         if self._bars is not None:
             self._bars.stop()
         self._bars = None
@@ -83,7 +70,7 @@ class Display:
         """Show a change; a log shows it only `log_seconds` after its last line."""
         if self._bars is not None:
             self._update_bars(self._bars)
-        elif not self._has_bars and time.monotonic() >= self._line_time + log_seconds:
+        elif not self.has_bars and time.monotonic() >= self._line_time + log_seconds:
             self._print_line()
 
     def _update_bars(self, bars: Progress) -> None:
@@ -99,11 +86,11 @@ class Display:
         # Steps inside a stage are hidden.
         shown = [
             activity.format_label()
-            for index, activity in enumerate(self._running)
-            if activity.total is None or index == 0 or self._running[index - 1].total is not None
+            for outer, activity in zip([None, *self._running], self._running, strict=False)
+            if activity.total is None or outer is None or outer.total is not None
         ]
         line = ": ".join(shown)
-        if line != self._line and not any(a.is_preparation for a in self._running):
+        if line != self._line:
             self._line, self._line_time = line, time.monotonic()
             self._console.print(line, highlight=False, markup=False, soft_wrap=True)
 
@@ -134,8 +121,8 @@ _listener: ContextVar[Callable[[str], None] | None] = ContextVar("listener", def
 
 @contextmanager
 def show_progress(console: Console | None) -> Iterator[None]:
-    """Show activities of the block on `console`; None hides them."""
-    display = None if console is None else Display(console)
+    """Show activities of the block on `console`; None or a quiet one hides them."""
+    display = None if console is None or console.quiet else Display(console)
     token = _display.set(display)
     try:
         yield
@@ -157,37 +144,33 @@ def notify_of_stages(listener: Callable[[str], None]) -> Iterator[None]:
 
 def stage(name: str) -> AbstractContextManager[None]:
     """Show a stage during the block, and notify the listener."""
-    listener = _listener.get()
+    listener, display = _listener.get(), _display.get()
     if listener is not None:
         listener(name)
-    return show_activity(Activity(name))
+    return nullcontext() if display is None else display.show(Activity(name))
 
 
 def show_preparation(name: str) -> AbstractContextManager[None]:
-    """Show a preparation during the block, on a terminal only."""
-    return show_activity(Activity(name, is_preparation=True))
-
-
-@contextmanager
-def show_activity(activity: Activity) -> Iterator[None]:
-    """Show an activity during the block, if a display is active."""
+    """Show a preparation with its stages during the block, on a terminal only."""
     display = _display.get()
-    if display is None:
-        yield
-        return
+    if display is None or not display.has_bars:
+        return show_progress(None)
+    return display.show(Activity(name))
+
+
+def track(items: Iterable[T], description: str, total: int | None = None) -> Iterable[T]:
+    """Show the progress while iterating over `items`, `total` if they have no length."""
+    display = _display.get()
+    total = len(items) if isinstance(items, Sized) else total
+    if display is None or not total:
+        return items
+    return count_items(items, Activity(description, total), display)
+
+
+def count_items(items: Iterable[T], activity: Activity, display: Display) -> Iterator[T]:
+    """Count items on a display while iterating over them."""
     with display.show(activity):
-        yield
-
-
-def track(items: Sequence[T], description: str) -> Iterable[T]:
-    """Show the progress while iterating over items."""
-    return items if _display.get() is None else count_items(items, description)
-
-
-def count_items(items: Sequence[T], description: str) -> Iterator[T]:
-    """Count items while iterating over them."""
-    activity = Activity(description, len(items))
-    with show_activity(activity):
         for item in items:
             yield item
-            activity.count_step()
+            activity.num_done += 1
+            display.update(LOG_SECONDS)

@@ -250,7 +250,7 @@ def test_rows_of_one_scene_get_numbers_and_equal_names_are_refused(tmp_path):
 @pytest.mark.parametrize(
     ("row", "sentence"),
     [
-        ({"targt": 2}, "no option --targt; the nearest is --target"),
+        ({"targt": 2}, "options: --targt"),
         ({"resolution": "wide"}, "resolution"),
         ({"out": "elsewhere"}, "cannot set 'out'"),
         ({"video": "perhaps"}, "must be true or false"),

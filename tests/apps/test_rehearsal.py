@@ -13,7 +13,7 @@ from rich.console import Console
 
 from command import run
 from gscompleter import GSCompleter, kernels
-from gscompleter.apps.warmup import compilation, rehearsal
+from gscompleter.apps import warmup
 from gscompleter.kernels import compiled
 from gscompleter.progress import show_progress
 from paths import TESTS
@@ -51,13 +51,11 @@ def signatures() -> set[tuple[str, str]]:
 
 
 @pytest.fixture
-def marked(monkeypatch, tmp_path) -> list[str]:
-    """Use an empty folder of marks, and rehearse parts by writing their names."""
-    done: list[str] = []
+def rehearsed(monkeypatch, tmp_path) -> list[bool]:
+    """Use an empty folder of marks, and note each rehearsal instead of running it."""
+    done: list[bool] = []
     monkeypatch.setattr(compiled, "get_cache_folder", lambda: tmp_path)
-    monkeypatch.setattr(compilation, "PARTS", ("cpu", "plane-sweep"))
-    monkeypatch.setattr(rehearsal, "PARTS", dict.fromkeys(compilation.PARTS, done.append))
-    monkeypatch.setattr(compilation, "get_thread_count", lambda: 1)
+    monkeypatch.setattr(warmup, "rehearse", lambda with_splat: done.append(with_splat))
     return done
 
 
@@ -66,9 +64,8 @@ def test_a_rehearsal_meets_every_kernel_of_a_completion():
     said = """
 import sys
 sys.path[:0] = [sys.argv[1], f"{sys.argv[1]}/../support"]
-from test_rehearsal import complete, rehearsal, signatures
-for name, rehearse in rehearsal.PARTS.items():
-    rehearse(name)
+from test_rehearsal import complete, signatures, warmup
+warmup.rehearse(with_splat=True)
 rehearsed = signatures()
 complete()
 print(len(rehearsed), *sorted(signatures() - rehearsed), sep="\\n")
@@ -80,59 +77,40 @@ print(len(rehearsed), *sorted(signatures() - rehearsed), sep="\\n")
     assert others == []
 
 
-def test_each_part_that_is_named_is_rehearsed():
-    assert tuple(rehearsal.PARTS) == compilation.PARTS
+def test_what_is_compiled_is_compiled_once(rehearsed):
+    assert warmup.compile_kernels(["cuda", "mvsplat"]) is None
+    assert warmup.compile_kernels(["cpu", "mvsplat"]) > 0
+    assert warmup.compile_kernels(["plane-sweep", "cpu"]) is None
+    assert rehearsed == [False]
+    assert warmup.compile_kernels(["cpu", warmup.SPLAT_PART]) > 0
+    assert warmup.compile_kernels(["cpu", warmup.SPLAT_PART]) is None
+    assert rehearsed == [False, True]
 
 
-def test_what_is_compiled_is_compiled_once(marked):
-    assert compilation.compile_kernels(["cpu", "mvsplat"]) > 0
-    assert marked == ["cpu"]
-    assert compilation.compile_kernels(["cpu"]) is None
-    assert compilation.compile_kernels(["plane-sweep", "cpu"]) > 0
-    assert marked == ["cpu", "plane-sweep"]
-
-
-def test_kernels_are_compiled_anew_for_another_processor(marked, monkeypatch):
-    compilation.compile_kernels(["cpu"])
+def test_kernels_are_compiled_anew_for_another_processor(rehearsed, monkeypatch):
+    warmup.compile_kernels(["cpu"])
     monkeypatch.setattr(compiled, "get_host_cpu_name", lambda: "another")
-    compilation.compile_kernels(["cpu"])
-    assert marked == ["cpu", "cpu"]
+    warmup.compile_kernels(["cpu"])
+    assert len(rehearsed) == 2
 
 
-def test_one_line_says_so_before_it_happens(marked):
+def test_one_line_says_so_before_it_happens(rehearsed):
     console = Console(record=True, file=io.StringIO(), width=200)
     with show_progress(console):
-        compilation.compile_kernels(["cpu"])
-        compilation.compile_kernels(["cpu"])
+        warmup.compile_kernels(["cpu"])
+        warmup.compile_kernels(["cpu"])
     said = console.export_text()
     assert said == "compiling kernels for this machine, once\n"
 
 
-def test_warmup_says_what_it_did(marked, monkeypatch, capsys):
+def test_warmup_says_what_it_did(rehearsed, monkeypatch, capsys):
     assert run(monkeypatch, "warmup") == 0
     assert capsys.readouterr().out.startswith("All kernels are compiled, in ")
     assert run(monkeypatch, "warmup") == 0
     assert capsys.readouterr().out.startswith("All kernels are compiled already: ")
     assert run(monkeypatch, "warmup", "--quiet") == 0
     assert capsys.readouterr() == ("", "")
-    assert marked == ["cpu", "plane-sweep"]
-
-
-def test_models_are_compiled_in_another_process_beside_the_renderer(monkeypatch):
-    names = ["cpu", "brought", "plane-sweep"]
-    monkeypatch.setattr(compilation, "get_thread_count", lambda: 2)
-    assert compilation.split_parts(names) == (["cpu", "brought"], ["plane-sweep"])
-    assert compilation.split_parts(["plane-sweep"]) == (["plane-sweep"], [])
-    monkeypatch.setattr(compilation, "get_thread_count", lambda: 1)
-    assert compilation.split_parts(names) == (names, [])
-
-
-def test_a_part_that_fails_in_its_process_is_no_success(monkeypatch):
-    with (
-        pytest.raises(subprocess.CalledProcessError),
-        compilation.rehearse_in_subprocess(["no such part"]),
-    ):
-        pass
+    assert rehearsed == [True]
 
 
 @pytest.mark.slow

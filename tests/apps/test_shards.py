@@ -191,12 +191,12 @@ def test_rows_that_come_while_tables_are_written_get_into_them(finished, tmp_pat
     row.rename(late)
     written = []
 
-    def draw(summary, out, quiet):
+    def draw(summary, out):
         written.append(len(summary.common_tasks))
         if len(written) == 1:
             late.rename(row)
 
-    monkeypatch.setattr(command, "try_plots", draw)
+    monkeypatch.setattr(command.plots, "draw_plots", draw)
     command.write_and_print_tables(out, quiet=True, num_rows=6)
     assert written == [2, 3]
     same_tables(out, finished)
@@ -209,11 +209,11 @@ def test_a_shard_leaves_the_last_tables_to_the_others(finished, tmp_path, monkey
     list_row_paths(out)[0].unlink()
     calls = []
 
-    def draw(summary, out, quiet):
+    def draw(summary, out):
         calls.append(summary)
         list_row_paths(out)[0].touch()
 
-    monkeypatch.setattr(command, "try_plots", draw)
+    monkeypatch.setattr(command.plots, "draw_plots", draw)
     command.write_and_print_tables(out, quiet=True, num_rows=6)
     assert len(calls) == 1
 

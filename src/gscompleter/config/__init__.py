@@ -4,12 +4,12 @@ from __future__ import annotations
 
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Annotated, Any, Literal
+from typing import Annotated, Any, Literal, get_args
 
 from annotated_types import Interval
 
 from gscompleter.config.coverage import COVERED
-from gscompleter.config.renamed import refuse_old_keys
+from gscompleter.config.renamed import list_paths, refuse_old_keys
 from gscompleter.config.settings import Count, Settings, Share, Weight, apply_changes
 from gscompleter.errors import InputError, quote_value
 
@@ -25,8 +25,7 @@ class SynthesisConfig(Settings):
     correct_color: bool = True
     """Match the colours of the synthesized image to those of the photographs (not in the paper)."""
     source_depth: Literal["context", "monocular"] = "context"
-    """Depth map of the photograph for PE-Field if `--generator-depth` is not given: rendered from
-    the scene, or estimated by a monocular network as in the paper."""
+    """Default of `--generator-depth`: rendered from the scene, or by a network (paper)."""
 
 
 @dataclass(frozen=True)
@@ -40,8 +39,7 @@ class AnchorConfig(Settings):
     min_baseline: Share = 0.01
     """Smallest baseline between anchor and target, relative to the widest one (paper: 0)."""
     min_overlap: Share = 0.25
-    """Smallest share of the observed target image that an anchor must see too, if any view does
-    (paper: 0)."""
+    """Smallest share of the observed target image that an anchor should see too (paper: 0)."""
 
 
 @dataclass(frozen=True)
@@ -51,8 +49,8 @@ class AlignmentConfig(Settings):
     align_at: Literal["anchor", "target", "none"] = "anchor"
     """View at which depths are compared. `target` and `none` are ablations of the paper."""
     min_agreement: Share = 0.3
-    """Smallest share of observed pixels at the target that must agree with the fit at the anchor;
-    below it, a fit at the target may replace it (paper: 0, it never does)."""
+    """Smallest share of observed target pixels that must agree with the fit at the anchor; below
+    it, a fit at the target may replace it (paper: 0, it never does)."""
 
 
 @dataclass(frozen=True)
@@ -78,8 +76,8 @@ class RegistrationConfig(Settings):
     beta2: Memory = 0.8
     """Adam's decay rate of squared gradients, usually 0.999."""
     lr_unit: Literal["distance", "scene"] = "distance"
-    """`distance`: relative to each Gaussian's distance, with depth losses relative to the median
-    depth, so that the unit of the scene does not matter. `scene`: in scene units (paper)."""
+    """`distance`: relative to each Gaussian's distance, and depth losses to the median depth, so
+    that the unit of the scene does not matter. `scene`: in scene units (paper)."""
     degrees_of_freedom: Literal[1, 3] = 1
     """1 moves Gaussians along their rays, 3 moves them freely (ablation of the paper)."""
     depth_weight: Weight = 1.0
@@ -95,19 +93,16 @@ class RegistrationConfig(Settings):
     """`constant` scales a Gaussian with its distance, which preserves the target image; `fixed`
     keeps its size (paper)."""
     mask_occluded: bool = True
-    """Exclude pixels from the stereo loss where the scene occludes the new surface in the anchor
-    view. The paper includes them, which pulls the surface forward."""
+    """Exclude pixels from the stereo loss where the scene hides the new surface from the anchor.
+    The paper includes them, which pulls the surface forward."""
     mask_sky: bool = True
     """Exclude the sky from the depth losses (paper: included)."""
     min_ratio: Annotated[float, Interval(gt=0, le=1)] | None = 0.1
-    """Smallest factor by which a distance may shrink, so that nothing passes the camera. None sets
-    no limit (paper)."""
+    """Smallest factor by which a distance may shrink. None sets no limit (paper)."""
     hole_depth: Literal["lifted", "scene"] = "lifted"
-    """Depth in holes: of the lifted Gaussians, or continued smoothly from the trusted scene around.
-    A smooth image has no texture that stereo could use."""
+    """Depth in holes: of the lifted Gaussians, or continued smoothly from the scene around."""
     extrapolate_into_holes: bool = True
-    """Move pixels in a hole like the observed pixels around it, which avoids a depth step at the
-    seam. The paper keeps their affine alignment."""
+    """Move pixels in a hole like those around it. The paper keeps their affine alignment."""
 
 
 @dataclass(frozen=True)
@@ -126,13 +121,11 @@ class HoleConfig(Settings):
     """τ of Eq. 12: pixels with less accumulated opacity are holes. Depth comparisons always use
     0.5."""
     min_covered: Share = 0.02
-    """Smallest share of the target image that must show surfaces of the scene; targets that see
-    less are skipped."""
+    """Smallest share of the target image that must show the scene; others are skipped."""
     dilation: Pixels = 3
     """Pixels by which the hole mask is dilated to hide seams; 0 disables it (paper)."""
     candidate_radius: Pixels | None = 16
-    """Distance to a hole, in pixels, within which lifted Gaussians are registered. None registers
-    all of them (paper)."""
+    """Distance to a hole, in pixels, within which Gaussians are registered (paper: None, all)."""
 
 
 @dataclass(frozen=True)
@@ -140,8 +133,7 @@ class DynamicMasksConfig(Settings):
     """Guard `dynamic-masks`: copy nothing from regions that moved between photographs."""
 
     min_color_difference: Annotated[float, Interval(gt=0, le=1)] = 0.12
-    """Colour difference, in [0, 1], above which two photographs of a surface show different
-    things."""
+    """Colour difference, in [0, 1], above which a surface has moved between photographs."""
 
 
 @dataclass(frozen=True)
@@ -185,7 +177,7 @@ class RecolorConfig(Settings):
     iterations: Count = 8
     """Rounds on the residual image."""
     min_change: Share = 6 / 255
-    """Largest change of a colour, as the target sees it, that is not worth a change of the file."""
+    """Largest change of a colour at the target that is not worth a change of the file."""
 
 
 @dataclass(frozen=True)
@@ -207,8 +199,7 @@ class NextBestViewConfig(Settings):
     bases: Annotated[int, Interval(ge=1, le=1000)] = 16
     """Photographs, spread over the scene, around which candidates are placed."""
     max_step: Annotated[float, Interval(gt=0, le=1)] = 0.2
-    """Largest move of a candidate, relative to the depth of the image. It is never larger than the
-    distance between these photographs."""
+    """Largest move of a candidate, relative to the depth of the image."""
     yaw_fraction: Annotated[float, Interval(gt=0, le=0.5)] = 0.25
     """Rotation of a candidate, relative to the field of view."""
     image_size: Annotated[int, Interval(ge=16, le=4096)] = 96
@@ -245,14 +236,7 @@ class CompleterConfig(Settings):
     trust: Literal["full", "photometric"] = "full"
     """Trust in the scene: `full` takes it as it is (paper), `photometric` counts a Gaussian as far
     as photographs confirm it."""
-    guards: tuple[GuardName, ...] = (
-        "dynamic-masks",
-        "image-agreement",
-        "depth-agreement",
-        "free-space",
-        "psnr",
-        "contribution",
-    )
+    guards: tuple[GuardName, ...] = get_args(GuardName)
     """Safeguards beyond the paper, in the order in which they are asked (paper: none)."""
     margin: Annotated[float, Interval(ge=0, le=4)] = 0.25
     """Padding of the target image on every side, relative to its size, if a hole reaches its
@@ -350,9 +334,6 @@ def get_named_config(name: str, is_splat: bool = False) -> CompleterConfig:
     """Return `default`, `splat` or `paper`, or one of them with an ablation: `paper/no-sa`.
 
     `default` follows the input: it is `splat` for a splat that comes with further photographs.
-
-    Raises:
-        InputError: The name is unknown.
     """
     bases = {
         "default": CompleterConfig.for_input(is_splat),
@@ -373,15 +354,7 @@ def get_named_config(name: str, is_splat: bool = False) -> CompleterConfig:
 
 
 def load_config(source: str, is_splat: bool = False) -> CompleterConfig:
-    """Return a config by name, or read the changes to its `base` from a YAML file.
-
-    Args:
-        source: Name of a config, or path of a YAML file.
-        is_splat: True if the config is for a splat that comes with further photographs.
-
-    Raises:
-        InputError: The file cannot be read, or it has an unknown setting or an invalid value.
-    """
+    """Return a config by name, or read the changes to its `base` from a YAML file."""
     path = Path(source)
     if path.suffix not in {".yaml", ".yml"}:
         return get_named_config(source, is_splat)
@@ -389,5 +362,5 @@ def load_config(source: str, is_splat: bool = False) -> CompleterConfig:
 
     changes = read_yaml(path)
     base = get_named_config(str(changes.pop("base", "default")), is_splat)
-    refuse_old_keys(changes, f"{quote_value(source)}: ")
+    refuse_old_keys(list_paths(changes), f"{quote_value(source)}: ")
     return apply_changes(base, changes, f"{quote_value(source)}: ")

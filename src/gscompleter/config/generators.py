@@ -1,9 +1,9 @@
-"""Settings of each generator, by its name. Nothing here needs torch."""
+"""Settings of each generator, by its name, and their options. Nothing here needs torch."""
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-from typing import Annotated
+from dataclasses import asdict, dataclass
+from typing import Annotated, Any
 
 from annotated_types import Interval, MinLen
 
@@ -17,7 +17,7 @@ Steps = Annotated[int, Interval(ge=1, le=1000)]
 
 @dataclass(frozen=True)
 class GeneratorSettings(Settings):
-    """Settings of a generator that has none."""
+    """Settings of a generator; each is an option that the class `GeneratorOptions` explains."""
 
 
 @dataclass(frozen=True)
@@ -35,12 +35,8 @@ class DiffusionSettings(GeneratorSettings):
     """Settings of a generator with weights."""
 
     weights: Text | None = None
-    """Weights: a folder saved by diffusers, or USER/NAME or USER/NAME@COMMIT on the Hugging Face
-    hub. By default the published ones of pe-field; diffusers-inpaint needs this option."""
     retries: Annotated[int, Interval(ge=0, le=100)] = 0
-    """Further seeds to try if the image disagrees with the photographs."""
     offload: bool = False
-    """Keep only the active part of the model on the GPU, which needs less GPU memory."""
 
 
 @dataclass(frozen=True)
@@ -48,13 +44,8 @@ class PEFieldSettings(DiffusionSettings):
     """The paper's diffusion transformer."""
 
     steps: Steps = 4
-    """Denoising steps. The paper uses 4, its authors' demo 28."""
     depth: Text | None = None
-    """Depth of the photograph: context (rendered from the scene), monocular (a published network),
-    or the folder or hub id of another network. By default context, or monocular with the config
-    `paper`."""
     batch_size: Annotated[int, Interval(ge=1, le=1000)] = 4
-    """Most target images to denoise together. Fewer need less memory."""
 
 
 @dataclass(frozen=True)
@@ -62,9 +53,7 @@ class DiffusersInpaintSettings(DiffusionSettings):
     """Any inpainting pipeline of diffusers."""
 
     steps: Steps | None = None
-    """Denoising steps; the pipeline's own number if not given."""
     prompt: Text = "a photograph"
-    """Text prompt."""
 
 
 GENERATORS: dict[str, type[GeneratorSettings]] = {
@@ -73,6 +62,8 @@ GENERATORS: dict[str, type[GeneratorSettings]] = {
     "pe-field": PEFieldSettings,
     "diffusers-inpaint": DiffusersInpaintSettings,
 }
+
+PREFIX = "generator_"
 
 PLUGINS = "gscompleter.generators"
 """Group of entry points that name tables of further generators, from name to loader."""
@@ -90,3 +81,55 @@ def get_settings_class(name: str) -> type[GeneratorSettings]:
         f"{', '.join(dict.fromkeys([*GENERATORS, *others]))}.",
         "generator",
     )
+
+
+@dataclass(frozen=True)
+class GeneratorOptions(Settings):
+    """Model that synthesizes images, and its settings."""
+
+    generator: str = "warp-inpaint"
+    """Model that synthesizes the image at a target: warp-inpaint (photographs warped to the target,
+    holes filled by patches; needs no weights), oracle (the real photograph, for measurements),
+    pe-field (the paper's diffusion transformer) or diffusers-inpaint (any inpainting pipeline)."""
+    generator_weights: str | None = None
+    """Weights of pe-field or diffusers-inpaint: a folder saved by diffusers, or USER/NAME or
+    USER/NAME@COMMIT on the Hugging Face hub. By default the published ones of pe-field;
+    diffusers-inpaint needs this option."""
+    generator_retries: int | None = None
+    """Further seeds to try if the image disagrees with the photographs (0)."""
+    generator_offload: bool = False
+    """Keep only the active part of the model on the GPU, which needs less GPU memory."""
+    generator_steps: int | None = None
+    """Denoising steps: for pe-field 4, as in the paper (its authors' demo has 28), for
+    diffusers-inpaint the pipeline's own number."""
+    generator_depth: str | None = None
+    """Depth of the photograph for pe-field: context (rendered from the scene), monocular (a
+    published network), or the folder or hub id of another network. By default context, or monocular
+    with the config `paper`."""
+    generator_batch_size: int | None = None
+    """Most target images that pe-field denoises together (4). Fewer need less memory."""
+    generator_prompt: str | None = None
+    """Text prompt of diffusers-inpaint (a photograph)."""
+
+    def make_settings(self) -> GeneratorSettings:
+        """Return the settings, or raise InputError if one is unknown to the generator."""
+        kind = get_settings_class(self.generator)
+        given = {
+            name.removeprefix(PREFIX): value
+            for name, value in vars(self).items()
+            if name.startswith(PREFIX) and value is not None and value is not False
+        }
+        for setting in given:
+            knowing = [name for name, kind in GENERATORS.items() if hasattr(kind, setting)]
+            if self.generator not in knowing:
+                raise InputError(
+                    f"The generator '{self.generator}' has no setting {setting}; leave it out, or "
+                    f"choose {' or '.join(knowing)}.",
+                    PREFIX + setting,
+                )
+        return kind(**given)
+
+    def describe(self) -> dict[str, Any]:
+        """Describe the generator for `summary.json`."""
+        settings = asdict(self.make_settings())
+        return {"generator": self.generator, **{PREFIX + name: settings[name] for name in settings}}

@@ -17,21 +17,14 @@ MAX_REASON_LENGTH = 120
 """Most characters of PyYAML's reason in a sentence."""
 
 
-class PlainLoader(yaml.SafeLoader):
-    """A YAML loader without aliases, which can expand a short file endlessly."""
-
-    def compose_node(self, parent: Any, index: Any) -> Any:
-        """Refuse aliases."""
-        if self.check_event(yaml.AliasEvent):
-            raise yaml.YAMLError("aliases are not read; write the value out")
-        return super().compose_node(parent, index)
-
-
 def read_yaml(path: Path) -> dict[str, Any]:
     """Read the mapping in a YAML file, limited to JSON values, or raise InputError."""
     name, data = f"The config {quote_value(path)}", read_bytes(path, MAX_CONFIG_BYTES)
     try:
-        content = json.loads(json.dumps(yaml.load(data.decode(), PlainLoader), default=str))
+        # They can expand a short file endlessly.
+        if any(isinstance(token, yaml.AliasToken) for token in yaml.scan(data.decode())):
+            raise yaml.YAMLError("aliases are not read; write the value out")
+        content = json.loads(json.dumps(yaml.safe_load(data.decode()), default=str))
     except RecursionError as error:
         raise InputError(f"{name} is nested too deeply.") from error
     except Exception as error:  # PyYAML fails in many ways, KeyError and IndexError among them

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from contextlib import nullcontext
 from dataclasses import asdict, dataclass, field, replace
 from functools import partial
 from itertools import pairwise
@@ -20,7 +19,7 @@ from gscompleter.generators import load_generator
 from gscompleter.jobs.jobs import Job, describe_loss
 from gscompleter.jobs.workers import Engine, check_shard, run_jobs
 from gscompleter.memory import check_memory
-from gscompleter.progress import Activity, show_activity, show_progress, stage
+from gscompleter.progress import show_progress, stage, track
 from gscompleter.reconstructors import load_reconstructor
 from gscompleter.render import load_renderer
 from gscompleter.stages.context import normalize_exposures, reconstruct_context, sort_by_frame
@@ -118,15 +117,14 @@ def evaluate(
                 row.unlink(missing_ok=True)
     todo = {row: task for task in share for row in runner.find_missing_rows(task)}
     jobs = [make_task_job(task) for task in {task.name: task for task in todo.values()}.values()]
-    activity = Activity("evaluating", len(todo))
 
     def has_rows(job: Job) -> bool:
         return not runner.find_missing_rows(job.options["task"])
 
-    with show_activity(activity) if todo else nullcontext():
-        for job in run_jobs(jobs, runner, has_rows, engine, RETRIES):
-            for _ in set(runner.find_rows(job.options["task"])) & set(todo):
-                activity.count_step()
+    ended = run_jobs(jobs, runner, has_rows, engine, RETRIES)
+    rows = (row for job in ended for row in runner.find_rows(job.options["task"]) if row in todo)
+    for _ in track(rows, "evaluating", len(todo)):
+        pass
     failed = sum(map(has_failed, todo))
     return RowCounts(len(todo) - failed, failed, len(share) * len(methods) - len(todo))
 

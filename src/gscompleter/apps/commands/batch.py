@@ -9,7 +9,6 @@ import os
 import re
 import time
 from collections.abc import Sequence
-from contextlib import nullcontext
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
@@ -32,7 +31,7 @@ from gscompleter.jobs.jobs import (
     run_job,
 )
 from gscompleter.jobs.workers import parse_shard, run_jobs
-from gscompleter.progress import Activity, show_activity, show_preparation, show_progress
+from gscompleter.progress import show_preparation, show_progress, track
 
 
 def run_batch(options: BatchOptions) -> None:
@@ -41,7 +40,7 @@ def run_batch(options: BatchOptions) -> None:
         raise InputError(f"{quote_value(options.out)} is an address; name a folder.", "out")
     number, count = parse_shard(options.shard, os.environ)
     console = Console(stderr=True, quiet=options.quiet, highlight=False)
-    with show_progress(None if options.quiet else console):
+    with show_progress(console):
         with show_preparation("reading the manifest"):
             jobs = read_manifest(options.manifest, parse_pairs(options.each, "each"))
             out = options.out.resolve()  # absolute, for workers elsewhere
@@ -50,10 +49,9 @@ def run_batch(options: BatchOptions) -> None:
             share = jobs[number::count]
             left = find_missing_jobs(share, out, options.rerun == "failures")
         perform, is_done = JobCompleter(out, options.retries), partial(has_row, out=out)
-        activity = Activity("completing", len(left))
-        with show_activity(activity) if left else nullcontext():
-            for _ in run_jobs(left, perform, is_done, engine, options.retries):
-                activity.count_step()
+        ended = run_jobs(left, perform, is_done, engine, options.retries)
+        for _ in track(ended, "completing", len(left)):
+            pass
         with show_preparation("table"):
             write_batch_results(out, jobs)
     sentence = f"{summarize_rows(out, share, left)} All results: {options.out}/index.html"

@@ -14,7 +14,7 @@ from torch import Tensor
 
 from gscompleter import __version__
 from gscompleter.apps.commands.options import CleanOptions
-from gscompleter.apps.commands.output import describe_run, is_replaceable, report_interrupts
+from gscompleter.apps.commands.output import describe_run, is_replaceable
 from gscompleter.apps.inputs.opening import (
     apply_working_range,
     check_context,
@@ -25,7 +25,7 @@ from gscompleter.apps.inputs.opening import (
 )
 from gscompleter.apps.inputs.plan import describe_opening
 from gscompleter.apps.report.completion import save_completed_splat
-from gscompleter.apps.warmup.compilation import compile_kernels
+from gscompleter.apps.warmup import compile_kernels
 from gscompleter.cleaning import find_superfluous
 from gscompleter.errors import InputError, quote_value
 from gscompleter.evaluation.metrics.image import psnr
@@ -38,21 +38,13 @@ from gscompleter.types import Gaussians, View
 
 
 def run_clean(options: CleanOptions) -> None:
-    """Clean the splat, and print a summary."""
-    with report_interrupts(options.out):
-        summary = clean_splat(options)
-        if not options.quiet:
-            print_cleaning(summary, options.out)
-
-
-def clean_splat(options: CleanOptions) -> dict[str, Any]:
-    """Clean the splat, write `options.out`, and return the summary."""
+    """Clean the splat, write the result, and print a summary."""
     console = Console(stderr=True, quiet=options.quiet)
     check_output(options.out, is_replaceable(options))
     check_context(options)
     device = choose_device(options.device)
     renderer = load_renderer(device)
-    with show_progress(None if options.quiet else console):
+    with show_progress(console):
         opened = open_scene(options, console)
         with show_preparation("reading photographs"):
             task = read_photographs(options, opened, device)
@@ -85,7 +77,8 @@ def clean_splat(options: CleanOptions) -> dict[str, Any]:
             with stage("writing"):
                 save_completed_splat(folder, given, removed, given[:0], splat_file)
                 (folder / SUMMARY_FILE).write_text(json.dumps(summary, indent=2) + "\n")
-    return summary
+    if not options.quiet:
+        print_cleaning(summary, options.out)
 
 
 def score_cleaning(

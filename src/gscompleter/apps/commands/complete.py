@@ -17,7 +17,6 @@ from gscompleter.apps.commands.output import (
     describe_run,
     is_replaceable,
     read_held_out,
-    report_interrupts,
 )
 from gscompleter.apps.inputs.opening import (
     Opened,
@@ -45,7 +44,7 @@ from gscompleter.apps.report.plain_words import (
     describe_motion,
     describe_new_photographs,
 )
-from gscompleter.apps.warmup.compilation import SPLAT_PART, compile_kernels
+from gscompleter.apps.warmup import SPLAT_PART, compile_kernels
 from gscompleter.completer import GSCompleter, check_target_ids
 from gscompleter.config import CompleterConfig
 from gscompleter.config.generators import get_settings_class
@@ -116,13 +115,12 @@ class Plan:
 
 def run_completion(options: CompleteOptions) -> None:
     """Complete the scene, and print a summary."""
-    with report_interrupts(options.out):
-        if options.dry_run:
-            plan_folder(options)
-            return
-        summary = complete_folder(options)
-        if not options.quiet:
-            print_completion(summary, options)
+    if options.dry_run:
+        plan_folder(options)
+        return
+    summary = complete_folder(options)
+    if not options.quiet:
+        print_completion(summary, options)
 
 
 def complete_folder(options: CompleteOptions) -> dict[str, Any]:
@@ -130,7 +128,7 @@ def complete_folder(options: CompleteOptions) -> dict[str, Any]:
     if options.video:
         find_ffmpeg()
     console = Console(stderr=True, quiet=options.quiet)
-    with show_progress(None if options.quiet else console):
+    with show_progress(console):
         ready = prepare_completion(options, console)
         print_lines(console, *describe_task(options, ready.opened, ready.task))
         with open_output_folder(options.out, is_replaceable(options)) as folder:
@@ -147,7 +145,7 @@ def complete_folder(options: CompleteOptions) -> dict[str, Any]:
 def plan_folder(options: CompleteOptions) -> None:
     """Write the targets and print the plan, without completing the scene."""
     console = Console(stderr=True, quiet=options.quiet)
-    with show_progress(None if options.quiet else console):
+    with show_progress(console):
         ready = prepare_completion(options, console)
         print_lines(console, *describe_task(options, ready.opened, ready.task))
         with open_output_folder(options.out, is_replaceable(options)) as folder:
@@ -185,14 +183,14 @@ def prepare_completion(options: CompleteOptions, console: Console) -> Prepared:
     check_context(options)
     check_targets(options)
     check_reconstructor(options.reconstructor)
-    get_settings_class(options.synthesis.name)
+    get_settings_class(options.synthesis.generator)
     device = choose_device(options.device)
     opened = open_scene(options, console)
     if not options.config.ego_mask:
         opened = replace(opened, photographs=opened.photographs.keep_ego_vehicle())
     with show_preparation("reading photographs"):
         task = read_task(options, opened, device)
-    parts = device, options.reconstructor, options.synthesis.name
+    parts = device, options.reconstructor, options.synthesis.generator
     if options.scene is None:
         compile_kernels(parts)
     else:
@@ -233,7 +231,7 @@ def describe_settings(options: CompleteOptions) -> dict[str, Any]:
         "reconstructor": options.reconstructor,
         "weights": None if options.weights is None else str(options.weights),
         **options.synthesis.describe(),
-        "uses_target_photographs": options.synthesis.name == "oracle",
+        "uses_target_photographs": options.synthesis.generator == "oracle",
     }
 
 
@@ -244,7 +242,7 @@ def load_completer(options: CompleteOptions, targets: Sequence[Target], device: 
         for target in targets
         if target.photograph is not None
     ]
-    name, settings = options.synthesis.name, options.synthesis.make_settings()
+    name, settings = options.synthesis.generator, options.synthesis.make_settings()
     return GSCompleter(
         load_reconstructor(options.reconstructor, options.weights, device),
         load_generator(name, options.seed, photographs, device, settings),
@@ -387,7 +385,7 @@ def describe_plan(options: CompleteOptions, plan: Plan) -> str:
     if number == 0:
         return "No camera has much to gain; there is nothing to complete."
     duration = "in a time that is not known in advance"
-    if options.scene is None and options.synthesis.name == "warp-inpaint":
+    if options.scene is None and options.synthesis.generator == "warp-inpaint":
         spent = plan.context_seconds
         seconds = number * LIFTED_VIEWS * spent / len(plan.task.views)
         duration = f"in about {seconds:.0f} s after the context ({spent:.0f} s)"

@@ -7,7 +7,7 @@ from pathlib import Path
 
 from rich.console import Console
 
-from gscompleter.apps.commands.tool_options import ConvertOptions, StripOptions
+from gscompleter.apps.commands.options import ConvertOptions, StripOptions
 from gscompleter.errors import InputError
 from gscompleter.progress import show_preparation, show_progress
 from gscompleter.splats.formats import (
@@ -23,7 +23,7 @@ from gscompleter.splats.strip import strip
 def run_convert(options: ConvertOptions) -> None:
     """Convert A to B, and print the number of Gaussians."""
     check_output_file(options.out, options.overwrite)
-    with show_progress(None if options.quiet else Console(stderr=True)):
+    with show_progress(Console(stderr=True, quiet=options.quiet)):
         with show_preparation("reading"):
             gaussians = load_splat(options.source, options.drop_nonfinite)
         generated = gaussians.generated
@@ -42,7 +42,7 @@ def run_strip(options: StripOptions) -> None:
     """Write the original scene and print the number of Gaussians."""
     check_output_file(options.out, options.overwrite)
     with (
-        show_progress(None if options.quiet else Console(stderr=True)),
+        show_progress(Console(stderr=True, quiet=options.quiet)),
         show_preparation("stripping"),
     ):
         given, generated = strip(options.completed, options.out)

@@ -12,14 +12,14 @@ import torch
 from packaging.requirements import Requirement
 
 from gscompleter.apps.bench.machine import describe_machine
-from gscompleter.apps.commands.tool_options import DoctorOptions
+from gscompleter.apps.commands.options import DoctorOptions
 from gscompleter.apps.viewer.packages import (
     BUILT_LIBRARIES,
     LOCK_FILE,
     get_archive_path,
     read_lock,
 )
-from gscompleter.apps.warmup.compilation import PARTS
+from gscompleter.apps.warmup import PARTS
 from gscompleter.errors import InputError
 from gscompleter.io.cache import get_download_folder
 from gscompleter.kernels.compiled import get_cache_folder, is_compiled
@@ -71,10 +71,19 @@ def run_doctor(options: DoctorOptions) -> None:
 
 def inspect_installation() -> Iterator[Found]:
     """Inspect all parts, in the order of the result."""
-    yield from inspect_machine()
-    yield from inspect_packages()
-    yield from inspect_extras()
-    yield from inspect_renderers()
+    for name, value in describe_machine(choose_device()).items():
+        yield Found("machine", name, True, str(value))
+    for requirement in list_requirements():
+        version = find_installed_version(requirement)
+        remedy = f"every command needs it; pip install '{requirement}'"
+        yield Found("packages", requirement.name, version is not None, version or remedy)
+    for extra, purpose in PURPOSES.items():
+        yield inspect_extra(extra, purpose)
+    for name in ("cpu", "cuda", "reference"):
+        yield inspect_renderer(name)
+    compiled = all(is_compiled(part) for part in PARTS)
+    remedy = "compiled by the first completion, or in advance by `gscompleter warmup`"
+    yield Found("renderers", "kernels", compiled, "compiled" if compiled else remedy)
     yield from inspect_weights()
     yield inspect_viewer()
     yield Found("caches", "downloads", True, f"{get_download_folder()} (GSCOMPLETER_HOME)")
@@ -82,47 +91,22 @@ def inspect_installation() -> Iterator[Found]:
     yield Found("caches", "torch.hub", True, f"{torch.hub.get_dir()} (TORCH_HOME)")
 
 
-def inspect_machine() -> Iterator[Found]:
-    """Inspect versions, processor, memory and device."""
-    for name, value in describe_machine(choose_device()).items():
-        if name == "memory_gb":
-            yield Found("machine", "memory", True, f"{value} GB")
-        else:
-            yield Found("machine", name, True, str(value))
-
-
-def inspect_packages() -> Iterator[Found]:
-    """Inspect the packages that everything needs."""
-    for requirement in list_requirements():
-        there = find_installed_version(requirement)
-        details = there or f"{requirement}, which every command needs; pip install '{requirement}'"
-        yield Found("packages", requirement.name, there is not None, details)
-
-
-def inspect_extras() -> Iterator[Found]:
-    """Inspect the extras."""
-    for extra, purpose in PURPOSES.items():
-        versions = {r.name: find_installed_version(r) for r in list_requirements(extra)}
-        missing = [name for name, there in versions.items() if there is None]
-        if not versions:
-            told = f"the installed version or this Python is older than this extra; for {purpose}"
-        elif missing:
-            told = f"{', '.join(missing)}, for {purpose}; pip install '{DISTRIBUTION}[{extra}]'"
-        else:
-            listed = ", ".join(f"{name} {there}" for name, there in versions.items())
-            told = f"{listed}, for {purpose}"
-        yield Found("extras", extra, bool(versions) and not missing, told)
+def inspect_extra(extra: str, purpose: str) -> Found:
+    """Inspect the packages of an extra."""
+    versions = {r.name: find_installed_version(r) for r in list_requirements(extra)}
+    missing = [name for name, version in versions.items() if version is None]
+    if not versions:
+        told = f"the installed version or this Python is older than this extra; for {purpose}"
+    elif missing:
+        told = f"{', '.join(missing)}, for {purpose}; pip install '{DISTRIBUTION}[{extra}]'"
+    else:
+        told = f"{', '.join(f'{name} {it}' for name, it in versions.items())}, for {purpose}"
+    return Found("extras", extra, bool(versions) and not missing, told)
 
 
 def list_requirements(extra: str = "") -> list[Requirement]:
     """List the requirements of the package, or those that an extra adds."""
-    try:
-        lines = importlib.metadata.requires(DISTRIBUTION) or []
-    except importlib.metadata.PackageNotFoundError:
-        raise InputError(
-            f"{DISTRIBUTION} is not installed, so its requirements are unknown; run "
-            "`pip install .` in its source folder."
-        ) from None
+    lines = importlib.metadata.requires(DISTRIBUTION) or []
     return [r for r in map(Requirement, lines) if is_required_by(extra, r)]
 
 
@@ -136,24 +120,19 @@ def is_required_by(extra: str, requirement: Requirement) -> bool:
 def find_installed_version(requirement: Requirement) -> str | None:
     """Return the installed version if it satisfies the requirement."""
     try:
-        there = importlib.metadata.version(requirement.name)
+        version = importlib.metadata.version(requirement.name)
     except importlib.metadata.PackageNotFoundError:
         return None
-    return there if requirement.specifier.contains(there, prereleases=True) else None
+    return version if requirement.specifier.contains(version, prereleases=True) else None
 
 
-def inspect_renderers() -> Iterator[Found]:
-    """Inspect the renderers and the compiled kernels."""
-    for name in ("cpu", "cuda", "reference"):
-        try:
-            load_renderer(name)
-        except InputError as error:
-            yield Found("renderers", name, False, str(error))
-        else:
-            yield Found("renderers", name, True, "draws here")
-    compiled = all(is_compiled(part) for part in PARTS)
-    lacking = "compiled by the first completion, or in advance by `gscompleter warmup`"
-    yield Found("renderers", "kernels", compiled, "compiled" if compiled else lacking)
+def inspect_renderer(name: str) -> Found:
+    """Load a renderer."""
+    try:
+        load_renderer(name)
+    except InputError as error:
+        return Found("renderers", name, False, str(error))
+    return Found("renderers", name, True, "draws here")
 
 
 def inspect_weights() -> Iterator[Found]:
@@ -165,10 +144,7 @@ def inspect_weights() -> Iterator[Found]:
 
 def inspect_viewer() -> Found:
     """Inspect the JavaScript libraries of the pages."""
-    if BUILT_LIBRARIES.is_file():
-        return Found("viewer", "libraries", True, f"with the package, {BUILT_LIBRARIES}")
-    missing = [p.name for p in read_lock(LOCK_FILE) if not get_archive_path(p).is_file()]
-    lacking = (
-        f"{', '.join(missing)}, fetched with npm's registry when `gscompleter view` first runs"
-    )
-    return Found("viewer", "libraries", not missing, lacking if missing else "in the cache")
+    archives = [get_archive_path(package) for package in read_lock(LOCK_FILE)]
+    there = BUILT_LIBRARIES.is_file() or all(path.is_file() for path in archives)
+    told = "here" if there else "fetched with npm's registry when `gscompleter view` first runs"
+    return Found("viewer", "libraries", there, told)

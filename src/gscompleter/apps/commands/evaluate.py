@@ -1,4 +1,4 @@
-"""The commands `evaluate`, `write_tables` and `index`."""
+"""The commands `evaluate`, `tables` and `index`."""
 
 from __future__ import annotations
 
@@ -13,6 +13,7 @@ from typing import Any
 from rich.console import Console
 from rich.table import Table
 
+from gscompleter.apps.commands.convert import check_free
 from gscompleter.apps.commands.engines import make_engine
 from gscompleter.apps.commands.options import (
     LONG_SIDE,
@@ -23,8 +24,8 @@ from gscompleter.apps.commands.options import (
 )
 from gscompleter.apps.report.evaluation_page import render_evaluation_page
 from gscompleter.apps.report.page import write_page
-from gscompleter.apps.warmup.compilation import compile_kernels
-from gscompleter.data.cases import SkippedScene, filter_usable, open_clips, read_cases
+from gscompleter.apps.warmup import compile_kernels
+from gscompleter.data.cases import Case, SkippedScene, filter_usable, open_clips, read_cases
 from gscompleter.data.formats import open_photographs
 from gscompleter.data.resize import check_resolution
 from gscompleter.errors import InputError, quote_value
@@ -49,8 +50,7 @@ def run_evaluation(options: EvaluateOptions) -> None:
         check_resolution(parse_resolution(options.resolution))
     skipped: list[SkippedScene] = []
     notes: list[str] = []
-    shown = None if options.quiet else console
-    with show_progress(shown), show_preparation("reading cases"):
+    with show_progress(console), show_preparation("reading cases"):
         tasks = collect_tasks(options, skipped, notes)
     for note in dict.fromkeys(notes):
         console.print(note, markup=False, soft_wrap=True)
@@ -58,14 +58,14 @@ def run_evaluation(options: EvaluateOptions) -> None:
     config = RunConfig(
         reconstructor=options.reconstructor,
         weights=None if options.weights is None else str(options.weights),
-        generator=options.synthesis.name,
+        generator=options.synthesis.generator,
         generator_settings=options.synthesis.make_settings(),
         device=choose_device(options.device),
         seed=options.seed,
         source=describe_source(options),
     )
     engine = make_engine(options, options.out.resolve())
-    with show_progress(shown):
+    with show_progress(console):
         compile_kernels((config.device, config.reconstructor, config.generator))
         counts = evaluate(tasks, methods, options.out, config, shard, options.rerun, engine)
         line = f"Scored {counts.done}, failed {counts.failed}, scored earlier {counts.skipped}."
@@ -77,9 +77,7 @@ def run_evaluation(options: EvaluateOptions) -> None:
 
 def describe_source(options: EvaluateOptions) -> dict[str, Any]:
     """Describe the cases, as an output folder records them."""
-    size = options.resolution
-    if size is None and options.protocol:
-        size = LONG_SIDE
+    size = LONG_SIDE if options.resolution is None and options.protocol else options.resolution
     return {
         "paths": [path.resolve().name for path in options.paths],
         "protocols": list(options.protocol),
@@ -92,7 +90,7 @@ def describe_source(options: EvaluateOptions) -> dict[str, Any]:
 
 def run_tables(options: TablesOptions) -> None:
     """Write the tables and plots of an evaluation, and print the tables."""
-    with show_progress(None if options.quiet else Console(stderr=True)):
+    with show_progress(Console(stderr=True, quiet=options.quiet)):
         write_and_print_tables(options.out, options.quiet, options.fid)
 
 
@@ -108,7 +106,10 @@ def write_and_print_tables(
         seen = there
         with show_preparation("tables"):
             summary = tables.write_tables(out, with_fid)
-            try_plots(summary, out, quiet)
+            try:
+                plots.draw_plots(summary, out)
+            except plots.PlotsNotAvailable as missing:
+                Console(stderr=True, quiet=quiet).print(str(missing), highlight=False)
             write_page(out, render_evaluation_page(out))
         there = list_row_times(out)
     if not quiet:
@@ -120,22 +121,15 @@ def list_row_times(out: Path) -> dict[Path, int]:
     return {path: path.stat().st_mtime_ns for path in list_row_paths(out)}
 
 
-def try_plots(summary: RunSummary, out: Path, quiet: bool) -> None:
-    """Draw the plots, or print the missing requirement."""
-    try:
-        plots.draw_plots(summary, out)
-    except plots.PlotsNotAvailable as missing:
-        Console(stderr=True, quiet=quiet).print(str(missing), highlight=False, markup=False)
-
-
 def run_index(options: IndexOptions) -> None:
     """Write the evaluation index of a protocol for a data set."""
-    if options.out.exists() and not options.overwrite:
-        raise InputError(f"{options.out} exists; name another file, or use --overwrite.")
+    check_free(options.out, options.overwrite)
     skipped: list[SkippedScene] = []
     rule = protocols.parse_protocol(options.protocol)
-    shown = None if options.quiet else Console(stderr=True)
-    with show_progress(shown), show_preparation("reading clips"):
+    with (
+        show_progress(Console(stderr=True, quiet=options.quiet)),
+        show_preparation("reading clips"),
+    ):
         index = protocols.build_index(rule, filter_usable(open_clips(options.path), skipped))
     index = replace(index, scenes={**index.scenes, **{clip.name: () for clip in skipped}})
     protocols.write_evaluation_index(options.out, index)
@@ -159,20 +153,23 @@ def collect_tasks(
     cases = [case for path in options.paths for case in read_cases(find_cases_file(path))]
     if options.one_per_scene:
         first = {case.scene: case for case in reversed(cases)}
-        cases = [first[scene] for scene in dict.fromkeys(case.scene for case in cases)]
+        cases = [case for case in cases if case is first[case.scene]]
     cases = cases[: options.limit]
     for scene in dict.fromkeys(case.scene for case in cases):
         with suppress(InputError):  # a row of the table says why a scene cannot be opened
             notes += open_photographs(scene).notes
-    if options.resolution is not None:
-        size = parse_resolution(options.resolution)
-        cases = [replace(case, resolution=size) for case in cases]
-    use_masks, ego_mask = options.use_masks, options.ego_mask
-    cases = [
-        replace(case, ignore_masked=use_masks or case.ignore_masked, ego_mask=ego_mask)
-        for case in cases
-    ]
-    return [protocols.make_case_task(case) for case in cases]
+    return [protocols.make_case_task(apply_options(case, options)) for case in cases]
+
+
+def apply_options(case: Case, options: EvaluateOptions) -> Case:
+    """Return a case with the masks and the resolution of the options."""
+    size = options.resolution
+    return replace(
+        case,
+        resolution=case.resolution if size is None else parse_resolution(size),
+        ignore_masked=options.use_masks or case.ignore_masked,
+        ego_mask=options.ego_mask,
+    )
 
 
 def iterate_tasks(
@@ -200,14 +197,11 @@ def iterate_tasks(
 
 def find_cases_file(path: Path) -> Path:
     """Find the cases.json that `path` is or contains."""
-    if not os.path.exists(path):
-        raise InputError(
-            f"There is no '{quote_value(path)}'; name a cases.json, or scenes with --protocol."
-        )
     file = path / "cases.json" if os.path.isdir(path) else path
     if file.suffix != ".json" or not os.path.isfile(file) or file.name == "transforms.json":
         raise InputError(
-            f"{path} defines no context and target frames; add --protocol, as in --protocol n-10."
+            f"{quote_value(path)} is no cases.json; name one, or add --protocol for scenes, as in "
+            "--protocol n-10."
         )
     return file
 

@@ -17,7 +17,7 @@ from gscompleter.apps.commands.options import (
     LiveOptions,
     parse_resolution,
 )
-from gscompleter.apps.commands.output import is_replaceable, report_interrupts
+from gscompleter.apps.commands.output import is_replaceable
 from gscompleter.apps.inputs.opening import print_lines
 from gscompleter.apps.inputs.plan import describe_opening
 from gscompleter.apps.live.session import FrameConversion, Session
@@ -54,16 +54,15 @@ def run_live(options: LiveOptions) -> None:
     from gscompleter.apps.live.page import Page, PageServices
 
     console = Console(stderr=True, quiet=options.quiet)
-    with report_interrupts(options.out):
-        with show_progress(None if options.quiet else console):
-            ready = prepare(options, console)
-            services = PageServices(
-                begin_session(ready),
-                read_page_photographs(ready),
-                lambda now: find_next_target(ready, now),
-                Saver(ready).save,
-            )
-        page = Page(services, options.host, options.port)
+    with show_progress(console):
+        ready = prepare(options, console)
+        services = PageServices(
+            begin_session(ready),
+            read_page_photographs(ready),
+            lambda now: find_next_target(ready, now),
+            Saver(ready).save,
+        )
+    page = Page(services, options.host, options.port)
     serve_session(page, options)
 
 

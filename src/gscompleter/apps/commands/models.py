@@ -10,7 +10,7 @@ from pathlib import Path
 from rich.console import Console
 from rich.table import Table
 
-from gscompleter.apps.commands.tool_options import ModelsOptions
+from gscompleter.apps.commands.options import ModelsOptions
 from gscompleter.models.weights.fetching import (
     INSTALL,
     find_cached,
@@ -53,12 +53,9 @@ def print_models(found: dict[str, Path | None]) -> None:
         table.add_row(*format_cells(PUBLISHED[name], path))
     width = None if sys.stdout.isatty() else MAX_LINE_WIDTH  # a file or a pipe wraps no rows
     Console(width=width, markup=False, highlight=False).print(table)
-    cautions: dict[str, list[str]] = {}
-    for weights in PUBLISHED.values():
-        if weights.caution:
-            cautions.setdefault(weights.caution, []).append(weights.name)
     print("\n(!) Whether commercial use is allowed is unclear:")
-    for caution, names in cautions.items():
+    for caution in dict.fromkeys(w.caution for w in PUBLISHED.values() if w.caution):
+        names = [w.name for w in PUBLISHED.values() if w.caution == caution]
         print(f"    {', '.join(names)}: {caution}.")
     if not is_hub_installed():
         print(f"\nThe hub's cache was not searched, for lack of huggingface_hub: {INSTALL}")

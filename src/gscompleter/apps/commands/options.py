@@ -9,9 +9,9 @@ from typing import Annotated, Literal
 import tyro
 from annotated_types import Interval
 
-from gscompleter.apps.commands.generator_options import GeneratorOptions
 from gscompleter.config import CompleterConfig
 from gscompleter.config.cleaning import CleaningConfig
+from gscompleter.config.generators import GeneratorOptions
 from gscompleter.config.settings import Seed, Settings
 from gscompleter.jobs.engines import EngineName
 
@@ -41,12 +41,19 @@ class Options(Settings):
 
 
 @dataclass(frozen=True, kw_only=True)
+class WritingOptions(Options):
+    """Options of every command that replaces earlier results on request only."""
+
+    overwrite: bool = False
+    """Replace an existing file, or the results of an earlier run in the output folder."""
+
+
+@dataclass(frozen=True, kw_only=True)
 class ComputeOptions(Options):
     """Options of every command that computes for long."""
 
     threads: Threads | None = None
-    """CPU threads to compute with; all available cores if not given. The result does not depend on
-    it."""
+    """CPU threads to compute with; all available cores if not given."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -72,7 +79,7 @@ class ModelOptions(RunOptions):
 
 
 @dataclass(frozen=True, kw_only=True)
-class SceneOptions(ComputeOptions):
+class SceneOptions(ComputeOptions, WritingOptions):
     """Options of every command that opens photographs with cameras."""
 
     folder: Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="SCENE")]
@@ -80,6 +87,8 @@ class SceneOptions(ComputeOptions):
     PandaSet, a pixelSplat chunk or a RealEstate10K camera file. If it has no cameras, COLMAP finds
     them and they are kept in OUT/colmap."""
     context: Frames = None
+    """Frame numbers of the photographs to work with, counted in the order of their file paths. If
+    not given, those that help most; photographs of targets are never used. `clean` takes all."""
     out: Path
     format: str | None = None
     """Format of SCENE: colmap, nerfstudio, cameras-json, llff, kitti, kitti-raw, dgp, waymo,
@@ -94,8 +103,6 @@ class SceneOptions(ComputeOptions):
     """Largest depth in the scene, in the unit of its cameras; estimated if not given."""
     drop_nonfinite: bool = False
     """Drop Gaussians that contain NaN or infinity instead of refusing the file."""
-    overwrite: bool = False
-    """Replace the results of an earlier run in the output folder."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -108,17 +115,13 @@ class CompletingOptions(SceneOptions, ModelOptions):
     no_recolor: bool = False
     """Keep the colours of the splat, too; Gaussians are only added where it is empty."""
     config: Annotated[CompleterConfig, tyro.conf.FlagConversionOff] = CompleterConfig()
-    """Settings of the method. `--config NAME` selects default, splat, paper, an ablation such as
-    no-sa, or a YAML file; the options here change single settings of it."""
+    """Settings of the method, which change those of `--config NAME`."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class CompleteOptions(CompletingOptions):
     """Fill the parts of a scene that its photographs do not show, and write the result."""
 
-    context: Frames = None
-    """Frame numbers of the photographs to start from, counted in the order of their file paths. If
-    not given, those that help the targets most. Photographs of targets are never used."""
     target: tuple[str, ...] = ()
     """Cameras to complete the scene for: frame numbers, or a file of cameras (transforms.json,
     cameras.json, COLMAP's images.txt, SuperSplat poses). If not given, cameras that see holes are
@@ -138,14 +141,8 @@ class CompleteOptions(CompletingOptions):
 
 @dataclass(frozen=True, kw_only=True)
 class LiveOptions(CompletingOptions):
-    """Complete a scene in the browser: fly to a hole, press a button, and watch it close.
+    """Complete a scene in the browser: fly to a hole, press a button, and watch it close."""
 
-    Every step can be undone. Saving writes the same files as `gscompleter complete`.
-    """
-
-    context: Frames = None
-    """Frame numbers of the photographs to start from, counted in the order of their file paths;
-    those that show most of the scene if not given."""
     out: Path = Path("live")
     """Output folder of the Save button."""
     resolution: Size = (256, 256)
@@ -153,8 +150,7 @@ class LiveOptions(CompletingOptions):
     port: Port = 0
     """Port of the page; a free one if not given."""
     host: str = "127.0.0.1"
-    """Address of the page. Anyone who can reach it can use it; the default is this computer
-    only."""
+    """Address of the page. Anyone who can reach it can use it."""
     no_open: bool = False
     """Print the address without opening a browser."""
 
@@ -167,9 +163,6 @@ class CleanOptions(SceneOptions):
     removed Gaussians back.
     """
 
-    context: Frames = None
-    """Frame numbers of the photographs to compare with, counted in the order of their file paths;
-    all if not given. Gaussians that only other photographs need may be removed."""
     out: Path
     """Folder for completed.ply, removed.ply and summary.json."""
     scene: Path
@@ -180,17 +173,11 @@ class CleanOptions(SceneOptions):
 
 
 @dataclass(frozen=True, kw_only=True)
-class DemoOptions(RunOptions):
-    """Complete a stereo pair to the left and right of its cameras, and show before and after.
-
-    The photographs are the Middlebury motorcycle pair that scikit-image contains. Nothing is
-    downloaded.
-    """
+class DemoOptions(RunOptions, WritingOptions):
+    """Complete the stereo pair that scikit-image contains, and show before and after."""
 
     out: Path = Path("demo")
     """Folder for the scene, its completion and before_after.png."""
-    overwrite: bool = False
-    """Replace the results of an earlier run in the output folder."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -201,8 +188,7 @@ class EngineOptions(Options):
     workers: Annotated[int, Interval(ge=1, le=100_000)] | None = None
     """Number of workers; as many as fit if not given (one with SLURM)."""
     threads: Threads | None = None
-    """CPU threads of each worker; an equal share of the cores on this machine, one elsewhere if not
-    given."""
+    """CPU threads of each worker; an equal share of this machine's cores, or one elsewhere."""
     address: str | None = None
     """Address of a running Ray cluster; a cluster is started here if not given."""
     gpus: Annotated[float, Interval(ge=0, le=1024)] = 0.0
@@ -229,7 +215,7 @@ class BatchOptions(EngineOptions):
     out: Path
     """Folder for the results; a folder of an earlier run is continued."""
     engine: EngineName = "local"
-    """Engine that runs the jobs: processes of this machine, Ray, or SLURM (submitit)."""
+    """Engine that runs the jobs: processes of this machine, Ray, or SLURM."""
     retries: Annotated[int, Interval(ge=0, le=100)] = 2
     """Further attempts for a job that was killed or that failed unexpectedly."""
     rerun: Literal["nothing", "failures"] = "nothing"
@@ -268,14 +254,11 @@ class EvaluateOptions(ModelOptions, EngineOptions):
     resolution: Size | None = None
     """Working size as in `complete`; by default that of the cases."""
     use_masks: bool = False
-    """Ignore image regions that the data set masks or marks as moving objects, in the methods and
-    in the scores."""
+    """Ignore what the data set masks or marks as moving, in the methods and in the scores."""
     one_per_scene: bool = False
-    """Run only the first case of each scene, for each protocol. The paper has one case per
-    scene."""
+    """Run only the first case of each scene and protocol, as the paper does."""
     ego_mask: bool = True
-    """Ignore image regions that stay the same while the camera moves, such as the bonnet of the car
-    that carries it, in the methods and in the scores."""
+    """Ignore what stays the same while the camera moves, such as the bonnet of its car."""
     limit: Annotated[int, Interval(ge=1)] | None = None
     """Most cases to run, over all shards."""
 
@@ -291,7 +274,7 @@ class TablesOptions(Options):
 
 
 @dataclass(frozen=True, kw_only=True)
-class IndexOptions(Options):
+class IndexOptions(WritingOptions):
     """Write the frames that a protocol selects in a data set."""
 
     path: Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="PATH")]
@@ -300,12 +283,10 @@ class IndexOptions(Options):
     """Protocol as in `evaluate`."""
     out: Path
     """JSON file for the evaluation index."""
-    overwrite: bool = False
-    """Replace an existing file."""
 
 
 @dataclass(frozen=True, kw_only=True)
-class BenchOptions(RunOptions):
+class BenchOptions(RunOptions, WritingOptions):
     """Measure how long completions take on this machine and how the time grows.
 
     Every completion is a process of its own, start-up included; methods are compared within one
@@ -341,8 +322,104 @@ class BenchOptions(RunOptions):
     """Print all measurements as JSON instead of tables."""
     out: Path | None = None
     """Folder for bench.json and tables.md."""
-    overwrite: bool = False
-    """Replace the results of an earlier run in the output folder."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class ModelsOptions(Settings):
+    """List published model weights with their licences, and show which are downloaded."""
+
+    json: bool = False
+    """Print all details as JSON."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class PosesOptions(ComputeOptions, WritingOptions):
+    """Find the cameras of photographs with COLMAP, and write a COLMAP folder.
+
+    A second run with the same photographs keeps the result.
+    """
+
+    photographs: Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="PHOTOS")]
+    """Folder of overlapping photographs of one scene. They are not changed."""
+    out: Path
+    """Output folder: upright copies in images, cameras and points in sparse/0."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class ConvertOptions(WritingOptions):
+    """Convert a file of Gaussians to .ply, .compressed.ply, .spz or .splat, by the name of B.
+
+    It also reads .ksplat, .sog (a bundle or its folder) and .glb.
+    """
+
+    source: Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="A")]
+    """File to read, or the folder of a .sog."""
+    out: Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="B")]
+    """File to write."""
+    drop_nonfinite: bool = False
+    """Drop Gaussians that contain NaN or infinity instead of refusing the file."""
+    plain: bool = False
+    """Write no labels of generated Gaussians: no property `generated` in a .ply, which some
+    programs misread, and no file of labels beside other formats. All Gaussians are kept."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class StripOptions(WritingOptions):
+    """Undo a completion: remove what was generated and put the originals back."""
+
+    completed: Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="COMPLETED")]
+    """Completed scene. Gaussians of a removed.ply beside it are put back."""
+    out: Path
+    """File for the original scene."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class ReportOptions(Options):
+    """Write report.html of a completion or an evaluation again."""
+
+    out: Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="OUT")]
+    """Output folder of `complete`, `demo` or `evaluate`."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class ViewOptions(WritingOptions):
+    """Show a scene before and after its completion in the browser.
+
+    Side by side, with a slider, or one at a time; generated Gaussians can be tinted or hidden.
+    """
+
+    scene: Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="A")]
+    """Output folder of `complete`, or a file of Gaussians in any format that `convert` reads."""
+    other: Annotated[Path | None, tyro.conf.Positional, tyro.conf.arg(metavar="B")] = None
+    """Scene after completion if A is the scene before. If not given, A is shown with and without
+    its generated Gaussians."""
+    cameras: Path | None = None
+    """Cameras to jump to: a file of cameras as in `complete --target`, or a folder with a
+    transforms.json or a COLMAP model. They are in the coordinates of the photographs if A is an
+    output folder, otherwise in those of A."""
+    resolution: tuple[int, int] | None = None
+    """Image size (height and width) of cameras whose file has none."""
+    save: Path | None = None
+    """Write the page to this file instead of serving it."""
+    port: Port = 0
+    """Port of the page on 127.0.0.1; a free one if not given."""
+    no_open: bool = False
+    """Print the address without opening a browser."""
+    drop_nonfinite: bool = False
+    """Drop Gaussians that contain NaN or infinity instead of refusing the file."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class WarmupOptions(ComputeOptions):
+    """Compile all kernels for this type of processor into numba's cache (NUMBA_CACHE_DIR)."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class DoctorOptions(Settings):
+    """Print what is installed, and for what is missing its purpose and what to do."""
+
+    json: bool = False
+    """Print the result as JSON."""
 
 
 def get_max_targets(options: CompleteOptions) -> int:

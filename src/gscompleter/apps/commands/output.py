@@ -1,12 +1,11 @@
-"""Input of a run for `summary.json`, and messages of interrupted runs."""
+"""Input of a run for `summary.json`."""
 
 from __future__ import annotations
 
 import os
-from collections.abc import Iterator, Mapping
-from contextlib import contextmanager, suppress
+from collections.abc import Mapping
+from contextlib import suppress
 from dataclasses import asdict
-from pathlib import Path
 from types import MappingProxyType
 from typing import Any
 
@@ -18,7 +17,6 @@ from gscompleter.config import CompleterConfig
 from gscompleter.config.cleaning import CleaningConfig
 from gscompleter.data.sfm.poses import POSES
 from gscompleter.errors import InputError
-from gscompleter.io.files import SUMMARY_FILE
 from gscompleter.types import Camera, View
 
 MAX_HELD_OUT = 8
@@ -86,26 +84,3 @@ def is_replaceable(options: SceneOptions) -> bool:
     if os.path.isdir(options.out) and os.listdir(options.out) == [POSES]:
         return True  # only the cameras of an earlier run
     return options.overwrite
-
-
-@contextmanager
-def report_interrupts(out: Path) -> Iterator[None]:
-    """Let an interrupt name the results that were written."""
-    sentences = {
-        out / SUMMARY_FILE: f"the result is written: {out}",
-        out / POSES / SUMMARY_FILE: "nothing was written but the cameras that were found: "
-        f"{out / POSES}",
-    }
-    before = {path: get_time(path) for path in sentences}
-    try:
-        yield
-    except KeyboardInterrupt as stop:
-        for path, sentence in sentences.items():
-            if get_time(path) != before[path]:
-                raise KeyboardInterrupt(sentence) from stop
-        raise
-
-
-def get_time(path: Path) -> int | None:
-    """Return the modification time of a file, or None without one."""
-    return path.stat().st_mtime_ns if path.is_file() else None

@@ -4,14 +4,14 @@ from __future__ import annotations
 
 from rich.console import Console
 
-from gscompleter.apps.commands.tool_options import PosesOptions
+from gscompleter.apps.commands.options import PosesOptions
 from gscompleter.data.sfm.poses import find_poses
 from gscompleter.progress import show_progress
 
 
 def run_poses(options: PosesOptions) -> None:
     """Find and write the cameras, and print their number and error."""
-    with show_progress(None if options.quiet else Console(stderr=True)):
+    with show_progress(Console(stderr=True, quiet=options.quiet)):
         found = find_poses(options.photographs, options.out, options.overwrite)
     if options.quiet:
         return

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import os
 
-from gscompleter.apps.commands.tool_options import ReportOptions
+from gscompleter.apps.commands.options import ReportOptions
 from gscompleter.apps.report.completion_page import render_completion_page
 from gscompleter.apps.report.evaluation_page import TABLES_FILE, render_evaluation_page
 from gscompleter.apps.report.page import REPORT_FILE, write_page

@@ -8,7 +8,7 @@ from dataclasses import replace
 from pathlib import Path
 
 from gscompleter.apps.commands.convert import check_free
-from gscompleter.apps.commands.tool_options import ViewOptions
+from gscompleter.apps.commands.options import ViewOptions
 from gscompleter.apps.viewer import packages
 from gscompleter.apps.viewer.exhibit import (
     ViewerContent,

@@ -1,29 +1,44 @@
-"""Parser of the command line."""
+"""Parser of the command line, and its help pages."""
 
 from __future__ import annotations
 
 import re
 import sys
 from collections.abc import Callable, Collection, Sequence
-from contextlib import redirect_stderr, redirect_stdout, suppress
-from dataclasses import dataclass
-from difflib import get_close_matches
-from functools import cache, partial
+from contextlib import redirect_stderr
+from dataclasses import dataclass, replace
+from functools import cache
+from inspect import get_annotations
 from io import StringIO
 from itertools import dropwhile, takewhile
-from typing import Any
+from typing import Annotated, Any
 
 import tyro
-from tyro.constructors import ConstructorRegistry, StructTypeInfo
+from tyro.constructors import (
+    ConstructorRegistry,
+    StructConstructorSpec,
+    StructFieldSpec,
+    StructTypeInfo,
+)
 
-from gscompleter.apps.commands.help import HELP, HELP_ALL, Rule, make_help_rule
 from gscompleter.apps.commands.options import DEFAULT_NUM_TARGETS
 from gscompleter.config import CompleterConfig, load_config
-from gscompleter.config.renamed import refuse_old_options
+from gscompleter.config.renamed import refuse_old_keys
+from gscompleter.config.settings import Settings
 from gscompleter.errors import PROGRAM, InputError, quote_value
 
-MIN_SIMILARITY = 0.75
-"""Smallest similarity of an option to a misspelt one, from 0 to 1."""
+HELP = ("-h", "--help")
+HELP_ALL = "--help-all"
+
+CONFIG = StructFieldSpec(
+    "config",
+    str,
+    "default",
+    "Settings of the method: default, paper, an ablation such as no-sa, or a YAML file. Single "
+    f"settings are changed by options such as --config.holes.dilation 5; {HELP_ALL} lists them.",
+)
+
+Rule = Callable[[StructTypeInfo], StructConstructorSpec | None]
 
 RENAMED = {
     "keep-unsupported": "no-recolor",
@@ -35,6 +50,9 @@ RENAMED = {
     "ignore-masked": "use-masks",
 }
 """Names of the last release with today's; they are accepted for one release."""
+
+HINTS = {"Argument helptext:": "give", "Perhaps you meant:": "the nearest is"}
+"""Titles in tyro's messages before the option that is meant."""
 
 
 def format_error(error: InputError) -> str:
@@ -50,62 +68,38 @@ def parse_words(words: Sequence[str], command: Any, names: Collection[str]) -> A
     It raises InputError for wrong words, and SystemExit after printing the help.
     """
     words = use_new_names(words)
+    if words and words[0] not in names and words[0] not in (*HELP, HELP_ALL):
+        raise InputError(
+            f"There is no command {quote_value(words[0])}; choose one of {', '.join(names)} "
+            "(see gscompleter --help)."
+        )
     asked = any(word in (*HELP, HELP_ALL) for word in words)
     helps = [make_help_rule(show_all=HELP_ALL in words)] if asked else []
     words = ["--help" if word == HELP_ALL else word for word in words]
     check_once(words)
-    refuse_old_options(words)
-    printed, config = StringIO(), CompleterConfig()
-    read = partial(
-        tyro.cli,
-        command,
-        prog="gscompleter",
-        description="Complete 3D Gaussian Splatting scenes: generate, then register.",
-        config=(
-            tyro.conf.DisallowNone,
-            tyro.conf.FlagCreatePairsOff,
-            tyro.conf.OmitSubcommandPrefixes,
-        ),
-    )
+    settings = [word[9:].split("=")[0] for word in words if word.startswith("--config.")]
+    refuse_old_keys([name.replace("-", "_") for name in settings])
+    printed = StringIO()
     try:
         with redirect_stderr(printed):
             config, words = load_named_config(insert_auto_count(words))
-            return read(args=words, registry=make_registry(config, *helps))
+            return tyro.cli(
+                command,
+                prog="gscompleter",
+                description="Complete 3D Gaussian Splatting scenes: generate, then register.",
+                args=words,
+                config=(
+                    tyro.conf.DisallowNone,
+                    tyro.conf.FlagCreatePairsOff,
+                    tyro.conf.OmitSubcommandPrefixes,
+                ),
+                registry=make_registry(config, *helps),
+            )
     except SystemExit as stop:
         if not stop.code:
             raise
-        options = list_options(
-            lambda words: read(args=words, registry=make_registry(config)), words
-        )
-        see = " ".join(["gscompleter", *(word for word in words[:1] if word in names)])
-        sentence = find_misspelling(words, names, options) or extract_sentence(printed.getvalue())
-        raise InputError(f"{sentence} (see {see} --help).") from None
-
-
-def list_options(read: Callable[[Sequence[str]], Any], words: Sequence[str]) -> list[str]:
-    """List the options of the command in `words`."""
-    if not words or words[0].startswith("--"):
-        return ["--help", "--version"]
-    help_text = StringIO()
-    with redirect_stdout(help_text), suppress(SystemExit):
-        read([*words[:1], "--help"])
-    found = re.findall(r"^[ │]*(?:-h, )?(--[a-z][\w.-]*)", help_text.getvalue(), re.MULTILINE)
-    return [*found, HELP_ALL]
-
-
-def find_misspelling(
-    words: Sequence[str], names: Collection[str], options: Sequence[str]
-) -> str | None:
-    """Write a sentence on an unknown command or option that is similar to a known one, if any."""
-    near = get_close_matches(words[0], names, 1) if words else []
-    if near and words[0] not in names:
-        return f"There is no command {quote_value(words[0])}; the nearest is {near[0]}"
-    for given in (word.split("=")[0] for word in words if word.startswith("--")):
-        option = given.replace("_", "-")
-        near = get_close_matches(option, options, 1, MIN_SIMILARITY)
-        if near and near[0] != option:
-            return f"There is no option {quote_value(given)}; the nearest is {near[0]}"
-    return None
+        see = " ".join(["gscompleter", *words[:1]])
+        raise InputError(f"{extract_sentence(printed.getvalue())} (see {see} --help).") from None
 
 
 def check_once(words: Sequence[str]) -> None:
@@ -162,43 +156,71 @@ def make_registry(config: CompleterConfig, *rules: Rule) -> ConstructorRegistry:
     return registry
 
 
+def make_help_rule(show_all: bool) -> Rule:
+    """Return a rule by which tyro writes help pages. No option can be parsed with it."""
+    entered: list[type] = []
+
+    def rule(info: StructTypeInfo) -> StructConstructorSpec | None:
+        kind: Any = info.type
+        if not isinstance(kind, type) or not issubclass(kind, Settings) or kind in entered:
+            return None
+        entered.append(kind)
+        spec = ConstructorRegistry.get_struct_spec(info)
+        entered.remove(kind)
+        if not isinstance(spec, StructConstructorSpec):
+            return None
+        own = get_annotations(kind)
+        fields = sorted(spec.fields, key=lambda field: field.name not in own)
+        return replace(spec, fields=tuple(tidy_field(field, show_all) for field in fields))
+
+    return rule
+
+
+def tidy_field(field: StructFieldSpec, show_all: bool) -> StructFieldSpec:
+    """Join the lines of a help text, and hide a default that says nothing.
+
+    Unless `show_all` is set, the settings of the method become one option.
+    """
+    if isinstance(field.default, CompleterConfig) and not show_all:
+        return CONFIG
+
+    def text() -> str | None:
+        found = field.helptext() if callable(field.helptext) else field.helptext
+        return None if found is None else " ".join(found.split())
+
+    kind: Any = field.type
+    if field.default is None or field.default is False or field.default == ():
+        kind = Annotated[kind, tyro.conf.arg(help_behavior_hint="")]
+    return replace(field, helptext=text, type=kind)
+
+
 def extract_sentence(box: str) -> str:
-    """Extract the sentence from tyro's boxed error message."""
-
-    def is_empty(line: str) -> bool:
-        return not line.strip("─- ")
-
+    """Extract the sentence from tyro's boxed error message, with the option that is meant."""
     lines = [line[2:].rstrip("│ ") for line in box.splitlines()[1:]]
-    first_lines = takewhile(lambda line: not is_empty(line), dropwhile(is_empty, lines))
-    sentence = " ".join(line.strip() for line in first_lines if not line.startswith(" " * 5))
-    usage = lines.index("Argument helptext:") + 1 if "Argument helptext:" in lines else None
-    needed = "" if usage is None else f"; give {lines[usage].strip()}"
-    return f"{quote_value(sentence, 200).removesuffix('.')}{needed}"
+    text = dropwhile(lambda line: not line.strip("─- "), lines)
+    paragraph = takewhile(lambda line: line.strip("─- "), text)
+    sentence = " ".join(line.strip() for line in paragraph if not line.startswith(" " * 5))
+    hint = ""
+    for title, words in HINTS.items():
+        if title in lines:
+            hint = f"; {words} {lines[lines.index(title) + 1].strip()}"
+    return f"{quote_value(sentence, 200).removesuffix('.')}{hint}"
 
 
 def use_new_names(words: Sequence[str]) -> list[str]:
     """Replace old names of options such as `--film` or `--rerun=failures`, and warn of each."""
-    renamed = []
-    for word in words:
-        old, equals, value = word.partition("=")
-        new = f"--{translate_name(old[2:])}" if old.startswith("--") else old
-        renamed.append(f"{new}{equals}{value}")
-    return renamed
-
-
-def translate_name(name: str) -> str:
-    """Return today's name of an option without dashes, and warn of an old one."""
-    old = name.replace("_", "-")
-    if old not in RENAMED:
-        return name
-    warn_renamed(old, RENAMED[old])
-    return RENAMED[old]
+    return [re.sub(r"^--([\w-]+)", lambda name: f"--{translate_name(name[1])}", w) for w in words]
 
 
 @cache
-def warn_renamed(old: str, new: str) -> None:
-    """Print once per process that an option has a new name."""
+def translate_name(name: str) -> str:
+    """Return today's name of an option without dashes; warn of an old one once per process."""
+    old = name.replace("_", "-")
+    if old not in RENAMED:
+        return name
     print(
-        f"{PROGRAM}--{old} is now called --{new}; the old name stops working in the next release.",
+        f"{PROGRAM}--{old} is now called --{RENAMED[old]}; the old name stops working in the next "
+        "release.",
         file=sys.stderr,
     )
+    return RENAMED[old]

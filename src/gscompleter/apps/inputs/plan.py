@@ -107,7 +107,7 @@ def describe_work(options: CompleteOptions, task: Task) -> str:
     targets = targets or [f"up to {get_max_targets(options)} cameras that are found"]
     return (
         f"context from {list_frames(task.context_frames)}{chosen}, completed for "
-        f"{' and '.join(targets)} by {options.reconstructor} and {options.synthesis.name} on "
+        f"{' and '.join(targets)} by {options.reconstructor} and {options.synthesis.generator} on "
         f"{task.device.type}, written to {quote_value(options.out)}"
     )
 

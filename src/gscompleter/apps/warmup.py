@@ -1,0 +1,77 @@
+"""Compilation of all kernels in advance, by completing a tiny scene.
+
+It is a textured wall, parallel to the image planes of cameras side by side.
+"""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Collection
+
+import torch
+
+from gscompleter.completer import GSCompleter
+from gscompleter.image_ops import smooth_masked
+from gscompleter.kernels.compiled import is_compiled, mark_compiled
+from gscompleter.progress import stage
+from gscompleter.render import load_renderer
+from gscompleter.render.lod import simplify_scene
+from gscompleter.types import Camera, View
+
+SPLAT_PART = "splat"
+"""Part that only input splats need."""
+PARTS = ("cpu", "plane-sweep", "warp-inpaint", SPLAT_PART)
+"""Renderer, models and part that have kernels."""
+COMPILING_STAGE = "compiling kernels for this machine, once"
+
+IMAGE_SIZE_PX = 64
+"""Image size, in pixels."""
+DISPARITY_PX = 6
+"""Disparity of the wall between neighbouring cameras, in pixels."""
+WALL_DEPTH = 2.0
+"""Depth of the wall, in baselines."""
+
+
+def compile_kernels(names: Collection[str]) -> float | None:
+    """Compile the missing kernels of these parts; return the seconds, or None if there are none."""
+    missing = [name for name in PARTS if name in names and not is_compiled(name)]
+    if not missing:
+        return None
+    start = time.perf_counter()
+    with stage(COMPILING_STAGE):
+        rehearse(with_splat=SPLAT_PART in missing)
+    for name in PARTS:
+        if name != SPLAT_PART or SPLAT_PART in missing:
+            mark_compiled(name)
+    return time.perf_counter() - start
+
+
+def rehearse(with_splat: bool) -> None:
+    """Complete the wall, reconstructed from two photographs and optionally given."""
+    completer = GSCompleter(renderer=load_renderer("cpu"))
+    views, target = make_photographs(), make_wall_camera(2)
+    completion = completer(views, target)
+    if with_splat:
+        completer(views, target, completion.context, views)
+        simplify_scene(completion.context, [target])
+
+
+def make_photographs() -> list[View]:
+    """Create the photographs of two cameras."""
+    noise = torch.rand(
+        IMAGE_SIZE_PX, IMAGE_SIZE_PX + DISPARITY_PX, 3, generator=torch.Generator().manual_seed(0)
+    )
+    wall = smooth_masked(noise, torch.ones(noise.shape[:2], dtype=torch.bool), 1)
+    return [
+        View(wall[:, DISPARITY_PX * i :][:, :IMAGE_SIZE_PX].contiguous(), make_wall_camera(i))
+        for i in range(2)
+    ]
+
+
+def make_wall_camera(place: int) -> Camera:
+    """Create a camera `place` baselines to the right."""
+    c2w = torch.eye(4)
+    c2w[0, 3] = place
+    focal = DISPARITY_PX * WALL_DEPTH
+    K = torch.tensor([[focal, 0, IMAGE_SIZE_PX / 2], [0, focal, IMAGE_SIZE_PX / 2], [0, 0, 1]])
+    return Camera(c2w, K, IMAGE_SIZE_PX, IMAGE_SIZE_PX, near=WALL_DEPTH / 2, far=WALL_DEPTH * 4)
