@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import webbrowser
 from contextlib import suppress
-from dataclasses import replace
 from pathlib import Path
 
 from gscompleter.apps.commands.convert import check_free
@@ -12,15 +11,15 @@ from gscompleter.apps.commands.tool_options import ViewOptions
 from gscompleter.apps.viewer import packages
 from gscompleter.apps.viewer.exhibit import (
     ViewerContent,
-    is_completion,
-    load_file_cameras,
+    add_file_cameras,
     load_viewer_completion,
     load_viewer_files,
 )
-from gscompleter.apps.viewer.page import Page, make_page
+from gscompleter.apps.viewer.page import make_page
 from gscompleter.apps.viewer.server import ADDRESS, make_page_server
 from gscompleter.errors import InputError, quote_value
 from gscompleter.io.files import replace_file
+from gscompleter.splats.sog import META
 
 
 def run_view(options: ViewOptions) -> None:
@@ -28,14 +27,14 @@ def run_view(options: ViewOptions) -> None:
     if options.save is not None:
         check_page(options.save, options.overwrite)
     libraries = packages.load_libraries()
-    exhibit = load_exhibit(options)
-    page = make_page(exhibit, libraries, "page" if options.save is None else options.save.stem)
-    if not options.quiet:
-        print_remarks(exhibit, page)
+    page = make_page(load_content(options), libraries)
+    for note in () if options.quiet else page.notes:
+        print(note)
     if options.save is None:
-        serve_page(options, page)
+        serve_page(options, page.html)
     else:
-        write_parts(page, options.save)
+        with replace_file(options.save) as file:
+            file.write(page.html)
 
 
 def check_page(path: Path, overwrite: bool) -> None:
@@ -45,43 +44,21 @@ def check_page(path: Path, overwrite: bool) -> None:
     check_free(path, overwrite)
 
 
-def load_exhibit(options: ViewOptions) -> ViewerContent:
+def load_content(options: ViewOptions) -> ViewerContent:
     """Read the scenes and cameras of the options."""
-    if options.other is None and is_completion(options.scene):
-        exhibit = load_viewer_completion(options.scene, options.drop_nonfinite)
-    elif options.other is None:
-        exhibit = load_viewer_files(options.scene, None, options.drop_nonfinite)
+    scene, other, drop_nonfinite = options.scene, options.other, options.drop_nonfinite
+    if other is not None:
+        content = load_viewer_files(other, scene, drop_nonfinite)
+    elif scene.is_dir() and not (scene / META).is_file():
+        content = load_viewer_completion(scene, drop_nonfinite)
     else:
-        exhibit = load_viewer_files(options.other, options.scene, options.drop_nonfinite)
+        content = load_viewer_files(scene, None, drop_nonfinite)
     if options.cameras is None:
-        return exhibit
-    shots = load_file_cameras(options.cameras, options.resolution, exhibit.scene_transform)
-    return replace(exhibit, cameras=(*exhibit.cameras, *shots))
+        return content
+    return add_file_cameras(content, options.cameras, options.resolution)
 
 
-def print_remarks(exhibit: ViewerContent, page: Page) -> None:
-    """Print remarks on the page."""
-    for remark in exhibit.notes:
-        print(remark)
-    if page.num_omitted:
-        print(f"{page.num_omitted:,} Gaussians are too far away to be shown.")
-    if page.parts:
-        print(
-            f"The Gaussians do not fit into one page; keep these {len(page.parts)} files beside "
-            f"it: {', '.join(page.parts)}."
-        )
-
-
-def write_parts(page: Page, path: Path) -> None:
-    """Write the parts of the page, then the page."""
-    for name, part in page.parts.items():
-        with replace_file(path.with_name(name)) as file:
-            file.write(part)
-    with replace_file(path) as file:
-        file.write(page.html)
-
-
-def serve_page(options: ViewOptions, page: Page) -> None:
+def serve_page(options: ViewOptions, page: bytes) -> None:
     """Serve the page to this machine until Ctrl-C."""
     with make_page_server(page, options.port) as server, suppress(KeyboardInterrupt):
         address = f"http://{ADDRESS}:{server.server_address[1]}/"
