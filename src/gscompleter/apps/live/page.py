@@ -9,7 +9,6 @@ import time
 import traceback
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager, redirect_stdout
-from dataclasses import dataclass
 from functools import partial
 from io import StringIO
 from queue import SimpleQueue
@@ -33,7 +32,6 @@ from gscompleter.errors import InputError
 from gscompleter.geometry import compute_spacing, estimate_up
 from gscompleter.progress import notify_of_stages
 from gscompleter.state import NOTHING_ADDED, Completion, TargetResult
-from gscompleter.timing import STAGES
 from gscompleter.types import Camera, Gaussians, View
 
 LOCAL_HOSTS = ("127.0.0.1", "localhost")
@@ -42,12 +40,10 @@ MAX_FRUSTUM_LENGTH, MAX_SPACING_FRACTION = 0.1, 0.2
 """Largest length of a camera pyramid, in page units and as a fraction of camera spacing."""
 CLEARANCE_LENGTHS = 6.0
 """Photographs nearer than this many pyramid lengths are hidden; they would cover the scene."""
-PHOTOGRAPH_COLOR, TARGET_COLOR = (150, 150, 150), (80, 220, 120)
 NOTICE_SECONDS = 4.0
 
 WELCOME = "Fly to a hole in the scene, then press “Complete what I see”."
 BUSY = "The last request is still running; press the button again when it is done."
-NO_HOLE = "No large hole is left around the photographs."
 CONTROLS_HELP = (
     "Drag to rotate, drag with the right button to move, scroll to zoom, fly with W A S D Q E. "
     "Click a photograph to go to its camera."
@@ -57,18 +53,6 @@ Job = Callable[[viser.ClientHandle, PagePose], str]
 """Action of a button: takes the browser and its camera, returns a sentence for the page."""
 
 
-@dataclass(frozen=True)
-class PageServices:
-    """Everything a page needs besides its address."""
-
-    session: Session
-    photographs: Sequence[View]
-    """Small images, with their cameras in the frame of the result."""
-    find_hole: Callable[[Completion], Camera | None]
-    """Returns the camera with the most to gain, or None."""
-    save: Callable[[Session], str]
-
-
 class Page:
     """A session in all browsers that have the page open.
 
@@ -76,18 +60,25 @@ class Page:
     that arrives meanwhile is refused.
     """
 
-    def __init__(self, subject: PageServices, host: str, port: int) -> None:
-        self.subject, self.session = subject, subject.session
-        self.server = start_server(host, port)
-        self._first = subject.session.initial.views[0].camera
+    def __init__(
+        self,
+        session: Session,
+        find_hole: Callable[[Completion], Camera | None],
+        save: Callable[[Session], str],
+        server: viser.ViserServer,
+    ) -> None:
+        """Build the page; `find_hole` finds the camera with the most to gain, if there is one."""
+        self.session, self.server = session, server
+        self._find_hole, self._save = find_hole, save
+        self._photographs = session.initial.views
+        self._first = self._photographs[0].camera
         self._unit = compute_page_unit(self._first)
-        self._length = compute_frustum_length(subject.photographs, self._unit)
+        self._length = compute_frustum_length(self._photographs, self._unit)
         self._requests: SimpleQueue[Callable[[], str]] = SimpleQueue()
         self._busy, self._generated_lock = Lock(), Lock()
         self._generated: Any = None
-        self._photographs: list[Any] = []
-        self._targets: list[Any] = []
-        self._build_page()
+        self._frustums: list[viser.CameraFrustumHandle] = []
+        self._build()
 
     def handle_requests(self) -> None:
         """Run requests until the process is interrupted."""
@@ -108,7 +99,7 @@ class Page:
         start = time.perf_counter()
         camera = camera_from_page(seen, self._first.height, self._first.width, self._unit)
         before = self.session
-        with notify_of_stages(lambda stage: self.show_message(format_progress(stage))):
+        with notify_of_stages(lambda stage: self.show_message(f"Completing: {stage} …")):
             self.session, result = complete_camera(before, camera)
         self._show_changes(before)
         return describe_outcome(result, time.perf_counter() - start)
@@ -116,9 +107,9 @@ class Page:
     def find(self, client: viser.ClientHandle, seen: PagePose) -> str:
         """Move a browser to the camera with the most to gain."""
         self.show_message("Searching for a hole …")
-        camera = self.subject.find_hole(self.session.latest)
+        camera = self._find_hole(self.session.latest)
         if camera is None:
-            return NO_HOLE
+            return "No large hole is left around the photographs."
         self._move_browser(client, camera_to_page(camera, self._unit))
         return "The scene has a hole here; press “Complete what I see”."
 
@@ -133,21 +124,18 @@ class Page:
     def save(self, client: viser.ClientHandle, seen: PagePose) -> str:
         """Write the completed scene."""
         self.show_message("Saving …")
-        return self.subject.save(self.session)
+        return self._save(self.session)
 
     def show_message(self, text: str) -> None:
-        """Show a text on the page, its first line in bold."""
-        first, *others = (html.escape(line) for line in text.splitlines())
-        self._status.content = (
-            '<div role="status" style="padding: 0.5em 1em">'
-            f"{'<br>'.join((f'<b>{first}</b>', *others))}</div>"
-        )
+        """Show a text on the page."""
+        lines = "<br>".join(html.escape(line) for line in text.splitlines())
+        self._status.content = f'<div role="status" style="padding: 0.5em 1em">{lines}</div>'
 
-    def _build_page(self) -> None:
+    def _build(self) -> None:
         scene, gui = self.server.scene, self.server.gui
         gui.configure_theme(dark_mode=True, show_logo=False, show_share_button=False)
         gui.set_panel_label("gscompleter live")
-        scene.set_up_direction(estimate_up([v.camera for v in self.subject.photographs]).numpy())
+        scene.set_up_direction(estimate_up([view.camera for view in self._photographs]).numpy())
         self._set_initial_camera(camera_to_page(self._first, self._unit))
         self._status = gui.add_html("")
         for label, job in (
@@ -192,7 +180,7 @@ class Page:
 
     def _hide_near_photographs(self, pose: PagePose) -> None:
         """Hide the photographs near a pose and show all others."""
-        for frustum in self._photographs:
+        for frustum in self._frustums:
             apart = np.linalg.norm(frustum.position - pose.position)
             frustum.visible = bool(apart > CLEARANCE_LENGTHS * self._length)
 
@@ -203,12 +191,6 @@ class Page:
             if before.latest.parts[0] is not now.parts[0]:
                 self._show("/observed", now.recolored_context, tinted=False)
             self._show_generated()
-            for frustum in self._targets:
-                frustum.remove()
-            self._targets = [
-                self._add_frustum(f"/cameras/target {number}", result.target, TARGET_COLOR)
-                for number, result in enumerate(now.targets, start=1)
-            ]
 
     def _show_generated(self) -> None:
         with self._generated_lock:
@@ -225,40 +207,31 @@ class Page:
         return self.server.scene.add_gaussian_splats(name, **splat)
 
     def _show_photographs(self) -> None:
-        for number, view in enumerate(self.subject.photographs):
-            frustum = self._add_frustum(
-                f"/cameras/photograph {number}", view.camera, PHOTOGRAPH_COLOR, view
-            )
+        for number, view in enumerate(self._photographs):
             pose = camera_to_page(view.camera, self._unit)
+            frustum = self.server.scene.add_camera_frustum(
+                f"/cameras/photograph {number}",
+                pose.fov,
+                view.camera.width / view.camera.height,
+                scale=self._length,
+                thickness=1.5,
+                thickness_units="screen",
+                color=(150, 150, 150),
+                image=(255 * view.image.clamp(0, 1)).byte().cpu().numpy(),
+                wxyz=pose.wxyz,
+                position=pose.position,
+            )
             frustum.on_click(lambda event, pose=pose: self._move_browser(event.client, pose))
-            self._photographs.append(frustum)
+            self._frustums.append(frustum)
         self._hide_near_photographs(camera_to_page(self._first, self._unit))
-
-    def _add_frustum(
-        self, name: str, camera: Camera, color: tuple[int, int, int], view: View | None = None
-    ) -> Any:
-        pose = camera_to_page(camera, self._unit)
-        image = None if view is None else (255 * view.image.clamp(0, 1)).byte().cpu().numpy()
-        return self.server.scene.add_camera_frustum(
-            name,
-            pose.fov,
-            camera.width / camera.height,
-            scale=self._length,
-            thickness=1.5,
-            thickness_units="screen",
-            color=color,
-            image=image,
-            wxyz=pose.wxyz,
-            position=pose.position,
-        )
 
 
 def compute_frustum_length(photographs: Sequence[View], unit: float) -> float:
     """Compute the length of camera pyramids, in page units."""
     apart = compute_spacing([view.camera for view in photographs]) * unit
-    return (
-        min(MAX_FRUSTUM_LENGTH, MAX_SPACING_FRACTION * apart) if apart > 0 else MAX_FRUSTUM_LENGTH
-    )
+    if apart == 0:
+        return MAX_FRUSTUM_LENGTH
+    return min(MAX_FRUSTUM_LENGTH, MAX_SPACING_FRACTION * apart)
 
 
 def run_request(request: Callable[[], str]) -> str:
@@ -271,11 +244,6 @@ def run_request(request: Callable[[], str]) -> str:
     except Exception as error:
         traceback.print_exc()
         return f"That failed ({type(error).__name__}: {error}); the scene is unchanged."
-
-
-def format_progress(stage: str) -> str:
-    """Format the progress line with the current stage in brackets."""
-    return "Completing …\n" + " → ".join(f"[{s}]" if s == stage else s for s in STAGES)
 
 
 def describe_outcome(result: TargetResult, seconds: float) -> str:
