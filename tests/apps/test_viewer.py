@@ -247,7 +247,7 @@ def test_a_large_scene_is_held_in_parts(tmp_path, monkeypatch):
     whole = make_page(room_exhibit(), NONE)
     monkeypatch.setattr(pages, "PART", 20_000)
     page = make_page(room_exhibit(), NONE)
-    assert page.html.count(b"gscPart(\"") > 2
+    assert page.html.count(b'gscPart("') > 2
     for layer in ("observed", "generated"):
         assert torch.equal(
             gaussians_in(page, layer, tmp_path).means, gaussians_in(whole, layer, tmp_path).means
