@@ -43,7 +43,7 @@ from gscompleter.progress import notify_of_stages
 from gscompleter.splat_alignment.similarity import make_similarity, transform_camera
 from gscompleter.splats.transform import transform_gaussians
 from gscompleter.timing import STAGES
-from gscompleter.types import merge
+from gscompleter.types import Camera, merge
 from scenes import Room, camera_at, gaussians_of, photographed, random_gaussians, view_of
 
 SIZE = 48
@@ -205,7 +205,7 @@ def test_a_camera_of_the_page_is_the_one_it_was_made_of(unit):
 def test_a_splat_of_any_unit_survives_the_pages_precision(unit):
     gaussians = random_gaussians(100)
     scaled = replace(gaussians, means=unit * gaussians.means, scales=unit * gaussians.scales)
-    splat = make_page_splat(scaled, 1.0, tinted=False)
+    splat = make_page_splat(scaled, 1.0)
     axes = Rotation.from_quat(gaussians.quats.numpy(), scalar_first=True).as_matrix()
     true = axes @ (gaussians.scales.numpy()[:, :, None] ** 2 * axes.transpose(0, 2, 1))
     shown = (
@@ -213,13 +213,6 @@ def test_a_splat_of_any_unit_survives_the_pages_precision(unit):
     )
     assert np.abs(shown - true).max() < 1e-3 * np.abs(true).max()
     assert np.allclose(splat["centers"] * splat["scale"], scaled.means, rtol=1e-5)
-
-
-def test_a_tint_changes_colours_alone():
-    gaussians = random_gaussians(10)
-    plain, tinted = (make_page_splat(gaussians, 1.0, tinted=tint) for tint in (False, True))
-    assert np.abs(plain["rgbs"] - tinted["rgbs"]).max() > 0.1
-    assert np.array_equal(plain["covariances"], tinted["covariances"])
 
 
 def test_an_error_is_a_sentence_and_ends_nothing(capsys):
@@ -242,30 +235,29 @@ def page(begun) -> Iterator[Page]:
     page.close()
 
 
-def test_what_was_generated_is_shown_tinted_or_hidden_and_undone(page, begun):
-    client, seen = Mock(spec=viser.ClientHandle), camera_to_page(HOLES[0], page._unit)
-    assert "Completed" in page.complete(client, seen)
-    shown = page._generated.buffer.copy()
-    assert len(shown) == len(page.session.latest.added)
-    page._generated_mode.value = "hide"
-    assert page._generated is None
-    page._generated_mode.value = "tint"
-    assert len(page._generated.buffer) == len(shown)
-    assert not np.array_equal(page._generated.buffer, shown)
-    assert "0 completions are left" in page.undo(client, seen)
+def browser_at(page: Page, camera: Camera) -> MagicMock:
+    """Make a browser that shows the scene from a camera."""
+    seen = camera_to_page(camera, page._unit)
+    view = Mock(wxyz=seen.wxyz, position=seen.position, fov=seen.fov)
+    return MagicMock(spec=viser.ClientHandle, camera=view)
+
+
+def test_what_was_generated_is_shown_and_undone(page, begun):
+    client = browser_at(page, HOLES[0])
+    assert "Completed" in page.complete(client)
+    assert len(page._generated.buffer) == len(page.session.latest.added)
+    assert page.undo(client) == "Undone. Completions left: 0."
     assert page.session == begun
     assert page._generated is None
 
 
-def test_photographs_near_a_camera_that_is_jumped_to_make_way(page):
-    client = MagicMock(spec=viser.ClientHandle, camera=Mock())
-    first, second = (camera_to_page(view.camera, page._unit) for view in page.session.latest.views)
-    assert not page._frustums[0].visible  # where browsers begin
-    page._move_browser(client, second)
-    assert np.array_equal(client.camera.position, second.position)
-    assert not page._frustums[1].visible
-    page._move_browser(client, replace(first, position=first.position - 5))
-    assert all(frustum.visible for frustum in page._frustums)
+def test_photographs_are_visited_one_after_the_other(page):
+    client = browser_at(page, HOLES[0])
+    for view in (*page.session.latest.views, page.session.latest.views[0]):
+        page.visit_photograph(client)
+        expected = camera_to_page(view.camera, page._unit)
+        assert np.array_equal(client.camera.position, expected.position)
+        assert client.camera.fov == expected.fov
 
 
 def test_what_is_said_stays_text(page):
@@ -274,8 +266,7 @@ def test_what_is_said_stays_text(page):
 
 
 def test_one_thing_is_done_at_a_time(page):
-    client = Mock(spec=viser.ClientHandle)
-    client.camera = Mock(wxyz=np.array([1.0, 0, 0, 0]), position=np.zeros(3), fov=1.0)
+    client = browser_at(page, HOLES[0])
     event = Mock(spec=viser.GuiEvent, client=client)
     page._submit(page.undo, event)
     assert client.add_notification.call_count == 0

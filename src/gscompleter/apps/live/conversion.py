@@ -19,7 +19,6 @@ from gscompleter.types import SH_C0, Camera, Gaussians
 
 SCENE_DISTANCE = 3.0
 """Distance of the middle of the depth range, in page units."""
-TINT_FACTORS = (1.0, 0.45, 0.9)
 
 
 @dataclass(frozen=True)
@@ -58,7 +57,7 @@ def camera_from_page(pose: PagePose, height: int, width: int, unit: float) -> Ca
     return Camera(c2w.float(), K, width, height)
 
 
-def make_page_splat(gaussians: Gaussians, unit: float, tinted: bool) -> dict[str, Any]:
+def make_page_splat(gaussians: Gaussians, unit: float) -> dict[str, Any]:
     """Convert one or more Gaussians for the page, which scales them back by `scale`.
 
     The page keeps covariances in float16, in which those of a scene in kilometres would vanish, so
@@ -68,11 +67,10 @@ def make_page_splat(gaussians: Gaussians, unit: float, tinted: bool) -> dict[str
     size = gaussians.scales.amax(dim=1).median().item()
     axes = quats_to_rotations(gaussians.quats) * (gaussians.scales / size)[:, None, :]
     rgbs = (0.5 + SH_C0 * gaussians.sh[:, 0]).clamp(0, 1)
-    tint = torch.tensor(TINT_FACTORS if tinted else (1.0, 1.0, 1.0))
     return {
         "centers": (gaussians.means / size).numpy(),
         "covariances": (axes @ axes.transpose(1, 2)).numpy(),
-        "rgbs": (rgbs * tint).numpy(),
+        "rgbs": rgbs.numpy(),
         "opacities": gaussians.opacities[:, None].clamp(0, 1).numpy(),
         "scale": size * unit,
     }

@@ -7,15 +7,15 @@ import re
 import socket
 import time
 import traceback
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager, redirect_stdout
 from functools import partial
 from io import StringIO
+from itertools import cycle
 from queue import SimpleQueue
 from threading import Lock
 from typing import Any
 
-import numpy as np
 import viser
 from websockets.asyncio import server as websockets
 
@@ -29,28 +29,23 @@ from gscompleter.apps.live.conversion import (
 )
 from gscompleter.apps.live.session import Session, complete_camera, undo_step
 from gscompleter.errors import InputError
-from gscompleter.geometry import compute_spacing, estimate_up
+from gscompleter.geometry import estimate_up
 from gscompleter.progress import notify_of_stages
 from gscompleter.state import NOTHING_ADDED, Completion, TargetResult
-from gscompleter.types import Camera, Gaussians, View
+from gscompleter.types import Camera, Gaussians
 
 LOCAL_HOSTS = ("127.0.0.1", "localhost")
 LOCAL_ORIGIN = re.compile(r"http://(127\.0\.0\.1|localhost)(:\d+)?")
-MAX_FRUSTUM_LENGTH, MAX_SPACING_FRACTION = 0.1, 0.2
-"""Largest length of a camera pyramid, in page units and as a fraction of camera spacing."""
-CLEARANCE_LENGTHS = 6.0
-"""Photographs nearer than this many pyramid lengths are hidden; they would cover the scene."""
 NOTICE_SECONDS = 4.0
 
 WELCOME = "Fly to a hole in the scene, then press “Complete what I see”."
 BUSY = "The last request is still running; press the button again when it is done."
 CONTROLS_HELP = (
-    "Drag to rotate, drag with the right button to move, scroll to zoom, fly with W A S D Q E. "
-    "Click a photograph to go to its camera."
+    "Drag to rotate, drag with the right button to move, scroll to zoom, fly with W A S D Q E."
 )
 
-Job = Callable[[viser.ClientHandle, PagePose], str]
-"""Action of a button: takes the browser and its camera, returns a sentence for the page."""
+Job = Callable[[viser.ClientHandle], str]
+"""Action of a button: takes the browser, returns a sentence for the page."""
 
 
 class Page:
@@ -70,14 +65,12 @@ class Page:
         """Build the page; `find_hole` finds the camera with the most to gain, if there is one."""
         self.session, self.server = session, server
         self._find_hole, self._save = find_hole, save
-        self._photographs = session.initial.views
-        self._first = self._photographs[0].camera
+        self._first = session.initial.views[0].camera
+        self._photographs = cycle([view.camera for view in session.initial.views])
         self._unit = compute_page_unit(self._first)
-        self._length = compute_frustum_length(self._photographs, self._unit)
         self._requests: SimpleQueue[Callable[[], str]] = SimpleQueue()
-        self._busy, self._generated_lock = Lock(), Lock()
+        self._busy = Lock()
         self._generated: Any = None
-        self._frustums: list[viser.CameraFrustumHandle] = []
         self._build()
 
     def handle_requests(self) -> None:
@@ -94,34 +87,36 @@ class Page:
         with redirect_stdout(StringIO()):
             self.server.stop()
 
-    def complete(self, client: viser.ClientHandle, seen: PagePose) -> str:
+    def complete(self, client: viser.ClientHandle) -> str:
         """Complete the scene for the camera of a browser."""
         start = time.perf_counter()
+        seen = PagePose(client.camera.wxyz, client.camera.position, client.camera.fov)
         camera = camera_from_page(seen, self._first.height, self._first.width, self._unit)
-        before = self.session
         with notify_of_stages(lambda stage: self.show_message(f"Completing: {stage} …")):
-            self.session, result = complete_camera(before, camera)
-        self._show_changes(before)
+            session, result = complete_camera(self.session, camera)
+        self._change_session(session)
         return describe_outcome(result, time.perf_counter() - start)
 
-    def find(self, client: viser.ClientHandle, seen: PagePose) -> str:
+    def find(self, client: viser.ClientHandle) -> str:
         """Move a browser to the camera with the most to gain."""
         self.show_message("Searching for a hole …")
         camera = self._find_hole(self.session.latest)
         if camera is None:
             return "No large hole is left around the photographs."
-        self._move_browser(client, camera_to_page(camera, self._unit))
+        self._move_browser(client, camera)
         return "The scene has a hole here; press “Complete what I see”."
 
-    def undo(self, client: viser.ClientHandle, seen: PagePose) -> str:
-        """Undo the last step."""
-        before = self.session
-        self.session = undo_step(before)
-        self._show_changes(before)
-        left = len(self.session.steps)
-        return f"Undone: {left} {'completion is' if left == 1 else 'completions are'} left."
+    def visit_photograph(self, client: viser.ClientHandle) -> str:
+        """Move a browser to the next photograph of the context."""
+        self._move_browser(client, next(self._photographs))
+        return WELCOME
 
-    def save(self, client: viser.ClientHandle, seen: PagePose) -> str:
+    def undo(self, client: viser.ClientHandle) -> str:
+        """Undo the last step."""
+        self._change_session(undo_step(self.session))
+        return f"Undone. Completions left: {len(self.session.steps)}."
+
+    def save(self, client: viser.ClientHandle) -> str:
         """Write the completed scene."""
         self.show_message("Saving …")
         return self._save(self.session)
@@ -135,24 +130,23 @@ class Page:
         scene, gui = self.server.scene, self.server.gui
         gui.configure_theme(dark_mode=True, show_logo=False, show_share_button=False)
         gui.set_panel_label("gscompleter live")
-        scene.set_up_direction(estimate_up([view.camera for view in self._photographs]).numpy())
+        cameras = [view.camera for view in self.session.initial.views]
+        scene.set_up_direction(estimate_up(cameras).numpy())
         self._set_initial_camera(camera_to_page(self._first, self._unit))
         self._status = gui.add_html("")
         for label, job in (
             ("Complete what I see", self.complete),
             ("Find a hole", self.find),
+            ("Next photograph", self.visit_photograph),
             ("Undo", self.undo),
             ("Save", self.save),
         ):
             gui.add_button(label).on_click(partial(self._submit, job))
-        self._generated_mode = gui.add_dropdown("Generated", ("show", "tint", "hide"))
-        self._generated_mode.on_update(lambda _: self._show_generated())
-        cameras = scene.add_frame("/cameras", show_axes=False)
-        show_cameras = gui.add_checkbox("Cameras", initial_value=True)
-        show_cameras.on_update(lambda _: setattr(cameras, "visible", show_cameras.value))
+        generated = scene.add_frame("/generated", show_axes=False)
+        show_generated = gui.add_checkbox("Generated", initial_value=True)
+        show_generated.on_update(lambda _: setattr(generated, "visible", show_generated.value))
         gui.add_markdown(CONTROLS_HELP)
-        self._show("/observed", self.session.latest.context, tinted=False)
-        self._show_photographs()
+        self._show("/observed", self.session.latest.context)
         self.show_message(WELCOME)
 
     def _submit(self, job: Job, event: viser.GuiEvent[Any]) -> None:
@@ -160,9 +154,8 @@ class Page:
         client = event.client
         if client is None:  # The browser has closed the page.
             return
-        seen = PagePose(client.camera.wxyz, client.camera.position, client.camera.fov)
         if self._busy.acquire(blocking=False):
-            self._requests.put(partial(job, client, seen))
+            self._requests.put(partial(job, client))
         else:
             client.add_notification("Still busy", BUSY, auto_close_seconds=NOTICE_SECONDS)
 
@@ -172,66 +165,27 @@ class Page:
         start.position, start.fov = pose.position, pose.fov
         start.look_at, start.up = pose.position + SCENE_DISTANCE * rotation[:, 2], -rotation[:, 1]
 
-    def _move_browser(self, client: viser.ClientHandle, pose: PagePose) -> None:
-        self._hide_near_photographs(pose)
+    def _move_browser(self, client: viser.ClientHandle, camera: Camera) -> None:
+        pose = camera_to_page(camera, self._unit)
         with client.atomic():
             client.camera.position, client.camera.wxyz = pose.position, pose.wxyz
             client.camera.fov = pose.fov
 
-    def _hide_near_photographs(self, pose: PagePose) -> None:
-        """Hide the photographs near a pose and show all others."""
-        for frustum in self._frustums:
-            apart = np.linalg.norm(frustum.position - pose.position)
-            frustum.visible = bool(apart > CLEARANCE_LENGTHS * self._length)
-
-    def _show_changes(self, before: Session) -> None:
-        """Show all parts of the session that differ from `before`."""
+    def _change_session(self, session: Session) -> None:
+        """Show all parts of a session that differ from the one before."""
+        before, now = self.session.latest, session.latest
+        self.session = session
         with self.server.atomic():
-            now = self.session.latest
-            if before.latest.parts[0] is not now.parts[0]:
-                self._show("/observed", now.recolored_context, tinted=False)
-            self._show_generated()
-
-    def _show_generated(self) -> None:
-        with self._generated_lock:
-            added, look = self.session.latest.added, self._generated_mode.value
+            if before.parts[0] is not now.parts[0]:
+                self._show("/observed", now.recolored_context)
             if self._generated is not None:
                 self._generated.remove()
-            shown = len(added) and look != "hide"
-            self._generated = self._show("/generated", added, look == "tint") if shown else None
+            self._generated = self._show("/generated/splats", now.added)
 
-    def _show(self, name: str, gaussians: Gaussians, tinted: bool) -> Any:
+    def _show(self, name: str, gaussians: Gaussians) -> Any:
         if len(gaussians) == 0:
             return None
-        splat = make_page_splat(gaussians, self._unit, tinted)
-        return self.server.scene.add_gaussian_splats(name, **splat)
-
-    def _show_photographs(self) -> None:
-        for number, view in enumerate(self._photographs):
-            pose = camera_to_page(view.camera, self._unit)
-            frustum = self.server.scene.add_camera_frustum(
-                f"/cameras/photograph {number}",
-                pose.fov,
-                view.camera.width / view.camera.height,
-                scale=self._length,
-                thickness=1.5,
-                thickness_units="screen",
-                color=(150, 150, 150),
-                image=(255 * view.image.clamp(0, 1)).byte().cpu().numpy(),
-                wxyz=pose.wxyz,
-                position=pose.position,
-            )
-            frustum.on_click(lambda event, pose=pose: self._move_browser(event.client, pose))
-            self._frustums.append(frustum)
-        self._hide_near_photographs(camera_to_page(self._first, self._unit))
-
-
-def compute_frustum_length(photographs: Sequence[View], unit: float) -> float:
-    """Compute the length of camera pyramids, in page units."""
-    apart = compute_spacing([view.camera for view in photographs]) * unit
-    if apart == 0:
-        return MAX_FRUSTUM_LENGTH
-    return min(MAX_FRUSTUM_LENGTH, MAX_SPACING_FRACTION * apart)
+        return self.server.scene.add_gaussian_splats(name, **make_page_splat(gaussians, self._unit))
 
 
 def run_request(request: Callable[[], str]) -> str:
