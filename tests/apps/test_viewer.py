@@ -384,7 +384,7 @@ def test_photographs_whose_cameras_were_found_are_jumped_to(tmp_path):
 
 
 def test_a_folder_that_is_no_completion_is_refused(tmp_path):
-    with pytest.raises(InputError, match=r"has no completed\.ply"):
+    with pytest.raises(InputError, match=r"has no summary\.json"):
         load_viewer_completion(tmp_path, False)
 
 

@@ -9,7 +9,7 @@ import numpy as np
 from jaxtyping import Float
 from PIL import Image
 
-from gscompleter.apps.report.schema import CompletionSummary, check_results, read_summary
+from gscompleter.apps.report.schema import CompletionSummary, read_summary
 from gscompleter.data.camera_files import read_cameras
 from gscompleter.data.formats import open_photographs
 from gscompleter.data.local_origin import compute_frame_from_photographs
@@ -88,15 +88,11 @@ def load_viewer_completion(folder: Path, drop_nonfinite: bool) -> ViewerContent:
     Raises:
         InputError: The folder is no output of `complete`, or a file cannot be read.
     """
-    check_results(folder, COMPLETED_FILE)
-    before, after = (
-        load_splat(folder / name, drop_nonfinite) for name in (CONTEXT_FILE, COMPLETED_FILE)
-    )
     summary = read_summary(folder)
     content = ViewerContent(
         folder.resolve().name,
-        after,
-        before,
+        after=load_splat(folder / COMPLETED_FILE, drop_nonfinite),
+        before=load_splat(folder / CONTEXT_FILE, drop_nonfinite),
         transform=np.array(summary.frame.transform),
         origin=np.array(summary.frame.origin),
     )
