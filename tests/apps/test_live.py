@@ -22,15 +22,13 @@ from command import run
 from gscompleter import load_ply, save_ply
 from gscompleter.apps.commands import live
 from gscompleter.apps.commands.options import LiveOptions
-from gscompleter.apps.live.conversion import (
+from gscompleter.apps.live.page import (
+    Page,
     camera_from_page,
     camera_to_page,
     compute_page_unit,
-    make_page_splat,
-)
-from gscompleter.apps.live.page import (
-    Page,
     describe_outcome,
+    make_page_splat,
     run_request,
     start_server,
 )

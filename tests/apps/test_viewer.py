@@ -19,6 +19,7 @@ import pytest
 import torch
 
 from command import run
+from gscompleter.apps.commands.view import make_page_server
 from gscompleter.apps.report.schema import (
     AlignmentRow,
     CompletionSummary,
@@ -46,7 +47,6 @@ from gscompleter.apps.viewer.packages import (
     read_lock,
 )
 from gscompleter.apps.viewer.page import Page, make_page
-from gscompleter.apps.viewer.server import make_page_server
 from gscompleter.data.scene import write_cameras
 from gscompleter.errors import InputError
 from gscompleter.evaluation.metrics.coverage import Coverage

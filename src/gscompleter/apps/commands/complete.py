@@ -36,7 +36,7 @@ from gscompleter.apps.inputs.plan import describe_task, name_target
 from gscompleter.apps.inputs.selection import collect_usable_cameras
 from gscompleter.apps.report.completion import Surroundings, Target, write_report
 from gscompleter.apps.report.completion_page import average_scores, render_completion_page
-from gscompleter.apps.report.film import VIDEO_FILE, write_comparison_video
+from gscompleter.apps.report.film import write_comparison_video
 from gscompleter.apps.report.page import REPORT_FILE, write_page
 from gscompleter.apps.report.plain_words import format_number, format_percent, list_scene_notes
 from gscompleter.apps.report.schema import CompletionSummary, read_summary
@@ -264,8 +264,6 @@ def make_score_table(summary: CompletionSummary) -> Table:
 def describe_result(summary: CompletionSummary, options: CompleteOptions) -> Iterator[str]:
     """Write the sentences below the table."""
     yield from list_scene_notes(summary)
-    if summary.targets and options.video:
-        yield f"Video: {options.out / VIDEO_FILE}"
     share = "Trusted" if summary.settings["config"]["trust"] == "photometric" else "Coverage"
     before, after = map(format_percent, (summary.coverage.before, summary.coverage.after))
     yield f"{share} around the photographs: {before} before, {after} after."

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import webbrowser
 from contextlib import suppress
+from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 from pathlib import Path
 
 from gscompleter.apps.commands.convert import check_free
@@ -16,10 +17,14 @@ from gscompleter.apps.viewer.exhibit import (
     load_viewer_files,
 )
 from gscompleter.apps.viewer.page import make_page
-from gscompleter.apps.viewer.server import ADDRESS, make_page_server
 from gscompleter.errors import InputError, quote_value
 from gscompleter.io.files import replace_file
 from gscompleter.splats.sog import META
+
+ADDRESS = "127.0.0.1"
+"""Network interface of the server."""
+HOST_NAMES = (ADDRESS, "localhost")
+"""Accepted host names; any other one may be a DNS rebinding attack by a website."""
 
 
 def run_view(options: ViewOptions) -> None:
@@ -67,3 +72,36 @@ def serve_page(options: ViewOptions, page: bytes) -> None:
         if not options.no_open:
             webbrowser.open(address)
         server.serve_forever()
+
+
+def make_page_server(page: bytes, port: int = 0) -> ThreadingHTTPServer:
+    """Make a server on `port` (0 for any) that shows the page to browsers of this machine."""
+
+    class Handler(BaseHTTPRequestHandler):
+        def do_GET(self) -> None:
+            if self.headers.get("Host", "").rsplit(":", 1)[0].lower() not in HOST_NAMES:
+                self.send_error(421, "This server answers to 127.0.0.1 and localhost only")
+            elif self.path != "/":
+                self.send_error(404)
+            else:
+                self.send_page()
+
+        def send_page(self) -> None:
+            self.send_response(200)
+            self.send_header("Content-Type", "text/html; charset=utf-8")
+            self.send_header("Content-Length", str(len(page)))
+            self.send_header("Cross-Origin-Resource-Policy", "same-origin")
+            self.send_header("Cache-Control", "no-store")
+            self.end_headers()
+            self.wfile.write(page)
+
+        def log_message(self, format: str, *args: object) -> None:
+            """Log nothing."""
+
+    try:
+        return ThreadingHTTPServer((ADDRESS, port), Handler)
+    except OSError as error:
+        raise InputError(
+            f"Port {port} of {ADDRESS} is not available ({error.strerror}); name another one.",
+            "port",
+        ) from error

@@ -187,8 +187,8 @@ def make_task(
     targets = [
         replace(t, camera=replace(t.camera, near=bounded.near, far=bounded.far)) for t in targets
     ]
-    check_sides([bounded.camera(frame, resolution) for frame in frames])
-    check_sides([target.camera for target in targets])
+    cameras = [bounded.camera(frame, resolution) for frame in frames]
+    check_sides([*cameras, *(target.camera for target in targets)])
     return Task(
         [view.to(device) for view in bounded.views(frames, resolution)],
         [add_photograph(target, bounded, options) for target in targets],
@@ -281,13 +281,12 @@ def find_depth_sources(
     options: SceneOptions, given: Photographs, bounded: Photographs
 ) -> dict[str, str]:
     """Find the sources of `near` and `far`; `bounded` has those of the sparse points."""
-    holders = {"given": options, "scene": given, "points": bounded}
     estimate = "features" if options.scene is None else "splat"
-    sources = {"near": estimate, "far": estimate}
-    for name in sources:
-        known = [source for source, held in holders.items() if getattr(held, name) is not None]
-        sources[name] = known[0] if known else estimate
-    return sources
+    sources = {"given": options, "scene": given, "points": bounded}
+    return {
+        name: next((s for s, held in sources.items() if getattr(held, name) is not None), estimate)
+        for name in ("near", "far")
+    }
 
 
 def read_targets(given: Photographs, options: CompleteOptions) -> list[Target]:

@@ -83,11 +83,7 @@ def load_viewer_files(after: Path, before: Path | None, drop_nonfinite: bool) ->
 
 
 def load_viewer_completion(folder: Path, drop_nonfinite: bool) -> ViewerContent:
-    """Load an output folder of `complete`, with target and context cameras.
-
-    Raises:
-        InputError: The folder is no output of `complete`, or a file cannot be read.
-    """
+    """Load an output folder of `complete`, with target and context cameras."""
     summary = read_summary(folder)
     content = ViewerContent(
         folder.resolve().name,

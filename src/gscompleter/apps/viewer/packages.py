@@ -71,11 +71,7 @@ class Libraries:
 
 
 def load_libraries() -> Libraries:
-    """Load the libraries of the wheel, or in a source tree those of the pinned archives.
-
-    Raises:
-        InputError: They cannot be fetched, or differ from their hashes.
-    """
+    """Load the libraries of the wheel, or in a source tree those of the pinned archives."""
     if BUILT_LIBRARIES.is_file():
         return Libraries(**json.loads(BUILT_LIBRARIES.read_text(encoding="utf-8")))
     return extract_libraries(LOCK_FILE)

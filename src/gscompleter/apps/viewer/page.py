@@ -86,11 +86,7 @@ def compute_page_frame(gaussians: Gaussians) -> PageFrame:
 
 
 def make_page(viewer_content: ViewerContent, libraries: Libraries) -> Page:
-    """Make the page; the same values give the same bytes.
-
-    Raises:
-        InputError: Nothing is left to show.
-    """
+    """Make the page; the same values give the same bytes."""
     frame = compute_page_frame(viewer_content.after)
     layers = {
         name: frame.normalize(part.to("cpu")) for name, part in split_layers(viewer_content).items()
