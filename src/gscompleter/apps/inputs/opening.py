@@ -152,7 +152,7 @@ def refuse_splat(path: Path) -> None:
 
 
 def read_task(options: CompleteOptions, opened: Opened, device: str) -> Task:
-    """Read the photographs and targets of the options, if they fit into memory."""
+    """Read the photographs and targets of the options, after checking the memory."""
     given, resolution = opened.photographs, parse_resolution(options.resolution)
     targets = read_targets(given, options)
     frames = options.context or choose_context(options, given, targets)
