@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import sys
 import tempfile
 from pathlib import Path
@@ -17,30 +18,28 @@ class ViewerLibraries(BuildHookInterface[Any]):
     """Packs the pinned npm packages into wheel and sdist; the same lock gives the same bytes."""
 
     def initialize(self, version: str, build_data: dict[str, Any]) -> None:
-        """Fetch them, and say so where that cannot be: `view` does the same when it first runs.
-
-        Of an sdist, which has them, a wheel is built without a connection.
-        """
+        """Take the libraries of an sdist or fetch them; without a connection, warn only."""
         if version == "editable":
             return
-        place = PLACE if self.target_name == "wheel" else f"src/{PLACE}"
         packed = Path(self.root) / "src" / PLACE
-        if packed.is_file() or (packed := self.fetched()) is not None:
+        if not packed.is_file():
+            self.folder = tempfile.TemporaryDirectory()
+            packed = Path(self.folder.name) / "libraries.json"
+            self.fetch(packed)
+        if packed.is_file():
+            place = PLACE if self.target_name == "wheel" else f"src/{PLACE}"
             build_data["force_include"][str(packed)] = place
 
-    def fetched(self) -> Path | None:
-        """Return a file of the libraries; None, with a warning, where they cannot be had."""
+    def fetch(self, path: Path) -> None:
+        """Write the libraries to a file, or warn that `view` will fetch them when it first runs."""
         sys.path.insert(0, str(Path(self.root) / "src"))
-        from gscompleter.apps.viewer.packages import write_libraries
+        from gscompleter.apps.viewer.packages import LOCK_FILE, extract_libraries
         from gscompleter.errors import InputError
 
-        self.folder = tempfile.TemporaryDirectory()
-        packed = Path(self.folder.name) / "libraries.json"
         try:
-            write_libraries(packed)
+            libraries = extract_libraries(LOCK_FILE)
         except InputError as error:
-            self.app.display_warning(
-                f"This {self.target_name} comes without the viewer's libraries: {error}"
-            )
-            return None
-        return packed
+            self.app.display_warning(f"This {self.target_name} has no viewer libraries: {error}")
+        else:
+            text = json.dumps(vars(libraries), sort_keys=True, ensure_ascii=False)
+            path.write_text(text, encoding="utf-8")

@@ -84,18 +84,6 @@ def count_fitting_gaussians(number: int) -> int:
     return MAX_FROZEN_BYTES // (number * BYTES_PER_SPLAT)
 
 
-def count_fitting_images(pixels: int) -> int | None:
-    """Compute how many images of `pixels` fit into memory, or None if that is unknown.
-
-    Other programs are ignored, so that the same command always selects the same photographs.
-    """
-    available = read_memory_bytes()
-    if available is None:
-        return None
-    left = available - estimate_bytes(pixels, 0)
-    return max(0, left // (pixels * BYTES_PER_VIEW_PIXEL))
-
-
 def read_memory_bytes() -> int | None:
     """Return the memory of this machine or its container limit, or None if unknown."""
     found = []

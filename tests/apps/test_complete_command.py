@@ -14,15 +14,11 @@ from command import run
 from gscompleter import InputError, load_cameras, load_ply, save_ply
 from gscompleter.apps.commands import complete as command
 from gscompleter.apps.commands.evaluate import collect_tasks
-from gscompleter.apps.commands.options import CompleteOptions
-from gscompleter.apps.inputs import selection
-from gscompleter.apps.inputs.opening import Opened, Task, read_task
-from gscompleter.apps.inputs.plan import describe_memory
+from gscompleter.apps.inputs.opening import Opened, Task, estimate_memory, read_task
 from gscompleter.apps.inputs.selection import select_near_and_far
 from gscompleter.cli import parse_command
 from gscompleter.data.formats import open_photographs
 from gscompleter.data.scene import write_cameras
-from gscompleter.memory import count_fitting_images, estimate_bytes
 from gscompleter.types import View
 from pose_files import write_colmap_text, write_photographs
 from scenes import camera_at, photographed
@@ -93,62 +89,35 @@ def test_without_a_context_the_frames_that_matter_are_taken(chosen):
 
 
 def test_four_lines_come_before_the_work(scene, chosen):
-    out, (opened, found, plan, budget) = chosen
-    assert opened == (
-        f"Opened: {scene}, nerfstudio, 5 photographs, 1 camera with no lens distortion, no points."
-    )
+    out, (opened, found, plan, memory) = chosen
+    assert opened == f"Opened: {scene}, nerfstudio, 5 of 5 photographs."
     assert found.startswith("Found: the frame of the photographs; depths from ")
-    assert "to 20 (by matched features and as given); worked at 48 x 48 (the photog" in found
-    assert "have 64 x 64; --resolution full keeps that)." in found
+    assert found.endswith(" to 20; worked at 48 x 48 (--resolution changes it).")
     assert plan == (
-        "To do: context from frames 0, 1, 4 (chosen), completed for frame 2 by plane-sweep and "
+        "To do: complete the scene from frames 0, 1, 4 for target 2 by plane-sweep and "
         f"warp-inpaint on cpu, written to {out}."
     )
-    assert re.fullmatch(
-        r"Budget: at most 3 of 4 photographs for the context \(--context names others\), up to "
-        r"1 GB of [0-9,]+ GB of memory\.",
-        budget,
-    )
+    assert re.fullmatch(r"Memory: up to 1 GB of [0-9,]+ GB\.", memory)
 
 
-def opened_with(scene: Path, *words: object) -> tuple[CompleteOptions, Task]:
+def opened_with(scene: Path, *words: object) -> Task:
     """Open `scene` with these options; nothing is completed."""
     options = parse_command([str(word) for word in ("complete", scene, *words, "--out", "OUT")])
     photographs = open_photographs(scene, near=0.5, far=20.0)
-    return options, read_task(options, Opened(photographs, "nerfstudio", 5), "cpu")
-
-
-def test_fewer_photographs_are_chosen_where_there_is_no_memory_for_more(scene, monkeypatch):
-    pixels = SIZE * SIZE
-    for fit, chosen in ((9, 3), (3, 2), (0, 2)):
-        monkeypatch.setattr(selection, "count_fitting_images", lambda _pixels, fit=fit: fit)
-        _, task = opened_with(scene, "--target", TARGET)
-        assert len(task.views) == chosen
-        said = task.context_note
-        assert said.startswith(f"at most {chosen} of 4 photographs for the context")
-        assert (" (memory is too small for 3) (" in said) == (chosen < 3)
-    for memory in (estimate_bytes(pixels, 3), estimate_bytes(pixels, 3) - 1):
-        monkeypatch.setattr("gscompleter.memory.read_memory_bytes", lambda memory=memory: memory)
-        assert count_fitting_images(pixels) == (3 if memory == estimate_bytes(pixels, 3) else 2)
+    return read_task(options, Opened(photographs, "nerfstudio", 5), "cpu")
 
 
 def test_a_context_that_is_named_is_the_one_that_is_taken(scene):
-    options, task = opened_with(scene, "--target", TARGET, "--context", 0, 4)
+    task = opened_with(scene, "--target", TARGET, "--context", 0, 4)
     assert [view.frame for view in task.views] == [0, 4]
-    assert task.context_note == "2 photographs for the context, as named"
-    assert describe_memory(options, task).startswith("up to 1 GB ")
 
 
-def test_the_memory_that_is_said_grows_with_pixels(scene):
-    options, pair = opened_with(scene, "--target", TARGET, "--context", 0, 4)
-
-    def large(task: Task, side: int) -> Task:
-        cameras = [replace(view.camera, width=side, height=side) for view in task.views]
-        image = torch.zeros(1, 1, 3).expand(side, side, 3)
-        views = [View(image, camera) for camera in cameras]
-        return replace(task, views=views)
-
-    assert "up to 4 GB of " in describe_memory(options, large(pair, 1000))
+def test_the_estimated_memory_grows_with_pixels(scene):
+    task = opened_with(scene, "--target", TARGET, "--context", 0, 4)
+    cameras = [replace(view.camera, width=1000, height=1000) for view in task.views]
+    image = torch.zeros(1, 1, 3).expand(1000, 1000, 3)
+    large = replace(task, views=[View(image, camera) for camera in cameras])
+    assert estimate_memory(task, None) < 1e9 < 3e9 < estimate_memory(large, None) < 4e9
 
 
 def test_the_summary_says_what_was_opened_and_between_which_depths(chosen):
@@ -168,11 +137,11 @@ def test_too_few_photographs_beside_the_targets_are_refused(scene, tmp_path, mon
     words = ["complete", scene, "--out", tmp_path / "out", "--target", 0, 1, 2, 3]
     assert run(monkeypatch, *words) == 2
     assert (
-        "1 usable photograph is left without the targets, and the context needs at least 2;"
+        "The context needs at least 2 photographs, and without the targets 1 can be used;"
     ) in capsys.readouterr().err
     assert run(monkeypatch, *words, 4) == 2
     assert (
-        "0 usable photographs are left without the targets, and the context needs at least 2;"
+        "The context needs at least 2 photographs, and without the targets 0 can be used;"
     ) in capsys.readouterr().err
 
 

@@ -22,16 +22,13 @@ from command import run
 from gscompleter import load_ply, save_ply
 from gscompleter.apps.commands import live
 from gscompleter.apps.commands.options import LiveOptions
-from gscompleter.apps.live.conversion import (
+from gscompleter.apps.live.page import (
+    Page,
     camera_from_page,
     camera_to_page,
     compute_page_unit,
-    make_page_splat,
-)
-from gscompleter.apps.live.page import (
-    Page,
-    PageServices,
     describe_outcome,
+    make_page_splat,
     run_request,
     start_server,
 )
@@ -41,10 +38,10 @@ from gscompleter.config import CompleterConfig
 from gscompleter.errors import InputError
 from gscompleter.geometry import measure_rotation
 from gscompleter.progress import notify_of_stages
-from gscompleter.splat_alignment.similarity import make_similarity
+from gscompleter.splat_alignment.similarity import make_similarity, transform_camera
 from gscompleter.splats.transform import transform_gaussians
 from gscompleter.timing import STAGES
-from gscompleter.types import merge
+from gscompleter.types import Camera, merge
 from scenes import Room, camera_at, gaussians_of, photographed, random_gaussians, view_of
 
 SIZE = 48
@@ -123,14 +120,13 @@ def the_same_as_complete(monkeypatch, ready: live.Prepared, tmp_path: Path, *mor
 
 
 def test_what_is_saved_is_what_complete_writes(ready, begun, tmp_path, monkeypatch):
-    saver = live.Saver(ready)
     with pytest.raises(InputError, match="nothing to save"):
-        saver.save(begun)
+        live.save_session(ready, begun)
     session, _ = complete_camera(begun, HOLES[0])
-    assert str(ready.options.out) in saver.save(session)
+    assert str(ready.options.out) in live.save_session(ready, session)
     assert the_same_as_complete(monkeypatch, ready, tmp_path)
     session, _ = complete_camera(session, HOLES[1])
-    saver.save(session)  # replaces its own files
+    live.save_session(ready, session)  # replaces its own files
     assert len(json.loads((ready.options.out / "summary.json").read_text())["targets"]) == 2
     assert the_same_as_complete(monkeypatch, ready, tmp_path, "--overwrite")
 
@@ -156,14 +152,11 @@ def test_what_is_saved_of_a_splat_in_a_frame_of_its_own_is_too(tmp_path, monkeyp
     ready = live.prepare(options, QUIET)
     assert ready.task.method == "dataparser"
     session = live.begin_session(ready)
-    target = session.conversion.convert_to_result(HOLES[0])
+    target = transform_camera(HOLES[0], ready.task.frame)
     session, result = complete_camera(session, target)
     assert len(result.added) > 0
     assert torch.allclose(session.steps[0].camera.c2w.float(), HOLES[0].c2w, atol=1e-6)
-    assert torch.equal(
-        session.conversion.convert_to_result(session.steps[0].camera).c2w, result.target.c2w
-    )
-    live.Saver(ready).save(session)
+    live.save_session(ready, session)
     assert the_same_as_complete(monkeypatch, ready, tmp_path, "--scene", options.scene)
 
 
@@ -177,7 +170,7 @@ def test_an_antialiased_splat_is_named_so_and_saved_as_one(room, tmp_path):
     assert "antialiased Gaussians of SH degree 0" in said
     assert "The page renders antialiased Gaussians as classic ones" in said
     session, _ = complete_camera(live.begin_session(ready), HOLES[0])
-    live.Saver(ready).save(session)
+    live.save_session(ready, session)
     for name in ("context.ply", "completed.ply", "generated.ply"):
         assert load_ply(tmp_path / "out" / name).is_antialiased, name
 
@@ -210,7 +203,7 @@ def test_a_camera_of_the_page_is_the_one_it_was_made_of(unit):
 def test_a_splat_of_any_unit_survives_the_pages_precision(unit):
     gaussians = random_gaussians(100)
     scaled = replace(gaussians, means=unit * gaussians.means, scales=unit * gaussians.scales)
-    splat = make_page_splat(scaled, 1.0, tinted=False)
+    splat = make_page_splat(scaled, 1.0)
     axes = Rotation.from_quat(gaussians.quats.numpy(), scalar_first=True).as_matrix()
     true = axes @ (gaussians.scales.numpy()[:, :, None] ** 2 * axes.transpose(0, 2, 1))
     shown = (
@@ -218,13 +211,6 @@ def test_a_splat_of_any_unit_survives_the_pages_precision(unit):
     )
     assert np.abs(shown - true).max() < 1e-3 * np.abs(true).max()
     assert np.allclose(splat["centers"] * splat["scale"], scaled.means, rtol=1e-5)
-
-
-def test_a_tint_changes_colours_alone():
-    gaussians = random_gaussians(10)
-    plain, tinted = (make_page_splat(gaussians, 1.0, tinted=tint) for tint in (False, True))
-    assert np.abs(plain["rgbs"] - tinted["rgbs"]).max() > 0.1
-    assert np.array_equal(plain["covariances"], tinted["covariances"])
 
 
 def test_an_error_is_a_sentence_and_ends_nothing(capsys):
@@ -241,48 +227,44 @@ def test_an_error_is_a_sentence_and_ends_nothing(capsys):
 
 @pytest.fixture
 def page(begun) -> Iterator[Page]:
-    subject = PageServices(begun, begun.latest.views, lambda _: None, lambda _: "Saved.")
-    page = Page(subject, "127.0.0.1", 0)
+    server = start_server("127.0.0.1", 0)
+    page = Page(begun, lambda _: None, lambda _: "Saved.", server)
     yield page
     page.close()
 
 
-def test_what_was_generated_is_shown_tinted_or_hidden_and_undone(page, begun):
-    client, seen = Mock(spec=viser.ClientHandle), camera_to_page(HOLES[0], page._unit)
-    assert "Completed" in page.complete(client, seen)
-    assert len(page._targets) == 1
-    shown = page._generated.buffer.copy()
-    assert len(shown) == len(page.session.latest.added)
-    page._generated_mode.value = "hide"
-    assert page._generated is None
-    page._generated_mode.value = "tint"
-    assert len(page._generated.buffer) == len(shown)
-    assert not np.array_equal(page._generated.buffer, shown)
-    assert "0 completions are left" in page.undo(client, seen)
+def browser_at(page: Page, camera: Camera) -> MagicMock:
+    """Make a browser that shows the scene from a camera."""
+    seen = camera_to_page(camera, page._unit)
+    view = Mock(wxyz=seen.wxyz, position=seen.position, fov=seen.fov)
+    return MagicMock(spec=viser.ClientHandle, camera=view)
+
+
+def test_what_was_generated_is_shown_and_undone(page, begun):
+    client = browser_at(page, HOLES[0])
+    assert "Completed" in page.complete(client)
+    assert len(page._generated.buffer) == len(page.session.latest.added)
+    assert page.undo(client) == "Undone. Completions left: 0."
     assert page.session == begun
     assert page._generated is None
-    assert page._targets == []
 
 
-def test_photographs_near_a_camera_that_is_jumped_to_make_way(page):
-    client = MagicMock(spec=viser.ClientHandle, camera=Mock())
-    first, second = (camera_to_page(view.camera, page._unit) for view in page.subject.photographs)
-    assert not page._photographs[0].visible  # where browsers begin
-    page._move_browser(client, second)
-    assert np.array_equal(client.camera.position, second.position)
-    assert not page._photographs[1].visible
-    page._move_browser(client, replace(first, position=first.position - 5))
-    assert all(frustum.visible for frustum in page._photographs)
+def test_photographs_are_visited_one_after_the_other(page):
+    client = browser_at(page, HOLES[0])
+    for view in (*page.session.latest.views, page.session.latest.views[0]):
+        page.visit_photograph(client)
+        expected = camera_to_page(view.camera, page._unit)
+        assert np.array_equal(client.camera.position, expected.position)
+        assert client.camera.fov == expected.fov
 
 
 def test_what_is_said_stays_text(page):
     page.show_message("<b>A</b> & B\nmore")
-    assert "<b>&lt;b&gt;A&lt;/b&gt; &amp; B</b><br>more" in page._status.content
+    assert "&lt;b&gt;A&lt;/b&gt; &amp; B<br>more" in page._status.content
 
 
 def test_one_thing_is_done_at_a_time(page):
-    client = Mock(spec=viser.ClientHandle)
-    client.camera = Mock(wxyz=np.array([1.0, 0, 0, 0]), position=np.zeros(3), fov=1.0)
+    client = browser_at(page, HOLES[0])
     event = Mock(spec=viser.GuiEvent, client=client)
     page._submit(page.undo, event)
     assert client.add_notification.call_count == 0

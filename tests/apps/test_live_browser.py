@@ -86,7 +86,7 @@ def test_a_hole_that_is_flown_to_closes_opens_again_and_is_saved(
     press(page, "Complete what I see")
     assert "Gaussians are added" in wait_for(page, "Completed in")
     press(page, "Undo")
-    wait_for(page, "Undone: 0 completions are left.")
+    wait_for(page, "Undone. Completions left: 0.")
     press(page, "Find a hole")
     wait_for(page, "The scene has a hole here")
     press(page, "Complete what I see")

@@ -19,6 +19,7 @@ import pytest
 import torch
 
 from command import run
+from gscompleter.apps.commands.view import make_page_server
 from gscompleter.apps.report.schema import (
     AlignmentRow,
     CompletionSummary,
@@ -27,6 +28,7 @@ from gscompleter.apps.report.schema import (
     SceneRow,
     TargetRow,
 )
+from gscompleter.apps.viewer import packages
 from gscompleter.apps.viewer import page as pages
 from gscompleter.apps.viewer.exhibit import (
     ViewerCamera,
@@ -36,7 +38,6 @@ from gscompleter.apps.viewer.exhibit import (
 )
 from gscompleter.apps.viewer.packages import (
     MODULES,
-    REGISTRY_VARIABLE,
     Libraries,
     NpmPackage,
     extract_libraries,
@@ -44,10 +45,8 @@ from gscompleter.apps.viewer.packages import (
     get_archive_path,
     load_libraries,
     read_lock,
-    write_libraries,
 )
 from gscompleter.apps.viewer.page import Page, make_page
-from gscompleter.apps.viewer.server import make_page_server
 from gscompleter.data.scene import write_cameras
 from gscompleter.errors import InputError
 from gscompleter.evaluation.metrics.coverage import Coverage
@@ -73,7 +72,7 @@ def content_of(page: Page) -> dict:
 
 def gaussians_in(page: Page, layer: str, folder: Path) -> Gaussians:
     """Read a layer of a page."""
-    calls = re.findall(rb'gscPart\("(\w+)", "([^"]*)"\)', page.html + b"".join(page.parts.values()))
+    calls = re.findall(rb'gscPart\("(\w+)", "([^"]*)"\)', page.html)
     source = content_of(page)["layers"][layer].encode()
     path = folder / f"{layer}.spz"
     path.write_bytes(b"".join(base64.b64decode(text) for name, text in calls if name == source))
@@ -87,7 +86,7 @@ def gaussians_in(page: Page, layer: str, folder: Path) -> Gaussians:
 def registry(tmp_path, monkeypatch) -> Path:
     """Return the lock of a registry that is a folder, with a cache that is empty."""
     monkeypatch.setenv("GSCOMPLETER_HOME", str(tmp_path / "home"))
-    monkeypatch.setenv(REGISTRY_VARIABLE, (tmp_path / "registry").as_uri())
+    monkeypatch.setattr(packages, "REGISTRY", (tmp_path / "registry").as_uri())
     files: dict[str, dict[str, str]] = {}
     for package, file in MODULES.values():
         files.setdefault(package, {"LICENSE": f"of {package}"})[file] = f"// {package} {file}"
@@ -118,9 +117,9 @@ def three_of(lock: Path) -> NpmPackage:
 
 
 def test_the_lock_pins_every_package_by_its_hash():
-    packages = read_lock(Path(pages.__file__).with_name("package-lock.json"))
-    assert {package.name for package in packages} == {"three", "@sparkjsdev/spark", "fflate"}
-    for package in packages:
+    pinned = read_lock(packages.LOCK_FILE)
+    assert {package.name for package in pinned} == {"three", "@sparkjsdev/spark", "fflate"}
+    for package in pinned:
         assert package.path.endswith(f"-{package.version}.tgz")
         assert len(base64.b64decode(package.integrity.removeprefix("sha512-"))) == 64
 
@@ -144,7 +143,7 @@ def test_an_archive_that_was_tampered_with_is_refused_and_not_kept(registry):
     three = three_of(registry)
     source = archive_in(registry.parent, three)
     source.write_bytes(source.read_bytes() + b"\0")
-    with pytest.raises(InputError, match="is not three 1.2.3: its SHA-512 differs"):
+    with pytest.raises(InputError, match="its SHA-512 differs"):
         get_archive(three)
     assert not get_archive_path(three).exists()
 
@@ -160,20 +159,19 @@ def test_a_damaged_archive_in_the_cache_is_fetched_again(registry):
 def test_without_a_connection_a_sentence_says_where_to_put_what(registry):
     three = three_of(registry)
     archive_in(registry.parent, three).unlink()
-    with pytest.raises(InputError, match="cannot be reached") as refused:
+    with pytest.raises(InputError, match="cannot be fetched") as refused:
         get_archive(three)
     sentence = refused.value.args[0]  # in full, because folders of a test may be long
     assert three.path in sentence
     assert str(get_archive_path(three)) in sentence
 
 
-def test_a_wheel_needs_no_connection_and_its_libraries_are_the_same_bytes(registry, tmp_path):
-    written = [tmp_path / f"{n}.json" for n in range(2)]
-    for path in written:
-        write_libraries(path, registry)
-    assert written[0].read_bytes() == written[1].read_bytes()
-    built = load_libraries(lock=tmp_path / "nowhere", built=written[0])
-    assert built == extract_libraries(registry)
+def test_a_wheel_needs_no_connection(registry, tmp_path, monkeypatch):
+    libraries, built = extract_libraries(registry), tmp_path / "libraries.json"
+    built.write_text(json.dumps(vars(libraries)))
+    monkeypatch.setattr(packages, "BUILT_LIBRARIES", built)
+    monkeypatch.setattr(packages, "LOCK_FILE", tmp_path / "nowhere")
+    assert load_libraries() == libraries
 
 
 # ---------------------------------------------------------------------------------- the page
@@ -245,14 +243,11 @@ def test_a_page_names_nothing_outside_of_itself():
     assert not re.search(r"\b(src|href)=", text)
 
 
-def test_a_large_scene_lies_beside_its_page(tmp_path, monkeypatch):
+def test_a_large_scene_is_held_in_parts(tmp_path, monkeypatch):
     whole = make_page(room_exhibit(), NONE)
-    monkeypatch.setattr(pages, "LARGEST_PAGE", 1000)
     monkeypatch.setattr(pages, "PART", 20_000)
-    page = make_page(room_exhibit(), NONE, "my #page")
-    assert len(page.parts) > 2
-    assert re.findall(r'src="([^"]*)"', page.html.decode())[0] == "my%20%23page.1.js"
-    assert next(iter(page.parts)) == "my #page.1.js"
+    page = make_page(room_exhibit(), NONE)
+    assert page.html.count(b'gscPart("') > 2
     for layer in ("observed", "generated"):
         assert torch.equal(
             gaussians_in(page, layer, tmp_path).means, gaussians_in(whole, layer, tmp_path).means
@@ -264,7 +259,7 @@ def test_floaters_beyond_all_measure_are_left_out_and_counted():
     means = exhibit.after.means.clone()
     means[:3] = 1e9
     page = make_page(replace(exhibit, after=replace(exhibit.after, means=means), before=None), NONE)
-    assert page.num_omitted == 3
+    assert page.notes == ("3 Gaussians are too far away to be shown.",)
     assert content_of(page)["counts"]["observed"] == SIDE * SIDE - 3
 
 
@@ -389,7 +384,7 @@ def test_photographs_whose_cameras_were_found_are_jumped_to(tmp_path):
 
 
 def test_a_folder_that_is_no_completion_is_refused(tmp_path):
-    with pytest.raises(InputError, match=r"has no completed\.ply"):
+    with pytest.raises(InputError, match=r"has no summary\.json"):
         load_viewer_completion(tmp_path, False)
 
 
@@ -421,7 +416,7 @@ def test_the_second_scene_is_the_one_after(packed, tmp_path, monkeypatch):
     save_ply(tmp_path / "b.ply", exhibit.after)
     page = tmp_path / "page.html"
     assert run(monkeypatch, "view", tmp_path / "a.ply", tmp_path / "b.ply", "--save", page) == 0
-    counts = content_of(Page(page.read_bytes(), {}, 0))["counts"]
+    counts = content_of(Page(page.read_bytes(), ()))["counts"]
     assert counts == {"before": 50, "observed": SIDE * SIDE, "generated": SIDE * SIDE}
 
 
@@ -432,7 +427,7 @@ def test_cameras_bring_their_photographs_as_thumbnails(packed, tmp_path, monkeyp
     page = tmp_path / "page.html"
     cameras = ("--cameras", tmp_path / "transforms.json")
     assert run(monkeypatch, "view", tmp_path / "a.ply", *cameras, "--save", page) == 0
-    shots = content_of(Page(page.read_bytes(), {}, 0))["shots"]
+    shots = content_of(Page(page.read_bytes(), ()))["shots"]
     assert [(shot["name"], shot["title"]) for shot in shots] == [
         ("camera-1", "left.png"),
         ("camera-2", "gone.png"),
@@ -446,7 +441,7 @@ def test_cameras_of_a_colmap_folder_are_jumped_to(packed, tmp_path, monkeypatch)
     (folder / "colmap" / "images" / NAMES[1]).unlink()
     cameras = ("--cameras", folder / "colmap")
     assert run(monkeypatch, "view", folder, *cameras, "--save", page) == 0
-    shots = content_of(Page(page.read_bytes(), {}, 0))["shots"]
+    shots = content_of(Page(page.read_bytes(), ()))["shots"]
     found = [shot for shot in shots if shot["name"].startswith("camera-")]
     assert [shot["title"] for shot in found] == NAMES
     assert [shot["thumbnail"] is None for shot in found] == [False, True, False, False, False]
@@ -508,8 +503,8 @@ def test_without_a_file_to_save_to_the_page_is_served_and_opened(
 
 @pytest.fixture
 def port() -> Iterator[int]:
-    """Return the port of a server of a page with one part."""
-    with make_page_server(Page(b"<!doctype html>", {"my page.1.js": b"gscPart()"}, 0)) as server:
+    """Return the port of a server of a page."""
+    with make_page_server(b"<!doctype html>") as server:
         thread = threading.Thread(target=server.serve_forever)
         thread.start()
         yield server.server_address[1]
@@ -525,10 +520,8 @@ def answer(port: int, method: str, path: str, host: str) -> tuple[int, bytes]:
 
 
 @pytest.mark.parametrize("host", ["127.0.0.1:1234", "localhost", "LOCALHOST:80"])
-def test_this_machine_gets_the_page_and_its_parts(port, host):
+def test_this_machine_gets_the_page(port, host):
     assert answer(port, "GET", "/", host) == (200, b"<!doctype html>")
-    assert answer(port, "GET", "/my%20page.1.js", host) == (200, b"gscPart()")
-    assert answer(port, "HEAD", "/", host) == (200, b"")
 
 
 @pytest.mark.parametrize("host", ["evil.example", "127.0.0.1.evil.example:80", "", "[::1]"])
@@ -543,11 +536,11 @@ def test_nothing_else_is_served(port, path):
     assert answer(port, "GET", path, "localhost")[0] == 404
 
 
-@pytest.mark.parametrize("method", ["POST", "PUT", "DELETE", "OPTIONS"])
+@pytest.mark.parametrize("method", ["POST", "PUT", "DELETE", "OPTIONS", "HEAD"])
 def test_nothing_can_be_sent(port, method):
     assert answer(port, method, "/", "localhost")[0] == 501
 
 
 def test_a_port_that_is_taken_gets_a_sentence(port):
     with pytest.raises(InputError, match=f"Port {port}"):
-        make_page_server(Page(b"", {}, 0), port)
+        make_page_server(b"", port)

@@ -219,22 +219,15 @@ def test_a_link_opens_at_its_camera(browser, saved):
     tab.context.close()
 
 
-def test_parts_beside_the_page_are_read_from_its_folder(
+def test_the_parts_of_a_large_scene_are_put_together(
     browser, exhibit, libraries, tmp_path, monkeypatch
 ):
-    monkeypatch.setattr(pages, "LARGEST_PAGE", 1000)
     monkeypatch.setattr(pages, "PART", 100_000)
-    page = make_page(exhibit, libraries, "my #page")
-    (tmp_path / "my #page.html").write_bytes(page.html)
-    for name, part in page.parts.items():
-        (tmp_path / name).write_bytes(part)
-    tab = Window(browser, tmp_path / "my #page.html", 320, 240)
+    (tmp_path / "page.html").write_bytes(make_page(exhibit, libraries).html)
+    tab = Window(browser, tmp_path / "page.html", 320, 240)
     assert tab.do("gsc.stats()")["frames"] > 0
     assert tab.errors == []
     tab.context.close()
-    (tmp_path / next(iter(page.parts))).unlink()
-    with pytest.raises(Exception, match="files that have to lie beside this page are missing"):
-        Window(browser, tmp_path / "my #page.html", 320, 240)
 
 
 def test_antialiased_gaussians_are_those_of_our_renderer(browser, libraries, tmp_path):

@@ -82,7 +82,7 @@ def test_the_same_sources_give_the_same_bytes_wherever_they_lie(
 ):
     """An sdist contains the viewer's libraries, and so needs no connection."""
     monkeypatch.setenv("GSCOMPLETER_HOME", str(tmp_path / "nothing"))
-    monkeypatch.setenv("npm_config_registry", "http://127.0.0.1:9")
+    monkeypatch.setenv("https_proxy", "http://127.0.0.1:9")
     assert built("wheel", tmp_path / "wheel", unpacked).read_bytes() == wheel.read_bytes()
     assert built("sdist", tmp_path / "sdist", unpacked).read_bytes() == sdist.read_bytes()
 

@@ -3,9 +3,9 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from pathlib import Path
-from statistics import fmean
 from typing import Any
 
 import numpy as np
@@ -31,22 +31,16 @@ from gscompleter.apps.inputs.opening import (
     print_lines,
     read_task,
 )
-from gscompleter.apps.inputs.plan import describe_task
+from gscompleter.apps.inputs.plan import describe_task, name_target
 from gscompleter.apps.inputs.selection import collect_usable_cameras
 from gscompleter.apps.report.completion import Surroundings, Target, write_report
-from gscompleter.apps.report.completion_page import render_completion_page
-from gscompleter.apps.report.film import VIDEO_FILE, write_comparison_video
+from gscompleter.apps.report.completion_page import average_scores, render_completion_page
+from gscompleter.apps.report.film import write_comparison_video
 from gscompleter.apps.report.page import REPORT_FILE, write_page
-from gscompleter.apps.report.plain_words import (
-    NO_TARGET_NOTE,
-    describe_exposures,
-    describe_ignored,
-    describe_motion,
-    describe_new_photographs,
-)
+from gscompleter.apps.report.plain_words import format_number, format_percent, list_scene_notes
+from gscompleter.apps.report.schema import CompletionSummary, read_summary
 from gscompleter.apps.warmup import SPLAT_PART, compile_kernels
 from gscompleter.completer import GSCompleter, check_target_ids
-from gscompleter.config import CompleterConfig
 from gscompleter.config.generators import get_settings_class
 from gscompleter.data.local_origin import compute_frame_from_photographs
 from gscompleter.data.scene import write_cameras
@@ -67,11 +61,7 @@ from gscompleter.splats.formats import load_splat
 from gscompleter.splats.morton import argsort_nearby
 from gscompleter.state import Completion
 from gscompleter.timing import add_seconds, record_seconds, timed_stage
-from gscompleter.types import Camera, View
-
-LIFTED_VIEWS = 3
-"""Time to complete a target, relative to the reconstruction of one photograph. Measured: 1.8 to 3.3
-(docs/performance.md)."""
+from gscompleter.types import Camera
 
 
 @dataclass(frozen=True)
@@ -103,56 +93,49 @@ class Prepared:
         return replace(self, task=replace(self.task, targets=targets))
 
 
-@dataclass(frozen=True)
-class Plan:
-    """Targets and the time of a completion."""
-
-    task: Task
-    holes: Sequence[float]
-    """Hole fraction of each target, after completion of the previous ones."""
-    context_seconds: float
-
-
 def run_completion(options: CompleteOptions) -> None:
     """Complete the scene, and print a summary."""
     if options.dry_run:
         plan_folder(options)
         return
-    summary = complete_folder(options)
+    complete_folder(options)
     if not options.quiet:
-        print_completion(summary, options)
+        print_completion(options)
 
 
 def complete_folder(options: CompleteOptions) -> dict[str, Any]:
     """Complete the scene, write `options.out`, and return the summary."""
     if options.video:
         find_ffmpeg()
-    console = Console(stderr=True, quiet=options.quiet)
-    with show_progress(console):
-        ready = prepare_completion(options, console)
-        print_lines(console, *describe_task(options, ready.opened, ready.task))
-        with open_output_folder(options.out, is_replaceable(options)) as folder:
-            completion, ready = complete_targets(ready)
-            with stage("report"):
-                summary = write_done(folder, ready, completion)
-                write_targets(folder, ready.task)
-            if options.video:
-                photographs, renderer = list(ready.cameras.values()), ready.completer.renderer
-                write_comparison_video(folder, completion, photographs, renderer)
+    with open_completion(options) as (ready, folder):
+        completion, ready = complete_targets(ready)
+        with stage("report"):
+            summary = write_done(folder, ready, completion)
+            write_targets(folder, ready.task)
+        if options.video:
+            photographs, renderer = list(ready.cameras.values()), ready.completer.renderer
+            write_comparison_video(folder, completion, photographs, renderer)
     return summary
 
 
 def plan_folder(options: CompleteOptions) -> None:
     """Write the targets and print the plan, without completing the scene."""
+    with open_completion(options) as (ready, folder):
+        task, holes = plan_completion(ready)
+        write_targets(folder, task)
+    if not options.quiet:
+        print_plan(options, task.targets, holes)
+
+
+@contextmanager
+def open_completion(options: CompleteOptions) -> Iterator[tuple[Prepared, Path]]:
+    """Load everything, print the input, and open the output folder."""
     console = Console(stderr=True, quiet=options.quiet)
     with show_progress(console):
         ready = prepare_completion(options, console)
         print_lines(console, *describe_task(options, ready.opened, ready.task))
         with open_output_folder(options.out, is_replaceable(options)) as folder:
-            plan = plan_completion(ready)
-            write_targets(folder, plan.task)
-    if not options.quiet:
-        print_plan(options, plan)
+            yield ready, folder
 
 
 def write_done(folder: Path, ready: Prepared, completion: Completion) -> dict[str, Any]:
@@ -237,93 +220,62 @@ def describe_settings(options: CompleteOptions) -> dict[str, Any]:
 
 def load_completer(options: CompleteOptions, targets: Sequence[Target], device: str) -> GSCompleter:
     """Load the models of the options."""
-    photographs = [
-        View(target.photograph, target.camera, target.frame)
-        for target in targets
-        if target.photograph is not None
-    ]
-    name, settings = options.synthesis.generator, options.synthesis.make_settings()
+    photographs = [target.view for target in targets if target.view is not None]
+    synthesis, config = options.synthesis, options.config
+    if options.no_recolor:
+        config = replace(config, recolor=replace(config.recolor, iterations=0))
     return GSCompleter(
         load_reconstructor(options.reconstructor, options.weights, device),
-        load_generator(name, options.seed, photographs, device, settings),
+        load_generator(
+            synthesis.generator, options.seed, photographs, device, synthesis.make_settings()
+        ),
         load_renderer(device),
-        get_stage_config(options),
+        config,
         options.seed,
     )
 
 
-def get_stage_config(options: CompleteOptions) -> CompleterConfig:
-    """Return the settings, changed by options that have a name of their own."""
-    config = options.config
-    if options.no_recolor:
-        return replace(config, recolor=replace(config.recolor, iterations=0))
-    return config
-
-
-def print_completion(summary: Mapping[str, Any], options: CompleteOptions) -> None:
+def print_completion(options: CompleteOptions) -> None:
     """Print the scores per camera, the notes, and the location of the results."""
-    console = Console(highlight=False)
+    console, summary = Console(highlight=False), read_summary(options.out)
     console.print(make_score_table(summary))
-    for row in summary["targets"]:
-        for note in row["notes"]:
-            console.print(f"{name_target(row['frame'], row['derived_from'])}: {note}")
+    for row in summary.targets:
+        for note in row.notes:
+            console.print(f"{row.name}: {note}")
     for sentence in describe_result(summary, options):
         console.print(sentence, soft_wrap=True)
 
 
-def make_score_table(summary: Mapping[str, Any]) -> Table:
+def make_score_table(summary: CompletionSummary) -> Table:
     """Make the table of PSNR before and after at each camera."""
     table = Table("camera", "hole", "PSNR before", "PSNR after", "added", box=None)
-
-    def format_scores(row: Mapping[str, Any]) -> Iterable[str]:
-        scores = row["psnr_before"], row["psnr_after"]
-        return ("–" if score is None else f"{score:.2f}" for score in scores)
-
-    for row in summary["context"]:
-        table.add_row(f"context {row['frame']}", "", *format_scores(row), "")
-    for row in summary["targets"]:
-        name, hole = name_target(row["frame"], row["derived_from"]), row["hole_fraction"]
-        table.add_row(name, f"{100 * hole:.1f} %", *format_scores(row), f"{row['added']:,}")
+    for row in summary.context:
+        scores = format_number(row.psnr_before), format_number(row.psnr_after)
+        table.add_row(f"context {row.frame}", "", *scores, "")
+    for target in summary.targets:
+        scores = format_number(target.psnr_before), format_number(target.psnr_after)
+        hole = format_percent(target.hole_fraction)
+        table.add_row(f"target: {target.name}", hole, *scores, f"{target.added:,}")
     return table
 
 
-def describe_result(summary: Mapping[str, Any], options: CompleteOptions) -> Iterator[str]:
+def describe_result(summary: CompletionSummary, options: CompleteOptions) -> Iterator[str]:
     """Write the sentences below the table."""
-    context = summary["context"]
-    notes = (
-        describe_exposures(row["exposure_gain"] for row in context),
-        describe_motion({row["frame"]: row["dynamic_fraction"] for row in context}),
-        describe_ignored(row["ignored"] for row in context),
-        describe_new_photographs(summary.get("new_photographs")),
-    )
-    yield from filter(None, notes)
-    origin = summary["frame"]["origin"]
-    if any(origin):
-        yield (
-            f"The coordinates are very large, so the result has its origin at "
-            f"{' '.join(map(str, origin))}; summary.json has the transform."
-        )
-    if not summary["targets"]:
-        yield NO_TARGET_NOTE
-    elif options.video:
-        yield f"Video: {options.out / VIDEO_FILE}"
-    before, after = (100 * summary["coverage"][when] for when in ("before", "after"))
-    share = "Trusted" if summary["settings"]["config"]["trust"] == "photometric" else "Coverage"
-    yield f"{share} around the photographs: {before:.1f} % before, {after:.1f} % after."
-    unused = [row for row in summary["held_out"] if not row["is_check"]]
+    yield from list_scene_notes(summary)
+    share = "Trusted" if summary.settings["config"]["trust"] == "photometric" else "Coverage"
+    before, after = map(format_percent, (summary.coverage.before, summary.coverage.after))
+    yield f"{share} around the photographs: {before} before, {after} after."
+    unused = [row for row in summary.held_out if not row.is_check]
     if unused:
-        before, after = (
-            fmean(row[f"psnr_{when}"] for row in unused) for when in ("before", "after")
-        )
+        mean = average_scores(unused)
         yield (
-            f"Mean PSNR of {len(unused)} photographs that were not used: {before:.2f} dB before, "
-            f"{after:.2f} dB after."
+            f"Mean PSNR of {len(unused)} photographs that were not used: "
+            f"{format_number(mean.psnr_before)} dB before, "
+            f"{format_number(mean.psnr_after)} dB after."
         )
-    counts, seconds = summary["gaussians"], summary["seconds"]["total"]
+    counts, seconds = summary.gaussians, summary.seconds["total"]
     yield (
-        f"Added {counts['added']:,} Gaussians to {counts['context']:,}"
-        f"{', recoloured ' + format(counts['recolored'], ',') if 'recolored' in counts else ''}"
-        f" in {seconds:.1f} s: "
+        f"Added {counts['added']:,} Gaussians to {counts['context']:,} in {seconds:.1f} s: "
         f"{options.out / COMPLETED_FILE}"
     )
     yield f"Report: {options.out / REPORT_FILE}"
@@ -355,50 +307,27 @@ def complete_targets(ready: Prepared) -> tuple[Completion, Prepared]:
     return completion, ready.with_choices(choices)
 
 
-def plan_completion(ready: Prepared) -> Plan:
-    """Plan the completion without running it."""
-    begun = ready.begin()
-    context_seconds = begun.seconds["context"]
-    if ready.task.targets:
-        holes = ready.explorer.compute_hole_fractions(begun, ready.task.target_cameras)
-        return Plan(ready.task, holes, context_seconds)
+def plan_completion(ready: Prepared) -> tuple[Task, Sequence[float]]:
+    """Find the targets, and the hole fraction of each after those before it are completed."""
+    begun, targets = ready.begin(), ready.task.target_cameras
+    if targets:
+        return ready.task, ready.explorer.compute_hole_fractions(begun, targets)
     cameras = list(ready.cameras.values())
     choices = ready.explorer.plan(begun, cameras, get_max_targets(ready.options))
-    holes = [choice.hole_fraction for choice in choices]
-    return Plan(ready.with_choices(choices).task, holes, context_seconds)
+    return ready.with_choices(choices).task, [choice.hole_fraction for choice in choices]
 
 
-def print_plan(options: CompleteOptions, plan: Plan) -> None:
-    """Print the targets, their holes and the estimated time."""
-    table = Table("camera", "hole", box=None)
-    for number, (target, hole) in enumerate(zip(plan.task.targets, plan.holes, strict=True), 1):
-        name = name_target(target.frame, target.derived_from)
-        table.add_row(f"{number}: {name}", f"{100 * hole:.1f} %")
+def print_plan(options: CompleteOptions, targets: Sequence[Target], holes: Sequence[float]) -> None:
+    """Print the targets and their holes."""
     console = Console(highlight=False)
+    if not targets:
+        console.print("No camera has much to gain; there is nothing to complete.")
+        return
+    table = Table("camera", "hole", box=None)
+    for number, (target, hole) in enumerate(zip(targets, holes, strict=True), 1):
+        table.add_row(f"{number}: {name_target(target)}", format_percent(hole))
     console.print(table)
-    console.print(describe_plan(options, plan), soft_wrap=True)
-
-
-def describe_plan(options: CompleteOptions, plan: Plan) -> str:
-    """Write the sentence on the number of targets and the estimated time."""
-    number = len(plan.holes)
-    if number == 0:
-        return "No camera has much to gain; there is nothing to complete."
-    duration = "in a time that is not known in advance"
-    if options.scene is None and options.synthesis.generator == "warp-inpaint":
-        spent = plan.context_seconds
-        seconds = number * LIFTED_VIEWS * spent / len(plan.task.views)
-        duration = f"in about {seconds:.0f} s after the context ({spent:.0f} s)"
-    counted = "1 camera" if number == 1 else f"{number} cameras"
-    place = quote_value(options.out / TARGETS_FILE)
-    return f"To complete: {counted}, {duration}. Edit the cameras in {place}."
-
-
-def name_target(frame: int | None, near: int | None) -> str:
-    """Name a target for tables."""
-    if near is not None:
-        return f"target near {near}"
-    return "target" if frame is None else f"target {frame}"
+    console.print(f"Edit the cameras in {quote_value(options.out / TARGETS_FILE)}.", soft_wrap=True)
 
 
 def write_targets(folder: Path, task: Task) -> None:

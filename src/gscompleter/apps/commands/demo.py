@@ -77,13 +77,13 @@ def run_demo(options: DemoOptions) -> None:
             seed=options.seed,
             quiet=options.quiet,
         )
-        summary = complete_folder(complete_options)
+        complete_folder(complete_options)
         images = folder / "completion" / "images"
         names = [f"target{n}_{when}" for n in (1, 2) for when in ("before", "after")]
         shown = join_images([read_image(images / f"{name}.png") for name in names])
         write_image(folder / "before_after.png", shown)
     if not options.quiet:
-        print_completion(summary, replace(complete_options, out=options.out / "completion"))
+        print_completion(replace(complete_options, out=options.out / "completion"))
         Console(highlight=False).print(
             f"Before and after, beyond the left and the right camera: "
             f"{options.out / 'before_after.png'}",

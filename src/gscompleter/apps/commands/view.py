@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import webbrowser
 from contextlib import suppress
-from dataclasses import replace
+from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 from pathlib import Path
 
 from gscompleter.apps.commands.convert import check_free
@@ -12,15 +12,19 @@ from gscompleter.apps.commands.options import ViewOptions
 from gscompleter.apps.viewer import packages
 from gscompleter.apps.viewer.exhibit import (
     ViewerContent,
-    is_completion,
-    load_file_cameras,
+    add_file_cameras,
     load_viewer_completion,
     load_viewer_files,
 )
-from gscompleter.apps.viewer.page import Page, make_page
-from gscompleter.apps.viewer.server import ADDRESS, make_page_server
+from gscompleter.apps.viewer.page import make_page
 from gscompleter.errors import InputError, quote_value
 from gscompleter.io.files import replace_file
+from gscompleter.splats.sog import META
+
+ADDRESS = "127.0.0.1"
+"""Network interface of the server."""
+HOST_NAMES = (ADDRESS, "localhost")
+"""Accepted host names; any other one may be a DNS rebinding attack by a website."""
 
 
 def run_view(options: ViewOptions) -> None:
@@ -28,14 +32,14 @@ def run_view(options: ViewOptions) -> None:
     if options.save is not None:
         check_page(options.save, options.overwrite)
     libraries = packages.load_libraries()
-    exhibit = load_exhibit(options)
-    page = make_page(exhibit, libraries, "page" if options.save is None else options.save.stem)
-    if not options.quiet:
-        print_remarks(exhibit, page)
+    page = make_page(load_content(options), libraries)
+    for note in () if options.quiet else page.notes:
+        print(note)
     if options.save is None:
-        serve_page(options, page)
+        serve_page(options, page.html)
     else:
-        write_parts(page, options.save)
+        with replace_file(options.save) as file:
+            file.write(page.html)
 
 
 def check_page(path: Path, overwrite: bool) -> None:
@@ -45,43 +49,21 @@ def check_page(path: Path, overwrite: bool) -> None:
     check_free(path, overwrite)
 
 
-def load_exhibit(options: ViewOptions) -> ViewerContent:
+def load_content(options: ViewOptions) -> ViewerContent:
     """Read the scenes and cameras of the options."""
-    if options.other is None and is_completion(options.scene):
-        exhibit = load_viewer_completion(options.scene, options.drop_nonfinite)
-    elif options.other is None:
-        exhibit = load_viewer_files(options.scene, None, options.drop_nonfinite)
+    scene, other, drop_nonfinite = options.scene, options.other, options.drop_nonfinite
+    if other is not None:
+        content = load_viewer_files(other, scene, drop_nonfinite)
+    elif scene.is_dir() and not (scene / META).is_file():
+        content = load_viewer_completion(scene, drop_nonfinite)
     else:
-        exhibit = load_viewer_files(options.other, options.scene, options.drop_nonfinite)
+        content = load_viewer_files(scene, None, drop_nonfinite)
     if options.cameras is None:
-        return exhibit
-    shots = load_file_cameras(options.cameras, options.resolution, exhibit.scene_transform)
-    return replace(exhibit, cameras=(*exhibit.cameras, *shots))
+        return content
+    return add_file_cameras(content, options.cameras, options.resolution)
 
 
-def print_remarks(exhibit: ViewerContent, page: Page) -> None:
-    """Print remarks on the page."""
-    for remark in exhibit.notes:
-        print(remark)
-    if page.num_omitted:
-        print(f"{page.num_omitted:,} Gaussians are too far away to be shown.")
-    if page.parts:
-        print(
-            f"The Gaussians do not fit into one page; keep these {len(page.parts)} files beside "
-            f"it: {', '.join(page.parts)}."
-        )
-
-
-def write_parts(page: Page, path: Path) -> None:
-    """Write the parts of the page, then the page."""
-    for name, part in page.parts.items():
-        with replace_file(path.with_name(name)) as file:
-            file.write(part)
-    with replace_file(path) as file:
-        file.write(page.html)
-
-
-def serve_page(options: ViewOptions, page: Page) -> None:
+def serve_page(options: ViewOptions, page: bytes) -> None:
     """Serve the page to this machine until Ctrl-C."""
     with make_page_server(page, options.port) as server, suppress(KeyboardInterrupt):
         address = f"http://{ADDRESS}:{server.server_address[1]}/"
@@ -90,3 +72,36 @@ def serve_page(options: ViewOptions, page: Page) -> None:
         if not options.no_open:
             webbrowser.open(address)
         server.serve_forever()
+
+
+def make_page_server(page: bytes, port: int = 0) -> ThreadingHTTPServer:
+    """Make a server on `port` (0 for any) that shows the page to browsers of this machine."""
+
+    class Handler(BaseHTTPRequestHandler):
+        def do_GET(self) -> None:
+            if self.headers.get("Host", "").rsplit(":", 1)[0].lower() not in HOST_NAMES:
+                self.send_error(421, "This server answers to 127.0.0.1 and localhost only")
+            elif self.path != "/":
+                self.send_error(404)
+            else:
+                self.send_page()
+
+        def send_page(self) -> None:
+            self.send_response(200)
+            self.send_header("Content-Type", "text/html; charset=utf-8")
+            self.send_header("Content-Length", str(len(page)))
+            self.send_header("Cross-Origin-Resource-Policy", "same-origin")
+            self.send_header("Cache-Control", "no-store")
+            self.end_headers()
+            self.wfile.write(page)
+
+        def log_message(self, format: str, *args: object) -> None:
+            """Log nothing."""
+
+    try:
+        return ThreadingHTTPServer((ADDRESS, port), Handler)
+    except OSError as error:
+        raise InputError(
+            f"Port {port} of {ADDRESS} is not available ({error.strerror}); name another one.",
+            "port",
+        ) from error

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import os
 import re
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -15,11 +15,7 @@ from jaxtyping import Float, Int64
 from rich.console import Console
 from torch import Tensor
 
-from gscompleter.apps.commands.options import (
-    CompleteOptions,
-    SceneOptions,
-    parse_resolution,
-)
+from gscompleter.apps.commands.options import CompleteOptions, SceneOptions, parse_resolution
 from gscompleter.apps.inputs.selection import (
     CHECK_VIEW_SIZE,
     choose_context,
@@ -37,7 +33,6 @@ from gscompleter.data.local_origin import (
 )
 from gscompleter.data.photographs import Photographs
 from gscompleter.data.points import add_depth_range
-from gscompleter.data.resize import Resolution
 from gscompleter.data.scene import load_cameras
 from gscompleter.data.sfm.poses import POSES, find_poses, has_photographs
 from gscompleter.errors import InputError, join_numbers, quote_value
@@ -88,8 +83,6 @@ class Task:
     """Origin of the result in the coordinates of the input; zero unless those are large."""
     depths: Mapping[str, str]
     """Source of `near` and `far`: given, scene, points, splat or features."""
-    context_note: str = ""
-    """Number of context photographs and its reason, for the user."""
     scene: Gaussians | None = None
     """Input splat, or None to reconstruct the context."""
     splat_file: InputSplatFile | None = None
@@ -159,17 +152,14 @@ def refuse_splat(path: Path) -> None:
 
 
 def read_task(options: CompleteOptions, opened: Opened, device: str) -> Task:
-    """Read the photographs and targets of the options, after checking sizes and memory."""
-    given = opened.photographs
+    """Read the photographs and targets of the options, after checking the memory."""
+    given, resolution = opened.photographs, parse_resolution(options.resolution)
     targets = read_targets(given, options)
-    if options.context:
-        count = len(options.context)
-        photographs = "photograph" if count == 1 else "photographs"
-        frames, note = options.context, f"{count} {photographs} for the context, as named"
-    else:
-        frames, note = choose_context(options, given, targets)
-    task = make_opened_task(options, given, frames, targets, device, check_sizes)
-    return replace(task, context_note=note)
+    frames = options.context or choose_context(options, given, targets)
+    cameras = [given.camera(frame, resolution) for frame in frames]
+    cameras += [target.camera for target in targets]
+    check_memory(max(camera.width * camera.height for camera in cameras), len(cameras))
+    return make_task(options, given, frames, targets, device)
 
 
 def read_photographs(options: SceneOptions, opened: Opened, device: str) -> Task:
@@ -181,30 +171,30 @@ def read_photographs(options: SceneOptions, opened: Opened, device: str) -> Task
             f"No photograph of {quote_value(options.folder)} can be used; name the folder that the "
             "splat was trained on."
         )
-    return make_opened_task(options, given, frames, (), device, check_sides)
+    return make_task(options, given, frames, (), device)
 
 
-def make_opened_task(
+def make_task(
     options: SceneOptions,
     given: Photographs,
     frames: Sequence[int],
     targets: Sequence[Target],
     device: str,
-    check: Callable[[Sequence[Camera]], None],
 ) -> Task:
-    """Read the photographs of `frames`, in ascending order, once the cameras pass `check`."""
+    """Read the photographs of `frames`, in ascending order, and those of the targets."""
     frames, resolution = sorted(frames), parse_resolution(options.resolution)
     bounded = add_depth_range(given, frames, resolution)
-    near, far = bounded.near, bounded.far
-    targets = [replace(t, camera=replace(t.camera, near=near, far=far)) for t in targets]
+    targets = [
+        replace(t, camera=replace(t.camera, near=bounded.near, far=bounded.far)) for t in targets
+    ]
     cameras = [bounded.camera(frame, resolution) for frame in frames]
-    check([*cameras, *(target.camera for target in targets)])
+    check_sides([*cameras, *(target.camera for target in targets)])
     return Task(
         [view.to(device) for view in bounded.views(frames, resolution)],
-        [add_photograph(target, bounded, resolution) for target in targets],
+        [add_photograph(target, bounded, options) for target in targets],
         compute_frame_from_photographs(given.origin),
         given.origin,
-        {name: find_depth_source(name, options, given, bounded) for name in ("near", "far")},
+        find_depth_sources(options, given, bounded),
     )
 
 
@@ -263,16 +253,17 @@ def apply_working_range(task: Task, renderer: Renderer) -> Task:
 def check_context(options: SceneOptions) -> None:
     """Refuse too few or repeated context frames."""
     context, needed = options.context, get_min_views(options)
-    if context is not None and len(context) < needed:
+    if context is None:
+        return
+    if len(context) < needed:
         raise InputError(
             f"--context names {len(context)} frame(s), and stereo needs at least {needed}; "
             "name more, as in --context 0 4, or leave it out."
         )
-    if context is not None and len(set(context)) < len(context):
-        twice = [frame for frame in context if context.count(frame) > 1]
+    if len(set(context)) < len(context):
         raise InputError(
-            f"--context names {join_numbers(twice)} twice, which gives "
-            "identical cameras and no baseline; name different frames."
+            f"--context names a frame of {join_numbers(context)} twice, and identical cameras have "
+            "no baseline; name different frames."
         )
 
 
@@ -286,17 +277,16 @@ def check_targets(options: CompleteOptions) -> None:
         )
 
 
-def find_depth_source(
-    name: str, options: SceneOptions, given: Photographs, bounded: Photographs
-) -> str:
-    """Find the source of one end of the depth range, `near` or `far`."""
-    if getattr(options, name) is not None:
-        return "given"
-    if getattr(given, name) is not None:
-        return "scene"
-    if getattr(bounded, name) is not None:
-        return "points"
-    return "features" if options.scene is None else "splat"
+def find_depth_sources(
+    options: SceneOptions, given: Photographs, bounded: Photographs
+) -> dict[str, str]:
+    """Find the sources of `near` and `far`; `bounded` has those of the sparse points."""
+    estimate = "features" if options.scene is None else "splat"
+    sources = {"given": options, "scene": given, "points": bounded}
+    return {
+        name: next((s for s, held in sources.items() if getattr(held, name) is not None), estimate)
+        for name in ("near", "far")
+    }
 
 
 def read_targets(given: Photographs, options: CompleteOptions) -> list[Target]:
@@ -319,34 +309,30 @@ def read_targets(given: Photographs, options: CompleteOptions) -> list[Target]:
     return targets
 
 
-def add_photograph(target: Target, given: Photographs, resolution: Resolution) -> Target:
+def add_photograph(target: Target, given: Photographs, options: SceneOptions) -> Target:
     """Add its photograph to a target, if there is one."""
     if target.frame is None or not given.has_photograph(target.frame):
         return target
-    (view,) = given.views([target.frame], resolution)
+    (view,) = given.views([target.frame], parse_resolution(options.resolution))
     return replace(target, photograph=view.image, ignore_mask=view.ignore_mask)
-
-
-def check_sizes(cameras: Sequence[Camera]) -> None:
-    """Refuse images that are too small, or too large for the memory."""
-    check_sides(cameras)
-    check_memory(max(camera.width * camera.height for camera in cameras), len(cameras))
 
 
 def check_scene(task: Task, scene: Gaussians) -> None:
     """Refuse a splat that does not fit into memory together with its photographs."""
+    photographs = len(task.views) + len(task.check_views or ())
+    check_scene_memory(len(scene), photographs, estimate_memory(task, scene))
+
+
+def estimate_memory(task: Task, scene: Gaussians | None) -> int:
+    """Estimate the bytes that a completion needs, with an input splat or without."""
     pixels = max(camera.width * camera.height for camera in task.cameras)
-    needed = estimate_bytes(pixels, len(task.cameras)) + estimate_splat_bytes(task, scene)
-    check_scene_memory(len(scene), len(task.views) + len(task.check_views or ()), needed)
-
-
-def estimate_splat_bytes(task: Task, scene: Gaussians) -> int:
-    """Estimate the additional memory of an input splat, in bytes."""
+    needed = estimate_bytes(pixels, len(task.cameras))
+    if scene is None:
+        return needed
     cameras = [view.camera for view in (*task.views, *(task.check_views or ()))]
-    parts = [part for part in vars(scene).values() if isinstance(part, Tensor)]
-    numbers = sum(part[0].numel() for part in parts)
+    numbers = sum(part[0].numel() for part in vars(scene).values() if isinstance(part, Tensor))
     sizes = [camera.width * camera.height for camera in cameras]
-    return estimate_scene_bytes(len(scene), numbers, sizes)
+    return needed + estimate_scene_bytes(len(scene), numbers, sizes)
 
 
 def check_sides(cameras: Sequence[Camera]) -> None:

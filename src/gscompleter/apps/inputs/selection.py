@@ -8,18 +8,12 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from gscompleter.apps.commands.options import (
-    CompleteOptions,
-    SceneOptions,
-    get_max_targets,
-    parse_resolution,
-)
+from gscompleter.apps.commands.options import CompleteOptions, SceneOptions, parse_resolution
 from gscompleter.apps.report.completion import Target
 from gscompleter.data.photographs import Photographs
 from gscompleter.data.resize import Resolution
 from gscompleter.errors import InputError
 from gscompleter.geometry import select_spread_cameras
-from gscompleter.memory import count_fitting_images
 from gscompleter.reconstructors.features.depth_range import estimate_depth_range
 from gscompleter.stages.select_context import (
     make_points_in_front,
@@ -44,41 +38,32 @@ def get_min_views(options: SceneOptions) -> int:
 
 def choose_context(
     options: CompleteOptions, given: Photographs, targets: Sequence[Target]
-) -> tuple[tuple[int, ...], str]:
+) -> tuple[int, ...]:
     """Choose context frames for the targets, or for the whole scene without any.
 
-    Targets are never chosen, because their photographs score the result. The second value is
-    `Task.context_note`.
+    Targets are never chosen, because their photographs score the result.
     """
     target_frames = {target.frame for target in targets}
     others = [frame for frame in range(len(given)) if frame not in target_frames]
     cameras = collect_usable_cameras(given, others, parse_resolution(options.resolution))
     fewest = get_min_views(options)
     if len(cameras) < fewest:
-        left = "photograph is" if len(cameras) == 1 else "photographs are"
         raise InputError(
-            f"{len(cameras)} usable {left} left without the targets, and the context needs at "
-            f"least {fewest}; name fewer targets, or add photographs."
+            f"The context needs at least {fewest} photographs, and without the targets "
+            f"{len(cameras)} can be used; name fewer targets, or add photographs."
         )
     candidates, target_cameras = list(cameras.values()), [target.camera for target in targets]
-    usual = NUM_CONTEXT if targets and options.scene is None else NUM_CONTEXT_WITH_SPLAT
-    fit = count_fitting_images(max(c.width * c.height for c in [*candidates, *target_cameras]))
-    left_over = usual if fit is None else fit - (len(targets) or get_max_targets(options))
-    count = max(fewest, min(usual, left_over))
     points = given.points()
     if points is None or len(points) == 0:
         goals = target_cameras or summarize_cameras(candidates)
         points = sample_scene_points(given, goals, cameras)
-    if targets:
-        chosen = select_context(target_cameras, candidates, points, count)
+    if not targets:
+        chosen = select_overview(candidates, points, NUM_CONTEXT_WITH_SPLAT)
     else:
-        chosen = select_overview(candidates, points, count)
-    limit = "" if count == usual else f" (memory is too small for {usual})"
+        count = NUM_CONTEXT if options.scene is None else NUM_CONTEXT_WITH_SPLAT
+        chosen = select_context(target_cameras, candidates, points, count)
     frames = list(cameras)
-    return tuple(frames[index] for index in chosen), (
-        f"at most {count} of {len(cameras):,} photographs for the context{limit} "
-        "(--context names others)"
-    )
+    return tuple(frames[index] for index in chosen)
 
 
 def collect_usable_cameras(

@@ -1,72 +1,66 @@
-"""The page of a live session: the scene in the browser, and its buttons."""
+"""The page of a live session: the scene in the browser, and its buttons.
+
+Scene and page both have OpenCV axes. Page units are scaled so that the photographed surfaces are a
+few units away, as the controls and clipping planes of the page expect.
+"""
 
 from __future__ import annotations
 
 import html
+import math
 import re
 import socket
 import time
 import traceback
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager, redirect_stdout
 from dataclasses import dataclass
 from functools import partial
 from io import StringIO
+from itertools import cycle
 from queue import SimpleQueue
 from threading import Lock
 from typing import Any
 
 import numpy as np
+import torch
 import viser
+from jaxtyping import Float
 from websockets.asyncio import server as websockets
 
-from gscompleter.apps.live.conversion import (
-    SCENE_DISTANCE,
-    PagePose,
-    camera_from_page,
-    camera_to_page,
-    compute_page_unit,
-    make_page_splat,
-)
 from gscompleter.apps.live.session import Session, complete_camera, undo_step
 from gscompleter.errors import InputError
-from gscompleter.geometry import compute_spacing, estimate_up
+from gscompleter.geometry import estimate_up, quats_to_rotations, rotations_to_quats
 from gscompleter.progress import notify_of_stages
 from gscompleter.state import NOTHING_ADDED, Completion, TargetResult
-from gscompleter.timing import STAGES
-from gscompleter.types import Camera, Gaussians, View
+from gscompleter.types import SH_C0, Camera, Gaussians
 
 LOCAL_HOSTS = ("127.0.0.1", "localhost")
 LOCAL_ORIGIN = re.compile(r"http://(127\.0\.0\.1|localhost)(:\d+)?")
-MAX_FRUSTUM_LENGTH, MAX_SPACING_FRACTION = 0.1, 0.2
-"""Largest length of a camera pyramid, in page units and as a fraction of camera spacing."""
-CLEARANCE_LENGTHS = 6.0
-"""Photographs nearer than this many pyramid lengths are hidden; they would cover the scene."""
-PHOTOGRAPH_COLOR, TARGET_COLOR = (150, 150, 150), (80, 220, 120)
 NOTICE_SECONDS = 4.0
+SCENE_DISTANCE = 3.0
+"""Distance of the middle of the depth range, in page units."""
 
 WELCOME = "Fly to a hole in the scene, then press “Complete what I see”."
 BUSY = "The last request is still running; press the button again when it is done."
-NO_HOLE = "No large hole is left around the photographs."
 CONTROLS_HELP = (
-    "Drag to rotate, drag with the right button to move, scroll to zoom, fly with W A S D Q E. "
-    "Click a photograph to go to its camera."
+    "Drag to rotate, drag with the right button to move, scroll to zoom, fly with W A S D Q E."
 )
 
-Job = Callable[[viser.ClientHandle, PagePose], str]
-"""Action of a button: takes the browser and its camera, returns a sentence for the page."""
+Job = Callable[[viser.ClientHandle], str]
+"""Action of a button: takes the browser, returns a sentence for the page."""
 
 
 @dataclass(frozen=True)
-class PageServices:
-    """Everything a page needs besides its address."""
+class PagePose:
+    """Position, rotation and field of view of a page camera."""
 
-    session: Session
-    photographs: Sequence[View]
-    """Small images, with their cameras in the frame of the result."""
-    find_hole: Callable[[Completion], Camera | None]
-    """Returns the camera with the most to gain, or None."""
-    save: Callable[[Session], str]
+    wxyz: Float[np.ndarray, "4"]
+    """Rotation to the world, as a quaternion."""
+    position: Float[np.ndarray, "3"]
+    """Camera centre, in page units."""
+    fov: float
+    """Vertical field of view, in radians."""
 
 
 class Page:
@@ -76,18 +70,23 @@ class Page:
     that arrives meanwhile is refused.
     """
 
-    def __init__(self, subject: PageServices, host: str, port: int) -> None:
-        self.subject, self.session = subject, subject.session
-        self.server = start_server(host, port)
-        self._first = subject.session.initial.views[0].camera
+    def __init__(
+        self,
+        session: Session,
+        find_hole: Callable[[Completion], Camera | None],
+        save: Callable[[Session], str],
+        server: viser.ViserServer,
+    ) -> None:
+        """Build the page; `find_hole` finds the camera with the most to gain, if there is one."""
+        self.session, self.server = session, server
+        self._find_hole, self._save = find_hole, save
+        self._first = session.initial.views[0].camera
+        self._photographs = cycle([view.camera for view in session.initial.views])
         self._unit = compute_page_unit(self._first)
-        self._length = compute_frustum_length(subject.photographs, self._unit)
         self._requests: SimpleQueue[Callable[[], str]] = SimpleQueue()
-        self._busy, self._generated_lock = Lock(), Lock()
+        self._busy = Lock()
         self._generated: Any = None
-        self._photographs: list[Any] = []
-        self._targets: list[Any] = []
-        self._build_page()
+        self._build()
 
     def handle_requests(self) -> None:
         """Run requests until the process is interrupted."""
@@ -103,68 +102,66 @@ class Page:
         with redirect_stdout(StringIO()):
             self.server.stop()
 
-    def complete(self, client: viser.ClientHandle, seen: PagePose) -> str:
+    def complete(self, client: viser.ClientHandle) -> str:
         """Complete the scene for the camera of a browser."""
         start = time.perf_counter()
+        seen = PagePose(client.camera.wxyz, client.camera.position, client.camera.fov)
         camera = camera_from_page(seen, self._first.height, self._first.width, self._unit)
-        before = self.session
-        with notify_of_stages(lambda stage: self.show_message(format_progress(stage))):
-            self.session, result = complete_camera(before, camera)
-        self._show_changes(before)
+        with notify_of_stages(lambda stage: self.show_message(f"Completing: {stage} …")):
+            session, result = complete_camera(self.session, camera)
+        self._change_session(session)
         return describe_outcome(result, time.perf_counter() - start)
 
-    def find(self, client: viser.ClientHandle, seen: PagePose) -> str:
+    def find(self, client: viser.ClientHandle) -> str:
         """Move a browser to the camera with the most to gain."""
         self.show_message("Searching for a hole …")
-        camera = self.subject.find_hole(self.session.latest)
+        camera = self._find_hole(self.session.latest)
         if camera is None:
-            return NO_HOLE
-        self._move_browser(client, camera_to_page(camera, self._unit))
+            return "No large hole is left around the photographs."
+        self._move_browser(client, camera)
         return "The scene has a hole here; press “Complete what I see”."
 
-    def undo(self, client: viser.ClientHandle, seen: PagePose) -> str:
-        """Undo the last step."""
-        before = self.session
-        self.session = undo_step(before)
-        self._show_changes(before)
-        left = len(self.session.steps)
-        return f"Undone: {left} {'completion is' if left == 1 else 'completions are'} left."
+    def visit_photograph(self, client: viser.ClientHandle) -> str:
+        """Move a browser to the next photograph of the context."""
+        self._move_browser(client, next(self._photographs))
+        return WELCOME
 
-    def save(self, client: viser.ClientHandle, seen: PagePose) -> str:
+    def undo(self, client: viser.ClientHandle) -> str:
+        """Undo the last step."""
+        self._change_session(undo_step(self.session))
+        return f"Undone. Completions left: {len(self.session.steps)}."
+
+    def save(self, client: viser.ClientHandle) -> str:
         """Write the completed scene."""
         self.show_message("Saving …")
-        return self.subject.save(self.session)
+        return self._save(self.session)
 
     def show_message(self, text: str) -> None:
-        """Show a text on the page, its first line in bold."""
-        first, *others = (html.escape(line) for line in text.splitlines())
-        self._status.content = (
-            '<div role="status" style="padding: 0.5em 1em">'
-            f"{'<br>'.join((f'<b>{first}</b>', *others))}</div>"
-        )
+        """Show a text on the page."""
+        lines = "<br>".join(html.escape(line) for line in text.splitlines())
+        self._status.content = f'<div role="status" style="padding: 0.5em 1em">{lines}</div>'
 
-    def _build_page(self) -> None:
+    def _build(self) -> None:
         scene, gui = self.server.scene, self.server.gui
         gui.configure_theme(dark_mode=True, show_logo=False, show_share_button=False)
         gui.set_panel_label("gscompleter live")
-        scene.set_up_direction(estimate_up([v.camera for v in self.subject.photographs]).numpy())
+        cameras = [view.camera for view in self.session.initial.views]
+        scene.set_up_direction(estimate_up(cameras).numpy())
         self._set_initial_camera(camera_to_page(self._first, self._unit))
         self._status = gui.add_html("")
         for label, job in (
             ("Complete what I see", self.complete),
             ("Find a hole", self.find),
+            ("Next photograph", self.visit_photograph),
             ("Undo", self.undo),
             ("Save", self.save),
         ):
             gui.add_button(label).on_click(partial(self._submit, job))
-        self._generated_mode = gui.add_dropdown("Generated", ("show", "tint", "hide"))
-        self._generated_mode.on_update(lambda _: self._show_generated())
-        cameras = scene.add_frame("/cameras", show_axes=False)
-        show_cameras = gui.add_checkbox("Cameras", initial_value=True)
-        show_cameras.on_update(lambda _: setattr(cameras, "visible", show_cameras.value))
+        generated = scene.add_frame("/generated", show_axes=False)
+        show_generated = gui.add_checkbox("Generated", initial_value=True)
+        show_generated.on_update(lambda _: setattr(generated, "visible", show_generated.value))
         gui.add_markdown(CONTROLS_HELP)
-        self._show("/observed", self.session.latest.context, tinted=False)
-        self._show_photographs()
+        self._show("/observed", self.session.latest.context)
         self.show_message(WELCOME)
 
     def _submit(self, job: Job, event: viser.GuiEvent[Any]) -> None:
@@ -172,9 +169,8 @@ class Page:
         client = event.client
         if client is None:  # The browser has closed the page.
             return
-        seen = PagePose(client.camera.wxyz, client.camera.position, client.camera.fov)
         if self._busy.acquire(blocking=False):
-            self._requests.put(partial(job, client, seen))
+            self._requests.put(partial(job, client))
         else:
             client.add_notification("Still busy", BUSY, auto_close_seconds=NOTICE_SECONDS)
 
@@ -184,81 +180,70 @@ class Page:
         start.position, start.fov = pose.position, pose.fov
         start.look_at, start.up = pose.position + SCENE_DISTANCE * rotation[:, 2], -rotation[:, 1]
 
-    def _move_browser(self, client: viser.ClientHandle, pose: PagePose) -> None:
-        self._hide_near_photographs(pose)
+    def _move_browser(self, client: viser.ClientHandle, camera: Camera) -> None:
+        pose = camera_to_page(camera, self._unit)
         with client.atomic():
             client.camera.position, client.camera.wxyz = pose.position, pose.wxyz
             client.camera.fov = pose.fov
 
-    def _hide_near_photographs(self, pose: PagePose) -> None:
-        """Hide the photographs near a pose and show all others."""
-        for frustum in self._photographs:
-            apart = np.linalg.norm(frustum.position - pose.position)
-            frustum.visible = bool(apart > CLEARANCE_LENGTHS * self._length)
-
-    def _show_changes(self, before: Session) -> None:
-        """Show all parts of the session that differ from `before`."""
+    def _change_session(self, session: Session) -> None:
+        """Show all parts of a session that differ from the one before."""
+        before, now = self.session.latest, session.latest
+        self.session = session
         with self.server.atomic():
-            now = self.session.latest
-            if before.latest.parts[0] is not now.parts[0]:
-                self._show("/observed", now.recolored_context, tinted=False)
-            self._show_generated()
-            for frustum in self._targets:
-                frustum.remove()
-            self._targets = [
-                self._add_frustum(f"/cameras/target {number}", result.target, TARGET_COLOR)
-                for number, result in enumerate(now.targets, start=1)
-            ]
-
-    def _show_generated(self) -> None:
-        with self._generated_lock:
-            added, look = self.session.latest.added, self._generated_mode.value
+            if before.parts[0] is not now.parts[0]:
+                self._show("/observed", now.recolored_context)
             if self._generated is not None:
                 self._generated.remove()
-            shown = len(added) and look != "hide"
-            self._generated = self._show("/generated", added, look == "tint") if shown else None
+            self._generated = self._show("/generated/splats", now.added)
 
-    def _show(self, name: str, gaussians: Gaussians, tinted: bool) -> Any:
+    def _show(self, name: str, gaussians: Gaussians) -> Any:
         if len(gaussians) == 0:
             return None
-        splat = make_page_splat(gaussians, self._unit, tinted)
-        return self.server.scene.add_gaussian_splats(name, **splat)
-
-    def _show_photographs(self) -> None:
-        for number, view in enumerate(self.subject.photographs):
-            frustum = self._add_frustum(
-                f"/cameras/photograph {number}", view.camera, PHOTOGRAPH_COLOR, view
-            )
-            pose = camera_to_page(view.camera, self._unit)
-            frustum.on_click(lambda event, pose=pose: self._move_browser(event.client, pose))
-            self._photographs.append(frustum)
-        self._hide_near_photographs(camera_to_page(self._first, self._unit))
-
-    def _add_frustum(
-        self, name: str, camera: Camera, color: tuple[int, int, int], view: View | None = None
-    ) -> Any:
-        pose = camera_to_page(camera, self._unit)
-        image = None if view is None else (255 * view.image.clamp(0, 1)).byte().cpu().numpy()
-        return self.server.scene.add_camera_frustum(
-            name,
-            pose.fov,
-            camera.width / camera.height,
-            scale=self._length,
-            thickness=1.5,
-            thickness_units="screen",
-            color=color,
-            image=image,
-            wxyz=pose.wxyz,
-            position=pose.position,
-        )
+        return self.server.scene.add_gaussian_splats(name, **make_page_splat(gaussians, self._unit))
 
 
-def compute_frustum_length(photographs: Sequence[View], unit: float) -> float:
-    """Compute the length of camera pyramids, in page units."""
-    apart = compute_spacing([view.camera for view in photographs]) * unit
-    return (
-        min(MAX_FRUSTUM_LENGTH, MAX_SPACING_FRACTION * apart) if apart > 0 else MAX_FRUSTUM_LENGTH
-    )
+def compute_page_unit(camera: Camera) -> float:
+    """Compute page units per scene unit from a camera with a depth range."""
+    assert camera.near is not None
+    assert camera.far is not None
+    return SCENE_DISTANCE / math.sqrt(camera.near * camera.far)
+
+
+def camera_to_page(camera: Camera, unit: float) -> PagePose:
+    """Convert a scene camera to a page pose."""
+    c2w = camera.c2w.detach().cpu().double()
+    fov = 2 * math.atan(camera.height / 2 / camera.K[1, 1].item())
+    return PagePose(rotations_to_quats(c2w[:3, :3]).numpy(), c2w[:3, 3].numpy() * unit, fov)
+
+
+def camera_from_page(pose: PagePose, height: int, width: int, unit: float) -> Camera:
+    """Convert a page pose to a scene camera with the same vertical field of view."""
+    c2w = torch.eye(4, dtype=torch.float64)
+    c2w[:3, :3] = quats_to_rotations(torch.from_numpy(np.asarray(pose.wxyz, dtype=np.float64)))
+    c2w[:3, 3] = torch.from_numpy(np.asarray(pose.position, dtype=np.float64)) / unit
+    focal = height / 2 / math.tan(pose.fov / 2)
+    K = torch.tensor([[focal, 0.0, width / 2], [0.0, focal, height / 2], [0.0, 0.0, 1.0]])
+    return Camera(c2w.float(), K, width, height)
+
+
+def make_page_splat(gaussians: Gaussians, unit: float) -> dict[str, Any]:
+    """Convert one or more Gaussians for the page, without view-dependent colour.
+
+    The page keeps covariances in float16, in which those of a scene in kilometres would vanish, so
+    their unit is the median of the largest scales, and the page scales them back by `scale`.
+    """
+    gaussians = gaussians.to("cpu")
+    size = gaussians.scales.amax(dim=1).median().item()
+    axes = quats_to_rotations(gaussians.quats) * (gaussians.scales / size)[:, None, :]
+    rgbs = (0.5 + SH_C0 * gaussians.sh[:, 0]).clamp(0, 1)
+    return {
+        "centers": (gaussians.means / size).numpy(),
+        "covariances": (axes @ axes.transpose(1, 2)).numpy(),
+        "rgbs": rgbs.numpy(),
+        "opacities": gaussians.opacities[:, None].clamp(0, 1).numpy(),
+        "scale": size * unit,
+    }
 
 
 def run_request(request: Callable[[], str]) -> str:
@@ -271,11 +256,6 @@ def run_request(request: Callable[[], str]) -> str:
     except Exception as error:
         traceback.print_exc()
         return f"That failed ({type(error).__name__}: {error}); the scene is unchanged."
-
-
-def format_progress(stage: str) -> str:
-    """Format the progress line with the current stage in brackets."""
-    return "Completing …\n" + " → ".join(f"[{s}]" if s == stage else s for s in STAGES)
 
 
 def describe_outcome(result: TargetResult, seconds: float) -> str:

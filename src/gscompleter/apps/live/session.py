@@ -9,43 +9,14 @@ from tempfile import TemporaryDirectory
 import numpy as np
 from jaxtyping import Float
 
-from gscompleter.apps.viewer.exhibit import SceneTransform
+from gscompleter.apps.viewer.exhibit import load_scene_cameras
 from gscompleter.completer import GSCompleter
 from gscompleter.data.resize import Resolution
 from gscompleter.data.scene import write_cameras
 from gscompleter.errors import InputError
-from gscompleter.io.files import TARGETS_FILE
 from gscompleter.splat_alignment.similarity import transform_camera_exactly
 from gscompleter.state import Completion, TargetResult
 from gscompleter.types import Camera
-
-
-@dataclass(frozen=True)
-class FrameConversion:
-    """Conversion of cameras between the frames of the photographs and of the result.
-
-    Cameras go through a file before they are used, so that the saved file gives the very same
-    result.
-    """
-
-    result_from_photographs: Float[np.ndarray, "4 4"]
-    """Similarity from the frame of the photographs to that of the result."""
-    origin: Float[np.ndarray, "3"]
-    """Local origin of the coordinates, in the frame of the photographs."""
-    resolution: Resolution = None
-
-    def convert_to_photographs(self, camera: Camera) -> Camera:
-        """Convert a camera to the frame of the photographs, in float64."""
-        return transform_camera_exactly(camera, np.linalg.inv(self.result_from_photographs))
-
-    def convert_to_result(self, source: Camera) -> Camera:
-        """Convert a camera to the frame of the result, by way of a file."""
-        place = SceneTransform.from_photographs(self.result_from_photographs, self.origin)
-        with TemporaryDirectory() as folder:
-            path = Path(folder) / TARGETS_FILE
-            write_cameras(path, [source])
-            (camera,) = place.load(path, self.resolution)
-        return camera
 
 
 @dataclass(frozen=True)
@@ -62,8 +33,12 @@ class Session:
     """A scene with all steps that are not undone."""
 
     completer: GSCompleter
-    conversion: FrameConversion
     initial: Completion
+    transform: Float[np.ndarray, "4 4"]
+    """Similarity from the frame of the photographs to that of the result."""
+    origin: Float[np.ndarray, "3"]
+    """Local origin of the coordinates, in the frame of the photographs."""
+    resolution: Resolution = None
     steps: tuple[CompletedStep, ...] = ()
 
     @property
@@ -75,10 +50,15 @@ class Session:
 def complete_camera(session: Session, camera: Camera) -> tuple[Session, TargetResult]:
     """Complete the scene for a camera in the frame of the result.
 
-    Returns the same session if nothing was added or recoloured.
+    Returns the same session if nothing was added or recoloured. The camera goes through a file
+    first, so that the saved file gives the very same result.
     """
-    told = session.conversion.convert_to_photographs(camera)
-    target = session.conversion.convert_to_result(told).to(session.latest.views[0].image.device)
+    told = transform_camera_exactly(camera, np.linalg.inv(session.transform))
+    with TemporaryDirectory() as folder:
+        path = Path(folder) / "target.json"
+        write_cameras(path, [told])
+        (target,) = load_scene_cameras(path, session.transform, session.origin, session.resolution)
+    target = target.to(session.latest.views[0].image.device)
     completion = session.completer.advance(session.latest, target)
     result = completion.targets[-1]
     if not len(result.added) and not result.num_recolored:

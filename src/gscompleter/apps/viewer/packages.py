@@ -3,7 +3,7 @@
 `package-lock.json` pins three.js, Spark (which renders Gaussians with it) and fflate (part of
 Spark). A wheel contains the result of `extract_libraries`; a source tree fetches the archives from
 npm's registry when a page is first made and caches them. Every archive is compared with its hash
-when it is opened. Only the standard library is used, because the build of the wheel runs this.
+when it is opened.
 """
 
 from __future__ import annotations
@@ -12,20 +12,18 @@ import base64
 import hashlib
 import io
 import json
-import os
 import tarfile
 import urllib.request
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from urllib.parse import urlsplit
 
 from gscompleter.errors import InputError
 from gscompleter.io.cache import get_download_folder
 from gscompleter.io.files import replace_file
 
 LOCK_FILE = Path(__file__).with_name("package-lock.json")
-"""Pinned packages with addresses and hashes."""
+"""Pinned packages with their hashes."""
 BUILT_LIBRARIES = Path(__file__).with_name("libraries.json")
 """Libraries stored by the build of a wheel."""
 MODULES = {
@@ -37,15 +35,9 @@ MODULES = {
 """Package and file of each module, by its import name."""
 CORE_IMPORT = ('"./three.core.min.js"', '"three-core"')
 """Replacement for the one relative import: modules in a page have no folder."""
-LICENCE_FILE = "LICENSE"
-"""File of each package that is distributed with it."""
-MAX_ARCHIVE_BYTES = 64 << 20
-"""Largest archive in bytes; ours have up to 8 million."""
+REGISTRY = "https://registry.npmjs.org"
 TIMEOUT = 30.0
 """Timeout of the registry in seconds."""
-REGISTRY = "https://registry.npmjs.org"
-REGISTRY_VARIABLE = "npm_config_registry"
-"""Environment variable of npm with the address of another registry."""
 
 
 @dataclass(frozen=True)
@@ -78,35 +70,24 @@ class Libraries:
     """Licence texts by package name and version."""
 
 
-def load_libraries(lock: Path = LOCK_FILE, built: Path = BUILT_LIBRARIES) -> Libraries:
-    """Load the libraries of the wheel, or in a source tree those of the pinned archives.
-
-    Raises:
-        InputError: They cannot be fetched, or differ from their hashes.
-    """
-    if built.is_file():
-        return Libraries(**json.loads(built.read_text(encoding="utf-8")))
-    return extract_libraries(lock)
-
-
-def write_libraries(path: Path, lock: Path = LOCK_FILE) -> None:
-    """Write the libraries for a wheel; the same lock gives the same bytes."""
-    text = json.dumps(vars(extract_libraries(lock)), sort_keys=True, ensure_ascii=False)
-    with replace_file(path) as file:
-        file.write(text.encode())
+def load_libraries() -> Libraries:
+    """Load the libraries of the wheel, or in a source tree those of the pinned archives."""
+    if BUILT_LIBRARIES.is_file():
+        return Libraries(**json.loads(BUILT_LIBRARIES.read_text(encoding="utf-8")))
+    return extract_libraries(LOCK_FILE)
 
 
 def extract_libraries(lock: Path) -> Libraries:
     """Extract the modules and licences of the packages pinned in `lock`."""
-    packages = {package.name: package for package in read_lock(lock)}
-    archives = {name: get_archive(package) for name, package in packages.items()}
+    packages = read_lock(lock)
+    archives = {package.name: get_archive(package) for package in packages}
     modules = {
         name: read_archive_member(archives[package], file).replace(*CORE_IMPORT)
         for name, (package, file) in MODULES.items()
     }
     licences = {
-        f"{p.name} {p.version}": read_archive_member(archives[name], LICENCE_FILE)
-        for name, p in packages.items()
+        f"{package.name} {package.version}": read_archive_member(archives[package.name], "LICENSE")
+        for package in packages
     }
     return Libraries(modules, licences)
 
@@ -115,8 +96,8 @@ def read_lock(lock: Path) -> list[NpmPackage]:
     """Read the packages of an npm lock file (`lockfileVersion` 3), in order."""
     entries = json.loads(lock.read_text(encoding="utf-8"))["packages"]
     return [
-        NpmPackage(path.removeprefix("node_modules/"), e["version"], e["integrity"])
-        for path, e in entries.items()
+        NpmPackage(path.removeprefix("node_modules/"), entry["version"], entry["integrity"])
+        for path, entry in entries.items()
         if path
     ]
 
@@ -140,23 +121,20 @@ def get_archive_path(package: NpmPackage) -> Path:
 
 def fetch_archive(package: NpmPackage) -> bytes:
     """Fetch an archive from the npm registry and compare its hash."""
-    registry = os.environ.get(REGISTRY_VARIABLE) or REGISTRY
-    url, name = f"{registry.rstrip('/')}/{package.path}", f"{package.name} {package.version}"
+    url, archive = f"{REGISTRY}/{package.path}", b""
     try:
         with urllib.request.urlopen(url, timeout=TIMEOUT) as answer:
-            archive: bytes = answer.read(MAX_ARCHIVE_BYTES)
-    except (OSError, ValueError) as error:
-        raise InputError(
-            f"The page needs {name}, which is not on this machine, and "
-            f"{urlsplit(url).netloc or 'its address'} cannot be reached; install gscompleter from "
-            f"its wheel, which contains it, or put {url} at {get_archive_path(package)}."
-        ) from error
-    if not package.is_intact(archive):
-        raise InputError(
-            f"The file at {url} is not {name}: its SHA-512 differs, so it was not used; try "
-            "another connection."
-        )
-    return archive
+            archive = answer.read()
+    except OSError as error:
+        reason = f"it cannot be fetched ({error})"
+    else:
+        if package.is_intact(archive):
+            return archive
+        reason = "its SHA-512 differs"
+    raise InputError(
+        f"The page needs {url}, but {reason}; install gscompleter from its wheel, which contains "
+        f"it, or put it at {get_archive_path(package)}."
+    )
 
 
 def read_archive_member(archive: bytes, name: str) -> str:

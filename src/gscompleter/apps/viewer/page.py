@@ -12,12 +12,10 @@ import html
 import json
 import math
 import re
-from collections import Counter
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
-from urllib.parse import quote
 
 import torch
 from jaxtyping import Float
@@ -36,18 +34,14 @@ PAGE_EXTENT = 4.0
 """Median distance of Gaussians from the centre, within a factor of 2, in page units."""
 MAX_DISTANCE = 4096.0
 """Largest distance of a Gaussian from the centre, in page units; leaves ten fractional bits."""
-LARGEST_PAGE = 60_000_000
-"""Bytes of Gaussians up to which they are inside the page; otherwise in files beside it."""
 PART = 48_000_000
-"""Bytes of Gaussians per file, below the longest string of any browser."""
+"""Bytes of Gaussians per script element, below the longest string of any browser."""
 THREE_FROM_OPENCV = torch.diag(torch.tensor([1.0, -1.0, -1.0, 1.0], dtype=torch.float64))
 """Half a turn about x, for the axes of the world and of a camera."""
 MAX_LANDMARKS = 100_000
 """Approximate number of Gaussians that determine the focus of a camera."""
-OVERVIEW_SIZE = (640, 480)
-"""Width and height of the camera for a scene without cameras."""
-OVERVIEW_FOCAL = 550.0
-"""Its focal length in pixels, for a field of view of 60 degrees."""
+OVERVIEW_SIZE, OVERVIEW_FOCAL = (640, 480), 550.0
+"""Width, height and focal length (pixels) of the camera for a scene without cameras."""
 OVERVIEW_DISTANCE = 2.5
 """Its distance from the centre, relative to the median distance of Gaussians."""
 
@@ -75,13 +69,11 @@ class PageFrame:
 
 @dataclass(frozen=True)
 class Page:
-    """Files to write or serve."""
+    """A page to write or serve."""
 
     html: bytes
-    parts: Mapping[str, bytes]
-    """Scripts with the Gaussians by file name; empty if the page contains them."""
-    num_omitted: int
-    """Gaussians of the scene after that are too far away to be shown."""
+    notes: tuple[str, ...]
+    """Sentences on missing or changed content."""
 
 
 def compute_page_frame(gaussians: Gaussians) -> PageFrame:
@@ -89,46 +81,40 @@ def compute_page_frame(gaussians: Gaussians) -> PageFrame:
     means = gaussians.means.double().cpu()
     centre = means.median(dim=0).values
     spread = (means - centre).norm(dim=1).median().item()
-    return PageFrame(
-        centre, 2.0 ** math.floor(math.log2(spread / PAGE_EXTENT)) if spread > 0 else 1.0
-    )
+    power = math.floor(math.log2(spread / PAGE_EXTENT)) if spread > 0 else 0
+    return PageFrame(centre, 2.0**power)
 
 
-def make_page(viewer_content: ViewerContent, libraries: Libraries, name: str = "page") -> Page:
-    """Make the page; the same values give the same bytes.
-
-    `name` is the stem of the page's file, which names the files beside it.
-
-    Raises:
-        InputError: Nothing is left to show.
-    """
+def make_page(viewer_content: ViewerContent, libraries: Libraries) -> Page:
+    """Make the page; the same values give the same bytes."""
     frame = compute_page_frame(viewer_content.after)
     layers = {
-        key: frame.normalize(part.to("cpu")) for key, part in split_layers(viewer_content).items()
+        name: frame.normalize(part.to("cpu")) for name, part in split_layers(viewer_content).items()
     }
-    shown = {key: part[part.means.norm(dim=1) <= MAX_DISTANCE] for key, part in layers.items()}
-    sources = {key: encode_spz(Path(key), part) for key, part in shown.items() if len(part) > 0}
+    shown = {name: part[part.means.norm(dim=1) <= MAX_DISTANCE] for name, part in layers.items()}
+    sources = {name: encode_spz(Path(name), part) for name, part in shown.items() if len(part) > 0}
     if not sources.keys() - {"before"}:
         raise InputError(f"{quote_value(viewer_content.title)} has nothing that a page can show.")
-    layer_sources = {key: key for key in sources}
+    layer_sources = {name: name for name in sources}
     if sources.get("before") == sources.get("observed", b""):
         del sources["before"]
         layer_sources["before"] = "observed"
-    parts = split_sources(sources)
-    means = sample_landmarks(layers)
+    means = torch.cat([layers["observed"].means, layers["generated"].means]).double()
+    landmarks = means[:: max(1, len(means) // MAX_LANDMARKS)]
+    cameras = viewer_content.cameras or (make_overview(viewer_content.after),)
     content = {
         "title": viewer_content.title,
         "frame": {"centre": frame.centre.tolist(), "unit": frame.unit},
-        "counts": {key: len(part) for key, part in shown.items()},
+        "counts": {name: len(part) for name, part in shown.items()},
         "layers": layer_sources,
-        "antialiased": {key: part.is_antialiased for key, part in layers.items()},
-        "parts": Counter(key for key, _ in parts),
-        "shots": [describe_camera(shot, frame, means) for shot in list_cameras(viewer_content)],
+        "antialiased": {name: part.is_antialiased for name, part in layers.items()},
+        "shots": [describe_camera(camera, frame, landmarks) for camera in cameras],
         **vars(libraries),
     }
-    scripts, beside = place_scripts(parts, name)
-    left_out = sum(len(layers[key]) - len(shown[key]) for key in ("observed", "generated"))
-    return Page(fill_template(content, scripts).encode(), beside, left_out)
+    omitted = sum(len(layers[name]) - len(shown[name]) for name in ("observed", "generated"))
+    notes = (f"{omitted:,} Gaussians are too far away to be shown.",) if omitted else ()
+    page = fill_template(content, make_scripts(sources))
+    return Page(page.encode(), (*viewer_content.notes, *notes))
 
 
 def split_layers(viewer_content: ViewerContent) -> dict[str, Gaussians]:
@@ -138,52 +124,33 @@ def split_layers(viewer_content: ViewerContent) -> dict[str, Gaussians]:
     return layers if before is None else {"before": before, **layers}
 
 
-def split_sources(sources: Mapping[str, bytes]) -> list[tuple[str, bytes]]:
-    """Split the bytes of each source into parts."""
+def make_scripts(sources: Mapping[str, bytes]) -> list[str]:
+    """Make the script elements that hold the bytes of each source in base64, in parts."""
     return [
-        (key, content[start : start + PART])
-        for key, content in sorted(sources.items())
-        for start in range(0, len(content), PART)
+        f'<script>gscPart("{name}", "{base64.b64encode(part).decode()}");</script>'
+        for name, content in sorted(sources.items())
+        for part in (content[start : start + PART] for start in range(0, len(content), PART))
     ]
 
 
-def place_scripts(
-    parts: Sequence[tuple[str, bytes]], name: str
-) -> tuple[list[str], dict[str, bytes]]:
-    """Make the script elements of the page, and the files of stem `name` that they refer to."""
-    calls = [f'gscPart("{key}", "{base64.b64encode(part).decode()}");' for key, part in parts]
-    if sum(map(len, calls)) <= LARGEST_PAGE:
-        return [f"<script>{call}</script>" for call in calls], {}
-    files = {f"{name}.{number}.js": call.encode() for number, call in enumerate(calls, start=1)}
-    return [f'<script src="{quote(file)}"></script>' for file in files], files
-
-
-def list_cameras(viewer_content: ViewerContent) -> tuple[ViewerCamera, ...]:
-    """List the cameras; a scene without any gets an overview."""
-    if viewer_content.cameras:
-        return viewer_content.cameras
-    means = viewer_content.after.means.cpu()
+def make_overview(scene: Gaussians) -> ViewerCamera:
+    """Make a camera that sees the scene, for a page without any other."""
+    means = scene.means.cpu()
     centre = means.median(dim=0).values
     distance = OVERVIEW_DISTANCE * (means - centre).norm(dim=1).median()
     c2w, K, (width, height) = torch.eye(4), torch.eye(3), OVERVIEW_SIZE
     c2w[:3, 3] = centre - distance * torch.tensor([0.0, 0.0, 1.0])
     K[0, 0] = K[1, 1] = OVERVIEW_FOCAL
     K[:2, 2] = torch.tensor([width / 2, height / 2])
-    return (ViewerCamera("overview", "Overview", Camera(c2w, K, width, height)),)
-
-
-def sample_landmarks(layers: Mapping[str, Gaussians]) -> Float[Tensor, "n 3"]:
-    """Sample means of the scene after, in page origin and unit and scene axes."""
-    means = torch.cat([layers["observed"].means, layers["generated"].means])
-    return means[:: max(1, len(means) // MAX_LANDMARKS)].double()
+    return ViewerCamera("overview", "Overview", Camera(c2w, K, width, height))
 
 
 def describe_camera(
-    view_camera: ViewerCamera, frame: PageFrame, means: Float[Tensor, "n 3"]
+    view_camera: ViewerCamera, frame: PageFrame, landmarks: Float[Tensor, "n 3"]
 ) -> dict[str, Any]:
-    """Describe a camera as the page reads it, focused on the landmarks `means`."""
+    """Describe a camera as the page reads it, focused on landmarks in page unit and scene axes."""
     camera, thumbnail = frame.move_camera(view_camera.camera), view_camera.thumbnail
-    K, (pixels, depths) = camera.K, project(means, camera)
+    K, (pixels, depths) = camera.K, project(landmarks, camera)
     seen = depths[is_inside(pixels, depths, camera)]
     return {
         "name": view_camera.name,
@@ -197,7 +164,7 @@ def describe_camera(
     }
 
 
-def fill_template(content: Mapping[str, Any], scripts: list[str]) -> str:
+def fill_template(content: Mapping[str, Any], scripts: Sequence[str]) -> str:
     """Fill the template `viewer.html`.
 
     External text is inserted as JSON without `<`, which no HTML parser can misread.
