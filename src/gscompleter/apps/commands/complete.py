@@ -34,17 +34,12 @@ from gscompleter.apps.inputs.opening import (
 )
 from gscompleter.apps.inputs.plan import describe_task
 from gscompleter.apps.inputs.selection import collect_usable_cameras
-from gscompleter.apps.report.completion import Surroundings, Target, write_report
+from gscompleter.apps.report.completion import Target, write_report
 from gscompleter.apps.report.completion_page import render_completion_page
 from gscompleter.apps.report.film import VIDEO_FILE, write_comparison_video
 from gscompleter.apps.report.page import REPORT_FILE, write_page
-from gscompleter.apps.report.plain_words import (
-    NO_TARGET_NOTE,
-    describe_exposures,
-    describe_ignored,
-    describe_motion,
-    describe_new_photographs,
-)
+from gscompleter.apps.report.plain_words import list_notes
+from gscompleter.apps.report.schema import parse_summary
 from gscompleter.apps.warmup.compilation import SPLAT_PART, compile_kernels
 from gscompleter.completer import GSCompleter, check_target_ids
 from gscompleter.config import CompleterConfig
@@ -54,7 +49,13 @@ from gscompleter.data.scene import write_cameras
 from gscompleter.errors import quote_value
 from gscompleter.evaluation.metrics.coverage import render_pairs, sample_held_out_cameras
 from gscompleter.generators import load_generator
-from gscompleter.io.files import COMPLETED_FILE, TARGETS_FILE, check_output, open_output_folder
+from gscompleter.io.files import (
+    COMPLETED_FILE,
+    SUMMARY_FILE,
+    TARGETS_FILE,
+    check_output,
+    open_output_folder,
+)
 from gscompleter.io.video import check_video_writer
 from gscompleter.kernels.parallel import run_in_background
 from gscompleter.next_best_view.gain import Choice
@@ -169,10 +170,11 @@ def write_done(folder: Path, ready: Prepared, completion: Completion) -> dict[st
             folder,
             completion,
             task.targets,
-            completer,
+            completer.renderer,
             {**facts, "seed": options.seed},
             task.splat_file,
-            lambda: Surroundings(tuple(looks()), cameras),
+            cameras,
+            looks,
             read_held_out(options, ready.opened, task, ready.cameras),
         )
     write_page(folder, render_completion_page(folder))
@@ -291,23 +293,8 @@ def make_score_table(summary: Mapping[str, Any]) -> Table:
 
 def describe_result(summary: Mapping[str, Any], options: CompleteOptions) -> Iterator[str]:
     """Write the sentences below the table."""
-    context = summary["context"]
-    notes = (
-        describe_exposures(row["exposure_gain"] for row in context),
-        describe_motion({row["frame"]: row["dynamic_fraction"] for row in context}),
-        describe_ignored(row["ignored"] for row in context),
-        describe_new_photographs(summary.get("new_photographs")),
-    )
-    yield from filter(None, notes)
-    origin = summary["frame"]["origin"]
-    if any(origin):
-        yield (
-            f"The coordinates are very large, so the result has its origin at "
-            f"{' '.join(map(str, origin))}; summary.json has the transform."
-        )
-    if not summary["targets"]:
-        yield NO_TARGET_NOTE
-    elif options.video:
+    yield from list_notes(parse_summary(summary, options.out / SUMMARY_FILE))
+    if summary["targets"] and options.video:
         yield f"Video: {options.out / VIDEO_FILE}"
     before, after = (100 * summary["coverage"][when] for when in ("before", "after"))
     share = "Trusted" if summary["settings"]["config"]["trust"] == "photometric" else "Coverage"
