@@ -151,7 +151,7 @@ def test_the_background_fills_what_an_object_uncovers():
     known = torch.ones(32, 48, dtype=torch.bool)
     known[:, 16:32] = False
     depth = torch.where(torch.arange(48) < 24, 1.0, 4.0).expand(32, 48).contiguous()
-    tone, log_depth = fill_background_first(WarpedImage(image, known, depth, ()))
+    tone, log_depth = fill_background_first(WarpedImage(image, known, depth, torch.ones(0, 3)))
     middle = tone[16, 24]
     assert middle[2] > 5 * middle[0]
     assert log_depth[16, 24].exp() > 3

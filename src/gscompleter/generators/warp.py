@@ -13,7 +13,7 @@ from gscompleter.generators.exposure import match_exposures
 from gscompleter.generators.smooth import continue_smoothly
 from gscompleter.geometry import is_inside, measure_baseline, project, sample, unproject
 from gscompleter.image_ops import dilate
-from gscompleter.types import Camera, GeneratorInput, Render, View
+from gscompleter.types import Camera, GeneratorInput, Render, TensorDataclass, View
 
 DEPTH_TOLERANCE = 0.03
 """Relative depth error at which the weight of a photograph falls to 1/e."""
@@ -26,7 +26,7 @@ DYNAMIC_MARGIN = 4
 
 
 @dataclass(frozen=True)
-class WarpedImage:
+class WarpedImage(TensorDataclass):
     """The known part of the target image."""
 
     image: Float[Tensor, "h w 3"]
@@ -34,17 +34,8 @@ class WarpedImage:
     """True at pixels that show the scene; the others are undefined."""
     depth: Float[Tensor, "h w"]
     """z-depth in the target camera in scene units, valid if known."""
-    gains: tuple[Float[Tensor, "3"], ...]
+    gains: Float[Tensor, "views 3"]
     """Exposure gain applied to each photograph to match the nearest one."""
-
-    def to(self, device: torch.device | str) -> WarpedImage:
-        """Return a copy on `device`."""
-        return WarpedImage(
-            self.image.to(device),
-            self.known.to(device),
-            self.depth.to(device),
-            tuple(gain.to(device) for gain in self.gains),
-        )
 
 
 def warp_photographs(nearest: View, target: Camera, context: GeneratorInput) -> WarpedImage:
@@ -82,7 +73,7 @@ def warp_photographs(nearest: View, target: Camera, context: GeneratorInput) -> 
     if context.trusted_alpha is not None:
         known = known | ((scene.alpha >= context.max_alpha) & (total > MIN_WEIGHT**SHARPNESS))
     known = known & ~(dilate(dynamic, DYNAMIC_MARGIN) & (total < MIN_WEIGHT**SHARPNESS))
-    return WarpedImage(image.clamp(0, 1), known, scene.depth, tuple(factors))
+    return WarpedImage(image.clamp(0, 1), known, scene.depth, torch.stack(factors))
 
 
 def add_unexplained(warped: WarpedImage, target: Camera, context: GeneratorInput) -> WarpedImage:
