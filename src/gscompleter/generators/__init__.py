@@ -129,9 +129,9 @@ def _load_warp_inpaint(
 def _load_oracle(
     settings: GeneratorSettings, seed: int, photographs: Sequence[View], device: str
 ) -> Generator:
-    from gscompleter.generators.oracle import Oracle
+    from gscompleter.generators.oracle import make_oracle
 
-    return Oracle(photographs)
+    return make_oracle(photographs)
 
 
 GENERATORS: dict[str, Callable[..., Generator]] = {

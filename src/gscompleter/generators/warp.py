@@ -82,7 +82,7 @@ def add_unexplained(warped: WarpedImage, target: Camera, context: GeneratorInput
     Its depth is unknown, so the depth around the hole is continued. Only photographs whose own
     render is empty in that direction count; others show an occluder. Some pixel must be known.
     """
-    guess = continue_depth(warped).exp().to(warped.depth.device)
+    guess = fill_background_first(warped, 0)[1].exp().to(warped.depth.device)
     points = unproject(guess, target)
     colour = torch.zeros_like(warped.image)
     total = torch.zeros_like(guess)
@@ -105,31 +105,18 @@ def add_unexplained(warped: WarpedImage, target: Camera, context: GeneratorInput
 
 
 def fill_background_first(
-    warped: WarpedImage,
-) -> tuple[Float[Tensor, "h w 3"], Float[Tensor, "h w"]]:
-    """Continue image and log-depth beyond the known pixels, preferring far pixels.
+    warped: WarpedImage, num_channels: int = 3
+) -> tuple[Float[Tensor, "h w c"], Float[Tensor, "h w"]]:
+    """Continue colour channels and log-depth beyond the known pixels, preferring far pixels.
 
     A hole beside an object usually shows the background, so the weight is the squared depth.
     """
-    log_depth, weight, middle = _compute_relative_depth(warped)
-    layers = continue_smoothly(torch.cat([warped.image.cpu(), log_depth], dim=-1), weight)
-    return layers[..., :3], layers[..., 3] + middle
-
-
-def continue_depth(warped: WarpedImage) -> Float[Tensor, "h w"]:
-    """Continue only the log-depth, as in `fill_background_first`."""
-    log_depth, weight, middle = _compute_relative_depth(warped)
-    return continue_smoothly(log_depth, weight)[..., 0] + middle
-
-
-def _compute_relative_depth(
-    warped: WarpedImage,
-) -> tuple[Float[Tensor, "h w 1"], Float[Tensor, "h w"], Float[Tensor, ""]]:
-    """Compute log-depth relative to the median, its weight and the log of the median."""
     known, depth = warped.known.cpu(), warped.depth.cpu()
     middle = depth[known].median()
     relative = (depth / middle).clamp(0.1, 10.0)
-    return relative.log()[..., None], relative**2 * known, middle.log()
+    layers = torch.cat([warped.image.cpu()[..., :num_channels], relative.log()[..., None]], dim=-1)
+    filled = continue_smoothly(layers, relative**2 * known)
+    return filled[..., :-1], filled[..., -1] + middle.log()
 
 
 def _compute_visibility(

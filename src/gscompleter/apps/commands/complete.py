@@ -39,7 +39,7 @@ from gscompleter.apps.report.completion_page import render_completion_page
 from gscompleter.apps.report.film import VIDEO_FILE, write_comparison_video
 from gscompleter.apps.report.page import REPORT_FILE, write_page
 from gscompleter.apps.report.plain_words import list_notes
-from gscompleter.apps.report.schema import parse_summary
+from gscompleter.apps.report.schema import CompletionSummary, parse_content
 from gscompleter.apps.warmup.compilation import SPLAT_PART, compile_kernels
 from gscompleter.completer import GSCompleter, check_target_ids
 from gscompleter.config import CompleterConfig
@@ -293,7 +293,7 @@ def make_score_table(summary: Mapping[str, Any]) -> Table:
 
 def describe_result(summary: Mapping[str, Any], options: CompleteOptions) -> Iterator[str]:
     """Write the sentences below the table."""
-    yield from list_notes(parse_summary(summary, options.out / SUMMARY_FILE))
+    yield from list_notes(parse_content(CompletionSummary, summary, options.out / SUMMARY_FILE))
     if summary["targets"] and options.video:
         yield f"Video: {options.out / VIDEO_FILE}"
     before, after = (100 * summary["coverage"][when] for when in ("before", "after"))

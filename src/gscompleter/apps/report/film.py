@@ -117,7 +117,7 @@ def plan_camera_path(
 
     It slows down at each stop and may pass the photographs.
     """
-    legs = [interpolate_path(find_waypoints(a, b, photographs), count) for a, b in pairwise(stops)]
+    legs = [follow_path(find_waypoints(a, b, photographs), count) for a, b in pairwise(stops)]
     return [*(camera for each in legs for camera in each[:-1]), stops[-1]]
 
 
@@ -140,22 +140,29 @@ def find_waypoints(first: Camera, second: Camera, photographs: Sequence[Camera])
     return [first, *way[::-1]]
 
 
-def interpolate_path(way: Sequence[Camera], count: int) -> list[Camera]:
-    """Interpolate the path of a leg in `count` steps, with the intrinsics of its first camera.
+def follow_path(way: Sequence[Camera], count: int) -> list[Camera]:
+    """Plan the path of a leg in `count` steps, with the intrinsics of its first camera.
 
-    Centres, right and forward axes are smooth functions of the length of the way. Between level
-    cameras the right axes are level, and so the horizon stays level.
+    Centres, right and forward axes follow a cubic B-spline from the first camera to the last, past
+    the others. Between level cameras the right axes are level, and so the horizon stays level.
     """
-    from scipy.interpolate import PchipInterpolator
+    from scipy.interpolate import BSpline
 
-    where = embed_cameras(way).double().cpu()
-    steps = (where[1:] - where[:-1]).norm(dim=1).clamp_min(1e-6).numpy()
-    lengths = np.concatenate([[0.0], np.cumsum(steps)])
+    degree = min(3, len(way) - 1)
+    poses = torch.stack([camera.c2w[:3, [0, 2, 3]] for camera in way]).double().cpu().numpy()
+    smooth = BSpline(place_knots(way, degree), poses, degree)
     shares = np.linspace(0, 1, count + 1)
-    eased = lengths[-1] * shares**2 * (3 - 2 * shares)  # zero speed at both ends
-    poses = torch.stack([camera.c2w for camera in way]).double().cpu().numpy()
-    smooth = PchipInterpolator(lengths, poses[:, :3, [0, 2, 3]])(eased)
-    return [make_camera(way[0], *pose.T) for pose in smooth]
+    eased = shares**2 * (3 - 2 * shares)  # zero speed at both ends
+    return [make_camera(way[0], *pose.T) for pose in smooth(eased)]
+
+
+def place_knots(way: Sequence[Camera], degree: int) -> Float[np.ndarray, "k"]:
+    """Place the knots of a spline from 0 to 1 by the lengths of the steps of `way`."""
+    where = embed_cameras(way).double().cpu()
+    steps = (where[1:] - where[:-1]).norm(dim=1).clamp_min(1e-6)
+    lengths = np.array([0, *(steps.cumsum(dim=0) / steps.sum()).tolist()])
+    places = np.linspace(0, len(way) - 1, len(way) - degree + 1)
+    return np.pad(np.interp(places, range(len(way)), lengths), degree, mode="edge")
 
 
 def make_camera(

@@ -185,12 +185,7 @@ class CompletionRecord:
 def read_summary(folder: Path) -> CompletionSummary:
     """Read `summary.json`; raise an InputError if it is missing or damaged."""
     path = find_result(folder, SUMMARY_FILE)
-    return parse_summary(with_new_keys(read_json(path, ADVICE)), path)
-
-
-def parse_summary(content: Any, path: Path) -> CompletionSummary:
-    """Validate the content of a summary; `path` is for errors."""
-    return parse_content(CompletionSummary, content, path)
+    return parse_content(CompletionSummary, with_new_keys(read_json(path, ADVICE)), path)
 
 
 def read_record(folder: Path, summary: CompletionSummary) -> CompletionRecord:
