@@ -112,9 +112,10 @@ def compute_quantile(values: Float[Tensor, "n"], share: float) -> float:
 def describe_disagreement(found: Agreement, observed: WarpedImage, num_seeds: int) -> str:
     """Describe an inconsistent image for a reader of the results."""
     gains = ", ".join(f"{gain:.2f}" for gain in found.gain.tolist())
+    seeds = "" if num_seeds == 1 else f" (best of {num_seeds} seeds)"
     return (
         "The synthesized image disagrees with the photographs: over the "
         f"{observed.known.float().mean():.0%} of it that they show, colours differ by "
         f"{found.residual:.3f} ({found.limit:.3f} is the limit) after scaling the channels by "
-        f"{gains}; seeds tried: {num_seeds}."
+        f"{gains}{seeds}."
     )
