@@ -417,7 +417,7 @@ def test_depths_that_the_scene_contradicts_are_reported_and_not_added(tmp_path):
     assert len(refused.added) == len(result.added) == 0
     assert result.rejected_by == "depth-agreement"
     assert torch.equal(result.after.image, result.before.image)
-    summary = write_report(tmp_path, refused, [Target(target)], completer, {})
+    summary = write_report(tmp_path, refused, [Target(target)], completer.renderer, {})
     (said,) = summary["targets"]
     assert said["added"] == 0
     assert said["affine"]["agreement"] < 0.1
@@ -511,7 +511,7 @@ def test_an_antialiased_scene_is_completed_as_one(tmp_path, doubted):
     assert done.scene.is_antialiased
     drawn = load_renderer("cpu").render(done.scene, target)
     assert_close(drawn.image, result.after.image, "image", 1e-5)
-    write_report(tmp_path, done, [Target(target)], knowing(), {})
+    write_report(tmp_path, done, [Target(target)], knowing().renderer, {})
     for name in ("context.ply", "completed.ply", "generated.ply"):
         assert load_ply(tmp_path / name).is_antialiased, name
 

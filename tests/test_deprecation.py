@@ -51,16 +51,3 @@ def test_a_view_has_its_old_members():
 def test_a_module_has_its_old_names(module, old, new):
     with warns(f"{module.__name__}.{old}", new):
         assert getattr(module, old) is getattr(module, new)
-
-
-def test_a_generator_may_have_its_old_members():
-    class Old:
-        takes_margin, at_once = False, 3
-
-        def synthesize(self, requests):
-            return [len(requests)]
-
-    with warns("Generator.takes_margin, at_once", "supports_padding, max_batch_size"):
-        generator = gscompleter.generators.as_generator(Old())
-    assert (generator.supports_padding, generator.max_batch_size) == (False, 3)
-    assert generator.synthesize([None]) == [1]

@@ -22,7 +22,7 @@ NOISE = torch.rand(96, 96, 3, generator=torch.Generator().manual_seed(0))
 def observed() -> WarpedImage:
     """Return the left half of the true image; the right half is unknown."""
     image = torch.where(SEEN[..., None], TRUTH, torch.zeros_like(TRUTH))
-    return WarpedImage(image, SEEN, torch.ones(96, 96), ())
+    return WarpedImage(image, SEEN, torch.ones(96, 96), torch.ones(0, 3))
 
 
 def paint_checked(*arguments) -> tuple[torch.Tensor, tuple[str, ...]]:
@@ -72,7 +72,7 @@ def test_an_image_in_negative_is_no_colour_shift():
     assert not found.is_consistent
     assert found.residual < found.limit
     _, (note,) = paint_checked(lambda seed: 1 - TRUTH, 0, observed())
-    assert "a colour channel matches only with factor -1.00 and offset +1.00" in note
+    assert "after scaling the channels by -1.00, -1.00" in note
 
 
 @pytest.mark.parametrize("contrast", [0.5, 1.0])
@@ -131,7 +131,7 @@ def test_further_seeds_are_tried_where_asked_and_only_until_one_agrees():
     image, notes = paint_checked(paint, 7, observed(), 5)
     assert tried == [7, 8, 9]
     assert (image - TRUTH).abs().max() < 0.01
-    assert notes[-1].startswith("3 seeds were tried")
+    assert notes == ()
     tried.clear()
     _, notes = paint_checked(paint, 0, observed(), 1)
     assert tried == [0, 1]
@@ -139,7 +139,7 @@ def test_further_seeds_are_tried_where_asked_and_only_until_one_agrees():
 
 
 def test_where_nothing_was_seen_nothing_is_said():
-    nothing = WarpedImage(TRUTH, torch.zeros_like(SEEN), torch.ones(96, 96), ())
+    nothing = WarpedImage(TRUTH, torch.zeros_like(SEEN), torch.ones(96, 96), torch.ones(0, 3))
     image, notes = paint_checked(lambda seed: NOISE, 0, nothing)
     assert torch.equal(image, NOISE)
     assert notes == ()

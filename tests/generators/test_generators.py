@@ -10,7 +10,7 @@ import torch
 from gscompleter import InputError, load_generator, load_renderer
 from gscompleter.evaluation.metrics.image import psnr
 from gscompleter.generators.exposure import match_exposures
-from gscompleter.generators.oracle import Oracle
+from gscompleter.generators.oracle import make_oracle
 from gscompleter.generators.smooth import compute_distance_to_known, continue_smoothly
 from gscompleter.generators.warp import WarpedImage, warp_photographs
 from gscompleter.generators.warp_inpaint import WarpInpaint, fill_background_first, remove_cracks
@@ -151,7 +151,7 @@ def test_the_background_fills_what_an_object_uncovers():
     known = torch.ones(32, 48, dtype=torch.bool)
     known[:, 16:32] = False
     depth = torch.where(torch.arange(48) < 24, 1.0, 4.0).expand(32, 48).contiguous()
-    tone, log_depth = fill_background_first(WarpedImage(image, known, depth, ()))
+    tone, log_depth = fill_background_first(WarpedImage(image, known, depth, torch.ones(0, 3)))
     middle = tone[16, 24]
     assert middle[2] > 5 * middle[0]
     assert log_depth[16, 24].exp() > 3
@@ -252,10 +252,12 @@ def test_a_foreground_object_is_not_copied_behind_itself():
 def test_the_oracle_returns_the_photograph_and_refuses_without_one():
     photograph = view_of(Room(), TARGET)
     context = known_room()
-    image = answer(Oracle([*context.views, photograph]), context.views[0], TARGET, context).image
+    image = answer(
+        make_oracle([*context.views, photograph]), context.views[0], TARGET, context
+    ).image
     assert torch.equal(image, photograph.image)
     with pytest.raises(InputError, match="photograph"):
-        answer(Oracle(context.views), context.views[0], TARGET, context)
+        answer(make_oracle(context.views), context.views[0], TARGET, context)
 
 
 def test_an_unknown_generator_is_refused():

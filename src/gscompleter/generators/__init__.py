@@ -11,7 +11,7 @@ from torch import Tensor
 
 from gscompleter.config.generators import PLUGINS, GeneratorSettings, get_settings_class
 from gscompleter.config.settings import validate
-from gscompleter.deprecation import resolve_old_name, warn_deprecated
+from gscompleter.deprecation import resolve_old_name
 from gscompleter.errors import InputError
 from gscompleter.plugins import load_plugins
 from gscompleter.types import Camera, GeneratorInput, View
@@ -76,23 +76,9 @@ class FunctionGenerator:
         return [a if isinstance(a, GeneratorOutput) else GeneratorOutput(a) for a in answers]
 
 
-@dataclass(frozen=True)
-class RenamedGenerator:
-    """A generator whose class has the old member names."""
-
-    synthesize: Callable[[Sequence[GeneratorRequest]], list[GeneratorOutput]]
-    supports_padding: bool
-    max_batch_size: int
-
-
 def as_generator(phi: Any) -> Generator:
-    """Return a `Generator`, wrapping an `ImageFunction` or a class with the old member names."""
-    if isinstance(phi, Generator):
-        return phi
-    if hasattr(phi, "takes_margin"):
-        warn_deprecated("Generator.takes_margin, at_once", "supports_padding, max_batch_size")
-        return RenamedGenerator(phi.synthesize, phi.takes_margin, phi.at_once)
-    return FunctionGenerator(phi)
+    """Return a `Generator`, wrapping an `ImageFunction`."""
+    return phi if isinstance(phi, Generator) else FunctionGenerator(phi)
 
 
 def load_generator(
@@ -143,9 +129,9 @@ def _load_warp_inpaint(
 def _load_oracle(
     settings: GeneratorSettings, seed: int, photographs: Sequence[View], device: str
 ) -> Generator:
-    from gscompleter.generators.oracle import Oracle
+    from gscompleter.generators.oracle import make_oracle
 
-    return Oracle(photographs)
+    return make_oracle(photographs)
 
 
 GENERATORS: dict[str, Callable[..., Generator]] = {

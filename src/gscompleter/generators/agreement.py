@@ -41,16 +41,10 @@ class Agreement:
     """Quantile of the colour difference after the correction."""
     limit: float
     """Largest residual of a consistent image."""
-    share: float
     is_consistent: bool
     """True if the image is consistent with the photographs, or cannot be compared."""
     image: Float[Tensor, "h w 3"]
     """The image, corrected if it is consistent."""
-
-    @property
-    def shift(self) -> float:
-        """Largest change of mid-grey by the correction."""
-        return float((0.5 * self.gain + self.offset - 0.5).abs().max())
 
 
 def paint_consistently(
@@ -77,7 +71,8 @@ def paint_consistently(
             f"The generator painted no finite image ({len(found)} seed(s) tried); check that its "
             "weights are correct, or choose another generator."
         )
-    return GeneratorOutput(best.image, write_notes(best, len(found)), not best.is_consistent)
+    notes = () if best.is_consistent else (describe_disagreement(best, observed, len(found)),)
+    return GeneratorOutput(best.image, notes, not best.is_consistent)
 
 
 def compare_with_observed(
@@ -88,11 +83,10 @@ def compare_with_observed(
 ) -> Agreement:
     """Fit the colour shift of `image` to the `known` pixels and correct it if consistent."""
     ones, zeros = torch.ones(3).to(image), torch.zeros(3).to(image)
-    share = known.float().mean().item()
     if not image.isfinite().all():
-        return Agreement(ones, zeros, float("inf"), MIN_LIMIT, share, False, image)
+        return Agreement(ones, zeros, float("inf"), MIN_LIMIT, False, image)
     if int(known.sum()) < MIN_PIXELS:
-        return Agreement(ones, zeros, 0.0, MIN_LIMIT, share, True, image)
+        return Agreement(ones, zeros, 0.0, MIN_LIMIT, True, image)
     ours = smooth_masked(image, known, BLUR_RADIUS)[known]
     theirs = smooth_masked(observed, known, BLUR_RADIUS)[known]
     gain, offset = fit_robust_affine(ours, theirs)
@@ -107,7 +101,7 @@ def compare_with_observed(
     if agrees and not correct_color:
         gain, offset = ones, zeros
     corrected = (gain * image + offset).clamp(0, 1) if agrees else image
-    return Agreement(gain, offset, residual, limit, share, agrees, corrected)
+    return Agreement(gain, offset, residual, limit, agrees, corrected)
 
 
 def compute_quantile(values: Float[Tensor, "n"], share: float) -> float:
@@ -115,30 +109,13 @@ def compute_quantile(values: Float[Tensor, "n"], share: float) -> float:
     return values.kthvalue(1 + int(share * (len(values) - 1))).values.item()
 
 
-def write_notes(found: Agreement, num_seeds: int) -> tuple[str, ...]:
-    """Write notes on the comparison for a reader of the results."""
-    if not found.is_consistent:
-        seeds = "" if num_seeds == 1 else f" (best of {num_seeds} seeds)"
-        if found.residual > found.limit:
-            reason = f"colours differ by {found.residual:.3f}"
-            limit = f"{found.limit:.3f} is the limit"
-        else:
-            worst = int(((found.gain - 1).abs() + found.offset.abs()).argmax())
-            gain, offset = found.gain[worst].item(), found.offset[worst].item()
-            reason = (
-                f"a colour channel matches only with factor {gain:.2f} and offset {offset:+.2f}"
-            )
-            limit = "this is more than a colour shift"
-        return (
-            f"The synthesized image disagrees with the photographs: over the {found.share:.0%} of "
-            f"it that they show, {reason}{seeds}, and {limit}.",
-        )
-    notes = []
-    if found.shift > 0.5 / 255:
-        notes.append(
-            "The colours of the synthesized image were matched to those of the photographs "
-            f"(mid-grey changed by {255 * found.shift:.1f} of 255)."
-        )
-    if num_seeds > 1:
-        notes.append(f"{num_seeds} seeds were tried before the synthesized image agreed.")
-    return tuple(notes)
+def describe_disagreement(found: Agreement, observed: WarpedImage, num_seeds: int) -> str:
+    """Describe an inconsistent image for a reader of the results."""
+    gains = ", ".join(f"{gain:.2f}" for gain in found.gain.tolist())
+    seeds = "" if num_seeds == 1 else f" (best of {num_seeds} seeds)"
+    return (
+        "The synthesized image disagrees with the photographs: over the "
+        f"{observed.known.float().mean():.0%} of it that they show, colours differ by "
+        f"{found.residual:.3f} ({found.limit:.3f} is the limit) after scaling the channels by "
+        f"{gains}{seeds}."
+    )

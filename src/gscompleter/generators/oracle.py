@@ -3,41 +3,24 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
-
-from jaxtyping import Float
-from torch import Tensor
 
 from gscompleter.errors import InputError
-from gscompleter.generators import GeneratorOutput, GeneratorRequest
+from gscompleter.generators import FunctionGenerator, GeneratorOutput
 from gscompleter.geometry import is_same_camera
-from gscompleter.types import Camera, View
+from gscompleter.types import Camera, GeneratorInput, View
 
 
-@dataclass(frozen=True)
-class Oracle:
-    """Φ that returns the photograph of the target camera."""
+def make_oracle(photographs: Sequence[View]) -> FunctionGenerator:
+    """Make the Φ that returns the photograph of the target camera, which cannot be padded."""
 
-    photographs: Sequence[View]
-
-    supports_padding: bool = False
-    """False, because a photograph cannot be extended."""
-    max_batch_size: int = 1
-
-    def synthesize(self, requests: Sequence[GeneratorRequest]) -> list[GeneratorOutput]:
-        """Return the photographs of the targets."""
-        return [
-            GeneratorOutput(self.find_photograph(request.target), is_photograph=True)
-            for request in requests
-        ]
-
-    def find_photograph(self, target: Camera) -> Float[Tensor, "h w 3"]:
-        """Find the photograph of `target`; raise InputError if there is none."""
-        for photograph in self.photographs:
+    def find_photograph(nearest: View, target: Camera, context: GeneratorInput) -> GeneratorOutput:
+        for photograph in photographs:
             if is_same_camera(photograph.camera, target):
-                return photograph.image.to(target.K.device)
+                return GeneratorOutput(photograph.image.to(target.K.device), is_photograph=True)
         raise InputError(
-            f"The generator 'oracle' has {len(self.photographs)} photographs, none of them taken "
-            "by the target camera; give it the photograph of the target frame, or choose "
-            "'warp-inpaint' if there is none."
+            f"The generator 'oracle' has {len(photographs)} photographs, none of them taken by the "
+            "target camera; give it the photograph of the target frame, or choose 'warp-inpaint' "
+            "if there is none."
         )
+
+    return FunctionGenerator(find_photograph, supports_padding=False)

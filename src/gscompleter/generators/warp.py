@@ -13,7 +13,7 @@ from gscompleter.generators.exposure import match_exposures
 from gscompleter.generators.smooth import continue_smoothly
 from gscompleter.geometry import is_inside, measure_baseline, project, sample, unproject
 from gscompleter.image_ops import dilate
-from gscompleter.types import Camera, GeneratorInput, Render, View
+from gscompleter.types import Camera, GeneratorInput, Render, TensorDataclass, View
 
 DEPTH_TOLERANCE = 0.03
 """Relative depth error at which the weight of a photograph falls to 1/e."""
@@ -26,7 +26,7 @@ DYNAMIC_MARGIN = 4
 
 
 @dataclass(frozen=True)
-class WarpedImage:
+class WarpedImage(TensorDataclass):
     """The known part of the target image."""
 
     image: Float[Tensor, "h w 3"]
@@ -34,17 +34,8 @@ class WarpedImage:
     """True at pixels that show the scene; the others are undefined."""
     depth: Float[Tensor, "h w"]
     """z-depth in the target camera in scene units, valid if known."""
-    gains: tuple[Float[Tensor, "3"], ...]
+    gains: Float[Tensor, "views 3"]
     """Exposure gain applied to each photograph to match the nearest one."""
-
-    def to(self, device: torch.device | str) -> WarpedImage:
-        """Return a copy on `device`."""
-        return WarpedImage(
-            self.image.to(device),
-            self.known.to(device),
-            self.depth.to(device),
-            tuple(gain.to(device) for gain in self.gains),
-        )
 
 
 def warp_photographs(nearest: View, target: Camera, context: GeneratorInput) -> WarpedImage:
@@ -82,7 +73,7 @@ def warp_photographs(nearest: View, target: Camera, context: GeneratorInput) -> 
     if context.trusted_alpha is not None:
         known = known | ((scene.alpha >= context.max_alpha) & (total > MIN_WEIGHT**SHARPNESS))
     known = known & ~(dilate(dynamic, DYNAMIC_MARGIN) & (total < MIN_WEIGHT**SHARPNESS))
-    return WarpedImage(image.clamp(0, 1), known, scene.depth, tuple(factors))
+    return WarpedImage(image.clamp(0, 1), known, scene.depth, torch.stack(factors))
 
 
 def add_unexplained(warped: WarpedImage, target: Camera, context: GeneratorInput) -> WarpedImage:
@@ -91,7 +82,7 @@ def add_unexplained(warped: WarpedImage, target: Camera, context: GeneratorInput
     Its depth is unknown, so the depth around the hole is continued. Only photographs whose own
     render is empty in that direction count; others show an occluder. Some pixel must be known.
     """
-    guess = continue_depth(warped).exp().to(warped.depth.device)
+    guess = fill_background_first(warped, 0)[1].exp().to(warped.depth.device)
     points = unproject(guess, target)
     colour = torch.zeros_like(warped.image)
     total = torch.zeros_like(guess)
@@ -114,31 +105,18 @@ def add_unexplained(warped: WarpedImage, target: Camera, context: GeneratorInput
 
 
 def fill_background_first(
-    warped: WarpedImage,
-) -> tuple[Float[Tensor, "h w 3"], Float[Tensor, "h w"]]:
-    """Continue image and log-depth beyond the known pixels, preferring far pixels.
+    warped: WarpedImage, num_channels: int = 3
+) -> tuple[Float[Tensor, "h w c"], Float[Tensor, "h w"]]:
+    """Continue colour channels and log-depth beyond the known pixels, preferring far pixels.
 
     A hole beside an object usually shows the background, so the weight is the squared depth.
     """
-    log_depth, weight, middle = _compute_relative_depth(warped)
-    layers = continue_smoothly(torch.cat([warped.image.cpu(), log_depth], dim=-1), weight)
-    return layers[..., :3], layers[..., 3] + middle
-
-
-def continue_depth(warped: WarpedImage) -> Float[Tensor, "h w"]:
-    """Continue only the log-depth, as in `fill_background_first`."""
-    log_depth, weight, middle = _compute_relative_depth(warped)
-    return continue_smoothly(log_depth, weight)[..., 0] + middle
-
-
-def _compute_relative_depth(
-    warped: WarpedImage,
-) -> tuple[Float[Tensor, "h w 1"], Float[Tensor, "h w"], Float[Tensor, ""]]:
-    """Compute log-depth relative to the median, its weight and the log of the median."""
     known, depth = warped.known.cpu(), warped.depth.cpu()
     middle = depth[known].median()
     relative = (depth / middle).clamp(0.1, 10.0)
-    return relative.log()[..., None], relative**2 * known, middle.log()
+    layers = torch.cat([warped.image.cpu()[..., :num_channels], relative.log()[..., None]], dim=-1)
+    filled = continue_smoothly(layers, relative**2 * known)
+    return filled[..., :-1], filled[..., -1] + middle.log()
 
 
 def _compute_visibility(

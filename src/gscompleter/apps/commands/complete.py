@@ -33,11 +33,11 @@ from gscompleter.apps.inputs.opening import (
 )
 from gscompleter.apps.inputs.plan import describe_task, name_target
 from gscompleter.apps.inputs.selection import collect_usable_cameras
-from gscompleter.apps.report.completion import Surroundings, Target, write_report
+from gscompleter.apps.report.completion import Target, write_report
 from gscompleter.apps.report.completion_page import average_scores, render_completion_page
 from gscompleter.apps.report.film import write_comparison_video
 from gscompleter.apps.report.page import REPORT_FILE, write_page
-from gscompleter.apps.report.plain_words import format_number, format_percent, list_scene_notes
+from gscompleter.apps.report.plain_words import format_number, format_percent, list_notes
 from gscompleter.apps.report.schema import CompletionSummary, read_summary
 from gscompleter.apps.warmup import SPLAT_PART, compile_kernels
 from gscompleter.completer import GSCompleter, check_target_ids
@@ -150,10 +150,11 @@ def write_done(folder: Path, ready: Prepared, completion: Completion) -> dict[st
             folder,
             completion,
             task.targets,
-            completer,
+            completer.renderer,
             {**facts, "seed": options.seed},
             task.splat_file,
-            lambda: Surroundings(tuple(looks()), cameras),
+            cameras,
+            looks,
             read_held_out(options, ready.opened, task, ready.cameras),
         )
     write_page(folder, render_completion_page(folder))
@@ -261,7 +262,7 @@ def make_score_table(summary: CompletionSummary) -> Table:
 
 def describe_result(summary: CompletionSummary, options: CompleteOptions) -> Iterator[str]:
     """Write the sentences below the table."""
-    yield from list_scene_notes(summary)
+    yield from list_notes(summary)
     share = "Trusted" if summary.settings["config"]["trust"] == "photometric" else "Coverage"
     before, after = map(format_percent, (summary.coverage.before, summary.coverage.after))
     yield f"{share} around the photographs: {before} before, {after} after."

@@ -1,231 +1,142 @@
-"""Charts of a report, as their templates draw them, and depth images."""
+"""The drawing of cameras, the plot of depth pairs, and the colours of depth images."""
 
 from __future__ import annotations
 
-import math
 from collections.abc import Sequence
-from dataclasses import dataclass, field
-from pathlib import Path
+from dataclasses import dataclass
 
 import cv2
 import numpy as np
 import torch
-from jaxtyping import Bool, Float, UInt8
-from PIL import Image
+from jaxtyping import Float
+from torch import Tensor
+from torch.nn.functional import normalize
 
-from gscompleter.apps.report.schema import CompletionRecord, Limits, PairsRow, PoseRow
-from gscompleter.io.files import replace_file
-from gscompleter.io.image import PNG_COMPRESSION
-from gscompleter.types import DepthMap
+from gscompleter.apps.report.schema import PairsRow, SceneDrawing
+from gscompleter.evaluation.metrics.coverage import RenderPair
+from gscompleter.geometry import estimate_up
+from gscompleter.io.image import convert_to_image
+from gscompleter.state import Completion
+from gscompleter.types import Camera, Gaussians, Render
 
-WIDTH, HEIGHT = 360.0, 220.0
-LEFT, BOTTOM, TOP, RIGHT = 52.0, 40.0, 12.0, 12.0
-"""Margins around the axes of a plot."""
+MAX_POINTS = 600
+"""Largest number of points to draw, of the context and of the added Gaussians each."""
+MIN_SURFACE_OPACITY = 0.3
+FRUSTUM = ((-1, -1, 1), (1, -1, 1), (1, 1, 1), (-1, 1, 1))
+"""Image corners of a camera pyramid, whose apex is the origin."""
 FRUSTUM_DEPTH = 0.11
-"""Length of a camera pyramid in the scene drawing, in radii."""
-FRUSTUM_CORNERS = np.array([[-1, -1], [1, -1], [1, 1], [-1, 1]])
-MAX_POINT_DISTANCE = 15.0
-"""Largest distance of points from the cameras, as a factor of the extent of the cameras."""
+"""Length of a camera pyramid, in radii."""
+SHOWN_FRACTION = 0.9
+"""Fraction of the points within the radius."""
 POINT_BOUND = 1.2
 """Largest coordinate of a point, in radii."""
-SHOWN_FRACTION = 0.9
-"""Fraction of cameras and points within the radius."""
 NO_DEPTH_COLOR = (128, 128, 128)
 TAIL_FRACTION = 0.01
 """Fraction of the depths at either end that the colours do not resolve."""
 
 
 @dataclass(frozen=True)
-class Axis:
-    """A linear axis: its range in values and in drawing units."""
+class DrawingFrame:
+    """Coordinate frame of a drawing."""
 
-    name: str
-    low: float
-    high: float
-    start: float
-    end: float
-
-    def __call__(self, value: float) -> float:
-        """Compute the drawing position of a value."""
-        share = (value - self.low) / (self.high - self.low)
-        return self.start + share * (self.end - self.start)
-
-    @property
-    def ticks(self) -> list[tuple[float, str]]:
-        """Drawing positions of round numbers, and the numbers."""
-        return [(self(value), f"{value:g}") for value in compute_ticks(self.low, self.high)]
-
-
-@dataclass(frozen=True)
-class Plot:
-    """Lines and dots by kind between two axes."""
-
-    title: str
-    description: str
-    x: Axis
-    y: Axis
-    lines: dict[str, str] = field(default_factory=dict)
-    """`points` of polylines."""
-    dots: dict[str, str] = field(default_factory=dict)
-    """`d` of paths."""
-
-
-def compute_ticks(low: float, high: float, most: int = 5) -> list[float]:
-    """Return round numbers from `low` to `high`."""
-    raw = (high - low) / most
-    size = 10.0 ** math.floor(math.log10(raw))
-    step = next(size * factor for factor in (1, 2, 5, 10) if size * factor >= raw * (1 - 1e-9))
-    first, last = math.ceil(low / step - 1e-9), math.floor(high / step + 1e-9)
-    return [k * step for k in range(first, last + 1)]
-
-
-def make_axes(
-    names: tuple[str, str], across: Sequence[float], up: Sequence[float]
-) -> tuple[Axis, Axis]:
-    """Make the axes of a plot around values."""
-    x, y = (pad_range(min(values), max(values)) for values in (across, up))
-    return Axis(names[0], *x, LEFT, WIDTH - RIGHT), Axis(names[1], *y, HEIGHT - BOTTOM, TOP)
-
-
-def pad_range(low: float, high: float) -> tuple[float, float]:
-    """Widen a range; the result is never empty."""
-    padding = 0.05 * ((high - low) or abs(high) or 1.0)
-    return low - padding, high + padding
-
-
-def plot_loss(title: str, losses: Sequence[float]) -> Plot | None:
-    """Plot the loss over the iterations, or return None for less than two."""
-    known = [(float(k), loss) for k, loss in enumerate(losses, start=1) if math.isfinite(loss)]
-    if len(known) < 2:
-        return None
-    text = f"A curve over {len(losses)} iterations, from {known[0][1]:.3g} to {known[-1][1]:.3g}."
-    x, y = make_axes(("iteration", "loss"), *zip(*known, strict=True))
-    return Plot(title, text, x, y, {"curve": draw_line(known, x, y)})
-
-
-def plot_depth_pairs(pairs: PairsRow, scale: float, shift: float, unit: str) -> Plot | None:
-    """Plot lifted against scene depths with the fitted line, or return None without pairs."""
-    if not pairs.agrees or not math.isfinite(scale + shift):
-        return None
-    share, count = sum(pairs.agrees) / len(pairs.agrees), len(pairs.agrees)
-    line = f"{scale:.3f} times depth plus {shift:.3g}"
-    text = f"{count} pixels; {share:.0%} lie on the line {line}."
-    names = (f"lifted depth ({unit})", f"scene depth ({unit})")
-    x, y = make_axes(names, pairs.predicted, pairs.context)
-    dots = {"outlier": "", "inlier": ""}
-    for depth, seen, agrees in zip(pairs.predicted, pairs.context, pairs.agrees, strict=True):
-        dots["inlier" if agrees else "outlier"] += f"M{x(depth):.1f} {y(seen):.1f}h0"
-    low, high = max(x.low, (y.low - shift) / scale), min(x.high, (y.high - shift) / scale)
-    ends = [(low, scale * low + shift), (high, scale * high + shift)] if low < high else []
-    title = "Lifted depth against scene depth"
-    return Plot(title, text, x, y, {"fit": draw_line(ends, x, y)}, dots)
-
-
-def draw_line(points: Sequence[tuple[float, float]], x: Axis, y: Axis) -> str:
-    """Write `points` of a polyline."""
-    return " ".join(f"{x(a):.1f},{y(b):.1f}" for a, b in points)
-
-
-@dataclass(frozen=True)
-class SceneDrawing:
-    """Coordinate frame of the drawing of cameras and points, which the page rotates.
-
-    Coordinates are relative to the middle of the cameras, upright, in units of the radius.
-    """
-
-    center: Float[np.ndarray, "3"]
-    axes: Float[np.ndarray, "3 3"]
-    """Axes as rows; the second points up."""
+    center: Float[Tensor, "3"]
+    axes: Float[Tensor, "3 3"]
+    """Unit axes as rows: right, up and back."""
     radius: float
 
-    def convert(self, points: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "n 3"]:
+    def convert(self, points: Float[Tensor, "*n 3"]) -> Float[Tensor, "*n 3"]:
         """Convert world points to the drawing."""
         return (points - self.center) @ self.axes.T / self.radius
 
-    def place_points(self, points: Sequence[Sequence[float]]) -> list[str]:
-        """Write the positions of points within the borders of the drawing."""
-        placed = self.convert(np.reshape(points, (-1, 3)))
-        within = np.abs(placed).max(axis=1, initial=0) <= POINT_BOUND
-        return [format_points(point) for point in placed[within]]
 
-    def place_camera(self, pose: PoseRow) -> str:
-        """Write the corners of one line along the edges of a camera pyramid, centre first."""
-        c2w, depth = np.array(pose.c2w), FRUSTUM_DEPTH * self.radius
-        sides = FRUSTUM_CORNERS * pose.opening / max(pose.opening) * 0.6
-        a, b, c, d = np.c_[sides, np.ones(4)] * depth @ c2w[:, :3].T + c2w[:, 3]
-        o = c2w[:, 3]
-        return format_points(self.convert(np.stack([o, a, b, c, d, a, b, o, c, d, o])))
+def draw_scene(completion: Completion, photographs: Sequence[Camera]) -> SceneDrawing:
+    """Draw all cameras, and samples of the context and of the added Gaussians."""
+    context = [view.camera.to("cpu") for view in completion.views]
+    targets = [result.target.to("cpu") for result in completion.targets]
+    others = [camera.to("cpu") for camera in photographs]
+    scene, added = sample_points(completion.context), sample_points(completion.added)
+    frame = fit_frame([*others, *context, *targets], torch.cat([scene, added]))
+    return SceneDrawing(
+        *(tuple(draw_camera(camera, frame) for camera in g) for g in (others, context, targets)),
+        *(draw_points(points, frame) for points in (scene, added)),
+    )
 
 
-def format_points(points: Float[np.ndarray, "*n 3"]) -> str:
+def sample_points(gaussians: Gaussians) -> Float[Tensor, "n 3"]:
+    """Sample means of opaque Gaussians."""
+    opaque = gaussians.means[gaussians.opacities >= MIN_SURFACE_OPACITY].detach().cpu()
+    order = torch.randperm(len(opaque), generator=torch.Generator().manual_seed(0))
+    return opaque[order[:MAX_POINTS]]
+
+
+def fit_frame(cameras: Sequence[Camera], points: Float[Tensor, "n 3"]) -> DrawingFrame:
+    """Fit a frame around cameras and points whose up axis is that of most cameras."""
+    up = estimate_up(cameras)
+    level = min(cameras, key=lambda camera: (camera.c2w[:3, 1] @ up).item())
+    back = normalize(torch.linalg.cross(level.c2w[:3, 0], up), dim=0)
+    centers = torch.stack([camera.center for camera in cameras])
+    middle = torch.cat([centers, points]).median(dim=0).values
+    farthest = 1.1 * (centers - middle).norm(dim=1).max()
+    away = torch.cat([(points - middle).norm(dim=1), farthest[None]])
+    radius = max(farthest.item(), away.quantile(SHOWN_FRACTION).item(), 1e-9)
+    return DrawingFrame(middle, torch.stack([torch.linalg.cross(up, back), up, back]), radius)
+
+
+def draw_camera(camera: Camera, frame: DrawingFrame) -> str:
+    """Write the corners of one line along the edges of a camera pyramid, centre first."""
+    size = torch.tensor([camera.width, camera.height]) / camera.K.diagonal()[:2]
+    sides = torch.cat([0.6 * size / size.max(), torch.ones(1)])
+    a, b, c, d = torch.tensor(FRUSTUM) * sides @ camera.c2w[:3, :3].T @ frame.axes.T
+    o = torch.zeros(3)
+    corners = FRUSTUM_DEPTH * torch.stack([o, a, b, c, d, a, b, o, c, d, o])
+    return format_points(frame.convert(camera.center) + corners)
+
+
+def draw_points(points: Float[Tensor, "n 3"], frame: DrawingFrame) -> tuple[str, ...]:
+    """Write the positions of points within the borders of the drawing."""
+    placed = frame.convert(points)
+    return tuple(map(format_points, placed[(placed.abs() <= POINT_BOUND).all(dim=1)]))
+
+
+def format_points(points: Float[Tensor, "*n 3"]) -> str:
     """Format points for the script of the page."""
     return " ".join(f"{value:.3f}" for value in points.flatten().tolist())
 
 
-def fit_drawing(record: CompletionRecord) -> SceneDrawing:
-    """Fit a frame around cameras and points whose up axis is that of most cameras."""
-    targets = tuple(target.camera for target in record.targets)
-    poses = np.array([pose.c2w for pose in (*record.photographs, *record.context, *targets)])
-    points = np.reshape(record.scene_points + record.added_points, (-1, 3))
-    cameras = poses[:, :, 3]
-    extent = compute_distances(cameras, cameras.mean(axis=0)).max()
-    far = compute_distances(points, cameras.mean(axis=0)) > MAX_POINT_DISTANCE * extent
-    shown = np.concatenate([cameras, points if extent == 0 else points[~far]])
-    center = np.quantile(shown, [1 - SHOWN_FRACTION, SHOWN_FRACTION], axis=0).mean(axis=0)
-    away = compute_distances(shown, center)
-    radius = max(np.quantile(away, SHOWN_FRACTION), 1.1 * away[: len(cameras)].max())
-    return SceneDrawing(center, fit_upright_axes(poses), float(radius) or 1.0)
+@dataclass(frozen=True)
+class DepthPlot:
+    """Lifted depths (to the right) against scene depths (down), as paths in a unit square."""
+
+    end: float
+    """Largest depth, at the end of both axes, in scene units."""
+    inliers: str
+    outliers: str
 
 
-def fit_upright_axes(poses: Float[np.ndarray, "n 3 4"]) -> Float[np.ndarray, "3 3"]:
-    """Fit axes as rows: right, up and back of most cameras."""
-    up, forward = -poses[:, :, 1].mean(axis=0), poses[:, :, 2].mean(axis=0)
-    right = np.cross(forward, up)
-    if np.linalg.norm(right) < 1e-6:
-        up, right = -poses[0, :, 1], poses[0, :, 0]
-    right, up = right / np.linalg.norm(right), up / np.linalg.norm(up)
-    return np.stack([right, up, np.cross(right, up)])
+def plot_depth_pairs(pairs: PairsRow) -> DepthPlot:
+    """Plot the compared depths of a target as dots."""
+    end = max(*pairs.predicted, *pairs.context)
+    dots = {True: "", False: ""}
+    for lifted, seen, agrees in zip(pairs.predicted, pairs.context, pairs.agrees, strict=True):
+        dots[agrees] += f"M{lifted / end:.4f} {seen / end:.4f}h0"
+    return DepthPlot(end, dots[True], dots[False])
 
 
-def compute_distances(
-    points: Float[np.ndarray, "n 3"], center: Float[np.ndarray, "3"]
-) -> Float[np.ndarray, "n"]:
-    """Compute the distances of points from `center`."""
-    return np.linalg.norm(points - center, axis=1)
-
-
-def make_palette() -> UInt8[np.ndarray, "256 3"]:
-    """Make the palette of depth images: grey for no depth, then viridis from near to far."""
-    steps = np.linspace(0, 255, 255).round().astype(np.uint8)
-    viridis = cv2.applyColorMap(steps, cv2.COLORMAP_VIRIDIS).reshape(-1, 3)[:, ::-1]
-    return np.concatenate([np.array([NO_DEPTH_COLOR], np.uint8), viridis])
-
-
-def compute_depth_limits(maps: Sequence[DepthMap]) -> Limits | None:
+def compute_depth_limits(pair: RenderPair) -> tuple[float, float] | None:
     """Compute the nearest and farthest depth of the colours, or None without any depth."""
-    known = np.concatenate([depth[mask] for depth, mask in map(copy_depths, maps)])
+    maps = pair.before.depth_map(), pair.after.depth_map()
+    known = torch.cat([depth_map.depth[depth_map.valid] for depth_map in maps])
     if len(known) == 0:
         return None
-    near, far = np.quantile(known, [TAIL_FRACTION, 1 - TAIL_FRACTION]).tolist()
-    return near, max(far, 1.001 * near)
+    ends = np.quantile(known.cpu().double().numpy(), [TAIL_FRACTION, 1 - TAIL_FRACTION])
+    return ends[0].item(), max(ends[1], 1.001 * ends[0]).item()
 
 
-def write_depth_image(path: Path, depth_map: DepthMap, limits: Limits) -> None:
-    """Write a depth map as a palette PNG: viridis over the logarithm of z-depth."""
-    near, far = np.log(limits)
-    depth, known = copy_depths(depth_map)
-    share = (np.log(np.where(known, depth, 1.0)) - near) / (far - near)
-    indices = np.where(known, 1 + np.rint(254 * share.clip(0, 1)), 0).astype(np.uint8)
-    image = Image.fromarray(indices)
-    image.putpalette(make_palette().tobytes())
-    with replace_file(path) as file:
-        image.save(file, format="PNG", compress_level=PNG_COMPRESSION)
-
-
-def copy_depths(
-    depth_map: DepthMap,
-) -> tuple[Float[np.ndarray, "h w"], Bool[np.ndarray, "h w"]]:
-    """Copy z-depths to the CPU, with the mask of pixels that have one."""
-    depth = depth_map.depth.detach()
-    known = depth_map.valid & torch.isfinite(depth) & (depth > 0)
-    return depth.cpu().double().numpy(), known.cpu().numpy()
+def color_depth(render: Render, limits: tuple[float, float]) -> Float[Tensor, "h w 3"]:
+    """Color the logarithm of z-depth with viridis, from near to far; grey without a depth."""
+    near, far = limits
+    depth = render.depth.cpu().double().clamp(near, far).numpy()
+    levels = np.rint(255 * np.log(depth / near) / np.log(far / near)).astype(np.uint8)
+    colors = cv2.cvtColor(cv2.applyColorMap(levels, cv2.COLORMAP_VIRIDIS), cv2.COLOR_BGR2RGB)
+    colors[~render.depth_map().valid.cpu().numpy()] = NO_DEPTH_COLOR
+    return convert_to_image(colors)

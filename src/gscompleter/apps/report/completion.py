@@ -15,7 +15,7 @@ from jaxtyping import Bool, Float, Int64
 from torch import Tensor
 
 from gscompleter import __version__
-from gscompleter.apps.report.charts import compute_depth_limits, write_depth_image
+from gscompleter.apps.report.charts import color_depth, compute_depth_limits, draw_scene
 from gscompleter.apps.report.schema import (
     RECORD_FILE,
     SCORES,
@@ -23,14 +23,10 @@ from gscompleter.apps.report.schema import (
     CompletionRecord,
     ContextRow,
     HeldOutRow,
-    Limits,
     PairsRow,
-    PoseRow,
     TargetRecord,
     TargetRow,
-    Vector,
 )
-from gscompleter.completer import GSCompleter
 from gscompleter.evaluation.metrics.coverage import RenderPair, compute_coverage
 from gscompleter.evaluation.metrics.image import compute_masked_psnr, ssim
 from gscompleter.io.files import COMPLETED_FILE, CONTEXT_FILE, SUMMARY_FILE
@@ -41,14 +37,12 @@ from gscompleter.splats.layout import save_like
 from gscompleter.splats.ply import save_ply
 from gscompleter.splats.strip import REMOVED_FILE, save_removed
 from gscompleter.state import Completion, TargetResult
-from gscompleter.types import Camera, DepthPairs, Gaussians, Render, View, merge
+from gscompleter.types import Camera, Gaussians, View, merge
 
 GENERATED_FILE = "generated.ply"
 MAX_PHOTOGRAPHS = 200
-MAX_POINTS = 600
-"""Largest number of points to keep, of the context and of the added Gaussians each."""
+"""Largest number of photographs in the drawing and for the path of the video."""
 MAX_SURROUNDING_VIEWS = 6
-MIN_SURFACE_OPACITY = 0.3
 MIN_COLOR_CHANGE = 0.002
 """Smallest mean colour difference, in [0, 1], of a changed image."""
 IGNORED_COLOR = (1.0, 0.0, 1.0)
@@ -99,38 +93,47 @@ class InputSplatFile:
     """Index among these of each Gaussian of the context; None for the order of the file."""
 
 
-@dataclass(frozen=True)
-class Surroundings:
-    """Views around the photographs, for the report."""
+def write_report(
+    folder: Path,
+    completion: Completion,
+    targets: Sequence[Target],
+    renderer: Renderer,
+    run_info: Mapping[str, Any],
+    input_splat: InputSplatFile | None = None,
+    photographs: Sequence[Camera] = (),
+    render_around: Callable[[], Sequence[RenderPair]] = list,
+    held_out: Sequence[HeldOut] = (),
+) -> dict[str, Any]:
+    """Write the scenes, `images/`, `report.json` and `summary.json`; return the summary.
 
-    views: tuple[RenderPair, ...] = ()
-    photographs: tuple[Camera, ...] = ()
-    """Cameras of all photographs, in the frame of the result."""
+    `completed.ply` keeps the layout of an input splat. `photographs` are the cameras of all, in the
+    frame of the result. `render_around` renders surrounding views, and is called last.
+
+    Raises:
+        InputError: if a file cannot be written.
+    """
+    at_targets = [
+        render_before_after(completion, result.target, renderer) for result in completion.targets
+    ]
+    scores = {
+        "held_out": score_held_out(completion, held_out, renderer),
+        "context": score_context(completion, renderer),
+        "targets": score_targets(completion, targets, at_targets),
+    }
+    write_scenes(folder, completion, input_splat)
+    around = render_around()
+    shown = select_most_changed(around)
+    write_pictures(folder / "images", completion, targets, at_targets, shown)
+    record = make_record(completion, photographs, at_targets, shown)
+    (folder / RECORD_FILE).write_text(json.dumps(asdict(record)) + "\n")
+    coverage = {"coverage": asdict(compute_coverage(around))} if around else {}
+    counts = {**count_changes(completion), "seconds": dict(completion.seconds)}
+    summary = {"version": __version__, **run_info, **coverage, **scores, **counts}
+    (folder / SUMMARY_FILE).write_text(json.dumps(summary, indent=2) + "\n")
+    return summary
 
 
-@dataclass(frozen=True)
-class BeforeAfter:
-    """Renders of one camera before and after the completion."""
-
-    before: Render
-    after: Render
-    photograph: View | None
-
-    def compute_scores(self) -> Scores:
-        """Compute PSNR (dB) and SSIM over the valid pixels, or None without a photograph."""
-        scores: Scores = dict.fromkeys(SCORES)
-        truth = self.photograph
-        if truth is not None:
-            for when, render in (("before", self.before), ("after", self.after)):
-                image = render.image
-                scores[f"psnr_{when}"] = compute_masked_psnr(image, truth.image, truth.valid_mask)
-                scores[f"ssim_{when}"] = ssim(truth.fill_ignored(image), truth.image)
-        return scores
-
-
-def render_before_after(
-    completion: Completion, camera: Camera, photograph: View | None, renderer: Renderer
-) -> BeforeAfter:
+def render_before_after(completion: Completion, camera: Camera, renderer: Renderer) -> RenderPair:
     """Render the context and the completed scene."""
     with torch.no_grad():
         frozen = renderer.freeze(completion.context, camera)
@@ -138,61 +141,81 @@ def render_before_after(
             after = frozen.composite(completion.added)
         else:
             after = renderer.render(completion.scene, camera)
-    return BeforeAfter(frozen.render, after, photograph)
+    return RenderPair(frozen.render, after)
+
+
+def compute_scores(pair: RenderPair, photograph: View | None) -> Scores:
+    """Compute PSNR (dB) and SSIM over the valid pixels, or None without a photograph."""
+    scores: Scores = dict.fromkeys(SCORES)
+    if photograph is not None:
+        truth, valid = photograph.image, photograph.valid_mask
+        for when, render in (("before", pair.before), ("after", pair.after)):
+            scores[f"psnr_{when}"] = compute_masked_psnr(render.image, truth, valid)
+            scores[f"ssim_{when}"] = ssim(photograph.fill_ignored(render.image), truth)
+    return scores
+
+
+def score_views(completion: Completion, views: Sequence[View], renderer: Renderer) -> list[Scores]:
+    """Score the scene before and after at photographs."""
+
+    def score(view: View) -> Scores:
+        return compute_scores(render_before_after(completion, view.camera, renderer), view)
+
+    return list(get_view_map(completion.added)(score, views))
 
 
 def score_held_out(
-    completion: Completion, photographs: Sequence[HeldOut], renderer: Renderer
+    completion: Completion, held_out: Sequence[HeldOut], renderer: Renderer
 ) -> list[dict[str, Any]]:
-    """Score the scene before and after at held-out photographs."""
-
-    def score(held_out: HeldOut) -> dict[str, Any]:
-        view = held_out.view
-        scores = render_before_after(completion, view.camera, view, renderer).compute_scores()
-        return asdict(HeldOutRow(view.frame, **scores, is_check=held_out.is_check))
-
-    return list(get_view_map(completion.added)(score, photographs))
+    """Make the rows of held-out photographs."""
+    scores = score_views(completion, [photograph.view for photograph in held_out], renderer)
+    return [
+        asdict(HeldOutRow(photograph.view.frame, **found, is_check=photograph.is_check))
+        for photograph, found in zip(held_out, scores, strict=True)
+    ]
 
 
-def build_summary(
-    completion: Completion, targets: Sequence[Target], scores: Sequence[Scores]
-) -> dict[str, Any]:
-    """Build the results in summary.json from the scores of context and targets."""
-    views, results = completion.views, completion.targets
-    gains = completion.exposure_gains
+def score_context(completion: Completion, renderer: Renderer) -> list[dict[str, Any]]:
+    """Make the rows of the context photographs."""
+    views, gains = completion.views, completion.exposure_gains
+    scores = score_views(completion, views, renderer)
     gain_rows = [None] * len(views) if gains is None else map(tuple, gains.tolist())
-    context = map(make_context_row, views, scores[: len(views)], gain_rows)
-    anchors = [views[result.anchor].frame for result in results]
-    at_targets = map(make_target_row, targets, results, scores[len(views) :], anchors)
-    return {
-        "context": [asdict(row) for row in context],
-        "targets": [asdict(row) for row in at_targets],
-        "gaussians": count_gaussians(completion),
-        **count_new_photographs(completion),
-        "seconds": dict(completion.seconds),
-    }
-
-
-def make_context_row(view: View, scores: Scores, exposure_gain: Vector | None) -> ContextRow:
-    """Make the row of a context photograph."""
-    return ContextRow(
-        view.frame,
-        **scores,
-        exposure_gain=exposure_gain,
-        dynamic_fraction=compute_mask_fraction(view.dynamic_mask),
-        ignored=compute_mask_fraction(view.ignore_mask),
+    rows = (
+        ContextRow(
+            view.frame,
+            **found,
+            exposure_gain=gain,
+            dynamic_fraction=compute_mask_fraction(view.dynamic_mask),
+            ignored=compute_mask_fraction(view.ignore_mask),
+        )
+        for view, found, gain in zip(views, scores, gain_rows, strict=True)
     )
+    return [asdict(row) for row in rows]
+
+
+def compute_mask_fraction(mask: Bool[Tensor, "h w"] | None) -> float:
+    """Compute the fraction of True pixels; 0 without a mask."""
+    return 0.0 if mask is None else mask.float().mean().item()
+
+
+def score_targets(
+    completion: Completion, targets: Sequence[Target], pairs: Sequence[RenderPair]
+) -> list[dict[str, Any]]:
+    """Make the rows of the targets."""
+    scores = map_in_parallel(compute_scores, pairs, [target.view for target in targets])
+    rows = zip(targets, completion.targets, scores, strict=True)
+    return [asdict(make_target_row(completion, *row)) for row in rows]
 
 
 def make_target_row(
-    target: Target, result: TargetResult, scores: Scores, anchor: int | None
+    completion: Completion, target: Target, result: TargetResult, scores: Scores
 ) -> TargetRow:
-    """Make the row of a target; `anchor` is a frame."""
+    """Make the row of a target."""
     fit, added = result.affine, result.added
     return TargetRow(
         target.frame,
         **scores,
-        anchor=anchor,
+        anchor=completion.views[result.anchor].frame,
         anchor_fallback=result.anchor_fallback,
         hole_fraction=result.hole_fraction,
         affine=AlignmentRow(fit.scale, fit.shift, fit.inliers, fit.method, fit.agreement),
@@ -205,132 +228,48 @@ def make_target_row(
     )
 
 
-def compute_mask_fraction(mask: Bool[Tensor, "h w"] | None) -> float:
-    """Compute the fraction of True pixels; 0 without a mask."""
-    return 0.0 if mask is None else mask.float().mean().item()
-
-
-def count_new_photographs(completion: Completion) -> dict[str, int]:
-    """Count the photographs that a splat was not trained on; empty under full trust."""
+def count_changes(completion: Completion) -> dict[str, Any]:
+    """Count the Gaussians and, of a splat, the photographs that it was not trained on."""
+    counts = {"context": len(completion.context), "added": len(completion.added)}
     if completion.config.trust == "full":
-        return {}
-    return {"new_photographs": completion.num_new_photos}
-
-
-def count_gaussians(completion: Completion) -> dict[str, int]:
-    """Count the Gaussians of the context, the added and, of a splat, the recoloured ones."""
-    found = {"context": len(completion.context), "added": len(completion.added)}
-    if completion.config.trust == "full":
-        return found
-    return found | {"recolored": int(completion.recolored_mask.sum())}
-
-
-def write_report(
-    folder: Path,
-    completion: Completion,
-    targets: Sequence[Target],
-    completer: GSCompleter,
-    run_info: Mapping[str, Any],
-    input_splat: InputSplatFile | None = None,
-    render_surroundings: Callable[[], Surroundings] = Surroundings,
-    held_out: Sequence[HeldOut] = (),
-) -> dict[str, Any]:
-    """Write the scenes, `images/`, `report.json` and `summary.json`; return the summary.
-
-    `completed.ply` keeps the layout of an input splat. Surrounding views are rendered last, and
-    held-out photographs only score the result.
-
-    Raises:
-        InputError: if a file cannot be written.
-    """
-    renderer, views = completer.renderer, completion.views
-    results = list(zip(targets, completion.targets, strict=True))
-    seen = [(v.camera, v) for v in views] + [(r.target, t.view) for t, r in results]
-    images = [render_before_after(completion, camera, view, renderer) for camera, view in seen]
-    scores = map_in_parallel(BeforeAfter.compute_scores, images)
-    unused = score_held_out(completion, held_out, renderer)
-    write_scenes(folder, completion, input_splat)
-    pictured = folder / "images"
-    pictured.mkdir()
-    write_images(pictured, paint_ignored(views))
-    pairs = zip(completion.targets, images[len(views) :], strict=True)
-    limits = [write_pictures(pictured, number, *pair) for number, pair in enumerate(pairs, start=1)]
-    around = render_surroundings()
-    shown = select_most_changed(around.views)
-    write_images(pictured, name_surrounding_images(shown))
-    record = make_record(completion, limits, shown, around.photographs)
-    (folder / RECORD_FILE).write_text(
-        json.dumps(record, default=vars, separators=(",", ":")) + "\n"
-    )
-    coverage = {"coverage": asdict(compute_coverage(around.views))} if around.views else {}
-    summary = {"version": __version__, **run_info, **coverage, "held_out": unused}
-    summary |= build_summary(completion, targets, scores)
-    (folder / SUMMARY_FILE).write_text(json.dumps(summary, indent=2) + "\n")
-    return summary
+        return {"gaussians": counts}
+    counts["recolored"] = int(completion.recolored_mask.sum())
+    return {"gaussians": counts, "new_photographs": completion.num_new_photos}
 
 
 def make_record(
     completion: Completion,
-    limits: Sequence[Limits | None],
-    around: Sequence[RenderPair],
     photographs: Sequence[Camera],
+    at_targets: Sequence[RenderPair],
+    around: Sequence[RenderPair],
 ) -> CompletionRecord:
-    """Collect the data of a completion."""
-    shown = thin_evenly(photographs, MAX_PHOTOGRAPHS)
-    return CompletionRecord(
-        context=tuple(make_pose(view.camera) for view in completion.views),
-        photographs=tuple(make_pose(camera) for camera in shown),
-        num_photographs=len(photographs),
-        targets=tuple(map(make_target_record, completion.targets, limits)),
-        around=tuple(compute_coverage([look]) for look in around),
-        scene_points=sample_points(completion.context),
-        added_points=sample_points(completion.added),
+    """Collect what the page shows besides the summary and the images."""
+    drawing = draw_scene(completion, thin_evenly(photographs, MAX_PHOTOGRAPHS))
+    limits, pairs = map(compute_depth_limits, at_targets), map(round_pairs, completion.targets)
+    targets, coverages = map(TargetRecord, limits, pairs), (compute_coverage([p]) for p in around)
+    return CompletionRecord(len(photographs), drawing, tuple(targets), tuple(coverages))
+
+
+def round_pairs(result: TargetResult) -> PairsRow:
+    """Round the depth pairs of a target to six significant digits."""
+    pairs = result.affine.pairs
+    predicted, context = (
+        tuple(float(f"{depth:.6g}") for depth in depths.tolist())
+        for depths in (pairs.predicted, pairs.context)
     )
-
-
-def make_target_record(result: TargetResult, limits: Limits | None) -> TargetRecord:
-    """Collect the data of a target."""
-    losses = {name: round_values(torch.tensor(values)) for name, values in result.losses.items()}
-    compared = result.affine.pairs
-    pairs = make_pairs(compared) if len(compared.predicted) else None
-    return TargetRecord(make_pose(result.target), limits, losses, pairs)
-
-
-def make_pairs(pairs: DepthPairs) -> PairsRow:
-    """Round depth pairs."""
-    predicted, context = round_values(pairs.predicted), round_values(pairs.context)
     return PairsRow(pairs.fit_view, predicted, context, tuple(pairs.inlier_mask.tolist()))
 
 
-def make_pose(camera: Camera) -> PoseRow:
-    """Convert a camera to its pose and field of view."""
-    a, b, c = camera.c2w[:3]
-    wide, high = camera.width / 2 / camera.K[0, 0].item(), camera.height / 2 / camera.K[1, 1].item()
-    return PoseRow((round_values(a), round_values(b), round_values(c)), (wide, high))
-
-
-def sample_points(gaussians: Gaussians) -> tuple[Vector, ...]:
-    """Sample means of opaque Gaussians, in the frame of the .ply."""
-    opaque = gaussians.means[gaussians.opacities >= MIN_SURFACE_OPACITY]
-    order = torch.randperm(len(opaque), generator=torch.Generator().manual_seed(0))
-    return tuple(map(round_values, opaque[order[:MAX_POINTS].to(opaque.device)].cpu()))
-
-
-def select_most_changed(looks: Sequence[RenderPair]) -> list[RenderPair]:
+def select_most_changed(pairs: Sequence[RenderPair]) -> list[RenderPair]:
     """Select the views whose images changed most, in descending order."""
-    changes = [(look.after.image - look.before.image).abs().mean().item() for look in looks]
-    order = sorted(range(len(looks)), key=changes.__getitem__, reverse=True)
-    return [looks[i] for i in order[:MAX_SURROUNDING_VIEWS] if changes[i] >= MIN_COLOR_CHANGE]
+    changes = [(pair.after.image - pair.before.image).abs().mean().item() for pair in pairs]
+    order = sorted(range(len(pairs)), key=changes.__getitem__, reverse=True)
+    return [pairs[i] for i in order[:MAX_SURROUNDING_VIEWS] if changes[i] >= MIN_COLOR_CHANGE]
 
 
 def thin_evenly(items: Sequence[Camera], most: int) -> Sequence[Camera]:
     """Take every n-th item so that at most `most` are left."""
     return items[:: max(1, -(-len(items) // most))]
-
-
-def round_values(values: Tensor) -> tuple[Any, ...]:
-    """Round numbers [n] to six significant digits."""
-    return tuple(float(f"{value:.6g}") for value in values.detach().cpu().double().tolist())
 
 
 def write_scenes(folder: Path, completion: Completion, input_splat: InputSplatFile | None) -> None:
@@ -389,52 +328,53 @@ def save_completed_splat(
 
 
 def write_pictures(
-    folder: Path, number: int, result: TargetResult, images: BeforeAfter
-) -> Limits | None:
-    """Write the images of a target; return the limits of its depth colours."""
-    alpha = result.trusted_alpha
-    named = {
-        "before": images.before.image,
-        "after": images.after.image,
+    folder: Path,
+    completion: Completion,
+    targets: Sequence[Target],
+    at_targets: Sequence[RenderPair],
+    around: Sequence[RenderPair],
+) -> None:
+    """Write `images/`: targets, surrounding views, and photographs with ignored regions."""
+    folder.mkdir()
+    results = zip(targets, completion.targets, at_targets, strict=True)
+    for number, (target, result, pair) in enumerate(results, start=1):
+        write_images(folder, f"target{number}", name_target_images(target, result, pair))
+    for number, pair in enumerate(around, start=1):
+        shown = {"before": pair.before.image, "after": pair.after.image}
+        write_images(folder, f"around{number}", shown)
+    for number, view in enumerate(completion.views, start=1):
+        if view.ignore_mask is not None:
+            write_images(folder, f"context{number}", {"ignored": paint_ignored(view)})
+
+
+def name_target_images(
+    target: Target, result: TargetResult, pair: RenderPair
+) -> dict[str, Tensor | None]:
+    """Name the images of a target: colours [h, w, 3], grey or masks [h, w]."""
+    alpha, limits = result.trusted_alpha, compute_depth_limits(pair)
+    return {
+        "before": pair.before.image,
+        "after": pair.after.image,
+        "depth_before": limits and color_depth(pair.before, limits),
+        "depth_after": limits and color_depth(pair.after, limits),
         "hole_mask": result.hole_mask.float(),
         "support": None if torch.equal(alpha, result.before.alpha) else alpha,
         "reference": None if result.reference is None else result.reference.image,
-        "truth": None if images.photograph is None else images.photograph.image,
-    }
-    known = {f"target{number}_{name}": i for name, i in named.items() if i is not None}
-    write_images(folder, known)
-    depths = {"before": images.before.depth_map(), "after": images.after.depth_map()}
-    limits = compute_depth_limits(list(depths.values()))
-    if limits is not None:
-        for when, depth in depths.items():
-            write_depth_image(folder / f"target{number}_depth_{when}.png", depth, limits)
-    return limits
-
-
-def paint_ignored(views: Sequence[View]) -> dict[str, Float[Tensor, "h w 3"]]:
-    """Paint over the ignored pixels of each photograph that has some."""
-    return {
-        f"context{number}_ignored": torch.where(
-            view.ignore_mask[..., None], view.image.new_tensor(IGNORED_COLOR), view.image
-        )
-        for number, view in enumerate(views, start=1)
-        if view.ignore_mask is not None
+        "truth": target.photograph,
     }
 
 
-def name_surrounding_images(looks: Sequence[RenderPair]) -> dict[str, Float[Tensor, "h w 3"]]:
-    """Name the images of surrounding views."""
-    named = {}
-    for number, look in enumerate(looks, start=1):
-        named[f"around{number}_before"] = look.before.image
-        named[f"around{number}_after"] = look.after.image
-    return named
+def paint_ignored(view: View) -> Float[Tensor, "h w 3"]:
+    """Paint over the ignored pixels of a photograph."""
+    color = view.image.new_tensor(IGNORED_COLOR)
+    return torch.where(view.valid_mask[..., None], view.image, color)
 
 
-def write_images(folder: Path, images: Mapping[str, Tensor]) -> None:
-    """Write images by name in parallel: colour [h, w, 3], grey or masks [h, w]."""
-    paths = [folder / f"{name}.png" for name in images]
-    map_in_parallel(write_image, paths, images.values())
+def write_images(folder: Path, name: str, images: Mapping[str, Tensor | None]) -> None:
+    """Write the images that there are, in parallel, as `{name}_{ending}.png`."""
+    known = {ending: image for ending, image in images.items() if image is not None}
+    paths = [folder / f"{name}_{ending}.png" for ending in known]
+    map_in_parallel(write_image, paths, known.values())
 
 
 def join_images(

@@ -2,14 +2,14 @@
 
 from __future__ import annotations
 
-import os
 import re
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
-from gscompleter.apps.report.page import Picture, open_gallery, render_template
-from gscompleter.apps.report.schema import check_results
+from gscompleter.apps.report.page import Picture, encode_uri, render_template
+from gscompleter.apps.report.schema import find_result
+from gscompleter.io.image import read_image_size
 from gscompleter.io.reading import read_bytes
 
 TABLES_FILE, TIMINGS_FILE = "tables.md", "timings.md"
@@ -33,13 +33,12 @@ def render_evaluation_page(folder: Path) -> str:
     Raises:
         InputError: if the folder has no evaluation.
     """
-    check_results(folder, TABLES_FILE)
     return render_template(
         "evaluation.html",
         {
-            "scores": list(read_markdown(folder / TABLES_FILE)),
-            "times": list(read_markdown(folder / TIMINGS_FILE)),
-            "plots": list(embed_plots(folder)),
+            "scores": list(read_markdown(find_result(folder, TABLES_FILE))),
+            "times": list(read_markdown(find_result(folder, TIMINGS_FILE))),
+            "plots": [embed_plot(path) for path in sorted(folder.glob("*.png"))],
         },
     )
 
@@ -63,9 +62,7 @@ def split_row(line: str) -> list[str]:
     return [cell.strip().replace("\\|", "|") for cell in cells]
 
 
-def embed_plots(folder: Path) -> Iterator[tuple[Picture, str]]:
-    """Embed the plots that exist."""
-    gallery = open_gallery(folder)
-    for name, caption in PLOT_CAPTIONS.items():
-        if os.path.isfile(folder / f"{name}.png"):
-            yield gallery.embed(f"{name}.png", caption, exact=True), caption
+def embed_plot(path: Path) -> Picture:
+    """Embed a plot as it is."""
+    caption = PLOT_CAPTIONS.get(path.stem, path.stem.replace("_", " "))
+    return Picture(caption, *read_image_size(path), encode_uri("image/png", path.read_bytes()))

@@ -17,20 +17,11 @@ import numpy as np
 import torch
 from jaxtyping import Float, UInt8
 from PIL import Image, ImageDraw, ImageFont
-from torch import Tensor
-from torch.nn.functional import normalize
 
 from gscompleter.apps.report.completion import MAX_PHOTOGRAPHS, render_before_after, thin_evenly
-from gscompleter.geometry import (
-    embed_cameras,
-    estimate_up,
-    measure_baseline,
-    resize_camera,
-    shrink_camera,
-)
+from gscompleter.geometry import embed_cameras, measure_baseline, resize_camera, shrink_camera
 from gscompleter.io.image import convert_to_pixels
 from gscompleter.io.video import write_video
-from gscompleter.next_best_view.candidates import interpolate_camera
 from gscompleter.progress import track
 from gscompleter.render import Renderer
 from gscompleter.state import Completion
@@ -48,14 +39,6 @@ GAP_PIXELS = 4
 MIN_WIDTH = 720
 """Smallest width of the video in pixels."""
 MIN_LABEL_SIZE = 12
-SMOOTHING_FRACTION = 0.15
-"""Half width of the smoothing window, as a fraction of a leg."""
-UP_WEIGHT = 1e-3
-"""Weight of the image's up direction against level image rows."""
-MIN_UPRIGHT_COSINE = 0.7
-"""Cosine limit between a camera's up direction and the mean for cameras held upright."""
-MAX_LEVEL_COSINE = 0.99
-"""Cosine to the vertical above which a camera has no horizon."""
 
 
 def write_comparison_video(
@@ -108,11 +91,9 @@ def render_frame(
     completion: Completion, camera: Camera, renderer: Renderer
 ) -> UInt8[np.ndarray, "h w 3"]:
     """Render before and after side by side on white, with labels."""
-    images = render_before_after(completion, camera, None, renderer)
-    before, after = (
-        draw_corner_label(convert_to_pixels(getattr(images, when).image), when)
-        for when in ("before", "after")
-    )
+    pair = render_before_after(completion, camera, renderer)
+    before = draw_corner_label(convert_to_pixels(pair.before.image), "before")
+    after = draw_corner_label(convert_to_pixels(pair.after.image), "after")
     gap = np.full((camera.height, GAP_PIXELS, 3), 255, dtype=np.uint8)
     return np.concatenate([before, gap, after], axis=1)
 
@@ -136,47 +117,14 @@ def plan_camera_path(
 
     It slows down at each stop and may pass the photographs.
     """
-    up = fit_vertical([*stops, *photographs])
-    legs = [plan_leg(a, b, photographs, up, count) for a, b in pairwise(stops)]
+    legs = [follow_path(find_waypoints(a, b, photographs), count) for a, b in pairwise(stops)]
     return [*(camera for each in legs for camera in each[:-1]), stops[-1]]
-
-
-def plan_leg(
-    first: Camera,
-    second: Camera,
-    photographs: Sequence[Camera],
-    up: Float[Tensor, "3"],
-    count: int,
-) -> list[Camera]:
-    """Plan `count` cameras from `first` on, and `second`."""
-    way = find_waypoints(first, second, photographs)
-    shares = [k / count for k in range(count + 1)]
-    eased = [share * share * (3 - 2 * share) for share in shares]  # zero speed at both ends
-    sharp = [interpolate_path(way, share) for share in eased]
-    widths = [min(k, count - k, round(SMOOTHING_FRACTION * count)) for k in range(count + 1)]
-    rounded = [average_cameras(sharp[k - width : k + width + 1]) for k, width in enumerate(widths)]
-    if max(abs((camera.forward @ up).item()) for camera in rounded) > MAX_LEVEL_COSINE:
-        return rounded
-    start = measure_roll(first, up)
-    turn = math.remainder(measure_roll(second, up) - start, 2 * math.pi)
-    return [set_roll(c, start + turn * k / count, up) for k, c in enumerate(rounded)]
-
-
-def fit_vertical(cameras: Sequence[Camera]) -> Float[Tensor, "3"]:
-    """Estimate the unit up direction, to which image rows of level cameras are orthogonal."""
-    about = estimate_up(cameras).double()
-    axes = torch.stack([camera.c2w[:3, :2].T for camera in cameras]).double()
-    rows = axes[-axes[:, 1] @ about > MIN_UPRIGHT_COSINE, 0]
-    # If all cameras have the same direction, several axes are orthogonal to the rows.
-    slant = rows.T @ rows / len(rows) - UP_WEIGHT * torch.outer(about, about)
-    axis = torch.linalg.eigh(slant).eigenvectors[:, 0]
-    return (axis if axis @ about > 0 else -axis).to(cameras[0].c2w)
 
 
 def find_waypoints(first: Camera, second: Camera, photographs: Sequence[Camera]) -> list[Camera]:
     """Find the path along photographs with the smallest sum of squared steps.
 
-    It prefers many short steps. All cameras get the intrinsics of `first`.
+    It prefers many short steps.
     """
     # Imported here, since SciPy is slow to import and only videos need it.
     from scipy.sparse.csgraph import shortest_path
@@ -187,48 +135,45 @@ def find_waypoints(first: Camera, second: Camera, photographs: Sequence[Camera])
     _, before = shortest_path(squares, indices=0, return_predecessors=True)
     way, number = [second], before[-1]
     while number > 0:
-        way.append(replace(first, c2w=cameras[number].c2w.to(first.c2w)))
+        way.append(cameras[number])
         number = before[number]
     return [first, *way[::-1]]
 
 
-def interpolate_path(way: Sequence[Camera], share: float) -> Camera:
-    """Interpolate the path at a fraction of its length."""
+def follow_path(way: Sequence[Camera], count: int) -> list[Camera]:
+    """Plan the path of a leg in `count` steps, with the intrinsics of its first camera.
+
+    Centres, right and forward axes follow a cubic B-spline from the first camera to the last, past
+    the others. Between level cameras the right axes are level, and so the horizon stays level.
+    """
+    from scipy.interpolate import BSpline
+
+    degree = min(3, len(way) - 1)
+    poses = torch.stack([camera.c2w[:3, [0, 2, 3]] for camera in way]).double().cpu().numpy()
+    smooth = BSpline(place_knots(way, degree), poses, degree)
+    shares = np.linspace(0, 1, count + 1)
+    eased = shares**2 * (3 - 2 * shares)  # zero speed at both ends
+    return [make_camera(way[0], *pose.T) for pose in smooth(eased)]
+
+
+def place_knots(way: Sequence[Camera], degree: int) -> Float[np.ndarray, "k"]:
+    """Place the knots of a spline from 0 to 1 by the lengths of the steps of `way`."""
     where = embed_cameras(way).double().cpu()
-    ends = np.concatenate([[0.0], np.cumsum((where[1:] - where[:-1]).norm(dim=1).numpy())])
-    done = share * ends[-1]
-    number = min(int(np.searchsorted(ends, done, side="right")), len(way) - 1)
-    length = max(ends[number] - ends[number - 1], 1e-30)
-    return interpolate_camera(
-        way[number - 1], way[number], float((done - ends[number - 1]) / length)
-    )
+    steps = (where[1:] - where[:-1]).norm(dim=1).clamp_min(1e-6)
+    lengths = np.array([0, *(steps.cumsum(dim=0) / steps.sum()).tolist()])
+    places = np.linspace(0, len(way) - 1, len(way) - degree + 1)
+    return np.pad(np.interp(places, range(len(way)), lengths), degree, mode="edge")
 
 
-def average_cameras(cameras: Sequence[Camera]) -> Camera:
-    """Average cameras that are close to each other."""
-    c2w = torch.stack([camera.c2w for camera in cameras]).double().mean(dim=0)
-    left, _, right = torch.linalg.svd(c2w[:3, :3])
-    c2w[:3, :3] = left @ right
-    return replace(cameras[0], c2w=c2w.to(cameras[0].c2w))
-
-
-def compute_level_axes(camera: Camera, up: Float[Tensor, "3"]) -> tuple[Tensor, Tensor]:
-    """Compute the right [3] and down [3] axes of a level camera with the same direction."""
-    right = normalize(torch.linalg.cross(camera.forward, up), dim=0)
-    return right, torch.linalg.cross(camera.forward, right)
-
-
-def measure_roll(camera: Camera, up: Float[Tensor, "3"]) -> float:
-    """Measure the rotation about the viewing direction, in radians from level."""
-    right, down = compute_level_axes(camera, up)
-    across = camera.c2w[:3, 0]
-    return math.atan2((across @ down).item(), (across @ right).item())
-
-
-def set_roll(camera: Camera, angle: float, up: Float[Tensor, "3"]) -> Camera:
-    """Set the roll of a camera, in radians."""
-    right, down = compute_level_axes(camera, up)
-    cos, sin = math.cos(angle), math.sin(angle)
-    c2w = camera.c2w.clone()
-    c2w[:3, 0], c2w[:3, 1] = cos * right + sin * down, cos * down - sin * right
-    return replace(camera, c2w=c2w)
+def make_camera(
+    lens: Camera,
+    right: Float[np.ndarray, "3"],
+    forward: Float[np.ndarray, "3"],
+    center: Float[np.ndarray, "3"],
+) -> Camera:
+    """Give a camera another pose; the axes are made orthonormal, the right one first."""
+    axes, signs = np.linalg.qr(np.column_stack([right, forward]))
+    right, forward = (axes * np.where(np.diag(signs) < 0, -1, 1)).T
+    pose = np.column_stack([right, np.cross(forward, right), forward, center])
+    c2w = torch.from_numpy(np.concatenate([pose, [[0, 0, 0, 1]]]))
+    return replace(lens, c2w=c2w.to(lens.c2w))

@@ -7,20 +7,17 @@ from __future__ import annotations
 
 import base64
 import hashlib
-import io
 from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import cache
-from importlib.resources import files
 from pathlib import Path
 
-from jinja2 import Environment, FunctionLoader, StrictUndefined
+from jinja2 import Environment, PackageLoader, StrictUndefined
 from markupsafe import Markup
 from PIL import Image
 
 from gscompleter import __version__
 from gscompleter.apps.report.plain_words import format_change, format_number, format_percent
-from gscompleter.errors import InputError
 from gscompleter.io.files import replace_file
 from gscompleter.io.image import encode_jpeg, read_image_size, read_pixels
 
@@ -32,22 +29,12 @@ MAX_PAGE_PIXELS = 12_000_000
 
 @dataclass(frozen=True)
 class Picture:
-    """An embedded image, or the reason why it is missing."""
+    """An embedded image."""
 
     alt: str
-    width: int = 0
-    height: int = 0
-    uri: str | None = None
-    missing: str | None = None
-
-
-@dataclass(frozen=True)
-class Slider:
-    """Two images of one camera with a movable border."""
-
-    before: Picture
-    after: Picture
-    label: str
+    width: int
+    height: int
+    uri: str
 
 
 @dataclass(frozen=True)
@@ -57,56 +44,24 @@ class Gallery:
     folder: Path
     scale: float = 1.0
 
-    def embed(self, name: str, alt: str, exact: bool = False) -> Picture:
-        """Embed an image as a JPEG, or a mask, depth image or plot (`exact`) as a PNG."""
-        try:
-            image = Image.fromarray(read_pixels(self.folder / name))
-        except InputError:
-            return Picture(alt, missing=f"{name} is missing or damaged.")
-        image = scale_image(image, self.scale, exact)
-        return Picture(alt, *image.size, uri=encode_image(image, exact))
+    def embed(self, name: str, alt: str) -> Picture:
+        """Embed an image as a JPEG; raise an InputError if it is missing or damaged."""
+        image = Image.fromarray(read_pixels(self.folder / f"{name}.png"))
+        if self.scale < 1:
+            width, height = (max(1, round(self.scale * side)) for side in image.size)
+            image = image.resize((width, height), Image.Resampling.LANCZOS)
+        return Picture(alt, *image.size, encode_uri("image/jpeg", encode_jpeg(image, JPEG_QUALITY)))
 
     def has(self, name: str) -> bool:
-        """Return True if there is a file of this name."""
-        return (self.folder / name).is_file()
-
-    def embed_slider(self, name: str, label: str, exact: bool = False) -> Slider:
-        """Embed an image before and after."""
-        before, after = (
-            self.embed(f"{name}_{when}.png", f"{label}, {when}", exact)
-            for when in ("before", "after")
-        )
-        return Slider(before, after, label)
+        """Return True if there is an image of this name."""
+        return (self.folder / f"{name}.png").is_file()
 
 
 def open_gallery(folder: Path) -> Gallery:
     """Choose a scale at which all images of `folder` fit into a page."""
-    pixels = 0
-    for path in sorted(folder.glob("*.png")):
-        try:
-            width, height = read_image_size(path)
-        except InputError:
-            continue
-        pixels += width * height
+    sizes = [read_image_size(path) for path in folder.glob("*.png")]
+    pixels = sum(width * height for width, height in sizes)
     return Gallery(folder, min(1.0, (MAX_PAGE_PIXELS / max(pixels, 1)) ** 0.5))
-
-
-def scale_image(image: Image.Image, scale: float, exact: bool) -> Image.Image:
-    """Scale an image, without interpolation if `exact`."""
-    if scale == 1:
-        return image
-    size = (max(1, round(image.width * scale)), max(1, round(image.height * scale)))
-    return image.resize(size, Image.Resampling.NEAREST if exact else Image.Resampling.LANCZOS)
-
-
-def encode_image(image: Image.Image, exact: bool) -> str:
-    """Encode an image as a data URI: a JPEG, or a PNG if `exact`, with a palette if it can."""
-    if not exact:
-        return encode_uri("image/jpeg", encode_jpeg(image, JPEG_QUALITY))
-    file = io.BytesIO()
-    image = image.quantize(256) if image.getcolors(256) else image
-    image.save(file, format="PNG", compress_level=6)
-    return encode_uri("image/png", file.getvalue())
 
 
 def encode_uri(kind: str, content: bytes) -> str:
@@ -116,11 +71,11 @@ def encode_uri(kind: str, content: bytes) -> str:
 
 def render_template(template: str, values: Mapping[str, object]) -> str:
     """Render a template with style and script."""
-    style, script = read_template("style.css"), read_template("script.js")
+    environment = create_environment()
+    script = environment.get_template("script.js").render()
     digest = base64.b64encode(hashlib.sha256(script.encode()).digest()).decode()
-    shared = {"style": Markup(style), "script": Markup(script), "digest": digest}
-    page = create_environment().get_template(template)
-    return page.render(version=__version__, **shared, **values)
+    shared = {"version": __version__, "script": Markup(script), "digest": digest}
+    return environment.get_template(template).render(**shared, **values)
 
 
 def write_page(folder: Path, page: str) -> None:
@@ -133,7 +88,7 @@ def write_page(folder: Path, page: str) -> None:
 def create_environment() -> Environment:
     """Create the template environment: escapes all text, refuses unknown names."""
     environment = Environment(
-        loader=FunctionLoader(read_template),
+        loader=PackageLoader(__package__),
         autoescape=True,
         undefined=StrictUndefined,
         trim_blocks=True,
@@ -146,8 +101,3 @@ def create_environment() -> Environment:
         "count": "{:,}".format,
     }
     return environment
-
-
-def read_template(name: str) -> str:
-    """Read a file of the folder `templates`."""
-    return files(__package__).joinpath("templates").joinpath(name).read_text(encoding="utf-8")

@@ -3,23 +3,22 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterator, Sequence
 
-from gscompleter.apps.report.schema import AlignmentRow, CompletionSummary
+from gscompleter.apps.report.schema import AlignmentRow, CompletionSummary, ContextRow
 
 FRAME_NOTES = {
-    "given": None,
-    "cameras": "The splat is in the frame of its cameras.json, not in that of the photographs.",
-    "dataparser": "The splat is in the frame of its trainer's dataparser.",
-    "normalised": "The splat is in a frame that its trainer normalised.",
-    "similarity": "The splat is in a frame of its own, aligned by matching features.",
+    "cameras": "in the frame of its cameras.json, not in that of the photographs",
+    "dataparser": "in the frame of its trainer's dataparser",
+    "normalised": "in a frame that its trainer normalised",
+    "similarity": "in a frame of its own, aligned by matching features",
 }
 ALIGNMENTS = {
-    "ransac": "RANSAC fits scene depth = {scale} × lifted depth {shift}; {inliers} of the pixels "
-    "agree",
-    "median": "The median depth ratio is used: scene depth = {scale} × lifted depth; "
-    "{inliers} of the pixels agree",
-    "identity": "The lifted depths are used unchanged",
+    "ransac": "RANSAC fits scene depth = {scale:.3f} × lifted depth {shift:+.3f} {unit}; "
+    "{inliers} of the pixels agree.",
+    "median": "The median depth ratio is used: scene depth = {scale:.3f} × lifted depth; "
+    "{inliers} of the pixels agree.",
+    "identity": "The lifted depths are used unchanged.",
 }
 ORIGIN_NOTE = (
     "The coordinates are much larger than the distances between the cameras, so the result is "
@@ -35,96 +34,74 @@ RECOLORED_NOTE = (
 )
 NO_SCORES_NOTE = "No target has a photograph, so there are no scores at targets."
 NO_TARGET_NOTE = "No large hole was found around the photographs; nothing was completed."
+NOTHING_NEW_NOTE = (
+    "The splat reproduces all photographs. Where it is wrong from elsewhere, only smooth colours "
+    "are known: little is to be gained without new photographs of the place or a learned generator."
+)
 
 
-def describe_motion(shares: Mapping[int | None, float]) -> str | None:
-    """Describe the dynamic fractions of photographs by frame, or return None if all are 0."""
-    parts = [
-        f"{format_percent(share)} of frame {frame}" for frame, share in shares.items() if share > 0
-    ]
-    if not parts:
-        return None
-    return (
-        f"{', '.join(parts)} show something that moves; the completion does not use these regions."
-    )
+def list_notes(summary: CompletionSummary) -> Iterator[str]:
+    """List the notes on the whole completion."""
+    frame, scene, targets = summary.frame, summary.scene, summary.targets
+    if frame.method in FRAME_NOTES:
+        yield f"The splat is {FRAME_NOTES[frame.method]}; summary.json lists the transform."
+    if any(frame.origin):
+        yield ORIGIN_NOTE
+    yield from list_photograph_notes(summary.context)
+    if summary.settings.get("context") is None:
+        yield f"{scene.used} of {scene.photographs} photographs were chosen as the context."
+    if summary.settings.get("uses_target_photographs"):
+        yield ORACLE_NOTE
+    if targets and all(row.psnr_after is None for row in targets):
+        yield NO_SCORES_NOTE
+    yield from list_splat_notes(summary)
+    if not targets:
+        yield NO_TARGET_NOTE
 
 
-def describe_ignored(shares: Iterable[float]) -> str | None:
-    """Describe the ignored fractions of photographs, or return None if all are 0."""
-    most = max(shares, default=0.0)
-    if most == 0:
-        return None
-    return (
-        f"Up to {format_percent(most)} of a photograph stays the same while the camera moves, "
-        "like the bonnet of a vehicle; it is ignored, also in scores "
-        "(images/context*_ignored.png)."
-    )
-
-
-def describe_exposures(gains: Iterable[Sequence[float] | None]) -> str | None:
-    """Describe the exposure gains of photographs, or return None without any."""
-    factors = [factor for gain in gains for factor in gain or ()]
-    if not factors or min(factors) <= 0:
-        return None
-    return (
-        "The exposures of the context photographs differ by a factor of up to "
-        f"{max(factors) / min(factors):.2f}; the scene has the mean exposure, at which these "
-        "photographs are scored. Target photographs are scored as they are."
-    )
-
-
-def describe_new_photographs(count: int | None) -> str | None:
-    """Describe what photographs beyond those of the training bring to a splat."""
-    if count is None:
-        return None
-    if count == 0:
-        return (
-            "The splat reproduces all photographs. Where it is wrong from elsewhere, only smooth "
-            "colours are known: little is to be gained without new photographs of the place or a "
-            "learned generator."
+def list_photograph_notes(context: Sequence[ContextRow]) -> Iterator[str]:
+    """List the notes on what moves, on what is ignored, and on exposures."""
+    moving = [row for row in context if row.dynamic_fraction > 0]
+    if moving:
+        shares = (f"{format_percent(row.dynamic_fraction)} of frame {row.frame}" for row in moving)
+        yield f"{', '.join(shares)} show something that moves; these regions are not used."
+    ignored = max((row.ignored for row in context), default=0.0)
+    if ignored > 0:
+        yield (
+            f"Up to {format_percent(ignored)} of a photograph stays the same while the camera "
+            "moves, like the bonnet of a vehicle; it is ignored, also in scores "
+            "(images/context*_ignored.png)."
         )
-    return (
-        f"The splat was not trained on {count} of the photographs; it is recoloured to them, which "
-        "helps most."
-    )
+    factors = [factor for row in context for factor in row.exposure_gain or ()]
+    if factors:
+        yield (
+            "The exposures of the context photographs differ by a factor of up to "
+            f"{max(factors) / min(factors):.2f}; the scene has the mean exposure, at which these "
+            "photographs are scored. Target photographs are scored as they are."
+        )
+
+
+def list_splat_notes(summary: CompletionSummary) -> Iterator[str]:
+    """List the notes on what photographs bring to a splat."""
+    if summary.new_photographs == 0:
+        yield NOTHING_NEW_NOTE
+    elif summary.new_photographs is not None:
+        yield (
+            f"The splat was not trained on {summary.new_photographs} of the photographs; it is "
+            "recoloured to them, which helps most."
+        )
+    if recolored := summary.gaussians.get("recolored"):
+        yield f"{recolored:,} {RECOLORED_NOTE}"
 
 
 def describe_alignment(affine: AlignmentRow, unit: str) -> str:
     """Describe the depth alignment of a target."""
-    sign = "−" if affine.shift < 0 else "+"
-    text = ALIGNMENTS.get(affine.method, "The depths are aligned by an unknown method").format(
-        scale=format_number(affine.scale, 3),
-        shift=f"{sign} {format_number(abs(affine.shift), 3)} {unit}",
-        inliers=format_percent(affine.inliers, 0),
-    )
+    text = ALIGNMENTS.get(affine.method, "The depths are aligned by an unknown method.")
+    inliers = format_percent(affine.inliers, 0)
+    fit = text.format(scale=affine.scale, shift=affine.shift, unit=unit, inliers=inliers)
     if affine.agreement is None:
-        return f"{text}."
-    share = format_percent(affine.agreement, 0)
-    return f"{text}. At the target, {share} of the visible scene agree."
-
-
-def list_scene_notes(summary: CompletionSummary) -> list[str]:
-    """List the notes on the whole completion."""
-    context, targets, scene = summary.context, summary.targets, summary.scene
-    placed = FRAME_NOTES.get(summary.frame.method, "The splat is in a frame of its own.")
-    recolored = summary.gaussians.get("recolored")
-    notes = [
-        placed and f"{placed} summary.json lists the transform from the photographs to the result.",
-        ORIGIN_NOTE if any(summary.frame.origin) else None,
-        describe_motion({row.frame: row.dynamic_fraction for row in context}),
-        describe_ignored(row.ignored for row in context),
-        f"{scene.used} of {scene.photographs} photographs were chosen as the context; --context "
-        "chooses others."
-        if summary.settings.get("context") is None
-        else None,
-        describe_exposures(row.exposure_gain for row in context),
-        ORACLE_NOTE if summary.settings.get("uses_target_photographs") else None,
-        NO_SCORES_NOTE if targets and all(row.psnr_after is None for row in targets) else None,
-        describe_new_photographs(summary.new_photographs),
-        f"{recolored:,} {RECOLORED_NOTE}" if recolored else None,
-        None if targets else NO_TARGET_NOTE,
-    ]
-    return [note for note in notes if note is not None]
+        return fit
+    return f"{fit} At the target, {format_percent(affine.agreement, 0)} of the visible scene agree."
 
 
 def format_number(value: float | None, digits: int = 2) -> str:
@@ -141,5 +118,4 @@ def format_change(before: float | None, after: float | None, digits: int = 2) ->
     """Format the change of a score with its sign."""
     if before is None or after is None or not math.isfinite(after - before):
         return "–"
-    rise = round(after - before, digits)
-    return f"{rise:+.{digits}f}".replace("-", "−") if rise else f"{0:.{digits}f}"
+    return f"{round(after - before, digits) + 0.0:+.{digits}f}"

@@ -26,8 +26,6 @@ RENAMED = {
 SCORES = ("psnr_before", "psnr_after", "ssim_before", "ssim_after")
 
 T = TypeVar("T")
-Limits = tuple[float, float]
-"""z-depths at the ends of the colours, in scene units."""
 Vector = tuple[float, float, float]
 Row = tuple[float, float, float, float]
 """Row of a transform."""
@@ -60,9 +58,7 @@ class ContextRow(ScoreRow):
     """A photograph of the context."""
 
     exposure_gain: Vector | None = None
-    """Exposure gain per channel; None if exposures were not normalized."""
     dynamic_fraction: float = 0.0
-    """Fraction of the image in the dynamic mask."""
     ignored: float = 0.0
     """Fraction of ignored pixels, which stay the same while the camera moves."""
 
@@ -142,15 +138,6 @@ class CompletionSummary:
 
 
 @dataclass(frozen=True)
-class PoseRow:
-    """Pose and field of view of a camera, in the frame of the .ply."""
-
-    c2w: tuple[Row, Row, Row]
-    opening: tuple[float, float]
-    """Tangents of half the field of view, horizontally and vertically."""
-
-
-@dataclass(frozen=True)
 class PairsRow:
     """Depth pairs of the alignment, in scene units."""
 
@@ -164,54 +151,50 @@ class PairsRow:
 class TargetRecord:
     """Data of a target."""
 
-    camera: PoseRow
-    depth_limits: Limits | None
-    losses: Mapping[str, tuple[float, ...]]
+    depth_limits: tuple[float, float] | None
+    """z-depths at the ends of the colours, in scene units."""
     pairs: PairsRow | None
+
+
+@dataclass(frozen=True)
+class SceneDrawing:
+    """Cameras as lines and scenes as points, which the page rotates.
+
+    Each text has the coordinates x y z of its points: right, up and back from the middle, in units
+    of the radius.
+    """
+
+    photographs: tuple[str, ...]
+    context: tuple[str, ...]
+    targets: tuple[str, ...]
+    scene: tuple[str, ...]
+    added: tuple[str, ...]
 
 
 @dataclass(frozen=True)
 class CompletionRecord:
     """All of `report.json`: what a report shows besides the summary and the images."""
 
-    context: tuple[PoseRow, ...]
-    photographs: tuple[PoseRow, ...]
     num_photographs: int
+    drawing: SceneDrawing
     targets: tuple[TargetRecord, ...]
     around: tuple[Coverage, ...]
     """Coverage of each surrounding view."""
-    scene_points: tuple[Vector, ...]
-    added_points: tuple[Vector, ...]
 
 
-def read_summary(folder: Path, only_version: str | None = None) -> CompletionSummary:
-    """Read `summary.json`; InputError if it is missing, damaged or not of `only_version`."""
-    path = folder / SUMMARY_FILE
-    check_results(folder, SUMMARY_FILE)
-    content = with_new_keys(read_json(path, ADVICE))
-    version = content.get("version") if isinstance(content, dict) else None
-    if isinstance(version, str) and only_version not in (None, version):
-        raise InputError(
-            f"{quote_value(path)} was written by version {quote_value(version)}, and this is "
-            f"{only_version}; use that version, or {ADVICE}."
-        )
-    return parse_content(CompletionSummary, content, path)
+def read_summary(folder: Path) -> CompletionSummary:
+    """Read `summary.json`; raise an InputError if it is missing or damaged."""
+    path = find_result(folder, SUMMARY_FILE)
+    return parse_content(CompletionSummary, with_new_keys(read_json(path, ADVICE)), path)
 
 
 def read_record(folder: Path, summary: CompletionSummary) -> CompletionRecord:
-    """Read `report.json`; InputError if it is missing, damaged or does not fit the summary."""
-    path = folder / RECORD_FILE
-    if not os.path.isfile(path):
-        raise InputError(
-            f"{quote_value(folder)} has no {RECORD_FILE}, which the report needs; {ADVICE}."
-        )
+    """Read `report.json`; raise an InputError if it does not fit the summary."""
+    path = find_result(folder, RECORD_FILE)
     record = parse_content(CompletionRecord, read_json(path, ADVICE), path)
-    sizes = (len(summary.targets), len(summary.context))
-    if sizes != (len(record.targets), len(record.context)):
-        raise InputError(
-            f"{SUMMARY_FILE} and {RECORD_FILE} in {quote_value(folder)} list different numbers of "
-            f"cameras; {ADVICE}."
-        )
+    sizes = len(record.targets), len(record.drawing.targets), len(record.drawing.context)
+    if sizes != (len(summary.targets), len(summary.targets), len(summary.context)):
+        raise InputError(f"{quote_value(path)} does not fit {SUMMARY_FILE} beside it; {ADVICE}.")
     return record
 
 
@@ -228,8 +211,8 @@ def rename_keys(row: Any) -> Any:
     return {RENAMED.get(k, k): v for k, v in row.items()} if isinstance(row, dict) else row
 
 
-def check_results(folder: Path, name: str) -> None:
-    """Raise an InputError unless `folder` holds the file `name`."""
+def find_result(folder: Path, name: str) -> Path:
+    """Find the file `name` in `folder`; raise an InputError if there is none."""
     if not os.path.isdir(folder):
         raise InputError(f"There is no folder {quote_value(folder)}; name one with results.")
     if not os.path.isfile(folder / name):
@@ -237,6 +220,7 @@ def check_results(folder: Path, name: str) -> None:
             f"{quote_value(folder)} has no {name}; name the output folder of a completion or an "
             "evaluation."
         )
+    return folder / name
 
 
 def parse_content(kind: type[T], content: Any, path: Path) -> T:

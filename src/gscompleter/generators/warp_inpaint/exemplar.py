@@ -238,20 +238,17 @@ def downsample_level(level: Level) -> Level:
     image = torch.where(share > 0.5, seen, guess)
     expected = pool_pixels(level.expected[..., None])[..., 0]
 
-    valid = level.sources.valid.float()[..., None]
+    sources = level.sources
+    valid = sources.valid.float()[..., None]
     usable = pool_pixels(valid)
-    sources = Sources(
-        pool_pixels(level.sources.images * valid) / usable.clamp_min(1e-6),
-        usable[..., 0] > 0.75,
-        (pool_pixels(level.sources.log_depth[..., None] * valid) / usable.clamp_min(1e-6))[..., 0],
-    )
-    return Level(image, share[..., 0] > 0.5, expected, sources)
+    layers = torch.cat([sources.images, sources.log_depth[..., None]], dim=-1)
+    means = pool_pixels(layers * valid) / usable.clamp_min(1e-6)
+    halved = Sources(means[..., :3], usable[..., 0] > 0.75, means[..., 3])
+    return Level(image, share[..., 0] > 0.5, expected, halved)
 
 
 def pool_pixels(values: Float[Tensor, "*s h w c"]) -> Float[Tensor, "*s h2 w2 c"]:
     """Average 2 x 2 pixels."""
-    channels_first = values.movedim(-1, -3)
-    flat = channels_first.reshape(-1, *channels_first.shape[-3:]).contiguous()
-    means = avg_pool2d(flat, 2, ceil_mode=True, count_include_pad=False)
-    shape = (*channels_first.shape[:-2], *means.shape[-2:])
-    return means.reshape(shape).movedim(-3, -1).contiguous()
+    channels_first = values.movedim(-1, -3).contiguous()
+    means = avg_pool2d(channels_first, 2, ceil_mode=True, count_include_pad=False)
+    return means.movedim(-3, -1).contiguous()
