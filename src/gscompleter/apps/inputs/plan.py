@@ -11,7 +11,6 @@ from gscompleter.data.formats import FORMATS
 from gscompleter.data.frame import Frame
 from gscompleter.errors import join_names, quote_value
 from gscompleter.memory import estimate_bytes, format_whole_gigabytes, read_memory_bytes
-from gscompleter.splats.formats import note_infinite_opacities
 from gscompleter.types import Camera, Gaussians
 
 SOURCE_NAMES = {
@@ -35,13 +34,11 @@ def describe_task(options: CompleteOptions, opened: Opened, task: Task) -> list[
 
 def describe_opening(options: SceneOptions, opened: Opened, task: Task) -> list[str]:
     """Write the lines on the opened scene."""
-    splat, note = "", None
+    splat = ""
     if task.scene is not None and options.scene is not None:
         splat = f"; {describe_splat(options.scene, task.scene)}"
-        note = note_infinite_opacities(task.scene)
     return [
         f"Opened: {quote_value(options.folder)}, {describe_photographs(opened)}{splat}.",
-        *([] if note is None else [note]),
         f"Found: {describe_found(options, opened, task)}.",
     ]
 
