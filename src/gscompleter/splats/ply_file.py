@@ -10,11 +10,12 @@ import os
 import re
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
-from itertools import islice
+from itertools import chain, islice
 from pathlib import Path
 from typing import BinaryIO
 
 import numpy as np
+from jaxtyping import UInt8
 from numpy.lib.recfunctions import unstructured_to_structured
 
 from gscompleter.errors import InputError, quote_value, refuse_pointer
@@ -54,8 +55,8 @@ class PlyFile:
     """Everything up to and including `end_header`."""
     rows: np.ndarray
     """One structured row per vertex, [n]."""
-    trailer: bytes = b""
-    """Everything after the last row."""
+    trailer: UInt8[np.ndarray, "m"]
+    """Everything after the last row of a binary file, in bytes."""
     is_ascii: bool = False
 
 
@@ -114,23 +115,27 @@ def read_ply_file(path: Path, needed: Sequence[str], kind: str) -> PlyFile:
                 f"{', '.join(missing or names)} and no lists."
             )
         is_ascii = re.search(rb"^format\s+ascii", header, re.M) is not None
-        rows = _read_ascii_rows(file, vertex, path) if is_ascii else _map_rows(file, vertex)
+        rows = (
+            _read_ascii_rows(file, vertex, path)
+            if is_ascii
+            else _map_rows(file, vertex.dtype, len(header), vertex.count)
+        )
         if len(rows) < vertex.count:
             raise InputError(
                 f"{path} is truncated: {len(rows):,} of {quote_value(f'{vertex.count:,}')} rows "
                 "are there; fetch or write the file again."
             )
-        file.seek(0 if is_ascii else len(header) + rows.nbytes)
-        return PlyFile(header, rows, b"" if is_ascii else file.read(), is_ascii)
+        trailer = _map_rows(file, np.dtype(np.uint8), len(header) + rows.nbytes)
+        return PlyFile(header, rows, trailer, is_ascii)
 
 
-def _map_rows(file: BinaryIO, vertex: Element) -> np.ndarray:
-    """Map the rows of a binary file into memory, at most as many as it has."""
-    remaining = os.fstat(file.fileno()).st_size - file.tell()
-    count = min(vertex.count, remaining // vertex.dtype.itemsize)
-    if count == 0:
-        return np.empty(0, vertex.dtype)
-    return np.asarray(np.memmap(file, vertex.dtype, "r", file.tell(), (count,)))
+def _map_rows(file: BinaryIO, dtype: np.dtype, start: int, count: int | None = None) -> np.ndarray:
+    """Map rows of a binary file into memory: those that it has, at most `count`."""
+    available = max(os.fstat(file.fileno()).st_size - start, 0) // dtype.itemsize
+    number = available if count is None else min(count, available)
+    if number == 0:
+        return np.empty(0, dtype)
+    return np.asarray(np.memmap(file, dtype, "r", start, (number,)))
 
 
 def _read_ascii_rows(file: BinaryIO, vertex: Element, path: Path) -> np.ndarray:
@@ -158,11 +163,14 @@ def make_header(elements: Mapping[str, tuple[int, np.dtype]], comment: str | Non
 
 
 def write_ply_file(
-    path: Path | str, header: bytes, count: int, blocks: Iterable[np.ndarray], trailer: bytes = b""
+    path: Path | str,
+    header: bytes,
+    count: int,
+    blocks: Iterable[np.ndarray],
+    trailer: np.ndarray | None = None,
 ) -> None:
     """Write a .ply with `count` rows in total, which replaces the number in the header."""
     with replace_file(path) as file:
         file.write(_COUNT_LINE.sub(rb"\g<1>" + str(count).encode(), header, count=1))
-        for rows in blocks:
+        for rows in chain(blocks, () if trailer is None else [trailer]):
             file.write(rows.view(np.uint8).data)
-        file.write(trailer)

@@ -94,7 +94,7 @@ def save_removed(
         header, values = layout.header, held[rows.numpy()]
     first, _, end = split_header(header)
     place = f"element place {len(rows)}\nproperty uint row\n".encode()
-    trailer = rows.numpy().astype("<u4").tobytes()
+    trailer = rows.numpy().astype("<u4")
     write_ply_file(path, b"".join([first, place, end]), len(values), [values], trailer)
 
 
@@ -106,7 +106,7 @@ def reinsert(
     removed = require_finite(decode_gaussians(source), path, drop_nonfinite=False)
     total, rows = len(kept) + len(removed), np.zeros(0, np.int64)
     if b"element place " in source.header and len(source.trailer) == 4 * len(removed):
-        rows = np.frombuffer(source.trailer, "<u4").astype(np.int64)
+        rows = source.trailer.view("<u4").astype(np.int64)
     is_ordered = len(rows) > 0 and bool((np.diff(rows, append=total) > 0).all())
     if not is_ordered or kept.is_antialiased != removed.is_antialiased:
         raise InputError(
