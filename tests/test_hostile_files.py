@@ -34,7 +34,7 @@ def sentence(call, *arguments) -> str:
 
 
 def ply(tmp_path: Path, ahead: str, file_format: str = "ascii") -> Path:
-    """Write a scene of one Gaussian behind another element."""
+    """Write a scene of one Gaussian with a further line in its header."""
     path = tmp_path / "scene.ply"
     save_ply(path, random_gaussians(1))
     head, body = path.read_bytes().split(b"end_header\n")
@@ -46,32 +46,17 @@ def ply(tmp_path: Path, ahead: str, file_format: str = "ascii") -> Path:
     return path
 
 
-@pytest.mark.parametrize("rows", [10**12, 10**30, 10**4000])
+@pytest.mark.parametrize("rows", ["1", "1" + 12 * "0", "1" + 5000 * "0"])
 @pytest.mark.parametrize("properties", ["", "\nproperty float a", "\nproperty list int float a"])
-def test_an_ascii_element_of_more_rows_than_bytes_is_truncated(tmp_path, rows, properties):
-    path = ply(tmp_path, f"element foo {rows}{properties}")
-    assert "foos are there" in sentence(load_ply, path)
-
-
-@pytest.mark.parametrize("rows", [10**12, 10**30])
-@pytest.mark.parametrize("properties", ["\nproperty float a", "\nproperty list int float a"])
-def test_a_binary_one_too(tmp_path, rows, properties):
-    path = ply(tmp_path, f"element foo {rows}{properties}", "binary_little_endian")
-    assert "foos are there" in sentence(load_ply, path)
-
-
-def test_elements_that_are_there_are_skipped_still(tmp_path):
-    path = ply(tmp_path, "element foo 1\nproperty int a")
-    head, body = path.read_bytes().split(b"end_header\n")
-    path.write_bytes(head + b"end_header\n7\n" + body)
-    assert len(load_ply(path)) == 1
+def test_a_scene_behind_another_element_is_refused(tmp_path, rows, properties):
+    sentence(load_ply, ply(tmp_path, f"element foo {rows}{properties}"))
 
 
 @pytest.mark.parametrize("file_format", ["ascii", "binary_little_endian"])
 def test_a_scene_that_claims_more_gaussians_than_bytes_is_truncated(tmp_path, file_format):
     path = ply(tmp_path, "comment nothing", file_format)
     path.write_bytes(path.read_bytes().replace(b"vertex 1\n", b"vertex 10000000000000000\n"))
-    assert "of 10,000,000,000,000,000 Gaussians are there" in sentence(load_ply, path)
+    assert "of 10,000,000,000,000,000 rows are there" in sentence(load_ply, path)
 
 
 def test_a_header_is_quoted_in_part(tmp_path):

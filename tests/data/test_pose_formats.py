@@ -224,7 +224,7 @@ def test_points_of_nerfstudio_lie_in_the_frame_of_the_cameras(tmp_path):
     assert points is not None
     assert torch.allclose(points.double(), torch.from_numpy(surface_points()), atol=1e-5)
     (scene / "sparse_pc.ply").write_text("ply\nformat ascii 1.0\nelement face 0\nend_header\n")
-    with pytest.raises(InputError, match="holds no points with x, y and z"):
+    with pytest.raises(InputError, match="is no point cloud"):
         open_photographs(scene).points()
     (scene / "sparse_pc.ply").unlink()
     assert open_photographs(scene).points() is None

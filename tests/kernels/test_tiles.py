@@ -70,17 +70,6 @@ def test_splats_in_the_order_of_their_use_are_the_same():
         assert np.array_equal(after, before[order])
 
 
-def test_gradients_are_summed_by_the_name_of_the_splat():
-    entries = RANDOM.integers(0, 20, 200).astype(np.int32)
-    rows = RANDOM.permutation(30)[:20].astype(np.int32)
-    gradients, written = RANDOM.random((200, 3), np.float32), RANDOM.random(200) < 0.7
-    totals, wanted = np.zeros((30, 3), np.float32), np.zeros((30, 3))
-    for begin, end in ((0, 7), (7, 20)):
-        tiles.sum_by_gaussian(begin, end, entries, rows, gradients, written, totals)
-    np.add.at(wanted, rows[entries[written]], gradients[written])
-    assert np.allclose(totals, wanted, rtol=1e-5)
-
-
 def test_an_image_too_wide_for_small_boxes_is_drawn_like_its_part():
     gaussians, camera = random_gaussians(40, sh_degree=0), camera_at(size=32)
     gaussians = replace(gaussians, opacities=torch.full((40,), 0.9))

@@ -14,7 +14,7 @@ from gscompleter.errors import InputError
 from gscompleter.render import load_renderer
 from gscompleter.render.lod import thin_gaussians
 from gscompleter.splat_alignment.estimate import SplatAlignment, align_splat, sample_views
-from gscompleter.splat_alignment.fit import ImageFit, SplatFit, score_splat
+from gscompleter.splat_alignment.fit import ImageFit, SplatFit, score_splat, summarize_fits
 from gscompleter.splat_alignment.similarity import make_similarity, transform_pose
 from gscompleter.splat_alignment.trainer_frames import (
     NERFSTUDIO_WORLDS,
@@ -214,8 +214,8 @@ def test_a_large_splat_is_thinned_to_one_that_looks_alike(splat, room):
     assert thin_gaussians(splat, len(splat)) is splat
 
 
-def fit_of(*margins, psnr=15.0, covered=0.8, drift=0.1):
-    return SplatFit(tuple(ImageFit(psnr, margin, covered, drift) for margin in margins))
+def fit_of(*margins, psnr=15.0, covered=0.8, drift=0.1) -> SplatFit:
+    return summarize_fits([ImageFit(psnr, margin, covered, drift) for margin in margins])
 
 
 def test_two_photographs_that_show_the_splat_are_enough_and_one_of_many_is_not():

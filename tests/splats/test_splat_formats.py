@@ -299,7 +299,7 @@ def test_labels_of_another_file_are_not_believed(tmp_path):
     save_splat(other, gaussians[:10])
     labels = get_labels_path(path)
     shutil.copy(labels, get_labels_path(other))
-    refused(other, "labels of another state")
+    refused(other, "does not hold the labels")
     save_splat(other, gaussians[:10])
     assert not get_labels_path(other).exists()
     for text in (
@@ -334,14 +334,14 @@ def test_what_is_no_splat_is_refused(tmp_path):
         ("empty.splat", b"", "is empty"),
         ("a.txt", b"hello", "format that is known"),
         ("b.spz", b"hello", "format that is known"),
-        ("c.splat", b"hello", "no multiple of 32"),
+        ("c.splat", b"hello", "buffer size"),
         ("d.spz", gzip.compress(b"x" * 100), "no .spz"),
         ("e.spz", b"NGSP" + struct.pack("<IIBBBB", 9, 1, 0, 12, 0, 0), "version 9"),
-        ("f.glb", b"glTF" + bytes(8), "no description"),
+        ("f.glb", b"glTF" + bytes(8), "cannot be read"),
         ("g.json", b'{"frames": []}', "no .sog"),
         ("g.gltf", b'{"asset": {}}', "no .sog"),
-        ("h.ksplat", b"\x00\x07" + bytes(4094), "is empty"),
-        ("i.ksplat", b"\x09" + bytes(4095), "which cannot be read"),
+        ("h.ksplat", b"\x00\x07" + bytes(4094), "got none"),
+        ("i.ksplat", b"\x09" + bytes(4095), "version 9"),
     ]:
         (tmp_path / name).write_bytes(data)
         refused(tmp_path / name, sentence)
@@ -360,13 +360,13 @@ def test_absurd_counts_are_refused_before_anything_is_unpacked(tmp_path):
     image = bytearray(files["quats.webp"])
     struct.pack_into("<I", image, 21, 0x0FFFFFFF)
     write_sog(tmp_path / "b.sog", files | {"quats.webp": bytes(image)})
-    refused(tmp_path / "b.sog", "claim to hold")
+    refused(tmp_path / "b.sog", "exceeds limit")
     with zipfile.ZipFile(tmp_path / "c.sog", "w", zipfile.ZIP_DEFLATED) as bundle:
         bundle.writestr("meta.json", bytes(100_000_000))
     refused(tmp_path / "c.sog", "claim to hold")
     table, binary = glb_table(plausible(20, 0))
     table["accessors"][3]["count"] = 19
-    refused(write_glb(tmp_path / "b.glb", table, binary), "another size")
+    refused(write_glb(tmp_path / "b.glb", table, binary), "cannot be read")
     table["scenes"][0]["nodes"] = [0] * 100_000
     refused(write_glb(tmp_path / "a.glb", table, binary), "contain each other|more Gaussians")
 
@@ -436,7 +436,7 @@ def test_names_and_versions_of_others_are_quoted_in_part(tmp_path):
         {**table, "means": {long: 1}},
     ):
         (path / "meta.json").write_text(json.dumps(changed))
-        assert len(refused(path, "version|is invalid|names a file")) <= 287
+        assert len(refused(path, "cannot be read")) <= 287
     gaussians, binary = glb_table(plausible(20, 0))
     primitive = gaussians["meshes"][0]["primitives"][0]
     primitive["extensions"]["KHR_gaussian_splatting"] = {"kernel": long, "colorSpace": long}
@@ -509,14 +509,10 @@ def test_files_of_others_are_read_as_a_third_party_reads_them(shared):
         assert torch.allclose(covariances(loaded), covariances(expected), atol=1e-6)
 
 
-def test_opaque_gaussians_that_a_third_party_decoded_are_kept(
-    shared, tmp_path, monkeypatch, capsys
-):
-    """Their logits are infinite in its .ply; that is reported, and finite once saved again."""
+def test_opaque_gaussians_that_a_third_party_decoded_are_kept(shared, tmp_path, monkeypatch):
+    """Their logits are infinite in its .ply, and finite once saved again."""
     folder, out = shared / "formats" / "gaussians", tmp_path / "out.ply"
     assert run(monkeypatch, "convert", folder / "guitar.from-compressed.ply", out) == 0
-    said = capsys.readouterr().out.replace("\n", " ")
-    assert "667 of 90,854 Gaussians have an opacity logit of +infinity and 0 of" in said
     camera = camera_at(0.29, -1.13, -1.5, size=96)
     truth, ours = (
         CPU.render(load_splat(path), camera).image

@@ -14,10 +14,8 @@ from torch import Tensor
 from gscompleter.data.limits import DEPTH_RANGE
 from gscompleter.data.photographs import Photographs
 from gscompleter.data.resize import Resolution
-from gscompleter.errors import InputError, quote_value
 from gscompleter.geometry import is_inside, project
-from gscompleter.io.reading import open_file
-from gscompleter.splats.ply import read_header, read_vertices
+from gscompleter.splats.ply_file import read_ply_file
 from gscompleter.types import Camera
 
 AXES = ("x", "y", "z")
@@ -72,15 +70,5 @@ def widen_depth_range(nearest: float, farthest: float) -> tuple[float, float]:
 
 def read_point_cloud(path: Path) -> Float[np.ndarray, "n 3"]:
     """Read the vertices of a PLY file, in scene units."""
-    with open_file(path) as file:
-        file_format, elements = read_header(file, path)
-        vertex = next((e for e in elements if e.name == "vertex"), None)
-        names = [prop.name for prop in vertex.properties] if vertex else []
-        unique = len(set(names)) == len(names)
-        if vertex is None or not unique or not set(AXES) <= set(names) or vertex.has_lists:
-            raise InputError(
-                f"{quote_value(path)} holds no points with x, y and z; export them again."
-            )
-        ahead = elements[: elements.index(vertex)]
-        vertices = read_vertices(file, file_format, ahead, vertex, path)
+    vertices = read_ply_file(path, AXES, "point cloud").rows
     return np.stack([vertices[axis].astype(np.float64) for axis in AXES], axis=-1)

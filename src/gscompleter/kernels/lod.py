@@ -5,6 +5,8 @@ import math
 import numpy as np
 from numba import njit
 
+from gscompleter.kernels.project import compute_rotation, normalize_quat
+
 BLOCK = 4096
 """Consecutive Gaussians that are cut into runs independently of the others."""
 MAX_OPACITY = np.float32(0.9999)
@@ -68,19 +70,6 @@ def _compute_fullness(thickness):
 
 
 @njit(cache=True, fastmath={"contract"}, error_model="numpy")
-def _compute_rotation(quats, i):
-    w, x, y, z = quats[i, 0], quats[i, 1], quats[i, 2], quats[i, 3]
-    inverse = np.float32(1) / math.sqrt(max(w * w + x * x + y * y + z * z, MIN_DIVISOR))
-    w, x, y, z = w * inverse, x * inverse, y * inverse, z * inverse
-    one, two = np.float32(1), np.float32(2)
-    return (
-        (one - two * (y * y + z * z), two * (x * y - w * z), two * (x * z + w * y)),
-        (two * (x * y + w * z), one - two * (x * x + z * z), two * (y * z - w * x)),
-        (two * (x * z - w * y), two * (y * z + w * x), one - two * (x * x + y * y)),
-    )
-
-
-@njit(cache=True, fastmath={"contract"}, error_model="numpy")
 def _compute_shares(first, last, scales, opacities, shares):
     """Write shares of first..last in thickness times cross-section; return largest and total."""
     total, most = np.float32(0), first
@@ -112,9 +101,9 @@ def _compute_variance(first, last, shares, means, quats, scales, mean, axis):
     for i in range(first, last):
         dx, dy, dz = means[i, 0] - mean[0], means[i, 1] - mean[1], means[i, 2] - mean[2]
         squares = (ax * dx + ay * dy + az * dz) ** 2
-        own = _compute_rotation(quats, i)
+        own = compute_rotation(normalize_quat(quats, i)[0])
         for k in range(3):
-            along = (ax * own[0][k] + ay * own[1][k] + az * own[2][k]) * scales[i, k]
+            along = (ax * own[k] + ay * own[3 + k] + az * own[6 + k]) * scales[i, k]
             squares += along * along
         variance += shares[i] * squares
     return variance
@@ -139,9 +128,9 @@ def merge_runs(begin, end, start, gaussians, shares, merged):
         if last - first == 1:
             to_scales[run], to_opacities[run] = scales[first], opacities[first]
             continue
-        axes = _compute_rotation(quats, most)
+        axes = compute_rotation(normalize_quat(quats, most)[0])
         for k in range(3):
-            axis = axes[0][k], axes[1][k], axes[2][k]
+            axis = axes[k], axes[3 + k], axes[6 + k]
             seen = (means, quats, scales, to_means[run], axis)
             to_scales[run, k] = math.sqrt(_compute_variance(first, last, shares, *seen))
         thickness = total / max(_compute_cross_section(to_scales, run), MIN_DIVISOR)

@@ -78,14 +78,16 @@ def _apply_matrix(a, x, y, z):
 
 
 @njit(cache=True, fastmath={"contract"}, error_model="numpy")
-def _normalize_quat(quats, i):
+def normalize_quat(quats, i):
+    """Return the unit quaternion i, and the factor that normalised it."""
     w, x, y, z = quats[i, 0], quats[i, 1], quats[i, 2], quats[i, 3]
     factor = np.float32(1) / math.sqrt(w * w + x * x + y * y + z * z)
     return (w * factor, x * factor, y * factor, z * factor), factor
 
 
 @njit(cache=True, fastmath={"contract"})
-def _compute_rotation(quat):
+def compute_rotation(quat):
+    """Compute the rotation matrix of a unit quaternion, row by row."""
     w, x, y, z = quat
     one, two = np.float32(1), np.float32(2)
     return (
@@ -262,8 +264,8 @@ def project(begin, end, gaussians, pinhole, splats, boxes, factors):
         if not (z > near and z < np.inf and opacities[i] >= MIN_ALPHA):
             continue
         tan_x, tan_y = x * (one / z), y * (one / z)
-        quat, _ = _normalize_quat(quats, i)
-        axes = _scale_columns(_multiply(view, _compute_rotation(quat)), scales, i)
+        quat, _ = normalize_quat(quats, i)
+        axes = _scale_columns(_multiply(view, compute_rotation(quat)), scales, i)
         flat = _flatten(axes, _compute_jacobian(fx, fy, tan_x, tan_y, one / z, limits))
 
         # The determinant of F Fᵀ + blur is summed from squares: nothing cancels, however thin
@@ -380,8 +382,8 @@ def project_backward(
         )
         inverse_z = one / z
         tan_x, tan_y = x * inverse_z, y * inverse_z
-        quat, unit_factor = _normalize_quat(quats, i)
-        rotation = _multiply(view, _compute_rotation(quat))
+        quat, unit_factor = normalize_quat(quats, i)
+        rotation = _multiply(view, compute_rotation(quat))
         axes = _scale_columns(rotation, scales, i)
         jacobian = _compute_jacobian(fx, fy, tan_x, tan_y, inverse_z, limits)
         flat = _flatten(axes, jacobian)

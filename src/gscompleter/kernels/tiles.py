@@ -3,7 +3,7 @@
 import numpy as np
 from numba import njit
 
-from gscompleter.kernels.project import DEPTH, NUM_SPLAT_COLUMNS
+from gscompleter.kernels.project import DEPTH
 from gscompleter.kernels.simd import TILE
 
 TILE_SHIFT = 4
@@ -134,19 +134,6 @@ def number_by_use(entries, count):
     return order[:used], renamed
 
 
-@njit(cache=True, nogil=True)
-def copy_splats(begin, end, rows, splats, opacities, boxes, taken):
-    """Copy the splats of `rows` to the places begin..end of the arrays in `taken`."""
-    to_splats, to_opacities, to_boxes = taken
-    for place in range(begin, end):
-        i = rows[place]
-        for column in range(NUM_SPLAT_COLUMNS):
-            to_splats[place, column] = splats[i, column]
-        to_opacities[place] = opacities[i]
-        for side in range(4):
-            to_boxes[place, side] = boxes[i, side]
-
-
 @njit(cache=True, nogil=True, fastmath={"contract"}, error_model="numpy")
 def sum_entries(begin, end, slot_start, gradients, written, totals):
     """Sum the gradients of the entries of each of the Gaussians begin..end into `totals` [n, c].
@@ -160,16 +147,3 @@ def sum_entries(begin, end, slot_start, gradients, written, totals):
             if written[slot]:
                 for column in range(gradients.shape[1]):
                     totals[i, column] += gradients[slot, column]
-
-
-@njit(cache=True, nogil=True, fastmath={"contract"})
-def sum_by_gaussian(begin, end, entries, rows, gradients, written, totals):
-    """Add the gradients of the entries of splats begin..end to those of their Gaussians.
-
-    gradients [e, c] float32 count if written [e]. rows [splats]: Gaussian of each splat.
-    """
-    for place in range(len(entries)):
-        i = entries[place]
-        if begin <= i < end and written[place]:
-            for column in range(gradients.shape[1]):
-                totals[rows[i], column] += gradients[place, column]

@@ -15,9 +15,8 @@ from torch import Tensor
 from torch.autograd.function import once_differentiable
 
 from gscompleter.errors import InputError
-from gscompleter.kernels import composite, project, tiles
+from gscompleter.kernels import composite, project
 from gscompleter.kernels.composite import Layer, RasterFrame
-from gscompleter.kernels.parallel import run, split_range
 from gscompleter.kernels.project import GaussianArrays, Pinhole
 from gscompleter.kernels.simd import TILE
 from gscompleter.render import ColorErrors, ColorSums, DepthRender, OpacityRender
@@ -25,6 +24,7 @@ from gscompleter.render.viewpoint import (
     BinnedSplats,
     Splats,
     Viewpoint,
+    bin_layer,
     gather_splats,
     order_by_use,
     to_float32,
@@ -106,16 +106,13 @@ class CpuFrozenScene:
 
     def backproject(self, image: Float[Tensor, "h w 3"]) -> Float[Tensor, "n 3"]:
         """Backproject `image` by the backward pass on the frozen frame."""
-        nothing, itself = freeze_nothing(self.viewpoint).layer, assign_own_slots(self.layer)
+        nothing, itself = freeze_nothing(self.viewpoint).layer, bin_layer(self.layer)
         frame = self.frame._replace(used=np.ascontiguousarray(self.frame.used[:, ::-1]))
         d_frame = (image, torch.zeros_like(image[..., 0]), torch.zeros_like(image[..., 0]))
         composited = (nothing, itself, frame, d_frame, composite.WANT_COLOR)
         gradients = self.viewpoint.composite_backward(*composited)
         totals = np.zeros((self.count, 3), np.float32)
-        named = (self.layer.entries, self.rows, *gradients, totals)
-        pieces = split_range(len(self.rows), self.viewpoint.threads)  # Each reads all entries.
-        calls = [(*piece, *named) for piece in pieces]
-        run(tiles.sum_by_gaussian, calls, self.viewpoint.threads)
+        totals[self.rows] = self.viewpoint.sum_by_gaussian(itself, gradients)
         return torch.from_numpy(totals)
 
     def splat(self, values: Float[Tensor, "n"]) -> Float[Tensor, "h w"]:
@@ -319,12 +316,6 @@ def join_layers(
         rows = [np.flatnonzero(part).astype(np.int32) for part in np.split(named, counts[:1])]
     whole = new[:3] if len(rows[1]) == sum(counts) else gather_splats([context, new], rows)
     return Layer(*whole, tile_start, entries), rows
-
-
-def assign_own_slots(layer: Layer) -> BinnedSplats:
-    """Give each entry of a layer its own slot."""
-    slots = np.arange(len(layer.entries), dtype=np.int32)
-    return BinnedSplats(layer, slots, np.zeros(1, np.int64))
 
 
 def to_arrays(gaussians: Gaussians) -> GaussianArrays:

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
-from itertools import accumulate, pairwise
 from typing import Any
 
 import numpy as np
@@ -95,8 +94,7 @@ class Viewpoint:
 
     def enter(self, splats: Splats, depth_limits: Float32[ndarray, "tiles"]) -> BinnedSplats:
         """Enter splats into the lists of the tiles, and give those of each splat adjacent slots."""
-        layer = self.fill_lists(splats, depth_limits)
-        return BinnedSplats(layer, *tiles.number_slots(layer.entries, len(layer.splats)))
+        return bin_layer(self.fill_lists(splats, depth_limits))
 
     def project(self, gaussians: GaussianArrays, is_antialiased: bool) -> Splats:
         """Project Gaussians to splats; invisible ones get empty boxes."""
@@ -186,6 +184,11 @@ class Viewpoint:
         share(kernel, count, *arguments, threads=self.threads)
 
 
+def bin_layer(layer: Layer) -> BinnedSplats:
+    """Give the entries of each splat adjacent slots."""
+    return BinnedSplats(layer, *tiles.number_slots(layer.entries, len(layer.splats)))
+
+
 def find_touched_tiles(layer: Layer) -> Int64[ndarray, "touched"]:
     """Find the tiles in which a layer has entries."""
     return np.flatnonzero(np.diff(layer.tile_start))
@@ -214,13 +217,9 @@ def gather_splats(
     layers: Sequence[Layer], rows: Sequence[Int32[ndarray, "_"]]
 ) -> tuple[Float32[ndarray, "n 9"], Float32[ndarray, "n"], Integer[ndarray, "n 4"]]:
     """Gather the splats, opacities and boxes of these rows of each layer."""
-    bounds = [0, *accumulate(map(len, rows))]
-    taken = (
-        np.empty((bounds[-1], project.NUM_SPLAT_COLUMNS), np.float32),
-        np.empty(bounds[-1], np.float32),
-        np.empty((bounds[-1], 4), layers[0].boxes.dtype),
+    pairs = list(zip(layers, rows, strict=True))
+    return (
+        np.concatenate([layer.splats[row] for layer, row in pairs]),
+        np.concatenate([layer.opacities[row] for layer, row in pairs]),
+        np.concatenate([layer.boxes[row] for layer, row in pairs]),
     )
-    for layer, row, (start, stop) in zip(layers, rows, pairwise(bounds), strict=True):
-        into = tuple(array[start:stop] for array in taken)
-        share(tiles.copy_splats, len(row), row, *layer[:3], into)
-    return taken

@@ -25,8 +25,6 @@ from gscompleter.splat_alignment.matching import (
 )
 from gscompleter.splat_alignment.similarity import (
     Matrix,
-    get_pose,
-    has_baseline,
     transform_camera,
     transform_view,
 )
@@ -161,75 +159,50 @@ def estimate_alignment(
     given = data.score_transform(np.eye(4))
     best = SplatAlignment("given", np.eye(4), given, given)
     if not given.is_match:
-        best = select_known_frame(data, best, poses, points, trainer_frames)
-    if best.fit.is_match:
-        return best if best.fit.is_exact else polish(data, best)
-    found = search_alignment(data, points, given)
-    if found is None:
+        computed = compute_trainer_frames(poses, points)
+        normalised: Iterable[FrameProposal] = (("normalised", frame) for frame in computed)
+        for method, transform in chain(trainer_frames, normalised):
+            fit = data.score_transform(transform)
+            if is_better(fit, best.fit):
+                best = replace(best, method=method, transform=transform, fit=fit)
+            if best.fit.is_exact:
+                break
+    best = best if best.fit.is_exact else align_by_features(data, best, points)
+    if not best.fit.is_match:
         raise InputError(
             f"The splat does not show what the photographs show: at their cameras it covers "
             f"{100 * given.coverage:.0f} % of the pixels and matches them at {given.psnr:.1f} dB, "
             "and no other frame was found; give the photographs and poses that the splat was "
             "trained on."
         )
-    return found
-
-
-def select_known_frame(
-    data: AlignmentData,
-    best: SplatAlignment,
-    poses: Poses,
-    points: Points | None,
-    trainer_frames: Iterable[FrameProposal],
-) -> SplatAlignment:
-    """Select the best of `best` and the trainers' frames, stopping at the first that is exact."""
-    normalised = compute_trainer_frames(poses, points)
-    for method, transform in chain(trainer_frames, (("normalised", t) for t in normalised)):
-        fit = data.score_transform(transform)
-        if is_better(fit, best.fit):
-            best = replace(best, method=method, transform=transform, fit=fit)
-        if best.fit.is_exact:
-            break
     return best
 
 
 def is_better(fit: SplatFit, than: SplatFit) -> bool:
-    """Return True if a fit is clearly better and has at least half of the coverage."""
-    if not fit.is_match or fit.coverage < 0.5 * than.coverage:
-        return False
-    return not than.is_match or fit.margin > than.margin + MIN_IMPROVEMENT
+    """Return True if a fit is a match and clearly better, with at least half of the coverage."""
+    if not fit.is_match or not than.is_match:
+        return fit.is_match
+    return fit.coverage >= 0.5 * than.coverage and fit.margin > than.margin + MIN_IMPROVEMENT
 
 
-def polish(data: AlignmentData, found: SplatAlignment) -> SplatAlignment:
-    """Refine an alignment by image features; keep `found` unless the result is clearly better."""
-    data = data.restrict_to(found.transform)
+def align_by_features(
+    data: AlignmentData, best: SplatAlignment, points: Points | None
+) -> SplatAlignment:
+    """Improve an alignment by image features; without a match, search from all directions."""
     photographs = extract_photo_features(data.views)
-    transform = refine_similarity(data.scene, photographs, found.transform, data.renderer)
-    if transform is None:
-        return found
-    fit = data.score_transform(transform)
-    if not is_better(fit, found.fit):
-        return found
-    return SplatAlignment("similarity", transform, fit, found.given_fit)
-
-
-def search_alignment(
-    data: AlignmentData, points: Points | None, given: SplatFit
-) -> SplatAlignment | None:
-    """Search all directions for the first similarity that fits, or return None."""
-    renderer = data.renderer
-    if not has_baseline([get_pose(view.camera) for view in data.views]):
-        return None
-    photographs = extract_photo_features(data.views)
-    place = estimate_points(data.views) if points is None else points
-    for start in search_similarities(thin_gaussians(data.scene), photographs, place, renderer):
-        transform = refine_similarity(data.restrict_to(start).scene, photographs, start, renderer)
-        if transform is None:
-            continue
-        fit = data.score_transform(transform)
-        if fit.is_match:
-            return SplatAlignment("similarity", transform, fit, given)
-    return None
+    if best.fit.is_match:
+        starts: Iterable[Matrix] = [best.transform]
+    else:
+        place = estimate_points(data.views) if points is None else points
+        scene = thin_gaussians(data.scene)
+        starts = search_similarities(scene, photographs, place, data.renderer)
+    for start in starts:
+        scene = data.restrict_to(start).scene
+        transform = refine_similarity(scene, photographs, start, data.renderer)
+        fit = best.fit if transform is None else data.score_transform(transform)
+        if transform is not None and is_better(fit, best.fit):
+            return replace(best, method="similarity", transform=transform, fit=fit)
+    return best
 
 
 def estimate_points(views: Sequence[View]) -> Points:

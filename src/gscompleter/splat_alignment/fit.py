@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
+from typing import NamedTuple
 
 import cv2
 import numpy as np
@@ -40,16 +41,16 @@ GreyBytes = UInt8[np.ndarray, "h w"]
 Corners = Float[np.ndarray, "n 1 2"]
 
 
-@dataclass(frozen=True)
-class ImageFit:
+class ImageFit(NamedTuple):
     """Fit of the splat to one photograph."""
 
-    psnr: float
+    psnr: float = 0.0
     """PSNR in dB over the covered pixels, after matching the exposure."""
-    margin: float
+    margin: float = 0.0
     """PSNR above that of the best flat image, in dB."""
-    coverage: float
-    drift: float
+    coverage: float = 0.0
+    """Share of the pixels that the splat covers."""
+    drift: float = math.inf
     """Displacement of corners from render to photograph, in pixels; infinity if unknown."""
 
     @property
@@ -59,52 +60,37 @@ class ImageFit:
         return self.coverage >= MIN_COVERAGE and (self.margin >= MIN_MARGIN or flat)
 
 
-@dataclass(frozen=True)
-class SplatFit:
-    """Fit of the splat to several photographs.
+class SplatFit(NamedTuple):
+    """Fit of the splat to several photographs: medians over the better half of those that see it.
 
-    Figures are medians over the better half of those that see the splat: it may not be trained on
-    all.
+    It may not be trained on all.
     """
 
-    images: tuple[ImageFit, ...]
-
-    @property
-    def is_match(self) -> bool:
-        """True if the splat matches two photographs, or the only one."""
-        shown = sum(image.is_match for image in self.images)
-        return shown >= max(1, min(2, len(self.images)))
+    psnr: float
+    margin: float
+    coverage: float
+    """Mean over all photographs."""
+    drift: float
+    is_match: bool
+    """True if the splat matches two photographs, or the only one."""
 
     @property
     def is_exact(self) -> bool:
         """True if the splat fits and is displaced by at most `MAX_DRIFT`."""
         return self.is_match and self.drift <= MAX_DRIFT
 
-    @property
-    def psnr(self) -> float:
-        """PSNR in dB; 0 if no photograph sees the splat."""
-        return self._compute_median("psnr", 0.0)
 
-    @property
-    def margin(self) -> float:
-        """PSNR above that of the best flat image, in dB."""
-        return self._compute_median("margin", 0.0)
-
-    @property
-    def drift(self) -> float:
-        """Displacement in pixels; infinity if unknown."""
-        return self._compute_median("drift", math.inf)
-
-    @property
-    def coverage(self) -> float:
-        """Mean share of the pixels that the splat covers, over all photographs."""
-        return sum(image.coverage for image in self.images) / max(len(self.images), 1)
-
-    def _compute_median(self, name: str, otherwise: float) -> float:
-        seen = [image for image in self.images if image.coverage >= MIN_COVERAGE]
-        seen.sort(key=lambda image: image.margin, reverse=True)
-        values = sorted(getattr(image, name) for image in seen[: math.ceil(len(seen) / 2)])
-        return values[len(values) // 2] if values else otherwise
+def summarize_fits(images: Sequence[ImageFit]) -> SplatFit:
+    """Summarize the fits to several photographs."""
+    seen = [image for image in images if image.coverage >= MIN_COVERAGE]
+    seen.sort(key=lambda image: image.margin, reverse=True)
+    better = seen[: math.ceil(len(seen) / 2)] or [ImageFit()]
+    psnr, margin, _, drift = (
+        sorted(values)[len(better) // 2] for values in zip(*better, strict=True)
+    )
+    coverage = sum(image.coverage for image in images) / max(len(images), 1)
+    is_match = sum(image.is_match for image in images) >= max(1, min(2, len(images)))
+    return SplatFit(psnr, margin, coverage, drift, is_match)
 
 
 def score_splat(scene: Gaussians, views: Sequence[View], renderer: Renderer) -> SplatFit:
@@ -113,7 +99,7 @@ def score_splat(scene: Gaussians, views: Sequence[View], renderer: Renderer) -> 
     def fit(view: View) -> ImageFit:
         return score_image(render_from(scene, view.camera, renderer), view.image)
 
-    return SplatFit(tuple(get_view_map(scene)(fit, views)))
+    return summarize_fits(list(get_view_map(scene)(fit, views)))
 
 
 def render_from(scene: Gaussians, camera: Camera, renderer: Renderer) -> Render:
@@ -129,7 +115,7 @@ def score_image(render: Render, photograph: Float[Tensor, "h w 3"]) -> ImageFit:
     where = render.alpha >= COVERED
     covered = where.float().mean().item()
     if covered < MIN_COVERAGE:
-        return ImageFit(0.0, 0.0, covered, math.inf)
+        return ImageFit(coverage=covered)
     truth = photograph[where].double()
     rendered = match_exposure(render.image[where].double(), truth)
     psnr = convert_to_psnr((rendered - truth).square().mean())
@@ -163,15 +149,15 @@ def measure_drift(
     Both are brightness in the exposure of the photograph. Corners in the valid pixels are tracked
     forward and back (Lucas-Kanade). Infinity if too few survive.
     """
-    render, photograph = convert_to_grey_bytes(rendered), convert_to_grey_bytes(truth)
+    before, after = ((255 * i.clip(0, 1)).round().astype(np.uint8) for i in (rendered, truth))
     mask = valid_mask.astype(np.uint8)
-    corners = cv2.goodFeaturesToTrack(render, MAX_CORNERS, 0.01, 5, mask=mask)
-    if corners is None or len(corners) < MIN_TRACKED_CORNERS:
+    corners = cv2.goodFeaturesToTrack(before, MAX_CORNERS, 0.01, 5, mask=mask)
+    if corners is None:
         return math.inf
-    there, found = track_corners(render, photograph, corners)
-    back, found_again = track_corners(photograph, render, there)
-    returned = np.linalg.norm(back - corners, axis=2)[:, 0] < MAX_ROUND_TRIP_ERROR
-    trusted = found & found_again & returned
+    there, is_found = track_corners(before, after, corners)
+    back, is_found_again = track_corners(after, before, there)
+    is_back = np.linalg.norm(back - corners, axis=2)[:, 0] < MAX_ROUND_TRIP_ERROR
+    trusted = is_found & is_found_again & is_back
     if trusted.sum() < MIN_TRACKED_CORNERS:
         return math.inf
     return float(np.median(np.linalg.norm(there - corners, axis=2)[trusted]))
@@ -185,8 +171,3 @@ def track_corners(
         before, after, corners, np.zeros_like(corners), winSize=(15, 15), maxLevel=3
     )
     return np.asarray(moved), np.asarray(status)[:, 0] > 0
-
-
-def convert_to_grey_bytes(brightness: Float[np.ndarray, "h w"]) -> GreyBytes:
-    """Convert brightness in [0, 1] to bytes."""
-    return (255 * brightness.clip(0, 1)).round().astype(np.uint8)

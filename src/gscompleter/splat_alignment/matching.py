@@ -8,7 +8,6 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
-from functools import partial
 
 import cv2
 import numpy as np
@@ -42,13 +41,11 @@ SCALE_FACTORS = (1.0, 0.6, 1.7)
 """Trial factors on the size of the splat, which far Gaussians and floaters blur."""
 NUM_ROUNDS = 2
 """Iterations of the refinement, each with renders at the cameras of the previous one."""
-MAX_SHIFT = 0.25
-"""Median change of the reprojected points, in pixels, at which the iteration stops."""
 
-CenterRadius = tuple[Float[np.ndarray, "3"], float]
-"""Centre and radius of points."""
 PhotoFeatures = tuple[Camera, Features]
 """A photograph's camera and features."""
+RenderedFeatures = tuple[Features, Float[np.ndarray, "h w 3"]]
+"""Features of a render, and the visible point of the splat at each pixel, or NaN."""
 
 
 @dataclass(frozen=True)
@@ -70,22 +67,23 @@ def search_similarities(
 ) -> Iterator[Matrix]:
     """Yield similarities from photographs to splat by which some photographs match."""
     seer = photographs[len(photographs) // 2][0]
-    if len(scene) == 0:
+    if len(scene) == 0 or not has_baseline([get_pose(camera) for camera, _ in photographs]):
         return
     solid = scene.means[scene.opacities >= scene.opacities.median()].detach().cpu().double().numpy()
-    goal = compute_center_radius(solid)
-    if goal[1] == 0:  # most of it is one point: all directions are alike
-        return
-    for transform in generate_starts(get_pose(seer), compute_center_radius(points), goal):
-        found = locate_photos(scene, transform_camera(seer, transform), photographs, renderer)
-        answer = fit_similarity(found)
+    for transform in generate_starts(get_pose(seer), points, solid):
+        rendered = render_features(scene, transform_camera(seer, transform), renderer)
+        answer = fit_similarity([locate_photo(rendered, photograph) for photograph in photographs])
         if answer is not None:
             yield answer
 
 
-def generate_starts(pose: Matrix, start: CenterRadius, goal: CenterRadius) -> Iterator[Matrix]:
-    """Yield similarities that map `place` to `goal` (centre, radius), from all directions."""
-    (center, radius), (new_center, new_radius) = start, goal
+def generate_starts(
+    pose: Matrix, points: Points, solid: Float[np.ndarray, "n 3"]
+) -> Iterator[Matrix]:
+    """Yield similarities that map `points` to `solid`, from all directions."""
+    (center, radius), (new_center, new_radius) = map(compute_center_radius, (points, solid))
+    if new_radius == 0:  # most of it is one point: all directions are alike
+        return
     for zoom in SCALE_FACTORS:
         scale = zoom * new_radius / max(radius, 1e-12)
         for direction in sample_directions(NUM_DIRECTIONS):
@@ -93,7 +91,7 @@ def generate_starts(pose: Matrix, start: CenterRadius, goal: CenterRadius) -> It
             yield make_similarity(scale, turn, new_center - scale * turn @ center)
 
 
-def compute_center_radius(points: Points) -> CenterRadius:
+def compute_center_radius(points: Points) -> tuple[Float[np.ndarray, "3"], float]:
     """Compute centre and radius of points as medians, which ignore floaters."""
     center = np.median(points, axis=0)
     return center, float(np.median(np.linalg.norm(points - center, axis=1)))
@@ -108,32 +106,29 @@ def sample_directions(count: int) -> Float[np.ndarray, "n 3"]:
 
 
 def refine_similarity(
-    scene: Gaussians, photographs: Sequence[PhotoFeatures], transform: Matrix, renderer: Renderer
+    scene: Gaussians, photographs: Sequence[PhotoFeatures], start: Matrix, renderer: Renderer
 ) -> Matrix | None:
     """Refine a similarity (photographs to splat) by features; None if too few match."""
+
+    def locate(photograph: PhotoFeatures, camera: Camera) -> LocatedPhoto | None:
+        return locate_photo(render_features(scene, camera, renderer), photograph)
+
+    transform: Matrix | None = start
     for _ in range(NUM_ROUNDS):
-        cameras = [transform_camera(camera, transform) for camera, _ in photographs]
-        alone = [[photograph] for photograph in photographs]
-        places = get_view_map(scene)(
-            partial(locate_photos, scene, renderer=renderer), cameras, alone
-        )
-        found = [place for these in places for place in these]
-        better = fit_similarity(found)
-        if better is None:
-            return None
-        moved = np.median([_compute_shift(place, transform, better) for place in found])
-        transform = better
-        if moved <= MAX_SHIFT:
-            break
+        if transform is not None:
+            cameras = [transform_camera(camera, transform) for camera, _ in photographs]
+            found = list(get_view_map(scene)(locate, photographs, cameras))
+            transform = fit_similarity(found)
     return transform
 
 
-def fit_similarity(found: Sequence[LocatedPhoto]) -> Matrix | None:
+def fit_similarity(photos: Sequence[LocatedPhoto | None]) -> Matrix | None:
     """Fit photographs' frame to splat's frame by located photographs; None if too few."""
-    before = [get_pose(place.camera) for place in found]
+    found = [photo for photo in photos if photo is not None]
+    before = [get_pose(photo.camera) for photo in found]
     if not has_baseline(before):
         return None
-    start = fit_pose_similarity(before, [place.pose for place in found])
+    start = fit_pose_similarity(before, [photo.pose for photo in found])
     return minimize_reprojection(found, start) if np.linalg.det(start[:3, :3]) > 0 else None
 
 
@@ -145,14 +140,14 @@ def minimize_reprojection(found: Sequence[LocatedPhoto], start: Matrix) -> Matri
     """
     # Imported here, because it takes half a second and few splats need it.
     from scipy.optimize import least_squares
-    from scipy.spatial.transform import Rotation
 
-    points = [transform_back(place, start) for place in found]
+    back = np.linalg.inv(start)
+    points = [photo.points @ back[:3, :3].T + back[:3, 3] for photo in found]
     center = np.median(np.concatenate(points), axis=0)
     unit = float(np.median(np.linalg.norm(np.concatenate(points) - center, axis=1)))
 
     def change(unknowns: Float[np.ndarray, "7"]) -> Matrix:
-        turn = np.exp(unknowns[0]) * Rotation.from_rotvec(unknowns[1:4]).as_matrix()
+        turn = np.exp(unknowns[0]) * cv2.Rodrigues(unknowns[1:4])[0]
         return make_similarity(1.0, turn, center + unit * unknowns[4:] - turn @ center)
 
     def errors(unknowns: Float[np.ndarray, "7"]) -> Float[np.ndarray, "m"]:
@@ -164,18 +159,6 @@ def minimize_reprojection(found: Sequence[LocatedPhoto], start: Matrix) -> Matri
 
     answer = least_squares(errors, np.zeros(7), loss="cauchy", f_scale=0.3 * MAX_REPROJECTION_ERROR)
     return start @ np.linalg.inv(change(answer.x))
-
-
-def transform_back(photo: LocatedPhoto, transform: Matrix) -> Float[np.ndarray, "m 3"]:
-    """Transform the inlier points of a photograph to the photographs' frame."""
-    back = np.linalg.inv(transform)
-    return photo.points @ back[:3, :3].T + back[:3, 3]
-
-
-def _compute_shift(photo: LocatedPhoto, before: Matrix, after: Matrix) -> float:
-    """Compute the median change of the reprojection error between two similarities, in pixels."""
-    seen = [_compute_residuals(transform_back(photo, m), photo) for m in (before, after)]
-    return float(np.median(np.abs(seen[1] - seen[0])))
 
 
 def _compute_residuals(
@@ -202,26 +185,20 @@ def extract_view_features(view: View) -> Features:
     return detect_features(StereoImage(pixels, K, pose[:3, :3], pose[:3, 3]))
 
 
-def locate_photos(
-    scene: Gaussians, camera: Camera, photographs: Sequence[PhotoFeatures], renderer: Renderer
-) -> list[LocatedPhoto]:
-    """Find the poses of the photographs that show what `camera` sees of the splat."""
+def render_features(scene: Gaussians, camera: Camera, renderer: Renderer) -> RenderedFeatures:
+    """Extract the features of what `camera` sees of the splat."""
     render = render_from(scene, camera, renderer)
-    features = extract_view_features(View(render.image, camera))
     surface = unproject(render.depth, camera).where((render.alpha >= COVERED)[..., None], torch.nan)
-    places = surface.detach().cpu().double().numpy()
-    found = (_locate_photo(features, places, photograph) for photograph in photographs)
-    return [one for one in found if one is not None]
+    features = extract_view_features(View(render.image, camera))
+    return features, surface.detach().cpu().double().numpy()
 
 
-def _locate_photo(
-    features: Features, places: Float[np.ndarray, "h w 3"], photograph: PhotoFeatures
-) -> LocatedPhoto | None:
+def locate_photo(rendered: RenderedFeatures, photograph: PhotoFeatures) -> LocatedPhoto | None:
     """Estimate a photograph's pose by PnP against a render; None with too few inliers."""
-    camera, own_features = photograph
-    rendered, pixels = match_features(features, own_features)
-    columns, rows = np.floor(rendered).astype(int).T
-    points = places[rows.clip(0, len(places) - 1), columns.clip(0, places.shape[1] - 1)]
+    (features, surface), (camera, own_features) = rendered, photograph
+    places, pixels = match_features(features, own_features)
+    columns, rows = np.floor(places).astype(int).T
+    points = surface[rows.clip(0, len(surface) - 1), columns.clip(0, surface.shape[1] - 1)]
     known = np.isfinite(points).all(axis=1)
     points, pixels = points[known], pixels[known]
     if len(points) < MIN_INLIERS:
@@ -232,12 +209,6 @@ def _locate_photo(
     )
     if not answer[0] or answer[3] is None or len(answer[3]) < MIN_INLIERS:
         return None
-    chosen = answer[3].ravel()
-    return LocatedPhoto(camera, _make_c2w(answer[1], answer[2]), points[chosen], pixels[chosen])
-
-
-def _make_c2w(rotation: Float[np.ndarray, "3 1"], shift: Float[np.ndarray, "3 1"]) -> Matrix:
-    """Convert OpenCV's world-to-camera vectors to camera-to-world."""
-    viewmat = np.eye(4)
-    viewmat[:3, :3], viewmat[:3, 3] = cv2.Rodrigues(rotation)[0], shift.ravel()
-    return np.linalg.inv(viewmat)
+    viewmat, chosen = np.eye(4), answer[3].ravel()
+    viewmat[:3, :3], viewmat[:3, 3] = cv2.Rodrigues(answer[1])[0], answer[2].ravel()
+    return LocatedPhoto(camera, np.linalg.inv(viewmat), points[chosen], pixels[chosen])

@@ -7,10 +7,11 @@ and returns transforms from their frame to the trainer's.
 
 from __future__ import annotations
 
+import os
 from collections import Counter
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
-from pathlib import Path, PurePosixPath
+from pathlib import Path
 from typing import Literal
 
 import numpy as np
@@ -135,8 +136,8 @@ def fit_named_cameras(ours: Mapping[str, Matrix], theirs: Mapping[str, Matrix]) 
 
 def match_names(ours: Sequence[str], theirs: Sequence[str]) -> list[tuple[str, str]]:
     """Match names that differ only in extension, or in folder if base names are unique."""
-    for spelled in (drop_extension, lambda name: PurePosixPath(name).stem):
-        a, b = index_unique(ours, spelled), index_unique(theirs, spelled)
+    for normalize in (drop_extension, lambda name: drop_extension(os.path.basename(name))):
+        a, b = index_unique(ours, normalize), index_unique(theirs, normalize)
         if len(a.keys() & b.keys()) >= 2:
             return [(a[name], b[name]) for name in a if name in b]
     return []
@@ -150,8 +151,7 @@ def index_unique(names: Sequence[str], normalize: Callable[[str], str]) -> dict[
 
 def drop_extension(name: str) -> str:
     """Drop the extension: `images/0001` for `images/0001.jpg`."""
-    path = PurePosixPath(name)
-    return str(path.with_name(path.stem)) if path.name else name
+    return os.path.splitext(name)[0]
 
 
 def compute_trainer_frames(poses: Poses, points: Points | None = None) -> Iterator[Matrix]:

@@ -16,20 +16,17 @@ import numpy as np
 from jaxtyping import Float, UInt8
 from numpy import ndarray
 
-from gscompleter.errors import quote_value
 from gscompleter.io.files import replace_file
 from gscompleter.splats.packing import (
-    NUM_SH_REST,
     assemble_sh,
     build_gaussians,
-    check_size,
     drop_largest,
-    make_damage_error,
     pack_fractions,
     restore_largest,
     unpack_fractions,
 )
-from gscompleter.splats.ply import Element, encode, make_header, read_header, read_mode
+from gscompleter.splats.ply import MODE_COMMENT, encode, has_mode_comment
+from gscompleter.splats.ply_file import make_header, read_header
 from gscompleter.types import SH_C0, Gaussians
 
 CHUNK_SIZE = 256
@@ -53,17 +50,8 @@ def is_compressed_ply(head: bytes) -> bool:
 
 def read_compressed_ply(path: Path) -> Gaussians:
     """Read a compressed .ply of SH degree 0 to 3."""
-    tables, is_antialiased = _read_tables(path)
-    if not {"chunk", "vertex"} <= tables.keys():
-        raise make_damage_error(path, "it has no chunks or no vertices")
+    header, tables = _read_tables(path)
     chunk, vertex = tables["chunk"], tables["vertex"]
-    found = chunk.dtype.names or ()
-    missing = [name for name in PACKED_PROPERTIES if name not in (vertex.dtype.names or ())]
-    missing += [name for name in CHUNK_PROPERTIES[:12] if name not in found]
-    if missing or len(chunk) * CHUNK_SIZE < len(vertex):
-        raise make_damage_error(
-            path, f"it lacks {', '.join(missing) or 'chunks for some of its vertices'}"
-        )
     position, rotation, scale, color = (
         vertex[name].astype(np.uint32) for name in PACKED_PROPERTIES
     )
@@ -72,13 +60,13 @@ def read_compressed_ply(path: Path) -> Gaussians:
         for packed, bounds in ((position, CHUNK_PROPERTIES[:6]), (scale, CHUNK_PROPERTIES[6:12]))
     )
     rgba = unpack_fractions(color, COLOR_BITS)
-    has_color_bounds = set(CHUNK_PROPERTIES) <= set(found)
+    has_color_bounds = set(CHUNK_PROPERTIES) <= set(chunk.dtype.names or ())
     rgb = _map_to_chunk(chunk, CHUNK_PROPERTIES[12:], rgba[:, :3]) if has_color_bounds else rgba
     smaller = (unpack_fractions(rotation, QUAT_BITS) - 0.5) * np.float32(np.sqrt(2))
     quats = restore_largest(rotation >> np.uint32(30), smaller)
-    sh = assemble_sh(rgb[:, :3], _unpack_sh_rest(path, tables.get("sh"), len(vertex)))
+    sh = assemble_sh(rgb[:, :3], _unpack_sh_rest(tables["sh"]) if "sh" in tables else None)
     gaussians = build_gaussians(means, quats, np.exp(log_scales), rgba[:, 3], sh)
-    return replace(gaussians, is_antialiased=is_antialiased)
+    return replace(gaussians, is_antialiased=has_mode_comment(header))
 
 
 def _map_to_chunk(
@@ -90,53 +78,29 @@ def _map_to_chunk(
     return limits[:, :3] * (1 - fractions) + limits[:, 3:] * fractions
 
 
-def _read_tables(path: Path) -> tuple[dict[str, ndarray], bool]:
-    """Read the elements of a binary .ply by name, and if its Gaussians are antialiased."""
+def _read_tables(path: Path) -> tuple[bytes, dict[str, ndarray]]:
+    """Read the header and the elements of a binary .ply by name."""
     with path.open("rb") as file:
-        file_format, elements = read_header(file, path)
-        is_antialiased = read_mode(file)
+        header, elements = read_header(file, path)
         data = file.read()
-    if file_format != "binary_little_endian":
-        raise make_damage_error(
-            path, f"a compressed .ply is binary_little_endian, not {file_format}"
-        )
+    if b"\nformat binary" not in header:
+        raise ValueError("it is no binary file")
     tables, start = {}, 0
     for element in elements:
-        row = _make_row_dtype(path, element)
-        check_size(path, len(data), start + element.count * row.itemsize)
-        # An element without properties has no bytes, whatever count it claims.
-        count = element.count if row.itemsize else 0
-        tables[element.name] = np.frombuffer(data, row, count, start) if count else np.empty(0, row)
-        start += count * row.itemsize
-    return tables, is_antialiased
+        if element.dtype.itemsize > 0:
+            rows = np.frombuffer(data, element.dtype, element.count, start)
+            tables[element.name] = rows
+            start += rows.nbytes
+    return header, tables
 
 
-def _make_row_dtype(path: Path, element: Element) -> np.dtype:
-    names = [p.name for p in element.properties]
-    if element.has_lists or len(set(names)) < len(names):
-        raise make_damage_error(
-            path, f"its element '{quote_value(element.name)}' holds lists or a name twice"
-        )
-    return element.dtype("<")
-
-
-def _unpack_sh_rest(
-    path: Path, table: ndarray | None, count: int
-) -> Float[ndarray, "n k 3"] | None:
+def _unpack_sh_rest(table: ndarray) -> Float[ndarray, "n k 3"]:
     """Unpack SH of degree 1 and above; a byte stands for the middle of its interval."""
-    if table is None:
-        return None
-    names = table.dtype.names or ()
-    wanted = tuple(f"f_rest_{i}" for i in range(len(names)))
-    is_known = len(names) in [3 * k for k in NUM_SH_REST] and set(names) == set(wanted)
-    if len(table) != count or not is_known:
-        raise make_damage_error(path, "its harmonics are not those of degree 0 to 3")
-    if any(table.dtype[name] != np.uint8 for name in names):
-        raise make_damage_error(path, "its harmonics are no bytes")
-    packed = np.stack([table[name] for name in wanted], axis=1) if names else np.empty((count, 0))
+    count, num_rest = len(table), len(table.dtype.names or ())
+    packed = np.stack([table[f"f_rest_{i}"] for i in range(num_rest)], axis=1)
     values = np.clip((packed.astype(np.float32) + 0.5) / 256, 0, 1)
     values = np.where(packed == 0, 0, np.where(packed == 255, 1, values)) * 8 - 4
-    return values.reshape(count, 3, len(names) // 3).transpose(0, 2, 1)
+    return values.reshape(count, 3, num_rest // 3).transpose(0, 2, 1)
 
 
 def write_compressed_ply(path: Path, gaussians: Gaussians) -> None:
@@ -180,8 +144,7 @@ def _make_header(gaussians: Gaussians, chunks: int, num_rest: int) -> bytes:
     elements = {
         "chunk": (chunks, np.dtype([(name, "<f4") for name in CHUNK_PROPERTIES])),
         "vertex": (count, np.dtype([(name, "<u4") for name in PACKED_PROPERTIES])),
-        "sh": (count, np.dtype(rest)),
     }
-    if not rest:
-        del elements["sh"]
-    return make_header(elements, gaussians.is_antialiased)
+    if rest:
+        elements["sh"] = (count, np.dtype(rest))
+    return make_header(elements, MODE_COMMENT if gaussians.is_antialiased else None)

@@ -15,8 +15,7 @@ from pathlib import Path
 
 import numpy as np
 import torch
-from jaxtyping import Int64, UInt8
-from numpy import ndarray
+from jaxtyping import UInt8
 from torch import Tensor
 
 from gscompleter.errors import InputError, quote_value, refuse_pointer
@@ -31,6 +30,7 @@ from gscompleter.splats.compressed_ply import (
 from gscompleter.splats.glb import is_glb, read_glb
 from gscompleter.splats.ksplat import read_ksplat
 from gscompleter.splats.morton import sort_along_morton
+from gscompleter.splats.packing import refuse_damage
 from gscompleter.splats.ply import load_ply, require_finite, save_ply
 from gscompleter.splats.sog import META, is_sog, read_sog
 from gscompleter.splats.splat import read_splat, write_splat
@@ -52,30 +52,15 @@ class Format:
     """Test on the first bytes of a file, or None if only the extension identifies the format."""
     read: Callable[[Path], Gaussians]
     write: Callable[[Path, Gaussians], None] | None = None
-    sort: Callable[[Gaussians], Gaussians] | None = None
-    """Sorts Gaussians as the format needs them; None keeps their order."""
-    supports_antialiased: bool = False
-    """True if the format can mark Gaussians as antialiased."""
 
 
 FORMATS = {
     "compressed-ply": Format(
-        (".compressed.ply",),
-        is_compressed_ply,
-        read_compressed_ply,
-        write_compressed_ply,
-        sort_along_morton,
-        supports_antialiased=True,
+        (".compressed.ply",), is_compressed_ply, read_compressed_ply, write_compressed_ply
     ),
-    "ply": Format(
-        (".ply",),
-        lambda head: head.startswith(b"ply"),
-        load_ply,
-        save_ply,
-        supports_antialiased=True,
-    ),
-    "spz": Format((".spz",), is_spz, read_spz, write_spz, supports_antialiased=True),
-    "sog": Format((".sog", META), is_sog, read_sog, supports_antialiased=True),
+    "ply": Format((".ply",), lambda head: head.startswith(b"ply"), load_ply, save_ply),
+    "spz": Format((".spz",), is_spz, read_spz, write_spz),
+    "sog": Format((".sog", META), is_sog, read_sog),
     "glb": Format((".glb",), is_glb, read_glb),
     "splat": Format((".splat",), None, read_splat, write_splat),
     "ksplat": Format((".ksplat",), None, read_ksplat),
@@ -98,16 +83,14 @@ def load_splat(path: Path | str, drop_nonfinite: bool = False) -> Gaussians:
         InputError: The file is missing, empty, truncated or damaged, or its format is unknown.
     """
     path = Path(path)
-    format_ = FORMATS[detect_splat_format(path)]
-    if format_.read is load_ply:
+    name = detect_splat_format(path)
+    if name == "ply":
         return load_ply(path, drop_nonfinite)
-    with np.errstate(over="ignore", invalid="ignore"):  # infinite values are refused below
-        gaussians = format_.read(path)
-    if len(gaussians) == 0:
-        raise InputError(f"{quote_value(path)} is empty: it holds no Gaussian.")
-    gaussians = validate_ranges(gaussians, path)
+    # Infinite values are refused below.
+    with refuse_damage(path), np.errstate(over="ignore", invalid="ignore"):
+        gaussians = FORMATS[name].read(path)
     labelled = replace(gaussians, generated=load_labels(path, len(gaussians)))
-    return require_finite(labelled, path, drop_nonfinite)
+    return require_finite(validate_ranges(labelled, path), path, drop_nonfinite)
 
 
 def validate_ranges(gaussians: Gaussians, path: Path) -> Gaussians:
@@ -133,40 +116,26 @@ def save_splat(path: Path | str, gaussians: Gaussians) -> None:
         InputError: The format is unknown or read-only, there are no Gaussians, or writing fails.
     """
     path = Path(path)
-    format_ = get_writable_format(path)
+    write = get_writer(path)
     if len(gaussians) == 0:
         raise InputError(f"There is no Gaussian to write to {quote_value(path)}.")
-    if format_.write is save_ply:
+    if write is save_ply:
         save_ply(path, gaussians)
         return
-    assert format_.write is not None
     gaussians = require_finite(gaussians.to("cpu"), path, drop_nonfinite=False)
-    if format_.sort is not None:
-        gaussians = format_.sort(gaussians)
-    format_.write(path, gaussians)
+    if write is write_compressed_ply:
+        gaussians = sort_along_morton(gaussians)
+    write(path, gaussians)
     save_labels(path, gaussians.generated)
 
 
 def describe_mode_loss(path: Path, gaussians: Gaussians) -> str | None:
     """Describe that the format of `path` cannot mark antialiased Gaussians, or return None."""
-    format_ = get_writable_format(path)
-    if format_.supports_antialiased or not gaussians.is_antialiased:
+    if get_writer(path) is not write_splat or not gaussians.is_antialiased:
         return None
     return (
-        f"A {format_.extensions[0]} file cannot mark Gaussians as antialiased: viewers will "
-        "render them as classic ones, which makes small ones too opaque."
-    )
-
-
-def note_infinite_opacities(gaussians: Gaussians) -> str | None:
-    """Describe the number of infinite opacity logits in a sentence, or return None."""
-    logits = None if gaussians.encoded is None else gaussians.encoded[:, 3]
-    if logits is None or logits.sum().isfinite():
-        return None
-    opaque, clear = int(logits.isposinf().sum()), int(logits.isneginf().sum())
-    return (
-        f"{opaque:,} of {len(gaussians):,} Gaussians have an opacity logit of +infinity and "
-        f"{clear:,} of -infinity; they are rendered as opaque and as transparent."
+        "A .splat file cannot mark Gaussians as antialiased: viewers will render them as classic "
+        "ones, which makes small ones too opaque."
     )
 
 
@@ -195,22 +164,21 @@ def detect_splat_format(path: Path) -> str:
     return named
 
 
-def get_writable_format(path: Path) -> Format:
-    """Get the format for the extension of `path`, which must be one that is written."""
+def get_writer(path: Path) -> Callable[[Path, Gaussians], None]:
+    """Get the function that writes the format for the extension of `path`."""
     name = _match_extension(path)
-    if name is None or FORMATS[name].write is None:
+    write = None if name is None else FORMATS[name].write
+    if write is None:
         raise InputError(
             f"{quote_value(path)} cannot be written in the format of its extension; end it in "
             f"{', '.join(f.extensions[0] for f in FORMATS.values() if f.write)}."
         )
-    return FORMATS[name]
+    return write
 
 
 def _match_extension(path: Path) -> str | None:
-    for name, format_ in FORMATS.items():
-        if path.name.lower().endswith(format_.extensions):
-            return name
-    return None
+    endings = {name: format_.extensions for name, format_ in FORMATS.items()}
+    return next((n for n, ends in endings.items() if path.name.lower().endswith(ends)), None)
 
 
 def get_labels_path(path: Path) -> Path:
@@ -238,21 +206,15 @@ def load_labels(path: Path, count: int) -> UInt8[Tensor, "n"]:
     table = read_json(place, "remove it to go on without labels")
     try:
         runs = np.array(table["generated"], dtype=np.int64).reshape(-1, 2)
-        fits = table["sha256"] == _hash_file(path) and _is_complete(runs, count)
-    except (KeyError, TypeError, ValueError, OverflowError) as error:
-        raise InputError(f"{place} holds no labels; remove it to go on without them.") from error
+        in_range = bool(((runs >= 0) & (runs <= [255, count])).all())
+        fits = in_range and runs[:, 1].sum() == count and table["sha256"] == _hash_file(path)
+    except (KeyError, TypeError, ValueError, OverflowError):
+        fits = False
     if not fits:
         raise InputError(
-            f"{place} holds the labels of another state of {path.name}; remove it to go on "
-            "without them."
+            f"{place} does not hold the labels of {path.name}; remove it to go on without them."
         )
     return torch.from_numpy(np.repeat(runs[:, 0].astype(np.uint8), runs[:, 1]))
-
-
-def _is_complete(runs: Int64[ndarray, "m 2"], count: int) -> bool:
-    """Return True if the runs are valid labels of exactly `count` Gaussians."""
-    in_range = ((runs >= 0) & (runs <= [255, count])).all()
-    return bool(in_range) and sum(runs[:, 1].tolist()) == count
 
 
 def _hash_file(path: Path) -> str:

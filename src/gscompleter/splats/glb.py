@@ -20,15 +20,10 @@ from jaxtyping import Float
 from numpy import ndarray
 from torch import Tensor
 
-from gscompleter.errors import InputError, quote_value
+from gscompleter.errors import quote_value
 from gscompleter.geometry import quats_to_rotations
 from gscompleter.io.reading import read_bytes
-from gscompleter.splats.packing import (
-    build_gaussians,
-    check_size,
-    make_damage_error,
-    refuse_invalid,
-)
+from gscompleter.splats.packing import build_gaussians
 from gscompleter.splats.transform import HALF_TURN_Z, rotate_half_turn, transform_gaussians
 from gscompleter.types import Gaussians, merge
 
@@ -51,7 +46,6 @@ MAX_NODE_DEPTH = 100
 class GlbDocument:
     """The JSON and binary parts of a .glb."""
 
-    path: Path
     table: dict[str, Any]
     binary: bytes
 
@@ -63,35 +57,28 @@ def is_glb(head: bytes) -> bool:
 
 def read_glb(path: Path) -> Gaussians:
     """Read all Gaussians of the scene in a .glb, in the axes of a .ply."""
-    document = _parse_document(path, read_bytes(path))
-    with refuse_invalid(path, "JSON part"):
-        placed = list(_find_primitives(document))
-        _check_counts(document, [primitive for primitive, _ in placed])
-        parts = [
-            transform_gaussians(_decode_primitive(document, primitive), place)
-            for primitive, place in placed
-        ]
-    if not parts:
-        raise InputError(f"{quote_value(path)} holds no Gaussians: nothing in it uses {EXTENSION}.")
+    document = _parse_document(read_bytes(path))
+    placed = list(_find_primitives(document))
+    if not placed:
+        raise ValueError(f"nothing in it uses {EXTENSION}")
+    counts = [_get_accessor(document, p, "POSITION")["count"] for p, _ in placed]
+    if sum(counts) * MIN_GAUSSIAN_BYTES > len(document.binary):
+        raise ValueError("it claims more Gaussians than fit into it")
+    parts = [
+        transform_gaussians(_decode_primitive(document, primitive), place)
+        for primitive, place in placed
+    ]
     return rotate_half_turn(merge(parts), HALF_TURN_Z)
 
 
-def _parse_document(path: Path, data: bytes) -> GlbDocument:
+def _parse_document(data: bytes) -> GlbDocument:
     chunks: dict[int, bytes] = {}
     start = 12
-    while start + CHUNK_HEADER.size <= len(data):
+    while start < len(data):
         size, kind = CHUNK_HEADER.unpack_from(data, start)
-        start += CHUNK_HEADER.size
-        check_size(path, len(data), start + size)
-        chunks.setdefault(kind, data[start : start + size])
-        start += size
-    try:
-        table = json.loads(chunks[JSON])
-    except (KeyError, ValueError, RecursionError) as error:
-        raise make_damage_error(path, "it has no description") from error
-    if not isinstance(table, dict):
-        raise make_damage_error(path, "its description is no table")
-    return GlbDocument(path, table, chunks.get(BINARY, b""))
+        start += CHUNK_HEADER.size + size
+        chunks.setdefault(kind, data[start - size : start])
+    return GlbDocument(json.loads(chunks.get(JSON, b"")), chunks.get(BINARY, b""))
 
 
 def _find_primitives(
@@ -105,9 +92,9 @@ def _find_primitives(
     while waiting:
         index, above, depth = waiting.pop(0)
         if depth > MAX_NODE_DEPTH or len(waiting) > len(table["nodes"]):
-            raise make_damage_error(document.path, "its nodes contain each other")
+            raise ValueError("its nodes contain each other")
         node = table["nodes"][index]
-        place = above @ _read_transform(document, node)
+        place = above @ _read_transform(node)
         waiting += [(child, place, depth + 1) for child in node.get("children", ())]
         if "mesh" in node:
             for primitive in table["meshes"][node["mesh"]]["primitives"]:
@@ -115,7 +102,7 @@ def _find_primitives(
                     yield primitive, place.float()
 
 
-def _read_transform(document: GlbDocument, node: dict[str, Any]) -> Float[Tensor, "4 4"]:
+def _read_transform(node: dict[str, Any]) -> Float[Tensor, "4 4"]:
     """Read the transform of a node; only similarities are accepted."""
     if "matrix" in node:
         place = torch.tensor(node["matrix"], dtype=torch.float64).reshape(4, 4).T
@@ -129,49 +116,30 @@ def _read_transform(document: GlbDocument, node: dict[str, Any]) -> Float[Tensor
     volume = float(torch.linalg.det(linear))
     shape = linear @ linear.T / max(volume, 1e-30) ** (2 / 3)
     if not volume > 0 or not torch.allclose(shape, torch.eye(3).double(), atol=1e-3):
-        raise InputError(
-            f"{document.path} mirrors or stretches its Gaussians unevenly by a node; apply the "
-            "transform in the program that wrote it."
-        )
+        raise ValueError("one of its nodes mirrors or stretches Gaussians unevenly")
     return place
 
 
-def _check_counts(document: GlbDocument, primitives: list[dict[str, Any]]) -> None:
-    accessors = [
-        document.table["accessors"][primitive["attributes"]["POSITION"]] for primitive in primitives
-    ]
-    if sum(int(a["count"]) for a in accessors) * MIN_GAUSSIAN_BYTES > len(document.binary):
-        raise make_damage_error(document.path, "it claims more Gaussians than fit into it")
+def _get_accessor(document: GlbDocument, primitive: dict[str, Any], name: str) -> dict[str, Any]:
+    return document.table["accessors"][primitive["attributes"][name]]
 
 
 def _decode_primitive(document: GlbDocument, primitive: dict[str, Any]) -> Gaussians:
     """Decode the Gaussians of a primitive, in the frame of its node."""
-    extension, attributes = primitive["extensions"][EXTENSION], primitive["attributes"]
+    extension = primitive["extensions"][EXTENSION]
     packed = ", ".join({**extension.get("extensions", {}), **primitive["extensions"]})
-    kernel = extension.get("kernel", "ellipse")
-    colours = extension.get("colorSpace", COLOR_SPACE)
-    if (packed, kernel, colours) != (EXTENSION, "ellipse", COLOR_SPACE):
-        raise InputError(
-            f"{document.path} stores Gaussians in an unknown way ({quote_value(packed)}, "
-            f"{quote_value(kernel)}, {quote_value(colours)}); export it as .ply."
-        )
-    count = document.table["accessors"][attributes["POSITION"]]["count"]
+    stored = (packed, extension.get("kernel", "ellipse"), extension.get("colorSpace", COLOR_SPACE))
+    if stored != (EXTENSION, "ellipse", COLOR_SPACE):
+        raise ValueError(f"it stores Gaussians in an unknown way, {quote_value(stored)}")
 
     def read_attribute(name: str, kind: str = "VEC3") -> Float[ndarray, "n k"]:
-        if name not in attributes:
-            raise InputError(f"{document.path} lacks the attribute {name} of its Gaussians.")
-        accessor = document.table["accessors"][attributes[name]]
-        if (accessor["type"], accessor["count"]) != (kind, count):
-            defect = f"its attribute {name} has another size than it must have"
-            raise make_damage_error(document.path, defect)
+        accessor = _get_accessor(document, primitive, name)
+        if accessor["type"] != kind:
+            raise ValueError(f"its attribute {name} is no {kind}")
         return _read_accessor(document, accessor)
 
-    degree = max(d for d in range(4) if d == 0 or f"{EXTENSION}:SH_DEGREE_{d}_COEF_0" in attributes)
-    sh = [
-        read_attribute(f"{EXTENSION}:SH_DEGREE_{d}_COEF_{i}")
-        for d in range(degree + 1)
-        for i in range(2 * d + 1)
-    ]
+    sh_names = [f"{EXTENSION}:SH_DEGREE_{d}_COEF_{i}" for d in range(4) for i in range(2 * d + 1)]
+    sh = [read_attribute(name) for name in sh_names if name in primitive["attributes"]]
     return build_gaussians(
         read_attribute("POSITION"),
         np.roll(read_attribute(f"{EXTENSION}:ROTATION", "VEC4"), 1, axis=1),
@@ -183,25 +151,19 @@ def _decode_primitive(document: GlbDocument, primitive: dict[str, Any]) -> Gauss
 
 def _read_accessor(document: GlbDocument, accessor: dict[str, Any]) -> Float[ndarray, "n k"]:
     """Read the numbers of an accessor from the binary part; integers may stand for fractions."""
-    if "sparse" in accessor or "bufferView" not in accessor:
-        raise InputError(f"{document.path} holds sparse attributes; export it as .ply.")
-    view = document.table["bufferViews"][accessor["bufferView"]]
+    view = {} if "sparse" in accessor else document.table["bufferViews"][accessor["bufferView"]]
     if view.get("buffer") != 0 or view.get("extensions"):
-        raise InputError(
-            f"{document.path} holds its Gaussians compressed or in another file; export it as .ply."
-        )
+        raise ValueError("it holds its Gaussians sparse, compressed or in another file")
     kind = np.dtype(COMPONENT_TYPES[accessor["componentType"]])
     width = NUM_COMPONENTS[accessor["type"]]
     start = int(view.get("byteOffset", 0)) + int(accessor.get("byteOffset", 0))
     stride = int(view.get("byteStride", 0)) or width * kind.itemsize
     shape = (int(accessor["count"]), width)
-    if stride < width * kind.itemsize:
-        raise make_damage_error(document.path, "its attributes overlap")
     # numpy refuses views that exceed the buffer.
     values = np.ndarray(shape, kind, document.binary, start, (stride, kind.itemsize))
     if kind.kind == "f":
         return values.astype(np.float32)
     if not accessor.get("normalized") and width != 3:
-        raise make_damage_error(document.path, "its rotations or opacities are no fractions")
+        raise ValueError("its rotations or opacities are no fractions")
     largest = np.iinfo(kind).max if accessor.get("normalized") else 1
     return np.maximum(values.astype(np.float32) / largest, -1 if largest > 1 else -np.inf)

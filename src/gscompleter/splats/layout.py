@@ -1,4 +1,4 @@
-"""A .ply with the layout of its writer: header, extra columns and property order.
+"""Splats in the layout of their own .ply: header, foreign columns and property order.
 
 An input splat is completed in its own file: its rows stay byte for byte, `uchar generated` is
 appended to them, and new rows follow. Removing both restores the input file.
@@ -7,9 +7,8 @@ appended to them, and new rows follow. Removing both restores the input file.
 from __future__ import annotations
 
 import re
-from collections.abc import Iterable
-from dataclasses import dataclass, replace
-from itertools import chain
+from collections.abc import Iterator
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -18,112 +17,45 @@ from numpy import ndarray
 from numpy.lib.recfunctions import require_fields
 from torch import Tensor
 
-from gscompleter.io.files import replace_file
+from gscompleter.splats.formats import detect_splat_format
 from gscompleter.splats.ply import (
+    MEANS,
+    count_rest,
     iterate_blocks,
-    make_header,
     make_rows,
-    read_header,
+    read_columns,
+    read_scene,
     save_ply,
 )
+from gscompleter.splats.ply_file import PlyFile, write_ply_file
 from gscompleter.types import Gaussians, merge
 
 LABEL_COLUMN = "generated"
-_COUNT_LINE = re.compile(rb"^(element\s+vertex\s+)\d+", re.M)
 _LABEL_LINE = re.compile(rb"^property\s+\w+\s+generated\s*?\n", re.M)
+_ELEMENT_LINE = re.compile(rb"^(?:element|end_header)", re.M)
 
 
-@dataclass(frozen=True)
-class PlyLayout:
-    """A binary .ply whose first element contains Gaussians."""
-
-    header: bytes
-    """Everything up to and including `end_header`."""
-    rows: ndarray
-    """One structured row per Gaussian, [n]."""
-    trailer: bytes = b""
-    """Everything after the last row."""
-
-    @property
-    def is_labelled(self) -> bool:
-        """True if there is a column `generated`."""
-        return LABEL_COLUMN in (self.rows.dtype.names or ())
-
-    @property
-    def num_rest(self) -> int:
-        """Number of properties for SH of degree 1 and above."""
-        return sum(name.startswith("f_rest_") for name in self.rows.dtype.names or ())
-
-    def split_header(self) -> tuple[list[bytes], list[bytes]]:
-        """Split the header into lines before and after the end of the vertex element."""
-        lines = self.header.splitlines(keepends=True)
-        starts = [i for i, line in enumerate(lines) if line.startswith((b"element", b"end_header"))]
-        return lines[: starts[1]], lines[starts[1] :]
+def find_layout(path: Path | None) -> PlyFile | None:
+    """Read the layout of the file of a splat, or None if it is no binary .ply."""
+    if path is None or detect_splat_format(path) != "ply":
+        return None
+    layout = read_scene(path)
+    return None if layout.is_ascii else layout
 
 
-def read_layout(path: Path) -> PlyLayout | None:
-    """Read the layout of a .ply, or None if it is ASCII or begins with another element."""
-    with path.open("rb") as file:
-        file_format, (vertex, *_) = read_header(file, path)
-        if file_format == "ascii" or vertex.name != "vertex":
-            return None
-        size = file.tell()
-        file.seek(0)
-        header = file.read(size)
-        byte_order = "<" if file_format == "binary_little_endian" else ">"
-        rows = np.memmap(file, vertex.dtype(byte_order), "r", size, vertex.count)
-        file.seek(size + rows.nbytes)
-        return PlyLayout(header, rows, file.read())
+def split_header(header: bytes) -> tuple[bytes, bytes, bytes]:
+    """Split a header into the lines of the first element, those of others, and its end."""
+    starts = [line.start() for line in _ELEMENT_LINE.finditer(header)]
+    return header[: starts[1]], header[starts[1] : starts[-1]], header[starts[-1] :]
 
 
-def find_layout(given: Path | None) -> PlyLayout | None:
-    """Read the layout of the file of a scene, or None if it is no binary .ply."""
-    is_ply = given is not None and given.name.lower().endswith(".ply")
-    return read_layout(given) if given is not None and is_ply else None
-
-
-def make_layout(gaussians: Gaussians) -> PlyLayout:
-    """Make the standard layout, with `generated` if anything was generated."""
-    rows = make_rows(gaussians, bool((gaussians.generated > 0).any()))
-    header = make_header({"vertex": (len(rows), rows.dtype)}, gaussians.is_antialiased)
-    return PlyLayout(header, rows)
-
-
-def write_layout(path: Path, layout: PlyLayout) -> None:
-    """Write a .ply, with the number of its rows in the header."""
-    write_rows(path, layout, len(layout.rows), [layout.rows])
-
-
-def write_rows(path: Path, layout: PlyLayout, count: int, rows: Iterable[ndarray]) -> None:
-    """Write a .ply with other `rows` of the same type, `count` in total, block by block."""
-    with replace_file(path) as file:
-        file.write(_COUNT_LINE.sub(rb"\g<1>" + str(count).encode(), layout.header, count=1))
-        for part in rows:
-            file.write(part.view(np.uint8).data)
-        file.write(layout.trailer)
-
-
-def drop_generated(layout: PlyLayout) -> PlyLayout:
+def drop_generated(layout: PlyFile) -> PlyFile:
     """Remove the generated rows and the column `generated`."""
-    if not layout.is_labelled:
+    if LABEL_COLUMN not in (layout.rows.dtype.names or ()):
         return layout
     dtype = [column for column in layout.rows.dtype.descr if column[0] != LABEL_COLUMN]
     rows = require_fields(layout.rows[layout.rows[LABEL_COLUMN] == 0], dtype)
     return replace(layout, header=_LABEL_LINE.sub(b"", layout.header), rows=rows)
-
-
-def insert_rows(
-    layout: PlyLayout, others: PlyLayout, row_numbers: Int[Tensor, "m"]
-) -> PlyLayout | None:
-    """Insert the rows of `others` at the indices `row_numbers`; None if their columns differ."""
-    if others.rows.dtype != layout.rows.dtype:
-        return None
-    total = len(layout.rows) + len(others.rows)
-    taken = np.zeros(total, bool)
-    taken[row_numbers.numpy()] = True
-    rows = np.empty(total, layout.rows.dtype)
-    rows[taken], rows[~taken] = others.rows, layout.rows
-    return replace(layout, rows=rows)
 
 
 def save_like(
@@ -141,53 +73,43 @@ def save_like(
     """
     context, layout = context.to("cpu"), find_layout(given)
     added = merge([context[:0], added.to("cpu")])
-    numbers = _match_rows(context, layout, kept) if layout and _can_hold(layout, added) else None
+    numbers = None if layout is None else _match_rows(layout, context, added, kept)
     if layout is None or numbers is None:
         save_ply(path, merge([context, added]), provenance=True)
         return
-    label = [] if layout.is_labelled else [(LABEL_COLUMN, "u1")]
+    header, label = _add_label_line(layout.header), [(LABEL_COLUMN, "u1")]
+    if LABEL_COLUMN in (layout.rows.dtype.names or ()):
+        header, label = layout.header, []
     dtype = np.dtype([*layout.rows.dtype.descr, *label])
 
-    def labelled(values: ndarray, labels: UInt8[Tensor, "m"]) -> ndarray:
+    def write_labels(values: ndarray, labels: UInt8[Tensor, "m"]) -> ndarray:
         rows = require_fields(values, dtype)
         rows[LABEL_COLUMN] = labels.numpy()
         return rows
 
-    given_rows = (
-        labelled(layout.rows[numbers[block]], context.generated[block])
-        for block in iterate_blocks(len(context))
-    )
-    added_rows = labelled(make_rows(added, provenance=False), added.generated)
-    header = layout.header if layout.is_labelled else _add_label_line(layout)
-    count = len(context) + len(added)
-    write_rows(path, replace(layout, header=header), count, chain(given_rows, [added_rows]))
+    def generate_blocks() -> Iterator[ndarray]:
+        for block in iterate_blocks(len(context)):
+            yield write_labels(layout.rows[numbers[block]], context.generated[block])
+        yield write_labels(make_rows(added, provenance=False), added.generated)
 
-
-def _can_hold(layout: PlyLayout, scene: Gaussians) -> bool:
-    labels = not layout.is_labelled or layout.rows.dtype[LABEL_COLUMN] == np.uint8
-    return labels and layout.num_rest == 3 * (scene.sh.shape[1] - 1)
+    write_ply_file(path, header, len(context) + len(added), generate_blocks(), layout.trailer)
 
 
 def _match_rows(
-    context: Gaussians, layout: PlyLayout, kept: Bool[Tensor, "n"] | None
+    layout: PlyFile, context: Gaussians, added: Gaussians, kept: Bool[Tensor, "n"] | None
 ) -> Int[ndarray, "m"] | None:
-    """Find the rows of a file that its context was read from, or None if positions differ."""
-    numbers = np.arange(len(layout.rows)) if kept is None else np.flatnonzero(kept.numpy())
-    if len(numbers) != len(context):
+    """Find the rows of a file that its context was read from, or None if `added` do not fit in."""
+    names = layout.rows.dtype.names or ()
+    if LABEL_COLUMN in names and layout.rows.dtype[LABEL_COLUMN] != np.uint8:
         return None
-    means = context.means.numpy()
-    stands = all(
-        np.array_equal(layout.rows[axis][numbers[block]].astype(np.float32), means[block, column])
-        for block in iterate_blocks(len(numbers))
-        for column, axis in enumerate("xyz")
-    )
-    return numbers if stands else None
+    numbers = np.arange(len(layout.rows)) if kept is None else np.flatnonzero(kept.numpy())
+    means = read_columns(layout.rows, MEANS)[numbers]
+    fits = count_rest(layout) == 3 * (added.sh.shape[1] - 1)
+    return numbers if fits and np.array_equal(means, context.means.numpy()) else None
 
 
-def _add_label_line(layout: PlyLayout) -> bytes:
-    """Add a line for `generated` after the last vertex property of the header."""
-    lines, after = layout.split_header()
-    last = max(i for i, line in enumerate(lines) if line.startswith(b"property"))
-    ending = b"\r\n" if lines[last].endswith(b"\r\n") else b"\n"
-    lines.insert(last + 1, b"property uchar generated" + ending)
-    return b"".join(lines + after)
+def _add_label_line(header: bytes) -> bytes:
+    """Add a line for `generated` at the end of the first element."""
+    first, others, end = split_header(header)
+    ending = b"\r\n" if end.endswith(b"\r\n") else b"\n"
+    return b"".join([first, b"property uchar generated", ending, others, end])

@@ -18,6 +18,8 @@ NUM_SH_REST = (0, 3, 8, 15)
 """SH coefficients per channel above degree 0, by degree."""
 MIN_ALLOWED_BYTES = 1 << 20
 """Unpacked size in bytes that is allowed for any file, however small."""
+MAX_DEFECT = 120
+"""Most characters of the description of a defect."""
 MAX_GROWTH = 256
 """Largest ratio of unpacked to packed size. Real files reach 2, real images 10."""
 
@@ -67,38 +69,28 @@ def drop_largest(
     return largest, np.take_along_axis(unit, places, axis=1)
 
 
-def check_growth(path: Path, unpacked: int, packed: int, max_growth: int = MAX_GROWTH) -> None:
-    """Raise InputError if a file claims to unpack to over `max_growth` times its size in bytes."""
+def check_growth(unpacked: int, packed: int, max_growth: int = MAX_GROWTH) -> None:
+    """Raise ValueError if data claim to unpack to over `max_growth` times their size in bytes."""
     if unpacked > MIN_ALLOWED_BYTES + max_growth * packed:
-        raise InputError(
-            f"{quote_value(path)} is damaged: its {packed:,} bytes claim to hold {unpacked:,}; "
-            "fetch the file again."
-        )
-
-
-def check_size(path: Path, found: int, needed: int) -> None:
-    """Raise InputError if a file has fewer bytes than needed."""
-    if found < needed:
-        raise InputError(
-            f"{quote_value(path)} is truncated: {found:,} of {needed:,} bytes are there; fetch or "
-            "write the file again."
-        )
-
-
-def make_damage_error(path: Path, defect: str) -> InputError:
-    """Make the error for a file that contradicts itself."""
-    return InputError(f"{quote_value(path)} is damaged: {defect}; fetch or write the file again.")
+        raise ValueError(f"its {packed:,} bytes claim to hold {quote_value(f'{unpacked:,}')}")
 
 
 @contextmanager
-def refuse_invalid(path: Path, part: str) -> Iterator[None]:
-    """Raise InputError for what goes wrong while values of JSON, in `part` of a file, are read."""
+def refuse_damage(path: Path) -> Iterator[None]:
+    """Raise InputError for whatever goes wrong while the contents of a file are decoded.
+
+    Readers raise ValueError for what they find wrong. Damaged bytes fail in many further ways, in
+    numpy, zlib, zipfile, Pillow and others.
+    """
     try:
         yield
     except InputError:
         raise
-    except (LookupError, TypeError, ValueError, OverflowError, AttributeError, RecursionError) as e:
-        raise make_damage_error(path, f"its {part} is invalid ({quote_value(str(e))})") from e
+    except Exception as error:
+        raise InputError(
+            f"{quote_value(path)} cannot be read: {quote_value(str(error), MAX_DEFECT)}; fetch the "
+            "file again, or export it as .ply."
+        ) from error
 
 
 def build_gaussians(
@@ -110,6 +102,8 @@ def build_gaussians(
 ) -> Gaussians:
     """Build observed Gaussians (`generated` is 0) from arrays, as float32."""
     arrays = (means, quats, scales, opacities, sh)
+    if len({len(array) for array in arrays}) > 1 or sh.shape[1] - 1 not in NUM_SH_REST:
+        raise ValueError("its Gaussians do not all have the same properties")
     return make_observed(
         *(torch.from_numpy(np.require(array, np.float32, ["C", "W"])) for array in arrays)
     )

@@ -10,7 +10,6 @@ from pathlib import Path
 
 import numpy as np
 
-from gscompleter.errors import InputError, quote_value
 from gscompleter.io.files import replace_file
 from gscompleter.io.reading import read_bytes
 from gscompleter.splats.packing import assemble_sh, build_gaussians
@@ -21,13 +20,7 @@ ROW = np.dtype([("mean", "<f4", 3), ("scale", "<f4", 3), ("rgba", "u1", 4), ("qu
 
 def read_splat(path: Path) -> Gaussians:
     """Read a .splat."""
-    data = read_bytes(path)
-    if len(data) % ROW.itemsize:
-        raise InputError(
-            f"{quote_value(path)} is truncated or no .splat: its {len(data):,} bytes are no "
-            f"multiple of {ROW.itemsize}; fetch the file again."
-        )
-    rows = np.frombuffer(data, ROW)
+    rows = np.frombuffer(read_bytes(path), ROW)
     rgba = rows["rgba"].astype(np.float32) / 255
     quats = (rows["quat"].astype(np.float32) - 128) / 128
     return build_gaussians(rows["mean"], quats, rows["scale"], rgba[:, 3], assemble_sh(rgba[:, :3]))

@@ -9,9 +9,10 @@ zstd stream per attribute. Axes are x right, y up, z back.
 from __future__ import annotations
 
 import gzip
+import io
 import struct
-import zlib
 from dataclasses import replace
+from itertools import pairwise
 from pathlib import Path
 from typing import NamedTuple
 
@@ -27,9 +28,7 @@ from gscompleter.splats.packing import (
     assemble_sh,
     build_gaussians,
     check_growth,
-    check_size,
     drop_largest,
-    make_damage_error,
     pack_fractions,
     restore_largest,
     unpack_fractions,
@@ -42,8 +41,6 @@ MAGIC = b"NGSP"
 GZIP = b"\x1f\x8b"
 HEADER = struct.Struct("<4sIIBBBB")
 """Magic, version, count, SH degree, fractional bits, flags, and the number of streams."""
-TABLE_OFFSET = struct.Struct("<I12x")
-"""In version 4, the offset of the table of stream sizes follows."""
 ANTIALIASED_FLAG = 0x1
 """Flag of antialiased Gaussians."""
 MAX_WINDOW = 1 << 27
@@ -68,11 +65,14 @@ class SpzHeader(NamedTuple):
     num_streams: int
 
     @property
+    def widths(self) -> list[int]:
+        """Bytes of position, opacity, colour, scale, rotation and SH of a Gaussian."""
+        return [9, 1, 3, 3, 3 if self.version == 2 else 4, 3 * NUM_SH_REST[self.degree]]
+
+    @property
     def stream_sizes(self) -> list[int]:
-        """Bytes of positions, opacities, colours, scales, rotations and SH."""
-        rotation = 3 if self.version == 2 else 4
-        widths = [9, 1, 3, 3, rotation, 3 * NUM_SH_REST[self.degree]]
-        return [width * self.num_gaussians for width in widths]
+        """Bytes of all positions, opacities, colours, scales, rotations and SH."""
+        return [width * self.num_gaussians for width in self.widths]
 
 
 def is_spz(head: bytes) -> bool:
@@ -84,100 +84,61 @@ def read_spz(path: Path) -> Gaussians:
     """Read a .spz of SH degree 0 to 3, in the axes of a .ply."""
     data = read_bytes(path)
     if data.startswith(GZIP):
-        header, streams = _read_gzip(path, data)
-    else:
-        header = _parse_header(path, data)
-        if header.version < 4:
-            streams = _split_streams(path, header, data[HEADER.size :])
-        else:
-            streams = _read_zstd(path, header, data)
+        data = _unpack_gzip(data)
+    header = _parse_header(data)
+    streams = _split_streams(header, data) if header.version < 4 else _read_zstd(header, data)
     turned = rotate_half_turn(_decode_streams(header, streams), HALF_TURN_X)
     return replace(turned, is_antialiased=bool(header.flags & ANTIALIASED_FLAG))
 
 
-def _parse_header(path: Path, data: bytes) -> SpzHeader:
-    check_size(path, len(data), HEADER.size)
+def _parse_header(data: bytes) -> SpzHeader:
     header = SpzHeader(*HEADER.unpack_from(data))
     if header.magic != MAGIC:
-        raise InputError(f"{quote_value(path)} is no .spz but other compressed data.")
-    if header.version not in (2, 3, 4):
-        raise InputError(
-            f"{quote_value(path)} is .spz version {header.version}; versions 2, 3 and 4 are known."
-        )
-    if header.num_gaussians == 0:
-        raise InputError(f"{quote_value(path)} is empty: it holds no Gaussian.")
-    if header.degree >= len(NUM_SH_REST) or header.fractional_bits > 24:
-        raise InputError(
-            f"{quote_value(path)} has harmonics of degree {header.degree} and "
-            f"{header.fractional_bits} fractional bits; a .spz of degree 0 to 3 and at most 24 "
-            "bits is needed."
+        raise ValueError("it is no .spz but other data")
+    if header.version not in (2, 3, 4) or header.degree > 3:
+        raise ValueError(
+            f"it is .spz version {header.version} of SH degree {header.degree}, and 2 to 4 of "
+            "degree 0 to 3 are known"
         )
     return header
 
 
-def _read_gzip(path: Path, data: bytes) -> tuple[SpzHeader, list[bytes]]:
-    unpacker = zlib.decompressobj(31)
-    try:
-        header = _parse_header(path, unpacker.decompress(data, HEADER.size))
-        if header.version > 3:
-            raise make_damage_error(path, f"version {header.version} is no gzip stream")
-        size = sum(header.stream_sizes)
-        check_growth(path, size, len(data))
-        body = unpacker.decompress(unpacker.unconsumed_tail, size)
-        more = unpacker.decompress(unpacker.unconsumed_tail, 1)  # reads the checksum
-    except zlib.error as error:
-        raise make_damage_error(path, "it cannot be unpacked") from error
-    if not (more or unpacker.eof):
-        raise make_damage_error(path, "it ends too early")
-    return header, _split_streams(path, header, body)
+def _unpack_gzip(data: bytes) -> bytes:
+    with gzip.GzipFile(fileobj=io.BytesIO(data)) as file:
+        start = file.read(HEADER.size)
+        size = sum(_parse_header(start).stream_sizes)
+        check_growth(size, len(data))
+        body = file.read(size)
+        file.read(1)  # compares the checksum
+    return start + body
 
 
-def _split_streams(path: Path, header: SpzHeader, body: bytes) -> list[bytes]:
-    check_size(path, len(body), sum(header.stream_sizes))
-    ends = np.cumsum(header.stream_sizes).tolist()
-    return [body[end - size : end] for end, size in zip(ends, header.stream_sizes, strict=True)]
+def _split_streams(header: SpzHeader, data: bytes) -> list[bytes]:
+    ends = np.cumsum([HEADER.size, *header.stream_sizes]).tolist()
+    return [data[start:end] for start, end in pairwise(ends)]
 
 
-def _read_zstd(path: Path, header: SpzHeader, data: bytes) -> list[bytes]:
-    """Decompress the attributes of version 4, each from its own stream."""
-    check_size(path, len(data), HEADER.size + TABLE_OFFSET.size)
-    (place,) = TABLE_OFFSET.unpack_from(data, HEADER.size)
-    start = place + 16 * header.num_streams
-    check_size(path, len(data), start)
-    check_growth(path, sum(header.stream_sizes), len(data))
-    needed = 6 if header.degree else 5
-    if header.num_streams < needed:
-        raise make_damage_error(path, f"{header.num_streams} of {needed} attributes are there")
-    streams = []
-    for number, size in enumerate(header.stream_sizes[:needed]):
-        packed, unpacked = struct.unpack_from("<QQ", data, place + 16 * number)
-        check_size(path, len(data), start + packed)
-        if unpacked != size:
-            raise make_damage_error(
-                path, "the sizes of its attributes do not fit the count of Gaussians"
-            )
-        streams.append(_decompress(path, data[start : start + packed], size))
-        start += packed
-    return [*streams, b""][:6]
-
-
-def _decompress(path: Path, data: bytes, size: int) -> bytes:
+def _read_zstd(header: SpzHeader, data: bytes) -> list[bytes]:
+    """Decompress the attributes of version 4, each from its own stream; SH may be absent."""
     import zstandard  # only version 4 needs it
 
-    unpacker = zstandard.ZstdDecompressor(max_window_size=MAX_WINDOW)
-    try:
-        body = unpacker.stream_reader(data).read(size)
-    except (zstandard.ZstdError, MemoryError) as error:
-        raise make_damage_error(path, "it cannot be unpacked") from error
-    check_size(path, len(body), size)
-    return body
+    check_growth(sum(header.stream_sizes), len(data))
+    (place,) = struct.unpack_from("<I", data, HEADER.size)
+    table = np.frombuffer(data, "<u8", 2 * header.num_streams, place).reshape(-1, 2)
+    start, streams = place + table.nbytes, []
+    for packed, size in zip(table[:, 0].tolist(), header.stream_sizes, strict=False):
+        unpacker = zstandard.ZstdDecompressor(max_window_size=MAX_WINDOW)
+        streams.append(unpacker.stream_reader(data[start : start + packed]).read(size))
+        start += packed
+    return [*streams, b""][: len(header.stream_sizes)]
 
 
 def _decode_streams(header: SpzHeader, streams: list[bytes]) -> Gaussians:
     """Decode the Gaussians, in the axes of the file."""
     n = header.num_gaussians
     positions, opacities, colours, scales, rotations, rest = (
-        np.frombuffer(stream, np.uint8).reshape(n, len(stream) // n) for stream in streams
+        np.frombuffer(stream, np.uint8).reshape(n, width)
+        for stream, width in zip(streams, header.widths, strict=True)
     )
     colour = 0.5 + SH_C0 * (colours.astype(np.float32) / 255 - 0.5) / COLOR_SCALE
     higher = rest.astype(np.float32)

@@ -15,22 +15,18 @@ from jaxtyping import Bool, Int
 from torch import Tensor
 
 from gscompleter.errors import InputError, quote_value
-from gscompleter.splats.formats import (
-    detect_splat_format,
-    get_writable_format,
-    load_splat,
-    save_splat,
+from gscompleter.splats.formats import get_writer, load_splat, save_splat
+from gscompleter.splats.layout import drop_generated, find_layout, split_header
+from gscompleter.splats.ply import (
+    count_rest,
+    decode_gaussians,
+    make_rows,
+    make_scene_header,
+    read_scene,
+    require_finite,
+    save_ply,
 )
-from gscompleter.splats.layout import (
-    PlyLayout,
-    drop_generated,
-    find_layout,
-    insert_rows,
-    make_layout,
-    read_layout,
-    write_layout,
-)
-from gscompleter.splats.ply import load_ply, read_header, save_ply
+from gscompleter.splats.ply_file import PlyFile, write_ply_file
 from gscompleter.types import Gaussians, merge
 
 REMOVED_FILE = "removed.ply"
@@ -46,28 +42,23 @@ def strip(path: Path, out: Path) -> tuple[int, int]:
     Raises:
         InputError: All Gaussians are generated, or a file cannot be read or written.
     """
-    completed = load_splat(path)
-    given = restore_input(completed, path)
-    layout = restore_layout(path, given)
-    if layout is not None and get_writable_format(out).write is save_ply:
-        write_layout(out, layout)
-    else:
-        save_splat(out, given)
-    return len(given), int((completed.generated > 0).sum())
-
-
-def restore_input(completed: Gaussians, path: Path) -> Gaussians:
-    """Restore the input Gaussians of the completed scene at `path`, in their order."""
+    completed, layout = load_splat(path), find_layout(path)
     given = drop_sh_padding(completed)
-    place = path.parent / REMOVED_FILE
-    if place.is_file():
-        given = reinsert(given, *load_removed(place), place)
+    layout = None if layout is None else drop_generated(layout)
+    removed = path.parent / REMOVED_FILE
+    if removed.is_file():
+        given, layout = reinsert(given, layout, removed)
     if len(given) == 0:
         raise InputError(
             f"{quote_value(path)} holds only generated Gaussians: there is no input scene to "
             "restore."
         )
-    return given
+    is_padded = layout is None or count_rest(layout) != 3 * (given.sh.shape[1] - 1)
+    if layout is None or is_padded or get_writer(out) is not save_ply:
+        save_splat(out, given)
+    else:
+        write_ply_file(out, layout.header, len(layout.rows), [layout.rows], layout.trailer)
+    return len(given), int((completed.generated > 0).sum())
 
 
 def drop_sh_padding(completed: Gaussians) -> Gaussians:
@@ -80,20 +71,6 @@ def drop_sh_padding(completed: Gaussians) -> Gaussians:
             break
         k = lower
     return replace(observed, sh=observed.sh[:, :k].contiguous())
-
-
-def restore_layout(path: Path, given: Gaussians) -> PlyLayout | None:
-    """Remove what completing added to the .ply at `path`; None if its rows cannot be restored."""
-    layout = read_layout(path) if detect_splat_format(path) == "ply" else None
-    if layout is None or layout.num_rest != 3 * (given.sh.shape[1] - 1):
-        return None
-    layout, place = drop_generated(layout), path.parent / REMOVED_FILE
-    if not place.is_file():
-        return layout
-    others = read_layout(place)
-    if others is None:
-        return None
-    return insert_rows(layout, drop_generated(others), load_removed(place)[1])
 
 
 def save_removed(
@@ -110,52 +87,39 @@ def save_removed(
     """
     layout = find_layout(given)
     if layout is None:
-        layout = make_layout(removed.to("cpu"))
+        has_labels = bool((removed.generated > 0).any())
+        header, values = make_scene_header(removed, has_labels), make_rows(removed, has_labels)
     else:
-        all_rows = layout.rows if kept is None else layout.rows[kept.numpy()]
-        layout = replace(layout, rows=all_rows[rows.numpy()])
-    head, after = layout.split_header()
+        held = layout.rows if kept is None else layout.rows[kept.numpy()]
+        header, values = layout.header, held[rows.numpy()]
+    first, _, end = split_header(header)
     place = f"element place {len(rows)}\nproperty uint row\n".encode()
-    header = b"".join([*head, place, after[-1]])
-    trailer = rows.numpy().astype("<u4").tobytes()
-    write_layout(path, replace(layout, header=header, trailer=trailer))
+    trailer = rows.numpy().astype("<u4")
+    write_ply_file(path, b"".join([first, place, end]), len(values), [values], trailer)
 
 
-def load_removed(path: Path) -> tuple[Gaussians, Int[Tensor, "n"]]:
-    """Load replaced originals and their row numbers in the input scene."""
-    removed = load_ply(path)
-    with path.open("rb") as file:
-        _, (vertex, *others) = read_header(file, path)
-        layout = [(e.name, e.count, [(p.name, p.kind) for p in e.properties]) for e in others]
-        if layout != [("place", len(removed), [("row", "u4")])]:
-            raise InputError(
-                f"{quote_value(path)} does not say where its Gaussians belong in the scene; "
-                "without it they cannot be put back in order."
-            )
-        file.seek(vertex.count * vertex.dtype("<").itemsize, 1)
-        rows = np.frombuffer(file.read(), "<u4")
-    if len(rows) != len(removed) or (np.diff(rows.astype(np.int64)) <= 0).any():
+def reinsert(
+    kept: Gaussians, layout: PlyFile | None, path: Path
+) -> tuple[Gaussians, PlyFile | None]:
+    """Insert the replaced originals of the file `path` at their rows; None if columns differ."""
+    source = read_scene(path)
+    removed = require_finite(decode_gaussians(source), path, drop_nonfinite=False)
+    total, rows = len(kept) + len(removed), np.zeros(0, np.int64)
+    if b"element place " in source.header and len(source.trailer) == 4 * len(removed):
+        rows = source.trailer.view("<u4").astype(np.int64)
+    is_ordered = len(rows) > 0 and bool((np.diff(rows, append=total) > 0).all())
+    if not is_ordered or kept.is_antialiased != removed.is_antialiased:
         raise InputError(
-            f"{quote_value(path)} is damaged: its rows do not ascend; fetch the file again."
+            f"{quote_value(path)} does not say where its Gaussians belong in the scene beside it; "
+            "fetch both files again."
         )
-    return removed, torch.from_numpy(rows.astype(np.int64))
-
-
-def reinsert(kept: Gaussians, removed: Gaussians, rows: Int[Tensor, "n"], path: Path) -> Gaussians:
-    """Insert replaced originals at their rows; `path` names their file in errors."""
-    total = len(kept) + len(removed)
-    if len(rows) and int(rows.max()) >= total:
-        raise InputError(
-            f"{quote_value(path)} belongs to another scene: it names row {int(rows.max()):,} of "
-            f"one that has {total:,} Gaussians."
-        )
-    if kept.is_antialiased != removed.is_antialiased:
-        raise InputError(
-            f"{quote_value(path)} belongs to another scene: only one of the two is antialiased."
-        )
-    taken: Bool[Tensor, "n"] = torch.zeros(total, dtype=torch.bool)
-    taken[rows] = True
+    taken = torch.zeros(total, dtype=torch.bool)
+    taken[torch.from_numpy(rows)] = True
     order = torch.empty(total, dtype=torch.int64)
     order[~taken] = torch.arange(len(kept))
     order[taken] = torch.arange(len(kept), total)
-    return merge([kept, removed])[order]
+    restored, others = merge([kept, removed])[order], drop_generated(source).rows
+    if layout is None or others.dtype != layout.rows.dtype or len(others) != len(removed):
+        return restored, None
+    joined = np.concatenate([layout.rows, others], dtype=others.dtype)
+    return restored, replace(layout, rows=joined[order.numpy()])

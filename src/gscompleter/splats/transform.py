@@ -12,6 +12,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
+from gscompleter.geometry import multiply_quats, rotations_to_quats
 from gscompleter.render.spherical_harmonics import evaluate_sh_basis
 from gscompleter.types import Gaussians
 
@@ -47,7 +48,7 @@ def transform_gaussians(gaussians: Gaussians, similarity: Float[Tensor, "4 4"]) 
     return replace(
         gaussians,
         means=gaussians.means @ similarity[:3, :3].T + similarity[:3, 3],
-        quats=_multiply_quats(_matrix_to_quat(rotation), gaussians.quats),
+        quats=multiply_quats(rotations_to_quats(rotation), gaussians.quats),
         scales=gaussians.scales * scale,
         sh=_rotate_sh(gaussians.sh, rotation),
         encoded=None,
@@ -68,27 +69,3 @@ def _rotate_sh(
     # Rounded, since the last bits of the solution differ from call to call.
     matrix = torch.linalg.lstsq(after, before).solution.round(decimals=12)
     return torch.einsum("ij,njc->nic", matrix.to(sh), sh)
-
-
-def _matrix_to_quat(rotation: Float[Tensor, "3 3"]) -> Float[Tensor, "4"]:
-    """Convert a rotation to wxyz: the largest eigenvector of Bar-Itzhack's matrix."""
-    (a, b, c), (d, e, f), (g, h, i) = rotation.double().tolist()
-    matrix = torch.tensor(
-        [
-            [a + e + i, h - f, c - g, d - b],
-            [h - f, a - e - i, b + d, c + g],
-            [c - g, b + d, e - a - i, f + h],
-            [d - b, c + g, f + h, i - a - e],
-        ],
-        dtype=torch.float64,
-    )
-    return torch.linalg.eigh(matrix).eigenvectors[:, -1].to(rotation.dtype)
-
-
-def _multiply_quats(a: Float[Tensor, "4"], b: Float[Tensor, "n 4"]) -> Float[Tensor, "n 4"]:
-    """Compute the Hamilton product of wxyz quaternions: rotation `b` first, then `a`."""
-    vector = (
-        a[0] * b[:, 1:] + b[:, :1] * a[1:] + torch.linalg.cross(a[1:].expand(len(b), 3), b[:, 1:])
-    )
-    scalar = a[0] * b[:, :1] - b[:, 1:] @ a[1:, None]
-    return torch.cat([scalar, vector], dim=1)

@@ -12,9 +12,8 @@ from gscompleter.errors import InputError
 from gscompleter.progress import show_preparation, show_progress
 from gscompleter.splats.formats import (
     describe_mode_loss,
-    get_writable_format,
+    get_writer,
     load_splat,
-    note_infinite_opacities,
     save_splat,
 )
 from gscompleter.splats.strip import strip
@@ -31,8 +30,7 @@ def run_convert(options: ConvertOptions) -> None:
         with show_preparation("writing"):
             save_splat(options.out, written if options.plain else gaussians)
     if not options.quiet:
-        notes = note_infinite_opacities(gaussians), describe_mode_loss(options.out, gaussians)
-        for note in filter(None, notes):
+        if note := describe_mode_loss(options.out, gaussians):
             print(note)
         count = int((generated > 0).sum())
         print(f"{len(gaussians):,} Gaussians, {count:,} of them generated: {options.out}")
@@ -52,7 +50,7 @@ def run_strip(options: StripOptions) -> None:
 
 def check_output_file(path: Path, overwrite: bool) -> None:
     """Refuse a name without a format, and an existing file unless `overwrite` is set."""
-    get_writable_format(path)
+    get_writer(path)
     check_free(path, overwrite)
 
 

@@ -7,7 +7,6 @@ from gscompleter.apps.inputs.opening import Opened, Task, estimate_memory
 from gscompleter.apps.report.completion import Target
 from gscompleter.errors import join_names, quote_value
 from gscompleter.memory import format_whole_gigabytes, read_memory_bytes
-from gscompleter.splats.formats import note_infinite_opacities
 
 MAX_NAMED = 8
 """Most frames or targets that a line names."""
@@ -30,18 +29,16 @@ def describe_task(options: CompleteOptions, opened: Opened, task: Task) -> list[
 
 
 def describe_opening(options: SceneOptions, opened: Opened, task: Task) -> list[str]:
-    """Write the lines on the opened scene, with a note on an unusual splat."""
+    """Write the lines on the opened scene."""
     scene, camera, used = task.scene, task.views[0].camera, len(opened.photographs)
-    splat, note = "", None
+    splat = ""
     if scene is not None:
         mode = "antialiased " if scene.is_antialiased else ""
         name = quote_value(options.scene)
         splat = f"; {name}, {len(scene):,} {mode}Gaussians of SH degree {scene.sh_degree}"
-        note = note_infinite_opacities(scene)
     return [
         f"Opened: {quote_value(options.folder)}, {opened.format}, {used} of "
         f"{opened.num_photographs} photographs{splat}.",
-        *([] if note is None else [note]),
         f"Found: {task.frame_description.rstrip('.')}; depths from {camera.near:.3g} to "
         f"{camera.far:.3g}; worked at {camera.width} x {camera.height} (--resolution changes it).",
     ]

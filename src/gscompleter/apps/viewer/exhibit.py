@@ -20,7 +20,7 @@ from gscompleter.errors import InputError, quote_value
 from gscompleter.io.files import COMPLETED_FILE, CONTEXT_FILE, TARGETS_FILE
 from gscompleter.io.image import encode_jpeg, read_pixels
 from gscompleter.splat_alignment.similarity import transform_camera
-from gscompleter.splats.formats import load_splat, note_infinite_opacities
+from gscompleter.splats.formats import load_splat
 from gscompleter.types import Camera, Gaussians
 
 THUMBNAIL_SIDE, THUMBNAIL_QUALITY = 160, 80
@@ -73,13 +73,11 @@ def load_scene_cameras(
 def load_viewer_files(after: Path, before: Path | None, drop_nonfinite: bool) -> ViewerContent:
     """Load a splat to compare with `before`, or with its observed part if that is None."""
     scene = load_splat(after, drop_nonfinite)
-    note = note_infinite_opacities(scene)
-    notes = () if note is None else (note,)
     if before is not None:
-        return ViewerContent(after.name, scene, load_splat(before, drop_nonfinite), notes=notes)
+        return ViewerContent(after.name, scene, load_splat(before, drop_nonfinite))
     given = scene[scene.generated == 0]
     shown = given if 0 < len(given) < len(scene) else None
-    return ViewerContent(after.name, scene, shown, notes=notes)
+    return ViewerContent(after.name, scene, shown)
 
 
 def load_viewer_completion(folder: Path, drop_nonfinite: bool) -> ViewerContent:
