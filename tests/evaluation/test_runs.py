@@ -453,7 +453,7 @@ def test_chunks_run_end_to_end_and_a_broken_image_costs_its_own_cases(
         (("--shard", "3/2"), "no shard 3/2"),
         (("--protocol", "m-1"), "no protocol 'm-1'"),
         (("--protocol", "m" * 5000), "no protocol 'mmm"),
-        (("--protocol", "stress"), "no case to run"),
+        (("--protocol", "stress"), "lists no frames"),
         (("--limit", "0"), "--limit"),
         (("--generator", "dall-e"), "no generator"),
     ],

@@ -189,8 +189,7 @@ def test_a_result_is_relative_to_an_origin_where_the_splat_lies_there(
     moved_by = load_ply(given).means - load_ply(out / "context.ply").means
     assert np.allclose(moved_by, frame["origin"], atol=1e-3)
     assert any(frame["origin"]) == any(place)
-    told = f"origin at {' '.join(map(str, frame['origin']))};"
-    assert (told in capsys.readouterr().out) == any(place)
+    assert ("relative to a local origin" in capsys.readouterr().out) == any(place)
 
 
 def test_floaters_kilometres_away_change_nothing(splat, room, tmp_path):
