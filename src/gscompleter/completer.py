@@ -172,7 +172,7 @@ class GSCompleter:
             moved = slide_along_rays(lifted, affine, image, view)  # Eq. 9 to 11
             kept = guards.place(filter_holes(moved, view), view)  # Eq. 12
             refined = refine(kept, image, view)  # Eq. 13
-            added, rejected_by = guards.verify(Attempt(view, image, affine, refined))
+            added, rejection = guards.verify(Attempt(view, image, affine, refined))
             recolored = recolor(image, view, state.next_target_id)
             result = replace(
                 view.make_unchanged_result(),
@@ -184,7 +184,7 @@ class GSCompleter:
                 registered=moved.gaussians if self.keep_registered else None,
                 num_recolored=recolored.count,
                 synthesis_notes=image.notes,
-                rejected_by=rejected_by,
+                rejection=rejection,
             )
         return recolored.state.extended(result, seconds)
 

@@ -27,15 +27,6 @@ NEW_PHOTO_ID = 255
 """Value of `generated` for Gaussians that were recoloured to a new photograph of the scene."""
 NOTHING_ADDED = "Nothing of it was added."
 
-REJECTIONS = {
-    "depth-agreement": (
-        "Only {agreement:.0%} of the scene that the target sees agrees with the depths of the "
-        "synthesized image, and no other fit is better."
-    ),
-    "psnr": "Most of the Gaussians that were generated here make photographs worse.",
-}
-"""Sentence of each guard that rejected a target."""
-
 
 @dataclass(frozen=True)
 class ContextScene:
@@ -66,6 +57,16 @@ class Photo:
     """With the depth range of the scene, in the exposure of the context."""
     budgets: tuple[ErrorBudget, ...] = ()
     """Largest errors that additions may cause; none if no guard sets them."""
+
+
+@dataclass(frozen=True)
+class Rejection:
+    """The guard that removed everything that was generated for a target, if one did."""
+
+    guard: str = ""
+    """Name of the guard; empty if none did."""
+    reason: str = ""
+    """Sentence for the report; empty if the notes of Φ say it."""
 
 
 @dataclass(frozen=True)
@@ -100,8 +101,7 @@ class TargetResult(RenamedMembers):
     """Number of rendered context Gaussians that got new colours."""
     synthesis_notes: tuple[str, ...] = ()
     """Sentences of the generator about its image."""
-    rejected_by: str = ""
-    """Name of the guard that removed everything; empty if none did."""
+    rejection: Rejection = Rejection()
     refusal: str | None = None
     """Sentence why the target cannot be completed, or None if it can."""
     skip_reason: str = ""
@@ -117,12 +117,11 @@ class TargetResult(RenamedMembers):
         """Sentences about fallbacks and rejections, for a reader of the results."""
         if self.skip_reason:
             return (self.skip_reason,)
-        rejection = REJECTIONS.get(self.rejected_by, "").format(agreement=self.affine.agreement)
         sentences = (
             *self.synthesis_notes,
             *self._describe_fallbacks(),
-            rejection,
-            NOTHING_ADDED if self.rejected_by else "",
+            self.rejection.reason,
+            NOTHING_ADDED if self.rejection.guard else "",
         )
         return tuple(filter(None, sentences))
 

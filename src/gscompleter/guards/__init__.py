@@ -1,6 +1,6 @@
 """Safeguards beyond the paper, a file each; a preset names those that are asked, in order.
 
-A new guard is a class with a `name` that overrides one of three hooks, and an entry in `GUARDS`.
+A new guard is a class that overrides one of three hooks, and an entry in `config.GUARDS`.
 """
 
 from __future__ import annotations
@@ -11,12 +11,12 @@ from functools import reduce
 from importlib import import_module
 from typing import ClassVar
 
-from gscompleter.config import CompleterConfig
+from gscompleter.config import GUARDS, CompleterConfig
 from gscompleter.render.cache import SceneRenderer
 from gscompleter.stages.refine import Refined
 from gscompleter.stages.synthesize import GeneratedView
 from gscompleter.stages.target_view import TargetView
-from gscompleter.state import Completion
+from gscompleter.state import Completion, Rejection
 from gscompleter.timing import timed_stage
 from gscompleter.types import DepthAffine, Gaussians
 
@@ -48,6 +48,10 @@ class Guard:
         """Fade or drop refined Gaussians; returning none of them rejects the target."""
         return added
 
+    def explain_rejection(self, attempt: Attempt) -> str:
+        """Return the sentence for the report if this guard rejects the target, or an empty one."""
+        return ""
+
 
 class Guards:
     """Guards that are asked in order."""
@@ -65,26 +69,15 @@ class Guards:
         return reduce(lambda kept, guard: guard.place(kept, view), self._guards, candidates)
 
     @timed_stage("integrate")
-    def verify(self, attempt: Attempt) -> tuple[Gaussians, str]:
-        """Return what may be added, and the name of the guard that rejected all, if one did."""
+    def verify(self, attempt: Attempt) -> tuple[Gaussians, Rejection]:
+        """Return what may be added, and which guard rejected all of it, if one did."""
         added = attempt.refined.gaussians
         for guard in self._guards:
             checked = guard.verify(added, attempt)
             if len(added) > 0 and len(checked) == 0:
-                return checked, guard.name
+                return checked, Rejection(guard.name, guard.explain_rejection(attempt))
             added = checked
-        return added, ""
-
-
-GUARDS = {
-    "dynamic-masks": "gscompleter.guards.dynamic_masks:DynamicMasks",
-    "image-agreement": "gscompleter.guards.agreement:ImageAgreement",
-    "depth-agreement": "gscompleter.guards.agreement:DepthAgreement",
-    "free-space": "gscompleter.guards.free_space:FreeSpace",
-    "psnr": "gscompleter.guards.psnr:PsnrGuard",
-    "contribution": "gscompleter.guards.contribution:Contribution",
-}
-"""Module and class of each guard, imported when a preset names it."""
+        return added, Rejection()
 
 
 def load_guards(config: CompleterConfig) -> Guards:

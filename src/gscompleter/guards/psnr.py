@@ -67,6 +67,10 @@ class PsnrGuard(Guard):
             state.config.psnr_guard,
         )
 
+    def explain_rejection(self, attempt: Attempt) -> str:
+        """Name the photographs as the reason."""
+        return "Most of the Gaussians that were generated here make photographs worse."
+
 
 def set_error_budgets(
     photograph: View,
