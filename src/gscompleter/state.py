@@ -14,39 +14,27 @@ from functools import cached_property
 from typing import ClassVar
 
 import torch
-from jaxtyping import Bool, Float, Int64, Shaped
+from jaxtyping import Bool, Float
 from torch import Tensor
 
 from gscompleter.config import CompleterConfig
 from gscompleter.deprecation import RenamedMembers
 from gscompleter.timing import add_seconds
 from gscompleter.trust import Trust
-from gscompleter.types import Camera, DepthAffine, ErrorBudget, Gaussians, Render, View, merge
+from gscompleter.types import (
+    Camera,
+    ContextScene,
+    DepthAffine,
+    ErrorBudget,
+    Gaussians,
+    Render,
+    View,
+    merge,
+)
 
 NEW_PHOTO_ID = 255
 """Value of `generated` for Gaussians that were recoloured to a new photograph of the scene."""
 NOTHING_ADDED = "Nothing of it was added."
-
-
-@dataclass(frozen=True)
-class ContextScene:
-    """The n Gaussians of the context and the m <= n that are rendered in their place (LOD)."""
-
-    gaussians: Gaussians
-    """As Ψ made them or as the user's file holds them."""
-    rendered: Gaussians
-    """The m Gaussians that the stages render; `gaussians` itself for small scenes and on GPUs."""
-    proxy_index: Int64[Tensor, "n"]
-    """Rendered Gaussian that stands for each Gaussian; empty if `rendered is gaussians`."""
-
-    @staticmethod
-    def whole(gaussians: Gaussians) -> ContextScene:
-        """Return a context that is rendered as it is."""
-        return ContextScene(gaussians, gaussians, gaussians.means.new_empty(0).long())
-
-    def expand(self, values: Shaped[Tensor, "m *c"]) -> Shaped[Tensor, "n *c"]:
-        """Map values of rendered Gaussians to the Gaussians they stand for."""
-        return values if self.rendered is self.gaussians else values[self.proxy_index]
 
 
 @dataclass(frozen=True)

@@ -32,7 +32,8 @@ class DepthAgreement(Guard):
 
     def explain_rejection(self, attempt: Attempt) -> str:
         """Name the share that agrees."""
+        agreement = attempt.affine.agreement or 0.0
         return (
-            f"Only {attempt.affine.agreement or 0.0:.0%} of the scene that the target sees agrees with "
-            "the depths of the synthesized image, and no other fit is better."
+            f"Only {agreement:.0%} of the scene that the target sees agrees with the depths of the "
+            "synthesized image, and no other fit is better."
         )

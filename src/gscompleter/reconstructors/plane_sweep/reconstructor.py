@@ -13,13 +13,13 @@ from torch import Tensor
 from gscompleter.kernels.parallel import map_in_parallel
 from gscompleter.reconstructors.features.depth_range import get_depth_range
 from gscompleter.reconstructors.features.stereo_image import StereoImage
-from gscompleter.reconstructors.plane_sweep.consistency import Mask
 from gscompleter.reconstructors.plane_sweep.fusion import Layer
 from gscompleter.reconstructors.plane_sweep.gaussians import Splatter
 from gscompleter.reconstructors.plane_sweep.rig import Rig, build_rig
 from gscompleter.reconstructors.plane_sweep.sky_mask import find_skies, find_sky, transfer_sky
 from gscompleter.reconstructors.plane_sweep.surfaces import fit_surfaces
 from gscompleter.reconstructors.plane_sweep.sweep import (
+    Mask,
     Measurement,
     compute_inverse_depth,
     measure_depths,
