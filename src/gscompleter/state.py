@@ -34,6 +34,12 @@ from gscompleter.types import (
 
 NEW_PHOTO_ID = 255
 """Value of `generated` for Gaussians that were recoloured to a new photograph of the scene."""
+AFFINE_NOTES = {
+    "ransac": "",
+    "median": "RANSAC finds no reliable depth correction; the median depth ratio replaces it.",
+    "identity": "There is nothing to fit a depth correction to; the predicted depths are used.",
+}
+"""Sentence about each estimator of the depth correction; empty for the usual one."""
 NOTHING_ADDED = "Nothing of it was added."
 
 
@@ -105,32 +111,18 @@ class TargetResult(RenamedMembers):
         """Sentences about fallbacks and rejections, for a reader of the results."""
         if self.skip_reason:
             return (self.skip_reason,)
-        sentences = (
-            *self.synthesis_notes,
-            *self._describe_fallbacks(),
-            self.rejection.reason,
-            NOTHING_ADDED if self.rejection.guard else "",
-        )
-        return tuple(filter(None, sentences))
-
-    def _describe_fallbacks(self) -> tuple[str, ...]:
-        """Return one sentence for each fallback that was taken, empty for others."""
-        methods = {
-            "median": "RANSAC finds no reliable depth correction; the median depth ratio "
-            "replaces it.",
-            "identity": "There is nothing to fit a depth correction to; the predicted depths are "
-            "used.",
-        }
-        return (
-            "Every view is turned too far; the least-turned one is the anchor."
-            if self.anchor_fallback
-            else "",
-            "The depths that fit the anchor contradict the scene at the target; they are fitted at "
-            "the target instead."
-            if self.affine.is_refitted_at_target
-            else "",
-            methods.get(self.affine.method, ""),
-        )
+        notes = [*self.synthesis_notes]
+        if self.anchor_fallback:
+            notes.append("Every view is turned too far; the least-turned one is the anchor.")
+        if self.affine.is_refitted_at_target:
+            notes.append(
+                "The depths that fit the anchor contradict the scene at the target; they are "
+                "fitted at the target instead."
+            )
+        notes.append(AFFINE_NOTES[self.affine.method])
+        if self.rejection.guard:
+            notes += [self.rejection.reason, NOTHING_ADDED]
+        return tuple(filter(None, notes))
 
 
 @dataclass(frozen=True)

@@ -184,26 +184,19 @@ class View(TensorDataclass):
 
     def __post_init__(self) -> None:
         """Raise InputError if the image or one of its maps does not have the size of the camera."""
-        size = self.camera.height, self.camera.width
-        image = self.image
-        if (
-            not isinstance(image, Tensor)
-            or image.shape[2:] != (3,)
-            or not image.is_floating_point()
-        ):
+        image, size = self.image, (self.camera.height, self.camera.width)
+        is_colored = isinstance(image, Tensor) and image.shape[2:] == (3,)
+        if not is_colored or not image.is_floating_point():
             raise InputError(
                 "The image of a view is no tensor of floats of shape [h, w, 3]; convert it."
             )
-        maps = {
-            "depth": self.depth,
-            "ignore mask": self.ignore_mask,
-            "dynamic mask": self.dynamic_mask,
-        }
-        for name, pixels in {"image": image, **maps}.items():
+        for name in ("image", "depth", "ignore_mask", "dynamic_mask"):
+            pixels = getattr(self, name)
             if pixels is not None and tuple(pixels.shape[:2]) != size:
                 raise InputError(
-                    f"The {name} of a view has the shape {list(pixels.shape)}, and its camera has "
-                    f"{size[0]} × {size[1]} pixels (height × width); resize one of them."
+                    f"The {name.replace('_', ' ')} of a view has the shape {list(pixels.shape)}, "
+                    f"and its camera has {size[0]} × {size[1]} pixels (height × width); resize one "
+                    "of them."
                 )
 
     @property

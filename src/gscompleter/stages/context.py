@@ -14,7 +14,7 @@ from gscompleter.config import CompleterConfig
 from gscompleter.errors import InputError
 from gscompleter.geometry import compute_z_depths, project_mask
 from gscompleter.reconstructors import Reconstructor, run_reconstructor
-from gscompleter.reconstructors.features.depth_range import get_depth_range
+from gscompleter.reconstructors.features.depth_range import get_depth_range, set_depth_range
 from gscompleter.render import Renderer
 from gscompleter.render.lod import build_proxy
 from gscompleter.types import Camera, ContextScene, Gaussians, Reconstruction, View
@@ -101,11 +101,6 @@ def take_scene(
     source = build_proxy(scene, [*targets, *(view.camera for view in photos)])
     near, far = find_depth_range(views, source.rendered, renderer)
     return InitialContext(source, tuple(set_depth_range(photos, near, far)))
-
-
-def set_depth_range(views: Sequence[View], near: float, far: float) -> list[View]:
-    """Set the depth range of all cameras, in scene units."""
-    return [replace(view, camera=replace(view.camera, near=near, far=far)) for view in views]
 
 
 def check_colors(views: Sequence[View]) -> None:

@@ -56,5 +56,10 @@ def convert_output(output: GeneratorOutput, target: Camera) -> GeneratedView:
             f"the generator must return a finite image of shape {expected}, "
             f"got {tuple(output.image.shape)}"
         )
-    flags = {"is_inconsistent": output.is_inconsistent, "is_photograph": output.is_photograph}
-    return GeneratedView(output.image, target, notes=output.notes, **flags)
+    return GeneratedView(
+        output.image,
+        target,
+        notes=output.notes,
+        is_inconsistent=output.is_inconsistent,
+        is_photograph=output.is_photograph,
+    )

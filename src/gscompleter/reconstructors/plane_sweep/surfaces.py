@@ -44,8 +44,8 @@ def fit_surfaces(measured: Map, confidence: Map, image: Image) -> Map:
     levels: list[Level] = [(measured, confidence, image)]
     while len(levels) < LEVELS and min(levels[-1][0].shape) > 4:
         levels.append(halve_level(*levels[-1]))
-    data, weight, _ = (torch.from_numpy(part) for part in levels[-1])
-    heights = fill_smoothly(data, weight > 0).numpy().copy()
+    known, sure, _ = (torch.from_numpy(part) for part in levels[-1])
+    heights = fill_smoothly(known, sure > 0).numpy().copy()
     gradients = np.zeros((2, *heights.shape), np.float32)
     for number, (data, weight, colours) in reversed(list(enumerate(levels))):
         if heights.shape != data.shape:
