@@ -40,7 +40,7 @@ def main(count: int = 2_000_000, size: int = 256, cameras: int = 4) -> None:
         move_right(start, 0.6 * number / max(cameras - 1, 1)) for number in range(cameras)
     ]
     made = measure_median_seconds(lambda: simplify_scene(scene, viewpoints), runs=3)
-    proxy = simplify_scene(scene, viewpoints).scene
+    proxy = simplify_scene(scene, viewpoints).rendered
     whole, ours, fewer = (
         measure_median_seconds(lambda part=part: freeze_at_all(part, viewpoints), runs=3)
         for part in (scene, proxy, thin_gaussians(scene, len(proxy)))

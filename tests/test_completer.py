@@ -415,7 +415,7 @@ def test_depths_that_the_scene_contradicts_are_reported_and_not_added(tmp_path):
     refused = completer(context, target)
     (result,) = refused.targets
     assert len(refused.added) == len(result.added) == 0
-    assert result.rejected_by == "depth-agreement"
+    assert result.rejection.guard == "depth-agreement"
     assert torch.equal(result.after.image, result.before.image)
     summary = write_report(tmp_path, refused, [Target(target)], completer.renderer, {})
     (said,) = summary["targets"]
@@ -432,15 +432,15 @@ def test_a_splat_is_not_compared_in_depth():
     context, target = photographs(), cameras()[1]
     completer = GSCompleter(Confused(), KnowingGenerator())
     scene = completer.begin(context).context
-    for check_views, rejected_by in ((None, "depth-agreement"), ([], "")):
+    for check_views, guard in ((None, "depth-agreement"), ([], "")):
         (result,) = completer(context, target, scene, check_views).targets
-        assert (result.rejected_by == "depth-agreement") == bool(rejected_by)
+        assert (result.rejection.guard == "depth-agreement") == bool(guard)
         assert result.affine.agreement < 0.1
 
 
 def test_depths_that_are_a_little_wrong_are_mended_and_added():
     (result,) = completed(CompleterConfig()).targets
-    assert not result.rejected_by
+    assert not result.rejection.guard
     assert result.affine.agreement > 0.5
     assert len(result.added) > 0
 

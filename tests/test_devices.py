@@ -41,7 +41,7 @@ from gscompleter.models.feed_forward.depth_predictor import DepthConfig
 from gscompleter.models.feed_forward.depthsplat import VARIANTS
 from gscompleter.reconstructors import Reconstructor, iterate_tensors, run_reconstructor
 from gscompleter.reconstructors.from_depth import FromDepth
-from gscompleter.stages.context import measure_depth_range, reconstruct
+from gscompleter.stages.context import measure_depth_range
 from gscompleter.stages.filter_holes import select_in_mask
 from gscompleter.stages.lift import lift_pair
 from gscompleter.types import Lift, Reconstruction, View
@@ -188,7 +188,7 @@ def test_a_model_that_leaves_a_tensor_on_the_cpu_is_named_with_it(views, name):
         )
         return replace(whole, **{name: left})
 
-    for stage in (lambda: reconstruct(careless, views), lambda: lift_pair(careless, *views)):
+    for stage in (lambda: run_reconstructor(careless, views), lambda: lift_pair(careless, *views)):
         with pytest.raises(ValueError, match=f"returned the reconstruction.{name}.* on cpu"):
             stage()
 

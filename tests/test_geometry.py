@@ -8,7 +8,6 @@ from scipy.spatial.transform import Rotation
 
 from gscompleter.geometry import (
     axis_angle_to_matrix,
-    depth_to_distance,
     footprint_mask,
     is_inside,
     is_same_camera,
@@ -40,12 +39,6 @@ def test_the_optical_axis_points_along_z_and_the_top_left_ray_up_and_left():
     camera = camera_at(size=2, focal=0.5)  # pixel centres half a focal length off the axis
     assert camera.z_rays()[0, 0].tolist() == [-0.5, -0.5, 1.0]
     assert torch.allclose(camera.forward, torch.tensor([0.0, 0.0, 1.0]))
-
-
-def test_distance_is_depth_over_the_cosine_to_the_axis():
-    camera = camera_at(size=2, focal=0.5)
-    distance = depth_to_distance(torch.full((2, 2), 4.0), camera)
-    assert torch.allclose(distance, torch.full((2, 2), 4.0 * 1.5**0.5))
 
 
 def test_points_behind_the_camera_are_not_inside_its_image():

@@ -11,12 +11,12 @@ import torch
 from gscompleter.data.formats import open_photographs
 from gscompleter.geometry import project
 from gscompleter.guards.free_space import respect_free_space
+from gscompleter.reconstructors.features.depth_range import get_depth_range, set_depth_range
 from gscompleter.reconstructors.plane_sweep import PlaneSweep
-from gscompleter.reconstructors.plane_sweep.consistency import find_hidden
-from gscompleter.reconstructors.plane_sweep.reconstructor import set_depth_range
+from gscompleter.reconstructors.plane_sweep.sweep import find_hidden
 from gscompleter.render import load_renderer
 from gscompleter.sky import SKY_DEPTH, extend_sky, is_sky, mask_out_sky
-from gscompleter.stages.extrapolate import extrapolate_sky
+from gscompleter.stages.slide_along_rays import extrapolate_sky
 from gscompleter.types import SH_C0, DepthMap, View, sh_from_rgb
 from scenes import (
     Room,
@@ -93,7 +93,7 @@ WHITE_ROOMS = {
 
 
 def has_sky(views: list[View]) -> bool:
-    views = set_depth_range(views)
+    views = set_depth_range(views, *get_depth_range(views))
     depths = PlaneSweep().estimate_depths(views)
     return any(is_sky(d.depth, v.camera).any() for d, v in zip(depths, views, strict=True))
 

@@ -14,7 +14,7 @@ from gscompleter.deprecation import accept_old_keywords
 from gscompleter.errors import InputError
 from gscompleter.generators import Generator, ImageFunction, as_generator, load_generator
 from gscompleter.geometry import pad_camera, pad_like
-from gscompleter.guards import Attempt, load_guards
+from gscompleter.guards import Attempt, place, prepare_guards, verify
 from gscompleter.image_ops import is_enclosed
 from gscompleter.progress import track
 from gscompleter.reconstructors import Reconstructor, load_reconstructor
@@ -142,7 +142,7 @@ class GSCompleter:
             known = [view for number, view in enumerate(made.views) if number not in new]
             trust = load_trust(config, parts, known, self.scenes)
             state = Completion(config, made.source, parts, photos, len(views), trust)
-            state = load_guards(config).begin(state, self.scenes)
+            state = prepare_guards(state, self.scenes)
             state = recolor_to_photos(state, [made.views[i] for i in new], self.scenes)
         return replace(state, exposure_gains=made.exposure_gains, seconds=seconds)
 
@@ -161,7 +161,7 @@ class GSCompleter:
             InputError: The scene holds as many targets as a .ply can tell apart.
         """
         check_target_ids(state.context, len(state.targets) + 1)
-        guards, rng = load_guards(state.config), torch.Generator().manual_seed(self.seed)
+        rng = torch.Generator().manual_seed(self.seed)
         with record_seconds() as seconds:
             view = self.observe(state, target, reference)
             if view.skip_reason:
@@ -170,9 +170,9 @@ class GSCompleter:
             lifted = lift(self.reconstructor, image, view)  # Eq. 7
             affine = align_depth(lifted, view, rng)  # Eq. 8
             moved = slide_along_rays(lifted, affine, image, view)  # Eq. 9 to 11
-            kept = guards.place(filter_holes(moved, view), view)  # Eq. 12
+            kept = place(filter_holes(moved, view), view)  # Eq. 12
             refined = refine(kept, image, view)  # Eq. 13
-            added, rejected_by = guards.verify(Attempt(view, image, affine, refined))
+            added, rejection = verify(Attempt(view, image, affine, refined))
             recolored = recolor(image, view, state.next_target_id)
             result = replace(
                 view.make_unchanged_result(),
@@ -184,7 +184,7 @@ class GSCompleter:
                 registered=moved.gaussians if self.keep_registered else None,
                 num_recolored=recolored.count,
                 synthesis_notes=image.notes,
-                rejected_by=rejected_by,
+                rejection=rejection,
             )
         return recolored.state.extended(result, seconds)
 

@@ -54,11 +54,6 @@ def sample(
     return sampled[0, :, 0].T.reshape(*pixels.shape[:-1], -1)
 
 
-def depth_to_distance(depth: Float[Tensor, "h w"], camera: Camera) -> Float[Tensor, "h w"]:
-    """Convert z-depth to the Euclidean distance along each pixel's ray (paper, Eq. 9)."""
-    return depth * camera.z_rays().norm(dim=-1)
-
-
 def slide(
     gaussians: Gaussians,
     camera: Camera,

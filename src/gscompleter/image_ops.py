@@ -73,6 +73,12 @@ def smooth_masked(
     return totals[..., :-1] / totals[..., -1:].clamp_min(1e-8)
 
 
+def average_box(values: Float[Tensor, "h w"], radius: int) -> Float[Tensor, "h w"]:
+    """Average the pixels of the image in a square of 2 radius + 1 pixels."""
+    side = 2 * radius + 1
+    return avg_pool2d(values[None, None], side, 1, radius, count_include_pad=False)[0, 0]
+
+
 def blur_gaussian(values: Float[Tensor, "h w *c"], sigma: float) -> Float[Tensor, "h w *c"]:
     """Blur an image by a Gaussian of standard deviation `sigma` in pixels."""
     return torch.from_numpy(cv2.GaussianBlur(values.cpu().numpy(), (0, 0), sigma)).to(values)

@@ -14,48 +14,33 @@ from functools import cached_property
 from typing import ClassVar
 
 import torch
-from jaxtyping import Bool, Float, Int64, Shaped
+from jaxtyping import Bool, Float
 from torch import Tensor
 
 from gscompleter.config import CompleterConfig
 from gscompleter.deprecation import RenamedMembers
 from gscompleter.timing import add_seconds
 from gscompleter.trust import Trust
-from gscompleter.types import Camera, DepthAffine, ErrorBudget, Gaussians, Render, View, merge
+from gscompleter.types import (
+    Camera,
+    ContextScene,
+    DepthAffine,
+    ErrorBudget,
+    Gaussians,
+    Render,
+    View,
+    merge,
+)
 
 NEW_PHOTO_ID = 255
 """Value of `generated` for Gaussians that were recoloured to a new photograph of the scene."""
-NOTHING_ADDED = "Nothing of it was added."
-
-REJECTIONS = {
-    "depth-agreement": (
-        "Only {agreement:.0%} of the scene that the target sees agrees with the depths of the "
-        "synthesized image, and no other fit is better."
-    ),
-    "psnr": "Most of the Gaussians that were generated here make photographs worse.",
+AFFINE_NOTES = {
+    "ransac": "",
+    "median": "RANSAC finds no reliable depth correction; the median depth ratio replaces it.",
+    "identity": "There is nothing to fit a depth correction to; the predicted depths are used.",
 }
-"""Sentence of each guard that rejected a target."""
-
-
-@dataclass(frozen=True)
-class ContextScene:
-    """The n Gaussians of the context and the m <= n that are rendered in their place (LOD)."""
-
-    gaussians: Gaussians
-    """As Ψ made them or as the user's file holds them."""
-    rendered: Gaussians
-    """The m Gaussians that the stages render; `gaussians` itself for small scenes and on GPUs."""
-    proxy_index: Int64[Tensor, "n"]
-    """Rendered Gaussian that stands for each Gaussian; empty if `rendered is gaussians`."""
-
-    @staticmethod
-    def whole(gaussians: Gaussians) -> ContextScene:
-        """Return a context that is rendered as it is."""
-        return ContextScene(gaussians, gaussians, gaussians.means.new_empty(0).long())
-
-    def expand(self, values: Shaped[Tensor, "m *c"]) -> Shaped[Tensor, "n *c"]:
-        """Map values of rendered Gaussians to the Gaussians they stand for."""
-        return values if self.rendered is self.gaussians else values[self.proxy_index]
+"""Sentence about each estimator of the depth correction; empty for the usual one."""
+NOTHING_ADDED = "Nothing of it was added."
 
 
 @dataclass(frozen=True)
@@ -66,6 +51,16 @@ class Photo:
     """With the depth range of the scene, in the exposure of the context."""
     budgets: tuple[ErrorBudget, ...] = ()
     """Largest errors that additions may cause; none if no guard sets them."""
+
+
+@dataclass(frozen=True)
+class Rejection:
+    """The guard that removed everything that was generated for a target, if one did."""
+
+    guard: str = ""
+    """Name of the guard; empty if none did."""
+    reason: str = ""
+    """Sentence for the report; empty if the notes of Φ say it."""
 
 
 @dataclass(frozen=True)
@@ -100,8 +95,7 @@ class TargetResult(RenamedMembers):
     """Number of rendered context Gaussians that got new colours."""
     synthesis_notes: tuple[str, ...] = ()
     """Sentences of the generator about its image."""
-    rejected_by: str = ""
-    """Name of the guard that removed everything; empty if none did."""
+    rejection: Rejection = Rejection()
     refusal: str | None = None
     """Sentence why the target cannot be completed, or None if it can."""
     skip_reason: str = ""
@@ -117,33 +111,18 @@ class TargetResult(RenamedMembers):
         """Sentences about fallbacks and rejections, for a reader of the results."""
         if self.skip_reason:
             return (self.skip_reason,)
-        rejection = REJECTIONS.get(self.rejected_by, "").format(agreement=self.affine.agreement)
-        sentences = (
-            *self.synthesis_notes,
-            *self._describe_fallbacks(),
-            rejection,
-            NOTHING_ADDED if self.rejected_by else "",
-        )
-        return tuple(filter(None, sentences))
-
-    def _describe_fallbacks(self) -> tuple[str, ...]:
-        """Return one sentence for each fallback that was taken, empty for others."""
-        methods = {
-            "median": "RANSAC finds no reliable depth correction; the median depth ratio "
-            "replaces it.",
-            "identity": "There is nothing to fit a depth correction to; the predicted depths are "
-            "used.",
-        }
-        return (
-            "Every view is turned too far; the least-turned one is the anchor."
-            if self.anchor_fallback
-            else "",
-            "The depths that fit the anchor contradict the scene at the target; they are fitted at "
-            "the target instead."
-            if self.affine.is_refitted_at_target
-            else "",
-            methods.get(self.affine.method, ""),
-        )
+        notes = [*self.synthesis_notes]
+        if self.anchor_fallback:
+            notes.append("Every view is turned too far; the least-turned one is the anchor.")
+        if self.affine.is_refitted_at_target:
+            notes.append(
+                "The depths that fit the anchor contradict the scene at the target; they are "
+                "fitted at the target instead."
+            )
+        notes.append(AFFINE_NOTES[self.affine.method])
+        if self.rejection.guard:
+            notes += [self.rejection.reason, NOTHING_ADDED]
+        return tuple(filter(None, notes))
 
 
 @dataclass(frozen=True)

@@ -24,7 +24,7 @@ from gscompleter.io.json_file import read_json
 from gscompleter.reconstructors import load_reconstructor
 from gscompleter.reconstructors.features.matches import detect_features
 from gscompleter.reconstructors.features.stereo_image import make_stereo_images
-from gscompleter.stages.context import reconstruct
+from gscompleter.stages.context import reconstruct_context
 from gscompleter.types import SH_C0, Camera
 from scenes import camera_at, open_street
 
@@ -166,10 +166,10 @@ def test_nothing_is_matched_or_made_of_it(clip):
         columns, rows = detect_features(image)[0].astype(int).T
         assert len(rows)
         assert not image.ignore_mask[rows, columns].any()
-    scene, _ = reconstruct(load_reconstructor("plane-sweep"), views)
-    plain, _ = reconstruct(
+    scene = reconstruct_context(load_reconstructor("plane-sweep"), views).source.gaussians
+    plain = reconstruct_context(
         load_reconstructor("plane-sweep"), [replace(view, ignore_mask=None) for view in views]
-    )
+    ).source.gaussians
     # Nothing below the horizon is as far away as where a bonnet is matched.
     low = [s.means[s.means[:, 1] > 0.6] for s in (scene, plain)]
     beyond = [(means[:, 2] > 40.0).sum().item() for means in low]
@@ -183,7 +183,7 @@ def test_what_is_fitted_takes_nothing_from_it(clip):
     painted = [
         replace(v, image=torch.where(v.ignore_mask[..., None], magenta, v.image)) for v in views
     ]
-    scene, _ = reconstruct(load_reconstructor("plane-sweep"), painted)
+    scene = reconstruct_context(load_reconstructor("plane-sweep"), painted).source.gaussians
     red, green, blue = (0.5 + SH_C0 * scene.sh[:, 0]).T
     assert ((torch.minimum(red, blue) - green) > 0.6).float().mean() < 0.003
 

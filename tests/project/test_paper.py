@@ -6,7 +6,6 @@ from pathlib import Path
 import pytest
 
 import gscompleter
-from gscompleter.geometry import depth_to_distance
 from gscompleter.stages import (
     align_depth,
     context,
@@ -24,7 +23,7 @@ EQUATIONS = {
     6: (r"\Phi(\mathbf{I}_n, \mathbf{P}_t)", [synthesize.synthesize]),
     7: (r"\Psi(\mathcal{V}_{\text{pair}}; \Theta)", [lift.lift_pair]),
     8: (r"(s \cdot D_{\text{pred}}^{\text{anc}}", [align_depth.fit_affine, DepthAffine]),
-    9: (r"d_i^{\text{init}} = \frac", [depth_to_distance, slide_along_rays.apply_affine]),
+    9: (r"d_i^{\text{init}} = \frac", [slide_along_rays.apply_affine]),
     10: (r"\mathbf{c}_{\text{tgt}} + d_i \cdot \mathbf{r}_i", [slide_along_rays.move_along_rays]),
     11: (
         r"\lambda_s \mathcal{L}_{\text{stereo}}",

@@ -18,14 +18,14 @@ from gscompleter.reconstructors.features.stereo_image import (
     make_stereo_images,
 )
 from gscompleter.reconstructors.plane_sweep import PlaneSweep
-from gscompleter.reconstructors.plane_sweep.consistency import (
+from gscompleter.reconstructors.plane_sweep.fit import OPACITY_STEPS, fit_colors, fit_opacities
+from gscompleter.reconstructors.plane_sweep.rig import compute_epipolar_distances, rotate_to_matches
+from gscompleter.reconstructors.plane_sweep.surfaces import fit_surfaces
+from gscompleter.reconstructors.plane_sweep.sweep import (
     compute_confidence,
     find_hidden,
     remove_speckles,
 )
-from gscompleter.reconstructors.plane_sweep.fit import OPACITY_STEPS, fit_colors, fit_opacities
-from gscompleter.reconstructors.plane_sweep.rig import compute_epipolar_distances, rotate_to_matches
-from gscompleter.reconstructors.plane_sweep.surfaces import fit_surfaces
 from gscompleter.render import load_renderer
 from gscompleter.render.cpu import CpuFrozenScene
 from gscompleter.types import View, merge

@@ -55,15 +55,15 @@ def pixel_at(scene: Gaussians) -> torch.Tensor:
 
 
 def test_a_small_scene_is_its_own_proxy():
-    assert build_proxy(ROOM, CAMERAS).scene is ROOM
+    assert build_proxy(ROOM, CAMERAS).rendered is ROOM
     completion = GSCompleter(KnowingReconstructor()).begin(VIEWS[::2], ROOM, VIEWS[1:2])
     assert completion.parts[0] is completion.scene is completion.context is ROOM
 
 
 def test_a_crowd_is_drawn_with_few_and_looks_alike():
-    assert len(PROXY.scene) < 2 * len(CROWD) / COPIES
+    assert len(PROXY.rendered) < 2 * len(CROWD) / COPIES
     for camera in (*CAMERAS, TARGET):
-        drawn = (thin_gaussians(CROWD, len(PROXY.scene)), PROXY.scene, CROWD)
+        drawn = (thin_gaussians(CROWD, len(PROXY.rendered)), PROXY.rendered, CROWD)
         thin, ours, truth = (RENDERER.render(scene, camera) for scene in drawn)
         assert psnr(ours.image, truth.image) > psnr(thin.image, truth.image) + 3
         assert (ours.alpha - truth.alpha).abs().mean() < 0.01
@@ -71,7 +71,7 @@ def test_a_crowd_is_drawn_with_few_and_looks_alike():
 
 def test_an_antialiased_crowd_is_drawn_as_one():
     crowd = replace(CROWD, is_antialiased=True)
-    scene = simplify_scene(crowd, CAMERAS).scene
+    scene = simplify_scene(crowd, CAMERAS).rendered
     assert scene.is_antialiased
     assert thin_gaussians(crowd, 1000).is_antialiased
     ours, truth = (RENDERER.render(drawn, TARGET) for drawn in (scene, crowd))
@@ -93,26 +93,26 @@ def test_what_is_large_or_alone_stays_to_the_bit():
     huge = replace(scene, scales=scene.scales + 100 * MAX_DEVIATION * pixel_at(scene)[:, None])
     for given in (huge, scene[::25]):
         proxy = simplify_scene(given, CAMERAS)
-        assert len(proxy.scene) == len(given)
+        assert len(proxy.rendered) == len(given)
         for name in ("means", "quats", "scales", "opacities", "sh"):
-            assert torch.equal(getattr(proxy.scene, name), getattr(given, name)), name
+            assert torch.equal(getattr(proxy.rendered, name), getattr(given, name)), name
 
 
 def test_a_run_is_of_one_provenance():
     mixed = replace(CROWD, generated=(torch.arange(len(CROWD)) % 2).to(torch.uint8))
     found = simplify_scene(mixed, CAMERAS)
-    assert torch.equal(found.scene.generated[found.proxy_index], mixed.generated)
+    assert torch.equal(found.rendered.generated[found.proxy_index], mixed.generated)
     halves = replace(CROWD, generated=(torch.arange(len(CROWD)) > 2000).to(torch.uint8))
     found = simplify_scene(halves, CAMERAS)
-    assert torch.equal(found.scene.generated[found.proxy_index], halves.generated)
-    assert len(found.scene) <= len(PROXY.scene) + 1
+    assert torch.equal(found.rendered.generated[found.proxy_index], halves.generated)
+    assert len(found.rendered) <= len(PROXY.rendered) + 1
 
 
 def test_of_what_lies_at_one_place_the_mean_is_drawn_as_opaque_as_all():
     one = gaussians_of(VIEWS[0])[:1]
     pair = replace(merge([one, one]), opacities=torch.tensor([0.3, 0.6]))
     pair = replace(pair, sh=torch.tensor([[[0.0, 0.0, 0.0]], [[1.0, 1.0, 1.0]]]))
-    (found,) = (simplify_scene(pair, CAMERAS).scene,)
+    (found,) = (simplify_scene(pair, CAMERAS).rendered,)
     assert len(found) == 1
     assert torch.allclose(found.means, one.means)
     assert found.opacities.item() == pytest.approx(1 - 0.7 * 0.4, abs=1e-4)
@@ -124,7 +124,7 @@ def test_what_lies_aside_widens_it():
     one = gaussians_of(VIEWS[0])[:1]
     step = 0.4 * pixel_at(one)
     other = replace(one, means=one.means + torch.tensor([1.0, 0.0, 0.0]) * step)
-    found = simplify_scene(merge([one, other]), CAMERAS).scene
+    found = simplify_scene(merge([one, other]), CAMERAS).rendered
     assert len(found) == 1
     assert torch.allclose(found.means, (one.means + other.means) / 2)
     width, height, depth = (found.scales / one.scales)[0].tolist()
@@ -133,16 +133,16 @@ def test_what_lies_aside_widens_it():
 
 
 def test_where_there_is_little_room_fewer_are_drawn(monkeypatch):
-    room = len(CAMERAS) * BYTES_PER_SPLAT * len(PROXY.scene) // 2
+    room = len(CAMERAS) * BYTES_PER_SPLAT * len(PROXY.rendered) // 2
     monkeypatch.setattr("gscompleter.memory.MAX_FROZEN_BYTES", room)
-    assert len(simplify_scene(CROWD, CAMERAS).scene) <= len(PROXY.scene) // 2
+    assert len(simplify_scene(CROWD, CAMERAS).rendered) <= len(PROXY.rendered) // 2
 
 
 def test_the_same_runs_on_any_number_of_threads(monkeypatch):
     monkeypatch.setattr("numba.config.NUMBA_NUM_THREADS", 1)
     again = simplify_scene(CROWD, CAMERAS)
     assert torch.equal(again.proxy_index, PROXY.proxy_index)
-    assert torch.equal(again.scene.scales, PROXY.scene.scales)
+    assert torch.equal(again.rendered.scales, PROXY.rendered.scales)
 
 
 def evidence_of(scene: Gaussians) -> PhotoObservations:
@@ -159,13 +159,13 @@ def trusted_alpha(scene: Gaussians) -> torch.Tensor:
 
 
 def test_of_a_proxy_as_much_is_believed_as_of_the_scene():
-    ours, truth = trusted_alpha(PROXY.scene), trusted_alpha(CROWD)
+    ours, truth = trusted_alpha(PROXY.rendered), trusted_alpha(CROWD)
     assert truth.std() > 0.2
     assert (ours - truth).abs().mean() < 0.05
 
 
 def test_evidence_of_the_scene_and_of_its_proxy_is_the_same():
-    ours, truth = evidence_of(PROXY.scene).areas.sum(), evidence_of(CROWD).areas.sum()
+    ours, truth = evidence_of(PROXY.rendered).areas.sum(), evidence_of(CROWD).areas.sum()
     assert ours.item() == pytest.approx(truth.item(), rel=0.02)
 
 
@@ -190,14 +190,14 @@ def test_a_scene_is_completed_alike_whether_or_not_it_has_a_proxy(monkeypatch):
     monkeypatch.setattr(proxies, "MIN_PROXY_GAUSSIANS", 0)
     found = GSCompleter(KnowingReconstructor(), paint)(*asked)
     assert len(found.source.rendered) < 0.5 * len(CROWD)
-    assert torch.equal(found.scene.means, torch.cat([CROWD.means, found.added.means]))
+    assert torch.equal(found.rendered.means, torch.cat([CROWD.means, found.added.means]))
     truth = view_of(Room(), TARGET).image
     ours, theirs = (psnr(RENDERER.render(c.scene, TARGET).image, truth) for c in (found, whole))
     assert ours > psnr(RENDERER.render(CROWD, TARGET).image, truth) + 3
     assert abs(ours - theirs) < 0.5
     for view in VIEWS:
         before = psnr(RENDERER.render(CROWD, view.camera).image, view.image)
-        assert psnr(RENDERER.render(found.scene, view.camera).image, view.image) > before - 0.05
+        assert psnr(RENDERER.render(found.rendered, view.camera).image, view.image) > before - 0.05
 
 
 def test_a_scene_is_drawn_as_finely_as_the_targets_that_are_known(monkeypatch):

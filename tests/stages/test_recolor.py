@@ -12,10 +12,9 @@ from gscompleter.render.cache import SceneRenderer
 from gscompleter.render.cpu import CpuRenderer
 from gscompleter.render.spherical_harmonics import evaluate_sh_basis
 from gscompleter.stages.recolor import fit_colors
-from gscompleter.state import ContextScene
 from gscompleter.trust import HeldViews
 from gscompleter.trust.photometric import load_trust, sum_weights
-from gscompleter.types import View
+from gscompleter.types import ContextScene, View
 from scenes import Room, camera_at, gaussians_of, view_of
 from target_views import begin_with
 

@@ -9,16 +9,16 @@ from gscompleter.geometry import pad_camera
 from gscompleter.render import Renderer, load_renderer
 from gscompleter.render.cache import SceneRenderer
 from gscompleter.stages.target_view import TargetView, render_target
-from gscompleter.state import Completion, ContextScene, Photo
-from gscompleter.trust import FullTrust, Trust
-from gscompleter.types import Camera, Gaussians, View
+from gscompleter.state import Completion, Photo
+from gscompleter.trust import Trust
+from gscompleter.types import Camera, ContextScene, Gaussians, View
 
 
 def begin_with(
     context: Gaussians,
     views: Sequence[View],
     config: CompleterConfig = CompleterConfig(),
-    trust: Trust = FullTrust(),
+    trust: Trust = Trust(),
 ) -> Completion:
     """Begin a completion of `context` without guards."""
     photos = tuple(map(Photo, views))

@@ -25,7 +25,7 @@ from gscompleter.render import load_renderer
 from gscompleter.render.lod import MIN_PROXY_GAUSSIANS
 from gscompleter.splats.morton import argsort_nearby
 from gscompleter.splats.ply import load_ply, save_ply
-from gscompleter.trust import FullTrust
+from gscompleter.trust import Trust
 from gscompleter.trust.photometric import (
     compute_trust,
     gather_observations,
@@ -175,13 +175,13 @@ def test_closing_a_hole_makes_up_for_nothing_that_was_good():
 def test_without_its_photographs_a_scene_is_taken_as_it_is():
     completion = knowing()(VIEWS[::2], TARGET, SCENE)
     assert not completion.recolored_mask.any()
-    assert completion.trust == FullTrust()
+    assert completion.trust == Trust()
     assert completion.targets[0].hole_fraction < 0.05
 
 
 def test_the_paper_doubts_nothing():
     completion = knowing(CompleterConfig.paper())(VIEWS[::2], TARGET, SCENE, check_views=())
-    assert completion.trust == FullTrust()
+    assert completion.trust == Trust()
 
 
 def complete(scene, splat, out, *more):

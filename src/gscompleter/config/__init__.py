@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Annotated, Any, Literal, get_args
+from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 from annotated_types import Interval
 
@@ -216,14 +216,20 @@ class NextBestViewConfig(Settings):
     """Share of the best gain that is enough for a nearer camera to be preferred."""
 
 
-GuardName = Literal[
-    "dynamic-masks",
-    "image-agreement",
-    "depth-agreement",
-    "free-space",
-    "psnr",
-    "contribution",
-]
+GUARDS = {
+    "dynamic-masks": "gscompleter.guards.dynamic_masks:DynamicMasks",
+    "image-agreement": "gscompleter.guards.agreement:ImageAgreement",
+    "depth-agreement": "gscompleter.guards.agreement:DepthAgreement",
+    "free-space": "gscompleter.guards.free_space:FreeSpace",
+    "psnr": "gscompleter.guards.psnr:PsnrGuard",
+    "contribution": "gscompleter.guards.contribution:Contribution",
+}
+"""Module and class of each guard, imported when a preset names it."""
+
+if TYPE_CHECKING:
+    GuardName = str
+else:
+    GuardName = Literal[tuple(GUARDS)]
 
 
 @dataclass(frozen=True)
@@ -236,7 +242,14 @@ class CompleterConfig(Settings):
     trust: Literal["full", "photometric"] = "full"
     """Trust in the scene: `full` takes it as it is (paper), `photometric` counts a Gaussian as far
     as photographs confirm it."""
-    guards: tuple[GuardName, ...] = get_args(GuardName)
+    guards: tuple[GuardName, ...] = (
+        "dynamic-masks",
+        "image-agreement",
+        "depth-agreement",
+        "free-space",
+        "psnr",
+        "contribution",
+    )
     """Safeguards beyond the paper, in the order in which they are asked (paper: none)."""
     margin: Annotated[float, Interval(ge=0, le=4)] = 0.25
     """Padding of the target image on every side, relative to its size, if a hole reaches its

@@ -1,22 +1,21 @@
 """Safeguards beyond the paper, a file each; a preset names those that are asked, in order.
 
-A new guard is a class with a `name` that overrides one of three hooks, and an entry in `GUARDS`.
+A new guard is a class that overrides one of three hooks, and an entry in `config.GUARDS`.
 """
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import reduce
 from importlib import import_module
 from typing import ClassVar
 
-from gscompleter.config import CompleterConfig
+from gscompleter.config import GUARDS, CompleterConfig
 from gscompleter.render.cache import SceneRenderer
 from gscompleter.stages.refine import Refined
 from gscompleter.stages.synthesize import GeneratedView
 from gscompleter.stages.target_view import TargetView
-from gscompleter.state import Completion
+from gscompleter.state import Completion, Rejection
 from gscompleter.timing import timed_stage
 from gscompleter.types import DepthAffine, Gaussians
 
@@ -48,52 +47,36 @@ class Guard:
         """Fade or drop refined Gaussians; returning none of them rejects the target."""
         return added
 
-
-class Guards:
-    """Guards that are asked in order."""
-
-    def __init__(self, guards: Sequence[Guard]) -> None:
-        self._guards = tuple(guards)
-
-    def begin(self, state: Completion, scenes: SceneRenderer) -> Completion:
-        """Inspect the scene before its first target."""
-        return reduce(lambda state, guard: guard.begin(state, scenes), self._guards, state)
-
-    @timed_stage("integrate")
-    def place(self, candidates: Gaussians, view: TargetView) -> Gaussians:
-        """Move or drop registered Gaussians, before they are refined."""
-        return reduce(lambda kept, guard: guard.place(kept, view), self._guards, candidates)
-
-    @timed_stage("integrate")
-    def verify(self, attempt: Attempt) -> tuple[Gaussians, str]:
-        """Return what may be added, and the name of the guard that rejected all, if one did."""
-        added = attempt.refined.gaussians
-        for guard in self._guards:
-            checked = guard.verify(added, attempt)
-            if len(added) > 0 and len(checked) == 0:
-                return checked, guard.name
-            added = checked
-        return added, ""
+    def explain_rejection(self, attempt: Attempt) -> str:
+        """Return the sentence for the report if this guard rejects the target, or an empty one."""
+        return ""
 
 
-GUARDS = {
-    "dynamic-masks": "gscompleter.guards.dynamic_masks:DynamicMasks",
-    "image-agreement": "gscompleter.guards.agreement:ImageAgreement",
-    "depth-agreement": "gscompleter.guards.agreement:DepthAgreement",
-    "free-space": "gscompleter.guards.free_space:FreeSpace",
-    "psnr": "gscompleter.guards.psnr:PsnrGuard",
-    "contribution": "gscompleter.guards.contribution:Contribution",
-}
-"""Module and class of each guard, imported when a preset names it."""
+def prepare_guards(state: Completion, scenes: SceneRenderer) -> Completion:
+    """Let the guards of a completion inspect the scene before its first target."""
+    return reduce(lambda state, guard: guard.begin(state, scenes), load_guards(state.config), state)
 
 
-def load_guards(config: CompleterConfig) -> Guards:
+@timed_stage("integrate")
+def place(candidates: Gaussians, view: TargetView) -> Gaussians:
+    """Let guards move or drop registered Gaussians, before they are refined."""
+    guards = load_guards(view.state.config)
+    return reduce(lambda kept, guard: guard.place(kept, view), guards, candidates)
+
+
+@timed_stage("integrate")
+def verify(attempt: Attempt) -> tuple[Gaussians, Rejection]:
+    """Return what may be added, and which guard rejected all of it, if one did."""
+    added = attempt.refined.gaussians
+    for guard in load_guards(attempt.view.state.config):
+        checked = guard.verify(added, attempt)
+        if len(added) > 0 and len(checked) == 0:
+            return checked, Rejection(guard.name, guard.explain_rejection(attempt))
+        added = checked
+    return added, Rejection()
+
+
+def load_guards(config: CompleterConfig) -> list[Guard]:
     """Load the guards that a config names, in its order."""
-    return Guards([load_guard(name) for name in config.guards])
-
-
-def load_guard(name: str) -> Guard:
-    """Load a guard by name."""
-    module, _, kind = GUARDS[name].partition(":")
-    guard: Guard = getattr(import_module(module), kind)()
-    return guard
+    places = [GUARDS[name].partition(":") for name in config.guards]
+    return [getattr(import_module(module), kind)() for module, _, kind in places]

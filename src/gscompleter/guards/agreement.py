@@ -29,3 +29,11 @@ class DepthAgreement(Guard):
         affine, least = attempt.affine, attempt.view.state.config.depth_agreement.reject_below
         is_checked = affine.coverage >= MIN_TARGET_COVERAGE
         return added[:0] if is_checked and (affine.agreement or 0.0) < least else added
+
+    def explain_rejection(self, attempt: Attempt) -> str:
+        """Name the share that agrees."""
+        agreement = attempt.affine.agreement or 0.0
+        return (
+            f"Only {agreement:.0%} of the scene that the target sees agrees with the depths of the "
+            "synthesized image, and no other fit is better."
+        )

@@ -8,16 +8,16 @@ both.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from itertools import product
 
 import cv2
 import numpy as np
 import torch
-from jaxtyping import Bool, Float, Int
+from jaxtyping import Bool, Float, UInt8
 from torch import Tensor
-from torch.nn.functional import avg_pool2d, interpolate, max_pool2d
+from torch.nn.functional import interpolate, max_pool2d
 
 from gscompleter.config import DynamicMasksConfig
 from gscompleter.config.coverage import COVERED
@@ -31,7 +31,7 @@ from gscompleter.geometry import (
     unproject,
 )
 from gscompleter.guards import Guard
-from gscompleter.image_ops import dilate
+from gscompleter.image_ops import average_box, dilate
 from gscompleter.render.cache import SceneRenderer
 from gscompleter.state import Completion
 from gscompleter.types import Camera, Render, View
@@ -81,8 +81,8 @@ class SmallPhoto:
 
 
 @dataclass(frozen=True)
-class Reprojection:
-    """Surfaces of one photograph, reprojected into another."""
+class Comparison:
+    """Surfaces of one photograph, reprojected into another and compared with it."""
 
     pixels: Float[Tensor, "h w 2"]
     """Positions in the other photograph."""
@@ -91,20 +91,25 @@ class Reprojection:
     """True inside the other image."""
     valid_mask: Bool[Tensor, "h w"]
     """True where both photographs have a known surface."""
-    difference: Float[Tensor, "h w"]
-    """Colour difference in [0, 1]."""
-    median_difference: float
+    visible_mask: Bool[Tensor, "h w"]
+    """True where, besides, no surface of the other photograph is in front."""
+    differs_mask: Bool[Tensor, "h w"]
+    """True where the colours differ."""
 
+    @property
+    def confirmed_mask(self) -> Bool[Tensor, "h w"]:
+        """True where the other photograph shows the same colour."""
+        return self.visible_mask & ~self.differs_mask
 
-@dataclass(frozen=True)
-class Comparison:
-    """Agreement of one photograph with the surfaces of another."""
+    @property
+    def conflict_mask(self) -> Bool[Tensor, "h w"]:
+        """True where the other photograph shows another colour."""
+        return self.visible_mask & self.differs_mask
 
-    reprojection: Reprojection
-    confirmed_mask: Bool[Tensor, "h w"]
-    """True where it shows the same colour."""
-    conflict_mask: Bool[Tensor, "h w"]
-    """True where it shows another colour."""
+    def occlude_by(self, depth: Float[Tensor, "_ _"]) -> Comparison:
+        """Determine the visible surfaces again, from another depth map of the other photograph."""
+        visible = self.valid_mask & find_unoccluded(self.pixels, self.z, depth)
+        return replace(self, visible_mask=visible)
 
 
 class DynamicMasks(Guard):
@@ -165,43 +170,27 @@ def compare_both_ways(
     one: SmallPhoto, other: SmallPhoto, min_difference: float
 ) -> tuple[Comparison, Comparison]:
     """Compare two photographs both ways, twice: surfaces in conflict then occlude nothing."""
-    there, back = reproject(one, other), reproject(other, one)
-    first = classify_surfaces(there, other.depth, min_difference)
-    second = classify_surfaces(back, one.depth, min_difference)
+    there, back = compare(one, other, min_difference), compare(other, one, min_difference)
     return (
-        classify_surfaces(
-            there, other.depth.where(~second.conflict_mask, torch.inf), min_difference
-        ),
-        classify_surfaces(back, one.depth.where(~first.conflict_mask, torch.inf), min_difference),
+        there.occlude_by(other.depth.where(~back.conflict_mask, torch.inf)),
+        back.occlude_by(one.depth.where(~there.conflict_mask, torch.inf)),
     )
 
 
-def reproject(photo: SmallPhoto, other: SmallPhoto) -> Reprojection:
+def compare(photo: SmallPhoto, other: SmallPhoto, min_difference: float) -> Comparison:
     """Reproject the surfaces of one photograph into another and compare colours."""
     pixels, z = project(unproject(photo.depth, photo.camera), other.camera)
-    framed = find_inside_border(pixels, z, other.camera)
-    known = (
-        framed
-        & photo.valid_mask
-        & (sample(other.valid_mask[..., None].float(), pixels)[..., 0] == 1)
-    )
+    framed = is_inside(pixels - BORDER, z, other.camera)
+    framed &= is_inside(pixels + BORDER, z, other.camera)
+    seen = sample(other.valid_mask[..., None].float(), pixels)[..., 0] == 1
+    known = framed & photo.valid_mask & seen
     visible = known & find_unoccluded(pixels, z, other.depth)
     if int(visible.sum()) < MIN_SHARED_PIXELS:
         nothing = torch.zeros_like(known)
-        return Reprojection(pixels, z, framed, nothing, nothing.float(), 0.0)
-    differences = compute_patch_difference(photo, other, pixels, visible)
-    return Reprojection(pixels, z, framed, known, differences, differences[visible].median().item())
-
-
-def classify_surfaces(
-    match: Reprojection, depth: Float[Tensor, "_ _"], min_difference: float
-) -> Comparison:
-    """Mark visible surfaces as confirmed or in conflict, given the other depth map."""
-    visible = match.valid_mask & find_unoccluded(match.pixels, match.z, depth)
-    conflict = visible & (
-        match.difference > max(min_difference, MAX_MEDIAN_RATIO * match.median_difference)
-    )
-    return Comparison(match, visible & ~conflict, conflict)
+        return Comparison(pixels, z, framed, nothing, nothing, nothing)
+    difference = compute_patch_difference(photo, other, pixels, visible)
+    limit = max(min_difference, MAX_MEDIAN_RATIO * difference[visible].median().item())
+    return Comparison(pixels, z, framed, known, visible, difference > limit)
 
 
 def find_unoccluded(
@@ -210,13 +199,6 @@ def find_unoccluded(
     """Find points that no surface of a depth map occludes, including its 3 x 3 neighbours."""
     nearest = -max_pool2d(-depth[None, None], 3, stride=1, padding=1)[0, 0]
     return sample(nearest[..., None], pixels, "nearest")[..., 0] >= (1 - HIDDEN_TOLERANCE) * z
-
-
-def find_inside_border(
-    pixels: Float[Tensor, "h w 2"], z: Float[Tensor, "h w"], camera: Camera
-) -> Bool[Tensor, "h w"]:
-    """Find points inside an image without its border."""
-    return is_inside(pixels - BORDER, z, camera) & is_inside(pixels + BORDER, z, camera)
 
 
 def compute_patch_difference(
@@ -235,14 +217,8 @@ def compute_patch_difference(
     for shift in product(range(-MAX_SHIFT, MAX_SHIFT + 1), repeat=2):
         shown = sample(normalized, pixels + pixels.new_tensor(shift))
         differs = (shown - photo.image).abs().amax(dim=-1)
-        least = torch.minimum(least, average_patches(differs))
+        least = torch.minimum(least, average_box(differs, PATCH_RADIUS))
     return least
-
-
-def average_patches(values: Float[Tensor, "h w"]) -> Float[Tensor, "h w"]:
-    """Average values over patches."""
-    side = 2 * PATCH_RADIUS + 1
-    return avg_pool2d(values[None, None], side, 1, PATCH_RADIUS, count_include_pad=False)[0, 0]
 
 
 def find_mutual_regions(
@@ -250,27 +226,21 @@ def find_mutual_regions(
 ) -> tuple[Bool[Tensor, "h w"], Bool[Tensor, "other_h other_w"]]:
     """Find regions in which two photographs contradict each other, each in both images."""
     other_regions = find_regions(other)
-    own_regions = keep_shared_parts(find_regions(one), other_regions, one.reprojection.pixels)
-    other_regions = keep_shared_parts(other_regions, own_regions, other.reprojection.pixels)
-    return keep_shared_parts(own_regions, other_regions, one.reprojection.pixels), other_regions
+    own_regions = keep_shared_parts(find_regions(one), other_regions, one.pixels)
+    other_regions = keep_shared_parts(other_regions, own_regions, other.pixels)
+    return keep_shared_parts(own_regions, other_regions, one.pixels), other_regions
 
 
 def find_regions(comparison: Comparison) -> Bool[Tensor, "h w"]:
     """Find regions in conflict that are large enough and surrounded by confirmed pixels."""
     width = GAP_RADIUS + OUTLINE_WIDTH
-    padded = (
-        np.pad(mask.cpu().numpy().astype(np.uint8), width)
-        for mask in (
-            comparison.conflict_mask,
-            comparison.reprojection.in_frame_mask,
-            comparison.confirmed_mask,
-        )
+    masks = comparison.conflict_mask, comparison.in_frame_mask, comparison.confirmed_mask
+    conflict, framed, confirmed = (
+        np.pad(mask.cpu().numpy().astype(np.uint8), width) for mask in masks
     )
-    conflict, framed, confirmed = padded
     whole = cv2.morphologyEx(conflict, cv2.MORPH_CLOSE, make_disc(GAP_RADIUS))
-    labels = label_components(cv2.morphologyEx(whole, cv2.MORPH_OPEN, make_disc(NOISE_RADIUS)))
-    found = np.zeros_like(labels, dtype=bool)
-    for region in (labels == label for label in range(1, labels.max() + 1)):
+    found = np.zeros(conflict.shape, bool)
+    for region in split_parts(cv2.morphologyEx(whole, cv2.MORPH_OPEN, make_disc(NOISE_RADIUS))):
         outline = compute_outline(region)
         closed = framed[outline].mean() >= 1 - MAX_OUT_OF_FRAME
         certain = confirmed[outline].mean() >= MIN_CONFIRMED
@@ -286,14 +256,11 @@ def keep_shared_parts(
 ) -> Bool[Tensor, "h w"]:
     """Keep the parts of a region that project onto regions of the other photograph."""
     falls = sample(dilate(others, 2)[..., None].float(), pixels, "nearest")[..., 0] > 0
-    labels = torch.from_numpy(label_components(region.cpu().numpy().astype(np.uint8))).to(
-        region.device
-    )
-    found = torch.zeros_like(region)
-    for part in (labels == label for label in range(1, int(labels.max()) + 1)):
-        if int((part & falls).sum()) >= MIN_SHARED_REGION * int(part.sum()):
+    shared, found = falls.cpu().numpy(), np.zeros(region.shape, bool)
+    for part in split_parts(region.cpu().numpy().astype(np.uint8)):
+        if (part & shared).sum() >= MIN_SHARED_REGION * part.sum():
             found |= part
-    return found
+    return torch.from_numpy(found).to(region.device)
 
 
 def compute_outline(region: Bool[np.ndarray, "h w"]) -> Bool[np.ndarray, "h w"]:
@@ -302,9 +269,10 @@ def compute_outline(region: Bool[np.ndarray, "h w"]) -> Bool[np.ndarray, "h w"]:
     return (cv2.dilate(mask, make_disc(OUTLINE_WIDTH)) > 0) & (cv2.dilate(mask, make_disc(1)) == 0)
 
 
-def label_components(mask: np.ndarray) -> Int[np.ndarray, "h w"]:
-    """Label connected components from 1; 0 is background."""
-    return cv2.connectedComponents(mask, connectivity=4)[1]
+def split_parts(mask: UInt8[np.ndarray, "h w"]) -> Iterator[Bool[np.ndarray, "h w"]]:
+    """Split a mask into its connected parts."""
+    count, labels = cv2.connectedComponents(mask, connectivity=4)
+    return (labels == label for label in range(1, count))
 
 
 def make_disc(radius: int) -> np.ndarray:

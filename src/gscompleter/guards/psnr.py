@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from functools import cached_property
 from typing import Literal
 
 import torch
@@ -66,6 +65,10 @@ class PsnrGuard(Guard):
             [restrict_to_image(plan) for plan in plans],
             state.config.psnr_guard,
         )
+
+    def explain_rejection(self, attempt: Attempt) -> str:
+        """Name the photographs as the reason."""
+        return "Most of the Gaussians that were generated here make photographs worse."
 
 
 def set_error_budgets(
@@ -170,27 +173,10 @@ class CheckedRender:
     check: Check
     opacities: Float[Tensor, "n"]
     image: Float[Tensor, "h w 3"]
-
-    @staticmethod
-    def from_check(check: Check, opacities: Float[Tensor, "n"]) -> CheckedRender:
-        """Render the photograph of a check."""
-        return CheckedRender(check, *render_with_gradient(check.render_image, opacities))
-
-    @cached_property
-    def worst_budget(self) -> ErrorBudget:
-        """The budget that is exceeded most, relative to its limit."""
-        return max(
-            self.check.budgets, key=lambda one: self.compute_error(one) / max(one.limit, 1e-12)
-        )
-
-    @cached_property
-    def excess(self) -> float:
-        """Error above the limit of that budget."""
-        return self.compute_error(self.worst_budget) - self.worst_budget.limit
-
-    def compute_error(self, budget: ErrorBudget) -> float:
-        """Compute the error that a budget limits."""
-        return compute_pixel_errors(self.image.detach().clamp(0, 1), budget).sum().item()
+    worst_budget: ErrorBudget
+    """The budget that is exceeded most, relative to its limit."""
+    excess: float
+    """Error above the limit of that budget."""
 
     def choose_fading(self, trial: int, added: Gaussians) -> Bool[Tensor, "n"]:
         """Choose the Gaussians that lose opacity.
@@ -219,8 +205,18 @@ class CheckedRender:
 
 def find_over_budget(checks: Sequence[Check], opacities: Float[Tensor, "n"]) -> list[CheckedRender]:
     """Render all photographs and return those over budget."""
-    rendered = (CheckedRender.from_check(check, opacities) for check in checks)
+    rendered = (render_check(check, opacities) for check in checks)
     return [render for render in rendered if render.excess > 0]
+
+
+def render_check(check: Check, opacities: Float[Tensor, "n"]) -> CheckedRender:
+    """Render a photograph and compare it with its error budgets."""
+    variable, image = render_with_gradient(check.render_image, opacities)
+    clipped = image.detach().clamp(0, 1)
+    errors = [compute_pixel_errors(clipped, budget).sum().item() for budget in check.budgets]
+    budgets = zip(check.budgets, errors, strict=True)
+    worst, error = max(budgets, key=lambda pair: pair[1] / max(pair[0].limit, 1e-12))
+    return CheckedRender(check, variable, image, worst, error - worst.limit)
 
 
 def is_mostly_faded(

@@ -24,8 +24,8 @@ from gscompleter.geometry import (
 from gscompleter.image_ops import dilate, fill_smoothly
 from gscompleter.next_best_view.candidates import Candidate
 from gscompleter.render.lod import MAX_PREVIEW_GAUSSIANS, choose_thinned_rows, thin_gaussians
-from gscompleter.state import Completion, ContextScene
-from gscompleter.types import Camera, Gaussians, Render, make_observed
+from gscompleter.state import Completion
+from gscompleter.types import Camera, ContextScene, Gaussians, Render, make_observed
 
 
 @dataclass(frozen=True)

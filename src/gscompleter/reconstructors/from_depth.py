@@ -11,6 +11,7 @@ import numpy as np
 from jaxtyping import Bool
 from torch import Tensor
 
+from gscompleter.reconstructors.features.depth_range import get_depth_range, set_depth_range
 from gscompleter.reconstructors.features.stereo_image import (
     StereoImage,
     compute_source_from_reference,
@@ -18,7 +19,6 @@ from gscompleter.reconstructors.features.stereo_image import (
 )
 from gscompleter.reconstructors.plane_sweep.fusion import Layer
 from gscompleter.reconstructors.plane_sweep.gaussians import Splatter
-from gscompleter.reconstructors.plane_sweep.reconstructor import set_depth_range
 from gscompleter.reconstructors.plane_sweep.rig import Transforms
 from gscompleter.types import DepthMap, Reconstruction, View
 
@@ -40,7 +40,7 @@ class FromDepth(Splatter):
 
     def __call__(self, views: Sequence[View]) -> Reconstruction:
         """Predict depths and build the scene; errors as in `PlaneSweep.__call__`."""
-        views = set_depth_range(views)
+        views = set_depth_range(views, *get_depth_range(views))
         images, unit = make_stereo_images(views)
         depths = self.model(views)
         layers = [make_layer(*pair, unit) for pair in zip(images, depths, strict=True)]
@@ -48,7 +48,7 @@ class FromDepth(Splatter):
 
     def lift(self, views: Sequence[View], pixel_mask: Bool[Tensor, "h w"]) -> Reconstruction:
         """Lift the pixels of `pixel_mask` in the first view; errors as in `__call__`."""
-        views = set_depth_range(views)
+        views = set_depth_range(views, *get_depth_range(views))
         return self.lift_pixels(views, self.model(views), pixel_mask)
 
 

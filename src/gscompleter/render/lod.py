@@ -21,7 +21,7 @@ from gscompleter.kernels.project import GaussianArrays
 from gscompleter.memory import count_fitting_gaussians
 from gscompleter.render.cpu import to_arrays
 from gscompleter.render.viewpoint import to_float32
-from gscompleter.types import Camera, Gaussians, Proxy
+from gscompleter.types import Camera, ContextScene, Gaussians
 
 MIN_PROXY_GAUSSIANS = 500_000
 """Gaussians from which on a proxy saves more time than it takes to build."""
@@ -33,14 +33,14 @@ MAX_GROWTH = 8.0
 """Largest factor on both, if the proxy would be too large otherwise."""
 
 
-def build_proxy(scene: Gaussians, cameras: Sequence[Camera]) -> Proxy:
+def build_proxy(scene: Gaussians, cameras: Sequence[Camera]) -> ContextScene:
     """Build the LOD proxy of a large `scene`; one that is small or on a GPU is its own."""
     if len(scene) < MIN_PROXY_GAUSSIANS or scene.means.is_cuda:
-        return Proxy(scene, torch.arange(0, device=scene.means.device))
+        return ContextScene.whole(scene)
     return simplify_scene(scene, cameras)
 
 
-def simplify_scene(scene: Gaussians, cameras: Sequence[Camera]) -> Proxy:
+def simplify_scene(scene: Gaussians, cameras: Sequence[Camera]) -> ContextScene:
     """Merge runs of adjacent, close Gaussians of one provenance to one Gaussian each.
 
     Runs are as few as frozen views of `cameras` can hold. A scene in random order has no runs.
@@ -56,7 +56,7 @@ def simplify_scene(scene: Gaussians, cameras: Sequence[Camera]) -> Proxy:
     run = torch.arange(len(sizes)).repeat_interleave(sizes)
     appearance = opacities, sh.unflatten(1, scene.sh.shape[1:]), scene.generated[first]
     merged = Gaussians(means, quats, scales, *appearance, is_antialiased=scene.is_antialiased)
-    return Proxy(merged, run)
+    return ContextScene(scene, merged, run)
 
 
 def find_run_starts(

@@ -96,8 +96,7 @@ class AlignmentData:
     def restrict_to(self, transform: Matrix) -> AlignmentData:
         """Simplify the splat to what the cameras see under `transform`, photographs to splat."""
         cameras = [transform_camera(view.camera, transform) for view in self.views]
-        proxy = build_proxy(self.scene, cameras)
-        return replace(self, scene=thin_gaussians(self.scene if proxy is None else proxy.scene))
+        return replace(self, scene=thin_gaussians(build_proxy(self.scene, cameras).rendered))
 
     def score_transform(self, transform: Matrix) -> SplatFit:
         """Score a transform from the photographs' frame to the splat's."""

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from typing import Literal
 
 import torch
 from jaxtyping import Bool, Float
@@ -11,7 +12,7 @@ from torch import Tensor
 from gscompleter.config import AlignmentConfig
 from gscompleter.stages.target_view import TargetView
 from gscompleter.timing import timed_stage
-from gscompleter.types import DepthAffine, DepthMap, DepthPairs, Lift, Render
+from gscompleter.types import DepthAffine, DepthMap, DepthPairs, Lift
 
 MAX_TRIALS = 512
 """Two-point hypotheses."""
@@ -25,8 +26,11 @@ MIN_INLIERS = 0.3
 """Smallest inlier fraction of a reliable fit."""
 MIN_PIXELS = 64
 """Fewest comparable pixels that a fit needs."""
+MAX_PAIRS = 1000
+"""Most compared depths that are kept as a sample."""
 MIN_DEPTH_SPREAD = 0.05
-"""Smallest depth spread that separates scale and shift; below, only a scale is fitted."""
+"""Smallest (p95 - p5) / median of depths that separates scale and shift.
+Below, only a scale is fitted."""
 
 
 def fit_affine(predicted: DepthMap, context: DepthMap, rng: torch.Generator) -> DepthAffine:
@@ -41,7 +45,8 @@ def fit_affine(predicted: DepthMap, context: DepthMap, rng: torch.Generator) -> 
         sample = torch.randperm(len(x), generator=rng)[:MAX_PIXELS].to(x.device)
         x, y = x[sample], y[sample]
 
-    if compute_depth_spread(x) >= MIN_DEPTH_SPREAD:
+    low, median, high = x.quantile(x.new_tensor([0.05, 0.5, 0.95])).tolist()
+    if (high - low) / median >= MIN_DEPTH_SPREAD:
         scale, shift = fit_line_ransac(x, y, rng)
         inliers = find_affine_inliers(x, y, scale, shift).double().mean().item()
         if scale > 0 and inliers >= MIN_INLIERS:
@@ -58,12 +63,6 @@ def pair_depths(
     """Return both z-depths at the pixels where both are valid."""
     comparable = predicted.valid & context.valid & (predicted.depth > 0) & (context.depth > 0)
     return predicted.depth[comparable].double(), context.depth[comparable].double()
-
-
-def compute_depth_spread(depth: Float[Tensor, "n"]) -> float:
-    """Compute (p95 - p5) / median of depths."""
-    low, median, high = depth.quantile(depth.new_tensor([0.05, 0.5, 0.95])).tolist()
-    return (high - low) / median
 
 
 def find_affine_inliers(
@@ -112,31 +111,23 @@ def fit_line_ransac(
 
 @timed_stage("register")
 def align_depth(lift: Lift, view: TargetView, rng: torch.Generator) -> DepthAffine:
-    """Fit the affine depth correction of a lifted target, with a sample of compared depths."""
-    config = view.state.config.alignment
-    affine = fit_alignment(lift, view.render, view.anchor_render, rng, config)
-    pairs = sample_depth_pairs(lift, view.render, view.anchor_render, affine, config)
-    return replace(affine, pairs=pairs)
-
-
-def fit_alignment(
-    lift: Lift,
-    at_target: Render,
-    at_anchor: Render,
-    rng: torch.Generator,
-    config: AlignmentConfig = AlignmentConfig(),
-) -> DepthAffine:
     """Fit the affine depth correction at the anchor (the paper's bridge) or at the target.
 
     The context has holes at the target, but the part that is visible there can contradict the
     anchor.
     """
+    config = view.state.config.alignment
+    at_target = lift.reference_depth, view.render.depth_map()
+    at_anchor = lift.anchor_depth, view.anchor_render.depth_map()
     if config.align_at == "none":
         return DepthAffine()
     if config.align_at == "target":
-        return fit_affine(lift.reference_depth, at_target.depth_map(), rng)
-    affine = fit_affine(lift.anchor_depth, at_anchor.depth_map(), rng)
-    return refit_at_target(affine, lift.reference_depth, at_target.depth_map(), rng, config)
+        affine = fit_affine(*at_target, rng)
+    else:
+        affine = refit_at_target(fit_affine(*at_anchor, rng), *at_target, rng, config)
+    if config.align_at == "target" or affine.is_refitted_at_target:
+        return replace(affine, pairs=sample_depth_pairs("target", *at_target, affine))
+    return replace(affine, pairs=sample_depth_pairs("anchor", *at_anchor, affine))
 
 
 def refit_at_target(
@@ -164,22 +155,14 @@ def refit_at_target(
     return replace(refitted, agreement=refitted.inliers, is_refitted_at_target=True)
 
 
-MAX_PAIRS = 1000
-"""Most pixels in the sample."""
-
-
 def sample_depth_pairs(
-    lift: Lift, at_target: Render, at_anchor: Render, affine: DepthAffine, config: AlignmentConfig
+    fit_view: Literal["anchor", "target"],
+    predicted: DepthMap,
+    context: DepthMap,
+    affine: DepthAffine,
 ) -> DepthPairs:
     """Sample the depths that `affine` was fitted to."""
-    if config.align_at == "none":
-        return DepthPairs.empty()
-    at_the_target = config.align_at == "target" or affine.is_refitted_at_target
-    predicted, render = lift.anchor_depth, at_anchor
-    if at_the_target:
-        predicted, render = lift.reference_depth, at_target
-    x, y = pair_depths(predicted, render.depth_map())
+    x, y = pair_depths(predicted, context)
     step = max(1, -(-len(x) // MAX_PAIRS))
     x, y = x[::step], y[::step]
-    agrees = find_affine_inliers(x, y, affine.scale, affine.shift)
-    return DepthPairs("target" if at_the_target else "anchor", x, y, agrees)
+    return DepthPairs(fit_view, x, y, find_affine_inliers(x, y, affine.scale, affine.shift))

@@ -14,11 +14,10 @@ from gscompleter.config import CompleterConfig
 from gscompleter.errors import InputError
 from gscompleter.geometry import compute_z_depths, project_mask
 from gscompleter.reconstructors import Reconstructor, run_reconstructor
-from gscompleter.reconstructors.features.depth_range import get_depth_range
+from gscompleter.reconstructors.features.depth_range import get_depth_range, set_depth_range
 from gscompleter.render import Renderer
 from gscompleter.render.lod import build_proxy
-from gscompleter.state import ContextScene
-from gscompleter.types import Camera, Gaussians, Reconstruction, View
+from gscompleter.types import Camera, ContextScene, Gaussians, Reconstruction, View
 
 MIN_CONTRAST = 0.02
 """Brightness range in 5 x 5 smoothed pixels that counts as texture; colours are in [0, 1]."""
@@ -81,8 +80,9 @@ def reconstruct_context(reconstructor: Reconstructor, views: Sequence[View]) -> 
     """Reconstruct `G_ctx = Ψ(V_in)` from posed photographs (paper, Eq. 5)."""
     check_texture(views)
     views = set_depth_range(views, *get_depth_range(views))
-    gaussians, gains = reconstruct(reconstructor, views)
-    return InitialContext(ContextScene.whole(gaussians), normalize_exposures(views, gains), gains)
+    made = run_reconstructor(reconstructor, views)
+    source, gains = ContextScene.whole(drop_ignored(made, views)), made.exposure_gains
+    return InitialContext(source, normalize_exposures(views, gains), gains)
 
 
 def take_scene(
@@ -98,23 +98,9 @@ def take_scene(
     """
     check_finite(scene)
     photos = [*views, *check_views]
-    proxy = build_proxy(scene, [*targets, *(view.camera for view in photos)])
-    source = ContextScene(scene, proxy.scene, proxy.proxy_index)
+    source = build_proxy(scene, [*targets, *(view.camera for view in photos)])
     near, far = find_depth_range(views, source.rendered, renderer)
     return InitialContext(source, tuple(set_depth_range(photos, near, far)))
-
-
-def reconstruct(
-    reconstructor: Reconstructor, views: Sequence[View]
-) -> tuple[Gaussians, Float[Tensor, "v 3"] | None]:
-    """Run Ψ without ignored pixels; also return exposure gains if it estimated them."""
-    reconstruction = run_reconstructor(reconstructor, views)
-    return drop_ignored(reconstruction, views), reconstruction.exposure_gains
-
-
-def set_depth_range(views: Sequence[View], near: float, far: float) -> list[View]:
-    """Set the depth range of all cameras, in scene units."""
-    return [replace(view, camera=replace(view.camera, near=near, far=far)) for view in views]
 
 
 def check_colors(views: Sequence[View]) -> None:
@@ -216,11 +202,6 @@ def measure_depth_range(
             "No context camera sees the scene that was given; check that the .ply and the "
             "photographs share one world frame and one unit."
         )
-    low, high = compute_percentiles(torch.cat(depths), 0.01, 0.99)
+    ordered = torch.cat(depths).sort().values  # torch.quantile stops at 16 million
+    low, high = (ordered[round(share * (len(ordered) - 1))].item() for share in (0.01, 0.99))
     return 0.5 * low, 2.0 * high
-
-
-def compute_percentiles(values: torch.Tensor, *shares: float) -> list[float]:
-    """Compute percentiles of any number of values (torch.quantile stops at 16 million)."""
-    ordered = values.flatten().sort().values
-    return [ordered[round(share * (len(ordered) - 1))].item() for share in shares]

@@ -17,7 +17,7 @@ from gscompleter.progress import track
 from gscompleter.render import OpacityRender
 from gscompleter.stages.target_view import TargetView
 from gscompleter.timing import timed_stage
-from gscompleter.types import Camera, Gaussians, View
+from gscompleter.types import Gaussians, View
 
 
 @dataclass(frozen=True)
@@ -36,17 +36,13 @@ def refine(kept: Gaussians, reference: View, view: TargetView) -> Refined:
     """Refine the opacities of added Gaussians against the image and the nearest photographs."""
     views, config = view.state.views, view.state.config.refine
     plans = tuple(frozen.vary_opacities(kept) for frozen in view.frozen_photos)
-    near = sort_by_distance(reference.camera, views)[: config.num_views]
+    distances = [measure_baseline(reference.camera, photo.camera) for photo in views]
+    near = sorted(range(len(views)), key=distances.__getitem__)[: config.num_views]
     at_target = view.frozen.vary_opacities(kept)
     refined, losses = refine_opacities(
         kept, at_target, reference, [plans[i] for i in near], [views[i] for i in near], config
     )
     return Refined(refined, plans, losses)
-
-
-def sort_by_distance(camera: Camera, views: Sequence[View]) -> list[int]:
-    """Sort indices of `views` by their distance to `camera`."""
-    return sorted(range(len(views)), key=lambda i: measure_baseline(camera, views[i].camera))
 
 
 def has_settled(losses: Sequence[float], rel_tol: float) -> bool:

@@ -49,7 +49,7 @@ def select_context(
     `points` are on or near surfaces, in world coordinates; at least one.
     """
     share = max(MAX_POINTS // len(targets), 1)
-    seen = [subsample(find_visible_points(target, points), share) for target in targets]
+    seen = [find_visible_points(target, points, share) for target in targets]
     worth = torch.cat(
         [score_cameras(t, candidates, p) for t, p in zip(targets, seen, strict=True)], dim=1
     )
@@ -101,12 +101,14 @@ def score_cameras(
     return torch.where(shown, 1.0, OUTSIDE_SCORE) / (1 + (apart / HALF_SCORE_ANGLE) ** 2)
 
 
-def find_visible_points(target: Camera, points: Float[Tensor, "n 3"]) -> Float[Tensor, "p 3"]:
-    """Return the points that a target sees, or points on a plane if there are few."""
+def find_visible_points(
+    target: Camera, points: Float[Tensor, "n 3"], count: int = MAX_POINTS
+) -> Float[Tensor, "p 3"]:
+    """Return every n-th point that a target sees, or points on a plane if there are few."""
     seen = points[is_inside(*project(points, target), target)]
-    if len(seen) >= MIN_POINTS:
-        return seen
-    return make_plane_in_front(target, (points - target.center).norm(dim=-1).median().item())
+    if len(seen) < MIN_POINTS:
+        seen = make_plane_in_front(target, (points - target.center).norm(dim=-1).median().item())
+    return seen[:: -(-len(seen) // count)]
 
 
 def make_points_in_front(target: Camera, near: float, far: float) -> Float[Tensor, "p 3"]:
@@ -123,11 +125,6 @@ def make_plane_in_front(target: Camera, depth: float) -> Float[Tensor, "p 3"]:
         for side in (target.height, target.width)
     )
     return target.center + depth * rays[rows][:, columns].reshape(-1, 3)
-
-
-def subsample(points: Float[Tensor, "n 3"], count: int) -> Float[Tensor, "m 3"]:
-    """Keep every n-th point, at most `count`."""
-    return points[:: -(-len(points) // count)]
 
 
 def compute_directions(
@@ -199,26 +196,20 @@ def find_medoid(apart: Float[Tensor, "n n"], members: Tensor) -> int:
 def has_partner(
     index: int, chosen: Sequence[int], cameras: Sequence[Camera], points: Float[Tensor, "n 3"]
 ) -> bool:
-    """Return True if another chosen camera shares enough points at usable angles."""
-    seen = subsample(find_visible_points(cameras[index], points), MAX_POINTS)
-    others = [cameras[other] for other in chosen if other != index]
-    return any(
-        compute_shared_fraction(cameras[index], other, seen) >= MIN_SHARED_FRACTION
-        for other in others
-    )
-
-
-def compute_shared_fraction(camera: Camera, other: Camera, points: Float[Tensor, "p 3"]) -> float:
-    """Compute the fraction of points that another camera sees at a usable triangulation angle."""
-    one, two = compute_directions([camera, other], points)
-    turn = compute_angles(one, two)
-    bearable = (turn > 0) & (turn < MAX_ANGLE)
-    return (bearable & is_inside(*project(points, other), other)).float().mean().item()
+    """Return True if another chosen camera shares enough points at usable triangulation angles."""
+    seen = find_visible_points(cameras[index], points)
+    own, *rays = compute_directions([cameras[i] for i in (index, *chosen)], seen)
+    for number, directions in zip(chosen, rays, strict=True):
+        turn, camera = compute_angles(own, directions), cameras[number]
+        shared = (turn > 0) & (turn < MAX_ANGLE) & is_inside(*project(seen, camera), camera)
+        if number != index and shared.float().mean().item() >= MIN_SHARED_FRACTION:
+            return True
+    return False
 
 
 def find_partner(index: int, cameras: Sequence[Camera], points: Float[Tensor, "n 3"]) -> int:
     """Find the camera that makes the best stereo pair with another."""
-    seen = subsample(find_visible_points(cameras[index], points), MAX_POINTS)
+    seen = find_visible_points(cameras[index], points)
     worth = score_cameras(cameras[index], cameras, seen)
     pairs = score_pairs(index, worth, compute_directions(cameras, seen)).sum(dim=-1)
     pairs[index] = -1.0

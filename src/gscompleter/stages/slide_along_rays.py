@@ -6,6 +6,8 @@ from collections.abc import Callable
 from dataclasses import dataclass, replace
 from typing import Literal
 
+import cv2
+import numpy as np
 import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
@@ -17,8 +19,7 @@ from gscompleter.image_ops import fill_smoothly
 from gscompleter.optim import Adam
 from gscompleter.progress import track
 from gscompleter.render import FrozenScene, Renderer
-from gscompleter.sky import mask_out_sky
-from gscompleter.stages.extrapolate import extrapolate_sky
+from gscompleter.sky import compute_sky_depth, is_sky, mask_out_sky
 from gscompleter.stages.target_view import TargetView
 from gscompleter.timing import timed_stage
 from gscompleter.types import Camera, DepthAffine, DepthMap, Gaussians, Lift, Render, View
@@ -27,6 +28,8 @@ OCCLUSION_TOLERANCE = 0.05
 """Distance behind the context, relative to depth, that still counts as the same surface."""
 EXTRAPOLATION_TOLERANCE = 0.02
 """Largest relative depth error of a pixel whose correction is extrapolated into holes."""
+MAX_COLOR_DIFFERENCE = 0.1
+"""Largest colour difference per channel between a hole and the sky that is extrapolated."""
 
 
 @dataclass(frozen=True)
@@ -52,15 +55,7 @@ def slide_along_rays(
     )
     if config.iterations == 0 or len(coarse) == 0:
         return Registration(coarse, pixel_index, ())
-    registered, losses = register_along_rays(
-        coarse,
-        view.frozen,
-        view.anchor_render,
-        reference,
-        view.anchor_view.camera,
-        view.scenes.renderer,
-        config,
-    )
+    registered, losses = register_along_rays(coarse, reference, view)
     if config.hole_depth == "scene" and pixel_index is not None:
         depth = fill_smoothly(view.render.depth, ~view.holes).flatten()[pixel_index]
         return Registration(move_to_depths(coarse, reference.camera, depth), pixel_index, losses)
@@ -98,6 +93,39 @@ def extrapolate_into_holes(
     return slide(coarse, camera, ratio, config.footprint)
 
 
+def extrapolate_sky(
+    candidates: Gaussians, pixel_index: Int[Tensor, "n"], scene: DepthMap, reference: View
+) -> Gaussians:
+    """Move Gaussians of holes that continue the sky to its depth.
+
+    `scene` is the depth at the target; its invalid pixels are holes.
+    """
+    camera = reference.camera
+    sky = scene.valid & is_sky(scene.depth, camera)
+    if not sky.any():
+        return candidates
+    continued = find_sky_continuation(sky, scene.valid, reference.image).flatten()[pixel_index]
+    depths = compute_z_depths(candidates.means, camera)
+    return move_to_depths(candidates, camera, depths.where(~continued, compute_sky_depth(camera)))
+
+
+def find_sky_continuation(
+    sky: Bool[Tensor, "h w"], known: Bool[Tensor, "h w"], image: Float[Tensor, "h w 3"]
+) -> Bool[Tensor, "h w"]:
+    """Find hole pixels whose nearest known pixel is sky of a similar colour."""
+    _, labels = cv2.distanceTransformWithLabels(
+        (~known).cpu().numpy().astype(np.uint8), cv2.DIST_L2, 5, labelType=cv2.DIST_LABEL_PIXEL
+    )
+    label = torch.from_numpy(labels).long().to(known.device)
+    pixel = torch.zeros(int(label.max()) + 1, dtype=torch.long, device=known.device)
+    at = torch.nonzero(known.flatten())[:, 0]
+    pixel[label.flatten()[at]] = at
+    nearest = pixel[label]
+    colours = image.reshape(-1, 3)[nearest]
+    like = (image - colours).abs().amax(dim=-1) < MAX_COLOR_DIFFERENCE
+    return ~known & sky.flatten()[nearest] & like
+
+
 def apply_affine(
     gaussians: Gaussians,
     affine: DepthAffine,
@@ -120,19 +148,15 @@ def bound(ratio: Float[Tensor, "n"], least: float | None) -> Float[Tensor, "n"]:
 
 
 def register_along_rays(
-    coarse: Gaussians,
-    frozen_target: FrozenScene,
-    at_anchor: Render,
-    reference: View,
-    anchor: Camera,
-    renderer: Renderer,
-    config: RegistrationConfig,
+    coarse: Gaussians, reference: View, view: TargetView
 ) -> tuple[Gaussians, tuple[float, ...]]:
     """Minimize Eq. 11 over one distance per Gaussian; also return the loss per iteration.
 
     Gaussians that reach no compared pixel have no gradient and are not rendered.
     """
-    objective = Objective.from_renders(frozen_target.render, at_anchor, reference, anchor, config)
+    config, renderer = view.state.config.registration, view.scenes.renderer
+    anchor = view.anchor_view.camera
+    objective = Objective.from_renders(view.render, view.anchor_render, reference, anchor, config)
     rows = objective.find_reached(coarse, reference.camera, anchor).nonzero()[:, 0]
     seen = coarse[rows]
     alone = make_renderer_alone(
@@ -146,7 +170,7 @@ def register_along_rays(
     for iteration in track(range(config.iterations), "Registering"):
         left = 1 - iteration / config.iterations if config.lr_schedule == "linear" else 1.0
         moved = move_along_rays(seen, parameters, reference.camera, config)
-        loss = objective(moved, frozen_target, alone, renderer.render(moved, anchor))
+        loss = objective(moved, view.frozen, alone, renderer.render(moved, anchor))
         optimizer.step(loss, left)
         losses.append(loss.item())
     with torch.no_grad():

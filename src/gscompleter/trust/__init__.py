@@ -7,7 +7,6 @@ everywhere, right or wrong, so there the photographs decide.
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Protocol, runtime_checkable
 
 import torch
 from jaxtyping import Float, Int, Int64
@@ -36,41 +35,24 @@ class HeldViews:
         )
 
 
-@runtime_checkable
-class Trust(Protocol):
-    """Trust in [0, 1] of each Gaussian of the context; added Gaussians always have 1."""
+@dataclass(frozen=True, kw_only=True)
+class Trust:
+    """Trust in [0, 1] of each Gaussian of the context; added Gaussians always have 1.
+
+    This one is 1 everywhere: the paper's assumption, exact for a context that Ψ reconstructed.
+    """
+
+    held: HeldViews = HeldViews(torch.empty(0, 3), torch.empty(0, 0), torch.empty(0))
+    """Views in which recolouring keeps the colours of the context; without any, none changes."""
 
     def compute_alpha(self, frozen: FrozenScene, camera: Camera) -> Float[Tensor, "h w"]:
         """Render accumulated opacity with every Gaussian weighted by its trust."""
+        return frozen.render.alpha
 
     def accept(self, frozen: FrozenScene, camera: Camera, rows: Int64[Tensor, "r"]) -> Trust:
         """Trust recoloured rows, and hold all colours in the direction of a completed target."""
+        return self
 
     def thin(self, rows: Int[Tensor, "r"], growth: Float[Tensor, "r"]) -> Trust:
         """Restrict to rows that stand for their neighbours, each enlarged by a factor."""
-
-    @property
-    def held(self) -> HeldViews:
-        """Views in which recolouring keeps the colours of the context."""
-
-
-@dataclass(frozen=True)
-class FullTrust:
-    """Trust 1 everywhere: the paper's assumption, exact for a context that Ψ reconstructed."""
-
-    def compute_alpha(self, frozen: FrozenScene, camera: Camera) -> Float[Tensor, "h w"]:
-        """Return the rendered alpha itself."""
-        return frozen.render.alpha
-
-    def accept(self, frozen: FrozenScene, camera: Camera, rows: Int64[Tensor, "r"]) -> FullTrust:
-        """Return the same trust."""
         return self
-
-    def thin(self, rows: Int[Tensor, "r"], growth: Float[Tensor, "r"]) -> FullTrust:
-        """Return the same trust."""
-        return self
-
-    @property
-    def held(self) -> HeldViews:
-        """Return views of no Gaussian, so that none is recoloured."""
-        return HeldViews(torch.empty(0, 3), torch.empty(0, 0), torch.empty(0))

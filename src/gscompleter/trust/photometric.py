@@ -16,19 +16,20 @@ import numpy as np
 import torch
 from jaxtyping import Bool, Float, Int, Int64
 from torch import Tensor
-from torch.nn.functional import avg_pool2d, pad
+from torch.nn.functional import pad
 
 from gscompleter.config import CompleterConfig, TrustConfig
 from gscompleter.cpu_threads import use_one_torch_thread
 from gscompleter.generators.exposure import fit_robust_affine
 from gscompleter.geometry import compute_z_depths
+from gscompleter.image_ops import average_box
 from gscompleter.kernels import support as kernels
 from gscompleter.kernels.parallel import map_in_parallel, share
 from gscompleter.kernels.support import CameraPose
 from gscompleter.render import FrozenScene, get_view_map
 from gscompleter.render.cache import SceneRenderer
 from gscompleter.render.viewpoint import to_float32
-from gscompleter.trust import FullTrust, HeldViews, Trust
+from gscompleter.trust import HeldViews, Trust
 from gscompleter.types import Camera, Gaussians, Render, View
 
 BLUR_RADIUS = 0.01
@@ -54,12 +55,13 @@ class PhotoObservations:
 
 
 @dataclass(frozen=True)
-class PhotometricTrust:
-    """Trust of a Gaussian as far as photographs from similar directions confirm its colour."""
+class PhotometricTrust(Trust):
+    """Trust of a Gaussian as far as photographs from similar directions confirm its colour.
+
+    The held views are the photographs, then completed targets.
+    """
 
     observations: PhotoObservations
-    held: HeldViews
-    """The photographs, then completed targets."""
     is_recolored: Bool[Tensor, "m"]
     """True for Gaussians that a completed target recoloured; these are trusted."""
     config: TrustConfig
@@ -103,7 +105,7 @@ def load_trust(
 ) -> Trust:
     """Load the trust that a config names, from all photographs of the scene."""
     if config.trust == "full":
-        return FullTrust()
+        return Trust()
     cameras = tuple(view.camera for view in views)
     frozen, settings = scenes.freeze_at(parts, cameras), config.trust_settings
     observations = gather_observations(parts[0], views, frozen, settings)
@@ -112,7 +114,7 @@ def load_trust(
     weights = sums.new_full((len(cameras),), config.recolor.hold_weight)
     held = HeldViews(observations.centers, sums, weights)
     is_recolored = torch.zeros(len(parts[0]), dtype=torch.bool, device=sums.device)
-    return PhotometricTrust(observations, held, is_recolored, settings)
+    return PhotometricTrust(observations, is_recolored, settings, held=held)
 
 
 def compute_pixel_areas(means: Float[Tensor, "m 3"], camera: Camera) -> Float[Tensor, "m"]:
@@ -194,6 +196,4 @@ def sum_weights(frozen: FrozenScene) -> Float[Tensor, "n"]:
 
 def blur(values: Float[Tensor, "h w"]) -> Float[Tensor, "h w"]:
     """Apply the box filter of radius `BLUR_RADIUS`."""
-    radius = max(round(BLUR_RADIUS * max(values.shape)), 1)
-    pooled = avg_pool2d(values[None, None], 2 * radius + 1, 1, radius, count_include_pad=False)
-    return pooled[0, 0]
+    return average_box(values, max(round(BLUR_RADIUS * max(values.shape)), 1))

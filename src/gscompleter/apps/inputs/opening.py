@@ -43,6 +43,7 @@ from gscompleter.memory import (
     estimate_bytes,
     estimate_scene_bytes,
 )
+from gscompleter.reconstructors.features.depth_range import set_depth_range
 from gscompleter.render import Renderer, load_renderer
 from gscompleter.splat_alignment.estimate import align_splat
 from gscompleter.splat_alignment.similarity import transform_camera, transform_view
@@ -50,7 +51,7 @@ from gscompleter.splat_alignment.trainer_frames import InputSplat
 from gscompleter.splats.formats import FORMATS as SPLAT_FORMATS
 from gscompleter.splats.formats import detect_splat_format
 from gscompleter.splats.ply import find_finite_rows
-from gscompleter.stages.context import find_depth_range, set_depth_range
+from gscompleter.stages.context import find_depth_range
 from gscompleter.types import Camera, Gaussians, View
 
 MIN_IMAGE_SIZE = 16

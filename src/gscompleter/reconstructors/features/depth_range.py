@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
+from dataclasses import replace
 
 import numpy as np
 from jaxtyping import Float
@@ -52,6 +53,11 @@ def get_depth_range(
             "than far."
         )
     return near, far
+
+
+def set_depth_range(views: Sequence[View], near: float, far: float) -> list[View]:
+    """Set the depth range of all cameras, in scene units."""
+    return [replace(view, camera=replace(view.camera, near=near, far=far)) for view in views]
 
 
 def derive_range_from_baselines(

@@ -15,8 +15,8 @@ from jaxtyping import Float, Int
 
 from gscompleter.kernels import stereo
 from gscompleter.reconstructors.features.stereo_image import StereoImage
-from gscompleter.reconstructors.plane_sweep.consistency import MAX_RETURN_ERROR, UNKNOWN, Map, Mask
 from gscompleter.reconstructors.plane_sweep.rig import Transform, Transforms
+from gscompleter.reconstructors.plane_sweep.sweep import MAX_RETURN_ERROR, UNKNOWN, Map, Mask
 
 MAX_DEPTH_DIFFERENCE = 0.05
 """Largest relative depth difference between two views of the same surface."""
@@ -89,47 +89,39 @@ def compare_with_views(
 
 
 def find_free_pixels(layers: Sequence[Layer], transforms: Transforms) -> list[Mask]:
-    """Find the pixels of each view that are outside the free space of all other views."""
-    everywhere = [np.ones_like(layer.measured_mask) for layer in layers]
-    return [
-        find_unrefuted(layer, compare_with_views(number, layers, everywhere, transforms))
-        for number, layer in enumerate(layers)
-    ]
+    """Find the pixels of each view that are outside the free space of all other views.
 
-
-def find_unrefuted(layer: Layer, comparisons: Iterable[DepthComparison]) -> Mask:
-    """Mark pixels that no view sees through, or that more views confirm than refute."""
-    balance = np.zeros(layer.inverse.shape, np.int32)
-    seen_through = np.zeros(layer.inverse.shape, bool)
-    for meeting in comparisons:
-        balance += meeting.same_surface_mask.astype(np.int32) - meeting.free_space_mask
-        seen_through |= meeting.free_space_mask
-    return ~seen_through | (layer.measured_mask & (balance > 0))
+    No view sees through them, or more views confirm than refute them.
+    """
+    everywhere, found = [np.ones_like(layer.measured_mask) for layer in layers], []
+    for number, layer in enumerate(layers):
+        balance = np.zeros(layer.inverse.shape, np.int32)
+        seen_through = np.zeros(layer.inverse.shape, bool)
+        for meeting in compare_with_views(number, layers, everywhere, transforms):
+            balance += meeting.same_surface_mask.astype(np.int32) - meeting.free_space_mask
+            seen_through |= meeting.free_space_mask
+        found.append(~seen_through | (layer.measured_mask & (balance > 0)))
+    return found
 
 
 def find_finest_pixels(
     layers: Sequence[Layer], free: Sequence[Mask], transforms: Transforms
 ) -> list[Mask]:
-    """Find the `free` pixels of each view that no other view resolves better."""
-    return [
-        mask & ~find_better_elsewhere(number, layers, free, transforms)
-        for number, mask in enumerate(free)
-    ]
+    """Find the `free` pixels of each view whose surface no other view measured better.
 
-
-def find_better_elsewhere(
-    number: int, layers: Sequence[Layer], free: Sequence[Mask], transforms: Transforms
-) -> Mask:
-    """Mark interpolated or coarse pixels whose surface another view measured better."""
-    layer = layers[number]
-    own = 1 / layer.inverse / layer.image.K[0, 0]
-    better = np.zeros(own.shape, bool)
-    for meeting in compare_with_views(number, layers, free, transforms):
-        ratio = compute_depth_ratio(layer.inverse, transforms[number, meeting.other])
-        footprint = ratio / layer.inverse / layers[meeting.other].image.K[0, 0]
-        limit = own / FINER_FOOTPRINT if meeting.other < number else own * FINER_FOOTPRINT
-        better |= meeting.same_surface_mask & (~layer.measured_mask | (footprint < limit))
-    return better
+    A view measures better if the pixel is interpolated, or coarser.
+    """
+    found = []
+    for number, layer in enumerate(layers):
+        own = 1 / layer.inverse / layer.image.K[0, 0]
+        better = np.zeros(own.shape, bool)
+        for meeting in compare_with_views(number, layers, free, transforms):
+            ratio = compute_depth_ratio(layer.inverse, transforms[number, meeting.other])
+            footprint = ratio / layer.inverse / layers[meeting.other].image.K[0, 0]
+            limit = own / FINER_FOOTPRINT if meeting.other < number else own * FINER_FOOTPRINT
+            better |= meeting.same_surface_mask & (~layer.measured_mask | (footprint < limit))
+        found.append(free[number] & ~better)
+    return found
 
 
 def compute_depth_ratio(inverse: Map, transform: Transform) -> Float[np.ndarray, "h w"]:

@@ -10,7 +10,6 @@ from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from gscompleter.geometry import rotations_to_quats
-from gscompleter.reconstructors.plane_sweep.consistency import Mask
 from gscompleter.reconstructors.plane_sweep.fit import fit_colors, fit_jointly, fit_opacities
 from gscompleter.reconstructors.plane_sweep.fusion import (
     Layer,
@@ -19,6 +18,7 @@ from gscompleter.reconstructors.plane_sweep.fusion import (
     find_free_pixels,
 )
 from gscompleter.reconstructors.plane_sweep.rig import Transforms
+from gscompleter.reconstructors.plane_sweep.sweep import Mask
 from gscompleter.render import Renderer, load_renderer
 from gscompleter.sky import extend_sky, is_sky, restore_sky_colors
 from gscompleter.types import (

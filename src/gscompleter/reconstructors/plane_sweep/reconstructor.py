@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 import torch
@@ -11,15 +11,15 @@ from jaxtyping import Bool
 from torch import Tensor
 
 from gscompleter.kernels.parallel import map_in_parallel
-from gscompleter.reconstructors.features.depth_range import get_depth_range
+from gscompleter.reconstructors.features.depth_range import get_depth_range, set_depth_range
 from gscompleter.reconstructors.features.stereo_image import StereoImage
-from gscompleter.reconstructors.plane_sweep.consistency import Mask
 from gscompleter.reconstructors.plane_sweep.fusion import Layer
 from gscompleter.reconstructors.plane_sweep.gaussians import Splatter
 from gscompleter.reconstructors.plane_sweep.rig import Rig, build_rig
 from gscompleter.reconstructors.plane_sweep.sky_mask import find_skies, find_sky, transfer_sky
 from gscompleter.reconstructors.plane_sweep.surfaces import fit_surfaces
 from gscompleter.reconstructors.plane_sweep.sweep import (
+    Mask,
     Measurement,
     compute_inverse_depth,
     measure_depths,
@@ -43,7 +43,7 @@ class PlaneSweep(Splatter):
         Raises:
             InputError: There are fewer than two views, no baseline, or the depth range is empty.
         """
-        views = set_depth_range(views)
+        views = set_depth_range(views, *get_depth_range(views))
         rig = build_rig(views)
         layers = self.compute_layers(rig, views)
         return self.build_scene(
@@ -57,7 +57,7 @@ class PlaneSweep(Splatter):
         surfaces around it, at full size. Colours are fitted to the image itself. The sky gets no
         depth.
         """
-        views = set_depth_range(views)
+        views = set_depth_range(views, *get_depth_range(views))
         rig = build_rig(views)
         first, second = match_views(rig, views)
         open_there = find_sky(rig.images[1], second)
@@ -69,7 +69,7 @@ class PlaneSweep(Splatter):
 
     def estimate_depths(self, views: Sequence[View]) -> list[DepthMap]:
         """Estimate z-depth and confidence of every pixel, in scene units."""
-        views = set_depth_range(views)
+        views = set_depth_range(views, *get_depth_range(views))
         rig = build_rig(views)
         return make_depth_maps(self.compute_layers(rig, views), rig.unit, views)
 
@@ -79,12 +79,6 @@ class PlaneSweep(Splatter):
         seen = find_skies(rig, found)
         surfaces = map_in_parallel(make_layer, rig.images, map(Measurement.exclude, found, seen))
         return list(map(add_sky, surfaces, found, seen))
-
-
-def set_depth_range(views: Sequence[View]) -> list[View]:
-    """Give all views the same depth range, estimated if unknown."""
-    near, far = get_depth_range(views)
-    return [replace(v, camera=replace(v.camera, near=near, far=far)) for v in views]
 
 
 def match_views(rig: Rig, views: Sequence[View]) -> list[Measurement]:

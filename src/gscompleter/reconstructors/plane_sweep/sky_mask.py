@@ -12,7 +12,7 @@ from collections.abc import Sequence
 
 import cv2
 import numpy as np
-from jaxtyping import Bool, Float32, Float64
+from jaxtyping import Float32
 
 from gscompleter.reconstructors.features.stereo_image import (
     StereoImage,
@@ -20,12 +20,7 @@ from gscompleter.reconstructors.features.stereo_image import (
     take_largest_channel,
 )
 from gscompleter.reconstructors.plane_sweep.rig import Rig
-from gscompleter.reconstructors.plane_sweep.sweep import Measurement
-
-Map = Float32[np.ndarray, "h w"]
-Mask = Bool[np.ndarray, "h w"]
-OtherMask = Bool[np.ndarray, "a b"]
-Plane = Float64[np.ndarray, "3"]
+from gscompleter.reconstructors.plane_sweep.sweep import Map, Mask, Measurement
 
 MAX_SKY_GRADIENT = 0.012
 """Largest colour gradient inside a sky, per pixel, for colours in [0, 1]."""
@@ -76,7 +71,7 @@ def find_skies(rig: Rig, found: Sequence[Measurement]) -> list[Mask]:
     ]
 
 
-def transfer_sky(rig: Rig, sky_of_second: OtherMask) -> Mask:
+def transfer_sky(rig: Rig, sky_of_second: Mask) -> Mask:
     """Find the sky of the first view of a pair in the directions of the second view's sky."""
     first = rig.images[0]
     return find_even_region(first) & (sample_at_infinity(first.size, sky_of_second, rig, 0, 1) == 1)
@@ -168,12 +163,12 @@ def measure_planarity(outline: Mask, heights: Map) -> float:
     values, weight = heights[outline].astype(np.float64), np.ones(len(rows))
     for _ in range(ROUNDS):
         weighted = sites * weight[:, None]
-        plane: Plane = np.linalg.lstsq(weighted.T @ sites, weighted.T @ values, rcond=None)[0]
+        plane = np.linalg.lstsq(weighted.T @ sites, weighted.T @ values, rcond=None)[0]
         weight = 1 / np.maximum(np.abs(sites @ plane - values), 0.1 * PLANE_TOLERANCE)
     return float((np.abs(sites @ plane - values) < PLANE_TOLERANCE).mean())
 
 
-def is_confirmed(number: int, sky: Mask, others: Sequence[np.ndarray], rig: Rig) -> bool:
+def is_confirmed(number: int, sky: Mask, others: Sequence[Mask], rig: Rig) -> bool:
     """Test if most of `sky` is sky in the other views that show its direction."""
     shown = [
         sample_at_infinity(sky.shape, other, rig, number, i)[sky]
@@ -186,7 +181,7 @@ def is_confirmed(number: int, sky: Mask, others: Sequence[np.ndarray], rig: Rig)
 
 
 def sample_at_infinity(
-    size: tuple[int, ...], mask: OtherMask, rig: Rig, this: int, other: int
+    size: tuple[int, ...], mask: Mask, rig: Rig, this: int, other: int
 ) -> Float32[np.ndarray, "h w"]:
     """Sample the mask of another view in each pixel's direction; -1 if outside."""
     x, y = np.arange(size[1]) + 0.5, np.arange(size[0])[:, None] + 0.5

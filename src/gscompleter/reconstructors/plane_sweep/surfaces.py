@@ -44,7 +44,8 @@ def fit_surfaces(measured: Map, confidence: Map, image: Image) -> Map:
     levels: list[Level] = [(measured, confidence, image)]
     while len(levels) < LEVELS and min(levels[-1][0].shape) > 4:
         levels.append(halve_level(*levels[-1]))
-    heights = fill_unmeasured(*levels[-1][:2])
+    known, sure, _ = (torch.from_numpy(part) for part in levels[-1])
+    heights = fill_smoothly(known, sure > 0).numpy().copy()
     gradients = np.zeros((2, *heights.shape), np.float32)
     for number, (data, weight, colours) in reversed(list(enumerate(levels))):
         if heights.shape != data.shape:
@@ -57,11 +58,6 @@ def fit_surfaces(measured: Map, confidence: Map, image: Image) -> Map:
         steps = ITERATIONS * 2**number
         tgv.fit(heights, gradients, data, weight, across, down, bend, tolerance, steps)
     return heights
-
-
-def fill_unmeasured(data: AnyMap, weight: AnyMap) -> AnyMap:
-    """Continue the measurements smoothly as a starting point."""
-    return fill_smoothly(torch.from_numpy(data), torch.from_numpy(weight > 0)).numpy().copy()
 
 
 def compute_step_costs(image: Image) -> tuple[Map, Map]:
