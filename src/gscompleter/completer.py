@@ -10,7 +10,6 @@ import torch
 
 from gscompleter.config import CompleterConfig
 from gscompleter.config.settings import validate
-from gscompleter.deprecation import accept_old_keywords
 from gscompleter.errors import InputError
 from gscompleter.generators import Generator, ImageFunction, as_generator, load_generator
 from gscompleter.geometry import pad_camera, pad_like
@@ -76,13 +75,13 @@ class GSCompleter:
         """The renderer, with scenes frozen at the cameras that are visited again."""
         return SceneRenderer(self.renderer)
 
-    @accept_old_keywords(witnesses="check_views")
     def __call__(
         self,
         views: Sequence[View],
         target: Camera | Sequence[Camera],
         scene: Gaussians | None = None,
         check_views: Sequence[View] | None = None,
+        witnesses: Sequence[View] | None = None,
     ) -> Completion:
         """Complete what `views` never saw, as seen from one or several targets.
 
@@ -94,6 +93,7 @@ class GSCompleter:
                 reconstructs the context from `views`.
             check_views: Further photographs of `scene` that must not get worse. With them the scene
                 is trusted only as far as the photographs confirm it.
+            witnesses: Old name of `check_views`.
 
         Raises:
             InputError: Too few views, no baseline, too many targets, no view sees the scene, or no
@@ -103,6 +103,7 @@ class GSCompleter:
         if not targets:
             raise InputError("No target camera was given; name at least one view to complete.")
         check_target_ids(scene, len(targets))
+        check_views = check_views if witnesses is None else witnesses
         state = self.begin(views, scene, check_views, targets)
         batch = as_generator(self.generator).max_batch_size
         counted_as = "target" if batch == 1 else "group of targets"
@@ -111,7 +112,6 @@ class GSCompleter:
         check_any_completed(state)
         return state
 
-    @accept_old_keywords(witnesses="check_views")
     def begin(
         self,
         views: Sequence[View],
