@@ -9,8 +9,14 @@ from typing import Annotated, Any, Literal, get_args
 from annotated_types import Interval
 
 from gscompleter.config.coverage import COVERED
-from gscompleter.config.renamed import list_paths, refuse_old_keys
-from gscompleter.config.settings import Count, Settings, Share, Weight, apply_changes
+from gscompleter.config.settings import (
+    Count,
+    Settings,
+    Share,
+    Weight,
+    apply_changes,
+    read_yaml,
+)
 from gscompleter.errors import InputError, quote_value
 
 Pixels = Annotated[int, Interval(ge=0, le=4096)]
@@ -358,9 +364,6 @@ def load_config(source: str, is_splat: bool = False) -> CompleterConfig:
     path = Path(source)
     if path.suffix not in {".yaml", ".yml"}:
         return get_named_config(source, is_splat)
-    from gscompleter.config.yaml_file import read_yaml
-
     changes = read_yaml(path)
     base = get_named_config(str(changes.pop("base", "default")), is_splat)
-    refuse_old_keys(list_paths(changes), f"{quote_value(source)}: ")
     return apply_changes(base, changes, f"{quote_value(source)}: ")
