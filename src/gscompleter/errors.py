@@ -1,9 +1,8 @@
 """Errors for the user, and the sentences that they hold."""
 
 import os
-from collections.abc import Iterable, Sequence
+from collections.abc import Sequence
 from contextlib import suppress
-from itertools import pairwise
 from pathlib import Path
 from reprlib import Repr
 
@@ -63,16 +62,6 @@ def join_names(names: Sequence[object], most: int, length: int | None = None) ->
     """List the first `most` names, as in "a, b and 7 more"."""
     shown = ", ".join(quote_value(name, length) for name in names[:most])
     return f"{shown} and {len(names) - most} more" if len(names) > most else shown
-
-
-def join_numbers(numbers: Iterable[int]) -> str:
-    """List the first three runs of numbers, as in "0-39, 52 and 12 others"."""
-    found = sorted(set(numbers))
-    starts = [0, *(i + 1 for i, (a, b) in enumerate(pairwise(found)) if b != a + 1), len(found)]
-    runs = [found[start:stop] for start, stop in pairwise(starts)]
-    shown = ", ".join(f"{r[0]}-{r[-1]}" if len(r) > 1 else str(r[0]) for r in runs[:3] if r)
-    others = sum(map(len, runs[3:]))
-    return f"{shown} and {others} others" if others else shown
 
 
 def refuse_pointer(path: Path) -> None:
