@@ -81,7 +81,7 @@ class GSCompleter:
         target: Camera | Sequence[Camera],
         scene: Gaussians | None = None,
         check_views: Sequence[View] | None = None,
-        witnesses: Sequence[View] | None = None,
+        witnesses: Sequence[View] | None = None,  # the old name of `check_views`
     ) -> Completion:
         """Complete what `views` never saw, as seen from one or several targets.
 
@@ -93,7 +93,6 @@ class GSCompleter:
                 reconstructs the context from `views`.
             check_views: Further photographs of `scene` that must not get worse. With them the scene
                 is trusted only as far as the photographs confirm it.
-            witnesses: Old name of `check_views`.
 
         Raises:
             InputError: Too few views, no baseline, too many targets, no view sees the scene, or no

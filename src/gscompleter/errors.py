@@ -17,6 +17,10 @@ MAX_PATH_LENGTH = 250
 
 LFS_POINTER = b"version https://git-lfs"
 
+_REPR = Repr()
+_REPR.maxlevel, _REPR.maxstring, _REPR.maxother = 4, 4 * MAX_QUOTE_LENGTH, 4 * MAX_QUOTE_LENGTH
+_REPR.maxlist = _REPR.maxtuple = _REPR.maxdict = _REPR.maxset = MAX_QUOTE_LENGTH // 2
+
 
 class InputError(ValueError):
     """An error in the input, which the user can correct.
@@ -48,7 +52,7 @@ def quote_value(value: object, length: int | None = None) -> str:
     """
     if length is None:
         length = MAX_PATH_LENGTH if isinstance(value, os.PathLike) else MAX_QUOTE_LENGTH
-    text = str(value) if isinstance(value, (str, os.PathLike)) else _format_value(value)
+    text = str(value) if isinstance(value, (str, os.PathLike)) else _REPR.repr(value)
     # Only the ends of very long texts are processed.
     ends = text if len(text) <= 4 * length else text[: 2 * length] + text[-2 * length :]
     line = "".join(c if c.isprintable() else " " for c in ends)
@@ -74,15 +78,3 @@ def refuse_pointer(path: Path) -> None:
                 f"{quote_value(path)} is a git-lfs pointer, not the file itself; run "
                 "`git lfs pull` in its repository to fetch it."
             )
-
-
-_REPR = Repr()
-_REPR.maxlevel, _REPR.maxstring, _REPR.maxother = 4, 4 * MAX_QUOTE_LENGTH, 4 * MAX_QUOTE_LENGTH
-_REPR.maxlist = _REPR.maxtuple = _REPR.maxdict = _REPR.maxset = MAX_QUOTE_LENGTH // 2
-
-
-def _format_value(value: object) -> str:
-    try:
-        return _REPR.repr(value)
-    except (ValueError, RecursionError):  # integers of more than 4,300 digits are among them
-        return f"a {type(value).__name__} that cannot be written out"

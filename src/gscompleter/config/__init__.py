@@ -304,11 +304,6 @@ class CompleterConfig(Settings):
             holes=HoleConfig(dilation=0, candidate_radius=None),
         )
 
-    @staticmethod
-    def for_input(is_splat: bool) -> CompleterConfig:
-        """Return the preset for a splat with further photographs, or for any other input."""
-        return CompleterConfig.splat() if is_splat else CompleterConfig()
-
     def without_guard(self, name: GuardName) -> CompleterConfig:
         """Return the same settings without one guard."""
         return replace(self, guards=tuple(guard for guard in self.guards if guard != name))
@@ -342,7 +337,7 @@ def get_named_config(name: str, is_splat: bool = False) -> CompleterConfig:
     `default` follows the input: it is `splat` for a splat that comes with further photographs.
     """
     bases = {
-        "default": CompleterConfig.for_input(is_splat),
+        "default": CompleterConfig.splat() if is_splat else CompleterConfig(),
         "splat": CompleterConfig.splat(),
         "paper": CompleterConfig.paper(),
     }
