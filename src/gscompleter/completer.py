@@ -75,7 +75,7 @@ class GSCompleter:
         """The renderer, with scenes frozen at the cameras that are visited again."""
         return SceneRenderer(self.renderer)
 
-    def __call__(
+    def __call__(  # noqa: D417  (an old name needs no explanation)
         self,
         views: Sequence[View],
         target: Camera | Sequence[Camera],
