@@ -4,8 +4,8 @@ import pytest
 
 from gscompleter import InputError
 from gscompleter.memory import (
+    check_bytes,
     check_memory,
-    check_scene_memory,
     estimate_bytes,
     estimate_scene_bytes,
     read_memory_bytes,
@@ -58,14 +58,13 @@ def test_memory_grows_less_than_with_each_photograph_of_a_large_scene():
     assert many - one < 22 * 10**7 * 16 + 22 * 10**8
 
 
-def test_a_scene_that_does_not_fit_is_refused_with_both_numbers(sixteen_gigabytes):
-    check_scene_memory(10**7, 30, 16 * 10**9)
+def test_bytes_that_do_not_fit_are_refused_with_both_numbers(sixteen_gigabytes):
+    check_bytes(16 * 10**9, "The Gaussians", "crop the scene")
     with pytest.raises(
         InputError,
-        match=r"^The 10,000,000 Gaussians of the scene and 30 photographs need about 17 GB of "
-        r"memory, and there are 16 GB; crop the scene",
+        match="^The Gaussians need about 17 GB of memory, and there are 16 GB; crop the scene",
     ):
-        check_scene_memory(10**7, 30, 16 * 10**9 + 1)
+        check_bytes(16 * 10**9 + 1, "The Gaussians", "crop the scene")
 
 
 def test_ten_million_gaussians_fit_where_a_hundred_do_not():

@@ -7,8 +7,7 @@ import gc
 import os
 import sys
 import warnings
-from collections.abc import Iterator, Sequence
-from contextlib import contextmanager
+from collections.abc import Sequence
 from importlib import import_module
 from typing import Annotated, Any, Union
 
@@ -52,10 +51,7 @@ Command: Any = Union[  # noqa: UP007  (of as many as there are)
 
 
 def run() -> None:
-    """Run `main` and end the process at once: the command `gscompleter`."""
-    done: list[bool] = []
-    # Functions that are registered later run before it.
-    atexit.register(end_at_once, done)
+    """Run `main` as the command `gscompleter`, whose output a reader may leave."""
     try:
         try:
             main()
@@ -64,28 +60,6 @@ def run() -> None:
     except BrokenPipeError:  # the reader, such as `head`, has ended
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         sys.exit(1)
-    done.append(True)
-
-
-def end_at_once(done: Sequence[bool]) -> None:
-    """End the process if it is `done`; Python would take 0.2 s to free torch's operators."""
-    if done:
-        sys.stdout.flush()
-        os._exit(0)
-
-
-@contextmanager
-def freeze_imports() -> Iterator[None]:
-    """Exclude what is imported during the block from garbage collection.
-
-    Each search of torch alone takes 0.2 s.
-    """
-    gc.disable()
-    try:
-        yield
-    finally:
-        gc.freeze()
-        gc.enable()
 
 
 def main() -> None:
@@ -102,13 +76,12 @@ def main() -> None:
     # Damaged photographs are read or refused with a sentence; Pillow's warnings add nothing.
     warnings.filterwarnings("ignore", module="PIL")
     try:
-        with freeze_imports():
-            given = validate(parse_command(words))
-            if isinstance(given, options.ComputeOptions):
-                limit_threads(given.threads)
-            _, module, function = COMMANDS[words[0]]
-            module = f"gscompleter.apps.commands.{module}"
-            command = getattr(import_module(module), function)
+        given = validate(parse_command(words))
+        if isinstance(given, options.ComputeOptions):
+            limit_threads(given.threads)
+        _, module, function = COMMANDS[words[0]]
+        command = getattr(import_module(f"gscompleter.apps.commands.{module}"), function)
+        gc.freeze()  # each later search of torch for garbage would take 0.2 s
         command(given)
     except InputError as error:
         print(f"{PROGRAM}{format_error(error)}", file=sys.stderr)

@@ -10,7 +10,6 @@ import torch
 
 from gscompleter.config import CompleterConfig
 from gscompleter.config.settings import validate
-from gscompleter.deprecation import accept_old_keywords
 from gscompleter.errors import InputError
 from gscompleter.generators import Generator, ImageFunction, as_generator, load_generator
 from gscompleter.geometry import pad_camera, pad_like
@@ -76,13 +75,13 @@ class GSCompleter:
         """The renderer, with scenes frozen at the cameras that are visited again."""
         return SceneRenderer(self.renderer)
 
-    @accept_old_keywords(witnesses="check_views")
-    def __call__(
+    def __call__(  # noqa: D417  (an old name needs no explanation)
         self,
         views: Sequence[View],
         target: Camera | Sequence[Camera],
         scene: Gaussians | None = None,
         check_views: Sequence[View] | None = None,
+        witnesses: Sequence[View] | None = None,  # the old name of `check_views`
     ) -> Completion:
         """Complete what `views` never saw, as seen from one or several targets.
 
@@ -103,6 +102,7 @@ class GSCompleter:
         if not targets:
             raise InputError("No target camera was given; name at least one view to complete.")
         check_target_ids(scene, len(targets))
+        check_views = check_views if witnesses is None else witnesses
         state = self.begin(views, scene, check_views, targets)
         batch = as_generator(self.generator).max_batch_size
         counted_as = "target" if batch == 1 else "group of targets"
@@ -111,7 +111,6 @@ class GSCompleter:
         check_any_completed(state)
         return state
 
-    @accept_old_keywords(witnesses="check_views")
     def begin(
         self,
         views: Sequence[View],

@@ -1,9 +1,8 @@
 """Errors for the user, and the sentences that they hold."""
 
 import os
-from collections.abc import Iterable, Sequence
+from collections.abc import Sequence
 from contextlib import suppress
-from itertools import pairwise
 from pathlib import Path
 from reprlib import Repr
 
@@ -17,6 +16,10 @@ MAX_PATH_LENGTH = 250
 """Most characters of a quoted path."""
 
 LFS_POINTER = b"version https://git-lfs"
+
+_REPR = Repr()
+_REPR.maxlevel, _REPR.maxstring, _REPR.maxother = 4, 4 * MAX_QUOTE_LENGTH, 4 * MAX_QUOTE_LENGTH
+_REPR.maxlist = _REPR.maxtuple = _REPR.maxdict = _REPR.maxset = MAX_QUOTE_LENGTH // 2
 
 
 class InputError(ValueError):
@@ -49,7 +52,7 @@ def quote_value(value: object, length: int | None = None) -> str:
     """
     if length is None:
         length = MAX_PATH_LENGTH if isinstance(value, os.PathLike) else MAX_QUOTE_LENGTH
-    text = str(value) if isinstance(value, (str, os.PathLike)) else _format_value(value)
+    text = str(value) if isinstance(value, (str, os.PathLike)) else _REPR.repr(value)
     # Only the ends of very long texts are processed.
     ends = text if len(text) <= 4 * length else text[: 2 * length] + text[-2 * length :]
     line = "".join(c if c.isprintable() else " " for c in ends)
@@ -65,16 +68,6 @@ def join_names(names: Sequence[object], most: int, length: int | None = None) ->
     return f"{shown} and {len(names) - most} more" if len(names) > most else shown
 
 
-def join_numbers(numbers: Iterable[int]) -> str:
-    """List the first three runs of numbers, as in "0-39, 52 and 12 others"."""
-    found = sorted(set(numbers))
-    starts = [0, *(i + 1 for i, (a, b) in enumerate(pairwise(found)) if b != a + 1), len(found)]
-    runs = [found[start:stop] for start, stop in pairwise(starts)]
-    shown = ", ".join(f"{r[0]}-{r[-1]}" if len(r) > 1 else str(r[0]) for r in runs[:3] if r)
-    others = sum(map(len, runs[3:]))
-    return f"{shown} and {others} others" if others else shown
-
-
 def refuse_pointer(path: Path) -> None:
     """Raise InputError for a git-lfs pointer in place of the file itself."""
     if not os.path.isfile(path):
@@ -85,15 +78,3 @@ def refuse_pointer(path: Path) -> None:
                 f"{quote_value(path)} is a git-lfs pointer, not the file itself; run "
                 "`git lfs pull` in its repository to fetch it."
             )
-
-
-_REPR = Repr()
-_REPR.maxlevel, _REPR.maxstring, _REPR.maxother = 4, 4 * MAX_QUOTE_LENGTH, 4 * MAX_QUOTE_LENGTH
-_REPR.maxlist = _REPR.maxtuple = _REPR.maxdict = _REPR.maxset = MAX_QUOTE_LENGTH // 2
-
-
-def _format_value(value: object) -> str:
-    try:
-        return _REPR.repr(value)
-    except (ValueError, RecursionError):  # integers of more than 4,300 digits are among them
-        return f"a {type(value).__name__} that cannot be written out"

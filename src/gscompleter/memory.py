@@ -46,12 +46,6 @@ def estimate_bytes(pixels: int, images: int) -> int:
     return PROGRAM_BYTES + pixels * (BYTES_PER_PIXEL + images * BYTES_PER_VIEW_PIXEL)
 
 
-def check_scene_memory(count: int, photographs: int, needed: int) -> None:
-    """Raise InputError if `needed` bytes, for `count` Gaussians, exceed the memory."""
-    number = f"The {count:,} Gaussians of the scene and {photographs} photographs"
-    check_bytes(needed, number, "crop the scene, or give a folder with fewer photographs")
-
-
 def check_bytes(needed: int, number: str, remedy: str, argument: str | None = None) -> None:
     """Raise InputError if `needed` bytes, for what `number` says, exceed the memory."""
     available = read_memory_bytes()

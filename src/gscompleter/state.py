@@ -11,14 +11,12 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
-from typing import ClassVar
 
 import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
 from gscompleter.config import CompleterConfig
-from gscompleter.deprecation import RenamedMembers
 from gscompleter.timing import add_seconds
 from gscompleter.trust import Trust
 from gscompleter.types import (
@@ -64,10 +62,8 @@ class Rejection:
 
 
 @dataclass(frozen=True)
-class TargetResult(RenamedMembers):
+class TargetResult:
     """Result of one target camera. No stage reads it."""
-
-    old_names: ClassVar[Mapping[str, str]] = {"support": "trusted_alpha", "refused": "refusal"}
 
     target: Camera
     before: Render
@@ -126,15 +122,8 @@ class TargetResult(RenamedMembers):
 
 
 @dataclass(frozen=True)
-class Completion(RenamedMembers):
+class Completion:
     """A scene during completion; steps return a new value, and the old one serves as undo."""
-
-    old_names: ClassVar[Mapping[str, str]] = {
-        "bystanders": "free_space_cameras",
-        "gains": "exposure_gains",
-        "next_number": "next_target_id",
-        "ranged": "with_depth_range",
-    }
 
     config: CompleterConfig
     source: ContextScene

@@ -9,9 +9,9 @@ opacities in [0, 1], spherical harmonics [n, k, 3] in the 3DGS basis. All values
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
-from typing import TYPE_CHECKING, Any, ClassVar, Literal, TypeVar
+from typing import Any, Literal, TypeVar
 
 import numpy as np
 import torch
@@ -19,7 +19,6 @@ from jaxtyping import Bool, Float, Int, Int64, Shaped, UInt8
 from torch import Tensor
 
 from gscompleter.config.coverage import COVERED
-from gscompleter.deprecation import RenamedMembers, accept_old_keywords, resolve_old_name
 from gscompleter.errors import InputError
 
 SH_C0 = 0.28209479177387814
@@ -32,7 +31,7 @@ M = TypeVar("M", bound="TensorDataclass")
 
 
 @dataclass(frozen=True)
-class TensorDataclass(RenamedMembers):
+class TensorDataclass:
     """A value whose tensors all lie on one device."""
 
     def to(self: M, device: torch.device | str) -> M:
@@ -161,15 +160,6 @@ class PaddedCamera:
 @dataclass(frozen=True)
 class View(TensorDataclass):
     """A photograph (or a synthesized image) and its camera."""
-
-    old_names: ClassVar[Mapping[str, str]] = {
-        "ignored": "ignore_mask",
-        "contradicted": "dynamic_mask",
-        "counted": "valid_mask",
-        "trusted": "static_mask",
-        "compared": "fill_ignored",
-        "evened": "normalize_exposure",
-    }
 
     image: Float[Tensor, "h w 3"]
     camera: Camera
@@ -309,12 +299,8 @@ def sh_from_rgb(rgb: Float[Tensor, "n 3"]) -> Float[Tensor, "n 1 3"]:
 
 
 @dataclass(frozen=True)
-class Render(RenamedMembers):
+class Render:
     """A rendering of Gaussians over black."""
-
-    old_names: ClassVar[Mapping[str, str]] = {
-        "cropped": "crop",
-    }
 
     image: Float[Tensor, "h w 3"]
     depth: Float[Tensor, "h w"]
@@ -342,12 +328,8 @@ class DepthMap:
 
 
 @dataclass(frozen=True)
-class Reconstruction(RenamedMembers):
+class Reconstruction:
     """Output of a reconstructor Ψ, on the device of its views: Gaussians and depth maps."""
-
-    old_names: ClassVar[Mapping[str, str]] = {
-        "gains": "exposure_gains",
-    }
 
     gaussians: Gaussians
     depths: tuple[DepthMap, ...]
@@ -360,14 +342,8 @@ class Reconstruction(RenamedMembers):
 
 
 @dataclass(frozen=True)
-class GeneratorInput(RenamedMembers):
+class GeneratorInput:
     """Input of a generator Φ besides the target camera and its nearest view."""
-
-    old_names: ClassVar[Mapping[str, str]] = {
-        "at_views": "view_renders",
-        "at_target": "target_render",
-        "believed": "trusted_alpha",
-    }
 
     views: tuple[View, ...]
     view_renders: tuple[Render, ...]
@@ -403,12 +379,8 @@ class Lift:
 
 
 @dataclass(frozen=True)
-class DepthAffine(RenamedMembers):
+class DepthAffine:
     """Correction `D_ctx = scale * D_pred + shift` on z-depth (paper, Eq. 8)."""
-
-    old_names: ClassVar[Mapping[str, str]] = {
-        "contradicted": "is_refitted_at_target",
-    }
 
     scale: float = 1.0
     shift: float = 0.0
@@ -471,16 +443,3 @@ class ErrorBudget:
     """The photograph; its ignored pixels do not count."""
     metric: Literal["mse", "dssim"]
     limit: float
-
-
-View.__init__ = accept_old_keywords(  # type: ignore[method-assign]
-    ignored="ignore_mask", contradicted="dynamic_mask"
-)(View.__init__)
-Reconstruction.__init__ = accept_old_keywords(  # type: ignore[method-assign]
-    gains="exposure_gains"
-)(Reconstruction.__init__)
-
-if not TYPE_CHECKING:
-
-    def __getattr__(name: str) -> Any:
-        return resolve_old_name(__name__, name, {"SceneContext": "GeneratorInput"})

@@ -31,7 +31,7 @@ from gscompleter.apps.report.plain_words import (
     format_percent,
     list_photograph_notes,
 )
-from gscompleter.apps.report.schema import ContextRow, PairsRow, read_summary
+from gscompleter.apps.report.schema import ContextRow, PairsRow
 from gscompleter.errors import InputError
 from gscompleter.evaluation.metrics.coverage import RenderPair
 from gscompleter.types import Render
@@ -283,27 +283,6 @@ def test_what_is_no_result_is_refused_in_a_sentence(out, monkeypatch, capsys, da
     assert said.count("\n") == 1
     if (out / "report.html").exists():
         assert (out / "report.html").read_bytes() == before
-
-
-def test_keys_of_the_last_release_are_read(completed_room, tmp_path):
-    names = {
-        "context": {"exposure_gain": "gain", "dynamic_fraction": "contradicted"},
-        "targets": {"derived_from": "near", "target_id": "generated"},
-    }
-    old, out = tmp_path / "old", completed_room
-    shutil.copytree(out, old)
-
-    def rename(summary: dict) -> None:
-        for group, keys in names.items():
-            summary[group] = [{keys.get(k, k): v for k, v in r.items()} for r in summary[group]]
-            summary[group][0].update({"gain": [2, 2, 2], "contradicted": 0.5, "near": 3})
-
-    changed(old / "summary.json", rename)
-    assert all(f'"{new}"' not in (old / "summary.json").read_text() for new in names["context"])
-    summary = read_summary(old)
-    row, target = summary.context[0], summary.targets[0]
-    assert (row.exposure_gain, row.dynamic_fraction) == ((2, 2, 2), 0.5)
-    assert target.derived_from == 3
 
 
 def test_notes_of_a_target_are_shown_and_nothing_added_is_said(out):

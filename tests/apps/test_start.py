@@ -53,10 +53,6 @@ ENDING = """
 import atexit, sys
 from gscompleter.cli import run
 
-class Late:
-    def __del__(self): print("taken back")
-late = Late()
-
 sys.argv = ["gscompleter", *sys.argv[1:]]
 run()
 atexit.register(print, "done at the end")

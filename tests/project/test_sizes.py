@@ -11,7 +11,7 @@ METHOD = ("completer.py", "stages", "guards", "trust", "next_best_view")
 CORE = (
     *("__init__.py", "types.py", "geometry.py", "image_ops.py", "optim.py", "sky.py", "errors.py"),
     *("progress.py", "timing.py", "memory.py", "cpu_threads.py", "state.py", "cleaning.py"),
-    *("ssim.py", "plugins.py", "deprecation.py", "config", "render", *METHOD),
+    *("ssim.py", "plugins.py", "config", "render", *METHOD),
 )
 KERNELS = ("simd", "project", "composite", "tiles", "lod", "support", "parallel", "compiled")
 

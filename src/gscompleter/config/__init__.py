@@ -9,8 +9,14 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 from annotated_types import Interval
 
 from gscompleter.config.coverage import COVERED
-from gscompleter.config.renamed import list_paths, refuse_old_keys
-from gscompleter.config.settings import Count, Settings, Share, Weight, apply_changes
+from gscompleter.config.settings import (
+    Count,
+    Settings,
+    Share,
+    Weight,
+    apply_changes,
+    read_yaml,
+)
 from gscompleter.errors import InputError, quote_value
 
 Pixels = Annotated[int, Interval(ge=0, le=4096)]
@@ -311,11 +317,6 @@ class CompleterConfig(Settings):
             holes=HoleConfig(dilation=0, candidate_radius=None),
         )
 
-    @staticmethod
-    def for_input(is_splat: bool) -> CompleterConfig:
-        """Return the preset for a splat with further photographs, or for any other input."""
-        return CompleterConfig.splat() if is_splat else CompleterConfig()
-
     def without_guard(self, name: GuardName) -> CompleterConfig:
         """Return the same settings without one guard."""
         return replace(self, guards=tuple(guard for guard in self.guards if guard != name))
@@ -349,7 +350,7 @@ def get_named_config(name: str, is_splat: bool = False) -> CompleterConfig:
     `default` follows the input: it is `splat` for a splat that comes with further photographs.
     """
     bases = {
-        "default": CompleterConfig.for_input(is_splat),
+        "default": CompleterConfig.splat() if is_splat else CompleterConfig(),
         "splat": CompleterConfig.splat(),
         "paper": CompleterConfig.paper(),
     }
@@ -371,9 +372,6 @@ def load_config(source: str, is_splat: bool = False) -> CompleterConfig:
     path = Path(source)
     if path.suffix not in {".yaml", ".yml"}:
         return get_named_config(source, is_splat)
-    from gscompleter.config.yaml_file import read_yaml
-
     changes = read_yaml(path)
     base = get_named_config(str(changes.pop("base", "default")), is_splat)
-    refuse_old_keys(list_paths(changes), f"{quote_value(source)}: ")
     return apply_changes(base, changes, f"{quote_value(source)}: ")

@@ -88,13 +88,11 @@ class GeneratorOptions(Settings):
     """Model that synthesizes images, and its settings."""
 
     generator: str = "warp-inpaint"
-    """Model that synthesizes the image at a target: warp-inpaint (photographs warped to the target,
-    holes filled by patches; needs no weights), oracle (the real photograph, for measurements),
-    pe-field (the paper's diffusion transformer) or diffusers-inpaint (any inpainting pipeline)."""
+    """Model that synthesizes the image at a target: warp-inpaint (warped photographs, holes filled
+    by patches), oracle (the real photograph), pe-field (the paper's) or diffusers-inpaint."""
     generator_weights: str | None = None
-    """Weights of pe-field or diffusers-inpaint: a folder saved by diffusers, or USER/NAME or
-    USER/NAME@COMMIT on the Hugging Face hub. By default the published ones of pe-field;
-    diffusers-inpaint needs this option."""
+    """Weights of pe-field (by default those published) or diffusers-inpaint: a folder saved by
+    diffusers, or USER/NAME or USER/NAME@COMMIT on the Hugging Face hub."""
     generator_retries: int | None = None
     """Further seeds to try if the image disagrees with the photographs (0)."""
     generator_offload: bool = False
@@ -103,9 +101,8 @@ class GeneratorOptions(Settings):
     """Denoising steps: for pe-field 4, as in the paper (its authors' demo has 28), for
     diffusers-inpaint the pipeline's own number."""
     generator_depth: str | None = None
-    """Depth of the photograph for pe-field: context (rendered from the scene), monocular (a
-    published network), or the folder or hub id of another network. By default context, or monocular
-    with the config `paper`."""
+    """Depth of the photograph for pe-field: context (rendered; the default), monocular (a published
+    network; with the config `paper`), or the folder or hub id of another network."""
     generator_batch_size: int | None = None
     """Most target images that pe-field denoises together (4). Fewer need less memory."""
     generator_prompt: str | None = None

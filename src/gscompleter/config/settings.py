@@ -7,11 +7,13 @@ import re
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import asdict
+from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, ClassVar, TypeVar
 
 from annotated_types import Interval
 
 from gscompleter.errors import InputError, quote_value
+from gscompleter.io.reading import read_bytes
 
 if TYPE_CHECKING:
     from pydantic_core import ErrorDetails
@@ -23,6 +25,39 @@ Share = Annotated[float, Interval(ge=0, le=1)]
 Weight = Annotated[float, Interval(ge=0, le=1e6)]
 # Levels and rounds add to the seed.
 Seed = Annotated[int, Interval(ge=0, lt=2**62)]
+
+MAX_CONFIG_BYTES = 65_536
+"""Largest size of a settings file, in bytes."""
+MAX_REASON_LENGTH = 120
+"""Most characters of PyYAML's reason in a sentence."""
+
+RENAMED = {
+    "registration.affine.bridge": "alignment.align_at",
+    "registration.affine.min_agreement": "alignment.min_agreement",
+    "registration.affine.min_merged": "depth_agreement.reject_below",
+    "registration.affine": "alignment",
+    "registration.schedule": "registration.lr_schedule",
+    "registration.step": "registration.lr_unit",
+    "registration.depth_of": "registration.rendered_depth",
+    "registration.carry_into_holes": "registration.extrapolate_into_holes",
+    "holes.neighbourhood": "holes.candidate_radius",
+    "contradiction.min_difference": "dynamic_masks.min_color_difference",
+    "contradiction": "dynamic_masks",
+    "support.doubts": "trust",
+    "support.max_difference": "trust_settings.color_sigma",
+    "support.max_turn": "trust_settings.angle_sigma",
+    "support": "trust_settings",
+    "refine.min_fall": "refine.rel_tol",
+    "harm.tolerance": "psnr_guard.max_drop",
+    "harm.ssim_tolerance": "psnr_guard.max_ssim_drop",
+    "harm.max_loss": "psnr_guard.max_opacity_loss",
+    "harm": "psnr_guard",
+    "exploration.turn": "next_best_view.yaw_fraction",
+    "exploration.side": "next_best_view.image_size",
+    "exploration.reach": "next_best_view.border_radius",
+    "exploration": "next_best_view",
+}
+"""Old names of settings and groups of settings with today's."""
 
 
 class Settings:
@@ -76,13 +111,50 @@ def merge_nested(values: Mapping[str, Any], changes: Mapping[str, Any]) -> dict[
 
 def describe_invalid(wrong: ErrorDetails, name: str, settings: object) -> str:
     """Write the sentence about the setting called `name`."""
+    given = wrong["input"]
     if wrong["type"] == "unexpected_keyword_argument":
+        is_group = isinstance(given, Mapping) and len(given) > 0
+        renamed = describe_renamed(f"{name}.{next(iter(given))}" if is_group else name)
+        if renamed is not None:
+            return renamed
         for part in wrong["loc"][:-1]:
             settings = getattr(settings, str(part))
         known = ", ".join(vars(settings))
         return f"There is no setting '{quote_value(name)}'; choose one of {known}."
-    given = wrong["input"]
     shown = f"'{quote_value(given)}'" if isinstance(given, str) else quote_value(given)
     if wrong["type"] == "dataclass_type":
         return f"{name} is a group of settings, got {shown}."
     return f"{name} {re.sub(r'^[A-Z][a-z]+ should', 'must', wrong['msg'])}, got {shown}."
+
+
+def describe_renamed(path: str) -> str | None:
+    """Write the sentence about a setting under an old name; None if there was no such name."""
+    for old, new in RENAMED.items():
+        if f"{path}.".startswith(f"{old}."):
+            return f"The setting {old} is now called {new}; use the new name."
+    return None
+
+
+def read_yaml(path: Path) -> dict[str, Any]:
+    """Read the mapping in a YAML file, limited to JSON values, or raise InputError."""
+    import yaml
+
+    name, data = f"The config {quote_value(path)}", read_bytes(path, MAX_CONFIG_BYTES)
+    try:
+        # They can expand a short file endlessly.
+        if any(isinstance(token, yaml.AliasToken) for token in yaml.scan(data.decode())):
+            raise yaml.YAMLError("aliases are not read; write the value out")
+        content = json.loads(json.dumps(yaml.safe_load(data.decode()), default=str))
+    except RecursionError as error:
+        raise InputError(f"{name} is nested too deeply.") from error
+    except Exception as error:  # PyYAML fails in many ways, KeyError and IndexError among them
+        mark = getattr(error, "problem_mark", None)
+        place = "" if mark is None else f" in line {mark.line + 1}"
+        problem = getattr(error, "problem", None) or str(error)
+        reason = quote_value(problem, MAX_REASON_LENGTH) + place
+        raise InputError(f"{name} is not YAML: {reason}.") from error
+    if content is None:
+        return {}
+    if not isinstance(content, dict):
+        raise InputError(f"{name} must map settings to values, as in `holes: ...`.")
+    return content

@@ -4,14 +4,13 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any, Protocol, runtime_checkable
+from typing import Any, Protocol, runtime_checkable
 
 from jaxtyping import Float
 from torch import Tensor
 
 from gscompleter.config.generators import PLUGINS, GeneratorSettings, get_settings_class
 from gscompleter.config.settings import validate
-from gscompleter.deprecation import resolve_old_name
 from gscompleter.errors import InputError
 from gscompleter.plugins import load_plugins
 from gscompleter.types import Camera, GeneratorInput, View
@@ -139,9 +138,3 @@ GENERATORS: dict[str, Callable[..., Generator]] = {
     "oracle": _load_oracle,
 }
 """Loader of each built-in generator: (settings, seed, true images, device) -> Φ."""
-
-if not TYPE_CHECKING:
-
-    def __getattr__(name: str) -> Any:
-        old = {"Synthesis": "GeneratorOutput", "Request": "GeneratorRequest"}
-        return resolve_old_name(__name__, name, old)

@@ -10,7 +10,7 @@ from jaxtyping import Float
 from torch import Tensor
 from torch.nn.functional import avg_pool2d, max_pool2d
 
-from gscompleter.config import CompleterConfig
+from gscompleter.config import CompleterConfig, get_named_config
 from gscompleter.errors import InputError
 from gscompleter.geometry import compute_z_depths, project_mask
 from gscompleter.reconstructors import Reconstructor, run_reconstructor
@@ -49,7 +49,7 @@ def choose_config(
     run.
     """
     is_splat = scene is not None and check_views is not None
-    config = config or CompleterConfig.for_input(is_splat)
+    config = config or get_named_config("default", is_splat)
     if scene and bool((scene.generated > 0).any()):
         config = replace(config, recolor=replace(config.recolor, iterations=0))
     return config

@@ -13,11 +13,7 @@ from rich.console import Console
 from rich.table import Table
 
 from gscompleter.apps.commands.options import CompleteOptions, get_max_targets, parse_resolution
-from gscompleter.apps.commands.output import (
-    describe_run,
-    is_replaceable,
-    read_held_out,
-)
+from gscompleter.apps.commands.output import describe_run, is_replaceable, read_held_out
 from gscompleter.apps.inputs.opening import (
     Opened,
     Task,

@@ -10,12 +10,7 @@ from rich.console import Console
 from gscompleter.apps.commands.options import ConvertOptions, StripOptions
 from gscompleter.errors import InputError
 from gscompleter.progress import show_preparation, show_progress
-from gscompleter.splats.formats import (
-    describe_mode_loss,
-    get_writer,
-    load_splat,
-    save_splat,
-)
+from gscompleter.splats.formats import describe_mode_loss, get_writer, load_splat, save_splat
 from gscompleter.splats.strip import strip
 
 
@@ -39,11 +34,7 @@ def run_convert(options: ConvertOptions) -> None:
 def run_strip(options: StripOptions) -> None:
     """Write the original scene and print the number of Gaussians."""
     check_output_file(options.out, options.overwrite)
-    with (
-        show_progress(Console(stderr=True, quiet=options.quiet)),
-        show_preparation("stripping"),
-    ):
-        given, generated = strip(options.completed, options.out)
+    given, generated = strip(options.completed, options.out)
     if not options.quiet:
         print(f"{given:,} Gaussians, {generated:,} generated ones removed: {options.out}")
 

@@ -13,12 +13,7 @@ from packaging.requirements import Requirement
 
 from gscompleter.apps.bench.machine import describe_machine
 from gscompleter.apps.commands.options import DoctorOptions
-from gscompleter.apps.viewer.packages import (
-    BUILT_LIBRARIES,
-    LOCK_FILE,
-    get_archive_path,
-    read_lock,
-)
+from gscompleter.apps.viewer.packages import BUILT_LIBRARIES, LOCK_FILE, get_archive_path, read_lock
 from gscompleter.apps.warmup import PARTS
 from gscompleter.errors import InputError
 from gscompleter.io.cache import get_download_folder

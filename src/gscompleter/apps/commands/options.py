@@ -71,8 +71,7 @@ class ModelOptions(RunOptions):
     """Options of every command with a choice of models."""
 
     reconstructor: str = "plane-sweep"
-    """Model that turns photographs into Gaussians: plane-sweep, which needs no weights, or one that
-    `gscompleter models` lists."""
+    """Model that turns photographs into Gaussians: plane-sweep, or one of `gscompleter models`."""
     weights: Path | None = None
     """Weights file of the reconstructor; downloaded if not given."""
     synthesis: Annotated[GeneratorOptions, tyro.conf.OmitArgPrefixes] = GeneratorOptions()
@@ -110,8 +109,7 @@ class CompletingOptions(SceneOptions, ModelOptions):
     """Options of the commands that complete one scene."""
 
     scene: Path | None = None
-    """File of Gaussians (a splat) to complete; all of them are kept. If not given, the scene is
-    reconstructed from the photographs."""
+    """File of Gaussians (a splat) to complete instead of reconstructing the scene; all are kept."""
     no_recolor: bool = False
     """Keep the colours of the splat, too; Gaussians are only added where it is empty."""
     config: Annotated[CompleterConfig, tyro.conf.FlagConversionOff] = CompleterConfig()
@@ -129,14 +127,11 @@ class CompleteOptions(CompletingOptions):
     auto: Annotated[int, Interval(ge=1, le=254)] | None = None
     """Most cameras to search for if no target is given; 4 if no number follows."""
     dry_run: bool = False
-    """Only search for cameras, write them to targets.json (to edit and to pass to --target), and
-    print the plan."""
+    """Only print the plan, and write its cameras to targets.json, to edit and pass to --target."""
     out: Path
-    """Folder for the completed scene (completed.ply), the report (report.html), images and
-    summary.json."""
+    """Folder for completed.ply, the report (report.html), images and summary.json."""
     video: bool = False
-    """Also write video.mp4: a flight of six seconds through the holes, before and after side by
-    side."""
+    """Also write video.mp4: a flight through the holes, before and after side by side."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -146,7 +141,7 @@ class LiveOptions(CompletingOptions):
     out: Path = Path("live")
     """Output folder of the Save button."""
     resolution: Size = (256, 256)
-    """Working size: height and width, the longest side in pixels, or `full`. Smaller is faster."""
+    """Working size as in `complete`; smaller is faster."""
     port: Port = 0
     """Port of the page; a free one if not given."""
     host: str = "127.0.0.1"
@@ -159,8 +154,7 @@ class LiveOptions(CompletingOptions):
 class CleanOptions(SceneOptions):
     """Remove Gaussians of a splat that make its photographs worse or that none of them needs.
 
-    Nothing is generated, and no photograph loses more than 0.01 dB. `gscompleter strip` puts the
-    removed Gaussians back.
+    No photograph loses more than 0.01 dB. `gscompleter strip` puts the removed Gaussians back.
     """
 
     out: Path
@@ -197,21 +191,20 @@ class EngineOptions(Options):
     """Parameters for SLURM with --engine submitit, as in --slurm partition=gpu time=120."""
     shard: str | None = None
     """Run every n-th job or case from the i-th on, given as i/n with i from 0; `auto` takes both
-    from a SLURM array. Several commands on one folder each need a shard."""
+    from a SLURM array."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class BatchOptions(EngineOptions):
     """Complete many scenes, on several processes or machines.
 
-    Run the same command again to continue. A scene that cannot be completed is listed with its
-    reason. OUT contains a folder per scene in jobs/, table.csv and index.html.
+    Run the same command again to continue. OUT contains a folder per scene in jobs/, table.csv
+    (with the reason where a scene could not be completed) and index.html.
     """
 
     manifest: Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="MANIFEST")]
-    """Scenes to complete: a .csv or .jsonl file with a row per scene, whose columns are `folder`
-    (SCENE), `name` and options of `complete`; or a folder of scenes. Paths are relative to the
-    manifest."""
+    """A .csv or .jsonl file with a row per scene, whose columns are `folder` (SCENE, relative to
+    the file), `name` and options of `complete`; or a folder of scenes."""
     out: Path
     """Folder for the results; a folder of an earlier run is continued."""
     engine: EngineName = "local"
@@ -228,8 +221,7 @@ class BatchOptions(EngineOptions):
 class EvaluateOptions(ModelOptions, EngineOptions):
     """Run methods on cases with known target photographs, and score them.
 
-    Run the same command again to continue an interrupted evaluation. The tables are printed and
-    written at the end; `gscompleter tables OUT` writes them at any time.
+    Run the same command again to continue. `gscompleter tables OUT` writes the tables at any time.
     """
 
     paths: Annotated[tuple[Path, ...], tyro.conf.Positional, tyro.conf.arg(metavar="PATH")]
@@ -247,10 +239,9 @@ class EvaluateOptions(ModelOptions, EngineOptions):
     """Methods to compare: context, full, paper, an ablation such as no-sa, densify-100,
     densify-800, distill, reggs; or a group: ablations, baselines, all."""
     rerun: Literal["nothing", "failures", "scores"] = "nothing"
-    """Cases of an earlier run to repeat: those that failed, or the scoring of all saved
-    predictions."""
+    """Cases of an earlier run to repeat: those that failed, or all scores."""
     engine: EngineName | None = None
-    """Engine that runs the cases; this process if not given."""
+    """Engine of `batch` that runs the cases; this process if not given."""
     resolution: Size | None = None
     """Working size as in `complete`; by default that of the cases."""
     use_masks: bool = False
@@ -290,9 +281,8 @@ class BenchOptions(RunOptions, WritingOptions):
     """Measure how long completions take on this machine and how the time grows.
 
     Every completion is a process of its own, start-up included; methods are compared within one
-    process. Times are also given relative to a yardstick: one forward and backward pass of the
-    renderer with 196,608 Gaussians at 256 x 256. Without a scene or cases the stereo pair of
-    `gscompleter demo` is measured.
+    process. Times are also given relative to one pass of the renderer, forward and backward, with
+    196,608 Gaussians at 256 x 256. Without a scene or cases the pair of `demo` is measured.
     """
 
     folder: Annotated[Path | None, tyro.conf.Positional, tyro.conf.arg(metavar="SCENE")] = None
@@ -300,7 +290,7 @@ class BenchOptions(RunOptions, WritingOptions):
     context: tuple[Frame, ...] = ()
     """Frame numbers of the photographs to start from."""
     target: tuple[Frame, ...] = ()
-    """Frame numbers to complete the scene for. Methods are compared on the first."""
+    """Frame numbers to complete the scene for."""
     resolution: tuple[int, int] = (256, 256)
     """Working size, height and width, if --cases is not given."""
     near: float | None = None
@@ -308,10 +298,9 @@ class BenchOptions(RunOptions, WritingOptions):
     far: float | None = None
     """Largest depth in the scene, in the unit of its cameras; estimated if not given."""
     cases: Path | None = None
-    """JSON file of cases and growth series instead of a scene, as benchmarks/performance.json.
-    Methods are compared on the first case."""
+    """JSON file of cases and growth series instead of a scene, as benchmarks/performance.json."""
     methods: tuple[BenchMethod, ...] = ("full", "autograd", "densify-800", "distill", "reggs")
-    """Methods to compare: full (ours), autograd (ours without a frozen context), or others."""
+    """Methods to compare on the first case: full (ours), autograd (without a frozen context), …"""
     growth: tuple[Axis, ...] = ("gaussians", "pixels", "views", "targets")
     """Quantities to increase in the first case."""
     repeats: Repeats = 5
@@ -359,8 +348,8 @@ class ConvertOptions(WritingOptions):
     drop_nonfinite: bool = False
     """Drop Gaussians that contain NaN or infinity instead of refusing the file."""
     plain: bool = False
-    """Write no labels of generated Gaussians: no property `generated` in a .ply, which some
-    programs misread, and no file of labels beside other formats. All Gaussians are kept."""
+    """Write no labels of generated Gaussians, which some programs misread: no property `generated`
+    in a .ply, no file beside other formats."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -391,12 +380,10 @@ class ViewOptions(WritingOptions):
     scene: Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="A")]
     """Output folder of `complete`, or a file of Gaussians in any format that `convert` reads."""
     other: Annotated[Path | None, tyro.conf.Positional, tyro.conf.arg(metavar="B")] = None
-    """Scene after completion if A is the scene before. If not given, A is shown with and without
-    its generated Gaussians."""
+    """The scene after, if A is the one before; by default A with its generated Gaussians."""
     cameras: Path | None = None
-    """Cameras to jump to: a file of cameras as in `complete --target`, or a folder with a
-    transforms.json or a COLMAP model. They are in the coordinates of the photographs if A is an
-    output folder, otherwise in those of A."""
+    """Cameras to jump to: a file as in `complete --target`, or a folder with a transforms.json or a
+    COLMAP model; in the coordinates of the photographs if A is an output folder, else of A."""
     resolution: tuple[int, int] | None = None
     """Image size (height and width) of cameras whose file has none."""
     save: Path | None = None

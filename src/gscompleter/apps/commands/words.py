@@ -23,8 +23,7 @@ from tyro.constructors import (
 
 from gscompleter.apps.commands.options import DEFAULT_NUM_TARGETS
 from gscompleter.config import CompleterConfig, load_config
-from gscompleter.config.renamed import refuse_old_keys
-from gscompleter.config.settings import Settings
+from gscompleter.config.settings import Settings, describe_renamed
 from gscompleter.errors import PROGRAM, InputError, quote_value
 
 HELP = ("-h", "--help")
@@ -77,8 +76,7 @@ def parse_words(words: Sequence[str], command: Any, names: Collection[str]) -> A
     helps = [make_help_rule(show_all=HELP_ALL in words)] if asked else []
     words = ["--help" if word == HELP_ALL else word for word in words]
     check_once(words)
-    settings = [word[9:].split("=")[0] for word in words if word.startswith("--config.")]
-    refuse_old_keys([name.replace("-", "_") for name in settings])
+    refuse_old_settings(words)
     printed = StringIO()
     try:
         with redirect_stderr(printed):
@@ -111,6 +109,16 @@ def check_once(words: Sequence[str]) -> None:
             f"{quote_value(twice)} is given twice, and only one of them would count; name it "
             "once, with all its values after it."
         )
+
+
+def refuse_old_settings(words: Sequence[str]) -> None:
+    """Refuse a setting of the method under an old name."""
+    for word in words:
+        name = word.partition("=")[0].replace("-", "_")
+        _, _, path = name.partition("__config.")
+        sentence = describe_renamed(path)
+        if sentence is not None:
+            raise InputError(sentence)
 
 
 def insert_auto_count(words: Sequence[str]) -> list[str]:

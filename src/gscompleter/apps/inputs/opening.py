@@ -35,11 +35,11 @@ from gscompleter.data.photographs import Photographs
 from gscompleter.data.points import add_depth_range
 from gscompleter.data.scene import load_cameras
 from gscompleter.data.sfm.poses import POSES, find_poses, has_photographs
-from gscompleter.errors import InputError, join_numbers, quote_value
+from gscompleter.errors import InputError, join_names, quote_value
 from gscompleter.io.files import SUMMARY_FILE
 from gscompleter.memory import (
+    check_bytes,
     check_memory,
-    check_scene_memory,
     estimate_bytes,
     estimate_scene_bytes,
 )
@@ -263,8 +263,8 @@ def check_context(options: SceneOptions) -> None:
         )
     if len(set(context)) < len(context):
         raise InputError(
-            f"--context names a frame of {join_numbers(context)} twice, and identical cameras have "
-            "no baseline; name different frames."
+            f"--context names a frame of {join_names(context, 8)} twice, and identical cameras "
+            "have no baseline; name different frames."
         )
 
 
@@ -321,7 +321,9 @@ def add_photograph(target: Target, given: Photographs, options: SceneOptions) ->
 def check_scene(task: Task, scene: Gaussians) -> None:
     """Refuse a splat that does not fit into memory together with its photographs."""
     photographs = len(task.views) + len(task.check_views or ())
-    check_scene_memory(len(scene), photographs, estimate_memory(task, scene))
+    what = f"The {len(scene):,} Gaussians of the scene and {photographs} photographs"
+    remedy = "crop the scene, or give a folder with fewer photographs"
+    check_bytes(estimate_memory(task, scene), what, remedy)
 
 
 def estimate_memory(task: Task, scene: Gaussians | None) -> int:

@@ -15,13 +15,6 @@ from gscompleter.io.json_file import read_json
 
 RECORD_FILE = "report.json"
 ADVICE = "complete the scene again"
-RENAMED = {
-    "gain": "exposure_gain",
-    "contradicted": "dynamic_fraction",
-    "near": "derived_from",
-    "generated": "target_id",
-}
-"""Keys of the last release in rows of `summary.json`, with the new ones; read for one release."""
 
 SCORES = ("psnr_before", "psnr_after", "ssim_before", "ssim_after")
 
@@ -185,7 +178,7 @@ class CompletionRecord:
 def read_summary(folder: Path) -> CompletionSummary:
     """Read `summary.json`; raise an InputError if it is missing or damaged."""
     path = find_result(folder, SUMMARY_FILE)
-    return parse_content(CompletionSummary, with_new_keys(read_json(path, ADVICE)), path)
+    return parse_content(CompletionSummary, read_json(path, ADVICE), path)
 
 
 def read_record(folder: Path, summary: CompletionSummary) -> CompletionRecord:
@@ -196,19 +189,6 @@ def read_record(folder: Path, summary: CompletionSummary) -> CompletionRecord:
     if sizes != (len(summary.targets), len(summary.targets), len(summary.context)):
         raise InputError(f"{quote_value(path)} does not fit {SUMMARY_FILE} beside it; {ADVICE}.")
     return record
-
-
-def with_new_keys(content: Any) -> Any:
-    """Return the content of a summary with today's keys for those of the last release."""
-    if not isinstance(content, dict):
-        return content
-    groups = [key for key in ("context", "targets") if isinstance(content.get(key), list)]
-    return content | {key: [rename_keys(row) for row in content[key]] for key in groups}
-
-
-def rename_keys(row: Any) -> Any:
-    """Rename the keys of a row."""
-    return {RENAMED.get(k, k): v for k, v in row.items()} if isinstance(row, dict) else row
 
 
 def find_result(folder: Path, name: str) -> Path:
