@@ -21,7 +21,7 @@ Threads = Annotated[int, Interval(ge=1, le=1024)]
 Repeats = Annotated[int, Interval(ge=1, le=1000)]
 Port = Annotated[int, Interval(ge=0, le=65535)]
 Axis = Literal["gaussians", "pixels", "views", "targets"]
-BenchMethod = Literal["full", "autograd", "densify-100", "densify-800", "distill", "reggs"]
+BenchMethod = Literal["full", "densify-100", "densify-800", "distill", "reggs"]
 Device = Literal["auto", "cpu", "cuda"]
 Size = tuple[int, int] | int | Literal["full"]
 """Height and width, the longest side, or `full` for the photographs' own size."""
@@ -310,12 +310,12 @@ class BenchOptions(RunOptions, WritingOptions):
     cases: Path | None = None
     """JSON file of cases and growth series instead of a scene, as benchmarks/performance.json.
     Methods are compared on the first case."""
-    methods: tuple[BenchMethod, ...] = ("full", "autograd", "densify-800", "distill", "reggs")
-    """Methods to compare: full (ours), autograd (ours without a frozen context), or others."""
+    methods: tuple[BenchMethod, ...] = ("full", "densify-800", "distill", "reggs")
+    """Methods to compare: full (ours) or others."""
     growth: tuple[Axis, ...] = ("gaussians", "pixels", "views", "targets")
     """Quantities to increase in the first case."""
     repeats: Repeats = 5
-    """Number of repetitions; slow methods, all but full and autograd, run once."""
+    """Number of repetitions; methods other than full run once."""
     quick: bool = False
     """Run a quick check: the smallest case once, two iterations of the baselines, no growth."""
     json: bool = False
