@@ -10,8 +10,8 @@ import torch
 from command import run
 from gscompleter.apps.bench.cases import (
     BenchCase,
+    GrowthValues,
     Manifest,
-    make_default_growth,
     multiply_gaussians,
     read_manifest,
 )
@@ -39,7 +39,7 @@ SIZE = 64
 CAMERAS = (camera_at(-0.2, size=SIZE), camera_at(0.2, size=SIZE), camera_at(0.5, size=SIZE))
 PERFORMANCE = ROOT / "benchmarks" / "performance.json"
 AXES = ("gaussians", "pixels", "views", "targets")
-CASE = BenchCase("room", Path("room"), (0, 1, 2, 3), (4, 5), (64, 96))
+CASE = BenchCase("room", Path("room"), (0, 1), (4, 5), (64, 96))
 
 
 @pytest.fixture(scope="module")
@@ -47,14 +47,22 @@ def scene(tmp_path_factory):
     return photographed(tmp_path_factory.mktemp("bench") / "room", CAMERAS)
 
 
+def write_cases(scene: Path, **more) -> Path:
+    """Write a file with the room as its only case."""
+    row = {"name": "room", "scene": scene.name, "context": [0, 1], "targets": [2]}
+    path = scene.parent / "cases.json"
+    path.write_text(json.dumps({"cases": [{**row, "resolution": [SIZE, SIZE], **more}]}))
+    return path
+
+
 @pytest.fixture(scope="module")
 def quick(scene, tmp_path_factory):
     """Return the files of a quick run on a room."""
     out = tmp_path_factory.mktemp("bench") / "out"
-    given = ("--context", 0, 1, "--target", 2, "--resolution", SIZE, SIZE, "--near", 0.5)
+    cases = write_cases(scene, near=0.5, far=20)
     methods = ("--methods", "full", "densify-100")
     with pytest.MonkeyPatch.context() as patch:
-        assert run(patch, "bench", scene, *given, "--far", 20, *methods, "--quick", "--quiet",
+        assert run(patch, "bench", "--cases", cases, *methods, "--quick", "--quiet",
                    "--out", out) == 0  # fmt: skip
     return out
 
@@ -166,11 +174,11 @@ def test_methods_are_told_in_multiples_of_the_first():
 
 
 def test_a_case_that_several_series_share_is_measured_once():
-    growth = Manifest((CASE,), make_default_growth(CASE)).make_series(AXES)
+    values = GrowthValues((5, 6), ((64, 96), (9, 9)), ((0, 1), (0, 1, 2, 3)), ((4,), (4, 5)))
+    growth = Manifest((CASE,), values).make_series(AXES)
     base = replace(CASE, targets=(4,))
-    assert [c.resolution for c in growth["pixels"].values()][2] == base.resolution
     different = {base, *(case for found in growth.values() for case in found.values())}
-    assert len(different) == 1 + 4 + 4 + 1 + 1  # each but Gaussians holds the base
+    assert len(different) == 1 + 2 + 1 + 1 + 1  # each but Gaussians holds the base
     assert {size: c.context for size, c in growth["views"].items()} == {2: (0, 1), 4: (0, 1, 2, 3)}
     assert {size: c.targets for size, c in growth["targets"].items()} == {1: (4,), 2: (4, 5)}
 
@@ -230,23 +238,20 @@ def test_a_file_that_names_no_cases_is_refused(tmp_path, monkeypatch, capsys, te
 
 
 @pytest.mark.parametrize(
-    ("more", "sentence"),
+    ("case", "words", "sentence"),
     [
-        (["--context", 0, 1], "needs context frames"),
-        (["--context", 0, 1, "--target", 9], "no frame 9"),
-        (["--context", 0, 1, "--target", 2, "--methods", "magic"], "'magic'"),
-        (["--cases", "cases.json"], "both named"),
-        (["--repeats", 0], "repeats"),
+        ({"targets": [9]}, [], "no frame 9"),
+        ({}, ["--methods", "magic"], "'magic'"),
+        ({}, ["--repeats", 0], "repeats"),
     ],
 )
-def test_what_cannot_be_measured_is_refused(scene, monkeypatch, capsys, more, sentence):
-    assert run(monkeypatch, "bench", scene, *more) == 2
+def test_what_cannot_be_measured_is_refused(scene, monkeypatch, capsys, case, words, sentence):
+    assert run(monkeypatch, "bench", "--cases", write_cases(scene, **case), *words) == 2
     assert sentence in assert_a_sentence(capsys)
 
 
 def test_results_are_not_replaced_unasked(quick, scene, monkeypatch, capsys):
-    given = ("--context", 0, 1, "--target", 2, "--out", quick)
-    assert run(monkeypatch, "bench", scene, *given) == 2
+    assert run(monkeypatch, "bench", "--cases", write_cases(scene), "--out", quick) == 2
     assert "not empty" in assert_a_sentence(capsys)
 
 

@@ -68,10 +68,6 @@ Series = dict[str, dict[int, BenchCase]]
 """Cases by axis and size, which differ only in the field of the axis."""
 AXES = {"gaussians": "gaussians", "pixels": "resolution", "views": "context", "targets": "targets"}
 """Axes of growth, with the field of a case that each one changes."""
-GAUSSIANS = (250_000, 500_000, 1_000_000, 2_000_000)
-"""Default numbers of Gaussians of the input splats."""
-SIDES = (0.5, 0.5**0.5, 1.0, 2**0.5, 2.0)
-"""Default sides of the images, as multiples of the sides of the case."""
 
 
 @dataclass(frozen=True)
@@ -109,24 +105,6 @@ def get_size(axis: str, case: BenchCase) -> int:
         return case.pixels
     value = getattr(case, AXES[axis])
     return value if isinstance(value, int) else len(value)
-
-
-def make_default_growth(case: BenchCase) -> GrowthValues:
-    """Make series of doubled sizes from a case."""
-    height, width = case.resolution
-    return GrowthValues(
-        GAUSSIANS,
-        tuple((round(side * height), round(side * width)) for side in SIDES),
-        make_prefixes(case.context, 2),
-        make_prefixes(case.targets, 1),
-    )
-
-
-def make_prefixes(frames: Frames, fewest: int) -> tuple[Frames, ...]:
-    """Return the first `fewest` frames, the first twice as many, and so on, if several fit."""
-    counts = [fewest * 2**n for n in range(len(frames).bit_length())]
-    prefixes = tuple(frames[:count] for count in counts if count <= len(frames))
-    return prefixes if len(prefixes) > 1 else ()
 
 
 def read_manifest(path: Path) -> Manifest:

@@ -14,10 +14,10 @@ from rich.console import Console
 
 from gscompleter.apps.bench.cases import (
     BenchCase,
+    GrowthValues,
     Manifest,
     Series,
     check_frames,
-    make_default_growth,
     read_manifest,
     write_input_splat,
 )
@@ -44,7 +44,6 @@ from gscompleter.apps.commands.demo import (
 )
 from gscompleter.apps.commands.options import BenchOptions
 from gscompleter.data.scene import write_cameras
-from gscompleter.errors import InputError
 from gscompleter.evaluation.methods import Models
 from gscompleter.generators import load_generator
 from gscompleter.io.files import check_output, open_output_folder
@@ -54,6 +53,11 @@ from gscompleter.render import choose_device, load_renderer
 
 BEYOND = (1.0, 1.25, 1.5, 1.75)
 """Distances of targets to the right of the demo's right camera, in baselines."""
+DEMO_GROWTH = GrowthValues(
+    gaussians=(250_000, 500_000, 1_000_000, 2_000_000),
+    pixels=((128, 128), (256, 256), (512, 512)),
+    targets=((2,), (2, 3), (2, 3, 4, 5)),
+)
 QUICK_ITERATIONS = 2
 
 
@@ -85,14 +89,12 @@ class Bench:
 
 def run_bench(options: BenchOptions) -> None:
     """Measure the cases and methods, and print or write the tables."""
-    if options.folder is not None and options.cases is not None:
-        raise InputError("A scene and a file of cases are both named; name one.", "cases")
     if options.out is not None:
         check_output(options.out, options.overwrite)
     if options.quick:
         options = replace(options, repeats=1, growth=())
     with TemporaryDirectory(prefix="gscompleter-bench-") as temporary:
-        manifest = load_manifest(options, Path(temporary))
+        manifest = load_manifest(options, Path(temporary) / "motorcycle")
         cases, series = [*manifest.cases], manifest.make_series(options.growth)
         if options.quick:
             cases = [min(cases, key=lambda case: (case.gaussians or 0, case.pixels))]
@@ -115,31 +117,15 @@ def write_report(report: Report, options: BenchOptions) -> None:
 
 
 def load_manifest(options: BenchOptions, folder: Path) -> Manifest:
-    """Collect the cases of a file, a scene or the demo's pair."""
+    """Read the cases of a file, or write the demo's pair to `folder`."""
     if options.cases is not None:
         return read_manifest(options.cases)
-    if options.folder is None:
-        case = write_demo_case(options, folder / "motorcycle")
-        return Manifest((replace(case, targets=case.targets[:1]),), make_default_growth(case))
-    if not options.context or not options.target:
-        raise InputError(
-            "A scene needs context frames and targets; name them, as in --context 0 4 --target 8.",
-        )
-    name, planes = options.folder.resolve().name, (options.near, options.far)
-    frames = options.context, options.target
-    case = BenchCase(name, options.folder, *frames, options.resolution, *planes)
-    return Manifest((case,), make_default_growth(case))
-
-
-def write_demo_case(options: BenchOptions, folder: Path) -> BenchCase:
-    """Write the demo's pair to `folder` with targets beyond its right camera."""
     write_motorcycle_scene(folder)
     left, right = get_motorcycle_cameras(741, 500)
     beyond = [move_right(right, step * BASELINE_M) for step in BEYOND]
     names = [f"images/{name}.png" for name in ("left", "right", *BEYOND)]
     write_cameras(folder / "transforms.json", [left, right, *beyond], names)
-    targets = tuple(range(2, 2 + len(beyond)))
-    return BenchCase("motorcycle", folder, (0, 1), targets, options.resolution)
+    return Manifest((BenchCase("motorcycle", folder, (0, 1), (2,), (256, 256)),), DEMO_GROWTH)
 
 
 def prepare_bench(options: BenchOptions, folder: Path) -> Bench:

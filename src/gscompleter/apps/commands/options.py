@@ -291,24 +291,12 @@ class BenchOptions(RunOptions, WritingOptions):
 
     Every completion is a process of its own, start-up included; methods are compared within one
     process. Times are also given relative to a yardstick: one forward and backward pass of the
-    renderer with 196,608 Gaussians at 256 x 256. Without a scene or cases the stereo pair of
+    renderer with 196,608 Gaussians at 256 x 256. Without cases the stereo pair of
     `gscompleter demo` is measured.
     """
 
-    folder: Annotated[Path | None, tyro.conf.Positional, tyro.conf.arg(metavar="SCENE")] = None
-    """Photographs with cameras as in `complete`; needs --context and --target."""
-    context: tuple[Frame, ...] = ()
-    """Frame numbers of the photographs to start from."""
-    target: tuple[Frame, ...] = ()
-    """Frame numbers to complete the scene for. Methods are compared on the first."""
-    resolution: tuple[int, int] = (256, 256)
-    """Working size, height and width, if --cases is not given."""
-    near: float | None = None
-    """Smallest depth in the scene, in the unit of its cameras; estimated if not given."""
-    far: float | None = None
-    """Largest depth in the scene, in the unit of its cameras; estimated if not given."""
     cases: Path | None = None
-    """JSON file of cases and growth series instead of a scene, as benchmarks/performance.json.
+    """JSON file of scenes with their frames and growth series, as benchmarks/performance.json.
     Methods are compared on the first case."""
     methods: tuple[BenchMethod, ...] = ("full", "densify-800", "distill", "reggs")
     """Methods to compare: full (ours) or others."""
