@@ -243,13 +243,13 @@ def test_manifests_of_all_kinds_name_the_same_jobs(tmp_path):
     assert options[0][1] == parse_row(by_folder[1].options, tmp_path / "o")
 
 
-def test_rows_of_one_scene_get_numbers_and_equal_names_are_refused(tmp_path):
+def test_rows_of_one_scene_need_names(tmp_path):
     manifest = tmp_path / "m.jsonl"
-    rows = [{"folder": "room"}, {"folder": "room", "seed": 1}, {"folder": "room", "name": "a/b"}]
+    rows = [{"folder": "room"}, {"folder": "room", "seed": 1, "name": "a/b"}]
     manifest.write_text("\n".join(map(json.dumps, rows)))
-    assert [j.name for j in read_manifest(manifest, {})] == ["room-1", "room-2", "a-b"]
-    manifest.write_text("\n".join(map(json.dumps, [{"name": "x"}, {"name": "x"}])))
-    with pytest.raises(InputError, match="Two jobs have the name x"):
+    assert [j.name for j in read_manifest(manifest, {})] == ["room", "a-b"]
+    manifest.write_text("\n".join(map(json.dumps, [{"folder": "room"}, {"folder": "room"}])))
+    with pytest.raises(InputError, match="Two jobs have the name room"):
         read_manifest(manifest, {})
 
 
