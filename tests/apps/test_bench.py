@@ -10,8 +10,8 @@ import torch
 from command import run
 from gscompleter.apps.bench.cases import (
     BenchCase,
+    GrowthValues,
     Manifest,
-    make_default_growth,
     multiply_gaussians,
     read_manifest,
 )
@@ -19,25 +19,19 @@ from gscompleter.apps.bench.measure import (
     PROCESS,
     REST,
     Sample,
-    UnfrozenRenderer,
     make_yardstick,
     measure_beside,
     measure_in_rounds,
     run_command,
 )
 from gscompleter.apps.bench.report import (
-    PEAK,
+    Measured,
     Report,
     fit_exponent,
-    fit_growth,
     format_report,
-    summarize,
 )
-from gscompleter.completer import GSCompleter
-from gscompleter.config import CompleterConfig
 from gscompleter.errors import InputError
 from gscompleter.render import load_renderer
-from gscompleter.types import merge
 from paths import ROOT
 from scenes import Room, camera_at, gaussians_of, photographed, view_of
 
@@ -45,7 +39,7 @@ SIZE = 64
 CAMERAS = (camera_at(-0.2, size=SIZE), camera_at(0.2, size=SIZE), camera_at(0.5, size=SIZE))
 PERFORMANCE = ROOT / "benchmarks" / "performance.json"
 AXES = ("gaussians", "pixels", "views", "targets")
-CASE = BenchCase("room", Path("room"), (0, 1, 2, 3), (4, 5), (64, 96))
+CASE = BenchCase("room", Path("room"), (0, 1), (4, 5), (64, 96))
 
 
 @pytest.fixture(scope="module")
@@ -53,14 +47,22 @@ def scene(tmp_path_factory):
     return photographed(tmp_path_factory.mktemp("bench") / "room", CAMERAS)
 
 
+def write_cases(scene: Path, **more) -> Path:
+    """Write a file with the room as its only case."""
+    row = {"name": "room", "scene": scene.name, "context": [0, 1], "targets": [2]}
+    path = scene.parent / "cases.json"
+    path.write_text(json.dumps({"cases": [{**row, "resolution": [SIZE, SIZE], **more}]}))
+    return path
+
+
 @pytest.fixture(scope="module")
 def quick(scene, tmp_path_factory):
     """Return the files of a quick run on a room."""
     out = tmp_path_factory.mktemp("bench") / "out"
-    given = ("--context", 0, 1, "--target", 2, "--resolution", SIZE, SIZE, "--near", 0.5)
-    methods = ("--methods", "full", "autograd", "densify-100")
+    cases = write_cases(scene, near=0.5, far=20)
+    methods = ("--methods", "full", "densify-100")
     with pytest.MonkeyPatch.context() as patch:
-        assert run(patch, "bench", scene, *given, "--far", 20, *methods, "--quick", "--quiet",
+        assert run(patch, "bench", "--cases", cases, *methods, "--quick", "--quiet",
                    "--out", out) == 0  # fmt: skip
     return out
 
@@ -73,24 +75,13 @@ def sample(seconds: float, yardstick: float = 0.5) -> Sample:
 def test_a_quick_run_tells_every_stage_of_its_case_and_its_methods(quick):
     report = json.loads((quick / "bench.json").read_text())
     (case,) = report["cases"]
-    assert {"context", "generate", "lift", "register", "integrate", "total"} < set(case["seconds"])
-    assert case["gaussians"]["context"] == 2 * SIZE * SIZE
-    assert [method["name"] for method in report["methods"]] == [
-        "full",
-        "autograd",
-        "densify-100",
-    ]
-    assert report["growth"] == []
+    (one,) = case["samples"]
+    assert {"context", "generate", "lift", "register", "integrate", "total"} < set(one["seconds"])
+    assert one["gaussians"]["context"] == 2 * SIZE * SIZE
+    assert [method["name"] for method in report["methods"]] == ["full", "densify-100"]
+    assert report["growth"] == {}
     assert report["machine"]["cores"] >= 1
     assert report["settings"]["baseline_iterations"] == 2
-
-
-def test_every_ratio_is_the_whole_in_yardsticks(quick):
-    report = json.loads((quick / "bench.json").read_text())
-    for kind, whole in (("cases", PROCESS), ("methods", "own")):
-        for measured in report[kind]:
-            (one,) = measured["samples"]
-            assert measured["ratio"] == pytest.approx(one["seconds"][whole] / one["yardstick"])
 
 
 def test_the_rest_of_a_process_is_what_its_completion_does_not_count(quick):
@@ -103,23 +94,7 @@ def test_the_rest_of_a_process_is_what_its_completion_does_not_count(quick):
 def test_the_tables_have_a_row_for_each_case_and_method(quick):
     text = (quick / "tables.md").read_text()
     assert text.count("| room |") == 1
-    assert all(f"| {name} |" in text for name in ("full", "autograd", "densify-100"))
-
-
-def test_nothing_frozen_descends_as_what_is_frozen_does():
-    views = [view_of(Room(), camera) for camera in CAMERAS[:2]]
-    scene = merge([gaussians_of(view) for view in views])
-    renderer = load_renderer("cpu")
-
-    def losses(renderer, config):
-        completer = GSCompleter(renderer=renderer, config=config)
-        (target,) = completer(views, CAMERAS[2], scene).targets
-        assert len(target.added) > 0
-        return torch.tensor([*target.losses["register"], *target.losses["refine"]])
-
-    for config in (CompleterConfig(), CompleterConfig.paper()):
-        frozen, plain = losses(renderer, config), losses(UnfrozenRenderer(renderer), config)
-        assert (frozen - plain).abs().max() < 1e-4 * frozen.abs().max()
+    assert all(f"| {name} |" in text for name in ("full", "densify-100"))
 
 
 def test_a_crowd_of_copies_looks_like_the_scene():
@@ -145,14 +120,16 @@ def test_a_crowd_is_the_same_for_the_same_seed_and_may_be_smaller():
 
 
 def test_the_yardstick_renders_one_gaussian_per_pixel_of_three_cameras():
-    counts = []
+    counts, renderer = [], load_renderer("cpu")
 
-    class Counting(UnfrozenRenderer):
+    class Counting:
+        freeze = renderer.freeze
+
         def render(self, gaussians, camera):
             counts.append(len(gaussians))
-            return self.renderer.render(gaussians, camera)
+            return renderer.render(gaussians, camera)
 
-    yardstick = make_yardstick(Counting(load_renderer("cpu")), "cpu")
+    yardstick = make_yardstick(Counting(), "cpu")
     found, unit = measure_beside(yardstick, lambda: "found")
     assert set(counts) == {3 * 256 * 256}
     assert found == "found"
@@ -168,11 +145,11 @@ def test_the_slope_of_a_power_is_its_exponent():
 
 
 def test_a_sample_in_yardsticks_is_its_seconds_over_theirs():
-    measured = summarize("case", [sample(1.0, 0.5), sample(3.0, 0.5), sample(10.0, 2.0)])
+    measured = Measured("case", [sample(1.0, 0.5), sample(3.0, 0.5), sample(10.0, 2.0)])
     assert measured.seconds[PROCESS] == 3.0
     assert measured.ratio == 5.0
     assert measured.peak_bytes == 2**30
-    table = format_report(Report({}, {"repeats": 3}, 0.5, (measured,), (), ()))
+    table = format_report(Report({}, {"repeats": 3}, (measured,), (), {}))
     assert "| case | 0.75 | 3.00 | 5.0 (2.0–6.0) | 1.07 | 1 | 2 |" in table
 
 
@@ -189,29 +166,27 @@ def test_everything_has_its_turn_before_anything_has_two():
 
 def test_methods_are_told_in_multiples_of_the_first():
     def method(name, own):
-        return summarize(name, [Sample({"register": own, "own": own}, 0.5, None, {})])
+        return Measured(name, [Sample({"register": own, "own": own}, 0.5, None, {})])
 
-    ours, theirs = method("full", 0.5), method("reggs", 150.0)
-    report = Report({}, {"repeats": 1}, 0.5, (), (ours, theirs), ())
+    methods = method("full", 0.5), method("reggs", 150.0)
+    report = Report({}, {"repeats": 1}, (Measured("case", [sample(1.0)]),), methods, {})
     assert "| reggs | 150.00 | 150.00 | 300.0 | – | 300 |" in format_report(report)
 
 
 def test_a_case_that_several_series_share_is_measured_once():
-    growth = Manifest((CASE,), make_default_growth(CASE)).make_series(AXES)
+    values = GrowthValues((5, 6), ((64, 96), (9, 9)), ((0, 1), (0, 1, 2, 3)), ((4,), (4, 5)))
+    growth = Manifest((CASE,), values).make_series(AXES)
     base = replace(CASE, targets=(4,))
-    assert [c.resolution for c in growth["pixels"].values()][2] == base.resolution
     different = {base, *(case for found in growth.values() for case in found.values())}
-    assert len(different) == 1 + 4 + 4 + 1 + 1  # each but Gaussians holds the base
+    assert len(different) == 1 + 2 + 1 + 1 + 1  # each but Gaussians holds the base
     assert {size: c.context for size, c in growth["views"].items()} == {2: (0, 1), 4: (0, 1, 2, 3)}
     assert {size: c.targets for size, c in growth["targets"].items()} == {1: (4,), 2: (4, 5)}
 
 
 def test_growth_is_told_with_its_exponents():
-    series = fit_growth("targets", {n: summarize(f"{n}", [sample(0.1 * n)]) for n in (1, 2, 4)})
-    report = Report({"cores": 2}, {"repeats": 1}, 0.5, (), (), (series,))
-    assert series.exponents[PROCESS] == pytest.approx(1)
-    assert series.exponents[PEAK] == pytest.approx(0)
-    assert "| exponent | 1.00 | 1.00 | – | 0.00 |" in format_report(report)
+    series = {n: Measured(f"{n}", [sample(0.1 * n)]) for n in (1, 2, 4)}
+    report = Report({"cores": 2}, {"repeats": 1}, (series[1],), (), {"targets": series})
+    assert "| exponent | 1.00 | 1.00 | 1.00 | 0.00 |" in format_report(report)
 
 
 def test_the_cases_of_the_documentation_can_be_read():
@@ -246,13 +221,12 @@ ROW = {"name": "a", "scene": "room", "context": [0, 1], "targets": [2], "resolut
         "no JSON",
         "[]",
         '{"cases": []}',
-        json.dumps({"cases": [ROW, ROW]}),
         json.dumps({"cases": [{**ROW, "context": []}]}),
         json.dumps({"cases": [{**ROW, "resolution": [64]}]}),
         json.dumps({"cases": [{**ROW, "targets": [2.5]}]}),
         json.dumps({"cases": [{**ROW, "near": "close"}]}),
-        json.dumps({"cases": [ROW], "growth": {"case": "b"}}),
-        json.dumps({"cases": [ROW], "growth": {"case": "a", "pixels": [64]}}),
+        json.dumps({"cases": [ROW], "growth": {"case": "a"}}),
+        json.dumps({"cases": [ROW], "growth": {"pixels": [64]}}),
         json.dumps({"cases": [ROW]}),
     ],
 )
@@ -264,23 +238,20 @@ def test_a_file_that_names_no_cases_is_refused(tmp_path, monkeypatch, capsys, te
 
 
 @pytest.mark.parametrize(
-    ("more", "sentence"),
+    ("case", "words", "sentence"),
     [
-        (["--context", 0, 1], "needs context frames"),
-        (["--context", 0, 1, "--target", 9], "no frame 9"),
-        (["--context", 0, 1, "--target", 2, "--methods", "magic"], "'magic'"),
-        (["--cases", "cases.json"], "both named"),
-        (["--repeats", 0], "repeats"),
+        ({"targets": [9]}, [], "no frame 9"),
+        ({}, ["--methods", "magic"], "'magic'"),
+        ({}, ["--repeats", 0], "repeats"),
     ],
 )
-def test_what_cannot_be_measured_is_refused(scene, monkeypatch, capsys, more, sentence):
-    assert run(monkeypatch, "bench", scene, *more) == 2
+def test_what_cannot_be_measured_is_refused(scene, monkeypatch, capsys, case, words, sentence):
+    assert run(monkeypatch, "bench", "--cases", write_cases(scene, **case), *words) == 2
     assert sentence in assert_a_sentence(capsys)
 
 
 def test_results_are_not_replaced_unasked(quick, scene, monkeypatch, capsys):
-    given = ("--context", 0, 1, "--target", 2, "--out", quick)
-    assert run(monkeypatch, "bench", scene, *given) == 2
+    assert run(monkeypatch, "bench", "--cases", write_cases(scene), "--out", quick) == 2
     assert "not empty" in assert_a_sentence(capsys)
 
 

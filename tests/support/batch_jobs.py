@@ -15,7 +15,7 @@ from typing import Any
 
 from gscompleter.errors import InputError
 from gscompleter.io.files import replace_file
-from gscompleter.jobs.engines import LocalEngine, RayEngine
+from gscompleter.jobs.engines import open_local, open_ray
 from gscompleter.jobs.jobs import JOBS, Job, find_missing_jobs, has_row, make_folder, run_job
 from gscompleter.jobs.workers import Engine, run_jobs
 
@@ -65,7 +65,7 @@ def run_all(out: Path, jobs: Sequence[Job], engine: Engine | None, retries: int 
 
 
 def engine_named(name: str, workers: int) -> Engine:
-    return LocalEngine(workers) if name == "local" else RayEngine(workers, threads=1)
+    return partial(open_local, workers) if name == "local" else partial(open_ray, workers, 1)
 
 
 def plain_jobs(count: int, seconds: float) -> list[Job]:

@@ -8,14 +8,13 @@ from __future__ import annotations
 
 import re
 import time
-from abc import ABC, abstractmethod
 from collections import deque
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import AbstractContextManager
 from dataclasses import dataclass, replace
 from typing import Any
 
-from gscompleter.errors import InputError, quote_value
+from gscompleter.errors import InputError
 from gscompleter.jobs.jobs import Job
 
 POLL_SECONDS = 0.1
@@ -52,18 +51,12 @@ class Pool:
     """Number of shares that run simultaneously."""
     start: Callable[[Share], Any]
     """Starts a share; returns its future, with `done()`, `exception()` and `result()`."""
+    num_shares: int | None = None
+    """Number of shares to divide the jobs into; None makes one of each job."""
 
 
-class Engine(ABC):
-    """Starts workers somewhere."""
-
-    @abstractmethod
-    def open(self) -> AbstractContextManager[Pool]:
-        """Open a pool; its workers are stopped at the end of the block."""
-
-    def divide(self, jobs: Sequence[Job]) -> list[list[Job]]:
-        """Divide jobs into shares."""
-        return [[job] for job in jobs]
+Engine = Callable[[], AbstractContextManager[Pool]]
+"""Opens a pool, whose workers are stopped at the end of the block."""
 
 
 def run_jobs(
@@ -87,8 +80,10 @@ def run_jobs(
             perform(job)
             yield job
         return
-    waiting, running = deque(engine.divide(jobs)), dict[Any, list[Job]]()
-    with engine.open() as pool:
+    running: dict[Any, list[Job]] = {}
+    with engine() as pool:
+        count = min(pool.num_shares or len(jobs), len(jobs))
+        waiting = deque(list(jobs[i::count]) for i in range(count))
         while waiting or running:
             while waiting and len(running) < pool.size:
                 share = waiting.popleft()
@@ -141,13 +136,8 @@ def parse_shard(text: str | None, environment: Mapping[str, str]) -> tuple[int, 
         task, first, count = map(int, numbers)
         return check_shard((task - first, count))
     match = re.fullmatch(r"([0-9]{1,6})/([0-9]{1,6})", text)
-    if match is None:
-        raise InputError(
-            f"The shard is '{quote_value(text)}'; give it as i/n, as in 0/4 for the first of four, "
-            "or auto in an array of SLURM.",
-            "shard",
-        )
-    return check_shard((int(match[1]), int(match[2])))
+    number, count = map(int, match.groups()) if match else (-1, 0)
+    return check_shard((number, count))
 
 
 def check_shard(shard: tuple[int, int]) -> tuple[int, int]:
@@ -155,6 +145,7 @@ def check_shard(shard: tuple[int, int]) -> tuple[int, int]:
     number, count = shard
     if not 0 <= number < count:
         raise InputError(
-            f"There is no shard {number}/{count}; of n shards the first is 0/n, the last (n-1)/n."
+            "There is no such shard; give i/n: of four shards the first is 0/4, the last 3/4.",
+            "shard",
         )
     return shard

@@ -43,7 +43,7 @@ def read_manifest(manifest: Path, common: Mapping[str, Any]) -> list[Job]:
     rows = [{**here, **resolve_paths(row, base)} for row in read_rows(manifest)]
     if not rows:
         raise InputError("The manifest names no job; give it a row for each scene.")
-    names = list(name_jobs(rows))
+    names = [make_job_name(row) for row in rows]
     name, count = Counter(names).most_common(1)[0]
     if count > 1:
         raise InputError(
@@ -110,19 +110,7 @@ def parse_json_lines(text: str) -> Iterator[Options]:
             yield row
 
 
-def name_jobs(rows: list[Options]) -> Iterator[str]:
-    """Name the jobs by their `name` or scene folder, numbered if several share a folder."""
-    scenes = [None if NAME in row else Path(str(row.get(FOLDER, ""))).name for row in rows]
-    count, seen = Counter(scenes), Counter[str]()
-    for row, scene in zip(rows, scenes, strict=True):
-        if scene is None:
-            yield make_job_name(str(row[NAME]))
-        else:
-            seen[scene] += 1
-            name = make_job_name(scene)
-            yield name if count[scene] == 1 else f"{name}-{seen[scene]}"
-
-
-def make_job_name(name: str) -> str:
-    """Turn a name into a valid file name."""
+def make_job_name(row: Options) -> str:
+    """Turn the name of a row, or that of its scene folder, into a valid file name."""
+    name = str(row[NAME]) if NAME in row else Path(str(row.get(FOLDER, ""))).name
     return re.sub(r"[^\w.+-]+", "-", name).strip(".")[:LONGEST_NAME] or "job"

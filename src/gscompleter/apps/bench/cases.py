@@ -12,7 +12,7 @@ from typing import Annotated
 
 import torch
 from annotated_types import Ge, MinLen
-from pydantic import TypeAdapter
+from pydantic import ConfigDict, TypeAdapter
 
 from gscompleter.data.formats import open_photographs
 from gscompleter.data.photographs import Photographs
@@ -64,19 +64,17 @@ class BenchCase:
         return models.make_completer().begin([view.to(device) for view in views])
 
 
+Series = dict[str, dict[int, BenchCase]]
+"""Cases by axis and size, which differ only in the field of the axis."""
 AXES = {"gaussians": "gaussians", "pixels": "resolution", "views": "context", "targets": "targets"}
 """Axes of growth, with the field of a case that each one changes."""
-GAUSSIANS = (250_000, 500_000, 1_000_000, 2_000_000)
-"""Default numbers of Gaussians of the input splats."""
-SIDES = (0.5, 0.5**0.5, 1.0, 2**0.5, 2.0)
-"""Default sides of the images, as multiples of the sides of the case."""
 
 
 @dataclass(frozen=True)
 class GrowthValues:
-    """Values along each axis, for the case with a name."""
+    """Values along each axis."""
 
-    case: str
+    __pydantic_config__ = ConfigDict(extra="forbid")
     gaussians: tuple[Whole, ...] = ()
     pixels: tuple[Size, ...] = ()
     views: tuple[Frames, ...] = ()
@@ -85,17 +83,15 @@ class GrowthValues:
 
 @dataclass(frozen=True)
 class Manifest:
-    """All cases to measure; the first one is also used to compare methods."""
+    """All cases to measure; methods are compared on the first one, which also grows."""
 
     cases: Annotated[tuple[BenchCase, ...], MinLen(1)]
-    growth: GrowthValues | None = None
+    growth: GrowthValues = GrowthValues()
 
-    def make_series(self, axes: Sequence[str]) -> dict[str, dict[int, BenchCase]]:
-        """Vary a case, with its first target, along each of `axes`: cases by axis and size."""
-        if self.growth is None:
-            return {}
-        (case,) = (case for case in self.cases if case.name == self.growth.case)
-        base, series = replace(case, targets=case.targets[:1]), {}
+    def make_series(self, axes: Sequence[str]) -> Series:
+        """Vary the first case, with its first target, along each of `axes`."""
+        base = replace(self.cases[0], targets=self.cases[0].targets[:1])
+        series: Series = {}
         for axis in axes:
             cases = [replace(base, **{AXES[axis]: value}) for value in getattr(self.growth, axis)]
             if cases:
@@ -111,33 +107,11 @@ def get_size(axis: str, case: BenchCase) -> int:
     return value if isinstance(value, int) else len(value)
 
 
-def make_default_growth(case: BenchCase) -> GrowthValues:
-    """Make series of doubled sizes from a case."""
-    height, width = case.resolution
-    return GrowthValues(
-        case.name,
-        GAUSSIANS,
-        tuple((round(side * height), round(side * width)) for side in SIDES),
-        make_prefixes(case.context, 2),
-        make_prefixes(case.targets, 1),
-    )
-
-
-def make_prefixes(frames: Frames, fewest: int) -> tuple[Frames, ...]:
-    """Return the first `fewest` frames, the first twice as many, and so on, if several fit."""
-    counts = [fewest * 2**n for n in range(len(frames).bit_length())]
-    prefixes = tuple(frames[:count] for count in counts if count <= len(frames))
-    return prefixes if len(prefixes) > 1 else ()
-
-
 def read_manifest(path: Path) -> Manifest:
     """Read a manifest from a JSON file; paths are relative to its folder."""
     text = json.dumps(read_json(path, "name a file of cases to measure"))
     try:
         found = TypeAdapter(Manifest).validate_json(text, strict=True)
-        names = [case.name for case in found.cases]
-        if len(set(names)) < len(names) or (found.growth and found.growth.case not in names):
-            raise ValueError("two cases have the same name, or that of the growth has none")
     except ValueError as error:
         raise InputError(
             f"{quote_value(path)} names no cases to measure ({quote_value(str(error))}); it needs "

@@ -10,7 +10,6 @@ import time
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from tempfile import TemporaryDirectory
 from typing import TypeVar
 
 import torch
@@ -21,9 +20,8 @@ from gscompleter.evaluation.methods import BASELINES, METHODS, Method, Models, P
 from gscompleter.io.files import SUMMARY_FILE
 from gscompleter.progress import show_progress, track
 from gscompleter.render import Renderer
-from gscompleter.render.redraw import RedrawnScene
 from gscompleter.state import Completion
-from gscompleter.types import Camera, Gaussians, Render, make_observed, merge, sh_from_rgb
+from gscompleter.types import Camera, Gaussians, make_observed, merge, sh_from_rgb
 
 SIDE = 256
 """Side of the yardstick's image, in pixels."""
@@ -42,18 +40,17 @@ OWN = "own"
 """Name of the sum of their seconds."""
 
 PROGRAM = """
-import sys
-from pathlib import Path
 from gscompleter.cli import run
-peak = Path(sys.argv.pop(1))
 try:
     run()
 finally:
     from gscompleter.evaluation.memory import read_process_peak
-    peak.write_text(str(read_process_peak() or ""))
+    print(read_process_peak() or "")
 """
-"""Program of a process. It reports its own peak, because a child inherits its parent's."""
+"""Program of a process. It prints its own peak, because a child inherits its parent's."""
 
+BENCH_METHODS: dict[str, Method] = {"full": METHODS["full"], **BASELINES}
+"""Methods by name; the first one is ours."""
 Yardstick = Callable[[], object]
 T = TypeVar("T")
 K = TypeVar("K")
@@ -75,6 +72,10 @@ class Sample:
     def ratio(self) -> float:
         """Seconds of the last stage, in yardsticks."""
         return [*self.seconds.values()][-1] / self.yardstick
+
+
+Task = tuple[Callable[[], Sample], int]
+"""A measurement with its repeats."""
 
 
 def make_yardstick(renderer: Renderer, device: str) -> Yardstick:
@@ -155,52 +156,17 @@ def run_command(words: Sequence[str]) -> tuple[float, int | None]:
         Wall time in seconds with start-up and imports, and the peak resident memory in bytes, or
         None if the system does not report it.
     """
-    with TemporaryDirectory() as folder:
-        peak = Path(folder) / "peak"
-        start = time.perf_counter()
-        done = subprocess.run(
-            [sys.executable, "-c", PROGRAM, str(peak), *words],
-            stdout=subprocess.DEVNULL,
-            stderr=subprocess.PIPE,
-            text=True,
-        )
-        seconds = time.perf_counter() - start
-        if done.returncode == 2:
-            raise InputError(done.stderr.strip().removeprefix("gscompleter: "))
-        if done.returncode != 0:
-            raise RuntimeError(f"gscompleter {' '.join(words)} failed:\n{done.stderr}")
-        peak_bytes = peak.read_text()
-    return seconds, int(peak_bytes) if peak_bytes else None
-
-
-@dataclass(frozen=True)
-class UnfrozenRenderer:
-    """A renderer that renders and differentiates the whole scene in every iteration."""
-
-    renderer: Renderer
-
-    def render(self, gaussians: Gaussians, camera: Camera) -> Render:
-        """Render as the wrapped renderer does."""
-        return self.renderer.render(gaussians, camera)
-
-    def freeze(self, context: Gaussians, camera: Camera) -> RedrawnScene:
-        """Return a scene that is rendered anew with every call."""
-        return RedrawnScene(self.renderer, context, camera)
-
-
-def complete_with_autograd(state: Completion, target: Camera, models: Models) -> Prediction:
-    """Complete as `full` does, with the same objectives and iterations but no frozen context."""
-    return METHODS["full"](
-        state, target, replace(models, renderer=UnfrozenRenderer(models.renderer))
+    start = time.perf_counter()
+    done = subprocess.run(
+        [sys.executable, "-c", PROGRAM, *words], capture_output=True, text=True, check=False
     )
-
-
-BENCH_METHODS: dict[str, Method] = {
-    "full": METHODS["full"],
-    "autograd": complete_with_autograd,
-    **BASELINES,
-}
-"""Methods by name; the first one is ours, and times of others are multiples of its time."""
+    seconds = time.perf_counter() - start
+    if done.returncode == 2:
+        raise InputError(done.stderr.strip().removeprefix("gscompleter: "))
+    if done.returncode != 0:
+        raise RuntimeError(f"gscompleter {' '.join(words)} failed:\n{done.stderr}")
+    peak = done.stdout.splitlines()[-1]
+    return seconds, int(peak) if peak else None
 
 
 def measure_method(
@@ -220,16 +186,10 @@ def measure_method(
     return Sample({**found.seconds, OWN: own}, unit, peak_bytes, counts)
 
 
-def measure_in_rounds(
-    tasks: Mapping[K, tuple[Callable[[], Sample], int]],
-) -> dict[K, list[Sample]]:
-    """Run measurements in rounds until each has its repeats, so that a busy hour slows all alike.
-
-    Args:
-        tasks: Measurements, with their repeats.
-    """
+def measure_in_rounds(tasks: Mapping[K, Task]) -> dict[K, list[Sample]]:
+    """Measure in rounds until each task has its repeats, so that a busy hour slows all alike."""
     samples: dict[K, list[Sample]] = {key: [] for key in tasks}
-    rounds = range(max((repeats for _, repeats in tasks.values()), default=0))
+    rounds = range(max(repeats for _, repeats in tasks.values()))
     turns = [key for n in rounds for key, (_, repeats) in tasks.items() if n < repeats]
     for key in track(turns, "measuring"):
         with show_progress(None):  # no progress lines inside a measurement

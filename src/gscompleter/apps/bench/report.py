@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-import statistics
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from statistics import median
 from typing import Any
 
 import numpy as np
@@ -16,61 +16,46 @@ from gscompleter.timing import STAGES
 CASE_COLUMNS = (*STAGES, "total", REST, PROCESS)
 METHOD_COLUMNS = ("generate", "lift", "register", "integrate", "optimize", OWN)
 """Columns of seconds; stages that did not run are omitted."""
-PEAK = "peak"
-"""Key of the exponent of the peak memory."""
+COUNTS = ("context", "added")
+"""Numbers of Gaussians of a case."""
 
 
 @dataclass(frozen=True)
 class Measured:
-    """All samples of one case or method, with medians."""
+    """All samples of one case or method, with their medians."""
 
     name: str
-    seconds: Mapping[str, float]
-    """Wall time by stage."""
-    ratio: float
-    """Wall time in yardsticks."""
-    peak_bytes: int | None
-    """Largest peak memory, or None if unknown."""
-    gaussians: Mapping[str, int]
-    """Numbers of Gaussians; the seed makes all samples equal."""
     samples: Sequence[Sample]
 
+    @property
+    def seconds(self) -> dict[str, float]:
+        """Wall time by stage."""
+        stages = self.samples[0].seconds
+        return {stage: median(sample.seconds[stage] for sample in self.samples) for stage in stages}
 
-def summarize(name: str, samples: Sequence[Sample]) -> Measured:
-    """Compute the medians of samples."""
-    return Measured(
-        name,
-        {
-            stage: statistics.median([sample.seconds[stage] for sample in samples])
-            for stage in samples[0].seconds
-        },
-        statistics.median([sample.ratio for sample in samples]),
-        max((s.peak_bytes for s in samples if s.peak_bytes is not None), default=None),
-        samples[0].gaussians,
-        samples,
-    )
+    @property
+    def ratio(self) -> float:
+        """Wall time in yardsticks."""
+        return median(sample.ratio for sample in self.samples)
+
+    @property
+    def peak_bytes(self) -> int:
+        """Largest peak memory, or 0 if unknown."""
+        return max(sample.peak_bytes or 0 for sample in self.samples)
 
 
 @dataclass(frozen=True)
-class Growth:
-    """Measurements along an axis."""
+class Report:
+    """All measurements of one run; bench.json has these fields."""
 
-    axis: str
-    exponents: Mapping[str, float | None]
-    """Exponent p of seconds ~ size^p by stage, and of the peak memory."""
-    points: Mapping[int, Measured]
-    """Measurements by size."""
-
-
-def fit_growth(axis: str, points: Mapping[int, Measured]) -> Growth:
-    """Fit a power law to the medians of each stage."""
-    found, sizes = [*points.values()], [*points]
-    exponents = {
-        stage: fit_exponent(sizes, [point.seconds[stage] for point in found])
-        for stage in found[0].seconds
-    }
-    exponents[PEAK] = fit_exponent(sizes, [float(point.peak_bytes or 0) for point in found])
-    return Growth(axis, exponents, points)
+    machine: Mapping[str, str | int]
+    settings: Mapping[str, Any]
+    """Seed, repeats, and maximum number of iterations of the baselines."""
+    cases: Sequence[Measured]
+    methods: Sequence[Measured]
+    """Measurements on the first target of the first case."""
+    growth: Mapping[str, Mapping[int, Measured]]
+    """Measurements of the first case by axis and size."""
 
 
 def fit_exponent(sizes: Sequence[int], values: Sequence[float]) -> float | None:
@@ -82,44 +67,29 @@ def fit_exponent(sizes: Sequence[int], values: Sequence[float]) -> float | None:
     return float(np.polyfit(x, y, 1)[0])
 
 
-@dataclass(frozen=True)
-class Report:
-    """All measurements of one run; bench.json has these fields."""
-
-    machine: Mapping[str, str | int]
-    settings: Mapping[str, Any]
-    """Seed, repeats, and maximum number of iterations of the baselines."""
-    yardstick: float
-    """Median seconds of the yardstick."""
-    cases: Sequence[Measured]
-    methods: Sequence[Measured]
-    """Measurements on the first target of the first case; ours is the first if present."""
-    growth: Sequence[Growth]
-
-
 def format_report(report: Report) -> str:
     """Format machine, cases, methods and growth as Markdown."""
     machine = [f"{name.replace('_', ' ')} {value}" for name, value in report.machine.items()]
+    units = [sample.yardstick for case in report.cases for sample in case.samples]
     parts = [
         f"{', '.join(machine)}. Medians of {report.settings['repeats']}, of yardsticks also "
-        f"smallest to largest; seconds. The yardstick took {report.yardstick:.3f} s.\n"
+        f"smallest to largest; seconds. The yardstick took {median(units):.3f} s.\n",
+        *("### Cases\n", format_case_table(report.cases)),
     ]
-    if report.cases:
-        parts += ["### Cases\n", format_case_table(report.cases)]
     if report.methods:
         parts += ["### Methods\n", format_method_table(report.methods)]
-    for series in report.growth:
-        parts += [f"### Growth over {series.axis}\n", format_growth_table(series)]
+    for axis, points in report.growth.items():
+        parts += [f"### Growth over {axis}\n", format_growth_table(axis, points)]
     return "\n".join(parts)
 
 
 def format_case_table(cases: Sequence[Measured]) -> str:
     """Format seconds by stage, memory and Gaussians, one row per case."""
     columns = select_columns(cases, CASE_COLUMNS)
-    rows = [
-        [*format_cells(case, columns), *(f"{case.gaussians[k]:,}" for k in ("context", "added"))]
-        for case in cases
-    ]
+    rows = []
+    for case in cases:
+        counts = case.samples[0].gaussians
+        rows.append([*format_cells(case, columns), *(f"{counts[k]:,}" for k in COUNTS)])
     return format_table("case", columns, rows, "Gaussians", "added")
 
 
@@ -132,14 +102,15 @@ def format_method_table(methods: Sequence[Measured]) -> str:
     return format_table("method", columns, rows, f"times {first.name}")
 
 
-def format_growth_table(series: Growth) -> str:
-    """Format seconds and memory, one row per size, and then the exponents."""
-    points = [*series.points.values()]
-    columns = select_columns(points, CASE_COLUMNS)
-    powers = [*(series.exponents[column] for column in columns), None, series.exponents[PEAK]]
+def format_growth_table(axis: str, points: Mapping[int, Measured]) -> str:
+    """Format seconds and memory, one row per size, and the exponents p of value ~ size^p."""
+    found, sizes = [*points.values()], [*points]
+    columns = select_columns(found, CASE_COLUMNS)
+    values = [[point.seconds[column] for point in found] for column in columns]
+    values += [[point.ratio for point in found], [float(point.peak_bytes) for point in found]]
+    powers = [fit_exponent(sizes, column) for column in values]
     last = ["exponent", *("–" if power is None else f"{power:.2f}" for power in powers)]
-    rows = [format_cells(point, columns) for point in points]
-    return format_table(series.axis, columns, [*rows, last])
+    return format_table(axis, columns, [*(format_cells(p, columns) for p in found), last])
 
 
 def format_table(
@@ -156,11 +127,11 @@ def select_columns(found: Sequence[Measured], columns: Sequence[str]) -> list[st
 
 def format_cells(found: Measured, columns: Sequence[str]) -> list[str]:
     """Format the name, the seconds of each column, the yardsticks, and the memory."""
-    ratios = [sample.ratio for sample in found.samples]
+    seconds, ratios = found.seconds, [sample.ratio for sample in found.samples]
     spread = f" ({min(ratios):.1f}–{max(ratios):.1f})" if len(ratios) > 1 else ""
     return [
         found.name,
-        *(f"{found.seconds[c]:.2f}" if c in found.seconds else "–" for c in columns),
+        *(f"{seconds[c]:.2f}" if c in seconds else "–" for c in columns),
         f"{found.ratio:.1f}{spread}",
-        "–" if found.peak_bytes is None else f"{found.peak_bytes / 1e9:.2f}",
+        f"{found.peak_bytes / 1e9:.2f}" if found.peak_bytes else "–",
     ]

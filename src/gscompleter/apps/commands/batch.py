@@ -9,7 +9,6 @@ import os
 import re
 import time
 from collections.abc import Sequence
-from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -48,8 +47,8 @@ def run_batch(options: BatchOptions) -> None:
             claim_folder(out)
             share = jobs[number::count]
             left = find_missing_jobs(share, out, options.rerun == "failures")
-        perform, is_done = JobCompleter(out, options.retries), partial(has_row, out=out)
-        ended = run_jobs(left, perform, is_done, engine, options.retries)
+        perform = partial(perform_job, out=out, retries=options.retries)
+        ended = run_jobs(left, perform, partial(has_row, out=out), engine, options.retries)
         for _ in track(ended, "completing", len(left)):
             pass
         with show_preparation("table"):
@@ -79,16 +78,9 @@ def write_batch_results(out: Path, jobs: Sequence[Job]) -> None:
         write_overview(out, there)
 
 
-@dataclass(frozen=True)
-class JobCompleter:
-    """A callable that completes the scene of a job, in any process."""
-
-    out: Path
-    retries: int
-
-    def __call__(self, job: Job) -> None:
-        """Complete the scene of `job` and write its row."""
-        run_job(job, self.out, lambda: complete_job(job, self.out / JOBS), self.retries)
+def perform_job(job: Job, out: Path, retries: int) -> None:
+    """Complete the scene of a job in any process, and write its row."""
+    run_job(job, out, lambda: complete_job(job, out / JOBS), retries)
 
 
 def complete_job(job: Job, jobs: Path) -> dict[str, Any]:

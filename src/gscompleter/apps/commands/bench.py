@@ -3,11 +3,10 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import asdict, dataclass, replace
 from functools import partial
 from pathlib import Path
-from statistics import median
 from tempfile import TemporaryDirectory
 from typing import Any
 
@@ -15,15 +14,17 @@ from rich.console import Console
 
 from gscompleter.apps.bench.cases import (
     BenchCase,
+    GrowthValues,
     Manifest,
+    Series,
     check_frames,
-    make_default_growth,
     read_manifest,
     write_input_splat,
 )
 from gscompleter.apps.bench.machine import describe_machine
 from gscompleter.apps.bench.measure import (
     Sample,
+    Task,
     Yardstick,
     make_yardstick,
     measure_command,
@@ -31,10 +32,9 @@ from gscompleter.apps.bench.measure import (
     measure_method,
 )
 from gscompleter.apps.bench.report import (
+    Measured,
     Report,
-    fit_growth,
     format_report,
-    summarize,
 )
 from gscompleter.apps.commands.demo import (
     BASELINE_M,
@@ -44,7 +44,6 @@ from gscompleter.apps.commands.demo import (
 )
 from gscompleter.apps.commands.options import BenchOptions
 from gscompleter.data.scene import write_cameras
-from gscompleter.errors import InputError
 from gscompleter.evaluation.methods import Models
 from gscompleter.generators import load_generator
 from gscompleter.io.files import check_output, open_output_folder
@@ -53,13 +52,13 @@ from gscompleter.reconstructors import load_reconstructor
 from gscompleter.render import choose_device, load_renderer
 
 BEYOND = (1.0, 1.25, 1.5, 1.75)
-"""Distances of the demo's targets from its two cameras, in baselines."""
+"""Distances of targets to the right of the demo's right camera, in baselines."""
+DEMO_GROWTH = GrowthValues(
+    gaussians=(250_000, 500_000, 1_000_000, 2_000_000),
+    pixels=((128, 128), (256, 256), (512, 512)),
+    targets=((2,), (2, 3), (2, 3, 4, 5)),
+)
 QUICK_ITERATIONS = 2
-FAST_METHODS = ("full", "autograd")
-"""Methods that are repeated; others take minutes."""
-
-Series = dict[str, dict[int, BenchCase]]
-"""Cases by axis and size, which differ only in the field of the axis."""
 
 
 @dataclass(frozen=True)
@@ -90,18 +89,25 @@ class Bench:
 
 def run_bench(options: BenchOptions) -> None:
     """Measure the cases and methods, and print or write the tables."""
-    if options.folder is not None and options.cases is not None:
-        raise InputError("A scene and a file of cases are both named; name one.", "cases")
     if options.out is not None:
         check_output(options.out, options.overwrite)
     if options.quick:
         options = replace(options, repeats=1, growth=())
     with TemporaryDirectory(prefix="gscompleter-bench-") as temporary:
-        cases, series = select_cases(load_manifest(options, Path(temporary)), options)
+        manifest = load_manifest(options, Path(temporary) / "motorcycle")
+        cases, series = [*manifest.cases], manifest.make_series(options.growth)
+        if options.quick:
+            cases = [min(cases, key=lambda case: (case.gaussians or 0, case.pixels))]
+        check_frames([*cases, *(case for found in series.values() for case in found.values())])
         with show_progress(None if options.quiet else Console(stderr=True)):
             with show_preparation("getting ready"):
                 bench = prepare_bench(options, Path(temporary))
             report = run_measurements(bench, cases, series)
+    write_report(report, options)
+
+
+def write_report(report: Report, options: BenchOptions) -> None:
+    """Print the tables or JSON, and write both to the output folder."""
     text, tables = json.dumps(asdict(report), indent=1), format_report(report)
     if options.out is not None:
         with open_output_folder(options.out, options.overwrite) as folder:
@@ -111,45 +117,15 @@ def run_bench(options: BenchOptions) -> None:
 
 
 def load_manifest(options: BenchOptions, folder: Path) -> Manifest:
-    """Collect the cases of a file, a scene or the demo's pair."""
+    """Read the cases of a file, or write the demo's pair to `folder`."""
     if options.cases is not None:
         return read_manifest(options.cases)
-    if options.folder is None:
-        case = write_demo_case(options, folder / "motorcycle")
-        return Manifest((replace(case, targets=case.targets[:1]),), make_default_growth(case))
-    if not options.context or not options.target:
-        raise InputError(
-            "A scene needs context frames and targets; name them, as in --context 0 4 --target 8.",
-        )
-    name, planes = options.folder.resolve().name, (options.near, options.far)
-    frames = options.context, options.target
-    case = BenchCase(name, options.folder, *frames, options.resolution, *planes)
-    return Manifest((case,), make_default_growth(case))
-
-
-def write_demo_case(options: BenchOptions, folder: Path) -> BenchCase:
-    """Write the demo's pair to `folder` with targets beyond its cameras."""
     write_motorcycle_scene(folder)
     left, right = get_motorcycle_cameras(741, 500)
-    beyond = [
-        move_right(camera, side * step * BASELINE_M)
-        for step in BEYOND
-        for camera, side in ((left, -1), (right, 1))
-    ]
-    names = ["images/left.png", "images/right.png"]
-    names += [f"images/unseen_{number}.png" for number in range(len(beyond))]
+    beyond = [move_right(right, step * BASELINE_M) for step in BEYOND]
+    names = [f"images/{name}.png" for name in ("left", "right", *BEYOND)]
     write_cameras(folder / "transforms.json", [left, right, *beyond], names)
-    targets = tuple(range(2, 2 + len(beyond)))
-    return BenchCase("motorcycle", folder, (0, 1), targets, options.resolution)
-
-
-def select_cases(manifest: Manifest, options: BenchOptions) -> tuple[list[BenchCase], Series]:
-    """Select the cases and series of the options, and check their frames."""
-    cases, series = [*manifest.cases], manifest.make_series(options.growth)
-    if options.quick:
-        cases = [min(cases, key=lambda case: (case.gaussians or 0, case.pixels))]
-    check_frames([*cases, *(case for found in series.values() for case in found.values())])
-    return cases, series
+    return Manifest((BenchCase("motorcycle", folder, (0, 1), (2,), (256, 256)),), DEMO_GROWTH)
 
 
 def prepare_bench(options: BenchOptions, folder: Path) -> Bench:
@@ -168,31 +144,27 @@ def prepare_bench(options: BenchOptions, folder: Path) -> Bench:
 
 def run_measurements(bench: Bench, cases: Sequence[BenchCase], series: Series) -> Report:
     """Run all measurements in rounds, after a first run that is not counted."""
+    repeats = bench.options.repeats
     if not bench.options.quick:
         with stage("warming up"):
             bench.complete(cases[0])
-    tasks: dict[Any, tuple[Callable[[], Sample], int]] = {}
-    for case in [*cases, *(case for found in series.values() for case in found.values())]:
-        tasks[case] = partial(bench.complete, case), bench.options.repeats
+    grown = [case for found in series.values() for case in found.values()]
+    tasks: dict[Any, Task] = {c: (partial(bench.complete, c), repeats) for c in (*cases, *grown)}
     samples = measure_in_rounds(tasks | make_method_tasks(bench, cases[0]))
+    limit = bench.models.baseline_iterations
     return Report(
         describe_machine(bench.device),
+        {"seed": bench.options.seed, "repeats": repeats, "baseline_iterations": limit},
+        [Measured(case.name, samples[case]) for case in cases],
+        [Measured(name, samples[name]) for name in dict.fromkeys(bench.options.methods)],
         {
-            "seed": bench.options.seed,
-            "repeats": bench.options.repeats,
-            "baseline_iterations": bench.models.baseline_iterations,
-        },
-        median(one.yardstick for found in samples.values() for one in found),
-        [summarize(case.name, samples[case]) for case in cases],
-        [summarize(name, samples[name]) for name in dict.fromkeys(bench.options.methods)],
-        [
-            fit_growth(axis, {n: summarize(f"{n:,}", samples[case]) for n, case in found.items()})
+            axis: {size: Measured(f"{size:,}", samples[case]) for size, case in found.items()}
             for axis, found in series.items()
-        ],
+        },
     )
 
 
-def make_method_tasks(bench: Bench, case: BenchCase) -> dict[str, tuple[Callable[[], Sample], int]]:
+def make_method_tasks(bench: Bench, case: BenchCase) -> dict[str, Task]:
     """Create the tasks that compare methods at the first target of `case`."""
     if not bench.options.methods:
         return {}
@@ -202,10 +174,8 @@ def make_method_tasks(bench: Bench, case: BenchCase) -> dict[str, tuple[Callable
     if not bench.options.quick:
         with stage("warming up"), show_progress(None):
             measure_method("full", *start)
+    repeats = {"full": bench.options.repeats}  # others take minutes
     return {
-        name: (
-            partial(measure_method, name, *start),
-            bench.options.repeats if name in FAST_METHODS else 1,
-        )
+        name: (partial(measure_method, name, *start), repeats.get(name, 1))
         for name in bench.options.methods
     }

@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from functools import partial
 from pathlib import Path
 
 from gscompleter.apps.commands.options import EngineOptions
 from gscompleter.cpu_threads import count_available_cores, limit_threads
 from gscompleter.errors import InputError, quote_value
-from gscompleter.jobs.engines import LocalEngine, RayEngine, SubmititEngine, choose_num_workers
+from gscompleter.jobs.engines import choose_num_workers, open_local, open_ray, open_submitit
 from gscompleter.jobs.workers import Engine
 
 
@@ -34,10 +35,11 @@ def make_engine(options: EngineOptions, out: Path) -> Engine | None:
         return None
     threads = options.threads or 1
     if options.engine == "ray":
-        return RayEngine(options.workers, threads, options.gpus, options.address)
+        return partial(open_ray, options.workers, threads, options.gpus, options.address)
     if options.engine == "submitit":
         slurm, folder = parse_pairs(options.slurm, "slurm"), out / "submitit"
-        return SubmititEngine(options.workers or 1, threads, options.gpus, folder, slurm)
+        workers = options.workers or 1
+        return partial(open_submitit, workers, threads, options.gpus, folder, slurm)
     workers = options.workers or choose_num_workers()
     limit_threads(options.threads or max(1, count_available_cores() // workers))
-    return LocalEngine(workers)
+    return partial(open_local, workers)

@@ -21,7 +21,7 @@ Threads = Annotated[int, Interval(ge=1, le=1024)]
 Repeats = Annotated[int, Interval(ge=1, le=1000)]
 Port = Annotated[int, Interval(ge=0, le=65535)]
 Axis = Literal["gaussians", "pixels", "views", "targets"]
-BenchMethod = Literal["full", "autograd", "densify-100", "densify-800", "distill", "reggs"]
+BenchMethod = Literal["full", "densify-100", "densify-800", "distill", "reggs"]
 Device = Literal["auto", "cpu", "cuda"]
 Size = tuple[int, int] | int | Literal["full"]
 """Height and width, the longest side, or `full` for the photographs' own size."""
@@ -282,29 +282,17 @@ class BenchOptions(RunOptions, WritingOptions):
 
     Every completion is a process of its own, start-up included; methods are compared within one
     process. Times are also given relative to one pass of the renderer, forward and backward, with
-    196,608 Gaussians at 256 x 256. Without a scene or cases the pair of `demo` is measured.
+    196,608 Gaussians at 256 x 256. Without cases the pair of `demo` is measured.
     """
 
-    folder: Annotated[Path | None, tyro.conf.Positional, tyro.conf.arg(metavar="SCENE")] = None
-    """Photographs with cameras as in `complete`; needs --context and --target."""
-    context: tuple[Frame, ...] = ()
-    """Frame numbers of the photographs to start from."""
-    target: tuple[Frame, ...] = ()
-    """Frame numbers to complete the scene for."""
-    resolution: tuple[int, int] = (256, 256)
-    """Working size, height and width, if --cases is not given."""
-    near: float | None = None
-    """Smallest depth in the scene, in the unit of its cameras; estimated if not given."""
-    far: float | None = None
-    """Largest depth in the scene, in the unit of its cameras; estimated if not given."""
     cases: Path | None = None
-    """JSON file of cases and growth series instead of a scene, as benchmarks/performance.json."""
-    methods: tuple[BenchMethod, ...] = ("full", "autograd", "densify-800", "distill", "reggs")
-    """Methods to compare on the first case: full (ours), autograd (without a frozen context), …"""
+    """JSON file of scenes with their frames and growth series, as benchmarks/performance.json."""
+    methods: tuple[BenchMethod, ...] = ("full", "densify-800", "distill", "reggs")
+    """Methods to compare on the first case: full (ours) or others."""
     growth: tuple[Axis, ...] = ("gaussians", "pixels", "views", "targets")
     """Quantities to increase in the first case."""
     repeats: Repeats = 5
-    """Number of repetitions; slow methods, all but full and autograd, run once."""
+    """Number of repetitions; methods other than full run once."""
     quick: bool = False
     """Run a quick check: the smallest case once, two iterations of the baselines, no growth."""
     json: bool = False

@@ -5,9 +5,8 @@ from __future__ import annotations
 import re
 import shlex
 from collections.abc import Iterator, Mapping
-from functools import cache
 from pathlib import Path
-from typing import Annotated, Any, Union, get_args, get_type_hints
+from typing import Annotated, Any, Union, get_type_hints
 
 import tyro
 
@@ -44,47 +43,34 @@ def row_to_words(row: Mapping[str, Any], prefix: str = "") -> Iterator[str]:
     """Convert a row to words of a command line."""
     for key, value in row.items():
         name = translate_name(f"{prefix}{key}".replace("_", "-"))
-        kind = list_type_hints().get(name)
         if name in RESERVED:
             raise InputError(f"A row cannot set '{quote_value(name)}'; the batch sets it.")
-        if name == FOLDER or value is None:
-            continue
         if isinstance(value, Mapping):
             yield from row_to_words(value, f"{name}.")
-        elif kind is bool:
-            yield from [f"--{name}"] if parse_flag(name, value) else []
-        else:
-            yield from (f"--{name}", *value_to_words(name, value, has_tuple(kind)))
+        elif name != FOLDER and value is not None:
+            yield from option_to_words(name, value)
 
 
-def value_to_words(name: str, value: Any, is_multiple: bool) -> list[str]:
-    """Convert a value to words; a text is split like a shell if it can have several."""
-    words = [str(item) for item in value] if isinstance(value, list) else [str(value)]
-    if isinstance(value, str) and is_multiple:
+def option_to_words(name: str, value: Any) -> list[str]:
+    """Convert an option to words; a text is split like a shell if it can have several values."""
+    kind = get_type_hints(CompleteOptions).get(name.replace("-", "_"))
+    if kind is bool:
+        if str(value).lower() not in TRUE + FALSE:
+            raise InputError(f"{name} is {quote_value(str(value))}; it must be true or false.")
+        return [f"--{name}"] if str(value).lower() in TRUE else []
+    values = value if isinstance(value, list) else [value]
+    if isinstance(value, str) and has_tuple(kind):
         try:
-            words = shlex.split(value)
+            values = shlex.split(value)
         except ValueError as error:
             raise InputError(f"'{quote_value(value)}' has an unmatched quotation mark.") from error
+    words = [str(item) for item in values]
     for word in words:
         if re.match(r"-(?![\d.])", word):
             raise InputError(f"{name} cannot be '{quote_value(word)}', which begins with a dash.")
-    return words
-
-
-def parse_flag(name: str, value: Any) -> bool:
-    """Return True if a row sets a flag."""
-    text = str(value).lower()
-    if text not in TRUE + FALSE:
-        raise InputError(f"{name} is '{quote_value(text)}'; it must be true or false.")
-    return text in TRUE
+    return [f"--{name}", *words]
 
 
 def has_tuple(kind: Any) -> bool:
     """Return True if an option of this type has several values."""
-    return "tuple" in str(kind).lower() or any(map(has_tuple, get_args(kind)))
-
-
-@cache
-def list_type_hints() -> dict[str, Any]:
-    """Return the options of `complete` with their types."""
-    return {n.replace("_", "-"): kind for n, kind in get_type_hints(CompleteOptions).items()}
+    return "tuple" in str(kind).lower()

@@ -89,10 +89,10 @@ def render_batch_page(out: Path, rows: Sequence[Mapping[str, Any]]) -> str:
 
 def embed_thumbnails(folder: Path) -> list[Picture]:
     """Embed the first target of a completion before and after; none if an image is missing."""
-    names = {when: f"images/target1_{when}.png" for when in ("before", "after")}
+    images = folder / "images"
     try:
-        _, height = read_image_size(folder / names["before"])
+        _, height = read_image_size(images / "target1_before.png")
     except InputError:
         return []
-    gallery = Gallery(folder, min(1.0, THUMBNAIL_HEIGHT / height))
-    return [gallery.embed(name, f"{folder.name}, {when}") for when, name in names.items()]
+    gallery = Gallery(images, min(1.0, THUMBNAIL_HEIGHT / height))
+    return [gallery.embed(f"target1_{w}", f"{folder.name}, {w}") for w in ("before", "after")]
