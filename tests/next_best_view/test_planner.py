@@ -14,13 +14,14 @@ from gscompleter.evaluation.metrics.coverage import (
     render_pairs,
     sample_held_out_cameras,
 )
-from gscompleter.next_best_view.gain import (
+from gscompleter.next_best_view.planner import (
+    ViewPlanner,
+    add_free_space_cameras,
     compute_gain,
     compute_remoteness,
     make_placeholders,
     simplify_completion,
 )
-from gscompleter.next_best_view.planner import ViewPlanner, add_free_space_cameras
 from gscompleter.render import load_renderer
 from gscompleter.stages.select_anchor import compute_overlap
 from gscompleter.state import Completion

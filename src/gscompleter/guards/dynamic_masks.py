@@ -97,7 +97,7 @@ class Comparison:
     """True where the colours differ."""
 
     @property
-    def confirmed_mask(self) -> Bool[Tensor, "h w"]:
+    def match_mask(self) -> Bool[Tensor, "h w"]:
         """True where the other photograph shows the same colour."""
         return self.visible_mask & ~self.differs_mask
 
@@ -142,7 +142,7 @@ def find_dynamic_masks(
         for index, comparison, region in zip(
             (one, other), pair, find_mutual_regions(*pair), strict=True
         ):
-            votes[index] += region.int() - (comparison.confirmed_mask & ~region).int()
+            votes[index] += region.int() - (comparison.match_mask & ~region).int()
     return [resize_mask(vote > 0, view.camera) for vote, view in zip(votes, views, strict=True)]
 
 
@@ -234,7 +234,7 @@ def find_mutual_regions(
 def find_regions(comparison: Comparison) -> Bool[Tensor, "h w"]:
     """Find regions in conflict that are large enough and surrounded by confirmed pixels."""
     width = GAP_RADIUS + OUTLINE_WIDTH
-    masks = comparison.conflict_mask, comparison.in_frame_mask, comparison.confirmed_mask
+    masks = comparison.conflict_mask, comparison.in_frame_mask, comparison.match_mask
     conflict, framed, confirmed = (
         np.pad(mask.cpu().numpy().astype(np.uint8), width) for mask in masks
     )

@@ -1,4 +1,9 @@
-"""Next-best-view planner: choose target cameras greedily and complete the scene for them."""
+"""Next-best-view planner: choose target cameras greedily and complete the scene for them.
+
+The gain of a camera is the image fraction of holes near observed pixels (farther away anything
+could be there) and of distrust elsewhere, times the overlap with the anchor. Among similar gains,
+the camera nearest to the photographs wins.
+"""
 
 from __future__ import annotations
 
@@ -6,38 +11,59 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 
+import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
 from gscompleter.completer import GSCompleter
+from gscompleter.config import NextBestViewConfig
 from gscompleter.geometry import (
+    compute_field_of_view,
     compute_spacing,
     is_same_camera,
+    measure_baseline,
+    measure_rotation,
     select_spread_cameras,
     shrink_camera,
+    unproject,
 )
+from gscompleter.image_ops import dilate, fill_smoothly
 from gscompleter.next_best_view.candidates import Candidate, is_close, propose_candidates
-from gscompleter.next_best_view.gain import (
-    Choice,
-    choose_best,
-    compute_gain,
-    make_placeholders,
-    simplify_completion,
-)
 from gscompleter.progress import stage, track
 from gscompleter.render import get_view_map
 from gscompleter.render.antialiasing import adapt_to_mode
+from gscompleter.render.lod import MAX_PREVIEW_GAUSSIANS, choose_thinned_rows, thin_gaussians
 from gscompleter.stages.select_anchor import compute_overlap, select_anchor
 from gscompleter.stages.target_view import compute_distrust, compute_hole_mask
 from gscompleter.state import Completion
 from gscompleter.timing import record_seconds
-from gscompleter.types import Camera, Render
+from gscompleter.types import Camera, ContextScene, Gaussians, Render, make_observed
 
 MAX_FREE_SPACE_CAMERAS = 40
 """Most cameras of photographs, besides the context views, whose free space is kept empty."""
 
 CompletionStep = Callable[[Completion, Camera], Completion]
 """Step that is taken at a chosen camera."""
+
+
+@dataclass(frozen=True)
+class Choice:
+    """A candidate with its score."""
+
+    candidate: Candidate
+    hole_fraction: float
+    """Fraction of its image in holes."""
+    gain: float
+    """Expected gain, as a fraction of its image."""
+
+    @property
+    def camera(self) -> Camera:
+        """Camera of the candidate."""
+        return self.candidate.camera
+
+    def is_near(self, other: Candidate, step: float) -> bool:
+        """Return True if another candidate is at most one step away, as in `choose_best`."""
+        return compute_remoteness(other.camera, [self.camera], step) <= 1
 
 
 @dataclass(frozen=True)
@@ -200,3 +226,72 @@ def add_free_space_cameras(completion: Completion, cameras: Sequence[Camera]) ->
         return completion
     chosen = select_spread_cameras(others, MAX_FREE_SPACE_CAMERAS)
     return replace(completion, free_space_cameras=tuple(others[index] for index in chosen))
+
+
+def compute_gain(
+    holes: Bool[Tensor, "h w"],
+    distrust: Float[Tensor, "h w"],
+    overlap: float,
+    config: NextBestViewConfig = NextBestViewConfig(),
+) -> float:
+    """Compute the gain of completing an image, as a fraction of the image.
+
+    Pixels outside of `holes` count by the square of their `distrust` in [0, 1], since a little of
+    it is everywhere. `overlap` is the fraction of the observed part that the anchor sees, too.
+    """
+    radius = max(round(config.border_radius * max(holes.shape)), 1)
+    bordering = holes & dilate(~holes, radius)
+    return torch.where(holes, bordering.float(), distrust**2).mean().item() * overlap
+
+
+def choose_best(
+    choices: Sequence[Choice],
+    photographs: Sequence[Camera],
+    step: float,
+    config: NextBestViewConfig = NextBestViewConfig(),
+) -> Choice | None:
+    """Choose the camera to complete next, or None if little is left; `step` is in scene units."""
+    most = max((choice.gain for choice in choices), default=0.0)
+    if most < config.min_gain:
+        return None
+    good = [choice for choice in choices if choice.gain >= config.enough * most]
+
+    def order(choice: Choice) -> tuple[int, float]:
+        return round(compute_remoteness(choice.camera, photographs, step)), -choice.gain
+
+    return min(good, key=order)
+
+
+def compute_remoteness(camera: Camera, photographs: Sequence[Camera], step: float) -> float:
+    """Compute the distance to the nearest photograph in steps; a quarter field of view is one."""
+    quarter = torch.rad2deg(torch.tensor(min(compute_field_of_view(camera)) / 4)).item()
+    return min(
+        measure_baseline(camera, other) / max(step, 1e-30)
+        + measure_rotation(camera, other) / quarter
+        for other in photographs
+    )
+
+
+def make_placeholders(render: Render, holes: Bool[Tensor, "h w"], camera: Camera) -> Gaussians:
+    """Make grey Gaussians that close holes at the smoothly extrapolated depth around them."""
+    seen = render.depth_map()
+    depth = fill_smoothly(seen.depth, seen.valid & ~holes)
+    means = unproject(depth, camera)[holes]
+    size = (0.7 * depth / camera.K[0, 0])[holes]
+    quats = torch.eye(4).to(means)[:1].repeat(len(means), 1)
+    return make_observed(
+        means,
+        quats,
+        size[:, None].repeat(1, 3),
+        torch.full_like(size, 0.99),
+        torch.zeros((len(means), 1, 3)).to(means),
+    )
+
+
+def simplify_completion(completion: Completion, most: int = MAX_PREVIEW_GAUSSIANS) -> Completion:
+    """Simplify a completion for small images, with its trust."""
+    rows, growth = choose_thinned_rows(completion.parts[0], most)
+    context = thin_gaussians(completion.parts[0], most)
+    parts = (context, thin_gaussians(completion.added, most))
+    trust = completion.trust.thin(rows, growth)
+    return replace(completion, source=ContextScene.whole(context), parts=parts, trust=trust)

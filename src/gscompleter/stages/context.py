@@ -123,13 +123,12 @@ def check_finite(scene: Gaussians) -> None:
 
 def check_texture(views: Sequence[View]) -> None:
     """Raise InputError if fewer than two photographs have any texture to match."""
-    flat = [view for view in views if not has_texture(view.image)]
-    if len(views) - len(flat) >= 2:
-        return
-    raise InputError(
-        f"{len(flat)} of the {len(views)} context photographs show no texture, and stereo needs at "
-        "least 2 that do; choose other photographs."
-    )
+    num_flat = sum(not has_texture(view.image) for view in views)
+    if len(views) - num_flat < 2:
+        raise InputError(
+            f"{num_flat} of the {len(views)} context photographs show no texture, and stereo needs "
+            "at least 2 that do; choose other photographs."
+        )
 
 
 def has_texture(image: Float[Tensor, "h w 3"]) -> bool:

@@ -181,16 +181,13 @@ def find_medoids(cameras: Sequence[Camera], count: int) -> list[int]:
     chosen = select_spread_cameras(cameras, count)
     for _ in range(NUM_ROUNDS):
         groups = apart[:, chosen].argmin(dim=1)
-        members = [torch.nonzero(groups == group)[:, 0] for group in range(len(chosen))]
-        before, chosen = chosen, [find_medoid(apart, own) for own in members if len(own) > 0]
+        members = [torch.nonzero(groups == group)[:, 0] for group in groups.unique()]
+        costs = [apart[own][:, own].square().sum(dim=1) for own in members]
+        pairs = zip(members, costs, strict=True)
+        before, chosen = chosen, [int(own[cost.argmin()]) for own, cost in pairs]
         if chosen == before:
             break
     return sorted(set(chosen))
-
-
-def find_medoid(apart: Float[Tensor, "n n"], members: Tensor) -> int:
-    """Find the member with the smallest sum of squared distances to the others."""
-    return int(members[apart[members][:, members].square().sum(dim=1).argmin()])
 
 
 def has_partner(

@@ -46,8 +46,7 @@ from gscompleter.generators import load_generator
 from gscompleter.io.files import COMPLETED_FILE, TARGETS_FILE, check_output, open_output_folder
 from gscompleter.io.video import find_ffmpeg
 from gscompleter.kernels.parallel import run_in_background
-from gscompleter.next_best_view.gain import Choice
-from gscompleter.next_best_view.planner import ViewPlanner
+from gscompleter.next_best_view.planner import Choice, ViewPlanner
 from gscompleter.progress import show_preparation, show_progress, stage
 from gscompleter.reconstructors import check_reconstructor, load_reconstructor
 from gscompleter.render import choose_device, load_renderer
