@@ -1,55 +1,63 @@
 """Structure from motion in a separate process, because COLMAP aborts on errors.
 
 Standard input is a `Job` as JSON. The last line of the output is the result, as JSON too.
+
+Beyond a few photographs, only neighbours in a sequence and photographs that look alike are matched:
+those whose few largest features match (preemptive matching; Wu, "Towards Linear-time Incremental
+Structure from Motion", 2013). It needs no vocabulary.
 """
 
 from __future__ import annotations
 
 import json
 import math
+import re
 import sys
-from collections import Counter
-from copy import deepcopy
+from collections.abc import Sequence
 from dataclasses import dataclass
+from itertools import combinations
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pycolmap
+from jaxtyping import Float
 
-from gscompleter.data.sfm.match_pairs import (
-    Pairs,
-    is_sequence,
-    pair_all,
-    pair_neighbours,
-    pair_similar,
-    select_largest_features,
-)
 from gscompleter.data.sfm.poses import UprightCopy
 
 SEED = 0
 MAX_FEATURES = 4096
 """Most features in a photograph."""
-MAX_EXHAUSTIVE = 60
-"""Most unordered photographs that are all matched with each other."""
 LENS = "SIMPLE_RADIAL"
 """COLMAP's camera model: one focal length, one distortion coefficient."""
 GUESSED_FOCAL = 1.2
 """Focal length in longer image sides, if EXIF lacks it."""
 MIN_MODEL = 3
 """Fewest photographs of a model."""
-MIN_FOR_CENTRE = 10
-"""Fewest photographs per camera to refine its principal point."""
-MAX_OFF_CENTRE = 0.1
-"""Largest plausible distance of the principal point from the centre, in longer sides."""
+WANTED_SHARE = 0.5
+"""Share of the photographs in a model below which other focal lengths are tried."""
 FOV = 10.0, 150.0
 """Plausible range of the field of view along the longer side, in degrees."""
 MAX_SHIFT = 0.5
 """Largest plausible shift of an image corner by distortion, relative to its radius."""
 FIXED_FOVS = (75.0, 60.0, 90.0, 45.0)
 """Fields of view along the longer side, in degrees, to fix the focal length at, in order."""
-ROUNDS = 2
-"""Rounds of mapping with a fixed focal length, the second at the value that the first fitted."""
+
+MAX_EXHAUSTIVE = 60
+"""Most unordered photographs that are all matched with each other."""
+NEIGHBOURS = 10
+"""Photographs before and after each one of a sequence to match it with."""
+NUM_SIMILAR = 20
+"""Most similar photographs to match each one with."""
+NUM_LARGEST_FEATURES = 256
+"""Largest-scale features that decide similarity."""
+MIN_SHARED = 4
+"""Fewest matches among these for a pair."""
+MIN_COSINE = 0.85
+"""Smallest cosine between descriptors of matching features."""
+
+Pairs = set[tuple[int, int]]
+"""Index pairs of photographs, the smaller index first."""
 
 
 @dataclass(frozen=True)
@@ -64,8 +72,6 @@ class Job:
     """Folder for the largest model; it does not exist yet."""
     photographs: list[UprightCopy]
     threads: int
-    min_photographs: int
-    """Fewest photographs in a model that end the search for a focal length."""
 
     @property
     def database(self) -> Path:
@@ -86,13 +92,13 @@ def main() -> None:
 
 
 def find_features(job: Job) -> None:
-    """Extract SIFT features of all photographs; those of equal size and lens share a camera."""
+    """Extract SIFT features; photographs of equal size and focal length share a camera."""
     extraction = pycolmap.FeatureExtractionOptions(num_threads=job.threads, use_gpu=False)
     extraction.sift.max_num_features = MAX_FEATURES
-    cameras = {(one.width, one.height, one.lens): one for one in job.photographs}
-    numbers = {key: _add_camera(job, one) for key, one in cameras.items()}
+    lenses = dict.fromkeys((one.width, one.height, one.focal) for one in job.photographs)
+    numbers = {lens: _add_camera(job, *lens) for lens in lenses}
     for one in job.photographs:  # one by one, so that they are numbered in their order
-        number = numbers[one.width, one.height, one.lens]
+        number = numbers[one.width, one.height, one.focal]
         pycolmap.extract_features(
             job.database,
             job.images,
@@ -103,10 +109,10 @@ def find_features(job: Job) -> None:
         )
 
 
-def _add_camera(job: Job, one: UprightCopy) -> int:
-    focal = one.focal or GUESSED_FOCAL * max(one.width, one.height)
-    camera = pycolmap.Camera.create_from_model_name(1, LENS, focal, one.width, one.height)
-    camera.has_prior_focal_length = one.focal is not None
+def _add_camera(job: Job, width: int, height: int, focal: float | None) -> int:
+    guess = GUESSED_FOCAL * max(width, height)
+    camera = pycolmap.Camera.create_from_model_name(1, LENS, focal or guess, width, height)
+    camera.has_prior_focal_length = focal is not None
     with pycolmap.Database.open(job.database) as database:
         return int(database.write_camera(camera))
 
@@ -116,17 +122,50 @@ def select_pairs(job: Job) -> Pairs:
     names = [one.name for one in job.photographs]
     neighbours = pair_neighbours(len(names)) if is_sequence(names) else set()
     if not neighbours and len(names) <= MAX_EXHAUSTIVE:
-        return pair_all(len(names))
+        return set(combinations(range(len(names)), 2))
     with pycolmap.Database.open(job.database) as database:
         return neighbours | pair_similar([_read_features(database, name) for name in names])
 
 
-def _read_features(database: Any, name: str) -> np.ndarray:
+def is_sequence(names: Sequence[str]) -> bool:
+    """Check whether the names differ only in the last number of the file name."""
+    forms = {re.sub(r"\d+(?=[^\d/]*$)", "#", name) for name in names}
+    return len(forms) == 1 and not forms & set(names)
+
+
+def pair_neighbours(count: int) -> Pairs:
+    """Pair each photograph of a sequence with the next ones, and those 16, 32, 64, … ahead."""
+    steps = [*range(1, NEIGHBOURS + 1), *(2**n for n in range(4, count.bit_length()))]
+    return {(i, i + step) for step in steps for i in range(count - step)}
+
+
+def _read_features(database: Any, name: str) -> Float[np.ndarray, "k 128"]:
+    """Read the normalized descriptors of the largest features of a photograph."""
     number = database.read_image_with_name(name).image_id
     scales = np.linalg.norm(database.read_keypoints(number)[:, 2:4], axis=1)
-    return select_largest_features(
-        scales, np.asarray(database.read_descriptors(number).data, dtype=np.float32)
-    )
+    largest = np.argsort(-scales, kind="stable")[:NUM_LARGEST_FEATURES]
+    chosen = np.asarray(database.read_descriptors(number).data, dtype=np.float32)[largest]
+    return chosen / np.maximum(np.linalg.norm(chosen, axis=1, keepdims=True), 1e-9)
+
+
+def pair_similar(features: Sequence[Float[np.ndarray, "_ 128"]]) -> Pairs:
+    """Pair each photograph with those that share most features with it."""
+    shared = np.zeros((len(features), len(features)), dtype=np.int64)
+    for i, j in combinations(range(len(features)), 2):
+        shared[i, j] = shared[j, i] = _count_shared(features[i], features[j])
+    order = np.argsort(-shared, axis=1, kind="stable")[:, :NUM_SIMILAR]
+    found = ((i, int(j)) for i, row in enumerate(order) for j in row if shared[i, j] >= MIN_SHARED)
+    return {(min(pair), max(pair)) for pair in found}
+
+
+def _count_shared(a: Float[np.ndarray, "m 128"], b: Float[np.ndarray, "n 128"]) -> int:
+    """Count the mutual best matches above `MIN_COSINE`."""
+    if len(a) == 0 or len(b) == 0:
+        return 0
+    cosines = a @ b.T
+    best, back = cosines.argmax(axis=1), cosines.argmax(axis=0)
+    is_mutual = back[best] == np.arange(len(a))
+    return int(np.count_nonzero(is_mutual & (cosines.max(axis=1) > MIN_COSINE)))
 
 
 def match(job: Job, pairs: Pairs) -> None:
@@ -141,87 +180,54 @@ def match(job: Job, pairs: Pairs) -> None:
 
 
 def map_photographs(job: Job) -> dict[str, Any]:
-    """Find cameras and points from the matches, and write the largest model.
+    """Find cameras and points with a free focal length, then with plausible fixed ones.
+
+    With a wrong focal length the mapper still connects photographs that it cannot connect with a
+    free one, and together they determine the right value. The best model is written.
 
     Returns:
         Its `registered` photographs by the names of their copies, its number of `points`, its mean
         reprojection `error` in pixels, True if its lenses are plausible (`is_plausible`), and the
         `focal` length in pixels if it was fixed at first, else None.
     """
-    model, is_focal_fixed = select_model(job)
-    if model is None:
+    best, best_fov = map_largest(job), None
+    for fov in FIXED_FOVS:
+        if _rate_model(best) >= (True, math.ceil(WANTED_SHARE * len(job.photographs)), 0):
+            break
+        _fix_focals(job, fov)
+        found = map_largest(job, is_focal_fixed=True)
+        if _rate_model(found) > _rate_model(best):
+            best, best_fov = found, fov
+    if best is None:
         return {"registered": []}
-    counts = _count_photographs(model)
-    if min(counts.values()) >= MIN_FOR_CENTRE:
-        # Fewer photographs cannot separate the principal point from a rotation.
-        model = refine_lenses(model, refine_principal_point=True)
     Path(job.model).mkdir(parents=True)
-    model.write(job.model)
+    best.write(job.model)
+    first = best.images[best.reg_image_ids()[0]]
     return {
-        "registered": [model.images[i].name for i in model.reg_image_ids()],
-        "points": model.num_points3D(),
-        "error": model.compute_mean_reprojection_error(),
-        "is_plausible": has_plausible_lenses(model),
-        "focal": model.cameras[max(counts)].mean_focal_length() if is_focal_fixed else None,
+        "registered": [best.images[i].name for i in best.reg_image_ids()],
+        "points": best.num_points3D(),
+        "error": best.compute_mean_reprojection_error(),
+        "is_plausible": _rate_model(best)[0],
+        "focal": first.camera.mean_focal_length() if best_fov else None,
     }
 
 
-def select_model(job: Job) -> tuple[pycolmap.Reconstruction | None, bool]:
-    """Map with a free focal length, then with each plausible fixed value, until it is good.
-
-    Returns:
-        The best model, and True if its focal length was fixed at first.
-    """
-    best, is_focal_fixed = map_largest(job), False
-    for fov in FIXED_FOVS:
-        if _rate_model(best) >= (True, job.min_photographs, 0):
-            break
-        found = map_with_fixed_focals(job, fov)
-        if _rate_model(found) > _rate_model(best):
-            best, is_focal_fixed = found, True
-    return best, is_focal_fixed
-
-
-def _rate_model(model: pycolmap.Reconstruction | None) -> tuple[bool, int, int]:
-    """Rate a model by plausible lenses, then photographs, then points."""
-    if model is None:
-        return False, 0, 0
-    return has_plausible_lenses(model), model.num_reg_images(), model.num_points3D()
-
-
-def map_with_fixed_focals(job: Job, fov: float) -> pycolmap.Reconstruction | None:
-    """Map with focal lengths fixed for a field of view in degrees, then with the refined ones.
-
-    With a wrong focal length the mapper still connects photographs that it cannot connect with a
-    free one, and together they determine the right value.
-    """
-    focals = dict[int, float]()
-    model: pycolmap.Reconstruction | None = None
-    for _ in range(ROUNDS):
-        _fix_focals(job, focals, fov)
-        mapped = map_largest(job, is_focal_fixed=True)
-        if mapped is None:
-            return model
-        model = refine_lenses(mapped, refine_extra_params=False)
-        focals = {n: model.cameras[n].mean_focal_length() for n in _count_photographs(model)}
-    return None if model is None else refine_lenses(model)
-
-
-def _fix_focals(job: Job, focals: dict[int, float], fov: float) -> None:
-    """Fix focal lengths (pixels by camera, or else as of `fov`) in the database, undistorted."""
+def _fix_focals(job: Job, fov: float) -> None:
+    """Fix the focal lengths in the database for a field of view in degrees, undistorted."""
     with pycolmap.Database.open(job.database) as database:
         for camera in database.read_all_cameras():
             width, height, number = camera.width, camera.height, camera.camera_id
             focal = max(width, height) / 2 / math.tan(math.radians(fov / 2))
-            known = pycolmap.Camera.create_from_model_name(
-                number, LENS, focals.get(number, focal), width, height
-            )
+            known = pycolmap.Camera.create_from_model_name(number, LENS, focal, width, height)
             known.has_prior_focal_length = True
             database.update_camera(known)
 
 
 def map_largest(job: Job, is_focal_fixed: bool = False) -> pycolmap.Reconstruction | None:
-    """Map the scene; return the model with most photographs, or None if there is none."""
+    """Map the scene; return the model with most photographs, or None if there is none.
+
+    A fixed focal length is set free once the model is complete.
+    """
     options = pycolmap.IncrementalPipelineOptions(
         num_threads=job.threads,
         random_seed=SEED,
@@ -230,41 +236,30 @@ def map_largest(job: Job, is_focal_fixed: bool = False) -> pycolmap.Reconstructi
         ba_refine_extra_params=not is_focal_fixed,
     )
     found = pycolmap.incremental_mapping(job.database, job.images, job.work, options)
-    return max(found.values(), key=lambda model: model.num_reg_images(), default=None)
+    model = max(found.values(), key=lambda model: model.num_reg_images(), default=None)
+    if model is not None and is_focal_fixed:
+        pycolmap.bundle_adjustment(model, pycolmap.BundleAdjustmentOptions(print_summary=False))
+        model.update_point_3d_errors()
+    return model
 
 
-def refine_lenses(model: pycolmap.Reconstruction, **options: bool) -> pycolmap.Reconstruction:
-    """Bundle-adjust a copy with free focal lengths; return the input if a lens gets implausible."""
-    refined = deepcopy(model)
-    adjustment = pycolmap.BundleAdjustmentOptions(print_summary=False, **options)
-    pycolmap.bundle_adjustment(refined, adjustment)
-    refined.update_point_3d_errors()
-    return refined if has_plausible_lenses(refined) else model
-
-
-def has_plausible_lenses(model: pycolmap.Reconstruction) -> bool:
-    """Check the cameras of the photographs in the model."""
-    return all(is_plausible(model.cameras[number]) for number in _count_photographs(model))
+def _rate_model(model: pycolmap.Reconstruction | None) -> tuple[bool, int, int]:
+    """Rate a model by plausible lenses, then photographs, then points."""
+    if model is None:
+        return False, 0, 0
+    lenses = (model.images[i].camera for i in model.reg_image_ids())
+    return all(map(is_plausible, lenses)), model.num_reg_images(), model.num_points3D()
 
 
 def is_plausible(camera: pycolmap.Camera) -> bool:
-    """Check whether a camera has a field of view, distortion and principal point of a real one."""
+    """Check whether a camera has a field of view and distortion of a real one."""
     focal, side = camera.mean_focal_length(), max(camera.width, camera.height)
     if not (math.isfinite(focal) and focal > 0):
         return False
     fov = math.degrees(2 * math.atan(side / 2 / focal))
     corner = (camera.width**2 + camera.height**2) / 4 / focal**2
     shift = camera.params[camera.extra_params_idxs()[0]] * corner
-    off = math.hypot(
-        camera.principal_point_x - camera.width / 2, camera.principal_point_y - camera.height / 2
-    )
-    is_bent = bool(abs(shift) > MAX_SHIFT)
-    return FOV[0] <= fov <= FOV[1] and not is_bent and off <= MAX_OFF_CENTRE * side
-
-
-def _count_photographs(model: pycolmap.Reconstruction) -> Counter[int]:
-    """Count the photographs of each camera in the model."""
-    return Counter(model.images[i].camera_id for i in model.reg_image_ids())
+    return FOV[0] <= fov <= FOV[1] and bool(abs(shift) <= MAX_SHIFT)
 
 
 if __name__ == "__main__":

@@ -16,7 +16,7 @@ import shutil
 import subprocess
 import sys
 import tempfile
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import asdict, dataclass, replace
 from importlib.util import find_spec
 from pathlib import Path
@@ -27,7 +27,6 @@ from PIL import Image, ImageOps
 from gscompleter.cpu_threads import get_thread_count
 from gscompleter.data.frame import DOWNSCALE_FACTORS
 from gscompleter.data.image_folders import MASKS
-from gscompleter.data.sfm.match_pairs import make_sort_key
 from gscompleter.errors import InputError, join_names, quote_value
 from gscompleter.io.files import SUMMARY_FILE, open_output_folder
 from gscompleter.io.image import ORIENTATION, open_image
@@ -44,8 +43,6 @@ MIN_PHOTOGRAPHS = 3
 """Fewest photographs; two determine neither a focal length nor a wrong match."""
 MIN_SHARE = 0.25
 """Smallest share of the photographs in a usable model."""
-WANTED_SHARE = 0.5
-"""Share of the photographs in a model below which other focal lengths are tried."""
 MIN_POINTS = 30
 """Fewest points of a model; COLMAP needs as many in common with one photograph."""
 MAX_SIDE = 1600
@@ -54,8 +51,7 @@ QUALITY = 95
 """JPEG quality of rotated or shrunk copies."""
 FULL_FRAME_DIAGONAL = 43.2666
 """Diagonal of 36 x 24 mm, the reference of EXIF's "focal length in 35 mm film"."""
-MAKE, MODEL = 0x010F, 0x0110
-EXIF, FOCAL_LENGTH, FOCAL_LENGTH_35 = 0x8769, 0x920A, 0xA405
+EXIF, FOCAL_LENGTH_35 = 0x8769, 0xA405
 MAX_THREADS = 4
 MAX_NAMED = 5
 """Most photographs that a note names."""
@@ -74,8 +70,6 @@ class UprightCopy:
     height: int
     focal: float | None
     """Focal length in pixels of the copy from EXIF, or None."""
-    lens: str
-    """Key of camera, lens and zoom from EXIF."""
 
 
 @dataclass(frozen=True)
@@ -83,17 +77,14 @@ class FoundPoses:
     """Result of structure from motion on a folder of photographs."""
 
     photographs: int
-    """Number of input photographs."""
     missing: list[str]
     """Photographs without a camera."""
     points: int
-    """Points of the model."""
     error: float
     """Mean reprojection error, in pixels of the copies."""
     focal: float | None = None
     """Focal length in pixels of the copies if it had to be fixed at first, else None."""
     reused: bool = False
-    """True if the result is from an earlier run."""
 
     @property
     def num_registered(self) -> int:
@@ -136,13 +127,12 @@ def find_poses(photographs: Path, out: Path, overwrite: bool = False) -> FoundPo
     return found
 
 
-def _read_earlier(out: Path, known: Mapping[str, list[int]]) -> FoundPoses | None:
+def _read_earlier(out: Path, known: dict[str, list[int]]) -> FoundPoses | None:
     """Read the earlier result for these photographs; None if there is none."""
     if not os.path.isfile(out / SUMMARY_FILE) or not os.path.isdir(out / "sparse" / "0"):
         return None
     content = read_json(out / SUMMARY_FILE, "name another folder")
-    is_ours = isinstance(content, dict) and content.keys() == {"poses", "photographs"}
-    if not is_ours or content["photographs"] != known:
+    if not isinstance(content, dict) or content.get("photographs") != known:
         return None
     return replace(FoundPoses(**content["poses"]), reused=True)
 
@@ -172,6 +162,11 @@ def _walk_photographs(folder: Path) -> list[str]:
         shown = (Path(home, name) for name in files if not name.startswith("."))
         found += [path.relative_to(folder) for path in shown if path.suffix.lower() in ENDINGS]
     return sorted((path.as_posix() for path in found), key=make_sort_key)
+
+
+def make_sort_key(name: str) -> tuple[str, ...]:
+    """Return a key that sorts names by their numbers: 2.jpg before 10.jpg."""
+    return tuple(f"{int(p):030d}" if p.isdecimal() else p for p in re.split(r"(\d+)", name))
 
 
 def is_own(folder: Path) -> bool:
@@ -220,10 +215,7 @@ def write_upright(root: Path, source: str, folder: Path) -> UprightCopy:
         is_known = kind in ("JPEG", "PNG")
         is_upright = exif.get(ORIENTATION, 1) == 1 and max(image.size) <= MAX_SIDE
         is_ready = is_known and is_upright and image.mode in ("RGB", "L")
-        if not is_ready:  # decodes a JPEG at half or a quarter of its size if that is enough
-            image.draft("RGB", (MAX_SIDE, MAX_SIDE))
         copy = ImageOps.exif_transpose(image).convert("RGB")
-        focal, lens = _read_focal(exif), _describe_lens(exif)
     copy.thumbnail((MAX_SIDE, MAX_SIDE), Image.Resampling.LANCZOS)
     # In COLMAP's lists a space ends a name, and # begins a comment.
     name = re.sub(r"[\s#]", "_", source) + ("" if is_known else ".png")
@@ -231,9 +223,9 @@ def write_upright(root: Path, source: str, folder: Path) -> UprightCopy:
     if is_ready:
         shutil.copyfile(path, target)
     else:
-        _save(copy, target, "JPEG" if kind == "JPEG" else "PNG")
-    diagonal = math.hypot(*copy.size)
-    return UprightCopy(name, source, *copy.size, focal and focal * diagonal, lens)
+        copy.save(target, kind if is_known else "PNG", quality=QUALITY, subsampling=0)
+    focal = _read_focal(exif)
+    return UprightCopy(name, source, *copy.size, focal and focal * math.hypot(*copy.size))
 
 
 def _prepare_target(target: Path, source: Path) -> Path:
@@ -247,12 +239,6 @@ def _prepare_target(target: Path, source: Path) -> Path:
     return target
 
 
-def _save(image: Image.Image, target: Path, kind: str) -> None:
-    image.info.clear()  # removes the orientation, which is applied already
-    options = {"quality": QUALITY, "subsampling": 0} if kind == "JPEG" else {}
-    image.save(target, format=kind, **options)
-
-
 def _read_focal(exif: Image.Exif) -> float | None:
     """Read the focal length in image diagonals from the 35 mm equivalent; None if there is none."""
     try:
@@ -260,13 +246,6 @@ def _read_focal(exif: Image.Exif) -> float | None:
     except (KeyError, TypeError, ValueError, ZeroDivisionError):  # broken values are common
         return None
     return millimetres / FULL_FRAME_DIAGONAL if 1 <= millimetres <= 5000 else None
-
-
-def _describe_lens(exif: Image.Exif) -> str:
-    detail = exif.get_ifd(EXIF)
-    values = [exif.get(MAKE), exif.get(MODEL)]
-    values += [detail.get(FOCAL_LENGTH), detail.get(FOCAL_LENGTH_35)]
-    return " ".join(map(str, values))
 
 
 def _map(copies: Sequence[UprightCopy], folder: Path) -> dict[str, Any]:
@@ -278,7 +257,6 @@ def _map(copies: Sequence[UprightCopy], folder: Path) -> dict[str, Any]:
             "model": str(folder / "sparse" / "0"),
             "photographs": [asdict(copy) for copy in copies],
             "threads": min(MAX_THREADS, get_thread_count()),
-            "min_photographs": math.ceil(WANTED_SHARE * len(copies)),
         }
         done = subprocess.run(
             [sys.executable, "-m", PROCESS],
