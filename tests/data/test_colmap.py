@@ -389,7 +389,7 @@ def test_truncated_and_empty_files_are_refused(tmp_path, name):
     ("name", "line", "sentence"),
     [
         ("cameras.txt", "7 PINHOLE 64", "line 1 of .*cameras.txt is '7 PINHOLE 64', where CAM"),
-        ("cameras.txt", "7 PINHOLE 64 64 50 50 32", "PINHOLE of camera 7 .* 4 parameters .* 3 are"),
+        ("cameras.txt", "7 PINHOLE 64 64 50 50 32", "model of camera 7 .* 4 parameters .* 3 are"),
         ("cameras.txt", "7 PANORAMA 64 64 50", "camera model PANORAMA of camera 7"),
         ("cameras.txt", "7 PINHOLE 64 64 50 x 32 32", "line 1 of .*cameras.txt"),
         ("cameras.txt", "7 PINHOLE 64 64 50 1e400 32 32", "parameter fy of camera 7 .* is inf"),

@@ -21,7 +21,7 @@ from gscompleter.apps.viewer.packages import (
 )
 from gscompleter.apps.warmup import PARTS
 from gscompleter.errors import InputError
-from gscompleter.io.cache import get_download_folder
+from gscompleter.io.files import get_download_folder
 from gscompleter.kernels.compiled import get_cache_folder, is_compiled
 from gscompleter.models.weights.fetching import find_cached
 from gscompleter.models.weights.published import PUBLISHED

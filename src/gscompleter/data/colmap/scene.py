@@ -61,10 +61,9 @@ def _select_largest(path: Path) -> tuple[Path, list[Frame], tuple[str, ...]]:
     model, frames = max(found, key=lambda one: len(one[1]))
     if len(found) == 1:
         return model, frames, ()
-    others = ", ".join(str(len(frames)) for other, frames in found if other != model)
     note = (
         f"{len(found)} models lie in {model.parent}: {model.name} with {len(frames)} images is "
-        f"used; the others, with {others} images, are ignored."
+        "used; the others are ignored."
     )
     return model, frames, (note,)
 
