@@ -400,7 +400,7 @@ def test_truncated_and_empty_files_are_refused(tmp_path, name):
         (
             "images.txt",
             "1 1 0 0 0 0 0 0 7 0.png\n\n2 1 0 0 0 1 0 0 7 0.png",
-            "lists the image 0.png 2 times",
+            "lists an image twice",
         ),
         ("images.txt", "1 0 0 0 0 0 0 0 7 0.png", "pose holds NaN"),
         ("points3D.txt", "1 2", "line 1 of .*points3D.txt .* POINT3D_ID"),

@@ -187,28 +187,23 @@ def map_photographs(job: Job) -> dict[str, Any]:
 
     Returns:
         Its `registered` photographs by the names of their copies, its number of `points`, its mean
-        reprojection `error` in pixels, True if its lenses are plausible (`is_plausible`), and the
-        `focal` length in pixels if it was fixed at first, else None.
+        reprojection `error` in pixels, and True if its lenses are plausible (`is_plausible`).
     """
-    best, best_fov = map_largest(job), None
+    best = map_largest(job)
     for fov in FIXED_FOVS:
         if _rate_model(best) >= (True, math.ceil(WANTED_SHARE * len(job.photographs)), 0):
             break
         _fix_focals(job, fov)
-        found = map_largest(job, is_focal_fixed=True)
-        if _rate_model(found) > _rate_model(best):
-            best, best_fov = found, fov
+        best = max(best, map_largest(job, is_focal_fixed=True), key=_rate_model)
     if best is None:
         return {"registered": []}
     Path(job.model).mkdir(parents=True)
     best.write(job.model)
-    first = best.images[best.reg_image_ids()[0]]
     return {
         "registered": [best.images[i].name for i in best.reg_image_ids()],
         "points": best.num_points3D(),
         "error": best.compute_mean_reprojection_error(),
         "is_plausible": _rate_model(best)[0],
-        "focal": first.camera.mean_focal_length() if best_fov else None,
     }
 
 

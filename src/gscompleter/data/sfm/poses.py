@@ -82,8 +82,6 @@ class FoundPoses:
     points: int
     error: float
     """Mean reprojection error, in pixels of the copies."""
-    focal: float | None = None
-    """Focal length in pixels of the copies if it had to be fixed at first, else None."""
     reused: bool = False
 
     @property
@@ -94,17 +92,8 @@ class FoundPoses:
     @property
     def notes(self) -> list[str]:
         """Sentences for the user."""
-        notes = []
-        if self.focal is not None:
-            notes.append(
-                f"{self.num_registered} of {self.photographs} cameras were found with a focal "
-                f"length of {self.focal:.0f} px, fixed at plausible values first, because COLMAP "
-                "failed with a free one."
-            )
-        if self.missing:
-            names = join_names(self.missing, MAX_NAMED)
-            notes.append(f"No camera was found for {names}; they are left out.")
-        return notes
+        names = join_names(self.missing, MAX_NAMED)
+        return [f"No camera was found for {names}; they are left out."] if names else []
 
 
 def find_poses(photographs: Path, out: Path, overwrite: bool = False) -> FoundPoses:
@@ -190,17 +179,17 @@ def _run(photographs: Path, names: Sequence[str], folder: Path) -> FoundPoses:
             "two thirds and are sharp."
         )
     missing = [copy.source for copy in copies if copy.name not in result["registered"]]
-    found = FoundPoses(len(names), missing, result["points"], result["error"], result["focal"])
+    found = FoundPoses(len(names), missing, result["points"], result["error"])
     enough = max(MIN_PHOTOGRAPHS, MIN_SHARE * len(names))
     is_large = found.num_registered >= enough and found.points >= MIN_POINTS
-    if not (is_large and result["is_plausible"]):
-        lens = "" if result["is_plausible"] else " and an implausible lens"
-        raise InputError(
-            f"COLMAP placed {found.num_registered} of {found.photographs} photographs in "
-            f"{quote_value(photographs, 40)}, with {found.points:,} points{lens}, which is no "
-            "usable model; add sharp photographs that overlap by two thirds, or name their cameras."
-        )
-    return found
+    if is_large and result["is_plausible"]:
+        return found
+    lens = "" if result["is_plausible"] else " and an implausible lens"
+    raise InputError(
+        f"COLMAP placed {found.num_registered} of {found.photographs} photographs in "
+        f"{quote_value(photographs, 40)}, with {found.points:,} points{lens}, which is no usable "
+        "model; add sharp photographs that overlap by two thirds, or name their cameras."
+    )
 
 
 def write_upright(root: Path, source: str, folder: Path) -> UprightCopy:
