@@ -128,17 +128,13 @@ def build_intrinsics(
                 "needed."
             )
 
-    def select(*names: str) -> tuple[float, ...]:
-        return tuple(values[name] for name in names if name in values)
-
-    distortion = Distortion(
-        model.projection,
-        shape=select(*_SHAPES),
-        radial=select("k1", "k2", "k3", "k4"),
-        tangential=(values.get("p1", 0.0), values.get("p2", 0.0)),
-        denominator=select("d1", "d2", "d3"),
-        prism=(values.get("s1", 0.0), values.get("s3", 0.0)),
+    shape, radial, denominator = (
+        tuple(values[name] for name in names if name in values)
+        for names in (_SHAPES, ("k1", "k2", "k3", "k4"), ("d1", "d2", "d3"))
     )
+    tangential = values.get("p1", 0.0), values.get("p2", 0.0)
+    prism = values.get("s1", 0.0), values.get("s3", 0.0)
+    distortion = Distortion(model.projection, shape, radial, tangential, denominator, prism)
     focal = values.get("fx", values.get("f")), values.get("fy", values.get("f"))
     return Intrinsics(size, focal, (values["cx"], values["cy"]), distortion=distortion)
 

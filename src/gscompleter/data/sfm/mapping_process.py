@@ -211,11 +211,10 @@ def _fix_focals(job: Job, fov: float) -> None:
     """Fix the focal lengths in the database for a field of view in degrees, undistorted."""
     with pycolmap.Database.open(job.database) as database:
         for camera in database.read_all_cameras():
-            width, height, number = camera.width, camera.height, camera.camera_id
-            focal = max(width, height) / 2 / math.tan(math.radians(fov / 2))
-            known = pycolmap.Camera.create_from_model_name(number, LENS, focal, width, height)
-            known.has_prior_focal_length = True
-            database.update_camera(known)
+            side = max(camera.width, camera.height)
+            camera.focal_length = side / 2 / math.tan(math.radians(fov / 2))
+            camera.has_prior_focal_length = True
+            database.update_camera(camera)
 
 
 def map_largest(job: Job, is_focal_fixed: bool = False) -> pycolmap.Reconstruction | None:
