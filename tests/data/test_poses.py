@@ -92,6 +92,9 @@ def test_the_next_run_keeps_what_was_found(tmp_path, monkeypatch):
     stand_in(monkeypatch, tmp_path, model_script(["0.png", "2.png", "3.png"]))
     first = find_poses(given, out)
     stand_in(monkeypatch, tmp_path, "raise SystemExit('asked again')")
+    summary = find_poses_summary(out)
+    summary["poses"]["focal"] = None  # as older versions wrote it
+    (out / "summary.json").write_text(json.dumps(summary))
     again = find_poses(given, out)
     assert again.reused
     assert again.missing == first.missing == ["1.png"]

@@ -241,7 +241,7 @@ def _rate_model(model: pycolmap.Reconstruction | None) -> tuple[bool, int, int]:
     """Rate a model by plausible lenses, then photographs, then points."""
     if model is None:
         return False, 0, 0
-    lenses = (model.images[i].camera for i in model.reg_image_ids())
+    lenses = (model.cameras[model.images[i].camera_id] for i in model.reg_image_ids())
     return all(map(is_plausible, lenses)), model.num_reg_images(), model.num_points3D()
 
 

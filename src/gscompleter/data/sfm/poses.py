@@ -17,7 +17,7 @@ import subprocess
 import sys
 import tempfile
 from collections.abc import Sequence
-from dataclasses import asdict, dataclass, replace
+from dataclasses import asdict, dataclass
 from importlib.util import find_spec
 from pathlib import Path
 from typing import Any
@@ -123,7 +123,9 @@ def _read_earlier(out: Path, known: dict[str, list[int]]) -> FoundPoses | None:
     content = read_json(out / SUMMARY_FILE, "name another folder")
     if not isinstance(content, dict) or content.get("photographs") != known:
         return None
-    return replace(FoundPoses(**content["poses"]), reused=True)
+    earlier = content["poses"]  # older versions stored more
+    values = (earlier[name] for name in ("photographs", "missing", "points", "error"))
+    return FoundPoses(*values, reused=True)
 
 
 def has_photographs(path: Path) -> bool:
