@@ -124,8 +124,8 @@ def _read_earlier(out: Path, known: dict[str, list[int]]) -> FoundPoses | None:
     if not isinstance(content, dict) or content.get("photographs") != known:
         return None
     earlier = content["poses"]  # older versions stored more
-    values = (earlier[name] for name in ("photographs", "missing", "points", "error"))
-    return FoundPoses(*values, reused=True)
+    values = {name: earlier[name] for name in ("photographs", "missing", "points", "error")}
+    return FoundPoses(**values, reused=True)
 
 
 def has_photographs(path: Path) -> bool:
