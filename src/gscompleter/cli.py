@@ -19,7 +19,7 @@ from gscompleter.apps.commands.words import format_error, parse_words
 from gscompleter.config.settings import validate
 from gscompleter.cpu_threads import limit_threads
 from gscompleter.errors import PROGRAM, InputError
-from gscompleter.io.interrupts import handle_stop_signals
+from gscompleter.io.files import handle_stop_signals
 
 # Options, module and function of each command. The module is imported after the options are
 # validated, so that `--help` does not wait for torch.

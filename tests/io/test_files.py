@@ -181,8 +181,7 @@ def test_a_linked_folder_stays_a_link(tmp_path):
 
 WRITES = """
 import os, signal, sys, time
-from gscompleter.io.interrupts import handle_stop_signals
-from gscompleter.io.files import open_output_folder, replace_file
+from gscompleter.io.files import handle_stop_signals, open_output_folder, replace_file
 
 for number in (signal.SIGTERM, signal.SIGHUP):
     signal.signal(number, signal.SIG_DFL)  # nohup and shells in the background ignore some
@@ -252,8 +251,8 @@ def test_a_process_that_is_told_to_stop_cleans_up(tmp_path, results, number):
 @pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGHUP, signal.SIGINT])
 def test_an_interrupt_while_results_are_replaced_leaves_nothing_behind(results, number):
     code = (
-        "import os, shutil, sys\nfrom gscompleter.io.interrupts import handle_stop_signals\n"
-        "from gscompleter.io.files import open_output_folder\n"
+        "import os, shutil, sys\n"
+        "from gscompleter.io.files import handle_stop_signals, open_output_folder\n"
         "import signal\nsignal.signal(signal.SIGTERM, signal.SIG_DFL)\n"
         "signal.signal(signal.SIGHUP, signal.SIG_DFL)\n"
         "signal.signal(signal.SIGINT, signal.default_int_handler)\nhandle_stop_signals()\n"

@@ -46,8 +46,7 @@ from gscompleter.data.resize import Resolution
 from gscompleter.data.transforms import NAME as TRANSFORMS
 from gscompleter.data.transforms import read_frames
 from gscompleter.errors import InputError, quote_value
-from gscompleter.io.json_file import is_json_list, read_json
-from gscompleter.io.reading import read_head
+from gscompleter.io.reading import is_json_list, read_head, read_json
 
 NAME = "cameras.json"
 ADVICE = "export the cameras again"

@@ -57,13 +57,13 @@ class Intrinsics:
 
 def find_pinhole_defect(pinhole: Pinhole) -> str | None:
     """Describe why intrinsics are impossible; None if they are valid."""
+    unit = pinhole.resize(1, 1)
     low, high = FOCAL_RANGE
-    w, h = pinhole.width, pinhole.height
-    for focal in (pinhole.fl_x / w, pinhole.fl_y / h):
+    for focal in (unit.fl_x, unit.fl_y):
         if not low <= focal <= high:
             given = f"its focal length is {focal:g} times the size of the image"
             return f"{given}, which is not within {low:g} to {high:g}"
-    for center in (pinhole.cx / w, pinhole.cy / h):
+    for center in (unit.cx, unit.cy):
         if not abs(center) <= MAX_CENTER:
             given = f"its principal point lies {center:g} image sizes from the corner"
             return f"{given}, which is beyond {MAX_CENTER:g}"

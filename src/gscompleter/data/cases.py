@@ -19,7 +19,7 @@ from gscompleter.data.formats import FORMATS, detect_format, find_format, open_p
 from gscompleter.data.photographs import Photographs, apply_masks
 from gscompleter.data.resize import Resolution
 from gscompleter.errors import InputError, quote_value
-from gscompleter.io.json_file import read_json
+from gscompleter.io.reading import read_json
 from gscompleter.types import View
 
 

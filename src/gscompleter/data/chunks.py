@@ -23,8 +23,7 @@ from gscompleter.data.limits import require
 from gscompleter.data.photographs import Photographs, build_photographs
 from gscompleter.data.real_estate import parse_camera_row
 from gscompleter.errors import InputError, quote_value, refuse_pointer
-from gscompleter.io.json_file import read_json
-from gscompleter.io.reading import check_file
+from gscompleter.io.reading import check_file, read_json
 
 TEST = "test"
 """Folder of the test split of a data set."""

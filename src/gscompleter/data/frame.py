@@ -74,16 +74,15 @@ class Frame:
         A photograph inside a container file is not opened if the camera file gives its size.
         """
         stated = None if self.intrinsics.size == FRACTIONS else self.intrinsics.size
-        if stated is not None and callable(self.image):
+        stored = None if stated is not None and callable(self.image) else self.find_stored()
+        if stored is not None:
+            return read_image_size(stored, capitalize(self.title))
+        if stated is not None:
             return stated
-        stored = self.find_stored()
-        size = stated if stored is None else read_image_size(stored, capitalize(self.title))
-        if size is None:
-            raise InputError(
-                f"The size of {self.title} is not known, because it has no image and no `w` and "
-                "`h`; add these, or its image."
-            )
-        return size
+        raise InputError(
+            f"The size of {self.title} is not known, because it has no image and no `w` and `h`; "
+            "add these, or its image."
+        )
 
     def require_stored(self) -> Path | bytes:
         """Return the image file or its bytes, or raise an InputError if there is none."""

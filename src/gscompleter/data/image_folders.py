@@ -7,9 +7,8 @@ in any case.
 from __future__ import annotations
 
 import os
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import replace
-from functools import cache
 from pathlib import Path, PurePosixPath
 
 from gscompleter.data.frame import DOWNSCALE_FACTORS, ENDINGS, Frame
@@ -24,30 +23,21 @@ MAX_NAMED = 3
 """Missing photographs that a note names."""
 
 
-def _list_entries(folder: Path) -> dict[str, str]:
-    """Map the case-folded names in a folder to the names."""
-    try:
-        return {name.casefold(): name for name in sorted(os.listdir(folder), reverse=True)}
-    except (OSError, ValueError):
-        return {}
-
-
-def find_path(
-    folder: Path, relative: str, list_entries: Callable[[Path], dict[str, str]] = _list_entries
-) -> Path | None:
+def find_path(folder: Path, relative: str) -> Path | None:
     """Find `relative` below `folder`, ignoring case; None if it does not exist."""
     if os.path.exists(folder / relative):
         return folder / relative
     for part in PurePosixPath(relative).parts:
-        name = list_entries(folder).get(part.casefold())
-        if name is None:
+        names = sorted(os.listdir(folder)) if os.path.isdir(folder) else []
+        same = [name for name in names if name.casefold() == part.casefold()]
+        if not same:
             return None
-        folder = folder / name
+        folder = folder / same[0]
     return folder
 
 
 class ImageFinder:
-    """Finder of the photographs and masks of one scene that lists each folder once.
+    """Finder of the photographs and masks of one scene.
 
     `roots` are the nearest first, and `order` are the folders in them, the likeliest first.
     """
@@ -58,23 +48,19 @@ class ImageFinder:
         self.folders = [folder for folder in folders if folder is not None and folder.is_dir()]
         self.folders += roots
         self.masks = [folder for folder in masks if folder is not None]
-        self.list_entries = cache(_list_entries)
 
     def locate(self, frame: Frame) -> Frame:
         """Return the frame with the paths of its photograph and mask, if they exist."""
         name = PurePosixPath(frame.name)
         masks = (f"{name}.png", f"{name.parent / name.stem}.png")
         photographs = [frame.name + ending for ending in ENDINGS]
-        return replace(
-            frame,
-            image=self._find_file(self.folders, photographs),
-            mask=self._find_file(self.masks, masks),
-        )
+        image, mask = _find_file(self.folders, photographs), _find_file(self.masks, masks)
+        return replace(frame, image=image, mask=mask)
 
-    def _find_file(self, folders: Sequence[Path], names: Sequence[str]) -> Path | None:
-        places = ((folder, name) for folder in folders for name in names)
-        found = (find_path(folder, name, self.list_entries) for folder, name in places)
-        return next((path for path in found if path is not None and os.path.isfile(path)), None)
+
+def _find_file(folders: Sequence[Path], names: Sequence[str]) -> Path | None:
+    found = (find_path(folder, name) for folder in folders for name in names)
+    return next((path for path in found if path is not None and os.path.isfile(path)), None)
 
 
 def keep_existing(frames: Sequence[Frame], title: str) -> tuple[tuple[Frame, ...], tuple[str, ...]]:

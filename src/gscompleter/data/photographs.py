@@ -43,20 +43,18 @@ class Photographs:
     """
 
     name: str
-    """Name in evaluation indices."""
     title: str
     """Name in error messages."""
     frames: tuple[Frame, ...]
     origin: Float[np.ndarray, "3"]
     """Origin of the cameras' coordinates, in those of the files (float64)."""
     near: float | None = None
-    """Smallest z-depth of the scene, in scene units, or None if unknown."""
+    """Smallest z-depth of the scene, in scene units."""
     far: float | None = None
-    """Largest z-depth of the scene, in scene units, or None if unknown."""
+    """Largest z-depth of the scene, in scene units."""
     notes: tuple[str, ...] = ()
     """Sentences about choices made while opening."""
     format: str | None = None
-    """Name of the format, if known."""
     sparse: Callable[[], Float[np.ndarray, "n 3"]] | None = None
     """Reads points on the scene's surfaces, in the files' frame."""
     front: str | None = None
@@ -80,16 +78,9 @@ class Photographs:
         return self._build_camera(found, found.size(), resolution)
 
     def views(self, frames: Sequence[int], resolution: Resolution = None) -> list[View]:
-        """Load photographs with cameras, and depth if available.
+        """Load undistorted photographs with cameras, and depth if available.
 
-        Undistorted images keep the size of the photograph and have no empty pixels (see
-        `undistort_pinhole`). `ignore_mask` marks the vehicle that carries the camera, if it is
-        detected.
-
-        Args:
-            frames: Frame numbers.
-            resolution: Height and width to cover and crop to, or the most pixels of the longer
-                side; None keeps the size.
+        `ignore_mask` marks the vehicle that carries the camera, if it is detected.
         """
         return [self._load_view(number, resolution) for number in frames]
 
@@ -101,8 +92,7 @@ class Photographs:
             shown = read_pixels(found.mask).max(axis=-1)
             masks.append(undistort_and_resize(found, shown, found.size(), resolution) == 0)
         if found.boxes is not None:
-            camera = self._build_camera(found, found.size(), resolution)
-            masks.append(mask_moving(found.boxes(), camera, self.origin))
+            masks.append(mask_moving(found.boxes(), self.camera(frame, resolution), self.origin))
         return torch.from_numpy(np.logical_or.reduce(masks)) if masks else None
 
     def points(self) -> Float[Tensor, "n 3"] | None:
@@ -122,9 +112,11 @@ class Photographs:
 
     def find_skip_reason(self) -> str | None:
         """Explain why benchmarks skip the photographs; None if they are kept."""
-        reasons = (_find_skip_reason(frame, self.origin) for frame in self.frames)
-        found = ((number, reason) for number, reason in enumerate(reasons) if reason is not None)
-        return next((f"frame {number}: {reason}" for number, reason in found), None)
+        for number, frame in enumerate(self.frames):
+            reason = _find_skip_reason(frame, self.origin)
+            if reason is not None:
+                return f"frame {number}: {reason}"
+        return None
 
     def frame(self, number: int) -> Frame:
         """Return the frame of that number."""
@@ -171,13 +163,15 @@ def apply_masks(
     for view in views:
         assert view.frame is not None
         mask = photographs.mask(view.frame, resolution)
-        if mask is not None and mask.all():
+        if mask is None:
+            found.append(view)
+            continue
+        if mask.all():
             raise InputError(
                 f"All of frame {view.frame} of {photographs.name} is masked; choose another frame."
             )
-        if mask is not None and view.ignore_mask is not None:
-            mask = mask | view.ignore_mask
-        found.append(view if mask is None else replace(view, ignore_mask=mask))
+        whole = mask if view.ignore_mask is None else mask | view.ignore_mask
+        found.append(replace(view, ignore_mask=whole))
     return found
 
 

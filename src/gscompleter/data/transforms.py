@@ -26,7 +26,7 @@ from gscompleter.data.photographs import Photographs, build_photographs
 from gscompleter.data.points import read_point_cloud
 from gscompleter.data.undistort import Distortion
 from gscompleter.errors import quote_value
-from gscompleter.io.json_file import is_json_list, read_json
+from gscompleter.io.reading import is_json_list, read_json
 
 NAME = "transforms.json"
 ADVICE = "export the scene again"

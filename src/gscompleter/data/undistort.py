@@ -13,7 +13,7 @@ from typing import Literal
 import cv2
 import numpy as np
 import torch
-from jaxtyping import Float, Shaped
+from jaxtyping import Float, Int, Shaped
 from torch import Tensor
 
 MAX_ZOOM_OUT = 0.5
@@ -47,20 +47,9 @@ class Pinhole:
         """Return the camera of the crop that begins at pixel (left, top)."""
         return Pinhole(self.fl_x, self.fl_y, self.cx - left, self.cy - top, width, height)
 
-    def magnify(self, zoom: float) -> Pinhole:
-        """Magnify the image by `zoom` about the principal point, at the same size."""
-        return replace(self, fl_x=self.fl_x * zoom, fl_y=self.fl_y * zoom)
-
 
 Projection = Literal["perspective", "equidistant", "field-of-view", "division", "unified"]
-"""Maps from directions to the image plane, before any polynomial:
-
-* perspective: pinhole.
-* equidistant: the radius is the angle to the axis (fisheye).
-* field-of-view: one angle ω; the radius is atan(2 r tan(ω/2)) / ω.
-* division: one number k; the radius is the ρ with ρ / (1 + k ρ²) = r.
-* unified: two numbers α and β; points are divided by α √(β r² + 1) + 1 - α.
-"""
+"""Maps from directions to the image plane, before any polynomial (see `_compute_radius`)."""
 
 
 @dataclass(frozen=True)
@@ -72,7 +61,7 @@ class Distortion:
 
     projection: Projection = "perspective"
     shape: tuple[float, ...] = ()
-    """Parameters of the projection."""
+    """Parameters of the projection: the angle ω, k, or α and β."""
     radial: tuple[float, ...] = ()
     """Coefficients k1, k2, … of even powers of the radius, from the second on."""
     tangential: tuple[float, float] = (0.0, 0.0)
@@ -99,6 +88,7 @@ def distort(points: Float[np.ndarray, "*n 2"], distortion: Distortion) -> Float[
 
 
 def _compute_radius(r: Float[np.ndarray, "*n"], distortion: Distortion) -> Float[np.ndarray, "*n"]:
+    """Project a radius at z = 1; the division model gives the ρ with ρ / (1 + k ρ²) = r."""
     if distortion.projection == "equidistant":
         return np.arctan(r)
     if distortion.projection == "field-of-view":
@@ -138,15 +128,16 @@ def undistort_pinhole(pinhole: Pinhole, distortion: Distortion) -> Pinhole | Non
     """
     if not distortion:
         return pinhole
-    zoom, radius = None, np.zeros(())
-    for candidate in np.geomspace(MAX_ZOOM_IN, MAX_ZOOM_OUT, 400):
-        bent = distort(_compute_border(pinhole.magnify(float(candidate))), distortion)
+    found, radius = None, np.zeros(())
+    for zoom in np.geomspace(MAX_ZOOM_IN, MAX_ZOOM_OUT, 400).tolist():
+        new = replace(pinhole, fl_x=pinhole.fl_x * zoom, fl_y=pinhole.fl_y * zoom)
+        bent = distort(_compute_border(new), distortion)
         # Zooming out must move every border point outwards: beyond the fold of a polynomial,
         # points return into the photograph and show something else.
         if not _is_within(pinhole, bent) or (np.linalg.norm(bent, axis=-1) < radius).any():
             break
-        zoom, radius = float(candidate), np.linalg.norm(bent, axis=-1)
-    return None if zoom is None else pinhole.magnify(zoom)
+        found, radius = new, np.linalg.norm(bent, axis=-1)
+    return found
 
 
 @lru_cache(maxsize=1)
@@ -154,8 +145,8 @@ def compute_undistortion_map(
     pinhole: Pinhole, distortion: Distortion, new: Pinhole
 ) -> Float[np.ndarray, "h w 2"]:
     """Compute the photograph position of each undistorted pixel, for `remap`."""
-    x, y = np.meshgrid(np.arange(new.width) + 0.5, np.arange(new.height) + 0.5)
-    pixels = _to_pixels(pinhole, distort(_to_plane(new, x, y), distortion))
+    plane = _compute_plane(new, np.arange(new.width), np.arange(new.height))
+    pixels = _to_pixels(pinhole, distort(plane, distortion))
     # The nearest border fills pixels outside the field of the lens.
     finite = np.nan_to_num(pixels - 0.5, nan=-1.0, posinf=-1.0, neginf=-1.0)
     with np.errstate(over="ignore"):
@@ -172,16 +163,18 @@ def remap(
 
 def _compute_border(pinhole: Pinhole) -> Float[np.ndarray, "n 2"]:
     """Compute the outermost pixel centres on the image plane at z = 1."""
-    x, y = np.arange(pinhole.width) + 0.5, np.arange(pinhole.height) + 0.5
-    rows = [_to_plane(pinhole, x, np.full_like(x, edge)) for edge in (y[0], y[-1])]
-    columns = [_to_plane(pinhole, np.full_like(y, edge), y) for edge in (x[0], x[-1])]
-    return np.concatenate(rows + columns)
+    columns, rows = np.arange(pinhole.width), np.arange(pinhole.height)
+    edges = (columns, rows[[0, -1]]), (columns[[0, -1]], rows)
+    return np.concatenate([_compute_plane(pinhole, *edge).reshape(-1, 2) for edge in edges])
 
 
-def _to_plane(
-    pinhole: Pinhole, x: Float[np.ndarray, "*n"], y: Float[np.ndarray, "*n"]
-) -> Float[np.ndarray, "*n 2"]:
-    return np.stack([(x - pinhole.cx) / pinhole.fl_x, (y - pinhole.cy) / pinhole.fl_y], axis=-1)
+def _compute_plane(
+    pinhole: Pinhole, columns: Int[np.ndarray, "w"], rows: Int[np.ndarray, "h"]
+) -> Float[np.ndarray, "h w 2"]:
+    """Compute the pixel centres in these columns and rows on the image plane at z = 1."""
+    x = (columns + 0.5 - pinhole.cx) / pinhole.fl_x
+    y = (rows + 0.5 - pinhole.cy) / pinhole.fl_y
+    return np.stack(np.meshgrid(x, y), axis=-1)
 
 
 def _to_pixels(pinhole: Pinhole, points: Float[np.ndarray, "*n 2"]) -> Float[np.ndarray, "*n 2"]:

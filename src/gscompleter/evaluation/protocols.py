@@ -24,7 +24,7 @@ from gscompleter.data.photographs import Photographs, apply_masks
 from gscompleter.data.resize import Resolution
 from gscompleter.errors import InputError, quote_value
 from gscompleter.io.files import replace_file
-from gscompleter.io.json_file import read_json
+from gscompleter.io.reading import read_json
 from gscompleter.types import View
 
 VERSION = 1

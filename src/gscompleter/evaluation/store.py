@@ -25,7 +25,7 @@ from torch import Tensor
 
 from gscompleter.errors import InputError, quote_value
 from gscompleter.evaluation.methods import Prediction
-from gscompleter.io import json_file
+from gscompleter.io import reading
 from gscompleter.io.files import replace_file
 from gscompleter.io.image import write_image
 from gscompleter.jobs.jobs import list_names, make_folder
@@ -186,4 +186,4 @@ def save_image(path: Path, image: Float[Tensor, "h w 3"]) -> None:
 
 def read_json(path: Path, advice: str = "delete it and run again") -> Any:
     """Read a JSON file of results."""
-    return json_file.read_json(path, advice)
+    return reading.read_json(path, advice)

@@ -1,4 +1,7 @@
-"""Atomic writes: a file or folder is written completely or left as it was."""
+"""Atomic writes: a file or folder is written completely or left as it was.
+
+Interrupts (Ctrl-C, `kill`, a scheduler, or a closed terminal) wait while results are renamed.
+"""
 
 from __future__ import annotations
 
@@ -6,13 +9,14 @@ import errno
 import os
 import secrets
 import shutil
+import signal
+import threading
 from collections.abc import Container, Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import BinaryIO
 
 from gscompleter.errors import InputError, OutputError, quote_value
-from gscompleter.io.interrupts import defer_interrupts
 
 SUMMARY_FILE = "summary.json"
 """File that marks a folder as complete: it is removed first and written last."""
@@ -33,9 +37,6 @@ def replace_file(path: Path | str, keep_existing: bool = False) -> Iterator[Bina
 
     An existing file survives every failure. With `keep_existing`, a file that another process
     wrote at `path` meanwhile is kept, where the file system has hard links.
-
-    Raises:
-        InputError: The file cannot be written.
     """
     # The target of a symbolic link is replaced, not the link.
     target = Path(os.path.realpath(path))
@@ -57,11 +58,7 @@ def replace_file(path: Path | str, keep_existing: bool = False) -> Iterator[Bina
 
 
 def check_output(path: Path | str, overwrite: bool = False) -> None:
-    """Check, by trying, that a folder of results can be written.
-
-    Raises:
-        InputError: `path` is a file, not empty while `overwrite` is off, or not writable.
-    """
+    """Raise an InputError if results cannot be written to this folder, by trying."""
     with _create_draft(Path(path), overwrite):
         pass
 
@@ -72,10 +69,7 @@ def open_output_folder(path: Path | str, overwrite: bool = False) -> Iterator[Pa
 
     A new `path` is made by one rename. In an existing one, entries of the same names are replaced,
     the summary last, and other files stay. After any exception, `path` and its parents are as
-    before. An interrupt waits for the renames.
-
-    Raises:
-        InputError: As in `check_output`, or the disk is full.
+    before.
     """
     with _create_draft(Path(path), overwrite) as draft:
         try:
@@ -171,3 +165,39 @@ def convert_write_errors(path: Path | str, numbers: Container[int] | None = None
             f"Cannot write {quote_value(Path(path))}: {error.strerror or error}; free some space, "
             "or choose another place."
         ) from error
+
+
+def handle_stop_signals() -> None:
+    """Let SIGTERM and SIGHUP raise KeyboardInterrupt, so that everything is cleaned up.
+
+    Signals that are ignored (`nohup`) or handled already stay so. This works in the main thread
+    only.
+    """
+    for name in ("SIGTERM", "SIGHUP"):
+        number = getattr(signal, name, None)  # Windows has no SIGHUP
+        if number is not None and signal.getsignal(number) is signal.SIG_DFL:
+            signal.signal(number, signal.default_int_handler)
+
+
+@contextmanager
+def defer_interrupts(state: str) -> Iterator[None]:
+    """Defer KeyboardInterrupt, with the message `state`, to the end of a block."""
+    came: list[int] = []
+    handled = []
+    if threading.current_thread() is threading.main_thread():
+        handled = [n for n in signal.Signals if signal.getsignal(n) is signal.default_int_handler]
+    for number in handled:
+        signal.signal(number, lambda number, _: came.append(number))
+    try:
+        yield
+    finally:
+        for number in handled:
+            signal.signal(number, signal.default_int_handler)
+    if came:
+        raise KeyboardInterrupt(state)
+
+
+def get_download_folder() -> Path:
+    """Return $GSCOMPLETER_HOME, or else ~/.cache/gscompleter."""
+    home = os.environ.get("GSCOMPLETER_HOME")
+    return Path(home).expanduser() if home else Path.home() / ".cache" / "gscompleter"

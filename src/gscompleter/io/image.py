@@ -74,18 +74,14 @@ def has_orientation_tag(path: Path) -> bool:
 def read_pixels(stored: Path | str | bytes, name: str = "") -> UInt8[np.ndarray, "h w 3"]:
     """Read an image in 8-bit colours, over black; 16-bit images are reduced.
 
-    Orientation tags are ignored, because poses and intrinsics belong to the stored pixels. `name`
-    names bytes in errors.
+    Orientation tags are ignored, because poses and intrinsics belong to the stored pixels.
     """
     with open_image(stored, name) as image:
         return _composite_over_black(image)
 
 
 def read_brightness(stored: Path | bytes, side: int, name: str = "") -> Float[np.ndarray, "h w"]:
-    """Read the brightness (0 to 255) of an image shrunk to a longer side of `side` pixels.
-
-    A JPEG is decoded no larger than necessary; `name` names bytes in errors.
-    """
+    """Read the brightness (0 to 255) of an image shrunk to a longer side of `side` pixels."""
     with open_image(stored, name) as image:
         scale = min(1.0, side / max(image.size))
         size = max(round(image.width * scale), 1), max(round(image.height * scale), 1)
@@ -97,7 +93,7 @@ def read_brightness(stored: Path | bytes, side: int, name: str = "") -> Float[np
 
 def read_depth(path: Path, unit: float) -> Float[np.ndarray, "h w"]:
     """Read z-depth from a 16-bit PNG or a `.npy` file, times `unit`; 0 where unknown."""
-    values = _read_array(path) if path.suffix == ".npy" else _read_values(path)
+    values = _read_array(path) if path.suffix == ".npy" else _read_stored(path)
     values = values[..., 0] if values.ndim == 3 and values.shape[-1] == 1 else values
     if values.ndim != 2 or values.dtype.kind not in "uif" or values.dtype == np.uint8:
         raise InputError(
@@ -109,7 +105,7 @@ def read_depth(path: Path, unit: float) -> Float[np.ndarray, "h w"]:
     return np.where(np.isfinite(depth) & (depth > 0), depth, np.float32(0))
 
 
-def _read_values(path: Path) -> np.ndarray:
+def _read_stored(path: Path) -> np.ndarray:
     with open_image(path) as image:
         return np.array(image)
 

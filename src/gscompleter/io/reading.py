@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import os
 import stat
 from collections.abc import Iterator
@@ -18,6 +19,10 @@ MAX_TEXT = 1 << 23
 """Largest text file, in bytes."""
 MAX_LINE = 4096
 """Longest line, in characters."""
+MAX_JSON = 1 << 29
+"""Largest JSON file, in bytes."""
+MAX_DIGITS = 20
+"""Longest integer in JSON: 64 bits have no more digits."""
 MAX_DEPTH = 64
 """Deepest nesting of lists and dictionaries, the most dimensions that numpy supports."""
 
@@ -77,6 +82,32 @@ def read_lines(
                     "which its format does not allow; copy the file again."
                 )
             yield line
+
+
+def read_json(path: Path, advice: str) -> Any:
+    """Read a JSON file; errors end with `advice`, such as "download it again"."""
+    data = read_bytes(path, MAX_JSON)
+    try:
+        value = json.loads(data.decode("utf-8-sig"), parse_int=_parse_integer)
+    except RecursionError as error:
+        raise InputError(f"{quote_value(path)} is nested too deeply; {advice}.") from error
+    except ValueError as error:
+        raise InputError(
+            f"{quote_value(path)} is not JSON ({quote_value(str(error))}); {advice}."
+        ) from error
+    check_plain(value, path, len(data))
+    return value
+
+
+def _parse_integer(digits: str) -> int:
+    if len(digits.lstrip("-")) > MAX_DIGITS:
+        raise ValueError(f"an integer of {len(digits.lstrip('-'))} digits")
+    return int(digits)
+
+
+def is_json_list(path: Path) -> bool:
+    """Return True if the JSON file is a list, by its first character."""
+    return read_head(path, 64).removeprefix(b"\xef\xbb\xbf").lstrip().startswith(b"[")
 
 
 def check_plain(value: Any, path: Path, max_values: int) -> None:

@@ -16,7 +16,7 @@ from typing import Any
 
 from gscompleter.errors import InputError, OutputError, quote_value
 from gscompleter.io.files import UNFINISHED_PREFIX, replace_file
-from gscompleter.io.json_file import read_json
+from gscompleter.io.reading import read_json
 
 BATCH, JOBS, ROWS = "batch.json", "jobs", "rows"
 """File that marks the folder of a batch, and its folders."""

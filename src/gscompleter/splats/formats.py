@@ -20,8 +20,7 @@ from torch import Tensor
 
 from gscompleter.errors import InputError, quote_value, refuse_pointer
 from gscompleter.io.files import replace_file
-from gscompleter.io.json_file import read_json
-from gscompleter.io.reading import open_file
+from gscompleter.io.reading import open_file, read_json
 from gscompleter.splats.compressed_ply import (
     is_compressed_ply,
     read_compressed_ply,

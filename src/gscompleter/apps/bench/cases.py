@@ -18,7 +18,7 @@ from gscompleter.data.formats import open_photographs
 from gscompleter.data.photographs import Photographs
 from gscompleter.errors import InputError, quote_value
 from gscompleter.evaluation.methods import Models
-from gscompleter.io.json_file import read_json
+from gscompleter.io.reading import read_json
 from gscompleter.splats.ply import save_ply
 from gscompleter.state import Completion
 from gscompleter.types import Gaussians

@@ -16,7 +16,7 @@ from gscompleter.apps.commands.options import DoctorOptions
 from gscompleter.apps.viewer.packages import BUILT_LIBRARIES, LOCK_FILE, get_archive_path, read_lock
 from gscompleter.apps.warmup import PARTS
 from gscompleter.errors import InputError
-from gscompleter.io.cache import get_download_folder
+from gscompleter.io.files import get_download_folder
 from gscompleter.kernels.compiled import get_cache_folder, is_compiled
 from gscompleter.models.weights.fetching import find_cached
 from gscompleter.models.weights.published import PUBLISHED

@@ -11,7 +11,7 @@ from typing import Any, Literal, TypeVar
 from gscompleter.errors import InputError, quote_value
 from gscompleter.evaluation.metrics.coverage import Coverage
 from gscompleter.io.files import SUMMARY_FILE
-from gscompleter.io.json_file import read_json
+from gscompleter.io.reading import read_json
 
 RECORD_FILE = "report.json"
 ADVICE = "complete the scene again"

@@ -19,8 +19,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from gscompleter.errors import InputError
-from gscompleter.io.cache import get_download_folder
-from gscompleter.io.files import replace_file
+from gscompleter.io.files import get_download_folder, replace_file
 
 LOCK_FILE = Path(__file__).with_name("package-lock.json")
 """Pinned packages with their hashes."""

@@ -9,10 +9,10 @@ from __future__ import annotations
 import mmap
 import os
 import struct
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, TypeVar
 
 import numpy as np
 from jaxtyping import Float
@@ -31,6 +31,11 @@ MAX_LINE = 1 << 22
 """Longest line in characters: the features of an image."""
 MAX_BYTES = 1 << 34
 """Longest text file, in bytes."""
+
+
+CameraEntry = tuple[int, str | int, tuple[int, int], Sequence[float]]
+"""Number of a camera, name or number of its model, width and height, and parameters."""
+Entry = TypeVar("Entry")
 
 
 class PosedImage(NamedTuple):
@@ -109,6 +114,11 @@ def build_intrinsics(
             f"The size of {title} is {quote_value(size[0])} × {quote_value(size[1])}; sides from "
             f"1 to {MAX_SIDE} pixels are needed."
         )
+    if len(numbers) != len(model.parameters):
+        raise InputError(
+            f"The model of {title} has the {len(model.parameters)} parameters {model.names}, and "
+            f"{len(numbers)} are given; export the model again."
+        )
     values = dict(zip(model.parameters, numbers, strict=True))
     for name, value in values.items():
         limit = MAX_IN_PIXELS if name in _IN_PIXELS else MAX_COEFFICIENT
@@ -118,76 +128,84 @@ def build_intrinsics(
                 "needed."
             )
 
-    def select(*names: str) -> tuple[float, ...]:
-        return tuple(values[name] for name in names if name in values)
-
-    distortion = Distortion(
-        model.projection,
-        shape=select(*_SHAPES),
-        radial=select("k1", "k2", "k3", "k4"),
-        tangential=(values.get("p1", 0.0), values.get("p2", 0.0)),
-        denominator=select("d1", "d2", "d3"),
-        prism=(values.get("s1", 0.0), values.get("s3", 0.0)),
+    shape, radial, denominator = (
+        tuple(values[name] for name in names if name in values)
+        for names in (_SHAPES, ("k1", "k2", "k3", "k4"), ("d1", "d2", "d3"))
     )
+    tangential = values.get("p1", 0.0), values.get("p2", 0.0)
+    prism = values.get("s1", 0.0), values.get("s3", 0.0)
+    distortion = Distortion(model.projection, shape, radial, tangential, denominator, prism)
     focal = values.get("fx", values.get("f")), values.get("fy", values.get("f"))
     return Intrinsics(size, focal, (values["cx"], values["cy"]), distortion=distortion)
 
 
 def read_cameras(path: Path) -> dict[int, Intrinsics]:
     """Read the cameras of a cameras.bin or cameras.txt by number."""
-    read = _read_text_cameras if _is_text(path) else _read_binary_cameras
-    return dict(read(path))
+    if _is_text(path):
+        found = _parse_lines(path, "CAMERA_ID MODEL WIDTH HEIGHT PARAMS…", _parse_camera)
+    else:
+        found = _read_binary_cameras(path)
+    cameras = {}
+    for number, name, size, numbers in found:
+        title = f"camera {number} of {quote_value(path)}"
+        cameras[number] = build_intrinsics(find_model(name, title), size, numbers, title)
+    return cameras
 
 
 def read_images(path: Path) -> list[PosedImage]:
     """Read the images of an images.bin or images.txt in its order, without features."""
-    read = _read_text_images if _is_text(path) else _read_binary_images
-    return list(read(path))
+    if _is_text(path):
+        form = "IMAGE_ID QW QX QY QZ TX TY TZ CAMERA_ID NAME"
+        return [image for image in _parse_lines(path, form, _parse_image) if image is not None]
+    return list(_read_binary_images(path))
 
 
 def read_points(path: Path) -> Float[np.ndarray, "n 3"]:
     """Read the points of a points3D.bin or points3D.txt in scene units, without tracks."""
-    read = _read_text_points if _is_text(path) else _read_binary_points
-    return np.fromiter(read(path), dtype=np.dtype((np.float64, 3)))
+    if _is_text(path):
+        found = _parse_lines(path, "POINT3D_ID X Y Z …", _parse_point)
+    else:
+        found = _read_binary_points(path)
+    return np.fromiter(found, dtype=np.dtype((np.float64, 3)))
 
 
 def _is_text(path: Path) -> bool:
     return path.suffix.lower() == ".txt"
 
 
-def _read_binary_cameras(path: Path) -> Iterator[tuple[int, Intrinsics]]:
-    with _open_records(path) as records:
-        for _ in range(records.read_count()):
-            number, model_number, width, height = records.read("<IiQQ")
+def _read_binary_cameras(path: Path) -> Iterator[CameraEntry]:
+    with _open_binary(path) as content:
+        for _ in range(_read_count(content)):
+            number, model, width, height = _unpack(content, "<IiQQ")
             title = f"camera {number} of {quote_value(path)}"
-            model = find_model(model_number, title)
-            numbers = records.read(f"<{len(model.parameters)}d")
-            yield number, build_intrinsics(model, (width, height), numbers, title)
+            count = len(find_model(model, title).parameters)
+            yield number, model, (width, height), _unpack(content, f"<{count}d")
 
 
 def _read_binary_images(path: Path) -> Iterator[PosedImage]:
-    with _open_records(path) as records:
-        for _ in range(records.read_count()):
-            _, *pose, camera = records.read("<I4d3dI")
-            name = records.read_name()
-            records.skip(records.read_count() * FEATURE_SIZE)
+    with _open_binary(path) as content:
+        for _ in range(_read_count(content)):
+            _, *pose, camera = _unpack(content, "<I4d3dI")
+            name = _read_name(content)
+            content.seek(_read_count(content) * FEATURE_SIZE, os.SEEK_CUR)
             yield build_posed_image(name, camera, pose)
 
 
 def _read_binary_points(path: Path) -> Iterator[tuple[float, ...]]:
-    with _open_records(path) as records:
-        for _ in range(records.read_count()):
-            yield records.read("<Q3d3Bd")[1:4]
-            records.skip(records.read_count() * SIGHTING_SIZE)
+    with _open_binary(path) as content:
+        for _ in range(_read_count(content)):
+            yield _unpack(content, "<Q3d3Bd")[1:4]
+            content.seek(_read_count(content) * SIGHTING_SIZE, os.SEEK_CUR)
 
 
 @contextmanager
-def _open_records(path: Path) -> Iterator[_Records]:
+def _open_binary(path: Path) -> Iterator[mmap.mmap]:
+    """Map a file into memory; reading or seeking beyond its end becomes an InputError."""
     refuse_pointer(path)
     with open_file(path) as file:
         try:
             with mmap.mmap(file.fileno(), 0, access=mmap.ACCESS_READ) as content:
-                yield _Records(content, path)
+                yield content
         except InputError:
             raise
         except (struct.error, ValueError, OverflowError) as error:
@@ -197,89 +215,54 @@ def _open_records(path: Path) -> Iterator[_Records]:
             ) from error
 
 
-class _Records:
-    """Sequential reader of a file; a read beyond its end raises an error of struct or mmap."""
-
-    def __init__(self, content: mmap.mmap, path: Path) -> None:
-        self.content = content
-        self.path = path
-
-    def read(self, form: str) -> tuple[Any, ...]:
-        return struct.unpack(form, self.content.read(struct.calcsize(form)))
-
-    def read_count(self) -> int:
-        return int(self.read("<Q")[0])
-
-    def read_name(self) -> str:
-        start = self.content.tell()
-        end = self.content.find(b"\0", start, start + MAX_NAME)
-        if end < 0:
-            raise ValueError("a name without an end")
-        name = os.fsdecode(self.content.read(end - start))
-        self.skip(1)
-        return name
-
-    def skip(self, size: int) -> None:
-        self.content.seek(size, os.SEEK_CUR)
+def _unpack(content: mmap.mmap, form: str) -> tuple[Any, ...]:
+    return struct.unpack(form, content.read(struct.calcsize(form)))
 
 
-def _read_text_cameras(path: Path) -> Iterator[tuple[int, Intrinsics]]:
-    for line, place in _read_content_lines(path):
-        with _name_line(place, line, "CAMERA_ID MODEL WIDTH HEIGHT PARAMS…"):
-            number, name, width, height, *words = line.split()
-            size, numbers = (int(width), int(height)), [float(word) for word in words]
-            title = f"camera {int(number)} of {place}"
-        model = find_model(name, title)
-        if len(numbers) != len(model.parameters):
-            raise InputError(
-                f"The model {name} of {title} has the {len(model.parameters)} parameters "
-                f"{' '.join(model.parameters)}, and {len(numbers)} are given; export the model "
-                "again."
-            )
-        yield int(number), build_intrinsics(model, size, numbers, title)
+def _read_count(content: mmap.mmap) -> int:
+    return int(_unpack(content, "<Q")[0])
 
 
-def _read_text_images(path: Path) -> Iterator[PosedImage]:
-    for line, place in _read_content_lines(path):
-        if _has_features(line):
-            continue
-        with _name_line(place, line, "IMAGE_ID QW QX QY QZ TX TY TZ CAMERA_ID NAME"):
-            _, qw, qx, qy, qz, x, y, z, camera, name = line.split(maxsplit=9)
-            pose = [float(word) for word in (qw, qx, qy, qz, x, y, z)]
-            image = build_posed_image(name.strip(), int(camera), pose)
-        yield image
+def _read_name(content: mmap.mmap) -> str:
+    start = content.tell()
+    end = content.find(b"\0", start, start + MAX_NAME)
+    if end < 0:
+        raise ValueError("a name without an end")
+    return os.fsdecode(content.read(end + 1 - start)[:-1])
 
 
-def _read_text_points(path: Path) -> Iterator[tuple[float, ...]]:
-    for line, place in _read_content_lines(path):
-        with _name_line(place, line, "POINT3D_ID X Y Z …"):
-            _, x, y, z, *_ = line.split(maxsplit=4)
-            point = float(x), float(y), float(z)
-        yield point
-
-
-def _has_features(line: str) -> bool:
-    """Check whether a line holds triples X Y POINT3D_ID instead of a pose and a name."""
-    words = line.split()
-    return len(words) % 3 == 0 and words[-1].lstrip("-").isdecimal()
-
-
-def _read_content_lines(path: Path) -> Iterator[tuple[str, str]]:
-    """Yield the lines with content, each with its location."""
+def _parse_lines(path: Path, form: str, parse: Callable[[str], Entry]) -> Iterator[Entry]:
+    """Parse the lines with content; a line without the words of `form` becomes an InputError."""
     # Names may have any encoding and are passed to the file system unchanged.
     lines = read_lines(path, MAX_LINE, MAX_BYTES, errors="surrogateescape")
-    for number, line in enumerate(lines, start=1):
-        if line.strip() and not line.lstrip().startswith("#"):
-            yield line, f"line {number} of {quote_value(path)}"
+    for number, line in enumerate(map(str.strip, lines), start=1):
+        if not line or line.startswith("#"):
+            continue
+        try:
+            entry = parse(line)
+        except ValueError as error:
+            raise InputError(
+                f"The line {number} of {quote_value(path)} is '{quote_value(line)}', where {form} "
+                "is needed; export the model again."
+            ) from error
+        yield entry
 
 
-@contextmanager
-def _name_line(place: str, line: str, form: str) -> Iterator[None]:
-    """Name the line that lacks the words of a form or has others in place of numbers."""
-    try:
-        yield
-    except ValueError as error:
-        raise InputError(
-            f"The {place} is '{quote_value(line.strip())}', where {form} is needed; export the "
-            "model again."
-        ) from error
+def _parse_camera(line: str) -> CameraEntry:
+    number, model, width, height, *words = line.split()
+    return int(number), model, (int(width), int(height)), [float(word) for word in words]
+
+
+def _parse_image(line: str) -> PosedImage | None:
+    """Parse a pose and a name; None for the features X Y POINT3D_ID of an image."""
+    words = line.split()
+    if len(words) % 3 == 0 and words[-1].lstrip("-").isdecimal():
+        return None
+    _, qw, qx, qy, qz, x, y, z, camera, name = line.split(maxsplit=9)
+    pose = [float(word) for word in (qw, qx, qy, qz, x, y, z)]
+    return build_posed_image(name, int(camera), pose)
+
+
+def _parse_point(line: str) -> tuple[float, ...]:
+    _, x, y, z, *_ = line.split(maxsplit=4)
+    return float(x), float(y), float(z)

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import os
-from collections import Counter
 from collections.abc import Iterator, Sequence
 from dataclasses import replace
 from functools import partial
@@ -61,10 +60,9 @@ def _select_largest(path: Path) -> tuple[Path, list[Frame], tuple[str, ...]]:
     model, frames = max(found, key=lambda one: len(one[1]))
     if len(found) == 1:
         return model, frames, ()
-    others = ", ".join(str(len(frames)) for other, frames in found if other != model)
     note = (
         f"{len(found)} models lie in {model.parent}: {model.name} with {len(frames)} images is "
-        f"used; the others, with {others} images, are ignored."
+        "used; the others are ignored."
     )
     return model, frames, (note,)
 
@@ -114,12 +112,8 @@ def read_image_file(path: Path) -> list[Frame]:
     images = read_images(path)
     if not images:
         raise InputError(f"{quote_value(path)} lists no images; export the model again.")
-    (name, times), *_ = Counter(image.name for image in images).most_common(1)
-    if times > 1:
-        raise InputError(
-            f"{quote_value(path)} lists the image {quote_value(name)} {times:,} times; export the "
-            "model again."
-        )
+    if len({image.name for image in images}) < len(images):
+        raise InputError(f"{quote_value(path)} lists an image twice; export the model again.")
     lacking = {image.camera for image in images} - cameras.keys()
     if lacking:
         raise InputError(

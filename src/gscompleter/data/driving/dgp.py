@@ -31,8 +31,7 @@ from gscompleter.data.json_fields import (
 from gscompleter.data.limits import require
 from gscompleter.data.photographs import Photographs, build_photographs
 from gscompleter.errors import InputError, quote_value
-from gscompleter.io.json_file import read_json
-from gscompleter.io.reading import check_file, read_head
+from gscompleter.io.reading import check_file, read_head, read_json
 
 ADVICE = "download the scene again"
 MAX_SNIFFED = 1 << 26

@@ -15,7 +15,7 @@ from gscompleter.data.json_fields import get_intrinsics, get_pose
 from gscompleter.data.limits import require
 from gscompleter.data.photographs import Photographs, build_drive
 from gscompleter.errors import quote_value
-from gscompleter.io.json_file import read_json
+from gscompleter.io.reading import read_json
 
 FRONT = "front_camera"
 POSES = "poses.json"

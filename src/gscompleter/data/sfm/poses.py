@@ -31,7 +31,7 @@ from gscompleter.data.sfm.match_pairs import make_sort_key
 from gscompleter.errors import InputError, join_names, quote_value
 from gscompleter.io.files import SUMMARY_FILE, open_output_folder
 from gscompleter.io.image import ORIENTATION, open_image
-from gscompleter.io.json_file import read_json
+from gscompleter.io.reading import read_json
 from gscompleter.progress import stage, track
 
 ENDINGS = (".jpg", ".jpeg", ".png", ".tif", ".tiff", ".webp", ".bmp")

@@ -10,7 +10,7 @@ from importlib.util import find_spec
 from pathlib import Path
 
 from gscompleter.errors import InputError
-from gscompleter.io.cache import get_download_folder
+from gscompleter.io.files import get_download_folder
 from gscompleter.models.weights.published import PublishedWeights
 
 MAX_RETRIES = 2
