@@ -301,6 +301,16 @@ def test_a_missing_chunk_of_an_index_is_named(tmp_path):
         list(open_chunks(root))
 
 
+def test_a_scene_that_its_chunk_lacks_is_named(tmp_path):
+    root = save_dataset(tmp_path / "data")
+    index = json.loads((root / "test" / "index.json").read_text())
+    (root / "test" / "index.json").write_text(json.dumps({**index, "d": "000001.torch"}))
+    clips = open_chunks(root)
+    assert [next(clips).name, next(clips).name] == ["a", "b"]
+    with pytest.raises(InputError, match=r"index.json lists d in .*000001.torch, which lacks it"):
+        next(clips)
+
+
 @pytest.mark.parametrize("text", ["{", "[]", "{}", '{"a": 1}', "\x00"])
 def test_an_index_that_is_none_is_named(tmp_path, text):
     (tmp_path / "index.json").write_text(text)
