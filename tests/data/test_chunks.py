@@ -22,6 +22,7 @@ from chunk_files import (
 from gscompleter import InputError
 from gscompleter.data.cases import SkippedScene, filter_usable, open_clips
 from gscompleter.data.chunks import open_chunks
+from gscompleter.data.formats import open_photographs
 from gscompleter.data.photographs import Photographs
 from gscompleter.data.real_estate import read_camera_file
 from gscompleter.geometry import project
@@ -319,8 +320,8 @@ def test_an_index_that_is_none_is_named(tmp_path, text):
 
 
 def test_a_folder_without_chunks_is_named(tmp_path):
-    with pytest.raises(InputError, match="There are no chunks in"):
-        open_chunks(tmp_path)
+    with pytest.raises(InputError, match="no photographs in the format chunks in"):
+        open_photographs(tmp_path, "chunks")
 
 
 def test_a_real_chunk_agrees_with_its_camera_file_and_its_photographs(shared):

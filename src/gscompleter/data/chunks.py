@@ -35,7 +35,7 @@ def has_chunks(path: Path) -> bool:
     """Check whether `path` is a chunk, an index of chunks, or a folder with either."""
     if os.path.isfile(path):
         return path.suffix == ".torch" or path.name == INDEX
-    return _find_folder(path) is not None
+    return bool(_list_folders(path))
 
 
 def open_chunks(path: Path) -> Iterator[Photographs]:
@@ -46,18 +46,16 @@ def open_chunks(path: Path) -> Iterator[Photographs]:
     """
     if path.suffix == ".torch":
         return _open_chunk(path)
-    folder = path.parent if path.name == INDEX else _find_folder(path)
-    if folder is None:
-        raise InputError(f"There are no chunks in {path}; name a .torch file, or a folder of such.")
+    folder = path.parent if path.name == INDEX else _list_folders(path)[0]
     listed = _read_index(folder / INDEX) if os.path.isfile(folder / INDEX) else {}
     files = sorted(set(listed.values())) or sorted(file.name for file in folder.glob("*.torch"))
     keys = {file: {key for key, chunk in listed.items() if chunk == file} for file in files}
     return (scene for file in files for scene in _open_chunk(folder / file, keys[file]))
 
 
-def _find_folder(path: Path) -> Path | None:
+def _list_folders(path: Path) -> list[Path]:
     folders = (path, path / TEST)
-    return next((f for f in folders if os.path.isfile(f / INDEX) or any(f.glob("*.torch"))), None)
+    return [f for f in folders if os.path.isfile(f / INDEX) or any(f.glob("*.torch"))]
 
 
 def _read_index(index: Path) -> dict[str, str]:
