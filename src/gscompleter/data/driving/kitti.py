@@ -182,7 +182,7 @@ def _get_matrix(entries: Mapping[str, Numbers], label: str, path: Path) -> Pose:
     return _complete(_get_entry(entries, label, 12, path))
 
 
-def _complete(numbers: Numbers) -> Pose:
+def _complete(numbers: Numbers | Float[np.ndarray, "3 4"]) -> Pose:
     """Complete the upper 3×4 of a matrix."""
     return np.vstack([numbers.reshape(3, 4), [0, 0, 0, 1]])
 
