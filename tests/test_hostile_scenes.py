@@ -17,7 +17,7 @@ import torch
 from chunk_files import example, save_chunk
 from driving_files import infos, write_drive, write_infos, write_swept_dgp
 from gscompleter import InputError
-from gscompleter.data.driving.restricted_pickle import load_plain
+from gscompleter.data.driving.mmdet3d import load_plain
 from gscompleter.data.formats import open_photographs
 from gscompleter.errors import MAX_MESSAGE_LENGTH
 from pose_files import WRITERS, write_photographs
@@ -100,13 +100,6 @@ def test_infos_without_end_are_refused_before_they_are_walked(tmp_path, place, v
     assert "nested too deeply or without end" in sentence(
         write_infos(tmp_path, replaced(place, value))
     )
-
-
-def test_a_key_that_overflows_the_stack_when_it_is_hashed_is_no_key(tmp_path):
-    path = tmp_path / "infos.pkl"
-    path.write_bytes(b"\x80\x02})" + b"\x85" * 300_000 + b"K\x01s.")
-    with pytest.raises(InputError, match="is no pickle of plain values"):
-        load_plain(path)
 
 
 def test_a_pickle_changes_no_class(tmp_path):

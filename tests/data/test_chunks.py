@@ -22,6 +22,7 @@ from chunk_files import (
 from gscompleter import InputError
 from gscompleter.data.cases import SkippedScene, filter_usable, open_clips
 from gscompleter.data.chunks import open_chunks
+from gscompleter.data.formats import open_photographs
 from gscompleter.data.photographs import Photographs
 from gscompleter.data.real_estate import read_camera_file
 from gscompleter.geometry import project
@@ -40,21 +41,23 @@ def test_a_chunk_gives_back_the_views_it_was_made_of(tmp_path):
         assert torch.allclose(view.camera.K, truth.camera.K, atol=1e-4)
 
 
+def count_image_bytes() -> int:
+    """Count the bytes of all images in memory."""
+    gc.collect()
+    tensors = [value for value in gc.get_objects() if type(value) is torch.Tensor]
+    return sum(tensor.numel() for tensor in tensors if tensor.dtype == torch.uint8)
+
+
 def test_clips_that_are_held_keep_one_chunk_in_memory(tmp_path):
+    before = count_image_bytes()
     noise = torch.randint(0, 256, (100_000,), dtype=torch.uint8)
     for number in range(4):
         one = {**example(str(number)), "images": [noise.clone() for _ in VIEWS]}
         save_chunk(tmp_path / f"{number:06}.torch", one)
     del one, noise
     clips = list(open_chunks(tmp_path))
-    gc.collect()
-    held = sum(
-        value.numel()
-        for value in gc.get_objects()
-        if type(value) is torch.Tensor and value.dtype == torch.uint8
-    )
     assert [clip.name for clip in clips] == ["0", "1", "2", "3"]
-    assert held < 2 * len(VIEWS) * 100_000
+    assert count_image_bytes() - before < 2 * len(VIEWS) * 100_000
 
 
 def test_jpeg_bytes_are_photographs_too(tmp_path):
@@ -301,6 +304,16 @@ def test_a_missing_chunk_of_an_index_is_named(tmp_path):
         list(open_chunks(root))
 
 
+def test_a_scene_that_its_chunk_lacks_is_named(tmp_path):
+    root = save_dataset(tmp_path / "data")
+    index = json.loads((root / "test" / "index.json").read_text())
+    (root / "test" / "index.json").write_text(json.dumps({**index, "d": "000001.torch"}))
+    clips = open_chunks(root)
+    assert [next(clips).name, next(clips).name] == ["a", "b"]
+    with pytest.raises(InputError, match=r"index.json lists d in .*000001.torch, which lacks it"):
+        next(clips)
+
+
 @pytest.mark.parametrize("text", ["{", "[]", "{}", '{"a": 1}', "\x00"])
 def test_an_index_that_is_none_is_named(tmp_path, text):
     (tmp_path / "index.json").write_text(text)
@@ -309,8 +322,8 @@ def test_an_index_that_is_none_is_named(tmp_path, text):
 
 
 def test_a_folder_without_chunks_is_named(tmp_path):
-    with pytest.raises(InputError, match="There are no chunks in"):
-        open_chunks(tmp_path)
+    with pytest.raises(InputError, match="no photographs in the format chunks in"):
+        open_photographs(tmp_path, "chunks")
 
 
 def test_a_real_chunk_agrees_with_its_camera_file_and_its_photographs(shared):

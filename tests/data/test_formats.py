@@ -159,7 +159,7 @@ def test_a_chunk_and_a_camera_file_are_completed_like_a_folder(tmp_path, monkeyp
 def test_a_forced_format_and_several_scenes_get_a_sentence(tmp_path, monkeypatch, capsys):
     scene, out = save_scene(tmp_path / "room"), tmp_path / "out"
     assert complete(monkeypatch, scene, out, "--format", "chunks") == 2
-    assert "There are no chunks in" in capsys.readouterr().err
+    assert "There are no photographs in the format chunks in" in capsys.readouterr().err
     assert complete(monkeypatch, scene, out, "--format", "colmapp") == 2
     said = capsys.readouterr().err
     assert "no format 'colmapp'; choose one of chunks, dgp, nerfstudio, colmap, " in said

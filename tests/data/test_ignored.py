@@ -8,7 +8,11 @@ import torch
 
 from gscompleter import InputError
 from gscompleter.config import RefineConfig
-from gscompleter.data.driving.vehicle import Box, build_box, compute_sparse_depth, mask_moving
+from gscompleter.data.driving.vehicle import (
+    compute_moving_boxes,
+    compute_sparse_depth,
+    mask_moving,
+)
 from gscompleter.data.formats import open_photographs
 from gscompleter.data.photographs import apply_masks
 from gscompleter.evaluation.metrics.scores import Truth, score
@@ -149,14 +153,14 @@ def test_masks_of_files_are_ignored_where_asked(tmp_path):
         apply_masks(masked.views([1]), masked)
 
 
-def box_at(center: tuple[float, ...], side: float, speed: float, turn: float = 0.0) -> Box:
-    velocity = np.array([speed, 0.0])
-    return build_box(np.eye(4), np.array(center), np.full(3, side), turn, velocity)
+def box_at(center: tuple[float, ...], speed: float, turn: float = 0.0) -> np.ndarray:
+    """Return the corners of a cube of 1 m, or none if it stands."""
+    return compute_moving_boxes(np.eye(4), np.array([[*center, 1, 1, 1, turn, speed, 0.0]]))
 
 
 def test_a_box_covers_its_outline():
     """A cube with its front face 2 m ahead is widened to 1.1 m: 0.55 m to either side."""
-    mask = mask_moving([box_at((0.0, 0.0, 2.55), 1.0, 3.0)], CAMERA, CAMERA.center.double().numpy())
+    mask = mask_moving(box_at((0.0, 0.0, 2.55), 3.0), CAMERA, CAMERA.center.double().numpy())
     half = 0.55 / 2.0 * 0.9 * SIZE
     rows, columns = torch.nonzero(torch.from_numpy(mask), as_tuple=True)
     for found in (rows, columns):
@@ -176,7 +180,7 @@ def test_a_box_covers_its_outline():
     ],
 )
 def test_boxes_that_stand_lie_behind_or_around(center, speed, share):
-    mask = mask_moving([box_at(center, 1.0, speed, 0.7)], CAMERA, CAMERA.center.double().numpy())
+    mask = mask_moving(box_at(center, speed, 0.7), CAMERA, CAMERA.center.double().numpy())
     assert mask.mean() >= share
     assert share > 0 or not mask.any()
 

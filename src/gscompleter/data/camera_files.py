@@ -63,14 +63,12 @@ METASHAPE = ("Metashape", "export its cameras as COLMAP, which Metashape does si
 REALITYSCAN = ("RealityScan", "export its registration as COLMAP")
 POLYCAM = ("Polycam", "turn it into nerfstudio's transforms.json by ns-process-data polycam")
 EXPORTS = (
-    (".psx", b"", METASHAPE),
-    (".psz", b"", METASHAPE),
-    (".xml", b"<chunk", METASHAPE),
-    (".rspj", b"", REALITYSCAN),
-    (".rcproj", b"", REALITYSCAN),
-    (".csv", b"#name,", REALITYSCAN),
-    (".csv", b"#cameras", REALITYSCAN),
-    (".json", b'"t_00"', POLYCAM),
+    ((".psx", ".psz"), b"", METASHAPE),
+    ((".xml",), b"<chunk", METASHAPE),
+    ((".rspj", ".rcproj"), b"", REALITYSCAN),
+    ((".csv",), b"#name,", REALITYSCAN),
+    ((".csv",), b"#cameras", REALITYSCAN),
+    ((".json",), b'"t_00"', POLYCAM),
 )
 """Endings of files that are not read, what their first bytes hold, the program and what to do."""
 PLACES = ("*", "*cameras/*.json", "keyframes/*cameras/*.json")
@@ -180,9 +178,9 @@ def _build_upright_c2w(
 def refuse_other_exports(path: Path) -> None:
     """Raise an InputError with advice if `path` holds cameras of an unsupported program."""
     inside = [file for place in PLACES for file in sorted(path.glob(place))]
-    for file, (ending, mark, (program, advice)) in product([path, *inside], EXPORTS):
+    for file, (endings, mark, (program, advice)) in product([path, *inside], EXPORTS):
         require(
-            file.suffix.lower() != ending or mark not in read_head(file, HEAD),
+            file.suffix.lower() not in endings or mark not in read_head(file, HEAD),
             f"{quote_value(file)} holds cameras of {program}, which cannot be read; {advice}, or "
             "name a folder of the photographs alone.",
         )

@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import os
 import warnings
-from collections.abc import Iterator
+from collections.abc import Collection, Iterator
 from functools import lru_cache, partial
 from pathlib import Path
 from typing import Any, TypeGuard
@@ -22,7 +22,7 @@ from gscompleter.data.frame import Frame
 from gscompleter.data.limits import require
 from gscompleter.data.photographs import Photographs, build_photographs
 from gscompleter.data.real_estate import parse_camera_row
-from gscompleter.errors import InputError, quote_value, refuse_pointer
+from gscompleter.errors import InputError, join_names, quote_value, refuse_pointer
 from gscompleter.io.reading import check_file, read_json
 
 TEST = "test"
@@ -34,7 +34,7 @@ def has_chunks(path: Path) -> bool:
     """Check whether `path` is a chunk, an index of chunks, or a folder with either."""
     if os.path.isfile(path):
         return path.suffix == ".torch" or path.name == INDEX
-    return _find_folder(path) is not None
+    return bool(_list_folders(path))
 
 
 def open_chunks(path: Path) -> Iterator[Photographs]:
@@ -45,22 +45,20 @@ def open_chunks(path: Path) -> Iterator[Photographs]:
     """
     if path.suffix == ".torch":
         return _open_chunk(path)
-    folder = path.parent if path.name == INDEX else _find_folder(path)
-    if folder is None:
-        raise InputError(f"There are no chunks in {path}; name a .torch file, or a folder of such.")
-    files = _list_chunks(folder / INDEX) or sorted(folder.glob("*.torch"))
-    return (scene for file in files for scene in _open_chunk(file))
+    folder = path.parent if path.name == INDEX else _list_folders(path)[0]
+    listed = _read_index(folder / INDEX) if os.path.isfile(folder / INDEX) else {}
+    files = sorted(set(listed.values())) or sorted(file.name for file in folder.glob("*.torch"))
+    keys = {file: {key for key, chunk in listed.items() if chunk == file} for file in files}
+    return (scene for file in files for scene in _open_chunk(folder / file, keys[file]))
 
 
-def _find_folder(path: Path) -> Path | None:
+def _list_folders(path: Path) -> list[Path]:
     folders = (path, path / TEST)
-    return next((f for f in folders if os.path.isfile(f / INDEX) or any(f.glob("*.torch"))), None)
+    return [f for f in folders if os.path.isfile(f / INDEX) or any(f.glob("*.torch"))]
 
 
-def _list_chunks(index: Path) -> list[Path]:
-    """List the chunks of an index; none if it does not exist."""
-    if not os.path.isfile(index):
-        return []
+def _read_index(index: Path) -> dict[str, str]:
+    """Read the file name of each scene's chunk by the key of the scene."""
     content = read_json(index, "download it again")
     chunks = list(content.values()) if isinstance(content, dict) else []
     require(
@@ -68,11 +66,18 @@ def _list_chunks(index: Path) -> list[Path]:
         f"{index} is no index of chunks: it has to map the key of each scene to the name of its "
         ".torch file.",
     )
-    return [index.parent / chunk for chunk in sorted(set(chunks))]
+    return dict(content)
 
 
-def _open_chunk(path: Path) -> Iterator[Photographs]:
-    return (_parse_scene(example, path, n) for n, example in enumerate(_load_chunk(path)))
+def _open_chunk(path: Path, keys: Collection[str] = ()) -> Iterator[Photographs]:
+    """Open the scenes of a chunk, which has to hold those of `keys`."""
+    scenes = [_parse_scene(example, path, n) for n, example in enumerate(_load_chunk(path))]
+    missing = sorted(set(keys) - {scene.name for scene in scenes})
+    require(
+        not missing,
+        f"{INDEX} lists {join_names(missing, 3)} in {path}, which lacks it; download it again.",
+    )
+    yield from scenes
 
 
 def _load_chunk(path: Path) -> list[Any]:

@@ -24,8 +24,8 @@ from gscompleter.errors import InputError
 
 FEWEST, MOST = 6, 12
 """Fewest and most photographs of a camera that are searched; with fewer, nothing is found."""
-SIDE, MIN_SIDE = 256, 16
-"""Longer side of the small copies, and smallest shorter side, in pixels."""
+SIDE = 256
+"""Longer side of the small copies, in pixels."""
 MAX_TURN = 25.0
 """Largest deviation of the travel direction and the down axis from their means, in degrees."""
 MIN_STEADY_SHARE = 0.8
@@ -98,13 +98,12 @@ def select_evenly(frames: Sequence[Frame], steps: Float[np.ndarray, "_"]) -> lis
 
 def read_small(frames: Sequence[Frame]) -> dict[Frame, Float[np.ndarray, "h w"]]:
     """Read small copies of the photographs that have the size of the first readable one."""
-    found = {}
+    found: dict[Frame, Float[np.ndarray, "h w"]] = {}
     for frame in frames:
         with suppress(InputError):
             found[frame] = frame.load_small_pixels(SIDE)
-    shape = next((image.shape for image in found.values()), (0, 0))
-    is_large = min(shape) >= MIN_SIDE
-    return {frame: image for frame, image in found.items() if is_large and image.shape == shape}
+    shape = next((image.shape for image in found.values()), None)
+    return {frame: image for frame, image in found.items() if image.shape == shape}
 
 
 def estimate_motion(

@@ -68,14 +68,8 @@ def open_photographs(
 ) -> Photographs:
     """Open the photographs of one scene; reads only its cameras.
 
-    Args:
-        path: A file or folder of one of `FORMATS` with a single scene.
-        format: Name of the format; detected if None.
-        near: Smallest z-depth in scene units; that of the files if None.
-        far: Largest z-depth in scene units; that of the files if None.
-
-    Raises:
-        InputError: If there is no scene or more than one, or its cameras cannot be read.
+    The format is detected if None. `near` and `far` are the smallest and largest z-depth in scene
+    units; those of the files if None.
     """
     check_planes(near, far)
     path = Path(path)
@@ -102,11 +96,14 @@ def detect_format(path: Path, name: str | None = None) -> str:
         f"There is no format '{quote_value(name)}'; choose one of {formats}.",
     )
     require(os.path.exists(path), f"There is no {quote_value(path)}; {advice}.")
-    found = find_format(path) if name is None else name
+    if name is not None and FORMATS[name].detect(path):
+        return name
+    found = None if name else find_format(path)
     if found is None:
         refuse_other_exports(path)
         refuse_scenes_below(path)
-        raise InputError(f"There are no posed photographs in {quote_value(path)}; {advice}.")
+        kind = f"photographs in the format {name}" if name else "posed photographs"
+        raise InputError(f"There are no {kind} in {quote_value(path)}; {advice}.")
     return found
 
 

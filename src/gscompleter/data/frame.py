@@ -17,7 +17,6 @@ from gscompleter.data.cameras import (
     find_pose_defect,
     make_rigid,
 )
-from gscompleter.data.driving.vehicle import Box
 from gscompleter.data.limits import MAX_SIDE
 from gscompleter.data.undistort import Pinhole, undistort_pinhole
 from gscompleter.errors import InputError, quote_value
@@ -53,8 +52,8 @@ class Frame:
     """Name of the vehicle's camera, or None for a single camera."""
     laser_points: Callable[[], Float[np.ndarray, "n 3"]] | None = None
     """Reads laser points of about that time, in the frame of the poses."""
-    boxes: Callable[[], tuple[Box, ...]] | None = None
-    """Reads boxes of objects at about that time, in the frame of the poses."""
+    boxes: Callable[[], Float[np.ndarray, "n 8 3"]] | None = None
+    """Reads the corners of moving objects' boxes at about that time, in the frame of the poses."""
     vehicle: Callable[[], Bool[np.ndarray, "h w"] | None] | None = None
     """Detects the vehicle that carries the camera, as a mask of any size; None to keep it."""
 

@@ -22,6 +22,7 @@ from gscompleter.data.limits import (
 )
 from gscompleter.errors import quote_value
 
+NUMBERS = (int, float, np.integer, np.floating)
 Part = TypeVar("Part")
 
 
@@ -35,7 +36,7 @@ def get_number(entry: Any, key: str, title: str, low: float, high: float) -> flo
     """Return the number at `key`, checked to lie in [low, high]."""
     value = _get(entry, key)
     require(value is not None, f"The `{key}` of {title} is missing; add it.")
-    is_number = isinstance(value, (int, float)) and not isinstance(value, bool)
+    is_number = isinstance(value, NUMBERS) and not isinstance(value, bool)
     require(
         is_number and low <= value <= high,
         f"The `{key}` of {title} is {quote_value(value)}; a number from {low:g} to {high:g} is "

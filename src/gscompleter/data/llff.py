@@ -18,7 +18,8 @@ from jaxtyping import Float
 from gscompleter.data.cameras import Intrinsics
 from gscompleter.data.frame import Frame
 from gscompleter.data.image_folders import ImageFinder
-from gscompleter.data.limits import DEPTH_RANGE, MAX_SIDE, require
+from gscompleter.data.json_fields import get_size
+from gscompleter.data.limits import DEPTH_RANGE, require
 from gscompleter.data.photographs import Photographs, build_photographs
 from gscompleter.data.points import widen_depth_range
 from gscompleter.errors import InputError, quote_value
@@ -52,15 +53,10 @@ def open_llff(path: Path) -> Iterator[Photographs]:
 
 def _parse_frame(image: Path, row: Float[np.ndarray, "17"], title: str) -> Frame:
     down, right, back, center, (height, width, focal) = row[:15].reshape(3, 5).T
-    sides = np.array([height, width])
-    require(
-        ((sides >= 1) & (sides <= MAX_SIDE) & (sides % 1 == 0)).all(),
-        f"The {title} has an image of {width:g} × {height:g}; whole numbers of pixels from 1 to "
-        f"{MAX_SIDE} are needed, so {ADVICE}.",
-    )
+    size = get_size({"width": width, "height": height}, title)
     c2w = np.eye(4)
     c2w[:3] = np.stack([right, down, -back, center], axis=1)
-    intrinsics = Intrinsics((int(width), int(height)), (float(focal), float(focal)))
+    intrinsics = Intrinsics(size, (float(focal), float(focal)))
     return Frame(image.name, title, c2w, intrinsics, image)
 
 
@@ -68,21 +64,16 @@ def _read_rows(path: Path) -> Float[np.ndarray, "n 17"]:
     check_file(path)
     try:
         # Mapping refuses an array that claims more than the file holds.
-        stored = np.lib.format.open_memmap(path, mode="r")
-        rows = stored.astype(np.float64, casting="same_kind")
+        rows = np.load(path, mmap_mode="r").astype(np.float64, casting="same_kind")
     except Exception as error:  # damaged headers raise anything
         raise InputError(f"{quote_value(path)} is no array of real numbers; {ADVICE}.") from error
     require(
         rows.ndim == 2 and rows.shape[1] == 17 and len(rows) > 0,
-        f"{quote_value(path)} has the shape {list(rows.shape)}, where a row of 17 numbers for each "
-        f"photograph is needed; {ADVICE}.",
+        f"{quote_value(path)} has the shape {list(rows.shape)}, not 17 columns; {ADVICE}.",
     )
     (low, high), near, far = DEPTH_RANGE, rows[:, 15], rows[:, 16]
-    require(
-        ((near >= low) & (near < far) & (far <= high)).all(),
-        f"The bounds in {quote_value(path)} are no z-depths, nearest first, from {low:g} to "
-        f"{high:g}; {ADVICE}.",
-    )
+    bounded = ((near >= low) & (near < far) & (far <= high)).all()
+    require(bounded, f"The bounds in {quote_value(path)} are no z-depths, nearest first; {ADVICE}.")
     return rows
 
 

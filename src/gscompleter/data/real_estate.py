@@ -19,15 +19,12 @@ from gscompleter.io.reading import read_head, read_lines
 
 def has_camera_files(path: Path) -> bool:
     """Check whether `path` is a RealEstate10K camera file, or a folder with some."""
-    if os.path.isdir(path):
-        return bool(_list_camera_files(path))
-    return path.suffix == ".txt" and _is_camera_file(path)
+    return bool(_list_camera_files(path))
 
 
 def open_camera_files(path: Path) -> Iterator[Photographs]:
     """Open the photographs of each camera file that `path` is or holds, sorted by name."""
-    files = _list_camera_files(path) if os.path.isdir(path) else [path]
-    return (read_camera_file(file) for file in files)
+    return map(read_camera_file, _list_camera_files(path))
 
 
 def read_camera_file(path: Path) -> Photographs:
@@ -73,9 +70,6 @@ def _parse_frame(line: str, number: int, path: Path) -> Frame:
     return Frame(timestamp, title, c2w, intrinsics, folder / timestamp)
 
 
-def _list_camera_files(folder: Path) -> list[Path]:
-    return sorted(file for file in folder.glob("*.txt") if _is_camera_file(file))
-
-
-def _is_camera_file(path: Path) -> bool:
-    return read_head(path, 4) == b"http"
+def _list_camera_files(path: Path) -> list[Path]:
+    files = sorted(path.glob("*.txt")) if os.path.isdir(path) else [path]
+    return [file for file in files if file.suffix == ".txt" and read_head(file, 4) == b"http"]

@@ -31,17 +31,11 @@ def load_views(
     float32 would lose the baselines, cameras are relative to `open_photographs(scene).origin`.
 
     Args:
-        scene: A folder with nerfstudio's `transforms.json`, that file, or any other path that
-            `open_photographs` opens.
-        frames: Frame numbers, counted by sorted `file_path`; all frames if None. Only these are
-            read.
-        resolution: Height and width in pixels, or the most pixels of the longer side, as in
-            `Photographs.views`.
+        scene: Any path that `open_photographs` opens.
+        frames: Numbers of the frames to read, counted by sorted names; all if None.
+        resolution: Height and width in pixels, or the most pixels of the longer side.
         near: Smallest z-depth of the scene, in scene units, if known.
         far: Largest z-depth of the scene, in scene units, if known.
-
-    Raises:
-        InputError: If the scene, a frame or an image is missing or impossible.
     """
     photographs = open_photographs(scene, near=near, far=far)
     return photographs.views(range(len(photographs)) if frames is None else frames, resolution)
@@ -57,9 +51,6 @@ def load_camera(
     """Load the camera of a frame, as in `load_views`; None takes the only frame.
 
     Its photograph may be missing if the file has `w` and `h`.
-
-    Raises:
-        InputError: If the scene or frame is missing or impossible, or none of several is chosen.
     """
     photographs = open_photographs(scene, near=near, far=far)
     require(
@@ -83,9 +74,6 @@ def load_cameras(
     SuperSplat's poses, which need a height and width; a folder with a `transforms.json` or a COLMAP
     model; or the images.txt or images.bin of such a model. `origin` is that of the scene's
     coordinates, `open_photographs(scene).origin`; the rest is as in `load_views`.
-
-    Raises:
-        InputError: If the file or one of its cameras is missing or impossible.
     """
     check_planes(near, far)
     zero, frames = np.asarray(origin, dtype=np.float64), tuple(read_cameras(Path(path), resolution))
@@ -98,15 +86,8 @@ def write_cameras(
 ) -> None:
     """Write cameras to a JSON file that `load_cameras` reads back bit for bit.
 
-    Near and far planes are not part of the format.
-
-    Args:
-        path: The JSON file.
-        cameras: At least one camera.
-        file_paths: Image paths relative to its folder, for the `transforms.json` of a scene.
-
-    Raises:
-        InputError: If the file cannot be written.
+    Near and far planes are not part of the format. `file_paths` are image paths relative to its
+    folder, for the `transforms.json` of a scene.
     """
     frames = [_build_entry(camera) for camera in cameras]
     if file_paths is not None:

@@ -61,7 +61,7 @@ def open_transforms(path: Path) -> Iterator[Photographs]:
     path, by their order in the file. Poses and points stay in the frame of the file:
     `applied_transform`, the exporter's change of COLMAP's frame, is not undone.
     """
-    files = _find_files(path) or [path / NAME]
+    files = _find_files(path)
     frames = [frame for file in files for frame in read_frames(file)]
     if all(frame.image is not None for frame in frames):
         frames = sorted(frames, key=lambda frame: frame.name)

@@ -8,7 +8,6 @@ gives sparse depth.
 from __future__ import annotations
 
 import os
-import zipfile
 from collections.abc import Iterator, Mapping
 from dataclasses import replace
 from functools import partial
@@ -19,19 +18,13 @@ import numpy as np
 from jaxtyping import Float
 
 from gscompleter.data.cameras import Intrinsics
-from gscompleter.data.driving.vehicle import MAX_SWEEP, transform_finite
+from gscompleter.data.driving.vehicle import transform_points
 from gscompleter.data.frame import Frame
-from gscompleter.data.json_fields import (
-    get_intrinsics,
-    get_part,
-    get_pose,
-    get_size,
-    get_text,
-)
+from gscompleter.data.json_fields import get_intrinsics, get_part, get_pose, get_size, get_text
 from gscompleter.data.limits import require
 from gscompleter.data.photographs import Photographs, build_photographs
 from gscompleter.errors import InputError, quote_value
-from gscompleter.io.reading import check_file, read_head, read_json
+from gscompleter.io.reading import read_head, read_json
 
 ADVICE = "download the scene again"
 MAX_SNIFFED = 1 << 26
@@ -40,7 +33,7 @@ MAX_SNIFFED = 1 << 26
 
 def has_dgp(path: Path) -> bool:
     """Check whether `path` is a DGP scene file, or a folder with one."""
-    return _find_scene_file(path) is not None
+    return bool(_list_scene_files(path))
 
 
 def open_dgp(path: Path) -> Iterator[Photographs]:
@@ -49,9 +42,7 @@ def open_dgp(path: Path) -> Iterator[Photographs]:
     Frames of all cameras are numbered by their sorted names, which are paths below the folder. The
     first camera by name, in DDAD CAMERA_01, is the front camera.
     """
-    file = _find_scene_file(path)
-    if file is None:
-        raise InputError(f"There is no scene of DGP in {quote_value(path)}; name its scene.json.")
+    file = _list_scene_files(path)[0]
     content = read_json(file, ADVICE)
     cameras, sweeps = _read_calibrations(file, content), _map_sweeps(content)
     images = [d for d in get_part(content, "data", list) if "image" in get_part(d, "datum", dict)]
@@ -88,16 +79,13 @@ def _get_pose(entry: Any, title: str) -> Float[np.ndarray, "4 4"]:
 
 def _map_sweeps(content: Any) -> dict[str, Any]:
     """Map the key of each datum to the point cloud of its sample."""
-    clouds = {}
-    for datum in get_part(content, "data", list):
-        cloud = get_part(get_part(datum, "datum", dict), "point_cloud", dict)
-        if cloud:
-            clouds[str(datum.get("key"))] = cloud
+    data = [datum for datum in get_part(content, "data", list) if isinstance(datum, dict)]
+    entries = {str(datum.get("key")): get_part(datum, "datum", dict) for datum in data}
     found: dict[str, Any] = {}
     for sample in get_part(content, "samples", list):
         keys = [str(key) for key in get_part(sample, "datum_keys", list)]
-        swept = [clouds[key] for key in keys if key in clouds]
-        found |= {key: swept[0] for key in keys if swept}
+        clouds = (get_part(entries.get(key), "point_cloud", dict) for key in keys)
+        found |= dict.fromkeys(keys, next(filter(None, clouds), None))
     return found
 
 
@@ -105,33 +93,15 @@ def _read_points(
     path: Path, world_from_laser: Float[np.ndarray, "4 4"]
 ) -> Float[np.ndarray, "n 3"]:
     """Read the points of a sweep in the world frame: the first three columns of `data`."""
-    check_file(path)
     try:
-        with zipfile.ZipFile(path) as archive, archive.open("data.npy") as member:
-            if archive.getinfo("data.npy").file_size > MAX_SWEEP:
-                raise ValueError
-            table = np.lib.format.read_array(member, allow_pickle=False)
-        x, y, z = table[:, :3].astype(np.float64, casting="same_kind").T
+        points = np.load(path)["data"][:, :3].astype(np.float64, casting="same_kind")
+        return transform_points(points, world_from_laser)
     except Exception as error:  # damaged archives and arrays raise anything
         raise InputError(f"{quote_value(path)} is no point cloud of DGP; {ADVICE}.") from error
-    return transform_finite(np.stack([x, y, z], axis=-1), world_from_laser)
 
 
 def _read_calibrations(scene: Path, content: Any) -> dict[str, Intrinsics]:
-    """Read the intrinsics by camera name, without image sizes."""
-    file = _find_calibration_file(scene, content)
-    calibration = read_json(file, ADVICE)
-    names, entries = (get_part(calibration, key, list) for key in ("names", "intrinsics"))
-    # Entries of other sensors are zeros.
-    return {
-        str(name): get_intrinsics(entry, f"camera {quote_value(name)} of {quote_value(file)}")
-        for name, entry in zip(names, entries, strict=False)
-        if isinstance(entry, dict) and entry.get("fx")
-    }
-
-
-def _find_calibration_file(scene: Path, content: Any) -> Path:
-    """Find the calibration of the first sample: `calibration/KEY.json` or calibration.json."""
+    """Read the intrinsics by camera name, without image sizes, that the first sample names."""
     samples = get_part(content, "samples", list)
     key = get_text(samples[0] if samples else None, "calibration_key", str(scene))
     keyed = scene.parent / "calibration" / f"{key}.json"
@@ -140,10 +110,17 @@ def _find_calibration_file(scene: Path, content: Any) -> Path:
         raise InputError(
             f"The calibration of {quote_value(scene)} is missing; put it at {quote_value(keyed)}."
         )
-    return found
+    calibration = read_json(found, ADVICE)
+    names, entries = (get_part(calibration, key, list) for key in ("names", "intrinsics"))
+    # Entries of other sensors are zeros.
+    return {
+        str(name): get_intrinsics(entry, f"camera {quote_value(name)} of {quote_value(found)}")
+        for name, entry in zip(names, entries, strict=False)
+        if isinstance(entry, dict) and entry.get("fx")
+    }
 
 
-def _find_scene_file(path: Path) -> Path | None:
+def _list_scene_files(path: Path) -> list[Path]:
     files = sorted(path.glob("scene*.json")) if os.path.isdir(path) else [path]
     files = [file for file in files if file.suffix == ".json" and os.path.isfile(file)]
-    return next((file for file in files if b'"datum"' in read_head(file, MAX_SNIFFED)), None)
+    return [file for file in files if b'"datum"' in read_head(file, MAX_SNIFFED)]

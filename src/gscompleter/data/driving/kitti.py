@@ -1,12 +1,11 @@
 """KITTI: odometry sequences, and raw drives (synced and rectified).
 
-A sequence has a file of poses, the upper 3×4 of camera-to-world of camera 0 in OpenCV axes, one
-line per frame, and a `calib.txt`, whose lines are the 3×4 projections from the frame of camera 0 to
-the rectified cameras, and optionally `Tr`, the laser pose. The sweeps in `velodyne` give depth.
+Poses of a sequence are the upper 3×4 of camera-to-world of camera 0 in OpenCV axes, one line per
+frame. Lines of `calib.txt` are the 3×4 projections from the frame of camera 0 to the rectified
+cameras, and optionally `Tr`, the laser pose.
 
-A drive `DATE/DATE_drive_NNNN_sync` holds `image_02/data`, `oxts/data` with poses from GPS and
-inertial sensors, and optionally `velodyne_points/data`; `DATE` holds the calibrations. Latitude and
-longitude become metres by a Mercator projection at the scale of the first latitude, as in the
+A drive has poses from GPS and inertial sensors, and the folder above it the calibrations. Latitude
+and longitude become metres by a Mercator projection at the scale of the first latitude, as in the
 development kit.
 """
 
@@ -25,7 +24,7 @@ from gscompleter.data.driving.vehicle import build_poses, read_sweep
 from gscompleter.data.frame import Frame
 from gscompleter.data.limits import MAX_NUMBER, require
 from gscompleter.data.photographs import Photographs, build_drive, build_photographs
-from gscompleter.errors import InputError, quote_value
+from gscompleter.errors import quote_value
 from gscompleter.io.reading import MAX_LINE, read_head, read_lines
 
 POSES, CALIBRATION = "poses.txt", "calib.txt"
@@ -46,12 +45,11 @@ Pose = Float[np.ndarray, "4 4"]
 def has_kitti(path: Path) -> bool:
     """Check whether `path` is a KITTI odometry sequence, or a file of poses."""
     if os.path.isdir(path):
-        return os.path.isfile(path / CALIBRATION) and _find_poses(path) is not None
-    if path.suffix != ".txt" or not os.path.isfile(path):
-        return False
+        return os.path.isfile(path / CALIBRATION) and bool(_list_poses(path))
     line, _, _ = read_head(path, MAX_LINE).partition(b"\n")
     first = _parse_numbers(line.decode("utf-8-sig", errors="replace"))
-    return len(first) == 12 and find_pose_defect(_complete(first)) is None
+    is_pose = len(first) == 12 and find_pose_defect(_complete(first)) is None
+    return is_pose and path.suffix == ".txt"
 
 
 def open_kitti(path: Path) -> Iterator[Photographs]:
@@ -61,15 +59,14 @@ def open_kitti(path: Path) -> Iterator[Photographs]:
     poses, with calibration and photographs beside it or in ../sequences. The left colour camera (2)
     is preferred.
     """
-    poses, folder = (_find_poses(path), path) if os.path.isdir(path) else (path, path.parent)
-    if poses is None:
-        raise InputError(f"There are no poses in {quote_value(path)}; put {POSES} into it.")
+    poses, folder = _list_poses(path)[0], path if os.path.isdir(path) else path.parent
     sequence = poses.resolve().parent.parent / "sequences" / poses.stem
     if poses == path and os.path.isdir(sequence):
         folder = sequence
-    calibration = _find_calibration(folder, poses)
-    images, camera = _find_camera_folder(folder)
+    calibration = folder / CALIBRATION
     entries = _read_entries(calibration)
+    images = next((name for name in CAMERAS if os.path.isdir(folder / name)), "image_2")
+    camera = CAMERAS[images]
     label = f"P{camera}" if f"P{camera}" in entries else str(camera)
     projection = _get_matrix(entries, label, calibration)
     intrinsics, first_from_camera = _split_projection(projection, calibration)
@@ -82,22 +79,19 @@ def open_kitti(path: Path) -> Iterator[Photographs]:
         sweep = folder / "velodyne" / f"{name}.bin"
         points = _find_sweep(sweep, first @ lasers[0]) if lasers else None
         c2w = first @ first_from_camera
-        frames.append(Frame(name, title, c2w, intrinsics, images / name, laser_points=points))
+        image = folder / images / name
+        frames.append(Frame(name, title, c2w, intrinsics, image, laser_points=points))
     yield build_photographs(folder.resolve().name, str(poses), frames)
 
 
 def has_kitti_raw(path: Path) -> bool:
     """Check whether `path` is the folder of a drive."""
-    return os.path.isdir(path / "oxts" / "data") and _find_raw_camera(path) is not None
+    return os.path.isdir(path / "oxts" / "data") and bool(_list_raw_cameras(path))
 
 
 def open_kitti_raw(path: Path) -> Iterator[Photographs]:
     """Open the photographs of a drive in the order of their numbers; its folder names it."""
-    camera = _find_raw_camera(path)
-    if camera is None:
-        raise InputError(
-            f"There are no photographs in {quote_value(path)}; a folder image_02 is needed."
-        )
+    camera = _list_raw_cameras(path)[0]
     date = path.resolve().parent
     imu_from_laser = np.linalg.pinv(_read_rigid(date / "calib_imu_to_velo.txt"))
     intrinsics, first_from_camera, first_from_laser = _read_raw_camera(date, camera)
@@ -154,19 +148,16 @@ def _compute_imu_pose(reading: Numbers, scale: float) -> Pose:
 def _read_oxts(path: Path) -> Numbers:
     """Read latitude, longitude (degrees), altitude (metres), roll, pitch and yaw (radians)."""
     numbers = _read_entries(path).get("0", np.zeros(0))[:6]
-    require(
-        len(numbers) == 6 and abs(numbers[0]) <= MAX_LATITUDE,
-        f"{quote_value(path)} holds no latitude, longitude and angles; copy it again.",
-    )
+    fits = len(numbers) == 6 and abs(numbers[0]) <= MAX_LATITUDE
+    require(fits, f"{quote_value(path)} holds no latitude, longitude and angles; copy it again.")
     return numbers
 
 
 def _read_rigid(path: Path) -> Pose:
     """Read a rigid transform from the lines R and T."""
-    entries, transform = _read_entries(path), np.eye(4)
-    transform[:3, :3] = _get_entry(entries, "R", 9, path).reshape(3, 3)
-    transform[:3, 3] = _get_entry(entries, "T", 3, path)
-    return transform
+    entries = _read_entries(path)
+    parts = _get_entry(entries, "R", 9, path).reshape(3, 3), _get_entry(entries, "T", 3, path)
+    return _complete(np.column_stack(parts))
 
 
 def _read_entries(path: Path) -> dict[str, Numbers]:
@@ -191,7 +182,7 @@ def _get_matrix(entries: Mapping[str, Numbers], label: str, path: Path) -> Pose:
     return _complete(_get_entry(entries, label, 12, path))
 
 
-def _complete(numbers: Numbers) -> Pose:
+def _complete(numbers: Numbers | Float[np.ndarray, "3 4"]) -> Pose:
     """Complete the upper 3×4 of a matrix."""
     return np.vstack([numbers.reshape(3, 4), [0, 0, 0, 1]])
 
@@ -205,33 +196,14 @@ def _parse_numbers(text: str) -> Numbers:
     return numbers if (np.abs(numbers) <= MAX_NUMBER).all() else np.zeros(0)
 
 
-def _find_poses(folder: Path) -> Path | None:
-    sequence = folder.resolve()
-    candidates = (folder / POSES, sequence.parent.parent / "poses" / f"{sequence.name}.txt")
-    return next(filter(os.path.isfile, candidates), None)
+def _list_poses(path: Path) -> list[Path]:
+    """List the files of poses of a sequence, which may be one itself."""
+    if not os.path.isdir(path):
+        return [path]
+    sequence = path.resolve()
+    candidates = (path / POSES, sequence.parent.parent / "poses" / f"{sequence.name}.txt")
+    return list(filter(os.path.isfile, candidates))
 
 
-def _find_calibration(folder: Path, poses: Path) -> Path:
-    renamed = poses.with_name(poses.name.replace("poses", "calib"))
-    found = [f for f in (folder / CALIBRATION, renamed) if os.path.isfile(f) and f != poses]
-    require(
-        found,
-        f"{quote_value(poses)} holds poses only, and there is no {CALIBRATION} in "
-        f"{quote_value(folder)}; copy it there from the same sequence.",
-    )
-    return found[0]
-
-
-def _find_camera_folder(folder: Path) -> tuple[Path, int]:
-    found = [name for name in CAMERAS if os.path.isdir(folder / name)]
-    require(
-        found,
-        f"There are no photographs in {quote_value(folder)}; a folder image_2 or image_0 of the "
-        "same sequence is needed.",
-    )
-    return folder / found[0], CAMERAS[found[0]]
-
-
-def _find_raw_camera(path: Path) -> str | None:
-    shown = (c for c in RAW_CAMERAS if any((path / f"image_{c}" / "data").glob("*.*")))
-    return next(shown, None)
+def _list_raw_cameras(path: Path) -> list[str]:
+    return [c for c in RAW_CAMERAS if any((path / f"image_{c}" / "data").glob("*.*"))]

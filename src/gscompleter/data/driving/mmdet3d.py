@@ -6,26 +6,28 @@ samples of one drive make a scene.
 
 from __future__ import annotations
 
+import io
 import os
-from collections.abc import Iterator
+import pickle
+from collections.abc import Callable, Iterator
 from contextlib import suppress
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from functools import partial
 from itertools import pairwise
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from jaxtyping import Float
 
 from gscompleter.data.cameras import Intrinsics
-from gscompleter.data.driving.restricted_pickle import load_plain
-from gscompleter.data.driving.vehicle import Box, build_box
+from gscompleter.data.driving.vehicle import compute_moving_boxes
 from gscompleter.data.frame import Frame
 from gscompleter.data.json_fields import get_array, get_number, get_part, get_size, get_text
 from gscompleter.data.limits import require
 from gscompleter.data.photographs import Photographs, build_drive
-from gscompleter.errors import quote_value
+from gscompleter.errors import InputError, quote_value
+from gscompleter.io.reading import check_plain, read_bytes
 
 ADVICE = "write the infos again with mmdetection3d 1.1"
 FRONT = "CAM_FRONT"
@@ -37,6 +39,16 @@ MICROSECONDS = 1e12
 """Smallest time that is in microseconds."""
 MAX_TIME = 1e18
 """Largest time in either unit."""
+MAX_BYTES = 1 << 30
+"""Largest pickle in bytes."""
+MAX_REPEATS = 4
+"""Most values per byte of a pickle, as a bound on self-repetition."""
+CONSTRUCTORS: dict[tuple[str, str], Callable[..., Any]] = {
+    ("numpy.core.multiarray", "scalar"): np.float64().__reduce__()[0],
+    ("numpy", "dtype"): np.dtype,
+    ("_codecs", "encode"): str.encode,
+}
+"""Functions that a pickle may name."""
 
 Pose = Float[np.ndarray, "4 4"]
 
@@ -54,22 +66,20 @@ def open_infos(path: Path) -> Iterator[Photographs]:
     """
     content = get_part(load_plain(path), "data_list", list)
     require(content, f"{quote_value(path)} holds no infos with a `data_list`; {ADVICE}.")
-    samples = sorted((_parse_sample(s, path) for s in content), key=lambda s: (s.drive, s.time))
-    return (_build_scene(path, scene) for scene in _split_scenes(samples))
+    shots = [shot for sample in content for shot in _parse_sample(sample, path)]
+    shots.sort(key=lambda shot: (shot.drive, shot.time))
+    return (_build_scene(path, scene) for scene in _split_scenes(shots))
 
 
-@dataclass(frozen=True)
-class _Sample:
-    """Record of the vehicle at one time."""
+class _Shot(NamedTuple):
+    """A photograph of a drive, and its time in seconds."""
 
     drive: str
     time: float
-    """Time in seconds."""
-    frames: dict[str, Frame]
-    """Frames by camera."""
+    frame: Frame
 
 
-def _parse_sample(sample: Any, path: Path) -> _Sample:
+def _parse_sample(sample: Any, path: Path) -> list[_Shot]:
     title = f"a sample of {quote_value(path)}"
     images = {
         quote_value(name): image
@@ -83,27 +93,24 @@ def _parse_sample(sample: Any, path: Path) -> _Sample:
     things = get_part(sample, "instances", list)
     things = [t for t in things if isinstance(t, dict) and "velocity" in t]  # none in Waymo's infos
     boxes = partial(_read_boxes, things, world_from_laser, path) if things else None
-    frames = {
-        name: replace(_make_frame(path, name, time, image, world_from_laser), boxes=boxes)
-        for name, image in images.items()
-    }
-    first = os.path.basename(frames.get(FRONT, next(iter(frames.values()))).name)
-    drive = get_text(sample, "context_name", title) or first.split("__")[0]
-    return _Sample(drive, time, frames)
+    first = images.get(FRONT, next(iter(images.values())))
+    file = os.path.basename(get_text(first, "img_path", title) or "")
+    drive = get_text(sample, "context_name", title) or file.split("__")[0]
+    frames = (_make_frame(path, n, time, image, world_from_laser) for n, image in images.items())
+    return [_Shot(drive, time, replace(frame, boxes=boxes)) for frame in frames]
 
 
 def _read_laser_pose(sample: Any, title: str) -> Pose:
+    # In Waymo's infos the laser frame is that of the vehicle.
+    lidar = {"lidar2ego": np.eye(4), **get_part(sample, "lidar_points", dict)}
     vehicle = get_array(sample, "ego2global", title, (4, 4))
-    lidar = get_part(sample, "lidar_points", dict)
-    if "lidar2ego" not in lidar:  # in Waymo's infos the laser frame is that of the vehicle
-        return vehicle
     return vehicle @ get_array(lidar, "lidar2ego", title, (4, 4))
 
 
-def _split_scenes(samples: list[_Sample]) -> Iterator[list[_Sample]]:
-    """Group consecutive samples of one drive."""
-    scene = samples[:1]
-    for before, after in pairwise(samples):
+def _split_scenes(shots: list[_Shot]) -> Iterator[list[_Shot]]:
+    """Group consecutive photographs of one drive."""
+    scene = shots[:1]
+    for before, after in pairwise(shots):
         if after.drive != before.drive or after.time - before.time > MAX_GAP:
             yield scene
             scene = []
@@ -111,12 +118,11 @@ def _split_scenes(samples: list[_Sample]) -> Iterator[list[_Sample]]:
     yield scene
 
 
-def _build_scene(path: Path, samples: list[_Sample]) -> Photographs:
-    cameras = {camera for sample in samples for camera in sample.frames}
-    names = sorted(cameras, key=lambda name: (name != FRONT, name))
-    frames = [s.frames[name] for name in names for s in samples if name in s.frames]
-    called = f"{samples[0].drive}_{samples[0].time:.3f}"
-    return build_drive(called, str(path), frames, front=names[0])
+def _build_scene(path: Path, shots: list[_Shot]) -> Photographs:
+    frames = [shot.frame for shot in shots]
+    frames.sort(key=lambda frame: (frame.sensor != FRONT, frame.sensor))
+    called = f"{shots[0].drive}_{shots[0].time:.3f}"
+    return build_drive(called, str(path), frames, front=frames[0].sensor)
 
 
 def _make_frame(path: Path, camera: str, time: float, image: Any, world_from_laser: Pose) -> Frame:
@@ -144,11 +150,35 @@ def _find_image(folder: Path, file: str, camera: str) -> Path:
     return next((place for place in places if os.path.isfile(place)), places[0])
 
 
-def _read_boxes(things: list[Any], world_from_laser: Pose, path: Path) -> tuple[Box, ...]:
-    """Read the boxes of a sample; in the infos they are in the laser frame."""
-    title, boxes = f"a box in {quote_value(path)}", []
-    for thing in things:
-        center, sides, (heading,) = np.split(get_array(thing, "bbox_3d", title, (7,)), [3, 6])
-        velocity = get_array(thing, "velocity", title, (2,))
-        boxes.append(build_box(world_from_laser, center, sides, heading, velocity))
-    return tuple(boxes)
+def _read_boxes(
+    things: list[Any], world_from_laser: Pose, path: Path
+) -> Float[np.ndarray, "n 8 3"]:
+    """Read the boxes of moving objects; in the infos they are in the laser frame."""
+    title = f"a box in {quote_value(path)}"
+    parts = (("bbox_3d", (7,)), ("velocity", (2,)))
+    rows = [[get_array(thing, key, title, shape) for key, shape in parts] for thing in things]
+    return compute_moving_boxes(world_from_laser, np.stack([np.concatenate(row) for row in rows]))
+
+
+class _PlainUnpickler(pickle._Unpickler):  # that in C allocates whatever a few bytes claim
+    """Unpickler of plain values and NumPy scalars, which calls nothing else that a file names."""
+
+    def find_class(self, module: str, name: str) -> Callable[..., Any]:
+        found = CONSTRUCTORS.get((module.replace("numpy._core", "numpy.core"), name))
+        if found is None:
+            raise pickle.UnpicklingError(f"it names {module}.{name}")
+        return found
+
+
+def load_plain(path: Path) -> Any:
+    """Load the plain value in a pickle; refuses anything else."""
+    data = read_bytes(path, MAX_BYTES)
+    try:
+        value = _PlainUnpickler(io.BytesIO(data)).load()
+    except Exception as error:  # damaged pickles raise anything
+        raise InputError(
+            f"{quote_value(path)} is no pickle of plain values ({type(error).__name__}: "
+            f"{quote_value(str(error))}); write it again with lists and numbers only."
+        ) from error
+    check_plain(value, path, MAX_REPEATS * len(data))
+    return value

@@ -20,9 +20,13 @@ import numpy as np
 from jaxtyping import Float
 
 from gscompleter.data.cameras import Intrinsics
-from gscompleter.data.driving.vehicle import Box, build_box, build_poses, transform_points
+from gscompleter.data.driving.vehicle import (
+    build_poses,
+    compute_moving_boxes,
+    transform_points,
+)
 from gscompleter.data.frame import Frame
-from gscompleter.data.limits import MAX_SIDE, require
+from gscompleter.data.limits import require
 from gscompleter.data.photographs import Photographs, build_drive
 from gscompleter.data.undistort import Distortion
 from gscompleter.errors import InputError, quote_value
@@ -48,9 +52,7 @@ PosedLens = tuple[Intrinsics, Float[np.ndarray, "4 4"]]
 
 def has_waymo(path: Path) -> bool:
     """Check whether `path` is a folder of segments, or the photographs of one."""
-    if os.path.isdir(path):
-        return any((path / IMAGES).glob("*.parquet"))
-    return path.suffix == ".parquet" and path.parent.name == IMAGES and os.path.isfile(path)
+    return bool(_list_segments(path))
 
 
 def open_waymo(path: Path) -> Iterator[Photographs]:
@@ -58,8 +60,12 @@ def open_waymo(path: Path) -> Iterator[Photographs]:
 
     Frames are numbered camera by camera, the front camera first, and by time.
     """
+    return map(_open_segment, _list_segments(path))
+
+
+def _list_segments(path: Path) -> list[Path]:
     files = sorted((path / IMAGES).glob("*.parquet")) if os.path.isdir(path) else [path]
-    return (_open_segment(file) for file in files)
+    return [f for f in files if f.match(f"{IMAGES}/*.parquet") and os.path.isfile(f)]
 
 
 def _locate(segment: Path, component: str) -> Path:
@@ -73,29 +79,11 @@ def _has_components(segment: Path, *components: str) -> bool:
 
 def _read_rows(
     path: Path, columns: Sequence[str], where: Mapping[str, int] | None = None
-) -> Iterator[tuple[Any, ...]]:
-    """Read columns of a file, named without their prefix, row by row.
+) -> list[tuple[Any, ...]]:
+    """Read columns of a file, named without their prefix, as rows of plain values.
 
-    Only rows where the columns of `where` have these values are read. Lists of numbers become
-    arrays; null becomes None.
+    Only rows where the columns of `where` have these values are read.
     """
-    pyarrow, parquet = _import_pyarrow(path)
-    check_file(path)
-    filters = [(column, "==", value) for column, value in (where or {}).items()] or None
-    try:
-        stored = {name.rpartition("].")[2]: name for name in parquet.read_schema(path).names}
-        names = [stored.get(column, column) for column in columns]
-        table = parquet.read_table(path, columns=names, filters=filters, partitioning=None)
-    except (pyarrow.ArrowException, OSError, UnicodeDecodeError) as error:
-        lines = str(error).strip().splitlines() or [type(error).__name__]
-        raise InputError(
-            f"{quote_value(path)} cannot be read ({quote_value(lines[0])}); {ADVICE}."
-        ) from error
-    values = [[_to_plain(value) for value in table.column(name)] for name in names]
-    return zip(*values, strict=True)
-
-
-def _import_pyarrow(path: Path) -> tuple[Any, Any]:
     try:
         import pyarrow
         from pyarrow import parquet
@@ -104,15 +92,22 @@ def _import_pyarrow(path: Path) -> tuple[Any, Any]:
             f"{quote_value(path)} is a parquet file, and pyarrow is not installed; run "
             "`pip install 'gscompleter[waymo]'`."
         ) from error
-    return pyarrow, parquet
+    check_file(path)
+    filters = [(column, "==", value) for column, value in (where or {}).items()] or None
+    try:
+        stored = {name.rpartition("].")[2]: name for name in parquet.read_schema(path).names}
+        names = [stored.get(column, column) for column in columns]
+        table = parquet.read_table(path, columns=names, filters=filters, partitioning=None)
+    except (pyarrow.ArrowException, OSError, UnicodeDecodeError) as error:
+        raise InputError(f"{quote_value(path)} cannot be read; {ADVICE}.") from error
+    return [tuple(row[name] for name in names) for row in table.to_pylist()]
 
 
-def _to_plain(scalar: Any) -> Any:
-    """Convert to a Python value, and a list of numbers to an array."""
-    if not scalar.is_valid:
-        return None
-    values = getattr(scalar, "values", None)
-    return scalar.as_py() if values is None else values.to_numpy(zero_copy_only=False)
+def _read_value(path: Path, column: str, where: Mapping[str, int]) -> Any:
+    """Read the value of a column in the only row where other columns have these values."""
+    found = [value for (value,) in _read_rows(path, (column,), where) if value]
+    require(len(found) == 1, f"{quote_value(path)} lacks a {column} of a frame; {ADVICE}.")
+    return found[0]
 
 
 def _open_segment(segment: Path) -> Photographs:
@@ -151,11 +146,11 @@ def _read_cameras(path: Path) -> dict[int, PosedLens]:
     for camera, pose, *numbers in _read_rows(path, (CAMERA, "extrinsic.transform", *LENS)):
         lens = np.array(numbers, dtype=np.float64)  # null becomes NaN
         require(
-            np.isfinite(lens).all() and (lens[:2] >= 1).all() and (lens[:2] <= MAX_SIDE).all(),
+            np.isfinite(lens).all() and (lens[:2] >= 1).all(),
             f"Camera {camera} in {title} has no size or no intrinsics; {ADVICE}.",
         )
-        width, height, f_u, f_v, c_u, c_v, k1, k2, k3, p1, p2 = lens.tolist()
-        distortion = Distortion(radial=(k1, k2, k3), tangential=(p1, p2))
+        width, height, f_u, f_v, c_u, c_v, *radial, p1, p2 = lens.tolist()
+        distortion = Distortion(radial=tuple(radial), tangential=(p1, p2))
         size = (int(width), int(height))
         intrinsics = Intrinsics(size, (f_u, f_v), (c_u, c_v), distortion=distortion)
         found[camera] = intrinsics, _parse_matrix(pose, title)
@@ -163,10 +158,7 @@ def _read_cameras(path: Path) -> dict[int, PosedLens]:
 
 
 def _read_image(segment: Path, time: int, camera: int) -> bytes:
-    found = list(_read_rows(segment, ("image",), {TIME: time, CAMERA: camera}))
-    title = f"{CAMERAS[camera]} at {time} in {quote_value(segment)}"
-    require(len(found) == 1 and found[0][0], f"The image of {title} is missing; {ADVICE}.")
-    image: bytes = found[0][0]
+    image: bytes = _read_value(segment, "image", {TIME: time, CAMERA: camera})
     return image
 
 
@@ -176,7 +168,7 @@ def _read_points(segment: Path, time: int) -> Float[np.ndarray, "n 3"]:
 
     The roof laser rotates while the vehicle drives; `lidar_pose` has the vehicle pose per pixel.
     """
-    vehicle = _read_vehicle_pose(_locate(segment, "vehicle_pose"), time)
+    vehicle = _read_vehicle_pose(segment, time)
     lasers = _read_lasers(_locate(segment, "lidar_calibration"))
     measured, turning = _locate(segment, "lidar"), _locate(segment, "lidar_pose")
     poses = _read_range_images(turning, time) if os.path.isfile(turning) else {}
@@ -197,7 +189,7 @@ def _compute_points(
     title: str,
     ranges: Float[np.ndarray, "h w"],
     extrinsic: Float[np.ndarray, "4 4"],
-    beams: Float[np.ndarray, "_"] | None,
+    beams: Sequence[float] | None,
     low: float | None,
     high: float | None,
 ) -> Float[np.ndarray, "h w 3"]:
@@ -208,22 +200,22 @@ def _compute_points(
     ascending, by default evenly spaced from `low` to `high`; `extrinsic` is the pose of the laser.
     """
     height, width = ranges.shape
+    rising = np.array(beams, dtype=np.float64)
     if beams is None and low is not None and high is not None:
-        beams = low + (np.arange(height) + 0.5) / height * (high - low)
-    if beams is None or len(beams) != height:
-        raise InputError(f"The {title} does not fit its calibration; {ADVICE}.")
+        rising = low + (np.arange(height) + 0.5) / height * (high - low)
+    require(rising.size == height, f"The {title} does not fit its calibration; {ADVICE}.")
     yaw = np.arctan2(extrinsic[1, 0], extrinsic[0, 0])
     azimuths = np.pi * (1 - 2 * (np.arange(width) + 0.5) / width) - yaw
-    level, up = np.cos(beams[::-1, None]), np.sin(beams[::-1, None])
+    level, up = np.cos(rising[::-1, None]), np.sin(rising[::-1, None])
     up = np.broadcast_to(up, ranges.shape)
     rays = np.stack([level * np.cos(azimuths), level * np.sin(azimuths), up], axis=-1)
     return transform_points(ranges[..., None] * rays, extrinsic)
 
 
-def _read_vehicle_pose(path: Path, time: int) -> Float[np.ndarray, "4 4"]:
-    rows = list(_read_rows(path, ("world_from_vehicle.transform",), {TIME: time}))
-    require(len(rows) == 1, f"{quote_value(path)} has {len(rows)} poses at {time}; {ADVICE}.")
-    return _parse_matrix(rows[0][0], quote_value(path))
+def _read_vehicle_pose(segment: Path, time: int) -> Float[np.ndarray, "4 4"]:
+    path = _locate(segment, "vehicle_pose")
+    values = _read_value(path, "world_from_vehicle.transform", {TIME: time})
+    return _parse_matrix(values, quote_value(path))
 
 
 def _read_lasers(path: Path) -> dict[int, tuple[Any, ...]]:
@@ -244,20 +236,20 @@ def _read_range_images(path: Path, time: int) -> dict[int, Float[np.ndarray, "h 
     return found
 
 
-def _read_boxes(segment: Path, time: int) -> tuple[Box, ...]:
-    """Read the boxes of objects around the vehicle, except signs."""
-    vehicle = _read_vehicle_pose(_locate(segment, "vehicle_pose"), time)
-    vectors = ("box.center", "box.size", "speed")
-    columns = ["type", "box.heading", *(f"{name}.{axis}" for name in vectors for axis in "xyz")]
-    rows, boxes = _read_rows(_locate(segment, "lidar_box"), columns, {TIME: time}), []
-    for kind, heading, *numbers in rows:
-        center, sides, velocity = np.array(numbers, dtype=np.float64).reshape(3, 3)
-        if kind != SIGN:
-            boxes.append(build_box(vehicle, center, sides, np.float64(heading), velocity))
-    return tuple(boxes)
+def _read_boxes(segment: Path, time: int) -> Float[np.ndarray, "n 8 3"]:
+    """Read the boxes of moving objects around the vehicle, except signs."""
+    vehicle = _read_vehicle_pose(segment, time)
+    center, size, speed = (
+        [f"{name}.{axis}" for axis in "xyz"] for name in ("box.center", "box.size", "speed")
+    )
+    columns = ["type", *center, *size, "box.heading", *speed]
+    rows = _read_rows(_locate(segment, "lidar_box"), columns, {TIME: time})
+    objects = [numbers for kind, *numbers in rows if kind != SIGN]
+    return compute_moving_boxes(vehicle, np.array(objects, dtype=np.float64).reshape(-1, 10))
 
 
 def _parse_matrix(values: Any, title: str) -> Float[np.ndarray, "4 4"]:
-    fits = values is not None and len(values) == 16 and np.isfinite(values).all()
+    matrix = np.array(values, dtype=np.float64)  # null becomes NaN
+    fits = matrix.size == 16 and np.isfinite(matrix).all()
     require(fits, f"A transform in {title} is damaged; {ADVICE}.")
-    return np.asarray(values, dtype=np.float64).reshape(4, 4)
+    return matrix.reshape(4, 4)
