@@ -35,7 +35,7 @@ from gscompleter.apps.inputs.plan import describe_task, name_target
 from gscompleter.apps.inputs.selection import collect_usable_cameras
 from gscompleter.apps.report.completion import Target, write_report
 from gscompleter.apps.report.completion_page import average_scores, render_completion_page
-from gscompleter.apps.report.film import write_comparison_video
+from gscompleter.apps.report.film import VIDEO_FILE, write_comparison_video
 from gscompleter.apps.report.page import REPORT_FILE, write_page
 from gscompleter.apps.report.plain_words import format_number, format_percent, list_notes
 from gscompleter.apps.report.schema import CompletionSummary, read_summary
@@ -280,6 +280,8 @@ def describe_result(summary: CompletionSummary, options: CompleteOptions) -> Ite
         f"{options.out / COMPLETED_FILE}"
     )
     yield f"Report: {options.out / REPORT_FILE}"
+    if options.video and summary.targets:
+        yield f"Video: {options.out / VIDEO_FILE}"
 
 
 def collect_cameras(options: CompleteOptions, opened: Opened, task: Task) -> dict[int, Camera]:
