@@ -15,16 +15,13 @@ from jaxtyping import Bool, Float, Int64
 from torch import Tensor
 
 from gscompleter import __version__
-from gscompleter.apps.report.charts import color_depth, compute_depth_limits, draw_scene
+from gscompleter.apps.report.charts import make_record
 from gscompleter.apps.report.schema import (
     RECORD_FILE,
     SCORES,
     AlignmentRow,
-    CompletionRecord,
     ContextRow,
     HeldOutRow,
-    PairsRow,
-    TargetRecord,
     TargetRow,
 )
 from gscompleter.evaluation.metrics.coverage import RenderPair, compute_coverage
@@ -124,7 +121,7 @@ def write_report(
     around = render_around()
     shown = select_most_changed(around)
     write_pictures(folder / "images", completion, targets, at_targets, shown)
-    record = make_record(completion, photographs, at_targets, shown)
+    record = make_record(completion, thin_evenly(photographs, MAX_PHOTOGRAPHS))
     (folder / RECORD_FILE).write_text(json.dumps(asdict(record)) + "\n")
     coverage = {"coverage": asdict(compute_coverage(around))} if around else {}
     counts = {**count_changes(completion), "seconds": dict(completion.seconds)}
@@ -237,29 +234,6 @@ def count_changes(completion: Completion) -> dict[str, Any]:
     return {"gaussians": counts, "new_photographs": completion.num_new_photos}
 
 
-def make_record(
-    completion: Completion,
-    photographs: Sequence[Camera],
-    at_targets: Sequence[RenderPair],
-    around: Sequence[RenderPair],
-) -> CompletionRecord:
-    """Collect what the page shows besides the summary and the images."""
-    drawing = draw_scene(completion, thin_evenly(photographs, MAX_PHOTOGRAPHS))
-    limits, pairs = map(compute_depth_limits, at_targets), map(round_pairs, completion.targets)
-    targets, coverages = map(TargetRecord, limits, pairs), (compute_coverage([p]) for p in around)
-    return CompletionRecord(len(photographs), drawing, tuple(targets), tuple(coverages))
-
-
-def round_pairs(result: TargetResult) -> PairsRow:
-    """Round the depth pairs of a target to six significant digits."""
-    pairs = result.affine.pairs
-    predicted, context = (
-        tuple(float(f"{depth:.6g}") for depth in depths.tolist())
-        for depths in (pairs.predicted, pairs.context)
-    )
-    return PairsRow(pairs.fit_view, predicted, context, tuple(pairs.inlier_mask.tolist()))
-
-
 def select_most_changed(pairs: Sequence[RenderPair]) -> list[RenderPair]:
     """Select the views whose images changed most, in descending order."""
     changes = [(pair.after.image - pair.before.image).abs().mean().item() for pair in pairs]
@@ -351,12 +325,10 @@ def name_target_images(
     target: Target, result: TargetResult, pair: RenderPair
 ) -> dict[str, Tensor | None]:
     """Name the images of a target: colours [h, w, 3], grey or masks [h, w]."""
-    alpha, limits = result.trusted_alpha, compute_depth_limits(pair)
+    alpha = result.trusted_alpha
     return {
         "before": pair.before.image,
         "after": pair.after.image,
-        "depth_before": limits and color_depth(pair.before, limits),
-        "depth_after": limits and color_depth(pair.after, limits),
         "hole_mask": result.hole_mask.float(),
         "support": None if torch.equal(alpha, result.before.alpha) else alpha,
         "reference": None if result.reference is None else result.reference.image,

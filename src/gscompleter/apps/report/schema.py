@@ -3,9 +3,10 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
+from statistics import fmean
 from typing import Any, Literal, TypeVar
 
 from gscompleter.errors import InputError, quote_value
@@ -139,26 +140,16 @@ class CompletionSummary:
 
 @dataclass(frozen=True)
 class PairsRow:
-    """Depth pairs of the alignment, in scene units."""
+    """Depth pairs of the alignment at a target."""
 
     seen_from: Literal["anchor", "target"]
-    predicted: tuple[float, ...]
-    context: tuple[float, ...]
-    agrees: tuple[bool, ...]
+    points: tuple[tuple[float, float, bool], ...]
+    """Lifted depth and scene depth, in scene units, and True for an inlier."""
 
 
 @dataclass(frozen=True)
-class TargetRecord:
-    """Data of a target."""
-
-    depth_limits: tuple[float, float] | None
-    """z-depths at the ends of the colours, in scene units."""
-    pairs: PairsRow | None
-
-
-@dataclass(frozen=True)
-class SceneDrawing:
-    """Cameras as lines and scenes as points, which the page rotates.
+class CompletionRecord:
+    """All of `report.json`: cameras as lines and scenes as points, and depth pairs by target.
 
     Each text has the coordinates x y z of its points: right, up and back from the middle, in units
     of the radius.
@@ -169,17 +160,7 @@ class SceneDrawing:
     targets: tuple[str, ...]
     scene: tuple[str, ...]
     added: tuple[str, ...]
-
-
-@dataclass(frozen=True)
-class CompletionRecord:
-    """All of `report.json`: what a report shows besides the summary and the images."""
-
-    num_photographs: int
-    drawing: SceneDrawing
-    targets: tuple[TargetRecord, ...]
-    around: tuple[Coverage, ...]
-    """Coverage of each surrounding view."""
+    pairs: tuple[PairsRow, ...]
 
 
 def read_summary(folder: Path) -> CompletionSummary:
@@ -192,10 +173,16 @@ def read_record(folder: Path, summary: CompletionSummary) -> CompletionRecord:
     """Read `report.json`; raise an InputError if it does not fit the summary."""
     path = find_result(folder, RECORD_FILE)
     record = parse_content(CompletionRecord, read_json(path, ADVICE), path)
-    sizes = len(record.targets), len(record.drawing.targets), len(record.drawing.context)
+    sizes = len(record.pairs), len(record.targets), len(record.context)
     if sizes != (len(summary.targets), len(summary.targets), len(summary.context)):
         raise InputError(f"{quote_value(path)} does not fit {SUMMARY_FILE} beside it; {ADVICE}.")
     return record
+
+
+def average(values: Iterable[float | None]) -> float | None:
+    """Average the scores that there are; None without any."""
+    known = [value for value in values if value is not None]
+    return fmean(known) if known else None
 
 
 def with_new_keys(content: Any) -> Any:
@@ -213,12 +200,9 @@ def rename_keys(row: Any) -> Any:
 
 def find_result(folder: Path, name: str) -> Path:
     """Find the file `name` in `folder`; raise an InputError if there is none."""
-    if not os.path.isdir(folder):
-        raise InputError(f"There is no folder {quote_value(folder)}; name one with results.")
     if not os.path.isfile(folder / name):
         raise InputError(
-            f"{quote_value(folder)} has no {name}; name the output folder of a completion or an "
-            "evaluation."
+            f"{quote_value(folder)} has no {name}; name the output folder of a completion."
         )
     return folder / name
 
