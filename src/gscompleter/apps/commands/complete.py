@@ -26,12 +26,13 @@ from gscompleter.apps.inputs.opening import (
     check_context,
     check_scene,
     check_targets,
+    describe_task,
     move_to_splat,
+    name_target,
     open_scene,
     print_lines,
     read_task,
 )
-from gscompleter.apps.inputs.plan import describe_task, name_target
 from gscompleter.apps.inputs.selection import collect_usable_cameras
 from gscompleter.apps.report.completion import Target, write_report
 from gscompleter.apps.report.completion_page import write_completion_page

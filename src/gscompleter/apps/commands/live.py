@@ -16,8 +16,7 @@ from gscompleter.apps.commands.options import (
     LiveOptions,
     parse_resolution,
 )
-from gscompleter.apps.inputs.opening import print_lines
-from gscompleter.apps.inputs.plan import describe_opening
+from gscompleter.apps.inputs.opening import describe_opening, print_lines
 from gscompleter.apps.live.session import Session
 from gscompleter.apps.report.completion import Target
 from gscompleter.data.scene import write_cameras

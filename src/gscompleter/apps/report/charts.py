@@ -13,19 +13,12 @@ from torch.nn.functional import normalize
 from gscompleter.apps.report.schema import CompletionRecord, PairsRow
 from gscompleter.geometry import estimate_up
 from gscompleter.state import Completion, TargetResult
-from gscompleter.types import Camera, Gaussians
+from gscompleter.types import Camera
 
-MAX_POINTS = 600
-"""Largest number of points to draw, of the context and of the added Gaussians each."""
-MIN_SURFACE_OPACITY = 0.3
 FRUSTUM = ((-1, -1, 1), (1, -1, 1), (1, 1, 1), (-1, 1, 1))
 """Image corners of a camera pyramid, whose apex is the origin."""
 FRUSTUM_DEPTH = 0.11
 """Length of a camera pyramid, in radii."""
-SHOWN_FRACTION = 0.9
-"""Fraction of the points within the radius."""
-POINT_BOUND = 1.2
-"""Largest coordinate of a point, in radii."""
 
 
 @dataclass(frozen=True)
@@ -43,39 +36,27 @@ class DrawingFrame:
 
 
 def make_record(completion: Completion, photographs: Sequence[Camera]) -> CompletionRecord:
-    """Draw all cameras and samples of the context and of the added Gaussians; list depth pairs."""
+    """Draw all cameras, and list depth pairs."""
     context = [view.camera.to("cpu") for view in completion.views]
     targets = [result.target.to("cpu") for result in completion.targets]
     others = [camera.to("cpu") for camera in photographs]
-    scene, added = sample_points(completion.context), sample_points(completion.added)
-    frame = fit_frame([*others, *context, *targets], torch.cat([scene, added]))
+    frame = fit_frame([*others, *context, *targets])
     return CompletionRecord(
         photographs=draw_cameras(others, frame),
         context=draw_cameras(context, frame),
         targets=draw_cameras(targets, frame),
-        scene=draw_points(scene, frame),
-        added=draw_points(added, frame),
         pairs=tuple(map(list_depth_pairs, completion.targets)),
     )
 
 
-def sample_points(gaussians: Gaussians) -> Float[Tensor, "n 3"]:
-    """Sample means of opaque Gaussians."""
-    opaque = gaussians.means[gaussians.opacities >= MIN_SURFACE_OPACITY].detach().cpu()
-    order = torch.randperm(len(opaque), generator=torch.Generator().manual_seed(0))
-    return opaque[order[:MAX_POINTS]]
-
-
-def fit_frame(cameras: Sequence[Camera], points: Float[Tensor, "n 3"]) -> DrawingFrame:
-    """Fit a frame around cameras and points whose up axis is that of most cameras."""
+def fit_frame(cameras: Sequence[Camera]) -> DrawingFrame:
+    """Fit a frame around cameras whose up axis is that of most of them."""
     up = estimate_up(cameras)
     level = min(cameras, key=lambda camera: (camera.c2w[:3, 1] @ up).item())
     back = normalize(torch.linalg.cross(level.c2w[:3, 0], up), dim=0)
     centers = torch.stack([camera.center for camera in cameras])
-    middle = torch.cat([centers, points]).median(dim=0).values
-    farthest = 1.1 * (centers - middle).norm(dim=1).max()
-    away = torch.cat([(points - middle).norm(dim=1), farthest[None]])
-    radius = max(farthest.item(), away.quantile(SHOWN_FRACTION).item(), 1e-9)
+    middle = centers.median(dim=0).values
+    radius = max(1.1 * (centers - middle).norm(dim=1).max().item(), 1e-9)
     return DrawingFrame(middle, torch.stack([torch.linalg.cross(up, back), up, back]), radius)
 
 
@@ -91,17 +72,7 @@ def draw_camera(camera: Camera, frame: DrawingFrame) -> str:
     a, b, c, d = torch.tensor(FRUSTUM) * sides @ camera.c2w[:3, :3].T @ frame.axes.T
     o = torch.zeros(3)
     corners = FRUSTUM_DEPTH * torch.stack([o, a, b, c, d, a, b, o, c, d, o])
-    return format_points(frame.convert(camera.center) + corners)
-
-
-def draw_points(points: Float[Tensor, "n 3"], frame: DrawingFrame) -> tuple[str, ...]:
-    """Write the positions of points within the borders of the drawing."""
-    placed = frame.convert(points)
-    return tuple(map(format_points, placed[(placed.abs() <= POINT_BOUND).all(dim=1)]))
-
-
-def format_points(points: Float[Tensor, "*n 3"]) -> str:
-    """Format points for the script of the page."""
+    points = frame.convert(camera.center) + corners
     return " ".join(f"{value:.3f}" for value in points.flatten().tolist())
 
 

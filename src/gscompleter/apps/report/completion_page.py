@@ -29,11 +29,7 @@ def write_completion_page(folder: Path) -> None:
 
 
 def render_completion_page(folder: Path) -> str:
-    """Render the page of the completion in `folder`.
-
-    Raises:
-        InputError: if the folder has no completion, or a damaged one.
-    """
+    """Render the page of the completion in `folder`."""
     summary = read_summary(folder)
     path = summary.scene.splat or str(summary.settings.get("folder") or "")
     return render_template(
@@ -42,7 +38,6 @@ def render_completion_page(folder: Path) -> str:
             "title": Path(path).name or "Scene",
             "summary": summary,
             "record": read_record(folder, summary),
-            "num_around": len(list(folder.glob("images/around*_after.png"))),
             "gallery": open_gallery(folder / "images"),
             "notes": list(list_notes(summary)),
             "describe_alignment": describe_alignment,

@@ -149,7 +149,7 @@ class PairsRow:
 
 @dataclass(frozen=True)
 class CompletionRecord:
-    """All of `report.json`: cameras as lines and scenes as points, and depth pairs by target.
+    """All of `report.json`: cameras as lines, and depth pairs by target.
 
     Each text has the coordinates x y z of its points: right, up and back from the middle, in units
     of the radius.
@@ -158,8 +158,6 @@ class CompletionRecord:
     photographs: tuple[str, ...]
     context: tuple[str, ...]
     targets: tuple[str, ...]
-    scene: tuple[str, ...]
-    added: tuple[str, ...]
     pairs: tuple[PairsRow, ...]
 
 
