@@ -29,7 +29,6 @@ SCORES = ("psnr_before", "psnr_after", "ssim_before", "ssim_after")
 T = TypeVar("T")
 Vector = tuple[float, float, float]
 Row = tuple[float, float, float, float]
-"""Row of a transform."""
 
 
 @dataclass(frozen=True)
@@ -76,7 +75,6 @@ class TargetRow(ScoreRow):
     """Result at a target."""
 
     anchor: int | None
-    """Frame of the anchor."""
     anchor_fallback: bool
     hole_fraction: float
     affine: AlignmentRow
@@ -127,7 +125,6 @@ class CompletionSummary:
     scene: SceneRow
     frame: ResultFrame
     depth_range: Mapping[str, Any]
-    """Near and far plane in scene units."""
     coverage: Coverage
     context: tuple[ContextRow, ...]
     targets: tuple[TargetRow, ...]
