@@ -160,14 +160,14 @@ class CompletionRecord:
 
 def read_summary(folder: Path) -> CompletionSummary:
     """Read `summary.json`; raise an InputError if it is missing or damaged."""
-    path = find_result(folder, SUMMARY_FILE)
-    return parse_content(CompletionSummary, with_new_keys(read_json(path, ADVICE)), path)
+    content = with_new_keys(read_result(folder / SUMMARY_FILE))
+    return parse_content(CompletionSummary, content, folder / SUMMARY_FILE)
 
 
 def read_record(folder: Path, summary: CompletionSummary) -> CompletionRecord:
     """Read `report.json`; raise an InputError if it does not fit the summary."""
-    path = find_result(folder, RECORD_FILE)
-    record = parse_content(CompletionRecord, read_json(path, ADVICE), path)
+    path = folder / RECORD_FILE
+    record = parse_content(CompletionRecord, read_result(path), path)
     sizes = len(record.pairs), len(record.targets), len(record.context)
     if sizes != (len(summary.targets), len(summary.targets), len(summary.context)):
         raise InputError(f"{quote_value(path)} does not fit {SUMMARY_FILE} beside it; {ADVICE}.")
@@ -193,13 +193,14 @@ def rename_keys(row: Any) -> Any:
     return {RENAMED.get(k, k): v for k, v in row.items()} if isinstance(row, dict) else row
 
 
-def find_result(folder: Path, name: str) -> Path:
-    """Find the file `name` in `folder`; raise an InputError if there is none."""
-    if not os.path.isfile(folder / name):
+def read_result(path: Path) -> Any:
+    """Read a JSON file of a completion."""
+    if not os.path.isfile(path):
         raise InputError(
-            f"{quote_value(folder)} has no {name}; name the output folder of a completion."
+            f"{quote_value(path.parent)} has no {path.name}; name the output folder of a "
+            "completion."
         )
-    return folder / name
+    return read_json(path, ADVICE)
 
 
 def parse_content(kind: type[T], content: Any, path: Path) -> T:
