@@ -155,7 +155,7 @@ def test_what_is_saved_of_a_splat_in_a_frame_of_its_own_is_too(tmp_path, monkeyp
     target = transform_camera(HOLES[0], ready.task.frame)
     session, result = complete_camera(session, target)
     assert len(result.added) > 0
-    assert torch.allclose(session.steps[0].camera.c2w.float(), HOLES[0].c2w, atol=1e-6)
+    assert torch.allclose(session.cameras[0].c2w.float(), HOLES[0].c2w, atol=1e-6)
     live.save_session(ready, session)
     assert the_same_as_complete(monkeypatch, ready, tmp_path, "--scene", options.scene)
 

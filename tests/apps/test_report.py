@@ -1,4 +1,4 @@
-"""Report pages of completions and evaluations: content, escaping, and no external requests."""
+"""Report pages of completions: content, escaping, and no external requests."""
 
 from __future__ import annotations
 
@@ -14,16 +14,8 @@ import torch
 from PIL import Image
 
 from command import run
-from gscompleter.apps.report.charts import (
-    NO_DEPTH_COLOR,
-    color_depth,
-    compute_depth_limits,
-    fit_frame,
-    plot_depth_pairs,
-)
-from gscompleter.apps.report.completion import MAX_SURROUNDING_VIEWS, select_most_changed
+from gscompleter.apps.report.charts import fit_frame
 from gscompleter.apps.report.completion_page import render_completion_page
-from gscompleter.apps.report.evaluation_page import render_evaluation_page
 from gscompleter.apps.report.page import open_gallery
 from gscompleter.apps.report.plain_words import (
     format_change,
@@ -31,10 +23,8 @@ from gscompleter.apps.report.plain_words import (
     format_percent,
     list_photograph_notes,
 )
-from gscompleter.apps.report.schema import ContextRow, PairsRow
+from gscompleter.apps.report.schema import ContextRow
 from gscompleter.errors import InputError
-from gscompleter.evaluation.metrics.coverage import RenderPair
-from gscompleter.types import Render
 from scenes import camera_at
 
 VOID = {"meta", "img", "input", "link", "br", "hr"}
@@ -91,8 +81,7 @@ def changed(path: Path, change) -> None:
 def test_the_page_is_well_formed_and_every_target_has_its_slider(completed_room):
     page = Page((completed_room / "report.html").read_text())
     sliders = [i for i in page.all("input") if i["min"] == "0" and i["max"] == "100"]
-    around = len(list((completed_room / "images").glob("around*_after.png")))
-    assert len(sliders) == 1 + 1 + around  # images and depths of the target, coverage cameras
+    assert len(sliders) == 1
     ids = [attributes["id"] for _, attributes in page.tags if "id" in attributes]
     assert "target1" in ids
     assert len(ids) == len(set(ids))
@@ -215,8 +204,7 @@ def test_a_missing_or_damaged_image_is_told(out, content):
 
 def test_a_completion_without_targets_says_so(out):
     changed(out / "summary.json", lambda summary: summary.update(targets=[]))
-    changed(out / "report.json", lambda kept: kept.update(targets=[], around=[]))
-    changed(out / "report.json", lambda kept: kept["drawing"].update(targets=[], photographs=[]))
+    changed(out / "report.json", lambda kept: kept.update(targets=[], pairs=[], photographs=[]))
     assert "nothing was completed" in Page(render_completion_page(out)).said()
 
 
@@ -269,8 +257,8 @@ def a_file(out: Path) -> None:
         (no_summary, "has no summary.json"),
         (no_record, "has no report.json"),
         (other_record, "does not fit summary.json"),
-        (no_folder, "There is no folder"),
-        (a_file, "There is no folder"),
+        (no_folder, "has no summary.json"),
+        (a_file, "has no summary.json"),
     ],
 )
 def test_what_is_no_result_is_refused_in_a_sentence(out, monkeypatch, capsys, damage, sentence):
@@ -308,22 +296,6 @@ def test_the_fit_of_the_depths_is_said(out, method, sentence):
     assert sentence in Page(render_completion_page(out)).said()
 
 
-def test_depths_become_colours_from_near_to_far_and_grey_where_there_are_none():
-    depth = torch.tensor([[1.0, 2.0, 4.0], [8.0, 3.0, 0.0]])
-    alpha = torch.tensor([[1.0, 1.0, 1.0], [1.0, 0.1, 0.0]])
-    render = Render(torch.zeros(2, 3, 3), depth, alpha)
-    colors = color_depth(render, (1.0, 4.0))
-    brightness = colors @ torch.tensor([0.2126, 0.7152, 0.0722])
-    assert brightness[0, 0] < brightness[0, 1] < brightness[0, 2]
-    assert colors[0, 2].tolist() == colors[1, 0].tolist()
-    assert (255 * colors[1, 1:]).round().tolist() == [list(NO_DEPTH_COLOR)] * 2
-    near, far = compute_depth_limits(RenderPair(render, render))
-    assert 1.0 <= near < 1.2
-    assert 7.5 < far <= 8.0
-    empty = Render(render.image, depth, torch.zeros_like(alpha))
-    assert compute_depth_limits(RenderPair(empty, empty)) is None
-
-
 def test_pages_stay_small(tmp_path):
     Image.new("L", (8, 8)).save(tmp_path / "small.png")
     assert open_gallery(tmp_path).scale == 1
@@ -332,110 +304,36 @@ def test_pages_stay_small(tmp_path):
     assert 11e6 < large.width * large.height < 12.1e6
 
 
-def look(change: float) -> RenderPair:
-    before = Render(torch.zeros(4, 4, 3), torch.ones(4, 4), torch.ones(4, 4))
-    return RenderPair(before, Render(before.image + change, before.depth, before.alpha))
-
-
-def test_the_cameras_that_changed_most_are_kept():
-    looks = [look(change) for change in (0.1, 0.0, 0.3, 0.2, 0.15, 0.05, 0.06, 0.07)]
-    kept = select_most_changed(looks)
-    assert len(kept) == MAX_SURROUNDING_VIEWS
-    assert [k.after.image.mean().item() for k in kept] == sorted(
-        (k.after.image.mean().item() for k in kept), reverse=True
-    )
-    assert kept[0] is looks[2]
-    assert select_most_changed(looks[1:2]) == []
-
-
 def test_the_record_keeps_what_the_affine_was_fitted_to(completed_room):
     kept = json.loads((completed_room / "report.json").read_text())
     (affine,) = [
         t["affine"] for t in json.loads((completed_room / "summary.json").read_text())["targets"]
     ]
-    pairs = kept["targets"][0]["pairs"]
-    x, y = np.array(pairs["predicted"]), np.array(pairs["context"])
-    agrees = np.array(pairs["agrees"])
+    points = np.array(kept["pairs"][0]["points"])
+    x, y, agrees = points[:, 0], points[:, 1], points[:, 2] == 1
     assert 100 < len(x) == len(y) == len(agrees) <= 1000
     residual = np.abs(affine["scale"] * x + affine["shift"] - y)
     assert (residual[agrees] < 0.0501 * y[agrees]).all()
     assert (residual[~agrees] > 0.0499 * y[~agrees]).all()
     assert agrees.mean() == pytest.approx(affine["inliers"], abs=0.05)
-    assert len(kept["drawing"]["photographs"]) == kept["num_photographs"] == 3
+    assert len(kept["photographs"]) == 3
 
 
-def test_depth_pairs_are_drawn_in_a_unit_square():
-    pairs = PairsRow("anchor", (1.0, 2.0, 3.0), (2.0, 4.0, 5.0), (True, True, False))
-    plot = plot_depth_pairs(pairs)
-    assert plot.end == 5
-    assert plot.inliers == "M0.2000 0.4000h0M0.4000 0.8000h0"
-    assert plot.outliers == "M0.6000 1.0000h0"
+def test_depth_pairs_are_drawn_in_a_unit_square(out):
+    points = [(1, 2, True), (2, 4, True), (3, 5, False)]
+    changed(out / "report.json", lambda kept: kept["pairs"][0].update(points=points))
+    text = render_completion_page(out)
+    assert '<path class="inlier" d="M0.2000 0.4000h0M0.4000 0.8000h0"/>' in text
+    assert '<path class="outlier" d="M0.6000 1.0000h0"/>' in text
 
 
 def test_the_drawing_stands_upright():
     cameras = [camera_at(), camera_at(1.0, yaw=180)]
-    frame = fit_frame(cameras, torch.zeros(0, 3))
+    frame = fit_frame(cameras)
     assert torch.allclose(frame.axes[1], torch.tensor([0.0, -1.0, 0.0]))  # y points down
     assert torch.allclose(frame.axes @ frame.axes.T, torch.eye(3), atol=1e-6)
     assert torch.linalg.det(frame.axes) > 0
     assert frame.convert(torch.stack([c.center for c in cameras])).norm(dim=1).max() <= 1
-
-
-TABLES = f"""Means over the 1 of 2 cases that all methods finished.
-
-### Images
-
-| method | PSNR |
-| --- | ---: |
-| full | 24.50 |
-| reggs | – |
-
-reggs is not the paper's {HOSTILE}
-
-FID: not requested.
-
-### Failed
-
-| case | method | reason |
-| --- | ---: | ---: |
-| b | reggs | {HOSTILE} or \\| |
-"""
-TIMINGS = """Median seconds of a step.
-
-| method | lift | total | memory |
-| --- | ---: | ---: | ---: |
-| full | 1.00 | 2.00 | 1.00 |
-| reggs | – | 4.00 | – |
-"""
-
-
-@pytest.fixture
-def evaluated(tmp_path) -> Path:
-    (tmp_path / "tables.md").write_text(TABLES)
-    (tmp_path / "timings.md").write_text(TIMINGS)
-    Image.new("RGB", (40, 30), "white").save(tmp_path / "gain_by_hole.png")
-    return tmp_path
-
-
-def test_an_evaluation_has_a_page_with_its_tables_and_plots(evaluated, monkeypatch):
-    assert run(monkeypatch, "report", evaluated, "--quiet") == 0
-    text = (evaluated / "report.html").read_text()
-    assert text == render_evaluation_page(evaluated)
-    page, said = Page(text), Page(text).said()
-    assert "Images method PSNR full 24.50 reggs –" in said
-    assert "full 1.00 2.00 1.00 reggs – 4.00 –" in said
-    assert "or | Plots" in said
-    assert [len(page.all(tag)) for tag in ("img", "script", "table")] == [1, 1, 3]
-    assert "<script>alert(1)</script>" in said
-    assert "reggs is not the paper's" in said
-    assert "FID: not requested." in said
-
-
-@pytest.mark.parametrize("name", ["tables.md", "timings.md"])
-def test_missing_tables_are_told(evaluated, name):
-    (evaluated / name).unlink()
-    with pytest.raises(InputError, match=name):
-        render_evaluation_page(evaluated)
 
 
 def test_that_something_moved_is_told_with_where():

@@ -46,7 +46,7 @@ from gscompleter.apps.viewer.packages import (
     load_libraries,
     read_lock,
 )
-from gscompleter.apps.viewer.page import Page, make_page
+from gscompleter.apps.viewer.page import make_page
 from gscompleter.data.scene import write_cameras
 from gscompleter.errors import InputError
 from gscompleter.evaluation.metrics.coverage import Coverage
@@ -62,17 +62,17 @@ NONE = Libraries({}, {})
 """A page without libraries renders nothing, which only a browser would notice."""
 
 
-def content_of(page: Page) -> dict:
+def content_of(page: bytes) -> dict:
     """Read the content that the page has for its program."""
     found = re.findall(
-        r'<script type="application/json" id="content">(.*?)</script>', page.html.decode(), re.S
+        r'<script type="application/json" id="content">(.*?)</script>', page.decode(), re.S
     )
     return json.loads(found[0])
 
 
-def gaussians_in(page: Page, layer: str, folder: Path) -> Gaussians:
+def gaussians_in(page: bytes, layer: str, folder: Path) -> Gaussians:
     """Read a layer of a page."""
-    calls = re.findall(rb'gscPart\("(\w+)", "([^"]*)"\)', page.html)
+    calls = re.findall(rb'gscPart\("(\w+)", "([^"]*)"\)', page)
     source = content_of(page)["layers"][layer].encode()
     path = folder / f"{layer}.spz"
     path.write_bytes(b"".join(base64.b64decode(text) for name, text in calls if name == source))
@@ -185,7 +185,7 @@ def test_the_same_values_give_the_same_bytes():
 def test_a_page_holds_the_gaussians_whatever_their_unit(tmp_path, unit):
     camera = camera_at(size=32, unit=unit)
     observed, generated = room_from(camera, 0, unit), room_from(camera, 1, unit)
-    page = make_page(ViewerContent("room", merge([observed, generated]), None), NONE)
+    page, _ = make_page(ViewerContent("room", merge([observed, generated]), None), NONE)
     frame = content_of(page)["frame"]
     held = gaussians_in(page, "generated", tmp_path)
     means = held.means.double() * frame["unit"] + torch.tensor(frame["centre"])
@@ -196,14 +196,14 @@ def test_a_page_holds_the_gaussians_whatever_their_unit(tmp_path, unit):
 
 
 def test_what_did_not_change_is_held_once():
-    layers = content_of(make_page(room_exhibit(), NONE))["layers"]
+    layers = content_of(make_page(room_exhibit(), NONE)[0])["layers"]
     assert layers == {"before": "observed", "observed": "observed", "generated": "generated"}
 
 
 def test_the_page_knows_which_layers_are_antialiased():
     exhibit = room_exhibit()
     marked = replace(exhibit, after=replace(exhibit.after, is_antialiased=True))
-    content = content_of(make_page(marked, NONE))
+    content = content_of(make_page(marked, NONE)[0])
     assert content["antialiased"] == {"before": False, "observed": True, "generated": True}
     assert content["layers"]["before"] == "before"
 
@@ -211,7 +211,7 @@ def test_the_page_knows_which_layers_are_antialiased():
 def test_what_changed_is_held_beside_what_it_became(tmp_path):
     exhibit = room_exhibit()
     assert exhibit.before is not None
-    page = make_page(replace(exhibit, before=exhibit.before[:100]), NONE)
+    page, _ = make_page(replace(exhibit, before=exhibit.before[:100]), NONE)
     assert len(gaussians_in(page, "before", tmp_path)) == 100
     assert content_of(page)["layers"]["before"] == "before"
 
@@ -219,8 +219,8 @@ def test_what_changed_is_held_beside_what_it_became(tmp_path):
 def test_text_from_outside_cannot_leave_its_place():
     evil = "</script><script>alert(1)</script><!--"
     shot = ViewerCamera("target-1", evil, TARGET, notes=(evil,))
-    page = make_page(replace(room_exhibit(evil), cameras=(shot,)), Libraries({}, {evil: evil}))
-    text = page.html.decode()
+    page, _ = make_page(replace(room_exhibit(evil), cameras=(shot,)), Libraries({}, {evil: evil}))
+    text = page.decode()
     assert evil not in text
     assert "alert(1)</script" not in text
     content = content_of(page)
@@ -238,16 +238,16 @@ def test_our_program_writes_text_and_never_markup():
 
 
 def test_a_page_names_nothing_outside_of_itself():
-    text = make_page(room_exhibit(), NONE).html.decode()
+    text = make_page(room_exhibit(), NONE)[0].decode()
     assert "http" not in text.replace('http-equiv="Content-Security-Policy"', "")
     assert not re.search(r"\b(src|href)=", text)
 
 
 def test_a_large_scene_is_held_in_parts(tmp_path, monkeypatch):
-    whole = make_page(room_exhibit(), NONE)
+    whole, _ = make_page(room_exhibit(), NONE)
     monkeypatch.setattr(pages, "PART", 20_000)
-    page = make_page(room_exhibit(), NONE)
-    assert page.html.count(b'gscPart("') > 2
+    page, _ = make_page(room_exhibit(), NONE)
+    assert page.count(b'gscPart("') > 2
     for layer in ("observed", "generated"):
         assert torch.equal(
             gaussians_in(page, layer, tmp_path).means, gaussians_in(whole, layer, tmp_path).means
@@ -258,14 +258,15 @@ def test_floaters_beyond_all_measure_are_left_out_and_counted():
     exhibit = room_exhibit()
     means = exhibit.after.means.clone()
     means[:3] = 1e9
-    page = make_page(replace(exhibit, after=replace(exhibit.after, means=means), before=None), NONE)
-    assert page.notes == ("3 Gaussians are too far away to be shown.",)
+    floating = replace(exhibit, after=replace(exhibit.after, means=means), before=None)
+    page, notes = make_page(floating, NONE)
+    assert notes == ("3 Gaussians are too far away to be shown.",)
     assert content_of(page)["counts"]["observed"] == SIDE * SIDE - 3
 
 
 def test_a_scene_without_cameras_has_one_that_sees_it():
     exhibit = replace(room_exhibit(), cameras=())
-    (shot,) = content_of(make_page(exhibit, NONE))["shots"]
+    (shot,) = content_of(make_page(exhibit, NONE)[0])["shots"]
     assert shot["name"] == "overview"
     pose = np.array(shot["pose"]).reshape(4, 4)
     # It looks along -z of the page at its origin, which is the middle of the scene.
@@ -274,7 +275,7 @@ def test_a_scene_without_cameras_has_one_that_sees_it():
 
 
 def test_a_camera_looks_as_far_as_what_it_sees():
-    content = content_of(make_page(room_exhibit(), NONE))
+    content = content_of(make_page(room_exhibit(), NONE)[0])
     depth = room_from(LEFT, 0).means.double() - LEFT.center
     expected = (depth @ LEFT.forward.double()).median().item()
     focus = content["shots"][1]["focus"] * content["frame"]["unit"]
@@ -298,7 +299,7 @@ def test_a_scene_of_one_kind_is_compared_with_nothing(tmp_path, generated):
     save_ply(tmp_path / "a.ply", room_from(LEFT, generated))
     found = load_viewer_files(tmp_path / "a.ply", None, drop_nonfinite=False)
     assert found.before is None
-    assert "before" not in content_of(make_page(found, NONE))["layers"]
+    assert "before" not in content_of(make_page(found, NONE)[0])["layers"]
 
 
 def completion_in(folder: Path, transform: np.ndarray, origin: np.ndarray) -> Path:
@@ -416,7 +417,7 @@ def test_the_second_scene_is_the_one_after(packed, tmp_path, monkeypatch):
     save_ply(tmp_path / "b.ply", exhibit.after)
     page = tmp_path / "page.html"
     assert run(monkeypatch, "view", tmp_path / "a.ply", tmp_path / "b.ply", "--save", page) == 0
-    counts = content_of(Page(page.read_bytes(), ()))["counts"]
+    counts = content_of(page.read_bytes())["counts"]
     assert counts == {"before": 50, "observed": SIDE * SIDE, "generated": SIDE * SIDE}
 
 
@@ -427,7 +428,7 @@ def test_cameras_bring_their_photographs_as_thumbnails(packed, tmp_path, monkeyp
     page = tmp_path / "page.html"
     cameras = ("--cameras", tmp_path / "transforms.json")
     assert run(monkeypatch, "view", tmp_path / "a.ply", *cameras, "--save", page) == 0
-    shots = content_of(Page(page.read_bytes(), ()))["shots"]
+    shots = content_of(page.read_bytes())["shots"]
     assert [(shot["name"], shot["title"]) for shot in shots] == [
         ("camera-1", "left.png"),
         ("camera-2", "gone.png"),
@@ -441,7 +442,7 @@ def test_cameras_of_a_colmap_folder_are_jumped_to(packed, tmp_path, monkeypatch)
     (folder / "colmap" / "images" / NAMES[1]).unlink()
     cameras = ("--cameras", folder / "colmap")
     assert run(monkeypatch, "view", folder, *cameras, "--save", page) == 0
-    shots = content_of(Page(page.read_bytes(), ()))["shots"]
+    shots = content_of(page.read_bytes())["shots"]
     found = [shot for shot in shots if shot["name"].startswith("camera-")]
     assert [shot["title"] for shot in found] == NAMES
     assert [shot["thumbnail"] is None for shot in found] == [False, True, False, False, False]

@@ -74,7 +74,7 @@ def exhibit() -> ViewerContent:
 def saved(exhibit, libraries, tmp_path_factory) -> Path:
     """Return the page as a file, in a folder whose name needs to be escaped."""
     path = tmp_path_factory.mktemp("a folder #1") / "page.html"
-    path.write_bytes(make_page(exhibit, libraries).html)
+    path.write_bytes(make_page(exhibit, libraries)[0])
     return path
 
 
@@ -223,7 +223,7 @@ def test_the_parts_of_a_large_scene_are_put_together(
     browser, exhibit, libraries, tmp_path, monkeypatch
 ):
     monkeypatch.setattr(pages, "PART", 100_000)
-    (tmp_path / "page.html").write_bytes(make_page(exhibit, libraries).html)
+    (tmp_path / "page.html").write_bytes(make_page(exhibit, libraries)[0])
     tab = Window(browser, tmp_path / "page.html", 320, 240)
     assert tab.do("gsc.stats()")["frames"] > 0
     assert tab.errors == []
@@ -236,7 +236,7 @@ def test_antialiased_gaussians_are_those_of_our_renderer(browser, libraries, tmp
     small = [replace(g, scales=0.7 * g.scales) for g in (room.before, room.after)]
     before, after = (replace(gaussians, is_antialiased=True) for gaussians in small)
     exhibit = replace(room, before=before, after=after)
-    (tmp_path / "page.html").write_bytes(make_page(exhibit, libraries).html)
+    (tmp_path / "page.html").write_bytes(make_page(exhibit, libraries)[0])
     tab = Window(browser, tmp_path / "page.html", 2 * SIDE, SIDE)
     tab.page.add_style_tag(content=BARE)
     tab.do("gsc.setMode('side')")
@@ -253,7 +253,7 @@ def test_antialiased_gaussians_are_those_of_our_renderer(browser, libraries, tmp
 
 def test_text_from_outside_stays_text(browser, libraries, tmp_path):
     evil = "</script><img src=x onerror=document.title='broken'>"
-    (tmp_path / "page.html").write_bytes(make_page(room_exhibit(evil), libraries).html)
+    (tmp_path / "page.html").write_bytes(make_page(room_exhibit(evil), libraries)[0])
     tab = Window(browser, tmp_path / "page.html", 320, 240)
     assert tab.page.title() == evil
     assert tab.page.locator("h1").text_content() == evil

@@ -18,12 +18,12 @@ from gscompleter.apps.commands.output import describe_run, is_replaceable
 from gscompleter.apps.inputs.opening import (
     apply_working_range,
     check_context,
+    describe_opening,
     move_to_splat,
     open_scene,
     print_lines,
     read_photographs,
 )
-from gscompleter.apps.inputs.plan import describe_opening
 from gscompleter.apps.report.completion import save_completed_splat
 from gscompleter.apps.warmup import compile_kernels
 from gscompleter.cleaning import find_superfluous

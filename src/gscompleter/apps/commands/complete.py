@@ -22,19 +22,20 @@ from gscompleter.apps.inputs.opening import (
     check_context,
     check_scene,
     check_targets,
+    describe_task,
     move_to_splat,
+    name_target,
     open_scene,
     print_lines,
     read_task,
 )
-from gscompleter.apps.inputs.plan import describe_task, name_target
 from gscompleter.apps.inputs.selection import collect_usable_cameras
 from gscompleter.apps.report.completion import Target, write_report
-from gscompleter.apps.report.completion_page import average_scores, render_completion_page
-from gscompleter.apps.report.film import write_comparison_video
-from gscompleter.apps.report.page import REPORT_FILE, write_page
+from gscompleter.apps.report.completion_page import write_completion_page
+from gscompleter.apps.report.film import VIDEO_FILE, write_comparison_video
+from gscompleter.apps.report.page import REPORT_FILE
 from gscompleter.apps.report.plain_words import format_number, format_percent, list_notes
-from gscompleter.apps.report.schema import CompletionSummary, read_summary
+from gscompleter.apps.report.schema import CompletionSummary, average, read_summary
 from gscompleter.apps.warmup import SPLAT_PART, compile_kernels
 from gscompleter.completer import GSCompleter, check_target_ids
 from gscompleter.config.generators import get_settings_class
@@ -152,7 +153,7 @@ def write_done(folder: Path, ready: Prepared, completion: Completion) -> dict[st
             looks,
             read_held_out(options, ready.opened, task, ready.cameras),
         )
-    write_page(folder, render_completion_page(folder))
+    write_completion_page(folder)
     return summary
 
 
@@ -263,11 +264,10 @@ def describe_result(summary: CompletionSummary, options: CompleteOptions) -> Ite
     yield f"{share} around the photographs: {before} before, {after} after."
     unused = [row for row in summary.held_out if not row.is_check]
     if unused:
-        mean = average_scores(unused)
         yield (
             f"Mean PSNR of {len(unused)} photographs that were not used: "
-            f"{format_number(mean.psnr_before)} dB before, "
-            f"{format_number(mean.psnr_after)} dB after."
+            f"{format_number(average(row.psnr_before for row in unused))} dB before, "
+            f"{format_number(average(row.psnr_after for row in unused))} dB after."
         )
     counts, seconds = summary.gaussians, summary.seconds["total"]
     yield (
@@ -275,6 +275,8 @@ def describe_result(summary: CompletionSummary, options: CompleteOptions) -> Ite
         f"{options.out / COMPLETED_FILE}"
     )
     yield f"Report: {options.out / REPORT_FILE}"
+    if options.video and summary.targets:
+        yield f"Video: {options.out / VIDEO_FILE}"
 
 
 def collect_cameras(options: CompleteOptions, opened: Opened, task: Task) -> dict[int, Camera]:

@@ -22,8 +22,6 @@ from gscompleter.apps.commands.options import (
     TablesOptions,
     parse_resolution,
 )
-from gscompleter.apps.report.evaluation_page import render_evaluation_page
-from gscompleter.apps.report.page import write_page
 from gscompleter.apps.warmup import compile_kernels
 from gscompleter.data.cases import Case, SkippedScene, filter_usable, open_clips, read_cases
 from gscompleter.data.formats import open_photographs
@@ -97,7 +95,7 @@ def run_tables(options: TablesOptions) -> None:
 def write_and_print_tables(
     out: Path, quiet: bool, with_fid: bool = False, num_rows: int = 0
 ) -> None:
-    """Write the tables, plots and page of an evaluation, and print the tables unless `quiet`.
+    """Write the tables and plots of an evaluation, and print the tables unless `quiet`.
 
     It repeats this if other shards added rows meanwhile and all `num_rows` are there.
     """
@@ -110,7 +108,6 @@ def write_and_print_tables(
                 plots.draw_plots(summary, out)
             except plots.PlotsNotAvailable as missing:
                 Console(stderr=True, quiet=quiet).print(str(missing), highlight=False)
-            write_page(out, render_evaluation_page(out))
         there = list_row_times(out)
     if not quiet:
         print_tables(summary, out)

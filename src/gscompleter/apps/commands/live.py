@@ -16,8 +16,7 @@ from gscompleter.apps.commands.options import (
     LiveOptions,
     parse_resolution,
 )
-from gscompleter.apps.inputs.opening import print_lines
-from gscompleter.apps.inputs.plan import describe_opening
+from gscompleter.apps.inputs.opening import describe_opening, print_lines
 from gscompleter.apps.live.session import Session
 from gscompleter.apps.report.completion import Target
 from gscompleter.data.scene import write_cameras
@@ -85,7 +84,7 @@ def make_complete_options(options: LiveOptions) -> CompleteOptions:
 def begin_session(ready: Prepared) -> Session:
     """Start the session."""
     origin, resolution = ready.opened.photographs.origin, parse_resolution(ready.options.resolution)
-    return Session(ready.completer, ready.begin(), ready.task.frame, origin, resolution)
+    return Session(ready.completer, (ready.begin(),), ready.task.frame, origin, resolution)
 
 
 def find_next_target(ready: Prepared, completion: Completion) -> Camera | None:
@@ -96,7 +95,7 @@ def find_next_target(ready: Prepared, completion: Completion) -> Camera | None:
 
 def save_session(ready: Prepared, session: Session) -> str:
     """Write the results of `complete`, in place of those saved before, and return a sentence."""
-    if not session.steps:
+    if not session.cameras:
         raise InputError("There is nothing to save; complete a hole first.")
     out = ready.options.out
     targets = [Target(result.target) for result in session.latest.targets]
@@ -104,5 +103,5 @@ def save_session(ready: Prepared, session: Session) -> str:
         write_done(
             folder, replace(ready, task=replace(ready.task, targets=targets)), session.latest
         )
-        write_cameras(folder / TARGETS_FILE, [step.camera for step in session.steps])
+        write_cameras(folder / TARGETS_FILE, session.cameras)
     return f"Saved in {quote_value(out)}."

@@ -352,10 +352,10 @@ class StripOptions(WritingOptions):
 
 @dataclass(frozen=True, kw_only=True)
 class ReportOptions(Options):
-    """Write report.html of a completion or an evaluation again."""
+    """Write report.html of a completion again."""
 
     out: Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="OUT")]
-    """Output folder of `complete`, `demo` or `evaluate`."""
+    """Output folder of `complete` or `demo`."""
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -32,14 +32,14 @@ def run_view(options: ViewOptions) -> None:
     if options.save is not None:
         check_page(options.save, options.overwrite)
     libraries = packages.load_libraries()
-    page = make_page(load_content(options), libraries)
-    for note in () if options.quiet else page.notes:
+    page, notes = make_page(load_content(options), libraries)
+    for note in () if options.quiet else notes:
         print(note)
     if options.save is None:
-        serve_page(options, page.html)
+        serve_page(options, page)
     else:
         with replace_file(options.save) as file:
-            file.write(page.html)
+            file.write(page)
 
 
 def check_page(path: Path, overwrite: bool) -> None:

@@ -15,7 +15,12 @@ from jaxtyping import Float, Int64
 from rich.console import Console
 from torch import Tensor
 
-from gscompleter.apps.commands.options import CompleteOptions, SceneOptions, parse_resolution
+from gscompleter.apps.commands.options import (
+    CompleteOptions,
+    SceneOptions,
+    get_max_targets,
+    parse_resolution,
+)
 from gscompleter.apps.inputs.selection import (
     CHECK_VIEW_SIZE,
     choose_context,
@@ -42,6 +47,8 @@ from gscompleter.memory import (
     check_memory,
     estimate_bytes,
     estimate_scene_bytes,
+    format_whole_gigabytes,
+    read_memory_bytes,
 )
 from gscompleter.reconstructors.features.depth_range import set_depth_range
 from gscompleter.render import Renderer, load_renderer
@@ -58,6 +65,8 @@ MIN_IMAGE_SIZE = 16
 """Smallest side of an image, in pixels."""
 SPLAT_EXTENSIONS = tuple(end for format in SPLAT_FORMATS.values() for end in format.extensions)
 FRAME_NUMBER = re.compile("-?[0-9]{1,9}")
+MAX_NAMED = 8
+"""Most frames or targets that a line names."""
 MAX_CHECK_VIEWS = 40
 """Most check views of an input splat, in addition to the context."""
 
@@ -346,6 +355,45 @@ def check_sides(cameras: Sequence[Camera]) -> None:
                 f"An image is {camera.width} x {camera.height} pixels, and both sides must have at "
                 f"least {MIN_IMAGE_SIZE}; choose a larger --resolution, or another camera."
             )
+
+
+def describe_task(options: CompleteOptions, opened: Opened, task: Task) -> list[str]:
+    """Write the four lines; the cameras of `task` have the working depth range."""
+    targets = join_names([name_target(target) for target in task.targets], MAX_NAMED)
+    found = f"up to {get_max_targets(options)} cameras that are found"
+    models = f"{options.reconstructor} and {options.synthesis.generator} on {task.device.type}"
+    needed = estimate_memory(task, task.scene if task.device.type == "cpu" else None)
+    available = read_memory_bytes()
+    of = "" if available is None else f" of {format_whole_gigabytes(available)}"
+    return [
+        *describe_opening(options, opened, task),
+        f"To do: complete the scene from frames {join_names(task.context_frames, MAX_NAMED)} for "
+        f"{targets or found} by {models}, written to {quote_value(options.out)}.",
+        f"Memory: up to {format_whole_gigabytes(needed)}{of}.",
+    ]
+
+
+def describe_opening(options: SceneOptions, opened: Opened, task: Task) -> list[str]:
+    """Write the lines on the opened scene."""
+    scene, camera, used = task.scene, task.views[0].camera, len(opened.photographs)
+    splat = ""
+    if scene is not None:
+        mode = "antialiased " if scene.is_antialiased else ""
+        name = quote_value(options.scene)
+        splat = f"; {name}, {len(scene):,} {mode}Gaussians of SH degree {scene.sh_degree}"
+    return [
+        f"Opened: {quote_value(options.folder)}, {opened.format}, {used} of "
+        f"{opened.num_photographs} photographs{splat}.",
+        f"Found: {task.frame_description.rstrip('.')}; depths from {camera.near:.3g} to "
+        f"{camera.far:.3g}; worked at {camera.width} x {camera.height} (--resolution changes it).",
+    ]
+
+
+def name_target(target: Target) -> str:
+    """Name a target for lines and tables."""
+    if target.derived_from is not None:
+        return f"target near {target.derived_from}"
+    return "a given camera" if target.frame is None else f"target {target.frame}"
 
 
 def print_lines(console: Console, *lines: str) -> None:

@@ -80,8 +80,8 @@ class Page:
         """Build the page; `find_hole` finds the camera with the most to gain, if there is one."""
         self.session, self.server = session, server
         self._find_hole, self._save = find_hole, save
-        self._first = session.initial.views[0].camera
-        self._photographs = cycle([view.camera for view in session.initial.views])
+        self._first = session.latest.views[0].camera
+        self._photographs = cycle([view.camera for view in session.latest.views])
         self._unit = compute_page_unit(self._first)
         self._requests: SimpleQueue[Callable[[], str]] = SimpleQueue()
         self._busy = Lock()
@@ -129,7 +129,7 @@ class Page:
     def undo(self, client: viser.ClientHandle) -> str:
         """Undo the last step."""
         self._change_session(undo_step(self.session))
-        return f"Undone. Completions left: {len(self.session.steps)}."
+        return f"Undone. Completions left: {len(self.session.cameras)}."
 
     def save(self, client: viser.ClientHandle) -> str:
         """Write the completed scene."""
@@ -145,7 +145,7 @@ class Page:
         scene, gui = self.server.scene, self.server.gui
         gui.configure_theme(dark_mode=True, show_logo=False, show_share_button=False)
         gui.set_panel_label("gscompleter live")
-        cameras = [view.camera for view in self.session.initial.views]
+        cameras = [view.camera for view in self.session.latest.views]
         scene.set_up_direction(estimate_up(cameras).numpy())
         self._set_initial_camera(camera_to_page(self._first, self._unit))
         self._status = gui.add_html("")

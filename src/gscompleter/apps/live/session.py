@@ -20,31 +20,24 @@ from gscompleter.types import Camera
 
 
 @dataclass(frozen=True)
-class CompletedStep:
-    """A completed target camera and the scene after it."""
-
-    camera: Camera
-    """Target camera in the frame of the photographs, as it is saved."""
-    completion: Completion
-
-
-@dataclass(frozen=True)
 class Session:
     """A scene with all steps that are not undone."""
 
     completer: GSCompleter
-    initial: Completion
+    completions: tuple[Completion, ...]
+    """The scene at first and after each step."""
     transform: Float[np.ndarray, "4 4"]
     """Similarity from the frame of the photographs to that of the result."""
     origin: Float[np.ndarray, "3"]
     """Local origin of the coordinates, in the frame of the photographs."""
     resolution: Resolution = None
-    steps: tuple[CompletedStep, ...] = ()
+    cameras: tuple[Camera, ...] = ()
+    """Target camera of each step in the frame of the photographs, as it is saved."""
 
     @property
     def latest(self) -> Completion:
         """The completion after the last step."""
-        return self.steps[-1].completion if self.steps else self.initial
+        return self.completions[-1]
 
 
 def complete_camera(session: Session, camera: Camera) -> tuple[Session, TargetResult]:
@@ -63,11 +56,13 @@ def complete_camera(session: Session, camera: Camera) -> tuple[Session, TargetRe
     result = completion.targets[-1]
     if not len(result.added) and not result.num_recolored:
         return session, result
-    return replace(session, steps=(*session.steps, CompletedStep(told, completion))), result
+    completions, cameras = (*session.completions, completion), (*session.cameras, told)
+    return replace(session, completions=completions, cameras=cameras), result
 
 
 def undo_step(session: Session) -> Session:
     """Remove the last step."""
-    if not session.steps:
+    if not session.cameras:
         raise InputError("There is nothing to undo; complete something first.")
-    return replace(session, steps=session.steps[:-1])
+    earlier, cameras = session.completions[:-1], session.cameras[:-1]
+    return replace(session, completions=earlier, cameras=cameras)

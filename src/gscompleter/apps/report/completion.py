@@ -15,16 +15,14 @@ from jaxtyping import Bool, Float, Int64
 from torch import Tensor
 
 from gscompleter import __version__
-from gscompleter.apps.report.charts import color_depth, compute_depth_limits, draw_scene
+from gscompleter.apps.report.charts import make_record
 from gscompleter.apps.report.schema import (
     RECORD_FILE,
     SCORES,
     AlignmentRow,
-    CompletionRecord,
     ContextRow,
     HeldOutRow,
-    PairsRow,
-    TargetRecord,
+    ScoreRow,
     TargetRow,
 )
 from gscompleter.evaluation.metrics.coverage import RenderPair, compute_coverage
@@ -42,9 +40,6 @@ from gscompleter.types import Camera, Gaussians, View, merge
 GENERATED_FILE = "generated.ply"
 MAX_PHOTOGRAPHS = 200
 """Largest number of photographs in the drawing and for the path of the video."""
-MAX_SURROUNDING_VIEWS = 6
-MIN_COLOR_CHANGE = 0.002
-"""Smallest mean colour difference, in [0, 1], of a changed image."""
 IGNORED_COLOR = (1.0, 0.0, 1.0)
 
 Scores = dict[str, float | None]
@@ -107,24 +102,21 @@ def write_report(
     """Write the scenes, `images/`, `report.json` and `summary.json`; return the summary.
 
     `completed.ply` keeps the layout of an input splat. `photographs` are the cameras of all, in the
-    frame of the result. `render_around` renders surrounding views, and is called last.
-
-    Raises:
-        InputError: if a file cannot be written.
+    frame of the result. `render_around` renders the views whose coverage is measured.
     """
     at_targets = [
         render_before_after(completion, result.target, renderer) for result in completion.targets
     ]
-    scores = {
+    rows: dict[str, Sequence[ScoreRow]] = {
         "held_out": score_held_out(completion, held_out, renderer),
         "context": score_context(completion, renderer),
         "targets": score_targets(completion, targets, at_targets),
     }
+    scores = {key: [asdict(row) for row in group] for key, group in rows.items()}
     write_scenes(folder, completion, input_splat)
     around = render_around()
-    shown = select_most_changed(around)
-    write_pictures(folder / "images", completion, targets, at_targets, shown)
-    record = make_record(completion, photographs, at_targets, shown)
+    write_pictures(folder / "images", completion, targets, at_targets)
+    record = make_record(completion, thin_evenly(photographs, MAX_PHOTOGRAPHS))
     (folder / RECORD_FILE).write_text(json.dumps(asdict(record)) + "\n")
     coverage = {"coverage": asdict(compute_coverage(around))} if around else {}
     counts = {**count_changes(completion), "seconds": dict(completion.seconds)}
@@ -166,21 +158,21 @@ def score_views(completion: Completion, views: Sequence[View], renderer: Rendere
 
 def score_held_out(
     completion: Completion, held_out: Sequence[HeldOut], renderer: Renderer
-) -> list[dict[str, Any]]:
+) -> list[HeldOutRow]:
     """Make the rows of held-out photographs."""
     scores = score_views(completion, [photograph.view for photograph in held_out], renderer)
     return [
-        asdict(HeldOutRow(photograph.view.frame, **found, is_check=photograph.is_check))
+        HeldOutRow(photograph.view.frame, **found, is_check=photograph.is_check)
         for photograph, found in zip(held_out, scores, strict=True)
     ]
 
 
-def score_context(completion: Completion, renderer: Renderer) -> list[dict[str, Any]]:
+def score_context(completion: Completion, renderer: Renderer) -> list[ContextRow]:
     """Make the rows of the context photographs."""
     views, gains = completion.views, completion.exposure_gains
     scores = score_views(completion, views, renderer)
     gain_rows = [None] * len(views) if gains is None else map(tuple, gains.tolist())
-    rows = (
+    return [
         ContextRow(
             view.frame,
             **found,
@@ -189,8 +181,7 @@ def score_context(completion: Completion, renderer: Renderer) -> list[dict[str, 
             ignored=compute_mask_fraction(view.ignore_mask),
         )
         for view, found, gain in zip(views, scores, gain_rows, strict=True)
-    )
-    return [asdict(row) for row in rows]
+    ]
 
 
 def compute_mask_fraction(mask: Bool[Tensor, "h w"] | None) -> float:
@@ -200,11 +191,11 @@ def compute_mask_fraction(mask: Bool[Tensor, "h w"] | None) -> float:
 
 def score_targets(
     completion: Completion, targets: Sequence[Target], pairs: Sequence[RenderPair]
-) -> list[dict[str, Any]]:
+) -> list[TargetRow]:
     """Make the rows of the targets."""
     scores = map_in_parallel(compute_scores, pairs, [target.view for target in targets])
     rows = zip(targets, completion.targets, scores, strict=True)
-    return [asdict(make_target_row(completion, *row)) for row in rows]
+    return [make_target_row(completion, *row) for row in rows]
 
 
 def make_target_row(
@@ -235,36 +226,6 @@ def count_changes(completion: Completion) -> dict[str, Any]:
         return {"gaussians": counts}
     counts["recolored"] = int(completion.recolored_mask.sum())
     return {"gaussians": counts, "new_photographs": completion.num_new_photos}
-
-
-def make_record(
-    completion: Completion,
-    photographs: Sequence[Camera],
-    at_targets: Sequence[RenderPair],
-    around: Sequence[RenderPair],
-) -> CompletionRecord:
-    """Collect what the page shows besides the summary and the images."""
-    drawing = draw_scene(completion, thin_evenly(photographs, MAX_PHOTOGRAPHS))
-    limits, pairs = map(compute_depth_limits, at_targets), map(round_pairs, completion.targets)
-    targets, coverages = map(TargetRecord, limits, pairs), (compute_coverage([p]) for p in around)
-    return CompletionRecord(len(photographs), drawing, tuple(targets), tuple(coverages))
-
-
-def round_pairs(result: TargetResult) -> PairsRow:
-    """Round the depth pairs of a target to six significant digits."""
-    pairs = result.affine.pairs
-    predicted, context = (
-        tuple(float(f"{depth:.6g}") for depth in depths.tolist())
-        for depths in (pairs.predicted, pairs.context)
-    )
-    return PairsRow(pairs.fit_view, predicted, context, tuple(pairs.inlier_mask.tolist()))
-
-
-def select_most_changed(pairs: Sequence[RenderPair]) -> list[RenderPair]:
-    """Select the views whose images changed most, in descending order."""
-    changes = [(pair.after.image - pair.before.image).abs().mean().item() for pair in pairs]
-    order = sorted(range(len(pairs)), key=changes.__getitem__, reverse=True)
-    return [pairs[i] for i in order[:MAX_SURROUNDING_VIEWS] if changes[i] >= MIN_COLOR_CHANGE]
 
 
 def thin_evenly(items: Sequence[Camera], most: int) -> Sequence[Camera]:
@@ -332,16 +293,12 @@ def write_pictures(
     completion: Completion,
     targets: Sequence[Target],
     at_targets: Sequence[RenderPair],
-    around: Sequence[RenderPair],
 ) -> None:
-    """Write `images/`: targets, surrounding views, and photographs with ignored regions."""
+    """Write `images/`: targets, and photographs with ignored regions."""
     folder.mkdir()
     results = zip(targets, completion.targets, at_targets, strict=True)
     for number, (target, result, pair) in enumerate(results, start=1):
         write_images(folder, f"target{number}", name_target_images(target, result, pair))
-    for number, pair in enumerate(around, start=1):
-        shown = {"before": pair.before.image, "after": pair.after.image}
-        write_images(folder, f"around{number}", shown)
     for number, view in enumerate(completion.views, start=1):
         if view.ignore_mask is not None:
             write_images(folder, f"context{number}", {"ignored": paint_ignored(view)})
@@ -351,12 +308,10 @@ def name_target_images(
     target: Target, result: TargetResult, pair: RenderPair
 ) -> dict[str, Tensor | None]:
     """Name the images of a target: colours [h, w, 3], grey or masks [h, w]."""
-    alpha, limits = result.trusted_alpha, compute_depth_limits(pair)
+    alpha = result.trusted_alpha
     return {
         "before": pair.before.image,
         "after": pair.after.image,
-        "depth_before": limits and color_depth(pair.before, limits),
-        "depth_after": limits and color_depth(pair.after, limits),
         "hole_mask": result.hole_mask.float(),
         "support": None if torch.equal(alpha, result.before.alpha) else alpha,
         "reference": None if result.reference is None else result.reference.image,

@@ -150,19 +150,11 @@ def follow_path(way: Sequence[Camera], count: int) -> list[Camera]:
 
     degree = min(3, len(way) - 1)
     poses = torch.stack([camera.c2w[:3, [0, 2, 3]] for camera in way]).double().cpu().numpy()
-    smooth = BSpline(place_knots(way, degree), poses, degree)
+    knots = np.pad(np.linspace(0, 1, len(way) - degree + 1), degree, mode="edge")
+    smooth = BSpline(knots, poses, degree)
     shares = np.linspace(0, 1, count + 1)
     eased = shares**2 * (3 - 2 * shares)  # zero speed at both ends
     return [make_camera(way[0], *pose.T) for pose in smooth(eased)]
-
-
-def place_knots(way: Sequence[Camera], degree: int) -> Float[np.ndarray, "k"]:
-    """Place the knots of a spline from 0 to 1 by the lengths of the steps of `way`."""
-    where = embed_cameras(way).double().cpu()
-    steps = (where[1:] - where[:-1]).norm(dim=1).clamp_min(1e-6)
-    lengths = np.array([0, *(steps.cumsum(dim=0) / steps.sum()).tolist()])
-    places = np.linspace(0, len(way) - 1, len(way) - degree + 1)
-    return np.pad(np.interp(places, range(len(way)), lengths), degree, mode="edge")
 
 
 def make_camera(

@@ -18,7 +18,6 @@ from PIL import Image
 
 from gscompleter import __version__
 from gscompleter.apps.report.plain_words import format_change, format_number, format_percent
-from gscompleter.io.files import replace_file
 from gscompleter.io.image import encode_jpeg, read_image_size, read_pixels
 
 REPORT_FILE = "report.html"
@@ -50,7 +49,8 @@ class Gallery:
         if self.scale < 1:
             width, height = (max(1, round(self.scale * side)) for side in image.size)
             image = image.resize((width, height), Image.Resampling.LANCZOS)
-        return Picture(alt, *image.size, encode_uri("image/jpeg", encode_jpeg(image, JPEG_QUALITY)))
+        content = base64.b64encode(encode_jpeg(image, JPEG_QUALITY)).decode()
+        return Picture(alt, *image.size, f"data:image/jpeg;base64,{content}")
 
     def has(self, name: str) -> bool:
         """Return True if there is an image of this name."""
@@ -64,11 +64,6 @@ def open_gallery(folder: Path) -> Gallery:
     return Gallery(folder, min(1.0, (MAX_PAGE_PIXELS / max(pixels, 1)) ** 0.5))
 
 
-def encode_uri(kind: str, content: bytes) -> str:
-    """Encode the content of a file as a data URI."""
-    return f"data:{kind};base64,{base64.b64encode(content).decode()}"
-
-
 def render_template(template: str, values: Mapping[str, object]) -> str:
     """Render a template with style and script."""
     environment = create_environment()
@@ -76,12 +71,6 @@ def render_template(template: str, values: Mapping[str, object]) -> str:
     digest = base64.b64encode(hashlib.sha256(script.encode()).digest()).decode()
     shared = {"version": __version__, "script": Markup(script), "digest": digest}
     return environment.get_template(template).render(**shared, **values)
-
-
-def write_page(folder: Path, page: str) -> None:
-    """Write `report.html`."""
-    with replace_file(folder / REPORT_FILE) as file:
-        file.write(page.encode())
 
 
 @cache

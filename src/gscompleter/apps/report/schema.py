@@ -3,9 +3,10 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
+from statistics import fmean
 from typing import Any, Literal, TypeVar
 
 from gscompleter.errors import InputError, quote_value
@@ -21,7 +22,6 @@ SCORES = ("psnr_before", "psnr_after", "ssim_before", "ssim_after")
 T = TypeVar("T")
 Vector = tuple[float, float, float]
 Row = tuple[float, float, float, float]
-"""Row of a transform."""
 
 
 @dataclass(frozen=True)
@@ -68,7 +68,6 @@ class TargetRow(ScoreRow):
     """Result at a target."""
 
     anchor: int | None
-    """Frame of the anchor."""
     anchor_fallback: bool
     hole_fraction: float
     affine: AlignmentRow
@@ -119,7 +118,6 @@ class CompletionSummary:
     scene: SceneRow
     frame: ResultFrame
     depth_range: Mapping[str, Any]
-    """Near and far plane in scene units."""
     coverage: Coverage
     context: tuple[ContextRow, ...]
     targets: tuple[TargetRow, ...]
@@ -132,26 +130,16 @@ class CompletionSummary:
 
 @dataclass(frozen=True)
 class PairsRow:
-    """Depth pairs of the alignment, in scene units."""
+    """Depth pairs of the alignment at a target."""
 
     seen_from: Literal["anchor", "target"]
-    predicted: tuple[float, ...]
-    context: tuple[float, ...]
-    agrees: tuple[bool, ...]
+    points: tuple[tuple[float, float, bool], ...]
+    """Lifted depth and scene depth, in scene units, and True for an inlier."""
 
 
 @dataclass(frozen=True)
-class TargetRecord:
-    """Data of a target."""
-
-    depth_limits: tuple[float, float] | None
-    """z-depths at the ends of the colours, in scene units."""
-    pairs: PairsRow | None
-
-
-@dataclass(frozen=True)
-class SceneDrawing:
-    """Cameras as lines and scenes as points, which the page rotates.
+class CompletionRecord:
+    """All of `report.json`: cameras as lines, and depth pairs by target.
 
     Each text has the coordinates x y z of its points: right, up and back from the middle, in units
     of the radius.
@@ -160,47 +148,40 @@ class SceneDrawing:
     photographs: tuple[str, ...]
     context: tuple[str, ...]
     targets: tuple[str, ...]
-    scene: tuple[str, ...]
-    added: tuple[str, ...]
-
-
-@dataclass(frozen=True)
-class CompletionRecord:
-    """All of `report.json`: what a report shows besides the summary and the images."""
-
-    num_photographs: int
-    drawing: SceneDrawing
-    targets: tuple[TargetRecord, ...]
-    around: tuple[Coverage, ...]
-    """Coverage of each surrounding view."""
+    pairs: tuple[PairsRow, ...]
 
 
 def read_summary(folder: Path) -> CompletionSummary:
     """Read `summary.json`; raise an InputError if it is missing or damaged."""
-    path = find_result(folder, SUMMARY_FILE)
-    return parse_content(CompletionSummary, read_json(path, ADVICE), path)
+    return parse_content(
+        CompletionSummary, read_result(folder / SUMMARY_FILE), folder / SUMMARY_FILE
+    )
 
 
 def read_record(folder: Path, summary: CompletionSummary) -> CompletionRecord:
     """Read `report.json`; raise an InputError if it does not fit the summary."""
-    path = find_result(folder, RECORD_FILE)
-    record = parse_content(CompletionRecord, read_json(path, ADVICE), path)
-    sizes = len(record.targets), len(record.drawing.targets), len(record.drawing.context)
+    path = folder / RECORD_FILE
+    record = parse_content(CompletionRecord, read_result(path), path)
+    sizes = len(record.pairs), len(record.targets), len(record.context)
     if sizes != (len(summary.targets), len(summary.targets), len(summary.context)):
         raise InputError(f"{quote_value(path)} does not fit {SUMMARY_FILE} beside it; {ADVICE}.")
     return record
 
 
-def find_result(folder: Path, name: str) -> Path:
-    """Find the file `name` in `folder`; raise an InputError if there is none."""
-    if not os.path.isdir(folder):
-        raise InputError(f"There is no folder {quote_value(folder)}; name one with results.")
-    if not os.path.isfile(folder / name):
+def average(values: Iterable[float | None]) -> float | None:
+    """Average the scores that there are; None without any."""
+    known = [value for value in values if value is not None]
+    return fmean(known) if known else None
+
+
+def read_result(path: Path) -> Any:
+    """Read a JSON file of a completion."""
+    if not os.path.isfile(path):
         raise InputError(
-            f"{quote_value(folder)} has no {name}; name the output folder of a completion or an "
-            "evaluation."
+            f"{quote_value(path.parent)} has no {path.name}; name the output folder of a "
+            "completion."
         )
-    return folder / name
+    return read_json(path, ADVICE)
 
 
 def parse_content(kind: type[T], content: Any, path: Path) -> T:

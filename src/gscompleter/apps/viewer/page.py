@@ -67,15 +67,6 @@ class PageFrame:
         return replace(camera, c2w=c2w, K=camera.K.double())
 
 
-@dataclass(frozen=True)
-class Page:
-    """A page to write or serve."""
-
-    html: bytes
-    notes: tuple[str, ...]
-    """Sentences on missing or changed content."""
-
-
 def compute_page_frame(gaussians: Gaussians) -> PageFrame:
     """Compute the page's frame from the median position and spread of Gaussians."""
     means = gaussians.means.double().cpu()
@@ -85,8 +76,8 @@ def compute_page_frame(gaussians: Gaussians) -> PageFrame:
     return PageFrame(centre, 2.0**power)
 
 
-def make_page(viewer_content: ViewerContent, libraries: Libraries) -> Page:
-    """Make the page; the same values give the same bytes."""
+def make_page(viewer_content: ViewerContent, libraries: Libraries) -> tuple[bytes, tuple[str, ...]]:
+    """Make the page, and sentences on missing content; the same values give the same bytes."""
     frame = compute_page_frame(viewer_content.after)
     layers = {
         name: frame.normalize(part.to("cpu")) for name, part in split_layers(viewer_content).items()
@@ -114,7 +105,7 @@ def make_page(viewer_content: ViewerContent, libraries: Libraries) -> Page:
     omitted = sum(len(layers[name]) - len(shown[name]) for name in ("observed", "generated"))
     notes = (f"{omitted:,} Gaussians are too far away to be shown.",) if omitted else ()
     page = fill_template(content, make_scripts(sources))
-    return Page(page.encode(), (*viewer_content.notes, *notes))
+    return page.encode(), (*viewer_content.notes, *notes)
 
 
 def split_layers(viewer_content: ViewerContent) -> dict[str, Gaussians]:

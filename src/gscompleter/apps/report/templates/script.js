@@ -25,8 +25,7 @@ for (const space of document.querySelectorAll(".turning")) {
     };
     for (const { part, points } of parts) {
       const drawn = points.map(project);
-      const names = { circle: ["cx", "cy"], text: ["x", "y"] }[part.tagName];
-      if (names) names.forEach((name, k) => part.setAttribute(name, drawn[0][k]));
+      if (part.tagName === "text") ["x", "y"].forEach((name, k) => part.setAttribute(name, drawn[0][k]));
       else part.setAttribute("points", drawn.map((point) => point.join(",")).join(" "));
     }
   };
