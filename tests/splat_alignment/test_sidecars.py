@@ -233,8 +233,8 @@ def test_little_of_a_flat_wall_is_no_sign():
 def test_details_that_are_off_are_told():
     off = SplatAlignment("given", np.eye(4), fit_of(5.0, 5.0, drift=4.2), fit_of())
     assert off.describe() == (
-        "The splat fits the photographs as it is, at 15.0 dB; but details are off by 4.2 px in "
-        "images of 320 px."
+        "The splat as it is fits the photographs at 15.0 dB; details are off by "
+        "4.2 px in images of 320 px."
     )
 
 

@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+import struct
+import zipfile
+import zlib
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
@@ -10,6 +13,7 @@ import numpy as np
 import torch
 from jaxtyping import Float, Integer, UInt32
 from numpy import ndarray
+from PIL import Image
 
 from gscompleter.errors import InputError, quote_value
 from gscompleter.types import SH_C0, Gaussians, make_observed
@@ -22,6 +26,14 @@ MAX_DEFECT = 120
 """Most characters of the description of a defect."""
 MAX_GROWTH = 256
 """Largest ratio of unpacked to packed size. Real files reach 2, real images 10."""
+DECODING_ERRORS = (
+    *(ArithmeticError, EOFError, LookupError, MemoryError, OSError, RecursionError, ValueError),
+    *(NotImplementedError, struct.error, zipfile.BadZipFile, zlib.error),
+    Image.DecompressionBombError,
+)
+"""Errors that decoders raise on damaged bytes."""
+JSON_ERRORS = (AttributeError, TypeError)
+"""Errors by JSON whose values are of another type."""
 
 
 def unpack_fractions(packed: UInt32[ndarray, "n"], widths: Sequence[int]) -> Float[ndarray, "n k"]:
@@ -76,17 +88,13 @@ def check_growth(unpacked: int, packed: int, max_growth: int = MAX_GROWTH) -> No
 
 
 @contextmanager
-def refuse_damage(path: Path) -> Iterator[None]:
-    """Raise InputError for whatever goes wrong while the contents of a file are decoded.
-
-    Readers raise ValueError for what they find wrong. Damaged bytes fail in many further ways, in
-    numpy, zlib, zipfile, Pillow and others.
-    """
+def refuse_damage(path: Path, errors: tuple[type[Exception], ...]) -> Iterator[None]:
+    """Raise InputError for `errors` while the contents of a file are decoded."""
     try:
         yield
     except InputError:
         raise
-    except Exception as error:
+    except errors as error:
         raise InputError(
             f"{quote_value(path)} cannot be read: {quote_value(str(error), MAX_DEFECT)}; fetch the "
             "file again, or export it as .ply."

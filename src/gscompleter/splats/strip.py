@@ -38,9 +38,6 @@ def strip(path: Path, out: Path) -> tuple[int, int]:
 
     If both are .ply, the layout of the file is kept. Returns the numbers of Gaussians written and
     left out.
-
-    Raises:
-        InputError: All Gaussians are generated, or a file cannot be read or written.
     """
     completed, layout = load_splat(path), find_layout(path)
     given = drop_sh_padding(completed)
