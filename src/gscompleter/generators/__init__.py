@@ -110,16 +110,14 @@ def load_generator(
     return load(settings, seed, photographs, device)
 
 
-def _load_warp_inpaint(
-    settings: GeneratorSettings, seed: int, photographs: Sequence[View], device: str
-) -> Generator:
+def _load_warp_inpaint(settings: GeneratorSettings, seed: int, *_: Any) -> Generator:
     from gscompleter.generators.warp_inpaint import WarpInpaint
 
     return FunctionGenerator(WarpInpaint(seed))
 
 
 def _load_oracle(
-    settings: GeneratorSettings, seed: int, photographs: Sequence[View], device: str
+    settings: GeneratorSettings, seed: int, photographs: Sequence[View], *_: Any
 ) -> Generator:
     """Load the Φ that returns the photograph of the target camera, which cannot be padded."""
 

@@ -19,7 +19,7 @@ from gscompleter.render import Renderer
 from gscompleter.render.lod import build_proxy, thin_gaussians
 from gscompleter.splat_alignment.fit import SplatFit, score_splat
 from gscompleter.splat_alignment.matching import (
-    extract_photo_features,
+    extract_view_features,
     refine_similarity,
     search_similarities,
 )
@@ -173,7 +173,7 @@ def align_by_features(
     data: AlignmentData, best: SplatAlignment, points: Points | None
 ) -> SplatAlignment:
     """Improve an alignment by image features; without a match, search from all directions."""
-    photographs = extract_photo_features(data.views)
+    photographs = [(view.camera, extract_view_features(view)) for view in data.views]
     if best.fit.is_match:
         starts: Iterable[Matrix] = [best.transform]
     else:

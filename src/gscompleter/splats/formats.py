@@ -8,6 +8,9 @@ from __future__ import annotations
 import contextlib
 import hashlib
 import json
+import struct
+import zipfile
+import zlib
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from itertools import groupby
@@ -16,6 +19,7 @@ from pathlib import Path
 import numpy as np
 import torch
 from jaxtyping import UInt8
+from PIL import Image
 from torch import Tensor
 
 from gscompleter.errors import InputError, quote_value, refuse_pointer
@@ -26,7 +30,6 @@ from gscompleter.splats.compressed_ply import read_compressed_ply, write_compres
 from gscompleter.splats.glb import read_glb
 from gscompleter.splats.ksplat import read_ksplat
 from gscompleter.splats.morton import sort_along_morton
-from gscompleter.splats.packing import DECODING_ERRORS, JSON_ERRORS, refuse_damage
 from gscompleter.splats.ply import load_ply, require_finite, save_ply
 from gscompleter.splats.sog import META, ZIP_MAGIC, read_sog
 from gscompleter.splats.splat import read_splat, write_splat
@@ -35,6 +38,16 @@ from gscompleter.types import Gaussians
 
 OPACITY_TOLERANCE = 1e-3
 """Distance from [0, 1] up to which an opacity is clamped instead of refused."""
+DECODING_ERRORS = (
+    *(ArithmeticError, EOFError, LookupError, MemoryError, OSError, RecursionError, ValueError),
+    *(NotImplementedError, struct.error, zipfile.BadZipFile, zlib.error),
+    Image.DecompressionBombError,
+)
+"""Errors that decoders raise on damaged bytes."""
+JSON_ERRORS = (AttributeError, TypeError)
+"""Errors by JSON whose values are of another type."""
+MAX_DEFECT = 120
+"""Most characters of the description of a defect."""
 HEAD_BYTES = 8192
 """Bytes read to detect a format; the header of a compressed .ply fits."""
 COMPRESSED_PROPERTY = b"packed_position"
@@ -78,9 +91,16 @@ def load_splat(path: Path | str, drop_nonfinite: bool = False) -> Gaussians:
     if name == "ply":
         return load_ply(path, drop_nonfinite)
     errors = (*DECODING_ERRORS, *(JSON_ERRORS if name in ("sog", "glb") else ()))
-    # Infinite values are refused below.
-    with refuse_damage(path, errors), np.errstate(over="ignore", invalid="ignore"):
-        gaussians = FORMATS[name].read(path)
+    try:
+        with np.errstate(over="ignore", invalid="ignore"):  # infinite values are refused below
+            gaussians = FORMATS[name].read(path)
+    except InputError:
+        raise
+    except errors as error:
+        raise InputError(
+            f"{quote_value(path)} cannot be read: {quote_value(str(error), MAX_DEFECT)}; fetch the "
+            "file again, or export it as .ply."
+        ) from error
     labelled = replace(gaussians, generated=load_labels(path, len(gaussians)))
     return require_finite(validate_ranges(labelled, path), path, drop_nonfinite)
 

@@ -2,38 +2,22 @@
 
 from __future__ import annotations
 
-import struct
-import zipfile
-import zlib
-from collections.abc import Iterator, Sequence
-from contextlib import contextmanager
-from pathlib import Path
+from collections.abc import Sequence
 
 import numpy as np
 import torch
 from jaxtyping import Float, Integer, UInt32
 from numpy import ndarray
-from PIL import Image
 
-from gscompleter.errors import InputError, quote_value
+from gscompleter.errors import quote_value
 from gscompleter.types import SH_C0, Gaussians, make_observed
 
 NUM_SH_REST = (0, 3, 8, 15)
 """SH coefficients per channel above degree 0, by degree."""
 MIN_ALLOWED_BYTES = 1 << 20
 """Unpacked size in bytes that is allowed for any file, however small."""
-MAX_DEFECT = 120
-"""Most characters of the description of a defect."""
 MAX_GROWTH = 256
 """Largest ratio of unpacked to packed size. Real files reach 2, real images 10."""
-DECODING_ERRORS = (
-    *(ArithmeticError, EOFError, LookupError, MemoryError, OSError, RecursionError, ValueError),
-    *(NotImplementedError, struct.error, zipfile.BadZipFile, zlib.error),
-    Image.DecompressionBombError,
-)
-"""Errors that decoders raise on damaged bytes."""
-JSON_ERRORS = (AttributeError, TypeError)
-"""Errors by JSON whose values are of another type."""
 
 
 def unpack_fractions(packed: UInt32[ndarray, "n"], widths: Sequence[int]) -> Float[ndarray, "n k"]:
@@ -85,20 +69,6 @@ def check_growth(unpacked: int, packed: int, max_growth: int = MAX_GROWTH) -> No
     """Raise ValueError if data claim to unpack to over `max_growth` times their size in bytes."""
     if unpacked > MIN_ALLOWED_BYTES + max_growth * packed:
         raise ValueError(f"its {packed:,} bytes claim to hold {quote_value(f'{unpacked:,}')}")
-
-
-@contextmanager
-def refuse_damage(path: Path, errors: tuple[type[Exception], ...]) -> Iterator[None]:
-    """Raise InputError for `errors` while the contents of a file are decoded."""
-    try:
-        yield
-    except InputError:
-        raise
-    except errors as error:
-        raise InputError(
-            f"{quote_value(path)} cannot be read: {quote_value(str(error), MAX_DEFECT)}; fetch the "
-            "file again, or export it as .ply."
-        ) from error
 
 
 def build_gaussians(

@@ -16,7 +16,7 @@ from gscompleter.splats.formats import (
     load_splat,
     save_splat,
 )
-from gscompleter.splats.strip import strip
+from gscompleter.splats.layout import strip
 
 
 def run_convert(options: ConvertOptions) -> None:
