@@ -124,7 +124,7 @@ def split_sequence(num_frames: int, k: int, steps: int = MAX_TARGET_ID) -> tuple
     return (Split((0, k), targets, is_sequence=True),) if targets else ()
 
 
-FRAME_RULES = {
+FRAME_RULES: dict[str, Callable[..., tuple[Split, ...]]] = {
     "n-([0-9]{1,6})(?:-stride-([0-9]{1,6}))?": extrapolate,
     "sequence-([0-9]{1,6})(?:-steps-([0-9]{1,6}))?": split_sequence,
     "stress": split_stress_test,

@@ -40,8 +40,8 @@ from gscompleter.timing import STAGES
 Fids = dict[str, float] | str
 """The Fréchet inception distance of each method, or the reason why there is none."""
 
-RANKS = (*METHODS, "reconstruct", *STAGES, "optimize")
-"""Order of methods in the tables, and of stages."""
+ORDER = ("reconstruct", *STAGES, "optimize")
+"""Order of stages in the tables."""
 FEW_PIXELS_NOTE = f"A geometry score counts if it is measured over at least {MIN_PIXELS} pixels."
 REGGS_NOTE = (
     "reggs gets our metric lift and the true poses. RegGS in its paper gets neither, so this "
@@ -115,7 +115,7 @@ class RunSummary:
         if not rows:
             return {}
         steps = [step["seconds"] for row in rows for step in row["steps"]]
-        stages = sorted({stage for step in steps for stage in step}, key=rank_name)
+        stages = sorted({stage for step in steps for stage in step}, key=rank_stage)
         medians = {s: statistics.median(step.get(s, 0.0) for step in steps) for s in stages}
         return {"reconstruct": statistics.median(r["reconstruct_seconds"] for r in rows), **medians}
 
@@ -139,16 +139,21 @@ def read_rows(out: Path) -> list[RunRow]:
     return list(rows.values())
 
 
-def rank_name(name: str) -> tuple[int, str]:
-    """Return the sort key of a method or stage in tables, unknown names last."""
-    return (RANKS.index(name) if name in RANKS else len(RANKS), name)
+def rank_method(method: str) -> tuple[int, str]:
+    """Return the sort key of a method in tables, unknown ones last."""
+    return ([*METHODS, method].index(method), method)
+
+
+def rank_stage(stage: str) -> tuple[int, str]:
+    """Return the sort key of a stage in tables, unknown ones last."""
+    return ([*ORDER, stage].index(stage), stage)
 
 
 def summarize_run(rows: Sequence[RunRow]) -> RunSummary:
     """Average over the tasks that all methods finished, for a fair comparison."""
-    rows = sorted(rows, key=lambda row: (row["task"]["name"], rank_name(row["method"])))
+    rows = sorted(rows, key=lambda row: (row["task"]["name"], rank_method(row["method"])))
     found = {(row["task"]["name"], row["method"]): row for row in rows}
-    methods = tuple(sorted({method for _, method in found}, key=rank_name))
+    methods = tuple(sorted({method for _, method in found}, key=rank_method))
     tasks = tuple(dict.fromkeys(task for task, _ in found))
     done = {pair: row for pair, row in found.items() if row["error"] is None}
     common = tuple(task for task in tasks if all((task, method) in done for method in methods))
@@ -320,7 +325,7 @@ def collect_method_scores(summary: RunSummary, method: str) -> dict[str, Any]:
 def format_timing_markdown(summary: RunSummary) -> str:
     """Format median seconds by stage and peak memory."""
     seconds = {method: summary.compute_seconds(method) for method in summary.methods}
-    stages = sorted({stage for found in seconds.values() for stage in found}, key=rank_name)
+    stages = sorted({stage for found in seconds.values() for stage in found}, key=rank_stage)
     rows = []
     for method, found in seconds.items():
         peak = summary.find_peak_bytes(method)
