@@ -174,7 +174,7 @@ def test_a_splat_in_the_map_of_its_photographs_is_told_from_their_origin(splat):
 
 @pytest.mark.parametrize("place", [(3000.0, 1000.0, 0.0), (0.0, 0.0, 0.0)])
 def test_a_result_is_relative_to_an_origin_where_the_splat_lies_there(
-    room, splat, place, tmp_path, monkeypatch, capsys
+    room, splat, place, tmp_path, monkeypatch
 ):
     put_on_map(room, (3000.0, 1000.0, 0.0))
     here = make_similarity(1.0, np.eye(3), np.array(place)) @ ARBITRARY
@@ -189,8 +189,6 @@ def test_a_result_is_relative_to_an_origin_where_the_splat_lies_there(
     moved_by = load_ply(given).means - load_ply(out / "context.ply").means
     assert np.allclose(moved_by, frame["origin"], atol=1e-3)
     assert any(frame["origin"]) == any(place)
-    told = f"origin at {' '.join(map(str, frame['origin']))};"
-    assert (told in capsys.readouterr().out) == any(place)
 
 
 def test_floaters_kilometres_away_change_nothing(splat, room, tmp_path):
