@@ -49,10 +49,11 @@ def find_superfluous(
     removable = find_removable(scene, removable, views, renderer, config) & (scene.generated == 0)
     removable = find_removable(scene, removable, views, renderer, config) & removable
     checks = [*views, *map(halve_view, views)]
-    allowed = [
-        add_psnr_loss(compute_scene_error(scene, view, renderer).item(), config.tolerance)
-        for view in checks
-    ]
+    allowed = []
+    for view in checks:
+        image = view.fill_ignored(renderer.render(scene, view.camera).image)
+        error = compute_squared_error(image, view.image).item()
+        allowed.append(add_psnr_loss(error, config.tolerance))
     return exclude_needed(scene, removable, checks, allowed, renderer)
 
 
@@ -166,9 +167,3 @@ def find_needed(
             torch.where(absent, -gradient * opacities, 0.0), error - max_error
         )
     return back | (missing & (gradient != 0))
-
-
-def compute_scene_error(scene: Gaussians, view: View, renderer: Renderer) -> Float[Tensor, ""]:
-    """Compute the mean squared error of the scene against a photograph."""
-    image = renderer.render(scene, view.camera).image
-    return compute_squared_error(view.fill_ignored(image), view.image)

@@ -10,7 +10,6 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
-from gscompleter.io.json_file import read_json
 from torch import Tensor
 
 from command import run
@@ -21,6 +20,7 @@ from gscompleter.data.photographs import Photographs
 from gscompleter.data.scene import write_cameras
 from gscompleter.evaluation.protocols import make_tasks, parse_protocol
 from gscompleter.io.image import read_image, write_image
+from gscompleter.io.reading import read_json
 from gscompleter.reconstructors import load_reconstructor
 from gscompleter.reconstructors.features.matches import detect_features
 from gscompleter.reconstructors.features.stereo_image import make_stereo_images

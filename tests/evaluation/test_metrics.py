@@ -27,8 +27,13 @@ from gscompleter.evaluation.metrics.image import (
     psnr,
     ssim,
 )
-from gscompleter.evaluation.metrics.learned import compute_fid, compute_lpips, load_lpips
-from gscompleter.evaluation.metrics.perceptual import compute_flip_map, haarpsi
+from gscompleter.evaluation.metrics.perceptual import (
+    compute_fid,
+    compute_flip_map,
+    compute_lpips,
+    haarpsi,
+    load_lpips,
+)
 from gscompleter.evaluation.metrics.scores import (
     Truth,
     measure_part,

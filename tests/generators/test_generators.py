@@ -10,7 +10,6 @@ import torch
 from gscompleter import InputError, load_generator, load_renderer
 from gscompleter.evaluation.metrics.image import psnr
 from gscompleter.generators.exposure import match_exposures
-from gscompleter.generators.oracle import make_oracle
 from gscompleter.generators.smooth import compute_distance_to_known, continue_smoothly
 from gscompleter.generators.warp import WarpedImage, warp_photographs
 from gscompleter.generators.warp_inpaint import WarpInpaint, fill_background_first, remove_cracks
@@ -253,11 +252,15 @@ def test_the_oracle_returns_the_photograph_and_refuses_without_one():
     photograph = view_of(Room(), TARGET)
     context = known_room()
     image = answer(
-        make_oracle([*context.views, photograph]), context.views[0], TARGET, context
+        load_generator("oracle", photographs=[*context.views, photograph]),
+        context.views[0],
+        TARGET,
+        context,
     ).image
     assert torch.equal(image, photograph.image)
     with pytest.raises(InputError, match="photograph"):
-        answer(make_oracle(context.views), context.views[0], TARGET, context)
+        oracle = load_generator("oracle", photographs=context.views)
+        answer(oracle, context.views[0], TARGET, context)
 
 
 def test_an_unknown_generator_is_refused():

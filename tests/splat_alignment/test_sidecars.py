@@ -174,7 +174,7 @@ def test_a_splat_in_the_map_of_its_photographs_is_told_from_their_origin(splat):
 
 @pytest.mark.parametrize("place", [(3000.0, 1000.0, 0.0), (0.0, 0.0, 0.0)])
 def test_a_result_is_relative_to_an_origin_where_the_splat_lies_there(
-    room, splat, place, tmp_path, monkeypatch, capsys
+    room, splat, place, tmp_path, monkeypatch
 ):
     put_on_map(room, (3000.0, 1000.0, 0.0))
     here = make_similarity(1.0, np.eye(3), np.array(place)) @ ARBITRARY
@@ -232,8 +232,8 @@ def test_little_of_a_flat_wall_is_no_sign():
 def test_details_that_are_off_are_told():
     off = SplatAlignment("given", np.eye(4), fit_of(5.0, 5.0, drift=4.2), fit_of())
     assert off.describe() == (
-        "The splat fits the photographs as it is, at 15.0 dB; but details are off by 4.2 px in "
-        "images of 320 px."
+        "The splat as it is fits the photographs at 15.0 dB; details are off by "
+        "4.2 px in images of 320 px."
     )
 
 

@@ -10,8 +10,7 @@ import torch
 
 from command import run
 from gscompleter import Gaussians, load_ply, load_splat, merge, save_ply, save_splat
-from gscompleter.splats.layout import save_like
-from gscompleter.splats.strip import save_removed
+from gscompleter.splats.layout import save_like, save_removed
 from scenes import labelled, random_gaussians
 
 

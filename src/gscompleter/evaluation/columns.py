@@ -67,25 +67,31 @@ def find_number(step: StepRow, path: str) -> Any:
     return found
 
 
-def _make_gain(key: str, title: str, path: str, reduce: Reduction = statistics.fmean) -> Column:
-    """Make a column of changes by the completion."""
-    return Column(key, title, 2, f"{path}.after", f"{path}.before", reduce, reduce)
-
-
 def _make_median(key: str, title: str, digits: int, path: str) -> Column:
     """Make a column of medians over the tasks."""
     return Column(key, title, digits, path, reduce_tasks=statistics.median)
 
 
 def _make_geometry(
-    key: str, title: str, path: str, digits: int = 4, reduce: Reduction = statistics.median
+    key: str, title: str, path: str, digits: int = 3, reduce: Reduction = statistics.median
 ) -> Column:
     """Make a column of a number of an `Agreement`."""
     pixels = f"{path.split('.')[0]}.pixels"
     return Column(key, title, digits, path, reduce_tasks=reduce, pixels=pixels)
 
 
+def _make_agreements(path: str, title: str, key: str = "registered") -> tuple[Column, ...]:
+    """Make the columns of an `Agreement` with the context."""
+    numbers = (("abs_rel", "AbsRel", 4), ("chamfer", "Chamfer", 4), ("f_score", "F-score", 3))
+    return tuple(
+        _make_geometry(f"{key}_{name}_median", f"{of} {title} (median)", f"{path}.{name}", digits)
+        for name, of, digits in numbers
+    )
+
+
 BEFORE, AFTER = "target_before.psnr", "target_after.psnr"
+NEAR_BEFORE, NEAR_AFTER = "neighbours_psnr.before", "neighbours_psnr.after"
+SEEN_BEFORE, SEEN_AFTER = "context_psnr.before", "context_psnr.after"
 PSNR_BEFORE = Column("psnr_before", "PSNR before", 2, BEFORE)
 PSNR = Column("psnr", "PSNR", 2, AFTER)
 GAIN = Column("gain", "ΔPSNR", 2, AFTER, BEFORE)
@@ -100,11 +106,11 @@ GROUPS = {
         Column("lpips_alex", "LPIPS (Alex)", 3, "target_after.lpips_alex"),
         Column("hole_psnr", "PSNR (hole)", 2, "hole.psnr"),
         Column("observed_psnr", "PSNR (observed)", 2, "observed.psnr"),
-        Column("neighbours", "PSNR (neighbour views)", 2, "neighbours_psnr.after"),
-        _make_gain("neighbours_gain", "ΔPSNR (neighbour views)", "neighbours_psnr"),
-        Column("context", "PSNR (context)", 2, "context_psnr.after"),
+        Column("neighbours", "PSNR (neighbour views)", 2, NEAR_AFTER),
+        Column("neighbours_gain", "ΔPSNR (neighbour views)", 2, NEAR_AFTER, NEAR_BEFORE),
+        Column("context", "PSNR (context)", 2, SEEN_AFTER),
         Column("context_ssim", "SSIM (context)", 3, "context_ssim.after"),
-        _make_gain("context_change", "min ΔPSNR (context)", "context_psnr", min),
+        Column("context_change", "min ΔPSNR (context)", 2, SEEN_AFTER, SEEN_BEFORE, min, min),
     ),
     # 0 is the best FLIP, 1 the best HaarPSI, and 1 the gradient energy of the photograph. That is a
     # median, since a flat photograph gives arbitrary ratios.
@@ -120,10 +126,12 @@ GROUPS = {
     ),
     "Geometry": (
         _make_geometry(
-            "depth_observed", "AbsRel observed", "depth_observed.abs_rel", 3, statistics.fmean
+            "depth_observed", "AbsRel observed", "depth_observed.abs_rel", reduce=statistics.fmean
         ),
-        _make_geometry("depth_hole", "AbsRel in holes", "depth_hole.abs_rel", 3, statistics.fmean),
-        _make_geometry("depth_hole_median", "AbsRel in holes (median)", "depth_hole.abs_rel", 3),
+        _make_geometry(
+            "depth_hole", "AbsRel in holes", "depth_hole.abs_rel", reduce=statistics.fmean
+        ),
+        _make_geometry("depth_hole_median", "AbsRel in holes (median)", "depth_hole.abs_rel"),
     ),
     # All are medians over the cases; lengths are relative to the depth.
     "Geometry of added Gaussians": (
@@ -131,22 +139,10 @@ GROUPS = {
             _make_median("depth_rim_median", "depth step at seam (median)", 4, "seam_step"),
             pixels="added.pixels",
         ),
-        _make_geometry("align_abs_rel_median", "AbsRel to context (median)", "added.abs_rel"),
-        _make_geometry("align_chamfer_median", "Chamfer to context (median)", "added.chamfer"),
-        _make_geometry("align_f_score_median", "F-score to context (median)", "added.f_score", 3),
+        *_make_agreements("added", "to context", "align"),
     ),
     # The same after registration, before the hole filter.
-    "Geometry of all lifted Gaussians": (
-        _make_geometry(
-            "registered_abs_rel_median", "AbsRel of all lifted (median)", "registered.abs_rel"
-        ),
-        _make_geometry(
-            "registered_chamfer_median", "Chamfer of all lifted (median)", "registered.chamfer"
-        ),
-        _make_geometry(
-            "registered_f_score_median", "F-score of all lifted (median)", "registered.f_score", 3
-        ),
-    ),
+    "Geometry of all lifted Gaussians": _make_agreements("registered", "of all lifted"),
     "Sequences": (
         PSNR_BEFORE,
         Column("psnr_end", "PSNR at the end", 2, "psnr_end"),

@@ -49,13 +49,14 @@ class Prediction:
     """The scene that a method leaves for one target."""
 
     scene: Gaussians
-    """The scene after the method has run."""
     added: Gaussians | None
     """Gaussians that the method added, or None if it changed existing ones."""
     seconds: Mapping[str, float]
     """Wall time by stage, without the reconstruction of the context, and `total`."""
     anchor: int | None = None
     """Index of the anchor view, or None for a method that lifts nothing."""
+    anchor_fallback: bool = False
+    """True if all views were rotated too far and the least rotated one was chosen."""
     registered: Gaussians | None = None
     """All lifted Gaussians after registration and before filtering; None if nothing is lifted."""
     peak_bytes: int | None = None
@@ -79,7 +80,9 @@ def make_completion_method(config: str) -> Method:
         views = [replace(view, dynamic_mask=None) for view in state.views]  # another config's
         done = completer.advance(completer.begin(views, state.scene), target)
         (made,) = done.targets
-        return Prediction(done.scene, made.added, done.seconds, made.anchor, made.registered)
+        return Prediction(
+            done.scene, made.added, done.seconds, made.anchor, made.anchor_fallback, made.registered
+        )
 
     return method
 
@@ -119,7 +122,7 @@ def complete_by_similarity(state: Completion, target: Camera, models: Models) ->
                 pair.gaussians, state.scene, reference, models.renderer, models.seed, config
             )
     scene = merge([state.scene, added])
-    return Prediction(scene, added, seconds, anchor.index, registered=added)
+    return Prediction(scene, added, seconds, anchor.index, anchor.fallback, added)
 
 
 def mark_target(prediction: Prediction, number: int, before: Gaussians) -> Prediction:
@@ -171,10 +174,9 @@ GROUPS: dict[str, tuple[str, ...]] = {
 
 def expand_methods(names: Sequence[str]) -> tuple[str, ...]:
     """Replace groups by their methods and drop duplicates; raise as `check_methods`."""
-    found = [method for name in names for method in GROUPS.get(name, (name,))]
-    chosen = tuple(dict.fromkeys(found))
-    check_methods(chosen)
-    return chosen
+    chosen = dict.fromkeys(method for name in names for method in GROUPS.get(name, (name,)))
+    check_methods(tuple(chosen))
+    return tuple(chosen)
 
 
 def check_methods(names: Sequence[str], steps: int = 1) -> None:

@@ -14,7 +14,6 @@ from gscompleter.io.files import replace_file
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
-    from matplotlib.figure import Figure
 
 MARKERS = "osD^vP*X<>"
 
@@ -23,32 +22,24 @@ class PlotsNotAvailable(InputError):  # noqa: N818  (a state of affairs, told in
     """Error for a missing matplotlib."""
 
 
-def draw_plots(summary: RunSummary, out: Path) -> list[Path]:
-    """Draw `gain_by_hole.png` into `out`, if any case has all methods."""
+def draw_plots(summary: RunSummary, out: Path) -> None:
+    """Draw `gain_by_hole.png` into `out`, if any case has all methods; equal values, equal bytes.
+
+    Raises `PlotsNotAvailable` without matplotlib.
+    """
     if not summary.common_tasks:
-        return []
-    figure = create_plot_figure(4.5)
-    draw_gain_by_hole(figure.add_subplot(), summary)
-    figure.legend(loc="outside right upper", fontsize="small")
-    return [write_figure(figure, out / "gain_by_hole.png")]
-
-
-def write_figure(figure: Figure, path: Path) -> Path:
-    """Write a figure as a PNG; equal values give equal bytes."""
-    with replace_file(path) as file:
-        figure.savefig(file, format="png", dpi=120, metadata={"Software": None})
-    return path
-
-
-def create_plot_figure(height: float) -> Figure:
-    """Create an empty figure, 8 inches wide; raise `PlotsNotAvailable` without matplotlib."""
+        return
     try:
         from matplotlib.figure import Figure
     except ImportError as error:
         raise PlotsNotAvailable(
             f"Plots need matplotlib ({error}); run `pip install gscompleter[evaluation]`."
         ) from error
-    return Figure(figsize=(8, height), layout="constrained")
+    figure = Figure(figsize=(8, 4.5), layout="constrained")
+    draw_gain_by_hole(figure.add_subplot(), summary)
+    figure.legend(loc="outside right upper", fontsize="small")
+    with replace_file(out / "gain_by_hole.png") as file:
+        figure.savefig(file, format="png", dpi=120, metadata={"Software": None})
 
 
 def select_plot_methods(methods: Sequence[str]) -> list[str]:
@@ -65,14 +56,9 @@ def draw_gain_by_hole(axes: Axes, summary: RunSummary) -> None:
         steps = [step for row in summary.rows[method] for step in row["steps"]]
         holes = [100 * step["scores"]["hole_fraction"] for step in steps]
         gains: Any = list(map(GAIN.get_value, steps))
-        axes.plot(holes, gains, linestyle="none", label=method, **get_curve_style(number))
+        marker, color = MARKERS[number % len(MARKERS)], f"C{number % 10}"
+        axes.plot(holes, gains, marker, color=color, markersize=5, alpha=0.8, label=method)
     axes.axhline(0, color="black", linewidth=0.8)
     axes.set_xlabel("hole at the target (% of its pixels)")
     axes.set_ylabel("ΔPSNR at the target (dB)")
     axes.grid(alpha=0.3)
-
-
-def get_curve_style(number: int) -> dict[str, Any]:
-    """Return the style of a curve by its number."""
-    marker = MARKERS[number % len(MARKERS)]
-    return {"color": f"C{number % 10}", "marker": marker, "markersize": 5, "alpha": 0.8}

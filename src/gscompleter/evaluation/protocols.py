@@ -10,7 +10,7 @@ import json
 import os
 import re
 from collections.abc import Callable, Iterable, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
 from typing import Annotated, Literal
@@ -48,13 +48,14 @@ class FrameRule:
     """A protocol that chooses frames by their number in a clip."""
 
     name: str
-    """Name of the protocol for `parse_protocol` and the tables."""
-    split: Callable[[int], tuple[Split, ...]] = field(compare=False)
-    """Function that returns the splits of a clip with so many frames."""
+    split: Callable[..., tuple[Split, ...]]
+    """Function of the number of frames in a clip and of `numbers` that returns its splits."""
+    numbers: tuple[int, ...]
+    """Numbers in the name."""
 
     def select_splits(self, clip: Photographs) -> tuple[Split, ...]:
         """Return the splits of a clip; none if it is too short."""
-        return self.split(len(clip))
+        return self.split(len(clip), *self.numbers)
 
 
 @dataclass(frozen=True)
@@ -72,7 +73,6 @@ class EvaluationIndex:
 
 
 EvaluationProtocol = FrameRule | EvaluationIndex
-"""A deterministic rule that chooses frames."""
 
 
 @dataclass(frozen=True)
@@ -86,24 +86,16 @@ class IndexFile:
 
 def parse_protocol(text: str) -> EvaluationProtocol:
     """Parse a protocol: `n-10`, `n-10-stride-5`, `stress`, `sequence-4` or the path of an index."""
-    number = "([0-9]{1,6})"
-    if match := re.fullmatch(f"n-{number}(?:-stride-{number})?", text):
-        k, stride = int(match[1]), int(match[2] or 2 * int(match[1]) + 1)
-        if k < 1 or stride < 1:
-            raise InputError(
-                f"The protocol {text} is impossible; its numbers have to be at least 1."
-            )
-        return FrameRule(text, partial(extrapolate, k, stride))
-    if match := re.fullmatch(f"sequence-{number}(?:-steps-{number})?", text):
-        k, steps = int(match[1]), int(match[2] or MAX_TARGET_ID)
-        if k < 1 or not 1 <= steps <= MAX_TARGET_ID:
-            raise InputError(
-                f"The protocol {text} is impossible; its numbers have to be at least 1, and steps "
-                f"at most {MAX_TARGET_ID}, the number of targets that a .ply can tell apart."
-            )
-        return FrameRule(text, partial(split_sequence, k, steps))
-    if text == "stress":
-        return FrameRule(text, split_stress_test)
+    for pattern, split in FRAME_RULES.items():
+        if match := re.fullmatch(pattern, text):
+            numbers = tuple(int(number) for number in match.groups() if number is not None)
+            is_too_long = split is split_sequence and max(numbers[1:], default=0) > MAX_TARGET_ID
+            if 0 in numbers or is_too_long:
+                raise InputError(
+                    f"The protocol {text} is impossible; its numbers have to be at least 1, and "
+                    f"steps at most {MAX_TARGET_ID}."
+                )
+            return FrameRule(text, split, numbers)
     if os.path.isfile(text):
         return read_evaluation_index(text)
     raise InputError(
@@ -112,11 +104,11 @@ def parse_protocol(text: str) -> EvaluationProtocol:
     )
 
 
-def extrapolate(k: int, stride: int, num_frames: int) -> tuple[Split, ...]:
+def extrapolate(num_frames: int, k: int, stride: int | None = None) -> tuple[Split, ...]:
     """Choose n, n + k → n + 2k and n + 2k, n + k → n, for n = 0, stride, 2 stride, …."""
     return tuple(
         split
-        for n in range(0, num_frames - 2 * k, stride)
+        for n in range(0, num_frames - 2 * k, stride or 2 * k + 1)
         for split in (Split((n, n + k), (n + 2 * k,)), Split((n + 2 * k, n + k), (n,)))
     )
 
@@ -126,10 +118,18 @@ def split_stress_test(num_frames: int) -> tuple[Split, ...]:
     return (Split((0, 30), (99,)),) if num_frames > 99 else ()
 
 
-def split_sequence(k: int, steps: int, num_frames: int) -> tuple[Split, ...]:
+def split_sequence(num_frames: int, k: int, steps: int = MAX_TARGET_ID) -> tuple[Split, ...]:
     """Choose 0, k → 2k, 3k, 4k, …: targets completed one after the other into one scene."""
     targets = tuple(range(2 * k, num_frames, k))[:steps]
     return (Split((0, k), targets, is_sequence=True),) if targets else ()
+
+
+FRAME_RULES: dict[str, Callable[..., tuple[Split, ...]]] = {
+    "n-([0-9]{1,6})(?:-stride-([0-9]{1,6}))?": extrapolate,
+    "sequence-([0-9]{1,6})(?:-steps-([0-9]{1,6}))?": split_sequence,
+    "stress": split_stress_test,
+}
+"""Functions that choose frames, by the name of the protocol with its numbers."""
 
 
 def build_index(protocol: EvaluationProtocol, clips: Iterable[Photographs]) -> EvaluationIndex:
@@ -185,12 +185,10 @@ class Task:
     """A scene with its context and target frames."""
 
     scene: str
-    """Name of the clip."""
     context: tuple[int, ...]
     targets: tuple[int, ...]
     """Target frames, completed in this order into one scene."""
     load: Callable[[tuple[int, ...]], list[View]]
-    """Function that loads the photographs of frames."""
     neighbours: tuple[int, ...] = ()
     """Frames beside the target, for scoring only."""
 
@@ -215,11 +213,7 @@ def make_tasks(
 ) -> list[Task]:
     """Make the tasks of a clip: one per target, or one per sequence.
 
-    Args:
-        protocol: Chooses the frames.
-        clip: The photographs.
-        resolution: As in `Photographs.views`.
-        use_masks: True to ignore masked pixels of the photographs.
+    `resolution` is that of `Photographs.views`; `use_masks` ignores masked pixels.
     """
     load = partial(load_clip_views, clip, resolution, use_masks)
     tasks = []

@@ -90,19 +90,9 @@ def evaluate(
 ) -> RowCounts:
     """Run methods on tasks and write a row of scores for each pair.
 
-    Existing rows and completed steps are kept. A failed task leaves rows with its error.
-
-    Args:
-        tasks: Tasks of all shards.
-        methods: Names of methods.
-        out: Folder of results: new, or of an earlier call or another shard.
-        config: Settings that determine the numbers; the same as in earlier calls.
-        shard: (i, n) selects the tasks i, i + n, i + 2n, ….
-        rerun: Results of an earlier call to redo.
-        engine: Starts workers; None uses this process. Simultaneous calls share the tasks.
-
-    Raises:
-        InputError: Invalid name or shard, other content in `out`, or a full disk.
+    Existing rows and completed steps in `out` are kept. A failed task leaves rows with its error.
+    `shard` (i, n) selects the tasks i, i + n, i + 2n, …. `engine` starts workers; None uses this
+    process. Simultaneous calls share the tasks.
     """
     check_methods(methods, max((len(task.targets) for task in tasks), default=0))
     check_shard(shard)
@@ -116,7 +106,8 @@ def evaluate(
             if rerun == "scores" or (rerun == "failures" and has_failed(row)):
                 row.unlink(missing_ok=True)
     todo = {row: task for task in share for row in runner.find_missing_rows(task)}
-    jobs = [make_task_job(task) for task in {task.name: task for task in todo.values()}.values()]
+    named = {store.make_file_name(task.name): task for task in todo.values()}
+    jobs = [Job(name, {"task": task}) for name, task in named.items()]
 
     def has_rows(job: Job) -> bool:
         return not runner.find_missing_rows(job.options["task"])
@@ -127,11 +118,6 @@ def evaluate(
         pass
     failed = sum(map(has_failed, todo))
     return RowCounts(len(todo) - failed, failed, len(share) * len(methods) - len(todo))
-
-
-def make_task_job(task: Task) -> Job:
-    """Make a job of a task, with all its methods."""
-    return Job(store.make_file_name(task.name), {"task": task})
 
 
 def has_failed(row: Path) -> bool:
@@ -157,12 +143,11 @@ class TaskRunner:
 
     def __call__(self, job: Job) -> None:
         """Compute the missing rows of a task; one that was often killed is given up."""
-        given_up = describe_loss(job.lost) if job.lost > RETRIES else None
-        self.run(job.options["task"], given_up)
-
-    def run(self, task: Task, prepared: PreparedTask | str | None) -> None:
-        """Compute the missing rows of a task; `prepared` may be an error."""
+        task: Task = job.options["task"]
         folder = store.get_task_folder(self.out, task.name)
+        prepared: PreparedTask | str | None = None
+        if job.lost > RETRIES:
+            prepared = describe_loss(job.lost)
         for row, method in self.find_missing_rows(task).items():
             # Progress inside a task would flood a log.
             with stage(f"{task.name}, {method}"), show_progress(None):
@@ -215,8 +200,8 @@ def load_or_reconstruct(path: Path, views: Sequence[View], models: Models) -> st
         found = store.SavedContext(
             source.gaussians, near, far, seconds["total"], made.exposure_gains
         )
-        store.save_context(path, found)
-    return store.load_context(path, views[0].image.device)
+        store.save_values(path, vars(found))
+    return store.SavedContext(**store.load_values(path, views[0].image.device))
 
 
 def build_row(

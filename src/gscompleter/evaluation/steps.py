@@ -19,6 +19,7 @@ from gscompleter.evaluation import store
 from gscompleter.evaluation.memory import measure_peak_memory
 from gscompleter.evaluation.methods import METHODS, Models, Prediction, mark_target
 from gscompleter.evaluation.metrics import scores as scoring
+from gscompleter.io.image import write_image
 from gscompleter.stages.lift import lift_pair
 from gscompleter.state import Completion
 from gscompleter.types import DepthMap, Gaussians, View
@@ -31,10 +32,8 @@ class PreparedTask:
     """A task with the data that all methods share; cameras have the depth range of the scene."""
 
     context: Gaussians
-    """Gaussians that Ψ reconstructed from the views."""
     views: tuple[View, ...]
     targets: tuple[View, ...]
-    """Target photographs in order."""
     neighbours: tuple[View, ...]
     """Photographs beside the target, for scoring only."""
     models: Models
@@ -49,6 +48,7 @@ class Step:
     frame: int
     anchor: int | None
     """Anchor frame, or None for a method that lifts nothing."""
+    anchor_fallback: bool
     scores: scoring.Scores
     """Scores of the scene before and after the step."""
     psnr_end: float | None
@@ -59,21 +59,19 @@ class Step:
     gaussians: int
     """Number of Gaussians in the scene after the step."""
     seconds: dict[str, float]
-    """Wall time by stage, and `total`."""
     peak_bytes: int | None
-    """Peak memory in bytes, or None if the system does not report it."""
+    """As of `Prediction`."""
 
 
 @dataclass(frozen=True)
 class Progress:
-    """The steps of a task so far."""
+    """The steps of a task so far, and the reason why it stopped."""
 
     scene: Gaussians
     """The context and all added Gaussians."""
     views: tuple[View, ...]
     steps: tuple[Step, ...] = ()
     error: str | None = None
-    """Reason why the task stopped, or None."""
 
 
 def complete_task(task: PreparedTask, method: str, folder: Path) -> Progress:
@@ -85,11 +83,12 @@ def complete_task(task: PreparedTask, method: str, folder: Path) -> Progress:
             progress = replace(progress, error=f"Frame {target.frame}: {following}")
             break
         progress = following
-    steps = []
-    for step, target in zip(progress.steps, task.targets, strict=False):  # the last may have failed
+
+    def set_end(step: Step, target: View) -> Step:
         image = task.models.renderer.render(progress.scene, target.camera).image
-        steps.append(replace(step, psnr_end=scoring.compute_view_psnr(image, target)))
-    return replace(progress, steps=tuple(steps))
+        return replace(step, psnr_end=scoring.compute_view_psnr(image, target))
+
+    return replace(progress, steps=tuple(map(set_end, progress.steps, task.targets)))
 
 
 def advance_task(
@@ -107,9 +106,9 @@ def advance_task(
     # Always read back, so that a resumed run continues with the same tensors.
     prediction = store.load_prediction(path, state.scene)
     step, seen = score_step(prediction, state, target, task)
-    store.save_image(path.with_suffix(".png"), seen.after.image)
-    store.save_image(path.with_name(f"before-{number:03d}.png"), seen.before.image)
-    store.save_image(store.get_truth_path(folder, number), target.image)
+    write_image(path.with_suffix(".png"), seen.after.image)
+    write_image(path.with_name(f"before-{number:03d}.png"), seen.before.image)
+    write_image(store.get_truth_path(folder, number), target.image)
     return Progress(prediction.scene, (*progress.views, target), (*progress.steps, step))
 
 
@@ -133,6 +132,7 @@ def score_step(
     step = Step(
         frame=target.frame,
         anchor=None if anchor is None else anchor.frame,
+        anchor_fallback=prediction.anchor_fallback,
         scores=found,
         psnr_end=None,
         depth_scale=scale,

@@ -27,7 +27,6 @@ from gscompleter.errors import InputError, quote_value
 from gscompleter.evaluation.methods import Prediction
 from gscompleter.io import reading
 from gscompleter.io.files import replace_file
-from gscompleter.io.image import write_image
 from gscompleter.jobs.jobs import list_names, make_folder
 from gscompleter.jobs.jobs import write_json as write_json
 from gscompleter.types import Gaussians, merge
@@ -38,6 +37,8 @@ VERSION = 4
 """Version of the files of a run."""
 FIELDS = ("means", "quats", "scales", "opacities", "sh", "generated")
 """Tensors of Gaussians that are saved."""
+GAUSSIANS = ("gaussians", "scene", "added", "registered")
+"""Saved values that are Gaussians."""
 
 
 def make_file_name(name: str) -> str:
@@ -118,35 +119,16 @@ class SavedContext:
     """Exposure gain of each photograph by channel, or None without exposure normalization."""
 
 
-def save_context(path: Path, context: SavedContext) -> None:
-    """Write the initial scene of a task."""
-    save_tensors(path, {**vars(context), "gaussians": collect_tensors(context.gaussians)})
-
-
-def load_context(path: Path, device: torch.device | str) -> SavedContext:
-    """Read the initial scene of a task."""
-    saved = load_tensors(path, device)
-    return SavedContext(**{**saved, "gaussians": Gaussians(**saved["gaussians"])})
-
-
 def save_prediction(path: Path, prediction: Prediction) -> None:
     """Write the added Gaussians, or the whole scene if it was changed, and the registered ones."""
-    changed, registered = prediction.added, prediction.registered
-    content = {
-        **vars(prediction),
-        "seconds": dict(prediction.seconds),
-        "scene": collect_tensors(prediction.scene) if changed is None else None,
-        "added": None if changed is None else collect_tensors(changed),
-        "registered": None if registered is None else collect_tensors(registered),
-    }
-    save_tensors(path, content)
+    scene = prediction.scene if prediction.added is None else None
+    seconds = dict(prediction.seconds)
+    save_values(path, {**vars(prediction), "seconds": seconds, "scene": scene})
 
 
 def load_prediction(path: Path, before: Gaussians) -> Prediction:
     """Read the prediction for the scene `before`."""
-    saved = load_tensors(path, before.means.device)
-    for name in ("scene", "added", "registered"):
-        saved[name] = None if saved[name] is None else Gaussians(**saved[name])
+    saved = load_values(path, before.means.device)
     if saved["scene"] is None:
         saved["scene"] = merge([before, saved["added"]])
     return Prediction(**saved)
@@ -161,27 +143,23 @@ def collect_tensors(gaussians: Gaussians) -> dict[str, Tensor]:
     }
 
 
-def save_tensors(path: Path, content: Mapping[str, Any]) -> None:
-    """Write tensors and plain values atomically; raise OutputError if that fails."""
+def save_values(path: Path, content: Mapping[str, Any]) -> None:
+    """Write Gaussians and plain values atomically; raise OutputError if that fails."""
     make_folder(path.parent)
+    packed = {k: collect_tensors(v) if isinstance(v, Gaussians) else v for k, v in content.items()}
     with replace_file(path) as file:
-        torch.save(dict(content), file)
+        torch.save(packed, file)
 
 
-def load_tensors(path: Path, device: torch.device | str) -> dict[str, Any]:
-    """Read what `save_tensors` wrote."""
-    return dict(torch.load(path, map_location=device, weights_only=True))
+def load_values(path: Path, device: torch.device | str) -> dict[str, Any]:
+    """Read what `save_values` wrote."""
+    saved = torch.load(path, map_location=device, weights_only=True)
+    return {k: Gaussians(**v) if k in GAUSSIANS and v else v for k, v in saved.items()}
 
 
 def is_complete(path: Path) -> bool:
-    """Return True if a file of tensors exists and has its end."""
+    """Return True if a file of `save_values` exists and has its end."""
     return is_zipfile(path)
-
-
-def save_image(path: Path, image: Float[Tensor, "h w 3"]) -> None:
-    """Write an image; raise OutputError if that fails."""
-    make_folder(path.parent)
-    write_image(path, image)
 
 
 def read_json(path: Path, advice: str = "delete it and run again") -> Any:

@@ -24,7 +24,7 @@ from gscompleter.evaluation.columns import (
     StepRow,
 )
 from gscompleter.evaluation.methods import METHODS
-from gscompleter.evaluation.metrics.learned import compute_fid
+from gscompleter.evaluation.metrics.perceptual import compute_fid
 from gscompleter.evaluation.store import (
     get_step_path,
     get_task_folder,
@@ -40,6 +40,8 @@ from gscompleter.timing import STAGES
 Fids = dict[str, float] | str
 """The Fréchet inception distance of each method, or the reason why there is none."""
 
+ORDER = ("reconstruct", *STAGES, "optimize")
+"""Order of stages in the tables."""
 FEW_PIXELS_NOTE = f"A geometry score counts if it is measured over at least {MIN_PIXELS} pixels."
 REGGS_NOTE = (
     "reggs gets our metric lift and the true poses. RegGS in its paper gets neither, so this "
@@ -56,14 +58,6 @@ ABSENT_NOTES = {
     ),
 }
 """Reasons why the group of a column is absent."""
-
-
-@dataclass(frozen=True)
-class TableCell:
-    """A reduced value over the tasks that have one."""
-
-    value: float | None
-    count: int
 
 
 @dataclass(frozen=True)
@@ -103,18 +97,14 @@ class RunSummary:
         notes = {FEW_PIXELS_NOTE: has_geometry, REGGS_NOTE: "reggs" in self.methods}
         return [note for note, is_needed in notes.items() if is_needed]
 
-    def list_values(self, method: str, column: Column) -> list[float | None]:
-        """List the value of each common task, in their order for all methods."""
-        return [column.compute_row(row) for row in self.rows[method]]
-
-    def compute_cell(self, method: str, column: Column) -> TableCell:
-        """Reduce the known values of the tasks as `column` says."""
-        values = [v for v in self.list_values(method, column) if v is not None]
-        return TableCell(column.reduce_tasks(values) if values else None, len(values))
+    def compute_cell(self, method: str, column: Column) -> tuple[float | None, int]:
+        """Reduce the known values of the tasks as `column` says, and count them."""
+        values = [v for row in self.rows[method] if (v := column.compute_row(row)) is not None]
+        return column.reduce_tasks(values) if values else None, len(values)
 
     def has_value(self, column: Column) -> bool:
         """Return True if any method has a value."""
-        return any(self.compute_cell(method, column).count for method in self.methods)
+        return any(self.compute_cell(method, column)[1] for method in self.methods)
 
     def compute_seconds(self, method: str) -> dict[str, float]:
         """Compute the median wall time over the steps by stage.
@@ -150,18 +140,13 @@ def read_rows(out: Path) -> list[RunRow]:
 
 
 def rank_method(method: str) -> tuple[int, str]:
-    """Return the sort key of a method in tables."""
-    return rank_name(method, list(METHODS))
+    """Return the sort key of a method in tables, unknown ones last."""
+    return ([*METHODS, method].index(method), method)
 
 
 def rank_stage(stage: str) -> tuple[int, str]:
-    """Return the sort key of a stage in running order."""
-    return rank_name(stage, ["reconstruct", *STAGES, "optimize"])
-
-
-def rank_name(name: str, order: Sequence[str]) -> tuple[int, str]:
-    """Return the sort key of a name: its place in `order`, unknown names last."""
-    return (order.index(name) if name in order else len(order), name)
+    """Return the sort key of a stage in tables, unknown ones last."""
+    return ([*ORDER, stage].index(stage), stage)
 
 
 def summarize_run(rows: Sequence[RunRow]) -> RunSummary:
@@ -188,15 +173,7 @@ def summarize_run(rows: Sequence[RunRow]) -> RunSummary:
 
 
 def write_tables(out: Path, with_fid: bool = False) -> RunSummary:
-    """Write tables.md, tables.tex, tables.json and timings.md of a run.
-
-    Args:
-        out: Folder of the run.
-        with_fid: Also compute the FID of each method against the photographs.
-
-    Raises:
-        InputError: if `out` has no run, no rows, or a damaged one.
-    """
+    """Write tables.md, tables.tex, tables.json and timings.md of a run; FID takes longer."""
     summary = summarize_run(read_rows(out))
     fids: Fids = compute_fids(out, summary) if with_fid else "not requested."
     texts = {
@@ -234,19 +211,15 @@ def format_score(value: float | None, digits: int) -> str:
     return "–" if value is None else f"{value:.{digits}f}"
 
 
-def format_cell(cell: TableCell, digits: int, count: int) -> str:
-    """Format an entry, with its number of tasks if that is not `count`."""
-    number = format_score(cell.value, digits)
-    return number if cell.count in (0, count) else f"{number} ({cell.count})"
-
-
 def format_score_cells(summary: RunSummary, columns: Sequence[Column]) -> list[list[str]]:
-    """Format a table of scores, one row per method."""
-    n = len(summary.common_tasks)
-    return [
-        [method, *(format_cell(summary.compute_cell(method, c), c.digits, n) for c in columns)]
-        for method in summary.methods
-    ]
+    """Format a table of scores, one row per method; a number of tasks other than all is added."""
+
+    def format_cell(method: str, column: Column) -> str:
+        value, count = summary.compute_cell(method, column)
+        number = format_score(value, column.digits)
+        return number if count in (0, len(summary.common_tasks)) else f"{number} ({count})"
+
+    return [[m, *(format_cell(m, column) for column in columns)] for m in summary.methods]
 
 
 def format_score_tables(
@@ -285,7 +258,12 @@ def format_score_markdown(summary: RunSummary, fids: Fids) -> str:
     """Format scores, notes, failures and the steps of sequences."""
     tables = format_score_tables(summary, format_markdown)
     present = {column.key for column in summary.columns}
-    parts = [describe_scope(summary), *(f"### {t}\n\n{table}" for t, table in tables.items())]
+    scope = (
+        f"Means over the {len(summary.common_tasks)} of {len(summary.tasks)} cases that all "
+        "methods finished; of a sequence, means over its steps come first. A number in brackets "
+        "is the number of cases with the score, if some have none.\n"
+    )
+    parts = [scope, *(f"### {title}\n\n{table}" for title, table in tables.items())]
     parts += [f"{note}\n" for note in summary.notes]
     parts += [f"{note}\n" for key, note in ABSENT_NOTES.items() if key not in present]
     parts.append(format_fid_markdown(summary, fids))
@@ -297,15 +275,6 @@ def format_score_markdown(summary: RunSummary, fids: Fids) -> str:
         rows = [[m, *format_step_cells(step)] for m, steps in by_method.items() for step in steps]
         parts.append(f"### {name}\n\n" + format_markdown(head, rows))
     return "\n".join(parts)
-
-
-def describe_scope(summary: RunSummary) -> str:
-    """Describe which cases the numbers cover."""
-    return (
-        f"Means over the {len(summary.common_tasks)} of {len(summary.tasks)} cases that all "
-        "methods finished; of a sequence, means over its steps come first. A number in brackets "
-        "is the number of cases with the score, if some have none.\n"
-    )
 
 
 def format_fid_markdown(summary: RunSummary, fids: Fids) -> str:
@@ -349,7 +318,7 @@ def collect_method_scores(summary: RunSummary, method: str) -> dict[str, Any]:
     """Return the number of finished tasks and all scores of a method, for JSON."""
     columns = [column for group in GROUPS.values() for column in group]
     cells = {column.key: summary.compute_cell(method, column) for column in columns}
-    scores = {key: {"value": cell.value, "cases": cell.count} for key, cell in cells.items()}
+    scores = {key: {"value": value, "cases": count} for key, (value, count) in cells.items()}
     return {"finished": summary.finished[method], **scores}
 
 

@@ -12,6 +12,7 @@ from torch import Tensor
 from gscompleter.config.generators import PLUGINS, GeneratorSettings, get_settings_class
 from gscompleter.config.settings import validate
 from gscompleter.errors import InputError
+from gscompleter.geometry import is_same_camera
 from gscompleter.plugins import load_plugins
 from gscompleter.types import Camera, GeneratorInput, View
 
@@ -87,18 +88,9 @@ def load_generator(
     device: str = "cpu",
     settings: GeneratorSettings | None = None,
 ) -> Generator:
-    """Load a generator by name.
+    """Load a generator by name; only `oracle` uses `photographs`, the true images of the targets.
 
-    Args:
-        name: Name of the generator.
-        seed: Random seed; the same seed gives the same image.
-        photographs: True images of the targets, used by `oracle` only.
-        device: Device of the network, cpu or cuda.
-        settings: Settings of this generator, or None for the defaults.
-
-    Raises:
-        InputError: The name is unknown, packages or weights are missing, or the settings do not
-            fit.
+    The same seed gives the same image. `settings` are those of this generator; None for defaults.
     """
     kind = get_settings_class(name)
     if not isinstance(settings, kind | None):
@@ -117,20 +109,28 @@ def load_generator(
     return load(settings, seed, photographs, device)
 
 
-def _load_warp_inpaint(
-    settings: GeneratorSettings, seed: int, photographs: Sequence[View], device: str
-) -> Generator:
+def _load_warp_inpaint(settings: GeneratorSettings, seed: int, *_: Any) -> Generator:
     from gscompleter.generators.warp_inpaint import WarpInpaint
 
     return FunctionGenerator(WarpInpaint(seed))
 
 
 def _load_oracle(
-    settings: GeneratorSettings, seed: int, photographs: Sequence[View], device: str
+    settings: GeneratorSettings, seed: int, photographs: Sequence[View], *_: Any
 ) -> Generator:
-    from gscompleter.generators.oracle import make_oracle
+    """Load the Φ that returns the photograph of the target camera, which cannot be padded."""
 
-    return make_oracle(photographs)
+    def find_photograph(nearest: View, target: Camera, context: GeneratorInput) -> GeneratorOutput:
+        for photograph in photographs:
+            if is_same_camera(photograph.camera, target):
+                return GeneratorOutput(photograph.image.to(target.K.device), is_photograph=True)
+        raise InputError(
+            f"The generator 'oracle' has {len(photographs)} photographs, none of them taken by the "
+            "target camera; give it the photograph of the target frame, or choose 'warp-inpaint' "
+            "if there is none."
+        )
+
+    return FunctionGenerator(find_photograph, supports_padding=False)
 
 
 GENERATORS: dict[str, Callable[..., Generator]] = {

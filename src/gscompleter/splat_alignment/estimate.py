@@ -19,15 +19,11 @@ from gscompleter.render import Renderer
 from gscompleter.render.lod import build_proxy, thin_gaussians
 from gscompleter.splat_alignment.fit import SplatFit, score_splat
 from gscompleter.splat_alignment.matching import (
-    extract_photo_features,
+    extract_view_features,
     refine_similarity,
     search_similarities,
 )
-from gscompleter.splat_alignment.similarity import (
-    Matrix,
-    transform_camera,
-    transform_view,
-)
+from gscompleter.splat_alignment.similarity import Matrix, transform_camera, transform_view
 from gscompleter.splat_alignment.trainer_frames import (
     InputSplat,
     Points,
@@ -48,6 +44,13 @@ DRIFT_WARNING = 2.0
 """Displacement in pixels of the small photographs from which the user is warned."""
 
 AlignmentMethod = Literal["given", "cameras", "dataparser", "normalised", "similarity"]
+FRAMES: dict[AlignmentMethod, str] = {
+    "given": "as it is",
+    "cameras": "in the frame of its trainer's camera list",
+    "dataparser": "in the frame of dataparser_transforms.json",
+    "normalised": "in the frame that its trainer normalised to",
+    "similarity": "in a frame found by matching image features",
+}
 FrameProposal = tuple[AlignmentMethod, Matrix]
 """A transform from the photographs' frame to the splat's, and its source."""
 
@@ -57,7 +60,6 @@ class SplatAlignment:
     """The frame of a splat relative to its photographs."""
 
     method: AlignmentMethod
-    """Source of the transform: none, a file of the trainer, its normalisation, or the images."""
     transform: Matrix
     """From the frame of the photographs to that of the splat."""
     fit: SplatFit
@@ -67,20 +69,12 @@ class SplatAlignment:
 
     def describe(self) -> str:
         """Describe the alignment in a sentence."""
-        given = f"{self.given_fit.psnr:.1f} dB as given"
-        found = f"it fits the photographs at {self.fit.psnr:.1f} dB ({given})"
-        where = {
-            "given": f"The splat fits the photographs as it is, at {self.fit.psnr:.1f} dB",
-            "cameras": f"The splat is in the frame of its trainer's camera list: {found}",
-            "dataparser": f"The splat is in the frame of dataparser_transforms.json: {found}",
-            "normalised": f"The splat is in the frame that its trainer normalised to: {found}",
-            "similarity": f"The splat is in a frame found by matching image features: {found}",
-        }[self.method]
-        if not DRIFT_WARNING < self.fit.drift < math.inf:
-            return f"{where}."
-        return (
-            f"{where}; but details are off by {self.fit.drift:.1f} px in images of {LONG_SIDE} px."
-        )
+        told = f"The splat {FRAMES[self.method]} fits the photographs at {self.fit.psnr:.1f} dB"
+        if self.method != "given":
+            told += f" ({self.given_fit.psnr:.1f} dB as given)"
+        if DRIFT_WARNING < self.fit.drift < math.inf:
+            told += f"; details are off by {self.fit.drift:.1f} px in images of {LONG_SIDE} px"
+        return f"{told}."
 
 
 @dataclass(frozen=True)
@@ -110,9 +104,6 @@ def align_splat(
     """Estimate the transform from photographs to splat, relative to their origins.
 
     The photographs numbered `frames` are used in any case.
-
-    Raises:
-        InputError: No frame fits, or one of `frames` cannot be read.
     """
     views = [view.to(splat.scene.means.device) for view in sample_views(photographs, frames)]
     points = photographs.points()
@@ -125,11 +116,7 @@ def align_splat(
 
 
 def sample_views(photographs: Photographs, frames: Sequence[int]) -> list[View]:
-    """Load the first of `frames` and further photographs spread over all.
-
-    Raises:
-        InputError: One of `frames` cannot be read; other unreadable photographs are skipped.
-    """
+    """Load the first of `frames` and, spread over all, further photographs that can be read."""
     named = list(frames)[: NUM_SAMPLE_VIEWS // 2]
     spread = np.linspace(0, len(photographs) - 1, NUM_SAMPLE_VIEWS).round().astype(int).tolist()
     others = [frame for frame in dict.fromkeys(spread) if frame not in named]
@@ -151,9 +138,6 @@ def estimate_alignment(
     Frames are tried from the simplest on, up to the first that is exact. One that fits is replaced
     only by one that fits better by `MIN_IMPROVEMENT`. `poses` are camera-to-world of all
     photographs, `points` sparse points in their frame.
-
-    Raises:
-        InputError: No frame fits.
     """
     given = data.score_transform(np.eye(4))
     best = SplatAlignment("given", np.eye(4), given, given)
@@ -188,7 +172,7 @@ def align_by_features(
     data: AlignmentData, best: SplatAlignment, points: Points | None
 ) -> SplatAlignment:
     """Improve an alignment by image features; without a match, search from all directions."""
-    photographs = extract_photo_features(data.views)
+    photographs = [(view.camera, extract_view_features(view)) for view in data.views]
     if best.fit.is_match:
         starts: Iterable[Matrix] = [best.transform]
     else:

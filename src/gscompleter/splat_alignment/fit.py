@@ -31,9 +31,8 @@ MAX_DRIFT = 0.25
 
 A scale error of 0.5 % causes 0.5.
 """
-MIN_TRACKED_CORNERS = 15
-"""Fewest tracked corners for a valid median."""
-MAX_CORNERS = 200
+MIN_TRACKED_CORNERS, MAX_CORNERS = 15, 200
+"""Fewest tracked corners for a valid median, and most."""
 MAX_ROUND_TRIP_ERROR = 1.0
 """Largest error of a corner tracked forward and back, in pixels."""
 
@@ -49,7 +48,6 @@ class ImageFit(NamedTuple):
     margin: float = 0.0
     """PSNR above that of the best flat image, in dB."""
     coverage: float = 0.0
-    """Share of the pixels that the splat covers."""
     drift: float = math.inf
     """Displacement of corners from render to photograph, in pixels; infinity if unknown."""
 

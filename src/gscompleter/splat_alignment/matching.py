@@ -59,7 +59,6 @@ class LocatedPhoto:
     points: Float[np.ndarray, "m 3"]
     """Inlier points of the splat, in its frame."""
     pixels: Float[np.ndarray, "m 2"]
-    """Pixels of the points in the photograph."""
 
 
 def search_similarities(
@@ -170,11 +169,6 @@ def _compute_residuals(
     homogeneous = local @ photo.camera.K.detach().cpu().double().numpy().T
     ahead = np.maximum(homogeneous[:, 2:], 1e-9 * np.abs(homogeneous).max())
     return np.clip(homogeneous[:, :2] / ahead - photo.pixels, -1e4, 1e4).ravel()
-
-
-def extract_photo_features(views: Sequence[View]) -> list[PhotoFeatures]:
-    """Extract the features of all views."""
-    return [(view.camera, extract_view_features(view)) for view in views]
 
 
 def extract_view_features(view: View) -> Features:

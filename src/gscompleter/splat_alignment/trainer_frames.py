@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import os
 from collections import Counter
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Literal
@@ -121,11 +121,7 @@ def find_camera_lists(splat: InputSplat) -> list[Path]:
 
 
 def fit_named_cameras(ours: Mapping[str, Matrix], theirs: Mapping[str, Matrix]) -> Matrix | None:
-    """Fit the similarity from the poses `ours` to those of the same names in `theirs`.
-
-    Returns:
-        None if fewer than two names match, or all cameras have one position.
-    """
+    """Fit the similarity from `ours` to `theirs` by name; None without two matched positions."""
     pairs = match_names(list(ours), list(theirs))
     pairs = pairs[:: max(1, len(pairs) // MAX_PAIRS)]
     before, after = [ours[a] for a, _ in pairs], [theirs[b] for _, b in pairs]
@@ -136,22 +132,19 @@ def fit_named_cameras(ours: Mapping[str, Matrix], theirs: Mapping[str, Matrix]) 
 
 def match_names(ours: Sequence[str], theirs: Sequence[str]) -> list[tuple[str, str]]:
     """Match names that differ only in extension, or in folder if base names are unique."""
-    for normalize in (drop_extension, lambda name: drop_extension(os.path.basename(name))):
-        a, b = index_unique(ours, normalize), index_unique(theirs, normalize)
+    for with_folder in (True, False):
+        a, b = index_unique(ours, with_folder), index_unique(theirs, with_folder)
         if len(a.keys() & b.keys()) >= 2:
             return [(a[name], b[name]) for name in a if name in b]
     return []
 
 
-def index_unique(names: Sequence[str], normalize: Callable[[str], str]) -> dict[str, str]:
-    """Index names by their normalized form; ambiguous ones are dropped."""
-    count = Counter(map(normalize, names))
-    return {normalize(name): name for name in names if count[normalize(name)] == 1}
-
-
-def drop_extension(name: str) -> str:
-    """Drop the extension: `images/0001` for `images/0001.jpg`."""
-    return os.path.splitext(name)[0]
+def index_unique(names: Sequence[str], with_folder: bool) -> dict[str, str]:
+    """Index names without extension and, if wanted, folder; ambiguous ones are dropped."""
+    places = [name if with_folder else os.path.basename(name) for name in names]
+    keys = [os.path.splitext(place)[0] for place in places]
+    count = Counter(keys)
+    return {key: name for key, name in zip(keys, names, strict=True) if count[key] == 1}
 
 
 def compute_trainer_frames(poses: Poses, points: Points | None = None) -> Iterator[Matrix]:

@@ -43,11 +43,6 @@ MAX_LOG_SCALE = 20.0
 """Largest absolute log-scale that is written, as in other writers."""
 
 
-def is_compressed_ply(head: bytes) -> bool:
-    """Return True if a file with the first bytes `head` is a compressed .ply."""
-    return head.startswith(b"ply") and b"packed_position" in head
-
-
 def read_compressed_ply(path: Path) -> Gaussians:
     """Read a compressed .ply of SH degree 0 to 3."""
     header, tables = _read_tables(path)

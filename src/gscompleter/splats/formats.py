@@ -8,6 +8,9 @@ from __future__ import annotations
 import contextlib
 import hashlib
 import json
+import struct
+import zipfile
+import zlib
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from itertools import groupby
@@ -16,30 +19,38 @@ from pathlib import Path
 import numpy as np
 import torch
 from jaxtyping import UInt8
+from PIL import Image
 from torch import Tensor
 
 from gscompleter.errors import InputError, quote_value, refuse_pointer
 from gscompleter.io.files import replace_file
 from gscompleter.io.reading import open_file, read_json
-from gscompleter.splats.compressed_ply import (
-    is_compressed_ply,
-    read_compressed_ply,
-    write_compressed_ply,
-)
-from gscompleter.splats.glb import is_glb, read_glb
+from gscompleter.splats.compressed_ply import read_compressed_ply, write_compressed_ply
+from gscompleter.splats.glb import read_glb
 from gscompleter.splats.ksplat import read_ksplat
 from gscompleter.splats.morton import sort_along_morton
-from gscompleter.splats.packing import refuse_damage
 from gscompleter.splats.ply import load_ply, require_finite, save_ply
-from gscompleter.splats.sog import META, is_sog, read_sog
+from gscompleter.splats.sog import META, ZIP_MAGIC, read_sog
 from gscompleter.splats.splat import read_splat, write_splat
-from gscompleter.splats.spz import is_spz, read_spz, write_spz
+from gscompleter.splats.spz import read_spz, write_spz
 from gscompleter.types import Gaussians
 
 OPACITY_TOLERANCE = 1e-3
 """Distance from [0, 1] up to which an opacity is clamped instead of refused."""
+DECODING_ERRORS = (
+    *(ArithmeticError, EOFError, LookupError, MemoryError, OSError, RecursionError, ValueError),
+    *(NotImplementedError, struct.error, zipfile.BadZipFile, zlib.error),
+    Image.DecompressionBombError,
+)
+"""Errors that decoders raise on damaged bytes."""
+JSON_ERRORS = (AttributeError, TypeError)
+"""Errors by JSON whose values are of another type."""
+MAX_DEFECT = 120
+"""Most characters of the description of a defect."""
 HEAD_BYTES = 8192
 """Bytes read to detect a format; the header of a compressed .ply fits."""
+COMPRESSED_PROPERTY = b"packed_position"
+"""Text in the header of a compressed .ply only."""
 
 
 @dataclass(frozen=True)
@@ -47,47 +58,48 @@ class Format:
     """Functions that detect, read and write one file format."""
 
     extensions: tuple[str, ...]
-    recognizes: Callable[[bytes], bool] | None
-    """Test on the first bytes of a file, or None if only the extension identifies the format."""
+    starts: tuple[bytes, ...]
+    """First bytes of a file, white space aside; none if only the extension tells the format."""
     read: Callable[[Path], Gaussians]
     write: Callable[[Path, Gaussians], None] | None = None
 
 
 FORMATS = {
     "compressed-ply": Format(
-        (".compressed.ply",), is_compressed_ply, read_compressed_ply, write_compressed_ply
+        (".compressed.ply",), (b"ply",), read_compressed_ply, write_compressed_ply
     ),
-    "ply": Format((".ply",), lambda head: head.startswith(b"ply"), load_ply, save_ply),
-    "spz": Format((".spz",), is_spz, read_spz, write_spz),
-    "sog": Format((".sog", META), is_sog, read_sog),
-    "glb": Format((".glb",), is_glb, read_glb),
-    "splat": Format((".splat",), None, read_splat, write_splat),
-    "ksplat": Format((".ksplat",), None, read_ksplat),
+    "ply": Format((".ply",), (b"ply",), load_ply, save_ply),
+    "spz": Format((".spz",), (b"NGSP", b"\x1f\x8b"), read_spz, write_spz),
+    "sog": Format((".sog", META), (ZIP_MAGIC, b"{"), read_sog),
+    "glb": Format((".glb",), (b"glTF",), read_glb),
+    "splat": Format((".splat",), (), read_splat, write_splat),
+    "ksplat": Format((".ksplat",), (), read_ksplat),
 }
-"""Formats by name, in the order in which they are tried."""
+"""Formats by name; a compressed .ply says so in its header."""
 
 
 def load_splat(path: Path | str, drop_nonfinite: bool = False) -> Gaussians:
     """Load the Gaussians of a file in any format of `FORMATS`, in the axes of a 3DGS .ply.
 
-    The labels of generated Gaussians are read from a .ply itself, and for other formats from the
-    file `NAME.generated.json` beside it.
-
-    Args:
-        path: The file, or the folder of a .sog.
-        drop_nonfinite: Drop Gaussians with NaN, infinity or a zero quaternion instead of refusing
-            the file.
-
-    Raises:
-        InputError: The file is missing, empty, truncated or damaged, or its format is unknown.
+    A .ply has the labels of generated Gaussians; other formats have `NAME.generated.json` beside
+    them. `drop_nonfinite` drops Gaussians with NaN, infinity or a zero quaternion instead of
+    refusing the file.
     """
     path = Path(path)
     name = detect_splat_format(path)
     if name == "ply":
         return load_ply(path, drop_nonfinite)
-    # Infinite values are refused below.
-    with refuse_damage(path), np.errstate(over="ignore", invalid="ignore"):
-        gaussians = FORMATS[name].read(path)
+    errors = (*DECODING_ERRORS, *(JSON_ERRORS if name in ("sog", "glb") else ()))
+    try:
+        with np.errstate(over="ignore", invalid="ignore"):  # infinite values are refused below
+            gaussians = FORMATS[name].read(path)
+    except InputError:
+        raise
+    except errors as error:
+        raise InputError(
+            f"{quote_value(path)} cannot be read: {quote_value(str(error), MAX_DEFECT)}; fetch the "
+            "file again, or export it as .ply."
+        ) from error
     labelled = replace(gaussians, generated=load_labels(path, len(gaussians)))
     return require_finite(validate_ranges(labelled, path), path, drop_nonfinite)
 
@@ -110,9 +122,6 @@ def save_splat(path: Path | str, gaussians: Gaussians) -> None:
 
     A .ply stores everything. Other formats round, and the labels of generated Gaussians go to
     `NAME.generated.json` beside the file.
-
-    Raises:
-        InputError: The format is unknown or read-only, there are no Gaussians, or writing fails.
     """
     path = Path(path)
     write = get_writer(path)
@@ -152,10 +161,11 @@ def detect_splat_format(path: Path) -> str:
     if not head:
         raise InputError(f"{quote_value(path)} is empty; a file of Gaussians is needed.")
     for name, format_ in FORMATS.items():
-        if format_.recognizes is not None and format_.recognizes(head):
+        is_other_ply = name == "compressed-ply" and COMPRESSED_PROPERTY not in head
+        if head.lstrip().startswith(format_.starts) and not is_other_ply:
             return name
     named = _match_extension(path)
-    if named is None or FORMATS[named].recognizes is not None:
+    if named is None or FORMATS[named].starts:
         known = ", ".join(f"*{ending}" for f in FORMATS.values() for ending in f.extensions)
         raise InputError(
             f"{quote_value(path)} holds no Gaussians in a format that is known: {known}."

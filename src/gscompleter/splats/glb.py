@@ -10,9 +10,8 @@ from __future__ import annotations
 import json
 import struct
 from collections.abc import Iterator
-from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 import torch
@@ -27,7 +26,6 @@ from gscompleter.splats.packing import build_gaussians
 from gscompleter.splats.transform import HALF_TURN_Z, rotate_half_turn, transform_gaussians
 from gscompleter.types import Gaussians, merge
 
-MAGIC = b"glTF"
 CHUNK_HEADER = struct.Struct("<II")
 JSON, BINARY = 0x4E4F534A, 0x004E4942
 EXTENSION = "KHR_gaussian_splatting"
@@ -42,17 +40,11 @@ MAX_NODE_DEPTH = 100
 """Largest depth of the node tree; a deeper one contains a cycle."""
 
 
-@dataclass(frozen=True)
-class GlbDocument:
+class GlbDocument(NamedTuple):
     """The JSON and binary parts of a .glb."""
 
     table: dict[str, Any]
     binary: bytes
-
-
-def is_glb(head: bytes) -> bool:
-    """Return True if a file with the first bytes `head` is binary glTF."""
-    return head.startswith(MAGIC)
 
 
 def read_glb(path: Path) -> Gaussians:

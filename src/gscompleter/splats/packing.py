@@ -2,24 +2,20 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
-from contextlib import contextmanager
-from pathlib import Path
+from collections.abc import Sequence
 
 import numpy as np
 import torch
 from jaxtyping import Float, Integer, UInt32
 from numpy import ndarray
 
-from gscompleter.errors import InputError, quote_value
+from gscompleter.errors import quote_value
 from gscompleter.types import SH_C0, Gaussians, make_observed
 
 NUM_SH_REST = (0, 3, 8, 15)
 """SH coefficients per channel above degree 0, by degree."""
 MIN_ALLOWED_BYTES = 1 << 20
 """Unpacked size in bytes that is allowed for any file, however small."""
-MAX_DEFECT = 120
-"""Most characters of the description of a defect."""
 MAX_GROWTH = 256
 """Largest ratio of unpacked to packed size. Real files reach 2, real images 10."""
 
@@ -73,24 +69,6 @@ def check_growth(unpacked: int, packed: int, max_growth: int = MAX_GROWTH) -> No
     """Raise ValueError if data claim to unpack to over `max_growth` times their size in bytes."""
     if unpacked > MIN_ALLOWED_BYTES + max_growth * packed:
         raise ValueError(f"its {packed:,} bytes claim to hold {quote_value(f'{unpacked:,}')}")
-
-
-@contextmanager
-def refuse_damage(path: Path) -> Iterator[None]:
-    """Raise InputError for whatever goes wrong while the contents of a file are decoded.
-
-    Readers raise ValueError for what they find wrong. Damaged bytes fail in many further ways, in
-    numpy, zlib, zipfile, Pillow and others.
-    """
-    try:
-        yield
-    except InputError:
-        raise
-    except Exception as error:
-        raise InputError(
-            f"{quote_value(path)} cannot be read: {quote_value(str(error), MAX_DEFECT)}; fetch the "
-            "file again, or export it as .ply."
-        ) from error
 
 
 def build_gaussians(

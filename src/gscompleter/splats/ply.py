@@ -58,9 +58,6 @@ def load_ply(path: Path | str, drop_nonfinite: bool = False) -> Gaussians:
     With `drop_nonfinite`, Gaussians with NaN, infinity or a zero quaternion are dropped; otherwise
     the file is refused. Infinite opacity logits are valid: converters write them for opacities of 1
     and 0.
-
-    Raises:
-        InputError: The file is missing, no 3DGS .ply, empty, truncated or has invalid values.
     """
     path = Path(path)
     return require_finite(decode_gaussians(read_scene(path)), path, drop_nonfinite)
@@ -199,9 +196,6 @@ def save_ply(path: Path | str, gaussians: Gaussians, provenance: bool | None = N
 
     `provenance` decides if `generated` is written; the default is yes if anything was generated.
     Some readers (such as gsply 0.4) misread rows that end in a byte; False writes the plain layout.
-
-    Raises:
-        InputError: The file cannot be written; an existing one is kept.
     """
     if provenance is None:
         provenance = bool((gaussians.generated > 0).any())

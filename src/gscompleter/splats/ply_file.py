@@ -99,11 +99,7 @@ def _parse_elements(lines: Iterable[bytes]) -> list[Element]:
 
 
 def read_ply_file(path: Path, needed: Sequence[str], kind: str) -> PlyFile:
-    """Read a file whose vertices have the properties `needed`.
-
-    Raises:
-        InputError: The file is missing, truncated or damaged, or no `kind`, such as "3DGS scene".
-    """
+    """Read a file whose vertices have the properties `needed`; errors name the `kind` of file."""
     with open_file(path) as file:
         header, elements = read_header(file, path)
         vertex = elements[0] if elements and elements[0].name == "vertex" else None

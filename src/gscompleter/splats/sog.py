@@ -44,11 +44,6 @@ FileReader = Callable[[str], bytes]
 """Function that reads a file of the scene by name, from a folder or a bundle."""
 
 
-def is_sog(head: bytes) -> bool:
-    """Return True if a file with the first bytes `head` is a bundle or a `meta.json`."""
-    return head.startswith(ZIP_MAGIC) or head.lstrip()[:1] == b"{"
-
-
 def read_sog(path: Path) -> Gaussians:
     """Read a bundle, a folder, or the folder of a `meta.json`."""
     if path.is_dir():
@@ -62,6 +57,8 @@ def read_sog(path: Path) -> Gaussians:
 
 def _read_entry(bundle: zipfile.ZipFile, name: str) -> bytes:
     entry = bundle.getinfo(name)
+    if entry.flag_bits & 1:
+        raise ValueError(f"its {name} is encrypted")
     check_growth(entry.file_size, entry.compress_size, MAX_ENTRY_GROWTH)
     return bundle.read(entry)
 

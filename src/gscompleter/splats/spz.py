@@ -75,11 +75,6 @@ class SpzHeader(NamedTuple):
         return [width * self.num_gaussians for width in self.widths]
 
 
-def is_spz(head: bytes) -> bool:
-    """Return True if a file with the first bytes `head` is a .spz."""
-    return head.startswith((MAGIC, GZIP))
-
-
 def read_spz(path: Path) -> Gaussians:
     """Read a .spz of SH degree 0 to 3, in the axes of a .ply."""
     data = read_bytes(path)
@@ -128,7 +123,10 @@ def _read_zstd(header: SpzHeader, data: bytes) -> list[bytes]:
     start, streams = place + table.nbytes, []
     for packed, size in zip(table[:, 0].tolist(), header.stream_sizes, strict=False):
         unpacker = zstandard.ZstdDecompressor(max_window_size=MAX_WINDOW)
-        streams.append(unpacker.stream_reader(data[start : start + packed]).read(size))
+        try:
+            streams.append(unpacker.stream_reader(data[start : start + packed]).read(size))
+        except zstandard.ZstdError as error:
+            raise ValueError(str(error)) from error
         start += packed
     return [*streams, b""][: len(header.stream_sizes)]
 

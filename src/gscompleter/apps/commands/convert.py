@@ -11,7 +11,7 @@ from gscompleter.apps.commands.options import ConvertOptions, StripOptions
 from gscompleter.errors import InputError
 from gscompleter.progress import show_preparation, show_progress
 from gscompleter.splats.formats import describe_mode_loss, get_writer, load_splat, save_splat
-from gscompleter.splats.strip import strip
+from gscompleter.splats.layout import strip
 
 
 def run_convert(options: ConvertOptions) -> None:

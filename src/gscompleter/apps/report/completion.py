@@ -31,9 +31,8 @@ from gscompleter.io.files import COMPLETED_FILE, CONTEXT_FILE, SUMMARY_FILE
 from gscompleter.io.image import write_image
 from gscompleter.kernels.parallel import map_in_parallel
 from gscompleter.render import Renderer, get_view_map
-from gscompleter.splats.layout import save_like
+from gscompleter.splats.layout import REMOVED_FILE, save_like, save_removed
 from gscompleter.splats.ply import save_ply
-from gscompleter.splats.strip import REMOVED_FILE, save_removed
 from gscompleter.state import Completion, TargetResult
 from gscompleter.types import Camera, Gaussians, View, merge
 

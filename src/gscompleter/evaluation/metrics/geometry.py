@@ -34,7 +34,6 @@ class Agreement:
     pixels: int
     """Number of the target's pixels in the overlap."""
     abs_rel: float | None = None
-    """AbsRel of the z-depth."""
     chamfer: float | None = None
     """Chamfer distance as a share of the median depth of the context, for averages over scenes."""
     f_score: float | None = None

@@ -1,15 +1,24 @@
-"""HaarPSI and FLIP, which do not reward blur.
+"""HaarPSI and FLIP, which do not reward blur; LPIPS and FID, which compare learned features.
 
 HaarPSI (Reisenhofer et al., A Haar Wavelet-Based Perceptual Similarity Index, 2018) compares Haar
-wavelets, which differ where only one image has an edge. FLIP is NVIDIA's flip-evaluator.
+wavelets, which differ where only one image has an edge. FLIP is NVIDIA's flip-evaluator, LPIPS and
+FID are torchmetrics' (`gscompleter[evaluation]`).
 """
 
 from __future__ import annotations
+
+from collections.abc import Sequence
+from functools import cache
+from typing import Any, Literal
 
 import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 from torch.nn.functional import avg_pool2d, conv2d, pad
+
+from gscompleter.errors import InputError
+
+Image = Float[Tensor, "h w 3"]
 
 C = 30.0
 """Constant of the similarity, in units of 8-bit colours; fitted by the authors."""
@@ -17,11 +26,12 @@ ALPHA = 4.2
 """Steepness of the logistic function; fitted by the authors."""
 YIQ = ((0.299, 0.587, 0.114), (0.5959, -0.2746, -0.3213), (0.2115, -0.5227, 0.3112))
 """Conversion from RGB to luminance and two chrominances."""
+MISSING = (ImportError, OSError, RuntimeError)
+"""Errors without a package, without weights, and with a torchvision for another torch."""
+ADVICE = "run `pip install gscompleter[evaluation]`, and the first time with a connection."
 
 
-def haarpsi(
-    image: Float[Tensor, "h w 3"], truth: Float[Tensor, "h w 3"], where: Bool[Tensor, "h w"]
-) -> float | None:
+def haarpsi(image: Image, truth: Image, where: Bool[Tensor, "h w"]) -> float | None:
     """Compute HaarPSI of two images in [0, 1] over the pixels of `where`; 1 is best.
 
     Images are halved first, as published; a pixel counts if half of its area is in `where`. None
@@ -89,9 +99,7 @@ def halve_image(values: Float[Tensor, "c h w"]) -> Float[Tensor, "c half_h half_
     return avg_pool2d(pad(values, (0, w % 2, 0, h % 2)), 2)
 
 
-def compute_flip_map(
-    image: Float[Tensor, "h w 3"], truth: Float[Tensor, "h w 3"]
-) -> Float[Tensor, "h w"] | None:
+def compute_flip_map(image: Image, truth: Image) -> Float[Tensor, "h w"] | None:
     """Compute the FLIP error per pixel of two sRGB images; None if the package is missing."""
     try:
         import flip_evaluator
@@ -100,3 +108,46 @@ def compute_flip_map(
     both = (x.clamp(0, 1).float().cpu().contiguous().numpy() for x in (truth, image))
     errors, _, _ = flip_evaluator.evaluate(*both, "LDR", applyMagma=False, computeMeanError=False)
     return torch.from_numpy(errors[..., 0].copy())
+
+
+@torch.no_grad()
+def compute_lpips(image: Image, truth: Image, network: Literal["vgg", "alex"]) -> float | None:
+    """Compute LPIPS of two images, clipped to [0, 1]; 0 is best. None if it is not available."""
+    metric = load_lpips(network)
+    return None if metric is None else float(metric(to_batch(image), to_batch(truth)))
+
+
+@cache
+def load_lpips(network: Literal["vgg", "alex"]) -> Any | None:
+    """Load the metric, and download its weights on first use; None if that fails."""
+    try:
+        # Imported here because the package imports torchvision.
+        from torchmetrics.image.lpip import LearnedPerceptualImagePatchSimilarity
+
+        return LearnedPerceptualImagePatchSimilarity(net_type=network, normalize=True)
+    except MISSING:
+        return None
+
+
+def compute_fid(images: Sequence[Image], truths: Sequence[Image]) -> float:
+    """Compute |μ - μ'|² + tr(Σ + Σ' - 2 (Σ Σ')^½) of 2,048 Inception features; 0 is best.
+
+    The estimate is biased: compare sets of equal size only, with thousands of images if possible.
+    """
+    try:
+        from torchmetrics.image.fid import FrechetInceptionDistance
+
+        metric = FrechetInceptionDistance(feature=2048, normalize=True)
+    except MISSING as error:
+        raise InputError(f"FID is not available ({error}); {ADVICE}") from error
+    for side, found in (("photographs", truths), ("rendered images", images)):
+        if len(found) < 2:
+            raise InputError(f"FID needs at least two {side}, got {len(found)}.")
+        for image in found:
+            metric.update(to_batch(image), real=found is truths)
+    return float(metric.compute())
+
+
+def to_batch(image: Image) -> Float[Tensor, "1 3 h w"]:
+    """Clip an image to [0, 1] and make it a batch in torch's layout, on the CPU."""
+    return image.clamp(0, 1).permute(2, 0, 1)[None].float().cpu()

@@ -21,8 +21,7 @@ from gscompleter.evaluation.metrics.image import (
     compute_masked_psnr,
     ssim,
 )
-from gscompleter.evaluation.metrics.learned import compute_lpips
-from gscompleter.evaluation.metrics.perceptual import compute_flip_map, haarpsi
+from gscompleter.evaluation.metrics.perceptual import compute_flip_map, compute_lpips, haarpsi
 from gscompleter.render import Renderer
 from gscompleter.stages.target_view import compute_hole_mask
 from gscompleter.types import Camera, DepthMap, Gaussians, Render, View
@@ -35,7 +34,7 @@ MIN_PIXELS = 50
 
 @dataclass(frozen=True)
 class Truth:
-    """Photographs to score against; their cameras have the depth range of the scene."""
+    """Photographs to score against, in the depth range of the scene."""
 
     views: tuple[View, ...]
     target: View
@@ -55,10 +54,9 @@ class Quality:
     """Scores of one image against its photograph."""
 
     psnr: float
-    """PSNR in dB."""
     ssim: float
     lpips_vgg: float | None
-    """None if it is not available."""
+    """LPIPS; None if it is not available."""
     lpips_alex: float | None
 
 
@@ -67,7 +65,6 @@ class PartQuality:
     """Scores of a part of an image, most of which do not reward blur; None without a pixel."""
 
     psnr: float | None
-    """PSNR in dB."""
     flip: float | None
     """Mean of the FLIP map; None also if flip-evaluator is missing."""
     haarpsi: float | None
@@ -77,7 +74,7 @@ class PartQuality:
 
 @dataclass(frozen=True)
 class Scores:
-    """Scores of a completion against held-out photographs; None if the truth is missing."""
+    """Scores against held-out photographs, PSNR in dB; None if the truth is missing."""
 
     hole_fraction: float
     """Share of the target's pixels that the context does not cover."""
@@ -88,11 +85,8 @@ class Scores:
     observed: PartQuality
     """At the target over all other pixels."""
     neighbours_psnr: tuple[Change, ...]
-    """PSNR in dB of each neighbour view."""
     context_psnr: tuple[Change, ...]
-    """PSNR in dB of each context view."""
     context_ssim: tuple[Change, ...]
-    """SSIM of each context view."""
     depth_observed: Agreement | None
     """Depth at the target against the true depth, where the context covers it."""
     depth_hole: Agreement | None
@@ -107,12 +101,11 @@ class Scores:
 
 @dataclass(frozen=True)
 class TargetRenders:
-    """Renders at the target."""
+    """Renders at the target, and the holes of the scene before completion."""
 
     before: Render
     after: Render
     holes: Bool[Tensor, "h w"]
-    """True in holes of the scene before completion."""
 
 
 @torch.no_grad()
