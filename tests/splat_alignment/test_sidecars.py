@@ -174,7 +174,7 @@ def test_a_splat_in_the_map_of_its_photographs_is_told_from_their_origin(splat):
 
 @pytest.mark.parametrize("place", [(3000.0, 1000.0, 0.0), (0.0, 0.0, 0.0)])
 def test_a_result_is_relative_to_an_origin_where_the_splat_lies_there(
-    room, splat, place, tmp_path, monkeypatch
+    room, splat, place, tmp_path, monkeypatch, capsys
 ):
     put_on_map(room, (3000.0, 1000.0, 0.0))
     here = make_similarity(1.0, np.eye(3), np.array(place)) @ ARBITRARY
