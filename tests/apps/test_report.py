@@ -18,12 +18,13 @@ from gscompleter.apps.report.charts import fit_frame
 from gscompleter.apps.report.completion_page import render_completion_page
 from gscompleter.apps.report.page import open_gallery
 from gscompleter.apps.report.plain_words import (
+    describe_wanted_photographs,
     format_change,
     format_number,
     format_percent,
     list_photograph_notes,
 )
-from gscompleter.apps.report.schema import ContextRow
+from gscompleter.apps.report.schema import AlignmentRow, ContextRow, TargetRow
 from gscompleter.errors import InputError
 from scenes import camera_at
 
@@ -346,3 +347,13 @@ def test_that_something_moved_is_told_with_where():
     ]
     (said,) = list_photograph_notes(rows)
     assert "1.6 % of frame 7, 0.6 % of frame 23" in said
+
+
+def test_where_to_stand_for_new_photographs():
+    scores, alignment = [None] * 4, AlignmentRow(1.0, 0.0, 0.0, "identity")
+    rows = [
+        TargetRow(None, *scores, 0, False, 0.1, alignment, 0, derived_from=frame)
+        for frame in (12, 31, 5)
+    ]
+    assert "beside frame 12 and frame 31" in describe_wanted_photographs(rows)
+    assert "--target" in describe_wanted_photographs([])

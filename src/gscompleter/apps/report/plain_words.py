@@ -5,7 +5,12 @@ from __future__ import annotations
 import math
 from collections.abc import Iterator, Sequence
 
-from gscompleter.apps.report.schema import AlignmentRow, CompletionSummary, ContextRow
+from gscompleter.apps.report.schema import (
+    AlignmentRow,
+    CompletionSummary,
+    ContextRow,
+    TargetRow,
+)
 
 FRAME_NOTES = {
     "cameras": "in the frame of its cameras.json, not in that of the photographs",
@@ -34,6 +39,8 @@ RECOLORED_NOTE = (
 )
 NO_SCORES_NOTE = "No target has a photograph, so there are no scores at targets."
 NO_TARGET_NOTE = "No large hole was found around the photographs; nothing was completed."
+NUM_WANTED = 2
+"""Most places that are named for new photographs."""
 NOTHING_NEW_NOTE = (
     "The splat reproduces all photographs. Where it is wrong from elsewhere, only smooth colours "
     "are known: little is to be gained without new photographs of the place or a learned generator."
@@ -85,6 +92,7 @@ def list_splat_notes(summary: CompletionSummary) -> Iterator[str]:
     """List the notes on what photographs bring to a splat."""
     if summary.new_photographs == 0:
         yield NOTHING_NEW_NOTE
+        yield describe_wanted_photographs(summary.targets)
     elif summary.new_photographs is not None:
         yield (
             f"The splat was not trained on {summary.new_photographs} of the photographs; it is "
@@ -92,6 +100,15 @@ def list_splat_notes(summary: CompletionSummary) -> Iterator[str]:
         )
     if recolored := summary.gaussians.get("recolored"):
         yield f"{recolored:,} {RECOLORED_NOTE}"
+
+
+def describe_wanted_photographs(targets: Sequence[TargetRow]) -> str:
+    """Describe where new photographs would help most: at the planned targets."""
+    planned = [str(row.derived_from) for row in targets if row.derived_from is not None]
+    if not planned:
+        return "Without --target, `complete` finds the cameras where they would help most."
+    frames = " and ".join(f"frame {frame}" for frame in planned[:NUM_WANTED])
+    return f"They would help most at the first cameras of targets.json, beside {frames}."
 
 
 def describe_alignment(affine: AlignmentRow, unit: str) -> str:
