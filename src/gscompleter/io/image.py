@@ -93,7 +93,11 @@ def read_brightness(stored: Path | bytes, side: int, name: str = "") -> Float[np
 
 def read_depth(path: Path, unit: float) -> Float[np.ndarray, "h w"]:
     """Read z-depth from a 16-bit PNG or a `.npy` file, times `unit`; 0 where unknown."""
-    values = _read_array(path) if path.suffix == ".npy" else _read_stored(path)
+    if path.suffix == ".npy":
+        values = _read_array(path)
+    else:
+        with open_image(path) as image:
+            values = np.array(image)
     values = values[..., 0] if values.ndim == 3 and values.shape[-1] == 1 else values
     if values.ndim != 2 or values.dtype.kind not in "uif" or values.dtype == np.uint8:
         raise InputError(
@@ -103,11 +107,6 @@ def read_depth(path: Path, unit: float) -> Float[np.ndarray, "h w"]:
     with np.errstate(over="ignore", invalid="ignore"):
         depth = (values.astype(np.float64) * unit).astype(np.float32)
     return np.where(np.isfinite(depth) & (depth > 0), depth, np.float32(0))
-
-
-def _read_stored(path: Path) -> np.ndarray:
-    with open_image(path) as image:
-        return np.array(image)
 
 
 def _read_array(path: Path) -> np.ndarray:

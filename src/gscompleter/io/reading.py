@@ -89,9 +89,7 @@ def read_json(path: Path, advice: str) -> Any:
     data = read_bytes(path, MAX_JSON)
     try:
         value = json.loads(data.decode("utf-8-sig"), parse_int=_parse_integer)
-    except RecursionError as error:
-        raise InputError(f"{quote_value(path)} is nested too deeply; {advice}.") from error
-    except ValueError as error:
+    except (ValueError, RecursionError) as error:
         raise InputError(
             f"{quote_value(path)} is not JSON ({quote_value(str(error))}); {advice}."
         ) from error

@@ -25,7 +25,7 @@ from gscompleter.data.sfm.match_pairs import (
     pair_similar,
     select_largest_features,
 )
-from gscompleter.data.sfm.poses import UprightCopy
+from gscompleter.data.sfm.poses import MIN_PHOTOGRAPHS, UprightCopy
 
 SEED = 0
 MAX_FEATURES = 4096
@@ -36,8 +36,8 @@ LENS = "SIMPLE_RADIAL"
 """COLMAP's camera model: one focal length, one distortion coefficient."""
 GUESSED_FOCAL = 1.2
 """Focal length in longer image sides, if EXIF lacks it."""
-MIN_MODEL = 3
-"""Fewest photographs of a model."""
+WANTED_SHARE = 0.5
+"""Share of the photographs in a model below which other focal lengths are tried."""
 MIN_FOR_CENTRE = 10
 """Fewest photographs per camera to refine its principal point."""
 MAX_OFF_CENTRE = 0.1
@@ -64,8 +64,6 @@ class Job:
     """Folder for the largest model; it does not exist yet."""
     photographs: list[UprightCopy]
     threads: int
-    min_photographs: int
-    """Fewest photographs in a model that end the search for a focal length."""
 
     @property
     def database(self) -> Path:
@@ -141,16 +139,14 @@ def match(job: Job, pairs: Pairs) -> None:
 
 
 def map_photographs(job: Job) -> dict[str, Any]:
-    """Find cameras and points from the matches, and write the largest model.
+    """Find cameras and points from the matches; write the best model and return its quality.
 
-    Returns:
-        Its `registered` photographs by the names of their copies, its number of `points`, its mean
-        reprojection `error` in pixels, True if its lenses are plausible (`is_plausible`), and the
-        `focal` length in pixels if it was fixed at first, else None.
+    `registered` are the names of the copies, `error` is the mean reprojection error in pixels, and
+    `focal` the focal length in pixels if it was fixed at first, else None.
     """
     model, is_focal_fixed = select_model(job)
     if model is None:
-        return {"registered": []}
+        return {"registered": [], "points": 0, "error": 0, "is_plausible": True, "focal": None}
     counts = _count_photographs(model)
     if min(counts.values()) >= MIN_FOR_CENTRE:
         # Fewer photographs cannot separate the principal point from a rotation.
@@ -167,14 +163,11 @@ def map_photographs(job: Job) -> dict[str, Any]:
 
 
 def select_model(job: Job) -> tuple[pycolmap.Reconstruction | None, bool]:
-    """Map with a free focal length, then with each plausible fixed value, until it is good.
-
-    Returns:
-        The best model, and True if its focal length was fixed at first.
-    """
+    """Map with a free focal length, then with plausible fixed ones (True), until it is good."""
     best, is_focal_fixed = map_largest(job), False
+    wanted = math.ceil(WANTED_SHARE * len(job.photographs))
     for fov in FIXED_FOVS:
-        if _rate_model(best) >= (True, job.min_photographs, 0):
+        if _rate_model(best) >= (True, wanted, 0):
             break
         found = map_with_fixed_focals(job, fov)
         if _rate_model(found) > _rate_model(best):
@@ -225,7 +218,7 @@ def map_largest(job: Job, is_focal_fixed: bool = False) -> pycolmap.Reconstructi
     options = pycolmap.IncrementalPipelineOptions(
         num_threads=job.threads,
         random_seed=SEED,
-        min_model_size=MIN_MODEL,
+        min_model_size=MIN_PHOTOGRAPHS,
         ba_refine_focal_length=not is_focal_fixed,
         ba_refine_extra_params=not is_focal_fixed,
     )

@@ -44,8 +44,6 @@ MIN_PHOTOGRAPHS = 3
 """Fewest photographs; two determine neither a focal length nor a wrong match."""
 MIN_SHARE = 0.25
 """Smallest share of the photographs in a usable model."""
-WANTED_SHARE = 0.5
-"""Share of the photographs in a model below which other focal lengths are tried."""
 MIN_POINTS = 30
 """Fewest points of a model; COLMAP needs as many in common with one photograph."""
 MAX_SIDE = 1600
@@ -83,11 +81,9 @@ class FoundPoses:
     """Result of structure from motion on a folder of photographs."""
 
     photographs: int
-    """Number of input photographs."""
     missing: list[str]
     """Photographs without a camera."""
     points: int
-    """Points of the model."""
     error: float
     """Mean reprojection error, in pixels of the copies."""
     focal: float | None = None
@@ -107,8 +103,7 @@ class FoundPoses:
         if self.focal is not None:
             notes.append(
                 f"{self.num_registered} of {self.photographs} cameras were found with a focal "
-                f"length of {self.focal:.0f} px, fixed at plausible values first, because COLMAP "
-                "failed with a free one."
+                f"length of {self.focal:.0f} px, which was fixed at first."
             )
         if self.missing:
             names = join_names(self.missing, MAX_NAMED)
@@ -154,8 +149,6 @@ def has_photographs(path: Path) -> bool:
 
 def list_photograph_files(folder: Path) -> list[str]:
     """List the photographs below a folder in natural order; at least `MIN_PHOTOGRAPHS`."""
-    if not os.path.isdir(folder):
-        raise InputError(f"There is no folder {quote_value(folder)}; name a folder of photographs.")
     names = _walk_photographs(folder)
     if len(names) < MIN_PHOTOGRAPHS:
         raise InputError(
@@ -188,12 +181,6 @@ def _run(photographs: Path, names: Sequence[str], folder: Path) -> FoundPoses:
         for name in track(names, "Turning photographs upright")
     ]
     result = _map(copies, folder)
-    if not result["registered"]:
-        raise InputError(
-            f"COLMAP found no cameras for the {len(names)} photographs in "
-            f"{quote_value(str(photographs))}; add photographs of the same scene that overlap by "
-            "two thirds and are sharp."
-        )
     missing = [copy.source for copy in copies if copy.name not in result["registered"]]
     found = FoundPoses(len(names), missing, result["points"], result["error"], result["focal"])
     enough = max(MIN_PHOTOGRAPHS, MIN_SHARE * len(names))
@@ -231,7 +218,9 @@ def write_upright(root: Path, source: str, folder: Path) -> UprightCopy:
     if is_ready:
         shutil.copyfile(path, target)
     else:
-        _save(copy, target, "JPEG" if kind == "JPEG" else "PNG")
+        copy.info.clear()  # removes the orientation, which is applied already
+        written = "JPEG" if kind == "JPEG" else "PNG"
+        copy.save(target, format=written, quality=QUALITY, subsampling=0)
     diagonal = math.hypot(*copy.size)
     return UprightCopy(name, source, *copy.size, focal and focal * diagonal, lens)
 
@@ -245,12 +234,6 @@ def _prepare_target(target: Path, source: Path) -> Path:
         )
     target.parent.mkdir(parents=True, exist_ok=True)
     return target
-
-
-def _save(image: Image.Image, target: Path, kind: str) -> None:
-    image.info.clear()  # removes the orientation, which is applied already
-    options = {"quality": QUALITY, "subsampling": 0} if kind == "JPEG" else {}
-    image.save(target, format=kind, **options)
 
 
 def _read_focal(exif: Image.Exif) -> float | None:
@@ -278,7 +261,6 @@ def _map(copies: Sequence[UprightCopy], folder: Path) -> dict[str, Any]:
             "model": str(folder / "sparse" / "0"),
             "photographs": [asdict(copy) for copy in copies],
             "threads": min(MAX_THREADS, get_thread_count()),
-            "min_photographs": math.ceil(WANTED_SHARE * len(copies)),
         }
         done = subprocess.run(
             [sys.executable, "-m", PROCESS],
