@@ -14,8 +14,7 @@ from test_pose_formats import check_room, write_cloud
 
 from command import run
 from gscompleter import InputError, load_cameras
-from gscompleter.data.colmap.model_files import MODELS, build_intrinsics
-from gscompleter.data.colmap.scene import _list_roots
+from gscompleter.data.colmap import MODELS, _list_roots, build_intrinsics
 from gscompleter.data.formats import open_photographs
 from gscompleter.data.points import add_depth_range
 from gscompleter.data.undistort import Distortion, distort

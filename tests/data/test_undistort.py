@@ -4,7 +4,7 @@ import cv2
 import numpy as np
 import pytest
 
-from gscompleter.data.colmap.model_files import MODELS, build_intrinsics
+from gscompleter.data.colmap import MODELS, build_intrinsics
 from gscompleter.data.undistort import (
     Distortion,
     Pinhole,

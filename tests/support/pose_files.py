@@ -10,7 +10,7 @@ from pathlib import Path
 import numpy as np
 import torch
 
-from gscompleter.data.colmap.model_files import MODELS
+from gscompleter.data.colmap import MODELS
 from gscompleter.data.scene import write_cameras
 from gscompleter.io.image import write_image
 from gscompleter.types import Camera, View

@@ -24,14 +24,8 @@ import numpy as np
 from jaxtyping import Float
 
 from gscompleter.data.cameras import Intrinsics
-from gscompleter.data.colmap.scene import (
-    has_colmap,
-    is_image_file,
-    read_image_file,
-    read_scene_cameras,
-)
-from gscompleter.data.frame import Frame
-from gscompleter.data.image_folders import ImageFinder, keep_existing
+from gscompleter.data.colmap import has_colmap, is_image_file, read_image_file, read_scene_cameras
+from gscompleter.data.frame import Frame, ImageFinder, keep_existing
 from gscompleter.data.json_fields import (
     get_array,
     get_focal,
@@ -41,8 +35,7 @@ from gscompleter.data.json_fields import (
     get_text,
 )
 from gscompleter.data.limits import require
-from gscompleter.data.photographs import Photographs, build_photographs
-from gscompleter.data.resize import Resolution
+from gscompleter.data.photographs import Photographs, Resolution, build_photographs
 from gscompleter.data.transforms import NAME as TRANSFORMS
 from gscompleter.data.transforms import read_frames
 from gscompleter.errors import InputError, quote_value

@@ -16,8 +16,7 @@ from typing import Any
 
 from gscompleter.data.ego_vehicle import attach_vehicle_detector
 from gscompleter.data.formats import FORMATS, detect_format, find_format, open_photographs
-from gscompleter.data.photographs import Photographs, apply_masks
-from gscompleter.data.resize import Resolution
+from gscompleter.data.photographs import Photographs, Resolution, apply_masks
 from gscompleter.errors import InputError, quote_value
 from gscompleter.io.reading import read_json
 from gscompleter.types import View

@@ -14,14 +14,14 @@ from pathlib import Path
 
 from gscompleter.data.camera_files import has_camera_list, open_camera_list, refuse_other_exports
 from gscompleter.data.chunks import has_chunks, open_chunks
-from gscompleter.data.colmap.scene import has_colmap, open_colmap
+from gscompleter.data.colmap import has_colmap, open_colmap
 from gscompleter.data.driving.dgp import has_dgp, open_dgp
 from gscompleter.data.driving.kitti import has_kitti, has_kitti_raw, open_kitti, open_kitti_raw
 from gscompleter.data.driving.mmdet3d import has_infos, open_infos
 from gscompleter.data.driving.pandaset import has_pandaset, open_pandaset
 from gscompleter.data.driving.waymo import has_waymo, open_waymo
 from gscompleter.data.ego_vehicle import attach_vehicle_detector
-from gscompleter.data.image_folders import FOLDERS
+from gscompleter.data.frame import FOLDERS
 from gscompleter.data.limits import check_planes, require
 from gscompleter.data.llff import has_llff, open_llff
 from gscompleter.data.photographs import Photographs

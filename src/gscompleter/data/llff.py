@@ -16,8 +16,7 @@ import numpy as np
 from jaxtyping import Float
 
 from gscompleter.data.cameras import Intrinsics
-from gscompleter.data.frame import Frame
-from gscompleter.data.image_folders import ImageFinder
+from gscompleter.data.frame import Frame, ImageFinder
 from gscompleter.data.json_fields import get_size
 from gscompleter.data.limits import DEPTH_RANGE, require
 from gscompleter.data.photographs import Photographs, build_photographs

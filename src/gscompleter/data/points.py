@@ -12,8 +12,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from gscompleter.data.limits import DEPTH_RANGE
-from gscompleter.data.photographs import Photographs
-from gscompleter.data.resize import Resolution
+from gscompleter.data.photographs import Photographs, Resolution
 from gscompleter.geometry import is_inside, project
 from gscompleter.splats.ply_file import read_ply_file
 from gscompleter.types import Camera

@@ -11,8 +11,7 @@ import numpy as np
 from gscompleter.data.camera_files import read_cameras
 from gscompleter.data.formats import open_photographs
 from gscompleter.data.limits import check_planes, require
-from gscompleter.data.photographs import Photographs
-from gscompleter.data.resize import Resolution
+from gscompleter.data.photographs import Photographs, Resolution
 from gscompleter.data.transforms import OPENCV_FROM_OPENGL
 from gscompleter.io.files import replace_file
 from gscompleter.types import Camera, View

@@ -20,8 +20,7 @@ from pydantic import Field, TypeAdapter, ValidationError
 
 from gscompleter.completer import MAX_TARGET_ID
 from gscompleter.data.cases import Case
-from gscompleter.data.photographs import Photographs, apply_masks
-from gscompleter.data.resize import Resolution
+from gscompleter.data.photographs import Photographs, Resolution, apply_masks
 from gscompleter.errors import InputError, quote_value
 from gscompleter.io.files import replace_file
 from gscompleter.io.reading import read_json

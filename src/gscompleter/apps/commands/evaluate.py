@@ -25,7 +25,7 @@ from gscompleter.apps.commands.options import (
 from gscompleter.apps.warmup import compile_kernels
 from gscompleter.data.cases import Case, SkippedScene, filter_usable, open_clips, read_cases
 from gscompleter.data.formats import open_photographs
-from gscompleter.data.resize import check_resolution
+from gscompleter.data.photographs import check_resolution
 from gscompleter.errors import InputError, quote_value
 from gscompleter.evaluation import plots, protocols, tables
 from gscompleter.evaluation.methods import expand_methods

@@ -10,8 +10,7 @@ from torch import Tensor
 
 from gscompleter.apps.commands.options import CompleteOptions, SceneOptions, parse_resolution
 from gscompleter.apps.report.completion import Target
-from gscompleter.data.photographs import Photographs
-from gscompleter.data.resize import Resolution
+from gscompleter.data.photographs import Photographs, Resolution
 from gscompleter.errors import InputError
 from gscompleter.geometry import select_spread_cameras
 from gscompleter.reconstructors.features.depth_range import estimate_depth_range

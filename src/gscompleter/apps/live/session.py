@@ -11,7 +11,7 @@ from jaxtyping import Float
 
 from gscompleter.apps.viewer.exhibit import load_scene_cameras
 from gscompleter.completer import GSCompleter
-from gscompleter.data.resize import Resolution
+from gscompleter.data.photographs import Resolution
 from gscompleter.data.scene import write_cameras
 from gscompleter.errors import InputError
 from gscompleter.splat_alignment.similarity import transform_camera_exactly

@@ -13,7 +13,7 @@ from gscompleter.apps.report.schema import CompletionSummary, read_summary
 from gscompleter.data.camera_files import read_cameras
 from gscompleter.data.formats import open_photographs
 from gscompleter.data.local_origin import compute_frame_from_photographs
-from gscompleter.data.resize import Resolution
+from gscompleter.data.photographs import Resolution
 from gscompleter.data.scene import load_cameras
 from gscompleter.data.sfm.poses import POSES
 from gscompleter.errors import InputError, quote_value

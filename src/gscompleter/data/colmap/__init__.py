@@ -1,1 +1,0 @@
-"""Readers for COLMAP's sparse models, binary and text."""
