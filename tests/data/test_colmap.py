@@ -14,10 +14,10 @@ from test_pose_formats import check_room, write_cloud
 
 from command import run
 from gscompleter import InputError, load_cameras
+from gscompleter.data.cameras import Distortion, distort
 from gscompleter.data.colmap import MODELS, _list_roots, build_intrinsics
 from gscompleter.data.formats import open_photographs
 from gscompleter.data.points import add_depth_range
-from gscompleter.data.undistort import Distortion, distort
 from gscompleter.io.image import write_image
 from gscompleter.types import Camera, View
 from pose_files import (

@@ -212,7 +212,7 @@ def test_a_frame_without_its_photograph_has_a_camera_where_its_size_is_known(tmp
     scene = save_scene(tmp_path / "room")
     (scene / "1.png").unlink()
     photographs = open_photographs(scene)
-    assert [photographs.has_photograph(number) for number in (0, 1)] == [True, False]
+    assert [photographs.frame(number).has_photograph() for number in (0, 1)] == [True, False]
     assert torch.allclose(photographs.camera(1).c2w, VIEWS[1].camera.c2w, atol=1e-6)
     stored = open_photographs(save_camera_file(tmp_path / "room.txt"))
     with pytest.raises(InputError, match="size of frame 1 of .*room.txt is not known"):
@@ -240,7 +240,7 @@ def test_copies_of_other_folders_are_no_photographs_of_this_one(tmp_path):
     scene = save_scene(tmp_path / "room")
     save_scene(tmp_path / "room_2")
     (scene / "1.png").unlink()
-    assert not open_photographs(scene).has_photograph(1)
+    assert not open_photographs(scene).frame(1).has_photograph()
 
 
 @pytest.mark.parametrize(

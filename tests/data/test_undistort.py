@@ -4,14 +4,14 @@ import cv2
 import numpy as np
 import pytest
 
-from gscompleter.data.colmap import MODELS, build_intrinsics
-from gscompleter.data.undistort import (
+from gscompleter.data.cameras import (
     Distortion,
     Pinhole,
     compute_undistortion_map,
     distort,
     undistort_pinhole,
 )
+from gscompleter.data.colmap import MODELS, build_intrinsics
 
 PINHOLE = Pinhole(fl_x=130.0, fl_y=127.5, cx=81.5, cy=59.0, width=160, height=120)
 

@@ -25,7 +25,7 @@ from jaxtyping import Float
 
 from gscompleter.data.cameras import Intrinsics
 from gscompleter.data.colmap import has_colmap, is_image_file, read_image_file, read_scene_cameras
-from gscompleter.data.frame import Frame, ImageFinder, keep_existing
+from gscompleter.data.frame import Frame, keep_existing, locate_images
 from gscompleter.data.json_fields import (
     get_array,
     get_focal,
@@ -95,8 +95,7 @@ def open_camera_list(path: Path) -> Iterator[Photographs]:
     sorted names of the photographs that exist.
     """
     file = path / NAME if os.path.isdir(path) else path
-    finder = ImageFinder([file.parent])
-    frames = [finder.locate(frame) for frame in read_camera_list(file)]
+    frames = locate_images(read_camera_list(file), [file.parent])
     there, notes = keep_existing(frames, str(file))
     name = file.resolve().parent.name if file.name == NAME else file.stem
     yield replace(build_photographs(name, str(file), there), notes=notes)

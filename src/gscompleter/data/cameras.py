@@ -1,18 +1,29 @@
-"""Intrinsics as stored in files, and their validation."""
+"""Cameras: intrinsics, lens distortion, undistortion and the validation of poses.
+
+Pixel coordinates put the centre of the top-left pixel at (0.5, 0.5). OpenCV puts it at (0, 0),
+which matters only when an image is passed to it.
+"""
 
 from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from functools import lru_cache
+from typing import Literal
 
+import cv2
 import numpy as np
-from jaxtyping import Float
+import torch
+from jaxtyping import Float, Int, Shaped
+from torch import Tensor
 
 from gscompleter.data.limits import FOCAL_RANGE, MAX_CENTER, MAX_COORDINATE
-from gscompleter.data.undistort import Distortion, Pinhole
 from gscompleter.types import MAX_RIGID_ERROR
 
+MAX_ZOOM_OUT = 0.5
+"""Smallest share of the central resolution that undistortion keeps."""
+MAX_ZOOM_IN = 4.0
 FRACTIONS = (1, 1)
 """`Intrinsics.size` of values in image widths and heights."""
 
@@ -20,6 +31,172 @@ FLOAT_NOISE = 1e-6
 """Largest deviation from a rotation that is kept as it is."""
 SAME_ASPECT = 0.02
 """Relative difference of aspect ratios that rounding of sizes explains."""
+
+
+@dataclass(frozen=True)
+class Pinhole:
+    """Intrinsics of a pinhole camera, in pixels and float64."""
+
+    fl_x: float
+    fl_y: float
+    cx: float
+    cy: float
+    width: int
+    height: int
+
+    @property
+    def K(self) -> Float[Tensor, "3 3"]:
+        """Intrinsic matrix in pixels, float32."""
+        rows = [[self.fl_x, 0, self.cx], [0, self.fl_y, self.cy], [0, 0, 1]]
+        return torch.tensor(rows, dtype=torch.float64).float()
+
+    def resize(self, width: int, height: int) -> Pinhole:
+        """Return the camera of the image resized to width × height."""
+        x, y = width / self.width, height / self.height
+        return Pinhole(self.fl_x * x, self.fl_y * y, self.cx * x, self.cy * y, width, height)
+
+    def crop(self, left: int, top: int, width: int, height: int) -> Pinhole:
+        """Return the camera of the crop that begins at pixel (left, top)."""
+        return Pinhole(self.fl_x, self.fl_y, self.cx - left, self.cy - top, width, height)
+
+
+Projection = Literal["perspective", "equidistant", "field-of-view", "division", "unified"]
+"""Maps from directions to the image plane, before any polynomial (see `_compute_radius`)."""
+
+
+@dataclass(frozen=True)
+class Distortion:
+    """Lens distortion of points of the image plane at z = 1: a projection, then polynomials.
+
+    The polynomials are OpenCV's; with the equidistant projection they are its fisheye model.
+    """
+
+    projection: Projection = "perspective"
+    shape: tuple[float, ...] = ()
+    """Parameters of the projection: the angle ω, k, or α and β."""
+    radial: tuple[float, ...] = ()
+    """Coefficients k1, k2, … of even powers of the radius, from the second on."""
+    tangential: tuple[float, float] = (0.0, 0.0)
+    """Coefficients p1 and p2."""
+    denominator: tuple[float, ...] = ()
+    """Coefficients k4, k5 and k6 of OpenCV's rational model, which divide the radial polynomial."""
+    prism: tuple[float, float] = (0.0, 0.0)
+    """Thin-prism coefficients s1 and s3, which multiply r² in x and y."""
+
+    def __bool__(self) -> bool:
+        """Return True if a photograph needs undistortion."""
+        polynomials = (*self.radial, *self.tangential, *self.denominator, *self.prism)
+        return self.projection != "perspective" or any(polynomials)
+
+
+def distort(points: Float[np.ndarray, "*n 2"], distortion: Distortion) -> Float[np.ndarray, "*n 2"]:
+    """Distort points of the image plane at z = 1; NaN outside the field of the lens."""
+    # Far outside the photograph, polynomials overflow and the division has no solution.
+    with np.errstate(all="ignore"):
+        if distortion.projection != "perspective":
+            r = np.maximum(np.linalg.norm(points, axis=-1), 1e-6)
+            points = points * (_compute_radius(r, distortion) / r)[..., None]
+        return _apply_polynomials(points, distortion)
+
+
+def _compute_radius(r: Float[np.ndarray, "*n"], distortion: Distortion) -> Float[np.ndarray, "*n"]:
+    """Project a radius at z = 1; the division model gives the ρ with ρ / (1 + k ρ²) = r."""
+    if distortion.projection == "equidistant":
+        return np.arctan(r)
+    if distortion.projection == "field-of-view":
+        (omega,) = distortion.shape
+        return np.arctan(2 * r * np.tan(omega / 2)) / omega
+    if distortion.projection == "division":
+        (k,) = distortion.shape
+        return 2 * r / (1 + np.sqrt(1 - 4 * k * r * r))
+    alpha, beta = distortion.shape
+    return r / (alpha * np.sqrt(beta * r * r + 1) + 1 - alpha)
+
+
+def _apply_polynomials(
+    points: Float[np.ndarray, "*n 2"], distortion: Distortion
+) -> Float[np.ndarray, "*n 2"]:
+    x, y = points[..., 0], points[..., 1]
+    r2 = x * x + y * y
+    # Both are 1 + k1 r² + k2 r⁴ + …
+    numerator, denominator = (
+        np.polynomial.polynomial.polyval(r2, (1.0, *coefficients))
+        for coefficients in (distortion.radial, distortion.denominator)
+    )
+    radial = numerator / denominator
+    (p1, p2), (s1, s3) = distortion.tangential, distortion.prism
+    new_x = x * radial + 2 * p1 * x * y + p2 * (r2 + 2 * x * x) + s1 * r2
+    new_y = y * radial + p1 * (r2 + 2 * y * y) + 2 * p2 * x * y + s3 * r2
+    return np.stack([new_x, new_y], axis=-1)
+
+
+@lru_cache(maxsize=16)
+def undistort_pinhole(pinhole: Pinhole, distortion: Distortion) -> Pinhole | None:
+    """Compute the pinhole camera of the undistorted photograph, of the same size.
+
+    It keeps the principal point and zooms until every pixel lies in the photograph and the borders
+    lose as little as possible. Fisheye lenses lose more, since the zoom stops at `MAX_ZOOM_OUT`.
+    Returns None if the coefficients fold the image, so that no zoom works.
+    """
+    if not distortion:
+        return pinhole
+    found, radius = None, np.zeros(())
+    for zoom in np.geomspace(MAX_ZOOM_IN, MAX_ZOOM_OUT, 400).tolist():
+        new = replace(pinhole, fl_x=pinhole.fl_x * zoom, fl_y=pinhole.fl_y * zoom)
+        bent = distort(_compute_border(new), distortion)
+        # Zooming out must move every border point outwards: beyond the fold of a polynomial,
+        # points return into the photograph and show something else.
+        if not _is_within(pinhole, bent) or (np.linalg.norm(bent, axis=-1) < radius).any():
+            break
+        found, radius = new, np.linalg.norm(bent, axis=-1)
+    return found
+
+
+@lru_cache(maxsize=1)
+def compute_undistortion_map(
+    pinhole: Pinhole, distortion: Distortion, new: Pinhole
+) -> Float[np.ndarray, "h w 2"]:
+    """Compute the photograph position of each undistorted pixel, for `remap`."""
+    plane = _compute_plane(new, np.arange(new.width), np.arange(new.height))
+    pixels = _to_pixels(pinhole, distort(plane, distortion))
+    # The nearest border fills pixels outside the field of the lens.
+    finite = np.nan_to_num(pixels - 0.5, nan=-1.0, posinf=-1.0, neginf=-1.0)
+    with np.errstate(over="ignore"):
+        return finite.astype(np.float32)
+
+
+def remap(
+    image: Shaped[np.ndarray, "h w *c"], source: Float[np.ndarray, "h w 2"], interpolation: int
+) -> Shaped[np.ndarray, "h w *c"]:
+    """Sample `image` at the positions `source`."""
+    x, y = np.ascontiguousarray(source[..., 0]), np.ascontiguousarray(source[..., 1])
+    return np.asarray(cv2.remap(image, x, y, interpolation, borderMode=cv2.BORDER_REPLICATE))
+
+
+def _compute_border(pinhole: Pinhole) -> Float[np.ndarray, "n 2"]:
+    """Compute the outermost pixel centres on the image plane at z = 1."""
+    columns, rows = np.arange(pinhole.width), np.arange(pinhole.height)
+    edges = (columns, rows[[0, -1]]), (columns[[0, -1]], rows)
+    return np.concatenate([_compute_plane(pinhole, *edge).reshape(-1, 2) for edge in edges])
+
+
+def _compute_plane(
+    pinhole: Pinhole, columns: Int[np.ndarray, "w"], rows: Int[np.ndarray, "h"]
+) -> Float[np.ndarray, "h w 2"]:
+    """Compute the pixel centres in these columns and rows on the image plane at z = 1."""
+    x = (columns + 0.5 - pinhole.cx) / pinhole.fl_x
+    y = (rows + 0.5 - pinhole.cy) / pinhole.fl_y
+    return np.stack(np.meshgrid(x, y), axis=-1)
+
+
+def _to_pixels(pinhole: Pinhole, points: Float[np.ndarray, "*n 2"]) -> Float[np.ndarray, "*n 2"]:
+    return points * [pinhole.fl_x, pinhole.fl_y] + [pinhole.cx, pinhole.cy]
+
+
+def _is_within(pinhole: Pinhole, points: Float[np.ndarray, "*n 2"]) -> bool:
+    """Check whether all points fall on pixels of the photograph, within 0.001 pixels."""
+    pixels, size = _to_pixels(pinhole, points), np.array([pinhole.width, pinhole.height])
+    return bool(((pixels >= 0.499) & (pixels <= size - 0.499)).all())
 
 
 @dataclass(frozen=True)

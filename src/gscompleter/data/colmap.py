@@ -19,18 +19,21 @@ from typing import Any, NamedTuple, TypeVar
 import numpy as np
 from jaxtyping import Float
 
-from gscompleter.data.cameras import Intrinsics, compute_rotation, invert_viewmat
-from gscompleter.data.frame import FOLDERS, ORIGINALS, Frame, ImageFinder, find_path, keep_existing
+from gscompleter.data.cameras import (
+    Distortion,
+    Intrinsics,
+    Projection,
+    compute_rotation,
+    invert_viewmat,
+)
+from gscompleter.data.frame import Frame, find_file, find_path, keep_existing, locate_images
 from gscompleter.data.limits import MAX_COEFFICIENT, MAX_IN_PIXELS, MAX_SIDE
 from gscompleter.data.photographs import Photographs, build_photographs
 from gscompleter.data.points import read_point_cloud
-from gscompleter.data.undistort import Distortion, Projection
 from gscompleter.errors import InputError, quote_value, refuse_pointer
 from gscompleter.io.reading import open_file, read_lines
 
-DISTORTED = "distorted"
-"""Folder of the model with distortion, beside undistorted photographs (3DGS's scripts)."""
-HOMES = ("sparse", "colmap/sparse", f"{DISTORTED}/sparse", "")
+HOMES = ("sparse", "colmap/sparse", "distorted/sparse", "")
 """Folders that are models or hold numbered ones, in search order."""
 
 ENDINGS = (".bin", ".txt")
@@ -292,14 +295,17 @@ def open_colmap(path: Path) -> Iterator[Photographs]:
     The model with most images is used. Frames are numbered by the sorted names of the photographs
     that exist.
     """
-    yield _build_scene(path.parent if is_image_file(path) else path, *_select_largest(path))
+    model, frames, notes = _select_largest(path)
+    roots = _list_roots(path.parent if is_image_file(path) else path, model)
+    there, missing = keep_existing(locate_images(frames, roots), str(model))
+    photographs = build_photographs(roots[-1].name, str(model), there)
+    yield replace(photographs, notes=notes + missing, sparse=_make_point_reader(model))
 
 
 def read_scene_cameras(path: Path) -> list[Frame]:
     """Read the cameras of a scene's largest model in its order, with existing photographs."""
     model, frames, _ = _select_largest(path)
-    finder = _make_finder(_list_roots(path, model))
-    return [finder.locate(frame) for frame in frames]
+    return locate_images(frames, _list_roots(path, model))
 
 
 def _select_largest(path: Path) -> tuple[Path, list[Frame], tuple[str, ...]]:
@@ -346,8 +352,7 @@ def _list_home(home: Path) -> list[Path]:
 
 def _find_model_file(folder: Path, name: str) -> Path | None:
     """Find a file of a model, preferring binary; None if there is none."""
-    found = (find_path(folder, name + ending) for ending in ENDINGS)
-    return next((path for path in found if path is not None and os.path.isfile(path)), None)
+    return find_file([folder], [name + ending for ending in ENDINGS])
 
 
 def read_image_file(path: Path) -> list[Frame]:
@@ -377,22 +382,6 @@ def read_image_file(path: Path) -> list[Frame]:
         Frame(name, f"image {quote_value(name)} of {quote_value(path)}", c2w, cameras[camera], None)
         for name, camera, c2w in images
     ]
-
-
-def _build_scene(
-    scene: Path, model: Path, frames: Sequence[Frame], notes: tuple[str, ...]
-) -> Photographs:
-    roots = _list_roots(scene, model)
-    finder = _make_finder(roots)
-    there, missing = keep_existing([finder.locate(frame) for frame in frames], str(model))
-    photographs = build_photographs(roots[-1].name, str(model), there)
-    return replace(photographs, notes=notes + missing, sparse=_make_point_reader(model))
-
-
-def _make_finder(roots: Sequence[Path]) -> ImageFinder:
-    # Beside a model with distortion, `images` may hold undistorted photographs.
-    lens = any(root.name.casefold() == DISTORTED for root in roots)
-    return ImageFinder(roots, (ORIGINALS, *FOLDERS) if lens else FOLDERS)
 
 
 def _list_roots(scene: Path, model: Path) -> list[Path]:

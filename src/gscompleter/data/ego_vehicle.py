@@ -17,9 +17,8 @@ import cv2
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
-from gscompleter.data.cameras import find_pose_defect
+from gscompleter.data.cameras import Pinhole, find_pose_defect
 from gscompleter.data.frame import Frame
-from gscompleter.data.undistort import Pinhole
 from gscompleter.errors import InputError
 
 FEWEST, MOST = 6, 12

@@ -17,12 +17,13 @@ from jaxtyping import Bool, Float, UInt8
 from gscompleter.data.cameras import (
     FRACTIONS,
     Intrinsics,
+    Pinhole,
     find_pinhole_defect,
     find_pose_defect,
     make_rigid,
+    undistort_pinhole,
 )
 from gscompleter.data.limits import MAX_SIDE
-from gscompleter.data.undistort import Pinhole, undistort_pinhole
 from gscompleter.errors import InputError, join_names, quote_value
 from gscompleter.io.image import read_brightness, read_image_size, read_pixels
 
@@ -35,6 +36,8 @@ ORIGINALS = "input"
 """Folder of photographs before undistortion, as in the scripts of 3DGS."""
 FOLDERS = ("images", *(f"images_{n}" for n in DOWNSCALE_FACTORS), ORIGINALS)
 """Usual folders of photographs, in search order."""
+DISTORTED = "distorted"
+"""Folder of the model with distortion, beside undistorted photographs (3DGS's scripts)."""
 MASKS = "masks"
 MAX_NAMED = 3
 """Missing photographs that a note names."""
@@ -42,10 +45,7 @@ MAX_NAMED = 3
 
 @dataclass(frozen=True, eq=False)
 class Frame:
-    """One camera of a scene; its photograph is read on demand.
-
-    Its methods raise an InputError if a file is missing, damaged or impossible.
-    """
+    """One camera of a scene; its photograph is read on demand."""
 
     name: str
     title: str
@@ -181,29 +181,30 @@ def find_path(folder: Path, relative: str) -> Path | None:
     return folder
 
 
-class ImageFinder:
-    """Finder of the photographs and masks of one scene.
-
-    `roots` are the nearest first, and `order` are the folders in them, the likeliest first.
-    """
-
-    def __init__(self, roots: Sequence[Path], order: Sequence[str] = FOLDERS) -> None:
-        masks = [find_path(root, MASKS) for root in roots]
-        folders = [find_path(root, name) for root in roots for name in order]
-        self.folders = [folder for folder in folders if folder is not None and folder.is_dir()]
-        self.folders += roots
-        self.masks = [folder for folder in masks if folder is not None]
-
-    def locate(self, frame: Frame) -> Frame:
-        """Return the frame with the paths of its photograph and mask, if they exist."""
-        name = PurePosixPath(frame.name)
-        masks = (f"{name}.png", f"{name.parent / name.stem}.png")
-        photographs = [frame.name + ending for ending in ENDINGS]
-        image, mask = _find_file(self.folders, photographs), _find_file(self.masks, masks)
-        return replace(frame, image=image, mask=mask)
+def list_image_folders(roots: Sequence[Path]) -> list[Path]:
+    """List the folders that may hold the photographs: those in the roots, then the roots."""
+    # Beside a model with distortion, `images` may hold undistorted photographs.
+    has_lens = any(root.name.casefold() == DISTORTED for root in roots)
+    order = (ORIGINALS, *FOLDERS) if has_lens else FOLDERS
+    folders = [find_path(root, name) for root in roots for name in order]
+    return [folder for folder in folders if folder is not None and folder.is_dir()] + [*roots]
 
 
-def _find_file(folders: Sequence[Path], names: Sequence[str]) -> Path | None:
+def locate_images(frames: Sequence[Frame], roots: Sequence[Path]) -> list[Frame]:
+    """Return the frames with the paths of their photographs and masks, if they exist."""
+    folders = list_image_folders(roots)
+    masks = [folder for root in roots if (folder := find_path(root, MASKS)) is not None]
+    found = []
+    for frame in frames:
+        stem = os.path.splitext(frame.name)[0]
+        image = find_file(folders, [frame.name + ending for ending in ENDINGS])
+        mask = find_file(masks, [f"{frame.name}.png", f"{stem}.png"])
+        found.append(replace(frame, image=image, mask=mask))
+    return found
+
+
+def find_file(folders: Sequence[Path], names: Sequence[str]) -> Path | None:
+    """Find the first of the files in the first of the folders; None if there is none."""
     found = (find_path(folder, name) for folder in folders for name in names)
     return next((path for path in found if path is not None and os.path.isfile(path)), None)
 

@@ -16,7 +16,7 @@ import numpy as np
 from jaxtyping import Float
 
 from gscompleter.data.cameras import Intrinsics
-from gscompleter.data.frame import Frame, ImageFinder
+from gscompleter.data.frame import Frame, list_image_folders
 from gscompleter.data.json_fields import get_size
 from gscompleter.data.limits import DEPTH_RANGE, require
 from gscompleter.data.photographs import Photographs, build_photographs
@@ -79,7 +79,7 @@ def _read_rows(path: Path) -> Float[np.ndarray, "n 17"]:
 def _find_photographs(file: Path, count: int) -> list[Path]:
     """List the photographs of the first folder with one for each row."""
     numbers = []
-    for folder in ImageFinder([file.parent]).folders:
+    for folder in list_image_folders([file.parent]):
         images = sorted(path for path in folder.iterdir() if path.suffix.lower() in IMAGES)
         if len(images) == count:
             return images

@@ -16,12 +16,17 @@ from jaxtyping import Bool, Float, Shaped
 from PIL import Image
 from torch import Tensor
 
-from gscompleter.data.cameras import compute_fov, find_pose_defect
+from gscompleter.data.cameras import (
+    Pinhole,
+    compute_fov,
+    compute_undistortion_map,
+    find_pose_defect,
+    remap,
+)
 from gscompleter.data.driving.vehicle import compute_sparse_depth, mask_moving
 from gscompleter.data.frame import Frame
 from gscompleter.data.limits import MAX_SIDE
 from gscompleter.data.local_origin import choose_local_origin
-from gscompleter.data.undistort import Pinhole, compute_undistortion_map, remap
 from gscompleter.errors import InputError, quote_value
 from gscompleter.io.image import convert_to_image, read_depth, read_pixels
 from gscompleter.types import Camera, View
@@ -44,10 +49,7 @@ MAX_MAP_COORDINATE = 100.0
 
 @dataclass(frozen=True, eq=False)
 class Photographs:
-    """A named sequence of photographs with known cameras, numbered from 0.
-
-    Its methods raise an InputError if a frame does not exist, cannot be read or is impossible.
-    """
+    """A named sequence of photographs with known cameras, numbered from 0."""
 
     name: str
     title: str
@@ -56,9 +58,8 @@ class Photographs:
     origin: Float[np.ndarray, "3"]
     """Origin of the cameras' coordinates, in those of the files (float64)."""
     near: float | None = None
-    """Smallest z-depth of the scene, in scene units."""
     far: float | None = None
-    """Largest z-depth of the scene, in scene units."""
+    """Range of the scene's z-depths, in scene units."""
     notes: tuple[str, ...] = ()
     """Sentences about choices made while opening."""
     format: str | None = None
@@ -74,10 +75,6 @@ class Photographs:
 
     def __len__(self) -> int:
         return len(self.frames)
-
-    def has_photograph(self, frame: int) -> bool:
-        """Check whether the photograph of a frame exists."""
-        return self.frame(frame).has_photograph()
 
     def camera(self, frame: int, resolution: Resolution = None) -> Camera:
         """Return the camera of a frame, even without its photograph if the file gives the size."""

@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float
 
-from gscompleter.data.cameras import Intrinsics
+from gscompleter.data.cameras import Distortion, Intrinsics
 from gscompleter.data.frame import Frame
 from gscompleter.data.json_fields import (
     get_array,
@@ -24,7 +24,6 @@ from gscompleter.data.json_fields import (
 from gscompleter.data.limits import DEPTH_RANGE, MAX_COEFFICIENT, MAX_IN_PIXELS, require
 from gscompleter.data.photographs import Photographs, build_photographs
 from gscompleter.data.points import read_point_cloud
-from gscompleter.data.undistort import Distortion
 from gscompleter.errors import quote_value
 from gscompleter.io.reading import is_json_list, read_json
 

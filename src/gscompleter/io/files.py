@@ -108,9 +108,7 @@ def _create_draft(path: Path, overwrite: bool) -> Iterator[Path]:
 
 def _check_free(path: Path, overwrite: bool) -> None:
     """Raise an error if `path` is a file or contains something that must not be overwritten."""
-    names = list[str]()
-    with suppress(FileNotFoundError):
-        names = os.listdir(path)
+    names = os.listdir(path) if os.path.exists(path) else []
     if not overwrite and any(not name.startswith(UNFINISHED_PREFIX) for name in names):
         raise InputError(
             f"The output folder {quote_value(path)} is not empty; name another one, or overwrite "
@@ -199,5 +197,4 @@ def defer_interrupts(state: str) -> Iterator[None]:
 
 def get_download_folder() -> Path:
     """Return $GSCOMPLETER_HOME, or else ~/.cache/gscompleter."""
-    home = os.environ.get("GSCOMPLETER_HOME")
-    return Path(home).expanduser() if home else Path.home() / ".cache" / "gscompleter"
+    return Path(os.environ.get("GSCOMPLETER_HOME") or "~/.cache/gscompleter").expanduser()

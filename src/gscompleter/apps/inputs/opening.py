@@ -321,7 +321,7 @@ def read_targets(given: Photographs, options: CompleteOptions) -> list[Target]:
 
 def add_photograph(target: Target, given: Photographs, options: SceneOptions) -> Target:
     """Add its photograph to a target, if there is one."""
-    if target.frame is None or not given.has_photograph(target.frame):
+    if target.frame is None or not given.frame(target.frame).has_photograph():
         return target
     (view,) = given.views([target.frame], parse_resolution(options.resolution))
     return replace(target, photograph=view.image, ignore_mask=view.ignore_mask)

@@ -72,7 +72,7 @@ def collect_usable_cameras(
     cameras = {}
     for frame in frames:
         try:
-            if given.has_photograph(frame):
+            if given.frame(frame).has_photograph():
                 cameras[frame] = given.camera(frame, resolution)
         except InputError:
             continue

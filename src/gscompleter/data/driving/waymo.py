@@ -19,7 +19,7 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float
 
-from gscompleter.data.cameras import Intrinsics
+from gscompleter.data.cameras import Distortion, Intrinsics
 from gscompleter.data.driving.vehicle import (
     build_poses,
     compute_moving_boxes,
@@ -28,7 +28,6 @@ from gscompleter.data.driving.vehicle import (
 from gscompleter.data.frame import Frame
 from gscompleter.data.limits import require
 from gscompleter.data.photographs import Photographs, build_drive
-from gscompleter.data.undistort import Distortion
 from gscompleter.errors import InputError, quote_value
 from gscompleter.io.reading import check_file
 

@@ -146,7 +146,7 @@ def map_photographs(job: Job) -> dict[str, Any]:
     """
     model, is_focal_fixed = select_model(job)
     if model is None:
-        return {"registered": [], "points": 0, "error": 0, "is_plausible": True, "focal": None}
+        return {"registered": [], "points": 0, "error": 0.0, "is_plausible": True, "focal": None}
     counts = _count_photographs(model)
     if min(counts.values()) >= MIN_FOR_CENTRE:
         # Fewer photographs cannot separate the principal point from a rotation.

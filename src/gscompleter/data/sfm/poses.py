@@ -1,9 +1,8 @@
 """Camera poses for photographs without poses, by COLMAP on the CPU.
 
 The output folder has COLMAP's standard layout: copies in `images`, the model in `sparse/0`. COLMAP
-ignores the EXIF orientation, so the pixels of the copies are rotated.
-A `summary.json` records the input photographs, so that the next run can reuse the result. COLMAP
-runs in a separate process (`mapping_process`).
+ignores the EXIF orientation, so the pixels of the copies are rotated. A `summary.json` records the
+input photographs, so that the next run can reuse the result.
 """
 
 from __future__ import annotations
