@@ -308,7 +308,7 @@ class BentCamera(Camera):
 @pytest.mark.parametrize("model", MODELS)
 def test_photographs_of_every_lens_show_the_room_without_it(tmp_path, model):
     size = (LENS_SIZE, LENS_SIZE)
-    parameters = [LENS_NUMBERS[name] for name in MODELS[model].parameters]
+    parameters = [LENS_NUMBERS[name] for name in MODELS[model].parameters.split()]
     lens = build_intrinsics(MODELS[model], size, parameters, "the camera").distortion
     straight = camera_at(size=LENS_SIZE)
     photograph, _ = cast(Room(), BentCamera(straight.c2w, straight.K, *size, lens=lens))

@@ -76,13 +76,9 @@ class Model(NamedTuple):
     """A camera model: its number in binary files, parameters and projection."""
 
     number: int
-    names: str
+    parameters: str
+    """Names of the parameters, in the order of the files."""
     projection: Projection = "perspective"
-
-    @property
-    def parameters(self) -> list[str]:
-        """Names of the parameters, in the order of the files."""
-        return self.names.split()
 
 
 MODELS = {
@@ -130,12 +126,13 @@ def build_intrinsics(
             f"The size of {title} is {quote_value(size[0])} × {quote_value(size[1])}; sides from "
             f"1 to {MAX_SIDE} pixels are needed."
         )
-    if len(numbers) != len(model.parameters):
+    names = model.parameters.split()
+    if len(numbers) != len(names):
         raise InputError(
-            f"The model of {title} has the {len(model.parameters)} parameters {model.names}, and "
+            f"The model of {title} has the {len(names)} parameters {model.parameters}, and "
             f"{len(numbers)} are given; export the model again."
         )
-    values = dict(zip(model.parameters, numbers, strict=True))
+    values = dict(zip(names, numbers, strict=True))
     for name, value in values.items():
         limit = MAX_IN_PIXELS if name in _IN_PIXELS else MAX_COEFFICIENT
         if not abs(value) <= limit:
@@ -145,8 +142,8 @@ def build_intrinsics(
             )
 
     shape, radial, denominator = (
-        tuple(values[name] for name in names if name in values)
-        for names in (_SHAPES, ("k1", "k2", "k3", "k4"), ("d1", "d2", "d3"))
+        tuple(values[name] for name in group if name in values)
+        for group in (_SHAPES, ("k1", "k2", "k3", "k4"), ("d1", "d2", "d3"))
     )
     tangential = values.get("p1", 0.0), values.get("p2", 0.0)
     prism = values.get("s1", 0.0), values.get("s3", 0.0)
@@ -194,7 +191,7 @@ def _read_binary_cameras(path: Path) -> Iterator[CameraEntry]:
         for _ in range(_read_count(content)):
             number, model, width, height = _unpack(content, "<IiQQ")
             title = f"camera {number} of {quote_value(path)}"
-            count = len(find_model(model, title).parameters)
+            count = len(find_model(model, title).parameters.split())
             yield number, model, (width, height), _unpack(content, f"<{count}d")
 
 

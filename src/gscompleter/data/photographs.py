@@ -82,10 +82,7 @@ class Photographs:
         return self._build_camera(found, found.size(), resolution)
 
     def views(self, frames: Sequence[int], resolution: Resolution = None) -> list[View]:
-        """Load undistorted photographs with cameras, and depth if available.
-
-        `ignore_mask` marks the vehicle that carries the camera, if it is detected.
-        """
+        """Load undistorted photographs with cameras, known depth and the detected vehicle."""
         return [self._load_view(number, resolution) for number in frames]
 
     def mask(self, frame: int, resolution: Resolution = None) -> Bool[Tensor, "h w"] | None:

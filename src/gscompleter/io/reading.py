@@ -67,11 +67,7 @@ def read_bytes(path: Path, max_bytes: int = MAX_BYTES) -> bytes:
 def read_lines(
     path: Path, max_length: int = MAX_LINE, max_bytes: int = MAX_TEXT, errors: str = "replace"
 ) -> Iterator[str]:
-    """Read the lines of a UTF-8 text file one by one; raise InputError if it is too long.
-
-    Lines have at most `max_length` characters, the file `max_bytes` bytes. `errors` as in
-    `bytes.decode`.
-    """
+    """Read the lines of a UTF-8 text file one by one; raise InputError if it is too long."""
     with open_file(path) as file:
         _check_size(path, file, max_bytes)
         text = TextIOWrapper(file, encoding="utf-8-sig", errors=errors)

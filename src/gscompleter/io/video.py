@@ -44,10 +44,7 @@ def find_ffmpeg() -> str:
 
 
 def write_video(path: Path, frames: Iterable[UInt8[np.ndarray, "h w 3"]], rate: int) -> None:
-    """Write frames of one size, both sides even, as an mp4 with `rate` frames per second.
-
-    The frames may be rendered while they are written. The file is not atomic.
-    """
+    """Write frames of one size, both sides even, as an mp4 with `rate` frames per second."""
     iterator = iter(frames)
     first = next(iterator)
     size = f"{first.shape[1]}x{first.shape[0]}"
