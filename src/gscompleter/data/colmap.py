@@ -31,6 +31,7 @@ from gscompleter.data.limits import MAX_COEFFICIENT, MAX_IN_PIXELS, MAX_SIDE
 from gscompleter.data.photographs import Photographs, build_photographs
 from gscompleter.data.points import read_point_cloud
 from gscompleter.errors import InputError, quote_value, refuse_pointer
+from gscompleter.io.image import has_orientation_tag
 from gscompleter.io.reading import open_file, read_lines
 
 HOMES = ("sparse", "colmap/sparse", "distorted/sparse", "")
@@ -295,8 +296,11 @@ def open_colmap(path: Path) -> Iterator[Photographs]:
     model, frames, notes = _select_largest(path)
     roots = _list_roots(path.parent if is_image_file(path) else path, model)
     there, missing = keep_existing(locate_images(frames, roots), str(model))
+    notes += missing
+    if isinstance(there[0].image, Path) and has_orientation_tag(there[0].image):
+        notes += ("EXIF rotation is ignored: photographs are used as they are stored.",)
     photographs = build_photographs(roots[-1].name, str(model), there)
-    yield replace(photographs, notes=notes + missing, sparse=_make_point_reader(model))
+    yield replace(photographs, notes=notes, sparse=_make_point_reader(model))
 
 
 def read_scene_cameras(path: Path) -> list[Frame]:

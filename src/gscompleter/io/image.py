@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import io
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from pathlib import Path
 
 import numpy as np
@@ -25,6 +25,9 @@ MAX_PIXELS = 178_956_970
 
 PNG_COMPRESSION = 3
 """zlib level of written PNGs: 6 % more bytes than level 6, in a third of its time."""
+
+ORIENTATION = 0x0112
+"""EXIF tag of the orientation; 1 is upright."""
 
 
 def read_image(path: Path | str) -> Float[Tensor, "h w 3"]:
@@ -59,6 +62,13 @@ def read_image_size(stored: Path | bytes, name: str = "") -> tuple[int, int]:
     """Read width and height of an image file, or of its bytes; `name` is for errors."""
     with open_image(stored, name) as image:
         return image.size
+
+
+def has_orientation_tag(path: Path) -> bool:
+    """Return True if the EXIF data of a photograph ask viewers to rotate it."""
+    with suppress(InputError), open_image(path) as image:
+        return bool(image.getexif().get(ORIENTATION, 1) != 1)
+    return False  # reading the photograph reports the error
 
 
 def read_pixels(stored: Path | str | bytes, name: str = "") -> UInt8[np.ndarray, "h w 3"]:

@@ -28,7 +28,7 @@ from gscompleter.data.frame import DOWNSCALE_FACTORS, MASKS
 from gscompleter.data.sfm.match_pairs import make_sort_key
 from gscompleter.errors import InputError, join_names, quote_value
 from gscompleter.io.files import SUMMARY_FILE, open_output_folder
-from gscompleter.io.image import open_image
+from gscompleter.io.image import ORIENTATION, open_image
 from gscompleter.io.reading import read_json
 from gscompleter.progress import stage, track
 
@@ -50,7 +50,7 @@ QUALITY = 95
 """JPEG quality of rotated or shrunk copies."""
 FULL_FRAME_DIAGONAL = 43.2666
 """Diagonal of 36 x 24 mm, the reference of EXIF's "focal length in 35 mm film"."""
-MAKE, MODEL, ORIENTATION = 0x010F, 0x0110, 0x0112
+MAKE, MODEL = 0x010F, 0x0110
 EXIF, FOCAL_LENGTH, FOCAL_LENGTH_35 = 0x8769, 0x920A, 0xA405
 MAX_THREADS = 4
 MAX_NAMED = 5
