@@ -20,6 +20,7 @@ from jaxtyping import Bool, Float, Int
 from gscompleter.data.cameras import Pinhole, find_pose_defect
 from gscompleter.data.frame import Frame
 from gscompleter.errors import InputError
+from gscompleter.io.image import read_brightness
 
 FEWEST, MOST = 6, 12
 """Fewest and most photographs of a camera that are searched; with fewer, nothing is found."""
@@ -100,7 +101,7 @@ def read_small(frames: Sequence[Frame]) -> dict[Frame, Float[np.ndarray, "h w"]]
     found: dict[Frame, Float[np.ndarray, "h w"]] = {}
     for frame in frames:
         with suppress(InputError):
-            found[frame] = frame.load_small_pixels(SIDE)
+            found[frame] = read_brightness(frame.require_stored(), SIDE)
     shape = next((image.shape for image in found.values()), None)
     return {frame: image for frame, image in found.items() if image.shape == shape}
 

@@ -25,7 +25,7 @@ from gscompleter.data.cameras import (
 )
 from gscompleter.data.limits import MAX_SIDE
 from gscompleter.errors import InputError, join_names, quote_value
-from gscompleter.io.image import read_brightness, read_image_size, read_pixels
+from gscompleter.io.image import read_image_size, read_pixels
 
 ENDINGS = ("", ".png", ".jpg", ".jpeg")
 """Image file endings tried for names without one."""
@@ -107,10 +107,6 @@ class Frame:
     def load_pixels(self) -> UInt8[np.ndarray, "h w 3"]:
         """Read the photograph as it is stored."""
         return read_pixels(self.require_stored(), capitalize(self.title))
-
-    def load_small_pixels(self, side: int) -> Float[np.ndarray, "h w"]:
-        """Read brightness in [0, 255], shrunk to at most `side` pixels on the longer side."""
-        return read_brightness(self.require_stored(), side, capitalize(self.title))
 
     def find_defect(self, width: int, height: int) -> str | None:
         """Describe why the camera is impossible at this photograph size; None if it is valid."""

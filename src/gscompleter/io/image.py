@@ -80,9 +80,9 @@ def read_pixels(stored: Path | str | bytes, name: str = "") -> UInt8[np.ndarray,
         return _composite_over_black(image)
 
 
-def read_brightness(stored: Path | bytes, side: int, name: str = "") -> Float[np.ndarray, "h w"]:
+def read_brightness(stored: Path | bytes, side: int) -> Float[np.ndarray, "h w"]:
     """Read the brightness (0 to 255) of an image shrunk to a longer side of `side` pixels."""
-    with open_image(stored, name) as image:
+    with open_image(stored) as image:
         scale = min(1.0, side / max(image.size))
         size = max(round(image.width * scale), 1), max(round(image.height * scale), 1)
         image.draft("L", size)
