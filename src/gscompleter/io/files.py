@@ -108,7 +108,9 @@ def _create_draft(path: Path, overwrite: bool) -> Iterator[Path]:
 
 def _check_free(path: Path, overwrite: bool) -> None:
     """Raise an error if `path` is a file or contains something that must not be overwritten."""
-    names = os.listdir(path) if os.path.exists(path) else []
+    names = list[str]()
+    with suppress(FileNotFoundError):
+        names = os.listdir(path)
     if not overwrite and any(not name.startswith(UNFINISHED_PREFIX) for name in names):
         raise InputError(
             f"The output folder {quote_value(path)} is not empty; name another one, or overwrite "

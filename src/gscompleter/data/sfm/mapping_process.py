@@ -57,7 +57,6 @@ class Job:
     """Input of the process."""
 
     images: str
-    """Folder of the photographs."""
     work: str
     """Folder for the database and temporary files."""
     model: str

@@ -245,8 +245,7 @@ def _read_focal(exif: Image.Exif) -> float | None:
 
 def _describe_lens(exif: Image.Exif) -> str:
     detail = exif.get_ifd(EXIF)
-    values = [exif.get(MAKE), exif.get(MODEL)]
-    values += [detail.get(FOCAL_LENGTH), detail.get(FOCAL_LENGTH_35)]
+    values = exif.get(MAKE), exif.get(MODEL), detail.get(FOCAL_LENGTH), detail.get(FOCAL_LENGTH_35)
     return " ".join(map(str, values))
 
 
