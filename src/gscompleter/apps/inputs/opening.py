@@ -62,13 +62,10 @@ from gscompleter.stages.context import find_depth_range
 from gscompleter.types import Camera, Gaussians, View
 
 MIN_IMAGE_SIZE = 16
-"""Smallest side of an image, in pixels."""
 SPLAT_EXTENSIONS = tuple(end for format in SPLAT_FORMATS.values() for end in format.extensions)
 FRAME_NUMBER = re.compile("-?[0-9]{1,9}")
 MAX_NAMED = 8
-"""Most frames or targets that a line names."""
 MAX_CHECK_VIEWS = 40
-"""Most check views of an input splat, in addition to the context."""
 
 
 @dataclass(frozen=True)
@@ -98,7 +95,6 @@ class Task:
     splat_file: InputSplatFile | None = None
     method: str = "given"
     frame_description: str = "the frame of the photographs"
-    """Description of `method` for the user."""
     check_views: Sequence[View] | None = None
     """Check views of the input splat, at low resolution."""
 

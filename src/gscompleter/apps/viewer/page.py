@@ -29,7 +29,6 @@ from gscompleter.splats.spz import encode_spz
 from gscompleter.types import Camera, Gaussians
 
 ASSETS = Path(__file__).with_name("assets")
-"""Folder of our own page sources."""
 PAGE_EXTENT = 4.0
 """Median distance of Gaussians from the centre, within a factor of 2, in page units."""
 MAX_DISTANCE = 4096.0
