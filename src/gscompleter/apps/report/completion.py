@@ -313,11 +313,12 @@ def make_record(completion: Completion, photographs: Sequence[Camera]) -> Comple
     targets = [result.target.to("cpu") for result in completion.targets]
     others = [camera.to("cpu") for camera in photographs]
     frame = fit_frame([*others, *context, *targets])
-    lines = [
-        tuple(draw_camera(camera, frame) for camera in group)
-        for group in (others, context, targets)
-    ]
-    return CompletionRecord(*lines, tuple(map(list_depth_pairs, completion.targets)))
+
+    def draw(cameras: Sequence[Camera]) -> tuple[str, ...]:
+        return tuple(draw_camera(camera, frame) for camera in cameras)
+
+    pairs = tuple(map(list_depth_pairs, completion.targets))
+    return CompletionRecord(draw(others), draw(context), draw(targets), pairs)
 
 
 def fit_frame(cameras: Sequence[Camera]) -> DrawingFrame:

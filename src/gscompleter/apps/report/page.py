@@ -51,6 +51,7 @@ TABLE_COLUMNS = (
     *("coverage_before", "coverage_after", "added"),
     *("seconds", "cpu_seconds", "result_bytes", "peak_bytes"),
 )
+SETTINGS = ("version", "device", "seed", "depth_range", "settings")
 JPEG_QUALITY = 85
 MAX_PAGE_PIXELS = 12_000_000
 """Largest sum of image pixels in a page (about 5 MB); more are scaled down."""
@@ -133,6 +134,7 @@ def render_completion_page(folder: Path) -> str:
     """Render the page of the completion in `folder`."""
     summary = read_summary(folder)
     path = summary.scene.splat or str(summary.settings.get("folder") or "")
+    settings = {name: getattr(summary, name) for name in SETTINGS}
     return render_template(
         "completion.html",
         {
@@ -147,7 +149,7 @@ def render_completion_page(folder: Path) -> str:
                 key: average(getattr(r, key) for r in summary.held_out) for key in SCORES
             },
             "seconds": {name: s for name, s in summary.seconds.items() if name != "total"},
-            "settings": format_settings(summary),
+            "settings": json.dumps(settings, indent=2, ensure_ascii=False),
             "viewer": VIEWER_FILE if os.path.isfile(folder / VIEWER_FILE) else None,
         },
     )
@@ -159,13 +161,6 @@ def find_length_unit(summary: CompletionSummary) -> str:
     if format is None or format.unit is None or summary.frame.method != "given":
         return "scene units"
     return str(format.unit)
-
-
-def format_settings(summary: CompletionSummary) -> str:
-    """Format all settings, and what was found in the input, as JSON."""
-    names = ("version", "device", "seed", "depth_range", "settings")
-    values = {name: getattr(summary, name) for name in names}
-    return json.dumps(values, indent=2, ensure_ascii=False)
 
 
 def average_scores(summary: Mapping[str, Any]) -> dict[str, Any]:

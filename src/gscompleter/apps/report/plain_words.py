@@ -33,7 +33,6 @@ RECOLORED_NOTE = (
     "removed.ply has them as they were."
 )
 NUM_WANTED = 2
-"""Most places that are named for new photographs."""
 NOTHING_NEW_NOTE = (
     "The splat reproduces all photographs. Where it is wrong from elsewhere, only smooth colours "
     "are known: little is to be gained without new photographs of the place or a learned generator."

@@ -53,7 +53,6 @@ class ContextRow(ScoreRow):
     exposure_gain: Vector | None = None
     dynamic_fraction: float = 0.0
     ignored: float = 0.0
-    """Fraction of ignored pixels, which stay the same while the camera moves."""
 
 
 @dataclass(frozen=True)
