@@ -14,9 +14,8 @@ import torch
 from PIL import Image
 
 from command import run
-from gscompleter.apps.report.charts import fit_frame
-from gscompleter.apps.report.completion_page import render_completion_page
-from gscompleter.apps.report.page import open_gallery
+from gscompleter.apps.report.completion import fit_frame
+from gscompleter.apps.report.page import open_gallery, render_completion_page
 from gscompleter.apps.report.plain_words import (
     describe_wanted_photographs,
     format_change,

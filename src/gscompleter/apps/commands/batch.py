@@ -70,7 +70,7 @@ def summarize_rows(out: Path, share: Sequence[Job], left: Sequence[Job]) -> str:
 
 def write_batch_results(out: Path, jobs: Sequence[Job]) -> None:
     """Write the table and the page, repeatedly while other shards add rows."""
-    from gscompleter.apps.report.batch_page import write_overview
+    from gscompleter.apps.report.page import write_overview
 
     seen = None
     while seen != (there := [job for job in jobs if has_row(job, out)]):
@@ -92,7 +92,7 @@ def complete_job(job: Job, jobs: Path) -> dict[str, Any]:
 
     from gscompleter.apps.commands.complete import complete_folder
     from gscompleter.apps.commands.row_options import parse_row
-    from gscompleter.apps.report.batch_page import average_scores
+    from gscompleter.apps.report.page import average_scores
     from gscompleter.evaluation.memory import measure_peak_memory
 
     warnings.filterwarnings("ignore", module="PIL")  # as the command line has it

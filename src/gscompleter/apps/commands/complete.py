@@ -31,9 +31,8 @@ from gscompleter.apps.inputs.opening import (
 )
 from gscompleter.apps.inputs.selection import collect_usable_cameras
 from gscompleter.apps.report.completion import Target, write_report
-from gscompleter.apps.report.completion_page import write_completion_page
 from gscompleter.apps.report.film import VIDEO_FILE, write_comparison_video
-from gscompleter.apps.report.page import REPORT_FILE
+from gscompleter.apps.report.page import REPORT_FILE, write_completion_page
 from gscompleter.apps.report.plain_words import format_number, format_percent, list_notes
 from gscompleter.apps.report.schema import CompletionSummary, average, read_summary
 from gscompleter.apps.warmup import SPLAT_PART, compile_kernels

@@ -3,8 +3,7 @@
 from __future__ import annotations
 
 from gscompleter.apps.commands.options import ReportOptions
-from gscompleter.apps.report.completion_page import write_completion_page
-from gscompleter.apps.report.page import REPORT_FILE
+from gscompleter.apps.report.page import REPORT_FILE, write_completion_page
 
 
 def run_report(options: ReportOptions) -> None:

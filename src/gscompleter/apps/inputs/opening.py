@@ -62,13 +62,10 @@ from gscompleter.stages.context import find_depth_range
 from gscompleter.types import Camera, Gaussians, View
 
 MIN_IMAGE_SIZE = 16
-"""Smallest side of an image, in pixels."""
 SPLAT_EXTENSIONS = tuple(end for format in SPLAT_FORMATS.values() for end in format.extensions)
 FRAME_NUMBER = re.compile("-?[0-9]{1,9}")
 MAX_NAMED = 8
-"""Most frames or targets that a line names."""
 MAX_CHECK_VIEWS = 40
-"""Most check views of an input splat, in addition to the context."""
 
 
 @dataclass(frozen=True)
@@ -98,7 +95,6 @@ class Task:
     splat_file: InputSplatFile | None = None
     method: str = "given"
     frame_description: str = "the frame of the photographs"
-    """Description of `method` for the user."""
     check_views: Sequence[View] | None = None
     """Check views of the input splat, at low resolution."""
 
@@ -263,17 +259,10 @@ def apply_working_range(task: Task, renderer: Renderer) -> Task:
 def check_context(options: SceneOptions) -> None:
     """Refuse too few or repeated context frames."""
     context, needed = options.context, get_min_views(options)
-    if context is None:
-        return
-    if len(context) < needed:
+    if context is not None and len(set(context)) < max(needed, len(context)):
         raise InputError(
-            f"--context names {len(context)} frame(s), and stereo needs at least {needed}; "
-            "name more, as in --context 0 4, or leave it out."
-        )
-    if len(set(context)) < len(context):
-        raise InputError(
-            f"--context names a frame of {join_names(context, 8)} twice, and identical cameras "
-            "have no baseline; name different frames."
+            f"--context names too few frames, or one twice; name at least {needed} different "
+            "ones, as in --context 0 4, or leave it out."
         )
 
 
@@ -311,9 +300,8 @@ def read_targets(given: Photographs, options: CompleteOptions) -> list[Target]:
             targets += [Target(camera) for camera in cameras]
         else:
             raise InputError(
-                f"'{quote_value(word, 60)}' is no target: a target is the number of a frame, from "
-                f"0 to {len(given) - 1}, or a file of cameras (transforms.json, cameras.json, "
-                "COLMAP's images.txt, SuperSplat's poses), and there is no such file.",
+                f"'{quote_value(word, 60)}' is no target: name a frame from 0 to {len(given) - 1}, "
+                "or an existing file of cameras, such as a transforms.json.",
                 "target",
             )
     return targets

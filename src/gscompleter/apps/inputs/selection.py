@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from contextlib import suppress
 
 import torch
 from jaxtyping import Float
@@ -71,11 +72,9 @@ def collect_usable_cameras(
     """Return the valid cameras of frames that have a photograph."""
     cameras = {}
     for frame in frames:
-        try:
+        with suppress(InputError):
             if given.frame(frame).has_photograph():
                 cameras[frame] = given.camera(frame, resolution)
-        except InputError:
-            continue
     return cameras
 
 

@@ -13,20 +13,23 @@ from typing import Any
 import torch
 from jaxtyping import Bool, Float, Int64
 from torch import Tensor
+from torch.nn.functional import normalize
 
 from gscompleter import __version__
-from gscompleter.apps.report.charts import make_record
 from gscompleter.apps.report.schema import (
     RECORD_FILE,
     SCORES,
     AlignmentRow,
+    CompletionRecord,
     ContextRow,
     HeldOutRow,
+    PairsRow,
     ScoreRow,
     TargetRow,
 )
 from gscompleter.evaluation.metrics.coverage import RenderPair, compute_coverage
 from gscompleter.evaluation.metrics.image import compute_masked_psnr, ssim
+from gscompleter.geometry import estimate_up
 from gscompleter.io.files import COMPLETED_FILE, CONTEXT_FILE, SUMMARY_FILE
 from gscompleter.io.image import write_image
 from gscompleter.kernels.parallel import map_in_parallel
@@ -40,6 +43,10 @@ GENERATED_FILE = "generated.ply"
 MAX_PHOTOGRAPHS = 200
 """Largest number of photographs in the drawing and for the path of the video."""
 IGNORED_COLOR = (1.0, 0.0, 1.0)
+FRUSTUM = ((-1, -1, 1), (1, -1, 1), (1, 1, 1), (-1, 1, 1))
+"""Image corners of a camera pyramid, whose apex is the origin."""
+FRUSTUM_DEPTH = 0.11
+"""Length of a camera pyramid, in radii."""
 
 Scores = dict[str, float | None]
 
@@ -71,7 +78,6 @@ class HeldOut:
     """A photograph that is neither context nor target and only scores the result."""
 
     view: View
-    """View in the frame of the result."""
     is_check: bool = False
     """True if a small copy of it checked the input splat."""
 
@@ -87,6 +93,20 @@ class InputSplatFile:
     """Index among these of each Gaussian of the context; None for the order of the file."""
 
 
+@dataclass(frozen=True)
+class DrawingFrame:
+    """Coordinate frame of a drawing."""
+
+    center: Float[Tensor, "3"]
+    axes: Float[Tensor, "3 3"]
+    """Unit axes as rows: right, up and back."""
+    radius: float
+
+    def convert(self, points: Float[Tensor, "*n 3"]) -> Float[Tensor, "*n 3"]:
+        """Convert world points to the drawing."""
+        return (points - self.center) @ self.axes.T / self.radius
+
+
 def write_report(
     folder: Path,
     completion: Completion,
@@ -100,8 +120,8 @@ def write_report(
 ) -> dict[str, Any]:
     """Write the scenes, `images/`, `report.json` and `summary.json`; return the summary.
 
-    `completed.ply` keeps the layout of an input splat. `photographs` are the cameras of all, in the
-    frame of the result. `render_around` renders the views whose coverage is measured.
+    `photographs` are the cameras of all, in the frame of the result. `render_around` renders the
+    views whose coverage is measured.
     """
     at_targets = [
         render_before_after(completion, result.target, renderer) for result in completion.targets
@@ -287,6 +307,49 @@ def save_completed_splat(
     save_like(folder / COMPLETED_FILE, context[~changed], generated, input_splat.path, stays)
 
 
+def make_record(completion: Completion, photographs: Sequence[Camera]) -> CompletionRecord:
+    """Draw all cameras, and list depth pairs."""
+    context = [view.camera.to("cpu") for view in completion.views]
+    targets = [result.target.to("cpu") for result in completion.targets]
+    others = [camera.to("cpu") for camera in photographs]
+    frame = fit_frame([*others, *context, *targets])
+
+    def draw(cameras: Sequence[Camera]) -> tuple[str, ...]:
+        return tuple(draw_camera(camera, frame) for camera in cameras)
+
+    pairs = tuple(map(list_depth_pairs, completion.targets))
+    return CompletionRecord(draw(others), draw(context), draw(targets), pairs)
+
+
+def fit_frame(cameras: Sequence[Camera]) -> DrawingFrame:
+    """Fit a frame around cameras whose up axis is that of most of them."""
+    up = estimate_up(cameras)
+    level = min(cameras, key=lambda camera: (camera.c2w[:3, 1] @ up).item())
+    back = normalize(torch.linalg.cross(level.c2w[:3, 0], up), dim=0)
+    centers = torch.stack([camera.center for camera in cameras])
+    middle = centers.median(dim=0).values
+    radius = max(1.1 * (centers - middle).norm(dim=1).max().item(), 1e-9)
+    return DrawingFrame(middle, torch.stack([torch.linalg.cross(up, back), up, back]), radius)
+
+
+def draw_camera(camera: Camera, frame: DrawingFrame) -> str:
+    """Write the corners of one line along the edges of a camera pyramid, centre first."""
+    size = torch.tensor([camera.width, camera.height]) / camera.K.diagonal()[:2]
+    sides = torch.cat([0.6 * size / size.max(), torch.ones(1)])
+    a, b, c, d = torch.tensor(FRUSTUM) * sides @ camera.c2w[:3, :3].T @ frame.axes.T
+    o = torch.zeros(3)
+    corners = FRUSTUM_DEPTH * torch.stack([o, a, b, c, d, a, b, o, c, d, o])
+    points = frame.convert(camera.center) + corners
+    return " ".join(f"{value:.3f}" for value in points.flatten().tolist())
+
+
+def list_depth_pairs(result: TargetResult) -> PairsRow:
+    """List the depth pairs of a target."""
+    pairs = result.affine.pairs
+    columns = pairs.predicted, pairs.context, pairs.inlier_mask
+    return PairsRow(pairs.fit_view, tuple(zip(*(c.tolist() for c in columns), strict=True)))
+
+
 def write_pictures(
     folder: Path,
     completion: Completion,
@@ -300,7 +363,9 @@ def write_pictures(
         write_images(folder, f"target{number}", name_target_images(target, result, pair))
     for number, view in enumerate(completion.views, start=1):
         if view.ignore_mask is not None:
-            write_images(folder, f"context{number}", {"ignored": paint_ignored(view)})
+            color = view.image.new_tensor(IGNORED_COLOR)
+            painted = torch.where(view.valid_mask[..., None], view.image, color)
+            write_images(folder, f"context{number}", {"ignored": painted})
 
 
 def name_target_images(
@@ -316,12 +381,6 @@ def name_target_images(
         "reference": None if result.reference is None else result.reference.image,
         "truth": target.photograph,
     }
-
-
-def paint_ignored(view: View) -> Float[Tensor, "h w 3"]:
-    """Paint over the ignored pixels of a photograph."""
-    color = view.image.new_tensor(IGNORED_COLOR)
-    return torch.where(view.valid_mask[..., None], view.image, color)
 
 
 def write_images(folder: Path, name: str, images: Mapping[str, Tensor | None]) -> None:

@@ -30,15 +30,12 @@ from gscompleter.types import Camera
 VIDEO_FILE = "video.mp4"
 FRAMES_PER_SECOND = 24
 ONE_WAY_SECONDS = 3.0
-"""Duration of one direction."""
 MIN_LEG_SECONDS = 0.75
 MAX_TARGETS = 6
 MAX_SIDE = 640
 """Longer side of one half in pixels, unless `MIN_WIDTH` needs more."""
 GAP_PIXELS = 4
 MIN_WIDTH = 720
-"""Smallest width of the video in pixels."""
-MIN_LABEL_SIZE = 12
 
 
 def write_comparison_video(
@@ -100,7 +97,7 @@ def render_frame(
 
 def draw_corner_label(image: UInt8[np.ndarray, "h w 3"], name: str) -> UInt8[np.ndarray, "h w 3"]:
     """Write a label in the corner, white on a dark box."""
-    size = max(MIN_LABEL_SIZE, image.shape[0] // 24)
+    size = max(12, image.shape[0] // 24)
     font, canvas = ImageFont.load_default(size), Image.fromarray(image)
     draw, inset = ImageDraw.Draw(canvas, "RGBA"), size // 2
     left, top, right, bottom = draw.textbbox((2 * inset, 2 * inset), name, font, anchor="lt")
@@ -113,19 +110,13 @@ def draw_corner_label(image: UInt8[np.ndarray, "h w 3"], name: str) -> UInt8[np.
 def plan_camera_path(
     stops: Sequence[Camera], photographs: Sequence[Camera], count: int
 ) -> list[Camera]:
-    """Plan a path through two or more stops, with `count` frames from one to the next.
-
-    It slows down at each stop and may pass the photographs.
-    """
+    """Plan a path through two or more stops, with `count` frames from one to the next."""
     legs = [follow_path(find_waypoints(a, b, photographs), count) for a, b in pairwise(stops)]
     return [*(camera for each in legs for camera in each[:-1]), stops[-1]]
 
 
 def find_waypoints(first: Camera, second: Camera, photographs: Sequence[Camera]) -> list[Camera]:
-    """Find the path along photographs with the smallest sum of squared steps.
-
-    It prefers many short steps.
-    """
+    """Find the path along photographs with the smallest sum of squared steps."""
     # Imported here, since SciPy is slow to import and only videos need it.
     from scipy.sparse.csgraph import shortest_path
 

@@ -1,4 +1,4 @@
-"""Self-contained HTML pages: one file with style, script and images.
+"""Self-contained HTML pages of a completion and of a batch: one file with style and images.
 
 Templates escape all text. A content security policy blocks all requests and other scripts.
 """
@@ -6,21 +6,52 @@ Templates escape all text. A content security policy blocks all requests and oth
 from __future__ import annotations
 
 import base64
+import csv
 import hashlib
-from collections.abc import Mapping
+import io
+import json
+import os
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cache
 from pathlib import Path
+from statistics import median
+from typing import Any
 
 from jinja2 import Environment, PackageLoader, StrictUndefined
 from markupsafe import Markup
 from PIL import Image
 
 from gscompleter import __version__
-from gscompleter.apps.report.plain_words import format_change, format_number, format_percent
+from gscompleter.apps.report.plain_words import (
+    describe_alignment,
+    format_change,
+    format_number,
+    format_percent,
+    list_notes,
+)
+from gscompleter.apps.report.schema import (
+    SCORES,
+    CompletionSummary,
+    average,
+    read_record,
+    read_summary,
+)
+from gscompleter.data.formats import FORMATS
+from gscompleter.io.files import replace_file
 from gscompleter.io.image import encode_jpeg, read_image_size, read_pixels
+from gscompleter.jobs.jobs import JOBS, Job, read_row
 
-REPORT_FILE = "report.html"
+REPORT_FILE, VIEWER_FILE = "report.html", "view.html"
+INDEX_FILE, TABLE_FILE = "index.html", "table.csv"
+TARGET_COLUMNS = ("hole_fraction", "psnr_before", "psnr_after")
+TABLE_COLUMNS = (
+    *("job", "state", "reason", "attempts"),
+    *("targets", *TARGET_COLUMNS),
+    *("coverage_before", "coverage_after", "added"),
+    *("seconds", "cpu_seconds", "result_bytes", "peak_bytes"),
+)
+SETTINGS = ("version", "device", "seed", "depth_range", "settings")
 JPEG_QUALITY = 85
 MAX_PAGE_PIXELS = 12_000_000
 """Largest sum of image pixels in a page (about 5 MB); more are scaled down."""
@@ -90,3 +121,93 @@ def create_environment() -> Environment:
         "count": "{:,}".format,
     }
     return environment
+
+
+def write_completion_page(folder: Path) -> None:
+    """Write `report.html` of the completion in `folder`."""
+    page = render_completion_page(folder)
+    with replace_file(folder / REPORT_FILE) as file:
+        file.write(page.encode())
+
+
+def render_completion_page(folder: Path) -> str:
+    """Render the page of the completion in `folder`."""
+    summary = read_summary(folder)
+    path = summary.scene.splat or str(summary.settings.get("folder") or "")
+    settings = {name: getattr(summary, name) for name in SETTINGS}
+    return render_template(
+        "completion.html",
+        {
+            "title": Path(path).name or "Scene",
+            "summary": summary,
+            "record": read_record(folder, summary),
+            "gallery": open_gallery(folder / "images"),
+            "notes": list(list_notes(summary)),
+            "describe_alignment": describe_alignment,
+            "unit": find_length_unit(summary),
+            "mean_held_out": {
+                key: average(getattr(r, key) for r in summary.held_out) for key in SCORES
+            },
+            "seconds": {name: s for name, s in summary.seconds.items() if name != "total"},
+            "settings": json.dumps(settings, indent=2, ensure_ascii=False),
+            "viewer": VIEWER_FILE if os.path.isfile(folder / VIEWER_FILE) else None,
+        },
+    )
+
+
+def find_length_unit(summary: CompletionSummary) -> str:
+    """Return metres if the format defines them and the splat has no frame of its own."""
+    format = FORMATS.get(summary.scene.format)
+    if format is None or format.unit is None or summary.frame.method != "given":
+        return "scene units"
+    return str(format.unit)
+
+
+def average_scores(summary: Mapping[str, Any]) -> dict[str, Any]:
+    """Average the scores of a completion over its targets."""
+    targets = summary["targets"]
+    return {
+        "targets": len(targets),
+        **{key: average(target[key] for target in targets) for key in TARGET_COLUMNS},
+        "coverage_before": summary["coverage"]["before"],
+        "coverage_after": summary["coverage"]["after"],
+        "added": summary["gaussians"]["added"],
+    }
+
+
+def write_overview(out: Path, jobs: Sequence[Job]) -> None:
+    """Write the table and the page of `jobs`."""
+    rows = [row for job in jobs if (row := read_row(job, out)) is not None]
+    texts = {TABLE_FILE: format_csv(rows), INDEX_FILE: render_batch_page(rows)}
+    for name, text in texts.items():
+        with replace_file(out / name) as file:
+            file.write(text.encode())
+
+
+def format_csv(rows: Iterable[Mapping[str, Any]]) -> str:
+    """Format rows as CSV."""
+    text = io.StringIO(newline="")
+    writer = csv.DictWriter(text, TABLE_COLUMNS, extrasaction="ignore", lineterminator="\n")
+    writer.writeheader()
+    writer.writerows(rows)
+    return text.getvalue()
+
+
+def render_batch_page(rows: Sequence[Mapping[str, Any]]) -> str:
+    """Render the page of a batch."""
+    good = [row for row in rows if row["state"] == "done"]
+    gains = [r["psnr_after"] - r["psnr_before"] for r in good if r["psnr_after"] is not None]
+    seconds = [row["seconds"] for row in good]
+    return render_template(
+        "batch.html",
+        {
+            "jobs": good,
+            "failures": [f"{r['job']}: {r['reason']}" for r in rows if r["state"] == "failed"],
+            "gain": median(gains) if gains else None,
+            "seconds": median(seconds) if seconds else None,
+            "hours": sum(seconds) / 3600,
+            "folder": JOBS,
+            "report": REPORT_FILE,
+            "table": TABLE_FILE,
+        },
+    )

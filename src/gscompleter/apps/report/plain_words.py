@@ -5,12 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Iterator, Sequence
 
-from gscompleter.apps.report.schema import (
-    AlignmentRow,
-    CompletionSummary,
-    ContextRow,
-    TargetRow,
-)
+from gscompleter.apps.report.schema import AlignmentRow, CompletionSummary, ContextRow, TargetRow
 
 FRAME_NOTES = {
     "cameras": "in the frame of its cameras.json, not in that of the photographs",
@@ -37,10 +32,7 @@ RECOLORED_NOTE = (
     "Gaussians of the input splat got new colours, because no photograph confirms theirs; "
     "removed.ply has them as they were."
 )
-NO_SCORES_NOTE = "No target has a photograph, so there are no scores at targets."
-NO_TARGET_NOTE = "No large hole was found around the photographs; nothing was completed."
 NUM_WANTED = 2
-"""Most places that are named for new photographs."""
 NOTHING_NEW_NOTE = (
     "The splat reproduces all photographs. Where it is wrong from elsewhere, only smooth colours "
     "are known: little is to be gained without new photographs of the place or a learned generator."
@@ -60,10 +52,10 @@ def list_notes(summary: CompletionSummary) -> Iterator[str]:
     if summary.settings.get("uses_target_photographs"):
         yield ORACLE_NOTE
     if targets and all(row.psnr_after is None for row in targets):
-        yield NO_SCORES_NOTE
+        yield "No target has a photograph, so there are no scores at targets."
     yield from list_splat_notes(summary)
     if not targets:
-        yield NO_TARGET_NOTE
+        yield "No large hole was found around the photographs; nothing was completed."
 
 
 def list_photograph_notes(context: Sequence[ContextRow]) -> Iterator[str]:

@@ -53,7 +53,6 @@ class ContextRow(ScoreRow):
     exposure_gain: Vector | None = None
     dynamic_fraction: float = 0.0
     ignored: float = 0.0
-    """Fraction of ignored pixels, which stay the same while the camera moves."""
 
 
 @dataclass(frozen=True)
@@ -153,15 +152,13 @@ class CompletionRecord:
 
 def read_summary(folder: Path) -> CompletionSummary:
     """Read `summary.json`; raise an InputError if it is missing or damaged."""
-    return parse_content(
-        CompletionSummary, read_result(folder / SUMMARY_FILE), folder / SUMMARY_FILE
-    )
+    return read_result(CompletionSummary, folder / SUMMARY_FILE)
 
 
 def read_record(folder: Path, summary: CompletionSummary) -> CompletionRecord:
     """Read `report.json`; raise an InputError if it does not fit the summary."""
     path = folder / RECORD_FILE
-    record = parse_content(CompletionRecord, read_result(path), path)
+    record = read_result(CompletionRecord, path)
     sizes = len(record.pairs), len(record.targets), len(record.context)
     if sizes != (len(summary.targets), len(summary.targets), len(summary.context)):
         raise InputError(f"{quote_value(path)} does not fit {SUMMARY_FILE} beside it; {ADVICE}.")
@@ -174,20 +171,16 @@ def average(values: Iterable[float | None]) -> float | None:
     return fmean(known) if known else None
 
 
-def read_result(path: Path) -> Any:
-    """Read a JSON file of a completion."""
+def read_result(kind: type[T], path: Path) -> T:
+    """Read and validate a JSON file of a completion."""
+    from pydantic import TypeAdapter, ValidationError
+
     if not os.path.isfile(path):
         raise InputError(
             f"{quote_value(path.parent)} has no {path.name}; name the output folder of a "
             "completion."
         )
-    return read_json(path, ADVICE)
-
-
-def parse_content(kind: type[T], content: Any, path: Path) -> T:
-    """Validate the content of a JSON file; raise an InputError if it does not fit."""
-    from pydantic import TypeAdapter, ValidationError
-
+    content = read_json(path, ADVICE)
     try:
         return TypeAdapter(kind).validate_python(content)
     except ValidationError as error:

@@ -38,7 +38,6 @@ class ViewerCamera:
     """In the frame of the scene."""
     thumbnail: bytes | None = None
     notes: tuple[str, ...] = ()
-    """Sentences on its completion."""
 
 
 @dataclass(frozen=True)
@@ -51,7 +50,6 @@ class ViewerContent:
     """The other state, or None to show one only."""
     cameras: tuple[ViewerCamera, ...] = ()
     notes: tuple[str, ...] = ()
-    """Sentences on missing or changed content."""
     transform: Float[np.ndarray, "4 4"] = field(default_factory=lambda: np.eye(4))
     """Similarity from the frame of further cameras to that of the scene."""
     origin: Float[np.ndarray, "3"] = field(default_factory=lambda: np.zeros(3))
@@ -139,10 +137,7 @@ def load_context_cameras(
 
 
 def add_file_cameras(content: ViewerContent, path: Path, resolution: Resolution) -> ViewerContent:
-    """Add the cameras of a file, with thumbnails of photographs that exist.
-
-    `resolution` is used if the file states no size.
-    """
+    """Add the cameras of a file, with thumbnails of photographs that exist."""
     cameras = load_scene_cameras(path, content.transform, content.origin, resolution)
     frames = read_cameras(path, resolution)
     shots = [

@@ -1,9 +1,7 @@
 """The JavaScript renderer of the viewer: npm packages pinned by their hashes.
 
 `package-lock.json` pins three.js, Spark (which renders Gaussians with it) and fflate (part of
-Spark). A wheel contains the result of `extract_libraries`; a source tree fetches the archives from
-npm's registry when a page is first made and caches them. Every archive is compared with its hash
-when it is opened.
+Spark). A wheel contains them; a source tree fetches and caches them when a page is first made.
 """
 
 from __future__ import annotations
@@ -22,7 +20,6 @@ from gscompleter.errors import InputError
 from gscompleter.io.files import get_download_folder, replace_file
 
 LOCK_FILE = Path(__file__).with_name("package-lock.json")
-"""Pinned packages with their hashes."""
 BUILT_LIBRARIES = Path(__file__).with_name("libraries.json")
 """Libraries stored by the build of a wheel."""
 MODULES = {
@@ -35,8 +32,7 @@ MODULES = {
 CORE_IMPORT = ('"./three.core.min.js"', '"three-core"')
 """Replacement for the one relative import: modules in a page have no folder."""
 REGISTRY = "https://registry.npmjs.org"
-TIMEOUT = 30.0
-"""Timeout of the registry in seconds."""
+TIMEOUT_SECONDS = 30.0
 
 
 @dataclass(frozen=True)
@@ -120,16 +116,15 @@ def get_archive_path(package: NpmPackage) -> Path:
 
 def fetch_archive(package: NpmPackage) -> bytes:
     """Fetch an archive from the npm registry and compare its hash."""
-    url, archive = f"{REGISTRY}/{package.path}", b""
+    url = f"{REGISTRY}/{package.path}"
     try:
-        with urllib.request.urlopen(url, timeout=TIMEOUT) as answer:
-            archive = answer.read()
-    except OSError as error:
-        reason = f"it cannot be fetched ({error})"
-    else:
+        with urllib.request.urlopen(url, timeout=TIMEOUT_SECONDS) as answer:
+            archive: bytes = answer.read()
         if package.is_intact(archive):
             return archive
         reason = "its SHA-512 differs"
+    except OSError as error:
+        reason = f"it cannot be fetched ({error})"
     raise InputError(
         f"The page needs {url}, but {reason}; install gscompleter from its wheel, which contains "
         f"it, or put it at {get_archive_path(package)}."

@@ -29,7 +29,6 @@ from gscompleter.splats.spz import encode_spz
 from gscompleter.types import Camera, Gaussians
 
 ASSETS = Path(__file__).with_name("assets")
-"""Folder of our own page sources."""
 PAGE_EXTENT = 4.0
 """Median distance of Gaussians from the centre, within a factor of 2, in page units."""
 MAX_DISTANCE = 4096.0
@@ -40,10 +39,8 @@ THREE_FROM_OPENCV = torch.diag(torch.tensor([1.0, -1.0, -1.0, 1.0], dtype=torch.
 """Half a turn about x, for the axes of the world and of a camera."""
 MAX_LANDMARKS = 100_000
 """Approximate number of Gaussians that determine the focus of a camera."""
-OVERVIEW_SIZE, OVERVIEW_FOCAL = (640, 480), 550.0
-"""Width, height and focal length (pixels) of the camera for a scene without cameras."""
 OVERVIEW_DISTANCE = 2.5
-"""Its distance from the centre, relative to the median distance of Gaussians."""
+"""Distance of a camera for the whole scene, relative to the median distance of Gaussians."""
 
 
 @dataclass(frozen=True)
@@ -129,11 +126,10 @@ def make_overview(scene: Gaussians) -> ViewerCamera:
     means = scene.means.cpu()
     centre = means.median(dim=0).values
     distance = OVERVIEW_DISTANCE * (means - centre).norm(dim=1).median()
-    c2w, K, (width, height) = torch.eye(4), torch.eye(3), OVERVIEW_SIZE
+    c2w = torch.eye(4)
     c2w[:3, 3] = centre - distance * torch.tensor([0.0, 0.0, 1.0])
-    K[0, 0] = K[1, 1] = OVERVIEW_FOCAL
-    K[:2, 2] = torch.tensor([width / 2, height / 2])
-    return ViewerCamera("overview", "Overview", Camera(c2w, K, width, height))
+    K = torch.tensor([[550.0, 0.0, 320.0], [0.0, 550.0, 240.0], [0.0, 0.0, 1.0]])
+    return ViewerCamera("overview", "Overview", Camera(c2w, K, 640, 480))
 
 
 def describe_camera(
