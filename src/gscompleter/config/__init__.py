@@ -1,4 +1,4 @@
-"""Settings of a completion: the defaults, the paper's, and its ablations."""
+"""Settings of a completion (the defaults, the paper's, and its ablations) and of `clean`."""
 
 from __future__ import annotations
 
@@ -220,6 +220,22 @@ class NextBestViewConfig(Settings):
     """Smallest gain, as a share of the image, for which another target is added."""
     enough: Annotated[float, Interval(gt=0, le=1)] = 0.7
     """Share of the best gain that is enough for a nearer camera to be preferred."""
+
+
+@dataclass(frozen=True)
+class CleaningConfig(Settings):
+    """Settings of the cleaning."""
+
+    min_ratio: Annotated[float, Interval(ge=1, le=1e6)] = 4.0
+    """Remove a Gaussian if some photographs gain this many times what the others lose without
+    it."""
+    idle: Weight = 1.0
+    """Also remove a Gaussian if the photographs lose at most this many times an equal share of
+    their error, spread over all visible Gaussians."""
+    tolerance: Annotated[float, Interval(ge=0, le=10)] = 0.01
+    """Largest loss of PSNR of a photograph by the whole cleaning, in dB."""
+    probes: Annotated[int, Interval(ge=1, le=1000)] = 8
+    """Number of random images for the estimate of a Gaussian's influence."""
 
 
 GUARDS = {

@@ -1,4 +1,4 @@
-"""The command `complete`: complete a scene and report the result."""
+"""The commands `complete` and `report`: complete a scene and report the result."""
 
 from __future__ import annotations
 
@@ -12,7 +12,12 @@ import numpy as np
 from rich.console import Console
 from rich.table import Table
 
-from gscompleter.apps.commands.options import CompleteOptions, get_max_targets, parse_resolution
+from gscompleter.apps.commands.options import (
+    CompleteOptions,
+    ReportOptions,
+    get_max_targets,
+    parse_resolution,
+)
 from gscompleter.apps.commands.output import describe_run, is_replaceable, read_held_out
 from gscompleter.apps.inputs.opening import (
     Opened,
@@ -97,6 +102,13 @@ def run_completion(options: CompleteOptions) -> None:
     complete_folder(options)
     if not options.quiet:
         print_completion(options)
+
+
+def run_report(options: ReportOptions) -> None:
+    """Write `report.html` and print its path."""
+    write_completion_page(options.out)
+    if not options.quiet:
+        print(options.out / REPORT_FILE)
 
 
 def complete_folder(options: CompleteOptions) -> dict[str, Any]:

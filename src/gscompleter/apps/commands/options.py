@@ -9,8 +9,7 @@ from typing import Annotated, Literal
 import tyro
 from annotated_types import Interval
 
-from gscompleter.config import CompleterConfig
-from gscompleter.config.cleaning import CleaningConfig
+from gscompleter.config import CleaningConfig, CompleterConfig
 from gscompleter.config.generators import GeneratorOptions
 from gscompleter.config.settings import Seed, Settings
 from gscompleter.jobs.engines import EngineName
