@@ -43,8 +43,6 @@ COMMANDS: dict[str, tuple[type, str, str]] = {
     "warmup": (options.WarmupOptions, "doctor", "run_warmup"),
 }
 
-UNFINISHED = "no unfinished result was written"
-
 Command: Any = Union[  # noqa: UP007  (of as many as there are)
     tuple(Annotated[kind, tyro.conf.subcommand(name)] for name, (kind, _, _) in COMMANDS.items())
 ]
@@ -87,7 +85,8 @@ def main() -> None:
         print(f"{PROGRAM}{format_error(error)}", file=sys.stderr)
         sys.exit(2)
     except KeyboardInterrupt as stop:
-        print(f"{PROGRAM}interrupted; {str(stop) or UNFINISHED}.", file=sys.stderr)
+        reason = str(stop) or "no unfinished result was written"
+        print(f"{PROGRAM}interrupted; {reason}.", file=sys.stderr)
         sys.exit(130)
 
 

@@ -104,10 +104,7 @@ def perform_job(job: Job, out: Path, retries: int) -> None:
 
 
 def complete_job(job: Job, jobs: Path) -> dict[str, Any]:
-    """Complete the scene of a job in a folder of `jobs`, and return its part of a row.
-
-    `cpu_seconds` is the sum over all threads, which does not depend on how busy the machine is.
-    """
+    """Complete the scene of a job in a folder of `jobs`, and return its part of a row."""
     import warnings
 
     from gscompleter.apps.commands.complete import complete_folder

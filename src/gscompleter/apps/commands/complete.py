@@ -76,7 +76,6 @@ class Prepared:
     cameras: Mapping[int, Camera]
     """Cameras of all usable photographs by frame, in the frame of the result."""
     seconds: Mapping[str, float]
-    """Wall time by stage so far."""
 
     @property
     def completer(self) -> GSCompleter:
@@ -189,11 +188,7 @@ def prepare_completion(options: CompleteOptions, console: Console) -> Prepared:
         task = add_splat(task, options.scene, options, opened, parts)
     with show_preparation("loading models"):
         completer = load_completer(options, task.targets, device)
-    with (
-        show_preparation("depth range"),
-        record_seconds() as seconds,
-        timed_stage("context"),
-    ):
+    with show_preparation("depth range"), record_seconds() as seconds, timed_stage("context"):
         task = apply_working_range(task, completer.renderer)
     cameras = collect_cameras(options, opened, task)
     return Prepared(options, opened, task, ViewPlanner(completer), cameras, seconds)

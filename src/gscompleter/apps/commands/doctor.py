@@ -5,7 +5,7 @@ from __future__ import annotations
 import importlib.metadata
 import json
 import sys
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import asdict, dataclass
 from itertools import groupby
 from pathlib import Path
@@ -31,8 +31,6 @@ from gscompleter.models.weights.fetching import (
 from gscompleter.models.weights.published import PUBLISHED, PublishedWeights
 from gscompleter.progress import show_progress
 from gscompleter.render import choose_device, load_renderer
-
-DISTRIBUTION = "gscompleter"
 
 PURPOSES = {
     "cuda": "rendering on an NVIDIA GPU",
@@ -103,7 +101,7 @@ def inspect_extra(extra: str, purpose: str) -> Found:
     if not versions:
         told = f"the installed version or this Python is older than this extra; for {purpose}"
     elif missing:
-        told = f"{', '.join(missing)}, for {purpose}; pip install '{DISTRIBUTION}[{extra}]'"
+        told = f"{', '.join(missing)}, for {purpose}; pip install 'gscompleter[{extra}]'"
     else:
         told = f"{', '.join(f'{name} {it}' for name, it in versions.items())}, for {purpose}"
     return Found("extras", extra, bool(versions) and not missing, told)
@@ -111,7 +109,7 @@ def inspect_extra(extra: str, purpose: str) -> Found:
 
 def list_requirements(extra: str = "") -> list[Requirement]:
     """List the requirements of the package, or those that an extra adds."""
-    lines = importlib.metadata.requires(DISTRIBUTION) or []
+    lines = importlib.metadata.requires("gscompleter") or []
     return [r for r in map(Requirement, lines) if is_required_by(extra, r)]
 
 
@@ -157,33 +155,31 @@ def inspect_viewer() -> Found:
 
 def run_models(options: ModelsOptions) -> None:
     """Print the published weights and their location on this machine."""
-    found = {name: find_cached(weights) for name, weights in PUBLISHED.items()}
-    if options.json:
-        rows = [describe_weights(PUBLISHED[name], path) for name, path in found.items()]
-        print(json.dumps(rows, indent=2))
-    else:
+    found = [(weights, find_cached(weights)) for weights in PUBLISHED.values()]
+    if not options.json:
         print_models(found)
+        return
+    rows = [
+        {
+            **asdict(weights),
+            "url": weights.url,
+            "pinned_by": weights.integrity_check,
+            "cached": None if path is None else str(path),
+            "place": str(get_cache_path(weights)),
+        }
+        for weights, path in found
+    ]
+    print(json.dumps(rows, indent=2))
 
 
-def describe_weights(weights: PublishedWeights, path: Path | None) -> dict[str, object]:
-    """Describe weights and their location."""
-    return {
-        **asdict(weights),
-        "url": weights.url,
-        "pinned_by": weights.integrity_check,
-        "cached": None if path is None else str(path),
-        "place": str(get_cache_path(weights)),
-    }
-
-
-def print_models(found: dict[str, Path | None]) -> None:
+def print_models(found: Sequence[tuple[PublishedWeights, Path | None]]) -> None:
     """Print the table and its footnotes."""
     table = Table(box=None)
     for title in ("name", "model", "parameters", "views", "size", "code / weights", "cached"):
         table.add_column(title, no_wrap=title == "name")
     table.add_column("source", overflow="fold")
-    for name, path in found.items():
-        table.add_row(*format_cells(PUBLISHED[name], path))
+    for weights, path in found:
+        table.add_row(*format_cells(weights, path))
     width = None if sys.stdout.isatty() else 1000  # a file or a pipe wraps no rows
     Console(width=width, markup=False, highlight=False).print(table)
     print("\n(!) Whether commercial use is allowed is unclear:")

@@ -17,7 +17,6 @@ from gscompleter.jobs.engines import EngineName
 Frame = Annotated[int, Interval(ge=0, lt=10**9)]
 Frames = Annotated[tuple[Frame, ...] | None, tyro.conf.arg(metavar="INT [INT ...]")]
 Threads = Annotated[int, Interval(ge=1, le=1024)]
-Repeats = Annotated[int, Interval(ge=1, le=1000)]
 Port = Annotated[int, Interval(ge=0, le=65535)]
 Axis = Literal["gaussians", "pixels", "views", "targets"]
 BenchMethod = Literal["full", "densify-100", "densify-800", "distill", "reggs"]
@@ -28,7 +27,6 @@ LONG_SIDE = 640
 """Default length of a photograph's longer side, in pixels."""
 
 DEFAULT_NUM_TARGETS = 4
-"""Default number of target cameras that are searched for."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -290,7 +288,7 @@ class BenchOptions(RunOptions, WritingOptions):
     """Methods to compare on the first case: full (ours) or others."""
     growth: tuple[Axis, ...] = ("gaussians", "pixels", "views", "targets")
     """Quantities to increase in the first case."""
-    repeats: Repeats = 5
+    repeats: Annotated[int, Interval(ge=1, le=1000)] = 5
     """Number of repetitions; methods other than full run once."""
     quick: bool = False
     """Run a quick check: the smallest case once, two iterations of the baselines, no growth."""

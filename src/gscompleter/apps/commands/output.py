@@ -19,7 +19,6 @@ from gscompleter.errors import InputError
 from gscompleter.types import Camera, View
 
 MAX_HELD_OUT = 8
-"""Most unused photographs to score."""
 
 
 def describe_run(
