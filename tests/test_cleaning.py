@@ -11,7 +11,7 @@ import torch
 
 from command import run
 from gscompleter.cleaning import find_removable, find_superfluous, predict_error_change
-from gscompleter.config.cleaning import CleaningConfig
+from gscompleter.config import CleaningConfig
 from gscompleter.evaluation.metrics.image import psnr
 from gscompleter.guards.psnr import compute_squared_error
 from gscompleter.render import load_renderer

@@ -17,7 +17,7 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 from torch.nn.functional import avg_pool2d
 
-from gscompleter.config.cleaning import CleaningConfig
+from gscompleter.config import CleaningConfig
 from gscompleter.guards.psnr import (
     add_psnr_loss,
     compute_mse_and_gradient,

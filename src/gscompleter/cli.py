@@ -33,17 +33,15 @@ COMMANDS: dict[str, tuple[type, str, str]] = {
     "tables": (options.TablesOptions, "evaluate", "run_tables"),
     "index": (options.IndexOptions, "evaluate", "run_index"),
     "bench": (options.BenchOptions, "bench", "run_bench"),
-    "models": (options.ModelsOptions, "models", "run_models"),
+    "models": (options.ModelsOptions, "doctor", "run_models"),
     "convert": (options.ConvertOptions, "convert", "run_convert"),
     "poses": (options.PosesOptions, "poses", "run_poses"),
-    "report": (options.ReportOptions, "report", "run_report"),
+    "report": (options.ReportOptions, "complete", "run_report"),
     "strip": (options.StripOptions, "convert", "run_strip"),
     "view": (options.ViewOptions, "view", "run_view"),
     "doctor": (options.DoctorOptions, "doctor", "run_doctor"),
-    "warmup": (options.WarmupOptions, "warmup", "run_warmup"),
+    "warmup": (options.WarmupOptions, "doctor", "run_warmup"),
 }
-
-UNFINISHED = "no unfinished result was written"
 
 Command: Any = Union[  # noqa: UP007  (of as many as there are)
     tuple(Annotated[kind, tyro.conf.subcommand(name)] for name, (kind, _, _) in COMMANDS.items())
@@ -87,7 +85,8 @@ def main() -> None:
         print(f"{PROGRAM}{format_error(error)}", file=sys.stderr)
         sys.exit(2)
     except KeyboardInterrupt as stop:
-        print(f"{PROGRAM}interrupted; {str(stop) or UNFINISHED}.", file=sys.stderr)
+        reason = str(stop) or "no unfinished result was written"
+        print(f"{PROGRAM}interrupted; {reason}.", file=sys.stderr)
         sys.exit(130)
 
 

@@ -9,11 +9,8 @@ from reprlib import Repr
 PROGRAM = "gscompleter: "
 """Prefix of every error message."""
 MAX_MESSAGE_LENGTH = 300
-"""Most characters of an error message on the command line."""
 MAX_QUOTE_LENGTH = 60
-"""Most characters of a value quoted in a sentence."""
 MAX_PATH_LENGTH = 250
-"""Most characters of a quoted path."""
 
 LFS_POINTER = b"version https://git-lfs"
 

@@ -30,8 +30,8 @@ BYTES_PER_SPLAT = 52
 BYTES_PER_PHOTO_PIXEL = 400
 """Bytes per pixel of each photograph of an input splat, for the fit to it."""
 
+# Of containers, for cgroup versions 2 and 1.
 _LIMIT_FILES = ("/sys/fs/cgroup/memory.max", "/sys/fs/cgroup/memory/memory.limit_in_bytes")
-"""Files with the memory limit of a container, for cgroup versions 2 and 1."""
 
 
 def check_memory(pixels: int, images: int) -> None:
@@ -58,12 +58,9 @@ def check_bytes(needed: int, number: str, remedy: str, argument: str | None = No
 
 
 def estimate_scene_bytes(count: int, numbers: int, photographs: Sequence[int]) -> int:
-    """Estimate the additional peak memory for an input splat.
+    """Estimate the additional peak memory for `count` Gaussians of an input splat.
 
-    Args:
-        count: Number of Gaussians.
-        numbers: Float32 values per Gaussian.
-        photographs: Pixels of each photograph, at working resolution.
+    Each has `numbers` float32 values; `photographs` are the pixels of each, at working resolution.
     """
     number = len(photographs)
     rendered = min(count, count_fitting_gaussians(number))

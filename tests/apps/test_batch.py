@@ -17,7 +17,7 @@ from batch_jobs import Writing, engine_named, plain_jobs, run_all
 from command import run
 from gscompleter import InputError
 from gscompleter.apps.batch.manifest import read_manifest
-from gscompleter.apps.commands.row_options import parse_row
+from gscompleter.apps.commands.batch import parse_row
 from gscompleter.errors import OutputError
 from gscompleter.jobs import jobs as batch
 from gscompleter.jobs.engines import open_submitit

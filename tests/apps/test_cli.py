@@ -21,7 +21,7 @@ import torch
 
 from command import run
 from gscompleter import load_ply, save_ply
-from gscompleter.apps.commands.row_options import parse_row
+from gscompleter.apps.commands.batch import parse_row
 from gscompleter.apps.commands.words import translate_name
 from gscompleter.cli import COMMANDS, parse_command
 from gscompleter.config import CompleterConfig

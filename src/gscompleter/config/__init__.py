@@ -1,4 +1,4 @@
-"""Settings of a completion: the defaults, the paper's, and its ablations."""
+"""Settings of a completion (the defaults, the paper's, and its ablations) and of `clean`."""
 
 from __future__ import annotations
 
@@ -9,14 +9,7 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 from annotated_types import Interval
 
 from gscompleter.config.coverage import COVERED
-from gscompleter.config.settings import (
-    Count,
-    Settings,
-    Share,
-    Weight,
-    apply_changes,
-    read_yaml,
-)
+from gscompleter.config.settings import Count, Settings, Share, Weight, apply_changes, read_yaml
 from gscompleter.errors import InputError, quote_value
 
 Pixels = Annotated[int, Interval(ge=0, le=4096)]
@@ -99,8 +92,7 @@ class RegistrationConfig(Settings):
     """`constant` scales a Gaussian with its distance, which preserves the target image; `fixed`
     keeps its size (paper)."""
     mask_occluded: bool = True
-    """Exclude pixels from the stereo loss where the scene hides the new surface from the anchor.
-    The paper includes them, which pulls the surface forward."""
+    """Exclude surfaces that the scene hides from the anchor from the stereo loss (paper: no)."""
     mask_sky: bool = True
     """Exclude the sky from the depth losses (paper: included)."""
     min_ratio: Annotated[float, Interval(gt=0, le=1)] | None = 0.1
@@ -220,6 +212,21 @@ class NextBestViewConfig(Settings):
     """Smallest gain, as a share of the image, for which another target is added."""
     enough: Annotated[float, Interval(gt=0, le=1)] = 0.7
     """Share of the best gain that is enough for a nearer camera to be preferred."""
+
+
+@dataclass(frozen=True)
+class CleaningConfig(Settings):
+    """Settings of the cleaning."""
+
+    min_ratio: Annotated[float, Interval(ge=1, le=1e6)] = 4.0
+    """Remove a Gaussian if photographs gain this many times what others lose without it."""
+    idle: Weight = 1.0
+    """Also remove a Gaussian if the photographs lose at most this many times an equal share of
+    their error, spread over all visible Gaussians."""
+    tolerance: Annotated[float, Interval(ge=0, le=10)] = 0.01
+    """Largest loss of PSNR of a photograph by the whole cleaning, in dB."""
+    probes: Annotated[int, Interval(ge=1, le=1000)] = 8
+    """Number of random images for the estimate of a Gaussian's influence."""
 
 
 GUARDS = {

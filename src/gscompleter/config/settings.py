@@ -27,9 +27,7 @@ Weight = Annotated[float, Interval(ge=0, le=1e6)]
 Seed = Annotated[int, Interval(ge=0, lt=2**62)]
 
 MAX_CONFIG_BYTES = 65_536
-"""Largest size of a settings file, in bytes."""
-MAX_REASON_LENGTH = 120
-"""Most characters of PyYAML's reason in a sentence."""
+MAX_REASON_LENGTH = 120  # of a sentence about YAML
 
 RENAMED = {
     "registration.affine.bridge": "alignment.align_at",

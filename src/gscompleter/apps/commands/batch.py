@@ -7,18 +7,28 @@ from __future__ import annotations
 
 import os
 import re
+import shlex
 import time
-from collections.abc import Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from functools import partial
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any, Union, get_type_hints
 
+import tyro
 from rich.console import Console
 
-from gscompleter.apps.batch.manifest import read_manifest
-from gscompleter.apps.commands.engines import make_engine, parse_pairs
-from gscompleter.apps.commands.options import BatchOptions
+from gscompleter.apps.batch.manifest import FOLDER, read_manifest
+from gscompleter.apps.commands.options import (
+    BatchOptions,
+    CompleteOptions,
+    EngineOptions,
+    LiveOptions,
+)
+from gscompleter.apps.commands.words import format_error, parse_words, translate_name
+from gscompleter.config.settings import validate
+from gscompleter.cpu_threads import count_available_cores, limit_threads
 from gscompleter.errors import InputError, quote_value
+from gscompleter.jobs.engines import choose_num_workers, open_local, open_ray, open_submitit
 from gscompleter.jobs.jobs import (
     JOBS,
     Job,
@@ -29,8 +39,18 @@ from gscompleter.jobs.jobs import (
     read_row,
     run_job,
 )
-from gscompleter.jobs.workers import parse_shard, run_jobs
+from gscompleter.jobs.workers import Engine, parse_shard, run_jobs
 from gscompleter.progress import show_preparation, show_progress, track
+
+COMPLETE = "complete"
+Command: Any = Union[  # noqa: UP007  (a command line has several)
+    Annotated[CompleteOptions, tyro.conf.subcommand(COMPLETE)],
+    Annotated[LiveOptions, tyro.conf.subcommand("live")],
+]
+RESERVED = ("out", "overwrite", "quiet", "threads", "dry-run", "help", "help-all")
+"""Options that a batch sets for all jobs."""
+TRUE, FALSE = ("true", "yes", "1"), ("false", "no", "0", "")
+"""Values of a flag in a CSV."""
 
 
 def run_batch(options: BatchOptions) -> None:
@@ -84,14 +104,10 @@ def perform_job(job: Job, out: Path, retries: int) -> None:
 
 
 def complete_job(job: Job, jobs: Path) -> dict[str, Any]:
-    """Complete the scene of a job in a folder of `jobs`, and return its part of a row.
-
-    `cpu_seconds` is the sum over all threads, which does not depend on how busy the machine is.
-    """
+    """Complete the scene of a job in a folder of `jobs`, and return its part of a row."""
     import warnings
 
     from gscompleter.apps.commands.complete import complete_folder
-    from gscompleter.apps.commands.row_options import parse_row
     from gscompleter.apps.report.page import average_scores
     from gscompleter.evaluation.memory import measure_peak_memory
 
@@ -107,3 +123,79 @@ def complete_job(job: Job, jobs: Path) -> dict[str, Any]:
         "result_bytes": sum(f.stat().st_size for f in (jobs / job.name).rglob("*") if f.is_file()),
         "peak_bytes": peak.bytes,
     }
+
+
+def parse_row(row: Mapping[str, Any], out: Path) -> CompleteOptions:
+    """Parse a row, or raise InputError; `out` is the output folder."""
+    if not isinstance(row.get(FOLDER), str):
+        raise InputError("The row has no folder; give it the folder of a scene.")
+    words = [COMPLETE, row[FOLDER], *row_to_words(row), "--out", str(out), "--overwrite", "--quiet"]
+    try:
+        options: CompleteOptions = validate(parse_words(words, Command, (COMPLETE,)))
+    except InputError as error:
+        raise InputError(format_error(error)) from error
+    return options
+
+
+def row_to_words(row: Mapping[str, Any], prefix: str = "") -> Iterator[str]:
+    """Convert a row to words of a command line."""
+    for key, value in row.items():
+        name = translate_name(f"{prefix}{key}".replace("_", "-"))
+        if name in RESERVED:
+            raise InputError(f"A row cannot set '{quote_value(name)}'; the batch sets it.")
+        if isinstance(value, Mapping):
+            yield from row_to_words(value, f"{name}.")
+        elif name != FOLDER and value is not None:
+            yield from option_to_words(name, value)
+
+
+def option_to_words(name: str, value: Any) -> list[str]:
+    """Convert an option to words; a text is split like a shell if it can have several values."""
+    kind = get_type_hints(CompleteOptions).get(name.replace("-", "_"))
+    if kind is bool:
+        if str(value).lower() not in TRUE + FALSE:
+            raise InputError(f"{name} is {quote_value(str(value))}; it must be true or false.")
+        return [f"--{name}"] if str(value).lower() in TRUE else []
+    values = value if isinstance(value, list) else [value]
+    if isinstance(value, str) and "tuple" in str(kind).lower():
+        try:
+            values = shlex.split(value)
+        except ValueError as error:
+            raise InputError(f"'{quote_value(value)}' has an unmatched quotation mark.") from error
+    words = [str(item) for item in values]
+    for word in words:
+        if re.match(r"-(?![\d.])", word):
+            raise InputError(f"{name} cannot be '{quote_value(word)}', which begins with a dash.")
+    return [f"--{name}", *words]
+
+
+def parse_pairs(words: Sequence[str], option: str) -> dict[str, str]:
+    """Parse `NAME=VALUE` words."""
+    pairs = {}
+    for word in words:
+        name, sign, value = word.partition("=")
+        if not name or not sign:
+            raise InputError(
+                f"'{quote_value(word)}' is not NAME=VALUE, as in resolution=256.", option
+            )
+        pairs[name] = value
+    return pairs
+
+
+def make_engine(options: EngineOptions, out: Path) -> Engine | None:
+    """Create the engine, or None for this process.
+
+    On this machine it also sets the threads, which workers inherit.
+    """
+    if options.engine is None:
+        return None
+    threads = options.threads or 1
+    if options.engine == "ray":
+        return partial(open_ray, options.workers, threads, options.gpus, options.address)
+    if options.engine == "submitit":
+        slurm, folder = parse_pairs(options.slurm, "slurm"), out / "submitit"
+        workers = options.workers or 1
+        return partial(open_submitit, workers, threads, options.gpus, folder, slurm)
+    workers = options.workers or choose_num_workers()
+    limit_threads(options.threads or max(1, count_available_cores() // workers))
+    return partial(open_local, workers)

@@ -31,11 +31,7 @@ from gscompleter.apps.bench.measure import (
     measure_in_rounds,
     measure_method,
 )
-from gscompleter.apps.bench.report import (
-    Measured,
-    Report,
-    format_report,
-)
+from gscompleter.apps.bench.report import Measured, Report, format_report
 from gscompleter.apps.commands.demo import (
     BASELINE_M,
     get_motorcycle_cameras,

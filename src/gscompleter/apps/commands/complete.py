@@ -1,4 +1,4 @@
-"""The command `complete`: complete a scene and report the result."""
+"""The commands `complete` and `report`: complete a scene and report the result."""
 
 from __future__ import annotations
 
@@ -12,7 +12,12 @@ import numpy as np
 from rich.console import Console
 from rich.table import Table
 
-from gscompleter.apps.commands.options import CompleteOptions, get_max_targets, parse_resolution
+from gscompleter.apps.commands.options import (
+    CompleteOptions,
+    ReportOptions,
+    get_max_targets,
+    parse_resolution,
+)
 from gscompleter.apps.commands.output import describe_run, is_replaceable, read_held_out
 from gscompleter.apps.inputs.opening import (
     Opened,
@@ -70,7 +75,6 @@ class Prepared:
     cameras: Mapping[int, Camera]
     """Cameras of all usable photographs by frame, in the frame of the result."""
     seconds: Mapping[str, float]
-    """Wall time by stage so far."""
 
     @property
     def completer(self) -> GSCompleter:
@@ -96,6 +100,13 @@ def run_completion(options: CompleteOptions) -> None:
     complete_folder(options)
     if not options.quiet:
         print_completion(options)
+
+
+def run_report(options: ReportOptions) -> None:
+    """Write `report.html` and print its path."""
+    write_completion_page(options.out)
+    if not options.quiet:
+        print(options.out / REPORT_FILE)
 
 
 def complete_folder(options: CompleteOptions) -> dict[str, Any]:
@@ -176,11 +187,7 @@ def prepare_completion(options: CompleteOptions, console: Console) -> Prepared:
         task = add_splat(task, options.scene, options, opened, parts)
     with show_preparation("loading models"):
         completer = load_completer(options, task.targets, device)
-    with (
-        show_preparation("depth range"),
-        record_seconds() as seconds,
-        timed_stage("context"),
-    ):
+    with show_preparation("depth range"), record_seconds() as seconds, timed_stage("context"):
         task = apply_working_range(task, completer.renderer)
     cameras = collect_cameras(options, opened, task)
     return Prepared(options, opened, task, ViewPlanner(completer), cameras, seconds)

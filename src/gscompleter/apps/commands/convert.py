@@ -16,7 +16,8 @@ from gscompleter.splats.layout import strip
 
 def run_convert(options: ConvertOptions) -> None:
     """Convert A to B, and print the number of Gaussians."""
-    check_output_file(options.out, options.overwrite)
+    get_writer(options.out)  # refuses a name without a format
+    check_free(options.out, options.overwrite)
     with show_progress(Console(stderr=True, quiet=options.quiet)):
         with show_preparation("reading"):
             gaussians = load_splat(options.source, options.drop_nonfinite)
@@ -33,16 +34,11 @@ def run_convert(options: ConvertOptions) -> None:
 
 def run_strip(options: StripOptions) -> None:
     """Write the original scene and print the number of Gaussians."""
-    check_output_file(options.out, options.overwrite)
+    get_writer(options.out)
+    check_free(options.out, options.overwrite)
     given, generated = strip(options.completed, options.out)
     if not options.quiet:
         print(f"{given:,} Gaussians, {generated:,} generated ones removed: {options.out}")
-
-
-def check_output_file(path: Path, overwrite: bool) -> None:
-    """Refuse a name without a format, and an existing file unless `overwrite` is set."""
-    get_writer(path)
-    check_free(path, overwrite)
 
 
 def check_free(path: Path, overwrite: bool) -> None:

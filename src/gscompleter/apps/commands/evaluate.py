@@ -13,8 +13,8 @@ from typing import Any
 from rich.console import Console
 from rich.table import Table
 
+from gscompleter.apps.commands.batch import make_engine
 from gscompleter.apps.commands.convert import check_free
-from gscompleter.apps.commands.engines import make_engine
 from gscompleter.apps.commands.options import (
     LONG_SIDE,
     EvaluateOptions,

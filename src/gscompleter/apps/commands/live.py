@@ -26,11 +26,11 @@ from gscompleter.progress import show_progress
 from gscompleter.state import Completion
 from gscompleter.types import Camera
 
+# viser renders antialiased scenes differently.
 ANTIALIASED_NOTE = (
     "The page renders antialiased Gaussians as classic ones, small ones too opaque; saved files "
     "are correct, and so is `gscompleter view`."
 )
-"""Note on antialiased scenes, which viser renders differently."""
 
 
 def run_live(options: LiveOptions) -> None:

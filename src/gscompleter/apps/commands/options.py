@@ -9,8 +9,7 @@ from typing import Annotated, Literal
 import tyro
 from annotated_types import Interval
 
-from gscompleter.config import CompleterConfig
-from gscompleter.config.cleaning import CleaningConfig
+from gscompleter.config import CleaningConfig, CompleterConfig
 from gscompleter.config.generators import GeneratorOptions
 from gscompleter.config.settings import Seed, Settings
 from gscompleter.jobs.engines import EngineName
@@ -18,7 +17,6 @@ from gscompleter.jobs.engines import EngineName
 Frame = Annotated[int, Interval(ge=0, lt=10**9)]
 Frames = Annotated[tuple[Frame, ...] | None, tyro.conf.arg(metavar="INT [INT ...]")]
 Threads = Annotated[int, Interval(ge=1, le=1024)]
-Repeats = Annotated[int, Interval(ge=1, le=1000)]
 Port = Annotated[int, Interval(ge=0, le=65535)]
 Axis = Literal["gaussians", "pixels", "views", "targets"]
 BenchMethod = Literal["full", "densify-100", "densify-800", "distill", "reggs"]
@@ -29,7 +27,6 @@ LONG_SIDE = 640
 """Default length of a photograph's longer side, in pixels."""
 
 DEFAULT_NUM_TARGETS = 4
-"""Default number of target cameras that are searched for."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -291,7 +288,7 @@ class BenchOptions(RunOptions, WritingOptions):
     """Methods to compare on the first case: full (ours) or others."""
     growth: tuple[Axis, ...] = ("gaussians", "pixels", "views", "targets")
     """Quantities to increase in the first case."""
-    repeats: Repeats = 5
+    repeats: Annotated[int, Interval(ge=1, le=1000)] = 5
     """Number of repetitions; methods other than full run once."""
     quick: bool = False
     """Run a quick check: the smallest case once, two iterations of the baselines, no growth."""

@@ -13,14 +13,12 @@ from gscompleter.apps.commands.options import SceneOptions, parse_resolution
 from gscompleter.apps.inputs.opening import Opened, Task
 from gscompleter.apps.inputs.selection import select_closest
 from gscompleter.apps.report.completion import HeldOut
-from gscompleter.config import CompleterConfig
-from gscompleter.config.cleaning import CleaningConfig
+from gscompleter.config import CleaningConfig, CompleterConfig
 from gscompleter.data.sfm.poses import POSES
 from gscompleter.errors import InputError
 from gscompleter.types import Camera, View
 
 MAX_HELD_OUT = 8
-"""Most unused photographs to score."""
 
 
 def describe_run(

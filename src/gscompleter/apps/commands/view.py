@@ -5,7 +5,6 @@ from __future__ import annotations
 import webbrowser
 from contextlib import suppress
 from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
-from pathlib import Path
 
 from gscompleter.apps.commands.convert import check_free
 from gscompleter.apps.commands.options import ViewOptions
@@ -22,7 +21,6 @@ from gscompleter.io.files import replace_file
 from gscompleter.splats.sog import META
 
 ADDRESS = "127.0.0.1"
-"""Network interface of the server."""
 HOST_NAMES = (ADDRESS, "localhost")
 """Accepted host names; any other one may be a DNS rebinding attack by a website."""
 
@@ -30,7 +28,10 @@ HOST_NAMES = (ADDRESS, "localhost")
 def run_view(options: ViewOptions) -> None:
     """Make the page, and write it or serve it until Ctrl-C."""
     if options.save is not None:
-        check_page(options.save, options.overwrite)
+        if options.save.suffix.lower() not in (".html", ".htm"):
+            name = quote_value(options.save)
+            raise InputError(f"{name} is no .html file; name it *.html.", "save")
+        check_free(options.save, options.overwrite)
     libraries = packages.load_libraries()
     page, notes = make_page(load_content(options), libraries)
     for note in () if options.quiet else notes:
@@ -40,13 +41,6 @@ def run_view(options: ViewOptions) -> None:
     else:
         with replace_file(options.save) as file:
             file.write(page)
-
-
-def check_page(path: Path, overwrite: bool) -> None:
-    """Refuse a file name without .html, and an existing file unless `overwrite` is set."""
-    if path.suffix.lower() not in (".html", ".htm"):
-        raise InputError(f"{quote_value(path)} is no .html file; name it *.html.", "save")
-    check_free(path, overwrite)
 
 
 def load_content(options: ViewOptions) -> ViewerContent:
