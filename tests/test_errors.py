@@ -6,7 +6,7 @@ import pytest
 
 from gscompleter import load_ply, load_splat
 from gscompleter.apps.commands.words import format_error
-from gscompleter.data.chunks import open_chunks
+from gscompleter.data.real_estate import open_chunks
 from gscompleter.data.colmap.model_files import read_images
 from gscompleter.data.points import read_point_cloud
 from gscompleter.data.sfm.poses import write_upright

@@ -9,7 +9,7 @@ import pytest
 from chunk_files import VIEWS, example, save_chunk
 from gscompleter import InputError
 from gscompleter.data.cases import open_clips
-from gscompleter.data.chunks import open_chunks
+from gscompleter.data.real_estate import open_chunks
 from gscompleter.data.formats import open_photographs
 from gscompleter.data.photographs import Photographs
 from gscompleter.evaluation.protocols import (

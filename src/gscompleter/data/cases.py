@@ -103,13 +103,10 @@ def open_clips(path: Path | str) -> Iterator[Photographs]:
     inside = [] if find_format(path) or not os.path.isdir(path) else sorted(path.iterdir())
     folders = [child for child in inside if child.is_dir() and find_format(child)]
     scenes = [(FORMATS[detect_format(place)], place) for place in folders or [path]]
-    return (drop_side_cameras(clip) for format, place in scenes for clip in format.open(place))
-
-
-def drop_side_cameras(clip: Photographs) -> Photographs:
-    """Keep only the front camera of a vehicle with several cameras."""
-    ahead = [frame for frame in clip.frames if clip.front in (None, frame.sensor)]
-    return replace(clip, frames=attach_vehicle_detector(ahead))
+    for format, place in scenes:
+        for clip in format.open(place):
+            ahead = [frame for frame in clip.frames if clip.front in (None, frame.sensor)]
+            yield replace(clip, frames=attach_vehicle_detector(ahead))
 
 
 def filter_usable(

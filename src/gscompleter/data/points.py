@@ -31,9 +31,8 @@ def add_depth_range(
     photographs: Photographs, frames: Sequence[int], resolution: Resolution = None
 ) -> Photographs:
     """Set missing near and far planes from the points that the cameras of `frames` see."""
-    if photographs.near is not None and photographs.far is not None:
-        return photographs
-    points = photographs.points()
+    is_known = photographs.near is not None and photographs.far is not None
+    points = None if is_known else photographs.points()
     if points is None:
         return photographs
     found = compute_depth_range(points, [photographs.camera(f, resolution) for f in frames])

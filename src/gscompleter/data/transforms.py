@@ -21,7 +21,7 @@ from gscompleter.data.json_fields import (
     get_size,
     get_text,
 )
-from gscompleter.data.limits import DEPTH_RANGE, MAX_COEFFICIENT, MAX_IN_PIXELS, require
+from gscompleter.data.limits import DEPTH_RANGE, MAX_COEFFICIENT, MAX_NUMBER, require
 from gscompleter.data.photographs import Photographs, build_photographs
 from gscompleter.data.points import read_point_cloud
 from gscompleter.data.undistort import Distortion
@@ -131,11 +131,11 @@ def _parse_frame(
 
 
 def _parse_intrinsics(entry: Mapping[str, Any], title: str) -> Intrinsics:
-    def read_pair(*keys: str, low: float = -MAX_IN_PIXELS, high: float = MAX_IN_PIXELS) -> Pair:
+    def read_pair(*keys: str, low: float = -MAX_NUMBER, high: float = MAX_NUMBER) -> Pair:
         x, y = (get_optional_number(entry, key, title, low, high) for key in keys)
         return x, y
 
-    focal = read_pair("fl_x", "fl_y", low=1 / MAX_IN_PIXELS)
+    focal = read_pair("fl_x", "fl_y", low=1 / MAX_NUMBER)
     angle = read_pair("camera_angle_x", "camera_angle_y", low=ANGLE_RANGE[0], high=ANGLE_RANGE[1])
     require(
         any(focal + angle),

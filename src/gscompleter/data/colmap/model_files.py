@@ -18,7 +18,7 @@ import numpy as np
 from jaxtyping import Float
 
 from gscompleter.data.cameras import Intrinsics, compute_rotation, invert_viewmat
-from gscompleter.data.limits import MAX_COEFFICIENT, MAX_IN_PIXELS, MAX_SIDE
+from gscompleter.data.limits import MAX_COEFFICIENT, MAX_NUMBER, MAX_SIDE
 from gscompleter.data.undistort import Distortion, Projection
 from gscompleter.errors import InputError, quote_value, refuse_pointer
 from gscompleter.io.reading import open_file, read_lines
@@ -121,7 +121,7 @@ def build_intrinsics(
         )
     values = dict(zip(model.parameters, numbers, strict=True))
     for name, value in values.items():
-        limit = MAX_IN_PIXELS if name in _IN_PIXELS else MAX_COEFFICIENT
+        limit = MAX_NUMBER if name in _IN_PIXELS else MAX_COEFFICIENT
         if not abs(value) <= limit:
             raise InputError(
                 f"The parameter {name} of {title} is {value:g}; a number of at most {limit:g} is "
