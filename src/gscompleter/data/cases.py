@@ -33,11 +33,9 @@ class Case:
     neighbours: tuple[int, ...]
     """Frames beside the target, for scoring only."""
     resolution: Resolution
-    """Height and width, or another `Resolution`."""
     near: float | None = None
     far: float | None = None
     ignore_masked: bool = False
-    """True if masked pixels of the photographs are ignored."""
     ego_mask: bool = True
     """True if pixels of the vehicle that carries the camera are ignored."""
 
@@ -94,10 +92,9 @@ class SkippedScene:
 
 
 def open_clips(path: Path | str) -> Iterator[Photographs]:
-    """Open the scenes in a file or folder of any format, or a folder of such.
+    """Open the scenes in a file or folder of any format, or a folder of such, one at a time.
 
-    For a vehicle with several cameras only the front camera is used. Scenes are read one at a time,
-    so damage raises an InputError while iterating.
+    For a vehicle with several cameras only the front camera is used.
     """
     path = Path(path)
     inside = [] if find_format(path) or not os.path.isdir(path) else sorted(path.iterdir())

@@ -27,8 +27,6 @@ from gscompleter.data.photographs import Photographs, build_photographs
 from gscompleter.errors import InputError, join_names, quote_value, refuse_pointer
 from gscompleter.io.reading import check_file, open_file, read_head, read_json, read_lines
 
-TEST = "test"
-"""Folder of the test split of a data set."""
 INDEX = "index.json"
 
 
@@ -53,10 +51,7 @@ def read_camera_file(path: Path) -> Photographs:
 def parse_camera_row(
     numbers: Float[np.ndarray, "18"],
 ) -> tuple[Intrinsics, Float[np.ndarray, "4 4"]]:
-    """Split a row: fx, fy, cx, cy, two unused numbers, and the upper 3×4 of world-to-camera.
-
-    The pose is camera-to-world, or the transform itself if it cannot be inverted.
-    """
+    """Split a row into intrinsics and camera-to-world; an invalid transform stays as it is."""
     fx, fy, cx, cy = numbers[:4].tolist()
     viewmat = np.vstack([numbers[6:].reshape(3, 4), [0, 0, 0, 1]])
     return Intrinsics(FRACTIONS, (fx, fy), (cx, cy)), invert_viewmat(viewmat)
@@ -109,7 +104,7 @@ def open_chunks(path: Path) -> Iterator[Photographs]:
 
 
 def _list_folders(path: Path) -> list[Path]:
-    folders = (path, path / TEST)
+    folders = (path, path / "test")
     return [f for f in folders if os.path.isfile(f / INDEX) or any(f.glob("*.torch"))]
 
 

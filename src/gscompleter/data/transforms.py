@@ -91,11 +91,7 @@ def _make_point_reader(files: Sequence[Path]) -> partial[Float[np.ndarray, "n 3"
 
 
 def read_frames(path: Path) -> list[Frame]:
-    """Read the frames of a JSON file in its order, with exactly rigid poses.
-
-    Poses within `MAX_RIGID_ERROR` of a rigid transform get the nearest rotation, unless they are
-    within `FLOAT_NOISE` of it.
-    """
+    """Read the frames of a JSON file in its order, with exactly rigid poses (`make_rigid`)."""
     content = read_json(path, ADVICE)
     entries = get_part(content, "frames", list)
     require(entries, f"{path} lists no frames; its `frames` has to be a list with cameras.")
@@ -108,8 +104,7 @@ def _parse_frame(
 ) -> Frame:
     title = f"frame {position} of {path}"
     file_path = get_text(entry, "file_path", title)
-    if file_path is not None:
-        title = f"frame {quote_value(file_path)} of {path}"
+    title = title if file_path is None else f"frame {quote_value(file_path)} of {path}"
 
     def locate(key: str) -> Path | None:
         name = get_text(entry, key, title)

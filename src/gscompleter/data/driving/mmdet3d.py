@@ -37,8 +37,6 @@ MAX_GAP = 1.5
 """Largest gap between samples of a scene, in seconds; nuScenes has 0.5."""
 MICROSECONDS = 1e12
 """Smallest time that is in microseconds."""
-MAX_TIME = 1e18
-"""Largest time in either unit."""
 MAX_BYTES = 1 << 30
 """Largest pickle in bytes."""
 MAX_REPEATS = 4
@@ -81,7 +79,7 @@ def _parse_sample(sample: Any, path: Path) -> list[Shot]:
         if isinstance(image, dict) and all(image.get(key) is not None for key in NEEDED)
     }
     require(images, f"The images of {title} have no file or no pose; {ADVICE}.")
-    time = get_number(sample, "timestamp", title, 0.0, MAX_TIME)
+    time = get_number(sample, "timestamp", title, 0.0, 1e6 * MICROSECONDS)
     time = time * 1e-6 if time >= MICROSECONDS else time
     world_from_laser = _read_laser_pose(sample, title)
     things = get_part(sample, "instances", list)

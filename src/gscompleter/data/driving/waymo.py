@@ -47,10 +47,7 @@ PosedLens = tuple[Intrinsics, Float[np.ndarray, "4 4"]]
 
 
 def open_waymo(path: Path) -> Iterator[Photographs]:
-    """Open the segments in a folder, or the named one.
-
-    Frames are numbered camera by camera, the front camera first, and by time.
-    """
+    """Open segments; frames are numbered by camera, the front camera first, and time."""
     return map(_open_segment, list_segments(path))
 
 
