@@ -6,9 +6,9 @@ import pytest
 
 from gscompleter import load_ply, load_splat
 from gscompleter.apps.commands.words import format_error
-from gscompleter.data.chunks import open_chunks
 from gscompleter.data.colmap import read_images
 from gscompleter.data.points import read_point_cloud
+from gscompleter.data.real_estate import open_chunks
 from gscompleter.data.sfm.poses import write_upright
 from gscompleter.errors import InputError, join_names, quote_value
 from gscompleter.io.image import read_pixels

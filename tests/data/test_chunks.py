@@ -21,10 +21,9 @@ from chunk_files import (
 )
 from gscompleter import InputError
 from gscompleter.data.cases import SkippedScene, filter_usable, open_clips
-from gscompleter.data.chunks import open_chunks
 from gscompleter.data.formats import open_photographs
 from gscompleter.data.photographs import Photographs
-from gscompleter.data.real_estate import read_camera_file
+from gscompleter.data.real_estate import open_chunks, read_camera_file
 from gscompleter.geometry import project
 
 

@@ -84,11 +84,11 @@ def test_what_is_no_clip_is_told_what_would_be_one(tmp_path):
     (tmp_path / "empty").mkdir()
     for name in ("a.png", "empty"):
         with pytest.raises(InputError, match=f"no posed photographs in .*{name}; name .* nerfst"):
-            open_clips(tmp_path / name)
+            list(open_clips(tmp_path / name))
     with pytest.raises(InputError, match="a.json lists no frames"):
         next(open_clips(tmp_path / "a.json"))
     with pytest.raises(InputError, match="There is no .*missing; name .* nerfstudio"):
-        open_clips(tmp_path / "missing")
+        list(open_clips(tmp_path / "missing"))
     (tmp_path / "a.json").write_text("{")
     with pytest.raises(InputError, match="is not JSON"):
         next(open_clips(tmp_path / "a.json"))

@@ -9,9 +9,9 @@ import pytest
 from chunk_files import VIEWS, example, save_chunk
 from gscompleter import InputError
 from gscompleter.data.cases import open_clips
-from gscompleter.data.chunks import open_chunks
 from gscompleter.data.formats import open_photographs
 from gscompleter.data.photographs import Photographs
+from gscompleter.data.real_estate import open_chunks
 from gscompleter.evaluation.protocols import (
     EvaluationIndex,
     Split,

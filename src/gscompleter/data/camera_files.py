@@ -43,15 +43,11 @@ from gscompleter.io.reading import is_json_list, read_head, read_json
 
 NAME = "cameras.json"
 ADVICE = "export the cameras again"
-DEFAULT_FOV = 60.0
-"""SuperSplat's default field of view, in degrees."""
-FOV_RANGE = (1.0, 179.0)
-"""Range of SuperSplat's field of view, in degrees."""
+DEFAULT_FOV, FOV_RANGE = 60.0, (1.0, 179.0)
+"""SuperSplat's default field of view, and its range, in degrees."""
 SPLAT_FROM_WORLD = np.array([-1.0, -1.0, 1.0])
 """Axis factors from SuperSplat's world to the splat: 180° about z."""
 
-HEAD = 4096
-"""Bytes at the start of a file that tell its program."""
 METASHAPE = ("Metashape", "export its cameras as COLMAP, which Metashape does since 2.2")
 REALITYSCAN = ("RealityScan", "export its registration as COLMAP")
 POLYCAM = ("Polycam", "turn it into nerfstudio's transforms.json by ns-process-data polycam")
@@ -172,7 +168,7 @@ def refuse_other_exports(path: Path) -> None:
     inside = [file for place in PLACES for file in sorted(path.glob(place))]
     for file, (endings, mark, (program, advice)) in product([path, *inside], EXPORTS):
         require(
-            file.suffix.lower() not in endings or mark not in read_head(file, HEAD),
+            file.suffix.lower() not in endings or mark not in read_head(file, 4096),
             f"{quote_value(file)} holds cameras of {program}, which cannot be read; {advice}, or "
             "name a folder of the photographs alone.",
         )

@@ -32,11 +32,9 @@ class Case:
     neighbours: tuple[int, ...]
     """Frames beside the target, for scoring only."""
     resolution: Resolution
-    """Height and width, or another `Resolution`."""
     near: float | None = None
     far: float | None = None
     ignore_masked: bool = False
-    """True if masked pixels of the photographs are ignored."""
     ego_mask: bool = True
     """True if pixels of the vehicle that carries the camera are ignored."""
 
@@ -93,22 +91,18 @@ class SkippedScene:
 
 
 def open_clips(path: Path | str) -> Iterator[Photographs]:
-    """Open the scenes in a file or folder of any format, or a folder of such.
+    """Open the scenes in a file or folder of any format, or a folder of such, one at a time.
 
-    For a vehicle with several cameras only the front camera is used. Scenes are read one at a time,
-    so damage raises an InputError while iterating.
+    For a vehicle with several cameras only the front camera is used.
     """
     path = Path(path)
     inside = [] if find_format(path) or not os.path.isdir(path) else sorted(path.iterdir())
     folders = [child for child in inside if child.is_dir() and find_format(child)]
     scenes = [(FORMATS[detect_format(place)], place) for place in folders or [path]]
-    return (drop_side_cameras(clip) for format, place in scenes for clip in format.open(place))
-
-
-def drop_side_cameras(clip: Photographs) -> Photographs:
-    """Keep only the front camera of a vehicle with several cameras."""
-    ahead = [frame for frame in clip.frames if clip.front in (None, frame.sensor)]
-    return replace(clip, frames=attach_vehicle_detector(ahead))
+    for format, place in scenes:
+        for clip in format.open(place):
+            ahead = [frame for frame in clip.frames if clip.front in (None, frame.sensor)]
+            yield replace(clip, frames=attach_vehicle_detector(ahead))
 
 
 def filter_usable(

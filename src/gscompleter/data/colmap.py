@@ -27,7 +27,7 @@ from gscompleter.data.cameras import (
     invert_viewmat,
 )
 from gscompleter.data.frame import Frame, find_file, find_path, keep_existing, locate_images
-from gscompleter.data.limits import MAX_COEFFICIENT, MAX_IN_PIXELS, MAX_SIDE
+from gscompleter.data.limits import MAX_COEFFICIENT, MAX_NUMBER, MAX_SIDE
 from gscompleter.data.photographs import Photographs, build_photographs
 from gscompleter.data.points import read_point_cloud
 from gscompleter.errors import InputError, quote_value, refuse_pointer
@@ -135,7 +135,7 @@ def build_intrinsics(
         )
     values = dict(zip(names, numbers, strict=True))
     for name, value in values.items():
-        limit = MAX_IN_PIXELS if name in _IN_PIXELS else MAX_COEFFICIENT
+        limit = MAX_NUMBER if name in _IN_PIXELS else MAX_COEFFICIENT
         if not abs(value) <= limit:
             raise InputError(
                 f"The parameter {name} of {title} is {value:g}; a number of at most {limit:g} is "

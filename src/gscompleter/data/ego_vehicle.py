@@ -78,7 +78,10 @@ def detect_vehicle(frames: tuple[Frame, ...]) -> Bool[np.ndarray, "h w"] | None:
     poses = np.stack([frame.c2w for frame in usable])
     steps = np.linalg.norm(np.diff(poses[:, :3, 3], axis=0), axis=1)
     motion = estimate_motion(poses, steps)
-    small = {} if motion is None else read_small(select_evenly(usable, steps))
+    way = np.concatenate([[0.0], np.cumsum(steps)])
+    evenly = np.searchsorted(way, np.linspace(0, way[-1], MOST)).tolist()
+    chosen = [usable[index] for index in dict.fromkeys(evenly)]
+    small = {} if motion is None else read_small(chosen)
     if motion is None or len(small) < FEWEST:
         return None
     first, images = next(iter(small)), np.stack(list(small.values()))
@@ -87,13 +90,6 @@ def detect_vehicle(frames: tuple[Frame, ...]) -> Bool[np.ndarray, "h w"] | None:
         return None
     pinhole = first.intrinsics.compute_pinhole(*size)
     return find_static_region(images, *predict_ground_flow(motion, pinhole, images.shape[1:]))
-
-
-def select_evenly(frames: Sequence[Frame], steps: Float[np.ndarray, "_"]) -> list[Frame]:
-    """Select photographs that are evenly spaced along the way, of which `steps` are the parts."""
-    way = np.concatenate([[0.0], np.cumsum(steps)])
-    places = np.searchsorted(way, np.linspace(0, way[-1], MOST))
-    return [frames[index] for index in dict.fromkeys(places.tolist())]
 
 
 def read_small(frames: Sequence[Frame]) -> dict[Frame, Float[np.ndarray, "h w"]]:

@@ -13,19 +13,23 @@ from itertools import islice
 from pathlib import Path
 
 from gscompleter.data.camera_files import has_camera_list, open_camera_list, refuse_other_exports
-from gscompleter.data.chunks import has_chunks, open_chunks
 from gscompleter.data.colmap import has_colmap, open_colmap
-from gscompleter.data.driving.dgp import has_dgp, open_dgp
+from gscompleter.data.driving.dgp import list_scene_files, open_dgp
 from gscompleter.data.driving.kitti import has_kitti, has_kitti_raw, open_kitti, open_kitti_raw
 from gscompleter.data.driving.mmdet3d import has_infos, open_infos
 from gscompleter.data.driving.pandaset import has_pandaset, open_pandaset
-from gscompleter.data.driving.waymo import has_waymo, open_waymo
+from gscompleter.data.driving.waymo import list_segments, open_waymo
 from gscompleter.data.ego_vehicle import attach_vehicle_detector
 from gscompleter.data.frame import FOLDERS
 from gscompleter.data.limits import check_planes, require
 from gscompleter.data.llff import has_llff, open_llff
 from gscompleter.data.photographs import Photographs
-from gscompleter.data.real_estate import has_camera_files, open_camera_files
+from gscompleter.data.real_estate import (
+    has_chunks,
+    list_camera_files,
+    open_camera_files,
+    open_chunks,
+)
 from gscompleter.data.sfm.poses import ENDINGS, is_own
 from gscompleter.data.transforms import has_transforms, open_transforms
 from gscompleter.errors import InputError, join_names, quote_value
@@ -35,8 +39,8 @@ from gscompleter.errors import InputError, join_names, quote_value
 class Format:
     """A layout of posed photographs on disk."""
 
-    detect: Callable[[Path], bool]
-    """Detects the format of a file or folder by names and first bytes."""
+    detect: Callable[[Path], object]
+    """Detects the format of a file or folder by names and first bytes; may return its files."""
     open: Callable[[Path], Iterable[Photographs]]
     """Opens the scenes in such a file or folder one at a time; reads only cameras."""
     unit: str | None = None
@@ -48,7 +52,7 @@ MAX_NAMED = 4
 
 FORMATS = {
     "chunks": Format(has_chunks, open_chunks),
-    "dgp": Format(has_dgp, open_dgp, "m"),
+    "dgp": Format(list_scene_files, open_dgp, "m"),
     "nerfstudio": Format(has_transforms, open_transforms),
     "colmap": Format(has_colmap, open_colmap),
     "cameras-json": Format(has_camera_list, open_camera_list),
@@ -57,8 +61,8 @@ FORMATS = {
     "kitti-raw": Format(has_kitti_raw, open_kitti_raw, "m"),
     "pandaset": Format(has_pandaset, open_pandaset, "m"),
     "mmdet3d": Format(has_infos, open_infos, "m"),
-    "waymo": Format(has_waymo, open_waymo, "m"),
-    "real-estate-10k": Format(has_camera_files, open_camera_files),
+    "waymo": Format(list_segments, open_waymo, "m"),
+    "real-estate-10k": Format(list_camera_files, open_camera_files),
 }
 """Formats by the names that `open_photographs` takes, in the order of detection."""
 

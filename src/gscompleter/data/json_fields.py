@@ -12,14 +12,7 @@ import numpy as np
 from jaxtyping import Float
 
 from gscompleter.data.cameras import Intrinsics, compute_rotation
-from gscompleter.data.limits import (
-    MAX_COORDINATE,
-    MAX_IN_PIXELS,
-    MAX_NUMBER,
-    MAX_PATH,
-    MAX_SIDE,
-    require,
-)
+from gscompleter.data.limits import MAX_COORDINATE, MAX_NUMBER, MAX_PATH, MAX_SIDE, require
 from gscompleter.errors import quote_value
 
 NUMBERS = (int, float, np.integer, np.floating)
@@ -76,7 +69,10 @@ def get_array(
     entry: Any, key: str, title: str, *shapes: tuple[int, ...]
 ) -> Float[np.ndarray, "*n"]:
     """Return the nested list of numbers or NaN at `key` as an array of one of these shapes."""
-    array = _convert_to_array(_get(entry, key))
+    try:
+        array = np.array(_get(entry, key), dtype=np.float64)
+    except (ValueError, TypeError, OverflowError):
+        array = np.zeros(0)
     sizes = " or ".join(" × ".join(map(str, shape)) for shape in shapes)
     require(
         array.shape in shapes and not (np.abs(array) > MAX_NUMBER).any(),
@@ -88,14 +84,14 @@ def get_array(
 
 def get_focal(entry: Any, title: str) -> tuple[float, float]:
     """Return the focal lengths `fx` and `fy` in pixels."""
-    low, high = 1 / MAX_IN_PIXELS, MAX_IN_PIXELS
+    low, high = 1 / MAX_NUMBER, MAX_NUMBER
     return get_number(entry, "fx", title, low, high), get_number(entry, "fy", title, low, high)
 
 
 def get_intrinsics(entry: Any, title: str) -> Intrinsics:
     """Return the intrinsics `fx`, `fy`, `cx` and `cy` in pixels, without an image size."""
     focal = get_focal(entry, title)
-    cx, cy = (get_number(entry, key, title, -MAX_IN_PIXELS, MAX_IN_PIXELS) for key in ("cx", "cy"))
+    cx, cy = (get_number(entry, key, title, -MAX_NUMBER, MAX_NUMBER) for key in ("cx", "cy"))
     return Intrinsics(None, focal, (cx, cy))
 
 
@@ -120,11 +116,3 @@ def get_pose(
 def _get(entry: Any, key: str) -> Any:
     """Return the value at `key`; None without one, or if `entry` is no object."""
     return entry.get(key) if isinstance(entry, dict) else None
-
-
-def _convert_to_array(value: Any) -> Float[np.ndarray, "*n"]:
-    """Convert nested lists of numbers to an array; an empty one if they are none."""
-    try:
-        return np.array(value, dtype=np.float64)
-    except (ValueError, TypeError, OverflowError):
-        return np.zeros(0)

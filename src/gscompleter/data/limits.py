@@ -12,9 +12,7 @@ from gscompleter.errors import InputError
 MAX_SIDE = 16_384
 """Largest width or height of an image, in pixels."""
 MAX_NUMBER = 1e12
-"""Largest number of any kind in a camera file."""
-MAX_IN_PIXELS = MAX_NUMBER
-"""Largest focal length or principal point, in pixels."""
+"""Largest number of any kind in a camera file, such as a focal length in pixels."""
 MAX_COORDINATE = 1e9
 """Largest coordinate of a camera centre, in scene units."""
 FOCAL_RANGE = (1e-3, 1e6)

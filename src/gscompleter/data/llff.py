@@ -20,7 +20,7 @@ from gscompleter.data.frame import Frame, list_image_folders
 from gscompleter.data.json_fields import get_size
 from gscompleter.data.limits import DEPTH_RANGE, require
 from gscompleter.data.photographs import Photographs, build_photographs
-from gscompleter.data.points import widen_depth_range
+from gscompleter.data.points import FAR_FACTOR, NEAR_FACTOR
 from gscompleter.errors import InputError, quote_value
 from gscompleter.io.reading import check_file
 
@@ -45,7 +45,7 @@ def open_llff(path: Path) -> Iterator[Photographs]:
     titles = (f"row {number} of {quote_value(file)}" for number in range(len(rows)))
     images = _find_photographs(file, len(rows))
     frames = list(map(_parse_frame, images, rows, titles))
-    near, far = widen_depth_range(float(rows[:, 15].min()), float(rows[:, 16].max()))
+    near, far = NEAR_FACTOR * rows[:, 15].min().item(), FAR_FACTOR * rows[:, 16].max().item()
     scene = build_photographs(file.resolve().parent.name, str(file), frames)
     yield replace(scene, near=near, far=far)
 
@@ -78,14 +78,11 @@ def _read_rows(path: Path) -> Float[np.ndarray, "n 17"]:
 
 def _find_photographs(file: Path, count: int) -> list[Path]:
     """List the photographs of the first folder with one for each row."""
-    numbers = []
     for folder in list_image_folders([file.parent]):
         images = sorted(path for path in folder.iterdir() if path.suffix.lower() in IMAGES)
         if len(images) == count:
             return images
-        numbers.append(f"{len(images)} in {folder.name}")
     raise InputError(
-        f"{quote_value(file)} has {count} rows, one per photograph in order of their names, but "
-        f"there are {', '.join(numbers)}; put exactly these photographs into a folder `images` "
-        "beside it."
+        f"{quote_value(file)} has {count} rows, one per photograph in order of their names; put "
+        "exactly these photographs into a folder `images` beside it."
     )

@@ -30,9 +30,8 @@ def add_depth_range(
     photographs: Photographs, frames: Sequence[int], resolution: Resolution = None
 ) -> Photographs:
     """Set missing near and far planes from the points that the cameras of `frames` see."""
-    if photographs.near is not None and photographs.far is not None:
-        return photographs
-    points = photographs.points()
+    is_known = photographs.near is not None and photographs.far is not None
+    points = None if is_known else photographs.points()
     if points is None:
         return photographs
     found = compute_depth_range(points, [photographs.camera(f, resolution) for f in frames])
@@ -46,10 +45,7 @@ def add_depth_range(
 def compute_depth_range(
     points: Float[Tensor, "n 3"], cameras: Sequence[Camera]
 ) -> tuple[float, float] | None:
-    """Compute near and far planes (scene units) around the points that the cameras see.
-
-    Returns None for too few points. Hidden points count too; the percentiles tolerate them.
-    """
+    """Compute near and far planes (scene units) around visible points; None for too few."""
     seen = [torch.zeros(0)]
     for camera in cameras:
         pixels, z = project(points, camera)
@@ -58,13 +54,8 @@ def compute_depth_range(
     if len(depths) < MIN_POINTS:
         return None
     low, high = np.quantile(depths.double().numpy(), PERCENTILES).tolist()
-    near, far = widen_depth_range(low, high)
+    near, far = NEAR_FACTOR * low, FAR_FACTOR * high
     return (near, far) if DEPTH_RANGE[0] <= near < far <= DEPTH_RANGE[1] else None
-
-
-def widen_depth_range(nearest: float, farthest: float) -> tuple[float, float]:
-    """Widen a depth range (scene units) for surfaces without points."""
-    return NEAR_FACTOR * nearest, FAR_FACTOR * farthest
 
 
 def read_point_cloud(path: Path) -> Float[np.ndarray, "n 3"]:

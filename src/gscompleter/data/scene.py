@@ -26,15 +26,10 @@ def load_views(
 ) -> list[View]:
     """Load the photographs of a scene with their cameras, and true depth if available.
 
-    Lens distortion is removed, as in `Photographs.views`. If coordinates are so large that
-    float32 would lose the baselines, cameras are relative to `open_photographs(scene).origin`.
-
-    Args:
-        scene: Any path that `open_photographs` opens.
-        frames: Numbers of the frames to read, counted by sorted names; all if None.
-        resolution: Height and width in pixels, or the most pixels of the longer side.
-        near: Smallest z-depth of the scene, in scene units, if known.
-        far: Largest z-depth of the scene, in scene units, if known.
+    Lens distortion is removed. If coordinates are so large that float32 would lose the baselines,
+    cameras are relative to `open_photographs(scene).origin`.
+    `frames` are counted by sorted names, all if None; `resolution` is height and width in pixels,
+    or the most pixels of the longer side; `near` and `far` are z-depths in scene units, if known.
     """
     photographs = open_photographs(scene, near=near, far=far)
     return photographs.views(range(len(photographs)) if frames is None else frames, resolution)
@@ -47,10 +42,7 @@ def load_camera(
     near: float | None = None,
     far: float | None = None,
 ) -> Camera:
-    """Load the camera of a frame, as in `load_views`; None takes the only frame.
-
-    Its photograph may be missing if the file has `w` and `h`.
-    """
+    """Load the camera of a frame, with or without photograph; None takes the only frame."""
     photographs = open_photographs(scene, near=near, far=far)
     require(
         frame is not None or len(photographs) == 1,

@@ -21,7 +21,7 @@ from gscompleter.data.json_fields import (
     get_size,
     get_text,
 )
-from gscompleter.data.limits import DEPTH_RANGE, MAX_COEFFICIENT, MAX_IN_PIXELS, require
+from gscompleter.data.limits import DEPTH_RANGE, MAX_COEFFICIENT, MAX_NUMBER, require
 from gscompleter.data.photographs import Photographs, build_photographs
 from gscompleter.data.points import read_point_cloud
 from gscompleter.errors import quote_value
@@ -90,11 +90,7 @@ def _make_point_reader(files: Sequence[Path]) -> partial[Float[np.ndarray, "n 3"
 
 
 def read_frames(path: Path) -> list[Frame]:
-    """Read the frames of a JSON file in its order, with exactly rigid poses.
-
-    Poses within `MAX_RIGID_ERROR` of a rigid transform get the nearest rotation, unless they are
-    within `FLOAT_NOISE` of it.
-    """
+    """Read the frames of a JSON file in its order, with exactly rigid poses (`make_rigid`)."""
     content = read_json(path, ADVICE)
     entries = get_part(content, "frames", list)
     require(entries, f"{path} lists no frames; its `frames` has to be a list with cameras.")
@@ -107,8 +103,7 @@ def _parse_frame(
 ) -> Frame:
     title = f"frame {position} of {path}"
     file_path = get_text(entry, "file_path", title)
-    if file_path is not None:
-        title = f"frame {quote_value(file_path)} of {path}"
+    title = title if file_path is None else f"frame {quote_value(file_path)} of {path}"
 
     def locate(key: str) -> Path | None:
         name = get_text(entry, key, title)
@@ -130,11 +125,11 @@ def _parse_frame(
 
 
 def _parse_intrinsics(entry: Mapping[str, Any], title: str) -> Intrinsics:
-    def read_pair(*keys: str, low: float = -MAX_IN_PIXELS, high: float = MAX_IN_PIXELS) -> Pair:
+    def read_pair(*keys: str, low: float = -MAX_NUMBER, high: float = MAX_NUMBER) -> Pair:
         x, y = (get_optional_number(entry, key, title, low, high) for key in keys)
         return x, y
 
-    focal = read_pair("fl_x", "fl_y", low=1 / MAX_IN_PIXELS)
+    focal = read_pair("fl_x", "fl_y", low=1 / MAX_NUMBER)
     angle = read_pair("camera_angle_x", "camera_angle_y", low=ANGLE_RANGE[0], high=ANGLE_RANGE[1])
     require(
         any(focal + angle),

@@ -31,18 +31,13 @@ MAX_SNIFFED = 1 << 26
 """Bytes read from a file to detect a scene."""
 
 
-def has_dgp(path: Path) -> bool:
-    """Check whether `path` is a DGP scene file, or a folder with one."""
-    return bool(_list_scene_files(path))
-
-
 def open_dgp(path: Path) -> Iterator[Photographs]:
     """Open the photographs of a DGP scene; its folder names it.
 
     Frames of all cameras are numbered by their sorted names, which are paths below the folder. The
     first camera by name, in DDAD CAMERA_01, is the front camera.
     """
-    file = _list_scene_files(path)[0]
+    file = list_scene_files(path)[0]
     content = read_json(file, ADVICE)
     cameras, sweeps = _read_calibrations(file, content), _map_sweeps(content)
     images = [d for d in get_part(content, "data", list) if "image" in get_part(d, "datum", dict)]
@@ -120,7 +115,8 @@ def _read_calibrations(scene: Path, content: Any) -> dict[str, Intrinsics]:
     }
 
 
-def _list_scene_files(path: Path) -> list[Path]:
+def list_scene_files(path: Path) -> list[Path]:
+    """List the DGP scene file at `path`, or those in a folder."""
     files = sorted(path.glob("scene*.json")) if os.path.isdir(path) else [path]
     files = [file for file in files if file.suffix == ".json" and os.path.isfile(file)]
     return [file for file in files if b'"datum"' in read_head(file, MAX_SNIFFED)]

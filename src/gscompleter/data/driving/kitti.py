@@ -12,7 +12,7 @@ development kit.
 from __future__ import annotations
 
 import os
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Iterator, Mapping
 from functools import partial
 from pathlib import Path
 
@@ -32,13 +32,11 @@ CAMERAS = {"image_2": 2, "image_0": 0, "image_3": 3, "image_1": 1, "image_l": 0,
 """Folders of photographs of a sequence in search order, and their camera numbers."""
 RAW_CAMERAS = ("02", "03", "00", "01")
 """Cameras of a drive in order of preference: colour left, colour right, then grey."""
-EARTH_RADIUS = 6_378_137.0
-"""Earth radius in metres."""
+EARTH_RADIUS = 6_378_137.0  # metres
 MAX_LATITUDE = 89.0
 """Largest latitude in degrees; Mercator's map has no poles."""
 
 Numbers = Float[np.ndarray, "_"]
-Points = Float[np.ndarray, "n 3"]
 Pose = Float[np.ndarray, "4 4"]
 
 
@@ -56,8 +54,7 @@ def open_kitti(path: Path) -> Iterator[Photographs]:
     """Open the photographs of a sequence, numbered like the poses; its folder names it.
 
     `path` is a folder with calib.txt and poses.txt, or with its poses in ../../poses; or a file of
-    poses, with calibration and photographs beside it or in ../sequences. The left colour camera (2)
-    is preferred.
+    poses, with calibration and photographs beside it or in ../sequences.
     """
     poses, folder = _list_poses(path)[0], path if os.path.isdir(path) else path.parent
     sequence = poses.resolve().parent.parent / "sequences" / poses.stem
@@ -109,8 +106,7 @@ def open_kitti_raw(path: Path) -> Iterator[Photographs]:
     yield build_drive(path.resolve().name, str(path), frames)
 
 
-def _find_sweep(path: Path, world_from_laser: Pose) -> Callable[[], Points] | None:
-    """Return a reader of the points of a sweep; None if there is no file."""
+def _find_sweep(path: Path, world_from_laser: Pose) -> partial[Float[np.ndarray, "n 3"]] | None:
     return partial(read_sweep, path, world_from_laser) if os.path.isfile(path) else None
 
 

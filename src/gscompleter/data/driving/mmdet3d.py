@@ -15,7 +15,7 @@ from dataclasses import replace
 from functools import partial
 from itertools import pairwise
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 from jaxtyping import Float
@@ -37,8 +37,6 @@ MAX_GAP = 1.5
 """Largest gap between samples of a scene, in seconds; nuScenes has 0.5."""
 MICROSECONDS = 1e12
 """Smallest time that is in microseconds."""
-MAX_TIME = 1e18
-"""Largest time in either unit."""
 MAX_BYTES = 1 << 30
 """Largest pickle in bytes."""
 MAX_REPEATS = 4
@@ -51,6 +49,8 @@ CONSTRUCTORS: dict[tuple[str, str], Callable[..., Any]] = {
 """Functions that a pickle may name."""
 
 Pose = Float[np.ndarray, "4 4"]
+Shot = tuple[str, float, Frame]
+"""Drive, time in seconds, and photograph."""
 
 
 def has_infos(path: Path) -> bool:
@@ -67,19 +67,11 @@ def open_infos(path: Path) -> Iterator[Photographs]:
     content = get_part(load_plain(path), "data_list", list)
     require(content, f"{quote_value(path)} holds no infos with a `data_list`; {ADVICE}.")
     shots = [shot for sample in content for shot in _parse_sample(sample, path)]
-    shots.sort(key=lambda shot: (shot.drive, shot.time))
+    shots.sort(key=lambda shot: shot[:2])
     return (_build_scene(path, scene) for scene in _split_scenes(shots))
 
 
-class _Shot(NamedTuple):
-    """A photograph of a drive, and its time in seconds."""
-
-    drive: str
-    time: float
-    frame: Frame
-
-
-def _parse_sample(sample: Any, path: Path) -> list[_Shot]:
+def _parse_sample(sample: Any, path: Path) -> list[Shot]:
     title = f"a sample of {quote_value(path)}"
     images = {
         quote_value(name): image
@@ -87,7 +79,7 @@ def _parse_sample(sample: Any, path: Path) -> list[_Shot]:
         if isinstance(image, dict) and all(image.get(key) is not None for key in NEEDED)
     }
     require(images, f"The images of {title} have no file or no pose; {ADVICE}.")
-    time = get_number(sample, "timestamp", title, 0.0, MAX_TIME)
+    time = get_number(sample, "timestamp", title, 0.0, 1e6 * MICROSECONDS)
     time = time * 1e-6 if time >= MICROSECONDS else time
     world_from_laser = _read_laser_pose(sample, title)
     things = get_part(sample, "instances", list)
@@ -97,7 +89,7 @@ def _parse_sample(sample: Any, path: Path) -> list[_Shot]:
     file = os.path.basename(get_text(first, "img_path", title) or "")
     drive = get_text(sample, "context_name", title) or file.split("__")[0]
     frames = (_make_frame(path, n, time, image, world_from_laser) for n, image in images.items())
-    return [_Shot(drive, time, replace(frame, boxes=boxes)) for frame in frames]
+    return [(drive, time, replace(frame, boxes=boxes)) for frame in frames]
 
 
 def _read_laser_pose(sample: Any, title: str) -> Pose:
@@ -107,22 +99,22 @@ def _read_laser_pose(sample: Any, title: str) -> Pose:
     return vehicle @ get_array(lidar, "lidar2ego", title, (4, 4))
 
 
-def _split_scenes(shots: list[_Shot]) -> Iterator[list[_Shot]]:
+def _split_scenes(shots: list[Shot]) -> Iterator[list[Shot]]:
     """Group consecutive photographs of one drive."""
     scene = shots[:1]
-    for before, after in pairwise(shots):
-        if after.drive != before.drive or after.time - before.time > MAX_GAP:
+    for (drive, time, _), after in pairwise(shots):
+        if after[0] != drive or after[1] - time > MAX_GAP:
             yield scene
             scene = []
         scene.append(after)
     yield scene
 
 
-def _build_scene(path: Path, shots: list[_Shot]) -> Photographs:
-    frames = [shot.frame for shot in shots]
+def _build_scene(path: Path, shots: list[Shot]) -> Photographs:
+    (drive, time, _), *_ = shots
+    frames = [frame for _, _, frame in shots]
     frames.sort(key=lambda frame: (frame.sensor != FRONT, frame.sensor))
-    called = f"{shots[0].drive}_{shots[0].time:.3f}"
-    return build_drive(called, str(path), frames, front=frames[0].sensor)
+    return build_drive(f"{drive}_{time:.3f}", str(path), frames, front=frames[0].sensor)
 
 
 def _make_frame(path: Path, camera: str, time: float, image: Any, world_from_laser: Pose) -> Frame:

@@ -28,10 +28,7 @@ def has_pandaset(path: Path) -> bool:
 
 
 def open_pandaset(path: Path) -> Iterator[Photographs]:
-    """Open the photographs of a sequence; its folder names it.
-
-    Frames are numbered camera by camera, the front camera first, and by time.
-    """
+    """Open a sequence; frames are numbered by camera, the front camera first, and time."""
     files = (path / "camera").glob(f"*/{POSES}")
     cameras = sorted(files, key=lambda file: (file.parent.name != FRONT, file))
     frames = [frame for file in cameras for frame in _read_frames(file)]

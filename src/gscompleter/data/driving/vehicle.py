@@ -19,8 +19,6 @@ from gscompleter.types import Camera
 
 POINT_BYTES = 16
 """Size of a point of KITTI: x, y, z and reflectance as float32."""
-MAX_SWEEP = 1 << 28
-"""Largest sweep, in bytes."""
 MIN_SPEED = 0.5
 """Smallest speed of a moving object, in metres per second."""
 MARGIN = 0.1
@@ -32,10 +30,7 @@ MAX_PIXELS = 1e5
 
 
 def compute_sparse_depth(points: Float[Tensor, "n 3"], camera: Camera) -> Float[Tensor, "h w"]:
-    """Project points to z-depth in scene units: the nearest per pixel, 0 without one.
-
-    Points behind an unmeasured surface remain visible.
-    """
+    """Project points to z-depth in scene units: the nearest per pixel, 0 without one."""
     pixels, z = project(points, camera)
     seen = is_inside(pixels, z, camera)
     x, y = pixels[seen].long().unbind(-1)
@@ -46,7 +41,7 @@ def compute_sparse_depth(points: Float[Tensor, "n 3"], camera: Camera) -> Float[
 
 def read_sweep(path: Path, world_from_laser: Float[np.ndarray, "4 4"]) -> Float[np.ndarray, "n 3"]:
     """Read the points of a sweep of KITTI in the world frame, in metres."""
-    data = read_bytes(path, MAX_SWEEP)
+    data = read_bytes(path)
     require(
         len(data) % POINT_BYTES == 0,
         f"{quote_value(path)} is truncated: it ends within a point; copy it again.",

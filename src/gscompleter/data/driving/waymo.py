@@ -20,11 +20,7 @@ import numpy as np
 from jaxtyping import Float
 
 from gscompleter.data.cameras import Distortion, Intrinsics
-from gscompleter.data.driving.vehicle import (
-    build_poses,
-    compute_moving_boxes,
-    transform_points,
-)
+from gscompleter.data.driving.vehicle import build_poses, compute_moving_boxes, transform_points
 from gscompleter.data.frame import Frame
 from gscompleter.data.limits import require
 from gscompleter.data.photographs import Photographs, build_drive
@@ -49,20 +45,13 @@ PosedLens = tuple[Intrinsics, Float[np.ndarray, "4 4"]]
 """Intrinsics of a camera, and its pose on the vehicle in Waymo's axes."""
 
 
-def has_waymo(path: Path) -> bool:
-    """Check whether `path` is a folder of segments, or the photographs of one."""
-    return bool(_list_segments(path))
-
-
 def open_waymo(path: Path) -> Iterator[Photographs]:
-    """Open the segments in a folder, or the named one.
-
-    Frames are numbered camera by camera, the front camera first, and by time.
-    """
-    return map(_open_segment, _list_segments(path))
+    """Open segments; frames are numbered by camera, the front camera first, and time."""
+    return map(_open_segment, list_segments(path))
 
 
-def _list_segments(path: Path) -> list[Path]:
+def list_segments(path: Path) -> list[Path]:
+    """List the photograph files of the segments in a folder, or the given one."""
     files = sorted((path / IMAGES).glob("*.parquet")) if os.path.isdir(path) else [path]
     return [f for f in files if f.match(f"{IMAGES}/*.parquet") and os.path.isfile(f)]
 
@@ -132,7 +121,7 @@ def _make_frame(
         title,
         _parse_matrix(pose, title) @ vehicle_from_camera @ CAMERA_FROM_OPENCV,
         intrinsics,
-        partial(_read_image, segment, time, camera),
+        partial(_read_value, segment, "image", {TIME: time, CAMERA: camera}),
         sensor=name,
         laser_points=partial(_read_points, segment, time) if measured else None,
         boxes=partial(_read_boxes, segment, time) if boxed else None,
@@ -140,7 +129,6 @@ def _make_frame(
 
 
 def _read_cameras(path: Path) -> dict[int, PosedLens]:
-    """Read the cameras by their numbers."""
     title, found = quote_value(path), {}
     for camera, pose, *numbers in _read_rows(path, (CAMERA, "extrinsic.transform", *LENS)):
         lens = np.array(numbers, dtype=np.float64)  # null becomes NaN
@@ -154,11 +142,6 @@ def _read_cameras(path: Path) -> dict[int, PosedLens]:
         intrinsics = Intrinsics(size, (f_u, f_v), (c_u, c_v), distortion=distortion)
         found[camera] = intrinsics, _parse_matrix(pose, title)
     return found
-
-
-def _read_image(segment: Path, time: int, camera: int) -> bytes:
-    image: bytes = _read_value(segment, "image", {TIME: time, CAMERA: camera})
-    return image
 
 
 @lru_cache(maxsize=2)
