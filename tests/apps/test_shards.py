@@ -196,7 +196,7 @@ def test_rows_that_come_while_tables_are_written_get_into_them(finished, tmp_pat
         if len(written) == 1:
             late.rename(row)
 
-    monkeypatch.setattr(command.plots, "draw_plots", draw)
+    monkeypatch.setattr(command.tables, "draw_plots", draw)
     command.write_and_print_tables(out, quiet=True, num_rows=6)
     assert written == [2, 3]
     same_tables(out, finished)
@@ -213,7 +213,7 @@ def test_a_shard_leaves_the_last_tables_to_the_others(finished, tmp_path, monkey
         calls.append(summary)
         list_row_paths(out)[0].touch()
 
-    monkeypatch.setattr(command.plots, "draw_plots", draw)
+    monkeypatch.setattr(command.tables, "draw_plots", draw)
     command.write_and_print_tables(out, quiet=True, num_rows=6)
     assert len(calls) == 1
 

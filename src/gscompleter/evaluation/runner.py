@@ -16,8 +16,7 @@ from gscompleter.evaluation.methods import Models, check_methods
 from gscompleter.evaluation.protocols import Task
 from gscompleter.evaluation.steps import PreparedTask, attempt, complete_task
 from gscompleter.generators import load_generator
-from gscompleter.jobs.jobs import Job, describe_loss
-from gscompleter.jobs.workers import Engine, check_shard, run_jobs
+from gscompleter.jobs.jobs import Engine, Job, check_shard, describe_loss, run_jobs
 from gscompleter.memory import check_memory
 from gscompleter.progress import show_progress, stage, track
 from gscompleter.reconstructors import load_reconstructor

@@ -18,7 +18,7 @@ from typing import Any, Literal
 from gscompleter.cpu_threads import count_available_cores, limit_threads
 from gscompleter.errors import InputError, quote_value
 from gscompleter.io.files import handle_stop_signals
-from gscompleter.jobs.workers import Pool, Share
+from gscompleter.jobs.jobs import Pool, Share
 from gscompleter.memory import estimate_bytes, read_memory_bytes
 
 EngineName = Literal["local", "ray", "submitit"]

@@ -1,16 +1,23 @@
-"""Statistics of measurements, and their tables in Markdown."""
+"""Statistics of measurements, their tables in Markdown, and the machine they are valid for."""
 
 from __future__ import annotations
 
+import platform
+import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from pathlib import Path
 from statistics import median
 from typing import Any
 
 import numpy as np
+import torch
 
+from gscompleter import __version__
 from gscompleter.apps.bench.measure import OWN, PROCESS, REST, Sample
+from gscompleter.cpu_threads import count_available_cores
 from gscompleter.evaluation.tables import format_markdown
+from gscompleter.memory import read_memory_bytes
 from gscompleter.timing import STAGES
 
 CASE_COLUMNS = (*STAGES, "total", REST, PROCESS)
@@ -135,3 +142,28 @@ def format_cells(found: Measured, columns: Sequence[str]) -> list[str]:
         f"{found.ratio:.1f}{spread}",
         f"{found.peak_bytes / 1e9:.2f}" if found.peak_bytes else "–",
     ]
+
+
+def describe_machine(device: str) -> dict[str, str | int]:
+    """Describe the versions and the hardware."""
+    memory = read_memory_bytes()
+    return {
+        "gscompleter": __version__,
+        "processor": get_processor_name(),
+        "cores": count_available_cores(),
+        "memory_gb": 0 if memory is None else round(memory / 1e9),
+        "system": f"{platform.system()} {platform.release()}",
+        "python": platform.python_version(),
+        "torch": str(torch.__version__),
+        "device": device,
+        **({"gpu": torch.cuda.get_device_name()} if device == "cuda" else {}),
+    }
+
+
+def get_processor_name() -> str:
+    """Return the model of the processor, or its architecture if Linux does not report it."""
+    try:
+        model = re.search(r"^model name\s*:\s*(.+)$", Path("/proc/cpuinfo").read_text(), re.M)
+    except OSError:
+        model = None
+    return model[1] if model else platform.processor() or platform.machine()

@@ -26,10 +26,11 @@ from gscompleter.jobs.jobs import (
     find_missing_jobs,
     has_row,
     make_folder,
+    parse_shard,
     read_row,
     run_job,
+    run_jobs,
 )
-from gscompleter.jobs.workers import parse_shard, run_jobs
 from gscompleter.progress import show_preparation, show_progress, track
 
 

@@ -11,7 +11,7 @@ from itertools import groupby
 import torch
 from packaging.requirements import Requirement
 
-from gscompleter.apps.bench.machine import describe_machine
+from gscompleter.apps.bench.report import describe_machine
 from gscompleter.apps.commands.options import DoctorOptions
 from gscompleter.apps.viewer.packages import BUILT_LIBRARIES, LOCK_FILE, get_archive_path, read_lock
 from gscompleter.apps.warmup import PARTS

@@ -10,7 +10,7 @@ from gscompleter.apps.commands.options import EngineOptions
 from gscompleter.cpu_threads import count_available_cores, limit_threads
 from gscompleter.errors import InputError, quote_value
 from gscompleter.jobs.engines import choose_num_workers, open_local, open_ray, open_submitit
-from gscompleter.jobs.workers import Engine
+from gscompleter.jobs.jobs import Engine
 
 
 def parse_pairs(words: Sequence[str], option: str) -> dict[str, str]:
