@@ -7,9 +7,9 @@ from __future__ import annotations
 
 import json
 import statistics
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
-from functools import cached_property
+from functools import cached_property, partial
 from pathlib import Path
 from typing import Any
 
@@ -143,14 +143,12 @@ def read_rows(out: Path) -> list[RunRow]:
     return list(rows.values())
 
 
-def rank_method(method: str) -> tuple[int, str]:
-    """Return the sort key of a method in tables, unknown ones last."""
-    return ([*METHODS, method].index(method), method)
+def rank(order: Iterable[str], name: str) -> tuple[int, str]:
+    """Return the sort key of a name in tables: its place in `order`, unknown ones last."""
+    return ([*order, name].index(name), name)
 
 
-def rank_stage(stage: str) -> tuple[int, str]:
-    """Return the sort key of a stage in tables, unknown ones last."""
-    return ([*ORDER, stage].index(stage), stage)
+rank_method, rank_stage = partial(rank, METHODS), partial(rank, ORDER)
 
 
 def summarize_run(rows: Sequence[RunRow]) -> RunSummary:

@@ -17,15 +17,16 @@ from collections import deque
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import AbstractContextManager
 from dataclasses import dataclass, field, replace
+from functools import partial
 from pathlib import Path
 from typing import Any
 
 from gscompleter.errors import InputError, OutputError, quote_value
-from gscompleter.io.files import UNFINISHED_PREFIX, replace_file
+from gscompleter.io.files import UNFINISHED_PREFIX, convert_write_errors, replace_file
 from gscompleter.io.reading import read_json
 
-BATCH, JOBS, ROWS = "batch.json", "jobs", "rows"
-"""File that marks the folder of a batch, and its folders."""
+JOBS, ROWS = "jobs", "rows"
+"""Folders in the folder of a batch."""
 RETRY_SECONDS = 1.0
 """Delay before the first retry after an error not caused by the input; doubled for the next."""
 POLL_SECONDS = 0.1
@@ -81,7 +82,7 @@ def describe_loss(lost: int) -> str:
 
 
 def get_row_path(job: Job, out: Path) -> Path:
-    """Return the path of the row of a job."""
+    """Return the path of a row."""
     return out / ROWS / f"{job.name}.json"
 
 
@@ -98,11 +99,7 @@ def read_row(job: Job, out: Path) -> dict[str, Any] | None:
 
 
 def find_missing_jobs(jobs: Sequence[Job], out: Path, rerun_failed: bool) -> list[Job]:
-    """Return jobs without a row, and remove the failed rows to repeat (new options, or `rerun`).
-
-    Raises:
-        InputError: A job was done with other options.
-    """
+    """Return jobs without a row, and remove the failed rows to repeat (new options, or `rerun`)."""
     left = []
     for job in jobs:
         row = read_row(job, out)
@@ -118,36 +115,29 @@ def find_missing_jobs(jobs: Sequence[Job], out: Path, rerun_failed: bool) -> lis
     return left
 
 
-def claim_folder(out: Path) -> None:
-    """Make `out` the folder of a batch, or raise InputError if it holds something else."""
-    # Order matters: every run writes this file before all others.
-    if list_names(out) and not (out / BATCH).is_file():
-        raise InputError(f"{quote_value(out)} holds something other than a batch; name another.")
-    write_json(out / BATCH, {"version": 1, "kind": "batch"}, keep_existing=True)
+def claim_folder(out: Path, kind: str, content: Mapping[str, Any]) -> None:
+    """Write `KIND.json` before all other files of a folder, unless it exists.
 
-
-def list_names(folder: Path) -> set[str]:
-    """List the names in a folder, without unfinished files; empty if it does not exist."""
+    Several processes may do so simultaneously. InputError is raised if the folder has other files.
+    """
+    marker = out / f"{kind}.json"
     try:
-        names = {path.name for path in folder.iterdir()}
-    except FileNotFoundError:
-        return set()
+        names = [path.name for path in out.iterdir()] if out.exists() else []
     except OSError as error:
         raise InputError(
-            f"{quote_value(folder)} cannot be read: {error.strerror}; name another."
+            f"{quote_value(out)} cannot be read: {error.strerror}; name another."
         ) from error
-    return {name for name in names if not name.startswith(UNFINISHED_PREFIX)}
+    # Listed first, as another process may be writing the marker.
+    is_used = any(not name.startswith(UNFINISHED_PREFIX) for name in names)
+    if is_used and not marker.is_file():
+        raise InputError(f"{quote_value(out)} holds something other than a {kind}; name another.")
+    write_json(marker, content, keep_existing=True)
 
 
 def make_folder(folder: Path) -> None:
     """Create a folder with its parents; raise OutputError if that fails."""
-    try:
+    with convert_write_errors(folder):
         folder.mkdir(parents=True, exist_ok=True)
-    except OSError as error:
-        raise OutputError(
-            f"Cannot write {quote_value(folder)}: {error.strerror}; free some space or choose "
-            "another place."
-        ) from error
 
 
 def write_json(path: Path, content: Any, keep_existing: bool = False) -> None:
@@ -161,21 +151,8 @@ Perform = Callable[[Job], None]
 """Runs a job in any process and writes its row, unless it has one."""
 
 
-@dataclass(frozen=True)
-class Share:
-    """The jobs of one worker, in its order."""
-
-    perform: Perform
-    jobs: Sequence[Job]
-
-    def __call__(self) -> Exception | None:
-        """Run the jobs; return the error that ends the whole run, such as a full disk."""
-        try:
-            for job in self.jobs:
-                self.perform(job)
-        except Exception as error:  # engines do not all hand over what is raised
-            return error
-        return None
+Share = Callable[[], Exception | None]
+"""Runs the jobs of one worker; returns the error that ends the whole run, such as a full disk."""
 
 
 @dataclass(frozen=True)
@@ -194,6 +171,16 @@ Engine = Callable[[], AbstractContextManager[Pool]]
 """Opens a pool, whose workers are stopped at the end of the block."""
 
 
+def run_share(perform: Perform, jobs: Sequence[Job]) -> Exception | None:
+    """Run the jobs of a `Share` in order."""
+    try:
+        for job in jobs:
+            perform(job)
+    except Exception as error:  # engines do not all hand over what is raised
+        return error
+    return None
+
+
 def run_jobs(
     jobs: Sequence[Job],
     perform: Perform,
@@ -203,12 +190,8 @@ def run_jobs(
 ) -> Iterator[Job]:
     """Run jobs until each has a row, and yield them in the order in which they end.
 
-    Args:
-        jobs: Jobs without a row.
-        perform: Runs one of them; the row of a job lost more than `retries` times is a failure.
-        has_row: Returns True if a job has its row.
-        engine: Starts the workers; None runs the jobs in this process.
-        retries: Number of times that a job may cost its worker.
+    Without an engine they run in this process. The row of a job that cost its worker more than
+    `retries` times is a failure.
     """
     if engine is None:
         for job in jobs:
@@ -222,7 +205,7 @@ def run_jobs(
         while waiting or running:
             while waiting and len(running) < pool.size:
                 share = waiting.popleft()
-                running[pool.start(Share(perform, tuple(share)))] = share
+                running[pool.start(partial(run_share, perform, tuple(share)))] = share
             time.sleep(POLL_SECONDS)
             ended = [future for future in running if future.done()]
             for share in running.values():
@@ -269,18 +252,16 @@ def parse_shard(text: str | None, environment: Mapping[str, str]) -> tuple[int, 
                 "shard",
             )
         task, first, count = map(int, numbers)
-        return check_shard((task - first, count))
+        return check_shard(task - first, count)
     match = re.fullmatch(r"([0-9]{1,6})/([0-9]{1,6})", text)
-    number, count = map(int, match.groups()) if match else (-1, 0)
-    return check_shard((number, count))
+    return check_shard(*map(int, match.groups() if match else (-1, 0)))
 
 
-def check_shard(shard: tuple[int, int]) -> tuple[int, int]:
+def check_shard(number: int, count: int) -> tuple[int, int]:
     """Return the shard, or raise InputError if it is impossible."""
-    number, count = shard
     if not 0 <= number < count:
         raise InputError(
             "There is no such shard; give i/n: of four shards the first is 0/4, the last 3/4.",
             "shard",
         )
-    return shard
+    return number, count

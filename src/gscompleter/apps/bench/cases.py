@@ -118,8 +118,8 @@ def read_manifest(path: Path) -> Manifest:
             "cases, each with name, scene, context, targets and resolution.",
             "cases",
         ) from error
-    scenes = [path.parent / os.path.expandvars(case.scene) for case in found.cases]
-    cases = [replace(case, scene=scene) for case, scene in zip(found.cases, scenes, strict=True)]
+    base = path.parent
+    cases = [replace(c, scene=base / os.path.expandvars(c.scene)) for c in found.cases]
     return replace(found, cases=tuple(cases))
 
 

@@ -23,8 +23,6 @@ from gscompleter.timing import STAGES
 CASE_COLUMNS = (*STAGES, "total", REST, PROCESS)
 METHOD_COLUMNS = ("generate", "lift", "register", "integrate", "optimize", OWN)
 """Columns of seconds; stages that did not run are omitted."""
-COUNTS = ("context", "added")
-"""Numbers of Gaussians of a case."""
 
 
 @dataclass(frozen=True)
@@ -60,9 +58,8 @@ class Report:
     """Seed, repeats, and maximum number of iterations of the baselines."""
     cases: Sequence[Measured]
     methods: Sequence[Measured]
-    """Measurements on the first target of the first case."""
     growth: Mapping[str, Mapping[int, Measured]]
-    """Measurements of the first case by axis and size."""
+    """Measurements by axis and size, of the first case as those of the methods."""
 
 
 def fit_exponent(sizes: Sequence[int], values: Sequence[float]) -> float | None:
@@ -95,8 +92,8 @@ def format_case_table(cases: Sequence[Measured]) -> str:
     columns = select_columns(cases, CASE_COLUMNS)
     rows = []
     for case in cases:
-        counts = case.samples[0].gaussians
-        rows.append([*format_cells(case, columns), *(f"{counts[k]:,}" for k in COUNTS)])
+        counts = [case.samples[0].gaussians[key] for key in ("context", "added")]
+        rows.append([*format_cells(case, columns), *(f"{count:,}" for count in counts)])
     return format_table("case", columns, rows, "Gaussians", "added")
 
 

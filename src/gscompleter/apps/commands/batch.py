@@ -45,7 +45,7 @@ def run_batch(options: BatchOptions) -> None:
             jobs = read_manifest(options.manifest, parse_pairs(options.each, "each"))
             out = options.out.resolve()  # absolute, for workers elsewhere
             engine = make_engine(options, out)
-            claim_folder(out)
+            claim_folder(out, "batch", {"version": 1, "kind": "batch"})
             share = jobs[number::count]
             left = find_missing_jobs(share, out, options.rerun == "failures")
         perform = partial(perform_job, out=out, retries=options.retries)
