@@ -5,7 +5,6 @@ import os
 import shutil
 import subprocess
 import sys
-from dataclasses import replace
 from pathlib import Path
 
 import pytest
@@ -22,10 +21,10 @@ from gscompleter.evaluation.runner import (
     TaskRunner,
     collect_settings,
     evaluate,
-    make_task_job,
 )
 from gscompleter.evaluation.store import VERSION, claim, list_row_paths, read_json, write_json
 from gscompleter.evaluation.tables import write_tables
+from gscompleter.jobs.jobs import Job
 from scenes import Room, camera_at, photographed
 
 SIZE = 32
@@ -226,7 +225,7 @@ def test_workers_end_with_the_tables_of_one_run(scenes, finished, tmp_path):
 
 
 def test_a_case_whose_workers_were_killed_is_given_up(tasks, tmp_path):
-    job = replace(make_task_job(tasks[0]), lost=RETRIES + 1)
+    job = Job("given up", {"task": tasks[0]}, lost=RETRIES + 1)
     TaskRunner(tmp_path, METHOD_NAMES, RunConfig())(job)
     errors = [read_json(row)["error"] for row in list_row_paths(tmp_path)]
     assert len(errors) == len(METHOD_NAMES)
