@@ -207,10 +207,7 @@ def make_tasks(
     resolution: Resolution = None,
     use_masks: bool = False,
 ) -> list[Task]:
-    """Make the tasks of a clip: one per target, or one per sequence.
-
-    `resolution` is that of `Photographs.views`; `use_masks` ignores masked pixels.
-    """
+    """Make the tasks of a clip: one per target, or one per sequence."""
     load = partial(load_clip_views, clip, resolution, use_masks)
     tasks = []
     for split in protocol.select_splits(clip):
@@ -232,7 +229,7 @@ def make_tasks(
 def load_clip_views(
     clip: Photographs, resolution: Resolution, use_masks: bool, frames: tuple[int, ...]
 ) -> list[View]:
-    """Load photographs of a clip, with the arguments of `make_tasks`."""
+    """Load photographs of a clip, without masked pixels if `use_masks`."""
     views = clip.views(frames, resolution)
     return apply_masks(views, clip, resolution) if use_masks else views
 

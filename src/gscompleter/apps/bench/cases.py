@@ -38,7 +38,6 @@ class BenchCase:
 
     name: str = field(compare=False)
     scene: Path
-    """Folder of the scene."""
     context: Frames
     targets: Frames
     """Target frames, completed in this order."""
