@@ -10,7 +10,7 @@ import json
 import os
 import re
 from collections.abc import Callable, Iterable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from functools import partial
 from pathlib import Path
 from typing import Annotated, Literal
@@ -48,8 +48,8 @@ class FrameRule:
     """A protocol that chooses frames by their number in a clip."""
 
     name: str
-    split: Callable[[int], tuple[Split, ...]]
-    """Returns the splits of a clip with this number of frames."""
+    split: Callable[[int], tuple[Split, ...]] = field(compare=False)
+    """Returns the splits of a clip with this number of frames; determined by the name."""
 
     def select_splits(self, clip: Photographs) -> tuple[Split, ...]:
         """Return the splits of a clip; none if it is too short."""
