@@ -21,8 +21,7 @@ from gscompleter.apps.commands.batch import parse_row
 from gscompleter.errors import OutputError
 from gscompleter.jobs import jobs as batch
 from gscompleter.jobs.engines import open_submitit
-from gscompleter.jobs.jobs import Job, find_missing_jobs, run_job
-from gscompleter.jobs.workers import parse_shard, run_jobs
+from gscompleter.jobs.jobs import Job, find_missing_jobs, parse_shard, run_job, run_jobs
 from paths import SUPPORT
 from scenes import camera_at, photographed
 from simulate_batch import Fleet, Replay, replay

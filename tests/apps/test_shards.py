@@ -5,7 +5,6 @@ import os
 import shutil
 import subprocess
 import sys
-from dataclasses import replace
 from pathlib import Path
 
 import pytest
@@ -22,10 +21,10 @@ from gscompleter.evaluation.runner import (
     TaskRunner,
     collect_settings,
     evaluate,
-    make_task_job,
 )
 from gscompleter.evaluation.store import VERSION, claim, list_row_paths, read_json, write_json
 from gscompleter.evaluation.tables import write_tables
+from gscompleter.jobs.jobs import Job
 from scenes import Room, camera_at, photographed
 
 SIZE = 32
@@ -196,7 +195,7 @@ def test_rows_that_come_while_tables_are_written_get_into_them(finished, tmp_pat
         if len(written) == 1:
             late.rename(row)
 
-    monkeypatch.setattr(command.plots, "draw_plots", draw)
+    monkeypatch.setattr(command.tables, "draw_plots", draw)
     command.write_and_print_tables(out, quiet=True, num_rows=6)
     assert written == [2, 3]
     same_tables(out, finished)
@@ -213,7 +212,7 @@ def test_a_shard_leaves_the_last_tables_to_the_others(finished, tmp_path, monkey
         calls.append(summary)
         list_row_paths(out)[0].touch()
 
-    monkeypatch.setattr(command.plots, "draw_plots", draw)
+    monkeypatch.setattr(command.tables, "draw_plots", draw)
     command.write_and_print_tables(out, quiet=True, num_rows=6)
     assert len(calls) == 1
 
@@ -226,7 +225,7 @@ def test_workers_end_with_the_tables_of_one_run(scenes, finished, tmp_path):
 
 
 def test_a_case_whose_workers_were_killed_is_given_up(tasks, tmp_path):
-    job = replace(make_task_job(tasks[0]), lost=RETRIES + 1)
+    job = Job("given up", {"task": tasks[0]}, lost=RETRIES + 1)
     TaskRunner(tmp_path, METHOD_NAMES, RunConfig())(job)
     errors = [read_json(row)["error"] for row in list_row_paths(tmp_path)]
     assert len(errors) == len(METHOD_NAMES)

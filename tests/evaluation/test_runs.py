@@ -32,7 +32,6 @@ from gscompleter.evaluation.methods import (
     synthesize_reference,
 )
 from gscompleter.evaluation.metrics.image import psnr
-from gscompleter.evaluation.plots import draw_plots
 from gscompleter.evaluation.protocols import Task, make_case_task, read_evaluation_index
 from gscompleter.evaluation.runner import RowCounts, RunConfig, evaluate
 from gscompleter.evaluation.store import (
@@ -42,7 +41,7 @@ from gscompleter.evaluation.store import (
     load_values,
     read_json,
 )
-from gscompleter.evaluation.tables import summarize_run, write_tables
+from gscompleter.evaluation.tables import draw_plots, summarize_run, write_tables
 from gscompleter.io.image import read_image
 from gscompleter.timing import STAGES
 from scenes import Room, camera_at, photographed

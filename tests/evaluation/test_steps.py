@@ -21,7 +21,6 @@ from gscompleter.evaluation.columns import GROUPS
 from gscompleter.evaluation.methods import METHODS
 from gscompleter.evaluation.metrics import scores
 from gscompleter.evaluation.metrics.scores import compute_depth_scale
-from gscompleter.evaluation.plots import draw_plots
 from gscompleter.evaluation.protocols import Task, make_tasks, parse_protocol
 from gscompleter.evaluation.runner import RowCounts, RunConfig, evaluate, prepare_task
 from gscompleter.evaluation.steps import (
@@ -32,7 +31,7 @@ from gscompleter.evaluation.steps import (
     get_metric_depth,
 )
 from gscompleter.evaluation.store import read_json
-from gscompleter.evaluation.tables import write_tables
+from gscompleter.evaluation.tables import draw_plots, write_tables
 from gscompleter.geometry import slide
 from gscompleter.io.image import read_pixels
 from gscompleter.types import View

@@ -16,8 +16,16 @@ from typing import Any
 from gscompleter.errors import InputError
 from gscompleter.io.files import replace_file
 from gscompleter.jobs.engines import open_local, open_ray
-from gscompleter.jobs.jobs import JOBS, Job, find_missing_jobs, has_row, make_folder, run_job
-from gscompleter.jobs.workers import Engine, run_jobs
+from gscompleter.jobs.jobs import (
+    JOBS,
+    Engine,
+    Job,
+    find_missing_jobs,
+    has_row,
+    make_folder,
+    run_job,
+    run_jobs,
+)
 
 
 @dataclass(frozen=True)

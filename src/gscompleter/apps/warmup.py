@@ -22,10 +22,8 @@ SPLAT_PART = "splat"
 """Part that only input splats need."""
 PARTS = ("cpu", "plane-sweep", "warp-inpaint", SPLAT_PART)
 """Renderer, models and part that have kernels."""
-COMPILING_STAGE = "compiling kernels for this machine, once"
 
 IMAGE_SIZE_PX = 64
-"""Image size, in pixels."""
 DISPARITY_PX = 6
 """Disparity of the wall between neighbouring cameras, in pixels."""
 WALL_DEPTH = 2.0
@@ -38,7 +36,7 @@ def compile_kernels(names: Collection[str]) -> float | None:
     if not missing:
         return None
     start = time.perf_counter()
-    with stage(COMPILING_STAGE):
+    with stage("compiling kernels for this machine, once"):
         rehearse(with_splat=SPLAT_PART in missing)
     for name in PARTS:
         if name != SPLAT_PART or SPLAT_PART in missing:

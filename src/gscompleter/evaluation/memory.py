@@ -11,10 +11,9 @@ import torch
 
 
 class Peak:
-    """Result of `measure_peak_memory`, filled in when its body ends."""
+    """Result of `measure_peak_memory`: None until its body ends, or if the system has none."""
 
     bytes: int | None = None
-    """Peak memory in bytes, or None if the system does not report it."""
 
 
 @contextmanager
@@ -36,9 +35,7 @@ def measure_peak_memory(device: torch.device | str = "cpu") -> Iterator[Peak]:
 
 def read_process_peak() -> int | None:
     """Read the peak resident memory of this process, or None if the system does not report it."""
-    try:
-        status = Path("/proc/self/status").read_text()
-    except OSError:
-        return None
-    most = re.search(r"VmHWM:\s*([0-9]+) kB", status)
-    return None if most is None else 1024 * int(most[1])
+    with suppress(OSError):
+        if most := re.search(r"VmHWM:\s*([0-9]+) kB", Path("/proc/self/status").read_text()):
+            return 1024 * int(most[1])
+    return None

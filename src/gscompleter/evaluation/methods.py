@@ -149,17 +149,12 @@ _ABLATIONS = {"unconstrained" if name == "3-dof" else name: name for name in ABL
 # Method name to config name. Three degrees of freedom are no ablation: the paper compares the ray
 # constraint with them.
 
-SETTINGS: dict[str, str] = {
-    "full": "default",
-    "paper": "paper",
-    **_ABLATIONS,
-    **{f"paper/{title}": f"paper/{name}" for title, name in _ABLATIONS.items()},
-}
-"""Our methods, with the name of their config for `get_named_config`."""
-
 METHODS: dict[str, Method] = {
     "context": keep_scene,
-    **{title: make_completion_method(name) for title, name in SETTINGS.items()},
+    "full": make_completion_method("default"),
+    "paper": make_completion_method("paper"),
+    **{title: make_completion_method(name) for title, name in _ABLATIONS.items()},
+    **{f"paper/{t}": make_completion_method(f"paper/{name}") for t, name in _ABLATIONS.items()},
     **BASELINES,
 }
 """All methods by name, in the order of the tables."""
@@ -180,7 +175,7 @@ def expand_methods(names: Sequence[str]) -> tuple[str, ...]:
 
 
 def check_methods(names: Sequence[str], steps: int = 1) -> None:
-    """Raise InputError for no, unknown or repeated names and methods that cannot do `steps`."""
+    """Raise InputError for no or unknown names and methods that cannot do `steps`."""
     known = ", ".join([*GROUPS, *(name for name in METHODS if not name.startswith("paper/"))])
     if not names:
         raise InputError(f"No method was named; choose one or more of {known}.")
@@ -195,5 +190,3 @@ def check_methods(names: Sequence[str], steps: int = 1) -> None:
                 f"The method {name!r} changes existing Gaussians, and a sequence can only add new "
                 "ones; choose one of context, full, paper, an ablation of these, and reggs."
             )
-    if len(set(names)) < len(names):
-        raise InputError(f"A method is named twice ({' '.join(names)}); name each once.")

@@ -10,7 +10,7 @@ import json
 import os
 import re
 from collections.abc import Callable, Iterable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from functools import partial
 from pathlib import Path
 from typing import Annotated, Literal
@@ -47,14 +47,12 @@ class FrameRule:
     """A protocol that chooses frames by their number in a clip."""
 
     name: str
-    split: Callable[..., tuple[Split, ...]]
-    """Function of the number of frames in a clip and of `numbers` that returns its splits."""
-    numbers: tuple[int, ...]
-    """Numbers in the name."""
+    split: Callable[[int], tuple[Split, ...]] = field(compare=False)
+    """Returns the splits of a clip with this number of frames; determined by the name."""
 
     def select_splits(self, clip: Photographs) -> tuple[Split, ...]:
         """Return the splits of a clip; none if it is too short."""
-        return self.split(len(clip), *self.numbers)
+        return self.split(len(clip))
 
 
 @dataclass(frozen=True)
@@ -87,16 +85,15 @@ def parse_protocol(text: str) -> EvaluationProtocol:
     """Parse a protocol: `n-10`, `n-10-stride-5`, `stress`, `sequence-4` or the path of an index."""
     for pattern, split in FRAME_RULES.items():
         if match := re.fullmatch(pattern, text):
-            numbers = tuple(int(number) for number in match.groups() if number is not None)
-            is_too_long = split is split_sequence and max(numbers[1:], default=0) > MAX_TARGET_ID
-            if 0 in numbers or is_too_long:
+            numbers = {key: int(n) for key, n in match.groupdict().items() if n}
+            if 0 in numbers.values() or numbers.get("steps", 0) > MAX_TARGET_ID:
                 raise InputError(
                     f"The protocol {text} is impossible; its numbers have to be at least 1, and "
                     f"steps at most {MAX_TARGET_ID}."
                 )
-            return FrameRule(text, split, numbers)
+            return FrameRule(text, partial(split, **numbers))
     if os.path.isfile(text):
-        return read_evaluation_index(text)
+        return read_evaluation_index(Path(text))
     raise InputError(
         f"There is no protocol '{quote_value(text)}'; give n-K for a number of frames K (as n-10), "
         "stress, sequence-K (as sequence-4), or the path of an evaluation index."
@@ -124,8 +121,8 @@ def split_sequence(num_frames: int, k: int, steps: int = MAX_TARGET_ID) -> tuple
 
 
 FRAME_RULES: dict[str, Callable[..., tuple[Split, ...]]] = {
-    "n-([0-9]{1,6})(?:-stride-([0-9]{1,6}))?": extrapolate,
-    "sequence-([0-9]{1,6})(?:-steps-([0-9]{1,6}))?": split_sequence,
+    "n-(?P<k>[0-9]{1,6})(?:-stride-(?P<stride>[0-9]{1,6}))?": extrapolate,
+    "sequence-(?P<k>[0-9]{1,6})(?:-steps-(?P<steps>[0-9]{1,6}))?": split_sequence,
     "stress": split_stress_test,
 }
 """Functions that choose frames, by the name of the protocol with its numbers."""
@@ -146,9 +143,8 @@ def build_index(protocol: EvaluationProtocol, clips: Iterable[Photographs]) -> E
     return EvaluationIndex(protocol.name, scenes)
 
 
-def read_evaluation_index(path: Path | str) -> EvaluationIndex:
+def read_evaluation_index(path: Path) -> EvaluationIndex:
     """Read an evaluation index, published or of `write_evaluation_index`."""
-    path = Path(path)
     content = read_json(path, "download it again")
     if not isinstance(content, dict) or "version" not in content:
         content = {"version": VERSION, "protocol": path.stem, "scenes": content}
@@ -210,10 +206,7 @@ def make_tasks(
     resolution: Resolution = None,
     use_masks: bool = False,
 ) -> list[Task]:
-    """Make the tasks of a clip: one per target, or one per sequence.
-
-    `resolution` is that of `Photographs.views`; `use_masks` ignores masked pixels.
-    """
+    """Make the tasks of a clip: one per target, or one per sequence."""
     load = partial(load_clip_views, clip, resolution, use_masks)
     tasks = []
     for split in protocol.select_splits(clip):
@@ -235,7 +228,7 @@ def make_tasks(
 def load_clip_views(
     clip: Photographs, resolution: Resolution, use_masks: bool, frames: tuple[int, ...]
 ) -> list[View]:
-    """Load photographs of a clip, with the arguments of `make_tasks`."""
+    """Load photographs of a clip, without masked pixels if `use_masks`."""
     views = clip.views(frames, resolution)
     return apply_masks(views, clip, resolution) if use_masks else views
 

@@ -2,10 +2,10 @@
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass, field, replace
 from functools import partial
-from itertools import pairwise
 from pathlib import Path
 from typing import Any, Literal
 
@@ -16,8 +16,7 @@ from gscompleter.evaluation.methods import Models, check_methods
 from gscompleter.evaluation.protocols import Task
 from gscompleter.evaluation.steps import PreparedTask, attempt, complete_task
 from gscompleter.generators import load_generator
-from gscompleter.jobs.jobs import Job, describe_loss
-from gscompleter.jobs.workers import Engine, check_shard, run_jobs
+from gscompleter.jobs.jobs import Engine, Job, check_shard, describe_loss, run_jobs
 from gscompleter.memory import check_memory
 from gscompleter.progress import show_progress, stage, track
 from gscompleter.reconstructors import load_reconstructor
@@ -39,11 +38,10 @@ class RunConfig:
     """File with the weights of the reconstructor; None selects the published ones."""
     generator: str = "warp-inpaint"
     generator_settings: GeneratorSettings | None = None
-    """Settings of the generator; None keeps its defaults."""
     device: Literal["cpu", "cuda"] = "cpu"
     seed: int = 0
     baseline_iterations: int | None = None
-    """Maximum number of iterations of the baselines; None keeps their own numbers."""
+    """As of `Models`."""
     source: Mapping[str, Any] = field(default_factory=dict)
     """Origin of the tasks, so that no folder mixes two sources."""
 
@@ -70,13 +68,11 @@ Rerun = Literal["nothing", "failures", "scores"]
 
 @dataclass(frozen=True)
 class RowCounts:
-    """Numbers of rows (pairs of a task and a method) after a call of `evaluate`."""
+    """Numbers of rows of a call of `evaluate`, and of those that earlier calls wrote."""
 
     done: int
     failed: int
-    """Rows of this call that hold an error."""
     skipped: int
-    """Rows of earlier calls."""
 
 
 def evaluate(
@@ -88,19 +84,18 @@ def evaluate(
     rerun: Rerun = "nothing",
     engine: Engine | None = None,
 ) -> RowCounts:
-    """Run methods on tasks and write a row of scores for each pair.
+    """Run methods on tasks and write a row of scores, or of an error, for each pair.
 
-    Existing rows and completed steps in `out` are kept. A failed task leaves rows with its error.
-    `shard` (i, n) selects the tasks i, i + n, i + 2n, …. `engine` starts workers; None uses this
-    process. Simultaneous calls share the tasks.
+    Existing rows and completed steps in `out` are kept; simultaneous calls share the tasks.
+    `shard` (i, n) selects the tasks i, i + n, i + 2n, ….
     """
     check_methods(methods, max((len(task.targets) for task in tasks), default=0))
-    check_shard(shard)
+    check_shard(*shard)
     check_tasks(tasks)
     config.load_models(())
     store.claim(out, collect_settings(config))
     share = tasks[shard[0] :: shard[1]]
-    runner = TaskRunner(out, tuple(methods), config)
+    runner = TaskRunner(out, tuple(dict.fromkeys(methods)), config)
     for task in share:
         for row in runner.find_rows(task):
             if rerun == "scores" or (rerun == "failures" and has_failed(row)):
@@ -117,7 +112,7 @@ def evaluate(
     for _ in track(rows, "evaluating", len(todo)):
         pass
     failed = sum(map(has_failed, todo))
-    return RowCounts(len(todo) - failed, failed, len(share) * len(methods) - len(todo))
+    return RowCounts(len(todo) - failed, failed, len(share) * len(runner.methods) - len(todo))
 
 
 def has_failed(row: Path) -> bool:
@@ -145,9 +140,8 @@ class TaskRunner:
         """Compute the missing rows of a task; one that was often killed is given up."""
         task: Task = job.options["task"]
         folder = store.get_task_folder(self.out, task.name)
-        prepared: PreparedTask | str | None = None
-        if job.lost > RETRIES:
-            prepared = describe_loss(job.lost)
+        is_given_up = job.lost > RETRIES
+        prepared: PreparedTask | str | None = describe_loss(job.lost) if is_given_up else None
         for row, method in self.find_missing_rows(task).items():
             # Progress inside a task would flood a log.
             with stage(f"{task.name}, {method}"), show_progress(None):
@@ -224,10 +218,9 @@ def check_tasks(tasks: Sequence[Task]) -> None:
             "There is no case to run: no clip has the frames that the protocol needs; choose a "
             "protocol with a smaller step, or other data."
         )
-    names = sorted(store.make_file_name(task.name) for task in tasks)
-    for name, following in pairwise(names):
-        if name == following:
-            raise InputError(f"Two cases are called {name}; rename a scene.")
+    name, count = Counter(store.make_file_name(task.name) for task in tasks).most_common(1)[0]
+    if count > 1:
+        raise InputError(f"Two cases are called {name}; rename a scene.")
 
 
 def collect_settings(config: RunConfig) -> dict[str, Any]:

@@ -50,7 +50,6 @@ class Step:
     """Anchor frame, or None for a method that lifts nothing."""
     anchor_fallback: bool
     scores: scoring.Scores
-    """Scores of the scene before and after the step."""
     psnr_end: float | None
     """PSNR at the target, in dB, of the final scene of the task; None while the task runs."""
     depth_scale: float | None
@@ -60,7 +59,6 @@ class Step:
     """Number of Gaussians in the scene after the step."""
     seconds: dict[str, float]
     peak_bytes: int | None
-    """As of `Prediction`."""
 
 
 @dataclass(frozen=True)
@@ -68,7 +66,6 @@ class Progress:
     """The steps of a task so far, and the reason why it stopped."""
 
     scene: Gaussians
-    """The context and all added Gaussians."""
     views: tuple[View, ...]
     steps: tuple[Step, ...] = ()
     error: str | None = None

@@ -27,7 +27,7 @@ from gscompleter.errors import InputError, quote_value
 from gscompleter.evaluation.methods import Prediction
 from gscompleter.io import reading
 from gscompleter.io.files import replace_file
-from gscompleter.jobs.jobs import list_names, make_folder
+from gscompleter.jobs.jobs import claim_folder, make_folder
 from gscompleter.jobs.jobs import write_json as write_json
 from gscompleter.types import Gaussians, merge
 
@@ -72,17 +72,9 @@ def list_row_paths(out: Path) -> list[Path]:
 
 
 def claim(out: Path, settings: Mapping[str, Any]) -> None:
-    """Create the folder of a run, or check that it holds a run with the same settings.
-
-    If several processes claim it simultaneously, one creates it and the others compare.
-    """
+    """Create the folder of a run, or check that it holds a run with the same settings."""
     wanted = json.loads(json.dumps({"version": VERSION, **settings}))
-    if not (out / RUN).is_file():
-        # Listed at once, as another process may be creating the run.
-        entries = list_names(out)
-        if entries and RUN not in entries:
-            raise InputError(f"{out} holds something other than a run; name another folder.")
-        write_json(out / RUN, wanted, keep_existing=True)
+    claim_folder(out, "run", wanted)
     found = read_settings(out)
     for key in {**wanted, **found}:
         if found.get(key) != wanted.get(key):
@@ -112,7 +104,6 @@ class SavedContext:
 
     gaussians: Gaussians
     near: float
-    """Depth range of the reconstruction in scene units."""
     far: float
     seconds: float
     gains: Float[Tensor, "v 3"] | None = None
@@ -137,10 +128,8 @@ def load_prediction(path: Path, before: Gaussians) -> Prediction:
 def collect_tensors(gaussians: Gaussians) -> dict[str, Tensor]:
     """Copy the tensors to the CPU, in torch's own layout, on which rounding of sums depends."""
     tensors = {name: getattr(gaussians, name).detach().cpu() for name in FIELDS}
-    return {
-        name: tensor.clone(memory_format=torch.contiguous_format)
-        for name, tensor in tensors.items()
-    }
+    layout = torch.contiguous_format
+    return {name: tensor.clone(memory_format=layout) for name, tensor in tensors.items()}
 
 
 def save_values(path: Path, content: Mapping[str, Any]) -> None:

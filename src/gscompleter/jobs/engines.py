@@ -18,7 +18,7 @@ from typing import Any, Literal
 from gscompleter.cpu_threads import count_available_cores, limit_threads
 from gscompleter.errors import InputError, quote_value
 from gscompleter.io.files import handle_stop_signals
-from gscompleter.jobs.workers import Pool, Share
+from gscompleter.jobs.jobs import Pool, Share
 from gscompleter.memory import estimate_bytes, read_memory_bytes
 
 EngineName = Literal["local", "ray", "submitit"]
@@ -35,9 +35,8 @@ STORE_BYTES = 200 * 10**6
 
 def choose_num_workers() -> int:
     """Return the number of cores, limited by the memory of a typical completion."""
-    there = read_memory_bytes()
-    fitting = count_available_cores() if there is None else there // estimate_bytes(PIXELS, IMAGES)
-    return max(1, min(count_available_cores(), fitting))
+    there, cores = read_memory_bytes(), count_available_cores()
+    return cores if there is None else max(1, min(cores, there // estimate_bytes(PIXELS, IMAGES)))
 
 
 @contextlib.contextmanager
@@ -96,13 +95,10 @@ def import_engine(package: str, extra: str) -> Any:
 def open_ray(
     workers: int | None, threads: int, gpus: float = 0.0, address: str | None = None
 ) -> Iterator[Pool]:
-    """Connect to Ray and open a pool of tasks.
+    """Connect to the cluster at `address`, or start one here, and open a pool of tasks.
 
-    Args:
-        workers: Number of simultaneous tasks; None uses all of the cluster.
-        threads: Cores per task.
-        gpus: GPUs per task, possibly a fraction.
-        address: Address of a cluster; None starts one on this machine.
+    Without a number of workers, tasks fill the cluster. `threads` and `gpus`, possibly a fraction,
+    are those of one task.
     """
     ray = import_engine("ray", "ray")
     connect_to_ray(ray, address, None if workers is None else workers * threads)

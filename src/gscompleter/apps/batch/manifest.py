@@ -34,11 +34,7 @@ Options = dict[str, Any]
 
 
 def read_manifest(manifest: Path, common: Mapping[str, Any]) -> list[Job]:
-    """Read the jobs of a `.csv` or `.jsonl` file or a folder of scenes.
-
-    Raises:
-        InputError: The manifest cannot be read, names no job, or repeats a name.
-    """
+    """Read the jobs of a `.csv` or `.jsonl` file or a folder of scenes."""
     base, here = manifest.resolve().parent, resolve_paths(common, Path.cwd())
     rows = [{**here, **resolve_paths(row, base)} for row in read_rows(manifest)]
     if not rows:

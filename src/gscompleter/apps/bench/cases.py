@@ -38,7 +38,6 @@ class BenchCase:
 
     name: str = field(compare=False)
     scene: Path
-    """Folder of the scene."""
     context: Frames
     targets: Frames
     """Target frames, completed in this order."""
@@ -118,8 +117,8 @@ def read_manifest(path: Path) -> Manifest:
             "cases, each with name, scene, context, targets and resolution.",
             "cases",
         ) from error
-    scenes = [path.parent / os.path.expandvars(case.scene) for case in found.cases]
-    cases = [replace(case, scene=scene) for case, scene in zip(found.cases, scenes, strict=True)]
+    base = path.parent
+    cases = [replace(c, scene=base / os.path.expandvars(c.scene)) for c in found.cases]
     return replace(found, cases=tuple(cases))
 
 

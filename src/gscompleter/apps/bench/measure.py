@@ -16,7 +16,7 @@ import torch
 
 from gscompleter.errors import InputError
 from gscompleter.evaluation.memory import measure_peak_memory
-from gscompleter.evaluation.methods import BASELINES, METHODS, Method, Models, Prediction
+from gscompleter.evaluation.methods import METHODS, Models, Prediction
 from gscompleter.io.files import SUMMARY_FILE
 from gscompleter.progress import show_progress, track
 from gscompleter.render import Renderer
@@ -29,8 +29,6 @@ SHIFTS = (-0.2, 0.2, 0.4)
 """Camera positions in metres to the right; each camera adds one Gaussian per pixel."""
 RUNS = 5
 """Number of runs of which the median is taken."""
-GRADIENT_FIELDS = ("means", "quats", "scales", "opacities", "sh")
-"""Fields that have gradients."""
 
 PROCESS, REST = "process", "rest"
 """Seconds of the whole process, and those outside the stages: start, imports, files, scores."""
@@ -49,8 +47,6 @@ finally:
 """
 """Program of a process. It prints its own peak, because a child inherits its parent's."""
 
-BENCH_METHODS: dict[str, Method] = {"full": METHODS["full"], **BASELINES}
-"""Methods by name; the first one is ours."""
 Yardstick = Callable[[], object]
 T = TypeVar("T")
 K = TypeVar("K")
@@ -87,7 +83,8 @@ def make_yardstick(renderer: Renderer, device: str) -> Yardstick:
     scene = merge([make_surface(camera) for camera in cameras])
 
     def render() -> None:
-        varied = {name: getattr(scene, name).clone() for name in GRADIENT_FIELDS}
+        names = ("means", "quats", "scales", "opacities", "sh")
+        varied = {name: getattr(scene, name).clone() for name in names}
         variables = [tensor.requires_grad_() for tensor in varied.values()]
         image = renderer.render(replace(scene, **varied), cameras[-1]).image
         torch.autograd.grad(image.sum(), variables)
@@ -104,17 +101,15 @@ def measure_beside(yardstick: Yardstick, measure: Callable[[], T]) -> tuple[T, f
 
 
 def measure_median_seconds(work: Yardstick) -> float:
-    """Measure the median seconds of `RUNS` runs."""
-    return statistics.median(measure_call(work) for _ in range(RUNS))
-
-
-def measure_call(work: Callable[[], object]) -> float:
-    """Measure the seconds of a call, including its work on a GPU."""
-    start = time.perf_counter()
-    work()
-    if torch.cuda.is_available():
-        torch.cuda.synchronize()
-    return time.perf_counter() - start
+    """Measure the median seconds of `RUNS` runs, including their work on a GPU."""
+    seconds = []
+    for _ in range(RUNS):
+        start = time.perf_counter()
+        work()
+        if torch.cuda.is_available():
+            torch.cuda.synchronize()
+        seconds.append(time.perf_counter() - start)
+    return statistics.median(seconds)
 
 
 def make_yardstick_camera(shift: float) -> Camera:
@@ -150,12 +145,7 @@ def measure_command(words: Sequence[str], out: Path, yardstick: Yardstick) -> Sa
 
 
 def run_command(words: Sequence[str]) -> tuple[float, int | None]:
-    """Run `gscompleter` in a process; raise InputError if it rejects its input.
-
-    Returns:
-        Wall time in seconds with start-up and imports, and the peak resident memory in bytes, or
-        None if the system does not report it.
-    """
+    """Return wall seconds and peak bytes of `gscompleter` in a process; raise its InputError."""
     start = time.perf_counter()
     done = subprocess.run(
         [sys.executable, "-c", PROGRAM, *words], capture_output=True, text=True, check=False
@@ -177,7 +167,7 @@ def measure_method(
 
     def run() -> tuple[Prediction, int | None]:
         with measure_peak_memory(before.means.device) as peak:
-            prediction = BENCH_METHODS[name](state, target, models)
+            prediction = METHODS[name](state, target, models)
         return prediction, peak.bytes
 
     (found, peak_bytes), unit = measure_beside(yardstick, run)

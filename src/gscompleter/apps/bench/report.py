@@ -1,23 +1,28 @@
-"""Statistics of measurements, and their tables in Markdown."""
+"""Statistics of measurements, their tables in Markdown, and the machine they are valid for."""
 
 from __future__ import annotations
 
+import platform
+import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from pathlib import Path
 from statistics import median
 from typing import Any
 
 import numpy as np
+import torch
 
+from gscompleter import __version__
 from gscompleter.apps.bench.measure import OWN, PROCESS, REST, Sample
+from gscompleter.cpu_threads import count_available_cores
 from gscompleter.evaluation.tables import format_markdown
+from gscompleter.memory import read_memory_bytes
 from gscompleter.timing import STAGES
 
 CASE_COLUMNS = (*STAGES, "total", REST, PROCESS)
 METHOD_COLUMNS = ("generate", "lift", "register", "integrate", "optimize", OWN)
 """Columns of seconds; stages that did not run are omitted."""
-COUNTS = ("context", "added")
-"""Numbers of Gaussians of a case."""
 
 
 @dataclass(frozen=True)
@@ -53,9 +58,8 @@ class Report:
     """Seed, repeats, and maximum number of iterations of the baselines."""
     cases: Sequence[Measured]
     methods: Sequence[Measured]
-    """Measurements on the first target of the first case."""
     growth: Mapping[str, Mapping[int, Measured]]
-    """Measurements of the first case by axis and size."""
+    """Measurements by axis and size, of the first case as those of the methods."""
 
 
 def fit_exponent(sizes: Sequence[int], values: Sequence[float]) -> float | None:
@@ -88,8 +92,8 @@ def format_case_table(cases: Sequence[Measured]) -> str:
     columns = select_columns(cases, CASE_COLUMNS)
     rows = []
     for case in cases:
-        counts = case.samples[0].gaussians
-        rows.append([*format_cells(case, columns), *(f"{counts[k]:,}" for k in COUNTS)])
+        counts = [case.samples[0].gaussians[key] for key in ("context", "added")]
+        rows.append([*format_cells(case, columns), *(f"{count:,}" for count in counts)])
     return format_table("case", columns, rows, "Gaussians", "added")
 
 
@@ -135,3 +139,28 @@ def format_cells(found: Measured, columns: Sequence[str]) -> list[str]:
         f"{found.ratio:.1f}{spread}",
         f"{found.peak_bytes / 1e9:.2f}" if found.peak_bytes else "–",
     ]
+
+
+def describe_machine(device: str) -> dict[str, str | int]:
+    """Describe the versions and the hardware."""
+    memory = read_memory_bytes()
+    return {
+        "gscompleter": __version__,
+        "processor": get_processor_name(),
+        "cores": count_available_cores(),
+        "memory_gb": 0 if memory is None else round(memory / 1e9),
+        "system": f"{platform.system()} {platform.release()}",
+        "python": platform.python_version(),
+        "torch": str(torch.__version__),
+        "device": device,
+        **({"gpu": torch.cuda.get_device_name()} if device == "cuda" else {}),
+    }
+
+
+def get_processor_name() -> str:
+    """Return the model of the processor, or its architecture if Linux does not report it."""
+    try:
+        model = re.search(r"^model name\s*:\s*(.+)$", Path("/proc/cpuinfo").read_text(), re.M)
+    except OSError:
+        model = None
+    return model[1] if model else platform.processor() or platform.machine()

@@ -31,15 +31,17 @@ from gscompleter.errors import InputError, quote_value
 from gscompleter.jobs.engines import choose_num_workers, open_local, open_ray, open_submitit
 from gscompleter.jobs.jobs import (
     JOBS,
+    Engine,
     Job,
     claim_folder,
     find_missing_jobs,
     has_row,
     make_folder,
+    parse_shard,
     read_row,
     run_job,
+    run_jobs,
 )
-from gscompleter.jobs.workers import Engine, parse_shard, run_jobs
 from gscompleter.progress import show_preparation, show_progress, track
 
 COMPLETE = "complete"
@@ -64,7 +66,7 @@ def run_batch(options: BatchOptions) -> None:
             jobs = read_manifest(options.manifest, parse_pairs(options.each, "each"))
             out = options.out.resolve()  # absolute, for workers elsewhere
             engine = make_engine(options, out)
-            claim_folder(out)
+            claim_folder(out, "batch", {"version": 1, "kind": "batch"})
             share = jobs[number::count]
             left = find_missing_jobs(share, out, options.rerun == "failures")
         perform = partial(perform_job, out=out, retries=options.retries)

@@ -21,7 +21,6 @@ from gscompleter.apps.bench.cases import (
     read_manifest,
     write_input_splat,
 )
-from gscompleter.apps.bench.machine import describe_machine
 from gscompleter.apps.bench.measure import (
     Sample,
     Task,
@@ -31,7 +30,12 @@ from gscompleter.apps.bench.measure import (
     measure_in_rounds,
     measure_method,
 )
-from gscompleter.apps.bench.report import Measured, Report, format_report
+from gscompleter.apps.bench.report import (
+    Measured,
+    Report,
+    describe_machine,
+    format_report,
+)
 from gscompleter.apps.commands.demo import (
     BASELINE_M,
     get_motorcycle_cameras,

@@ -15,7 +15,7 @@ from packaging.requirements import Requirement
 from rich.console import Console
 from rich.table import Table
 
-from gscompleter.apps.bench.machine import describe_machine
+from gscompleter.apps.bench.report import describe_machine
 from gscompleter.apps.commands.options import DoctorOptions, ModelsOptions, WarmupOptions
 from gscompleter.apps.viewer.packages import BUILT_LIBRARIES, LOCK_FILE, get_archive_path, read_lock
 from gscompleter.apps.warmup import PARTS, compile_kernels

@@ -27,12 +27,12 @@ from gscompleter.data.cases import Case, SkippedScene, filter_usable, open_clips
 from gscompleter.data.formats import open_photographs
 from gscompleter.data.photographs import check_resolution
 from gscompleter.errors import InputError, quote_value
-from gscompleter.evaluation import plots, protocols, tables
+from gscompleter.evaluation import protocols, tables
 from gscompleter.evaluation.methods import expand_methods
 from gscompleter.evaluation.runner import RunConfig, evaluate
 from gscompleter.evaluation.store import list_row_paths
 from gscompleter.evaluation.tables import RunSummary
-from gscompleter.jobs.workers import parse_shard
+from gscompleter.jobs.jobs import parse_shard
 from gscompleter.progress import show_preparation, show_progress
 from gscompleter.render import choose_device
 
@@ -105,8 +105,8 @@ def write_and_print_tables(
         with show_preparation("tables"):
             summary = tables.write_tables(out, with_fid)
             try:
-                plots.draw_plots(summary, out)
-            except plots.PlotsNotAvailable as missing:
+                tables.draw_plots(summary, out)
+            except InputError as missing:
                 Console(stderr=True, quiet=quiet).print(str(missing), highlight=False)
         there = list_row_times(out)
     if not quiet:

@@ -98,11 +98,8 @@ def register_by_similarity(
         depth = (moved.depth - scale * own.depth.detach())[overlap].abs().sum()
         loss = colour + DEPTH_WEIGHT * depth
         if compare_mixtures:
-            scaled = Mixture(
-                scale * small_lifted.means,
-                scale**2 * small_lifted.covariances,
-                small_lifted.weights,
-            )
+            means, covariances = scale * small_lifted.means, scale**2 * small_lifted.covariances
+            scaled = Mixture(means, covariances, small_lifted.weights)
             distance = compute_mixture_wasserstein(scaled, rotate_mixture(small_scene, fit, camera))
             recent = distances[-PATIENCE:]
             if len(distances) >= PATIENCE and distance.item() >= max(recent):
@@ -146,18 +143,13 @@ def cluster_gaussians(gaussians: Gaussians, camera: Camera, components: int, see
     rotation = camera.c2w[:3, :3]
     axes = rotation.T @ quats_to_rotations(gaussians.quats)
     spread = axes * gaussians.scales[:, None, :]
-    mixture = Mixture(
-        (gaussians.means - camera.center) @ rotation,
-        spread @ spread.transpose(-1, -2),
-        torch.softmax(gaussians.opacities, dim=0),
-    )
+    means, weights = (gaussians.means - camera.center) @ rotation, gaussians.opacities.softmax(0)
+    mixture = Mixture(means, spread @ spread.transpose(-1, -2), weights)
     if len(gaussians) <= components:
         return mixture
     points = mixture.means.double().cpu().numpy()
     _, labels = kmeans2(points, components, iter=10, minit="points", seed=seed)
-    return reduce_mixture(
-        mixture, torch.from_numpy(labels.astype(np.int64)).to(mixture.means.device)
-    )
+    return reduce_mixture(mixture, torch.tensor(labels, device=camera.c2w.device).long())
 
 
 def rotate_mixture(mixture: Mixture, fit: Similarity, camera: Camera) -> Mixture:
@@ -165,11 +157,8 @@ def rotate_mixture(mixture: Mixture, fit: Similarity, camera: Camera) -> Mixture
     c2w = camera.c2w[:3, :3]
     rotation = c2w.T @ fit.rotation @ c2w
     offset = (fit.rotation @ camera.center + fit.translation - camera.center) @ c2w
-    return Mixture(
-        mixture.means @ rotation.T + offset,
-        rotation @ mixture.covariances @ rotation.T,
-        mixture.weights,
-    )
+    covariances = rotation @ mixture.covariances @ rotation.T
+    return Mixture(mixture.means @ rotation.T + offset, covariances, mixture.weights)
 
 
 @dataclass(frozen=True)

@@ -60,17 +60,10 @@ def compute_similarities(
 ) -> tuple[Float[Tensor, "3 h w"], Float[Tensor, "3 h w"]]:
     """Compare two finer scales of luminance, and chrominance; the coarsest scale gives weights."""
     of_a, of_b = ([compute_wavelets(p[0], scale) for scale in (1, 2, 3)] for p in (a, b))
-    luminance = torch.stack(
-        [compare_values(x, y) for x, y in zip(of_a[:2], of_b[:2], strict=True)]
-    ).mean(0)
-    chrominance = compare_values(average_neighbours(a[1:]), average_neighbours(b[1:])).mean(
-        0, keepdim=True
-    )
+    luminance = compare_values(torch.stack(of_a[:2]), torch.stack(of_b[:2])).mean(0)
+    chrominance = compare_values(average_neighbours(a[1:]), average_neighbours(b[1:])).mean(0)
     weight = torch.maximum(of_a[2], of_b[2])
-    return (
-        torch.cat([luminance, chrominance]),
-        torch.cat([weight, weight.mean(0, keepdim=True)]),
-    )
+    return torch.cat([luminance, chrominance[None]]), torch.cat([weight, weight.mean(0)[None]])
 
 
 def compare_values(a: Float[Tensor, "*n"], b: Float[Tensor, "*n"]) -> Float[Tensor, "*n"]:
@@ -130,10 +123,7 @@ def load_lpips(network: Literal["vgg", "alex"]) -> Any | None:
 
 
 def compute_fid(images: Sequence[Image], truths: Sequence[Image]) -> float:
-    """Compute |μ - μ'|² + tr(Σ + Σ' - 2 (Σ Σ')^½) of 2,048 Inception features; 0 is best.
-
-    The estimate is biased: compare sets of equal size only, with thousands of images if possible.
-    """
+    """Compute |μ - μ'|² + tr(Σ + Σ' - 2 (Σ Σ')^½) of 2,048 Inception features; 0 is best."""
     try:
         from torchmetrics.image.fid import FrechetInceptionDistance
 

@@ -56,7 +56,7 @@ class Quality:
     psnr: float
     ssim: float
     lpips_vgg: float | None
-    """LPIPS; None if it is not available."""
+    """None if LPIPS is not available."""
     lpips_alex: float | None
 
 
@@ -81,16 +81,14 @@ class Scores:
     target_before: Quality
     target_after: Quality
     hole: PartQuality
-    """At the target in the hole, after completion."""
+    """Quality after completion in the hole; `observed` over all other pixels."""
     observed: PartQuality
-    """At the target over all other pixels."""
     neighbours_psnr: tuple[Change, ...]
     context_psnr: tuple[Change, ...]
     context_ssim: tuple[Change, ...]
     depth_observed: Agreement | None
-    """Depth at the target against the true depth, where the context covers it."""
+    """Depth against the true one where the context covers it; `depth_hole` in the filled hole."""
     depth_hole: Agreement | None
-    """The same in the filled hole."""
     seam_step: float | None
     """Median relative depth difference of the added Gaussians to the context, where both cover."""
     added: Agreement | None
@@ -131,9 +129,11 @@ def score(
     )
     depths: list[Agreement | None] = [None, None]
     if target.depth is not None:
-        depths = [
-            compare_depths(now.depth, target.depth, part & covered) for part in (~holes, holes)
-        ]
+        parts = (~holes & covered, holes & covered)
+        depths = [compare_depths(now.depth, target.depth, part) for part in parts]
+    lifted = None
+    if registered:
+        lifted = measure_primitive_alignment(registered, before, camera, renderer)
     scores = Scores(
         hole_fraction=holes.float().mean().item(),
         target_before=measure_quality(was.image, target),
@@ -147,11 +147,7 @@ def score(
         depth_hole=depths[1],
         seam_step=measure_seam_step(added, was, camera, renderer) if added else None,
         added=measure_alignment(added, before, camera, renderer) if added else None,
-        registered=(
-            measure_primitive_alignment(registered, before, camera, renderer)
-            if registered
-            else None
-        ),
+        registered=lifted,
     )
     return scores, TargetRenders(was, now, holes)
 
