@@ -15,7 +15,7 @@ from gscompleter.data.limits import DEPTH_RANGE
 from gscompleter.data.photographs import Photographs
 from gscompleter.data.resize import Resolution
 from gscompleter.geometry import is_inside, project
-from gscompleter.splats.ply_file import read_ply_file
+from gscompleter.splats.ply import read_ply_file
 from gscompleter.types import Camera
 
 AXES = ("x", "y", "z")

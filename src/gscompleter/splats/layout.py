@@ -24,6 +24,7 @@ from gscompleter.errors import InputError, quote_value
 from gscompleter.splats.formats import detect_splat_format, get_writer, load_splat, save_splat
 from gscompleter.splats.ply import (
     MEANS,
+    PlyFile,
     count_rest,
     decode_gaussians,
     iterate_blocks,
@@ -33,8 +34,8 @@ from gscompleter.splats.ply import (
     read_scene,
     require_finite,
     save_ply,
+    write_ply_file,
 )
-from gscompleter.splats.ply_file import PlyFile, write_ply_file
 from gscompleter.types import Gaussians, merge
 
 LABEL_COLUMN = "generated"

@@ -11,7 +11,6 @@ from torch import Tensor
 from gscompleter.types import Gaussians
 
 BITS_PER_AXIS = 21
-"""Bits per axis; three axes give a code of 63 bits."""
 SPREAD_STEPS = (
     (32, 0x001F00000000FFFF),
     (16, 0x001F0000FF0000FF),
