@@ -86,10 +86,7 @@ def load_generator(
     device: str = "cpu",
     settings: GeneratorSettings | None = None,
 ) -> Generator:
-    """Load a generator by name; only `oracle` uses `photographs`, the true images of the targets.
-
-    The same seed gives the same image. `settings` are those of this generator; None for defaults.
-    """
+    """Load a generator by name; only `oracle` uses `photographs`, the true target images."""
     kind = get_settings_class(name)
     if not isinstance(settings, kind | None):
         raise InputError(

@@ -44,16 +44,13 @@ DEPTH_PENALTY = 0.02
 """Cost per squared log-depth of a source in front of the expected depth."""
 DISTANCE_PENALTY = 0.002
 """Cost of a source at the other end of the image."""
-MIN_VOTE_ROUNDS = 2
-"""Iterations of search and vote on the finest level."""
-MAX_VOTE_ROUNDS = 10
-"""Iterations on the coarsest level; sharp votes need more to agree."""
+MIN_VOTE_ROUNDS, MAX_VOTE_ROUNDS = 2, 10
+"""Iterations on the finest and the coarsest level, where sharp votes need more to agree."""
 COARSEST_PASSES, FINER_PASSES = 2, 1
 """Search passes per iteration, on the coarsest level and on finer ones."""
 VOTE_SHARPNESS = 8
 """Decay of a vote with its cost; at 1, averaged patches lose a quarter of their detail."""
 MIN_VOTE = 1e-6
-"""Smallest weight of a vote."""
 WEIGHT_DECAY = 0.85
 """Weight factor of an unknown pixel per pixel from the border of the hole."""
 MIN_SIZE = 80

@@ -1,8 +1,7 @@
 """Frames that splat trainers leave behind or normalise a scene to.
 
 Trainers store their cameras or the transform of the scene beside a splat. Without these files the
-known normalisations are computed from cameras and points: each function takes poses (OpenCV axes)
-and returns transforms from their frame to the trainer's.
+known normalisations are computed from poses (OpenCV axes) and points.
 """
 
 from __future__ import annotations
@@ -57,7 +56,7 @@ class InputSplat:
     path: Path
     scene: Gaussians
     origin: Float[np.ndarray, "3"]
-    """Origin of the coordinates of `scene`, in the frame of its file."""
+    """Origin of `scene`, in the frame of its file."""
     photographs: Path
     """Folder of the photographs, or a file in it."""
 
@@ -143,10 +142,7 @@ def index_unique(names: Sequence[str], with_folder: bool) -> dict[str, str]:
 
 
 def compute_trainer_frames(poses: Poses, points: Points | None = None) -> Iterator[Matrix]:
-    """Yield the transform of every known normalisation.
-
-    `poses` are those of all photographs, `points` the sparse points that the trainer started from.
-    """
+    """Yield the transforms of known normalisations; trainers started from the sparse `points`."""
     yield normalize_opensplat(poses)
     for world in NERFSTUDIO_WORLDS:
         yield normalize_nerfstudio(poses, world)

@@ -40,7 +40,6 @@ from gscompleter.types import Gaussians, merge
 
 LABEL_COLUMN = "generated"
 REMOVED_FILE = "removed.ply"
-"""Name of the file of replaced originals, beside the completed scene."""
 _LABEL_LINE = re.compile(rb"^property\s+\w+\s+generated\s*?\n", re.M)
 _ELEMENT_LINE = re.compile(rb"^(?:element|end_header)", re.M)
 

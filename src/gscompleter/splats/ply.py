@@ -51,7 +51,7 @@ _SCALES = ("scale_0", "scale_1", "scale_2")
 _QUATS = ("rot_0", "rot_1", "rot_2", "rot_3")
 _NEEDED = (*MEANS, *_DC, "opacity", *_SCALES, *_QUATS)
 _NUM_REST = (0, 9, 24, 45)
-"""Number of properties f_rest_* for SH of degree 0 to 3."""
+"""Number of properties f_rest_* by SH degree."""
 
 _MAX_LOGIT = 30.0
 """Opacities of 0 are written as this logit, negated."""
@@ -172,23 +172,17 @@ def read_columns(rows: np.ndarray, names: tuple[str, ...]) -> Float[np.ndarray, 
 
 def require_finite(gaussians: Gaussians, path: Path, drop_nonfinite: bool) -> Gaussians:
     """Refuse non-finite Gaussians of the file `path`, or drop them if some are finite."""
-    if len(gaussians) == 0:
-        raise InputError(f"{quote_value(path)} is empty: it holds no Gaussian.")
     good = find_finite(gaussians)
     bad = int((~good).sum())
-    if bad == 0:
-        return gaussians
-    if not drop_nonfinite:
+    if bad == len(good) and (bad == 0 or drop_nonfinite):
+        raise InputError(f"{quote_value(path)} holds no Gaussian that is finite; write it anew.")
+    if bad > 0 and not drop_nonfinite:
         raise InputError(
             f"{quote_value(path)} has {bad:,} of {len(good):,} Gaussians with NaN, infinity or a "
             "rotation of zeros; repair it, or drop what is not finite.",
             "drop_nonfinite",
         )
-    if bad == len(good):
-        raise InputError(
-            f"{quote_value(path)} holds no Gaussian without NaN or infinity; write it anew."
-        )
-    return gaussians[good]
+    return gaussians[good] if bad > 0 else gaussians
 
 
 def find_finite(gaussians: Gaussians) -> Bool[Tensor, "n"]:

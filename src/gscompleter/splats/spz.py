@@ -86,7 +86,9 @@ def read_spz(path: Path) -> Gaussians:
 
 def _parse_header(data: bytes) -> SpzHeader:
     header = SpzHeader(*HEADER.unpack_from(data))
-    if header.magic != MAGIC or header.version not in (2, 3, 4) or header.degree > 3:
+    if header.magic != MAGIC:
+        raise ValueError("it is no .spz but other data")
+    if header.version not in (2, 3, 4) or header.degree > 3:
         raise ValueError(f"it is .spz version {header.version} of SH degree {header.degree}")
     return header
 
