@@ -3,8 +3,7 @@
 An image is linear in the opacity of one Gaussian, so its squared error is quadratic, and one render
 predicts the error without each. A Gaussian is removable if some photographs gain several times the
 loss of others, or hardly any loses. A second pass with these faded protects walls behind floaters.
-Finally they are removed together; those that a photograph needs, at full or half size, are put
-back.
+Finally they are removed together; those that a photograph needs at full or half size return.
 """
 
 from __future__ import annotations

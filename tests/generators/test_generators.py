@@ -12,8 +12,13 @@ from gscompleter.evaluation.metrics.image import psnr
 from gscompleter.generators.exposure import match_exposures
 from gscompleter.generators.smooth import compute_distance_to_known, continue_smoothly
 from gscompleter.generators.warp import WarpedImage, warp_photographs
-from gscompleter.generators.warp_inpaint import WarpInpaint, fill_background_first, remove_cracks
-from gscompleter.generators.warp_inpaint.exemplar import Sources, fill_by_patches
+from gscompleter.generators.warp_inpaint import (
+    Sources,
+    WarpInpaint,
+    fill_background_first,
+    fill_by_patches,
+    remove_cracks,
+)
 from gscompleter.types import Camera, GeneratorInput, Render, View, merge
 from scenes import Room, answer, camera_at, gaussians_of, view_of
 

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from gscompleter.generators.warp_inpaint.exemplar import compute_likelihood
+from gscompleter.generators.warp_inpaint import compute_likelihood
 from gscompleter.kernels import patchmatch
 from gscompleter.kernels.patchmatch import RADIUS, SIDE
 

@@ -14,7 +14,7 @@ from torch import Tensor
 from gscompleter.data.limits import DEPTH_RANGE
 from gscompleter.data.photographs import Photographs, Resolution
 from gscompleter.geometry import is_inside, project
-from gscompleter.splats.ply_file import read_ply_file
+from gscompleter.splats.ply import read_ply_file
 from gscompleter.types import Camera
 
 AXES = ("x", "y", "z")

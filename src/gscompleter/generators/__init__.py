@@ -19,13 +19,11 @@ from gscompleter.types import Camera, GeneratorInput, View
 
 @dataclass(frozen=True)
 class GeneratorRequest:
-    """Input of Φ for one image."""
+    """Input of Φ for one image: the photograph taken closest to `target`, and all of them."""
 
     nearest: View
-    """Photograph taken closest to `target`."""
     target: Camera
     context: GeneratorInput
-    """All photographs, and renders of the current scene."""
 
 
 @dataclass(frozen=True)
@@ -88,10 +86,7 @@ def load_generator(
     device: str = "cpu",
     settings: GeneratorSettings | None = None,
 ) -> Generator:
-    """Load a generator by name; only `oracle` uses `photographs`, the true images of the targets.
-
-    The same seed gives the same image. `settings` are those of this generator; None for defaults.
-    """
+    """Load a generator by name; only `oracle` uses `photographs`, the true target images."""
     kind = get_settings_class(name)
     if not isinstance(settings, kind | None):
         raise InputError(
@@ -126,8 +121,7 @@ def _load_oracle(
                 return GeneratorOutput(photograph.image.to(target.K.device), is_photograph=True)
         raise InputError(
             f"The generator 'oracle' has {len(photographs)} photographs, none of them taken by the "
-            "target camera; give it the photograph of the target frame, or choose 'warp-inpaint' "
-            "if there is none."
+            "target camera; give it that photograph, or choose 'warp-inpaint'."
         )
 
     return FunctionGenerator(find_photograph, supports_padding=False)

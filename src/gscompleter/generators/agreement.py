@@ -16,7 +16,7 @@ from gscompleter.generators.warp import WarpedImage
 from gscompleter.image_ops import smooth_masked
 
 BLUR_RADIUS = 2
-"""Blur radius in pixels before colours are compared; edges may be a pixel off."""
+"""Blur in pixels before colours are compared; edges may be a pixel off."""
 MAX_SHARE = 0.6
 """Largest residual of a consistent image, relative to that of a constant colour."""
 QUANTILE = 0.7
@@ -26,7 +26,6 @@ MIN_LIMIT = 0.03
 MAX_GAIN = 1.6
 """Largest gain of a colour shift; its inverse is the smallest."""
 MAX_OFFSET = 0.25
-"""Largest offset of a colour shift."""
 MIN_PIXELS = 200
 """Fewest observed pixels for a comparison."""
 
@@ -40,7 +39,6 @@ class Agreement:
     residual: float
     """Quantile of the colour difference after the correction."""
     limit: float
-    """Largest residual of a consistent image."""
     is_consistent: bool
     """True if the image is consistent with the photographs, or cannot be compared."""
     image: Float[Tensor, "h w 3"]

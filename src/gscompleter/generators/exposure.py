@@ -10,12 +10,12 @@ from torch import Tensor
 
 MIN_PIXELS = 100
 """Fewest shared pixels to compare two photographs."""
-DARKEST = 0.05
-"""Smallest usable value; darker ones are noise."""
-BRIGHTEST = 0.95
-"""Largest usable value; brighter ones may be clipped."""
+DARKEST, BRIGHTEST = 0.05, 0.95
+"""Range of usable values; darker ones are noise, brighter ones may be clipped."""
 MAX_GAIN = 2.0
 """Largest plausible gain; its inverse is the smallest."""
+ROUNDS = 5
+"""Number of robust fits; each one leaves out the outliers of the previous one."""
 
 
 def match_exposures(
@@ -25,8 +25,7 @@ def match_exposures(
 ) -> list[Float[Tensor, "3"]]:
     """Compute factors that match each photograph to the exposure of `reference`.
 
-    The pairs that share most `visible` pixels are matched first; gains without enough of them stay
-    1.
+    The pairs that share most `visible` pixels are matched first; others keep a gain of 1.
     """
     ones = torch.ones(3, dtype=colors[reference].dtype, device=colors[reference].device)
     found = {reference: ones}
@@ -56,17 +55,12 @@ def compute_median_ratio(
     return ratios
 
 
-ROUNDS = 5
-"""Number of fits; each one leaves out the outliers of the previous one."""
-
-
 def fit_robust_affine(
     x: Float[Tensor, "n c"], y: Float[Tensor, "n c"]
 ) -> tuple[Float[Tensor, "c"], Float[Tensor, "c"]]:
     """Fit `y = gain * x + offset` per channel by trimmed least squares, starting at gain 1.
 
-    Residuals above 2.5 standard deviations are dropped; the gain of a constant channel stays close
-    to 1.
+    Residuals above 2.5 standard deviations are dropped; a constant channel keeps about gain 1.
     """
     gain = torch.ones_like(x[0])
     offset = (y - x).median(dim=0).values

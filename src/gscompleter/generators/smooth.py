@@ -21,8 +21,7 @@ MEANS_SIDE = 160
 FIRST_SIGMA, NUM_SCALES = 5.0, 5
 """Standard deviation of the finest mean in that image, and number of scales, each of twice it."""
 COARSER_WEIGHT = 0.02
-"""Weight of each scale relative to the next finer one, so that it counts only where that is
-empty."""
+"""Weight of a scale relative to the next finer one: it counts only where that is empty."""
 MIN_TRUST = 0.1
 """Weight of a pixel without trust, relative to a trusted one."""
 

@@ -56,8 +56,9 @@ def warp_photographs(nearest: View, target: Camera, context: GeneratorInput) -> 
         visible = _compute_visibility(pixels, z, view, render)
         shown = (visible * _compute_closeness(points, target, view)) ** SHARPNESS
         colours.append(sample(view.image, pixels))
-        weights.append(shown * _sample_trusted(view, pixels))
-        dynamic |= (shown > MIN_WEIGHT**SHARPNESS) & _sample_dynamic(view, pixels)
+        weights.append(shown * ~_touches_mask(~view.static_mask, pixels))
+        if view.dynamic_mask is not None:
+            dynamic |= (shown > MIN_WEIGHT**SHARPNESS) & _touches_mask(view.dynamic_mask, pixels)
 
     baselines = [measure_baseline(nearest.camera, view.camera) for view in context.views]
     reference = baselines.index(min(baselines))
@@ -90,7 +91,7 @@ def add_unexplained(warped: WarpedImage, target: Camera, context: GeneratorInput
         pixels, z = project(points, view.camera)
         empty = sample(render.alpha[..., None], pixels)[..., 0] < COVERED
         unexplained = empty & is_inside(pixels, z, view.camera) & ~warped.known
-        unexplained = unexplained & _sample_trusted(view, pixels)
+        unexplained &= ~_touches_mask(~view.static_mask, pixels)
         weight = unexplained * _compute_closeness(points, target, view) ** SHARPNESS
         colour = colour + weight[..., None] * gain * sample(view.image, pixels)
         total = total + weight
@@ -130,16 +131,11 @@ def _compute_visibility(
     return torch.exp(-(error**2)) * visible
 
 
-def _sample_trusted(view: View, pixels: Float[Tensor, "h w 2"]) -> Bool[Tensor, "h w"]:
-    """Mark `pixels` whose whole neighbourhood in the photograph is trusted."""
-    return sample((~view.static_mask)[..., None].float(), pixels)[..., 0] == 0
-
-
-def _sample_dynamic(view: View, pixels: Float[Tensor, "h w 2"]) -> Bool[Tensor, "h w"]:
-    """Mark `pixels` in or beside the dynamic mask of a photograph."""
-    if view.dynamic_mask is None:
-        return torch.zeros_like(pixels[..., 0], dtype=torch.bool)
-    return sample(view.dynamic_mask[..., None].float(), pixels)[..., 0] > 0
+def _touches_mask(
+    mask: Bool[Tensor, "photo_h photo_w"], pixels: Float[Tensor, "h w 2"]
+) -> Bool[Tensor, "h w"]:
+    """Mark `pixels` in or beside the mask of a photograph."""
+    return sample(mask[..., None].float(), pixels)[..., 0] > 0
 
 
 def _compute_closeness(

@@ -35,9 +35,8 @@ from gscompleter.splat_alignment.trainer_frames import (
 from gscompleter.types import Gaussians, View
 
 NUM_SAMPLE_VIEWS = 8
-"""Number of sample photographs."""
 LONG_SIDE = 320
-"""Their longer side in pixels: enough for features and for a blur of one pixel."""
+"""Longer side of the samples in pixels: enough for features and for a blur of one pixel."""
 MIN_IMPROVEMENT = 2.0
 """Gain in dB by which a frame must fit better than a simpler one; blur alone can cause 1 dB."""
 DRIFT_WARNING = 2.0
@@ -63,7 +62,6 @@ class SplatAlignment:
     transform: Matrix
     """From the frame of the photographs to that of the splat."""
     fit: SplatFit
-    """Fit of the splat to the photographs under `transform`."""
     given_fit: SplatFit
     """Fit under the identity."""
 
@@ -84,7 +82,6 @@ class AlignmentData:
     scene: Gaussians
     """The splat. Large ones are in spatial order, so that neighbours are adjacent."""
     views: Sequence[View]
-    """A few small photographs, in their own frame."""
     renderer: Renderer
 
     def restrict_to(self, transform: Matrix) -> AlignmentData:
@@ -101,10 +98,7 @@ class AlignmentData:
 def align_splat(
     splat: InputSplat, photographs: Photographs, frames: Sequence[int], renderer: Renderer
 ) -> SplatAlignment:
-    """Estimate the transform from photographs to splat, relative to their origins.
-
-    The photographs numbered `frames` are used in any case.
-    """
+    """Estimate the transform from photographs (`frames` among them) to splat, at their origins."""
     views = [view.to(splat.scene.means.device) for view in sample_views(photographs, frames)]
     points = photographs.points()
     return estimate_alignment(
@@ -154,9 +148,8 @@ def estimate_alignment(
     if not best.fit.is_match:
         raise InputError(
             f"The splat does not show what the photographs show: at their cameras it covers "
-            f"{100 * given.coverage:.0f} % of the pixels and matches them at {given.psnr:.1f} dB, "
-            "and no other frame was found; give the photographs and poses that the splat was "
-            "trained on."
+            f"{100 * given.coverage:.0f} % of the pixels and matches them at {given.psnr:.1f} dB; "
+            "give the photographs and poses that it was trained on."
         )
     return best
 

@@ -27,10 +27,7 @@ MIN_MARGIN = 3.0
 MIN_PSNR = 30.0
 """PSNR in dB above which a flat photograph counts as a match, if half of it is covered."""
 MAX_DRIFT = 0.25
-"""Largest displacement of an exact alignment, in pixels of the small photographs.
-
-A scale error of 0.5 % causes 0.5.
-"""
+"""Largest displacement of an exact alignment, in pixels; a scale error of 0.5 % causes 0.5."""
 MIN_TRACKED_CORNERS, MAX_CORNERS = 15, 200
 """Fewest tracked corners for a valid median, and most."""
 MAX_ROUND_TRIP_ERROR = 1.0
@@ -59,10 +56,7 @@ class ImageFit(NamedTuple):
 
 
 class SplatFit(NamedTuple):
-    """Fit of the splat to several photographs: medians over the better half of those that see it.
-
-    It may not be trained on all.
-    """
+    """Fit to several photographs: medians over the better half of those that see the splat."""
 
     psnr: float
     margin: float
@@ -83,9 +77,8 @@ def summarize_fits(images: Sequence[ImageFit]) -> SplatFit:
     seen = [image for image in images if image.coverage >= MIN_COVERAGE]
     seen.sort(key=lambda image: image.margin, reverse=True)
     better = seen[: math.ceil(len(seen) / 2)] or [ImageFit()]
-    psnr, margin, _, drift = (
-        sorted(values)[len(better) // 2] for values in zip(*better, strict=True)
-    )
+    columns = zip(*better, strict=True)
+    psnr, margin, _, drift = (sorted(values)[len(better) // 2] for values in columns)
     coverage = sum(image.coverage for image in images) / max(len(images), 1)
     is_match = sum(image.is_match for image in images) >= max(1, min(2, len(images)))
     return SplatFit(psnr, margin, coverage, drift, is_match)
@@ -144,8 +137,7 @@ def measure_drift(
 ) -> float:
     """Compute the median displacement of corners from a render to a photograph, in pixels.
 
-    Both are brightness in the exposure of the photograph. Corners in the valid pixels are tracked
-    forward and back (Lucas-Kanade). Infinity if too few survive.
+    Corners are tracked forward and back (Lucas-Kanade); infinity if too few survive.
     """
     before, after = ((255 * i.clip(0, 1)).round().astype(np.uint8) for i in (rendered, truth))
     mask = valid_mask.astype(np.uint8)

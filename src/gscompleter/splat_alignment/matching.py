@@ -1,7 +1,6 @@
 """Finds a similarity by features: photographs are matched with renders of the splat.
 
-The splat is rendered from all directions until some photographs match; the similarity is refined
-by renders at their cameras.
+It is rendered from all directions until some match; renders at their cameras refine the result.
 """
 
 from __future__ import annotations
@@ -53,11 +52,11 @@ class LocatedPhoto:
     """A photograph whose pose in the splat was found."""
 
     camera: Camera
-    """Its camera in the photographs' frame."""
+    """In the photographs' frame."""
     pose: Matrix
     """Camera-to-world in the splat's frame."""
     points: Float[np.ndarray, "m 3"]
-    """Inlier points of the splat, in its frame."""
+    """Inliers, in the splat's frame."""
     pixels: Float[np.ndarray, "m 2"]
 
 
@@ -173,9 +172,9 @@ def _compute_residuals(
 
 def extract_view_features(view: View) -> Features:
     """Extract the features of one view."""
-    camera, pose = view.camera, get_pose(view.camera)
+    pose = get_pose(view.camera)
     pixels = np.ascontiguousarray(view.image.detach().cpu().clamp(0, 1).float().numpy())
-    K = camera.K.detach().cpu().double().numpy()
+    K = view.camera.K.detach().cpu().double().numpy()
     return detect_features(StereoImage(pixels, K, pose[:3, :3], pose[:3, 3]))
 
 

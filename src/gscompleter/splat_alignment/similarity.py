@@ -76,8 +76,7 @@ def has_baseline(poses: Sequence[Matrix]) -> bool:
 def fit_pose_similarity(before: Sequence[Matrix], after: Sequence[Matrix]) -> Matrix:
     """Fit the similarity between two sets of poses of the same cameras, robust to outliers.
 
-    The rotation is the one closest to most; scale and shift are medians. Both sets satisfy
-    `has_baseline`.
+    The rotation is the one closest to most, scale and shift are medians; both `has_baseline`.
     """
     turns = np.stack([b[:3, :3] @ a[:3, :3].T for a, b in zip(before, after, strict=True)])
     closeness = np.einsum("iab,jab->ij", turns, turns)

@@ -1,8 +1,7 @@
 """Frames that splat trainers leave behind or normalise a scene to.
 
 Trainers store their cameras or the transform of the scene beside a splat. Without these files the
-known normalisations are computed from cameras and points: each function takes poses (OpenCV axes)
-and returns transforms from their frame to the trainer's.
+known normalisations are computed from poses (OpenCV axes) and points.
 """
 
 from __future__ import annotations
@@ -19,7 +18,6 @@ from jaxtyping import Float
 
 from gscompleter.data.camera_files import has_camera_list, read_camera_list
 from gscompleter.data.cameras import find_pose_defect
-from gscompleter.data.frame import Frame
 from gscompleter.data.local_origin import compute_frame_from_photographs, read_dataparser_transforms
 from gscompleter.data.photographs import Photographs
 from gscompleter.splat_alignment.similarity import (
@@ -58,7 +56,7 @@ class InputSplat:
     path: Path
     scene: Gaussians
     origin: Float[np.ndarray, "3"]
-    """Origin of the coordinates of `scene`, in the frame of its file."""
+    """Origin of `scene`, in the frame of its file."""
     photographs: Path
     """Folder of the photographs, or a file in it."""
 
@@ -82,7 +80,7 @@ def read_trainer_frames(
     to_splat = compute_frame_from_photographs(splat.origin)
     ours = dict(collect_poses(photographs))
     for file in find_camera_lists(splat):
-        theirs = {f.name: localize_pose(f, splat.origin) for f in read_camera_list(file)}
+        theirs = {f.name: to_splat @ f.c2w for f in read_camera_list(file)}
         transform = fit_named_cameras(ours, theirs)
         if transform is not None:
             yield "cameras", transform
@@ -96,16 +94,12 @@ def read_trainer_frames(
 
 def collect_poses(photographs: Photographs) -> list[tuple[str, Matrix]]:
     """Collect names and valid poses of the photographs, relative to their origin."""
+    localize = compute_frame_from_photographs(photographs.origin)
     return [
-        (frame.name, localize_pose(frame, photographs.origin))
+        (frame.name, localize @ frame.c2w)
         for frame in photographs.frames
         if find_pose_defect(frame.c2w) is None
     ]
-
-
-def localize_pose(frame: Frame, origin: Float[np.ndarray, "3"]) -> Matrix:
-    """Compute the pose of a frame relative to `origin`."""
-    return compute_frame_from_photographs(origin) @ frame.c2w
 
 
 def find_camera_lists(splat: InputSplat) -> list[Path]:
@@ -148,10 +142,7 @@ def index_unique(names: Sequence[str], with_folder: bool) -> dict[str, str]:
 
 
 def compute_trainer_frames(poses: Poses, points: Points | None = None) -> Iterator[Matrix]:
-    """Yield the transform of every known normalisation.
-
-    `poses` are those of all photographs, `points` the sparse points that the trainer started from.
-    """
+    """Yield the transforms of known normalisations; trainers started from the sparse `points`."""
     yield normalize_opensplat(poses)
     for world in NERFSTUDIO_WORLDS:
         yield normalize_nerfstudio(poses, world)
@@ -193,8 +184,7 @@ def normalize_gsplat_cameras(poses: Poses) -> Matrix:
 def align_gsplat_axes(cameras: Matrix, points: Points) -> Iterator[Matrix]:
     """Yield the point half: principal axes become x, y and z, the largest first.
 
-    Signs of eigenvectors depend on the library, and newer versions flip the scene upright: all four
-    right-handed choices are yielded.
+    Signs depend on the library and its version: all four right-handed choices are yielded.
     """
     moved = points @ cameras[:3, :3].T + cameras[:3, 3]
     center = np.median(moved, axis=0)

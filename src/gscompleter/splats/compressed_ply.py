@@ -13,7 +13,7 @@ from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
-from jaxtyping import Float, UInt8
+from jaxtyping import Float
 from numpy import ndarray
 
 from gscompleter.io.files import replace_file
@@ -25,8 +25,13 @@ from gscompleter.splats.packing import (
     restore_largest,
     unpack_fractions,
 )
-from gscompleter.splats.ply import MODE_COMMENT, encode, has_mode_comment
-from gscompleter.splats.ply_file import make_header, read_header
+from gscompleter.splats.ply import (
+    MODE_COMMENT,
+    encode,
+    has_mode_comment,
+    make_header,
+    read_header,
+)
 from gscompleter.types import SH_C0, Gaussians
 
 CHUNK_SIZE = 256
@@ -120,18 +125,13 @@ def write_compressed_ply(path: Path, gaussians: Gaussians) -> None:
         pack_fractions(scale, VECTOR_BITS),
         pack_fractions(rgba, COLOR_BITS),
     ]
-    rest = _pack_sh_rest(gaussians)
+    rest = gaussians.sh[:, 1:].transpose(1, 2).reshape(len(gaussians), -1).numpy()
+    rest_bytes = np.clip(np.floor((rest / 8 + 0.5) * 256), 0, 255).astype(np.uint8)
     with replace_file(path) as file:
         file.write(_make_header(gaussians, len(starts), rest.shape[1]))
         file.write(np.concatenate(bounds, axis=1).astype("<f4").tobytes())
         file.write(np.stack(columns, axis=1).astype("<u4").tobytes())
-        file.write(rest.tobytes())
-
-
-def _pack_sh_rest(gaussians: Gaussians) -> UInt8[ndarray, "n m"]:
-    """Pack SH of degree 1 and above into bytes: all of red, then green, then blue."""
-    rest = gaussians.sh[:, 1:].transpose(1, 2).reshape(len(gaussians), -1).numpy()
-    return np.clip(np.floor((rest / 8 + 0.5) * 256), 0, 255).astype(np.uint8)
+        file.write(rest_bytes.tobytes())
 
 
 def _make_header(gaussians: Gaussians, chunks: int, num_rest: int) -> bytes:

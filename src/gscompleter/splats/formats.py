@@ -152,9 +152,7 @@ def detect_splat_format(path: Path) -> str:
     if path.is_dir():
         if (path / META).is_file():
             return "sog"
-        raise InputError(
-            f"{quote_value(path)} is a folder without {META}; name a file of Gaussians."
-        )
+        raise InputError(f"{quote_value(path)} is a folder without {META}; name a file.")
     with open_file(path) as file:
         head = file.read(HEAD_BYTES)
     refuse_pointer(path)

@@ -36,8 +36,6 @@ COMPONENT_TYPES = {5120: "<i1", 5121: "<u1", 5122: "<i2", 5123: "<u2", 5126: "<f
 NUM_COMPONENTS = {"SCALAR": 1, "VEC3": 3, "VEC4": 4}
 MIN_GAUSSIAN_BYTES = 8
 """Lower bound on the bytes of a Gaussian; with fewer, the file repeats its data."""
-MAX_NODE_DEPTH = 100
-"""Largest depth of the node tree; a deeper one contains a cycle."""
 
 
 class GlbDocument(NamedTuple):
@@ -80,14 +78,16 @@ def _find_primitives(
     table = document.table
     scenes = table.get("scenes")
     roots = scenes[table.get("scene", 0)]["nodes"] if scenes else range(len(table["nodes"]))
-    waiting = [(index, torch.eye(4, dtype=torch.float64), 0) for index in roots]
+    waiting = [(index, torch.eye(4, dtype=torch.float64)) for index in roots]
+    visited: set[int] = set()
     while waiting:
-        index, above, depth = waiting.pop(0)
-        if depth > MAX_NODE_DEPTH or len(waiting) > len(table["nodes"]):
+        index, above = waiting.pop(0)
+        if index in visited:
             raise ValueError("its nodes contain each other")
+        visited.add(index)
         node = table["nodes"][index]
         place = above @ _read_transform(node)
-        waiting += [(child, place, depth + 1) for child in node.get("children", ())]
+        waiting += [(child, place) for child in node.get("children", ())]
         if "mesh" in node:
             for primitive in table["meshes"][node["mesh"]]["primitives"]:
                 if EXTENSION in primitive.get("extensions", {}):

@@ -37,14 +37,13 @@ class Section(NamedTuple):
     bucket_size: int
     num_buckets: int
     bucket_side: float
-    """Side length of a bucket, in scene units."""
+    """In scene units."""
     bucket_bytes: int
     num_steps: int
     """Steps from the centre of a bucket to its side; 0 stands for the default."""
     num_full: int
-    """Full buckets, which come first."""
+    """Full buckets, which come first; partly filled ones follow."""
     num_partial: int
-    """Partly filled buckets."""
     degree: int
 
     @property

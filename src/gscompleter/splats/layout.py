@@ -24,6 +24,7 @@ from gscompleter.errors import InputError, quote_value
 from gscompleter.splats.formats import detect_splat_format, get_writer, load_splat, save_splat
 from gscompleter.splats.ply import (
     MEANS,
+    PlyFile,
     count_rest,
     decode_gaussians,
     iterate_blocks,
@@ -33,13 +34,12 @@ from gscompleter.splats.ply import (
     read_scene,
     require_finite,
     save_ply,
+    write_ply_file,
 )
-from gscompleter.splats.ply_file import PlyFile, write_ply_file
 from gscompleter.types import Gaussians, merge
 
 LABEL_COLUMN = "generated"
 REMOVED_FILE = "removed.ply"
-"""Name of the file of replaced originals, beside the completed scene."""
 _LABEL_LINE = re.compile(rb"^property\s+\w+\s+generated\s*?\n", re.M)
 _ELEMENT_LINE = re.compile(rb"^(?:element|end_header)", re.M)
 

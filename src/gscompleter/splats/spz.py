@@ -42,7 +42,6 @@ GZIP = b"\x1f\x8b"
 HEADER = struct.Struct("<4sIIBBBB")
 """Magic, version, count, SH degree, fractional bits, flags, and the number of streams."""
 ANTIALIASED_FLAG = 0x1
-"""Flag of antialiased Gaussians."""
 MAX_WINDOW = 1 << 27
 """Largest window of zstd, in bytes, which it keeps in memory."""
 COLOR_SCALE = 0.15
@@ -50,7 +49,6 @@ COLOR_SCALE = 0.15
 SIGN_SIZE_BITS = (1, 9) * 3
 """Bits of sign and size of three components of a rotation."""
 MAX_FRACTIONAL_BITS = 16
-"""Largest number of fractional bits of a position."""
 
 
 class SpzHeader(NamedTuple):
@@ -91,10 +89,7 @@ def _parse_header(data: bytes) -> SpzHeader:
     if header.magic != MAGIC:
         raise ValueError("it is no .spz but other data")
     if header.version not in (2, 3, 4) or header.degree > 3:
-        raise ValueError(
-            f"it is .spz version {header.version} of SH degree {header.degree}, and 2 to 4 of "
-            "degree 0 to 3 are known"
-        )
+        raise ValueError(f"it is .spz version {header.version} of SH degree {header.degree}")
     return header
 
 
@@ -139,9 +134,7 @@ def _decode_streams(header: SpzHeader, streams: list[bytes]) -> Gaussians:
         for stream, width in zip(streams, header.widths, strict=True)
     )
     colour = 0.5 + SH_C0 * (colours.astype(np.float32) / 255 - 0.5) / COLOR_SCALE
-    higher = rest.astype(np.float32)
-    higher -= 128
-    higher /= 128
+    higher = (rest.astype(np.float32) - 128) / 128
     return build_gaussians(
         np.ldexp(_decode_int24(positions).astype(np.float32), -header.fractional_bits),
         _decode_quats_v2(rotations) if header.version == 2 else _decode_quats_v3(rotations),
@@ -170,9 +163,6 @@ def _decode_quats_v3(rotations: UInt8[ndarray, "n 4"]) -> Float[ndarray, "n 4"]:
     sizes = fields[:, 1::2] * np.float32(np.sqrt(0.5))
     smaller = np.where(fields[:, ::2] > 0, -sizes, sizes)
     return np.roll(restore_largest(packed >> np.uint32(30), smaller), 1, axis=1)
-
-
-# --------------------------------------------------------------------------------- writing
 
 
 def write_spz(path: Path, gaussians: Gaussians) -> None:

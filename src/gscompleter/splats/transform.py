@@ -16,29 +16,22 @@ from gscompleter.geometry import multiply_quats, rotations_to_quats
 from gscompleter.render.spherical_harmonics import evaluate_sh_basis
 from gscompleter.types import Gaussians
 
-HALF_TURN_X = (1.0, -1.0, -1.0)
-"""Signs of the axes after half a turn about x."""
-HALF_TURN_Z = (-1.0, -1.0, 1.0)
-"""Signs of the axes after half a turn about z."""
+HALF_TURN_X, HALF_TURN_Z = (1.0, -1.0, -1.0), (-1.0, -1.0, 1.0)
+"""Signs of the axes after half a turn about x and about z."""
 
 
 def rotate_half_turn(gaussians: Gaussians, signs: tuple[float, float, float]) -> Gaussians:
     """Rotate Gaussians by half a turn about an axis; exact, because only signs change."""
-    flip = torch.tensor(signs)
+    flip, k = torch.tensor(signs), gaussians.sh.shape[1]
+    # Each SH basis function is even or odd under half a turn: any direction tells its sign.
+    direction = torch.nn.functional.normalize(torch.tensor([[0.3, 0.5, 0.7]]), dim=1)
+    before, after = evaluate_sh_basis(direction, k), evaluate_sh_basis(direction * flip, k)
     return replace(
         gaussians,
         means=gaussians.means * flip,
         quats=gaussians.quats * torch.tensor((1.0, *signs)),
-        sh=gaussians.sh * _compute_sh_signs(signs, gaussians.sh.shape[1])[:, None],
+        sh=gaussians.sh * (after / before).round().mT,
     )
-
-
-def _compute_sh_signs(signs: tuple[float, float, float], k: int) -> Float[Tensor, "k"]:
-    """Compute the sign of each SH basis function, all even or odd under half a turn."""
-    direction = torch.nn.functional.normalize(torch.tensor([[0.3, 0.5, 0.7]]), dim=1)
-    return (
-        evaluate_sh_basis(direction * torch.tensor(signs), k) / evaluate_sh_basis(direction, k)
-    )[0].round()
 
 
 def transform_gaussians(gaussians: Gaussians, similarity: Float[Tensor, "4 4"]) -> Gaussians:

@@ -1,13 +1,13 @@
-"""Coarse-to-fine hole filling with patches of the photographs.
+"""The default Φ, without weights: warped photographs, and holes filled with patches.
 
-After Wexler et al. (2007), Barnes et al. (PatchMatch, 2009) and Darabi et al. (Image Melding,
-2012).
+The tone of a hole continues its border smoothly; structure near the border comes from patches of
+the photographs, coarse to fine, after Wexler et al. (2007), Barnes et al. (PatchMatch, 2009) and
+Darabi et al. (Image Melding, 2012).
 """
 
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
 from dataclasses import dataclass
 
 import cv2
@@ -18,11 +18,24 @@ from numpy import ndarray
 from torch import Tensor
 from torch.nn.functional import avg_pool2d, pad
 
-from gscompleter.generators.smooth import compute_distance_to_known
-from gscompleter.image_ops import dilate
+from gscompleter.generators.smooth import average_trusted, compute_distance_to_known
+from gscompleter.generators.warp import (
+    WarpedImage,
+    add_unexplained,
+    fill_background_first,
+    warp_photographs,
+)
+from gscompleter.image_ops import dilate, smooth_masked
 from gscompleter.kernels import patchmatch
 from gscompleter.kernels.patchmatch import RADIUS, SIDE
+from gscompleter.types import Camera, GeneratorInput, View
 
+STRUCTURE_REACH = 0.15
+"""Depth of structure in a hole, relative to the longer image side; its second half fades."""
+TONE_RADIUS = 4
+"""Radius in pixels over which patches keep the tone of the smooth continuation."""
+CRACK_WIDTH = 4
+"""Width in pixels up to which gaps are filled smoothly, without patches."""
 MAX_BIAS = 0.1
 """Largest colour shift of a patch per channel."""
 BIAS_PENALTY = 0.3
@@ -31,22 +44,89 @@ DEPTH_PENALTY = 0.02
 """Cost per squared log-depth of a source in front of the expected depth."""
 DISTANCE_PENALTY = 0.002
 """Cost of a source at the other end of the image."""
-MIN_VOTE_ROUNDS = 2
-"""Iterations of search and vote on the finest level."""
-MAX_VOTE_ROUNDS = 10
-"""Iterations on the coarsest level; sharp votes need more to agree."""
+MIN_VOTE_ROUNDS, MAX_VOTE_ROUNDS = 2, 10
+"""Iterations on the finest and the coarsest level, where sharp votes need more to agree."""
 COARSEST_PASSES, FINER_PASSES = 2, 1
 """Search passes per iteration, on the coarsest level and on finer ones."""
 VOTE_SHARPNESS = 8
 """Decay of a vote with its cost; at 1, averaged patches lose a quarter of their detail."""
 MIN_VOTE = 1e-6
-"""Smallest weight of a vote."""
 WEIGHT_DECAY = 0.85
 """Weight factor of an unknown pixel per pixel from the border of the hole."""
 MIN_SIZE = 80
 """Shorter side of the coarsest level, in pixels; coarser ones cost 0.3 dB."""
 FINE_REACH = 8
 """Radius in pixels of the random search around a match of the coarser level."""
+
+
+@dataclass(frozen=True)
+class WarpInpaint:
+    """Φ by depth-aware warping of all photographs and exemplar-based filling."""
+
+    seed: int = 0
+
+    def __call__(
+        self, nearest: View, target: Camera, context: GeneratorInput
+    ) -> Float[Tensor, "h w 3"]:
+        """Synthesize the complete image of `target`, in [0, 1].
+
+        A scene that is not fully trusted gets smooth colours, which cannot be wrong in structure.
+        """
+        render, trusted_alpha = context.target_render, context.trusted_alpha
+        if trusted_alpha is None or trusted_alpha is render.alpha:
+            return self.fill_holes(nearest, target, context)
+        return average_trusted(render, trusted_alpha / render.alpha.clamp_min(1e-6))
+
+    def fill_holes(
+        self, nearest: View, target: Camera, context: GeneratorInput
+    ) -> Float[Tensor, "h w 3"]:
+        """Synthesize the image of `target` from warped photographs and patches."""
+        warped = warp_photographs(nearest, target, context)
+        if not warped.known.any():
+            # The target observes nothing, so there is no border to continue.
+            return nearest.image.mean(dim=(0, 1)).expand(target.height, target.width, 3)
+        warped = add_unexplained(warped, target, context).to("cpu")
+        image = self.add_structure(*fill_background_first(warped), warped, context)
+        return image.clamp(0, 1).to(nearest.image.device)
+
+    def add_structure(
+        self,
+        tone: Float[Tensor, "h w 3"],
+        log_depth: Float[Tensor, "h w"],
+        warped: WarpedImage,
+        context: GeneratorInput,
+    ) -> Float[Tensor, "h w 3"]:
+        """Add structure to the smooth image `tone` along the borders of its holes."""
+        reach = STRUCTURE_REACH * max(warped.known.shape)
+        away = compute_distance_to_known(warped.known)
+        undecided = remove_cracks(~warped.known, CRACK_WIDTH) & (away <= reach)
+        if not undecided.any():
+            return tone
+        sources = collect_sources(context, warped)
+        patched = fill_by_patches(tone, ~undecided, log_depth, sources, self.seed)
+        detail = patched - tone
+        detail = detail - smooth_masked(detail, undecided, TONE_RADIUS)
+        fading = (2 * (1 - away / reach)).clamp(0, 1)
+        return torch.where(undecided[..., None], tone + fading[..., None] * detail, tone)
+
+
+def remove_cracks(hole: Bool[Tensor, "h w"], width: int) -> Bool[Tensor, "h w"]:
+    """Keep the parts of `hole` wider than `width` pixels; the image border is no limit."""
+    kernel = np.ones((width + 1, width + 1), np.uint8)
+    padded = np.pad(hole.numpy().astype(np.uint8), width + 1, mode="edge")
+    opened = cv2.morphologyEx(padded, cv2.MORPH_OPEN, kernel)
+    inner = slice(width + 1, -width - 1)
+    return torch.from_numpy(opened[inner, inner] > 0)
+
+
+def collect_sources(context: GeneratorInput, warped: WarpedImage) -> Sources:
+    """Collect patch sources: photographs of equal exposure, and the known target pixels."""
+    pairs = zip(context.views, warped.gains, strict=True)
+    return Sources.stack_images(
+        [*((gain * view.image.cpu()).clamp(0, 1) for view, gain in pairs), warped.image],
+        [*(view.static_mask.cpu() for view in context.views), warped.known],
+        [*(render.depth.cpu() for render in context.view_renders), warped.depth],
+    )
 
 
 @dataclass(frozen=True)
@@ -66,18 +146,16 @@ class Sources:
         """Stack images of any size; depth is in scene units, 0 if unknown."""
         h, w = (max(image.shape[axis] for image in images) for axis in (0, 1))
 
-        def pad_to_size(values: Tensor) -> Tensor:
-            below, right = h - values.shape[0], w - values.shape[1]
-            return pad(values, ((0, 0) * (values.dim() - 2)) + (0, right, 0, below))
+        def stack(layers: list[Tensor]) -> Tensor:
+            borders = [(0, w - layer.shape[1], 0, h - layer.shape[0]) for layer in layers]
+            return torch.stack(
+                [pad(x, (0, 0) * (x.dim() - 2) + b) for x, b in zip(layers, borders, strict=True)]
+            )
 
         # Unknown depth counts as far away, which costs nothing.
         farthest = max(depth.max().item() for depth in depths)
         logs = [torch.where(d > 0, d, farthest).clamp_min(1e-30).log() for d in depths]
-        return Sources(
-            torch.stack([pad_to_size(image) for image in images]),
-            torch.stack([pad_to_size(v) for v in valid]),
-            torch.stack([pad_to_size(log) for log in logs]),
-        )
+        return Sources(stack(images), stack(valid), stack(logs))
 
 
 @dataclass(frozen=True)
@@ -90,10 +168,8 @@ class Level:
     sources: Sources
 
 
-Field = Int64[ndarray, "h w 3"]
+Field = Int64[ndarray, "_ _ 3"]
 """Source, row and column of the matching patch per pixel near the hole; -1 elsewhere."""
-CoarseField = Int64[ndarray, "coarse_h coarse_w 3"]
-"""Field of the next coarser level."""
 
 
 def fill_by_patches(
@@ -120,7 +196,7 @@ def fill_by_patches(
 
 
 def search_and_vote(
-    level: Level, coarse_field: CoarseField | None, rounds: int, seed: int
+    level: Level, coarse_field: Field | None, rounds: int, seed: int
 ) -> tuple[Float[Tensor, "h w 3"], Field | None]:
     """Alternate between searching the best patches and voting for the image."""
     h, w = level.known.shape
@@ -141,16 +217,17 @@ def search_and_vote(
     frame = patchmatch.pad_border(np.repeat(weight[..., None], 3, axis=-1))
     total = cv2.boxFilter(weight, -1, (SIDE, SIDE), normalize=False, borderType=cv2.BORDER_CONSTANT)
     target = (total[near_hole], queries, query_at, level.expected.numpy()[near_hole])
-    costs = make_costs(usable.shape[1:])
+    diagonal = math.hypot(*usable.shape[1:])
+    penalties = MAX_BIAS, BIAS_PENALTY, DEPTH_PENALTY, DISTANCE_PENALTY, diagonal
+    costs = patchmatch.Costs(*map(np.float32, penalties))
 
     def vote_colors() -> Float32[ndarray, "p 3"]:
         return patchmatch.vote(query_at, votes, images, matches, shift)[0][~known]
 
     current = level.image.numpy().copy()
-    if coarse_field is not None:
-        current[~known] = vote_colors()
     reach, passes = max(usable.shape), COARSEST_PASSES
     if coarse_field is not None:
+        current[~known] = vote_colors()
         reach, passes = FINE_REACH, FINER_PASSES
     for number in range(rounds):
         matched = patchmatch.PatchProblem(
@@ -177,12 +254,6 @@ def compute_pixel_weights(known: Bool[Tensor, "h w"]) -> Float32[ndarray, "h w"]
     return np.where(known, 1.0, np.maximum(WEIGHT_DECAY**away, 0.05)).astype(np.float32)
 
 
-def make_costs(size: Sequence[int]) -> patchmatch.Costs:
-    """Set up the matching costs for images of a size (height, width)."""
-    weights = MAX_BIAS, BIAS_PENALTY, DEPTH_PENALTY, DISTANCE_PENALTY, math.hypot(*size)
-    return patchmatch.Costs(*map(np.float32, weights))
-
-
 def find_usable_centres(valid: Bool[Tensor, "s h w"]) -> Bool[ndarray, "s h w"]:
     """Mark the pixels whose whole patch is valid and inside the image."""
     lacking = pad(~valid, (RADIUS,) * 4, value=True)
@@ -192,7 +263,7 @@ def find_usable_centres(valid: Bool[Tensor, "s h w"]) -> Bool[ndarray, "s h w"]:
 
 def init_matches(
     queries: Int64[ndarray, "q 2"],
-    coarse_field: CoarseField | None,
+    coarse_field: Field | None,
     usable: Bool[ndarray, "s source_h source_w"],
     seed: int,
 ) -> Int64[ndarray, "q 3"]:
