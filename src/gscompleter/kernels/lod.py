@@ -14,7 +14,6 @@ MAX_OPACITY = np.float32(0.9999)
 MAX_THICKNESS = np.float32(4.6)
 """Optical thickness (at opacity 0.99) beyond which a Gaussian hardly gets wider."""
 MIN_DIVISOR = np.float32(1e-30)
-"""Smallest divisor."""
 
 
 @njit(cache=True, nogil=True, fastmath={"contract"}, error_model="numpy")

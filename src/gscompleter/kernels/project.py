@@ -119,17 +119,7 @@ def _rotation_backward(quat, d):
 @njit(cache=True, fastmath={"contract"})
 def _scale_columns(a, scales, i):
     x, y, z = scales[i, 0], scales[i, 1], scales[i, 2]
-    return (
-        a[0] * x,
-        a[1] * y,
-        a[2] * z,
-        a[3] * x,
-        a[4] * y,
-        a[5] * z,
-        a[6] * x,
-        a[7] * y,
-        a[8] * z,
-    )
+    return a[0] * x, a[1] * y, a[2] * z, a[3] * x, a[4] * y, a[5] * z, a[6] * x, a[7] * y, a[8] * z
 
 
 @njit(cache=True, fastmath={"contract"}, error_model="numpy")

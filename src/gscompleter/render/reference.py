@@ -2,14 +2,15 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+import math
+from dataclasses import dataclass, replace
 
 import torch
 from jaxtyping import Float
 from torch import Tensor
 from torch.utils.checkpoint import checkpoint
 
-from gscompleter.geometry import quats_to_rotations
+from gscompleter.geometry import compute_z_depths, quats_to_rotations
 from gscompleter.render.redraw import RedrawnScene
 from gscompleter.render.spherical_harmonics import evaluate_colors
 from gscompleter.types import Camera, Gaussians, Render
@@ -127,10 +128,7 @@ def compute_compensations(
 ) -> Float[Tensor, "n"]:
     """Compute the factors on opacities that compensate for the low-pass when antialiased.
 
-    Args:
-        flat: Axes of the Gaussians in the image; `flat @ flat.T` is the covariance before the
-            low-pass.
-        covariances: Covariances after it.
+    The low-pass widens `flat @ flat.T` to `covariances`.
     """
     # Lagrange's identity gives the determinant of `flat @ flat.T` without cancellation.
     area = torch.linalg.cross(flat[:, 0], flat[:, 1]).norm(dim=-1)
@@ -153,3 +151,17 @@ def composite(
     before = torch.cat([torch.ones_like(behind[:1]), behind[:-1]])
     weights = alpha * before
     return weights.T @ splats.colors, weights.T @ splats.depths, weights.sum(dim=0)
+
+
+def adapt_to_mode(scene: Gaussians, gaussians: Gaussians, camera: Camera) -> Gaussians:
+    """Adapt Gaussians made for the pixels of `camera` to the rendering mode of `scene`.
+
+    Classic rendering widens each splat by the low-pass and keeps its opacity; antialiased rendering
+    lowers it. So the low-pass becomes part of the Gaussians' own size, with the same total
+    coverage.
+    """
+    if gaussians.is_antialiased or not scene.is_antialiased:
+        return gaussians
+    pixel = compute_z_depths(gaussians.means, camera) * 2 / (camera.K[0, 0] + camera.K[1, 1])
+    scales = torch.hypot(gaussians.scales, math.sqrt(BLUR) * pixel[:, None])
+    return replace(gaussians, scales=scales, encoded=None, is_antialiased=True)
