@@ -12,7 +12,7 @@ from gscompleter.geometry import compute_z_depths, move_to_depths
 from gscompleter.kernels import composite
 from gscompleter.render import choose_device
 from gscompleter.render.cpu import CpuRenderer
-from gscompleter.render.gsplat import CudaFrozenScene
+from gscompleter.render.gsplat import CudaFrozenScene, CudaRenderer
 from gscompleter.render.redraw import RedrawnScene
 from gscompleter.render.reference import ReferenceRenderer
 from gscompleter.types import make_observed, sh_from_rgb
@@ -423,8 +423,11 @@ def test_without_a_gpu_cuda_is_refused_and_auto_is_the_cpu():
 
 
 @dataclass(frozen=True)
-class SlowDrawing(ReferenceRenderer):
+class SlowDrawing(ReferenceRenderer, CudaRenderer):
     """The reference in the place of gsplat: it tries out which Gaussians leave a trace."""
+
+    def __post_init__(self):
+        """Need no GPU."""
 
     def freeze(self, context, camera):
         rows = torch.arange(len(context))

@@ -58,10 +58,7 @@ def run(kernel, calls, threads=None):
 
 def map_in_parallel(function, *arguments):
     """Map `function`, which may call kernels, over the arguments on several threads."""
-    threads = numba.config.NUMBA_NUM_THREADS
-    if threads == 1:
-        return list(map(function, *arguments))
-    with ThreadPoolExecutor(threads) as pool:
+    with ThreadPoolExecutor(numba.config.NUMBA_NUM_THREADS) as pool:
         return list(pool.map(function, *arguments))
 
 

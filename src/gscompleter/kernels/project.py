@@ -45,11 +45,9 @@ class GaussianArrays(NamedTuple):
     sh: np.ndarray
 
 
-# ---- 3 × 3 matrices as tuples of nine, row by row ---------------------------------------------
-
-
 @njit(cache=True, fastmath={"contract"})
 def _multiply(a, b):
+    """Multiply 3 × 3 matrices, which are tuples of nine here, row by row."""
     return (
         a[0] * b[0] + a[1] * b[3] + a[2] * b[6],
         a[0] * b[1] + a[1] * b[4] + a[2] * b[7],

@@ -216,8 +216,7 @@ def _close_if_full(builder, passing, limits, row, filled):
 def composite_rows(typing, begin, end, position, state, last, row_limit, splat):
     """Composite a splat over the rows begin..end of a tile; return how many it filled.
 
-    state [16, 5, 16]: per row the transmittance, negative in full pixels, and sums of colour and
-    depth.
+    state [16, 5, 16]: transmittances of a row, negative in full pixels; sums of colour and depth.
     last [16, 16] int32: position of the last contribution. row_limit [16] int32: -1 in full rows.
     splat: x and y relative to the first pixel centre, u, v, w, opacity, red, green, blue and depth.
     """

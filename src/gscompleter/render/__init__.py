@@ -20,8 +20,10 @@ from gscompleter.errors import InputError, quote_value
 from gscompleter.kernels.parallel import map_small_tasks
 from gscompleter.types import Camera, Gaussians, Render
 
-OpacityRender = DepthRender = Callable[[Float[Tensor, "n"]], Render]
-"""Renders a frozen scene with Gaussians that vary in opacity or z-depth [n] only."""
+OpacityRender = Callable[[Float[Tensor, "n"]], Render]
+"""Renders a frozen scene with Gaussians that vary in opacity [n] only."""
+DepthRender = OpacityRender
+"""Renders a frozen scene with Gaussians that vary in z-depth [n] only."""
 
 OpacityImage = Callable[[Float[Tensor, "n"]], Float[Tensor, "h w 3"]]
 """The image of an `OpacityRender`."""
@@ -46,10 +48,7 @@ def get_view_map(scene: Gaussians) -> Callable[..., Iterable[Any]]:
 
 @runtime_checkable
 class FrozenScene(Protocol):
-    """A scene prepared for one camera: whatever depends on these two alone is computed once.
-
-    Optimisations, which render the same context a hundred times, pay only for what they vary.
-    """
+    """A scene prepared for one camera: whatever depends on these two alone is computed once."""
 
     @property
     def render(self) -> Render:

@@ -62,8 +62,7 @@ class CpuRenderer:
 class CpuFrozenScene:
     """The frozen context: projected, sorted, binned, and cut behind opaque surfaces.
 
-    It keeps only splats that some tile shows. New Gaussians are composited only in tiles they
-    touch.
+    It keeps only splats that some tile shows. New ones are composited only in tiles they touch.
     """
 
     viewpoint: Viewpoint

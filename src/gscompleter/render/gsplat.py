@@ -64,17 +64,9 @@ class CudaRenderer:
             values = torch.cat([colors[None], seen["depths"][..., None]], dim=-1)
 
         def render(opacities: Float[Tensor, "n"]) -> Render:
-            sums, alphas = rasterize_to_pixels(
-                seen["means2d"],
-                seen["conics"],
-                values,
-                (factors * opacities)[None],
-                camera.width,
-                camera.height,
-                seen["tile_size"],
-                seen["isect_offsets"],
-                seen["flatten_ids"],
-            )
+            drawn = seen["means2d"], seen["conics"], values, (factors * opacities)[None]
+            tiles = seen["tile_size"], seen["isect_offsets"], seen["flatten_ids"]
+            sums, alphas = rasterize_to_pixels(*drawn, camera.width, camera.height, *tiles)
             alpha = alphas[0, ..., 0]
             return Render(sums[0, ..., :3], sums[0, ..., 3] / alpha.clamp_min(1e-10), alpha)
 

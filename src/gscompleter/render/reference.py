@@ -102,12 +102,9 @@ def compute_jacobians(
     """Compute the Jacobian of the projection at points in the camera, with clamped tangents."""
     fx, fy, cx, cy = K[0, 0], K[1, 1], K[0, 2], K[1, 2]
     x, y, z = points.unbind(-1)
-    tan_x = (x / z).clamp(
-        -(cx + TANGENT_MARGIN * width) / fx, (width - cx + TANGENT_MARGIN * width) / fx
-    )
-    tan_y = (y / z).clamp(
-        -(cy + TANGENT_MARGIN * height) / fy, (height - cy + TANGENT_MARGIN * height) / fy
-    )
+    margin_x, margin_y = TANGENT_MARGIN * width, TANGENT_MARGIN * height
+    tan_x = (x / z).clamp(-(cx + margin_x) / fx, (width - cx + margin_x) / fx)
+    tan_y = (y / z).clamp(-(cy + margin_y) / fy, (height - cy + margin_y) / fy)
     zero = torch.zeros_like(z)
     rows = [
         torch.stack([fx / z, zero, -fx * tan_x / z], dim=-1),
@@ -157,8 +154,7 @@ def adapt_to_mode(scene: Gaussians, gaussians: Gaussians, camera: Camera) -> Gau
     """Adapt Gaussians made for the pixels of `camera` to the rendering mode of `scene`.
 
     Classic rendering widens each splat by the low-pass and keeps its opacity; antialiased rendering
-    lowers it. So the low-pass becomes part of the Gaussians' own size, with the same total
-    coverage.
+    lowers it. So the low-pass becomes part of the Gaussians' size, with the same total coverage.
     """
     if gaussians.is_antialiased or not scene.is_antialiased:
         return gaussians
