@@ -21,8 +21,8 @@ from gscompleter.generators import GeneratorOutput
 from gscompleter.geometry import project
 from gscompleter.guards.free_space import respect_free_space
 from gscompleter.guards.psnr import is_mostly_faded
-from gscompleter.render.antialiasing import adapt_to_mode
 from gscompleter.render.cpu import CpuRenderer
+from gscompleter.render.reference import adapt_to_mode
 from gscompleter.stages.lift import lift_pair
 from gscompleter.stages.slide_along_rays import apply_affine
 from gscompleter.stages.target_view import compute_hole_mask

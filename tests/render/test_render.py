@@ -2,7 +2,6 @@
 
 import sys
 from dataclasses import dataclass, replace
-from functools import partial
 
 import pytest
 import torch
@@ -13,7 +12,7 @@ from gscompleter.geometry import compute_z_depths, move_to_depths
 from gscompleter.kernels import composite
 from gscompleter.render import choose_device
 from gscompleter.render.cpu import CpuRenderer
-from gscompleter.render.gsplat import freeze_with
+from gscompleter.render.gsplat import CudaFrozenScene, CudaRenderer
 from gscompleter.render.redraw import RedrawnScene
 from gscompleter.render.reference import ReferenceRenderer
 from gscompleter.types import make_observed, sh_from_rgb
@@ -424,8 +423,15 @@ def test_without_a_gpu_cuda_is_refused_and_auto_is_the_cpu():
 
 
 @dataclass(frozen=True)
-class SlowDrawing(ReferenceRenderer):
+class SlowDrawing(ReferenceRenderer, CudaRenderer):
     """The reference in the place of gsplat: it tries out which Gaussians leave a trace."""
+
+    def __post_init__(self):
+        """Need no GPU."""
+
+    def freeze(self, context, camera):
+        rows = torch.arange(len(context))
+        return CudaFrozenScene(self, context, camera, rows, len(context))
 
     def find_visible(self, gaussians, camera):
         traces = [self.render(gaussians[i : i + 1], camera).alpha for i in range(len(gaussians))]
@@ -470,7 +476,7 @@ def test_a_frozen_view_that_drops_what_its_camera_does_not_see_draws_the_same(na
     beside = replace(SCENES[name], means=SCENES[name].means + torch.tensor([9.0, 0, 0]))
     context, new = merge([SCENES[name], beside]), random_gaussians(40, seed=5, sh_degree=1)
     new = replace(new, is_antialiased=context.is_antialiased)
-    view = freeze_with(SlowDrawing(), context, CAMERA)
+    view = SlowDrawing().freeze(context, CAMERA)
     assert 0 < len(view.visible_scene) < len(context) / 2 + 1
     assert view.visible_scene.sh.shape[1] == 1
     plain = REFERENCE.freeze(context, CAMERA)
@@ -478,7 +484,7 @@ def test_a_frozen_view_that_drops_what_its_camera_does_not_see_draws_the_same(na
     assert torch.equal(view.render.image, plain.render.image)
 
 
-@pytest.mark.parametrize("freeze", [CPU.freeze, partial(freeze_with, SlowDrawing())])
+@pytest.mark.parametrize("freeze", [CPU.freeze, SlowDrawing().freeze])
 @pytest.mark.parametrize("name", ["harmonics", "strange", "antialiased-harmonics"])
 def test_a_frozen_view_tells_what_it_shows_of_each_gaussian(name, freeze):
     context, new = SCENES[name][::2], SCENES[name][1::2]
@@ -498,7 +504,7 @@ def test_a_frozen_view_tells_what_it_shows_of_each_gaussian(name, freeze):
 
 def test_a_frozen_view_of_nothing_draws_what_is_new():
     new = SCENES["random"]
-    view = freeze_with(SlowDrawing(), new[:0], CAMERA)
+    view = SlowDrawing().freeze(new[:0], CAMERA)
     assert torch.equal(view.composite(new).image, REFERENCE.render(new, CAMERA).image)
 
 

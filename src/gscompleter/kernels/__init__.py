@@ -21,13 +21,11 @@ def _skip_blas_check():
     def refuse():
         raise ImportError("BLAS is not needed")
 
-    if ensure_blas is not None:
-        linalg.ensure_blas = refuse
+    linalg.ensure_blas = refuse
     try:
         yield
     finally:
-        if ensure_blas is not None:
-            linalg.ensure_blas = ensure_blas
+        linalg.ensure_blas = ensure_blas
 
 
 def _remove_stale_indices():

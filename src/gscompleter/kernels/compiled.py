@@ -26,12 +26,9 @@ def get_cache_folder():
 
 
 def _get_marker(part):
-    return get_cache_folder() / f"{part}-{_hash_state()}.compiled"
-
-
-def _hash_state():
     sources = sorted(Path(__file__).parent.glob("*.py"))
     stamps = [(s.name, s.stat().st_mtime_ns, s.stat().st_size) for s in sources]
     machine = (get_host_cpu_name(), get_host_cpu_features().flatten())
     state = repr((stamps, machine, numba.__version__, sys.version))
-    return hashlib.sha256(state.encode()).hexdigest()[:16]
+    code = hashlib.sha256(state.encode()).hexdigest()[:16]
+    return get_cache_folder() / f"{part}-{code}.compiled"

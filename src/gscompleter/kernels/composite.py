@@ -24,8 +24,7 @@ class Layer(NamedTuple):
     """[n, 9] float32, columns X to BLUE."""
     opacities: np.ndarray
     boxes: np.ndarray
-    """Pixels that a splat may touch: x from, x to, y from, y to (excluded) [n, 4], int16 or
-    int32."""
+    """Pixels that a splat may touch, int16 or int32 [n, 4]: x from, to; y from, to (excluded)."""
     tile_start: np.ndarray
     """Start of the list of each tile [tiles + 1] int64."""
     entries: np.ndarray
@@ -47,9 +46,6 @@ class RasterFrame(NamedTuple):
     """Entries of both lists that were composited until the tile was full [tiles, 2] int32."""
     full: np.ndarray
     """True for tiles without any transmittance left [tiles] bool."""
-
-
-# ---- Two lists, merged by depth ------------------------------------------------------------------
 
 
 @njit(cache=True)
@@ -97,9 +93,6 @@ def merge_lists(begin, end, context, new, used, full, tile_start, entries, depth
         depth_limits[tile] = depth if full[tile] else infinity
 
 
-# ---- Compositing ---------------------------------------------------------------------------------
-
-
 @njit(cache=True)
 def _allocate_aligned(size):
     """Allocate float32 values from a cache line on, so that no vector straddles two."""
@@ -125,7 +118,7 @@ def _open_pixels(state, columns):
 
 
 @njit(cache=True, fastmath={"contract"})
-def _place_in_tile(splats, opacities, boxes, i, left, top):
+def _place(splats, opacities, boxes, i, left, top):
     """Return the rows of the tile at (left, top) that splat i touches, and the relative splat."""
     half = np.float32(0.5)
     return (
@@ -174,15 +167,11 @@ def composite(begin, end, tiles, context, new, frame):
         while open_rows > 0 and (c < c_end or n < n_end):
             position = np.int32(c - c_begin + n - n_begin)
             if c_depth <= n_depth:
-                first, stop, splat = _place_in_tile(
-                    c_splats, c_opacities, c_boxes, c_entries[c], left, top
-                )
+                first, stop, splat = _place(c_splats, c_opacities, c_boxes, c_entries[c], left, top)
                 c += 1
                 c_depth = _get_depth(c_splats, c_entries, c, c_begin, c_end, infinity)
             else:
-                first, stop, splat = _place_in_tile(
-                    n_splats, n_opacities, n_boxes, n_entries[n], left, top
-                )
+                first, stop, splat = _place(n_splats, n_opacities, n_boxes, n_entries[n], left, top)
                 n += 1
                 n_depth = _get_depth(n_splats, n_entries, n, n_begin, n_end, infinity)
             open_rows -= simd.composite_rows(first, stop, position, state, last, row_limit, splat)
@@ -235,17 +224,13 @@ def backproject_residual(begin, end, tiles, context, new, photograph, slots, sum
         place = np.int64(0)  # with a plain 0, its callees are compiled twice
         while open_rows > 0 and (c < c_end or n < n_end):
             if c_depth <= n_depth:
-                first, stop, splat = _place_in_tile(
-                    c_splats, c_opacities, c_boxes, c_entries[c], left, top
-                )
+                first, stop, splat = _place(c_splats, c_opacities, c_boxes, c_entries[c], left, top)
                 c += 1
                 c_depth = _get_depth(c_splats, c_entries, c, c_begin, c_end, infinity)
                 # The next splat overwrites its weights.
                 open_rows -= simd.weigh_rows(first, stop, place, state, row_limit, kept, splat)
                 continue
-            first, stop, splat = _place_in_tile(
-                n_splats, n_opacities, n_boxes, n_entries[n], left, top
-            )
+            first, stop, splat = _place(n_splats, n_opacities, n_boxes, n_entries[n], left, top)
             n += 1
             n_depth = _get_depth(n_splats, n_entries, n, n_begin, n_end, infinity)
             open_rows -= simd.weigh_rows(first, stop, place, state, row_limit, kept, splat)
@@ -319,16 +304,12 @@ def composite_backward(
             position = np.int32(c - c_begin + n - n_begin - 1)
             if c_depth > n_depth:
                 c -= 1
-                first, stop, splat = _place_in_tile(
-                    c_splats, c_opacities, c_boxes, c_entries[c], left, top
-                )
+                first, stop, splat = _place(c_splats, c_opacities, c_boxes, c_entries[c], left, top)
                 c_depth = _get_depth(c_splats, c_entries, c - 1, c_begin, c, nothing)
                 simd.pass_rows(first, stop, position, state, last, row_limit, sums, splat)
                 continue
             n -= 1
-            first, stop, splat = _place_in_tile(
-                n_splats, n_opacities, n_boxes, n_entries[n], left, top
-            )
+            first, stop, splat = _place(n_splats, n_opacities, n_boxes, n_entries[n], left, top)
             n_depth = _get_depth(n_splats, n_entries, n - 1, n_begin, n, nothing)
             slot = slots[n]
             written[slot] = True

@@ -14,7 +14,6 @@ MAX_OPACITY = np.float32(0.9999)
 MAX_THICKNESS = np.float32(4.6)
 """Optical thickness (at opacity 0.99) beyond which a Gaussian hardly gets wider."""
 MIN_DIVISOR = np.float32(1e-30)
-"""Smallest divisor."""
 
 
 @njit(cache=True, nogil=True, fastmath={"contract"}, error_model="numpy")
@@ -22,8 +21,7 @@ def mark_run_starts(begin, end, means, scales, generated, centers, focals, reach
     """Write to `begins` [n] which Gaussians of the blocks begin..end start a run.
 
     It continues while the next Gaussian has the provenance of the first, lies within `reach` pixels
-    of it, and has no standard deviation above `largest` pixels, for the smallest pixel of all
-    cameras.
+    of it, and is no wider than `largest` pixels, for the smallest pixel of all cameras.
     """
     for block in range(begin, end):
         pixel, x, y, z = np.float32(-1), np.float32(0), np.float32(0), np.float32(0)
@@ -113,9 +111,8 @@ def _compute_variance(first, last, shares, means, quats, scales, mean, axis):
 def merge_runs(begin, end, start, gaussians, shares, merged):
     """Merge each of the runs begin..end into one Gaussian.
 
-    It has their joint transmittance, mean position and mean colour, and their variances along the
-    axes of the largest. Thicker ones are made wider, since 1 - exp(-t g) falls off more slowly than
-    g.
+    It has their joint transmittance, mean position and colour, and variances along the axes of the
+    largest. Thicker ones are made wider, since 1 - exp(-t g) falls off more slowly than g.
     """
     means, quats, scales, opacities, sh = gaussians
     to_means, to_quats, to_scales, to_opacities, to_sh = merged

@@ -16,13 +16,7 @@ import numba
 PIECES_PER_THREAD = 4
 """Number of pieces per thread, which balances pieces of different cost."""
 
-
 _thread = threading.local()
-
-
-def _stay_alone():
-    """Run the kernels of the calling thread on it alone."""
-    _thread.is_alone = True
 
 
 def count_threads(threads):
@@ -36,12 +30,8 @@ def share(kernel, count, *arguments, threads=None):
     `threads` defaults to NUMBA_NUM_THREADS; the result does not depend on it.
     """
     threads = count_threads(threads)
-    run(kernel, [(*piece, *arguments) for piece in split_into_pieces(count, threads)], threads)
-
-
-def split_into_pieces(count, threads):
-    """Split range(count) into pieces for `threads` threads."""
-    return split_range(count, threads * PIECES_PER_THREAD if threads > 1 else 1)
+    pieces = split_range(count, threads * PIECES_PER_THREAD if threads > 1 else 1)
+    run(kernel, [(*piece, *arguments) for piece in pieces], threads)
 
 
 def run(kernel, calls, threads=None):
@@ -68,10 +58,7 @@ def run(kernel, calls, threads=None):
 
 def map_in_parallel(function, *arguments):
     """Map `function`, which may call kernels, over the arguments on several threads."""
-    threads = numba.config.NUMBA_NUM_THREADS
-    if threads == 1:
-        return list(map(function, *arguments))
-    with ThreadPoolExecutor(threads) as pool:
+    with ThreadPoolExecutor(numba.config.NUMBA_NUM_THREADS) as pool:
         return list(pool.map(function, *arguments))
 
 
@@ -81,7 +68,8 @@ def map_small_tasks(function, *arguments):
     if threads == 1:
         yield from map(function, *arguments)
         return
-    with ThreadPoolExecutor(threads, initializer=_stay_alone) as pool:
+    alone = {"initializer": setattr, "initargs": (_thread, "is_alone", True)}
+    with ThreadPoolExecutor(threads, **alone) as pool:
         yield from pool.map(function, *arguments)
 
 

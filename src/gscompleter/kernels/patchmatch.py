@@ -190,11 +190,8 @@ def _improve(begin, end, problem, costs, number, max_reach, seed, before, field,
                     s = np.int64((state >> np.uint64(48)) % np.uint64(num_sources))
                 span = np.uint64(2 * reach + 1)
                 sy = field[i, 1] + np.int64((state & np.uint64(0xFFFFFF)) % span) - reach
-                sx = (
-                    field[i, 2]
-                    + np.int64(((state >> np.uint64(24)) & np.uint64(0xFFFFFF)) % span)
-                    - reach
-                )
+                other = (state >> np.uint64(24)) & np.uint64(0xFFFFFF)
+                sx = field[i, 2] + np.int64(other % span) - reach
                 reach = reach * 6 // 10
             if sy < 0 or sy >= H or sx < 0 or sx >= W or not usable[s, sy, sx]:
                 continue

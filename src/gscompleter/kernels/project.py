@@ -45,11 +45,9 @@ class GaussianArrays(NamedTuple):
     sh: np.ndarray
 
 
-# ---- 3 × 3 matrices as tuples of nine, row by row ---------------------------------------------
-
-
 @njit(cache=True, fastmath={"contract"})
 def _multiply(a, b):
+    """Multiply 3 × 3 matrices, which are tuples of nine here, row by row."""
     return (
         a[0] * b[0] + a[1] * b[3] + a[2] * b[6],
         a[0] * b[1] + a[1] * b[4] + a[2] * b[7],
@@ -119,17 +117,7 @@ def _rotation_backward(quat, d):
 @njit(cache=True, fastmath={"contract"})
 def _scale_columns(a, scales, i):
     x, y, z = scales[i, 0], scales[i, 1], scales[i, 2]
-    return (
-        a[0] * x,
-        a[1] * y,
-        a[2] * z,
-        a[3] * x,
-        a[4] * y,
-        a[5] * z,
-        a[6] * x,
-        a[7] * y,
-        a[8] * z,
-    )
+    return a[0] * x, a[1] * y, a[2] * z, a[3] * x, a[4] * y, a[5] * z, a[6] * x, a[7] * y, a[8] * z
 
 
 @njit(cache=True, fastmath={"contract"}, error_model="numpy")

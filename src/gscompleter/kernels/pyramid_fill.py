@@ -77,10 +77,8 @@ def _sample(pyramid, y, x, level, sums):
     for c in range(len(sums)):
         a, b = pyramid.sums[start + top * w + left, c], pyramid.sums[start + top * w + right, c]
         upper = a + along * (b - a)
-        a, b = (
-            pyramid.sums[start + bottom * w + left, c],
-            pyramid.sums[start + bottom * w + right, c],
-        )
+        a = pyramid.sums[start + bottom * w + left, c]
+        b = pyramid.sums[start + bottom * w + right, c]
         sums[c] = upper + down * (a + along * (b - a) - upper)
 
 

@@ -29,7 +29,7 @@ _LOG2_E = 1.4426950408889634
 
 
 class _Lanes:
-    """Sixteen float32 values of a function under construction."""
+    """Sixteen values of a function under construction, float32 unless said otherwise."""
 
     def __init__(self, builder, value):
         self.builder, self.value = builder, value
@@ -89,7 +89,7 @@ def _sum_lanes(builder, vectors):
             for first, second in zip(values[::2], values[1::2], strict=True)
         ]
         width = half
-    return values[0]
+    return _Lanes(builder, values[0])
 
 
 def _make_constant(value):
@@ -99,7 +99,8 @@ def _make_constant(value):
 def _broadcast(builder, scalar, vector_type=_FLOATS):
     undefined = ir.Constant(vector_type, ir.Undefined)
     first = builder.insert_element(undefined, scalar, ir.Constant(_INT, 0))
-    return builder.shuffle_vector(first, undefined, ir.Constant(_INTS, [0] * TILE))
+    lanes = builder.shuffle_vector(first, undefined, ir.Constant(_INTS, [0] * TILE))
+    return _Lanes(builder, lanes)
 
 
 def _exp_negative(values):
@@ -133,10 +134,25 @@ class _Rows:
         return self.builder.bitcast(pointer, self.vector_type.as_pointer())
 
     def load(self, row, index):
-        return self.builder.load(self._get_pointer(row, index), align=4)
+        value = self.builder.load(self._get_pointer(row, index), align=4)
+        return _Lanes(self.builder, value)
 
-    def store(self, row, index, value):
-        self.builder.store(value, self._get_pointer(row, index), align=4)
+    def store(self, row, index, lanes):
+        self.builder.store(lanes.value, self._get_pointer(row, index), align=4)
+
+
+class _Total:
+    """Sixteen sums, 0 at first."""
+
+    def __init__(self, builder):
+        self.builder = builder
+        self.pointer = cgutils.alloca_once_value(builder, _make_constant(0.0))
+
+    def load(self):
+        return _Lanes(self.builder, self.builder.load(self.pointer))
+
+    def store(self, lanes):
+        self.builder.store(lanes.value, self.pointer)
 
 
 class _Splat:
@@ -145,21 +161,19 @@ class _Splat:
     def __init__(self, builder, x, y, u, v, w, opacity, red, green, blue, depth):
         self.builder = builder
         self.y, self.v, self.w = y, v, w
-        self.channels = [
-            _Lanes(builder, _broadcast(builder, value)) for value in (red, green, blue, depth)
-        ]
+        self.channels = [_broadcast(builder, value) for value in (red, green, blue, depth)]
         lane_numbers = ir.Constant(_FLOATS, [float(lane) for lane in range(TILE)])
-        self.dx = _Lanes(builder, builder.fsub(lane_numbers, _broadcast(builder, x)))
-        self.u_dx = self.dx * _Lanes(builder, _broadcast(builder, u))
-        self.opacity = _Lanes(builder, _broadcast(builder, opacity))
+        self.dx = _Lanes(builder, lane_numbers) - _broadcast(builder, x)
+        self.u_dx = self.dx * _broadcast(builder, u)
+        self.opacity = _broadcast(builder, opacity)
 
     def compute_falloff(self, row):
         """Return dy of a row, and alpha before and after capping, and its mask."""
         builder = self.builder
         dy = builder.fsub(builder.sitofp(row, _FLOAT), self.y)
-        s = self.u_dx + _Lanes(builder, _broadcast(builder, builder.fmul(self.v, dy)))
+        s = self.u_dx + _broadcast(builder, builder.fmul(self.v, dy))
         t = builder.fmul(self.w, dy)
-        sigma = s.multiply_add(s, plus=_Lanes(builder, _broadcast(builder, builder.fmul(t, t))))
+        sigma = s.multiply_add(s, plus=_broadcast(builder, builder.fmul(t, t)))
         raw = self.opacity * _exp_negative(sigma)
         capped = raw.where(raw.compare("<=", MAX_ALPHA), MAX_ALPHA)
         return dy, raw, capped, raw.compare(">=", MIN_ALPHA)
@@ -176,18 +190,16 @@ def _loop_over_rows(builder, rows, position, row_limit, body):
 
 def _blend(splat, state, row):
     """Composite a splat over a row; return its weights, and masks of visible and passing lanes."""
-    builder = splat.builder
     _, _, alpha, visible = splat.compute_falloff(row)
     alpha = alpha.where(visible, 0.0)
-    before = _Lanes(builder, state.load(row, 0))
+    before = state.load(row, 0)
     after = alpha.multiply_add(0.0 - before, plus=before)
     passing = after.compare(">", MIN_TRANSMITTANCE)
     weight = (alpha * before).where(passing, 0.0)
     closed = before.where(before.compare("<", 0.0), 0.0 - before)
-    state.store(row, 0, after.where(passing, closed).value)
+    state.store(row, 0, after.where(passing, closed))
     for index, channel in enumerate(splat.channels[: state.stride // TILE - 1], start=1):
-        total = weight.multiply_add(channel, plus=_Lanes(builder, state.load(row, index)))
-        state.store(row, index, total.value)
+        state.store(row, index, weight.multiply_add(channel, plus=state.load(row, index)))
     return weight, visible, passing
 
 
@@ -204,8 +216,7 @@ def _close_if_full(builder, passing, limits, row, filled):
 def composite_rows(typing, begin, end, position, state, last, row_limit, splat):
     """Composite a splat over the rows begin..end of a tile; return how many it filled.
 
-    state [16, 5, 16]: per row the transmittance, negative in full pixels, and sums of colour and
-    depth.
+    state [16, 5, 16]: transmittances of a row, negative in full pixels; sums of colour and depth.
     last [16, 16] int32: position of the last contribution. row_limit [16] int32: -1 in full rows.
     splat: x and y relative to the first pixel centre, u, v, w, opacity, red, green, blue and depth.
     """
@@ -223,7 +234,7 @@ def composite_rows(typing, begin, end, position, state, last, row_limit, splat):
         def composite_row(row):
             _, visible, passing = _blend(splat, state, row)
             contributes = builder.and_(visible, passing)
-            last.store(row, 0, builder.select(contributes, positions, last.load(row, 0)))
+            last.store(row, 0, positions.where(contributes, last.load(row, 0)))
             _close_if_full(builder, passing, limits, row, filled)
 
         _loop_over_rows(builder, (begin, end), position, limits, composite_row)
@@ -251,10 +262,10 @@ def weigh_rows(typing, begin, end, place, state, row_limit, kept, splat):
             with builder.if_else(is_open) as (open_row, full_row):
                 with open_row:
                     weight, _, passing = _blend(splat, state, row)
-                    kept.store(at, 0, weight.value)
+                    kept.store(at, 0, weight)
                     _close_if_full(builder, passing, limits, row, filled)
                 with full_row:
-                    kept.store(at, 0, _make_constant(0.0))
+                    kept.store(at, 0, _Lanes(builder, _make_constant(0.0)))
         return builder.load(filled)
 
     return signature, generate
@@ -269,22 +280,16 @@ def sum_weighted_rows(typing, begin, end, place, state, kept, sums):
         begin, end, place, state, kept, sums = arguments
         state = _Rows(context, builder, signature.args[3], state, _FLOATS, 4)
         kept = _Rows(context, builder, signature.args[4], kept, _FLOATS, 1)
-        zeros = ir.Constant(_FLOATS, [0.0] * TILE)
-        totals = [cgutils.alloca_once_value(builder, zeros) for _ in range(4)]
+        totals = [_Total(builder) for _ in range(4)]
         with cgutils.for_range(builder, end, start=begin, intp=_LONG) as loop:
             at = builder.add(place, builder.sub(loop.index, begin))
-            weight = _Lanes(builder, kept.load(at, 0))
-            for index, total in enumerate(totals, start=1):
-                value = _Lanes(builder, builder.load(total))
-                if index < 4:
-                    value = weight.multiply_add(
-                        _Lanes(builder, state.load(loop.index, index)), plus=value
-                    )
-                else:
-                    value = value + weight
-                builder.store(value.value, total)
+            weight = kept.load(at, 0)
+            for index, total in enumerate(totals[:3], start=1):
+                value = state.load(loop.index, index)
+                total.store(weight.multiply_add(value, plus=total.load()))
+            totals[3].store(totals[3].load() + weight)
         out = _Rows(context, builder, signature.args[5], sums, _FLOATS, 1)
-        columns = [_Lanes(builder, builder.load(total)) for total in totals]
+        columns = [total.load() for total in totals]
         out.store(ir.Constant(_LONG, 0), 0, _sum_lanes(builder, columns))
         return context.get_dummy_value()
 
@@ -303,9 +308,8 @@ def _make_revert(wanted):
         q dx, q dy, q dx², q dx dy, q dy² (q = alpha dL/dalpha), and of weight times dL/d depth,
         red, green and blue.
         """
-        signature = types.void(
-            types.int64, types.int64, types.int32, state, last, row_limit, sums, splat
-        )
+        arrays = state, last, row_limit, sums
+        signature = types.void(types.int64, types.int64, types.int32, *arrays, splat)
 
         def generate(context, builder, signature, arguments):
             begin, end, position, state, last, row_limit, sums, splat = arguments
@@ -315,52 +319,45 @@ def _make_revert(wanted):
             limits = context.make_array(signature.args[5])(context, builder, row_limit).data
             positions = _broadcast(builder, position, _INTS)
             count = {"nothing": 0, "opacity": 1, "depth": 1, "colour": 3, "all": 7}[wanted]
-            totals = [
-                cgutils.alloca_once_value(builder, ir.Constant(_FLOATS, [0.0] * TILE))
-                for _ in range(count)
-            ]
+            totals = [_Total(builder) for _ in range(count)]
 
             def revert(row):
                 dy, raw, alpha, visible = splat.compute_falloff(row)
-                reached = builder.icmp_signed("<=", positions, last.load(row, 0))
+                reached = builder.icmp_signed("<=", positions.value, last.load(row, 0).value)
                 contributes = builder.and_(visible, reached)
                 alpha = alpha.where(contributes, 0.0)
-                gradients = [_Lanes(builder, state.load(row, index)) for index in range(2, 7)]
-                behind = _Lanes(builder, state.load(row, 1))
+                gradients = [state.load(row, index) for index in range(2, 7)]
+                behind = state.load(row, 1)
 
                 opening = 1.0 / (1.0 - alpha)
-                before = _Lanes(builder, state.load(row, 0)) * opening
+                before = state.load(row, 0) * opening
                 weight = alpha * before
                 value = gradients[4]
                 for channel, gradient in zip(splat.channels, gradients[:4], strict=True):
                     value = channel.multiply_add(gradient, plus=value)
-                state.store(row, 0, before.value)
-                state.store(row, 1, weight.multiply_add(value, plus=behind).value)
+                state.store(row, 0, before)
+                state.store(row, 1, weight.multiply_add(value, plus=behind))
                 if wanted == "nothing":
                     return
 
                 if wanted == "colour":
                     for total, gradient in zip(totals, gradients[:3], strict=True):
-                        value = weight.multiply_add(
-                            gradient, plus=_Lanes(builder, builder.load(total))
-                        )
-                        builder.store(value.value, total)
+                        total.store(weight.multiply_add(gradient, plus=total.load()))
                     return
 
                 q = (before * value - behind * opening) * alpha
                 q = q.where(raw.compare("<=", MAX_ALPHA), 0.0)
                 terms = [weight * gradients[3]] if wanted == "depth" else [q]
                 if wanted == "all":
-                    dys = _Lanes(builder, _broadcast(builder, dy))
+                    dys = _broadcast(builder, dy)
                     terms += [q * dys, q * dys * dys]
                     terms += [weight * gradients[index] for index in (3, 0, 1, 2)]
                 for total, term in zip(totals, terms, strict=True):
-                    value = _Lanes(builder, builder.load(total)) + term
-                    builder.store(value.value, total)
+                    total.store(total.load() + term)
 
             _loop_over_rows(builder, (begin, end), position, limits, revert)
 
-            columns = [_Lanes(builder, builder.load(total)) for total in totals]
+            columns = [total.load() for total in totals]
             if wanted == "all":
                 q, q_dy, q_dy2 = columns[:3]
                 moments = [q, q * splat.dx, q_dy, q * splat.dx * splat.dx, q_dy * splat.dx, q_dy2]

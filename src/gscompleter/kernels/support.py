@@ -11,7 +11,6 @@ BLOCK = 256
 MIN_ANGLE_WEIGHT = np.float32(1e-6)
 """Smallest angular weight: opposite photographs count if there are no others."""
 MIN_DIVISOR = np.float32(1e-20)
-"""Smallest divisor."""
 
 # Abramowitz and Stegun 4.4.46: acos(x) = sqrt(1 - x) p(x) from 0 to 1, to 2e-8.
 _A0, _A1, _A2, _A3 = map(np.float32, (1.5707963050, -0.2145988016, 0.0889789874, -0.0501743046))

@@ -49,8 +49,7 @@ def advance(top, top_step, end, end_step, iterations, state, given):
     """Run iterations on a range of rows whose ends move by a step each time.
 
     Ends may not move in more than `ITERATIONS_PER_PASS` iterations. An end that moves away leaves
-    its neighbour all the dual variables that it needs, and one that moves towards it finds the
-    same.
+    its neighbour all the dual variables it needs, and one that moves towards it finds the same.
     """
     for begin in range(0, iterations, ITERATIONS_PER_PASS):
         count = min(ITERATIONS_PER_PASS, iterations - begin)

@@ -10,9 +10,6 @@ TILE_SHIFT = 4
 """Binary logarithm of `TILE`."""
 
 
-# ---- From splats to lists ------------------------------------------------------------------------
-
-
 @njit(cache=True, nogil=True)
 def count_entries(begin, end, splats, boxes, depth_limits, tiles_x, counts):
     """Add to `counts` [tiles] int32 how many of the splats begin..end touch each tile.
@@ -92,9 +89,6 @@ def sort_lists(begin, end, tile_start, entries, keys):
                 spare_entries[place], spare_keys[place] = own_entries[k], own_keys[k]
             for k in range(size):
                 own_entries[k], own_keys[k] = spare_entries[k], spare_keys[k]
-
-
-# ---- From lists to splats ------------------------------------------------------------------------
 
 
 @njit(cache=True, nogil=True)

@@ -31,8 +31,8 @@ from gscompleter.image_ops import dilate, fill_smoothly
 from gscompleter.next_best_view.candidates import Candidate, is_close, propose_candidates
 from gscompleter.progress import stage, track
 from gscompleter.render import get_view_map
-from gscompleter.render.antialiasing import adapt_to_mode
 from gscompleter.render.lod import MAX_PREVIEW_GAUSSIANS, choose_thinned_rows, thin_gaussians
+from gscompleter.render.reference import adapt_to_mode
 from gscompleter.stages.select_anchor import compute_overlap, select_anchor
 from gscompleter.stages.target_view import compute_distrust, compute_hole_mask
 from gscompleter.state import Completion

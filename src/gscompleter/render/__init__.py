@@ -22,6 +22,8 @@ from gscompleter.types import Camera, Gaussians, Render
 
 OpacityRender = Callable[[Float[Tensor, "n"]], Render]
 """Renders a frozen scene with Gaussians that vary in opacity [n] only."""
+DepthRender = OpacityRender
+"""Renders a frozen scene with Gaussians that vary in z-depth [n] only."""
 
 OpacityImage = Callable[[Float[Tensor, "n"]], Float[Tensor, "h w 3"]]
 """The image of an `OpacityRender`."""
@@ -32,13 +34,8 @@ def restrict_to_image(plan: OpacityRender) -> OpacityImage:
     return lambda opacities: plan(opacities).image
 
 
-DepthRender = Callable[[Float[Tensor, "n"]], Render]
-"""Renders a frozen scene with Gaussians that vary in z-depth [n] only."""
-
-
 ColorSums = tuple[Float[Tensor, "n 3"], Float[Tensor, "n"]]
 """Per Gaussian: compositing weight times an image [h, w, 3], and weight, summed over pixels."""
-
 
 ColorErrors = Callable[[Float[Tensor, "n 3"], Float[Tensor, "h w 3"]], ColorSums]
 """Backprojects the residual of a photograph [h, w, 3], at given colours [n, 3]."""
@@ -51,10 +48,7 @@ def get_view_map(scene: Gaussians) -> Callable[..., Iterable[Any]]:
 
 @runtime_checkable
 class FrozenScene(Protocol):
-    """A scene prepared for one camera: whatever depends on these two alone is computed once.
-
-    Optimisations, which render the same context a hundred times, pay only for what they vary.
-    """
+    """A scene prepared for one camera: whatever depends on these two alone is computed once."""
 
     @property
     def render(self) -> Render:
@@ -97,11 +91,7 @@ class Renderer(Protocol):
 
 
 def load_renderer(name: str) -> Renderer:
-    """Load the renderer called `name`: reference, cpu or cuda.
-
-    Raises:
-        InputError: The name is unknown, or `cuda` lacks a GPU or gsplat.
-    """
+    """Load the renderer called `name`: reference, cpu or cuda."""
     if name == "cpu":
         from gscompleter.render.cpu import CpuRenderer
 
@@ -118,24 +108,14 @@ def load_renderer(name: str) -> Renderer:
 
 
 def choose_device(device: Literal["auto", "cpu", "cuda"] = "auto") -> Literal["cpu", "cuda"]:
-    """Choose the device; `auto` uses a GPU if torch finds one and gsplat is installed.
-
-    Raises:
-        InputError: The device is `cuda`, but there is no GPU or no gsplat.
-    """
-    has_gpu = torch.cuda.is_available()
-    has_gsplat = importlib.util.find_spec("gsplat") is not None
+    """Choose the device; `auto` uses a GPU if torch finds one and gsplat is installed."""
+    is_ready = torch.cuda.is_available() and importlib.util.find_spec("gsplat") is not None
+    if device == "cuda" and not is_ready:
+        raise InputError(
+            "The device cuda needs a GPU that torch sees, and gsplat from "
+            "`pip install gscompleter[cuda]`; choose the device cpu without them.",
+            "device",
+        )
     if device == "auto":
-        return "cuda" if has_gpu and has_gsplat else "cpu"
-    if device == "cuda" and not has_gpu:
-        raise InputError(
-            "The device cuda needs a GPU, and torch sees none here; choose the device cpu.",
-            "device",
-        )
-    if device == "cuda" and not has_gsplat:
-        raise InputError(
-            "The device cuda renders through gsplat, which is not installed; "
-            "run `pip install gscompleter[cuda]` or choose the device cpu.",
-            "device",
-        )
+        return "cuda" if is_ready else "cpu"
     return device

@@ -49,9 +49,8 @@ class SceneRenderer:
         self, parts: Parts, camera: Camera, known: Parts, frozen: FrozenScene | None
     ) -> FrozenScene:
         """Extend a frozen scene if the new one begins with its parts, else freeze anew."""
-        shared = len(
-            list(takewhile(lambda pair: pair[0] is pair[1], zip(known, parts, strict=False)))
-        )
+        pairs = zip(known, parts, strict=False)
+        shared = len(list(takewhile(lambda pair: pair[0] is pair[1], pairs)))
         if frozen is None or shared < len(known):
             frozen, shared = self.renderer.freeze(parts[0], camera), 1
         for part in parts[shared:]:

@@ -34,7 +34,6 @@ from gscompleter.types import Camera, Gaussians, Render
 MAX_SIDE = TILE * np.iinfo(np.int16).max
 """Largest side of an image in pixels, since kernels number tiles in 16 bits."""
 
-
 MIN_USED_SHARE = 0.9
 """Share of splats in use from which a layer is kept whole, since copying takes longer."""
 
@@ -63,8 +62,7 @@ class CpuRenderer:
 class CpuFrozenScene:
     """The frozen context: projected, sorted, binned, and cut behind opaque surfaces.
 
-    It keeps only splats that some tile shows. New Gaussians are composited only in tiles they
-    touch.
+    It keeps only splats that some tile shows. New ones are composited only in tiles they touch.
     """
 
     viewpoint: Viewpoint
@@ -134,8 +132,9 @@ class CpuFrozenScene:
         return frame, to_render(frame)
 
     def vary_opacities(self, new: Gaussians) -> OpacityRender:
-        """Project, sort and bin `new` once, with boxes that hold for every opacity."""
-        binned = self.viewpoint.bin(to_opaque_arrays(new), new.is_antialiased, self.depth_limits)
+        """Project, sort and bin `new` once at opacity 1, so that boxes hold for every opacity."""
+        opaque = to_arrays(replace(new, opacities=torch.ones_like(new.opacities)))
+        binned = self.viewpoint.bin(opaque, new.is_antialiased, self.depth_limits)
 
         def render(opacities: Float[Tensor, "n"]) -> Render:
             return Render(*_VaryOpacities.apply(self, binned, opacities.to("cpu", torch.float32)))
@@ -272,11 +271,7 @@ def freeze_nothing(viewpoint: Viewpoint) -> CpuFrozenScene:
 
 
 def make_pinhole(camera: Camera) -> Pinhole:
-    """Convert a camera for the kernels.
-
-    Raises:
-        InputError: The image is empty or larger than the kernels can number.
-    """
+    """Convert a camera for the kernels, whose image must not be too large for them."""
     if not 0 < min(camera.width, camera.height) <= max(camera.width, camera.height) <= MAX_SIDE:
         raise InputError(
             f"An image of {camera.width} x {camera.height} pixels cannot be rendered; its sides "
@@ -320,15 +315,8 @@ def join_layers(
 
 def to_arrays(gaussians: Gaussians) -> GaussianArrays:
     """Convert Gaussians for the kernels, without gradients."""
-    return GaussianArrays(
-        *(to_float32(getattr(gaussians, name)) for name in GaussianArrays._fields)
-    )
-
-
-def to_opaque_arrays(gaussians: Gaussians) -> GaussianArrays:
-    """Convert Gaussians at opacity 1, which makes their boxes hold for every opacity."""
-    arrays = to_arrays(gaussians)
-    return arrays._replace(opacities=np.ones_like(arrays.opacities))
+    tensors = (getattr(gaussians, name) for name in GaussianArrays._fields)
+    return GaussianArrays(*map(to_float32, tensors))
 
 
 def to_render(frame: RasterFrame) -> Render:

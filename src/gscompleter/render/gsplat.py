@@ -8,36 +8,21 @@ from __future__ import annotations
 
 from dataclasses import dataclass, replace
 from functools import cached_property
-from typing import Any, Protocol, runtime_checkable
+from typing import Any
 
 import torch
 from jaxtyping import Bool, Float, Int64
 from torch import Tensor
 
-from gscompleter.render import OpacityRender, Renderer, choose_device
+from gscompleter.render import OpacityRender, choose_device
 from gscompleter.render.redraw import RedrawnScene, set_colors
 from gscompleter.render.spherical_harmonics import evaluate_colors
 from gscompleter.types import Camera, Gaussians, Render, merge
 
 
-@runtime_checkable
-class CullingRenderer(Renderer, Protocol):
-    """A renderer as a `CudaFrozenScene` needs it."""
-
-    def find_visible(self, gaussians: Gaussians, camera: Camera) -> Bool[Tensor, "n"]:
-        """Return True for Gaussians that reach the image, ignoring occlusion."""
-
-    def vary_opacities(self, gaussians: Gaussians, camera: Camera) -> OpacityRender:
-        """Prepare renders with opacities [n] that are no larger than their own."""
-
-
 @dataclass(frozen=True)
 class CudaRenderer:
-    """Renders on the device of the Gaussians, which must be a CUDA device.
-
-    Raises:
-        InputError: Torch finds no GPU, or gsplat is not installed.
-    """
+    """Renders on the device of the Gaussians, which must be a CUDA device."""
 
     def __post_init__(self) -> None:
         choose_device("cuda")
@@ -52,7 +37,8 @@ class CudaRenderer:
 
     def freeze(self, context: Gaussians, camera: Camera) -> CudaFrozenScene:
         """Prepare `context` for many renders from `camera`."""
-        return freeze_with(self, context, camera)
+        rows = torch.arange(len(context), device=context.means.device)
+        return CudaFrozenScene(self, context, camera, rows, len(context))
 
     @torch.no_grad()
     def find_visible(self, gaussians: Gaussians, camera: Camera) -> Bool[Tensor, "n"]:
@@ -63,7 +49,7 @@ class CudaRenderer:
         return (radii.reshape(len(gaussians), -1) > 0).all(dim=1)
 
     def vary_opacities(self, gaussians: Gaussians, camera: Camera) -> OpacityRender:
-        """Project, sort and bin once.
+        """Project, sort and bin once; the opacities [n] must not exceed those of `gaussians`.
 
         Fainter Gaussians render the same in the larger box, where alpha 1/255 drops the rest.
         """
@@ -78,17 +64,9 @@ class CudaRenderer:
             values = torch.cat([colors[None], seen["depths"][..., None]], dim=-1)
 
         def render(opacities: Float[Tensor, "n"]) -> Render:
-            sums, alphas = rasterize_to_pixels(
-                seen["means2d"],
-                seen["conics"],
-                values,
-                (factors * opacities)[None],
-                camera.width,
-                camera.height,
-                seen["tile_size"],
-                seen["isect_offsets"],
-                seen["flatten_ids"],
-            )
+            drawn = seen["means2d"], seen["conics"], values, (factors * opacities)[None]
+            tiles = seen["tile_size"], seen["isect_offsets"], seen["flatten_ids"]
+            sums, alphas = rasterize_to_pixels(*drawn, camera.width, camera.height, *tiles)
             alpha = alphas[0, ..., 0]
             return Render(sums[0, ..., :3], sums[0, ..., 3] / alpha.clamp_min(1e-10), alpha)
 
@@ -128,7 +106,7 @@ class CudaFrozenScene(RedrawnScene):
     Each composite still projects and sorts all of them, since new ones may lie anywhere in between.
     """
 
-    renderer: CullingRenderer
+    renderer: CudaRenderer
     rows: Int64[Tensor, "m"]
     """Index in the context of each Gaussian of `scene`."""
     count: int
@@ -168,9 +146,3 @@ class CudaFrozenScene(RedrawnScene):
         opaque = replace(new, opacities=torch.ones_like(new.opacities))
         render = self.renderer.vary_opacities(merge([self.visible_scene, opaque]), self.camera)
         return lambda opacities: render(torch.cat([self.visible_scene.opacities, opacities]))
-
-
-def freeze_with(renderer: CullingRenderer, context: Gaussians, camera: Camera) -> CudaFrozenScene:
-    """Freeze all of `context`."""
-    rows = torch.arange(len(context), device=context.means.device)
-    return CudaFrozenScene(renderer, context, camera, rows, len(context))

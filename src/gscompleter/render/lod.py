@@ -79,8 +79,8 @@ def find_run_starts(
         growth *= 2
 
 
-MAX_GAUSSIANS = 400_000
-"""Largest number kept: several per pixel of a small image."""
+MAX_GAUSSIANS, MAX_PREVIEW_GAUSSIANS = 400_000, 25_000
+"""Largest number kept by default, and for previews: several per pixel of a small image."""
 SAMPLE_SIZE = 100_000
 """Gaussians from which the distribution of sizes is estimated."""
 
@@ -106,8 +106,7 @@ def choose_thinned_rows(
         return torch.arange(len(scene), device=scene.means.device), torch.ones_like(scene.opacities)
     chance = compute_keep_probabilities(scene, max_gaussians)
     place = chance.double().cumsum(0).floor()
-    stays = place > torch.nn.functional.pad(place[:-1], (1, 0))
-    rows = torch.nonzero(stays)[:, 0]
+    rows = torch.nonzero(place > torch.nn.functional.pad(place[:-1], (1, 0)))[:, 0]
     return rows, chance[rows].rsqrt()
 
 
@@ -121,7 +120,3 @@ def compute_keep_probabilities(scene: Gaussians, max_gaussians: int) -> Float[Te
     sample = size[:: max(1, len(size) // SAMPLE_SIZE)]
     size = size.clamp(max=sample.quantile(0.99)).clamp_min(1e-30)
     return (max_gaussians * (size / size.sum(dtype=torch.float64))).clamp(max=1).to(size)
-
-
-MAX_PREVIEW_GAUSSIANS = 25_000
-"""Gaussians of a simplified scene: several per pixel of the small images."""

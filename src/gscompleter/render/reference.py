@@ -2,14 +2,15 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+import math
+from dataclasses import dataclass, replace
 
 import torch
 from jaxtyping import Float
 from torch import Tensor
 from torch.utils.checkpoint import checkpoint
 
-from gscompleter.geometry import quats_to_rotations
+from gscompleter.geometry import compute_z_depths, quats_to_rotations
 from gscompleter.render.redraw import RedrawnScene
 from gscompleter.render.spherical_harmonics import evaluate_colors
 from gscompleter.types import Camera, Gaussians, Render
@@ -101,12 +102,9 @@ def compute_jacobians(
     """Compute the Jacobian of the projection at points in the camera, with clamped tangents."""
     fx, fy, cx, cy = K[0, 0], K[1, 1], K[0, 2], K[1, 2]
     x, y, z = points.unbind(-1)
-    tan_x = (x / z).clamp(
-        -(cx + TANGENT_MARGIN * width) / fx, (width - cx + TANGENT_MARGIN * width) / fx
-    )
-    tan_y = (y / z).clamp(
-        -(cy + TANGENT_MARGIN * height) / fy, (height - cy + TANGENT_MARGIN * height) / fy
-    )
+    margin_x, margin_y = TANGENT_MARGIN * width, TANGENT_MARGIN * height
+    tan_x = (x / z).clamp(-(cx + margin_x) / fx, (width - cx + margin_x) / fx)
+    tan_y = (y / z).clamp(-(cy + margin_y) / fy, (height - cy + margin_y) / fy)
     zero = torch.zeros_like(z)
     rows = [
         torch.stack([fx / z, zero, -fx * tan_x / z], dim=-1),
@@ -127,10 +125,7 @@ def compute_compensations(
 ) -> Float[Tensor, "n"]:
     """Compute the factors on opacities that compensate for the low-pass when antialiased.
 
-    Args:
-        flat: Axes of the Gaussians in the image; `flat @ flat.T` is the covariance before the
-            low-pass.
-        covariances: Covariances after it.
+    The low-pass widens `flat @ flat.T` to `covariances`.
     """
     # Lagrange's identity gives the determinant of `flat @ flat.T` without cancellation.
     area = torch.linalg.cross(flat[:, 0], flat[:, 1]).norm(dim=-1)
@@ -153,3 +148,16 @@ def composite(
     before = torch.cat([torch.ones_like(behind[:1]), behind[:-1]])
     weights = alpha * before
     return weights.T @ splats.colors, weights.T @ splats.depths, weights.sum(dim=0)
+
+
+def adapt_to_mode(scene: Gaussians, gaussians: Gaussians, camera: Camera) -> Gaussians:
+    """Adapt Gaussians made for the pixels of `camera` to the rendering mode of `scene`.
+
+    Classic rendering widens each splat by the low-pass and keeps its opacity; antialiased rendering
+    lowers it. So the low-pass becomes part of the Gaussians' size, with the same total coverage.
+    """
+    if gaussians.is_antialiased or not scene.is_antialiased:
+        return gaussians
+    pixel = compute_z_depths(gaussians.means, camera) * 2 / (camera.K[0, 0] + camera.K[1, 1])
+    scales = torch.hypot(gaussians.scales, math.sqrt(BLUR) * pixel[:, None])
+    return replace(gaussians, scales=scales, encoded=None, is_antialiased=True)

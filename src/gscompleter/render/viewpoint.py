@@ -122,10 +122,7 @@ class Viewpoint:
             )
         tile_start = tiles.counts_to_offsets(counts)
         entries, keys = np.empty(total, np.int32), np.empty(total, np.uint32)
-        filling = [
-            (*chunk, *seen, places, entries, keys)
-            for chunk, places in zip(chunks, counts, strict=True)
-        ]
+        filling = [(*call, entries, keys) for call in counting]
         run(tiles.fill_entries, filling, self.threads)
         self.share(tiles.sort_lists, self.tiles, tile_start, entries, keys)
         return Layer(splats.columns, splats.opacities, splats.boxes, tile_start, entries)

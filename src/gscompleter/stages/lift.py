@@ -9,7 +9,7 @@ from torch import Tensor
 
 from gscompleter.geometry import is_inside, project
 from gscompleter.reconstructors import Reconstructor, run_reconstructor
-from gscompleter.render.antialiasing import adapt_to_mode
+from gscompleter.render.reference import adapt_to_mode
 from gscompleter.stages.target_view import TargetView
 from gscompleter.timing import timed_stage
 from gscompleter.types import Lift, View
