@@ -143,7 +143,10 @@ def find_dynamic_masks(
             (one, other), pair, find_mutual_regions(*pair), strict=True
         ):
             votes[index] += region.int() - (comparison.match_mask & ~region).int()
-    return [resize_mask(vote > 0, view.camera) for vote, view in zip(votes, views, strict=True)]
+    return [
+        interpolate((vote > 0)[None, None].float(), view.image.shape[:2])[0, 0] > 0
+        for vote, view in zip(votes, views, strict=True)
+    ]
 
 
 def pair_with_neighbours(cameras: Sequence[Camera]) -> list[tuple[int, int]]:
@@ -278,9 +281,3 @@ def split_parts(mask: UInt8[np.ndarray, "h w"]) -> Iterator[Bool[np.ndarray, "h 
 def make_disc(radius: int) -> np.ndarray:
     """Make a disc for morphological operations."""
     return cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (2 * radius + 1, 2 * radius + 1))
-
-
-def resize_mask(mask: Bool[Tensor, "small_h small_w"], camera: Camera) -> Bool[Tensor, "h w"]:
-    """Resize a small mask to the image of a camera."""
-    size = camera.height, camera.width
-    return interpolate(mask[None, None].float(), size)[0, 0] > 0

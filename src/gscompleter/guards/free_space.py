@@ -66,11 +66,7 @@ def respect_free_space(
     footprint: Literal["constant", "fixed"],
     config: FreeSpaceConfig = FreeSpaceConfig(),
 ) -> tuple[Gaussians, Bool[Tensor, "n"]]:
-    """Slide Gaussians back along their target rays until they leave observed free space.
-
-    Returns:
-        The Gaussians, and a mask of those that found a position [n].
-    """
+    """Slide Gaussians back along target rays out of free space; mark those that found a place."""
     ratio = torch.ones_like(gaussians.opacities)
     offsets = gaussians.means - target.center
     waiting = torch.arange(len(gaussians), device=ratio.device)

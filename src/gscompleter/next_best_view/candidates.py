@@ -154,9 +154,6 @@ def compute_depth_quantiles(renders: Sequence[Render], share: float) -> list[flo
     """Compute a quantile of the z-depths in each render, in scene units.
 
     A render that shows hardly anything of the scene gets the quantile over all renders.
-
-    Raises:
-        ValueError: No render shows anything.
     """
     valid = [render.depth_map().valid for render in renders]
     own = [render.depth[where] for render, where in zip(renders, valid, strict=True)]

@@ -23,8 +23,6 @@ MIN_CONTRAST = 0.02
 """Brightness range in 5 x 5 smoothed pixels that counts as texture; colours are in [0, 1]."""
 MIN_TEXTURED = 0.01
 """Smallest textured fraction of an image."""
-
-
 COLOR_TOLERANCE = 0.01
 """Largest tolerated excess of a colour beyond [0, 1], as resampling causes it."""
 
@@ -184,9 +182,6 @@ def measure_depth_range(
     """Measure near and far plane of an input splat from its rendered depths, in scene units.
 
     Half the nearest and twice the farthest percentile leave space for what the scene lacks.
-
-    Raises:
-        InputError: No camera sees the scene.
     """
     depths = []
     for camera in cameras:

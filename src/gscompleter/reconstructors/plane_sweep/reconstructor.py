@@ -39,9 +39,6 @@ class PlaneSweep(Splatter):
         """Reconstruct the scene and the depth of every pixel.
 
         More than two large views are matched at half size, which takes an eighth of the time.
-
-        Raises:
-            InputError: There are fewer than two views, no baseline, or the depth range is empty.
         """
         views = set_depth_range(views, *get_depth_range(views))
         rig = build_rig(views)
