@@ -52,7 +52,6 @@ class GSCompleter:
     )
     """Φ: nearest view and target camera -> image."""
     renderer: Renderer = field(default_factory=lambda: load_renderer("cpu"))
-    """Differentiable renderer of Gaussians."""
     config: CompleterConfig | None = None
     """Settings, or None for the preset that fits the input: `CompleterConfig.splat()` for a scene
     with check views, `CompleterConfig()` for all others."""

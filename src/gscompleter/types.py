@@ -395,7 +395,6 @@ class DepthPairs:
     predicted: Float[Tensor, "n"]
     context: Float[Tensor, "n"]
     inlier_mask: Bool[Tensor, "n"]
-    """True for inliers of the affine."""
 
     @staticmethod
     def empty() -> DepthPairs:

@@ -88,13 +88,11 @@ class Comparison:
     """Positions in the other photograph."""
     z: Float[Tensor, "h w"]
     in_frame_mask: Bool[Tensor, "h w"]
-    """True inside the other image."""
     valid_mask: Bool[Tensor, "h w"]
     """True where both photographs have a known surface."""
     visible_mask: Bool[Tensor, "h w"]
     """True where, besides, no surface of the other photograph is in front."""
     differs_mask: Bool[Tensor, "h w"]
-    """True where the colours differ."""
 
     @property
     def match_mask(self) -> Bool[Tensor, "h w"]:
@@ -139,9 +137,8 @@ def find_dynamic_masks(
     votes = [torch.zeros_like(photo.valid_mask, dtype=torch.int32) for photo in photos]
     for one, other in pair_with_neighbours([view.camera for view in views]):
         pair = compare_both_ways(photos[one], photos[other], config.min_color_difference)
-        for index, comparison, region in zip(
-            (one, other), pair, find_mutual_regions(*pair), strict=True
-        ):
+        regions = find_mutual_regions(*pair)
+        for index, comparison, region in zip((one, other), pair, regions, strict=True):
             votes[index] += region.int() - (comparison.match_mask & ~region).int()
     return [
         interpolate((vote > 0)[None, None].float(), view.image.shape[:2])[0, 0] > 0

@@ -63,9 +63,8 @@ def propose_candidates(
     found = []
     for index, (base, depth) in enumerate(zip(bases, depths, strict=True)):
         longest = config.max_step * depth
-        away = make_moves(
-            base, depth, min(step, longest) if step > 0 else longest, config.yaw_fraction, up
-        )
+        length = min(step, longest) if step > 0 else longest
+        away = make_moves(base, depth, length, config.yaw_fraction, up)
         if stays_beside:
             between = [interpolate_camera(base, bases[other], 0.5) for other in similar[index]]
             away = [*(away[move] for move in MOVES_ASIDE), *between]

@@ -49,7 +49,6 @@ class Choice:
 
     candidate: Candidate
     hole_fraction: float
-    """Fraction of its image in holes."""
     gain: float
     """Expected gain, as a fraction of its image."""
 

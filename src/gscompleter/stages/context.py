@@ -94,7 +94,9 @@ def take_scene(
 
     The proxy is made fine enough for all photographs and targets.
     """
-    check_finite(scene)
+    parts = (scene.means, scene.quats, scene.scales, scene.opacities)
+    if not all(bool(part.isfinite().all()) for part in parts):
+        raise InputError("The scene holds NaN or infinity; remove such Gaussians.")
     photos = [*views, *check_views]
     source = build_proxy(scene, [*targets, *(view.camera for view in photos)])
     near, far = find_depth_range(views, source.rendered, renderer)
@@ -110,13 +112,6 @@ def check_colors(views: Sequence[View]) -> None:
                 f"The image of view {number} has values from {low:g} to {high:g}; colours in "
                 "[0, 1] are needed."
             )
-
-
-def check_finite(scene: Gaussians) -> None:
-    """Raise InputError for NaN or infinity in a scene."""
-    parts = (scene.means, scene.quats, scene.scales, scene.opacities)
-    if not all(bool(part.isfinite().all()) for part in parts):
-        raise InputError("The scene holds NaN or infinity; remove such Gaussians.")
 
 
 def check_texture(views: Sequence[View]) -> None:

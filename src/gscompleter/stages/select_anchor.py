@@ -52,8 +52,6 @@ def select_anchor(
     `min_baseline` and `min_overlap` (fraction of the target's visible surfaces) unless no view has
     them.
     """
-    if not views:
-        raise ValueError("select_anchor needs at least one observed view, got none")
     if config.selection == "nearest":
         return AnchorChoice(find_nearest_view(target, views), fallback=False)
 
@@ -79,9 +77,5 @@ def compute_overlap(camera: Camera, render: Render, anchor: Camera, at_anchor: R
         return 0.0
     pixels, z = project(points, anchor)
     surface = sample(at_anchor.depth[..., None], pixels)[:, 0]
-    return (
-        (is_inside(pixels, z, anchor) & (z < (1 + SURFACE_TOLERANCE) * surface))
-        .float()
-        .mean()
-        .item()
-    )
+    shared = is_inside(pixels, z, anchor) & (z < (1 + SURFACE_TOLERANCE) * surface)
+    return shared.float().mean().item()

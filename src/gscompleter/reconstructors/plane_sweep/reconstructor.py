@@ -43,9 +43,8 @@ class PlaneSweep(Splatter):
         views = set_depth_range(views, *get_depth_range(views))
         rig = build_rig(views)
         layers = self.compute_layers(rig, views)
-        return self.build_scene(
-            views, make_depth_maps(layers, rig.unit, views), layers, rig.transforms
-        )
+        depths = make_depth_maps(layers, rig.unit, views)
+        return self.build_scene(views, depths, layers, rig.transforms)
 
     def lift(self, views: Sequence[View], pixel_mask: Bool[Tensor, "h w"]) -> Reconstruction:
         """Lift the pixels of `pixel_mask` in the first view, a synthesized image.
