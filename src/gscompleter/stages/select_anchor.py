@@ -52,6 +52,8 @@ def select_anchor(
     `min_baseline` and `min_overlap` (fraction of the target's visible surfaces) unless no view has
     them.
     """
+    if not views:
+        raise ValueError("select_anchor needs at least one observed view, got none")
     if config.selection == "nearest":
         return AnchorChoice(find_nearest_view(target, views), fallback=False)
 

@@ -52,7 +52,9 @@ def convert_output(output: GeneratorOutput, target: Camera) -> GeneratedView:
     expected = (target.height, target.width, 3)
     if tuple(output.image.shape) != expected or not torch.isfinite(output.image).all():
         shape = tuple(output.image.shape)
-        raise ValueError(f"the generator must return a finite {expected} image, got {shape}")
+        raise ValueError(
+            f"the generator must return a finite image of shape {expected}, got {shape}"
+        )
     return GeneratedView(
         output.image,
         target,
