@@ -29,12 +29,7 @@ from gscompleter.stages.refine import refine
 from gscompleter.stages.slide_along_rays import slide_along_rays
 from gscompleter.stages.synthesize import GeneratedView, synthesize
 from gscompleter.stages.target_view import TargetView, render_target
-from gscompleter.state import (
-    NEW_PHOTO_ID,
-    Completion,
-    Photo,
-    find_last_target_id,
-)
+from gscompleter.state import NEW_PHOTO_ID, Completion, Photo, find_last_target_id
 from gscompleter.timing import record_seconds, timed_stage
 from gscompleter.trust.photometric import load_trust
 from gscompleter.types import Camera, Gaussians, PaddedCamera, View
@@ -57,7 +52,6 @@ class GSCompleter:
     )
     """Φ: nearest view and target camera -> image."""
     renderer: Renderer = field(default_factory=lambda: load_renderer("cpu"))
-    """Differentiable renderer of Gaussians."""
     config: CompleterConfig | None = None
     """Settings, or None for the preset that fits the input: `CompleterConfig.splat()` for a scene
     with check views, `CompleterConfig()` for all others."""
@@ -118,17 +112,9 @@ class GSCompleter:
         check_views: Sequence[View] | None = None,
         targets: Sequence[Camera] = (),
     ) -> Completion:
-        """Initialize the context (stage 1; paper, Eq. 5).
+        """Initialize the context (stage 1; paper, Eq. 5); arguments and errors as in `__call__`.
 
-        Args:
-            views: As in `__call__`.
-            scene: As in `__call__`.
-            check_views: As in `__call__`.
-            targets: Targets that are known already. The LOD proxy of a large scene is made fine
-                enough for them and the photographs.
-
-        Raises:
-            InputError: Too few views, no baseline, or no view sees the scene.
+        The LOD proxy of a large scene is made fine enough for photographs and known targets.
         """
         config = choose_config(self.config, scene, check_views)
         with record_seconds() as seconds, timed_stage("context"):
@@ -150,14 +136,8 @@ class GSCompleter:
     ) -> Completion:
         """Complete the scene for one more target (stages 2 to 4 of the paper).
 
-        Args:
-            state: The scene so far; it is not changed.
-            target: Camera to complete the scene for.
-            reference: Image at the target, padded if Φ supports it, if it was synthesized in
-                advance.
-
-        Raises:
-            InputError: The scene holds as many targets as a .ply can tell apart.
+        `reference` is the image at the target if it was synthesized in advance, padded if Φ
+        supports it.
         """
         check_target_ids(state.context, len(state.targets) + 1)
         rng = torch.Generator().manual_seed(self.seed)

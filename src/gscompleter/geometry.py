@@ -134,9 +134,8 @@ def pad_pixels(camera: Camera, left: int, top: int) -> PaddedCamera:
 
 def pad_like(camera: Camera, padded: Camera) -> PaddedCamera:
     """Pad the image of `camera` to the size of `padded`, centred."""
-    return pad_pixels(
-        camera, (padded.width - camera.width) // 2, (padded.height - camera.height) // 2
-    )
+    left, top = (padded.width - camera.width) // 2, (padded.height - camera.height) // 2
+    return pad_pixels(camera, left, top)
 
 
 def is_same_camera(a: Camera, b: Camera) -> bool:
@@ -219,9 +218,8 @@ def estimate_up(cameras: Sequence[Camera]) -> Float[Tensor, "3"]:
 def shrink_camera(camera: Camera, side: int) -> Camera:
     """Reduce the image of a camera to at most `side` pixels on its longer side."""
     factor = min(side / max(camera.width, camera.height), 1.0)
-    return resize_camera(
-        camera, *(max(round(factor * n), 1) for n in (camera.width, camera.height))
-    )
+    width, height = (max(round(factor * side), 1) for side in (camera.width, camera.height))
+    return resize_camera(camera, width, height)
 
 
 def resize_camera(camera: Camera, width: int, height: int) -> Camera:

@@ -15,9 +15,7 @@ from torch.optim.adam import adam
 class Adam:
     """The Adam optimiser with one step size per variable.
 
-    Args:
-        rates: Tensors to optimise, each with its step size.
-        betas: Decay of the running means of gradients and squared gradients.
+    `betas` are the decay of the running means of gradients and squared gradients.
     """
 
     def __init__(

@@ -49,11 +49,7 @@ def mask_out_sky(render: Render, camera: Camera) -> DepthMap:
 def extend_sky(
     view: View, sky: Bool[Tensor, "h w"], sigma: float
 ) -> tuple[Gaussians, Int[Tensor, "n"]]:
-    """Extend the sky behind bordering surfaces, by Gaussians of `sigma` pixels.
-
-    Returns:
-        Gaussians and their row-major pixels.
-    """
+    """Extend the sky behind surfaces by Gaussians of `sigma` pixels; return their pixels, too."""
     camera, image = view.camera, view.image
     reach = round(SKY_EXTENSION * min(camera.width, camera.height))
     where = dilate(sky, reach) & ~sky

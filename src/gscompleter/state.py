@@ -1,10 +1,4 @@
-"""Values that the stages exchange, and their conventions.
-
-OpenCV axes (x right, y down, z forward). `c2w` is camera-to-world. Intrinsics are in pixels; the
-centre of the top-left pixel is (0.5, 0.5). Images are [h, w, 3] in [0, 1]. `depth` is z-depth in
-scene units, `distance` is Euclidean along a unit ray. Quaternions are wxyz, scales linear,
-opacities in [0, 1], spherical harmonics [n, k, 3] in the 3DGS basis. All values are immutable.
-"""
+"""A scene during completion, and the result of each target; conventions are in `types`."""
 
 from __future__ import annotations
 
@@ -56,7 +50,6 @@ class Rejection:
     """The guard that removed everything that was generated for a target, if one did."""
 
     guard: str = ""
-    """Name of the guard; empty if none did."""
     reason: str = ""
     """Sentence for the report; empty if the notes of Φ say it."""
 

@@ -147,9 +147,8 @@ class PaddedCamera:
     padded: Camera
     """The padded camera; its rays through the pixels of `target` are those of `target`."""
     left: int
-    """Padding in pixels on the left and on the right each."""
+    """Padding in pixels on the left and on the right each; `top` likewise."""
     top: int
-    """Padding in pixels at the top and at the bottom each."""
 
     def crop(self, image: Shaped[Tensor, "wide_h wide_w *c"]) -> Shaped[Tensor, "h w *c"]:
         """Cut the padding off an image of `pad_depth`."""
@@ -198,9 +197,8 @@ class View(TensorDataclass):
     @property
     def static_mask(self) -> Bool[Tensor, "h w"]:
         """True where completion may copy from the image: valid and not dynamic."""
-        return (
-            self.valid_mask if self.dynamic_mask is None else self.valid_mask & ~self.dynamic_mask
-        )
+        valid = self.valid_mask
+        return valid if self.dynamic_mask is None else valid & ~self.dynamic_mask
 
     def fill_ignored(self, image: Float[Tensor, "h w 3"]) -> Float[Tensor, "h w 3"]:
         """Replace ignored pixels of a render by those of the photograph."""
@@ -265,13 +263,7 @@ def make_observed(
 
 
 def merge(parts: Sequence[Gaussians]) -> Gaussians:
-    """Concatenate Gaussians; SH of lower degree are padded with zeros, which changes no colour.
-
-    Raises:
-        ValueError: No parts, or antialiased Gaussians mixed with classic ones.
-    """
-    if not parts:
-        raise ValueError("merge needs at least one set of Gaussians, got none")
+    """Concatenate Gaussians; SH of lower degree are padded with zeros, which changes no colour."""
     if len({part.is_antialiased for part in parts}) > 1:
         raise ValueError("antialiased Gaussians cannot be merged with others")
     k = max(part.sh.shape[1] for part in parts)
@@ -281,15 +273,12 @@ def merge(parts: Sequence[Gaussians]) -> Gaussians:
         part.means.new_full((len(part), 4), unknown) if part.encoded is None else part.encoded
         for part in parts
     ]
+    names = ("means", "quats", "scales", "opacities", "generated")
     return Gaussians(
-        torch.cat([part.means for part in parts]),
-        torch.cat([part.quats for part in parts]),
-        torch.cat([part.scales for part in parts]),
-        torch.cat([part.opacities for part in parts]),
-        torch.cat(sh),
-        torch.cat([part.generated for part in parts]),
-        torch.cat(encoded) if any(part.encoded is not None for part in parts) else None,
-        parts[0].is_antialiased,
+        **{name: torch.cat([getattr(part, name) for part in parts]) for name in names},
+        sh=torch.cat(sh),
+        encoded=torch.cat(encoded) if any(part.encoded is not None for part in parts) else None,
+        is_antialiased=parts[0].is_antialiased,
     )
 
 
@@ -406,7 +395,6 @@ class DepthPairs:
     predicted: Float[Tensor, "n"]
     context: Float[Tensor, "n"]
     inlier_mask: Bool[Tensor, "n"]
-    """True for inliers of the affine."""
 
     @staticmethod
     def empty() -> DepthPairs:

@@ -88,13 +88,11 @@ class Comparison:
     """Positions in the other photograph."""
     z: Float[Tensor, "h w"]
     in_frame_mask: Bool[Tensor, "h w"]
-    """True inside the other image."""
     valid_mask: Bool[Tensor, "h w"]
     """True where both photographs have a known surface."""
     visible_mask: Bool[Tensor, "h w"]
     """True where, besides, no surface of the other photograph is in front."""
     differs_mask: Bool[Tensor, "h w"]
-    """True where the colours differ."""
 
     @property
     def match_mask(self) -> Bool[Tensor, "h w"]:
@@ -139,11 +137,13 @@ def find_dynamic_masks(
     votes = [torch.zeros_like(photo.valid_mask, dtype=torch.int32) for photo in photos]
     for one, other in pair_with_neighbours([view.camera for view in views]):
         pair = compare_both_ways(photos[one], photos[other], config.min_color_difference)
-        for index, comparison, region in zip(
-            (one, other), pair, find_mutual_regions(*pair), strict=True
-        ):
+        regions = find_mutual_regions(*pair)
+        for index, comparison, region in zip((one, other), pair, regions, strict=True):
             votes[index] += region.int() - (comparison.match_mask & ~region).int()
-    return [resize_mask(vote > 0, view.camera) for vote, view in zip(votes, views, strict=True)]
+    return [
+        interpolate((vote > 0)[None, None].float(), view.image.shape[:2])[0, 0] > 0
+        for vote, view in zip(votes, views, strict=True)
+    ]
 
 
 def pair_with_neighbours(cameras: Sequence[Camera]) -> list[tuple[int, int]]:
@@ -278,9 +278,3 @@ def split_parts(mask: UInt8[np.ndarray, "h w"]) -> Iterator[Bool[np.ndarray, "h 
 def make_disc(radius: int) -> np.ndarray:
     """Make a disc for morphological operations."""
     return cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (2 * radius + 1, 2 * radius + 1))
-
-
-def resize_mask(mask: Bool[Tensor, "small_h small_w"], camera: Camera) -> Bool[Tensor, "h w"]:
-    """Resize a small mask to the image of a camera."""
-    size = camera.height, camera.width
-    return interpolate(mask[None, None].float(), size)[0, 0] > 0

@@ -66,11 +66,7 @@ def respect_free_space(
     footprint: Literal["constant", "fixed"],
     config: FreeSpaceConfig = FreeSpaceConfig(),
 ) -> tuple[Gaussians, Bool[Tensor, "n"]]:
-    """Slide Gaussians back along their target rays until they leave observed free space.
-
-    Returns:
-        The Gaussians, and a mask of those that found a position [n].
-    """
+    """Slide Gaussians back along target rays out of free space; mark those that found a place."""
     ratio = torch.ones_like(gaussians.opacities)
     offsets = gaussians.means - target.center
     waiting = torch.arange(len(gaussians), device=ratio.device)
@@ -82,11 +78,8 @@ def respect_free_space(
         ratio[waiting] = (1 + SLIDE_STEP) ** (step + 1)
     if any(is_sky_visible(render, camera) for render, camera in zip(renders, cameras, strict=True)):
         # Gaussians that find no position up to the sky become part of the sky.
-        behind = (
-            (1 + SLIDE_STEP)
-            * compute_sky_depth(target)
-            / compute_z_depths(gaussians.means[waiting], target)
-        )
+        depths = compute_z_depths(gaussians.means[waiting], target)
+        behind = (1 + SLIDE_STEP) * compute_sky_depth(target) / depths
         means = target.center + behind[:, None] * offsets[waiting]
         found = ~find_in_free_space(means, cameras, renders)
         ratio[waiting[found]] = behind[found]

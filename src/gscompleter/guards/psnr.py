@@ -78,18 +78,11 @@ def set_error_budgets(
     tolerance: float,
     ssim_tolerance: float,
 ) -> tuple[ErrorBudget, ...]:
-    """Set the error budgets of a photograph.
+    """Set the error budgets of a photograph from the render and holes of the context there.
 
-    Args:
-        photograph: Reference of the comparison.
-        image: Render of the context at its camera.
-        holes: Hole mask of the context there.
-        tolerance: Largest loss of PSNR in dB.
-        ssim_tolerance: Largest loss of SSIM.
-
-    Returns:
-        Budgets of the mean squared error without the holes, then over the whole photograph, then of
-        SSIM. The first exists so that closing a hole cannot compensate for an error elsewhere.
+    They limit the mean squared error without the holes, so that closing a hole cannot compensate
+    for an error elsewhere, then over the whole photograph (both by a loss of PSNR in dB), then the
+    loss of SSIM.
     """
 
     def budget(view: View, metric: Literal["mse", "dssim"]) -> ErrorBudget:
@@ -131,10 +124,8 @@ def meet_error_budgets(
 
     In a photograph over budget, opacities with a harmful gradient are halved, the most harmful
     first and no more than needed. If that fails (two Gaussians may occlude each other), Gaussians
-    at the worst pixels are removed, finally all that the photograph sees.
-
-    Returns:
-        The Gaussians, or none of them if they lose more than `max_loss` of their opacity.
+    at the worst pixels are removed, finally all that the photograph sees. None are left if they
+    would lose more than `max_opacity_loss` of their opacity.
     """
     if len(added) == 0:
         return added

@@ -63,9 +63,8 @@ def propose_candidates(
     found = []
     for index, (base, depth) in enumerate(zip(bases, depths, strict=True)):
         longest = config.max_step * depth
-        away = make_moves(
-            base, depth, min(step, longest) if step > 0 else longest, config.yaw_fraction, up
-        )
+        length = min(step, longest) if step > 0 else longest
+        away = make_moves(base, depth, length, config.yaw_fraction, up)
         if stays_beside:
             between = [interpolate_camera(base, bases[other], 0.5) for other in similar[index]]
             away = [*(away[move] for move in MOVES_ASIDE), *between]
@@ -154,9 +153,6 @@ def compute_depth_quantiles(renders: Sequence[Render], share: float) -> list[flo
     """Compute a quantile of the z-depths in each render, in scene units.
 
     A render that shows hardly anything of the scene gets the quantile over all renders.
-
-    Raises:
-        ValueError: No render shows anything.
     """
     valid = [render.depth_map().valid for render in renders]
     own = [render.depth[where] for render, where in zip(renders, valid, strict=True)]

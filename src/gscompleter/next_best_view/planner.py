@@ -42,9 +42,6 @@ from gscompleter.types import Camera, ContextScene, Gaussians, Render, make_obse
 MAX_FREE_SPACE_CAMERAS = 40
 """Most cameras of photographs, besides the context views, whose free space is kept empty."""
 
-CompletionStep = Callable[[Completion, Camera], Completion]
-"""Step that is taken at a chosen camera."""
-
 
 @dataclass(frozen=True)
 class Choice:
@@ -52,7 +49,6 @@ class Choice:
 
     candidate: Candidate
     hole_fraction: float
-    """Fraction of its image in holes."""
     gain: float
     """Expected gain, as a fraction of its image."""
 
@@ -60,10 +56,6 @@ class Choice:
     def camera(self) -> Camera:
         """Camera of the candidate."""
         return self.candidate.camera
-
-    def is_near(self, other: Candidate, step: float) -> bool:
-        """Return True if another candidate is at most one step away, as in `choose_best`."""
-        return compute_remoteness(other.camera, [self.camera], step) <= 1
 
 
 @dataclass(frozen=True)
@@ -88,17 +80,13 @@ class ViewPlanner:
     ) -> tuple[Completion, tuple[Choice, ...]]:
         """Choose up to `count` target cameras and complete the scene for each.
 
-        Args:
-            completion: The scene so far, such as `GSCompleter.begin` returns.
-            cameras: Cameras of all photographs of the scene, used for the context or not.
-            count: Largest number of targets; there are fewer if little is left to gain.
+        `cameras` are those of all photographs of the scene, used for the context or not.
         """
         before = completion.seconds["total"]
         with record_seconds() as seconds:
             completion = add_free_space_cameras(completion, cameras)
-            completion, choices = self.complete_greedily(
-                completion, cameras, count, self.completer.advance
-            )
+            advance = self.completer.advance
+            completion, choices = self.complete_greedily(completion, cameras, count, advance)
         total = before + seconds["total"]
         explore = total - completion.seconds["total"]
         recorded = {**completion.seconds, "explore": explore, "total": total}
@@ -111,9 +99,8 @@ class ViewPlanner:
 
         Grey placeholders close the holes of each chosen camera.
         """
-        return self.complete_greedily(
-            simplify_completion(completion), cameras, count, self.add_placeholders
-        )[1]
+        small = simplify_completion(completion)
+        return self.complete_greedily(small, cameras, count, self.add_placeholders)[1]
 
     def compute_hole_fractions(
         self, completion: Completion, cameras: Sequence[Camera]
@@ -130,7 +117,7 @@ class ViewPlanner:
         completion: Completion,
         cameras: Sequence[Camera],
         count: int,
-        complete: CompletionStep,
+        complete: Callable[[Completion, Camera], Completion],
     ) -> tuple[Completion, tuple[Choice, ...]]:
         """Repeatedly choose the best camera and complete the scene there."""
         with stage("finding targets"):
@@ -147,7 +134,8 @@ class ViewPlanner:
             left = [c.candidate for c in choices if c.gain >= config.min_gain]
             remaining = [candidate for candidate in left if candidate is not choice.candidate]
             if completion.config.trust != "full":  # one attempt for each place
-                remaining = [c for c in remaining if not choice.is_near(c, step)]
+                at = [choice.camera]
+                remaining = [c for c in remaining if compute_remoteness(c.camera, at, step) > 1]
         return completion, tuple(chosen)
 
     def find_candidates(
@@ -217,11 +205,8 @@ def add_free_space_cameras(completion: Completion, cameras: Sequence[Camera]) ->
     An input splat gets none: its renders may be wrong there, and check views protect it better.
     """
     taken = [view.camera for view in completion.views]
-    others = [
-        completion.with_depth_range(c)
-        for c in cameras
-        if not any(is_same_camera(c, t) for t in taken)
-    ]
+    new = [c for c in cameras if not any(is_same_camera(c, t) for t in taken)]
+    others = list(map(completion.with_depth_range, new))
     if completion.config.trust == "photometric" or not others:
         return completion
     chosen = select_spread_cameras(others, MAX_FREE_SPACE_CAMERAS)

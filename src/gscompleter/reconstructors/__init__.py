@@ -105,15 +105,10 @@ def check_reconstructor(name: str) -> None:
 def load_reconstructor(
     name: str, weights: Path | str | None = None, device: str = "cpu"
 ) -> Reconstructor:
-    """Load a reconstructor by name.
+    """Load a reconstructor by name, with published weights unless others are given.
 
-    Args:
-        name: A key of `list_reconstructors()`.
-        weights: Path of the weights; None uses the published ones and downloads them if needed.
-        device: Device of the network. `plane-sweep` always runs on the CPU.
-
-    Raises:
-        InputError: The name is unknown, or the weights are not needed, not available or do not fit.
+    Published weights are downloaded if needed. `device` is that of the network; `plane-sweep`
+    always runs on the CPU.
     """
     check_reconstructor(name)
     load = RECONSTRUCTORS.get(name) or list_reconstructors()[name]

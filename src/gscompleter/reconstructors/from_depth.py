@@ -19,7 +19,6 @@ from gscompleter.reconstructors.features.stereo_image import (
 )
 from gscompleter.reconstructors.plane_sweep.fusion import Layer
 from gscompleter.reconstructors.plane_sweep.gaussians import Splatter
-from gscompleter.reconstructors.plane_sweep.rig import Transforms
 from gscompleter.types import DepthMap, Reconstruction, View
 
 
@@ -44,7 +43,9 @@ class FromDepth(Splatter):
         images, unit = make_stereo_images(views)
         depths = self.model(views)
         layers = [make_layer(*pair, unit) for pair in zip(images, depths, strict=True)]
-        return self.build_scene(views, depths, layers, compute_transforms(images))
+        pairs = permutations(range(len(images)), 2)
+        transforms = {(i, j): compute_source_from_reference(images[i], images[j]) for i, j in pairs}
+        return self.build_scene(views, depths, layers, transforms)
 
     def lift(self, views: Sequence[View], pixel_mask: Bool[Tensor, "h w"]) -> Reconstruction:
         """Lift the pixels of `pixel_mask` in the first view; errors as in `__call__`."""
@@ -57,9 +58,3 @@ def make_layer(image: StereoImage, depth: DepthMap, unit: float) -> Layer:
     inverse = (unit / depth.depth.detach().cpu().double()).float().numpy()
     sure = depth.valid.float() if depth.confidence is None else depth.confidence
     return Layer(image, inverse, np.ascontiguousarray(sure.detach().cpu().float().numpy()))
-
-
-def compute_transforms(images: Sequence[StereoImage]) -> Transforms:
-    """Compute the pixel transforms between all ordered pairs of images."""
-    pairs = permutations(range(len(images)), 2)
-    return {(i, j): compute_source_from_reference(images[i], images[j]) for i, j in pairs}

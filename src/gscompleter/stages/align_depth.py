@@ -84,12 +84,9 @@ def fit_line_ransac(
     scales = (y[i] - y[j]) / torch.where(x[i] == x[j], torch.inf, x[i] - x[j])
     shifts = y[i] - scales * x[i]
     points = torch.stack([x / y, 1 / y])
-    counts = torch.cat(
-        [
-            ((batch @ points).sub_(1).abs_() < RESIDUAL_THRESHOLD).sum(dim=1)
-            for batch in torch.stack([scales, shifts], dim=1).split(HYPOTHESES_PER_BATCH)
-        ]
-    )
+    batches = torch.stack([scales, shifts], dim=1).split(HYPOTHESES_PER_BATCH)
+    residuals = ((batch @ points).sub_(1).abs_() for batch in batches)
+    counts = torch.cat([(each < RESIDUAL_THRESHOLD).sum(dim=1) for each in residuals])
     best = counts.where(scales > 0, -1).argmax()
     if scales[best] <= 0:
         return 0.0, 0.0

@@ -23,8 +23,6 @@ MIN_CONTRAST = 0.02
 """Brightness range in 5 x 5 smoothed pixels that counts as texture; colours are in [0, 1]."""
 MIN_TEXTURED = 0.01
 """Smallest textured fraction of an image."""
-
-
 COLOR_TOLERANCE = 0.01
 """Largest tolerated excess of a colour beyond [0, 1], as resampling causes it."""
 
@@ -96,7 +94,9 @@ def take_scene(
 
     The proxy is made fine enough for all photographs and targets.
     """
-    check_finite(scene)
+    parts = (scene.means, scene.quats, scene.scales, scene.opacities)
+    if not all(bool(part.isfinite().all()) for part in parts):
+        raise InputError("The scene holds NaN or infinity; remove such Gaussians.")
     photos = [*views, *check_views]
     source = build_proxy(scene, [*targets, *(view.camera for view in photos)])
     near, far = find_depth_range(views, source.rendered, renderer)
@@ -112,13 +112,6 @@ def check_colors(views: Sequence[View]) -> None:
                 f"The image of view {number} has values from {low:g} to {high:g}; colours in "
                 "[0, 1] are needed."
             )
-
-
-def check_finite(scene: Gaussians) -> None:
-    """Raise InputError for NaN or infinity in a scene."""
-    parts = (scene.means, scene.quats, scene.scales, scene.opacities)
-    if not all(bool(part.isfinite().all()) for part in parts):
-        raise InputError("The scene holds NaN or infinity; remove such Gaussians.")
 
 
 def check_texture(views: Sequence[View]) -> None:
@@ -184,9 +177,6 @@ def measure_depth_range(
     """Measure near and far plane of an input splat from its rendered depths, in scene units.
 
     Half the nearest and twice the farthest percentile leave space for what the scene lacks.
-
-    Raises:
-        InputError: No camera sees the scene.
     """
     depths = []
     for camera in cameras:

@@ -55,7 +55,7 @@ def recolor(reference: GeneratedView, view: TargetView, label: int) -> Recolored
     weight = torch.ones_like(view.alpha) if reference.is_photograph else view.distrust
     if reference.is_inconsistent or not weight.any():
         return Recolored(state, view.frozen, 0)
-    found = fit_colors(
+    rows, delta = fit_colors(
         merge(state.parts),
         view.frozen,
         reference,
@@ -64,25 +64,13 @@ def recolor(reference: GeneratedView, view: TargetView, label: int) -> Recolored
         view.scenes.renderer,
         state.config.recolor,
     )
-    if len(found.rows) == 0:
+    if len(rows) == 0:
         return Recolored(state, view.frozen, 0)
-    generated = context.generated.index_fill(0, found.rows, label)
-    context = replace(found.apply(context), generated=generated)
-    parts, trust = (context, *state.parts[1:]), state.trust.accept(view.frozen, camera, found.rows)
+    generated = context.generated.index_fill(0, rows, label)
+    context = replace(context, sh=context.sh.index_add(0, rows, delta), generated=generated)
+    parts, trust = (context, *state.parts[1:]), state.trust.accept(view.frozen, camera, rows)
     frozen = view.scenes.freeze(parts, camera)
-    return Recolored(replace(state, parts=parts, trust=trust), frozen, len(found.rows))
-
-
-@dataclass(frozen=True)
-class ColorChange:
-    """Changes of the spherical harmonics of c Gaussians of a scene."""
-
-    rows: Int64[Tensor, "c"]
-    delta: Float[Tensor, "c k 3"]
-
-    def apply(self, scene: Gaussians) -> Gaussians:
-        """Change the colours; whatever is not in `rows` keeps its bits."""
-        return replace(scene, sh=scene.sh.index_add(0, self.rows, self.delta))
+    return Recolored(replace(state, parts=parts, trust=trust), frozen, len(rows))
 
 
 def fit_colors(
@@ -93,17 +81,11 @@ def fit_colors(
     held: HeldViews,
     renderer: Renderer,
     config: RecolorConfig = RecolorConfig(),
-) -> ColorChange:
-    """Fit colours towards `reference`, as far as its weight and the held views allow.
+) -> tuple[Int64[Tensor, "c"], Float[Tensor, "c k 3"]]:
+    """Fit colours towards `reference`; return rows of `scene` and the change of their harmonics.
 
-    Args:
-        scene: The m Gaussians of the context, whose colours may change, and then others.
-        frozen: `scene`, frozen at the camera of `reference`.
-        reference: The synthesized image.
-        weight: Weight of `reference` per pixel, in [0, 1]; the rest is the render of `scene`.
-        held: Views in which the m Gaussians keep their colours.
-        renderer: Renderer of `frozen`.
-        config: Settings of the fit.
+    Only the m Gaussians of the context, which are the first of `scene`, may change, as far as the
+    `held` views allow. Where `weight`, in [0, 1], is low, the render of `scene` is wanted instead.
     """
     layers = torch.stack([torch.ones_like(weight), weight, torch.zeros_like(weight)], dim=-1)
     sums, open_sums, _ = frozen.backproject(layers).unbind(-1)
@@ -111,7 +93,7 @@ def fit_colors(
     is_open[held.sums.shape[1] :] = False
     rows = torch.nonzero(is_open)[:, 0]
     if len(rows) == 0 or config.iterations == 0:
-        return ColorChange(rows[:0], scene.sh[:0])
+        return rows[:0], scene.sh[:0]
     basis, change = solve_directions(scene, rows, sums[rows], reference.camera, held, config.ridge)
     colors = 0.5 + torch.einsum("nk,nkc->nc", basis, scene.sh[rows].double())
     gains = (basis * change).sum(dim=1, keepdim=True)
@@ -120,7 +102,7 @@ def fit_colors(
     steps = fit_steps(errors, wanted, colors, gains, config.iterations)
     is_changed = (gains * steps).abs().amax(dim=1) > config.min_change
     delta = change[is_changed, :, None] * steps[is_changed, None]
-    return ColorChange(rows[is_changed], delta.to(scene.sh))
+    return rows[is_changed], delta.to(scene.sh)
 
 
 def solve_directions(

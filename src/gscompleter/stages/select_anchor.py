@@ -79,9 +79,5 @@ def compute_overlap(camera: Camera, render: Render, anchor: Camera, at_anchor: R
         return 0.0
     pixels, z = project(points, anchor)
     surface = sample(at_anchor.depth[..., None], pixels)[:, 0]
-    return (
-        (is_inside(pixels, z, anchor) & (z < (1 + SURFACE_TOLERANCE) * surface))
-        .float()
-        .mean()
-        .item()
-    )
+    shared = is_inside(pixels, z, anchor) & (z < (1 + SURFACE_TOLERANCE) * surface)
+    return shared.float().mean().item()

@@ -50,9 +50,8 @@ def select_context(
     """
     share = max(MAX_POINTS // len(targets), 1)
     seen = [find_visible_points(target, points, share) for target in targets]
-    worth = torch.cat(
-        [score_cameras(t, candidates, p) for t, p in zip(targets, seen, strict=True)], dim=1
-    )
+    pairs = zip(targets, seen, strict=True)
+    worth = torch.cat([score_cameras(t, candidates, p) for t, p in pairs], dim=1)
     closest = worth.sum(1).argsort(descending=True, stable=True)[:MAX_CANDIDATES]
     rays = compute_directions([candidates[i] for i in closest.tolist()], torch.cat(seen))
     chosen = select_greedily(worth[closest], rays, count)
@@ -94,9 +93,8 @@ def score_cameras(
     target: Camera, candidates: Sequence[Camera], points: Float[Tensor, "p 3"]
 ) -> Float[Tensor, "c p"]:
     """Score each candidate at points that the target sees."""
-    apart = compute_angles(
-        compute_directions([target], points)[0], compute_directions(candidates, points)
-    )
+    own = compute_directions([target], points)[0]
+    apart = compute_angles(own, compute_directions(candidates, points))
     shown = torch.stack([is_inside(*project(points, c), c) for c in candidates])
     return torch.where(shown, 1.0, OUTSIDE_SCORE) / (1 + (apart / HALF_SCORE_ANGLE) ** 2)
 

@@ -50,20 +50,17 @@ def slide_along_rays(
 ) -> Registration:
     """Register lifted Gaussians: all by one affine (Eq. 9), then each along its ray (Eq. 10)."""
     config, pixel_index = view.state.config.registration, lift.pixel_index
-    coarse = apply_affine(
-        lift.gaussians, affine, reference.camera, config.footprint, config.min_ratio
-    )
+    camera = reference.camera
+    coarse = apply_affine(lift.gaussians, affine, camera, config.footprint, config.min_ratio)
     if config.iterations == 0 or len(coarse) == 0:
         return Registration(coarse, pixel_index, ())
     registered, losses = register_along_rays(coarse, reference, view)
     if config.hole_depth == "scene" and pixel_index is not None:
         depth = fill_smoothly(view.render.depth, ~view.holes).flatten()[pixel_index]
-        return Registration(move_to_depths(coarse, reference.camera, depth), pixel_index, losses)
+        return Registration(move_to_depths(coarse, camera, depth), pixel_index, losses)
     if config.extrapolate_into_holes and config.degrees_of_freedom == 1 and pixel_index is not None:
         scene = view.render.depth_map(view.state.config.holes.max_alpha)
-        registered = extrapolate_into_holes(
-            coarse, registered, pixel_index, scene, reference.camera, config
-        )
+        registered = extrapolate_into_holes(coarse, registered, pixel_index, scene, camera, config)
         registered = extrapolate_sky(registered, pixel_index, scene, reference)
     return Registration(registered, pixel_index, losses)
 
@@ -159,9 +156,8 @@ def register_along_rays(
     objective = Objective.from_renders(view.render, view.anchor_render, reference, anchor, config)
     rows = objective.find_reached(coarse, reference.camera, anchor).nonzero()[:, 0]
     seen = coarse[rows]
-    alone = make_renderer_alone(
-        seen, reference.camera, objective.target_depth.valid, renderer, config
-    )
+    where = objective.target_depth.valid
+    alone = make_renderer_alone(seen, reference.camera, where, renderer, config)
     parameters = torch.zeros(
         (len(seen), config.degrees_of_freedom), device=coarse.means.device, requires_grad=True
     )

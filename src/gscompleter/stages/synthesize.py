@@ -27,7 +27,6 @@ class GeneratedView(View):
     is_inconsistent: bool = False
     """True if the image is photometrically inconsistent with the photographs."""
     is_photograph: bool = False
-    """True if the image is a true photograph."""
 
     def crop(self, camera: PaddedCamera) -> View:
         """Cut the padding off the image."""
@@ -52,9 +51,9 @@ def convert_output(output: GeneratorOutput, target: Camera) -> GeneratedView:
     """Convert the output of a generator to a view, after checking its size and values."""
     expected = (target.height, target.width, 3)
     if tuple(output.image.shape) != expected or not torch.isfinite(output.image).all():
+        shape = tuple(output.image.shape)
         raise ValueError(
-            f"the generator must return a finite image of shape {expected}, "
-            f"got {tuple(output.image.shape)}"
+            f"the generator must return a finite image of shape {expected}, got {shape}"
         )
     return GeneratedView(
         output.image,

@@ -167,9 +167,8 @@ def render_target(state: Completion, camera: PaddedCamera, scenes: SceneRenderer
     """Render the scene at a padded target and select its stereo anchor."""
     frozen = scenes.freeze(state.parts, camera.padded)
     alpha = state.trust.compute_alpha(frozen, camera.padded)
-    return TargetView(
-        state, scenes, camera, frozen, alpha, choose_anchor(state, camera.target, scenes)
-    )
+    anchor = choose_anchor(state, camera.target, scenes)
+    return TargetView(state, scenes, camera, frozen, alpha, anchor)
 
 
 def choose_anchor(state: Completion, target: Camera, scenes: SceneRenderer) -> AnchorChoice:

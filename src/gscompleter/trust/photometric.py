@@ -66,16 +66,13 @@ class PhotometricTrust(Trust):
     """True for Gaussians that a completed target recoloured; these are trusted."""
     config: TrustConfig
 
-    def compute_weights(self, frozen: FrozenScene, camera: Camera) -> Float[Tensor, "n"]:
-        """Compute the trust of every Gaussian; added and invisible ones have 1."""
+    def compute_alpha(self, frozen: FrozenScene, camera: Camera) -> Float[Tensor, "h w"]:
+        """Render accumulated opacity weighted by trust; added and invisible Gaussians have 1."""
         sums, count = sum_weights(frozen), len(self.observations.means)
         trust = compute_trust(self.observations, sums[:count], camera, self.config)
-        return pad(torch.where(self.is_recolored, 1.0, trust), (0, len(sums) - count), value=1.0)
-
-    def compute_alpha(self, frozen: FrozenScene, camera: Camera) -> Float[Tensor, "h w"]:
-        """Render accumulated opacity with every Gaussian weighted by its trust."""
-        trusted = blur(frozen.splat(self.compute_weights(frozen, camera)))
-        return torch.minimum(trusted, frozen.render.alpha)
+        trust = torch.where(self.is_recolored, 1.0, trust)
+        weights = pad(trust, (0, len(sums) - count), value=1.0)
+        return torch.minimum(blur(frozen.splat(weights)), frozen.render.alpha)
 
     def accept(
         self, frozen: FrozenScene, camera: Camera, rows: Int64[Tensor, "r"]

@@ -23,9 +23,6 @@ def estimate_depth_range(views: Sequence[View]) -> tuple[float, float]:
 
     They are half the depth of the nearest 2 % of the triangulated matches and four times that of
     the farthest 2 %. With too few matches they are derived from the baselines.
-
-    Raises:
-        InputError: There are fewer than two views, or no baseline between them.
     """
     images, unit = make_stereo_images(views)
     neighbours = find_neighbours(images)

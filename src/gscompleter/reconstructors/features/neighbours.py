@@ -45,7 +45,6 @@ class Neighbours:
     neighbours_of: tuple[tuple[int, ...], ...]
     """Neighbours of each photograph, the best one first."""
     matches: Matches
-    """Feature matches of all compared pairs."""
 
     @property
     def pairs(self) -> list[Pair]:

@@ -91,10 +91,9 @@ class Splatter:
         """Lift the pixels of `pixel_mask` in the first view and fit their colours to it."""
         rows = torch.nonzero(pixel_mask.reshape(-1))[:, 0]
         blurred = self.splat(views[0], depths[0])[rows]
-        gaussians = fit_colors(blurred.to("cpu"), [views[0].to("cpu")], self.renderer)
-        return Reconstruction(
-            gaussians.to(rows.device), tuple(depths), torch.zeros_like(rows), rows
-        )
+        fitted = fit_colors(blurred.to("cpu"), [views[0].to("cpu")], self.renderer)
+        made = fitted.to(rows.device)
+        return Reconstruction(made, tuple(depths), torch.zeros_like(rows), rows)
 
     def select_pixels(
         self,

@@ -39,16 +39,12 @@ class PlaneSweep(Splatter):
         """Reconstruct the scene and the depth of every pixel.
 
         More than two large views are matched at half size, which takes an eighth of the time.
-
-        Raises:
-            InputError: There are fewer than two views, no baseline, or the depth range is empty.
         """
         views = set_depth_range(views, *get_depth_range(views))
         rig = build_rig(views)
         layers = self.compute_layers(rig, views)
-        return self.build_scene(
-            views, make_depth_maps(layers, rig.unit, views), layers, rig.transforms
-        )
+        depths = make_depth_maps(layers, rig.unit, views)
+        return self.build_scene(views, depths, layers, rig.transforms)
 
     def lift(self, views: Sequence[View], pixel_mask: Bool[Tensor, "h w"]) -> Reconstruction:
         """Lift the pixels of `pixel_mask` in the first view, a synthesized image.

@@ -114,17 +114,13 @@ def is_overhead(region: Mask) -> bool:
 
 def find_even_region(image: StereoImage) -> Mask:
     """Find the uniform region connected to the top of the image, up to its edges."""
-    even = cv2.erode(
-        (compute_color_gradient(image) < MAX_SKY_GRADIENT).astype(np.uint8),
-        np.ones((3, 3), np.uint8),
-    )
+    smooth = compute_color_gradient(image) < MAX_SKY_GRADIENT
+    even = cv2.erode(smooth.astype(np.uint8), np.ones((3, 3), np.uint8))
     _, labels = cv2.connectedComponents(even, connectivity=4)
     top = labels[0][labels[0] > 0]
     core = np.isin(labels, top)
-    return core | (
-        dilate_square(core, EDGE_RADIUS)
-        & (compute_color_difference(core, image) < MAX_SKY_DIFFERENCE)
-    )
+    alike = compute_color_difference(core, image) < MAX_SKY_DIFFERENCE
+    return core | (dilate_square(core, EDGE_RADIUS) & alike)
 
 
 def compute_color_gradient(image: StereoImage) -> Map:

@@ -9,7 +9,7 @@ from functools import cached_property
 import cv2
 import numpy as np
 import torch
-from jaxtyping import Bool, Float, Float32, Int, Int16, UInt8
+from jaxtyping import Bool, Float32, Int, Int16, UInt8
 
 from gscompleter.kernels import stereo
 from gscompleter.kernels.stereo import TILE_COLUMNS, TILE_ROWS, Bands
@@ -230,21 +230,15 @@ def place_planes(
         H, W = source.size
         seen = (ratio > 1e-3) & (at >= 0).all(-1) & (at[..., 0] < W) & (at[..., 1] < H)
         steps = np.linalg.norm(np.diff(at, axis=0), axis=-1)
-        motion = np.maximum(motion, compute_quantiles(steps, seen[1:] & seen[:-1], 0.8))
+        known = torch.from_numpy(np.where(seen[1:] & seen[:-1], steps, np.nan))
+        usual = known.nanquantile(0.8, dim=1).nan_to_num().numpy()  # 0 where nothing is seen
+        motion = np.maximum(motion, usual)
         overlap = np.maximum(overlap, seen.mean(axis=1))
     useful = np.flatnonzero(overlap >= 0.02)
     last = max(int(useful[-1]), 8) if len(useful) else 256
     wanted = float(motion[:last].sum()) / MAX_PLANE_MOTION
     planes = int(np.clip(np.ceil(wanted), MIN_PLANES, MAX_PLANES))
     return np.linspace(samples[0], samples[last], planes).astype(np.float32)
-
-
-def compute_quantiles(
-    values: Float[np.ndarray, "r c"], valid: Bool[np.ndarray, "r c"], share: float
-) -> Float[np.ndarray, "r"]:
-    """Compute a quantile of the `valid` values of each row; 0 for rows without any."""
-    known = torch.from_numpy(np.where(valid, values, np.nan))
-    return known.nanquantile(share, dim=1).nan_to_num().numpy()
 
 
 def make_full_bands(size: tuple[int, int], planes: int) -> Bands:
@@ -254,10 +248,7 @@ def make_full_bands(size: tuple[int, int], planes: int) -> Bands:
 
 
 def make_guided_bands(guess: Map, shrinkage: int, size: tuple[int, int], planes: int) -> Bands:
-    """Create bands around the planes `guess` of an image `1 / shrinkage` the size.
-
-    `size` is the height and width of the full image, `planes` the number of planes.
-    """
+    """Create bands around the planes `guess` of an image `1 / shrinkage` the `size`."""
     likely = cv2.medianBlur(guess, MEDIAN_SIZE)
     window = np.ones((2 * GUESS_MARGIN + 1, 2 * GUESS_MARGIN + 1), np.uint8)
     lowest = reduce_tiles(np.minimum, cv2.erode(likely, window), shrinkage, size)
