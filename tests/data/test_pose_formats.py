@@ -260,7 +260,7 @@ def test_bounds_of_llff_enclose_the_scene_with_room(tmp_path):
 def test_rows_of_llff_need_as_many_photographs(tmp_path):
     scene = llff(tmp_path / "room")
     (scene / "images" / "3.png").rename(scene / "images_aside.png")
-    with pytest.raises(InputError, match="has 5 rows, .* there are 4 in .*images, 1 in"):
+    with pytest.raises(InputError, match="has 5 rows, one per photograph"):
         open_photographs(scene)
 
 
