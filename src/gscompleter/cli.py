@@ -33,7 +33,7 @@ COMMANDS: dict[str, tuple[type, str, str]] = {
     "tables": (options.TablesOptions, "evaluate", "run_tables"),
     "index": (options.IndexOptions, "evaluate", "run_index"),
     "bench": (options.BenchOptions, "bench", "run_bench"),
-    "models": (options.ModelsOptions, "doctor", "run_models"),
+    "models": (options.ModelsOptions, "models", "run_models"),
     "convert": (options.ConvertOptions, "convert", "run_convert"),
     "poses": (options.PosesOptions, "poses", "run_poses"),
     "report": (options.ReportOptions, "complete", "run_report"),

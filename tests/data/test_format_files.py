@@ -89,8 +89,8 @@ SPLATS = {
 """Number of Gaussians, SH degree, and medians of the means."""
 
 UNKNOWN = "holds no Gaussians in a format that is known"
-OTHER_JSON = r"is no \.sog: its .* describes something else"
-OTHER_ZIP = r"is no \.sog: this archive has no meta.json in it"
+OTHER_JSON = r"cannot be read: .* describes no \.sog"
+OTHER_ZIP = r"cannot be read: .*meta.json"
 POINTER = "is a git-lfs pointer, not the file itself; run `git lfs pull`"
 NO_SPLATS = {
     "dgp_ddad/calibration.json": OTHER_JSON,

@@ -1,34 +1,28 @@
-"""The commands `doctor`, `models` and `warmup`: what is installed, downloaded and compiled."""
+"""The commands `doctor` and `warmup`: what is installed and compiled."""
 
 from __future__ import annotations
 
 import importlib.metadata
 import json
-import sys
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator
 from dataclasses import asdict, dataclass
 from itertools import groupby
-from pathlib import Path
 
 import torch
 from packaging.requirements import Requirement
 from rich.console import Console
-from rich.table import Table
 
 from gscompleter.apps.bench.report import describe_machine
-from gscompleter.apps.commands.options import DoctorOptions, ModelsOptions, WarmupOptions
+from gscompleter.apps.commands.options import DoctorOptions, WarmupOptions
 from gscompleter.apps.viewer.packages import BUILT_LIBRARIES, LOCK_FILE, get_archive_path, read_lock
 from gscompleter.apps.warmup import PARTS, compile_kernels
 from gscompleter.errors import InputError
 from gscompleter.io.files import get_download_folder
 from gscompleter.kernels.compiled import get_cache_folder, is_compiled
 from gscompleter.models.weights.fetching import (
-    INSTALL,
     find_cached,
-    get_cache_path,
-    is_hub_installed,
 )
-from gscompleter.models.weights.published import PUBLISHED, PublishedWeights
+from gscompleter.models.weights.published import PUBLISHED
 from gscompleter.progress import show_progress
 from gscompleter.render import choose_device, load_renderer
 
@@ -151,59 +145,6 @@ def inspect_viewer() -> Found:
     there = BUILT_LIBRARIES.is_file() or all(path.is_file() for path in archives)
     told = "here" if there else "fetched with npm's registry when `gscompleter view` first runs"
     return Found("viewer", "libraries", there, told)
-
-
-def run_models(options: ModelsOptions) -> None:
-    """Print the published weights and their location on this machine."""
-    found = [(weights, find_cached(weights)) for weights in PUBLISHED.values()]
-    if not options.json:
-        print_models(found)
-        return
-    rows = [
-        {
-            **asdict(weights),
-            "url": weights.url,
-            "pinned_by": weights.integrity_check,
-            "cached": None if path is None else str(path),
-            "place": str(get_cache_path(weights)),
-        }
-        for weights, path in found
-    ]
-    print(json.dumps(rows, indent=2))
-
-
-def print_models(found: Sequence[tuple[PublishedWeights, Path | None]]) -> None:
-    """Print the table and its footnotes."""
-    table = Table(box=None)
-    for title in ("name", "model", "parameters", "views", "size", "code / weights", "cached"):
-        table.add_column(title, no_wrap=title == "name")
-    table.add_column("source", overflow="fold")
-    for weights, path in found:
-        table.add_row(*format_cells(weights, path))
-    width = None if sys.stdout.isatty() else 1000  # a file or a pipe wraps no rows
-    Console(width=width, markup=False, highlight=False).print(table)
-    print("\n(!) Whether commercial use is allowed is unclear:")
-    for caution in dict.fromkeys(w.caution for w in PUBLISHED.values() if w.caution):
-        names = [w.name for w in PUBLISHED.values() if w.caution == caution]
-        print(f"    {', '.join(names)}: {caution}.")
-    if not is_hub_installed():
-        print(f"\nThe hub's cache was not searched, for lack of huggingface_hub: {INSTALL}")
-
-
-def format_cells(weights: PublishedWeights, path: Path | None) -> tuple[str, ...]:
-    """Format a row of the table."""
-    fewest, most = weights.views
-    count = weights.parameters
-    return (
-        weights.name,
-        weights.model if weights.gives == "Gaussians" else f"{weights.model}, {weights.gives} only",
-        "?" if count is None else f"{count / 1e6:.1f} M",
-        f"{fewest}" if fewest == most else f"{fewest}-{most}",
-        weights.size,
-        f"{weights.code_licence} / {weights.weights_licence}{' (!)' if weights.caution else ''}",
-        "no" if path is None else str(path),
-        weights.source,
-    )
 
 
 def run_warmup(options: WarmupOptions) -> None:

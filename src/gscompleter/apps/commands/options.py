@@ -124,7 +124,7 @@ class CompleteOptions(CompletingOptions):
     auto: Annotated[int, Interval(ge=1, le=254)] | None = None
     """Most cameras to search for if no target is given; 4 if no number follows."""
     dry_run: bool = False
-    """Only print the plan, and write its cameras to targets.json, to edit and pass to --target."""
+    """Only print the plan, and write its cameras to targets.json, which `--target` reads."""
     out: Path
     """Folder for completed.ply, the report (report.html), images and summary.json."""
     video: bool = False

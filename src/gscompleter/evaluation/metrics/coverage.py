@@ -8,7 +8,7 @@ photographs confirm; what was added or recoloured is trusted afterwards.
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import torch
@@ -80,12 +80,13 @@ def render_trusted(frozen: FrozenScene, trust: Trust, camera: Camera) -> Render:
 
 def compute_coverage(pairs: Sequence[RenderPair]) -> Coverage:
     """Compute the coverage before and after completion, and count the cameras."""
+    before, after = [pair.before for pair in pairs], [pair.after for pair in pairs]
+    return Coverage(compute_covered_share(before), compute_covered_share(after), len(pairs))
 
-    def compute_share(renders: Iterable[Render]) -> float:
-        return torch.cat([r.alpha.flatten() >= COVERED for r in renders]).float().mean().item()
 
-    before, after = (pair.before for pair in pairs), (pair.after for pair in pairs)
-    return Coverage(compute_share(before), compute_share(after), len(pairs))
+def compute_covered_share(renders: Sequence[Render]) -> float:
+    """Compute the share of pixels of all renders whose alpha is high enough."""
+    return torch.cat([r.alpha.flatten() >= COVERED for r in renders]).float().mean().item()
 
 
 def sample_held_out_cameras(

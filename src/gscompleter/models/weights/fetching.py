@@ -129,7 +129,7 @@ def _download(weights: PublishedWeights, offline: bool) -> Path:
     except LocalEntryNotFoundError as error:
         reason = "downloads are off" if offline else "the hub cannot be reached"
         raise WeightsNotAvailable(
-            f"The weights {weights.name} are not on this machine and {reason}; "
+            f"The weights {weights.name} are missing and {reason}; "
             f"{_describe_manual_download(weights)}."
         ) from error
     except Exception as error:
