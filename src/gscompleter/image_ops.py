@@ -1,4 +1,4 @@
-"""Smooth interpolation of values that are known in a part of an image."""
+"""Smooth interpolation of partly known images, and structural similarity."""
 
 from __future__ import annotations
 
@@ -6,7 +6,10 @@ import cv2
 import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
-from torch.nn.functional import avg_pool2d, interpolate, max_pool2d, pad
+from torch.nn.functional import avg_pool2d, conv2d, interpolate, max_pool2d, pad
+
+SSIM_RADIUS, SSIM_SIGMA = 5, 1.5
+"""Radius and standard deviation of the Gaussian window of SSIM, in pixels."""
 
 
 def fill_smoothly(
@@ -95,3 +98,24 @@ def dilate(mask: Bool[Tensor, "h w"], radius: int) -> Bool[Tensor, "h w"]:
 def is_enclosed(mask: Bool[Tensor, "h w"]) -> bool:
     """Return True if `mask` is not empty and does not touch the border of the image."""
     return bool(mask.any()) and int(mask.sum()) == int(mask[1:-1, 1:-1].sum())
+
+
+def ssim_map(
+    image: Float[Tensor, "h w 3"], other: Float[Tensor, "h w 3"]
+) -> Float[Tensor, "1 3 h w"]:
+    """Compute structural similarity (Wang et al. 2004) around each pixel, padding with black."""
+    offsets = (
+        torch.arange(2 * SSIM_RADIUS + 1, dtype=image.dtype, device=image.device) - SSIM_RADIUS
+    )
+    line = torch.exp(-(offsets**2) / (2 * SSIM_SIGMA**2))
+    line = (line / line.sum()).repeat(3, 1)
+
+    def blur(values: Float[Tensor, "h w 3"]) -> Tensor:
+        planes = values.permute(2, 0, 1)[None]
+        rows = conv2d(planes, line[:, None, None, :], padding=(0, SSIM_RADIUS), groups=3)
+        return conv2d(rows, line[:, None, :, None], padding=(SSIM_RADIUS, 0), groups=3)
+
+    a, b = blur(image), blur(other)
+    aa, bb, ab = blur(image**2) - a**2, blur(other**2) - b**2, blur(image * other) - a * b
+    c1, c2 = 0.01**2, 0.03**2
+    return (2 * a * b + c1) * (2 * ab + c2) / ((a**2 + b**2 + c1) * (aa + bb + c2))

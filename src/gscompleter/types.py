@@ -18,7 +18,7 @@ import torch
 from jaxtyping import Bool, Float, Int, Int64, Shaped, UInt8
 from torch import Tensor
 
-from gscompleter.config.coverage import COVERED
+from gscompleter.config.settings import COVERED
 from gscompleter.errors import InputError
 
 SH_C0 = 0.28209479177387814

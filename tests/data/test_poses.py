@@ -13,14 +13,19 @@ from PIL import Image
 from command import run
 from gscompleter.data.formats import open_photographs
 from gscompleter.data.sfm import poses
-from gscompleter.data.sfm.match_pairs import (
+from gscompleter.data.sfm.mapping_process import (
     is_sequence,
-    make_sort_key,
     pair_all,
     pair_neighbours,
     pair_similar,
 )
-from gscompleter.data.sfm.poses import MAX_SIDE, find_poses, list_photograph_files, write_upright
+from gscompleter.data.sfm.poses import (
+    MAX_SIDE,
+    find_poses,
+    list_photograph_files,
+    make_sort_key,
+    write_upright,
+)
 from gscompleter.errors import InputError
 from gscompleter.io.image import write_image
 from scenes import Room, camera_at, view_of

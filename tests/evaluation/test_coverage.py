@@ -7,7 +7,7 @@ import torch
 
 from gscompleter import CompleterConfig, GSCompleter, load_renderer
 from gscompleter.config import HoleConfig
-from gscompleter.config.coverage import COVERED
+from gscompleter.config.settings import COVERED
 from gscompleter.generators.warp import warp_photographs
 from gscompleter.geometry import project
 from gscompleter.stages.align_depth import align_depth

@@ -7,7 +7,7 @@ import torch
 
 from gscompleter import CompleterConfig, GSCompleter
 from gscompleter.config import AlignmentConfig, NextBestViewConfig, RegistrationConfig
-from gscompleter.config.coverage import COVERED
+from gscompleter.config.settings import COVERED
 from gscompleter.evaluation.metrics.coverage import (
     compute_coverage,
     compute_covered_share,

@@ -11,7 +11,7 @@ METHOD = ("completer.py", "stages", "guards", "trust", "next_best_view")
 CORE = (
     *("__init__.py", "types.py", "geometry.py", "image_ops.py", "optim.py", "sky.py", "errors.py"),
     *("progress.py", "timing.py", "memory.py", "cpu_threads.py", "state.py", "cleaning.py"),
-    *("ssim.py", "plugins.py", "config", "render", *METHOD),
+    *("plugins.py", "config", "render", *METHOD),
 )
 KERNELS = ("simd", "project", "composite", "tiles", "lod", "support", "parallel", "compiled")
 
@@ -39,3 +39,8 @@ def test_the_method_seldom_asks_what_is_missing():
 def test_the_core_is_short():
     kernels = tuple(f"kernels/{name}.py" for name in KERNELS)
     assert count_lines((*CORE, *kernels)) <= 10_000
+
+
+def test_everything_but_the_learned_models_is_short():
+    files = (path for path in PACKAGE.rglob("*.py") if "models" not in path.parts)
+    assert sum(len(path.read_text().splitlines()) for path in files) <= 29_000

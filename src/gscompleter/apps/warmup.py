@@ -12,7 +12,7 @@ import torch
 
 from gscompleter.completer import GSCompleter
 from gscompleter.image_ops import smooth_masked
-from gscompleter.kernels.compiled import is_compiled, mark_compiled
+from gscompleter.kernels.compiled import find_marker
 from gscompleter.progress import stage
 from gscompleter.render import load_renderer
 from gscompleter.render.lod import simplify_scene
@@ -32,7 +32,7 @@ WALL_DEPTH = 2.0
 
 def compile_kernels(names: Collection[str]) -> float | None:
     """Compile the missing kernels of these parts; return the seconds, or None if there are none."""
-    missing = [name for name in PARTS if name in names and not is_compiled(name)]
+    missing = [name for name in PARTS if name in names and not find_marker(name).is_file()]
     if not missing:
         return None
     start = time.perf_counter()
@@ -40,7 +40,7 @@ def compile_kernels(names: Collection[str]) -> float | None:
         rehearse(with_splat=SPLAT_PART in missing)
     for name in PARTS:
         if name != SPLAT_PART or SPLAT_PART in missing:
-            mark_compiled(name)
+            find_marker(name).touch()
     return time.perf_counter() - start
 
 

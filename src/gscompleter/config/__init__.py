@@ -8,8 +8,15 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 from annotated_types import Interval
 
-from gscompleter.config.coverage import COVERED
-from gscompleter.config.settings import Count, Settings, Share, Weight, apply_changes, read_yaml
+from gscompleter.config.settings import (
+    COVERED,
+    Count,
+    Settings,
+    Share,
+    Weight,
+    apply_changes,
+    read_yaml,
+)
 from gscompleter.errors import InputError, quote_value
 
 Pixels = Annotated[int, Interval(ge=0, le=4096)]

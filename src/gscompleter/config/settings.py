@@ -23,6 +23,8 @@ S = TypeVar("S", bound="Settings")
 Count = Annotated[int, Interval(ge=0, le=100_000)]
 Share = Annotated[float, Interval(ge=0, le=1)]
 Weight = Annotated[float, Interval(ge=0, le=1e6)]
+COVERED = 0.5
+"""Alpha from which a pixel is covered, unless `holes.max_alpha` (τ of Eq. 12) demands more."""
 # Levels and rounds add to the seed.
 Seed = Annotated[int, Interval(ge=0, lt=2**62)]
 

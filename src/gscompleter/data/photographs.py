@@ -17,7 +17,6 @@ from PIL import Image
 from torch import Tensor
 
 from gscompleter.data.cameras import (
-    Pinhole,
     compute_fov,
     compute_undistortion_map,
     find_pose_defect,
@@ -130,7 +129,8 @@ class Photographs:
 
     def _build_camera(self, frame: Frame, size: tuple[int, int], resolution: Resolution) -> Camera:
         _, pinhole = frame.compute_pinholes(*size)
-        final = compute_framing(*size, resolution).apply_to_camera(pinhole)
+        framing = compute_framing(*size, resolution)
+        final = pinhole.resize(*framing.scaled_size).crop(*framing.corner, *framing.size)
         c2w = frame.c2w.copy()
         c2w[:3, 3] -= self.origin  # before rounding to float32
         pose = torch.from_numpy(c2w).float()
@@ -214,7 +214,10 @@ def undistort_and_resize(
         source = compute_undistortion_map(pinhole, frame.intrinsics.distortion, new)
         pixels = remap(pixels, source, cv2.INTER_CUBIC if colours else cv2.INTER_NEAREST)
     filtering = Image.Resampling.LANCZOS if colours else Image.Resampling.NEAREST
-    return compute_framing(*size, resolution).apply_to_image(pixels, filtering)
+    framing = compute_framing(*size, resolution)
+    (left, top), (width, height) = framing.corner, framing.size
+    resized = resize(pixels, framing.scaled_size, filtering)
+    return np.ascontiguousarray(resized[top : top + height, left : left + width])
 
 
 def _find_skip_reason(frame: Frame, origin: Float[np.ndarray, "3"]) -> str | None:
@@ -237,19 +240,6 @@ class Framing:
     scaled_size: tuple[int, int]
     corner: tuple[int, int]
     size: tuple[int, int]
-
-    def apply_to_camera(self, pinhole: Pinhole) -> Pinhole:
-        """Return the camera of the framed image."""
-        return pinhole.resize(*self.scaled_size).crop(*self.corner, *self.size)
-
-    def apply_to_image(
-        self, image: Shaped[np.ndarray, "h w *c"], filtering: Image.Resampling
-    ) -> Shaped[np.ndarray, "h2 w2 *c"]:
-        """Resize and crop an image."""
-        left, top = self.corner
-        width, height = self.size
-        resized = resize(image, self.scaled_size, filtering)
-        return np.ascontiguousarray(resized[top : top + height, left : left + width])
 
 
 def compute_framing(width: int, height: int, resolution: Resolution) -> Framing:

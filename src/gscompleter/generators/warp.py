@@ -8,7 +8,7 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
-from gscompleter.config.coverage import COVERED
+from gscompleter.config.settings import COVERED
 from gscompleter.generators.exposure import match_exposures
 from gscompleter.generators.smooth import continue_smoothly
 from gscompleter.geometry import is_inside, measure_baseline, project, sample, unproject

@@ -20,7 +20,7 @@ from torch import Tensor
 from torch.nn.functional import interpolate, max_pool2d
 
 from gscompleter.config import DynamicMasksConfig
-from gscompleter.config.coverage import COVERED
+from gscompleter.config.settings import COVERED
 from gscompleter.generators.exposure import fit_robust_affine
 from gscompleter.geometry import (
     is_inside,

@@ -15,10 +15,9 @@ from gscompleter.config import PsnrGuardConfig
 from gscompleter.cpu_threads import use_one_torch_thread
 from gscompleter.geometry import project_mask
 from gscompleter.guards import Attempt, Guard
-from gscompleter.image_ops import dilate
+from gscompleter.image_ops import SSIM_RADIUS, dilate, ssim_map
 from gscompleter.render import FrozenScene, OpacityImage, restrict_to_image
 from gscompleter.render.cache import SceneRenderer
-from gscompleter.ssim import RADIUS, ssim_map
 from gscompleter.stages.target_view import compute_hole_mask
 from gscompleter.state import Completion
 from gscompleter.types import ErrorBudget, Gaussians, View
@@ -94,7 +93,7 @@ def set_error_budgets(
     budgets = [budget(replace(photograph, ignore_mask=holes | ~photograph.valid_mask), "mse")]
     if holes.any():
         budgets.append(budget(photograph, "mse"))
-    if min(photograph.image.shape[:2]) > 2 * RADIUS:
+    if min(photograph.image.shape[:2]) > 2 * SSIM_RADIUS:
         budgets.append(budget(photograph, "dssim"))
     return tuple(budgets)
 
@@ -107,9 +106,9 @@ def compute_pixel_errors(
     masked = view.fill_ignored(image)
     if budget.metric == "mse":
         return (masked - view.image).square().mean(dim=-1) / view.valid_mask.numel()
-    inner = slice(RADIUS, -RADIUS)
+    inner = slice(SSIM_RADIUS, -SSIM_RADIUS)
     dissimilar = (1 - ssim_map(masked, view.image).mean(dim=(0, 1)))[inner, inner]
-    return pad(dissimilar / dissimilar.numel(), (RADIUS,) * 4)
+    return pad(dissimilar / dissimilar.numel(), (SSIM_RADIUS,) * 4)
 
 
 @use_one_torch_thread()

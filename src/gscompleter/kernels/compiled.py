@@ -1,4 +1,4 @@
-"""Markers in numba's cache for the parts whose kernels are compiled."""
+"""Markers in numba's cache for the parts whose kernels are compiled for this machine."""
 
 import hashlib
 import sys
@@ -10,22 +10,13 @@ from llvmlite.binding import get_host_cpu_features, get_host_cpu_name
 from gscompleter.kernels import tgv
 
 
-def is_compiled(part):
-    """Return True if the current kernels of a part are compiled for this machine."""
-    return _get_marker(part).is_file()
-
-
-def mark_compiled(part):
-    """Mark the kernels of a part as compiled."""
-    _get_marker(part).touch()
-
-
 def get_cache_folder():
     """Return the folder of numba's cache."""
     return Path(tgv.advance.stats.cache_path)
 
 
-def _get_marker(part):
+def find_marker(part):
+    """Return the file that exists if the current kernels of a part are compiled here."""
     sources = sorted(Path(__file__).parent.glob("*.py"))
     stamps = [(s.name, s.stat().st_mtime_ns, s.stat().st_size) for s in sources]
     machine = (get_host_cpu_name(), get_host_cpu_features().flatten())

@@ -13,7 +13,7 @@ import torch
 from jaxtyping import Bool, Float, UInt8
 from torch import Tensor
 
-from gscompleter.config.coverage import COVERED
+from gscompleter.config.settings import COVERED
 from gscompleter.geometry import compute_z_depths
 from gscompleter.render import Renderer, get_view_map
 from gscompleter.types import Camera, Gaussians, Render, View

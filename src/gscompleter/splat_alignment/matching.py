@@ -13,7 +13,7 @@ import numpy as np
 import torch
 from jaxtyping import Float
 
-from gscompleter.config.coverage import COVERED
+from gscompleter.config.settings import COVERED
 from gscompleter.geometry import unproject
 from gscompleter.reconstructors.features.matches import Features, detect_features, match_features
 from gscompleter.reconstructors.features.stereo_image import StereoImage

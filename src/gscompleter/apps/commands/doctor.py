@@ -18,7 +18,7 @@ from gscompleter.apps.viewer.packages import BUILT_LIBRARIES, LOCK_FILE, get_arc
 from gscompleter.apps.warmup import PARTS, compile_kernels
 from gscompleter.errors import InputError
 from gscompleter.io.files import get_download_folder
-from gscompleter.kernels.compiled import get_cache_folder, is_compiled
+from gscompleter.kernels.compiled import find_marker, get_cache_folder
 from gscompleter.models.weights.fetching import (
     find_cached,
 )
@@ -78,7 +78,7 @@ def inspect_installation() -> Iterator[Found]:
         yield inspect_extra(extra, purpose)
     for name in ("cpu", "cuda", "reference"):
         yield inspect_renderer(name)
-    compiled = all(is_compiled(part) for part in PARTS)
+    compiled = all(find_marker(part).is_file() for part in PARTS)
     remedy = "compiled by the first completion, or in advance by `gscompleter warmup`"
     yield Found("renderers", "kernels", compiled, "compiled" if compiled else remedy)
     yield from inspect_weights()

@@ -66,7 +66,7 @@ def parse_words(words: Sequence[str], command: Any, names: Collection[str]) -> A
 
     It raises InputError for wrong words, and SystemExit after printing the help.
     """
-    words = use_new_names(words)
+    words = [re.sub(r"^--([\w-]+)", lambda old: f"--{translate_name(old[1])}", w) for w in words]
     if words and words[0] not in names and words[0] not in (*HELP, HELP_ALL):
         raise InputError(
             f"There is no command {quote_value(words[0])}; choose one of {', '.join(names)} "
@@ -213,11 +213,6 @@ def extract_sentence(box: str) -> str:
         if title in lines:
             hint = f"; {words} {lines[lines.index(title) + 1].strip()}"
     return f"{quote_value(sentence, 200).removesuffix('.')}{hint}"
-
-
-def use_new_names(words: Sequence[str]) -> list[str]:
-    """Replace old names of options such as `--film` or `--rerun=failures`, and warn of each."""
-    return [re.sub(r"^--([\w-]+)", lambda name: f"--{translate_name(name[1])}", w) for w in words]
 
 
 @cache

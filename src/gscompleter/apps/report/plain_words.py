@@ -99,7 +99,7 @@ def describe_wanted_photographs(targets: Sequence[TargetRow]) -> str:
     planned = [str(row.derived_from) for row in targets if row.derived_from is not None]
     if not planned:
         return "Without --target, `complete` finds the cameras where they would help most."
-    frames = " and ".join(f"frame {frame}" for frame in planned[:NUM_WANTED])
+    frames = " and ".join(f"frame {frame}" for frame in planned[:2])
     return f"They would help most at the first cameras of targets.json, beside {frames}."
 
 

@@ -25,7 +25,6 @@ from PIL import Image, ImageOps
 
 from gscompleter.cpu_threads import get_thread_count
 from gscompleter.data.frame import DOWNSCALE_FACTORS, MASKS
-from gscompleter.data.sfm.match_pairs import make_sort_key
 from gscompleter.errors import InputError, join_names, quote_value
 from gscompleter.io.files import SUMMARY_FILE, open_output_folder
 from gscompleter.io.image import ORIENTATION, open_image
@@ -274,3 +273,8 @@ def _map(copies: Sequence[UprightCopy], folder: Path) -> dict[str, Any]:
             "damaged, and try again."
         )
     return json.loads(done.stdout.splitlines()[-1])
+
+
+def make_sort_key(name: str) -> tuple[str, ...]:
+    """Return a key that sorts names by their numbers: 2.jpg before 10.jpg."""
+    return tuple(f"{int(p):030d}" if p.isdecimal() else p for p in re.split(r"(\d+)", name))

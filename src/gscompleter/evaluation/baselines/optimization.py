@@ -15,9 +15,9 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 
 from gscompleter.geometry import compute_z_depths, quats_to_rotations
+from gscompleter.image_ops import ssim_map
 from gscompleter.progress import track
 from gscompleter.render import Renderer
-from gscompleter.ssim import ssim_map
 from gscompleter.types import Camera, Gaussians, View, merge
 
 POSITION_RATE, ROTATION_RATE, SCALE_RATE = 1.6e-4, 1e-3, 5e-3

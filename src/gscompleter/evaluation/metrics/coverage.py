@@ -13,7 +13,7 @@ from dataclasses import dataclass, replace
 
 import torch
 
-from gscompleter.config.coverage import COVERED
+from gscompleter.config.settings import COVERED
 from gscompleter.geometry import (
     axis_angle_to_matrix,
     compute_spacing,
