@@ -33,8 +33,7 @@ class InputError(ValueError):
 
     def __str__(self) -> str:
         option = 0 if self.argument is None else len(f" (--{self.argument}).")
-        line = " ".join(part.strip() for part in super().__str__().splitlines())
-        return quote_value(line, MAX_MESSAGE_LENGTH - len(PROGRAM) - option)
+        return shorten_message(super().__str__(), MAX_MESSAGE_LENGTH - len(PROGRAM) - option)
 
 
 class OutputError(InputError):
@@ -57,6 +56,18 @@ def quote_value(value: object, length: int | None = None) -> str:
         return line
     half = (length - 1) // 2
     return f"{line[:half]}…{line[-half:]}"
+
+
+def shorten_message(message: str, most: int) -> str:
+    """Shorten the longest words of a message, such as paths but not URLs, and then its middle."""
+    words = message.split()
+    while (excess := len(" ".join(words)) - most) > 0:
+        longest = max(range(len(words)), key=lambda i: len(words[i]) * ("://" not in words[i]))
+        length = max(len(words[longest]) - excess, MAX_QUOTE_LENGTH)
+        if length >= len(words[longest]):
+            break
+        words[longest] = quote_value(words[longest], length)
+    return quote_value(" ".join(words), most)
 
 
 def join_names(names: Sequence[object], most: int, length: int | None = None) -> str:

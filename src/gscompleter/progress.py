@@ -97,8 +97,7 @@ class Display:
 
 def start_bars(console: Console) -> Progress:
     """Start live lines that disappear at the end."""
-    # Imported here because a log does not need it.
-    from rich import progress
+    from rich import progress  # a log does not need it
 
     bars = progress.Progress(
         progress.SpinnerColumn(),

@@ -264,6 +264,8 @@ def make_observed(
 
 def merge(parts: Sequence[Gaussians]) -> Gaussians:
     """Concatenate Gaussians; SH of lower degree are padded with zeros, which changes no colour."""
+    if not parts:
+        raise ValueError("merge needs at least one set of Gaussians, got none")
     if len({part.is_antialiased for part in parts}) > 1:
         raise ValueError("antialiased Gaussians cannot be merged with others")
     k = max(part.sh.shape[1] for part in parts)

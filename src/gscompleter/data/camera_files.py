@@ -4,9 +4,8 @@
   fx and fy. Position and rotation are camera-to-world in OpenCV axes; the principal point is the
   image centre.
 * SuperSplat's poses are the `poseSets` of a project's document.json, or the list. A pose has a
-  position and a target in SuperSplat's world, which is that of the splat rotated by 180° about z,
-  so that y points up. It has neither image size nor roll: cameras are upright, and their field of
-  view is that of the longer side.
+  position and a target in the world of the splat rotated by 180° about z, where y points up. It has
+  no image size and no roll: cameras are upright, with the field of view of the longer side.
 * Exports of Metashape, RealityScan and Polycam are refused, with advice.
 """
 

@@ -140,13 +140,15 @@ def undistort_pinhole(pinhole: Pinhole, distortion: Distortion) -> Pinhole | Non
     """
     if not distortion:
         return pinhole
-    found, radius = None, np.zeros(())
+    found, radius, size = None, np.zeros(()), np.array([pinhole.width, pinhole.height])
     for zoom in np.geomspace(MAX_ZOOM_IN, MAX_ZOOM_OUT, 400).tolist():
         new = replace(pinhole, fl_x=pinhole.fl_x * zoom, fl_y=pinhole.fl_y * zoom)
         bent = distort(_compute_border(new), distortion)
         # Zooming out must move every border point outwards: beyond the fold of a polynomial,
         # points return into the photograph and show something else.
-        if not _is_within(pinhole, bent) or (np.linalg.norm(bent, axis=-1) < radius).any():
+        pixels = _to_pixels(pinhole, bent)
+        is_within = ((pixels >= 0.499) & (pixels <= size - 0.499)).all()
+        if not is_within or (np.linalg.norm(bent, axis=-1) < radius).any():
             break
         found, radius = new, np.linalg.norm(bent, axis=-1)
     return found
@@ -191,12 +193,6 @@ def _compute_plane(
 
 def _to_pixels(pinhole: Pinhole, points: Float[np.ndarray, "*n 2"]) -> Float[np.ndarray, "*n 2"]:
     return points * [pinhole.fl_x, pinhole.fl_y] + [pinhole.cx, pinhole.cy]
-
-
-def _is_within(pinhole: Pinhole, points: Float[np.ndarray, "*n 2"]) -> bool:
-    """Check whether all points fall on pixels of the photograph, within 0.001 pixels."""
-    pixels, size = _to_pixels(pinhole, points), np.array([pinhole.width, pinhole.height])
-    return bool(((pixels >= 0.499) & (pixels <= size - 0.499)).all())
 
 
 @dataclass(frozen=True)

@@ -1,8 +1,7 @@
 """Detection of the vehicle that carries the camera, such as its bonnet, in photographs.
 
-The vehicle does not move in the image, so stereo places it at infinity. A road hardly changes
-either. The difference is the outline of the vehicle: it stays in place although it crosses the
-direction in which the ground moves through the image.
+The vehicle does not move in the image, and a road hardly changes either. The difference is the
+outline: it stays in place although it crosses the direction in which the ground moves.
 """
 
 from __future__ import annotations

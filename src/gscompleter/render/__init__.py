@@ -113,7 +113,7 @@ def choose_device(device: Literal["auto", "cpu", "cuda"] = "auto") -> Literal["c
     if device == "cuda" and not is_ready:
         raise InputError(
             "The device cuda needs a GPU that torch sees, and gsplat from "
-            "`pip install gscompleter[cuda]`; choose the device cpu without them.",
+            "`pip install gscompleter[cuda]`; without them, choose the device cpu.",
             "device",
         )
     if device == "auto":

@@ -5,8 +5,7 @@ frame. Lines of `calib.txt` are the 3×4 projections from the frame of camera 0 
 cameras, and optionally `Tr`, the laser pose.
 
 A drive has poses from GPS and inertial sensors, and the folder above it the calibrations. Latitude
-and longitude become metres by a Mercator projection at the scale of the first latitude, as in the
-development kit.
+and longitude become metres by a Mercator projection at the scale of the first latitude.
 """
 
 from __future__ import annotations

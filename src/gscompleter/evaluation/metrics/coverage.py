@@ -1,8 +1,8 @@
 """Coverage: share of pixels with trusted alpha of at least 0.5, over held-out cameras.
 
-The cameras are random, close to the path of the context cameras and rotated by some degrees. Under
-full trust, trusted alpha is alpha. Of a trained splat, which is opaque everywhere, it counts what
-photographs confirm; what was added or recoloured is trusted afterwards.
+The cameras are random, near the path of the context cameras, rotated by some degrees. Under full
+trust, trusted alpha is alpha; of a trained splat it counts what photographs confirm, and afterwards
+what was added or recoloured.
 """
 
 from __future__ import annotations
