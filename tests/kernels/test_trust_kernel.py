@@ -31,7 +31,7 @@ def some_evidence(n: int, k: int) -> tuple[PhotoObservations, torch.Tensor, torc
 
 
 def expected_support(evidence, means, sums, camera, config):
-    """Evaluate the definition in `stages/support.py` in plain tensors of twice the precision."""
+    """Evaluate the definition in `kernels/support.py` in plain tensors of twice the precision."""
     rays = normalize(means - camera.center, dim=-1).double()
     seen = normalize(means[None] - evidence.centers[:, None], dim=-1).double()
     turn = torch.rad2deg(torch.acos((seen * rays).sum(-1).clamp(-1, 1)))

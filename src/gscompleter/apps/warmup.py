@@ -1,7 +1,4 @@
-"""Compilation of all kernels in advance, by completing a tiny scene.
-
-It is a textured wall, parallel to the image planes of cameras side by side.
-"""
+"""Compilation of all kernels in advance, by completing a tiny scene: a textured wall."""
 
 from __future__ import annotations
 
@@ -55,10 +52,9 @@ def rehearse(with_splat: bool) -> None:
 
 
 def make_photographs() -> list[View]:
-    """Create the photographs of two cameras."""
-    noise = torch.rand(
-        IMAGE_SIZE_PX, IMAGE_SIZE_PX + DISPARITY_PX, 3, generator=torch.Generator().manual_seed(0)
-    )
+    """Create photographs of the wall, parallel to their image planes, by two cameras."""
+    random = torch.Generator().manual_seed(0)
+    noise = torch.rand(IMAGE_SIZE_PX, IMAGE_SIZE_PX + DISPARITY_PX, 3, generator=random)
     wall = smooth_masked(noise, torch.ones(noise.shape[:2], dtype=torch.bool), 1)
     return [
         View(wall[:, DISPARITY_PX * i :][:, :IMAGE_SIZE_PX].contiguous(), make_wall_camera(i))

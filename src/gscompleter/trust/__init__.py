@@ -35,15 +35,17 @@ class HeldViews:
         )
 
 
-@dataclass(frozen=True, kw_only=True)
+@dataclass(frozen=True)
 class Trust:
     """Trust in [0, 1] of each Gaussian of the context; added Gaussians always have 1.
 
     This one is 1 everywhere: the paper's assumption, exact for a context that Ψ reconstructed.
     """
 
-    held: HeldViews = HeldViews(torch.empty(0, 3), torch.empty(0, 0), torch.empty(0))
-    """Views in which recolouring keeps the colours of the context; without any, none changes."""
+    @property
+    def held(self) -> HeldViews:
+        """Views in which recolouring keeps the colours; there are none, so that none changes."""
+        return HeldViews(torch.empty(0, 3), torch.empty(0, 0), torch.empty(0))
 
     def compute_alpha(self, frozen: FrozenScene, camera: Camera) -> Float[Tensor, "h w"]:
         """Render accumulated opacity with every Gaussian weighted by its trust."""

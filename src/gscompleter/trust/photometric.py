@@ -56,15 +56,19 @@ class PhotoObservations:
 
 @dataclass(frozen=True)
 class PhotometricTrust(Trust):
-    """Trust of a Gaussian as far as photographs from similar directions confirm its colour.
-
-    The held views are the photographs, then completed targets.
-    """
+    """Trust of a Gaussian as far as photographs from similar directions confirm its colour."""
 
     observations: PhotoObservations
     is_recolored: Bool[Tensor, "m"]
     """True for Gaussians that a completed target recoloured; these are trusted."""
     config: TrustConfig
+    held_views: HeldViews
+    """The photographs, then completed targets."""
+
+    @property
+    def held(self) -> HeldViews:
+        """Views in which colours stay."""
+        return self.held_views
 
     def compute_alpha(self, frozen: FrozenScene, camera: Camera) -> Float[Tensor, "h w"]:
         """Render accumulated opacity weighted by trust; added and invisible Gaussians have 1."""
@@ -81,7 +85,7 @@ class PhotometricTrust(Trust):
         sums = sum_weights(frozen)[: len(self.is_recolored)]
         return replace(
             self,
-            held=self.held.add(camera, sums),
+            held_views=self.held.add(camera, sums),
             is_recolored=self.is_recolored.index_fill(0, rows, True),
         )
 
@@ -91,7 +95,7 @@ class PhotometricTrust(Trust):
         areas, agreement = seen.areas[:, rows] * growth**2, seen.agreement[:, rows]
         thinned = PhotoObservations(seen.means[rows], seen.centers, areas, agreement)
         held = replace(self.held, sums=self.held.sums[:, rows])
-        return replace(self, observations=thinned, held=held, is_recolored=self.is_recolored[rows])
+        return PhotometricTrust(thinned, self.is_recolored[rows], self.config, held)
 
 
 def load_trust(
@@ -111,7 +115,7 @@ def load_trust(
     weights = sums.new_full((len(cameras),), config.recolor.hold_weight)
     held = HeldViews(observations.centers, sums, weights)
     is_recolored = torch.zeros(len(parts[0]), dtype=torch.bool, device=sums.device)
-    return PhotometricTrust(observations, is_recolored, settings, held=held)
+    return PhotometricTrust(observations, is_recolored, settings, held)
 
 
 def compute_pixel_areas(means: Float[Tensor, "m 3"], camera: Camera) -> Float[Tensor, "m"]:

@@ -1,8 +1,7 @@
 """A video that moves through the completed holes, before and after side by side.
 
 The camera starts at the photograph nearest to the first target, passes all targets and returns the
-same way, so the video can loop and each frame is rendered once. Its path is smooth, with a level
-horizon, and near the photographs: there is free space, and the scene is sharpest.
+same way, so the video can loop and each frame is rendered once. Its path is smooth and level.
 """
 
 from __future__ import annotations

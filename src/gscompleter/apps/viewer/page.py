@@ -1,8 +1,7 @@
 """Makes one self-contained HTML file that loads nothing from the network.
 
 The page has the axes of three.js (x right, y up, z back), its origin at the centre of the scene,
-and a unit in which the scene has about the size `PAGE_EXTENT`, so that the few bits of a .spz
-suffice for scenes in millimetres and in kilometres.
+and a unit in which the scene has about the size `PAGE_EXTENT`, which suits the few bits of a .spz.
 """
 
 from __future__ import annotations

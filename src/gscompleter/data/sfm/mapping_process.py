@@ -1,8 +1,8 @@
 """Structure from motion in a separate process, because COLMAP aborts on errors.
 
-Standard input is a `Job` as JSON. The last line of the output is the result, as JSON too. Many
-unordered photographs are matched with similar ones only, which share the few largest of their
-features (preemptive matching; Wu, "Towards Linear-time Incremental Structure from Motion", 2013).
+Standard input is a `Job` as JSON. The last line of the output is the result, as JSON too. Of many
+unordered photographs, those are matched whose few largest features match (preemptive matching; Wu,
+"Towards Linear-time Incremental Structure from Motion", 2013).
 """
 
 from __future__ import annotations
