@@ -87,7 +87,7 @@ def list_splat_notes(summary: CompletionSummary) -> Iterator[str]:
         yield describe_wanted_photographs(summary.targets)
     elif summary.new_photographs is not None:
         yield (
-            f"The splat was not trained on {summary.new_photographs} of the photographs; it is "
+            f"The splat does not reproduce {summary.new_photographs} of the photographs; it is "
             "recoloured to them, which helps most."
         )
     if recolored := summary.gaussians.get("recolored"):
