@@ -22,9 +22,9 @@ from gscompleter.evaluation.runner import (
     collect_settings,
     evaluate,
 )
-from gscompleter.evaluation.store import VERSION, claim, list_row_paths, read_json, write_json
+from gscompleter.evaluation.store import VERSION, claim, list_row_paths, read_json
 from gscompleter.evaluation.tables import write_tables
-from gscompleter.jobs.jobs import Job
+from gscompleter.jobs.jobs import Job, write_json
 from scenes import Room, camera_at, photographed
 
 SIZE = 32

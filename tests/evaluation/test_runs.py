@@ -20,7 +20,7 @@ from command import run
 from gscompleter import GSCompleter, InputError, memory
 from gscompleter.data.cases import Case
 from gscompleter.evaluation import methods as runs_methods
-from gscompleter.evaluation import store
+from gscompleter.evaluation import runner
 from gscompleter.evaluation.baselines.reggs import RegGSConfig
 from gscompleter.evaluation.columns import GROUPS
 from gscompleter.evaluation.memory import measure_peak_memory
@@ -317,17 +317,17 @@ def test_peak_memory_sees_what_was_let_go_of():
 
 def test_a_run_goes_on_where_it_was_stopped(finished, tasks, tmp_path, monkeypatch):
     out = tmp_path / "out"
-    original = store.write_json
+    original = runner.write_json
 
     def stopped(path, content, keep_existing=False):
         if path.parent.name.startswith("wide") and path.name == "full.json":
             raise KeyboardInterrupt
         original(path, content, keep_existing)
 
-    monkeypatch.setattr(store, "write_json", stopped)
+    monkeypatch.setattr(runner, "write_json", stopped)
     with pytest.raises(KeyboardInterrupt):
         evaluate(tasks, METHOD_NAMES, out, CONFIG)
-    monkeypatch.setattr(store, "write_json", original)
+    monkeypatch.setattr(runner, "write_json", original)
     (wide,) = (out / "tasks").glob("wide*")
     (wide / "context.pt").write_bytes(b"half")
     (wide / "full" / "step-001.pt").unlink()

@@ -16,7 +16,7 @@ from gscompleter.evaluation.methods import Models, check_methods
 from gscompleter.evaluation.protocols import Task
 from gscompleter.evaluation.steps import PreparedTask, attempt, complete_task
 from gscompleter.generators import load_generator
-from gscompleter.jobs.jobs import Engine, Job, check_shard, describe_loss, run_jobs
+from gscompleter.jobs.jobs import Engine, Job, check_shard, describe_loss, run_jobs, write_json
 from gscompleter.memory import check_memory
 from gscompleter.progress import show_progress, stage, track
 from gscompleter.reconstructors import load_reconstructor
@@ -148,7 +148,7 @@ class TaskRunner:
                 if prepared is None:
                     prepared = attempt(partial(prepare_task, task, folder, self.config))
                 made = build_row(task, method, prepared, folder)
-            store.write_json(row, made)
+            write_json(row, made)
 
 
 def prepare_task(task: Task, folder: Path, config: RunConfig) -> PreparedTask:

@@ -28,7 +28,6 @@ from gscompleter.evaluation.methods import Prediction
 from gscompleter.io import reading
 from gscompleter.io.files import replace_file
 from gscompleter.jobs.jobs import claim_folder, make_folder
-from gscompleter.jobs.jobs import write_json as write_json
 from gscompleter.types import Gaussians, merge
 
 RUN, TASKS = "run.json", "tasks"
