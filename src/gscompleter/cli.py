@@ -29,7 +29,7 @@ COMMANDS: dict[str, tuple[type, str, str]] = {
     "live": (options.LiveOptions, "live", "run_live"),
     "clean": (options.CleanOptions, "clean", "run_clean"),
     "demo": (options.DemoOptions, "demo", "run_demo"),
-    "evaluate": (options.EvaluateOptions, "evaluate", "run_evaluation"),
+    "evaluate": (options.EvaluateOptions, "reproduce", "run_evaluation"),
     "tables": (options.TablesOptions, "evaluate", "run_tables"),
     "index": (options.IndexOptions, "evaluate", "run_index"),
     "bench": (options.BenchOptions, "bench", "run_bench"),

@@ -10,6 +10,7 @@ from typing import Any
 import numpy as np
 
 from gscompleter.evaluation.steps import compute_scale_drift
+from gscompleter.timing import STAGES
 
 RunRow = dict[str, Any]
 """Output of `evaluate` for a task and a method."""
@@ -58,12 +59,13 @@ class Column:
 
 def find_number(step: StepRow, path: str) -> Any:
     """Return the number at a place in a step or its scores, one per view, or None."""
-    found: Any = step if path in step else step["scores"]
+    is_direct = path in step or path.startswith("seconds.")
+    found: Any = step if is_direct else step["scores"]
     for key in path.split("."):
         if isinstance(found, list):
             found = [view[key] for view in found]
         else:
-            found = None if found is None else found[key]
+            found = None if found is None else found.get(key)
     return found
 
 
@@ -151,3 +153,20 @@ GROUPS = {
     ),
 }
 """Columns by the title of their table; PSNR is in dB."""
+
+PAPER = (
+    *(
+        _make_geometry(f"{key}{name}", f"{title}{of}", f"{path}.{name}", 4, statistics.fmean)
+        for key, path, of in (("", "registered", ""), ("rim_", "added", " (rim)"))
+        for name, title in (("abs_rel", "AbsRel"), ("chamfer", "Chamfer"), ("f_score", "F-score"))
+    ),
+    Column("fid", "FID", 2, "fid"),  # of all images at once, see `tables.compute_fids`
+    Column("fallbacks", "FB", 0, "anchor_fallback", reduce_steps=sum, reduce_tasks=sum),
+    Column("seconds", "total (s)", 2, "seconds.total"),
+    *(Column(f"seconds_{s}", f"{s} (s)", 2, f"seconds.{s}") for s in STAGES),
+)
+"""Further columns of the paper's tables, which are means over cases; all lifted Gaussians are
+compared with the context, at the rim only those that are added."""
+
+BY_KEY = {column.key: column for group in (*GROUPS.values(), PAPER) for column in group}
+"""All columns by their key."""

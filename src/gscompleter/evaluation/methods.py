@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
+from typing import Any
 
 import torch
 
@@ -87,6 +88,19 @@ def make_completion_method(config: str) -> Method:
     return method
 
 
+def make_steps_method(steps: int) -> Method:
+    """Make the paper's method with a number of denoising steps of its generator."""
+    complete = make_completion_method("paper")
+
+    def method(state: Completion, target: Camera, models: Models) -> Prediction:
+        if not hasattr(models.generator, "steps"):
+            raise InputError(f"steps-{steps} needs denoising steps; add --generator pe-field.")
+        generator: Any = models.generator
+        return complete(state, target, replace(models, generator=replace(generator, steps=steps)))
+
+    return method
+
+
 def make_optimization_method(config: OptimizationConfig) -> Method:
     """Make a method that optimizes the scene on the photographs and the reference."""
 
@@ -155,6 +169,7 @@ METHODS: dict[str, Method] = {
     "paper": make_completion_method("paper"),
     **{title: make_completion_method(name) for title, name in _ABLATIONS.items()},
     **{f"paper/{t}": make_completion_method(f"paper/{name}") for t, name in _ABLATIONS.items()},
+    **{f"steps-{steps}": make_steps_method(steps) for steps in (2, 4, 8, 16)},
     **BASELINES,
 }
 """All methods by name, in the order of the tables."""
@@ -176,7 +191,9 @@ def expand_methods(names: Sequence[str]) -> tuple[str, ...]:
 
 def check_methods(names: Sequence[str], steps: int = 1) -> None:
     """Raise InputError for no or unknown names and methods that cannot do `steps`."""
-    known = ", ".join([*GROUPS, *(name for name in METHODS if not name.startswith("paper/"))])
+    known = ", ".join(
+        [*GROUPS, *(name for name in METHODS if not name.startswith(("paper/", "steps-")))]
+    )
     if not names:
         raise InputError(f"No method was named; choose one or more of {known}.")
     for name in names:

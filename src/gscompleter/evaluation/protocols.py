@@ -82,7 +82,7 @@ class IndexFile:
 
 
 def parse_protocol(text: str) -> EvaluationProtocol:
-    """Parse a protocol: `n-10`, `n-10-stride-5`, `stress`, `sequence-4` or the path of an index."""
+    """Parse a protocol: `n-10`, `n-10-stride-5`, `stress`, `sequence-4`, or a path."""
     for pattern, split in FRAME_RULES.items():
         if match := re.fullmatch(pattern, text):
             numbers = {key: int(n) for key, n in match.groupdict().items() if n}
@@ -96,7 +96,7 @@ def parse_protocol(text: str) -> EvaluationProtocol:
         return read_evaluation_index(Path(text))
     raise InputError(
         f"There is no protocol '{quote_value(text)}'; give n-K for a number of frames K (as n-10), "
-        "stress, sequence-K (as sequence-4), or the path of an evaluation index."
+        "stress or stress-K-TARGET, sequence-K (as sequence-4), or the path of an evaluation index."
     )
 
 
@@ -109,9 +109,9 @@ def extrapolate(num_frames: int, k: int, stride: int | None = None) -> tuple[Spl
     )
 
 
-def split_stress_test(num_frames: int) -> tuple[Split, ...]:
-    """Choose 0, 30 → 99: most of the target is outside the context."""
-    return (Split((0, 30), (99,)),) if num_frames > 99 else ()
+def split_stress_test(num_frames: int, k: int = 30, target: int = 99) -> tuple[Split, ...]:
+    """Choose 0, k → target: most of the target is outside the context."""
+    return (Split((0, k), (target,)),) if num_frames > target > k else ()
 
 
 def split_sequence(num_frames: int, k: int, steps: int = MAX_TARGET_ID) -> tuple[Split, ...]:
@@ -123,7 +123,7 @@ def split_sequence(num_frames: int, k: int, steps: int = MAX_TARGET_ID) -> tuple
 FRAME_RULES: dict[str, Callable[..., tuple[Split, ...]]] = {
     "n-(?P<k>[0-9]{1,6})(?:-stride-(?P<stride>[0-9]{1,6}))?": extrapolate,
     "sequence-(?P<k>[0-9]{1,6})(?:-steps-(?P<steps>[0-9]{1,6}))?": split_sequence,
-    "stress": split_stress_test,
+    "stress(?:-(?P<k>[0-9]{1,6})-(?P<target>[0-9]{1,6}))?": split_stress_test,
 }
 """Functions that choose frames, by the name of the protocol with its numbers."""
 

@@ -74,6 +74,8 @@ class Progress:
 def complete_task(task: PreparedTask, method: str, folder: Path) -> Progress:
     """Complete targets in order until a step fails; saved steps in `folder` are read back."""
     progress = Progress(task.context, task.views)
+    for number, view in enumerate(task.views, start=1):
+        write_image(store.get_photograph_path(folder, number), view.image)
     for target in task.targets:
         following = attempt(partial(advance_task, progress, target, task, method, folder))
         if isinstance(following, str):
@@ -105,6 +107,7 @@ def advance_task(
     step, seen = score_step(prediction, state, target, task)
     write_image(path.with_suffix(".png"), seen.after.image)
     write_image(path.with_name(f"before-{number:03d}.png"), seen.before.image)
+    write_image(path.with_name(f"holes-{number:03d}.png"), seen.holes)
     write_image(store.get_truth_path(folder, number), target.image)
     return Progress(prediction.scene, (*progress.views, target), (*progress.steps, step))
 

@@ -3,10 +3,12 @@
 run.json                            settings that determine the numbers
 tasks/TASK/context.pt               initial scene of all methods
 tasks/TASK/truth-001.png            photograph of the first target
+tasks/TASK/context-001.png          first given photograph
 tasks/TASK/METHOD.json              row of a method: its steps and its error
 tasks/TASK/METHOD/step-001.pt       prediction for the first target
 tasks/TASK/METHOD/step-001.png      render at the first target after completion
 tasks/TASK/METHOD/before-001.png    render at the first target before completion
+tasks/TASK/METHOD/holes-001.png     mask of the holes before completion
 """
 
 from __future__ import annotations
@@ -63,6 +65,11 @@ def get_step_path(folder: Path, method: str, number: int) -> Path:
 def get_truth_path(folder: Path, number: int) -> Path:
     """Return the path of the target photograph of step `number`, counted from 1."""
     return folder / f"truth-{number:03d}.png"
+
+
+def get_photograph_path(folder: Path, number: int) -> Path:
+    """Return the path of a given photograph, counted from 1."""
+    return folder / f"context-{number:03d}.png"
 
 
 def list_row_paths(out: Path) -> list[Path]:

@@ -1,4 +1,4 @@
-"""Tables of a run: scores in three formats, timings in a file of their own, and a plot.
+"""Tables of a run: scores in three formats, and timings in a file of their own.
 
 Score files contain no timings, so an interrupted and resumed run gives the same bytes.
 """
@@ -13,10 +13,8 @@ from functools import cached_property, partial
 from pathlib import Path
 from typing import Any
 
-from gscompleter.config import ABLATIONS
 from gscompleter.errors import InputError
 from gscompleter.evaluation.columns import (
-    GAIN,
     GROUPS,
     MIN_PIXELS,
     PSNR,
@@ -60,8 +58,6 @@ ABSENT_NOTES = {
     ),
 }
 """Reasons why the group of a column is absent."""
-MARKERS = "osD^vP*X<>"
-"""Markers of the methods in the plot."""
 
 
 @dataclass(frozen=True)
@@ -339,41 +335,3 @@ def format_timing_markdown(summary: RunSummary) -> str:
         "finished, and peak memory (GiB). The total excludes the reconstruction of the context, "
         "which all methods share.\n\n" + format_markdown(["method", *stages, "memory"], rows)
     )
-
-
-def draw_plots(summary: RunSummary, out: Path) -> None:
-    """Plot the ΔPSNR of each step against the hole fraction, as `gain_by_hole.png` in `out`.
-
-    Equal values give equal bytes; no plot is made if no case has all methods.
-    """
-    if not summary.common_tasks:
-        return
-    try:
-        from matplotlib.figure import Figure
-    except ImportError as error:
-        raise InputError(
-            f"Plots need matplotlib ({error}); run `pip install gscompleter[evaluation]`."
-        ) from error
-    figure = Figure(figsize=(8, 4.5), layout="constrained")
-    axes = figure.add_subplot()
-    for number, method in enumerate(select_plot_methods(summary.methods)):
-        steps = [step for row in summary.rows[method] for step in row["steps"]]
-        holes = [100 * step["scores"]["hole_fraction"] for step in steps]
-        gains: Any = list(map(GAIN.get_value, steps))
-        marker, color = MARKERS[number % len(MARKERS)], f"C{number % 10}"
-        axes.plot(holes, gains, marker, color=color, markersize=5, alpha=0.8, label=method)
-    axes.axhline(0, color="black", linewidth=0.8)
-    axes.set_xlabel("hole at the target (% of its pixels)")
-    axes.set_ylabel("ΔPSNR at the target (dB)")
-    axes.grid(alpha=0.3)
-    figure.legend(loc="outside right upper", fontsize="small")
-    with replace_file(out / "gain_by_hole.png") as file:
-        figure.savefig(file, format="png", dpi=120, metadata={"Software": None})
-
-
-def select_plot_methods(methods: Sequence[str]) -> list[str]:
-    """Select the methods for the plot: not the context, and no ablations beside other methods."""
-    ablations = {*ABLATIONS, "unconstrained", *(f"paper/{name}" for name in ABLATIONS)}
-    completing = [name for name in methods if name != "context"]
-    others = [name for name in completing if name not in ablations]
-    return others or completing or list(methods)

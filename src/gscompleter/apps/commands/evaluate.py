@@ -25,6 +25,7 @@ from gscompleter.apps.commands.options import (
 from gscompleter.apps.warmup import compile_kernels
 from gscompleter.data.cases import Case, SkippedScene, filter_usable, open_clips, read_cases
 from gscompleter.data.formats import open_photographs
+from gscompleter.data.limits import check_planes
 from gscompleter.data.photographs import check_resolution
 from gscompleter.errors import InputError, quote_value
 from gscompleter.evaluation import protocols, tables
@@ -37,8 +38,17 @@ from gscompleter.progress import show_preparation, show_progress
 from gscompleter.render import choose_device
 
 
-def run_evaluation(options: EvaluateOptions) -> None:
-    """Run and score the methods on the cases, and write the tables."""
+def run_methods(options: EvaluateOptions) -> None:
+    """Run and score the methods on the cases, and write and print the tables."""
+    num_rows = score_methods(options)
+    # A shard without cases has no tables.
+    if list_row_paths(options.out):
+        with show_progress(Console(stderr=True, quiet=options.quiet)):
+            write_and_print_tables(options.out, options.quiet, num_rows=num_rows)
+
+
+def score_methods(options: EvaluateOptions) -> int:
+    """Run and score the methods on the cases; return the number of rows of all shards."""
     if not options.paths:
         raise InputError("No data is given; name a cases.json, or scenes with --protocol.")
     console = Console(stderr=True, quiet=options.quiet, highlight=False)
@@ -54,8 +64,8 @@ def run_evaluation(options: EvaluateOptions) -> None:
         console.print(note, markup=False, soft_wrap=True)
     print_skipped(skipped, console)
     config = RunConfig(
-        reconstructor=options.reconstructor,
-        weights=None if options.weights is None else str(options.weights),
+        reconstructor=options.reconstructor[0],
+        weights=str(options.weights[0]) if options.weights else None,
         generator=options.synthesis.generator,
         generator_settings=options.synthesis.make_settings(),
         device=choose_device(options.device),
@@ -66,11 +76,9 @@ def run_evaluation(options: EvaluateOptions) -> None:
     with show_progress(console):
         compile_kernels((config.device, config.reconstructor, config.generator))
         counts = evaluate(tasks, methods, options.out, config, shard, options.rerun, engine)
-        line = f"Scored {counts.done}, failed {counts.failed}, scored earlier {counts.skipped}."
-        console.print(line)
-        # A shard without cases has no tables.
-        if counts.done + counts.failed + counts.skipped > 0:
-            write_and_print_tables(options.out, options.quiet, num_rows=len(tasks) * len(methods))
+    line = f"Scored {counts.done}, failed {counts.failed}, scored earlier {counts.skipped}."
+    console.print(line)
+    return len(tasks) * len(methods)
 
 
 def describe_source(options: EvaluateOptions) -> dict[str, Any]:
@@ -83,11 +91,12 @@ def describe_source(options: EvaluateOptions) -> dict[str, Any]:
         **({"ignore_masked": True} if options.use_masks else {}),
         **({"one_per_scene": True} if options.one_per_scene else {}),
         **({} if options.ego_mask else {"ego_mask": False}),
+        **{k: v for k in ("near", "far") if (v := getattr(options, k)) is not None},
     }
 
 
 def run_tables(options: TablesOptions) -> None:
-    """Write the tables and plots of an evaluation, and print the tables."""
+    """Write the tables of an evaluation, and print the tables."""
     with show_progress(Console(stderr=True, quiet=options.quiet)):
         write_and_print_tables(options.out, options.quiet, options.fid)
 
@@ -95,7 +104,7 @@ def run_tables(options: TablesOptions) -> None:
 def write_and_print_tables(
     out: Path, quiet: bool, with_fid: bool = False, num_rows: int = 0
 ) -> None:
-    """Write the tables and plots of an evaluation, and print the tables unless `quiet`.
+    """Write the tables of an evaluation, and print the tables unless `quiet`.
 
     It repeats this if other shards added rows meanwhile and all `num_rows` are there.
     """
@@ -104,10 +113,6 @@ def write_and_print_tables(
         seen = there
         with show_preparation("tables"):
             summary = tables.write_tables(out, with_fid)
-            try:
-                tables.draw_plots(summary, out)
-            except InputError as missing:
-                Console(stderr=True, quiet=quiet).print(str(missing), highlight=False)
         there = list_row_times(out)
     if not quiet:
         print_tables(summary, out)
@@ -159,10 +164,12 @@ def collect_tasks(
 
 
 def apply_options(case: Case, options: EvaluateOptions) -> Case:
-    """Return a case with the masks and the resolution of the options."""
+    """Return a case with masks, resolution and depth range of the options."""
     size = options.resolution
     return replace(
         case,
+        near=case.near if options.near is None else options.near,
+        far=case.far if options.far is None else options.far,
         resolution=case.resolution if size is None else parse_resolution(size),
         ignore_masked=options.use_masks or case.ignore_masked,
         ego_mask=options.ego_mask,
@@ -184,6 +191,10 @@ def iterate_tasks(
                     "out."
                 )
             clip = clip if options.ego_mask else clip.keep_ego_vehicle()
+            near = clip.near if options.near is None else options.near
+            far = clip.far if options.far is None else options.far
+            check_planes(near, far)
+            clip = replace(clip, near=near, far=far)
             for rule in rules:
                 tasks = protocols.make_tasks(rule, clip, size, options.use_masks)
                 if not tasks and isinstance(rule, protocols.FrameRule):

@@ -20,6 +20,17 @@ Threads = Annotated[int, Interval(ge=1, le=1024)]
 Port = Annotated[int, Interval(ge=0, le=65535)]
 Axis = Literal["gaussians", "pixels", "views", "targets"]
 BenchMethod = Literal["full", "densify-100", "densify-800", "distill", "reggs"]
+# fmt: off
+TableName = Literal[
+    "models", "ablation", "refinement", "time", "dof", "alignment", "spans", "stress", "steps",
+    "rotation", "paradigms", "sequence", "all",
+]
+FigureName = Literal[
+    "qualitative", "densification", "registration", "seams", "sequence", "all"
+]
+# fmt: on
+AUTO = "auto"
+"""Generator of the preset, or else the default one."""
 Device = Literal["auto", "cpu", "cuda"]
 Size = tuple[int, int] | int | Literal["full"]
 """Height and width, the longest side, or `full` for the photographs' own size."""
@@ -64,14 +75,20 @@ class RunOptions(ComputeOptions):
 
 
 @dataclass(frozen=True, kw_only=True)
-class ModelOptions(RunOptions):
+class SynthesisOptions(RunOptions):
+    """Options of every command with a choice of the generator."""
+
+    synthesis: Annotated[GeneratorOptions, tyro.conf.OmitArgPrefixes] = GeneratorOptions()
+
+
+@dataclass(frozen=True, kw_only=True)
+class ModelOptions(SynthesisOptions):
     """Options of every command with a choice of models."""
 
     reconstructor: str = "plane-sweep"
     """Model that turns photographs into Gaussians: plane-sweep, or one of `gscompleter models`."""
     weights: Path | None = None
     """Weights file of the reconstructor; downloaded if not given."""
-    synthesis: Annotated[GeneratorOptions, tyro.conf.OmitArgPrefixes] = GeneratorOptions()
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -215,10 +232,12 @@ class BatchOptions(EngineOptions):
 
 
 @dataclass(frozen=True, kw_only=True)
-class EvaluateOptions(ModelOptions, EngineOptions):
+class EvaluateOptions(SynthesisOptions, EngineOptions):
     """Run methods on cases with known target photographs, and score them.
 
     Run the same command again to continue. `gscompleter tables OUT` writes the tables at any time.
+    With a preset, a table, a figure or several reconstructors it writes tables and figures of the
+    paper instead.
     """
 
     paths: Annotated[tuple[Path, ...], tyro.conf.Positional, tyro.conf.arg(metavar="PATH")]
@@ -229,12 +248,36 @@ class EvaluateOptions(ModelOptions, EngineOptions):
     """Folder for the results; a folder of an earlier run is continued."""
     protocol: tuple[str, ...] = ()
     """Choice of context and target frames; one or several of: n-10 (frames n and n + 10 for n + 20,
-    then n + 20 and n + 10 for n, for n = 0, 21, 42, …); stress (0 and 30 for 99); sequence-4 or
-    sequence-4-steps-6 (start from frames 0 and 4, then complete 8, 12, … one after the other); or
-    the path of an evaluation index. A cases.json needs none."""
+    then n + 20 and n + 10 for n, for n = 0, 21, 42, …); stress (0 and 30 for 99) or stress-12-39
+    (0 and 12 for 39); sequence-4 or sequence-4-steps-6 (start from frames 0 and 4, then complete 8,
+    12, … one after the other); or the path of an evaluation index. A cases.json needs none."""
     methods: tuple[str, ...] = ("context", "full", "paper")
     """Methods to compare: context, full, paper, an ablation such as no-sa, densify-100,
-    densify-800, distill, reggs; or a group: ablations, baselines, all."""
+    densify-800, distill, reggs; or a group: ablations, baselines, all. Tables and figures of the
+    paper have their own."""
+    preset: Literal["re10k", "acid", "dl3dv", "waymo"] | None = None
+    """Data set of the paper, which sets protocol, resolution, near, far, reconstructors and
+    generator where they are not given."""
+    table: tuple[TableName, ...] = ()
+    """Tables of the paper to write; `all` leaves out those that need another generator."""
+    figure: tuple[FigureName, ...] = ()
+    """Figures of the paper to draw."""
+    figure_cases: tuple[str, ...] = ()
+    """Cases of the figures, named as in the tables; by default the first eight."""
+    outlines: bool = False
+    """Outline the holes in figures."""
+    crops: bool = False
+    """Show the largest hole of each case in figures magnified."""
+    reconstructor: tuple[str, ...] = ()
+    """Models that turn photographs into Gaussians: plane-sweep (the default), or one or several of
+    `gscompleter models`."""
+    weights: tuple[Path, ...] = ()
+    """Weights file of each reconstructor; downloaded if not given."""
+    synthesis: Annotated[GeneratorOptions, tyro.conf.OmitArgPrefixes] = GeneratorOptions(AUTO)
+    near: float | None = None
+    """Smallest depth in the scenes, in the unit of their cameras; by default as in the data."""
+    far: float | None = None
+    """Largest depth in the scenes; by default as in the data."""
     rerun: Literal["nothing", "failures", "scores"] = "nothing"
     """Cases of an earlier run to repeat: those that failed, or all scores."""
     engine: EngineName | None = None
@@ -256,7 +299,7 @@ class TablesOptions(Options):
     """Print and write the tables of an evaluation, finished or not."""
 
     out: Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="OUT")]
-    """Output folder of `evaluate`; tables and plots are written there."""
+    """Output folder of `evaluate`; the tables are written there."""
     fid: bool = False
     """Also compute the FID of each method."""
 

@@ -1,0 +1,185 @@
+"""The command `evaluate`: scores of methods, and from them tables and figures of the paper."""
+
+from __future__ import annotations
+
+import subprocess
+from dataclasses import replace
+from pathlib import Path
+
+from rich.console import Console
+
+from gscompleter.apps.bench.report import describe_machine
+from gscompleter.apps.commands.evaluate import run_methods, score_methods
+from gscompleter.apps.commands.options import AUTO, EvaluateOptions
+from gscompleter.config.generators import GeneratorOptions
+from gscompleter.errors import InputError
+from gscompleter.evaluation.figures import draw_figure
+from gscompleter.evaluation.paper import (
+    DataSet,
+    FigureSpec,
+    Requirements,
+    TableSpec,
+    load_paper,
+    select_names,
+)
+from gscompleter.evaluation.paper_tables import fill_table, judge_claims, write_paper_table
+from gscompleter.evaluation.store import make_file_name
+from gscompleter.evaluation.tables import format_markdown, write_tables
+from gscompleter.io.files import replace_file
+from gscompleter.jobs.jobs import make_folder
+from gscompleter.render import choose_device
+
+DEFAULTS = DataSet((), (0, 0), ("plane-sweep",), GeneratorOptions.generator)
+"""Models without a preset."""
+UNUSUAL = ("stress", "sequence")
+"""Starts of the protocols that only tables of their own use."""
+TABLES, FIGURES, RUNS, RESULTS = "tables", "figures", "runs", "results.md"
+"""Files of a reproduction in OUT."""
+
+
+def run_evaluation(options: EvaluateOptions) -> None:
+    """Run the methods of the options, or those that tables and figures of the paper need."""
+    is_reproduction = bool(options.preset or options.table or options.figure)
+    options = apply_preset(options)
+    models, weights = options.reconstructor, options.weights
+    if len(set(models)) < len(models) or len(weights) not in (0, len(models)):
+        raise InputError(
+            "Every reconstructor has to be another one, with one file of weights each or none; "
+            "change --reconstructor or --weights."
+        )
+    if is_reproduction or len(models) > 1:
+        reproduce(options)
+    else:
+        run_methods(options)
+
+
+def apply_preset(options: EvaluateOptions) -> EvaluateOptions:
+    """Set what is not given as the preset does, or as without one."""
+    preset = load_paper().data_sets[options.preset] if options.preset else DEFAULTS
+    size = preset.resolution if options.preset else None
+    synthesis = options.synthesis
+    if synthesis.generator == AUTO:
+        synthesis = replace(synthesis, generator=preset.generator)
+    return replace(
+        options,
+        resolution=size if options.resolution is None else options.resolution,
+        reconstructor=options.reconstructor or preset.reconstructor,
+        near=preset.near if options.near is None else options.near,
+        far=preset.far if options.far is None else options.far,
+        synthesis=synthesis,
+    )
+
+
+def reproduce(options: EvaluateOptions) -> None:
+    """Write the tables and figures of the options, and all results in OUT as one page."""
+    paper, console = load_paper(), Console(stderr=True, quiet=options.quiet, highlight=False)
+    generator = options.synthesis.generator
+    names = options.table or (() if options.figure else ("models",))
+    chosen = {
+        TABLES: select_names(names, paper.tables, generator),
+        FIGURES: select_names(options.figure, paper.figures, generator),
+    }
+    for kind, specs in chosen.items():
+        make_folder(options.out / kind)
+        for name, spec in specs.items():
+            console.print(f"{name}: {spec.title}", markup=False)
+            try:
+                write(options, name, spec)
+            except InputError as error:
+                if "all" not in (*options.table, *options.figure):
+                    raise
+                console.print(f"Left out {name}: {error}", markup=False, soft_wrap=True)
+    text = write_results(options)
+    if not options.quiet:
+        Console(highlight=False).print(text, markup=False, soft_wrap=True)
+
+
+def write(options: EvaluateOptions, name: str, spec: Requirements) -> None:
+    """Run what a table or figure needs, and write it."""
+    runs = run_all(options, spec)
+    if isinstance(spec, TableSpec):
+        table = fill_table(spec, runs)
+        if not any(table.num_cases.values()):
+            reason = (*table.failures, "no row is there")[0]
+            raise InputError(f"No case of the table was completed: {reason}")
+        write_paper_table(options.out / TABLES / name, table)
+    if isinstance(spec, FigureSpec):
+        by_model = {model: folder for (model, _), folder in runs.items()}
+        names, path = options.figure_cases, options.out / FIGURES / name
+        draw_figure(path, spec, by_model, names, options.outlines, options.crops)
+
+
+def run_all(options: EvaluateOptions, spec: Requirements) -> dict[tuple[str, str], Path]:
+    """Run what a table or figure needs; return the folder of each model and protocol."""
+    runs = {}
+    for number, model in enumerate(options.reconstructor):
+        for protocol in choose_protocols(options, spec):
+            run = make_run(options, spec, number, protocol)
+            score_methods(run)
+            write_tables(run.out)
+            runs[model, Path(protocol).stem] = run.out
+    return runs
+
+
+def choose_protocols(options: EvaluateOptions, spec: Requirements) -> tuple[str, ...]:
+    """Choose the given protocols of the kind that a table needs, or else those of the paper.
+
+    A file of cases, which needs no protocol, has an empty one.
+    """
+    preset = load_paper().data_sets[options.preset] if options.preset else DEFAULTS
+    kinds = {name.split("-")[0] for name in spec.protocol}
+    if kinds:
+        return tuple(p for p in options.protocol if p.split("-")[0] in kinds) or spec.protocol
+    usual = [p for p in options.protocol if not p.startswith(UNUSUAL)]
+    return tuple(usual[:1]) or preset.protocol or ("",)
+
+
+def make_run(
+    options: EvaluateOptions, spec: Requirements, number: int, protocol: str
+) -> EvaluateOptions:
+    """Return the options of a run of one model with one protocol, in a folder of its own."""
+    synthesis = options.synthesis
+    if spec.generator not in (None, synthesis.generator):
+        synthesis = GeneratorOptions(spec.generator or AUTO)
+    one_per_scene = options.one_per_scene or spec.one_per_scene
+    model = options.reconstructor[number]
+    parts = (model, Path(protocol).stem or "cases", synthesis.generator)
+    name = " ".join([*parts, *(["one-per-scene"] if one_per_scene else [])])
+    return replace(
+        options,
+        out=options.out / RUNS / make_file_name(name),
+        reconstructor=(model,),
+        weights=options.weights[number : number + 1],
+        protocol=(protocol,) if protocol else (),
+        methods=spec.list_methods(),
+        synthesis=synthesis,
+        one_per_scene=one_per_scene,
+    )
+
+
+def write_results(options: EvaluateOptions) -> str:
+    """Write all tables, claims and figures in OUT as one page, and return its text."""
+    out, paper = options.out, load_paper()
+    machine = {**describe_machine(choose_device(options.device)), **find_commit()}
+    parts = [f"# Results\n\n{', '.join(f'{key} {value}' for key, value in machine.items())}.\n"]
+    tables = [out / TABLES / f"{name}.md" for name in paper.tables]
+    parts += [path.read_text() for path in tables if path.is_file()]
+    head = ["claim", "table", "measured", "verdict"]
+    judged = format_markdown(head, judge_claims(out / TABLES, paper.claims))
+    parts.append(f"## Claims of the paper\n\n{judged}")
+    for name, figure in paper.figures.items():
+        if (out / FIGURES / f"{name}.png").is_file():
+            parts.append(f"## {figure.title}\n\n![{figure.title}]({FIGURES}/{name}.png)\n")
+    text = "\n".join(parts)
+    with replace_file(out / RESULTS) as file:
+        file.write(text.encode())
+    return text
+
+
+def find_commit() -> dict[str, str]:
+    """Return the commit of this code, or nothing if it is not a git checkout."""
+    root = Path(__file__).parents[4]
+    if not (root / ".git").exists():
+        return {}
+    git = ["git", "-C", str(root), "describe", "--always", "--dirty"]
+    return {"commit": subprocess.run(git, capture_output=True, text=True).stdout.strip()}

@@ -1,0 +1,165 @@
+"""Figures of the paper: grids of images with a row for each case, as PNG and PDF for print."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+
+from gscompleter.errors import InputError
+from gscompleter.evaluation import store
+from gscompleter.evaluation.paper import PHOTOGRAPH, TRUTH, FigureSpec, is_photograph
+from gscompleter.io.files import replace_file
+from gscompleter.io.image import read_pixels
+
+DPI = 300
+IMAGE_INCHES = 1.4
+"""Width of an image in print."""
+MAX_ROWS = 8
+"""Most cases in a figure if none are named."""
+OUTLINE_COLOR = (255, 60, 60)
+CROP = 1 / 3
+"""Side of a crop, relative to the shorter side of the image."""
+
+
+@dataclass(frozen=True)
+class FigureCase:
+    """A target whose images fill a row."""
+
+    name: str
+    number: int
+    """Step of the target, from 1."""
+
+
+def list_cases(runs: Mapping[str, Path], methods: Sequence[str]) -> list[FigureCase]:
+    """List the targets that all methods have completed in all runs."""
+    common: dict[FigureCase, int] = {}
+    for folder in runs.values():
+        for path in store.list_row_paths(folder):
+            row = store.read_json(path)
+            if row["method"] in methods and row["error"] is None:
+                for number in range(1, len(row["steps"]) + 1):
+                    case = FigureCase(row["task"]["name"], number)
+                    common[case] = common.get(case, 0) + 1
+    return [case for case, count in common.items() if count == len(runs) * len(methods)]
+
+
+def select_cases(cases: Sequence[FigureCase], names: Sequence[str]) -> list[FigureCase]:
+    """Select the cases of these names, or the first ones; raise InputError if there are none."""
+    found = [case for case in cases if not names or case.name in names]
+    if not found:
+        known = ", ".join(f"'{case.name}'" for case in cases) or "none"
+        raise InputError(f"No case for the figure was completed by all methods; there are {known}.")
+    return found if names else found[:MAX_ROWS]
+
+
+def draw_figure(
+    path: Path,
+    spec: FigureSpec,
+    runs: Mapping[str, Path],
+    names: Sequence[str] = (),
+    outlines: bool = False,
+    crops: bool = False,
+) -> None:
+    """Draw a figure from runs of `evaluate` by model, as .png and .pdf; `path` has no suffix.
+
+    `names` chooses the cases, `outlines` marks holes, `crops` magnifies the largest hole of each.
+    """
+    cases = select_cases(list_cases(runs, spec.list_methods()), names)
+    columns = list_columns(spec, runs)
+    rows = []
+    for case in cases:
+        holes = read_holes(next(iter(runs.values())), spec, case)
+        images = [read_figure_image(folder, image, case) for _, folder, image in columns]
+        box = find_largest_hole(holes)
+        marked = [draw_outline(image, holes) for image in images] if outlines else images
+        title = f"{case.name} ({case.number})" if case.number > 1 else case.name
+        rows.append((title, marked))
+        if crops:
+            rows.append(("", [image[box] for image in images]))
+    save_grid(path, [title for title, _, _ in columns], rows)
+
+
+def list_columns(spec: FigureSpec, runs: Mapping[str, Path]) -> list[tuple[str, Path, str]]:
+    """List title, run and image of the columns: methods for each model, photographs once."""
+    first, columns = next(iter(runs.values())), []
+    methods = spec.list_methods()
+    for image in spec.images:
+        if is_photograph(image):
+            columns.append((image.replace(PHOTOGRAPH, "photograph "), first, image))
+        elif image == methods[0]:
+            for model, folder in runs.items():
+                prefix = f"{model}\n" if len(runs) > 1 else ""
+                columns += [(prefix + method, folder, method) for method in methods]
+    return columns
+
+
+def read_figure_image(folder: Path, image: str, case: FigureCase) -> np.ndarray:
+    """Read a photograph or the render of a method as uint8 [h, w, 3]."""
+    task = store.get_task_folder(folder, case.name)
+    if image == TRUTH:
+        return read_pixels(store.get_truth_path(task, case.number))
+    if image.startswith(PHOTOGRAPH):
+        return read_pixels(store.get_photograph_path(task, int(image.removeprefix(PHOTOGRAPH))))
+    return read_pixels(store.get_step_path(task, image, case.number).with_suffix(".png"))
+
+
+def read_holes(folder: Path, spec: FigureSpec, case: FigureCase) -> np.ndarray:
+    """Read the hole mask at a target, before its completion, as uint8 [h, w] of 0 and 255."""
+    task = store.get_task_folder(folder, case.name)
+    step = store.get_step_path(task, spec.list_methods()[0], case.number)
+    return read_pixels(step.with_name(f"holes-{case.number:03d}.png"))[..., 0].copy()
+
+
+def draw_outline(image: np.ndarray, holes: np.ndarray) -> np.ndarray:
+    """Draw the outline of the holes."""
+    contours, _ = cv2.findContours(holes, cv2.RETR_LIST, cv2.CHAIN_APPROX_NONE)
+    return cv2.drawContours(image.copy(), contours, -1, OUTLINE_COLOR, 1)
+
+
+def find_largest_hole(holes: np.ndarray) -> tuple[slice, slice]:
+    """Return rows and columns of a square at the largest hole, or in the middle without any."""
+    height, width = holes.shape
+    side = round(CROP * min(height, width))
+    count, _, stats, centers = cv2.connectedComponentsWithStats(holes)
+    middle = (width / 2, height / 2)
+    if count > 1:
+        middle = centers[1 + int(stats[1:, cv2.CC_STAT_AREA].argmax())]
+    x, y = (
+        int(min(max(c - side / 2, 0), n - side))
+        for c, n in zip(middle, (width, height), strict=True)
+    )
+    return slice(y, y + side), slice(x, x + side)
+
+
+def save_grid(
+    path: Path, titles: Sequence[str], rows: Sequence[tuple[str, Sequence[np.ndarray]]]
+) -> None:
+    """Save rows of images with their titles; equal images give equal bytes."""
+    try:
+        from matplotlib.figure import Figure
+        from matplotlib.layout_engine import ConstrainedLayoutEngine
+    except ImportError as error:
+        raise InputError(
+            f"Figures need matplotlib ({error}); run `pip install gscompleter[evaluation]`."
+        ) from error
+    heights = [images[0].shape[0] / images[0].shape[1] for _, images in rows]
+    size = (IMAGE_INCHES * len(titles) + 0.3, IMAGE_INCHES * sum(heights) + 0.5)
+    layout = ConstrainedLayoutEngine(w_pad=0.01, h_pad=0.01, wspace=0, hspace=0)
+    figure = Figure(figsize=size, layout=layout)
+    grid: Any = figure.subplots(len(rows), len(titles), squeeze=False, height_ratios=heights)
+    for line, (name, images) in zip(grid, rows, strict=True):
+        for axes, image in zip(line, images, strict=True):
+            axes.imshow(image, interpolation="nearest", aspect="auto")
+            axes.set(xticks=[], yticks=[])
+            axes.spines[:].set_visible(False)
+        line[0].set_ylabel(name, fontsize=5)
+    for axes, title in zip(grid[0], titles, strict=True):
+        axes.set_title(title, fontsize=7)
+    for suffix, metadata in ((".png", {"Software": None}), (".pdf", {"CreationDate": None})):
+        with replace_file(path.with_name(path.name + suffix)) as file:
+            figure.savefig(file, format=suffix[1:], dpi=DPI, metadata=metadata)

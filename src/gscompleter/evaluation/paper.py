@@ -1,0 +1,117 @@
+"""The paper's data sets, tables, figures and claims, as `paper.yaml` lists them."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass
+from functools import cache
+from importlib.resources import files
+from typing import Any, Literal
+
+import yaml
+from pydantic import TypeAdapter
+
+from gscompleter.config.settings import Settings
+
+TRUTH, PHOTOGRAPH = "truth", "context-"
+"""Names of the images of a figure that are no method."""
+
+
+@dataclass(frozen=True)
+class DataSet(Settings):
+    """Options of `evaluate` for a data set of the paper."""
+
+    protocol: tuple[str, ...]
+    resolution: tuple[int, int]
+    reconstructor: tuple[str, ...]
+    generator: str
+    near: float | None = None
+    far: float | None = None
+
+
+@dataclass(frozen=True)
+class Requirements(Settings):
+    """Runs that a table or a figure needs; what is empty or None is that of the command."""
+
+    title: str
+    protocol: tuple[str, ...] = ()
+    generator: str | None = None
+    one_per_scene: bool = False
+    """True to run only the first case of each scene, because a method is slow."""
+
+    def list_methods(self) -> tuple[str, ...]:
+        """List the methods to run."""
+        raise NotImplementedError
+
+
+@dataclass(frozen=True, kw_only=True)
+class TableSpec(Requirements):
+    """A table with a row for each model, protocol and method."""
+
+    methods: tuple[str, ...]
+    baseline: str
+    """Method to which differences are given."""
+    columns: tuple[str, ...]
+    """Keys of `columns.BY_KEY`."""
+
+    def list_methods(self) -> tuple[str, ...]:
+        """List the methods to run."""
+        return self.methods
+
+
+@dataclass(frozen=True, kw_only=True)
+class FigureSpec(Requirements):
+    """A grid of images with a row for each case."""
+
+    images: tuple[str, ...]
+    """Methods, `context-N` for the N-th given photograph, `truth` for that of the target."""
+
+    def list_methods(self) -> tuple[str, ...]:
+        """List the methods to run."""
+        return tuple(name for name in self.images if not is_photograph(name))
+
+
+@dataclass(frozen=True)
+class Claim(Settings):
+    """A claim that a method is better than another in a column of a table."""
+
+    says: str
+    table: str
+    column: str
+    method: str
+    baseline: str
+    better: Literal["higher", "lower"]
+
+
+@dataclass(frozen=True)
+class Paper(Settings):
+    """Content of `paper.yaml`."""
+
+    data_sets: Mapping[str, DataSet]
+    tables: Mapping[str, TableSpec]
+    figures: Mapping[str, FigureSpec]
+    claims: Sequence[Claim]
+
+
+@cache
+def load_paper() -> Paper:
+    """Load and validate `paper.yaml`."""
+    content: Any = yaml.safe_load(files(__package__).joinpath("paper.yaml").read_text())
+    return TypeAdapter(Paper).validate_python(content)
+
+
+def is_photograph(image: str) -> bool:
+    """Return True if an image of a figure is a photograph instead of a render."""
+    return image == TRUTH or image.startswith(PHOTOGRAPH)
+
+
+def select_names(
+    given: Iterable[str], known: Mapping[str, Requirements], generator: str
+) -> dict[str, Requirements]:
+    """Select tables or figures by name; `all` leaves out those that need another generator."""
+    usable = (generator, "oracle", None)
+    every = {name: spec for name, spec in known.items() if spec.generator in usable}
+    chosen: dict[str, Requirements] = {}
+    for name in given:
+        chosen |= every if name == "all" else {name: known[name]}
+    return chosen

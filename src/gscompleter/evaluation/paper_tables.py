@@ -1,0 +1,262 @@
+"""Tables of several models and protocols, with standard errors and paired differences."""
+
+from __future__ import annotations
+
+import json
+import math
+import statistics
+from collections import defaultdict
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from dataclasses import asdict, dataclass
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+from gscompleter.evaluation.columns import BY_KEY, Column
+from gscompleter.evaluation.paper import Claim, TableSpec
+from gscompleter.evaluation.store import read_json
+from gscompleter.evaluation.tables import (
+    ABSENT_NOTES,
+    RunSummary,
+    compute_fids,
+    format_latex,
+    format_markdown,
+    format_score,
+    read_rows,
+    summarize_run,
+)
+from gscompleter.io.files import replace_file
+
+NOISE = 2.0
+"""Number of standard errors up to which a difference is within noise."""
+ABOUT = (
+    "Mean ± standard error over scenes; in brackets the mean of the paired differences to "
+    "*{baseline}*, with ≈ if it is within two of its standard errors. {cases}."
+)
+
+
+@dataclass(frozen=True)
+class Estimate:
+    """A mean over cases with its standard error, or None for a single scene."""
+
+    mean: float
+    error: float | None
+
+    @property
+    def is_noise(self) -> bool:
+        """True unless the mean differs from zero by more than `NOISE` standard errors."""
+        return self.error is None or abs(self.mean) <= NOISE * self.error
+
+
+@dataclass(frozen=True)
+class Cell:
+    """A number of a method, and the mean of its paired differences to the baseline."""
+
+    value: float | None
+    error: float | None = None
+    difference: Estimate | None = None
+    is_noise: bool = True
+    cases: Mapping[str, float] | None = None
+    """Value of each case, for other comparisons."""
+
+
+@dataclass(frozen=True)
+class TableRow:
+    """The cells of a method with a model and a protocol."""
+
+    model: str
+    protocol: str
+    method: str
+    cells: Mapping[str, Cell]
+    """Cells by the key of their column."""
+
+
+@dataclass(frozen=True)
+class PaperTable:
+    """A filled table of the paper."""
+
+    spec: TableSpec
+    rows: Sequence[TableRow]
+    num_cases: Mapping[str, int]
+    """Number of cases that all methods finished, by model and protocol."""
+    failures: Sequence[str] = ()
+
+    @property
+    def columns(self) -> list[Column]:
+        """Columns in which any row has a value."""
+        return [BY_KEY[key] for key in self.spec.columns if self.has_value(key)]
+
+    def has_value(self, key: str) -> bool:
+        """Return True if any row has a value in a column."""
+        return any(row.cells[key].value is not None for row in self.rows)
+
+
+def get_scene(case: str) -> str:
+    """Return the scene in the name of a case, which may be followed by `|` and its run."""
+    return case.split("|")[0].rpartition(" ")[0]
+
+
+def estimate_mean(values: Mapping[str, float]) -> Estimate:
+    """Average over cases, with the standard error of a mean whose cases are clustered by scene.
+
+    The error is sqrt(G / (G - 1) Σ_g (Σ_i∈g (x_i - mean))²) / n for n cases of G scenes.
+    """
+    mean = statistics.fmean(values.values())
+    sums: dict[str, float] = defaultdict(float)
+    for case, value in values.items():
+        sums[get_scene(case)] += value - mean
+    count = len(sums)
+    if count < 2:
+        return Estimate(mean, None)
+    spread = count / (count - 1) * math.fsum(total**2 for total in sums.values())
+    return Estimate(mean, math.sqrt(spread) / len(values))
+
+
+def compare_cases(values: Mapping[str, float], others: Mapping[str, float]) -> Estimate | None:
+    """Average the differences over the cases that both have; None if there are none."""
+    common = {case: value - others[case] for case, value in values.items() if case in others}
+    return estimate_mean(common) if common else None
+
+
+def fill_table(spec: TableSpec, runs: Mapping[tuple[str, str], Path]) -> PaperTable:
+    """Fill a table from runs of `evaluate`, given by model and protocol."""
+    rows: list[TableRow] = []
+    counts, failures = {}, []
+    for (model, protocol), folder in runs.items():
+        found = [row for row in read_rows(folder) if row["method"] in spec.methods]
+        summary = summarize_run(found)
+        counts[f"{model}, {protocol}" if protocol else model] = len(summary.common_tasks)
+        failures += [" ".join(failure) for failure in summary.failures]
+        fids = compute_fids(folder, summary) if "fid" in spec.columns else ""
+        baseline = collect_values(summary, spec.baseline, spec.columns)
+        for method in spec.methods:
+            values = collect_values(summary, method, spec.columns)
+            cells = {
+                key: fill_cell(BY_KEY[key], values[key], {} if method == spec.baseline else base)
+                for key, base in baseline.items()
+            }
+            if isinstance(fids, dict):
+                cells["fid"] = Cell(fids[method])
+            rows.append(TableRow(model, protocol, method, cells))
+    return PaperTable(spec, rows, counts, failures)
+
+
+def collect_values(
+    summary: RunSummary, method: str, columns: Sequence[str]
+) -> dict[str, dict[str, float]]:
+    """Collect the values of a method in each column, by case."""
+    pairs = list(zip(summary.common_tasks, summary.rows[method], strict=True))
+    values = {key: {task: BY_KEY[key].compute_row(row) for task, row in pairs} for key in columns}
+    return {key: {t: v for t, v in of.items() if v is not None} for key, of in values.items()}
+
+
+def fill_cell(column: Column, values: dict[str, float], baseline: Mapping[str, float]) -> Cell:
+    """Reduce the values of the cases; only means have an error and a difference."""
+    if not values:
+        return Cell(None)
+    if column.reduce_tasks is not statistics.fmean:
+        return Cell(column.reduce_tasks([*values.values()]), cases=values)
+    found, difference = estimate_mean(values), compare_cases(values, baseline)
+    is_noise = difference is None or difference.is_noise
+    return Cell(found.mean, found.error, difference, is_noise, values)
+
+
+def write_paper_table(path: Path, table: PaperTable) -> None:
+    """Write a table as .md, .tex and .json beside each other; `path` has no suffix."""
+    texts = {".md": format_paper_markdown(table), ".tex": format_paper_latex(table)}
+    content = {
+        "title": table.spec.title,
+        "baseline": table.spec.baseline,
+        "cases": table.num_cases,
+        "rows": [asdict(row) for row in table.rows],
+    }
+    texts[".json"] = json.dumps(content, indent=1) + "\n"
+    for suffix, text in texts.items():
+        with replace_file(path.with_name(path.name + suffix)) as file:
+            file.write(text.encode())
+
+
+def format_rows(
+    table: PaperTable, format_cell: Callable[[Column, Cell], str]
+) -> tuple[list[str], list[list[str]]]:
+    """Return the titles and the cells of a table; columns with a single name are left out."""
+    names: dict[str, Callable[[TableRow], str]] = {
+        "Ψ": lambda row: row.model,
+        "protocol": lambda row: row.protocol,
+        "method": lambda row: row.method,
+    }
+    shown = {t: get for t, get in names.items() if len(set(map(get, table.rows))) > 1}
+    shown["method"] = names["method"]
+    head = [*shown, *(column.title for column in table.columns)]
+    rows = [
+        [*(get(row) for get in shown.values())]
+        + [format_cell(column, row.cells[column.key]) for column in table.columns]
+        for row in table.rows
+    ]
+    return head, rows
+
+
+def format_number(column: Column, cell: Cell, error: str, difference: str) -> str:
+    """Format a cell with templates of its error and its difference."""
+    text, digits = format_score(cell.value, column.digits), column.digits
+    if cell.error is not None:
+        text += error.format(f"{cell.error:.{digits}f}")
+    if cell.difference is not None:
+        mark = "≈" if cell.is_noise else ""
+        text += difference.format(f"{mark}{cell.difference.mean:+.{digits}f}")
+    return text
+
+
+def format_paper_markdown(table: PaperTable) -> str:
+    """Format a table with its title and notes."""
+    counts = [f"{count} cases ({name})" for name, count in table.num_cases.items()]
+    about = ABOUT.format(baseline=table.spec.baseline, cases="; ".join(counts))
+    head, rows = format_rows(table, partial(format_number, error=" ± {}", difference=" ({})"))
+    failed = [f"Failed: {failure}\n" for failure in table.failures]
+    body = [format_markdown(head, rows), *describe_missing(table), *failed]
+    return "\n".join([f"## {table.spec.title}\n", f"{about}\n", *body])
+
+
+def describe_missing(table: PaperTable) -> list[str]:
+    """Name the columns without a value, with the reason if it is known."""
+    absent = [key for key in table.spec.columns if not table.has_value(key)]
+    names = ", ".join(BY_KEY[key].title for key in absent)
+    notes = [f"{ABSENT_NOTES[key]}\n" for key in absent if key in ABSENT_NOTES]
+    return [f"Without a value: {names}.\n", *notes] if absent else []
+
+
+def format_paper_latex(table: PaperTable) -> str:
+    """Format a table with booktabs."""
+    cell = partial(format_number, error=r"{{\tiny$\pm${}}}", difference=r"~{{\tiny({})}}")
+    text = format_latex(*format_rows(table, cell))
+    for sign, command in {"≈": r"$\approx$", "Ψ": r"$\Psi$", "Δ": r"$\Delta$"}.items():
+        text = text.replace(sign, command)
+    return f"% {table.spec.title}\n{text}\n"
+
+
+def judge_claims(folder: Path, claims: Iterable[Claim]) -> list[list[str]]:
+    """Compare the claims with the tables in a folder: claim, table, comparison, verdict."""
+    return [[claim.says, claim.table, *judge_claim(folder, claim)] for claim in claims]
+
+
+def judge_claim(folder: Path, claim: Claim) -> tuple[str, str]:
+    """Return the difference that a claim is about, and whether it is reproduced."""
+    path = folder / f"{claim.table}.json"
+    content: Mapping[str, Any] = read_json(path) if path.is_file() else {"rows": []}
+    column, sign = BY_KEY[claim.column], 1 if claim.better == "higher" else -1
+    of: dict[str, dict[str, float]] = {claim.method: {}, claim.baseline: {}}
+    for row in content["rows"]:
+        if row["method"] in of:
+            values = row["cells"][claim.column]["cases"] or {}
+            where = f"|{row['model']}|{row['protocol']}"
+            of[row["method"]] |= {case + where: value for case, value in values.items()}
+    found = compare_cases(of[claim.method], of[claim.baseline])
+    if found is None:
+        return "", "not measured"
+    text = f"{column.title} {found.mean:+.{column.digits}f}"
+    if found.error is None:
+        return text, "one scene only"
+    text += f" ± {found.error:.{column.digits}f}"
+    if found.is_noise:
+        return text, "within noise"
+    return text, "reproduced" if sign * found.mean > 0 else "not reproduced"
