@@ -9,7 +9,7 @@ TORCH_CPU_INDEX ?= https://download.pytorch.org/whl/cpu
 TORCH_INDEX := $(shell command -v nvidia-smi >/dev/null 2>&1 || echo --extra-index-url $(TORCH_CPU_INDEX))
 PIP := $(BIN)/python -m pip install --quiet --disable-pip-version-check
 
-.PHONY: demo test test-slow golden check-golden lint format types docs dist release-check evaluate bench gpu clean
+.PHONY: demo test test-slow golden check-golden lint format types docs dist release-check evaluate reproduce bench gpu clean
 
 demo: $(VENV)/installed
 	$(BIN)/gscompleter demo --out demo --overwrite
@@ -60,6 +60,20 @@ METHODS ?= context full paper
 RESULTS ?= results
 evaluate: $(VENV)/installed-evaluation
 	$(BIN)/gscompleter evaluate $(CASES) --methods $(METHODS) --out $(RESULTS)
+
+# Tables, figures and claims of the paper on the same photographs, in under half an hour; the slow
+# baselines run on few cases. docs/reproduce.md explains them.
+REPRODUCED ?= $(RESULTS)/paper
+reproduce: $(VENV)/installed-evaluation
+	$(BIN)/gscompleter evaluate $(CASES) --table models --figure qualitative --out $(REPRODUCED)
+	$(BIN)/gscompleter evaluate $(CASES) --one-per-scene --out $(REPRODUCED) --figure seams \
+		--table ablation refinement time dof alignment rotation
+	$(BIN)/gscompleter evaluate $(CASES) --limit 4 --out $(REPRODUCED) --table paradigms \
+		--figure densification registration
+	$(BIN)/gscompleter evaluate $(dir $(CASES)) --one-per-scene --resolution 256 256 --out $(REPRODUCED) \
+		--table spans stress --protocol n-2 n-4 n-8 stress-12-39
+	$(BIN)/gscompleter evaluate $(dir $(CASES)) --limit 2 --resolution 256 256 --out $(REPRODUCED) \
+		--table sequence --figure sequence --protocol sequence-4-steps-2
 
 # Ours beside what else a user has. Holes are filled on photographs that are held back: name a CASES.
 # What completions take comes first (docs/performance.md); without its scenes, name another PERFORMANCE.

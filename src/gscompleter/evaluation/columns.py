@@ -49,7 +49,7 @@ class Column:
             value = np.subtract(value, find_number(step, self.minus)).tolist()
         if isinstance(value, list):
             return self.reduce_steps(value) if value else None
-        return value
+        return None if value is None else float(value)
 
     def compute_row(self, row: RunRow) -> float | None:
         """Compute the value of a task, or None if no step has one."""

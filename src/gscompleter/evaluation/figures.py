@@ -67,7 +67,7 @@ def draw_figure(
 ) -> None:
     """Draw a figure from runs of `evaluate` by model, as .png and .pdf; `path` has no suffix.
 
-    `names` chooses the cases, `outlines` marks holes, `crops` magnifies the largest hole of each.
+    `names` chooses the cases, `outlines` marks holes, `crops` magnifies the widest hole of each.
     """
     cases = select_cases(list_cases(runs, spec.list_methods()), names)
     columns = list_columns(spec, runs)
@@ -75,8 +75,11 @@ def draw_figure(
     for case in cases:
         holes = read_holes(next(iter(runs.values())), spec, case)
         images = [read_figure_image(folder, image, case) for _, folder, image in columns]
-        box = find_largest_hole(holes)
-        marked = [draw_outline(image, holes) for image in images] if outlines else images
+        box = find_widest_hole(holes)
+        marked = [
+            draw_outline(image, holes) if outlines and not name.startswith(PHOTOGRAPH) else image
+            for image, (_, _, name) in zip(images, columns, strict=True)
+        ]
         title = f"{case.name} ({case.number})" if case.number > 1 else case.name
         rows.append((title, marked))
         if crops:
@@ -121,19 +124,15 @@ def draw_outline(image: np.ndarray, holes: np.ndarray) -> np.ndarray:
     return cv2.drawContours(image.copy(), contours, -1, OUTLINE_COLOR, 1)
 
 
-def find_largest_hole(holes: np.ndarray) -> tuple[slice, slice]:
-    """Return rows and columns of a square at the largest hole, or in the middle without any."""
-    height, width = holes.shape
-    side = round(CROP * min(height, width))
-    count, _, stats, centers = cv2.connectedComponentsWithStats(holes)
-    middle = (width / 2, height / 2)
-    if count > 1:
-        middle = centers[1 + int(stats[1:, cv2.CC_STAT_AREA].argmax())]
-    x, y = (
-        int(min(max(c - side / 2, 0), n - side))
-        for c, n in zip(middle, (width, height), strict=True)
+def find_widest_hole(holes: np.ndarray) -> tuple[slice, slice]:
+    """Return rows and columns of a square around the middle of the widest hole."""
+    side = round(CROP * min(holes.shape))
+    *_, (x, y) = cv2.minMaxLoc(cv2.distanceTransform(holes, cv2.DIST_L2, 3))
+    top, left = (
+        min(max(center - side // 2, 0), size - side)
+        for center, size in zip((y, x), holes.shape, strict=True)
     )
-    return slice(y, y + side), slice(x, x + side)
+    return slice(top, top + side), slice(left, left + side)
 
 
 def save_grid(

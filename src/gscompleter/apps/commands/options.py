@@ -267,7 +267,7 @@ class EvaluateOptions(SynthesisOptions, EngineOptions):
     outlines: bool = False
     """Outline the holes in figures."""
     crops: bool = False
-    """Show the largest hole of each case in figures magnified."""
+    """Show the widest hole of each case in figures magnified."""
     reconstructor: tuple[str, ...] = ()
     """Models that turn photographs into Gaussians: plane-sweep (the default), or one or several of
     `gscompleter models`."""

@@ -1,0 +1,234 @@
+"""The paper's tables, figures and claims, and a small reproduction of all of them."""
+
+import json
+import math
+import statistics
+from functools import partial
+from pathlib import Path
+from typing import get_args
+
+import numpy as np
+import pytest
+import torch
+
+import tiny_diffusion
+from chunk_files import example, save_chunk
+from command import run
+from gscompleter.apps.commands.options import EvaluateOptions, FigureName, TableName
+from gscompleter.apps.commands.reproduce import apply_preset, choose_protocols
+from gscompleter.data.formats import open_photographs
+from gscompleter.evaluation.columns import BY_KEY
+from gscompleter.evaluation.figures import draw_outline, find_widest_hole
+from gscompleter.evaluation.methods import METHODS
+from gscompleter.evaluation.paper import Claim, load_paper, select_names
+from gscompleter.evaluation.paper_tables import (
+    compare_cases,
+    estimate_mean,
+    judge_claim,
+)
+from gscompleter.evaluation.runner import RunConfig
+from gscompleter.io.image import read_pixels
+from gscompleter.models.feed_forward import MVSplat
+from gscompleter.models.weights.published import PUBLISHED
+from scenes import Room, camera_at, view_of
+
+PAPER = load_paper()
+SIZE = 64
+FRAMES = 9
+PROTOCOLS = ("n-2", "n-3", "stress-2-7", "sequence-2-steps-2")
+
+
+def test_the_registry_names_what_exists():
+    assert (*PAPER.tables, "all") == get_args(TableName)
+    assert (*PAPER.figures, "all") == get_args(FigureName)
+    for spec in (*PAPER.tables.values(), *PAPER.figures.values()):
+        assert set(spec.list_methods()) <= set(METHODS)
+    for spec in PAPER.tables.values():
+        assert set(spec.columns) <= set(BY_KEY)
+        assert spec.baseline in spec.methods
+    for claim in PAPER.claims:
+        table = PAPER.tables[claim.table]
+        assert {claim.method, claim.baseline} <= set(table.methods)
+        assert claim.column in table.columns
+    for preset in PAPER.data_sets.values():
+        assert all(PUBLISHED[name].is_reconstructor for name in preset.reconstructor)
+
+
+def test_the_standard_error_is_over_scenes():
+    alone = {"a 0>1": 1.0, "b 0>1": 2.0, "c 0>1": 6.0}
+    found = estimate_mean(alone)
+    assert found.mean == 3
+    assert found.error == pytest.approx(statistics.stdev(alone.values()) / math.sqrt(3))
+    # Cases of the same scenes with the same values tell nothing new.
+    repeated = {f"{case}{i}": value for case, value in alone.items() for i in range(4)}
+    assert estimate_mean(repeated).error == pytest.approx(found.error)
+    assert estimate_mean({"a 0>1": 1.0, "a 0>2": 5.0}).error is None
+
+
+def test_differences_are_paired():
+    easy, hard = {"a 0>1": 30.0, "b 0>1": 10.0}, {"a 0>1": 30.5, "b 0>1": 10.4, "c 0>1": 0.0}
+    found = compare_cases(hard, easy)
+    assert found.mean == pytest.approx(0.45)
+    assert not found.is_noise
+    assert estimate_mean(easy).error > 9
+    assert compare_cases({"a 0>1": 1.0}, {"b 0>1": 1.0}) is None
+
+
+@pytest.mark.parametrize(
+    ("values", "verdict"),
+    [
+        ((1.0, 1.1, 0.9), "not reproduced"),
+        ((-1.0, -1.1, -0.9), "reproduced"),
+        ((-1.0, 1.1, 0.0), "within noise"),
+        ((-1.0,), "one scene only"),
+        ((), "not measured"),
+    ],
+)
+def test_a_claim_is_judged_by_paired_differences(values, verdict, tmp_path):
+    def row(method, shift):
+        cases = {f"{scene} 0>1": 5 + shift * v for scene, v in zip("abc", values, strict=False)}
+        cells = {"abs_rel": {"cases": cases}}
+        return {"model": "x", "protocol": "", "method": method, "cells": cells}
+
+    content = {"rows": [row("paper", 1), row("paper/no-rc", 0)]}
+    (tmp_path / "dof.json").write_text(json.dumps(content))
+    claim = Claim("-", "dof", "abs_rel", "paper", "paper/no-rc", "lower")
+    assert judge_claim(tmp_path, claim)[1] == verdict
+
+
+def options(**given: object) -> EvaluateOptions:
+    return EvaluateOptions(paths=(), out=Path("out"), **given)
+
+
+def test_a_preset_sets_what_is_not_given():
+    found = apply_preset(options(preset="dl3dv"))
+    assert (found.resolution, found.near, found.far) == ((256, 448), 0.5, 200)
+    assert found.reconstructor == ("depthsplat-base-dl3dv-256x448",)
+    assert found.synthesis.generator == "pe-field"
+    found = apply_preset(options(preset="dl3dv", reconstructor=("plane-sweep",), resolution=64))
+    assert (found.reconstructor, found.resolution) == (("plane-sweep",), 64)
+    found = apply_preset(options())
+    assert (found.reconstructor, found.synthesis.generator) == (("plane-sweep",), "warp-inpaint")
+
+
+def test_a_table_takes_the_given_protocols_of_its_kind():
+    given = options(preset="re10k", protocol=("n-2", "n-3", "stress-2-7"))
+    assert choose_protocols(given, PAPER.tables["spans"]) == ("n-2", "n-3")
+    assert choose_protocols(given, PAPER.tables["stress"]) == ("stress-2-7",)
+    assert choose_protocols(given, PAPER.tables["models"]) == ("n-2",)
+    assert choose_protocols(given, PAPER.tables["sequence"]) == ("sequence-10",)
+    assert choose_protocols(options(preset="re10k"), PAPER.tables["models"]) == ("n-30",)
+    assert choose_protocols(options(), PAPER.tables["models"]) == ("",)
+
+
+def test_all_leaves_out_what_another_generator_is_needed_for():
+    assert "steps" not in select_names(["all"], PAPER.tables, "warp-inpaint")
+    assert "steps" in select_names(["all"], PAPER.tables, "pe-field")
+    assert list(select_names(["steps"], PAPER.tables, "warp-inpaint")) == ["steps"]
+
+
+def test_crops_and_outlines_are_at_the_holes():
+    holes = np.zeros((60, 90), np.uint8)
+    holes[40:, 70:] = 255
+    holes[:3] = 255
+    rows, columns = find_widest_hole(holes)
+    assert (rows.stop, columns.stop) == (60, 90)
+    assert rows.stop - rows.start == columns.stop - columns.start == 20
+    marked = draw_outline(np.zeros((60, 90, 3), np.uint8), holes)
+    assert marked[50, 70].any()
+    assert not marked[55, 80].any()
+
+
+@pytest.fixture(scope="module")
+def rooms(tmp_path_factory) -> Path:
+    """Write a chunk with two rooms."""
+    cameras = [camera_at(x=0.12 * i, yaw=3.0 * i, size=SIZE) for i in range(FRAMES)]
+    inside = {"a": Room(), "b": Room(boxes=(((-4.0, -1.5, -1.0), (4.0, 1.5, 6.0)),))}
+    examples = [example(k, views=[view_of(r, c) for c in cameras]) for k, r in inside.items()]
+    return save_chunk(tmp_path_factory.mktemp("rooms") / "000000.torch", *examples)
+
+
+@pytest.fixture
+def clips(shared, tmp_path) -> Path:
+    """Write a chunk with two clips of photographs."""
+    folders = [shared / "data" / name for name in ("re10k_0d4de33c", "re10k_000c3ab1")]
+    opened = {folder.name: open_photographs(folder) for folder in folders}
+    views = {name: clip.views(range(FRAMES), (SIZE, SIZE)) for name, clip in opened.items()}
+    examples = [example(name, views=found) for name, found in views.items()]
+    return save_chunk(tmp_path / "000000.torch", *examples)
+
+
+def reproduce(monkeypatch, data: Path, out: Path, *more: object) -> int:
+    words = ["evaluate", data, "--out", out, "--one-per-scene", "--resolution", SIZE, SIZE]
+    protocols = () if "--protocol" in more else ("--protocol", *PROTOCOLS)
+    return run(monkeypatch, *words, *protocols, "--quiet", *more)
+
+
+def test_a_table_and_a_figure_of_rooms(rooms, tmp_path, monkeypatch):
+    more = ("--table", "models", "spans", "--figure", "seams", "--outlines", "--crops")
+    assert reproduce(monkeypatch, rooms, tmp_path, *more) == 0
+    table = json.loads((tmp_path / "tables" / "spans.json").read_text())
+    assert [row["protocol"] for row in table["rows"]] == ["n-2", "n-2", "n-3", "n-3"]
+    before, after = (row["cells"]["psnr"] for row in table["rows"][:2])
+    differences = [after["cases"][case] - value for case, value in before["cases"].items()]
+    assert len(differences) == 2
+    assert after["difference"]["mean"] == pytest.approx(statistics.fmean(differences))
+    assert after["value"] > before["value"]
+    text = (tmp_path / "results.md").read_text()
+    assert "## Seams without and with a dilated hole mask" in text
+    assert text.count("not measured") < len(PAPER.claims)
+    # Two rows with their crops, four columns.
+    height, width, _ = read_pixels(tmp_path / "figures" / "seams.png").shape
+    assert height == pytest.approx(width, rel=0.15)
+    first = {path: path.read_bytes() for path in tmp_path.glob("*/s*.*")}
+    assert reproduce(monkeypatch, rooms, tmp_path, *more) == 0
+    assert {path: path.read_bytes() for path in tmp_path.glob("*/s*.*")} == first
+
+
+def test_all_of_the_paper_on_photographs(clips, tmp_path, monkeypatch):
+    """Two models with random weights, and a tiny diffusion model in place of PE-Field's."""
+    weights = []
+    for seed in range(2):
+        torch.manual_seed(seed)
+        state = {f"encoder.{k}": v for k, v in MVSplat().state_dict().items()}
+        weights.append(tmp_path / f"{seed}.ckpt")
+        torch.save({"state_dict": state}, weights[-1])
+    kontext = tiny_diffusion.saved(tiny_diffusion.kontext_pipeline(), tmp_path / "kontext")
+    more = ["--table", "all", "--figure", "all", "--preset", "re10k", "--weights", *weights]
+    more += ["--reconstructor", "mvsplat-re10k", "mvsplat-acid"]
+    more += ["--generator-weights", kontext, "--generator-depth", "context"]
+    out = tmp_path / "out"
+    few = partial(RunConfig, baseline_iterations=5)
+    monkeypatch.setattr("gscompleter.apps.commands.evaluate.RunConfig", few)
+    assert reproduce(monkeypatch, clips, out, *more) == 0
+    for name, spec in PAPER.tables.items():
+        table = json.loads((out / "tables" / f"{name}.json").read_text())
+        assert {row["method"] for row in table["rows"]} == set(spec.methods)
+        assert {row["model"] for row in table["rows"]} == {"mvsplat-re10k", "mvsplat-acid"}
+        assert set(table["cases"].values()) == {2}
+        latex = (out / "tables" / f"{name}.tex").read_text()
+        assert latex.count(r"\\") == 1 + len(table["rows"])
+    for name in PAPER.figures:
+        assert (read_pixels(out / "figures" / f"{name}.png") < 128).any()
+        assert (out / "figures" / f"{name}.pdf").read_bytes().startswith(b"%PDF")
+    text = (out / "results.md").read_text()
+    assert all(spec.title in text for spec in (*PAPER.tables.values(), *PAPER.figures.values()))
+    assert all(claim.says in text for claim in PAPER.claims)
+
+
+@pytest.mark.parametrize(
+    ("more", "sentence"),
+    [
+        (("--table", "stress", "--protocol", "stress-2-70"), "no clip has the frames"),
+        (("--figure", "seams", "--figure-cases", "x 0>1"), "there are 'a 0+2>4', 'b 0+2>4'"),
+        (("--table", "steps", "--generator", "warp-inpaint"), "FLUX.1-Kontext"),
+        (("--reconstructor", "plane-sweep", "plane-sweep"), "another one"),
+        (("--table", "models", "--weights", "x.ckpt", "y.ckpt"), "one file of weights each"),
+        (("--preset", "re10k", "--weights", "a.ckpt", "b.ckpt", "c.ckpt"), "a.ckpt"),
+    ],
+)
+def test_what_cannot_be_made_is_a_sentence(more, sentence, rooms, tmp_path, monkeypatch, capsys):
+    assert reproduce(monkeypatch, rooms, tmp_path, *more) == 2
+    error = " ".join(capsys.readouterr().err.split())
+    assert sentence in error
+    assert "Traceback" not in error
