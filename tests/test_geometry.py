@@ -70,6 +70,10 @@ def test_sampling_at_pixel_centres_returns_the_pixels():
     assert torch.allclose(sample(values, torch.stack([x, y], dim=-1)), values, atol=1e-6)
 
 
+def test_sampling_at_no_pixel_gives_nothing():
+    assert sample(torch.zeros(4, 5, 3), torch.zeros(0, 2)).shape == (0, 3)
+
+
 def test_the_synthetic_room_shows_the_same_colour_from_everywhere():
     room, a, b = Room(), camera_at(-0.3, size=64), camera_at(0.3, size=64)
     image_a, depth_a = cast(room, a)

@@ -45,13 +45,13 @@ def sample(
     values: Float[Tensor, "h w c"], pixels: Float[Tensor, "*shape 2"], mode: str = "bilinear"
 ) -> Float[Tensor, "*shape c"]:
     """Sample `values` at pixel coordinates, `bilinear` or `nearest`, extending the border."""
-    h, w = values.shape[:2]
+    h, w, c = values.shape
     size = torch.tensor([w, h], dtype=pixels.dtype, device=pixels.device)
     grid = (pixels / size * 2 - 1).reshape(1, 1, -1, 2)
     sampled = torch.nn.functional.grid_sample(
         values.permute(2, 0, 1)[None], grid, mode, padding_mode="border", align_corners=False
     )
-    return sampled[0, :, 0].T.reshape(*pixels.shape[:-1], -1)
+    return sampled[0, :, 0].T.reshape(*pixels.shape[:-1], c)
 
 
 def slide(

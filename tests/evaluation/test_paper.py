@@ -3,6 +3,7 @@
 import json
 import math
 import statistics
+from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
 from typing import get_args
@@ -17,6 +18,7 @@ from command import run
 from gscompleter.apps.commands.options import EvaluateOptions, FigureName, TableName
 from gscompleter.apps.commands.reproduce import apply_preset, choose_protocols
 from gscompleter.data.formats import open_photographs
+from gscompleter.evaluation.baselines.reggs import RegGSConfig
 from gscompleter.evaluation.columns import BY_KEY
 from gscompleter.evaluation.figures import draw_outline, find_widest_hole
 from gscompleter.evaluation.methods import METHODS
@@ -36,6 +38,13 @@ PAPER = load_paper()
 SIZE = 64
 FRAMES = 9
 PROTOCOLS = ("n-2", "n-3", "stress-2-7", "sequence-2-steps-2")
+
+
+@dataclass(frozen=True)
+class CoarseRegGS(RegGSConfig):
+    """RegGS with few clusters, because its time is quadratic in them."""
+
+    components: int = 50
 
 
 def test_the_registry_names_what_exists():
@@ -186,7 +195,7 @@ def test_a_table_and_a_figure_of_rooms(rooms, tmp_path, monkeypatch):
 
 
 def test_all_of_the_paper_on_photographs(clips, tmp_path, monkeypatch):
-    """Two models with random weights, and a tiny diffusion model in place of PE-Field's."""
+    """Two models with random weights, and for steps a tiny diffusion model in place of PE-Field's."""
     weights = []
     for seed in range(2):
         torch.manual_seed(seed)
@@ -194,18 +203,23 @@ def test_all_of_the_paper_on_photographs(clips, tmp_path, monkeypatch):
         weights.append(tmp_path / f"{seed}.ckpt")
         torch.save({"state_dict": state}, weights[-1])
     kontext = tiny_diffusion.saved(tiny_diffusion.kontext_pipeline(), tmp_path / "kontext")
-    more = ["--table", "all", "--figure", "all", "--preset", "re10k", "--weights", *weights]
-    more += ["--reconstructor", "mvsplat-re10k", "mvsplat-acid"]
-    more += ["--generator-weights", kontext, "--generator-depth", "context"]
-    out = tmp_path / "out"
-    few = partial(RunConfig, baseline_iterations=5)
+    few = partial(RunConfig, baseline_iterations=3)
     monkeypatch.setattr("gscompleter.apps.commands.evaluate.RunConfig", few)
-    assert reproduce(monkeypatch, clips, out, *more) == 0
+    monkeypatch.setattr("gscompleter.evaluation.methods.RegGSConfig", CoarseRegGS)
+    out, names = tmp_path / "out", ("mvsplat-re10k", "mvsplat-acid")
+    more = ("--reconstructor", *names, "--weights", *weights)
+    every = ("--table", "all", "--figure", "all", "--generator", "warp-inpaint")
+    assert reproduce(monkeypatch, clips, out, *every, *more) == 0
+    tiny = ("--generator-weights", kontext, "--generator-depth", "context", "--limit", 1)
+    assert (
+        reproduce(monkeypatch, clips, out, "--table", "steps", "--preset", "re10k", *tiny, *more)
+        == 0
+    )
     for name, spec in PAPER.tables.items():
         table = json.loads((out / "tables" / f"{name}.json").read_text())
         assert {row["method"] for row in table["rows"]} == set(spec.methods)
-        assert {row["model"] for row in table["rows"]} == {"mvsplat-re10k", "mvsplat-acid"}
-        assert set(table["cases"].values()) == {2}
+        assert {row["model"] for row in table["rows"]} == set(names)
+        assert set(table["cases"].values()) == {1 if name == "steps" else 2}
         latex = (out / "tables" / f"{name}.tex").read_text()
         assert latex.count(r"\\") == 1 + len(table["rows"])
     for name in PAPER.figures:
