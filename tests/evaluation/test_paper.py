@@ -195,7 +195,7 @@ def test_a_table_and_a_figure_of_rooms(rooms, tmp_path, monkeypatch):
 
 
 def test_all_of_the_paper_on_photographs(clips, tmp_path, monkeypatch):
-    """Two models with random weights, and for steps a tiny diffusion model in place of PE-Field's."""
+    """Two models with random weights, and for steps a tiny model in place of PE-Field's."""
     weights = []
     for seed in range(2):
         torch.manual_seed(seed)
