@@ -94,7 +94,7 @@ def make_steps_method(steps: int) -> Method:
 
     def method(state: Completion, target: Camera, models: Models) -> Prediction:
         if not hasattr(models.generator, "steps"):
-            raise InputError(f"steps-{steps} needs denoising steps; add --generator pe-field.")
+            raise InputError(f"steps-{steps} needs denoising steps; choose the generator pe-field.")
         generator: Any = models.generator
         return complete(state, target, replace(models, generator=replace(generator, steps=steps)))
 
