@@ -25,15 +25,6 @@ OpacityRender = Callable[[Float[Tensor, "n"]], Render]
 DepthRender = OpacityRender
 """Renders a frozen scene with Gaussians that vary in z-depth [n] only."""
 
-OpacityImage = Callable[[Float[Tensor, "n"]], Float[Tensor, "h w 3"]]
-"""The image of an `OpacityRender`."""
-
-
-def restrict_to_image(plan: OpacityRender) -> OpacityImage:
-    """Restrict an `OpacityRender` to its image."""
-    return lambda opacities: plan(opacities).image
-
-
 ColorSums = tuple[Float[Tensor, "n 3"], Float[Tensor, "n"]]
 """Per Gaussian: compositing weight times an image [h, w, 3], and weight, summed over pixels."""
 

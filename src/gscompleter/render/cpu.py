@@ -134,7 +134,8 @@ class CpuFrozenScene:
     def vary_opacities(self, new: Gaussians) -> OpacityRender:
         """Project, sort and bin `new` once at opacity 1, so that boxes hold for every opacity."""
         opaque = to_arrays(replace(new, opacities=torch.ones_like(new.opacities)))
-        binned = self.viewpoint.bin(opaque, new.is_antialiased, self.depth_limits)
+        splats = self.viewpoint.project(opaque, new.is_antialiased)
+        binned = self.viewpoint.enter(splats, self.depth_limits)
 
         def render(opacities: Float[Tensor, "n"]) -> Render:
             return Render(*_VaryOpacities.apply(self, binned, opacities.to("cpu", torch.float32)))
@@ -143,7 +144,8 @@ class CpuFrozenScene:
 
     def vary_colors(self, new: Gaussians) -> ColorErrors:
         """Project, sort and bin `new` once."""
-        binned = self.viewpoint.bin(to_arrays(new), new.is_antialiased, self.depth_limits)
+        splats = self.viewpoint.project(to_arrays(new), new.is_antialiased)
+        binned = self.viewpoint.enter(splats, self.depth_limits)
 
         def errors(colors: Float[Tensor, "n 3"], photograph: Float[Tensor, "h w 3"]) -> ColorSums:
             binned.layer.splats[:, project.RED :] = np.maximum(to_float32(colors), 0)

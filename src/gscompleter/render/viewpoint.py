@@ -83,15 +83,6 @@ class Viewpoint:
         fits = max(self.pinhole.width, self.pinhole.height) <= np.iinfo(np.int16).max
         return np.int16 if fits else np.int32
 
-    def bin(
-        self,
-        gaussians: GaussianArrays,
-        is_antialiased: bool,
-        depth_limits: Float32[ndarray, "tiles"],
-    ) -> BinnedSplats:
-        """Project, sort and enter Gaussians into the lists of the tiles."""
-        return self.enter(self.project(gaussians, is_antialiased), depth_limits)
-
     def enter(self, splats: Splats, depth_limits: Float32[ndarray, "tiles"]) -> BinnedSplats:
         """Enter splats into the lists of the tiles, and give those of each splat adjacent slots."""
         return bin_layer(self.fill_lists(splats, depth_limits))
