@@ -13,7 +13,7 @@ from collections.abc import Callable, Iterable
 from typing import Any, Literal, Protocol, runtime_checkable
 
 import torch
-from jaxtyping import Bool, Float
+from jaxtyping import Float
 from torch import Tensor
 
 from gscompleter.errors import InputError, quote_value
@@ -63,8 +63,8 @@ class FrozenScene(Protocol):
     def vary_colors(self, new: Gaussians) -> ColorErrors:
         """Fix all of `new` but its colours, which the camera sees as given, from 0 up."""
 
-    def vary_depths(self, new: Gaussians, where: Bool[Tensor, "h w"]) -> DepthRender:
-        """Fix all of `new` but its z-depths, and render it at least in the mask `where`.
+    def vary_depths(self, new: Gaussians) -> DepthRender:
+        """Fix all of `new` but its z-depths.
 
         Gaussians move along the camera's rays with constant footprint. The depth is differentiable.
         """

@@ -9,7 +9,7 @@ from typing import Any
 import numba
 import numpy as np
 import torch
-from jaxtyping import Bool, Float, Float32, Int32, Int64
+from jaxtyping import Float, Float32, Int32, Int64
 from numpy import ndarray
 from torch import Tensor
 from torch.autograd.function import once_differentiable
@@ -26,16 +26,12 @@ from gscompleter.render.viewpoint import (
     Viewpoint,
     bin_layer,
     gather_splats,
-    order_by_use,
     to_float32,
 )
 from gscompleter.types import Camera, Gaussians, Render
 
 MAX_SIDE = TILE * np.iinfo(np.int16).max
 """Largest side of an image in pixels, since kernels number tiles in 16 bits."""
-
-MIN_USED_SHARE = 0.9
-"""Share of splats in use from which a layer is kept whole, since copying takes longer."""
 
 
 @dataclass(frozen=True)
@@ -84,7 +80,7 @@ class CpuFrozenScene:
     def extend(self, new: Gaussians) -> CpuFrozenScene:
         """Freeze context and `new` together, in that order."""
         splats = self.viewpoint.project(to_arrays(new), new.is_antialiased)
-        added, order = order_by_use(self.viewpoint.fill_lists(splats, self.depth_limits))
+        added = self.viewpoint.fill_lists(splats, self.depth_limits)
         count = self.count + len(new)
         if len(added.entries) == 0:
             return replace(self, count=count)
@@ -98,7 +94,7 @@ class CpuFrozenScene:
         merged = (tile_start, entries, depth_limits)
         self.viewpoint.share(composite.merge_lists, len(used), *walked, *merged)
         layer, kept = join_layers(self.layer, added, tile_start, entries)
-        rows = np.concatenate([self.rows[kept[0]], order[kept[1]] + np.int32(self.count)])
+        rows = np.concatenate([self.rows[kept[0]], kept[1] + np.int32(self.count)])
         frame = frame._replace(used=used)
         return CpuFrozenScene(self.viewpoint, layer, frame, depth_limits, rows, count)
 
@@ -154,17 +150,12 @@ class CpuFrozenScene:
 
         return errors
 
-    def vary_depths(self, new: Gaussians, where: Bool[Tensor, "h w"]) -> DepthRender:
-        """Project `new` once, as far as it touches tiles of the mask."""
+    def vary_depths(self, new: Gaussians) -> DepthRender:
+        """Project `new` once."""
         splats = self.viewpoint.project(to_arrays(new), new.is_antialiased)
-        anywhere = self.viewpoint.limit_to_mask(where)
-        touched_splats = np.zeros(len(splats.boxes), np.bool_)
-        touched_splats[self.viewpoint.fill_lists(splats, anywhere).entries] = True
-        splats = splats.keep_only(touched_splats)
-        limits = np.minimum(anywhere, self.depth_limits)
 
         def render(depths: Float[Tensor, "n"]) -> Render:
-            return Render(*_VaryDepths.apply(self, splats, limits, depths.to("cpu", torch.float32)))
+            return Render(*_VaryDepths.apply(self, splats, depths.to("cpu", torch.float32)))
 
         return render
 
@@ -217,10 +208,9 @@ class _VaryOpacities(torch.autograd.Function):
     def backward(ctx: Any, *d_frame: Tensor) -> tuple[Tensor | None, ...]:
         view, binned, frame = ctx.scene
         opacities = to_float32(ctx.saved_tensors[0])
-        composited = (view.layer, binned, frame, d_frame)
-        gradients = view.viewpoint.composite_backward(*composited, composite.WANT_OPACITY)
-        sums = view.viewpoint.sum_by_gaussian(binned, gradients)[:, 0]
-        result = np.divide(sums, opacities, out=np.zeros_like(sums), where=sums != 0)
+        gradients = view.viewpoint.composite_backward(view.layer, binned, frame, d_frame)
+        sums = view.viewpoint.sum_by_gaussian(binned, gradients)[:, project.SUM]
+        result = np.divide(sums, opacities, out=np.zeros_like(opacities), where=sums != 0)
         return None, None, torch.from_numpy(result)
 
 
@@ -229,10 +219,10 @@ class _VaryDepths(torch.autograd.Function):
 
     @staticmethod
     def forward(
-        ctx: Any, view: CpuFrozenScene, splats: Splats, limits: Any, depths: Tensor
+        ctx: Any, view: CpuFrozenScene, splats: Splats, depths: Tensor
     ) -> tuple[Tensor, ...]:
         moved = splats.move_to_depths(to_float32(depths), view.viewpoint.pinhole.near)
-        binned = view.viewpoint.enter(moved, limits)
+        binned = view.viewpoint.enter(moved, view.depth_limits)
         frame, render = view.composite_layer(binned.layer)
         ctx.scene = (view, binned, frame)
         ctx.save_for_backward(render.depth, render.alpha)
@@ -243,10 +233,9 @@ class _VaryDepths(torch.autograd.Function):
     @once_differentiable
     def backward(ctx: Any, *d_frame: Tensor) -> tuple[Tensor | None, ...]:
         view, binned, frame = ctx.scene
-        composited = (view.layer, binned, frame, d_frame)
-        gradients = view.viewpoint.composite_backward(*composited, composite.WANT_DEPTH)
-        sums = view.viewpoint.sum_by_gaussian(binned, gradients)[:, 0]
-        return None, None, None, torch.from_numpy(sums)
+        gradients = view.viewpoint.composite_backward(view.layer, binned, frame, d_frame)
+        sums = view.viewpoint.sum_by_gaussian(binned, gradients)[:, project.SUM_DEPTH]
+        return None, None, torch.from_numpy(sums.copy())
 
 
 def freeze_nothing(viewpoint: Viewpoint) -> CpuFrozenScene:
@@ -300,19 +289,14 @@ def join_layers(
     """Join two layers to one with only the splats that `entries` names.
 
     Entries number the splats of `new` after those of the context. Also returns the rows used of
-    each layer. New splats that are alone and nearly all used stay as they are.
+    each layer.
     """
     counts = len(context.splats), len(new.splats)
     named = np.zeros(sum(counts), np.bool_)
     named[entries] = True
-    if np.count_nonzero(named) >= (MIN_USED_SHARE if counts[0] == 0 else 1) * len(named):
-        rows = [np.arange(count, dtype=np.int32) for count in counts]
-    else:
-        numbers = np.cumsum(named, dtype=np.int32) - np.int32(1)
-        entries = numbers[entries]
-        rows = [np.flatnonzero(part).astype(np.int32) for part in np.split(named, counts[:1])]
-    whole = new[:3] if len(rows[1]) == sum(counts) else gather_splats([context, new], rows)
-    return Layer(*whole, tile_start, entries), rows
+    numbers = np.cumsum(named, dtype=np.int32) - np.int32(1)
+    rows = [np.flatnonzero(part).astype(np.int32) for part in np.split(named, counts[:1])]
+    return Layer(*gather_splats([context, new], rows), tile_start, numbers[entries]), rows
 
 
 def to_arrays(gaussians: Gaussians) -> GaussianArrays:
