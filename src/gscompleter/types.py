@@ -239,9 +239,6 @@ class Gaussians(TensorDataclass):
     def __getitem__(self, index: Tensor | slice) -> Gaussians:
         """Return the Gaussians at a boolean mask [n], integer indices [m] or a slice."""
         tensors: dict[str, Any] = {n: p for n, p in vars(self).items() if isinstance(p, Tensor)}
-        if isinstance(index, Tensor) and index.dtype == torch.int64:
-            index = index.to(self.means.device)  # twice as fast as indexing
-            return replace(self, **{n: part.index_select(0, index) for n, part in tensors.items()})
         return replace(self, **{n: part[index] for n, part in tensors.items()})
 
     @property

@@ -25,7 +25,6 @@ from gscompleter.render.viewpoint import (
     Splats,
     Viewpoint,
     bin_layer,
-    gather_splats,
     to_float32,
 )
 from gscompleter.types import Camera, Gaussians, Render
@@ -296,7 +295,11 @@ def join_layers(
     named[entries] = True
     numbers = np.cumsum(named, dtype=np.int32) - np.int32(1)
     rows = [np.flatnonzero(part).astype(np.int32) for part in np.split(named, counts[:1])]
-    return Layer(*gather_splats([context, new], rows), tile_start, numbers[entries]), rows
+    splats, opacities, boxes = (
+        np.concatenate([old[rows[0]], added[rows[1]]])
+        for old, added in zip(context[:3], new[:3], strict=True)
+    )
+    return Layer(splats, opacities, boxes, tile_start, numbers[entries]), rows
 
 
 def to_arrays(gaussians: Gaussians) -> GaussianArrays:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -183,15 +183,3 @@ def check_lengths(gaussians: GaussianArrays) -> int:
 def to_float32(values: Tensor) -> Float32[ndarray, "..."]:
     """Convert a tensor to a contiguous array, without copying if it is one already."""
     return values.detach().to("cpu", torch.float32).contiguous().numpy()
-
-
-def gather_splats(
-    layers: Sequence[Layer], rows: Sequence[Int32[ndarray, "_"]]
-) -> tuple[Float32[ndarray, "n 9"], Float32[ndarray, "n"], Integer[ndarray, "n 4"]]:
-    """Gather the splats, opacities and boxes of these rows of each layer."""
-    pairs = list(zip(layers, rows, strict=True))
-    return (
-        np.concatenate([layer.splats[row] for layer, row in pairs]),
-        np.concatenate([layer.opacities[row] for layer, row in pairs]),
-        np.concatenate([layer.boxes[row] for layer, row in pairs]),
-    )
