@@ -161,8 +161,7 @@ def apply_masks(
             raise InputError(
                 f"All of frame {view.frame} of {photographs.name} is masked; choose another frame."
             )
-        whole = mask if view.ignore_mask is None else mask | view.ignore_mask
-        found.append(replace(view, ignore_mask=whole))
+        found.append(replace(view, ignore_mask=mask | ~view.valid_mask))
     return found
 
 
