@@ -85,10 +85,6 @@ class Camera(TensorDataclass):
         """z-depth of the near clipping plane: `near` / 100 (for any scene unit), else 0.01."""
         return 0.01 * self.near if self.near is not None else 0.01
 
-    def rays(self) -> Float[Tensor, "h w 3"]:
-        """Return unit directions through the pixel centres, in world axes."""
-        return torch.nn.functional.normalize(self.z_rays(), dim=-1)
-
     def z_rays(self) -> Float[Tensor, "h w 3"]:
         """Return world-axis rays with unit z in the camera: points are `center + depth * z_ray`."""
         x = torch.arange(self.width, device=self.K.device, dtype=self.K.dtype) + 0.5
