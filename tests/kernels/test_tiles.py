@@ -12,7 +12,7 @@ from gscompleter.kernels import tiles
 from gscompleter.kernels.project import DEPTH, NUM_SPLAT_COLUMNS
 from gscompleter.kernels.simd import TILE
 from gscompleter.render.cpu import CpuRenderer, make_pinhole
-from gscompleter.render.viewpoint import Splats, Viewpoint
+from gscompleter.render.viewpoint import Splats, Viewpoint, order_by_use
 from scenes import camera_at, random_gaussians
 
 RANDOM = np.random.default_rng(0)
@@ -56,6 +56,18 @@ def test_slots_number_the_entries_splat_by_splat():
     slots, starts = tiles.number_slots(entries, 51)
     assert np.array_equal(starts, np.searchsorted(np.sort(entries), np.arange(52)))
     assert np.array_equal(np.argsort(slots), np.argsort(entries, kind="stable"))
+
+
+def test_splats_in_the_order_of_their_use_are_the_same():
+    viewpoint, splats = Viewpoint(make_pinhole(camera_at(size=40)), 2), some_splats(300, 40)
+    layer = viewpoint.fill_lists(splats, np.full(viewpoint.tiles, np.inf, np.float32))
+    ordered, order = order_by_use(layer)
+    assert np.array_equal(order[ordered.entries], layer.entries)
+    assert len(order) == len(np.unique(layer.entries))
+    first = np.unique(ordered.entries, return_index=True)[1]
+    assert (np.diff(first) > 0).all()
+    for after, before in zip(ordered[:3], layer[:3], strict=True):
+        assert np.array_equal(after, before[order])
 
 
 def test_an_image_too_wide_for_small_boxes_is_drawn_like_its_part():

@@ -255,6 +255,13 @@ def test_a_frozen_view_keeps_no_splat_that_no_tile_draws():
     assert_same_render(frozen.render, CPU.render(opaque, CAMERA))
 
 
+def test_tiles_find_their_splats_in_the_order_in_which_they_name_them():
+    context, _ = context_and_new()
+    frozen = CPU.freeze(context[torch.randperm(len(context))], CAMERA)
+    seen = dict.fromkeys(frozen.layer.entries.tolist())
+    assert list(seen) == list(range(len(frozen.layer.splats)))
+
+
 def test_only_tiles_that_something_new_touches_are_drawn(monkeypatch):
     """The new Gaussian touches one of the nine tiles, forward and backward."""
     drawn = count_tiles(monkeypatch)

@@ -104,6 +104,22 @@ def number_slots(entries, count):
     return slots, slot_start
 
 
+@njit(cache=True, nogil=True)
+def number_by_use(entries, count):
+    """Renumber `entries` by the first use of splats; return the used splats in order, and them."""
+    numbers = np.full(count, -1, np.int32)
+    order, renamed = np.empty(count, np.int32), np.empty_like(entries)
+    used = 0
+    for place in range(len(entries)):
+        i = entries[place]
+        if numbers[i] < 0:
+            numbers[i] = used
+            order[used] = i
+            used += 1
+        renamed[place] = numbers[i]
+    return order[:used], renamed
+
+
 @njit(cache=True, nogil=True, fastmath={"contract"}, error_model="numpy")
 def sum_entries(begin, end, slot_start, gradients, written, totals):
     """Sum the gradients of the entries of each of the Gaussians begin..end into `totals` [n, c].

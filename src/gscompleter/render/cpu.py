@@ -25,6 +25,7 @@ from gscompleter.render.viewpoint import (
     Splats,
     Viewpoint,
     bin_layer,
+    order_by_use,
     to_float32,
 )
 from gscompleter.types import Camera, Gaussians, Render
@@ -79,7 +80,7 @@ class CpuFrozenScene:
     def extend(self, new: Gaussians) -> CpuFrozenScene:
         """Freeze context and `new` together, in that order."""
         splats = self.viewpoint.project(to_arrays(new), new.is_antialiased)
-        added = self.viewpoint.fill_lists(splats, self.depth_limits)
+        added, order = order_by_use(self.viewpoint.fill_lists(splats, self.depth_limits))
         count = self.count + len(new)
         if len(added.entries) == 0:
             return replace(self, count=count)
@@ -93,7 +94,7 @@ class CpuFrozenScene:
         merged = (tile_start, entries, depth_limits)
         self.viewpoint.share(composite.merge_lists, len(used), *walked, *merged)
         layer, kept = join_layers(self.layer, added, tile_start, entries)
-        rows = np.concatenate([self.rows[kept[0]], kept[1] + np.int32(self.count)])
+        rows = np.concatenate([self.rows[kept[0]], order[kept[1]] + np.int32(self.count)])
         frame = frame._replace(used=used)
         return CpuFrozenScene(self.viewpoint, layer, frame, depth_limits, rows, count)
 

@@ -172,6 +172,13 @@ def find_touched_tiles(layer: Layer) -> Int64[ndarray, "touched"]:
     return np.flatnonzero(np.diff(layer.tile_start))
 
 
+def order_by_use(layer: Layer) -> tuple[Layer, Int32[ndarray, "splats"]]:
+    """Reorder splats by first use and drop unused ones, for locality; also return their order."""
+    order, entries = tiles.number_by_use(layer.entries, len(layer.splats))
+    used = layer.splats[order], layer.opacities[order], layer.boxes[order]
+    return Layer(*used, layer.tile_start, entries), order
+
+
 def check_lengths(gaussians: GaussianArrays) -> int:
     """Return the number of Gaussians; raise ValueError if the arrays differ in length."""
     lengths = {len(array) for array in gaussians}
