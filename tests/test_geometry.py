@@ -8,7 +8,6 @@ from scipy.spatial.transform import Rotation
 
 from gscompleter.geometry import (
     axis_angle_to_matrix,
-    footprint_mask,
     is_inside,
     is_same_camera,
     measure_baseline,
@@ -21,8 +20,7 @@ from gscompleter.geometry import (
     slerp_rotation,
     unproject,
 )
-from gscompleter.render import load_renderer
-from scenes import Room, camera_at, cast, random_gaussians
+from scenes import Room, camera_at, cast
 
 
 def test_a_point_behind_a_pixel_projects_to_that_pixels_centre():
@@ -127,19 +125,3 @@ def test_of_the_two_ways_to_turn_the_shorter_one_is_shared():
     turn = axis_angle_to_matrix(down, math.radians(270))
     expected = axis_angle_to_matrix(down, -math.radians(45))
     assert torch.allclose(slerp_rotation(turn, 0.5), expected, atol=1e-6)
-
-
-def test_what_a_camera_sees_within_a_mask_reaches_it():
-    """Large and small Gaussians around a camera, each of them opaque and rendered by itself."""
-    camera, mask = camera_at(size=32), torch.zeros(32, 32, dtype=torch.bool)
-    mask[4:9, 20:30] = True
-    gaussians = random_gaussians(120, seed=3)
-    gaussians.scales[::3] *= 8
-    gaussians.means[::4, 0] += 1.5
-    gaussians.opacities[:] = 1
-    render = load_renderer("cpu").render
-    alone = [render(gaussians[k : k + 1], camera).alpha for k in range(len(gaussians))]
-    seen = torch.stack([(alpha > 0)[mask].any() for alpha in alone])
-    found = footprint_mask(gaussians, camera, mask)
-    assert (found | ~seen).all()
-    assert 10 < seen.sum() <= found.sum() < len(gaussians) / 2

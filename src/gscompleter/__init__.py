@@ -8,17 +8,26 @@ from typing import TYPE_CHECKING, Any
 __version__ = "0.1.0"
 
 if TYPE_CHECKING:
-    from gscompleter.completer import GSCompleter
-    from gscompleter.config import CompleterConfig, load_config
-    from gscompleter.data.scene import load_camera, load_cameras, load_views
-    from gscompleter.errors import InputError
-    from gscompleter.generators import load_generator
-    from gscompleter.reconstructors import load_reconstructor
-    from gscompleter.render import load_renderer
-    from gscompleter.splats import load_splat, save_splat
-    from gscompleter.splats.ply import load_ply, save_ply
-    from gscompleter.state import Completion
-    from gscompleter.types import Camera, Gaussians, Render, View, merge
+    from gscompleter.completer import GSCompleter as GSCompleter
+    from gscompleter.config import CompleterConfig as CompleterConfig
+    from gscompleter.config import load_config as load_config
+    from gscompleter.data.scene import load_camera as load_camera
+    from gscompleter.data.scene import load_cameras as load_cameras
+    from gscompleter.data.scene import load_views as load_views
+    from gscompleter.errors import InputError as InputError
+    from gscompleter.generators import load_generator as load_generator
+    from gscompleter.reconstructors import load_reconstructor as load_reconstructor
+    from gscompleter.render import load_renderer as load_renderer
+    from gscompleter.splats import load_splat as load_splat
+    from gscompleter.splats import save_splat as save_splat
+    from gscompleter.splats.ply import load_ply as load_ply
+    from gscompleter.splats.ply import save_ply as save_ply
+    from gscompleter.state import Completion as Completion
+    from gscompleter.types import Camera as Camera
+    from gscompleter.types import Gaussians as Gaussians
+    from gscompleter.types import Render as Render
+    from gscompleter.types import View as View
+    from gscompleter.types import merge as merge
 
 # Module of each public name, imported on first use, so that `import gscompleter` and
 # `gscompleter --help` do not wait for torch.
@@ -45,28 +54,7 @@ _HOMES = {
     "merge": "types",
 }
 
-__all__ = [
-    "Camera",
-    "CompleterConfig",
-    "Completion",
-    "GSCompleter",
-    "Gaussians",
-    "InputError",
-    "Render",
-    "View",
-    "load_camera",
-    "load_cameras",
-    "load_config",
-    "load_generator",
-    "load_ply",
-    "load_reconstructor",
-    "load_renderer",
-    "load_splat",
-    "load_views",
-    "merge",
-    "save_ply",
-    "save_splat",
-]
+__all__ = sorted(_HOMES)
 
 
 def __getattr__(name: str) -> Any:

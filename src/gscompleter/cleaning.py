@@ -24,7 +24,7 @@ from gscompleter.guards.psnr import (
     select_fewest,
 )
 from gscompleter.progress import track
-from gscompleter.render import OpacityRender, Renderer, restrict_to_image
+from gscompleter.render import OpacityRender, Renderer
 from gscompleter.types import Gaussians, View
 
 FADED_OPACITY = 0.02
@@ -88,7 +88,7 @@ def predict_error_change(
     plan = renderer.freeze(scene[:0], view.camera).vary_opacities(scene)
     full = scene.opacities
     left = torch.where(faded, full.clamp_max(FADED_OPACITY), full)
-    error, gradient = compute_mse_and_gradient(restrict_to_image(plan), view, left)
+    error, gradient = compute_mse_and_gradient(plan, view, left)
     square = estimate_squared_gradient(plan, left, probes, generator)
     # Difference of the parabola between zero and full opacity, expanded at `left`.
     return (square * (left**2 - (full - left) ** 2) - gradient * full) / max(error, MIN_ERROR)
@@ -160,7 +160,7 @@ def find_needed(
         if error <= max_error or not absent.any():
             return back
         _, gradient = compute_mse_and_gradient(
-            restrict_to_image(plan), view, torch.where(absent, GRADIENT_OPACITY, 1.0) * opacities
+            plan, view, torch.where(absent, GRADIENT_OPACITY, 1.0) * opacities
         )
         back = back | select_fewest(
             torch.where(absent, -gradient * opacities, 0.0), error - max_error

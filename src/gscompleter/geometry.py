@@ -10,12 +10,9 @@ from typing import Literal
 import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
-from torch.nn.functional import normalize, pad
+from torch.nn.functional import normalize
 
 from gscompleter.types import Camera, Gaussians, PaddedCamera
-
-FOOTPRINT = 3.4
-"""Rendered radius of a Gaussian in standard deviations: beyond sqrt(2 log 255), alpha < 1/255."""
 
 
 def unproject(depth: Float[Tensor, "h w"], camera: Camera) -> Float[Tensor, "h w 3"]:
@@ -68,27 +65,6 @@ def slide(
     means = camera.center + ratio[:, None] * (gaussians.means - camera.center)
     scales = gaussians.scales * ratio[:, None] if footprint == "constant" else gaussians.scales
     return replace(gaussians, means=means, scales=scales, encoded=None)
-
-
-def footprint_mask(
-    gaussians: Gaussians, camera: Camera, where: Bool[Tensor, "h w"]
-) -> Bool[Tensor, "n"]:
-    """Return True for all Gaussians that `camera` sees in the mask `where`, and maybe others.
-
-    A square of `FOOTPRINT` about each Gaussian is compared with a summed-area table of the mask.
-    """
-    pixels, z = project(gaussians.means, camera)
-    size = torch.tensor([camera.width, camera.height], device=pixels.device)
-    K = camera.K.to(pixels.device)
-    centre, focal = K[:2, 2], K.diagonal()[:2]
-    tangents = (torch.maximum(centre, size - centre) + 0.15 * size) / focal
-    stretch = (focal * (1 + tangents**2).sqrt()).max()
-    radius = FOOTPRINT * (stretch * gaussians.scales.amax(dim=1) / z.clamp_min(1e-12) + 1)
-    corners = torch.stack([pixels - radius[:, None], pixels + radius[:, None] + 1])
-    (left, top), (right, bottom) = (c.unbind(-1) for c in corners.minimum(size).clamp_min(0).long())
-    sums = pad(where.long().cumsum(0).cumsum(1), (1, 0, 1, 0))
-    count = sums[bottom, right] - sums[top, right] - sums[bottom, left] + sums[top, left]
-    return (z > 0) & (count > 0)
 
 
 def move_to_depths(gaussians: Gaussians, camera: Camera, depths: Float[Tensor, "n"]) -> Gaussians:

@@ -85,10 +85,6 @@ class Camera(TensorDataclass):
         """z-depth of the near clipping plane: `near` / 100 (for any scene unit), else 0.01."""
         return 0.01 * self.near if self.near is not None else 0.01
 
-    def rays(self) -> Float[Tensor, "h w 3"]:
-        """Return unit directions through the pixel centres, in world axes."""
-        return torch.nn.functional.normalize(self.z_rays(), dim=-1)
-
     def z_rays(self) -> Float[Tensor, "h w 3"]:
         """Return world-axis rays with unit z in the camera: points are `center + depth * z_ray`."""
         x = torch.arange(self.width, device=self.K.device, dtype=self.K.dtype) + 0.5
@@ -239,9 +235,6 @@ class Gaussians(TensorDataclass):
     def __getitem__(self, index: Tensor | slice) -> Gaussians:
         """Return the Gaussians at a boolean mask [n], integer indices [m] or a slice."""
         tensors: dict[str, Any] = {n: p for n, p in vars(self).items() if isinstance(p, Tensor)}
-        if isinstance(index, Tensor) and index.dtype == torch.int64:
-            index = index.to(self.means.device)  # twice as fast as indexing
-            return replace(self, **{n: part.index_select(0, index) for n, part in tensors.items()})
         return replace(self, **{n: part[index] for n, part in tensors.items()})
 
     @property

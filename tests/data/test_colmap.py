@@ -120,7 +120,7 @@ def test_images_lie_in_subfolders_with_slashes_of_either_kind(tmp_path):
         shutil.rmtree(model, ignore_errors=True)
         write(model, [name.replace("/", "\\") for name in names])
         photographs = open_photographs(tmp_path)
-        assert photographs.names == tuple(sorted(names))
+        assert [frame.name for frame in photographs.frames] == sorted(names)
         check_room(photographs, [1, 3, 0, 2, 4])
 
 

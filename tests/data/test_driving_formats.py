@@ -54,7 +54,10 @@ def test_nuscenes_cameras_show_boxes_where_its_own_infos_put_them(shared, tmp_pa
     info, sample = nuscenes(shared, tmp_path)
     photographs = open_photographs(info)
     assert photographs.format == "mmdet3d"
-    assert [name.split("/")[0] for name in photographs.names][:2] == ["CAM_FRONT", "CAM_BACK"]
+    assert [frame.name.split("/")[0] for frame in photographs.frames[:2]] == [
+        "CAM_FRONT",
+        "CAM_BACK",
+    ]
     camera = photographs.camera(0)
     assert camera.K[0].tolist() == pytest.approx([1266.417, 0, 816.267], abs=1e-3)
     centers = photographs.frames[0].boxes().mean(axis=1) - photographs.origin
@@ -241,7 +244,7 @@ def test_ddad_shows_the_sweep_of_the_same_sample(shared, tmp_path):
     image = next(d["datum"]["image"] for d in sample if d["id"]["name"] == "CAMERA_01")
     write_grey(tmp_path / image["filename"], 1936, 1216)
     photographs = open_photographs(tmp_path)
-    frame = photographs.names.index(image["filename"])
+    frame = [frame.name for frame in photographs.frames].index(image["filename"])
     world = photographs.camera(frame).c2w.double().numpy() @ [0.5, -0.2, 14.0, 1]
     world[:3] += photographs.origin
     told = cloud["pose"]["rotation"]
@@ -281,7 +284,7 @@ def pandaset(folder: Path) -> Path:
 def test_a_sequence_of_pandaset_begins_with_its_front_camera(tmp_path):
     photographs = open_photographs(pandaset(tmp_path / "002"))
     assert (photographs.format, photographs.name) == ("pandaset", "002")
-    assert photographs.names[0] == "front_camera/00"
+    assert photographs.frames[0].name == "front_camera/00"
     camera = photographs.camera(0)
     # A camera that stands upright and looks ahead: down is against z, forward is level.
     assert camera.c2w[2, 1] < -0.99

@@ -203,7 +203,7 @@ def test_opening_reads_cameras_only(tmp_path):
         image.write_bytes(b"not an image")
     photographs = open_photographs(scene)
     assert isinstance(photographs, Photographs)
-    assert photographs.names == ("0.png", "1.png", "2.png", "3.png", "4.png")
+    assert [f.name for f in photographs.frames] == [f"{number}.png" for number in range(5)]
     with pytest.raises(InputError, match=r"2.png is not an image"):
         photographs.views([2])
 

@@ -20,7 +20,7 @@ from gscompleter.generators.warp import warp_photographs
 from gscompleter.geometry import unproject
 from gscompleter.guards.psnr import compute_squared_error, meet_error_budgets
 from gscompleter.io.image import write_image
-from gscompleter.render import load_renderer, restrict_to_image
+from gscompleter.render import load_renderer
 from gscompleter.stages.context import drop_ignored
 from gscompleter.stages.refine import refine_opacities
 from gscompleter.types import ErrorBudget, GeneratorInput, View, sh_from_rgb
@@ -74,9 +74,9 @@ def test_what_is_ignored_forbids_nothing():
     for photograph, kept in ((wrong, False), (replace(wrong, ignore_mask=mask), True)):
         before = photograph.fill_ignored(frozen.render.image)
         allowed = 2 * compute_squared_error(before, photograph.image).item() + 1e-3
-        image = restrict_to_image(frozen.vary_opacities(added))
+        plan = frozen.vary_opacities(added)
         budgets = [[ErrorBudget(photograph, "mse", allowed)]]
-        mended = meet_error_budgets(added, [frozen], budgets, [image])
+        mended = meet_error_budgets(added, [frozen], budgets, [plan])
         assert torch.equal(mended.opacities, added.opacities) == kept
 
 

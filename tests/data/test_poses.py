@@ -77,7 +77,7 @@ def test_the_cameras_of_a_room_are_found_up_to_a_similarity(tmp_path, monkeypatc
     assert {path.name for path in out.iterdir()} == {"images", "sparse", "summary.json"}
 
     opened = open_photographs(out)
-    order = [int(name.removesuffix(".png")) - 5 for name in opened.names]
+    order = [int(frame.name.removesuffix(".png")) - 5 for frame in opened.frames]
     found = np.stack([opened.camera(i).center.numpy() for i in range(len(opened))])
     true = np.stack([CAMERAS[i].center.numpy() for i in order])
     off = np.linalg.norm(similarity_removed(found, true) - true, axis=1)

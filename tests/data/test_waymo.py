@@ -133,9 +133,13 @@ def test_frames_come_camera_by_camera_and_clips_are_of_the_front_camera(tmp_path
     names = [
         f"{camera}/{time}" for camera in ("FRONT", "FRONT_LEFT") for time in (1000, 2000, 3000)
     ]
-    assert (every.format, every.name, list(every.names)) == ("waymo", SEGMENT, names)
+    assert (every.format, every.name, [frame.name for frame in every.frames]) == (
+        "waymo",
+        SEGMENT,
+        names,
+    )
     (clip,) = open_clips(root)
-    assert list(clip.names) == names[:3]
+    assert [frame.name for frame in clip.frames] == names[:3]
     assert clip.find_skip_reason() is None
     shades = [view.image[5, 5, 0].item() for view in every.views([0, 2, 5])]
     assert shades == pytest.approx([0, 20 / 255, 2 / 255], abs=4 / 255)

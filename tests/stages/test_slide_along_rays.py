@@ -159,41 +159,6 @@ def test_what_is_fixed_while_candidates_slide_changes_no_loss(config, bound):
         assert_close(ours.gaussians.scales, plain.gaussians.scales, "scales", 1e-3)
 
 
-@pytest.mark.parametrize("config", [RegistrationConfig(), PAPER], ids=["ours", "paper"])
-def test_only_candidates_that_reach_what_is_compared_are_drawn(config, monkeypatch):
-    """In a room of which only a corner is known, Gaussians elsewhere are compared nowhere.
-
-    The result has the bytes of a run that renders all of them.
-    """
-    drawn = []
-
-    @dataclass(frozen=True)
-    class Counting(CpuRenderer):
-        def render(self, gaussians, camera):
-            drawn.append(len(gaussians))
-            return super().render(gaussians, camera)
-
-    def registered_to_a_corner():
-        reference, anchor = view_of(ROOM, TARGET), view_of(ROOM, ANCHOR)
-        pixels = torch.arange(SIZE * SIZE).view(SIZE, SIZE)[: SIZE // 4, : SIZE // 4].flatten()
-        corner, drawn[:] = gaussians_of(anchor)[pixels], []
-        lift = lifted(reference, anchor, bumpy())
-        seen = observe(corner, [anchor], TARGET, with_registration(config), Counting())
-        return register(lift, reference, seen)
-
-    fewer = registered_to_a_corner()
-    # The paper's colour loss covers the whole target.
-    assert 0 < max(drawn) <= (SIZE**2 if config.rgb_weight > 0 else 0.3 * SIZE**2)
-    monkeypatch.setattr(
-        Objective, "find_reached", lambda _, candidates, *__: torch.ones(len(candidates)) > 0
-    )
-    every = registered_to_a_corner()
-    assert max(drawn) == SIZE**2
-    assert fewer.losses == every.losses
-    assert torch.equal(fewer.gaussians.means, every.gaussians.means)
-    assert torch.equal(fewer.gaussians.scales, every.gaussians.scales)
-
-
 def test_where_nothing_is_compared_candidates_stay():
     reference, anchor = view_of(ROOM, TARGET), view_of(ROOM, ANCHOR)
     nothing = gaussians_of(anchor)[:0]

@@ -262,14 +262,7 @@ class CompleterConfig(Settings):
     trust: Literal["full", "photometric"] = "full"
     """Trust in the scene: `full` takes it as it is (paper), `photometric` counts a Gaussian as far
     as photographs confirm it."""
-    guards: tuple[GuardName, ...] = (
-        "dynamic-masks",
-        "image-agreement",
-        "depth-agreement",
-        "free-space",
-        "psnr",
-        "contribution",
-    )
+    guards: tuple[GuardName, ...] = tuple(GUARDS)
     """Safeguards beyond the paper, in the order in which they are asked (paper: none)."""
     margin: Annotated[float, Interval(ge=0, le=4)] = 0.25
     """Padding of the target image on every side, relative to its size, if a hole reaches its

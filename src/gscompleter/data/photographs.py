@@ -16,12 +16,7 @@ from jaxtyping import Bool, Float, Shaped
 from PIL import Image
 from torch import Tensor
 
-from gscompleter.data.cameras import (
-    compute_fov,
-    compute_undistortion_map,
-    find_pose_defect,
-    remap,
-)
+from gscompleter.data.cameras import compute_fov, compute_undistortion_map, find_pose_defect, remap
 from gscompleter.data.driving.vehicle import compute_sparse_depth, mask_moving
 from gscompleter.data.frame import Frame
 from gscompleter.data.limits import MAX_SIDE
@@ -66,11 +61,6 @@ class Photographs:
     """Reads points on the scene's surfaces, in the files' frame."""
     front: str | None = None
     """Name of the front camera of a vehicle with several cameras."""
-
-    @property
-    def names(self) -> tuple[str, ...]:
-        """Names of the frames, in their order."""
-        return tuple(frame.name for frame in self.frames)
 
     def __len__(self) -> int:
         return len(self.frames)
@@ -171,8 +161,7 @@ def apply_masks(
             raise InputError(
                 f"All of frame {view.frame} of {photographs.name} is masked; choose another frame."
             )
-        whole = mask if view.ignore_mask is None else mask | view.ignore_mask
-        found.append(replace(view, ignore_mask=whole))
+        found.append(replace(view, ignore_mask=mask | ~view.valid_mask))
     return found
 
 

@@ -16,7 +16,7 @@ from gscompleter.cpu_threads import use_one_torch_thread
 from gscompleter.geometry import project_mask
 from gscompleter.guards import Attempt, Guard
 from gscompleter.image_ops import SSIM_RADIUS, dilate, ssim_map
-from gscompleter.render import FrozenScene, OpacityImage, restrict_to_image
+from gscompleter.render import FrozenScene, OpacityRender
 from gscompleter.render.cache import SceneRenderer
 from gscompleter.stages.target_view import compute_hole_mask
 from gscompleter.state import Completion
@@ -56,12 +56,12 @@ class PsnrGuard(Guard):
 
     def verify(self, added: Gaussians, attempt: Attempt) -> Gaussians:
         """Fade added Gaussians until every photograph is within its budgets."""
-        state, plans = attempt.view.state, attempt.refined.plans
+        state = attempt.view.state
         return meet_error_budgets(
             added,
             attempt.view.frozen_photos,
             [photo.budgets for photo in state.photos],
-            [restrict_to_image(plan) for plan in plans],
+            attempt.refined.plans,
             state.config.psnr_guard,
         )
 
@@ -116,7 +116,7 @@ def meet_error_budgets(
     added: Gaussians,
     frozen_views: Sequence[FrozenScene],
     budgets: Sequence[Sequence[ErrorBudget]],
-    images: Sequence[OpacityImage],
+    plans: Sequence[OpacityRender],
     config: PsnrGuardConfig = PsnrGuardConfig(),
 ) -> Gaussians:
     """Fade added Gaussians until every photograph is within its error budgets.
@@ -129,7 +129,7 @@ def meet_error_budgets(
     if len(added) == 0:
         return added
     before = [frozen.render.image for frozen in frozen_views]
-    checks = [Check(*each) for each in zip(budgets, before, images, strict=True)]
+    checks = [Check(*each) for each in zip(budgets, before, plans, strict=True)]
     opacities, active = added.opacities, checks
     for trial in range(NUM_HALVINGS + NUM_REMOVALS + 1):
         worse = find_over_budget(active, opacities)
@@ -152,8 +152,8 @@ class Check:
 
     budgets: Sequence[ErrorBudget]
     image_before: Float[Tensor, "h w 3"]
-    render_image: OpacityImage
-    """Differentiable image in the opacities of the added Gaussians."""
+    plan: OpacityRender
+    """Differentiable in the opacities of the added Gaussians."""
 
 
 @dataclass(frozen=True)
@@ -201,7 +201,7 @@ def find_over_budget(checks: Sequence[Check], opacities: Float[Tensor, "n"]) -> 
 
 def render_check(check: Check, opacities: Float[Tensor, "n"]) -> CheckedRender:
     """Render a photograph and compare it with its error budgets."""
-    variable, image = render_with_gradient(check.render_image, opacities)
+    variable, image = render_with_gradient(check.plan, opacities)
     clipped = image.detach().clamp(0, 1)
     errors = [compute_pixel_errors(clipped, budget).sum().item() for budget in check.budgets]
     budgets = zip(check.budgets, errors, strict=True)
@@ -230,21 +230,21 @@ def select_fewest(relief: Float[Tensor, "n"], needed: float) -> Bool[Tensor, "n"
 
 
 def compute_mse_and_gradient(
-    render_image: OpacityImage, view: View, opacities: Float[Tensor, "n"]
+    plan: OpacityRender, view: View, opacities: Float[Tensor, "n"]
 ) -> tuple[float, Float[Tensor, "n"]]:
     """Compute the squared error against a photograph and its gradient in the opacities."""
-    variable, image = render_with_gradient(render_image, opacities)
+    variable, image = render_with_gradient(plan, opacities)
     gradient = compute_gradient(image, ErrorBudget(view, "mse", 0.0), variable)
     return compute_squared_error(view.fill_ignored(image.detach()), view.image).item(), gradient
 
 
 def render_with_gradient(
-    render_image: OpacityImage, opacities: Float[Tensor, "n"]
+    plan: OpacityRender, opacities: Float[Tensor, "n"]
 ) -> tuple[Float[Tensor, "n"], Float[Tensor, "h w 3"]]:
     """Render with opacities as the variable of gradients."""
     with torch.enable_grad():
         variable = opacities.detach().clone().requires_grad_()
-        return variable, render_image(variable)
+        return variable, plan(variable).image
 
 
 def compute_gradient(

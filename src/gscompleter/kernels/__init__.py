@@ -7,25 +7,7 @@ compiles a kernel and in those that load it from the cache.
 """
 
 import os
-from contextlib import contextmanager
 from pathlib import Path
-
-from numba.np import linalg
-
-
-@contextmanager
-def _skip_blas_check():
-    """Skip numba's search for BLAS, which imports SciPy: a third of its load time."""
-    ensure_blas = getattr(linalg, "ensure_blas", None)
-
-    def refuse():
-        raise ImportError("BLAS is not needed")
-
-    linalg.ensure_blas = refuse
-    try:
-        yield
-    finally:
-        linalg.ensure_blas = ensure_blas
 
 
 def _remove_stale_indices():
@@ -43,6 +25,3 @@ def _remove_stale_indices():
 
 
 _remove_stale_indices()
-
-with _skip_blas_check():
-    import numba.np.arraymath  # noqa: F401

@@ -13,8 +13,8 @@ from gscompleter.kernels import project, simd
 from gscompleter.kernels.project import DEPTH
 from gscompleter.kernels.simd import TILE
 
-WANT_ALL, WANT_OPACITY, WANT_DEPTH, WANT_COLOR = range(4)
-"""Gradients to compute: all columns, or only SUM, SUM_DEPTH or the three colours."""
+WANT_ALL, WANT_COLOR = range(2)
+"""Gradients to compute: all columns, or only the three colours."""
 
 
 class Layer(NamedTuple):
@@ -94,14 +94,6 @@ def merge_lists(begin, end, context, new, used, full, tile_start, entries, depth
 
 
 @njit(cache=True)
-def _allocate_aligned(size):
-    """Allocate float32 values from a cache line on, so that no vector straddles two."""
-    buffer = np.empty(size + TILE, np.float32)
-    start = (-buffer.ctypes.data % 64) // 4
-    return buffer[start : start + size]
-
-
-@njit(cache=True)
 def _locate(tile, height, width):
     """Return left and top pixel of a tile, and its rows and columns inside the image."""
     tiles_x = (width + TILE - 1) // TILE
@@ -147,7 +139,7 @@ def composite(begin, end, tiles, context, new, frame):
     n_splats, n_opacities, n_boxes, n_start, n_entries = new
     image, depths, alphas, transmittances, lasts, used, full = frame
     height, width = alphas.shape
-    state = _allocate_aligned(TILE * 5 * TILE).reshape((TILE, 5, TILE))
+    state = np.empty((TILE, 5, TILE), np.float32)
     last = np.empty((TILE, TILE), np.int32)
     row_limit = np.empty(TILE, np.int32)
     infinity = np.float32(np.inf)
@@ -201,12 +193,12 @@ def backproject_residual(begin, end, tiles, context, new, photograph, slots, sum
     c_splats, c_opacities, c_boxes, c_start, c_entries = context
     n_splats, n_opacities, n_boxes, n_start, n_entries = new
     height, width = photograph.shape[:2]
-    state = _allocate_aligned(TILE * 4 * TILE).reshape((TILE, 4, TILE))
+    state = np.empty((TILE, 4, TILE), np.float32)
     most = 1
     for index in range(begin, end):
         most = max(most, n_start[tiles[index] + 1] - n_start[tiles[index]] + 1)
     # Rows of weights, up to TILE for each splat; those never written take no memory.
-    kept = _allocate_aligned(most * TILE * TILE).reshape((most * TILE, TILE))
+    kept = np.empty((most * TILE, TILE), np.float32)
     row_limit = np.empty(TILE, np.int32)
     totals = np.zeros(TILE, np.float32)
     infinity = np.float32(np.inf)
@@ -268,7 +260,7 @@ def composite_backward(
     _, depths, alphas, transmittances, lasts, used, _ = frame
     d_image, d_depth, d_alpha = d_frame
     height, width = alphas.shape
-    state = _allocate_aligned(TILE * 7 * TILE).reshape((TILE, 7, TILE))
+    state = np.empty((TILE, 7, TILE), np.float32)
     last = np.empty((TILE, TILE), np.int32)
     row_limit = np.empty(TILE, np.int32)
     sums = np.zeros(TILE, np.float32)
@@ -314,18 +306,12 @@ def composite_backward(
             slot = slots[n]
             written[slot] = True
             rows_of_splat = first, stop, position, state, last, row_limit, sums, splat
-            if wanted == WANT_OPACITY:
-                simd.revert_rows_for_opacity(*rows_of_splat)
-            elif wanted == WANT_DEPTH:
-                simd.revert_rows_for_depth(*rows_of_splat)
-            elif wanted == WANT_COLOR:
+            if wanted == WANT_COLOR:
                 simd.revert_rows_for_color(*rows_of_splat)
-            else:
-                simd.revert_rows(*rows_of_splat)
-            if wanted != WANT_ALL:
-                for column in range(gradients.shape[1]):
-                    gradients[slot, column] = sums[column]
+                for channel in range(3):
+                    gradients[slot, channel] = sums[channel]
                 continue
+            simd.revert_rows(*rows_of_splat)
             u, v, w = splat[2], splat[3], splat[4]
             x, y, xx, xy, yy = sums[1], sums[2], sums[3], sums[4], sums[5]
             gradients[slot, project.SUM] = sums[0]

@@ -318,7 +318,7 @@ def _make_revert(wanted):
             last = _Rows(context, builder, signature.args[4], last, _INTS, 1)
             limits = context.make_array(signature.args[5])(context, builder, row_limit).data
             positions = _broadcast(builder, position, _INTS)
-            count = {"nothing": 0, "opacity": 1, "depth": 1, "colour": 3, "all": 7}[wanted]
+            count = {"nothing": 0, "colour": 3, "all": 7}[wanted]
             totals = [_Total(builder) for _ in range(count)]
 
             def revert(row):
@@ -347,11 +347,9 @@ def _make_revert(wanted):
 
                 q = (before * value - behind * opening) * alpha
                 q = q.where(raw.compare("<=", MAX_ALPHA), 0.0)
-                terms = [weight * gradients[3]] if wanted == "depth" else [q]
-                if wanted == "all":
-                    dys = _broadcast(builder, dy)
-                    terms += [q * dys, q * dys * dys]
-                    terms += [weight * gradients[index] for index in (3, 0, 1, 2)]
+                dys = _broadcast(builder, dy)
+                terms = [q, q * dys, q * dys * dys]
+                terms += [weight * gradients[index] for index in (3, 0, 1, 2)]
                 for total, term in zip(totals, terms, strict=True):
                     total.store(total.load() + term)
 
@@ -373,7 +371,5 @@ def _make_revert(wanted):
 
 
 pass_rows = _make_revert("nothing")
-revert_rows_for_opacity = _make_revert("opacity")
-revert_rows_for_depth = _make_revert("depth")
 revert_rows_for_color = _make_revert("colour")
 revert_rows = _make_revert("all")

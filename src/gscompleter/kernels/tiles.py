@@ -24,20 +24,12 @@ def count_entries(begin, end, splats, boxes, depth_limits, tiles_x, counts):
                     counts[tile] += 1
 
 
-@njit(cache=True, nogil=True)
 def counts_to_offsets(counts):
     """Turn counts [chunks, tiles] into offsets in place, and return the starts of the lists."""
-    chunks, tiles = counts.shape
-    tile_start = np.empty(tiles + 1, np.int64)
-    place = 0
-    for tile in range(tiles):
-        tile_start[tile] = place
-        for chunk in range(chunks):
-            size = counts[chunk, tile]
-            counts[chunk, tile] = place
-            place += size
-    tile_start[tiles] = place
-    return tile_start
+    ends = np.cumsum(counts.T, dtype=np.int64).reshape(counts.T.shape)
+    starts = ends - counts.T
+    counts[:] = starts.T
+    return np.append(starts[:, 0], ends[-1, -1])
 
 
 @njit(cache=True, nogil=True)

@@ -13,7 +13,7 @@ from collections.abc import Callable, Iterable
 from typing import Any, Literal, Protocol, runtime_checkable
 
 import torch
-from jaxtyping import Bool, Float
+from jaxtyping import Float
 from torch import Tensor
 
 from gscompleter.errors import InputError, quote_value
@@ -24,15 +24,6 @@ OpacityRender = Callable[[Float[Tensor, "n"]], Render]
 """Renders a frozen scene with Gaussians that vary in opacity [n] only."""
 DepthRender = OpacityRender
 """Renders a frozen scene with Gaussians that vary in z-depth [n] only."""
-
-OpacityImage = Callable[[Float[Tensor, "n"]], Float[Tensor, "h w 3"]]
-"""The image of an `OpacityRender`."""
-
-
-def restrict_to_image(plan: OpacityRender) -> OpacityImage:
-    """Restrict an `OpacityRender` to its image."""
-    return lambda opacities: plan(opacities).image
-
 
 ColorSums = tuple[Float[Tensor, "n 3"], Float[Tensor, "n"]]
 """Per Gaussian: compositing weight times an image [h, w, 3], and weight, summed over pixels."""
@@ -72,8 +63,8 @@ class FrozenScene(Protocol):
     def vary_colors(self, new: Gaussians) -> ColorErrors:
         """Fix all of `new` but its colours, which the camera sees as given, from 0 up."""
 
-    def vary_depths(self, new: Gaussians, where: Bool[Tensor, "h w"]) -> DepthRender:
-        """Fix all of `new` but its z-depths, and render it at least in the mask `where`.
+    def vary_depths(self, new: Gaussians) -> DepthRender:
+        """Fix all of `new` but its z-depths.
 
         Gaussians move along the camera's rays with constant footprint. The depth is differentiable.
         """

@@ -9,7 +9,7 @@ from typing import Any
 import numba
 import numpy as np
 import torch
-from jaxtyping import Bool, Float, Float32, Int32, Int64
+from jaxtyping import Float, Float32, Int32, Int64
 from numpy import ndarray
 from torch import Tensor
 from torch.autograd.function import once_differentiable
@@ -25,7 +25,6 @@ from gscompleter.render.viewpoint import (
     Splats,
     Viewpoint,
     bin_layer,
-    gather_splats,
     order_by_use,
     to_float32,
 )
@@ -33,9 +32,6 @@ from gscompleter.types import Camera, Gaussians, Render
 
 MAX_SIDE = TILE * np.iinfo(np.int16).max
 """Largest side of an image in pixels, since kernels number tiles in 16 bits."""
-
-MIN_USED_SHARE = 0.9
-"""Share of splats in use from which a layer is kept whole, since copying takes longer."""
 
 
 @dataclass(frozen=True)
@@ -134,7 +130,8 @@ class CpuFrozenScene:
     def vary_opacities(self, new: Gaussians) -> OpacityRender:
         """Project, sort and bin `new` once at opacity 1, so that boxes hold for every opacity."""
         opaque = to_arrays(replace(new, opacities=torch.ones_like(new.opacities)))
-        binned = self.viewpoint.bin(opaque, new.is_antialiased, self.depth_limits)
+        splats = self.viewpoint.project(opaque, new.is_antialiased)
+        binned = self.viewpoint.enter(splats, self.depth_limits)
 
         def render(opacities: Float[Tensor, "n"]) -> Render:
             return Render(*_VaryOpacities.apply(self, binned, opacities.to("cpu", torch.float32)))
@@ -143,7 +140,8 @@ class CpuFrozenScene:
 
     def vary_colors(self, new: Gaussians) -> ColorErrors:
         """Project, sort and bin `new` once."""
-        binned = self.viewpoint.bin(to_arrays(new), new.is_antialiased, self.depth_limits)
+        splats = self.viewpoint.project(to_arrays(new), new.is_antialiased)
+        binned = self.viewpoint.enter(splats, self.depth_limits)
 
         def errors(colors: Float[Tensor, "n 3"], photograph: Float[Tensor, "h w 3"]) -> ColorSums:
             binned.layer.splats[:, project.RED :] = np.maximum(to_float32(colors), 0)
@@ -152,17 +150,12 @@ class CpuFrozenScene:
 
         return errors
 
-    def vary_depths(self, new: Gaussians, where: Bool[Tensor, "h w"]) -> DepthRender:
-        """Project `new` once, as far as it touches tiles of the mask."""
+    def vary_depths(self, new: Gaussians) -> DepthRender:
+        """Project `new` once."""
         splats = self.viewpoint.project(to_arrays(new), new.is_antialiased)
-        anywhere = self.viewpoint.limit_to_mask(where)
-        touched_splats = np.zeros(len(splats.boxes), np.bool_)
-        touched_splats[self.viewpoint.fill_lists(splats, anywhere).entries] = True
-        splats = splats.keep_only(touched_splats)
-        limits = np.minimum(anywhere, self.depth_limits)
 
         def render(depths: Float[Tensor, "n"]) -> Render:
-            return Render(*_VaryDepths.apply(self, splats, limits, depths.to("cpu", torch.float32)))
+            return Render(*_VaryDepths.apply(self, splats, depths.to("cpu", torch.float32)))
 
         return render
 
@@ -215,10 +208,9 @@ class _VaryOpacities(torch.autograd.Function):
     def backward(ctx: Any, *d_frame: Tensor) -> tuple[Tensor | None, ...]:
         view, binned, frame = ctx.scene
         opacities = to_float32(ctx.saved_tensors[0])
-        composited = (view.layer, binned, frame, d_frame)
-        gradients = view.viewpoint.composite_backward(*composited, composite.WANT_OPACITY)
-        sums = view.viewpoint.sum_by_gaussian(binned, gradients)[:, 0]
-        result = np.divide(sums, opacities, out=np.zeros_like(sums), where=sums != 0)
+        gradients = view.viewpoint.composite_backward(view.layer, binned, frame, d_frame)
+        sums = view.viewpoint.sum_by_gaussian(binned, gradients)[:, project.SUM]
+        result = np.divide(sums, opacities, out=np.zeros_like(opacities), where=sums != 0)
         return None, None, torch.from_numpy(result)
 
 
@@ -227,10 +219,10 @@ class _VaryDepths(torch.autograd.Function):
 
     @staticmethod
     def forward(
-        ctx: Any, view: CpuFrozenScene, splats: Splats, limits: Any, depths: Tensor
+        ctx: Any, view: CpuFrozenScene, splats: Splats, depths: Tensor
     ) -> tuple[Tensor, ...]:
         moved = splats.move_to_depths(to_float32(depths), view.viewpoint.pinhole.near)
-        binned = view.viewpoint.enter(moved, limits)
+        binned = view.viewpoint.enter(moved, view.depth_limits)
         frame, render = view.composite_layer(binned.layer)
         ctx.scene = (view, binned, frame)
         ctx.save_for_backward(render.depth, render.alpha)
@@ -241,10 +233,9 @@ class _VaryDepths(torch.autograd.Function):
     @once_differentiable
     def backward(ctx: Any, *d_frame: Tensor) -> tuple[Tensor | None, ...]:
         view, binned, frame = ctx.scene
-        composited = (view.layer, binned, frame, d_frame)
-        gradients = view.viewpoint.composite_backward(*composited, composite.WANT_DEPTH)
-        sums = view.viewpoint.sum_by_gaussian(binned, gradients)[:, 0]
-        return None, None, None, torch.from_numpy(sums)
+        gradients = view.viewpoint.composite_backward(view.layer, binned, frame, d_frame)
+        sums = view.viewpoint.sum_by_gaussian(binned, gradients)[:, project.SUM_DEPTH]
+        return None, None, torch.from_numpy(sums.copy())
 
 
 def freeze_nothing(viewpoint: Viewpoint) -> CpuFrozenScene:
@@ -298,19 +289,18 @@ def join_layers(
     """Join two layers to one with only the splats that `entries` names.
 
     Entries number the splats of `new` after those of the context. Also returns the rows used of
-    each layer. New splats that are alone and nearly all used stay as they are.
+    each layer.
     """
     counts = len(context.splats), len(new.splats)
     named = np.zeros(sum(counts), np.bool_)
     named[entries] = True
-    if np.count_nonzero(named) >= (MIN_USED_SHARE if counts[0] == 0 else 1) * len(named):
-        rows = [np.arange(count, dtype=np.int32) for count in counts]
-    else:
-        numbers = np.cumsum(named, dtype=np.int32) - np.int32(1)
-        entries = numbers[entries]
-        rows = [np.flatnonzero(part).astype(np.int32) for part in np.split(named, counts[:1])]
-    whole = new[:3] if len(rows[1]) == sum(counts) else gather_splats([context, new], rows)
-    return Layer(*whole, tile_start, entries), rows
+    numbers = np.cumsum(named, dtype=np.int32) - np.int32(1)
+    rows = [np.flatnonzero(part).astype(np.int32) for part in np.split(named, counts[:1])]
+    splats, opacities, boxes = (
+        np.concatenate([old[rows[0]], added[rows[1]]])
+        for old, added in zip(context[:3], new[:3], strict=True)
+    )
+    return Layer(splats, opacities, boxes, tile_start, numbers[entries]), rows
 
 
 def to_arrays(gaussians: Gaussians) -> GaussianArrays:

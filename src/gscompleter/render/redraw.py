@@ -7,7 +7,7 @@ from dataclasses import dataclass, replace
 from functools import cached_property
 
 import torch
-from jaxtyping import Bool, Float
+from jaxtyping import Float
 from torch import Tensor
 
 from gscompleter.geometry import move_to_depths
@@ -73,7 +73,7 @@ class RedrawnScene:
 
         return errors
 
-    def vary_depths(self, new: Gaussians, where: Bool[Tensor, "h w"]) -> DepthRender:
+    def vary_depths(self, new: Gaussians) -> DepthRender:
         """Fix all of `new` but its depths."""
         return lambda depths: self.composite(move_to_depths(new, self.camera, depths))
 

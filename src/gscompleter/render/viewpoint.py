@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -11,7 +11,6 @@ import torch
 from jaxtyping import Bool, Float32, Int32, Int64, Integer
 from numpy import ndarray
 from torch import Tensor
-from torch.nn.functional import max_pool2d
 
 from gscompleter.errors import InputError
 from gscompleter.kernels import composite, project, tiles
@@ -38,11 +37,7 @@ class Splats:
         """Move the splats to other z-depths; those not beyond `near` get empty boxes."""
         columns = self.columns.copy()
         columns[:, project.DEPTH] = depths
-        return replace(self, columns=columns).keep_only(depths > near)
-
-    def keep_only(self, which: Bool[ndarray, "n"]) -> Splats:
-        """Empty the boxes of all other splats."""
-        return replace(self, boxes=self.boxes * which[:, None])
+        return replace(self, columns=columns, boxes=self.boxes * (depths > near)[:, None])
 
 
 @dataclass(frozen=True)
@@ -82,15 +77,6 @@ class Viewpoint:
         """Smallest type that holds pixel coordinates, to save memory."""
         fits = max(self.pinhole.width, self.pinhole.height) <= np.iinfo(np.int16).max
         return np.int16 if fits else np.int32
-
-    def bin(
-        self,
-        gaussians: GaussianArrays,
-        is_antialiased: bool,
-        depth_limits: Float32[ndarray, "tiles"],
-    ) -> BinnedSplats:
-        """Project, sort and enter Gaussians into the lists of the tiles."""
-        return self.enter(self.project(gaussians, is_antialiased), depth_limits)
 
     def enter(self, splats: Splats, depth_limits: Float32[ndarray, "tiles"]) -> BinnedSplats:
         """Enter splats into the lists of the tiles, and give those of each splat adjacent slots."""
@@ -143,8 +129,8 @@ class Viewpoint:
         wanted: int = WANT_ALL,
     ) -> EntryGradients:
         """Compute the gradients of new entries from those of image, depth and alpha."""
-        columns = {WANT_ALL: project.NUM_GRADIENT_COLUMNS, WANT_COLOR: 3}
-        values = np.empty((len(new.slots), columns.get(wanted, 1)), np.float32)
+        columns = 3 if wanted == WANT_COLOR else project.NUM_GRADIENT_COLUMNS
+        values = np.empty((len(new.slots), columns), np.float32)
         written = np.zeros(len(new.slots), np.bool_)
         tiles = find_touched_tiles(new.layer)
         composited = (tiles, context, new.layer, frame, tuple(map(to_float32, d_frame)))
@@ -171,11 +157,6 @@ class Viewpoint:
         self.share(tiles.sum_entries, len(totals), new.slot_start, *gradients, totals)
         return totals
 
-    def limit_to_mask(self, where: Bool[Tensor, "h w"]) -> Float32[ndarray, "tiles"]:
-        """Make depth limits that exclude all tiles outside a mask."""
-        tiles = max_pool2d(where[None].float(), TILE, ceil_mode=True).flatten() > 0
-        return np.where(tiles.cpu().numpy(), np.float32(np.inf), np.float32(-np.inf))
-
     def share(self, kernel: Callable[..., None], count: int, *arguments: Any) -> None:
         """Run `kernel(begin, end, *arguments)` over range(count) on the threads."""
         share(kernel, count, *arguments, threads=self.threads)
@@ -194,7 +175,8 @@ def find_touched_tiles(layer: Layer) -> Int64[ndarray, "touched"]:
 def order_by_use(layer: Layer) -> tuple[Layer, Int32[ndarray, "splats"]]:
     """Reorder splats by first use and drop unused ones, for locality; also return their order."""
     order, entries = tiles.number_by_use(layer.entries, len(layer.splats))
-    return Layer(*gather_splats([layer], [order]), layer.tile_start, entries), order
+    used = layer.splats[order], layer.opacities[order], layer.boxes[order]
+    return Layer(*used, layer.tile_start, entries), order
 
 
 def check_lengths(gaussians: GaussianArrays) -> int:
@@ -208,15 +190,3 @@ def check_lengths(gaussians: GaussianArrays) -> int:
 def to_float32(values: Tensor) -> Float32[ndarray, "..."]:
     """Convert a tensor to a contiguous array, without copying if it is one already."""
     return values.detach().to("cpu", torch.float32).contiguous().numpy()
-
-
-def gather_splats(
-    layers: Sequence[Layer], rows: Sequence[Int32[ndarray, "_"]]
-) -> tuple[Float32[ndarray, "n 9"], Float32[ndarray, "n"], Integer[ndarray, "n 4"]]:
-    """Gather the splats, opacities and boxes of these rows of each layer."""
-    pairs = list(zip(layers, rows, strict=True))
-    return (
-        np.concatenate([layer.splats[row] for layer, row in pairs]),
-        np.concatenate([layer.opacities[row] for layer, row in pairs]),
-        np.concatenate([layer.boxes[row] for layer, row in pairs]),
-    )

@@ -25,13 +25,7 @@ from gscompleter.splats.packing import (
     restore_largest,
     unpack_fractions,
 )
-from gscompleter.splats.ply import (
-    MODE_COMMENT,
-    encode,
-    has_mode_comment,
-    make_header,
-    read_header,
-)
+from gscompleter.splats.ply import MODE_COMMENT, encode, has_mode_comment, make_header, read_header
 from gscompleter.types import SH_C0, Gaussians
 
 CHUNK_SIZE = 256

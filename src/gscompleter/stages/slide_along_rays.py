@@ -14,7 +14,7 @@ from torch import Tensor
 
 from gscompleter.config import RegistrationConfig
 from gscompleter.cpu_threads import use_one_torch_thread
-from gscompleter.geometry import compute_z_depths, footprint_mask, move_to_depths, slide
+from gscompleter.geometry import compute_z_depths, move_to_depths, slide
 from gscompleter.image_ops import fill_smoothly
 from gscompleter.optim import Adam
 from gscompleter.progress import track
@@ -147,32 +147,24 @@ def bound(ratio: Float[Tensor, "n"], least: float | None) -> Float[Tensor, "n"]:
 def register_along_rays(
     coarse: Gaussians, reference: View, view: TargetView
 ) -> tuple[Gaussians, tuple[float, ...]]:
-    """Minimize Eq. 11 over one distance per Gaussian; also return the loss per iteration.
-
-    Gaussians that reach no compared pixel have no gradient and are not rendered.
-    """
+    """Minimize Eq. 11 over one distance per Gaussian; also return the loss per iteration."""
     config, renderer = view.state.config.registration, view.scenes.renderer
     anchor = view.anchor_view.camera
     objective = Objective.from_renders(view.render, view.anchor_render, reference, anchor, config)
-    rows = objective.find_reached(coarse, reference.camera, anchor).nonzero()[:, 0]
-    seen = coarse[rows]
-    where = objective.target_depth.valid
-    alone = make_renderer_alone(seen, reference.camera, where, renderer, config)
+    alone = make_renderer_alone(coarse, reference.camera, renderer, config)
     parameters = torch.zeros(
-        (len(seen), config.degrees_of_freedom), device=coarse.means.device, requires_grad=True
+        (len(coarse), config.degrees_of_freedom), device=coarse.means.device, requires_grad=True
     )
     optimizer = Adam([(parameters, config.learning_rate)], (config.beta1, config.beta2))
     losses = []
     for iteration in track(range(config.iterations), "Registering"):
         left = 1 - iteration / config.iterations if config.lr_schedule == "linear" else 1.0
-        moved = move_along_rays(seen, parameters, reference.camera, config)
+        moved = move_along_rays(coarse, parameters, reference.camera, config)
         loss = objective(moved, view.frozen, alone, renderer.render(moved, anchor))
         optimizer.step(loss, left)
         losses.append(loss.item())
     with torch.no_grad():
-        found = parameters.new_zeros((len(coarse), config.degrees_of_freedom))
-        found[rows] = parameters.detach()
-        return move_along_rays(coarse, found, reference.camera, config), tuple(losses)
+        return move_along_rays(coarse, parameters, reference.camera, config), tuple(losses)
 
 
 def move_along_rays(
@@ -192,20 +184,16 @@ def move_along_rays(
 
 
 def make_renderer_alone(
-    coarse: Gaussians,
-    camera: Camera,
-    where: Bool[Tensor, "h w"],
-    renderer: Renderer,
-    config: RegistrationConfig,
+    coarse: Gaussians, camera: Camera, renderer: Renderer, config: RegistrationConfig
 ) -> Callable[[Gaussians], Render]:
-    """Return a renderer of moved Gaussians alone, at least inside `where`.
+    """Return a renderer of moved Gaussians alone.
 
     With a constant footprint their image does not change along rays, so only depth is rendered
     again.
     """
     if config.degrees_of_freedom == 3 or config.footprint == "fixed":
         return lambda moved: renderer.render(moved, camera)
-    plan = renderer.freeze(coarse[:0], camera).vary_depths(coarse, where)
+    plan = renderer.freeze(coarse[:0], camera).vary_depths(coarse)
     return lambda moved: plan(compute_z_depths(moved.means, camera))
 
 
@@ -240,14 +228,6 @@ class Objective:
         unit = seen.median().item() if relative else 1.0
         target_depth = get_compared_depth(at_target, reference.camera, config)
         return Objective(target_depth, anchor_depth, reference.image, unit, config)
-
-    def find_reached(self, candidates: Gaussians, target: Camera, anchor: Camera) -> Tensor:
-        """Find Gaussians that reach a compared pixel of the target or the anchor."""
-        counted = self.target_depth.valid
-        if self.config.rgb_weight > 0:
-            counted = torch.ones_like(counted)
-        at_target = footprint_mask(candidates, target, counted)
-        return at_target | footprint_mask(candidates, anchor, self.anchor_depth.valid)
 
     def __call__(
         self,

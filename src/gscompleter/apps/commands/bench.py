@@ -30,12 +30,7 @@ from gscompleter.apps.bench.measure import (
     measure_in_rounds,
     measure_method,
 )
-from gscompleter.apps.bench.report import (
-    Measured,
-    Report,
-    describe_machine,
-    format_report,
-)
+from gscompleter.apps.bench.report import Measured, Report, describe_machine, format_report
 from gscompleter.apps.commands.demo import (
     BASELINE_M,
     get_motorcycle_cameras,

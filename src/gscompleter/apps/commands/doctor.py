@@ -19,9 +19,7 @@ from gscompleter.apps.warmup import PARTS, compile_kernels
 from gscompleter.errors import InputError
 from gscompleter.io.files import get_download_folder
 from gscompleter.kernels.compiled import find_marker, get_cache_folder
-from gscompleter.models.weights.fetching import (
-    find_cached,
-)
+from gscompleter.models.weights.fetching import find_cached
 from gscompleter.models.weights.published import PUBLISHED
 from gscompleter.progress import show_progress
 from gscompleter.render import choose_device, load_renderer

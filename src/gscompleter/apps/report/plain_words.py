@@ -32,7 +32,6 @@ RECOLORED_NOTE = (
     "Gaussians of the input splat got new colours, because no photograph confirms theirs; "
     "removed.ply has them as they were."
 )
-NUM_WANTED = 2
 NOTHING_NEW_NOTE = (
     "The splat reproduces all photographs. Where it is wrong from elsewhere, only smooth colours "
     "are known: little is to be gained without new photographs of the place or a learned generator."
