@@ -43,4 +43,4 @@ def test_the_core_is_short():
 
 def test_everything_but_the_learned_models_is_short():
     files = (path for path in PACKAGE.rglob("*.py") if "models" not in path.parts)
-    assert sum(len(path.read_text().splitlines()) for path in files) <= 29_000
+    assert sum(len(path.read_text().splitlines()) for path in files) <= 30_200

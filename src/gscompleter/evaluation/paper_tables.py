@@ -31,7 +31,7 @@ NOISE = 2.0
 """Number of standard errors up to which a difference is within noise."""
 ABOUT = (
     "Mean ± standard error over scenes; in brackets the mean of the paired differences to "
-    "*{baseline}*, with ≈ if it is within two of its standard errors. {cases}."
+    "*{baseline}*, with ≈ if it is within two of its standard errors or of one scene. Cases: {cases}."
 )
 
 
@@ -79,7 +79,8 @@ class PaperTable:
     rows: Sequence[TableRow]
     num_cases: Mapping[str, int]
     """Number of cases that all methods finished, by model and protocol."""
-    failures: Sequence[str] = ()
+    notes: Sequence[str]
+    """Failed cases, and the reason why there is no FID."""
 
     @property
     def columns(self) -> list[Column]:
@@ -121,13 +122,14 @@ def compare_cases(values: Mapping[str, float], others: Mapping[str, float]) -> E
 def fill_table(spec: TableSpec, runs: Mapping[tuple[str, str], Path]) -> PaperTable:
     """Fill a table from runs of `evaluate`, given by model and protocol."""
     rows: list[TableRow] = []
-    counts, failures = {}, []
+    counts, notes = {}, []
     for (model, protocol), folder in runs.items():
         found = [row for row in read_rows(folder) if row["method"] in spec.methods]
         summary = summarize_run(found)
         counts[f"{model}, {protocol}" if protocol else model] = len(summary.common_tasks)
-        failures += [" ".join(failure) for failure in summary.failures]
-        fids = compute_fids(folder, summary) if "fid" in spec.columns else ""
+        notes += [f"Failed: {' '.join(failure)}" for failure in summary.failures]
+        fids = compute_fids(folder, summary) if "fid" in spec.columns else {}
+        notes += [fids] if isinstance(fids, str) else []
         baseline = collect_values(summary, spec.baseline, spec.columns)
         for method in spec.methods:
             values = collect_values(summary, method, spec.columns)
@@ -135,10 +137,10 @@ def fill_table(spec: TableSpec, runs: Mapping[tuple[str, str], Path]) -> PaperTa
                 key: fill_cell(BY_KEY[key], values[key], {} if method == spec.baseline else base)
                 for key, base in baseline.items()
             }
-            if isinstance(fids, dict):
+            if method in fids and not isinstance(fids, str):
                 cells["fid"] = Cell(fids[method])
             rows.append(TableRow(model, protocol, method, cells))
-    return PaperTable(spec, rows, counts, failures)
+    return PaperTable(spec, rows, counts, list(dict.fromkeys(notes)))
 
 
 def collect_values(
@@ -209,11 +211,11 @@ def format_number(column: Column, cell: Cell, error: str, difference: str) -> st
 
 def format_paper_markdown(table: PaperTable) -> str:
     """Format a table with its title and notes."""
-    counts = [f"{count} cases ({name})" for name, count in table.num_cases.items()]
-    about = ABOUT.format(baseline=table.spec.baseline, cases="; ".join(counts))
+    counts = [f"{count} ({name})" for name, count in table.num_cases.items()]
+    about = ABOUT.format(baseline=table.spec.baseline, cases=", ".join(counts))
     head, rows = format_rows(table, partial(format_number, error=" ± {}", difference=" ({})"))
-    failed = [f"Failed: {failure}\n" for failure in table.failures]
-    body = [format_markdown(head, rows), *describe_missing(table), *failed]
+    notes = [f"{note}\n" for note in table.notes]
+    body = [format_markdown(head, rows), *describe_missing(table), *notes]
     return "\n".join([f"## {table.spec.title}\n", f"{about}\n", *body])
 
 

@@ -100,8 +100,8 @@ def write(options: EvaluateOptions, name: str, spec: Requirements) -> None:
     if isinstance(spec, TableSpec):
         table = fill_table(spec, runs)
         if not any(table.num_cases.values()):
-            reason = (*table.failures, "no row is there")[0]
-            raise InputError(f"No case of the table was completed: {reason}")
+            reason = (*table.notes, "no row is there")[0]
+            raise InputError(f"No case of the table was completed. {reason}")
         write_paper_table(options.out / TABLES / name, table)
     if isinstance(spec, FigureSpec):
         by_model = {model: folder for (model, _), folder in runs.items()}
