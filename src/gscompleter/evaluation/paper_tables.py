@@ -31,7 +31,8 @@ NOISE = 2.0
 """Number of standard errors up to which a difference is within noise."""
 ABOUT = (
     "Mean ± standard error over scenes; in brackets the mean of the paired differences to "
-    "*{baseline}*, with ≈ if it is within two of its standard errors or of one scene. Cases: {cases}."
+    "*{baseline}*, with ≈ if it is within two of its standard errors or of one scene. Cases: "
+    "{cases}."
 )
 
 
