@@ -17,14 +17,15 @@ from torch.nn.functional import normalize
 from gscompleter.reconstructors.plane_sweep.virtual_views import make_virtual_views
 from gscompleter.render import ColorErrors, Renderer
 from gscompleter.render.spherical_harmonics import linear_colors_to_sh
-from gscompleter.types import SH_C0, Camera, Gaussians, View
+from gscompleter.types import SH_C0, Camera, DepthMap, Gaussians, View
 
-VIRTUAL_WEIGHT = 0.5
+VIRTUAL_WEIGHT = 0.25
 """Weight of a pixel of a virtual photograph, against one of a photograph."""
 SLOPE_PENALTY = 0.0006
 """Cost of a squared colour change per radian, against a squared colour difference in the images."""
-RELAXATIONS = 3.0, 1.0, 2.5, 1.0
-"""Step size of each round; long steps in turn with short ones converge faster (Richardson 1911)."""
+RELAXATIONS = (3.0, 1.0), (2.5, 1.0)
+"""Step sizes of the rounds on the photographs alone, then on all; long and short ones in turn
+converge faster than equal ones (Richardson 1911)."""
 MIN_WEIGHT = 0.05
 """Summed weight up to which colours are damped, as hardly any image shows them."""
 
@@ -71,52 +72,57 @@ class WeightedImage:
 
     def backproject(
         self, colors: Float[Tensor, "n 3"], slopes: Float[Tensor, "n 3"]
-    ) -> tuple[Float[Tensor, "n 3"], Float[Tensor, "n"]]:
+    ) -> tuple[Float[Tensor, "n 3"], Float[Tensor, "n 1"]]:
         """Backproject the weighted residual at given colours, and the weights."""
         residual, seen = self.errors(colors + self.position[:, None] * slopes, self.image)
-        return self.weight * residual, self.weight * seen
+        return self.weight * residual, self.weight * seen[:, None]
 
 
 def fit_directional_colors(
-    scene: Gaussians, views: Sequence[View], renderer: Renderer
+    scene: Gaussians, views: Sequence[View], depths: Sequence[DepthMap], renderer: Renderer
 ) -> Gaussians:
     """Fit colours that are linear in the direction to two photographs and two virtual ones.
 
-    Each round minimizes an upper bound in which every Gaussian stands alone, as in SIRT.
+    `depths` are those of the scene at the photographs.
     """
     line = ColorLine.between(scene, views[0].camera, views[1].camera)
-    weighted = [(view, 1.0) for view in views]
-    weighted += [(view, VIRTUAL_WEIGHT) for view in make_virtual_views(scene, views, renderer)]
-    images = [
-        WeightedImage(
-            renderer.freeze(scene[:0], view.camera).vary_colors(scene),
-            view.image,
-            weight,
-            line.locate(scene, view.camera),
-        )
-        for view, weight in weighted
-    ]
-    colors, slopes = solve_colors(images, scene.sh[:, 0] * SH_C0 + 0.5, line.squared_angle)
-    return replace(scene, sh=line.to_sh(colors, slopes))
+
+    def weigh(view: View, weight: float) -> WeightedImage:
+        errors = renderer.freeze(scene[:0], view.camera).vary_colors(scene)
+        return WeightedImage(errors, view.image, weight, line.locate(scene, view.camera))
+
+    images = [weigh(view, 1.0) for view in views]
+    virtual = make_virtual_views(scene, views, depths, renderer)
+    every = images + [weigh(view, VIRTUAL_WEIGHT) for view in virtual]
+    colors = scene.sh[:, 0] * SH_C0 + 0.5
+    state = colors, torch.zeros_like(colors)
+    for used, relaxations in zip((images, every), RELAXATIONS, strict=True):
+        for relaxation in relaxations:
+            state = improve_colors(*state, used, line.squared_angle, relaxation)
+    return replace(scene, sh=line.to_sh(*state))
 
 
-def solve_colors(
-    images: Sequence[WeightedImage],
+def improve_colors(
     colors: Float[Tensor, "n 3"],
+    slopes: Float[Tensor, "n 3"],
+    images: Sequence[WeightedImage],
     squared_angle: Float[Tensor, "n"],
+    relaxation: float,
 ) -> tuple[Float[Tensor, "n 3"], Float[Tensor, "n 3"]]:
-    """Solve for colours and slopes by block Jacobi with varying relaxation, slopes damped."""
-    slopes = torch.zeros_like(colors)
-    for relaxation in RELAXATIONS:
-        residuals, seen = zip(*(i.backproject(colors, slopes) for i in images), strict=True)
-        at = [image.position[:, None] for image in images]
-        total = torch.stack(seen).sum(0).clamp_min(MIN_WEIGHT)[:, None]
-        cross = sum(w[:, None] * s for w, s in zip(seen, at, strict=True))
-        damping = SLOPE_PENALTY * total / squared_angle[:, None]
-        square = sum(w[:, None] * s * s for w, s in zip(seen, at, strict=True)) + damping
-        pull = torch.stack(residuals).sum(0)
-        turn = sum(r * s for r, s in zip(residuals, at, strict=True)) - damping * slopes
-        step = relaxation / (total * square - cross * cross)
-        colors = colors + step * (square * pull - cross * turn)
-        slopes = slopes + step * (total * turn - cross * pull)
-    return colors, slopes
+    """Improve colours and their slopes, which are damped, by a step of block Jacobi.
+
+    With a relaxation of 1 it minimizes an upper bound in which every Gaussian stands alone.
+    """
+    residuals, seen = zip(*(image.backproject(colors, slopes) for image in images), strict=True)
+    at = [image.position[:, None] for image in images]
+    total = sum(seen).clamp_min(MIN_WEIGHT)
+    damping = SLOPE_PENALTY * total / squared_angle[:, None]
+    cross = sum(w * s for w, s in zip(seen, at, strict=True))
+    square = sum(w * s * s for w, s in zip(seen, at, strict=True)) + damping
+    pull = sum(residuals)
+    turn = sum(r * s for r, s in zip(residuals, at, strict=True)) - damping * slopes
+    step = relaxation / (total * square - cross * cross)
+    return (
+        colors + step * (square * pull - cross * turn),
+        slopes + step * (total * turn - cross * pull),
+    )

@@ -128,8 +128,8 @@ class Splatter:
     ) -> Gaussians:
         """Fit the Gaussians to views that are brighter by `gains`."""
         if len(views) == 2:
-            faded = fit_opacities(gaussians, views, self.renderer)
-            return fit_directional_colors(faded, views, self.renderer)
+            faded, depths = fit_opacities(gaussians, views, self.renderer)
+            return fit_directional_colors(faded, views, depths, self.renderer)
         return fit_jointly(gaussians, views, gains, self.renderer)
 
     def splat(self, view: View, depth: DepthMap) -> Gaussians:

@@ -11,34 +11,29 @@ from collections.abc import Sequence
 from dataclasses import replace
 
 import torch
-from jaxtyping import Float
-from torch import Tensor
 
 from gscompleter.config.settings import COVERED
 from gscompleter.geometry import is_inside, project, sample, unproject
 from gscompleter.render import Renderer
-from gscompleter.types import Camera, Gaussians, Render, View
+from gscompleter.types import Camera, DepthMap, Gaussians, View
 
 DEPTH_TOLERANCE = 0.03
 """Relative depth difference at which the share of a photograph's colour falls to 1/e."""
 
 
 def make_virtual_views(
-    scene: Gaussians, views: Sequence[View], renderer: Renderer
-) -> tuple[View, View]:
-    """Warp two photographs, through the depth of `scene`, to one camera beyond each of them."""
-    first, second = ((view, renderer.render(scene, view.camera)) for view in views)
+    scene: Gaussians, views: Sequence[View], depths: Sequence[DepthMap], renderer: Renderer
+) -> list[View]:
+    """Warp two photographs to one camera beyond each, through the depth of `scene` there.
 
-    def look_beyond(far: tuple[View, Render], near: tuple[View, Render]) -> View:
-        camera = extrapolate_camera(far[0].camera, near[0].camera)
-        shown = renderer.render(scene, camera)
-        points, image = unproject(shown.depth, camera), shown.image
-        for photograph in (far, near):
-            colors, share = warp(*photograph, points)
-            image = torch.lerp(image, colors, (share * (shown.alpha >= COVERED))[..., None])
-        return View(image.clamp(0, 1), camera)
-
-    return look_beyond(second, first), look_beyond(first, second)
+    `depths` are those of the scene at the photographs.
+    """
+    first, second = (view.camera for view in views)
+    cameras = extrapolate_camera(second, first), extrapolate_camera(first, second)
+    return [
+        warp(view, depth, scene, camera, renderer)
+        for view, depth, camera in zip(views, depths, cameras, strict=True)
+    ]
 
 
 def extrapolate_camera(before: Camera, camera: Camera) -> Camera:
@@ -51,12 +46,17 @@ def extrapolate_camera(before: Camera, camera: Camera) -> Camera:
 
 
 def warp(
-    view: View, render: Render, points: Float[Tensor, "h w 3"]
-) -> tuple[Float[Tensor, "h w 3"], Float[Tensor, "h w"]]:
-    """Sample a photograph at surface points, with weights in [0, 1] that tell if it shows them."""
-    pixels, z = project(points, view.camera)
-    layers = torch.cat([view.image, render.depth[..., None], render.alpha[..., None]], dim=-1)
-    colors, depth, alpha = sample(layers, pixels).split([3, 1, 1], dim=-1)
+    view: View, own: DepthMap, scene: Gaussians, camera: Camera, renderer: Renderer
+) -> View:
+    """Warp a photograph to another camera; what it does not show keeps the colours of `scene`."""
+    shown = renderer.render(scene, camera)
+    covered = shown.alpha >= COVERED
+    # At its borders the scene is half transparent, and nothing behind it is black.
+    colors = shown.image / shown.alpha.where(covered, 1.0)[..., None]
+    pixels, z = project(unproject(shown.depth, camera), view.camera)
+    layers = torch.cat([view.image, own.depth[..., None], own.valid[..., None]], dim=-1)
+    sampled, depth, valid = sample(layers, pixels).split([3, 1, 1], dim=-1)
     error = (z - depth[..., 0]) / (DEPTH_TOLERANCE * z.abs().clamp_min(1e-12))
-    seen = is_inside(pixels, z, view.camera) & (alpha[..., 0] >= COVERED)
-    return colors, torch.exp(-error.square()) * seen
+    seen = covered & is_inside(pixels, z, view.camera) & (valid[..., 0] >= 0.5)
+    share = torch.exp(-error.square()) * seen
+    return View((colors + share[..., None] * (sampled - colors)).clamp(0, 1), camera)
