@@ -19,10 +19,11 @@ from gscompleter.render import ColorErrors, Renderer
 from gscompleter.render.spherical_harmonics import linear_colors_to_sh
 from gscompleter.types import SH_C0, Camera, DepthMap, Gaussians, View
 
-VIRTUAL_WEIGHT = 0.25
+VIRTUAL_WEIGHT = 0.3
 """Weight of a pixel of a virtual photograph, against one of a photograph."""
-SLOPE_PENALTY = 0.0006
-"""Cost of a squared colour change per radian, against a squared colour difference in the images."""
+SLOPE_PENALTY, ANGLE = 1.0, 0.015
+"""Cost of a squared colour change between middle and photograph, against a squared difference in
+the images; doubled if the rays of the photographs are this many radians from the middle."""
 RELAXATIONS = (3.0, 1.0), (2.5, 1.0)
 """Step sizes of the rounds on the photographs alone, then on all; long and short ones in turn
 converge faster than equal ones (Richardson 1911)."""
@@ -116,7 +117,7 @@ def improve_colors(
     residuals, seen = zip(*(image.backproject(colors, slopes) for image in images), strict=True)
     at = [image.position[:, None] for image in images]
     total = sum(seen).clamp_min(MIN_WEIGHT)
-    damping = SLOPE_PENALTY * total / squared_angle[:, None]
+    damping = SLOPE_PENALTY * total * (1 + ANGLE**2 / squared_angle[:, None])
     cross = sum(w * s for w, s in zip(seen, at, strict=True))
     square = sum(w * s * s for w, s in zip(seen, at, strict=True)) + damping
     pull = sum(residuals)
