@@ -28,20 +28,6 @@ def evaluate_colors(
     return (0.5 + torch.einsum("nk,nkc->nc", basis, sh)).clamp_min(0)
 
 
-def linear_colors_to_sh(
-    colors: Float[Tensor, "n 3"],
-    directions: Float[Tensor, "n 3"],
-    gradients: Float[Tensor, "n 3 3"],
-) -> Float[Tensor, "n 4 3"]:
-    """Convert colours that change linearly with the direction to harmonics of degree 1.
-
-    A Gaussian has `colors` at `directions`, and gradients[n, axis, channel] per unit of direction.
-    """
-    constant = colors - 0.5 - (directions[..., None] * gradients).sum(dim=1)
-    x, y, z = gradients.unbind(1)
-    return torch.stack([constant / SH_C0, -y / SH_C1, z / SH_C1, -x / SH_C1], dim=1)
-
-
 def evaluate_sh_basis(directions: Float[Tensor, "n 3"], k: int) -> Float[Tensor, "n k"]:
     """Evaluate the first `k` (1, 4, 9 or 16) basis functions at unit `directions` (world)."""
     x, y, z = directions.unbind(-1)

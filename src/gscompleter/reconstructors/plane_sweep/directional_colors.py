@@ -16,7 +16,7 @@ from torch.nn.functional import normalize
 
 from gscompleter.reconstructors.plane_sweep.virtual_views import make_virtual_views
 from gscompleter.render import ColorErrors, Renderer
-from gscompleter.render.spherical_harmonics import linear_colors_to_sh
+from gscompleter.render.spherical_harmonics import SH_C1
 from gscompleter.types import SH_C0, Camera, DepthMap, Gaussians, View
 
 VIRTUAL_WEIGHT = 0.3
@@ -30,16 +30,18 @@ converge faster than equal ones (Richardson 1911)."""
 MIN_WEIGHT = 0.05
 """Summed weight up to which colours are damped, as hardly any image shows them."""
 
+Colors = Float[Tensor, "n 3"]
+
 
 @dataclass(frozen=True)
 class ColorLine:
-    """Direction, per Gaussian, along which its colour changes."""
+    """Directions, one per Gaussian, along which the colours change."""
 
     middle: Float[Tensor, "n 3"]
     """Mean of the unit rays from two photographs."""
     axis: Float[Tensor, "n 3"]
     """Half of their difference: the ray of the second is `middle + axis`."""
-    squared_angle: Float[Tensor, "n"]
+    squared_angle: Float[Tensor, "n 1"]
     """Squared length of the axis, in squared radians."""
 
     @staticmethod
@@ -47,19 +49,20 @@ class ColorLine:
         """Return the line between the rays of two cameras."""
         start, end = (normalize(scene.means - c.center, dim=-1) for c in (first, second))
         axis = (end - start) / 2
-        return ColorLine((start + end) / 2, axis, axis.square().sum(dim=-1).clamp_min(1e-12))
+        squared_angle = axis.square().sum(dim=-1, keepdim=True).clamp_min(1e-12)
+        return ColorLine((start + end) / 2, axis, squared_angle)
 
-    def locate(self, scene: Gaussians, camera: Camera) -> Float[Tensor, "n"]:
+    def locate(self, scene: Gaussians, camera: Camera) -> Float[Tensor, "n 1"]:
         """Locate the rays of a camera on the lines: -1 and 1 are those of the two cameras."""
         rays = normalize(scene.means - camera.center, dim=-1)
-        return ((rays - self.middle) * self.axis).sum(dim=-1) / self.squared_angle
+        return ((rays - self.middle) * self.axis).sum(dim=-1, keepdim=True) / self.squared_angle
 
-    def to_sh(
-        self, colors: Float[Tensor, "n 3"], slopes: Float[Tensor, "n 3"]
-    ) -> Float[Tensor, "n 4 3"]:
+    def to_sh(self, colors: Colors, slopes: Colors) -> Float[Tensor, "n 4 3"]:
         """Convert colours at position 0, and their slopes, to spherical harmonics."""
-        per_radian = self.axis / self.squared_angle[:, None]
-        return linear_colors_to_sh(colors, self.middle, per_radian[..., None] * slopes[:, None])
+        x, y, z = (self.axis / self.squared_angle)[..., None].unbind(1)
+        at_zero = colors - slopes * (self.middle * self.axis / self.squared_angle).sum(1, True)
+        linear = [-y * slopes / SH_C1, z * slopes / SH_C1, -x * slopes / SH_C1]
+        return torch.stack([(at_zero - 0.5) / SH_C0, *linear], dim=1)
 
 
 @dataclass(frozen=True)
@@ -69,13 +72,11 @@ class WeightedImage:
     errors: ColorErrors
     image: Float[Tensor, "h w 3"]
     weight: float
-    position: Float[Tensor, "n"]
+    position: Float[Tensor, "n 1"]
 
-    def backproject(
-        self, colors: Float[Tensor, "n 3"], slopes: Float[Tensor, "n 3"]
-    ) -> tuple[Float[Tensor, "n 3"], Float[Tensor, "n 1"]]:
+    def backproject(self, colors: Colors, slopes: Colors) -> tuple[Colors, Float[Tensor, "n 1"]]:
         """Backproject the weighted residual at given colours, and the weights."""
-        residual, seen = self.errors(colors + self.position[:, None] * slopes, self.image)
+        residual, seen = self.errors(colors + self.position * slopes, self.image)
         return self.weight * residual, self.weight * seen[:, None]
 
 
@@ -104,26 +105,23 @@ def fit_directional_colors(
 
 
 def improve_colors(
-    colors: Float[Tensor, "n 3"],
-    slopes: Float[Tensor, "n 3"],
+    colors: Colors,
+    slopes: Colors,
     images: Sequence[WeightedImage],
-    squared_angle: Float[Tensor, "n"],
+    squared_angle: Float[Tensor, "n 1"],
     relaxation: float,
-) -> tuple[Float[Tensor, "n 3"], Float[Tensor, "n 3"]]:
+) -> tuple[Colors, Colors]:
     """Improve colours and their slopes, which are damped, by a step of block Jacobi.
 
     With a relaxation of 1 it minimizes an upper bound in which every Gaussian stands alone.
     """
-    residuals, seen = zip(*(image.backproject(colors, slopes) for image in images), strict=True)
-    at = [image.position[:, None] for image in images]
-    total = sum(seen).clamp_min(MIN_WEIGHT)
-    damping = SLOPE_PENALTY * total * (1 + ANGLE**2 / squared_angle[:, None])
-    cross = sum(w * s for w, s in zip(seen, at, strict=True))
-    square = sum(w * s * s for w, s in zip(seen, at, strict=True)) + damping
-    pull = sum(residuals)
-    turn = sum(r * s for r, s in zip(residuals, at, strict=True)) - damping * slopes
+    found = [(*image.backproject(colors, slopes), image.position) for image in images]
+    total = torch.stack([seen for _, seen, _ in found]).sum(0).clamp_min(MIN_WEIGHT)
+    damping = SLOPE_PENALTY * total * (1 + ANGLE**2 / squared_angle)
+    cross = torch.stack([seen * at for _, seen, at in found]).sum(0)
+    square = torch.stack([seen * at**2 for _, seen, at in found]).sum(0) + damping
+    pull = torch.stack([residual for residual, _, _ in found]).sum(0)
+    turn = torch.stack([residual * at for residual, _, at in found]).sum(0) - damping * slopes
     step = relaxation / (total * square - cross * cross)
-    return (
-        colors + step * (square * pull - cross * turn),
-        slopes + step * (total * turn - cross * pull),
-    )
+    colors = colors + step * (square * pull - cross * turn)
+    return colors, slopes + step * (total * turn - cross * pull)

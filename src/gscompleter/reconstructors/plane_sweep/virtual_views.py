@@ -45,9 +45,7 @@ def extrapolate_camera(before: Camera, camera: Camera) -> Camera:
     return replace(camera, c2w=c2w)
 
 
-def warp(
-    view: View, own: DepthMap, scene: Gaussians, camera: Camera, renderer: Renderer
-) -> View:
+def warp(view: View, own: DepthMap, scene: Gaussians, camera: Camera, renderer: Renderer) -> View:
     """Warp a photograph to another camera; what it does not show keeps the colours of `scene`."""
     shown = renderer.render(scene, camera)
     covered = shown.alpha >= COVERED
