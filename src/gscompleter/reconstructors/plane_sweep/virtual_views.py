@@ -49,12 +49,12 @@ def warp(view: View, own: DepthMap, scene: Gaussians, camera: Camera, renderer: 
     """Warp a photograph to another camera; what it does not show keeps the colours of `scene`."""
     shown = renderer.render(scene, camera)
     covered = shown.alpha >= COVERED
-    # At its borders the scene is half transparent, and nothing behind it is black.
-    colors = shown.image / shown.alpha.where(covered, 1.0)[..., None]
     pixels, z = project(unproject(shown.depth, camera), view.camera)
     layers = torch.cat([view.image, own.depth[..., None], own.valid[..., None]], dim=-1)
     sampled, depth, valid = sample(layers, pixels).split([3, 1, 1], dim=-1)
     error = (z - depth[..., 0]) / (DEPTH_TOLERANCE * z.abs().clamp_min(1e-12))
     seen = covered & is_inside(pixels, z, view.camera) & (valid[..., 0] >= 0.5)
     share = torch.exp(-error.square()) * seen
-    return View((colors + share[..., None] * (sampled - colors)).clamp(0, 1), camera)
+    # Where the scene ends it is half transparent, and a completion adds what is behind.
+    wanted = shown.alpha[..., None] * sampled
+    return View((shown.image + share[..., None] * (wanted - shown.image)).clamp(0, 1), camera)
