@@ -60,11 +60,11 @@ def test_harmonics_are_the_line_in_every_direction():
     line = ColorLine.between(scene, views[0].camera, views[1].camera)
     generator = torch.Generator().manual_seed(0)
     colors = 0.4 + 0.2 * torch.rand(len(scene), 3, generator=generator)
-    slopes = 0.02 * torch.randn(len(scene), 3, generator=generator)
-    sh = line.to_sh(colors, slopes)
+    gradients = 0.02 * torch.randn(len(scene), 3, generator=generator)
+    sh = line.to_sh(colors, gradients)
     for x in (-0.2, 0.0, 0.2, 0.6):
         camera = camera_at(x, size=SIZE)
-        expected = colors + line.locate(scene, camera) * slopes
+        expected = colors + line.locate(scene, camera) * gradients
         found = evaluate_colors(sh, scene.means, camera.center)
         assert torch.allclose(found, expected.clamp_min(0), atol=1e-3)
 
@@ -114,7 +114,7 @@ def test_colours_stay_calm_far_off_the_photographs():
 
 
 def test_without_parallax_colours_do_not_depend_on_the_direction():
-    """Gaussians very far away, as those of the sky, get no slope."""
+    """Gaussians very far away, as those of the sky, get no gradient."""
     views = take_pair()
     far = [gaussians_of(view, torch.full((SIZE, SIZE), 1e5)) for view in views]
     scene, renderer = merge(far), load_renderer("cpu")

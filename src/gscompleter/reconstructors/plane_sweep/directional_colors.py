@@ -21,7 +21,7 @@ from gscompleter.types import SH_C0, Camera, DepthMap, Gaussians, View
 
 VIRTUAL_WEIGHT = 0.3
 """Weight of a pixel of a virtual photograph, against one of a photograph."""
-SLOPE_PENALTY, ANGLE = 1.0, 0.015
+GRADIENT_PENALTY, ANGLE = 1.0, 0.015
 """Cost of a squared colour change between middle and photograph, against a squared difference in
 the images; doubled if the rays of the photographs are this many radians from the middle."""
 RELAXATIONS = (3.0, 1.0), (2.5, 1.0)
@@ -57,11 +57,11 @@ class ColorLine:
         rays = normalize(scene.means - camera.center, dim=-1)
         return ((rays - self.middle) * self.axis).sum(dim=-1, keepdim=True) / self.squared_angle
 
-    def to_sh(self, colors: Colors, slopes: Colors) -> Float[Tensor, "n 4 3"]:
-        """Convert colours at position 0, and their slopes, to spherical harmonics."""
+    def to_sh(self, colors: Colors, gradients: Colors) -> Float[Tensor, "n 4 3"]:
+        """Convert colours at position 0, and their gradients, to spherical harmonics."""
         x, y, z = (self.axis / self.squared_angle)[..., None].unbind(1)
-        at_zero = colors - slopes * (self.middle * self.axis / self.squared_angle).sum(1, True)
-        linear = [-y * slopes / SH_C1, z * slopes / SH_C1, -x * slopes / SH_C1]
+        at_zero = colors - gradients * (self.middle * self.axis / self.squared_angle).sum(1, True)
+        linear = [-y * gradients / SH_C1, z * gradients / SH_C1, -x * gradients / SH_C1]
         return torch.stack([(at_zero - 0.5) / SH_C0, *linear], dim=1)
 
 
@@ -74,9 +74,9 @@ class WeightedImage:
     weight: float
     position: Float[Tensor, "n 1"]
 
-    def backproject(self, colors: Colors, slopes: Colors) -> tuple[Colors, Float[Tensor, "n 1"]]:
+    def backproject(self, colors: Colors, gradients: Colors) -> tuple[Colors, Float[Tensor, "n 1"]]:
         """Backproject the weighted residual at given colours, and the weights."""
-        residual, seen = self.errors(colors + self.position * slopes, self.image)
+        residual, seen = self.errors(colors + self.position * gradients, self.image)
         return self.weight * residual, self.weight * seen[:, None]
 
 
@@ -106,22 +106,22 @@ def fit_directional_colors(
 
 def improve_colors(
     colors: Colors,
-    slopes: Colors,
+    gradients: Colors,
     images: Sequence[WeightedImage],
     squared_angle: Float[Tensor, "n 1"],
     relaxation: float,
 ) -> tuple[Colors, Colors]:
-    """Improve colours and their slopes, which are damped, by a step of block Jacobi.
+    """Improve colours and their gradients, which are damped, by a step of block Jacobi.
 
     With a relaxation of 1 it minimizes an upper bound in which every Gaussian stands alone.
     """
-    found = [(*image.backproject(colors, slopes), image.position) for image in images]
+    found = [(*image.backproject(colors, gradients), image.position) for image in images]
     total = torch.stack([seen for _, seen, _ in found]).sum(0).clamp_min(MIN_WEIGHT)
-    damping = SLOPE_PENALTY * total * (1 + ANGLE**2 / squared_angle)
+    damping = GRADIENT_PENALTY * total * (1 + ANGLE**2 / squared_angle)
     cross = torch.stack([seen * at for _, seen, at in found]).sum(0)
     square = torch.stack([seen * at**2 for _, seen, at in found]).sum(0) + damping
     pull = torch.stack([residual for residual, _, _ in found]).sum(0)
-    turn = torch.stack([residual * at for residual, _, at in found]).sum(0) - damping * slopes
+    turn = torch.stack([residual * at for residual, _, at in found]).sum(0) - damping * gradients
     step = relaxation / (total * square - cross * cross)
     colors = colors + step * (square * pull - cross * turn)
-    return colors, slopes + step * (total * turn - cross * pull)
+    return colors, gradients + step * (total * turn - cross * pull)
