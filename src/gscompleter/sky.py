@@ -75,5 +75,6 @@ def restore_sky_colors(made: Gaussians, fitted: Gaussians, camera: Camera) -> Ga
     in_sky = is_sky((made.means - camera.center).norm(dim=-1), camera)
     if not in_sky.any():
         return fitted
-    sh = torch.where(in_sky[:, None, None], made.sh, fitted.sh)
+    sh = torch.where(in_sky[:, None, None], 0, fitted.sh)
+    sh[in_sky, : made.sh.shape[1]] = made.sh[in_sky]
     return replace(fitted, sh=sh, encoded=None)

@@ -257,7 +257,7 @@ def with_floater(views: list[View]) -> torch.Tensor:
 def test_what_photographs_object_to_fades_and_the_rest_stays():
     views, renderer = pair(), load_renderer("cpu")
     scene = with_floater(views)
-    fitted = fit_opacities(scene, views, renderer)
+    fitted, _ = fit_opacities(scene, views, renderer)
     assert fitted.opacities[-400:].mean() < 0.5
     for view in views:
         assert renderer.render(fitted, view.camera).alpha.mean() > 0.97

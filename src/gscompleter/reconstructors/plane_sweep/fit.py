@@ -15,9 +15,10 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
+from gscompleter.config.settings import COVERED
 from gscompleter.optim import Adam
 from gscompleter.render import Renderer
-from gscompleter.types import SH_C0, Gaussians, View, sh_from_rgb
+from gscompleter.types import SH_C0, DepthMap, Gaussians, View, sh_from_rgb
 
 OPACITY_STEPS = 6
 """Adam steps on the opacities of two photographs."""
@@ -42,20 +43,27 @@ FAINTEST = 0.02
 """Margin from 0 and 1 to which the initial opacities are clamped."""
 
 
-def fit_opacities(gaussians: Gaussians, views: Sequence[View], renderer: Renderer) -> Gaussians:
-    """Minimize the L1 image difference plus a penalty on removed opacity."""
+def fit_opacities(
+    gaussians: Gaussians, views: Sequence[View], renderer: Renderer
+) -> tuple[Gaussians, list[DepthMap]]:
+    """Minimize the L1 image difference plus a penalty on removed opacity.
+
+    Also return the depth rendered at each view before its last step.
+    """
     nothing = gaussians[:0]
     plans = [(renderer.freeze(nothing, v.camera).vary_opacities(gaussians), v.image) for v in views]
     logits = gaussians.opacities.logit(eps=1e-4).requires_grad_()
     optimizer = Adam([(logits, OPACITY_RATE)], OPACITY_BETAS)
     weight = REMOVAL_PENALTY * len(views) / len(gaussians)
+    depths: list[DepthMap] = []
     for step in range(OPACITY_STEPS):
         plan, image = plans[step % len(plans)]
         opacities = logits.sigmoid()
         removed = (gaussians.opacities - opacities).clamp_min(0).sum()
-        difference = (plan(opacities).image - image).abs().mean()
-        optimizer.step(len(views) * difference + weight * removed)
-    return replace(gaussians, opacities=logits.detach().sigmoid())
+        render = plan(opacities)
+        optimizer.step(len(views) * (render.image - image).abs().mean() + weight * removed)
+        depths.append(DepthMap(render.depth.detach(), render.alpha.detach() >= COVERED))
+    return replace(gaussians, opacities=logits.detach().sigmoid()), depths[-len(views) :]
 
 
 def fit_colors(gaussians: Gaussians, views: Sequence[View], renderer: Renderer) -> Gaussians:

@@ -10,6 +10,7 @@ from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from gscompleter.geometry import rotations_to_quats
+from gscompleter.reconstructors.plane_sweep.directional_colors import fit_directional_colors
 from gscompleter.reconstructors.plane_sweep.fit import fit_colors, fit_jointly, fit_opacities
 from gscompleter.reconstructors.plane_sweep.fusion import (
     Layer,
@@ -127,8 +128,8 @@ class Splatter:
     ) -> Gaussians:
         """Fit the Gaussians to views that are brighter by `gains`."""
         if len(views) == 2:
-            faded = fit_opacities(gaussians, views, self.renderer)
-            return fit_colors(faded, views, self.renderer)
+            faded, depths = fit_opacities(gaussians, views, self.renderer)
+            return fit_directional_colors(faded, views, depths, self.renderer)
         return fit_jointly(gaussians, views, gains, self.renderer)
 
     def splat(self, view: View, depth: DepthMap) -> Gaussians:

@@ -1,0 +1,127 @@
+"""Colours of two photographs by direction: each keeps its own, and cameras beyond see the nearer's.
+
+What a photograph shows depends on exposure, reflections, and errors of depth and pose. So a colour
+may change linearly with the direction, between the rays to the two photographs.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+from torch.nn.functional import normalize
+
+from gscompleter.reconstructors.plane_sweep.virtual_views import make_virtual_views
+from gscompleter.render import ColorErrors, Renderer
+from gscompleter.render.spherical_harmonics import SH_C1
+from gscompleter.types import SH_C0, Camera, DepthMap, Gaussians, View
+
+VIRTUAL_WEIGHT = 0.3
+"""Weight of a pixel of a virtual photograph, against one of a photograph."""
+GRADIENT_PENALTY, ANGLE = 1.0, 0.015
+"""Cost of a squared colour change between middle and photograph, against a squared difference in
+the images; doubled if the rays of the photographs are this many radians from the middle."""
+RELAXATIONS = (3.0, 1.0), (2.5, 1.0)
+"""Step sizes of the rounds on the photographs alone, then on all; long and short ones in turn
+converge faster than equal ones (Richardson 1911)."""
+MIN_WEIGHT = 0.05
+"""Summed weight up to which colours are damped, as hardly any image shows them."""
+
+Colors = Float[Tensor, "n 3"]
+
+
+@dataclass(frozen=True)
+class ColorLine:
+    """Directions, one per Gaussian, along which the colours change."""
+
+    middle: Float[Tensor, "n 3"]
+    """Mean of the unit rays from two photographs."""
+    axis: Float[Tensor, "n 3"]
+    """Half of their difference: the ray of the second is `middle + axis`."""
+    squared_angle: Float[Tensor, "n 1"]
+    """Squared length of the axis, in squared radians."""
+
+    @staticmethod
+    def between(scene: Gaussians, first: Camera, second: Camera) -> ColorLine:
+        """Return the line between the rays of two cameras."""
+        start, end = (normalize(scene.means - c.center, dim=-1) for c in (first, second))
+        axis = (end - start) / 2
+        squared_angle = axis.square().sum(dim=-1, keepdim=True).clamp_min(1e-12)
+        return ColorLine((start + end) / 2, axis, squared_angle)
+
+    def locate(self, scene: Gaussians, camera: Camera) -> Float[Tensor, "n 1"]:
+        """Locate the rays of a camera on the lines: -1 and 1 are those of the two cameras."""
+        rays = normalize(scene.means - camera.center, dim=-1)
+        return ((rays - self.middle) * self.axis).sum(dim=-1, keepdim=True) / self.squared_angle
+
+    def to_sh(self, colors: Colors, gradients: Colors) -> Float[Tensor, "n 4 3"]:
+        """Convert colours at position 0, and their gradients, to spherical harmonics."""
+        x, y, z = (self.axis / self.squared_angle)[..., None].unbind(1)
+        at_zero = colors - gradients * (self.middle * self.axis / self.squared_angle).sum(1, True)
+        linear = [-y * gradients / SH_C1, z * gradients / SH_C1, -x * gradients / SH_C1]
+        return torch.stack([(at_zero - 0.5) / SH_C0, *linear], dim=1)
+
+
+@dataclass(frozen=True)
+class WeightedImage:
+    """An image to fit to, and where its rays are on the lines."""
+
+    errors: ColorErrors
+    image: Float[Tensor, "h w 3"]
+    weight: float
+    position: Float[Tensor, "n 1"]
+
+    def backproject(self, colors: Colors, gradients: Colors) -> tuple[Colors, Float[Tensor, "n 1"]]:
+        """Backproject the weighted residual at given colours, and the weights."""
+        residual, seen = self.errors(colors + self.position * gradients, self.image)
+        return self.weight * residual, self.weight * seen[:, None]
+
+
+def fit_directional_colors(
+    scene: Gaussians, views: Sequence[View], depths: Sequence[DepthMap], renderer: Renderer
+) -> Gaussians:
+    """Fit colours that are linear in the direction to two photographs and two virtual ones.
+
+    `depths` are those of the scene at the photographs.
+    """
+    line = ColorLine.between(scene, views[0].camera, views[1].camera)
+
+    def weigh(view: View, weight: float) -> WeightedImage:
+        errors = renderer.freeze(scene[:0], view.camera).vary_colors(scene)
+        return WeightedImage(errors, view.image, weight, line.locate(scene, view.camera))
+
+    images = [weigh(view, 1.0) for view in views]
+    virtual = make_virtual_views(scene, views, depths, renderer)
+    every = images + [weigh(view, VIRTUAL_WEIGHT) for view in virtual]
+    colors = scene.sh[:, 0] * SH_C0 + 0.5
+    state = colors, torch.zeros_like(colors)
+    for used, relaxations in zip((images, every), RELAXATIONS, strict=True):
+        for relaxation in relaxations:
+            state = improve_colors(*state, used, line.squared_angle, relaxation)
+    return replace(scene, sh=line.to_sh(*state))
+
+
+def improve_colors(
+    colors: Colors,
+    gradients: Colors,
+    images: Sequence[WeightedImage],
+    squared_angle: Float[Tensor, "n 1"],
+    relaxation: float,
+) -> tuple[Colors, Colors]:
+    """Improve colours and their gradients, which are damped, by a step of block Jacobi.
+
+    With a relaxation of 1 it minimizes an upper bound in which every Gaussian stands alone.
+    """
+    found = [(*image.backproject(colors, gradients), image.position) for image in images]
+    total = torch.stack([seen for _, seen, _ in found]).sum(0).clamp_min(MIN_WEIGHT)
+    damping = GRADIENT_PENALTY * total * (1 + ANGLE**2 / squared_angle)
+    cross = torch.stack([seen * at for _, seen, at in found]).sum(0)
+    square = torch.stack([seen * at**2 for _, seen, at in found]).sum(0) + damping
+    pull = torch.stack([residual for residual, _, _ in found]).sum(0)
+    turn = torch.stack([residual * at for residual, _, at in found]).sum(0) - damping * gradients
+    step = relaxation / (total * square - cross * cross)
+    colors = colors + step * (square * pull - cross * turn)
+    return colors, gradients + step * (total * turn - cross * pull)

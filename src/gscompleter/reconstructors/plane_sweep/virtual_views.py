@@ -1,0 +1,60 @@
+"""Virtual photographs beyond a pair: what each of the two shows, from one baseline further on.
+
+Two photographs do not determine the colours of twice as many Gaussians: fitted to both alone, they
+cancel errors of depth, pose and exposure there and look wrong from everywhere else. Virtual
+photographs say what the scene should look like elsewhere.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import replace
+
+import torch
+
+from gscompleter.config.settings import COVERED
+from gscompleter.geometry import is_inside, project, sample, unproject
+from gscompleter.render import Renderer
+from gscompleter.types import Camera, DepthMap, Gaussians, View
+
+DEPTH_TOLERANCE = 0.03
+"""Relative depth difference at which the share of a photograph's colour falls to 1/e."""
+
+
+def make_virtual_views(
+    scene: Gaussians, views: Sequence[View], depths: Sequence[DepthMap], renderer: Renderer
+) -> list[View]:
+    """Warp two photographs to one camera beyond each, through the depth of `scene` there.
+
+    `depths` are those of the scene at the photographs.
+    """
+    first, second = (view.camera for view in views)
+    cameras = extrapolate_camera(second, first), extrapolate_camera(first, second)
+    return [
+        warp(view, depth, scene, camera, renderer)
+        for view, depth, camera in zip(views, depths, cameras, strict=True)
+    ]
+
+
+def extrapolate_camera(before: Camera, camera: Camera) -> Camera:
+    """Continue the motion from `before` to `camera` by as much again."""
+    rotation, center = camera.c2w[:3, :3], 2 * camera.center - before.center
+    c2w = camera.c2w.clone()
+    c2w[:3, :3] = rotation @ before.c2w[:3, :3].T @ rotation
+    c2w[:3, 3] = center
+    return replace(camera, c2w=c2w)
+
+
+def warp(view: View, own: DepthMap, scene: Gaussians, camera: Camera, renderer: Renderer) -> View:
+    """Warp a photograph to another camera; what it does not show keeps the colours of `scene`."""
+    shown = renderer.render(scene, camera)
+    covered = shown.alpha >= COVERED
+    pixels, z = project(unproject(shown.depth, camera), view.camera)
+    layers = torch.cat([view.image, own.depth[..., None], own.valid[..., None]], dim=-1)
+    sampled, depth, valid = sample(layers, pixels).split([3, 1, 1], dim=-1)
+    error = (z - depth[..., 0]) / (DEPTH_TOLERANCE * z.abs().clamp_min(1e-12))
+    seen = covered & is_inside(pixels, z, view.camera) & (valid[..., 0] >= 0.5)
+    share = torch.exp(-error.square()) * seen
+    # Where the scene ends it is half transparent, and a completion adds what is behind.
+    wanted = shown.alpha[..., None] * sampled
+    return View((shown.image + share[..., None] * (wanted - shown.image)).clamp(0, 1), camera)

@@ -1,0 +1,126 @@
+"""Colours by direction: each photograph keeps its own, and cameras beyond it see them too."""
+
+from dataclasses import replace
+
+import pytest
+import torch
+
+from gscompleter.evaluation.metrics.image import psnr
+from gscompleter.geometry import axis_angle_to_matrix
+from gscompleter.reconstructors.plane_sweep.directional_colors import (
+    ColorLine,
+    fit_directional_colors,
+)
+from gscompleter.reconstructors.plane_sweep.fit import fit_colors
+from gscompleter.reconstructors.plane_sweep.virtual_views import (
+    extrapolate_camera,
+    make_virtual_views,
+)
+from gscompleter.render import load_renderer
+from gscompleter.render.spherical_harmonics import evaluate_colors
+from gscompleter.types import Gaussians, View, merge
+from scenes import Room, camera_at, gaussians_of, view_of
+
+SIZE = 96
+GAIN = 0.85
+
+
+def take_pair() -> list[View]:
+    """Two photographs of a room; the second is darker."""
+    first, second = (view_of(Room(), camera_at(x, size=SIZE)) for x in (-0.2, 0.2))
+    return [first, replace(second, image=GAIN * second.image)]
+
+
+def fit(views: list[View]) -> tuple[Gaussians, Gaussians]:
+    """Return the Gaussians of both photographs before and after the fit."""
+    scene, renderer = merge([gaussians_of(view) for view in views]), load_renderer("cpu")
+    depths = [renderer.render(scene, view.camera).depth_map() for view in views]
+    return scene, fit_directional_colors(scene, views, depths, renderer)
+
+
+def measure(scene: Gaussians, view: View) -> float:
+    """PSNR where the scene covers the image."""
+    render = load_renderer("cpu").render(scene, view.camera)
+    covered = render.alpha > 0.9
+    return psnr(render.image[covered][None], view.image[covered][None])
+
+
+def test_rays_of_the_two_photographs_are_at_minus_one_and_one():
+    views = take_pair()
+    scene = gaussians_of(views[0])
+    line = ColorLine.between(scene, views[0].camera, views[1].camera)
+    for view, expected in zip(views, (-1.0, 1.0), strict=True):
+        at = line.locate(scene, view.camera)
+        assert torch.allclose(at, torch.full_like(at, expected), atol=1e-3)
+
+
+def test_harmonics_are_the_line_in_every_direction():
+    views = take_pair()
+    scene = gaussians_of(views[0])
+    line = ColorLine.between(scene, views[0].camera, views[1].camera)
+    generator = torch.Generator().manual_seed(0)
+    colors = 0.4 + 0.2 * torch.rand(len(scene), 3, generator=generator)
+    gradients = 0.02 * torch.randn(len(scene), 3, generator=generator)
+    sh = line.to_sh(colors, gradients)
+    for x in (-0.2, 0.0, 0.2, 0.6):
+        camera = camera_at(x, size=SIZE)
+        expected = colors + line.locate(scene, camera) * gradients
+        found = evaluate_colors(sh, scene.means, camera.center)
+        assert torch.allclose(found, expected.clamp_min(0), atol=1e-3)
+
+
+def test_a_camera_is_extrapolated_in_place_and_rotation():
+    before, camera = camera_at(0.0, size=SIZE), camera_at(0.3, size=SIZE)
+    turned = camera.c2w.clone()
+    turned[:3, :3] = axis_angle_to_matrix(torch.tensor([0.0, 1.0, 0.0]), 0.1) @ turned[:3, :3]
+    beyond = extrapolate_camera(before, replace(camera, c2w=turned))
+    twice = axis_angle_to_matrix(torch.tensor([0.0, 1.0, 0.0]), 0.2) @ before.c2w[:3, :3]
+    assert torch.allclose(beyond.c2w[:3, :3], twice, atol=1e-5)
+    assert torch.allclose(beyond.center, 2 * camera.center - before.center, atol=1e-6)
+
+
+def test_virtual_photographs_show_what_the_nearer_photograph_does():
+    views, renderer = take_pair(), load_renderer("cpu")
+    scene = merge([gaussians_of(view) for view in views])
+    depths = [renderer.render(scene, view.camera).depth_map() for view in views]
+    virtual = make_virtual_views(scene, views, depths, renderer)
+    for made, gain, x in zip(virtual, (1.0, GAIN), (-0.6, 0.6), strict=True):
+        truth = gain * view_of(Room(), camera_at(x, size=SIZE)).image
+        seen = renderer.render(scene, made.camera).alpha > 0.9
+        assert made.camera.center[0] == pytest.approx(x, abs=1e-5)
+        difference = (made.image - truth).abs().mean(dim=-1)[seen]
+        assert difference.median() < 0.01
+
+
+def test_each_photograph_keeps_its_tone_and_cameras_beyond_see_the_nearer_one():
+    views = take_pair()
+    scene, fitted = fit(views)
+    alike = fit_colors(scene, views, load_renderer("cpu"))
+    for view in views:
+        assert measure(fitted, view) > measure(alike, view) + 1
+    for gain, x in ((1.0, -0.45), (GAIN, 0.45)):
+        unseen = view_of(Room(), camera_at(x, size=SIZE))
+        unseen = replace(unseen, image=gain * unseen.image)
+        assert measure(fitted, unseen) > measure(alike, unseen) + 0.5
+
+
+def test_colours_stay_calm_far_off_the_photographs():
+    _, fitted = fit(take_pair())
+    for x in (-1.5, 1.5):
+        center = camera_at(x, size=SIZE).center
+        colors = evaluate_colors(fitted.sh, fitted.means, center)
+        middle = evaluate_colors(fitted.sh, fitted.means, torch.zeros(3))
+        assert (colors - middle).abs().quantile(0.95) < 0.25
+
+
+def test_without_parallax_colours_do_not_depend_on_the_direction():
+    """Gaussians very far away, as those of the sky, get no gradient."""
+    views = take_pair()
+    far = [gaussians_of(view, torch.full((SIZE, SIZE), 1e5)) for view in views]
+    scene, renderer = merge(far), load_renderer("cpu")
+    depths = [renderer.render(scene, view.camera).depth_map() for view in views]
+    fitted = fit_directional_colors(scene, views, depths, renderer)
+    center = views[0].camera.center
+    ahead = evaluate_colors(fitted.sh, fitted.means, center)
+    aside = evaluate_colors(fitted.sh, fitted.means, center + torch.tensor([1e5, 0.0, 0.0]))
+    assert (ahead - aside).abs().max() < 0.05
