@@ -8,12 +8,15 @@ import torch
 from jaxtyping import Bool, Float, Float32
 from numpy import ndarray
 from torch import Tensor
+from torch.nn.functional import avg_pool2d, interpolate
 
+from gscompleter.image_ops import fill_smoothly
 from gscompleter.kernels.pyramid_fill import build_pyramid, compute_means
 from gscompleter.types import Render
 
 BLUR_SIGMA = 1.5
 """Standard deviation of the blur of each pyramid level, in its pixels."""
+CELL, RELAX = 4, 64
 SIGMA_PER_DISTANCE = 0.7
 """Standard deviation of the averaging, relative to the distance to known pixels."""
 MEANS_SIDE = 160
@@ -62,6 +65,21 @@ def build_sum_pyramid(weighted: Float32[ndarray, "h w c"]) -> list[Float32[ndarr
         # OpenCV averages at most four channels of odd sizes, so they are resized one by one.
         planes = [cv2.resize(p, half, interpolation=cv2.INTER_AREA) for p in cv2.split(blurred)]
         weighted = np.stack(planes, axis=-1)
+
+
+def continue_membrane(
+    values: Float[Tensor, "h w c"], known: Bool[Tensor, "h w"]
+) -> Float[Tensor, "h w c"]:
+    """Fill the pixels that are not `known` with a membrane of cells of `CELL` pixels."""
+    weight = known.float()[..., None]
+    layers = torch.cat([values * weight, weight], dim=-1).permute(2, 0, 1)
+    cells = avg_pool2d(layers, CELL, ceil_mode=True, count_include_pad=False).permute(1, 2, 0)
+    share = cells[..., -1]
+    means = cells[..., :-1] / share.clamp_min(1e-6)[..., None]
+    means = torch.stack([fill_smoothly(m, share > 0, RELAX) for m in means.unbind(-1)])
+    size = [CELL * n for n in share.shape]
+    large = interpolate(means[None], size=size, mode="bicubic")[0].permute(1, 2, 0)
+    return torch.where(known[..., None], values, large[: known.shape[0], : known.shape[1]])
 
 
 def average_trusted(render: Render, trust: Float[Tensor, "h w"]) -> Float[Tensor, "h w 3"]:

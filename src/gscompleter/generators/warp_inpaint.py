@@ -18,11 +18,12 @@ from numpy import ndarray
 from torch import Tensor
 from torch.nn.functional import avg_pool2d, pad
 
+from gscompleter.generators.lines import continue_lines
 from gscompleter.generators.smooth import average_trusted, compute_distance_to_known
 from gscompleter.generators.warp import (
     WarpedImage,
     add_unexplained,
-    fill_background_first,
+    continue_tone,
     warp_photographs,
 )
 from gscompleter.image_ops import dilate, smooth_masked
@@ -34,6 +35,7 @@ STRUCTURE_REACH = 0.15
 """Depth of structure in a hole, relative to the longer image side; its second half fades."""
 TONE_RADIUS = 4
 """Radius in pixels over which patches keep the tone of the smooth continuation."""
+YIELDING = 1.5
 CRACK_WIDTH = 4
 """Width in pixels up to which gaps are filled smoothly, without patches."""
 MAX_BIAS = 0.1
@@ -86,7 +88,13 @@ class WarpInpaint:
             # The target observes nothing, so there is no border to continue.
             return nearest.image.mean(dim=(0, 1)).expand(target.height, target.width, 3)
         warped = add_unexplained(warped, target, context).to("cpu")
-        image = self.add_structure(*fill_background_first(warped), warped, context)
+        if warped.known.all():
+            return warped.image.to(nearest.image.device)
+        tone, log_depth, occluded = continue_tone(warped, target, context)
+        structured = self.add_structure(tone, log_depth, warped, context)
+        carried, weight = continue_lines(tone, warped.known)
+        weight = (weight * (1 - occluded))[..., None]
+        image = tone + weight * (carried - tone) + (1 - weight**YIELDING) * (structured - tone)
         return image.clamp(0, 1).to(nearest.image.device)
 
     def add_structure(
