@@ -7,18 +7,23 @@ import numpy as np
 import torch
 from jaxtyping import Bool, Float, Float32
 from numpy import ndarray
+from scipy.sparse import diags, kronsum
+from scipy.sparse.linalg import splu
 from torch import Tensor
-from torch.nn.functional import avg_pool2d, interpolate
 
-from gscompleter.image_ops import fill_smoothly
 from gscompleter.kernels.pyramid_fill import build_pyramid, compute_means
 from gscompleter.types import Render
 
 BLUR_SIGMA = 1.5
 """Standard deviation of the blur of each pyramid level, in its pixels."""
-CELL, RELAX = 4, 64
 SIGMA_PER_DISTANCE = 0.7
 """Standard deviation of the averaging, relative to the distance to known pixels."""
+MEMBRANE_SIDE = 96
+"""Number of cells along the longer side of a membrane."""
+FIDELITY = 8.0
+"""Weight of a known cell relative to the stiffness of the membrane."""
+TO_MEAN = 1e-3
+"""Weight of the mean of all known colours in every cell."""
 MEANS_SIDE = 160
 """Longer side of the small image in which trusted colours are averaged, in pixels."""
 FIRST_SIGMA, NUM_SCALES = 5.0, 5
@@ -67,19 +72,29 @@ def build_sum_pyramid(weighted: Float32[ndarray, "h w c"]) -> list[Float32[ndarr
         weighted = np.stack(planes, axis=-1)
 
 
-def continue_membrane(
-    values: Float[Tensor, "h w c"], known: Bool[Tensor, "h w"]
+def fit_membrane(
+    values: Float[Tensor, "h w c"], weight: Float[Tensor, "h w"]
 ) -> Float[Tensor, "h w c"]:
-    """Fill the pixels that are not `known` with a membrane of cells of `CELL` pixels."""
-    weight = known.float()[..., None]
-    layers = torch.cat([values * weight, weight], dim=-1).permute(2, 0, 1)
-    cells = avg_pool2d(layers, CELL, ceil_mode=True, count_include_pad=False).permute(1, 2, 0)
-    share = cells[..., -1]
-    means = cells[..., :-1] / share.clamp_min(1e-6)[..., None]
-    means = torch.stack([fill_smoothly(m, share > 0, RELAX) for m in means.unbind(-1)])
-    size = [CELL * n for n in share.shape]
-    large = interpolate(means[None], size=size, mode="bicubic")[0].permute(1, 2, 0)
-    return torch.where(known[..., None], values, large[: known.shape[0], : known.shape[1]])
+    """Fit a membrane of at most `MEMBRANE_SIDE` cells a side to `values`, where they have weight.
+
+    Natural images have spectra of 1/f², of which it is the likeliest continuation.
+    """
+    height, width = weight.shape
+    scale = min(1.0, MEMBRANE_SIDE / max(height, width))
+    rows, columns = max(round(scale * height), 2), max(round(scale * width), 2)
+    layers = torch.cat([values * weight[..., None], weight[..., None]], dim=-1).numpy()
+    cells = cv2.resize(layers, (columns, rows), interpolation=cv2.INTER_AREA).astype(np.float64)
+    sums, weights = cells[..., :-1].reshape(rows * columns, -1), cells[..., -1].ravel()
+    steps = [diags([-1.0, 1.0], [0, 1], shape=(n - 1, n)) for n in (columns, rows)]
+    stiffness = kronsum(*(step.T @ step for step in steps))
+    matrix = (stiffness + diags(FIDELITY * weights + TO_MEAN)).tocsc()
+    mean = sums.sum(axis=0) / weights.sum()
+    solver = splu(matrix, "MMD_AT_PLUS_A", diag_pivot_thresh=0, options={"SymmetricMode": True})
+    fitted = solver.solve(FIDELITY * sums + TO_MEAN * mean).astype(np.float32)
+    large = cv2.resize(
+        fitted.reshape(rows, columns, -1), (width, height), interpolation=cv2.INTER_CUBIC
+    )
+    return torch.from_numpy(large.reshape(values.shape))
 
 
 def average_trusted(render: Render, trust: Float[Tensor, "h w"]) -> Float[Tensor, "h w 3"]:

@@ -10,9 +10,9 @@ from torch import Tensor
 
 from gscompleter.config.settings import COVERED
 from gscompleter.generators.exposure import match_exposures
-from gscompleter.generators.smooth import continue_membrane, continue_smoothly
+from gscompleter.generators.smooth import continue_smoothly
 from gscompleter.geometry import is_inside, measure_baseline, project, sample, unproject
-from gscompleter.image_ops import blur_gaussian, dilate
+from gscompleter.image_ops import dilate
 from gscompleter.types import Camera, GeneratorInput, Render, TensorDataclass, View
 
 DEPTH_TOLERANCE = 0.03
@@ -27,9 +27,6 @@ DYNAMIC_MARGIN = 4
 
 OCCLUDER_MARGIN = 0.05
 """Smallest depth of a surface behind its occluder, relative to its own."""
-OCCLUSION_BLUR = 3.0
-"""Standard deviation in pixels of the blur of the mask of what was occluded."""
-MEMBRANE_SHARE = 0.5
 
 
 @dataclass(frozen=True)
@@ -110,24 +107,6 @@ def add_unexplained(warped: WarpedImage, target: Camera, context: GeneratorInput
         known=warped.known | found,
         depth=torch.where(found, guess, warped.depth),
     )
-
-
-def continue_tone(
-    warped: WarpedImage, target: Camera, context: GeneratorInput
-) -> tuple[Float[Tensor, "h w 3"], Float[Tensor, "h w"], Float[Tensor, "h w"]]:
-    """Continue colours and log-depth beyond the known pixels, and weigh what was occluded.
-
-    Behind objects the background continues. Elsewhere nothing was occluded, so that all of the
-    border counts evenly; otherwise distant sky would cover the ground beyond the frame.
-    """
-    image, log_depth = fill_background_first(warped)
-    depth = log_depth.exp().to(warped.depth.device)
-    occluded = find_occluded(depth, target, context).cpu() & ~warped.known
-    share = blur_gaussian(occluded.float(), OCCLUSION_BLUR)
-    known = warped.known.float()
-    even = continue_smoothly(warped.image, known)
-    even = torch.lerp(even, continue_membrane(warped.image, warped.known), MEMBRANE_SHARE)
-    return torch.lerp(even, image, share[..., None]), log_depth, share
 
 
 def find_occluded(

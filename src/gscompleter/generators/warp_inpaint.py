@@ -18,12 +18,11 @@ from numpy import ndarray
 from torch import Tensor
 from torch.nn.functional import avg_pool2d, pad
 
-from gscompleter.generators.lines import continue_lines
+from gscompleter.generators.lines import continue_image
 from gscompleter.generators.smooth import average_trusted, compute_distance_to_known
 from gscompleter.generators.warp import (
     WarpedImage,
     add_unexplained,
-    continue_tone,
     warp_photographs,
 )
 from gscompleter.image_ops import dilate, smooth_masked
@@ -35,7 +34,7 @@ STRUCTURE_REACH = 0.15
 """Depth of structure in a hole, relative to the longer image side; its second half fades."""
 TONE_RADIUS = 4
 """Radius in pixels over which patches keep the tone of the smooth continuation."""
-YIELDING = 1.5
+YIELDING = 1
 CRACK_WIDTH = 4
 """Width in pixels up to which gaps are filled smoothly, without patches."""
 MAX_BIAS = 0.1
@@ -90,11 +89,9 @@ class WarpInpaint:
         warped = add_unexplained(warped, target, context).to("cpu")
         if warped.known.all():
             return warped.image.to(nearest.image.device)
-        tone, log_depth, occluded = continue_tone(warped, target, context)
-        structured = self.add_structure(tone, log_depth, warped, context)
-        carried, weight = continue_lines(tone, warped.known)
-        weight = (weight * (1 - occluded))[..., None]
-        image = tone + weight * (carried - tone) + (1 - weight**YIELDING) * (structured - tone)
+        filled = continue_image(warped, target, context)
+        structured = self.add_structure(filled.tone, filled.log_depth, warped, context)
+        image = structured+filled.weight*(filled.carried-structured) if YIELDING == 1 else filled.tone + filled.weight * (filled.carried - filled.tone) + (1 - filled.weight**YIELDING) * (structured - filled.tone)
         return image.clamp(0, 1).to(nearest.image.device)
 
     def add_structure(

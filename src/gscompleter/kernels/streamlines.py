@@ -31,47 +31,47 @@ def trace_lines(image, known, directions, limits):
 
 @njit(cache=True, nogil=True, fastmath={"contract"})
 def _trace_rows(begin, end, image, known, directions, limits, colours, lengths):
-    ends = np.empty(3, np.float32)
     for y in range(begin, end):
         for x in range(known.shape[1]):
-            total = np.float32(0)
-            for sign in (-1, 1):
-                limit = limits[y, x]
-                length = _trace_way(image, known, directions, y, x, sign, limit, ends)
+            total, limit = np.float32(0), limits[y, x]
+            for sign in (np.float32(-1), np.float32(1)):
+                length, r, g, b = _trace_way(image, known, directions, y, x, sign, limit)
                 if length < limit:
                     weight = np.float32(1) / (length * length + LENGTH_FLOOR)
                     total += weight
-                    colours[y, x] += weight * ends
+                    colours[y, x, 0] += weight * r
+                    colours[y, x, 1] += weight * g
+                    colours[y, x, 2] += weight * b
                     lengths[y, x] = min(lengths[y, x], length)
-            if total > 0:
-                colours[y, x] /= total
+            for c in range(3):
+                colours[y, x, c] /= max(total, np.float32(1e-12))
 
 
 @njit(cache=True, fastmath={"contract"})
-def _trace_way(image, known, directions, row, column, sign, limit, mean):
-    """Write the mean colour where a way ends, and return its length; `limit` if it has no end."""
+def _trace_way(image, known, directions, row, column, sign, limit):
+    """Return the length of a way and the mean colour at its end; `limit` if it has no end."""
     h, w = known.shape
     dx, dy = sign * directions[row, column, 0], sign * directions[row, column, 1]
     x, y = np.float32(column) + np.float32(0.5), np.float32(row) + np.float32(0.5)
-    length, count = np.float32(0), 0
-    mean[:] = 0
+    r = g = b = length = count = np.float32(0)
     while length < limit and count < NUM_SAMPLES:
         if known[row, column]:
-            mean += image[row, column]
-            count += 1
+            r += image[row, column, 0]
+            g += image[row, column, 1]
+            b += image[row, column, 2]
+            count += np.float32(1)
         elif count > 0:
             break
         else:
             length += np.float32(1)
-        ahead_x, ahead_y = directions[row, column, 0], directions[row, column, 1]
-        if ahead_x * dx + ahead_y * dy < 0:
-            ahead_x, ahead_y = -ahead_x, -ahead_y
-        dx, dy = ahead_x, ahead_y
-        x, y = x + dx, y + dy
-        row, column = int(np.floor(y)), int(np.floor(x))
-        if row < 0 or row >= h or column < 0 or column >= w:
+        x += dx
+        y += dy
+        if x < 0 or y < 0 or x >= w or y >= h:
             break
+        row, column = int(y), int(x)
+        ahead_x, ahead_y = directions[row, column, 0], directions[row, column, 1]
+        turn = np.float32(1) if ahead_x * dx + ahead_y * dy >= 0 else np.float32(-1)
+        dx, dy = turn * ahead_x, turn * ahead_y
     if count == 0:
-        return limit
-    mean /= np.float32(count)
-    return length
+        return limit, r, g, b
+    return length, r / count, g / count, b / count
