@@ -1,7 +1,7 @@
 """The default Φ, without weights: warped photographs, and holes filled with patches.
 
-The tone of a hole continues its border smoothly; structure near the border comes from patches of
-the photographs, coarse to fine, after Wexler et al. (2007), Barnes et al. (PatchMatch, 2009) and
+Tone and lines of a hole continue its border. Elsewhere near the border, structure comes from
+patches of the photographs, coarse to fine, after Wexler et al. (2007), Barnes et al. (PatchMatch, 2009) and
 Darabi et al. (Image Melding, 2012).
 """
 
@@ -18,11 +18,12 @@ from numpy import ndarray
 from torch import Tensor
 from torch.nn.functional import avg_pool2d, pad
 
-from gscompleter.generators.lines import continue_image
 from gscompleter.generators.smooth import average_trusted, compute_distance_to_known
 from gscompleter.generators.warp import (
     WarpedImage,
     add_unexplained,
+    continue_image,
+    fill_background_first,
     warp_photographs,
 )
 from gscompleter.image_ops import dilate, smooth_masked
@@ -34,7 +35,6 @@ STRUCTURE_REACH = 0.15
 """Depth of structure in a hole, relative to the longer image side; its second half fades."""
 TONE_RADIUS = 4
 """Radius in pixels over which patches keep the tone of the smooth continuation."""
-YIELDING = 1
 CRACK_WIDTH = 4
 """Width in pixels up to which gaps are filled smoothly, without patches."""
 MAX_BIAS = 0.1
@@ -86,18 +86,14 @@ class WarpInpaint:
         if not warped.known.any():
             # The target observes nothing, so there is no border to continue.
             return nearest.image.mean(dim=(0, 1)).expand(target.height, target.width, 3)
-        warped = add_unexplained(warped, target, context).to("cpu")
-        if warped.known.all():
-            return warped.image.to(nearest.image.device)
-        filled = continue_image(warped, target, context)
-        structured = self.add_structure(filled.tone, filled.log_depth, warped, context)
-        image = structured+filled.weight*(filled.carried-structured) if YIELDING == 1 else filled.tone + filled.weight * (filled.carried - filled.tone) + (1 - filled.weight**YIELDING) * (structured - filled.tone)
+        warped = add_unexplained(fill_background_first(warped), target, context)
+        continued = continue_image(warped, target, context)
+        image = continued.add_lines(self.add_structure(continued.tone, warped.to("cpu"), context))
         return image.clamp(0, 1).to(nearest.image.device)
 
     def add_structure(
         self,
         tone: Float[Tensor, "h w 3"],
-        log_depth: Float[Tensor, "h w"],
         warped: WarpedImage,
         context: GeneratorInput,
     ) -> Float[Tensor, "h w 3"]:
@@ -108,7 +104,7 @@ class WarpInpaint:
         if not undecided.any():
             return tone
         sources = collect_sources(context, warped)
-        patched = fill_by_patches(tone, ~undecided, log_depth, sources, self.seed)
+        patched = fill_by_patches(tone, ~undecided, warped.depth.log(), sources, self.seed)
         detail = patched - tone
         detail = detail - smooth_masked(detail, undecided, TONE_RADIUS)
         fading = (2 * (1 - away / reach)).clamp(0, 1)
