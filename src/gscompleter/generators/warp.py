@@ -24,8 +24,6 @@ MIN_WEIGHT = 1.0
 """Smallest weight, before the exponent, of a photograph that observes a surface."""
 DYNAMIC_MARGIN = 4
 """Pixels around a dynamic mask without trust in the rendered colour."""
-
-
 OCCLUDER_MARGIN = 0.05
 """Smallest distance in depth to an occluder, relative to the depth of the surface."""
 OCCLUSION_SIGMA = 3.0
@@ -125,38 +123,24 @@ def add_unexplained(filled: WarpedImage, target: Camera, context: GeneratorInput
     return replace(filled, image=image, known=filled.known | found)
 
 
-@dataclass(frozen=True)
-class ContinuedImage(TensorDataclass):
-    """Tone and lines of an image, continued beyond its known pixels."""
-
-    tone: Float[Tensor, "h w 3"]
-    lines: Float[Tensor, "h w 3"]
-    weight: Float[Tensor, "h w 1"]
-    """Weight in [0, 1] of `lines`; 0 where known."""
-
-    def add_lines(self, image: Float[Tensor, "h w 3"]) -> Float[Tensor, "h w 3"]:
-        """Blend the lines over `tone` or over what was made from it."""
-        return torch.lerp(image, self.lines, self.weight)
-
-
 def continue_image(
     filled: WarpedImage, target: Camera, context: GeneratorInput
-) -> ContinuedImage:
-    """Continue tone and lines from the known pixels of `fill_background_first`.
+) -> tuple[Float[Tensor, "h w 3"], Float[Tensor, "h w 3"], Float[Tensor, "h w 1"]]:
+    """Continue tone and lines beyond the known pixels; returns tone, lines and their weight.
 
-    The tone is a membrane over what is known and what lines carry. It does not know depth, so what
-    an object hid keeps its filling; beyond the frame nothing is hidden, and near and far count
-    alike, otherwise the sky would cover the ground.
+    The tone is a membrane over what is known and what lines carry. A membrane does not know depth,
+    so what an object hid keeps the filling. Beyond the frame nothing was hidden and all depths
+    count alike: the sky does not cover the ground.
     """
-    occluded = (find_occluded(filled, target, context) & ~filled.known).float()
-    filled = filled.to("cpu")
-    share = blur_gaussian(occluded, OCCLUSION_SIGMA).cpu()[..., None]
-    lines, weight = continue_lines(filled.image, filled.known)
-    known, weight = filled.known[..., None], weight[..., None] * (1 - share)
-    values = torch.where(known, filled.image, lines)
-    tone = fit_membrane(values, torch.where(known, 1.0, LINE_FIDELITY * weight)[..., 0])
-    tone = torch.where(known, filled.image, torch.lerp(tone, filled.image, share))
-    return ContinuedImage(tone, lines, weight)
+    occluded = find_occluded(filled, target, context) & ~filled.known
+    share = blur_gaussian(occluded.float(), OCCLUSION_SIGMA).cpu()[..., None]
+    image, known = filled.image.cpu(), filled.known.cpu()
+    lines, weight = continue_lines(image, known)
+    weight = weight[..., None] * (1 - share)
+    known = known[..., None]
+    fidelity = torch.where(known, 1.0, LINE_FIDELITY * weight)[..., 0]
+    tone = fit_membrane(torch.where(known, image, lines), fidelity)
+    return torch.where(known, image, torch.lerp(tone, image, share)), lines, weight
 
 
 def find_occluded(

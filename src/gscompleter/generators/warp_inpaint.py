@@ -87,15 +87,12 @@ class WarpInpaint:
             # The target observes nothing, so there is no border to continue.
             return nearest.image.mean(dim=(0, 1)).expand(target.height, target.width, 3)
         warped = add_unexplained(fill_background_first(warped), target, context)
-        continued = continue_image(warped, target, context)
-        image = continued.add_lines(self.add_structure(continued.tone, warped.to("cpu"), context))
+        tone, lines, weight = continue_image(warped, target, context)
+        image = torch.lerp(self.add_structure(tone, warped.to("cpu"), context), lines, weight)
         return image.clamp(0, 1).to(nearest.image.device)
 
     def add_structure(
-        self,
-        tone: Float[Tensor, "h w 3"],
-        warped: WarpedImage,
-        context: GeneratorInput,
+        self, tone: Float[Tensor, "h w 3"], warped: WarpedImage, context: GeneratorInput
     ) -> Float[Tensor, "h w 3"]:
         """Add structure to the smooth image `tone` along the borders of its holes."""
         reach = STRUCTURE_REACH * max(warped.known.shape)

@@ -121,8 +121,7 @@ def complete_warp(nearest: View, target: Camera, context: GeneratorInput) -> War
     if not warped.known.any():
         return replace(warped, image=nearest.image.mean(dim=(0, 1)).expand_as(warped.image))
     warped = add_unexplained(fill_background_first(warped), target, context)
-    continued = continue_image(warped, target, context)
-    image = continued.add_lines(continued.tone).clamp(0, 1)
+    image = torch.lerp(*continue_image(warped, target, context)).clamp(0, 1)
     return replace(warped, image=image.to(warped.image.device))
 
 
