@@ -13,7 +13,7 @@ from gscompleter.generators.exposure import match_exposures
 from gscompleter.generators.lines import continue_lines
 from gscompleter.generators.smooth import continue_smoothly, fit_membrane
 from gscompleter.geometry import is_inside, measure_baseline, project, sample, unproject
-from gscompleter.image_ops import blur_gaussian, dilate
+from gscompleter.image_ops import dilate, smooth_masked
 from gscompleter.types import Camera, GeneratorInput, Render, TensorDataclass, View
 
 DEPTH_TOLERANCE = 0.03
@@ -26,8 +26,8 @@ DYNAMIC_MARGIN = 4
 """Pixels around a dynamic mask without trust in the rendered colour."""
 OCCLUDER_MARGIN = 0.05
 """Smallest distance in depth to an occluder, relative to the depth of the surface."""
-OCCLUSION_SIGMA = 3.0
-"""Standard deviation in pixels of the blur of the mask of occluded pixels."""
+OCCLUSION_RADIUS = 4
+"""Radius in pixels over which the mask of occluded hole pixels is averaged."""
 LINE_FIDELITY = 0.1
 """Weight of a line in the membrane, relative to a known pixel."""
 
@@ -132,9 +132,9 @@ def continue_image(
     so what an object hid keeps the filling. Beyond the frame nothing was hidden and all depths
     count alike: the sky does not cover the ground.
     """
-    occluded = find_occluded(filled, target, context) & ~filled.known
-    share = blur_gaussian(occluded.float(), OCCLUSION_SIGMA).cpu()[..., None]
     image, known = filled.image.cpu(), filled.known.cpu()
+    occluded = find_occluded(filled, target, context).cpu()[..., None].float()
+    share = smooth_masked(occluded, ~known, OCCLUSION_RADIUS)
     lines, weight = continue_lines(image, known)
     weight = weight[..., None] * (1 - share)
     known = known[..., None]

@@ -1,8 +1,8 @@
 """The default Φ, without weights: warped photographs, and holes filled with patches.
 
-Tone and lines of a hole continue its border. Elsewhere near the border, structure comes from
-patches of the photographs, coarse to fine, after Wexler et al. (2007), Barnes et al. (PatchMatch, 2009) and
-Darabi et al. (Image Melding, 2012).
+Tone and lines continue the border of a hole. Where no line leads, structure near the border comes
+from patches of the photographs, coarse to fine, after Wexler et al. (2007), Barnes et al.
+(PatchMatch, 2009) and Darabi et al. (Image Melding, 2012).
 """
 
 from __future__ import annotations
