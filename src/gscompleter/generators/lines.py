@@ -40,7 +40,7 @@ def continue_lines(
     reach = REACH * max(known.shape)
     limits = reach * (coherence.where(~known, 0.0) / MIN_WEIGHT).clamp_min(1).log()
     limits = limits.where(limits > compute_distance_to_known(known), 0.0)
-    arrays = (layer.numpy() for layer in (image, known, directions, limits))
+    arrays = (layer.contiguous().numpy() for layer in (image, known, directions, limits))
     colours, lengths = map(torch.from_numpy, trace_lines(*arrays))
     return colours, coherence * torch.exp(-lengths / reach)
 
