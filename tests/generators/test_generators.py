@@ -11,11 +11,10 @@ from gscompleter import InputError, load_generator, load_renderer
 from gscompleter.evaluation.metrics.image import psnr
 from gscompleter.generators.exposure import match_exposures
 from gscompleter.generators.smooth import compute_distance_to_known, continue_smoothly
-from gscompleter.generators.warp import WarpedImage, warp_photographs
+from gscompleter.generators.warp import WarpedImage, fill_background_first, warp_photographs
 from gscompleter.generators.warp_inpaint import (
     Sources,
     WarpInpaint,
-    fill_background_first,
     fill_by_patches,
     remove_cracks,
 )
@@ -155,10 +154,11 @@ def test_the_background_fills_what_an_object_uncovers():
     known = torch.ones(32, 48, dtype=torch.bool)
     known[:, 16:32] = False
     depth = torch.where(torch.arange(48) < 24, 1.0, 4.0).expand(32, 48).contiguous()
-    tone, log_depth = fill_background_first(WarpedImage(image, known, depth, torch.ones(0, 3)))
-    middle = tone[16, 24]
+    filled = fill_background_first(WarpedImage(image, known, depth, torch.ones(0, 3)))
+    middle = filled.image[16, 24]
     assert middle[2] > 5 * middle[0]
-    assert log_depth[16, 24].exp() > 3
+    assert filled.depth[16, 24] > 3
+    assert torch.equal(filled.depth[known], depth[known])
 
 
 def test_one_thread_gives_the_same_bytes_as_three(monkeypatch):

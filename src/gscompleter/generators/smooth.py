@@ -7,6 +7,8 @@ import numpy as np
 import torch
 from jaxtyping import Bool, Float, Float32
 from numpy import ndarray
+from scipy.sparse import diags, kronsum
+from scipy.sparse.linalg import splu
 from torch import Tensor
 
 from gscompleter.kernels.pyramid_fill import build_pyramid, compute_means
@@ -16,6 +18,12 @@ BLUR_SIGMA = 1.5
 """Standard deviation of the blur of each pyramid level, in its pixels."""
 SIGMA_PER_DISTANCE = 0.7
 """Standard deviation of the averaging, relative to the distance to known pixels."""
+MEMBRANE_SIDE = 96
+"""Cells along the longer side of a membrane."""
+FIDELITY = 8.0
+"""Weight of the colour of a known cell, relative to its difference to one neighbour."""
+MEAN_WEIGHT = 1e-3
+"""Weight of the mean colour in every cell, on the same scale."""
 MEANS_SIDE = 160
 """Longer side of the small image in which trusted colours are averaged, in pixels."""
 FIRST_SIGMA, NUM_SCALES = 5.0, 5
@@ -62,6 +70,30 @@ def build_sum_pyramid(weighted: Float32[ndarray, "h w c"]) -> list[Float32[ndarr
         # OpenCV averages at most four channels of odd sizes, so they are resized one by one.
         planes = [cv2.resize(p, half, interpolation=cv2.INTER_AREA) for p in cv2.split(blurred)]
         weighted = np.stack(planes, axis=-1)
+
+
+def fit_membrane(
+    values: Float[Tensor, "h w c"], weight: Float[Tensor, "h w"]
+) -> Float[Tensor, "h w c"]:
+    """Fit a membrane to `values` by `weight`; some pixel must have one.
+
+    It is the likeliest continuation of an image whose spectrum falls with the squared frequency.
+    """
+    height, width = weight.shape
+    scale = min(1.0, MEMBRANE_SIDE / max(height, width))
+    rows, columns = max(round(scale * height), 2), max(round(scale * width), 2)
+    layers = torch.cat([values * weight[..., None], weight[..., None]], dim=-1).numpy()
+    cells = cv2.resize(layers, (columns, rows), interpolation=cv2.INTER_AREA)
+    sums = cells.reshape(rows * columns, -1).astype(np.float64)
+    steps = [diags([-1.0, 1.0], [0, 1], shape=(n - 1, n)) for n in (columns, rows)]
+    stiffness = kronsum(*(step.T @ step for step in steps))
+    matrix = (stiffness + diags(FIDELITY * sums[:, -1] + MEAN_WEIGHT)).tocsc()
+    total = sums.sum(axis=0)
+    wanted = FIDELITY * sums[:, :-1] + MEAN_WEIGHT * total[:-1] / total[-1]
+    solver = splu(matrix, "MMD_AT_PLUS_A", diag_pivot_thresh=0, options={"SymmetricMode": True})
+    fitted = solver.solve(wanted).reshape(rows, columns, -1).astype(np.float32)
+    enlarged = cv2.resize(fitted, (width, height), interpolation=cv2.INTER_CUBIC)
+    return torch.from_numpy(enlarged.reshape(values.shape))
 
 
 def average_trusted(render: Render, trust: Float[Tensor, "h w"]) -> Float[Tensor, "h w 3"]:

@@ -10,9 +10,10 @@ from torch import Tensor
 
 from gscompleter.config.settings import COVERED
 from gscompleter.generators.exposure import match_exposures
-from gscompleter.generators.smooth import continue_smoothly
+from gscompleter.generators.lines import continue_lines
+from gscompleter.generators.smooth import continue_smoothly, fit_membrane
 from gscompleter.geometry import is_inside, measure_baseline, project, sample, unproject
-from gscompleter.image_ops import dilate
+from gscompleter.image_ops import dilate, smooth_masked
 from gscompleter.types import Camera, GeneratorInput, Render, TensorDataclass, View
 
 DEPTH_TOLERANCE = 0.03
@@ -23,6 +24,12 @@ MIN_WEIGHT = 1.0
 """Smallest weight, before the exponent, of a photograph that observes a surface."""
 DYNAMIC_MARGIN = 4
 """Pixels around a dynamic mask without trust in the rendered colour."""
+OCCLUDER_MARGIN = 0.05
+"""Smallest distance in depth to an occluder, relative to the depth of the surface."""
+OCCLUSION_RADIUS = 4
+"""Radius in pixels over which the mask of occluded hole pixels is averaged."""
+LINE_FIDELITY = 0.1
+"""Weight of a line in the membrane, relative to a known pixel."""
 
 
 @dataclass(frozen=True)
@@ -77,47 +84,77 @@ def warp_photographs(nearest: View, target: Camera, context: GeneratorInput) -> 
     return WarpedImage(image.clamp(0, 1), known, scene.depth, torch.stack(factors))
 
 
-def add_unexplained(warped: WarpedImage, target: Camera, context: GeneratorInput) -> WarpedImage:
-    """Fill holes with photographed content that the scene lacks.
+def fill_background_first(warped: WarpedImage) -> WarpedImage:
+    """Continue colours and log-depth smoothly beyond the known pixels, preferring far pixels.
 
-    Its depth is unknown, so the depth around the hole is continued. Only photographs whose own
-    render is empty in that direction count; others show an occluder. Some pixel must be known.
+    A hole beside an object usually shows the background, so the weight is the squared depth. Some
+    pixel must be known.
     """
-    guess = fill_background_first(warped, 0)[1].exp().to(warped.depth.device)
-    points = unproject(guess, target)
-    colour = torch.zeros_like(warped.image)
-    total = torch.zeros_like(guess)
-    for view, render, gain in zip(context.views, context.view_renders, warped.gains, strict=True):
+    known, depth = warped.known.cpu(), warped.depth.cpu()
+    middle = depth[known].median()
+    relative = (depth / middle).clamp(0.1, 10.0)
+    layers = torch.cat([warped.image.cpu(), relative.log()[..., None]], dim=-1)
+    filled = continue_smoothly(layers, relative**2 * known).to(warped.depth.device)
+    depth = middle.to(filled) * filled[..., 3].exp()
+    return replace(
+        warped, image=filled[..., :3], depth=torch.where(warped.known, warped.depth, depth)
+    )
+
+
+def add_unexplained(filled: WarpedImage, target: Camera, context: GeneratorInput) -> WarpedImage:
+    """Show photographed content that the scene lacks in the holes of a filled image.
+
+    Its depth is unknown, so that of the filling is used. Only photographs whose own render is
+    empty in that direction count; others show an occluder.
+    """
+    points = unproject(filled.depth, target)
+    colour, total = torch.zeros_like(filled.image), torch.zeros_like(filled.depth)
+    for view, render, gain in zip(context.views, context.view_renders, filled.gains, strict=True):
         pixels, z = project(points, view.camera)
         empty = sample(render.alpha[..., None], pixels)[..., 0] < COVERED
-        unexplained = empty & is_inside(pixels, z, view.camera) & ~warped.known
+        unexplained = empty & is_inside(pixels, z, view.camera) & ~filled.known
         unexplained &= ~_touches_mask(~view.static_mask, pixels)
         weight = unexplained * _compute_closeness(points, target, view) ** SHARPNESS
         colour = colour + weight[..., None] * gain * sample(view.image, pixels)
         total = total + weight
     found = total > 0
     shown = (colour / total.clamp_min(1e-12)[..., None]).clamp(0, 1)
-    return replace(
-        warped,
-        image=torch.where(found[..., None], shown, warped.image),
-        known=warped.known | found,
-        depth=torch.where(found, guess, warped.depth),
-    )
+    image = torch.where(found[..., None], shown, filled.image)
+    return replace(filled, image=image, known=filled.known | found)
 
 
-def fill_background_first(
-    warped: WarpedImage, num_channels: int = 3
-) -> tuple[Float[Tensor, "h w c"], Float[Tensor, "h w"]]:
-    """Continue colour channels and log-depth beyond the known pixels, preferring far pixels.
+def continue_image(
+    filled: WarpedImage, target: Camera, context: GeneratorInput
+) -> tuple[Float[Tensor, "h w 3"], Float[Tensor, "h w 3"], Float[Tensor, "h w 1"]]:
+    """Continue tone and lines beyond the known pixels; returns tone, lines and their weight.
 
-    A hole beside an object usually shows the background, so the weight is the squared depth.
+    The tone is a membrane over what is known and what lines carry. A membrane does not know depth,
+    so what an object hid keeps the filling. Beyond the frame nothing was hidden and all depths
+    count alike: the sky does not cover the ground.
     """
-    known, depth = warped.known.cpu(), warped.depth.cpu()
-    middle = depth[known].median()
-    relative = (depth / middle).clamp(0.1, 10.0)
-    layers = torch.cat([warped.image.cpu()[..., :num_channels], relative.log()[..., None]], dim=-1)
-    filled = continue_smoothly(layers, relative**2 * known)
-    return filled[..., :-1], filled[..., -1] + middle.log()
+    image, known = filled.image.cpu(), filled.known.cpu()
+    occluded = find_occluded(filled, target, context).cpu()[..., None].float()
+    share = smooth_masked(occluded, ~known, OCCLUSION_RADIUS)
+    lines, weight = continue_lines(image, known)
+    weight = weight[..., None] * (1 - share)
+    known = known[..., None]
+    fidelity = torch.where(known, 1.0, LINE_FIDELITY * weight)[..., 0]
+    tone = fit_membrane(torch.where(known, image, lines), fidelity)
+    return torch.where(known, image, torch.lerp(tone, image, share)), lines, weight
+
+
+def find_occluded(
+    warped: WarpedImage, target: Camera, context: GeneratorInput
+) -> Bool[Tensor, "h w"]:
+    """Find the pixels whose surface lies behind what some photograph shows."""
+    points = unproject(warped.depth, target)
+    occluded = torch.zeros_like(warped.known)
+    for view, render in zip(context.views, context.view_renders, strict=True):
+        pixels, z = project(points, view.camera)
+        shown, alpha = sample(torch.stack([render.depth, render.alpha], dim=-1), pixels).unbind(-1)
+        hides = (alpha >= COVERED) & (shown < (1 - OCCLUDER_MARGIN) * z)
+        occluded |= is_inside(pixels, z, view.camera) & hides
+    return occluded
 
 
 def _compute_visibility(

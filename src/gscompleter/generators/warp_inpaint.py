@@ -1,8 +1,8 @@
 """The default Φ, without weights: warped photographs, and holes filled with patches.
 
-The tone of a hole continues its border smoothly; structure near the border comes from patches of
-the photographs, coarse to fine, after Wexler et al. (2007), Barnes et al. (PatchMatch, 2009) and
-Darabi et al. (Image Melding, 2012).
+Tone and lines continue the border of a hole. Where no line leads, structure near the border comes
+from patches of the photographs, coarse to fine, after Wexler et al. (2007), Barnes et al.
+(PatchMatch, 2009) and Darabi et al. (Image Melding, 2012).
 """
 
 from __future__ import annotations
@@ -22,6 +22,7 @@ from gscompleter.generators.smooth import average_trusted, compute_distance_to_k
 from gscompleter.generators.warp import (
     WarpedImage,
     add_unexplained,
+    continue_image,
     fill_background_first,
     warp_photographs,
 )
@@ -85,16 +86,13 @@ class WarpInpaint:
         if not warped.known.any():
             # The target observes nothing, so there is no border to continue.
             return nearest.image.mean(dim=(0, 1)).expand(target.height, target.width, 3)
-        warped = add_unexplained(warped, target, context).to("cpu")
-        image = self.add_structure(*fill_background_first(warped), warped, context)
+        warped = add_unexplained(fill_background_first(warped), target, context)
+        tone, lines, weight = continue_image(warped, target, context)
+        image = torch.lerp(self.add_structure(tone, warped.to("cpu"), context), lines, weight)
         return image.clamp(0, 1).to(nearest.image.device)
 
     def add_structure(
-        self,
-        tone: Float[Tensor, "h w 3"],
-        log_depth: Float[Tensor, "h w"],
-        warped: WarpedImage,
-        context: GeneratorInput,
+        self, tone: Float[Tensor, "h w 3"], warped: WarpedImage, context: GeneratorInput
     ) -> Float[Tensor, "h w 3"]:
         """Add structure to the smooth image `tone` along the borders of its holes."""
         reach = STRUCTURE_REACH * max(warped.known.shape)
@@ -103,7 +101,7 @@ class WarpInpaint:
         if not undecided.any():
             return tone
         sources = collect_sources(context, warped)
-        patched = fill_by_patches(tone, ~undecided, log_depth, sources, self.seed)
+        patched = fill_by_patches(tone, ~undecided, warped.depth.log(), sources, self.seed)
         detail = patched - tone
         detail = detail - smooth_masked(detail, undecided, TONE_RADIUS)
         fading = (2 * (1 - away / reach)).clamp(0, 1)

@@ -18,6 +18,7 @@ from gscompleter.generators.agreement import paint_consistently
 from gscompleter.generators.warp import (
     WarpedImage,
     add_unexplained,
+    continue_image,
     fill_background_first,
     warp_photographs,
 )
@@ -115,13 +116,13 @@ class DiffusersInpaint:
 
 
 def complete_warp(nearest: View, target: Camera, context: GeneratorInput) -> WarpedImage:
-    """Warp the photographs to the target and extrapolate their colours smoothly into the holes."""
+    """Warp the photographs to the target and continue their tone and lines into the holes."""
     warped = warp_photographs(nearest, target, context)
     if not warped.known.any():
         return replace(warped, image=nearest.image.mean(dim=(0, 1)).expand_as(warped.image))
-    warped = add_unexplained(warped, target, context)
-    tone, _ = fill_background_first(warped)
-    return replace(warped, image=tone.clamp(0, 1).to(warped.image.device))
+    warped = add_unexplained(fill_background_first(warped), target, context)
+    image = torch.lerp(*continue_image(warped, target, context)).clamp(0, 1)
+    return replace(warped, image=image.to(warped.image.device))
 
 
 def load_diffusers_inpaint(
