@@ -115,7 +115,7 @@ $(VENV)/installed: pyproject.toml | $(VENV)/torch
 	touch $@
 
 $(VENV)/installed-evaluation: pyproject.toml | $(VENV)/torch
-	$(PIP) $(TORCH_INDEX) $(TORCH) -e '.[evaluation]'
+	$(PIP) --retries 1 $(TORCH_INDEX) $(TORCH) -e '.[evaluation]'
 	touch $@ $(VENV)/installed
 
 $(VENV)/installed-test: pyproject.toml | $(VENV)/torch
