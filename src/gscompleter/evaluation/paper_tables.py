@@ -125,23 +125,27 @@ def fill_table(spec: TableSpec, runs: Mapping[tuple[str, str], Path]) -> PaperTa
     rows: list[TableRow] = []
     counts, notes = {}, []
     for (model, protocol), folder in runs.items():
-        found = [row for row in read_rows(folder) if row["method"] in spec.methods]
-        summary = summarize_run(found)
-        counts[f"{model}, {protocol}" if protocol else model] = len(summary.common_tasks)
-        notes += [f"Failed: {' '.join(failure)}" for failure in summary.failures]
+        summary = summarize_run([r for r in read_rows(folder) if r["method"] in spec.methods])
         fids = compute_fids(folder, summary) if "fid" in spec.columns else {}
+        notes += [f"Failed: {' '.join(failure)}" for failure in summary.failures]
         notes += [fids] if isinstance(fids, str) else []
-        baseline = collect_values(summary, spec.baseline, spec.columns)
+        counts[f"{model}, {protocol}" if protocol else model] = len(summary.common_tasks)
         for method in spec.methods:
-            values = collect_values(summary, method, spec.columns)
-            cells = {
-                key: fill_cell(BY_KEY[key], values[key], {} if method == spec.baseline else base)
-                for key, base in baseline.items()
-            }
-            if method in fids and not isinstance(fids, str):
+            cells = fill_cells(spec, summary, method)
+            if not isinstance(fids, str) and fids:
                 cells["fid"] = Cell(fids[method])
             rows.append(TableRow(model, protocol, method, cells))
     return PaperTable(spec, rows, counts, list(dict.fromkeys(notes)))
+
+
+def fill_cells(spec: TableSpec, summary: RunSummary, method: str) -> dict[str, Cell]:
+    """Fill the cells of a method, by the key of their column."""
+    values = collect_values(summary, method, spec.columns)
+    others = collect_values(summary, spec.baseline, spec.columns)
+    return {
+        key: fill_cell(BY_KEY[key], values[key], {} if method == spec.baseline else others[key])
+        for key in spec.columns
+    }
 
 
 def collect_values(

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import shutil
 import subprocess
 from dataclasses import replace
 from pathlib import Path
@@ -84,7 +85,7 @@ def reproduce(options: EvaluateOptions) -> None:
         for name, spec in specs.items():
             console.print(f"{name}: {spec.title}", markup=False)
             try:
-                write(options, name, spec)
+                write_output(options, name, spec)
             except InputError as error:
                 if "all" not in (*options.table, *options.figure):
                     raise
@@ -94,7 +95,7 @@ def reproduce(options: EvaluateOptions) -> None:
         Console(highlight=False).print(text, markup=False, soft_wrap=True)
 
 
-def write(options: EvaluateOptions, name: str, spec: Requirements) -> None:
+def write_output(options: EvaluateOptions, name: str, spec: Requirements) -> None:
     """Run what a table or figure needs, and write it."""
     runs = run_all(options, spec)
     if isinstance(spec, TableSpec):
@@ -179,7 +180,7 @@ def write_results(options: EvaluateOptions) -> str:
 def find_commit() -> dict[str, str]:
     """Return the commit of this code, or nothing if it is not a git checkout."""
     root = Path(__file__).parents[4]
-    if not (root / ".git").exists():
+    if not (root / ".git").exists() or shutil.which("git") is None:
         return {}
     git = ["git", "-C", str(root), "describe", "--always", "--dirty"]
     return {"commit": subprocess.run(git, capture_output=True, text=True).stdout.strip()}
