@@ -64,16 +64,18 @@ evaluate: $(VENV)/installed-evaluation
 # Tables, figures and claims of the paper on the same photographs, in under half an hour; the slow
 # baselines run on few cases. docs/reproduce.md explains them.
 REPRODUCED ?= $(RESULTS)/paper
+SCENES ?= $(dir $(CASES))
+SEQUENCES ?= $(SCENES)hololens_room $(SCENES)open3d_rgbd
 reproduce: $(VENV)/installed-evaluation
 	$(BIN)/gscompleter evaluate $(CASES) --table models --figure qualitative --out $(REPRODUCED)
 	$(BIN)/gscompleter evaluate $(CASES) --one-per-scene --out $(REPRODUCED) --figure seams \
 		--table ablation refinement time dof alignment rotation
 	$(BIN)/gscompleter evaluate $(CASES) --limit 4 --out $(REPRODUCED) --table paradigms \
 		--figure densification registration
-	$(BIN)/gscompleter evaluate $(dir $(CASES)) --one-per-scene --resolution 256 256 --out $(REPRODUCED) \
+	$(BIN)/gscompleter evaluate $(SCENES) --one-per-scene --resolution 256 256 --out $(REPRODUCED) \
 		--table spans stress --protocol n-2 n-4 n-8 stress-12-39
-	$(BIN)/gscompleter evaluate $(dir $(CASES)) --limit 2 --resolution 256 256 --out $(REPRODUCED) \
-		--table sequence --figure sequence --protocol sequence-4-steps-2
+	$(BIN)/gscompleter evaluate $(SEQUENCES) --resolution 256 256 --out $(REPRODUCED) \
+		--table sequence --figure sequence --protocol sequence-1-steps-2
 
 # Ours beside what else a user has. Holes are filled on photographs that are held back: name a CASES.
 # What completions take comes first (docs/performance.md); without its scenes, name another PERFORMANCE.
