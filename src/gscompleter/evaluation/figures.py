@@ -148,12 +148,12 @@ def save_grid(
         ) from error
     heights = [images[0].shape[0] / images[0].shape[1] for _, images in rows]
     size = (IMAGE_INCHES * len(titles) + 0.3, IMAGE_INCHES * sum(heights) + 0.5)
-    layout = ConstrainedLayoutEngine(w_pad=0.01, h_pad=0.01, wspace=0, hspace=0)
+    layout = ConstrainedLayoutEngine(w_pad=0.01, h_pad=0.01, wspace=0, hspace=0, compress=True)
     figure = Figure(figsize=size, layout=layout)
     grid: Any = figure.subplots(len(rows), len(titles), squeeze=False, height_ratios=heights)
     for line, (name, images) in zip(grid, rows, strict=True):
         for axes, image in zip(line, images, strict=True):
-            axes.imshow(image, interpolation="nearest", aspect="auto")
+            axes.imshow(image, interpolation="nearest")
             axes.set(xticks=[], yticks=[])
             axes.spines[:].set_visible(False)
         line[0].set_ylabel(name, fontsize=5)
@@ -161,4 +161,4 @@ def save_grid(
         axes.set_title(title, fontsize=7)
     for suffix, metadata in ((".png", {"Software": None}), (".pdf", {"CreationDate": None})):
         with replace_file(path.with_name(path.name + suffix)) as file:
-            figure.savefig(file, format=suffix[1:], dpi=DPI, metadata=metadata)
+            figure.savefig(file, format=suffix[1:], dpi=DPI, metadata=metadata, bbox_inches="tight")
