@@ -65,7 +65,7 @@ evaluate: $(VENV)/installed-evaluation
 # baselines run on few cases. docs/reproduce.md explains them.
 REPRODUCED ?= $(RESULTS)/paper
 SCENES ?= $(dir $(CASES))
-SEQUENCES ?= $(SCENES)hololens_room $(SCENES)open3d_rgbd
+SEQUENCES ?= $(SCENES)open3d_rgbd
 reproduce: $(VENV)/installed-evaluation
 	$(BIN)/gscompleter evaluate $(CASES) --table models --figure qualitative --out $(REPRODUCED)
 	$(BIN)/gscompleter evaluate $(CASES) --one-per-scene --out $(REPRODUCED) --figure seams \
