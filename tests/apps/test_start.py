@@ -36,7 +36,6 @@ def imported(tmp_path_factory) -> set[str]:
         "matplotlib",
         "packaging.requirements",
         "rich.progress",
-        "scipy.linalg",
         "scipy.ndimage",
         "scipy.optimize",
         "scipy.spatial",
