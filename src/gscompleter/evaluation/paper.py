@@ -11,6 +11,7 @@ from typing import Any, Literal
 import yaml
 from pydantic import TypeAdapter
 
+from gscompleter.config.generators import GeneratorOptions
 from gscompleter.config.settings import Settings
 
 TRUTH, PHOTOGRAPH = "truth", "context-"
@@ -19,12 +20,12 @@ TRUTH, PHOTOGRAPH = "truth", "context-"
 
 @dataclass(frozen=True)
 class DataSet(Settings):
-    """Options of `evaluate` for a data set of the paper."""
+    """Options of `evaluate` for a data set of the paper; the defaults are those without one."""
 
-    protocol: tuple[str, ...]
-    resolution: tuple[int, int]
-    reconstructor: tuple[str, ...]
-    generator: str
+    protocol: tuple[str, ...] = ()
+    resolution: tuple[int, int] | None = None
+    reconstructor: tuple[str, ...] = ("plane-sweep",)
+    generator: str = GeneratorOptions.generator
     near: float | None = None
     far: float | None = None
 

@@ -30,8 +30,6 @@ from gscompleter.io.files import replace_file
 from gscompleter.jobs.jobs import make_folder
 from gscompleter.render import choose_device
 
-DEFAULTS = DataSet((), (0, 0), ("plane-sweep",), GeneratorOptions.generator)
-"""Models without a preset."""
 UNUSUAL = ("stress", "sequence")
 """Starts of the protocols that only tables of their own use."""
 TABLES, FIGURES, RUNS, RESULTS = "tables", "figures", "runs", "results.md"
@@ -54,16 +52,19 @@ def run_evaluation(options: EvaluateOptions) -> None:
         run_methods(options)
 
 
+def get_preset(options: EvaluateOptions) -> DataSet:
+    """Return the preset of the options, or the defaults without one."""
+    return load_paper().data_sets[options.preset] if options.preset else DataSet()
+
+
 def apply_preset(options: EvaluateOptions) -> EvaluateOptions:
     """Set what is not given as the preset does, or as without one."""
-    preset = load_paper().data_sets[options.preset] if options.preset else DEFAULTS
-    size = preset.resolution if options.preset else None
-    synthesis = options.synthesis
+    preset, synthesis = get_preset(options), options.synthesis
     if synthesis.generator == AUTO:
         synthesis = replace(synthesis, generator=preset.generator)
     return replace(
         options,
-        resolution=size if options.resolution is None else options.resolution,
+        resolution=preset.resolution if options.resolution is None else options.resolution,
         reconstructor=options.reconstructor or preset.reconstructor,
         near=preset.near if options.near is None else options.near,
         far=preset.far if options.far is None else options.far,
@@ -127,12 +128,11 @@ def choose_protocols(options: EvaluateOptions, spec: Requirements) -> tuple[str,
 
     A file of cases, which needs no protocol, has an empty one.
     """
-    preset = load_paper().data_sets[options.preset] if options.preset else DEFAULTS
     kinds = {name.split("-")[0] for name in spec.protocol}
     if kinds:
         return tuple(p for p in options.protocol if p.split("-")[0] in kinds) or spec.protocol
     usual = [p for p in options.protocol if not p.startswith(UNUSUAL)]
-    return tuple(usual[:1]) or preset.protocol or ("",)
+    return tuple(usual[:1]) or get_preset(options).protocol or ("",)
 
 
 def make_run(
@@ -140,8 +140,8 @@ def make_run(
 ) -> EvaluateOptions:
     """Return the options of a run of one model with one protocol, in a folder of its own."""
     synthesis = options.synthesis
-    if spec.generator not in (None, synthesis.generator):
-        synthesis = GeneratorOptions(spec.generator or AUTO)
+    if spec.generator and spec.generator != synthesis.generator:
+        synthesis = GeneratorOptions(spec.generator)
     one_per_scene = options.one_per_scene or spec.one_per_scene
     model = options.reconstructor[number]
     parts = (model, Path(protocol).stem or "cases", synthesis.generator)
