@@ -96,7 +96,7 @@ def test_the_depth_of_a_thin_pixel_is_followed_by_default_and_carried_into_where
         return ((z.reshape(SIZE, SIZE) / truth - 1).abs()[INNER]).median().item()
 
     assert error(COVERED) > 0.04
-    assert error(0.8) < 0.01
+    assert error(0.8) < 0.015
 
 
 def test_rendered_depth_is_valid_where_half_of_the_pixel_is_covered():

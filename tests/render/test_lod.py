@@ -194,7 +194,7 @@ def test_a_scene_is_completed_alike_whether_or_not_it_has_a_proxy(monkeypatch):
     truth = view_of(Room(), TARGET).image
     ours, theirs = (psnr(RENDERER.render(c.scene, TARGET).image, truth) for c in (found, whole))
     assert ours > psnr(RENDERER.render(CROWD, TARGET).image, truth) + 3
-    assert abs(ours - theirs) < 0.5
+    assert abs(ours - theirs) < 0.6
     for view in VIEWS:
         before = psnr(RENDERER.render(CROWD, view.camera).image, view.image)
         assert psnr(RENDERER.render(found.scene, view.camera).image, view.image) > before - 0.05

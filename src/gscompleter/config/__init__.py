@@ -71,9 +71,9 @@ class DepthAgreementConfig(Settings):
 class RegistrationConfig(Settings):
     """Registration of the lifted Gaussians along their rays (Eq. 9 to 11)."""
 
-    iterations: Count = 8
+    iterations: Count = 6
     """Iterations of Adam; 0 keeps the affine alignment (ablation without RC)."""
-    learning_rate: Step = 0.019
+    learning_rate: Step = 0.025
     """Learning rate of Adam, in the unit of `lr_unit`."""
     lr_schedule: Literal["linear", "constant"] = "linear"
     """`linear` decreases the learning rate to zero, `constant` keeps it (paper)."""
@@ -155,8 +155,10 @@ class TrustConfig(Settings):
 
 @dataclass(frozen=True)
 class RefineConfig(Settings):
-    """Refinement of the opacities of added Gaussians (Eq. 13)."""
+    """Refinement of colours and opacities of added Gaussians (Eq. 13)."""
 
+    color_rounds: Count = 4
+    """Rounds of the colour fit to the synthesized image; 0 keeps the lifted colours (paper)."""
     iterations: Count = 10
     """Most iterations of Adam; 0 keeps the lifted opacities (ablation without MV)."""
     rel_tol: Share | None = 3e-4
@@ -320,7 +322,7 @@ class CompleterConfig(Settings):
                 min_ratio=None,
                 extrapolate_into_holes=False,
             ),
-            refine=RefineConfig(iterations=30, rel_tol=None, learning_rate=0.08),
+            refine=RefineConfig(color_rounds=0, iterations=30, rel_tol=None, learning_rate=0.08),
             holes=HoleConfig(dilation=0, candidate_radius=None),
         )
 

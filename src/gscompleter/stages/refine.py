@@ -1,4 +1,4 @@
-"""Stage 4: refine the opacities of added Gaussians, and nothing else (paper, Sec. III-F)."""
+"""Stage 4: refine added Gaussians, and nothing else (paper, Sec. III-F)."""
 
 from __future__ import annotations
 
@@ -15,6 +15,7 @@ from gscompleter.geometry import measure_baseline
 from gscompleter.optim import Adam
 from gscompleter.progress import track
 from gscompleter.render import OpacityRender
+from gscompleter.render.fit_colors import fit_colors
 from gscompleter.stages.target_view import TargetView
 from gscompleter.timing import timed_stage
 from gscompleter.types import Gaussians, View
@@ -22,7 +23,7 @@ from gscompleter.types import Gaussians, View
 
 @dataclass(frozen=True)
 class Refined:
-    """Added Gaussians with refined opacities."""
+    """Added Gaussians with refined colours and opacities."""
 
     gaussians: Gaussians
     plans: tuple[OpacityRender, ...]
@@ -33,14 +34,19 @@ class Refined:
 
 @timed_stage("integrate")
 def refine(kept: Gaussians, reference: View, view: TargetView) -> Refined:
-    """Refine the opacities of added Gaussians against the image and the nearest photographs."""
+    """Refine colours against the image, then opacities also against the nearest photographs.
+
+    Registration changes which Gaussians hide others, and so the image that Ψ fitted their colours
+    to. The paper refines opacities alone (Eq. 13).
+    """
     views, config = view.state.views, view.state.config.refine
-    plans = tuple(frozen.vary_opacities(kept) for frozen in view.frozen_photos)
+    colored = fit_colors(kept, view.frozen, reference, config.color_rounds)
+    plans = tuple(frozen.vary_opacities(colored) for frozen in view.frozen_photos)
     distances = [measure_baseline(reference.camera, photo.camera) for photo in views]
     near = sorted(range(len(views)), key=distances.__getitem__)[: config.num_views]
-    at_target = view.frozen.vary_opacities(kept)
+    at_target = view.frozen.vary_opacities(colored)
     refined, losses = refine_opacities(
-        kept, at_target, reference, [plans[i] for i in near], [views[i] for i in near], config
+        colored, at_target, reference, [plans[i] for i in near], [views[i] for i in near], config
     )
     return Refined(refined, plans, losses)
 

@@ -19,12 +19,12 @@ from gscompleter.render import ColorErrors, Renderer
 from gscompleter.render.spherical_harmonics import SH_C1
 from gscompleter.types import SH_C0, Camera, DepthMap, Gaussians, View
 
-VIRTUAL_WEIGHT = 0.3
+VIRTUAL_WEIGHT = 0.45
 """Weight of a pixel of a virtual photograph, against one of a photograph."""
 GRADIENT_PENALTY, ANGLE = 1.0, 0.015
 """Cost of a squared colour change between middle and photograph, against a squared difference in
 the images; doubled if the rays of the photographs are this many radians from the middle."""
-RELAXATIONS = (3.0, 1.0), (2.5, 1.0)
+RELAXATIONS = (3.0, 1.0), (2.5, 1.0, 2.5, 1.0)
 """Step sizes of the rounds on the photographs alone, then on all; long and short ones in turn
 converge faster than equal ones (Richardson 1911)."""
 MIN_WEIGHT = 0.05

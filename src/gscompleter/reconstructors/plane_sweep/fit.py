@@ -18,7 +18,7 @@ from torch import Tensor
 from gscompleter.config.settings import COVERED
 from gscompleter.optim import Adam
 from gscompleter.render import Renderer
-from gscompleter.types import SH_C0, DepthMap, Gaussians, View, sh_from_rgb
+from gscompleter.types import DepthMap, Gaussians, View
 
 OPACITY_STEPS = 6
 """Adam steps on the opacities of two photographs."""
@@ -26,10 +26,6 @@ OPACITY_RATE, OPACITY_BETAS = 1.0, (0.7, 0.99)
 """Adam step size and decay rates, short because there are few steps."""
 REMOVAL_PENALTY = 0.01
 """Loss per unit of removed opacity; keeps Gaussians that no photograph contradicts."""
-COLOR_STEPS = 4
-"""Iterations of the colour correction."""
-RELAXATION = 1.7
-"""Step size as a multiple of the mean residual; below 2 the iterations converge."""
 
 STEPS_PER_VIEW = 10
 """Number of steps of the joint fit per photograph."""
@@ -64,18 +60,6 @@ def fit_opacities(
         optimizer.step(len(views) * (render.image - image).abs().mean() + weight * removed)
         depths.append(DepthMap(render.depth.detach(), render.alpha.detach() >= COVERED))
     return replace(gaussians, opacities=logits.detach().sigmoid()), depths[-len(views) :]
-
-
-def fit_colors(gaussians: Gaussians, views: Sequence[View], renderer: Renderer) -> Gaussians:
-    """Fit the colours by SIRT (Gilbert 1972), as the image is linear in them."""
-    nothing, colours = gaussians[:0], gaussians.sh[:, 0] * SH_C0 + 0.5
-    plans = [(renderer.freeze(nothing, v.camera).vary_colors(gaussians), v.image) for v in views]
-    for _ in range(COLOR_STEPS):
-        sums, weights = zip(*(errors(colours, image) for errors, image in plans), strict=True)
-        # The lower bound damps Gaussians that hardly contribute to any image.
-        total = torch.stack(weights).sum(0).clamp_min(0.05)
-        colours = colours + RELAXATION * torch.stack(sums).sum(0) / total[:, None]
-    return replace(gaussians, sh=sh_from_rgb(colours))
 
 
 def fit_jointly(

@@ -11,7 +11,7 @@ from torch import Tensor
 
 from gscompleter.geometry import rotations_to_quats
 from gscompleter.reconstructors.plane_sweep.directional_colors import fit_directional_colors
-from gscompleter.reconstructors.plane_sweep.fit import fit_colors, fit_jointly, fit_opacities
+from gscompleter.reconstructors.plane_sweep.fit import fit_jointly, fit_opacities
 from gscompleter.reconstructors.plane_sweep.fusion import (
     Layer,
     estimate_gains,
@@ -21,6 +21,7 @@ from gscompleter.reconstructors.plane_sweep.fusion import (
 from gscompleter.reconstructors.plane_sweep.rig import Transforms
 from gscompleter.reconstructors.plane_sweep.sweep import Mask
 from gscompleter.render import Renderer, load_renderer
+from gscompleter.render.fit_colors import fit_colors
 from gscompleter.sky import extend_sky, is_sky, restore_sky_colors
 from gscompleter.types import (
     DepthMap,
@@ -36,17 +37,19 @@ MIN_ALPHA = 0.7
 """Alpha below which a removed pixel is restored to close a gap."""
 THICKNESS = 0.15
 """Standard deviation along the normal, relative to that across the viewing ray."""
-MAX_STRETCH = 3.0
+MAX_STRETCH = 6.0
 """Largest elongation of a disc on a slanted surface, relative to a frontal one."""
 OPACITY = 0.98
 """Initial opacity of every disc."""
+COLOR_ROUNDS = 4
+"""Rounds of the colour fit to a synthesized image."""
 
 
 @dataclass(frozen=True)
 class Splatter:
     """Base of reconstructors that splat depth maps and fit the Gaussians."""
 
-    disc_sigma: float = 0.6
+    disc_sigma: float = 0.55
     """Standard deviation of a Gaussian across the viewing ray, in pixels."""
     renderer: Renderer = field(default_factory=lambda: load_renderer("cpu"))
 
@@ -91,9 +94,9 @@ class Splatter:
     ) -> Reconstruction:
         """Lift the pixels of `pixel_mask` in the first view and fit their colours to it."""
         rows = torch.nonzero(pixel_mask.reshape(-1))[:, 0]
-        blurred = self.splat(views[0], depths[0])[rows]
-        fitted = fit_colors(blurred.to("cpu"), [views[0].to("cpu")], self.renderer)
-        made = fitted.to(rows.device)
+        blurred, image = self.splat(views[0], depths[0])[rows].to("cpu"), views[0].to("cpu")
+        alone = self.renderer.freeze(blurred[:0], image.camera)
+        made = fit_colors(blurred, alone, image, COLOR_ROUNDS).to(rows.device)
         return Reconstruction(made, tuple(depths), torch.zeros_like(rows), rows)
 
     def select_pixels(
