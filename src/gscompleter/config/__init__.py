@@ -157,7 +157,7 @@ class TrustConfig(Settings):
 class RefineConfig(Settings):
     """Refinement of colours and opacities of added Gaussians (Eq. 13)."""
 
-    color_rounds: Count = 4
+    color_rounds: Count = 3
     """Rounds of the colour fit to the synthesized image; 0 keeps the lifted colours (paper)."""
     iterations: Count = 10
     """Most iterations of Adam; 0 keeps the lifted opacities (ablation without MV)."""

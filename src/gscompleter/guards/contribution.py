@@ -8,7 +8,6 @@ from torch import Tensor
 
 from gscompleter.guards import Attempt, Guard
 from gscompleter.render import FrozenScene
-from gscompleter.trust.photometric import sum_weights
 from gscompleter.types import Gaussians
 
 MIN_WEIGHT = 0.002
@@ -31,5 +30,5 @@ class Contribution(Guard):
 
 def find_shown(added: Gaussians, frozen: FrozenScene) -> Bool[Tensor, "n"]:
     """Find Gaussians with enough summed weight in the image of a frozen scene."""
-    sums = sum_weights(frozen.extend(added))
-    return sums[len(sums) - len(added) :] > MIN_WEIGHT
+    _, sums = frozen.vary_colors(added)(torch.zeros_like(added.means), frozen.render.image)
+    return sums > MIN_WEIGHT

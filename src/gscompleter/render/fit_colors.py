@@ -6,6 +6,7 @@ from dataclasses import replace
 
 import torch
 
+from gscompleter.cpu_threads import use_one_torch_thread
 from gscompleter.render import FrozenScene
 from gscompleter.render.spherical_harmonics import evaluate_colors
 from gscompleter.types import SH_C0, Gaussians, View
@@ -16,6 +17,7 @@ MIN_WEIGHT = 0.05
 """Summed weight up to which colours are damped, as the image hardly shows them."""
 
 
+@use_one_torch_thread()
 def fit_colors(new: Gaussians, frozen: FrozenScene, image: View, rounds: int) -> Gaussians:
     """Fit the colours of `new` Gaussians by SIRT (Gilbert 1972).
 

@@ -54,40 +54,54 @@ def slide_along_rays(
     coarse = apply_affine(lift.gaussians, affine, camera, config.footprint, config.min_ratio)
     if config.iterations == 0 or len(coarse) == 0:
         return Registration(coarse, pixel_index, ())
-    registered, losses = register_along_rays(coarse, reference, view)
     if config.hole_depth == "scene" and pixel_index is not None:
         depth = fill_smoothly(view.render.depth, ~view.holes).flatten()[pixel_index]
-        return Registration(move_to_depths(coarse, camera, depth), pixel_index, losses)
+        return Registration(move_to_depths(coarse, camera, depth), pixel_index, ())
     if config.extrapolate_into_holes and config.degrees_of_freedom == 1 and pixel_index is not None:
-        scene = view.render.depth_map(view.state.config.holes.max_alpha)
-        registered = extrapolate_into_holes(coarse, registered, pixel_index, scene, camera, config)
-        registered = extrapolate_sky(registered, pixel_index, scene, reference)
+        return register_beside_holes(coarse, pixel_index, reference, view)
+    registered, losses = register_along_rays(coarse, reference, view)
     return Registration(registered, pixel_index, losses)
+
+
+def register_beside_holes(
+    coarse: Gaussians, pixel_index: Int[Tensor, "n"], reference: View, view: TargetView
+) -> Registration:
+    """Register Gaussians that overlap the scene, and move those in holes like them."""
+    scene = view.render.depth_map(view.state.config.holes.max_alpha)
+    rows = torch.nonzero(scene.valid.flatten()[pixel_index])[:, 0]
+    registered, losses = register_along_rays(coarse[rows], reference, view)
+    moved = extrapolate_into_holes(
+        coarse,
+        registered,
+        rows,
+        pixel_index,
+        scene,
+        reference.camera,
+        view.state.config.registration,
+    )
+    return Registration(extrapolate_sky(moved, pixel_index, scene, reference), pixel_index, losses)
 
 
 def extrapolate_into_holes(
     coarse: Gaussians,
     registered: Gaussians,
+    rows: Int[Tensor, "k"],
     pixel_index: Int[Tensor, "n"],
     scene: DepthMap,
     camera: Camera,
     config: RegistrationConfig,
 ) -> Gaussians:
-    """Extrapolate the correction d' / d of well registered Gaussians smoothly into holes."""
-    before = compute_z_depths(coarse.means, camera)
-    after = compute_z_depths(registered.means, camera)
-    error = (after / scene.depth.flatten()[pixel_index].clamp_min(1e-12) - 1).abs()
-    agrees = scene.valid.flatten()[pixel_index] & (error < EXTRAPOLATION_TOLERANCE)
-
+    """Extrapolate the correction d' / d of well registered rows of `coarse` smoothly into holes."""
+    depths, pixels = compute_z_depths(registered.means, camera), pixel_index[rows]
     correction = torch.zeros_like(scene.depth).flatten()
-    correction[pixel_index] = (after / before).log()
+    correction[pixels] = (depths / compute_z_depths(coarse.means[rows], camera)).log()
     known = torch.zeros_like(scene.valid).flatten()
-    known[pixel_index] = agrees
+    error = (depths / scene.depth.flatten()[pixels].clamp_min(1e-12) - 1).abs()
+    known[pixels] = error < EXTRAPOLATION_TOLERANCE
     shape = scene.valid.shape
-    filled = fill_smoothly(correction.view(shape), known.view(shape)).flatten()[pixel_index]
-    in_hole = ~scene.valid.flatten()[pixel_index]
-    ratio = torch.where(in_hole, filled, (after / before).log()).exp()
-    return slide(coarse, camera, ratio, config.footprint)
+    filled = fill_smoothly(correction.view(shape), known.view(shape))
+    ratio = torch.where(scene.valid, correction.view(shape), filled).exp()
+    return slide(coarse, camera, ratio.flatten()[pixel_index], config.footprint)
 
 
 def extrapolate_sky(

@@ -9,6 +9,7 @@ import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
+from gscompleter.cpu_threads import use_one_torch_thread
 from gscompleter.geometry import rotations_to_quats
 from gscompleter.reconstructors.plane_sweep.directional_colors import fit_directional_colors
 from gscompleter.reconstructors.plane_sweep.fit import fit_jointly, fit_opacities
@@ -41,7 +42,7 @@ MAX_STRETCH = 6.0
 """Largest elongation of a disc on a slanted surface, relative to a frontal one."""
 OPACITY = 0.98
 """Initial opacity of every disc."""
-COLOR_ROUNDS = 4
+COLOR_ROUNDS = 2
 """Rounds of the colour fit to a synthesized image."""
 
 
@@ -126,6 +127,7 @@ class Splatter:
         image = self.renderer.render(made, view.camera).image * gain
         return replace(view, image=torch.where(view.ignore_mask[..., None], image, view.image))
 
+    @use_one_torch_thread()
     def fit_gaussians(
         self, gaussians: Gaussians, views: Sequence[View], gains: Float[Tensor, "views 3"]
     ) -> Gaussians:

@@ -17,7 +17,7 @@ from gscompleter.reconstructors.plane_sweep.fusion import Layer
 from gscompleter.reconstructors.plane_sweep.gaussians import Splatter
 from gscompleter.reconstructors.plane_sweep.rig import Rig, build_rig
 from gscompleter.reconstructors.plane_sweep.sky_mask import find_skies, find_sky, transfer_sky
-from gscompleter.reconstructors.plane_sweep.surfaces import fit_surfaces
+from gscompleter.reconstructors.plane_sweep.surfaces import ITERATIONS, fit_surfaces
 from gscompleter.reconstructors.plane_sweep.sweep import (
     Mask,
     Measurement,
@@ -27,6 +27,8 @@ from gscompleter.reconstructors.plane_sweep.sweep import (
 from gscompleter.sky import SKY_DEPTH, is_sky
 from gscompleter.types import DepthMap, Reconstruction, View
 
+LIFT_ITERATIONS = ITERATIONS // 2
+"""Iterations of the surfaces of a synthesized image, which registration corrects."""
 MIN_HALVED_SIDE = 192
 """Shortest side, in pixels, from which three or more images are matched at half size."""
 
@@ -58,8 +60,10 @@ class PlaneSweep(Splatter):
         first, second = match_views(rig, views)
         open_there = find_sky(rig.images[1], second)
         layers = [
-            make_layer(rig.images[0], first.exclude(transfer_sky(rig, open_there))),
-            make_layer(rig.images[1], second.exclude(open_there), is_completed=False),
+            make_layer(
+                rig.images[0], first.exclude(transfer_sky(rig, open_there)), LIFT_ITERATIONS
+            ),
+            make_layer(rig.images[1], second.exclude(open_there), 0),
         ]
         return self.lift_pixels(views, make_depth_maps(layers, rig.unit, views), pixel_mask)
 
@@ -87,10 +91,10 @@ def match_views(rig: Rig, views: Sequence[View]) -> list[Measurement]:
     ]
 
 
-def make_layer(image: StereoImage, found: Measurement, is_completed: bool = True) -> Layer:
-    """Convert the measured depths of a view to a layer, completed by surfaces or as measured."""
+def make_layer(image: StereoImage, found: Measurement, iterations: int = ITERATIONS) -> Layer:
+    """Convert the measured depths of a view to a layer, by surfaces after so many iterations."""
     full = found.resize_to(image.size)
-    index = fit_surfaces(full.index, full.weight, image.image) if is_completed else full.index
+    index = fit_surfaces(full.index, full.weight, image.image, iterations)
     return Layer(image, compute_inverse_depth(full.planes, index), full.confidence)
 
 

@@ -37,9 +37,12 @@ ITERATIONS = 100
 """Iterations on the finest level, doubled on each coarser one."""
 
 
-def fit_surfaces(measured: Map, confidence: Map, image: Image) -> Map:
-    """Fit inverse depths to measurements with weights in [0, 1]; keep them if all are 0."""
-    if not (confidence > 0).any():
+def fit_surfaces(measured: Map, confidence: Map, image: Image, iterations: int = ITERATIONS) -> Map:
+    """Fit inverse depths to measurements with weights in [0, 1].
+
+    Without a positive weight or an iteration they stay as measured.
+    """
+    if iterations == 0 or not (confidence > 0).any():
         return measured
     levels: list[Level] = [(measured, confidence, image)]
     while len(levels) < LEVELS and min(levels[-1][0].shape) > 4:
@@ -55,7 +58,7 @@ def fit_surfaces(measured: Map, confidence: Map, image: Image) -> Map:
         scale = 2.0**number
         across, down = (cost / np.float32(scale) for cost in compute_step_costs(colours))
         bend, tolerance = np.float32(BEND_PENALTY / scale**2), np.float32(TOLERANCE)
-        steps = ITERATIONS * 2**number
+        steps = iterations * 2**number
         tgv.fit(heights, gradients, data, weight, across, down, bend, tolerance, steps)
     return heights
 
