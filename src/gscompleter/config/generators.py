@@ -31,10 +31,16 @@ class OracleSettings(GeneratorSettings):
 
 
 @dataclass(frozen=True)
-class DiffusionSettings(GeneratorSettings):
+class FileSettings(GeneratorSettings):
     """Settings of a generator with weights."""
 
     weights: Text | None = None
+
+
+@dataclass(frozen=True)
+class DiffusionSettings(FileSettings):
+    """Settings of a generator that denoises."""
+
     retries: Annotated[int, Interval(ge=0, le=100)] = 0
     offload: bool = False
 
@@ -66,7 +72,10 @@ GENERATORS: dict[str, type[GeneratorSettings]] = {
 PREFIX = "generator_"
 
 PLUGINS = "gscompleter.generators"
-"""Group of entry points that name tables of further generators, from name to loader."""
+"""Group of entry points that name tables of further generators, from name to loader.
+
+A loader that takes settings has their class as its attribute `settings`.
+"""
 
 
 def get_settings_class(name: str) -> type[GeneratorSettings]:
@@ -75,7 +84,7 @@ def get_settings_class(name: str) -> type[GeneratorSettings]:
         return GENERATORS[name]
     others = load_plugins(PLUGINS)
     if name in others:
-        return GeneratorSettings
+        return getattr(others[name], "settings", GeneratorSettings)
     raise InputError(
         f"There is no generator '{quote_value(name)}'; choose one of "
         f"{', '.join(dict.fromkeys([*GENERATORS, *others]))}.",
@@ -89,10 +98,12 @@ class GeneratorOptions(Settings):
 
     generator: str = "warp-inpaint"
     """Model that synthesizes the image at a target: warp-inpaint (warped photographs, holes filled
-    by patches), oracle (the real photograph), pe-field (the paper's) or diffusers-inpaint."""
+    by patches), oracle (the real photograph), pe-field (the paper's), diffusers-inpaint, or a model
+    that gives images in the list of `gscompleter models`."""
     generator_weights: str | None = None
-    """Weights of pe-field (by default those published) or diffusers-inpaint: a folder saved by
-    diffusers, or USER/NAME or USER/NAME@COMMIT on the Hugging Face hub."""
+    """Weights, by default those published: a folder saved by diffusers, USER/NAME or
+    USER/NAME@COMMIT on the Hugging Face hub for pe-field and diffusers-inpaint (which has no
+    default), and a file for others."""
     generator_retries: int | None = None
     """Further seeds to try if the image disagrees with the photographs (0)."""
     generator_offload: bool = False
@@ -117,8 +128,8 @@ class GeneratorOptions(Settings):
             if name.startswith(PREFIX) and value is not None and value is not False
         }
         for setting in given:
-            knowing = [name for name, kind in GENERATORS.items() if hasattr(kind, setting)]
-            if self.generator not in knowing:
+            if not hasattr(kind, setting):
+                knowing = [name for name, kind in GENERATORS.items() if hasattr(kind, setting)]
                 raise InputError(
                     f"The generator '{self.generator}' has no setting {setting}; leave it out, or "
                     f"choose {' or '.join(knowing)}.",

@@ -3,10 +3,12 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
+from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
-from typing import Any
+from typing import Any, ClassVar
 
+from gscompleter.config.generators import FileSettings
 from gscompleter.generators import FunctionGenerator, Generator
 from gscompleter.models.weights.published import PUBLISHED
 from gscompleter.reconstructors import Reconstructor
@@ -36,6 +38,37 @@ def load_diffusers_inpaint(
     return FunctionGenerator(load_diffusers_inpaint(seed, device, settings))
 
 
+@dataclass(frozen=True)
+class InpaintingLoader:
+    """Loads a generator that fills holes by a network of one file."""
+
+    load_network: Callable[[Path | None, str], Any]
+    settings: ClassVar[type[FileSettings]] = FileSettings
+
+    def __call__(
+        self, settings: FileSettings, seed: int, photographs: Sequence[View], device: str
+    ) -> Generator:
+        """Load the network from the file of the settings, or the published one."""
+        from gscompleter.models.inpainting.fill import InpaintingGenerator
+
+        local = None if settings.weights is None else Path(settings.weights)
+        return FunctionGenerator(InpaintingGenerator(self.load_network(local, device)))
+
+
+def load_migan(local: Path | None, device: str) -> Any:
+    """Load MI-GAN."""
+    from gscompleter.models.inpainting.migan import load_migan
+
+    return load_migan(local, device)
+
+
+def load_lama(local: Path | None, device: str) -> Any:
+    """Load LaMa."""
+    from gscompleter.models.inpainting.lama import load_lama
+
+    return load_lama(local, device)
+
+
 RECONSTRUCTORS: dict[str, Callable[[Path | None, str], Reconstructor]] = {
     name: partial(load_learned_reconstructor, name)
     for name, weights in PUBLISHED.items()
@@ -46,5 +79,7 @@ RECONSTRUCTORS: dict[str, Callable[[Path | None, str], Reconstructor]] = {
 GENERATORS: dict[str, Callable[[Any, int, Sequence[View], str], Generator]] = {
     "pe-field": load_pe_field,
     "diffusers-inpaint": load_diffusers_inpaint,
+    "migan": InpaintingLoader(load_migan),
+    "lama": InpaintingLoader(load_lama),
 }
 """Loaders of the learned generators, called with settings, seed, true images and a device."""

@@ -29,6 +29,7 @@ PURPOSES = {
     "evaluation": "the plots of evaluate and tables, FLIP, LPIPS and FID",
     "models": "downloading published weights from the Hugging Face hub",
     "diffusion": "--generator pe-field and diffusers-inpaint",
+    "onnx": "--generator migan and lama",
     "poses": "photographs whose cameras are not known",
     "live": "completing in the browser with gscompleter live",
     "browser": "the picture of the viewer (examples/04_picture_of_the_viewer.py)",

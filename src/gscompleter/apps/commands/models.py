@@ -12,8 +12,10 @@ from rich.console import Console
 from rich.table import Table
 
 from gscompleter.apps.commands.options import ModelsOptions
+from gscompleter.errors import InputError, quote_value
 from gscompleter.models.weights.fetching import (
     INSTALL,
+    fetch,
     find_cached,
     get_cache_path,
     is_hub_installed,
@@ -22,7 +24,9 @@ from gscompleter.models.weights.published import PUBLISHED, PublishedWeights
 
 
 def run_models(options: ModelsOptions) -> None:
-    """Print the published weights and their location on this machine."""
+    """Print the published weights and their location on this machine; download some first."""
+    for name in options.download:
+        download(name)
     found = [(weights, find_cached(weights)) for weights in PUBLISHED.values()]
     if not options.json:
         print_models(found)
@@ -38,6 +42,22 @@ def run_models(options: ModelsOptions) -> None:
         for weights, path in found
     ]
     print(json.dumps(rows, indent=2))
+
+
+def download(name: str) -> None:
+    """Download a published file to the hub's cache, and verify it by its SHA-256."""
+    if name not in PUBLISHED:
+        raise InputError(
+            f"There are no weights '{quote_value(name)}'; choose one of {', '.join(PUBLISHED)}.",
+            "download",
+        )
+    from gscompleter.models.weights.reading import check_kind, check_sha256
+
+    weights = PUBLISHED[name]
+    path = fetch(weights)
+    check_kind(path, weights.file)
+    if weights.sha256 is not None:
+        check_sha256(path, weights.sha256, weights.file)
 
 
 def print_models(found: Sequence[tuple[PublishedWeights, Path | None]]) -> None:

@@ -345,6 +345,8 @@ class BenchOptions(RunOptions, WritingOptions):
 class ModelsOptions(Settings):
     """List published model weights with their licences, and show which are downloaded."""
 
+    download: tuple[str, ...] = ()
+    """Names of the list, whose files are downloaded and verified first."""
     json: bool = False
     """Print all details as JSON."""
 

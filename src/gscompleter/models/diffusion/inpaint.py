@@ -15,13 +15,7 @@ from gscompleter.config.generators import DiffusersInpaintSettings
 from gscompleter.errors import InputError
 from gscompleter.generators import GeneratorOutput
 from gscompleter.generators.agreement import paint_consistently
-from gscompleter.generators.warp import (
-    WarpedImage,
-    add_unexplained,
-    continue_image,
-    fill_background_first,
-    warp_photographs,
-)
+from gscompleter.generators.warp import complete_warp
 from gscompleter.image_ops import dilate
 from gscompleter.models.diffusion.complete import check_parts, load_language_models
 from gscompleter.models.diffusion.kontext import resize_antialiased
@@ -113,16 +107,6 @@ class DiffusersInpaint:
         painted = paint_consistently(paint, self.seed, compared, self.retries, correct)
         known = observed.known[..., None]
         return replace(painted, image=torch.where(known, observed.image, painted.image))
-
-
-def complete_warp(nearest: View, target: Camera, context: GeneratorInput) -> WarpedImage:
-    """Warp the photographs to the target and continue their tone and lines into the holes."""
-    warped = warp_photographs(nearest, target, context)
-    if not warped.known.any():
-        return replace(warped, image=nearest.image.mean(dim=(0, 1)).expand_as(warped.image))
-    warped = add_unexplained(fill_background_first(warped), target, context)
-    image = torch.lerp(*continue_image(warped, target, context)).clamp(0, 1)
-    return replace(warped, image=image.to(warped.image.device))
 
 
 def load_diffusers_inpaint(

@@ -1,4 +1,4 @@
-"""Published weights of the learned reconstructors (no torch, so it imports fast).
+"""Published weights of learned models in single files (no torch, so it imports fast).
 
 Names, digits and licences are those of the authors' pages; no file was downloaded to verify them.
 """
@@ -51,8 +51,9 @@ class PublishedWeights:
     """Entry of the file with the tensors, unless they are at the top level."""
     prefix: str = "encoder."
     """Prefix of the network's tensor names in the file."""
-    gives: Literal["Gaussians", "scene depth", "depth"] = "Gaussians"
-    """Output of the network; `scene depth` is converted to Gaussians, `depth` is not supported."""
+    gives: Literal["Gaussians", "scene depth", "depth", "image"] = "Gaussians"
+    """Output of the network; `scene depth` is converted to Gaussians, `depth` is not supported, and
+    an `image` is that of a generator."""
 
     @property
     def url(self) -> str:
@@ -64,7 +65,7 @@ class PublishedWeights:
     @property
     def is_reconstructor(self) -> bool:
         """True if the network is known and yields Gaussians, directly or from depth."""
-        return self.gives != "depth" and self.network is not None
+        return self.gives in ("Gaussians", "scene depth") and self.network is not None
 
     @property
     def integrity_check(self) -> str:
@@ -198,6 +199,47 @@ DEPTHSPLAT = _create_depthsplat(
 )
 DEPTH_ALONE: dict[str, Any] = {"near_far": None, "entry": "model", "prefix": "", "gives": "depth"}
 
+MIGAN = PublishedWeights(
+    name="migan",
+    model="MI-GAN",
+    network="migan",
+    repository="andraniksargsyan/migan",
+    revision="406830d0fa60666da0071c342ad2fbc8f30c5c64",
+    file="migan_pipeline_v2.onnx",
+    sha256="6f1f3530a1a2324b19752018ce756088b07973cda8d7d890034ace5c8a48c40b",
+    megabytes=28,
+    parameters=None,
+    views=(1, 1),
+    image_size=(512, 512),
+    near_far=None,
+    code="https://github.com/Picsart-AI-Research/MI-GAN",
+    weights_licence="MIT",
+    caution="",
+    source="https://huggingface.co/andraniksargsyan/migan",
+    gives="image",
+)
+
+LAMA = PublishedWeights(
+    name="lama",
+    model="LaMa",
+    network="lama",
+    repository="Carve/LaMa-ONNX",
+    revision="c3c0c9e468934d62e79c329e35d82dd09ff8c444",
+    file="lama_fp32.onnx",
+    sha256="1faef5301d78db7dda502fe59966957ec4b79dd64e16f03ed96913c7a4eb68d6",
+    megabytes=208,
+    parameters=None,
+    views=(1, 1),
+    image_size=(512, 512),
+    near_far=None,
+    code="https://github.com/advimman/lama",
+    code_licence="Apache-2.0",
+    weights_licence="Apache-2.0",
+    caution="",
+    source="https://huggingface.co/Carve/LaMa-ONNX",
+    gives="image",
+)
+
 _FILES = (
     MVSPLAT,
     replace(MVSPLAT, name="mvsplat-acid", file="acid.ckpt"),
@@ -280,6 +322,8 @@ _FILES = (
         gives="scene depth",
     ),
     _create_depth_anything("da3-nested-giant-large", "DA3NESTED-GIANT-LARGE-1.1", 1_689_845_519),
+    MIGAN,
+    LAMA,
 )
 
 PUBLISHED: dict[str, PublishedWeights] = {weights.name: weights for weights in _FILES}

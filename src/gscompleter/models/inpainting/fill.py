@@ -1,0 +1,84 @@
+"""Φ by an inpainting network: photographs are kept, and holes are filled window by window."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+
+import torch
+from jaxtyping import Bool, Float
+from torch import Tensor
+
+from gscompleter.errors import InputError
+from gscompleter.generators.smooth import fit_membrane
+from gscompleter.generators.warp import complete_warp
+from gscompleter.image_ops import dilate
+from gscompleter.types import Camera, GeneratorInput, View
+
+BORDER_WIDTH = 4
+"""Width in pixels around a hole that is filled, too, as depth at its border is unsure."""
+WINDOW = 512
+"""Side in pixels of the windows in which larger images are filled; networks are trained at it."""
+
+Fill = Callable[[Float[Tensor, "h w 3"], Bool[Tensor, "h w"]], Float[Tensor, "h w 3"]]
+"""Network: image and hole -> image, of the same size; pixels outside the hole may change."""
+
+
+@dataclass(frozen=True)
+class InpaintingGenerator:
+    """Generator Φ that fills the holes of warped photographs by a network."""
+
+    fill: Fill
+
+    def __call__(
+        self, nearest: View, target: Camera, context: GeneratorInput
+    ) -> Float[Tensor, "h w 3"]:
+        """Synthesize the image at `target`; pixels outside the hole are warped photographs."""
+        warped = complete_warp(nearest, target, context).to("cpu")
+        hole = dilate(~warped.known, BORDER_WIDTH)
+        filled = fill_windows(warped.image, hole, self.fill)
+        if not filled.isfinite().all():
+            raise InputError(
+                "The generator painted no finite image; check that its weights are correct, or "
+                "choose another generator."
+            )
+        toned = match_tone(filled, warped.image, warped.known & hole)
+        image = torch.where(warped.known[..., None], warped.image, toned)
+        return image.clamp(0, 1).to(nearest.image.device)
+
+
+def fill_windows(
+    image: Float[Tensor, "h w 3"], hole: Bool[Tensor, "h w"], fill: Fill
+) -> Float[Tensor, "h w 3"]:
+    """Fill a hole window by window, those with the smallest share of it first.
+
+    What a window filled is known to the next, so that large images are not reduced.
+    """
+    image, left = image.clone(), hole.clone()
+    windows = sorted(place_windows(*hole.shape), key=lambda at: hole[at].float().mean().item())
+    for at in windows:
+        if left[at].any():
+            filled = fill(image[at], left[at])
+            image[at] = torch.where(left[at][..., None], filled, image[at])
+            left[at] = False
+    return image
+
+
+def place_windows(height: int, width: int) -> Iterator[tuple[slice, slice]]:
+    """Cover an image by windows that overlap by at least half, in equal distances."""
+
+    def place(length: int) -> list[slice]:
+        steps = -(-2 * max(length - WINDOW, 0) // WINDOW)
+        starts = [round(i * (length - WINDOW) / steps) for i in range(steps + 1)] if steps else [0]
+        return [slice(start, start + WINDOW) for start in starts]
+
+    return ((rows, columns) for rows in place(height) for columns in place(width))
+
+
+def match_tone(
+    filled: Float[Tensor, "h w 3"], observed: Float[Tensor, "h w 3"], ring: Bool[Tensor, "h w"]
+) -> Float[Tensor, "h w 3"]:
+    """Add a smooth difference of colours, so that `filled` continues `observed` in the ring."""
+    if not ring.any():
+        return filled
+    return filled + fit_membrane(observed - filled, ring.float())

@@ -1,0 +1,44 @@
+"""LaMa (Suvorov et al., WACV 2022): inpainting by Fourier convolutions."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import torch
+from jaxtyping import Bool, Float
+from torch import Tensor
+
+from gscompleter.models.inpainting.onnx_network import OnnxNetwork, load_network
+from gscompleter.models.weights.published import PUBLISHED
+
+SIGNATURE = {"image": ("tensor(float)", 3), "mask": ("tensor(float)", 1)}
+MULTIPLE = 32
+"""Divisor of the side lengths that the network accepts if they are not fixed."""
+
+
+class LaMa:
+    """Network that takes colours in [0, 1] and a mask, 1 in the hole, and returns [0, 255]."""
+
+    def __init__(self, network: OnnxNetwork) -> None:
+        self.network = network
+
+    def __call__(
+        self, image: Float[Tensor, "h w 3"], hole: Bool[Tensor, "h w"]
+    ) -> Float[Tensor, "h w 3"]:
+        """Fill the hole of an image in [0, 1], reflected beyond its border to a valid size."""
+        height, width = hole.shape
+        rows, columns = self.network.fixed_size or (
+            -(-height // MULTIPLE) * MULTIPLE,
+            -(-width // MULTIPLE) * MULTIPLE,
+        )
+        border = ((0, rows - height), (0, columns - width))
+        pixels = np.pad(image.numpy(), (*border, (0, 0)), mode="symmetric").transpose(2, 0, 1)[None]
+        mask = np.pad(hole.float().numpy(), border, mode="symmetric")[None, None]
+        result = self.network(image=np.ascontiguousarray(pixels), mask=mask)
+        return torch.from_numpy(result[0] / 255).permute(1, 2, 0)[:height, :width]
+
+
+def load_lama(local: Path | None = None, device: str = "cpu") -> LaMa:
+    """Load the network; raises the errors of `load_network`."""
+    return LaMa(load_network(PUBLISHED["lama"], SIGNATURE, local, device))
