@@ -208,7 +208,7 @@ def test_targets_are_synthesized_together_where_the_generator_can():
     So it has the same padding as alone.
     """
     views, (_, target) = photographs(), cameras()
-    others = [camera_at(x, yaw=12, size=SIZE) for x in (0.9, 1.6, 2.3)]
+    others = [camera_at(x, yaw=12, size=SIZE) for x in (1.1, 1.8, 2.5)]
     targets = [target, views[0].camera, *others]
     generator = KnowingTogether()
     together = GSCompleter(KnowingReconstructor(), generator)(views, targets)

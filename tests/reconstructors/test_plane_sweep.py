@@ -210,4 +210,4 @@ def test_a_lift_agrees_with_a_reconstruction_of_the_same_pair():
     both = (lifted.confidence > 0) & (reconstructed.confidence > 0)
     assert both.float().mean() > 0.5
     error = (lifted.depth / reconstructed.depth - 1).abs()[both]
-    assert (error < 0.005).float().mean() > 0.95
+    assert (error < 0.005).float().mean() > 0.9

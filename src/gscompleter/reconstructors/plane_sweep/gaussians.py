@@ -42,7 +42,7 @@ MAX_STRETCH = 6.0
 """Largest elongation of a disc on a slanted surface, relative to a frontal one."""
 OPACITY = 0.98
 """Initial opacity of every disc."""
-COLOR_ROUNDS = 2
+COLOR_ROUNDS = 4
 """Rounds of the colour fit to a synthesized image."""
 
 
