@@ -6,6 +6,7 @@ generators with the protocol.
 
 from __future__ import annotations
 
+import inspect
 import json
 import shutil
 from dataclasses import replace
@@ -255,6 +256,32 @@ def test_inpainting_keeps_what_was_warped_and_fills_the_rest(name, tmp_path):
     assert torch.equal(image, generator(context.views[1], TARGET, context).image)
     other = replace(generator, seed=1)(context.views[1], TARGET, context).image
     assert not torch.equal(image, other)
+
+
+def test_flux2_klein_sees_the_nearest_photograph(tmp_path):
+    folder = tiny_diffusion.saved(tiny_diffusion.flux2_klein(), tmp_path)
+    kind = get_settings_class("flux2-klein")
+    assert (kind().steps, kind().weights.partition("@")[0]) == (
+        4,
+        "black-forest-labs/FLUX.2-klein-4B",
+    )
+    generator = load_generator("flux2-klein", settings=kind(weights=str(folder))).function
+    painter = replace(generator.painter, side=128)
+    assert type(painter.pipeline).__name__ == "Flux2KleinInpaintPipeline"
+    context, seen = known_room(), {}
+    call = type(painter.pipeline).__call__
+
+    class Watched(type(painter.pipeline)):
+        def __call__(self, *values, image_reference=None, **others):
+            seen.update(image_reference=image_reference, **others)
+            return call(self, *values, image_reference=image_reference, **others)
+
+        __call__.__signature__ = inspect.signature(call)
+
+    painter.pipeline.__class__ = Watched
+    replace(generator, painter=painter)(context.views[1], TARGET, context)
+    assert torch.equal(seen["image_reference"][0].permute(1, 2, 0), context.views[1].image)
+    assert (seen["num_inference_steps"], seen["strength"]) == (4, 1.0)
 
 
 def test_the_size_follows_the_pipeline_and_the_aspect(inpaint_folder):

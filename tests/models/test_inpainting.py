@@ -110,14 +110,14 @@ def convolve(mask, image):
 
 
 def test_migan_gets_bytes_and_a_mask_of_what_is_known(migan_file):
-    filled = load_migan(migan_file)(IMAGE, HOLE)
+    filled = load_migan(str(migan_file)).fill(IMAGE, HOLE)
     seen = (255 * IMAGE).round() / 255 * (~HOLE)[..., None]
     expected = torch.where(HOLE[..., None], convolve(~HOLE, seen).clamp(0, 1), seen)
     assert (filled - expected).abs().max() <= 1.001 / 255  # bytes are cut, not rounded
 
 
 def test_lama_gets_colours_and_a_mask_of_the_hole(lama_file):
-    filled = load_lama(lama_file)(IMAGE, HOLE)
+    filled = load_lama(str(lama_file)).fill(IMAGE, HOLE)
     expected = convolve(HOLE, IMAGE)
     inner = slice(1, -1)
     assert filled.shape == IMAGE.shape
@@ -209,7 +209,7 @@ def test_other_files_are_refused_with_one_sentence(name, migan_file, tmp_path):
         load(tmp_path / "missing.onnx")
 
 
-def test_the_published_file_is_verified(migan_file, tmp_path, monkeypatch):
+def test_the_published_file_is_verified(migan_file, tmp_path, monkeypatch, capsys):
     monkeypatch.setenv("GSCOMPLETER_HOME", str(tmp_path))
     place = tmp_path / "weights" / "mi-gan" / "migan_pipeline_v2.onnx"
     place.parent.mkdir(parents=True)
@@ -217,8 +217,13 @@ def test_the_published_file_is_verified(migan_file, tmp_path, monkeypatch):
     with pytest.raises(InputError, match="is not the published file"):
         load_migan()
     digest = hashlib.sha256(place.read_bytes()).hexdigest()
+    assert run(monkeypatch, "models", "--download", "migan") == 2
     monkeypatch.setitem(PUBLISHED, "migan", replace(PUBLISHED["migan"], sha256=digest))
-    assert load_migan()(IMAGE, HOLE).shape == IMAGE.shape
+    assert load_migan().fill(IMAGE, HOLE).shape == IMAGE.shape
+    assert run(monkeypatch, "models", "--download", "migan") == 0
+    assert str(place) in capsys.readouterr().out
+    assert run(monkeypatch, "models", "--download", "migan", "nobody") == 2
+    assert "There are no weights 'nobody'" in capsys.readouterr().err
 
 
 @pytest.mark.parametrize("name", ["migan", "lama"])

@@ -203,11 +203,94 @@ def flux_fill() -> Any:
     return FluxFillPipeline(transformer=transformer, **{name: parts[name] for name in kept})
 
 
+def qwen3(layers: int) -> dict[str, Any]:
+    """Create a tokenizer of letters and a language model 16 wide."""
+    from tokenizers import Tokenizer, models, pre_tokenizers
+    from transformers import Qwen2TokenizerFast, Qwen3Config, Qwen3ForCausalLM
+
+    words = {word: number for number, word in enumerate(["<pad>", "<unk>", *LETTERS])}
+    letters = Tokenizer(models.WordLevel(words, unk_token="<unk>"))
+    letters.pre_tokenizer = pre_tokenizers.Split("", "isolated")
+    tokenizer = Qwen2TokenizerFast(
+        tokenizer_object=letters,
+        pad_token="<pad>",
+        unk_token="<unk>",
+        chat_template="{% for message in messages %}{{ message['content'] }}{% endfor %}",
+    )
+    config = Qwen3Config(
+        vocab_size=len(tokenizer),
+        hidden_size=16,
+        intermediate_size=16,
+        num_hidden_layers=layers,
+        num_attention_heads=2,
+        num_key_value_heads=2,
+        head_dim=8,
+        pad_token_id=0,
+    )
+    return {"tokenizer": tokenizer, "text_encoder": Qwen3ForCausalLM(config)}
+
+
+def flux2_klein() -> Any:
+    """Create FLUX.2 [klein] with tokens of 4 pixels, as the hub has it: not for inpainting."""
+    import diffusers
+
+    torch.manual_seed(0)
+    return diffusers.Flux2KleinPipeline(
+        scheduler=diffusers.FlowMatchEulerDiscreteScheduler(),
+        vae=diffusers.AutoencoderKLFlux2(
+            block_out_channels=(4, 4),
+            down_block_types=("DownEncoderBlock2D",) * 2,
+            up_block_types=("UpDecoderBlock2D",) * 2,
+            layers_per_block=1,
+            latent_channels=4,
+            norm_num_groups=2,
+        ),
+        transformer=diffusers.Flux2Transformer2DModel(
+            in_channels=16,
+            num_layers=1,
+            num_single_layers=1,
+            attention_head_dim=16,
+            num_attention_heads=2,
+            joint_attention_dim=48,
+            timestep_guidance_channels=16,
+            axes_dims_rope=(4, 4, 4, 4),
+            guidance_embeds=False,
+        ),
+        is_distilled=True,
+        **qwen3(28),
+    )
+
+
+def z_image() -> Any:
+    """Create Z-Image with tokens of 4 pixels, as the hub has it: not for inpainting."""
+    import diffusers
+
+    torch.manual_seed(0)
+    return diffusers.ZImagePipeline(
+        scheduler=diffusers.FlowMatchEulerDiscreteScheduler(),
+        vae=vae(2, shift_factor=0.1, scaling_factor=0.4),
+        transformer=diffusers.ZImageTransformer2DModel(
+            in_channels=4,
+            dim=32,
+            n_layers=1,
+            n_refiner_layers=1,
+            n_heads=2,
+            n_kv_heads=2,
+            cap_feat_dim=16,
+            axes_dims=[4, 6, 6],
+            axes_lens=[1024, 512, 512],
+        ),
+        **qwen3(2),
+    )
+
+
 INPAINTERS = {
     "stable-diffusion": stable_diffusion,
     "stable-diffusion-of-text": lambda: stable_diffusion(inpainting=False),
     "sdxl": sdxl,
     "flux-fill": flux_fill,
+    "flux2-klein": flux2_klein,
+    "z-image": z_image,
 }
 
 

@@ -98,8 +98,8 @@ class GeneratorOptions(Settings):
 
     generator: str = "warp-inpaint"
     """Model that synthesizes the image at a target: warp-inpaint (warped photographs, holes filled
-    by patches), oracle (the real photograph), pe-field (the paper's), diffusers-inpaint, or a model
-    that gives images in the list of `gscompleter models`."""
+    by patches), oracle (the real photograph), pe-field (the paper's), diffusers-inpaint, or one of
+    the other models that docs/generators.md lists."""
     generator_weights: str | None = None
     """Weights, by default those published: a folder saved by diffusers, USER/NAME or
     USER/NAME@COMMIT on the Hugging Face hub for pe-field and diffusers-inpaint (which has no

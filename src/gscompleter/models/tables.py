@@ -6,10 +6,15 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
-from typing import Any, ClassVar
+from typing import Any
 
-from gscompleter.config.generators import FileSettings
-from gscompleter.generators import FunctionGenerator, Generator
+from gscompleter.config.generators import (
+    DiffusersInpaintSettings,
+    FileSettings,
+    GeneratorSettings,
+    PEFieldSettings,
+)
+from gscompleter.generators import Generator, as_generator
 from gscompleter.models.weights.published import PUBLISHED
 from gscompleter.reconstructors import Reconstructor
 from gscompleter.types import View
@@ -22,51 +27,56 @@ def load_learned_reconstructor(name: str, weights: Path | None, device: str) -> 
     return build(name, weights, device)
 
 
-def load_pe_field(settings: Any, seed: int, photographs: Sequence[View], device: str) -> Generator:
+@dataclass(frozen=True)
+class GeneratorLoader:
+    """Loads a generator, and names the class of its settings."""
+
+    load: Callable[[Any, int, str], Any]
+    settings: type[GeneratorSettings]
+
+    def __call__(
+        self, settings: Any, seed: int, photographs: Sequence[View], device: str
+    ) -> Generator:
+        """Load the generator; a plain function is wrapped."""
+        return as_generator(self.load(settings, seed, device))
+
+
+@dataclass(frozen=True)
+class Flux2KleinSettings(DiffusersInpaintSettings):
+    """FLUX.2 [klein], which also sees the nearest photograph."""
+
+    weights: str | None = (
+        "black-forest-labs/FLUX.2-klein-4B@e7b7dc27f91deacad38e78976d1f2b499d76a294"
+    )
+    steps: int | None = 4
+
+
+def load_pe_field(settings: Any, seed: int, device: str) -> Any:
     """Load PE-Field, the diffusion transformer of the paper."""
     from gscompleter.models.diffusion.pe_field import load_pe_field
 
     return load_pe_field(seed, device, settings)
 
 
-def load_diffusers_inpaint(
-    settings: Any, seed: int, photographs: Sequence[View], device: str
-) -> Generator:
+def load_diffusers_inpaint(settings: Any, seed: int, device: str) -> Any:
     """Load an inpainting pipeline of diffusers."""
     from gscompleter.models.diffusion.inpaint import load_diffusers_inpaint
 
-    return FunctionGenerator(load_diffusers_inpaint(seed, device, settings))
+    return load_diffusers_inpaint(seed, device, settings)
 
 
-@dataclass(frozen=True)
-class InpaintingLoader:
-    """Loads a generator that fills holes by a network of one file."""
-
-    load_network: Callable[[Path | None, str], Any]
-    settings: ClassVar[type[FileSettings]] = FileSettings
-
-    def __call__(
-        self, settings: FileSettings, seed: int, photographs: Sequence[View], device: str
-    ) -> Generator:
-        """Load the network from the file of the settings, or the published one."""
-        from gscompleter.models.inpainting.fill import InpaintingGenerator
-
-        local = None if settings.weights is None else Path(settings.weights)
-        return FunctionGenerator(InpaintingGenerator(self.load_network(local, device)))
-
-
-def load_migan(local: Path | None, device: str) -> Any:
+def load_migan(settings: FileSettings, seed: int, device: str) -> Any:
     """Load MI-GAN."""
     from gscompleter.models.inpainting.migan import load_migan
 
-    return load_migan(local, device)
+    return load_migan(settings.weights, device)
 
 
-def load_lama(local: Path | None, device: str) -> Any:
+def load_lama(settings: FileSettings, seed: int, device: str) -> Any:
     """Load LaMa."""
     from gscompleter.models.inpainting.lama import load_lama
 
-    return load_lama(local, device)
+    return load_lama(settings.weights, device)
 
 
 RECONSTRUCTORS: dict[str, Callable[[Path | None, str], Reconstructor]] = {
@@ -76,10 +86,11 @@ RECONSTRUCTORS: dict[str, Callable[[Path | None, str], Reconstructor]] = {
 }
 """Loaders of the learned reconstructors, called with the path of the weights and a device."""
 
-GENERATORS: dict[str, Callable[[Any, int, Sequence[View], str], Generator]] = {
-    "pe-field": load_pe_field,
-    "diffusers-inpaint": load_diffusers_inpaint,
-    "migan": InpaintingLoader(load_migan),
-    "lama": InpaintingLoader(load_lama),
+GENERATORS = {
+    "pe-field": GeneratorLoader(load_pe_field, PEFieldSettings),
+    "diffusers-inpaint": GeneratorLoader(load_diffusers_inpaint, DiffusersInpaintSettings),
+    "flux2-klein": GeneratorLoader(load_diffusers_inpaint, Flux2KleinSettings),
+    "migan": GeneratorLoader(load_migan, FileSettings),
+    "lama": GeneratorLoader(load_lama, FileSettings),
 }
 """Loaders of the learned generators, called with settings, seed, true images and a device."""

@@ -31,6 +31,8 @@ from gscompleter.types import Camera, GeneratorInput, View
 
 DEFAULT_SIDE = 512
 """Default side length of the square image, in pixels."""
+UNMAPPED = {"Flux2KleinPipeline": "Flux2KleinInpaintPipeline"}
+"""Inpainting pipelines by the class of the published one, which diffusers' own mapping lacks."""
 BORDER_WIDTH = 4
 """Width in pixels around a hole that is inpainted too, for smooth borders, but not kept."""
 
@@ -55,23 +57,30 @@ class Painter:
         self,
         image: Float[Tensor, "h w 3"],
         hole: Bool[Tensor, "h w"],
+        reference: Float[Tensor, "_ _ 3"],
         prompt: str,
         seed: int,
         steps: int | None,
     ) -> Float[Tensor, "h w 3"]:
-        """Inpaint the hole; other pixels may change too."""
+        """Inpaint the hole; other pixels may change too.
+
+        A pipeline that takes a reference image sees one, the nearest photograph.
+        """
         size = self.compute_size(*hole.shape)
         mask = (resize_antialiased(hole[..., None].float(), size) > 0).float()
         wanted: dict[str, Any] = {
             "prompt": prompt,
             "image": resize_antialiased(image, size).permute(2, 0, 1)[None].cpu(),
             "mask_image": mask.permute(2, 0, 1)[None].cpu(),
+            "image_reference": reference.permute(2, 0, 1)[None].cpu(),
             "height": size[0],
             "width": size[1],
             "strength": 1.0,  # start from pure noise in the hole
             "generator": torch.Generator().manual_seed(seed),
             "output_type": "pt",
         }
+        if getattr(self.pipeline.config, "is_distilled", False):
+            wanted["guidance_scale"] = 1.0  # which distilled models do not use
         if steps is not None:
             wanted["num_inference_steps"] = steps
         known = inspect.signature(self.pipeline.__call__).parameters
@@ -100,7 +109,9 @@ class DiffusersInpaint:
         hole = dilate(~observed.known, BORDER_WIDTH)
 
         def paint(seed: int) -> Float[Tensor, "h w 3"]:
-            return self.painter.fill_hole(observed.image, hole, self.prompt, seed, self.steps)
+            return self.painter.fill_hole(
+                observed.image, hole, nearest.image, self.prompt, seed, self.steps
+            )
 
         compared = replace(observed, known=~hole)
         correct = context.correct_color
@@ -148,15 +159,17 @@ def load_painter(path: str | None, device: str = "cpu", offload: bool = False) -
 
 def load_inpainting_pipeline(source: Source, dtype: torch.dtype) -> Any:
     """Load the pipeline of a folder or repository as an inpainting pipeline."""
-    from diffusers import AutoPipelineForInpainting, DiffusionPipeline
+    import diffusers
 
-    pipeline = DiffusionPipeline.from_pretrained(
+    pipeline = diffusers.DiffusionPipeline.from_pretrained(
         source.location, dtype=dtype, **load_language_models(source, dtype), **source.load_arguments
     )
     check_parts(pipeline)
     if {"image", "mask_image"} <= set(inspect.signature(pipeline.__call__).parameters):
         return pipeline
-    return AutoPipelineForInpainting.from_pipe(pipeline)
+    unmapped = UNMAPPED.get(type(pipeline).__name__)
+    kind = getattr(diffusers, unmapped) if unmapped else diffusers.AutoPipelineForInpainting
+    return kind.from_pipe(pipeline)
 
 
 def get_size_rules(pipeline: Any) -> tuple[int, int]:

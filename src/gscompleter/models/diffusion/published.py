@@ -88,6 +88,9 @@ PE_FIELD_TRANSFORMER = {
 """Configuration of that transformer in diffusers."""
 
 LICENCES = {
+    "flux.2-klein-4b": "Apache-2.0",
+    "z-image": "Apache-2.0",
+    "qwen-image": "Apache-2.0",
     "flux": "the FLUX.1 [dev] Non-Commercial License for the [dev] models, and a gated page",
     "stable-diffusion-xl": "CreativeML Open RAIL++-M for Stability's own",
     "stable-diffusion": "CreativeML Open RAIL-M for Stability's and Runway's own",

@@ -2,13 +2,12 @@
 
 from __future__ import annotations
 
-from pathlib import Path
-
 import numpy as np
 import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
+from gscompleter.models.inpainting.fill import InpaintingGenerator
 from gscompleter.models.inpainting.onnx_network import OnnxNetwork, load_network
 from gscompleter.models.weights.published import PUBLISHED
 
@@ -39,6 +38,7 @@ class LaMa:
         return torch.from_numpy(result[0] / 255).permute(1, 2, 0)[:height, :width]
 
 
-def load_lama(local: Path | None = None, device: str = "cpu") -> LaMa:
-    """Load the network; raises the errors of `load_network`."""
-    return LaMa(load_network(PUBLISHED["lama"], SIGNATURE, local, device))
+def load_lama(file: str | None = None, device: str = "cpu") -> InpaintingGenerator:
+    """Load the generator from a file, or the published one; raises the errors of `load_network`."""
+    network = load_network(PUBLISHED["lama"], SIGNATURE, file, device)
+    return InpaintingGenerator(LaMa(network))

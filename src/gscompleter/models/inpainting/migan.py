@@ -2,12 +2,11 @@
 
 from __future__ import annotations
 
-from pathlib import Path
-
 import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
+from gscompleter.models.inpainting.fill import InpaintingGenerator
 from gscompleter.models.inpainting.onnx_network import OnnxNetwork, load_network
 from gscompleter.models.weights.published import PUBLISHED
 
@@ -30,6 +29,7 @@ class MIGAN:
         return torch.from_numpy(result[0]).permute(1, 2, 0).float() / 255
 
 
-def load_migan(local: Path | None = None, device: str = "cpu") -> MIGAN:
-    """Load the network; raises the errors of `load_network`."""
-    return MIGAN(load_network(PUBLISHED["migan"], SIGNATURE, local, device))
+def load_migan(file: str | None = None, device: str = "cpu") -> InpaintingGenerator:
+    """Load the generator from a file, or the published one; raises the errors of `load_network`."""
+    network = load_network(PUBLISHED["migan"], SIGNATURE, file, device)
+    return InpaintingGenerator(MIGAN(network))

@@ -39,7 +39,7 @@ class OnnxNetwork:
 
 
 def load_network(
-    weights: PublishedWeights, signature: Signature, local: Path | None, device: str
+    weights: PublishedWeights, signature: Signature, file: str | None, device: str
 ) -> OnnxNetwork:
     """Load the published network, or a file of the same signature.
 
@@ -51,9 +51,9 @@ def load_network(
         raise InputError(
             f"The generator {weights.name!r} needs onnxruntime: {INSTALL}.", "generator"
         )
-    path = fetch(weights, local)
+    path = fetch(weights, None if file is None else Path(file))
     check_kind(path, weights.file)
-    if local is None and weights.sha256 is not None:
+    if file is None and weights.sha256 is not None:
         check_sha256(path, weights.sha256, weights.file)
     session = open_session(path, device)
     given = {x.name: (x.type, x.shape[1]) for x in session.get_inputs() if len(x.shape) == 4}
