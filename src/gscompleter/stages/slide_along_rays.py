@@ -52,7 +52,7 @@ def slide_along_rays(
     config, pixel_index = view.state.config.registration, lift.pixel_index
     camera = reference.camera
     coarse = apply_affine(lift.gaussians, affine, camera, config.footprint, config.min_ratio)
-    if config.iterations == 0 or len(coarse) == 0:
+    if config.iterations == 0:
         return Registration(coarse, pixel_index, ())
     if config.hole_depth == "scene" and pixel_index is not None:
         depth = fill_smoothly(view.render.depth, ~view.holes).flatten()[pixel_index]
@@ -68,40 +68,33 @@ def register_beside_holes(
 ) -> Registration:
     """Register Gaussians that overlap the scene, and move those in holes like them."""
     scene = view.render.depth_map(view.state.config.holes.max_alpha)
+    camera, config = reference.camera, view.state.config.registration
     rows = torch.nonzero(scene.valid.flatten()[pixel_index])[:, 0]
     registered, losses = register_along_rays(coarse[rows], reference, view)
-    moved = extrapolate_into_holes(
-        coarse,
-        registered,
-        rows,
-        pixel_index,
-        scene,
-        reference.camera,
-        view.state.config.registration,
-    )
+    ratios = extrapolate_into_holes(coarse[rows], registered, pixel_index[rows], scene, camera)
+    moved = slide(coarse, camera, ratios.flatten()[pixel_index], config.footprint)
     return Registration(extrapolate_sky(moved, pixel_index, scene, reference), pixel_index, losses)
 
 
 def extrapolate_into_holes(
     coarse: Gaussians,
     registered: Gaussians,
-    rows: Int[Tensor, "k"],
-    pixel_index: Int[Tensor, "n"],
+    pixels: Int[Tensor, "n"],
     scene: DepthMap,
     camera: Camera,
-    config: RegistrationConfig,
-) -> Gaussians:
-    """Extrapolate the correction d' / d of well registered rows of `coarse` smoothly into holes."""
-    depths, pixels = compute_z_depths(registered.means, camera), pixel_index[rows]
+) -> Float[Tensor, "h w"]:
+    """Compute the correction d' / d of each pixel; well registered ones are extrapolated smoothly.
+
+    `pixels` are those of the Gaussians, where `scene` is valid; it is extrapolated elsewhere.
+    """
+    depths = compute_z_depths(registered.means, camera)
     correction = torch.zeros_like(scene.depth).flatten()
-    correction[pixels] = (depths / compute_z_depths(coarse.means[rows], camera)).log()
+    correction[pixels] = (depths / compute_z_depths(coarse.means, camera)).log()
     known = torch.zeros_like(scene.valid).flatten()
     error = (depths / scene.depth.flatten()[pixels].clamp_min(1e-12) - 1).abs()
     known[pixels] = error < EXTRAPOLATION_TOLERANCE
-    shape = scene.valid.shape
-    filled = fill_smoothly(correction.view(shape), known.view(shape))
-    ratio = torch.where(scene.valid, correction.view(shape), filled).exp()
-    return slide(coarse, camera, ratio.flatten()[pixel_index], config.footprint)
+    correction, known = correction.view_as(scene.depth), known.view_as(scene.valid)
+    return torch.where(scene.valid, correction, fill_smoothly(correction, known)).exp()
 
 
 def extrapolate_sky(
@@ -162,6 +155,8 @@ def register_along_rays(
     coarse: Gaussians, reference: View, view: TargetView
 ) -> tuple[Gaussians, tuple[float, ...]]:
     """Minimize Eq. 11 over one distance per Gaussian; also return the loss per iteration."""
+    if len(coarse) == 0:
+        return coarse, ()
     config, renderer = view.state.config.registration, view.scenes.renderer
     anchor = view.anchor_view.camera
     objective = Objective.from_renders(view.render, view.anchor_render, reference, anchor, config)
