@@ -180,6 +180,25 @@ def test_an_image_that_is_not_finite_is_refused():
         generator(context.views[1], TARGET, context)
 
 
+def test_a_network_that_fails_is_refused_with_one_sentence(tmp_path):
+    wide, hole = IMAGE.repeat(1, 2, 1), HOLE.repeat(1, 2)
+    turn = [make_node("Transpose", "image", "output", perm=[0, 1, 3, 2])]
+    turned = save(tmp_path / "turned.onnx", TensorProto.FLOAT, turn, output="output")
+    with pytest.raises(
+        InputError, match=r"an image of shape \(1, 3, 64, 128\) by \(1, 3, 128, 64\)"
+    ):
+        load_lama(str(turned)).fill(wide, hole)
+    add = [make_node("Add", "turned image", "output")]
+    failing = save(
+        tmp_path / "failing.onnx",
+        TensorProto.FLOAT,
+        [make_node("Transpose", "image", "turned", perm=[0, 1, 3, 2]), *add],
+        output="output",
+    )
+    with pytest.raises(InputError, match="failed on an image"):
+        load_lama(str(failing)).fill(wide, hole)
+
+
 @pytest.mark.parametrize("name", ["migan", "lama"])
 def test_other_files_are_refused_with_one_sentence(name, migan_file, tmp_path):
     assert get_settings_class(name) is FileSettings

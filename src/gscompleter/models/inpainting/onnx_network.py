@@ -16,13 +16,14 @@ from gscompleter.models.weights.published import PublishedWeights
 from gscompleter.models.weights.reading import check_kind, check_sha256
 
 INSTALL = "pip install 'gscompleter[onnx]'"
+ADVICE = "check that the file is the published one, or choose another generator"
 
 Signature = Mapping[str, tuple[str, int]]
 """Type and number of channels of each input, by its name."""
 
 
 class OnnxNetwork:
-    """A network with two or more image inputs and one image as its output."""
+    """A network from an image and a mask to an image of the same size."""
 
     def __init__(self, session: Any) -> None:
         self.session = session
@@ -33,9 +34,17 @@ class OnnxNetwork:
         height, width = (*self.session.get_inputs()[0].shape, None, None)[2:4]
         return (height, width) if isinstance(height, int) and isinstance(width, int) else None
 
-    def __call__(self, **images: ndarray) -> ndarray:
-        """Run the network on arrays of shape [1, c, h, w]."""
-        return self.session.run(None, images)[0]
+    def __call__(self, image: ndarray, mask: ndarray) -> ndarray:
+        """Run the network on arrays of shape [1, c, h, w]; raise InputError if it fails."""
+        try:
+            (result,) = self.session.run(None, {"image": image, "mask": mask})
+        except Exception as error:  # onnxruntime has an error class per status code
+            raise InputError(f"The network failed on an image; {ADVICE}.") from error
+        if result.shape != image.shape:
+            raise InputError(
+                f"The network answered an image of shape {image.shape} by {result.shape}; {ADVICE}."
+            )
+        return result
 
 
 def load_network(
