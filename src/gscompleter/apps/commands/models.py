@@ -22,6 +22,14 @@ from gscompleter.models.weights.fetching import (
 )
 from gscompleter.models.weights.published import PUBLISHED, PublishedWeights
 
+KINDS = {
+    "Gaussians": "",
+    "scene depth": ", scene depth only",
+    "depth": ", depth only",
+    "image": ", a generator",
+}
+"""What the table says of a network, by its output."""
+
 
 def run_models(options: ModelsOptions) -> None:
     """Print the published weights and their location on this machine; download some first."""
@@ -84,7 +92,7 @@ def format_cells(weights: PublishedWeights, path: Path | None) -> tuple[str, ...
     count = weights.parameters
     return (
         weights.name,
-        weights.model if weights.gives == "Gaussians" else f"{weights.model}, {weights.gives} only",
+        weights.model + KINDS[weights.gives],
         "?" if count is None else f"{count / 1e6:.1f} M",
         f"{fewest}" if fewest == most else f"{fewest}-{most}",
         weights.size,
