@@ -84,6 +84,23 @@ def test_a_quick_run_tells_every_stage_of_its_case_and_its_methods(quick):
     assert report["settings"]["baseline_iterations"] == 2
 
 
+def test_generators_are_compared_in_the_same_holes(scene, tmp_path, monkeypatch, capsys):
+    cases, out = write_cases(scene, near=0.5, far=20), tmp_path / "out"
+    words = ("bench", "--cases", cases, "--quick", "--quiet", "--generators", "warp-inpaint")
+    assert run(monkeypatch, *words, "--out", out) == 0
+    (filling,) = json.loads((out / "bench.json").read_text())["warp-inpaint"]
+    assert filling["seconds"] > 0
+    assert filling["hole"]["psnr"] > 12
+    table = (out / "tables.md").read_text()
+    assert table == capsys.readouterr().out.rstrip("\n") + "\n"
+    assert (
+        f"| warp-inpaint | 1 | {filling['seconds']:.2f} | {filling['hole']['psnr']:.2f} |" in table
+    )
+    monkeypatch.setenv("HF_HUB_OFFLINE", "1")
+    assert run(monkeypatch, *words, "nothing") == 2
+    assert "There is no generator 'nothing'" in capsys.readouterr().err
+
+
 def test_the_rest_of_a_process_is_what_its_completion_does_not_count(quick):
     (case,) = json.loads((quick / "bench.json").read_text())["cases"]
     seconds = case["samples"][0]["seconds"]

@@ -21,6 +21,7 @@ from gscompleter.apps.bench.cases import (
     read_manifest,
     write_input_splat,
 )
+from gscompleter.apps.bench.generators import compare_generators, format_generators
 from gscompleter.apps.bench.measure import (
     Sample,
     Task,
@@ -97,13 +98,18 @@ def run_bench(options: BenchOptions) -> None:
         with show_progress(None if options.quiet else Console(stderr=True)):
             with show_preparation("getting ready"):
                 bench = prepare_bench(options, Path(temporary))
+            if options.generators:
+                found = compare_generators(options.generators, cases, bench.models, bench.device)
+                values = {name: [asdict(one) for one in some] for name, some in found.items()}
+                write_results(values, format_generators(found), options)
+                return
             report = run_measurements(bench, cases, series)
-    write_report(report, options)
+    write_results(asdict(report), format_report(report), options)
 
 
-def write_report(report: Report, options: BenchOptions) -> None:
+def write_results(values: dict[str, Any], tables: str, options: BenchOptions) -> None:
     """Print the tables or JSON, and write both to the output folder."""
-    text, tables = json.dumps(asdict(report), indent=1), format_report(report)
+    text = json.dumps(values, indent=1)
     if options.out is not None:
         with open_output_folder(options.out, options.overwrite) as folder:
             (folder / "bench.json").write_text(text + "\n")

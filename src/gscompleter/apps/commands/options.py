@@ -329,6 +329,9 @@ class BenchOptions(RunOptions, WritingOptions):
     """JSON file of scenes with their frames and growth series, as benchmarks/performance.json."""
     methods: tuple[BenchMethod, ...] = ("full", "densify-800", "distill", "reggs")
     """Methods to compare on the first case: full (ours) or others."""
+    generators: tuple[str, ...] = ()
+    """Compare these generators instead, at the first target of each case: seconds, and scores in
+    holes."""
     growth: tuple[Axis, ...] = ("gaussians", "pixels", "views", "targets")
     """Quantities to increase in the first case."""
     repeats: Annotated[int, Interval(ge=1, le=1000)] = 5
