@@ -28,7 +28,7 @@ KINDS = {
     "depth": ", depth only",
     "image": ", a generator",
 }
-"""What the table says of a network, by its output."""
+"""Description of a network in the table, by its output."""
 
 
 def run_models(options: ModelsOptions) -> None:
