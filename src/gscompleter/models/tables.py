@@ -27,6 +27,13 @@ def load_learned_reconstructor(name: str, weights: Path | None, device: str) -> 
     return build(name, weights, device)
 
 
+def load_map_anything(weights: Path | None, device: str) -> Reconstructor:
+    """Load MapAnything through its own package."""
+    from gscompleter.models.map_anything import load_map_anything
+
+    return load_map_anything(weights, device)
+
+
 @dataclass(frozen=True)
 class GeneratorLoader:
     """Loads a generator, and names the class of its settings."""
@@ -83,7 +90,7 @@ RECONSTRUCTORS: dict[str, Callable[[Path | None, str], Reconstructor]] = {
     name: partial(load_learned_reconstructor, name)
     for name, weights in PUBLISHED.items()
     if weights.is_reconstructor
-}
+} | {"mapanything": load_map_anything}
 """Loaders of the learned reconstructors, called with the path of the weights and a device."""
 
 GENERATORS = {
