@@ -28,6 +28,8 @@ OCCLUDER_MARGIN = 0.05
 """Smallest distance in depth to an occluder, relative to the depth of the surface."""
 OCCLUSION_RADIUS = 4
 """Radius in pixels over which the mask of occluded hole pixels is averaged."""
+BORDER_WIDTH = 4
+"""Width in pixels around a hole that networks paint, too, as depth at its border is unsure."""
 LINE_FIDELITY = 0.1
 """Weight of a line in the membrane, relative to a known pixel."""
 

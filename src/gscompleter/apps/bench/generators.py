@@ -66,9 +66,15 @@ def format_generators(found: dict[str, list[Filling]]) -> str:
             name,
             str(len(fillings)),
             f"{median(one.seconds for one in fillings):.2f}",
-            f"{fmean(one.hole.psnr or 0.0 for one in fillings):.2f}",
-            f"{fmean(one.hole.haarpsi or 0.0 for one in fillings):.3f}",
+            format_mean([one.hole.psnr for one in fillings], 2),
+            format_mean([one.hole.haarpsi for one in fillings], 3),
         ]
         for name, fillings in found.items()
     ]
     return format_markdown(columns, rows)
+
+
+def format_mean(values: Sequence[float | None], digits: int) -> str:
+    """Format the mean of the known values, or a dash without one."""
+    known = [value for value in values if value is not None]
+    return f"{fmean(known):.{digits}f}" if known else "–"

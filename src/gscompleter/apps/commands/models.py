@@ -15,7 +15,6 @@ from gscompleter.apps.commands.options import ModelsOptions
 from gscompleter.errors import InputError, quote_value
 from gscompleter.models.weights.fetching import (
     INSTALL,
-    fetch,
     find_cached,
     get_cache_path,
     is_hub_installed,
@@ -59,13 +58,9 @@ def download(name: str) -> None:
             f"There are no weights '{quote_value(name)}'; choose one of {', '.join(PUBLISHED)}.",
             "download",
         )
-    from gscompleter.models.weights.reading import check_kind, check_sha256
+    from gscompleter.models.weights.reading import fetch_checked
 
-    weights = PUBLISHED[name]
-    path = fetch(weights)
-    check_kind(path, weights.file)
-    if weights.sha256 is not None:
-        check_sha256(path, weights.sha256, weights.file)
+    fetch_checked(PUBLISHED[name])
 
 
 def print_models(found: Sequence[tuple[PublishedWeights, Path | None]]) -> None:

@@ -15,7 +15,7 @@ from gscompleter.config.generators import DiffusersInpaintSettings
 from gscompleter.errors import InputError
 from gscompleter.generators import GeneratorOutput
 from gscompleter.generators.agreement import paint_consistently
-from gscompleter.generators.warp import complete_warp
+from gscompleter.generators.warp import BORDER_WIDTH, complete_warp
 from gscompleter.image_ops import dilate
 from gscompleter.models.diffusion.complete import check_parts, load_language_models
 from gscompleter.models.diffusion.kontext import resize_antialiased
@@ -33,8 +33,6 @@ DEFAULT_SIDE = 512
 """Default side length of the square image, in pixels."""
 UNMAPPED = {"Flux2KleinPipeline": "Flux2KleinInpaintPipeline"}
 """Inpainting pipelines by the class of the published one, which diffusers' own mapping lacks."""
-BORDER_WIDTH = 4
-"""Width in pixels around a hole that is inpainted too, for smooth borders, but not kept."""
 
 
 @dataclass(frozen=True)

@@ -11,12 +11,10 @@ from torch import Tensor
 
 from gscompleter.errors import InputError
 from gscompleter.generators.smooth import fit_membrane
-from gscompleter.generators.warp import complete_warp
+from gscompleter.generators.warp import BORDER_WIDTH, complete_warp
 from gscompleter.image_ops import dilate
 from gscompleter.types import Camera, GeneratorInput, View
 
-BORDER_WIDTH = 4
-"""Width in pixels around a hole that is filled, too, as depth at its border is unsure."""
 WINDOW = 512
 """Side in pixels of the windows in which larger images are filled; networks are trained at it."""
 

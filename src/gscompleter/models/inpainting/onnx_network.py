@@ -11,9 +11,8 @@ from numpy import ndarray
 
 from gscompleter.cpu_threads import get_thread_count
 from gscompleter.errors import InputError
-from gscompleter.models.weights.fetching import fetch
 from gscompleter.models.weights.published import PublishedWeights
-from gscompleter.models.weights.reading import check_kind, check_sha256
+from gscompleter.models.weights.reading import fetch_checked
 
 INSTALL = "pip install 'gscompleter[onnx]'"
 ADVICE = "check that the file is the published one, or choose another generator"
@@ -60,10 +59,7 @@ def load_network(
         raise InputError(
             f"The generator {weights.name!r} needs onnxruntime: {INSTALL}.", "generator"
         )
-    path = fetch(weights, None if file is None else Path(file))
-    check_kind(path, weights.file)
-    if file is None and weights.sha256 is not None:
-        check_sha256(path, weights.sha256, weights.file)
+    path = fetch_checked(weights, None if file is None else Path(file))
     session = open_session(path, device)
     given = {x.name: (x.type, x.shape[1]) for x in session.get_inputs() if len(x.shape) == 4}
     network = OnnxNetwork(session)

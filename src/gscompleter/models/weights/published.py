@@ -199,45 +199,48 @@ DEPTHSPLAT = _create_depthsplat(
 )
 DEPTH_ALONE: dict[str, Any] = {"near_far": None, "entry": "model", "prefix": "", "gives": "depth"}
 
-MIGAN = PublishedWeights(
-    name="migan",
-    model="MI-GAN",
-    network="migan",
-    repository="andraniksargsyan/migan",
+
+def _create_inpainting(
+    model: str, repository: str, licence: str, **others: Any
+) -> PublishedWeights:
+    """Create the entry of a generator that fills holes, whose licence allows commercial use."""
+    return PublishedWeights(
+        name=model.lower().replace("-", ""),
+        model=model,
+        network=None,
+        repository=repository,
+        parameters=None,
+        views=(1, 1),
+        image_size=(512, 512),
+        near_far=None,
+        code_licence=licence,
+        weights_licence=licence,
+        caution="",
+        source=f"https://huggingface.co/{repository}",
+        gives="image",
+        **others,
+    )
+
+
+MIGAN = _create_inpainting(
+    "MI-GAN",
+    "andraniksargsyan/migan",
+    "MIT",
     revision="406830d0fa60666da0071c342ad2fbc8f30c5c64",
     file="migan_pipeline_v2.onnx",
     sha256="6f1f3530a1a2324b19752018ce756088b07973cda8d7d890034ace5c8a48c40b",
     megabytes=28,
-    parameters=None,
-    views=(1, 1),
-    image_size=(512, 512),
-    near_far=None,
     code="https://github.com/Picsart-AI-Research/MI-GAN",
-    weights_licence="MIT",
-    caution="",
-    source="https://huggingface.co/andraniksargsyan/migan",
-    gives="image",
 )
-
-LAMA = PublishedWeights(
-    name="lama",
-    model="LaMa",
-    network="lama",
-    repository="Carve/LaMa-ONNX",
+LAMA = _create_inpainting(
+    "LaMa",
+    "Carve/LaMa-ONNX",
+    "Apache-2.0",
     revision="c3c0c9e468934d62e79c329e35d82dd09ff8c444",
     file="lama_fp32.onnx",
     sha256="1faef5301d78db7dda502fe59966957ec4b79dd64e16f03ed96913c7a4eb68d6",
     megabytes=208,
-    parameters=None,
-    views=(1, 1),
-    image_size=(512, 512),
-    near_far=None,
     code="https://github.com/advimman/lama",
-    code_licence="Apache-2.0",
-    weights_licence="Apache-2.0",
-    caution="",
-    source="https://huggingface.co/Carve/LaMa-ONNX",
-    gives="image",
 )
 
 _FILES = (

@@ -16,6 +16,7 @@ from torch import Tensor
 
 from gscompleter.errors import InputError, join_names, quote_value, refuse_pointer
 from gscompleter.io.reading import open_file
+from gscompleter.models.weights.fetching import fetch
 from gscompleter.models.weights.published import PUBLISHED, PublishedWeights
 
 IGNORED_PREFIXES = ("decoder.", "losses.")
@@ -39,6 +40,15 @@ def read_state_dict(path: Path, weights: PublishedWeights) -> dict[str, Tensor]:
         check_archive(path, weights.file)
     read = read_safetensors if path.suffix == ".safetensors" else read_tensors
     return extract_network_tensors(read(path, weights.file), path, weights)
+
+
+def fetch_checked(weights: PublishedWeights, local: Path | None = None) -> Path:
+    """Fetch a file and check it, by its published SHA-256 unless the user names it by `local`."""
+    path = fetch(weights, local)
+    check_kind(path, weights.file)
+    if local is None and weights.sha256 is not None:
+        check_sha256(path, weights.sha256, weights.file)
+    return path
 
 
 def check_kind(path: Path, name: str) -> None:
