@@ -36,6 +36,8 @@ class RunConfig:
     reconstructor: str = "plane-sweep"
     weights: str | None = None
     """File with the weights of the reconstructor; None selects the published ones."""
+    depth: str = "none"
+    depth_weights: str | None = None
     generator: str = "warp-inpaint"
     generator_settings: GeneratorSettings | None = None
     device: Literal["cpu", "cuda"] = "cpu"
@@ -50,9 +52,10 @@ class RunConfig:
 
         Only the generator `oracle` uses the images of `targets`.
         """
-        weights = None if self.weights is None else Path(self.weights)
         return Models(
-            load_reconstructor(self.reconstructor, weights, self.device),
+            load_reconstructor(
+                self.reconstructor, self.weights, self.device, self.depth, self.depth_weights
+            ),
             load_generator(
                 self.generator, self.seed, targets, self.device, self.generator_settings
             ),

@@ -17,6 +17,7 @@ from gscompleter.config.generators import (
 from gscompleter.generators import Generator, as_generator
 from gscompleter.models.weights.published import PUBLISHED
 from gscompleter.reconstructors import Reconstructor
+from gscompleter.reconstructors.depth_predictors import DepthPredictor
 from gscompleter.types import View
 
 
@@ -72,6 +73,13 @@ def load_diffusers_inpaint(settings: Any, seed: int, device: str) -> Any:
     return load_diffusers_inpaint(seed, device, settings)
 
 
+def load_moge(name: str, weights: Path | None, device: str) -> DepthPredictor:
+    """Load MoGe-2."""
+    from gscompleter.models.moge import load_moge
+
+    return load_moge(name, weights, device)
+
+
 def load_migan(settings: FileSettings, seed: int, device: str) -> Any:
     """Load MI-GAN."""
     from gscompleter.models.inpainting.migan import load_migan
@@ -101,3 +109,10 @@ GENERATORS = {
     "lama": GeneratorLoader(load_lama, FileSettings),
 }
 """Loaders of the learned generators, called with settings, seed, true images and a device."""
+
+DEPTH_PREDICTORS = {
+    name: partial(load_moge, name)
+    for name, weights in PUBLISHED.items()
+    if weights.gives == "monocular depth"
+}
+"""Loaders of monocular depth, called with the path of the weights and a device."""

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Sequence
-from dataclasses import fields, is_dataclass
+from dataclasses import fields, is_dataclass, replace
 from pathlib import Path
 from typing import Protocol, runtime_checkable
 
@@ -12,6 +12,7 @@ from torch import Tensor
 
 from gscompleter.errors import InputError, quote_value
 from gscompleter.plugins import load_plugins
+from gscompleter.reconstructors.depth_predictors import load_depth_predictor
 from gscompleter.types import Reconstruction, View
 
 
@@ -103,13 +104,25 @@ def check_reconstructor(name: str) -> None:
 
 
 def load_reconstructor(
-    name: str, weights: Path | str | None = None, device: str = "cpu"
+    name: str,
+    weights: Path | str | None = None,
+    device: str = "cpu",
+    depth: str = "none",
+    depth_weights: Path | str | None = None,
 ) -> Reconstructor:
     """Load a reconstructor by name, with published weights unless others are given.
 
-    Published weights are downloaded if needed. `device` is that of the network; `plane-sweep`
-    always runs on the CPU.
+    Published weights are downloaded if needed. `device` is that of the networks; `plane-sweep`
+    itself runs on the CPU. `depth` names the monocular depth that supports it.
     """
     check_reconstructor(name)
     load = RECONSTRUCTORS.get(name) or list_reconstructors()[name]
-    return load(None if weights is None else Path(weights), device)
+    made = load(None if weights is None else Path(weights), device)
+    if depth == "none":
+        return made
+    if "predict_depth" not in getattr(made, "__dataclass_fields__", ()):
+        raise InputError(
+            f"The reconstructor '{name}' uses no monocular depth; leave it out.", "depth"
+        )
+    given = None if depth_weights is None else Path(depth_weights)
+    return replace(made, predict_depth=load_depth_predictor(depth, given, device))  # type: ignore[type-var]

@@ -22,7 +22,7 @@ from gscompleter.jobs.jobs import Job
 
 FOLDER, NAME = "folder", "name"
 """Columns of the scene folder and of the job name."""
-PATHS = (FOLDER, "scene", "weights")
+PATHS = (FOLDER, "scene", "weights", "depth_weights")
 """Options that are paths."""
 LONGEST_FILE = 2 * 10**9
 """Maximum number of bytes of a manifest."""

@@ -216,6 +216,7 @@ def describe_settings(options: CompleteOptions) -> dict[str, Any]:
         "auto": None if options.target else get_max_targets(options),
         "reconstructor": options.reconstructor,
         "weights": None if options.weights is None else str(options.weights),
+        "depth": options.depth,
         **options.synthesis.describe(),
         "uses_target_photographs": options.synthesis.generator == "oracle",
     }
@@ -228,7 +229,9 @@ def load_completer(options: CompleteOptions, targets: Sequence[Target], device: 
     if options.no_recolor:
         config = replace(config, recolor=replace(config.recolor, iterations=0))
     return GSCompleter(
-        load_reconstructor(options.reconstructor, options.weights, device),
+        load_reconstructor(
+            options.reconstructor, options.weights, device, options.depth, options.depth_weights
+        ),
         load_generator(
             synthesis.generator, options.seed, photographs, device, synthesis.make_settings()
         ),

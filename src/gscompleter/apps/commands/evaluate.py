@@ -66,6 +66,8 @@ def score_methods(options: EvaluateOptions) -> int:
     config = RunConfig(
         reconstructor=options.reconstructor[0],
         weights=str(options.weights[0]) if options.weights else None,
+        depth=options.depth,
+        depth_weights=str(options.depth_weights) if options.depth_weights else None,
         generator=options.synthesis.generator,
         generator_settings=options.synthesis.make_settings(),
         device=choose_device(options.device),

@@ -24,6 +24,7 @@ from gscompleter.models.weights.published import PUBLISHED, PublishedWeights
 KINDS = {
     "Gaussians": "",
     "scene depth": ", scene depth only",
+    "monocular depth": ", for --depth",
     "depth": ", depth only",
     "image": ", a generator",
 }

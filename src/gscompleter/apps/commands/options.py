@@ -78,6 +78,10 @@ class RunOptions(ComputeOptions):
 class SynthesisOptions(RunOptions):
     """Options of every command with a choice of the generator."""
 
+    depth: str = "none"
+    """Monocular depth that helps plane-sweep where stereo measures nothing: none, or moge-2."""
+    depth_weights: Path | None = None
+    """Weights file of that depth; downloaded if not given."""
     synthesis: Annotated[GeneratorOptions, tyro.conf.OmitArgPrefixes] = GeneratorOptions()
 
 

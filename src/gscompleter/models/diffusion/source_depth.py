@@ -20,10 +20,12 @@ from gscompleter.models.diffusion.published import (
     convert_load_errors,
     parse_source,
 )
+from gscompleter.models.tables import DEPTH_PREDICTORS
+from gscompleter.reconstructors.depth_predictors import DepthPredictor
 from gscompleter.types import Render, View
 
 MONOCULAR_MODEL = "depth-anything/Depth-Anything-V2-Small-hf"
-"""Published depth model. The authors use MoGe-2, which transformers does not support."""
+"""Published depth model of transformers. The authors use MoGe-2."""
 PREDICTS_DEPTH = {"depth_anything": False, "dpt": False, "glpn": True}
 """Supported kinds of networks, and True for those that predict depth rather than disparity."""
 UNUSED_TENSORS = r"fusion_stage\.layers\.0\.residual_layer1\."
@@ -90,6 +92,19 @@ class MonocularDepth:
         return rescale_depth(guess, render) if metric else convert_disparity(guess, render)
 
 
+@dataclass(frozen=True)
+class PredictedDepth:
+    """Depth of a predictor, fitted to the scene; the sky is as far as the farthest surface."""
+
+    predict: DepthPredictor
+
+    def __call__(self, photograph: View, render: Render) -> Float[Tensor, "h w"]:
+        """Predict depth and fit it to the scene; raises the errors of `compute_context_depth`."""
+        found = self.predict(photograph)
+        farthest = found.depth.where(found.valid, 0.0).max()
+        return rescale_depth(found.depth.where(found.valid, farthest), render)
+
+
 def rescale_depth(guess: Float[Tensor, "h w"], render: Render) -> Float[Tensor, "h w"]:
     """Scale depth by the median ratio to the depth of the scene."""
     valid = find_valid_depth(render)
@@ -115,9 +130,11 @@ def compute_deviation(values: Float[Tensor, "n"]) -> Float[Tensor, ""]:
 
 
 def load_source_depth(name: str, device: str = "cpu") -> SourceDepth:
-    """Return `context`, `monocular` (the published model), or the model of a path."""
+    """Return `context`, `monocular` (the published model), MoGe-2 or the model of a path."""
     if name == "context":
         return compute_context_depth
+    if name in DEPTH_PREDICTORS:
+        return PredictedDepth(DEPTH_PREDICTORS[name](None, device))
     return load_monocular(MONOCULAR_MODEL if name == "monocular" else name, device)
 
 

@@ -7,12 +7,14 @@ from dataclasses import dataclass
 
 import torch
 from jaxtyping import Bool, Float
+from numpy import ndarray
 from torch import Tensor
 
 from gscompleter.errors import InputError
 from gscompleter.generators.smooth import fit_membrane
 from gscompleter.generators.warp import BORDER_WIDTH, complete_warp
 from gscompleter.image_ops import dilate
+from gscompleter.models.onnx_network import ADVICE, OnnxNetwork
 from gscompleter.types import Camera, GeneratorInput, View
 
 WINDOW = 512
@@ -60,6 +62,16 @@ def fill_windows(
             image[at] = torch.where(left[at][..., None], filled, image[at])
             left[at] = False
     return image
+
+
+def run_network(network: OnnxNetwork, image: ndarray, mask: ndarray) -> ndarray:
+    """Run a network on an image and a mask; raise InputError if its answer is of another size."""
+    (result,) = network(image=image, mask=mask)
+    if result.shape != image.shape:
+        raise InputError(
+            f"The network answered an image of shape {image.shape} by {result.shape}; {ADVICE}."
+        )
+    return result
 
 
 def place_windows(height: int, width: int) -> Iterator[tuple[slice, slice]]:

@@ -2,13 +2,15 @@
 
 from __future__ import annotations
 
+from pathlib import Path
+
 import numpy as np
 import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
-from gscompleter.models.inpainting.fill import InpaintingGenerator
-from gscompleter.models.inpainting.onnx_network import OnnxNetwork, load_network
+from gscompleter.models.inpainting.fill import InpaintingGenerator, run_network
+from gscompleter.models.onnx_network import OnnxNetwork, load_network
 from gscompleter.models.weights.published import PUBLISHED
 
 SIGNATURE = {"image": ("tensor(float)", 3), "mask": ("tensor(float)", 1)}
@@ -34,11 +36,12 @@ class LaMa:
         border = ((0, rows - height), (0, columns - width))
         pixels = np.pad(image.numpy(), (*border, (0, 0)), mode="symmetric").transpose(2, 0, 1)[None]
         mask = np.pad(hole.float().numpy(), border, mode="symmetric")[None, None]
-        result = self.network(image=np.ascontiguousarray(pixels), mask=mask)
+        result = run_network(self.network, image=np.ascontiguousarray(pixels), mask=mask)
         return torch.from_numpy(result[0] / 255).permute(1, 2, 0)[:height, :width]
 
 
 def load_lama(file: str | None = None, device: str = "cpu") -> InpaintingGenerator:
     """Load the generator from a file, or the published one; raises the errors of `load_network`."""
-    network = load_network(PUBLISHED["lama"], SIGNATURE, file, device)
+    path = None if file is None else Path(file)
+    network = load_network(PUBLISHED["lama"], SIGNATURE, path, device)
     return InpaintingGenerator(LaMa(network))

@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+from pathlib import Path
+
 import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
-from gscompleter.models.inpainting.fill import InpaintingGenerator
-from gscompleter.models.inpainting.onnx_network import OnnxNetwork, load_network
+from gscompleter.models.inpainting.fill import InpaintingGenerator, run_network
+from gscompleter.models.onnx_network import OnnxNetwork, load_network
 from gscompleter.models.weights.published import PUBLISHED
 
 SIGNATURE = {"image": ("tensor(uint8)", 3), "mask": ("tensor(uint8)", 1)}
@@ -25,11 +27,12 @@ class MIGAN:
         """Fill the hole of an image in [0, 1]."""
         pixels = (255 * image.clamp(0, 1)).round().byte().permute(2, 0, 1)[None]
         known = 255 * (~hole).byte()[None, None]
-        result = self.network(image=pixels.contiguous().numpy(), mask=known.numpy())
+        result = run_network(self.network, image=pixels.contiguous().numpy(), mask=known.numpy())
         return torch.from_numpy(result[0]).permute(1, 2, 0).float() / 255
 
 
 def load_migan(file: str | None = None, device: str = "cpu") -> InpaintingGenerator:
     """Load the generator from a file, or the published one; raises the errors of `load_network`."""
-    network = load_network(PUBLISHED["migan"], SIGNATURE, file, device)
+    path = None if file is None else Path(file)
+    network = load_network(PUBLISHED["migan"], SIGNATURE, path, device)
     return InpaintingGenerator(MIGAN(network))

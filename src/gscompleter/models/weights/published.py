@@ -51,9 +51,9 @@ class PublishedWeights:
     """Entry of the file with the tensors, unless they are at the top level."""
     prefix: str = "encoder."
     """Prefix of the network's tensor names in the file."""
-    gives: Literal["Gaussians", "scene depth", "depth", "image"] = "Gaussians"
-    """Output of the network; `scene depth` is converted to Gaussians, `depth` is not supported, and
-    an `image` is that of a generator."""
+    gives: Literal["Gaussians", "scene depth", "monocular depth", "depth", "image"] = "Gaussians"
+    """Output of the network; `scene depth` is converted to Gaussians, `monocular depth` supports
+    stereo, `depth` is not supported, and an `image` is that of a generator."""
 
     @property
     def url(self) -> str:
@@ -222,6 +222,32 @@ def _create_inpainting(
     )
 
 
+def _create_moge(
+    name: str, size: str, sha256: str, megabytes: int, parameters: int, revision: str = "main"
+) -> PublishedWeights:
+    """Create the entry of a size of MoGe-2, as its authors exported it."""
+    repository = f"Ruicheng/moge-2-{size}-normal-onnx"
+    return PublishedWeights(
+        name=name,
+        model="MoGe-2",
+        network=None,
+        repository=repository,
+        revision=revision,
+        file="model.onnx",
+        sha256=sha256,
+        megabytes=megabytes,
+        parameters=parameters,
+        views=(1, 1),
+        image_size=(518, 518),
+        near_far=None,
+        code="https://github.com/microsoft/MoGe",
+        weights_licence="MIT",
+        caution="",
+        source=f"https://huggingface.co/{repository}",
+        gives="monocular depth",
+    )
+
+
 MIGAN = _create_inpainting(
     "MI-GAN",
     "andraniksargsyan/migan",
@@ -327,6 +353,28 @@ _FILES = (
     _create_depth_anything("da3-nested-giant-large", "DA3NESTED-GIANT-LARGE-1.1", 1_689_845_519),
     MIGAN,
     LAMA,
+    _create_moge(
+        "moge-2",
+        "vits",
+        "24eacb5dc7a2c54c7bc98f7de085ffbed79ad006ea5b664c2c2cdc02ff3a52f0",
+        141,
+        35_000_000,
+        "e50ffda41565591092adea54c6ac83d6212e1e23",
+    ),
+    _create_moge(
+        "moge-2-base",
+        "vitb",
+        "bbf14e07a30f11e69d36ab861590123f5598ababcbc8946a063eb4a966f35a21",
+        419,
+        104_000_000,
+    ),
+    _create_moge(
+        "moge-2-large",
+        "vitl",
+        "afbc4ccc3450298f3afb35b90f015f4c4f552dea21dc6470d5f7b78b77e2d751",
+        1324,
+        331_000_000,
+    ),
 )
 
 PUBLISHED: dict[str, PublishedWeights] = {weights.name: weights for weights in _FILES}

@@ -11,10 +11,12 @@ from jaxtyping import Bool
 from torch import Tensor
 
 from gscompleter.kernels.parallel import map_in_parallel
+from gscompleter.reconstructors.depth_predictors import DepthPredictor, predict_nothing
 from gscompleter.reconstructors.features.depth_range import get_depth_range, set_depth_range
 from gscompleter.reconstructors.features.stereo_image import StereoImage
 from gscompleter.reconstructors.plane_sweep.fusion import Layer
 from gscompleter.reconstructors.plane_sweep.gaussians import Splatter
+from gscompleter.reconstructors.plane_sweep.predicted_depth import add_prediction
 from gscompleter.reconstructors.plane_sweep.rig import Rig, build_rig
 from gscompleter.reconstructors.plane_sweep.sky_mask import find_skies, find_sky, transfer_sky
 from gscompleter.reconstructors.plane_sweep.surfaces import ITERATIONS, fit_surfaces
@@ -36,6 +38,9 @@ MIN_HALVED_SIDE = 192
 @dataclass(frozen=True)
 class PlaneSweep(Splatter):
     """Reconstructor by plane-sweep stereo, surface completion and splatting."""
+
+    predict_depth: DepthPredictor = predict_nothing
+    """Monocular depth, used where stereo measures nothing."""
 
     def __call__(self, views: Sequence[View]) -> Reconstruction:
         """Reconstruct the scene and the depth of every pixel.
@@ -59,6 +64,7 @@ class PlaneSweep(Splatter):
         rig = build_rig(views)
         first, second = match_views(rig, views)
         open_there = find_sky(rig.images[1], second)
+        first = add_prediction(first, self.predict_depth(views[0]))
         layers = [
             make_layer(
                 rig.images[0], first.exclude(transfer_sky(rig, open_there)), LIFT_ITERATIONS
@@ -77,7 +83,8 @@ class PlaneSweep(Splatter):
         """Compute the completed inverse depth of each view."""
         found = match_views(rig, views)
         seen = find_skies(rig, found)
-        surfaces = map_in_parallel(make_layer, rig.images, map(Measurement.exclude, found, seen))
+        guided = map(add_prediction, found, map(self.predict_depth, views))
+        surfaces = map_in_parallel(make_layer, rig.images, map(Measurement.exclude, guided, seen))
         return list(map(add_sky, surfaces, found, seen))
 
 

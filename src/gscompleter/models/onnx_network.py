@@ -15,14 +15,14 @@ from gscompleter.models.weights.published import PublishedWeights
 from gscompleter.models.weights.reading import fetch_checked
 
 INSTALL = "pip install 'gscompleter[onnx]'"
-ADVICE = "check that the file is the published one, or choose another generator"
+ADVICE = "check that the file is the published one, or choose another model"
 
-Signature = Mapping[str, tuple[str, int]]
-"""Type and number of channels of each input, by its name."""
+Signature = Mapping[str, tuple[str, int | None]]
+"""Type of each input and its number of channels, or None for a number, by its name."""
 
 
 class OnnxNetwork:
-    """A network from an image and a mask to an image of the same size."""
+    """A network that reads an image, and perhaps more."""
 
     def __init__(self, session: Any) -> None:
         self.session = session
@@ -33,48 +33,48 @@ class OnnxNetwork:
         height, width = (*self.session.get_inputs()[0].shape, None, None)[2:4]
         return (height, width) if isinstance(height, int) and isinstance(width, int) else None
 
-    def __call__(self, image: ndarray, mask: ndarray) -> ndarray:
-        """Run the network on arrays of shape [1, c, h, w]; raise InputError if it fails."""
+    def __call__(self, **inputs: ndarray) -> list[ndarray]:
+        """Run the network on images of shape [1, c, h, w]; raise InputError if it fails."""
         try:
-            (result,) = self.session.run(None, {"image": image, "mask": mask})
+            return list(self.session.run(None, inputs))
         except Exception as error:  # onnxruntime has an error class per status code
             raise InputError(f"The network failed on an image; {ADVICE}.") from error
-        if result.shape != image.shape:
-            raise InputError(
-                f"The network answered an image of shape {image.shape} by {result.shape}; {ADVICE}."
-            )
-        return result
 
 
 def load_network(
-    weights: PublishedWeights, signature: Signature, file: str | None, device: str
+    weights: PublishedWeights,
+    signature: Signature,
+    file: Path | None,
+    device: str,
+    option: str = "generator_weights",
+    num_outputs: int = 1,
 ) -> OnnxNetwork:
-    """Load the published network, or a file of the same signature.
+    """Load the published network, or a file of the same signature that the user named by `option`.
 
     Raises:
         InputError: onnxruntime or the file is missing, or the file is not such a network.
         WeightsNotAvailable: The published file is not local and cannot be downloaded.
     """
     if find_spec("onnxruntime") is None:
-        raise InputError(
-            f"The generator {weights.name!r} needs onnxruntime: {INSTALL}.", "generator"
-        )
-    path = fetch_checked(weights, None if file is None else Path(file))
-    session = open_session(path, device)
-    given = {x.name: (x.type, x.shape[1]) for x in session.get_inputs() if len(x.shape) == 4}
+        raise InputError(f"The model {weights.name!r} needs onnxruntime: {INSTALL}.")
+    path = fetch_checked(weights, file)
+    session = open_session(path, device, option)
+    given = {
+        x.name: (x.type, x.shape[1] if len(x.shape) == 4 else None) for x in session.get_inputs()
+    }
     network = OnnxNetwork(session)
     fits = given == dict(signature) and network.fixed_size in (None, weights.image_size)
-    if not fits or len(session.get_outputs()) != 1:
+    if not fits or len(session.get_outputs()) != num_outputs:
         found = ", ".join(f"{x.name} {x.type} {x.shape}" for x in session.get_inputs())
         raise InputError(
             f"{path} is no {weights.model} network: its inputs are {found}; give {weights.file} "
             f"from {weights.source}.",
-            "generator_weights",
+            option,
         )
     return network
 
 
-def open_session(path: Path, device: str) -> Any:
+def open_session(path: Path, device: str, option: str) -> Any:
     """Open an ONNX file, with the same result in every run on one machine."""
     import onnxruntime
 
@@ -91,5 +91,5 @@ def open_session(path: Path, device: str) -> Any:
     except Exception as error:  # onnxruntime has an error class per status code
         raise InputError(
             f"{path} cannot be read as an ONNX network: it is damaged or of another format.",
-            "generator_weights",
+            option,
         ) from error

@@ -1,0 +1,83 @@
+"""MoGe-2 (Wang et al., 2025): metric depth of single photographs, in the authors' ONNX export.
+
+Tested with tiny networks of the published signature. Not tested: published weights, and a GPU.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+import torch
+from jaxtyping import Bool, Float
+from numpy import ndarray
+from scipy.optimize import least_squares
+
+from gscompleter.errors import InputError
+from gscompleter.models.onnx_network import ADVICE, OnnxNetwork, load_network
+from gscompleter.models.weights.published import PUBLISHED
+from gscompleter.types import Camera, DepthMap, View
+
+SIGNATURE = {"image": ("tensor(float)", 3), "num_tokens": ("tensor(int64)", None)}
+NUM_TOKENS = np.array(1800)
+"""Patches of the transformer per image, as in the authors' export; they train with 1200 to 3600."""
+MIN_MASK = 0.5
+"""Score from which a pixel has a depth; the sky has none."""
+FIT_SIDE = 64
+"""Rows and columns of pixels that the shift is fitted to."""
+
+
+@dataclass(frozen=True)
+class MoGe:
+    """Metric depth of single views."""
+
+    network: OnnxNetwork
+
+    def __call__(self, view: View) -> DepthMap:
+        """Predict z-depth in metres; raise InputError if the answer has another shape.
+
+        The network gives points up to a shift along the optical axis, which the known focal length
+        of the camera determines.
+        """
+        pixels = view.image.detach().cpu().float().permute(2, 0, 1)[None].contiguous().numpy()
+        points, _, mask, scale = self.network(image=pixels, num_tokens=NUM_TOKENS)
+        size = pixels.shape[2:]
+        if points.shape != (1, *size, 3) or mask.shape != (1, *size) or scale.size != 1:
+            raise InputError(
+                f"The network answered an image by points of {points.shape}; {ADVICE}."
+            )
+        valid = mask[0] >= MIN_MASK
+        depth = scale.item() * (points[0, ..., 2] + fit_shift(points[0], valid, view.camera))
+        valid &= np.isfinite(depth) & (depth > 0)
+        made = torch.from_numpy(np.where(valid, depth, 1).astype(np.float32))
+        device = view.image.device
+        return DepthMap(made.to(device), torch.from_numpy(valid).to(device))
+
+
+def fit_shift(
+    points: Float[ndarray, "h w 3"], valid: Bool[ndarray, "h w"], camera: Camera
+) -> float:
+    """Fit the shift along z after which the points project to their pixels; 0 without points."""
+    h, w = valid.shape
+    rows, columns = (np.unique(np.linspace(0, n - 1, FIT_SIDE).round().astype(int)) for n in (h, w))
+    points = points[np.ix_(rows, columns)].astype(np.float64)
+    used = valid[np.ix_(rows, columns)] & np.isfinite(points).all(axis=-1) & (points[..., 2] > 0)
+    if used.sum() < 2:
+        return 0.0
+    fx, fy = camera.K[0, 0].item(), camera.K[1, 1].item()
+    rays = np.stack(np.meshgrid((columns + 0.5 - w / 2) / fx, (rows + 0.5 - h / 2) / fy), axis=-1)[
+        used
+    ]
+    found = points[used]
+
+    def miss(shift: Float[ndarray, "1"]) -> Float[ndarray, "n"]:
+        return (found[:, :2] / (found[:, 2:] + shift) - rays).ravel()
+
+    return float(least_squares(miss, 0.0, ftol=1e-3, method="lm").x[0])
+
+
+def load_moge(name: str, weights: Path | None = None, device: str = "cpu") -> MoGe:
+    """Load a published size, or a file; raises the errors of `load_network`."""
+    network = load_network(PUBLISHED[name], SIGNATURE, weights, device, "depth_weights", 4)
+    return MoGe(network)

@@ -1,0 +1,42 @@
+"""Monocular depth by name, which supports stereo where that measures nothing."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from pathlib import Path
+
+import torch
+
+from gscompleter.errors import InputError, quote_value
+from gscompleter.plugins import load_plugins
+from gscompleter.types import DepthMap, View
+
+DepthPredictor = Callable[[View], DepthMap]
+"""Monocular depth of a view, right up to an affine function of inverse depth."""
+
+
+def predict_nothing(view: View) -> DepthMap:
+    """Predict no depth: surfaces continue what stereo measured."""
+    depth = torch.ones_like(view.image[..., 0])
+    return DepthMap(depth, torch.zeros_like(depth, dtype=torch.bool))
+
+
+DEPTH_PREDICTORS: dict[str, Callable[[Path | None, str], DepthPredictor]] = {
+    "none": lambda weights, device: predict_nothing
+}
+"""Loader of each built-in predictor: (weights path or None for the published, device)."""
+
+PLUGINS = "gscompleter.depth_predictors"
+"""Group of entry points that name further tables of this form."""
+
+
+def load_depth_predictor(
+    name: str, weights: Path | None = None, device: str = "cpu"
+) -> DepthPredictor:
+    """Load a predictor by name; raise InputError if no predictor has it."""
+    loaders = DEPTH_PREDICTORS | load_plugins(PLUGINS)
+    if name not in loaders:
+        raise InputError(
+            f"There is no depth '{quote_value(name)}'; choose one of {', '.join(loaders)}.", "depth"
+        )
+    return loaders[name](weights, device)
