@@ -23,12 +23,20 @@ from typing import Any
 
 import torch
 
+import tiny_diffusion
 from bench_models import MODELS, load_model, measure_repeatedly
 from bench_pe_field import build_transformer
 from bench_render import measure_median_seconds
 from gpu_report import Part, Row, main, shorten, try_rows
 from gscompleter import Gaussians, GSCompleter, View, load_renderer
+from gscompleter.generators import GeneratorRequest, load_generator
+from gscompleter.models.diffusion.inpaint import DiffusersInpaint, Painter, get_size_rules
 from gscompleter.models.diffusion.pe_field import PEField
+from gscompleter.models.diffusion.placing import select_dtype
+from gscompleter.models.tables import DEPTH_PREDICTORS
+from gscompleter.models.weights.fetching import find_cached
+from gscompleter.models.weights.published import PUBLISHED
+from gscompleter.reconstructors.depth_predictors import load_depth_predictor
 from gscompleter.render import FrozenScene, Renderer
 from gscompleter.render.redraw import RedrawnScene
 from gscompleter.types import Camera, GeneratorInput, merge
@@ -221,7 +229,6 @@ def build_random_kontext(device: str) -> Any:
 
     from bench_pe_field import BLOCKS, TEXT
     from gscompleter.models.diffusion.kontext import Kontext, Prompt
-    from gscompleter.models.diffusion.placing import select_dtype
     from gscompleter.models.diffusion.rotary import enable_per_head_positions
 
     dtype, levels = select_dtype(device), 4
@@ -248,6 +255,82 @@ def build_random_kontext(device: str) -> Any:
     return Kontext(pipeline, Prompt(tokens, pooled), device, dtype)
 
 
+def measure_free_models(bench: Bench, klein: Callable[[str], Any] | None = None) -> Iterator[Row]:
+    """Measure the models that anyone may use: FLUX.2 [klein], and published files that are here."""
+    size = bench.sizes[0]
+    views, target = bench.make_views(size), bench.make_target(size)
+    scene = bench.make_scene(views)
+    seen = tuple(bench.renderer.render(scene, view.camera) for view in views)
+    request = (
+        views[1],
+        target,
+        GeneratorInput(tuple(views), seen, bench.renderer.render(scene, target)),
+    )
+
+    def painted() -> Iterator[Row]:
+        pipeline = (klein or build_random_klein)(bench.device)
+        generator = DiffusersInpaint(Painter(pipeline, *get_size_rules(pipeline)), steps=4)
+        seconds = measure_median_seconds(lambda: generator(*request), bench.repetitions)
+        yield Row("flux2-klein, 4 steps", seconds, "s")
+
+    def ran(name: str) -> Iterator[Row]:
+        if find_cached(PUBLISHED[name]) is None:
+            yield Row(name, note="its file is not on this machine")
+        elif name in DEPTH_PREDICTORS:
+            predict = load_depth_predictor(name, device=bench.device)
+            yield Row(
+                name, measure_median_seconds(lambda: predict(views[0]), bench.repetitions), "s"
+            )
+        else:
+            phi = load_generator(name, device=bench.device)
+            asked = [GeneratorRequest(*request)]
+            yield Row(
+                name, measure_median_seconds(lambda: phi.synthesize(asked), bench.repetitions), "s"
+            )
+
+    yield from try_rows("flux2-klein", painted)
+    for name in ("migan", "lama", *DEPTH_PREDICTORS):
+        yield from try_rows(name, lambda name=name: ran(name))
+
+
+def build_random_klein(device: str) -> Any:
+    """Build FLUX.2 [klein] 4B with random weights and a tokenizer of letters."""
+    import diffusers
+    from transformers import Qwen3Config, Qwen3ForCausalLM
+
+    language = Qwen3Config(
+        vocab_size=151_936,
+        hidden_size=2560,
+        intermediate_size=9728,
+        num_hidden_layers=36,
+        num_attention_heads=32,
+        num_key_value_heads=8,
+        head_dim=128,
+    )
+    before, default = torch.get_default_dtype(), select_dtype(device)
+    torch.set_default_dtype(default)
+    try:
+        with torch.device(device):
+            transformer = diffusers.Flux2Transformer2DModel(
+                num_layers=5,
+                num_single_layers=20,
+                num_attention_heads=24,
+                joint_attention_dim=7680,
+                guidance_embeds=False,
+            )
+            vae, encoder = diffusers.AutoencoderKLFlux2(), Qwen3ForCausalLM(language)
+    finally:
+        torch.set_default_dtype(before)
+    return diffusers.Flux2KleinInpaintPipeline(
+        scheduler=diffusers.FlowMatchEulerDiscreteScheduler(),
+        vae=vae.eval(),
+        text_encoder=encoder.eval(),
+        tokenizer=tiny_diffusion.qwen3(1)["tokenizer"],
+        transformer=transformer.eval(),
+        is_distilled=True,
+    )
+
+
 BENCH = Bench()
 PARTS = {
     "build": Part("gsplat compiles", 270, lambda: measure_build(BENCH)),
@@ -264,6 +347,7 @@ PARTS = {
     ),
     "models": Part("Ψ, two photographs at 256x256", 90, lambda: measure_models(BENCH)),
     "pe-field": Part("PE-Field, all of it", 120, lambda: measure_pe_field(BENCH)),
+    "free-models": Part("Models for any use", 120, lambda: measure_free_models(BENCH)),
 }
 
 

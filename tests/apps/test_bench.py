@@ -60,10 +60,8 @@ def quick(scene, tmp_path_factory):
     """Return the files of a quick run on a room."""
     out = tmp_path_factory.mktemp("bench") / "out"
     cases = write_cases(scene, near=0.5, far=20)
-    methods = ("--methods", "full", "densify-100")
     with pytest.MonkeyPatch.context() as patch:
-        assert run(patch, "bench", "--cases", cases, *methods, "--quick", "--quiet",
-                   "--out", out) == 0  # fmt: skip
+        assert run(patch, "bench", "--cases", cases, "--quick", "--quiet", "--out", out) == 0
     return out
 
 
@@ -72,16 +70,26 @@ def sample(seconds: float, yardstick: float = 0.5) -> Sample:
     return Sample({"lift": seconds / 4, PROCESS: seconds}, yardstick, 2**30, counts)
 
 
-def test_a_quick_run_tells_every_stage_of_its_case_and_its_methods(quick):
+def test_a_quick_run_tells_every_stage_of_its_case(quick):
     report = json.loads((quick / "bench.json").read_text())
     (case,) = report["cases"]
     (one,) = case["samples"]
     assert {"context", "generate", "lift", "register", "integrate", "total"} < set(one["seconds"])
     assert one["gaussians"]["context"] == 2 * SIZE * SIZE
-    assert [method["name"] for method in report["methods"]] == ["full", "densify-100"]
     assert report["growth"] == {}
     assert report["machine"]["cores"] >= 1
-    assert report["settings"]["baseline_iterations"] == 2
+    assert report["settings"]["repeats"] == 1
+
+
+def test_completions_in_one_process_have_no_start_up(scene, tmp_path, monkeypatch):
+    cases, out = write_cases(scene, near=0.5, far=20, gaussians=3000), tmp_path / "out"
+    words = ("bench", "--cases", cases, "--growth", "targets", "--repeats", 2, "--quiet")
+    assert run(monkeypatch, *words, "--in-process", "--out", out) == 0
+    report = json.loads((out / "bench.json").read_text())
+    assert report["settings"]["in_process"]
+    for one in report["cases"][0]["samples"]:
+        assert one["gaussians"]["context"] == 3000
+        assert 0 <= one["seconds"][REST] < 0.5 * one["seconds"][PROCESS]
 
 
 def test_generators_are_compared_in_the_same_holes(scene, tmp_path, monkeypatch, capsys):
@@ -108,10 +116,9 @@ def test_the_rest_of_a_process_is_what_its_completion_does_not_count(quick):
     assert seconds[REST] > 0
 
 
-def test_the_tables_have_a_row_for_each_case_and_method(quick):
+def test_the_tables_have_a_row_for_each_case(quick):
     text = (quick / "tables.md").read_text()
     assert text.count("| room |") == 1
-    assert all(f"| {name} |" in text for name in ("full", "densify-100"))
 
 
 def test_a_crowd_of_copies_looks_like_the_scene():
@@ -166,28 +173,19 @@ def test_a_sample_in_yardsticks_is_its_seconds_over_theirs():
     assert measured.seconds[PROCESS] == 3.0
     assert measured.ratio == 5.0
     assert measured.peak_bytes == 2**30
-    table = format_report(Report({}, {"repeats": 3}, (measured,), (), {}))
+    table = format_report(Report({}, {"repeats": 3}, (measured,), {}))
     assert "| case | 0.75 | 3.00 | 5.0 (2.0–6.0) | 1.07 | 1 | 2 |" in table
 
 
 def test_everything_has_its_turn_before_anything_has_two():
     turns = []
 
-    def task(name, repeats):
-        return lambda: turns.append(name) or sample(1.0), repeats
+    def task(name):
+        return lambda: turns.append(name) or sample(1.0)
 
-    found = measure_in_rounds({"a": task("a", 3), "b": task("b", 1)})
-    assert turns == ["a", "b", "a", "a"]
-    assert [len(found[name]) for name in "ab"] == [3, 1]
-
-
-def test_methods_are_told_in_multiples_of_the_first():
-    def method(name, own):
-        return Measured(name, [Sample({"register": own, "own": own}, 0.5, None, {})])
-
-    methods = method("full", 0.5), method("reggs", 150.0)
-    report = Report({}, {"repeats": 1}, (Measured("case", [sample(1.0)]),), methods, {})
-    assert "| reggs | 150.00 | 150.00 | 300.0 | – | 300 |" in format_report(report)
+    found = measure_in_rounds({"a": task("a"), "b": task("b")}, 2)
+    assert turns == ["a", "b", "a", "b"]
+    assert [len(found[name]) for name in "ab"] == [2, 2]
 
 
 def test_a_case_that_several_series_share_is_measured_once():
@@ -202,7 +200,7 @@ def test_a_case_that_several_series_share_is_measured_once():
 
 def test_growth_is_told_with_its_exponents():
     series = {n: Measured(f"{n}", [sample(0.1 * n)]) for n in (1, 2, 4)}
-    report = Report({"cores": 2}, {"repeats": 1}, (series[1],), (), {"targets": series})
+    report = Report({"cores": 2}, {"repeats": 1}, (series[1],), {"targets": series})
     assert "| exponent | 1.00 | 1.00 | 1.00 | 0.00 |" in format_report(report)
 
 
@@ -258,7 +256,7 @@ def test_a_file_that_names_no_cases_is_refused(tmp_path, monkeypatch, capsys, te
     ("case", "words", "sentence"),
     [
         ({"targets": [9]}, [], "no frame 9"),
-        ({}, ["--methods", "magic"], "'magic'"),
+        ({}, ["--growth", "magic"], "'magic'"),
         ({}, ["--repeats", 0], "repeats"),
     ],
 )

@@ -25,13 +25,9 @@ from gscompleter.apps.commands.batch import parse_row
 from gscompleter.apps.commands.words import translate_name
 from gscompleter.cli import COMMANDS, parse_command
 from gscompleter.config import CompleterConfig
-from gscompleter.config.generators import (
-    GENERATORS,
-    DiffusersInpaintSettings,
-    PEFieldSettings,
-    WarpInpaintSettings,
-)
+from gscompleter.config.generators import GeneratorSettings
 from gscompleter.data.scene import write_cameras
+from gscompleter.models.settings import DiffusersInpaintSettings, PEFieldSettings
 from scenes import camera_at
 
 SIZE = 64
@@ -374,7 +370,7 @@ def test_the_options_of_a_generator_are_its_settings(scene, tmp_path):
     options = parse_command([str(word) for word in complete(scene, tmp_path, *words)])
     assert options.synthesis.make_settings() == DiffusersInpaintSettings(prompt="a quiet street")
     options = parse_command([str(word) for word in complete(scene, tmp_path)])
-    assert options.synthesis.make_settings() == WarpInpaintSettings()
+    assert options.synthesis.make_settings() == GeneratorSettings()
 
 
 @pytest.mark.parametrize(
@@ -444,7 +440,7 @@ def test_every_command_has_both_kinds_of_help(monkeypatch, capsys, words):
 def test_help_all_knows_every_setting(monkeypatch, capsys):
     assert run(monkeypatch, "complete", "--help-all") == 0
     said = capsys.readouterr().out
-    for kind in GENERATORS.values():
+    for kind in (PEFieldSettings, DiffusersInpaintSettings):
         assert all(f"--generator-{f.name.replace('_', '-')}" in said for f in fields(kind))
     assert "--config.alignment.min-agreement" in said
     assert "Further seeds to try if" in said

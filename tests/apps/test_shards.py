@@ -11,7 +11,6 @@ import pytest
 
 from gscompleter import InputError
 from gscompleter.apps.commands import evaluate as command
-from gscompleter.config.generators import PEFieldSettings
 from gscompleter.data.cases import read_cases
 from gscompleter.evaluation.protocols import Task, make_case_task
 from gscompleter.evaluation.runner import (
@@ -25,6 +24,7 @@ from gscompleter.evaluation.runner import (
 from gscompleter.evaluation.store import VERSION, claim, list_row_paths, read_json
 from gscompleter.evaluation.tables import write_tables
 from gscompleter.jobs.jobs import Job, write_json
+from gscompleter.models.settings import PEFieldSettings
 from scenes import Room, camera_at, photographed
 
 SIZE = 32

@@ -25,11 +25,7 @@ from test_source_depth import tiny_model
 import tiny_diffusion
 from command import run
 from gscompleter import InputError, load_generator, load_renderer
-from gscompleter.config.generators import (
-    DiffusersInpaintSettings,
-    PEFieldSettings,
-    get_settings_class,
-)
+from gscompleter.config.generators import get_settings_class
 from gscompleter.generators import GeneratorRequest
 from gscompleter.models.diffusion import pe_field
 from gscompleter.models.diffusion.inpaint import DiffusersInpaint, complete_warp, load_painter
@@ -41,6 +37,7 @@ from gscompleter.models.diffusion.source_depth import (
     compute_context_depth,
     load_monocular,
 )
+from gscompleter.models.settings import DiffusersInpaintSettings, PEFieldSettings
 from gscompleter.types import Gaussians, GeneratorInput, merge
 from parity import assert_close
 from scenes import Room, answer, camera_at, gaussians_of, photographed, view_of

@@ -4,7 +4,7 @@ import pytest
 
 from command import run
 from gscompleter import InputError, load_generator
-from gscompleter.config.generators import GeneratorOptions, PEFieldSettings, get_settings_class
+from gscompleter.config.generators import GeneratorOptions, get_settings_class
 from gscompleter.models.diffusion import published
 from gscompleter.models.diffusion.loading import find_sources
 from gscompleter.models.diffusion.published import (
@@ -16,6 +16,7 @@ from gscompleter.models.diffusion.published import (
     create_load_error,
     parse_source,
 )
+from gscompleter.models.settings import PEFieldSettings
 from scenes import camera_at, photographed
 
 
@@ -33,8 +34,12 @@ def test_without_the_packages_one_sentence_says_what_to_install(name, monkeypatc
 @pytest.mark.parametrize(
     ("name", "setting", "way_out"),
     [
-        ("warp-inpaint", {"weights": "somebody/something"}, "choose pe-field or diffusers-inpaint"),
-        ("oracle", {"steps": 8}, "choose pe-field or diffusers-inpaint"),
+        (
+            "warp-inpaint",
+            {"weights": "somebody/something"},
+            "choose pe-field or diffusers-inpaint or",
+        ),
+        ("oracle", {"steps": 8}, "choose pe-field or diffusers-inpaint or"),
         ("pe-field", {"prompt": "a cat"}, "choose diffusers-inpaint"),
         ("diffusers-inpaint", {"depth": "monocular"}, "choose pe-field"),
     ],
@@ -49,7 +54,7 @@ def test_a_setting_that_a_generator_does_not_know_is_refused(name, setting, way_
 
 
 def test_the_settings_of_another_generator_are_refused():
-    with pytest.raises(InputError, match="'oracle' takes OracleSettings, got PEFieldSettings"):
+    with pytest.raises(InputError, match="'oracle' takes GeneratorSettings, got PEFieldSettings"):
         load_generator("oracle", settings=PEFieldSettings())
 
 

@@ -20,7 +20,7 @@ from torch.nn.functional import conv2d
 
 from command import run
 from gscompleter import InputError, load_generator, load_ply
-from gscompleter.config.generators import FileSettings, get_settings_class
+from gscompleter.config.generators import get_settings_class
 from gscompleter.generators.warp import complete_warp
 from gscompleter.models.inpainting.fill import (
     WINDOW,
@@ -31,6 +31,7 @@ from gscompleter.models.inpainting.fill import (
 )
 from gscompleter.models.inpainting.lama import load_lama
 from gscompleter.models.inpainting.migan import load_migan
+from gscompleter.models.settings import FileSettings
 from gscompleter.models.weights.published import PUBLISHED
 from scenes import camera_at, photographed
 

@@ -98,8 +98,8 @@ def test_names_are_model_size_and_data_and_files_carry_them():
         if name.startswith("da3-"):  # images of any shape; files are distinguished by their folders
             assert weights.repository == f"depth-anything/{weights.model}"
             continue
-        if weights.gives == "image":  # one file each, for images of any size
-            assert name == weights.model.lower().replace("-", "")
+        if weights.gives in ("image", "monocular depth"):  # one file each, for images of any size
+            assert name.replace("-", "") == weights.model.lower().replace("-", "")
             continue
         height, width = weights.image_size
         size = "" if (height, width) == (256, 256) else f"-{height}x{width}"

@@ -178,3 +178,26 @@ def test_pe_field_paints_with_any_model_of_its_kind():
     (row,) = gpu.measure_pe_field(SMALL, tiny)
     assert row.what == "64x80, 4 steps"
     assert row.value > 0
+
+
+def test_free_models_run_where_their_files_are(monkeypatch):
+    pytest.importorskip("diffusers", reason="needs gscompleter[diffusion]")
+    pytest.importorskip("transformers", reason="needs gscompleter[diffusion]")
+    import diffusers
+
+    import tiny_diffusion
+
+    def tiny(device: str) -> object:
+        return diffusers.Flux2KleinInpaintPipeline.from_pipe(tiny_diffusion.flux2_klein())
+
+    monkeypatch.setattr(gpu, "find_cached", lambda weights: None)
+    painted, *others = gpu.measure_free_models(SMALL, tiny)
+    assert (painted.what, painted.failed) == ("flux2-klein, 4 steps", False), painted
+    assert [row.what for row in others] == [
+        "migan",
+        "lama",
+        "moge-2",
+        "moge-2-base",
+        "moge-2-large",
+    ]
+    assert {row.note for row in others} == {"its file is not on this machine"}

@@ -9,7 +9,16 @@ from paths import ROOT
 PACKAGE = ROOT / "src" / "gscompleter"
 METHOD = ("completer.py", "stages", "guards", "trust", "next_best_view")
 CORE = (
-    *("__init__.py", "types.py", "geometry.py", "image_ops.py", "optim.py", "ransac.py", "sky.py", "errors.py"),
+    *(
+        "__init__.py",
+        "types.py",
+        "geometry.py",
+        "image_ops.py",
+        "optim.py",
+        "ransac.py",
+        "sky.py",
+        "errors.py",
+    ),
     *("progress.py", "timing.py", "memory.py", "cpu_threads.py", "state.py", "cleaning.py"),
     *("plugins.py", "config", "render", *METHOD),
 )

@@ -1,18 +1,13 @@
-"""Settings of each generator, by its name, and their options. Nothing here needs torch."""
+"""The choice of a generator, and its settings as options. Nothing here needs torch."""
 
 from __future__ import annotations
 
 from dataclasses import asdict, dataclass
-from typing import Annotated, Any
-
-from annotated_types import Interval, MinLen
+from typing import Any
 
 from gscompleter.config.settings import Settings
 from gscompleter.errors import InputError, quote_value
 from gscompleter.plugins import load_plugins
-
-Text = Annotated[str, MinLen(1)]
-Steps = Annotated[int, Interval(ge=1, le=1000)]
 
 
 @dataclass(frozen=True)
@@ -20,54 +15,8 @@ class GeneratorSettings(Settings):
     """Settings of a generator; each is an option that the class `GeneratorOptions` explains."""
 
 
-@dataclass(frozen=True)
-class WarpInpaintSettings(GeneratorSettings):
-    """Photographs warped to the target, with holes filled by patches (needs no weights)."""
-
-
-@dataclass(frozen=True)
-class OracleSettings(GeneratorSettings):
-    """The real photograph of the target, for measurements."""
-
-
-@dataclass(frozen=True)
-class FileSettings(GeneratorSettings):
-    """Settings of a generator with weights."""
-
-    weights: Text | None = None
-
-
-@dataclass(frozen=True)
-class DiffusionSettings(FileSettings):
-    """Settings of a generator that denoises."""
-
-    retries: Annotated[int, Interval(ge=0, le=100)] = 0
-    offload: bool = False
-
-
-@dataclass(frozen=True)
-class PEFieldSettings(DiffusionSettings):
-    """The paper's diffusion transformer."""
-
-    steps: Steps = 4
-    depth: Text | None = None
-    batch_size: Annotated[int, Interval(ge=1, le=1000)] = 4
-
-
-@dataclass(frozen=True)
-class DiffusersInpaintSettings(DiffusionSettings):
-    """Any inpainting pipeline of diffusers."""
-
-    steps: Steps | None = None
-    prompt: Text = "a photograph"
-
-
-GENERATORS: dict[str, type[GeneratorSettings]] = {
-    "warp-inpaint": WarpInpaintSettings,
-    "oracle": OracleSettings,
-    "pe-field": PEFieldSettings,
-    "diffusers-inpaint": DiffusersInpaintSettings,
-}
+BUILT_IN = ("warp-inpaint", "oracle")
+"""Generators without settings."""
 
 PREFIX = "generator_"
 
@@ -80,14 +29,14 @@ A loader that takes settings has their class as its attribute `settings`.
 
 def get_settings_class(name: str) -> type[GeneratorSettings]:
     """Return the class of a generator's settings, or raise InputError for an unknown name."""
-    if name in GENERATORS:
-        return GENERATORS[name]
+    if name in BUILT_IN:
+        return GeneratorSettings
     others = load_plugins(PLUGINS)
     if name in others:
         return getattr(others[name], "settings", GeneratorSettings)
     raise InputError(
         f"There is no generator '{quote_value(name)}'; choose one of "
-        f"{', '.join(dict.fromkeys([*GENERATORS, *others]))}.",
+        f"{', '.join([*BUILT_IN, *others])}.",
         "generator",
     )
 
@@ -129,7 +78,8 @@ class GeneratorOptions(Settings):
         }
         for setting in given:
             if not hasattr(kind, setting):
-                knowing = [name for name, kind in GENERATORS.items() if hasattr(kind, setting)]
+                others = load_plugins(PLUGINS)
+                knowing = [name for name in others if hasattr(get_settings_class(name), setting)]
                 raise InputError(
                     f"The generator '{self.generator}' has no setting {setting}; leave it out, or "
                     f"choose {' or '.join(knowing)}.",

@@ -145,12 +145,22 @@ def continue_image(
     return torch.where(known, image, torch.lerp(tone, image, share)), lines, weight
 
 
-def complete_warp(nearest: View, target: Camera, context: GeneratorInput) -> WarpedImage:
-    """Warp the photographs to the target and continue their tone and lines into the holes."""
+def warp_and_fill(nearest: View, target: Camera, context: GeneratorInput) -> WarpedImage:
+    """Warp the photographs to the target and fill the holes smoothly, background first.
+
+    A target that observes nothing has no border to continue; it gets the mean colour.
+    """
     warped = warp_photographs(nearest, target, context)
     if not warped.known.any():
         return replace(warped, image=nearest.image.mean(dim=(0, 1)).expand_as(warped.image))
-    warped = add_unexplained(fill_background_first(warped), target, context)
+    return add_unexplained(fill_background_first(warped), target, context)
+
+
+def complete_warp(nearest: View, target: Camera, context: GeneratorInput) -> WarpedImage:
+    """Warp the photographs to the target and continue their tone and lines into the holes."""
+    warped = warp_and_fill(nearest, target, context)
+    if not warped.known.any():
+        return warped
     image = torch.lerp(*continue_image(warped, target, context)).clamp(0, 1)
     return replace(warped, image=image.to(warped.image.device))
 

@@ -19,13 +19,7 @@ from torch import Tensor
 from torch.nn.functional import avg_pool2d, pad
 
 from gscompleter.generators.smooth import average_trusted, compute_distance_to_known
-from gscompleter.generators.warp import (
-    WarpedImage,
-    add_unexplained,
-    continue_image,
-    fill_background_first,
-    warp_photographs,
-)
+from gscompleter.generators.warp import WarpedImage, continue_image, warp_and_fill
 from gscompleter.image_ops import dilate, smooth_masked
 from gscompleter.kernels import patchmatch
 from gscompleter.kernels.patchmatch import RADIUS, SIDE
@@ -82,11 +76,9 @@ class WarpInpaint:
         self, nearest: View, target: Camera, context: GeneratorInput
     ) -> Float[Tensor, "h w 3"]:
         """Synthesize the image of `target` from warped photographs and patches."""
-        warped = warp_photographs(nearest, target, context)
+        warped = warp_and_fill(nearest, target, context)
         if not warped.known.any():
-            # The target observes nothing, so there is no border to continue.
-            return nearest.image.mean(dim=(0, 1)).expand(target.height, target.width, 3)
-        warped = add_unexplained(fill_background_first(warped), target, context)
+            return warped.image
         tone, lines, weight = continue_image(warped, target, context)
         image = torch.lerp(self.add_structure(tone, warped.to("cpu"), context), lines, weight)
         return image.clamp(0, 1).to(nearest.image.device)

@@ -8,13 +8,14 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
-from gscompleter.config.generators import (
+from gscompleter.config.generators import GeneratorSettings
+from gscompleter.generators import Generator, as_generator
+from gscompleter.models.settings import (
     DiffusersInpaintSettings,
     FileSettings,
-    GeneratorSettings,
+    Flux2KleinSettings,
     PEFieldSettings,
 )
-from gscompleter.generators import Generator, as_generator
 from gscompleter.models.weights.published import PUBLISHED
 from gscompleter.reconstructors import Reconstructor
 from gscompleter.reconstructors.depth_predictors import DepthPredictor
@@ -47,16 +48,6 @@ class GeneratorLoader:
     ) -> Generator:
         """Load the generator; a plain function is wrapped."""
         return as_generator(self.load(settings, seed, device))
-
-
-@dataclass(frozen=True)
-class Flux2KleinSettings(DiffusersInpaintSettings):
-    """FLUX.2 [klein], which also sees the nearest photograph."""
-
-    weights: str | None = (
-        "black-forest-labs/FLUX.2-klein-4B@e7b7dc27f91deacad38e78976d1f2b499d76a294"
-    )
-    steps: int | None = 4
 
 
 def load_pe_field(settings: Any, seed: int, device: str) -> Any:

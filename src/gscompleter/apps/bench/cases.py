@@ -19,7 +19,7 @@ from gscompleter.data.photographs import Photographs
 from gscompleter.errors import InputError, quote_value
 from gscompleter.evaluation.methods import Models
 from gscompleter.io.reading import read_json
-from gscompleter.splats.ply import save_ply
+from gscompleter.splats.ply import load_ply, save_ply
 from gscompleter.state import Completion
 from gscompleter.types import Gaussians
 
@@ -62,6 +62,14 @@ class BenchCase:
         views = self.open().views(self.context, self.resolution)
         return models.make_completer().begin([view.to(device) for view in views])
 
+    def complete(self, models: Models, device: str, splat: Path | None) -> Completion:
+        """Complete the photographs, or the given splat, for all targets."""
+        photographs = self.open()
+        views = [view.to(device) for view in photographs.views(self.context, self.resolution)]
+        targets = [photographs.camera(frame, self.resolution).to(device) for frame in self.targets]
+        scene = None if splat is None else load_ply(splat).to(device)
+        return models.make_completer()(views, targets, scene)
+
 
 Series = dict[str, dict[int, BenchCase]]
 """Cases by axis and size, which differ only in the field of the axis."""
@@ -82,7 +90,7 @@ class GrowthValues:
 
 @dataclass(frozen=True)
 class Manifest:
-    """All cases to measure; methods are compared on the first one, which also grows."""
+    """All cases to measure, of which the first one also grows."""
 
     cases: Annotated[tuple[BenchCase, ...], MinLen(1)]
     growth: GrowthValues = GrowthValues()

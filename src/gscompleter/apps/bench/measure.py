@@ -1,4 +1,4 @@
-"""Time and memory of one completion or one method, next to a yardstick."""
+"""Time and memory of one completion, next to a yardstick."""
 
 from __future__ import annotations
 
@@ -15,8 +15,7 @@ from typing import TypeVar
 import torch
 
 from gscompleter.errors import InputError
-from gscompleter.evaluation.memory import measure_peak_memory
-from gscompleter.evaluation.methods import METHODS, Models, Prediction
+from gscompleter.evaluation.memory import Peak, measure_peak_memory
 from gscompleter.io.files import SUMMARY_FILE
 from gscompleter.progress import show_progress, track
 from gscompleter.render import Renderer
@@ -32,11 +31,6 @@ RUNS = 5
 
 PROCESS, REST = "process", "rest"
 """Seconds of the whole process, and those outside the stages: start, imports, files, scores."""
-OWN_STAGES = ("register", "integrate", "optimize")
-"""Stages after generation and lifting, in which methods differ."""
-OWN = "own"
-"""Name of the sum of their seconds."""
-
 PROGRAM = """
 from gscompleter.cli import run
 try:
@@ -68,10 +62,6 @@ class Sample:
     def ratio(self) -> float:
         """Seconds of the last stage, in yardsticks."""
         return [*self.seconds.values()][-1] / self.yardstick
-
-
-Task = tuple[Callable[[], Sample], int]
-"""A measurement with its repeats."""
 
 
 def make_yardstick(renderer: Renderer, device: str) -> Yardstick:
@@ -159,29 +149,28 @@ def run_command(words: Sequence[str]) -> tuple[float, int | None]:
     return seconds, int(peak) if peak else None
 
 
-def measure_method(
-    name: str, state: Completion, target: Camera, models: Models, yardstick: Yardstick
-) -> Sample:
-    """Measure one run of a method on a target, with the seconds of its own stages."""
-    before = state.scene
+def measure_call(complete: Callable[[], Completion], device: str, yardstick: Yardstick) -> Sample:
+    """Measure one completion within this process."""
 
-    def run() -> tuple[Prediction, int | None]:
-        with measure_peak_memory(before.means.device) as peak:
-            prediction = METHODS[name](state, target, models)
-        return prediction, peak.bytes
+    def run() -> tuple[Completion, float, Peak]:
+        start = time.perf_counter()
+        with measure_peak_memory(device) as peak:
+            done = complete()
+        return done, time.perf_counter() - start, peak
 
-    (found, peak_bytes), unit = measure_beside(yardstick, run)
-    own = sum(spent for stage, spent in found.seconds.items() if stage in OWN_STAGES)
-    counts = {"context": len(before), "added": len(found.scene) - len(before)}
-    return Sample({**found.seconds, OWN: own}, unit, peak_bytes, counts)
+    (done, spent, peak), unit = measure_beside(yardstick, run)
+    added = sum(len(result.added) for result in done.targets)
+    counts = {"context": len(done.scene) - added, "added": added}
+    seconds = {**done.seconds, REST: spent - done.seconds["total"], PROCESS: spent}
+    return Sample(seconds, unit, peak.bytes, counts)
 
 
-def measure_in_rounds(tasks: Mapping[K, Task]) -> dict[K, list[Sample]]:
-    """Measure in rounds until each task has its repeats, so that a busy hour slows all alike."""
+def measure_in_rounds(
+    tasks: Mapping[K, Callable[[], Sample]], repeats: int
+) -> dict[K, list[Sample]]:
+    """Repeat all measurements in rounds, so that a busy hour slows all of them alike."""
     samples: dict[K, list[Sample]] = {key: [] for key in tasks}
-    rounds = range(max(repeats for _, repeats in tasks.values()))
-    turns = [key for n in rounds for key, (_, repeats) in tasks.items() if n < repeats]
-    for key in track(turns, "measuring"):
+    for key in track([*tasks] * repeats, "measuring"):
         with show_progress(None):  # no progress lines inside a measurement
-            samples[key].append(tasks[key][0]())
+            samples[key].append(tasks[key]())
     return samples

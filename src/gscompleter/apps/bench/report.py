@@ -14,20 +14,19 @@ import numpy as np
 import torch
 
 from gscompleter import __version__
-from gscompleter.apps.bench.measure import OWN, PROCESS, REST, Sample
+from gscompleter.apps.bench.measure import PROCESS, REST, Sample
 from gscompleter.cpu_threads import count_available_cores
 from gscompleter.evaluation.tables import format_markdown
 from gscompleter.memory import read_memory_bytes
 from gscompleter.timing import STAGES
 
-CASE_COLUMNS = (*STAGES, "total", REST, PROCESS)
-METHOD_COLUMNS = ("generate", "lift", "register", "integrate", "optimize", OWN)
+COLUMNS = (*STAGES, "total", REST, PROCESS)
 """Columns of seconds; stages that did not run are omitted."""
 
 
 @dataclass(frozen=True)
 class Measured:
-    """All samples of one case or method, with their medians."""
+    """All samples of one case, with their medians."""
 
     name: str
     samples: Sequence[Sample]
@@ -55,11 +54,10 @@ class Report:
 
     machine: Mapping[str, str | int]
     settings: Mapping[str, Any]
-    """Seed, repeats, and maximum number of iterations of the baselines."""
+    """Seed, repeats, and whether all completions ran in one process."""
     cases: Sequence[Measured]
-    methods: Sequence[Measured]
     growth: Mapping[str, Mapping[int, Measured]]
-    """Measurements by axis and size, of the first case as those of the methods."""
+    """Measurements of the first case by axis and size."""
 
 
 def fit_exponent(sizes: Sequence[int], values: Sequence[float]) -> float | None:
@@ -72,7 +70,7 @@ def fit_exponent(sizes: Sequence[int], values: Sequence[float]) -> float | None:
 
 
 def format_report(report: Report) -> str:
-    """Format machine, cases, methods and growth as Markdown."""
+    """Format machine, cases and growth as Markdown."""
     machine = [f"{name.replace('_', ' ')} {value}" for name, value in report.machine.items()]
     units = [sample.yardstick for case in report.cases for sample in case.samples]
     parts = [
@@ -80,8 +78,6 @@ def format_report(report: Report) -> str:
         f"smallest to largest; seconds. The yardstick took {median(units):.3f} s.\n",
         *("### Cases\n", format_case_table(report.cases)),
     ]
-    if report.methods:
-        parts += ["### Methods\n", format_method_table(report.methods)]
     for axis, points in report.growth.items():
         parts += [f"### Growth over {axis}\n", format_growth_table(axis, points)]
     return "\n".join(parts)
@@ -89,7 +85,7 @@ def format_report(report: Report) -> str:
 
 def format_case_table(cases: Sequence[Measured]) -> str:
     """Format seconds by stage, memory and Gaussians, one row per case."""
-    columns = select_columns(cases, CASE_COLUMNS)
+    columns = select_columns(cases, COLUMNS)
     rows = []
     for case in cases:
         counts = [case.samples[0].gaussians[key] for key in ("context", "added")]
@@ -97,19 +93,10 @@ def format_case_table(cases: Sequence[Measured]) -> str:
     return format_table("case", columns, rows, "Gaussians", "added")
 
 
-def format_method_table(methods: Sequence[Measured]) -> str:
-    """Format seconds by stage, and multiples of the first method, one row per method."""
-    columns, first = select_columns(methods, METHOD_COLUMNS), methods[0]
-    rows = [
-        [*format_cells(method, columns), f"{method.ratio / first.ratio:.3g}"] for method in methods
-    ]
-    return format_table("method", columns, rows, f"times {first.name}")
-
-
 def format_growth_table(axis: str, points: Mapping[int, Measured]) -> str:
     """Format seconds and memory, one row per size, and the exponents p of value ~ size^p."""
     found, sizes = [*points.values()], [*points]
-    columns = select_columns(found, CASE_COLUMNS)
+    columns = select_columns(found, COLUMNS)
     values = [[point.seconds[column] for point in found] for column in columns]
     values += [[point.ratio for point in found], [float(point.peak_bytes) for point in found]]
     powers = [fit_exponent(sizes, column) for column in values]

@@ -24,12 +24,11 @@ from gscompleter.apps.bench.cases import (
 from gscompleter.apps.bench.generators import compare_generators, format_generators
 from gscompleter.apps.bench.measure import (
     Sample,
-    Task,
     Yardstick,
     make_yardstick,
+    measure_call,
     measure_command,
     measure_in_rounds,
-    measure_method,
 )
 from gscompleter.apps.bench.report import Measured, Report, describe_machine, format_report
 from gscompleter.apps.commands.demo import (
@@ -54,7 +53,6 @@ DEMO_GROWTH = GrowthValues(
     pixels=((128, 128), (256, 256), (512, 512)),
     targets=((2,), (2, 3), (2, 3, 4, 5)),
 )
-QUICK_ITERATIONS = 2
 
 
 @dataclass(frozen=True)
@@ -69,9 +67,12 @@ class Bench:
     """Folder for temporary scenes and results."""
 
     def complete(self, case: BenchCase) -> Sample:
-        """Complete a case in a process of its own."""
+        """Complete a case, in a process of its own unless all share this one."""
         out = self.folder / "completion"
         scene = write_input_splat(case, self.folder, self.models, self.device)
+        if self.options.in_process:
+            call = partial(case.complete, self.models, self.device, scene)
+            return measure_call(call, self.device, self.yardstick)
         given = {"--near": case.near, "--far": case.far, "--scene": scene}
         words = [
             *("complete", case.scene, "--out", out, "--overwrite", "--quiet"),
@@ -84,7 +85,7 @@ class Bench:
 
 
 def run_bench(options: BenchOptions) -> None:
-    """Measure the cases and methods, and print or write the tables."""
+    """Measure the cases, and print or write the tables."""
     if options.out is not None:
         check_output(options.out, options.overwrite)
     if options.quick:
@@ -138,45 +139,25 @@ def prepare_bench(options: BenchOptions, folder: Path) -> Bench:
         load_generator("warp-inpaint", options.seed, device=device),
         renderer,
         options.seed,
-        QUICK_ITERATIONS if options.quick else None,
     )
     return Bench(options, device, models, make_yardstick(renderer, device), folder)
 
 
 def run_measurements(bench: Bench, cases: Sequence[BenchCase], series: Series) -> Report:
     """Run all measurements in rounds, after a first run that is not counted."""
-    repeats = bench.options.repeats
-    if not bench.options.quick:
+    options = bench.options
+    if not options.quick:
         with stage("warming up"):
             bench.complete(cases[0])
     grown = [case for found in series.values() for case in found.values()]
-    tasks: dict[Any, Task] = {c: (partial(bench.complete, c), repeats) for c in (*cases, *grown)}
-    samples = measure_in_rounds(tasks | make_method_tasks(bench, cases[0]))
-    limit = bench.models.baseline_iterations
+    tasks = {case: partial(bench.complete, case) for case in (*cases, *grown)}
+    samples = measure_in_rounds(tasks, options.repeats)
     return Report(
         describe_machine(bench.device),
-        {"seed": bench.options.seed, "repeats": repeats, "baseline_iterations": limit},
+        {"seed": options.seed, "repeats": options.repeats, "in_process": options.in_process},
         [Measured(case.name, samples[case]) for case in cases],
-        [Measured(name, samples[name]) for name in dict.fromkeys(bench.options.methods)],
         {
             axis: {size: Measured(f"{size:,}", samples[case]) for size, case in found.items()}
             for axis, found in series.items()
         },
     )
-
-
-def make_method_tasks(bench: Bench, case: BenchCase) -> dict[str, Task]:
-    """Create the tasks that compare methods at the first target of `case`."""
-    if not bench.options.methods:
-        return {}
-    state = case.begin(bench.models, bench.device)
-    target = case.open().camera(case.targets[0], case.resolution).to(bench.device)
-    start = state, target, bench.models, bench.yardstick
-    if not bench.options.quick:
-        with stage("warming up"), show_progress(None):
-            measure_method("full", *start)
-    repeats = {"full": bench.options.repeats}  # others take minutes
-    return {
-        name: (partial(measure_method, name, *start), repeats.get(name, 1))
-        for name in bench.options.methods
-    }

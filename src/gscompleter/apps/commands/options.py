@@ -19,7 +19,6 @@ Frames = Annotated[tuple[Frame, ...] | None, tyro.conf.arg(metavar="INT [INT ...
 Threads = Annotated[int, Interval(ge=1, le=1024)]
 Port = Annotated[int, Interval(ge=0, le=65535)]
 Axis = Literal["gaussians", "pixels", "views", "targets"]
-BenchMethod = Literal["full", "densify-100", "densify-800", "distill", "reggs"]
 # fmt: off
 TableName = Literal[
     "models", "ablation", "refinement", "time", "dof", "alignment", "spans", "stress", "steps",
@@ -324,24 +323,24 @@ class IndexOptions(WritingOptions):
 class BenchOptions(RunOptions, WritingOptions):
     """Measure how long completions take on this machine and how the time grows.
 
-    Every completion is a process of its own, start-up included; methods are compared within one
-    process. Times are also given relative to one pass of the renderer, forward and backward, with
-    196,608 Gaussians at 256 x 256. Without cases the pair of `demo` is measured.
+    Every completion is a process of its own, start-up included. Times are also given relative to
+    one pass of the renderer, forward and backward, with 196,608 Gaussians at 256 x 256. Without
+    cases the pair of `demo` is measured.
     """
 
     cases: Path | None = None
     """JSON file of scenes with their frames and growth series, as benchmarks/performance.json."""
-    methods: tuple[BenchMethod, ...] = ("full", "densify-800", "distill", "reggs")
-    """Methods to compare on the first case: full (ours) or others."""
+    in_process: bool = False
+    """Run all completions in this process, as a program does that uses the library."""
     generators: tuple[str, ...] = ()
     """Compare these generators instead, at the first target of each case: seconds, and scores in
     holes."""
     growth: tuple[Axis, ...] = ("gaussians", "pixels", "views", "targets")
     """Quantities to increase in the first case."""
     repeats: Annotated[int, Interval(ge=1, le=1000)] = 5
-    """Number of repetitions; methods other than full run once."""
+    """Number of repetitions."""
     quick: bool = False
-    """Run a quick check: the smallest case once, two iterations of the baselines, no growth."""
+    """Run a quick check: the smallest case once, no growth."""
     json: bool = False
     """Print all measurements as JSON instead of tables."""
     out: Path | None = None

@@ -11,7 +11,6 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
-from gscompleter.config.generators import DiffusersInpaintSettings
 from gscompleter.errors import InputError
 from gscompleter.generators import GeneratorOutput
 from gscompleter.generators.agreement import paint_consistently
@@ -27,6 +26,7 @@ from gscompleter.models.diffusion.published import (
     convert_load_errors,
     parse_source,
 )
+from gscompleter.models.settings import DiffusersInpaintSettings
 from gscompleter.types import Camera, GeneratorInput, View
 
 DEFAULT_SIDE = 512

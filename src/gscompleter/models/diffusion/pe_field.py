@@ -13,7 +13,6 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from gscompleter.config.generators import PEFieldSettings
 from gscompleter.errors import InputError
 from gscompleter.generators import GeneratorOutput, GeneratorRequest
 from gscompleter.generators.agreement import paint_consistently
@@ -32,6 +31,7 @@ from gscompleter.models.diffusion.source_depth import (
     load_source_depth,
 )
 from gscompleter.models.diffusion.splat import splat_forward
+from gscompleter.models.settings import PEFieldSettings
 from gscompleter.types import Camera, GeneratorInput, Render, View
 
 GUIDANCE = 3.5

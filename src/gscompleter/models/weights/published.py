@@ -229,7 +229,7 @@ def _create_moge(
     repository = f"Ruicheng/moge-2-{size}-normal-onnx"
     return PublishedWeights(
         name=name,
-        model="MoGe-2",
+        model=name.replace("moge", "MoGe"),
         network=None,
         repository=repository,
         revision=revision,
