@@ -53,4 +53,4 @@ def test_the_core_is_short():
 def test_everything_but_the_learned_models_is_short():
     # Of these, 750 lines write the paper's tables and figures.
     files = (path for path in PACKAGE.rglob("*.py") if "models" not in path.parts)
-    assert sum(len(path.read_text().splitlines()) for path in files) <= 30_200
+    assert sum(len(path.read_text().splitlines()) for path in files) <= 30_300

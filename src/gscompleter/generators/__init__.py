@@ -88,12 +88,13 @@ def load_generator(
 ) -> Generator:
     """Load a generator by name; only `oracle` uses `photographs`, the true target images."""
     kind = get_settings_class(name)
-    if not isinstance(settings, kind | None):
+    settings = settings or kind()
+    if type(settings) is not kind:
         raise InputError(
             f"The generator {name!r} takes {kind.__name__}, got {type(settings).__name__}.",
             "generator",
         )
-    settings = validate(settings or kind(), "generator_")
+    settings = validate(settings, "generator_")
     if getattr(settings, "offload", False) and device == "cpu":
         raise InputError(
             "offload keeps parts of the generator off the GPU, and it runs on the CPU; leave it "
