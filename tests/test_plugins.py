@@ -44,5 +44,5 @@ def test_models_of_another_package_are_found_by_name():
 def test_a_name_that_nobody_has_is_refused_with_all_that_there_are():
     with pytest.raises(InputError, match=", ".join([*RECONSTRUCTORS, "my-psi", "mvsplat-re10k"])):
         load_reconstructor("your-psi")
-    with pytest.raises(InputError, match=r"warp-inpaint, oracle, pe-field, .*my-phi"):
+    with pytest.raises(InputError, match=r"warp-inpaint, oracle, .*my-phi"):
         load_generator("your-phi")
