@@ -41,13 +41,13 @@ DISTANCE_PENALTY = 0.002
 """Cost of a source at the other end of the image."""
 MIN_VOTE_ROUNDS, MAX_VOTE_ROUNDS = 2, 10
 """Iterations on the finest and the coarsest level, where sharp votes need more to agree."""
-COARSEST_PASSES, FINER_PASSES = 2, 1
-"""Search passes per iteration, on the coarsest level and on finer ones."""
 VOTE_SHARPNESS = 8
 """Decay of a vote with its cost; at 1, averaged patches lose a quarter of their detail."""
 MIN_VOTE = 1e-6
 WEIGHT_DECAY = 0.85
 """Weight factor of an unknown pixel per pixel from the border of the hole."""
+FINEST_SPACING = 2
+"""Only every second patch is matched on the finest level, like the squares of one colour."""
 MIN_SIZE = 80
 """Shorter side of the coarsest level, in pixels; coarser ones cost 0.3 dB."""
 FINE_REACH = 8
@@ -181,32 +181,42 @@ def fill_by_patches(
     for number, level in reversed(list(enumerate(levels))):
         share = number / max(len(levels) - 1, 1)
         rounds = MIN_VOTE_ROUNDS + round((MAX_VOTE_ROUNDS - MIN_VOTE_ROUNDS) * share)
-        filled, field = search_and_vote(level, field, rounds, seed + 7919 * number)
+        centres = find_patch_centres(level.known, FINEST_SPACING if number == 0 else 1)
+        filled, field = search_and_vote(level, field, centres, rounds, seed + 7919 * number)
     return filled
 
 
+def find_patch_centres(known: Bool[Tensor, "h w"], spacing: int) -> Bool[ndarray, "h w"]:
+    """Find the patches that overlap the hole, every `spacing`-th on each diagonal."""
+    rows, columns = np.indices(known.shape)
+    return dilate(~known, RADIUS).numpy() & ((rows + columns) % spacing == 0)
+
+
 def search_and_vote(
-    level: Level, coarse_field: Field | None, rounds: int, seed: int
+    level: Level,
+    coarse_field: Field | None,
+    centres: Bool[ndarray, "h w"],
+    rounds: int,
+    seed: int,
 ) -> tuple[Float[Tensor, "h w 3"], Field | None]:
-    """Alternate between searching the best patches and voting for the image."""
+    """Alternate between searching the best patches around `centres` and voting for the image."""
     h, w = level.known.shape
     known = level.known.numpy()
     usable = find_usable_centres(level.sources.valid)
-    near_hole = dilate(~level.known, RADIUS).numpy()
     if not usable.any() or known.all():
         return level.image, None
 
-    queries = np.argwhere(near_hole)
+    queries = np.argwhere(centres)
     query_at = np.full((h, w), -1, np.int64)
-    query_at[near_hole] = np.arange(len(queries))
+    query_at[centres] = np.arange(len(queries))
     weight = compute_pixel_weights(level.known)
-    votes, shift = weight[near_hole], np.zeros((len(queries), 3), np.float32)
+    votes, shift = weight[centres], np.zeros((len(queries), 3), np.float32)
     matches = init_matches(queries, coarse_field, usable, seed)
     images = patchmatch.pad_column(level.sources.images.numpy())
     log_depth = np.ascontiguousarray(level.sources.log_depth.numpy())
     frame = patchmatch.pad_border(np.repeat(weight[..., None], 3, axis=-1))
     total = cv2.boxFilter(weight, -1, (SIDE, SIDE), normalize=False, borderType=cv2.BORDER_CONSTANT)
-    target = (total[near_hole], queries, query_at, level.expected.numpy()[near_hole])
+    target = (total[centres], queries, query_at, level.expected.numpy()[centres])
     diagonal = math.hypot(*usable.shape[1:])
     penalties = MAX_BIAS, BIAS_PENALTY, DEPTH_PENALTY, DISTANCE_PENALTY, diagonal
     costs = patchmatch.Costs(*map(np.float32, penalties))
@@ -215,19 +225,19 @@ def search_and_vote(
         return patchmatch.vote(query_at, votes, images, matches, shift)[0][~known]
 
     current = level.image.numpy().copy()
-    reach, passes = max(usable.shape), COARSEST_PASSES
+    reach = max(usable.shape)
     if coarse_field is not None:
         current[~known] = vote_colors()
-        reach, passes = FINE_REACH, FINER_PASSES
+        reach = FINE_REACH
     for number in range(rounds):
         matched = patchmatch.PatchProblem(
             patchmatch.pad_border(current), frame, *target, images, usable, log_depth
         )
-        cost, shift = patchmatch.search(matched, costs, matches, passes, reach, seed + 31 * number)
-        votes = weight[near_hole] * compute_likelihood(cost)
+        cost, shift = patchmatch.search(matched, costs, matches, reach, seed + 31 * number)
+        votes = weight[centres] * compute_likelihood(cost)
         current[~known] = vote_colors()
     field = np.full((h, w, 3), -1, np.int64)
-    field[near_hole] = matches
+    field[centres] = matches
     return torch.from_numpy(current), field
 
 

@@ -32,6 +32,7 @@ from gscompleter.geometry import (
 )
 from gscompleter.guards import Guard
 from gscompleter.image_ops import average_box, dilate
+from gscompleter.render import get_view_map
 from gscompleter.render.cache import SceneRenderer
 from gscompleter.state import Completion
 from gscompleter.types import Camera, Render, View
@@ -170,7 +171,8 @@ def compare_both_ways(
     one: SmallPhoto, other: SmallPhoto, min_difference: float
 ) -> tuple[Comparison, Comparison]:
     """Compare two photographs both ways, twice: surfaces in conflict then occlude nothing."""
-    there, back = compare(one, other, min_difference), compare(other, one, min_difference)
+    limits = min_difference, min_difference
+    there, back = get_view_map(one.image)(compare, (one, other), (other, one), limits)
     return (
         there.occlude_by(other.depth.where(~back.conflict_mask, torch.inf)),
         back.occlude_by(one.depth.where(~there.conflict_mask, torch.inf)),

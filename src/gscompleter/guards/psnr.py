@@ -16,7 +16,7 @@ from gscompleter.cpu_threads import use_one_torch_thread
 from gscompleter.geometry import project_mask
 from gscompleter.guards import Attempt, Guard
 from gscompleter.image_ops import SSIM_RADIUS, dilate, ssim_map
-from gscompleter.render import FrozenScene, OpacityRender
+from gscompleter.render import FrozenScene, OpacityRender, get_view_map
 from gscompleter.render.cache import SceneRenderer
 from gscompleter.stages.target_view import compute_hole_mask
 from gscompleter.state import Completion
@@ -195,8 +195,11 @@ class CheckedRender:
 
 def find_over_budget(checks: Sequence[Check], opacities: Float[Tensor, "n"]) -> list[CheckedRender]:
     """Render all photographs and return those over budget."""
-    rendered = (render_check(check, opacities) for check in checks)
-    return [render for render in rendered if render.excess > 0]
+
+    def render(check: Check) -> CheckedRender:
+        return render_check(check, opacities)
+
+    return [found for found in get_view_map(opacities)(render, checks) if found.excess > 0]
 
 
 def render_check(check: Check, opacities: Float[Tensor, "n"]) -> CheckedRender:

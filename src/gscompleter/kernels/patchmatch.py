@@ -130,8 +130,8 @@ def _compute_prior(costs, nearer, dy, dx):
     )
 
 
-def search(problem, costs, field, rounds, max_reach, seed):
-    """Improve the nearest source patch of every query, by propagation and random search.
+def search(problem, costs, field, max_reach, seed):
+    """Improve the nearest source patch of every query once, by propagation and random search.
 
     field: matches (source, y, x) [q, 3], all of them usable; updated in place.
     max_reach: radius of the random search at its start, in pixels.
@@ -139,15 +139,13 @@ def search(problem, costs, field, rounds, max_reach, seed):
     """
     count = len(problem.queries)
     cost, shift = np.full(count, np.inf, np.float32), np.zeros((count, 3), np.float32)
-    for number in range(rounds):
-        chance = (number, max_reach, seed)
-        share(_improve, count, problem, costs, *chance, field.copy(), field, cost, shift)
+    share(_improve, count, problem, costs, max_reach, seed, field.copy(), field, cost, shift)
     return cost, shift
 
 
 @njit(cache=True, nogil=True, fastmath={"contract"})
-def _improve(begin, end, problem, costs, number, max_reach, seed, before, field, cost, shift):
-    """Run pass `number` over the queries begin..end; `before` is the previous field."""
+def _improve(begin, end, problem, costs, max_reach, seed, before, field, cost, shift):
+    """Improve the queries begin..end; `before` is the previous field."""
     usable, query_at = problem.usable_mask, problem.query_at
     num_sources, H, W = usable.shape
     h, w = query_at.shape
@@ -158,13 +156,9 @@ def _improve(begin, end, problem, costs, number, max_reach, seed, before, field,
         _copy(problem.image, y, x, patch)
         _copy(problem.weight, y, x, weight)
         best = cost[i]
-        state = _hash(
-            np.uint64(seed) * np.uint64(0x9E3779B97F4A7C15)
-            + np.uint64(number * 1000003)
-            + np.uint64(y * 65537 + x)
-        )
+        state = _hash(np.uint64(seed) * np.uint64(0x9E3779B97F4A7C15) + np.uint64(y * 65537 + x))
         reach = max_reach
-        for trial in range(-1 if number == 0 else 0, 24):
+        for trial in range(-1, 24):
             if trial < 0:
                 # The cost of the initial match is not known yet.
                 s, sy, sx = field[i, 0], field[i, 1], field[i, 2]

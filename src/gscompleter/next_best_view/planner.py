@@ -158,7 +158,7 @@ class ViewPlanner:
         small = simplify_completion(completion)
         anchors = [self.render_small_view(small, view.camera) for view in small.views]
         choose = partial(self.score_candidate, small, anchors)
-        choices = get_view_map(small.parts[0])(choose, candidates_left)
+        choices = get_view_map(small.parts[0].means)(choose, candidates_left)
         counted = zip(track(candidates_left, "finding targets"), choices, strict=True)
         return [choice for _, choice in counted]
 

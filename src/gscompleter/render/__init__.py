@@ -32,9 +32,9 @@ ColorErrors = Callable[[Float[Tensor, "n 3"], Float[Tensor, "h w 3"]], ColorSums
 """Backprojects the residual of a photograph [h, w, 3], at given colours [n, 3]."""
 
 
-def get_view_map(scene: Gaussians) -> Callable[..., Iterable[Any]]:
-    """Return a `map` over views of `scene`: on a CPU several at a time, elsewhere one by one."""
-    return map_small_tasks if scene.means.device.type == "cpu" else map
+def get_view_map(values: Tensor) -> Callable[..., Iterable[Any]]:
+    """Return a `map` over views: several at a time if `values` are on a CPU, else one by one."""
+    return map_small_tasks if values.device.type == "cpu" else map
 
 
 @runtime_checkable

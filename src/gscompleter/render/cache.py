@@ -36,7 +36,7 @@ class SceneRenderer:
         def update(camera: Camera, before: tuple[Parts, FrozenScene | None]) -> FrozenScene:
             return self._update(parts, camera, *before)
 
-        frozen = tuple(get_view_map(parts[0])(update, cameras, known))
+        frozen = tuple(get_view_map(parts[0].means)(update, cameras, known))
         self._views.update((key, (parts, view)) for key, view in zip(keys, frozen, strict=True))
         return frozen
 

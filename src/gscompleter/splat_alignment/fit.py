@@ -90,7 +90,7 @@ def score_splat(scene: Gaussians, views: Sequence[View], renderer: Renderer) -> 
     def fit(view: View) -> ImageFit:
         return score_image(render_from(scene, view.camera, renderer), view.image)
 
-    return summarize_fits(list(get_view_map(scene)(fit, views)))
+    return summarize_fits(list(get_view_map(scene.means)(fit, views)))
 
 
 def render_from(scene: Gaussians, camera: Camera, renderer: Renderer) -> Render:

@@ -115,7 +115,7 @@ def refine_similarity(
     for _ in range(NUM_ROUNDS):
         if transform is not None:
             cameras = [transform_camera(camera, transform) for camera, _ in photographs]
-            found = list(get_view_map(scene)(locate, photographs, cameras))
+            found = list(get_view_map(scene.means)(locate, photographs, cameras))
             transform = fit_similarity(found)
     return transform
 

@@ -139,7 +139,7 @@ def gather_observations(
         measured = measure_agreement(frozen[k], rendered.means, views[k].camera, agrees)
         areas[k], agreement[k] = measured
 
-    for _ in get_view_map(rendered)(gather, range(len(views))):
+    for _ in get_view_map(rendered.means)(gather, range(len(views))):
         pass
     centers = torch.stack([view.camera.center for view in views])
     return PhotoObservations(rendered.means, centers, areas, agreement)

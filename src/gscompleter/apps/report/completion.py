@@ -172,7 +172,7 @@ def score_views(completion: Completion, views: Sequence[View], renderer: Rendere
     def score(view: View) -> Scores:
         return compute_scores(render_before_after(completion, view.camera, renderer), view)
 
-    return list(get_view_map(completion.added)(score, views))
+    return list(get_view_map(completion.added.means)(score, views))
 
 
 def score_held_out(

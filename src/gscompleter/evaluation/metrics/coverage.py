@@ -56,6 +56,7 @@ def render_pairs(
     completion: Completion, cameras: Sequence[Camera], renderer: Renderer
 ) -> list[RenderPair]:
     """Render the scene before and after completion in small images, from a thinned scene."""
+    is_unchanged = completion.parts[0] is completion.source.rendered
     begun = thin_gaussians(completion.source.rendered, MAX_PREVIEW_GAUSSIANS)
     kept = thin_gaussians(completion.parts[0], MAX_PREVIEW_GAUSSIANS)
     added = [thin_gaussians(result.added, MAX_PREVIEW_GAUSSIANS) for result in completion.targets]
@@ -66,11 +67,15 @@ def render_pairs(
         at_first = replace(trust, is_recolored=torch.zeros_like(trust.is_recolored))
 
     def render_pair(camera: Camera) -> RenderPair:
-        first = render_trusted(renderer.freeze(begun, camera), at_first, camera)
-        last = renderer.freeze(kept, camera).extend(new)
-        return RenderPair(first, render_trusted(last, trust, camera))
+        first = renderer.freeze(begun, camera)
+        last = (first if is_unchanged else renderer.freeze(kept, camera)).extend(new)
+        return RenderPair(
+            render_trusted(first, at_first, camera), render_trusted(last, trust, camera)
+        )
 
-    return list(get_view_map(new)(render_pair, [shrink_camera(camera, SIDE) for camera in cameras]))
+    return list(
+        get_view_map(new.means)(render_pair, [shrink_camera(camera, SIDE) for camera in cameras])
+    )
 
 
 def render_trusted(frozen: FrozenScene, trust: Trust, camera: Camera) -> Render:

@@ -15,7 +15,7 @@ from torch import Tensor
 from torch.nn.functional import normalize
 
 from gscompleter.reconstructors.plane_sweep.virtual_views import make_virtual_views
-from gscompleter.render import ColorErrors, Renderer
+from gscompleter.render import ColorErrors, Renderer, get_view_map
 from gscompleter.render.spherical_harmonics import SH_C1
 from gscompleter.types import SH_C0, Camera, DepthMap, Gaussians, View
 
@@ -93,12 +93,12 @@ def fit_directional_colors(
         errors = renderer.freeze(scene[:0], view.camera).vary_colors(scene)
         return WeightedImage(errors, view.image, weight, line.locate(scene, view.camera))
 
-    images = [weigh(view, 1.0) for view in views]
     virtual = make_virtual_views(scene, views, depths, renderer)
-    every = images + [weigh(view, VIRTUAL_WEIGHT) for view in virtual]
+    weights = [1.0] * len(views) + [VIRTUAL_WEIGHT] * len(virtual)
+    every = list(get_view_map(scene.means)(weigh, [*views, *virtual], weights))
     colors = scene.sh[:, 0] * SH_C0 + 0.5
     state = colors, torch.zeros_like(colors)
-    for used, relaxations in zip((images, every), RELAXATIONS, strict=True):
+    for used, relaxations in zip((every[: len(views)], every), RELAXATIONS, strict=True):
         for relaxation in relaxations:
             state = improve_colors(*state, used, line.squared_angle, relaxation)
     return replace(scene, sh=line.to_sh(*state))
@@ -115,7 +115,11 @@ def improve_colors(
 
     With a relaxation of 1 it minimizes an upper bound in which every Gaussian stands alone.
     """
-    found = [(*image.backproject(colors, gradients), image.position) for image in images]
+
+    def backproject(image: WeightedImage) -> tuple[Tensor, Tensor, Tensor]:
+        return *image.backproject(colors, gradients), image.position
+
+    found = list(get_view_map(colors)(backproject, images))
     total = torch.stack([seen for _, seen, _ in found]).sum(0).clamp_min(MIN_WEIGHT)
     damping = GRADIENT_PENALTY * total * (1 + ANGLE**2 / squared_angle)
     cross = torch.stack([seen * at for _, seen, at in found]).sum(0)
