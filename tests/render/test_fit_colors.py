@@ -17,7 +17,7 @@ VIEW = view_of(Room(), CAMERA)
 @pytest.mark.parametrize("name", ["cpu", "reference"])
 def test_an_image_gets_back_what_rendering_blurs(name):
     blurred, renderer = gaussians_of(VIEW), load_renderer(name)
-    fitted = fit_colors(blurred, renderer.freeze(blurred[:0], CAMERA), VIEW, 4)
+    fitted = fit_colors(blurred, [renderer.freeze(blurred[:0], CAMERA)], [VIEW], [1.7] * 4)
     before, after = (
         psnr(renderer.render(scene, CAMERA).image, VIEW.image) for scene in (blurred, fitted)
     )
@@ -32,7 +32,7 @@ def test_new_gaussians_make_up_for_what_the_scene_shows_before_and_behind_them()
     frozen = load_renderer("cpu").freeze(thin, CAMERA)
     before, after = (
         psnr(frozen.composite(new).image, VIEW.image)
-        for new in (added, fit_colors(added, frozen, VIEW, 4))
+        for new in (added, fit_colors(added, [frozen], [VIEW], [1.7] * 4))
     )
     assert after > before + 0.5
 
@@ -41,7 +41,7 @@ def test_colours_change_alike_in_all_directions():
     plain, renderer = gaussians_of(VIEW), load_renderer("cpu")
     linear = 0.1 * torch.randn(len(plain), 3, 3, generator=torch.Generator().manual_seed(0))
     tinted = replace(plain, sh=torch.cat([plain.sh, linear], dim=1))
-    fitted = fit_colors(tinted, renderer.freeze(plain[:0], CAMERA), VIEW, 8)
+    fitted = fit_colors(tinted, [renderer.freeze(plain[:0], CAMERA)], [VIEW], [1.7] * 8)
     assert torch.equal(fitted.sh[:, 1:], linear)
     before, after = (
         psnr(renderer.render(scene, CAMERA).image, VIEW.image) for scene in (tinted, fitted)
@@ -51,5 +51,5 @@ def test_colours_change_alike_in_all_directions():
 
 def test_no_round_keeps_the_colours():
     scene = gaussians_of(VIEW)
-    kept = fit_colors(scene, load_renderer("cpu").freeze(scene[:0], CAMERA), VIEW, 0)
+    kept = fit_colors(scene, [load_renderer("cpu").freeze(scene[:0], CAMERA)], [VIEW], [])
     assert torch.equal(kept.sh, scene.sh)

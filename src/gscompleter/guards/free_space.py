@@ -93,15 +93,24 @@ def find_in_free_space(
     points: Float[Tensor, "n 3"], cameras: Sequence[Camera], renders: Sequence[Render]
 ) -> Bool[Tensor, "n"]:
     """Find points in front of an observed surface, or inside the near distance of a camera."""
-    in_free_space = torch.zeros(len(points), dtype=torch.bool, device=points.device)
+    left = torch.arange(len(points), device=points.device)
     for camera, render in zip(cameras, renders, strict=True):
-        pixels, z = project(points, camera)
-        size = torch.tensor([camera.width, camera.height], device=pixels.device)
-        visible = (z > 0) & (pixels > -BORDER).all(-1) & (pixels < size + BORDER).all(-1)
-        nearest = torch.where(visible[:, None], pixels, 0.0).long().clamp_min(0)
-        x, y = torch.minimum(nearest, size - 1).unbind(-1)
-        scene = render.depth_map()
-        before = z < (1 + CLEARANCE) * scene.depth[y, x]
-        in_free_space |= visible & scene.valid[y, x] & before
-        in_free_space |= (points - camera.center).norm(dim=-1) < (camera.near or 0.0)
-    return in_free_space
+        left = left[~is_before_surface(points[left], camera, render)]
+    return torch.ones(len(points), dtype=torch.bool, device=points.device).index_fill(
+        0, left, False
+    )
+
+
+def is_before_surface(
+    points: Float[Tensor, "n 3"], camera: Camera, render: Render
+) -> Bool[Tensor, "n"]:
+    """Mark points in front of what a camera observes, or inside of its near distance."""
+    pixels, z = project(points, camera)
+    size = torch.tensor([camera.width, camera.height], device=pixels.device)
+    visible = (z > 0) & (pixels > -BORDER).all(-1) & (pixels < size + BORDER).all(-1)
+    nearest = torch.where(visible[:, None], pixels, 0.0).long().clamp_min(0)
+    x, y = torch.minimum(nearest, size - 1).unbind(-1)
+    scene = render.depth_map()
+    before = z < (1 + CLEARANCE) * scene.depth[y, x]
+    is_near = (points - camera.center).norm(dim=-1) < (camera.near or 0.0)
+    return (visible & scene.valid[y, x] & before) | is_near

@@ -63,9 +63,12 @@ def map_in_parallel(function, *arguments):
 
 
 def map_small_tasks(function, *arguments):
-    """Map `function` lazily over small tasks, each with its kernels on a single thread."""
+    """Map `function` lazily over small tasks, each with its kernels on a single thread.
+
+    Fewer tasks than threads run one after the other, with their kernels on all threads.
+    """
     threads = numba.config.NUMBA_NUM_THREADS
-    if threads == 1:
+    if threads == 1 or len(arguments[0]) < threads:
         yield from map(function, *arguments)
         return
     alone = {"initializer": setattr, "initargs": (_thread, "is_alone", True)}

@@ -1,34 +1,47 @@
-"""Colours of Gaussians fitted to an image, which is linear in them."""
+"""Colours of Gaussians fitted to images, which are linear in them."""
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import replace
 
 import torch
+from torch import Tensor
 
 from gscompleter.cpu_threads import use_one_torch_thread
-from gscompleter.render import FrozenScene
+from gscompleter.render import ColorErrors, ColorSums, FrozenScene, get_view_map
 from gscompleter.render.spherical_harmonics import evaluate_colors
 from gscompleter.types import SH_C0, Gaussians, View
 
 RELAXATION = 1.7
 """Step size as a multiple of the mean residual; below 2 the rounds converge."""
 MIN_WEIGHT = 0.05
-"""Summed weight up to which colours are damped, as the image hardly shows them."""
+"""Summed weight up to which colours are damped, as the images hardly show them."""
 
 
 @use_one_torch_thread()
-def fit_colors(new: Gaussians, frozen: FrozenScene, image: View, rounds: int) -> Gaussians:
-    """Fit the colours of `new` Gaussians by SIRT (Gilbert 1972).
+def fit_colors(
+    new: Gaussians,
+    frozen: Sequence[FrozenScene],
+    images: Sequence[View],
+    relaxations: Sequence[float],
+) -> Gaussians:
+    """Fit the colours of `new` Gaussians by SIRT (Gilbert 1972), with a step size per round.
 
-    `frozen` is the scene in front of and behind them, at the camera of the image. The change is the
-    same in all directions.
+    `frozen` is the scene in front of and behind them, at the camera of each image. The change is
+    the same in all directions.
     """
-    errors = frozen.vary_colors(new)
-    colors = evaluate_colors(new.sh, new.means, image.camera.center)
-    change = torch.zeros_like(colors)
-    for _ in range(rounds):
-        sums, weights = errors(colors + change, image.image)
-        change = change + RELAXATION * sums / weights.clamp_min(MIN_WEIGHT)[:, None]
+    view_map = get_view_map(new.means)
+    errors = list(view_map(lambda scene: scene.vary_colors(new), frozen))
+    colors = [evaluate_colors(new.sh, new.means, view.camera.center) for view in images]
+    change = torch.zeros_like(colors[0])
+
+    def measure(error: ColorErrors, color: Tensor, view: View) -> ColorSums:
+        return error(color + change, view.image)
+
+    for relaxation in relaxations:
+        found = list(view_map(measure, errors, colors, images))
+        sums, weights = (torch.stack(parts).sum(dim=0) for parts in zip(*found, strict=True))
+        change = change + relaxation * sums / weights.clamp_min(MIN_WEIGHT)[:, None]
     sh = torch.cat([new.sh[:, :1] + change[:, None] / SH_C0, new.sh[:, 1:]], dim=1)
     return replace(new, sh=sh, encoded=None)

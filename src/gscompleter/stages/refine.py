@@ -15,7 +15,7 @@ from gscompleter.geometry import measure_baseline
 from gscompleter.optim import Adam
 from gscompleter.progress import track
 from gscompleter.render import OpacityRender
-from gscompleter.render.fit_colors import fit_colors
+from gscompleter.render.fit_colors import RELAXATION, fit_colors
 from gscompleter.stages.target_view import TargetView
 from gscompleter.timing import timed_stage
 from gscompleter.types import Gaussians, View
@@ -40,7 +40,8 @@ def refine(kept: Gaussians, reference: View, view: TargetView) -> Refined:
     to. The paper refines opacities alone (Eq. 13).
     """
     views, config = view.state.views, view.state.config.refine
-    colored = fit_colors(kept, view.frozen, reference, config.color_rounds)
+    relaxations = [RELAXATION] * config.color_rounds
+    colored = fit_colors(kept, [view.frozen], [reference], relaxations)
     plans = tuple(frozen.vary_opacities(colored) for frozen in view.frozen_photos)
     distances = [measure_baseline(reference.camera, photo.camera) for photo in views]
     near = sorted(range(len(views)), key=distances.__getitem__)[: config.num_views]

@@ -18,6 +18,7 @@ from torch import Tensor
 from gscompleter.config.settings import COVERED
 from gscompleter.optim import Adam
 from gscompleter.render import Renderer
+from gscompleter.render.fit_colors import fit_colors
 from gscompleter.types import DepthMap, Gaussians, View
 
 OPACITY_STEPS = 6
@@ -27,14 +28,16 @@ OPACITY_RATE, OPACITY_BETAS = 1.0, (0.7, 0.99)
 REMOVAL_PENALTY = 0.01
 """Loss per unit of removed opacity; keeps Gaussians that no photograph contradicts."""
 
-STEPS_PER_VIEW = 10
+STEPS_PER_VIEW = 7
 """Number of steps of the joint fit per photograph."""
 RATES = {"moved": 0.2, "quats": 0.0375, "grown": 0.1875, "logits": 0.75, "sh": 0.1125}
 """Initial Adam step sizes; positions are in units of the Gaussian's size."""
-FINAL_RATE = 0.2
+FINAL_RATE = 0.5
 """Final step size relative to the initial one; the decay is linear."""
-BETAS = 0.9, 0.99
+BETAS = 0.8, 0.99
 """Adam decay rates of the joint fit."""
+COLOR_RELAXATIONS = 2.0, 1.0
+"""Step sizes of the rounds in which colours alone are fitted, to all photographs at once."""
 FAINTEST = 0.02
 """Margin from 0 and 1 to which the initial opacities are clamped."""
 
@@ -68,7 +71,10 @@ def fit_jointly(
     gains: Float[Tensor, "views 3"],
     renderer: Renderer,
 ) -> Gaussians:
-    """Minimize the squared image error, with renders scaled by each view's exposure gain."""
+    """Minimize the squared image error, with renders scaled by each view's exposure gain.
+
+    Colours are linear in the images, so that they are then fitted without gradients.
+    """
     unknown = init_parameters(gaussians)
     optimizer = Adam([(unknown[name], rate) for name, rate in RATES.items()], BETAS)
     order = shuffle_views(len(views))
@@ -77,7 +83,11 @@ def fit_jointly(
         image = renderer.render(fitted, view.camera).image
         left = 1 - (1 - FINAL_RATE) * step / len(order)
         optimizer.step((gains[number] * image - view.image).square().mean(), left)
-    return apply_parameters(gaussians, {name: value.detach() for name, value in unknown.items()})
+    found = {name: value.detach() for name, value in unknown.items()}
+    made = apply_parameters(gaussians, found)
+    frozen = [renderer.freeze(made[:0], view.camera) for view in views]
+    even = [replace(v, image=v.image / gain) for v, gain in zip(views, gains, strict=True)]
+    return fit_colors(made, frozen, even, COLOR_RELAXATIONS)
 
 
 def init_parameters(gaussians: Gaussians) -> dict[str, Tensor]:

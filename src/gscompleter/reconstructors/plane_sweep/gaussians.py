@@ -22,7 +22,7 @@ from gscompleter.reconstructors.plane_sweep.fusion import (
 from gscompleter.reconstructors.plane_sweep.rig import Transforms
 from gscompleter.reconstructors.plane_sweep.sweep import Mask
 from gscompleter.render import Renderer, load_renderer
-from gscompleter.render.fit_colors import fit_colors
+from gscompleter.render.fit_colors import RELAXATION, fit_colors
 from gscompleter.sky import extend_sky, is_sky, restore_sky_colors
 from gscompleter.types import (
     DepthMap,
@@ -97,7 +97,7 @@ class Splatter:
         rows = torch.nonzero(pixel_mask.reshape(-1))[:, 0]
         blurred, image = self.splat(views[0], depths[0])[rows].to("cpu"), views[0].to("cpu")
         alone = self.renderer.freeze(blurred[:0], image.camera)
-        made = fit_colors(blurred, alone, image, COLOR_ROUNDS).to(rows.device)
+        made = fit_colors(blurred, [alone], [image], [RELAXATION] * COLOR_ROUNDS).to(rows.device)
         return Reconstruction(made, tuple(depths), torch.zeros_like(rows), rows)
 
     def select_pixels(
