@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 
@@ -31,8 +32,9 @@ from gscompleter.types import DepthMap, Reconstruction, View
 
 LIFT_ITERATIONS = ITERATIONS // 2
 """Iterations of the surfaces of a synthesized image, which registration corrects."""
-MIN_HALVED_SIDE = 192
-"""Shortest side, in pixels, from which three or more images are matched at half size."""
+MIN_HALVED_SIDES = {"pair": math.inf, "many": 192, "lift": 320}
+"""Shortest side, in pixels, from which images are matched at half size, which takes an eighth of
+the time: two photographs, more of them, a synthesized image and its anchor."""
 
 
 @dataclass(frozen=True)
@@ -43,10 +45,7 @@ class PlaneSweep(Splatter):
     """Monocular depth, used where stereo measures nothing."""
 
     def __call__(self, views: Sequence[View]) -> Reconstruction:
-        """Reconstruct the scene and the depth of every pixel.
-
-        More than two large views are matched at half size, which takes an eighth of the time.
-        """
+        """Reconstruct the scene and the depth of every pixel."""
         views = set_depth_range(views, *get_depth_range(views))
         rig = build_rig(views)
         layers = self.compute_layers(rig, views)
@@ -57,12 +56,12 @@ class PlaneSweep(Splatter):
         """Lift the pixels of `pixel_mask` in the first view, a synthesized image.
 
         No photograph observes a hole, so its opacities are not fitted; its depth continues the
-        surfaces around it, at full size. Colours are fitted to the image itself. The sky gets no
+        surfaces around it. Colours are fitted to the image itself. The sky gets no
         depth.
         """
         views = set_depth_range(views, *get_depth_range(views))
         rig = build_rig(views)
-        first, second = match_views(rig, views)
+        first, second = match_views(rig, views, MIN_HALVED_SIDES["lift"])
         open_there = find_sky(rig.images[1], second)
         first = add_prediction(first, self.predict_depth(views[0]))
         layers = [
@@ -81,16 +80,17 @@ class PlaneSweep(Splatter):
 
     def compute_layers(self, rig: Rig, views: Sequence[View]) -> list[Layer]:
         """Compute the completed inverse depth of each view."""
-        found = match_views(rig, views)
+        least = MIN_HALVED_SIDES["pair" if len(views) == 2 else "many"]
+        found = match_views(rig, views, least)
         seen = find_skies(rig, found)
         guided = map(add_prediction, found, map(self.predict_depth, views))
         surfaces = map_in_parallel(make_layer, rig.images, map(Measurement.exclude, guided, seen))
         return list(map(add_sky, surfaces, found, seen))
 
 
-def match_views(rig: Rig, views: Sequence[View]) -> list[Measurement]:
-    """Measure depth outside the ignored pixels, at half size for three or more large views."""
-    is_halved = len(views) > 2 and min(min(image.size) for image in rig.images) >= MIN_HALVED_SIDE
+def match_views(rig: Rig, views: Sequence[View], min_halved_side: float) -> list[Measurement]:
+    """Measure depth outside the ignored pixels, at half size if all images are large enough."""
+    is_halved = min(min(image.size) for image in rig.images) >= min_halved_side
     found = measure_depths(rig.halve() if is_halved else rig, *get_depth_range(views))
     return [
         one if image.ignore_mask is None else one.exclude(image.ignore_mask)
