@@ -24,6 +24,11 @@ class SceneRenderer:
         self._views: dict[Hashable, tuple[Parts, FrozenScene]] = {}
         self._thinned: list[tuple[Gaussians, Gaussians]] = []
 
+    def clear(self) -> None:
+        """Forget all frozen scenes, which take the most memory of a completion."""
+        self._views.clear()
+        self._thinned = []
+
     def freeze(self, parts: Parts, camera: Camera) -> FrozenScene:
         """Freeze a scene at a camera that is not visited again."""
         return self._update(parts, camera, (), None)

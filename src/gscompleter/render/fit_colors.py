@@ -6,10 +6,9 @@ from collections.abc import Sequence
 from dataclasses import replace
 
 import torch
-from torch import Tensor
 
 from gscompleter.cpu_threads import use_one_torch_thread
-from gscompleter.render import ColorErrors, ColorSums, FrozenScene, get_view_map
+from gscompleter.render import ColorSums, FrozenScene, get_view_map
 from gscompleter.render.spherical_harmonics import evaluate_colors
 from gscompleter.types import SH_C0, Gaussians, View
 
@@ -31,17 +30,16 @@ def fit_colors(
     `frozen` is the scene in front of and behind them, at the camera of each image. The change is
     the same in all directions.
     """
-    view_map = get_view_map(new.means)
-    errors = list(view_map(lambda scene: scene.vary_colors(new), frozen))
-    colors = [evaluate_colors(new.sh, new.means, view.camera.center) for view in images]
-    change = torch.zeros_like(colors[0])
+    change = torch.zeros_like(new.means)
 
-    def measure(error: ColorErrors, color: Tensor, view: View) -> ColorSums:
-        return error(color + change, view.image)
+    def measure(scene: FrozenScene, view: View) -> ColorSums:
+        colors = evaluate_colors(new.sh, new.means, view.camera.center)
+        return scene.vary_colors(new)(colors + change, view.image)
 
     for relaxation in relaxations:
-        found = list(view_map(measure, errors, colors, images))
-        sums, weights = (torch.stack(parts).sum(dim=0) for parts in zip(*found, strict=True))
+        sums, weights = change.new_zeros(change.shape), change.new_zeros(len(change))
+        for pull, weight in get_view_map(change)(measure, frozen, images):
+            sums, weights = sums + pull, weights + weight
         change = change + relaxation * sums / weights.clamp_min(MIN_WEIGHT)[:, None]
     sh = torch.cat([new.sh[:, :1] + change[:, None] / SH_C0, new.sh[:, 1:]], dim=1)
     return replace(new, sh=sh, encoded=None)

@@ -115,6 +115,7 @@ def complete_folder(options: CompleteOptions) -> dict[str, Any]:
         find_ffmpeg()
     with open_completion(options) as (ready, folder):
         completion, ready = complete_targets(ready)
+        ready.completer.scenes.clear()
         with stage("report"):
             summary = write_done(folder, ready, completion)
             write_targets(folder, ready.task)
