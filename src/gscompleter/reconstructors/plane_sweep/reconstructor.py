@@ -32,7 +32,7 @@ from gscompleter.types import DepthMap, Reconstruction, View
 
 LIFT_ITERATIONS = ITERATIONS // 2
 """Iterations of the surfaces of a synthesized image, which registration corrects."""
-MIN_HALVED_SIDES = {"pair": math.inf, "many": 192, "lift": 320}
+MIN_HALVED_SIDES = {"pair": math.inf, "many": 192.0, "lift": 320.0}
 """Shortest side, in pixels, from which images are matched at half size, which takes an eighth of
 the time: two photographs, more of them, a synthesized image and its anchor."""
 
