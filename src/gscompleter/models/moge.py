@@ -20,7 +20,7 @@ from gscompleter.models.weights.published import PUBLISHED
 from gscompleter.types import Camera, DepthMap, View
 
 SIGNATURE = {"image": ("tensor(float)", 3), "num_tokens": ("tensor(int64)", None)}
-NUM_TOKENS = np.array(1800)
+NUM_TOKENS = np.array(1800, np.int64)
 """Patches of the transformer per image, as in the authors' export; they train with 1200 to 3600."""
 MIN_MASK = 0.5
 """Score from which a pixel has a depth; the sky has none."""
