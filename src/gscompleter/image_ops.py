@@ -106,8 +106,7 @@ def ssim_map(
     image: Float[Tensor, "h w 3"], other: Float[Tensor, "h w 3"]
 ) -> Float[Tensor, "1 3 h w"]:
     """Compute structural similarity (Wang et al. 2004) around each pixel, padding with black."""
-    offsets = torch.arange(-SSIM_RADIUS, SSIM_RADIUS + 1, dtype=image.dtype)
-    line = torch.exp(-(offsets**2) / (2 * SSIM_SIGMA**2))
+    line = torch.exp(-(torch.arange(-SSIM_RADIUS, SSIM_RADIUS + 1.0) ** 2) / (2 * SSIM_SIGMA**2))
     weights = (line / line.sum()).tolist()
 
     def blur(values: Float[Tensor, "h w 3"]) -> Tensor:

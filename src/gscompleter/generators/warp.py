@@ -146,10 +146,7 @@ def continue_image(
 
 
 def warp_and_fill(nearest: View, target: Camera, context: GeneratorInput) -> WarpedImage:
-    """Warp the photographs to the target and fill the holes smoothly, background first.
-
-    A target that observes nothing has no border to continue; it gets the mean colour.
-    """
+    """Warp the photographs and fill the holes smoothly; the mean colour where nothing is known."""
     warped = warp_photographs(nearest, target, context)
     if not warped.known.any():
         return replace(warped, image=nearest.image.mean(dim=(0, 1)).expand_as(warped.image))

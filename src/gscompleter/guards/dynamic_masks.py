@@ -171,8 +171,7 @@ def compare_both_ways(
     one: SmallPhoto, other: SmallPhoto, min_difference: float
 ) -> tuple[Comparison, Comparison]:
     """Compare two photographs both ways, twice: surfaces in conflict then occlude nothing."""
-    limits = min_difference, min_difference
-    there, back = get_view_map(one.image)(compare, (one, other), (other, one), limits)
+    there, back = get_view_map(one.image)(compare, (one, other), (other, one), [min_difference] * 2)
     return (
         there.occlude_by(other.depth.where(~back.conflict_mask, torch.inf)),
         back.occlude_by(one.depth.where(~there.conflict_mask, torch.inf)),

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 from typing import Literal
 
 import torch
@@ -195,11 +196,8 @@ class CheckedRender:
 
 def find_over_budget(checks: Sequence[Check], opacities: Float[Tensor, "n"]) -> list[CheckedRender]:
     """Render all photographs and return those over budget."""
-
-    def render(check: Check) -> CheckedRender:
-        return render_check(check, opacities)
-
-    return [found for found in get_view_map(opacities)(render, checks) if found.excess > 0]
+    rendered = get_view_map(opacities)(partial(render_check, opacities=opacities), checks)
+    return [render for render in rendered if render.excess > 0]
 
 
 def render_check(check: Check, opacities: Float[Tensor, "n"]) -> CheckedRender:

@@ -115,11 +115,8 @@ def improve_colors(
 
     With a relaxation of 1 it minimizes an upper bound in which every Gaussian stands alone.
     """
-
-    def backproject(image: WeightedImage) -> tuple[Tensor, Tensor, Tensor]:
-        return *image.backproject(colors, gradients), image.position
-
-    found = list(get_view_map(colors)(backproject, images))
+    sums = get_view_map(colors)(lambda image: image.backproject(colors, gradients), images)
+    found = [(*each, image.position) for each, image in zip(sums, images, strict=True)]
     total = torch.stack([seen for _, seen, _ in found]).sum(0).clamp_min(MIN_WEIGHT)
     damping = GRADIENT_PENALTY * total * (1 + ANGLE**2 / squared_angle)
     cross = torch.stack([seen * at for _, seen, at in found]).sum(0)

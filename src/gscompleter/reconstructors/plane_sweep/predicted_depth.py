@@ -8,7 +8,11 @@ import numpy as np
 import torch
 
 from gscompleter.ransac import find_affine_inliers, fit_line_ransac
-from gscompleter.reconstructors.plane_sweep.sweep import Measurement, compute_plane_index
+from gscompleter.reconstructors.plane_sweep.sweep import (
+    Measurement,
+    compute_inverse_depth,
+    compute_plane_index,
+)
 from gscompleter.types import DepthMap
 
 MIN_CONFIDENCE = 0.5
@@ -35,7 +39,8 @@ def add_prediction(found: Measurement, predicted: DepthMap) -> Measurement:
     if len(sure) < MIN_PIXELS:
         return found
     sample = sure[:: -(-len(sure) // MAX_PIXELS)]
-    x, y = (torch.from_numpy(values.ravel()[sample]).double() for values in (guess, full.inverse))
+    pair = guess, compute_inverse_depth(full.planes, full.index)
+    x, y = (torch.from_numpy(values.ravel()[sample]).double() for values in pair)
     scale, shift = fit_line_ransac(x, y, torch.Generator().manual_seed(0))
     if find_affine_inliers(x, y, scale, shift).double().mean() < MIN_INLIERS:
         return found
