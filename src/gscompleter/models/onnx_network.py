@@ -44,7 +44,7 @@ class OnnxNetwork:
 def load_network(
     weights: PublishedWeights,
     signature: Signature,
-    file: Path | None,
+    file: Path | str | None,
     device: str,
     option: str = "generator_weights",
     num_outputs: int = 1,
@@ -57,7 +57,7 @@ def load_network(
     """
     if find_spec("onnxruntime") is None:
         raise InputError(f"The model {weights.name!r} needs onnxruntime: {INSTALL}.")
-    path = fetch_checked(weights, file)
+    path = fetch_checked(weights, None if file is None else Path(file))
     session = open_session(path, device, option)
     given = {
         x.name: (x.type, x.shape[1] if len(x.shape) == 4 else None) for x in session.get_inputs()

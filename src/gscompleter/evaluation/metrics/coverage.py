@@ -58,7 +58,7 @@ def render_pairs(
     """Render the scene before and after completion in small images, from a thinned scene."""
     is_unchanged = completion.parts[0] is completion.source.rendered
     begun = thin_gaussians(completion.source.rendered, MAX_PREVIEW_GAUSSIANS)
-    kept = thin_gaussians(completion.parts[0], MAX_PREVIEW_GAUSSIANS)
+    kept = begun if is_unchanged else thin_gaussians(completion.parts[0], MAX_PREVIEW_GAUSSIANS)
     added = [thin_gaussians(result.added, MAX_PREVIEW_GAUSSIANS) for result in completion.targets]
     new = merge([begun[:0], *added])
     trust = completion.trust.thin(*choose_thinned_rows(completion.parts[0], MAX_PREVIEW_GAUSSIANS))
@@ -68,7 +68,7 @@ def render_pairs(
 
     def render_pair(camera: Camera) -> RenderPair:
         first = renderer.freeze(begun, camera)
-        last = (first if is_unchanged else renderer.freeze(kept, camera)).extend(new)
+        last = (first if kept is begun else renderer.freeze(kept, camera)).extend(new)
         return RenderPair(
             render_trusted(first, at_first, camera), render_trusted(last, trust, camera)
         )

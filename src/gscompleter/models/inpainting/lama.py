@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from pathlib import Path
-
 import numpy as np
 import torch
 from jaxtyping import Bool, Float
@@ -42,6 +40,5 @@ class LaMa:
 
 def load_lama(file: str | None = None, device: str = "cpu") -> InpaintingGenerator:
     """Load the generator from a file, or the published one; raises the errors of `load_network`."""
-    path = None if file is None else Path(file)
-    network = load_network(PUBLISHED["lama"], SIGNATURE, path, device)
+    network = load_network(PUBLISHED["lama"], SIGNATURE, file, device)
     return InpaintingGenerator(LaMa(network))

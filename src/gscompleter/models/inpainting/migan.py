@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from pathlib import Path
-
 import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
@@ -33,6 +31,5 @@ class MIGAN:
 
 def load_migan(file: str | None = None, device: str = "cpu") -> InpaintingGenerator:
     """Load the generator from a file, or the published one; raises the errors of `load_network`."""
-    path = None if file is None else Path(file)
-    network = load_network(PUBLISHED["migan"], SIGNATURE, path, device)
+    network = load_network(PUBLISHED["migan"], SIGNATURE, file, device)
     return InpaintingGenerator(MIGAN(network))

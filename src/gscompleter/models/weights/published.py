@@ -200,51 +200,42 @@ DEPTHSPLAT = _create_depthsplat(
 DEPTH_ALONE: dict[str, Any] = {"near_far": None, "entry": "model", "prefix": "", "gives": "depth"}
 
 
-def _create_inpainting(
-    model: str, repository: str, licence: str, **others: Any
-) -> PublishedWeights:
-    """Create the entry of a generator that fills holes, whose licence allows commercial use."""
+def _create_onnx(repository: str, licence: str, **others: Any) -> PublishedWeights:
+    """Create the entry of an ONNX file, whose licence allows commercial use."""
     return PublishedWeights(
-        name=model.lower().replace("-", ""),
-        model=model,
         network=None,
         repository=repository,
-        parameters=None,
         views=(1, 1),
-        image_size=(512, 512),
         near_far=None,
         code_licence=licence,
         weights_licence=licence,
         caution="",
         source=f"https://huggingface.co/{repository}",
-        gives="image",
         **others,
     )
 
 
-def _create_moge(
-    name: str, size: str, sha256: str, megabytes: int, parameters: int, revision: str = "main"
+def _create_inpainting(
+    model: str, repository: str, licence: str, **others: Any
 ) -> PublishedWeights:
+    """Create the entry of a generator that fills holes."""
+    name = model.lower().replace("-", "")
+    given = {"name": name, "model": model, "parameters": None, "gives": "image", **others}
+    return _create_onnx(repository, licence, image_size=(512, 512), **given)
+
+
+def _create_moge(name: str, size: str, **others: Any) -> PublishedWeights:
     """Create the entry of a size of MoGe-2, as its authors exported it."""
-    repository = f"Ruicheng/moge-2-{size}-normal-onnx"
-    return PublishedWeights(
+    return _create_onnx(
+        f"Ruicheng/moge-2-{size}-normal-onnx",
+        "MIT",
         name=name,
         model=name.replace("moge", "MoGe"),
-        network=None,
-        repository=repository,
-        revision=revision,
         file="model.onnx",
-        sha256=sha256,
-        megabytes=megabytes,
-        parameters=parameters,
-        views=(1, 1),
         image_size=(518, 518),
-        near_far=None,
         code="https://github.com/microsoft/MoGe",
-        weights_licence="MIT",
-        caution="",
-        source=f"https://huggingface.co/{repository}",
         gives="monocular depth",
+        **others,
     )
 
 
@@ -356,24 +347,24 @@ _FILES = (
     _create_moge(
         "moge-2",
         "vits",
-        "24eacb5dc7a2c54c7bc98f7de085ffbed79ad006ea5b664c2c2cdc02ff3a52f0",
-        141,
-        35_000_000,
-        "e50ffda41565591092adea54c6ac83d6212e1e23",
+        revision="e50ffda41565591092adea54c6ac83d6212e1e23",
+        sha256="24eacb5dc7a2c54c7bc98f7de085ffbed79ad006ea5b664c2c2cdc02ff3a52f0",
+        megabytes=141,
+        parameters=35_000_000,
     ),
     _create_moge(
         "moge-2-base",
         "vitb",
-        "bbf14e07a30f11e69d36ab861590123f5598ababcbc8946a063eb4a966f35a21",
-        419,
-        104_000_000,
+        sha256="bbf14e07a30f11e69d36ab861590123f5598ababcbc8946a063eb4a966f35a21",
+        megabytes=419,
+        parameters=104_000_000,
     ),
     _create_moge(
         "moge-2-large",
         "vitl",
-        "afbc4ccc3450298f3afb35b90f015f4c4f552dea21dc6470d5f7b78b77e2d751",
-        1324,
-        331_000_000,
+        sha256="afbc4ccc3450298f3afb35b90f015f4c4f552dea21dc6470d5f7b78b77e2d751",
+        megabytes=1324,
+        parameters=331_000_000,
     ),
 )
 
