@@ -1,5 +1,6 @@
 """Threads of all libraries; the result does not depend on their number."""
 
+import ctypes
 import hashlib
 import os
 import subprocess
@@ -42,6 +43,27 @@ def counted(*arguments: str, **told: str) -> list[int]:
 def test_every_library_takes_as_many_as_it_is_told():
     assert counted("1") == [1, 1, 1]
     assert counted("3")[1:] == [3, 3]  # torch takes no more than there are cores
+
+ARENAS = """
+import ctypes, threading
+from gscompleter.cpu_threads import limit_threads
+limit_threads(2)
+library = ctypes.CDLL(None)
+library.malloc.restype = library.fdopen.restype = ctypes.c_void_p
+held = [threading.Thread(target=library.malloc, args=(10_000,)) for _ in range(4)]
+[thread.start() for thread in held]
+[thread.join() for thread in held]
+stdout = ctypes.c_void_p(library.fdopen(1, b"w"))
+library.malloc_info(0, stdout)
+library.fflush(stdout)
+"""
+
+
+@pytest.mark.skipif(not hasattr(ctypes.CDLL(None), "malloc_info"), reason="needs glibc")
+def test_all_threads_allocate_from_one_arena():
+    command = [sys.executable, "-c", ARENAS]
+    life = subprocess.run(command, capture_output=True, text=True, check=True)
+    assert life.stdout.count("<heap nr=") == 1
 
 
 def test_what_the_environment_says_gives_way_to_what_is_told_and_to_nothing_else():

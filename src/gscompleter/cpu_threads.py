@@ -1,15 +1,20 @@
-"""Number of CPU threads of torch, numba and OpenCV."""
+"""Number of CPU threads of torch, numba and OpenCV, and the memory that they share."""
 
 from __future__ import annotations
 
+import ctypes
 import math
 import os
+import sys
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 
 THREAD_VARIABLES = ("OMP_NUM_THREADS", "NUMBA_NUM_THREADS", "OPENCV_FOR_THREADS_NUM")
 """Environment variables that torch, numba and OpenCV read on import."""
+
+ARENA_MAX = -8
+"""Parameter of glibc's `mallopt`: the number of arenas from which threads allocate."""
 
 QUOTA_FILE = Path("/sys/fs/cgroup/cpu.max")
 """File of a Linux container's CPU quota: microseconds per period."""
@@ -24,6 +29,14 @@ def limit_threads(count: int | None) -> None:
     for name in THREAD_VARIABLES:
         if count is not None or name not in os.environ:
             os.environ[name] = str(count or count_available_cores())
+    use_one_arena()
+
+
+def use_one_arena() -> None:
+    """Let all threads allocate from one arena (glibc): each keeps free memory of its own."""
+    library = ctypes.CDLL(None) if sys.platform == "linux" else None
+    if hasattr(library, "mallopt"):
+        library.mallopt(ARENA_MAX, 1)
 
 
 def get_thread_count() -> int:

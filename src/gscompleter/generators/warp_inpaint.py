@@ -309,13 +309,21 @@ def downsample_level(level: Level) -> Level:
     image = torch.where(share > 0.5, seen, guess)
     expected = pool_pixels(level.expected[..., None])[..., 0]
 
-    sources = level.sources
-    valid = sources.valid.float()[..., None]
-    usable = pool_pixels(valid)
-    layers = torch.cat([sources.images, sources.log_depth[..., None]], dim=-1)
-    means = pool_pixels(layers * valid) / usable.clamp_min(1e-6)
-    halved = Sources(means[..., :3], usable[..., 0] > 0.75, means[..., 3])
+    # One source at a time, since all of them and their copies take most memory of a synthesis.
+    parts = level.sources.images, level.sources.valid, level.sources.log_depth
+    halved = Sources(*map(torch.stack, zip(*map(halve_source, *parts), strict=True)))
     return Level(image, share[..., 0] > 0.5, expected, halved)
+
+
+def halve_source(
+    image: Float[Tensor, "h w 3"], valid: Bool[Tensor, "h w"], log_depth: Float[Tensor, "h w"]
+) -> tuple[Float[Tensor, "h2 w2 3"], Bool[Tensor, "h2 w2"], Float[Tensor, "h2 w2"]]:
+    """Halve a source; averages leave out invalid pixels."""
+    known = valid.float()[..., None]
+    usable = pool_pixels(known)
+    layers = torch.cat([image, log_depth[..., None]], dim=-1)
+    means = pool_pixels(layers * known) / usable.clamp_min(1e-6)
+    return means[..., :3], usable[..., 0] > 0.75, means[..., 3]
 
 
 def pool_pixels(values: Float[Tensor, "*s h w c"]) -> Float[Tensor, "*s h2 w2 c"]:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from functools import cached_property
+from functools import cached_property, reduce
 from typing import Any
 
 import numba
@@ -30,6 +30,8 @@ from gscompleter.render.viewpoint import (
 )
 from gscompleter.types import Camera, Gaussians, Render
 
+BLOCK = 1_000_000
+"""Gaussians that are frozen at a time."""
 MAX_SIDE = TILE * np.iinfo(np.int16).max
 """Largest side of an image in pixels, since kernels number tiles in 16 bits."""
 
@@ -78,7 +80,11 @@ class CpuFrozenScene:
         return to_render(self.frame)
 
     def extend(self, new: Gaussians) -> CpuFrozenScene:
-        """Freeze context and `new` together, in that order."""
+        """Freeze context and `new` together, in that order, some at a time to save memory."""
+        blocks = (new[start : start + BLOCK] for start in range(0, len(new), BLOCK))
+        return reduce(CpuFrozenScene._extend, blocks, self)
+
+    def _extend(self, new: Gaussians) -> CpuFrozenScene:
         splats = self.viewpoint.project(to_arrays(new), new.is_antialiased)
         added, order = order_by_use(self.viewpoint.fill_lists(splats, self.depth_limits))
         count = self.count + len(new)

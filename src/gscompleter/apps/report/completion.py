@@ -147,12 +147,10 @@ def write_report(
 def render_before_after(completion: Completion, camera: Camera, renderer: Renderer) -> RenderPair:
     """Render the context and the completed scene."""
     with torch.no_grad():
-        frozen = renderer.freeze(completion.context, camera)
-        if completion.recolored_context is completion.context:
-            after = frozen.composite(completion.added)
-        else:
-            after = renderer.render(completion.scene, camera)
-    return RenderPair(frozen.render, after)
+        before = after = renderer.freeze(completion.context, camera)
+        if completion.recolored_context is not completion.context:
+            after = renderer.freeze(completion.recolored_context, camera)
+        return RenderPair(before.render, after.composite(completion.added))
 
 
 def compute_scores(pair: RenderPair, photograph: View | None) -> Scores:
