@@ -25,6 +25,7 @@ from gscompleter.data.limits import DEPTH_RANGE, MAX_COEFFICIENT, MAX_NUMBER, re
 from gscompleter.data.photographs import Photographs, build_photographs
 from gscompleter.data.points import read_point_cloud
 from gscompleter.errors import quote_value
+from gscompleter.io.image import read_depth
 from gscompleter.io.reading import is_json_list, read_json
 
 NAME = "transforms.json"
@@ -117,7 +118,7 @@ def _parse_frame(
         c2w=np.vstack([c2w, [0, 0, 0, 1]]) if len(c2w) == 3 else c2w,
         intrinsics=_parse_intrinsics({**content, **entry}, title),
         image=locate("file_path"),
-        depth=None if depth is None else (depth, depth_unit),
+        depth=None if depth is None else partial(read_depth, depth, depth_unit),
         mask=locate("mask_path"),
     )
     frame = frame.with_rigid_pose(" (`transform_matrix`)")
