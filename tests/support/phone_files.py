@@ -102,9 +102,10 @@ def scanner_app() -> Files:
     files = {"info.json": b"{}", "points.ply": b"ply\n"}
     for frame in range(8):
         number, stem = frame // 2, f"{frame:05d}"
+        K = camera_of(number, WIDE).K - torch.tensor([[0, 0, 0.5], [0, 0, 0.5], [0, 0, 0]])
         content = {
             "cameraPoseARFrame": stored_pose(number, WIDE).ravel().tolist(),
-            "intrinsics": camera_of(number, WIDE).K.flatten().tolist(),
+            "intrinsics": K.flatten().tolist(),
             "frame_index": frame,
         }
         files[f"frame_{stem}.json"] = json.dumps(content).encode()

@@ -74,10 +74,10 @@ def parse_polycam(entry: Any, title: str) -> tuple[Float[np.ndarray, "4 4"], Int
 
 
 def parse_scanner_app(entry: Any, title: str) -> tuple[Float[np.ndarray, "4 4"], Intrinsics]:
-    """Parse a camera of 3d Scanner App; its matrices are lists of rows."""
+    """Parse a camera of 3d Scanner App: lists of rows, with whole numbers at pixel centres."""
     fx, _, cx, _, fy, cy = get_array(entry, "intrinsics", title, (9,))[:6].tolist()
     c2w = get_array(entry, "cameraPoseARFrame", title, (16,)).reshape(4, 4)
-    return c2w, Intrinsics(None, (fx, fy), (cx, cy))
+    return c2w, Intrinsics(None, (fx, fy), (cx + 0.5, cy + 0.5))
 
 
 DEPTH = (f"{HOME}/depth/*.png", f"{HOME}/confidence/*.png")
