@@ -58,7 +58,6 @@ EXPORTS = (
 )
 """Endings of files that are not read, what their first bytes hold, the program and what to do."""
 MODELS = (".usdz", ".fbx", ".las", ".laz", ".obj", ".stl")
-"""Endings of meshes and point clouds."""
 
 
 def read_cameras(path: Path, resolution: Resolution = None) -> list[Frame]:
@@ -167,9 +166,8 @@ def refuse_other_exports(path: Path) -> None:
         f"{quote_value(path)} is a model without photographs and cameras, which is all that "
         "Scaniverse exports; record with Polycam, Record3D or 3d Scanner App, or take photographs.",
     )
-    for file, (endings, mark, (program, advice)) in product(
-        [path, *sorted(path.glob("*"))], EXPORTS
-    ):
+    inside = sorted(path.glob("*"))
+    for file, (endings, mark, (program, advice)) in product([path, *inside], EXPORTS):
         require(
             file.suffix.lower() not in endings or mark not in read_head(file, 4096),
             f"{quote_value(file)} holds cameras of {program}, which cannot be read; {advice}, or "

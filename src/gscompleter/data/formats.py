@@ -23,8 +23,7 @@ from gscompleter.data.ego_vehicle import attach_vehicle_detector
 from gscompleter.data.frame import FOLDERS
 from gscompleter.data.limits import check_planes, require
 from gscompleter.data.llff import has_llff, open_llff
-from gscompleter.data.phones.keyframes import POLYCAM, SCANNER_APP
-from gscompleter.data.phones.record3d import has_record3d, open_record3d
+from gscompleter.data.phones.apps import POLYCAM, SCANNER_APP, find_recording, open_recording
 from gscompleter.data.photographs import Photographs
 from gscompleter.data.real_estate import (
     has_chunks,
@@ -66,7 +65,7 @@ FORMATS = {
     "waymo": Format(list_segments, open_waymo, "m"),
     "real-estate-10k": Format(list_camera_files, open_camera_files),
     "polycam": Format(POLYCAM.find_frames, POLYCAM.open, "m"),
-    "record3d": Format(has_record3d, open_record3d, "m"),
+    "record3d": Format(find_recording, open_recording, "m"),
     "3d-scanner-app": Format(SCANNER_APP.find_frames, SCANNER_APP.open, "m"),
 }
 """Formats by the names that `open_photographs` takes, in the order of detection."""

@@ -9,7 +9,7 @@ from pathlib import Path
 
 import numpy as np
 import torch
-from jaxtyping import Bool, Float, Shaped, UInt8
+from jaxtyping import Bool, Float, UInt8
 from PIL import Image
 from torch import Tensor
 
@@ -91,26 +91,19 @@ def read_brightness(stored: Path | bytes, side: int) -> Float[np.ndarray, "h w"]
     return np.array(grey.resize(size, Image.Resampling.BOX), np.float32)
 
 
-def read_depth(stored: Path | bytes, unit: float, name: str = "") -> Float[np.ndarray, "h w"]:
-    """Read z-depth from a `.npy` file, or a 16-bit PNG or its bytes, times `unit`."""
-    if isinstance(stored, Path) and stored.suffix == ".npy":
-        values = _read_array(stored)
+def read_depth(path: Path, unit: float) -> Float[np.ndarray, "h w"]:
+    """Read z-depth from a 16-bit PNG or a `.npy` file, times `unit`; 0 where unknown."""
+    if path.suffix == ".npy":
+        values = _read_array(path)
     else:
-        with open_image(stored, name) as image:
+        with open_image(path) as image:
             values = np.array(image)
     values = values[..., 0] if values.ndim == 3 and values.shape[-1] == 1 else values
     if values.ndim != 2 or values.dtype.kind not in "uif" or values.dtype == np.uint8:
-        shown = stored if isinstance(stored, Path) else name
         raise InputError(
-            f"{quote_value(shown)} is no depth map: a 16-bit grey PNG or an array [h, w] of "
-            f"numbers is needed, and it holds {values.dtype} of shape "
-            f"{quote_value(list(values.shape))}."
+            f"{quote_value(path)} is no depth map: a 16-bit grey PNG or an array [h, w] of numbers "
+            f"is needed, and it holds {values.dtype} of shape {quote_value(list(values.shape))}."
         )
-    return convert_to_depth(values, unit)
-
-
-def convert_to_depth(values: Shaped[np.ndarray, "h w"], unit: float) -> Float[np.ndarray, "h w"]:
-    """Convert stored z-depth to scene units by the factor `unit`; 0 where unknown."""
     with np.errstate(over="ignore", invalid="ignore"):
         depth = (values.astype(np.float64) * unit).astype(np.float32)
     return np.where(np.isfinite(depth) & (depth > 0), depth, np.float32(0))

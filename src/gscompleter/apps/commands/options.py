@@ -100,8 +100,8 @@ class SceneOptions(ComputeOptions, WritingOptions):
 
     folder: Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="SCENE")]
     """Folder of the photographs: COLMAP, nerfstudio, cameras.json, LLFF, KITTI, DGP, Waymo,
-    PandaSet, a pixelSplat chunk, a RealEstate10K camera file, or what a phone exports. If it has no cameras, COLMAP finds
-    them and they are kept in OUT/colmap."""
+    PandaSet, a pixelSplat chunk, a RealEstate10K camera file, or what Polycam, Record3D or 3d
+    Scanner App exports. If it has no cameras, COLMAP finds them and they are kept in OUT/colmap."""
     context: Frames = None
     """Frame numbers of the photographs to work with, counted in the order of their file paths. If
     not given, those that help most; photographs of targets are never used. `clean` takes all."""
