@@ -9,7 +9,7 @@ from __future__ import annotations
 import os
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
-from functools import partial
+from functools import lru_cache, partial
 from pathlib import Path, PurePosixPath
 from typing import Any
 from zipfile import ZipFile
@@ -24,7 +24,7 @@ from gscompleter.data.photographs import Photographs, build_photographs
 from gscompleter.data.transforms import OPENCV_FROM_OPENGL
 from gscompleter.errors import InputError, quote_value
 from gscompleter.io.image import open_image
-from gscompleter.io.reading import open_file, read_bytes
+from gscompleter.io.reading import check_file, read_bytes
 
 ADVICE = "export the recording again"
 MAX_ENTRY = 1 << 28
@@ -67,14 +67,19 @@ def _read_entry(export: Path, path: PurePosixPath) -> bytes:
 
 @contextmanager
 def _open_archive(path: Path) -> Iterator[ZipFile]:
-    with open_file(path) as file:
-        try:
-            with ZipFile(file) as archive:
-                yield archive
-        except Exception as error:  # damaged archives raise anything
-            raise InputError(
-                f"{quote_value(path)} cannot be read ({quote_value(str(error), 120)}); {ADVICE}."
-            ) from error
+    check_file(path)
+    try:
+        yield _keep_open(path, path.stat().st_mtime_ns)
+    except Exception as error:  # damaged archives raise anything
+        raise InputError(
+            f"{quote_value(path)} cannot be read ({quote_value(str(error), 120)}); {ADVICE}."
+        ) from error
+
+
+@lru_cache(maxsize=1)
+def _keep_open(path: Path, _written: int) -> ZipFile:
+    """Open an archive; the last one stays open, because its list of files is long."""
+    return ZipFile(path)
 
 
 def decode_png(data: bytes, title: str) -> Shaped[np.ndarray, "..."]:
