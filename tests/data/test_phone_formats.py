@@ -22,6 +22,7 @@ from phone_files import (
     camera_of,
     depth_of,
     encode,
+    nerf_capture,
     pack,
     photograph,
     polycam,
@@ -43,7 +44,9 @@ def lzfse(monkeypatch):
         monkeypatch.setitem(sys.modules, "liblzfse", module)
 
 
-def check_room(photographs: Photographs, size: tuple[int, int], name: str = "room") -> None:
+def check_room(
+    photographs: Photographs, size: tuple[int, int], name: str = "room", unsure: int = UNSURE
+) -> None:
     """Check cameras, photographs and depth against the room."""
     assert (len(photographs), photographs.notes) == (4, ())
     assert photographs.name == name
@@ -60,12 +63,12 @@ def check_room(photographs: Photographs, size: tuple[int, int], name: str = "roo
         assert view.depth is not None
         # Each pixel of a depth map covers 3 × 3 of the photograph, and is true at their centre.
         depth = torch.from_numpy(depth_of(number, size))
-        assert (view.depth[1::3, 1::3] - depth)[:, UNSURE:].abs().max() < 6e-4
-        assert (view.depth[:, 3 * UNSURE :] > 0).all()
-        assert (view.depth[:, : 3 * UNSURE] == 0).all()
+        assert (view.depth[1::3, 1::3] - depth)[:, unsure:].abs().max() < 6e-4
+        assert (view.depth[:, 3 * unsure :] > 0).all()
+        assert (view.depth[:, : 3 * unsure] == 0).all()
         at_centers = view_of(Room(), view.camera).depth
         assert at_centers is not None
-        assert (view.depth - at_centers)[1::3, 1 + 3 * UNSURE :: 3].abs().max() < 1e-3
+        assert (view.depth - at_centers)[1::3, 1 + 3 * unsure :: 3].abs().max() < 1e-3
 
 
 FOLDERS = {
@@ -161,8 +164,14 @@ def test_a_broken_frame_is_refused_by_its_name(tmp_path, kind):
 
 
 def test_photographs_without_any_camera_are_refused(tmp_path):
-    files = {"frame_00000.json": b"{}", "frame_00001.jpg": photograph(0, WIDE)}
+    files = {**without(scanner_app(), ".jpg"), "frame_00009.jpg": photograph(0, WIDE)}
     with pytest.raises(InputError, match="No photograph of .* has a camera"):
+        open_photographs(write_folder(tmp_path / "room", files))
+
+
+def test_other_files_beside_photographs_are_no_cameras(tmp_path):
+    files = {"frame_1.json": b'{"shapes": []}', "frame_1.jpg": photograph(0, WIDE)}
+    with pytest.raises(InputError, match="There are no posed photographs"):
         open_photographs(write_folder(tmp_path / "room", files))
 
 
@@ -271,6 +280,11 @@ def test_unknown_depth_is_zero(tmp_path):
 
 
 # Others.
+
+
+def test_recordings_of_nerf_capture_have_depth(tmp_path):
+    photographs = open_photographs(write_folder(tmp_path / "room", nerf_capture()))
+    check_room(photographs, WIDE, unsure=0)
 
 
 @pytest.mark.parametrize("name", ["scan.usdz", "scan.LAS", "scan.fbx"])

@@ -66,9 +66,9 @@ def encode(pixels: np.ndarray, kind: str = "PNG") -> bytes:
 
 
 @cache
-def photograph(number: int, size: tuple[int, int]) -> bytes:
+def photograph(number: int, size: tuple[int, int], kind: str = "JPEG") -> bytes:
     image = view_of(Room(), camera_of(number, size)).image
-    return encode(convert_to_pixels(image), "JPEG")
+    return encode(convert_to_pixels(image), kind)
 
 
 def millimetres(number: int, size: tuple[int, int]) -> bytes:
@@ -114,6 +114,21 @@ def scanner_app() -> Files:
         if frame % 2 == 0:
             files[f"frame_{stem}.jpg"] = photograph(number, WIDE)
     return files
+
+
+def nerf_capture() -> Files:
+    """Return a recording of NeRFCapture: depth up to 10 m in 16 bits, as large as photographs."""
+    K, files, frames = camera_of(0, WIDE).K.tolist(), Files(), []
+    for number in range(4):
+        depth = np.kron(depth_of(number, WIDE), np.ones((3, 3))) * 65535 / 10
+        files[f"images/{number}.png"] = photograph(number, WIDE, "PNG")
+        files[f"images/{number}.depth.png"] = encode(depth.astype(np.uint16))
+        place = {"file_path": f"images/{number}", "depth_path": f"images/{number}.depth.png"}
+        frames.append({"transform_matrix": stored_pose(number, WIDE).tolist(), **place})
+    lens = {"fl_x": K[0][0], "fl_y": K[1][1], "cx": K[0][2], "cy": K[1][2]}
+    scale = {"w": WIDE[0], "h": WIDE[1], "integer_depth_scale": 10 / 65535}
+    content = {**lens, **scale, "frames": frames}
+    return {**files, "transforms.json": json.dumps(content).encode()}
 
 
 def pack(data: bytes) -> bytes:

@@ -1,12 +1,10 @@
 """Exports of Polycam, 3d Scanner App and Record3D.
 
-* Raw data of Polycam and all data of 3d Scanner App have a JSON file for each photograph; the
-  latter more of them than photographs. Polycam's corrected photographs have no distortion and their
-  poses less drift; depth belongs to the others, which hardly differ.
-* A recording of Record3D is a zip archive `NAME.r3d`. Its `metadata` has the size `w` and `h` of
-  the photographs, `K` column by column, or fx, fy, cx and cy of each photograph, and `poses`: a
-  quaternion with the real part last, and the centre. `rgbd/N.depth` holds float32 metres and
-  `rgbd/N.conf` bytes, compressed with LZFSE.
+* Polycam's raw data and all data of 3d Scanner App have a JSON file for each photograph. Polycam's
+  corrected photographs have no distortion and their poses less drift; depth belongs to the others.
+* A recording of Record3D is a zip archive. Its `metadata` has the size `w` and `h` of photographs,
+  `K` column by column, or fx, fy, cx and cy of each, and `poses`: a quaternion with the real part
+  last, and the centre. `rgbd/N.depth` and `rgbd/N.conf` are compressed with LZFSE.
 """
 
 from __future__ import annotations
@@ -30,26 +28,28 @@ from gscompleter.data.photographs import Photographs
 from gscompleter.errors import InputError, quote_value
 from gscompleter.io.reading import parse_json
 
-HOME = "keyframes"
-"""Folder in Polycam's raw data."""
-METADATA, LENSES = "metadata", "perFrameIntrinsicCoeffs"
+HOME, METADATA, LENSES = "keyframes", "metadata", "perFrameIntrinsicCoeffs"
 NOTE = "Depth is left out; `pip install 'gscompleter[phones]'` makes it readable."
 
 
 @dataclass(frozen=True)
 class KeyframeFormat:
-    """Patterns of the files of frames, in order of preference, and the parser of cameras."""
+    """Files of frames and their cameras."""
 
-    patterns: tuple[tuple[str, str, str, str], ...]
-    """Patterns of cameras, photographs, depth maps and confidences."""
+    mark: bytes
+    """Part of each camera's JSON file."""
     parse: Callable[[Any, str], PoseAndLens]
-    """Function from the content of a JSON file, and its title, to the camera."""
+    """Function from the content of such a file, and its title, to the camera."""
+    patterns: tuple[tuple[str, str, str, str], ...]
+    """Patterns of cameras, photographs, depth maps and confidences, in order of preference."""
 
     def find_frames(self, path: Path) -> list[Files]:
         """Find the files of the first patterns with photographs; none if there are none."""
         root = path.parent if path.name == HOME else path
-        found = ([find_files(root, pattern) for pattern in group] for group in self.patterns)
-        return next((files for files in found if files[0] and files[1]), [])
+        for files in ([find_files(root, pattern) for pattern in group] for group in self.patterns):
+            if files[1] and self.mark in next(iter(files[0].values()), bytes)():
+                return files
+        return []
 
     def open(self, path: Path) -> Iterator[Photographs]:
         """Open a folder or an archive; frames are numbered by their sorted names."""
@@ -79,9 +79,9 @@ def parse_scanner_app(entry: Any, title: str) -> PoseAndLens:
 DEPTH = (f"{HOME}/depth/*.png", f"{HOME}/confidence/*.png")
 CORRECTED = (f"{HOME}/corrected_cameras/*.json", f"{HOME}/corrected_images/*.*", *DEPTH)
 ORIGINAL = (f"{HOME}/cameras/*.json", f"{HOME}/images/*.*", *DEPTH)
-POLYCAM = KeyframeFormat((CORRECTED, ORIGINAL), parse_polycam)
+POLYCAM = KeyframeFormat(b'"t_00"', parse_polycam, (CORRECTED, ORIGINAL))
 SCANNED = ("frame_*.json", "frame_*.jpg", "depth_*.png", "conf_*.png")
-SCANNER_APP = KeyframeFormat((SCANNED,), parse_scanner_app)
+SCANNER_APP = KeyframeFormat(b'"cameraPoseARFrame"', parse_scanner_app, (SCANNED,))
 
 
 def find_recording(path: Path) -> Files:
@@ -118,16 +118,14 @@ def _parse_recorded(content: Any, size: tuple[int, int], title: str) -> dict[str
     return cameras
 
 
-def _unpack(
-    kind: str, size: tuple[int, int], packed: bytes, title: str
-) -> Shaped[np.ndarray, "h w"]:
+def _unpack(kind: str, size: tuple[int, int], data: bytes, title: str) -> Shaped[np.ndarray, "h w"]:
     """Unpack a map with the aspect ratio of the photographs, and at most as many pixels."""
     from liblzfse import decompress
 
     try:
-        if len(packed) > 8 * math.prod(size):
+        if len(data) > 8 * math.prod(size):
             raise ValueError("it is larger than the photograph")
-        values = np.frombuffer(decompress(packed), kind)
+        values = np.frombuffer(decompress(data), kind)
         return values.reshape(round(math.sqrt(len(values) * size[1] / size[0])), -1)
     except Exception as error:  # damaged bytes raise anything
         raise InputError(
