@@ -1,6 +1,7 @@
 """Every shape in an annotation is checked at run time while the tests run."""
 
 import os
+import sys
 from pathlib import Path
 
 # As in the command line: threads that spin while they wait slow down a busy machine.
@@ -19,6 +20,13 @@ CHECKED = sorted(
     and path.stem not in ("__init__", "kernels")
 )
 install_import_hook([f"gscompleter.{name}" for name in CHECKED], "beartype.beartype")
+
+
+def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
+    """Skip tests of Linux elsewhere."""
+    for item in items:
+        if sys.platform != "linux" and item.get_closest_marker("linux"):
+            item.add_marker(pytest.mark.skip(reason="needs Linux"))
 
 
 @pytest.fixture(scope="session")

@@ -66,6 +66,7 @@ def test_a_header_is_quoted_in_part(tmp_path):
     sentence(load_ply, path)
 
 
+@pytest.mark.linux
 def test_a_pipe_is_no_scene_and_nobody_waits_for_it(tmp_path):
     os.mkfifo(tmp_path / "pipe.ply")
     assert "is no regular file" in sentence(load_ply, tmp_path / "pipe.ply")

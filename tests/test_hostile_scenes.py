@@ -236,6 +236,7 @@ def test_a_line_or_a_file_that_is_too_long_is_refused_before_it_is_parsed(tmp_pa
     assert "1,099,511,627,776 bytes, and at most" in sentence(path)
 
 
+@pytest.mark.linux
 @pytest.mark.parametrize("name", TEXTS)
 def test_a_text_that_is_a_pipe_is_not_waited_for(tmp_path, name):
     write, part = TEXTS[name]

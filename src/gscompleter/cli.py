@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import atexit
 import gc
+import io
 import os
 import sys
 import warnings
@@ -50,6 +51,8 @@ Command: Any = Union[  # noqa: UP007  (of as many as there are)
 
 def run() -> None:
     """Run `main` as the command `gscompleter`, whose output a reader may leave."""
+    if isinstance(sys.stdout, io.TextIOWrapper):  # Windows writes no UTF-8 into pipes
+        sys.stdout.reconfigure(errors="backslashreplace")
     try:
         try:
             main()

@@ -70,6 +70,6 @@ def count_available_cores() -> int:
 
 def read_quota(file: Path) -> float:
     """Read a CPU quota in cores; infinite if there is none."""
-    words = file.read_text().split() if file.is_file() else []
+    words = file.read_text("ascii").split() if file.is_file() else []
     bounded = len(words) == 2 and all(word.isdecimal() for word in words)
     return int(words[0]) / int(words[1]) if bounded else math.inf

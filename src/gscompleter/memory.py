@@ -79,7 +79,7 @@ def read_memory_bytes() -> int | None:
     """Return the memory of this machine or its container limit, or None if unknown."""
     found = []
     for file in filter(os.path.isfile, _LIMIT_FILES):
-        word = Path(file).read_text().strip()
+        word = Path(file).read_text("ascii").strip()
         found += [int(word)] if word.isdecimal() else []  # cgroup 2 has "max" for no limit
     with contextlib.suppress(AttributeError, OSError, ValueError):  # not on Windows
         found.append(os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES"))

@@ -84,10 +84,12 @@ def is_alive(pids: list[str]) -> bool:
         return False
 
 
+@pytest.mark.linux
 def test_what_is_killed_goes_on_and_every_job_is_done_once(tmp_path):
     killed_and_started_again("local", tmp_path, 8, 0.4)
 
 
+@pytest.mark.linux
 @pytest.mark.slow
 @pytest.mark.parametrize("engine", ["local", "ray"])
 def test_of_two_hundred_jobs_each_is_done_once_whatever_is_killed(engine, tmp_path):
@@ -147,11 +149,13 @@ class Deadly:
         os.kill(os.getpid(), signal.SIGKILL)
 
 
+@pytest.mark.linux
 def test_workers_that_cannot_even_list_a_failure_end_the_run():
     with pytest.raises(BrokenProcessPool):
         list(run_jobs([Job("one")], Deadly(), lambda job: False, engine_named("local", 1)))
 
 
+@pytest.mark.linux
 def test_an_interrupt_stops_the_workers_and_leaves_nothing_unfinished(tmp_path):
     driver = started("local", tmp_path, 4, 60.0, 2)
     until(lambda: len([*filter(None, lines(tmp_path / "begun").values())]) == 2)

@@ -583,6 +583,7 @@ def num_written(folder: Path) -> int:
     return sum("." in name for _, *names in os.walk(folder) for name in chain(*names))
 
 
+@pytest.mark.linux
 @pytest.mark.skipif(os.name != "posix", reason="kills with a POSIX signal")
 @pytest.mark.parametrize("written", [2, 4, 8])
 def test_a_kill_leaves_no_half_written_scene(scene, tmp_path, written):

@@ -66,6 +66,7 @@ def claimed(out: Path, count: int, kinds: int = 1) -> tuple[list[int], str]:
     return json.loads(done.stdout), done.stderr
 
 
+@pytest.mark.linux
 def test_of_many_simultaneous_claims_none_is_refused(tmp_path):
     for number in range(2):
         out = tmp_path / f"out-{number}" / "deep"
@@ -75,6 +76,7 @@ def test_of_many_simultaneous_claims_none_is_refused(tmp_path):
         assert read_json(out / "run.json") == {"version": VERSION, "seed": 0}
 
 
+@pytest.mark.linux
 def test_of_simultaneous_claims_with_other_settings_one_kind_wins(tmp_path):
     codes, refused = claimed(tmp_path / "out", 40, kinds=2)
     seed = read_json(tmp_path / "out" / "run.json")["seed"]

@@ -8,12 +8,13 @@ import signal
 import subprocess
 import sys
 from collections.abc import Iterator
+from enum import IntEnum
 from pathlib import Path
 
 import pytest
 
 from gscompleter import InputError
-from gscompleter.io.files import check_output, open_output_folder, replace_file
+from gscompleter.io.files import check_output, defer_interrupts, open_output_folder, replace_file
 
 
 def tree(folder: Path) -> dict[str, str]:
@@ -120,6 +121,7 @@ def test_checking_leaves_nothing_behind_and_does_not_touch_what_is_there(tmp_pat
     assert tree(results) == before
 
 
+@pytest.mark.linux
 def test_a_folder_that_cannot_take_results_is_refused_before_any_computing(tmp_path, results):
     with pytest.raises(InputError, match="is not empty; .* overwrite"):
         check_output(results)
@@ -170,6 +172,7 @@ def test_what_a_killed_run_left_does_not_make_a_folder_occupied(tmp_path):
     assert (tmp_path / "out" / "summary.json").read_text() == "new"
 
 
+@pytest.mark.linux
 def test_a_linked_folder_stays_a_link(tmp_path):
     (tmp_path / "real").mkdir()
     (tmp_path / "link").symlink_to(tmp_path / "real")
@@ -225,6 +228,7 @@ def stopped(process: subprocess.Popen, number: int) -> None:
     process.wait()
 
 
+@pytest.mark.linux
 @pytest.mark.parametrize("exists", [False, True])
 def test_a_killed_process_leaves_nothing_under_the_final_names(tmp_path, results, exists):
     out, before = results if exists else tmp_path / "new", tree(results)
@@ -238,18 +242,20 @@ def test_a_killed_process_leaves_nothing_under_the_final_names(tmp_path, results
     assert tree(tmp_path) == {f"out/{name}": text for name, text in before.items()}
 
 
-@pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGHUP, signal.SIGINT])
-def test_a_process_that_is_told_to_stop_cleans_up(tmp_path, results, number):
+@pytest.mark.linux
+@pytest.mark.parametrize("name", ["SIGTERM", "SIGHUP", "SIGINT"])
+def test_a_process_that_is_told_to_stop_cleans_up(tmp_path, results, name):
     before = tree(results)
     for out in (results, tmp_path / "new" / "folder"):
         with writing(out) as process:
-            stopped(process, number)
+            stopped(process, getattr(signal, name))
     assert os.listdir(tmp_path) == ["out"]
     assert tree(results) == before
 
 
-@pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGHUP, signal.SIGINT])
-def test_an_interrupt_while_results_are_replaced_leaves_nothing_behind(results, number):
+@pytest.mark.linux
+@pytest.mark.parametrize("name", ["SIGTERM", "SIGHUP", "SIGINT"])
+def test_an_interrupt_while_results_are_replaced_leaves_nothing_behind(results, name):
     code = (
         "import os, shutil, sys\n"
         "from gscompleter.io.files import handle_stop_signals, open_output_folder\n"
@@ -268,11 +274,17 @@ def test_an_interrupt_while_results_are_replaced_leaves_nothing_behind(results, 
         "            if not name.startswith('.'): (folder / name).write_text('new')\n"
         "except KeyboardInterrupt as stop:\n    print(stop)\n"
     )
-    command = [sys.executable, "-c", code, str(results), str(int(number))]
+    command = [sys.executable, "-c", code, str(results), str(int(getattr(signal, name)))]
     done = subprocess.run(command, capture_output=True, text=True, check=False)
     assert done.stdout.strip() == f"{results} is complete", done.stderr
     assert set(tree(results).values()) == {"new"}
     assert os.listdir(results.parent) == [results.name]
+
+
+def test_events_that_windows_lists_among_the_signals_are_not_asked_for(monkeypatch):
+    monkeypatch.setattr(signal, "Signals", IntEnum("Signals", {"CTRL_C_EVENT": 0, "SIGINT": 2}))
+    with pytest.raises(KeyboardInterrupt, match="is complete"), defer_interrupts("is complete"):
+        signal.raise_signal(signal.SIGINT)
 
 
 def test_a_file_written_in_place_of_another_keeps_it_until_the_end(tmp_path):

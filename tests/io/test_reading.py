@@ -24,6 +24,7 @@ def others(tmp_path):
         yield {kind: tmp_path / kind for kind in ("pipe", "folder", "device", "socket")}
 
 
+@pytest.mark.linux
 @pytest.mark.parametrize("kind", ["pipe", "folder", "device", "socket"])
 def test_what_is_no_file_is_never_opened(others, kind):
     for reader in (read_bytes, lambda path: list(read_lines(path)), load_splat):
@@ -61,6 +62,7 @@ def test_values_are_plain_up_to_a_depth_and_a_number(tmp_path):
             check_plain(value, tmp_path, 100)
 
 
+@pytest.mark.linux
 @pytest.mark.parametrize("part", ["meta.json", "means_l.webp"])
 @pytest.mark.parametrize("kind", ["pipe", "device", "socket", "folder"])
 def test_a_folder_of_sog_opens_files_alone(tmp_path, others, part, kind):

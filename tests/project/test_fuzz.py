@@ -4,9 +4,12 @@ import re
 import subprocess
 import sys
 
+import pytest
+
 from paths import SUPPORT
 
 
+@pytest.mark.linux
 def test_mutated_inputs_end_in_a_sentence_or_a_result():
     """It runs in a process of its own, whose forks inherit no threads."""
     script = SUPPORT / "fuzz.py"

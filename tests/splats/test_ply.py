@@ -268,6 +268,7 @@ def test_rotations_of_zeros_count_as_damage(tmp_path):
     assert len(load_ply(path, drop_nonfinite=True)) == 19
 
 
+@pytest.mark.linux
 def test_a_file_that_cannot_be_written_leaves_the_old_one(tmp_path):
     path = saved(tmp_path, random_gaussians(5))
     before = path.read_bytes()

@@ -98,6 +98,7 @@ def build(folder: Path) -> None:
     from driving_files import write_drive, write_infos, write_swept_dgp
     from gscompleter import save_ply
     from gscompleter.data.scene import write_cameras
+    from phone_files import polycam, record3d, scanner_app, write_archive, write_folder
     from pose_files import WRITERS, write_camera_list
     from scenes import Room, camera_at, gaussians_of, photographed, view_of
     from splat_files import FORMATS_BUT_PLY, made, plausible
@@ -144,6 +145,11 @@ def build(folder: Path) -> None:
     write_infos(folder / "infos")
     write_drive(folder / "kitti-raw")
     write_swept_dgp(folder / "dgp-swept")
+    write_folder(folder / "polycam", polycam())
+    write_archive(folder / "polycam.zip", polycam())
+    write_folder(folder / "scanner-app", scanner_app())
+    write_folder(folder / "record3d", record3d())
+    write_archive(folder / "record3d.r3d", record3d())
     in_every_format(WRITERS["colmap-text"][1](folder / "photographs") / "images")
 
 
@@ -494,6 +500,13 @@ KINDS: dict[str, Mutation] = {
     "sog": splat("scene.sog"),
     "sog-folder": splat("folder", "/*"),
     "glb": splat("scene.glb"),
+    "polycam": in_bytes("polycam/keyframes/*/*2.*", scene_words("polycam")),
+    "polycam-zip": in_bytes("polycam.zip", scene_words("polycam.zip")),
+    "scanner-app": in_bytes("scanner-app/*_00002.*", scene_words("scanner-app")),
+    "record3d": in_bytes("record3d/**/*[2at]*", scene_words("record3d")),
+    "record3d-zip": in_bytes("record3d.r3d", scene_words("record3d.r3d")),
+    "phone-file": not_a_file("polycam/keyframes/*/*2.*", scene_words("polycam")),
+    "archive-file": not_a_file("record3d.r3d", scene_words("record3d.r3d")),
     "infos": in_infos,
     "chunk-values": in_chunk,
     "sweep": in_sweep,

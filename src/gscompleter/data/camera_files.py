@@ -6,7 +6,7 @@
 * SuperSplat's poses are the `poseSets` of a project's document.json, or the list. A pose has a
   position and a target in the world of the splat rotated by 180° about z, where y points up. It has
   no image size and no roll: cameras are upright, with the field of view of the longer side.
-* Exports of Metashape, RealityScan and Polycam are refused, with advice.
+* Exports of Metashape and RealityScan, and models without cameras, are refused, with advice.
 """
 
 from __future__ import annotations
@@ -49,18 +49,15 @@ SPLAT_FROM_WORLD = np.array([-1.0, -1.0, 1.0])
 
 METASHAPE = ("Metashape", "export its cameras as COLMAP, which Metashape does since 2.2")
 REALITYSCAN = ("RealityScan", "export its registration as COLMAP")
-POLYCAM = ("Polycam", "turn it into nerfstudio's transforms.json by ns-process-data polycam")
 EXPORTS = (
     ((".psx", ".psz"), b"", METASHAPE),
     ((".xml",), b"<chunk", METASHAPE),
     ((".rspj", ".rcproj"), b"", REALITYSCAN),
     ((".csv",), b"#name,", REALITYSCAN),
     ((".csv",), b"#cameras", REALITYSCAN),
-    ((".json",), b'"t_00"', POLYCAM),
 )
 """Endings of files that are not read, what their first bytes hold, the program and what to do."""
-PLACES = ("*", "*cameras/*.json", "keyframes/*cameras/*.json")
-"""Places of such files in a folder; the last two are Polycam's."""
+MODELS = (".usdz", ".fbx", ".las", ".laz", ".obj", ".stl")
 
 
 def read_cameras(path: Path, resolution: Resolution = None) -> list[Frame]:
@@ -164,7 +161,12 @@ def _build_upright_c2w(
 
 def refuse_other_exports(path: Path) -> None:
     """Raise an InputError with advice if `path` holds cameras of an unsupported program."""
-    inside = [file for place in PLACES for file in sorted(path.glob(place))]
+    require(
+        path.suffix.lower() not in MODELS,
+        f"{quote_value(path)} is a model without photographs and cameras, which is all that "
+        "Scaniverse exports; record with Polycam, Record3D or 3d Scanner App, or take photographs.",
+    )
+    inside = sorted(path.glob("*"))
     for file, (endings, mark, (program, advice)) in product([path, *inside], EXPORTS):
         require(
             file.suffix.lower() not in endings or mark not in read_head(file, 4096),

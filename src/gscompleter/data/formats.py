@@ -23,6 +23,7 @@ from gscompleter.data.ego_vehicle import attach_vehicle_detector
 from gscompleter.data.frame import FOLDERS
 from gscompleter.data.limits import check_planes, require
 from gscompleter.data.llff import has_llff, open_llff
+from gscompleter.data.phones.apps import POLYCAM, SCANNER_APP, find_recording, open_recording
 from gscompleter.data.photographs import Photographs
 from gscompleter.data.real_estate import (
     has_chunks,
@@ -63,6 +64,9 @@ FORMATS = {
     "mmdet3d": Format(has_infos, open_infos, "m"),
     "waymo": Format(list_segments, open_waymo, "m"),
     "real-estate-10k": Format(list_camera_files, open_camera_files),
+    "polycam": Format(POLYCAM.find_frames, POLYCAM.open, "m"),
+    "record3d": Format(find_recording, open_recording, "m"),
+    "3d-scanner-app": Format(SCANNER_APP.find_frames, SCANNER_APP.open, "m"),
 }
 """Formats by the names that `open_photographs` takes, in the order of detection."""
 

@@ -55,8 +55,8 @@ class Frame:
     intrinsics: Intrinsics
     image: Path | Callable[[], bytes] | None
     """Expected path of the photograph, or a function that returns the bytes of its file."""
-    depth: tuple[Path, float] | None = None
-    """Depth map file, and the factor from its values to scene units."""
+    depth: Callable[[], Float[np.ndarray, "h w"]] | None = None
+    """Reads a depth map of any size: z-depth in scene units, 0 where unknown."""
     mask: Path | None = None
     """Mask image; black pixels are ignored."""
     sensor: str | None = None

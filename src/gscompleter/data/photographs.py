@@ -22,7 +22,7 @@ from gscompleter.data.frame import Frame
 from gscompleter.data.limits import MAX_SIDE
 from gscompleter.data.local_origin import choose_local_origin
 from gscompleter.errors import InputError, quote_value
-from gscompleter.io.image import convert_to_image, read_depth, read_pixels
+from gscompleter.io.image import convert_to_image, read_pixels
 from gscompleter.types import Camera, View
 
 Resolution = tuple[int, int] | int | None
@@ -134,7 +134,7 @@ class Photographs:
         image = convert_to_image(undistort_and_resize(frame, pixels, size, resolution))
         depth = ignored = None
         if frame.depth is not None:
-            values = undistort_and_resize(frame, read_depth(*frame.depth), size, resolution)
+            values = undistort_and_resize(frame, frame.depth(), size, resolution)
             depth = torch.from_numpy(values)
         elif frame.laser_points is not None:
             points = torch.from_numpy(frame.laser_points() - self.origin).float()

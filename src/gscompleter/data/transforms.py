@@ -25,6 +25,7 @@ from gscompleter.data.limits import DEPTH_RANGE, MAX_COEFFICIENT, MAX_NUMBER, re
 from gscompleter.data.photographs import Photographs, build_photographs
 from gscompleter.data.points import read_point_cloud
 from gscompleter.errors import quote_value
+from gscompleter.io.image import read_depth
 from gscompleter.io.reading import is_json_list, read_json
 
 NAME = "transforms.json"
@@ -42,6 +43,7 @@ FISHEYE_MODELS = ("OPENCV_FISHEYE", "SIMPLE_RADIAL_FISHEYE", "RADIAL_FISHEYE")
 
 ANGLE_RANGE = (1e-5, 3.14159)
 """Range of fields of view in radians, below π."""
+DEPTH_UNITS = ("depth_unit_scale_factor", "integer_depth_scale")
 
 Pair = tuple[float | None, float | None]
 
@@ -94,7 +96,8 @@ def read_frames(path: Path) -> list[Frame]:
     content = read_json(path, ADVICE)
     entries = get_part(content, "frames", list)
     require(entries, f"{path} lists no frames; its `frames` has to be a list with cameras.")
-    unit = get_optional_number(content, "depth_unit_scale_factor", str(path), *DEPTH_RANGE) or 1e-3
+    units = (get_optional_number(content, key, str(path), *DEPTH_RANGE) for key in DEPTH_UNITS)
+    unit = next(filter(None, units), 1e-3)
     return [_parse_frame(entry, i, content, unit, path) for i, entry in enumerate(entries)]
 
 
@@ -109,7 +112,7 @@ def _parse_frame(
         name = get_text(entry, key, title)
         return None if name is None else path.parent / name
 
-    depth = locate("depth_file_path")
+    depth = locate("depth_file_path") or locate("depth_path")  # of nerfstudio, of NeRFCapture
     c2w = get_array(entry, "transform_matrix", title, (3, 4), (4, 4))
     frame = Frame(
         name=file_path or str(position),
@@ -117,7 +120,7 @@ def _parse_frame(
         c2w=np.vstack([c2w, [0, 0, 0, 1]]) if len(c2w) == 3 else c2w,
         intrinsics=_parse_intrinsics({**content, **entry}, title),
         image=locate("file_path"),
-        depth=None if depth is None else (depth, depth_unit),
+        depth=None if depth is None else partial(read_depth, depth, depth_unit),
         mask=locate("mask_path"),
     )
     frame = frame.with_rigid_pose(" (`transform_matrix`)")

@@ -27,7 +27,7 @@ def measure_peak_memory(device: torch.device | str = "cpu") -> Iterator[Peak]:
         return
     is_reset = False
     with suppress(OSError):
-        Path("/proc/self/clear_refs").write_text("5")
+        Path("/proc/self/clear_refs").write_bytes(b"5")
         is_reset = True
     yield peak
     peak.bytes = read_process_peak() if is_reset else None
@@ -36,6 +36,6 @@ def measure_peak_memory(device: torch.device | str = "cpu") -> Iterator[Peak]:
 def read_process_peak() -> int | None:
     """Read the peak resident memory of this process, or None if the system does not report it."""
     with suppress(OSError):
-        if most := re.search(r"VmHWM:\s*([0-9]+) kB", Path("/proc/self/status").read_text()):
+        if most := re.search(rb"VmHWM:\s*([0-9]+) kB", Path("/proc/self/status").read_bytes()):
             return 1024 * int(most[1])
     return None

@@ -97,7 +97,7 @@ class Paper(Settings):
 @cache
 def load_paper() -> Paper:
     """Load and validate `paper.yaml`."""
-    content: Any = yaml.safe_load(files(__package__).joinpath("paper.yaml").read_text())
+    content: Any = yaml.safe_load(files(__package__).joinpath("paper.yaml").read_bytes())
     return TypeAdapter(Paper).validate_python(content)
 
 

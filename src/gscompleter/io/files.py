@@ -168,13 +168,13 @@ def convert_write_errors(path: Path | str, numbers: Container[int] | None = None
 
 
 def handle_stop_signals() -> None:
-    """Let SIGTERM and SIGHUP raise KeyboardInterrupt, so that everything is cleaned up.
+    """Let the signals that end a process raise KeyboardInterrupt, so that it cleans up.
 
     Signals that are ignored (`nohup`) or handled already stay so. This works in the main thread
     only.
     """
-    for name in ("SIGTERM", "SIGHUP"):
-        number = getattr(signal, name, None)  # Windows has no SIGHUP
+    for name in ("SIGTERM", "SIGHUP", "SIGBREAK"):
+        number = getattr(signal, name, None)  # only Windows has the last, and no SIGHUP
         if number is not None and signal.getsignal(number) is signal.SIG_DFL:
             signal.signal(number, signal.default_int_handler)
 
@@ -185,7 +185,8 @@ def defer_interrupts(state: str) -> Iterator[None]:
     came: list[int] = []
     handled = []
     if threading.current_thread() is threading.main_thread():
-        handled = [n for n in signal.Signals if signal.getsignal(n) is signal.default_int_handler]
+        numbers = signal.valid_signals()  # on Windows, `Signals` has others
+        handled = [n for n in numbers if signal.getsignal(n) is signal.default_int_handler]
     for number in handled:
         signal.signal(number, lambda number, _: came.append(number))
     try:

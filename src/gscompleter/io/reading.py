@@ -82,14 +82,18 @@ def read_lines(
 
 def read_json(path: Path, advice: str) -> Any:
     """Read a JSON file; errors end with `advice`, such as "download it again"."""
-    data = read_bytes(path, MAX_JSON)
+    return parse_json(read_bytes(path, MAX_JSON), path, advice)
+
+
+def parse_json(data: bytes, name: Path | str, advice: str) -> Any:
+    """Parse the bytes of a JSON file; `name` and `advice` are for errors."""
     try:
         value = json.loads(data.decode("utf-8-sig"), parse_int=_parse_integer)
     except (ValueError, RecursionError) as error:
         raise InputError(
-            f"{quote_value(path)} is not JSON ({quote_value(str(error))}); {advice}."
+            f"{quote_value(name)} is not JSON ({quote_value(str(error))}); {advice}."
         ) from error
-    check_plain(value, path, len(data))
+    check_plain(value, name, len(data))
     return value
 
 
@@ -104,8 +108,8 @@ def is_json_list(path: Path) -> bool:
     return read_head(path, 64).removeprefix(b"\xef\xbb\xbf").lstrip().startswith(b"[")
 
 
-def check_plain(value: Any, path: Path, max_values: int) -> None:
-    """Raise InputError if values read from `path` are nested too deeply or too many.
+def check_plain(value: Any, name: Path | str, max_values: int) -> None:
+    """Raise InputError if values read from `name` are nested too deeply or too many.
 
     Repeated values count again, so that a value that contains itself is refused as endless.
     """
@@ -118,7 +122,7 @@ def check_plain(value: Any, path: Path, max_values: int) -> None:
         count += len(parts)
         if depth > MAX_DEPTH or count > max_values:
             raise InputError(
-                f"{quote_value(path)} is nested too deeply or without end; write it again."
+                f"{quote_value(name)} is nested too deeply or without end; write it again."
             )
         waiting += [(part, depth + 1) for part in parts if isinstance(part, _HOLDERS)]
 

@@ -58,7 +58,7 @@ def write_video(path: Path, frames: Iterable[UInt8[np.ndarray, "h w 3"]], rate: 
     assert process.stdin is not None
     try:
         for frame in chain([first], iterator):
-            with suppress(BrokenPipeError):  # if ffmpeg has ended, its exit code tells
+            with suppress(OSError):  # if ffmpeg has ended, its exit code tells
                 process.stdin.write(np.ascontiguousarray(frame).data)
         _, messages = process.communicate()
     finally:  # also on an interrupt

@@ -128,7 +128,7 @@ def make_surface(camera: Camera) -> Gaussians:
 def measure_command(words: Sequence[str], out: Path, yardstick: Yardstick) -> Sample:
     """Measure one run of a command that writes to `out`, in a process of its own."""
     (spent, peak_bytes), unit = measure_beside(yardstick, lambda: run_command(words))
-    summary = json.loads((out / SUMMARY_FILE).read_text())
+    summary = json.loads((out / SUMMARY_FILE).read_bytes())
     stages = summary["seconds"]
     seconds = {**stages, REST: spent - stages["total"], PROCESS: spent}
     return Sample(seconds, unit, peak_bytes, summary["gaussians"])

@@ -147,7 +147,7 @@ def describe_machine(device: str) -> dict[str, str | int]:
 def get_processor_name() -> str:
     """Return the model of the processor, or its architecture if Linux does not report it."""
     try:
-        model = re.search(r"^model name\s*:\s*(.+)$", Path("/proc/cpuinfo").read_text(), re.M)
+        model = re.search(r"(?m)^model name\s*:\s*(.+)$", Path("/proc/cpuinfo").read_text("utf-8"))
     except OSError:
         model = None
     return model[1] if model else platform.processor() or platform.machine()

@@ -113,8 +113,8 @@ def write_results(values: dict[str, Any], tables: str, options: BenchOptions) ->
     text = json.dumps(values, indent=1)
     if options.out is not None:
         with open_output_folder(options.out, options.overwrite) as folder:
-            (folder / "bench.json").write_text(text + "\n")
-            (folder / "tables.md").write_text(tables)
+            (folder / "bench.json").write_bytes(text.encode() + b"\n")
+            (folder / "tables.md").write_bytes(tables.encode())
     print(text if options.json else tables)
 
 

@@ -76,7 +76,7 @@ def run_clean(options: CleanOptions) -> None:
                 )
             with stage("writing"):
                 save_completed_splat(folder, given, removed, given[:0], splat_file)
-                (folder / SUMMARY_FILE).write_text(json.dumps(summary, indent=2) + "\n")
+                (folder / SUMMARY_FILE).write_bytes(json.dumps(summary, indent=2).encode() + b"\n")
     if not options.quiet:
         print_cleaning(summary, options.out)
 

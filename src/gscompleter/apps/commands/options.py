@@ -100,15 +100,16 @@ class SceneOptions(ComputeOptions, WritingOptions):
 
     folder: Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="SCENE")]
     """Folder of the photographs: COLMAP, nerfstudio, cameras.json, LLFF, KITTI, DGP, Waymo,
-    PandaSet, a pixelSplat chunk or a RealEstate10K camera file. If it has no cameras, COLMAP finds
-    them and they are kept in OUT/colmap."""
+    PandaSet, a pixelSplat chunk, a RealEstate10K camera file, or what Polycam, Record3D or 3d
+    Scanner App exports. If it has no cameras, COLMAP finds them and they are kept in OUT/colmap."""
     context: Frames = None
     """Frame numbers of the photographs to work with, counted in the order of their file paths. If
     not given, those that help most; photographs of targets are never used. `clean` takes all."""
     out: Path
     format: str | None = None
     """Format of SCENE: colmap, nerfstudio, cameras-json, llff, kitti, kitti-raw, dgp, waymo,
-    mmdet3d, pandaset, chunks or real-estate-10k. Detected if not given."""
+    mmdet3d, pandaset, chunks, real-estate-10k, polycam, record3d or 3d-scanner-app. Detected if
+    not given."""
     scene: Path | None
     resolution: Size = LONG_SIDE
     """Working size: the longest side in pixels (photographs are never enlarged), or height and

@@ -164,7 +164,7 @@ def write_results(options: EvaluateOptions) -> str:
     machine = {**describe_machine(choose_device(options.device)), **find_commit()}
     parts = [f"# Results\n\n{', '.join(f'{key} {value}' for key, value in machine.items())}.\n"]
     tables = [out / TABLES / f"{name}.md" for name in paper.tables]
-    parts += [path.read_text() for path in tables if path.is_file()]
+    parts += [path.read_text("utf-8") for path in tables if path.is_file()]
     head = ["claim", "table", "measured", "verdict"]
     judged = format_markdown(head, judge_claims(out / TABLES, paper.claims))
     parts.append(f"## Claims of the paper\n\n{judged}")

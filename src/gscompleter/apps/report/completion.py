@@ -136,11 +136,11 @@ def write_report(
     around = render_around()
     write_pictures(folder / "images", completion, targets, at_targets)
     record = make_record(completion, thin_evenly(photographs, MAX_PHOTOGRAPHS))
-    (folder / RECORD_FILE).write_text(json.dumps(asdict(record)) + "\n")
+    (folder / RECORD_FILE).write_bytes(json.dumps(asdict(record)).encode() + b"\n")
     coverage = {"coverage": asdict(compute_coverage(around))} if around else {}
     counts = {**count_changes(completion), "seconds": dict(completion.seconds)}
     summary = {"version": __version__, **run_info, **coverage, **scores, **counts}
-    (folder / SUMMARY_FILE).write_text(json.dumps(summary, indent=2) + "\n")
+    (folder / SUMMARY_FILE).write_bytes(json.dumps(summary, indent=2).encode() + b"\n")
     return summary
 
 

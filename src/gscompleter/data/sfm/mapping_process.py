@@ -142,7 +142,8 @@ def match(job: Job, pairs: Pairs) -> None:
     """Match the features of all pairs and verify them with an essential matrix."""
     names = [one.name for one in job.photographs]
     listed = pycolmap.ImportedPairingOptions(match_list_path=Path(job.work) / "pairs.txt")
-    listed.match_list_path.write_text("".join(f"{names[i]} {names[j]}\n" for i, j in sorted(pairs)))
+    lines = "".join(f"{names[i]} {names[j]}\n" for i, j in sorted(pairs))
+    listed.match_list_path.write_bytes(lines.encode())
     matching = pycolmap.FeatureMatchingOptions(num_threads=job.threads, use_gpu=False)
     verification = pycolmap.TwoViewGeometryOptions()
     verification.ransac.random_seed = SEED

@@ -124,7 +124,7 @@ def find_poses(photographs: Path, out: Path, overwrite: bool = False) -> FoundPo
     with open_output_folder(out, overwrite) as folder:
         found = _run(photographs, names, folder)
         content = {"poses": asdict(found), "photographs": known}
-        (folder / SUMMARY_FILE).write_text(json.dumps(content, indent=1))
+        (folder / SUMMARY_FILE).write_bytes(json.dumps(content, indent=1).encode())
     return found
 
 

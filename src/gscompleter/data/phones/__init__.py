@@ -1,0 +1,1 @@
+"""Exports of apps that record photographs, poses and depth on a phone."""

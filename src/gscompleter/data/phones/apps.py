@@ -1,0 +1,133 @@
+"""Exports of Polycam, 3d Scanner App and Record3D.
+
+* Polycam's raw data and all data of 3d Scanner App have a JSON file for each photograph. Polycam's
+  corrected photographs have no distortion and their poses less drift; depth belongs to the others.
+* A recording of Record3D is a zip archive. Its `metadata` has the size `w` and `h` of photographs,
+  `K` column by column, or fx, fy, cx and cy of each, and `poses`: a quaternion with the real part
+  last, and the centre. `rgbd/N.depth` and `rgbd/N.conf` are compressed with LZFSE.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass, replace
+from functools import partial
+from importlib.util import find_spec
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from jaxtyping import Shaped
+
+from gscompleter.data.cameras import Intrinsics, compute_rotation
+from gscompleter.data.json_fields import get_array, get_intrinsics, get_number, get_part, get_size
+from gscompleter.data.limits import MAX_COORDINATE, require
+from gscompleter.data.phones.export import ADVICE, Files, PoseAndLens, build_recording, find_files
+from gscompleter.data.photographs import Photographs
+from gscompleter.errors import InputError, quote_value
+from gscompleter.io.reading import parse_json
+
+HOME, METADATA, LENSES = "keyframes", "metadata", "perFrameIntrinsicCoeffs"
+NOTE = "Depth is left out; `pip install 'gscompleter[phones]'` makes it readable."
+
+
+@dataclass(frozen=True)
+class KeyframeFormat:
+    """Files of frames and their cameras."""
+
+    mark: bytes
+    """Part of each camera's JSON file."""
+    parse: Callable[[Any, str], PoseAndLens]
+    """Function from the content of such a file, and its title, to the camera."""
+    patterns: tuple[tuple[str, str, str, str], ...]
+    """Patterns of cameras, photographs, depth maps and confidences, in order of preference."""
+
+    def find_frames(self, path: Path) -> list[Files]:
+        """Find the files of the first patterns with photographs; none if there are none."""
+        root = path.parent if path.name == HOME else path
+        for files in ([find_files(root, pattern) for pattern in group] for group in self.patterns):
+            if files[1] and self.mark in next(iter(files[0].values()), bytes)():
+                return files
+        return []
+
+    def open(self, path: Path) -> Iterator[Photographs]:
+        """Open a folder or an archive; frames are numbered by their sorted names."""
+        cameras, *files = self.find_frames(path)
+        parsed = {}
+        for name in sorted(cameras.keys() & files[0]):
+            title = f"frame {name} of {quote_value(path)}"
+            parsed[name] = self.parse(parse_json(cameras[name](), title, ADVICE), title)
+        yield build_recording(path, parsed, files)
+
+
+def parse_polycam(entry: Any, title: str) -> PoseAndLens:
+    """Parse a camera of Polycam."""
+    c2w, bound = np.eye(4), MAX_COORDINATE
+    for row, column in np.ndindex(3, 4):
+        c2w[row, column] = get_number(entry, f"t_{row}{column}", title, -bound, bound)
+    return c2w, replace(get_intrinsics(entry, title), size=get_size(entry, title))
+
+
+def parse_scanner_app(entry: Any, title: str) -> PoseAndLens:
+    """Parse a camera of 3d Scanner App: lists of rows, with whole numbers at pixel centres."""
+    fx, _, cx, _, fy, cy = get_array(entry, "intrinsics", title, (9,))[:6].tolist()
+    c2w = get_array(entry, "cameraPoseARFrame", title, (16,)).reshape(4, 4)
+    return c2w, Intrinsics(None, (fx, fy), (cx + 0.5, cy + 0.5))
+
+
+DEPTH = (f"{HOME}/depth/*.png", f"{HOME}/confidence/*.png")
+CORRECTED = (f"{HOME}/corrected_cameras/*.json", f"{HOME}/corrected_images/*.*", *DEPTH)
+ORIGINAL = (f"{HOME}/cameras/*.json", f"{HOME}/images/*.*", *DEPTH)
+POLYCAM = KeyframeFormat(b'"t_00"', parse_polycam, (CORRECTED, ORIGINAL))
+SCANNED = ("frame_*.json", "frame_*.jpg", "depth_*.png", "conf_*.png")
+SCANNER_APP = KeyframeFormat(b'"cameraPoseARFrame"', parse_scanner_app, (SCANNED,))
+
+
+def find_recording(path: Path) -> Files:
+    """Find the photographs of a recording of Record3D, packed or not; none if there are none."""
+    return find_files(path, "rgbd/*.jpg")
+
+
+def open_recording(path: Path) -> Iterator[Photographs]:
+    """Open a recording of Record3D; frames are numbered by time."""
+    title, metadata = quote_value(path), find_files(path, METADATA)
+    require(metadata, f"There is no `{METADATA}` in {title}; {ADVICE}.")
+    content = parse_json(metadata[METADATA](), f"`{METADATA}` of {title}", ADVICE)
+    size = get_size(content, title, "w", "h")
+    depths, confidences = find_files(path, "rgbd/*.depth"), find_files(path, "rgbd/*.conf")
+    notes = (NOTE,) if depths and find_spec("liblzfse") is None else ()
+    files = find_recording(path), {} if notes else depths, confidences
+    decoders = partial(_unpack, "<f4", size), partial(_unpack, "u1", size)
+    scene = build_recording(path, _parse_recorded(content, size, title), files, decoders)
+    yield replace(scene, notes=notes)
+
+
+def _parse_recorded(content: Any, size: tuple[int, int], title: str) -> dict[str, PoseAndLens]:
+    count = len(get_part(content, "poses", list))
+    require(count, f"{title} has no poses; record with the LiDAR.")
+    poses = get_array(content, "poses", title, (count, 7))
+    lenses = np.tile(get_array(content, "K", title, (9,))[[0, 4, 6, 7]], (count, 1))
+    if get_part(content, LENSES, list):
+        lenses = get_array(content, LENSES, title, (count, 4))
+    cameras: dict[str, PoseAndLens] = {}
+    for (x, y, z, w, *center), (fx, fy, cx, cy) in zip(poses, lenses.tolist(), strict=True):
+        c2w = np.eye(4)
+        c2w[:3, :3], c2w[:3, 3] = compute_rotation((w, x, y, z)), center
+        cameras[str(len(cameras))] = c2w, Intrinsics(size, (fx, fy), (cx, cy))
+    return cameras
+
+
+def _unpack(kind: str, size: tuple[int, int], data: bytes, title: str) -> Shaped[np.ndarray, "h w"]:
+    """Unpack a map with the aspect ratio of the photographs, and at most as many pixels."""
+    from liblzfse import decompress
+
+    try:
+        if len(data) > 8 * math.prod(size):
+            raise ValueError("it is larger than the photograph")
+        values = np.frombuffer(decompress(data), kind)
+        return values.reshape(round(math.sqrt(len(values) * size[1] / size[0])), -1)
+    except Exception as error:  # damaged bytes raise anything
+        raise InputError(
+            f"The depth of {title} cannot be read ({quote_value(str(error))}); {ADVICE}."
+        ) from error

@@ -1,0 +1,125 @@
+"""Files of a phone's export, in a folder or a zip archive, and the photographs that they make.
+
+Poses are ARKit's: camera-to-world in metres, x right, y up and z back in the stored photograph. So
+is confidence: 0 where depth is unreliable.
+"""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
+from functools import lru_cache, partial
+from pathlib import Path, PurePosixPath
+from typing import Any
+from zipfile import ZipFile
+
+import numpy as np
+from jaxtyping import Float, Shaped
+
+from gscompleter.data.cameras import Intrinsics
+from gscompleter.data.frame import Frame
+from gscompleter.data.limits import require
+from gscompleter.data.photographs import Photographs, build_photographs
+from gscompleter.data.transforms import OPENCV_FROM_OPENGL
+from gscompleter.errors import InputError, quote_value
+from gscompleter.io.image import open_image
+from gscompleter.io.reading import check_file, read_bytes
+
+ADVICE = "export the recording again"
+MAX_ENTRY = 1 << 28
+"""Largest file in an archive, in bytes."""
+
+Reader = Callable[[], bytes]
+Files = dict[str, Reader]
+"""Functions that read files, by the names of frames."""
+Decoder = Callable[[bytes, str], Shaped[np.ndarray, "..."]]
+"""Function from the bytes of a map of depth or confidence, and its title, to its values."""
+PoseAndLens = tuple[Float[np.ndarray, "4 4"], Intrinsics]
+
+
+def find_files(export: Path, pattern: str) -> Files:
+    """Map frame names to readers of the files that match a pattern, sorted by path.
+
+    The name of a frame is what follows the last underscore of the file's name. In an archive the
+    export may lie in a folder of its own.
+    """
+    paths: list[Any] = list(export.glob(pattern))
+    read: Callable[[Any], bytes] = read_bytes
+    if os.path.isfile(export) and export.suffix.lower() in (".zip", ".r3d"):
+        with _open_archive(export) as archive:
+            paths = [p for p in map(PurePosixPath, archive.namelist()) if p.match(pattern)]
+        read = partial(_read_entry, export)
+    paths = sorted(path for path in paths if not path.name.startswith("."))
+    require(
+        len({path.parent for path in paths}) <= 1,
+        f"{quote_value(export)} holds several recordings; unpack it, and name one of them.",
+    )
+    return {path.stem.rpartition("_")[2]: partial(read, path) for path in paths}
+
+
+def _read_entry(export: Path, path: PurePosixPath) -> bytes:
+    with _open_archive(export) as archive:
+        if archive.getinfo(str(path)).file_size > MAX_ENTRY:
+            raise ValueError(f"its {path} is too large")
+        return archive.read(str(path))
+
+
+@contextmanager
+def _open_archive(path: Path) -> Iterator[ZipFile]:
+    check_file(path)
+    try:
+        yield _keep_open(path, path.stat().st_mtime_ns)
+    except Exception as error:  # damaged archives raise anything
+        raise InputError(
+            f"{quote_value(path)} cannot be read ({quote_value(str(error), 120)}); {ADVICE}."
+        ) from error
+
+
+@lru_cache(maxsize=1)
+def _keep_open(path: Path, _written: int) -> ZipFile:
+    """Open an archive; the last one stays open, because its list of files is long."""
+    return ZipFile(path)
+
+
+def decode_png(data: bytes, title: str) -> Shaped[np.ndarray, "..."]:
+    """Decode the values of a PNG file."""
+    with open_image(data, title) as image:
+        return np.array(image)
+
+
+def build_recording(
+    path: Path,
+    cameras: Mapping[str, PoseAndLens],
+    files: Sequence[Files],
+    decoders: tuple[Decoder, Decoder] = (decode_png, decode_png),
+) -> Photographs:
+    """Build photographs from cameras by frame name, and the files of images, depth and confidence.
+
+    `decoders` are those of depth and of confidence, either of which a frame may lack.
+    """
+    frames, (images, depths, confidences) = [], files
+    for name in (name for name in cameras if name in images):
+        title, (c2w, lens), depth = f"frame {name} of {quote_value(path)}", cameras[name], None
+        if name in depths:
+            depth = partial(_read_depth, depths[name], confidences.get(name), decoders, title)
+        frame = Frame(name, title, c2w @ OPENCV_FROM_OPENGL, lens, images[name], depth)
+        frames.append(frame.with_rigid_pose())
+    require(frames, f"No photograph of {quote_value(path)} has a camera; {ADVICE}.")
+    return build_photographs(path.resolve().stem, str(path), frames)
+
+
+def _read_depth(
+    depth: Reader, confidence: Reader | None, decoders: tuple[Decoder, Decoder], title: str
+) -> Float[np.ndarray, "h w"]:
+    """Read z-depth in metres, 0 where it is unknown or unreliable."""
+    stored = decoders[0](depth(), title)
+    sure = stored if confidence is None else decoders[1](confidence(), title)
+    require(
+        stored.ndim == 2 and stored.dtype.itemsize > 1 and stored.shape == sure.shape,
+        f"The depth of {title} and its confidence are {stored.dtype} of shape {stored.shape} and "
+        f"{sure.dtype} of shape {sure.shape}; {ADVICE}.",
+    )
+    known = (sure > 0) & (stored > 0) & np.isfinite(stored)
+    unit = 1.0 if stored.dtype.kind == "f" else 1e-3  # whole numbers are millimetres
+    return np.where(known, stored * unit, 0).astype(np.float32)
