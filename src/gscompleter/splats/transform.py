@@ -1,7 +1,7 @@
 """Gaussians transformed to another frame, including view-dependent colour.
 
-The axes of a .ply and of most formats are x right, y down, z forward. SPZ has x right, y up,
-z back, which is half a turn about x; glTF has x left, y up, z forward, half a turn about z.
+The axes of a .ply and of most formats are x right, y down, z forward. SPZ and USD have x right,
+y up, z back, which is half a turn about x; glTF has x left, y up, z forward, half a turn about z.
 """
 
 from __future__ import annotations
@@ -32,6 +32,15 @@ def rotate_half_turn(gaussians: Gaussians, signs: tuple[float, float, float]) ->
         quats=gaussians.quats * torch.tensor((1.0, *signs)),
         sh=gaussians.sh * (after / before).round().mT,
     )
+
+
+def require_similarity(place: Float[Tensor, "4 4"]) -> None:
+    """Raise ValueError unless a transform in float64 only rotates, moves and scales evenly."""
+    linear = place[:3, :3]
+    volume = float(torch.linalg.det(linear))
+    shape = linear @ linear.T / max(volume, 1e-30) ** (2 / 3)
+    if not volume > 0 or not torch.allclose(shape, torch.eye(3).double(), atol=1e-3):
+        raise ValueError("one of its nodes mirrors or stretches Gaussians unevenly")
 
 
 def transform_gaussians(gaussians: Gaussians, similarity: Float[Tensor, "4 4"]) -> Gaussians:
