@@ -258,7 +258,7 @@ def test_what_was_generated_is_known_after_every_conversion(tmp_path, name):
 @pytest.mark.parametrize("antialiased", [False, True])
 def test_the_mode_of_gaussians_is_known_after_every_conversion(tmp_path, antialiased):
     given = replace(plausible(60), is_antialiased=antialiased)
-    for name in ("a.ply", "b.spz", "c.compressed.ply", "d.ply"):
+    for name in ("a.ply", "b.spz", "c.compressed.ply", "d.sog", "e.ply"):
         save_splat(tmp_path / name, given)
         given = load_splat(tmp_path / name)
         assert given.is_antialiased == antialiased, name
@@ -290,6 +290,8 @@ def test_convert_says_where_the_mode_is_lost(tmp_path, monkeypatch, capsys):
     assert "antialiased" not in capsys.readouterr().out
     assert run(monkeypatch, "convert", tmp_path / "b.spz", tmp_path / "c.splat") == 0
     assert "A .splat file cannot mark Gaussians as antialiased" in capsys.readouterr().out
+    assert run(monkeypatch, "convert", tmp_path / "b.spz", tmp_path / "d.glb") == 0
+    assert "A .glb file cannot mark Gaussians as antialiased" in capsys.readouterr().out
 
 
 def test_labels_of_another_file_are_not_believed(tmp_path):
@@ -446,7 +448,7 @@ def test_names_and_versions_of_others_are_quoted_in_part(tmp_path):
 
 def test_what_cannot_be_written_is_refused(tmp_path):
     gaussians = plausible(10, 0)
-    for name in ("scene.sog", "scene.glb", "scene.txt"):
+    for name in ("scene.ksplat", "meta.json", "scene.txt"):
         with pytest.raises(InputError, match="cannot be written"):
             save_splat(tmp_path / name, gaussians)
     with pytest.raises(InputError, match="cannot hold Gaussians"):
@@ -467,7 +469,7 @@ def test_convert_writes_once_and_says_what_it_wrote(tmp_path, monkeypatch, capsy
     assert run(monkeypatch, "convert", source, out) == 2
     assert "exists; name another file" in capsys.readouterr().err
     assert run(monkeypatch, "convert", source, out, "--overwrite", "--quiet") == 0
-    assert run(monkeypatch, "convert", source, tmp_path / "b.glb") == 2
+    assert run(monkeypatch, "convert", source, tmp_path / "b.ksplat") == 2
     assert run(monkeypatch, "convert", out, tmp_path / "c.ply") == 0
     assert load_splat(tmp_path / "c.ply").generated.tolist() == [1] * 30
 

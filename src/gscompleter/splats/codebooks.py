@@ -5,6 +5,7 @@ The first guess is evenly spaced, not random: the same values give the same code
 
 from __future__ import annotations
 
+import math
 import warnings
 
 import numpy as np
@@ -13,12 +14,12 @@ from numpy import ndarray
 from scipy.cluster.vq import kmeans2, vq
 
 CODEBOOK_SIZE = 256
-PALETTE_SIZE = 1 << 16
-NUM_CELLS = 256
-"""Parts of the space of rows in which a palette is fitted separately, which bounds the time."""
+MIN_PALETTE_SIZE, MAX_PALETTE_SIZE = 1 << 12, 1 << 16
+ROWS_PER_ENTRY = 4
+"""Rows that share an entry of a palette between these sizes."""
 SAMPLE_SIZE = 1 << 15
 """Values or rows to which a codebook or the cells are fitted."""
-ITERATIONS = 10
+ITERATIONS = 5
 
 
 def fit_codebook(
@@ -39,16 +40,21 @@ def fit_codebook(
 def fit_palette(
     rows: Float[ndarray, "n k"],
 ) -> tuple[Float[ndarray, "p k"], Int64[ndarray, "n"]]:
-    """Fit up to 65,536 rows to rows, which are kept if no more are distinct; number the nearest."""
+    """Fit up to 65,536 rows to rows, of which few are kept as they are; number the nearest.
+
+    The space of rows is divided into as many cells as each has entries, which bounds the time.
+    """
     distinct, numbers = np.unique(rows, axis=0, return_inverse=True)
-    if len(distinct) <= PALETTE_SIZE:
+    size = min(max(MIN_PALETTE_SIZE, len(rows) // ROWS_PER_ENTRY), MAX_PALETTE_SIZE)
+    if len(distinct) <= size:
         return distinct, numbers.reshape(-1)
+    num_cells = math.isqrt(size)
     sample = _take_evenly(distinct, SAMPLE_SIZE)
-    cell, _ = vq(distinct, _run_kmeans(sample, _take_evenly(sample, NUM_CELLS)))
+    cell, _ = vq(distinct, _run_kmeans(sample, _take_evenly(sample, num_cells)))
     labels, palettes, start = np.empty(len(distinct), np.int64), [], 0
     for inside in (np.flatnonzero(cell == number) for number in np.unique(cell)):
-        size = 1 + (PALETTE_SIZE - NUM_CELLS) * len(inside) // len(distinct)
-        palette = _run_kmeans(distinct[inside], _take_evenly(distinct[inside], size))
+        share = 1 + (size - num_cells) * len(inside) // len(distinct)
+        palette = _run_kmeans(distinct[inside], _take_evenly(distinct[inside], share))
         labels[inside] = start + vq(distinct[inside], palette)[0]
         palettes.append(palette)
         start += len(palette)

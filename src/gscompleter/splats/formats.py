@@ -29,8 +29,9 @@ from gscompleter.splats.compressed_ply import read_compressed_ply, write_compres
 from gscompleter.splats.glb import read_glb, write_glb
 from gscompleter.splats.ksplat import read_ksplat
 from gscompleter.splats.morton import sort_along_morton
+from gscompleter.splats.packing import ZIP_MAGIC
 from gscompleter.splats.ply import load_ply, require_finite, save_ply
-from gscompleter.splats.sog import META, ZIP_MAGIC, read_sog, write_sog
+from gscompleter.splats.sog import META, read_sog, write_sog
 from gscompleter.splats.splat import read_splat, write_splat
 from gscompleter.splats.spz import read_spz, write_spz
 from gscompleter.splats.usd import read_usd, write_usd
@@ -44,8 +45,10 @@ DECODING_ERRORS = (
     Image.DecompressionBombError,
 )
 """Errors that decoders raise on damaged bytes."""
-JSON_ERRORS = (AttributeError, TypeError)
-"""Errors by JSON whose values are of another type."""
+TYPE_ERRORS = (AttributeError, TypeError)
+"""Errors by files whose values can be of any type."""
+TYPED_FREELY = ("sog", "sog-folder", "glb", "usd", "usdz")
+"""Names of the formats of such files."""
 MAX_DEFECT = 120
 """Most characters of the description of a defect."""
 HEAD_BYTES = 8192
@@ -67,7 +70,10 @@ class Format:
 
 FORMATS = {
     "compressed-ply": Format(
-        *((".compressed.ply",), (b"ply",), read_compressed_ply, write_compressed_ply),
+        (".compressed.ply",),
+        (b"ply",),
+        read_compressed_ply,
+        write_compressed_ply,
         contains=b"packed_position",
     ),
     "ply": Format((".ply",), (b"ply",), load_ply, save_ply),
@@ -98,7 +104,7 @@ def load_splat(path: Path | str, drop_nonfinite: bool = False) -> Gaussians:
     name = detect_splat_format(path)
     if name == "ply":
         return load_ply(path, drop_nonfinite)
-    errors = (*DECODING_ERRORS, *(JSON_ERRORS if name in ("sog", "sog-folder", "glb") else ()))
+    errors = (*DECODING_ERRORS, *(TYPE_ERRORS if name in TYPED_FREELY else ()))
     try:
         with np.errstate(over="ignore", invalid="ignore"):  # infinite values are refused below
             gaussians = FORMATS[name].read(path)
@@ -151,8 +157,8 @@ def describe_mode_loss(path: Path, gaussians: Gaussians) -> str | None:
     if get_writer(path) not in UNMARKED or not gaussians.is_antialiased:
         return None
     return (
-        f"A {path.suffix} file cannot mark Gaussians as antialiased: viewers will render them as classic "
-        "ones, which makes small ones too opaque."
+        f"A {path.suffix} file cannot mark Gaussians as antialiased: viewers will render them as "
+        "classic ones, which makes small ones too opaque."
     )
 
 

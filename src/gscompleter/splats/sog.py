@@ -31,6 +31,7 @@ from gscompleter.splats.codebooks import fit_codebook, fit_palette
 from gscompleter.splats.packing import (
     MAX_LOG_SCALE,
     NUM_SH_REST,
+    ZIP_MAGIC,
     assemble_sh,
     build_gaussians,
     check_growth,
@@ -41,7 +42,6 @@ from gscompleter.splats.ply import encode
 from gscompleter.types import SH_C0, Gaussians
 
 META = "meta.json"
-ZIP_MAGIC = b"PK\x03\x04"
 PALETTE_WIDTH = 64
 """Entries of the SH palette in each row of its image."""
 MAX_ENTRY_GROWTH = 8
@@ -218,7 +218,11 @@ def _encode_means(
     """Encode positions as steps between bounds on the logarithmic scale."""
     logs = np.sign(means) * np.log1p(np.abs(means.astype(np.float64)))
     low, high = logs.min(0), logs.max(0)
-    return low, high, np.rint((logs - low) / np.where(high > low, high - low, 1) * 65535).astype(int)
+    return (
+        low,
+        high,
+        np.rint((logs - low) / np.where(high > low, high - low, 1) * 65535).astype(int),
+    )
 
 
 def _encode_quats(quats: Float[ndarray, "n 4"]) -> Float[ndarray, "n 4"]:

@@ -21,8 +21,9 @@ from numpy import ndarray
 
 from gscompleter.errors import InputError
 from gscompleter.io.files import replace_file
+from gscompleter.io.reading import read_bytes
 from gscompleter.splats.glb import COLOR_SPACE
-from gscompleter.splats.packing import build_gaussians
+from gscompleter.splats.packing import ZIP_MAGIC, build_gaussians
 from gscompleter.splats.transform import (
     HALF_TURN_X,
     require_similarity,
@@ -35,7 +36,7 @@ if TYPE_CHECKING:
     from pxr import Usd
 
 KIND = "ParticleField3DGaussianSplat"
-Z_UP = torch.tensor([[1, 0, 0, 0], [0, 0, 1, 0], [0, -1, 0, 0], [0, 0, 0, 1.0]]).double()
+Z_UP = torch.tensor([[1.0, 0, 0, 0], [0, 0, 1, 0], [0, -1, 0, 0], [0, 0, 0, 1]])
 """Transform from axes with z up to those with y up."""
 EXTENT = 3
 """Standard deviations of the Gaussians that lie within the bounds of the prim."""
@@ -46,13 +47,13 @@ PADDING_FIELD = 0x1986
 
 def write_usd(path: Path, gaussians: Gaussians) -> None:
     """Write a .usda, .usdc or .usdz, by the name of `path`."""
-    stage = _make_stage(rotate_half_turn(gaussians, HALF_TURN_X))
+    stage, ending = _make_stage(rotate_half_turn(gaussians, HALF_TURN_X)), path.suffix.lower()
     with tempfile.TemporaryDirectory() as folder:
-        layer = Path(folder, path.with_suffix(path.suffix.lower().replace("z", "c")).name)
+        layer = Path(folder, f"splat{ending.replace('z', 'c')}")
         stage.GetRootLayer().Export(str(layer))
         content = layer.read_bytes()
     with replace_file(path) as file:
-        file.write(_package(content) if path.suffix.lower() == ".usdz" else content)
+        file.write(_package(content) if ending == ".usdz" else content)
 
 
 def _make_stage(gaussians: Gaussians) -> Usd.Stage:
@@ -110,25 +111,36 @@ def _require_usd() -> None:
 def read_usd(path: Path) -> Gaussians:
     """Read the Gaussians of all prims on the stage of a file, in the axes of a .ply."""
     _require_usd()
-    from pxr import Tf, Usd, UsdGeom, UsdUtils
+    from pxr import UsdGeom
 
-    delegate = UsdUtils.CoalescingDiagnosticDelegate()  # keeps the warnings from being printed
+    content = read_bytes(path)
+    with tempfile.TemporaryDirectory() as folder:  # a copy alone, whose name usd-core understands
+        copy = Path(folder, "splat.usdz" if content.startswith(ZIP_MAGIC) else "splat.usd")
+        copy.write_bytes(content)
+        stage = _open_stage(copy)
+        parts = [_read_prim(prim) for prim in stage.Traverse() if prim.GetTypeName() == KIND]
+        is_z_up = UsdGeom.GetStageUpAxis(stage) == UsdGeom.Tokens.z
+    if not parts:
+        raise ValueError(f"it has no prim {KIND}")
+    merged = transform_gaussians(merge(parts), Z_UP) if is_z_up else merge(parts)
+    return rotate_half_turn(merged, HALF_TURN_X)
+
+
+def _open_stage(path: Path) -> Usd.Stage:
+    """Open a stage that lies in one file."""
+    from pxr import Tf, Usd, UsdUtils
+
+    delegate = UsdUtils.CoalescingDiagnosticDelegate()  # keeps warnings from being printed
     try:
         stage = Usd.Stage.Open(str(path))
     except Tf.ErrorException as error:
         raise ValueError("usd-core finds it damaged") from error
     finally:
         del delegate
-    ours = str(path.resolve())
-    if not all(it.anonymous or it.realPath.startswith(ours) for it in stage.GetUsedLayers()):
+    places = [layer.realPath for layer in stage.GetUsedLayers() if not layer.anonymous]
+    if not all(place.startswith(str(path.resolve())) for place in places):
         raise ValueError("it refers to other files")
-    prims = [prim for prim in stage.Traverse() if prim.GetTypeName() == KIND]
-    if not prims:
-        raise ValueError(f"it has no prim {KIND}")
-    merged = merge([_read_prim(prim) for prim in prims])
-    if UsdGeom.GetStageUpAxis(stage) == UsdGeom.Tokens.z:
-        merged = transform_gaussians(merged, Z_UP.float())
-    return rotate_half_turn(merged, HALF_TURN_X)
+    return stage
 
 
 def _read_prim(prim: Usd.Prim) -> Gaussians:

@@ -37,6 +37,7 @@ PURPOSES = {
     "ray": "batch --engine ray",
     "slurm": "batch --engine submitit",
     "waymo": "the Waymo Open Dataset 2, whose tables are parquet",
+    "usd": "splats as OpenUSD (.usda, .usdc, .usdz)",
 }
 """Purpose of each extra. Those for developers (`test`, `dev`, `docs`) are not listed."""
 
