@@ -47,8 +47,8 @@ DECODING_ERRORS = (
 """Errors that decoders raise on damaged bytes."""
 TYPE_ERRORS = (AttributeError, TypeError)
 """Errors by files whose values can be of any type."""
-TYPED_FREELY = ("sog", "sog-folder", "glb", "usd", "usdz")
-"""Names of the formats of such files."""
+FREE = (read_sog, read_glb, read_usd)
+"""Readers of such files."""
 MAX_DEFECT = 120
 """Most characters of the description of a defect."""
 HEAD_BYTES = 8192
@@ -104,7 +104,7 @@ def load_splat(path: Path | str, drop_nonfinite: bool = False) -> Gaussians:
     name = detect_splat_format(path)
     if name == "ply":
         return load_ply(path, drop_nonfinite)
-    errors = (*DECODING_ERRORS, *(TYPE_ERRORS if name in TYPED_FREELY else ()))
+    errors = (*DECODING_ERRORS, *(TYPE_ERRORS if FORMATS[name].read in FREE else ()))
     try:
         with np.errstate(over="ignore", invalid="ignore"):  # infinite values are refused below
             gaussians = FORMATS[name].read(path)

@@ -42,8 +42,8 @@ COLOR_SPACE = "srgb_rec709_display"
 """The colour space in which all splat trainers work."""
 COMPONENT_TYPES = {5120: "<i1", 5121: "<u1", 5122: "<i2", 5123: "<u2", 5126: "<f4"}
 """numpy names of the component types."""
-FLOAT, POINTS, VERTEX_BUFFER = 5126, 0, 34962
-"""Constants of glTF: the component type, primitive mode and buffer target that are written."""
+FLOAT, POINTS = 5126, 0
+"""Component type and primitive mode that are written."""
 NUM_COMPONENTS = {"SCALAR": 1, "VEC3": 3, "VEC4": 4}
 MAX_FILE_BYTES = 2**32 - 1
 """Largest size that the header of a .glb can state."""
@@ -178,8 +178,7 @@ def write_glb(path: Path, gaussians: Gaussians) -> None:
     total = FILE_HEADER.size + 2 * CHUNK_HEADER.size + len(text) + size
     if total > MAX_FILE_BYTES:
         raise InputError(
-            f"{quote_value(path)} cannot hold {len(gaussians):,} Gaussians, since a .glb ends at "
-            "4 GiB; write a .ply."
+            f"{quote_value(path)} would exceed 4 GiB, which no .glb can; write a .ply."
         )
     with replace_file(path) as file:
         file.write(FILE_HEADER.pack(b"glTF", 2, total))
@@ -206,17 +205,15 @@ def _make_columns(gaussians: Gaussians) -> dict[str, Float[ndarray, "n k"]]:
 
 def _describe_scene(columns: dict[str, Float[ndarray, "n k"]]) -> dict[str, Any]:
     """Describe a scene of one primitive whose attributes follow each other in the binary part."""
-    ends = np.cumsum([column.nbytes for column in columns.values()]).tolist()
-    views = [
-        {"buffer": 0, "byteOffset": end - column.nbytes, "byteLength": column.nbytes}
-        | {"target": VERTEX_BUFFER}
-        for end, column in zip(ends, columns.values(), strict=True)
-    ]
     kinds = {count: kind for kind, count in NUM_COMPONENTS.items()}
-    accessors: list[dict[str, Any]] = [
-        {"bufferView": view, "componentType": FLOAT, "count": len(it), "type": kinds[it.shape[1]]}
-        for view, it in enumerate(columns.values())
-    ]
+    views: list[dict[str, Any]] = []
+    accessors: list[dict[str, Any]] = []
+    size = 0
+    for view, values in enumerate(columns.values()):
+        views.append({"buffer": 0, "byteOffset": size, "byteLength": values.nbytes})
+        form = {"componentType": FLOAT, "count": len(values), "type": kinds[values.shape[1]]}
+        accessors.append({"bufferView": view, **form})
+        size += values.nbytes
     means = columns["POSITION"]
     accessors[0] |= {"min": means.min(0).tolist(), "max": means.max(0).tolist()}
     primitive = {
@@ -227,11 +224,7 @@ def _describe_scene(columns: dict[str, Float[ndarray, "n k"]]) -> dict[str, Any]
     return {
         "asset": {"version": "2.0", "generator": "gscompleter"},
         "extensionsUsed": [EXTENSION],
-        "scene": 0,
-        "scenes": [{"nodes": [0]}],
-        "nodes": [{"mesh": 0}],
+        **{"scene": 0, "scenes": [{"nodes": [0]}], "nodes": [{"mesh": 0}]},
         "meshes": [{"primitives": [primitive]}],
-        "buffers": [{"byteLength": ends[-1]}],
-        "bufferViews": views,
-        "accessors": accessors,
+        **{"buffers": [{"byteLength": size}], "bufferViews": views, "accessors": accessors},
     }

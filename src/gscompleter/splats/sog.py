@@ -20,7 +20,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from jaxtyping import Float, Integer, Shaped, UInt8
+from jaxtyping import Float, Shaped, UInt8
 from numpy import ndarray
 from PIL import Image
 
@@ -54,6 +54,8 @@ BLOCK = 4
 
 FileReader = Callable[[str], bytes]
 """Function that reads a file of the scene by name, from a folder or a bundle."""
+Coded = tuple[dict[str, Any], dict[str, bytes]]
+"""A property as numbers for `meta.json`, and images by file name."""
 
 
 def read_sog(path: Path) -> Gaussians:
@@ -175,72 +177,56 @@ def _decode_sh_rest(read: FileReader, table: dict[str, Any], count: int) -> Floa
 
 def write_sog(path: Path, gaussians: Gaussians) -> None:
     """Write a bundle of version 2; the Gaussians should be sorted with `sort_along_morton`."""
-    table, images = _encode_scene(gaussians)
+    coded = _encode_scene(gaussians)
+    model = "antialiased" if gaussians.is_antialiased else "default"
+    table = {"version": 2, "count": len(gaussians), "model": model}
+    table |= {name: {**values, "files": list(images)} for name, (values, images) in coded.items()}
+    files = {META: json.dumps(table).encode()}
+    for _, images in coded.values():
+        files |= images
     with replace_file(path) as file, zipfile.ZipFile(file, "w") as bundle:
-        for name, data in {META: json.dumps(table).encode(), **images}.items():
+        for name, data in files.items():
             bundle.writestr(zipfile.ZipInfo(name), data)  # without the time of writing
 
 
-def _encode_scene(gaussians: Gaussians) -> tuple[dict[str, Any], dict[str, bytes]]:
-    """Encode the Gaussians as the table of `meta.json` and the images that it names."""
-    low, high, steps = _encode_means(gaussians.means.numpy())
+def _encode_scene(gaussians: Gaussians) -> dict[str, Coded]:
+    """Encode the properties of Gaussians by their names in `meta.json`."""
     log_scales = encode(gaussians)[:, :3].numpy().clip(-MAX_LOG_SCALE, MAX_LOG_SCALE)
     scale_book, scales = fit_codebook(log_scales)
     color_book, colors = fit_codebook(gaussians.sh[:, 0].numpy())
-    opacities = np.rint(gaussians.opacities.numpy()[:, None] * 255).astype(np.uint8)
-    images = {
-        "means_l.webp": _encode_image(steps & 255),
-        "means_u.webp": _encode_image(steps >> 8),
-        "quats.webp": _encode_image(_encode_quats(gaussians.quats.numpy())),
-        "scales.webp": _encode_image(scales),
-        "sh0.webp": _encode_image(np.concatenate([colors, opacities], axis=1)),
+    rgba = np.column_stack([colors, np.rint(gaussians.opacities.numpy() * 255)])
+    largest, smaller = drop_largest(gaussians.quats.numpy())
+    quats = np.column_stack([np.rint((smaller / np.sqrt(2) + 0.5) * 255), ROTATION_MARK + largest])
+    coded: dict[str, Coded] = {
+        "means": _encode_means(gaussians.means.double().numpy()),
+        "scales": ({"codebook": scale_book.tolist()}, {"scales.webp": _encode_image(scales)}),
+        "quats": ({}, {"quats.webp": _encode_image(quats)}),
+        "sh0": ({"codebook": color_book.tolist()}, {"sh0.webp": _encode_image(rgba)}),
     }
-    bounds = {"mins": low.tolist(), "maxs": high.tolist()}
-    table = {
-        "version": 2,
-        "asset": {"generator": "gscompleter"},
-        "count": len(gaussians),
-        "model": "antialiased" if gaussians.is_antialiased else "default",
-        "means": {**bounds, "files": ["means_l.webp", "means_u.webp"]},
-        "scales": {"codebook": scale_book.tolist(), "files": ["scales.webp"]},
-        "quats": {"files": ["quats.webp"]},
-        "sh0": {"codebook": color_book.tolist(), "files": ["sh0.webp"]},
-    }
-    if gaussians.sh_degree > 0:
-        table["shN"], of_rest = _encode_sh_rest(gaussians)
-        images |= of_rest
-    return table, images
+    return coded | ({"shN": _encode_sh_rest(gaussians)} if gaussians.sh_degree else {})
 
 
-def _encode_means(
-    means: Float[ndarray, "n 3"],
-) -> tuple[Float[ndarray, "3"], Float[ndarray, "3"], Integer[ndarray, "n 3"]]:
-    """Encode positions as steps between bounds on the logarithmic scale."""
-    logs = np.sign(means) * np.log1p(np.abs(means.astype(np.float64)))
+def _encode_means(means: Float[ndarray, "n 3"]) -> Coded:
+    """Encode positions as 16 bits between bounds on the logarithmic scale."""
+    logs = np.sign(means) * np.log1p(np.abs(means))
     low, high = logs.min(0), logs.max(0)
-    return (
-        low,
-        high,
-        np.rint((logs - low) / np.where(high > low, high - low, 1) * 65535).astype(int),
-    )
+    steps = np.rint((logs - low) / np.where(high > low, high - low, 1) * 65535).astype(np.int64)
+    images = {"means_l.webp": _encode_image(steps & 255), "means_u.webp": _encode_image(steps >> 8)}
+    return {"mins": low.tolist(), "maxs": high.tolist()}, images
 
 
-def _encode_quats(quats: Float[ndarray, "n 4"]) -> Float[ndarray, "n 4"]:
-    largest, smaller = drop_largest(quats)
-    return np.column_stack([np.rint((smaller / np.sqrt(2) + 0.5) * 255), ROTATION_MARK + largest])
-
-
-def _encode_sh_rest(gaussians: Gaussians) -> tuple[dict[str, Any], dict[str, bytes]]:
+def _encode_sh_rest(gaussians: Gaussians) -> Coded:
     """Encode SH of degree 1 and above as numbers of rows of a palette."""
-    rest = gaussians.sh[:, 1:].numpy()
-    palette, labels = fit_palette(rest.reshape(len(rest), -1))
-    book, coded = fit_codebook(palette)
+    rest = gaussians.sh[:, 1:].flatten(1).numpy()
+    palette, labels = fit_palette(rest)
+    book, codes = fit_codebook(palette)
+    width = PALETTE_WIDTH * rest.shape[1] // 3
     images = {
-        "shN_centroids.webp": _encode_image(coded.reshape(-1, 3), PALETTE_WIDTH * rest.shape[1]),
+        "shN_centroids.webp": _encode_image(codes.reshape(-1, 3), width),
         "shN_labels.webp": _encode_image(np.stack([labels & 255, labels >> 8, 0 * labels], axis=1)),
     }
     sizes = {"count": len(palette), "bands": gaussians.sh_degree}
-    return {**sizes, "codebook": book.tolist(), "files": list(images)}, images
+    return {**sizes, "codebook": book.tolist()}, images
 
 
 def _encode_image(values: Shaped[ndarray, "n k"], width: int = 0) -> bytes:

@@ -1,16 +1,15 @@
 """Gaussians in OpenUSD, as prims ParticleField3DGaussianSplat, through usd-core (the extra `usd`).
 
-A prim has arrays of linear scales, opacities in [0, 1], rotations, and SH coefficients of one
-Gaussian after the other, in single or half precision. Files are written in single precision, with
-axes x right, y up, z back; a .usdz is a zip of one .usdc.
+A prim has arrays of linear scales, opacities in [0, 1], xyzw rotations, and SH coefficients, one
+Gaussian after the other, in single or half precision. Written are files of one prim in single
+precision, with axes x right, y up, z back; a .usdz is a zip of one .usdc.
 """
 
 from __future__ import annotations
 
-import io
-import struct
+import os
 import tempfile
-import zipfile
+import time
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -36,64 +35,55 @@ if TYPE_CHECKING:
     from pxr import Usd
 
 KIND = "ParticleField3DGaussianSplat"
+SH_NAME = "radiance:sphericalHarmonics"
 Z_UP = torch.tensor([[1.0, 0, 0, 0], [0, 0, 1, 0], [0, -1, 0, 0], [0, 0, 0, 1]])
 """Transform from axes with z up to those with y up."""
 EXTENT = 3
 """Standard deviations of the Gaussians that lie within the bounds of the prim."""
-ZIP_HEADER_BYTES, ZIP_ALIGNMENT = 30, 64
-PADDING_FIELD = 0x1986
-"""Number of the field in the header of a zip entry that aligns its content, as usd-core's."""
+PACKAGED = (2000, 1, 1, 0, 0, 0, 0, 0, -1)
+"""Time of the .usdc in a .usdz, so that the same Gaussians give the same bytes."""
 
 
 def write_usd(path: Path, gaussians: Gaussians) -> None:
     """Write a .usda, .usdc or .usdz, by the name of `path`."""
+    _require_usd()
+    from pxr import UsdUtils
+
     stage, ending = _make_stage(rotate_half_turn(gaussians, HALF_TURN_X)), path.suffix.lower()
     with tempfile.TemporaryDirectory() as folder:
-        layer = Path(folder, f"splat{ending.replace('z', 'c')}")
+        made = layer = Path(folder, f"splat{ending.replace('z', 'c')}")
         stage.GetRootLayer().Export(str(layer))
-        content = layer.read_bytes()
-    with replace_file(path) as file:
-        file.write(_package(content) if ending == ".usdz" else content)
+        if ending == ".usdz":
+            os.utime(layer, (time.mktime(PACKAGED),) * 2)
+            made = layer.with_suffix(ending)
+            UsdUtils.CreateNewUsdzPackage(str(layer), str(made))
+        with replace_file(path) as file:
+            file.write(made.read_bytes())
 
 
 def _make_stage(gaussians: Gaussians) -> Usd.Stage:
     """Make a stage of one prim, from Gaussians in its axes."""
-    _require_usd()
-    from pxr import Usd, UsdGeom, UsdVol, Vt
-
-    def vectors(values: Float[ndarray, "*n 3"]) -> Vt.Vec3fArray:
-        return Vt.Vec3fArray.FromNumpy(np.ascontiguousarray(values.reshape(-1, 3)))
+    from pxr import Usd, UsdGeom
 
     stage = Usd.Stage.CreateInMemory()
     UsdGeom.SetStageUpAxis(stage, UsdGeom.Tokens.y)
     UsdGeom.SetStageMetersPerUnit(stage, 1)
-    splat = UsdVol.ParticleField3DGaussianSplat.Define(stage, "/Splat")
-    stage.SetDefaultPrim(splat.GetPrim())
-    Usd.ColorSpaceAPI.Apply(splat.GetPrim()).CreateColorSpaceNameAttr(COLOR_SPACE)
+    prim = stage.DefinePrim("/Splat", KIND)
+    stage.SetDefaultPrim(prim)
+    Usd.ColorSpaceAPI.Apply(prim).CreateColorSpaceNameAttr(COLOR_SPACE)
     means, reach = gaussians.means, EXTENT * gaussians.scales.amax(1, keepdim=True)
-    bounds = torch.stack([(means - reach).amin(0), (means + reach).amax(0)])
-    unit = torch.nn.functional.normalize(gaussians.quats, dim=1)
-    xyzw = np.ascontiguousarray(unit.roll(-1, dims=1).numpy())
-    splat.CreateExtentAttr(vectors(bounds.numpy()))
-    splat.CreatePositionsAttr(vectors(means.numpy()))
-    splat.CreateOrientationsAttr(Vt.QuatfArray.FromNumpy(xyzw))
-    splat.CreateScalesAttr(vectors(gaussians.scales.numpy()))
-    splat.CreateOpacitiesAttr(Vt.FloatArray.FromNumpy(gaussians.opacities.numpy()))
-    splat.CreateRadianceSphericalHarmonicsDegreeAttr(gaussians.sh_degree)
-    splat.CreateRadianceSphericalHarmonicsCoefficientsAttr(vectors(gaussians.sh.numpy()))
+    values = {
+        "extent": torch.stack([(means - reach).amin(0), (means + reach).amax(0)]),
+        "positions": means,
+        "orientations": torch.nn.functional.normalize(gaussians.quats, dim=1).roll(-1, dims=1),
+        "scales": gaussians.scales,
+        "opacities": gaussians.opacities,
+        f"{SH_NAME}Coefficients": gaussians.sh.reshape(-1, 3),
+    }
+    for name, value in values.items():
+        prim.GetAttribute(name).Set(np.ascontiguousarray(value.numpy()))
+    prim.GetAttribute(f"{SH_NAME}Degree").Set(gaussians.sh_degree)
     return stage
-
-
-def _package(content: bytes) -> bytes:
-    """Pack a .usdc into a .usdz: a zip without compression, whose content starts at 64 bytes."""
-    info = zipfile.ZipInfo("splat.usdc")  # without the time of writing
-    start = ZIP_HEADER_BYTES + len(info.filename) + 4
-    padding = -start % ZIP_ALIGNMENT
-    info.extra = struct.pack("<HH", PADDING_FIELD, padding) + bytes(padding)
-    file = io.BytesIO()
-    with zipfile.ZipFile(file, "w") as bundle:
-        bundle.writestr(info, content)
-    return file.getvalue()
 
 
 def _require_usd() -> None:
@@ -101,46 +91,41 @@ def _require_usd() -> None:
     try:
         from pxr import UsdVol
 
-        found = hasattr(UsdVol, KIND)
-    except ImportError:
-        found = False
-    if not found:
-        raise InputError("OpenUSD needs usd-core 26.3 or newer: `pip install 'gscompleter[usd]'`.")
+        UsdVol.ParticleField3DGaussianSplat  # noqa: B018
+    except (ImportError, AttributeError) as error:
+        raise InputError(
+            "OpenUSD needs usd-core 26.3 or newer: `pip install 'gscompleter[usd]'`."
+        ) from error
 
 
 def read_usd(path: Path) -> Gaussians:
     """Read the Gaussians of all prims on the stage of a file, in the axes of a .ply."""
     _require_usd()
-    from pxr import UsdGeom
+    from pxr import Tf
 
     content = read_bytes(path)
-    with tempfile.TemporaryDirectory() as folder:  # a copy alone, whose name usd-core understands
+    with tempfile.TemporaryDirectory() as folder:  # a copy with a name that is understood
         copy = Path(folder, "splat.usdz" if content.startswith(ZIP_MAGIC) else "splat.usd")
         copy.write_bytes(content)
-        stage = _open_stage(copy)
-        parts = [_read_prim(prim) for prim in stage.Traverse() if prim.GetTypeName() == KIND]
-        is_z_up = UsdGeom.GetStageUpAxis(stage) == UsdGeom.Tokens.z
+        try:
+            return rotate_half_turn(_read_stage(copy), HALF_TURN_X)
+        except Tf.ErrorException as error:
+            raise ValueError("usd-core finds it damaged") from error
+
+
+def _read_stage(path: Path) -> Gaussians:
+    """Read the Gaussians of a stage that consists of one file, in axes with y up."""
+    from pxr import Sdf, Usd, UsdGeom
+
+    layer = Sdf.Layer.FindOrOpen(str(path))
+    if layer.GetCompositionAssetDependencies():
+        raise ValueError("it is composed of several files, which usdcat --flatten unites")
+    stage = Usd.Stage.Open(layer)
+    parts = [_read_prim(prim) for prim in stage.Traverse() if prim.GetTypeName() == KIND]
     if not parts:
         raise ValueError(f"it has no prim {KIND}")
-    merged = transform_gaussians(merge(parts), Z_UP) if is_z_up else merge(parts)
-    return rotate_half_turn(merged, HALF_TURN_X)
-
-
-def _open_stage(path: Path) -> Usd.Stage:
-    """Open a stage that lies in one file."""
-    from pxr import Tf, Usd, UsdUtils
-
-    delegate = UsdUtils.CoalescingDiagnosticDelegate()  # keeps warnings from being printed
-    try:
-        stage = Usd.Stage.Open(str(path))
-    except Tf.ErrorException as error:
-        raise ValueError("usd-core finds it damaged") from error
-    finally:
-        del delegate
-    places = [layer.realPath for layer in stage.GetUsedLayers() if not layer.anonymous]
-    if not all(place.startswith(str(path.resolve())) for place in places):
-        raise ValueError("it refers to other files")
-    return stage
+    is_z_up = UsdGeom.GetStageUpAxis(stage) == UsdGeom.Tokens.z
+    return transform_gaussians(merge(parts), Z_UP) if is_z_up else merge(parts)
 
 
 def _read_prim(prim: Usd.Prim) -> Gaussians:
@@ -148,21 +133,15 @@ def _read_prim(prim: Usd.Prim) -> Gaussians:
     from pxr import UsdGeom
 
     def read(name: str) -> Float[ndarray, "n *k"]:
-        """Read an attribute, in half precision if there is no other."""
-        found = (prim.GetAttribute(it).Get() for it in (name, f"{name}h"))
-        values = next((it for it in found if it is not None), None)
-        if values is None:
+        values = prim.GetAttribute(name).Get() or prim.GetAttribute(f"{name}h").Get()
+        if not values:
             raise ValueError(f"it lacks {name}")
         return np.asarray(values, np.float32)
 
-    means = read("positions")
-    gaussians = build_gaussians(
-        means,
-        np.roll(read("orientations"), 1, axis=1),
-        read("scales"),
-        read("opacities"),
-        read("radiance:sphericalHarmonicsCoefficients").reshape(len(means), -1, 3),
-    )
+    means, sh = read("positions"), read(f"{SH_NAME}Coefficients")
+    quats = np.roll(read("orientations"), 1, axis=1)
+    sh = sh.reshape(len(means), -1, 3)
+    gaussians = build_gaussians(means, quats, read("scales"), read("opacities"), sh)
     to_stage = UsdGeom.Xformable(prim).ComputeLocalToWorldTransform(0)
     place = torch.from_numpy(np.array(to_stage).T)  # pxr multiplies rows from the left
     require_similarity(place)
