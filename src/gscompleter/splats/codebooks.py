@@ -62,8 +62,8 @@ def fit_palette(
 
 
 def _take_evenly(rows: Float[ndarray, "n *k"], count: int) -> Float[ndarray, "m *k"]:
-    """Take up to `count` rows at even distances, with the first and the last."""
-    return rows[np.linspace(0, len(rows) - 1, min(count, len(rows))).astype(np.int64)]
+    """Take `count` rows at even distances, with the first and the last; of fewer, some twice."""
+    return rows[np.linspace(0, len(rows) - 1, count).astype(np.int64)]
 
 
 def _run_kmeans(rows: Float[ndarray, "n k"], guess: Float[ndarray, "m k"]) -> Float[ndarray, "m k"]:

@@ -34,7 +34,7 @@ from gscompleter.splats.ply import load_ply, require_finite, save_ply
 from gscompleter.splats.sog import META, read_sog, write_sog
 from gscompleter.splats.splat import read_splat, write_splat
 from gscompleter.splats.spz import read_spz, write_spz
-from gscompleter.splats.usd import read_usd, write_usd
+from gscompleter.splats.usd import refuse_usd, write_usd
 from gscompleter.types import Gaussians
 
 OPACITY_TOLERANCE = 1e-3
@@ -45,10 +45,8 @@ DECODING_ERRORS = (
     Image.DecompressionBombError,
 )
 """Errors that decoders raise on damaged bytes."""
-TYPE_ERRORS = (AttributeError, TypeError)
-"""Errors by files whose values can be of any type."""
-FREE = (read_sog, read_glb, read_usd)
-"""Readers of such files."""
+JSON_ERRORS = (AttributeError, TypeError)
+"""Errors by JSON whose values are of another type."""
 MAX_DEFECT = 120
 """Most characters of the description of a defect."""
 HEAD_BYTES = 8192
@@ -78,8 +76,8 @@ FORMATS = {
     ),
     "ply": Format((".ply",), (b"ply",), load_ply, save_ply),
     "spz": Format((".spz",), (b"NGSP", b"\x1f\x8b"), read_spz, write_spz),
-    "usdz": Format((".usdz",), (ZIP_MAGIC,), read_usd, write_usd, contains=b".usd"),
-    "usd": Format((".usdc", ".usda", ".usd"), (b"PXR-USDC", b"#usda"), read_usd, write_usd),
+    "usdz": Format((".usdz",), (ZIP_MAGIC,), refuse_usd, write_usd, contains=b".usd"),
+    "usd": Format((".usdc", ".usda", ".usd"), (b"PXR-USDC", b"#usda"), refuse_usd, write_usd),
     "sog": Format((".sog",), (ZIP_MAGIC,), read_sog, write_sog),
     "sog-folder": Format((META,), (b"{",), read_sog),
     "glb": Format((".glb",), (b"glTF",), read_glb, write_glb),
@@ -104,7 +102,7 @@ def load_splat(path: Path | str, drop_nonfinite: bool = False) -> Gaussians:
     name = detect_splat_format(path)
     if name == "ply":
         return load_ply(path, drop_nonfinite)
-    errors = (*DECODING_ERRORS, *(TYPE_ERRORS if FORMATS[name].read in FREE else ()))
+    errors = (*DECODING_ERRORS, *(JSON_ERRORS if name in ("sog", "sog-folder", "glb") else ()))
     try:
         with np.errstate(over="ignore", invalid="ignore"):  # infinite values are refused below
             gaussians = FORMATS[name].read(path)

@@ -25,12 +25,7 @@ from gscompleter.geometry import quats_to_rotations
 from gscompleter.io.files import replace_file
 from gscompleter.io.reading import read_bytes
 from gscompleter.splats.packing import build_gaussians
-from gscompleter.splats.transform import (
-    HALF_TURN_Z,
-    require_similarity,
-    rotate_half_turn,
-    transform_gaussians,
-)
+from gscompleter.splats.transform import HALF_TURN_Z, rotate_half_turn, transform_gaussians
 from gscompleter.types import SH_C0, Gaussians, merge
 
 FILE_HEADER = struct.Struct("<4sII")
@@ -117,7 +112,11 @@ def _read_transform(node: dict[str, Any]) -> Float[Tensor, "4 4"]:
         place[:3, :3] = quats_to_rotations(torch.tensor([w, x, y, z], dtype=torch.float64))
         place[:3, :3] *= torch.tensor(node.get("scale", (1, 1, 1)), dtype=torch.float64)
         place[:3, 3] = torch.tensor(node.get("translation", (0, 0, 0)), dtype=torch.float64)
-    require_similarity(place)
+    linear = place[:3, :3]
+    volume = float(torch.linalg.det(linear))
+    shape = linear @ linear.T / max(volume, 1e-30) ** (2 / 3)
+    if not volume > 0 or not torch.allclose(shape, torch.eye(3).double(), atol=1e-3):
+        raise ValueError("one of its nodes mirrors or stretches Gaussians unevenly")
     return place
 
 
@@ -178,7 +177,7 @@ def write_glb(path: Path, gaussians: Gaussians) -> None:
     total = FILE_HEADER.size + 2 * CHUNK_HEADER.size + len(text) + size
     if total > MAX_FILE_BYTES:
         raise InputError(
-            f"{quote_value(path)} would exceed 4 GiB, which no .glb can; write a .ply."
+            f"{quote_value(path)} would exceed 4 GiB; write a .ply or fewer Gaussians."
         )
     with replace_file(path) as file:
         file.write(FILE_HEADER.pack(b"glTF", 2, total))
@@ -224,7 +223,11 @@ def _describe_scene(columns: dict[str, Float[ndarray, "n k"]]) -> dict[str, Any]
     return {
         "asset": {"version": "2.0", "generator": "gscompleter"},
         "extensionsUsed": [EXTENSION],
-        **{"scene": 0, "scenes": [{"nodes": [0]}], "nodes": [{"mesh": 0}]},
+        "scene": 0,
+        "scenes": [{"nodes": [0]}],
+        "nodes": [{"mesh": 0}],
         "meshes": [{"primitives": [primitive]}],
-        **{"buffers": [{"byteLength": size}], "bufferViews": views, "accessors": accessors},
+        "buffers": [{"byteLength": size}],
+        "bufferViews": views,
+        "accessors": accessors,
     }

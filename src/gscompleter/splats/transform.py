@@ -34,15 +34,6 @@ def rotate_half_turn(gaussians: Gaussians, signs: tuple[float, float, float]) ->
     )
 
 
-def require_similarity(place: Float[Tensor, "4 4"]) -> None:
-    """Raise ValueError unless a transform in float64 only rotates, moves and scales evenly."""
-    linear = place[:3, :3]
-    volume = float(torch.linalg.det(linear))
-    shape = linear @ linear.T / max(volume, 1e-30) ** (2 / 3)
-    if not volume > 0 or not torch.allclose(shape, torch.eye(3).double(), atol=1e-3):
-        raise ValueError("one of its nodes mirrors or stretches Gaussians unevenly")
-
-
 def transform_gaussians(gaussians: Gaussians, similarity: Float[Tensor, "4 4"]) -> Gaussians:
     """Transform Gaussians by a similarity `x' = s R x + t`."""
     scale = torch.linalg.det(similarity[:3, :3]) ** (1 / 3)
