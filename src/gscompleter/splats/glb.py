@@ -176,9 +176,7 @@ def write_glb(path: Path, gaussians: Gaussians) -> None:
     size = sum(column.nbytes for column in columns.values())
     total = FILE_HEADER.size + 2 * CHUNK_HEADER.size + len(text) + size
     if total > MAX_FILE_BYTES:
-        raise InputError(
-            f"{quote_value(path)} would exceed 4 GiB; write a .ply or fewer Gaussians."
-        )
+        raise InputError(f"{quote_value(path)} would exceed the 4 GiB of a .glb; write a .ply.")
     with replace_file(path) as file:
         file.write(FILE_HEADER.pack(b"glTF", 2, total))
         file.write(CHUNK_HEADER.pack(len(text), JSON) + text + CHUNK_HEADER.pack(size, BINARY))
