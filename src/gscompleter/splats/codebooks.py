@@ -1,24 +1,18 @@
-"""Few values that stand for many: codebooks of numbers and palettes of rows, by k-means.
-
-The first guess is evenly spaced, not random: the same values give the same codebook.
-"""
+"""Few values that stand for many: codebooks of numbers and palettes of rows, by k-means."""
 
 from __future__ import annotations
 
 import math
-import warnings
 
+import cv2
 import numpy as np
-from jaxtyping import Float, Int64, UInt8
+from jaxtyping import Float, Int64, Integer, UInt8
 from numpy import ndarray
-from scipy.cluster.vq import kmeans2, vq
 
 CODEBOOK_SIZE = 256
 MIN_PALETTE_SIZE, MAX_PALETTE_SIZE = 1 << 12, 1 << 16
 ROWS_PER_ENTRY = 4
 """Rows that share an entry of a palette between these sizes."""
-SAMPLE_SIZE = 1 << 15
-"""Values or rows to which a codebook or the cells are fitted."""
 ITERATIONS = 5
 
 
@@ -27,14 +21,17 @@ def fit_codebook(
 ) -> tuple[Float[ndarray, "256"], UInt8[ndarray, "n k"]]:
     """Fit 256 numbers to all values; return them in ascending order, and the nearest by number.
 
-    Half of the guess are quantiles, half cover the range, so that rare values stay close too.
+    Half of the first guess are quantiles, half cover the range, so that rare values stay close.
     """
-    sample = _take_evenly(np.sort(values, axis=None), SAMPLE_SIZE)
     half = CODEBOOK_SIZE // 2
-    covering = np.linspace(sample[0], sample[-1], half, dtype=np.float32)
-    guess = np.concatenate([_take_evenly(sample, half), covering])
-    book = np.sort(_run_kmeans(sample[:, None], guess[:, None])[:, 0])
-    return book, np.searchsorted((book[1:] + book[:-1]) / 2, values).astype(np.uint8)
+    covering = np.linspace(values.min(), values.max(), half)
+    book = np.sort([*np.quantile(values, np.linspace(0, 1, half)), *covering])
+    for _ in range(ITERATIONS):
+        nearest = _find_nearest(book, values).ravel()
+        counts = np.bincount(nearest, minlength=CODEBOOK_SIZE)
+        sums = np.bincount(nearest, values.ravel(), CODEBOOK_SIZE)
+        book = np.where(counts > 0, sums / np.maximum(counts, 1), book)
+    return book.astype(np.float32), _find_nearest(book, values).astype(np.uint8)
 
 
 def fit_palette(
@@ -49,25 +46,29 @@ def fit_palette(
     if len(distinct) <= size:
         return distinct, numbers.reshape(-1)
     num_cells = math.isqrt(size)
-    sample = _take_evenly(distinct, SAMPLE_SIZE)
-    cell, _ = vq(distinct, _run_kmeans(sample, _take_evenly(sample, num_cells)))
+    _, cell = _run_kmeans(distinct, num_cells)
     labels, palettes, start = np.empty(len(distinct), np.int64), [], 0
-    for inside in (np.flatnonzero(cell == number) for number in np.unique(cell)):
+    for inside in (np.flatnonzero(cell == number) for number in range(num_cells)):
         share = 1 + (size - num_cells) * len(inside) // len(distinct)
-        palette = _run_kmeans(distinct[inside], _take_evenly(distinct[inside], share))
-        labels[inside] = start + vq(distinct[inside], palette)[0]
+        palette, nearest = _run_kmeans(distinct[inside], share)
+        labels[inside] = start + nearest
         palettes.append(palette)
         start += len(palette)
     return np.concatenate(palettes), labels[numbers.reshape(-1)]
 
 
-def _take_evenly(rows: Float[ndarray, "n *k"], count: int) -> Float[ndarray, "m *k"]:
-    """Take `count` rows at even distances, with the first and the last; of fewer, some twice."""
-    return rows[np.linspace(0, len(rows) - 1, count).astype(np.int64)]
+def _find_nearest(
+    book: Float[ndarray, "m"], values: Float[ndarray, "*n"]
+) -> Integer[ndarray, "*n"]:
+    """Find the entry of an ascending codebook that is nearest to each value."""
+    return np.searchsorted((book[1:] + book[:-1]) / 2, values)
 
 
-def _run_kmeans(rows: Float[ndarray, "n k"], guess: Float[ndarray, "m k"]) -> Float[ndarray, "m k"]:
-    """Run k-means from a guess; a centre that no row is nearest to stays in its place."""
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore", UserWarning)
-        return kmeans2(rows, guess, ITERATIONS, minit="matrix")[0]
+def _run_kmeans(
+    rows: Float[ndarray, "n k"], count: int
+) -> tuple[Float[ndarray, "m k"], Integer[ndarray, "n"]]:
+    """Find centres by k-means, always the same, and the nearest one to each row."""
+    cv2.setRNGSeed(0)
+    stop = (cv2.TERM_CRITERIA_MAX_ITER, ITERATIONS, 0.0)
+    _, nearest, centres = cv2.kmeans(rows, count, None, stop, 1, cv2.KMEANS_PP_CENTERS)
+    return centres, nearest.ravel()
