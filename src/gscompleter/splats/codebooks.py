@@ -69,6 +69,6 @@ def _run_kmeans(
 ) -> tuple[Float[ndarray, "m k"], Integer[ndarray, "n"]]:
     """Find centres by k-means, always the same, and the nearest one to each row."""
     cv2.setRNGSeed(0)
-    stop = (cv2.TERM_CRITERIA_MAX_ITER, ITERATIONS, 0.0)
-    _, nearest, centres = cv2.kmeans(rows, count, None, stop, 1, cv2.KMEANS_PP_CENTERS)
-    return centres, nearest.ravel()
+    stop, nearest = (cv2.TERM_CRITERIA_MAX_ITER, ITERATIONS, 0.0), np.zeros(len(rows), np.int32)
+    _, _, centres = cv2.kmeans(rows, count, nearest, stop, 1, cv2.KMEANS_PP_CENTERS)
+    return np.asarray(centres), nearest
