@@ -11,15 +11,20 @@ from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
+import torch
 import zstandard
 from PIL import Image
 
-from gscompleter import save_splat
+from gscompleter import Render, load_renderer, save_splat
 from gscompleter.splats.transform import HALF_TURN_Z, rotate_half_turn
 from gscompleter.types import SH_C0, Gaussians
-from scenes import random_gaussians
+from scenes import camera_at, random_gaussians
 
-WRITTEN = ("scene.ply", "scene.compressed.ply", "scene.spz", "scene.splat")
+CPU = load_renderer("cpu")
+WRITTEN = (
+    *("scene.ply", "scene.compressed.ply", "scene.spz", "scene.splat"),
+    *("written.sog", "written.glb"),
+)
 FORMATS_BUT_PLY = (
     "scene.compressed.ply",
     "scene.spz",
@@ -28,6 +33,8 @@ FORMATS_BUT_PLY = (
     "scene.ksplat",
     "scene.sog",
     "scene.glb",
+    "written.sog",
+    "written.glb",
 )
 SH_NAME = "KHR_gaussian_splatting:SH_DEGREE_{}_COEF_{}"
 
@@ -285,3 +292,31 @@ def made(folder: Path, name: str, gaussians: Gaussians) -> Path:
     else:
         write_sog(path, sog_files(gaussians))
     return path
+
+
+def psnr(a: Gaussians, b: Gaussians) -> float:
+    """Compute the PSNR between two scenes in dB, the worst of three cameras."""
+    cameras = [
+        camera_at(size=64),
+        camera_at(0.5, -0.3, yaw=20, size=64),
+        camera_at(yaw=-30, size=64),
+    ]
+
+    def error(camera) -> float:
+        drawn: list[Render] = [CPU.render(scene, camera) for scene in (a, b)]
+        return (drawn[0].image - drawn[1].image).square().mean().item()
+
+    return -10 * torch.tensor(max(error(camera) for camera in cameras) + 1e-12).log10().item()
+
+
+def covariances(gaussians: Gaussians) -> torch.Tensor:
+    """Compute [n, 3, 3], which unlike quaternions is independent of axis order and sign."""
+    w, x, y, z = torch.nn.functional.normalize(gaussians.quats.double(), dim=1).unbind(1)
+    rows = [
+        [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)],
+        [2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)],
+        [2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)],
+    ]
+    rotation = torch.stack([torch.stack(row, dim=1) for row in rows], dim=1)
+    axes = rotation * gaussians.scales.double()[:, None]
+    return axes @ axes.transpose(1, 2)

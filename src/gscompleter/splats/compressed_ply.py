@@ -18,6 +18,7 @@ from numpy import ndarray
 
 from gscompleter.io.files import replace_file
 from gscompleter.splats.packing import (
+    MAX_LOG_SCALE,
     assemble_sh,
     build_gaussians,
     drop_largest,
@@ -38,8 +39,6 @@ CHUNK_PROPERTIES = (
 PACKED_PROPERTIES = ("packed_position", "packed_rotation", "packed_scale", "packed_color")
 VECTOR_BITS, QUAT_BITS, COLOR_BITS = (11, 10, 11), (10, 10, 10), (8, 8, 8, 8)
 """Bits of positions and log-scales, of three components of a rotation, of colour and opacity."""
-MAX_LOG_SCALE = 20.0
-"""Largest absolute log-scale that is written, as in other writers."""
 
 
 def read_compressed_ply(path: Path) -> Gaussians:

@@ -26,13 +26,15 @@ from gscompleter.errors import InputError, quote_value, refuse_pointer
 from gscompleter.io.files import replace_file
 from gscompleter.io.reading import open_file, read_json
 from gscompleter.splats.compressed_ply import read_compressed_ply, write_compressed_ply
-from gscompleter.splats.glb import read_glb
+from gscompleter.splats.glb import read_glb, write_glb
 from gscompleter.splats.ksplat import read_ksplat
 from gscompleter.splats.morton import sort_along_morton
+from gscompleter.splats.packing import ZIP_MAGIC
 from gscompleter.splats.ply import load_ply, require_finite, save_ply
-from gscompleter.splats.sog import META, ZIP_MAGIC, read_sog
+from gscompleter.splats.sog import META, read_sog, write_sog
 from gscompleter.splats.splat import read_splat, write_splat
 from gscompleter.splats.spz import read_spz, write_spz
+from gscompleter.splats.usd import refuse_usd, write_usd
 from gscompleter.types import Gaussians
 
 OPACITY_TOLERANCE = 1e-3
@@ -49,8 +51,6 @@ MAX_DEFECT = 120
 """Most characters of the description of a defect."""
 HEAD_BYTES = 8192
 """Bytes read to detect a format; the header of a compressed .ply fits."""
-COMPRESSED_PROPERTY = b"packed_position"
-"""Text in the header of a compressed .ply only."""
 
 
 @dataclass(frozen=True)
@@ -62,20 +62,33 @@ class Format:
     """First bytes of a file, white space aside; none if only the extension tells the format."""
     read: Callable[[Path], Gaussians]
     write: Callable[[Path, Gaussians], None] | None = None
+    contains: bytes = b""
+    """Text near the start of a file that tells it from others with the same first bytes."""
 
 
 FORMATS = {
     "compressed-ply": Format(
-        (".compressed.ply",), (b"ply",), read_compressed_ply, write_compressed_ply
+        (".compressed.ply",),
+        (b"ply",),
+        read_compressed_ply,
+        write_compressed_ply,
+        contains=b"packed_position",
     ),
     "ply": Format((".ply",), (b"ply",), load_ply, save_ply),
     "spz": Format((".spz",), (b"NGSP", b"\x1f\x8b"), read_spz, write_spz),
-    "sog": Format((".sog", META), (ZIP_MAGIC, b"{"), read_sog),
-    "glb": Format((".glb",), (b"glTF",), read_glb),
+    "usdz": Format((".usdz",), (ZIP_MAGIC,), refuse_usd, write_usd, contains=b".usd"),
+    "usd": Format((".usdc", ".usda", ".usd"), (b"PXR-USDC", b"#usda"), refuse_usd, write_usd),
+    "sog": Format((".sog",), (ZIP_MAGIC,), read_sog, write_sog),
+    "sog-folder": Format((META,), (b"{",), read_sog),
+    "glb": Format((".glb",), (b"glTF",), read_glb, write_glb),
     "splat": Format((".splat",), (), read_splat, write_splat),
     "ksplat": Format((".ksplat",), (), read_ksplat),
 }
-"""Formats by name; a compressed .ply says so in its header."""
+"""Formats by name; the first that fits the start of a file is taken."""
+SORTED = (write_compressed_ply, write_sog)
+"""Writers of formats whose Gaussians lie along a Morton curve."""
+UNMARKED = (write_splat, write_glb, write_usd)
+"""Writers of formats that cannot mark Gaussians as antialiased."""
 
 
 def load_splat(path: Path | str, drop_nonfinite: bool = False) -> Gaussians:
@@ -89,7 +102,7 @@ def load_splat(path: Path | str, drop_nonfinite: bool = False) -> Gaussians:
     name = detect_splat_format(path)
     if name == "ply":
         return load_ply(path, drop_nonfinite)
-    errors = (*DECODING_ERRORS, *(JSON_ERRORS if name in ("sog", "glb") else ()))
+    errors = (*DECODING_ERRORS, *(JSON_ERRORS if name in ("sog", "sog-folder", "glb") else ()))
     try:
         with np.errstate(over="ignore", invalid="ignore"):  # infinite values are refused below
             gaussians = FORMATS[name].read(path)
@@ -131,7 +144,7 @@ def save_splat(path: Path | str, gaussians: Gaussians) -> None:
         save_ply(path, gaussians)
         return
     gaussians = require_finite(gaussians.to("cpu"), path, drop_nonfinite=False)
-    if write is write_compressed_ply:
+    if write in SORTED:
         gaussians = sort_along_morton(gaussians)
     write(path, gaussians)
     save_labels(path, gaussians.generated)
@@ -139,11 +152,11 @@ def save_splat(path: Path | str, gaussians: Gaussians) -> None:
 
 def describe_mode_loss(path: Path, gaussians: Gaussians) -> str | None:
     """Describe that the format of `path` cannot mark antialiased Gaussians, or return None."""
-    if get_writer(path) is not write_splat or not gaussians.is_antialiased:
+    if get_writer(path) not in UNMARKED or not gaussians.is_antialiased:
         return None
     return (
-        "A .splat file cannot mark Gaussians as antialiased: viewers will render them as classic "
-        "ones, which makes small ones too opaque."
+        f"A {path.suffix} file cannot mark Gaussians as antialiased: viewers will render them as "
+        "classic ones, which makes small ones too opaque."
     )
 
 
@@ -151,7 +164,7 @@ def detect_splat_format(path: Path) -> str:
     """Detect the format of a file or folder, by name."""
     if path.is_dir():
         if (path / META).is_file():
-            return "sog"
+            return "sog-folder"
         raise InputError(f"{quote_value(path)} is a folder without {META}; name a file.")
     with open_file(path) as file:
         head = file.read(HEAD_BYTES)
@@ -159,8 +172,7 @@ def detect_splat_format(path: Path) -> str:
     if not head:
         raise InputError(f"{quote_value(path)} is empty; a file of Gaussians is needed.")
     for name, format_ in FORMATS.items():
-        is_other_ply = name == "compressed-ply" and COMPRESSED_PROPERTY not in head
-        if head.lstrip().startswith(format_.starts) and not is_other_ply:
+        if head.lstrip().startswith(format_.starts) and format_.contains in head:
             return name
     named = _match_extension(path)
     if named is None or FORMATS[named].starts:

@@ -1,8 +1,9 @@
-"""Gaussians in binary glTF (.glb) with the extension KHR_gaussian_splatting, read only.
+"""Gaussians in binary glTF (.glb) with the extension KHR_gaussian_splatting.
 
 A primitive of points has one attribute per property: linear scales, opacities in [0, 1], xyzw
 rotations, and a `SH_DEGREE_d_COEF_i` of three channels for each SH coefficient. Nodes give its
-transform to the scene. Axes are x left, y up, z forward.
+transform to the scene. Axes are x left, y up, z forward. All numbers are written as float32, with
+linear colours for viewers that show points only.
 """
 
 from __future__ import annotations
@@ -19,21 +20,28 @@ from jaxtyping import Float
 from numpy import ndarray
 from torch import Tensor
 
-from gscompleter.errors import quote_value
+from gscompleter.errors import InputError, quote_value
 from gscompleter.geometry import quats_to_rotations
+from gscompleter.io.files import replace_file
 from gscompleter.io.reading import read_bytes
 from gscompleter.splats.packing import build_gaussians
 from gscompleter.splats.transform import HALF_TURN_Z, rotate_half_turn, transform_gaussians
-from gscompleter.types import Gaussians, merge
+from gscompleter.types import SH_C0, Gaussians, merge
 
+FILE_HEADER = struct.Struct("<4sII")
 CHUNK_HEADER = struct.Struct("<II")
 JSON, BINARY = 0x4E4F534A, 0x004E4942
 EXTENSION = "KHR_gaussian_splatting"
+SH_NAMES = [f"{EXTENSION}:SH_DEGREE_{d}_COEF_{i}" for d in range(4) for i in range(2 * d + 1)]
 COLOR_SPACE = "srgb_rec709_display"
 """The colour space in which all splat trainers work."""
 COMPONENT_TYPES = {5120: "<i1", 5121: "<u1", 5122: "<i2", 5123: "<u2", 5126: "<f4"}
 """numpy names of the component types."""
+FLOAT, POINTS = 5126, 0
+"""Component type and primitive mode that are written."""
 NUM_COMPONENTS = {"SCALAR": 1, "VEC3": 3, "VEC4": 4}
+MAX_FILE_BYTES = 2**32 - 1
+"""Largest size that the header of a .glb can state."""
 MIN_GAUSSIAN_BYTES = 8
 """Lower bound on the bytes of a Gaussian; with fewer, the file repeats its data."""
 
@@ -130,8 +138,7 @@ def _decode_primitive(document: GlbDocument, primitive: dict[str, Any]) -> Gauss
             raise ValueError(f"its attribute {name} is no {kind}")
         return _read_accessor(document, accessor)
 
-    sh_names = [f"{EXTENSION}:SH_DEGREE_{d}_COEF_{i}" for d in range(4) for i in range(2 * d + 1)]
-    sh = [read_attribute(name) for name in sh_names if name in primitive["attributes"]]
+    sh = [read_attribute(name) for name in SH_NAMES if name in primitive["attributes"]]
     return build_gaussians(
         read_attribute("POSITION"),
         np.roll(read_attribute(f"{EXTENSION}:ROTATION", "VEC4"), 1, axis=1),
@@ -159,3 +166,66 @@ def _read_accessor(document: GlbDocument, accessor: dict[str, Any]) -> Float[nda
         raise ValueError("its rotations or opacities are no fractions")
     largest = np.iinfo(kind).max if accessor.get("normalized") else 1
     return np.maximum(values.astype(np.float32) / largest, -1 if largest > 1 else -np.inf)
+
+
+def write_glb(path: Path, gaussians: Gaussians) -> None:
+    """Write a .glb whose scene is one primitive of Gaussians, with all SH."""
+    columns = _make_columns(rotate_half_turn(gaussians, HALF_TURN_Z))
+    text = json.dumps(_describe_scene(columns)).encode()
+    text += b" " * (-len(text) % 4)
+    size = sum(column.nbytes for column in columns.values())
+    total = FILE_HEADER.size + 2 * CHUNK_HEADER.size + len(text) + size
+    if total > MAX_FILE_BYTES:
+        raise InputError(f"{quote_value(path)} would exceed the 4 GiB of a .glb; write a .ply.")
+    with replace_file(path) as file:
+        file.write(FILE_HEADER.pack(b"glTF", 2, total))
+        file.write(CHUNK_HEADER.pack(len(text), JSON) + text + CHUNK_HEADER.pack(size, BINARY))
+        for column in columns.values():
+            file.write(column.data)
+
+
+def _make_columns(gaussians: Gaussians) -> dict[str, Float[ndarray, "n k"]]:
+    """Make the attributes of the primitive by name, from Gaussians in the axes of glTF."""
+    opacities, quats = gaussians.opacities[:, None], gaussians.quats
+    rgb = (0.5 + SH_C0 * gaussians.sh[:, 0]).clamp(0, 1)
+    linear = torch.where(rgb <= 0.04045, rgb / 12.92, ((rgb + 0.055) / 1.055) ** 2.4)
+    columns = {
+        "POSITION": gaussians.means,
+        "COLOR_0": torch.cat([linear, opacities], dim=1),
+        f"{EXTENSION}:ROTATION": torch.nn.functional.normalize(quats, dim=1).roll(-1, dims=1),
+        f"{EXTENSION}:SCALE": gaussians.scales,
+        f"{EXTENSION}:OPACITY": opacities,
+        **dict(zip(SH_NAMES, gaussians.sh.unbind(1), strict=False)),
+    }
+    return {name: np.require(it.numpy(), "<f4", ["C"]) for name, it in columns.items()}
+
+
+def _describe_scene(columns: dict[str, Float[ndarray, "n k"]]) -> dict[str, Any]:
+    """Describe a scene of one primitive whose attributes follow each other in the binary part."""
+    kinds = {count: kind for kind, count in NUM_COMPONENTS.items()}
+    views: list[dict[str, Any]] = []
+    accessors: list[dict[str, Any]] = []
+    size = 0
+    for view, values in enumerate(columns.values()):
+        views.append({"buffer": 0, "byteOffset": size, "byteLength": values.nbytes})
+        form = {"componentType": FLOAT, "count": len(values), "type": kinds[values.shape[1]]}
+        accessors.append({"bufferView": view, **form})
+        size += values.nbytes
+    means = columns["POSITION"]
+    accessors[0] |= {"min": means.min(0).tolist(), "max": means.max(0).tolist()}
+    primitive = {
+        "attributes": {name: index for index, name in enumerate(columns)},
+        "mode": POINTS,
+        "extensions": {EXTENSION: {"kernel": "ellipse", "colorSpace": COLOR_SPACE}},
+    }
+    return {
+        "asset": {"version": "2.0", "generator": "gscompleter"},
+        "extensionsUsed": [EXTENSION],
+        "scene": 0,
+        "scenes": [{"nodes": [0]}],
+        "nodes": [{"mesh": 0}],
+        "meshes": [{"primitives": [primitive]}],
+        "buffers": [{"byteLength": size}],
+        "bufferViews": views,
+        "accessors": accessors,
+    }

@@ -14,6 +14,9 @@ from gscompleter.types import SH_C0, Gaussians, make_observed
 
 NUM_SH_REST = (0, 3, 8, 15)
 """SH coefficients per channel above degree 0, by degree."""
+MAX_LOG_SCALE = 20.0
+"""Largest absolute log-scale that packed formats write, as in other writers."""
+ZIP_MAGIC = b"PK\x03\x04"
 MIN_ALLOWED_BYTES = 1 << 20
 """Unpacked size in bytes that is allowed for any file, however small."""
 MAX_GROWTH = 256

@@ -1,16 +1,18 @@
-"""The .sog format of PlayCanvas, a folder or a bundle (a zip of the same files), read only.
+"""The .sog format of PlayCanvas, a folder or a bundle (a zip of the same files).
 
 `meta.json` names lossless WebP images with one Gaussian per pixel: two images for 16 bits of
 position on a logarithmic scale, one for the rotation (2 + 3 x 8 bits), one for scales, one for
 colour and opacity. SH of degree 1 and above are rows of a palette. Bytes are entries of a
 codebook (version 2) or steps between a minimum and a maximum (version 1). Antialiased Gaussians
-are marked by `"model": "antialiased"`, in early files of version 2 by `"antialias": true`.
+are marked by `"model": "antialiased"`, in early files of version 2 by `"antialias": true`. Bundles
+of version 2 are written.
 """
 
 from __future__ import annotations
 
 import io
 import json
+import math
 import zipfile
 from collections.abc import Callable
 from dataclasses import replace
@@ -18,30 +20,42 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from jaxtyping import Float, UInt8
+from jaxtyping import Float, Shaped, UInt8
 from numpy import ndarray
 from PIL import Image
 
 from gscompleter.errors import quote_value
+from gscompleter.io.files import replace_file
 from gscompleter.io.reading import read_bytes
+from gscompleter.splats.codebooks import fit_codebook, fit_palette
 from gscompleter.splats.packing import (
+    MAX_LOG_SCALE,
     NUM_SH_REST,
+    ZIP_MAGIC,
     assemble_sh,
     build_gaussians,
     check_growth,
+    drop_largest,
     restore_largest,
 )
+from gscompleter.splats.ply import encode
 from gscompleter.types import SH_C0, Gaussians
 
 META = "meta.json"
-ZIP_MAGIC = b"PK\x03\x04"
 PALETTE_WIDTH = 64
 """Entries of the SH palette in each row of its image."""
 MAX_ENTRY_GROWTH = 8
 """Largest ratio of unpacked to packed size of a zip entry; images do not shrink."""
 
+ROTATION_MARK = 252
+"""Fourth byte of a rotation, plus the number of the dropped component."""
+BLOCK = 4
+"""Number of pixels of which the width of images is a multiple, as in other writers."""
+
 FileReader = Callable[[str], bytes]
 """Function that reads a file of the scene by name, from a folder or a bundle."""
+Coded = tuple[dict[str, Any], dict[str, bytes]]
+"""A property as numbers for `meta.json`, and images by file name."""
 
 
 def read_sog(path: Path) -> Gaussians:
@@ -125,7 +139,7 @@ def _interpolate(
 def _decode_quats(packed: UInt8[ndarray, "n 4"]) -> Float[ndarray, "n 4"]:
     smaller = (packed[:, :3].astype(np.float32) / 255 - 0.5) * np.float32(np.sqrt(2))
     quats = restore_largest(packed[:, 3] & 3, smaller)
-    quats[packed[:, 3] < 252] = (1, 0, 0, 0)  # the identity, as in other readers
+    quats[packed[:, 3] < ROTATION_MARK] = (1, 0, 0, 0)  # the identity, as in other readers
     return quats
 
 
@@ -159,3 +173,68 @@ def _decode_sh_rest(read: FileReader, table: dict[str, Any], count: int) -> Floa
         return _get_codebook(table)[rows[number]]
     low, high = float(table["mins"]), float(table["maxs"])
     return low + (high - low) * rows[number].astype(np.float32) / 255
+
+
+def write_sog(path: Path, gaussians: Gaussians) -> None:
+    """Write a bundle of version 2; the Gaussians should be sorted with `sort_along_morton`."""
+    coded = _encode_scene(gaussians)
+    model = "antialiased" if gaussians.is_antialiased else "default"
+    table = {"version": 2, "count": len(gaussians), "model": model}
+    table |= {name: {**values, "files": list(images)} for name, (values, images) in coded.items()}
+    files = {META: json.dumps(table).encode()}
+    for _, images in coded.values():
+        files |= images
+    with replace_file(path) as file, zipfile.ZipFile(file, "w") as bundle:
+        for name, data in files.items():
+            bundle.writestr(zipfile.ZipInfo(name), data)  # without the time of writing
+
+
+def _encode_scene(gaussians: Gaussians) -> dict[str, Coded]:
+    """Encode the properties of Gaussians by their names in `meta.json`."""
+    log_scales = encode(gaussians)[:, :3].numpy().clip(-MAX_LOG_SCALE, MAX_LOG_SCALE)
+    scale_book, scales = fit_codebook(log_scales)
+    color_book, colors = fit_codebook(gaussians.sh[:, 0].numpy())
+    rgba = np.column_stack([colors, np.rint(gaussians.opacities.numpy() * 255)])
+    largest, smaller = drop_largest(gaussians.quats.numpy())
+    quats = np.column_stack([np.rint((smaller / np.sqrt(2) + 0.5) * 255), ROTATION_MARK + largest])
+    coded: dict[str, Coded] = {
+        "means": _encode_means(gaussians.means.double().numpy()),
+        "scales": ({"codebook": scale_book.tolist()}, {"scales.webp": _encode_image(scales)}),
+        "quats": ({}, {"quats.webp": _encode_image(quats)}),
+        "sh0": ({"codebook": color_book.tolist()}, {"sh0.webp": _encode_image(rgba)}),
+    }
+    return coded | ({"shN": _encode_sh_rest(gaussians)} if gaussians.sh_degree else {})
+
+
+def _encode_means(means: Float[ndarray, "n 3"]) -> Coded:
+    """Encode positions as 16 bits between bounds on the logarithmic scale."""
+    logs = np.sign(means) * np.log1p(np.abs(means))
+    low, high = logs.min(0), logs.max(0)
+    steps = np.rint((logs - low) / np.where(high > low, high - low, 1) * 65535).astype(np.int64)
+    images = {"means_l.webp": _encode_image(steps & 255), "means_u.webp": _encode_image(steps >> 8)}
+    return {"mins": low.tolist(), "maxs": high.tolist()}, images
+
+
+def _encode_sh_rest(gaussians: Gaussians) -> Coded:
+    """Encode SH of degree 1 and above as numbers of rows of a palette."""
+    rest = gaussians.sh[:, 1:].flatten(1).numpy()
+    palette, labels = fit_palette(rest)
+    book, codes = fit_codebook(palette)
+    width = PALETTE_WIDTH * rest.shape[1] // 3
+    images = {
+        "shN_centroids.webp": _encode_image(codes.reshape(-1, 3), width),
+        "shN_labels.webp": _encode_image(np.stack([labels & 255, labels >> 8, 0 * labels], axis=1)),
+    }
+    sizes = {"count": len(palette), "bands": gaussians.sh_degree}
+    return {**sizes, "codebook": book.tolist()}, images
+
+
+def _encode_image(values: Shaped[ndarray, "n k"], width: int = 0) -> bytes:
+    """Encode rows of 3 or 4 bytes as a lossless image, by default about square."""
+    n, k = values.shape
+    width = width or BLOCK * math.ceil(math.sqrt(n) / BLOCK)
+    pixels = np.full((math.ceil(n / width), width, 4), 255, np.uint8)
+    pixels.reshape(-1, 4)[:n, :k] = values
+    file = io.BytesIO()
+    Image.fromarray(pixels).save(file, "WEBP", lossless=True, exact=True)
+    return file.getvalue()

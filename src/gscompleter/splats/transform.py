@@ -1,7 +1,7 @@
 """Gaussians transformed to another frame, including view-dependent colour.
 
-The axes of a .ply and of most formats are x right, y down, z forward. SPZ has x right, y up,
-z back, which is half a turn about x; glTF has x left, y up, z forward, half a turn about z.
+The axes of a .ply and of most formats are x right, y down, z forward. SPZ and USD have x right,
+y up, z back, which is half a turn about x; glTF has x left, y up, z forward, half a turn about z.
 """
 
 from __future__ import annotations

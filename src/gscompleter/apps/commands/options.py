@@ -373,9 +373,10 @@ class PosesOptions(ComputeOptions, WritingOptions):
 
 @dataclass(frozen=True, kw_only=True)
 class ConvertOptions(WritingOptions):
-    """Convert a file of Gaussians to .ply, .compressed.ply, .spz or .splat, by the name of B.
+    """Convert a file of Gaussians to another format, by the name of B.
 
-    It also reads .ksplat, .sog (a bundle or its folder) and .glb.
+    Formats are .ply, .compressed.ply, .spz, .splat, .sog, .glb (KHR_gaussian_splatting), and
+    .usda, .usdc and .usdz (OpenUSD, with usd-core). It also reads .ksplat and the folder of a .sog.
     """
 
     source: Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="A")]

@@ -1,0 +1,74 @@
+"""Few values that stand for many: codebooks of numbers and palettes of rows, by k-means."""
+
+from __future__ import annotations
+
+import math
+
+import cv2
+import numpy as np
+from jaxtyping import Float, Int64, Integer, UInt8
+from numpy import ndarray
+
+CODEBOOK_SIZE = 256
+MIN_PALETTE_SIZE, MAX_PALETTE_SIZE = 1 << 12, 1 << 16
+ROWS_PER_ENTRY = 4
+"""Rows that share an entry of a palette between these sizes."""
+ITERATIONS = 5
+
+
+def fit_codebook(
+    values: Float[ndarray, "n k"],
+) -> tuple[Float[ndarray, "256"], UInt8[ndarray, "n k"]]:
+    """Fit 256 numbers to all values; return them in ascending order, and the nearest by number.
+
+    Half of the first guess are quantiles, half cover the range, so that rare values stay close.
+    """
+    half = CODEBOOK_SIZE // 2
+    covering = np.linspace(values.min(), values.max(), half)
+    book = np.sort([*np.quantile(values, np.linspace(0, 1, half)), *covering])
+    for _ in range(ITERATIONS):
+        nearest = _find_nearest(book, values).ravel()
+        counts = np.bincount(nearest, minlength=CODEBOOK_SIZE)
+        sums = np.bincount(nearest, values.ravel(), CODEBOOK_SIZE)
+        book = np.where(counts > 0, sums / np.maximum(counts, 1), book)
+    return book.astype(np.float32), _find_nearest(book, values).astype(np.uint8)
+
+
+def fit_palette(
+    rows: Float[ndarray, "n k"],
+) -> tuple[Float[ndarray, "p k"], Int64[ndarray, "n"]]:
+    """Fit up to 65,536 rows to rows, of which few are kept as they are; number the nearest.
+
+    The space of rows is divided into as many cells as each has entries, which bounds the time.
+    """
+    distinct, numbers = np.unique(rows, axis=0, return_inverse=True)
+    size = min(max(MIN_PALETTE_SIZE, len(rows) // ROWS_PER_ENTRY), MAX_PALETTE_SIZE)
+    if len(distinct) <= size:
+        return distinct, numbers.reshape(-1)
+    num_cells = math.isqrt(size)
+    _, cell = _run_kmeans(distinct, num_cells)
+    labels, palettes, start = np.empty(len(distinct), np.int64), [], 0
+    for inside in (np.flatnonzero(cell == number) for number in range(num_cells)):
+        share = 1 + (size - num_cells) * len(inside) // len(distinct)
+        palette, nearest = _run_kmeans(distinct[inside], share)
+        labels[inside] = start + nearest
+        palettes.append(palette)
+        start += len(palette)
+    return np.concatenate(palettes), labels[numbers.reshape(-1)]
+
+
+def _find_nearest(
+    book: Float[ndarray, "m"], values: Float[ndarray, "*n"]
+) -> Integer[ndarray, "*n"]:
+    """Find the entry of an ascending codebook that is nearest to each value."""
+    return np.searchsorted((book[1:] + book[:-1]) / 2, values)
+
+
+def _run_kmeans(
+    rows: Float[ndarray, "n k"], count: int
+) -> tuple[Float[ndarray, "m k"], Integer[ndarray, "n"]]:
+    """Find centres by k-means, always the same, and the nearest one to each row."""
+    cv2.setRNGSeed(0)
+    stop, nearest = (cv2.TERM_CRITERIA_MAX_ITER, ITERATIONS, 0.0), np.zeros(len(rows), np.int32)
+    _, _, centres = cv2.kmeans(rows, count, nearest, stop, 1, cv2.KMEANS_PP_CENTERS)
+    return np.asarray(centres), nearest

@@ -1,0 +1,123 @@
+"""OpenUSD: what is written is read back by usd-core itself, by its schema."""
+
+import os
+import sys
+import zipfile
+
+import numpy as np
+import pytest
+import torch
+
+from command import run
+from gscompleter import Gaussians, InputError, load_splat, save_splat
+from gscompleter.splats.formats import get_labels_path
+from gscompleter.splats.transform import HALF_TURN_X, rotate_half_turn
+from gscompleter.types import make_observed
+from splat_files import covariances, plausible
+
+NAMES = ["scene.usda", "scene.usdc", "scene.usd", "scene.usdz"]
+
+
+@pytest.fixture
+def pxr():
+    return pytest.importorskip("pxr", reason="needs usd-core (the extra usd)")
+
+
+def read_stage(path) -> tuple:
+    """Read the stage and its one prim of Gaussians with usd-core."""
+    from pxr import Usd, UsdVol
+
+    stage = Usd.Stage.Open(str(path))
+    splat = UsdVol.ParticleField3DGaussianSplat(stage.GetDefaultPrim())
+    assert splat
+    return stage, splat
+
+
+def read_gaussians(path) -> Gaussians:
+    """Read the Gaussians through the getters of the schema, in the axes of a .ply."""
+    _, splat = read_stage(path)
+    quats = splat.GetOrientationsAttr().Get()
+    sh = np.array(splat.GetRadianceSphericalHarmonicsCoefficientsAttr().Get())
+    count = (splat.GetRadianceSphericalHarmonicsDegreeAttr().Get() + 1) ** 2
+    arrays = [
+        np.array(splat.GetPositionsAttr().Get()),
+        np.array([[q.GetReal(), *q.GetImaginary()] for q in quats], np.float32),
+        np.array(splat.GetScalesAttr().Get()),
+        np.array(splat.GetOpacitiesAttr().Get()),
+        sh.reshape(-1, count, 3),
+    ]
+    return rotate_half_turn(make_observed(*map(torch.from_numpy, arrays)), HALF_TURN_X)
+
+
+@pytest.mark.parametrize("degree", [0, 1, 2, 3])
+@pytest.mark.parametrize("name", NAMES)
+def test_usd_keeps_every_number(pxr, tmp_path, name, degree):
+    gaussians = plausible(40, degree)
+    save_splat(tmp_path / name, gaussians)
+    read = read_gaussians(tmp_path / name)
+    for field in ("means", "scales", "opacities", "sh"):
+        assert torch.equal(getattr(read, field), getattr(gaussians, field))
+    assert torch.allclose(covariances(read), covariances(gaussians), atol=1e-6)
+
+
+def test_a_stage_has_its_axes_units_bounds_and_colour_space(pxr, tmp_path):
+    from pxr import Usd, UsdGeom
+
+    gaussians = plausible(40, 1)
+    gaussians.means[0] = torch.tensor([1.0, 2.0, 30.0])  # right, down, forward
+    save_splat(tmp_path / "scene.usda", gaussians)
+    stage, splat = read_stage(tmp_path / "scene.usda")
+    assert UsdGeom.GetStageUpAxis(stage) == "Y"
+    assert UsdGeom.GetStageMetersPerUnit(stage) == 1
+    positions = np.array(splat.GetPositionsAttr().Get())
+    assert positions[0].tolist() == [1, -2, -30]
+    low, high = np.array(splat.GetExtentAttr().Get())
+    reach = 3 * np.array(splat.GetScalesAttr().Get()).max(1, keepdims=True)
+    assert np.allclose(low, (positions - reach).min(0))
+    assert np.allclose(high, (positions + reach).max(0))
+    space = Usd.ColorSpaceAPI(splat.GetPrim()).GetColorSpaceNameAttr().Get()
+    assert space == "srgb_rec709_display"
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_the_validators_of_openusd_find_nothing(pxr, tmp_path, name):
+    validation = pytest.importorskip("pxr.UsdValidation")
+    save_splat(tmp_path / name, plausible(10, 1))
+    validators = validation.ValidationRegistry().GetOrLoadAllValidators()
+    errors = validation.ValidationContext(validators).Validate(read_stage(tmp_path / name)[0])
+    assert [error.GetMessage() for error in errors] == []
+
+
+def test_a_package_is_aligned_uncompressed_and_the_same_every_time(pxr, tmp_path):
+    for name in ("a.usdz", "b.usdz"):
+        save_splat(tmp_path / name, plausible(50, 2))
+    data = (tmp_path / "a.usdz").read_bytes()
+    assert data == (tmp_path / "b.usdz").read_bytes()
+    with zipfile.ZipFile(tmp_path / "a.usdz") as package:
+        (entry,) = package.infolist()
+    assert entry.compress_type == zipfile.ZIP_STORED
+    assert data.index(b"PXR-USDC") % 64 == 0
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_usd_is_recognised_and_not_read(pxr, tmp_path, name):
+    save_splat(tmp_path / name, plausible(5, 0))
+    os.rename(tmp_path / name, tmp_path / "unnamed")
+    with pytest.raises(InputError, match="is OpenUSD, which is not read"):
+        load_splat(tmp_path / "unnamed")
+
+
+def test_labels_lie_beside_a_file_of_usd(pxr, tmp_path, monkeypatch, capsys):
+    gaussians = plausible(9, 0)
+    gaussians.generated[4] = 1
+    save_splat(tmp_path / "a.ply", gaussians)
+    assert run(monkeypatch, "convert", tmp_path / "a.ply", tmp_path / "B.USDZ") == 0
+    assert "9 Gaussians, 1 of them generated" in capsys.readouterr().out.replace("\n", " ")
+    assert get_labels_path(tmp_path / "B.USDZ").exists()
+
+
+def test_without_usd_core_nothing_is_written(tmp_path, monkeypatch):
+    monkeypatch.setitem(sys.modules, "pxr", None)
+    with pytest.raises(InputError, match=r"pip install 'gscompleter\[usd\]'"):
+        save_splat(tmp_path / "scene.usdz", plausible(5, 0))
+    assert os.listdir(tmp_path) == []
