@@ -16,6 +16,9 @@ from gscompleter.config import FloaterConfig
 from gscompleter.errors import InputError
 from gscompleter.types import Gaussians
 
+MAX_BREADTH = 10.0
+"""Largest factor by which the limit of opacity rises with the size of a Gaussian."""
+
 
 @dataclass(frozen=True)
 class Surroundings:
@@ -48,7 +51,7 @@ def find_floaters(
         "needles": (longest > config.max_elongation * middle)
         & (size > config.needle_size)
         & is_detached,
-        "transparent": scene.opacities < config.min_opacity * (size / 2).clamp_min(1),
+        "transparent": scene.opacities < config.min_opacity * (size / 2).clamp(1, MAX_BREADTH),
     }
     return {reason: mask & (scene.generated == 0) for reason, mask in reasons.items()}
 

@@ -263,8 +263,8 @@ class FloaterConfig(Settings):
     needle_distance: Weight = 5.0
     """... and it is farther from them than this many times their size."""
     min_opacity: Share = 0.01
-    """Transparent: its opacity is below this one, times half its size relative to its neighbours'
-    if it is more than twice as large."""
+    """Transparent: its opacity is below this one, or up to ten times this one if it is larger than
+    its neighbours: the limit is multiplied by half the ratio of the sizes."""
 
 
 GUARDS = {
