@@ -173,7 +173,8 @@ class RegisterPainting:
             completion = completer.advance(holes.state, holes.target)
             result = completion.targets[-1]
             if not len(result.added) and not result.num_recolored:
-                raise gsc.InputError(" ".join(filter(None, (result.refusal, *result.notes))))
+                reasons = filter(None, (result.refusal, *result.notes))
+                raise gsc.InputError(" ".join(["Nothing of the painting was added.", *reasons]))
             place = next(p for n in count(1) if not (p := Path(out) / f"{n:05}").exists())
             with open_output_folder(place) as folder:
                 splat = None if holes.splat is None else InputSplatFile(holes.splat)
