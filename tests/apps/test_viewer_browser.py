@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 import torch
 
-from browsing import Picture, Tab, launched, needed
+from browsing import CHROMIUM, SWITCHES, Picture, Tab, launched, needed
 from gscompleter.apps.viewer import page as pages
 from gscompleter.apps.viewer.exhibit import ViewerContent
 from gscompleter.apps.viewer.packages import Libraries, load_libraries
@@ -31,6 +31,28 @@ header, aside, figcaption, #divider { display: none !important; }
 """
 """Style that lets the pictures fill the window, to the pixel."""
 
+PLAYED = """(async () => {
+  const [button, stage] = ["play", "stage"].map((id) => document.getElementById(id));
+  const log = [];
+  const tell = () => log.push({ ...gsc.stats(), button: button.textContent });
+  const press = () => window.dispatchEvent(new KeyboardEvent("keydown", { key: "p" }));
+  const click = () => button.click();
+  const zoom = () => stage.dispatchEvent(new WheelEvent("wheel", { deltaY: 1 }));
+  for (const [start, stop] of [[() => {}, press], [press, click], [click, zoom]]) {
+    start();
+    const end = gsc.stats().seconds + 0.1;
+    while (gsc.stats().playing && gsc.stats().seconds < end) {
+      await new Promise(requestAnimationFrame);
+    }
+    tell();
+    stop();
+    tell();
+  }
+  return log;
+})()"""
+"""Script that plays the path three times and pauses it in three ways, within one call: a page that
+always renders lets few calls through."""
+
 
 @pytest.fixture(scope="module")
 def libraries() -> Libraries:
@@ -45,6 +67,14 @@ def libraries() -> Libraries:
 def browser() -> Iterator[Any]:
     with launched() as browser:
         yield browser
+
+
+@pytest.fixture(scope="module")
+def played_browser(browser) -> Iterator[Any]:
+    """Run a browser that waits for a screen before it renders the next frame."""
+    other = browser.browser_type.launch(executable_path=CHROMIUM, args=SWITCHES)
+    yield other
+    other.close()
 
 
 class Window(Tab):
@@ -201,6 +231,24 @@ def test_keys_and_drags_do_what_the_page_says(bare):
     assert step @ TARGET.forward.double().numpy() > 0.99 * np.linalg.norm(step) > 0
 
 
+def test_the_path_goes_smoothly_through_the_cameras(bare):
+    bare.do("gsc.setMode('side')")
+    end = bare.do("gsc.goTo('camera-1'), gsc.stats()")["seconds"]
+    stop = bare.picture()
+    bare.do(f"gsc.seek({end})")
+    assert np.abs(bare.picture() - stop).mean() < 0.01
+    assert bare.do("gsc.seek(0), gsc.stats()")["camera"] == "target-1"
+    times = np.linspace(0, 2 * end, 81)
+    eyes = np.array([bare.page.evaluate(f"gsc.seek({t}), gsc.stats().eye") for t in times])
+    assert distance(eyes[0], TARGET.center.tolist()) < 1e-5
+    assert distance(eyes[40], LEFT.center.tolist()) < 1e-5
+    assert distance(eyes[-1], eyes[0]) < 1e-5  # there and back
+    steps = np.linalg.norm(np.diff(eyes, axis=0), axis=1)
+    assert 0 < steps.max() < 2.2 * steps.mean()
+    assert steps[:40:39].max() < 0.2 * steps.max()  # at rest at both ends
+    assert np.linalg.norm(np.diff(eyes, n=2, axis=0), axis=1).max() < 0.2 * steps.max()
+
+
 def test_nothing_was_asked_for_and_nothing_went_wrong(bare):
     """Last of those that share the window."""
     assert bare.errors == []
@@ -217,6 +265,19 @@ def test_a_link_opens_at_its_camera(browser, saved):
     divider.press("ArrowRight")
     assert divider.get_attribute("aria-valuenow") == "52"
     tab.context.close()
+
+
+def test_a_link_plays_the_path_until_it_is_paused(saved, played_browser):
+    tab = Window(played_browser, saved, 160, 120, "#camera=target-1&play=1")
+    log = tab.page.evaluate(PLAYED)
+    tab.context.close()
+    assert [entry["playing"] for entry in log] == [True, False] * 3
+    assert [entry["button"] for entry in log] == ["Pause", "Play"] * 3
+    seconds = [entry["seconds"] for entry in log]
+    assert seconds == sorted(seconds)
+    eyes = [entry["eye"] for entry in log]
+    assert distance(eyes[0], TARGET.center.tolist()) > 0.001
+    assert distance(eyes[2], eyes[0]) > 0.001
 
 
 def test_the_parts_of_a_large_scene_are_put_together(

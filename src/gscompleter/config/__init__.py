@@ -238,6 +238,35 @@ class CleaningConfig(Settings):
     """Number of random images for the estimate of a Gaussian's influence."""
 
 
+@dataclass(frozen=True)
+class FloaterConfig(Settings):
+    """Settings of the cleaning without photographs.
+
+    A size is the largest standard deviation of a Gaussian. A spacing is the median distance of
+    neighbours, around a Gaussian or in the whole scene, whichever is larger.
+    """
+
+    neighbors: Annotated[int, Interval(ge=2, le=1000)] = 16
+    """Number of nearest neighbours that a Gaussian is compared with, by medians."""
+    max_gap: Weight = 3.5
+    """Isolated: it is farther from its neighbours than this many times the sum of both sizes."""
+    max_thickness: Weight = 2.5
+    """Huge: its smallest standard deviation exceeds this many spacings; or ..."""
+    max_size: Weight = 5.0
+    """... its size exceeds this many times that of its neighbours, ..."""
+    max_remoteness: Weight = 8.0
+    """... and it is farther from them than this many spacings."""
+    max_elongation: Annotated[float, Interval(ge=1, le=1e6)] = 30.0
+    """Needle: its size exceeds this many times its second largest standard deviation, ..."""
+    needle_size: Weight = 4.0
+    """... this many times the size of its neighbours, ..."""
+    needle_distance: Weight = 5.0
+    """... and it is farther from them than this many times their size."""
+    min_opacity: Share = 0.01
+    """Transparent: its opacity is below this one, or up to ten times this one if it is larger than
+    its neighbours: the limit is multiplied by half the ratio of the sizes."""
+
+
 GUARDS = {
     "dynamic-masks": "gscompleter.guards.dynamic_masks:DynamicMasks",
     "image-agreement": "gscompleter.guards.agreement:ImageAgreement",

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 from collections.abc import Mapping, Sequence
+from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
@@ -19,28 +20,59 @@ from gscompleter.apps.inputs.opening import (
     apply_working_range,
     check_context,
     describe_opening,
+    locate_splat,
     move_to_splat,
     open_scene,
     print_lines,
     read_photographs,
 )
-from gscompleter.apps.report.completion import save_completed_splat
+from gscompleter.apps.report.completion import (
+    InputSplatFile,
+    save_changed,
+    save_completed_splat,
+)
 from gscompleter.apps.warmup import compile_kernels
 from gscompleter.cleaning import find_superfluous
 from gscompleter.errors import InputError, quote_value
 from gscompleter.evaluation.metrics.image import psnr
-from gscompleter.io.files import SUMMARY_FILE, check_output, open_output_folder
+from gscompleter.floaters import find_floaters
+from gscompleter.io.files import COMPLETED_FILE, SUMMARY_FILE, check_output, open_output_folder
 from gscompleter.progress import show_preparation, show_progress, stage, track
 from gscompleter.render import Renderer, choose_device, load_renderer
 from gscompleter.splats.formats import load_splat
+from gscompleter.splats.layout import REMOVED_FILE
 from gscompleter.timing import record_seconds, timed_stage
 from gscompleter.types import Gaussians, View
+
+PHOTOGRAPH_OPTIONS = ("context", "format", "near", "far")
+
+
+@dataclass(frozen=True)
+class Cleaning:
+    """A splat, what goes, and the summary."""
+
+    given: Gaussians
+    removed: Bool[Tensor, "n"]
+    splat_file: InputSplatFile
+    summary: Mapping[str, Any]
 
 
 def run_clean(options: CleanOptions) -> None:
     """Clean the splat, write the result, and print a summary."""
     console = Console(stderr=True, quiet=options.quiet)
     check_output(options.out, is_replaceable(options))
+    clean = clean_alone if options.folder is None else clean_by_photographs
+    with show_progress(console):
+        cleaning = clean(options, console)
+        with open_output_folder(options.out, is_replaceable(options)) as folder, stage("writing"):
+            write_cleaning(folder, cleaning, options.dry_run)
+    if not options.quiet:
+        begin, name = ("Dry run: ", REMOVED_FILE) if options.dry_run else ("", COMPLETED_FILE)
+        print(f"{begin}{describe_cleaning(cleaning.summary)}: {options.out / name}")
+
+
+def clean_by_photographs(options: CleanOptions, console: Console) -> Cleaning:
+    """Find what makes the photographs worse, or what none of them needs."""
     check_context(options)
     device = choose_device(options.device)
     renderer = load_renderer(device)
@@ -79,12 +111,84 @@ def run_clean(options: CleanOptions) -> None:
                 (folder / SUMMARY_FILE).write_bytes(json.dumps(summary, indent=2).encode() + b"\n")
     if not options.quiet:
         print_cleaning(summary, options.out)
+    opened = open_scene(options, console)
+    with show_preparation("reading photographs"):
+        task = read_photographs(options, opened, device)
+    loaded = read_splat(options)
+    compile_kernels([device])
+    with show_preparation("aligning the scene"):
+        task = move_to_splat(task, loaded, options.scene, options, opened)
+    given, splat_file = task.scene, task.splat_file
+    assert given is not None
+    assert splat_file is not None
+    task = apply_working_range(task, renderer)
+    plan = f"compared with {len(task.views)} photographs on {device}"
+    plan += f", written to {quote_value(options.out)}"
+    print_lines(console, *describe_opening(options, opened, task), f"To do: {plan}.")
+    with record_seconds(()) as seconds, timed_stage("clean"):
+        removed = find_superfluous(given, task.views, renderer, options.config)
+    if removed.all():
+        raise InputError(
+            "Every Gaussian of the splat makes the photographs worse; check that they show the "
+            "same scene."
+        )
+    summary = {
+        "version": __version__,
+        **describe_run(options, opened, task, options.config),
+        "photographs": score_cleaning(given, task.views, removed, renderer),
+        "gaussians": count_removed(removed),
+        "seconds": seconds,
+    }
+    return Cleaning(given, removed, splat_file, summary)
+
+
+def clean_alone(options: CleanOptions, console: Console) -> Cleaning:
+    """Find floaters by statistics of the splat alone."""
+    named = next((n for n in PHOTOGRAPH_OPTIONS if getattr(options, n) is not None), None)
+    if named is not None:
+        raise InputError("There are no photographs to apply this to; name their SCENE.", named)
+    given = read_splat(options)
+    with record_seconds(()) as seconds, timed_stage("clean"):
+        reasons = find_floaters(given, options.floaters)
+    removed = torch.stack([*reasons.values()]).any(dim=0)
+    summary = {
+        "version": __version__,
+        "settings": {"scene": str(options.scene), "floaters": asdict(options.floaters)},
+        "reasons": {reason: int(mask.sum()) for reason, mask in reasons.items()},
+        "gaussians": count_removed(removed),
+        "seconds": seconds,
+    }
+    if removed.all():
+        raise InputError("Every Gaussian of the splat is a floater by these settings; relax them.")
+    return Cleaning(given, removed, locate_splat(options, options.scene), summary)
+
+
+def read_splat(options: CleanOptions) -> Gaussians:
+    """Read the splat to clean."""
+    with show_preparation("reading the scene"):
+        return load_splat(options.scene, options.drop_nonfinite)
+
+
+def write_cleaning(folder: Path, cleaning: Cleaning, dry_run: bool) -> None:
+    """Write the summary and both parts of the splat, or only what goes."""
+    given, removed, splat_file = cleaning.given, cleaning.removed, cleaning.splat_file
+    if not dry_run:
+        save_completed_splat(folder, given, removed, given[:0], splat_file)
+    elif removed.any():
+        save_changed(folder, given, removed, splat_file)
+    (folder / SUMMARY_FILE).write_text(json.dumps(cleaning.summary, indent=2) + "\n")
+
+
+def count_removed(removed: Bool[Tensor, "n"]) -> dict[str, int]:
+    """Count all, kept and removed Gaussians."""
+    count = int(removed.sum())
+    return {"given": len(removed), "kept": len(removed) - count, "removed": count}
 
 
 def score_cleaning(
     given: Gaussians, views: Sequence[View], taken: Bool[Tensor, "n"], renderer: Renderer
-) -> dict[str, Any]:
-    """Count the removed Gaussians, and compute PSNR (dB) before and after."""
+) -> list[dict[str, Any]]:
+    """Compute PSNR (dB) of each photograph before and after."""
     rows = []
     for view in track(views, "scores"):
         before, after = (
@@ -92,20 +196,20 @@ def score_cleaning(
             for scene in (given, given[~taken])
         )
         rows.append({"frame": view.frame, "psnr_before": before, "psnr_after": after})
-    removed = int(taken.sum())
-    counts = {"given": len(given), "kept": len(given) - removed, "removed": removed}
-    return {"photographs": rows, "gaussians": counts}
+    return rows
 
 
-def print_cleaning(summary: Mapping[str, Any], out: Path) -> None:
-    """Print the numbers of Gaussians and the change of PSNR."""
-    rows, counts = summary["photographs"], summary["gaussians"]
+def describe_cleaning(summary: Mapping[str, Any]) -> str:
+    """Describe the numbers of Gaussians, and the change of PSNR or the reasons."""
+    counts, seconds = summary["gaussians"], summary["seconds"]["total"]
+    text = f"{counts['removed']:,} of {counts['given']:,} Gaussians removed in {seconds:.1f} s; "
+    if "reasons" in summary:
+        return text + ", ".join(f"{count:,} {name}" for name, count in summary["reasons"].items())
     before, after = (
-        torch.tensor([row[f"psnr_{when}"] for row in rows]) for when in ("before", "after")
+        torch.tensor([row[f"psnr_{when}"] for row in summary["photographs"]])
+        for when in ("before", "after")
     )
-    print(
-        f"{counts['removed']:,} of {counts['given']:,} Gaussians removed in "
-        f"{summary['seconds']['total']:.1f} s; mean PSNR of the photographs {before.mean():.2f} dB "
-        f"before, {after.mean():.2f} dB after, worst change {(after - before).min():+.3f} dB: "
-        f"{out / 'completed.ply'}"
+    return text + (
+        f"mean PSNR of the photographs {before.mean():.2f} dB before, {after.mean():.2f} dB after, "
+        f"worst change {(after - before).min():+.3f} dB"
     )

@@ -9,7 +9,7 @@ from typing import Annotated, Literal
 import tyro
 from annotated_types import Interval
 
-from gscompleter.config import CleaningConfig, CompleterConfig
+from gscompleter.config import CleaningConfig, CompleterConfig, FloaterConfig
 from gscompleter.config.generators import GeneratorOptions
 from gscompleter.config.settings import Seed, Settings
 from gscompleter.jobs.engines import EngineName
@@ -172,16 +172,22 @@ class LiveOptions(CompletingOptions):
 class CleanOptions(SceneOptions):
     """Remove Gaussians of a splat that make its photographs worse or that none of them needs.
 
-    No photograph loses more than 0.01 dB. `gscompleter strip` puts the removed Gaussians back.
+    No photograph loses more than 0.01 dB. Without SCENE, remove those that stand out from their
+    neighbours: isolated, huge, needles, transparent. `gscompleter strip` puts all back.
     """
 
+    folder: Annotated[Path | None, tyro.conf.Positional, tyro.conf.arg(metavar="SCENE")] = None  # type: ignore[assignment]
+    """Folder of the photographs, as in `complete`; if not given, neighbours decide."""
     out: Path
     """Folder for completed.ply, removed.ply and summary.json."""
     scene: Path
     """File of Gaussians to clean."""
+    dry_run: bool = False
+    """Write only removed.ply, the Gaussians that would go, and summary.json."""
     device: Device = "auto"
-    """Device to compute on."""
+    """Device to compare photographs on."""
     config: CleaningConfig = CleaningConfig()
+    floaters: FloaterConfig = FloaterConfig()
 
 
 @dataclass(frozen=True, kw_only=True)

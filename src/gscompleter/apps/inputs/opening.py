@@ -221,8 +221,6 @@ def move_to_splat(
     scene = shift_to_origin(origin, scene, task.cameras).to(task.device)
     splat = InputSplat(path, scene, origin, options.folder)
     found = align_splat(splat, given, task.context_frames, load_renderer(task.device.type))
-    is_masked = options.drop_nonfinite and detect_splat_format(path) == "ply"
-    mask = find_finite_rows(path) if is_masked else None
     return replace(
         task,
         views=[transform_view(view, found.transform) for view in task.views],
@@ -232,11 +230,17 @@ def move_to_splat(
         frame=found.transform @ task.frame,
         origin=given.origin if found.method == "given" else origin,
         scene=scene,
-        splat_file=InputSplatFile(path, mask, order),
+        splat_file=replace(locate_splat(options, path), file_order=order),
         method=found.method,
         frame_description=found.describe(),
         check_views=[transform_view(view, found.transform) for view in task.check_views or ()],
     )
+
+
+def locate_splat(options: SceneOptions, path: Path) -> InputSplatFile:
+    """Describe the file of the input splat."""
+    is_masked = options.drop_nonfinite and detect_splat_format(path) == "ply"
+    return InputSplatFile(path, find_finite_rows(path) if is_masked else None)
 
 
 def add_check_views(task: Task, given: Photographs) -> Task:

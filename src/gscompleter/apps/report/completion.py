@@ -297,12 +297,19 @@ def save_completed_splat(
             shutil.copyfile(earlier, folder / REMOVED_FILE)
         save_like(folder / COMPLETED_FILE, context, generated, input_splat.path, kept)
         return
-    rows = torch.nonzero(changed.cpu())[:, 0]
-    save_removed(folder / REMOVED_FILE, context[changed].to("cpu"), rows, input_splat.path, kept)
+    save_changed(folder, context, changed, input_splat)
     stays = ~changed.cpu()
     if kept is not None:
         stays = torch.zeros_like(kept).masked_scatter(kept, stays)
     save_like(folder / COMPLETED_FILE, context[~changed], generated, input_splat.path, stays)
+
+
+def save_changed(
+    folder: Path, context: Gaussians, changed: Bool[Tensor, "n"], input_splat: InputSplatFile
+) -> None:
+    """Write `removed.ply`, the originals of the changed Gaussians."""
+    rows, kept = torch.nonzero(changed.cpu())[:, 0], input_splat.context_mask
+    save_removed(folder / REMOVED_FILE, context[changed].to("cpu"), rows, input_splat.path, kept)
 
 
 def make_record(completion: Completion, photographs: Sequence[Camera]) -> CompletionRecord:

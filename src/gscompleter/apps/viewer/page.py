@@ -23,7 +23,7 @@ from torch import Tensor
 from gscompleter.apps.viewer.exhibit import ViewerCamera, ViewerContent
 from gscompleter.apps.viewer.packages import Libraries
 from gscompleter.errors import InputError, quote_value
-from gscompleter.geometry import is_inside, project
+from gscompleter.geometry import embed_cameras, is_inside, project
 from gscompleter.splats.spz import encode_spz
 from gscompleter.types import Camera, Gaussians
 
@@ -40,6 +40,9 @@ MAX_LANDMARKS = 100_000
 """Approximate number of Gaussians that determine the focus of a camera."""
 OVERVIEW_DISTANCE = 2.5
 """Distance of a camera for the whole scene, relative to the median distance of Gaussians."""
+
+LEG_SECONDS = 2.0
+"""Mean time of the camera path from one camera to the next."""
 
 
 @dataclass(frozen=True)
@@ -95,6 +98,7 @@ def make_page(viewer_content: ViewerContent, libraries: Libraries) -> tuple[byte
         "counts": {name: len(part) for name, part in shown.items()},
         "layers": layer_sources,
         "antialiased": {name: part.is_antialiased for name, part in layers.items()},
+        "path": plan_path([camera.camera for camera in cameras]),
         "shots": [describe_camera(camera, frame, landmarks) for camera in cameras],
         **vars(libraries),
     }
@@ -148,6 +152,19 @@ def describe_camera(
         "focus": seen.median().item() if len(seen) else PAGE_EXTENT,
         "thumbnail": None if thumbnail is None else base64.b64encode(thumbnail).decode(),
     }
+
+
+def plan_path(cameras: Sequence[Camera]) -> list[tuple[int, float]]:
+    """Plan a path from the first camera, each time to the nearest one left: indices and seconds."""
+    where = embed_cameras([camera.to("cpu") for camera in cameras]).double()
+    apart, left, stops = torch.cdist(where, where), torch.zeros(len(where)), [0]
+    for _ in cameras[1:]:
+        left[stops[-1]] = torch.inf
+        stops.append(int((apart[stops[-1]] + left).argmin()))
+    steps = apart[stops[:-1], stops[1:]].sqrt()  # slower in short legs, but not by as much
+    steps = steps / steps.mean().clamp_min(1e-9) + 0.1
+    times = LEG_SECONDS * steps.cumsum(dim=0)
+    return list(zip(stops, [0.0, *times.tolist()], strict=True))
 
 
 def fill_template(content: Mapping[str, Any], scripts: Sequence[str]) -> str:

@@ -50,9 +50,12 @@ const state = {
   focus: 1,
   lens: null,
   size: null,
+  seconds: 0,
+  playing: false,
 };
 let THREE, SPARK;
 let pictures = [];
+let path = [];
 let frames = 0;
 let pending = 0;
 
@@ -183,12 +186,12 @@ function drawAll() {
   for (const picture of pictures) picture.draw();
 }
 
-/* Resolves once nothing is left to be sorted or drawn. */
+/* Resolves once nothing is left to be sorted or drawn, or at once while the path is played. */
 async function settled() {
   const idle = () => !pending && pictures.every((picture) => !picture.updating);
   do {
     await new Promise((resolve) => requestAnimationFrame(resolve));
-  } while (!idle());
+  } while (!state.playing && !idle());
 }
 
 /* --------------------------------------------------------------------------------- camera */
@@ -196,6 +199,8 @@ async function settled() {
 function goTo(name) {
   const shot = shotNamed.get(name);
   if (!shot) return false;
+  play(false);
+  state.seconds = content.path.find(([index]) => content.shots[index] === shot)[1];
   const pose = new THREE.Matrix4().set(...shot.pose);
   state.eye = new THREE.Vector3().setFromMatrixPosition(pose);
   state.turn = new THREE.Quaternion().setFromRotationMatrix(pose);
@@ -210,6 +215,64 @@ function step(by) {
   const names = content.shots.map((shot) => shot.name);
   const at = names.indexOf(state.shot);
   goTo(names[(at + by + names.length) % names.length]);
+}
+
+/* ------------------------------------------------------------------------------------ path */
+
+/* Numbers of each stop of the path: eye, turn, lens, size, focus. Of both quaternions of a turn it
+   takes the one nearer to the stop before. */
+function makeStops() {
+  const stops = [];
+  for (const [index] of content.path) {
+    const shot = content.shots[index];
+    const pose = new THREE.Matrix4().set(...shot.pose);
+    const turn = new THREE.Quaternion().setFromRotationMatrix(pose);
+    const last = stops.length && new THREE.Quaternion().fromArray(stops.at(-1), 3);
+    const sign = last && last.dot(turn) < 0 ? -1 : 1;
+    const eye = new THREE.Vector3().setFromMatrixPosition(pose);
+    stops.push([...eye.toArray(), ...turn.toArray().map((part) => sign * part), ...shot.lens, ...shot.size, shot.focus]);
+  }
+  return stops;
+}
+
+/* Moves the camera to where the path is after so many seconds: a cubic spline through its stops, to
+   the last one and back, at rest at both. */
+function seek(seconds) {
+  const times = content.path.map(([, time]) => time);
+  const end = times.at(-1);
+  const time = end - Math.abs(end - (seconds % (2 * end)));
+  const k = Math.max(0, Math.min(times.findLastIndex((stop) => stop <= time), times.length - 2));
+  const [from, to, length] = [path[k], path[k + 1], times[k + 1] - times[k]];
+  const speed = (i, part) => (path[i - 1] && path[i + 1] ? (path[i + 1][part] - path[i - 1][part]) / (times[i + 1] - times[i - 1]) : 0);
+  const u = (time - times[k]) / length;
+  const at = from.map((value, part) => value + u * u * (3 - 2 * u) * (to[part] - value)
+    + length * u * (1 - u) * ((1 - u) * speed(k, part) - u * speed(k + 1, part)));
+  state.eye.fromArray(at);
+  state.turn.fromArray(at, 3).normalize();
+  Object.assign(state, { seconds, lens: at.slice(7, 11), size: at.slice(11, 13), focus: at[13] });
+  const shot = content.shots[content.path[k + Math.round(u)][0]];
+  if (shot.name !== state.shot) tellShot(shot);
+  state.shot = shot.name;
+  changed();
+}
+
+/* Plays the path from the camera shown last on, or pauses it. */
+function play(playing) {
+  if (playing === state.playing || path.length < 2) return;
+  state.playing = playing;
+  byId("play").setAttribute("aria-pressed", String(playing));
+  byId("play").textContent = playing ? "Pause" : "Play";
+  if (!playing) return;
+  lastTick = performance.now();
+  requestAnimationFrame(fly);
+}
+
+function fly(now) {
+  if (!state.playing) return;
+  const seconds = Math.min(Math.max(0, now - lastTick) / 1000, LONGEST_STEP);
+  lastTick = now;
+  seek(state.seconds + seconds);
+  requestAnimationFrame(fly);
 }
 
 const axis = (x, y, z) => new THREE.Vector3(x, y, z).applyQuaternion(state.turn);
@@ -311,6 +374,7 @@ function tick(now) {
 /* However short a key is pressed, it moves by a step. */
 function press(code) {
   if (pressed.has(code)) return;
+  play(false);
   moveByKey(code, SHORTEST_STEP);
   lastTick = performance.now();
   if (pressed.size === 0) requestAnimationFrame(tick);
@@ -326,6 +390,7 @@ const KEYS = {
   f: () => next("drag", DRAGS),
   b: () => hold(true),
   r: () => goTo(state.shot),
+  p: () => play(!state.playing),
   "[": () => step(-1),
   "]": () => step(1),
   "?": () => { byId("help").open = !byId("help").open; },
@@ -354,6 +419,7 @@ const pointers = new Map();
 
 function onPointerDown(event) {
   if (!state.eye) return;
+  play(false);
   stage.setPointerCapture(event.pointerId);
   pointers.set(event.pointerId, { x: event.clientX, y: event.clientY });
 }
@@ -386,6 +452,7 @@ function onPointerEnd(event) {
 
 function onWheel(event) {
   event.preventDefault();
+  play(false);
   if (state.eye) dolly(Math.exp(Math.max(-0.5, Math.min(0.5, event.deltaY * 0.002))));
 }
 
@@ -417,6 +484,7 @@ function listen() {
   for (const end of ["pointerup", "pointerleave", "pointercancel"]) byId("hold").addEventListener(end, () => hold(false));
   byId("hold").addEventListener("keydown", (event) => { if ([" ", "Enter"].includes(event.key)) hold(true); });
   byId("hold").addEventListener("keyup", () => hold(false));
+  byId("play").addEventListener("click", () => play(!state.playing));
   for (const kind of Object.keys(choices)) {
     for (const button of document.querySelectorAll(`button[data-${kind}]`)) {
       button.addEventListener("click", () => choose(kind, button.dataset[kind]));
@@ -478,6 +546,7 @@ function followLink() {
   const found = goTo(words.get("camera"));
   if (words.has("mode")) choose("mode", words.get("mode"));
   if (words.has("generated")) choose("generated", words.get("generated"));
+  if (words.has("play")) play(true);
   return found;
 }
 
@@ -491,6 +560,8 @@ function stats() {
     generated: state.generated,
     drag: state.drag,
     eye: [centre[0] + unit * x, centre[1] - unit * y, centre[2] - unit * z],
+    seconds: state.seconds,
+    playing: state.playing,
     frames,
   };
 }
@@ -501,6 +572,8 @@ async function start() {
   writeTexts();
   await importLibraries();
   state.up = upOfAll();
+  path = makeStops();
+  byId("play").hidden = path.length < 2;
   pictures = [
     ...(content.layers.before ? [new Picture(byId("before"), ["before"])] : []),
     new Picture(byId("after"), ["observed", "generated"]),
@@ -523,6 +596,8 @@ function fail(error) {
 window.gsc = {
   ready: start().catch(fail),
   goTo,
+  play,
+  seek,
   setMode: (mode) => choose("mode", mode),
   setGenerated: (how) => choose("generated", how),
   settled,

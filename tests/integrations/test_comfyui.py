@@ -1,0 +1,166 @@
+"""The nodes of ComfyUI, called as ComfyUI does: its tensor layouts, in inference mode."""
+
+from __future__ import annotations
+
+import importlib.util
+import inspect
+import sys
+from pathlib import Path
+
+import pytest
+import torch
+
+import gscompleter as gsc
+from command import run
+from gscompleter.data.scene import write_cameras
+from paths import ROOT
+from scenes import Room, camera_at, gaussians_of, labelled, photographed, view_of
+
+PACKAGE = ROOT / "integrations" / "comfyui"
+SIZE = 64
+CAMERAS = [camera_at(x, size=SIZE) for x in (-0.3, 0.0, 0.3)]
+TARGET = camera_at(x=0.8, z=0.5, yaw=25, size=SIZE)
+MAGENTA = torch.tensor([1.0, 0.0, 1.0])
+
+
+def load_nodes():
+    """Import the folder as ComfyUI imports a custom node."""
+    place = PACKAGE / "__init__.py"
+    spec = importlib.util.spec_from_file_location(
+        "comfyui_nodes", place, submodule_search_locations=[str(PACKAGE)]
+    )
+    module = sys.modules[spec.name] = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(module)
+    return module
+
+
+NODES = load_nodes()
+
+
+def call(name, **inputs):
+    """Call a node's function as the executor does."""
+    node = NODES.NODE_CLASS_MAPPINGS[name]
+    with torch.inference_mode():
+        return getattr(node(), node.FUNCTION)(**inputs)
+
+
+def paint(image, mask):
+    """Paint the holes of a batch magenta, as a node between both does."""
+    with torch.inference_mode():
+        return torch.where(mask[..., None] > 0.5, MAGENTA, image)
+
+
+@pytest.fixture(scope="module")
+def scene(tmp_path_factory) -> Path:
+    folder = photographed(tmp_path_factory.mktemp("comfyui") / "scene", CAMERAS)
+    write_cameras(folder / "target.json", [CAMERAS[1], TARGET])
+    return folder
+
+
+def find(scene, **more):
+    target = {"target": str(scene / "target.json"), "camera": 1}
+    inputs = {"scene": str(scene), "context": "0, 2", "height": SIZE, "width": SIZE, **target}
+    return call("GSCompleterFindHoles", **{**inputs, **more})
+
+
+@pytest.fixture(scope="module")
+def found(scene):
+    return find(scene)
+
+
+def test_the_holes_come_in_the_layouts_of_comfyui(found):
+    image, mask, _ = found
+    assert image.shape == (1, SIZE, SIZE, 3)
+    assert mask.shape == (1, SIZE, SIZE)
+    assert (image.dtype, mask.dtype) == (torch.float32, torch.float32)
+    assert image.min() >= 0
+    assert image.max() <= 1
+    assert set(mask.unique().tolist()) == {0.0, 1.0}
+    truth = view_of(Room(), TARGET).image
+    error = (image[0] - truth).abs().mean(dim=-1)
+    assert error[mask[0] == 0].median() < 0.3 * error[mask[0] == 1].median()
+
+
+def test_the_painted_image_ends_in_the_splat(found, tmp_path):
+    image, mask, holes = found
+    (path,) = call(
+        "GSCompleterRegisterPainting", holes=holes, image=paint(image, mask), out=str(tmp_path)
+    )
+    scene = gsc.load_splat(path)
+    generated = scene[scene.generated > 0]
+    assert len(generated) > 0.3 * mask.sum()
+    inside = mask[0] == 1
+    shown = gsc.load_renderer("cpu").render(scene, holes.target).image
+    assert (shown - MAGENTA).abs()[inside].mean() < 0.1
+    assert (shown - image[0]).abs()[~inside].mean() < 0.05
+    assert sorted(file.name for file in Path(path).parent.iterdir()) == [
+        *("after.png", "before.png", "completed.ply", "context.ply", "generated.ply"),
+        "painted.png",
+    ]
+
+
+def test_each_painting_gets_its_folder_and_may_be_larger(found, tmp_path):
+    image, mask, holes = found
+    large = paint(image, mask).repeat_interleave(2, dim=1).repeat_interleave(2, dim=2)
+    results = [
+        call("GSCompleterRegisterPainting", holes=holes, image=batch, out=str(tmp_path))[0]
+        for batch in (paint(image, mask), torch.cat([large, 0 * large]))
+    ]
+    assert [Path(path).parent.name for path in results] == ["00001", "00002"]
+    small, scaled = map(gsc.load_splat, results)
+    assert (small.sh[-1] - scaled.sh[-1]).abs().max() < 0.2 * small.sh[-1].abs().max()
+
+
+def test_a_splat_keeps_its_bytes(scene, tmp_path, monkeypatch):
+    seen = [gaussians_of(view_of(Room(), camera)) for camera in CAMERAS[::2]]
+    splat = labelled(tmp_path / "splat.ply", gsc.merge(seen))
+    image, mask, holes = find(scene, splat=str(splat))
+    (path,) = call(
+        "GSCompleterRegisterPainting", holes=holes, image=paint(image, mask), out=str(tmp_path)
+    )
+    assert (gsc.load_splat(path).generated > 0).sum() > 0.3 * mask.sum()
+    assert run(monkeypatch, "strip", path, "--out", tmp_path / "back.ply") == 0
+    assert (tmp_path / "back.ply").read_bytes() == splat.read_bytes()
+
+
+@pytest.mark.parametrize(
+    ("more", "sentence"),
+    [
+        ({"context": "left right"}, "names no frames"),
+        ({"context": "0 9"}, "9"),
+        ({"camera": 2}, "has 2 cameras"),
+        ({"target": "nowhere.json"}, "nowhere.json"),
+    ],
+)
+def test_wrong_inputs_get_a_sentence(scene, more, sentence):
+    with pytest.raises(gsc.InputError, match=sentence):
+        find(scene, **more)
+
+
+def test_wrong_paintings_get_a_sentence_and_write_nothing(found, tmp_path):
+    image, _, holes = found
+    with pytest.raises(gsc.InputError, match="scale it without cropping"):
+        call("GSCompleterRegisterPainting", holes=holes, image=image[:, :32], out=str(tmp_path))
+    assert list(tmp_path.iterdir()) == []
+
+
+@pytest.mark.parametrize("name", NODES.NODE_CLASS_MAPPINGS)
+def test_nodes_declare_what_their_functions_take(name):
+    node = NODES.NODE_CLASS_MAPPINGS[name]
+    groups = node.INPUT_TYPES()
+    named = [key for group in groups.values() for key in group]
+    function = inspect.signature(getattr(node, node.FUNCTION))
+    assert ["self", *named] == list(function.parameters)
+    defaults = {k for k, p in function.parameters.items() if p.default is not p.empty}
+    assert defaults == set(groups.get("optional", {}))
+    assert len(node.RETURN_TYPES) == len(node.RETURN_NAMES)
+    assert name in NODES.NODE_DISPLAY_NAME_MAPPINGS
+
+
+def test_the_registry_finds_its_fields():
+    tomllib = pytest.importorskip("tomllib", reason="needs Python 3.11")
+    fields = tomllib.loads((PACKAGE / "pyproject.toml").read_text())
+    assert fields["project"]["name"] == "gscompleter-nodes"
+    assert fields["project"]["version"] == gsc.__version__
+    assert "gscompleter" in fields["project"]["dependencies"]
+    assert fields["tool"]["comfy"]["DisplayName"]
