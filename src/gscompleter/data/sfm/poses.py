@@ -93,8 +93,8 @@ class FoundPoses:
     """Focal length in pixels of the copies if it had to be fixed at first, else None."""
     reused: bool = False
     """True if the result is from an earlier run."""
-    origin: str | None = None
-    """Sentence on how the photographs were made, if not by a camera."""
+    origin: str = ""
+    """Sentences on how a video or panoramas became photographs."""
 
     @property
     def num_registered(self) -> int:
@@ -104,7 +104,7 @@ class FoundPoses:
     @property
     def notes(self) -> list[str]:
         """Sentences for the user."""
-        notes = [] if self.origin is None else [self.origin]
+        notes = [self.origin] if self.origin else []
         if self.focal is not None:
             notes.append(
                 f"{self.num_registered} of {self.photographs} cameras were found with a focal "
@@ -123,12 +123,7 @@ def find_poses(
 
     Of a video, at most `num_frames` frames are the photographs.
     """
-    root = photographs.parent if is_video(photographs) else photographs
-    names = [photographs.name] if is_video(photographs) else list_photograph_files(photographs)
-    stats = {name: (root / name).stat() for name in names}
-    known = {name: [stat.st_size, stat.st_mtime_ns] for name, stat in stats.items()}
-    if is_video(photographs):
-        known[photographs.name].append(num_frames)
+    known = _identify_input(photographs, num_frames)
     earlier = _read_earlier(out, known)
     if earlier is not None:
         return earlier
@@ -139,7 +134,7 @@ def find_poses(
         )
     with (
         open_output_folder(out, overwrite) as folder,
-        _open_folder(photographs, num_frames) as images,
+        _open_images(photographs, num_frames, folder) as images,
     ):
         found = _run(images, folder, photographs)
         content = {"poses": asdict(found), "photographs": known}
@@ -147,13 +142,22 @@ def find_poses(
     return found
 
 
+def _identify_input(path: Path, num_frames: int) -> dict[str, list[int]]:
+    """Identify photographs by size and time of change, a video also by the number of frames."""
+    if is_video(path):
+        stat = path.stat()
+        return {path.name: [stat.st_size, stat.st_mtime_ns, num_frames]}
+    stats = {name: (path / name).stat() for name in list_photograph_files(path)}
+    return {name: [stat.st_size, stat.st_mtime_ns] for name, stat in stats.items()}
+
+
 @contextmanager
-def _open_folder(path: Path, num_frames: int) -> Iterator[Path]:
-    """Open a folder of photographs, or a temporary one with frames of a video."""
+def _open_images(path: Path, num_frames: int, home: Path) -> Iterator[Path]:
+    """Open a folder of photographs, or a temporary one in `home` with frames of a video."""
     if not is_video(path):
         yield path
         return
-    with tempfile.TemporaryDirectory() as folder:
+    with tempfile.TemporaryDirectory(dir=home) as folder:
         extract_frames(path, Path(folder), num_frames)
         yield Path(folder)
 
@@ -177,21 +181,25 @@ def has_photographs(path: Path) -> bool:
 def list_photograph_files(folder: Path) -> list[str]:
     """List the photographs below a folder in natural order; two panoramas or three others."""
     names = _walk_photographs(folder)
-    if len(names) >= MIN_PHOTOGRAPHS:
-        return names
+    if len(names) < MIN_PHOTOGRAPHS:
+        _check_few(folder, names)
+    return names
+
+
+def _check_few(folder: Path, names: Sequence[str]) -> None:
+    """Refuse one or two photographs, or one panorama."""
     refuse_other_exports(folder)
     is_panoramic = has_panoramas([folder / name for name in names])
-    require(
-        len(names) != 1 or not is_panoramic,
-        f"{quote_value(folder / names[0], 80)} is a single panorama, which shows no depth; add "
-        "another one, taken a step away." if names else "",
-    )
     require(
         is_panoramic,
         f"There are {len(names)} photographs ({', '.join(ENDINGS)}) in {quote_value(folder)}, and "
         f"at least {MIN_PHOTOGRAPHS} are needed to find their cameras; add more.",
     )
-    return names
+    require(
+        len(names) > 1,
+        f"There is a single panorama in {quote_value(folder)}, which shows no depth; add another "
+        "one, taken a step away.",
+    )
 
 
 def _walk_photographs(folder: Path) -> list[str]:
@@ -235,12 +243,14 @@ def _run(photographs: Path, folder: Path, given: Path) -> FoundPoses:
     return found
 
 
-def _describe_origin(given: Path, images: int, copies: int) -> str | None:
-    """Describe the frames of a video and the views of panoramas; None of photographs."""
-    frames = f" are sharp frames of {quote_value(given, 80)}" * is_video(given)
-    views = f" were split into {copies} views of 90°" * (copies != images)
-    kind = "panoramas" if views else "photographs"
-    return f"{images} {kind}{' and'.join(filter(None, (frames, views)))}." if frames or views else None
+def _describe_origin(given: Path, images: int, copies: int) -> str:
+    """Describe the frames of a video and the views of panoramas; empty for photographs."""
+    sentences = []
+    if is_video(given):
+        sentences.append(f"{images} sharp frames of {quote_value(given)} serve as photographs.")
+    if copies > images:
+        sentences.append(f"{images} panoramas were split into {copies} views of 90° each.")
+    return " ".join(sentences)
 
 
 def write_copies(root: Path, source: str, folder: Path, is_panoramic: bool) -> list[UprightCopy]:
