@@ -50,10 +50,7 @@ SPLAT_FROM_WORLD = np.array([-1.0, -1.0, 1.0])
 
 METASHAPE = ("cameras of Metashape", "export its cameras as COLMAP, which Metashape does since 2.2")
 REALITYSCAN = ("cameras of RealityScan", "export its registration as COLMAP")
-POLYCAM = (
-    "cameras of Polycam",
-    "turn it into nerfstudio's transforms.json by ns-process-data polycam",
-)
+POLYCAM = ("cameras of Polycam", "make nerfstudio's transforms.json by ns-process-data polycam")
 INSTA360 = ("unstitched images of Insta360", "export 360° JPEG or MP4 (2:1) from Insta360 Studio")
 EXPORTS = (
     ((".psx", ".psz"), b"", METASHAPE),

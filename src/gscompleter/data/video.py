@@ -21,28 +21,32 @@ from gscompleter.errors import quote_value
 from gscompleter.io.video import read_frames
 from gscompleter.progress import stage
 
+Image8 = UInt8[np.ndarray, "h w"]
+Corners = Float[np.ndarray, "n 1 2"]
+Values = Float[np.ndarray, "n"]
+
 ENDINGS = (".mp4", ".mov", ".m4v", ".mkv", ".webm")
 """Endings of videos, in any case."""
 NUM_FRAMES = 40
 """Default number of frames to choose."""
-MIN_FRAMES, MAX_FRAMES = 3, 1000
+MIN_FRAMES = 3
 SMALL_SIDE = 640
 """Longer side in pixels at which frames are measured."""
 STEP = 0.02
-"""Median motion from one reference frame to the next, in longer sides."""
+"""Motion from one reference frame to the next, in longer sides."""
+QUANTILE = 0.75
+"""Quantile of the motions of corners; around a thing at the centre most move little."""
 NUM_CORNERS = 200
 """Most corners that are tracked."""
-MIN_CORNERS = 20
-"""Fewest corners of a reference frame."""
 MIN_TRACKED = 0.5
-"""Share of the corners below which the reference frame is out of sight."""
+"""Share of corners below which the reference frame is out of sight."""
 QUALITY = 95
 """JPEG quality of the chosen frames."""
 
 
 def is_video(path: Path) -> bool:
-    """Check whether a file is called like a video."""
-    return path.suffix.lower() in ENDINGS and not path.is_dir()
+    """Check whether `path` is a file with the name of a video."""
+    return path.suffix.lower() in ENDINGS and path.is_file()
 
 
 def extract_frames(video: Path, folder: Path, count: int) -> None:
@@ -50,18 +54,14 @@ def extract_frames(video: Path, folder: Path, count: int) -> None:
 
     They are named by their numbers in the video.
     """
-    require(
-        MIN_FRAMES <= count <= MAX_FRAMES,
-        f"{count} frames of a video are not possible; choose {MIN_FRAMES} to {MAX_FRAMES}.",
-    )
-    size = f"w={SMALL_SIDE}:h={SMALL_SIDE}:force_original_aspect_ratio=decrease"
+    size = f"'min({SMALL_SIDE},iw)':'min({SMALL_SIDE},ih)':force_original_aspect_ratio=decrease"
     with stage("Choosing frames"):
         small = read_frames(video, f"scale={size}:flags=area", is_grey=True)
         chosen = select_frames(*measure_frames(small), count)
         require(
             len(chosen) >= MIN_FRAMES,
-            f"{quote_value(video, 80)} has {len(chosen)} frames that differ in what they show, and "
-            f"{MIN_FRAMES} are needed; film for longer, and walk around the scene.",
+            f"The camera hardly moves in {quote_value(video, 80)}, of which {len(chosen)} frames "
+            f"differ and {MIN_FRAMES} are needed; film for longer, and walk around the scene.",
         )
         images = read_frames(video, f"select='{_write_choice(chosen)}'", is_grey=False)
         for number, pixels in zip(chosen, images, strict=True):
@@ -69,67 +69,47 @@ def extract_frames(video: Path, folder: Path, count: int) -> None:
             Image.fromarray(pixels).save(path, quality=QUALITY, subsampling=0)
 
 
-def measure_frames(
-    frames: Iterable[UInt8[np.ndarray, "h w"]],
-) -> tuple[Float[np.ndarray, "n"], Float[np.ndarray, "n"]]:
+def measure_frames(frames: Iterable[Image8]) -> tuple[Values, Values]:
     """Measure the variance of the Laplacian of each frame, and its motion since the first one.
 
     Motion is in steps of `STEP`; the fraction is the way from the last reference frame.
     """
     sharpness, motion = list[float](), list[float]()
-    reference, corners, steps = np.zeros((0, 0), np.uint8), np.zeros((0, 1, 2), np.float32), 0
+    reference, corners, steps = np.zeros((0, 0), np.uint8), None, 0
     for frame in frames:
         sharpness.append(float(cv2.Laplacian(frame, cv2.CV_32F).var()))
-        share = _measure_motion(reference, corners, frame) if len(corners) else 0.0
+        share = 0.0 if corners is None else _measure_motion(reference, corners, frame)
         motion.append(steps + share)
         steps += share == 1
-        if share == 1 or not len(corners):
-            reference, corners = frame, _find_corners(frame)
+        if share == 1 or corners is None:
+            reference, distance = frame, max(frame.shape) / 40
+            corners = cv2.goodFeaturesToTrack(frame, NUM_CORNERS, 0.01, distance)
     return np.array(sharpness), np.array(motion)
 
 
-def _find_corners(frame: UInt8[np.ndarray, "h w"]) -> Float[np.ndarray, "n 1 2"]:
-    """Find corners to track; none in a frame with few."""
-    found = cv2.goodFeaturesToTrack(frame, NUM_CORNERS, 0.01, max(frame.shape) / 40)
-    none = np.zeros((0, 1, 2), np.float32)
-    return none if found is None or len(found) < MIN_CORNERS else found
-
-
-def _measure_motion(
-    reference: UInt8[np.ndarray, "h w"],
-    corners: Float[np.ndarray, "n 1 2"],
-    frame: UInt8[np.ndarray, "h w"],
-) -> float:
-    """Measure the median motion of corners in steps, at most 1; 1 if most are lost."""
-    if frame.shape != reference.shape:
+def _measure_motion(reference: Image8, corners: Corners, frame: Image8) -> float:
+    """Measure the motion of most corners in steps, at most 1; 1 if too many are lost."""
+    found, status, _ = cv2.calcOpticalFlowPyrLK(reference, frame, corners, corners.copy())
+    if status.mean() < MIN_TRACKED:
         return 1.0
-    found, status, _ = cv2.calcOpticalFlowPyrLK(reference, frame, corners, None)
-    is_tracked = status.ravel() == 1
-    if is_tracked.mean() < MIN_TRACKED:
-        return 1.0
-    moved = np.linalg.norm((found - corners)[is_tracked], axis=-1)
-    return min(float(np.median(moved)) / (STEP * max(frame.shape)), 1.0)
+    moved = np.linalg.norm((found - corners)[status == 1], axis=-1)
+    return min(float(np.quantile(moved, QUANTILE)) / (STEP * max(frame.shape)), 1.0)
 
 
-def select_frames(
-    sharpness: Float[np.ndarray, "n"], motion: Float[np.ndarray, "n"], count: int
-) -> list[int]:
+def select_frames(sharpness: Values, motion: Values, count: int) -> list[int]:
     """Select the sharpest frame of each of at most `count` windows of equal motion.
 
-    Only the first half of a window counts, so that chosen frames are half a step apart or more.
+    Selected frames are at least half a window apart; a window may have none.
     """
+    selected, last = list[int](), -np.inf
     steps = int(motion.max(initial=-1)) + 1
     windows = min(count, steps)
-    bounds = [steps * number // max(windows, 1) for number in range(windows + 1)]
-    return [_find_sharpest(sharpness, motion, a, (a + b) / 2) for a, b in pairwise(bounds)]
-
-
-def _find_sharpest(
-    sharpness: Float[np.ndarray, "n"], motion: Float[np.ndarray, "n"], start: float, end: float
-) -> int:
-    """Find the sharpest frame whose motion is in [start, end)."""
-    inside = (start <= motion) & (motion < end)
-    return int(np.where(inside, sharpness, -1.0).argmax())
+    for start, end in pairwise(steps * n // windows for n in range(windows + 1) if windows):
+        inside = (motion >= max(start, last + (end - start) / 2)) & (motion < end)
+        if inside.any():
+            selected.append(int(np.where(inside, sharpness, -1.0).argmax()))
+            last = motion[selected[-1]]
+    return selected
 
 
 def _write_choice(numbers: Sequence[int]) -> str:

@@ -37,11 +37,6 @@ SAFE = ("-protocol_whitelist", "file", "-format_whitelist", "mov,matroska")
 """Options of ffmpeg for the input: these containers, and no further files or addresses."""
 CUT_OFF = "ended prematurely"
 """Message of ffmpeg about a truncated Matroska file, which is no error to it."""
-REASONS = {
-    "Stream map '' matches no streams": "it has no pictures",
-    "moov atom not found": "its index is missing",
-}
-"""Explanations of common messages of ffmpeg."""
 
 
 def find_ffmpeg() -> str:
@@ -63,7 +58,7 @@ def read_frames(path: Path, filters: str, is_grey: bool) -> Iterator[UInt8[np.nd
     refuse_pointer(path)
     command = [
         *(find_ffmpeg(), "-v", "error", "-nostdin", "-xerror", *SAFE),
-        *("-threads", str(get_thread_count()), "-i", f"file:{path}", "-map", "0:V:0"),
+        *("-threads", str(get_thread_count()), "-i", f"file:{path}", "-an", "-sn", "-dn"),
         # Every frame once, whatever its time; the header of a PNM has its size.
         *("-fps_mode", "passthrough", "-vf", filters, "-sws_flags", "accurate_rnd+bitexact"),
         *("-f", "image2pipe", "-c:v", "pgm" if is_grey else "ppm", "pipe:1"),
@@ -84,8 +79,7 @@ def read_frames(path: Path, filters: str, is_grey: bool) -> Iterator[UInt8[np.nd
             reason = re.sub(r"\[[^]]* @ \w*\] ", "", messages).partition("\n")[0].rstrip(".")
             raise InputError(
                 f"{quote_value(path, 80)} is no video that can be read to its end "
-                f"({REASONS.get(reason) or quote_value(reason, 80)}); copy it again, or export it "
-                "as H.264 in .mp4."
+                f"({quote_value(reason, 80)}); copy it again, or export it as H.264 in .mp4."
             )
 
 
@@ -93,11 +87,11 @@ def _read_images(stream: IO[bytes]) -> Iterator[UInt8[np.ndarray, "h w *c"]]:
     """Read 8-bit PNM images until the stream ends."""
     while kind := stream.readline():
         width, height = map(int, stream.readline().split())
+        shape = (height, width) if kind == b"P5\n" else (height, width, 3)
         stream.readline()  # 255
-        shape = (height, width) if kind.startswith(b"P5") else (height, width, 3)
-        pixels = np.frombuffer(stream.read(math.prod(shape)), np.uint8)
-        if pixels.size == math.prod(shape):  # else ffmpeg was stopped
-            yield pixels.reshape(shape)
+        pixels = stream.read(math.prod(shape))
+        if len(pixels) == math.prod(shape):  # else ffmpeg failed
+            yield np.frombuffer(pixels, np.uint8).reshape(shape)
 
 
 def write_video(path: Path, frames: Iterable[UInt8[np.ndarray, "h w 3"]], rate: int) -> None:

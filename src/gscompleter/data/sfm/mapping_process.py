@@ -138,10 +138,7 @@ def _add_camera(job: Job, one: UprightCopy) -> int:
 
 
 def select_pairs(job: Job) -> Pairs:
-    """Choose the photographs to match: sequence neighbours, all pairs, or similar photographs.
-
-    Views of one panorama are not matched.
-    """
+    """Choose the photographs to match: sequence neighbours, all pairs, or similar photographs."""
     names = [one.name for one in job.photographs]
     pairs = pair_neighbours(len(names)) if is_sequence(names) else set()
     if not pairs and len(names) <= MAX_EXHAUSTIVE:
@@ -149,6 +146,7 @@ def select_pairs(job: Job) -> Pairs:
     else:
         with pycolmap.Database.open(job.database) as database:
             pairs |= pair_similar([_read_features(database, name) for name in names])
+    # Between views of one panorama there is no baseline.
     centres = [name.partition("/")[2] if job.is_panoramic else name for name in names]
     return {(i, j) for i, j in pairs if centres[i] != centres[j]}
 
@@ -197,11 +195,8 @@ def map_photographs(job: Job) -> dict[str, Any]:
 
 
 def select_model(job: Job) -> tuple[pycolmap.Reconstruction | None, bool]:
-    """Map with a free focal length, then with plausible fixed ones (True), until it is good.
-
-    That of the views of panoramas is known.
-    """
-    if job.is_panoramic:
+    """Map with a free focal length, then with plausible fixed ones (True), until it is good."""
+    if job.is_panoramic:  # the focal length of views is known
         return map_largest(job, is_focal_fixed=True), False
     best, is_focal_fixed = map_largest(job), False
     wanted = math.ceil(WANTED_SHARE * len(job.photographs))
