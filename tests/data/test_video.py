@@ -87,6 +87,17 @@ def test_the_same_video_gives_the_same_bytes(video, tmp_path):
         assert path.read_bytes() == (tmp_path / "b" / path.name).read_bytes()
 
 
+def test_ten_bits_are_read_as_eight(video, tmp_path):
+    deep, options = tmp_path / "deep.mp4", ("-c:v", "libx264", "-pix_fmt", "yuv420p10le")
+    subprocess.run(
+        [find_ffmpeg(), "-v", "error", "-i", str(video), *options, str(deep)], check=True
+    )
+    for is_grey in (False, True):
+        pixels, true = (next(read_frames(path, "null", is_grey)) for path in (deep, video))
+        assert pixels.shape == true.shape
+        assert np.abs(pixels.astype(int) - true).mean() < 6
+
+
 @pytest.mark.parametrize("ending", [".mov", ".mkv", ".MP4"])
 def test_rotation_metadata_and_containers_are_honoured(video, tmp_path, ending):
     lying = change(video, tmp_path / f"lying{ending}", "-display_rotation", 90)

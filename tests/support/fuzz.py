@@ -98,6 +98,8 @@ def build(folder: Path) -> None:
     from driving_files import write_drive, write_infos, write_swept_dgp
     from gscompleter import save_ply
     from gscompleter.data.scene import write_cameras
+    from gscompleter.io.image import convert_to_pixels
+    from gscompleter.io.video import write_video
     from pose_files import WRITERS, write_camera_list
     from scenes import Room, camera_at, gaussians_of, photographed, view_of
     from splat_files import FORMATS_BUT_PLY, made, plausible
@@ -144,6 +146,7 @@ def build(folder: Path) -> None:
     write_infos(folder / "infos")
     write_drive(folder / "kitti-raw")
     write_swept_dgp(folder / "dgp-swept")
+    write_video(folder / "walk.mp4", [convert_to_pixels(view.image) for view in views], 10)
     in_every_format(WRITERS["colmap-text"][1](folder / "photographs") / "images")
 
 
@@ -481,6 +484,7 @@ KINDS: dict[str, Mutation] = {
     "splits": posed("splits", "*.json"),
     "photograph": posed("photographs", "images/*"),
     "photographs-alone": in_bytes("photographs/images/*", ALONE),
+    "video": in_bytes("walk.mp4", ["poses", "walk.mp4", "--out", "out", "--quiet"]),
     "targets-list": in_bytes("target-list.json", [*COMPLETE, "target-list.json", *RANGE]),
     "targets-colmap": in_bytes(
         "colmap-text/sparse/images.txt", [*COMPLETE, "colmap-text/sparse/images.txt", *RANGE]

@@ -1,8 +1,7 @@
 """Choice of frames of a video that serve as photographs.
 
-The video is decoded twice: at a small size, to measure how sharp each frame is and how far the
-image has moved, then only the chosen frames are kept. Motion is counted in steps from one
-reference frame to the next, so that a camera that stands still and trembles adds none.
+The video is decoded twice: at a small size to measure sharpness and motion, then to keep the chosen
+frames. Motion is counted in steps between reference frames, so that trembling adds none.
 """
 
 from __future__ import annotations
@@ -50,10 +49,7 @@ def is_video(path: Path) -> bool:
 
 
 def extract_frames(video: Path, folder: Path, count: int) -> None:
-    """Write at most `count` sharp frames of a video, upright, to `folder` as JPEGs.
-
-    They are named by their numbers in the video.
-    """
+    """Write at most `count` sharp frames of a video, upright, as JPEGs named by their numbers."""
     size = f"'min({SMALL_SIDE},iw)':'min({SMALL_SIDE},ih)':force_original_aspect_ratio=decrease"
     with stage("Choosing frames"):
         small = read_frames(video, f"scale={size}:flags=area", is_grey=True)

@@ -17,7 +17,6 @@ from jaxtyping import UInt8
 
 from gscompleter.cpu_threads import get_thread_count
 from gscompleter.errors import InputError, quote_value, refuse_pointer
-from gscompleter.io.reading import check_file
 
 QUALITY = 18
 """Constant rate factor of x264: 0 is lossless, 18 is visually lossless."""
@@ -54,14 +53,14 @@ def find_ffmpeg() -> str:
 
 def read_frames(path: Path, filters: str, is_grey: bool) -> Iterator[UInt8[np.ndarray, "h w *c"]]:
     """Decode a video upright, in grey or colours, after `filters` of ffmpeg; frame by frame."""
-    check_file(path)
     refuse_pointer(path)
     command = [
         *(find_ffmpeg(), "-v", "error", "-nostdin", "-xerror", *SAFE),
         *("-threads", str(get_thread_count()), "-i", f"file:{path}", "-an", "-sn", "-dn"),
         # Every frame once, whatever its time; the header of a PNM has its size.
         *("-fps_mode", "passthrough", "-vf", filters, "-sws_flags", "accurate_rnd+bitexact"),
-        *("-f", "image2pipe", "-c:v", "pgm" if is_grey else "ppm", "pipe:1"),
+        *("-f", "image2pipe", "-c:v", "pgm" if is_grey else "ppm"),
+        *("-pix_fmt", "gray" if is_grey else "rgb24", "pipe:1"),
     ]
     with (
         tempfile.TemporaryFile() as log,

@@ -119,10 +119,7 @@ class FoundPoses:
 def find_poses(
     photographs: Path, out: Path, overwrite: bool = False, num_frames: int = NUM_FRAMES
 ) -> FoundPoses:
-    """Find the cameras of the `photographs` in a folder and write them to the folder `out`.
-
-    Of a video, at most `num_frames` frames are the photographs.
-    """
+    """Find the cameras of a folder of photographs, or of frames of a video, and write them to `out`."""
     known = _identify_input(photographs, num_frames)
     earlier = _read_earlier(out, known)
     if earlier is not None:
