@@ -1,6 +1,7 @@
 """Videos in place of photographs: which frames are chosen, and what is refused."""
 
 import subprocess
+import sys
 from pathlib import Path
 
 import cv2
@@ -89,9 +90,8 @@ def test_the_same_video_gives_the_same_bytes(video, tmp_path):
 
 def test_ten_bits_are_read_as_eight(video, tmp_path):
     deep, options = tmp_path / "deep.mp4", ("-c:v", "libx264", "-pix_fmt", "yuv420p10le")
-    subprocess.run(
-        [find_ffmpeg(), "-v", "error", "-i", str(video), *options, str(deep)], check=True
-    )
+    command = [find_ffmpeg(), "-v", "error", "-i", str(video), *options, str(deep)]
+    subprocess.run(command, check=True)
     for is_grey in (False, True):
         pixels, true = (next(read_frames(path, "null", is_grey)) for path in (deep, video))
         assert pixels.shape == true.shape
@@ -187,6 +187,14 @@ def test_a_missing_video_is_refused(tmp_path, monkeypatch, capsys):
     for command in ("poses", "complete"):
         assert run(monkeypatch, command, tmp_path / "no.mp4", "--out", tmp_path / "out") == 2
         assert "no.mp4" in capsys.readouterr().err
+
+
+def test_a_missing_package_is_named(video, tmp_path, monkeypatch, capsys):
+    pytest.importorskip("pycolmap")
+    monkeypatch.setitem(sys.modules, "imageio_ffmpeg", None)
+    assert run(monkeypatch, "poses", video, "--out", tmp_path / "out", "--quiet") == 2
+    assert "pip install gscompleter[film]" in capsys.readouterr().err
+    assert not (tmp_path / "out").exists()
 
 
 def test_many_frames_can_be_chosen(tmp_path):

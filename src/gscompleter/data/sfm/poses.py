@@ -119,7 +119,7 @@ class FoundPoses:
 def find_poses(
     photographs: Path, out: Path, overwrite: bool = False, num_frames: int = NUM_FRAMES
 ) -> FoundPoses:
-    """Find the cameras of a folder of photographs, or of frames of a video, and write them to `out`."""
+    """Find the cameras of a folder of photographs or of a video's frames; write them to `out`."""
     known = _identify_input(photographs, num_frames)
     earlier = _read_earlier(out, known)
     if earlier is not None:
