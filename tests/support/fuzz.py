@@ -99,6 +99,8 @@ def build(folder: Path) -> None:
     from gscompleter import save_ply
     from gscompleter.data.scene import write_cameras
     from phone_files import polycam, record3d, scanner_app, write_archive, write_folder
+    from gscompleter.io.image import convert_to_pixels
+    from gscompleter.io.video import write_video
     from pose_files import WRITERS, write_camera_list
     from scenes import Room, camera_at, gaussians_of, photographed, view_of
     from splat_files import FORMATS_BUT_PLY, made, plausible
@@ -150,6 +152,7 @@ def build(folder: Path) -> None:
     write_folder(folder / "scanner-app", scanner_app())
     write_folder(folder / "record3d", record3d())
     write_archive(folder / "record3d.r3d", record3d())
+    write_video(folder / "walk.mp4", [convert_to_pixels(view.image) for view in views], 10)
     in_every_format(WRITERS["colmap-text"][1](folder / "photographs") / "images")
 
 
@@ -487,6 +490,7 @@ KINDS: dict[str, Mutation] = {
     "splits": posed("splits", "*.json"),
     "photograph": posed("photographs", "images/*"),
     "photographs-alone": in_bytes("photographs/images/*", ALONE),
+    "video": in_bytes("walk.mp4", ["poses", "walk.mp4", "--out", "out", "--quiet"]),
     "targets-list": in_bytes("target-list.json", [*COMPLETE, "target-list.json", *RANGE]),
     "targets-colmap": in_bytes(
         "colmap-text/sparse/images.txt", [*COMPLETE, "colmap-text/sparse/images.txt", *RANGE]

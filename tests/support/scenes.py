@@ -91,7 +91,13 @@ def texture(points: Float[Tensor, "*n 3"]) -> Float[Tensor, "*n 3"]:
 
 def cast(room: Room, camera: Camera) -> tuple[Float[Tensor, "h w 3"], Float[Tensor, "h w"]]:
     """Compute the true image and z-depth at the pixel centres."""
-    origin, z_rays = camera.center.double(), camera.z_rays().double()
+    return cast_rays(room, camera.center.double(), camera.z_rays().double())
+
+
+def cast_rays(
+    room: Room, origin: Float[Tensor, "3"], z_rays: Float[Tensor, "h w 3"]
+) -> tuple[Float[Tensor, "h w 3"], Float[Tensor, "h w"]]:
+    """Compute colours and depths along rays, in multiples of their lengths."""
     depth = torch.full(z_rays.shape[:2], torch.inf, dtype=torch.float64)
     for index, (low, high) in enumerate(room.boxes):
         low_t = torch.tensor(low, dtype=torch.float64) * room.unit

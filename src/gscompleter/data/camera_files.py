@@ -7,6 +7,8 @@
   position and a target in the world of the splat rotated by 180° about z, where y points up. It has
   no image size and no roll: cameras are upright, with the field of view of the longer side.
 * Exports of Metashape and RealityScan, and models without cameras, are refused, with advice.
+* Exports of Metashape, RealityScan and Polycam, and unstitched files of Insta360 are refused, with
+  advice.
 """
 
 from __future__ import annotations
@@ -49,6 +51,10 @@ SPLAT_FROM_WORLD = np.array([-1.0, -1.0, 1.0])
 
 METASHAPE = ("Metashape", "export its cameras as COLMAP, which Metashape does since 2.2")
 REALITYSCAN = ("RealityScan", "export its registration as COLMAP")
+METASHAPE = ("cameras of Metashape", "export its cameras as COLMAP, which Metashape does since 2.2")
+REALITYSCAN = ("cameras of RealityScan", "export its registration as COLMAP")
+POLYCAM = ("cameras of Polycam", "make nerfstudio's transforms.json by ns-process-data polycam")
+INSTA360 = ("unstitched images of Insta360", "export 360° JPEG or MP4 (2:1) from Insta360 Studio")
 EXPORTS = (
     ((".psx", ".psz"), b"", METASHAPE),
     ((".xml",), b"<chunk", METASHAPE),
@@ -58,6 +64,11 @@ EXPORTS = (
 )
 """Endings of files that are not read, what their first bytes hold, the program and what to do."""
 MODELS = (".usdz", ".fbx", ".las", ".laz", ".obj", ".stl")
+    ((".json",), b'"t_00"', POLYCAM),
+    ((".insp", ".insv"), b"", INSTA360),
+"""Endings of files that are not read, what their first bytes hold, their content and what to do."""
+PLACES = ("*", "*cameras/*.json", "keyframes/*cameras/*.json")
+"""Places of such files in a folder; the last two are Polycam's."""
 
 
 def read_cameras(path: Path, resolution: Resolution = None) -> list[Frame]:
@@ -168,8 +179,10 @@ def refuse_other_exports(path: Path) -> None:
     )
     inside = sorted(path.glob("*"))
     for file, (endings, mark, (program, advice)) in product([path, *inside], EXPORTS):
+    inside = [file for place in PLACES for file in sorted(path.glob(place))]
+    for file, (endings, mark, (content, advice)) in product([path, *inside], EXPORTS):
         require(
             file.suffix.lower() not in endings or mark not in read_head(file, 4096),
-            f"{quote_value(file)} holds cameras of {program}, which cannot be read; {advice}, or "
+            f"{quote_value(file)} holds {content}, which cannot be read; {advice}, or "
             "name a folder of the photographs alone.",
         )

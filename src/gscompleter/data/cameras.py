@@ -168,8 +168,8 @@ def compute_undistortion_map(
 
 
 def remap(
-    image: Shaped[np.ndarray, "h w *c"], source: Float[np.ndarray, "h w 2"], interpolation: int
-) -> Shaped[np.ndarray, "h w *c"]:
+    image: Shaped[np.ndarray, "h w *c"], source: Float[np.ndarray, "h2 w2 2"], interpolation: int
+) -> Shaped[np.ndarray, "h2 w2 *c"]:
     """Sample `image` at the positions `source`."""
     x, y = np.ascontiguousarray(source[..., 0]), np.ascontiguousarray(source[..., 1])
     return np.asarray(cv2.remap(image, x, y, interpolation, borderMode=cv2.BORDER_REPLICATE))

@@ -33,7 +33,7 @@ PURPOSES = {
     "poses": "photographs whose cameras are not known",
     "live": "completing in the browser with gscompleter live",
     "browser": "the picture of the viewer (examples/04_picture_of_the_viewer.py)",
-    "film": "complete --video",
+    "film": "videos as SCENE, and complete --video",
     "ray": "batch --engine ray",
     "slurm": "batch --engine submitit",
     "waymo": "the Waymo Open Dataset 2, whose tables are parquet",

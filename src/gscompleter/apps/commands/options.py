@@ -28,6 +28,7 @@ FigureName = Literal[
     "qualitative", "densification", "registration", "seams", "sequence", "all"
 ]
 # fmt: on
+NumFrames = Annotated[int, Interval(ge=3, le=1000)]
 AUTO = "auto"
 """Generator of the preset, or else the default one."""
 Device = Literal["auto", "cpu", "cuda"]
@@ -102,6 +103,11 @@ class SceneOptions(ComputeOptions, WritingOptions):
     """Folder of the photographs: COLMAP, nerfstudio, cameras.json, LLFF, KITTI, DGP, Waymo,
     PandaSet, a pixelSplat chunk, a RealEstate10K camera file, or what Polycam, Record3D or 3d
     Scanner App exports. If it has no cameras, COLMAP finds them and they are kept in OUT/colmap."""
+    PandaSet, a pixelSplat chunk or a RealEstate10K camera file. If it has no cameras, COLMAP finds
+    them and they are kept in OUT/colmap; also of 360° panoramas (2:1) and of a video (.mp4, .mov,
+    .mkv)."""
+    frames: NumFrames = 40
+    """Most frames of a video to take as photographs, sharp ones at even steps of the camera."""
     context: Frames = None
     """Frame numbers of the photographs to work with, counted in the order of their file paths. If
     not given, those that help most; photographs of targets are never used. `clean` takes all."""
@@ -368,11 +374,14 @@ class ModelsOptions(Settings):
 class PosesOptions(ComputeOptions, WritingOptions):
     """Find the cameras of photographs with COLMAP, and write a COLMAP folder.
 
-    A second run with the same photographs keeps the result.
+    A second run with the same photographs or video keeps the result.
     """
 
     photographs: Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="PHOTOS")]
-    """Folder of overlapping photographs of one scene. They are not changed."""
+    """Folder of overlapping photographs or 360° panoramas (2:1) of one scene, or a video. They are
+    not changed."""
+    frames: NumFrames = 40
+    """Most frames of a video to take as photographs, sharp ones at even steps of the camera."""
     out: Path
     """Output folder: upright copies in images, cameras and points in sparse/0."""
 

@@ -35,6 +35,7 @@ def describe_run(
         "settings": {
             "folder": str(options.folder),
             "format": options.format,
+            "frames": options.frames,
             "context": None if options.context is None else list(options.context),
             "scene": splat,
             **settings,

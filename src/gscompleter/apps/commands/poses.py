@@ -12,7 +12,7 @@ from gscompleter.progress import show_progress
 def run_poses(options: PosesOptions) -> None:
     """Find and write the cameras, and print their number and error."""
     with show_progress(Console(stderr=True, quiet=options.quiet)):
-        found = find_poses(options.photographs, options.out, options.overwrite)
+        found = find_poses(options.photographs, options.out, options.overwrite, options.frames)
     if options.quiet:
         return
     for note in found.notes:

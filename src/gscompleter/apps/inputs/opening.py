@@ -130,14 +130,14 @@ class Task:
 
 
 def open_scene(options: SceneOptions, console: Console) -> Opened:
-    """Open the photographs. If they have no cameras, find them and keep them in OUT."""
+    """Open the photographs or video. If they have no cameras, find them and keep them in OUT."""
     folder, poses, number = options.folder, options.out / POSES, None
     refuse_splat(folder)
     if options.format is None and has_photographs(folder) and find_format(folder) is None:
         refuse_other_exports(folder)
         refuse_scenes_below(folder)
         ours = options.overwrite or os.path.isfile(poses / SUMMARY_FILE)
-        found = find_poses(folder, poses, overwrite=ours)
+        found = find_poses(folder, poses, ours, options.frames)
         print_lines(console, *found.notes)
         folder, number = poses, found.photographs
     given = open_photographs(folder, options.format, options.near, options.far)
@@ -153,7 +153,7 @@ def refuse_splat(path: Path) -> None:
     if not os.path.isdir(path) and path.name.lower().endswith(SPLAT_EXTENSIONS):
         raise InputError(
             f"{quote_value(path, 80)} is a file of Gaussians, which goes to --scene; SCENE has to "
-            "be the folder of its photographs, with or without cameras."
+            "be the folder of its photographs, with or without cameras, or a video."
         )
 
 

@@ -23,6 +23,7 @@ import numpy as np
 import pycolmap
 from jaxtyping import Float
 
+from gscompleter.data.panorama import VIEWS, compute_rotation
 from gscompleter.data.sfm.poses import MIN_PHOTOGRAPHS, UprightCopy
 
 SEED = 0
@@ -74,6 +75,8 @@ class Job:
     model: str
     """Folder for the largest model; it does not exist yet."""
     photographs: list[UprightCopy]
+    is_panoramic: bool
+    """True if these are views of panoramas, in the folders view_0, view_1, …"""
     threads: int
 
     @property
@@ -90,6 +93,8 @@ def main() -> None:
     pycolmap.logging.minloglevel = pycolmap.logging.Level.ERROR.value
     pycolmap.set_random_seed(SEED)
     find_features(job)
+    if job.is_panoramic:
+        join_views(job)
     match(job, select_pairs(job))
     print(json.dumps(map_photographs(job)))
 
@@ -112,6 +117,18 @@ def find_features(job: Job) -> None:
         )
 
 
+def join_views(job: Job) -> None:
+    """Join the views of each panorama to a rig, with known rotations and one centre."""
+    rig = pycolmap.RigConfig()
+    for number, view in enumerate(VIEWS):
+        turn = pycolmap.Rigid3d(pycolmap.Rotation3d(compute_rotation(*view).T), np.zeros(3))
+        camera = pycolmap.RigConfigCamera(image_prefix=f"view_{number}/", ref_sensor=number == 0)
+        camera.cam_from_rig = turn if number else None
+        rig.cameras = [*rig.cameras, camera]
+    with pycolmap.Database.open(job.database) as database:
+        pycolmap.apply_rig_config([rig], database)
+
+
 def _add_camera(job: Job, one: UprightCopy) -> int:
     focal = one.focal or GUESSED_FOCAL * max(one.width, one.height)
     camera = pycolmap.Camera.create_from_model_name(1, LENS, focal, one.width, one.height)
@@ -123,11 +140,15 @@ def _add_camera(job: Job, one: UprightCopy) -> int:
 def select_pairs(job: Job) -> Pairs:
     """Choose the photographs to match: sequence neighbours, all pairs, or similar photographs."""
     names = [one.name for one in job.photographs]
-    neighbours = pair_neighbours(len(names)) if is_sequence(names) else set()
-    if not neighbours and len(names) <= MAX_EXHAUSTIVE:
-        return pair_all(len(names))
-    with pycolmap.Database.open(job.database) as database:
-        return neighbours | pair_similar([_read_features(database, name) for name in names])
+    pairs = pair_neighbours(len(names)) if is_sequence(names) else set()
+    if not pairs and len(names) <= MAX_EXHAUSTIVE:
+        pairs = pair_all(len(names))
+    else:
+        with pycolmap.Database.open(job.database) as database:
+            pairs |= pair_similar([_read_features(database, name) for name in names])
+    # Between views of one panorama there is no baseline.
+    centres = [name.partition("/")[2] if job.is_panoramic else name for name in names]
+    return {(i, j) for i, j in pairs if centres[i] != centres[j]}
 
 
 def _read_features(database: Any, name: str) -> np.ndarray:
@@ -160,7 +181,7 @@ def map_photographs(job: Job) -> dict[str, Any]:
     if model is None:
         return {"registered": [], "points": 0, "error": 0.0, "is_plausible": True, "focal": None}
     counts = _count_photographs(model)
-    if min(counts.values()) >= MIN_FOR_CENTRE:
+    if min(counts.values()) >= MIN_FOR_CENTRE and not job.is_panoramic:
         # Fewer photographs cannot separate the principal point from a rotation.
         model = refine_lenses(model, refine_principal_point=True)
     Path(job.model).mkdir(parents=True)
@@ -176,6 +197,8 @@ def map_photographs(job: Job) -> dict[str, Any]:
 
 def select_model(job: Job) -> tuple[pycolmap.Reconstruction | None, bool]:
     """Map with a free focal length, then with plausible fixed ones (True), until it is good."""
+    if job.is_panoramic:  # the focal length of views is known
+        return map_largest(job, is_focal_fixed=True), False
     best, is_focal_fixed = map_largest(job), False
     wanted = math.ceil(WANTED_SHARE * len(job.photographs))
     for fov in FIXED_FOVS:
@@ -233,6 +256,7 @@ def map_largest(job: Job, is_focal_fixed: bool = False) -> pycolmap.Reconstructi
         min_model_size=MIN_PHOTOGRAPHS,
         ba_refine_focal_length=not is_focal_fixed,
         ba_refine_extra_params=not is_focal_fixed,
+        ba_refine_sensor_from_rig=False,
     )
     found = pycolmap.incremental_mapping(job.database, job.images, job.work, options)
     return max(found.values(), key=lambda model: model.num_reg_images(), default=None)

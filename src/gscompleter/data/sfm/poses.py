@@ -1,8 +1,9 @@
-"""Camera poses for photographs without poses, by COLMAP on the CPU.
+"""Camera poses for photographs, panoramas and videos without poses, by COLMAP on the CPU.
 
 The output folder has COLMAP's standard layout: copies in `images`, the model in `sparse/0`. COLMAP
-ignores the EXIF orientation, so the pixels of the copies are rotated. A `summary.json` records the
-input photographs, so that the next run can reuse the result.
+ignores the EXIF orientation, so the pixels of the copies are rotated. Panoramas are split into
+views, and of a video some frames are photographs. A `summary.json` records the input files, so that
+the next run can reuse the result.
 """
 
 from __future__ import annotations
@@ -15,7 +16,8 @@ import shutil
 import subprocess
 import sys
 import tempfile
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from dataclasses import asdict, dataclass, replace
 from importlib.util import find_spec
 from pathlib import Path
@@ -24,7 +26,11 @@ from typing import Any
 from PIL import Image, ImageOps
 
 from gscompleter.cpu_threads import get_thread_count
+from gscompleter.data.camera_files import refuse_other_exports
 from gscompleter.data.frame import DOWNSCALE_FACTORS, MASKS
+from gscompleter.data.limits import require
+from gscompleter.data.panorama import has_panoramas, split_panorama
+from gscompleter.data.video import NUM_FRAMES, extract_frames, is_video
 from gscompleter.errors import InputError, join_names, quote_value
 from gscompleter.io.files import SUMMARY_FILE, open_output_folder
 from gscompleter.io.image import ORIENTATION, open_image
@@ -70,7 +76,7 @@ class UprightCopy:
     focal: float | None
     """Focal length in pixels of the copy from EXIF, or None."""
     lens: str
-    """Key of camera, lens and zoom from EXIF."""
+    """Key of camera, lens and zoom from EXIF, or of the view of a panorama."""
 
 
 @dataclass(frozen=True)
@@ -87,6 +93,8 @@ class FoundPoses:
     """Focal length in pixels of the copies if it had to be fixed at first, else None."""
     reused: bool = False
     """True if the result is from an earlier run."""
+    origin: str = ""
+    """Sentences on how a video or panoramas became photographs."""
 
     @property
     def num_registered(self) -> int:
@@ -96,7 +104,7 @@ class FoundPoses:
     @property
     def notes(self) -> list[str]:
         """Sentences for the user."""
-        notes = []
+        notes = [self.origin] if self.origin else []
         if self.focal is not None:
             notes.append(
                 f"{self.num_registered} of {self.photographs} cameras were found with a focal "
@@ -108,11 +116,11 @@ class FoundPoses:
         return notes
 
 
-def find_poses(photographs: Path, out: Path, overwrite: bool = False) -> FoundPoses:
-    """Find the cameras of the `photographs` in a folder and write them to the folder `out`."""
-    names = list_photograph_files(photographs)
-    stats = {name: (photographs / name).stat() for name in names}
-    known = {name: [stat.st_size, stat.st_mtime_ns] for name, stat in stats.items()}
+def find_poses(
+    photographs: Path, out: Path, overwrite: bool = False, num_frames: int = NUM_FRAMES
+) -> FoundPoses:
+    """Find the cameras of a folder of photographs or of a video's frames; write them to `out`."""
+    known = _identify_input(photographs, num_frames)
     earlier = _read_earlier(out, known)
     if earlier is not None:
         return earlier
@@ -121,11 +129,34 @@ def find_poses(photographs: Path, out: Path, overwrite: bool = False) -> FoundPo
             "Finding the cameras of photographs needs pycolmap, which is not installed; run "
             "pip install 'gscompleter[poses]'."
         )
-    with open_output_folder(out, overwrite) as folder:
-        found = _run(photographs, names, folder)
+    with (
+        open_output_folder(out, overwrite) as folder,
+        _open_images(photographs, num_frames, folder) as images,
+    ):
+        found = _run(images, folder, photographs)
         content = {"poses": asdict(found), "photographs": known}
         (folder / SUMMARY_FILE).write_bytes(json.dumps(content, indent=1).encode())
     return found
+
+
+def _identify_input(path: Path, num_frames: int) -> dict[str, list[int]]:
+    """Identify photographs by size and time of change, a video also by the number of frames."""
+    if is_video(path):
+        stat = path.stat()
+        return {path.name: [stat.st_size, stat.st_mtime_ns, num_frames]}
+    stats = {name: (path / name).stat() for name in list_photograph_files(path)}
+    return {name: [stat.st_size, stat.st_mtime_ns] for name, stat in stats.items()}
+
+
+@contextmanager
+def _open_images(path: Path, num_frames: int, home: Path) -> Iterator[Path]:
+    """Open a folder of photographs, or a temporary one in `home` with frames of a video."""
+    if not is_video(path):
+        yield path
+        return
+    with tempfile.TemporaryDirectory(dir=home) as folder:
+        extract_frames(path, Path(folder), num_frames)
+        yield Path(folder)
 
 
 def _read_earlier(out: Path, known: Mapping[str, list[int]]) -> FoundPoses | None:
@@ -140,19 +171,32 @@ def _read_earlier(out: Path, known: Mapping[str, list[int]]) -> FoundPoses | Non
 
 
 def has_photographs(path: Path) -> bool:
-    """Check whether `path` is a folder with photographs, with or without cameras."""
-    return os.path.isdir(path) and bool(_walk_photographs(path))
+    """Check whether `path` is a video or a folder with photographs, with or without cameras."""
+    return is_video(path) or (os.path.isdir(path) and bool(_walk_photographs(path)))
 
 
 def list_photograph_files(folder: Path) -> list[str]:
-    """List the photographs below a folder in natural order; at least `MIN_PHOTOGRAPHS`."""
+    """List the photographs below a folder in natural order; two panoramas or three others."""
     names = _walk_photographs(folder)
     if len(names) < MIN_PHOTOGRAPHS:
-        raise InputError(
-            f"There are {len(names)} photographs ({', '.join(ENDINGS)}) in {quote_value(folder)}, "
-            f"and at least {MIN_PHOTOGRAPHS} are needed to find their cameras; add more."
-        )
+        _check_few(folder, names)
     return names
+
+
+def _check_few(folder: Path, names: Sequence[str]) -> None:
+    """Refuse one or two photographs, or one panorama."""
+    refuse_other_exports(folder)
+    is_panoramic = has_panoramas([folder / name for name in names])
+    require(
+        is_panoramic,
+        f"There are {len(names)} photographs ({', '.join(ENDINGS)}) in {quote_value(folder)}, and "
+        f"at least {MIN_PHOTOGRAPHS} are needed to find their cameras; add more.",
+    )
+    require(
+        len(names) > 1,
+        f"There is a single panorama in {quote_value(folder)}, which shows no depth; add another "
+        "one, taken a step away.",
+    )
 
 
 def _walk_photographs(folder: Path) -> list[str]:
@@ -171,25 +215,56 @@ def is_own(folder: Path) -> bool:
     return not os.path.isfile(folder / SUMMARY_FILE)
 
 
-def _run(photographs: Path, names: Sequence[str], folder: Path) -> FoundPoses:
-    """Write `images` and `sparse/0` into `folder`."""
+def _run(photographs: Path, folder: Path, given: Path) -> FoundPoses:
+    """Write `images` and `sparse/0` of photographs, made from what was `given`, into `folder`."""
+    names = list_photograph_files(photographs)
+    is_panoramic = has_panoramas([photographs / name for name in names])
     copies = [
-        write_upright(photographs, name, folder / "images")
+        copy
         for name in track(names, "Turning photographs upright")
+        for copy in write_copies(photographs, name, folder / "images", is_panoramic)
     ]
-    result = _map(copies, folder)
+    result = _map(copies, folder, is_panoramic)
     missing = [copy.source for copy in copies if copy.name not in result["registered"]]
-    found = FoundPoses(len(names), missing, result["points"], result["error"], result["focal"])
-    enough = max(MIN_PHOTOGRAPHS, MIN_SHARE * len(names))
+    counts = len(copies), missing, result["points"], result["error"], result["focal"]
+    found = FoundPoses(*counts, origin=_describe_origin(given, len(names), len(copies)))
+    enough = max(MIN_PHOTOGRAPHS, MIN_SHARE * len(copies))
     is_large = found.num_registered >= enough and found.points >= MIN_POINTS
     if not (is_large and result["is_plausible"]):
         lens = "" if result["is_plausible"] else " and an implausible lens"
         raise InputError(
             f"COLMAP placed {found.num_registered} of {found.photographs} photographs in "
-            f"{quote_value(photographs, 40)}, with {found.points:,} points{lens}, which is no "
+            f"{quote_value(given, 40)}, with {found.points:,} points{lens}, which is no "
             "usable model; add sharp photographs that overlap by two thirds, or name their cameras."
         )
     return found
+
+
+def _describe_origin(given: Path, images: int, copies: int) -> str:
+    """Describe the frames of a video and the views of panoramas; empty for photographs."""
+    sentences = []
+    if is_video(given):
+        sentences.append(f"{images} sharp frames of {quote_value(given)} serve as photographs.")
+    if copies > images:
+        sentences.append(f"{images} panoramas were split into {copies} views of 90° each.")
+    return " ".join(sentences)
+
+
+def write_copies(root: Path, source: str, folder: Path, is_panoramic: bool) -> list[UprightCopy]:
+    """Write the upright copy of a photograph, or the views of a panorama, into `folder`.
+
+    The views of all panoramas with the same direction are in one folder, as COLMAP's rigs need it.
+    """
+    if not is_panoramic:
+        return [write_upright(root, source, folder)]
+    copies = []
+    for number, pixels in enumerate(split_panorama(root / source)):
+        kind, name = f"view_{number}", Path(re.sub(r"[\s#]", "_", source)).with_suffix(".jpg")
+        target = _prepare_target(folder / kind / name, root / source)
+        Image.fromarray(pixels).save(target, quality=QUALITY, subsampling=0)
+        side, place = len(pixels), f"{kind}/{name.as_posix()}"
+        copies.append(UprightCopy(place, place, side, side, side / 2, kind))
+    return copies
 
 
 def write_upright(root: Path, source: str, folder: Path) -> UprightCopy:
@@ -248,7 +323,7 @@ def _describe_lens(exif: Image.Exif) -> str:
     return " ".join(map(str, values))
 
 
-def _map(copies: Sequence[UprightCopy], folder: Path) -> dict[str, Any]:
+def _map(copies: Sequence[UprightCopy], folder: Path, is_panoramic: bool) -> dict[str, Any]:
     """Run `mapping_process` on the copies in `folder/images`; return its result."""
     with tempfile.TemporaryDirectory(dir=folder) as work, stage("Finding cameras"):
         job = {
@@ -256,6 +331,7 @@ def _map(copies: Sequence[UprightCopy], folder: Path) -> dict[str, Any]:
             "work": work,
             "model": str(folder / "sparse" / "0"),
             "photographs": [asdict(copy) for copy in copies],
+            "is_panoramic": is_panoramic,
             "threads": min(MAX_THREADS, get_thread_count()),
         }
         done = subprocess.run(

@@ -1,0 +1,102 @@
+"""Equirectangular panoramas, split into pinhole views that share one centre.
+
+A panorama shows all directions: longitude along its width, latitude along its height. Axes are
+those of a camera that faces its middle (x right, y down, z forward). No view looks down, where the
+operator or the tripod is.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator, Sequence
+from pathlib import Path
+
+import cv2
+import numpy as np
+from jaxtyping import Float, UInt8
+from PIL import Image
+
+from gscompleter.data.cameras import remap
+from gscompleter.data.limits import require
+from gscompleter.errors import quote_value
+from gscompleter.io.image import open_image, read_brightness, read_image_size
+from gscompleter.io.reading import read_head
+
+VIEWS = (*((yaw, 0) for yaw in range(0, 360, 60)), *((yaw, 50) for yaw in range(0, 360, 120)))
+"""Yaw and pitch (upwards) of the views in degrees, each 90° wide; the first faces the middle."""
+MAX_SIDE = 1600
+"""Largest side of a view in pixels."""
+BORDER = 4
+"""Columns that are repeated on the other side, in pixels."""
+MARK, HEAD = b"equirectangular", 1 << 18
+"""Projection in Google's photo sphere metadata (GPano), and the first bytes that have it."""
+SMALL_WIDTH = 1024
+"""Width at which borders are compared."""
+MAX_SEAM = 3.0
+"""Largest difference of the left and right border, relative to neighbouring columns."""
+MAX_POLE = 0.5
+"""Largest deviation along the upper and lower border, relative to other rows."""
+MIN_STRUCTURE = 0.3
+"""Smallest deviation along the left border, relative to other columns."""
+
+
+def has_panoramas(files: Sequence[Path]) -> bool:
+    """Check whether photographs are panoramas; panoramas and others together are refused.
+
+    They are if they are exactly twice as wide as high and either the metadata of one of them say
+    so, or the borders of most of them meet as on a sphere.
+    """
+    sizes = zip(files, map(read_image_size, files), strict=True)
+    wide = [path for path, (width, height) in sizes if width == 2 * height]
+    marked = any(MARK in read_head(path, HEAD) for path in wide)
+    if not marked and 2 * sum(map(_is_closed, wide)) <= len(wide):
+        return False
+    require(
+        len(wide) == len(files),
+        f"Beside {quote_value(wide[0], 80)} and other panoramas lie {len(files) - len(wide)} "
+        "photographs that are none; put the panoramas into a folder of their own.",
+    )
+    return True
+
+
+def _is_closed(path: Path) -> bool:
+    """Check whether left and right border continue each other, and each pole is one point."""
+    pixels = read_brightness(path, SMALL_WIDTH)
+    steps = np.abs(np.diff(pixels, axis=1, append=pixels[:, :1])).mean(axis=0)
+    rows, columns = pixels.std(axis=1), pixels.std(axis=0)
+    return bool(
+        steps[-1] < MAX_SEAM * np.median(steps)
+        and max(rows[0], rows[-1]) < MAX_POLE * np.median(rows)
+        and columns[0] > MIN_STRUCTURE * np.median(columns)
+    )
+
+
+def split_panorama(path: Path) -> Iterator[UInt8[np.ndarray, "s s 3"]]:
+    """Draw the `VIEWS` of a panorama, at its resolution or `MAX_SIDE`."""
+    widest = math.ceil(math.pi * MAX_SIDE)
+    with open_image(path) as image:
+        image.draft("RGB", (widest, widest // 2))
+        panorama = image.convert("RGB")
+    panorama.thumbnail((widest, widest), Image.Resampling.LANCZOS)
+    pixels = np.pad(np.asarray(panorama), ((0, 0), (BORDER, BORDER), (0, 0)), mode="wrap")
+    for view in VIEWS:
+        places = _project_rays(compute_rotation(*view), panorama.width)
+        yield remap(pixels, places, cv2.INTER_CUBIC)
+
+
+def _project_rays(rotation: Float[np.ndarray, "3 3"], width: int) -> Float[np.ndarray, "s s 2"]:
+    """Project the pixels of a view to positions (x, y) in a panorama of this width with borders."""
+    side = round(width / math.pi)
+    places = (np.arange(side) + 0.5) / side * 2 - 1
+    rays = np.stack([*np.meshgrid(places, places), np.ones((side, side))], axis=-1) @ rotation.T
+    longitude = np.arctan2(rays[..., 0], rays[..., 2])
+    latitude = np.arctan2(rays[..., 1], np.hypot(rays[..., 0], rays[..., 2]))
+    x = (longitude / (2 * np.pi) + 0.5) * width - 0.5 + BORDER
+    y = (latitude / np.pi + 0.5) * width / 2 - 0.5
+    return np.stack([x, y], axis=-1).astype(np.float32)
+
+
+def compute_rotation(yaw: int, pitch: int) -> Float[np.ndarray, "3 3"]:
+    """Compute the rotation from the axes of a view (degrees) to those of its panorama."""
+    turned, raised = (0.0, math.radians(yaw), 0.0), (math.radians(pitch), 0.0, 0.0)
+    return cv2.Rodrigues(np.array(turned))[0] @ cv2.Rodrigues(np.array(raised))[0]
