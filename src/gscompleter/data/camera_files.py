@@ -6,9 +6,8 @@
 * SuperSplat's poses are the `poseSets` of a project's document.json, or the list. A pose has a
   position and a target in the world of the splat rotated by 180° about z, where y points up. It has
   no image size and no roll: cameras are upright, with the field of view of the longer side.
-* Exports of Metashape and RealityScan, and models without cameras, are refused, with advice.
-* Exports of Metashape, RealityScan and Polycam, and unstitched files of Insta360 are refused, with
-  advice.
+* Exports of Metashape and RealityScan, unstitched files of Insta360, and models without cameras are
+  refused, with advice.
 """
 
 from __future__ import annotations
@@ -49,11 +48,8 @@ DEFAULT_FOV, FOV_RANGE = 60.0, (1.0, 179.0)
 SPLAT_FROM_WORLD = np.array([-1.0, -1.0, 1.0])
 """Axis factors from SuperSplat's world to the splat: 180° about z."""
 
-METASHAPE = ("Metashape", "export its cameras as COLMAP, which Metashape does since 2.2")
-REALITYSCAN = ("RealityScan", "export its registration as COLMAP")
 METASHAPE = ("cameras of Metashape", "export its cameras as COLMAP, which Metashape does since 2.2")
 REALITYSCAN = ("cameras of RealityScan", "export its registration as COLMAP")
-POLYCAM = ("cameras of Polycam", "make nerfstudio's transforms.json by ns-process-data polycam")
 INSTA360 = ("unstitched images of Insta360", "export 360° JPEG or MP4 (2:1) from Insta360 Studio")
 EXPORTS = (
     ((".psx", ".psz"), b"", METASHAPE),
@@ -61,14 +57,10 @@ EXPORTS = (
     ((".rspj", ".rcproj"), b"", REALITYSCAN),
     ((".csv",), b"#name,", REALITYSCAN),
     ((".csv",), b"#cameras", REALITYSCAN),
-)
-"""Endings of files that are not read, what their first bytes hold, the program and what to do."""
-MODELS = (".usdz", ".fbx", ".las", ".laz", ".obj", ".stl")
-    ((".json",), b'"t_00"', POLYCAM),
     ((".insp", ".insv"), b"", INSTA360),
+)
 """Endings of files that are not read, what their first bytes hold, their content and what to do."""
-PLACES = ("*", "*cameras/*.json", "keyframes/*cameras/*.json")
-"""Places of such files in a folder; the last two are Polycam's."""
+MODELS = (".usdz", ".fbx", ".las", ".laz", ".obj", ".stl")
 
 
 def read_cameras(path: Path, resolution: Resolution = None) -> list[Frame]:
@@ -178,8 +170,6 @@ def refuse_other_exports(path: Path) -> None:
         "Scaniverse exports; record with Polycam, Record3D or 3d Scanner App, or take photographs.",
     )
     inside = sorted(path.glob("*"))
-    for file, (endings, mark, (program, advice)) in product([path, *inside], EXPORTS):
-    inside = [file for place in PLACES for file in sorted(path.glob(place))]
     for file, (endings, mark, (content, advice)) in product([path, *inside], EXPORTS):
         require(
             file.suffix.lower() not in endings or mark not in read_head(file, 4096),

@@ -76,41 +76,6 @@ def clean_by_photographs(options: CleanOptions, console: Console) -> Cleaning:
     check_context(options)
     device = choose_device(options.device)
     renderer = load_renderer(device)
-    with show_progress(console):
-        opened = open_scene(options, console)
-        with show_preparation("reading photographs"):
-            task = read_photographs(options, opened, device)
-        with show_preparation("reading the scene"):
-            loaded = load_splat(options.scene, options.drop_nonfinite)
-        compile_kernels([device])
-        with show_preparation("aligning the scene"):
-            task = move_to_splat(task, loaded, options.scene, options, opened)
-        given, splat_file = task.scene, task.splat_file
-        assert given is not None
-        assert splat_file is not None
-        task = apply_working_range(task, renderer)
-        plan = f"compared with {len(task.views)} photographs on {device}"
-        plan += f", written to {quote_value(options.out)}"
-        print_lines(console, *describe_opening(options, opened, task), f"To do: {plan}.")
-        with open_output_folder(options.out, is_replaceable(options)) as folder:
-            with record_seconds(()) as seconds, timed_stage("clean"):
-                removed = find_superfluous(given, task.views, renderer, options.config)
-            summary = {
-                "version": __version__,
-                **describe_run(options, opened, task, options.config),
-                **score_cleaning(given, task.views, removed, renderer),
-                "seconds": seconds,
-            }
-            if removed.all():
-                raise InputError(
-                    "Every Gaussian of the splat makes the photographs worse; check that they show "
-                    "the same scene."
-                )
-            with stage("writing"):
-                save_completed_splat(folder, given, removed, given[:0], splat_file)
-                (folder / SUMMARY_FILE).write_bytes(json.dumps(summary, indent=2).encode() + b"\n")
-    if not options.quiet:
-        print_cleaning(summary, options.out)
     opened = open_scene(options, console)
     with show_preparation("reading photographs"):
         task = read_photographs(options, opened, device)
@@ -176,7 +141,7 @@ def write_cleaning(folder: Path, cleaning: Cleaning, dry_run: bool) -> None:
         save_completed_splat(folder, given, removed, given[:0], splat_file)
     elif removed.any():
         save_changed(folder, given, removed, splat_file)
-    (folder / SUMMARY_FILE).write_text(json.dumps(cleaning.summary, indent=2) + "\n")
+    (folder / SUMMARY_FILE).write_bytes(json.dumps(cleaning.summary, indent=2).encode() + b"\n")
 
 
 def count_removed(removed: Bool[Tensor, "n"]) -> dict[str, int]:

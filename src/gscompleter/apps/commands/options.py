@@ -102,10 +102,8 @@ class SceneOptions(ComputeOptions, WritingOptions):
     folder: Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="SCENE")]
     """Folder of the photographs: COLMAP, nerfstudio, cameras.json, LLFF, KITTI, DGP, Waymo,
     PandaSet, a pixelSplat chunk, a RealEstate10K camera file, or what Polycam, Record3D or 3d
-    Scanner App exports. If it has no cameras, COLMAP finds them and they are kept in OUT/colmap."""
-    PandaSet, a pixelSplat chunk or a RealEstate10K camera file. If it has no cameras, COLMAP finds
-    them and they are kept in OUT/colmap; also of 360° panoramas (2:1) and of a video (.mp4, .mov,
-    .mkv)."""
+    Scanner App exports. If it has no cameras, COLMAP finds them and they are kept in OUT/colmap;
+    also of 360° panoramas (2:1) and of a video (.mp4, .mov, .mkv)."""
     frames: NumFrames = 40
     """Most frames of a video to take as photographs, sharp ones at even steps of the camera."""
     context: Frames = None
