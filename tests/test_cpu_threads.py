@@ -44,6 +44,7 @@ def test_every_library_takes_as_many_as_it_is_told():
     assert counted("1") == [1, 1, 1]
     assert counted("3")[1:] == [3, 3]  # torch takes no more than there are cores
 
+
 ARENAS = """
 import ctypes, threading
 from gscompleter.cpu_threads import limit_threads
