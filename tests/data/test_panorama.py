@@ -86,14 +86,14 @@ def test_panoramas_are_recognised_by_their_borders_or_their_metadata(tmp_path):
     assert has_panoramas([tmp_path / "marked.jpg", wide])
 
 
-def test_panoramas_among_photographs_are_refused(tmp_path, monkeypatch, capsys):
+def test_panoramas_beside_other_sizes_are_refused(tmp_path, monkeypatch, capsys):
     pytest.importorskip("pycolmap")
-    for number in range(2):
-        ordinary(panoramas(tmp_path / f"p{number}", 2) / "wide.png", 64)
+    for width in (64, 128):
+        ordinary(panoramas(tmp_path / f"p{width}", 2) / "other.png", width)
         out = tmp_path / "out"
-        assert run(monkeypatch, "poses", tmp_path / f"p{number}", "--out", out, "--quiet") == 2
+        assert run(monkeypatch, "poses", tmp_path / f"p{width}", "--out", out, "--quiet") == 2
         said = capsys.readouterr().err
-        assert "lie 1 photographs that are none; put the panoramas into" in said
+        assert "other panoramas lie photographs of other sizes; put panoramas of one size" in said
         assert said.count("\n") == 1
         assert not out.exists()
 

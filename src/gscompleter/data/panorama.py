@@ -41,20 +41,20 @@ MIN_STRUCTURE = 0.3
 
 
 def has_panoramas(files: Sequence[Path]) -> bool:
-    """Check whether photographs are panoramas; panoramas and others together are refused.
+    """Check whether photographs are panoramas; panoramas beside other sizes are refused.
 
     They are if they are exactly twice as wide as high and either the metadata of one of them say
     so, or the borders of most of them meet as on a sphere.
     """
-    sizes = zip(files, map(read_image_size, files), strict=True)
-    wide = [path for path, (width, height) in sizes if width == 2 * height]
+    sizes = [read_image_size(path) for path in files]
+    wide = [path for path, (w, h) in zip(files, sizes, strict=True) if w == 2 * h]
     marked = any(MARK in read_head(path, HEAD) for path in wide)
     if not marked and 2 * sum(map(_is_closed, wide)) <= len(wide):
         return False
     require(
-        len(wide) == len(files),
-        f"Beside {quote_value(wide[0], 80)} and other panoramas lie {len(files) - len(wide)} "
-        "photographs that are none; put the panoramas into a folder of their own.",
+        len(set(sizes)) == 1,
+        f"Beside {quote_value(wide[0], 80)} and other panoramas lie photographs of other sizes; put "
+        "panoramas of one size into a folder of their own.",
     )
     return True
 
