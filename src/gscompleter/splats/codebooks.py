@@ -65,10 +65,7 @@ def _find_nearest(book: Float[ndarray, "m"], values: Float[ndarray, "*n"]) -> In
 def _run_kmeans(
     rows: Float[ndarray, "n k"], count: int
 ) -> tuple[Float[ndarray, "m k"], Int32[ndarray, "n"]]:
-    """Find centres by k-means, always the same, and the nearest one to each row.
-
-    OpenCV is given a column of vectors, since it takes a single row for a column of numbers.
-    """
+    """Find centres by k-means, and the nearest to each row; OpenCV needs rows as vectors."""
     cv2.setRNGSeed(0)
     stop, nearest = (cv2.TERM_CRITERIA_MAX_ITER, ITERATIONS, 0.0), np.zeros(len(rows), np.int32)
     _, _, centres = cv2.kmeans(rows[:, None], count, nearest, stop, 1, cv2.KMEANS_PP_CENTERS)
