@@ -63,3 +63,12 @@ def test_many_rows_share_a_palette_that_is_closer_than_a_choice_of_rows():
     nearest = np.square(rows[sample, None] - some).sum(2).min(1)
     assert error[sample].mean() < 0.8 * nearest.mean()
     assert np.array_equal(palette, fit_palette(rows)[0])
+
+
+def test_a_row_far_from_all_others_is_kept():
+    """It is a cell of its own, of one row."""
+    rows = np.random.default_rng(3).standard_normal((2 * MIN_PALETTE_SIZE, 5)).astype(np.float32)
+    rows[77] = 1000 + np.arange(5)
+    palette, labels = fit_palette(rows)
+    assert np.allclose(palette[labels[77]], rows[77])
+    assert np.abs(palette[labels] - rows).max() < 10

@@ -6,7 +6,7 @@ import math
 
 import cv2
 import numpy as np
-from jaxtyping import Float, Int64, Integer, UInt8
+from jaxtyping import Float, Int32, Int64, UInt8
 from numpy import ndarray
 
 CODEBOOK_SIZE = 256
@@ -57,18 +57,16 @@ def fit_palette(
     return np.concatenate(palettes), labels[numbers.reshape(-1)]
 
 
-def _find_nearest(
-    book: Float[ndarray, "m"], values: Float[ndarray, "*n"]
-) -> Integer[ndarray, "*n"]:
+def _find_nearest(book: Float[ndarray, "m"], values: Float[ndarray, "*n"]) -> Int64[ndarray, "*n"]:
     """Find the entry of an ascending codebook that is nearest to each value."""
     return np.searchsorted((book[1:] + book[:-1]) / 2, values)
 
 
 def _run_kmeans(
     rows: Float[ndarray, "n k"], count: int
-) -> tuple[Float[ndarray, "m k"], Integer[ndarray, "n"]]:
-    """Find centres by k-means, always the same, and the nearest one to each row."""
+) -> tuple[Float[ndarray, "m k"], Int32[ndarray, "n"]]:
+    """Find centres by k-means, and the nearest to each row; OpenCV needs rows as vectors."""
     cv2.setRNGSeed(0)
     stop, nearest = (cv2.TERM_CRITERIA_MAX_ITER, ITERATIONS, 0.0), np.zeros(len(rows), np.int32)
-    _, _, centres = cv2.kmeans(rows, count, nearest, stop, 1, cv2.KMEANS_PP_CENTERS)
+    _, _, centres = cv2.kmeans(rows[:, None], count, nearest, stop, 1, cv2.KMEANS_PP_CENTERS)
     return np.asarray(centres), nearest
