@@ -43,14 +43,13 @@ def find_floaters(
     around = measure_surroundings(scene, config.neighbors)
     longest, middle, shortest = around.sigmas.unbind(dim=1)
     size, remoteness = longest / around.sigma, around.distance / around.spacing
-    is_detached = around.distance > config.needle_distance * around.sigma
+    is_large = size > config.max_size
+    is_detached = around.distance > config.max_size * around.sigma
     reasons = {
         "isolated": around.gap > config.max_gap,
         "huge": (shortest > config.max_thickness * around.spacing)
-        | ((size > config.max_size) & (remoteness > config.max_remoteness)),
-        "needles": (longest > config.max_elongation * middle)
-        & (size > config.needle_size)
-        & is_detached,
+        | (is_large & (remoteness > config.max_remoteness)),
+        "needles": is_large & is_detached & (longest > config.max_elongation * middle),
         "transparent": scene.opacities < config.min_opacity * (size / 2).clamp(1, MAX_BREADTH),
     }
     return {reason: mask & (scene.generated == 0) for reason, mask in reasons.items()}

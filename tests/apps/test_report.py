@@ -212,7 +212,9 @@ def test_the_viewer_is_linked_where_there_is_one(out):
     assert "gscompleter view OUT" in Page(render_completion_page(out)).said()
     (out / "view.html").write_text("")
     links = [link["href"] for link in Page(render_completion_page(out)).all("a")]
-    assert links == ["view.html#camera=target-1", "view.html"]
+    assert links == [
+        *("view.html#camera=target-1", "view.html#camera=target-1&play=1", "view.html"),
+    ]
 
 
 def broken_json(out: Path) -> None:

@@ -65,6 +65,41 @@ def test_the_cameras_turn(tab):
     assert 0.02 < moved.max() < 1
 
 
+FLOWN = """async () => {
+  const [button, ...names] = document.querySelectorAll(".turning .views button");
+  const flying = document.querySelector(".turning .flying");
+  const current = () => names.findIndex((name) => name.getAttribute("aria-current") === "true");
+  const log = [];
+  const tell = () => log.push([button.textContent, current(), flying.getAttribute("points")]);
+  const wait = async (done) => { while (!done()) await new Promise(requestAnimationFrame); };
+  tell();
+  button.click();
+  tell();
+  await wait(() => current() === 1);
+  button.click();
+  tell();
+  names.at(-1).click();
+  tell();
+  return [log, names.map((name) => name.textContent)];
+}"""
+"""Script that plays the path to its second camera, pauses it, and jumps to the last one."""
+
+
+def test_the_camera_path_plays_and_named_views_are_jumped_to(tab):
+    log, names = tab.page.evaluate(FLOWN)
+    assert names == ["Photograph 0", "Photograph 1", "Target 1"]
+    assert [button for button, _, _ in log] == ["Play", "Pause", "Play", "Play"]
+    assert [current for _, current, _ in log] == [0, 0, 1, 2]
+    places = [points for _, _, points in log]
+    assert len({*places}) == 3
+    points_of = (
+        "(name) => document.querySelector(`.turning polyline.${name}`).getAttribute('points')"
+    )
+    assert places[3] == tab.page.evaluate(points_of, "target")
+    assert places[0] in [tab.page.evaluate(points_of, kind) for kind in ("context", "anchor")]
+    assert tab.errors == []
+
+
 def test_it_fits_a_phone(browser, completed_room):
     tab = Tab(browser, completed_room / "report.html", 360, 700)
     assert tab.page.evaluate("document.documentElement.scrollWidth") <= 360

@@ -14,7 +14,7 @@ WORDS = ("brought", "told", "doubt", "doubted", "doubts", "believe", "believed",
 WORDS += ("wary", "evened", "witness", "witnesses", "set aside")
 VERBS = {"embed", "feed", "need", "seed", "read", "speed"}
 MAX_PARTICIPLES = 9
-FOLDERS = ("src", "tests", "benchmarks", "examples", "docs")
+FOLDERS = ("src", "tests", "benchmarks", "examples", "docs", "integrations")
 FILES = [path for folder in FOLDERS for path in sorted((ROOT / folder).rglob("*.py"))]
 SOURCES = [path for path in FILES if path.is_relative_to(ROOT / "src")]
 

@@ -257,11 +257,8 @@ class FloaterConfig(Settings):
     max_remoteness: Weight = 8.0
     """... and it is farther from them than this many spacings."""
     max_elongation: Annotated[float, Interval(ge=1, le=1e6)] = 30.0
-    """Needle: its size exceeds this many times its second largest standard deviation, ..."""
-    needle_size: Weight = 4.0
-    """... this many times the size of its neighbours, ..."""
-    needle_distance: Weight = 5.0
-    """... and it is farther from them than this many times their size."""
+    """Needle: its size exceeds this many times its second largest standard deviation, and both its
+    size and its distance from its neighbours exceed `max_size` times their size."""
     min_opacity: Share = 0.01
     """Transparent: its opacity is below this one, or up to ten times this one if it is larger than
     its neighbours: the limit is multiplied by half the ratio of the sizes."""

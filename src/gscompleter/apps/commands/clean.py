@@ -49,12 +49,19 @@ PHOTOGRAPH_OPTIONS = ("context", "format", "near", "far")
 
 @dataclass(frozen=True)
 class Cleaning:
-    """A splat, what goes, and the summary."""
+    """A splat and what goes."""
 
     given: Gaussians
     removed: Bool[Tensor, "n"]
     splat_file: InputSplatFile
-    summary: Mapping[str, Any]
+    run_info: Mapping[str, Any]
+    """Further entries of `summary.json`."""
+
+    @property
+    def counts(self) -> dict[str, int]:
+        """Numbers of Gaussians."""
+        count = int(self.removed.sum())
+        return {"given": len(self.given), "kept": len(self.given) - count, "removed": count}
 
 
 def run_clean(options: CleanOptions) -> None:
@@ -64,11 +71,18 @@ def run_clean(options: CleanOptions) -> None:
     clean = clean_alone if options.folder is None else clean_by_photographs
     with show_progress(console):
         cleaning = clean(options, console)
+        if cleaning.removed.all():
+            raise InputError(
+                "Every Gaussian of the splat would go; check the settings, and that photographs "
+                "show the same scene."
+            )
+        summary = {"version": __version__, **cleaning.run_info, "gaussians": cleaning.counts}
         with open_output_folder(options.out, is_replaceable(options)) as folder, stage("writing"):
             write_cleaning(folder, cleaning, options.dry_run)
+            (folder / SUMMARY_FILE).write_bytes(json.dumps(summary, indent=2).encode() + b"\n")
     if not options.quiet:
         begin, name = ("Dry run: ", REMOVED_FILE) if options.dry_run else ("", COMPLETED_FILE)
-        print(f"{begin}{describe_cleaning(cleaning.summary)}: {options.out / name}")
+        print(f"{begin}{describe_cleaning(summary)}: {options.out / name}")
 
 
 def clean_by_photographs(options: CleanOptions, console: Console) -> Cleaning:
@@ -92,19 +106,10 @@ def clean_by_photographs(options: CleanOptions, console: Console) -> Cleaning:
     print_lines(console, *describe_opening(options, opened, task), f"To do: {plan}.")
     with record_seconds(()) as seconds, timed_stage("clean"):
         removed = find_superfluous(given, task.views, renderer, options.config)
-    if removed.all():
-        raise InputError(
-            "Every Gaussian of the splat makes the photographs worse; check that they show the "
-            "same scene."
-        )
-    summary = {
-        "version": __version__,
-        **describe_run(options, opened, task, options.config),
-        "photographs": score_cleaning(given, task.views, removed, renderer),
-        "gaussians": count_removed(removed),
-        "seconds": seconds,
-    }
-    return Cleaning(given, removed, splat_file, summary)
+    run_info = describe_run(options, opened, task, options.config)
+    scores = score_cleaning(given, task.views, removed, renderer)
+    run_info = {**run_info, "photographs": scores, "seconds": seconds}
+    return Cleaning(given, removed, splat_file, run_info)
 
 
 def clean_alone(options: CleanOptions, console: Console) -> Cleaning:
@@ -115,17 +120,13 @@ def clean_alone(options: CleanOptions, console: Console) -> Cleaning:
     given = read_splat(options)
     with record_seconds(()) as seconds, timed_stage("clean"):
         reasons = find_floaters(given, options.floaters)
-    removed = torch.stack([*reasons.values()]).any(dim=0)
-    summary = {
-        "version": __version__,
+    run_info = {
         "settings": {"scene": str(options.scene), "floaters": asdict(options.floaters)},
         "reasons": {reason: int(mask.sum()) for reason, mask in reasons.items()},
-        "gaussians": count_removed(removed),
         "seconds": seconds,
     }
-    if removed.all():
-        raise InputError("Every Gaussian of the splat is a floater by these settings; relax them.")
-    return Cleaning(given, removed, locate_splat(options, options.scene), summary)
+    removed = torch.stack([*reasons.values()]).any(dim=0)
+    return Cleaning(given, removed, locate_splat(options, options.scene), run_info)
 
 
 def read_splat(options: CleanOptions) -> Gaussians:
@@ -135,19 +136,12 @@ def read_splat(options: CleanOptions) -> Gaussians:
 
 
 def write_cleaning(folder: Path, cleaning: Cleaning, dry_run: bool) -> None:
-    """Write the summary and both parts of the splat, or only what goes."""
+    """Write both parts of the splat, or only what goes."""
     given, removed, splat_file = cleaning.given, cleaning.removed, cleaning.splat_file
     if not dry_run:
         save_completed_splat(folder, given, removed, given[:0], splat_file)
     elif removed.any():
         save_changed(folder, given, removed, splat_file)
-    (folder / SUMMARY_FILE).write_bytes(json.dumps(cleaning.summary, indent=2).encode() + b"\n")
-
-
-def count_removed(removed: Bool[Tensor, "n"]) -> dict[str, int]:
-    """Count all, kept and removed Gaussians."""
-    count = int(removed.sum())
-    return {"given": len(removed), "kept": len(removed) - count, "removed": count}
 
 
 def score_cleaning(

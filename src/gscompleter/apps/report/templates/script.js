@@ -29,7 +29,39 @@ for (const space of document.querySelectorAll(".turning")) {
       else part.setAttribute("points", drawn.map((point) => point.join(",")).join(" "));
     }
   };
-  draw();
+  const stops = parts.filter(({ part }) => part.matches("polyline:is(.context, .anchor, .target)"));
+  const flying = parts.find(({ part }) => part.matches(".flying"));
+  const [button, ...names] = space.querySelectorAll("button");
+  let [seconds, playing, before] = [0, false, 0];
+  // From each camera to the next in 1.5 s, at rest at both, to the last one and back.
+  const fly = () => {
+    const end = stops.length - 1;
+    const at = end - Math.abs(end - ((seconds / 1.5) % Math.max(2 * end, 1)));
+    const k = Math.min(Math.floor(at), Math.max(end - 1, 0));
+    const share = (at - k) ** 2 * (3 - 2 * (at - k));
+    const to = stops[Math.min(k + 1, end)].points;
+    flying.points = stops[k].points.map((point, i) => point.map((x, j) => x + share * (to[i][j] - x)));
+    names.forEach((name, i) => name.setAttribute("aria-current", String(i === Math.round(at))));
+    draw();
+  };
+  const play = (now) => {
+    if (!playing) return;
+    seconds += Math.min(Math.max(now - before, 0), 100) / 1000;
+    before = now;
+    fly();
+    requestAnimationFrame(play);
+  };
+  const setPlaying = (value) => {
+    [playing, before, button.textContent] = [value, performance.now(), value ? "Pause" : "Play"];
+    fly();
+    requestAnimationFrame(play);
+  };
+  button.addEventListener("click", () => setPlaying(!playing));
+  names.forEach((name, i) => name.addEventListener("click", () => {
+    seconds = 1.5 * i;
+    setPlaying(false);
+  }));
+  fly();
   ranges.yaw.addEventListener("input", draw);
   ranges.pitch.addEventListener("input", draw);
   let last = null;

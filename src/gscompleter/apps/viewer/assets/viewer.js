@@ -200,14 +200,11 @@ function goTo(name) {
   const shot = shotNamed.get(name);
   if (!shot) return false;
   play(false);
-  state.seconds = content.path.find(([index]) => content.shots[index] === shot)[1];
-  const pose = new THREE.Matrix4().set(...shot.pose);
-  state.eye = new THREE.Vector3().setFromMatrixPosition(pose);
-  state.turn = new THREE.Quaternion().setFromRotationMatrix(pose);
-  Object.assign(state, { shot: name, focus: shot.focus, lens: shot.lens, size: shot.size });
+  state.seconds = path.find((stop) => stop.shot === shot).time;
+  lookFrom(numbersOf(shot));
+  state.shot = name;
   tellShot(shot);
   link();
-  changed();
   return true;
 }
 
@@ -219,41 +216,44 @@ function step(by) {
 
 /* ------------------------------------------------------------------------------------ path */
 
-/* Numbers of each stop of the path: eye, turn, lens, size, focus. Of both quaternions of a turn it
-   takes the one nearer to the stop before. */
-function makeStops() {
-  const stops = [];
-  for (const [index] of content.path) {
-    const shot = content.shots[index];
-    const pose = new THREE.Matrix4().set(...shot.pose);
-    const turn = new THREE.Quaternion().setFromRotationMatrix(pose);
-    const last = stops.length && new THREE.Quaternion().fromArray(stops.at(-1), 3);
-    const sign = last && last.dot(turn) < 0 ? -1 : 1;
-    const eye = new THREE.Vector3().setFromMatrixPosition(pose);
-    stops.push([...eye.toArray(), ...turn.toArray().map((part) => sign * part), ...shot.lens, ...shot.size, shot.focus]);
+/* What describes a shot as one list: eye, turn, lens, size, focus. */
+function numbersOf({ pose, lens, size, focus }) {
+  const matrix = new THREE.Matrix4().set(...pose);
+  const turn = new THREE.Quaternion().setFromRotationMatrix(matrix);
+  return [...new THREE.Vector3().setFromMatrixPosition(matrix), ...turn, ...lens, ...size, focus];
+}
+
+function lookFrom(numbers) {
+  state.eye = new THREE.Vector3().fromArray(numbers);
+  state.turn = new THREE.Quaternion().fromArray(numbers, 3).normalize();
+  Object.assign(state, { lens: numbers.slice(7, 11), size: numbers.slice(11, 13), focus: numbers[13] });
+  changed();
+}
+
+/* The stops of the path: shot, time and numbers, with the sign of a turn nearer to the one before. */
+function makePath() {
+  path = content.path.map(([index, time]) => ({ shot: content.shots[index], time, at: numbersOf(content.shots[index]) }));
+  const turnOf = ({ at }) => new THREE.Quaternion().fromArray(at, 3);
+  for (const [k, stop] of path.entries()) {
+    if (k > 0 && turnOf(stop).dot(turnOf(path[k - 1])) < 0) stop.at = stop.at.map((value, i) => (i > 2 && i < 7 ? -value : value));
   }
-  return stops;
 }
 
 /* Moves the camera to where the path is after so many seconds: a cubic spline through its stops, to
    the last one and back, at rest at both. */
 function seek(seconds) {
-  const times = content.path.map(([, time]) => time);
-  const end = times.at(-1);
+  const end = path.at(-1).time;
   const time = end - Math.abs(end - (seconds % (2 * end)));
-  const k = Math.max(0, Math.min(times.findLastIndex((stop) => stop <= time), times.length - 2));
-  const [from, to, length] = [path[k], path[k + 1], times[k + 1] - times[k]];
-  const speed = (i, part) => (path[i - 1] && path[i + 1] ? (path[i + 1][part] - path[i - 1][part]) / (times[i + 1] - times[i - 1]) : 0);
-  const u = (time - times[k]) / length;
-  const at = from.map((value, part) => value + u * u * (3 - 2 * u) * (to[part] - value)
-    + length * u * (1 - u) * ((1 - u) * speed(k, part) - u * speed(k + 1, part)));
-  state.eye.fromArray(at);
-  state.turn.fromArray(at, 3).normalize();
-  Object.assign(state, { seconds, lens: at.slice(7, 11), size: at.slice(11, 13), focus: at[13] });
-  const shot = content.shots[content.path[k + Math.round(u)][0]];
+  const k = Math.min(path.findLastIndex((stop) => stop.time <= time), path.length - 2);
+  const [before, from, to, after] = [-1, 0, 1, 2].map((by) => path[k + by]);
+  const speed = (a, b, i) => (a && b ? (b.at[i] - a.at[i]) / (b.time - a.time) : 0);
+  const length = to.time - from.time;
+  const u = (time - from.time) / length;
+  lookFrom(from.at.map((value, i) => value + u * u * (3 - 2 * u) * (to.at[i] - value)
+    + length * u * (1 - u) * ((1 - u) * speed(before, to, i) - u * speed(from, after, i))));
+  const { shot } = u < 0.5 ? from : to;
   if (shot.name !== state.shot) tellShot(shot);
-  state.shot = shot.name;
-  changed();
+  Object.assign(state, { seconds, shot: shot.name });
 }
 
 /* Plays the path from the camera shown last on, or pauses it. */
@@ -572,7 +572,7 @@ async function start() {
   writeTexts();
   await importLibraries();
   state.up = upOfAll();
-  path = makeStops();
+  makePath();
   byId("play").hidden = path.length < 2;
   pictures = [
     ...(content.layers.before ? [new Picture(byId("before"), ["before"])] : []),
