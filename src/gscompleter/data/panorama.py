@@ -53,8 +53,8 @@ def has_panoramas(files: Sequence[Path]) -> bool:
         return False
     require(
         len(set(sizes)) == 1,
-        f"Beside {quote_value(wide[0], 80)} and other panoramas lie photographs of other sizes; put "
-        "panoramas of one size into a folder of their own.",
+        f"Beside {quote_value(wide[0], 80)} and other panoramas lie photographs of other sizes; "
+        "put panoramas of one size into a folder of their own.",
     )
     return True
 
