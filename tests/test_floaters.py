@@ -11,8 +11,11 @@ import torch
 
 from command import run
 from gscompleter.config import FloaterConfig
+from gscompleter.data.scene import load_views
 from gscompleter.errors import InputError
+from gscompleter.evaluation.metrics.image import psnr
 from gscompleter.floaters import find_floaters
+from gscompleter.render import load_renderer
 from gscompleter.splats import load_splat
 from gscompleter.splats.ply import load_ply
 from gscompleter.types import Gaussians, make_observed, merge, sh_from_rgb
@@ -122,7 +125,7 @@ def test_the_command_takes_them_out_and_strip_puts_them_back(tmp_path, monkeypat
     assert {reason: count > 0 for reason, count in summary["reasons"].items()} == dict.fromkeys(
         KINDS, True
     )
-    assert summary["settings"]["floaters"]["max_gap"] == FloaterConfig().max_gap
+    assert summary["settings"]["config"]["floaters"]["max_gap"] == FloaterConfig().max_gap
     assert torch.equal(load_ply(out / "completed.ply").means, ROOM.means)
     assert run(monkeypatch, "strip", out / "completed.ply", "--out", tmp_path / "back.ply") == 0
     assert (tmp_path / "back.ply").read_bytes() == splat.read_bytes()
@@ -136,8 +139,8 @@ def test_the_command_takes_them_out_and_strip_puts_them_back(tmp_path, monkeypat
     ("more", "sentence"),
     [
         (("--context", 0), "--context"),
-        (("--floaters.neighbors", 1), "neighbors"),
-        (("--floaters.min-opacity", 1.0), "Every Gaussian"),
+        (("--config.floaters.neighbors", 1), "neighbors"),
+        (("--config.floaters.min-opacity", 1.0), "Every Gaussian"),
     ],
 )
 def test_wrong_input_gets_a_sentence(tmp_path, monkeypatch, capsys, more, sentence):
@@ -147,3 +150,25 @@ def test_wrong_input_gets_a_sentence(tmp_path, monkeypatch, capsys, more, senten
     assert sentence in said
     assert said.count("\n") == 1
     assert not out.exists()
+
+
+def test_photographs_of_a_real_splat_hardly_change_and_floaters_in_it_go(shared):
+    """The fox, trained by OpenSplat on 24 of its 40 photographs."""
+    folder = shared / "splats" / "fox"
+    scene, views = load_splat(folder / "splat.ply"), load_views(folder, [0, 12, 30, 39], 160)
+    renderer = load_renderer("cpu")
+    size = scene.scales.max(dim=1).values.median().item()
+    cameras = [view.camera for view in views]
+    depths = [renderer.render(scene, camera).depth[40, 20] for camera in cameras]
+    places = [c.center + 0.5 * z * c.z_rays()[40, 20] for c, z in zip(cameras, depths, strict=True)]
+    floaters = blobs(torch.stack(places), 2.0 * size / UNIT)
+    sh = torch.nn.functional.pad(floaters.sh, (0, 0, 0, scene.sh.shape[1] - 1))
+    gone = taken(merge([scene, replace(floaters, sh=sh)]))
+    assert gone[len(scene) :].all()
+    assert 0 < gone[: len(scene)].sum() < 0.01 * len(scene)
+    for view in views:
+        before, after = (
+            psnr(renderer.render(part, view.camera).image, view.image)
+            for part in (scene, scene[~gone[: len(scene)]])
+        )
+        assert after > before - 0.02

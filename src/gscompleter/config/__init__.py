@@ -224,21 +224,6 @@ class NextBestViewConfig(Settings):
 
 
 @dataclass(frozen=True)
-class CleaningConfig(Settings):
-    """Settings of the cleaning."""
-
-    min_ratio: Annotated[float, Interval(ge=1, le=1e6)] = 4.0
-    """Remove a Gaussian if photographs gain this many times what others lose without it."""
-    idle: Weight = 1.0
-    """Also remove a Gaussian if the photographs lose at most this many times an equal share of
-    their error, spread over all visible Gaussians."""
-    tolerance: Annotated[float, Interval(ge=0, le=10)] = 0.01
-    """Largest loss of PSNR of a photograph by the whole cleaning, in dB."""
-    probes: Annotated[int, Interval(ge=1, le=1000)] = 8
-    """Number of random images for the estimate of a Gaussian's influence."""
-
-
-@dataclass(frozen=True)
 class FloaterConfig(Settings):
     """Settings of the cleaning without photographs.
 
@@ -262,6 +247,22 @@ class FloaterConfig(Settings):
     min_opacity: Share = 0.01
     """Transparent: its opacity is below this one, or up to ten times this one if it is larger than
     its neighbours: the limit is multiplied by half the ratio of the sizes."""
+
+
+@dataclass(frozen=True)
+class CleaningConfig(Settings):
+    """Settings of the cleaning."""
+
+    min_ratio: Annotated[float, Interval(ge=1, le=1e6)] = 4.0
+    """Remove a Gaussian if photographs gain this many times what others lose without it."""
+    idle: Weight = 1.0
+    """Also remove a Gaussian if the photographs lose at most this many times an equal share of
+    their error, spread over all visible Gaussians."""
+    tolerance: Annotated[float, Interval(ge=0, le=10)] = 0.01
+    """Largest loss of PSNR of a photograph by the whole cleaning, in dB."""
+    probes: Annotated[int, Interval(ge=1, le=1000)] = 8
+    """Number of random images for the estimate of a Gaussian's influence."""
+    floaters: FloaterConfig = FloaterConfig()
 
 
 GUARDS = {

@@ -117,11 +117,11 @@ def clean_alone(options: CleanOptions, console: Console) -> Cleaning:
     named = next((n for n in PHOTOGRAPH_OPTIONS if getattr(options, n) is not None), None)
     if named is not None:
         raise InputError("There are no photographs to apply this to; name their SCENE.", named)
-    given = read_splat(options)
+    given, floaters = read_splat(options), options.config.floaters
     with record_seconds(()) as seconds, timed_stage("clean"):
-        reasons = find_floaters(given, options.floaters)
+        reasons = find_floaters(given, floaters)
     run_info = {
-        "settings": {"scene": str(options.scene), "floaters": asdict(options.floaters)},
+        "settings": {"scene": str(options.scene), "config": {"floaters": asdict(floaters)}},
         "reasons": {reason: int(mask.sum()) for reason, mask in reasons.items()},
         "seconds": seconds,
     }

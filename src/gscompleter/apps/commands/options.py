@@ -9,7 +9,7 @@ from typing import Annotated, Literal
 import tyro
 from annotated_types import Interval
 
-from gscompleter.config import CleaningConfig, CompleterConfig, FloaterConfig
+from gscompleter.config import CleaningConfig, CompleterConfig
 from gscompleter.config.generators import GeneratorOptions
 from gscompleter.config.settings import Seed, Settings
 from gscompleter.jobs.engines import EngineName
@@ -191,7 +191,6 @@ class CleanOptions(SceneOptions):
     device: Device = "auto"
     """Device to compare photographs on."""
     config: CleaningConfig = CleaningConfig()
-    floaters: FloaterConfig = FloaterConfig()
 
 
 @dataclass(frozen=True, kw_only=True)
