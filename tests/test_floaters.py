@@ -68,6 +68,12 @@ def test_each_kind_goes_for_its_reason_and_the_room_stays(kind):
     assert not taken(scene)[: len(ROOM)].any()
 
 
+@pytest.mark.parametrize(("count", "goes"), [(8, True), (9, False)])
+def test_a_cluster_of_as_many_as_half_of_the_neighbours_goes(count, goes):
+    places = MIDDLE[1] + UNIT * torch.randn(count, 3, generator=torch.Generator().manual_seed(0))
+    assert taken(merge([ROOM, blobs(places, 1.0)]))[len(ROOM) :].all() == goes
+
+
 def test_a_huge_one_that_swallows_its_neighbours_goes():
     scene = merge([ROOM, blobs(ON_WALL, 30.0)])
     assert find_floaters(scene)["huge"].tolist() == [False] * len(ROOM) + [True] * len(ON_WALL)
@@ -133,6 +139,9 @@ def test_the_command_takes_them_out_and_strip_puts_them_back(tmp_path, monkeypat
     assert sorted(file.name for file in preview.iterdir()) == ["removed.ply", "summary.json"]
     assert (preview / "removed.ply").read_bytes() == (out / "removed.ply").read_bytes()
     assert torch.equal(load_splat(preview / "removed.ply").means, floaters.means)
+    again = ("--out", out, "--dry-run", "--overwrite")
+    assert run(monkeypatch, "clean", "--scene", splat, *again) == 2
+    assert "name another folder" in capsys.readouterr().err
 
 
 @pytest.mark.parametrize(
