@@ -14,7 +14,7 @@ from gscompleter.config import FloaterConfig
 from gscompleter.data.scene import load_views
 from gscompleter.errors import InputError
 from gscompleter.evaluation.metrics.image import psnr
-from gscompleter.floaters import find_floaters
+from gscompleter.floaters import find_floaters, rate_gaussians
 from gscompleter.render import load_renderer
 from gscompleter.splats import load_splat
 from gscompleter.splats.ply import load_ply
@@ -72,6 +72,14 @@ def test_each_kind_goes_for_its_reason_and_the_room_stays(kind):
 def test_a_cluster_of_as_many_as_half_of_the_neighbours_goes(count, goes):
     places = MIDDLE[1] + UNIT * torch.randn(count, 3, generator=torch.Generator().manual_seed(0))
     assert taken(merge([ROOM, blobs(places, 1.0)]))[len(ROOM) :].all() == goes
+
+
+def test_floaters_that_hide_one_another_are_found_in_several_rounds():
+    places = gaussians_of(VIEW, 0.5 * VIEW.depth).means[:: SIZE * SIZE // 12]
+    scene = merge([ROOM, blobs(places, 6.0)])
+    first = torch.stack([*rate_gaussians(scene, FloaterConfig()).values()]).any(dim=0)
+    assert 0 < first.sum() < len(places)
+    assert taken(scene).tolist() == [False] * len(ROOM) + [True] * len(places)
 
 
 def test_a_huge_one_that_swallows_its_neighbours_goes():
