@@ -48,19 +48,18 @@ def find_floaters(
             f"The scene has {len(scene)} Gaussians, too few to compare each with "
             f"{config.neighbors} neighbours; give its photographs."
         )
-    left, rounds = torch.arange(len(scene), device=scene.means.device), []
+    reasons: dict[str, Bool[Tensor, "n"]] = {}
+    left = torch.arange(len(scene), device=scene.means.device)
     while len(left) > config.neighbors:
         found = rate_gaussians(scene[left], config)
+        for reason, mask in found.items():
+            none = torch.zeros_like(scene.generated, dtype=torch.bool)
+            reasons[reason] = reasons.get(reason, none).index_fill(0, left[mask], True)
         gone = torch.stack([*found.values()]).any(dim=0)
-        rounds.append({reason: left[mask] for reason, mask in found.items()})
         if not gone.any():
             break
         left = left[~gone]
-    none = torch.zeros_like(scene.generated, dtype=torch.bool)
-    return {
-        reason: none.index_fill(0, torch.cat([each[reason] for each in rounds]), True)
-        for reason in rounds[0]
-    }
+    return reasons
 
 
 def rate_gaussians(scene: Gaussians, config: FloaterConfig) -> dict[str, Bool[Tensor, "n"]]:
