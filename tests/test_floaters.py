@@ -14,7 +14,7 @@ from gscompleter.config import FloaterConfig
 from gscompleter.data.scene import load_views
 from gscompleter.errors import InputError
 from gscompleter.evaluation.metrics.image import psnr
-from gscompleter.floaters import find_floaters
+from gscompleter.floaters import find_floaters, rate_gaussians
 from gscompleter.render import load_renderer
 from gscompleter.splats import load_splat
 from gscompleter.splats.ply import load_ply
@@ -66,6 +66,20 @@ def test_each_kind_goes_for_its_reason_and_the_room_stays(kind):
     reasons = find_floaters(scene)
     assert reasons[kind][len(ROOM) :].all()
     assert not taken(scene)[: len(ROOM)].any()
+
+
+@pytest.mark.parametrize(("count", "goes"), [(8, True), (9, False)])
+def test_a_cluster_of_as_many_as_half_of_the_neighbours_goes(count, goes):
+    places = MIDDLE[1] + UNIT * torch.randn(count, 3, generator=torch.Generator().manual_seed(0))
+    assert taken(merge([ROOM, blobs(places, 1.0)]))[len(ROOM) :].all() == goes
+
+
+def test_floaters_that_hide_one_another_are_found_in_several_rounds():
+    places = gaussians_of(VIEW, 0.5 * VIEW.depth).means[:: SIZE * SIZE // 12]
+    scene = merge([ROOM, blobs(places, 6.0)])
+    first = torch.stack([*rate_gaussians(scene, FloaterConfig()).values()]).any(dim=0)
+    assert 0 < first.sum() < len(places)
+    assert taken(scene).tolist() == [False] * len(ROOM) + [True] * len(places)
 
 
 def test_a_huge_one_that_swallows_its_neighbours_goes():
@@ -133,6 +147,9 @@ def test_the_command_takes_them_out_and_strip_puts_them_back(tmp_path, monkeypat
     assert sorted(file.name for file in preview.iterdir()) == ["removed.ply", "summary.json"]
     assert (preview / "removed.ply").read_bytes() == (out / "removed.ply").read_bytes()
     assert torch.equal(load_splat(preview / "removed.ply").means, floaters.means)
+    again = ("--out", out, "--dry-run", "--overwrite")
+    assert run(monkeypatch, "clean", "--scene", splat, *again) == 2
+    assert "name another folder" in capsys.readouterr().err
 
 
 @pytest.mark.parametrize(

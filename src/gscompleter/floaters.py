@@ -39,7 +39,31 @@ class Surroundings:
 def find_floaters(
     scene: Gaussians, config: FloaterConfig = FloaterConfig()
 ) -> dict[str, Bool[Tensor, "n"]]:
-    """Find floaters, by reason; generated Gaussians stay."""
+    """Find floaters by reason, again without those found until none is left; generated ones stay.
+
+    A Gaussian may have several reasons. Floaters beside others show only after these are found.
+    """
+    if len(scene) <= config.neighbors:
+        raise InputError(
+            f"The scene has {len(scene)} Gaussians, too few to compare each with "
+            f"{config.neighbors} neighbours; give its photographs."
+        )
+    reasons: dict[str, Bool[Tensor, "n"]] = {}
+    left = torch.arange(len(scene), device=scene.means.device)
+    while len(left) > config.neighbors:
+        found = rate_gaussians(scene[left], config)
+        for reason, mask in found.items():
+            none = torch.zeros_like(scene.generated, dtype=torch.bool)
+            reasons[reason] = reasons.get(reason, none).index_fill(0, left[mask], True)
+        gone = torch.stack([*found.values()]).any(dim=0)
+        if not gone.any():
+            break
+        left = left[~gone]
+    return reasons
+
+
+def rate_gaussians(scene: Gaussians, config: FloaterConfig) -> dict[str, Bool[Tensor, "n"]]:
+    """Compare Gaussians with their surroundings, as `find_floaters` does in each round."""
     around = measure_surroundings(scene, config.neighbors)
     longest, middle, shortest = around.sigmas.unbind(dim=1)
     size, remoteness = longest / around.sigma, around.distance / around.spacing
@@ -60,11 +84,6 @@ def measure_surroundings(scene: Gaussians, neighbors: int) -> Surroundings:
     # Imported here, since SciPy is slow to import.
     from scipy.spatial import cKDTree
 
-    if len(scene) <= neighbors:
-        raise InputError(
-            f"The scene has {len(scene)} Gaussians, too few to compare each with {neighbors} "
-            "neighbours; give its photographs."
-        )
     means = scene.means.double().cpu().numpy()
     found = cKDTree(means).query(means, neighbors + 1, workers=torch.get_num_threads())
     apart, rows = (torch.from_numpy(part[:, 1:]).to(scene.means.device) for part in found)

@@ -68,6 +68,8 @@ def run_clean(options: CleanOptions) -> None:
     """Clean the splat, write the result, and print a summary."""
     console = Console(stderr=True, quiet=options.quiet)
     check_output(options.out, is_replaceable(options))
+    if options.dry_run and (options.out / COMPLETED_FILE).exists():  # it needs its removed.ply
+        raise InputError(f"{quote_value(options.out)} holds a result; name another folder.", "out")
     clean = clean_alone if options.folder is None else clean_by_photographs
     with show_progress(console):
         cleaning = clean(options, console)
