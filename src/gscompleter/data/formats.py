@@ -24,6 +24,7 @@ from gscompleter.data.frame import FOLDERS
 from gscompleter.data.limits import check_planes, require
 from gscompleter.data.llff import has_llff, open_llff
 from gscompleter.data.photographs import Photographs
+from gscompleter.data.one_photograph import find_photograph, open_photograph
 from gscompleter.data.real_estate import (
     has_chunks,
     list_camera_files,
@@ -63,6 +64,7 @@ FORMATS = {
     "mmdet3d": Format(has_infos, open_infos, "m"),
     "waymo": Format(list_segments, open_waymo, "m"),
     "real-estate-10k": Format(list_camera_files, open_camera_files),
+    "photograph": Format(find_photograph, open_photograph),
 }
 """Formats by the names that `open_photographs` takes, in the order of detection."""
 

@@ -117,6 +117,8 @@ class SceneOptions(ComputeOptions, WritingOptions):
     """Smallest depth in the scene, in the unit of its cameras; estimated if not given."""
     far: float | None = None
     """Largest depth in the scene, in the unit of its cameras; estimated if not given."""
+    no_given_depth: bool = False
+    """Ignore the depth that SCENE holds: depth maps, laser sweeps and COLMAP's points."""
     drop_nonfinite: bool = False
     """Drop Gaussians that contain NaN or infinity instead of refusing the file."""
 

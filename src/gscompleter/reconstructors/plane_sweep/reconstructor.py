@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
+from itertools import repeat
 
 import numpy as np
 import torch
@@ -17,6 +18,7 @@ from gscompleter.reconstructors.features.depth_range import get_depth_range, set
 from gscompleter.reconstructors.features.stereo_image import StereoImage
 from gscompleter.reconstructors.plane_sweep.fusion import Layer
 from gscompleter.reconstructors.plane_sweep.gaussians import Splatter
+from gscompleter.reconstructors.plane_sweep.given_depth import add_given, measure_nothing
 from gscompleter.reconstructors.plane_sweep.predicted_depth import add_prediction
 from gscompleter.reconstructors.plane_sweep.rig import Rig, build_rig
 from gscompleter.reconstructors.plane_sweep.sky_mask import find_skies, find_sky, transfer_sky
@@ -62,6 +64,7 @@ class PlaneSweep(Splatter):
         views = set_depth_range(views, *get_depth_range(views))
         rig = build_rig(views)
         first, second = match_views(rig, views, MIN_HALVED_SIDES["lift"])
+        first = add_given(first, views[0], rig.unit)
         open_there = find_sky(rig.images[1], second)
         first = add_prediction(first, self.predict_depth(views[0]))
         layers = [
@@ -81,7 +84,8 @@ class PlaneSweep(Splatter):
     def compute_layers(self, rig: Rig, views: Sequence[View]) -> list[Layer]:
         """Compute the completed inverse depth of each view."""
         least = MIN_HALVED_SIDES["pair" if len(views) == 2 else "many"]
-        found = match_views(rig, views, least)
+        stereo = match_views(rig, views, least)
+        found = list(map(add_given, stereo, views, repeat(rig.unit)))
         seen = find_skies(rig, found)
         guided = map(add_prediction, found, map(self.predict_depth, views))
         surfaces = map_in_parallel(make_layer, rig.images, map(Measurement.exclude, guided, seen))
@@ -89,9 +93,15 @@ class PlaneSweep(Splatter):
 
 
 def match_views(rig: Rig, views: Sequence[View], min_halved_side: float) -> list[Measurement]:
-    """Measure depth outside the ignored pixels, at half size if all images are large enough."""
+    """Measure depth outside the ignored pixels, at half size if all images are large enough.
+
+    A single photograph has no stereo, and nothing is measured.
+    """
+    near, far = get_depth_range(views)
+    if len(views) == 1:
+        return [measure_nothing(rig.images[0], near / rig.unit, far / rig.unit)]
     is_halved = min(min(image.size) for image in rig.images) >= min_halved_side
-    found = measure_depths(rig.halve() if is_halved else rig, *get_depth_range(views))
+    found = measure_depths(rig.halve() if is_halved else rig, near, far)
     return [
         one if image.ignore_mask is None else one.exclude(image.ignore_mask)
         for one, image in zip(found, rig.images, strict=True)
