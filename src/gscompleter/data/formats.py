@@ -23,8 +23,8 @@ from gscompleter.data.ego_vehicle import attach_vehicle_detector
 from gscompleter.data.frame import FOLDERS
 from gscompleter.data.limits import check_planes, require
 from gscompleter.data.llff import has_llff, open_llff
-from gscompleter.data.photographs import Photographs
 from gscompleter.data.one_photograph import find_photograph, open_photograph
+from gscompleter.data.photographs import Photographs
 from gscompleter.data.real_estate import (
     has_chunks,
     list_camera_files,

@@ -14,9 +14,9 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from gscompleter.data.driving.vehicle import compute_sparse_depth
 from gscompleter.data.frame import Frame
 from gscompleter.data.photographs import Photographs, Resolution
+from gscompleter.geometry import compute_sparse_depth
 from gscompleter.types import View
 
 EDGE_SHARE, EDGE_RATIO = 1 / 128, 1.1

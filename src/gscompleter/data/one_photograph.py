@@ -27,7 +27,7 @@ from gscompleter.errors import quote_value
 from gscompleter.io.image import ORIENTATION, open_image
 
 PHONE_FOCAL = 26 / FULL_FRAME_DIAGONAL
-"""Focal length of a phone's main camera in image diagonals, if EXIF has none: 26 mm in 35 mm film."""
+"""Focal length if EXIF has none, in image diagonals: 26 mm in 35 mm film, a phone's camera."""
 
 
 def find_photograph(path: Path) -> Path | None:
@@ -50,8 +50,8 @@ def open_photograph(path: Path) -> Iterator[Photographs]:
     is_upright = exif.get(ORIENTATION, 1) == 1
     stored: Path | Callable[[], bytes] = file if is_upright else partial(read_upright, file)
     frame = Frame(file.name, title, np.eye(4), Intrinsics(size, (focal, focal)), stored)
-    origin = "EXIF" if found else "no EXIF: that of a phone's main camera is taken"
-    note = f"One photograph, with a focal length of {focal:.0f} px ({origin}); its camera is the frame."
+    origin = "of EXIF" if found else "of a phone, since EXIF has none"
+    note = f"The photograph has no camera; a focal length of {focal:.0f} px is used, {origin}."
     yield replace(build_photographs(file.stem, title, [frame]), notes=(note,))
 
 

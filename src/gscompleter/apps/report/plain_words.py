@@ -66,8 +66,8 @@ def list_photograph_notes(context: Sequence[ContextRow]) -> Iterator[str]:
     given = max((row.given_depth for row in context), default=0.0)
     if given > 0:
         yield (
-            f"The depth of up to {format_percent(given)} of a photograph's pixels was given, and "
-            "constrains the surfaces (--no-given-depth ignores it)."
+            f"Up to {format_percent(given)} of a photograph's pixels have a measured or predicted "
+            "depth, which decides their surfaces (--no-given-depth ignores what SCENE holds)."
         )
     ignored = max((row.ignored for row in context), default=0.0)
     if ignored > 0:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from itertools import repeat
 
 import numpy as np
@@ -12,6 +12,7 @@ import torch
 from jaxtyping import Bool
 from torch import Tensor
 
+from gscompleter.geometry import compute_sparse_depth, measure_baseline, unproject
 from gscompleter.kernels.parallel import map_in_parallel
 from gscompleter.reconstructors.depth_predictors import DepthPredictor, predict_nothing
 from gscompleter.reconstructors.features.depth_range import get_depth_range, set_depth_range
@@ -59,9 +60,12 @@ class PlaneSweep(Splatter):
 
         No photograph observes a hole, so its opacities are not fitted; its depth continues the
         surfaces around it. Colours are fitted to the image itself. The sky gets no
-        depth.
+        depth. At the place of an anchor with given depth there is no parallax, and the given
+        surfaces are continued.
         """
         views = set_depth_range(views, *get_depth_range(views))
+        if len(views[1].known_depths) and measure_baseline(*(v.camera for v in views)) == 0:
+            return self.lift_in_place(*views, pixel_mask)
         rig = build_rig(views)
         first, second = match_views(rig, views, MIN_HALVED_SIDES["lift"])
         first = add_given(first, views[0], rig.unit)
@@ -74,6 +78,17 @@ class PlaneSweep(Splatter):
             make_layer(rig.images[1], second.exclude(open_there), 0),
         ]
         return self.lift_pixels(views, make_depth_maps(layers, rig.unit, views), pixel_mask)
+
+    def lift_in_place(
+        self, image: View, anchor: View, pixel_mask: Bool[Tensor, "h w"]
+    ) -> Reconstruction:
+        """Lift an image by the given depth of a photograph from the same place."""
+        assert anchor.given_depth is not None
+        known = anchor.given_depth > 0
+        points = unproject(anchor.given_depth, anchor.camera)[known]
+        turned = replace(image, given_depth=compute_sparse_depth(points, image.camera))
+        (depth,) = self.estimate_depths([turned])
+        return self.lift_pixels([image], [depth, DepthMap(anchor.given_depth, known)], pixel_mask)
 
     def estimate_depths(self, views: Sequence[View]) -> list[DepthMap]:
         """Estimate z-depth and confidence of every pixel, in scene units."""
