@@ -23,6 +23,8 @@ NEAR_RADIUS = 10
 """Distance in pixels within which given depths are compared with stereo."""
 MAX_DIFFERENCE = 1.0
 """Difference in planes from which stereo contradicts a given depth."""
+MIN_CONTRADICTING = 2.5
+"""More than so many given depths have to contradict stereo: a triangulated point may be wrong."""
 
 
 def add_given(found: Measurement, view: View, unit: float) -> Measurement:
@@ -46,12 +48,12 @@ def add_given(found: Measurement, view: View, unit: float) -> Measurement:
 
 
 def find_contradicted(found: Measurement, index: Map, known: Mask) -> Mask:
-    """Find pixels around which most given depths contradict stereo."""
+    """Find pixels around which most given depths, and not just a few, contradict stereo."""
     compared = known & (found.confidence > 0)
     wrong = compared & (np.abs(found.index - index) > MAX_DIFFERENCE)
     window = (2 * NEAR_RADIUS + 1,) * 2
     total, bad = (cv2.boxFilter(m.astype(np.float32), -1, window) for m in (compared, wrong))
-    return bad > total / 2
+    return bad > np.maximum(total / 2, MIN_CONTRADICTING / window[0] ** 2)
 
 
 def measure_nothing(image: StereoImage, near: float, far: float) -> Measurement:
