@@ -101,14 +101,14 @@ class SceneOptions(ComputeOptions, WritingOptions):
     folder: Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="SCENE")]
     """Folder of the photographs: COLMAP, nerfstudio, cameras.json, LLFF, KITTI, DGP, Waymo,
     PandaSet, a pixelSplat chunk or a RealEstate10K camera file. If it has no cameras, COLMAP finds
-    them and they are kept in OUT/colmap."""
+    them and they are kept in OUT/colmap; one image needs none."""
     context: Frames = None
     """Frame numbers of the photographs to work with, counted in the order of their file paths. If
     not given, those that help most; photographs of targets are never used. `clean` takes all."""
     out: Path
     format: str | None = None
     """Format of SCENE: colmap, nerfstudio, cameras-json, llff, kitti, kitti-raw, dgp, waymo,
-    mmdet3d, pandaset, chunks or real-estate-10k. Detected if not given."""
+    mmdet3d, pandaset, chunks, real-estate-10k or photograph. Detected if not given."""
     scene: Path | None
     resolution: Size = LONG_SIDE
     """Working size: the longest side in pixels (photographs are never enlarged), or height and
