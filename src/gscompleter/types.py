@@ -186,7 +186,7 @@ class View(TensorDataclass):
                     "of them."
                 )
         given, scored = self.given_depth, self.depth
-        if given is not None and scored is not None and (given * scored).any():
+        if given is not None and scored is not None and ((given > 0) & (scored > 0)).any():
             raise InputError("A depth both constrains and scores a view; leave one of them out.")
 
     @property

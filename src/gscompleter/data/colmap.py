@@ -12,7 +12,7 @@ import struct
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import replace
-from functools import cache, partial
+from functools import lru_cache, partial
 from itertools import groupby
 from pathlib import Path
 from typing import Any, NamedTuple, TypeVar
@@ -183,8 +183,12 @@ def read_points(path: Path) -> Float[np.ndarray, "n 3"]:
     return np.fromiter((xyz for xyz, _ in _read_tracks(path)), dtype=np.dtype((np.float64, 3)))
 
 
-def read_seen_points(path: Path) -> dict[int, Float[np.ndarray, "n 3"]]:
-    """Read the points that each image shows, by the number of the image."""
+@lru_cache(maxsize=1)
+def read_seen_points(path: Path, changed: int) -> dict[int, Float[np.ndarray, "n 3"]]:
+    """Read the points that each image shows, by the number of the image.
+
+    `changed` is the time of the last change of the file.
+    """
     found = [(image, xyz) for xyz, images in _read_tracks(path) for image in set(images)]
     found.sort(key=lambda one: one[0])
     return {
@@ -397,21 +401,19 @@ def read_image_file(path: Path) -> list[Frame]:
             "the cameras file beside it; export the model again."
         )
     points = _find_model_file(path.parent, "points3D")
-    seen = None if points is None else cache(partial(read_seen_points, points))
 
     def make_frame(image: PosedImage) -> Frame:
         title = f"image {quote_value(image.name)} of {quote_value(path)}"
-        shown = None if seen is None else partial(_get_seen, seen, image.number)
+        shown = None if points is None else partial(_find_seen, points, image.number)
         lens = cameras[image.camera]
         return Frame(image.name, title, image.c2w, lens, None, seen_points=shown)
 
     return [make_frame(image) for image in images]
 
 
-def _get_seen(
-    read: Callable[[], dict[int, Float[np.ndarray, "n 3"]]], number: int
-) -> Float[np.ndarray, "n 3"]:
-    return read().get(number, np.zeros((0, 3)))
+def _find_seen(path: Path, number: int) -> Float[np.ndarray, "n 3"]:
+    found = read_seen_points(path, path.stat().st_mtime_ns)
+    return found.get(number, np.zeros((0, 3)))
 
 
 def _list_roots(scene: Path, model: Path) -> list[Path]:

@@ -65,7 +65,7 @@ class PlaneSweep(Splatter):
         """
         views = set_depth_range(views, *get_depth_range(views))
         if len(views[1].known_depths) and measure_baseline(*(v.camera for v in views)) == 0:
-            return self.lift_in_place(*views, pixel_mask)
+            return self.lift_in_place(views[0], views[1], pixel_mask)
         rig = build_rig(views)
         first, second = match_views(rig, views, MIN_HALVED_SIDES["lift"])
         first = add_given(first, views[0], rig.unit)
