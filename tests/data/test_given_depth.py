@@ -9,10 +9,12 @@ import torch
 from PIL import Image
 
 from command import run
-from gscompleter import InputError
+from gscompleter import GSCompleter, InputError
 from gscompleter.apps.report.schema import read_summary
 from gscompleter.data.formats import open_photographs
 from gscompleter.data.given_depth import drop_edges, drop_hidden, give_depths
+from gscompleter.evaluation.metrics.geometry import compare_depths
+from gscompleter.evaluation.metrics.image import compute_masked_psnr
 from gscompleter.geometry import project
 from gscompleter.io.image import write_image
 from gscompleter.types import Camera
@@ -128,3 +130,19 @@ def test_an_image_without_a_camera_opens_upright_at_the_focal_length_of_exif(tmp
     assert "of a phone, since EXIF has none" in plain.notes[0]
     (tmp_path / "plain.png").unlink()
     assert open_photographs(tmp_path).format == "photograph"
+
+
+def test_one_photograph_of_a_real_room_is_completed(shared):
+    folder = shared / "data" / "hololens_room"
+    if not folder.is_dir():
+        pytest.skip(f"needs {folder}")
+    photographs = open_photographs(folder, near=0.5, far=10.0)
+    (target,) = photographs.views([3], (96, 96))
+    done = GSCompleter()(give_depths(photographs, [0], (96, 96)), target.camera)
+    result, everywhere = done.targets[0], target.valid_mask
+    assert compare_depths(result.after.depth, target.depth, ~result.hole_mask).abs_rel < 0.05
+    before, after = (
+        compute_masked_psnr(render.image, target.image, everywhere)
+        for render in (result.before, result.after)
+    )
+    assert after > before + 0.3
