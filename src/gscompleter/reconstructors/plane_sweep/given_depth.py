@@ -19,6 +19,8 @@ from gscompleter.types import View
 
 WEIGHT = np.float32(1)
 """Weight of a given depth in the surface fit, that of the most confident stereo."""
+NEAREST = np.float32(1e-6)
+"""Smallest depth, in units of the images; sensors write any number."""
 NEAR_RADIUS = 10
 """Distance in pixels within which given depths are compared with stereo."""
 MAX_DIFFERENCE = 1.0
@@ -36,8 +38,8 @@ def add_given(found: Measurement, view: View, unit: float) -> Measurement:
         return found
     depth = view.given_depth.cpu().numpy()
     full, known = found.resize_to(depth.shape), depth > 0
-    inverse = (unit / np.where(known, depth, 1)).astype(np.float32)
-    index = compute_plane_index(full.planes, inverse)
+    inverse = (unit / np.maximum(depth, NEAREST * unit)).astype(np.float32)
+    index = compute_plane_index(full.planes, inverse).clip(-1, len(full.planes))
     kept = full.exclude(find_contradicted(full, index, known))
     return replace(
         kept,
