@@ -38,6 +38,16 @@ def is_inside(
     return (z > 0) & (x >= 0) & (x < camera.width) & (y >= 0) & (y < camera.height)
 
 
+def compute_sparse_depth(points: Float[Tensor, "n 3"], camera: Camera) -> Float[Tensor, "h w"]:
+    """Project points to z-depth in scene units: the nearest per pixel, 0 without one."""
+    pixels, z = project(points, camera)
+    seen = is_inside(pixels, z, camera)
+    x, y = pixels[seen].long().unbind(-1)
+    nearest = z.new_full((camera.height * camera.width,), torch.inf)
+    nearest = nearest.scatter_reduce(0, y * camera.width + x, z[seen], "amin")
+    return nearest.where(nearest.isfinite(), 0.0).view(camera.height, camera.width)
+
+
 def sample(
     values: Float[Tensor, "h w c"], pixels: Float[Tensor, "*shape 2"], mode: str = "bilinear"
 ) -> Float[Tensor, "*shape c"]:

@@ -166,6 +166,8 @@ class View(TensorDataclass):
     """True where the image must not be used (user mask), or None if all of it may be used."""
     dynamic_mask: Bool[Tensor, "h w"] | None = None
     """True where something moved between photographs; completion copies nothing from there."""
+    given_depth: Float[Tensor, "h w"] | None = None
+    """z-depth in scene units that constrains the reconstruction, 0 if unknown; scores nothing."""
 
     def __post_init__(self) -> None:
         """Raise InputError if the image or one of its maps does not have the size of the camera."""
@@ -175,7 +177,7 @@ class View(TensorDataclass):
             raise InputError(
                 "The image of a view is no tensor of floats of shape [h, w, 3]; convert it."
             )
-        for name in ("image", "depth", "ignore_mask", "dynamic_mask"):
+        for name in ("image", "depth", "ignore_mask", "dynamic_mask", "given_depth"):
             pixels = getattr(self, name)
             if pixels is not None and tuple(pixels.shape[:2]) != size:
                 raise InputError(
@@ -183,6 +185,15 @@ class View(TensorDataclass):
                     f"and its camera has {size[0]} × {size[1]} pixels (height × width); resize one "
                     "of them."
                 )
+        given, scored = self.given_depth, self.depth
+        if given is not None and scored is not None and ((given > 0) & (scored > 0)).any():
+            raise InputError("A depth both constrains and scores a view; leave one of them out.")
+
+    @property
+    def known_depths(self) -> Float[Tensor, "n"]:
+        """Given depths of the pixels that have one."""
+        given = self.image.new_zeros(0) if self.given_depth is None else self.given_depth
+        return given[given > 0]
 
     @property
     def valid_mask(self) -> Bool[Tensor, "h w"]:

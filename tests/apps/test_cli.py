@@ -211,7 +211,7 @@ def refused(monkeypatch, capsys, out: Path, arguments, sentence: str) -> None:
     ("more", "sentence"),
     [
         ({"context": (0,)}, "at least 2"),
-        ({"context": ()}, "at least 2"),
+        ({"context": ()}, "names no frame"),
         ({"context": (1, 1)}, "twice"),
         ({"context": (0, 9)}, "no frame 9"),
         ({"target": (9,)}, "no frame 9"),

@@ -136,12 +136,10 @@ def test_the_summary_says_what_was_opened_and_between_which_depths(chosen):
 def test_too_few_photographs_beside_the_targets_are_refused(scene, tmp_path, monkeypatch, capsys):
     words = ["complete", scene, "--out", tmp_path / "out", "--target", 0, 1, 2, 3]
     assert run(monkeypatch, *words) == 2
-    assert (
-        "The context needs at least 2 photographs, and without the targets 1 can be used;"
-    ) in capsys.readouterr().err
+    assert ("1 context view was given, and stereo needs at least 2;") in capsys.readouterr().err
     assert run(monkeypatch, *words, 4) == 2
     assert (
-        "The context needs at least 2 photographs, and without the targets 0 can be used;"
+        "The context needs photographs, and without the targets none can be used;"
     ) in capsys.readouterr().err
 
 

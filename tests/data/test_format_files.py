@@ -16,15 +16,23 @@ OPENED = {
     "nerfstudio_fox/transforms.json": (67, None, 1080),
     "re10k/000000.torch": (93, None, 640),
     "waymo_mmdet3d/waymo_infos_val.pkl": (1, 2059.0, 1920),
+    "colmap_bonsai/DSCF5574.JPG": (1, None, 699),
+    "colmap_bonsai/DSCF5575.JPG": (1, None, 699),
+    "colmap_bonsai/DSCF5597.JPG": (1, None, 699),
+    "gaussians/playbot_sog/means_l.webp": (1, None, 92),
+    "gaussians/playbot_sog/means_u.webp": (1, None, 92),
+    "gaussians/playbot_sog/quats.webp": (1, None, 92),
+    "gaussians/playbot_sog/scales.webp": (1, None, 92),
+    "gaussians/playbot_sog/sh0.webp": (1, None, 92),
+    "gaussians/playbot_sog/shN_centroids.webp": (1, None, 512),
+    "gaussians/playbot_sog/shN_labels.webp": (1, None, 92),
+    "waymo_mmdet3d/0000000.png": (1, None, 1920),
 }
 """Number of frames, focal length of the first one (None with distortion), and its width."""
 
 NOTHING = "There are no posed photographs in"
 NO_FRAMES = "lists no frames"
 REFUSED = {
-    "colmap_bonsai/DSCF5574.JPG": NOTHING,
-    "colmap_bonsai/DSCF5575.JPG": NOTHING,
-    "colmap_bonsai/DSCF5597.JPG": NOTHING,
     "colmap_bonsai/cameras.bin": NOTHING,
     "colmap_bonsai/points3D.bin": NOTHING,
     "dgp_ddad/calibration.json": NO_FRAMES,
@@ -44,14 +52,7 @@ REFUSED = {
     "gaussians/minimal/minimal.splat": NOTHING,
     "gaussians/playbot_lod4.from-sog.ply": NOTHING,
     "gaussians/playbot_sog": NOTHING,
-    "gaussians/playbot_sog/means_l.webp": NOTHING,
-    "gaussians/playbot_sog/means_u.webp": NOTHING,
     "gaussians/playbot_sog/meta.json": NO_FRAMES,
-    "gaussians/playbot_sog/quats.webp": NOTHING,
-    "gaussians/playbot_sog/scales.webp": NOTHING,
-    "gaussians/playbot_sog/sh0.webp": NOTHING,
-    "gaussians/playbot_sog/shN_centroids.webp": NOTHING,
-    "gaussians/playbot_sog/shN_labels.webp": NOTHING,
     "gsplat_garden/test_garden.npz": NOTHING,
     "idr_dtu/cameras_sphere.npz": NOTHING,
     "kitti/odometry00_poses_first200.txt": "calib.txt cannot be read",
@@ -67,7 +68,6 @@ REFUSED = {
     "NOTES.md": NOTHING,
     "nuscenes_mmdet3d/info.pkl": "size of the photograph of CAM_FRONT at .* is not known",
     "re10k/0d4de33c6888a754.head.txt": "size of frame 0 of .* is not known",
-    "waymo_mmdet3d/0000000.png": NOTHING,
 }
 
 SPLATS = {

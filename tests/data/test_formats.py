@@ -80,9 +80,9 @@ def test_a_data_set_of_chunks_is_opened_by_its_folder_or_index(tmp_path):
 
 def test_what_is_no_clip_is_told_what_would_be_one(tmp_path):
     (tmp_path / "a.json").write_text("{}")
-    (tmp_path / "a.png").write_bytes(b"")
+    (tmp_path / "a.txt").write_bytes(b"")
     (tmp_path / "empty").mkdir()
-    for name in ("a.png", "empty"):
+    for name in ("a.txt", "empty"):
         with pytest.raises(InputError, match=f"no posed photographs in .*{name}; name .* nerfst"):
             list(open_clips(tmp_path / name))
     with pytest.raises(InputError, match="a.json lists no frames"):

@@ -8,16 +8,12 @@ import torch
 
 from gscompleter import InputError
 from gscompleter.config import RefineConfig
-from gscompleter.data.driving.vehicle import (
-    compute_moving_boxes,
-    compute_sparse_depth,
-    mask_moving,
-)
+from gscompleter.data.driving.vehicle import compute_moving_boxes, mask_moving
 from gscompleter.data.formats import open_photographs
 from gscompleter.data.photographs import apply_masks
 from gscompleter.evaluation.metrics.scores import Truth, score
 from gscompleter.generators.warp import warp_photographs
-from gscompleter.geometry import unproject
+from gscompleter.geometry import compute_sparse_depth, unproject
 from gscompleter.guards.psnr import compute_squared_error, meet_error_budgets
 from gscompleter.io.image import write_image
 from gscompleter.render import load_renderer

@@ -70,7 +70,7 @@ def test_every_format_shows_the_room_from_where_it_says(tmp_path, kind):
 
 def test_every_format_is_tried_here_or_in_the_file_of_its_own():
     of_their_own = {"chunks", "real-estate-10k", "kitti-raw", "pandaset", "mmdet3d", "waymo"}
-    of_their_own |= {"polycam", "record3d", "3d-scanner-app"}
+    of_their_own |= {"polycam", "record3d", "3d-scanner-app", "photograph"}
     assert {name for name, _ in WRITERS.values()} | of_their_own == set(FORMATS)
 
 

@@ -283,8 +283,12 @@ def test_an_interrupt_while_results_are_replaced_leaves_nothing_behind(results, 
 
 def test_events_that_windows_lists_among_the_signals_are_not_asked_for(monkeypatch):
     monkeypatch.setattr(signal, "Signals", IntEnum("Signals", {"CTRL_C_EVENT": 0, "SIGINT": 2}))
-    with pytest.raises(KeyboardInterrupt, match="is complete"), defer_interrupts("is complete"):
-        signal.raise_signal(signal.SIGINT)
+    before = signal.signal(signal.SIGINT, signal.default_int_handler)  # ignored in the background
+    try:
+        with pytest.raises(KeyboardInterrupt, match="is complete"), defer_interrupts("is complete"):
+            signal.raise_signal(signal.SIGINT)
+    finally:
+        signal.signal(signal.SIGINT, before)
 
 
 def test_a_file_written_in_place_of_another_keeps_it_until_the_end(tmp_path):

@@ -489,6 +489,9 @@ KINDS: dict[str, Mutation] = {
     "dgp": posed("dgp", "**/*.json"),
     "splits": posed("splits", "*.json"),
     "photograph": posed("photographs", "images/*"),
+    "one-photograph": in_bytes(
+        "scene/0.png", ["complete", "scene/0.png", "--out", "out", "--quiet", "--auto", "1"]
+    ),
     "photographs-alone": in_bytes("photographs/images/*", ALONE),
     "video": in_bytes("walk.mp4", ["poses", "walk.mp4", "--out", "out", "--quiet"]),
     "targets-list": in_bytes("target-list.json", [*COMPLETE, "target-list.json", *RANGE]),

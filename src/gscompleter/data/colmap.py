@@ -12,7 +12,8 @@ import struct
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import replace
-from functools import partial
+from functools import lru_cache, partial
+from itertools import groupby
 from pathlib import Path
 from typing import Any, NamedTuple, TypeVar
 
@@ -52,12 +53,15 @@ MAX_BYTES = 1 << 34
 
 CameraEntry = tuple[int, str | int, tuple[int, int], Sequence[float]]
 """Number of a camera, name or number of its model, width and height, and parameters."""
+Track = tuple[tuple[float, ...], list[int]]
+"""Position of a point, and the numbers of the images that show it."""
 Entry = TypeVar("Entry")
 
 
 class PosedImage(NamedTuple):
     """An image of a model."""
 
+    number: int
     name: str
     """Path below the folder of photographs, with forward slashes."""
     camera: int
@@ -65,12 +69,12 @@ class PosedImage(NamedTuple):
     """Camera-to-world in OpenCV axes; world-to-camera where that cannot be inverted."""
 
 
-def build_posed_image(name: str, camera: int, numbers: Sequence[float]) -> PosedImage:
+def build_posed_image(number: int, name: str, camera: int, numbers: Sequence[float]) -> PosedImage:
     """Build an image from world-to-camera: a quaternion, real part first, and a translation."""
     viewmat = np.eye(4)
     viewmat[:3, :3] = compute_rotation(numbers[:4])
     viewmat[:3, 3] = numbers[4:]
-    return PosedImage(name.replace("\\", "/"), camera, invert_viewmat(viewmat))
+    return PosedImage(number, name.replace("\\", "/"), camera, invert_viewmat(viewmat))
 
 
 class Model(NamedTuple):
@@ -175,12 +179,28 @@ def read_images(path: Path) -> list[PosedImage]:
 
 
 def read_points(path: Path) -> Float[np.ndarray, "n 3"]:
-    """Read the points of a points3D.bin or points3D.txt in scene units, without tracks."""
+    """Read the points of a points3D.bin or points3D.txt in scene units."""
+    return np.fromiter((xyz for xyz, _ in _read_tracks(path)), dtype=np.dtype((np.float64, 3)))
+
+
+@lru_cache(maxsize=1)
+def read_seen_points(path: Path, changed: int) -> dict[int, Float[np.ndarray, "n 3"]]:
+    """Read the points that each image shows, by the number of the image.
+
+    `changed` is the time of the last change of the file.
+    """
+    found = [(image, xyz) for xyz, images in _read_tracks(path) for image in set(images)]
+    found.sort(key=lambda one: one[0])
+    return {
+        image: np.array([xyz for _, xyz in group])
+        for image, group in groupby(found, key=lambda one: one[0])
+    }
+
+
+def _read_tracks(path: Path) -> Iterator[Track]:
     if _is_text(path):
-        found = _parse_lines(path, "POINT3D_ID X Y Z …", _parse_point)
-    else:
-        found = _read_binary_points(path)
-    return np.fromiter(found, dtype=np.dtype((np.float64, 3)))
+        return _parse_lines(path, "POINT3D_ID X Y Z …", _parse_point)
+    return _read_binary_points(path)
 
 
 def _is_text(path: Path) -> bool:
@@ -199,17 +219,18 @@ def _read_binary_cameras(path: Path) -> Iterator[CameraEntry]:
 def _read_binary_images(path: Path) -> Iterator[PosedImage]:
     with _open_binary(path) as content:
         for _ in range(_read_count(content)):
-            _, *pose, camera = _unpack(content, "<I4d3dI")
+            number, *pose, camera = _unpack(content, "<I4d3dI")
             name = _read_name(content)
             content.seek(_read_count(content) * FEATURE_SIZE, os.SEEK_CUR)
-            yield build_posed_image(name, camera, pose)
+            yield build_posed_image(number, name, camera, pose)
 
 
-def _read_binary_points(path: Path) -> Iterator[tuple[float, ...]]:
+def _read_binary_points(path: Path) -> Iterator[Track]:
     with _open_binary(path) as content:
         for _ in range(_read_count(content)):
-            yield _unpack(content, "<Q3d3Bd")[1:4]
-            content.seek(_read_count(content) * SIGHTING_SIZE, os.SEEK_CUR)
+            xyz = _unpack(content, "<Q3d3Bd")[1:4]
+            track = content.read(_read_count(content) * SIGHTING_SIZE)
+            yield xyz, [image for image, _ in struct.iter_unpack("<II", track)]
 
 
 @contextmanager
@@ -272,14 +293,14 @@ def _parse_image(line: str) -> PosedImage | None:
     words = line.split()
     if len(words) % 3 == 0 and words[-1].lstrip("-").isdecimal():
         return None
-    _, qw, qx, qy, qz, x, y, z, camera, name = line.split(maxsplit=9)
+    number, qw, qx, qy, qz, x, y, z, camera, name = line.split(maxsplit=9)
     pose = [float(word) for word in (qw, qx, qy, qz, x, y, z)]
-    return build_posed_image(name, int(camera), pose)
+    return build_posed_image(int(number), name, int(camera), pose)
 
 
-def _parse_point(line: str) -> tuple[float, ...]:
-    _, x, y, z, *_ = line.split(maxsplit=4)
-    return float(x), float(y), float(z)
+def _parse_point(line: str) -> Track:
+    _, x, y, z, *rest = line.split()
+    return (float(x), float(y), float(z)), [int(image) for image in rest[4::2]]
 
 
 def has_colmap(path: Path) -> bool:
@@ -379,10 +400,20 @@ def read_image_file(path: Path) -> list[Frame]:
             f"Images in {quote_value(path)} were taken by camera {min(lacking)}, which is not in "
             "the cameras file beside it; export the model again."
         )
-    return [
-        Frame(name, f"image {quote_value(name)} of {quote_value(path)}", c2w, cameras[camera], None)
-        for name, camera, c2w in images
-    ]
+    points = _find_model_file(path.parent, "points3D")
+
+    def make_frame(image: PosedImage) -> Frame:
+        title = f"image {quote_value(image.name)} of {quote_value(path)}"
+        shown = None if points is None else partial(_find_seen, points, image.number)
+        lens = cameras[image.camera]
+        return Frame(image.name, title, image.c2w, lens, None, seen_points=shown)
+
+    return [make_frame(image) for image in images]
+
+
+def _find_seen(path: Path, number: int) -> Float[np.ndarray, "n 3"]:
+    found = read_seen_points(path, path.stat().st_mtime_ns)
+    return found.get(number, np.zeros((0, 3)))
 
 
 def _list_roots(scene: Path, model: Path) -> list[Path]:

@@ -23,6 +23,7 @@ from gscompleter.data.ego_vehicle import attach_vehicle_detector
 from gscompleter.data.frame import FOLDERS
 from gscompleter.data.limits import check_planes, require
 from gscompleter.data.llff import has_llff, open_llff
+from gscompleter.data.one_photograph import find_photograph, open_photograph
 from gscompleter.data.phones.apps import POLYCAM, SCANNER_APP, find_recording, open_recording
 from gscompleter.data.photographs import Photographs
 from gscompleter.data.real_estate import (
@@ -67,6 +68,7 @@ FORMATS = {
     "polycam": Format(POLYCAM.find_frames, POLYCAM.open, "m"),
     "record3d": Format(find_recording, open_recording, "m"),
     "3d-scanner-app": Format(SCANNER_APP.find_frames, SCANNER_APP.open, "m"),
+    "photograph": Format(find_photograph, open_photograph),
 }
 """Formats by the names that `open_photographs` takes, in the order of detection."""
 

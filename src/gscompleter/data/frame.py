@@ -63,6 +63,8 @@ class Frame:
     """Name of the vehicle's camera, or None for a single camera."""
     laser_points: Callable[[], Float[np.ndarray, "n 3"]] | None = None
     """Reads laser points of about that time, in the frame of the poses."""
+    seen_points: Callable[[], Float[np.ndarray, "n 3"]] | None = None
+    """Reads the triangulated points that the photograph shows, in the frame of the poses."""
     boxes: Callable[[], Float[np.ndarray, "n 8 3"]] | None = None
     """Reads the corners of moving objects' boxes at about that time, in the frame of the poses."""
     vehicle: Callable[[], Bool[np.ndarray, "h w"] | None] | None = None

@@ -17,11 +17,12 @@ from PIL import Image
 from torch import Tensor
 
 from gscompleter.data.cameras import compute_fov, compute_undistortion_map, find_pose_defect, remap
-from gscompleter.data.driving.vehicle import compute_sparse_depth, mask_moving
+from gscompleter.data.driving.vehicle import mask_moving
 from gscompleter.data.frame import Frame
 from gscompleter.data.limits import MAX_SIDE
 from gscompleter.data.local_origin import choose_local_origin
 from gscompleter.errors import InputError, quote_value
+from gscompleter.geometry import compute_sparse_depth
 from gscompleter.io.image import convert_to_image, read_pixels
 from gscompleter.types import Camera, View
 

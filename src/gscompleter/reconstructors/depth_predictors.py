@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
+from dataclasses import replace
 from pathlib import Path
 
 import torch
@@ -19,6 +20,17 @@ def predict_nothing(view: View) -> DepthMap:
     """Predict no depth: surfaces continue what stereo measured."""
     depth = torch.ones_like(view.image[..., 0])
     return DepthMap(depth, torch.zeros_like(depth, dtype=torch.bool))
+
+
+def give_prediction(views: Sequence[View], predict: DepthPredictor) -> list[View]:
+    """Give a single photograph the predicted depth, in the scale of the predictor.
+
+    Without stereo nothing else measures; several photographs and a given depth stay as they are.
+    """
+    if len(views) != 1 or len(views[0].known_depths):
+        return list(views)
+    predicted = predict(views[0])
+    return [replace(views[0], given_depth=predicted.depth.where(predicted.valid, 0.0))]
 
 
 DEPTH_PREDICTORS: dict[str, Callable[[Path | None, str], DepthPredictor]] = {

@@ -55,11 +55,12 @@ def transform_camera_exactly(camera: Camera, transform: Matrix) -> Camera:
 
 
 def transform_view(view: View, transform: Matrix) -> View:
-    """Transform a photograph's camera and its measured depth."""
+    """Transform a photograph's camera and its depths."""
     if np.array_equal(transform, np.eye(4)):
         return view
-    depth = None if view.depth is None else view.depth * get_scale(transform)
-    return replace(view, camera=transform_camera(view.camera, transform), depth=depth)
+    scale, names = get_scale(transform), ("depth", "given_depth")
+    depths = {name: d * scale for name in names if (d := getattr(view, name)) is not None}
+    return replace(view, camera=transform_camera(view.camera, transform), **depths)
 
 
 def get_pose(camera: Camera) -> Matrix:

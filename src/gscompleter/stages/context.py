@@ -14,6 +14,7 @@ from gscompleter.config import CompleterConfig, get_named_config
 from gscompleter.errors import InputError
 from gscompleter.geometry import compute_z_depths, project_mask
 from gscompleter.reconstructors import Reconstructor, run_reconstructor
+from gscompleter.reconstructors.depth_predictors import give_prediction, predict_nothing
 from gscompleter.reconstructors.features.depth_range import get_depth_range, set_depth_range
 from gscompleter.render import Renderer
 from gscompleter.render.lod import build_proxy
@@ -62,16 +63,27 @@ def init_context(
     renderer: Renderer,
 ) -> InitialContext:
     """Reconstruct the context from photographs, or take the scene that was given (Eq. 5)."""
-    if len(views) < (2 if scene is None else 1):
-        raise InputError(
-            f"{len(views)} context view was given, and stereo needs at least 2; name more "
-            "frames, or give a scene."
-        )
     views = sort_by_frame(views)
+    if scene is None:
+        views = prepare_single(reconstructor, views)
+    if not views:
+        raise InputError("No context view was given; name at least one frame.")
     check_colors([*views, *check_views])
     if scene is None:
         return reconstruct_context(reconstructor, views)
     return take_scene(scene, views, check_views, targets, renderer)
+
+
+def prepare_single(reconstructor: Reconstructor, views: Sequence[View]) -> list[View]:
+    """Give a single photograph its predicted depth; raise InputError if it has no depth at all."""
+    views = give_prediction(views, getattr(reconstructor, "predict_depth", predict_nothing))
+    if len(views) < 2 and not any(len(view.known_depths) for view in views):
+        raise InputError(
+            f"{len(views)} context view was given, and stereo needs at least 2; name more frames, "
+            "give a scene, or give one photograph with its depth or with a model that predicts it "
+            "(moge-2)."
+        )
+    return views
 
 
 def reconstruct_context(reconstructor: Reconstructor, views: Sequence[View]) -> InitialContext:
@@ -115,9 +127,9 @@ def check_colors(views: Sequence[View]) -> None:
 
 
 def check_texture(views: Sequence[View]) -> None:
-    """Raise InputError if fewer than two photographs have any texture to match."""
+    """Raise InputError if fewer than two of several photographs have any texture to match."""
     num_flat = sum(not has_texture(view.image) for view in views)
-    if len(views) - num_flat < 2:
+    if len(views) - num_flat < 2 <= len(views):
         raise InputError(
             f"{num_flat} of the {len(views)} context photographs show no texture, and stereo needs "
             "at least 2 that do; choose other photographs."

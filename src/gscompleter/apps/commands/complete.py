@@ -59,6 +59,7 @@ from gscompleter.render.lod import MIN_PROXY_GAUSSIANS
 from gscompleter.splat_alignment.similarity import transform_camera, transform_camera_exactly
 from gscompleter.splats.formats import load_splat
 from gscompleter.splats.morton import argsort_nearby
+from gscompleter.stages.context import prepare_single
 from gscompleter.state import Completion
 from gscompleter.timing import add_seconds, record_seconds, timed_stage
 from gscompleter.types import Camera
@@ -188,6 +189,8 @@ def prepare_completion(options: CompleteOptions, console: Console) -> Prepared:
         task = add_splat(task, options.scene, options, opened, parts)
     with show_preparation("loading models"):
         completer = load_completer(options, task.targets, device)
+    if options.scene is None:
+        task = replace(task, views=prepare_single(completer.reconstructor, task.views))
     with show_preparation("depth range"), record_seconds() as seconds, timed_stage("context"):
         task = apply_working_range(task, completer.renderer)
     cameras = collect_cameras(options, opened, task)

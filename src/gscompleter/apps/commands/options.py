@@ -103,7 +103,7 @@ class SceneOptions(ComputeOptions, WritingOptions):
     """Folder of the photographs: COLMAP, nerfstudio, cameras.json, LLFF, KITTI, DGP, Waymo,
     PandaSet, a pixelSplat chunk, a RealEstate10K camera file, or what Polycam, Record3D or 3d
     Scanner App exports. If it has no cameras, COLMAP finds them and they are kept in OUT/colmap;
-    also of 360° panoramas (2:1) and of a video (.mp4, .mov, .mkv)."""
+    also of 360° panoramas (2:1) and of a video (.mp4, .mov, .mkv). One image needs none."""
     frames: NumFrames = 40
     """Most frames of a video to take as photographs, sharp ones at even steps of the camera."""
     context: Frames = None
@@ -112,8 +112,8 @@ class SceneOptions(ComputeOptions, WritingOptions):
     out: Path
     format: str | None = None
     """Format of SCENE: colmap, nerfstudio, cameras-json, llff, kitti, kitti-raw, dgp, waymo,
-    mmdet3d, pandaset, chunks, real-estate-10k, polycam, record3d or 3d-scanner-app. Detected if
-    not given."""
+    mmdet3d, pandaset, chunks, real-estate-10k, polycam, record3d, 3d-scanner-app or photograph.
+    Detected if not given."""
     scene: Path | None
     resolution: Size = LONG_SIDE
     """Working size: the longest side in pixels (photographs are never enlarged), or height and
@@ -122,6 +122,8 @@ class SceneOptions(ComputeOptions, WritingOptions):
     """Smallest depth in the scene, in the unit of its cameras; estimated if not given."""
     far: float | None = None
     """Largest depth in the scene, in the unit of its cameras; estimated if not given."""
+    no_given_depth: bool = False
+    """Ignore the depth that SCENE holds: depth maps, laser sweeps and COLMAP's points."""
     drop_nonfinite: bool = False
     """Drop Gaussians that contain NaN or infinity instead of refusing the file."""
 

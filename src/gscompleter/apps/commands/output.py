@@ -42,6 +42,7 @@ def describe_run(
             "resolution": options.resolution,
             "near": options.near,
             "far": options.far,
+            "no_given_depth": options.no_given_depth,
             "config": asdict(config),
         },
         "device": task.device.type,

@@ -7,6 +7,7 @@ import re
 from collections.abc import Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, replace
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -25,12 +26,12 @@ from gscompleter.apps.inputs.selection import (
     CHECK_VIEW_SIZE,
     choose_context,
     collect_usable_cameras,
-    get_min_views,
     select_near_and_far,
 )
 from gscompleter.apps.report.completion import InputSplatFile, Target
 from gscompleter.data.camera_files import refuse_other_exports
 from gscompleter.data.formats import find_format, open_photographs, refuse_scenes_below
+from gscompleter.data.given_depth import give_depths
 from gscompleter.data.local_origin import (
     choose_scene_origin,
     compute_frame_from_photographs,
@@ -195,8 +196,9 @@ def make_task(
     ]
     cameras = [bounded.camera(frame, resolution) for frame in frames]
     check_sides([*cameras, *(target.camera for target in targets)])
+    load = bounded.views if options.no_given_depth else partial(give_depths, bounded)
     return Task(
-        [view.to(device) for view in bounded.views(frames, resolution)],
+        [view.to(device) for view in load(frames, resolution)],
         [add_photograph(target, bounded, options) for target in targets],
         compute_frame_from_photographs(given.origin),
         given.origin,
@@ -261,12 +263,12 @@ def apply_working_range(task: Task, renderer: Renderer) -> Task:
 
 
 def check_context(options: SceneOptions) -> None:
-    """Refuse too few or repeated context frames."""
-    context, needed = options.context, get_min_views(options)
-    if context is not None and len(set(context)) < max(needed, len(context)):
+    """Refuse an empty context, and repeated frames."""
+    context = options.context
+    if context is not None and not 0 < len(context) == len(set(context)):
         raise InputError(
-            f"--context names too few frames, or one twice; name at least {needed} different "
-            "ones, as in --context 0 4, or leave it out."
+            "--context names no frame, or one twice; name different ones, as in --context 0 4, or "
+            "leave it out."
         )
 
 

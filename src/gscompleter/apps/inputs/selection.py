@@ -9,7 +9,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from gscompleter.apps.commands.options import CompleteOptions, SceneOptions, parse_resolution
+from gscompleter.apps.commands.options import CompleteOptions, parse_resolution
 from gscompleter.apps.report.completion import Target
 from gscompleter.data.photographs import Photographs, Resolution
 from gscompleter.errors import InputError
@@ -31,11 +31,6 @@ NUM_DEPTH_VIEWS, CHECK_VIEW_SIZE = 6, 320
 """Photographs for depth range estimation, and the longer side of these and of check views."""
 
 
-def get_min_views(options: SceneOptions) -> int:
-    """Return the minimum number of photographs."""
-    return 2 if options.scene is None else 1
-
-
 def choose_context(
     options: CompleteOptions, given: Photographs, targets: Sequence[Target]
 ) -> tuple[int, ...]:
@@ -46,12 +41,13 @@ def choose_context(
     target_frames = {target.frame for target in targets}
     others = [frame for frame in range(len(given)) if frame not in target_frames]
     cameras = collect_usable_cameras(given, others, parse_resolution(options.resolution))
-    fewest = get_min_views(options)
-    if len(cameras) < fewest:
+    if not cameras:
         raise InputError(
-            f"The context needs at least {fewest} photographs, and without the targets "
-            f"{len(cameras)} can be used; name fewer targets, or add photographs."
+            "The context needs photographs, and without the targets none can be used; name fewer "
+            "targets, or add photographs."
         )
+    if len(cameras) == 1:
+        return tuple(cameras)
     candidates, target_cameras = list(cameras.values()), [target.camera for target in targets]
     points = given.points()
     if points is None or len(points) == 0:

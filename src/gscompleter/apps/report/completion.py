@@ -195,15 +195,16 @@ def score_context(completion: Completion, renderer: Renderer) -> list[ContextRow
             **found,
             exposure_gain=gain,
             dynamic_fraction=compute_mask_fraction(view.dynamic_mask),
+            given_depth=compute_mask_fraction(view.given_depth),
             ignored=compute_mask_fraction(view.ignore_mask),
         )
         for view, found, gain in zip(views, scores, gain_rows, strict=True)
     ]
 
 
-def compute_mask_fraction(mask: Bool[Tensor, "h w"] | None) -> float:
-    """Compute the fraction of True pixels; 0 without a mask."""
-    return 0.0 if mask is None else mask.float().mean().item()
+def compute_mask_fraction(mask: Bool[Tensor, "h w"] | Float[Tensor, "h w"] | None) -> float:
+    """Compute the fraction of True or positive pixels; 0 without a mask."""
+    return 0.0 if mask is None else (mask > 0).float().mean().item()
 
 
 def score_targets(

@@ -63,6 +63,12 @@ def list_photograph_notes(context: Sequence[ContextRow]) -> Iterator[str]:
     if moving:
         shares = (f"{format_percent(row.dynamic_fraction)} of frame {row.frame}" for row in moving)
         yield f"{', '.join(shares)} show something that moves; these regions are not used."
+    given = max((row.given_depth for row in context), default=0.0)
+    if given > 0:
+        yield (
+            f"Up to {format_percent(given)} of a photograph's pixels have a measured or predicted "
+            "depth, which decides their surfaces (--no-given-depth ignores what SCENE holds)."
+        )
     ignored = max((row.ignored for row in context), default=0.0)
     if ignored > 0:
         yield (

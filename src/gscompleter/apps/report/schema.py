@@ -52,6 +52,8 @@ class ContextRow(ScoreRow):
 
     exposure_gain: Vector | None = None
     dynamic_fraction: float = 0.0
+    given_depth: float = 0.0
+    """Share of the pixels whose depth was given."""
     ignored: float = 0.0
 
 

@@ -7,13 +7,10 @@ from pathlib import Path
 
 import cv2
 import numpy as np
-import torch
 from jaxtyping import Bool, Float
-from torch import Tensor
 
 from gscompleter.data.limits import require
 from gscompleter.errors import quote_value
-from gscompleter.geometry import is_inside, project
 from gscompleter.io.reading import read_bytes
 from gscompleter.types import Camera
 
@@ -27,16 +24,6 @@ NEAREST = 0.1
 """Smallest z-depth of the corners of a box, in metres."""
 MAX_PIXELS = 1e5
 """Largest pixel coordinate of a projected corner; rasterisers use integers."""
-
-
-def compute_sparse_depth(points: Float[Tensor, "n 3"], camera: Camera) -> Float[Tensor, "h w"]:
-    """Project points to z-depth in scene units: the nearest per pixel, 0 without one."""
-    pixels, z = project(points, camera)
-    seen = is_inside(pixels, z, camera)
-    x, y = pixels[seen].long().unbind(-1)
-    nearest = torch.full((camera.height * camera.width,), torch.inf)
-    nearest = nearest.scatter_reduce(0, y * camera.width + x, z[seen], "amin")
-    return nearest.where(nearest.isfinite(), 0.0).view(camera.height, camera.width)
 
 
 def read_sweep(path: Path, world_from_laser: Float[np.ndarray, "4 4"]) -> Float[np.ndarray, "n 3"]:

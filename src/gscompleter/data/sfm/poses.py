@@ -172,12 +172,12 @@ def _read_earlier(out: Path, known: Mapping[str, list[int]]) -> FoundPoses | Non
 
 def has_photographs(path: Path) -> bool:
     """Check whether `path` is a video or a folder with photographs, with or without cameras."""
-    return is_video(path) or (os.path.isdir(path) and bool(_walk_photographs(path)))
+    return is_video(path) or (os.path.isdir(path) and bool(list_all_photographs(path)))
 
 
 def list_photograph_files(folder: Path) -> list[str]:
     """List the photographs below a folder in natural order; two panoramas or three others."""
-    names = _walk_photographs(folder)
+    names = list_all_photographs(folder)
     if len(names) < MIN_PHOTOGRAPHS:
         _check_few(folder, names)
     return names
@@ -199,7 +199,8 @@ def _check_few(folder: Path, names: Sequence[str]) -> None:
     )
 
 
-def _walk_photographs(folder: Path) -> list[str]:
+def list_all_photographs(folder: Path) -> list[str]:
+    """List the photographs below a folder in natural order."""
     found: list[Path] = []
     for home, folders, files in os.walk(folder):
         folders[:] = [name for name in folders if is_own(Path(home, name))]
@@ -282,7 +283,7 @@ def write_upright(root: Path, source: str, folder: Path) -> UprightCopy:
         if not is_ready:  # decodes a JPEG at half or a quarter of its size if that is enough
             image.draft("RGB", (MAX_SIDE, MAX_SIDE))
         copy = ImageOps.exif_transpose(image).convert("RGB")
-        focal, lens = _read_focal(exif), _describe_lens(exif)
+        focal, lens = read_focal(exif), _describe_lens(exif)
     copy.thumbnail((MAX_SIDE, MAX_SIDE), Image.Resampling.LANCZOS)
     # In COLMAP's lists a space ends a name, and # begins a comment.
     name = re.sub(r"[\s#]", "_", source) + ("" if is_known else ".png")
@@ -308,7 +309,7 @@ def _prepare_target(target: Path, source: Path) -> Path:
     return target
 
 
-def _read_focal(exif: Image.Exif) -> float | None:
+def read_focal(exif: Image.Exif) -> float | None:
     """Read the focal length in image diagonals from the 35 mm equivalent; None if there is none."""
     try:
         millimetres = float(exif.get_ifd(EXIF)[FOCAL_LENGTH_35])

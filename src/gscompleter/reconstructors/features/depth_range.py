@@ -22,8 +22,12 @@ def estimate_depth_range(views: Sequence[View]) -> tuple[float, float]:
     """Estimate near and far z-depth of the scene, in scene units.
 
     They are half the depth of the nearest 2 % of the triangulated matches and four times that of
-    the farthest 2 %. With too few matches they are derived from the baselines.
+    the farthest 2 %. With too few matches they are derived from the baselines. For a single view
+    the given depths take the place of matches.
     """
+    if len(views) == 1 and len(views[0].known_depths):
+        low, high = np.quantile(views[0].known_depths.cpu(), [0.02, 0.98]).tolist()
+        return 0.5 * low, 4.0 * high
     images, unit = make_stereo_images(views)
     neighbours = find_neighbours(images)
     inverse = triangulate_neighbours(images, neighbours)

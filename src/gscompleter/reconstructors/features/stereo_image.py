@@ -38,9 +38,11 @@ def make_stereo_images(views: Sequence[View]) -> tuple[list[StereoImage], float]
     """Convert views to units of their widest baseline; return it in scene units too.
 
     Camera offsets are rounded to 2^-16 baselines, so that a scaled scene gives identical results.
-    Raise InputError for fewer than two views, a tiny image, or no baseline.
+    The unit of a single view with given depth is its near plane. Raise InputError for another
+    single view, a tiny image, or no baseline.
     """
-    if len(views) < 2:
+    is_single = len(views) == 1 and len(views[0].known_depths) > 0
+    if len(views) < 2 and not is_single:
         raise InputError(
             f"Stereo needs at least two views and got {len(views)}; give it another photograph."
         )
@@ -51,6 +53,8 @@ def make_stereo_images(views: Sequence[View]) -> tuple[list[StereoImage], float]
                 f"An image of {width} x {height} pixels was given, and stereo needs at least "
                 f"{MIN_SIDE} x {MIN_SIDE}; give a larger one."
             )
+    if is_single and views[0].camera.near:
+        return [_make_stereo_image(views[0], np.zeros(3))], views[0].camera.near
     centers = np.stack([view.camera.center.detach().cpu().double().numpy() for view in views])
     unit = float(np.linalg.norm(centers[:, None] - centers[None], axis=-1).max())
     if unit <= 2e-7 * float(np.linalg.norm(centers, axis=-1).max()):

@@ -63,8 +63,8 @@ class Splatter:
     ) -> Reconstruction:
         """Build the Gaussians of `views` and fit them to the photographs.
 
-        Two views keep all pixels. With more views each surface is kept once, from the view that
-        resolves it best; observed free space stays empty, and clearly different exposures are
+        One or two views keep all pixels. With more views each surface is kept once, from the view
+        that resolves it best; observed free space stays empty, and clearly different exposures are
         normalized to their mean. `depths` are in scene units, `layers` are the same per widest
         baseline.
         """
@@ -96,9 +96,13 @@ class Splatter:
         """Lift the pixels of `pixel_mask` in the first view and fit their colours to it."""
         rows = torch.nonzero(pixel_mask.reshape(-1))[:, 0]
         blurred, image = self.splat(views[0], depths[0])[rows].to("cpu"), views[0].to("cpu")
-        alone = self.renderer.freeze(blurred[:0], image.camera)
-        made = fit_colors(blurred, [alone], [image], [RELAXATION] * COLOR_ROUNDS).to(rows.device)
+        made = self.fit_to_image(blurred, image).to(rows.device)
         return Reconstruction(made, tuple(depths), torch.zeros_like(rows), rows)
+
+    def fit_to_image(self, gaussians: Gaussians, view: View) -> Gaussians:
+        """Fit only the colours, to one image."""
+        alone = self.renderer.freeze(gaussians[:0], view.camera)
+        return fit_colors(gaussians, [alone], [view], [RELAXATION] * COLOR_ROUNDS)
 
     def select_pixels(
         self,
@@ -108,7 +112,7 @@ class Splatter:
         transforms: Transforms,
     ) -> Bool[Tensor, "n"]:
         """Select the pixels that form the scene, over all views in turn."""
-        if len(views) == 2:
+        if len(views) <= 2:
             return torch.ones(len(gaussians), dtype=torch.bool)
         free = find_free_pixels(layers, transforms)
         kept = flatten_masks(find_finest_pixels(layers, free, transforms))
@@ -132,6 +136,8 @@ class Splatter:
         self, gaussians: Gaussians, views: Sequence[View], gains: Float[Tensor, "views 3"]
     ) -> Gaussians:
         """Fit the Gaussians to views that are brighter by `gains`."""
+        if len(views) == 1:
+            return self.fit_to_image(gaussians, views[0])
         if len(views) == 2:
             faded, depths = fit_opacities(gaussians, views, self.renderer)
             return fit_directional_colors(faded, views, depths, self.renderer)

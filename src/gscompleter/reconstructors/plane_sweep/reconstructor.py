@@ -4,19 +4,22 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from itertools import repeat
 
 import numpy as np
 import torch
 from jaxtyping import Bool
 from torch import Tensor
 
+from gscompleter.geometry import compute_sparse_depth, measure_baseline, unproject
 from gscompleter.kernels.parallel import map_in_parallel
 from gscompleter.reconstructors.depth_predictors import DepthPredictor, predict_nothing
 from gscompleter.reconstructors.features.depth_range import get_depth_range, set_depth_range
 from gscompleter.reconstructors.features.stereo_image import StereoImage
 from gscompleter.reconstructors.plane_sweep.fusion import Layer
 from gscompleter.reconstructors.plane_sweep.gaussians import Splatter
+from gscompleter.reconstructors.plane_sweep.given_depth import add_given, measure_nothing
 from gscompleter.reconstructors.plane_sweep.predicted_depth import add_prediction
 from gscompleter.reconstructors.plane_sweep.rig import Rig, build_rig
 from gscompleter.reconstructors.plane_sweep.sky_mask import find_skies, find_sky, transfer_sky
@@ -57,11 +60,15 @@ class PlaneSweep(Splatter):
 
         No photograph observes a hole, so its opacities are not fitted; its depth continues the
         surfaces around it. Colours are fitted to the image itself. The sky gets no
-        depth.
+        depth. At the place of an anchor with given depth there is no parallax, and the given
+        surfaces are continued.
         """
         views = set_depth_range(views, *get_depth_range(views))
+        if len(views[1].known_depths) and measure_baseline(*(v.camera for v in views)) == 0:
+            return self.lift_in_place(views[0], views[1], pixel_mask)
         rig = build_rig(views)
         first, second = match_views(rig, views, MIN_HALVED_SIDES["lift"])
+        first = add_given(first, views[0], rig.unit)
         open_there = find_sky(rig.images[1], second)
         first = add_prediction(first, self.predict_depth(views[0]))
         layers = [
@@ -72,6 +79,17 @@ class PlaneSweep(Splatter):
         ]
         return self.lift_pixels(views, make_depth_maps(layers, rig.unit, views), pixel_mask)
 
+    def lift_in_place(
+        self, image: View, anchor: View, pixel_mask: Bool[Tensor, "h w"]
+    ) -> Reconstruction:
+        """Lift an image by the given depth of a photograph from the same place."""
+        assert anchor.given_depth is not None
+        known = anchor.given_depth > 0
+        points = unproject(anchor.given_depth, anchor.camera)[known]
+        turned = replace(image, given_depth=compute_sparse_depth(points, image.camera))
+        (depth,) = self.estimate_depths([turned])
+        return self.lift_pixels([image], [depth, DepthMap(anchor.given_depth, known)], pixel_mask)
+
     def estimate_depths(self, views: Sequence[View]) -> list[DepthMap]:
         """Estimate z-depth and confidence of every pixel, in scene units."""
         views = set_depth_range(views, *get_depth_range(views))
@@ -81,7 +99,8 @@ class PlaneSweep(Splatter):
     def compute_layers(self, rig: Rig, views: Sequence[View]) -> list[Layer]:
         """Compute the completed inverse depth of each view."""
         least = MIN_HALVED_SIDES["pair" if len(views) == 2 else "many"]
-        found = match_views(rig, views, least)
+        stereo = match_views(rig, views, least)
+        found = list(map(add_given, stereo, views, repeat(rig.unit)))
         seen = find_skies(rig, found)
         guided = map(add_prediction, found, map(self.predict_depth, views))
         surfaces = map_in_parallel(make_layer, rig.images, map(Measurement.exclude, guided, seen))
@@ -89,9 +108,15 @@ class PlaneSweep(Splatter):
 
 
 def match_views(rig: Rig, views: Sequence[View], min_halved_side: float) -> list[Measurement]:
-    """Measure depth outside the ignored pixels, at half size if all images are large enough."""
+    """Measure depth outside the ignored pixels, at half size if all images are large enough.
+
+    A single photograph has no stereo, and nothing is measured.
+    """
+    near, far = get_depth_range(views)
+    if len(views) == 1:
+        return [measure_nothing(rig.images[0], near / rig.unit, far / rig.unit)]
     is_halved = min(min(image.size) for image in rig.images) >= min_halved_side
-    found = measure_depths(rig.halve() if is_halved else rig, *get_depth_range(views))
+    found = measure_depths(rig.halve() if is_halved else rig, near, far)
     return [
         one if image.ignore_mask is None else one.exclude(image.ignore_mask)
         for one, image in zip(found, rig.images, strict=True)

@@ -55,7 +55,7 @@ class Rig:
 def build_rig(views: Sequence[View]) -> Rig:
     """Relate the views by their poses, corrected to fit the feature matches."""
     images, unit = make_stereo_images(views)
-    neighbours = find_neighbours(images)
+    neighbours = find_neighbours(images) if len(images) > 1 else Neighbours(((),), {})
     transforms = {}
     for i, j in combinations(range(len(images)), 2):
         source = images[j]

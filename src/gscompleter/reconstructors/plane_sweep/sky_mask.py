@@ -165,13 +165,15 @@ def measure_planarity(outline: Mask, heights: Map) -> float:
 
 
 def is_confirmed(number: int, sky: Mask, others: Sequence[Mask], rig: Rig) -> bool:
-    """Test if most of `sky` is sky in the other views that show its direction."""
+    """Test if most of `sky` is sky in the other views, if any, that show its direction."""
     shown = [
         sample_at_infinity(sky.shape, other, rig, number, i)[sky]
         for i, other in enumerate(others)
         if i != number
     ]
-    answers = np.concatenate(shown) if shown else np.zeros(0)
+    if not shown:
+        return True
+    answers = np.concatenate(shown)
     seen = answers >= 0
     return bool(seen.any()) and float(answers[seen].mean()) > MIN_SKY_AGREEMENT
 

@@ -1,0 +1,68 @@
+"""Depth that a scene holds, given to its photographs: depth maps, laser sweeps, COLMAP's points.
+
+Nothing that is scored may be given, so `evaluate` never does this.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import replace
+
+import cv2
+import numpy as np
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from gscompleter.data.frame import Frame
+from gscompleter.data.photographs import Photographs, Resolution
+from gscompleter.geometry import compute_sparse_depth
+from gscompleter.types import View
+
+EDGE_SHARE, EDGE_RATIO = 1 / 128, 1.1
+"""Window around a pixel of a depth map, relative to the longer side, and the depth ratio within it
+from which the pixel lies at an edge, where sensor and photograph disagree."""
+GAP_SHARE, GAP_RATIO = 1 / 64, 1.2
+"""The same for laser points: how much nearer another is that hides a point."""
+
+
+def give_depths(
+    photographs: Photographs, frames: Sequence[int], resolution: Resolution = None
+) -> list[View]:
+    """Load photographs whose measured depth constrains the reconstruction and scores nothing."""
+    views = photographs.views(frames, resolution)
+    held = map(photographs.frame, frames)
+    return [give_depth(*pair, photographs.origin) for pair in zip(views, held, strict=True)]
+
+
+def give_depth(view: View, frame: Frame, origin: Float[np.ndarray, "3"]) -> View:
+    """Give a photograph its depth map or laser points, and the triangulated points beside them."""
+    given = torch.zeros_like(view.image[..., 0])
+    if frame.seen_points is not None:
+        points = torch.from_numpy(frame.seen_points() - origin).float()
+        given = compute_sparse_depth(points, view.camera)
+    if view.depth is not None:
+        sure = drop_edges(view.depth) if frame.depth is not None else drop_hidden(view.depth)
+        given = sure.where(sure > 0, given)
+    return replace(view, depth=None, given_depth=given)
+
+
+def drop_edges(depth: Float[Tensor, "h w"]) -> Float[Tensor, "h w"]:
+    """Set a depth map to 0 at its edges."""
+    nearest, farthest = find_extremes(depth, EDGE_SHARE)
+    return depth.where(farthest < EDGE_RATIO * nearest, 0.0)
+
+
+def drop_hidden(depth: Float[Tensor, "h w"]) -> Float[Tensor, "h w"]:
+    """Set sparse depths to 0 where a nearer surface lies beside them; a laser sees past it."""
+    return depth.where(depth < GAP_RATIO * find_extremes(depth, GAP_SHARE)[0], 0.0)
+
+
+def find_extremes(
+    depth: Float[Tensor, "h w"], share: float
+) -> tuple[Float[Tensor, "h w"], Float[Tensor, "h w"]]:
+    """Find the nearest and the farthest known depth around each pixel."""
+    values = depth.numpy()
+    window = np.ones((2 * max(1, round(share * max(values.shape))) + 1,) * 2, np.uint8)
+    known = np.where(values > 0, values, np.float32(np.inf))
+    return torch.from_numpy(cv2.erode(known, window)), torch.from_numpy(cv2.dilate(values, window))

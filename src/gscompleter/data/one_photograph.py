@@ -1,0 +1,70 @@
+"""One photograph without a camera: its own frame, and the focal length of EXIF or of a phone."""
+
+from __future__ import annotations
+
+import math
+import os
+from collections.abc import Callable, Iterator
+from dataclasses import replace
+from functools import partial
+from io import BytesIO
+from pathlib import Path
+
+import numpy as np
+from PIL import ImageOps
+
+from gscompleter.data.cameras import Intrinsics
+from gscompleter.data.frame import Frame
+from gscompleter.data.limits import require
+from gscompleter.data.panorama import has_panoramas
+from gscompleter.data.photographs import Photographs, build_photographs
+from gscompleter.data.sfm.poses import (
+    ENDINGS,
+    FULL_FRAME_DIAGONAL,
+    has_photographs,
+    list_all_photographs,
+    read_focal,
+)
+from gscompleter.errors import quote_value
+from gscompleter.io.image import ORIENTATION, open_image
+
+PHONE_FOCAL = 26 / FULL_FRAME_DIAGONAL
+"""Focal length if EXIF has none, in image diagonals: 26 mm in 35 mm film, a phone's camera."""
+
+
+def find_photograph(path: Path) -> Path | None:
+    """Return an image file, or the only photograph of a folder; None for anything else."""
+    if os.path.isfile(path):
+        return path if path.suffix.lower() in ENDINGS else None
+    names = list_all_photographs(path) if has_photographs(path) else []
+    return path / names[0] if len(names) == 1 else None
+
+
+def open_photograph(path: Path) -> Iterator[Photographs]:
+    """Open one photograph, upright, at the origin; x is right, y down, z forward."""
+    file = find_photograph(path)
+    assert file is not None
+    require(
+        not has_panoramas([file]),
+        f"{quote_value(file)} is a single panorama, which shows no depth; name a folder with "
+        "another one, taken a step away.",
+    )
+    with open_image(file) as image:
+        exif = image.getexif()
+        size = ImageOps.exif_transpose(image).size
+    found, title = read_focal(exif), quote_value(file)
+    focal = (found or PHONE_FOCAL) * math.hypot(*size)
+    is_upright = exif.get(ORIENTATION, 1) == 1
+    stored: Path | Callable[[], bytes] = file if is_upright else partial(read_upright, file)
+    frame = Frame(file.name, title, np.eye(4), Intrinsics(size, (focal, focal)), stored)
+    origin = "of EXIF" if found else "of a phone, since EXIF has none"
+    note = f"The photograph has no camera; a focal length of {focal:.0f} px is used, {origin}."
+    yield replace(build_photographs(file.stem, title, [frame]), notes=(note,))
+
+
+def read_upright(path: Path) -> bytes:
+    """Read a photograph that EXIF turns, as an upright PNG."""
+    made = BytesIO()
+    with open_image(path) as image:
+        ImageOps.exif_transpose(image).convert("RGB").save(made, "PNG")
+    return made.getvalue()

@@ -1,0 +1,111 @@
+"""Given depth is a measurement: it decides where it is known, and corrects stereo beside it."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import torch
+
+from gscompleter import GSCompleter, InputError
+from gscompleter.evaluation.metrics.geometry import compare_depths
+from gscompleter.evaluation.metrics.image import compute_masked_psnr
+from gscompleter.reconstructors.plane_sweep import PlaneSweep
+from gscompleter.reconstructors.plane_sweep.given_depth import NEAR_RADIUS, add_given
+from gscompleter.reconstructors.plane_sweep.sweep import Measurement
+from gscompleter.render import load_renderer
+from gscompleter.types import DepthMap, View
+from scenes import Room, camera_at, view_of
+
+PLANES = np.linspace(0.1, 1.3, 61, dtype=np.float32)
+SIZE = 64
+
+
+def give(view: View, where: torch.Tensor | float = 1.0) -> View:
+    """Give the true depth where a mask is True, and score with the rest."""
+    given = view.depth * where
+    return replace(view, depth=view.depth - given, given_depth=given)
+
+
+def measured(index: float) -> Measurement:
+    sure = np.ones((SIZE, SIZE), np.float32)
+    return Measurement(PLANES, index * sure, sure, sure)
+
+
+def test_a_given_depth_replaces_stereo_and_discredits_it_nearby():
+    view = replace(view_of(Room(), camera_at(size=SIZE)), depth=None)
+    depth = torch.zeros(SIZE, SIZE)
+    depth[30, 29:32] = 2.0
+    found = add_given(measured(5.0), replace(view, given_depth=depth), unit=1.0)
+    near = np.zeros((SIZE, SIZE), bool)
+    reach = slice(31 - NEAR_RADIUS, 30 + NEAR_RADIUS)
+    near[30 - NEAR_RADIUS : 31 + NEAR_RADIUS, reach] = True
+    assert found.index[30, 30] == pytest.approx(20.0, abs=1e-3)  # 1 / 2 in planes
+    assert found.confidence[30, 30] == 1
+    assert (found.weight[~near] == 1).all()
+    assert found.weight[near].sum() == 3
+    agreeing = add_given(measured(20.3), replace(view, given_depth=depth), unit=1.0)
+    assert (agreeing.weight == 1).all()
+    lone = add_given(
+        measured(5.0), replace(view, given_depth=depth * (torch.arange(SIZE) == 30)), 1.0
+    )
+    assert (lone.weight == 1).all()
+    assert add_given(found, view, unit=1.0) is found
+
+
+def test_blocks_of_depth_halve_the_error_between_them():
+    views = [view_of(Room(), camera_at(x, size=96)) for x in (-0.2, 0.2)]
+    blank = [torch.where((v.depth > 2.9)[..., None], 0.5, v.image) for v in views]
+    views = [replace(v, image=image) for v, image in zip(views, blank, strict=True)]
+    chessboard = torch.from_numpy(np.indices((96, 96)).sum(0) // 12 % 2 == 0)
+    errors = []
+    for given in views, [give(view, chessboard) for view in views]:
+        depths = PlaneSweep().estimate_depths(given)
+        parts = [
+            compare_depths(d.depth, v.depth, ~chessboard)
+            for d, v in zip(depths, views, strict=True)
+        ]
+        errors.append(np.mean([part.abs_rel for part in parts]))
+    assert errors[1] < 0.5 * errors[0]
+
+
+def test_no_depth_both_constrains_and_scores():
+    view = view_of(Room(), camera_at(size=SIZE))
+    half = torch.arange(SIZE) < SIZE // 2
+    split = give(view, half)
+    assert not (split.depth * split.given_depth).any()
+    with pytest.raises(InputError, match="both constrains and scores"):
+        replace(view, given_depth=view.depth)
+
+
+def predict_shifted(view: View) -> DepthMap:
+    """Predict the room from the photograph's place at twice the size."""
+    depth = 2 * view_of(Room(), view.camera).depth
+    return DepthMap(depth, depth < 2 * 4.5)
+
+
+@pytest.mark.parametrize("turn", [0.0, 12.0])
+def test_one_photograph_with_depth_is_a_context(turn):
+    view = give(view_of(Room(), camera_at(size=96)))
+    target = camera_at(0.3 if turn == 0 else 0.0, size=96, yaw=turn)
+    done = GSCompleter()([view], target)
+    truth, renderer = view_of(Room(), target), load_renderer("cpu")
+    shown = renderer.render(done.scene, target)
+    hole = done.targets[0].hole_mask
+    assert 0.05 < hole.float().mean() < 0.6
+    assert compare_depths(shown.depth, truth.depth, ~hole).abs_rel < 0.02
+    assert compare_depths(shown.depth, truth.depth, hole).abs_rel < 0.25
+    before = done.targets[0].before.image
+
+    assert compute_masked_psnr(before, truth.image, ~hole) > 22
+    assert shown.alpha[hole].mean() > 0.8
+
+
+def test_a_predictor_alone_sets_the_scale_of_one_photograph():
+    camera = replace(camera_at(size=96), near=None, far=None)
+    view = replace(view_of(Room(), camera), depth=None)
+    state = GSCompleter(reconstructor=PlaneSweep(predict_depth=predict_shifted)).begin([view])
+    shown = load_renderer("cpu").render(state.scene, state.views[0].camera)
+    truth = 2 * view_of(Room(), camera).depth
+    assert compare_depths(shown.depth, truth, truth < 9.0).abs_rel < 0.03
+    with pytest.raises(InputError, match="at least 2; .* a model that predicts it"):
+        GSCompleter().begin([view])
