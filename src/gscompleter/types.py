@@ -406,16 +406,31 @@ class ContextScene:
     rendered: Gaussians
     """The m Gaussians that the stages render; `gaussians` itself for small scenes and on GPUs."""
     proxy_index: Int64[Tensor, "_n"]
-    """Rendered Gaussian that stands for each Gaussian; empty if `rendered is gaussians`."""
+    """Rendered Gaussian that stands for each Gaussian, -1 if it was removed; empty if `rendered is
+    gaussians`."""
 
     @staticmethod
     def whole(gaussians: Gaussians) -> ContextScene:
         """Return a context that is rendered as it is."""
         return ContextScene(gaussians, gaussians, gaussians.means.new_empty(0).long())
 
+    @property
+    def stand_ins(self) -> Int64[Tensor, "n"]:
+        """Rendered Gaussian that stands for each Gaussian, -1 if it was removed."""
+        if self.rendered is not self.gaussians:
+            return self.proxy_index
+        return torch.arange(len(self.gaussians), device=self.gaussians.means.device)
+
+    @property
+    def removed_mask(self) -> Bool[Tensor, "n"]:
+        """True for Gaussians that were removed."""
+        return self.stand_ins < 0
+
     def expand(self, values: Shaped[Tensor, "m *c"]) -> Shaped[Tensor, "n *c"]:
-        """Map values of rendered Gaussians to the Gaussians they stand for."""
-        return values if self.rendered is self.gaussians else values[self.proxy_index]
+        """Map values of rendered Gaussians to those they stand for; 0 for removed ones."""
+        if self.rendered is self.gaussians:
+            return values
+        return torch.cat([values, torch.zeros_like(values[:1])])[self.proxy_index]
 
 
 @dataclass(frozen=True)

@@ -298,6 +298,16 @@ class CompleterConfig(Settings):
         )
 
     @staticmethod
+    def removal() -> CompleterConfig:
+        """Return the settings for a splat that something is removed from: its holes are filled.
+
+        What is left beside a hole is often half transparent.
+        """
+        return replace(
+            CompleterConfig.splat(), trust="full", holes=HoleConfig(max_alpha=0.85)
+        )
+
+    @staticmethod
     def paper() -> CompleterConfig:
         """Return the settings of the paper; `docs/paper.md` lists the remaining differences."""
         return CompleterConfig(
@@ -361,6 +371,7 @@ def get_named_config(name: str, is_splat: bool = False) -> CompleterConfig:
     bases = {
         "default": CompleterConfig.splat() if is_splat else CompleterConfig(),
         "splat": CompleterConfig.splat(),
+        "removal": CompleterConfig.removal(),
         "paper": CompleterConfig.paper(),
     }
     if name in bases:
@@ -368,7 +379,7 @@ def get_named_config(name: str, is_splat: bool = False) -> CompleterConfig:
     base, _, ablation = name.rpartition("/")
     if (base or "default") not in bases or ablation not in ABLATIONS:
         raise InputError(
-            f"There is no config '{quote_value(name)}'; choose default, splat, paper or one of "
+            f"There is no config '{quote_value(name)}'; choose default, splat, removal, paper or one of "
             f"{', '.join(ABLATIONS)} (paper/no-sa for an ablation of the paper's settings), or "
             "give a YAML file."
         )

@@ -152,6 +152,33 @@ class CompleteOptions(CompletingOptions):
 
 
 @dataclass(frozen=True, kw_only=True)
+class RemoveOptions(CompleteOptions):
+    """Remove something from a splat, and complete the hole that it leaves.
+
+    What other photographs show behind it fills the hole, and the generator invents the rest.
+    `gscompleter strip` gives the splat back as it was. Coordinates are those of the splat's file.
+    """
+
+    scene: Path
+    """File of Gaussians (a splat) to remove something from."""
+    box: tuple[float, ...] = ()
+    """Remove Gaussians inside of a box: smallest x, y and z, then largest; six for each of several
+    boxes."""
+    box_rotation: tuple[float, float, float, float] = (1.0, 0.0, 0.0, 0.0)
+    """Rotation of the boxes about their centres, as a quaternion w x y z."""
+    sphere: tuple[float, float, float, float] | None = None
+    """Remove Gaussians inside of a sphere: x, y and z of its centre, and its radius."""
+    mask: Path | None = None
+    """Remove what these masks show: a folder with an image per photograph, of its name, white where
+    something is to be removed. Not all photographs need one."""
+    select: Path | None = None
+    """Remove the Gaussians of this file, at exactly the same positions, as a selection that was
+    saved by another program."""
+    config: Annotated[CompleterConfig, tyro.conf.FlagConversionOff] = CompleterConfig.removal()
+    """Settings of the method, which change those of `--config NAME`."""
+
+
+@dataclass(frozen=True, kw_only=True)
 class LiveOptions(CompletingOptions):
     """Complete a scene in the browser: fly to a hole, press a button, and watch it close."""
 
