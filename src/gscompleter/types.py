@@ -406,8 +406,8 @@ class ContextScene:
     rendered: Gaussians
     """The m Gaussians that the stages render; `gaussians` itself for small scenes and on GPUs."""
     proxy_index: Int64[Tensor, "_n"]
-    """Rendered Gaussian that stands for each Gaussian, -1 if it was removed; empty if `rendered is
-    gaussians`."""
+    """Rendered Gaussian that stands for each Gaussian, below 0 if it was removed; empty if
+    `rendered is gaussians`."""
 
     @staticmethod
     def whole(gaussians: Gaussians) -> ContextScene:
@@ -416,7 +416,7 @@ class ContextScene:
 
     @property
     def stand_ins(self) -> Int64[Tensor, "n"]:
-        """Rendered Gaussian that stands for each Gaussian, -1 if it was removed."""
+        """Rendered Gaussian that stands for each Gaussian, below 0 if it was removed."""
         if self.rendered is not self.gaussians:
             return self.proxy_index
         return torch.arange(len(self.gaussians), device=self.gaussians.means.device)
@@ -430,7 +430,7 @@ class ContextScene:
         """Map values of rendered Gaussians to those they stand for; 0 for removed ones."""
         if self.rendered is self.gaussians:
             return values
-        return torch.cat([values, torch.zeros_like(values[:1])])[self.proxy_index]
+        return torch.cat([values, torch.zeros_like(values[:1])])[self.proxy_index.clamp_min(-1)]
 
 
 @dataclass(frozen=True)

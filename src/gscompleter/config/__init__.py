@@ -245,8 +245,12 @@ GUARDS = {
     "free-space": "gscompleter.guards.free_space:FreeSpace",
     "psnr": "gscompleter.guards.psnr:PsnrGuard",
     "contribution": "gscompleter.guards.contribution:Contribution",
+    "removal": "gscompleter.guards.removal:Removal",
 }
 """Module and class of each guard, imported when a preset names it."""
+USUAL_GUARDS = tuple(name for name in GUARDS if name != "removal")
+REMOVAL_ALPHA, REMOVAL_RADIUS = 0.85, 0.05
+"""`holes.max_alpha` and `next_best_view.border_radius` after a removal."""
 
 if TYPE_CHECKING:
     GuardName = str
@@ -264,7 +268,7 @@ class CompleterConfig(Settings):
     trust: Literal["full", "photometric"] = "full"
     """Trust in the scene: `full` takes it as it is (paper), `photometric` counts a Gaussian as far
     as photographs confirm it."""
-    guards: tuple[GuardName, ...] = tuple(GUARDS)
+    guards: tuple[GuardName, ...] = USUAL_GUARDS
     """Safeguards beyond the paper, in the order in which they are asked (paper: none)."""
     margin: Annotated[float, Interval(ge=0, le=4)] = 0.25
     """Padding of the target image on every side, relative to its size, if a hole reaches its
@@ -298,16 +302,6 @@ class CompleterConfig(Settings):
         )
 
     @staticmethod
-    def removal() -> CompleterConfig:
-        """Return the settings for a splat that something is removed from: its holes are filled.
-
-        What is left beside a hole is often half transparent.
-        """
-        return replace(
-            CompleterConfig.splat(), trust="full", holes=HoleConfig(max_alpha=0.85)
-        )
-
-    @staticmethod
     def paper() -> CompleterConfig:
         """Return the settings of the paper; `docs/paper.md` lists the remaining differences."""
         return CompleterConfig(
@@ -334,6 +328,20 @@ class CompleterConfig(Settings):
             ),
             refine=RefineConfig(color_rounds=0, iterations=30, rel_tol=None, learning_rate=0.08),
             holes=HoleConfig(dilation=0, candidate_radius=None),
+        )
+
+    def for_removal(self) -> CompleterConfig:
+        """Return the same settings for a splat that something is removed from.
+
+        Nothing but the hole is completed. Gaussians at its border are often half transparent, and
+        targets are best that show much of that border.
+        """
+        return replace(
+            self,
+            trust="full",
+            guards=("removal", *(name for name in self.guards if name != "removal")),
+            holes=replace(self.holes, max_alpha=REMOVAL_ALPHA),
+            next_best_view=replace(self.next_best_view, border_radius=REMOVAL_RADIUS),
         )
 
     def without_guard(self, name: GuardName) -> CompleterConfig:
@@ -371,7 +379,6 @@ def get_named_config(name: str, is_splat: bool = False) -> CompleterConfig:
     bases = {
         "default": CompleterConfig.splat() if is_splat else CompleterConfig(),
         "splat": CompleterConfig.splat(),
-        "removal": CompleterConfig.removal(),
         "paper": CompleterConfig.paper(),
     }
     if name in bases:
@@ -379,7 +386,7 @@ def get_named_config(name: str, is_splat: bool = False) -> CompleterConfig:
     base, _, ablation = name.rpartition("/")
     if (base or "default") not in bases or ablation not in ABLATIONS:
         raise InputError(
-            f"There is no config '{quote_value(name)}'; choose default, splat, removal, paper or one of "
+            f"There is no config '{quote_value(name)}'; choose default, splat, paper or one of "
             f"{', '.join(ABLATIONS)} (paper/no-sa for an ablation of the paper's settings), or "
             "give a YAML file."
         )

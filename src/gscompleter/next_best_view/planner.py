@@ -168,7 +168,8 @@ class ViewPlanner:
         """Score one candidate; its gain is 0 if it is too close to a surface."""
         config, views = completion.config, completion.views
         small_view = self.render_small_view(completion, candidate.camera)
-        hole = small_view.holes.float().mean().item()
+        holes = small_view.holes & candidate.region.to(small_view.holes.device)
+        hole = holes.float().mean().item()
         if is_close(small_view.render, candidate.nearest, config.next_best_view):
             return Choice(candidate, hole, 0.0)
         overlaps = [
@@ -176,7 +177,7 @@ class ViewPlanner:
             for anchor in anchors
         ]
         anchor = select_anchor(candidate.camera, views, config.anchor, overlaps).index
-        unsure = small_view.holes, small_view.distrust
+        unsure = holes, small_view.distrust
         gain = compute_gain(*unsure, overlaps[anchor], config.next_best_view)
         return Choice(candidate, hole, gain)
 

@@ -37,6 +37,7 @@ LONG_SIDE = 640
 """Default length of a photograph's longer side, in pixels."""
 
 DEFAULT_NUM_TARGETS = 4
+REMOVAL_CONFIG = CompleterConfig.splat().for_removal()
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -174,7 +175,7 @@ class RemoveOptions(CompleteOptions):
     select: Path | None = None
     """Remove the Gaussians of this file, at exactly the same positions, as a selection that was
     saved by another program."""
-    config: Annotated[CompleterConfig, tyro.conf.FlagConversionOff] = CompleterConfig.removal()
+    config: Annotated[CompleterConfig, tyro.conf.FlagConversionOff] = REMOVAL_CONFIG
     """Settings of the method, which change those of `--config NAME`."""
 
 

@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import Any
 
 from rich.console import Console
 
 from gscompleter.apps.commands.complete import Prepared, prepare_completion, run_completion
-from gscompleter.apps.commands.options import CompleteOptions, RemoveOptions
+from gscompleter.apps.commands.options import RemoveOptions
 from gscompleter.apps.inputs.removal import check_selection, choose_gaussians
 from gscompleter.next_best_view.photographs import PhotographPlanner
 from gscompleter.progress import stage
@@ -29,9 +29,7 @@ class PreparedRemoval(Prepared):
         begun, scenes = super().begin(), self.completer.scenes
         with stage("removing"):
             photographs, renderer = self.opened.photographs, self.completer.renderer
-            chosen = choose_gaussians(
-                self.options, self.task, photographs, self.cameras, renderer
-            )
+            chosen = choose_gaussians(self.options, self.task, photographs, self.cameras, renderer)
             return remove_gaussians(begun, chosen, scenes)
 
     def describe_settings(self) -> dict[str, Any]:
