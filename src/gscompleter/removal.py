@@ -8,27 +8,25 @@ full trust: only its holes are completed.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import replace
 
 import torch
-from jaxtyping import Bool, Float
+from jaxtyping import Bool
 from torch import Tensor
 
 from gscompleter.cleaning import exclude_needed, limit_errors
 from gscompleter.errors import InputError
 from gscompleter.guards import prepare_guards
+from gscompleter.guards.psnr import meet_error_budgets, set_error_budgets
 from gscompleter.guards.removal import mask_removed
-from gscompleter.render import Renderer, get_view_map
-from gscompleter.render.cache import Parts, SceneRenderer
+from gscompleter.render import Renderer
+from gscompleter.render.cache import SceneRenderer
 from gscompleter.state import Completion
 from gscompleter.trust import Trust
-from gscompleter.trust.photometric import compute_color_difference, compute_pixel_areas
-from gscompleter.types import ContextScene, Gaussians, Render, View, merge
+from gscompleter.trust.photometric import PhotoObservations, gather_observations
+from gscompleter.types import REMOVED, REVEALED, ContextScene, Gaussians, Render, View, merge
 
-REMOVED, REVEALED = -1, -2
-"""Values of `ContextScene.proxy_index` for Gaussians that were chosen, and for those behind."""
-TOLERANCE = 0.01
+TOLERANCE = 0.02
 """Largest loss of PSNR of a photograph, in dB, by revealed Gaussians that do not return."""
 MIN_REVEALED = 0.5
 """Share of a Gaussian, in some photograph, that has to come to light for it to be revealed."""
@@ -63,7 +61,7 @@ def remove_gaussians(
         trust=Trust(),
     )
     masked = [
-        hide_removed(photo.view, state.parts[0], gone, scenes.renderer) for photo in state.photos
+        hide_removed(photo.view, state.parts[0], asked, scenes.renderer) for photo in state.photos
     ]
     shown = scenes.freeze_at(changed.parts, [view.camera for view in masked])
     photos = [
@@ -76,66 +74,75 @@ def remove_gaussians(
 def restore_needed(state: Completion, renderer: Renderer) -> Completion:
     """Put back revealed Gaussians that photographs need where they do not show what was removed.
 
-    What was generated in the hole stands in front of them by now.
+    What was generated in the hole stands in front of them by now. It is faded first, until no
+    photograph is worse than with all of them.
     """
     source, views = state.source, [photo.view for photo in state.photos]
     revealed = source.stand_ins == REVEALED
     if not revealed.any():
         return state
-    hidden, count = source.gaussians[revealed], len(source.rendered)
-    limits = limit_errors(merge([state.parts[0], hidden]), views, TOLERANCE, renderer)
-    scene = merge([*state.parts, hidden])
-    missing = torch.arange(len(scene), device=revealed.device) >= len(scene) - len(hidden)
-    missing = exclude_needed(scene, missing, views, limits, renderer)[-len(hidden) :]
-    back = revealed.masked_scatter(revealed, ~missing)
-    index = source.stand_ins.masked_scatter(
-        back, count + torch.arange(len(missing)).to(missing.device)
-    )
+    hidden = source.gaussians[revealed]
+    whole = merge([state.parts[0], hidden])
+    added = fade_harmful(state, whole, renderer)
+    is_hidden = torch.arange(len(whole), device=revealed.device) >= len(state.parts[0])
+    missing = torch.cat([is_hidden, is_hidden.new_zeros(len(added))])
+    limits = limit_errors(whole, views, TOLERANCE, renderer)
+    missing = exclude_needed(merge([whole, added]), missing, views, limits, renderer)
+    back = revealed.masked_scatter(revealed, ~missing[len(state.parts[0]) : len(whole)])
     returned = source.gaussians[back]
+    numbers = len(source.rendered) + torch.arange(len(returned), device=revealed.device)
     rendered = merge([source.rendered, returned])
     first = rendered if state.parts[0] is source.rendered else merge([state.parts[0], returned])
     return replace(
         state,
-        source=ContextScene(source.gaussians, rendered, index),
-        parts=(first, *state.parts[1:]),
+        source=ContextScene(
+            source.gaussians, rendered, source.stand_ins.masked_scatter(back, numbers)
+        ),
+        parts=(first, added),
     )
+
+
+def fade_harmful(state: Completion, context: Gaussians, renderer: Renderer) -> Gaussians:
+    """Fade what was generated until no photograph is worse than `context` alone."""
+    config, views = state.config.psnr_guard, [photo.view for photo in state.photos]
+    frozen = [renderer.freeze(context, view.camera) for view in views]
+    budgets = [
+        set_error_budgets(
+            view,
+            scene.render.image,
+            ~view.valid_mask,
+            max(config.max_drop, TOLERANCE),
+            config.max_ssim_drop,
+        )
+        for view, scene in zip(views, frozen, strict=True)
+    ]
+    plans = [scene.vary_opacities(state.added) for scene in frozen]
+    return meet_error_budgets(state.added, frozen, budgets, plans, config)
 
 
 def find_revealed(
     state: Completion, gone: Bool[Tensor, "m"], scenes: SceneRenderer
 ) -> Bool[Tensor, "m"]:
     """Add to the `gone` those of `state.parts[0]` that only become visible without them."""
-    views, sigma = [photo.view for photo in state.photos], state.config.trust_settings.color_sigma
-    before, confirmed = measure_visibility(state.parts, views, scenes, sigma)
+    before = observe(state, ~torch.zeros_like(gone), scenes)
+    confirmed = (before.areas * before.agreement).amax(dim=0)
     for _ in range(MAX_ROUNDS):
-        parts = (state.parts[0][~gone], *state.parts[1:])
-        after = torch.zeros_like(before)
-        after[:, ~gone] = measure_visibility(parts, views, scenes, sigma)[0]
+        after = torch.zeros_like(before.areas)
+        after[:, ~gone] = observe(state, ~gone, scenes).areas
         most = after.amax(dim=0)
-        revealed = (after - before).amax(dim=0) > MIN_REVEALED * most
-        revealed &= confirmed.amax(dim=0) < MIN_CONFIRMED * most
+        revealed = (after - before.areas).amax(dim=0) > MIN_REVEALED * most
+        revealed &= confirmed < MIN_CONFIRMED * most
         if not revealed.any():
             break
         gone = gone | revealed
     return gone
 
 
-def measure_visibility(
-    parts: Parts, views: Sequence[View], scenes: SceneRenderer, sigma: float
-) -> Float[Tensor, "2 v m"]:
-    """Measure how much of each Gaussian of the first part photographs show, in scene units².
-
-    These are visible areas, then those that have the photograph's colour, up to about `sigma`.
-    """
-
-    def measure(view: View) -> Float[Tensor, "n 2"]:
-        frozen = scenes.freeze(parts, view.camera)
-        agrees = torch.exp(-((compute_color_difference(frozen.render, view) / sigma) ** 2))
-        layers = torch.stack([torch.ones_like(agrees), agrees, agrees], dim=-1)
-        areas = compute_pixel_areas(parts[0].means, view.camera)[:, None]
-        return areas * frozen.backproject(layers)[: len(parts[0]), :2]
-
-    return torch.stack(list(get_view_map(parts[0].means)(measure, views)), dim=-1).permute(1, 2, 0)
+def observe(state: Completion, left: Bool[Tensor, "m"], scenes: SceneRenderer) -> PhotoObservations:
+    """Observe the Gaussians of the first part that are left in all photographs."""
+    views, context = [photo.view for photo in state.photos], state.parts[0][left]
+    frozen = scenes.freeze_at((context, *state.parts[1:]), [view.camera for view in views])
+    return gather_observations(context, views, frozen, state.config.trust_settings)
 
 
 def hide_removed(

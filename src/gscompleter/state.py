@@ -179,8 +179,8 @@ class Completion:
     @cached_property
     def remaining_context(self) -> Gaussians:
         """The recoloured context without removed Gaussians."""
-        removed = self.source.removed_mask
-        return self.recolored_context[~removed] if removed.any() else self.recolored_context
+        gone = self.source.gone_mask
+        return self.recolored_context[~gone] if gone.any() else self.recolored_context
 
     @property
     def next_target_id(self) -> int:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Annotated, Literal
 
@@ -160,7 +160,7 @@ class RemoveOptions(CompleteOptions):
     `gscompleter strip` gives the splat back as it was. Coordinates are those of the splat's file.
     """
 
-    scene: Path
+    scene: Path = field()  # without the default of `complete`
     """File of Gaussians (a splat) to remove something from."""
     box: tuple[float, ...] = ()
     """Remove Gaussians inside of a box: smallest x, y and z, then largest; six for each of several

@@ -10,6 +10,7 @@ from rich.console import Console
 from gscompleter.apps.commands.complete import Prepared, prepare_completion, run_completion
 from gscompleter.apps.commands.options import RemoveOptions
 from gscompleter.apps.inputs.removal import check_selection, choose_gaussians
+from gscompleter.errors import InputError, quote_value
 from gscompleter.next_best_view.photographs import PhotographPlanner
 from gscompleter.progress import stage
 from gscompleter.removal import remove_gaussians
@@ -48,4 +49,9 @@ def prepare_removal(options: RemoveOptions, console: Console) -> PreparedRemoval
     """Open the scene, and load the models; targets are searched for among the photographs."""
     check_selection(options)
     ready = prepare_completion(options, console)
+    if ready.task.scene is not None and bool((ready.task.scene.generated > 0).any()):
+        raise InputError(
+            f"{quote_value(options.scene)} was completed before, and removed.ply keeps what one "
+            "run removed; strip it first, and remove everything at once."
+        )
     return PreparedRemoval(**{**vars(ready), "explorer": PhotographPlanner(ready.completer)})

@@ -53,7 +53,7 @@ def remove_in_box(session: Session, corners: Numbers, rotation: Numbers) -> tupl
         find_in_boxes(part.means.double(), corners, rotation)
         for part in (state.context, *state.parts[1:])
     ]
-    context = inside[0] & ~state.source.removed_mask
+    context = inside[0] & ~state.source.gone_mask
     if not any(mask.any() for mask in (context, *inside[1:])):
         raise InputError("The box contains nothing; drag it, or make it larger.")
     added = [part[~mask] for part, mask in zip(state.parts[1:], inside[1:], strict=True)]

@@ -249,7 +249,7 @@ def make_target_row(
 def count_changes(completion: Completion) -> dict[str, Any]:
     """Count the Gaussians and, of a splat, the photographs that it was not trained on."""
     counts = {"context": len(completion.context), "added": len(completion.added)}
-    if removed := int(completion.source.removed_mask.sum()):
+    if removed := int(completion.source.gone_mask.sum()):
         counts["removed"] = removed
     if completion.config.trust == "full":
         return {"gaussians": counts}
@@ -287,7 +287,7 @@ def restore_file_order(
 
     Changed are those that were recoloured or removed.
     """
-    changed = completion.recolored_mask | completion.source.removed_mask
+    changed = completion.recolored_mask | completion.source.gone_mask
     context = completion.context
     if input_splat.file_order is None:
         return context, changed
