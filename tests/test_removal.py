@@ -57,7 +57,7 @@ def removed(begun) -> Completion:
 
 def test_the_chosen_are_gone_and_so_is_what_only_they_hid(begun, removed):
     source, chosen = removed.source, choose_surface(begun)
-    assert torch.equal(source.removed_mask, chosen)
+    assert torch.equal(source.chosen_mask, chosen)
     assert source.stand_ins[-3:].tolist() == [REVEALED] * 3
     assert source.gone_mask.sum() < chosen.sum() + 0.05 * len(chosen)
     assert removed.context is begun.context

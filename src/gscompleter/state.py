@@ -159,8 +159,8 @@ class Completion:
 
     @cached_property
     def scene(self) -> Gaussians:
-        """What is left of the context, bit for bit unless recoloured, then all added Gaussians."""
-        parts = [self.remaining_context, *self.parts[1:]]
+        """The rest of the context, bit for bit unless recoloured, then all added Gaussians."""
+        parts = [self.kept_context, *self.parts[1:]]
         return merge(parts) if len(parts) > 1 else parts[0]
 
     @cached_property
@@ -177,7 +177,7 @@ class Completion:
         return replace(given, sh=sh, generated=generated)
 
     @cached_property
-    def remaining_context(self) -> Gaussians:
+    def kept_context(self) -> Gaussians:
         """The recoloured context without removed Gaussians."""
         gone = self.source.gone_mask
         return self.recolored_context[~gone] if gone.any() else self.recolored_context

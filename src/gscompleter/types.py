@@ -425,7 +425,7 @@ class ContextScene:
         return torch.arange(len(self.gaussians), device=self.gaussians.means.device)
 
     @property
-    def removed_mask(self) -> Bool[Tensor, "n"]:
+    def chosen_mask(self) -> Bool[Tensor, "n"]:
         """True for Gaussians that were removed, without those that this revealed."""
         return self.stand_ins == REMOVED
 

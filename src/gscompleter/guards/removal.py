@@ -26,7 +26,7 @@ class Removal(Guard):
     def place(self, candidates: Gaussians, view: TargetView) -> Gaussians:
         """Keep candidates in pixels that showed something removed."""
         camera, source = view.camera.padded, view.state.source
-        shown = mask_removed(source.gaussians, source.removed_mask, camera, view.scenes.renderer)
+        shown = mask_removed(source.gaussians, source.chosen_mask, camera, view.scenes.renderer)
         return candidates[project_mask(shown, candidates, camera)]
 
 

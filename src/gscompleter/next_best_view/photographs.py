@@ -44,5 +44,5 @@ class PhotographPlanner(ViewPlanner):
         """Make the candidate of a photograph."""
         small = shrink_camera(camera, completion.config.next_best_view.image_size)
         source, renderer = completion.source, self.completer.renderer
-        region = mask_removed(source.gaussians, source.removed_mask, small, renderer)
+        region = mask_removed(source.gaussians, source.chosen_mask, small, renderer)
         return Candidate(camera, index, 0.0, region)

@@ -209,7 +209,7 @@ class Page:
         self.session = session
         with self.server.atomic():
             if before.parts[0] is not now.parts[0]:
-                self._show("/observed", now.remaining_context)
+                self._show("/observed", now.kept_context)
             if self._generated is not None:
                 self._generated.remove()
             self._generated = self._show("/generated/splats", now.added)

@@ -149,7 +149,7 @@ def render_before_after(completion: Completion, camera: Camera, renderer: Render
     """Render the context and the completed scene."""
     with torch.no_grad():
         frozen = renderer.freeze(completion.context, camera)
-        if completion.remaining_context is completion.context:
+        if completion.kept_context is completion.context:
             after = frozen.composite(completion.added)
         else:
             after = renderer.render(completion.scene, camera)
@@ -169,7 +169,7 @@ def compute_scores(pair: RenderPair, photograph: View | None) -> Scores:
 
 def score_views(completion: Completion, views: Sequence[View], renderer: Renderer) -> list[Scores]:
     """Score the scene before and after at photographs, except where they show what was removed."""
-    removed = completion.source.removed_mask
+    removed = completion.source.chosen_mask
 
     def score(view: View) -> Scores:
         shown = hide_removed(view, completion.context, removed, renderer)
@@ -218,7 +218,7 @@ def score_targets(
     renderer: Renderer,
 ) -> list[TargetRow]:
     """Make the rows of the targets."""
-    scene, removed = completion.context, completion.source.removed_mask
+    scene, removed = completion.context, completion.source.chosen_mask
     views = [t.view and hide_removed(t.view, scene, removed, renderer) for t in targets]
     scores = map_in_parallel(compute_scores, pairs, views)
     rows = zip(targets, completion.targets, scores, strict=True)
