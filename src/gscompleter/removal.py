@@ -26,7 +26,7 @@ from gscompleter.trust import Trust
 from gscompleter.trust.photometric import PhotoObservations, gather_observations
 from gscompleter.types import REMOVED, REVEALED, ContextScene, Gaussians, Render, View, merge
 
-TOLERANCE = 0.02
+TOLERANCE = 0.005
 """Largest loss of PSNR of a photograph, in dB, by revealed Gaussians that do not return."""
 MIN_REVEALED = 0.5
 """Share of a Gaussian, in some photograph, that has to come to light for it to be revealed."""
