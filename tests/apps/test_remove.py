@@ -103,6 +103,17 @@ def test_targets_are_photographs_and_what_shows_the_crate_is_not_scored(
     assert (ignored == torch.tensor([1.0, 0.0, 1.0])).all(-1)[shown].float().mean() > 0.95
 
 
+def test_a_plan_names_a_photograph_and_the_hole_that_is_left(scene, tmp_path, monkeypatch, capsys):
+    splat = load_ply(scene / "splat.ply")
+    save_ply(tmp_path / "selected.ply", splat[find_in_boxes(splat.means, CRATE, UPRIGHT)])
+    words = [*remove(scene, tmp_path / "out", "--select", tmp_path / "selected.ply", "--dry-run")]
+    words.remove("--quiet")
+    assert run(monkeypatch, *words) == 0
+    (row,) = [line for line in capsys.readouterr().out.splitlines() if "1: target near" in line]
+    assert 2 < float(row.split()[-2]) < 40
+    assert [path.name for path in (tmp_path / "out").iterdir()] == ["targets.json"]
+
+
 def test_boxes_are_rotated_about_their_centres():
     points = torch.tensor([[1.0, 1, 1], [2.2, 1, 1], [1.8, 1.8, 1], [1, 1, 2.1]])
     box = (0.0, 0.0, 0.0, 2.0, 2.0, 2.0)
