@@ -48,12 +48,20 @@ def find_superfluous(
     removable = find_removable(scene, removable, views, renderer, config) & (scene.generated == 0)
     removable = find_removable(scene, removable, views, renderer, config) & removable
     checks = [*views, *map(halve_view, views)]
+    allowed = limit_errors(scene, checks, config.tolerance, renderer)
+    return exclude_needed(scene, removable, checks, allowed, renderer)
+
+
+def limit_errors(
+    scene: Gaussians, views: Sequence[View], tolerance: float, renderer: Renderer
+) -> list[float]:
+    """Compute the mean squared error of each photograph after a loss of PSNR, in dB."""
     allowed = []
-    for view in checks:
+    for view in views:
         image = view.fill_ignored(renderer.render(scene, view.camera).image)
         error = compute_squared_error(image, view.image).item()
-        allowed.append(add_psnr_loss(error, config.tolerance))
-    return exclude_needed(scene, removable, checks, allowed, renderer)
+        allowed.append(add_psnr_loss(error, tolerance))
+    return allowed
 
 
 def find_removable(

@@ -28,6 +28,7 @@ COMMANDS: dict[str, tuple[type, str, str]] = {
     "complete": (options.CompleteOptions, "complete", "run_completion"),
     "batch": (options.BatchOptions, "batch", "run_batch"),
     "live": (options.LiveOptions, "live", "run_live"),
+    "remove": (options.RemoveOptions, "remove", "run_removal"),
     "clean": (options.CleanOptions, "clean", "run_clean"),
     "demo": (options.DemoOptions, "demo", "run_demo"),
     "evaluate": (options.EvaluateOptions, "reproduce", "run_evaluation"),

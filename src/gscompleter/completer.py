@@ -97,7 +97,13 @@ class GSCompleter:
             raise InputError("No target camera was given; name at least one view to complete.")
         check_target_ids(scene, len(targets))
         check_views = check_views if witnesses is None else witnesses
-        state = self.begin(views, scene, check_views, targets)
+        return self.complete(self.begin(views, scene, check_views, targets), targets)
+
+    def complete(self, state: Completion, targets: Sequence[Camera]) -> Completion:
+        """Complete a begun scene for targets, one group after the other.
+
+        Raises InputError if every target is refused.
+        """
         batch = as_generator(self.generator).max_batch_size
         counted_as = "target" if batch == 1 else "group of targets"
         for start in track(range(0, len(targets), batch), counted_as):

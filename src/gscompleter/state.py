@@ -159,8 +159,8 @@ class Completion:
 
     @cached_property
     def scene(self) -> Gaussians:
-        """The context, bit for bit where it was not recoloured, then all added Gaussians."""
-        parts = [self.recolored_context, *self.parts[1:]]
+        """The rest of the context, bit for bit unless recoloured, then all added Gaussians."""
+        parts = [self.kept_context, *self.parts[1:]]
         return merge(parts) if len(parts) > 1 else parts[0]
 
     @cached_property
@@ -175,6 +175,12 @@ class Completion:
         )
         generated = torch.where(changed, self.source.expand(after.generated), given.generated)
         return replace(given, sh=sh, generated=generated)
+
+    @cached_property
+    def kept_context(self) -> Gaussians:
+        """The recoloured context without removed Gaussians."""
+        gone = self.source.gone_mask
+        return self.recolored_context[~gone] if gone.any() else self.recolored_context
 
     @property
     def next_target_id(self) -> int:

@@ -24,6 +24,9 @@ from gscompleter.errors import InputError
 SH_C0 = 0.28209479177387814
 """Constant spherical harmonic: colour = 0.5 + SH_C0 * sh[:, 0]."""
 
+REMOVED, REVEALED = -1, -2
+"""Numbers, in a `ContextScene`, of Gaussians that were removed, and of unseen ones behind them."""
+
 MAX_RIGID_ERROR = 1e-3
 """Largest entry of RᵀR - I that counts as rounding error of a rotation R."""
 
@@ -417,16 +420,36 @@ class ContextScene:
     rendered: Gaussians
     """The m Gaussians that the stages render; `gaussians` itself for small scenes and on GPUs."""
     proxy_index: Int64[Tensor, "_n"]
-    """Rendered Gaussian that stands for each Gaussian; empty if `rendered is gaussians`."""
+    """Rendered Gaussian that stands for each Gaussian, `REMOVED` or `REVEALED` for those that are
+    gone; empty if `rendered is gaussians`."""
 
     @staticmethod
     def whole(gaussians: Gaussians) -> ContextScene:
         """Return a context that is rendered as it is."""
         return ContextScene(gaussians, gaussians, gaussians.means.new_empty(0).long())
 
+    @property
+    def stand_ins(self) -> Int64[Tensor, "n"]:
+        """Rendered Gaussian that stands for each Gaussian, below 0 if it is gone."""
+        if self.rendered is not self.gaussians:
+            return self.proxy_index
+        return torch.arange(len(self.gaussians), device=self.gaussians.means.device)
+
+    @property
+    def chosen_mask(self) -> Bool[Tensor, "n"]:
+        """True for Gaussians that were removed, without those that this revealed."""
+        return self.stand_ins == REMOVED
+
+    @property
+    def gone_mask(self) -> Bool[Tensor, "n"]:
+        """True for Gaussians that were removed or revealed: they are not in the scene."""
+        return self.stand_ins < 0
+
     def expand(self, values: Shaped[Tensor, "m *c"]) -> Shaped[Tensor, "n *c"]:
-        """Map values of rendered Gaussians to the Gaussians they stand for."""
-        return values if self.rendered is self.gaussians else values[self.proxy_index]
+        """Map values of rendered Gaussians to those they stand for; 0 for removed ones."""
+        if self.rendered is self.gaussians:
+            return values
+        return torch.cat([values, torch.zeros_like(values[:1])])[self.proxy_index.clamp_min(-1)]
 
 
 @dataclass(frozen=True)

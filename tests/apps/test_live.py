@@ -22,6 +22,7 @@ from command import run
 from gscompleter import load_ply, save_ply
 from gscompleter.apps.commands import live
 from gscompleter.apps.commands.options import LiveOptions
+from gscompleter.apps.live.box import remove_in_box
 from gscompleter.apps.live.page import (
     Page,
     camera_from_page,
@@ -247,6 +248,52 @@ def test_what_was_generated_is_shown_and_undone(page, begun):
     assert page.undo(client) == "Undone. Completions left: 0."
     assert page.session == begun
     assert page._generated is None
+
+
+CRATE = (-0.6, 0.2, 2.1, 0.4, 1.47, 3.1)
+"""A box around the one in the middle of the room."""
+UPRIGHT = (1.0, 0.0, 0.0, 0.0)
+
+
+def test_a_box_is_removed_completed_undone_and_saved(room, tmp_path, monkeypatch):
+    scene = merge([gaussians_of(view_of(Room(), camera)) for camera in CAMERAS])
+    save_ply(tmp_path / "splat.ply", scene)
+    options = options_for(room, tmp_path / "out", scene=tmp_path / "splat.ply")
+    ready = live.prepare(replace(options, config=CompleterConfig.splat()), QUIET)
+    begun = live.begin_session(ready)
+    removed, count = remove_in_box(begun, CRATE, UPRIGHT)
+    assert count == len(begun.latest.scene) - len(removed.latest.scene) > 100
+    filled, result = complete_camera(removed, CAMERAS[2])
+    assert len(result.added) > 0
+    emptied, again = remove_in_box(filled, (-2.0, -1.0, 2.0, 2.0, 2.0, 6.0), UPRIGHT)
+    assert again > len(emptied.latest.added) - len(filled.latest.added)
+    assert undo_step(emptied) == filled
+    assert undo_step(filled) == removed
+    assert undo_step(removed) == begun
+    with pytest.raises(InputError, match="contains nothing"):
+        remove_in_box(removed, (50.0, 50.0, 50.0, 51.0, 51.0, 51.0), UPRIGHT)
+    live.save_session(ready, filled)
+    out, restored = tmp_path / "out", tmp_path / "restored.ply"
+    assert json.loads((out / "summary.json").read_text())["gaussians"]["removed"] > 100
+    assert run(monkeypatch, "strip", out / "completed.ply", "--out", restored, "--quiet") == 0
+    assert restored.read_bytes() == (tmp_path / "splat.ply").read_bytes()
+    live.save_session(ready, removed)
+    assert json.loads((out / "summary.json").read_text())["gaussians"]["added"] == 0
+
+
+def test_the_box_of_the_page_is_the_one_that_is_removed(page):
+    client = browser_at(page, HOLES[0])
+    with pytest.raises(InputError, match="Tick"):
+        page.remove(client)
+    low, high = np.array(CRATE[:3]) * page._unit, np.array(CRATE[3:]) * page._unit
+    page._box.shown.value = True
+    page._box.controls.position, page._box.size.value = (low + high) / 2, tuple(high - low)
+    corners, rotation = page._box.read(page._unit)
+    assert np.allclose(corners, CRATE)
+    assert rotation == UPRIGHT
+    assert "--box -0.6 0.2 2.1 0.4 1.47 3.1 --box-rotation 1 0 0 0" in page.remove(client)
+    assert page.session.latest.source.gone_mask.any()
+    page.undo(client)
 
 
 def test_photographs_are_visited_one_after_the_other(page):

@@ -272,8 +272,12 @@ GUARDS = {
     "free-space": "gscompleter.guards.free_space:FreeSpace",
     "psnr": "gscompleter.guards.psnr:PsnrGuard",
     "contribution": "gscompleter.guards.contribution:Contribution",
+    "removal": "gscompleter.guards.removal:Removal",
 }
 """Module and class of each guard, imported when a preset names it."""
+USUAL_GUARDS = tuple(name for name in GUARDS if name != "removal")
+REMOVAL_ALPHA, REMOVAL_RADIUS = 0.85, 0.05
+"""`holes.max_alpha` and `next_best_view.border_radius` after a removal."""
 
 if TYPE_CHECKING:
     GuardName = str
@@ -291,7 +295,7 @@ class CompleterConfig(Settings):
     trust: Literal["full", "photometric"] = "full"
     """Trust in the scene: `full` takes it as it is (paper), `photometric` counts a Gaussian as far
     as photographs confirm it."""
-    guards: tuple[GuardName, ...] = tuple(GUARDS)
+    guards: tuple[GuardName, ...] = USUAL_GUARDS
     """Safeguards beyond the paper, in the order in which they are asked (paper: none)."""
     margin: Annotated[float, Interval(ge=0, le=4)] = 0.25
     """Padding of the target image on every side, relative to its size, if a hole reaches its
@@ -351,6 +355,20 @@ class CompleterConfig(Settings):
             ),
             refine=RefineConfig(color_rounds=0, iterations=30, rel_tol=None, learning_rate=0.08),
             holes=HoleConfig(dilation=0, candidate_radius=None),
+        )
+
+    def for_removal(self) -> CompleterConfig:
+        """Return the same settings for a splat that something is removed from.
+
+        Nothing but the hole is completed. Gaussians at its border are often half transparent, and
+        targets are best that show much of that border.
+        """
+        return replace(
+            self,
+            trust="full",
+            guards=("removal", *(name for name in self.guards if name != "removal")),
+            holes=replace(self.holes, max_alpha=REMOVAL_ALPHA),
+            next_best_view=replace(self.next_best_view, border_radius=REMOVAL_RADIUS),
         )
 
     def without_guard(self, name: GuardName) -> CompleterConfig:

@@ -11,7 +11,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import torch
-from jaxtyping import Float
+from jaxtyping import Bool, Float
 from torch import Tensor
 
 from gscompleter.config import NextBestViewConfig
@@ -43,6 +43,8 @@ class Candidate:
     """Index of the camera that it was derived from."""
     nearest: float
     """5 % quantile of the z-depths that this camera sees, in scene units."""
+    region: Bool[Tensor, "*size"] = torch.tensor(True)
+    """Pixels of its small image that may be completed; all by default."""
 
 
 def propose_candidates(

@@ -37,7 +37,7 @@ from gscompleter.stages.select_anchor import compute_overlap, select_anchor
 from gscompleter.stages.target_view import compute_distrust, compute_hole_mask
 from gscompleter.state import Completion
 from gscompleter.timing import record_seconds
-from gscompleter.types import Camera, ContextScene, Gaussians, Render, make_observed
+from gscompleter.types import Camera, Gaussians, Render, make_observed
 
 MAX_FREE_SPACE_CAMERAS = 40
 """Most cameras of photographs, besides the context views, whose free space is kept empty."""
@@ -168,7 +168,9 @@ class ViewPlanner:
         """Score one candidate; its gain is 0 if it is too close to a surface."""
         config, views = completion.config, completion.views
         small_view = self.render_small_view(completion, candidate.camera)
-        hole = small_view.holes.float().mean().item()
+        region = candidate.region.to(small_view.holes.device)
+        holes, distrust = small_view.holes & region, small_view.distrust.where(region, 0.0)
+        hole = holes.float().mean().item()
         if is_close(small_view.render, candidate.nearest, config.next_best_view):
             return Choice(candidate, hole, 0.0)
         overlaps = [
@@ -176,8 +178,7 @@ class ViewPlanner:
             for anchor in anchors
         ]
         anchor = select_anchor(candidate.camera, views, config.anchor, overlaps).index
-        unsure = small_view.holes, small_view.distrust
-        gain = compute_gain(*unsure, overlaps[anchor], config.next_best_view)
+        gain = compute_gain(holes, distrust, overlaps[anchor], config.next_best_view)
         return Choice(candidate, hole, gain)
 
     def render_small_view(self, completion: Completion, camera: Camera) -> SmallView:
@@ -274,9 +275,9 @@ def make_placeholders(render: Render, holes: Bool[Tensor, "h w"], camera: Camera
 
 
 def simplify_completion(completion: Completion, most: int = MAX_PREVIEW_GAUSSIANS) -> Completion:
-    """Simplify a completion for small images, with its trust."""
+    """Simplify what is rendered of a completion for small images, with its trust."""
     rows, growth = choose_thinned_rows(completion.parts[0], most)
     context = thin_gaussians(completion.parts[0], most)
     parts = (context, thin_gaussians(completion.added, most))
     trust = completion.trust.thin(rows, growth)
-    return replace(completion, source=ContextScene.whole(context), parts=parts, trust=trust)
+    return replace(completion, parts=parts, trust=trust)

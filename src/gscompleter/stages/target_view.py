@@ -111,9 +111,11 @@ class TargetView:
         """Sentence why there is nothing to complete; empty if there is."""
         if self.refusal:
             return self.refusal
-        if any(is_same_camera(self.camera.target, view.camera) for view in self.state.views):
+        unsure = self.camera.crop(self.holes | (self.distrust > 0))
+        same = [v for v in self.state.views if is_same_camera(self.camera.target, v.camera)]
+        if any(not (unsure & ~view.valid_mask).any() for view in same):
             return "The target is a context view: nothing to complete."
-        if not self.camera.crop(self.holes | (self.distrust > 0)).any():
+        if not unsure.any():
             return "The scene has no hole here: nothing to complete."
         return ""
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -54,6 +54,7 @@ from gscompleter.kernels.parallel import run_in_background
 from gscompleter.next_best_view.planner import Choice, ViewPlanner
 from gscompleter.progress import show_preparation, show_progress, stage
 from gscompleter.reconstructors import check_reconstructor, load_reconstructor
+from gscompleter.removal import restore_needed
 from gscompleter.render import choose_device, load_renderer
 from gscompleter.render.lod import MIN_PROXY_GAUSSIANS
 from gscompleter.splat_alignment.similarity import transform_camera, transform_camera_exactly
@@ -84,7 +85,12 @@ class Prepared:
 
     def begin(self) -> Completion:
         """Initialize the context."""
-        return self.completer.begin(self.task.views, self.task.scene, self.task.check_views)
+        task = self.task
+        return self.completer.begin(task.views, task.scene, task.check_views, task.target_cameras)
+
+    def describe_settings(self) -> dict[str, Any]:
+        """Describe the settings of targets and models for `summary.json`."""
+        return describe_settings(self.options)
 
     def with_choices(self, choices: Iterable[Choice]) -> Prepared:
         """Return a copy with chosen candidates as targets."""
@@ -93,12 +99,17 @@ class Prepared:
         return replace(self, task=replace(self.task, targets=targets))
 
 
-def run_completion(options: CompleteOptions) -> None:
+Prepare = Callable[[Any, Console], Prepared]
+"""Opens the input of a command, whose options it takes, and loads the models."""
+
+
+def run_completion(options: CompleteOptions, prepare: Prepare | None = None) -> None:
     """Complete the scene, and print a summary."""
+    prepare = prepare or prepare_completion
     if options.dry_run:
-        plan_folder(options)
+        plan_folder(options, prepare)
         return
-    complete_folder(options)
+    complete_folder(options, prepare)
     if not options.quiet:
         print_completion(options)
 
@@ -110,11 +121,11 @@ def run_report(options: ReportOptions) -> None:
         print(options.out / REPORT_FILE)
 
 
-def complete_folder(options: CompleteOptions) -> dict[str, Any]:
+def complete_folder(options: CompleteOptions, prepare: Prepare | None = None) -> dict[str, Any]:
     """Complete the scene, write `options.out`, and return the summary."""
     if options.video:
         find_ffmpeg()
-    with open_completion(options) as (ready, folder):
+    with open_completion(options, prepare or prepare_completion) as (ready, folder):
         completion, ready = complete_targets(ready)
         ready.completer.scenes.clear()
         with stage("report"):
@@ -126,9 +137,9 @@ def complete_folder(options: CompleteOptions) -> dict[str, Any]:
     return summary
 
 
-def plan_folder(options: CompleteOptions) -> None:
+def plan_folder(options: CompleteOptions, prepare: Prepare) -> None:
     """Write the targets and print the plan, without completing the scene."""
-    with open_completion(options) as (ready, folder):
+    with open_completion(options, prepare) as (ready, folder):
         task, holes = plan_completion(ready)
         write_targets(folder, task)
     if not options.quiet:
@@ -136,11 +147,11 @@ def plan_folder(options: CompleteOptions) -> None:
 
 
 @contextmanager
-def open_completion(options: CompleteOptions) -> Iterator[tuple[Prepared, Path]]:
+def open_completion(options: CompleteOptions, prepare: Prepare) -> Iterator[tuple[Prepared, Path]]:
     """Load everything, print the input, and open the output folder."""
     console = Console(stderr=True, quiet=options.quiet)
     with show_progress(console):
-        ready = prepare_completion(options, console)
+        ready = prepare(options, console)
         print_lines(console, *describe_task(options, ready.opened, ready.task))
         with open_output_folder(options.out, is_replaceable(options)) as folder:
             yield ready, folder
@@ -149,10 +160,11 @@ def open_completion(options: CompleteOptions) -> Iterator[tuple[Prepared, Path]]
 def write_done(folder: Path, ready: Prepared, completion: Completion) -> dict[str, Any]:
     """Write all results but the targets and the video, and return the summary."""
     options, task, completer = ready.options, ready.task, ready.completer
+    completion = restore_needed(completion, completer.renderer)
     completion = replace(completion, seconds=add_seconds(completion.seconds, ready.seconds))
     cameras = tuple(ready.cameras.values())
     aside = sample_held_out_cameras(cameras, options.seed)
-    facts = describe_run(options, ready.opened, task, completion.config, describe_settings(options))
+    facts = describe_run(options, ready.opened, task, completion.config, ready.describe_settings())
     with run_in_background(render_pairs, completion, aside, completer.renderer) as looks:
         summary = write_report(
             folder,
@@ -310,8 +322,8 @@ def complete_targets(ready: Prepared) -> tuple[Completion, Prepared]:
     """Complete the scene for the named targets, or for targets that it finds."""
     task, count = ready.task, get_max_targets(ready.options)
     if task.targets:
-        named = ready.completer(task.views, task.target_cameras, task.scene, task.check_views)
-        return named, ready
+        check_target_ids(task.scene, len(task.targets))
+        return ready.completer.complete(ready.begin(), task.target_cameras), ready
     check_target_ids(task.scene, count)
     cameras = list(ready.cameras.values())
     completion, choices = ready.explorer.explore(ready.begin(), cameras, count)

@@ -95,7 +95,7 @@ def find_next_target(ready: Prepared, completion: Completion) -> Camera | None:
 
 def save_session(ready: Prepared, session: Session) -> str:
     """Write the results of `complete`, in place of those saved before, and return a sentence."""
-    if not session.cameras:
+    if len(session.completions) == 1:
         raise InputError("There is nothing to save; complete a hole first.")
     out = ready.options.out
     targets = [Target(result.target) for result in session.latest.targets]
@@ -103,5 +103,6 @@ def save_session(ready: Prepared, session: Session) -> str:
         write_done(
             folder, replace(ready, task=replace(ready.task, targets=targets)), session.latest
         )
-        write_cameras(folder / TARGETS_FILE, session.cameras)
+        if session.cameras:
+            write_cameras(folder / TARGETS_FILE, session.cameras)
     return f"Saved in {quote_value(out)}."

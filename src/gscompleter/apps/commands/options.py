@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Annotated, Literal
 
@@ -38,6 +38,7 @@ LONG_SIDE = 640
 """Default length of a photograph's longer side, in pixels."""
 
 DEFAULT_NUM_TARGETS = 4
+REMOVAL_CONFIG = CompleterConfig.splat().for_removal()
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -156,6 +157,33 @@ class CompleteOptions(CompletingOptions):
     """Folder for completed.ply, the report (report.html), images and summary.json."""
     video: bool = False
     """Also write video.mp4: a flight through the holes, before and after side by side."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class RemoveOptions(CompleteOptions):
+    """Remove something from a splat, and complete the hole that it leaves.
+
+    What other photographs show behind it fills the hole, and the generator invents the rest.
+    `gscompleter strip` gives the splat back as it was. Coordinates are those of the splat's file.
+    """
+
+    scene: Path = field()  # without the default of `complete`
+    """File of Gaussians (a splat) to remove something from."""
+    box: tuple[float, ...] = ()
+    """Remove Gaussians inside of a box: smallest x, y and z, then largest; six for each of several
+    boxes."""
+    box_rotation: tuple[float, float, float, float] = (1.0, 0.0, 0.0, 0.0)
+    """Rotation of the boxes about their centres, as a quaternion w x y z."""
+    sphere: tuple[float, float, float, float] | None = None
+    """Remove Gaussians inside of a sphere: x, y and z of its centre, and its radius."""
+    mask: Path | None = None
+    """Remove what these masks show: a folder with an image per photograph, of its name, white where
+    something is to be removed. Not all photographs need one."""
+    select: Path | None = None
+    """Remove the Gaussians of this file, at exactly the same positions, as a selection that was
+    saved by another program."""
+    config: Annotated[CompleterConfig, tyro.conf.FlagConversionOff] = REMOVAL_CONFIG
+    """Settings of the method, which change those of `--config NAME`."""
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -140,13 +140,14 @@ class NamedConfig:
 
 def load_named_config(words: Sequence[str]) -> tuple[CompleterConfig, Sequence[str]]:
     """Load the config of `--config NAME`, and return it with the other words."""
-    if words[:1] not in (["complete"], ["live"]):
+    if words[:1] not in (["complete"], ["live"], ["remove"]):
         return CompleterConfig(), words
     named, others = tyro.cli(
         NamedConfig, prog="gscompleter", args=words, return_unknown_args=True, add_help=False
     )
     is_splat = any(word.partition("=")[0] == "--scene" for word in others)
-    return load_config(named.config, is_splat), others
+    config = load_config(named.config, is_splat)
+    return config.for_removal() if words[0] == "remove" else config, others
 
 
 def make_registry(config: CompleterConfig, *rules: Rule) -> ConstructorRegistry:

@@ -28,6 +28,7 @@ import viser
 from jaxtyping import Float
 from websockets.asyncio import server as websockets
 
+from gscompleter.apps.live.box import PageBox, remove_in_box
 from gscompleter.apps.live.session import Session, complete_camera, undo_step
 from gscompleter.errors import InputError
 from gscompleter.geometry import estimate_up, quats_to_rotations, rotations_to_quats
@@ -126,6 +127,19 @@ class Page:
         self._move_browser(client, next(self._photographs))
         return WELCOME
 
+    def remove(self, client: viser.ClientHandle) -> str:
+        """Remove what the box contains."""
+        corners, rotation = self._box.read(self._unit)
+        self.show_message("Removing …")
+        session, count = remove_in_box(self.session, corners, rotation)
+        self._change_session(session)
+        numbers = " ".join(f"{number:.4g}" for number in corners)
+        turned = " ".join(f"{number:.4g}" for number in rotation)
+        return (
+            f"{count:,} Gaussians are removed; complete the hole, or undo.\n"
+            f"As options of remove: --box {numbers} --box-rotation {turned}"
+        )
+
     def undo(self, client: viser.ClientHandle) -> str:
         """Undo the last step."""
         self._change_session(undo_step(self.session))
@@ -153,10 +167,13 @@ class Page:
             ("Complete what I see", self.complete),
             ("Find a hole", self.find),
             ("Next photograph", self.visit_photograph),
+            ("Remove what the box contains", self.remove),
             ("Undo", self.undo),
             ("Save", self.save),
         ):
             gui.add_button(label).on_click(partial(self._submit, job))
+        ahead = self._first.center + self._first.forward * SCENE_DISTANCE / self._unit
+        self._box = PageBox(self.server, ahead.cpu().numpy() * self._unit)
         generated = scene.add_frame("/generated", show_axes=False)
         show_generated = gui.add_checkbox("Generated", initial_value=True)
         show_generated.on_update(lambda _: setattr(generated, "visible", show_generated.value))
@@ -192,7 +209,7 @@ class Page:
         self.session = session
         with self.server.atomic():
             if before.parts[0] is not now.parts[0]:
-                self._show("/observed", now.recolored_context)
+                self._show("/observed", now.kept_context)
             if self._generated is not None:
                 self._generated.remove()
             self._generated = self._show("/generated/splats", now.added)

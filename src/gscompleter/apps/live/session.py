@@ -32,7 +32,7 @@ class Session:
     """Local origin of the coordinates, in the frame of the photographs."""
     resolution: Resolution = None
     cameras: tuple[Camera, ...] = ()
-    """Target camera of each step in the frame of the photographs, as it is saved."""
+    """Target camera of each completion in the frame of the photographs, as it is saved."""
 
     @property
     def latest(self) -> Completion:
@@ -62,7 +62,8 @@ def complete_camera(session: Session, camera: Camera) -> tuple[Session, TargetRe
 
 def undo_step(session: Session) -> Session:
     """Remove the last step."""
-    if not session.cameras:
+    earlier = session.completions[:-1]
+    if not earlier:
         raise InputError("There is nothing to undo; complete something first.")
-    earlier, cameras = session.completions[:-1], session.cameras[:-1]
+    cameras = session.cameras[: len(earlier[-1].targets)]
     return replace(session, completions=earlier, cameras=cameras)

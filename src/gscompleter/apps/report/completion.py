@@ -33,6 +33,7 @@ from gscompleter.geometry import estimate_up
 from gscompleter.io.files import COMPLETED_FILE, CONTEXT_FILE, SUMMARY_FILE
 from gscompleter.io.image import write_image
 from gscompleter.kernels.parallel import map_in_parallel
+from gscompleter.removal import hide_removed
 from gscompleter.render import Renderer, get_view_map
 from gscompleter.splats.layout import REMOVED_FILE, save_like, save_removed
 from gscompleter.splats.ply import save_ply
@@ -129,7 +130,7 @@ def write_report(
     rows: dict[str, Sequence[ScoreRow]] = {
         "held_out": score_held_out(completion, held_out, renderer),
         "context": score_context(completion, renderer),
-        "targets": score_targets(completion, targets, at_targets),
+        "targets": score_targets(completion, targets, at_targets, renderer),
     }
     scores = {key: [asdict(row) for row in group] for key, group in rows.items()}
     write_scenes(folder, completion, input_splat)
@@ -148,8 +149,8 @@ def render_before_after(completion: Completion, camera: Camera, renderer: Render
     """Render the context and the completed scene."""
     with torch.no_grad():
         before = after = renderer.freeze(completion.context, camera)
-        if completion.recolored_context is not completion.context:
-            after = renderer.freeze(completion.recolored_context, camera)
+        if completion.kept_context is not completion.context:
+            after = renderer.freeze(completion.kept_context, camera)
         return RenderPair(before.render, after.composite(completion.added))
 
 
@@ -165,10 +166,12 @@ def compute_scores(pair: RenderPair, photograph: View | None) -> Scores:
 
 
 def score_views(completion: Completion, views: Sequence[View], renderer: Renderer) -> list[Scores]:
-    """Score the scene before and after at photographs."""
+    """Score the scene before and after at photographs, except where they show what was removed."""
+    removed = completion.source.chosen_mask
 
     def score(view: View) -> Scores:
-        return compute_scores(render_before_after(completion, view.camera, renderer), view)
+        shown = hide_removed(view, completion.context, removed, renderer)
+        return compute_scores(render_before_after(completion, view.camera, renderer), shown)
 
     return list(get_view_map(completion.added.means)(score, views))
 
@@ -208,10 +211,15 @@ def compute_mask_fraction(mask: Bool[Tensor, "h w"] | Float[Tensor, "h w"] | Non
 
 
 def score_targets(
-    completion: Completion, targets: Sequence[Target], pairs: Sequence[RenderPair]
+    completion: Completion,
+    targets: Sequence[Target],
+    pairs: Sequence[RenderPair],
+    renderer: Renderer,
 ) -> list[TargetRow]:
     """Make the rows of the targets."""
-    scores = map_in_parallel(compute_scores, pairs, [target.view for target in targets])
+    scene, removed = completion.context, completion.source.chosen_mask
+    views = [t.view and hide_removed(t.view, scene, removed, renderer) for t in targets]
+    scores = map_in_parallel(compute_scores, pairs, views)
     rows = zip(targets, completion.targets, scores, strict=True)
     return [make_target_row(completion, *row) for row in rows]
 
@@ -240,6 +248,8 @@ def make_target_row(
 def count_changes(completion: Completion) -> dict[str, Any]:
     """Count the Gaussians and, of a splat, the photographs that it was not trained on."""
     counts = {"context": len(completion.context), "added": len(completion.added)}
+    if removed := int(completion.source.gone_mask.sum()):
+        counts["removed"] = removed
     if completion.config.trust == "full":
         return {"gaussians": counts}
     counts["recolored"] = int(completion.recolored_mask.sum())
@@ -272,8 +282,12 @@ def write_scenes(folder: Path, completion: Completion, input_splat: InputSplatFi
 def restore_file_order(
     completion: Completion, input_splat: InputSplatFile
 ) -> tuple[Gaussians, Bool[Tensor, "n"]]:
-    """Sort the context and the mask of recoloured Gaussians in the order of the input file."""
-    context, changed = completion.context, completion.recolored_mask
+    """Sort the context and the mask of changed Gaussians in the order of the input file.
+
+    Changed are those that were recoloured or removed.
+    """
+    changed = completion.recolored_mask | completion.source.gone_mask
+    context = completion.context
     if input_splat.file_order is None:
         return context, changed
     places = input_splat.file_order.argsort().to(context.means.device)

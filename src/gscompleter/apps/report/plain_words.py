@@ -32,6 +32,10 @@ RECOLORED_NOTE = (
     "Gaussians of the input splat got new colours, because no photograph confirms theirs; "
     "removed.ply has them as they were."
 )
+REMOVED_NOTE = (
+    "Gaussians were removed: those selected, and those behind them that no photograph shows; "
+    "removed.ply has them, and strip puts them back."
+)
 NOTHING_NEW_NOTE = (
     "The splat reproduces all photographs. Where it is wrong from elsewhere, only smooth colours "
     "are known: little is to be gained without new photographs of the place or a learned generator."
@@ -73,8 +77,8 @@ def list_photograph_notes(context: Sequence[ContextRow]) -> Iterator[str]:
     if ignored > 0:
         yield (
             f"Up to {format_percent(ignored)} of a photograph stays the same while the camera "
-            "moves, like the bonnet of a vehicle; it is ignored, also in scores "
-            "(images/context*_ignored.png)."
+            "moves, like the bonnet of a vehicle, or shows what was removed; it is ignored, also "
+            "in scores (images/context*_ignored.png)."
         )
     factors = [factor for row in context for factor in row.exposure_gain or ()]
     if factors:
@@ -95,6 +99,8 @@ def list_splat_notes(summary: CompletionSummary) -> Iterator[str]:
             f"The splat does not reproduce {summary.new_photographs} of the photographs; it is "
             "recoloured to them, which helps most."
         )
+    if removed := summary.gaussians.get("removed"):
+        yield f"{removed:,} {REMOVED_NOTE}"
     if recolored := summary.gaussians.get("recolored"):
         yield f"{recolored:,} {RECOLORED_NOTE}"
 

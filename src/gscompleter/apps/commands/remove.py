@@ -1,0 +1,57 @@
+"""The command `remove`: take something out of a splat, and complete the hole that it leaves."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+from rich.console import Console
+
+from gscompleter.apps.commands.complete import Prepared, prepare_completion, run_completion
+from gscompleter.apps.commands.options import RemoveOptions
+from gscompleter.apps.inputs.removal import check_selection, choose_gaussians
+from gscompleter.errors import InputError, quote_value
+from gscompleter.next_best_view.photographs import PhotographPlanner
+from gscompleter.progress import stage
+from gscompleter.removal import remove_gaussians
+from gscompleter.state import Completion
+
+SELECTIONS = ("box", "box_rotation", "sphere", "mask", "select")
+
+
+@dataclass(frozen=True)
+class PreparedRemoval(Prepared):
+    """A completion that begins with the removal."""
+
+    options: RemoveOptions
+
+    def begin(self) -> Completion:
+        """Initialize the context, and remove the selected Gaussians from it."""
+        begun, scenes = super().begin(), self.completer.scenes
+        with stage("removing"):
+            photographs, renderer = self.opened.photographs, self.completer.renderer
+            chosen = choose_gaussians(self.options, self.task, photographs, self.cameras, renderer)
+            return remove_gaussians(begun, chosen, scenes)
+
+    def describe_settings(self) -> dict[str, Any]:
+        """Describe the settings, with the selection."""
+        selection = {name: getattr(self.options, name) for name in SELECTIONS}
+        texts = {name: str(selection[name]) for name in ("mask", "select") if selection[name]}
+        return {**super().describe_settings(), **selection, **texts}
+
+
+def run_removal(options: RemoveOptions) -> None:
+    """Remove the selection, complete the hole, and print a summary."""
+    run_completion(options, prepare_removal)
+
+
+def prepare_removal(options: RemoveOptions, console: Console) -> PreparedRemoval:
+    """Open the scene, and load the models; targets are searched for among the photographs."""
+    check_selection(options)
+    ready = prepare_completion(options, console)
+    if ready.task.scene is not None and bool((ready.task.scene.generated > 0).any()):
+        raise InputError(
+            f"{quote_value(options.scene)} was completed before, and removed.ply keeps what one "
+            "run removed; strip it first, and remove everything at once."
+        )
+    return PreparedRemoval(**{**vars(ready), "explorer": PhotographPlanner(ready.completer)})

@@ -1,0 +1,147 @@
+"""Choice of the Gaussians to remove: by boxes, a sphere, masks of photographs, or another file."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+
+import torch
+from jaxtyping import Bool, Float
+from torch import Tensor
+
+from gscompleter.apps.commands.options import RemoveOptions, parse_resolution
+from gscompleter.apps.inputs.opening import Task
+from gscompleter.data.frame import ENDINGS, find_file
+from gscompleter.data.local_origin import shift_to_origin
+from gscompleter.data.photographs import Photographs, Resolution, undistort_and_resize
+from gscompleter.errors import InputError, quote_value
+from gscompleter.geometry import quats_to_rotations
+from gscompleter.io.image import read_pixels
+from gscompleter.progress import track
+from gscompleter.render import Renderer
+from gscompleter.splats.formats import load_splat
+from gscompleter.types import Camera, Gaussians
+
+WHITE = 128
+"""Smallest value, of 255, of a mask's pixels that show something to remove."""
+
+
+def check_selection(options: RemoveOptions) -> None:
+    """Refuse a selection that is missing or impossible."""
+    if not (options.box or options.sphere or options.mask or options.select):
+        raise InputError(
+            "Nothing is named that is to be removed; give --box, --sphere, --mask or --select."
+        )
+    lows, highs = split_boxes(options.box)
+    if len(options.box) % 6 or not bool((lows < highs).all()):
+        raise InputError(
+            "A box needs six numbers: its smallest x, y and z, then its largest; several boxes "
+            "need six each.",
+            "box",
+        )
+    if options.sphere and options.sphere[3] <= 0:
+        raise InputError("A sphere needs a positive radius after its centre.", "sphere")
+    if not any(options.box_rotation):
+        raise InputError("A rotation is a quaternion w x y z that is not zero.", "box-rotation")
+    if options.mask and not os.path.isdir(options.mask):
+        raise InputError(f"There is no folder {quote_value(options.mask)}.", "mask")
+
+
+def choose_gaussians(
+    options: RemoveOptions,
+    task: Task,
+    photographs: Photographs,
+    cameras: Mapping[int, Camera],
+    renderer: Renderer,
+) -> Bool[Tensor, "n"]:
+    """Choose the Gaussians of the input splat that the options select in any way.
+
+    `cameras` are those of the photographs by frame, in the frame of the splat.
+    """
+    scene = task.scene
+    assert scene is not None
+    points = scene.means.double() + torch.from_numpy(task.origin).to(scene.means.device)
+    chosen = find_in_boxes(points, options.box, options.box_rotation)
+    if options.sphere:
+        center = points.new_tensor(options.sphere[:3])
+        chosen |= (points - center).norm(dim=1) <= options.sphere[3]
+    if options.mask:
+        masks = find_masks(options.mask, photographs)
+        resolution = parse_resolution(options.resolution)
+        chosen |= find_in_masks(masks, scene, photographs, cameras, resolution, renderer)
+    if options.select:
+        selected = load_splat(options.select, options.drop_nonfinite)
+        selected = shift_to_origin(task.origin, selected, list(cameras.values()))
+        chosen |= find_same_positions(scene, selected.to(scene.means.device))
+    if not chosen.any():
+        low, high = (" ".join(f"{x:.4g}" for x in end) for end in points.aminmax(dim=0))
+        raise InputError(
+            f"No Gaussian of the splat, which reaches from {low} to {high} in its own frame, is "
+            "selected; name another place, or selected Gaussians that were not moved."
+        )
+    return chosen
+
+
+def split_boxes(numbers: Sequence[float]) -> tuple[Float[Tensor, "b 3"], Float[Tensor, "b 3"]]:
+    """Split numbers into the smallest and the largest corners of boxes; a rest is left out."""
+    whole = torch.tensor(numbers[: len(numbers) // 6 * 6], dtype=torch.float64).reshape(-1, 6)
+    return whole[:, :3], whole[:, 3:]
+
+
+def find_in_boxes(
+    points: Float[Tensor, "n 3"], boxes: Sequence[float], rotation: Sequence[float]
+) -> Bool[Tensor, "n"]:
+    """Find points inside of boxes that a wxyz quaternion rotates about their centres."""
+    axes = quats_to_rotations(points.new_tensor(rotation))
+    inside = torch.zeros(len(points), dtype=torch.bool, device=points.device)
+    for low, high in zip(*(ends.to(points) for ends in split_boxes(boxes)), strict=True):
+        local = (points - (low + high) / 2) @ axes
+        inside |= (local.abs() <= (high - low) / 2).all(dim=1)
+    return inside
+
+
+def find_masks(folder: Path, photographs: Photographs) -> dict[int, Path]:
+    """Find the masks that are named as photographs, by frame."""
+    found = {}
+    for number, frame in enumerate(photographs.frames):
+        name = Path(frame.name)
+        stems = (name, name.with_suffix(""), Path(name.name), Path(name.stem))
+        path = find_file([folder], [f"{stem}{ending}" for stem in stems for ending in ENDINGS])
+        if path is not None:
+            found[number] = path
+    if not found:
+        raise InputError(
+            f"{quote_value(folder)} has no mask that is named as a photograph, such as "
+            f"{quote_value(Path(photographs.frames[0].name).stem)}.png.",
+            "mask",
+        )
+    return found
+
+
+def find_in_masks(
+    masks: Mapping[int, Path],
+    scene: Gaussians,
+    photographs: Photographs,
+    cameras: Mapping[int, Camera],
+    resolution: Resolution,
+    renderer: Renderer,
+) -> Bool[Tensor, "n"]:
+    """Find Gaussians of which photographs show more inside of their masks than outside."""
+    sums = torch.zeros_like(scene.means)
+    for number in track([number for number in masks if number in cameras], "masks"):
+        frame = photographs.frame(number)
+        pixels = read_pixels(masks[number]).max(axis=-1)
+        mask = undistort_and_resize(frame, pixels, frame.size(), resolution) >= WHITE
+        inside = torch.from_numpy(mask).to(sums)
+        layers = torch.stack([inside, 1 - inside, torch.zeros_like(inside)], dim=-1)
+        sums += renderer.freeze(scene, cameras[number]).backproject(layers)
+    return sums[:, 0] > sums[:, 1]
+
+
+def find_same_positions(scene: Gaussians, selected: Gaussians) -> Bool[Tensor, "n"]:
+    """Find Gaussians of a scene at exactly the positions of others."""
+    points = torch.cat([selected.means, scene.means])
+    _, number = torch.unique(points, dim=0, return_inverse=True)
+    own, others = number[len(selected) :], number[: len(selected)]
+    return torch.isin(own, others)

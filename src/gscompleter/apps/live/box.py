@@ -1,0 +1,63 @@
+"""The box on the page: whatever it contains can be removed."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import viser
+
+from gscompleter.apps.inputs.removal import find_in_boxes
+from gscompleter.apps.live.session import Session
+from gscompleter.errors import InputError
+from gscompleter.removal import remove_gaussians
+
+COLOR = (255, 80, 80)
+HANDLE = 0.5
+"""Length of the arrows, in page units."""
+
+Numbers = tuple[float, ...]
+
+
+class PageBox:
+    """A box that is dragged and rotated on the page, and sized by three numbers."""
+
+    def __init__(self, server: viser.ViserServer, position: np.ndarray) -> None:
+        """Add the controls, hidden at first; `position` is in page units."""
+        scene, gui = server.scene, server.gui
+        self.controls = scene.add_transform_controls(
+            "/box", scale=HANDLE, position=position, visible=False
+        )
+        self.shown = gui.add_checkbox("Box", initial_value=False)
+        self.size = gui.add_vector3("Size of the box", (1.0, 1.0, 1.0), step=0.01)
+        outline = scene.add_box("/box/outline", COLOR, self.size.value, wireframe=True)
+        self.shown.on_update(lambda _: setattr(self.controls, "visible", self.shown.value))
+        self.size.on_update(lambda _: setattr(outline, "dimensions", self.size.value))
+
+    def read(self, unit: float) -> tuple[Numbers, Numbers]:
+        """Return the corners, in scene units, and the rotation, as `remove` takes them."""
+        if not self.shown.value:
+            raise InputError("Tick “Box”, drag it over what you want to remove, and press again.")
+        center, half = np.array(self.controls.position), np.array(self.size.value) / 2
+        corners = np.concatenate([center - half, center + half]) / unit
+        return tuple(corners.tolist()), tuple(np.array(self.controls.wxyz).tolist())
+
+
+def remove_in_box(session: Session, corners: Numbers, rotation: Numbers) -> tuple[Session, int]:
+    """Remove all Gaussians in a box, in the frame of the result, and count them.
+
+    Gaussians of the context that only they hid go with them.
+    """
+    state, scenes = session.latest, session.completer.scenes
+    inside = [
+        find_in_boxes(part.means.double(), corners, rotation)
+        for part in (state.context, *state.parts[1:])
+    ]
+    context = inside[0] & ~state.source.gone_mask
+    if not any(mask.any() for mask in (context, *inside[1:])):
+        raise InputError("The box contains nothing; drag it, or make it larger.")
+    added = [part[~mask] for part, mask in zip(state.parts[1:], inside[1:], strict=True)]
+    parts, config = (state.parts[0], *added), state.config.for_removal()
+    changed = remove_gaussians(replace(state, parts=parts, config=config), context, scenes)
+    count = sum(map(len, state.parts)) - sum(map(len, changed.parts))
+    return replace(session, completions=(*session.completions, changed)), count

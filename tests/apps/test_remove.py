@@ -1,0 +1,226 @@
+"""`gscompleter remove`: selections, results that `strip` undoes, and refusals."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import pytest
+import torch
+
+from command import run
+from gscompleter import load_ply, save_ply
+from gscompleter.apps.inputs.removal import (
+    find_in_boxes,
+    find_in_masks,
+    find_masks,
+    find_same_positions,
+)
+from gscompleter.data.formats import open_photographs
+from gscompleter.geometry import axis_angle_to_matrix, rotations_to_quats
+from gscompleter.io.image import read_image, write_image
+from gscompleter.render import load_renderer
+from gscompleter.types import merge
+from scenes import Room, camera_at, cast, gaussians_of, photographed, random_gaussians, view_of
+
+SIZE = 48
+CAMERAS = [
+    camera_at(x, yaw=yaw, size=SIZE) for x, yaw in ((-0.6, 6), (-0.2, 2), (0.2, -2), (0.6, -6))
+]
+TARGET = camera_at(0.0, 0.05, size=SIZE)
+ROOM = Room()
+EMPTY = Room((ROOM.boxes[0], ROOM.boxes[2]))
+"""The room without the box in its middle."""
+CRATE = (-0.6, 0.2, 2.1, 0.4, 1.47, 3.1)
+UPRIGHT = (1.0, 0.0, 0.0, 0.0)
+RENDERER = load_renderer("cpu")
+
+
+@pytest.fixture(scope="module")
+def scene(tmp_path_factory) -> Path:
+    """Write photographs of the room, and a splat of what they show."""
+    folder = photographed(tmp_path_factory.mktemp("remove") / "room", CAMERAS)
+    save_ply(folder / "splat.ply", merge([gaussians_of(view_of(ROOM, c)) for c in CAMERAS]))
+    return folder
+
+
+def remove(scene: Path, out: Path, *others: object) -> tuple[object, ...]:
+    """Return the words of a command."""
+    size = ("--resolution", SIZE, SIZE, "--near", 0.5, "--far", 20, "--quiet")
+    return ("remove", scene, "--scene", scene / "splat.ply", "--out", out, *size, *others)
+
+
+def write_masks(folder: Path) -> Path:
+    """Write masks of the crate for two of the photographs."""
+    folder.mkdir()
+    for number in (0, 3):
+        shown = cast(ROOM, CAMERAS[number])[1] < cast(EMPTY, CAMERAS[number])[1] - 0.01
+        write_image(folder / f"{number}.png", shown)
+    return folder
+
+
+def test_the_crate_goes_its_place_is_filled_and_strip_brings_it_back(scene, tmp_path, monkeypatch):
+    out, camera = tmp_path / "out", tmp_path / "camera"
+    photographed(camera, [TARGET])
+    words = remove(scene, out, "--box", *CRATE, "--target", camera / "transforms.json")
+    assert run(monkeypatch, *words) == 0
+    given, completed = load_ply(scene / "splat.ply"), load_ply(out / "completed.ply")
+    left = completed[completed.generated == 0]
+    assert not find_in_boxes(left.means, CRATE, UPRIGHT).any()
+    counts = json.loads((out / "summary.json").read_text())["gaussians"]
+    assert counts["removed"] == len(given) - len(left) == len(load_ply(out / "removed.ply")) > 100
+    assert (out / "context.ply").read_bytes() == (scene / "splat.ply").read_bytes()
+    (row,) = json.loads((out / "summary.json").read_text())["targets"]
+    assert row["added"] > 0
+    depth, crate = (cast(room, TARGET)[1] for room in (EMPTY, ROOM))
+    after = RENDERER.render(completed, TARGET)
+    hole = (RENDERER.render(left, TARGET).alpha < 0.5) & (crate < 0.95 * depth)
+    assert hole.float().mean() > 0.03
+    assert (after.alpha[hole] > 0.5).float().mean() > 0.9
+    error, as_before = ((d / depth - 1).abs()[hole].median() for d in (after.depth, crate))
+    assert error < 0.5 * as_before
+    again = tmp_path / "again.ply"
+    assert run(monkeypatch, "strip", out / "completed.ply", "--out", again, "--quiet") == 0
+    assert again.read_bytes() == (scene / "splat.ply").read_bytes()
+
+
+def test_targets_are_photographs_and_what_shows_the_crate_is_not_scored(
+    scene, tmp_path, monkeypatch
+):
+    out, masks = tmp_path / "out", write_masks(tmp_path / "masks")
+    assert run(monkeypatch, *remove(scene, out, "--mask", masks, "--auto", 1)) == 0
+    summary = json.loads((out / "summary.json").read_text())
+    assert summary["settings"]["mask"] == str(masks)
+    (target,) = summary["targets"]
+    assert target["derived_from"] in range(len(CAMERAS))
+    assert target["hole_fraction"] > 0.02
+    assert target["added"] > 0
+    for row in summary["context"]:
+        assert 0.02 < row["ignored"] < 0.6
+        assert row["psnr_after"] > row["psnr_before"] - 0.05
+    ignored = read_image(out / "images" / "context1_ignored.png")
+    shown = cast(ROOM, CAMERAS[0])[1] < cast(EMPTY, CAMERAS[0])[1] - 0.01
+    assert (ignored == torch.tensor([1.0, 0.0, 1.0])).all(-1)[shown].float().mean() > 0.95
+
+
+def test_a_plan_names_a_photograph_and_the_hole_that_is_left(scene, tmp_path, monkeypatch, capsys):
+    splat = load_ply(scene / "splat.ply")
+    save_ply(tmp_path / "selected.ply", splat[find_in_boxes(splat.means, CRATE, UPRIGHT)])
+    words = [*remove(scene, tmp_path / "out", "--select", tmp_path / "selected.ply", "--dry-run")]
+    words.remove("--quiet")
+    assert run(monkeypatch, *words) == 0
+    (row,) = [line for line in capsys.readouterr().out.splitlines() if "1: target near" in line]
+    assert 2 < float(row.split()[-2]) < 40
+    assert [path.name for path in (tmp_path / "out").iterdir()] == ["targets.json"]
+
+
+def test_boxes_are_rotated_about_their_centres():
+    points = torch.tensor([[1.0, 1, 1], [2.2, 1, 1], [1.8, 1.8, 1], [1, 1, 2.1]])
+    box = (0.0, 0.0, 0.0, 2.0, 2.0, 2.0)
+    assert find_in_boxes(points, box, UPRIGHT).tolist() == [True, False, True, False]
+    turn = rotations_to_quats(axis_angle_to_matrix(torch.tensor([0.0, 0, 1]), torch.pi / 4))
+    assert find_in_boxes(points, box, turn.tolist()).tolist() == [True, True, False, False]
+    both = (*box, 1.5, 0.5, 1.5, 2.5, 1.5, 2.5)
+    assert find_in_boxes(points, both, (2.0, 0.0, 0.0, 0.0)).tolist() == [True, False, True, False]
+    assert find_in_boxes(points, (0.0, 0.0, 0.0, 1.0, 1.0, 3.0, *box), UPRIGHT)[3]
+
+
+def test_masks_choose_what_lies_in_them(scene, tmp_path):
+    photographs, splat = open_photographs(scene), load_ply(scene / "splat.ply")
+    cameras = {number: photographs.camera(number) for number in range(len(CAMERAS))}
+    masks = find_masks(write_masks(tmp_path / "masks"), photographs)
+    assert sorted(masks) == [0, 3]
+    chosen = find_in_masks(masks, splat, photographs, cameras, None, RENDERER)
+    crate = find_in_boxes(splat.means, CRATE, UPRIGHT)
+    assert chosen[crate].float().mean() > 0.8
+    assert chosen[~crate].float().mean() < 0.05
+
+
+def test_a_selection_is_found_by_position():
+    splat = random_gaussians(50)
+    splat.means[3] = splat.means[7]
+    found = find_same_positions(splat, splat[torch.tensor([7, 20])])
+    assert torch.nonzero(found)[:, 0].tolist() == [3, 7, 20]
+    moved = random_gaussians(50, seed=1)
+    assert not find_same_positions(splat, moved).any()
+
+
+@pytest.mark.parametrize(
+    ("selection", "said"),
+    [
+        ((), "Nothing is named"),
+        (("--box", 0, 0, 0, 1, 1), "six numbers"),
+        (("--box", 0, 0, 0, 1, -1, 1), "six numbers"),
+        (("--box", 50, 50, 50, 51, 51, 51), "No Gaussian of the splat"),
+        (("--box", -50, -50, -50, 50, 50, 50), "Nothing would be left"),
+        (("--sphere", 0, 0, 0, -1), "positive radius"),
+        (("--sphere", 0, 0, 1, 1, "--box-rotation", 0, 0, 0, 0), "quaternion"),
+        (("--mask", "nowhere"), "There is no folder"),
+        (("--mask", "EMPTY"), "no mask that is named as a photograph"),
+        (("--select", "MOVED"), "No Gaussian of the splat"),
+        (("--select", "nowhere.ply"), "nowhere.ply"),
+    ],
+)
+def test_wrong_selections_are_refused(scene, tmp_path, monkeypatch, capsys, selection, said):
+    (tmp_path / "EMPTY").mkdir()
+    save_ply(tmp_path / "MOVED", random_gaussians(5))
+    monkeypatch.chdir(tmp_path)
+    assert run(monkeypatch, *remove(scene, tmp_path / "out", *selection)) == 2
+    error = capsys.readouterr().err.strip()
+    assert said in error
+    assert len(error) <= 300 + len("gscompleter: ")
+    assert "\n" not in error
+    assert not (tmp_path / "out").exists()
+
+
+@pytest.fixture
+def fox(shared) -> Path:
+    folder = shared / "splats" / "fox"
+    if not folder.is_dir():
+        pytest.skip(f"needs the splat of another trainer, and there is no folder {folder}")
+    return folder
+
+
+FOX_BOX = (0.221, -3.331, 1.068, 3.621, 2.619, 4.318, 1.44, -0.987, 3.908, 4.54, 2.613, 4.098)
+FOX_ROTATION = (-0.3356, -0.0044, 0.9419, -0.0123)
+
+
+def test_the_fox_is_removed_and_brought_back(fox, tmp_path, monkeypatch):
+    out, again, few_photographs = tmp_path / "out", tmp_path / "again.ply", tmp_path / "fox"
+    (few_photographs / "images").mkdir(parents=True)
+    (few_photographs / "sparse").symlink_to(fox / "sparse")
+    for number in (1, 12, 21, 30, 42):
+        name = f"images/{number:04}.jpg"
+        (few_photographs / name).symlink_to(fox / name)
+    boxes = ("--box", *FOX_BOX, "--box-rotation", *FOX_ROTATION)
+    few = ("--resolution", 96, "--auto", 1, "--quiet")
+    words = ("remove", few_photographs, "--scene", fox / "splat.ply", *boxes, *few, "--out", out)
+    assert run(monkeypatch, *words) == 0
+    completed = load_ply(out / "completed.ply")
+    left = completed[completed.generated == 0]
+    assert not find_in_boxes(left.means, FOX_BOX, FOX_ROTATION).any()
+    (row,) = json.loads((out / "summary.json").read_text())["targets"]
+    assert row["hole_fraction"] > 0.1
+    assert row["added"] > 0
+    assert run(monkeypatch, "strip", out / "completed.ply", "--out", again, "--quiet") == 0
+    assert again.read_bytes() == (fox / "splat.ply").read_bytes()
+
+
+def test_masks_of_the_fox_choose_the_fox(fox, tmp_path):
+    photographs, splat = open_photographs(fox), load_ply(fox / "splat.ply")
+    cameras = {number: photographs.camera(number, 160) for number in (0, 12, 20, 26)}
+    inside = find_in_boxes(splat.means, FOX_BOX, FOX_ROTATION)
+    for number, camera in cameras.items():
+        weight = RENDERER.freeze(splat, camera).splat(inside.float())
+        name = Path(photographs.frames[number].name).stem
+        write_image(tmp_path / f"{name}.png", weight > 0.5)
+    masks = find_masks(tmp_path, photographs)
+    chosen = find_in_masks(masks, splat, photographs, cameras, 160, RENDERER)
+    seen = torch.zeros(len(splat))
+    for camera in cameras.values():
+        seen += RENDERER.freeze(splat, camera).backproject(
+            torch.ones(camera.height, camera.width, 3)
+        )[:, 0]
+    visible = seen > 1
+    both, either = (chosen & inside & visible).sum(), ((chosen | inside) & visible).sum()
+    assert both > 0.7 * either
