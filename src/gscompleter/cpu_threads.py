@@ -34,9 +34,8 @@ def limit_threads(count: int | None) -> None:
 
 def use_one_arena() -> None:
     """Let all threads allocate from one arena (glibc): each keeps free memory of its own."""
-    library = ctypes.CDLL(None) if sys.platform == "linux" else None
-    if hasattr(library, "mallopt"):
-        library.mallopt(ARENA_MAX, 1)
+    if sys.platform == "linux" and hasattr(ctypes.CDLL(None), "mallopt"):
+        ctypes.CDLL(None).mallopt(ARENA_MAX, 1)
 
 
 def get_thread_count() -> int:
