@@ -1,6 +1,5 @@
 """Threads of all libraries; the result does not depend on their number."""
 
-import ctypes
 import hashlib
 import os
 import subprocess
@@ -60,7 +59,7 @@ library.fflush(stdout)
 """
 
 
-@pytest.mark.skipif(not hasattr(ctypes.CDLL(None), "malloc_info"), reason="needs glibc")
+@pytest.mark.linux
 def test_all_threads_allocate_from_one_arena():
     command = [sys.executable, "-c", ARENAS]
     life = subprocess.run(command, capture_output=True, text=True, check=True)
