@@ -51,6 +51,16 @@ def test_overwriting_replaces_our_entries_and_leaves_those_of_the_user(results):
     assert sorted(os.listdir(results)) == ["completed.ply", "images", "mine.txt", "summary.json"]
 
 
+def test_a_completion_does_not_keep_the_removed_gaussians_of_an_earlier_one(results):
+    (results / "removed.ply").write_text("old")
+    with open_output_folder(results, overwrite=True) as folder:
+        (folder / "tables.md").write_text("new")
+    assert (results / "removed.ply").read_text() == "old"
+    with open_output_folder(results, overwrite=True) as folder:
+        write_results(folder)
+    assert not (results / "removed.ply").exists()
+
+
 def test_the_summary_leaves_first_and_arrives_last(results, monkeypatch):
     moved = []
     rename = os.rename

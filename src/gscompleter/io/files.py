@@ -24,6 +24,8 @@ TARGETS_FILE = "targets.json"
 """File of a completion with the target cameras."""
 CONTEXT_FILE, COMPLETED_FILE = "context.ply", "completed.ply"
 """The scene of a completion before and after."""
+OPTIONAL_FILES = ("removed.ply", TARGETS_FILE, "video.mp4")
+"""Files that only some completions have: those of an earlier one do not belong to its successor."""
 
 UNFINISHED_PREFIX = ".gscompleter-"
 """Prefix of the names of unfinished entries, which are never taken for results."""
@@ -126,7 +128,8 @@ def _publish(draft: Path, target: Path) -> None:
         return
     replaced = target / _make_name()
     names = sorted(os.listdir(draft), key=lambda name: (name == SUMMARY_FILE, name))
-    old = [name for name in reversed(names) if os.path.lexists(target / name)]
+    stale = [name for name in OPTIONAL_FILES if COMPLETED_FILE in names and name not in names]
+    old = [name for name in reversed([*stale, *names]) if os.path.lexists(target / name)]
     moves = [(target / name, replaced / name) for name in old]
     replaced.mkdir()
     try:
