@@ -128,7 +128,7 @@ def halve_view(view: View) -> View:
     image = avg_pool2d(view.image.permute(2, 0, 1), 2).permute(1, 2, 0)
     K = view.camera.K * view.camera.K.new_tensor([[0.5], [0.5], [1.0]])
     camera = replace(view.camera, K=K, height=image.shape[0], width=image.shape[1])
-    return replace(view, image=image, camera=camera, depth=None, ignore_mask=None)
+    return View(image, camera, view.frame)
 
 
 def exclude_needed(

@@ -84,7 +84,8 @@ def test_the_summary_has_the_keys_of_the_contract_and_the_numbers_add_up(complet
     scores = {"psnr_before", "psnr_after", "ssim_before", "ssim_after"}
     assert [row["frame"] for row in summary["context"]] == [0, 1]
     assert all(
-        set(row) == {"frame", "exposure_gain", "dynamic_fraction", "ignored", *scores}
+        set(row)
+        == {"frame", "exposure_gain", "dynamic_fraction", "given_depth", "ignored", *scores}
         for row in summary["context"]
     )
     assert all(row["exposure_gain"] is None for row in summary["context"])  # as they were taken

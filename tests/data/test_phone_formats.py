@@ -170,7 +170,8 @@ def test_photographs_without_any_camera_are_refused(tmp_path):
 
 
 def test_other_files_beside_photographs_are_no_cameras(tmp_path):
-    files = {"frame_1.json": b'{"shapes": []}', "frame_1.jpg": photograph(0, WIDE)}
+    files = {f"frame_{number}.jpg": photograph(0, WIDE) for number in (1, 2)}
+    files["frame_1.json"] = b'{"shapes": []}'
     with pytest.raises(InputError, match="There are no posed photographs"):
         open_photographs(write_folder(tmp_path / "room", files))
 

@@ -100,7 +100,7 @@ def open_photographs(
 def detect_format(path: Path, name: str | None = None) -> str:
     """Return the given format name after checking it, or detect the format of `path`."""
     formats = ", ".join(FORMATS)
-    advice = f"name photographs with cameras, in one of these formats (docs/formats.md): {formats}"
+    advice = "name photographs with cameras, such as colmap, nerfstudio or others (docs/formats.md)"
     require(
         name is None or name in FORMATS,
         f"There is no format '{quote_value(name)}'; choose one of {formats}.",

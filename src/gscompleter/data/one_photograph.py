@@ -46,8 +46,8 @@ def open_photograph(path: Path) -> Iterator[Photographs]:
     assert file is not None
     require(
         not has_panoramas([file]),
-        f"{quote_value(file)} is a single panorama, which shows no depth; name a folder with "
-        "another one, taken a step away.",
+        f"There is a single panorama in {quote_value(path)}, which shows no depth; name a folder "
+        "with another one, taken a step away.",
     )
     with open_image(file) as image:
         exif = image.getexif()

@@ -170,18 +170,15 @@ class RemoveOptions(CompleteOptions):
     scene: Path = field()  # without the default of `complete`
     """File of Gaussians (a splat) to remove something from."""
     box: tuple[float, ...] = ()
-    """Remove Gaussians inside of a box: smallest x, y and z, then largest; six for each of several
-    boxes."""
+    """Remove Gaussians inside of boxes: smallest x, y and z of each, then largest."""
     box_rotation: tuple[float, float, float, float] = (1.0, 0.0, 0.0, 0.0)
     """Rotation of the boxes about their centres, as a quaternion w x y z."""
     sphere: tuple[float, float, float, float] | None = None
     """Remove Gaussians inside of a sphere: x, y and z of its centre, and its radius."""
     mask: Path | None = None
-    """Remove what these masks show: a folder with an image per photograph, of its name, white where
-    something is to be removed. Not all photographs need one."""
+    """Remove what masks show: a folder of images named as photographs, white on the object."""
     select: Path | None = None
-    """Remove the Gaussians of this file, at exactly the same positions, as a selection that was
-    saved by another program."""
+    """Remove the Gaussians of this file, a selection that another program saved."""
     config: Annotated[CompleterConfig, tyro.conf.FlagConversionOff] = REMOVAL_CONFIG
     """Settings of the method, which change those of `--config NAME`."""
 
