@@ -39,7 +39,7 @@ DEPTH_PENALTY = 0.02
 """Cost per squared log-depth of a source in front of the expected depth."""
 DISTANCE_PENALTY = 0.002
 """Cost of a source at the other end of the image."""
-MIN_VOTE_ROUNDS, MAX_VOTE_ROUNDS = 2, 10
+MIN_VOTE_ROUNDS, MAX_VOTE_ROUNDS = 2, 8
 """Iterations on the finest and the coarsest level, where sharp votes need more to agree."""
 VOTE_SHARPNESS = 8
 """Decay of a vote with its cost; at 1, averaged patches lose a quarter of their detail."""
