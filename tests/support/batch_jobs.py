@@ -81,6 +81,7 @@ def plain_jobs(count: int, seconds: float) -> list[Job]:
 
 
 if __name__ == "__main__":
+    signal.signal(signal.SIGINT, signal.default_int_handler)  # a background job ignores it
     engine, out, count, seconds, workers = sys.argv[1:]
     jobs = plain_jobs(int(count), float(seconds))
     run_all(Path(out), jobs, engine_named(engine, int(workers)))
