@@ -99,13 +99,40 @@ class Prepared:
         return replace(self, task=replace(self.task, targets=targets))
 
 
+def prepare_completion(options: CompleteOptions, console: Console) -> Prepared:
+    """Open the scene and load the models."""
+    check_output(options.out, is_replaceable(options))
+    check_context(options)
+    check_targets(options)
+    check_reconstructor(options.reconstructor)
+    get_settings_class(options.synthesis.generator)
+    device = choose_device(options.device)
+    opened = open_scene(options, console)
+    if not options.config.ego_mask:
+        opened = replace(opened, photographs=opened.photographs.keep_ego_vehicle())
+    with show_preparation("reading photographs"):
+        task = read_task(options, opened, device)
+    parts = device, options.reconstructor, options.synthesis.generator
+    if options.scene is None:
+        compile_kernels(parts)
+    else:
+        task = add_splat(task, options.scene, options, opened, parts)
+    with show_preparation("loading models"):
+        completer = load_completer(options, task.targets, device)
+    if options.scene is None:
+        task = replace(task, views=prepare_single(completer.reconstructor, task.views))
+    with show_preparation("depth range"), record_seconds() as seconds, timed_stage("context"):
+        task = apply_working_range(task, completer.renderer)
+    cameras = collect_cameras(options, opened, task)
+    return Prepared(options, opened, task, ViewPlanner(completer), cameras, seconds)
+
+
 Prepare = Callable[[Any, Console], Prepared]
 """Opens the input of a command, whose options it takes, and loads the models."""
 
 
-def run_completion(options: CompleteOptions, prepare: Prepare | None = None) -> None:
+def run_completion(options: CompleteOptions, prepare: Prepare = prepare_completion) -> None:
     """Complete the scene, and print a summary."""
-    prepare = prepare or prepare_completion
     if options.dry_run:
         plan_folder(options, prepare)
         return
@@ -121,11 +148,13 @@ def run_report(options: ReportOptions) -> None:
         print(options.out / REPORT_FILE)
 
 
-def complete_folder(options: CompleteOptions, prepare: Prepare | None = None) -> dict[str, Any]:
+def complete_folder(
+    options: CompleteOptions, prepare: Prepare = prepare_completion
+) -> dict[str, Any]:
     """Complete the scene, write `options.out`, and return the summary."""
     if options.video:
         find_ffmpeg()
-    with open_completion(options, prepare or prepare_completion) as (ready, folder):
+    with open_completion(options, prepare) as (ready, folder):
         completion, ready = complete_targets(ready)
         ready.completer.scenes.clear()
         with stage("report"):
@@ -179,34 +208,6 @@ def write_done(folder: Path, ready: Prepared, completion: Completion) -> dict[st
         )
     write_completion_page(folder)
     return summary
-
-
-def prepare_completion(options: CompleteOptions, console: Console) -> Prepared:
-    """Open the scene and load the models."""
-    check_output(options.out, is_replaceable(options))
-    check_context(options)
-    check_targets(options)
-    check_reconstructor(options.reconstructor)
-    get_settings_class(options.synthesis.generator)
-    device = choose_device(options.device)
-    opened = open_scene(options, console)
-    if not options.config.ego_mask:
-        opened = replace(opened, photographs=opened.photographs.keep_ego_vehicle())
-    with show_preparation("reading photographs"):
-        task = read_task(options, opened, device)
-    parts = device, options.reconstructor, options.synthesis.generator
-    if options.scene is None:
-        compile_kernels(parts)
-    else:
-        task = add_splat(task, options.scene, options, opened, parts)
-    with show_preparation("loading models"):
-        completer = load_completer(options, task.targets, device)
-    if options.scene is None:
-        task = replace(task, views=prepare_single(completer.reconstructor, task.views))
-    with show_preparation("depth range"), record_seconds() as seconds, timed_stage("context"):
-        task = apply_working_range(task, completer.renderer)
-    cameras = collect_cameras(options, opened, task)
-    return Prepared(options, opened, task, ViewPlanner(completer), cameras, seconds)
 
 
 def add_splat(
