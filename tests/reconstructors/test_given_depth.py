@@ -9,9 +9,11 @@ import torch
 from gscompleter import GSCompleter, InputError
 from gscompleter.evaluation.metrics.geometry import compare_depths
 from gscompleter.evaluation.metrics.image import compute_masked_psnr
+from gscompleter.reconstructors.features.stereo_image import make_stereo_images
 from gscompleter.reconstructors.plane_sweep import PlaneSweep
-from gscompleter.reconstructors.plane_sweep.given_depth import NEAR_RADIUS, add_given
-from gscompleter.reconstructors.plane_sweep.sweep import Measurement
+from gscompleter.reconstructors.plane_sweep.given_depth import add_given
+from gscompleter.reconstructors.plane_sweep.rig import build_rig
+from gscompleter.reconstructors.plane_sweep.sweep import Measurement, sweep_views
 from gscompleter.render import load_renderer
 from gscompleter.types import DepthMap, View
 from scenes import Room, camera_at, view_of
@@ -31,25 +33,29 @@ def measured(index: float) -> Measurement:
     return Measurement(PLANES, index * sure, sure, sure)
 
 
-def test_a_given_depth_replaces_stereo_and_discredits_it_nearby():
-    view = replace(view_of(Room(), camera_at(size=SIZE)), depth=None)
+def test_a_given_depth_replaces_stereo():
     depth = torch.zeros(SIZE, SIZE)
     depth[30, 29:32] = 2.0
-    found = add_given(measured(5.0), replace(view, given_depth=depth), unit=1.0)
-    near = np.zeros((SIZE, SIZE), bool)
-    reach = slice(31 - NEAR_RADIUS, 30 + NEAR_RADIUS)
-    near[30 - NEAR_RADIUS : 31 + NEAR_RADIUS, reach] = True
-    assert found.index[30, 30] == pytest.approx(20.0, abs=1e-3)  # 1 / 2 in planes
-    assert found.confidence[30, 30] == 1
-    assert (found.weight[~near] == 1).all()
-    assert found.weight[near].sum() == 3
-    agreeing = add_given(measured(20.3), replace(view, given_depth=depth), unit=1.0)
-    assert (agreeing.weight == 1).all()
-    lone = add_given(
-        measured(5.0), replace(view, given_depth=depth * (torch.arange(SIZE) == 30)), 1.0
-    )
-    assert (lone.weight == 1).all()
-    assert add_given(found, view, unit=1.0) is found
+    view = replace(view_of(Room(), camera_at(size=SIZE)), depth=None, given_depth=depth)
+    (image, _), _ = make_stereo_images([view, view_of(Room(), camera_at(1.0, size=SIZE))])
+    unsure = replace(measured(5.0), weight=np.full_like(image.given, 0.1))
+    found, known = add_given(unsure, image), depth.numpy() > 0
+    assert found.index[known] == pytest.approx(20.0, abs=1e-3)  # 1 / 2 in planes
+    assert (found.index[~known] == 5).all()
+    assert (found.weight == np.where(known, 1, np.float32(0.1))).all()
+
+
+def test_matching_carries_given_depth_along_a_blank_wall():
+    cameras = [replace(camera_at(x, size=SIZE), near=1.8, far=11.0) for x in (0.0, 1.0)]
+    wall, stripe, shares = torch.full((SIZE, SIZE, 3), 0.5), torch.zeros(SIZE, SIZE), []
+    for depth in 0.0, 3.6:
+        stripe[:, 40:42] = depth
+        rig = build_rig([View(wall, cameras[0], given_depth=stripe), View(wall, cameras[1])])
+        sweep = sweep_views(rig, 1.8 / rig.unit, 11.0 / rig.unit)[0]
+        found = rig.unit / sweep.inverse[:, 36:56]
+        shares.append((np.abs(found / 3.6 - 1) < 0.05).mean())
+    assert shares[0] == 0
+    assert shares[1] > 0.95
 
 
 def test_blocks_of_depth_halve_the_error_between_them():

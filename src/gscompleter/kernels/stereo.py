@@ -228,6 +228,33 @@ def _match_tiles(
                     costs[place + x * count] = value
 
 
+def prefer_given(costs, bands, given, weight, step):
+    """Make planes beside given depths cost more, in place; within half a plane matching decides.
+
+    given [h, w]: plane of each pixel, or less than 0 if unknown. weight: of the matching cost
+    there. step: cost of each further plane.
+    """
+    share(_prefer_given, len(given), costs, bands, given, weight, step)
+
+
+@njit(cache=True, nogil=True, fastmath={"contract"})
+def _prefer_given(begin, end, costs, bands, given, weight, step):
+    w = given.shape[1]
+    for y in range(begin, end):
+        for x in range(w):
+            if given[y, x] < 0:
+                continue
+            first = _get_first_cost(bands, y, x, w)
+            row, column = y // TILE_ROWS, x // TILE_COLUMNS
+            low = bands.low[row, column]
+            for k in range(bands.high[row, column] - low):
+                beside = max(
+                    abs(np.float32(low + k) - given[y, x]) - np.float32(0.5), np.float32(0)
+                )
+                cost = weight * np.float32(costs[first + k]) + step * beside
+                costs[first + k] = np.uint8(min(cost, np.float32(254)))
+
+
 @njit(cache=True, fastmath={"contract"}, inline="always")
 def _step(cost, before, lowest, after, total, small, large):
     """Advance a path by one pixel and return its lowest cost there."""

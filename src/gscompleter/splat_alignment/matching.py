@@ -175,7 +175,8 @@ def extract_view_features(view: View) -> Features:
     pose = get_pose(view.camera)
     pixels = np.ascontiguousarray(view.image.detach().cpu().clamp(0, 1).float().numpy())
     K = view.camera.K.detach().cpu().double().numpy()
-    return detect_features(StereoImage(pixels, K, pose[:3, :3], pose[:3, 3]))
+    unknown = np.zeros(pixels.shape[:2], np.float32)
+    return detect_features(StereoImage(pixels, K, pose[:3, :3], pose[:3, 3], unknown))
 
 
 def render_features(scene: Gaussians, camera: Camera, renderer: Renderer) -> RenderedFeatures:

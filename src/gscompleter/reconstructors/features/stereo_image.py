@@ -14,6 +14,8 @@ from gscompleter.types import View
 
 MIN_SIDE = 8
 """Smallest side of an image that stereo can match, in pixels."""
+NEAREST = np.float32(1e-6)
+"""Smallest given depth, in units of the images; sensors write any number."""
 
 
 @dataclass(frozen=True)
@@ -25,6 +27,8 @@ class StereoImage:
     rotation: Float[np.ndarray, "3 3"]
     """Rotation from camera to world axes."""
     center: Float[np.ndarray, "3"]
+    given: Float32[np.ndarray, "h w"]
+    """Inverse depths that are given, 0 where unknown."""
     ignore_mask: Bool[np.ndarray, "h w"] | None = None
     """True at pixels that are not matched, or None to match all."""
 
@@ -53,8 +57,9 @@ def make_stereo_images(views: Sequence[View]) -> tuple[list[StereoImage], float]
                 f"An image of {width} x {height} pixels was given, and stereo needs at least "
                 f"{MIN_SIDE} x {MIN_SIDE}; give a larger one."
             )
-    if is_single and views[0].camera.near:
-        return [_make_stereo_image(views[0], np.zeros(3))], views[0].camera.near
+    near = views[0].camera.near
+    if is_single and near:
+        return [_make_stereo_image(views[0], np.zeros(3), near)], near
     centers = np.stack([view.camera.center.detach().cpu().double().numpy() for view in views])
     unit = float(np.linalg.norm(centers[:, None] - centers[None], axis=-1).max())
     if unit <= 2e-7 * float(np.linalg.norm(centers, axis=-1).max()):
@@ -64,19 +69,29 @@ def make_stereo_images(views: Sequence[View]) -> tuple[list[StereoImage], float]
         )
     offsets = np.round((centers - centers[0]) / unit * 2**16) / 2**16
     return [
-        _make_stereo_image(view, offset) for view, offset in zip(views, offsets, strict=True)
+        _make_stereo_image(view, offset, unit) for view, offset in zip(views, offsets, strict=True)
     ], unit
 
 
-def _make_stereo_image(view: View, center: Float[np.ndarray, "3"]) -> StereoImage:
+def _make_stereo_image(view: View, center: Float[np.ndarray, "3"], unit: float) -> StereoImage:
     camera = view.camera
     return StereoImage(
         np.ascontiguousarray(view.image.detach().cpu().float().numpy()),
         camera.K.detach().cpu().double().numpy(),
         camera.c2w[:3, :3].detach().cpu().double().numpy(),
         center,
+        invert_given(view, unit),
         None if view.ignore_mask is None else view.ignore_mask.cpu().numpy(),
     )
+
+
+def invert_given(view: View, unit: float) -> Float32[np.ndarray, "h w"]:
+    """Invert the given depth of a view, in scene units, to units of `unit`; 0 where unknown."""
+    if view.given_depth is None:
+        return np.zeros(view.image.shape[:2], np.float32)
+    depth = view.given_depth.detach().cpu().numpy()
+    inverse = unit / np.maximum(depth, NEAREST * unit)
+    return np.where(depth > 0, inverse, 0).astype(np.float32)
 
 
 def compute_contrast(

@@ -5,7 +5,6 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from itertools import repeat
 
 import numpy as np
 import torch
@@ -68,7 +67,7 @@ class PlaneSweep(Splatter):
             return self.lift_in_place(views[0], views[1], pixel_mask)
         rig = build_rig(views)
         first, second = match_views(rig, views, MIN_HALVED_SIDES["lift"])
-        first = add_given(first, views[0], rig.unit)
+        first = add_given(first, rig.images[0])
         open_there = find_sky(rig.images[1], second)
         first = add_prediction(first, self.predict_depth(views[0]))
         layers = [
@@ -100,7 +99,7 @@ class PlaneSweep(Splatter):
         """Compute the completed inverse depth of each view."""
         least = MIN_HALVED_SIDES["pair" if len(views) == 2 else "many"]
         stereo = match_views(rig, views, least)
-        found = list(map(add_given, stereo, views, repeat(rig.unit)))
+        found = list(map(add_given, stereo, rig.images))
         seen = find_skies(rig, found)
         guided = map(add_prediction, found, map(self.predict_depth, views))
         surfaces = map_in_parallel(make_layer, rig.images, map(Measurement.exclude, guided, seen))

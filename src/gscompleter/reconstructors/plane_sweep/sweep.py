@@ -59,6 +59,8 @@ NOISE = np.float32(0.015)
 """Standard deviation of the image noise; weaker texture does not correlate."""
 PIXEL_WEIGHT = np.float32(0.4)
 """Weight of the per-pixel difference in the cost; the rest is window correlation."""
+GIVEN_SHARE, GIVEN_COST = np.float32(1 / 8), np.float32(60)
+"""Weight of the matching cost at pixels with given depth, and cost of each plane beside it."""
 UNSEEN_COST = np.uint8(140)
 """Cost, from 0 to 254, of a plane at which no other view observes the pixel."""
 
@@ -206,6 +208,8 @@ def sweep_view(number: int, rig: Rig, near: float, far: float, guess: Sweep | No
         likely = compute_plane_index(planes, guess.inverse)
         bands = make_guided_bands(likely, 2, image.size, len(planes))
     costs = compute_costs(image, sources, planes, bands)
+    given = compute_plane_index(planes, image.given).clip(0, len(planes) - 1)
+    stereo.prefer_given(costs, bands, np.where(image.given > 0, given, -1), GIVEN_SHARE, GIVEN_COST)
     index, margin = stereo.select_planes(aggregate(costs, bands, image), bands, *image.size)
     if guess is not None:
         margin = np.minimum(margin, repeat_pixels(guess.margin, image.size))
