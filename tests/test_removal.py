@@ -11,8 +11,9 @@ from gscompleter import GSCompleter
 from gscompleter.config import CompleterConfig
 from gscompleter.errors import InputError
 from gscompleter.guards import load_guards
-from gscompleter.removal import remove_gaussians, restore_needed
-from gscompleter.state import Completion
+from gscompleter.image_ops import dilate
+from gscompleter.removal import find_outside, remove_gaussians, restore_surroundings
+from gscompleter.state import NEW_PHOTO_ID, Completion
 from gscompleter.types import REMOVED, REVEALED, Gaussians, make_observed, merge, sh_from_rgb
 from scenes import Room, camera_at, gaussians_of, view_of
 
@@ -52,7 +53,7 @@ def choose_surface(begun: Completion) -> torch.Tensor:
 
 @pytest.fixture(scope="module")
 def removed(begun) -> Completion:
-    return remove_gaussians(begun, choose_surface(begun), COMPLETER.scenes)
+    return remove_gaussians(begun, choose_surface(begun), is_crate, COMPLETER.scenes)
 
 
 def test_the_chosen_are_gone_and_so_is_what_only_they_hid(begun, removed):
@@ -62,7 +63,8 @@ def test_the_chosen_are_gone_and_so_is_what_only_they_hid(begun, removed):
     assert source.gone_mask.sum() < chosen.sum() + 0.05 * len(chosen)
     assert removed.context is begun.context
     left = begun.context[~source.gone_mask]
-    assert torch.equal(removed.scene.means, left.means)
+    assert torch.equal(removed.scene.means[: len(left)], left.means)
+    assert (removed.scene.generated[len(left) :] == NEW_PHOTO_ID).all()
     assert torch.equal(source.rendered.means, left.means)
     assert torch.equal(source.expand(source.rendered.opacities)[chosen], torch.zeros(chosen.sum()))
     assert not removed.recolored_mask.any()
@@ -106,7 +108,7 @@ def test_what_photographs_need_elsewhere_returns(begun):
         torch.tensor([0.99]),
         sh_from_rgb(torch.tensor([[1.0, 0.2, 0.2]])),
     )
-    thin = replace(begun.context, opacities=0.8 * begun.context.opacities)
+    thin = replace(begun.context, opacities=0.4 * begun.context.opacities)
     scene = merge([thin, glow])
     views = [
         replace(view, image=COMPLETER.renderer.render(scene, view.camera).image.clamp(0, 1))
@@ -114,7 +116,7 @@ def test_what_photographs_need_elsewhere_returns(begun):
     ]
     state = COMPLETER.begin(views, scene, [])
     chosen = is_crate(scene.means)
-    state = remove_gaussians(state, chosen, COMPLETER.scenes)
+    state = remove_gaussians(state, chosen, is_crate, COMPLETER.scenes)
     number = torch.full_like(state.source.stand_ins, REVEALED)
     hidden = replace(
         state.source,
@@ -122,13 +124,61 @@ def test_what_photographs_need_elsewhere_returns(begun):
         proxy_index=state.source.stand_ins.where(torch.arange(len(scene)) < len(scene) - 1, number),
     )
     state = replace(state, source=hidden, parts=(hidden.rendered,))
-    restored = restore_needed(state, COMPLETER.renderer)
+    restored = restore_surroundings(state, COMPLETER.renderer)
     assert restored.source.stand_ins[-1] == len(restored.parts[0]) - 1
     assert torch.equal(restored.scene.means[-1], glow.means[0])
     assert (restored.source.stand_ins == REMOVED).sum() == chosen.sum()
-    assert restore_needed(begun, COMPLETER.renderer) is begun
+    assert restore_surroundings(begun, COMPLETER.renderer) is begun
+
+
+def test_what_shows_in_the_hole_alone_does_not_return(removed):
+    views = [photo.view for photo in removed.photos]
+    wall = removed.context[~removed.source.gone_mask][::50]
+    found = find_outside(merge([make_junk(), wall]), removed.scene, views, COMPLETER.renderer)
+    assert not found[:3].any()
+    assert found[3:].float().mean() > 0.5
+
+
+def measure_errors(state: Completion, scene: Gaussians) -> list[float]:
+    """Return the mean difference of each photograph to a render around the crate."""
+    errors = []
+    for camera, photo in zip(CAMERAS, state.photos, strict=True):
+        around = ~dilate(view_of(ROOM, camera).depth < view_of(EMPTY, camera).depth - 0.01, 3)
+        image = COMPLETER.renderer.render(scene, camera).image
+        errors.append((image - photo.view.image)[around].abs().mean().item())
+    return errors
+
+
+def test_what_reaches_out_of_the_place_stays_and_additions_match_photographs(begun):
+    """A large disc in front of the crate is a stain on the walls beside it, too."""
+    stain = make_observed(
+        torch.tensor([[-0.1, 0.8, 2.17]]),
+        torch.tensor([[1.0, 0, 0, 0]]),
+        torch.tensor([[0.5, 0.5, 0.01]]),
+        torch.tensor([0.5]),
+        sh_from_rgb(torch.tensor([[1.0, 0.2, 0.2]])),
+    )
+    scene = merge([begun.context, stain])
+    views = [
+        replace(view, image=COMPLETER.renderer.render(scene, view.camera).image.clamp(0, 1))
+        for view in begun.views
+    ]
+    state = COMPLETER.begin(views, scene, [])
+    cut, uncut = (
+        remove_gaussians(state, is_crate(scene.means), region, COMPLETER.scenes)
+        for region in (is_crate, lambda points: torch.zeros(len(points), dtype=torch.bool))
+    )
+    pairs = zip(*(measure_errors(state, each.scene) for each in (cut, uncut)), strict=True)
+    assert all(less < 0.5 * more for less, more in pairs)
+    assert set(cut.added.generated.tolist()) == {NEW_PHOTO_ID}
+    dyed = replace(cut.added, sh=cut.added.sh - 0.5)
+    dyed = replace(cut, parts=(cut.parts[0], dyed))
+    restored = restore_surroundings(dyed, COMPLETER.renderer)
+    before, after = measure_errors(state, dyed.scene), measure_errors(state, restored.scene)
+    assert max(after) < 0.7 * max(before)
 
 
 def test_something_has_to_be_left(begun):
+    everything = torch.ones(len(begun.context), dtype=torch.bool)
     with pytest.raises(InputError, match="Nothing would be left"):
-        remove_gaussians(begun, torch.ones(len(begun.context), dtype=torch.bool), COMPLETER.scenes)
+        remove_gaussians(begun, everything, is_crate, COMPLETER.scenes)

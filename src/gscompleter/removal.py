@@ -1,17 +1,19 @@
 """Removal of chosen Gaussians from a begun completion, so that their hole can be completed.
 
-Behind an object a trained splat has Gaussians that no photograph ever showed. They are removed
-with it, or else they would fill its hole; at the end those return that photographs need elsewhere.
-The photographs still show the object, so their pixels are ignored there. From then on the scene has
-full trust: only its holes are completed.
+A Gaussian that reaches out of the chosen place is cut at its border. Behind an object a trained
+splat has Gaussians that no photograph ever showed. They are removed with it, or else they would
+fill its hole; at the end those return that photographs need elsewhere. The photographs still show
+the object, so their pixels are ignored there. From then on the scene has full trust: only its holes
+are completed.
 """
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import replace
 
 import torch
-from jaxtyping import Bool
+from jaxtyping import Bool, Int64
 from torch import Tensor
 
 from gscompleter.cleaning import exclude_needed, limit_errors
@@ -21,88 +23,150 @@ from gscompleter.guards.psnr import meet_error_budgets, set_error_budgets
 from gscompleter.guards.removal import mask_removed
 from gscompleter.render import Renderer
 from gscompleter.render.cache import SceneRenderer
-from gscompleter.state import Completion
+from gscompleter.render.fit_colors import RELAXATION, fit_colors
+from gscompleter.splats.cutting import Region, cut
+from gscompleter.state import NEW_PHOTO_ID, Completion, Photo
 from gscompleter.trust import Trust
 from gscompleter.trust.photometric import PhotoObservations, gather_observations
 from gscompleter.types import REMOVED, REVEALED, ContextScene, Gaussians, Render, View, merge
 
-TOLERANCE = 0.005
+TOLERANCE = 0.0005
 """Largest loss of PSNR of a photograph, in dB, by revealed Gaussians that do not return."""
 MIN_REVEALED = 0.5
 """Share of a Gaussian, in some photograph, that has to come to light for it to be revealed."""
 MIN_CONFIRMED = 0.25
 """Share of it that a photograph has to show, before the removal, for it to stay."""
+MIN_OUTSIDE = 0.05
+"""Share of a revealed Gaussian that has to be seen outside of the hole for it to return."""
 MAX_ROUNDS = 8
 """Layers of unseen Gaussians that are removed behind each other."""
+COLOR_ROUNDS = 12
+"""Rounds of fitting colours of additions to the photographs around the hole."""
 
 
 def remove_gaussians(
-    state: Completion, chosen: Bool[Tensor, "n"], scenes: SceneRenderer
+    state: Completion, chosen: Bool[Tensor, "n"], contains: Region, scenes: SceneRenderer
 ) -> Completion:
     """Remove chosen Gaussians of the context, and those that no photograph showed behind them.
 
+    Those in a region are removed as far as it reaches, and the rest of them is added.
     A rendered Gaussian that stands for several goes with the last of them.
     """
-    source, count = state.source, len(state.parts[0])
-    stays = source.stand_ins.where(~chosen, -1)
-    asked = torch.ones(count, dtype=torch.bool, device=chosen.device)
-    asked = asked.index_fill(0, stays[stays >= 0], False)
-    gone = find_revealed(state, asked, scenes)
+    source, first = state.source, state.parts[0]
+    asked = find_unused(source, chosen)
+    inner, outer = cut(source.gaussians[chosen], contains)
+    outer = replace(outer, generated=torch.full_like(outer.generated, NEW_PHOTO_ID))
+    gone, hidden = find_revealed(state, asked, inner, outer, scenes)
     if gone.all():
         raise InputError("Nothing would be left of the splat; choose fewer Gaussians.")
+    left = replace(
+        source,
+        rendered=source.rendered[~gone],
+        proxy_index=number_left(source, chosen, asked, gone),
+        removed=merge([source.removed, replace(inner, sh=inner.sh[:, :1])]),
+        revealed=merge([source.revealed, outer[hidden]]),
+    )
+    context = left.rendered if first is source.rendered else first[~gone]
+    rest = [outer[~hidden]] if not hidden.all() else []
+    parts = (context, *state.parts[1:], *rest)
+    changed = replace(state, source=left, parts=parts, trust=Trust())
+    photos = hide_in_photographs(changed, scenes)
+    return prepare_guards(replace(changed, photos=photos), scenes)
+
+
+def find_unused(source: ContextScene, chosen: Bool[Tensor, "n"]) -> Bool[Tensor, "m"]:
+    """Find the rendered Gaussians that stand for none but chosen ones."""
+    used = source.stand_ins[~chosen & ~source.gone_mask]
+    unused = torch.ones(len(source.rendered), dtype=torch.bool, device=used.device)
+    return unused.index_fill(0, used, False)
+
+
+def number_left(
+    source: ContextScene,
+    chosen: Bool[Tensor, "n"],
+    asked: Bool[Tensor, "m"],
+    gone: Bool[Tensor, "m"],
+) -> Int64[Tensor, "n"]:
+    """Compute the `proxy_index` of what is left: rendered Gaussians are numbered anew."""
     number = torch.where(asked, REMOVED, torch.where(gone, REVEALED, (~gone).cumsum(0) - 1))
     before = torch.arange(REVEALED, 0, device=chosen.device)  # numbers of those already gone
-    rendered = source.rendered[~gone]
-    context = rendered if state.parts[0] is source.rendered else state.parts[0][~gone]
-    changed = replace(
-        state,
-        source=ContextScene(source.gaussians, rendered, torch.cat([number, before])[stays]),
-        parts=(context, *state.parts[1:]),
-        trust=Trust(),
-    )
-    masked = [
-        hide_removed(photo.view, state.parts[0], asked, scenes.renderer) for photo in state.photos
-    ]
-    shown = scenes.freeze_at(changed.parts, [view.camera for view in masked])
-    photos = [
-        replace(photo, view=paint_over(view, frozen.render))
-        for photo, view, frozen in zip(state.photos, masked, shown, strict=True)
-    ]
-    return prepare_guards(replace(changed, photos=tuple(photos)), scenes)
+    return torch.cat([number, before])[source.stand_ins.where(~chosen, REMOVED)]
 
 
-def restore_needed(state: Completion, renderer: Renderer) -> Completion:
-    """Put back revealed Gaussians that photographs need where they do not show what was removed.
+def restore_surroundings(state: Completion, renderer: Renderer) -> Completion:
+    """Let photographs be as good as before where they do not show what was removed.
 
-    What was generated in the hole stands in front of them by now. It is faded first, until no
-    photograph is worse than with all of them.
+    What was generated is faded until none is worse than with all revealed Gaussians behind it. Of
+    these, the needed return. At last the colours of all additions are fitted.
     """
     source, views = state.source, [photo.view for photo in state.photos]
-    revealed = source.stand_ins == REVEALED
-    if not revealed.any():
+    if len(source.removed) == 0:
         return state
-    hidden = source.gaussians[revealed]
-    whole = merge([state.parts[0], hidden])
-    added = fade_harmful(state, whole, renderer)
-    is_hidden = torch.arange(len(whole), device=revealed.device) >= len(state.parts[0])
-    missing = torch.cat([is_hidden, is_hidden.new_zeros(len(added))])
-    limits = limit_errors(whole, views, TOLERANCE, renderer)
-    missing = exclude_needed(merge([whole, added]), missing, views, limits, renderer)
-    back = revealed.masked_scatter(revealed, ~missing[len(state.parts[0]) : len(whole)])
-    returned = source.gaussians[back]
-    numbers = len(source.rendered) + torch.arange(len(returned), device=revealed.device)
+    is_rest, back = state.added.generated == NEW_PHOTO_ID, source.stand_ins == REVEALED
+    revealed, rest = merge([source.gaussians[back], source.revealed]), state.added[is_rest]
+    known = merge([state.parts[0], rest])
+    added = fade_harmful(state.added[~is_rest], merge([known, revealed]), state, renderer)
+    needed = find_needed(revealed, known, added, views, renderer)
+    count = int(back.sum())
+    returned, pieces = revealed[:count][needed[:count]], revealed[count:][needed[count:]]
+    back = back.masked_scatter(back, needed[:count])
+    numbers = len(source.rendered) + torch.arange(len(returned), device=back.device)
     rendered = merge([source.rendered, returned])
     first = rendered if state.parts[0] is source.rendered else merge([state.parts[0], returned])
+    index = source.stand_ins.masked_scatter(back, numbers)
     return replace(
         state,
-        source=ContextScene(
-            source.gaussians, rendered, source.stand_ins.masked_scatter(back, numbers)
-        ),
-        parts=(first, added),
+        source=replace(source, rendered=rendered, proxy_index=index),
+        parts=(first, fit_to_photographs(merge([rest, pieces, added]), first, views, renderer)),
     )
 
 
-def fade_harmful(state: Completion, context: Gaussians, renderer: Renderer) -> Gaussians:
+def find_needed(
+    revealed: Gaussians,
+    known: Gaussians,
+    added: Gaussians,
+    views: Sequence[View],
+    renderer: Renderer,
+) -> Bool[Tensor, "n"]:
+    """Find the revealed Gaussians that photographs need where they do not show the removed ones.
+
+    What shows hardly anywhere but in the hole is not needed.
+    """
+    found = find_outside(revealed, merge([known, added]), views, renderer)
+    whole = merge([known, revealed[found]])
+    missing = torch.arange(len(whole) + len(added), device=found.device)
+    missing = (missing >= len(known)) & (missing < len(whole))
+    limits = limit_errors(whole, views, TOLERANCE, renderer)
+    missing = exclude_needed(merge([whole, added]), missing, views, limits, renderer)
+    return found.masked_scatter(found, ~missing[len(known) : len(whole)])
+
+
+def find_outside(
+    revealed: Gaussians, others: Gaussians, views: Sequence[View], renderer: Renderer
+) -> Bool[Tensor, "n"]:
+    """Find the revealed Gaussians that photographs see outside of the hole as well."""
+    scene, sums = merge([others, revealed]), torch.zeros_like(revealed.means)
+    for view in views:
+        outside = view.valid_mask.to(sums)
+        layers = torch.stack([outside, 1 - outside, torch.zeros_like(outside)], dim=-1)
+        sums += renderer.freeze(scene, view.camera).backproject(layers)[len(others) :]
+    return sums[:, 0] > MIN_OUTSIDE * sums.sum(dim=1)
+
+
+def fit_to_photographs(
+    added: Gaussians, context: Gaussians, views: Sequence[View], renderer: Renderer
+) -> Gaussians:
+    """Fit the colours of additions to photographs, and leave them as they are in the hole."""
+    frozen = [renderer.freeze(context, view.camera) for view in views]
+    images = [
+        paint_over(view, scene.composite(added)) for view, scene in zip(views, frozen, strict=True)
+    ]
+    return fit_colors(added, frozen, images, [RELAXATION] * COLOR_ROUNDS)
+
+
+def fade_harmful(
+    added: Gaussians, context: Gaussians, state: Completion, renderer: Renderer
+) -> Gaussians:
     """Fade what was generated until no photograph is worse than `context` alone."""
     config, views = state.config.psnr_guard, [photo.view for photo in state.photos]
     frozen = [renderer.freeze(context, view.camera) for view in views]
@@ -116,14 +180,25 @@ def fade_harmful(state: Completion, context: Gaussians, renderer: Renderer) -> G
         )
         for view, scene in zip(views, frozen, strict=True)
     ]
-    plans = [scene.vary_opacities(state.added) for scene in frozen]
-    return meet_error_budgets(state.added, frozen, budgets, plans, config)
+    plans = [scene.vary_opacities(added) for scene in frozen]
+    return meet_error_budgets(added, frozen, budgets, plans, config)
 
 
 def find_revealed(
-    state: Completion, gone: Bool[Tensor, "m"], scenes: SceneRenderer
-) -> Bool[Tensor, "m"]:
-    """Add to the `gone` those of `state.parts[0]` that only become visible without them."""
+    state: Completion,
+    asked: Bool[Tensor, "m"],
+    inner: Gaussians,
+    outer: Gaussians,
+    scenes: SceneRenderer,
+) -> tuple[Bool[Tensor, "m"], Bool[Tensor, "o"]]:
+    """Add to those `asked` for, of `state.parts[0]`, what only becomes visible without them.
+
+    Also returns which `outer` pieces do. With `inner` ones they stand for those asked for.
+    """
+    first = state.parts[0]
+    others = replace(first, opacities=first.opacities.masked_fill(asked, 0.0), encoded=None)
+    state = replace(state, parts=(merge([others, inner, outer]), *state.parts[1:]))
+    gone = torch.cat([asked, asked.new_ones(len(inner)), asked.new_zeros(len(outer))])
     before = observe(state, ~torch.zeros_like(gone), scenes)
     confirmed = (before.areas * before.agreement).amax(dim=0)
     for _ in range(MAX_ROUNDS):
@@ -135,7 +210,7 @@ def find_revealed(
         if not revealed.any():
             break
         gone = gone | revealed
-    return gone
+    return gone[: len(first)], gone[len(gone) - len(outer) :]
 
 
 def observe(state: Completion, left: Bool[Tensor, "m"], scenes: SceneRenderer) -> PhotoObservations:
@@ -145,13 +220,21 @@ def observe(state: Completion, left: Bool[Tensor, "m"], scenes: SceneRenderer) -
     return gather_observations(context, views, frozen, state.config.trust_settings)
 
 
-def hide_removed(
-    view: View, scene: Gaussians, removed: Bool[Tensor, "n"], renderer: Renderer
-) -> View:
-    """Ignore the pixels of a photograph that show Gaussians of `scene` that are removed from it."""
-    if not removed.any():
+def hide_in_photographs(state: Completion, scenes: SceneRenderer) -> tuple[Photo, ...]:
+    """Ignore the pixels of photographs that show something removed, and paint them over."""
+    views = [hide_removed(photo.view, state.source, scenes.renderer) for photo in state.photos]
+    shown = scenes.freeze_at(state.parts, [view.camera for view in views])
+    return tuple(
+        replace(photo, view=paint_over(view, scene.render))
+        for photo, view, scene in zip(state.photos, views, shown, strict=True)
+    )
+
+
+def hide_removed(view: View, source: ContextScene, renderer: Renderer) -> View:
+    """Ignore the pixels of a photograph that show something removed."""
+    if len(source.removed) == 0:
         return view
-    mask = mask_removed(scene, removed, view.camera, renderer)
+    mask = mask_removed(source, view.camera, renderer)
     return replace(view, ignore_mask=mask | ~view.valid_mask)
 
 

@@ -25,7 +25,7 @@ from gscompleter.types import (
 )
 
 NEW_PHOTO_ID = 255
-"""Value of `generated` for Gaussians that were recoloured to a new photograph of the scene."""
+"""Value of `generated` for Gaussians that were recoloured to a new photograph, or cut."""
 AFFINE_NOTES = {
     "ransac": "",
     "median": "RANSAC finds no reliable depth correction; the median depth ratio replaces it.",

@@ -422,11 +422,24 @@ class ContextScene:
     proxy_index: Int64[Tensor, "_n"]
     """Rendered Gaussian that stands for each Gaussian, `REMOVED` or `REVEALED` for those that are
     gone; empty if `rendered is gaussians`."""
+    removed: Gaussians
+    """The Gaussians that were removed, cut where they reached out of the place that was chosen; to
+    save memory, without their colours by direction."""
+    revealed: Gaussians
+    """Pieces of them outside of that place that only came to light by the removal."""
 
     @staticmethod
     def whole(gaussians: Gaussians) -> ContextScene:
         """Return a context that is rendered as it is."""
-        return ContextScene(gaussians, gaussians, gaussians.means.new_empty(0).long())
+        return ContextScene.build(gaussians, gaussians, gaussians.means.new_empty(0).long())
+
+    @staticmethod
+    def build(
+        gaussians: Gaussians, rendered: Gaussians, index: Int64[Tensor, "_n"]
+    ) -> ContextScene:
+        """Return a context from which nothing was removed yet."""
+        none = gaussians[:0]
+        return ContextScene(gaussians, rendered, index, replace(none, sh=none.sh[:, :1]), none)
 
     @property
     def stand_ins(self) -> Int64[Tensor, "n"]:

@@ -199,7 +199,7 @@ def test_gaussians_follow_their_proxy():
     scene = splat()
     rows, recolored_scene = recolored(scene)[0], change(scene)
     index = torch.arange(len(scene)).repeat_interleave(2)
-    source = ContextScene(scene[index], scene, index)
+    source = ContextScene.build(scene[index], scene, index)
     ids = scene.generated.index_fill(0, rows, 3)
     state = replace(
         begin_with(scene[index], PHOTOS),

@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
+import torch
 from jaxtyping import Bool
 from torch import Tensor
 
@@ -10,7 +13,7 @@ from gscompleter.guards import Guard
 from gscompleter.image_ops import dilate
 from gscompleter.render import Renderer
 from gscompleter.stages.target_view import TargetView
-from gscompleter.types import Camera, Gaussians
+from gscompleter.types import Camera, ContextScene, Gaussians
 
 MIN_WEIGHT = 0.1
 """Compositing weight of removed Gaussians from which on a pixel shows them."""
@@ -25,14 +28,15 @@ class Removal(Guard):
 
     def place(self, candidates: Gaussians, view: TargetView) -> Gaussians:
         """Keep candidates in pixels that showed something removed."""
-        camera, source = view.camera.padded, view.state.source
-        shown = mask_removed(source.gaussians, source.chosen_mask, camera, view.scenes.renderer)
+        camera = view.camera.padded
+        shown = mask_removed(view.state.source, camera, view.scenes.renderer)
         return candidates[project_mask(shown, candidates, camera)]
 
 
-def mask_removed(
-    scene: Gaussians, removed: Bool[Tensor, "n"], camera: Camera, renderer: Renderer
-) -> Bool[Tensor, "h w"]:
-    """Mark the pixels that show Gaussians of `scene` that are removed from it, and their border."""
-    weight = renderer.freeze(scene, camera).splat(removed.float())
+def mask_removed(source: ContextScene, camera: Camera, renderer: Renderer) -> Bool[Tensor, "h w"]:
+    """Mark the pixels that showed something removed, and their border."""
+    given, removed = source.gaussians, source.removed
+    others = replace(given, opacities=given.opacities.masked_fill(source.chosen_mask, 0.0))
+    values = torch.cat([torch.zeros_like(given.opacities), torch.ones_like(removed.opacities)])
+    weight = renderer.freeze(others, camera).extend(removed).splat(values)
     return dilate(weight > MIN_WEIGHT, max(round(MARGIN * max(weight.shape)), 1))

@@ -43,6 +43,5 @@ class PhotographPlanner(ViewPlanner):
     def propose(self, completion: Completion, camera: Camera, index: int) -> Candidate:
         """Make the candidate of a photograph."""
         small = shrink_camera(camera, completion.config.next_best_view.image_size)
-        source, renderer = completion.source, self.completer.renderer
-        region = mask_removed(source.gaussians, source.chosen_mask, small, renderer)
+        region = mask_removed(completion.source, small, self.completer.renderer)
         return Candidate(camera, index, 0.0, region)

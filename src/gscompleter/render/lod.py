@@ -56,7 +56,7 @@ def simplify_scene(scene: Gaussians, cameras: Sequence[Camera]) -> ContextScene:
     run = torch.arange(len(sizes)).repeat_interleave(sizes)
     appearance = opacities, sh.unflatten(1, scene.sh.shape[1:]), scene.generated[first]
     merged = Gaussians(means, quats, scales, *appearance, is_antialiased=scene.is_antialiased)
-    return ContextScene(scene, merged, run)
+    return ContextScene.build(scene, merged, run)
 
 
 def find_run_starts(

@@ -54,7 +54,7 @@ from gscompleter.kernels.parallel import run_in_background
 from gscompleter.next_best_view.planner import Choice, ViewPlanner
 from gscompleter.progress import show_preparation, show_progress, stage
 from gscompleter.reconstructors import check_reconstructor, load_reconstructor
-from gscompleter.removal import restore_needed
+from gscompleter.removal import restore_surroundings
 from gscompleter.render import choose_device, load_renderer
 from gscompleter.render.lod import MIN_PROXY_GAUSSIANS
 from gscompleter.splat_alignment.similarity import transform_camera, transform_camera_exactly
@@ -189,7 +189,7 @@ def open_completion(options: CompleteOptions, prepare: Prepare) -> Iterator[tupl
 def write_done(folder: Path, ready: Prepared, completion: Completion) -> dict[str, Any]:
     """Write all results but the targets and the video, and return the summary."""
     options, task, completer = ready.options, ready.task, ready.completer
-    completion = restore_needed(completion, completer.renderer)
+    completion = restore_surroundings(completion, completer.renderer)
     completion = replace(completion, seconds=add_seconds(completion.seconds, ready.seconds))
     cameras = tuple(ready.cameras.values())
     aside = sample_held_out_cameras(cameras, options.seed)

@@ -5,11 +5,14 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import Any
 
+import torch
+from jaxtyping import Bool, Float
 from rich.console import Console
+from torch import Tensor
 
 from gscompleter.apps.commands.complete import Prepared, prepare_completion, run_completion
 from gscompleter.apps.commands.options import RemoveOptions
-from gscompleter.apps.inputs.removal import check_selection, choose_gaussians
+from gscompleter.apps.inputs.removal import check_selection, choose_gaussians, find_in_region
 from gscompleter.errors import InputError, quote_value
 from gscompleter.next_best_view.photographs import PhotographPlanner
 from gscompleter.progress import stage
@@ -31,7 +34,12 @@ class PreparedRemoval(Prepared):
         with stage("removing"):
             photographs, renderer = self.opened.photographs, self.completer.renderer
             chosen = choose_gaussians(self.options, self.task, photographs, self.cameras, renderer)
-            return remove_gaussians(begun, chosen, scenes)
+            return remove_gaussians(begun, chosen, self.contains, scenes)
+
+    def contains(self, points: Float[Tensor, "n 3"]) -> Bool[Tensor, "n"]:
+        """Find points, in the frame of the result, in the boxes and the sphere."""
+        origin = torch.from_numpy(self.task.origin).to(points.device)
+        return find_in_region(points.double() + origin, self.options)
 
     def describe_settings(self) -> dict[str, Any]:
         """Describe the settings, with the selection."""

@@ -62,10 +62,7 @@ def choose_gaussians(
     scene = task.scene
     assert scene is not None
     points = scene.means.double() + torch.from_numpy(task.origin).to(scene.means.device)
-    chosen = find_in_boxes(points, options.box, options.box_rotation)
-    if options.sphere:
-        center = points.new_tensor(options.sphere[:3])
-        chosen |= (points - center).norm(dim=1) <= options.sphere[3]
+    chosen = find_in_region(points, options)
     if options.mask:
         masks = find_masks(options.mask, photographs)
         resolution = parse_resolution(options.resolution)
@@ -81,6 +78,15 @@ def choose_gaussians(
             "selected; name another place, or selected Gaussians that were not moved."
         )
     return chosen
+
+
+def find_in_region(points: Float[Tensor, "n 3"], options: RemoveOptions) -> Bool[Tensor, "n"]:
+    """Find points in the boxes and the sphere of the options."""
+    inside = find_in_boxes(points, options.box, options.box_rotation)
+    if options.sphere:
+        center = points.new_tensor(options.sphere[:3])
+        inside |= (points - center).norm(dim=1) <= options.sphere[3]
+    return inside
 
 
 def split_boxes(numbers: Sequence[float]) -> tuple[Float[Tensor, "b 3"], Float[Tensor, "b 3"]]:

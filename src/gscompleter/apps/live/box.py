@@ -6,6 +6,8 @@ from dataclasses import replace
 
 import numpy as np
 import viser
+from jaxtyping import Bool, Float
+from torch import Tensor
 
 from gscompleter.apps.inputs.removal import find_in_boxes
 from gscompleter.apps.live.session import Session
@@ -49,15 +51,18 @@ def remove_in_box(session: Session, corners: Numbers, rotation: Numbers) -> tupl
     Gaussians of the context that only they hid go with them.
     """
     state, scenes = session.latest, session.completer.scenes
-    inside = [
-        find_in_boxes(part.means.double(), corners, rotation)
-        for part in (state.context, *state.parts[1:])
-    ]
+
+    def contains(points: Float[Tensor, "n 3"]) -> Bool[Tensor, "n"]:
+        return find_in_boxes(points.double(), corners, rotation)
+
+    inside = [contains(part.means) for part in (state.context, *state.parts[1:])]
     context = inside[0] & ~state.source.gone_mask
     if not any(mask.any() for mask in (context, *inside[1:])):
         raise InputError("The box contains nothing; drag it, or make it larger.")
     added = [part[~mask] for part, mask in zip(state.parts[1:], inside[1:], strict=True)]
     parts, config = (state.parts[0], *added), state.config.for_removal()
-    changed = remove_gaussians(replace(state, parts=parts, config=config), context, scenes)
-    count = sum(map(len, state.parts)) - sum(map(len, changed.parts))
+    begun = replace(state, parts=parts, config=config)
+    changed = remove_gaussians(begun, context, contains, scenes)
+    gone = changed.source.gone_mask & ~state.source.gone_mask
+    count = sum(int(mask.sum()) for mask in (gone, *inside[1:]))
     return replace(session, completions=(*session.completions, changed)), count

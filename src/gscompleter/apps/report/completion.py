@@ -167,10 +167,9 @@ def compute_scores(pair: RenderPair, photograph: View | None) -> Scores:
 
 def score_views(completion: Completion, views: Sequence[View], renderer: Renderer) -> list[Scores]:
     """Score the scene before and after at photographs, except where they show what was removed."""
-    removed = completion.source.chosen_mask
 
     def score(view: View) -> Scores:
-        shown = hide_removed(view, completion.context, removed, renderer)
+        shown = hide_removed(view, completion.source, renderer)
         return compute_scores(render_before_after(completion, view.camera, renderer), shown)
 
     return list(get_view_map(completion.added.means)(score, views))
@@ -217,8 +216,7 @@ def score_targets(
     renderer: Renderer,
 ) -> list[TargetRow]:
     """Make the rows of the targets."""
-    scene, removed = completion.context, completion.source.chosen_mask
-    views = [t.view and hide_removed(t.view, scene, removed, renderer) for t in targets]
+    views = [t.view and hide_removed(t.view, completion.source, renderer) for t in targets]
     scores = map_in_parallel(compute_scores, pairs, views)
     rows = zip(targets, completion.targets, scores, strict=True)
     return [make_target_row(completion, *row) for row in rows]
