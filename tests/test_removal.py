@@ -11,6 +11,8 @@ from gscompleter import GSCompleter
 from gscompleter.config import CompleterConfig
 from gscompleter.errors import InputError
 from gscompleter.guards import load_guards
+from gscompleter.guards.free_space import ignore_removed, is_before_surface
+from gscompleter.guards.removal import find_removed
 from gscompleter.image_ops import dilate
 from gscompleter.removal import find_outside, remove_gaussians, restore_surroundings
 from gscompleter.state import NEW_PHOTO_ID, Completion
@@ -137,6 +139,18 @@ def test_what_shows_in_the_hole_alone_does_not_return(removed):
     found = find_outside(merge([make_junk(), wall]), removed.scene, views, COMPLETER.renderer)
     assert not found[:3].any()
     assert found[3:].float().mean() > 0.5
+
+
+def test_space_in_which_something_was_removed_is_not_free(removed, begun):
+    camera = CAMERAS[0]
+    behind = COMPLETER.renderer.render(gaussians_of(view_of(EMPTY, camera)), camera)
+    points = removed.source.removed.means
+    for state, expected in (begun, 1.0), (removed, 0.0):
+        seen = ignore_removed(behind, camera, COMPLETER.observe(state, camera))
+        share = is_before_surface(points, camera, seen).float().mean()
+        assert share == pytest.approx(expected, abs=0.05)
+    beside = find_removed(removed.source, camera, COMPLETER.renderer).logical_not()
+    assert torch.equal(seen.alpha[beside], behind.alpha[beside])
 
 
 def measure_errors(state: Completion, scene: Gaussians) -> list[float]:

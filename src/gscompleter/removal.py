@@ -30,7 +30,7 @@ from gscompleter.trust import Trust
 from gscompleter.trust.photometric import PhotoObservations, gather_observations
 from gscompleter.types import REMOVED, REVEALED, ContextScene, Gaussians, Render, View, merge
 
-TOLERANCE = 0.0005
+TOLERANCE = 0.003
 """Largest loss of PSNR of a photograph, in dB, by revealed Gaussians that do not return."""
 MIN_REVEALED = 0.5
 """Share of a Gaussian, in some photograph, that has to come to light for it to be revealed."""
@@ -40,7 +40,7 @@ MIN_OUTSIDE = 0.05
 """Share of a revealed Gaussian that has to be seen outside of the hole for it to return."""
 MAX_ROUNDS = 8
 """Layers of unseen Gaussians that are removed behind each other."""
-COLOR_ROUNDS = 12
+COLOR_ROUNDS = 8
 """Rounds of fitting colours of additions to the photographs around the hole."""
 
 
@@ -55,7 +55,6 @@ def remove_gaussians(
     source, first = state.source, state.parts[0]
     asked = find_unused(source, chosen)
     inner, outer = cut(source.gaussians[chosen], contains)
-    outer = replace(outer, generated=torch.full_like(outer.generated, NEW_PHOTO_ID))
     gone, hidden = find_revealed(state, asked, inner, outer, scenes)
     if gone.all():
         raise InputError("Nothing would be left of the splat; choose fewer Gaussians.")
@@ -64,11 +63,10 @@ def remove_gaussians(
         rendered=source.rendered[~gone],
         proxy_index=number_left(source, chosen, asked, gone),
         removed=merge([source.removed, replace(inner, sh=inner.sh[:, :1])]),
-        revealed=merge([source.revealed, outer[hidden]]),
     )
     context = left.rendered if first is source.rendered else first[~gone]
-    rest = [outer[~hidden]] if not hidden.all() else []
-    parts = (context, *state.parts[1:], *rest)
+    rest = replace(outer, generated=torch.full_like(outer.generated, NEW_PHOTO_ID))[~hidden]
+    parts = (context, *state.parts[1:], *([rest] if len(rest) else []))
     changed = replace(state, source=left, parts=parts, trust=Trust())
     photos = hide_in_photographs(changed, scenes)
     return prepare_guards(replace(changed, photos=photos), scenes)
@@ -103,13 +101,11 @@ def restore_surroundings(state: Completion, renderer: Renderer) -> Completion:
     if len(source.removed) == 0:
         return state
     is_rest, back = state.added.generated == NEW_PHOTO_ID, source.stand_ins == REVEALED
-    revealed, rest = merge([source.gaussians[back], source.revealed]), state.added[is_rest]
+    revealed, rest = source.gaussians[back], state.added[is_rest]
     known = merge([state.parts[0], rest])
     added = fade_harmful(state.added[~is_rest], merge([known, revealed]), state, renderer)
     needed = find_needed(revealed, known, added, views, renderer)
-    count = int(back.sum())
-    returned, pieces = revealed[:count][needed[:count]], revealed[count:][needed[count:]]
-    back = back.masked_scatter(back, needed[:count])
+    back, returned = back.masked_scatter(back, needed), revealed[needed]
     numbers = len(source.rendered) + torch.arange(len(returned), device=back.device)
     rendered = merge([source.rendered, returned])
     first = rendered if state.parts[0] is source.rendered else merge([state.parts[0], returned])
@@ -117,7 +113,7 @@ def restore_surroundings(state: Completion, renderer: Renderer) -> Completion:
     return replace(
         state,
         source=replace(source, rendered=rendered, proxy_index=index),
-        parts=(first, fit_to_photographs(merge([rest, pieces, added]), first, views, renderer)),
+        parts=(first, fit_to_photographs(merge([rest, added]), first, views, renderer)),
     )
 
 

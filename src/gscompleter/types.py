@@ -425,8 +425,6 @@ class ContextScene:
     removed: Gaussians
     """The Gaussians that were removed, cut where they reached out of the place that was chosen; to
     save memory, without their colours by direction."""
-    revealed: Gaussians
-    """Pieces of them outside of that place that only came to light by the removal."""
 
     @staticmethod
     def whole(gaussians: Gaussians) -> ContextScene:
@@ -439,7 +437,7 @@ class ContextScene:
     ) -> ContextScene:
         """Return a context from which nothing was removed yet."""
         none = gaussians[:0]
-        return ContextScene(gaussians, rendered, index, replace(none, sh=none.sh[:, :1]), none)
+        return ContextScene(gaussians, rendered, index, replace(none, sh=none.sh[:, :1]))
 
     @property
     def stand_ins(self) -> Int64[Tensor, "n"]:

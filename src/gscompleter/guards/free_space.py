@@ -17,6 +17,7 @@ from torch import Tensor
 from gscompleter.config import FreeSpaceConfig
 from gscompleter.geometry import compute_z_depths, project, shrink_camera, slide
 from gscompleter.guards import Guard
+from gscompleter.guards.removal import find_removed
 from gscompleter.sky import compute_sky_depth, is_sky_visible
 from gscompleter.stages.target_view import TargetView
 from gscompleter.types import Camera, Gaussians, Render
@@ -47,15 +48,25 @@ class FreeSpace(Guard):
             for frozen, camera in zip(view.at(state.views), cameras, strict=True)
         ]
         renders += [frozen.render for frozen in view.scenes.freeze_small(state.parts, small)]
+        cameras += small
         placed, is_placed = respect_free_space(
             candidates,
             view.camera.padded,
-            [*cameras, *small],
-            renders,
+            cameras,
+            [ignore_removed(*pair, view) for pair in zip(renders, cameras, strict=True)],
             state.config.registration.footprint,
             state.config.free_space,
         )
         return placed[is_placed]
+
+
+def ignore_removed(render: Render, camera: Camera, view: TargetView) -> Render:
+    """Observe nothing where something was removed: what stands behind it bounds no free space."""
+    source = view.state.source
+    if len(source.removed) == 0:
+        return render
+    removed = find_removed(source, camera, view.scenes.renderer)
+    return replace(render, alpha=render.alpha.where(~removed, 0.0))
 
 
 def respect_free_space(

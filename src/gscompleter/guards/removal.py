@@ -35,8 +35,13 @@ class Removal(Guard):
 
 def mask_removed(source: ContextScene, camera: Camera, renderer: Renderer) -> Bool[Tensor, "h w"]:
     """Mark the pixels that showed something removed, and their border."""
+    shown = find_removed(source, camera, renderer)
+    return dilate(shown, max(round(MARGIN * max(shown.shape)), 1))
+
+
+def find_removed(source: ContextScene, camera: Camera, renderer: Renderer) -> Bool[Tensor, "h w"]:
+    """Mark the pixels that showed something removed."""
     given, removed = source.gaussians, source.removed
     others = replace(given, opacities=given.opacities.masked_fill(source.chosen_mask, 0.0))
     values = torch.cat([torch.zeros_like(given.opacities), torch.ones_like(removed.opacities)])
-    weight = renderer.freeze(others, camera).extend(removed).splat(values)
-    return dilate(weight > MIN_WEIGHT, max(round(MARGIN * max(weight.shape)), 1))
+    return renderer.freeze(others, camera).extend(removed).splat(values) > MIN_WEIGHT
