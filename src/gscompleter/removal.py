@@ -13,7 +13,7 @@ from collections.abc import Sequence
 from dataclasses import replace
 
 import torch
-from jaxtyping import Bool, Int64
+from jaxtyping import Bool, Float, Int64
 from torch import Tensor
 
 from gscompleter.cleaning import exclude_needed, limit_errors
@@ -21,7 +21,7 @@ from gscompleter.errors import InputError
 from gscompleter.guards import prepare_guards
 from gscompleter.guards.psnr import meet_error_budgets, set_error_budgets
 from gscompleter.guards.removal import mask_removed
-from gscompleter.render import Renderer
+from gscompleter.render import FrozenScene, Renderer
 from gscompleter.render.cache import SceneRenderer
 from gscompleter.render.fit_colors import RELAXATION, fit_colors
 from gscompleter.splats.cutting import Region, cut
@@ -143,10 +143,14 @@ def find_outside(
     """Find the revealed Gaussians that photographs see outside of the hole as well."""
     scene, sums = merge([others, revealed]), torch.zeros_like(revealed.means)
     for view in views:
-        outside = view.valid_mask.to(sums)
-        layers = torch.stack([outside, 1 - outside, torch.zeros_like(outside)], dim=-1)
-        sums += renderer.freeze(scene, view.camera).backproject(layers)[len(others) :]
+        frozen = renderer.freeze(scene, view.camera)
+        sums += sum_in_mask(frozen, view.valid_mask.to(sums))[len(others) :]
     return sums[:, 0] > MIN_OUTSIDE * sums.sum(dim=1)
+
+
+def sum_in_mask(frozen: FrozenScene, inside: Float[Tensor, "h w"]) -> Float[Tensor, "n 3"]:
+    """Sum how much of each Gaussian is shown inside and outside of a mask; the third sum is 0."""
+    return frozen.backproject(torch.stack([inside, 1 - inside, torch.zeros_like(inside)], dim=-1))
 
 
 def fit_to_photographs(

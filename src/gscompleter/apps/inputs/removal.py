@@ -19,6 +19,7 @@ from gscompleter.errors import InputError, quote_value
 from gscompleter.geometry import quats_to_rotations
 from gscompleter.io.image import read_pixels
 from gscompleter.progress import track
+from gscompleter.removal import sum_in_mask
 from gscompleter.render import Renderer
 from gscompleter.splats.formats import load_splat
 from gscompleter.types import Camera, Gaussians
@@ -139,9 +140,8 @@ def find_in_masks(
         frame = photographs.frame(number)
         pixels = read_pixels(masks[number]).max(axis=-1)
         mask = undistort_and_resize(frame, pixels, frame.size(), resolution) >= WHITE
-        inside = torch.from_numpy(mask).to(sums)
-        layers = torch.stack([inside, 1 - inside, torch.zeros_like(inside)], dim=-1)
-        sums += renderer.freeze(scene, cameras[number]).backproject(layers)
+        frozen = renderer.freeze(scene, cameras[number])
+        sums += sum_in_mask(frozen, torch.from_numpy(mask).to(sums))
     return sums[:, 0] > sums[:, 1]
 
 

@@ -74,16 +74,11 @@ def halve_image(image: StereoImage) -> StereoImage:
     pixels = (rows[:, ::2] + rows[:, 1::2]) / 4
     K = image.K * np.array([[0.5], [0.5], [1.0]])
     ignored = None if image.ignore_mask is None else image.ignore_mask[::2, ::2]
-    given = np.pad(image.given, ((0, h % 2), (0, w % 2)))
-    nearest = np.maximum(given[::2], given[1::2])
-    return StereoImage(
-        pixels.astype(np.float32),
-        K,
-        image.rotation,
-        image.center,
-        np.maximum(nearest[:, ::2], nearest[:, 1::2]),
-        ignored,
-    )
+    padded = np.pad(image.given, ((0, h % 2), (0, w % 2)))
+    nearest = np.maximum(padded[::2], padded[1::2])
+    given = np.maximum(nearest[:, ::2], nearest[:, 1::2])
+    halved = pixels.astype(np.float32)
+    return replace(image, image=halved, K=K, given=given, ignore_mask=ignored)
 
 
 def halve_transform(transform: Transform) -> Transform:
