@@ -86,23 +86,12 @@ bench: $(VENV)/installed-test
 		$(BIN)/python $$script || exit 1; done
 	$(BIN)/python benchmarks/bench_inpaint.py $(CASES)
 
-# What needs a GPU, within nine minutes, into docs/gpu.md and docs/gpu.json. The venv takes the torch
-# of the machine where that sees the GPU, for it is large. gsplat compiles with the venv's ninja.
+# What needs a GPU, within nine minutes, into docs/gpu.md and docs/gpu.json. The torch of $(PYTHON) is
+# used where it sees the GPU. Without a network: bash benchmarks/fetch_gpu_wheels.sh, then carry .whl.
 GPU_VENV ?= .venv-gpu
 GPU_SECONDS ?= 530
 gpu:
-	@nvidia-smi -L 2>/dev/null | grep -q '^GPU' || { \
-		echo 'make gpu needs an NVIDIA GPU, and nvidia-smi finds none on this machine.' >&2; exit 2; }
-	@start=$$(date +%s) && timeout $(GPU_SECONDS) $(MAKE) --no-print-directory $(GPU_VENV)/installed && \
-		PYTHONPATH=src:tests/support:tests/render PATH="$(CURDIR)/$(GPU_VENV)/bin:$$PATH" $(GPU_VENV)/bin/python benchmarks/gpu.py \
-		--seconds $$(($(GPU_SECONDS) + start - $$(date +%s)))
-
-$(GPU_VENV)/installed: pyproject.toml
-	if $(PYTHON) -c 'import sys, torch; sys.exit(not torch.cuda.is_available())' 2>/dev/null; \
-		then $(PYTHON) -m venv --system-site-packages $(GPU_VENV); \
-		else $(PYTHON) -m venv $(GPU_VENV) && $(GPU_VENV)/bin/python -m pip install --quiet $(TORCH); fi
-	$(GPU_VENV)/bin/python -m pip install --quiet --disable-pip-version-check -e '.[cuda,test]'
-	touch $@
+	PYTHON=$(PYTHON) GPU_VENV=$(GPU_VENV) TORCH='$(TORCH)' bash benchmarks/gpu.sh --seconds $(GPU_SECONDS)
 
 $(VENV)/bin/python:
 	$(PYTHON) -c 'import sys; sys.exit(sys.version_info < (3, 10) and "gscompleter needs Python 3.10 or newer: make PYTHON=python3.11 ...")'

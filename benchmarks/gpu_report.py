@@ -1,6 +1,7 @@
 """Measurements in separate processes: a failure or timeout is a row, and the rest continues.
 
-Rows are written at once, so that a part that is stopped keeps what it measured.
+Rows are written at once, so that a part that is stopped keeps what it measured. The report is
+written after each part, so that a run that is stopped keeps its parts.
 """
 
 from __future__ import annotations
@@ -13,7 +14,8 @@ import subprocess
 import sys
 import time
 from collections.abc import Callable, Iterable, Iterator, Mapping
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, field
+from datetime import date
 from pathlib import Path
 from tempfile import TemporaryDirectory
 
@@ -61,6 +63,7 @@ class PartResult:
     title: str
     seconds: float
     rows: tuple[Row, ...]
+    date: str = field(default_factory=lambda: date.today().isoformat())
 
     @property
     def failed(self) -> bool:
@@ -75,6 +78,9 @@ class Options:
     """Folder of gpu.md and gpu.json."""
     only: tuple[str, ...] = ()
     """Names of parts; default: all."""
+    earlier: Path | None = None
+    """A gpu.json of the same machine: parts that are not measured now are taken from it, so that
+    several short runs make one report."""
 
 
 def main(parts: Mapping[str, Part], machine: Callable[[], dict[str, str]], about: str) -> None:
@@ -94,11 +100,32 @@ def main(parts: Mapping[str, Part], machine: Callable[[], dict[str, str]], about
     if unknown:
         raise SystemExit(f"There is no part {unknown[0]!r}; choose one of {', '.join(parts)}.")
     described = machine()
+    results = read_earlier(options.earlier, described)
     wanted = {name: p for name, p in parts.items() if not options.only or name in options.only}
-    found = measure_parts(wanted, Path(sys.argv[0]), options.seconds)
-    write_report(options.out, described, found)
-    if any(part.failed for part in found.values()):
+    for name, result in measure_parts(wanted, Path(sys.argv[0]), options.seconds):
+        results[name] = result
+        ordered = {name: results[name] for name in parts if name in results}
+        write_report(options.out, described, ordered)
+    if any(results[name].failed for name in wanted):
         raise SystemExit(1)
+
+
+def read_earlier(path: Path | None, machine: Mapping[str, str]) -> dict[str, PartResult]:
+    """Read the parts of an earlier report; exit if it is of another machine."""
+    if path is None:
+        return {}
+    content = json.loads(path.read_text())
+    differing = [
+        name for name in machine if name != "date" and content["machine"].get(name) != machine[name]
+    ]
+    if differing:
+        raise SystemExit(f"{path} is of another machine: its {differing[0]} differs; leave it out.")
+    return {
+        name: PartResult(
+            part["title"], part["seconds"], tuple(Row(**row) for row in part["rows"]), part["date"]
+        )
+        for name, part in content["parts"].items()
+    }
 
 
 def append(path: Path, rows: Iterable[Row]) -> None:
@@ -116,22 +143,25 @@ def try_rows(what: str, compute: Callable[[], Iterable[Row]]) -> Iterator[Row]:
         yield Row(what, note=f"{type(error).__name__}: {shorten(str(error))}", failed=True)
 
 
-def measure_parts(parts: Mapping[str, Part], script: Path, seconds: float) -> dict[str, PartResult]:
-    """Run the parts one after the other, within `seconds` in total."""
+def measure_parts(
+    parts: Mapping[str, Part], script: Path, seconds: float
+) -> Iterator[tuple[str, PartResult]]:
+    """Run the parts one after the other, within `seconds` in total, and yield each when it ends."""
     end = time.monotonic() + seconds
-    found: dict[str, PartResult] = {}
+    failed = {}
     for name, part in parts.items():
-        needed = None if part.needs is None else found.get(part.needs)
         left = min(part.limit, end - time.monotonic())
-        if needed is not None and needed.failed:
-            reason = f"left out, because '{needed.title}' failed"
+        if part.needs is not None and failed.get(part.needs):
+            reason = f"left out, because '{parts[part.needs].title}' failed"
         elif left <= 0:
             reason = f"left out, because the {seconds:.0f} s of all parts are over"
         else:
-            found[name] = measure_in_process(name, part, script, left)
+            result = measure_in_process(name, part, script, left)
+            failed[name] = result.failed
+            yield name, result
             continue
-        found[name] = PartResult(part.title, 0.0, (Row(part.title, note=reason, failed=True),))
-    return found
+        failed[name] = True
+        yield name, PartResult(part.title, 0.0, (Row(part.title, note=reason, failed=True),))
 
 
 def measure_in_process(name: str, part: Part, script: Path, limit: float) -> PartResult:
@@ -174,14 +204,33 @@ def shorten(text: str, most: int = 200) -> str:
 
 def write_report(folder: Path, machine: Mapping[str, str], found: Mapping[str, PartResult]) -> None:
     content = {"machine": machine, "parts": {name: asdict(part) for name, part in found.items()}}
-    (folder / "gpu.json").write_text(json.dumps(content, indent=2) + "\n")
-    (folder / "gpu.md").write_text(format_page(machine, found))
+    folder.mkdir(parents=True, exist_ok=True)
+    for name, text in (
+        ("gpu.json", json.dumps(content, indent=2) + "\n"),
+        ("gpu.md", format_page(machine, found)),
+    ):
+        draft = folder / f".{name}.draft"
+        draft.write_text(text)
+        draft.replace(folder / name)
 
 
 def format_page(machine: Mapping[str, str], found: Mapping[str, PartResult]) -> str:
-    lines = ["# On a GPU", "", "Written by `make gpu`; [gpu.json](gpu.json) holds the same.", ""]
+    lines = [
+        "# On a GPU",
+        "",
+        "Written by `make gpu`; [gpu.json](gpu.json) holds the same. Data are synthetic rooms and the",
+        "weights of networks are random: times and agreement are measured here, not the quality of",
+        "pictures.",
+        "",
+    ]
     lines += ["| | |", "|---|---|", *(f"| {key} | {value} |" for key, value in machine.items())]
     for part in found.values():
-        lines += ["", f"## {part.title} ({part.seconds:.0f} s)", "", "| | |", "|---|---|"]
+        lines += [
+            "",
+            f"## {part.title} ({part.date}, {part.seconds:.0f} s)",
+            "",
+            "| | |",
+            "|---|---|",
+        ]
         lines += [f"| {row.what} | {row.format()} |" for row in part.rows]
     return "\n".join(lines) + "\n"

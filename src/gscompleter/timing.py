@@ -8,11 +8,14 @@ from contextlib import contextmanager
 from contextvars import ContextVar
 
 import torch
+from torch.autograd.profiler import record_function
 
 from gscompleter.progress import stage
 
 STAGES = ("context", "generate", "lift", "register", "integrate")
 """Stages whose wall time every completion records."""
+STAGE_PREFIX = "gscompleter: "
+"""A profile of torch shows each stage as a range of this and its name."""
 
 _record: ContextVar[dict[str, float] | None] = ContextVar("record", default=None)
 """Seconds per stage of the innermost `record_seconds`; None inside a stage."""
@@ -36,11 +39,13 @@ def timed_stage(name: str) -> Iterator[None]:
     seconds, start = _record.get(), time.perf_counter()
     token = _record.set(None)
     try:
-        with stage(name):
+        with stage(name), record_function(STAGE_PREFIX + name):
             yield
     finally:
         _record.reset(token)
-        if torch.cuda.is_available():
+        # Only if something ran on a GPU: asking CUDA itself would start it, for half a second and
+        # half a gigabyte, even with `--device cpu`.
+        if torch.cuda.is_initialized():
             torch.cuda.synchronize()
         if seconds is not None:
             seconds[name] = seconds.get(name, 0.0) + time.perf_counter() - start

@@ -109,7 +109,8 @@ def test_a_part_that_is_none_is_refused(tmp_path):
 @pytest.mark.skipif(torch.cuda.is_available(), reason="there is a GPU")
 def test_without_a_gpu_one_sentence_says_so_and_nothing_is_written(tmp_path):
     command = [sys.executable, str(BENCHMARKS / "gpu.py"), "--out", str(tmp_path)]
-    paths = [str(BENCHMARKS.parent / name) for name in ("src", "tests/support", "tests/render")]
+    folders = ("src", "tests/support", "tests/render", "benchmarks")
+    paths = [str(BENCHMARKS.parent / name) for name in folders]
     done = subprocess.run(
         command, capture_output=True, text=True, check=False, env={"PYTHONPATH": ":".join(paths)}
     )
@@ -119,19 +120,54 @@ def test_without_a_gpu_one_sentence_says_so_and_nothing_is_written(tmp_path):
     assert list(tmp_path.iterdir()) == []
 
 
+def test_a_run_that_is_stopped_keeps_its_parts(tmp_path):
+    script = tmp_path / "script.py"
+    text = SCRIPT.format(benchmarks=str(BENCHMARKS))
+    script.write_text(text.replace('Part("Never ends", 3,', 'Part("Never ends", 300,'))
+    command = [sys.executable, str(script), "--out", str(tmp_path / "out")]
+    with subprocess.Popen([*command, "--only", "failing", "endless", "good"]) as process:
+        until = time.monotonic() + 60
+        while not (tmp_path / "out" / "gpu.json").exists() and time.monotonic() < until:
+            time.sleep(0.05)
+        process.kill()
+    parts = json.loads((tmp_path / "out" / "gpu.json").read_text())["parts"]
+    assert list(parts) == ["failing"]
+
+
+def test_parts_of_an_earlier_run_are_kept_if_it_was_on_the_same_machine(tmp_path):
+    (tmp_path / "first").mkdir()
+    (tmp_path / "second").mkdir()
+    call(tmp_path / "first", "--only", "good", "failing")
+    earlier = tmp_path / "first" / "gpu.json"
+    content = json.loads(earlier.read_text())
+    content["parts"]["good"]["date"] = "2026-01-01"
+    earlier.write_text(json.dumps(content))
+    done = call(tmp_path / "second", "--only", "several", "--earlier", str(earlier))
+    assert done.returncode == 1
+    parts = json.loads((tmp_path / "second" / "gpu.json").read_text())["parts"]
+    assert list(parts) == ["failing", "several", "good"]
+    assert parts["good"]["date"] == "2026-01-01"
+    earlier.write_text(json.dumps({**content, "machine": {"device": "another one"}}))
+    done = call(tmp_path / "second", "--only", "several", "--earlier", str(earlier))
+    assert "another machine: its device differs" in done.stderr
+
+
 def test_limits_leave_time_for_what_comes_after_the_build():
-    assert all(part.limit <= 270 for part in gpu.PARTS.values())
+    assert all(part.limit <= 200 for part in gpu.PARTS.values())
     assert {part.needs for part in gpu.PARTS.values()} == {"build", None}
 
 
-@pytest.mark.parametrize("part", ["build", "agreement", "renderer", "stages", "models"])
+@pytest.mark.parametrize(
+    "part", ["build", "agreement", "renderer", "stages", "profile", "baselines", "models"]
+)
 def test_every_part_gives_rows(part):
     rows = list(getattr(gpu, f"measure_{part}")(SMALL))
     assert rows
     assert [row for row in rows if row.failed or row.value is None] == []
     if part == "agreement":
-        assert max(row.value for row in rows if "image" in row.what) < 1e-2
-        assert max(row.value for row in rows if "gradients in sh" in row.what) < 1e-2
+        assert max(row.value for row in rows) < 1e-4
+    if part == "profile":
+        assert [row.value > 0 for row in rows] == [True] * 10
 
 
 def test_every_reconstructor_completes_a_room_and_one_that_fails_is_a_row(monkeypatch):
