@@ -218,9 +218,8 @@ def format_page(machine: Mapping[str, str], found: Mapping[str, PartResult]) -> 
     lines = [
         "# On a GPU",
         "",
-        "Written by `make gpu`; [gpu.json](gpu.json) holds the same. Data are synthetic rooms and the",
-        "weights of networks are random: times and agreement are measured here, not the quality of",
-        "pictures.",
+        "Written by `make gpu`; [gpu.json](gpu.json) holds the same. Data are synthetic rooms and",
+        "the weights of networks are random: times and agreement are measured here, not quality.",
         "",
     ]
     lines += ["| | |", "|---|---|", *(f"| {key} | {value} |" for key, value in machine.items())]
