@@ -53,8 +53,9 @@ def sample(
 ) -> Float[Tensor, "*shape c"]:
     """Sample `values` at pixel coordinates, `bilinear` or `nearest`, extending the border."""
     h, w, c = values.shape
-    size = torch.tensor([w, h], dtype=pixels.dtype, device=pixels.device)
-    grid = (pixels / size * 2 - 1).reshape(1, 1, -1, 2)
+    x, y = pixels.unbind(-1)
+    # Divided by numbers, since a tensor of the size would be copied to the GPU in each call.
+    grid = (torch.stack([x / w, y / h], dim=-1) * 2 - 1).reshape(1, 1, -1, 2)
     sampled = torch.nn.functional.grid_sample(
         values.permute(2, 0, 1)[None], grid, mode, padding_mode="border", align_corners=False
     )
@@ -92,7 +93,7 @@ def measure_rotation(a: Camera, b: Camera) -> float:
 
     The arctangent of sine and cosine is exact for small angles; the arccosine of the trace is not.
     """
-    relative = (a.c2w[:3, :3].T @ b.c2w[:3, :3]).double()
+    relative = (a.on_cpu.c2w[:3, :3].T @ b.on_cpu.c2w[:3, :3]).double()
     cos = (relative.trace() - 1) / 2
     skew = relative - relative.T
     axis = torch.stack([skew[2, 1], skew[0, 2], skew[1, 0]])
@@ -101,7 +102,7 @@ def measure_rotation(a: Camera, b: Camera) -> float:
 
 def measure_baseline(a: Camera, b: Camera) -> float:
     """Compute the distance between the camera centres, in scene units."""
-    return (a.center - b.center).norm().item()
+    return (a.on_cpu.center - b.on_cpu.center).norm().item()
 
 
 def pad_camera(camera: Camera, margin: float) -> PaddedCamera:
@@ -126,6 +127,8 @@ def pad_like(camera: Camera, padded: Camera) -> PaddedCamera:
 
 def is_same_camera(a: Camera, b: Camera) -> bool:
     """Return True if two cameras see the same image, up to float rounding."""
+    a = a.on_cpu
+    b = b.on_cpu
     extent = max(a.center.abs().max().item(), b.center.abs().max().item())
     return (
         (a.width, a.height) == (b.width, b.height)

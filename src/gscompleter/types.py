@@ -10,7 +10,8 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field, fields, replace
+from functools import cached_property
 from typing import Any, Literal, TypeVar
 
 import numpy as np
@@ -38,11 +39,15 @@ class TensorDataclass:
     """A value whose tensors all lie on one device."""
 
     def to(self: M, device: torch.device | str) -> M:
-        """Return a copy on `device`."""
-        parts = {
-            n: part for n, part in vars(self).items() if isinstance(part, (Tensor, TensorDataclass))
+        """Return a copy on `device`, or the value itself if it is there."""
+        parts = {field.name: getattr(self, field.name) for field in fields(self)}
+        moved = {
+            name: part.to(device)
+            for name, part in parts.items()
+            if isinstance(part, (Tensor, TensorDataclass))
         }
-        return replace(self, **{name: part.to(device) for name, part in parts.items()})
+        is_there = all(part is parts[name] for name, part in moved.items())
+        return self if is_there else replace(self, **moved)
 
 
 @dataclass(frozen=True)
@@ -78,10 +83,22 @@ class Camera(TensorDataclass):
         """Unit viewing direction (the z axis) in world coordinates."""
         return self.c2w[:3, 2]
 
-    @property
+    @cached_property
     def viewmat(self) -> Float[Tensor, "4 4"]:
-        """World-to-camera transform; only the rasterizers need it."""
-        return torch.linalg.inv(self.c2w.double()).to(self.c2w.dtype)
+        """World-to-camera transform; only the rasterizers need it.
+
+        `inv_ex` does not look for singular matrices, for which the host would wait for a GPU.
+        """
+        return torch.linalg.inv_ex(self.c2w.double()).inverse.to(self.c2w.dtype)
+
+    @property
+    def on_cpu(self) -> Camera:
+        """The camera on the CPU: its numbers are copied from a GPU once."""
+        return self if self.c2w.device.type == "cpu" else self._copy_on_cpu
+
+    @cached_property
+    def _copy_on_cpu(self) -> Camera:
+        return self.to("cpu")
 
     @property
     def near_plane(self) -> float:
@@ -94,7 +111,7 @@ class Camera(TensorDataclass):
         y = torch.arange(self.height, device=self.K.device, dtype=self.K.dtype) + 0.5
         pixels = torch.stack(torch.meshgrid(x, y, indexing="xy"), dim=-1)
         pixels = torch.nn.functional.pad(pixels, (0, 1), value=1.0)
-        return pixels @ torch.linalg.inv(self.K).T @ self.c2w[:3, :3].T
+        return pixels @ torch.linalg.inv_ex(self.K).inverse.T @ self.c2w[:3, :3].T
 
 
 def _find_planes_defect(near: float | None, far: float | None) -> str | None:

@@ -16,7 +16,8 @@ from torch import Tensor
 
 from gscompleter.geometry import is_inside
 from gscompleter.render.reference import Splats, composite, project
-from gscompleter.types import Camera, make_observed
+from gscompleter.render.spherical_harmonics import evaluate_sh_basis
+from gscompleter.types import Camera, make_observed, sh_from_rgb
 
 
 def rasterization(
@@ -31,18 +32,20 @@ def rasterization(
     height: int,
     near_plane: float,
     eps2d: float,
-    sh_degree: int,
+    sh_degree: None,
     packed: bool,
     render_mode: str,
     rasterize_mode: str,
 ) -> tuple[Tensor, Tensor, dict[str, Any]]:
-    """Rasterize for one camera: harmonics, colour and expected depth; rows keep their order."""
-    assert (eps2d, packed, render_mode) == (0.3, False, "RGB+ED")
+    """Rasterize for one camera: colour and expected depth; rows keep their order."""
+    assert (sh_degree, eps2d, packed, render_mode) == (None, 0.3, False, "RGB+ED")
     assert rasterize_mode in ("classic", "antialiased")
-    assert colors.shape == (len(means), (sh_degree + 1) ** 2, 3)
+    assert colors.shape == (len(means), 3)
     assert viewmats.shape == (1, 4, 4)
+    for values in (means, quats, scales, opacities, colors, viewmats, Ks):
+        assert values.dtype == torch.float32
     camera = Camera(torch.linalg.inv(viewmats[0]), Ks[0], width, height, near=100 * near_plane)
-    gaussians = make_observed(means, quats, scales, opacities, colors)
+    gaussians = make_observed(means, quats, scales, opacities, sh_from_rgb(colors))
     gaussians = replace(gaussians, is_antialiased=rasterize_mode == "antialiased")
     n = len(means)
     found = {
@@ -64,7 +67,9 @@ def rasterization(
         found["conics"][0, i] = own.precisions[0].flatten()[[0, 1, 3]]
         values[0, i] = torch.cat([own.colors[0], own.depths])
         found["opacities"][0, i] = own.opacities[0]
-    found["flatten_ids"] = found["radii"][0, :, 0].nonzero()[:, 0].to(torch.int32)
+    shown = found["radii"][0, :, 0].nonzero()[:, 0]
+    nearest_first = found["depths"][0, shown].argsort(stable=True)
+    found["flatten_ids"] = shown[nearest_first].to(torch.int32)
     tiles = (found["tile_size"], found["isect_offsets"], found["flatten_ids"])
     places = found["means2d"], found["conics"]
     seen = found["opacities"]
@@ -94,28 +99,66 @@ def rasterize_to_pixels(
     isect_offsets: Tensor,
     flatten_ids: Tensor,
 ) -> tuple[Tensor, Tensor]:
-    """Sum four channels by weight, and the weights, of the Gaussians in `flatten_ids`."""
+    """Sum channels by weight, and the weights, of the Gaussians in `flatten_ids`."""
     n = means2d.shape[1]
     assert means2d.shape == (1, n, 2)
     assert conics.shape == (1, n, 3)
-    assert colors.shape == (1, n, 4)
+    assert colors.shape[:2] == (1, n)
     assert opacities.shape == (1, n)
     assert isect_offsets.shape == (1, -(-image_height // tile_size), -(-image_width // tile_size))
-    ids = flatten_ids.long()
-    order = ids[colors[0, ids, 3].argsort(stable=True)]
+    order = flatten_ids.long()
     precisions = conics[0, order][:, [0, 1, 1, 2]].view(-1, 2, 2)
-    values = colors[0, order]
+    # The reference sums three channels and a fourth in place of the depth.
+    values = torch.nn.functional.pad(colors[0, order], (0, 4 - colors.shape[2]))
     splats = Splats(means2d[0, order], precisions, values[:, 3], opacities[0, order], values[:, :3])
     x, y = torch.arange(image_width) + 0.5, torch.arange(image_height) + 0.5
     pixels = torch.stack(torch.meshgrid(x, y, indexing="xy"), dim=-1).reshape(-1, 2)
     colour, depth, alpha = composite(splats, pixels)
     size = (1, image_height, image_width)
-    return torch.cat([colour, depth[:, None]], dim=-1).view(*size, 4), alpha.view(*size, 1)
+    sums = torch.cat([colour, depth[:, None]], dim=-1)[:, : colors.shape[2]]
+    return sums.view(*size, -1), alpha.view(*size, 1)
+
+
+def fully_fused_projection(
+    means: Tensor,
+    covars: None,
+    quats: Tensor,
+    scales: Tensor,
+    viewmats: Tensor,
+    Ks: Tensor,
+    width: int,
+    height: int,
+    eps2d: float,
+    near_plane: float,
+    opacities: Tensor,
+) -> tuple[Tensor, ...]:
+    """Return the radii of Gaussians in the image, and unset memory for all else."""
+    colors = torch.zeros_like(means)
+    _, _, found = rasterization(
+        means, quats, scales, opacities, colors, viewmats, Ks, width, height, near_plane, eps2d,
+        None, False, "RGB+ED", "classic",
+    )  # fmt: skip
+    unset = torch.full((1, len(means), 1), torch.nan)
+    return found["radii"], unset, unset, unset, unset
+
+
+def spherical_harmonics(degrees_to_use: int, dirs: Tensor, coeffs: Tensor) -> Tensor:
+    """Evaluate harmonics in directions of any length, without the offset of 3DGS."""
+    assert dirs.dtype == coeffs.dtype == torch.float32
+    assert coeffs.shape == (len(dirs), (degrees_to_use + 1) ** 2, 3)
+    basis = evaluate_sh_basis(torch.nn.functional.normalize(dirs, dim=-1), coeffs.shape[1])
+    return torch.einsum("nk,nkc->nc", basis, coeffs)
 
 
 def module() -> ModuleType:
     """Make a module named gsplat of it."""
     made = ModuleType("gsplat")
     made.__spec__ = ModuleSpec("gsplat", None)
-    made.rasterization, made.rasterize_to_pixels = rasterization, rasterize_to_pixels
+    for function in (
+        rasterization,
+        rasterize_to_pixels,
+        fully_fused_projection,
+        spherical_harmonics,
+    ):
+        setattr(made, function.__name__, function)
     return made

@@ -215,8 +215,10 @@ def compute_patch_difference(
     gain, offset = fit_robust_affine(sample(other.image, pixels)[visible], photo.image[visible])
     normalized = (gain * other.image + offset).clamp(0, 1)
     least = torch.ones_like(photo.image[..., 0])
-    for shift in product(range(-MAX_SHIFT, MAX_SHIFT + 1), repeat=2):
-        shown = sample(normalized, pixels + pixels.new_tensor(shift))
+    # One tensor of all shifts: each would be copied to the GPU by itself.
+    shifts = pixels.new_tensor(list(product(range(-MAX_SHIFT, MAX_SHIFT + 1), repeat=2)))
+    for shift in shifts:
+        shown = sample(normalized, pixels + shift)
         differs = (shown - photo.image).abs().amax(dim=-1)
         least = torch.minimum(least, average_box(differs, PATCH_RADIUS))
     return least

@@ -204,7 +204,8 @@ def render_check(check: Check, opacities: Float[Tensor, "n"]) -> CheckedRender:
     """Render a photograph and compare it with its error budgets."""
     variable, image = render_with_gradient(check.plan, opacities)
     clipped = image.detach().clamp(0, 1)
-    errors = [compute_pixel_errors(clipped, budget).sum().item() for budget in check.budgets]
+    sums = [compute_pixel_errors(clipped, budget).sum() for budget in check.budgets]
+    errors = torch.stack(sums).tolist()
     budgets = zip(check.budgets, errors, strict=True)
     worst, error = max(budgets, key=lambda pair: pair[1] / max(pair[0].limit, 1e-12))
     return CheckedRender(check, variable, image, worst, error - worst.limit)

@@ -70,5 +70,6 @@ class SceneRenderer:
 
 def make_camera_key(camera: Camera) -> Hashable:
     """Make a key that is equal for cameras with equal images."""
+    camera = camera.on_cpu
     numbers = (*camera.c2w.flatten().tolist(), *camera.K.flatten().tolist())
     return (*numbers, camera.width, camera.height, camera.near_plane)

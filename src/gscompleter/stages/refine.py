@@ -52,9 +52,12 @@ def refine(kept: Gaussians, reference: View, view: TargetView) -> Refined:
     return Refined(refined, plans, losses)
 
 
-def has_settled(losses: Sequence[float], rel_tol: float) -> bool:
+def has_settled(losses: Sequence[Float[Tensor, ""]], rel_tol: float) -> bool:
     """Return True if the relative decrease of the last step is at most `rel_tol`."""
-    return len(losses) > 1 and losses[-2] - losses[-1] <= rel_tol * losses[-2]
+    if len(losses) < 2:
+        return False
+    before, last = torch.stack([*losses[-2:]]).tolist()
+    return before - last <= rel_tol * before
 
 
 @use_one_torch_thread()
@@ -83,7 +86,7 @@ def refine_opacities(
     def opacities() -> Float[Tensor, "n"]:
         return parameters.sigmoid() if logit else parameters.clamp(0, 1)
 
-    losses = []
+    losses: list[Tensor] = []
     for _ in track(range(config.iterations), "Refining"):
         current = opacities()
         terms = [
@@ -91,8 +94,9 @@ def refine_opacities(
             for plan, view, weight in plans
         ]
         loss = torch.stack(terms).sum()
-        losses.append(loss.item())
+        losses.append(loss.detach())
         if config.rel_tol is not None and has_settled(losses, config.rel_tol):
             break
         optimizer.step(loss)
-    return replace(added, opacities=opacities().detach(), encoded=None), tuple(losses)
+    refined = replace(added, opacities=opacities().detach(), encoded=None)
+    return refined, tuple(torch.stack(losses).tolist())

@@ -171,9 +171,11 @@ def register_along_rays(
         moved = move_along_rays(coarse, parameters, reference.camera, config)
         loss = objective(moved, view.frozen, alone, renderer.render(moved, anchor))
         optimizer.step(loss, left)
-        losses.append(loss.item())
+        losses.append(loss.detach())
     with torch.no_grad():
-        return move_along_rays(coarse, parameters, reference.camera, config), tuple(losses)
+        moved = move_along_rays(coarse, parameters, reference.camera, config)
+    # Read together at the end: a GPU would have to finish each step before the next begins.
+    return moved, tuple(torch.stack(losses).tolist())
 
 
 def move_along_rays(
