@@ -22,6 +22,7 @@ from dataclasses import dataclass, replace
 from datetime import date
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
+from tempfile import TemporaryDirectory
 from typing import Any
 
 import torch
@@ -30,7 +31,7 @@ from torch.autograd import DeviceType
 import tiny_diffusion
 from bench_models import MODELS, load_model, measure_repeatedly
 from bench_pe_field import build_transformer
-from bench_render import measure_median_seconds
+from bench_render import measure_median_seconds, read_clock
 from gpu_report import Part, Row, main, shorten, try_rows
 from gscompleter import CompleterConfig, Gaussians, GSCompleter, View, load_renderer
 from gscompleter.evaluation.baselines.optimization import OptimizationConfig, optimize
@@ -47,7 +48,7 @@ from gscompleter.render import FrozenScene, Renderer
 from gscompleter.render.redraw import RedrawnScene
 from gscompleter.timing import STAGE_PREFIX, STAGES
 from gscompleter.types import Camera, GeneratorInput, merge
-from scenes import Room, camera_at, gaussians_of, view_of
+from scenes import Room, camera_at, gaussians_of, photographed, view_of
 
 ROOT = Path(__file__).resolve().parents[1]
 NETWORKS = MODELS[1:]
@@ -286,6 +287,48 @@ def measure_completions(bench: Bench) -> Iterator[Row]:
         yield from try_rows(name, lambda name=name: completed(name))
 
 
+def measure_commands(bench: Bench) -> Iterator[Row]:
+    """Run the command line on photographs of the room, each command in a process of its own.
+
+    The seconds are those of whole processes, with the start of Python and of CUDA.
+    """
+    size = bench.sizes[0]
+    cameras = [bench.make_camera(x, size, yaw) for x, yaw in ((-0.3, 0), (0.1, 0), (0.7, 12))]
+    with TemporaryDirectory() as folder:
+        room = photographed(Path(folder) / "room", cameras)
+        out = Path(folder) / "out"
+        given = Path(folder) / "of-a-splat"
+        commands = {
+            "complete": f"complete {room} --context 0 1 --target 2 --out {out}",
+            "complete --config paper": (
+                f"complete {room} --context 0 1 --target 2 --out {out}-paper --config paper"
+            ),
+            "complete --scene": (
+                f"complete {room} --scene {out}/context.ply --target 2 --out {given}"
+            ),
+            "remove": (
+                f"remove {room} --scene {out}/context.ply --sphere -0.1 0.9 2.6 0.6 "
+                f"--out {out}-removed"
+            ),
+            "clean": f"clean {room} --scene {out}/completed.ply --out {out}-cleaned",
+        }
+        for name, words in commands.items():
+            yield from try_rows(name, lambda n=name, w=words: run_command(bench, n, w))
+
+
+def run_command(bench: Bench, name: str, words: str) -> Iterator[Row]:
+    """Run a command of the package on the device of the bench."""
+    run = "from gscompleter.cli import run; run()"
+    command = [sys.executable, "-c", run, *words.split(), "--device", bench.device]
+    start = read_clock()
+    done = subprocess.run(command, capture_output=True, text=True, cwd=ROOT, check=False)
+    seconds = read_clock() - start
+    said = (done.stderr.strip() or done.stdout.strip() or "no output").splitlines()[-1]
+    yield Row(
+        name, seconds, "s", "" if done.returncode == 0 else shorten(said), done.returncode != 0
+    )
+
+
 def measure_models(bench: Bench) -> Iterator[Row]:
     """Measure two photographs through each network."""
     views = bench.make_views(bench.sizes[0])
@@ -477,6 +520,7 @@ PARTS = {
     "completions": Part(
         "A completion with every Ψ", 120, lambda: measure_completions(BENCH), needs="build"
     ),
+    "commands": Part("The command line", 120, lambda: measure_commands(BENCH), needs="build"),
     "models": Part("Ψ, two photographs at 256x256", 90, lambda: measure_models(BENCH)),
     "pe-field": Part("PE-Field, all of it", 120, lambda: measure_pe_field(BENCH), needs="build"),
     "baselines": Part("Methods of others", 60, lambda: measure_baselines(BENCH), needs="build"),

@@ -158,7 +158,8 @@ def test_limits_leave_time_for_what_comes_after_the_build():
 
 
 @pytest.mark.parametrize(
-    "part", ["build", "agreement", "renderer", "stages", "profile", "baselines", "models"]
+    "part",
+    ["build", "agreement", "renderer", "stages", "profile", "commands", "baselines", "models"],
 )
 def test_every_part_gives_rows(part):
     rows = list(getattr(gpu, f"measure_{part}")(SMALL))
