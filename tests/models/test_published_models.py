@@ -43,8 +43,6 @@ def test_every_listed_model_has_a_network_of_the_published_size(name):
         network = create_network(published)
     assert sum(p.numel() for p in network.parameters()) == published.parameters
     assert network.config.image_size == published.image_size
-    if published.near_far is not None:
-        assert (network.config.near, network.config.far) == published.near_far
 
 
 def test_published_models_are_reconstructors_and_those_of_depth_alone_are_not():

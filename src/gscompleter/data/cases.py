@@ -16,7 +16,12 @@ from typing import Any
 
 from gscompleter.data.ego_vehicle import attach_vehicle_detector
 from gscompleter.data.formats import FORMATS, detect_format, find_format, open_photographs
-from gscompleter.data.photographs import Photographs, Resolution, apply_masks
+from gscompleter.data.photographs import (
+    MAX_TRANSLATION,
+    Photographs,
+    Resolution,
+    apply_masks,
+)
 from gscompleter.errors import InputError, quote_value
 from gscompleter.io.reading import read_json
 from gscompleter.types import View
@@ -106,11 +111,16 @@ def open_clips(path: Path | str) -> Iterator[Photographs]:
 
 
 def filter_usable(
-    clips: Iterable[Photographs], skipped: list[SkippedScene]
+    clips: Iterable[Photographs],
+    skipped: list[SkippedScene],
+    max_translation: float | None = MAX_TRANSLATION,
 ) -> Iterator[Photographs]:
-    """Yield the scenes that benchmarks keep, and append the others to `skipped`."""
+    """Yield the scenes that benchmarks keep, and append the others to `skipped`.
+
+    `max_translation` is the largest camera coordinate, in scene units; None for any.
+    """
     for clip in clips:
-        reason = clip.find_skip_reason()
+        reason = clip.find_skip_reason(max_translation)
         if reason is None:
             yield clip
         else:

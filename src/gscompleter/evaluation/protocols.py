@@ -10,7 +10,7 @@ import json
 import os
 import re
 from collections.abc import Callable, Iterable, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import partial
 from pathlib import Path
 from typing import Annotated, Literal
@@ -40,6 +40,12 @@ class Split:
     targets: Annotated[Frames, Field(alias="target")]
     is_sequence: bool = False
     """True if all targets are completed into one scene, one after the other."""
+
+    def sort_frames(self) -> Split:
+        """Return the split with context and targets in ascending order."""
+        return replace(
+            self, context=tuple(sorted(self.context)), targets=tuple(sorted(self.targets))
+        )
 
 
 @dataclass(frozen=True)
@@ -186,6 +192,8 @@ class Task:
     load: Callable[[tuple[int, ...]], list[View]]
     neighbours: tuple[int, ...] = ()
     """Frames beside the target, for scoring only."""
+    keeps_order: bool = False
+    """True to give Ψ the context in this order, as a published index has it, instead of sorted."""
 
     @property
     def name(self) -> str:
@@ -205,8 +213,12 @@ def make_tasks(
     clip: Photographs,
     resolution: Resolution = None,
     use_masks: bool = False,
+    keeps_order: bool = False,
 ) -> list[Task]:
-    """Make the tasks of a clip: one per target, or one per sequence."""
+    """Make the tasks of a clip: one per target, or one per sequence.
+
+    With `keeps_order`, Ψ gets the context in the order of the split instead of sorted by frame.
+    """
     load = partial(load_clip_views, clip, resolution, use_masks)
     tasks = []
     for split in protocol.select_splits(clip):
@@ -217,11 +229,11 @@ def make_tasks(
                     f"has {len(clip)} frames; use the index of this data set."
                 )
         if split.is_sequence:
-            tasks.append(Task(clip.name, split.context, split.targets, load))
+            tasks.append(Task(clip.name, split.context, split.targets, load, (), keeps_order))
             continue
         for target in split.targets:
             beside = find_neighbours(target, split.context, len(clip))
-            tasks.append(Task(clip.name, split.context, (target,), load, beside))
+            tasks.append(Task(clip.name, split.context, (target,), load, beside, keeps_order))
     return tasks
 
 

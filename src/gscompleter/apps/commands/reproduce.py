@@ -16,10 +16,10 @@ from gscompleter.config.generators import GeneratorOptions
 from gscompleter.errors import InputError
 from gscompleter.evaluation.figures import draw_figure
 from gscompleter.evaluation.paper import (
-    DataSet,
     FigureSpec,
     Requirements,
     TableSpec,
+    get_data_set,
     load_paper,
     select_names,
 )
@@ -52,14 +52,10 @@ def run_evaluation(options: EvaluateOptions) -> None:
         run_methods(options)
 
 
-def get_preset(options: EvaluateOptions) -> DataSet:
-    """Return the preset of the options, or the defaults without one."""
-    return load_paper().data_sets[options.preset] if options.preset else DataSet()
-
-
 def apply_preset(options: EvaluateOptions) -> EvaluateOptions:
     """Set what is not given as the preset does, or as without one."""
-    preset, synthesis = get_preset(options), options.synthesis
+    preset = get_data_set(options.preset)
+    synthesis = options.synthesis
     if synthesis.generator == AUTO:
         synthesis = replace(synthesis, generator=preset.generator)
     return replace(
@@ -132,7 +128,7 @@ def choose_protocols(options: EvaluateOptions, spec: Requirements) -> tuple[str,
     if kinds:
         return tuple(p for p in options.protocol if p.split("-")[0] in kinds) or spec.protocol
     usual = [p for p in options.protocol if not p.startswith(UNUSUAL)]
-    return tuple(usual[:1]) or get_preset(options).protocol or ("",)
+    return tuple(usual[:1]) or get_data_set(options.preset).protocol or ("",)
 
 
 def make_run(
