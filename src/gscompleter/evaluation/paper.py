@@ -81,11 +81,18 @@ class Claim(Settings):
     """A claim that a method is better than another in a column of a table."""
 
     says: str
+    paper: str
+    """The paper's numbers, of the method after those of the baseline."""
     table: str
     column: str
     method: str
     baseline: str
     better: Literal["higher", "lower"]
+    """Direction in which the paper says that the method differs from the baseline."""
+    model: str | None = None
+    """Ψ that the claim is about; None for all."""
+    over_spans: bool = False
+    """True if the difference is said to grow from the first protocol of the table to the last."""
 
 
 @dataclass(frozen=True)

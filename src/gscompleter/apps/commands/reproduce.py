@@ -23,7 +23,8 @@ from gscompleter.evaluation.paper import (
     load_paper,
     select_names,
 )
-from gscompleter.evaluation.paper_tables import fill_table, judge_claims, write_paper_table
+from gscompleter.evaluation.claims import HEAD, tabulate_claims
+from gscompleter.evaluation.paper_tables import fill_table, write_paper_table
 from gscompleter.evaluation.store import make_file_name
 from gscompleter.evaluation.tables import format_markdown, write_tables
 from gscompleter.io.files import replace_file
@@ -161,8 +162,7 @@ def write_results(options: EvaluateOptions) -> str:
     parts = [f"# Results\n\n{', '.join(f'{key} {value}' for key, value in machine.items())}.\n"]
     tables = [out / TABLES / f"{name}.md" for name in paper.tables]
     parts += [path.read_text("utf-8") for path in tables if path.is_file()]
-    head = ["claim", "table", "measured", "verdict"]
-    judged = format_markdown(head, judge_claims(out / TABLES, paper.claims))
+    judged = format_markdown(HEAD, tabulate_claims(out / TABLES, paper.claims))
     parts.append(f"## Claims of the paper\n\n{judged}")
     for name, figure in paper.figures.items():
         if (out / FIGURES / f"{name}.png").is_file():
