@@ -16,8 +16,14 @@ import tiny_diffusion
 from chunk_files import example, save_chunk
 from command import run
 from gscompleter.apps.commands.options import EvaluateOptions, FigureName, TableName
-from gscompleter.apps.commands.reproduce import apply_preset, choose_protocols
+from gscompleter.apps.commands.reproduce import (
+    apply_preset,
+    assign_weights,
+    choose_protocols,
+    make_run,
+)
 from gscompleter.data.formats import open_photographs
+from gscompleter.errors import InputError
 from gscompleter.evaluation.baselines.reggs import RegGSConfig
 from gscompleter.evaluation.columns import BY_KEY
 from gscompleter.evaluation.figures import draw_outline, find_widest_hole
@@ -102,6 +108,39 @@ def test_a_preset_sets_what_is_not_given():
     assert (found.reconstructor, found.resolution) == (("plane-sweep",), 64)
     found = apply_preset(options())
     assert (found.reconstructor, found.synthesis.generator) == (("plane-sweep",), "warp-inpaint")
+
+
+@pytest.mark.parametrize(
+    ("weights", "assigned"),
+    [
+        ((), {}),
+        (("a.ckpt", "b.ckpt"), {"mvsplat-re10k": "a.ckpt", "volsplat-re10k": "b.ckpt"}),
+        (("mvsplat-re10k=re10k.ckpt",), {"mvsplat-re10k": "re10k.ckpt"}),
+        (("volsplat-re10k=x=1/b.ckpt",), {"volsplat-re10k": "x=1/b.ckpt"}),
+    ],
+)
+def test_weights_are_one_for_each_model_or_named(weights, assigned):
+    models = ("mvsplat-re10k", "volsplat-re10k")
+    found = assign_weights(models, [Path(path) for path in weights])
+    assert {name: str(path) for name, path in found.items()} == assigned
+
+
+@pytest.mark.parametrize(
+    "weights", [("a.ckpt",), ("a", "b", "c"), ("a", "mvsplat-re10k=b"), ("other=a.ckpt",)]
+)
+def test_weights_that_belong_to_no_model_are_refused(weights):
+    with pytest.raises(InputError, match="belongs to no reconstructor; give --weights one file"):
+        assign_weights(("mvsplat-re10k", "volsplat-re10k"), [Path(path) for path in weights])
+
+
+def test_each_run_of_table_i_gets_its_own_weights():
+    given = apply_preset(options(preset="re10k", weights=(Path("mvsplat-re10k=re10k.ckpt"),)))
+    runs = [make_run(given, PAPER.tables["models"], number, "n-30") for number in range(3)]
+    assert {run.reconstructor[0]: run.weights for run in runs} == {
+        "volsplat-re10k": (),
+        "mvsplat-re10k": (Path("re10k.ckpt"),),
+        "depthsplat-large-re10k": (),
+    }
 
 
 def test_a_table_takes_the_given_protocols_of_its_kind():

@@ -26,6 +26,8 @@ from gscompleter.io.files import replace_file
 from gscompleter.io.reading import read_json
 from gscompleter.types import View
 
+INDICES = Path(__file__).parent / "indices"
+"""Folder of the evaluation indices in the package; its README.md has the rule."""
 VERSION = 1
 """Version of the files that `write_evaluation_index` writes."""
 
@@ -100,10 +102,18 @@ def parse_protocol(text: str) -> EvaluationProtocol:
             return FrameRule(text, partial(split, **numbers))
     if os.path.isfile(text):
         return read_evaluation_index(Path(text))
+    if text in list_indices():
+        return read_evaluation_index(INDICES / f"{text}.json")
     raise InputError(
         f"There is no protocol '{quote_value(text)}'; give n-K for a number of frames K (as n-10), "
-        "stress or stress-K-TARGET, sequence-K (as sequence-4), or the path of an evaluation index."
+        "stress or stress-K-TARGET, sequence-K (as sequence-4), the path of an evaluation index, or "
+        f"the name of ours ({', '.join(list_indices())})."
     )
+
+
+def list_indices() -> list[str]:
+    """List the names of the evaluation indices in the package, as `dl3dv-n-10`."""
+    return sorted(path.stem for path in INDICES.glob("*.json"))
 
 
 def extrapolate(num_frames: int, k: int, stride: int | None = None) -> tuple[Split, ...]:
