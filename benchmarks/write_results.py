@@ -12,7 +12,7 @@ The comment names what is written:
     spans NAME COLUMN        a table with a row for each protocol
     claims                   the verdicts on the claims
     scores FILE COLUMN ...   means of `evaluate` of docs/results/FILE.json
-    cases FILE               the number of its cases
+    headline FILE ...        the three lines of the README, for each of these files
 """
 
 from __future__ import annotations
@@ -22,7 +22,6 @@ import json
 import re
 import shutil
 import sys
-from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -84,6 +83,12 @@ def fill_page(text: str) -> str:
 
     def fill(found: re.Match[str]) -> str:
         kind, *words = found["words"].split()
+        if (
+            kind in ("scores", "headline")
+            and read_scores(words[0]) is None
+            and found["body"].strip()
+        ):
+            return found[0]  # what stands there is of an evaluation whose output is not stored
         return f"{found[1]}\n{WRITERS[kind](*words).rstrip()}\n\n{found[4]}"
 
     return REGION.sub(fill, text)
@@ -130,7 +135,11 @@ def write_table(name: str, *columns: str) -> str:
 def write_spans(name: str, key: str) -> str:
     """Write a row for each protocol: both methods, the difference, and the number of cases."""
     table = read_table(name)
-    head = ["protocol", *dict.fromkeys(f"`{row['method']}`, ours" for row in table["rows"]), "cases"]
+    head = [
+        "protocol",
+        *dict.fromkeys(f"`{row['method']}`, ours" for row in table["rows"]),
+        "cases",
+    ]
     rows: dict[str, list[str]] = {}
     for row in table["rows"]:
         cell = row["cells"][key]
@@ -149,10 +158,9 @@ def write_claims() -> str:
 
 def write_scores(file: str, *columns: str) -> str:
     """Write the scores of an evaluation, a row for each method."""
-    path = STORED / f"{file}.json"
-    if not path.is_file():
+    content = read_scores(file)
+    if content is None:
         return NOT_MEASURED
-    content = json.loads(path.read_text("utf-8"))
     num_cases = len(content["common"])
 
     def format_score_cell(cell: dict[str, Any], key: str) -> str:
@@ -166,14 +174,40 @@ def write_scores(file: str, *columns: str) -> str:
     return format_markdown(["method", *(BY_KEY[key].title for key in columns)], rows)
 
 
-def write_cases(file: str) -> str:
-    """Write the number of cases of an evaluation."""
+def write_headline(*files: str) -> str:
+    """Write the lines of the README: target, photographs beside it, worst given photograph."""
+    lines = {
+        "psnr": "held-back photograph (target)",
+        "neighbours": "photographs beside it",
+        "context_change": "worst change of a given photograph",
+    }
+    methods = {"context": "before", "full": "gscompleter", "paper": "paper's settings"}
+    rows = []
+    for file in files:
+        content = read_scores(file)
+        if content is None:
+            rows.append([f"{name_scores(file)}: not measured yet", *["–"] * len(methods)])
+            continue
+        name = f"{name_scores(file)}, {len(content['common'])} cases"
+        for key, says in lines.items():
+            of = [content["methods"][method][key]["value"] for method in methods]
+            texts = [format_score(value, BY_KEY[key].digits) for value in of]
+            rows.append([f"{name}: {says}", *(["–", *texts[1:]] if "change" in key else texts)])
+    return format_markdown(["", *methods.values()], rows)
+
+
+def name_scores(file: str) -> str:
+    """Return the name of a set of cases in a sentence."""
+    return file.replace("_", "-")
+
+
+def read_scores(file: str) -> dict[str, Any] | None:
+    """Read the stored scores of an evaluation; None if it was not run yet."""
     path = STORED / f"{file}.json"
     if not path.is_file():
-        return NOT_MEASURED
-    names: Sequence[str] = json.loads(path.read_text("utf-8"))["common"]
-    scenes = {name.rpartition(" ")[0] for name in names}
-    return f"{len(names)} cases of {len(scenes)} scenes.\n"
+        return None
+    content: dict[str, Any] = json.loads(path.read_text("utf-8"))
+    return content
 
 
 WRITERS = {
@@ -181,7 +215,7 @@ WRITERS = {
     "spans": write_spans,
     "claims": write_claims,
     "scores": write_scores,
-    "cases": write_cases,
+    "headline": write_headline,
 }
 """Writers of a region, by the first word of its comment."""
 

@@ -53,7 +53,9 @@ def parse_value(text: str, name: str) -> Any:
     if name == "guards":
         return () if text == "none" else tuple(text.split(", "))
     # `none` is a name in `alignment.align_at`, and else no value.
-    named = {"true": True, "false": False} | ({} if name == "alignment.align_at" else {"none": None})
+    named = {"true": True, "false": False} | (
+        {} if name == "alignment.align_at" else {"none": None}
+    )
     return named[text] if text in named else yaml.safe_load(text)
 
 

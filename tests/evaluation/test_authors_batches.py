@@ -72,7 +72,9 @@ def normalize_intrinsics(view: View) -> torch.Tensor:
     return camera.K / camera.K.new_tensor([camera.width, camera.height, 1])[:, None]
 
 
-def check_fed(fed: Fed, stored: dict[str, Any], context: list[int], preset: str, model: str) -> None:
+def check_fed(
+    fed: Fed, stored: dict[str, Any], context: list[int], preset: str, model: str
+) -> None:
     """Compare context, targets and depth range of a task with the authors' batch."""
     for number, frame in enumerate(context):
         cameras = fed.cameras

@@ -12,9 +12,7 @@ from gscompleter.evaluation.paper_tables import SIGNIFICANCE
 
 def claim(**others: object) -> Claim:
     given = {"model": None, "over_spans": False, "table": "dof", "column": "abs_rel", **others}
-    return Claim(
-        "-", "2 → 1", method="paper", baseline="paper/no-da-rc", better="lower", **given
-    )
+    return Claim("-", "2 → 1", method="paper", baseline="paper/no-da-rc", better="lower", **given)
 
 
 def row(method: str, values: dict[str, float], column: str = "abs_rel", **where: str) -> dict:
@@ -105,7 +103,12 @@ def test_a_gain_that_widens_is_compared_within_scenes_between_spans(last, verdic
 
 def test_one_number_for_all_cases_has_no_test(tmp_path):
     rows = [
-        {"model": "x", "protocol": "", "method": method, "cells": {"fid": {"value": v, "cases": None}}}
+        {
+            "model": "x",
+            "protocol": "",
+            "method": method,
+            "cells": {"fid": {"value": v, "cases": None}},
+        }
         for method, v in (("paper", 60.95), ("context", 65.21))
     ]
     save(tmp_path, rows, "spans")

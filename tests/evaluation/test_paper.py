@@ -79,7 +79,9 @@ def test_the_standard_error_is_over_scenes():
 @pytest.mark.parametrize(("values", "p"), [((1, 2, 3), 0.0742), ((1, 2, 3, 4, 5), 0.0132)])
 def test_significance_is_by_t_with_one_degree_of_freedom_less_than_scenes(values, p):
     """Both are above two standard errors; p values are those of a table of Student's t."""
-    found = estimate_mean({f"{scene} 0>1": float(v) for scene, v in zip("abcde", values, strict=False)})
+    found = estimate_mean(
+        {f"{scene} 0>1": float(v) for scene, v in zip("abcde", values, strict=False)}
+    )
     assert found.degrees_of_freedom == len(values) - 1
     assert found.mean > 2 * found.error
     assert found.p_value == pytest.approx(p, abs=1e-4)

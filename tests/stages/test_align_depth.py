@@ -166,9 +166,7 @@ def test_the_paper_trusts_the_anchor_always():
         assert (affine.scale, affine.shift) == (1.2, 0.0)
 
 
-@pytest.mark.parametrize(
-    ("align_at", "scale"), [("anchor", 1.25), ("target", 0.8), ("none", 1.0)]
-)
+@pytest.mark.parametrize(("align_at", "scale"), [("anchor", 1.25), ("target", 0.8), ("none", 1.0)])
 def test_eq_8_compares_depths_at_the_anchor_and_its_ablation_at_the_target(align_at, scale):
     room = Room()
     target, anchor = camera_at(0.2, size=48), camera_at(-0.2, size=48)

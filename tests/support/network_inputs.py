@@ -82,8 +82,11 @@ def make_stand_in(network: nn.Module, recorded: Recorded) -> nn.Module:
     return made
 
 
-def record_networks(monkeypatch: pytest.MonkeyPatch) -> Recorded:
-    """Replace the networks of published weights by stand-ins, and record what they are fed."""
+def record_networks(monkeypatch: pytest.MonkeyPatch, keeps_going: bool = False) -> Recorded:
+    """Replace the networks of published weights by stand-ins, and record what they are fed.
+
+    Cases of `evaluate` end once their input is recorded, unless `keeps_going`.
+    """
     recorded = Recorded()
     create = build.create_network
     prepare = runner.prepare_task
@@ -105,5 +108,6 @@ def record_networks(monkeypatch: pytest.MonkeyPatch) -> Recorded:
     monkeypatch.setattr(build, "fetch", lambda *_: Path())
     monkeypatch.setattr(build, "read_state_dict", lambda *_: {})
     monkeypatch.setattr(build, "load_strictly", lambda *_: None)
-    monkeypatch.setattr(runner, "prepare_task", prepare_and_record)
+    if not keeps_going:
+        monkeypatch.setattr(runner, "prepare_task", prepare_and_record)
     return recorded

@@ -3,7 +3,8 @@
 A case has two or more context frames, a target frame whose photograph no stage sees, and frames
 beside the target ("neighbours"), which a flat billboard in front of the target cannot satisfy. A
 file of cases is JSON: `{"resolution": [h, w], "cases": [{"scene", "context", "target", "near",
-"far", "neighbours"}, ...]}`. Scene folders are relative to the file.
+"far", "neighbours"}, ...]}`. Scene folders are relative to the file, and may name variables of the
+environment (`$GSCOMPLETER_DATA/data/fox`).
 """
 
 from __future__ import annotations
@@ -71,7 +72,7 @@ def read_cases(path: Path) -> list[Case]:
 
 def _parse_case(row: Any, resolution: tuple[int, int], path: Path) -> Case:
     return Case(
-        path.parent / row["scene"],
+        path.parent / os.path.expandvars(row["scene"]),
         tuple(map(_check_whole, row["context"])),
         _check_whole(row["target"]),
         tuple(map(_check_whole, row.get("neighbours", ()))),

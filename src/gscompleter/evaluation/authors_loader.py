@@ -50,7 +50,9 @@ class AuthorsLoader(Settings):
             # In the world of the file: the origin of `clip` moves for remote cameras.
             highest = float(clip.frame(number).c2w[:3, 3].max())
             if self.max_coordinate is not None and highest > self.max_coordinate:
-                return f"frame {number}: its coordinate {highest:g} is above {self.max_coordinate:g}"
+                return (
+                    f"frame {number}: its coordinate {highest:g} is above {self.max_coordinate:g}"
+                )
         return None
 
     def choose_splits(
