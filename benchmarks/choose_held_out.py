@@ -1,16 +1,16 @@
-"""Write held_out.json: cases on which no setting was chosen, by a rule that leaves nothing to choose.
+"""Write held_out.json: cases on which no setting was chosen, by a rule that leaves no choice.
 
     GSCOMPLETER_DATA=DIR python benchmarks/choose_held_out.py
 
 Frames: a case is two context frames n, n + g and the target n + 2 g, or the same backwards, as the
 development cases of DIR/data/cases.json. g is the median gap of the scene's development cases, so
-that held-out ones are as hard. No frame of a case, and no photograph beside its target, belongs to a
+that held-out ones are as hard. No frame of a case, and no photograph beside its target, is in a
 development case, and its target is in no measurement of the documentation (`MEASURED`). Of what is
 left, the SHA-256 of "SCENE CONTEXT TARGET" decides: the smallest come first, up to three for each
 scene, none with a frame of another.
 
-Scenes kept apart: the two with the smallest SHA-256 of their name. From now on nothing is decided on
-them, neither on their development cases nor on other frames.
+Scenes kept apart: the two with the smallest SHA-256 of their name. From now on nothing is decided
+on them, neither on their development cases nor on other frames.
 """
 
 from __future__ import annotations

@@ -3,9 +3,9 @@
     python benchmarks/write_results.py [--reproduced OUT] [--held-out OUT] [--check]
 
 `make reproduce` and `make held-out` make the two outputs. Tables and scores are copied to
-docs/results, and what stands between `<!-- ours: ... -->` and `<!-- end -->` in the pages is written
-from there, beside the numbers of the paper (paper_values.yaml). Nobody types a figure. With --check
-nothing is written; the exit code is 1 if a page differs from the stored outputs.
+docs/results, and what stands between `<!-- ours: ... -->` and `<!-- end -->` in the pages is
+written from there, beside the numbers of the paper (paper_values.yaml). Nobody types a figure. With
+--check nothing is written; the exit code is 1 if a page differs from the stored outputs.
 
 The comment names what is written:
     table NAME COLUMN ...    a table of the paper, a row for each method

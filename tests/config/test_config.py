@@ -24,7 +24,6 @@ from gscompleter.errors import InputError
 from gscompleter.evaluation.methods import METHODS
 from paths import ROOT
 
-
 OTHER_STEPS = (
     "recolor", "trust_settings", "dynamic_masks", "depth_agreement", "free_space", "psnr_guard",
     "next_best_view",

@@ -74,7 +74,7 @@ def test_cases_of_one_scene_count_once(tmp_path):
 
 def test_a_claim_about_one_model_leaves_the_others_out(tmp_path):
     cases = {"a 0>1": 1.0, "b 0>1": 1.0}
-    better = {case: 0.5 for case in cases}
+    better = dict.fromkeys(cases, 0.5)
     rows = [row("paper", better, model="x"), row("paper/no-da-rc", cases, model="x")]
     save(tmp_path, rows)
     assert judge_claim(tmp_path, claim(model="x")).in_favour == "2 of 2"

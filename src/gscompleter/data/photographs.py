@@ -143,11 +143,9 @@ class Photographs:
         framing = compute_framing(*size, resolution)
         final = pinhole.resize(*framing.scaled_size).crop(*framing.corner, *framing.size)
         if isinstance(resolution, AuthorsCrop):
-            center = {
-                "cx": pinhole.cx / pinhole.width * final.width,
-                "cy": pinhole.cy / pinhole.height * final.height,
-            }
-            final = replace(final, **center)
+            cx = pinhole.cx / pinhole.width * final.width
+            cy = pinhole.cy / pinhole.height * final.height
+            final = replace(final, cx=cx, cy=cy)
         c2w = frame.c2w.copy()
         c2w[:3, 3] -= self.origin  # before rounding to float32
         pose = torch.from_numpy(c2w).float()
@@ -277,7 +275,7 @@ def compute_framing(width: int, height: int, resolution: Resolution) -> Framing:
         if width < new_width or height < new_height:
             raise InputError(
                 f"An image of {width} × {height} pixels is smaller than its crop of {new_width} × "
-                f"{new_height}; give a smaller --resolution."
+                f"{new_height}; choose a smaller resolution."
             )
     else:
         scale = max(new_height / height, new_width / width)

@@ -45,7 +45,7 @@ class AuthorsLoader(Settings):
                 needed = f"{self.image_size[1]} × {self.image_size[0]}"
                 return (
                     f"frame {number}: its {width} × {height} pixels are not the {needed} of this "
-                    "data set (--resolution takes any)"
+                    "data set (another resolution takes any)"
                 )
             # In the world of the file: the origin of `clip` moves for remote cameras.
             highest = float(clip.frame(number).c2w[:3, 3].max())
@@ -60,11 +60,15 @@ class AuthorsLoader(Settings):
     ) -> EvaluationProtocol:
         """Return the splits of a clip that the authors' code keeps, and append to `skipped`."""
         kept: list[Split] = []
+        reasons: list[str] = []
         for split in protocol.select_splits(clip):
             frames = [frame for frame in (*split.context, *split.targets) if frame < len(clip)]
             reason = self.find_skip_reason(clip, frames)
             if reason is None:
                 kept.append(split.sort_frames() if self.sorts_frames else split)
             else:
-                skipped.append(SkippedScene(clip.name, reason))
+                reasons.append(reason)
+        if reasons:  # one line for a scene, which has the same defect in all of its cases
+            count = f" (and {len(reasons) - 1} more cases)" if len(reasons) > 1 else ""
+            skipped.append(SkippedScene(clip.name, reasons[0] + count))
         return EvaluationIndex(protocol.name, {clip.name: tuple(kept)})

@@ -106,8 +106,8 @@ def parse_protocol(text: str) -> EvaluationProtocol:
         return read_evaluation_index(INDICES / f"{text}.json")
     raise InputError(
         f"There is no protocol '{quote_value(text)}'; give n-K for a number of frames K (as n-10), "
-        "stress or stress-K-TARGET, sequence-K (as sequence-4), the path of an evaluation index, or "
-        f"the name of ours ({', '.join(list_indices())})."
+        "stress or stress-K-TARGET, sequence-K (as sequence-4), the path of an evaluation index, "
+        f"or the name of ours ({', '.join(list_indices())})."
     )
 
 

@@ -15,6 +15,7 @@ from gscompleter.apps.commands.evaluate import run_methods, score_methods
 from gscompleter.apps.commands.options import AUTO, EvaluateOptions
 from gscompleter.config.generators import GeneratorOptions
 from gscompleter.errors import InputError, quote_value
+from gscompleter.evaluation.claims import HEAD, tabulate_claims
 from gscompleter.evaluation.figures import draw_figure
 from gscompleter.evaluation.paper import (
     FigureSpec,
@@ -24,7 +25,6 @@ from gscompleter.evaluation.paper import (
     load_paper,
     select_names,
 )
-from gscompleter.evaluation.claims import HEAD, tabulate_claims
 from gscompleter.evaluation.paper_tables import fill_table, write_paper_table
 from gscompleter.evaluation.protocols import list_indices
 from gscompleter.evaluation.store import make_file_name
@@ -68,8 +68,8 @@ def assign_weights(models: Sequence[str], weights: Sequence[Path]) -> dict[str, 
             plain.append(given)
     if plain and (named or len(plain) != len(models)):
         raise InputError(
-            f"{quote_value(plain[0])} belongs to no reconstructor; give --weights one file for each "
-            f"of {', '.join(models)} in this order, or {models[0]}=FILE for some of them."
+            f"{quote_value(plain[0])} belongs to no reconstructor; give --weights one file for "
+            f"each of {', '.join(models)} in this order, or {models[0]}=FILE for some of them."
         )
     return named or dict(zip(models, plain, strict=False))
 
