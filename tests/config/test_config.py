@@ -1,9 +1,14 @@
 """Settings by name and from YAML."""
 
+import re
+from collections.abc import Mapping
+from dataclasses import asdict
 from operator import attrgetter
 from pathlib import Path
+from typing import Any
 
 import pytest
+import yaml
 
 from gscompleter.config import (
     ABLATIONS,
@@ -16,30 +21,79 @@ from gscompleter.config import (
 )
 from gscompleter.config.settings import RENAMED, validate
 from gscompleter.errors import InputError
+from gscompleter.evaluation.methods import METHODS
+from paths import ROOT
+
+OTHER_STEPS = (
+    "recolor", "trust_settings", "dynamic_masks", "depth_agreement", "free_space", "psnr_guard",
+    "next_best_view",
+)  # fmt: skip
+"""Settings of steps that the paper does not have."""
 
 
-def test_the_papers_numbers():
-    paper = CompleterConfig.paper()
-    assert paper.anchor.max_rotation == 45
-    assert (paper.registration.iterations, paper.registration.learning_rate) == (50, 0.01)
-    weights = paper.registration
-    assert (weights.depth_weight, weights.stereo_weight, weights.rgb_weight) == (1, 1, 0.1)
-    assert (paper.registration.lr_unit, paper.registration.footprint) == ("scene", "fixed")
-    assert not paper.registration.mask_occluded
-    assert (paper.holes.max_alpha, paper.holes.dilation) == (0.5, 0)
-    assert get_named_config("paper/dilation").holes.dilation == 3
-    assert (paper.refine.iterations, paper.refine.learning_rate) == (30, 0.08)
-    assert (paper.refine.target_weight, paper.refine.num_views) == (0.1, 2)
-    assert paper.guards == ()
-    assert not paper.registration.mask_sky
-    assert paper.registration.min_ratio is None
-    assert paper.anchor.min_baseline == 0
-    assert (paper.synthesis.correct_color, paper.synthesis.source_depth) == (False, "monocular")
+def flatten(values: Mapping[str, Any], prefix: str = "") -> dict[str, Any]:
+    """List settings by their full names."""
+    flat: dict[str, Any] = {}
+    for name, value in values.items():
+        is_group = isinstance(value, dict)
+        flat |= flatten(value, f"{prefix}{name}.") if is_group else {prefix + name: value}
+    return flat
 
 
-@pytest.mark.parametrize("name", [n for n in ABLATIONS if n not in ("no-dilation", "theta-45")])
-def test_every_ablation_changes_something_of_the_paper(name):
-    assert get_named_config(f"paper/{name}") != CompleterConfig.paper()
+def read_table(heading: str) -> list[list[str]]:
+    """Read the rows of the table below a heading of docs/paper.md."""
+    section = (ROOT / "docs" / "paper.md").read_text("utf-8").split(f"\n## {heading}\n")[1]
+    lines = [line for line in section.split("\n## ")[0].splitlines() if line.startswith("|")]
+    return [[cell.strip() for cell in line.strip("|").split("|")] for line in lines[2:]]
+
+
+def parse_value(text: str, name: str) -> Any:
+    """Parse a value as the table writes it."""
+    if name == "guards":
+        return () if text == "none" else tuple(text.split(", "))
+    # `none` is a name in `alignment.align_at`, and else no value.
+    named = {"true": True, "false": False} | (
+        {} if name == "alignment.align_at" else {"none": None}
+    )
+    return named[text] if text in named else yaml.safe_load(text)
+
+
+def parse_changes(text: str) -> dict[str, Any]:
+    """Parse `name` value, `name` value, ...."""
+    pairs = re.findall(r"`([a-z_.]+)` ([^,]+)", text)
+    return {name: parse_value(value.strip(), name) for name, value in pairs}
+
+
+@pytest.mark.parametrize(("column", "config"), [(1, "paper"), (2, "default")])
+def test_every_setting_is_that_of_the_table_in_the_documentation(column, config):
+    rows = read_table("Settings")
+    names = [row[0].strip("`") for row in rows]
+    written = {n: parse_value(row[column], n) for n, row in zip(names, rows, strict=True)}
+    settings = flatten(asdict(get_named_config(config)))
+    assert len(names) == len(written)
+    assert written == {n: v for n, v in settings.items() if n.split(".")[0] not in OTHER_STEPS}
+
+
+def test_settings_of_other_steps_are_the_same_in_the_paper():
+    for group in OTHER_STEPS:
+        assert getattr(CompleterConfig.paper(), group) == getattr(CompleterConfig(), group)
+
+
+@pytest.mark.parametrize("base", ["paper", "default"])
+@pytest.mark.parametrize("name", ABLATIONS)
+def test_every_ablation_changes_what_the_documentation_says_and_no_more(name, base):
+    changes = {row[0].strip("`"): parse_changes(row[2]) for row in read_table("Ablations")}
+    expected = flatten(asdict(get_named_config(base))) | changes[name]
+    if name == "no-mv":
+        expected["guards"] = tuple(guard for guard in expected["guards"] if guard != "psnr")
+    assert flatten(asdict(get_named_config(f"{base}/{name}"))) == expected
+    assert set(changes) == set(ABLATIONS)
+
+
+def test_methods_of_an_evaluation_are_the_ablations_by_their_names():
+    for name in ABLATIONS:
+        method = "unconstrained" if name == "3-dof" else name
+        assert {method, f"paper/{method}"} <= set(METHODS)
 
 
 def test_without_anything_is_without_each():

@@ -22,9 +22,10 @@ from chunk_files import (
 from gscompleter import InputError
 from gscompleter.data.cases import SkippedScene, filter_usable, open_clips
 from gscompleter.data.formats import open_photographs
-from gscompleter.data.photographs import Photographs
+from gscompleter.data.photographs import AuthorsCrop, Photographs
 from gscompleter.data.real_estate import open_chunks, read_camera_file
 from gscompleter.geometry import project
+from gscompleter.types import View
 
 
 def test_a_chunk_gives_back_the_views_it_was_made_of(tmp_path):
@@ -108,6 +109,37 @@ def test_re10k_photographs_become_256_pixels_as_in_the_papers(tmp_path):
     # 360 x 640 becomes 256 x 455, of which 99 columns on the left are cropped.
     K = torch.tensor([[0.5 * 455, 0, 227.5 - 99], [0, 0.9 * 256, 128], [0, 0, 1]])
     assert torch.allclose(view.camera.K, K)
+
+
+def crop_wide(tmp_path: Path, crop: AuthorsCrop, height: int, width: int) -> View:
+    """Crop a photograph of this size whose principal point is not central."""
+    columns = np.tile(np.arange(width, dtype=np.uint8), (height, 1))
+    one = example()
+    one["images"] = [as_tensor(file_bytes(np.stack([columns] * 3, axis=-1)))] * 5
+    one["cameras"][:, :4] = torch.tensor([0.5, 0.9, 0.47, 0.52])
+    (clip,) = open_chunks(save_chunk(tmp_path / "000000.torch", one))
+    (view,) = clip.views([0], crop)
+    return view
+
+
+def test_the_authors_crop_keeps_the_principal_point_as_a_fraction(tmp_path):
+    """36 x 64 becomes 26 x 46, of which 20 columns are cut."""
+    camera = crop_wide(tmp_path, AuthorsCrop(26, 26, is_resized=True), 36, 64).camera
+    K = torch.tensor([[0.5 * 46, 0, 0.47 * 26], [0, 0.9 * 26, 0.52 * 26], [0, 0, 1]])
+    assert torch.allclose(camera.K, K)
+
+
+def test_the_authors_crop_of_dl3dv_resizes_nothing(tmp_path):
+    """Of 27 x 48, 11 x 32 in the middle are left as they are: eight rows and eight columns."""
+    view = crop_wide(tmp_path, AuthorsCrop(11, 32, is_resized=False), 27, 48)
+    K = torch.tensor([[0.5 * 48, 0, 0.47 * 32], [0, 0.9 * 27, 0.52 * 11], [0, 0, 1]])
+    assert torch.allclose(view.camera.K, K)
+    assert pixels_of(view)[5, :, 0].tolist() == list(range(8, 40))
+
+
+def test_an_image_smaller_than_the_authors_crop_is_refused(tmp_path):
+    with pytest.raises(InputError, match="48 × 27 pixels is smaller than its crop of 64 × 16"):
+        crop_wide(tmp_path, AuthorsCrop(16, 64, is_resized=False), 27, 48)
 
 
 @pytest.mark.parametrize("inside", ["", "test", "test/000000.torch"])

@@ -401,6 +401,21 @@ def test_all_that_was_lifted_is_compared_with_what_the_target_sees_of_the_contex
         assert (found.f_score > 0.95) == (factor == 1.0)
 
 
+@pytest.mark.parametrize("measure", [measure_alignment, measure_primitive_alignment])
+@pytest.mark.parametrize(("share", "f_score"), [(0.045, 1.0), (0.055, 0.0), (0.09, 0.0)])
+def test_a_wall_that_is_moved_back_is_at_its_distance_and_matches_within_5_percent(
+    measure, share, f_score
+):
+    """Chamfer is the mean of both directions, so that it is the shift itself, over the depth."""
+    view = view_of(Room(), TARGET)
+    wall = gaussians_of(view, torch.full_like(view.depth, 4.0))
+    moved = replace(wall, means=wall.means + 4.0 * share * TARGET.forward)
+    found = measure(moved, wall, TARGET, RENDERER)
+    assert found.chamfer == pytest.approx(share, rel=1e-3)
+    assert found.abs_rel == pytest.approx(share, rel=1e-2)
+    assert found.f_score == f_score
+
+
 def test_primitives_with_gaps_between_them_are_measured_like_all():
     """Renders of thinned Gaussians cover less and are measured over less."""
     context, view = room_context(), view_of(Room(), TARGET)

@@ -13,16 +13,20 @@ from gscompleter.data.formats import open_photographs
 from gscompleter.data.photographs import Photographs
 from gscompleter.data.real_estate import open_chunks
 from gscompleter.evaluation.protocols import (
+    INDICES,
     EvaluationIndex,
     Split,
     build_index,
     find_neighbours,
+    list_indices,
     make_tasks,
     parse_protocol,
     read_evaluation_index,
     write_evaluation_index,
 )
 from gscompleter.types import View
+
+README = (INDICES / "README.md").read_text("utf-8")
 
 
 class Frames(Photographs):
@@ -83,6 +87,44 @@ def test_what_is_no_protocol_is_told_what_would_be_one(text):
 def test_an_extrapolation_over_nothing_is_refused(text):
     with pytest.raises(InputError, match="at least 1"):
         parse_protocol(text)
+
+
+@pytest.mark.parametrize(
+    ("name", "num_scenes", "split"),
+    [
+        ("re10k-n-30", 5387, Split((0, 30), (60,))),
+        ("acid-n-30", 1343, Split((0, 30), (60,))),
+        ("dl3dv-n-10", 140, Split((0, 10), (20,))),
+        ("dl3dv-n-20", 140, Split((0, 20), (40,))),
+        ("dl3dv-n-30", 140, Split((0, 30), (60,))),
+        ("dl3dv-stress", 140, Split((0, 30), (99,))),
+    ],
+)
+def test_our_indices_are_the_first_case_of_the_rule_in_every_scene(name, num_scenes, split):
+    index = parse_protocol(name)
+    assert name in list_indices()
+    assert (index.name, len(index.scenes)) == (name, num_scenes)
+    assert set(index.scenes.values()) == {(split,)}
+    rule = parse_protocol(name.partition("-")[2])
+    assert rule.split(1 + split.targets[0])[0] == split
+    line = next(line for line in README.splitlines() if line.startswith(f"| `{name}.json`"))
+    cells = [cell.strip() for cell in line.strip("|").split("|")]
+    assert cells[1:4] == ["0, " + str(split.context[1]), str(split.targets[0]), str(num_scenes)]
+
+
+def test_scenes_of_one_data_set_are_the_same_in_all_of_our_indices():
+    scenes = [set(parse_protocol(name).scenes) for name in list_indices() if "dl3dv" in name]
+    assert all(of == scenes[0] for of in scenes)
+
+
+def test_scenes_of_our_indices_are_long_enough_by_the_published_ones(shared):
+    """Frames that the published indices of interpolation name do exist."""
+    for name in ("re10k", "acid"):
+        file = shared / "formats" / "evaluation_index" / f"evaluation_index_{name}.json"
+        published = json.loads(file.read_text())
+        for scene in parse_protocol(f"{name}-n-30").scenes:
+            split = published[scene]
+            assert max(*split["context"], *split["target"]) >= 60
 
 
 def test_neighbours_exist_and_are_not_context():

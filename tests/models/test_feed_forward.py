@@ -430,7 +430,7 @@ def test_gaussians_belong_to_pixels_of_the_whole_image(name, coefficients):
 
 def test_depth_of_mvsplat_is_a_distance_and_depth_of_depthsplat_is_z():
     views = [off_centre(x, 64, 64) for x in (-0.2, 0.2)]
-    images, cameras, _ = create_batch(views, 16, 1.0, 100.0)
+    images, cameras, _ = create_batch(views, 16)
     for name in NETWORKS:
         with torch.no_grad():
             predicted = network(name)(images, cameras)
@@ -443,7 +443,7 @@ def test_depth_of_mvsplat_is_a_distance_and_depth_of_depthsplat_is_z():
 
 def test_cameras_without_a_depth_range_take_that_of_the_model():
     known, unknown = off_centre(0, 64, 64), off_centre(0.2, 64, 64, near=None, far=None)
-    _, cameras, _ = create_batch([known, unknown], 16, 1.0, 100.0)
+    _, cameras, _ = create_batch([known, unknown], 16, (1.0, 100.0))
     assert cameras.near.tolist() == [[0.5, 1.0]]
     assert cameras.far.tolist() == [[20.0, 100.0]]
 

@@ -1,6 +1,7 @@
 """Reconstructors by published names, with random tensors in place of the published weights."""
 
 import json
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
@@ -12,6 +13,7 @@ from gscompleter.models.feed_forward import FeedForward, MVSplat
 from gscompleter.models.feed_forward.build import build, create_network
 from gscompleter.models.weights import PUBLISHED
 from gscompleter.reconstructors import list_reconstructors
+from network_inputs import record_networks
 from scenes import Room, camera_at, photographed, view_of
 
 SIZE = 64
@@ -43,8 +45,6 @@ def test_every_listed_model_has_a_network_of_the_published_size(name):
         network = create_network(published)
     assert sum(p.numel() for p in network.parameters()) == published.parameters
     assert network.config.image_size == published.image_size
-    if published.near_far is not None:
-        assert (network.config.near, network.config.far) == published.near_far
 
 
 def test_published_models_are_reconstructors_and_those_of_depth_alone_are_not():
@@ -90,3 +90,76 @@ def test_a_completion_with_random_weights_runs_end_to_end(mvsplat_file, tmp_path
     assert summary["settings"]["weights"] == str(mvsplat_file)
     assert summary["gaussians"]["context"] == 2 * SIZE * SIZE
     assert summary["targets"][0]["anchor"] in (0, 1)
+
+
+RANGED = [name for name in list_reconstructors() if name in PUBLISHED and PUBLISHED[name].near_far]
+
+
+@pytest.fixture
+def recorded(monkeypatch):
+    return record_networks(monkeypatch, keeps_going=True)
+
+
+@pytest.fixture(scope="module")
+def rooms(tmp_path_factory) -> Path:
+    cameras = [camera_at(x, size=SIZE) for x in (-0.3, 0.1, 0.6)]
+    cameras = [replace(camera, near=None, far=None) for camera in cameras]
+    return photographed(tmp_path_factory.mktemp("rooms"), cameras)
+
+
+def complete_room(monkeypatch, scene: Path, out: Path, model: str, *more: object) -> dict:
+    """Complete a room without a depth range in its files; return the summary."""
+    frames = ("--context", 0, 1, "--target", 2, "--reconstructor", model, "--device", "cpu")
+    assert run(monkeypatch, "complete", scene, *frames, "--out", out, *more) == 0
+    return json.loads((out / "summary.json").read_text())
+
+
+@pytest.mark.parametrize(
+    "name", ["mvsplat-re10k", "depthsplat-base-dl3dv-256x448", "volsplat-re10k"]
+)
+def test_complete_gives_a_network_the_range_of_its_authors(
+    name, rooms, recorded, tmp_path, monkeypatch
+):
+    summary = complete_room(monkeypatch, rooms, tmp_path / "out", name, "--quiet")
+    near, far = PUBLISHED[name].near_far
+    # The context, then the lift of the target.
+    assert len(recorded.batches) == 2
+    for _, cameras in recorded.batches:
+        assert cameras.near.tolist() == [[near, near]]
+        assert cameras.far.tolist() == [[far, far]]
+    assert summary["depth_range"] == {
+        "near": near,
+        "far": far,
+        "from": dict.fromkeys(("near", "far"), "model"),
+    }
+
+
+def test_a_range_that_is_given_goes_before_that_of_the_authors(
+    rooms, recorded, tmp_path, monkeypatch
+):
+    more = ("--near", 0.25, "--quiet")
+    summary = complete_room(monkeypatch, rooms, tmp_path / "out", "mvsplat-re10k", *more)
+    assert recorded.batches[0][1].near.tolist() == [[0.25, 0.25]]
+    assert recorded.batches[0][1].far.tolist() == [[100.0, 100.0]]
+    assert summary["depth_range"]["from"] == {"near": "given", "far": "model"}
+
+
+@pytest.mark.parametrize("name", RANGED)
+def test_a_published_network_is_built_with_the_range_of_its_authors(name, recorded):
+    assert load_reconstructor(name).depth_range == PUBLISHED[name].near_far
+
+
+def test_a_scene_in_another_unit_than_the_network_was_trained_on_is_told(
+    recorded, tmp_path, monkeypatch, capsys
+):
+    cameras = [camera_at(x, size=SIZE, unit=0.01) for x in (-0.3, 0.1, 0.6)]
+    cameras = [replace(camera, near=None, far=None) for camera in cameras]
+    scene = photographed(tmp_path / "small", cameras, Room(unit=0.01))
+    complete_room(monkeypatch, scene, tmp_path / "out", "mvsplat-re10k")
+    told = " ".join(capsys.readouterr().err.split())
+    assert "this model was trained on 1 to 100 (metres); scale the cameras" in told
+
+
+def test_a_scene_in_metres_is_not_remarked_upon(rooms, recorded, tmp_path, monkeypatch, capsys):
+    complete_room(monkeypatch, rooms, tmp_path / "out", "mvsplat-re10k")
+    assert "was trained on" not in capsys.readouterr().err

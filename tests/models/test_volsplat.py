@@ -78,7 +78,7 @@ def test_voxels_agree_with_the_authors_code_in_more_cases(path):
 
 
 def predict(network: VolSplat) -> VoxelGaussians:
-    images, cameras, _ = create_batch(photographs(), SMALL.patch, SMALL.near, SMALL.far)
+    images, cameras, _ = create_batch(photographs(), SMALL.patch)
     with torch.no_grad():
         return network(images, cameras)
 
@@ -150,7 +150,7 @@ def test_the_depth_maps_are_those_of_the_voxels():
 
 
 def test_several_scenes_at_once_are_refused():
-    images, cameras, _ = create_batch(photographs(), SMALL.patch, SMALL.near, SMALL.far)
+    images, cameras, _ = create_batch(photographs(), SMALL.patch)
     with pytest.raises(ValueError, match="one scene"):
         random_network()(images.repeat(2, 1, 1, 1, 1), cameras)
 

@@ -1,16 +1,18 @@
 """Stage 3, coarse: the affine is found, and fallbacks are reported."""
 
+from dataclasses import replace
+
 import pytest
 import torch
 
 from gscompleter.config import AlignmentConfig, CompleterConfig
 from gscompleter.guards import Attempt
 from gscompleter.guards.agreement import DepthAgreement
-from gscompleter.stages.align_depth import fit_affine, refit_at_target
+from gscompleter.stages.align_depth import align_depth, fit_affine, refit_at_target
 from gscompleter.stages.refine import Refined
 from gscompleter.stages.synthesize import GeneratedView
-from gscompleter.types import DepthAffine, DepthMap, View
-from scenes import camera_at, random_gaussians
+from gscompleter.types import DepthAffine, DepthMap, Lift, View, merge
+from scenes import Room, camera_at, gaussians_of, random_gaussians, view_of
 from target_views import observe
 
 CONFIG = AlignmentConfig()
@@ -162,3 +164,18 @@ def test_the_paper_trusts_the_anchor_always():
     for context in (depths() / 5, unlike()):
         affine = checked(1.2, context, config)
         assert (affine.scale, affine.shift) == (1.2, 0.0)
+
+
+@pytest.mark.parametrize(("align_at", "scale"), [("anchor", 1.25), ("target", 0.8), ("none", 1.0)])
+def test_eq_8_compares_depths_at_the_anchor_and_its_ablation_at_the_target(align_at, scale):
+    room = Room()
+    target, anchor = camera_at(0.2, size=48), camera_at(-0.2, size=48)
+    seen_at = [view_of(room, camera) for camera in (anchor, target)]
+    context = merge([gaussians_of(view) for view in seen_at])
+    config = CompleterConfig.paper()
+    config = replace(config, alignment=replace(config.alignment, align_at=align_at))
+    view = observe(context, seen_at[:1], target, config)
+    at_anchor, at_target = (known.depth for known in seen_at)
+    lift = Lift(context, everywhere(at_target / 0.8), everywhere(at_anchor / 1.25), None)
+    found = align_depth(lift, view, torch.Generator().manual_seed(0))
+    assert found.scale == pytest.approx(scale, rel=0.05)

@@ -5,14 +5,15 @@ from dataclasses import replace
 import pytest
 import torch
 
-from gscompleter.config import HoleConfig, RefineConfig
+from gscompleter.config import CompleterConfig, HoleConfig, RefineConfig
 from gscompleter.image_ops import dilate
 from gscompleter.render import load_renderer
 from gscompleter.stages.filter_holes import select_in_mask
-from gscompleter.stages.refine import refine_opacities
+from gscompleter.stages.refine import refine, refine_opacities
 from gscompleter.stages.target_view import compute_hole_mask
-from gscompleter.types import View
+from gscompleter.types import View, merge
 from scenes import Room, camera_at, gaussians_of, half_a_room_of, view_of
+from target_views import observe
 
 SIZE = 48
 ROOM = Room()
@@ -109,3 +110,23 @@ def test_without_iterations_opacities_stay_as_they_were_lifted():
     refined, losses = refined_by(added, frozen, view, [view], config)
     assert refined is added
     assert losses == ()
+
+
+@pytest.mark.parametrize("order", [(0, 1, 2, 3), (3, 1, 0, 2)])
+def test_the_loss_of_eq_13_weighs_the_target_and_sums_the_nearest_photographs(order):
+    """λ = 0.1 at the target, and the k = 2 photographs whose cameras are closest to it."""
+    config = CompleterConfig.paper()
+    _, context, added = half_a_room()
+    # Each photograph is darker than the one before, so that each has another error.
+    seen = [view_of(ROOM, camera_at(x, size=SIZE)) for x in (0.1, -0.2, 0.5, -0.7)]
+    photographs = [replace(v, image=v.image * 0.8**n) for n, v in enumerate(seen)]
+    reference = replace(seen[0], image=1 - seen[0].image, camera=CAMERA)
+    view = observe(context, [photographs[i] for i in order], CAMERA, config)
+    whole = merge([context, added])
+
+    def compute_error(photograph: View) -> float:
+        image = load_renderer("cpu").render(whole, photograph.camera).image
+        return (image - photograph.image).abs().mean().item()
+
+    expected = 0.1 * compute_error(reference) + sum(map(compute_error, photographs[:2]))
+    assert refine(added, reference, view).losses[0] == pytest.approx(expected, rel=1e-4)

@@ -19,7 +19,7 @@ from gscompleter.stages.slide_along_rays import (
     slide_along_rays,
 )
 from gscompleter.stages.target_view import TargetView
-from gscompleter.types import DepthAffine, DepthMap, Gaussians, Lift, View, merge
+from gscompleter.types import Camera, DepthAffine, DepthMap, Gaussians, Lift, View, merge
 from parity import assert_close
 from scenes import Room, camera_at, gaussians_of, scaled, view_of
 from target_views import observe
@@ -298,3 +298,31 @@ def test_where_nothing_overlaps_the_scene_the_affine_is_kept():
     moved = slide_along_rays(alone, DepthAffine(1.0, 0.0), reference, view)
     assert moved.losses == ()
     assert_close(moved.gaussians.means, alone.gaussians.means, "means")
+
+
+def test_the_loss_of_eq_11_has_the_weights_and_renders_of_the_paper():
+    """λ_d, λ_s, λ_c = 1, 1, 0.1; L_depth and L_rgb of the scene with the lifted Gaussians."""
+    config = CompleterConfig.paper()
+    config = replace(config, alignment=replace(config.alignment, align_at="none"))
+    truth, anchor = view_of(ROOM, TARGET), view_of(ROOM, ANCHOR)
+    reference = replace(truth, image=1 - truth.image)
+    others = [view_of(ROOM, camera_at(x, size=SIZE)) for x in (-0.2, 0.0)]
+    context = merge([gaussians_of(view) for view in others])
+    seen = observe(context, [anchor], TARGET, config)
+    lift = lifted(reference, anchor, 0.9)
+
+    def compute_depth_error(generated: Gaussians, camera: Camera) -> float:
+        shown = CPU.render(generated, camera).depth_map()
+        scene = CPU.render(context, camera).depth_map()
+        error = torch.where(shown.valid & scene.valid, shown.depth - scene.depth, 0.0)
+        return error.abs().mean().item()
+
+    together = merge([context, lift.gaussians])
+    image = CPU.render(together, TARGET).image
+    depth = compute_depth_error(together, TARGET)
+    stereo = compute_depth_error(lift.gaussians, ANCHOR)
+    color = (image - reference.image).abs().mean().item()
+    # Each of the terms has to count.
+    assert min(depth, stereo, 0.1 * color) > 0.005
+    expected = depth + stereo + 0.1 * color
+    assert register(lift, reference, seen).losses[0] == pytest.approx(expected, rel=1e-3)

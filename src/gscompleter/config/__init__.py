@@ -30,8 +30,9 @@ class SynthesisConfig(Settings):
 
     correct_color: bool = True
     """Match the colours of the synthesized image to those of the photographs (not in the paper)."""
-    source_depth: Literal["context", "monocular"] = "context"
-    """Default of `--generator-depth`: rendered from the scene, or by a network (paper)."""
+    source_depth: Literal["context", "monocular", "moge-2-large"] = "context"
+    """Default of `--generator-depth`: rendered from the scene, or by a network; `moge-2-large` is
+    that of PE-Field's authors (paper)."""
 
 
 @dataclass(frozen=True)
@@ -335,7 +336,7 @@ class CompleterConfig(Settings):
             guards=(),
             margin=0.0,
             ego_mask=False,
-            synthesis=SynthesisConfig(correct_color=False, source_depth="monocular"),
+            synthesis=SynthesisConfig(correct_color=False, source_depth="moge-2-large"),
             anchor=AnchorConfig(min_baseline=0.0, min_overlap=0.0),
             alignment=AlignmentConfig(min_agreement=0.0),
             registration=RegistrationConfig(

@@ -61,8 +61,9 @@ class GeneratorOptions(Settings):
     """Denoising steps: for pe-field 4, as in the paper (its authors' demo has 28), for
     diffusers-inpaint the pipeline's own number."""
     generator_depth: str | None = None
-    """Depth of the photograph for pe-field: context (rendered; the default), monocular (a published
-    network; with the config `paper`), or the folder or hub id of another network."""
+    """Depth of the photograph for pe-field: context (rendered; the default), moge-2-large (that of
+    its authors; with the config `paper`), monocular (a small network), or the folder or hub id of
+    another one."""
     generator_batch_size: int | None = None
     """Most target images that pe-field denoises together (4). Fewer need less memory."""
     generator_prompt: str | None = None

@@ -123,7 +123,7 @@ def _is_supersplat(content: Any) -> bool:
 
 def _parse_supersplat(content: Any, path: Path, resolution: Resolution) -> list[Frame]:
     """Read SuperSplat's poses as cameras in the frame of the splat; `resolution` must be given."""
-    if resolution is None or isinstance(resolution, int):
+    if not isinstance(resolution, tuple):
         raise InputError(
             f"The poses of SuperSplat in {quote_value(path)} have no image size; give a resolution "
             "(height and width).",

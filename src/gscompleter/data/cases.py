@@ -3,7 +3,8 @@
 A case has two or more context frames, a target frame whose photograph no stage sees, and frames
 beside the target ("neighbours"), which a flat billboard in front of the target cannot satisfy. A
 file of cases is JSON: `{"resolution": [h, w], "cases": [{"scene", "context", "target", "near",
-"far", "neighbours"}, ...]}`. Scene folders are relative to the file.
+"far", "neighbours"}, ...]}`. Scene folders are relative to the file, and may name variables of the
+environment (`$GSCOMPLETER_DATA/data/fox`).
 """
 
 from __future__ import annotations
@@ -16,7 +17,12 @@ from typing import Any
 
 from gscompleter.data.ego_vehicle import attach_vehicle_detector
 from gscompleter.data.formats import FORMATS, detect_format, find_format, open_photographs
-from gscompleter.data.photographs import Photographs, Resolution, apply_masks
+from gscompleter.data.photographs import (
+    MAX_TRANSLATION,
+    Photographs,
+    Resolution,
+    apply_masks,
+)
 from gscompleter.errors import InputError, quote_value
 from gscompleter.io.reading import read_json
 from gscompleter.types import View
@@ -66,7 +72,7 @@ def read_cases(path: Path) -> list[Case]:
 
 def _parse_case(row: Any, resolution: tuple[int, int], path: Path) -> Case:
     return Case(
-        path.parent / row["scene"],
+        path.parent / os.path.expandvars(row["scene"]),
         tuple(map(_check_whole, row["context"])),
         _check_whole(row["target"]),
         tuple(map(_check_whole, row.get("neighbours", ()))),
@@ -106,11 +112,16 @@ def open_clips(path: Path | str) -> Iterator[Photographs]:
 
 
 def filter_usable(
-    clips: Iterable[Photographs], skipped: list[SkippedScene]
+    clips: Iterable[Photographs],
+    skipped: list[SkippedScene],
+    max_translation: float | None = MAX_TRANSLATION,
 ) -> Iterator[Photographs]:
-    """Yield the scenes that benchmarks keep, and append the others to `skipped`."""
+    """Yield the scenes that benchmarks keep, and append the others to `skipped`.
+
+    `max_translation` is the largest camera coordinate, in scene units; None for any.
+    """
     for clip in clips:
-        reason = clip.find_skip_reason()
+        reason = clip.find_skip_reason(max_translation)
         if reason is None:
             yield clip
         else:

@@ -26,7 +26,23 @@ from gscompleter.geometry import compute_sparse_depth
 from gscompleter.io.image import convert_to_image, read_pixels
 from gscompleter.types import Camera, View
 
-Resolution = tuple[int, int] | int | None
+
+@dataclass(frozen=True)
+class AuthorsCrop:
+    """Central crop as the data loaders of pixelSplat, MVSplat, DepthSplat and VolSplat make it.
+
+    Unlike an exact crop it keeps the principal point as a fraction of the image. That is half a
+    pixel off where an odd number of rows or columns goes (455 to 256 columns), and more where the
+    principal point is not central. Their networks were trained on such cameras.
+    """
+
+    height: int
+    width: int
+    is_resized: bool
+    """True to resize the image to cover the crop first, False to cut the crop out as it is."""
+
+
+Resolution = tuple[int, int] | int | AuthorsCrop | None
 """Target size of images.
 
 Height and width in pixels: resize to cover, then crop the centre. One number: shrink to at most
@@ -101,10 +117,14 @@ class Photographs:
         """True if some frame has a mask or boxes."""
         return any(frame.mask is not None or frame.boxes is not None for frame in self.frames)
 
-    def find_skip_reason(self) -> str | None:
-        """Explain why benchmarks skip the photographs; None if they are kept."""
+    def find_skip_reason(self, max_translation: float | None = MAX_TRANSLATION) -> str | None:
+        """Explain why benchmarks skip the photographs; None if they are kept.
+
+        `max_translation` is the largest camera coordinate from the origin, in scene units; None
+        for any.
+        """
         for number, frame in enumerate(self.frames):
-            reason = _find_skip_reason(frame, self.origin)
+            reason = _find_skip_reason(frame, self.origin, max_translation)
             if reason is not None:
                 return f"frame {number}: {reason}"
         return None
@@ -122,6 +142,10 @@ class Photographs:
         _, pinhole = frame.compute_pinholes(*size)
         framing = compute_framing(*size, resolution)
         final = pinhole.resize(*framing.scaled_size).crop(*framing.corner, *framing.size)
+        if isinstance(resolution, AuthorsCrop):
+            cx = pinhole.cx / pinhole.width * final.width
+            cy = pinhole.cy / pinhole.height * final.height
+            final = replace(final, cx=cx, cy=cy)
         c2w = frame.c2w.copy()
         c2w[:3, 3] -= self.origin  # before rounding to float32
         pose = torch.from_numpy(c2w).float()
@@ -210,7 +234,9 @@ def undistort_and_resize(
     return np.ascontiguousarray(resized[top : top + height, left : left + width])
 
 
-def _find_skip_reason(frame: Frame, origin: Float[np.ndarray, "3"]) -> str | None:
+def _find_skip_reason(
+    frame: Frame, origin: Float[np.ndarray, "3"], max_translation: float | None
+) -> str | None:
     size = frame.intrinsics.size or frame.size()
     defect = frame.find_defect(*size)
     if defect is not None:
@@ -219,8 +245,9 @@ def _find_skip_reason(frame: Frame, origin: Float[np.ndarray, "3"]) -> str | Non
     if fov > MAX_FOV:
         return f"its opening angle of {fov:.1f}° is above {MAX_FOV:g}°"
     farthest = float(np.abs(frame.c2w[:3, 3] - origin).max())
-    too_far = f"its translation of {farthest:g} is above {MAX_TRANSLATION:g}"
-    return too_far if farthest > MAX_TRANSLATION else None
+    if max_translation is None or farthest <= max_translation:
+        return None
+    return f"its translation of {farthest:g} is above {max_translation:g}"
 
 
 @dataclass(frozen=True)
@@ -239,9 +266,20 @@ def compute_framing(width: int, height: int, resolution: Resolution) -> Framing:
         scale = 1.0 if resolution is None else min(1.0, resolution / max(width, height))
         size = max(round(width * scale), 1), max(round(height * scale), 1)
         return Framing(size, (0, 0), size)
-    new_height, new_width = resolution
-    scale = max(new_height / height, new_width / width)
-    scaled = max(round(width * scale), new_width), max(round(height * scale), new_height)
+    if isinstance(resolution, AuthorsCrop):
+        new_height, new_width = resolution.height, resolution.width
+    else:
+        new_height, new_width = resolution
+    if isinstance(resolution, AuthorsCrop) and not resolution.is_resized:
+        scaled = width, height
+        if width < new_width or height < new_height:
+            raise InputError(
+                f"An image of {width} × {height} pixels is smaller than its crop of {new_width} × "
+                f"{new_height}; choose a smaller resolution."
+            )
+    else:
+        scale = max(new_height / height, new_width / width)
+        scaled = max(round(width * scale), new_width), max(round(height * scale), new_height)
     if max(scaled) > MAX_SIDE:
         raise InputError(
             f"An image of {width} × {height} pixels that covers {new_width} × {new_height} has a "
@@ -262,6 +300,8 @@ def resize(
 
 def check_resolution(resolution: Resolution) -> None:
     """Raise an InputError if a side is not within 1 to `MAX_SIDE`."""
+    if isinstance(resolution, AuthorsCrop):
+        resolution = (resolution.height, resolution.width)
     sides = (resolution,) if isinstance(resolution, int) else resolution or ()
     if not all(1 <= side <= MAX_SIDE for side in sides):
         raise InputError(

@@ -13,6 +13,7 @@ from pydantic import TypeAdapter
 
 from gscompleter.config.generators import GeneratorOptions
 from gscompleter.config.settings import Settings
+from gscompleter.evaluation.authors_loader import AuthorsLoader
 
 TRUTH, PHOTOGRAPH = "truth", "context-"
 """Names of the images of a figure that are no method."""
@@ -28,6 +29,9 @@ class DataSet(Settings):
     generator: str = GeneratorOptions.generator
     near: float | None = None
     far: float | None = None
+    """Depth range in scene units; None for that of the data, or else of the model's authors."""
+    loader: AuthorsLoader | None = None
+    """What the authors' code does with the data set; None if nobody's code is followed."""
 
 
 @dataclass(frozen=True)
@@ -77,11 +81,18 @@ class Claim(Settings):
     """A claim that a method is better than another in a column of a table."""
 
     says: str
+    paper: str
+    """The paper's numbers, of the method after those of the baseline."""
     table: str
     column: str
     method: str
     baseline: str
     better: Literal["higher", "lower"]
+    """Direction in which the paper says that the method differs from the baseline."""
+    model: str | None = None
+    """Ψ that the claim is about; None for all."""
+    over_spans: bool = False
+    """True if the difference is said to grow from the first protocol of the table to the last."""
 
 
 @dataclass(frozen=True)
@@ -99,6 +110,11 @@ def load_paper() -> Paper:
     """Load and validate `paper.yaml`."""
     content: Any = yaml.safe_load(files(__package__).joinpath("paper.yaml").read_bytes())
     return TypeAdapter(Paper).validate_python(content)
+
+
+def get_data_set(preset: str | None) -> DataSet:
+    """Return the data set of a preset, or the defaults without one."""
+    return DataSet() if preset is None else load_paper().data_sets[preset]
 
 
 def is_photograph(image: str) -> bool:

@@ -10,7 +10,7 @@ import json
 import os
 import re
 from collections.abc import Callable, Iterable, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import partial
 from pathlib import Path
 from typing import Annotated, Literal
@@ -26,6 +26,8 @@ from gscompleter.io.files import replace_file
 from gscompleter.io.reading import read_json
 from gscompleter.types import View
 
+INDICES = Path(__file__).parent / "indices"
+"""Folder of the evaluation indices in the package; its README.md has the rule."""
 VERSION = 1
 """Version of the files that `write_evaluation_index` writes."""
 
@@ -40,6 +42,12 @@ class Split:
     targets: Annotated[Frames, Field(alias="target")]
     is_sequence: bool = False
     """True if all targets are completed into one scene, one after the other."""
+
+    def sort_frames(self) -> Split:
+        """Return the split with context and targets in ascending order."""
+        return replace(
+            self, context=tuple(sorted(self.context)), targets=tuple(sorted(self.targets))
+        )
 
 
 @dataclass(frozen=True)
@@ -94,10 +102,18 @@ def parse_protocol(text: str) -> EvaluationProtocol:
             return FrameRule(text, partial(split, **numbers))
     if os.path.isfile(text):
         return read_evaluation_index(Path(text))
+    if text in list_indices():
+        return read_evaluation_index(INDICES / f"{text}.json")
     raise InputError(
         f"There is no protocol '{quote_value(text)}'; give n-K for a number of frames K (as n-10), "
-        "stress or stress-K-TARGET, sequence-K (as sequence-4), or the path of an evaluation index."
+        "stress or stress-K-TARGET, sequence-K (as sequence-4), the path of an evaluation index, "
+        f"or the name of ours ({', '.join(list_indices())})."
     )
+
+
+def list_indices() -> list[str]:
+    """List the names of the evaluation indices in the package, as `dl3dv-n-10`."""
+    return sorted(path.stem for path in INDICES.glob("*.json"))
 
 
 def extrapolate(num_frames: int, k: int, stride: int | None = None) -> tuple[Split, ...]:
@@ -186,6 +202,8 @@ class Task:
     load: Callable[[tuple[int, ...]], list[View]]
     neighbours: tuple[int, ...] = ()
     """Frames beside the target, for scoring only."""
+    keeps_order: bool = False
+    """True to give Ψ the context in this order, as a published index has it, instead of sorted."""
 
     @property
     def name(self) -> str:
@@ -205,8 +223,12 @@ def make_tasks(
     clip: Photographs,
     resolution: Resolution = None,
     use_masks: bool = False,
+    keeps_order: bool = False,
 ) -> list[Task]:
-    """Make the tasks of a clip: one per target, or one per sequence."""
+    """Make the tasks of a clip: one per target, or one per sequence.
+
+    With `keeps_order`, Ψ gets the context in the order of the split instead of sorted by frame.
+    """
     load = partial(load_clip_views, clip, resolution, use_masks)
     tasks = []
     for split in protocol.select_splits(clip):
@@ -217,11 +239,11 @@ def make_tasks(
                     f"has {len(clip)} frames; use the index of this data set."
                 )
         if split.is_sequence:
-            tasks.append(Task(clip.name, split.context, split.targets, load))
+            tasks.append(Task(clip.name, split.context, split.targets, load, (), keeps_order))
             continue
         for target in split.targets:
             beside = find_neighbours(target, split.context, len(clip))
-            tasks.append(Task(clip.name, split.context, (target,), load, beside))
+            tasks.append(Task(clip.name, split.context, (target,), load, beside, keeps_order))
     return tasks
 
 

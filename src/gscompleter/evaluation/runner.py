@@ -156,7 +156,9 @@ class TaskRunner:
 
 def prepare_task(task: Task, folder: Path, config: RunConfig) -> PreparedTask:
     """Load the photographs of a task, and load or reconstruct its initial scene."""
-    views = sort_by_frame(load_task_views(task, task.context, config))
+    views = load_task_views(task, task.context, config)
+    if not task.keeps_order:
+        views = sort_by_frame(views)
     targets = load_task_views(task, task.targets, config)
     neighbours = load_task_views(task, task.neighbours, config)
     images = [*views, *targets]

@@ -22,6 +22,9 @@ class Reconstructor(Protocol):
 
     The cameras carry `near` and `far` in scene units. The Gaussians have the frame and unit of the
     cameras, and all tensors are on the device of the view images.
+
+    A Ψ that was trained on one depth range says so in an attribute `depth_range`, (near, far) in
+    scene units; cameras without a range get it instead of an estimate.
     """
 
     def __call__(self, views: Sequence[View]) -> Reconstruction:
@@ -58,6 +61,11 @@ def run_reconstructor(
                 f"{device}; it must return all tensors on the device of the views' images"
             )
     return found
+
+
+def get_trained_range(reconstructor: Reconstructor) -> tuple[float, float] | None:
+    """Return near and far that Ψ was trained on, in scene units; None if it adapts to any."""
+    return getattr(reconstructor, "depth_range", None)
 
 
 def iterate_tensors(value: object, name: str) -> Iterator[tuple[str, Tensor]]:

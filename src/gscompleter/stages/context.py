@@ -13,9 +13,13 @@ from torch.nn.functional import avg_pool2d, max_pool2d
 from gscompleter.config import CompleterConfig, get_named_config
 from gscompleter.errors import InputError
 from gscompleter.geometry import compute_z_depths, project_mask
-from gscompleter.reconstructors import Reconstructor, run_reconstructor
+from gscompleter.reconstructors import Reconstructor, get_trained_range, run_reconstructor
 from gscompleter.reconstructors.depth_predictors import give_prediction, predict_nothing
-from gscompleter.reconstructors.features.depth_range import get_depth_range, set_depth_range
+from gscompleter.reconstructors.features.depth_range import (
+    find_depth_range,
+    get_depth_range,
+    set_depth_range,
+)
 from gscompleter.render import Renderer
 from gscompleter.render.lod import build_proxy
 from gscompleter.types import Camera, ContextScene, Gaussians, Reconstruction, View
@@ -89,7 +93,7 @@ def prepare_single(reconstructor: Reconstructor, views: Sequence[View]) -> list[
 def reconstruct_context(reconstructor: Reconstructor, views: Sequence[View]) -> InitialContext:
     """Reconstruct `G_ctx = Ψ(V_in)` from posed photographs (paper, Eq. 5)."""
     check_texture(views)
-    views = set_depth_range(views, *get_depth_range(views))
+    views = set_depth_range(views, *find_depth_range(views, get_trained_range(reconstructor)))
     made = run_reconstructor(reconstructor, views)
     source, gains = ContextScene.whole(drop_ignored(made, views)), made.exposure_gains
     return InitialContext(source, normalize_exposures(views, gains), gains)
@@ -111,7 +115,7 @@ def take_scene(
         raise InputError("The scene holds NaN or infinity; remove such Gaussians.")
     photos = [*views, *check_views]
     source = build_proxy(scene, [*targets, *(view.camera for view in photos)])
-    near, far = find_depth_range(views, source.rendered, renderer)
+    near, far = find_splat_range(views, source.rendered, renderer)
     return InitialContext(source, tuple(set_depth_range(photos, near, far)))
 
 
@@ -173,12 +177,10 @@ def normalize_exposures(
     return tuple(views) if gains is None else tuple(map(View.normalize_exposure, views, gains))
 
 
-def find_depth_range(
-    views: Sequence[View], scene: Gaussians | None, renderer: Renderer
+def find_splat_range(
+    views: Sequence[View], scene: Gaussians, renderer: Renderer
 ) -> tuple[float, float]:
-    """Find near and far plane in scene units: given, or from the input splat, or from features."""
-    if scene is None:
-        return get_depth_range(views)
+    """Find near and far plane in scene units: those of the cameras, or of the input splat."""
     cameras = [view.camera for view in views]
     return get_depth_range(views, lambda _: measure_depth_range(scene, cameras, renderer))
 

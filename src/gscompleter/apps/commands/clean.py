@@ -17,7 +17,7 @@ from gscompleter import __version__
 from gscompleter.apps.commands.options import CleanOptions
 from gscompleter.apps.commands.output import describe_run, is_replaceable
 from gscompleter.apps.inputs.opening import (
-    apply_working_range,
+    apply_splat_range,
     check_context,
     describe_opening,
     locate_splat,
@@ -102,7 +102,7 @@ def clean_by_photographs(options: CleanOptions, console: Console) -> Cleaning:
     given, splat_file = task.scene, task.splat_file
     assert given is not None
     assert splat_file is not None
-    task = apply_working_range(task, renderer)
+    task = apply_splat_range(task, given, renderer)
     plan = f"compared with {len(task.views)} photographs on {device}"
     plan += f", written to {quote_value(options.out)}"
     print_lines(console, *describe_opening(options, opened, task), f"To do: {plan}.")

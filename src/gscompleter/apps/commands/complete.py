@@ -23,10 +23,12 @@ from gscompleter.apps.inputs.opening import (
     Opened,
     Task,
     add_check_views,
-    apply_working_range,
+    apply_scene_range,
+    apply_splat_range,
     check_context,
     check_scene,
     check_targets,
+    describe_range_mismatch,
     describe_task,
     move_to_splat,
     name_target,
@@ -119,10 +121,15 @@ def prepare_completion(options: CompleteOptions, console: Console) -> Prepared:
         task = add_splat(task, options.scene, options, opened, parts)
     with show_preparation("loading models"):
         completer = load_completer(options, task.targets, device)
+    reconstructor = completer.reconstructor
     if options.scene is None:
-        task = replace(task, views=prepare_single(completer.reconstructor, task.views))
+        task = replace(task, views=prepare_single(reconstructor, task.views))
     with show_preparation("depth range"), record_seconds() as seconds, timed_stage("context"):
-        task = apply_working_range(task, completer.renderer)
+        if task.scene is None:
+            task = apply_scene_range(task, reconstructor)
+        else:
+            task = apply_splat_range(task, task.scene, completer.renderer)
+    print_lines(console, *describe_range_mismatch(task, reconstructor))
     cameras = collect_cameras(options, opened, task)
     return Prepared(options, opened, task, ViewPlanner(completer), cameras, seconds)
 

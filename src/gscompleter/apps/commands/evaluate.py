@@ -5,7 +5,7 @@ from __future__ import annotations
 import os
 from collections.abc import Iterator, Sequence
 from contextlib import suppress
-from dataclasses import replace
+from dataclasses import asdict, replace
 from itertools import islice
 from pathlib import Path
 from typing import Any
@@ -26,10 +26,12 @@ from gscompleter.apps.warmup import compile_kernels
 from gscompleter.data.cases import Case, SkippedScene, filter_usable, open_clips, read_cases
 from gscompleter.data.formats import open_photographs
 from gscompleter.data.limits import check_planes
-from gscompleter.data.photographs import check_resolution
+from gscompleter.data.photographs import MAX_TRANSLATION, Resolution, check_resolution
 from gscompleter.errors import InputError, quote_value
 from gscompleter.evaluation import protocols, tables
+from gscompleter.evaluation.authors_loader import AuthorsLoader
 from gscompleter.evaluation.methods import expand_methods
+from gscompleter.evaluation.paper import get_data_set
 from gscompleter.evaluation.runner import RunConfig, evaluate
 from gscompleter.evaluation.store import list_row_paths
 from gscompleter.evaluation.tables import RunSummary
@@ -86,6 +88,7 @@ def score_methods(options: EvaluateOptions) -> int:
 def describe_source(options: EvaluateOptions) -> dict[str, Any]:
     """Describe the cases, as an output folder records them."""
     size = LONG_SIDE if options.resolution is None and options.protocol else options.resolution
+    loader = find_loader(options)
     return {
         "paths": [path.resolve().name for path in options.paths],
         "protocols": list(options.protocol),
@@ -93,6 +96,7 @@ def describe_source(options: EvaluateOptions) -> dict[str, Any]:
         **({"ignore_masked": True} if options.use_masks else {}),
         **({"one_per_scene": True} if options.one_per_scene else {}),
         **({} if options.ego_mask else {"ego_mask": False}),
+        **({} if loader is None else {"loader": asdict(loader)}),
         **{k: v for k in ("near", "far") if (v := getattr(options, k)) is not None},
     }
 
@@ -183,9 +187,11 @@ def iterate_tasks(
 ) -> Iterator[protocols.Task]:
     """Iterate over the tasks of the protocols, clip by clip."""
     rules = [protocols.parse_protocol(text) for text in options.protocol]
-    size = parse_resolution(LONG_SIDE if options.resolution is None else options.resolution)
+    loader = find_loader(options)
+    size = find_resolution(options)
+    max_translation = MAX_TRANSLATION if loader is None else None
     for path in options.paths:
-        for clip in filter_usable(open_clips(path), skipped):
+        for clip in filter_usable(open_clips(path), skipped, max_translation):
             notes += clip.notes
             if options.use_masks and not clip.has_masks:
                 raise InputError(
@@ -198,11 +204,28 @@ def iterate_tasks(
             check_planes(near, far)
             clip = replace(clip, near=near, far=far)
             for rule in rules:
-                tasks = protocols.make_tasks(rule, clip, size, options.use_masks)
-                if not tasks and isinstance(rule, protocols.FrameRule):
+                if isinstance(rule, protocols.FrameRule) and not rule.select_splits(clip):
                     reason = f"{rule.name} chooses none of its {len(clip)} frames"
                     skipped.append(SkippedScene(clip.name, reason))
+                kept = rule if loader is None else loader.choose_splits(rule, clip, skipped)
+                keeps_order = loader is not None
+                tasks = protocols.make_tasks(kept, clip, size, options.use_masks, keeps_order)
                 yield from tasks[:1] if options.one_per_scene else tasks
+
+
+def find_loader(options: EvaluateOptions) -> AuthorsLoader | None:
+    """Find the loader to follow; none without a preset, or at another size than the preset's."""
+    preset = get_data_set(options.preset)
+    return preset.loader if options.resolution == preset.resolution else None
+
+
+def find_resolution(options: EvaluateOptions) -> Resolution:
+    """Find how the photographs of scenes are resized and cropped."""
+    given = LONG_SIDE if options.resolution is None else options.resolution
+    loader = find_loader(options)
+    if loader is not None and isinstance(given, tuple):
+        return loader.make_crop(*given)
+    return parse_resolution(given)
 
 
 def find_cases_file(path: Path) -> Path:

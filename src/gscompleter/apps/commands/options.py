@@ -120,9 +120,10 @@ class SceneOptions(ComputeOptions, WritingOptions):
     """Working size: the longest side in pixels (photographs are never enlarged), or height and
     width (photographs are scaled and cropped), or `full`."""
     near: float | None = None
-    """Smallest depth in the scene, in the unit of its cameras; estimated if not given."""
+    """Smallest depth in the scene, in the unit of its cameras; if not given, that of the data or of
+    the model's authors, or else estimated."""
     far: float | None = None
-    """Largest depth in the scene, in the unit of its cameras; estimated if not given."""
+    """Largest depth in the scene, in the unit of its cameras; if not given, as for near."""
     no_given_depth: bool = False
     """Ignore the depth that SCENE holds: depth maps, laser sweeps and COLMAP's points."""
     drop_nonfinite: bool = False
@@ -290,14 +291,16 @@ class EvaluateOptions(SynthesisOptions, EngineOptions):
     """Choice of context and target frames; one or several of: n-10 (frames n and n + 10 for n + 20,
     then n + 20 and n + 10 for n, for n = 0, 21, 42, …); stress (0 and 30 for 99) or stress-12-39
     (0 and 12 for 39); sequence-4 or sequence-4-steps-6 (start from frames 0 and 4, then complete 8,
-    12, … one after the other); or the path of an evaluation index. A cases.json needs none."""
+    12, … one after the other); or an evaluation index, by its path or as dl3dv-n-10, re10k-n-30,
+    acid-n-30 or dl3dv-stress, which are ours. A cases.json needs none."""
     methods: tuple[str, ...] = ("context", "full", "paper")
     """Methods to compare: context, full, paper, an ablation such as no-sa, densify-100,
     densify-800, distill, reggs; or a group: ablations, baselines, all. Tables and figures of the
     paper have their own."""
     preset: Literal["re10k", "acid", "dl3dv", "waymo"] | None = None
     """Data set of the paper, which sets protocol, resolution, near, far, reconstructors and
-    generator where they are not given."""
+    generator where they are not given. At its own resolution photographs are cropped, and scenes
+    left out, as by the code of the models' authors."""
     table: tuple[TableName, ...] = ()
     """Tables of the paper to write; `all` leaves out those that need another generator."""
     figure: tuple[FigureName, ...] = ()
@@ -312,12 +315,14 @@ class EvaluateOptions(SynthesisOptions, EngineOptions):
     """Models that turn photographs into Gaussians: plane-sweep (the default), or one or several of
     `gscompleter models`."""
     weights: tuple[Path, ...] = ()
-    """Weights file of each reconstructor; downloaded if not given."""
+    """Weights file of each reconstructor, or NAME=FILE for some of them, as in
+    mvsplat-re10k=re10k.ckpt; others are downloaded."""
     synthesis: Annotated[GeneratorOptions, tyro.conf.OmitArgPrefixes] = GeneratorOptions(AUTO)
     near: float | None = None
-    """Smallest depth in the scenes, in the unit of their cameras; by default as in the data."""
+    """Smallest depth in the scenes, in the unit of their cameras; by default that of the data, or
+    else of the model's authors."""
     far: float | None = None
-    """Largest depth in the scenes; by default as in the data."""
+    """Largest depth in the scenes; by default as for near."""
     rerun: Literal["nothing", "failures", "scores"] = "nothing"
     """Cases of an earlier run to repeat: those that failed, or all scores."""
     engine: EngineName | None = None

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import shutil
 import subprocess
+from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 
@@ -13,17 +14,19 @@ from gscompleter.apps.bench.report import describe_machine
 from gscompleter.apps.commands.evaluate import run_methods, score_methods
 from gscompleter.apps.commands.options import AUTO, EvaluateOptions
 from gscompleter.config.generators import GeneratorOptions
-from gscompleter.errors import InputError
+from gscompleter.errors import InputError, quote_value
+from gscompleter.evaluation.claims import HEAD, tabulate_claims
 from gscompleter.evaluation.figures import draw_figure
 from gscompleter.evaluation.paper import (
-    DataSet,
     FigureSpec,
     Requirements,
     TableSpec,
+    get_data_set,
     load_paper,
     select_names,
 )
-from gscompleter.evaluation.paper_tables import fill_table, judge_claims, write_paper_table
+from gscompleter.evaluation.paper_tables import fill_table, write_paper_table
+from gscompleter.evaluation.protocols import list_indices
 from gscompleter.evaluation.store import make_file_name
 from gscompleter.evaluation.tables import format_markdown, write_tables
 from gscompleter.io.files import replace_file
@@ -31,7 +34,7 @@ from gscompleter.jobs.jobs import make_folder
 from gscompleter.render import choose_device
 
 UNUSUAL = ("stress", "sequence")
-"""Starts of the protocols that only tables of their own use."""
+"""Kinds of the protocols that only tables of their own use."""
 TABLES, FIGURES, RUNS, RESULTS = "tables", "figures", "runs", "results.md"
 """Files of a reproduction in OUT."""
 
@@ -40,26 +43,41 @@ def run_evaluation(options: EvaluateOptions) -> None:
     """Run the methods of the options, or those that tables and figures of the paper need."""
     is_reproduction = bool(options.preset or options.table or options.figure)
     options = apply_preset(options)
-    models, weights = options.reconstructor, options.weights
-    if len(set(models)) < len(models) or len(weights) not in (0, len(models)):
-        raise InputError(
-            "Every reconstructor has to be another one, with one file of weights each or none; "
-            "change --reconstructor or --weights."
-        )
+    models = options.reconstructor
+    if len(set(models)) < len(models):
+        raise InputError("A reconstructor is named twice; change --reconstructor.")
+    weights = assign_weights(models, options.weights)
     if is_reproduction or len(models) > 1:
         reproduce(options)
     else:
-        run_methods(options)
+        run_methods(replace(options, weights=tuple(weights.values())))
 
 
-def get_preset(options: EvaluateOptions) -> DataSet:
-    """Return the preset of the options, or the defaults without one."""
-    return load_paper().data_sets[options.preset] if options.preset else DataSet()
+def assign_weights(models: Sequence[str], weights: Sequence[Path]) -> dict[str, Path]:
+    """Assign files of weights to reconstructors: one for each in their order, or by `NAME=FILE`.
+
+    Those without a file take the published one. Raise InputError if a file has no reconstructor.
+    """
+    named: dict[str, Path] = {}
+    plain: list[Path] = []
+    for given in weights:
+        name, _, file = str(given).partition("=")
+        if file and name in models:
+            named[name] = Path(file)
+        else:
+            plain.append(given)
+    if plain and (named or len(plain) != len(models)):
+        raise InputError(
+            f"{quote_value(plain[0])} belongs to no reconstructor; give --weights one file for "
+            f"each of {', '.join(models)} in this order, or {models[0]}=FILE for some of them."
+        )
+    return named or dict(zip(models, plain, strict=False))
 
 
 def apply_preset(options: EvaluateOptions) -> EvaluateOptions:
     """Set what is not given as the preset does, or as without one."""
-    preset, synthesis = get_preset(options), options.synthesis
+    preset = get_data_set(options.preset)
+    synthesis = options.synthesis
     if synthesis.generator == AUTO:
         synthesis = replace(synthesis, generator=preset.generator)
     return replace(
@@ -128,11 +146,17 @@ def choose_protocols(options: EvaluateOptions, spec: Requirements) -> tuple[str,
 
     A file of cases, which needs no protocol, has an empty one.
     """
-    kinds = {name.split("-")[0] for name in spec.protocol}
+    kinds = {get_kind(name) for name in spec.protocol}
     if kinds:
-        return tuple(p for p in options.protocol if p.split("-")[0] in kinds) or spec.protocol
-    usual = [p for p in options.protocol if not p.startswith(UNUSUAL)]
-    return tuple(usual[:1]) or get_preset(options).protocol or ("",)
+        return tuple(p for p in options.protocol if get_kind(p) in kinds) or spec.protocol
+    usual = [p for p in options.protocol if get_kind(p) not in UNUSUAL]
+    return tuple(usual[:1]) or get_data_set(options.preset).protocol or ("",)
+
+
+def get_kind(protocol: str) -> str:
+    """Return the kind of a protocol: `n` of n-10 and of our index dl3dv-n-10, `stress`, ...."""
+    parts = protocol.split("-")
+    return parts[1] if protocol in list_indices() else parts[0]
 
 
 def make_run(
@@ -146,11 +170,12 @@ def make_run(
     model = options.reconstructor[number]
     parts = (model, Path(protocol).stem or "cases", synthesis.generator)
     name = " ".join([*parts, *(["one-per-scene"] if one_per_scene else [])])
+    own = assign_weights(options.reconstructor, options.weights).get(model)
     return replace(
         options,
         out=options.out / RUNS / make_file_name(name),
         reconstructor=(model,),
-        weights=options.weights[number : number + 1],
+        weights=() if own is None else (own,),
         protocol=(protocol,) if protocol else (),
         methods=spec.list_methods(),
         synthesis=synthesis,
@@ -165,8 +190,7 @@ def write_results(options: EvaluateOptions) -> str:
     parts = [f"# Results\n\n{', '.join(f'{key} {value}' for key, value in machine.items())}.\n"]
     tables = [out / TABLES / f"{name}.md" for name in paper.tables]
     parts += [path.read_text("utf-8") for path in tables if path.is_file()]
-    head = ["claim", "table", "measured", "verdict"]
-    judged = format_markdown(head, judge_claims(out / TABLES, paper.claims))
+    judged = format_markdown(HEAD, tabulate_claims(out / TABLES, paper.claims))
     parts.append(f"## Claims of the paper\n\n{judged}")
     for name, figure in paper.figures.items():
         if (out / FIGURES / f"{name}.png").is_file():

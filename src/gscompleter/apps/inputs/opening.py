@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import os
 import re
 from collections.abc import Mapping, Sequence
@@ -51,7 +52,12 @@ from gscompleter.memory import (
     format_whole_gigabytes,
     read_memory_bytes,
 )
-from gscompleter.reconstructors.features.depth_range import set_depth_range
+from gscompleter.reconstructors import Reconstructor, get_trained_range
+from gscompleter.reconstructors.features.depth_range import (
+    find_depth_range,
+    measure_feature_depths,
+    set_depth_range,
+)
 from gscompleter.render import Renderer, load_renderer
 from gscompleter.splat_alignment.estimate import align_splat
 from gscompleter.splat_alignment.similarity import transform_camera, transform_view
@@ -59,7 +65,7 @@ from gscompleter.splat_alignment.trainer_frames import InputSplat
 from gscompleter.splats.formats import FORMATS as SPLAT_FORMATS
 from gscompleter.splats.formats import detect_splat_format
 from gscompleter.splats.ply import find_finite_rows
-from gscompleter.stages.context import find_depth_range
+from gscompleter.stages.context import find_splat_range
 from gscompleter.types import Camera, Gaussians, View
 
 MIN_IMAGE_SIZE = 16
@@ -90,7 +96,7 @@ class Task:
     origin: Float[np.ndarray, "3"]
     """Origin of the result in the coordinates of the input; zero unless those are large."""
     depths: Mapping[str, str]
-    """Source of `near` and `far`: given, scene, points, splat or features."""
+    """Source of `near` and `far`: given, scene, points, splat, model or features."""
     scene: Gaussians | None = None
     """Input splat, or None to reconstruct the context."""
     splat_file: InputSplatFile | None = None
@@ -256,10 +262,45 @@ def add_check_views(task: Task, given: Photographs) -> Task:
     return replace(task, check_views=[view.to(task.device) for view in views])
 
 
-def apply_working_range(task: Task, renderer: Renderer) -> Task:
-    """Set the depth range of the photographs."""
-    near, far = find_depth_range(task.views, task.scene, renderer)
+def apply_splat_range(task: Task, scene: Gaussians, renderer: Renderer) -> Task:
+    """Set the depth range of the photographs of an input splat; it is measured if not known."""
+    near, far = find_splat_range(task.views, scene, renderer)
     return replace(task, views=set_depth_range(task.views, near, far))
+
+
+def apply_scene_range(task: Task, reconstructor: Reconstructor) -> Task:
+    """Set the depth range of the photographs from which Ψ reconstructs the scene."""
+    trained = get_trained_range(reconstructor)
+    near, far = find_depth_range(task.views, trained)
+    depths = dict(task.depths)
+    if trained is not None:
+        depths = {name: "model" if s == "features" else s for name, s in depths.items()}
+    return replace(task, views=set_depth_range(task.views, near, far), depths=depths)
+
+
+def describe_range_mismatch(task: Task, reconstructor: Reconstructor) -> list[str]:
+    """Say that the scene's features lie outside of the depths that Ψ was trained on.
+
+    Published networks sweep planes between depths that their authors chose for scenes in metres. A
+    scene in another unit, as of COLMAP, has its surfaces elsewhere, and the networks cannot see it.
+    """
+    trained = get_trained_range(reconstructor)
+    if trained is None or "model" not in task.depths.values():
+        return []
+    depths = measure_feature_depths(task.views)
+    if depths is None:
+        return []
+    nearest, farthest = depths
+    near, far = trained
+    # The geometric mean decides: the farthest features are often mismatches.
+    middle = math.sqrt(nearest * farthest)
+    if near <= middle <= far:
+        return []
+    return [
+        f"The scene lies at depths from {nearest:.2g} to {farthest:.2g}, and this model was "
+        f"trained on {near:g} to {far:g} (metres); scale the cameras to metres, or give --near "
+        "and --far."
+    ]
 
 
 def check_context(options: SceneOptions) -> None:

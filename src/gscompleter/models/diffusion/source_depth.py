@@ -25,7 +25,7 @@ from gscompleter.reconstructors.depth_predictors import DepthPredictor
 from gscompleter.types import Render, View
 
 MONOCULAR_MODEL = "depth-anything/Depth-Anything-V2-Small-hf"
-"""Published depth model of transformers. The authors use MoGe-2."""
+"""Small published depth model of transformers, for `monocular`. The authors use MoGe-2 (large)."""
 PREDICTS_DEPTH = {"depth_anything": False, "dpt": False, "glpn": True}
 """Supported kinds of networks, and True for those that predict depth rather than disparity."""
 UNUSED_TENSORS = r"fusion_stage\.layers\.0\.residual_layer1\."
@@ -134,8 +134,14 @@ def load_source_depth(name: str, device: str = "cpu") -> SourceDepth:
     if name == "context":
         return compute_context_depth
     if name in DEPTH_PREDICTORS:
-        return PredictedDepth(DEPTH_PREDICTORS[name](None, device))
+        return load_predicted(name, device)
     return load_monocular(MONOCULAR_MODEL if name == "monocular" else name, device)
+
+
+@lru_cache(maxsize=1)
+def load_predicted(name: str, device: str = "cpu") -> PredictedDepth:
+    """Load MoGe-2 by its name; it stays loaded, since each target asks for it."""
+    return PredictedDepth(DEPTH_PREDICTORS[name](None, device))
 
 
 @lru_cache(maxsize=1)

@@ -56,11 +56,20 @@ def build(name: str, weights: Path | None = None, device: str = "cpu") -> Learne
     state = read_state_dict(path, published)
     network = create_network(published)
     load_strictly(network, state, path, collect_all_shapes)
-    return wrap_network(network.eval().requires_grad_(False).to(device))
+    network = network.eval().requires_grad_(False).to(device)
+    return wrap_network(network, depth_range=published.near_far)
 
 
-def wrap_network(network: Network, dtype: torch.dtype = torch.float32) -> LearnedReconstructor:
-    """Wrap a network as a reconstructor; any `dtype` but float32 needs a GPU."""
+def wrap_network(
+    network: Network,
+    dtype: torch.dtype = torch.float32,
+    depth_range: tuple[float, float] | None = None,
+) -> LearnedReconstructor:
+    """Wrap a network as a reconstructor; any `dtype` but float32 needs a GPU.
+
+    `depth_range` is near and far for cameras without them, in scene units. Depth Anything 3 sweeps
+    no planes and takes none.
+    """
     inference = Inference(dtype=dtype)
     if isinstance(network, MetricDepthAnything):
         return FromDepth(model=MetricViewDepth(network, inference))
@@ -70,7 +79,7 @@ def wrap_network(network: Network, dtype: torch.dtype = torch.float32) -> Learne
         if network.gs_head is not None:
             return AnyViewGaussians(network, inference)
         return FromDepth(model=AnyViewDepth(network, inference))
-    return FeedForward(network, dtype)
+    return FeedForward(network, dtype, depth_range)
 
 
 def create_network(published: PublishedWeights) -> Network:

@@ -21,13 +21,11 @@ from gscompleter.models.feed_forward.pixel_features import PixelFeatures
 
 @dataclass(frozen=True)
 class DepthSplatConfig:
-    """Architecture of DepthSplat, and its depth range for cameras without one."""
+    """Architecture of DepthSplat."""
 
     depth: DepthConfig = DepthConfig()
     image_size: tuple[int, int] = (256, 256)
     """Height and width of the training images, in pixels; other sizes work too."""
-    near: float = 0.5
-    far: float = 100.0
     gaussian_scale_max: float = 3.0
     """Largest standard deviation of a Gaussian, in scene units."""
 
@@ -48,9 +46,9 @@ VARIANTS: Mapping[str, DepthSplatConfig] = {
     "base-re10k-256x256": DepthSplatConfig(BASE),
     "large-re10k-256x256": DepthSplatConfig(LARGE),
     "base-re10k-256x448": DepthSplatConfig(BASE_WIDE, (256, 448)),
-    "base-dl3dv-256x448": DepthSplatConfig(BASE_WIDE, (256, 448), far=200.0),
-    "small-re10kdl3dv-448x768": DepthSplatConfig(SMALL_WIDE, (448, 768), 0.5, 200.0, 0.1),
-    "base-re10kdl3dv-448x768": DepthSplatConfig(BASE_WIDE, (448, 768), 0.5, 200.0, 0.1),
+    "base-dl3dv-256x448": DepthSplatConfig(BASE_WIDE, (256, 448)),
+    "small-re10kdl3dv-448x768": DepthSplatConfig(SMALL_WIDE, (448, 768), 0.1),
+    "base-re10kdl3dv-448x768": DepthSplatConfig(BASE_WIDE, (448, 768), 0.1),
 }
 """Published variants by size, data and resolution."""
 

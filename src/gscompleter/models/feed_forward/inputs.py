@@ -11,7 +11,7 @@ from torch import Tensor
 
 from gscompleter.errors import InputError
 from gscompleter.models.feed_forward.cameras import Cameras
-from gscompleter.reconstructors.features.depth_range import get_depth_range
+from gscompleter.reconstructors.features.depth_range import estimate_depth_range, get_depth_range
 from gscompleter.types import Camera, DepthMap, View
 
 
@@ -70,11 +70,12 @@ def compute_central_crops(cameras: Sequence[Camera], patch: int) -> list[Crop]:
 
 
 def create_batch(
-    views: Sequence[View], patch: int, near: float, far: float
+    views: Sequence[View], patch: int, depth_range: tuple[float, float] | None = None
 ) -> tuple[Float[Tensor, "1 v 3 h w"], Cameras, list[Crop]]:
     """Create a batch of one scene from the central crops of `views`.
 
-    Cameras without a depth range get `near` and `far`; side lengths are multiples of `patch`.
+    Side lengths are multiples of `patch`. Cameras without near and far get `depth_range` (scene
+    units), or if that is None an estimate from matched features.
 
     Raises:
         InputError: Fewer than two views, an image below one patch, or an empty depth range.
@@ -85,7 +86,11 @@ def create_batch(
         )
     crops = compute_central_crops([view.camera for view in views], patch)
     pairs = list(zip(views, crops, strict=True))
-    ranges = [get_depth_range([view], lambda _: (near, far)) for view in views]
+
+    def fall_back(_: Sequence[View]) -> tuple[float, float]:
+        return depth_range or estimate_depth_range(views)
+
+    ranges = [get_depth_range([view], fall_back) for view in views]
     images = torch.stack([v.image[c.rows, c.columns].movedim(-1, 0) for v, c in pairs])
     cameras = Cameras(
         c2w=torch.stack([view.camera.c2w for view in views])[None].float(),
@@ -98,7 +103,10 @@ def create_batch(
 
 def crop_intrinsics(camera: Camera, crop: Crop) -> Float[Tensor, "3 3"]:
     """Compute the intrinsics of the crop, in units of its width and height."""
-    # The authors' loaders keep (cx, cy), which is the same for central principal points.
+    # The authors' loaders keep (cx, cy) as fractions, which is the same for a central principal
+    # point and an even number of cropped pixels. Here the rest of the completion projects with the
+    # exact camera, so the network gets it too; `AuthorsCrop` makes the authors' cameras for their
+    # data sets, before the views come here.
     K = camera.K.float().clone()
     K[0, 2] -= crop.left
     K[1, 2] -= crop.top

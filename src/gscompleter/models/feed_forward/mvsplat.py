@@ -39,8 +39,6 @@ class MVSplatConfig:
 
     image_size: tuple[int, int] = (256, 256)
     """Height and width of the training images, in pixels; other sizes work too."""
-    near: float = 1.0
-    far: float = 100.0
     depth_chunk: int = 16
     """Number of candidates per step; smaller values need less memory."""
 

@@ -33,6 +33,10 @@ class FeedForward:
     network: MVSplat | DepthSplat | VolSplat
     dtype: torch.dtype = torch.float32
     """Precision of the network under autocast; bfloat16 and float16 need a GPU (untested)."""
+    depth_range: tuple[float, float] | None = None
+    """Near and far z-depth for cameras without a range, in scene units: those of the authors'
+    evaluation. The networks sweep planes in this range and were trained on no other. If None, the
+    range is estimated from matched features."""
 
     def __post_init__(self) -> None:
         check_precision(self.device, self.dtype)
@@ -49,8 +53,8 @@ class FeedForward:
             InputError: Fewer than two views, images smaller than one patch, an empty depth range,
                 or a scene too large for the voxels of VolSplat.
         """
-        config = self.network.config
-        images, cameras, crops = create_batch(views, config.patch, config.near, config.far)
+        patch = self.network.config.patch
+        images, cameras, crops = create_batch(views, patch, self.depth_range)
         # Not torch.inference_mode: later stages optimise these tensors.
         with torch.no_grad(), lower_precision(self.device, self.dtype):
             predicted = self.network(images.to(self.device), cameras.to(self.device))

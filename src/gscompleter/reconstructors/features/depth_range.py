@@ -16,6 +16,8 @@ from gscompleter.types import View
 
 MIN_MATCHES = 12
 """Fewest triangulated features for an estimate."""
+MARGINS = (0.5, 4.0)
+"""Near and far over the depths of the nearest and farthest features."""
 
 
 def estimate_depth_range(views: Sequence[View]) -> tuple[float, float]:
@@ -27,16 +29,36 @@ def estimate_depth_range(views: Sequence[View]) -> tuple[float, float]:
     """
     if len(views) == 1 and len(views[0].known_depths):
         low, high = np.quantile(views[0].known_depths.cpu(), [0.02, 0.98]).tolist()
-        return 0.5 * low, 4.0 * high
+        return MARGINS[0] * low, MARGINS[1] * high
     images, unit = make_stereo_images(views)
     neighbours = find_neighbours(images)
-    inverse = triangulate_neighbours(images, neighbours)
-    if len(inverse) < MIN_MATCHES:
+    depths = measure_extreme_depths(images, neighbours)
+    if depths is None:
         near, far = derive_range_from_baselines(images, neighbours)
     else:
-        low, high = np.quantile(inverse, [0.02, 0.98])
-        near, far = 0.5 / high, 4.0 / low
+        near, far = MARGINS[0] * depths[0], MARGINS[1] * depths[1]
     return near * unit, far * unit
+
+
+def measure_feature_depths(views: Sequence[View]) -> tuple[float, float] | None:
+    """Measure the z-depths of the nearest and farthest 2 % of the features, in scene units.
+
+    None if too few are matched.
+    """
+    images, unit = make_stereo_images(views)
+    depths = measure_extreme_depths(images, find_neighbours(images))
+    return None if depths is None else (depths[0] * unit, depths[1] * unit)
+
+
+def measure_extreme_depths(
+    images: Sequence[StereoImage], neighbours: Neighbours
+) -> tuple[float, float] | None:
+    """Measure the depths of the nearest and farthest 2 %, per widest baseline; None for too few."""
+    inverse = triangulate_neighbours(images, neighbours)
+    if len(inverse) < MIN_MATCHES:
+        return None
+    low, high = np.quantile(inverse, [0.02, 0.98]).tolist()
+    return 1 / high, 1 / low
 
 
 def get_depth_range(
@@ -54,6 +76,17 @@ def get_depth_range(
             "than far."
         )
     return near, far
+
+
+def find_depth_range(
+    views: Sequence[View], trained: tuple[float, float] | None
+) -> tuple[float, float]:
+    """Find near and far z-depth of a scene, in scene units.
+
+    They are those of the first camera; else those that the model was `trained` on; else those of
+    matched features. Raise InputError for an empty range.
+    """
+    return get_depth_range(views, estimate_depth_range if trained is None else lambda _: trained)
 
 
 def set_depth_range(views: Sequence[View], near: float, far: float) -> list[View]:
