@@ -28,6 +28,7 @@ from gscompleter.apps.inputs.opening import (
     check_context,
     check_scene,
     check_targets,
+    choose_working_size,
     describe_task,
     move_to_splat,
     name_target,
@@ -115,6 +116,7 @@ def prepare_completion(options: CompleteOptions, console: Console) -> Prepared:
     get_settings_class(options.synthesis.generator)
     device = choose_device(options.device)
     opened = open_scene(options, console)
+    options = choose_working_size(options, opened.photographs, console)
     if not options.config.ego_mask:
         opened = replace(opened, photographs=opened.photographs.keep_ego_vehicle())
     with show_preparation("reading photographs"):
