@@ -206,7 +206,7 @@ def test_a_completion_without_targets_says_so(out):
     changed(out / "summary.json", lambda summary: summary.update(targets=[]))
     changed(out / "report.json", lambda kept: kept.update(targets=[], pairs=[], photographs=[]))
     said = Page(render_completion_page(out)).said()
-    assert "0 targets" in said
+    assert "targets 0" in said
     assert "At the targets" not in said
 
 

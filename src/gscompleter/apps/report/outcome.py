@@ -20,15 +20,22 @@ MIN_ABOVE_PHOTOGRAPH = 1.0
 """Median over the unused photographs, in dB, of how much nearer the scene is to them than the best
 photograph that was used, left as it is; below it, the scene did not reconstruct.
 
-TODO figures
+Chosen on seven of the scenes of real photographs that the project develops with, at 160 px, from
+two photographs and from the eight that the command chooses. With true poses it is 2.4 to 11.3 dB
+(20 runs). With permuted poses, poses of other axes or of the inverse direction, mirrored or negated
+positions, rotations off by 10 degrees, or unrelated photographs it is -8.2 to 0.3 dB in 59 of 62
+runs. The three others, at 1.0 to 5.9 dB, are scenes to which the error did little: a drive straight
+ahead looks the same mirrored. A focal length that is wrong by a quarter is not noticed in six of
+seven scenes: they are distorted, and still fit the photographs beside them.
 """
 MAX_ABOVE_COLOR = 10.0
 """Median over them, in dB above a single colour, from which a scene did reconstruct all the same:
-where the camera hardly moved, a photograph as it is comes near."""
-MIN_CONSISTENT = 0.35
+where the camera hardly moved, a photograph as it is comes near. Wrong poses reach 8.1 dB."""
+MIN_CONSISTENT = 0.3
 """Share of the matched features that has to fit the poses, where no unused photograph decides.
 
-On the same scenes it is 0.49 to 1.00 with true poses, and 0.00 to 0.26 with wrong ones.
+On the same scenes it is 0.49 to 1.00 with true poses. With wrong ones it is below 0.3 only where
+the cameras differ much, so that this notices about half of them.
 """
 MIN_MATCHES = 20
 """Fewest matched features that decide: by chance, few wrong ones may fit."""
@@ -58,7 +65,9 @@ def judge_completion(
         return OutcomeRow("not-reconstructed", failure)
     if not has_gained(completion):
         return OutcomeRow("nothing-gained", explain_no_gain(completion))
-    return OutcomeRow("completed", describe_gain(completion, held_out, is_given))
+    targets = completion.targets
+    told = describe_gain(count_changed(targets), len(targets), held_out, is_given)
+    return OutcomeRow("completed", told)
 
 
 def count_matches(completion: Completion) -> MatchCount:
@@ -102,9 +111,7 @@ def describe_mismatch(compared: Sequence[HeldOutRow]) -> str:
 
 def has_gained(completion: Completion) -> bool:
     """Return True if a target added or recoloured something, or a new photograph recoloured it."""
-    return bool(completion.recolored_mask.any()) or any(
-        len(result.added) > 0 or result.num_recolored > 0 for result in completion.targets
-    )
+    return bool(completion.recolored_mask.any()) or count_changed(completion.targets) > 0
 
 
 def explain_no_gain(completion: Completion) -> str:
@@ -135,13 +142,16 @@ def make_clause(sentence: str) -> str:
     return clause[:1].lower() + clause[1:]
 
 
-def describe_gain(completion: Completion, held_out: Sequence[HeldOutRow], is_given: bool) -> str:
+def count_changed(targets: Sequence[TargetResult]) -> int:
+    """Count the targets for which something was added or recoloured."""
+    return sum(len(result.added) > 0 or result.num_recolored > 0 for result in targets)
+
+
+def describe_gain(
+    num_changed: int, num_targets: int, held_out: Sequence[HeldOutRow], is_given: bool
+) -> str:
     """Describe a completion, and how unused photographs confirm or contradict it."""
-    changed = sum(
-        len(result.added) > 0 or result.num_recolored > 0 for result in completion.targets
-    )
-    total = len(completion.targets)
-    where = f" for {changed} of {total} targets" if changed < total else ""
+    where = f" for {num_changed} of {num_targets} targets" if num_changed < num_targets else ""
     done = f"The {'splat' if is_given else 'scene'} is completed{where}"
     unused = [row for row in held_out if row.psnr_after is not None and not row.is_check]
     if not unused:
