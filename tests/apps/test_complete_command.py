@@ -14,6 +14,7 @@ from command import run
 from gscompleter import InputError, load_cameras, load_ply, save_ply
 from gscompleter.apps.commands import complete as command
 from gscompleter.apps.commands.evaluate import collect_tasks
+from gscompleter.apps.commands.options import parse_resolution
 from gscompleter.apps.inputs.opening import Opened, Task, estimate_memory, read_task
 from gscompleter.apps.inputs.selection import select_near_and_far
 from gscompleter.cli import parse_command
@@ -72,8 +73,9 @@ def test_the_longer_side_is_shrunk_and_never_enlarged(tmp_path):
 
 
 def test_the_longer_side_has_640_pixels_unless_another_size_is_asked_for():
+    assert parse_resolution(None) == 640
     words = ["complete", "SCENE", "--target", "8", "--out", "OUT"]
-    sizes = {(): 640, ("full",): "full", ("300",): 300, ("300", "200"): (300, 200)}
+    sizes = {(): None, ("full",): "full", ("300",): 300, ("300", "200"): (300, 200)}
     for given, size in sizes.items():
         asked = [*words, "--resolution", *given] if given else words
         assert parse_command(asked).resolution == size

@@ -115,7 +115,7 @@ def test_one_wrong_camera_in_the_list_changes_nothing(room, splat, tmp_path):
 def test_cameras_of_another_splat_are_not_looked_at(tmp_path, splat):
     (tmp_path / "cameras_small.json").write_text("[]")
     given = InputSplat(tmp_path / "splat.ply", splat, np.zeros(3), tmp_path)
-    assert find_camera_lists(given) == []
+    assert find_camera_lists(given.path, given.photographs) == []
 
 
 @pytest.mark.parametrize("world", NERFSTUDIO_WORLDS)
@@ -230,10 +230,10 @@ def test_little_of_a_flat_wall_is_no_sign():
 
 
 def test_details_that_are_off_are_told():
-    off = SplatAlignment("given", np.eye(4), fit_of(5.0, 5.0, drift=4.2), fit_of())
+    off = SplatAlignment("given", np.eye(4), fit_of(5.0, 5.0, drift=4.2), fit_of(), side=240)
     assert off.describe() == (
-        "The splat as it is fits the photographs at 15.0 dB; details are off by "
-        "4.2 px in images of 320 px."
+        "The splat as it is fits the photographs at 15.0 dB in images of 240 px; details are off "
+        "by 4.2 px in them."
     )
 
 

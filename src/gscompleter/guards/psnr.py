@@ -68,7 +68,7 @@ class PsnrGuard(Guard):
 
     def explain_rejection(self, attempt: Attempt) -> str:
         """Name the photographs as the reason."""
-        return "Most of the Gaussians that were generated here make photographs worse."
+        return "Most of the Gaussians that were generated for the target make photographs worse."
 
 
 def set_error_budgets(

@@ -64,14 +64,19 @@ class SplatAlignment:
     fit: SplatFit
     given_fit: SplatFit
     """Fit under the identity."""
+    side: int = LONG_SIDE
+    """Longer side of the largest image in which it was measured, in pixels."""
 
     def describe(self) -> str:
         """Describe the alignment in a sentence."""
-        told = f"The splat {FRAMES[self.method]} fits the photographs at {self.fit.psnr:.1f} dB"
+        told = (
+            f"The splat {FRAMES[self.method]} fits the photographs at {self.fit.psnr:.1f} dB in "
+            f"images of {self.side} px"
+        )
         if self.method != "given":
             told += f" ({self.given_fit.psnr:.1f} dB as given)"
         if DRIFT_WARNING < self.fit.drift < math.inf:
-            told += f"; details are off by {self.fit.drift:.1f} px in images of {LONG_SIDE} px"
+            told += f"; details are off by {self.fit.drift:.1f} px in them"
         return f"{told}."
 
 
@@ -134,7 +139,8 @@ def estimate_alignment(
     photographs, `points` sparse points in their frame.
     """
     given = data.score_transform(np.eye(4))
-    best = SplatAlignment("given", np.eye(4), given, given)
+    side = max(max(view.camera.width, view.camera.height) for view in data.views)
+    best = SplatAlignment("given", np.eye(4), given, given, side)
     if not given.is_match:
         computed = compute_trainer_frames(poses, points)
         normalised: Iterable[FrameProposal] = (("normalised", frame) for frame in computed)

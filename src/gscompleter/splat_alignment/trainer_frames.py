@@ -60,12 +60,13 @@ class InputSplat:
     photographs: Path
     """Folder of the photographs, or a file in it."""
 
-    def list_folders(self) -> list[Path]:
-        """List the folders where trainers leave files, the nearest to the splat first."""
-        near = self.path.resolve().parent
-        model = [near.parent.parent] if near.name.startswith(ITERATION_PREFIX) else []
-        scene = self.photographs if self.photographs.is_dir() else self.photographs.parent
-        return list(dict.fromkeys([near, *model, scene.resolve()]))
+
+def list_trainer_folders(splat: Path, photographs: Path) -> list[Path]:
+    """List the folders where trainers leave files, the nearest to the splat first."""
+    near = splat.resolve().parent
+    model = [near.parent.parent] if near.name.startswith(ITERATION_PREFIX) else []
+    scene = photographs if photographs.is_dir() else photographs.parent
+    return list(dict.fromkeys([near, *model, scene.resolve()]))
 
 
 def read_trainer_frames(
@@ -79,12 +80,12 @@ def read_trainer_frames(
     to_photographs = np.linalg.inv(compute_frame_from_photographs(photographs.origin))
     to_splat = compute_frame_from_photographs(splat.origin)
     ours = dict(collect_poses(photographs))
-    for file in find_camera_lists(splat):
+    for file in find_camera_lists(splat.path, splat.photographs):
         theirs = {f.name: to_splat @ f.c2w for f in read_camera_list(file)}
         transform = fit_named_cameras(ours, theirs)
         if transform is not None:
             yield "cameras", transform
-    for folder in splat.list_folders():
+    for folder in list_trainer_folders(splat.path, splat.photographs):
         if (folder / DATAPARSER_FILE).is_file():
             transform = read_dataparser_transforms(folder / DATAPARSER_FILE)
             for world in NERFSTUDIO_WORLDS:
@@ -102,15 +103,14 @@ def collect_poses(photographs: Photographs) -> list[tuple[str, Matrix]]:
     ]
 
 
-def find_camera_lists(splat: InputSplat) -> list[Path]:
+def find_camera_lists(splat: Path, photographs: Path) -> list[Path]:
     """Find the camera lists whose name matches the splat, the best match first."""
     pattern = f"{CAMERA_LIST_PREFIX}*.json"
     return [
         file
-        for folder in splat.list_folders()
+        for folder in list_trainer_folders(splat, photographs)
         for file in sorted(folder.glob(pattern), key=lambda file: (-len(file.stem), file))
-        if splat.path.stem.endswith(file.stem.removeprefix(CAMERA_LIST_PREFIX))
-        and has_camera_list(file)
+        if splat.stem.endswith(file.stem.removeprefix(CAMERA_LIST_PREFIX)) and has_camera_list(file)
     ]
 
 

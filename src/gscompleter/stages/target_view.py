@@ -26,6 +26,9 @@ NO_TRUST = 0.6
 DISTRUST_BLUR = 2 / 320
 """Standard deviation of the blur of that weight, relative to the longer side of the image."""
 
+NOTHING_TO_COMPLETE = ": nothing to complete."
+"""End of each sentence why a target is skipped that is not refused."""
+
 
 @dataclass(frozen=True)
 class TargetView:
@@ -114,9 +117,9 @@ class TargetView:
         unsure = self.camera.crop(self.holes | (self.distrust > 0))
         same = [v for v in self.state.views if is_same_camera(self.camera.target, v.camera)]
         if any(not (unsure & ~view.valid_mask).any() for view in same):
-            return "The target is a context view: nothing to complete."
+            return f"The target is a context view{NOTHING_TO_COMPLETE}"
         if not unsure.any():
-            return "The scene has no hole here: nothing to complete."
+            return f"The target sees no hole of the scene{NOTHING_TO_COMPLETE}"
         return ""
 
     def make_unchanged_result(self) -> TargetResult:

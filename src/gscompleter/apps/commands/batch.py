@@ -118,6 +118,9 @@ def complete_job(job: Job, jobs: Path) -> dict[str, Any]:
     make_folder(jobs)
     with measure_peak_memory() as peak:
         summary = complete_folder(parse_row(job.options, jobs / job.name))
+    outcome = summary["outcome"]
+    if outcome["status"] == "not-reconstructed":  # its folder stays, to look at
+        raise InputError(outcome["headline"])
     return {
         **average_scores(summary),
         "seconds": time.monotonic() - start,

@@ -19,6 +19,7 @@ from gscompleter.apps.commands.output import describe_run, is_replaceable
 from gscompleter.apps.inputs.opening import (
     apply_splat_range,
     check_context,
+    choose_working_size,
     describe_opening,
     locate_splat,
     move_to_splat,
@@ -93,6 +94,7 @@ def clean_by_photographs(options: CleanOptions, console: Console) -> Cleaning:
     device = choose_device(options.device)
     renderer = load_renderer(device)
     opened = open_scene(options, console)
+    options = choose_working_size(options, opened.photographs, console)
     with show_preparation("reading photographs"):
         task = read_photographs(options, opened, device)
     loaded = read_splat(options)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import sys
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
@@ -28,6 +29,7 @@ from gscompleter.apps.inputs.opening import (
     check_context,
     check_scene,
     check_targets,
+    choose_working_size,
     describe_range_mismatch,
     describe_task,
     move_to_splat,
@@ -40,14 +42,20 @@ from gscompleter.apps.inputs.selection import collect_usable_cameras
 from gscompleter.apps.report.completion import Target, write_report
 from gscompleter.apps.report.film import VIDEO_FILE, write_comparison_video
 from gscompleter.apps.report.page import REPORT_FILE, write_completion_page
-from gscompleter.apps.report.plain_words import format_number, format_percent, list_notes
+from gscompleter.apps.report.plain_words import (
+    format_number,
+    format_percent,
+    group_target_notes,
+    list_notes,
+    list_shared_notes,
+)
 from gscompleter.apps.report.schema import CompletionSummary, average, read_summary
 from gscompleter.apps.warmup import SPLAT_PART, compile_kernels
 from gscompleter.completer import GSCompleter, check_target_ids
 from gscompleter.config.generators import get_settings_class
 from gscompleter.data.local_origin import compute_frame_from_photographs
 from gscompleter.data.scene import write_cameras
-from gscompleter.errors import quote_value
+from gscompleter.errors import PROGRAM, quote_value
 from gscompleter.evaluation.metrics.coverage import render_pairs, sample_held_out_cameras
 from gscompleter.generators import load_generator
 from gscompleter.io.files import COMPLETED_FILE, TARGETS_FILE, check_output, open_output_folder
@@ -110,6 +118,7 @@ def prepare_completion(options: CompleteOptions, console: Console) -> Prepared:
     get_settings_class(options.synthesis.generator)
     device = choose_device(options.device)
     opened = open_scene(options, console)
+    options = choose_working_size(options, opened.photographs, console)
     if not options.config.ego_mask:
         opened = replace(opened, photographs=opened.photographs.keep_ego_vehicle())
     with show_preparation("reading photographs"):
@@ -139,13 +148,18 @@ Prepare = Callable[[Any, Console], Prepared]
 
 
 def run_completion(options: CompleteOptions, prepare: Prepare = prepare_completion) -> None:
-    """Complete the scene, and print a summary."""
+    """Complete the scene, and print a summary. Exit code 1 if the scene did not reconstruct."""
     if options.dry_run:
         plan_folder(options, prepare)
         return
     complete_folder(options, prepare)
+    outcome = read_summary(options.out).outcome
     if not options.quiet:
         print_completion(options)
+    if outcome.status == "not-reconstructed":
+        if options.quiet:
+            print(f"{PROGRAM}{outcome.headline}", file=sys.stderr)
+        sys.exit(1)
 
 
 def run_report(options: ReportOptions) -> None:
@@ -267,11 +281,11 @@ def load_completer(options: CompleteOptions, targets: Sequence[Target], device: 
 
 def print_completion(options: CompleteOptions) -> None:
     """Print the scores per camera, the notes, and the location of the results."""
-    console, summary = Console(highlight=False), read_summary(options.out)
+    console = Console(highlight=False)
+    summary = read_summary(options.out)
+    print_lines(console, summary.outcome.headline)
     console.print(make_score_table(summary))
-    for row in summary.targets:
-        for note in row.notes:
-            console.print(f"{row.name}: {note}")
+    print_lines(console, *list_target_notes(summary))
     for sentence in describe_result(summary, options):
         console.print(sentence, soft_wrap=True)
 
@@ -289,6 +303,14 @@ def make_score_table(summary: CompletionSummary) -> Table:
     return table
 
 
+def list_target_notes(summary: CompletionSummary) -> Iterator[str]:
+    """List the notes on targets: what holds for several is said once."""
+    yield from list_shared_notes(summary)
+    for notes, numbers in group_target_notes(summary.targets).items():
+        if len(numbers) == 1 and summary.outcome.status != "nothing-gained":
+            yield f"{summary.targets[numbers[0] - 1].name}: {' '.join(notes)}"
+
+
 def describe_result(summary: CompletionSummary, options: CompleteOptions) -> Iterator[str]:
     """Write the sentences below the table."""
     yield from list_notes(summary)
@@ -297,11 +319,9 @@ def describe_result(summary: CompletionSummary, options: CompleteOptions) -> Ite
     yield f"{share} around the photographs: {before} before, {after} after."
     unused = [row for row in summary.held_out if not row.is_check]
     if unused:
-        yield (
-            f"Mean PSNR of {len(unused)} photographs that were not used: "
-            f"{format_number(average(row.psnr_before for row in unused))} dB before, "
-            f"{format_number(average(row.psnr_after for row in unused))} dB after."
-        )
+        at_first = format_percent(average(row.covered_before for row in unused))
+        at_last = format_percent(average(row.covered_after for row in unused))
+        yield f"Covered of the photographs that were not used: {at_first} before, {at_last} after."
     counts, seconds = summary.gaussians, summary.seconds["total"]
     yield (
         f"Added {counts['added']:,} Gaussians to {counts['context']:,} in {seconds:.1f} s: "

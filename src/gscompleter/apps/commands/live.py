@@ -100,9 +100,9 @@ def save_session(ready: Prepared, session: Session) -> str:
     out = ready.options.out
     targets = [Target(result.target) for result in session.latest.targets]
     with open_output_folder(out, overwrite=True) as folder:  # checked when the session began
-        write_done(
+        summary = write_done(
             folder, replace(ready, task=replace(ready.task, targets=targets)), session.latest
         )
         if session.cameras:
             write_cameras(folder / TARGETS_FILE, session.cameras)
-    return f"Saved in {quote_value(out)}."
+    return f"Saved in {quote_value(out)}. {summary['outcome']['headline']}"

@@ -116,9 +116,10 @@ class SceneOptions(ComputeOptions, WritingOptions):
     mmdet3d, pandaset, chunks, real-estate-10k, polycam, record3d, 3d-scanner-app or photograph.
     Detected if not given."""
     scene: Path | None
-    resolution: Size = LONG_SIDE
+    resolution: Size | None = None
     """Working size: the longest side in pixels (photographs are never enlarged), or height and
-    width (photographs are scaled and cropped), or `full`."""
+    width (photographs are scaled and cropped), or `full`. If not given, 640, or the size that the
+    splat was trained at if that is smaller."""
     near: float | None = None
     """Smallest depth in the scene, in the unit of its cameras; if not given, that of the data or of
     the model's authors, or else estimated."""
@@ -496,6 +497,7 @@ def get_max_targets(options: CompleteOptions) -> int:
     return DEFAULT_NUM_TARGETS if options.auto is None else options.auto
 
 
-def parse_resolution(given: Size) -> tuple[int, int] | int | None:
+def parse_resolution(given: Size | None) -> tuple[int, int] | int | None:
     """Return `--resolution` as the readers of photographs take it."""
-    return None if given == "full" else given
+    size = LONG_SIDE if given is None else given
+    return None if size == "full" else size

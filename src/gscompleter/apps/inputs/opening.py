@@ -10,6 +10,7 @@ from contextlib import suppress
 from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
+from typing import TypeVar
 
 import numpy as np
 import torch
@@ -18,6 +19,7 @@ from rich.console import Console
 from torch import Tensor
 
 from gscompleter.apps.commands.options import (
+    LONG_SIDE,
     CompleteOptions,
     SceneOptions,
     get_max_targets,
@@ -62,11 +64,14 @@ from gscompleter.render import Renderer, load_renderer
 from gscompleter.splat_alignment.estimate import align_splat
 from gscompleter.splat_alignment.similarity import transform_camera, transform_view
 from gscompleter.splat_alignment.trainer_frames import InputSplat
+from gscompleter.splat_alignment.training_size import find_training_size
 from gscompleter.splats.formats import FORMATS as SPLAT_FORMATS
 from gscompleter.splats.formats import detect_splat_format
 from gscompleter.splats.ply import find_finite_rows
 from gscompleter.stages.context import find_splat_range
 from gscompleter.types import Camera, Gaussians, View
+
+AnySceneOptions = TypeVar("AnySceneOptions", bound=SceneOptions)
 
 MIN_IMAGE_SIZE = 16
 SPLAT_EXTENSIONS = tuple(end for format in SPLAT_FORMATS.values() for end in format.extensions)
@@ -153,6 +158,32 @@ def open_scene(options: SceneOptions, console: Console) -> Opened:
     if number is None:
         return Opened(given, given.format, len(given))
     return Opened(given, "photographs", number)
+
+
+def choose_working_size(
+    options: AnySceneOptions, given: Photographs, console: Console
+) -> AnySceneOptions:
+    """Choose the working size unless it is given: that of the training of a splat, if smaller.
+
+    A larger one is only told: details beyond the default size cost much time, and no harm is done
+    where a splat is rendered smaller than it was trained.
+    """
+    if options.resolution is not None:
+        return options
+    side, trained = LONG_SIDE, None
+    if options.scene is not None:
+        some = collect_usable_cameras(given, range(min(len(given), MAX_NAMED)), LONG_SIDE)
+        trained = find_training_size(options.scene, options.folder, given, list(some))
+    if trained is not None:
+        told = f"{quote_value(options.scene)} was trained at {trained.long_side} px"
+        told += f" ({quote_value(trained.source)})"
+        if trained.long_side <= LONG_SIDE:
+            side = trained.long_side
+            print_lines(console, f"{told}, and so it is completed; --resolution changes that.")
+        else:
+            line = f"{told}; it is completed at {side} px unless --resolution says otherwise."
+            print_lines(console, line)
+    return replace(options, resolution=side)
 
 
 def refuse_splat(path: Path) -> None:

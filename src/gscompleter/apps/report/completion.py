@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 import shutil
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -16,6 +16,7 @@ from torch import Tensor
 from torch.nn.functional import normalize
 
 from gscompleter import __version__
+from gscompleter.apps.report.outcome import judge_completion
 from gscompleter.apps.report.schema import (
     RECORD_FILE,
     SCORES,
@@ -27,8 +28,10 @@ from gscompleter.apps.report.schema import (
     ScoreRow,
     TargetRow,
 )
+from gscompleter.config.settings import COVERED
 from gscompleter.evaluation.metrics.coverage import RenderPair, compute_coverage
-from gscompleter.evaluation.metrics.image import compute_masked_psnr, ssim
+from gscompleter.evaluation.metrics.image import compute_masked_psnr, compute_masked_ssim, ssim
+from gscompleter.evaluation.metrics.unused_photographs import measure_likeness, shrink_view
 from gscompleter.geometry import estimate_up
 from gscompleter.io.files import COMPLETED_FILE, CONTEXT_FILE, SUMMARY_FILE
 from gscompleter.io.image import write_image
@@ -127,12 +130,15 @@ def write_report(
     at_targets = [
         render_before_after(completion, result.target, renderer) for result in completion.targets
     ]
+    held_out_rows = score_held_out(completion, held_out, renderer)
     rows: dict[str, Sequence[ScoreRow]] = {
-        "held_out": score_held_out(completion, held_out, renderer),
+        "held_out": held_out_rows,
         "context": score_context(completion, renderer),
         "targets": score_targets(completion, targets, at_targets, renderer),
     }
     scores = {key: [asdict(row) for row in group] for key, group in rows.items()}
+    is_given = input_splat is not None
+    outcome = asdict(judge_completion(completion, held_out_rows, is_given))
     write_scenes(folder, completion, input_splat)
     around = render_around()
     write_pictures(folder / "images", completion, targets, at_targets)
@@ -140,7 +146,14 @@ def write_report(
     (folder / RECORD_FILE).write_bytes(json.dumps(asdict(record)).encode() + b"\n")
     coverage = {"coverage": asdict(compute_coverage(around))} if around else {}
     counts = {**count_changes(completion), "seconds": dict(completion.seconds)}
-    summary = {"version": __version__, **run_info, **coverage, **scores, **counts}
+    summary = {
+        "version": __version__,
+        "outcome": outcome,
+        **run_info,
+        **coverage,
+        **scores,
+        **counts,
+    }
     (folder / SUMMARY_FILE).write_bytes(json.dumps(summary, indent=2).encode() + b"\n")
     return summary
 
@@ -179,11 +192,37 @@ def score_held_out(
     completion: Completion, held_out: Sequence[HeldOut], renderer: Renderer
 ) -> list[HeldOutRow]:
     """Make the rows of held-out photographs."""
-    scores = score_views(completion, [photograph.view for photograph in held_out], renderer)
-    return [
-        HeldOutRow(photograph.view.frame, **found, is_check=photograph.is_check)
-        for photograph, found in zip(held_out, scores, strict=True)
-    ]
+    used = [shrink_view(view).image for view in completion.views]
+
+    def score(photograph: HeldOut) -> HeldOutRow:
+        view = hide_removed(photograph.view, completion.source, renderer)
+        row = score_photograph(completion, view, renderer)
+        small = shrink_view(view)
+        with torch.no_grad():
+            render = renderer.render(completion.source.rendered, small.camera)
+        likeness = measure_likeness(render, small, used)
+        row = replace(row, is_check=photograph.is_check)
+        return row if likeness is None else replace(row, **asdict(likeness))
+
+    return list(get_view_map(completion.added.means)(score, held_out))
+
+
+def score_photograph(completion: Completion, view: View, renderer: Renderer) -> HeldOutRow:
+    """Score a held-out photograph where the completed scene covers it."""
+    pair = render_before_after(completion, view.camera, renderer)
+    truth, valid = view.image, view.valid_mask
+    covered_before = (pair.before.alpha >= COVERED) & valid
+    covered_after = (pair.after.alpha >= COVERED) & valid
+    num_valid = max(int(valid.sum()), 1)
+    return HeldOutRow(
+        view.frame,
+        psnr_before=compute_masked_psnr(pair.before.image, truth, covered_after),
+        psnr_after=compute_masked_psnr(pair.after.image, truth, covered_after),
+        ssim_before=compute_masked_ssim(pair.before.image, truth, covered_after),
+        ssim_after=compute_masked_ssim(pair.after.image, truth, covered_after),
+        covered_before=int(covered_before.sum()) / num_valid,
+        covered_after=int(covered_after.sum()) / num_valid,
+    )
 
 
 def score_context(completion: Completion, renderer: Renderer) -> list[ContextRow]:

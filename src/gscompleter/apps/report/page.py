@@ -28,7 +28,9 @@ from gscompleter.apps.report.plain_words import (
     format_change,
     format_number,
     format_percent,
+    group_target_notes,
     list_notes,
+    list_shared_notes,
 )
 from gscompleter.apps.report.schema import (
     SCORES,
@@ -142,17 +144,25 @@ def render_completion_page(folder: Path) -> str:
             "summary": summary,
             "record": read_record(folder, summary),
             "gallery": open_gallery(folder / "images"),
-            "notes": list(list_notes(summary)),
+            "notes": [*list_shared_notes(summary), *list_notes(summary)],
+            "own_notes": select_own_notes(summary),
             "describe_alignment": describe_alignment,
             "unit": find_length_unit(summary),
             "mean_held_out": {
-                key: average(getattr(r, key) for r in summary.held_out) for key in SCORES
+                key: average(getattr(r, key) for r in summary.held_out)
+                for key in (*SCORES, "covered_before", "covered_after")
             },
             "seconds": {name: s for name, s in summary.seconds.items() if name != "total"},
             "settings": json.dumps(settings, indent=2, ensure_ascii=False),
             "viewer": VIEWER_FILE if os.path.isfile(folder / VIEWER_FILE) else None,
         },
     )
+
+
+def select_own_notes(summary: CompletionSummary) -> list[Sequence[str]]:
+    """Select the notes that only one target has; those of several are told above."""
+    groups = group_target_notes(summary.targets)
+    return [row.notes if len(groups.get(row.notes, ())) == 1 else () for row in summary.targets]
 
 
 def find_length_unit(summary: CompletionSummary) -> str:

@@ -57,8 +57,34 @@ def list_notes(summary: CompletionSummary) -> Iterator[str]:
     if targets and all(row.psnr_after is None for row in targets):
         yield "No target has a photograph, so there are no scores at targets."
     yield from list_splat_notes(summary)
-    if not targets:
-        yield "No large hole was found around the photographs; nothing was completed."
+
+
+def group_target_notes(targets: Sequence[TargetRow]) -> dict[tuple[str, ...], list[int]]:
+    """Group targets, numbered from 1, that have the same notes; those without notes are left out.
+
+    What holds for several targets is then said once.
+    """
+    groups: dict[tuple[str, ...], list[int]] = {}
+    for number, row in enumerate(targets, start=1):
+        if row.notes:
+            groups.setdefault(row.notes, []).append(number)
+    return groups
+
+
+def list_shared_notes(summary: CompletionSummary) -> Iterator[str]:
+    """List the notes of targets that several have, unless the headline says them."""
+    if summary.outcome.status == "nothing-gained":
+        return
+    for notes, numbers in group_target_notes(summary.targets).items():
+        if len(numbers) > 1:
+            yield f"{name_targets(numbers, len(summary.targets))}: {' '.join(notes)}"
+
+
+def name_targets(numbers: Sequence[int], total: int) -> str:
+    """Name targets by their numbers."""
+    if len(numbers) == total:
+        return f"All {total} targets"
+    return f"Targets {', '.join(map(str, numbers[:-1]))} and {numbers[-1]}"
 
 
 def list_photograph_notes(context: Sequence[ContextRow]) -> Iterator[str]:

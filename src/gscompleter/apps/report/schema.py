@@ -59,9 +59,21 @@ class ContextRow(ScoreRow):
 
 @dataclass(frozen=True)
 class HeldOutRow(ScoreRow):
-    """A photograph that only scores the result."""
+    """A photograph that only scores the result, where the completed scene covers it.
+
+    The scores before are of the same pixels as those after, so that their difference is a gain. The
+    pixels that stay empty are told by the covered shares alone.
+    """
 
     is_check: bool = False
+    covered_before: float = 0.0
+    """Share of the valid pixels that the scene covers before the completion."""
+    covered_after: float = 0.0
+    above_color: float | None = None
+    """PSNR in dB by which the scene before the completion is nearer to the photograph than a single
+    colour, in a small image; None if it covers too little of it."""
+    above_photograph: float | None = None
+    """The same beyond the nearest of the photographs that were used, left as they are."""
 
 
 @dataclass(frozen=True)
@@ -109,6 +121,15 @@ class SceneRow:
 
 
 @dataclass(frozen=True)
+class OutcomeRow:
+    """The verdict on a completion."""
+
+    status: Literal["completed", "nothing-gained", "not-reconstructed"]
+    headline: str
+    """First line of the report and of what the terminal shows."""
+
+
+@dataclass(frozen=True)
 class CompletionSummary:
     """The parts of `summary.json` that pages show."""
 
@@ -117,6 +138,7 @@ class CompletionSummary:
     seed: int
     device: str
     scene: SceneRow
+    outcome: OutcomeRow
     frame: ResultFrame
     depth_range: Mapping[str, Any]
     coverage: Coverage

@@ -43,6 +43,20 @@ def ssim(image: Float[Tensor, "h w 3"], truth: Float[Tensor, "h w 3"]) -> float:
     return float(np.array(channels, a.dtype).mean())
 
 
+def compute_masked_ssim(
+    image: Float[Tensor, "h w 3"], truth: Float[Tensor, "h w 3"], where: Bool[Tensor, "h w"]
+) -> float | None:
+    """Compute SSIM over the pixels of `where` that are not at the border; None without any.
+
+    Elsewhere the image is taken as right, so that what lies beside a pixel does not count.
+    """
+    shown = torch.where(where[..., None], image.clamp(0, 1), truth)
+    inner = slice(RADIUS, -RADIUS)
+    counted = where.cpu().numpy()[inner, inner]
+    similar = compute_ssim_map(shown.cpu().numpy(), truth.cpu().numpy())[inner, inner]
+    return float(similar[counted].mean(dtype=np.float64)) if counted.any() else None
+
+
 def compute_ssim_map(
     a: Float[np.ndarray, "h w 3"], b: Float[np.ndarray, "h w 3"]
 ) -> Float[np.ndarray, "h w 3"]:

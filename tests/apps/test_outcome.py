@@ -1,0 +1,180 @@
+"""Verdicts on completions: success is said only where photographs that were not used confirm it."""
+
+from __future__ import annotations
+
+import json
+import random
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+
+from command import run
+from gscompleter.apps.commands.batch import complete_job
+from gscompleter.apps.report.outcome import describe_gain, is_like, make_clause
+from gscompleter.apps.report.plain_words import list_shared_notes
+from gscompleter.apps.report.schema import (
+    HeldOutRow,
+    OutcomeRow,
+    read_summary,
+)
+from gscompleter.errors import InputError
+from gscompleter.jobs.jobs import Job
+from scenes import camera_at, photographed
+
+PLACES = [(-0.9 + 0.3 * number, -12 + 4 * number) for number in range(7)]
+CONTEXT, TARGET = (0, 2, 4), 6
+SIZE = ("--resolution", 64, "--near", 0.5, "--far", 20)
+
+
+@pytest.fixture(scope="module")
+def scene(tmp_path_factory) -> Path:
+    """Return a room photographed from seven places on a line."""
+    cameras = [camera_at(x, yaw=yaw, size=64) for x, yaw in PLACES]
+    return photographed(tmp_path_factory.mktemp("scene"), cameras)
+
+
+def permute_poses(scene: Path, folder: Path) -> Path:
+    """Copy a scene, with the poses of its photographs permuted."""
+    content = json.loads((scene / "transforms.json").read_text())
+    frames = content["frames"]
+    poses = [frame["transform_matrix"] for frame in frames]
+    random.Random(0).shuffle(poses)
+    for frame, pose in zip(frames, poses, strict=True):
+        frame["transform_matrix"] = pose
+        frame["file_path"] = str(scene / frame["file_path"])
+    folder.mkdir()
+    (folder / "transforms.json").write_text(json.dumps(content))
+    return folder
+
+
+def complete(scene: Path, out: Path, *more: object, target: tuple[int, ...] = (TARGET,)) -> list:
+    return [
+        *("complete", scene, "--context", *CONTEXT, "--target", *target),
+        *("--out", out, *SIZE, *more),
+    ]
+
+
+def outcome_of(out: Path) -> dict:
+    return json.loads((out / "summary.json").read_text())["outcome"]
+
+
+def test_a_scene_that_unused_photographs_confirm_is_a_success(scene, tmp_path, monkeypatch, capsys):
+    out = tmp_path / "out"
+    assert run(monkeypatch, *complete(scene, out)) == 0
+    said, outcome = capsys.readouterr().out, outcome_of(out)
+    assert outcome["status"] == "completed"
+    assert said.startswith(outcome["headline"])
+    assert "the 3 nearest unused photographs, where it covers them: " in outcome["headline"]
+    for row in json.loads((out / "summary.json").read_text())["held_out"]:
+        assert row["above_photograph"] > 2
+        assert 0.3 < row["covered_before"] <= row["covered_after"] <= 1
+
+
+def test_a_scene_of_wrong_poses_is_no_success(scene, tmp_path, monkeypatch, capsys):
+    broken, out = permute_poses(scene, tmp_path / "broken"), tmp_path / "out"
+    assert run(monkeypatch, *complete(broken, out)) == 1
+    said, outcome = capsys.readouterr(), outcome_of(out)
+    assert outcome["status"] == "not-reconstructed"
+    assert outcome["headline"].startswith("The scene did not reconstruct: at the 3 nearest unused")
+    assert said.out.startswith(outcome["headline"])
+    page = (out / "report.html").read_text()
+    assert page.index(outcome["headline"]) < page.index("<h1>")
+    assert "not reconstructed</title>" in page
+    assert (out / "completed.ply").is_file()  # to look at
+
+    assert run(monkeypatch, *complete(broken, tmp_path / "quiet", "--quiet")) == 1
+    said = capsys.readouterr()
+    assert said.out == ""
+    assert said.err == f"gscompleter: {outcome['headline']}\n"
+
+
+def test_a_job_of_a_batch_that_did_not_reconstruct_has_failed(scene, tmp_path):
+    broken = permute_poses(scene, tmp_path / "broken")
+    options = {"folder": str(broken), "context": list(CONTEXT), "target": [TARGET]}
+    job = Job("broken", {**options, "resolution": 64, "near": 0.5, "far": 20})
+    with pytest.raises(InputError, match="The scene did not reconstruct: at the 3"):
+        complete_job(job, tmp_path / "jobs")
+    assert (tmp_path / "jobs" / "broken" / "report.html").is_file()
+
+
+def test_without_unused_photographs_shared_features_decide(scene, tmp_path, monkeypatch):
+    broken = permute_poses(scene, tmp_path / "broken")
+    folders = {scene: ("completed", 0), broken: ("not-reconstructed", 1)}
+    for folder, (status, code) in folders.items():
+        out = tmp_path / status
+        words = complete(folder, out, "--quiet")
+        words[3:6] = [number for number in range(7) if number != TARGET]
+        assert run(monkeypatch, *words) == code
+        assert outcome_of(out)["status"] == status
+        assert json.loads((out / "summary.json").read_text())["held_out"] == []
+
+
+def test_the_reason_for_no_gain_is_the_first_line_and_is_said_once(
+    scene, tmp_path, monkeypatch, capsys
+):
+    out = tmp_path / "out"
+    assert run(monkeypatch, *complete(scene, out, target=CONTEXT)) == 0
+    said, outcome = capsys.readouterr().out, outcome_of(out)
+    assert outcome == {
+        "status": "nothing-gained",
+        "headline": ("Nothing was gained, because the target is a context view (3 of 3 targets)."),
+    }
+    assert said.startswith(outcome["headline"])
+    assert said.count("context view") == 1
+    page = (out / "report.html").read_text()
+    assert page.index(outcome["headline"]) < page.index("<h1>")
+    assert page.count("The target is a context view") == 0
+    assert page.count("Nothing was added here.") == 3
+
+
+def test_notes_of_several_targets_are_said_once(completed_room):
+    summary = read_summary(completed_room)
+    (row,) = summary.targets
+    noted = replace(row, notes=("It rained.", "It was dark."))
+    other = replace(row, notes=("It rained.",))
+    three = replace(summary, targets=(noted, other, noted))
+    assert list(list_shared_notes(three)) == ["Targets 1 and 3: It rained. It was dark."]
+    all_three = replace(summary, targets=(other, other, other))
+    assert list(list_shared_notes(all_three)) == ["All 3 targets: It rained."]
+    assert list(list_shared_notes(replace(summary, targets=(noted, other)))) == []
+    nothing = OutcomeRow("nothing-gained", "Nothing was gained, because it rained.")
+    assert list(list_shared_notes(replace(all_three, outcome=nothing))) == []
+
+
+def held_out(above_photograph: float, above_color: float) -> HeldOutRow:
+    none = dict.fromkeys(("psnr_before", "psnr_after", "ssim_before", "ssim_after"))
+    return HeldOutRow(5, **none, above_photograph=above_photograph, above_color=above_color)
+
+
+@pytest.mark.parametrize(
+    ("rows", "expected"),
+    [
+        ([(3.0, 5.0)], True),
+        ([(1.1, 2.0), (1.1, 2.0)], True),
+        ([(0.9, 2.0), (0.9, 2.0)], False),
+        ([(-4.0, 0.1), (-3.0, 0.2), (5.0, 6.0)], False),  # one by chance
+        ([(0.2, 15.0), (-0.2, 14.0)], True),  # a camera that hardly moved
+    ],
+)
+def test_a_scene_is_more_like_unused_photographs_than_used_ones_are(rows, expected):
+    assert is_like([held_out(*row) for row in rows]) is expected
+
+
+@pytest.mark.parametrize(
+    ("before", "after", "ending"),
+    [
+        (20.0, 21.0, "the unused photograph 5, where it covers them: 20.00 dB before, 21.00 dB"),
+        (20.0, 19.0, "but the unused photograph 5 is matched worse than before: 20.00 dB"),
+    ],
+)
+def test_a_loss_at_unused_photographs_is_in_the_headline(before, after, ending):
+    row = replace(held_out(3.0, 5.0), psnr_before=before, psnr_after=after)
+    assert ending in describe_gain(1, 1, [row], is_given=False)
+
+
+def test_sentences_become_clauses():
+    assert make_clause("The target sees no hole of the scene: nothing to complete.") == (
+        "the target sees no hole of the scene"
+    )
+    assert make_clause("Only 3% agree.") == "only 3% agree"
