@@ -20,9 +20,10 @@ from gscompleter.data.driving.mmdet3d import has_infos, open_infos
 from gscompleter.data.driving.pandaset import has_pandaset, open_pandaset
 from gscompleter.data.driving.waymo import list_segments, open_waymo
 from gscompleter.data.ego_vehicle import attach_vehicle_detector
-from gscompleter.data.frame import FOLDERS
+from gscompleter.data.frame import FOLDERS, describe_moved, keep_posed
 from gscompleter.data.limits import check_planes, require
 from gscompleter.data.llff import has_llff, open_llff
+from gscompleter.data.masks import attach_masks
 from gscompleter.data.one_photograph import find_photograph, open_photograph
 from gscompleter.data.phones.apps import POLYCAM, SCANNER_APP, find_recording, open_recording
 from gscompleter.data.photographs import Photographs
@@ -93,8 +94,12 @@ def open_photographs(
     near, far = scene.near if near is None else near, scene.far if far is None else far
     check_planes(near, far)
     sparse = None if scene.sparse is None else cache(scene.sparse)
-    frames = attach_vehicle_detector(scene.frames)
-    return replace(scene, frames=frames, near=near, far=far, format=found, sparse=sparse)
+    posed, lost = keep_posed(scene.frames, scene.title)
+    notes = (*scene.notes, *lost, *describe_moved(posed, scene.title))
+    frames = attach_vehicle_detector(attach_masks(posed))
+    return replace(
+        scene, frames=frames, near=near, far=far, notes=notes, format=found, sparse=sparse
+    )
 
 
 def detect_format(path: Path, name: str | None = None) -> str:

@@ -5,9 +5,10 @@ from __future__ import annotations
 import json
 import shutil
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from functools import partial
 from pathlib import Path
+from types import MappingProxyType
 from typing import Any
 
 import torch
@@ -49,7 +50,8 @@ FRUSTUM = ((-1, -1, 1), (1, -1, 1), (1, 1, 1), (-1, 1, 1))
 FRUSTUM_DEPTH = 0.11
 """Length of a camera pyramid, in radii."""
 
-Scores = dict[str, float | None]
+Scores = dict[str, Any]
+"""PSNR and SSIM before and after by name, or None without a photograph."""
 
 
 @dataclass(frozen=True)
@@ -65,6 +67,8 @@ class Target:
     """True for pixels that are not scored; None if all are."""
     derived_from: int | None = None
     """Frame number that a planned camera was derived from; None if the user gave the camera."""
+    offset: str | None = None
+    """Move and turn of a planned camera from that frame, in words."""
 
     @property
     def view(self) -> View | None:
@@ -118,11 +122,12 @@ def write_report(
     photographs: Sequence[Camera] = (),
     render_around: Callable[[], Sequence[RenderPair]] = list,
     held_out: Sequence[HeldOut] = (),
+    files: Mapping[int | None, str] = MappingProxyType({}),
 ) -> dict[str, Any]:
     """Write the scenes, `images/`, `report.json` and `summary.json`; return the summary.
 
     `photographs` are the cameras of all, in the frame of the result. `render_around` renders the
-    views whose coverage is measured.
+    views whose coverage is measured. `files` are those of the photographs by frame.
     """
     at_targets = [
         render_before_after(completion, result.target, renderer) for result in completion.targets
@@ -130,9 +135,19 @@ def write_report(
     rows: dict[str, Sequence[ScoreRow]] = {
         "held_out": score_held_out(completion, held_out, renderer),
         "context": score_context(completion, renderer),
-        "targets": score_targets(completion, targets, at_targets, renderer),
+        "targets": [
+            replace(
+                row,
+                derived_file=files.get(row.derived_from),
+                anchor_file=files.get(row.anchor),
+            )
+            for row in score_targets(completion, targets, at_targets, renderer)
+        ],
     }
-    scores = {key: [asdict(row) for row in group] for key, group in rows.items()}
+    scores = {
+        key: [asdict(replace(row, file=files.get(row.frame))) for row in group]
+        for key, group in rows.items()
+    }
     write_scenes(folder, completion, input_splat)
     around = render_around()
     write_pictures(folder / "images", completion, targets, at_targets)
@@ -240,6 +255,7 @@ def make_target_row(
         target_id=result.target_id if len(added) or result.num_recolored else None,
         notes=result.notes,
         refused=result.refusal,
+        offset=target.offset,
     )
 
 
