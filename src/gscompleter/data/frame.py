@@ -121,6 +121,13 @@ class Frame:
             )
         return stored
 
+    def find_turn(self) -> int:
+        """Return the EXIF orientation by which the photograph is turned; 1 without a photograph."""
+        stored = self.find_stored()
+        if stored is None:
+            return 1
+        return self.find_orientation(stored, *read_image_size(stored, capitalize(self.title)))
+
     def find_orientation(self, stored: Path | bytes, width: int, height: int) -> int:
         """Return the EXIF orientation by which stored pixels have to be turned, or 1.
 

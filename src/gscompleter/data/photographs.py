@@ -107,6 +107,16 @@ class Photographs:
         """Return a copy in which masks and alpha channels hide nothing."""
         return replace(self, is_masked=False)
 
+    def leave_out_masks_in(self, folder: Path) -> Photographs:
+        """Return a copy without the masks in a folder, which mean something else."""
+        frames = [
+            replace(frame, mask=None)
+            if frame.mask is not None and folder.resolve() in frame.mask.resolve().parents
+            else frame
+            for frame in self.frames
+        ]
+        return replace(self, frames=tuple(frames))
+
     def is_hidden(self, frame: int) -> bool:
         """Check whether a mask or the alpha channel hides all of a photograph."""
         found = self.frame(frame)

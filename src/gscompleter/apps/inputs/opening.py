@@ -18,6 +18,7 @@ from torch import Tensor
 
 from gscompleter.apps.commands.options import (
     CompleteOptions,
+    RemoveOptions,
     SceneOptions,
     get_max_targets,
     parse_resolution,
@@ -155,6 +156,8 @@ def open_scene(options: SceneOptions, console: Console) -> Opened:
         folder, number = poses, found.photographs
     given = open_photographs(folder, options.format, options.near, options.far)
     given = given if options.masks else given.leave_out_masks()
+    if isinstance(options, RemoveOptions) and options.mask is not None:
+        given = given.leave_out_masks_in(options.mask)
     print_lines(console, *given.notes)
     assert given.format is not None
     if number is None:
