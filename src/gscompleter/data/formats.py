@@ -50,6 +50,13 @@ class Format:
     """Unit of the coordinates, or None if the format does not define it."""
 
 
+# fmt: off
+UNREAD = (
+    ".dng", ".cr2", ".cr3", ".nef", ".arw", ".raf", ".rw2", ".orf", ".raw",  # of cameras
+    ".jxl", ".exr", ".hdr", ".psd",
+)
+# fmt: on
+"""Endings of photographs that are not read: raw data of cameras, and formats of other programs."""
 MAX_NAMED = 4
 """Most scenes that the message names."""
 
@@ -117,6 +124,7 @@ def detect_format(path: Path, name: str | None = None) -> str:
     if found is None:
         refuse_other_exports(path)
         refuse_scenes_below(path)
+        refuse_unread(path)
         kind = f"photographs in the format {name}" if name else "posed photographs"
         raise InputError(f"There are no {kind} in {quote_value(path)}; {advice}.")
     return found
@@ -145,6 +153,18 @@ def refuse_scenes_below(path: Path) -> None:
         f"{quote_value(path, 50)} is no scene itself, but holds {len(found)} scene(s) below it: "
         f"{names}; name one of them.",
     )
+
+
+def refuse_unread(path: Path) -> None:
+    """Refuse photographs in a file format that is not read, by its name and with the way out."""
+    names = sorted(os.listdir(path)) if os.path.isdir(path) else [path.name]
+    unread = [name for name in names if name.lower().endswith(UNREAD)]
+    if unread:
+        raise InputError(
+            f"{quote_value(path)} holds {len(unread)} photographs such as "
+            f"{quote_value(unread[0])}, whose format is not read; export JPEG or PNG from the "
+            "program that develops them."
+        )
 
 
 def find_format(path: Path) -> str | None:

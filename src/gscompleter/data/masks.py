@@ -51,15 +51,18 @@ def attach_masks(frames: Sequence[Frame]) -> tuple[Frame, ...]:
 def find_mask(photograph: Path, name: str, listings: FolderListings) -> Path | None:
     """Find the mask of a photograph; `name` is its path below the scene or its image folder."""
     parts = PurePosixPath(name).parts
-    depth = len(parts) if photograph.parts[-len(parts) :] == parts else 1
+    is_below = not PurePosixPath(name).is_absolute() and photograph.parts[-len(parts) :] == parts
+    depth = len(parts) if is_below else 1
     home = photograph.parents[depth - 1]
     relatives = [PurePosixPath(*photograph.parts[-depth:])]
-    if depth > 1 and photograph.parts[-depth].casefold() in FOLDERS:
-        # A transforms.json calls it "images/x.png", and its mask is masks/x.png.
-        relatives.append(PurePosixPath(*photograph.parts[1 - depth :]))
     roots = [home, photograph.parent]
+    # A transforms.json calls it "images/x.png" and COLMAP "x.png", and its mask is masks/x.png or
+    # masks/images/x.png.
+    if depth > 1 and photograph.parts[-depth].casefold() in FOLDERS:
+        relatives.append(PurePosixPath(*photograph.parts[1 - depth :]))
     if home.name.casefold() in FOLDERS:
         roots.append(home.parent)
+        relatives.append(PurePosixPath(home.name, *photograph.parts[-depth:]))
     folders = [root / folder for root, folder in product(dict.fromkeys(roots), MASK_FOLDERS)]
     in_folders = [mask for path in relatives for mask in list_mask_names(path, is_beside=False)]
     found = (

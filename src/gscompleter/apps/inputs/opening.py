@@ -31,8 +31,9 @@ from gscompleter.apps.inputs.selection import (
 )
 from gscompleter.apps.report.completion import InputSplatFile, Target, compute_mask_fraction
 from gscompleter.apps.report.names import name_photograph, name_target
-from gscompleter.data.camera_files import refuse_other_exports
+from gscompleter.data.camera_files import is_in_splat_frame, refuse_other_exports
 from gscompleter.data.formats import find_format, open_photographs, refuse_scenes_below
+from gscompleter.data.frame import FOLDERS
 from gscompleter.data.given_depth import give_depths
 from gscompleter.data.local_origin import (
     choose_scene_origin,
@@ -150,6 +151,7 @@ def open_scene(options: SceneOptions, console: Console) -> Opened:
     if options.format is None and has_photographs(folder) and find_format(folder) is None:
         refuse_other_exports(folder)
         refuse_scenes_below(folder)
+        print_lines(console, *describe_cameras_above(folder))
         ours = options.overwrite or os.path.isfile(poses / SUMMARY_FILE)
         found = find_poses(folder, poses, ours, options.frames)
         print_lines(console, *found.notes)
@@ -163,6 +165,18 @@ def open_scene(options: SceneOptions, console: Console) -> Opened:
     if number is None:
         return Opened(given, given.format, len(given))
     return Opened(given, "photographs", number)
+
+
+def describe_cameras_above(folder: Path) -> list[str]:
+    """Say that the folder above one of photographs has their cameras, which are not used."""
+    above = folder.resolve().parent
+    found = find_format(above) if folder.name.casefold() in FOLDERS else None
+    if found is None or found == "photograph":
+        return []
+    return [
+        f"{quote_value(above)} has cameras of these photographs ({found}); name that folder to use "
+        "them. Here they are found anew."
+    ]
 
 
 def refuse_splat(path: Path) -> None:
@@ -241,11 +255,18 @@ def move_to_splat(
     scene = shift_to_origin(origin, scene, task.cameras).to(task.device)
     splat = InputSplat(path, scene, origin, options.folder)
     found = align_splat(splat, given, task.context_frames, load_renderer(task.device.type))
+    # Cameras were read relative to the origin of the photographs, whatever frame they are in.
+    back = compute_frame_from_photographs(-given.origin)
+    to_result = {
+        False: found.transform,
+        True: compute_frame_from_photographs(origin) @ back,
+    }
     return replace(
         task,
         views=[transform_view(view, found.transform) for view in task.views],
         targets=[
-            replace(t, camera=transform_camera(t.camera, found.transform)) for t in task.targets
+            replace(t, camera=transform_camera(t.camera, to_result[t.is_in_splat_frame]))
+            for t in task.targets
         ],
         frame=found.transform @ task.frame,
         origin=given.origin if found.method == "given" else origin,
@@ -319,7 +340,8 @@ def read_targets(given: Photographs, options: CompleteOptions) -> list[Target]:
     for word in options.target:
         if os.path.exists(word) and not is_image(word):
             cameras = load_cameras(word, resolution, origin=given.origin.tolist())
-            targets += [Target(camera) for camera in cameras]
+            is_of_splat = options.scene is not None and is_in_splat_frame(Path(word))
+            targets += [Target(camera, is_in_splat_frame=is_of_splat) for camera in cameras]
         else:
             frame = find_frame(given, word, "target")
             targets.append(Target(given.camera(frame, resolution), frame))

@@ -69,6 +69,8 @@ class Target:
     """Frame number that a planned camera was derived from; None if the user gave the camera."""
     offset: str | None = None
     """Move and turn of a planned camera from that frame, in words."""
+    is_in_splat_frame: bool = False
+    """True if the camera is in the frame of the input splat's file."""
 
     @property
     def view(self) -> View | None:

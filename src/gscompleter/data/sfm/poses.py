@@ -312,9 +312,7 @@ def write_copies(
     return copies
 
 
-def write_upright(
-    root: Path, source: str, folder: Path, mask: Path | None = None
-) -> UprightCopy:
+def write_upright(root: Path, source: str, folder: Path, mask: Path | None = None) -> UprightCopy:
     """Write an upright copy of the photograph `root`/`source` to the same place in `folder`/images.
 
     A small upright 8-bit JPEG or PNG is copied byte for byte; a format that COLMAP may not read
