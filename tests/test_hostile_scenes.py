@@ -36,7 +36,7 @@ def read(path: Path) -> None:
     photographs = open_photographs(path)
     for frame in range(len(photographs)):
         photographs.views([frame])
-        photographs.mask(frame)
+        photographs.find_moving(frame)
 
 
 # ---- infos of nuScenes and Waymo ----------------------------------------------------------------

@@ -14,7 +14,7 @@ from dataclasses import replace
 import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
-from torch.nn.functional import avg_pool2d
+from torch.nn.functional import avg_pool2d, max_pool2d
 
 from gscompleter.config import CleaningConfig
 from gscompleter.guards.psnr import (
@@ -97,7 +97,7 @@ def predict_error_change(
     full = scene.opacities
     left = torch.where(faded, full.clamp_max(FADED_OPACITY), full)
     error, gradient = compute_mse_and_gradient(plan, view, left)
-    square = estimate_squared_gradient(plan, left, probes, generator)
+    square = estimate_squared_gradient(plan, left, view.valid_mask, probes, generator)
     # Difference of the parabola between zero and full opacity, expanded at `left`.
     return (square * (left**2 - (full - left) ** 2) - gradient * full) / max(error, MIN_ERROR)
 
@@ -105,12 +105,14 @@ def predict_error_change(
 def estimate_squared_gradient(
     plan: OpacityRender,
     opacities: Float[Tensor, "n"],
+    counted: Bool[Tensor, "h w"],
     probes: int,
     generator: torch.Generator,
 ) -> Float[Tensor, "n"]:
-    """Estimate the mean squared gradient of the image's colours in each opacity.
+    """Estimate the mean squared gradient of the counted pixels' colours in each opacity.
 
-    The estimate is unbiased: with random signs, products of different pixels cancel on average.
+    The mean is over the whole image. The estimate is unbiased: with random signs, products of
+    different pixels cancel on average.
     """
     with torch.enable_grad():
         variable = opacities.detach().clone().requires_grad_()
@@ -118,17 +120,21 @@ def estimate_squared_gradient(
         squares = torch.zeros_like(opacities)
         for _ in range(probes):
             signs = torch.randint(0, 2, image.shape, generator=generator).to(image) * 2 - 1
+            signs = signs * counted[..., None]
             (gradient,) = torch.autograd.grad((signs * image).sum(), variable, retain_graph=True)
             squares += gradient**2
     return squares / probes / image.numel()
 
 
 def halve_view(view: View) -> View:
-    """Reduce a photograph to half its size."""
+    """Reduce a photograph to half its size; a pixel with an ignored part is ignored."""
     image = avg_pool2d(view.image.permute(2, 0, 1), 2).permute(1, 2, 0)
     K = view.camera.K * view.camera.K.new_tensor([[0.5], [0.5], [1.0]])
     camera = replace(view.camera, K=K, height=image.shape[0], width=image.shape[1])
-    return View(image, camera, view.frame)
+    ignored = None
+    if view.ignore_mask is not None:
+        ignored = max_pool2d(view.ignore_mask[None].float(), 2)[0] > 0
+    return View(image, camera, view.frame, ignore_mask=ignored)
 
 
 def exclude_needed(

@@ -408,7 +408,7 @@ def test_old_option_names_of_other_commands_and_of_rows_work_too(tmp_path, capsy
     translate_name.cache_clear()
     words = ["evaluate", "cases.json", "--out", "o", "--again", "scores", "--ignore-masked"]
     options = parse_command(words)
-    assert (options.rerun, options.use_masks) == ("scores", True)
+    assert (options.rerun, options.ignore_moving) == ("scores", True)
     assert (
         parse_command(["batch", "m.csv", "--out", "o", "--again", "failures"]).rerun == "failures"
     )

@@ -75,7 +75,7 @@ def test_nuscenes_cameras_show_boxes_where_its_own_infos_put_them(shared, tmp_pa
 def test_moving_things_of_nuscenes_are_masked_and_parked_ones_are_not(shared, tmp_path):
     info, sample = nuscenes(shared, tmp_path)
     photographs = open_photographs(info)
-    mask = photographs.mask(0)
+    mask = photographs.find_moving(0)
     assert 0 < mask.float().mean() < 0.2
     speeds = [(t, float(np.hypot(*t["velocity"]))) for t in sample["cam_instances"]["CAM_FRONT"]]
     fast = [t for t, speed in speeds if speed > 1]

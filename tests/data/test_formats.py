@@ -13,7 +13,7 @@ from command import run
 from gscompleter import InputError
 from gscompleter.data.cases import open_clips, read_cases
 from gscompleter.data.formats import FORMATS, open_photographs, refuse_scenes_below
-from gscompleter.data.photographs import Photographs
+from gscompleter.data.photographs import Photographs, Resolution
 from gscompleter.data.real_estate import read_camera_file
 from gscompleter.data.scene import write_cameras
 from gscompleter.types import View
@@ -228,11 +228,15 @@ def test_masks_say_what_to_ignore_at_the_resolution_of_the_photograph(tmp_path):
     content["frames"][0]["mask_path"] = "mask.png"
     (scene / "transforms.json").write_text(json.dumps(content))
     photographs = open_photographs(scene)
-    assert torch.equal(photographs.mask(0), torch.from_numpy(shown == 0))
+
+    def ignored(frame: int, resolution: Resolution = None) -> torch.Tensor | None:
+        return photographs.views([frame], resolution)[0].ignore_mask
+
+    assert torch.equal(ignored(0), torch.from_numpy(shown == 0))
     # 64 x 64 becomes 32 x 32, of which eight columns are cropped on either side: the mask's half.
-    assert not photographs.mask(0, (32, 16)).any()
-    assert photographs.mask(0, (32, 32)).sum() == 32 * 8
-    assert photographs.mask(1) is None
+    assert not ignored(0, (32, 16)).any()
+    assert ignored(0, (32, 32)).sum() == 32 * 8
+    assert ignored(1) is None
 
 
 def test_copies_of_other_folders_are_no_photographs_of_this_one(tmp_path):

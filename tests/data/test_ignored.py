@@ -10,7 +10,6 @@ from gscompleter import InputError
 from gscompleter.config import RefineConfig
 from gscompleter.data.driving.vehicle import compute_moving_boxes, mask_moving
 from gscompleter.data.formats import open_photographs
-from gscompleter.data.photographs import apply_masks
 from gscompleter.evaluation.metrics.scores import Truth, score
 from gscompleter.generators.warp import warp_photographs
 from gscompleter.geometry import compute_sparse_depth, unproject
@@ -130,7 +129,7 @@ def test_scores_count_nothing_there():
     assert counted.abs_rel > ignoring.depth_observed.abs_rel + 0.1
 
 
-def test_masks_of_files_are_ignored_where_asked(tmp_path):
+def test_masks_of_files_are_ignored_unless_left_out(tmp_path):
     folder = photographed(tmp_path, [camera_at(x, size=SIZE) for x in (0.0, 0.3)])
     photographs = open_photographs(folder)
     for name, mask in (("one.png", square()), ("all.png", torch.ones(SIZE, SIZE) > 0)):
@@ -140,13 +139,14 @@ def test_masks_of_files_are_ignored_where_asked(tmp_path):
         for frame, name in zip(photographs.frames, ("one.png", "all.png"), strict=True)
     ]
     masked = replace(photographs, frames=tuple(frames))
-    assert (photographs.has_masks, masked.has_masks) == (False, True)
-    (view,) = apply_masks(masked.views([0]), masked)
-    assert torch.equal(view.ignore_mask, square())
-    (plain,) = apply_masks(photographs.views([0]), photographs)
-    assert plain.ignore_mask is None
+    assert torch.equal(masked.views([0])[0].ignore_mask, square())
+    assert photographs.views([0])[0].ignore_mask is None
+    (whole,) = masked.leave_out_masks().views([0])
+    assert whole.ignore_mask is None
+    assert torch.equal(whole.image, photographs.views([0])[0].image)
+    assert [masked.is_hidden(frame) for frame in (0, 1)] == [False, True]
     with pytest.raises(InputError, match="All of frame 1 of .* is masked"):
-        apply_masks(masked.views([1]), masked)
+        masked.views([1])
 
 
 def box_at(center: tuple[float, ...], speed: float, turn: float = 0.0) -> np.ndarray:

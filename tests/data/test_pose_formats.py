@@ -390,5 +390,6 @@ def test_masks_lie_in_a_folder_beside_the_photographs(tmp_path):
     Image.fromarray(shown).save(scene / "masks" / "1.png")
     photographs = open_photographs(scene)
     for number in (0, 1):
-        assert torch.equal(photographs.mask(number), torch.from_numpy(shown == 0))
-    assert photographs.mask(2) is None
+        (view,) = photographs.views([number])
+        assert torch.equal(view.ignore_mask, torch.from_numpy(shown == 0))
+    assert photographs.views([2])[0].ignore_mask is None

@@ -258,7 +258,7 @@ def test_copies_stand_upright_and_know_their_focal_length(tmp_path):
     exif[ORIENTATION] = 6  # stored lying on its left side: its left is the top
     exif.get_ifd(0x8769)[FOCAL_35] = 43
     image.save(tmp_path / "a.jpg", exif=exif)
-    copy = write_upright(tmp_path, "a.jpg", tmp_path / "images")
+    copy = write_upright(tmp_path, "a.jpg", tmp_path)
     assert (copy.width, copy.height) == (800, MAX_SIDE)
     assert copy.focal == pytest.approx(43 / 43.2666 * (800**2 + 1600**2) ** 0.5)
     with Image.open(tmp_path / "images" / "a.jpg") as written:
@@ -269,13 +269,13 @@ def test_copies_stand_upright_and_know_their_focal_length(tmp_path):
 
 def test_an_upright_small_photograph_is_copied_byte_for_byte(tmp_path):
     Image.new("RGB", (64, 48), "red").save(tmp_path / "a.jpg")
-    write_upright(tmp_path, "a.jpg", tmp_path / "images")
+    write_upright(tmp_path, "a.jpg", tmp_path)
     assert (tmp_path / "images/a.jpg").read_bytes() == (tmp_path / "a.jpg").read_bytes()
 
 
 def test_other_formats_become_png(tmp_path):
     Image.new("RGBA", (64, 48), "red").save(tmp_path / "a.tif")
-    copy = write_upright(tmp_path, "a.tif", tmp_path / "images")
+    copy = write_upright(tmp_path, "a.tif", tmp_path)
     assert copy.name == "a.tif.png"
     assert copy.source == "a.tif"
     with Image.open(tmp_path / "images" / copy.name) as written:
@@ -285,9 +285,9 @@ def test_other_formats_become_png(tmp_path):
 def test_names_that_colmap_cannot_list_are_changed(tmp_path):
     for name in ("a b.png", "a_b.png"):
         Image.new("RGB", (64, 48), "red").save(tmp_path / name)
-    assert write_upright(tmp_path, "a b.png", tmp_path / "images").name == "a_b.png"
+    assert write_upright(tmp_path, "a b.png", tmp_path).name == "a_b.png"
     with pytest.raises(InputError, match="would be called a_b.png"):
-        write_upright(tmp_path, "a_b.png", tmp_path / "images")
+        write_upright(tmp_path, "a_b.png", tmp_path)
 
 
 def test_masks_hidden_files_and_our_own_results_are_no_photographs(tmp_path):

@@ -197,7 +197,7 @@ def test_poses_of_pixels_that_are_not_those_of_the_laser_are_refused(tmp_path):
 
 def test_boxes_mask_what_moves(tmp_path):
     photographs = open_photographs(segment(tmp_path))
-    mask = photographs.mask(0)
+    mask = photographs.find_moving(0)
     camera = photographs.camera(0)
 
     def shown(center: tuple[float, float, float]) -> bool:
@@ -212,7 +212,7 @@ def test_boxes_mask_what_moves(tmp_path):
     assert not shown((9.0, -3.0, 1.0))
     assert not shown((9.0, 3.0, 2.0))
     assert 0.02 < mask.float().mean() < 0.3
-    halved = photographs.mask(0, (HEIGHT // 2, WIDTH // 2))
+    halved = photographs.find_moving(0, (HEIGHT // 2, WIDTH // 2))
     assert halved.float().mean().item() == pytest.approx(mask.float().mean().item(), rel=0.15)
 
 
@@ -247,7 +247,7 @@ def test_a_segment_without_lasers_has_no_depth(tmp_path):
     photographs = open_photographs(write_segment(tmp_path, bare, CAMERAS))
     (view,) = photographs.views([0])
     assert view.depth is None
-    assert photographs.mask(0) is None
+    assert photographs.find_moving(0) is None
 
 
 def test_without_pyarrow_a_sentence_says_what_to_install(tmp_path, monkeypatch):
@@ -285,7 +285,7 @@ def test_what_moves_on_a_real_road_does_not_count(shared, tmp_path, monkeypatch,
     root = kitti_city_segment(shared, tmp_path / "waymo", count=5, boxes=(ahead,))
     words = ("--protocol", "n-2", "--limit", 1, "--resolution", 36, 120, "--quiet")
     words = (*words, "--methods", "context")
-    for out, more in (("all", ()), ("ignoring", ("--use-masks",))):
+    for out, more in (("all", ()), ("ignoring", ("--ignore-moving",))):
         assert run(monkeypatch, "evaluate", root, *words, *more, "--out", tmp_path / out) == 0
     found = [
         read_json(path) for out in ("all", "ignoring") for path in list_row_paths(tmp_path / out)
@@ -294,6 +294,6 @@ def test_what_moves_on_a_real_road_does_not_count(shared, tmp_path, monkeypatch,
     assert ignoring["hole_fraction"] > every["hole_fraction"]
     bare = kitti_city_segment(shared, tmp_path / "bare", count=5)
     (bare / "lidar_box").mkdir(exist_ok=True)
-    words = (*words, "--use-masks", "--out", tmp_path / "bare-out")
+    words = (*words, "--ignore-moving", "--out", tmp_path / "bare-out")
     assert run(monkeypatch, "evaluate", bare, *words) == 2
-    assert "neither masks nor boxes of moving objects" in capsys.readouterr().err
+    assert "has no boxes of moving objects" in capsys.readouterr().err

@@ -6,6 +6,7 @@
 * SuperSplat's poses are the `poseSets` of a project's document.json, or the list. A pose has a
   position and a target in the world of the splat rotated by 180° about z, where y points up. It has
   no image size and no roll: cameras are upright, with the field of view of the longer side.
+* Camera paths of nerfstudio's viewer are read by `camera_paths.py`.
 * Exports of Metashape and RealityScan, unstitched files of Insta360, and models without cameras are
   refused, with advice.
 """
@@ -23,6 +24,7 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float
 
+from gscompleter.data.camera_paths import find_world, is_camera_path, parse_camera_path
 from gscompleter.data.cameras import Intrinsics
 from gscompleter.data.colmap import has_colmap, is_image_file, read_image_file, read_scene_cameras
 from gscompleter.data.frame import Frame, keep_existing, locate_images
@@ -74,7 +76,20 @@ def read_cameras(path: Path, resolution: Resolution = None) -> list[Frame]:
     content = read_json(path, "name a file of cameras")
     if _is_supersplat(content):
         return _parse_supersplat(content, path, resolution)
+    if is_camera_path(content):
+        return parse_camera_path(content, path)
     return read_camera_list(path) if isinstance(content, list) else read_frames(path)
+
+
+def is_in_splat_frame(path: Path) -> bool:
+    """Check whether the cameras of a file are in the frame of a splat, not of photographs.
+
+    So are poses of SuperSplat, and paths of nerfstudio without the transform of their run.
+    """
+    if path.suffix.lower() != ".json" or not os.path.isfile(path):
+        return False
+    content = read_json(path, "name a file of cameras")
+    return _is_supersplat(content) or (is_camera_path(content) and find_world(path) is None)
 
 
 def has_camera_list(path: Path) -> bool:

@@ -221,11 +221,23 @@ class Intrinsics:
         assert fl_y is not None
         return Pinhole(fl_x, fl_y, cx, cy, w, h).resize(width, height)
 
+    def fits(self, width: int, height: int) -> bool:
+        """Check whether a photograph has the aspect ratio of `size`, apart from rounding."""
+        if self.size is None or self.size == FRACTIONS:
+            return True
+        return has_same_aspect(self.size, (width, height))
+
     def is_transposed(self, width: int, height: int) -> bool:
         """Check whether a photograph of this size is rotated by 90° relative to `size`."""
-        w, h = self.size or (width, height)
-        same = math.isclose(width * h, height * w, rel_tol=SAME_ASPECT)
-        return not same and math.isclose(width * w, height * h, rel_tol=SAME_ASPECT)
+        return not self.fits(width, height) and self.fits(height, width)
+
+
+def has_same_aspect(one: tuple[int, int], other: tuple[int, int]) -> bool:
+    """Check whether two sizes differ by a scale, whose sides were rounded to whole pixels."""
+    (w, h), (width, height) = one, other
+    # A side that is rounded by a pixel changes its product by a side of the other image.
+    largest = max(w, h, width, height, SAME_ASPECT * width * h)
+    return abs(width * h - height * w) <= largest
 
 
 def find_pinhole_defect(pinhole: Pinhole) -> str | None:

@@ -17,12 +17,9 @@ from typing import Any
 
 from gscompleter.data.ego_vehicle import attach_vehicle_detector
 from gscompleter.data.formats import FORMATS, detect_format, find_format, open_photographs
-from gscompleter.data.photographs import (
-    MAX_TRANSLATION,
-    Photographs,
-    Resolution,
-    apply_masks,
-)
+from gscompleter.data.frame import describe_moved
+from gscompleter.data.masks import attach_masks
+from gscompleter.data.photographs import MAX_TRANSLATION, Photographs, Resolution
 from gscompleter.errors import InputError, quote_value
 from gscompleter.io.reading import read_json
 from gscompleter.types import View
@@ -40,7 +37,10 @@ class Case:
     resolution: Resolution
     near: float | None = None
     far: float | None = None
-    ignore_masked: bool = False
+    masks: bool = True
+    """True if pixels that masks and alpha channels hide are ignored."""
+    ignore_moving: bool = False
+    """True if pixels in boxes of moving objects are ignored."""
     ego_mask: bool = True
     """True if pixels of the vehicle that carries the camera are ignored."""
 
@@ -53,8 +53,9 @@ class Case:
         """Load the photographs of `frames`."""
         scene = open_photographs(self.scene, near=self.near, far=self.far)
         scene = scene if self.ego_mask else scene.keep_ego_vehicle()
-        views = scene.views(frames, self.resolution)
-        return apply_masks(views, scene, self.resolution) if self.ignore_masked else views
+        scene = scene if self.masks else scene.leave_out_masks()
+        scene = scene.ignore_moving() if self.ignore_moving else scene
+        return scene.views(frames, self.resolution)
 
 
 def read_cases(path: Path) -> list[Case]:
@@ -108,7 +109,9 @@ def open_clips(path: Path | str) -> Iterator[Photographs]:
     for format, place in scenes:
         for clip in format.open(place):
             ahead = [frame for frame in clip.frames if clip.front in (None, frame.sensor)]
-            yield replace(clip, frames=attach_vehicle_detector(ahead))
+            frames = attach_vehicle_detector(attach_masks(ahead))
+            notes = (*clip.notes, *describe_moved(ahead, clip.title))
+            yield replace(clip, frames=frames, notes=notes)
 
 
 def filter_usable(

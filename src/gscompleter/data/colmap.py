@@ -32,7 +32,7 @@ from gscompleter.data.limits import MAX_COEFFICIENT, MAX_NUMBER, MAX_SIDE
 from gscompleter.data.photographs import Photographs, build_photographs
 from gscompleter.data.points import read_point_cloud
 from gscompleter.errors import InputError, quote_value, refuse_pointer
-from gscompleter.io.image import has_orientation_tag
+from gscompleter.io.image import read_image_size, read_orientation
 from gscompleter.io.reading import open_file, read_lines
 
 HOMES = ("sparse", "colmap/sparse", "distorted/sparse", "")
@@ -318,10 +318,19 @@ def open_colmap(path: Path) -> Iterator[Photographs]:
     roots = _list_roots(path.parent if is_image_file(path) else path, model)
     there, missing = keep_existing(locate_images(frames, roots), str(model))
     notes += missing
-    if isinstance(there[0].image, Path) and has_orientation_tag(there[0].image):
-        notes += ("EXIF rotation is ignored: photographs are used as they are stored.",)
+    notes += _describe_orientation(there[0])
     photographs = build_photographs(roots[-1].name, str(model), there)
     yield replace(photographs, notes=notes, sparse=_make_point_reader(model))
+
+
+def _describe_orientation(frame: Frame) -> tuple[str, ...]:
+    """Say what becomes of an EXIF rotation, if the first photograph has one."""
+    if not isinstance(frame.image, Path) or read_orientation(frame.image) == 1:
+        return ()
+    stored = read_image_size(frame.image, frame.title)
+    if frame.find_orientation(frame.image, *stored) != 1:
+        return ("Photographs are turned as EXIF asks, because their cameras are upright.",)
+    return ("EXIF rotation is ignored: photographs are used as they are stored.",)
 
 
 def read_scene_cameras(path: Path) -> list[Frame]:

@@ -19,7 +19,7 @@ from jaxtyping import Bool, Float, Int
 from gscompleter.data.cameras import Pinhole, find_pose_defect
 from gscompleter.data.frame import Frame
 from gscompleter.errors import InputError
-from gscompleter.io.image import read_brightness
+from gscompleter.io.image import read_brightness, read_image_size, turn_upright
 
 FEWEST, MOST = 6, 12
 """Fewest and most photographs of a camera that are searched; with fewer, nothing is found."""
@@ -96,7 +96,9 @@ def read_small(frames: Sequence[Frame]) -> dict[Frame, Float[np.ndarray, "h w"]]
     found: dict[Frame, Float[np.ndarray, "h w"]] = {}
     for frame in frames:
         with suppress(InputError):
-            found[frame] = read_brightness(frame.require_stored(), SIDE)
+            stored = frame.require_stored()
+            orientation = frame.find_orientation(stored, *read_image_size(stored))
+            found[frame] = turn_upright(read_brightness(stored, SIDE), orientation)
     shape = next((image.shape for image in found.values()), None)
     return {frame: image for frame, image in found.items() if image.shape == shape}
 

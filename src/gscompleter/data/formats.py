@@ -20,9 +20,10 @@ from gscompleter.data.driving.mmdet3d import has_infos, open_infos
 from gscompleter.data.driving.pandaset import has_pandaset, open_pandaset
 from gscompleter.data.driving.waymo import list_segments, open_waymo
 from gscompleter.data.ego_vehicle import attach_vehicle_detector
-from gscompleter.data.frame import FOLDERS
+from gscompleter.data.frame import FOLDERS, describe_moved, keep_posed
 from gscompleter.data.limits import check_planes, require
 from gscompleter.data.llff import has_llff, open_llff
+from gscompleter.data.masks import attach_masks
 from gscompleter.data.one_photograph import find_photograph, open_photograph
 from gscompleter.data.phones.apps import POLYCAM, SCANNER_APP, find_recording, open_recording
 from gscompleter.data.photographs import Photographs
@@ -49,6 +50,13 @@ class Format:
     """Unit of the coordinates, or None if the format does not define it."""
 
 
+# fmt: off
+UNREAD = (
+    ".dng", ".cr2", ".cr3", ".nef", ".arw", ".raf", ".rw2", ".orf", ".raw",  # of cameras
+    ".jxl", ".exr", ".hdr", ".psd",
+)
+# fmt: on
+"""Endings of photographs that are not read: raw data of cameras, and formats of other programs."""
 MAX_NAMED = 4
 """Most scenes that the message names."""
 
@@ -93,8 +101,12 @@ def open_photographs(
     near, far = scene.near if near is None else near, scene.far if far is None else far
     check_planes(near, far)
     sparse = None if scene.sparse is None else cache(scene.sparse)
-    frames = attach_vehicle_detector(scene.frames)
-    return replace(scene, frames=frames, near=near, far=far, format=found, sparse=sparse)
+    posed, lost = keep_posed(scene.frames, scene.title)
+    notes = (*scene.notes, *lost, *describe_moved(posed, scene.title))
+    frames = attach_vehicle_detector(attach_masks(posed))
+    return replace(
+        scene, frames=frames, near=near, far=far, notes=notes, format=found, sparse=sparse
+    )
 
 
 def detect_format(path: Path, name: str | None = None) -> str:
@@ -112,6 +124,7 @@ def detect_format(path: Path, name: str | None = None) -> str:
     if found is None:
         refuse_other_exports(path)
         refuse_scenes_below(path)
+        refuse_unread(path)
         kind = f"photographs in the format {name}" if name else "posed photographs"
         raise InputError(f"There are no {kind} in {quote_value(path)}; {advice}.")
     return found
@@ -140,6 +153,18 @@ def refuse_scenes_below(path: Path) -> None:
         f"{quote_value(path, 50)} is no scene itself, but holds {len(found)} scene(s) below it: "
         f"{names}; name one of them.",
     )
+
+
+def refuse_unread(path: Path) -> None:
+    """Refuse photographs in a file format that is not read, by its name and with the way out."""
+    names = sorted(os.listdir(path)) if os.path.isdir(path) else [path.name]
+    unread = [name for name in names if name.lower().endswith(UNREAD)]
+    if unread:
+        raise InputError(
+            f"{quote_value(path)} holds {len(unread)} photographs such as "
+            f"{quote_value(unread[0])}, whose format is not read; export JPEG or PNG from the "
+            "program that develops them."
+        )
 
 
 def find_format(path: Path) -> str | None:

@@ -1,8 +1,4 @@
-"""One camera of a scene, and the search for its photograph and mask.
-
-Programs and users vary the case of folders and endings, so names are tried as written first, then
-in any case.
-"""
+"""One camera of a scene, and the search for its photograph and mask."""
 
 from __future__ import annotations
 
@@ -23,9 +19,16 @@ from gscompleter.data.cameras import (
     make_rigid,
     undistort_pinhole,
 )
+from gscompleter.data.file_names import FolderListings, list_endings
 from gscompleter.data.limits import MAX_SIDE
 from gscompleter.errors import InputError, join_names, quote_value
-from gscompleter.io.image import read_image_size, read_pixels
+from gscompleter.io.image import (
+    QUARTER_TURNS,
+    read_colors_and_alpha,
+    read_image_size,
+    read_orientation,
+    turn_upright,
+)
 
 ENDINGS = ("", ".png", ".jpg", ".jpeg")
 """Image file endings tried for names without one."""
@@ -39,6 +42,7 @@ FOLDERS = ("images", *(f"images_{n}" for n in DOWNSCALE_FACTORS), ORIGINALS)
 DISTORTED = "distorted"
 """Folder of the model with distortion, beside undistorted photographs (3DGS's scripts)."""
 MASKS = "masks"
+"""Folder of masks beside the photographs or their folder."""
 MAX_NAMED = 3
 """Missing photographs that a note names."""
 
@@ -58,7 +62,7 @@ class Frame:
     depth: Callable[[], Float[np.ndarray, "h w"]] | None = None
     """Reads a depth map of any size: z-depth in scene units, 0 where unknown."""
     mask: Path | None = None
-    """Mask image; black pixels are ignored."""
+    """Mask image; its black pixels are ignored (`data/masks.py`)."""
     sensor: str | None = None
     """Name of the vehicle's camera, or None for a single camera."""
     laser_points: Callable[[], Float[np.ndarray, "n 3"]] | None = None
@@ -69,6 +73,15 @@ class Frame:
     """Reads the corners of moving objects' boxes at about that time, in the frame of the poses."""
     vehicle: Callable[[], Bool[np.ndarray, "h w"] | None] | None = None
     """Detects the vehicle that carries the camera, as a mask of any size; None to keep it."""
+    written: str | None = None
+    """Path of the photograph in the file, if only an end of it exists here; else None."""
+
+    @property
+    def file_name(self) -> str:
+        """Path of the photograph below the folder of all, as users know it."""
+        path = PurePosixPath(self.name.replace("\\", "/"))
+        inside = len(path.parts) > 1 and path.parts[0].casefold() in FOLDERS
+        return str(PurePosixPath(*path.parts[1:]) if inside else path)
 
     def find_stored(self) -> Path | bytes | None:
         """Return the image file or its bytes; None if there is none."""
@@ -81,14 +94,16 @@ class Frame:
         return callable(self.image) or self.find_stored() is not None
 
     def size(self) -> tuple[int, int]:
-        """Return width and height of the photograph, or else those of the camera file.
+        """Return width and height of the upright photograph, or else those of the camera file.
 
         A photograph inside a container file is not opened if the camera file gives its size.
         """
         stated = None if self.intrinsics.size == FRACTIONS else self.intrinsics.size
         stored = None if stated is not None and callable(self.image) else self.find_stored()
         if stored is not None:
-            return read_image_size(stored, capitalize(self.title))
+            width, height = read_image_size(stored, capitalize(self.title))
+            is_turned = self.find_orientation(stored, width, height) != 1
+            return (height, width) if is_turned else (width, height)
         if stated is not None:
             return stated
         raise InputError(
@@ -106,17 +121,48 @@ class Frame:
             )
         return stored
 
-    def load_pixels(self) -> UInt8[np.ndarray, "h w 3"]:
-        """Read the photograph as it is stored."""
-        return read_pixels(self.require_stored(), capitalize(self.title))
+    def find_turn(self) -> int:
+        """Return the EXIF orientation by which the photograph is turned; 1 without a photograph."""
+        stored = self.find_stored()
+        if stored is None:
+            return 1
+        return self.find_orientation(stored, *read_image_size(stored, capitalize(self.title)))
+
+    def find_orientation(self, stored: Path | bytes, width: int, height: int) -> int:
+        """Return the EXIF orientation by which stored pixels have to be turned, or 1.
+
+        Cameras usually belong to the pixels as they are stored, whatever EXIF says. Only where the
+        camera's width and height are those of the turned photograph is it turned.
+        """
+        if not self.intrinsics.is_transposed(width, height):
+            return 1
+        orientation = read_orientation(stored)
+        return orientation if orientation in QUARTER_TURNS else 1
+
+    def load_pixels(
+        self,
+    ) -> tuple[UInt8[np.ndarray, "h w 3"], UInt8[np.ndarray, "h w"] | None, int]:
+        """Read the upright photograph: its colours, its alpha or None, and how it was turned.
+
+        The last is the EXIF orientation that was applied; 1 for the pixels as they are stored.
+        """
+        stored = self.require_stored()
+        colors, alpha = read_colors_and_alpha(stored, capitalize(self.title))
+        orientation = self.find_orientation(stored, colors.shape[1], colors.shape[0])
+        colors = turn_upright(colors, orientation)
+        alpha = None if alpha is None else turn_upright(alpha, orientation)
+        return colors, alpha, orientation
 
     def find_defect(self, width: int, height: int) -> str | None:
         """Describe why the camera is impossible at this photograph size; None if it is valid."""
         if max(width, height) > MAX_SIDE:
             return f"its {width} × {height} pixels have a side above {MAX_SIDE}"
-        if self.intrinsics.is_transposed(width, height):
+        if not self.intrinsics.fits(width, height):
             w, h = self.intrinsics.size or (width, height)
-            return f"its image has {width} × {height} pixels, but its `w` and `h` are {w} × {h}"
+            return (
+                f"its image has {width} × {height} pixels, and its camera {w} × {h}, which is "
+                "another aspect ratio"
+            )
         pinhole = self.intrinsics.compute_pinhole(width, height)
         defect = find_pose_defect(self.c2w) or find_pinhole_defect(pinhole)
         if defect is None and undistort_pinhole(pinhole, self.intrinsics.distortion) is None:
@@ -134,11 +180,21 @@ class Frame:
         return pinhole, new
 
     def with_rigid_pose(self, place: str = "") -> Frame:
-        """Return the frame with an exactly rigid pose; `place` in the file is for errors."""
+        """Return the frame with an exactly rigid pose; `place` in the file is for errors.
+
+        A pose that holds NaN stays, because one such camera need not cost the others.
+        """
+        if not self.has_finite_pose:
+            return self
         defect = find_pose_defect(self.c2w)
         if defect is not None:
             raise self.make_error(f"{defect}{place}")
         return replace(self, c2w=make_rigid(self.c2w))
+
+    @property
+    def has_finite_pose(self) -> bool:
+        """True if no number of the pose is NaN or infinite."""
+        return bool(np.isfinite(self.c2w).all())
 
     def make_error(self, defect: str) -> InputError:
         """Build the error for a frame with this defect."""
@@ -148,17 +204,25 @@ class Frame:
         )
 
 
-def find_image(path: Path) -> Path | None:
+def find_image(path: Path, listings: FolderListings | None = None) -> Path | None:
     """Find the image file at `path`, which may lack its ending; None if there is none.
 
     If folder `images` lacks it, the largest copy in `images_2`, `images_4` or `images_8` is used,
-    as nerfstudio writes and DL3DV publishes them.
+    as nerfstudio writes and DL3DV publishes them. With `listings`, file and folder may be written
+    in another case.
     """
     folders = [path.parent]
     if path.parent.name == "images":
         folders += [path.parent.with_name(f"images_{n}") for n in DOWNSCALE_FACTORS]
     candidates = (folder / (path.name + ending) for folder in folders for ending in ENDINGS)
-    return next((candidate for candidate in candidates if os.path.isfile(candidate)), None)
+    exact = next((candidate for candidate in candidates if os.path.isfile(candidate)), None)
+    if exact is not None or listings is None:
+        return exact
+    beside = find_file([path.parent], [path.name + ending for ending in ENDINGS], listings)
+    if beside is not None:
+        return beside
+    home = f"{path.parent.name}/{path.name}"
+    return find_file([path.parent.parent], [home + ending for ending in ENDINGS], listings)
 
 
 def capitalize(text: str) -> str:
@@ -168,15 +232,7 @@ def capitalize(text: str) -> str:
 
 def find_path(folder: Path, relative: str) -> Path | None:
     """Find `relative` below `folder`, ignoring case; None if it does not exist."""
-    if os.path.exists(folder / relative):
-        return folder / relative
-    for part in PurePosixPath(relative).parts:
-        names = sorted(os.listdir(folder)) if os.path.isdir(folder) else []
-        same = [name for name in names if name.casefold() == part.casefold()]
-        if not same:
-            return None
-        folder = folder / same[0]
-    return folder
+    return FolderListings().find(folder, relative)
 
 
 def list_image_folders(roots: Sequence[Path]) -> list[Path]:
@@ -192,18 +248,26 @@ def locate_images(frames: Sequence[Frame], roots: Sequence[Path]) -> list[Frame]
     """Return the frames with the paths of their photographs and masks, if they exist."""
     folders = list_image_folders(roots)
     masks = [folder for root in roots if (folder := find_path(root, MASKS)) is not None]
+    listings = FolderListings()
     found = []
     for frame in frames:
-        stem = os.path.splitext(frame.name)[0]
-        image = find_file(folders, [frame.name + ending for ending in ENDINGS])
-        mask = find_file(masks, [f"{frame.name}.png", f"{stem}.png"])
-        found.append(replace(frame, image=image, mask=mask))
+        names = list_endings(frame.name)
+        images = [name + ending for name in names for ending in ENDINGS]
+        stems = [os.path.splitext(name)[0] for name in names]
+        image = find_file(folders, images, listings)
+        mask = find_file(masks, [f"{name}.png" for name in [*names, *stems]], listings)
+        is_moved = len(names) > 1 and image is not None and image != Path(frame.name)
+        written = frame.name if is_moved else None
+        found.append(replace(frame, image=image, mask=mask, written=written))
     return found
 
 
-def find_file(folders: Sequence[Path], names: Sequence[str]) -> Path | None:
+def find_file(
+    folders: Sequence[Path], names: Sequence[str], listings: FolderListings | None = None
+) -> Path | None:
     """Find the first of the files in the first of the folders; None if there is none."""
-    found = (find_path(folder, name) for folder in folders for name in names)
+    listings = listings or FolderListings()
+    found = (listings.find(folder, name) for folder in folders for name in names)
     return next((path for path in found if path is not None and os.path.isfile(path)), None)
 
 
@@ -224,3 +288,33 @@ def keep_existing(frames: Sequence[Frame], title: str) -> tuple[tuple[Frame, ...
         f"{join_names(missing, MAX_NAMED)}."
     )
     return tuple(there), (note,)
+
+
+def keep_posed(frames: Sequence[Frame], title: str) -> tuple[tuple[Frame, ...], tuple[str, ...]]:
+    """Keep the frames whose pose is finite, and note the others."""
+    there = tuple(frame for frame in frames if frame.has_finite_pose)
+    lost = [frame.name for frame in frames if not frame.has_finite_pose]
+    if not there:
+        raise InputError(
+            f"The poses of all {len(frames)} cameras of {title} hold NaN or infinity "
+            f"({join_names(lost, MAX_NAMED)}); export the scene again."
+        )
+    if not lost:
+        return there, ()
+    note = (
+        f"{len(lost)} of {len(frames)} cameras of {title} are left out, because their poses hold "
+        f"NaN or infinity: {join_names(lost, MAX_NAMED)}."
+    )
+    return there, (note,)
+
+
+def describe_moved(frames: Sequence[Frame], title: str) -> tuple[str, ...]:
+    """Say in one sentence which photographs were found by the ends of their written paths."""
+    moved = [frame for frame in frames if frame.written is not None]
+    if not moved:
+        return ()
+    return (
+        f"{len(moved)} of {len(frames)} paths in {title} are of Windows or another machine, such "
+        f"as {quote_value(moved[0].written)}; the longest ends of them that exist are read, such "
+        f"as {quote_value(moved[0].name)}.",
+    )

@@ -44,7 +44,8 @@ def give_depth(view: View, frame: Frame, origin: Float[np.ndarray, "3"]) -> View
     if view.depth is not None:
         sure = drop_edges(view.depth) if frame.depth is not None else drop_hidden(view.depth)
         given = sure.where(sure > 0, given)
-    return replace(view, depth=None, given_depth=given)
+    # A point that a mask hides may lie behind what the mask hides it with.
+    return replace(view, depth=None, given_depth=given.where(view.valid_mask, 0.0))
 
 
 def drop_edges(depth: Float[Tensor, "h w"]) -> Float[Tensor, "h w"]:

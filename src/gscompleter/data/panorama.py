@@ -13,7 +13,7 @@ from pathlib import Path
 
 import cv2
 import numpy as np
-from jaxtyping import Float, UInt8
+from jaxtyping import Bool, Float, UInt8
 from PIL import Image
 
 from gscompleter.data.cameras import remap
@@ -71,17 +71,27 @@ def _is_closed(path: Path) -> bool:
     )
 
 
-def split_panorama(path: Path) -> Iterator[UInt8[np.ndarray, "s s 3"]]:
-    """Draw the `VIEWS` of a panorama, at its resolution or `MAX_SIDE`."""
+def split_panorama(
+    path: Path, hidden: Bool[np.ndarray, "h w"] | None = None
+) -> Iterator[tuple[UInt8[np.ndarray, "s s 3"], Bool[np.ndarray, "s s"] | None]]:
+    """Draw the `VIEWS` of a panorama and of its mask, at its resolution or `MAX_SIDE`.
+
+    `hidden` are the pixels of the panorama that its mask hides, or None without one.
+    """
     widest = math.ceil(math.pi * MAX_SIDE)
     with open_image(path) as image:
         image.draft("RGB", (widest, widest // 2))
         panorama = image.convert("RGB")
     panorama.thumbnail((widest, widest), Image.Resampling.LANCZOS)
     pixels = np.pad(np.asarray(panorama), ((0, 0), (BORDER, BORDER), (0, 0)), mode="wrap")
+    mask = None
+    if hidden is not None:
+        scaled = Image.fromarray(hidden).resize(panorama.size, Image.Resampling.NEAREST)
+        mask = np.pad(np.asarray(scaled, np.uint8), ((0, 0), (BORDER, BORDER)), mode="wrap")
     for view in VIEWS:
         places = _project_rays(compute_rotation(*view), panorama.width)
-        yield remap(pixels, places, cv2.INTER_CUBIC)
+        seen = None if mask is None else remap(mask, places, cv2.INTER_NEAREST) > 0
+        yield remap(pixels, places, cv2.INTER_CUBIC), seen
 
 
 def _project_rays(rotation: Float[np.ndarray, "3 3"], width: int) -> Float[np.ndarray, "s s 2"]:

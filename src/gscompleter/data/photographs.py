@@ -1,18 +1,20 @@
 """Posed photographs, independent of their format.
 
 A format (one module each, listed in `formats.py`) reads cameras and locates images. This module
-reads images on demand, removes lens distortion, and resizes image and intrinsics together.
+reads images on demand, leaves out what masks hide, removes lens distortion, and resizes image and
+intrinsics together.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
+from pathlib import Path, PurePosixPath
 
 import cv2
 import numpy as np
 import torch
-from jaxtyping import Bool, Float, Shaped
+from jaxtyping import Bool, Float, Shaped, UInt8
 from PIL import Image
 from torch import Tensor
 
@@ -21,9 +23,10 @@ from gscompleter.data.driving.vehicle import mask_moving
 from gscompleter.data.frame import Frame
 from gscompleter.data.limits import MAX_SIDE
 from gscompleter.data.local_origin import choose_local_origin
-from gscompleter.errors import InputError, quote_value
+from gscompleter.data.masks import fill_hidden, find_hidden
+from gscompleter.errors import InputError, join_names, quote_value
 from gscompleter.geometry import compute_sparse_depth
-from gscompleter.io.image import convert_to_image, read_pixels
+from gscompleter.io.image import composite_over_black, convert_to_image, has_alpha
 from gscompleter.types import Camera, View
 
 
@@ -54,6 +57,8 @@ MAX_FOV = 100.0
 MAX_TRANSLATION = 1e3
 """Largest camera coordinate that benchmarks keep, in scene units from the origin."""
 
+MAX_NAMED = 2
+"""Folders of masks that a sentence names."""
 MAX_MAP_COORDINATE = 100.0
 """Largest vehicle coordinate without a local origin, in metres."""
 
@@ -78,6 +83,10 @@ class Photographs:
     """Reads points on the scene's surfaces, in the files' frame."""
     front: str | None = None
     """Name of the front camera of a vehicle with several cameras."""
+    has_moving_boxes_ignored: bool = False
+    """True if boxes of moving objects are ignored like masks."""
+    is_masked: bool = True
+    """True if masks and alpha channels say what is ignored; else alpha is over black."""
 
     def __len__(self) -> int:
         return len(self.frames)
@@ -91,16 +100,53 @@ class Photographs:
         """Load undistorted photographs with cameras, known depth and the detected vehicle."""
         return [self._load_view(number, resolution) for number in frames]
 
-    def mask(self, frame: int, resolution: Resolution = None) -> Bool[Tensor, "h w"] | None:
-        """Return True where the photograph's mask is black or a moving box lies, or None."""
+    def describe_masks(self, frames: Sequence[int]) -> str | None:
+        """Say which of some photographs have masks, or None if none has; reads no pixels."""
+        if not self.is_masked:
+            return None
+        chosen = [self.frame(number) for number in frames]
+        named = [frame.mask for frame in chosen if frame.mask is not None]
+        clear = sum(map(_has_alpha, chosen))
+        kinds = []
+        if named:
+            places = list(dict.fromkeys(path.parent for path in named))
+            kinds.append(f"masks of {len(named)} photographs ({join_names(places, MAX_NAMED)})")
+        if clear:
+            kinds.append(f"the alpha channel of {clear} photographs")
+        return " and ".join(kinds) if kinds else None
+
+    def ignore_moving(self) -> Photographs:
+        """Return a copy in which boxes of moving objects are ignored like masks."""
+        return replace(self, has_moving_boxes_ignored=True)
+
+    def leave_out_masks(self) -> Photographs:
+        """Return a copy in which masks and alpha channels hide nothing."""
+        return replace(self, is_masked=False)
+
+    def leave_out_masks_in(self, folder: Path) -> Photographs:
+        """Return a copy without the masks in a folder, which mean something else."""
+        frames = [
+            replace(frame, mask=None)
+            if frame.mask is not None and folder.resolve() in frame.mask.resolve().parents
+            else frame
+            for frame in self.frames
+        ]
+        return replace(self, frames=tuple(frames))
+
+    def is_hidden(self, frame: int) -> bool:
+        """Check whether a mask or the alpha channel hides all of a photograph."""
         found = self.frame(frame)
-        masks = []
-        if found.mask is not None:
-            shown = read_pixels(found.mask).max(axis=-1)
-            masks.append(undistort_and_resize(found, shown, found.size(), resolution) == 0)
-        if found.boxes is not None:
-            masks.append(mask_moving(found.boxes(), self.camera(frame, resolution), self.origin))
-        return torch.from_numpy(np.logical_or.reduce(masks)) if masks else None
+        if not self.is_masked or (found.mask is None and not _has_alpha(found)):
+            return False
+        hidden = self._load_colors(found)[1]
+        return hidden is not None and bool(hidden.all())
+
+    def find_moving(self, frame: int, resolution: Resolution = None) -> Bool[Tensor, "h w"] | None:
+        """Return True where a photograph shows a moving box, or None without boxes."""
+        boxes = self.frame(frame).boxes
+        if boxes is None:
+            return None
+        return torch.from_numpy(mask_moving(boxes(), self.camera(frame, resolution), self.origin))
 
     def points(self) -> Float[Tensor, "n 3"] | None:
         """Load points on the scene's surfaces relative to `origin`; None if unknown."""
@@ -113,9 +159,9 @@ class Photographs:
         return replace(self, frames=tuple(replace(f, vehicle=None) for f in self.frames))
 
     @property
-    def has_masks(self) -> bool:
-        """True if some frame has a mask or boxes."""
-        return any(frame.mask is not None or frame.boxes is not None for frame in self.frames)
+    def has_boxes(self) -> bool:
+        """True if some frame has boxes of moving objects."""
+        return any(frame.boxes is not None for frame in self.frames)
 
     def find_skip_reason(self, max_translation: float | None = MAX_TRANSLATION) -> str | None:
         """Explain why benchmarks skip the photographs; None if they are kept.
@@ -138,6 +184,47 @@ class Photographs:
             )
         return self.frames[number]
 
+    def find_frame(self, word: int | str) -> int:
+        """Find a frame by its number, or by the name or the path of its photograph.
+
+        A name may lack its ending and its folders, and its case does not matter if no other
+        photograph has it.
+        """
+        if isinstance(word, int):
+            self.frame(word)
+            return word
+        found = self._match_names(word)
+        names = [self.frame(number).file_name for number in found]
+        if len(found) > 1:
+            raise InputError(
+                f"{len(found)} photographs of {self.title} are called {quote_value(word)}: "
+                f"{join_names(names, MAX_NAMED)}; name the path of one of them."
+            )
+        if not found:
+            example = self.frame(0).file_name
+            raise InputError(
+                f"There is no photograph {quote_value(word)} in {self.title}; name one of its "
+                f"{len(self)} photographs, such as {quote_value(example)}, or its number from 0 "
+                f"to {len(self) - 1}."
+            )
+        return found[0]
+
+    def _match_names(self, word: str) -> list[int]:
+        """List the frames whose photograph a word names, those that it names exactly if any."""
+        wanted = PurePosixPath(word.replace("\\", "/").casefold()).parts
+        exact, found = [], []
+        for number, frame in enumerate(self.frames):
+            path = PurePosixPath(frame.name.replace("\\", "/"))
+            if word in (frame.name, frame.file_name, path.name):
+                exact.append(number)
+            folded = PurePosixPath(str(path).casefold())
+            for parts in (folded.parts, folded.with_suffix("").parts):
+                shorter = min(len(parts), len(wanted))
+                if shorter and parts[-shorter:] == wanted[-shorter:]:
+                    found.append(number)
+                    break
+        return exact or found
+
     def _build_camera(self, frame: Frame, size: tuple[int, int], resolution: Resolution) -> Camera:
         _, pinhole = frame.compute_pinholes(*size)
         framing = compute_framing(*size, resolution)
@@ -153,41 +240,56 @@ class Photographs:
 
     def _load_view(self, number: int, resolution: Resolution) -> View:
         frame = self.frame(number)
-        pixels = frame.load_pixels()
-        size = pixels.shape[1], pixels.shape[0]
+        colors, hidden = self._load_colors(frame)
+        size = colors.shape[1], colors.shape[0]
         camera = self._build_camera(frame, size, resolution)
-        image = convert_to_image(undistort_and_resize(frame, pixels, size, resolution))
-        depth = ignored = None
-        if frame.depth is not None:
-            values = undistort_and_resize(frame, frame.depth(), size, resolution)
-            depth = torch.from_numpy(values)
-        elif frame.laser_points is not None:
-            points = torch.from_numpy(frame.laser_points() - self.origin).float()
-            depth = compute_sparse_depth(points, camera)
+        image = convert_to_image(undistort_and_resize(frame, colors, size, resolution))
+        depth = self._load_depth(frame, camera, size, resolution)
+        masks = []
+        if hidden is not None:
+            masks.append(torch.from_numpy(resize_mask(frame, hidden, size, resolution)))
+        if self.has_moving_boxes_ignored and frame.boxes is not None:
+            moving = mask_moving(frame.boxes(), camera, self.origin)
+            masks.append(torch.from_numpy(moving))
+        if masks:
+            ignored = torch.stack(masks).any(dim=0)
+            if ignored.all():
+                raise InputError(
+                    f"All of frame {number} of {self.name} ({quote_value(frame.name)}) is masked; "
+                    "choose another frame."
+                )
+            depth = None if depth is None else depth.masked_fill(ignored, 0.0)
         vehicle = None if frame.vehicle is None else frame.vehicle()
         if vehicle is not None:
-            mask = undistort_and_resize(frame, vehicle.astype(np.uint8), size, resolution) > 0
-            ignored = torch.from_numpy(mask)
-        return View(image, camera, number, depth, ignored)
+            small = undistort_and_resize(frame, vehicle.astype(np.uint8), size, resolution)
+            masks.append(torch.from_numpy(small > 0))
+        mask = torch.stack(masks).any(dim=0) if masks else None
+        return View(image, camera, number, depth, mask)
 
+    def _load_colors(
+        self, frame: Frame
+    ) -> tuple[UInt8[np.ndarray, "h w 3"], Bool[np.ndarray, "h w"] | None]:
+        """Load the upright photograph, and the pixels that masks hide or None.
 
-def apply_masks(
-    views: Sequence[View], photographs: Photographs, resolution: Resolution = None
-) -> list[View]:
-    """Mark masked pixels of views as ignored; refuses views without any other pixel."""
-    found = []
-    for view in views:
-        assert view.frame is not None
-        mask = photographs.mask(view.frame, resolution)
-        if mask is None:
-            found.append(view)
-            continue
-        if mask.all():
-            raise InputError(
-                f"All of frame {view.frame} of {photographs.name} is masked; choose another frame."
-            )
-        found.append(replace(view, ignore_mask=mask | ~view.valid_mask))
-    return found
+        Hidden pixels have the colours of their surroundings, so that no later step can take over
+        what they show.
+        """
+        colors, alpha, orientation = frame.load_pixels()
+        if not self.is_masked:
+            return (colors if alpha is None else composite_over_black(colors, alpha)), None
+        size = colors.shape[1], colors.shape[0]
+        hidden = find_hidden(frame, alpha, size, orientation)
+        return (colors if hidden is None else fill_hidden(colors, hidden)), hidden
+
+    def _load_depth(
+        self, frame: Frame, camera: Camera, size: tuple[int, int], resolution: Resolution
+    ) -> Float[Tensor, "h w"] | None:
+        if frame.depth is not None:
+            return torch.from_numpy(undistort_and_resize(frame, frame.depth(), size, resolution))
+        if frame.laser_points is not None:
+            points = torch.from_numpy(frame.laser_points() - self.origin).float()
+            return compute_sparse_depth(points, camera)
+        return None
 
 
 def build_photographs(
@@ -232,6 +334,26 @@ def undistort_and_resize(
     (left, top), (width, height) = framing.corner, framing.size
     resized = resize(pixels, framing.scaled_size, filtering)
     return np.ascontiguousarray(resized[top : top + height, left : left + width])
+
+
+def resize_mask(
+    frame: Frame, ignored: Bool[np.ndarray, "h w"], size: tuple[int, int], resolution: Resolution
+) -> Bool[np.ndarray, "h2 w2"]:
+    """Undistort and resize a mask of the photograph's `size`: ignored where half of a pixel is."""
+    share = ignored.astype(np.float32)
+    if frame.intrinsics.distortion:
+        pinhole, new = frame.compute_pinholes(*size)
+        source = compute_undistortion_map(pinhole, frame.intrinsics.distortion, new)
+        share = remap(share, source, cv2.INTER_LINEAR)
+    framing = compute_framing(*size, resolution)
+    (left, top), (width, height) = framing.corner, framing.size
+    resized = resize(share, framing.scaled_size, Image.Resampling.BOX)
+    return resized[top : top + height, left : left + width] >= 0.5
+
+
+def _has_alpha(frame: Frame) -> bool:
+    stored = frame.find_stored() if isinstance(frame.image, Path) else None
+    return isinstance(stored, Path) and has_alpha(stored)
 
 
 def _find_skip_reason(

@@ -61,10 +61,11 @@ def load_cameras(
 ) -> list[Camera]:
     """Load all cameras of a file in its order, without photographs.
 
-    `path` is a JSON file in the layout of nerfstudio's `transforms.json`, Inria's `cameras.json` or
-    SuperSplat's poses, which need a height and width; a folder with a `transforms.json` or a COLMAP
-    model; or the images.txt or images.bin of such a model. `origin` is that of the scene's
-    coordinates, `open_photographs(scene).origin`; the rest is as in `load_views`.
+    `path` is a JSON file in the layout of nerfstudio's `transforms.json` or `camera_path.json`,
+    Inria's `cameras.json` or SuperSplat's poses, which need a height and width; a folder with a
+    `transforms.json` or a COLMAP model; or the images.txt or images.bin of such a model. `origin`
+    is that of the scene's coordinates, `open_photographs(scene).origin`; the rest is as in
+    `load_views`.
     """
     check_planes(near, far)
     zero, frames = np.asarray(origin, dtype=np.float64), tuple(read_cameras(Path(path), resolution))

@@ -13,7 +13,8 @@ import numpy as np
 from jaxtyping import Float
 
 from gscompleter.data.cameras import Distortion, Intrinsics
-from gscompleter.data.frame import Frame
+from gscompleter.data.file_names import FolderListings, list_endings, locate
+from gscompleter.data.frame import Frame, find_file, find_image
 from gscompleter.data.json_fields import (
     get_array,
     get_optional_number,
@@ -86,9 +87,15 @@ def _make_point_reader(files: Sequence[Path]) -> partial[Float[np.ndarray, "n 3"
     """Return a reader of the points that a file names; None if there are none."""
     for file in files:
         name = get_text(read_json(file, ADVICE), "ply_file_path", str(file))
-        if name is not None and os.path.isfile(file.parent / name):
-            return partial(read_point_cloud, file.parent / name)
+        path = None if name is None else locate(file.parent, name, _find_any_case)
+        if path is not None and os.path.isfile(path):
+            return partial(read_point_cloud, path)
     return None
+
+
+def _find_any_case(path: Path, listings: FolderListings | None = None) -> Path | None:
+    """Find a file whose name may be written in another case; None if there is none."""
+    return find_file([path.parent], [path.name], listings)
 
 
 def read_frames(path: Path) -> list[Frame]:
@@ -98,30 +105,47 @@ def read_frames(path: Path) -> list[Frame]:
     require(entries, f"{path} lists no frames; its `frames` has to be a list with cameras.")
     units = (get_optional_number(content, key, str(path), *DEPTH_RANGE) for key in DEPTH_UNITS)
     unit = next(filter(None, units), 1e-3)
-    return [_parse_frame(entry, i, content, unit, path) for i, entry in enumerate(entries)]
+    listings = FolderListings()
+    return [
+        _parse_frame(entry, i, content, unit, path, listings) for i, entry in enumerate(entries)
+    ]
 
 
 def _parse_frame(
-    entry: Any, position: int, content: Mapping[str, Any], depth_unit: float, path: Path
+    entry: Any,
+    position: int,
+    content: Mapping[str, Any],
+    depth_unit: float,
+    path: Path,
+    listings: FolderListings,
 ) -> Frame:
     title = f"frame {position} of {path}"
     file_path = get_text(entry, "file_path", title)
     title = title if file_path is None else f"frame {quote_value(file_path)} of {path}"
 
-    def locate(key: str) -> Path | None:
+    def locate_file(key: str) -> Path | None:
         name = get_text(entry, key, title)
-        return None if name is None else path.parent / name
+        find = partial(_find_any_case, listings=listings)
+        return None if name is None else locate(path.parent, name, find)
 
-    depth = locate("depth_file_path") or locate("depth_path")  # of nerfstudio, of NeRFCapture
+    # Of nerfstudio, or of NeRFCapture.
+    depth = locate_file("depth_file_path") or locate_file("depth_path")
     c2w = get_array(entry, "transform_matrix", title, (3, 4), (4, 4))
+    image, name, is_moved = None, str(position), False
+    if file_path is not None:
+        image = locate(path.parent, file_path, partial(find_image, listings=listings))
+        endings = list_endings(file_path)
+        is_moved = len(endings) > 1 and os.path.exists(image) and image != path.parent / file_path
+        name = image.relative_to(path.parent).as_posix() if is_moved else file_path
     frame = Frame(
-        name=file_path or str(position),
+        name=name,
         title=title,
         c2w=np.vstack([c2w, [0, 0, 0, 1]]) if len(c2w) == 3 else c2w,
         intrinsics=_parse_intrinsics({**content, **entry}, title),
-        image=locate("file_path"),
+        image=image,
+        written=file_path if is_moved else None,
         depth=None if depth is None else partial(read_depth, depth, depth_unit),
-        mask=locate("mask_path"),
+        mask=locate_file("mask_path"),
     )
     frame = frame.with_rigid_pose(" (`transform_matrix`)")
     return replace(frame, c2w=frame.c2w @ OPENCV_FROM_OPENGL)

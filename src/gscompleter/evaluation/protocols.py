@@ -20,7 +20,7 @@ from pydantic import Field, TypeAdapter, ValidationError
 
 from gscompleter.completer import MAX_TARGET_ID
 from gscompleter.data.cases import Case
-from gscompleter.data.photographs import Photographs, Resolution, apply_masks
+from gscompleter.data.photographs import Photographs, Resolution
 from gscompleter.errors import InputError, quote_value
 from gscompleter.io.files import replace_file
 from gscompleter.io.reading import read_json
@@ -222,14 +222,13 @@ def make_tasks(
     protocol: EvaluationProtocol,
     clip: Photographs,
     resolution: Resolution = None,
-    use_masks: bool = False,
     keeps_order: bool = False,
 ) -> list[Task]:
     """Make the tasks of a clip: one per target, or one per sequence.
 
     With `keeps_order`, Ψ gets the context in the order of the split instead of sorted by frame.
     """
-    load = partial(load_clip_views, clip, resolution, use_masks)
+    load = partial(load_clip_views, clip, resolution)
     tasks = []
     for split in protocol.select_splits(clip):
         for frame in (*split.context, *split.targets):
@@ -248,11 +247,10 @@ def make_tasks(
 
 
 def load_clip_views(
-    clip: Photographs, resolution: Resolution, use_masks: bool, frames: tuple[int, ...]
+    clip: Photographs, resolution: Resolution, frames: tuple[int, ...]
 ) -> list[View]:
-    """Load photographs of a clip, without masked pixels if `use_masks`."""
-    views = clip.views(frames, resolution)
-    return apply_masks(views, clip, resolution) if use_masks else views
+    """Load photographs of a clip."""
+    return clip.views(frames, resolution)
 
 
 def find_neighbours(target: int, context: Sequence[int], num_frames: int) -> tuple[int, ...]:

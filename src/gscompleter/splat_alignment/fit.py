@@ -88,7 +88,7 @@ def score_splat(scene: Gaussians, views: Sequence[View], renderer: Renderer) -> 
     """Score `scene` against photographs whose cameras are in its frame."""
 
     def fit(view: View) -> ImageFit:
-        return score_image(render_from(scene, view.camera, renderer), view.image)
+        return score_image(render_from(scene, view.camera, renderer), view)
 
     return summarize_fits(list(get_view_map(scene.means)(fit, views)))
 
@@ -101,10 +101,11 @@ def render_from(scene: Gaussians, camera: Camera, renderer: Renderer) -> Render:
         return renderer.render(scene, replace(camera, near=0.1 * unit))
 
 
-def score_image(render: Render, photograph: Float[Tensor, "h w 3"]) -> ImageFit:
-    """Score a render against one photograph."""
-    where = render.alpha >= COVERED
-    covered = where.float().mean().item()
+def score_image(render: Render, view: View) -> ImageFit:
+    """Score a render against one photograph, except where that is ignored."""
+    photograph = view.image
+    where = (render.alpha >= COVERED) & view.valid_mask
+    covered = where.sum().item() / max(int(view.valid_mask.sum()), 1)
     if covered < MIN_COVERAGE:
         return ImageFit(coverage=covered)
     truth = photograph[where].double()

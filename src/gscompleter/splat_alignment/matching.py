@@ -176,7 +176,8 @@ def extract_view_features(view: View) -> Features:
     pixels = np.ascontiguousarray(view.image.detach().cpu().clamp(0, 1).float().numpy())
     K = view.camera.K.detach().cpu().double().numpy()
     unknown = np.zeros(pixels.shape[:2], np.float32)
-    return detect_features(StereoImage(pixels, K, pose[:3, :3], pose[:3, 3], unknown))
+    ignored = None if view.ignore_mask is None else view.ignore_mask.cpu().numpy()
+    return detect_features(StereoImage(pixels, K, pose[:3, :3], pose[:3, 3], unknown, ignored))
 
 
 def render_features(scene: Gaussians, camera: Camera, renderer: Renderer) -> RenderedFeatures:

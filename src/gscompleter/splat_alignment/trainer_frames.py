@@ -17,6 +17,7 @@ import numpy as np
 from jaxtyping import Float
 
 from gscompleter.data.camera_files import has_camera_list, read_camera_list
+from gscompleter.data.camera_paths import DATAPARSER_FILE
 from gscompleter.data.cameras import find_pose_defect
 from gscompleter.data.local_origin import compute_frame_from_photographs, read_dataparser_transforms
 from gscompleter.data.photographs import Photographs
@@ -29,8 +30,6 @@ from gscompleter.splat_alignment.similarity import (
 )
 from gscompleter.types import Gaussians
 
-DATAPARSER_FILE = "dataparser_transforms.json"
-"""File of a nerfstudio run with the transform that it applied to the scene."""
 CAMERA_LIST_PREFIX = "cameras"
 """Prefix of camera lists; the rest may match the splat: `cameras_2.json` for `splat_2.ply`."""
 ITERATION_PREFIX = "iteration_"

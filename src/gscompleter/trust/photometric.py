@@ -130,13 +130,14 @@ def gather_observations(
     """Measure visible area and photometric consistency of each Gaussian in each photograph."""
     with use_one_torch_thread():
         differences = map_in_parallel(compute_color_difference, [f.render for f in frozen], views)
-    usual = torch.stack([d.median() for d in differences]).median().item()
+    known = [d[view.valid_mask].median() for d, view in zip(differences, views, strict=True)]
+    usual = torch.stack(known).median().item()
     scale = config.color_sigma * max(1.0, usual / EXACT_DIFFERENCE)
     areas, agreement = torch.empty((2, len(views), len(rendered))).to(rendered.means)
 
     def gather(k: int) -> None:
         agrees = torch.exp(-((differences[k] / scale) ** 2))
-        measured = measure_agreement(frozen[k], rendered.means, views[k].camera, agrees)
+        measured = measure_agreement(frozen[k], rendered.means, views[k], agrees)
         areas[k], agreement[k] = measured
 
     for _ in get_view_map(rendered.means)(gather, range(len(views))):
@@ -146,13 +147,17 @@ def gather_observations(
 
 
 def measure_agreement(
-    frozen: FrozenScene, means: Float[Tensor, "m 3"], camera: Camera, agrees: Float[Tensor, "h w"]
+    frozen: FrozenScene, means: Float[Tensor, "m 3"], view: View, agrees: Float[Tensor, "h w"]
 ) -> tuple[Float[Tensor, "m"], Float[Tensor, "m"]]:
-    """Measure visible area [m] and mean agreement [m] of the first m Gaussians at a camera."""
-    layers = torch.stack([torch.ones_like(agrees), agrees, torch.zeros_like(agrees)], dim=-1)
+    """Measure visible area [m] and mean agreement [m] of the first m Gaussians at a photograph.
+
+    Its ignored pixels show none of them.
+    """
+    valid = view.valid_mask.to(agrees)
+    layers = torch.stack([valid, valid * agrees, torch.zeros_like(agrees)], dim=-1)
     sums = to_float32(frozen.backproject(layers)[: len(means)])
     area, agreement = np.empty((2, len(means)), np.float32)
-    seen = (sums, to_float32(means), convert_camera(camera))
+    seen = (sums, to_float32(means), convert_camera(view.camera))
     share(kernels.measure_photo_agreement, len(means), *seen, area, agreement)
     return torch.from_numpy(area).to(means), torch.from_numpy(agreement).to(means)
 
@@ -160,10 +165,11 @@ def measure_agreement(
 def compute_color_difference(render: Render, view: View) -> Float[Tensor, "h w"]:
     """Compute the absolute colour difference after an exposure fit, averaged over a few pixels."""
     shown = render.image.clamp(0, 1)
-    pixels = slice(None, None, max(1, view.image[..., 0].numel() // EXPOSURE_PIXELS))
-    pairs = (image.reshape(-1, 3)[pixels] for image in (shown, view.image))
+    valid = view.valid_mask.flatten()
+    pixels = slice(None, None, max(1, int(valid.sum()) // EXPOSURE_PIXELS))
+    pairs = (image.reshape(-1, 3)[valid][pixels] for image in (shown, view.image))
     gain, offset = fit_robust_affine(*pairs)
-    return blur((gain * shown + offset - view.image).abs().mean(dim=-1))
+    return blur((view.fill_ignored(gain * shown + offset) - view.image).abs().mean(dim=-1))
 
 
 def compute_trust(

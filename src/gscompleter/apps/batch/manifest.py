@@ -59,7 +59,9 @@ def resolve_paths(row: Mapping[str, Any], base: Path) -> Options:
 
     result = {key: join(value) if key in PATHS else value for key, value in row.items()}
     target, config = result.get("target"), result.get("config")
-    if isinstance(target, str) and not re.fullmatch(r"[\d\s]*", target):
+    # A text is the path of a file of cameras, or else numbers and names of photographs.
+    is_number = isinstance(target, str) and re.fullmatch(r"[\d\s]*", target)
+    if isinstance(target, str) and not is_number and os.path.exists(join(target)):
         result["target"] = [join(target)]
     if isinstance(config, str) and config.endswith((".yaml", ".yml")):
         result["config"] = join(config)

@@ -29,13 +29,14 @@ from gscompleter.apps.inputs.opening import (
 )
 from gscompleter.apps.report.completion import (
     InputSplatFile,
+    compute_mask_fraction,
     save_changed,
     save_completed_splat,
 )
 from gscompleter.apps.warmup import compile_kernels
 from gscompleter.cleaning import find_superfluous
 from gscompleter.errors import InputError, quote_value
-from gscompleter.evaluation.metrics.image import psnr
+from gscompleter.evaluation.metrics.image import compute_masked_psnr
 from gscompleter.floaters import find_floaters
 from gscompleter.io.files import COMPLETED_FILE, SUMMARY_FILE, check_output, open_output_folder
 from gscompleter.progress import show_preparation, show_progress, stage, track
@@ -111,7 +112,7 @@ def clean_by_photographs(options: CleanOptions, console: Console) -> Cleaning:
     with record_seconds(()) as seconds, timed_stage("clean"):
         removed = find_superfluous(given, task.views, renderer, options.config)
     run_info = describe_run(options, opened, task, options.config)
-    scores = score_cleaning(given, task.views, removed, renderer)
+    scores = score_cleaning(given, task.views, removed, renderer, opened.files)
     run_info = {**run_info, "photographs": scores, "seconds": seconds}
     return Cleaning(given, removed, splat_file, run_info)
 
@@ -149,16 +150,24 @@ def write_cleaning(folder: Path, cleaning: Cleaning, dry_run: bool) -> None:
 
 
 def score_cleaning(
-    given: Gaussians, views: Sequence[View], taken: Bool[Tensor, "n"], renderer: Renderer
+    given: Gaussians,
+    views: Sequence[View],
+    taken: Bool[Tensor, "n"],
+    renderer: Renderer,
+    files: Mapping[int | None, str],
 ) -> list[dict[str, Any]]:
-    """Compute PSNR (dB) of each photograph before and after."""
+    """Compute PSNR (dB) of each photograph before and after; `files` are theirs by frame."""
     rows = []
     for view in track(views, "scores"):
         before, after = (
-            psnr(renderer.render(scene, view.camera).image, view.image)
+            compute_masked_psnr(
+                renderer.render(scene, view.camera).image, view.image, view.valid_mask
+            )
             for scene in (given, given[~taken])
         )
-        rows.append({"frame": view.frame, "psnr_before": before, "psnr_after": after})
+        ignored = compute_mask_fraction(view.ignore_mask)
+        scores = {"psnr_before": before, "psnr_after": after, "ignored": ignored}
+        rows.append({"frame": view.frame, "file": files.get(view.frame), **scores})
     return rows
 
 

@@ -33,7 +33,6 @@ from gscompleter.apps.inputs.opening import (
     describe_range_mismatch,
     describe_task,
     move_to_splat,
-    name_target,
     open_scene,
     print_lines,
     read_task,
@@ -41,6 +40,7 @@ from gscompleter.apps.inputs.opening import (
 from gscompleter.apps.inputs.selection import collect_usable_cameras
 from gscompleter.apps.report.completion import Target, write_report
 from gscompleter.apps.report.film import VIDEO_FILE, write_comparison_video
+from gscompleter.apps.report.names import describe_offset
 from gscompleter.apps.report.page import REPORT_FILE, write_completion_page
 from gscompleter.apps.report.plain_words import (
     format_number,
@@ -105,7 +105,15 @@ class Prepared:
     def with_choices(self, choices: Iterable[Choice]) -> Prepared:
         """Return a copy with chosen candidates as targets."""
         frames = list(self.cameras)
-        targets = [Target(c.camera, derived_from=frames[c.candidate.base]) for c in choices]
+        bases = [frames[choice.candidate.base] for choice in choices]
+        targets = [
+            Target(
+                choice.camera,
+                derived_from=base,
+                offset=describe_offset(choice.camera, self.cameras[base]),
+            )
+            for choice, base in zip(choices, bases, strict=True)
+        ]
         return replace(self, task=replace(self.task, targets=targets))
 
 
@@ -193,7 +201,7 @@ def plan_folder(options: CompleteOptions, prepare: Prepare) -> None:
         task, holes = plan_completion(ready)
         write_targets(folder, task)
     if not options.quiet:
-        print_plan(options, task.targets, holes)
+        print_plan(options, ready.opened, task.targets, holes)
 
 
 @contextmanager
@@ -226,6 +234,7 @@ def write_done(folder: Path, ready: Prepared, completion: Completion) -> dict[st
             cameras,
             looks,
             read_held_out(options, ready.opened, task, ready.cameras),
+            ready.opened.files,
         )
     write_completion_page(folder)
     return summary
@@ -295,7 +304,7 @@ def make_score_table(summary: CompletionSummary) -> Table:
     table = Table("camera", "hole", "PSNR before", "PSNR after", "added", box=None)
     for row in summary.context:
         scores = format_number(row.psnr_before), format_number(row.psnr_after)
-        table.add_row(f"context {row.frame}", "", *scores, "")
+        table.add_row(f"context {row.photograph}", "", *scores, "")
     for target in summary.targets:
         scores = format_number(target.psnr_before), format_number(target.psnr_after)
         hole = format_percent(target.hole_fraction)
@@ -368,7 +377,9 @@ def plan_completion(ready: Prepared) -> tuple[Task, Sequence[float]]:
     return ready.with_choices(choices).task, [choice.hole_fraction for choice in choices]
 
 
-def print_plan(options: CompleteOptions, targets: Sequence[Target], holes: Sequence[float]) -> None:
+def print_plan(
+    options: CompleteOptions, opened: Opened, targets: Sequence[Target], holes: Sequence[float]
+) -> None:
     """Print the targets and their holes."""
     console = Console(highlight=False)
     if not targets:
@@ -376,7 +387,7 @@ def print_plan(options: CompleteOptions, targets: Sequence[Target], holes: Seque
         return
     table = Table("camera", "hole", box=None)
     for number, (target, hole) in enumerate(zip(targets, holes, strict=True), 1):
-        table.add_row(f"{number}: {name_target(target)}", format_percent(hole))
+        table.add_row(f"{number}: {opened.name_target(target)}", format_percent(hole))
     console.print(table)
     console.print(f"Edit the cameras in {quote_value(options.out / TARGETS_FILE)}.", soft_wrap=True)
 

@@ -38,6 +38,7 @@ PURPOSES = {
     "slurm": "batch --engine submitit",
     "waymo": "the Waymo Open Dataset 2, whose tables are parquet",
     "phones": "the depth of Record3D",
+    "heic": "photographs as HEIC, as iPhones take them",
     "usd": "splats as OpenUSD (.usda, .usdc, .usdz)",
 }
 """Purpose of each extra. Those for developers (`test`, `dev`, `docs`) are not listed."""

@@ -26,7 +26,7 @@ from gscompleter.apps.warmup import compile_kernels
 from gscompleter.data.cases import Case, SkippedScene, filter_usable, open_clips, read_cases
 from gscompleter.data.formats import open_photographs
 from gscompleter.data.limits import check_planes
-from gscompleter.data.photographs import MAX_TRANSLATION, Resolution, check_resolution
+from gscompleter.data.photographs import MAX_TRANSLATION, Photographs, Resolution, check_resolution
 from gscompleter.errors import InputError, quote_value
 from gscompleter.evaluation import protocols, tables
 from gscompleter.evaluation.authors_loader import AuthorsLoader
@@ -93,7 +93,8 @@ def describe_source(options: EvaluateOptions) -> dict[str, Any]:
         "paths": [path.resolve().name for path in options.paths],
         "protocols": list(options.protocol),
         "resolution": list(size) if isinstance(size, tuple) else size,
-        **({"ignore_masked": True} if options.use_masks else {}),
+        **({} if options.masks else {"masks": False}),
+        **({"ignore_moving": True} if options.ignore_moving else {}),
         **({"one_per_scene": True} if options.one_per_scene else {}),
         **({} if options.ego_mask else {"ego_mask": False}),
         **({} if loader is None else {"loader": asdict(loader)}),
@@ -163,10 +164,23 @@ def collect_tasks(
         first = {case.scene: case for case in reversed(cases)}
         cases = [case for case in cases if case is first[case.scene]]
     cases = cases[: options.limit]
+    tasks = [protocols.make_case_task(apply_options(case, options)) for case in cases]
     for scene in dict.fromkeys(case.scene for case in cases):
         with suppress(InputError):  # a row of the table says why a scene cannot be opened
-            notes += open_photographs(scene).notes
-    return [protocols.make_case_task(apply_options(case, options)) for case in cases]
+            clip = open_photographs(scene)
+            notes += clip.notes
+            clip = clip if options.masks else clip.leave_out_masks()
+            own = [task for task, case in zip(tasks, cases, strict=True) if case.scene == scene]
+            notes += describe_task_masks(clip, own)
+    return tasks
+
+
+def describe_task_masks(clip: Photographs, tasks: Sequence[protocols.Task]) -> list[str]:
+    """Say in one sentence which photographs of the tasks of a clip have masks; none without."""
+    frames = {f for task in tasks for f in (*task.context, *task.targets, *task.neighbours)}
+    known = sorted(frame for frame in frames if frame < len(clip))
+    found = clip.describe_masks(known)
+    return [] if found is None else [f"{clip.name}: {found} are read; what they hide is ignored."]
 
 
 def apply_options(case: Case, options: EvaluateOptions) -> Case:
@@ -177,7 +191,8 @@ def apply_options(case: Case, options: EvaluateOptions) -> Case:
         near=case.near if options.near is None else options.near,
         far=case.far if options.far is None else options.far,
         resolution=case.resolution if size is None else parse_resolution(size),
-        ignore_masked=options.use_masks or case.ignore_masked,
+        masks=options.masks,
+        ignore_moving=options.ignore_moving,
         ego_mask=options.ego_mask,
     )
 
@@ -193,12 +208,14 @@ def iterate_tasks(
     for path in options.paths:
         for clip in filter_usable(open_clips(path), skipped, max_translation):
             notes += clip.notes
-            if options.use_masks and not clip.has_masks:
+            if options.ignore_moving and not clip.has_boxes:
                 raise InputError(
-                    f"{clip.name} has neither masks nor boxes of moving objects; leave --use-masks "
-                    "out."
+                    f"{clip.name} has no boxes of moving objects; leave --ignore-moving out. Masks "
+                    "are always read (--no-masks leaves them out)."
                 )
             clip = clip if options.ego_mask else clip.keep_ego_vehicle()
+            clip = clip if options.masks else clip.leave_out_masks()
+            clip = clip.ignore_moving() if options.ignore_moving else clip
             near = clip.near if options.near is None else options.near
             far = clip.far if options.far is None else options.far
             check_planes(near, far)
@@ -209,7 +226,8 @@ def iterate_tasks(
                     skipped.append(SkippedScene(clip.name, reason))
                 kept = rule if loader is None else loader.choose_splits(rule, clip, skipped)
                 keeps_order = loader is not None
-                tasks = protocols.make_tasks(kept, clip, size, options.use_masks, keeps_order)
+                tasks = protocols.make_tasks(kept, clip, size, keeps_order)
+                notes += describe_task_masks(clip, tasks)
                 yield from tasks[:1] if options.one_per_scene else tasks
 
 

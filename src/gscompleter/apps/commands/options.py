@@ -15,7 +15,7 @@ from gscompleter.config.settings import Seed, Settings
 from gscompleter.jobs.engines import EngineName
 
 Frame = Annotated[int, Interval(ge=0, lt=10**9)]
-Frames = Annotated[tuple[Frame, ...] | None, tyro.conf.arg(metavar="INT [INT ...]")]
+Words = Annotated[tuple[int | str, ...] | None, tyro.conf.arg(metavar="PHOTO [PHOTO ...]")]
 Threads = Annotated[int, Interval(ge=1, le=1024)]
 Port = Annotated[int, Interval(ge=0, le=65535)]
 Axis = Literal["gaussians", "pixels", "views", "targets"]
@@ -107,9 +107,10 @@ class SceneOptions(ComputeOptions, WritingOptions):
     also of 360° panoramas (2:1) and of a video (.mp4, .mov, .mkv). One image needs none."""
     frames: NumFrames = 40
     """Most frames of a video to take as photographs, sharp ones at even steps of the camera."""
-    context: Frames = None
-    """Frame numbers of the photographs to work with, counted in the order of their file paths. If
-    not given, those that help most; photographs of targets are never used. `clean` takes all."""
+    context: Words = None
+    """Photographs to work with: their file names, or their numbers from 0 in the order of their
+    file paths. If not given, those that help most; photographs of targets are never used. `clean`
+    takes all."""
     out: Path
     format: str | None = None
     """Format of SCENE: colmap, nerfstudio, cameras-json, llff, kitti, kitti-raw, dgp, waymo,
@@ -127,6 +128,8 @@ class SceneOptions(ComputeOptions, WritingOptions):
     """Largest depth in the scene, in the unit of its cameras; if not given, as for near."""
     no_given_depth: bool = False
     """Ignore the depth that SCENE holds: depth maps, laser sweeps and COLMAP's points."""
+    masks: bool = True
+    """Ignore the pixels that masks of SCENE (black) or alpha channels (transparent) hide."""
     drop_nonfinite: bool = False
     """Drop Gaussians that contain NaN or infinity instead of refusing the file."""
 
@@ -148,9 +151,9 @@ class CompleteOptions(CompletingOptions):
     """Fill the parts of a scene that its photographs do not show, and write the result."""
 
     target: tuple[str, ...] = ()
-    """Cameras to complete the scene for: frame numbers, or a file of cameras (transforms.json,
-    cameras.json, COLMAP's images.txt, SuperSplat poses). If not given, cameras that see holes are
-    searched for and written to targets.json."""
+    """Cameras to complete the scene for: file names or numbers of photographs, or a file of cameras
+    (transforms.json, cameras.json, nerfstudio's camera_path.json, COLMAP's images.txt, SuperSplat
+    poses). If not given, cameras that see holes are searched for and written to targets.json."""
     auto: Annotated[int, Interval(ge=1, le=254)] | None = None
     """Most cameras to search for if no target is given; 4 if no number follows."""
     dry_run: bool = False
@@ -178,7 +181,8 @@ class RemoveOptions(CompleteOptions):
     sphere: tuple[float, float, float, float] | None = None
     """Remove Gaussians inside of a sphere: x, y and z of its centre, and its radius."""
     mask: Path | None = None
-    """Remove what masks show: a folder of images named as photographs, white on the object."""
+    """Remove what masks show: a folder of images named as photographs, white on the object. It
+    hides nothing in the photographs, even if it is called `masks`."""
     select: Path | None = None
     """Remove the Gaussians of this file, a selection that another program saved."""
     config: Annotated[CompleterConfig, tyro.conf.FlagConversionOff] = REMOVAL_CONFIG
@@ -330,8 +334,11 @@ class EvaluateOptions(SynthesisOptions, EngineOptions):
     """Engine of `batch` that runs the cases; this process if not given."""
     resolution: Size | None = None
     """Working size as in `complete`; by default that of the cases."""
-    use_masks: bool = False
-    """Ignore what the data set masks or marks as moving, in the methods and in the scores."""
+    masks: bool = True
+    """Ignore the pixels that masks (black) or alpha channels (transparent) hide, in the methods and
+    in the scores."""
+    ignore_moving: bool = False
+    """Ignore boxes of moving objects in the same way (Waymo, nuScenes)."""
     one_per_scene: bool = False
     """Run only the first case of each scene and protocol, as the paper does."""
     ego_mask: bool = True

@@ -43,6 +43,7 @@ def describe_run(
             "near": options.near,
             "far": options.far,
             "no_given_depth": options.no_given_depth,
+            "masks": options.masks,
             "config": asdict(config),
         },
         "device": task.device.type,

@@ -46,7 +46,8 @@ RENAMED = {
     "generator-at-once": "generator-batch-size",
     "film": "video",
     "again": "rerun",
-    "ignore-masked": "use-masks",
+    "ignore-masked": "ignore-moving",
+    "use-masks": "ignore-moving",
 }
 """Names of the last release with today's; they are accepted for one release."""
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 import os
 import re
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, replace
 from functools import partial
@@ -21,6 +21,7 @@ from torch import Tensor
 from gscompleter.apps.commands.options import (
     LONG_SIDE,
     CompleteOptions,
+    RemoveOptions,
     SceneOptions,
     get_max_targets,
     parse_resolution,
@@ -31,9 +32,11 @@ from gscompleter.apps.inputs.selection import (
     collect_usable_cameras,
     select_near_and_far,
 )
-from gscompleter.apps.report.completion import InputSplatFile, Target
-from gscompleter.data.camera_files import refuse_other_exports
+from gscompleter.apps.report.completion import InputSplatFile, Target, compute_mask_fraction
+from gscompleter.apps.report.names import name_photograph, name_target
+from gscompleter.data.camera_files import is_in_splat_frame, refuse_other_exports
 from gscompleter.data.formats import find_format, open_photographs, refuse_scenes_below
+from gscompleter.data.frame import FOLDERS
 from gscompleter.data.given_depth import give_depths
 from gscompleter.data.local_origin import (
     choose_scene_origin,
@@ -43,7 +46,7 @@ from gscompleter.data.local_origin import (
 from gscompleter.data.photographs import Photographs
 from gscompleter.data.points import add_depth_range
 from gscompleter.data.scene import load_cameras
-from gscompleter.data.sfm.poses import POSES, find_poses, has_photographs
+from gscompleter.data.sfm.poses import ENDINGS, POSES, find_poses, has_photographs
 from gscompleter.errors import InputError, join_names, quote_value
 from gscompleter.io.files import SUMMARY_FILE
 from gscompleter.memory import (
@@ -88,6 +91,17 @@ class Opened:
     format: str
     num_photographs: int
     """Number of photographs, with those whose camera was not found."""
+
+    @property
+    def files(self) -> dict[int | None, str]:
+        """Files of the photographs by frame, below the folder of all."""
+        return {number: f.file_name for number, f in enumerate(self.photographs.frames)}
+
+    def name_target(self, target: Target) -> str:
+        """Name a target for lines and tables."""
+        near = target.derived_from
+        file = self.files.get(target.frame if near is None else near)
+        return name_target(target.frame, file, near, target.offset)
 
 
 @dataclass(frozen=True)
@@ -148,11 +162,15 @@ def open_scene(options: SceneOptions, console: Console) -> Opened:
     if options.format is None and has_photographs(folder) and find_format(folder) is None:
         refuse_other_exports(folder)
         refuse_scenes_below(folder)
+        print_lines(console, *describe_cameras_above(folder))
         ours = options.overwrite or os.path.isfile(poses / SUMMARY_FILE)
         found = find_poses(folder, poses, ours, options.frames)
         print_lines(console, *found.notes)
         folder, number = poses, found.photographs
     given = open_photographs(folder, options.format, options.near, options.far)
+    given = given if options.masks else given.leave_out_masks()
+    if isinstance(options, RemoveOptions) and options.mask is not None:
+        given = given.leave_out_masks_in(options.mask)
     print_lines(console, *given.notes)
     assert given.format is not None
     if number is None:
@@ -186,6 +204,18 @@ def choose_working_size(
     return replace(options, resolution=side)
 
 
+def describe_cameras_above(folder: Path) -> list[str]:
+    """Say that the folder above one of photographs has their cameras, which are not used."""
+    above = folder.resolve().parent
+    found = find_format(above) if folder.name.casefold() in FOLDERS else None
+    if found is None or found == "photograph":
+        return []
+    return [
+        f"{quote_value(above)} has cameras of these photographs ({found}); name that folder to use "
+        "them. Here they are found anew."
+    ]
+
+
 def refuse_splat(path: Path) -> None:
     """Refuse a file of Gaussians given as the folder of photographs."""
     if not os.path.isdir(path) and path.name.lower().endswith(SPLAT_EXTENSIONS):
@@ -199,7 +229,7 @@ def read_task(options: CompleteOptions, opened: Opened, device: str) -> Task:
     """Read the photographs and targets of the options, after checking the memory."""
     given, resolution = opened.photographs, parse_resolution(options.resolution)
     targets = read_targets(given, options)
-    frames = options.context or choose_context(options, given, targets)
+    frames = find_context(options, given) or choose_context(options, given, targets)
     cameras = [given.camera(frame, resolution) for frame in frames]
     cameras += [target.camera for target in targets]
     check_memory(max(camera.width * camera.height for camera in cameras), len(cameras))
@@ -209,7 +239,9 @@ def read_task(options: CompleteOptions, opened: Opened, device: str) -> Task:
 def read_photographs(options: SceneOptions, opened: Opened, device: str) -> Task:
     """Read the named photographs, or all."""
     given, resolution = opened.photographs, parse_resolution(options.resolution)
-    frames = options.context or tuple(collect_usable_cameras(given, range(len(given)), resolution))
+    frames = find_context(options, given) or tuple(
+        collect_usable_cameras(given, range(len(given)), resolution)
+    )
     if not frames:
         raise InputError(
             f"No photograph of {quote_value(options.folder)} can be used; name the folder that the "
@@ -260,11 +292,18 @@ def move_to_splat(
     scene = shift_to_origin(origin, scene, task.cameras).to(task.device)
     splat = InputSplat(path, scene, origin, options.folder)
     found = align_splat(splat, given, task.context_frames, load_renderer(task.device.type))
+    # Cameras were read relative to the origin of the photographs, whatever frame they are in.
+    back = compute_frame_from_photographs(-given.origin)
+    to_result = {
+        False: found.transform,
+        True: compute_frame_from_photographs(origin) @ back,
+    }
     return replace(
         task,
         views=[transform_view(view, found.transform) for view in task.views],
         targets=[
-            replace(t, camera=transform_camera(t.camera, found.transform)) for t in task.targets
+            replace(t, camera=transform_camera(t.camera, to_result[t.is_in_splat_frame]))
+            for t in task.targets
         ],
         frame=found.transform @ task.frame,
         origin=given.origin if found.method == "given" else origin,
@@ -371,18 +410,46 @@ def read_targets(given: Photographs, options: CompleteOptions) -> list[Target]:
     resolution = parse_resolution(options.resolution)
     targets: list[Target] = []
     for word in options.target:
-        if FRAME_NUMBER.fullmatch(word):
-            targets.append(Target(given.camera(int(word), resolution), int(word)))
-        elif os.path.exists(word):
+        if os.path.exists(word) and not is_image(word):
             cameras = load_cameras(word, resolution, origin=given.origin.tolist())
-            targets += [Target(camera) for camera in cameras]
+            is_of_splat = options.scene is not None and is_in_splat_frame(Path(word))
+            targets += [Target(camera, is_in_splat_frame=is_of_splat) for camera in cameras]
         else:
-            raise InputError(
-                f"'{quote_value(word, 60)}' is no target: name a frame from 0 to {len(given) - 1}, "
-                "or an existing file of cameras, such as a transforms.json.",
-                "target",
-            )
+            frame = find_frame(given, word, "target")
+            targets.append(Target(given.camera(frame, resolution), frame))
     return targets
+
+
+def find_context(options: SceneOptions, given: Photographs) -> tuple[int, ...]:
+    """Find the context frames that the options name; none if they name none."""
+    frames = tuple(find_frame(given, word, "context") for word in options.context or ())
+    if len(set(frames)) < len(frames):
+        twice = next(frame for frame in frames if frames.count(frame) > 1)
+        raise InputError(
+            f"--context names photograph {twice} ({quote_value(given.frame(twice).file_name)}) "
+            "twice; name different ones."
+        )
+    return frames
+
+
+def find_frame(given: Photographs, word: int | str, option: str) -> int:
+    """Find the frame of a word of an option: a number, or the name of a photograph."""
+    number = int(word) if FRAME_NUMBER.fullmatch(str(word)) else word
+    try:
+        return given.find_frame(number)
+    except InputError as error:
+        if option == "target" and isinstance(number, str):
+            raise InputError(
+                f"'{quote_value(word, 60)}' is no target: name a photograph or its number from 0 "
+                f"to {len(given) - 1}, or an existing file of cameras, such as a transforms.json.",
+                option,
+            ) from error
+        raise InputError(str(error), option) from error
+
+
+def is_image(path: str) -> bool:
+    """Check whether a path names a photograph, not a file of cameras."""
+    return path.lower().endswith(ENDINGS)
 
 
 def add_photograph(target: Target, given: Photographs, options: SceneOptions) -> Target:
@@ -425,7 +492,9 @@ def check_sides(cameras: Sequence[Camera]) -> None:
 
 def describe_task(options: CompleteOptions, opened: Opened, task: Task) -> list[str]:
     """Write the four lines; the cameras of `task` have the working depth range."""
-    targets = join_names([name_target(target) for target in task.targets], MAX_NAMED)
+    targets = join_names([opened.name_target(target) for target in task.targets], MAX_NAMED)
+    files = opened.files
+    context = [name_photograph(frame, files.get(frame)) for frame in task.context_frames]
     found = f"up to {get_max_targets(options)} cameras that are found"
     models = f"{options.reconstructor} and {options.synthesis.generator} on {task.device.type}"
     needed = estimate_memory(task, task.scene if task.device.type == "cpu" else None)
@@ -433,7 +502,7 @@ def describe_task(options: CompleteOptions, opened: Opened, task: Task) -> list[
     of = "" if available is None else f" of {format_whole_gigabytes(available)}"
     return [
         *describe_opening(options, opened, task),
-        f"To do: complete the scene from frames {join_names(task.context_frames, MAX_NAMED)} for "
+        f"To do: complete the scene from photographs {join_names(context, MAX_NAMED)} for "
         f"{targets or found} by {models}, written to {quote_value(options.out)}.",
         f"Memory: up to {format_whole_gigabytes(needed)}{of}.",
     ]
@@ -452,14 +521,25 @@ def describe_opening(options: SceneOptions, opened: Opened, task: Task) -> list[
         f"{opened.num_photographs} photographs{splat}.",
         f"Found: {task.frame_description.rstrip('.')}; depths from {camera.near:.3g} to "
         f"{camera.far:.3g}; worked at {camera.width} x {camera.height} (--resolution changes it).",
+        *describe_masks(opened.photographs, task),
     ]
 
 
-def name_target(target: Target) -> str:
-    """Name a target for lines and tables."""
-    if target.derived_from is not None:
-        return f"target near {target.derived_from}"
-    return "a given camera" if target.frame is None else f"target {target.frame}"
+def describe_masks(given: Photographs, task: Task) -> list[str]:
+    """Say which masks were found for the photographs of a task, and how much they hide."""
+    found = given.describe_masks(sorted(filter_numbers(task.used_frames)))
+    if found is None:
+        return []
+    most = max(compute_mask_fraction(view.ignore_mask) for view in task.views)
+    return [
+        f"Masks: {found}; what they hide, up to {100 * most:.1f} % of a photograph, is neither "
+        "reconstructed nor scored (--no-masks uses it)."
+    ]
+
+
+def filter_numbers(frames: Iterable[int | None]) -> list[int]:
+    """List the frame numbers, without None of cameras from elsewhere."""
+    return [frame for frame in frames if frame is not None]
 
 
 def print_lines(console: Console, *lines: str) -> None:

@@ -14,18 +14,15 @@ from gscompleter.apps.commands.options import RemoveOptions, parse_resolution
 from gscompleter.apps.inputs.opening import Task
 from gscompleter.data.frame import ENDINGS, find_file
 from gscompleter.data.local_origin import shift_to_origin
-from gscompleter.data.photographs import Photographs, Resolution, undistort_and_resize
+from gscompleter.data.masks import load_mask
+from gscompleter.data.photographs import Photographs, Resolution, resize_mask
 from gscompleter.errors import InputError, quote_value
 from gscompleter.geometry import quats_to_rotations
-from gscompleter.io.image import read_pixels
 from gscompleter.progress import track
 from gscompleter.removal import sum_in_mask
 from gscompleter.render import Renderer
 from gscompleter.splats.formats import load_splat
 from gscompleter.types import Camera, Gaussians
-
-WHITE = 128
-"""Smallest value, of 255, of a mask's pixels that show something to remove."""
 
 
 def check_selection(options: RemoveOptions) -> None:
@@ -134,12 +131,16 @@ def find_in_masks(
     resolution: Resolution,
     renderer: Renderer,
 ) -> Bool[Tensor, "n"]:
-    """Find Gaussians of which photographs show more inside of their masks than outside."""
+    """Find Gaussians of which photographs show more inside of their masks than outside.
+
+    A mask is scaled to its photograph; one of another aspect ratio raises an InputError.
+    """
     sums = torch.zeros_like(scene.means)
     for number in track([number for number in masks if number in cameras], "masks"):
         frame = photographs.frame(number)
-        pixels = read_pixels(masks[number]).max(axis=-1)
-        mask = undistort_and_resize(frame, pixels, frame.size(), resolution) >= WHITE
+        size = frame.size()
+        white = ~load_mask(masks[number], size, frame.title, frame.find_turn())
+        mask = resize_mask(frame, white, size, resolution)
         frozen = renderer.freeze(scene, cameras[number])
         sums += sum_in_mask(frozen, torch.from_numpy(mask).to(sums))
     return sums[:, 0] > sums[:, 1]

@@ -36,10 +36,26 @@ def choose_context(
 ) -> tuple[int, ...]:
     """Choose context frames for the targets, or for the whole scene without any.
 
-    Targets are never chosen, because their photographs score the result.
+    Targets are never chosen, because their photographs score the result, and neither are
+    photographs of which a mask hides everything.
     """
     target_frames = {target.frame for target in targets}
     others = [frame for frame in range(len(given)) if frame not in target_frames]
+    while True:
+        chosen = _choose_frames(options, given, targets, others)
+        hidden = {frame for frame in chosen if given.is_hidden(frame)}
+        if not hidden:
+            return chosen
+        others = [frame for frame in others if frame not in hidden]
+
+
+def _choose_frames(
+    options: CompleteOptions,
+    given: Photographs,
+    targets: Sequence[Target],
+    others: Sequence[int],
+) -> tuple[int, ...]:
+    """Choose context frames among `others`."""
     cameras = collect_usable_cameras(given, others, parse_resolution(options.resolution))
     if not cameras:
         raise InputError(

@@ -8,6 +8,7 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, dataclass, replace
 from functools import partial
 from pathlib import Path
+from types import MappingProxyType
 from typing import Any
 
 import torch
@@ -52,7 +53,8 @@ FRUSTUM = ((-1, -1, 1), (1, -1, 1), (1, 1, 1), (-1, 1, 1))
 FRUSTUM_DEPTH = 0.11
 """Length of a camera pyramid, in radii."""
 
-Scores = dict[str, float | None]
+Scores = dict[str, Any]
+"""PSNR and SSIM before and after by name, or None without a photograph."""
 
 
 @dataclass(frozen=True)
@@ -68,6 +70,10 @@ class Target:
     """True for pixels that are not scored; None if all are."""
     derived_from: int | None = None
     """Frame number that a planned camera was derived from; None if the user gave the camera."""
+    offset: str | None = None
+    """Move and turn of a planned camera from that frame, in words."""
+    is_in_splat_frame: bool = False
+    """True if the camera is in the frame of the input splat's file."""
 
     @property
     def view(self) -> View | None:
@@ -121,11 +127,12 @@ def write_report(
     photographs: Sequence[Camera] = (),
     render_around: Callable[[], Sequence[RenderPair]] = list,
     held_out: Sequence[HeldOut] = (),
+    files: Mapping[int | None, str] = MappingProxyType({}),
 ) -> dict[str, Any]:
     """Write the scenes, `images/`, `report.json` and `summary.json`; return the summary.
 
     `photographs` are the cameras of all, in the frame of the result. `render_around` renders the
-    views whose coverage is measured.
+    views whose coverage is measured. `files` are those of the photographs by frame.
     """
     at_targets = [
         render_before_after(completion, result.target, renderer) for result in completion.targets
@@ -134,9 +141,19 @@ def write_report(
     rows: dict[str, Sequence[ScoreRow]] = {
         "held_out": held_out_rows,
         "context": score_context(completion, renderer),
-        "targets": score_targets(completion, targets, at_targets, renderer),
+        "targets": [
+            replace(
+                row,
+                derived_file=files.get(row.derived_from),
+                anchor_file=files.get(row.anchor),
+            )
+            for row in score_targets(completion, targets, at_targets, renderer)
+        ],
     }
-    scores = {key: [asdict(row) for row in group] for key, group in rows.items()}
+    scores = {
+        key: [asdict(replace(row, file=files.get(row.frame))) for row in group]
+        for key, group in rows.items()
+    }
     is_given = input_splat is not None
     outcome = asdict(judge_completion(completion, held_out_rows, is_given))
     write_scenes(folder, completion, input_splat)
@@ -279,6 +296,7 @@ def make_target_row(
         target_id=result.target_id if len(added) or result.num_recolored else None,
         notes=result.notes,
         refused=result.refusal,
+        offset=target.offset,
     )
 
 

@@ -91,7 +91,10 @@ def list_photograph_notes(context: Sequence[ContextRow]) -> Iterator[str]:
     """List the notes on what moves, on what is ignored, and on exposures."""
     moving = [row for row in context if row.dynamic_fraction > 0]
     if moving:
-        shares = (f"{format_percent(row.dynamic_fraction)} of frame {row.frame}" for row in moving)
+        shares = (
+            f"{format_percent(row.dynamic_fraction)} of photograph {row.photograph}"
+            for row in moving
+        )
         yield f"{', '.join(shares)} show something that moves; these regions are not used."
     given = max((row.given_depth for row in context), default=0.0)
     if given > 0:
@@ -102,9 +105,9 @@ def list_photograph_notes(context: Sequence[ContextRow]) -> Iterator[str]:
     ignored = max((row.ignored for row in context), default=0.0)
     if ignored > 0:
         yield (
-            f"Up to {format_percent(ignored)} of a photograph stays the same while the camera "
-            "moves, like the bonnet of a vehicle, or shows what was removed; it is ignored, also "
-            "in scores (images/context*_ignored.png)."
+            f"Up to {format_percent(ignored)} of a photograph is hidden by a mask, stays the same "
+            "while the camera moves, like the bonnet of a vehicle, or shows what was removed; it "
+            "is ignored, also in scores (images/context*_ignored.png)."
         )
     factors = [factor for row in context for factor in row.exposure_gain or ()]
     if factors:
@@ -133,11 +136,11 @@ def list_splat_notes(summary: CompletionSummary) -> Iterator[str]:
 
 def describe_wanted_photographs(targets: Sequence[TargetRow]) -> str:
     """Describe where new photographs would help most: at the planned targets."""
-    planned = [str(row.derived_from) for row in targets if row.derived_from is not None]
+    planned = [row.name.removeprefix("near ") for row in targets if row.derived_from is not None]
     if not planned:
         return "Without --target, `complete` finds the cameras where they would help most."
-    frames = " and ".join(f"frame {frame}" for frame in planned[:2])
-    return f"They would help most at the first cameras of targets.json, beside {frames}."
+    places = " and ".join(planned[:2])
+    return f"They would help most at the first cameras of targets.json, beside {places}."
 
 
 def describe_alignment(affine: AlignmentRow, unit: str) -> str:

@@ -4,11 +4,12 @@ from __future__ import annotations
 
 import os
 from collections.abc import Iterable, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from statistics import fmean
 from typing import Any, Literal, TypeVar
 
+from gscompleter.apps.report.names import name_photograph, name_target
 from gscompleter.errors import InputError, quote_value
 from gscompleter.evaluation.metrics.coverage import Coverage
 from gscompleter.io.files import SUMMARY_FILE
@@ -44,6 +45,13 @@ class ScoreRow:
     psnr_after: float | None
     ssim_before: float | None
     ssim_after: float | None
+    file: str | None = field(default=None, kw_only=True)
+    """File of the photograph, below the folder of all; None if it is not known."""
+
+    @property
+    def photograph(self) -> str:
+        """Number and file of the photograph."""
+        return name_photograph(self.frame, self.file)
 
 
 @dataclass(frozen=True)
@@ -92,13 +100,23 @@ class TargetRow(ScoreRow):
     notes: tuple[str, ...] = ()
     refused: str | None = None
     """Sentence why the target cannot be completed, or None if it can."""
+    derived_file: str | None = None
+    """File of the photograph that a planned camera was derived from."""
+    offset: str | None = None
+    """Move and turn from that photograph, in words."""
+    anchor_file: str | None = None
+    """File of the anchor's photograph."""
 
     @property
     def name(self) -> str:
         """Name of the target beside its number."""
-        if self.derived_from is not None:
-            return f"near photograph {self.derived_from}"
-        return "a given camera" if self.frame is None else f"photograph {self.frame}"
+        file = self.file if self.derived_from is None else self.derived_file
+        return name_target(self.frame, file, self.derived_from, self.offset)
+
+    @property
+    def anchor_name(self) -> str:
+        """Number and file of the anchor's photograph."""
+        return name_photograph(self.anchor, self.anchor_file)
 
 
 @dataclass(frozen=True)

@@ -9,6 +9,7 @@ import numpy as np
 from jaxtyping import Float
 from PIL import Image
 
+from gscompleter.apps.report.names import name_photograph
 from gscompleter.apps.report.schema import CompletionSummary, read_summary
 from gscompleter.data.camera_files import read_cameras
 from gscompleter.data.formats import open_photographs
@@ -110,7 +111,7 @@ def load_target_cameras(
     return tuple(
         ViewerCamera(
             f"target-{number}",
-            f"Target {number}",
+            f"Target {number}: {row.name}",
             camera,
             make_thumbnail(folder / "images" / f"target{number}_after.png"),
             row.notes,
@@ -128,7 +129,7 @@ def load_context_cameras(
     return tuple(
         ViewerCamera(
             f"photograph-{number}",
-            f"Photograph {number}",
+            f"Photograph {name_photograph(number, photographs.frame(number).file_name)}",
             transform_camera(photographs.camera(number), relative),
             make_thumbnail(photographs.frame(number).find_stored()),
         )

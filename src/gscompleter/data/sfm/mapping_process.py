@@ -70,6 +70,8 @@ class Job:
     """Input of the process."""
 
     images: str
+    masks: str
+    """Folder of the masks of some photographs."""
     work: str
     """Folder for the database and temporary files."""
     model: str
@@ -107,11 +109,14 @@ def find_features(job: Job) -> None:
     numbers = {key: _add_camera(job, one) for key, one in cameras.items()}
     for one in job.photographs:  # one by one, so that they are numbered in their order
         number = numbers[one.width, one.height, one.lens]
+        reading = pycolmap.ImageReaderOptions(existing_camera_id=number)
+        if one.is_masked:
+            reading.mask_path = job.masks
         pycolmap.extract_features(
             job.database,
             job.images,
             [one.name],
-            reader_options=pycolmap.ImageReaderOptions(existing_camera_id=number),
+            reader_options=reading,
             extraction_options=extraction,
             device=pycolmap.Device.cpu,
         )

@@ -1,6 +1,7 @@
 """Camera poses for photographs, panoramas and videos without poses, by COLMAP on the CPU.
 
-The output folder has COLMAP's standard layout: copies in `images`, the model in `sparse/0`. COLMAP
+The output folder has COLMAP's standard layout: copies in `images`, the model in `sparse/0`, and in
+`masks` what masks or alpha channels of the photographs hide, where COLMAP finds no features. COLMAP
 ignores the EXIF orientation, so the pixels of the copies are rotated. Panoramas are split into
 views, and of a video some frames are photographs. A `summary.json` records the input files, so that
 the next run can reuse the result.
@@ -23,24 +24,42 @@ from importlib.util import find_spec
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+from jaxtyping import Bool
 from PIL import Image, ImageOps
 
 from gscompleter.cpu_threads import get_thread_count
 from gscompleter.data.camera_files import refuse_other_exports
+from gscompleter.data.file_names import FolderListings
 from gscompleter.data.frame import DOWNSCALE_FACTORS, MASKS
 from gscompleter.data.limits import require
+from gscompleter.data.masks import MASK_FOLDERS, find_mask, leave_out_masks, load_mask
 from gscompleter.data.panorama import has_panoramas, split_panorama
 from gscompleter.data.video import NUM_FRAMES, extract_frames, is_video
 from gscompleter.errors import InputError, join_names, quote_value
 from gscompleter.io.files import SUMMARY_FILE, open_output_folder
-from gscompleter.io.image import ORIENTATION, open_image
+from gscompleter.io.image import (
+    HALF_OPAQUE,
+    ORIENTATION,
+    QUARTER_TURNS,
+    has_alpha,
+    open_image,
+    read_colors_and_alpha,
+    read_image_size,
+    read_orientation,
+    turn_upright,
+)
 from gscompleter.io.reading import read_json
 from gscompleter.progress import stage, track
 
-ENDINGS = (".jpg", ".jpeg", ".png", ".tif", ".tiff", ".webp", ".bmp")
+ENDINGS = (
+    ".jpg", ".jpeg", ".png", ".tif", ".tiff", ".webp", ".bmp", ".heic", ".heif", ".avif",
+)  # fmt: skip
 """Endings of photographs, in any case."""
-OTHER_FOLDERS = (MASKS, "depth", "depths", *(f"images_{n}" for n in DOWNSCALE_FACTORS))
+OTHER_FOLDERS = (*MASK_FOLDERS, "depth", "depths", *(f"images_{n}" for n in DOWNSCALE_FACTORS))
 """Folders that hold no photographs of the user."""
+IMAGES = "images"
+"""Folder of the copies."""
 POSES = "colmap"
 """Output folder of a completion for the poses found for it."""
 MIN_PHOTOGRAPHS = 3
@@ -77,6 +96,8 @@ class UprightCopy:
     """Focal length in pixels of the copy from EXIF, or None."""
     lens: str
     """Key of camera, lens and zoom from EXIF, or of the view of a panorama."""
+    is_masked: bool = False
+    """True if a mask for it lies in the folder of masks."""
 
 
 @dataclass(frozen=True)
@@ -95,6 +116,8 @@ class FoundPoses:
     """True if the result is from an earlier run."""
     origin: str = ""
     """Sentences on how a video or panoramas became photographs."""
+    masked: int = 0
+    """Number of copies with a mask."""
 
     @property
     def num_registered(self) -> int:
@@ -105,6 +128,11 @@ class FoundPoses:
     def notes(self) -> list[str]:
         """Sentences for the user."""
         notes = [self.origin] if self.origin else []
+        if self.masked:
+            notes.append(
+                f"Masks or alpha channels hide parts of {self.masked} of {self.photographs} "
+                "photographs; no features are taken from there."
+            )
         if self.focal is not None:
             notes.append(
                 f"{self.num_registered} of {self.photographs} cameras were found with a focal "
@@ -144,7 +172,11 @@ def _identify_input(path: Path, num_frames: int) -> dict[str, list[int]]:
     if is_video(path):
         stat = path.stat()
         return {path.name: [stat.st_size, stat.st_mtime_ns, num_frames]}
-    stats = {name: (path / name).stat() for name in list_photograph_files(path)}
+    files = {name: path / name for name in list_photograph_files(path)}
+    listings = FolderListings()
+    masks = {name: find_mask(file, name, listings) for name, file in files.items()}
+    files |= {f"mask of {name}": mask for name, mask in masks.items() if mask is not None}
+    stats = {name: file.stat() for name, file in files.items()}
     return {name: [stat.st_size, stat.st_mtime_ns] for name, stat in stats.items()}
 
 
@@ -204,8 +236,12 @@ def list_all_photographs(folder: Path) -> list[str]:
     found: list[Path] = []
     for home, folders, files in os.walk(folder):
         folders[:] = [name for name in folders if is_own(Path(home, name))]
-        shown = (Path(home, name) for name in files if not name.startswith("."))
-        found += [path.relative_to(folder) for path in shown if path.suffix.lower() in ENDINGS]
+        images = [
+            name
+            for name in files
+            if not name.startswith(".") and Path(name).suffix.lower() in ENDINGS
+        ]
+        found += [Path(home, name).relative_to(folder) for name in leave_out_masks(images)]
     return sorted((path.as_posix() for path in found), key=make_sort_key)
 
 
@@ -220,15 +256,17 @@ def _run(photographs: Path, folder: Path, given: Path) -> FoundPoses:
     """Write `images` and `sparse/0` of photographs, made from what was `given`, into `folder`."""
     names = list_photograph_files(photographs)
     is_panoramic = has_panoramas([photographs / name for name in names])
+    listings = FolderListings()
     copies = [
         copy
         for name in track(names, "Turning photographs upright")
-        for copy in write_copies(photographs, name, folder / "images", is_panoramic)
+        for copy in write_copies(photographs, name, folder, is_panoramic, listings)
     ]
     result = _map(copies, folder, is_panoramic)
     missing = [copy.source for copy in copies if copy.name not in result["registered"]]
     counts = len(copies), missing, result["points"], result["error"], result["focal"]
-    found = FoundPoses(*counts, origin=_describe_origin(given, len(names), len(copies)))
+    origin = _describe_origin(given, len(names), len(copies))
+    found = FoundPoses(*counts, origin=origin, masked=sum(copy.is_masked for copy in copies))
     enough = max(MIN_PHOTOGRAPHS, MIN_SHARE * len(copies))
     is_large = found.num_registered >= enough and found.points >= MIN_POINTS
     if not (is_large and result["is_plausible"]):
@@ -251,28 +289,34 @@ def _describe_origin(given: Path, images: int, copies: int) -> str:
     return " ".join(sentences)
 
 
-def write_copies(root: Path, source: str, folder: Path, is_panoramic: bool) -> list[UprightCopy]:
-    """Write the upright copy of a photograph, or the views of a panorama, into `folder`.
+def write_copies(
+    root: Path, source: str, folder: Path, is_panoramic: bool, listings: FolderListings
+) -> list[UprightCopy]:
+    """Write the upright copy of a photograph, or the views of a panorama, into `folder`/images.
 
     The views of all panoramas with the same direction are in one folder, as COLMAP's rigs need it.
+    What masks hide is written into `folder`/masks. `listings` are of the folders of `root`.
     """
+    mask = find_mask(root / source, source, listings)
     if not is_panoramic:
-        return [write_upright(root, source, folder)]
+        return [write_upright(root, source, folder, mask)]
     copies = []
-    for number, pixels in enumerate(split_panorama(root / source)):
+    hidden = read_hidden(root / source, mask)
+    for number, (pixels, shade) in enumerate(split_panorama(root / source, hidden)):
         kind, name = f"view_{number}", Path(re.sub(r"[\s#]", "_", source)).with_suffix(".jpg")
-        target = _prepare_target(folder / kind / name, root / source)
+        target = _prepare_target(folder / IMAGES / kind / name, root / source)
         Image.fromarray(pixels).save(target, quality=QUALITY, subsampling=0)
         side, place = len(pixels), f"{kind}/{name.as_posix()}"
-        copies.append(UprightCopy(place, place, side, side, side / 2, kind))
+        is_masked = shade is not None and _write_mask(folder, place, shade, (side, side))
+        copies.append(UprightCopy(place, place, side, side, side / 2, kind, is_masked))
     return copies
 
 
-def write_upright(root: Path, source: str, folder: Path) -> UprightCopy:
-    """Write an upright copy of the photograph `root`/`source` to the same place in `folder`.
+def write_upright(root: Path, source: str, folder: Path, mask: Path | None = None) -> UprightCopy:
+    """Write an upright copy of the photograph `root`/`source` to the same place in `folder`/images.
 
     A small upright 8-bit JPEG or PNG is copied byte for byte; a format that COLMAP may not read
-    becomes a PNG.
+    becomes a PNG. What its `mask` or its alpha hides is written into `folder`/masks.
     """
     path = root / source
     with open_image(path) as image:
@@ -287,15 +331,47 @@ def write_upright(root: Path, source: str, folder: Path) -> UprightCopy:
     copy.thumbnail((MAX_SIDE, MAX_SIDE), Image.Resampling.LANCZOS)
     # In COLMAP's lists a space ends a name, and # begins a comment.
     name = re.sub(r"[\s#]", "_", source) + ("" if is_known else ".png")
-    target = _prepare_target(folder / name, path)
+    target = _prepare_target(folder / IMAGES / name, path)
     if is_ready:
         shutil.copyfile(path, target)
     else:
         copy.info.clear()  # removes the orientation, which is applied already
         written = "JPEG" if kind == "JPEG" else "PNG"
         copy.save(target, format=written, quality=QUALITY, subsampling=0)
+    hidden = read_hidden(path, mask)
+    is_masked = hidden is not None and _write_mask(folder, name, hidden, copy.size)
     diagonal = math.hypot(*copy.size)
-    return UprightCopy(name, source, *copy.size, focal and focal * diagonal, lens)
+    return UprightCopy(name, source, *copy.size, focal and focal * diagonal, lens, is_masked)
+
+
+def read_hidden(path: Path, mask: Path | None) -> Bool[np.ndarray, "h w"] | None:
+    """Read what a mask or the alpha of a photograph hides, upright; None if it has neither."""
+    if mask is None and not has_alpha(path):
+        return None
+    width, height = read_image_size(path)
+    orientation = read_orientation(path)
+    size = (height, width) if orientation in QUARTER_TURNS else (width, height)
+    hidden = np.zeros((size[1], size[0]), dtype=bool)
+    if mask is not None:
+        hidden |= load_mask(mask, size, f"the photograph {quote_value(path)}", orientation)
+    if has_alpha(path):
+        _, alpha = read_colors_and_alpha(path)
+        assert alpha is not None
+        hidden |= turn_upright(alpha < HALF_OPAQUE, orientation)
+    return hidden
+
+
+def _write_mask(
+    folder: Path, name: str, hidden: Bool[np.ndarray, "h w"], size: tuple[int, int]
+) -> bool:
+    """Write the mask of a copy as COLMAP names it, black where it hides; False if it hides none."""
+    if not hidden.any():
+        return False
+    target = folder / MASKS / f"{name}.png"
+    target.parent.mkdir(parents=True, exist_ok=True)
+    shown = Image.fromarray(np.where(hidden, 0, 255).astype(np.uint8))
+    shown.resize(size, Image.Resampling.NEAREST).save(target)
+    return True
 
 
 def _prepare_target(target: Path, source: Path) -> Path:
@@ -328,7 +404,8 @@ def _map(copies: Sequence[UprightCopy], folder: Path, is_panoramic: bool) -> dic
     """Run `mapping_process` on the copies in `folder/images`; return its result."""
     with tempfile.TemporaryDirectory(dir=folder) as work, stage("Finding cameras"):
         job = {
-            "images": str(folder / "images"),
+            "images": str(folder / IMAGES),
+            "masks": str(folder / MASKS),
             "work": work,
             "model": str(folder / "sparse" / "0"),
             "photographs": [asdict(copy) for copy in copies],

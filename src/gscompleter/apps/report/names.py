@@ -1,0 +1,57 @@
+"""Names of photographs and targets, the same in lines, tables and pages."""
+
+from __future__ import annotations
+
+import math
+
+from gscompleter.types import Camera
+
+MIN_TURN = 0.5
+"""Smallest turn of a camera that is said, in degrees."""
+MIN_SHIFT = 1e-3
+"""Smallest shift of a camera that is said, relative to the longest of its components and 1."""
+
+
+def name_photograph(frame: int | None, file: str | None) -> str:
+    """Name a photograph by its number and its file, as in "5 (IMG_0012.jpg)"."""
+    number = "–" if frame is None else str(frame)
+    return number if file is None else f"{number} ({file})"
+
+
+def name_target(
+    frame: int | None,
+    file: str | None,
+    derived_from: int | None,
+    offset: str | None,
+) -> str:
+    """Name a target: a photograph, a camera near one, or a camera from elsewhere.
+
+    `file` is that of the photograph that it is or that it was derived from; `offset` tells targets
+    near one photograph apart.
+    """
+    if derived_from is not None:
+        near = f"near photograph {name_photograph(derived_from, file)}"
+        return near if offset is None else f"{near}, {offset}"
+    return "a given camera" if frame is None else f"photograph {name_photograph(frame, file)}"
+
+
+def describe_offset(camera: Camera, base: Camera) -> str:
+    """Describe how a camera is moved and turned from another one, as that one looks."""
+    axes = base.c2w[:3, :3].double().T
+    shift = (axes @ (camera.center - base.center).double()).tolist()
+    x, y, z = (axes @ camera.forward.double()).tolist()
+    yaw = math.degrees(math.atan2(x, z))
+    pitch = math.degrees(math.atan2(-y, math.hypot(x, z)))
+    parts = []
+    # The axes of a camera point right, down and forward.
+    length, negative, positive = max(
+        zip(shift, ("left", "up", "back"), ("right", "down", "forward"), strict=True),
+        key=lambda one: abs(one[0]),
+    )
+    if abs(length) >= MIN_SHIFT * max(1.0, base.center.abs().max().item()):
+        parts.append(f"moved {positive if length > 0 else negative} by {abs(length):.2g}")
+    if max(abs(yaw), abs(pitch)) >= MIN_TURN:
+        is_yaw = abs(yaw) >= abs(pitch)
+        side = ("right" if yaw > 0 else "left") if is_yaw else ("up" if pitch > 0 else "down")
+        parts.append(f"turned {side} by {abs(yaw if is_yaw else pitch):.0f}°")
+    return " and ".join(parts) or "at the same place"

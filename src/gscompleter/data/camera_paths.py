@@ -1,0 +1,95 @@
+"""Camera paths of nerfstudio's viewer (`camera_path.json`).
+
+A path has the size of its images, and cameras with `camera_to_world` (row by row, OpenGL axes) and
+the vertical field of view in degrees. They are in the frame that nerfstudio trained in: its
+`dataparser_transforms.json`, where that lies beside the path or one folder above, leads from the
+world of the reconstruction to it. A transforms.json there may have rotated that world before
+(`applied_transform`).
+"""
+
+from __future__ import annotations
+
+import math
+import os
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from jaxtyping import Float
+
+from gscompleter.data.cameras import Intrinsics
+from gscompleter.data.frame import Frame
+from gscompleter.data.json_fields import get_array, get_number, get_part, get_size
+from gscompleter.data.limits import require
+from gscompleter.data.local_origin import read_dataparser_transforms
+from gscompleter.data.transforms import NAME as TRANSFORMS
+from gscompleter.data.transforms import OPENCV_FROM_OPENGL
+from gscompleter.errors import quote_value
+from gscompleter.io.reading import read_json
+
+DATAPARSER_FILE = "dataparser_transforms.json"
+"""File of a nerfstudio run with the transform that it applied to the scene."""
+ADVICE = "export the camera path again"
+FOV_RANGE = (1.0, 179.0)
+"""Range of the vertical field of view, in degrees."""
+
+
+def is_camera_path(content: Any) -> bool:
+    """Check whether the content of a JSON file is a camera path."""
+    return isinstance(content, dict) and isinstance(content.get("camera_path"), list)
+
+
+def parse_camera_path(content: Any, path: Path) -> list[Frame]:
+    """Parse the cameras of a path, in the world of the scene's photographs if it is known."""
+    kind = content.get("camera_type", "perspective")
+    require(
+        kind == "perspective",
+        f"The cameras of {quote_value(path)} are of the type {quote_value(kind)}; export a "
+        "perspective path.",
+    )
+    entries = get_part(content, "camera_path", list)
+    require(entries, f"{quote_value(path)} holds no camera; {ADVICE}.")
+    size = get_size(content, str(path), "render_width", "render_height")
+    to_photographs = find_world(path)
+    return [
+        _parse_camera(entry, f"camera {number} of {quote_value(path)}", size, to_photographs)
+        for number, entry in enumerate(entries)
+    ]
+
+
+def find_world(path: Path) -> Float[np.ndarray, "4 4"] | None:
+    """Find the similarity from the frame of a path to that of the photographs; None if unknown."""
+    folders = [path.resolve().parent, path.resolve().parent.parent]
+    files = [folder / DATAPARSER_FILE for folder in folders]
+    dataparser = next((file for file in files if os.path.isfile(file)), None)
+    if dataparser is None:
+        return None
+    to_original = np.linalg.inv(read_dataparser_transforms(dataparser))
+    scenes = [folder / TRANSFORMS for folder in folders if os.path.isfile(folder / TRANSFORMS)]
+    for scene in scenes:
+        content = read_json(scene, ADVICE)
+        if isinstance(content, dict) and content.get("applied_transform") is not None:
+            applied = get_array(content, "applied_transform", str(scene), (3, 4), (4, 4))[:3]
+            return np.vstack([applied, [0.0, 0.0, 0.0, 1.0]]) @ to_original
+    return to_original
+
+
+def _parse_camera(
+    entry: Any,
+    title: str,
+    size: tuple[int, int],
+    to_photographs: Float[np.ndarray, "4 4"] | None,
+) -> Frame:
+    numbers = get_array(entry, "camera_to_world", title, (16,), (4, 4), (3, 4))
+    c2w = np.eye(4)
+    c2w[:3] = numbers.reshape(-1, 4)[:3]
+    fov = get_number(entry, "fov", title, *FOV_RANGE)
+    focal = size[1] / 2 / math.tan(math.radians(fov) / 2)
+    frame = Frame(title, title, c2w, Intrinsics(size, (focal, focal)), None).with_rigid_pose()
+    pose = frame.c2w @ OPENCV_FROM_OPENGL
+    if to_photographs is not None:
+        moved = to_photographs @ pose
+        # The similarity scales the axes of the pose, which stay of length one.
+        moved[:3, :3] /= np.cbrt(np.linalg.det(moved[:3, :3]))
+        pose = moved
+    return Frame(title, title, pose, frame.intrinsics, None)

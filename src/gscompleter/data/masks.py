@@ -1,0 +1,150 @@
+"""Masks of photographs, whose black pixels are neither reconstructed nor scored.
+
+Programs put them into a folder `masks` or beside the photographs. COLMAP calls the mask of x.jpg
+x.jpg.png, nerfstudio and others x.png, Metashape x_mask.png and RealityScan x.mask.png. Those that
+instant-ngp calls dynamic_mask_x.png are white where pixels are ignored. An alpha channel is a mask,
+too.
+"""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Collection, Sequence
+from dataclasses import replace
+from itertools import product
+from pathlib import Path, PurePosixPath
+
+import cv2
+import numpy as np
+from jaxtyping import Bool, UInt8
+from PIL import Image
+
+from gscompleter.data.cameras import has_same_aspect
+from gscompleter.data.file_names import FolderListings
+from gscompleter.data.frame import FOLDERS, MASKS, Frame
+from gscompleter.errors import InputError, quote_value
+from gscompleter.io.image import HALF_OPAQUE, read_mask, turn_upright
+
+MASK_FOLDERS = (MASKS, "mask")
+"""Folders of masks, beside the photographs, in their folder or beside it."""
+ENDINGS = (".png", ".jpg", ".jpeg")
+"""Image file endings of masks."""
+FORMS = tuple(product(("{}_mask", "{}.mask", "{}-mask"), ENDINGS))
+"""Names of masks by those of their photographs, and their endings."""
+INVERTED = "dynamic_mask_"
+"""Beginning of the names of instant-ngp's masks, in which white is ignored."""
+
+
+def attach_masks(frames: Sequence[Frame]) -> tuple[Frame, ...]:
+    """Attach the mask of each photograph that has one and whose format named none."""
+    listings = FolderListings()
+
+    def attach(frame: Frame) -> Frame:
+        stored = frame.find_stored() if isinstance(frame.image, Path) else None
+        if frame.mask is not None or not isinstance(stored, Path):
+            return frame
+        return replace(frame, mask=find_mask(stored, frame.name, listings))
+
+    return tuple(map(attach, frames))
+
+
+def find_mask(photograph: Path, name: str, listings: FolderListings) -> Path | None:
+    """Find the mask of a photograph; `name` is its path below the scene or its image folder."""
+    parts = PurePosixPath(name).parts
+    is_below = not PurePosixPath(name).is_absolute() and photograph.parts[-len(parts) :] == parts
+    depth = len(parts) if is_below else 1
+    home = photograph.parents[depth - 1]
+    relatives = [PurePosixPath(*photograph.parts[-depth:])]
+    roots = [home, photograph.parent]
+    # A transforms.json calls it "images/x.png" and COLMAP "x.png", and its mask is masks/x.png or
+    # masks/images/x.png.
+    if depth > 1 and photograph.parts[-depth].casefold() in FOLDERS:
+        relatives.append(PurePosixPath(*photograph.parts[1 - depth :]))
+    if home.name.casefold() in FOLDERS:
+        roots.append(home.parent)
+        relatives.append(PurePosixPath(home.name, *photograph.parts[-depth:]))
+    folders = [root / folder for root, folder in product(dict.fromkeys(roots), MASK_FOLDERS)]
+    in_folders = [mask for path in relatives for mask in list_mask_names(path, is_beside=False)]
+    found = (
+        listings.find(folder, mask)
+        for folder, masks in [
+            *((folder, in_folders) for folder in folders if os.path.isdir(folder)),
+            (photograph.parent, list_mask_names(PurePosixPath(photograph.name))),
+        ]
+        for mask in masks
+    )
+    return next((path for path in found if path is not None and os.path.isfile(path)), None)
+
+
+def list_mask_names(photograph: PurePosixPath, is_beside: bool = True) -> list[str]:
+    """List the names that the mask of a photograph may have, in a folder of masks or beside it."""
+    stem = str(photograph.with_suffix(""))
+    named = [f"{photograph}.png", *(form.format(stem) + end for form, end in FORMS)]
+    if is_beside:
+        inverted = photograph.with_name(INVERTED + photograph.stem)
+        return [*named, *(f"{inverted}{ending}" for ending in ENDINGS)]
+    same = [f"{path}{ending}" for path in (photograph, stem) for ending in ENDINGS]
+    return [*same, *named]
+
+
+def leave_out_masks(names: Collection[str]) -> list[str]:
+    """Leave out the files of a folder, given by name, that are masks of others there."""
+    masks = {mask.casefold() for name in names for mask in list_mask_names(PurePosixPath(name))}
+    return [name for name in names if name.casefold() not in masks]
+
+
+def load_mask(
+    path: Path, size: tuple[int, int], photograph: str, orientation: int = 1
+) -> Bool[np.ndarray, "h w"]:
+    """Read the ignored pixels of a mask at the `size` (width, height) of its upright photograph.
+
+    A mask of another size is scaled if its aspect ratio is the same. `orientation` is how EXIF
+    turned the photograph: a mask of the stored pixels is turned likewise. `photograph` is for the
+    error of any other mask.
+    """
+    ignored = read_mask(path)
+    if path.name.casefold().startswith(INVERTED):
+        ignored = ~ignored
+    is_stored = not has_same_aspect((ignored.shape[1], ignored.shape[0]), size)
+    if is_stored and orientation != 1:
+        ignored = turn_upright(ignored, orientation)
+    height, width = ignored.shape
+    if not has_same_aspect((width, height), size):
+        raise InputError(
+            f"The mask {quote_value(path)} has {width} × {height} pixels, and {photograph} has "
+            f"{size[0]} × {size[1]}, which is another aspect ratio; export the mask again in the "
+            "size of the photograph."
+        )
+    scaled = Image.fromarray(ignored).resize(size, Image.Resampling.NEAREST)
+    return np.array(scaled, dtype=bool)
+
+
+def find_hidden(
+    frame: Frame, alpha: UInt8[np.ndarray, "h w"] | None, size: tuple[int, int], orientation: int
+) -> Bool[np.ndarray, "h w"] | None:
+    """Find the pixels of an upright photograph that its mask or its alpha hides; None if none."""
+    masks = []
+    if frame.mask is not None:
+        masks.append(load_mask(frame.mask, size, frame.title, orientation))
+    if alpha is not None:
+        masks.append(alpha < HALF_OPAQUE)
+    hidden = np.logical_or.reduce(masks) if masks else None
+    return None if hidden is None or not hidden.any() else hidden
+
+
+def fill_hidden(
+    pixels: UInt8[np.ndarray, "h w 3"], hidden: Bool[np.ndarray, "h w"]
+) -> UInt8[np.ndarray, "h w 3"]:
+    """Replace hidden pixels by the nearest others, so that resampling mixes none into them."""
+    if hidden.all():
+        return pixels
+    _, labels = cv2.distanceTransformWithLabels(
+        hidden.astype(np.uint8), cv2.DIST_L2, 5, labelType=cv2.DIST_LABEL_PIXEL
+    )
+    # A visible pixel and the hidden ones that it is nearest to have the same label.
+    rows, columns = np.nonzero(~hidden)
+    number = np.zeros(labels.max() + 1, dtype=np.int64)
+    number[labels[rows, columns]] = np.arange(len(rows))
+    nearest = number[labels]
+    filled: UInt8[np.ndarray, "h w 3"] = pixels[rows[nearest], columns[nearest]]
+    return filled
