@@ -102,7 +102,7 @@ def detect_format(path: Path, name: str | None = None) -> str:
     formats = ", ".join(FORMATS)
     advice = "name photographs with cameras, such as colmap, nerfstudio or others (docs/formats.md)"
     require(
-        name is None or name in FORMATS,
+        name is None or (isinstance(name, str) and name in FORMATS),
         f"There is no format '{quote_value(name)}'; choose one of {formats}.",
     )
     require(os.path.exists(path), f"There is no {quote_value(path)}; {advice}.")

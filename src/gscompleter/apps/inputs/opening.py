@@ -9,6 +9,7 @@ from contextlib import suppress
 from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
+from typing import TypeVar
 
 import numpy as np
 import torch
@@ -56,11 +57,14 @@ from gscompleter.render import Renderer, load_renderer
 from gscompleter.splat_alignment.estimate import align_splat
 from gscompleter.splat_alignment.similarity import transform_camera, transform_view
 from gscompleter.splat_alignment.trainer_frames import InputSplat
+from gscompleter.splats.foreign import resolve_splat
 from gscompleter.splats.formats import FORMATS as SPLAT_FORMATS
 from gscompleter.splats.formats import detect_splat_format
 from gscompleter.splats.ply import find_finite_rows
 from gscompleter.stages.context import find_depth_range
 from gscompleter.types import Camera, Gaussians, View
+
+AnyOptions = TypeVar("AnyOptions", bound=SceneOptions)
 
 MIN_IMAGE_SIZE = 16
 SPLAT_EXTENSIONS = tuple(end for format in SPLAT_FORMATS.values() for end in format.extensions)
@@ -156,6 +160,13 @@ def refuse_splat(path: Path) -> None:
             f"{quote_value(path, 80)} is a file of Gaussians, which goes to --scene; SCENE has to "
             "be the folder of its photographs, with or without cameras, or a video."
         )
+
+
+def resolve_scene(options: AnyOptions) -> AnyOptions:
+    """Replace a trainer's model folder in `--scene` by the splat of its newest iteration."""
+    if options.scene is None:
+        return options
+    return replace(options, scene=resolve_splat(options.scene))
 
 
 def read_task(options: CompleteOptions, opened: Opened, device: str) -> Task:
