@@ -386,9 +386,11 @@ def make_observed(
 
 def merge(parts: Sequence[Gaussians]) -> Gaussians:
     """Concatenate Gaussians; SH of lower degree are padded with zeros, which changes no colour."""
+    if not isinstance(parts, (list, tuple)):
+        raise InputError(f"merge takes a list of Gaussians, and got one {describe(parts)}.")
     for part in parts:
         if not isinstance(part, Gaussians):
-            raise InputError(f"merge takes a list of Gaussians, and got {describe(part)}.")
+            raise InputError(f"merge takes a list of Gaussians, and got one with {describe(part)}.")
     if not parts:
         raise InputError("merge needs at least one set of Gaussians, and got none.")
     if len({part.is_antialiased for part in parts}) > 1:

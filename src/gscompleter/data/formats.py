@@ -34,7 +34,7 @@ from gscompleter.data.real_estate import (
 )
 from gscompleter.data.sfm.poses import ENDINGS, is_own
 from gscompleter.data.transforms import has_transforms, open_transforms
-from gscompleter.errors import InputError, join_names, quote_value
+from gscompleter.errors import InputError, join_names, quote_value, require_path
 
 
 @dataclass(frozen=True)
@@ -82,7 +82,7 @@ def open_photographs(
     units; those of the files if None.
     """
     check_planes(near, far)
-    path = Path(path)
+    path = require_path(path)
     found = detect_format(path, format)
     scene, *others = islice(FORMATS[found].open(path), 2)
     names = " and ".join(quote_value(one.name) for one in (scene, *others))

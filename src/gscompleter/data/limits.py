@@ -7,6 +7,8 @@ its numbers; those that `Camera` checks too are in `camera_limits`.
 
 from __future__ import annotations
 
+from numbers import Real
+
 from gscompleter.camera_limits import FOCAL_RANGE as FOCAL_RANGE
 from gscompleter.camera_limits import MAX_CENTER as MAX_CENTER
 from gscompleter.camera_limits import MAX_COORDINATE as MAX_COORDINATE
@@ -33,8 +35,9 @@ def check_planes(near: float | None, far: float | None) -> None:
     """Raise an InputError if the near or far plane (scene units) is impossible."""
     low, high = DEPTH_RANGE
     for name, value in (("near", near), ("far", far)):
+        is_number = isinstance(value, Real) and not isinstance(value, bool)
         require(
-            value is None or low <= value <= high,
+            value is None or (is_number and low <= value <= high),
             f"The {name} plane at {value} is impossible; give a positive z-depth in scene units, "
             f"from {low:g} to {high:g}.",
         )

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
+from numbers import Integral
 
 import cv2
 import numpy as np
@@ -111,10 +112,11 @@ class Photographs:
 
     def frame(self, number: int) -> Frame:
         """Return the frame of that number."""
-        if not 0 <= number < len(self):
+        is_whole = isinstance(number, Integral) and not isinstance(number, bool)
+        if not is_whole or not 0 <= number < len(self):
             raise InputError(
-                f"There is no frame {number} in {self.title}, whose frames are numbered 0 to "
-                f"{len(self) - 1}; choose one of these."
+                f"There is no frame {quote_value(number)} in {self.title}, whose frames are "
+                f"numbered 0 to {len(self) - 1}; choose one of these."
             )
         return self.frames[number]
 
@@ -235,7 +237,7 @@ class Framing:
 def compute_framing(width: int, height: int, resolution: Resolution) -> Framing:
     """Compute the framing of a width × height image for a resolution."""
     check_resolution(resolution)
-    if resolution is None or isinstance(resolution, int):
+    if not isinstance(resolution, (tuple, list)):
         scale = 1.0 if resolution is None else min(1.0, resolution / max(width, height))
         size = max(round(width * scale), 1), max(round(height * scale), 1)
         return Framing(size, (0, 0), size)
@@ -260,10 +262,19 @@ def resize(
     return np.array(Image.fromarray(image).resize(size, filtering))
 
 
+def _is_side(value: object) -> bool:
+    is_whole = isinstance(value, Integral) and not isinstance(value, bool)
+    return is_whole and 1 <= value <= MAX_SIDE  # type: ignore[operator]
+
+
 def check_resolution(resolution: Resolution) -> None:
     """Raise an InputError if a side is not within 1 to `MAX_SIDE`."""
-    sides = (resolution,) if isinstance(resolution, int) else resolution or ()
-    if not all(1 <= side <= MAX_SIDE for side in sides):
+    if resolution is None:
+        return
+    sides: Sequence[object] = (resolution,)
+    if isinstance(resolution, (tuple, list)) and len(resolution) == 2:
+        sides = resolution
+    if not all(_is_side(side) for side in sides):
         raise InputError(
             f"The resolution {' × '.join(map(quote_value, sides))} is impossible; height and "
             f"width have to be positive, and at most {MAX_SIDE}."

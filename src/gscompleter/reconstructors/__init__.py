@@ -173,7 +173,9 @@ def list_reconstructors() -> dict[str, Callable[[Path | None, str], Reconstructo
 
 def check_reconstructor(name: str) -> None:
     """Raise InputError if no reconstructor has this name."""
-    if name not in RECONSTRUCTORS and name not in list_reconstructors():
+    if not isinstance(name, str) or (
+        name not in RECONSTRUCTORS and name not in list_reconstructors()
+    ):
         raise InputError(
             f"There is no reconstructor '{quote_value(name)}'; choose one of "
             f"{', '.join(list_reconstructors())}."

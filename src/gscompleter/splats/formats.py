@@ -23,7 +23,7 @@ from jaxtyping import UInt8
 from PIL import Image
 from torch import Tensor
 
-from gscompleter.errors import InputError, quote_value, refuse_pointer
+from gscompleter.errors import InputError, quote_value, refuse_pointer, require_path
 from gscompleter.io.files import replace_file
 from gscompleter.io.reading import open_file, read_json
 from gscompleter.splats.compressed_ply import read_compressed_ply, write_compressed_ply
@@ -101,7 +101,7 @@ def load_splat(path: Path | str, drop_nonfinite: bool = False) -> Gaussians:
     Gaussians; other formats have `NAME.generated.json` beside them. `drop_nonfinite` drops
     Gaussians with NaN, infinity or a zero quaternion instead of refusing the file.
     """
-    path = resolve_splat(Path(path))
+    path = resolve_splat(require_path(path))
     name = detect_splat_format(path)
     if name == "ply":
         return load_ply(path, drop_nonfinite)
@@ -143,7 +143,7 @@ def save_splat(path: Path | str, gaussians: Gaussians) -> None:
     A .ply stores everything. Other formats round, and the labels of generated Gaussians go to
     `NAME.generated.json` beside the file.
     """
-    path = Path(path)
+    path = require_path(path)
     write = get_writer(path)
     check_gaussians(gaussians, "The scene to write")
     if len(gaussians) == 0:

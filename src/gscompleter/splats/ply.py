@@ -29,7 +29,7 @@ from jaxtyping import Bool, Float, UInt8
 from numpy.lib.recfunctions import require_fields, unstructured_to_structured
 from torch import Tensor
 
-from gscompleter.errors import InputError, quote_value, refuse_pointer
+from gscompleter.errors import InputError, quote_value, refuse_pointer, require_path
 from gscompleter.io.files import replace_file
 from gscompleter.io.reading import open_file
 from gscompleter.kernels.parallel import map_in_parallel
@@ -109,7 +109,7 @@ def load_ply(path: Path | str, drop_nonfinite: bool = False) -> Gaussians:
     the file is refused. Infinite opacity logits are valid: converters write them for opacities of 1
     and 0.
     """
-    path = Path(path)
+    path = require_path(path)
     try:
         return require_finite(decode_gaussians(read_scene(path)), path, drop_nonfinite)
     except MemoryError as error:
@@ -277,6 +277,7 @@ def save_ply(path: Path | str, gaussians: Gaussians, provenance: bool | None = N
     `provenance` decides if `generated` is written; the default is yes if anything was generated.
     Some readers (such as gsply 0.4) misread rows that end in a byte; False writes the plain layout.
     """
+    path = require_path(path)
     check_gaussians(gaussians, "The scene to write")
     if provenance is None:
         provenance = bool((gaussians.generated > 0).any())
