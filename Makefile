@@ -9,7 +9,7 @@ TORCH_CPU_INDEX ?= https://download.pytorch.org/whl/cpu
 TORCH_INDEX := $(shell command -v nvidia-smi >/dev/null 2>&1 || echo --extra-index-url $(TORCH_CPU_INDEX))
 PIP := $(BIN)/python -m pip install --quiet --disable-pip-version-check
 
-.PHONY: demo test test-slow golden check-golden lint format types docs dist release-check evaluate reproduce held-out results-pages bench gpu clean
+.PHONY: demo test test-slow golden check-golden lint format types docs dist release-check fuzz evaluate reproduce held-out results-pages bench gpu clean
 
 demo: $(VENV)/installed
 	$(BIN)/gscompleter demo --out demo --overwrite
@@ -27,6 +27,12 @@ golden: $(VENV)/installed
 
 check-golden: $(VENV)/installed
 	$(BIN)/python benchmarks/golden.py check $(if $(ONLY),--only $(ONLY))
+
+# Thousands of odd calls, damaged files and commands; an hour. SEED=1 for others.
+SEED ?= 0
+fuzz: $(VENV)/installed-test
+	$(BIN)/python tests/support/fuzz_python.py --calls 3000 --files 5000 --seed $(SEED)
+	$(BIN)/python tests/support/fuzz.py --count 1500 --seed $(SEED)
 
 lint: $(VENV)/installed-dev
 	$(BIN)/ruff check .

@@ -30,12 +30,16 @@ from gscompleter.stages.slide_along_rays import slide_along_rays
 from gscompleter.stages.synthesize import GeneratedView, synthesize
 from gscompleter.stages.target_view import TargetView, render_target
 from gscompleter.state import NEW_PHOTO_ID, Completion, Photo, find_last_target_id
+from gscompleter.tensor_checks import describe, is_whole
 from gscompleter.timing import record_seconds, timed_stage
 from gscompleter.trust.photometric import load_trust
 from gscompleter.types import Camera, Gaussians, PaddedCamera, View
+from gscompleter.value_checks import check_camera, check_gaussians, check_inputs
 
 MAX_TARGET_ID = NEW_PHOTO_ID - 1
 """Largest target id: `generated` is one byte per Gaussian, and 0 means observed."""
+MAX_SEED = 2**62
+"""Levels and rounds add to the seed, which has 64 bits."""
 
 
 @dataclass(frozen=True)
@@ -61,7 +65,26 @@ class GSCompleter:
     """True to keep all registered Gaussians in each result, for evaluation."""
 
     def __post_init__(self) -> None:
-        """Raise InputError if a setting is out of range."""
+        """Raise InputError for a model that cannot be called, or a setting out of range."""
+        if not callable(self.reconstructor) or isinstance(self.reconstructor, type):
+            raise InputError(
+                "The reconstructor has to be a function of views, such as gsc.load_reconstructor "
+                f"returns, and is {describe(self.reconstructor)}."
+            )
+        as_generator(self.generator)
+        if not isinstance(self.renderer, Renderer) or isinstance(self.renderer, type):
+            raise InputError(
+                "The renderer has to be one that gsc.load_renderer returns, and is "
+                f"{describe(self.renderer)}."
+            )
+        if self.config is not None and not isinstance(self.config, CompleterConfig):
+            raise InputError(
+                f"The config has to be a CompleterConfig, and is {describe(self.config)}."
+            )
+        if not is_whole(self.seed) or not 0 <= self.seed < MAX_SEED:
+            raise InputError(
+                f"The seed has to be a whole number from 0 to 2^62, and is {describe(self.seed)}."
+            )
         validate(self.config or CompleterConfig(), "config.")
 
     @cached_property
@@ -92,10 +115,10 @@ class GSCompleter:
             InputError: Too few views, no baseline, too many targets, no view sees the scene, or no
                 target sees enough of it.
         """
-        targets = [target] if isinstance(target, Camera) else list(target)
-        if not targets:
-            raise InputError("No target camera was given; name at least one view to complete.")
-        check_target_ids(scene, len(targets))
+        targets = list_targets(target)
+        if scene is not None:
+            check_gaussians(scene, "The scene")
+            check_target_ids(scene, len(targets))
         check_views = check_views if witnesses is None else witnesses
         return self.complete(self.begin(views, scene, check_views, targets), targets)
 
@@ -122,6 +145,7 @@ class GSCompleter:
 
         The LOD proxy of a large scene is made fine enough for photographs and known targets.
         """
+        check_inputs(views, scene, check_views or (), targets)
         config = choose_config(self.config, scene, check_views)
         with record_seconds() as seconds, timed_stage("context"):
             made = init_context(
@@ -193,6 +217,7 @@ class GSCompleter:
 
         A reference that was synthesized in advance determines the padding by its camera.
         """
+        check_camera(target, "The target")
         camera = self.pad_target(state, target)
         if reference:
             return render_target(state, pad_like(camera.target, reference.camera), self.scenes)
@@ -213,9 +238,22 @@ class GSCompleter:
         return synthesize(self.generator, inputs)
 
 
+def list_targets(target: object) -> list[Camera]:
+    """List one or several target cameras; raise InputError for anything else or none."""
+    targets = [target] if isinstance(target, Camera) else target
+    if not isinstance(targets, (list, tuple)):
+        raise InputError(
+            "The target has to be a Camera, such as gsc.load_camera returns, or a list of them, "
+            f"and is {describe(target)}."
+        )
+    if not targets:
+        raise InputError("No target camera was given; name at least one view to complete.")
+    return list(targets)
+
+
 def check_target_ids(scene: Gaussians | None, num_targets: int) -> None:
     """Raise InputError if `generated` cannot hold the ids of `num_targets` more targets."""
-    given = find_last_target_id(scene) if scene else 0
+    given = 0 if scene is None else find_last_target_id(scene)
     if given + num_targets > MAX_TARGET_ID:
         raise InputError(
             f"{num_targets} targets were given after {given} in the scene, and a .ply can tell "

@@ -70,6 +70,17 @@ def shorten_message(message: str, most: int) -> str:
     return quote_value(" ".join(words), most)
 
 
+def require_path(value: object) -> Path:
+    """Return a path, or raise InputError for a value that is none."""
+    if isinstance(value, (str, os.PathLike)):
+        path = Path(value)
+        if isinstance(value, os.PathLike) or value:
+            return path
+    raise InputError(
+        f"A path has to be a str or Path that is not empty, and is '{quote_value(value)}'."
+    )
+
+
 def join_names(names: Sequence[object], most: int, length: int | None = None) -> str:
     """List the first `most` names, as in "a, b and 7 more"."""
     shown = ", ".join(quote_value(name, length) for name in names[:most])

@@ -46,6 +46,18 @@ def estimate_bytes(pixels: int, images: int) -> int:
     return PROGRAM_BYTES + pixels * (BYTES_PER_PIXEL + images * BYTES_PER_VIEW_PIXEL)
 
 
+def check_images(pixels: int, images: int) -> None:
+    """Raise InputError if images of `pixels` pixels in all need more memory than there is.
+
+    This is a lower bound for models of any kind: the images, their Gaussians and their renders.
+    """
+    check_bytes(
+        PROGRAM_BYTES + pixels * BYTES_PER_VIEW_PIXEL,
+        f"{images:,} photographs and targets of {quote_value(f'{pixels:,}')} pixels together",
+        "choose a smaller resolution, or fewer views",
+    )
+
+
 def check_bytes(needed: int, number: str, remedy: str, argument: str | None = None) -> None:
     """Raise InputError if `needed` bytes, for what `number` says, exceed the memory."""
     available = read_memory_bytes()

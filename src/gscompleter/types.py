@@ -4,6 +4,9 @@ OpenCV axes (x right, y down, z forward). `c2w` is camera-to-world. Intrinsics a
 centre of the top-left pixel is (0.5, 0.5). Images are [h, w, 3] in [0, 1]. `depth` is z-depth in
 scene units, `distance` is Euclidean along a unit ray. Quaternions are wxyz, scales linear,
 opacities in [0, 1], spherical harmonics [n, k, 3] in the 3DGS basis. All values are immutable.
+
+Constructors raise InputError for other types, shapes and devices, and `Camera` for impossible
+numbers. The numbers in large tensors are checked where they enter (`value_checks`).
 """
 
 from __future__ import annotations
@@ -12,15 +15,27 @@ import math
 from collections.abc import Sequence
 from dataclasses import dataclass, field, fields, replace
 from functools import cached_property
-from typing import Any, Literal, TypeVar
+from typing import Any, ClassVar, Literal, TypeVar
 
 import numpy as np
 import torch
 from jaxtyping import Bool, Float, Int, Int64, Shaped, UInt8
 from torch import Tensor
 
+from gscompleter.camera_limits import FOCAL_RANGE, MAX_CENTER, MAX_COORDINATE, MAX_SIDE
 from gscompleter.config.settings import COVERED
 from gscompleter.errors import InputError
+from gscompleter.tensor_checks import (
+    BOOLS,
+    BYTES,
+    FLOATS,
+    INTEGERS,
+    Form,
+    check_tensors,
+    describe,
+    is_number,
+    is_whole,
+)
 
 SH_C0 = 0.28209479177387814
 """Constant spherical harmonic: colour = 0.5 + SH_C0 * sh[:, 0]."""
@@ -31,6 +46,11 @@ REMOVED, REVEALED = -1, -2
 MAX_RIGID_ERROR = 1e-3
 """Largest entry of RᵀR - I that counts as rounding error of a rotation R."""
 
+MAX_SKEW = 1e-6
+"""Largest entry of K, relative to the focal length, that counts as rounding error of 0."""
+NUM_SH = (1, 4, 9, 16)
+"""Spherical harmonics per channel, by degree."""
+
 M = TypeVar("M", bound="TensorDataclass")
 
 
@@ -40,14 +60,24 @@ class TensorDataclass:
 
     def to(self: M, device: torch.device | str) -> M:
         """Return a copy on `device`, or the value itself if it is there."""
-        parts = {field.name: getattr(self, field.name) for field in fields(self)}
-        moved = {
-            name: part.to(device)
-            for name, part in parts.items()
-            if isinstance(part, (Tensor, TensorDataclass))
-        }
+        parts = self._list_parts()
+        moved = {name: part.to(device) for name, part in parts.items()}
         is_there = all(part is parts[name] for name, part in moved.items())
         return self if is_there else replace(self, **moved)
+
+    def detach(self: M) -> M:
+        """Return the value without the history of its gradients; itself if there is none."""
+        parts = self._list_parts()
+        if not any(isinstance(part, Tensor) and part.requires_grad for part in parts.values()):
+            return self
+        return replace(self, **{name: part.detach() for name, part in parts.items()})
+
+    def _list_parts(self) -> dict[str, Any]:
+        # Of the fields alone: cached properties lie beside them.
+        values = {part.name: getattr(self, part.name) for part in fields(self)}
+        return {
+            name: it for name, it in values.items() if isinstance(it, (Tensor, TensorDataclass))
+        }
 
 
 @dataclass(frozen=True)
@@ -65,13 +95,25 @@ class Camera(TensorDataclass):
     far: float | None = None
     """Largest z-depth of the scene, in scene units, or None if unknown."""
 
+    owner: ClassVar[str] = "a camera"
+    forms: ClassVar[dict[str, Form]] = {"c2w": (FLOATS, (4, 4)), "K": (FLOATS, (3, 3))}
+
     def __post_init__(self) -> None:
-        """Raise InputError for an impossible camera; values on a GPU are not read."""
-        defect = _find_planes_defect(self.near, self.far) or (
-            _find_pose_defect(self.c2w) or _find_intrinsics_defect(self.K, self.width, self.height)
+        """Raise InputError for an impossible camera; numbers on a GPU are not read."""
+        check_tensors(self, self.owner, self.forms)
+        defect = (
+            _find_size_defect(self.width, self.height)
+            or _find_planes_defect(self.near, self.far)
+            or _find_pose_defect(self.c2w)
+            or _find_intrinsics_defect(self.K, self.width, self.height)
         )
         if defect is not None:
             raise InputError(f"There is no such camera: {defect}.")
+        # NumPy's numbers cannot be written as JSON.
+        for name, convert in (("width", int), ("height", int), ("near", float), ("far", float)):
+            number = getattr(self, name)
+            if number is not None and type(number) is not convert:
+                object.__setattr__(self, name, convert(number))
 
     @property
     def center(self) -> Float[Tensor, "3"]:
@@ -114,9 +156,21 @@ class Camera(TensorDataclass):
         return pixels @ torch.linalg.inv_ex(self.K).inverse.T @ self.c2w[:3, :3].T
 
 
+def _find_size_defect(width: object, height: object) -> str | None:
+    """Return a sentence part about an impossible size of the image, or None."""
+    for name, side in (("width", width), ("height", height)):
+        if not is_whole(side):
+            return f"its {name} is {describe(side)}, and a whole number of pixels is needed"
+        if not 1 <= side <= MAX_SIDE:  # type: ignore[operator]
+            return f"its {name} is {side} pixels, and 1 to {MAX_SIDE} are possible"
+    return None
+
+
 def _find_planes_defect(near: float | None, far: float | None) -> str | None:
     """Return a sentence part about impossible depth planes, or None."""
     for name, plane in (("near", near), ("far", far)):
+        if plane is not None and not is_number(plane):
+            return f"its {name} plane is {describe(plane)}, and a number is needed"
         if plane is not None and not 0 < plane < math.inf:
             return f"its {name} plane is at {plane:g}, and a positive z-depth is needed"
     if near is not None and far is not None and near >= far:
@@ -126,13 +180,15 @@ def _find_planes_defect(near: float | None, far: float | None) -> str | None:
 
 def _find_pose_defect(c2w: Float[Tensor, "4 4"]) -> str | None:
     """Return a sentence part about an impossible pose, or None."""
-    if not isinstance(c2w, Tensor) or c2w.shape != (4, 4) or not c2w.is_floating_point():
-        return "its pose is no tensor of 4 × 4 floats"
+    if c2w.requires_grad:
+        return "its pose requires a gradient, which nothing computes; detach it"
     if c2w.device.type != "cpu":
         return None
-    pose = c2w.detach().double().numpy()  # for one matrix ten times as fast as torch
+    pose = c2w.double().numpy()  # for one matrix ten times as fast as torch
     if not np.isfinite(pose).all():
         return "its pose holds NaN or infinity"
+    if np.abs(pose[:3, 3]).max() > MAX_COORDINATE:
+        return f"its centre is more than {MAX_COORDINATE:g} scene units from the origin"
     errors = pose[:, :3].T @ pose[:, :3] - np.eye(3), pose[3] - np.eye(4)[3]
     if not max(abs(error).max() for error in errors) <= MAX_RIGID_ERROR:
         return "its pose is no rotation and translation but scaled, sheared or projective"
@@ -143,15 +199,21 @@ def _find_pose_defect(c2w: Float[Tensor, "4 4"]) -> str | None:
 
 def _find_intrinsics_defect(K: Float[Tensor, "3 3"], width: int, height: int) -> str | None:
     """Return a sentence part about impossible intrinsics, or None."""
-    if not isinstance(K, Tensor) or K.shape != (3, 3) or not K.is_floating_point():
-        return "its K is no tensor of 3 × 3 floats"
-    if width < 1 or height < 1:
-        return f"its image has {width} × {height} pixels"
+    if K.requires_grad:
+        return "its K requires a gradient, which nothing computes; detach it"
     if K.device.type != "cpu":
         return None
-    (fx, skew, cx), (_, fy, cy), _ = K.tolist()
-    if not (fx > 0 and fy > 0 and math.isfinite(fx + fy + cx + cy + skew)):
+    (fx, skew, cx), (below, fy, cy), last = K.tolist()
+    if not (fx > 0 and fy > 0 and math.isfinite(fx + fy + cx + cy)):
         return f"its focal lengths are {fx:g} and {fy:g}, its centre is ({cx:g}, {cy:g})"
+    # Renderers read the focal lengths and the centre only; rays take the inverse of the whole K.
+    if last != [0, 0, 1] or not max(abs(skew), abs(below)) <= MAX_SKEW * min(fx, fy):
+        return "its K has a skew or another last row than 0 0 1; pixels must be right-angled"
+    low, high = FOCAL_RANGE
+    if not (low <= fx / width <= high and low <= fy / height <= high):
+        return f"its focal lengths of {fx:g} and {fy:g} pixels fit no lens"
+    if max(abs(cx) / width, abs(cy) / height) > MAX_CENTER:
+        return f"its centre ({cx:g}, {cy:g}) is far outside of its image"
     return None
 
 
@@ -189,15 +251,29 @@ class View(TensorDataclass):
     given_depth: Float[Tensor, "h w"] | None = None
     """z-depth in scene units that constrains the reconstruction, 0 if unknown; scores nothing."""
 
+    owner: ClassVar[str] = "a view"
+    forms: ClassVar[dict[str, Form]] = {
+        "image": (FLOATS, (None, None, 3)),
+        "depth": (FLOATS, (None, None)),
+        "ignore_mask": (BOOLS, (None, None)),
+        "dynamic_mask": (BOOLS, (None, None)),
+        "given_depth": (FLOATS, (None, None)),
+    }
+
     def __post_init__(self) -> None:
-        """Raise InputError if the image or one of its maps does not have the size of the camera."""
-        image, size = self.image, (self.camera.height, self.camera.width)
-        is_colored = isinstance(image, Tensor) and image.shape[2:] == (3,)
-        if not is_colored or not image.is_floating_point():
+        """Raise InputError if a part has another form than the image of the camera."""
+        check_tensors(self, self.owner, self.forms)
+        if not isinstance(self.camera, Camera):
             raise InputError(
-                "The image of a view is no tensor of floats of shape [h, w, 3]; convert it."
+                f"The camera of a view has to be a Camera, and is {describe(self.camera)}."
             )
-        for name in ("image", "depth", "ignore_mask", "dynamic_mask", "given_depth"):
+        if self.frame is not None and not is_whole(self.frame):
+            raise InputError(
+                f"The frame of a view is {describe(self.frame)}; give the number of a frame or "
+                "None."
+            )
+        size = (self.camera.height, self.camera.width)
+        for name in self.forms:
             pixels = getattr(self, name)
             if pixels is not None and tuple(pixels.shape[:2]) != size:
                 raise InputError(
@@ -205,6 +281,15 @@ class View(TensorDataclass):
                     f"and its camera has {size[0]} × {size[1]} pixels (height × width); resize one "
                     "of them."
                 )
+        if self.image.requires_grad:
+            raise InputError(
+                "The image of a view requires a gradient, which nothing computes; detach it."
+            )
+        if self.image.device != self.camera.K.device:
+            raise InputError(
+                f"The image of a view is on {self.image.device}, and its camera on "
+                f"{self.camera.K.device}; move one of them."
+            )
         given, scored = self.given_depth, self.depth
         if given is not None and scored is not None and ((given > 0) & (scored > 0)).any():
             raise InputError("A depth both constrains and scores a view; leave one of them out.")
@@ -260,6 +345,37 @@ class Gaussians(TensorDataclass):
     """True for Mip-Splatting: opacities are multiplied by `sqrt(det S / det(S + 0.3 I))`.
     S is the covariance in the image, in px²."""
 
+    owner: ClassVar[str] = "Gaussians"
+    forms: ClassVar[dict[str, Form]] = {
+        "means": (FLOATS, (None, 3)),
+        "quats": (FLOATS, (None, 4)),
+        "scales": (FLOATS, (None, 3)),
+        "opacities": (FLOATS, (None,)),
+        "sh": (FLOATS, (None, None, 3)),
+        "generated": (BYTES, (None,)),
+        "encoded": (FLOATS, (None, 4)),
+    }
+
+    def __post_init__(self) -> None:
+        """Raise InputError for other types, shapes and devices; no number is read."""
+        check_tensors(self, self.owner, self.forms)
+        counts = {n: len(it) for n in self.forms if (it := getattr(self, n)) is not None}
+        if len(set(counts.values())) > 1:
+            raise InputError(
+                "All properties of Gaussians need as many rows, and "
+                f"{', '.join(f'{name} has {count}' for name, count in counts.items())}."
+            )
+        if self.sh.shape[1] not in NUM_SH:
+            raise InputError(
+                f"Gaussians have {self.sh.shape[1]} spherical harmonics per channel; degree 0 to 3 "
+                "have 1, 4, 9 or 16."
+            )
+        if not isinstance(self.is_antialiased, bool):
+            raise InputError(
+                "is_antialiased of Gaussians has to be True or False, and is "
+                f"{describe(self.is_antialiased)}."
+            )
+
     def __len__(self) -> int:
         return self.means.shape[0]
 
@@ -271,7 +387,7 @@ class Gaussians(TensorDataclass):
     @property
     def sh_degree(self) -> int:
         """Degree of the spherical harmonics, 0 to 3."""
-        return {1: 0, 4: 1, 9: 2, 16: 3}[self.sh.shape[1]]
+        return NUM_SH.index(self.sh.shape[1])
 
 
 def make_observed(
@@ -288,10 +404,15 @@ def make_observed(
 
 def merge(parts: Sequence[Gaussians]) -> Gaussians:
     """Concatenate Gaussians; SH of lower degree are padded with zeros, which changes no colour."""
+    if not isinstance(parts, (list, tuple)):
+        raise InputError(f"merge takes a list of Gaussians, and got one {describe(parts)}.")
+    for part in parts:
+        if not isinstance(part, Gaussians):
+            raise InputError(f"merge takes a list of Gaussians, and got one with {describe(part)}.")
     if not parts:
-        raise ValueError("merge needs at least one set of Gaussians, got none")
+        raise InputError("merge needs at least one set of Gaussians, and got none.")
     if len({part.is_antialiased for part in parts}) > 1:
-        raise ValueError("antialiased Gaussians cannot be merged with others")
+        raise InputError("Antialiased Gaussians cannot be merged with others; convert one of them.")
     k = max(part.sh.shape[1] for part in parts)
     sh = [torch.nn.functional.pad(part.sh, (0, 0, 0, k - part.sh.shape[1])) for part in parts]
     unknown = float("nan")  # unequal to anything: the writer encodes these again
@@ -333,13 +454,30 @@ class Render:
 
 
 @dataclass(frozen=True)
-class DepthMap:
+class DepthMap(TensorDataclass):
     """z-depth per pixel, in scene units, with a validity mask."""
 
     depth: Float[Tensor, "h w"]
     valid: Bool[Tensor, "h w"]
     confidence: Float[Tensor, "h w"] | None = None
     """Confidence in [0, 1], or None if the model does not estimate it."""
+
+    owner: ClassVar[str] = "a depth map"
+    forms: ClassVar[dict[str, Form]] = {
+        "depth": (FLOATS, (None, None)),
+        "valid": (BOOLS, (None, None)),
+        "confidence": (FLOATS, (None, None)),
+    }
+
+    def __post_init__(self) -> None:
+        """Raise InputError for other types, shapes and devices; no number is read."""
+        check_tensors(self, self.owner, self.forms)
+        shapes = {tuple(getattr(self, n).shape) for n in self.forms if getattr(self, n) is not None}
+        if len(shapes) > 1:
+            raise InputError(
+                f"The parts of a depth map have to be of one size, and have the shapes "
+                f"{' and '.join(str(list(shape)) for shape in sorted(shapes))}."
+            )
 
 
 @dataclass(frozen=True)
@@ -354,6 +492,27 @@ class Reconstruction:
     """Row-major pixel of that view, or None if the model is not pixel-aligned."""
     exposure_gains: Float[Tensor, "v 3"] | None = None
     """Exposure gain per channel of each view relative to the Gaussians, or None."""
+
+    owner: ClassVar[str] = "a reconstruction"
+    forms: ClassVar[dict[str, Form]] = {
+        "view_index": (INTEGERS, (None,)),
+        "pixel_index": (INTEGERS, (None,)),
+        "exposure_gains": (FLOATS, (None, 3)),
+    }
+
+    def __post_init__(self) -> None:
+        """Raise InputError for other types, shapes and devices; no number is read."""
+        check_tensors(self, self.owner, self.forms)
+        if not isinstance(self.gaussians, Gaussians):
+            raise InputError(
+                f"The gaussians of a reconstruction have to be Gaussians, and are "
+                f"{describe(self.gaussians)}."
+            )
+        is_listed = isinstance(self.depths, (tuple, list))
+        if not is_listed or not all(isinstance(depth, DepthMap) for depth in self.depths):
+            raise InputError(
+                "The depths of a reconstruction have to be a tuple of one DepthMap per view."
+            )
 
 
 @dataclass(frozen=True)

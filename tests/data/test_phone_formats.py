@@ -1,6 +1,7 @@
 """Exports of phones give the cameras and the depth of the room that they show."""
 
 import json
+import struct
 import sys
 from importlib import import_module
 from importlib.machinery import ModuleSpec
@@ -149,6 +150,10 @@ BROKEN = {
     "size": (changed(polycam(), CAMERA, width=0.5), "`width` of frame 1660000000002"),
     "no JSON": ({**polycam(), CAMERA: b"<html>"}, "frame 1660000000002 .* is not JSON"),
     "deep JSON": ({**polycam(), CAMERA: b"[" * 9000}, "frame 1660000000002 .* is not JSON"),
+    "bomb": (
+        {**record3d(), "rgbd/1.depth": b"bvxn" + struct.pack("<II", 2**31, 0) + b"bvx$"},
+        "larger than the photograph",
+    ),
     "depth": ({**polycam(), DEPTH: b"PNG"}, "frame 1660000000002 .* is not an image"),
     "8-bit depth": ({**polycam(), DEPTH: encode(np.zeros((3, 4), np.uint8))}, "uint8 of shape"),
     "confidence": ({**polycam(), CONFIDENCE: encode(np.zeros((3, 4), np.uint8))}, r"\(3, 4\)"),

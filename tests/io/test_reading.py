@@ -69,5 +69,5 @@ def test_a_folder_of_sog_opens_files_alone(tmp_path, others, part, kind):
     folder = made(tmp_path, "splat", plausible(40, 1))
     (folder / part).unlink()
     (folder / part).symlink_to(others[kind])
-    with pytest.raises(InputError, match="no regular file|is a folder without meta.json"):
+    with pytest.raises(InputError, match="no regular file|is a folder without a splat"):
         load_splat(folder)

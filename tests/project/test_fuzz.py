@@ -1,5 +1,9 @@
-"""A few of the mutations of `fuzz.py`, which runs thousands by hand."""
+"""A few of the inputs of `fuzz.py` and `fuzz_python.py`; `make fuzz` runs thousands.
 
+`FUZZ_CALLS` and `FUZZ_FILES` in the environment set the numbers of the second.
+"""
+
+import os
 import re
 import subprocess
 import sys
@@ -21,3 +25,17 @@ def test_mutated_inputs_end_in_a_sentence_or_a_result():
     refused = re.search(r"40 mutations, 0 findings, (\d+) refused", done.stdout)
     assert refused is not None
     assert 0 < int(refused[1]) < 40
+
+
+@pytest.mark.linux
+def test_odd_values_and_damaged_files_end_in_a_sentence_or_a_result():
+    """Calls of the Python interface and its readers, in a process of its own with its limits."""
+    calls, files = os.environ.get("FUZZ_CALLS", "40"), os.environ.get("FUZZ_FILES", "68")
+    words = ["--calls", calls, "--files", files, "--seed", "2"]
+    command = [sys.executable, str(SUPPORT / "fuzz_python.py"), *words]
+    done = subprocess.run(command, capture_output=True, text=True, check=False)
+    assert done.returncode == 0, done.stdout[-3000:] + done.stderr[-3000:]
+    count = int(calls) + int(files)
+    refused = re.search(rf"{count} inputs, 0 findings, (\d+) refused", done.stdout)
+    assert refused is not None
+    assert 0 < int(refused[1]) < count

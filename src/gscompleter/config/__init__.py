@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 from annotated_types import Interval
@@ -17,7 +16,7 @@ from gscompleter.config.settings import (
     apply_changes,
     read_yaml,
 )
-from gscompleter.errors import InputError, quote_value
+from gscompleter.errors import InputError, quote_value, require_path
 
 Pixels = Annotated[int, Interval(ge=0, le=4096)]
 Step = Annotated[float, Interval(gt=0, le=10)]
@@ -424,7 +423,7 @@ def get_named_config(name: str, is_splat: bool = False) -> CompleterConfig:
 
 def load_config(source: str, is_splat: bool = False) -> CompleterConfig:
     """Return a config by name, or read the changes to its `base` from a YAML file."""
-    path = Path(source)
+    path = require_path(source)
     if path.suffix not in {".yaml", ".yml"}:
         return get_named_config(source, is_splat)
     changes = read_yaml(path)

@@ -29,10 +29,10 @@ A loader that takes settings has their class as its attribute `settings`.
 
 def get_settings_class(name: str) -> type[GeneratorSettings]:
     """Return the class of a generator's settings, or raise InputError for an unknown name."""
-    if name in BUILT_IN:
+    if isinstance(name, str) and name in BUILT_IN:
         return GeneratorSettings
     others = load_plugins(PLUGINS)
-    if name in others:
+    if isinstance(name, str) and name in others:
         return getattr(others[name], "settings", GeneratorSettings)
     raise InputError(
         f"There is no generator '{quote_value(name)}'; choose one of "

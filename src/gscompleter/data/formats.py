@@ -35,7 +35,7 @@ from gscompleter.data.real_estate import (
 )
 from gscompleter.data.sfm.poses import ENDINGS, is_own
 from gscompleter.data.transforms import has_transforms, open_transforms
-from gscompleter.errors import InputError, join_names, quote_value
+from gscompleter.errors import InputError, join_names, quote_value, require_path
 
 
 @dataclass(frozen=True)
@@ -90,7 +90,7 @@ def open_photographs(
     units; those of the files if None.
     """
     check_planes(near, far)
-    path = Path(path)
+    path = require_path(path)
     found = detect_format(path, format)
     scene, *others = islice(FORMATS[found].open(path), 2)
     names = " and ".join(quote_value(one.name) for one in (scene, *others))
@@ -114,7 +114,7 @@ def detect_format(path: Path, name: str | None = None) -> str:
     formats = ", ".join(FORMATS)
     advice = "name photographs with cameras, such as colmap, nerfstudio or others (docs/formats.md)"
     require(
-        name is None or name in FORMATS,
+        name is None or (isinstance(name, str) and name in FORMATS),
         f"There is no format '{quote_value(name)}'; choose one of {formats}.",
     )
     require(os.path.exists(path), f"There is no {quote_value(path)}; {advice}.")

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
+from numbers import Integral
 from pathlib import Path, PurePosixPath
 
 import cv2
@@ -177,10 +178,11 @@ class Photographs:
 
     def frame(self, number: int) -> Frame:
         """Return the frame of that number."""
-        if not 0 <= number < len(self):
+        is_whole = isinstance(number, Integral) and not isinstance(number, bool)
+        if not is_whole or not 0 <= number < len(self):
             raise InputError(
-                f"There is no frame {number} in {self.title}, whose frames are numbered 0 to "
-                f"{len(self) - 1}; choose one of these."
+                f"There is no frame {quote_value(number)} in {self.title}, whose frames are "
+                f"numbered 0 to {len(self) - 1}; choose one of these."
             )
         return self.frames[number]
 
@@ -420,12 +422,21 @@ def resize(
     return np.array(Image.fromarray(image).resize(size, filtering))
 
 
+def _is_side(value: object) -> bool:
+    is_whole = isinstance(value, Integral) and not isinstance(value, bool)
+    return is_whole and 1 <= value <= MAX_SIDE  # type: ignore[operator]
+
+
 def check_resolution(resolution: Resolution) -> None:
     """Raise an InputError if a side is not within 1 to `MAX_SIDE`."""
+    if resolution is None:
+        return
     if isinstance(resolution, AuthorsCrop):
         resolution = (resolution.height, resolution.width)
-    sides = (resolution,) if isinstance(resolution, int) else resolution or ()
-    if not all(1 <= side <= MAX_SIDE for side in sides):
+    sides: Sequence[object] = (resolution,)
+    if isinstance(resolution, (tuple, list)) and len(resolution) == 2:
+        sides = resolution
+    if not all(_is_side(side) for side in sides):
         raise InputError(
             f"The resolution {' × '.join(map(quote_value, sides))} is impossible; height and "
             f"width have to be positive, and at most {MAX_SIDE}."

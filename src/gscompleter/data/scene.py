@@ -13,6 +13,7 @@ from gscompleter.data.formats import open_photographs
 from gscompleter.data.limits import check_planes, require
 from gscompleter.data.photographs import Photographs, Resolution
 from gscompleter.data.transforms import OPENCV_FROM_OPENGL
+from gscompleter.errors import quote_value, require_path
 from gscompleter.io.files import replace_file
 from gscompleter.types import Camera, View
 
@@ -32,7 +33,12 @@ def load_views(
     or the most pixels of the longer side; `near` and `far` are z-depths in scene units, if known.
     """
     photographs = open_photographs(scene, near=near, far=far)
-    return photographs.views(range(len(photographs)) if frames is None else frames, resolution)
+    chosen = range(len(photographs)) if frames is None else frames
+    require(
+        isinstance(chosen, (Sequence, np.ndarray)) and not isinstance(chosen, (str, bytes)),
+        f"The frames have to be a list of numbers, and are '{quote_value(chosen)}'.",
+    )
+    return photographs.views(chosen, resolution)
 
 
 def load_camera(
@@ -49,7 +55,7 @@ def load_camera(
         f"{photographs.title} has {len(photographs)} frames; choose one, from 0 to "
         f"{len(photographs) - 1}.",
     )
-    return photographs.camera(frame or 0, resolution)
+    return photographs.camera(0 if frame is None else frame, resolution)
 
 
 def load_cameras(
@@ -68,8 +74,9 @@ def load_cameras(
     `load_views`.
     """
     check_planes(near, far)
-    zero, frames = np.asarray(origin, dtype=np.float64), tuple(read_cameras(Path(path), resolution))
-    cameras = Photographs(Path(path).stem, str(path), frames, zero, near, far)
+    path = require_path(path)
+    zero, frames = np.asarray(origin, dtype=np.float64), tuple(read_cameras(path, resolution))
+    cameras = Photographs(path.stem, str(path), frames, zero, near, far)
     return [cameras.camera(number, resolution) for number in range(len(cameras))]
 
 

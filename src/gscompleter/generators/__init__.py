@@ -14,6 +14,7 @@ from gscompleter.config.settings import validate
 from gscompleter.errors import InputError
 from gscompleter.geometry import is_same_camera
 from gscompleter.plugins import load_plugins
+from gscompleter.tensor_checks import describe, is_whole
 from gscompleter.types import Camera, GeneratorInput, View
 
 
@@ -75,8 +76,23 @@ class FunctionGenerator:
 
 
 def as_generator(phi: Any) -> Generator:
-    """Return a `Generator`, wrapping an `ImageFunction`."""
-    return phi if isinstance(phi, Generator) else FunctionGenerator(phi)
+    """Return a `Generator`, wrapping an `ImageFunction`; raise InputError for anything else."""
+    is_object = isinstance(phi, Generator) and not isinstance(phi, type)
+    if not is_object and (not callable(phi) or isinstance(phi, type)):
+        raise InputError(
+            "The generator has to be a function of nearest view, target and context, or an object "
+            "with supports_padding, max_batch_size and synthesize, and is "
+            f"{describe(phi)}."
+        )
+    generator: Generator = phi if is_object else FunctionGenerator(phi)
+    if not is_whole(generator.max_batch_size) or generator.max_batch_size < 1:
+        raise InputError(
+            "The max_batch_size of the generator has to be a whole number from 1, and is "
+            f"{describe(generator.max_batch_size)}."
+        )
+    if not callable(generator.synthesize):
+        raise InputError("The synthesize of the generator has to be a function of requests.")
+    return generator
 
 
 def load_generator(

@@ -2,18 +2,21 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Sequence
-from dataclasses import fields, is_dataclass, replace
+from collections.abc import Callable, Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import Protocol, runtime_checkable
 
+import torch
 from jaxtyping import Bool
 from torch import Tensor
 
 from gscompleter.errors import InputError, quote_value
 from gscompleter.plugins import load_plugins
 from gscompleter.reconstructors.depth_predictors import load_depth_predictor
+from gscompleter.tensor_checks import describe, iterate_tensors, name_dtype
 from gscompleter.types import Reconstruction, View
+from gscompleter.value_checks import check_gaussians
 
 
 @runtime_checkable
@@ -45,22 +48,47 @@ def run_reconstructor(
     views: Sequence[View],
     pixel_mask: Bool[Tensor, "h w"] | None = None,
 ) -> Reconstruction:
-    """Run Ψ on `views` and raise ValueError if its result is on another device.
+    """Run Ψ on `views`, and raise InputError if it returns what no scene can be.
 
     With `pixel_mask`, only these pixels of the first view need Gaussians; Ψ may return more.
     """
     if pixel_mask is not None and isinstance(reconstructor, Lifter):
-        found = reconstructor.lift(views, pixel_mask)
+        made = reconstructor.lift(views, pixel_mask)
     else:
-        found = reconstructor(views)
+        made = reconstructor(views)
+    check_reconstruction(made, views)
+    return replace(
+        made,
+        gaussians=made.gaussians.detach(),
+        depths=tuple(depth.detach() for depth in made.depths),
+    )
+
+
+def check_reconstruction(made: object, views: Sequence[View]) -> None:
+    """Raise InputError if the output of Ψ does not fit its views, or holds impossible numbers.
+
+    On a GPU this waits a few times.
+    """
+    if not isinstance(made, Reconstruction):
+        raise InputError(
+            f"The reconstructor has to return a Reconstruction, and returned {describe(made)}."
+        )
     device = views[0].image.device
-    for name, tensor in iterate_tensors(found, "the reconstruction"):
+    for name, tensor in iterate_tensors(made, "the reconstruction"):
         if tensor.device != device:
-            raise ValueError(
+            raise InputError(
                 f"the reconstructor returned {name} on {tensor.device}, and its views are on "
                 f"{device}; it must return all tensors on the device of the views' images"
             )
-    return found
+    check_gaussians(made.gaussians, "The reconstruction")
+    if bool((made.gaussians.generated != 0).any()):
+        raise InputError(
+            "The reconstruction labels Gaussians as generated, and all of them are observed; "
+            "return zeros in `generated`."
+        )
+    _check_depths(made, views)
+    _check_pixels(made, views)
+    _check_gains(made, views)
 
 
 def get_trained_range(reconstructor: Reconstructor) -> tuple[float, float] | None:
@@ -68,16 +96,65 @@ def get_trained_range(reconstructor: Reconstructor) -> tuple[float, float] | Non
     return getattr(reconstructor, "depth_range", None)
 
 
-def iterate_tensors(value: object, name: str) -> Iterator[tuple[str, Tensor]]:
-    """Yield every tensor inside nested dataclasses and tuples, with its attribute path."""
-    if isinstance(value, Tensor):
-        yield name, value
-    elif isinstance(value, tuple):
-        for i, item in enumerate(value):
-            yield from iterate_tensors(item, f"{name}[{i}]")
-    elif is_dataclass(value):
-        for field in fields(value):
-            yield from iterate_tensors(getattr(value, field.name), f"{name}.{field.name}")
+def _check_depths(made: Reconstruction, views: Sequence[View]) -> None:
+    if len(made.depths) != len(views):
+        raise InputError(
+            f"The reconstructor got {len(views)} views and returned {len(made.depths)} depth maps; "
+            "return one for each."
+        )
+    for number, (depth, view) in enumerate(zip(made.depths, views, strict=True)):
+        if depth.depth.shape != view.image.shape[:2]:
+            raise InputError(
+                f"Depth map {number} of the reconstruction has the shape "
+                f"{list(depth.depth.shape)}, and its view {list(view.image.shape[:2])}; return one "
+                "of the same size."
+            )
+        if depth.depth.dtype is not torch.float32:
+            raise InputError(
+                f"Depth map {number} of the reconstruction holds {name_dtype(depth.depth.dtype)}; "
+                "convert it to float32."
+            )
+        possible = (depth.depth > 0) & depth.depth.isfinite()
+        if not bool((possible | ~depth.valid).all()):
+            raise InputError(
+                f"Depth map {number} of the reconstruction is NaN, infinite or not positive where "
+                "it is valid; mark such pixels as invalid."
+            )
+
+
+def _check_pixels(made: Reconstruction, views: Sequence[View]) -> None:
+    if made.view_index is None or made.pixel_index is None:
+        return
+    counts = {len(made.gaussians), len(made.view_index), len(made.pixel_index)}
+    if len(counts) > 1:
+        raise InputError(
+            f"The reconstruction has {len(made.gaussians)} Gaussians, {len(made.view_index)} view "
+            f"indices and {len(made.pixel_index)} pixel indices; return as many of each."
+        )
+    if len(made.gaussians) == 0:
+        return
+    sizes = [view.camera.width * view.camera.height for view in views]
+    view_index = made.view_index.long()
+    is_view = (view_index >= 0) & (view_index < len(views))
+    limits = torch.tensor(sizes, device=view_index.device)[view_index.where(is_view, 0)]
+    is_pixel = (made.pixel_index >= 0) & (made.pixel_index < limits)
+    if not bool((is_view & is_pixel).all()):
+        raise InputError(
+            f"The reconstruction names views or pixels that there are not: it got {len(views)} "
+            f"views of {sizes[0]} pixels, counted from 0."
+        )
+
+
+def _check_gains(made: Reconstruction, views: Sequence[View]) -> None:
+    gains = made.exposure_gains
+    if gains is None:
+        return
+    is_positive = bool(((gains > 0) & gains.isfinite()).all())
+    if len(gains) != len(views) or gains.dtype is not torch.float32 or not is_positive:
+        raise InputError(
+            f"The exposure gains of the reconstruction have to be {len(views)} rows of three "
+            "positive float32 numbers; correct or leave them out."
+        )
 
 
 def _load_plane_sweep(weights: Path | None, device: str) -> Reconstructor:
@@ -104,7 +181,9 @@ def list_reconstructors() -> dict[str, Callable[[Path | None, str], Reconstructo
 
 def check_reconstructor(name: str) -> None:
     """Raise InputError if no reconstructor has this name."""
-    if name not in RECONSTRUCTORS and name not in list_reconstructors():
+    if not isinstance(name, str) or (
+        name not in RECONSTRUCTORS and name not in list_reconstructors()
+    ):
         raise InputError(
             f"There is no reconstructor '{quote_value(name)}'; choose one of "
             f"{', '.join(list_reconstructors())}."

@@ -83,6 +83,11 @@ class Renderer(Protocol):
 
 def load_renderer(name: str) -> Renderer:
     """Load the renderer called `name`: reference, cpu or cuda."""
+    if not isinstance(name, str):
+        raise InputError(
+            f"A renderer is named by a str, got '{quote_value(name)}'; choose reference, cpu or "
+            "cuda."
+        )
     if name == "cpu":
         from gscompleter.render.cpu import CpuRenderer
 

@@ -51,7 +51,8 @@ def transform_camera(camera: Camera, transform: Matrix) -> Camera:
 
 def transform_camera_exactly(camera: Camera, transform: Matrix) -> Camera:
     """Transform a camera in float64, for files: maps have large coordinates."""
-    return transform_camera(replace(camera, c2w=camera.c2w.double()), transform)
+    exact = replace(camera, c2w=camera.c2w.double(), K=camera.K.double())
+    return transform_camera(exact, transform)
 
 
 def transform_view(view: View, transform: Matrix) -> View:

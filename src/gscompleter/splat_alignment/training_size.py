@@ -105,7 +105,8 @@ def read_listed_scale(
     for file in find_camera_lists(splat, folder):
         with suppress(InputError):
             listed = {frame.name: frame.intrinsics.size for frame in read_camera_list(file)}
-            sizes = [listed[name] for _, name in match_names(names, list(listed))]
+            matched = [listed[name] for _, name in match_names(names, list(listed))]
+            sizes = [size for size in matched if size is not None]
             if sizes:
                 return median(max(size) for size in sizes) / own, file.name
     return None

@@ -8,6 +8,7 @@ from __future__ import annotations
 import contextlib
 import hashlib
 import json
+import lzma
 import struct
 import zipfile
 import zlib
@@ -22,26 +23,28 @@ from jaxtyping import UInt8
 from PIL import Image
 from torch import Tensor
 
-from gscompleter.errors import InputError, quote_value, refuse_pointer
+from gscompleter.errors import InputError, quote_value, refuse_pointer, require_path
 from gscompleter.io.files import replace_file
 from gscompleter.io.reading import open_file, read_json
 from gscompleter.splats.compressed_ply import read_compressed_ply, write_compressed_ply
+from gscompleter.splats.foreign import refuse_folder, refuse_foreign, resolve_splat
 from gscompleter.splats.glb import read_glb, write_glb
 from gscompleter.splats.ksplat import read_ksplat
 from gscompleter.splats.morton import sort_along_morton
-from gscompleter.splats.packing import ZIP_MAGIC
-from gscompleter.splats.ply import load_ply, require_finite, save_ply
+from gscompleter.splats.packing import ZIP_MAGIC, UnsupportedError
+from gscompleter.splats.ply import load_ply, make_memory_error, require_finite, save_ply
 from gscompleter.splats.sog import META, read_sog, write_sog
 from gscompleter.splats.splat import read_splat, write_splat
 from gscompleter.splats.spz import read_spz, write_spz
 from gscompleter.splats.usd import refuse_usd, write_usd
 from gscompleter.types import Gaussians
+from gscompleter.value_checks import check_gaussians
 
 OPACITY_TOLERANCE = 1e-3
 """Distance from [0, 1] up to which an opacity is clamped instead of refused."""
 DECODING_ERRORS = (
     *(ArithmeticError, EOFError, LookupError, MemoryError, OSError, RecursionError, ValueError),
-    *(NotImplementedError, struct.error, zipfile.BadZipFile, zlib.error),
+    *(NotImplementedError, struct.error, zipfile.BadZipFile, zlib.error, lzma.LZMAError),
     Image.DecompressionBombError,
 )
 """Errors that decoders raise on damaged bytes."""
@@ -94,11 +97,11 @@ UNMARKED = (write_splat, write_glb, write_usd)
 def load_splat(path: Path | str, drop_nonfinite: bool = False) -> Gaussians:
     """Load the Gaussians of a file in any format of `FORMATS`, in the axes of a 3DGS .ply.
 
-    A .ply has the labels of generated Gaussians; other formats have `NAME.generated.json` beside
-    them. `drop_nonfinite` drops Gaussians with NaN, infinity or a zero quaternion instead of
-    refusing the file.
+    Of a trainer's model folder, the newest iteration is loaded. A .ply has the labels of generated
+    Gaussians; other formats have `NAME.generated.json` beside them. `drop_nonfinite` drops
+    Gaussians with NaN, infinity or a zero quaternion instead of refusing the file.
     """
-    path = Path(path)
+    path = resolve_splat(require_path(path))
     name = detect_splat_format(path)
     if name == "ply":
         return load_ply(path, drop_nonfinite)
@@ -108,6 +111,10 @@ def load_splat(path: Path | str, drop_nonfinite: bool = False) -> Gaussians:
             gaussians = FORMATS[name].read(path)
     except InputError:
         raise
+    except UnsupportedError as error:
+        raise InputError(f"{quote_value(path)} {error}; export it as .ply.") from error
+    except MemoryError as error:
+        raise make_memory_error(path) from error
     except errors as error:
         raise InputError(
             f"{quote_value(path)} cannot be read: {quote_value(str(error), MAX_DEFECT)}; fetch the "
@@ -136,14 +143,15 @@ def save_splat(path: Path | str, gaussians: Gaussians) -> None:
     A .ply stores everything. Other formats round, and the labels of generated Gaussians go to
     `NAME.generated.json` beside the file.
     """
-    path = Path(path)
+    path = require_path(path)
     write = get_writer(path)
+    check_gaussians(gaussians, "The scene to write")
     if len(gaussians) == 0:
         raise InputError(f"There is no Gaussian to write to {quote_value(path)}.")
     if write is save_ply:
         save_ply(path, gaussians)
         return
-    gaussians = require_finite(gaussians.to("cpu"), path, drop_nonfinite=False)
+    gaussians = gaussians.detach().to("cpu")
     if write in SORTED:
         gaussians = sort_along_morton(gaussians)
     write(path, gaussians)
@@ -165,20 +173,21 @@ def detect_splat_format(path: Path) -> str:
     if path.is_dir():
         if (path / META).is_file():
             return "sog-folder"
-        raise InputError(f"{quote_value(path)} is a folder without {META}; name a file.")
+        refuse_folder(path)
     with open_file(path) as file:
         head = file.read(HEAD_BYTES)
     refuse_pointer(path)
     if not head:
         raise InputError(f"{quote_value(path)} is empty; a file of Gaussians is needed.")
+    refuse_foreign(path, head)
     for name, format_ in FORMATS.items():
         if head.lstrip().startswith(format_.starts) and format_.contains in head:
             return name
     named = _match_extension(path)
     if named is None or FORMATS[named].starts:
-        known = ", ".join(f"*{ending}" for f in FORMATS.values() for ending in f.extensions)
         raise InputError(
-            f"{quote_value(path)} holds no Gaussians in a format that is known: {known}."
+            f"{quote_value(path)} holds no Gaussians in a format that is known; name a .ply, "
+            ".spz, .splat, .ksplat or .glb (docs/formats.md has them all)."
         )
     return named
 

@@ -24,7 +24,7 @@ from gscompleter.errors import InputError, quote_value
 from gscompleter.geometry import quats_to_rotations
 from gscompleter.io.files import replace_file
 from gscompleter.io.reading import read_bytes
-from gscompleter.splats.packing import build_gaussians
+from gscompleter.splats.packing import UnsupportedError, build_gaussians
 from gscompleter.splats.transform import HALF_TURN_Z, rotate_half_turn, transform_gaussians
 from gscompleter.types import SH_C0, Gaussians, merge
 
@@ -58,7 +58,7 @@ def read_glb(path: Path) -> Gaussians:
     document = _parse_document(read_bytes(path))
     placed = list(_find_primitives(document))
     if not placed:
-        raise ValueError(f"nothing in it uses {EXTENSION}")
+        raise UnsupportedError(_describe_other_content(document.table))
     counts = [_get_accessor(document, p, "POSITION")["count"] for p, _ in placed]
     if sum(counts) * MIN_GAUSSIAN_BYTES > len(document.binary):
         raise ValueError("it claims more Gaussians than fit into it")
@@ -67,6 +67,14 @@ def read_glb(path: Path) -> Gaussians:
         for primitive, place in placed
     ]
     return rotate_half_turn(merge(parts), HALF_TURN_Z)
+
+
+def _describe_other_content(table: dict[str, Any]) -> str:
+    """Describe a .glb without Gaussians of the final extension."""
+    names = [name for name in table.get("extensionsUsed", ()) if "gaussian" in str(name).lower()]
+    if names:
+        return f"stores Gaussians by {quote_value(names[0])}, a draft or another extension"
+    return f"holds a mesh or points, no Gaussians ({EXTENSION})"
 
 
 def _parse_document(data: bytes) -> GlbDocument:
@@ -116,7 +124,7 @@ def _read_transform(node: dict[str, Any]) -> Float[Tensor, "4 4"]:
     volume = float(torch.linalg.det(linear))
     shape = linear @ linear.T / max(volume, 1e-30) ** (2 / 3)
     if not volume > 0 or not torch.allclose(shape, torch.eye(3).double(), atol=1e-3):
-        raise ValueError("one of its nodes mirrors or stretches Gaussians unevenly")
+        raise UnsupportedError("has a node that mirrors Gaussians or stretches them unevenly")
     return place
 
 
@@ -130,7 +138,9 @@ def _decode_primitive(document: GlbDocument, primitive: dict[str, Any]) -> Gauss
     packed = ", ".join({**extension.get("extensions", {}), **primitive["extensions"]})
     stored = (packed, extension.get("kernel", "ellipse"), extension.get("colorSpace", COLOR_SPACE))
     if stored != (EXTENSION, "ellipse", COLOR_SPACE):
-        raise ValueError(f"it stores Gaussians in an unknown way, {quote_value(stored)}")
+        raise UnsupportedError(f"stores Gaussians in an unknown way, {quote_value(stored)}")
+    if f"{EXTENSION}:ROTATION" not in primitive["attributes"]:
+        raise UnsupportedError(f"stores Gaussians as a draft of {EXTENSION} did")
 
     def read_attribute(name: str, kind: str = "VEC3") -> Float[ndarray, "n k"]:
         accessor = _get_accessor(document, primitive, name)
@@ -152,7 +162,7 @@ def _read_accessor(document: GlbDocument, accessor: dict[str, Any]) -> Float[nda
     """Read the numbers of an accessor from the binary part; integers may stand for fractions."""
     view = {} if "sparse" in accessor else document.table["bufferViews"][accessor["bufferView"]]
     if view.get("buffer") != 0 or view.get("extensions"):
-        raise ValueError("it holds its Gaussians sparse, compressed or in another file")
+        raise UnsupportedError("holds its Gaussians sparse, compressed or in another file")
     kind = np.dtype(COMPONENT_TYPES[accessor["componentType"]])
     width = NUM_COMPONENTS[accessor["type"]]
     start = int(view.get("byteOffset", 0)) + int(accessor.get("byteOffset", 0))
@@ -163,7 +173,7 @@ def _read_accessor(document: GlbDocument, accessor: dict[str, Any]) -> Float[nda
     if kind.kind == "f":
         return values.astype(np.float32)
     if not accessor.get("normalized") and width != 3:
-        raise ValueError("its rotations or opacities are no fractions")
+        raise UnsupportedError("has rotations or opacities that are no fractions")
     largest = np.iinfo(kind).max if accessor.get("normalized") else 1
     return np.maximum(values.astype(np.float32) / largest, -1 if largest > 1 else -np.inf)
 

@@ -17,7 +17,12 @@ from jaxtyping import Float
 from numpy import ndarray
 
 from gscompleter.io.reading import read_bytes
-from gscompleter.splats.packing import NUM_SH_REST, assemble_sh, build_gaussians
+from gscompleter.splats.packing import (
+    NUM_SH_REST,
+    UnsupportedError,
+    assemble_sh,
+    build_gaussians,
+)
 from gscompleter.types import Gaussians, merge
 
 HEADER_BYTES, SECTION_HEADER_BYTES = 4096, 1024
@@ -57,7 +62,10 @@ def read_ksplat(path: Path) -> Gaussians:
     data = memoryview(read_bytes(path))
     major, minor, num_sections, level, *sh_range = HEADER.unpack_from(data)
     if major != 0 or minor < 1 or level > 2:
-        raise ValueError(f"it is .ksplat version {major}.{minor} with compression {level}")
+        raise UnsupportedError(
+            f"is .ksplat version {major}.{minor} with compression {level}, and version 0.1 with "
+            "compression 0 to 2 is read"
+        )
     parts, start = [], HEADER_BYTES + num_sections * SECTION_HEADER_BYTES
     for number in range(num_sections):
         header = SECTION_HEADER.unpack_from(data, HEADER_BYTES + number * SECTION_HEADER_BYTES)

@@ -21,12 +21,14 @@ from numpy.lib.recfunctions import require_fields
 from torch import Tensor
 
 from gscompleter.errors import InputError, quote_value
+from gscompleter.splats.foreign import resolve_splat
 from gscompleter.splats.formats import detect_splat_format, get_writer, load_splat, save_splat
 from gscompleter.splats.ply import (
     MEANS,
     PlyFile,
     count_rest,
     decode_gaussians,
+    has_surfels,
     iterate_blocks,
     make_rows,
     make_scene_header,
@@ -76,9 +78,9 @@ def save_like(
 ) -> None:
     """Write a completed scene in the layout of the input file `given`.
 
-    The standard layout is used if `given` is ASCII or no .ply, has a column `generated` of another
-    type, fewer SH coefficients than `added`, or rows that do not match `context`. `kept` marks the
-    rows of `given` that the context has; None for all.
+    The standard layout is used if `given` is ASCII or no .ply, has surfels (two scales cannot hold
+    `added`), a column `generated` of another type, fewer SH coefficients than `added`, or rows that
+    do not match `context`. `kept` marks the rows of `given` that the context has; None for all.
     """
     context, layout = context.to("cpu"), find_layout(given)
     added = merge([context[:0], added.to("cpu")])
@@ -109,7 +111,8 @@ def _match_rows(
 ) -> Int[ndarray, "m"] | None:
     """Find the rows of a file that its context was read from, or None if `added` do not fit in."""
     names = layout.rows.dtype.names or ()
-    if LABEL_COLUMN in names and layout.rows.dtype[LABEL_COLUMN] != np.uint8:
+    has_other_labels = LABEL_COLUMN in names and layout.rows.dtype[LABEL_COLUMN] != np.uint8
+    if has_surfels(layout) or has_other_labels:
         return None
     numbers = np.arange(len(layout.rows)) if kept is None else np.flatnonzero(kept.numpy())
     means = read_columns(layout.rows, MEANS)[numbers]
@@ -130,6 +133,7 @@ def strip(path: Path, out: Path) -> tuple[int, int]:
     If both are .ply, the layout of the file is kept. Returns the numbers of Gaussians written and
     left out.
     """
+    path = resolve_splat(path)
     completed, layout = load_splat(path), find_layout(path)
     given = drop_sh_padding(completed)
     layout = None if layout is None else drop_generated(layout)

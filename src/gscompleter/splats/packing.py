@@ -23,6 +23,10 @@ MAX_GROWTH = 256
 """Largest ratio of unpacked to packed size. Real files reach 2, real images 10."""
 
 
+class UnsupportedError(ValueError):
+    """An intact file whose content is not read; its message follows the name of the file."""
+
+
 def unpack_fractions(packed: UInt32[ndarray, "n"], widths: Sequence[int]) -> Float[ndarray, "n k"]:
     """Unpack fields of `widths` bits, the last one in the lowest bits, as fractions in [0, 1]."""
     fractions = np.empty((len(packed), len(widths)), np.float32)

@@ -6,14 +6,19 @@ opacity scale_* rot_*), then `uchar generated`. Read are the same properties in 
 type. In the file scales are logarithms, opacities are logits, and f_rest_* has all coefficients
 of red, then green, then blue. A comment marks antialiased Gaussians: Brush's is written,
 Postshot's are read too.
+
+Two variants are read as ordinary Gaussians. A property `filter_3D` (Mip-Splatting, GOF) is fused
+into scales and opacities, as their viewers do. Surfels of 2DGS, which have two scales and the third
+axis as their normal, get a thin third scale.
 """
 
 from __future__ import annotations
 
+import math
 import os
 import re
 from collections.abc import Iterable, Iterator, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from itertools import chain, islice
 from pathlib import Path
 from typing import BinaryIO
@@ -24,11 +29,12 @@ from jaxtyping import Bool, Float, UInt8
 from numpy.lib.recfunctions import require_fields, unstructured_to_structured
 from torch import Tensor
 
-from gscompleter.errors import InputError, quote_value, refuse_pointer
+from gscompleter.errors import InputError, quote_value, refuse_pointer, require_path
 from gscompleter.io.files import replace_file
 from gscompleter.io.reading import open_file
 from gscompleter.kernels.parallel import map_in_parallel
 from gscompleter.types import Gaussians
+from gscompleter.value_checks import LARGEST, check_gaussians, find_finite
 
 _SCALARS = {
     **dict.fromkeys(("char", "int8"), "i1"),
@@ -49,15 +55,16 @@ _NORMALS = ("nx", "ny", "nz")
 _DC = ("f_dc_0", "f_dc_1", "f_dc_2")
 _SCALES = ("scale_0", "scale_1", "scale_2")
 _QUATS = ("rot_0", "rot_1", "rot_2", "rot_3")
-_NEEDED = (*MEANS, *_DC, "opacity", *_SCALES, *_QUATS)
+_NEEDED = (*MEANS, *_DC, "opacity", *_SCALES[:2], *_QUATS)
+FILTER = "filter_3D"
+"""Standard deviation of the smoothing filter of Mip-Splatting and GOF, in scene units."""
+SURFEL_THICKNESS = 1e-3
+"""Thickness of a surfel of 2DGS, relative to its smaller scale."""
 _NUM_REST = (0, 9, 24, 45)
 """Number of properties f_rest_* by SH degree."""
 
 _MAX_LOGIT = 30.0
 """Opacities of 0 are written as this logit, negated."""
-
-_MAX_SCALE = 1e38
-"""Larger scales are clamped to this one, which is finite in float32."""
 
 MODE_COMMENT = "SplatRenderMode: mip"
 """Comment that marks antialiased Gaussians."""
@@ -102,8 +109,23 @@ def load_ply(path: Path | str, drop_nonfinite: bool = False) -> Gaussians:
     the file is refused. Infinite opacity logits are valid: converters write them for opacities of 1
     and 0.
     """
-    path = Path(path)
-    return require_finite(decode_gaussians(read_scene(path)), path, drop_nonfinite)
+    path = require_path(path)
+    try:
+        return require_finite(decode_gaussians(read_scene(path)), path, drop_nonfinite)
+    except MemoryError as error:
+        raise make_memory_error(path) from error
+    except RuntimeError as error:
+        if "can't allocate memory" in str(error):  # PyTorch has no type for it
+            raise make_memory_error(path) from error
+        raise
+
+
+def make_memory_error(path: Path) -> InputError:
+    """Make the error of a file that needs more memory than there is."""
+    return InputError(
+        f"{quote_value(path)} needs more memory than there is; close other programs, or thin the "
+        "splat."
+    )
 
 
 def find_finite_rows(path: Path) -> Bool[Tensor, "n"]:
@@ -112,7 +134,7 @@ def find_finite_rows(path: Path) -> Bool[Tensor, "n"]:
 
 
 def read_scene(path: Path) -> PlyFile:
-    """Read the rows of a 3DGS .ply."""
+    """Read the rows of a 3DGS .ply, surfels of 2DGS included."""
     scene = read_ply_file(path, _NEEDED, "3DGS scene")
     names = scene.rows.dtype.names or ()
     num_rest = count_rest(scene)
@@ -138,17 +160,22 @@ def has_mode_comment(header: bytes) -> bool:
 def decode_gaussians(scene: PlyFile) -> Gaussians:
     """Decode the Gaussians of a .ply, non-finite ones included."""
     rows, num_rest = scene.rows, count_rest(scene)
+    names = rows.dtype.names or ()
     rests = tuple(f"f_rest_{i}" for i in range(num_rest))
+    logs = (*(name for name in _SCALES if name in names), "opacity")
     rest, means, quats, encoded, dc = map_in_parallel(
-        lambda names: torch.from_numpy(read_columns(rows, names)),
-        [rests, MEANS, _QUATS, (*_SCALES, "opacity"), _DC],
+        lambda columns: torch.from_numpy(read_columns(rows, columns)),
+        [rests, MEANS, _QUATS, logs, _DC],
     )
     rest = rest.view(len(rows), 3, num_rest // 3).transpose(1, 2)
+    if has_surfels(scene):
+        thin = encoded[:, :2].amin(1) + math.log(SURFEL_THICKNESS)
+        encoded = torch.cat([encoded[:, :2], thin[:, None], encoded[:, 2:]], dim=1)
     generated = np.zeros(len(rows), np.uint8)
-    if "generated" in (rows.dtype.names or ()):
+    if "generated" in names:
         with np.errstate(invalid="ignore"):
             generated = rows["generated"].astype(np.uint8)
-    return Gaussians(
+    gaussians = Gaussians(
         means=means,
         quats=quats,
         scales=_decode_scales(encoded),
@@ -157,6 +184,32 @@ def decode_gaussians(scene: PlyFile) -> Gaussians:
         generated=torch.from_numpy(generated),
         encoded=encoded,
         is_antialiased=has_mode_comment(scene.header),
+    )
+    if FILTER not in names:
+        return gaussians
+    return fuse_filter(gaussians, torch.from_numpy(read_columns(rows, (FILTER,)))[:, 0])
+
+
+def has_surfels(scene: PlyFile) -> bool:
+    """Return True for the file of 2DGS, whose Gaussians have two scales."""
+    return _SCALES[2] not in (scene.rows.dtype.names or ())
+
+
+def fuse_filter(gaussians: Gaussians, radii: Float[Tensor, "n"]) -> Gaussians:
+    """Fuse the 3D smoothing filter into scales and opacities (Mip-Splatting, Eq. 7).
+
+    A Gaussian is convolved with an isotropic one of standard deviation `radii`, in scene units, and
+    its opacity falls by the growth of its volume. This is what the authors' `fuse_3d_filter` does.
+    """
+    before = gaussians.scales.double().square()
+    after = before + radii.double().square()[:, None]
+    # A Gaussian of size zero with a filter of zero stays as it is.
+    loss = (before.clamp_min(1e-300) / after.clamp_min(1e-300)).prod(1).sqrt()
+    return replace(
+        gaussians,
+        scales=after.sqrt().float(),
+        opacities=(gaussians.opacities.double() * loss).float(),
+        encoded=None,
     )
 
 
@@ -178,22 +231,12 @@ def require_finite(gaussians: Gaussians, path: Path, drop_nonfinite: bool) -> Ga
         raise InputError(f"{quote_value(path)} holds no Gaussian that is finite; write it anew.")
     if bad > 0 and not drop_nonfinite:
         raise InputError(
-            f"{quote_value(path)} has {bad:,} of {len(good):,} Gaussians with NaN, infinity or a "
-            "rotation of zeros; repair it, or drop what is not finite.",
+            f"{quote_value(path)} has {bad:,} of {len(good):,} Gaussians with NaN, infinity, "
+            f"numbers above {LARGEST:g} or a rotation of zeros; repair it, or drop what is not "
+            "finite.",
             "drop_nonfinite",
         )
     return gaussians[good] if bad > 0 else gaussians
-
-
-def find_finite(gaussians: Gaussians) -> Bool[Tensor, "n"]:
-    """Mark Gaussians without NaN, infinity (except in logits) and zero quaternions."""
-    scales = gaussians.scales if gaussians.encoded is None else gaussians.encoded[:, :3]
-    opacities, good = gaussians.opacities, (gaussians.quats != 0).any(1)
-    tables = (gaussians.means, gaussians.quats, gaussians.scales, scales, gaussians.sh, opacities)
-    for values in tables:
-        if not values.sum().isfinite():  # ten times faster than a test of each value
-            good &= values.isfinite().reshape(len(values), -1).all(1)
-    return good
 
 
 def iterate_blocks(count: int) -> Iterator[slice]:
@@ -215,7 +258,7 @@ def encode(gaussians: Gaussians) -> Float[Tensor, "n 4"]:
     Values read from a file are reused where they still decode to the values in memory.
     """
     tiny = torch.finfo(torch.float32).tiny
-    scales = gaussians.scales.double().clamp(tiny, _MAX_SCALE).log()
+    scales = gaussians.scales.double().clamp_min(tiny).log()
     # The largest float32 below 1 has a logit of 16.6; a larger one could not be read back.
     opacities = gaussians.opacities.double().clamp(0, 1 - 2**-24).logit()
     anew = torch.cat([scales, opacities.clamp_min(-_MAX_LOGIT)[:, None]], dim=1).float()
@@ -234,9 +277,11 @@ def save_ply(path: Path | str, gaussians: Gaussians, provenance: bool | None = N
     `provenance` decides if `generated` is written; the default is yes if anything was generated.
     Some readers (such as gsply 0.4) misread rows that end in a byte; False writes the plain layout.
     """
+    path = require_path(path)
+    check_gaussians(gaussians, "The scene to write")
     if provenance is None:
         provenance = bool((gaussians.generated > 0).any())
-    gaussians = gaussians.to("cpu")
+    gaussians = gaussians.detach().to("cpu")
     blocks = (make_rows(gaussians[block], provenance) for block in iterate_blocks(len(gaussians)))
     header = make_scene_header(gaussians, provenance)
     write_ply_file(path, header, len(gaussians), blocks)
@@ -317,9 +362,15 @@ def read_ply_file(path: Path, needed: Sequence[str], kind: str) -> PlyFile:
         names = () if vertex is None else vertex.dtype.names or ()
         missing = [name for name in needed if name not in names]
         if vertex is None or missing or vertex.dtype.hasobject:
+            other = _describe_other_content(elements) if _DC[0] in missing else None
             raise InputError(
-                f"{path} is no {kind}: it does not begin with vertices that have "
-                f"{', '.join(missing or names)} and no lists."
+                f"{path} is no {kind}"
+                + (
+                    f" but {other}."
+                    if other is not None
+                    else f": it does not begin with vertices that have "
+                    f"{', '.join(missing or names)} and no lists."
+                )
             )
         is_ascii = re.search(rb"^format\s+ascii", header, re.M) is not None
         rows = (
@@ -334,6 +385,24 @@ def read_ply_file(path: Path, needed: Sequence[str], kind: str) -> PlyFile:
             )
         trailer = _map_rows(file, np.dtype(np.uint8), len(header) + rows.nbytes)
         return PlyFile(header, rows, trailer, is_ascii)
+
+
+def _describe_other_content(elements: Sequence[Element]) -> str | None:
+    """Describe what a .ply without Gaussians holds, and what to name instead; None if unknown."""
+    columns = {name for element in elements for name in element.dtype.names or ()}
+    if any(name.startswith(("f_offset_", "f_anchor_feat_")) for name in columns):
+        return (
+            "anchors of Scaffold-GS, whose Gaussians a network makes for each camera; export its "
+            "Gaussians, or train a splat of plain 3DGS"
+        )
+    if not columns.issuperset(MEANS) or _DC[0] in columns:
+        return None
+    if any(element.name == "face" for element in elements):
+        return "a mesh; train a splat from photographs, and name its .ply"
+    return (
+        "a point cloud; name the .ply that the training of the splat wrote (often "
+        "point_cloud/iteration_N/point_cloud.ply or splat.ply)"
+    )
 
 
 def _map_rows(file: BinaryIO, dtype: np.dtype, start: int, count: int | None = None) -> np.ndarray:

@@ -22,7 +22,7 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float, Shaped, UInt8
 from numpy import ndarray
-from PIL import Image
+from PIL import Image, UnidentifiedImageError
 
 from gscompleter.errors import quote_value
 from gscompleter.io.files import replace_file
@@ -32,6 +32,7 @@ from gscompleter.splats.packing import (
     MAX_LOG_SCALE,
     NUM_SH_REST,
     ZIP_MAGIC,
+    UnsupportedError,
     assemble_sh,
     build_gaussians,
     check_growth,
@@ -72,7 +73,7 @@ def read_sog(path: Path) -> Gaussians:
 def _read_entry(bundle: zipfile.ZipFile, name: str) -> bytes:
     entry = bundle.getinfo(name)
     if entry.flag_bits & 1:
-        raise ValueError(f"its {name} is encrypted")
+        raise UnsupportedError(f"is encrypted ({quote_value(name)})")
     check_growth(entry.file_size, entry.compress_size, MAX_ENTRY_GROWTH)
     return bundle.read(entry)
 
@@ -80,7 +81,7 @@ def _read_entry(bundle: zipfile.ZipFile, name: str) -> bytes:
 def _read_files(read: FileReader, meta: str = META) -> Gaussians:
     table = json.loads(read(meta))
     if "means" not in table or table.get("version", 1) not in (1, 2):
-        raise ValueError(f"its {meta} describes no .sog of version 1 or 2")
+        raise UnsupportedError(f"has a {meta} that describes no .sog of version 1 or 2")
     marked = table.get("model") == "antialiased" or table.get("antialias") is True
     return replace(_decode_scene(read, table), is_antialiased=marked)
 
@@ -107,7 +108,10 @@ def _read_image(read: FileReader, name: object) -> UInt8[ndarray, "h w 4"]:
     if not isinstance(name, str) or not name or Path(name).name != name:
         raise ValueError(f"it names a file '{quote_value(name)}' that is not beside it")
     data = read(name)
-    image = Image.open(io.BytesIO(data), formats=["WEBP"])  # does not decode it yet
+    try:
+        image = Image.open(io.BytesIO(data), formats=["WEBP"])  # does not decode it yet
+    except UnidentifiedImageError as error:
+        raise ValueError(f"its {quote_value(name)} is no WebP image") from error
     check_growth(4 * image.width * image.height, len(data))
     return np.array(image.convert("RGBA"))
 

@@ -25,6 +25,7 @@ from gscompleter.io.files import replace_file
 from gscompleter.io.reading import read_bytes
 from gscompleter.splats.packing import (
     NUM_SH_REST,
+    UnsupportedError,
     assemble_sh,
     build_gaussians,
     check_growth,
@@ -89,7 +90,10 @@ def _parse_header(data: bytes) -> SpzHeader:
     if header.magic != MAGIC:
         raise ValueError("it is no .spz but other data")
     if header.version not in (2, 3, 4) or header.degree > 3:
-        raise ValueError(f"it is .spz version {header.version} of SH degree {header.degree}")
+        raise UnsupportedError(
+            f"is .spz version {header.version} of SH degree {header.degree}, and version 2 to 4 of "
+            "degree 0 to 3 are read"
+        )
     return header
 
 

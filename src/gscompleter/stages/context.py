@@ -28,8 +28,6 @@ MIN_CONTRAST = 0.02
 """Brightness range in 5 x 5 smoothed pixels that counts as texture; colours are in [0, 1]."""
 MIN_TEXTURED = 0.01
 """Smallest textured fraction of an image."""
-COLOR_TOLERANCE = 0.01
-"""Largest tolerated excess of a colour beyond [0, 1], as resampling causes it."""
 
 
 @dataclass(frozen=True)
@@ -72,7 +70,6 @@ def init_context(
         views = prepare_single(reconstructor, views)
     if not views:
         raise InputError("No context view was given; name at least one frame.")
-    check_colors([*views, *check_views])
     if scene is None:
         return reconstruct_context(reconstructor, views)
     return take_scene(scene, views, check_views, targets, renderer)
@@ -110,24 +107,10 @@ def take_scene(
 
     The proxy is made fine enough for all photographs and targets.
     """
-    parts = (scene.means, scene.quats, scene.scales, scene.opacities)
-    if not all(bool(part.isfinite().all()) for part in parts):
-        raise InputError("The scene holds NaN or infinity; remove such Gaussians.")
     photos = [*views, *check_views]
-    source = build_proxy(scene, [*targets, *(view.camera for view in photos)])
+    source = build_proxy(scene.detach(), [*targets, *(view.camera for view in photos)])
     near, far = find_splat_range(views, source.rendered, renderer)
     return InitialContext(source, tuple(set_depth_range(photos, near, far)))
-
-
-def check_colors(views: Sequence[View]) -> None:
-    """Raise InputError for colours outside of [0, 1]."""
-    for number, view in enumerate(views):
-        low, high = (float(bound) for bound in view.image.aminmax())
-        if not (low >= -COLOR_TOLERANCE and high <= 1 + COLOR_TOLERANCE):  # nor NaN
-            raise InputError(
-                f"The image of view {number} has values from {low:g} to {high:g}; colours in "
-                "[0, 1] are needed."
-            )
 
 
 def check_texture(views: Sequence[View]) -> None:

@@ -6,7 +6,9 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import torch
+from torch import Tensor
 
+from gscompleter.errors import InputError
 from gscompleter.generators import (
     Generator,
     GeneratorOutput,
@@ -15,7 +17,9 @@ from gscompleter.generators import (
     as_generator,
 )
 from gscompleter.stages.select_anchor import find_nearest_view
+from gscompleter.tensor_checks import describe, iterate_tensors
 from gscompleter.types import Camera, GeneratorInput, PaddedCamera, View
+from gscompleter.value_checks import check_colors
 
 
 @dataclass(frozen=True)
@@ -43,22 +47,69 @@ def synthesize(
         GeneratorRequest(context.views[find_nearest_view(target, context.views)], target, context)
         for target, context in inputs
     ]
+    states = [fingerprint(request) for request in requests]
     outputs = as_generator(generator).synthesize(requests)
+    if not isinstance(outputs, (list, tuple)) or len(outputs) != len(requests):
+        answer = f"{len(outputs)}" if isinstance(outputs, (list, tuple)) else describe(outputs)
+        raise InputError(
+            f"The generator got {len(requests)} requests and has to return a list of as many "
+            f"outputs, and returned {answer}."
+        )
+    if [fingerprint(request) for request in requests] != states:
+        raise InputError(
+            "The generator changed its input, which is the scene itself; let it work on copies "
+            "(.clone())."
+        )
     return [convert_output(output, r.target) for output, r in zip(outputs, requests, strict=True)]
 
 
-def convert_output(output: GeneratorOutput, target: Camera) -> GeneratedView:
+def fingerprint(request: GeneratorRequest) -> tuple[object, ...]:
+    """Summarize the input of Φ, which must not write into it.
+
+    PyTorch counts what is written in place. NumPy, which shares the memory, does not: the sums
+    notice it in the images that a Φ most often paints on.
+    """
+    parts = [tensor for _, tensor in iterate_tensors(request, "") if not tensor.is_inference()]
+    versions = tuple(tensor._version for tensor in parts)
+    images = (request.nearest.image, request.context.target_render.image)
+    return (*versions, *map(_sum_bits, images))
+
+
+def _sum_bits(image: Tensor) -> int:
+    return int(image.contiguous().view(torch.int32).sum(dtype=torch.int64))
+
+
+def convert_output(output: object, target: Camera) -> GeneratedView:
     """Convert the output of a generator to a view, after checking its size and values."""
-    expected = (target.height, target.width, 3)
-    if tuple(output.image.shape) != expected or not torch.isfinite(output.image).all():
-        shape = tuple(output.image.shape)
-        raise ValueError(
-            f"the generator must return a finite image of shape {expected}, got {shape}"
+    if not isinstance(output, GeneratorOutput):
+        raise InputError(
+            f"The generator has to return a GeneratorOutput per request, and returned "
+            f"{describe(output)}."
+        )
+    image, shape = output.image, (target.height, target.width, 3)
+    is_image = isinstance(image, Tensor) and image.layout is torch.strided
+    if not is_image or image.dtype is not torch.float32 or tuple(image.shape) != shape:
+        raise InputError(
+            f"The generator has to return a finite image of shape {shape} as a float32 tensor, and "
+            f"returned {describe(image)}."
+        )
+    if image.device != target.K.device:
+        raise InputError(
+            f"The generator returned an image on {image.device} for a target on "
+            f"{target.K.device}; move it."
+        )
+    check_colors(image, "The image of the generator")
+    if not isinstance(output.notes, (tuple, list)) or not all(
+        isinstance(note, str) for note in output.notes
+    ):
+        raise InputError(
+            f"The notes of the generator have to be a tuple of sentences, and are "
+            f"{describe(output.notes)}."
         )
     return GeneratedView(
-        output.image,
+        image.detach(),
         target,
-        notes=output.notes,
-        is_inconsistent=output.is_inconsistent,
-        is_photograph=output.is_photograph,
+        notes=tuple(output.notes),
+        is_inconsistent=bool(output.is_inconsistent),
+        is_photograph=bool(output.is_photograph),
     )

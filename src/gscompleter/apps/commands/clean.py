@@ -26,6 +26,7 @@ from gscompleter.apps.inputs.opening import (
     open_scene,
     print_lines,
     read_photographs,
+    resolve_scene,
 )
 from gscompleter.apps.report.completion import (
     InputSplatFile,
@@ -68,6 +69,7 @@ class Cleaning:
 
 def run_clean(options: CleanOptions) -> None:
     """Clean the splat, write the result, and print a summary."""
+    options = resolve_scene(options)
     console = Console(stderr=True, quiet=options.quiet)
     check_output(options.out, is_replaceable(options))
     if options.dry_run and (options.out / COMPLETED_FILE).exists():  # it needs its removed.ply

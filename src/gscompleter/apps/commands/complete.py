@@ -36,6 +36,7 @@ from gscompleter.apps.inputs.opening import (
     open_scene,
     print_lines,
     read_task,
+    resolve_scene,
 )
 from gscompleter.apps.inputs.selection import collect_usable_cameras
 from gscompleter.apps.report.completion import Target, write_report
@@ -125,6 +126,7 @@ def prepare_completion(options: CompleteOptions, console: Console) -> Prepared:
     check_reconstructor(options.reconstructor)
     get_settings_class(options.synthesis.generator)
     device = choose_device(options.device)
+    options = resolve_scene(options)
     opened = open_scene(options, console)
     options = choose_working_size(options, opened.photographs, console)
     if not options.config.ego_mask:

@@ -17,7 +17,8 @@ from gscompleter.apps.viewer.exhibit import (
 )
 from gscompleter.apps.viewer.page import make_page
 from gscompleter.errors import InputError, quote_value
-from gscompleter.io.files import replace_file
+from gscompleter.io.files import SUMMARY_FILE, replace_file
+from gscompleter.splats.foreign import resolve_splat
 from gscompleter.splats.sog import META
 
 ADDRESS = "127.0.0.1"
@@ -46,6 +47,8 @@ def run_view(options: ViewOptions) -> None:
 def load_content(options: ViewOptions) -> ViewerContent:
     """Read the scenes and cameras of the options."""
     scene, other, drop_nonfinite = options.scene, options.other, options.drop_nonfinite
+    if not (scene / SUMMARY_FILE).is_file():
+        scene = resolve_splat(scene)
     if other is not None:
         content = load_viewer_files(other, scene, drop_nonfinite)
     elif scene.is_dir() and not (scene / META).is_file():

@@ -68,13 +68,14 @@ from gscompleter.splat_alignment.estimate import align_splat
 from gscompleter.splat_alignment.similarity import transform_camera, transform_view
 from gscompleter.splat_alignment.trainer_frames import InputSplat
 from gscompleter.splat_alignment.training_size import find_training_size
+from gscompleter.splats.foreign import resolve_splat
 from gscompleter.splats.formats import FORMATS as SPLAT_FORMATS
 from gscompleter.splats.formats import detect_splat_format
 from gscompleter.splats.ply import find_finite_rows
 from gscompleter.stages.context import find_splat_range
 from gscompleter.types import Camera, Gaussians, View
 
-AnySceneOptions = TypeVar("AnySceneOptions", bound=SceneOptions)
+AnyOptions = TypeVar("AnyOptions", bound=SceneOptions)
 
 MIN_IMAGE_SIZE = 16
 SPLAT_EXTENSIONS = tuple(end for format in SPLAT_FORMATS.values() for end in format.extensions)
@@ -179,8 +180,8 @@ def open_scene(options: SceneOptions, console: Console) -> Opened:
 
 
 def choose_working_size(
-    options: AnySceneOptions, given: Photographs, console: Console
-) -> AnySceneOptions:
+    options: AnyOptions, given: Photographs, console: Console
+) -> AnyOptions:
     """Choose the working size unless it is given: that of the training of a splat, if smaller.
 
     A larger one is only told: details beyond the default size cost much time, and no harm is done
@@ -223,6 +224,13 @@ def refuse_splat(path: Path) -> None:
             f"{quote_value(path, 80)} is a file of Gaussians, which goes to --scene; SCENE has to "
             "be the folder of its photographs, with or without cameras, or a video."
         )
+
+
+def resolve_scene(options: AnyOptions) -> AnyOptions:
+    """Replace a trainer's model folder in `--scene` by the splat of its newest iteration."""
+    if options.scene is None:
+        return options
+    return replace(options, scene=resolve_splat(options.scene))
 
 
 def read_task(options: CompleteOptions, opened: Opened, device: str) -> Task:

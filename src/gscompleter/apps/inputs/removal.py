@@ -97,7 +97,9 @@ def find_in_boxes(
     points: Float[Tensor, "n 3"], boxes: Sequence[float], rotation: Sequence[float]
 ) -> Bool[Tensor, "n"]:
     """Find points inside of boxes that a wxyz quaternion rotates about their centres."""
-    axes = quats_to_rotations(points.new_tensor(rotation))
+    # The square of a large number overflows, and a rotation has no length.
+    largest = max(map(abs, rotation))
+    axes = quats_to_rotations(points.new_tensor([part / largest for part in rotation]))
     inside = torch.zeros(len(points), dtype=torch.bool, device=points.device)
     for low, high in zip(*(ends.to(points) for ends in split_boxes(boxes)), strict=True):
         local = (points - (low + high) / 2) @ axes

@@ -9,6 +9,8 @@ from pathlib import Path
 from statistics import fmean
 from typing import Any, Literal, TypeVar
 
+import numpy as np
+
 from gscompleter.apps.report.names import name_photograph, name_target
 from gscompleter.errors import InputError, quote_value
 from gscompleter.evaluation.metrics.coverage import Coverage
@@ -17,6 +19,8 @@ from gscompleter.io.reading import read_json
 
 RECORD_FILE = "report.json"
 ADVICE = "complete the scene again"
+MAX_FRAME_NUMBER = 1e12
+"""Largest number of the transform and the origin, in scene units: its square is finite."""
 
 SCORES = ("psnr_before", "psnr_after", "ssim_before", "ssim_after")
 
@@ -194,7 +198,16 @@ class CompletionRecord:
 
 def read_summary(folder: Path) -> CompletionSummary:
     """Read `summary.json`; raise an InputError if it is missing or damaged."""
-    return read_result(CompletionSummary, folder / SUMMARY_FILE)
+    path = folder / SUMMARY_FILE
+    summary = read_result(CompletionSummary, path)
+    transform = np.array(summary.frame.transform)
+    numbers = np.concatenate([transform.ravel(), np.array(summary.frame.origin)])
+    is_bounded = bool((np.abs(numbers) <= MAX_FRAME_NUMBER).all())  # False for NaN
+    if not is_bounded or not np.linalg.det(transform[:3, :3]) > 0:
+        raise InputError(
+            f"{quote_value(path)} is damaged (frame: no similarity of photographs); {ADVICE}."
+        )
+    return summary
 
 
 def read_record(folder: Path, summary: CompletionSummary) -> CompletionRecord:

@@ -24,6 +24,7 @@ from gscompleter.data.cameras import Intrinsics, compute_rotation
 from gscompleter.data.json_fields import get_array, get_intrinsics, get_number, get_part, get_size
 from gscompleter.data.limits import MAX_COORDINATE, require
 from gscompleter.data.phones.export import ADVICE, Files, PoseAndLens, build_recording, find_files
+from gscompleter.data.phones.lzfse import measure_unpacked
 from gscompleter.data.photographs import Photographs
 from gscompleter.errors import InputError, quote_value
 from gscompleter.io.reading import parse_json
@@ -123,7 +124,9 @@ def _unpack(kind: str, size: tuple[int, int], data: bytes, title: str) -> Shaped
     from liblzfse import decompress
 
     try:
-        if len(data) > 8 * math.prod(size):
+        # Four bytes a pixel or one; checked before anything is unpacked.
+        limit = 8 * math.prod(size)
+        if len(data) > limit or measure_unpacked(data) > limit:
             raise ValueError("it is larger than the photograph")
         values = np.frombuffer(decompress(data), kind)
         return values.reshape(round(math.sqrt(len(values) * size[1] / size[0])), -1)

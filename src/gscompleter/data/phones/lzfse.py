@@ -1,0 +1,42 @@
+"""The size to which an LZFSE stream unpacks, read from the headers of its blocks.
+
+pyliblzfse has no limit of its own: it doubles its buffer until a stream ends, so that a small file
+can fill the memory. Layout: https://github.com/lzfse/lzfse, `lzfse_internal.h`.
+"""
+
+from __future__ import annotations
+
+import struct
+
+END = b"bvx$"
+RAW = b"bvx-"
+"""Block of bytes as they are: magic, number of bytes."""
+LZVN = b"bvxn"
+"""Block of short data: magic, unpacked bytes, packed bytes."""
+LZFSE = b"bvx2"
+"""Usual block: magic, unpacked bytes, and three fields of 64 bits."""
+LZFSE_HEADER = struct.Struct("<4sIQQQ")
+PAYLOAD_MASK = 0xFFFFF
+"""Lengths of payloads have 20 bits."""
+
+
+def measure_unpacked(data: bytes) -> int:
+    """Add up the unpacked sizes of all blocks, in bytes; raise ValueError for other data."""
+    size = start = 0
+    while data[start : start + 4] != END:
+        magic = data[start : start + 4]
+        if magic == RAW:
+            (unpacked,) = struct.unpack_from("<I", data, start + 4)
+            start += 8 + unpacked
+        elif magic == LZVN:
+            unpacked, packed = struct.unpack_from("<II", data, start + 4)
+            start += 12 + packed
+        elif magic == LZFSE:
+            _, unpacked, first, second, third = LZFSE_HEADER.unpack_from(data, start)
+            literals, matches = (first >> 20) & PAYLOAD_MASK, (second >> 40) & PAYLOAD_MASK
+            header_bytes = third & 0xFFFFFFFF
+            start += max(header_bytes, LZFSE_HEADER.size) + literals + matches
+        else:
+            raise ValueError("it is no LZFSE stream, or ends too early")
+        size += unpacked
+    return size

@@ -1,0 +1,194 @@
+"""Files and folders that are no splat of a format we read, each named for what it is.
+
+A sentence names what the file is and what to give instead: "cannot be read" would send people to
+look for damage in an intact file.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+import re
+import zipfile
+import zlib
+from contextlib import suppress
+from pathlib import Path
+
+from gscompleter.errors import InputError, quote_value
+from gscompleter.splats.packing import ZIP_MAGIC
+
+GZIP = b"\x1f\x8b"
+SPZ_MAGIC = b"NGSP"
+LOD_META = "lod-meta.json"
+"""Index of a streamed scene: one .sog for each level and place."""
+SOG_META = "meta.json"
+MAX_JSON = 1 << 26
+"""Largest JSON that is looked into, in bytes."""
+CHECKPOINTS = (".pt", ".pth", ".ckpt")
+POINT_CLOUDS = (".las", ".laz", ".e57", ".pcd", ".xyz", ".pts")
+POINT_CLOUD_STARTS = (b"LASF", b"ASTM-E57", b"# .PCD")
+MESHES = (".obj", ".stl", ".fbx", ".dae", ".off")
+SPLATS = (".ply", ".spz", ".splat", ".ksplat", ".sog", ".glb")
+"""Endings of files that are worth naming in an archive or folder."""
+
+# Where trainers write their splats, below the folder of a model; the number is the iteration.
+_PATTERNS = (
+    "point_cloud/iteration_*/point_cloud.ply",  # Inria, and most that build on it
+    "iteration_*/point_cloud.ply",
+    "point_cloud.ply",
+    "ply/point_cloud_*.ply",  # gsplat
+    "point_cloud_*.ply",
+    "splat_*.ply",  # LichtFeld Studio
+    "export_*.ply",  # Brush
+    "splat.ply",  # nerfstudio, OpenSplat
+    "ckpts/*.ply",
+)
+
+
+def find_newest_splat(folder: Path) -> Path | None:
+    """Find the splat of the newest iteration in a trainer's model folder, or None.
+
+    The first pattern with a file decides; of several files, the largest number in the name.
+    """
+    for pattern in _PATTERNS:
+        paths = [path for path in folder.glob(pattern) if path.is_file()]
+        if paths:
+            return max(paths, key=lambda path: (_get_iteration(path, folder), str(path)))
+    return None
+
+
+def _get_iteration(path: Path, folder: Path) -> int:
+    numbers = re.findall(r"\d+", str(path.relative_to(folder)))
+    return int(numbers[-1][:18]) if numbers else -1
+
+
+def resolve_splat(path: Path) -> Path:
+    """Return the newest splat of a trainer's model folder; other paths stay as they are."""
+    if not os.path.isdir(path) or os.path.isfile(path / SOG_META):
+        return path
+    return find_newest_splat(path) or path
+
+
+def refuse_folder(path: Path) -> None:
+    """Raise InputError for a folder without a splat."""
+    name = quote_value(path)
+    if os.path.isfile(path / LOD_META):
+        raise InputError(_describe_stream(name))
+    with suppress(OSError):
+        inside = sorted(n for n in os.listdir(path) if n.lower().endswith(SPLATS))
+        if inside:
+            raise InputError(
+                f"{name} is a folder; name one of the splats in it, such as "
+                f"{quote_value(inside[0])}."
+            )
+    raise InputError(f"{name} is a folder without a splat; name the file of a splat.")
+
+
+def refuse_foreign(path: Path, head: bytes) -> None:
+    """Raise InputError for a file of another kind; `head` are its first bytes."""
+    name, ending = quote_value(path), path.suffix.lower()
+    kind = _describe_by_content(path, head) or _describe_by_name(ending, head)
+    if kind is not None:
+        raise InputError(f"{name} {kind}.")
+
+
+def _describe_by_content(path: Path, head: bytes) -> str | None:
+    start = head.lstrip()
+    if start[:15].lower().startswith((b"<!doctype html", b"<html")):
+        return "is a web page; download the file that it links to"
+    if head.startswith(ZIP_MAGIC):
+        return _describe_zip(path)
+    if head.startswith(GZIP):
+        return _describe_gzip(path, head)
+    if start.startswith((b"{", b"[")):
+        return _describe_json(path)
+    if head.startswith(POINT_CLOUD_STARTS):
+        return _describe_points()
+    return None
+
+
+def _describe_by_name(ending: str, head: bytes) -> str | None:
+    is_known = head.lstrip().startswith((b"ply", SPZ_MAGIC, b"glTF", b"PXR-USDC", b"#usda"))
+    if is_known or head.startswith((ZIP_MAGIC, GZIP)):
+        return None
+    if ending in CHECKPOINTS:
+        return _describe_checkpoint()
+    if ending in POINT_CLOUDS:
+        return _describe_points()
+    if ending in MESHES:
+        return "is a mesh, not a splat; train a splat from photographs, and name its .ply"
+    return None
+
+
+def _describe_checkpoint() -> str:
+    return (
+        "is a checkpoint of a trainer or a network, not a splat; export the splat as .ply with "
+        "that trainer (nerfstudio: ns-export gaussian-splat) and name the .ply"
+    )
+
+
+def _describe_points() -> str:
+    return "is a point cloud, not a splat; train a splat from photographs, and name its .ply"
+
+
+def _describe_stream(name: str) -> str:
+    return (
+        f"{name} is a streamed scene in several levels of detail ({LOD_META}); join one level to a "
+        ".ply (splat-transform does), and name that."
+    )
+
+
+def _describe_zip(path: Path) -> str | None:
+    """Describe a .zip that is neither a bundle of one splat nor OpenUSD; None if it is."""
+    names: list[str] = []
+    errors = (OSError, ValueError, RuntimeError, zipfile.BadZipFile, NotImplementedError)
+    with suppress(*errors), zipfile.ZipFile(path) as archive:
+        names = archive.namelist()
+    if any(name.endswith("data.pkl") for name in names) or path.suffix.lower() in CHECKPOINTS:
+        return _describe_checkpoint()
+    if any(Path(name).name == LOD_META for name in names):
+        return (
+            "is a streamed scene in several levels of detail; join one level to a .ply "
+            "(splat-transform does), and name that"
+        )
+    is_usd = any(name.lower().endswith((".usd", ".usda", ".usdc")) for name in names)
+    if SOG_META in names or is_usd:
+        return None
+    if not names and path.suffix.lower() in (".sog", ".usdz"):
+        return None  # damaged, which the reader says
+    if names and all(name.endswith(".npy") for name in names):
+        return "holds arrays of NumPy, no splat; name the file of a splat"
+    splats = [name for name in names if name.lower().endswith(SPLATS)]
+    if splats:
+        return f"is a .zip archive; unpack it, and name {quote_value(splats[0])} in it"
+    return "is a .zip archive without a splat; name the file of a splat"
+
+
+def _describe_gzip(path: Path, head: bytes) -> str | None:
+    """Describe a .gz whose content does not begin as a .spz does; None if it may be one."""
+    content = b""
+    with suppress(zlib.error):
+        content = zlib.decompressobj(wbits=31).decompress(head, max_length=64)
+    if content.startswith(SPZ_MAGIC) or path.suffix.lower() == ".spz":
+        return None
+    return "is packed with gzip; unpack it (gunzip), and name the file inside"
+
+
+def _describe_json(path: Path) -> str | None:
+    """Describe a JSON file that is not that of a .sog; None if it is."""
+    table: object = None
+    with suppress(OSError, ValueError, RecursionError):
+        if os.path.getsize(path) <= MAX_JSON:
+            table = json.loads(path.read_bytes())
+    keys = set(table) if isinstance(table, dict) else set()
+    ending = path.suffix.lower()
+    if ending == ".gltf" or (keys >= {"asset"} and keys & {"meshes", "nodes", "scenes", "buffers"}):
+        return "is glTF with its data in other files; export it as one .glb, or as .ply"
+    if path.name.lower() == LOD_META or "lodLevels" in keys:
+        return (
+            "is the index of a streamed scene in several levels of detail; join one level to a "
+            ".ply (splat-transform does), and name that"
+        )
+    if path.name.lower() == SOG_META or "means" in keys:
+        return None
+    return "is a JSON file without Gaussians; name the file of a splat, such as a .ply"

@@ -1,0 +1,208 @@
+"""Files that are no splat are named for what they are, and intact ones are never called damaged."""
+
+import gzip
+import io
+import json
+import struct
+import zipfile
+from pathlib import Path
+
+import numpy as np
+import plyfile
+import pytest
+import torch
+
+from gscompleter import InputError, load_splat, save_ply, save_splat
+from gscompleter.splats import ply
+from scenes import random_gaussians
+
+
+def vertices(names: list[str], faces: bool = False) -> bytes:
+    rows = np.zeros(4, [(name, "<f4") for name in names])
+    elements = [plyfile.PlyElement.describe(rows, "vertex")]
+    if faces:
+        corners = np.array([([0, 1, 2],)], dtype=[("vertex_indices", "O")])
+        elements.append(plyfile.PlyElement.describe(corners, "face"))
+    file = io.BytesIO()
+    plyfile.PlyData(elements, byte_order="<").write(file)
+    return file.getvalue()
+
+
+def archive(**files: bytes) -> bytes:
+    file = io.BytesIO()
+    with zipfile.ZipFile(file, "w") as made:
+        for name, data in files.items():
+            made.writestr(name.replace("__", "/").replace("_dot_", "."), data)
+    return file.getvalue()
+
+
+def checkpoint(**options) -> bytes:
+    file = io.BytesIO()
+    torch.save({"step": 3, "pipeline": {"means": torch.zeros(3, 3)}}, file, **options)
+    return file.getvalue()
+
+
+def glb(table: dict) -> bytes:
+    text = json.dumps(table).encode()
+    text += b" " * (-len(text) % 4)
+    chunk = struct.pack("<II", len(text), 0x4E4F534A) + text
+    return struct.pack("<4sII", b"glTF", 2, 12 + len(chunk)) + chunk
+
+
+GLTF = {"asset": {"version": "2.0"}, "scenes": [{"nodes": [0]}], "nodes": [{"mesh": 0}]}
+POINTS = ["x", "y", "z", "nx", "ny", "nz", "red", "green", "blue"]
+ANCHORS = ["x", "y", "z", "f_offset_0", "f_anchor_feat_0", "opacity", "scale_0", "rot_0"]
+DRAFT = GLTF | {
+    "accessors": [{"count": 0}],
+    "meshes": [
+        {
+            "primitives": [
+                {
+                    "attributes": {"POSITION": 0, "_ROTATION": 0},
+                    "extensions": {"KHR_gaussian_splatting": {}},
+                }
+            ]
+        }
+    ],
+}
+PACKED = GLTF | {
+    "extensionsUsed": ["KHR_gaussian_splatting_compression_spz"],
+    "meshes": [{"primitives": [{"attributes": {}}]}],
+}
+MESH = GLTF | {"meshes": [{"primitives": [{"attributes": {"POSITION": 0}}]}]}
+
+FOREIGN = {
+    "model.ckpt": (checkpoint(), "is a checkpoint of a trainer"),
+    "model.pth": (checkpoint(_use_new_zipfile_serialization=False), "is a checkpoint of a trainer"),
+    "splat.ply.pt": (checkpoint(), "is a checkpoint of a trainer"),
+    "renamed.ply": (checkpoint(), "is a checkpoint of a trainer"),
+    "photos.zip": (archive(a_dot_jpg=b"x"), "is a .zip archive without a splat"),
+    "export.zip": (
+        archive(out__splat_dot_ply=b"ply"),
+        "is a .zip archive; unpack it, and name out/",
+    ),
+    "scene.ply.gz": (gzip.compress(b"ply\nformat"), "is packed with gzip; unpack it"),
+    "scene.gltf": (json.dumps(GLTF).encode(), "is glTF with its data in other files"),
+    "draft.glb": (glb(DRAFT), "stores Gaussians as a draft of KHR_gaussian_splatting did"),
+    "packed.glb": (glb(PACKED), "KHR_gaussian_splatting_compression_spz, a draft or another"),
+    "mesh.glb": (glb(MESH), "holds a mesh or points, no Gaussians"),
+    "points.ply": (vertices(POINTS), "is no 3DGS scene but a point cloud"),
+    "mesh.ply": (vertices(POINTS, faces=True), "is no 3DGS scene but a mesh"),
+    "anchors.ply": (vertices(ANCHORS), "but anchors of Scaffold-GS"),
+    "points.las": (b"LASF" + bytes(200), "is a point cloud"),
+    "points.pcd": (b"# .PCD v0.7\n", "is a point cloud"),
+    "points.xyz": (b"0 0 0\n", "is a point cloud"),
+    "mesh.obj": (b"v 0 0 0\n", "is a mesh"),
+    "lod-meta.json": (b'{"lodLevels": 3, "filenames": []}', "index of a streamed scene"),
+    "transforms.json": (b'{"frames": []}', "is a JSON file without Gaussians"),
+    "cameras.json": (b"[]", "is a JSON file without Gaussians"),
+    "page.ply": (b"<!DOCTYPE html><html>", "is a web page; download the file"),
+    "other.bin": (b"hello", "holds no Gaussians in a format that is known"),
+    "new.spz": (b"NGSP" + struct.pack("<IIBBBB", 9, 1, 0, 12, 0, 0), "is .spz version 9"),
+    "high.spz": (b"NGSP" + struct.pack("<IIBBBB", 3, 1, 4, 12, 0, 0), "SH degree 4"),
+    "new.ksplat": (b"\x09" + bytes(4095), "is .ksplat version 9"),
+}
+
+
+@pytest.mark.parametrize("name", FOREIGN)
+def test_a_file_of_another_kind_is_named_for_what_it_is(tmp_path, name):
+    data, sentence = FOREIGN[name]
+    (tmp_path / name).write_bytes(data)
+    with pytest.raises(InputError, match=sentence) as error:
+        load_splat(tmp_path / name)
+    said = str(error.value).replace(name, "")
+    assert "meta.json" not in said
+    assert ".sog" not in said
+    assert not any(word in said for word in ("fetch", "damaged", "truncated", "again"))
+    assert "\n" not in said
+    assert len(said) <= 300
+
+
+def test_a_folder_of_a_streamed_scene_is_named(tmp_path):
+    (tmp_path / "lod-meta.json").write_text('{"lodLevels": 2}')
+    with pytest.raises(InputError, match="is a streamed scene in several levels of detail"):
+        load_splat(tmp_path)
+
+
+def damaged_sog(tmp_path: Path, method: int) -> Path:
+    """Write a .sog packed by another method, with damage in its first entry."""
+    save_splat(tmp_path / "plain.sog", random_gaussians(60))
+    path = tmp_path / "scene.sog"
+    with zipfile.ZipFile(tmp_path / "plain.sog") as old, zipfile.ZipFile(path, "w", method) as new:
+        for name in old.namelist():
+            new.writestr(name, old.read(name))
+    data = bytearray(path.read_bytes())
+    start = 30 + sum(struct.unpack("<HH", data[26:30])) + 9
+    data[start : start + 40] = b"\xff" * 40
+    path.write_bytes(data)
+    return path
+
+
+@pytest.mark.parametrize("method", [zipfile.ZIP_DEFLATED, zipfile.ZIP_BZIP2, zipfile.ZIP_LZMA])
+def test_a_damaged_bundle_of_any_packing_is_refused(tmp_path, method):
+    with pytest.raises(InputError, match="cannot be read"):
+        load_splat(damaged_sog(tmp_path, method))
+
+
+def test_sentences_about_images_name_them(tmp_path):
+    """Pillow's own sentence holds the address of an object, which differs from run to run."""
+    save_splat(tmp_path / "scene.sog", random_gaussians(60))
+    with zipfile.ZipFile(tmp_path / "scene.sog") as old:
+        files = {name: old.read(name) for name in old.namelist()}
+    with zipfile.ZipFile(tmp_path / "scene.sog", "w") as new:
+        for name, data in (files | {"quats.webp": b"no image"}).items():
+            new.writestr(name, data)
+    with pytest.raises(InputError, match=r"its quats\.webp is no WebP image"):
+        load_splat(tmp_path / "scene.sog")
+
+
+@pytest.mark.parametrize("error", [MemoryError(), RuntimeError("you can't allocate memory: 9")])
+def test_a_splat_that_does_not_fit_into_memory_is_no_traceback(tmp_path, monkeypatch, error):
+    save_ply(tmp_path / "scene.ply", random_gaussians(5))
+
+    def exhaust(scene):
+        raise error
+
+    monkeypatch.setattr(ply, "decode_gaussians", exhaust)
+    with pytest.raises(InputError, match="needs more memory than there is"):
+        load_splat(tmp_path / "scene.ply")
+
+
+@pytest.mark.parametrize(
+    "name", ["a.ply", "a.splat", "a.spz", "a.sog", "a.glb", "a.compressed.ply"]
+)
+@pytest.mark.parametrize("degree", [0, 1, 2, 3])
+def test_gaussians_that_require_gradients_are_written(tmp_path, name, degree):
+    learned = random_gaussians(30, sh_degree=degree)
+    for part in (learned.means, learned.quats, learned.scales, learned.opacities, learned.sh):
+        part.requires_grad_()
+    save_splat(tmp_path / name, learned)
+    assert len(load_splat(tmp_path / name)) == 30
+
+
+@pytest.mark.filterwarnings("error")
+@pytest.mark.parametrize(
+    "name", ["a.ply", "a.splat", "a.spz", "a.sog", "a.glb", "a.compressed.ply"]
+)
+@pytest.mark.parametrize(
+    ("part", "value"),
+    [("quats", 1e17), ("quats", 1e-10), ("scales", 0.0), ("sh", 9e5), ("sh", -9e5)],
+)
+def test_what_is_written_can_be_read(tmp_path, name, part, value):
+    gaussians = random_gaussians(30)
+    getattr(gaussians, part)[3] = value
+    save_splat(tmp_path / name, gaussians)
+    loaded = load_splat(tmp_path / name)
+    assert len(loaded) == 30
+    assert loaded.quats.isfinite().all()
+
+
+@pytest.mark.parametrize(
+    "name", ["a.ply", "a.splat", "a.spz", "a.sog", "a.glb", "a.compressed.ply"]
+)
+@pytest.mark.parametrize(("part", "value"), [("quats", 1e38), ("quats", 0.0), ("sh", -1e38)])
+def test_what_could_not_be_read_is_not_written(tmp_path, name, part, value):
+    gaussians = random_gaussians(30)
+    getattr(gaussians, part)[3] = value
+    with pytest.raises(InputError, match="The scene to write has 1 of 30 Gaussians"):
+        save_splat(tmp_path / name, gaussians)
