@@ -215,8 +215,7 @@ def _choose_formats(head: bytes, shown: str) -> tuple[str, ...]:
         if features.check("avif"):
             return ("AVIF",)
         raise InputError(
-            f"{shown} is AVIF, which this Pillow does not read; run pip install --upgrade pillow, "
-            "or export JPEG."
+            f"{shown} is AVIF, which this Pillow does not read; update Pillow, or export JPEG."
         )
     if any(brand in HEIF_BRANDS for brand in brands):
         if find_spec("pillow_heif") is None:

@@ -179,12 +179,10 @@ def open_scene(options: SceneOptions, console: Console) -> Opened:
     return Opened(given, "photographs", number)
 
 
-def choose_working_size(
-    options: AnyOptions, given: Photographs, console: Console
-) -> AnyOptions:
+def choose_working_size(options: AnyOptions, given: Photographs, console: Console) -> AnyOptions:
     """Choose the working size unless it is given: that of the training of a splat, if smaller.
 
-    A larger one is only told: details beyond the default size cost much time, and no harm is done
+    A larger one is only reported: details beyond the default size cost much time, and no harm is done
     where a splat is rendered smaller than it was trained.
     """
     if options.resolution is not None:
