@@ -182,8 +182,8 @@ def open_scene(options: SceneOptions, console: Console) -> Opened:
 def choose_working_size(options: AnyOptions, given: Photographs, console: Console) -> AnyOptions:
     """Choose the working size unless it is given: that of the training of a splat, if smaller.
 
-    A larger one is only reported: details beyond the default size cost much time, and no harm is done
-    where a splat is rendered smaller than it was trained.
+    A larger one is only reported: details beyond the default size cost much time, and no harm is
+    done where a splat is rendered smaller than it was trained.
     """
     if options.resolution is not None:
         return options
