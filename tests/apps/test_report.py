@@ -166,7 +166,7 @@ def test_numbers_that_are_none_are_dashes(out, nothing):
 
     changed(out / "summary.json", forget)
     said = Page(render_completion_page(out)).said()
-    assert "1: photograph 2 – – – – – –" in said
+    assert "1: photograph 2 (2.png) – – – – – –" in said
     shown = said.split("All settings")[0].replace("–", "")
     assert re.search(r"\b(nan|inf|None|null)\b", shown) is None
 

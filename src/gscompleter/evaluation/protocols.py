@@ -186,6 +186,8 @@ class Task:
     load: Callable[[tuple[int, ...]], list[View]]
     neighbours: tuple[int, ...] = ()
     """Frames beside the target, for scoring only."""
+    has_masks: bool = False
+    """True if masks hide parts of the photographs of its scene."""
 
     @property
     def name(self) -> str:
