@@ -25,9 +25,11 @@ class FolderListings:
 
     def find(self, folder: Path, relative: str) -> Path | None:
         """Find `relative` below `folder`, as written or else in any case; None without it."""
+        if os.path.isabs(relative):
+            return Path(relative) if _exists(Path(relative)) else None
         path = folder
         for part in PurePosixPath(relative).parts:
-            if part in ("..", "/"):  # which no listing has
+            if part == "..":  # which no listing has
                 path = path / part
                 continue
             names = self._list(path)
