@@ -24,7 +24,7 @@ def test_photographs_whose_folder_has_cameras_say_so(tmp_path):
     ("words", "said"),
     [
         (("--context", "photo_001", "photo_001.png"), "names photograph 1 (photo_001.png) twice"),
-        (("--context", "photo_009.png"), "There is no photograph photo_009.png"),
+        (("--context", "photo_009.png"), "There is no photograph 'photo_009.png'"),
         (("--context", 9), "There is no frame 9"),
         (("--target", "photo_009.png"), "'photo_009.png' is no target: name a photograph"),
         (("--target", "missing.json"), "'missing.json' is no target: name a photograph"),

@@ -347,7 +347,7 @@ def test_that_something_moved_is_told_with_where():
         for frame, share in ((7, 0.0155), (15, 0.0), (23, 0.006))
     ]
     (said,) = list_photograph_notes(rows)
-    assert "1.6 % of frame 7, 0.6 % of frame 23" in said
+    assert "1.6 % of photograph 7, 0.6 % of photograph 23" in said
 
 
 def test_where_to_stand_for_new_photographs():
@@ -356,5 +356,5 @@ def test_where_to_stand_for_new_photographs():
         TargetRow(None, *scores, 0, False, 0.1, alignment, 0, derived_from=frame)
         for frame in (12, 31, 5)
     ]
-    assert "beside frame 12 and frame 31" in describe_wanted_photographs(rows)
+    assert "beside photograph 12 and photograph 31" in describe_wanted_photographs(rows)
     assert "--target" in describe_wanted_photographs([])

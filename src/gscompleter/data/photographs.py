@@ -184,7 +184,7 @@ class Photographs:
         if not found:
             example = self.frame(0).file_name
             raise InputError(
-                f"There is no photograph {quote_value(word)} in {self.title}; name one of its "
+                f"There is no photograph '{quote_value(word)}' in {self.title}; name one of its "
                 f"{len(self)} photographs, such as {quote_value(example)}, or its number from 0 "
                 f"to {len(self) - 1}."
             )
