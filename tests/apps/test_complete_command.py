@@ -96,8 +96,9 @@ def test_four_lines_come_before_the_work(scene, chosen):
     assert found.startswith("Found: the frame of the photographs; depths from ")
     assert found.endswith(" to 20; worked at 48 x 48 (--resolution changes it).")
     assert plan == (
-        "To do: complete the scene from frames 0, 1, 4 for target 2 by plane-sweep and "
-        f"warp-inpaint on cpu, written to {out}."
+        "To do: complete the scene from photographs 0 (0.png), 1 (1.png), 4 (4.png) for "
+        "photograph 2 (2.png) by plane-sweep and warp-inpaint on cpu, written to "
+        f"{out}."
     )
     assert re.fullmatch(r"Memory: up to 1 GB of [0-9,]+ GB\.", memory)
 

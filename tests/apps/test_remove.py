@@ -109,7 +109,7 @@ def test_a_plan_names_a_photograph_and_the_hole_that_is_left(scene, tmp_path, mo
     words = [*remove(scene, tmp_path / "out", "--select", tmp_path / "selected.ply", "--dry-run")]
     words.remove("--quiet")
     assert run(monkeypatch, *words) == 0
-    (row,) = [line for line in capsys.readouterr().out.splitlines() if "1: target near" in line]
+    (row,) = [line for line in capsys.readouterr().out.splitlines() if "1: near photograph" in line]
     assert 2 < float(row.split()[-2]) < 40
     assert [path.name for path in (tmp_path / "out").iterdir()] == ["targets.json"]
 

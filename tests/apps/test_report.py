@@ -166,7 +166,7 @@ def test_numbers_that_are_none_are_dashes(out, nothing):
 
     changed(out / "summary.json", forget)
     said = Page(render_completion_page(out)).said()
-    assert "1: photograph 2 – – – – – –" in said
+    assert "1: photograph 2 (2.png) – – – – – –" in said
     shown = said.split("All settings")[0].replace("–", "")
     assert re.search(r"\b(nan|inf|None|null)\b", shown) is None
 
@@ -349,7 +349,7 @@ def test_that_something_moved_is_told_with_where():
         for frame, share in ((7, 0.0155), (15, 0.0), (23, 0.006))
     ]
     (said,) = list_photograph_notes(rows)
-    assert "1.6 % of frame 7, 0.6 % of frame 23" in said
+    assert "1.6 % of photograph 7, 0.6 % of photograph 23" in said
 
 
 def test_where_to_stand_for_new_photographs():
@@ -358,5 +358,5 @@ def test_where_to_stand_for_new_photographs():
         TargetRow(None, *scores, 0, False, 0.1, alignment, 0, derived_from=frame)
         for frame in (12, 31, 5)
     ]
-    assert "beside frame 12 and frame 31" in describe_wanted_photographs(rows)
+    assert "beside photograph 12 and photograph 31" in describe_wanted_photographs(rows)
     assert "--target" in describe_wanted_photographs([])

@@ -7,7 +7,8 @@ import pytest
 import torch
 
 from gscompleter import InputError
-from gscompleter.config import RefineConfig
+from gscompleter.cleaning import halve_view
+from gscompleter.config import RefineConfig, TrustConfig
 from gscompleter.data.driving.vehicle import compute_moving_boxes, mask_moving
 from gscompleter.data.formats import open_photographs
 from gscompleter.evaluation.metrics.scores import Truth, score
@@ -16,8 +17,11 @@ from gscompleter.geometry import compute_sparse_depth, unproject
 from gscompleter.guards.psnr import compute_squared_error, meet_error_budgets
 from gscompleter.io.image import write_image
 from gscompleter.render import load_renderer
+from gscompleter.splat_alignment.fit import score_image
+from gscompleter.splat_alignment.matching import extract_view_features
 from gscompleter.stages.context import drop_ignored
 from gscompleter.stages.refine import refine_opacities
+from gscompleter.trust.photometric import gather_observations
 from gscompleter.types import ErrorBudget, GeneratorInput, View, sh_from_rgb
 from scenes import Room, camera_at, gaussians_of, half_a_room_of, photographed, reconstruction_of
 from scenes import view_of as photograph_of
@@ -105,6 +109,39 @@ def test_what_is_ignored_is_not_carried_over():
 
     assert reds(careless) > 0.8 * square().sum()
     assert reds(context) == 0
+
+
+def test_a_splat_is_neither_distrusted_nor_placed_by_what_is_ignored():
+    """The splat is right, and one of its photographs shows something red before it."""
+    view = photograph_of(ROOM, CAMERA)
+    scene = gaussians_of(view)
+    red = with_something_red(view)
+    frozen = [RENDERER.freeze(scene, CAMERA)]
+
+    def observe(photograph: View) -> tuple[torch.Tensor, torch.Tensor]:
+        found = gather_observations(scene, [photograph], frozen, TrustConfig())
+        return found.areas[0], found.agreement[0]
+
+    areas, agreement = observe(red)
+    known = areas > 0
+    assert known.float().mean() == pytest.approx(1 - square().float().mean().item(), abs=0.15)
+    assert (agreement[known] - observe(view)[1][known]).min() > -0.1
+    assert observe(replace(red, ignore_mask=None))[1].min() < 0.1
+    plain, ignoring, counting = (
+        score_image(frozen[0].render, photograph)
+        for photograph in (view, red, replace(red, ignore_mask=None))
+    )
+    assert ignoring.psnr > plain.psnr - 1
+    assert counting.psnr < plain.psnr - 5
+    pixels = extract_view_features(red)[0].astype(int)
+    assert not square()[pixels[:, 1], pixels[:, 0]].any()
+
+
+def test_a_halved_photograph_ignores_what_the_whole_one_does():
+    halved = halve_view(with_something_red(photograph_of(ROOM, CAMERA)))
+    reds = halved.image[..., 0] - halved.image[..., 1:].mean(-1) > 0.9
+    assert reds.any()
+    assert not (reds & halved.valid_mask).any()
 
 
 def test_scores_count_nothing_there():

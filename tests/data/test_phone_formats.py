@@ -251,7 +251,6 @@ POSES = json.loads(record3d()["metadata"])["poses"]
 RECORDINGS = {
     "no metadata": (without(record3d(), "metadata"), "no `metadata` in"),
     "no poses": (changed(record3d(), "metadata", poses=[]), "has no poses; record with the LiDAR"),
-    "zero": (changed(record3d(), "metadata", poses=[[0] * 7, *POSES[1:]]), "NaN or infinity"),
     "short": (changed(record3d(), "metadata", poses=[[0] * 6] * 4), "`poses` of .* 4 × 7"),
     "lenses": (changed(record3d(), "metadata", perFrameIntrinsicCoeffs=[1]), "4 × 4 numbers"),
     "K": (changed(record3d(), "metadata", K=[1]), "`K` of .* 9 numbers"),
@@ -269,6 +268,14 @@ def test_a_broken_recording_is_refused_in_a_sentence(tmp_path, kind):
     with pytest.raises(InputError, match=sentence) as error:
         open_photographs(write_archive(tmp_path / "room.r3d", files)).views(range(2))
     assert "\n" not in str(error.value)
+
+
+def test_frames_without_a_pose_are_left_out_with_a_note(tmp_path):
+    """Record3D writes zeros where tracking failed."""
+    files = changed(record3d(), "metadata", poses=[[0] * 7, *POSES[1:]])
+    photographs = open_photographs(write_archive(tmp_path / "room.r3d", files))
+    assert len(photographs) == len(POSES) - 1
+    assert any("NaN or infinity" in note for note in photographs.notes)
 
 
 def test_frames_that_were_dropped_keep_the_poses_of_the_others(tmp_path):

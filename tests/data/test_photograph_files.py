@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
-from PIL import Image, features
+from PIL import Image, ImageOps, features
 
 from exact_room import make_cameras, make_pose, write_colmap, write_photographs, write_transforms
 from gscompleter import InputError, load_cameras
@@ -90,6 +90,26 @@ def test_names_of_colmap_may_be_paths_of_another_machine(tmp_path):
     photographs = open_photographs(scene)
     assert len(photographs) == 4
     assert "4 of 4 paths" in photographs.notes[0]
+    assert [frame.name for frame in photographs.frames] == [Path(name).name for name in NAMES]
+
+
+def test_names_of_colmap_may_be_absolute_paths_that_exist(tmp_path):
+    scene = write_colmap(tmp_path / "scene", CAMERAS, n_points=20)
+    (scene / "images").rename(tmp_path / "photos")
+    file = scene / "sparse/0/images.txt"
+    file.write_text(file.read_text().replace("photo_", f"{tmp_path}/photos/photo_"))
+    photographs = open_photographs(scene)
+    assert photographs.notes == ()
+    assert photographs.frame(0).image == tmp_path / "photos/photo_000.png"
+
+
+@pytest.mark.parametrize("path", [".", "/", "..", "a/", "\\", "C:"])
+def test_odd_paths_are_missing_photographs(tmp_path, path):
+    scene = write_transforms(tmp_path, CAMERAS, NAMES)
+    change(scene, file_path=path)
+    photographs = open_photographs(scene)
+    assert sum(frame.has_photograph() for frame in photographs.frames) == 3
+    assert photographs.find_frame("photo_002.png") in range(4)
 
 
 def test_names_that_differ_in_case_only_are_two_photographs(tmp_path):
@@ -137,6 +157,14 @@ def test_portraits_whose_cameras_are_upright_are_turned(tmp_path, orientation):
     for view, camera in zip(open_photographs(scene).views([0, 1]), cameras, strict=True):
         assert np.array_equal((view.image * 255).round().numpy(), camera.photograph)
         assert (view.camera.width, view.camera.height) == (HEIGHT, WIDTH)
+
+
+@pytest.mark.parametrize("orientation", range(1, 9))
+def test_orientations_are_those_of_pillow(orientation):
+    image = Image.fromarray(CAMERAS[0].photograph)
+    image.getexif()[ORIENTATION] = orientation
+    expected = np.asarray(ImageOps.exif_transpose(image))
+    assert np.array_equal(turn_upright(CAMERAS[0].photograph, orientation), expected)
 
 
 def test_an_orientation_is_ignored_where_the_camera_is_that_of_the_stored_pixels(tmp_path):

@@ -9,11 +9,12 @@ from __future__ import annotations
 import os
 import re
 from collections.abc import Callable
+from contextlib import suppress
 from pathlib import Path, PurePosixPath, PureWindowsPath
 
 
 class FolderListings:
-    """Names in folders, each folder read once, so that thousands of look-ups stay quick.
+    """Names in folders, each folder read once, so that a million look-ups stay quick.
 
     It belongs to one opening of a scene, because folders change between two.
     """
@@ -24,25 +25,38 @@ class FolderListings:
 
     def find(self, folder: Path, relative: str) -> Path | None:
         """Find `relative` below `folder`, as written or else in any case; None without it."""
-        exact = folder / relative
-        if os.path.exists(exact):
-            return exact
+        if os.path.isabs(relative):
+            return Path(relative) if _exists(Path(relative)) else None
+        path = folder
         for part in PurePosixPath(relative).parts:
-            if part in ("..", "/"):  # names that no listing has
-                folder = folder / part
+            if part == "..":  # which no listing has
+                path = path / part
                 continue
-            name = self._list(folder).get(part.casefold())
+            names = self._list(path)
+            # Names as they are come under their own key, others under the folded one.
+            name = names.get(part) or names.get(part.casefold())
             if name is None:
-                return None
-            folder = folder / name
-        return folder
+                # A folder may be entered but not listed.
+                return folder / relative if not names and _exists(folder / relative) else None
+            path = path / name
+        return path
 
     def _list(self, folder: Path) -> dict[str, str]:
+        """Map each name to itself, and folded names to the first that folds so."""
         if folder not in self._names:
-            names = sorted(os.listdir(folder), reverse=True) if os.path.isdir(folder) else []
-            # Of names that differ in case only the first in order counts.
-            self._names[folder] = {name.casefold(): name for name in names}
+            names: list[str] = []
+            with suppress(OSError):
+                names = sorted(os.listdir(folder), reverse=True)
+            folded = {name.casefold(): name for name in names}
+            self._names[folder] = {**folded, **{name: name for name in names}}
         return self._names[folder]
+
+
+def _exists(path: Path) -> bool:
+    """Check whether a path exists; names that no file can have do not."""
+    with suppress(OSError, ValueError):
+        return os.path.exists(path)
+    return False
 
 
 def list_endings(written: str) -> list[str]:

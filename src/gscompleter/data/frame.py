@@ -251,15 +251,23 @@ def locate_images(frames: Sequence[Frame], roots: Sequence[Path]) -> list[Frame]
     listings = FolderListings()
     found = []
     for frame in frames:
-        names = list_endings(frame.name)
+        names = list(dict.fromkeys([frame.name, *list_endings(frame.name)]))
         images = [name + ending for name in names for ending in ENDINGS]
         stems = [os.path.splitext(name)[0] for name in names]
         image = find_file(folders, images, listings)
         mask = find_file(masks, [f"{name}.png" for name in [*names, *stems]], listings)
-        is_moved = len(names) > 1 and image is not None and image != Path(frame.name)
-        written = frame.name if is_moved else None
-        found.append(replace(frame, image=image, mask=mask, written=written))
+        found.append(_rename_moved(replace(frame, image=image, mask=mask), folders))
     return found
+
+
+def _rename_moved(frame: Frame, folders: Sequence[Path]) -> Frame:
+    """Name a frame by the photograph that was found, if its name is a path of another machine."""
+    image = frame.image
+    is_foreign = len(list_endings(frame.name)) > 1
+    if not is_foreign or not isinstance(image, Path) or image == Path(frame.name):
+        return frame
+    home = next(folder for folder in folders if folder in image.parents)
+    return replace(frame, name=image.relative_to(home).as_posix(), written=frame.name)
 
 
 def find_file(

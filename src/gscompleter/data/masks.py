@@ -51,7 +51,8 @@ def attach_masks(frames: Sequence[Frame]) -> tuple[Frame, ...]:
 def find_mask(photograph: Path, name: str, listings: FolderListings) -> Path | None:
     """Find the mask of a photograph; `name` is its path below the scene or its image folder."""
     parts = PurePosixPath(name).parts
-    is_below = not PurePosixPath(name).is_absolute() and photograph.parts[-len(parts) :] == parts
+    is_plain = not PurePosixPath(name).is_absolute() and ".." not in parts
+    is_below = is_plain and photograph.parts[-len(parts) :] == parts
     depth = len(parts) if is_below else 1
     home = photograph.parents[depth - 1]
     relatives = [PurePosixPath(*photograph.parts[-depth:])]

@@ -7,6 +7,7 @@ intrinsics together.
 
 from __future__ import annotations
 
+import os
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from numbers import Integral
@@ -205,7 +206,7 @@ class Photographs:
         if not found:
             example = self.frame(0).file_name
             raise InputError(
-                f"There is no photograph {quote_value(word)} in {self.title}; name one of its "
+                f"There is no photograph '{quote_value(word)}' in {self.title}; name one of its "
                 f"{len(self)} photographs, such as {quote_value(example)}, or its number from 0 "
                 f"to {len(self) - 1}."
             )
@@ -216,15 +217,12 @@ class Photographs:
         wanted = PurePosixPath(word.replace("\\", "/").casefold()).parts
         exact, found = [], []
         for number, frame in enumerate(self.frames):
-            path = PurePosixPath(frame.name.replace("\\", "/"))
-            if word in (frame.name, frame.file_name, path.name):
+            path = frame.name.replace("\\", "/")
+            if word in (frame.name, frame.file_name, PurePosixPath(path).name):
                 exact.append(number)
-            folded = PurePosixPath(str(path).casefold())
-            for parts in (folded.parts, folded.with_suffix("").parts):
-                shorter = min(len(parts), len(wanted))
-                if shorter and parts[-shorter:] == wanted[-shorter:]:
-                    found.append(number)
-                    break
+            names = path.casefold(), os.path.splitext(path.casefold())[0]
+            if any(_ends_alike(PurePosixPath(name).parts, wanted) for name in names):
+                found.append(number)
         return exact or found
 
     def _build_camera(self, frame: Frame, size: tuple[int, int], resolution: Resolution) -> Camera:
@@ -351,6 +349,12 @@ def resize_mask(
     (left, top), (width, height) = framing.corner, framing.size
     resized = resize(share, framing.scaled_size, Image.Resampling.BOX)
     return resized[top : top + height, left : left + width] >= 0.5
+
+
+def _ends_alike(one: Sequence[str], other: Sequence[str]) -> bool:
+    """Check whether the shorter of two paths is the end of the other; an empty one is of none."""
+    shorter = min(len(one), len(other))
+    return shorter > 0 and one[-shorter:] == other[-shorter:]
 
 
 def _has_alpha(frame: Frame) -> bool:

@@ -204,6 +204,8 @@ class Task:
     """Frames beside the target, for scoring only."""
     keeps_order: bool = False
     """True to give Ψ the context in this order, as a published index has it, instead of sorted."""
+    has_masks: bool = False
+    """True if masks hide parts of the photographs of its scene."""
 
     @property
     def name(self) -> str:

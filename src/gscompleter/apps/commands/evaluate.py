@@ -6,7 +6,7 @@ import os
 from collections.abc import Iterator, Sequence
 from contextlib import suppress
 from dataclasses import asdict, replace
-from itertools import islice
+from itertools import groupby, islice
 from pathlib import Path
 from typing import Any
 
@@ -74,7 +74,7 @@ def score_methods(options: EvaluateOptions) -> int:
         generator_settings=options.synthesis.make_settings(),
         device=choose_device(options.device),
         seed=options.seed,
-        source=describe_source(options),
+        source=describe_source(options, any(task.has_masks for task in tasks)),
     )
     engine = make_engine(options, options.out.resolve())
     with show_progress(console):
@@ -85,15 +85,18 @@ def score_methods(options: EvaluateOptions) -> int:
     return len(tasks) * len(methods)
 
 
-def describe_source(options: EvaluateOptions) -> dict[str, Any]:
-    """Describe the cases, as an output folder records them."""
+def describe_source(options: EvaluateOptions, has_masks: bool = False) -> dict[str, Any]:
+    """Describe the cases, as an output folder records them.
+
+    Scores with masks are not continued with scores without, nor the other way round.
+    """
     size = LONG_SIDE if options.resolution is None and options.protocol else options.resolution
     loader = find_loader(options)
     return {
         "paths": [path.resolve().name for path in options.paths],
         "protocols": list(options.protocol),
         "resolution": list(size) if isinstance(size, tuple) else size,
-        **({} if options.masks else {"masks": False}),
+        **({"masks": True} if has_masks else {}),
         **({"ignore_moving": True} if options.ignore_moving else {}),
         **({"one_per_scene": True} if options.one_per_scene else {}),
         **({} if options.ego_mask else {"ego_mask": False}),
@@ -164,23 +167,27 @@ def collect_tasks(
         first = {case.scene: case for case in reversed(cases)}
         cases = [case for case in cases if case is first[case.scene]]
     cases = cases[: options.limit]
-    tasks = [protocols.make_case_task(apply_options(case, options)) for case in cases]
-    for scene in dict.fromkeys(case.scene for case in cases):
+    tasks: list[protocols.Task] = []
+    for scene, group in groupby(cases, lambda case: case.scene):
+        own = [protocols.make_case_task(apply_options(case, options)) for case in group]
         with suppress(InputError):  # a row of the table says why a scene cannot be opened
             clip = open_photographs(scene)
             notes += clip.notes
-            clip = clip if options.masks else clip.leave_out_masks()
-            own = [task for task, case in zip(tasks, cases, strict=True) if case.scene == scene]
-            notes += describe_task_masks(clip, own)
+            own = mark_masked(clip if options.masks else clip.leave_out_masks(), own, notes)
+        tasks += own
     return tasks
 
 
-def describe_task_masks(clip: Photographs, tasks: Sequence[protocols.Task]) -> list[str]:
-    """Say in one sentence which photographs of the tasks of a clip have masks; none without."""
+def mark_masked(
+    clip: Photographs, tasks: Sequence[protocols.Task], notes: list[str]
+) -> list[protocols.Task]:
+    """Mark the tasks of a clip if their photographs have masks, and append a note about these."""
     frames = {f for task in tasks for f in (*task.context, *task.targets, *task.neighbours)}
-    known = sorted(frame for frame in frames if frame < len(clip))
-    found = clip.describe_masks(known)
-    return [] if found is None else [f"{clip.name}: {found} are read; what they hide is ignored."]
+    found = clip.describe_masks(sorted(frame for frame in frames if frame < len(clip)))
+    if found is None:
+        return [*tasks]
+    notes.append(f"{clip.name}: {found} are read; what they hide is ignored.")
+    return [replace(task, has_masks=True) for task in tasks]
 
 
 def apply_options(case: Case, options: EvaluateOptions) -> Case:
@@ -227,7 +234,7 @@ def iterate_tasks(
                 kept = rule if loader is None else loader.choose_splits(rule, clip, skipped)
                 keeps_order = loader is not None
                 tasks = protocols.make_tasks(kept, clip, size, keeps_order)
-                notes += describe_task_masks(clip, tasks)
+                tasks = mark_masked(clip, tasks, notes)
                 yield from tasks[:1] if options.one_per_scene else tasks
 
 

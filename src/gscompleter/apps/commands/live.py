@@ -53,6 +53,7 @@ def run_live(options: LiveOptions) -> None:
         lambda now: find_next_target(ready, now),
         lambda session: save_session(ready, session),
         server,
+        ready.opened.files,
     )
     address = f"http://{options.host}:{server.get_port()}/"
     # Printed once the server listens.

@@ -181,8 +181,7 @@ class RemoveOptions(CompleteOptions):
     sphere: tuple[float, float, float, float] | None = None
     """Remove Gaussians inside of a sphere: x, y and z of its centre, and its radius."""
     mask: Path | None = None
-    """Remove what masks show: a folder of images named as photographs, white on the object. It
-    hides nothing in the photographs, even if it is called `masks`."""
+    """Remove what masks show: a folder of images named as photographs, white on the object."""
     select: Path | None = None
     """Remove the Gaussians of this file, a selection that another program saved."""
     config: Annotated[CompleterConfig, tyro.conf.FlagConversionOff] = REMOVAL_CONFIG

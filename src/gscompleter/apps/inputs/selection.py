@@ -107,7 +107,8 @@ def sample_scene_points(
     """Sample points in front of the targets within the known or estimated depth range."""
     near, far = given.near, given.far
     if near is None or far is None:
-        frames = select_closest(targets, cameras, NUM_DEPTH_VIEWS)
+        closest = select_closest(targets, cameras, NUM_DEPTH_VIEWS)
+        frames = [frame for frame in closest if not given.is_hidden(frame)]
         low, high = estimate_depth_range(given.views(frames, CHECK_VIEW_SIZE))
         near, far = low if near is None else near, high if far is None else far
     return torch.cat([make_points_in_front(target, near, far) for target in targets])

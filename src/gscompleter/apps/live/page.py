@@ -12,7 +12,7 @@ import re
 import socket
 import time
 import traceback
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager, redirect_stdout
 from dataclasses import dataclass
 from functools import partial
@@ -20,6 +20,7 @@ from io import StringIO
 from itertools import cycle
 from queue import SimpleQueue
 from threading import Lock
+from types import MappingProxyType
 from typing import Any
 
 import numpy as np
@@ -30,6 +31,7 @@ from websockets.asyncio import server as websockets
 
 from gscompleter.apps.live.box import PageBox, remove_in_box
 from gscompleter.apps.live.session import Session, complete_camera, undo_step
+from gscompleter.apps.report.names import name_photograph
 from gscompleter.errors import InputError
 from gscompleter.geometry import estimate_up, quats_to_rotations, rotations_to_quats
 from gscompleter.progress import notify_of_stages
@@ -77,12 +79,21 @@ class Page:
         find_hole: Callable[[Completion], Camera | None],
         save: Callable[[Session], str],
         server: viser.ViserServer,
+        files: Mapping[int | None, str] = MappingProxyType({}),
     ) -> None:
-        """Build the page; `find_hole` finds the camera with the most to gain, if there is one."""
+        """Build the page; `find_hole` finds the camera with the most to gain, if there is one.
+
+        `files` are those of the photographs by frame.
+        """
         self.session, self.server = session, server
         self._find_hole, self._save = find_hole, save
         self._first = session.latest.views[0].camera
-        self._photographs = cycle([view.camera for view in session.latest.views])
+        self._photographs = cycle(
+            [
+                (f"Photograph {name_photograph(view.frame, files.get(view.frame))}.", view.camera)
+                for view in session.latest.views
+            ]
+        )
         self._unit = compute_page_unit(self._first)
         self._requests: SimpleQueue[Callable[[], str]] = SimpleQueue()
         self._busy = Lock()
@@ -124,8 +135,9 @@ class Page:
 
     def visit_photograph(self, client: viser.ClientHandle) -> str:
         """Move a browser to the next photograph of the context."""
-        self._move_browser(client, next(self._photographs))
-        return WELCOME
+        name, camera = next(self._photographs)
+        self._move_browser(client, camera)
+        return f"{name} {WELCOME}"
 
     def remove(self, client: viser.ClientHandle) -> str:
         """Remove what the box contains."""

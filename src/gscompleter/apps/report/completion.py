@@ -438,9 +438,13 @@ def write_pictures(
         write_images(folder, f"target{number}", name_target_images(target, result, pair))
     for number, view in enumerate(completion.views, start=1):
         if view.ignore_mask is not None:
-            color = view.image.new_tensor(IGNORED_COLOR)
-            painted = torch.where(view.valid_mask[..., None], view.image, color)
-            write_images(folder, f"context{number}", {"ignored": painted})
+            write_images(folder, f"context{number}", {"ignored": paint_ignored(view)})
+
+
+def paint_ignored(view: View) -> Float[Tensor, "h w 3"]:
+    """Paint the ignored pixels of a photograph in a colour that no scene has."""
+    color = view.image.new_tensor(IGNORED_COLOR)
+    return torch.where(view.valid_mask[..., None], view.image, color)
 
 
 def name_target_images(
@@ -454,7 +458,7 @@ def name_target_images(
         "hole_mask": result.hole_mask.float(),
         "support": None if torch.equal(alpha, result.before.alpha) else alpha,
         "reference": None if result.reference is None else result.reference.image,
-        "truth": target.photograph,
+        "truth": None if target.view is None else paint_ignored(target.view),
     }
 
 

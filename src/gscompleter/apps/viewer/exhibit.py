@@ -13,13 +13,14 @@ from gscompleter.apps.report.names import name_photograph
 from gscompleter.apps.report.schema import CompletionSummary, read_summary
 from gscompleter.data.camera_files import read_cameras
 from gscompleter.data.formats import open_photographs
+from gscompleter.data.frame import Frame
 from gscompleter.data.local_origin import compute_frame_from_photographs
 from gscompleter.data.photographs import Resolution
 from gscompleter.data.scene import load_cameras
 from gscompleter.data.sfm.poses import POSES
 from gscompleter.errors import InputError, quote_value
 from gscompleter.io.files import COMPLETED_FILE, CONTEXT_FILE, TARGETS_FILE
-from gscompleter.io.image import encode_jpeg, read_pixels
+from gscompleter.io.image import encode_jpeg, read_pixels, turn_upright
 from gscompleter.splat_alignment.similarity import transform_camera
 from gscompleter.splats.formats import load_splat
 from gscompleter.types import Camera, Gaussians
@@ -131,7 +132,7 @@ def load_context_cameras(
             f"photograph-{number}",
             f"Photograph {name_photograph(number, photographs.frame(number).file_name)}",
             transform_camera(photographs.camera(number), relative),
-            make_thumbnail(photographs.frame(number).find_stored()),
+            make_frame_thumbnail(photographs.frame(number)),
         )
         for number in [row.frame for row in summary.context if row.frame is not None]
     )
@@ -146,17 +147,23 @@ def add_file_cameras(content: ViewerContent, path: Path, resolution: Resolution)
             f"camera-{number}",
             Path(frame.name).name or f"Camera {number}",
             camera,
-            make_thumbnail(frame.find_stored()),
+            make_frame_thumbnail(frame),
         )
         for number, (frame, camera) in enumerate(zip(frames, cameras, strict=True), start=1)
     ]
     return replace(content, cameras=(*content.cameras, *shots))
 
 
-def make_thumbnail(stored: Path | bytes | None) -> bytes | None:
-    """Make a small JPEG of an image file; None if there is no file."""
-    if not isinstance(stored, Path) or not stored.is_file():
+def make_frame_thumbnail(frame: Frame) -> bytes | None:
+    """Make a small JPEG of the upright photograph of a frame; None if it is no file."""
+    stored = frame.find_stored()
+    return make_thumbnail(stored, frame.find_turn()) if isinstance(stored, Path) else None
+
+
+def make_thumbnail(stored: Path, orientation: int = 1) -> bytes | None:
+    """Make a small JPEG of an image file that EXIF turns; None if there is no file."""
+    if not stored.is_file():
         return None
-    image = Image.fromarray(read_pixels(stored))
+    image = Image.fromarray(turn_upright(read_pixels(stored), orientation))
     image.thumbnail((THUMBNAIL_SIDE, THUMBNAIL_SIDE))
     return encode_jpeg(image, THUMBNAIL_QUALITY)

@@ -1,0 +1,61 @@
+"""What is said and refused while photographs are opened."""
+
+import json
+
+import pytest
+
+from command import run
+from exact_room import make_cameras, write_photographs, write_transforms
+from gscompleter.apps.inputs.opening import describe_cameras_above
+
+CAMERAS = make_cameras(4, width=64, height=48, focal=52.0)
+
+
+def test_photographs_whose_folder_has_cameras_say_so(tmp_path):
+    scene = write_transforms(tmp_path / "scene", CAMERAS)
+    (line,) = describe_cameras_above(scene / "images")
+    assert f"{scene} has cameras of these photographs (nerfstudio)" in line
+    assert describe_cameras_above(scene) == []
+    write_photographs(tmp_path / "plain" / "images", CAMERAS)
+    assert describe_cameras_above(tmp_path / "plain" / "images") == []
+
+
+@pytest.mark.parametrize(
+    ("words", "said"),
+    [
+        (("--context", "photo_001", "photo_001.png"), "names photograph 1 (photo_001.png) twice"),
+        (("--context", "photo_009.png"), "There is no photograph 'photo_009.png'"),
+        (("--context", 9), "There is no frame 9"),
+        (("--target", "photo_009.png"), "'photo_009.png' is no target: name a photograph"),
+        (("--target", "missing.json"), "'missing.json' is no target: name a photograph"),
+    ],
+)
+def test_photographs_that_are_not_there_are_refused(tmp_path, monkeypatch, capsys, words, said):
+    scene = write_transforms(tmp_path / "scene", CAMERAS)
+    assert run(monkeypatch, "complete", scene, *words, "--out", tmp_path / "out") == 2
+    assert said in capsys.readouterr().err
+    assert not (tmp_path / "out").exists()
+
+
+def test_photographs_are_named_by_file_in_options_lines_and_results(tmp_path, monkeypatch, capsys):
+    scene = write_transforms(tmp_path / "scene", CAMERAS)
+    words = ("--context", "photo_000", scene / "images/photo_002.png", "--target", "PHOTO_003.png")
+    place = ("--resolution", 48, 64, "--out", tmp_path / "out")
+    assert run(monkeypatch, "complete", scene, *words, *place) == 0
+    captured = capsys.readouterr()
+    assert "from photographs 0 (photo_000.png), 2 (photo_002.png) for photograph 3" in captured.err
+    assert "context 2 (photo_002.png)" in captured.out
+    assert "target: photograph 3 (photo_003.png)" in captured.out
+    summary = json.loads((tmp_path / "out/summary.json").read_text())
+    assert [row["file"] for row in summary["context"]] == ["photo_000.png", "photo_002.png"]
+    assert [row["file"] for row in summary["held_out"]] == ["photo_001.png"]
+    (target,) = summary["targets"]
+    assert target["file"] == "photo_003.png"
+    assert target["anchor_file"] in ("photo_000.png", "photo_002.png")
+    page = (tmp_path / "out/report.html").read_text()
+    for text in (
+        "Target 1: photograph 3 (photo_003.png)",
+        "Photograph 2 (photo_002.png)",
+        "photograph 1 (photo_001.png)",
+    ):
+        assert text in page
