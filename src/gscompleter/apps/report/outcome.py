@@ -65,9 +65,8 @@ def judge_completion(
         return OutcomeRow("not-reconstructed", failure)
     if not has_gained(completion):
         return OutcomeRow("nothing-gained", explain_no_gain(completion))
-    targets = completion.targets
-    told = describe_gain(count_changed(targets), len(targets), held_out, is_given)
-    return OutcomeRow("completed", told)
+    work = describe_work(completion, is_given)
+    return OutcomeRow("completed", describe_gain(work, held_out))
 
 
 def count_matches(completion: Completion) -> MatchCount:
@@ -104,8 +103,8 @@ def describe_mismatch(compared: Sequence[HeldOutRow]) -> str:
     """Describe unused photographs that the scene does not resemble."""
     psnr = format_number(average(row.psnr_after for row in compared), 1)
     return (
-        f"The scene did not reconstruct: at {name_unused(compared)}, it does not show the "
-        f"same ({psnr} dB; one of its own photographs, as it is, comes as near). {ADVICE}"
+        f"The scene did not reconstruct: seen from {name_unused(compared)}, it shows something "
+        f"else ({psnr} dB; holding up one of its own photographs would be as good). {ADVICE}"
     )
 
 
@@ -147,25 +146,36 @@ def count_changed(targets: Sequence[TargetResult]) -> int:
     return sum(len(result.added) > 0 or result.num_recolored > 0 for result in targets)
 
 
-def describe_gain(
-    num_changed: int, num_targets: int, held_out: Sequence[HeldOutRow], is_given: bool
-) -> str:
-    """Describe a completion, and how unused photographs confirm or contradict it."""
-    where = f" for {num_changed} of {num_targets} targets" if num_changed < num_targets else ""
-    done = f"The {'splat' if is_given else 'scene'} is completed{where}"
-    unused = [row for row in held_out if row.psnr_after is not None and not row.is_check]
-    if not unused:
-        return f"{done}." if is_given else f"{done}; no unused photograph could test it."
-    before = average(row.psnr_before for row in unused) or 0.0
-    after = average(row.psnr_after for row in unused) or 0.0
+def describe_work(completion: Completion, is_given: bool) -> str:
+    """Describe in a clause what was done, and for how many of several targets."""
+    if completion.source.gone_mask.any():
+        work = "The selection is removed and its place is filled"
+    else:
+        work = f"The {'splat' if is_given else 'scene'} is completed"
+    changed, total = count_changed(completion.targets), len(completion.targets)
+    return f"{work} for {changed} of {total} targets" if changed < total else work
+
+
+def describe_gain(work: str, held_out: Sequence[HeldOutRow]) -> str:
+    """Describe a completion, and how other photographs confirm or contradict it.
+
+    If some were not used at all, only these count; of a splat, all may have checked it.
+    """
+    scored = [row for row in held_out if row.psnr_after is not None]
+    rows = [row for row in scored if not row.is_check] or scored
+    if not rows:
+        return f"{work}; no unused photograph could test it."
+    before = average(row.psnr_before for row in rows) or 0.0
+    after = average(row.psnr_after for row in rows) or 0.0
     scores = f"{format_number(before)} dB before, {format_number(after)} dB after"
     if after < before - MIN_LOSS:
-        return f"{done}, but {name_unused(unused)} are matched worse than before: {scores}."
-    return f"{done}; at {name_unused(unused)}, where it covers them: {scores}."
+        return f"{work}, but it matches {name_unused(rows)} worse than before: {scores}."
+    return f"{work}; at {name_unused(rows)}, where it covers them: {scores}."
 
 
 def name_unused(rows: Sequence[HeldOutRow]) -> str:
-    """Name unused photographs by their number."""
+    """Name photographs that only score, by their number."""
+    use = "checking" if rows[0].is_check else "unused"
     if len(rows) == 1:
-        return f"the unused photograph {rows[0].frame}"
-    return f"the {len(rows)} nearest unused photographs"
+        return f"the {use} photograph {rows[0].frame}"
+    return f"the {len(rows)} nearest {use} photographs"
