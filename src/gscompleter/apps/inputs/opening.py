@@ -173,10 +173,10 @@ def choose_working_size(
         told += f" ({quote_value(trained.source)})"
         if trained.long_side <= LONG_SIDE:
             side = trained.long_side
-            print_lines(console, f"{told}, and so it is completed; --resolution changes that.")
+            told += ", which is the working size; --resolution changes it."
         else:
-            line = f"{told}; it is completed at {side} px unless --resolution says otherwise."
-            print_lines(console, line)
+            told += f"; the working size stays {side} px unless --resolution changes it."
+        print_lines(console, told)
     return replace(options, resolution=side)
 
 

@@ -94,9 +94,9 @@ def explain_failure(completion: Completion, held_out: Sequence[HeldOutRow]) -> s
 
 def is_like(compared: Sequence[HeldOutRow]) -> bool:
     """Return True if a scene shows what the unused photographs show."""
-    above_photograph = median(row.above_photograph or 0.0 for row in compared)
-    above_color = median(row.above_color or 0.0 for row in compared)
-    return above_photograph >= MIN_ABOVE_PHOTOGRAPH or above_color >= MAX_ABOVE_COLOR
+    gains = [row.above_photograph for row in compared if row.above_photograph is not None]
+    margins = [row.above_color for row in compared if row.above_color is not None]
+    return median(gains) >= MIN_ABOVE_PHOTOGRAPH or median(margins) >= MAX_ABOVE_COLOR
 
 
 def describe_mismatch(compared: Sequence[HeldOutRow]) -> str:
@@ -148,21 +148,20 @@ def count_changed(targets: Sequence[TargetResult]) -> int:
 
 def describe_work(completion: Completion, is_given: bool) -> str:
     """Describe in a clause what was done, and for how many of several targets."""
+    has_added = any(len(result.added) > 0 for result in completion.targets)
     if completion.source.gone_mask.any():
         work = "The selection is removed and its place is filled"
-    else:
+    elif has_added:
         work = f"The {'splat' if is_given else 'scene'} is completed"
+    else:
+        return "Nothing was added to the splat; only colours changed"
     changed, total = count_changed(completion.targets), len(completion.targets)
     return f"{work} for {changed} of {total} targets" if changed < total else work
 
 
 def describe_gain(work: str, held_out: Sequence[HeldOutRow]) -> str:
-    """Describe a completion, and how other photographs confirm or contradict it.
-
-    If some were not used at all, only these count; of a splat, all may have checked it.
-    """
-    scored = [row for row in held_out if row.psnr_after is not None]
-    rows = [row for row in scored if not row.is_check] or scored
+    """Describe a completion, and how other photographs confirm or contradict it."""
+    rows = select_testing([row for row in held_out if row.psnr_after is not None])
     if not rows:
         return f"{work}; no unused photograph could test it."
     before = average(row.psnr_before for row in rows) or 0.0
@@ -171,6 +170,11 @@ def describe_gain(work: str, held_out: Sequence[HeldOutRow]) -> str:
     if after < before - MIN_LOSS:
         return f"{work}, but it matches {name_unused(rows)} worse than before: {scores}."
     return f"{work}; at {name_unused(rows)}, where it covers them: {scores}."
+
+
+def select_testing(held_out: Sequence[HeldOutRow]) -> list[HeldOutRow]:
+    """Select the photographs that test best: unused ones, or else those that checked a splat."""
+    return [row for row in held_out if not row.is_check] or list(held_out)
 
 
 def name_unused(rows: Sequence[HeldOutRow]) -> str:
