@@ -277,11 +277,10 @@ def print_completion(options: CompleteOptions) -> None:
     """Print the scores per camera, the notes, and the location of the results."""
     console = Console(highlight=False)
     summary = read_summary(options.out)
-    print_lines(console, summary.outcome.headline)
+    console.print(summary.outcome.headline, markup=False, soft_wrap=True)
     console.print(make_score_table(summary))
-    print_lines(console, *list_target_notes(summary))
-    for sentence in describe_result(summary, options):
-        console.print(sentence, soft_wrap=True)
+    for sentence in (*list_target_notes(summary), *describe_result(summary, options)):
+        console.print(sentence, markup=False, soft_wrap=True)
 
 
 def make_score_table(summary: CompletionSummary) -> Table:
