@@ -28,7 +28,7 @@ INRIA_FILE, GSPLAT_FILE = "cfg_args", "cfg.yml"
 INRIA_DIVISORS = (1, 2, 4, 8)
 """Values of Inria's `resolution` that divide the width; others above 0 are the width itself."""
 INRIA_MAX_WIDTH = 1600
-"""Width in pixels to which Inria's trainer shrinks wider images unless it is told otherwise."""
+"""Width in pixels to which Inria's trainer shrinks wider images by default."""
 MAX_SETTINGS_BYTES = 65536
 TOLERANCE = 0.02
 """Relative difference of two sizes that rounding explains."""

@@ -159,7 +159,7 @@ def choose_working_size(
 ) -> AnySceneOptions:
     """Choose the working size unless it is given: that of the training of a splat, if smaller.
 
-    A larger one is only told: details beyond the default size cost much time, and no harm is done
+    A larger one is only printed: details beyond the default size cost much time, and no harm is done
     where a splat is rendered smaller than it was trained.
     """
     if options.resolution is not None:
