@@ -105,9 +105,10 @@ def read_listed_scale(
     for file in find_camera_lists(splat, folder):
         with suppress(InputError):
             listed = {frame.name: frame.intrinsics.size for frame in read_camera_list(file)}
-            sizes = [listed[name] for _, name in match_names(names, list(listed))]
-            if sizes:
-                return median(max(size) for size in sizes) / own, file.name
+            matched = [listed[name] for _, name in match_names(names, list(listed))]
+            sides = [max(size) for size in matched if size is not None]
+            if sides:
+                return median(sides) / own, file.name
     return None
 
 
