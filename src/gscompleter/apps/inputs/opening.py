@@ -159,8 +159,8 @@ def choose_working_size(
 ) -> AnySceneOptions:
     """Choose the working size unless it is given: that of the training of a splat, if smaller.
 
-    A larger one is only printed: details beyond the default size cost much time, and no harm is done
-    where a splat is rendered smaller than it was trained.
+    A larger one is only printed: details beyond the default size cost much time, and no harm is
+    done where a splat is rendered smaller than it was trained.
     """
     if options.resolution is not None:
         return options
@@ -385,7 +385,8 @@ def check_sides(cameras: Sequence[Camera]) -> None:
 def describe_task(options: CompleteOptions, opened: Opened, task: Task) -> list[str]:
     """Write the four lines; the cameras of `task` have the working depth range."""
     targets = join_names([name_target(target) for target in task.targets], MAX_NAMED)
-    found = f"up to {get_max_targets(options)} cameras that are found"
+    count = get_max_targets(options)
+    found = "a camera that is found" if count == 1 else f"up to {count} cameras that are found"
     models = f"{options.reconstructor} and {options.synthesis.generator} on {task.device.type}"
     needed = estimate_memory(task, task.scene if task.device.type == "cpu" else None)
     available = read_memory_bytes()
