@@ -129,7 +129,7 @@ def test_photographs_that_were_not_used_are_scored(scene, tmp_path, monkeypatch,
         assert row["psnr_after"] > row["psnr_before"] + 1
     said = capsys.readouterr().out
     assert "the 8 nearest unused photographs, where it covers them: " in said
-    assert "Covered of the photographs that were not used: " in said
+    assert "Covered of the 8 nearest unused photographs: " in said
     page = (out / "report.html").read_text()
     assert "At held-out photographs" in page
     assert ">mean<" in page

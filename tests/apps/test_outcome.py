@@ -76,7 +76,7 @@ def test_a_scene_of_wrong_poses_is_no_success(scene, tmp_path, monkeypatch, caps
     assert run(monkeypatch, *complete(broken, out)) == 1
     said, outcome = capsys.readouterr(), outcome_of(out)
     assert outcome["status"] == "not-reconstructed"
-    assert outcome["headline"].startswith("The scene did not reconstruct: at the 3 nearest unused")
+    assert outcome["headline"].startswith("The scene did not reconstruct: seen from the 3 ")
     assert said.out.startswith(outcome["headline"])
     page = (out / "report.html").read_text()
     assert page.index(outcome["headline"]) < page.index("<h1>")
@@ -93,7 +93,7 @@ def test_a_job_of_a_batch_that_did_not_reconstruct_has_failed(scene, tmp_path):
     broken = permute_poses(scene, tmp_path / "broken")
     options = {"folder": str(broken), "context": list(CONTEXT), "target": [TARGET]}
     job = Job("broken", {**options, "resolution": 64, "near": 0.5, "far": 20})
-    with pytest.raises(InputError, match="The scene did not reconstruct: at the 3"):
+    with pytest.raises(InputError, match="The scene did not reconstruct: seen from the 3"):
         complete_job(job, tmp_path / "jobs")
     assert (tmp_path / "jobs" / "broken" / "report.html").is_file()
 
@@ -165,12 +165,16 @@ def test_a_scene_is_more_like_unused_photographs_than_used_ones_are(rows, expect
     ("before", "after", "ending"),
     [
         (20.0, 21.0, "the unused photograph 5, where it covers them: 20.00 dB before, 21.00 dB"),
-        (20.0, 19.0, "but the unused photograph 5 is matched worse than before: 20.00 dB"),
+        (20.0, 19.0, "but it matches the unused photograph 5 worse than before: 20.00 dB"),
     ],
 )
 def test_a_loss_at_unused_photographs_is_in_the_headline(before, after, ending):
     row = replace(held_out(3.0, 5.0), psnr_before=before, psnr_after=after)
-    assert ending in describe_gain(1, 1, [row], is_given=False)
+    assert ending in describe_gain("It is done", [row])
+    checked = replace(row, is_check=True, psnr_before=after + 9)
+    assert ending in describe_gain("It is done", [row, checked])  # it took part
+    assert "the checking photograph 5" in describe_gain("It is done", [checked])
+    assert describe_gain("It is done", []) == "It is done; no unused photograph could test it."
 
 
 def test_sentences_become_clauses():

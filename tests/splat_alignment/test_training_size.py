@@ -103,9 +103,9 @@ def test_gsplat_says_it_beside_the_folder_of_its_files(scene, tmp_path):
 @pytest.mark.parametrize(
     ("side", "words", "expected", "said"),
     [
-        (32, (), 32, "trained at 32 px (cameras.json), and so it is completed"),
+        (32, (), 32, "trained at 32 px (cameras.json), which is the working size"),
         (32, ("--resolution", "48"), 48, ""),
-        (900, (), 640, "trained at 900 px (cameras.json); it is completed at 640 px unless"),
+        (900, (), 640, "trained at 900 px (cameras.json); the working size stays 640 px unless"),
         (SIDE, (), 640, ""),
     ],
 )

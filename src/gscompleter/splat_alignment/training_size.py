@@ -28,7 +28,7 @@ INRIA_FILE, GSPLAT_FILE = "cfg_args", "cfg.yml"
 INRIA_DIVISORS = (1, 2, 4, 8)
 """Values of Inria's `resolution` that divide the width; others above 0 are the width itself."""
 INRIA_MAX_WIDTH = 1600
-"""Width in pixels to which Inria's trainer shrinks wider images if its settings are silent."""
+"""Width in pixels to which Inria's trainer shrinks wider images by default."""
 MAX_SETTINGS_BYTES = 65536
 TOLERANCE = 0.02
 """Relative difference of two sizes that rounding explains."""
@@ -106,9 +106,9 @@ def read_listed_scale(
         with suppress(InputError):
             listed = {frame.name: frame.intrinsics.size for frame in read_camera_list(file)}
             matched = [listed[name] for _, name in match_names(names, list(listed))]
-            sizes = [size for size in matched if size is not None]
-            if sizes:
-                return median(max(size) for size in sizes) / own, file.name
+            sides = [max(size) for size in matched if size is not None]
+            if sides:
+                return median(sides) / own, file.name
     return None
 
 

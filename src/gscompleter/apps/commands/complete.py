@@ -42,6 +42,7 @@ from gscompleter.apps.inputs.selection import collect_usable_cameras
 from gscompleter.apps.report.completion import Target, write_report
 from gscompleter.apps.report.film import VIDEO_FILE, write_comparison_video
 from gscompleter.apps.report.names import describe_offset
+from gscompleter.apps.report.outcome import name_unused, select_testing
 from gscompleter.apps.report.page import REPORT_FILE, write_completion_page
 from gscompleter.apps.report.plain_words import (
     format_number,
@@ -294,11 +295,10 @@ def print_completion(options: CompleteOptions) -> None:
     """Print the scores per camera, the notes, and the location of the results."""
     console = Console(highlight=False)
     summary = read_summary(options.out)
-    print_lines(console, summary.outcome.headline)
+    console.print(summary.outcome.headline, markup=False, soft_wrap=True)
     console.print(make_score_table(summary))
-    print_lines(console, *list_target_notes(summary))
-    for sentence in describe_result(summary, options):
-        console.print(sentence, soft_wrap=True)
+    for sentence in (*list_target_notes(summary), *describe_result(summary, options)):
+        console.print(sentence, markup=False, soft_wrap=True)
 
 
 def make_score_table(summary: CompletionSummary) -> Table:
@@ -328,11 +328,11 @@ def describe_result(summary: CompletionSummary, options: CompleteOptions) -> Ite
     share = "Trusted" if summary.settings["config"]["trust"] == "photometric" else "Coverage"
     before, after = map(format_percent, (summary.coverage.before, summary.coverage.after))
     yield f"{share} around the photographs: {before} before, {after} after."
-    unused = [row for row in summary.held_out if not row.is_check]
-    if unused:
-        at_first = format_percent(average(row.covered_before for row in unused))
-        at_last = format_percent(average(row.covered_after for row in unused))
-        yield f"Covered of the photographs that were not used: {at_first} before, {at_last} after."
+    rows = select_testing(summary.held_out)
+    if rows:
+        at_first = format_percent(average(row.covered_before for row in rows))
+        at_last = format_percent(average(row.covered_after for row in rows))
+        yield f"Covered of {name_unused(rows)}: {at_first} before, {at_last} after."
     counts, seconds = summary.gaussians, summary.seconds["total"]
     yield (
         f"Added {counts['added']:,} Gaussians to {counts['context']:,} in {seconds:.1f} s: "

@@ -196,10 +196,10 @@ def choose_working_size(options: AnyOptions, given: Photographs, console: Consol
         told += f" ({quote_value(trained.source)})"
         if trained.long_side <= LONG_SIDE:
             side = trained.long_side
-            print_lines(console, f"{told}, and so it is completed; --resolution changes that.")
+            told += ", which is the working size; --resolution changes it."
         else:
-            line = f"{told}; it is completed at {side} px unless --resolution says otherwise."
-            print_lines(console, line)
+            told += f"; the working size stays {side} px unless --resolution changes it."
+        print_lines(console, told)
     return replace(options, resolution=side)
 
 
@@ -501,7 +501,8 @@ def describe_task(options: CompleteOptions, opened: Opened, task: Task) -> list[
     targets = join_names([opened.name_target(target) for target in task.targets], MAX_NAMED)
     files = opened.files
     context = [name_photograph(frame, files.get(frame)) for frame in task.context_frames]
-    found = f"up to {get_max_targets(options)} cameras that are found"
+    count = get_max_targets(options)
+    found = "a camera that is found" if count == 1 else f"up to {count} cameras that are found"
     models = f"{options.reconstructor} and {options.synthesis.generator} on {task.device.type}"
     needed = estimate_memory(task, task.scene if task.device.type == "cpu" else None)
     available = read_memory_bytes()

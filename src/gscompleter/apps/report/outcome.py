@@ -65,9 +65,8 @@ def judge_completion(
         return OutcomeRow("not-reconstructed", failure)
     if not has_gained(completion):
         return OutcomeRow("nothing-gained", explain_no_gain(completion))
-    targets = completion.targets
-    told = describe_gain(count_changed(targets), len(targets), held_out, is_given)
-    return OutcomeRow("completed", told)
+    work = describe_work(completion, is_given)
+    return OutcomeRow("completed", describe_gain(work, held_out))
 
 
 def count_matches(completion: Completion) -> MatchCount:
@@ -95,17 +94,17 @@ def explain_failure(completion: Completion, held_out: Sequence[HeldOutRow]) -> s
 
 def is_like(compared: Sequence[HeldOutRow]) -> bool:
     """Return True if a scene shows what the unused photographs show."""
-    above_photograph = median(row.above_photograph or 0.0 for row in compared)
-    above_color = median(row.above_color or 0.0 for row in compared)
-    return above_photograph >= MIN_ABOVE_PHOTOGRAPH or above_color >= MAX_ABOVE_COLOR
+    gains = [row.above_photograph for row in compared if row.above_photograph is not None]
+    margins = [row.above_color for row in compared if row.above_color is not None]
+    return median(gains) >= MIN_ABOVE_PHOTOGRAPH or median(margins) >= MAX_ABOVE_COLOR
 
 
 def describe_mismatch(compared: Sequence[HeldOutRow]) -> str:
     """Describe unused photographs that the scene does not resemble."""
     psnr = format_number(average(row.psnr_after for row in compared), 1)
     return (
-        f"The scene did not reconstruct: at {name_unused(compared)}, it does not show the "
-        f"same ({psnr} dB; one of its own photographs, as it is, comes as near). {ADVICE}"
+        f"The scene did not reconstruct: seen from {name_unused(compared)}, it shows something "
+        f"else ({psnr} dB; holding up one of its own photographs would be as good). {ADVICE}"
     )
 
 
@@ -147,25 +146,40 @@ def count_changed(targets: Sequence[TargetResult]) -> int:
     return sum(len(result.added) > 0 or result.num_recolored > 0 for result in targets)
 
 
-def describe_gain(
-    num_changed: int, num_targets: int, held_out: Sequence[HeldOutRow], is_given: bool
-) -> str:
-    """Describe a completion, and how unused photographs confirm or contradict it."""
-    where = f" for {num_changed} of {num_targets} targets" if num_changed < num_targets else ""
-    done = f"The {'splat' if is_given else 'scene'} is completed{where}"
-    unused = [row for row in held_out if row.psnr_after is not None and not row.is_check]
-    if not unused:
-        return f"{done}." if is_given else f"{done}; no unused photograph could test it."
-    before = average(row.psnr_before for row in unused) or 0.0
-    after = average(row.psnr_after for row in unused) or 0.0
+def describe_work(completion: Completion, is_given: bool) -> str:
+    """Describe in a clause what was done, and for how many of several targets."""
+    has_added = any(len(result.added) > 0 for result in completion.targets)
+    if completion.source.gone_mask.any():
+        work = "The selection is removed and its place is filled"
+    elif has_added:
+        work = f"The {'splat' if is_given else 'scene'} is completed"
+    else:
+        return "Nothing was added to the splat; only colours changed"
+    changed, total = count_changed(completion.targets), len(completion.targets)
+    return f"{work} for {changed} of {total} targets" if changed < total else work
+
+
+def describe_gain(work: str, held_out: Sequence[HeldOutRow]) -> str:
+    """Describe a completion, and how other photographs confirm or contradict it."""
+    rows = select_testing([row for row in held_out if row.psnr_after is not None])
+    if not rows:
+        return f"{work}; no unused photograph could test it."
+    before = average(row.psnr_before for row in rows) or 0.0
+    after = average(row.psnr_after for row in rows) or 0.0
     scores = f"{format_number(before)} dB before, {format_number(after)} dB after"
     if after < before - MIN_LOSS:
-        return f"{done}, but {name_unused(unused)} are matched worse than before: {scores}."
-    return f"{done}; at {name_unused(unused)}, where it covers them: {scores}."
+        return f"{work}, but it matches {name_unused(rows)} worse than before: {scores}."
+    return f"{work}; at {name_unused(rows)}, where it covers them: {scores}."
+
+
+def select_testing(held_out: Sequence[HeldOutRow]) -> list[HeldOutRow]:
+    """Select the photographs that test best: unused ones, or else those that checked a splat."""
+    return [row for row in held_out if not row.is_check] or list(held_out)
 
 
 def name_unused(rows: Sequence[HeldOutRow]) -> str:
-    """Name unused photographs by their number."""
+    """Name photographs that only score, by their number."""
+    use = "checking" if rows[0].is_check else "unused"
     if len(rows) == 1:
-        return f"the unused photograph {rows[0].frame}"
-    return f"the {len(rows)} nearest unused photographs"
+        return f"the {use} photograph {rows[0].frame}"
+    return f"the {len(rows)} nearest {use} photographs"

@@ -160,7 +160,7 @@ def render_completion_page(folder: Path) -> str:
 
 
 def select_own_notes(summary: CompletionSummary) -> list[Sequence[str]]:
-    """Select the notes that only one target has; those of several are listed above."""
+    """Select the notes that only one target has; those of several stand above."""
     groups = group_target_notes(summary.targets)
     return [row.notes if len(groups.get(row.notes, ())) == 1 else () for row in summary.targets]
 

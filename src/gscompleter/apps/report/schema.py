@@ -74,7 +74,7 @@ class HeldOutRow(ScoreRow):
     """A photograph that only scores the result, where the completed scene covers it.
 
     The scores before are of the same pixels as those after, so that their difference is a gain. The
-    pixels that stay empty show in the covered shares alone.
+    pixels that stay empty count in the covered shares alone.
     """
 
     is_check: bool = False
