@@ -75,7 +75,7 @@ def _describe_defect(gaussians: Gaussians) -> str:
     if _find_infinite(gaussians.means, LARGEST).any():
         return "positions that are NaN or infinite"
     if _find_infinite(gaussians.quats, LARGEST).any():
-        return "rotations that are NaN or infinite"
+        return "rotations that are NaN or of infinite length"
     if _find_infinite(gaussians.scales, LARGEST).any() or (gaussians.scales < 0).any():
         return "scales that are negative, NaN or infinite"
     if _find_infinite(gaussians.sh, LARGEST_SH).any():

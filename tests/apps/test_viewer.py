@@ -314,7 +314,7 @@ def completion_in(folder: Path, transform: np.ndarray, origin: np.ndarray) -> Pa
     write_image(folder / "images" / "target1_after.png", torch.rand(SIDE, SIDE, 3))
     back = np.linalg.inv(transform)
     c2w = torch.from_numpy(back) @ TARGET.c2w.double()
-    write_cameras(folder / "targets.json", [replace(TARGET, c2w=c2w)])
+    write_cameras(folder / "targets.json", [replace(TARGET, c2w=c2w, K=TARGET.K.double())])
     scores = [None] * 4
     fit = AlignmentRow(1.0, 0.0, 1.0, "ransac")
     row = TargetRow(None, *scores, 0, False, 0.5, fit, 1, notes=("a <note>",))
@@ -359,6 +359,34 @@ def test_photographs_of_a_completion_are_jumped_to(tmp_path):
     assert [shot.name for shot in exhibit.cameras] == ["target-1", "photograph-0"]
     assert exhibit.cameras[1].thumbnail is not None
     assert exhibit.notes == ()
+
+
+def change_summary(folder: Path, part: str, name: str, value: object) -> None:
+    summary = json.loads((folder / "summary.json").read_text())
+    summary[part][name] = value
+    (folder / "summary.json").write_text(json.dumps(summary))
+
+
+@pytest.mark.filterwarnings("error")
+@pytest.mark.parametrize("number", [1e300, float("nan"), float("inf"), 0.0])
+def test_a_frame_that_is_no_similarity_is_refused_by_its_file(tmp_path, number):
+    folder = completion_in(tmp_path / "out", np.eye(4), np.zeros(3))
+    transform = np.eye(4)
+    transform[0, 0] = number
+    change_summary(folder, "frame", "transform", transform.tolist())
+    with pytest.raises(InputError, match=r"summary\.json is damaged \(frame: no similarity"):
+        load_viewer_completion(folder, False)
+
+
+@pytest.mark.parametrize("name", [["x"], {"a": 1}, 5, "\ud800"])
+def test_photographs_of_an_unknown_format_are_left_out(tmp_path, name):
+    """Another program wrote the summary: the scene is shown without its photographs."""
+    folder = completion_in(tmp_path / "out", np.eye(4), np.zeros(3))
+    (folder / "gone").mkdir()
+    change_summary(folder, "settings", "format", name)
+    exhibit = load_viewer_completion(folder, False)
+    assert [shot.name for shot in exhibit.cameras] == ["target-1"]
+    assert "are not shown" in exhibit.notes[0]
 
 
 def completion_of_photographs_in(folder: Path) -> Path:

@@ -125,7 +125,8 @@ def load_context_cameras(
     source: Path, summary: CompletionSummary, content: ViewerContent
 ) -> tuple[ViewerCamera, ...]:
     """Load the photographs of a completion's context; InputError if they were moved."""
-    photographs = open_photographs(source, summary.settings.get("format"))
+    name = summary.settings.get("format")
+    photographs = open_photographs(source, None if name is None else str(name))
     relative = content.transform @ compute_frame_from_photographs(-photographs.origin)
     return tuple(
         ViewerCamera(
