@@ -198,7 +198,9 @@ def iterate_tasks(
                     f"{clip.name} has neither masks nor boxes of moving objects; leave --use-masks "
                     "out."
                 )
-            clip = clip if options.ego_mask else clip.keep_ego_vehicle()
+            # The authors' code scores every pixel of their data sets.
+            is_masked = options.ego_mask and loader is None
+            clip = clip if is_masked else clip.keep_ego_vehicle()
             near = clip.near if options.near is None else options.near
             far = clip.far if options.far is None else options.far
             check_planes(near, far)
