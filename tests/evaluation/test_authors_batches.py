@@ -5,6 +5,7 @@ DepthSplat at 2dad25a7): images, intrinsics as fractions of the image, camera-to
 far. Those of drawn scenes are in this repository, those of photographs are in the shared data.
 """
 
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -13,6 +14,10 @@ import pytest
 import torch
 
 from command import run
+from gscompleter.apps.commands.evaluate import collect_tasks
+from gscompleter.apps.commands.options import EvaluateOptions
+from gscompleter.apps.commands.reproduce import apply_preset
+from gscompleter.data.cases import SkippedScene
 from gscompleter.evaluation.paper import load_paper
 from gscompleter.types import View
 from network_inputs import Fed, Recorded, record_networks
@@ -151,3 +156,29 @@ def test_photographs_of_dl3dv_are_fed_as_by_the_authors(shared, split, tmp_path,
     assert list_scenes(recorded) == scenes
     for scene in scenes:
         check_scene(recorded, "dl3dv", scene, batches / f"dl3dv_{scene}.npz", split)
+
+
+@pytest.mark.parametrize(("preset", "is_looked_for"), [("re10k", False), ("waymo", True)])
+def test_ego_vehicles_are_looked_for_where_no_authors_code_is_followed(preset, is_looked_for):
+    given = EvaluateOptions(paths=(DRAWN / "re10k",), out=Path("out"), preset=preset)
+    tasks = collect_tasks(apply_preset(replace(given, protocol=("n-1",))), [], [])
+    clips = [task.load.args[0] for task in tasks]
+    assert {frame.vehicle is not None for clip in clips for frame in clip.frames} == {is_looked_for}
+
+
+def test_another_resolution_than_that_of_a_preset_takes_photographs_of_any_size():
+    given = EvaluateOptions(paths=(DRAWN / "re10k",), out=Path("out"), preset="re10k")
+    given = replace(given, protocol=(str(DRAWN / "index.json"),))
+    for resolution, scenes in ((None, 4), ((128, 128), 5)):
+        skipped: list[SkippedScene] = []
+        options = apply_preset(replace(given, resolution=resolution))
+        assert len(collect_tasks(options, skipped, [])) == scenes
+        square = [skip.reason for skip in skipped if skip.name == "square"]
+        assert square == (
+            []
+            if resolution
+            else [
+                "frame 0: its 256 × 256 pixels are not the 640 × 360 of this data set (another "
+                "resolution takes any)"
+            ]
+        )

@@ -261,8 +261,8 @@ def test_all_of_the_paper_on_photographs(clips, tmp_path, monkeypatch):
         (("--table", "stress", "--protocol", "stress-2-70"), "no clip has the frames"),
         (("--figure", "seams", "--figure-cases", "x 0>1"), "there are 'a 0+2>4', 'b 0+2>4'"),
         (("--table", "steps", "--generator", "warp-inpaint"), "FLUX.1-Kontext"),
-        (("--reconstructor", "plane-sweep", "plane-sweep"), "another one"),
-        (("--table", "models", "--weights", "x.ckpt", "y.ckpt"), "one file of weights each"),
+        (("--reconstructor", "plane-sweep", "plane-sweep"), "is named twice"),
+        (("--table", "models", "--weights", "x.ckpt", "y.ckpt"), "x.ckpt belongs to no reconstructor"),
         (("--preset", "re10k", "--weights", "a.ckpt", "b.ckpt", "c.ckpt"), "a.ckpt"),
     ],
 )

@@ -3,6 +3,7 @@
 import json
 from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
 
 import pytest
 import torch
@@ -12,7 +13,7 @@ from gscompleter import InputError, load_reconstructor
 from gscompleter.models.feed_forward import FeedForward, MVSplat
 from gscompleter.models.feed_forward.build import build, create_network
 from gscompleter.models.weights import PUBLISHED
-from gscompleter.reconstructors import list_reconstructors
+from gscompleter.reconstructors import get_trained_range, list_reconstructors
 from network_inputs import record_networks
 from scenes import Room, camera_at, photographed, view_of
 
@@ -163,3 +164,15 @@ def test_a_scene_in_another_unit_than_the_network_was_trained_on_is_told(
 def test_a_scene_in_metres_is_not_remarked_upon(rooms, recorded, tmp_path, monkeypatch, capsys):
     complete_room(monkeypatch, rooms, tmp_path / "out", "mvsplat-re10k")
     assert "was trained on" not in capsys.readouterr().err
+
+
+@pytest.mark.parametrize("wrong", [5.0, (1.0,), (2.0, 1.0), (0.0, 1.0), ("a", "b")])
+def test_a_range_of_ones_own_model_that_is_none_is_refused(wrong):
+    mine = SimpleNamespace(depth_range=wrong)
+    with pytest.raises(InputError, match="The attribute depth_range of the reconstructor is"):
+        get_trained_range(mine)
+
+
+def test_a_model_of_ones_own_without_a_range_adapts_to_any():
+    assert get_trained_range(lambda views: None) is None
+    assert get_trained_range(SimpleNamespace(depth_range=[1, 5])) == (1.0, 5.0)

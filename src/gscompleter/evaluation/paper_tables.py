@@ -11,7 +11,7 @@ from dataclasses import asdict, dataclass
 from functools import partial
 from pathlib import Path
 
-from scipy.stats import t
+from scipy.stats import t as student_t
 
 from gscompleter.evaluation.columns import BY_KEY, Column
 from gscompleter.evaluation.paper import TableSpec
@@ -56,7 +56,7 @@ class Estimate:
             return 1.0
         if self.error == 0:
             return 0.0
-        return float(2 * t.sf(abs(self.mean) / self.error, self.degrees_of_freedom))
+        return float(2 * student_t.sf(abs(self.mean) / self.error, self.degrees_of_freedom))
 
     @property
     def is_noise(self) -> bool:

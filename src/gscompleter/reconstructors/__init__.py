@@ -92,8 +92,23 @@ def check_reconstruction(made: object, views: Sequence[View]) -> None:
 
 
 def get_trained_range(reconstructor: Reconstructor) -> tuple[float, float] | None:
-    """Return near and far that Ψ was trained on, in scene units; None if it adapts to any."""
-    return getattr(reconstructor, "depth_range", None)
+    """Return near and far that Ψ was trained on, in scene units; None if it adapts to any.
+
+    Raise InputError if the attribute of Ψ is no such pair.
+    """
+    trained = getattr(reconstructor, "depth_range", None)
+    if trained is None:
+        return None
+    try:
+        near, far = (float(bound) for bound in trained)
+    except (TypeError, ValueError):
+        near, far = 0.0, 0.0
+    if not 0 < near < far:
+        raise InputError(
+            f"The attribute depth_range of the reconstructor is {quote_value(trained)}; near and "
+            "far z-depth are needed, positive and in this order, or None."
+        )
+    return near, far
 
 
 def _check_depths(made: Reconstruction, views: Sequence[View]) -> None:

@@ -220,8 +220,10 @@ def iterate_tasks(
                     f"{clip.name} has no boxes of moving objects; leave --ignore-moving out. Masks "
                     "are always read (--no-masks leaves them out)."
                 )
-            clip = clip if options.ego_mask else clip.keep_ego_vehicle()
-            clip = clip if options.masks else clip.leave_out_masks()
+            # The authors' code scores every pixel of their data sets.
+            scores_all = loader is not None
+            clip = clip if options.ego_mask and not scores_all else clip.keep_ego_vehicle()
+            clip = clip if options.masks and not scores_all else clip.leave_out_masks()
             clip = clip.ignore_moving() if options.ignore_moving else clip
             near = clip.near if options.near is None else options.near
             far = clip.far if options.far is None else options.far
