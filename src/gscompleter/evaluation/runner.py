@@ -76,6 +76,8 @@ class RowCounts:
     done: int
     failed: int
     skipped: int
+    failures: Sequence[str] = ()
+    """Rows without a score, of this call and earlier ones, with the reasons."""
 
 
 def evaluate(
@@ -115,7 +117,18 @@ def evaluate(
     for _ in track(rows, "evaluating", len(todo)):
         pass
     failed = sum(map(has_failed, todo))
-    return RowCounts(len(todo) - failed, failed, len(share) * len(runner.methods) - len(todo))
+    skipped = len(share) * len(runner.methods) - len(todo)
+    return RowCounts(len(todo) - failed, failed, skipped, list_failures(runner, share))
+
+
+def list_failures(runner: TaskRunner, tasks: Sequence[Task]) -> list[str]:
+    """Describe the rows of tasks that hold an error, with the reason of each."""
+    return [
+        f"{task.name}, {method}: {store.read_json(row)['error']}"
+        for task in tasks
+        for row, method in runner.find_rows(task).items()
+        if has_failed(row)
+    ]
 
 
 def has_failed(row: Path) -> bool:

@@ -38,6 +38,10 @@ LONG_SIDE = 640
 """Default length of a photograph's longer side, in pixels."""
 
 DEFAULT_NUM_TARGETS = 4
+OUTPUTS = ("out", "save")
+"""Options that name what a command writes."""
+WORDS_OR_PATHS = ("target", "protocol", "generator_weights")
+"""Options whose words may be paths of files that are read."""
 REMOVAL_CONFIG = CompleterConfig.splat().for_removal()
 
 
@@ -484,6 +488,20 @@ class DoctorOptions(Settings):
 
     json: bool = False
     """Print the result as JSON."""
+
+
+def list_inputs(options: Settings) -> list[Path]:
+    """List the paths that a command reads: those of all its options but the outputs."""
+    inputs: list[Path] = []
+    for name, value in vars(options).items():
+        values = value if isinstance(value, tuple) else (value,)
+        if name in WORDS_OR_PATHS:
+            inputs += [Path(word) for word in values if isinstance(word, str)]
+        elif isinstance(value, Settings):
+            inputs += list_inputs(value)
+        elif name not in OUTPUTS:
+            inputs += [path for path in values if isinstance(path, Path)]
+    return inputs
 
 
 def get_max_targets(options: CompleteOptions) -> int:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import os
 import re
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, replace
 from functools import partial
@@ -32,17 +32,21 @@ from gscompleter.apps.report.completion import InputSplatFile, Target
 from gscompleter.data.camera_files import refuse_other_exports
 from gscompleter.data.formats import find_format, open_photographs, refuse_scenes_below
 from gscompleter.data.given_depth import give_depths
+from gscompleter.data.limits import check_planes
 from gscompleter.data.local_origin import (
     choose_scene_origin,
     compute_frame_from_photographs,
     shift_to_origin,
 )
-from gscompleter.data.photographs import Photographs
+from gscompleter.data.panorama import has_panoramas
+from gscompleter.data.photographs import Photographs, check_resolution
 from gscompleter.data.points import add_depth_range
 from gscompleter.data.scene import load_cameras
-from gscompleter.data.sfm.poses import POSES, find_poses, has_photographs
+from gscompleter.data.sfm.poses import find_poses, has_photographs, list_photograph_files
+from gscompleter.data.video import is_video
 from gscompleter.errors import InputError, join_names, quote_value
 from gscompleter.io.files import SUMMARY_FILE
+from gscompleter.io.output_folder import POSES
 from gscompleter.memory import (
     check_bytes,
     check_memory,
@@ -130,13 +134,23 @@ class Task:
         return {*self.context_frames, *(target.frame for target in self.targets)}
 
 
-def open_scene(options: SceneOptions, console: Console) -> Opened:
-    """Open the photographs or video. If they have no cameras, find them and keep them in OUT."""
+def open_scene(
+    options: SceneOptions, console: Console, check: Callable[[], object] = lambda: None
+) -> Opened:
+    """Open the photographs or video. If they have no cameras, find them and keep them in OUT.
+
+    `check` is called before that search, which takes minutes, and raises what would end the command
+    after it.
+    """
     folder, poses, number = options.folder, options.out / POSES, None
     refuse_splat(folder)
-    if options.format is None and has_photographs(folder) and find_format(folder) is None:
+    check_planes(options.near, options.far)
+    check_resolution(parse_resolution(options.resolution))
+    if options.format is None and find_format(folder) is None and has_photographs(folder):
         refuse_other_exports(folder)
         refuse_scenes_below(folder)
+        check_frame_numbers(options, folder)
+        check()
         ours = options.overwrite or os.path.isfile(poses / SUMMARY_FILE)
         found = find_poses(folder, poses, ours, options.frames)
         print_lines(console, *found.notes)
@@ -147,6 +161,29 @@ def open_scene(options: SceneOptions, console: Console) -> Opened:
     if number is None:
         return Opened(given, given.format, len(given))
     return Opened(given, "photographs", number)
+
+
+def check_frame_numbers(options: SceneOptions, folder: Path) -> None:
+    """Refuse frames beyond the photographs whose cameras have to be found.
+
+    Panoramas are split into several photographs each, and a video into as many as it is sharp.
+    """
+    words = getattr(options, "target", ())
+    frames = [*(options.context or ()), *(int(w) for w in words if FRAME_NUMBER.fullmatch(w))]
+    count = options.frames if is_video(folder) else len(list_photograph_files(folder))
+    if not frames or (not is_video(folder) and has_panoramas_in(folder)):
+        return
+    wrong = next((frame for frame in frames if not 0 <= frame < count), None)
+    if wrong is not None:
+        raise InputError(
+            f"There is no frame {wrong} among the {count} photographs of {quote_value(folder)}; "
+            f"name frames from 0 to {count - 1}."
+        )
+
+
+def has_panoramas_in(folder: Path) -> bool:
+    """Return True if the photographs of a folder are panoramas."""
+    return has_panoramas([folder / name for name in list_photograph_files(folder)])
 
 
 def refuse_splat(path: Path) -> None:
@@ -273,7 +310,14 @@ def check_context(options: SceneOptions) -> None:
 
 
 def check_targets(options: CompleteOptions) -> None:
-    """Refuse `--target` together with `--auto`."""
+    """Refuse `--target` together with `--auto`, and words that are neither frames nor files."""
+    for word in options.target:
+        if not FRAME_NUMBER.fullmatch(word) and not os.path.exists(word):
+            raise InputError(
+                f"'{quote_value(word, 60)}' is no target: name the number of a frame, or an "
+                "existing file of cameras, such as a transforms.json.",
+                "target",
+            )
     if options.target and options.auto is not None:
         raise InputError(
             "--target and --auto are both given; use one of them, and complete the result again "
