@@ -5,6 +5,7 @@ from __future__ import annotations
 import atexit
 import gc
 import io
+import logging
 import os
 import sys
 import warnings
@@ -112,6 +113,8 @@ def main() -> None:
         check_working_folder()
         given = validate(parse_command(words))
         check_overlap(given)
+        if getattr(given, "quiet", False):
+            logging.getLogger("gscompleter").setLevel(logging.ERROR)
         if isinstance(given, options.ComputeOptions):
             limit_threads(given.threads)
         _, module, function = COMMANDS[words[0]]

@@ -58,6 +58,14 @@ def replace_file(path: Path | str, keep_existing: bool = False) -> Iterator[Bina
                 temporary.unlink()
 
 
+def encode_text(text: str) -> bytes:
+    """Encode a text for a page or a table as UTF-8.
+
+    Names of files may hold bytes that are no UTF-8; each becomes the sign for an unknown character.
+    """
+    return text.encode("utf-8", "surrogatepass").decode("utf-8", "replace").encode()
+
+
 def refuse_special_file(path: Path) -> None:
     """Raise an OSError if there is something other than a regular file at the path."""
     if os.path.isdir(path):

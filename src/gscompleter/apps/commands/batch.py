@@ -30,7 +30,13 @@ from gscompleter.config.settings import validate
 from gscompleter.cpu_threads import count_available_cores, limit_threads
 from gscompleter.errors import InputError, join_names, quote_value
 from gscompleter.io.overlap import refuse_overlap
-from gscompleter.jobs.engines import choose_num_workers, open_local, open_ray, open_submitit
+from gscompleter.jobs.engines import (
+    check_processes,
+    choose_num_workers,
+    open_local,
+    open_ray,
+    open_submitit,
+)
 from gscompleter.jobs.jobs import (
     JOBS,
     Engine,
@@ -231,6 +237,7 @@ def make_engine(options: EngineOptions, out: Path) -> Engine | None:
         slurm, folder = parse_pairs(options.slurm, "slurm"), out / "submitit"
         workers = options.workers or 1
         return partial(open_submitit, workers, threads, options.gpus, folder, slurm)
+    check_processes()
     workers = options.workers or choose_num_workers()
     limit_threads(options.threads or max(1, count_available_cores() // workers))
     return partial(open_local, workers)

@@ -21,13 +21,13 @@ from gscompleter.apps.commands.options import (
 )
 from gscompleter.apps.commands.output import describe_run, read_held_out, refuse_results
 from gscompleter.apps.inputs.opening import (
-    FRAME_NUMBER,
     Opened,
     Task,
     add_check_views,
     apply_working_range,
     check_context,
     check_scene,
+    check_target_files,
     check_targets,
     describe_task,
     move_to_splat,
@@ -50,7 +50,7 @@ from gscompleter.apps.report.schema import (
 from gscompleter.apps.warmup import SPLAT_PART, compile_kernels
 from gscompleter.completer import GSCompleter, check_target_ids
 from gscompleter.data.local_origin import compute_frame_from_photographs
-from gscompleter.data.scene import load_cameras, write_cameras
+from gscompleter.data.scene import write_cameras
 from gscompleter.errors import quote_value
 from gscompleter.evaluation.metrics.coverage import render_pairs, sample_held_out_cameras
 from gscompleter.generators import load_generator
@@ -133,9 +133,7 @@ def check_inputs(options: CompleteOptions, device: str) -> None:
     It takes seconds, and the search for cameras after it minutes.
     """
     load_completer(options, (), device)
-    for word in options.target:
-        if not FRAME_NUMBER.fullmatch(word):
-            load_cameras(word, parse_resolution(options.resolution))
+    check_target_files(options)
     if options.scene is not None:
         load_splat(options.scene, options.drop_nonfinite)
 

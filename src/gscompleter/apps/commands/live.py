@@ -47,6 +47,9 @@ def run_live(options: LiveOptions) -> None:
             "The live page needs viser, which is not installed; run "
             "pip install 'gscompleter[live]'."
         )
+    from gscompleter.apps.live.page import check_bindable, resolve_host
+
+    check_bindable(resolve_host(options.host), options.host, options.port)
     with reserve_output(options.out, options.overwrite, COMMAND, RESULTS) as output:
         console = Console(stderr=True, quiet=options.quiet)
         print_lines(console, *output.describe_others())
@@ -59,7 +62,7 @@ def run_live(options: LiveOptions) -> None:
 def serve(options: LiveOptions, ready: Prepared, session: Session) -> None:
     """Serve the page of a session until Ctrl-C."""
     # Imported here because viser may be missing.
-    from gscompleter.apps.live.page import Page, start_server
+    from gscompleter.apps.live.page import Page, resolve_host, start_server
 
     server = start_server(options.host, options.port)
     page = Page(
@@ -68,7 +71,7 @@ def serve(options: LiveOptions, ready: Prepared, session: Session) -> None:
         lambda session: save_session(ready, session),
         server,
     )
-    address = f"http://{options.host}:{server.get_port()}/"
+    address = resolve_host(options.host).make_url(server.get_port())
     # Printed once the server listens.
     print(f"{address} (Ctrl-C ends it)", flush=True)
     if not options.no_open:

@@ -28,7 +28,7 @@ from gscompleter.evaluation.paper import (
 from gscompleter.evaluation.paper_tables import fill_table, judge_claims, write_paper_table
 from gscompleter.evaluation.store import make_file_name
 from gscompleter.evaluation.tables import format_markdown, write_tables
-from gscompleter.io.files import replace_file
+from gscompleter.io.files import encode_text, replace_file
 from gscompleter.jobs.jobs import make_folder
 from gscompleter.render import choose_device
 
@@ -205,7 +205,7 @@ def write_results(options: EvaluateOptions) -> str:
             parts.append(f"## {figure.title}\n\n![{figure.title}]({FIGURES}/{name}.png)\n")
     text = "\n".join(parts)
     with replace_file(out / RESULTS) as file:
-        file.write(text.encode())
+        file.write(encode_text(text))
     return text
 
 

@@ -310,20 +310,27 @@ def check_context(options: SceneOptions) -> None:
 
 
 def check_targets(options: CompleteOptions) -> None:
-    """Refuse `--target` together with `--auto`, and words that are neither frames nor files."""
-    for word in options.target:
-        if not FRAME_NUMBER.fullmatch(word) and not os.path.exists(word):
-            raise InputError(
-                f"'{quote_value(word, 60)}' is no target: name the number of a frame, or an "
-                "existing file of cameras, such as a transforms.json.",
-                "target",
-            )
+    """Refuse `--target` together with `--auto`."""
     if options.target and options.auto is not None:
         raise InputError(
             "--target and --auto are both given; use one of them, and complete the result again "
             "with the other.",
             "auto",
         )
+
+
+def check_target_files(options: CompleteOptions) -> None:
+    """Read the cameras of `--target`, and refuse words that are neither frames nor files."""
+    for word in options.target:
+        if FRAME_NUMBER.fullmatch(word):
+            continue
+        if not os.path.exists(word):
+            raise InputError(
+                f"'{quote_value(word, 60)}' is no target: name the number of a frame, or an "
+                "existing file of cameras, such as a transforms.json.",
+                "target",
+            )
+        load_cameras(word, parse_resolution(options.resolution))
 
 
 def find_depth_sources(
