@@ -42,7 +42,7 @@ def reserve_file(path: Path, overwrite: bool) -> Iterator[None]:
 
 def check_free(path: Path, overwrite: bool) -> None:
     """Refuse to replace a file unless `overwrite` is set."""
-    if os.path.lexists(path) and not overwrite:
+    if os.path.lexists(os.path.realpath(path)) and not overwrite:
         raise InputError(
             f"{quote_value(path)} exists; name another file, or overwrite it.", "overwrite"
         )

@@ -178,7 +178,7 @@ def _reserve(given: Path, target: Path, overwrite: bool, takes_over: bool) -> It
     try:
         for attempt in range(1, ATTEMPTS + 1):
             with convert_write_errors(given):
-                _check_free(given, overwrite)
+                _check_free(given, target, overwrite)
                 draft.mkdir(parents=True)
             rival = None if takes_over else _find_rival(draft, target)
             if rival is None:
@@ -209,16 +209,16 @@ def _describe_rival(given: Path, rival: Unfinished) -> str:
     )
 
 
-def _check_free(path: Path, overwrite: bool) -> None:
-    """Raise an error if `path` is a file or contains something that must not be overwritten."""
+def _check_free(given: Path, target: Path, overwrite: bool) -> None:
+    """Raise an error if `target` is a file or contains something that must not be overwritten."""
     names = list[str]()
     with suppress(FileNotFoundError):
-        names = [n for n in os.listdir(path) if not n.startswith(UNFINISHED_PREFIX)]
-    if names == [POSES] and os.path.isfile(path / POSES / SUMMARY_FILE):
+        names = [n for n in os.listdir(target) if not n.startswith(UNFINISHED_PREFIX)]
+    if names == [POSES] and os.path.isfile(target / POSES / SUMMARY_FILE):
         return  # only the cameras that an earlier run found
     if names and not overwrite:
         raise InputError(
-            f"The output folder {quote_value(path)} is not empty; name another one, or overwrite "
+            f"The output folder {quote_value(given)} is not empty; name another one, or overwrite "
             "the results in it.",
             "overwrite",
         )

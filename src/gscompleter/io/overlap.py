@@ -92,7 +92,8 @@ def _identify_chain(path: Path) -> Iterator[Identity]:
 def _identify(path: Path) -> Identity | None:
     """Identify a file or folder; None if there is none."""
     try:
-        status = os.stat(path)
+        # Also `missing/../folder` is written to the folder.
+        status = os.stat(os.path.realpath(path))
     except (OSError, ValueError):
         return None
     return status.st_dev, status.st_ino
