@@ -58,7 +58,7 @@ class WritingOptions(Options):
     """Options of every command that replaces earlier results on request only."""
 
     overwrite: bool = False
-    """Replace an existing file, or the results of an earlier run in the output folder."""
+    """Replace an existing file, or in the output folder the files that an earlier run wrote."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -76,7 +76,7 @@ class RunOptions(ComputeOptions):
     device: Device = "auto"
     """Device to compute on; `auto` takes an NVIDIA GPU if there is one."""
     seed: Seed = 0
-    """Seed of all random numbers. The same seed gives the same files on a CPU."""
+    """Seed of all random numbers. The same seed gives the same files on CPUs of one type."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -198,7 +198,7 @@ class LiveOptions(CompletingOptions):
     port: Port = 0
     """Port of the page; a free one if not given."""
     host: str = "127.0.0.1"
-    """Address of the page. Anyone who can reach it can use it."""
+    """Address of the page, such as 127.0.0.1 or ::1. Anyone who can reach it can use it."""
     no_open: bool = False
     """Print the address without opening a browser."""
 
