@@ -76,7 +76,7 @@ class RowCounts:
     done: int
     failed: int
     skipped: int
-    failures: Sequence[str] = ()
+    failures: Sequence[str] = field(default=(), compare=False)
     """Rows without a score, of this call and earlier ones, with the reasons."""
 
 
@@ -113,8 +113,8 @@ def evaluate(
         return not runner.find_missing_rows(job.options["task"])
 
     ended = run_jobs(jobs, runner, has_rows, engine, RETRIES)
-    rows = (row for job in ended for row in runner.find_rows(job.options["task"]) if row in todo)
-    for _ in track(rows, "evaluating", len(todo)):
+    # Cases are counted: the rows of all methods of a case come to light together.
+    for _ in track(ended, "evaluating case", len(jobs)):
         pass
     failed = sum(map(has_failed, todo))
     skipped = len(share) * len(runner.methods) - len(todo)
