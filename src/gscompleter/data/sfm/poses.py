@@ -99,8 +99,8 @@ class FoundPoses:
     """True if the result is from an earlier run."""
     origin: str = ""
     """Sentences on how a video or panoramas became photographs."""
-    kept: tuple[str, ...] = ()
-    """Sentence on other files in the output folder; not recorded there."""
+    kept: str = ""
+    """Sentence on other files in the output folder, if there are any; not recorded there."""
 
     @property
     def num_registered(self) -> int:
@@ -110,7 +110,7 @@ class FoundPoses:
     @property
     def notes(self) -> list[str]:
         """Sentences for the user."""
-        notes = [*self.kept, *([self.origin] if self.origin else [])]
+        notes = [note for note in (self.kept, self.origin) if note]
         if self.focal is not None:
             notes.append(
                 f"{self.num_registered} of {self.photographs} cameras were found with a focal "
@@ -143,7 +143,7 @@ def find_poses(
         found = _run(images, folder, photographs)
         content = {"poses": asdict(found), "photographs": known}
         (folder / SUMMARY_FILE).write_bytes(json.dumps(content, indent=1).encode())
-    return replace(found, kept=tuple(output.describe_others()))
+    return replace(found, kept=" ".join(output.describe_others()))
 
 
 def _identify_input(path: Path, num_frames: int) -> dict[str, list[int]]:
