@@ -20,8 +20,8 @@ import gscompleter as gsc
 from gscompleter.apps.report.completion import InputSplatFile, write_scenes
 from gscompleter.data.formats import open_photographs
 from gscompleter.generators import GeneratorOutput, GeneratorRequest
-from gscompleter.io.files import open_output_folder
 from gscompleter.io.image import write_image
+from gscompleter.io.output_folder import open_output_folder
 
 HANDLE = "GSCOMPLETER_HOLES"
 """Type of the link between both nodes."""

@@ -5,10 +5,12 @@ from __future__ import annotations
 import atexit
 import gc
 import io
+import logging
 import os
 import sys
 import warnings
 from collections.abc import Sequence
+from contextlib import suppress
 from importlib import import_module
 from typing import Annotated, Any, Union
 
@@ -16,11 +18,14 @@ import tyro
 
 from gscompleter import __version__
 from gscompleter.apps.commands import options
+from gscompleter.apps.commands.exit_codes import ERROR, INTERRUPTED, WRONG_INPUT
+from gscompleter.apps.commands.failures import explain_failure
+from gscompleter.apps.commands.overlap import check_overlap
 from gscompleter.apps.commands.words import format_error, parse_words
 from gscompleter.config.settings import validate
 from gscompleter.cpu_threads import limit_threads
-from gscompleter.errors import PROGRAM, InputError
-from gscompleter.io.files import handle_stop_signals
+from gscompleter.errors import PROGRAM, FullDiskError, InputError, NoCaseError
+from gscompleter.io.files import FULL_DISK_ERRORS, handle_stop_signals
 
 # Options, module and function of each command. The module is imported after the options are
 # validated, so that `--help` does not wait for torch.
@@ -51,21 +56,48 @@ Command: Any = Union[  # noqa: UP007  (of as many as there are)
 
 
 def run() -> None:
-    """Run `main` as the command `gscompleter`, whose output a reader may leave."""
-    if isinstance(sys.stdout, io.TextIOWrapper):  # Windows writes no UTF-8 into pipes
-        sys.stdout.reconfigure(errors="backslashreplace")
+    """Run `main` as the command `gscompleter`, whose output may be closed, full or left."""
+    replace_closed_outputs()
+    for output in (sys.stdout, sys.stderr):
+        if isinstance(output, io.TextIOWrapper):  # Windows writes no UTF-8 into pipes
+            output.reconfigure(errors="backslashreplace")
     try:
         try:
             main()
         finally:
             sys.stdout.flush()
     except BrokenPipeError:  # the reader, such as `head`, has ended
+        leave_output()
+        sys.exit(ERROR)
+    except OSError as error:
+        if error.errno not in FULL_DISK_ERRORS:
+            raise
+        leave_output()
+        print(f"{PROGRAM}the standard output cannot be written: {error.strerror}.", file=sys.stderr)
+        sys.exit(ERROR)
+
+
+def replace_closed_outputs() -> None:
+    """Open the null device in the place of a standard output or error that is closed (`>&-`).
+
+    Otherwise Python has None there, and the next file that is opened gets its number.
+    """
+    for number, name in ((1, "stdout"), (2, "stderr")):
+        if getattr(sys, name) is None:
+            null = os.open(os.devnull, os.O_WRONLY)
+            if null != number:
+                os.dup2(null, number)
+            setattr(sys, name, open(number, "w", encoding="utf-8", closefd=False))  # noqa: SIM115
+
+
+def leave_output() -> None:
+    """Let what is still written to the standard output vanish, also when Python ends."""
+    with suppress(OSError, ValueError):
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
-        sys.exit(1)
 
 
 def main() -> None:
-    """Run a command. Exit codes: 0 done, 2 wrong input, 1 anything else."""
+    """Run a command and exit with one of the codes of `exit_codes`."""
     # Waiting threads of torch must not spin, which slows a busy machine down ten times.
     os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")
     words = sys.argv[1:]
@@ -78,7 +110,11 @@ def main() -> None:
     # Damaged photographs are read or refused with a sentence; Pillow's warnings add nothing.
     warnings.filterwarnings("ignore", module="PIL")
     try:
+        check_working_folder()
         given = validate(parse_command(words))
+        check_overlap(given)
+        if getattr(given, "quiet", False):
+            logging.getLogger("gscompleter").setLevel(logging.ERROR)
         if isinstance(given, options.ComputeOptions):
             limit_threads(given.threads)
         _, module, function = COMMANDS[words[0]]
@@ -86,14 +122,33 @@ def main() -> None:
         command = getattr(import_module(f"gscompleter.apps.commands.{module}"), function)
         gc.freeze()  # each later search of torch for garbage would take 0.2 s
         gc.enable()
-        command(given)
+        code = command(given)
     except InputError as error:
         print(f"{PROGRAM}{format_error(error)}", file=sys.stderr)
-        sys.exit(2)
+        is_input = not isinstance(error, (FullDiskError, NoCaseError))
+        sys.exit(WRONG_INPUT if is_input else ERROR)
     except KeyboardInterrupt as stop:
         reason = str(stop) or "no unfinished result was written"
         print(f"{PROGRAM}interrupted; {reason}.", file=sys.stderr)
-        sys.exit(130)
+        sys.exit(INTERRUPTED)
+    except Exception as error:
+        failure = explain_failure(error)
+        if failure is None:
+            raise
+        print(f"{PROGRAM}{failure.sentence}", file=sys.stderr)
+        sys.exit(failure.code)
+    if code:
+        sys.exit(code)
+
+
+def check_working_folder() -> None:
+    """Refuse to run in a folder that was deleted, in which libraries end the process."""
+    try:
+        os.getcwd()
+    except OSError as error:
+        raise InputError(
+            "The working folder was deleted or cannot be read; change to another one with cd."
+        ) from error
 
 
 def parse_command(words: Sequence[str]) -> Any:

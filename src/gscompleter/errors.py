@@ -40,6 +40,14 @@ class OutputError(InputError):
     """An error while writing results, which affects all of them."""
 
 
+class FullDiskError(OutputError):
+    """A disk without space, or a quota that is used up, which is no fault of the input."""
+
+
+class NoCaseError(InputError):
+    """No case of an evaluation was completed, so that there is no table or figure to write."""
+
+
 def quote_value(value: object, length: int | None = None) -> str:
     """Format a value for a sentence: on one line, with its middle left out if it is long.
 

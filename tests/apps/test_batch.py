@@ -1,6 +1,8 @@
 """Batches: jobs run once even if processes are killed, and a page with all of them."""
 
+import errno
 import json
+import multiprocessing
 import os
 import signal
 import subprocess
@@ -16,7 +18,7 @@ import pytest
 from batch_jobs import Writing, engine_named, plain_jobs, run_all
 from command import run
 from gscompleter import InputError
-from gscompleter.apps.batch.manifest import read_manifest
+from gscompleter.apps.batch.manifest import list_results, read_manifest
 from gscompleter.apps.commands.batch import parse_row
 from gscompleter.errors import OutputError
 from gscompleter.jobs import jobs as batch
@@ -299,7 +301,7 @@ def test_a_batch_does_what_complete_does_and_tells_of_what_is_broken(
 ):
     out = tmp_path / "out"
     words = ("batch", manifest, "--out", out, "--workers", 1, "--threads", 1, "--quiet")
-    assert run(monkeypatch, *words) == 0
+    assert run(monkeypatch, *words) == 3
     alone = ("--context", 0, 1, "--target", 2, "--near", 0.5, "--far", 20, "--resolution", 48)
     room = manifest.parent / "room-1"
     words_alone = ("complete", room, *alone, "--out", tmp_path / "room-1", "--quiet")
@@ -324,10 +326,67 @@ def test_a_batch_does_what_complete_does_and_tells_of_what_is_broken(
     assert (out / "jobs" / "room-0" / "report.html").is_file()
     before = {p: p.stat().st_mtime_ns for p in out.rglob("*.ply")}
     capsys.readouterr()
-    assert run(monkeypatch, *words[:-1]) == 0
+    assert run(monkeypatch, *words[:-1]) == 3
     errors = capsys.readouterr().err
+    assert "Failed: nowhere: There is no " in errors
     assert "Done 0, failed 0, done earlier 4, 2 of them failed (--rerun failures repeats" in errors
     assert {p: p.stat().st_mtime_ns for p in out.rglob("*.ply")} == before
+
+
+def test_every_scene_failing_is_no_success_and_the_first_are_named(tmp_path, monkeypatch, capsys):
+    """A script sees it by the exit code, and a person the reasons."""
+    for number in range(7):
+        (tmp_path / "scenes" / f"empty-{number}").mkdir(parents=True)
+    out = tmp_path / "scenes" / "out"
+    words = ("batch", tmp_path / "scenes", "--out", out, "--workers", 1, "--threads", 1)
+    assert run(monkeypatch, *words) == 1
+    errors = capsys.readouterr().err
+    assert errors.count("Failed: empty-") == 5
+    assert "... and 2 more failed." in errors
+    assert "Done 0, failed 7, done earlier 0." in errors
+    assert run(monkeypatch, *words) == 1  # the output folder is no scene now, either
+    errors = capsys.readouterr().err
+    assert "Left out, as results and no scenes: out." in errors
+    assert "Done 0, failed 0, done earlier 7, 7 of them failed" in errors
+
+
+def test_results_in_a_folder_of_scenes_are_no_scenes(tmp_path):
+    scenes, out = tmp_path / "scenes", tmp_path / "scenes" / "out"
+    for name, files in {
+        "room": {},
+        "colmap": {"summary.json": {"command": "poses", "files": ["summary.json"]}},
+        "completed": {"summary.json": {"command": "complete", "files": ["summary.json"]}},
+        "theirs": {"summary.json": {"command": "complete"}},
+        "earlier": {"batch.json": {}},
+        "scores": {"run.json": {}},
+        "out": {},
+    }.items():
+        (scenes / name).mkdir(parents=True)
+        for file, content in files.items():
+            (scenes / name / file).write_text(json.dumps(content))
+    assert [job.name for job in read_manifest(scenes, {}, out)] == ["colmap", "room", "theirs"]
+    assert [p.name for p in list_results(scenes, out)] == ["completed", "earlier", "out", "scores"]
+
+
+def test_the_results_of_a_batch_never_lie_in_a_scene(tmp_path, monkeypatch, capsys):
+    room = tmp_path / "room"
+    room.mkdir()
+    (tmp_path / "m.csv").write_text("folder\nroom\n")
+    for out in (room, room / "out", tmp_path):
+        assert run(monkeypatch, "batch", tmp_path / "m.csv", "--out", out, "--quiet") == 2
+        assert "the input" in capsys.readouterr().err
+    assert sorted(os.listdir(tmp_path)) == ["m.csv", "room"]
+
+
+def test_without_shared_memory_nothing_is_begun(tmp_path, monkeypatch, capsys):
+    def refuse(*_: object) -> None:
+        raise FileNotFoundError(errno.ENOENT, os.strerror(errno.ENOENT))
+
+    (tmp_path / "m.csv").write_text("folder\nroom\n")
+    monkeypatch.setattr(multiprocessing.context.SpawnContext, "Lock", refuse)
+    assert run(monkeypatch, "batch", tmp_path / "m.csv", "--out", tmp_path / "out", "--quiet") == 2
+    assert "shared memory in /dev/shm" in capsys.readouterr().err
+    assert os.listdir(tmp_path) == ["m.csv"]
 
 
 def test_a_folder_of_something_else_is_refused(tmp_path, manifest, monkeypatch, capsys):

@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import math
 import socket
+import time
 from collections.abc import Iterator
 from dataclasses import replace
 from io import StringIO
@@ -24,12 +25,14 @@ from gscompleter.apps.commands import live
 from gscompleter.apps.commands.options import LiveOptions
 from gscompleter.apps.live.box import remove_in_box
 from gscompleter.apps.live.page import (
+    Address,
     Page,
     camera_from_page,
     camera_to_page,
     compute_page_unit,
     describe_outcome,
     make_page_splat,
+    resolve_host,
     run_request,
     start_server,
 )
@@ -329,6 +332,48 @@ def test_a_port_that_is_taken_is_refused():
             start_server("127.0.0.1", port)
 
 
+def has_ipv6() -> bool:
+    try:
+        socket.create_server(("::1", 0), family=socket.AF_INET6).close()
+    except OSError:
+        return False
+    return True
+
+
+@pytest.mark.parametrize(
+    ("host", "is_local"),
+    [("127.0.0.1", True), ("::1", True), ("::ffff:127.0.0.1", True), ("0.0.0.0", False)],
+)
+def test_only_an_address_of_this_machine_alone_is_local(host, is_local):
+    family = socket.AF_INET6 if ":" in host else socket.AF_INET
+    address = Address(family, host)
+    assert address.is_local == is_local
+    assert address.make_url(80) == (f"http://[{host}]:80/" if ":" in host else f"http://{host}:80/")
+
+
+def test_a_malformed_message_leaves_no_traceback(capfd):
+    server = start_server("127.0.0.1", 0)
+    try:
+        for sent in (b"GET / HTTP/1.1\r\nUpgrade: websocket\r\n\r\n", b"\x00\xff" * 50, b"\r\n"):
+            with socket.create_connection(("127.0.0.1", server.get_port())) as browser:
+                browser.sendall(sent)
+        assert send_frames(server.get_port(), b"\xff\xff\xff", b"\x82\x01x")
+    finally:
+        server.stop()
+    assert "Traceback" not in capfd.readouterr().err
+
+
+def send_frames(port: int, *frames: bytes) -> bool:
+    """Open WebSockets and send frames that are none."""
+    from websockets.sync.client import connect
+
+    for frame in frames:
+        with connect(f"ws://127.0.0.1:{port}", subprotocols=["viser-v0"], max_size=None) as browser:
+            browser.socket.sendall(frame)
+            time.sleep(0.2)
+    return True
+
+
 def test_without_viser_a_sentence_says_what_to_install(room, tmp_path, monkeypatch, capsys):
     monkeypatch.setattr(live, "find_spec", lambda _: None)
     assert run(monkeypatch, "live", room, "--out", tmp_path / "out") == 2
@@ -346,17 +391,25 @@ def test_the_options_of_complete_are_those_of_live(room, tmp_path):
     assert (asked.seed, asked.resolution, asked.target) == (3, (256, 256), ())
 
 
-def test_pages_from_elsewhere_are_refused():
+@pytest.mark.linux
+@pytest.mark.parametrize(
+    "host", ["127.0.0.1", "localhost", "127.1", "127.0.0.2", "LOCALHOST", "0x7f.1", "::1"]
+)
+def test_pages_from_elsewhere_are_refused(host):
+    """The address that is bound decides, whatever its spelling."""
+    if host == "::1" and not has_ipv6():
+        pytest.skip("this machine has no IPv6")
     from websockets.exceptions import InvalidStatus
     from websockets.sync.client import connect
 
-    server = start_server("127.0.0.1", 0)
+    server = start_server(host, 0)
     try:
-        address = f"ws://127.0.0.1:{server.get_port()}"
+        address = resolve_host(host).make_url(server.get_port()).replace("http:", "ws:")
         for origin in ("http://elsewhere.example", "http://127.0.0.1.elsewhere.example", "null"):
             with pytest.raises(InvalidStatus, match="403"):
                 connect(address, origin=origin, subprotocols=["viser-v0"], max_size=None)
-        own = f"http://localhost:{server.get_port()}"
-        connect(address, origin=own, subprotocols=["viser-v0"], max_size=None).close()
+        for name in ("localhost", "127.0.0.1", "LOCALHOST", "127.0.0.2", "[::1]"):
+            own = f"http://{name}:{server.get_port()}"
+            connect(address, origin=own, subprotocols=["viser-v0"], max_size=None).close()
     finally:
         server.stop()

@@ -5,6 +5,7 @@ import os
 import subprocess
 import sys
 from importlib import import_module
+from pathlib import Path
 from pkgutil import iter_modules
 
 import pytest
@@ -14,7 +15,9 @@ from rich.console import Console
 from command import run
 from gscompleter import GSCompleter, kernels
 from gscompleter.apps import warmup
+from gscompleter.apps.commands import doctor
 from gscompleter.kernels import compiled
+from gscompleter.kernels.cache import KernelCache
 from gscompleter.progress import show_progress
 from paths import TESTS
 from scenes import Room, camera_at, view_of
@@ -57,6 +60,60 @@ def rehearsed(monkeypatch, tmp_path) -> list[bool]:
     monkeypatch.setattr(compiled, "get_cache_folder", lambda: tmp_path)
     monkeypatch.setattr(warmup, "rehearse", lambda with_splat: done.append(with_splat))
     return done
+
+
+PLACES = """
+import os, sys
+from gscompleter.kernels.cache import CACHE, _probe, njit
+njit()(_probe)()
+print(CACHE.folder)
+print(CACHE.note)
+"""
+
+
+@pytest.mark.linux
+@pytest.mark.parametrize("temporary", ["private", "of-others", "missing"])
+def test_without_a_writable_cache_kernels_are_kept_elsewhere_or_nowhere(tmp_path, temporary):
+    """The installation is a read-only copy, and the home and NUMBA_CACHE_DIR are no folders."""
+    package = Path(kernels.__file__).parents[1]
+    for file in ("__init__.py", "cache.py"):
+        place = tmp_path / "lib" / "gscompleter" / "kernels" / file
+        place.parent.mkdir(parents=True, exist_ok=True)
+        place.write_bytes((package / "kernels" / file).read_bytes())
+    (tmp_path / "lib" / "gscompleter" / "__init__.py").touch()
+    # In the place of the folder for compiled code is a file, so that also root cannot write there.
+    (place.parent / "__pycache__").write_text("")
+    environment = {k: v for k, v in os.environ.items() if k not in ("NUMBA_CACHE_DIR", "TMPDIR")}
+    environment |= {"HOME": "/proc/none", "XDG_CACHE_HOME": "/proc/none"}
+    environment |= {"NUMBA_CACHE_DIR": "/proc/none", "PYTHONPATH": str(tmp_path / "lib")}
+    environment |= {"TMPDIR": str(tmp_path / "tmp"), "PYTHONDONTWRITEBYTECODE": "1"}
+    (tmp_path / "tmp").mkdir()
+    folder = tmp_path / "tmp" / f"gscompleter-kernels-{os.getuid()}"
+    if temporary == "of-others":
+        folder.mkdir()
+        folder.chmod(0o777)
+    elif temporary == "missing":
+        folder.write_text("")
+    command = [sys.executable, "-c", PLACES]
+    done = subprocess.run(command, capture_output=True, text=True, env=environment, check=False)
+    assert done.returncode == 0, done.stderr
+    where, note = done.stdout.splitlines()
+    assert "cannot be written to /proc/none" in note
+    assert note in done.stderr
+    if temporary == "private":
+        assert Path(where).is_relative_to(folder)
+        assert folder.stat().st_mode & 0o077 == 0
+        assert any(folder.rglob("*.nbi"))
+    else:
+        assert where == "None"
+        assert "compiled again in each run" in note
+
+
+def test_the_doctor_says_why_kernels_are_kept_elsewhere(monkeypatch, capsys):
+    note = "Compiled kernels cannot be written to /proc/none."
+    monkeypatch.setattr(doctor, "CACHE", KernelCache(None, note))
+    found = doctor.inspect_kernel_cache()
+    assert (found.there, found.told) == (False, note)
 
 
 def test_a_rehearsal_meets_every_kernel_of_a_completion():

@@ -7,6 +7,8 @@ import io
 import json
 import re
 import shutil
+import socket
+import struct
 import tarfile
 import threading
 from collections.abc import Iterator
@@ -569,6 +571,23 @@ def test_nothing_else_is_served(port, path):
 @pytest.mark.parametrize("method", ["POST", "PUT", "DELETE", "OPTIONS", "HEAD"])
 def test_nothing_can_be_sent(port, method):
     assert answer(port, method, "/", "localhost")[0] == 501
+
+
+def test_a_browser_that_leaves_leaves_no_traceback(monkeypatch, capfd):
+    """The page is larger than what fits between both programs."""
+    with make_page_server(bytes(2**26)) as server:
+        thread = threading.Thread(target=server.serve_forever)
+        thread.start()
+        for _ in range(3):
+            with socket.create_connection(server.server_address) as browser:
+                browser.sendall(b"GET / HTTP/1.1\r\nHost: localhost\r\n\r\n")
+                assert browser.recv(1)
+                # Closed with a reset, as by a browser that is ended.
+                linger = struct.pack("ii", 1, 0)
+                browser.setsockopt(socket.SOL_SOCKET, socket.SO_LINGER, linger)
+        server.shutdown()
+        thread.join()
+    assert capfd.readouterr().err == ""
 
 
 def test_a_port_that_is_taken_gets_a_sentence(port):

@@ -1,6 +1,7 @@
 """Runs of methods over tasks: files, resumed runs, and refused input."""
 
 import copy
+import itertools
 import json
 import mmap
 import os
@@ -415,6 +416,41 @@ def test_the_commands_run_end_to_end(scenes, tmp_path, monkeypatch, capsys):
     assert read_json(row)["error"] is None
 
 
+@pytest.mark.parametrize(("broken", "code"), [((0, 1), 1), ((1,), 3)])
+def test_cases_that_fail_are_no_success_and_the_first_are_named(
+    scenes, tmp_path, monkeypatch, capsys, broken, code
+):
+    attempt, numbers = runner.attempt, itertools.count()
+
+    def attempt_or_fail(make):
+        return "The photograph is damaged." if next(numbers) in broken else attempt(make)
+
+    monkeypatch.setattr(runner, "attempt", attempt_or_fail)
+    words = ["evaluate", scenes / "cases.json", "--methods", "context", "--device", "cpu"]
+    assert run(monkeypatch, *words, "--out", tmp_path / "out") == code
+    said = capsys.readouterr().err
+    assert said.count("Failed: ") == len(broken)
+    assert "context: The photograph is damaged." in said
+    done = 2 - len(broken)
+    assert f"Scored {done}, failed {len(broken)}, done earlier 0, of 2 cases by 1 methods." in said
+    assert "evaluating case 1 of 2" in said
+    assert run(monkeypatch, *words, "--out", tmp_path / "out", "--quiet") == code
+
+
+@pytest.mark.parametrize("more", [("--table", "rotation"), ("--figure", "qualitative"), ()])
+def test_what_is_refused_leaves_no_folder(tmp_path, monkeypatch, capsys, more):
+    assert run(monkeypatch, "evaluate", tmp_path / "no", "--out", tmp_path / "out", *more) == 2
+    assert "is no cases.json" in capsys.readouterr().err
+    assert os.listdir(tmp_path) == []
+
+
+def test_an_index_without_a_case_is_not_written(scenes, tmp_path, monkeypatch, capsys):
+    words = ("index", scenes / "box", "--protocol", "stress", "--out", tmp_path / "i.json")
+    assert run(monkeypatch, *words) == 2
+    assert "chooses no case in the 1 scene(s)" in capsys.readouterr().err
+    assert os.listdir(tmp_path) == []
+
+
 def test_chunks_run_end_to_end_and_a_broken_image_costs_its_own_cases(
     tmp_path, monkeypatch, capsys
 ):
@@ -425,7 +461,7 @@ def test_chunks_run_end_to_end_and_a_broken_image_costs_its_own_cases(
     chunk = save_chunk(tmp_path / "data" / "000000.torch", example("whole"), broken, wide)
     out = tmp_path / "out"
     arguments = ["evaluate", chunk.parent, "--protocol", "n-1", "n-2", "--out", out]
-    assert run(monkeypatch, *arguments, "--methods", "context", "--device", "cpu") == 0
+    assert run(monkeypatch, *arguments, "--methods", "context", "--device", "cpu") == 3
     errors = " ".join(capsys.readouterr().err.split())
     assert "Skipped wide: frame 0: its opening angle" in errors
     rows = [read_json(path) for path in (out / "tasks").glob("*/*.json")]

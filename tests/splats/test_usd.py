@@ -1,6 +1,7 @@
 """OpenUSD: what is written is read back by usd-core itself, by its schema."""
 
 import os
+import subprocess
 import sys
 import zipfile
 
@@ -13,6 +14,7 @@ from gscompleter import Gaussians, InputError, load_splat, save_splat
 from gscompleter.splats.formats import get_labels_path
 from gscompleter.splats.transform import HALF_TURN_X, rotate_half_turn
 from gscompleter.types import make_observed
+from paths import SUPPORT
 from splat_files import covariances, plausible
 
 NAMES = ["scene.usda", "scene.usdc", "scene.usd", "scene.usdz"]
@@ -47,6 +49,31 @@ def read_gaussians(path) -> Gaussians:
         sh.reshape(-1, count, 3),
     ]
     return rotate_half_turn(make_observed(*map(torch.from_numpy, arrays)), HALF_TURN_X)
+
+
+@pytest.mark.linux
+@pytest.mark.parametrize("name", NAMES)
+def test_a_full_disk_is_a_sentence_and_leaves_nothing(pxr, tmp_path, name):
+    """A limit of the size of files stands for it; the temporary folder is not used."""
+    code = (
+        "import resource, signal, sys\n"
+        "import torch\n"
+        "from gscompleter import save_splat\n"
+        "from gscompleter.errors import FullDiskError\n"
+        "from splat_files import plausible\n"
+        "signal.signal(signal.SIGXFSZ, signal.SIG_IGN)\n"
+        "resource.setrlimit(resource.RLIMIT_FSIZE, (2000, 2000))\n"
+        "try:\n"
+        "    save_splat(sys.argv[1], plausible(2000, 3))\n"
+        "except FullDiskError as error:\n"
+        "    print(error)\n"
+    )
+    environment = {**os.environ, "TMPDIR": "/proc/none"}
+    environment["PYTHONPATH"] = os.pathsep.join([str(SUPPORT), *sys.path])
+    command = [sys.executable, "-c", code, str(tmp_path / name)]
+    done = subprocess.run(command, capture_output=True, text=True, env=environment, check=False)
+    assert done.stdout.startswith(f"Cannot write {tmp_path / name}: File too large"), done.stderr
+    assert os.listdir(tmp_path) == []
 
 
 @pytest.mark.parametrize("degree", [0, 1, 2, 3])

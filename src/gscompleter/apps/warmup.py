@@ -9,7 +9,7 @@ import torch
 
 from gscompleter.completer import GSCompleter
 from gscompleter.image_ops import smooth_masked
-from gscompleter.kernels.compiled import find_marker
+from gscompleter.kernels.compiled import get_cache_folder, is_compiled, mark_compiled
 from gscompleter.progress import stage
 from gscompleter.render import load_renderer
 from gscompleter.render.lod import simplify_scene
@@ -29,15 +29,16 @@ WALL_DEPTH = 2.0
 
 def compile_kernels(names: Collection[str]) -> float | None:
     """Compile the missing kernels of these parts; return the seconds, or None if there are none."""
-    missing = [name for name in PARTS if name in names and not find_marker(name).is_file()]
-    if not missing:
+    missing = [name for name in PARTS if name in names and not is_compiled(name)]
+    # Without a cache each kernel is compiled when it is used, and a rehearsal gains nothing.
+    if not missing or get_cache_folder() is None:
         return None
     start = time.perf_counter()
     with stage("compiling kernels for this machine, once"):
         rehearse(with_splat=SPLAT_PART in missing)
     for name in PARTS:
         if name != SPLAT_PART or SPLAT_PART in missing:
-            find_marker(name).touch()
+            mark_compiled(name)
     return time.perf_counter() - start
 
 

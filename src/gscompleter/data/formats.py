@@ -36,6 +36,7 @@ from gscompleter.data.real_estate import (
 from gscompleter.data.sfm.poses import ENDINGS, is_own
 from gscompleter.data.transforms import has_transforms, open_transforms
 from gscompleter.errors import InputError, join_names, quote_value, require_path
+from gscompleter.io.reading import list_folders
 
 
 @dataclass(frozen=True)
@@ -59,6 +60,8 @@ UNREAD = (
 """Endings of photographs that are not read: raw data of cameras, and formats of other programs."""
 MAX_NAMED = 4
 """Most scenes that the message names."""
+MAX_BELOW = 1000
+"""Most folders below a path that are searched for scenes to name."""
 
 FORMATS = {
     "chunks": Format(has_chunks, open_chunks),
@@ -140,8 +143,13 @@ def refuse_scenes_below(path: Path) -> None:
         return
     if any(name.lower().endswith(ENDINGS) for name in os.listdir(path)):
         return
-    near = [folder for folder in sorted(path.iterdir()) if folder.is_dir() and is_own(folder)]
-    inside = [child for folder in near for child in sorted(folder.iterdir()) if child.is_dir()]
+    near = [folder for folder in list_folders(path) if is_own(folder)]
+    inside = [child for folder in near for child in list_folders(folder)]
+    require(
+        len(near) + len(inside) <= MAX_BELOW,
+        f"{quote_value(path)} is no scene itself, and has {len(near) + len(inside):,} folders "
+        "below it; name the folder of one scene.",
+    )
     below = sorted(near + [folder for folder in inside if is_own(folder)])
     posed = [folder for folder in below if find_format(folder)]
     plain = [folder for folder in below if has_image_folder(folder)]

@@ -8,6 +8,7 @@ from collections.abc import Callable, Iterator
 from dataclasses import replace
 from functools import partial
 from io import BytesIO
+from itertools import islice
 from pathlib import Path
 
 import numpy as np
@@ -21,8 +22,7 @@ from gscompleter.data.photographs import Photographs, build_photographs
 from gscompleter.data.sfm.poses import (
     ENDINGS,
     FULL_FRAME_DIAGONAL,
-    has_photographs,
-    list_all_photographs,
+    iterate_photographs,
     read_focal,
 )
 from gscompleter.errors import quote_value
@@ -36,8 +36,8 @@ def find_photograph(path: Path) -> Path | None:
     """Return an image file, or the only photograph of a folder; None for anything else."""
     if os.path.isfile(path):
         return path if path.suffix.lower() in ENDINGS else None
-    names = list_all_photographs(path) if has_photographs(path) else []
-    return path / names[0] if len(names) == 1 else None
+    found = list(islice(iterate_photographs(path), 2))
+    return found[0] if len(found) == 1 else None
 
 
 def open_photograph(path: Path) -> Iterator[Photographs]:

@@ -25,7 +25,7 @@ from gscompleter.evaluation.tables import (
     read_rows,
     summarize_run,
 )
-from gscompleter.io.files import replace_file
+from gscompleter.io.files import encode_text, replace_file
 
 SIGNIFICANCE = 0.05
 """Largest two-sided p at which a difference is more than noise."""
@@ -198,7 +198,7 @@ def write_paper_table(path: Path, table: PaperTable) -> None:
     texts[".json"] = json.dumps(content, indent=1) + "\n"
     for suffix, text in texts.items():
         with replace_file(path.with_name(path.name + suffix)) as file:
-            file.write(text.encode())
+            file.write(encode_text(text))
 
 
 def format_rows(

@@ -76,6 +76,8 @@ class RowCounts:
     done: int
     failed: int
     skipped: int
+    failures: Sequence[str] = field(default=(), compare=False)
+    """Rows without a score, of this call and earlier ones, with the reasons."""
 
 
 def evaluate(
@@ -111,11 +113,22 @@ def evaluate(
         return not runner.find_missing_rows(job.options["task"])
 
     ended = run_jobs(jobs, runner, has_rows, engine, RETRIES)
-    rows = (row for job in ended for row in runner.find_rows(job.options["task"]) if row in todo)
-    for _ in track(rows, "evaluating", len(todo)):
+    # Cases are counted: the rows of all methods of a case come to light together.
+    for _ in track(ended, "evaluating case", len(jobs)):
         pass
     failed = sum(map(has_failed, todo))
-    return RowCounts(len(todo) - failed, failed, len(share) * len(runner.methods) - len(todo))
+    skipped = len(share) * len(runner.methods) - len(todo)
+    return RowCounts(len(todo) - failed, failed, skipped, list_failures(runner, share))
+
+
+def list_failures(runner: TaskRunner, tasks: Sequence[Task]) -> list[str]:
+    """Describe the rows of tasks that hold an error, with the reason of each."""
+    return [
+        f"{task.name}, {method}: {store.read_json(row)['error']}"
+        for task in tasks
+        for row, method in runner.find_rows(task).items()
+        if has_failed(row)
+    ]
 
 
 def has_failed(row: Path) -> bool:

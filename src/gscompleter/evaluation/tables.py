@@ -33,7 +33,7 @@ from gscompleter.evaluation.store import (
     read_json,
     read_settings,
 )
-from gscompleter.io.files import replace_file
+from gscompleter.io.files import encode_text, replace_file
 from gscompleter.io.image import read_image
 from gscompleter.timing import STAGES
 
@@ -182,7 +182,7 @@ def write_tables(out: Path, with_fid: bool = False) -> RunSummary:
     }
     for name, text in texts.items():
         with replace_file(out / name) as file:
-            file.write(text.encode())
+            file.write(encode_text(text))
     return summary
 
 

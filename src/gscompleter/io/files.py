@@ -1,4 +1,4 @@
-"""Atomic writes: a file or folder is written completely or left as it was.
+"""Atomic writes: a file is written completely or left as it was.
 
 Interrupts (Ctrl-C, `kill`, a scheduler, or a closed terminal) wait while results are renamed.
 """
@@ -7,8 +7,6 @@ from __future__ import annotations
 
 import errno
 import os
-import secrets
-import shutil
 import signal
 import threading
 from collections.abc import Container, Iterator
@@ -16,7 +14,8 @@ from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import BinaryIO
 
-from gscompleter.errors import InputError, OutputError, quote_value
+from gscompleter.errors import FullDiskError, OutputError, quote_value
+from gscompleter.io.unfinished import make_unfinished_name
 
 SUMMARY_FILE = "summary.json"
 """File that marks a folder as complete: it is removed first and written last."""
@@ -24,13 +23,11 @@ TARGETS_FILE = "targets.json"
 """File of a completion with the target cameras."""
 CONTEXT_FILE, COMPLETED_FILE = "context.ply", "completed.ply"
 """The scene of a completion before and after."""
-OPTIONAL_FILES = ("removed.ply", TARGETS_FILE, "video.mp4")
-"""Files that only some completions have: those of an earlier one do not belong to its successor."""
+REMOVED_FILE = "removed.ply"
+"""Originals of changed and removed Gaussians of a given scene, beside the completed one."""
 
-UNFINISHED_PREFIX = ".gscompleter-"
-"""Prefix of the names of unfinished entries, which are never taken for results."""
-
-_DISK_ERRORS = {errno.ENOSPC, errno.EDQUOT, errno.EFBIG, errno.EROFS}
+FULL_DISK_ERRORS = {errno.ENOSPC, errno.EDQUOT, errno.EFBIG}
+"""Numbers of errors of a disk without space, of a full quota and of a limit of a file's size."""
 
 
 @contextmanager
@@ -38,12 +35,14 @@ def replace_file(path: Path | str, keep_existing: bool = False) -> Iterator[Bina
     """Open a temporary file that is renamed to `path` once it is completely on the disk.
 
     An existing file survives every failure. With `keep_existing`, a file that another process
-    wrote at `path` meanwhile is kept, where the file system has hard links.
+    wrote at `path` meanwhile is kept, where the file system has hard links. A device or a pipe is
+    never replaced by a file.
     """
     # The target of a symbolic link is replaced, not the link.
     target = Path(os.path.realpath(path))
-    temporary = target.with_name(_make_name())
+    temporary = target.with_name(make_unfinished_name(target.name))
     with convert_write_errors(path):
+        refuse_special_file(target)
         try:
             with temporary.open("xb") as file:
                 yield file
@@ -59,101 +58,20 @@ def replace_file(path: Path | str, keep_existing: bool = False) -> Iterator[Bina
                 temporary.unlink()
 
 
-def check_output(path: Path | str, overwrite: bool = False) -> None:
-    """Raise an InputError if results cannot be written to this folder, by trying."""
-    with _create_draft(Path(path), overwrite):
-        pass
+def encode_text(text: str) -> bytes:
+    """Encode a text for a page or a table as UTF-8.
 
-
-@contextmanager
-def open_output_folder(path: Path | str, overwrite: bool = False) -> Iterator[Path]:
-    """Open a temporary folder whose content becomes `path` at the end.
-
-    A new `path` is made by one rename. In an existing one, entries of the same names are replaced,
-    the summary last, and other files stay. After any exception, `path` and its parents are as
-    before.
+    Names of files may hold bytes that are no UTF-8; each becomes the sign for an unknown character.
     """
-    with _create_draft(Path(path), overwrite) as draft:
-        try:
-            with convert_write_errors(path, _DISK_ERRORS):
-                yield draft
-            state = f"{quote_value(Path(path))} is complete"
-            with convert_write_errors(path), defer_interrupts(state):
-                _publish(draft, Path(os.path.realpath(path)))
-        except InputError as error:
-            # The temporary name means nothing to the user.
-            whole = str(error.args[0]).replace(str(draft), str(path))
-            raise type(error)(whole, error.argument) from error
+    return text.encode("utf-8", "surrogatepass").decode("utf-8", "replace").encode()
 
 
-@contextmanager
-def _create_draft(path: Path, overwrite: bool) -> Iterator[Path]:
-    """Create a folder for the content of `path`, in it or beside it, with missing parents.
-
-    At the end whatever was not published is removed.
-    """
-    target = Path(os.path.realpath(path))
-    home = target if os.path.isdir(target) else target.parent
-    missing = [folder for folder in (home, *home.parents) if not os.path.exists(folder)]
-    draft = home / _make_name()
-    try:
-        with convert_write_errors(path):
-            _check_free(path, overwrite)
-            draft.mkdir(parents=True)
-        yield draft
-    finally:
-        shutil.rmtree(draft, ignore_errors=True)
-        for folder in missing:
-            with suppress(OSError):
-                folder.rmdir()
-
-
-def _check_free(path: Path, overwrite: bool) -> None:
-    """Raise an error if `path` is a file or contains something that must not be overwritten."""
-    names = list[str]()
-    with suppress(FileNotFoundError):
-        names = os.listdir(path)
-    if not overwrite and any(not name.startswith(UNFINISHED_PREFIX) for name in names):
-        raise InputError(
-            f"The output folder {quote_value(path)} is not empty; name another one, or overwrite "
-            "the results in it.",
-            "overwrite",
-        )
-
-
-def _publish(draft: Path, target: Path) -> None:
-    """Rename everything to its final name, or nothing; replaced entries are lost."""
-    if draft.parent != target:
-        os.rename(draft, target)
-        return
-    replaced = target / _make_name()
-    names = sorted(os.listdir(draft), key=lambda name: (name == SUMMARY_FILE, name))
-    stale = [name for name in OPTIONAL_FILES if COMPLETED_FILE in names and name not in names]
-    old = [name for name in reversed([*stale, *names]) if os.path.lexists(target / name)]
-    moves = [(target / name, replaced / name) for name in old]
-    replaced.mkdir()
-    try:
-        _rename_all(moves + [(draft / name, target / name) for name in names])
-    except OSError:
-        with suppress(OSError):  # an entry that could not be put back exists only here
-            replaced.rmdir()
-        raise
-    shutil.rmtree(replaced, ignore_errors=True)
-
-
-def _rename_all(moves: list[tuple[Path, Path]]) -> None:
-    """Do all renames, or none of them."""
-    for number, move in enumerate(moves):
-        try:
-            os.rename(*move)
-        except OSError:
-            for source, destination in reversed(moves[:number]):
-                os.rename(destination, source)
-            raise
-
-
-def _make_name() -> str:
-    return f"{UNFINISHED_PREFIX}{secrets.token_hex(6)}"
+def refuse_special_file(path: Path) -> None:
+    """Raise an OSError if there is something other than a regular file at the path."""
+    if os.path.isdir(path):
+        raise IsADirectoryError(errno.EISDIR, os.strerror(errno.EISDIR))
+    if os.path.lexists(path) and not os.path.isfile(path):
+        raise OSError(errno.EINVAL, "it is a device or a pipe, no file")
 
 
 @contextmanager
@@ -164,7 +82,8 @@ def convert_write_errors(path: Path | str, numbers: Container[int] | None = None
     except OSError as error:
         if numbers is not None and error.errno not in numbers:
             raise
-        raise OutputError(
+        kind = FullDiskError if error.errno in FULL_DISK_ERRORS else OutputError
+        raise kind(
             f"Cannot write {quote_value(Path(path))}: {error.strerror or error}; free some space, "
             "or choose another place."
         ) from error

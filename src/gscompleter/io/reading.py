@@ -80,6 +80,14 @@ def read_lines(
             yield line
 
 
+def list_folders(folder: Path) -> list[Path]:
+    """List the folders of a folder by name; none if it cannot be read."""
+    try:
+        return sorted(child for child in folder.iterdir() if os.path.isdir(child))
+    except OSError:
+        return []
+
+
 def read_json(path: Path, advice: str) -> Any:
     """Read a JSON file; errors end with `advice`, such as "download it again"."""
     return parse_json(read_bytes(path, MAX_JSON), path, advice)

@@ -39,6 +39,19 @@ def choose_num_workers() -> int:
     return cores if there is None else max(1, min(cores, there // estimate_bytes(PIXELS, IMAGES)))
 
 
+def check_processes() -> None:
+    """Refuse to start processes on a machine without shared memory, which their queues need."""
+    try:
+        multiprocessing.get_context("spawn").Lock()
+    except (OSError, ImportError) as error:
+        raise InputError(
+            f"Processes of this machine need shared memory in /dev/shm, which is missing or cannot "
+            f"be written ({quote_value(getattr(error, 'strerror', None) or str(error))}); mount "
+            "it, or choose another engine.",
+            "engine",
+        ) from error
+
+
 @contextlib.contextmanager
 def open_local(workers: int) -> Iterator[Pool]:
     """Open a pool of local processes, which end with this one."""

@@ -22,8 +22,9 @@ from pathlib import Path
 from typing import Any
 
 from gscompleter.errors import InputError, OutputError, quote_value
-from gscompleter.io.files import UNFINISHED_PREFIX, convert_write_errors, replace_file
+from gscompleter.io.files import convert_write_errors, replace_file
 from gscompleter.io.reading import read_json
+from gscompleter.io.unfinished import UNFINISHED_PREFIX, remove_left_behind_below
 
 JOBS, ROWS = "jobs", "rows"
 """Folders in the folder of a batch."""
@@ -122,7 +123,9 @@ def claim_folder(out: Path, kind: str, content: Mapping[str, Any]) -> None:
     """
     marker = out / f"{kind}.json"
     try:
-        names = [path.name for path in out.iterdir()] if out.exists() else []
+        names = [path.name for path in out.iterdir()]
+    except FileNotFoundError:
+        names = []
     except OSError as error:
         raise InputError(
             f"{quote_value(out)} cannot be read: {error.strerror}; name another."
@@ -131,6 +134,7 @@ def claim_folder(out: Path, kind: str, content: Mapping[str, Any]) -> None:
     is_used = any(not name.startswith(UNFINISHED_PREFIX) for name in names)
     if is_used and not marker.is_file():
         raise InputError(f"{quote_value(out)} holds something other than a {kind}; name another.")
+    remove_left_behind_below(out)
     write_json(marker, content, keep_existing=True)
 
 

@@ -6,8 +6,10 @@ limited to `contract`: reordered sums (`reassoc`) would round differently in the
 compiles a kernel and in those that load it from the cache.
 """
 
-import os
+from contextlib import suppress
 from pathlib import Path
+
+from gscompleter.kernels.cache import CACHE
 
 
 def _remove_stale_indices():
@@ -15,13 +17,13 @@ def _remove_stale_indices():
 
     numba itself notices edits of a kernel's own file, but not of those that it inlines.
     """
-    here = Path(__file__).parent
-    newest = max(source.stat().st_mtime for source in here.glob("*.py"))
-    caches = Path(os.environ.get("NUMBA_CACHE_DIR", here)).glob("kernels_*")
-    for folder in (here / "__pycache__", *caches):
-        for index in folder.glob("*.nbi"):
+    if CACHE.folder is None:
+        return
+    newest = max(source.stat().st_mtime for source in Path(__file__).parent.glob("*.py"))
+    for index in CACHE.folder.glob("*.nbi"):
+        with suppress(OSError):  # another process may be removing it
             if index.stat().st_mtime < newest:
-                index.unlink(missing_ok=True)
+                index.unlink()
 
 
 _remove_stale_indices()

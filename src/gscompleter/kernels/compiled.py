@@ -2,17 +2,30 @@
 
 import hashlib
 import sys
+from contextlib import suppress
 from pathlib import Path
 
 import numba
 from llvmlite.binding import get_host_cpu_features, get_host_cpu_name
 
-from gscompleter.kernels import tgv
+from gscompleter.kernels.cache import CACHE
 
 
 def get_cache_folder():
-    """Return the folder of numba's cache."""
-    return Path(tgv.advance.stats.cache_path)
+    """Return the folder of numba's cache; None if no folder can be written."""
+    return CACHE.folder
+
+
+def is_compiled(part):
+    """Return True if the current kernels of a part are compiled here."""
+    return get_cache_folder() is not None and find_marker(part).is_file()
+
+
+def mark_compiled(part):
+    """Record that the current kernels of a part are compiled, as far as there is a cache."""
+    if get_cache_folder() is not None:
+        with suppress(OSError):
+            find_marker(part).touch()
 
 
 def find_marker(part):

@@ -7,9 +7,9 @@ depth: the frozen `context`, and `new`, which gets gradients.
 from typing import NamedTuple
 
 import numpy as np
-from numba import njit
 
 from gscompleter.kernels import project, simd
+from gscompleter.kernels.cache import njit
 from gscompleter.kernels.project import DEPTH
 from gscompleter.kernels.simd import TILE
 
@@ -48,7 +48,7 @@ class RasterFrame(NamedTuple):
     """True for tiles without any transmittance left [tiles] bool."""
 
 
-@njit(cache=True)
+@njit()
 def _get_depth(splats, entries, place, begin, end, beyond):
     """Return the depth of an entry, or `beyond` for places outside begin..end."""
     if place < begin or place >= end:
@@ -56,7 +56,7 @@ def _get_depth(splats, entries, place, begin, end, beyond):
     return splats[entries[place], DEPTH]
 
 
-@njit(cache=True, nogil=True)
+@njit(nogil=True)
 def merge_lists(begin, end, context, new, used, full, tile_start, entries, depth_limits):
     """Merge the lists of the tiles begin..end of two layers, as far as they were composited.
 
@@ -93,7 +93,7 @@ def merge_lists(begin, end, context, new, used, full, tile_start, entries, depth
         depth_limits[tile] = depth if full[tile] else infinity
 
 
-@njit(cache=True)
+@njit()
 def _locate(tile, height, width):
     """Return left and top pixel of a tile, and its rows and columns inside the image."""
     tiles_x = (width + TILE - 1) // TILE
@@ -101,7 +101,7 @@ def _locate(tile, height, width):
     return left, top, min(TILE, height - top), min(TILE, width - left)
 
 
-@njit(cache=True)
+@njit()
 def _open_pixels(state, columns):
     """Reset the pixels of a tile. Those beyond the border of the image are full from the start."""
     state[:] = 0
@@ -109,7 +109,7 @@ def _open_pixels(state, columns):
     state[:, 0, columns:] = -1
 
 
-@njit(cache=True, fastmath={"contract"})
+@njit(fastmath={"contract"})
 def _place(splats, opacities, boxes, i, left, top):
     """Return the rows of the tile at (left, top) that splat i touches, and the relative splat."""
     half = np.float32(0.5)
@@ -131,7 +131,7 @@ def _place(splats, opacities, boxes, i, left, top):
     )
 
 
-@njit(cache=True, nogil=True, fastmath={"contract"}, error_model="numpy")
+@njit(nogil=True, fastmath={"contract"}, error_model="numpy")
 def composite(begin, end, tiles, context, new, frame):
     """Composite tiles[begin:end] of two layers into `frame`, the context first at equal depth."""
     # Taking an array out of a tuple counts references, which must not happen in the loops.
@@ -183,7 +183,7 @@ def composite(begin, end, tiles, context, new, frame):
                 lasts[y, x] = last[row, column]
 
 
-@njit(cache=True, nogil=True, fastmath={"contract"}, error_model="numpy")
+@njit(nogil=True, fastmath={"contract"}, error_model="numpy")
 def backproject_residual(begin, end, tiles, context, new, photograph, slots, sums, written):
     """Composite tiles[begin:end] and backproject the residual to the entries of `new`.
 
@@ -246,7 +246,7 @@ def backproject_residual(begin, end, tiles, context, new, photograph, slots, sum
                 sums[slot, column] = totals[column]
 
 
-@njit(cache=True, nogil=True, fastmath={"contract"}, error_model="numpy")
+@njit(nogil=True, fastmath={"contract"}, error_model="numpy")
 def composite_backward(
     begin, end, tiles, context, new, frame, d_frame, slots, wanted, gradients, written
 ):

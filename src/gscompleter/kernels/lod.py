@@ -3,8 +3,8 @@
 import math
 
 import numpy as np
-from numba import njit
 
+from gscompleter.kernels.cache import njit
 from gscompleter.kernels.project import compute_rotation, normalize_quat
 
 BLOCK = 4096
@@ -16,7 +16,7 @@ MAX_THICKNESS = np.float32(4.6)
 MIN_DIVISOR = np.float32(1e-30)
 
 
-@njit(cache=True, nogil=True, fastmath={"contract"}, error_model="numpy")
+@njit(nogil=True, fastmath={"contract"}, error_model="numpy")
 def mark_run_starts(begin, end, means, scales, generated, centers, focals, reach, largest, begins):
     """Write to `begins` [n] which Gaussians of the blocks begin..end start a run.
 
@@ -39,7 +39,7 @@ def mark_run_starts(begin, end, means, scales, generated, centers, focals, reach
                     pixel = np.float32(-1)
 
 
-@njit(cache=True, fastmath={"contract"}, error_model="numpy")
+@njit(fastmath={"contract"}, error_model="numpy")
 def _compute_pixel_size(x, y, z, centers, focals):
     """Compute the smallest pixel of all cameras at a point, in scene units."""
     smallest = np.float32(np.inf)
@@ -49,25 +49,25 @@ def _compute_pixel_size(x, y, z, centers, focals):
     return math.sqrt(smallest)
 
 
-@njit(cache=True, fastmath={"contract"}, error_model="numpy")
+@njit(fastmath={"contract"}, error_model="numpy")
 def _compute_cross_section(scales, i):
     a, b, c = scales[i, 0], scales[i, 1], scales[i, 2]
     return max(a * b, b * c, c * a)
 
 
-@njit(cache=True, fastmath={"contract"})
+@njit(fastmath={"contract"})
 def _compute_thickness(opacity):
     """Compute the optical thickness t of an opacity: exp(-t) is the transmittance."""
     return -math.log(np.float32(1) - min(opacity, MAX_OPACITY))
 
 
-@njit(cache=True)
+@njit()
 def _compute_fullness(thickness):
     """Compute the area of 1 - exp(-thickness g) relative to a Gaussian g of the same peak."""
     return np.float32(1) + np.float32(0.25) * min(thickness, MAX_THICKNESS)
 
 
-@njit(cache=True, fastmath={"contract"}, error_model="numpy")
+@njit(fastmath={"contract"}, error_model="numpy")
 def _compute_shares(first, last, scales, opacities, shares):
     """Write shares of first..last in thickness times cross-section; return largest and total."""
     total, most = np.float32(0), first
@@ -82,7 +82,7 @@ def _compute_shares(first, last, scales, opacities, shares):
     return most, total
 
 
-@njit(cache=True, fastmath={"contract"})
+@njit(fastmath={"contract"})
 def _compute_mean(first, last, shares, values, mean):
     for column in range(len(mean)):
         begun = values[first, column]
@@ -92,7 +92,7 @@ def _compute_mean(first, last, shares, values, mean):
         mean[column] = begun + away
 
 
-@njit(cache=True, fastmath={"contract"}, error_model="numpy")
+@njit(fastmath={"contract"}, error_model="numpy")
 def _compute_variance(first, last, shares, means, quats, scales, mean, axis):
     ax, ay, az = axis
     variance = np.float32(0)
@@ -107,7 +107,7 @@ def _compute_variance(first, last, shares, means, quats, scales, mean, axis):
     return variance
 
 
-@njit(cache=True, nogil=True, fastmath={"contract"}, error_model="numpy")
+@njit(nogil=True, fastmath={"contract"}, error_model="numpy")
 def merge_runs(begin, end, start, gaussians, shares, merged):
     """Merge each of the runs begin..end into one Gaussian.
 

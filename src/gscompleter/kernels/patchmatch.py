@@ -6,8 +6,8 @@ Pixels read the field of the last round and hash random numbers: any thread coun
 from typing import NamedTuple
 
 import numpy as np
-from numba import njit
 
+from gscompleter.kernels.cache import njit
 from gscompleter.kernels.parallel import share
 
 RADIUS = 3
@@ -56,7 +56,7 @@ class Costs(NamedTuple):
     """Distance of the largest cost, in pixels."""
 
 
-@njit(cache=True, inline="always")
+@njit(inline="always")
 def _hash(value):
     """Mix the bits of a 64-bit number (the finaliser of splitmix64)."""
     value = (value ^ (value >> np.uint64(30))) * np.uint64(0xBF58476D1CE4E5B9)
@@ -74,7 +74,7 @@ def pad_column(images):
     return np.pad(images, ((0, 0), (0, 0), (0, 1), (0, 0)))
 
 
-@njit(cache=True, inline="always")
+@njit(inline="always")
 def _copy(image, y, x, patch):
     numbers = image.reshape(-1)
     stride = np.uintp(3 * image.shape[1])
@@ -84,7 +84,7 @@ def _copy(image, y, x, patch):
             patch[row, lane] = numbers[start + np.uintp(row) * stride + np.uintp(lane)]
 
 
-@njit(cache=True, inline="always")
+@njit(inline="always")
 def _compute_patch_cost(costs, patch, weight, total, sources, s, sy, sx, sums, bias):
     """Compute the mean squared difference of `patch` and (s, sy, sx) after the best shift."""
     max_bias, bias_penalty = costs.max_bias, costs.bias_penalty
@@ -121,7 +121,7 @@ def _compute_patch_cost(costs, patch, weight, total, sources, s, sy, sx, sums, b
     return cost
 
 
-@njit(cache=True, fastmath={"contract"})
+@njit(fastmath={"contract"})
 def _compute_prior(costs, nearer, dy, dx):
     distance = np.float32(np.sqrt(float(dy**2 + dx**2)))
     nearer = max(nearer, np.float32(0))
@@ -143,7 +143,7 @@ def search(problem, costs, field, max_reach, seed):
     return cost, shift
 
 
-@njit(cache=True, nogil=True, fastmath={"contract"})
+@njit(nogil=True, fastmath={"contract"})
 def _improve(begin, end, problem, costs, max_reach, seed, before, field, cost, shift):
     """Improve the queries begin..end; `before` is the previous field."""
     usable, query_at = problem.usable_mask, problem.query_at
@@ -221,7 +221,7 @@ def vote(query_at, vote_weight, sources, field, shift):
     return colors[inner] / np.maximum(totals[inner], 1e-12)[..., None], totals[inner]
 
 
-@njit(cache=True, nogil=True, fastmath={"contract"})
+@njit(nogil=True, fastmath={"contract"})
 def _vote(begin, end, query_at, vote_weight, sources, field, shift, colors, totals):
     h, w = query_at.shape
     for y in range(max(begin - RADIUS, 0), min(end + RADIUS, h)):

@@ -4,8 +4,8 @@ import math
 from typing import NamedTuple
 
 import numpy as np
-from numba import njit
 
+from gscompleter.kernels.cache import njit
 from gscompleter.kernels.simd import MIN_ALPHA
 
 BLUR = np.float32(0.3)
@@ -45,7 +45,7 @@ class GaussianArrays(NamedTuple):
     sh: np.ndarray
 
 
-@njit(cache=True, fastmath={"contract"})
+@njit(fastmath={"contract"})
 def _multiply(a, b):
     """Multiply 3 × 3 matrices, which are tuples of nine here, row by row."""
     return (
@@ -61,12 +61,12 @@ def _multiply(a, b):
     )
 
 
-@njit(cache=True, fastmath={"contract"})
+@njit(fastmath={"contract"})
 def _transpose(a):
     return (a[0], a[3], a[6], a[1], a[4], a[7], a[2], a[5], a[8])
 
 
-@njit(cache=True, fastmath={"contract"})
+@njit(fastmath={"contract"})
 def _apply_matrix(a, x, y, z):
     return (
         a[0] * x + a[1] * y + a[2] * z,
@@ -75,7 +75,7 @@ def _apply_matrix(a, x, y, z):
     )
 
 
-@njit(cache=True, fastmath={"contract"}, error_model="numpy")
+@njit(fastmath={"contract"}, error_model="numpy")
 def normalize_quat(quats, i):
     """Return the unit quaternion i, and the factor that normalised it."""
     w, x, y, z = quats[i, 0], quats[i, 1], quats[i, 2], quats[i, 3]
@@ -83,7 +83,7 @@ def normalize_quat(quats, i):
     return (w * factor, x * factor, y * factor, z * factor), factor
 
 
-@njit(cache=True, fastmath={"contract"})
+@njit(fastmath={"contract"})
 def compute_rotation(quat):
     """Compute the rotation matrix of a unit quaternion, row by row."""
     w, x, y, z = quat
@@ -101,7 +101,7 @@ def compute_rotation(quat):
     )
 
 
-@njit(cache=True, fastmath={"contract"})
+@njit(fastmath={"contract"})
 def _rotation_backward(quat, d):
     """Compute the gradient of a unit quaternion from that of its rotation matrix."""
     w, x, y, z = quat
@@ -114,13 +114,13 @@ def _rotation_backward(quat, d):
     )
 
 
-@njit(cache=True, fastmath={"contract"})
+@njit(fastmath={"contract"})
 def _scale_columns(a, scales, i):
     x, y, z = scales[i, 0], scales[i, 1], scales[i, 2]
     return a[0] * x, a[1] * y, a[2] * z, a[3] * x, a[4] * y, a[5] * z, a[6] * x, a[7] * y, a[8] * z
 
 
-@njit(cache=True, fastmath={"contract"}, error_model="numpy")
+@njit(fastmath={"contract"}, error_model="numpy")
 def _compute_tangent_limits(pinhole):
     """Compute the range of x/z and of y/z at which the Jacobian is evaluated."""
     fx, fy, cx, cy = pinhole.intrinsics
@@ -134,7 +134,7 @@ def _compute_tangent_limits(pinhole):
     )
 
 
-@njit(cache=True, fastmath={"contract"})
+@njit(fastmath={"contract"})
 def _compute_jacobian(fx, fy, tan_x, tan_y, inverse_z, limits):
     """Return d pixel x / dx, d pixel x / dz, d pixel y / dy, d pixel y / dz."""
     least_x, largest_x, least_y, largest_y = limits
@@ -144,7 +144,7 @@ def _compute_jacobian(fx, fy, tan_x, tan_y, inverse_z, limits):
     return xx, -xx * clamped_x, yy, -yy * clamped_y
 
 
-@njit(cache=True, fastmath={"contract"})
+@njit(fastmath={"contract"})
 def _flatten(axes, jacobian):
     """Project the axes of a Gaussian (columns, in the camera) to a 2 × 3 matrix, by rows."""
     xx, xz, yy, yz = jacobian
@@ -167,7 +167,7 @@ _C3B, _C3Z = np.float32(0.4570457994644658), np.float32(0.3731763325901154)
 _C3XX = np.float32(1.445305721320277)
 
 
-@njit(cache=True, fastmath={"contract"}, error_model="numpy")
+@njit(fastmath={"contract"}, error_model="numpy")
 def _compute_direction(center, means, i):
     """Compute the unit vector from the camera centre to the mean, and the inverse distance."""
     x, y, z = means[i, 0] - center[0], means[i, 1] - center[1], means[i, 2] - center[2]
@@ -175,7 +175,7 @@ def _compute_direction(center, means, i):
     return (x * inverse, y * inverse, z * inverse), inverse
 
 
-@njit(cache=True, fastmath={"contract"})
+@njit(fastmath={"contract"})
 def _evaluate_basis(direction, basis):
     """Evaluate 1, 4, 9 or 16 basis functions at a unit direction."""
     x, y, z = direction
@@ -200,7 +200,7 @@ def _evaluate_basis(direction, basis):
         basis[15] = -_C3A * x * (xx - three * yy)
 
 
-@njit(cache=True, fastmath={"contract"})
+@njit(fastmath={"contract"})
 def _basis_backward(direction, g):
     """Compute the gradient in the direction of the sum of g[k] times basis function k."""
     x, y, z = direction
@@ -228,7 +228,7 @@ def _basis_backward(direction, g):
     return dx, dy, dz
 
 
-@njit(cache=True, nogil=True, fastmath={"contract"}, error_model="numpy")
+@njit(nogil=True, fastmath={"contract"}, error_model="numpy")
 def project(begin, end, gaussians, pinhole, splats, boxes, factors):
     """Project the Gaussians begin..end to `splats` and `boxes`, empty if invisible.
 
@@ -303,7 +303,7 @@ def project(begin, end, gaussians, pinhole, splats, boxes, factors):
             splats[i, RED + channel] = max(color, zero)
 
 
-@njit(cache=True, fastmath={"contract"}, error_model="numpy")
+@njit(fastmath={"contract"}, error_model="numpy")
 def _compensation_backward(flat, q):
     """Compute the gradient of the flattened axes from that of log sqrt(P / D).
 
@@ -326,7 +326,7 @@ def _compensation_backward(flat, q):
     )
 
 
-@njit(cache=True, nogil=True, fastmath={"contract"}, error_model="numpy")
+@njit(nogil=True, fastmath={"contract"}, error_model="numpy")
 def project_backward(
     begin, end, gaussians, pinhole, factors, splats, slot_start, gradients, written, d_gaussians
 ):

@@ -3,8 +3,8 @@
 from typing import NamedTuple
 
 import numpy as np
-from numba import njit
 
+from gscompleter.kernels.cache import njit
 from gscompleter.kernels.parallel import share
 
 MIN_LEVEL_WEIGHT = np.float32(1e-6)
@@ -40,7 +40,7 @@ def compute_means(pyramid, pixels, level):
     return found
 
 
-@njit(cache=True, nogil=True, fastmath={"contract"})
+@njit(nogil=True, fastmath={"contract"})
 def _compute_means(begin, end, pyramid, pixels, level, result):
     count = len(pyramid.global_mean)
     wider, sums = np.empty(count, np.float32), np.empty(count + 1, np.float32)
@@ -54,7 +54,7 @@ def _compute_means(begin, end, pyramid, pixels, level, result):
                 result[p, c] = (np.float32(1) - above) * result[p, c] + above * wider[c]
 
 
-@njit(cache=True, fastmath={"contract"})
+@njit(fastmath={"contract"})
 def _compute_mean(pyramid, y, x, number, sums, mean):
     count = len(pyramid.global_mean)
     for level in range(number, len(pyramid.starts)):
@@ -67,7 +67,7 @@ def _compute_mean(pyramid, y, x, number, sums, mean):
         mean[c] = pyramid.global_mean[c]
 
 
-@njit(cache=True, fastmath={"contract"})
+@njit(fastmath={"contract"})
 def _sample(pyramid, y, x, level, sums):
     """Write the sums of a level at a pixel of the image, interpolated bilinearly."""
     start, h, w = pyramid.starts[level], pyramid.sizes[level, 0], pyramid.sizes[level, 1]
@@ -82,7 +82,7 @@ def _sample(pyramid, y, x, level, sums):
         sums[c] = upper + down * (a + along * (b - a) - upper)
 
 
-@njit(cache=True, inline="always")
+@njit(inline="always")
 def _locate(pixel, count, total):
     exact = min(max((pixel + 0.5) * count / total - 0.5, 0.0), count - 1.0)
     first = int(exact)

@@ -7,8 +7,8 @@ depth w to the homogeneous pixel A (x, y, 1) + b w of another; its third entry i
 from typing import NamedTuple
 
 import numpy as np
-from numba import njit
 
+from gscompleter.kernels.cache import njit
 from gscompleter.kernels.parallel import run, share
 
 UNSEEN = 255
@@ -35,7 +35,7 @@ class Bands(NamedTuple):
     """Offset of the costs of each tile, row by row, and the end [tiles + 1] int64."""
 
 
-@njit(cache=True, inline="always")
+@njit(inline="always")
 def _get_first_cost(bands, y, x, width):
     row, column = y // TILE_ROWS, x // TILE_COLUMNS
     left = column * TILE_COLUMNS
@@ -45,14 +45,14 @@ def _get_first_cost(bands, y, x, width):
     return bands.start[row * bands.low.shape[1] + column] + within * planes
 
 
-@njit(cache=True, fastmath={"contract"}, inline="always")
+@njit(fastmath={"contract"}, inline="always")
 def _clip(value, low, high):
     """Clip to [low, high]; NaN becomes low, since the result is used as an index."""
     value = value if value > low else low
     return value if value < high else high
 
 
-@njit(cache=True, fastmath={"contract"})
+@njit(fastmath={"contract"})
 def _sum_boxes(values, sums, column, rows, width, radius):
     """Sum `values` over (2 radius + 1)^2 windows."""
     for x in range(width + 2 * radius):
@@ -91,7 +91,7 @@ def compute_matching_costs(
     return costs
 
 
-@njit(cache=True, fastmath={"contract"}, error_model="numpy", inline="always")
+@njit(fastmath={"contract"}, error_model="numpy", inline="always")
 def _compare(y, own, own_mean, other, other_mean, other_square, cross, line):
     """Turn window sums into deviations and products in place; line[0] gets pixel differences."""
     cols = cross.shape[1]
@@ -111,7 +111,7 @@ def _compare(y, own, own_mean, other, other_mean, other_square, cross, line):
             cross[y, x] -= area * other_mean[c, y, x] * own_mean[c, y, x]
 
 
-@njit(cache=True, nogil=True, fastmath={"contract"}, error_model="numpy")
+@njit(nogil=True, fastmath={"contract"}, error_model="numpy")
 def _match_tiles(
     begin, end, reference, source, transform, inverse_depths, bands, radius, noise, detail, costs
 ):
@@ -237,7 +237,7 @@ def prefer_given(costs, bands, given, weight, step):
     share(_prefer_given, len(given), costs, bands, given, weight, step)
 
 
-@njit(cache=True, nogil=True, fastmath={"contract"})
+@njit(nogil=True, fastmath={"contract"})
 def _prefer_given(begin, end, costs, bands, given, weight, step):
     w = given.shape[1]
     for y in range(begin, end):
@@ -255,7 +255,7 @@ def _prefer_given(begin, end, costs, bands, given, weight, step):
                 costs[first + k] = np.uint8(min(cost, np.float32(254)))
 
 
-@njit(cache=True, fastmath={"contract"}, inline="always")
+@njit(fastmath={"contract"}, inline="always")
 def _step(cost, before, lowest, after, total, small, large):
     """Advance a path by one pixel and return its lowest cost there."""
     planes = cost.shape[0]
@@ -274,7 +274,7 @@ def _step(cost, before, lowest, after, total, small, large):
     return best
 
 
-@njit(cache=True, inline="always")
+@njit(inline="always")
 def _align_bands(before, band_before, band, scratch):
     """Realign the costs of another tile's band to the planes of this one; others are FAR."""
     if band_before[0] == band[0] and band_before[1] == band[1]:
@@ -285,7 +285,7 @@ def _align_bands(before, band_before, band, scratch):
     return scratch
 
 
-@njit(cache=True, nogil=True, fastmath={"contract"})
+@njit(nogil=True, fastmath={"contract"})
 def _sweep_half(costs, bands, large_x, large_y, large_d, large_u, small, down, total):
     """Aggregate four of the eight paths: along the row, and from the row before."""
     h, w = large_y.shape[0] + 1, large_x.shape[1] + 1
@@ -362,7 +362,7 @@ def select_planes(totals, bands, h, w):
     return index, margin
 
 
-@njit(cache=True, nogil=True, fastmath={"contract"})
+@njit(nogil=True, fastmath={"contract"})
 def _choose(begin, end, totals, bands, index, margin):
     w = index.shape[1]
     for y in range(begin, end):
@@ -403,7 +403,7 @@ def reproject(depth, other, b_from_a, a_from_b):
     return error, ratio
 
 
-@njit(cache=True, nogil=True, fastmath={"contract"})
+@njit(nogil=True, fastmath={"contract"})
 def _carry(begin, end, depth, other, b_from_a, a_from_b, error, ratio):
     w = depth.shape[1]
     H, W = other.shape
@@ -451,7 +451,7 @@ def fill_background(values, known):
     return filled
 
 
-@njit(cache=True, nogil=True)
+@njit(nogil=True)
 def _fill(begin, end, values, known, filled):
     h, w = values.shape
     for y in range(begin, end):

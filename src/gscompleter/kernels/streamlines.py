@@ -1,8 +1,8 @@
 """Colours that lines carry from the known part of an image into its holes."""
 
 import numpy as np
-from numba import njit
 
+from gscompleter.kernels.cache import njit
 from gscompleter.kernels.parallel import share
 
 NUM_SAMPLES = 3
@@ -29,7 +29,7 @@ def trace_lines(image, known, directions, limits):
     return colours, lengths
 
 
-@njit(cache=True, nogil=True, fastmath={"contract"})
+@njit(nogil=True, fastmath={"contract"})
 def _trace_rows(begin, end, image, known, directions, limits, colours, lengths):
     for y in range(begin, end):
         for x in range(known.shape[1]):
@@ -47,7 +47,7 @@ def _trace_rows(begin, end, image, known, directions, limits, colours, lengths):
                 colours[y, x, c] /= max(total, np.float32(1e-12))
 
 
-@njit(cache=True, fastmath={"contract"})
+@njit(fastmath={"contract"})
 def _trace_way(image, known, directions, row, column, sign, limit):
     """Return the length of a way and the mean colour at its end; `limit` if it has no end."""
     h, w = known.shape

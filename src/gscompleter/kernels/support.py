@@ -4,7 +4,8 @@ import math
 from typing import NamedTuple
 
 import numpy as np
-from numba import njit
+
+from gscompleter.kernels.cache import njit
 
 BLOCK = 256
 """Gaussians per block."""
@@ -32,7 +33,7 @@ class CameraPose(NamedTuple):
     """Product of fx and fy, in squared pixels."""
 
 
-@njit(cache=True, fastmath={"contract"})
+@njit(fastmath={"contract"})
 def _acos(x):
     one = np.float32(1)
     away = min(abs(x), one)
@@ -42,7 +43,7 @@ def _acos(x):
     return angle if x >= np.float32(0) else _PI - angle
 
 
-@njit(cache=True, fastmath={"contract"})
+@njit(fastmath={"contract"})
 def _exp_negative(x):
     """Compute exp(-x) for x >= 0; beyond 80 it is practically 0."""
     power = max(-_LOG2_E * x, np.float32(-120))
@@ -52,7 +53,7 @@ def _exp_negative(x):
     return series * np.int32((whole + 127) << 23).view(np.float32)
 
 
-@njit(cache=True, fastmath={"contract"}, error_model="numpy")
+@njit(fastmath={"contract"}, error_model="numpy")
 def _compute_pixel_area(means, i, place):
     """Compute the area of a pixel at the depth of Gaussian i, in squared scene units."""
     center, forward = place.center, place.forward
@@ -63,7 +64,7 @@ def _compute_pixel_area(means, i, place):
     return z * z / place.focal
 
 
-@njit(cache=True, nogil=True, fastmath={"contract"}, error_model="numpy")
+@njit(nogil=True, fastmath={"contract"}, error_model="numpy")
 def measure_photo_agreement(begin, end, sums, means, place, areas, agreement):
     """Compute the visible area of the Gaussians begin..end in a photograph, and its agreement.
 
@@ -74,7 +75,7 @@ def measure_photo_agreement(begin, end, sums, means, place, areas, agreement):
         agreement[i] = sums[i, 1] / max(sums[i, 0], np.float32(1e-9))
 
 
-@njit(cache=True, nogil=True, fastmath={"contract"}, error_model="numpy")
+@njit(nogil=True, fastmath={"contract"}, error_model="numpy")
 def _add_agreement(x, y, z, rays, center, turn, areas, agreement, totals):
     """Add the weighted agreement of the photograph at `center` to the sums of a block."""
     one = np.float32(1)
@@ -91,7 +92,7 @@ def _add_agreement(x, y, z, rays, center, turn, areas, agreement, totals):
         largest[j] = max(largest[j], areas[j])
 
 
-@njit(cache=True, nogil=True, fastmath={"contract"}, error_model="numpy")
+@njit(nogil=True, fastmath={"contract"}, error_model="numpy")
 def accumulate_trust(
     begin, end, centers, areas, agreement, means, sums, place, max_turn, enough, values
 ):

@@ -1,8 +1,8 @@
 """Total generalized variation of second order: surfaces as planar as the data allow."""
 
 import numpy as np
-from numba import njit
 
+from gscompleter.kernels.cache import njit
 from gscompleter.kernels.parallel import count_threads, run, split_range
 
 PRIMAL_STEP, GRADIENT_STEP = np.float32(0.25), np.float32(0.2)
@@ -44,7 +44,7 @@ def fit(heights, gradients, data, weight, across, down, bend, tolerance, iterati
             run(advance, [(*part, count, state, given) for part in parts], threads)
 
 
-@njit(cache=True, nogil=True, fastmath={"contract"}, error_model="numpy")
+@njit(nogil=True, fastmath={"contract"}, error_model="numpy")
 def advance(top, top_step, end, end_step, iterations, state, given):
     """Run iterations on a range of rows whose ends move by a step each time.
 
@@ -63,7 +63,7 @@ def advance(top, top_step, end, end_step, iterations, state, given):
                     _lower_primals(y, state, given)
 
 
-@njit(cache=True, nogil=True, fastmath={"contract"}, error_model="numpy")
+@njit(nogil=True, fastmath={"contract"}, error_model="numpy")
 def _raise_duals(y, state, given):
     _, _, ahead, gradients_ahead, steps, bends = state
     _, _, across, down, bend, _ = given
@@ -89,7 +89,7 @@ def _raise_duals(y, state, given):
         bends[2, y, x], bends[3, y, x] = b2 * shorter, b3 * shorter
 
 
-@njit(cache=True, nogil=True, fastmath={"contract"}, error_model="numpy")
+@njit(nogil=True, fastmath={"contract"}, error_model="numpy")
 def _lower_primals(y, state, given):
     heights, gradients, ahead, gradients_ahead, steps, bends = state
     data, weight, _, _, _, tolerance = given

@@ -1,8 +1,8 @@
 """Splat lists of the tiles, front to back, and sums of gradients over their entries."""
 
 import numpy as np
-from numba import njit
 
+from gscompleter.kernels.cache import njit
 from gscompleter.kernels.project import DEPTH
 from gscompleter.kernels.simd import TILE
 
@@ -10,7 +10,7 @@ TILE_SHIFT = 4
 """Binary logarithm of `TILE`."""
 
 
-@njit(cache=True, nogil=True)
+@njit(nogil=True)
 def count_entries(begin, end, splats, boxes, depth_limits, tiles_x, counts):
     """Add to `counts` [tiles] int32 how many of the splats begin..end touch each tile.
 
@@ -32,7 +32,7 @@ def counts_to_offsets(counts):
     return np.append(starts[:, 0], ends[-1, -1])
 
 
-@njit(cache=True, nogil=True)
+@njit(nogil=True)
 def fill_entries(begin, end, splats, boxes, depth_limits, tiles_x, places, entries, keys):
     """Enter the splats begin..end into the lists of the tiles they touch; see `count_entries`.
 
@@ -49,7 +49,7 @@ def fill_entries(begin, end, splats, boxes, depth_limits, tiles_x, places, entri
                     entries[place], keys[place] = i, np.float32(splats[i, DEPTH]).view(np.uint32)
 
 
-@njit(cache=True, nogil=True)
+@njit(nogil=True)
 def sort_lists(begin, end, tile_start, entries, keys):
     """Sort the lists of the tiles begin..end front to back, by a stable radix sort of depths."""
     largest = 0
@@ -83,7 +83,7 @@ def sort_lists(begin, end, tile_start, entries, keys):
                 own_entries[k], own_keys[k] = spare_entries[k], spare_keys[k]
 
 
-@njit(cache=True, nogil=True)
+@njit(nogil=True)
 def number_slots(entries, count):
     """Assign slots to the entries [e] so that the gradients of a splat are adjacent.
 
@@ -104,7 +104,7 @@ def number_slots(entries, count):
     return slots, slot_start
 
 
-@njit(cache=True, nogil=True)
+@njit(nogil=True)
 def number_by_use(entries, count):
     """Renumber `entries` by the first use of splats; return the used splats in order, and them."""
     numbers = np.full(count, -1, np.int32)
@@ -120,7 +120,7 @@ def number_by_use(entries, count):
     return order[:used], renamed
 
 
-@njit(cache=True, nogil=True, fastmath={"contract"}, error_model="numpy")
+@njit(nogil=True, fastmath={"contract"}, error_model="numpy")
 def sum_entries(begin, end, slot_start, gradients, written, totals):
     """Sum the gradients of the entries of each of the Gaussians begin..end into `totals` [n, c].
 

@@ -21,6 +21,7 @@ from numpy.lib.recfunctions import require_fields
 from torch import Tensor
 
 from gscompleter.errors import InputError, quote_value
+from gscompleter.io.files import REMOVED_FILE
 from gscompleter.splats.foreign import resolve_splat
 from gscompleter.splats.formats import detect_splat_format, get_writer, load_splat, save_splat
 from gscompleter.splats.ply import (
@@ -41,7 +42,6 @@ from gscompleter.splats.ply import (
 from gscompleter.types import Gaussians, merge
 
 LABEL_COLUMN = "generated"
-REMOVED_FILE = "removed.ply"
 _LABEL_LINE = re.compile(rb"^property\s+\w+\s+generated\s*?\n", re.M)
 _ELEMENT_LINE = re.compile(rb"^(?:element|end_header)", re.M)
 

@@ -8,16 +8,19 @@ one .usdc.
 from __future__ import annotations
 
 import os
-import tempfile
+import shutil
 import time
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 import numpy as np
 import torch
 
-from gscompleter.errors import InputError, quote_value
-from gscompleter.io.files import replace_file
+from gscompleter.errors import InputError, OutputError, quote_value
+from gscompleter.io.files import convert_write_errors, replace_file
+from gscompleter.io.unfinished import make_unfinished_name
 from gscompleter.splats.glb import COLOR_SPACE
 from gscompleter.splats.transform import HALF_TURN_X, rotate_half_turn
 from gscompleter.types import Gaussians
@@ -27,6 +30,8 @@ if TYPE_CHECKING:
 
 KIND = "ParticleField3DGaussianSplat"
 SH_NAME = "radiance:sphericalHarmonics"
+PROBE_BYTES = 2**20
+"""Bytes that are written to find out why OpenUSD could not."""
 EXTENT = 3
 """Standard deviations of the Gaussians that lie within the bounds of the prim."""
 PACKAGED = (2000, 1, 1, 0, 0, 0, 0, 0, -1)
@@ -39,15 +44,47 @@ def write_usd(path: Path, gaussians: Gaussians) -> None:
     from pxr import UsdUtils
 
     stage, ending = _make_stage(rotate_half_turn(gaussians, HALF_TURN_X)), path.suffix.lower()
-    with tempfile.TemporaryDirectory() as folder:
-        made = layer = Path(folder, f"splat{ending.replace('z', 'c')}")
-        stage.GetRootLayer().Export(str(layer))
-        if ending == ".usdz":
-            os.utime(layer, (time.mktime(PACKAGED),) * 2)
-            made = layer.with_suffix(ending)
-            UsdUtils.CreateNewUsdzPackage(str(layer), str(made))
+    with _make_folder_beside(path) as folder:
+        made = layer = folder / f"splat{ending.replace('z', 'c')}"
+        with _convert_usd_errors(path, folder):
+            stage.GetRootLayer().Export(str(layer))
+            if ending == ".usdz":
+                os.utime(layer, (time.mktime(PACKAGED),) * 2)
+                made = layer.with_suffix(ending)
+                UsdUtils.CreateNewUsdzPackage(str(layer), str(made))
         with replace_file(path) as file:
             file.write(made.read_bytes())
+
+
+@contextmanager
+def _make_folder_beside(path: Path) -> Iterator[Path]:
+    """Make a folder for files of OpenUSD on the disk of `path`, which has space for the result."""
+    target = Path(os.path.realpath(path))
+    folder = target.with_name(make_unfinished_name(target.name))
+    with convert_write_errors(path):
+        folder.mkdir()
+    try:
+        yield folder
+    finally:
+        shutil.rmtree(folder, ignore_errors=True)
+
+
+@contextmanager
+def _convert_usd_errors(path: Path, folder: Path) -> Iterator[None]:
+    """Convert the errors of OpenUSD, which have no numbers, by trying to write as much."""
+    try:
+        yield
+    except Exception as error:
+        with convert_write_errors(path):
+            size = sum(file.stat().st_size for file in folder.iterdir())
+            with (folder / "probe").open("wb") as probe:
+                probe.write(bytes(max(size, PROBE_BYTES)))
+                probe.flush()
+                os.fsync(probe.fileno())
+        reason = quote_value(" ".join(str(error).split()), 120)
+        raise OutputError(
+            f"Cannot write {quote_value(path)}: OpenUSD says {reason}; choose another place."
+        ) from error
 
 
 def _make_stage(gaussians: Gaussians) -> Usd.Stage:

@@ -17,13 +17,18 @@ from pathlib import Path
 from typing import Any
 
 from gscompleter.errors import InputError, quote_value
-from gscompleter.io.reading import read_bytes
+from gscompleter.io.output_folder import read_command
+from gscompleter.io.reading import list_folders, read_bytes
 from gscompleter.jobs.jobs import Job
 
 FOLDER, NAME = "folder", "name"
 """Columns of the scene folder and of the job name."""
 PATHS = (FOLDER, "scene", "weights", "depth_weights")
 """Options that are paths."""
+MARKERS = ("batch.json", "run.json")
+"""Files that mark the output folders of `batch` and `evaluate`."""
+COMPLETING = ("complete", "clean", "demo")
+"""Commands whose output folders hold scenes of Gaussians and no photographs."""
 LONGEST_FILE = 2 * 10**9
 """Maximum number of bytes of a manifest."""
 LONGEST_NAME = 120
@@ -33,10 +38,13 @@ Options = dict[str, Any]
 """Options of `complete` by name."""
 
 
-def read_manifest(manifest: Path, common: Mapping[str, Any]) -> list[Job]:
-    """Read the jobs of a `.csv` or `.jsonl` file or a folder of scenes."""
+def read_manifest(manifest: Path, common: Mapping[str, Any], out: Path | None = None) -> list[Job]:
+    """Read the jobs of a `.csv` or `.jsonl` file or a folder of scenes.
+
+    In a folder of scenes those of `list_results` are left out.
+    """
     base, here = manifest.resolve().parent, resolve_paths(common, Path.cwd())
-    rows = [{**here, **resolve_paths(row, base)} for row in read_rows(manifest)]
+    rows = [{**here, **resolve_paths(row, base)} for row in read_rows(manifest, out)]
     if not rows:
         raise InputError("The manifest names no job; give it a row for each scene.")
     names = [make_job_name(row) for row in rows]
@@ -68,11 +76,12 @@ def resolve_paths(row: Mapping[str, Any], base: Path) -> Options:
     return result
 
 
-def read_rows(manifest: Path) -> list[Options]:
+def read_rows(manifest: Path, out: Path | None = None) -> list[Options]:
     """Read the rows of a manifest as they are."""
-    if manifest.is_dir():
-        folders = sorted(path for path in manifest.resolve().iterdir() if path.is_dir())
-        return [{FOLDER: str(path)} for path in folders if not path.name.startswith(".")]
+    if os.path.isdir(manifest):
+        results = list_results(manifest, out)
+        folders = [path for path in list_folders(manifest.resolve()) if path.name[0] != "."]
+        return [{FOLDER: str(path)} for path in folders if path not in results]
     parsers = {".csv": parse_csv, ".jsonl": parse_json_lines, ".ndjson": parse_json_lines}
     if manifest.suffix not in parsers:
         raise InputError(
@@ -87,6 +96,22 @@ def read_rows(manifest: Path) -> list[Options]:
             f"The manifest {quote_value(manifest)} cannot be read: {quote_value(str(error))}; "
             "correct it."
         ) from error
+
+
+def list_results(manifest: Path, out: Path | None = None) -> list[Path]:
+    """List the folders in a folder of scenes that hold results: `out`, and those of other runs."""
+    return [path for path in list_folders(manifest.resolve()) if is_result(path, out)]
+
+
+def is_result(folder: Path, out: Path | None) -> bool:
+    """Return True for `out` itself and for what `batch`, `evaluate` and completions wrote.
+
+    The output folder of `poses` is a scene.
+    """
+    if out is not None and os.path.realpath(folder) == os.path.realpath(out):
+        return True
+    has_marker = any(os.path.isfile(folder / name) for name in MARKERS)
+    return has_marker or read_command(folder) in COMPLETING
 
 
 def parse_csv(text: str) -> Iterator[Options]:

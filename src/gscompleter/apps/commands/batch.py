@@ -17,7 +17,8 @@ from typing import Annotated, Any, Union, get_type_hints
 import tyro
 from rich.console import Console
 
-from gscompleter.apps.batch.manifest import FOLDER, read_manifest
+from gscompleter.apps.batch.manifest import FOLDER, PATHS, list_results, read_manifest
+from gscompleter.apps.commands.exit_codes import choose_exit_code
 from gscompleter.apps.commands.options import (
     BatchOptions,
     CompleteOptions,
@@ -27,8 +28,15 @@ from gscompleter.apps.commands.options import (
 from gscompleter.apps.commands.words import format_error, parse_words, translate_name
 from gscompleter.config.settings import validate
 from gscompleter.cpu_threads import count_available_cores, limit_threads
-from gscompleter.errors import InputError, quote_value
-from gscompleter.jobs.engines import choose_num_workers, open_local, open_ray, open_submitit
+from gscompleter.errors import InputError, join_names, quote_value
+from gscompleter.io.overlap import refuse_overlap
+from gscompleter.jobs.engines import (
+    check_processes,
+    choose_num_workers,
+    open_local,
+    open_ray,
+    open_submitit,
+)
 from gscompleter.jobs.jobs import (
     JOBS,
     Engine,
@@ -51,32 +59,62 @@ Command: Any = Union[  # noqa: UP007  (a command line has several)
 ]
 RESERVED = ("out", "overwrite", "quiet", "threads", "dry-run", "help", "help-all")
 """Options that a batch sets for all jobs."""
+MAX_NAMED_FAILURES = 5
+"""Most failures that the terminal names."""
 TRUE, FALSE = ("true", "yes", "1"), ("false", "no", "0", "")
 """Values of a flag in a CSV."""
 
 
-def run_batch(options: BatchOptions) -> None:
-    """Complete the scenes of a manifest, and write the table and the page."""
+def run_batch(options: BatchOptions) -> int:
+    """Complete the scenes of a manifest, write the table and the page, and return the exit code."""
     if re.match(r"\w\w+:/", str(options.out)):
         raise InputError(f"{quote_value(options.out)} is an address; name a folder.", "out")
     number, count = parse_shard(options.shard, os.environ)
     console = Console(stderr=True, quiet=options.quiet, highlight=False)
     with show_progress(console):
         with show_preparation("reading the manifest"):
-            jobs = read_manifest(options.manifest, parse_pairs(options.each, "each"))
+            common = parse_pairs(options.each, "each")
+            jobs = read_manifest(options.manifest, common, options.out)
+            refuse_overlap(options.out, list_scenes(jobs))
             out = options.out.resolve()  # absolute, for workers elsewhere
             engine = make_engine(options, out)
             claim_folder(out, "batch", {"version": 1, "kind": "batch"})
             share = jobs[number::count]
             left = find_missing_jobs(share, out, options.rerun == "failures")
+        if results := list_results(options.manifest, options.out):
+            names = join_names([path.name for path in results], MAX_NAMED_FAILURES)
+            console.print(f"Left out, as results and no scenes: {names}.", markup=False)
         perform = partial(perform_job, out=out, retries=options.retries)
         ended = run_jobs(left, perform, partial(has_row, out=out), engine, options.retries)
         for _ in track(ended, "completing", len(left)):
             pass
         with show_preparation("table"):
             write_batch_results(out, jobs)
+    failures = collect_failures(out, share)
+    print_failures(console, failures)
     sentence = f"{summarize_rows(out, share, left)} All results: {options.out}/index.html"
     console.print(sentence, markup=False, soft_wrap=True)
+    return choose_exit_code(len(failures), len(share))
+
+
+def list_scenes(jobs: Sequence[Job]) -> list[Path]:
+    """List the paths that the rows of a batch read."""
+    paths = [job.options.get(name) for job in jobs for name in PATHS]
+    return [Path(path) for path in dict.fromkeys(paths) if isinstance(path, str) and path]
+
+
+def collect_failures(out: Path, jobs: Sequence[Job]) -> list[str]:
+    """Describe the jobs that failed, now or earlier, with the reasons."""
+    rows = [row for job in jobs if (row := read_row(job, out)) is not None]
+    return [f"{row['job']}: {row['reason']}" for row in rows if row["state"] == "failed"]
+
+
+def print_failures(console: Console, failures: Sequence[str]) -> None:
+    """Print the first failures with their reasons, and the number of the others."""
+    for failure in failures[:MAX_NAMED_FAILURES]:
+        console.print(f"Failed: {failure}", markup=False, soft_wrap=True)
+    if len(failures) > MAX_NAMED_FAILURES:
+        console.print(f"... and {len(failures) - MAX_NAMED_FAILURES} more failed.")
 
 
 def summarize_rows(out: Path, share: Sequence[Job], left: Sequence[Job]) -> str:
@@ -117,7 +155,8 @@ def complete_job(job: Job, jobs: Path) -> dict[str, Any]:
     start, cpu_start = time.monotonic(), time.process_time()
     make_folder(jobs)
     with measure_peak_memory() as peak:
-        summary = complete_folder(parse_row(job.options, jobs / job.name))
+        # The batch gives each job to one worker, and a further one only if that is lost.
+        summary = complete_folder(parse_row(job.options, jobs / job.name), takes_over=True)
     outcome = summary["outcome"]
     if outcome["status"] == "not-reconstructed":  # its folder stays, to look at
         raise InputError(outcome["headline"])
@@ -201,6 +240,7 @@ def make_engine(options: EngineOptions, out: Path) -> Engine | None:
         slurm, folder = parse_pairs(options.slurm, "slurm"), out / "submitit"
         workers = options.workers or 1
         return partial(open_submitit, workers, threads, options.gpus, folder, slurm)
+    check_processes()
     workers = options.workers or choose_num_workers()
     limit_threads(options.threads or max(1, count_available_cores() // workers))
     return partial(open_local, workers)

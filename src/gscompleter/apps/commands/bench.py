@@ -41,7 +41,7 @@ from gscompleter.apps.commands.options import BenchOptions
 from gscompleter.data.scene import write_cameras
 from gscompleter.evaluation.methods import Models
 from gscompleter.generators import load_generator
-from gscompleter.io.files import check_output, open_output_folder
+from gscompleter.io.output_folder import check_output, open_output_folder
 from gscompleter.progress import show_preparation, show_progress, stage
 from gscompleter.reconstructors import load_reconstructor
 from gscompleter.render import choose_device, load_renderer
@@ -112,7 +112,7 @@ def write_results(values: dict[str, Any], tables: str, options: BenchOptions) ->
     """Print the tables or JSON, and write both to the output folder."""
     text = json.dumps(values, indent=1)
     if options.out is not None:
-        with open_output_folder(options.out, options.overwrite) as folder:
+        with open_output_folder(options.out, options.overwrite, "bench") as folder:
             (folder / "bench.json").write_bytes(text.encode() + b"\n")
             (folder / "tables.md").write_bytes(tables.encode())
     print(text if options.json else tables)

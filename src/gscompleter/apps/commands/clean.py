@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -15,7 +16,7 @@ from torch import Tensor
 
 from gscompleter import __version__
 from gscompleter.apps.commands.options import CleanOptions
-from gscompleter.apps.commands.output import describe_run, is_replaceable
+from gscompleter.apps.commands.output import describe_run, refuse_results
 from gscompleter.apps.inputs.opening import (
     apply_splat_range,
     check_context,
@@ -39,15 +40,18 @@ from gscompleter.cleaning import find_superfluous
 from gscompleter.errors import InputError, quote_value
 from gscompleter.evaluation.metrics.image import compute_masked_psnr
 from gscompleter.floaters import find_floaters
-from gscompleter.io.files import COMPLETED_FILE, SUMMARY_FILE, check_output, open_output_folder
+from gscompleter.io.files import COMPLETED_FILE, REMOVED_FILE, SUMMARY_FILE
+from gscompleter.io.output_folder import reserve_output
 from gscompleter.progress import show_preparation, show_progress, stage, track
 from gscompleter.render import Renderer, choose_device, load_renderer
 from gscompleter.splats.formats import load_splat
-from gscompleter.splats.layout import REMOVED_FILE
 from gscompleter.timing import record_seconds, timed_stage
 from gscompleter.types import Gaussians, View
 
 PHOTOGRAPH_OPTIONS = ("context", "format", "near", "far")
+COMMAND = "clean"
+RESULTS = (COMPLETED_FILE, REMOVED_FILE, SUMMARY_FILE)
+"""Files that it may write."""
 
 
 @dataclass(frozen=True)
@@ -71,11 +75,14 @@ def run_clean(options: CleanOptions) -> None:
     """Clean the splat, write the result, and print a summary."""
     options = resolve_scene(options)
     console = Console(stderr=True, quiet=options.quiet)
-    check_output(options.out, is_replaceable(options))
-    if options.dry_run and (options.out / COMPLETED_FILE).exists():  # it needs its removed.ply
-        raise InputError(f"{quote_value(options.out)} holds a result; name another folder.", "out")
     clean = clean_alone if options.folder is None else clean_by_photographs
-    with show_progress(console):
+    with (
+        show_progress(console),
+        reserve_output(options.out, options.overwrite, COMMAND, RESULTS) as output,
+    ):
+        if options.dry_run:
+            refuse_results(options.out)
+        print_lines(console, *output.describe_others())
         cleaning = clean(options, console)
         if cleaning.removed.all():
             raise InputError(
@@ -83,7 +90,7 @@ def run_clean(options: CleanOptions) -> None:
                 "show the same scene."
             )
         summary = {"version": __version__, **cleaning.run_info, "gaussians": cleaning.counts}
-        with open_output_folder(options.out, is_replaceable(options)) as folder, stage("writing"):
+        with output.write() as folder, stage("writing"):
             write_cleaning(folder, cleaning, options.dry_run)
             (folder / SUMMARY_FILE).write_bytes(json.dumps(summary, indent=2).encode() + b"\n")
     if not options.quiet:
@@ -96,7 +103,7 @@ def clean_by_photographs(options: CleanOptions, console: Console) -> Cleaning:
     check_context(options)
     device = choose_device(options.device)
     renderer = load_renderer(device)
-    opened = open_scene(options, console)
+    opened = open_scene(options, console, partial(read_splat, options))
     options = choose_working_size(options, opened.photographs, console)
     with show_preparation("reading photographs"):
         task = read_photographs(options, opened, device)

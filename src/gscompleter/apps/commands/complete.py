@@ -6,6 +6,7 @@ import sys
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -19,7 +20,7 @@ from gscompleter.apps.commands.options import (
     get_max_targets,
     parse_resolution,
 )
-from gscompleter.apps.commands.output import describe_run, is_replaceable, read_held_out
+from gscompleter.apps.commands.output import describe_run, read_held_out, refuse_results
 from gscompleter.apps.inputs.opening import (
     Opened,
     Task,
@@ -28,6 +29,7 @@ from gscompleter.apps.inputs.opening import (
     apply_splat_range,
     check_context,
     check_scene,
+    check_target_files,
     check_targets,
     choose_working_size,
     describe_range_mismatch,
@@ -39,7 +41,7 @@ from gscompleter.apps.inputs.opening import (
     resolve_scene,
 )
 from gscompleter.apps.inputs.selection import collect_usable_cameras
-from gscompleter.apps.report.completion import Target, write_report
+from gscompleter.apps.report.completion import GENERATED_FILE, Target, write_report
 from gscompleter.apps.report.film import VIDEO_FILE, write_comparison_video
 from gscompleter.apps.report.names import describe_offset
 from gscompleter.apps.report.outcome import name_unused, select_testing
@@ -51,16 +53,27 @@ from gscompleter.apps.report.plain_words import (
     list_notes,
     list_shared_notes,
 )
-from gscompleter.apps.report.schema import CompletionSummary, average, read_summary
+from gscompleter.apps.report.schema import (
+    RECORD_FILE,
+    CompletionSummary,
+    average,
+    read_summary,
+)
 from gscompleter.apps.warmup import SPLAT_PART, compile_kernels
 from gscompleter.completer import GSCompleter, check_target_ids
-from gscompleter.config.generators import get_settings_class
 from gscompleter.data.local_origin import compute_frame_from_photographs
 from gscompleter.data.scene import write_cameras
 from gscompleter.errors import PROGRAM, quote_value
 from gscompleter.evaluation.metrics.coverage import render_pairs, sample_held_out_cameras
 from gscompleter.generators import load_generator
-from gscompleter.io.files import COMPLETED_FILE, TARGETS_FILE, check_output, open_output_folder
+from gscompleter.io.files import (
+    COMPLETED_FILE,
+    CONTEXT_FILE,
+    REMOVED_FILE,
+    SUMMARY_FILE,
+    TARGETS_FILE,
+)
+from gscompleter.io.output_folder import reserve_output
 from gscompleter.io.video import find_ffmpeg
 from gscompleter.kernels.parallel import run_in_background
 from gscompleter.next_best_view.planner import Choice, ViewPlanner
@@ -76,6 +89,13 @@ from gscompleter.stages.context import prepare_single
 from gscompleter.state import Completion
 from gscompleter.timing import add_seconds, record_seconds, timed_stage
 from gscompleter.types import Camera
+
+COMMAND = "complete"
+RESULTS = (
+    *(COMPLETED_FILE, CONTEXT_FILE, GENERATED_FILE, REMOVED_FILE, TARGETS_FILE),
+    *(REPORT_FILE, RECORD_FILE, SUMMARY_FILE, VIDEO_FILE, "images/target*.png"),
+)
+"""Globs of the files that a completion may write."""
 
 
 @dataclass(frozen=True)
@@ -119,16 +139,31 @@ class Prepared:
         return replace(self, task=replace(self.task, targets=targets))
 
 
-def prepare_completion(options: CompleteOptions, console: Console) -> Prepared:
-    """Open the scene and load the models."""
-    check_output(options.out, is_replaceable(options))
+def check_options(options: CompleteOptions) -> None:
+    """Refuse options that are wrong whatever the scene is."""
     check_context(options)
     check_targets(options)
     check_reconstructor(options.reconstructor)
-    get_settings_class(options.synthesis.generator)
+    options.synthesis.make_settings()
+
+
+def check_inputs(options: CompleteOptions, device: str) -> None:
+    """Read what can be read without the cameras of the photographs, and refuse it if it is wrong.
+
+    It takes seconds, and the search for cameras after it minutes.
+    """
+    load_completer(options, (), device)
+    check_target_files(options)
+    if options.scene is not None:
+        load_splat(options.scene, options.drop_nonfinite)
+
+
+def prepare_completion(options: CompleteOptions, console: Console) -> Prepared:
+    """Open the scene and load the models."""
+    check_options(options)
     device = choose_device(options.device)
     options = resolve_scene(options)
-    opened = open_scene(options, console)
+    opened = open_scene(options, console, partial(check_inputs, options, device))
     options = choose_working_size(options, opened.photographs, console)
     if not options.config.ego_mask:
         opened = replace(opened, photographs=opened.photographs.keep_ego_vehicle())
@@ -181,12 +216,12 @@ def run_report(options: ReportOptions) -> None:
 
 
 def complete_folder(
-    options: CompleteOptions, prepare: Prepare = prepare_completion
+    options: CompleteOptions, prepare: Prepare = prepare_completion, takes_over: bool = False
 ) -> dict[str, Any]:
     """Complete the scene, write `options.out`, and return the summary."""
     if options.video:
         find_ffmpeg()
-    with open_completion(options, prepare) as (ready, folder):
+    with open_completion(options, prepare, takes_over) as (ready, folder):
         completion, ready = complete_targets(ready)
         ready.completer.scenes.clear()
         with stage("report"):
@@ -208,13 +243,24 @@ def plan_folder(options: CompleteOptions, prepare: Prepare) -> None:
 
 
 @contextmanager
-def open_completion(options: CompleteOptions, prepare: Prepare) -> Iterator[tuple[Prepared, Path]]:
-    """Load everything, print the input, and open the output folder."""
+def open_completion(
+    options: CompleteOptions, prepare: Prepare, takes_over: bool = False
+) -> Iterator[tuple[Prepared, Path]]:
+    """Reserve the output folder, load everything, print the input, and open the folder.
+
+    `takes_over` is that of `reserve_output`.
+    """
     console = Console(stderr=True, quiet=options.quiet)
-    with show_progress(console):
+    with (
+        show_progress(console),
+        reserve_output(options.out, options.overwrite, COMMAND, RESULTS, takes_over) as output,
+    ):
+        if options.dry_run:
+            refuse_results(options.out)
+        print_lines(console, *output.describe_others())
         ready = prepare(options, console)
         print_lines(console, *describe_task(options, ready.opened, ready.task))
-        with open_output_folder(options.out, is_replaceable(options)) as folder:
+        with output.write() as folder:
             yield ready, folder
 
 

@@ -3,12 +3,11 @@
 from __future__ import annotations
 
 from dataclasses import replace
-from pathlib import Path
 
 from rich.console import Console
 
 from gscompleter.apps.commands.options import ConvertOptions, StripOptions
-from gscompleter.errors import InputError
+from gscompleter.io.output_file import reserve_file
 from gscompleter.progress import show_preparation, show_progress
 from gscompleter.splats.formats import describe_mode_loss, get_writer, load_splat, save_splat
 from gscompleter.splats.layout import strip
@@ -17,8 +16,10 @@ from gscompleter.splats.layout import strip
 def run_convert(options: ConvertOptions) -> None:
     """Convert A to B, and print the number of Gaussians."""
     get_writer(options.out)  # refuses a name without a format
-    check_free(options.out, options.overwrite)
-    with show_progress(Console(stderr=True, quiet=options.quiet)):
+    with (
+        reserve_file(options.out, options.overwrite),
+        show_progress(Console(stderr=True, quiet=options.quiet)),
+    ):
         with show_preparation("reading"):
             gaussians = load_splat(options.source, options.drop_nonfinite)
         generated = gaussians.generated
@@ -35,13 +36,7 @@ def run_convert(options: ConvertOptions) -> None:
 def run_strip(options: StripOptions) -> None:
     """Write the original scene and print the number of Gaussians."""
     get_writer(options.out)
-    check_free(options.out, options.overwrite)
-    given, generated = strip(options.completed, options.out)
+    with reserve_file(options.out, options.overwrite):
+        given, generated = strip(options.completed, options.out)
     if not options.quiet:
         print(f"{given:,} Gaussians, {generated:,} generated ones removed: {options.out}")
-
-
-def check_free(path: Path, overwrite: bool) -> None:
-    """Refuse to replace a file unless `overwrite` is set."""
-    if path.exists() and not overwrite:
-        raise InputError(f"{path} exists; name another file, or use --overwrite.")

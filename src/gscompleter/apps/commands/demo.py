@@ -10,22 +10,29 @@ from dataclasses import replace
 from pathlib import Path
 
 import torch
+from rich.console import Console
 from skimage.data import stereo_motorcycle
 
 from gscompleter.apps.commands.complete import complete_folder, print_completion
 from gscompleter.apps.commands.options import CompleteOptions, DemoOptions
+from gscompleter.apps.inputs.opening import print_lines
 from gscompleter.apps.report.completion import join_images
 from gscompleter.data.scene import write_cameras
-from gscompleter.io.files import open_output_folder
+from gscompleter.io.files import SUMMARY_FILE
 from gscompleter.io.image import read_image, write_image
+from gscompleter.io.output_folder import reserve_output
 from gscompleter.types import Camera
 
+PICTURE_FILE = "before_after.png"
 FOCAL_PX = 994.978
 PRINCIPAL_POINT_PX = (311.193, 254.877)
 PRINCIPAL_POINT_DX_PX = 31.086
 """Offset of the right image's principal point, in pixels."""
 BASELINE_M = 0.193001
 RESOLUTION = (250, 370)
+COMMAND = "demo"
+RESULTS = ("scene/**/*", "completion/**/*", PICTURE_FILE, SUMMARY_FILE)
+"""Globs of the files that it may write."""
 
 
 def get_motorcycle_cameras(width: int, height: int) -> tuple[Camera, Camera]:
@@ -62,7 +69,11 @@ def write_motorcycle_scene(folder: Path) -> None:
 
 def run_demo(options: DemoOptions) -> None:
     """Write the scene, complete it for both targets, and join before and after."""
-    with open_output_folder(options.out, options.overwrite) as folder:
+    with (
+        reserve_output(options.out, options.overwrite, COMMAND, RESULTS) as output,
+        output.write() as folder,
+    ):
+        print_lines(Console(stderr=True, quiet=options.quiet), *output.describe_others())
         scene = folder / "scene"
         write_motorcycle_scene(scene)
         complete_options = CompleteOptions(
@@ -79,7 +90,7 @@ def run_demo(options: DemoOptions) -> None:
         images = folder / "completion" / "images"
         names = [f"target{n}_{when}" for n in (1, 2) for when in ("before", "after")]
         shown = join_images([read_image(images / f"{name}.png") for name in names])
-        write_image(folder / "before_after.png", shown)
+        write_image(folder / PICTURE_FILE, shown)
     if not options.quiet:
         print_completion(replace(complete_options, out=options.out / "completion"))
-        print(f"Before and after, beyond either camera: {options.out / 'before_after.png'}")
+        print(f"Before and after, beyond either camera: {options.out / PICTURE_FILE}")

@@ -18,7 +18,8 @@ from gscompleter.apps.viewer.packages import BUILT_LIBRARIES, LOCK_FILE, get_arc
 from gscompleter.apps.warmup import PARTS, compile_kernels
 from gscompleter.errors import InputError
 from gscompleter.io.files import get_download_folder
-from gscompleter.kernels.compiled import find_marker, get_cache_folder
+from gscompleter.kernels.cache import CACHE
+from gscompleter.kernels.compiled import get_cache_folder, is_compiled
 from gscompleter.models.weights.fetching import find_cached
 from gscompleter.models.weights.published import PUBLISHED
 from gscompleter.progress import show_progress
@@ -80,14 +81,21 @@ def inspect_installation() -> Iterator[Found]:
         yield inspect_extra(extra, purpose)
     for name in ("cpu", "cuda", "reference"):
         yield inspect_renderer(name)
-    compiled = all(find_marker(part).is_file() for part in PARTS)
+    compiled = all(map(is_compiled, PARTS))
     remedy = "compiled by the first completion, or in advance by `gscompleter warmup`"
     yield Found("renderers", "kernels", compiled, "compiled" if compiled else remedy)
     yield from inspect_weights()
     yield inspect_viewer()
     yield Found("caches", "downloads", True, f"{get_download_folder()} (GSCOMPLETER_HOME)")
-    yield Found("caches", "kernels", True, f"{get_cache_folder()} (NUMBA_CACHE_DIR)")
+    yield inspect_kernel_cache()
     yield Found("caches", "torch.hub", True, f"{torch.hub.get_dir()} (TORCH_HOME)")
+
+
+def inspect_kernel_cache() -> Found:
+    """Inspect the folder of compiled kernels; a note says why it is not the usual one."""
+    if CACHE.note is not None:
+        return Found("caches", "kernels", False, CACHE.note)
+    return Found("caches", "kernels", True, f"{get_cache_folder()} (NUMBA_CACHE_DIR)")
 
 
 def inspect_extra(extra: str, purpose: str) -> Found:
@@ -151,6 +159,8 @@ def inspect_viewer() -> Found:
 
 def run_warmup(options: WarmupOptions) -> None:
     """Compile missing kernels, and print the time and the folder."""
+    if get_cache_folder() is None:
+        raise InputError(str(CACHE.note))
     with show_progress(Console(stderr=True, quiet=options.quiet)):
         seconds = compile_kernels(list(PARTS))
     if not options.quiet:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import os
 from collections.abc import Iterator, Sequence
 from contextlib import suppress
-from dataclasses import asdict, replace
+from dataclasses import asdict, dataclass, replace
 from itertools import groupby, islice
 from pathlib import Path
 from typing import Any
@@ -13,8 +13,8 @@ from typing import Any
 from rich.console import Console
 from rich.table import Table
 
-from gscompleter.apps.commands.batch import make_engine
-from gscompleter.apps.commands.convert import check_free
+from gscompleter.apps.commands.batch import make_engine, print_failures
+from gscompleter.apps.commands.exit_codes import choose_exit_code
 from gscompleter.apps.commands.options import (
     LONG_SIDE,
     EvaluateOptions,
@@ -35,22 +35,36 @@ from gscompleter.evaluation.paper import get_data_set
 from gscompleter.evaluation.runner import RunConfig, evaluate
 from gscompleter.evaluation.store import list_row_paths
 from gscompleter.evaluation.tables import RunSummary
+from gscompleter.io.output_file import reserve_file
 from gscompleter.jobs.jobs import parse_shard
 from gscompleter.progress import show_preparation, show_progress
 from gscompleter.render import choose_device
 
 
-def run_methods(options: EvaluateOptions) -> None:
-    """Run and score the methods on the cases, and write and print the tables."""
-    num_rows = score_methods(options)
+def run_methods(options: EvaluateOptions) -> int:
+    """Run and score the methods on the cases, write and print the tables; return the exit code."""
+    scored = score_methods(options)
     # A shard without cases has no tables.
     if list_row_paths(options.out):
         with show_progress(Console(stderr=True, quiet=options.quiet)):
-            write_and_print_tables(options.out, options.quiet, num_rows=num_rows)
+            write_and_print_tables(options.out, options.quiet, num_rows=scored.num_rows)
+    return choose_exit_code(len(scored.failures), scored.num_own_rows)
 
 
-def score_methods(options: EvaluateOptions) -> int:
-    """Run and score the methods on the cases; return the number of rows of all shards."""
+@dataclass(frozen=True)
+class Scored:
+    """Outcome of a call of `evaluate`."""
+
+    num_rows: int
+    """Number of rows of all shards."""
+    num_own_rows: int
+    """Number of rows of this shard, scored now or earlier."""
+    failures: Sequence[str]
+    """Rows of this shard without a score, with the reasons."""
+
+
+def score_methods(options: EvaluateOptions) -> Scored:
+    """Run and score the methods on the cases, and print the first failures."""
     if not options.paths:
         raise InputError("No data is given; name a cases.json, or scenes with --protocol.")
     console = Console(stderr=True, quiet=options.quiet, highlight=False)
@@ -80,9 +94,11 @@ def score_methods(options: EvaluateOptions) -> int:
     with show_progress(console):
         compile_kernels((config.device, config.reconstructor, config.generator))
         counts = evaluate(tasks, methods, options.out, config, shard, options.rerun, engine)
-    line = f"Scored {counts.done}, failed {counts.failed}, scored earlier {counts.skipped}."
-    console.print(line)
-    return len(tasks) * len(methods)
+    print_failures(console, counts.failures)
+    line = f"Scored {counts.done}, failed {counts.failed}, done earlier {counts.skipped}"
+    console.print(f"{line}, of {len(tasks)} cases by {len(methods)} methods.")
+    own = counts.done + counts.failed + counts.skipped
+    return Scored(len(tasks) * len(methods), own, counts.failures)
 
 
 def describe_source(options: EvaluateOptions, has_masks: bool = False) -> dict[str, Any]:
@@ -135,16 +151,18 @@ def list_row_times(out: Path) -> dict[Path, int]:
 
 def run_index(options: IndexOptions) -> None:
     """Write the evaluation index of a protocol for a data set."""
-    check_free(options.out, options.overwrite)
     skipped: list[SkippedScene] = []
     rule = protocols.parse_protocol(options.protocol)
     with (
+        reserve_file(options.out, options.overwrite),
         show_progress(Console(stderr=True, quiet=options.quiet)),
         show_preparation("reading clips"),
     ):
         index = protocols.build_index(rule, filter_usable(open_clips(options.path), skipped))
-    index = replace(index, scenes={**index.scenes, **{clip.name: () for clip in skipped}})
-    protocols.write_evaluation_index(options.out, index)
+        index = replace(index, scenes={**index.scenes, **{clip.name: () for clip in skipped}})
+        if not any(index.scenes.values()):
+            raise InputError(describe_empty_index(options, len(index.scenes), skipped))
+        protocols.write_evaluation_index(options.out, index)
     console = Console(quiet=options.quiet, highlight=False)
     print_skipped(skipped, console)
     targets = [len(split.targets) for splits in index.scenes.values() for split in splits]
@@ -201,6 +219,18 @@ def apply_options(case: Case, options: EvaluateOptions) -> Case:
         masks=options.masks,
         ignore_moving=options.ignore_moving,
         ego_mask=options.ego_mask,
+    )
+
+
+def describe_empty_index(
+    options: IndexOptions, num_scenes: int, skipped: Sequence[SkippedScene]
+) -> str:
+    """Describe why a protocol chooses no case at all."""
+    reason = f" ({skipped[0].name}: {skipped[0].reason})" if skipped else ""
+    return (
+        f"The protocol {quote_value(options.protocol)} chooses no case in the {num_scenes} "
+        f"scene(s) of {quote_value(options.path)}{reason}; choose one with a smaller step, or "
+        "other data."
     )
 
 

@@ -9,7 +9,13 @@ from importlib.util import find_spec
 
 from rich.console import Console
 
-from gscompleter.apps.commands.complete import Prepared, prepare_completion, write_done
+from gscompleter.apps.commands.complete import (
+    COMMAND,
+    RESULTS,
+    Prepared,
+    prepare_completion,
+    write_done,
+)
 from gscompleter.apps.commands.options import (
     CompleteOptions,
     CompletingOptions,
@@ -21,7 +27,8 @@ from gscompleter.apps.live.session import Session
 from gscompleter.apps.report.completion import Target
 from gscompleter.data.scene import write_cameras
 from gscompleter.errors import InputError, quote_value
-from gscompleter.io.files import TARGETS_FILE, open_output_folder
+from gscompleter.io.files import TARGETS_FILE
+from gscompleter.io.output_folder import check_output, open_output_folder, reserve_output
 from gscompleter.progress import show_progress
 from gscompleter.state import Completion
 from gscompleter.types import Camera
@@ -40,13 +47,23 @@ def run_live(options: LiveOptions) -> None:
             "The live page needs viser, which is not installed; run "
             "pip install 'gscompleter[live]'."
         )
-    # Imported here because viser may be missing.
-    from gscompleter.apps.live.page import Page, start_server
+    from gscompleter.apps.live.page import check_bindable, resolve_host
 
-    console = Console(stderr=True, quiet=options.quiet)
-    with show_progress(console):
-        ready = prepare(options, console)
-        session = begin_session(ready)
+    check_bindable(resolve_host(options.host), options.host, options.port)
+    with reserve_output(options.out, options.overwrite, COMMAND, RESULTS) as output:
+        console = Console(stderr=True, quiet=options.quiet)
+        print_lines(console, *output.describe_others())
+        with show_progress(console):
+            ready = prepare(options, console)
+            session = begin_session(ready)
+        serve(options, ready, session)
+
+
+def serve(options: LiveOptions, ready: Prepared, session: Session) -> None:
+    """Serve the page of a session until Ctrl-C."""
+    # Imported here because viser may be missing.
+    from gscompleter.apps.live.page import Page, resolve_host, start_server
+
     server = start_server(options.host, options.port)
     page = Page(
         session,
@@ -55,7 +72,7 @@ def run_live(options: LiveOptions) -> None:
         server,
         ready.opened.files,
     )
-    address = f"http://{options.host}:{server.get_port()}/"
+    address = resolve_host(options.host).make_url(server.get_port())
     # Printed once the server listens.
     print(f"{address} (Ctrl-C ends it)", flush=True)
     if not options.no_open:
@@ -67,6 +84,7 @@ def run_live(options: LiveOptions) -> None:
 
 def prepare(options: LiveOptions, console: Console) -> Prepared:
     """Open the scene as `complete` does."""
+    check_output(options.out, options.overwrite)
     ready = prepare_completion(make_complete_options(options), console)
     print_lines(console, *describe_opening(ready.options, ready.opened, ready.task))
     if ready.task.scene is not None and ready.task.scene.is_antialiased:
@@ -100,7 +118,8 @@ def save_session(ready: Prepared, session: Session) -> str:
         raise InputError("There is nothing to save; complete a hole first.")
     out = ready.options.out
     targets = [Target(result.target) for result in session.latest.targets]
-    with open_output_folder(out, overwrite=True) as folder:  # checked when the session began
+    # Whether it may be replaced was decided when the session began.
+    with open_output_folder(out, overwrite=True, command=COMMAND) as folder:
         summary = write_done(
             folder, replace(ready, task=replace(ready.task, targets=targets)), session.latest
         )

@@ -38,6 +38,10 @@ LONG_SIDE = 640
 """Default length of a photograph's longer side, in pixels."""
 
 DEFAULT_NUM_TARGETS = 4
+OUTPUTS = ("out", "save")
+"""Options that name what a command writes."""
+WORDS_OR_PATHS = ("target", "protocol", "generator_weights")
+"""Options whose words may be paths of files that are read."""
 REMOVAL_CONFIG = CompleterConfig.splat().for_removal()
 
 
@@ -54,7 +58,7 @@ class WritingOptions(Options):
     """Options of every command that replaces earlier results on request only."""
 
     overwrite: bool = False
-    """Replace an existing file, or the results of an earlier run in the output folder."""
+    """Replace an existing file, or in the output folder the files that an earlier run wrote."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -72,7 +76,7 @@ class RunOptions(ComputeOptions):
     device: Device = "auto"
     """Device to compute on; `auto` takes an NVIDIA GPU if there is one."""
     seed: Seed = 0
-    """Seed of all random numbers. The same seed gives the same files on a CPU."""
+    """Seed of all random numbers. The same seed gives the same files on CPUs of one type."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -199,7 +203,7 @@ class LiveOptions(CompletingOptions):
     port: Port = 0
     """Port of the page; a free one if not given."""
     host: str = "127.0.0.1"
-    """Address of the page. Anyone who can reach it can use it."""
+    """Address of the page, such as 127.0.0.1 or ::1. Anyone who can reach it can use it."""
     no_open: bool = False
     """Print the address without opening a browser."""
 
@@ -496,6 +500,20 @@ class DoctorOptions(Settings):
 
     json: bool = False
     """Print the result as JSON."""
+
+
+def list_inputs(options: Settings) -> list[Path]:
+    """List the paths that a command reads: those of all its options but the outputs."""
+    inputs: list[Path] = []
+    for name, value in vars(options).items():
+        values = value if isinstance(value, tuple) else (value,)
+        if name in WORDS_OR_PATHS:
+            inputs += [Path(word) for word in values if isinstance(word, str)]
+        elif isinstance(value, Settings):
+            inputs += list_inputs(value)
+        elif name not in OUTPUTS:
+            inputs += [path for path in values if isinstance(path, Path)]
+    return inputs
 
 
 def get_max_targets(options: CompleteOptions) -> int:

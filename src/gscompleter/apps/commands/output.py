@@ -6,6 +6,7 @@ import os
 from collections.abc import Mapping
 from contextlib import suppress
 from dataclasses import asdict
+from pathlib import Path
 from types import MappingProxyType
 from typing import Any
 
@@ -14,8 +15,8 @@ from gscompleter.apps.inputs.opening import Opened, Task
 from gscompleter.apps.inputs.selection import select_closest
 from gscompleter.apps.report.completion import HeldOut
 from gscompleter.config import CleaningConfig, CompleterConfig
-from gscompleter.data.sfm.poses import POSES
-from gscompleter.errors import InputError
+from gscompleter.errors import InputError, quote_value
+from gscompleter.io.files import COMPLETED_FILE
 from gscompleter.types import Camera, View
 
 MAX_HELD_OUT = 8
@@ -80,8 +81,7 @@ def read_held_out(
     return held_out
 
 
-def is_replaceable(options: SceneOptions) -> bool:
-    """Return True if the content of the output folder may be replaced."""
-    if os.path.isdir(options.out) and os.listdir(options.out) == [POSES]:
-        return True  # only the cameras of an earlier run
-    return options.overwrite
+def refuse_results(out: Path) -> None:
+    """Refuse the output folder of a dry run that holds a scene, which would be replaced."""
+    if os.path.lexists(out / COMPLETED_FILE):
+        raise InputError(f"{quote_value(out)} holds a result; name another folder.", "out")

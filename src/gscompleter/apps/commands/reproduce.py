@@ -4,17 +4,18 @@ from __future__ import annotations
 
 import shutil
 import subprocess
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 
 from rich.console import Console
 
 from gscompleter.apps.bench.report import describe_machine
-from gscompleter.apps.commands.evaluate import run_methods, score_methods
+from gscompleter.apps.commands.evaluate import Scored, run_methods, score_methods
+from gscompleter.apps.commands.exit_codes import choose_exit_code
 from gscompleter.apps.commands.options import AUTO, EvaluateOptions
 from gscompleter.config.generators import GeneratorOptions
-from gscompleter.errors import InputError, quote_value
+from gscompleter.errors import InputError, NoCaseError, OutputError, quote_value
 from gscompleter.evaluation.claims import HEAD, tabulate_claims
 from gscompleter.evaluation.figures import draw_figure
 from gscompleter.evaluation.paper import (
@@ -29,7 +30,7 @@ from gscompleter.evaluation.paper_tables import fill_table, write_paper_table
 from gscompleter.evaluation.protocols import list_indices
 from gscompleter.evaluation.store import make_file_name
 from gscompleter.evaluation.tables import format_markdown, write_tables
-from gscompleter.io.files import replace_file
+from gscompleter.io.files import encode_text, replace_file
 from gscompleter.jobs.jobs import make_folder
 from gscompleter.render import choose_device
 
@@ -39,8 +40,11 @@ TABLES, FIGURES, RUNS, RESULTS = "tables", "figures", "runs", "results.md"
 """Files of a reproduction in OUT."""
 
 
-def run_evaluation(options: EvaluateOptions) -> None:
-    """Run the methods of the options, or those that tables and figures of the paper need."""
+def run_evaluation(options: EvaluateOptions) -> int:
+    """Run the methods of the options, or those that tables and figures of the paper need.
+
+    Return the exit code.
+    """
     is_reproduction = bool(options.preset or options.table or options.figure)
     options = apply_preset(options)
     models = options.reconstructor
@@ -48,9 +52,8 @@ def run_evaluation(options: EvaluateOptions) -> None:
         raise InputError("A reconstructor is named twice; change --reconstructor.")
     weights = assign_weights(models, options.weights)
     if is_reproduction or len(models) > 1:
-        reproduce(options)
-    else:
-        run_methods(replace(options, weights=tuple(weights.values())))
+        return reproduce(options)
+    return run_methods(replace(options, weights=tuple(weights.values())))
 
 
 def assign_weights(models: Sequence[str], weights: Sequence[Path]) -> dict[str, Path]:
@@ -90,8 +93,11 @@ def apply_preset(options: EvaluateOptions) -> EvaluateOptions:
     )
 
 
-def reproduce(options: EvaluateOptions) -> None:
-    """Write the tables and figures of the options, and all results in OUT as one page."""
+def reproduce(options: EvaluateOptions) -> int:
+    """Write the tables and figures of the options, and all results in OUT as one page.
+
+    Return the exit code, which counts the cases of all tables and figures.
+    """
     paper, console = load_paper(), Console(stderr=True, quiet=options.quiet, highlight=False)
     generator = options.synthesis.generator
     names = options.table or (() if options.figure else ("models",))
@@ -99,43 +105,68 @@ def reproduce(options: EvaluateOptions) -> None:
         TABLES: select_names(names, paper.tables, generator),
         FIGURES: select_names(options.figure, paper.figures, generator),
     }
-    for kind, specs in chosen.items():
-        make_folder(options.out / kind)
-        for name, spec in specs.items():
-            console.print(f"{name}: {spec.title}", markup=False)
-            try:
-                write_output(options, name, spec)
-            except InputError as error:
-                if "all" not in (*options.table, *options.figure):
-                    raise
-                console.print(f"Left out {name}: {error}", markup=False, soft_wrap=True)
+    scored: list[Scored] = []
+    for name, spec in (item for specs in chosen.values() for item in specs.items()):
+        console.print(f"{name}: {spec.title}", markup=False)
+        try:
+            write_output(options, name, spec, scored)
+        except InputError as error:
+            if "all" not in (*options.table, *options.figure):
+                raise
+            console.print(f"Left out {name}: {error}", markup=False, soft_wrap=True)
+    if not scored:
+        raise InputError("None of the tables and figures could be begun; the lines above say why.")
     text = write_results(options)
     if not options.quiet:
         Console(highlight=False).print(text, markup=False, soft_wrap=True)
+    failed = sum(len(run.failures) for run in scored)
+    return choose_exit_code(failed, sum(run.num_own_rows for run in scored))
 
 
-def write_output(options: EvaluateOptions, name: str, spec: Requirements) -> None:
-    """Run what a table or figure needs, and write it."""
-    runs = run_all(options, spec)
+def write_output(
+    options: EvaluateOptions, name: str, spec: Requirements, scored: list[Scored]
+) -> None:
+    """Run what a table or figure needs, append the outcome to `scored`, and write it."""
+    runs = run_all(options, spec, scored)
+    try:
+        write_from_runs(options, name, spec, runs)
+    except OutputError:
+        raise
+    except InputError as error:
+        # The runs are written by now, so this is no refusal of the input.
+        raise NoCaseError(str(error.args[0]), error.argument) from error
+
+
+def write_from_runs(
+    options: EvaluateOptions, name: str, spec: Requirements, runs: Mapping[tuple[str, str], Path]
+) -> None:
+    """Write a table or figure from the folders of its runs."""
     if isinstance(spec, TableSpec):
         table = fill_table(spec, runs)
         if not any(table.num_cases.values()):
             reason = (*table.notes, "no row is there")[0]
             raise InputError(f"No case of the table was completed. {reason}")
+        make_folder(options.out / TABLES)
         write_paper_table(options.out / TABLES / name, table)
     if isinstance(spec, FigureSpec):
         by_model = {model: folder for (model, _), folder in runs.items()}
         names, path = options.figure_cases, options.out / FIGURES / name
+        make_folder(options.out / FIGURES)
         draw_figure(path, spec, by_model, names, options.outlines, options.crops)
 
 
-def run_all(options: EvaluateOptions, spec: Requirements) -> dict[tuple[str, str], Path]:
-    """Run what a table or figure needs; return the folder of each model and protocol."""
+def run_all(
+    options: EvaluateOptions, spec: Requirements, scored: list[Scored]
+) -> dict[tuple[str, str], Path]:
+    """Run what a table or figure needs; return the folder of each model and protocol.
+
+    The outcome of each run is appended to `scored`.
+    """
     runs = {}
     for number, model in enumerate(options.reconstructor):
         for protocol in choose_protocols(options, spec):
             run = make_run(options, spec, number, protocol)
-            score_methods(run)
+            scored.append(score_methods(run))
             write_tables(run.out)
             runs[model, Path(protocol).stem] = run.out
     return runs
@@ -197,7 +228,7 @@ def write_results(options: EvaluateOptions) -> str:
             parts.append(f"## {figure.title}\n\n![{figure.title}]({FIGURES}/{name}.png)\n")
     text = "\n".join(parts)
     with replace_file(out / RESULTS) as file:
-        file.write(text.encode())
+        file.write(encode_text(text))
     return text
 
 

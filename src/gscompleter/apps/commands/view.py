@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
+import os
+import sys
 import webbrowser
 from contextlib import suppress
 from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 
-from gscompleter.apps.commands.convert import check_free
 from gscompleter.apps.commands.options import ViewOptions
 from gscompleter.apps.viewer import packages
 from gscompleter.apps.viewer.exhibit import (
@@ -18,6 +19,7 @@ from gscompleter.apps.viewer.exhibit import (
 from gscompleter.apps.viewer.page import make_page
 from gscompleter.errors import InputError, quote_value
 from gscompleter.io.files import SUMMARY_FILE, replace_file
+from gscompleter.io.output_file import reserve_file
 from gscompleter.splats.foreign import resolve_splat
 from gscompleter.splats.sog import META
 
@@ -32,16 +34,21 @@ def run_view(options: ViewOptions) -> None:
         if options.save.suffix.lower() not in (".html", ".htm"):
             name = quote_value(options.save)
             raise InputError(f"{name} is no .html file; name it *.html.", "save")
-        check_free(options.save, options.overwrite)
+        with reserve_file(options.save, options.overwrite):
+            page = load_page(options)
+            with replace_file(options.save) as file:
+                file.write(page)
+    else:
+        serve_page(options, load_page(options))
+
+
+def load_page(options: ViewOptions) -> bytes:
+    """Make the page of the scenes and cameras of the options, and print its notes."""
     libraries = packages.load_libraries()
     page, notes = make_page(load_content(options), libraries)
     for note in () if options.quiet else notes:
         print(note)
-    if options.save is None:
-        serve_page(options, page)
-    else:
-        with replace_file(options.save) as file:
-            file.write(page)
+    return page
 
 
 def load_content(options: ViewOptions) -> ViewerContent:
@@ -51,7 +58,7 @@ def load_content(options: ViewOptions) -> ViewerContent:
         scene = resolve_splat(scene)
     if other is not None:
         content = load_viewer_files(other, scene, drop_nonfinite)
-    elif scene.is_dir() and not (scene / META).is_file():
+    elif os.path.isdir(scene) and not os.path.isfile(scene / META):
         content = load_viewer_completion(scene, drop_nonfinite)
     else:
         content = load_viewer_files(scene, None, drop_nonfinite)
@@ -95,8 +102,14 @@ def make_page_server(page: bytes, port: int = 0) -> ThreadingHTTPServer:
         def log_message(self, format: str, *args: object) -> None:
             """Log nothing."""
 
+    class Server(ThreadingHTTPServer):
+        def handle_error(self, request: object, client_address: object) -> None:
+            """Ignore a browser that leaves while it is answered; report any other error."""
+            if not isinstance(sys.exc_info()[1], ConnectionError):
+                super().handle_error(request, client_address)  # type: ignore[arg-type]
+
     try:
-        return ThreadingHTTPServer((ADDRESS, port), Handler)
+        return Server((ADDRESS, port), Handler)
     except OSError as error:
         raise InputError(
             f"Port {port} of {ADDRESS} is not available ({error.strerror}); name another one.",

@@ -73,6 +73,7 @@ def parse_words(words: Sequence[str], command: Any, names: Collection[str]) -> A
             f"There is no command {quote_value(words[0])}; choose one of {', '.join(names)} "
             "(see gscompleter --help)."
         )
+    refuse_empty_words(words)
     asked = any(word in (*HELP, HELP_ALL) for word in words)
     helps = [make_help_rule(show_all=HELP_ALL in words)] if asked else []
     words = ["--help" if word == HELP_ALL else word for word in words]
@@ -99,6 +100,18 @@ def parse_words(words: Sequence[str], command: Any, names: Collection[str]) -> A
             raise
         see = " ".join(["gscompleter", *words[:1]])
         raise InputError(f"{extract_sentence(printed.getvalue())} (see {see} --help).") from None
+
+
+def refuse_empty_words(words: Sequence[str]) -> None:
+    """Refuse an empty word, which as a path would mean the working folder."""
+    for before, word in zip(["gscompleter", *words], words, strict=False):
+        name, sign, value = word.partition("=")
+        if word and not (name.startswith("--") and sign and not value):
+            continue
+        raise InputError(
+            f"The word after {quote_value(name or before)} is empty; give it a value, or leave it "
+            "out (a variable of the shell may not be set)."
+        )
 
 
 def check_once(words: Sequence[str]) -> None:

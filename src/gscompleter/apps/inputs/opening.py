@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 import os
 import re
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, replace
 from functools import partial
@@ -38,17 +38,26 @@ from gscompleter.data.camera_files import is_in_splat_frame, refuse_other_export
 from gscompleter.data.formats import find_format, open_photographs, refuse_scenes_below
 from gscompleter.data.frame import FOLDERS
 from gscompleter.data.given_depth import give_depths
+from gscompleter.data.limits import check_planes
 from gscompleter.data.local_origin import (
     choose_scene_origin,
     compute_frame_from_photographs,
     shift_to_origin,
 )
-from gscompleter.data.photographs import Photographs
+from gscompleter.data.panorama import has_panoramas
+from gscompleter.data.photographs import Photographs, check_resolution
 from gscompleter.data.points import add_depth_range
 from gscompleter.data.scene import load_cameras
-from gscompleter.data.sfm.poses import ENDINGS, POSES, find_poses, has_photographs
+from gscompleter.data.sfm.poses import (
+    ENDINGS,
+    find_poses,
+    has_photographs,
+    list_photograph_files,
+)
+from gscompleter.data.video import is_video
 from gscompleter.errors import InputError, join_names, quote_value
 from gscompleter.io.files import SUMMARY_FILE
+from gscompleter.io.output_folder import POSES
 from gscompleter.memory import (
     check_bytes,
     check_memory,
@@ -156,14 +165,24 @@ class Task:
         return {*self.context_frames, *(target.frame for target in self.targets)}
 
 
-def open_scene(options: SceneOptions, console: Console) -> Opened:
-    """Open the photographs or video. If they have no cameras, find them and keep them in OUT."""
+def open_scene(
+    options: SceneOptions, console: Console, check: Callable[[], object] = lambda: None
+) -> Opened:
+    """Open the photographs or video. If they have no cameras, find them and keep them in OUT.
+
+    `check` is called before that search, which takes minutes, and raises what would end the command
+    after it.
+    """
     folder, poses, number = options.folder, options.out / POSES, None
     refuse_splat(folder)
-    if options.format is None and has_photographs(folder) and find_format(folder) is None:
+    check_planes(options.near, options.far)
+    check_resolution(parse_resolution(options.resolution))
+    if options.format is None and find_format(folder) is None and has_photographs(folder):
         refuse_other_exports(folder)
         refuse_scenes_below(folder)
         print_lines(console, *describe_cameras_above(folder))
+        check_frame_numbers(options, folder)
+        check()
         ours = options.overwrite or os.path.isfile(poses / SUMMARY_FILE)
         found = find_poses(folder, poses, ours, options.frames)
         print_lines(console, *found.notes)
@@ -213,6 +232,29 @@ def describe_cameras_above(folder: Path) -> list[str]:
         f"{quote_value(above)} has cameras of these photographs ({found}); name that folder to use "
         "them. Here they are found anew."
     ]
+
+
+def check_frame_numbers(options: SceneOptions, folder: Path) -> None:
+    """Refuse frames beyond the photographs whose cameras have to be found.
+
+    Panoramas are split into several photographs each, and a video into as many as it is sharp.
+    """
+    words = [*(options.context or ()), *getattr(options, "target", ())]
+    frames = [int(word) for word in map(str, words) if FRAME_NUMBER.fullmatch(word)]
+    count = options.frames if is_video(folder) else len(list_photograph_files(folder))
+    if not frames or (not is_video(folder) and has_panoramas_in(folder)):
+        return
+    wrong = next((frame for frame in frames if not 0 <= frame < count), None)
+    if wrong is not None:
+        raise InputError(
+            f"There is no frame {wrong} among the {count} photographs of {quote_value(folder)}; "
+            f"name frames from 0 to {count - 1}."
+        )
+
+
+def has_panoramas_in(folder: Path) -> bool:
+    """Return True if the photographs of a folder are panoramas."""
+    return has_panoramas([folder / name for name in list_photograph_files(folder)])
 
 
 def refuse_splat(path: Path) -> None:
@@ -397,6 +439,20 @@ def check_targets(options: CompleteOptions) -> None:
             "with the other.",
             "auto",
         )
+
+
+def check_target_files(options: CompleteOptions) -> None:
+    """Read the cameras of `--target`, and refuse words that are neither frames nor files."""
+    for word in options.target:
+        if FRAME_NUMBER.fullmatch(word):
+            continue
+        if not os.path.exists(word):
+            raise InputError(
+                f"'{quote_value(word, 60)}' is no target: name the number of a frame, or an "
+                "existing file of cameras, such as a transforms.json.",
+                "target",
+            )
+        load_cameras(word, parse_resolution(options.resolution))
 
 
 def find_depth_sources(

@@ -44,6 +44,8 @@ def check_selection(options: RemoveOptions) -> None:
         raise InputError("A rotation is a quaternion w x y z that is not zero.", "box-rotation")
     if options.mask and not os.path.isdir(options.mask):
         raise InputError(f"There is no folder {quote_value(options.mask)}.", "mask")
+    if options.select:
+        load_splat(options.select, options.drop_nonfinite)
 
 
 def choose_gaussians(

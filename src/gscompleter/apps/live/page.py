@@ -6,8 +6,12 @@ few units away, as the controls and clipping planes of the page expect.
 
 from __future__ import annotations
 
+import errno
 import html
+import ipaddress
+import logging
 import math
+import os
 import re
 import socket
 import time
@@ -32,14 +36,13 @@ from websockets.asyncio import server as websockets
 from gscompleter.apps.live.box import PageBox, remove_in_box
 from gscompleter.apps.live.session import Session, complete_camera, undo_step
 from gscompleter.apps.report.names import name_photograph
-from gscompleter.errors import InputError
+from gscompleter.errors import InputError, quote_value
 from gscompleter.geometry import estimate_up, quats_to_rotations, rotations_to_quats
 from gscompleter.progress import notify_of_stages
 from gscompleter.state import NOTHING_ADDED, Completion, TargetResult
 from gscompleter.types import SH_C0, Camera, Gaussians
 
-LOCAL_HOSTS = ("127.0.0.1", "localhost")
-LOCAL_ORIGIN = re.compile(r"http://(127\.0\.0\.1|localhost)(:\d+)?")
+LOCAL_ORIGIN = re.compile(r"http://(127(\.\d{1,3}){3}|\[::1\]|localhost)(:\d+)?", re.IGNORECASE)
 NOTICE_SECONDS = 4.0
 SCENE_DISTANCE = 3.0
 """Distance of the middle of the depth range, in page units."""
@@ -298,29 +301,83 @@ def describe_outcome(result: TargetResult, seconds: float) -> str:
     return "\n".join((text, *result.notes))
 
 
+@dataclass(frozen=True)
+class Address:
+    """An address of this machine, as the system knows it."""
+
+    family: socket.AddressFamily
+    host: str
+    """Number of the address, in which all spellings of it are the same."""
+
+    @property
+    def is_local(self) -> bool:
+        """Return True if only programs of this machine can reach it."""
+        number = ipaddress.ip_address(self.host.partition("%")[0])
+        return (getattr(number, "ipv4_mapped", None) or number).is_loopback
+
+    def make_url(self, port: int) -> str:
+        """Return the address of a page."""
+        host = f"[{self.host}]" if self.family == socket.AF_INET6 else self.host
+        return f"http://{host}:{port}/"
+
+
+def resolve_host(host: str) -> Address:
+    """Find the address that a host name stands for, or any spelling of an address."""
+    try:
+        family, *_, place = socket.getaddrinfo(host, 0, type=socket.SOCK_STREAM)[0]
+    except (OSError, UnicodeError) as error:
+        reason = getattr(error, "strerror", None) or "no name of a host"
+        raise InputError(
+            f"'{quote_value(host)}' is no address of this machine ({reason}); name another one, "
+            "such as 127.0.0.1.",
+            "host",
+        ) from error
+    return Address(family, str(place[0]))
+
+
 def start_server(host: str, port: int) -> viser.ViserServer:
     """Start a server, which runs in threads of its own."""
+    address = resolve_host(host)
+    check_bindable(address, host, port)
+    # A message that is no message of the page ends its connection, and is not worth a traceback.
+    logging.getLogger("websockets.server").setLevel(logging.CRITICAL)
+    with redirect_stdout(StringIO()), refuse_foreign_origins(address):  # viser prints a box
+        return viser.ViserServer(address.host, port, verbose=False)
+
+
+def describe_error(error: OSError) -> str:
+    """Return the system's words for an error, without those that Python adds to some."""
+    return str(error) if error.errno is None else os.strerror(error.errno)
+
+
+def check_bindable(address: Address, host: str, port: int) -> None:
+    """Raise an InputError if a server cannot listen at an address, which `host` stands for."""
     try:
-        socket.create_server((host, port)).close()
+        socket.create_server((address.host, port), family=address.family).close()
     except OSError as error:
+        if error.errno in (errno.EADDRINUSE, errno.EACCES):
+            raise InputError(
+                f"{quote_value(host)} cannot use port {port} ({describe_error(error)}); choose "
+                "another port.",
+                "port",
+            ) from error
         raise InputError(
-            f"{host} cannot use port {port} ({error.strerror}); choose another port.",
-            "port",
+            f"{quote_value(host)} is no address of this machine ({describe_error(error)}); name "
+            "another one, such as 127.0.0.1.",
+            "host",
         ) from error
-    with redirect_stdout(StringIO()), refuse_foreign_origins(host):  # viser prints a box
-        return viser.ViserServer(host, port, verbose=False)
 
 
 @contextmanager
-def refuse_foreign_origins(host: str) -> Iterator[None]:
-    """Make servers started inside refuse pages of other origins if `host` is this machine.
+def refuse_foreign_origins(address: Address) -> Iterator[None]:
+    """Make servers started inside refuse pages of other origins if only this machine reaches them.
 
     Any page in a browser may connect to this machine; only its `Origin` shows its source.
     websockets can check it, but viser has no option for that. Programs send no origin and may
     connect.
     """
     plain = websockets.serve
-    if host in LOCAL_HOSTS:
+    if address.is_local:
         websockets.serve = partial(plain, origins=[LOCAL_ORIGIN, None])  # type: ignore[misc, assignment]
     try:
         yield

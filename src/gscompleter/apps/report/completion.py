@@ -34,12 +34,12 @@ from gscompleter.evaluation.metrics.coverage import RenderPair, compute_coverage
 from gscompleter.evaluation.metrics.image import compute_masked_psnr, compute_masked_ssim, ssim
 from gscompleter.evaluation.metrics.unused_photographs import measure_likeness, shrink_view
 from gscompleter.geometry import estimate_up
-from gscompleter.io.files import COMPLETED_FILE, CONTEXT_FILE, SUMMARY_FILE
+from gscompleter.io.files import COMPLETED_FILE, CONTEXT_FILE, REMOVED_FILE, SUMMARY_FILE
 from gscompleter.io.image import write_image
 from gscompleter.kernels.parallel import map_in_parallel
 from gscompleter.removal import hide_removed
 from gscompleter.render import Renderer, get_view_map
-from gscompleter.splats.layout import REMOVED_FILE, save_like, save_removed
+from gscompleter.splats.layout import save_like, save_removed
 from gscompleter.splats.ply import save_ply
 from gscompleter.state import Completion, TargetResult
 from gscompleter.types import Camera, Gaussians, View, merge

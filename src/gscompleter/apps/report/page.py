@@ -1,6 +1,8 @@
-"""Self-contained HTML pages of a completion and of a batch: one file with style and images.
+"""HTML pages of a completion and of a batch: one file with style and script.
 
-Templates escape all text. A content security policy blocks all requests and other scripts.
+The page of a completion embeds its images; that of a batch shows those of the jobs, which lie
+beside it. Templates escape all text. A content security policy blocks all other requests and
+scripts.
 """
 
 from __future__ import annotations
@@ -40,7 +42,7 @@ from gscompleter.apps.report.schema import (
     read_summary,
 )
 from gscompleter.data.formats import FORMATS
-from gscompleter.io.files import replace_file
+from gscompleter.io.files import encode_text, replace_file
 from gscompleter.io.image import encode_jpeg, read_image_size, read_pixels
 from gscompleter.jobs.jobs import JOBS, Job, read_row
 
@@ -129,7 +131,7 @@ def write_completion_page(folder: Path) -> None:
     """Write `report.html` of the completion in `folder`."""
     page = render_completion_page(folder)
     with replace_file(folder / REPORT_FILE) as file:
-        file.write(page.encode())
+        file.write(encode_text(page))
 
 
 def render_completion_page(folder: Path) -> str:
@@ -191,7 +193,7 @@ def write_overview(out: Path, jobs: Sequence[Job]) -> None:
     texts = {TABLE_FILE: format_csv(rows), INDEX_FILE: render_batch_page(rows)}
     for name, text in texts.items():
         with replace_file(out / name) as file:
-            file.write(text.encode())
+            file.write(encode_text(text))
 
 
 def format_csv(rows: Iterable[Mapping[str, Any]]) -> str:

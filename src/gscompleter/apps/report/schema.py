@@ -14,7 +14,8 @@ import numpy as np
 from gscompleter.apps.report.names import name_photograph, name_target
 from gscompleter.errors import InputError, quote_value
 from gscompleter.evaluation.metrics.coverage import Coverage
-from gscompleter.io.files import SUMMARY_FILE
+from gscompleter.io.files import COMPLETED_FILE, SUMMARY_FILE
+from gscompleter.io.output_folder import read_command
 from gscompleter.io.reading import read_json
 
 RECORD_FILE = "report.json"
@@ -197,7 +198,18 @@ class CompletionRecord:
 
 
 def read_summary(folder: Path) -> CompletionSummary:
-    """Read `summary.json`; raise an InputError if it is missing or damaged."""
+    """Read `summary.json`; raise an InputError if it is missing, damaged or not of a completion."""
+    command = read_command(folder)
+    if command not in (None, "complete"):
+        raise InputError(
+            f"{quote_value(folder)} holds a result of `{quote_value(command)}`, which is no "
+            "completion; name the output folder of a completion."
+        )
+    if command and not os.path.lexists(folder / COMPLETED_FILE):
+        raise InputError(
+            f"{quote_value(folder)} holds no completed scene, but perhaps the plan of a dry run; "
+            "complete the scene first."
+        )
     path = folder / SUMMARY_FILE
     summary = read_result(CompletionSummary, path)
     transform = np.array(summary.frame.transform)

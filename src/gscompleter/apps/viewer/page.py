@@ -24,6 +24,7 @@ from gscompleter.apps.viewer.exhibit import ViewerCamera, ViewerContent
 from gscompleter.apps.viewer.packages import Libraries
 from gscompleter.errors import InputError, quote_value
 from gscompleter.geometry import embed_cameras, is_inside, project
+from gscompleter.io.files import encode_text
 from gscompleter.splats.spz import encode_spz
 from gscompleter.types import Camera, Gaussians
 
@@ -105,7 +106,7 @@ def make_page(viewer_content: ViewerContent, libraries: Libraries) -> tuple[byte
     omitted = sum(len(layers[name]) - len(shown[name]) for name in ("observed", "generated"))
     notes = (f"{omitted:,} Gaussians are too far away to be shown.",) if omitted else ()
     page = fill_template(content, make_scripts(sources))
-    return page.encode(), (*viewer_content.notes, *notes)
+    return encode_text(page), (*viewer_content.notes, *notes)
 
 
 def split_layers(viewer_content: ViewerContent) -> dict[str, Gaussians]:

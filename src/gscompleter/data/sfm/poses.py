@@ -37,7 +37,7 @@ from gscompleter.data.masks import MASK_FOLDERS, find_mask, leave_out_masks, loa
 from gscompleter.data.panorama import has_panoramas, split_panorama
 from gscompleter.data.video import NUM_FRAMES, extract_frames, is_video
 from gscompleter.errors import InputError, join_names, quote_value
-from gscompleter.io.files import SUMMARY_FILE, open_output_folder
+from gscompleter.io.files import SUMMARY_FILE
 from gscompleter.io.image import (
     HALF_OPAQUE,
     ORIENTATION,
@@ -49,6 +49,7 @@ from gscompleter.io.image import (
     read_orientation,
     turn_upright,
 )
+from gscompleter.io.output_folder import reserve_output
 from gscompleter.io.reading import read_json
 from gscompleter.progress import stage, track
 
@@ -60,8 +61,8 @@ OTHER_FOLDERS = (*MASK_FOLDERS, "depth", "depths", *(f"images_{n}" for n in DOWN
 """Folders that hold no photographs of the user."""
 IMAGES = "images"
 """Folder of the copies."""
-POSES = "colmap"
-"""Output folder of a completion for the poses found for it."""
+MAX_FOLDERS = 10_000
+"""Most folders below one that are searched for photographs."""
 MIN_PHOTOGRAPHS = 3
 """Fewest photographs; two determine neither a focal length nor a wrong match."""
 MIN_SHARE = 0.25
@@ -79,6 +80,9 @@ EXIF, FOCAL_LENGTH, FOCAL_LENGTH_35 = 0x8769, 0x920A, 0xA405
 MAX_THREADS = 4
 MAX_NAMED = 5
 """Most photographs that a note names."""
+COMMAND = "poses"
+RESULTS = ("images/**/*", "sparse/0/*", SUMMARY_FILE)
+"""Globs of the files that it may write. A foreign photograph would count as one of the copies."""
 PROCESS = "gscompleter.data.sfm.mapping_process"
 
 
@@ -118,6 +122,8 @@ class FoundPoses:
     """Sentences on how a video or panoramas became photographs."""
     masked: int = 0
     """Number of copies with a mask."""
+    kept: str = ""
+    """Sentence on other files in the output folder, if there are any; not recorded there."""
 
     @property
     def num_registered(self) -> int:
@@ -127,7 +133,7 @@ class FoundPoses:
     @property
     def notes(self) -> list[str]:
         """Sentences for the user."""
-        notes = [self.origin] if self.origin else []
+        notes = [note for note in (self.kept, self.origin) if note]
         if self.masked:
             notes.append(
                 f"Masks or alpha channels hide parts of {self.masked} of {self.photographs} "
@@ -158,13 +164,14 @@ def find_poses(
             "pip install 'gscompleter[poses]'."
         )
     with (
-        open_output_folder(out, overwrite) as folder,
+        reserve_output(out, overwrite, COMMAND, RESULTS) as output,
+        output.write() as folder,
         _open_images(photographs, num_frames, folder) as images,
     ):
         found = _run(images, folder, photographs)
         content = {"poses": asdict(found), "photographs": known}
         (folder / SUMMARY_FILE).write_bytes(json.dumps(content, indent=1).encode())
-    return found
+    return replace(found, kept=" ".join(output.describe_others()))
 
 
 def _identify_input(path: Path, num_frames: int) -> dict[str, list[int]]:
@@ -196,7 +203,7 @@ def _read_earlier(out: Path, known: Mapping[str, list[int]]) -> FoundPoses | Non
     if not os.path.isfile(out / SUMMARY_FILE) or not os.path.isdir(out / "sparse" / "0"):
         return None
     content = read_json(out / SUMMARY_FILE, "name another folder")
-    is_ours = isinstance(content, dict) and content.keys() == {"poses", "photographs"}
+    is_ours = isinstance(content, dict) and {"poses", "photographs"} <= content.keys()
     if not is_ours or content["photographs"] != known:
         return None
     return replace(FoundPoses(**content["poses"]), reused=True)
@@ -204,7 +211,7 @@ def _read_earlier(out: Path, known: Mapping[str, list[int]]) -> FoundPoses | Non
 
 def has_photographs(path: Path) -> bool:
     """Check whether `path` is a video or a folder with photographs, with or without cameras."""
-    return is_video(path) or (os.path.isdir(path) and bool(list_all_photographs(path)))
+    return is_video(path) or any(True for _ in iterate_photographs(path))
 
 
 def list_photograph_files(folder: Path) -> list[str]:
@@ -233,16 +240,28 @@ def _check_few(folder: Path, names: Sequence[str]) -> None:
 
 def list_all_photographs(folder: Path) -> list[str]:
     """List the photographs below a folder in natural order."""
-    found: list[Path] = []
-    for home, folders, files in os.walk(folder):
+    found = (path.relative_to(folder).as_posix() for path in iterate_photographs(folder))
+    return sorted(found, key=make_sort_key)
+
+
+def iterate_photographs(folder: Path) -> Iterator[Path]:
+    """Iterate over the photographs below a folder.
+
+    A folder with very many folders below it, such as a whole disk, is refused.
+    """
+    for number, (home, folders, files) in enumerate(os.walk(folder)):
+        require(
+            number < MAX_FOLDERS,
+            f"{quote_value(folder)} has more than {MAX_FOLDERS:,} folders below it; name the "
+            "folder of one scene.",
+        )
         folders[:] = [name for name in folders if is_own(Path(home, name))]
         images = [
             name
             for name in files
             if not name.startswith(".") and Path(name).suffix.lower() in ENDINGS
         ]
-        found += [Path(home, name).relative_to(folder) for name in leave_out_masks(images)]
-    return sorted((path.as_posix() for path in found), key=make_sort_key)
+        yield from (Path(home, name) for name in leave_out_masks(images))
 
 
 def is_own(folder: Path) -> bool:

@@ -1,0 +1,81 @@
+"""Failures of the machine, such as a lack of memory, as sentences for the user."""
+
+from __future__ import annotations
+
+import errno
+from collections.abc import Iterator
+from dataclasses import dataclass
+
+from gscompleter.apps.commands.exit_codes import ERROR, WRONG_INPUT
+from gscompleter.errors import MAX_MESSAGE_LENGTH, PROGRAM, quote_value, shorten_message
+from gscompleter.io.files import FULL_DISK_ERRORS
+
+NAME_ERRORS = {errno.ENAMETOOLONG, errno.ELOOP}
+"""Numbers of errors of a path that names nothing on any disk."""
+ACCESS_ERRORS = {errno.EACCES, errno.EPERM, errno.EROFS}
+"""Numbers of errors of a path that this user may not read or write."""
+MEMORY_WORDS = (
+    "can't start new thread",
+    "can't allocate memory",
+    "cannot allocate memory",
+    "out of memory",
+    "unable to allocate",
+    "failed to allocate",
+    "failed to map segment",
+    "insufficient memory",
+)
+"""Words of the messages by which libraries say that memory ran out, in small letters.
+
+Threads need memory, too: of a limit of the address space (`ulimit -v`) each takes its stack.
+"""
+
+
+@dataclass(frozen=True)
+class Failure:
+    """A failure that the user can understand."""
+
+    sentence: str
+    code: int
+
+
+def explain_failure(error: BaseException) -> Failure | None:
+    """Explain an error of the machine or of a path; None for any other, which is a defect."""
+    for cause in iterate_causes(error):
+        sentence, code = _explain(cause)
+        if sentence:
+            return Failure(shorten_message(sentence, MAX_MESSAGE_LENGTH - len(PROGRAM)), code)
+    return None
+
+
+def iterate_causes(error: BaseException) -> Iterator[BaseException]:
+    """Iterate over an error and those that it was raised from."""
+    seen: list[BaseException] = []
+    cause: BaseException | None = error
+    while cause is not None and cause not in seen:
+        yield cause
+        seen.append(cause)
+        cause = cause.__cause__ or cause.__context__
+
+
+def _explain(error: BaseException) -> tuple[str, int]:
+    number = getattr(error, "errno", None)
+    is_memory = isinstance(error, MemoryError) or number == errno.ENOMEM
+    if is_memory or any(words in str(error).lower() for words in MEMORY_WORDS):
+        return (
+            "The memory ran out; choose a smaller --resolution, fewer --threads or fewer "
+            "photographs, or raise the limit (ulimit -v).",
+            ERROR,
+        )
+    if not isinstance(error, OSError) or error.filename is None:
+        return "", ERROR
+    name, reason = quote_value(str(error.filename), 120), error.strerror
+    if number in NAME_ERRORS:
+        return f"{name} is no path: {reason}; correct it.", WRONG_INPUT
+    if number in ACCESS_ERRORS:
+        return (
+            f"{name} cannot be used: {reason}; change its permissions or name another.",
+            WRONG_INPUT,
+        )
+    if number in FULL_DISK_ERRORS:
+        return f"{name} cannot be written: {reason}; free some space.", ERROR
+    return "", ERROR

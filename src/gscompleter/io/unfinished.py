@@ -1,0 +1,194 @@
+"""Names of unfinished files and folders, which say whose they are.
+
+    .gscompleter-TARGET-MACHINE-PID-START-RANDOM
+
+TARGET stands for the name of the result and MACHINE for this computer since it was started. START
+is the time at which the process began, so that another process of the same PID is noticed. A run
+that is killed leaves such entries behind; the next one removes them once their process is gone.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import os
+import re
+import secrets
+import shutil
+import socket
+import threading
+import time
+from collections.abc import Iterator
+from contextlib import contextmanager, suppress
+from dataclasses import dataclass
+from functools import cache
+from pathlib import Path
+
+UNFINISHED_PREFIX = ".gscompleter-"
+"""Prefix of the names of unfinished entries, which are never taken for results."""
+REPLACED_SUFFIX = ".old"
+"""Suffix of the folder beside a draft that takes the files which the draft replaces."""
+
+SIGN_SECONDS = 30.0
+"""Interval at which the owner of a draft shows that it still runs."""
+FOLDER_LEASE_SECONDS = 180.0
+"""Time without a sign after which a draft of another machine counts as left behind."""
+FILE_LEASE_SECONDS = 24 * 3600.0
+"""The same for a file, whose owner gives no signs but only writes."""
+
+_NAME = re.compile(
+    re.escape(UNFINISHED_PREFIX)
+    + r"(?P<target>[0-9a-f]{8})-(?P<machine>[0-9a-f]{8})-(?P<pid>\d+)-(?P<start>\d+)-[0-9a-f]{8}"
+    + rf"(?:{re.escape(REPLACED_SUFFIX)})?"
+)
+
+
+@dataclass(frozen=True)
+class Unfinished:
+    """An unfinished entry of a folder."""
+
+    path: Path
+    target: str
+    """Digest of the name of the result."""
+    machine: str
+    pid: int
+    start: int
+
+    def is_running(self) -> bool:
+        """Return True if the process that writes the entry is, or may be, still running."""
+        if self.machine == _describe_machine() and _can_see_processes():
+            start = _read_start(self.pid)
+            return _is_hidden(self.pid) if start is None else start == self.start
+        try:
+            status = self.path.lstat()
+            # The clock of the disk counts, which on a server is not that of this machine.
+            now = _read_disk_time(self.path.parent)
+        except OSError:
+            return False
+        is_folder = self.path.is_dir()
+        return now - status.st_mtime < (FOLDER_LEASE_SECONDS if is_folder else FILE_LEASE_SECONDS)
+
+    def is_own(self) -> bool:
+        """Return True if this process writes the entry."""
+        return self.path.name.startswith(f"{UNFINISHED_PREFIX}{self.target}-{_describe_owner()}-")
+
+    def remove(self) -> None:
+        """Remove the entry, as far as this user may."""
+        shutil.rmtree(self.path, ignore_errors=True)
+        with suppress(OSError):
+            self.path.unlink()
+
+
+def make_unfinished_name(target: str) -> str:
+    """Make a new name for an unfinished entry of this process that will be called `target`."""
+    return f"{UNFINISHED_PREFIX}{digest_target(target)}-{_describe_owner()}-{secrets.token_hex(4)}"
+
+
+def digest_target(name: str) -> str:
+    """Return the part of an unfinished name that stands for the name of the result."""
+    return hashlib.sha256(os.fsencode(name)).hexdigest()[:8]
+
+
+def list_unfinished(folder: Path, target: str | None = None) -> list[Unfinished]:
+    """List the unfinished entries of a folder, or those of one result in it."""
+    try:
+        names = os.listdir(folder)
+    except OSError:
+        return []
+    matches = [match for name in names if (match := _NAME.fullmatch(name))]
+    return [
+        Unfinished(folder / m[0], m["target"], m["machine"], int(m["pid"]), int(m["start"]))
+        for m in matches
+        if target is None or m["target"] == digest_target(target)
+    ]
+
+
+def remove_left_behind(folder: Path, target: str | None = None) -> None:
+    """Remove unfinished entries of a folder whose process is gone."""
+    for entry in list_unfinished(folder, target):
+        if not entry.is_running():
+            entry.remove()
+
+
+def remove_left_behind_below(folder: Path) -> None:
+    """Remove unfinished entries whose process is gone from a folder and all folders in it."""
+    for home, folders, _ in os.walk(folder):
+        remove_left_behind(Path(home))
+        folders[:] = [name for name in folders if not name.startswith(UNFINISHED_PREFIX)]
+
+
+@contextmanager
+def give_signs(path: Path) -> Iterator[None]:
+    """Show other machines during the block that the owner of a draft is running."""
+    is_over = threading.Event()
+
+    def touch() -> None:
+        while not is_over.wait(SIGN_SECONDS):
+            with suppress(OSError):
+                os.utime(path)
+
+    thread = threading.Thread(target=touch, name="signs", daemon=True)
+    thread.start()
+    try:
+        yield
+    finally:
+        is_over.set()
+
+
+def _describe_owner() -> str:
+    """Return the part of an unfinished name that stands for this process."""
+    return f"{_describe_machine()}-{os.getpid()}-{_read_start(os.getpid()) or 0}"
+
+
+@cache
+def _describe_machine() -> str:
+    """Return a digest of this machine since its start, and of its list of processes.
+
+    Containers of one machine can have the same host name, but each numbers its own processes.
+    """
+    parts = [socket.gethostname()]
+    with suppress(OSError):
+        parts.append(Path("/proc/sys/kernel/random/boot_id").read_text("ascii"))
+    with suppress(OSError):
+        parts.append(os.readlink("/proc/self/ns/pid"))
+    return hashlib.sha256("\n".join(parts).encode()).hexdigest()[:8]
+
+
+def _can_see_processes() -> bool:
+    """Return True if the system lists its processes with the times at which they began."""
+    return _read_start(os.getpid()) is not None
+
+
+def _read_start(pid: int) -> int | None:
+    """Return when a process began, in ticks of the kernel; None if it has ended or is unknown."""
+    try:
+        line = Path(f"/proc/{pid}/stat").read_text("utf-8", errors="replace")
+    except OSError:
+        return None
+    # The second field is the name of the program in parentheses and may contain any characters.
+    state, *fields = line.rpartition(")")[2].split()
+    # A process that was killed stays in the list as a zombie until its parent asks for it.
+    return None if state in "ZX" else int(fields[18])
+
+
+def _is_hidden(pid: int) -> bool:
+    """Return True if a process of another user runs, whose entry in /proc is hidden."""
+    try:
+        os.kill(pid, 0)
+    except PermissionError:
+        return True
+    except OSError:
+        return False
+    return False
+
+
+def _read_disk_time(folder: Path) -> float:
+    """Return the time of the disk of a folder, or of this machine if it cannot be written to."""
+    probe = folder / f"{UNFINISHED_PREFIX}{secrets.token_hex(4)}"
+    try:
+        probe.touch(exist_ok=False)
+        return probe.stat().st_mtime
+    except OSError:
+        return time.time()
+    finally:
+        with suppress(OSError):
+            probe.unlink()

@@ -1,0 +1,65 @@
+"""The page of a batch in a real browser: it shows the pictures beside it and loads nothing else."""
+
+import json
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import pytest
+import torch
+
+from browsing import Tab, launched
+from gscompleter.apps.report.page import write_overview
+from gscompleter.io.image import write_image
+from gscompleter.jobs.jobs import Job
+
+pytestmark = pytest.mark.browser
+
+SCORES = ("hole_fraction", "psnr_before", "psnr_after", "coverage_before", "coverage_after")
+
+
+@pytest.fixture(scope="module")
+def browser() -> Iterator[Any]:
+    with launched() as browser:
+        yield browser
+
+
+@pytest.fixture
+def batch(tmp_path) -> Path:
+    """Write the folder of a batch with a scene that is done and one that failed."""
+    done = {"state": "done", "targets": 1, "added": 3, "seconds": 2.0, **dict.fromkeys(SCORES, 0.5)}
+    failed = {"state": "failed", "reason": "There is no <photograph>."}
+    (tmp_path / "rows").mkdir()
+    for name, row in (("room & hall", done), ("cellar", failed)):
+        content = {"job": name, "options": {}, "attempts": 1, **row}
+        (tmp_path / "rows" / f"{name}.json").write_text(json.dumps(content))
+    images = tmp_path / "jobs" / "room & hall" / "images"
+    images.mkdir(parents=True)
+    for number, when in enumerate(("before", "after")):
+        write_image(images / f"target1_{when}.png", torch.full((24, 32, 3), 0.5 + 0.2 * number))
+    write_overview(tmp_path, [Job("room & hall"), Job("cellar")])
+    return tmp_path
+
+
+def test_the_pictures_of_the_jobs_are_shown(browser, batch):
+    tab = Tab(browser, batch / "index.html", 1000, 800)
+    tab.page.evaluate("Promise.all([...document.images].map((image) => image.decode()))")
+    sizes = tab.page.evaluate("[...document.images].map((image) => image.naturalWidth)")
+    assert sizes == [32, 32]
+    assert tab.errors == []
+    below = batch.as_uri()
+    assert all(url.startswith(below) for url in tab.requests)
+    assert tab.page.locator("#failures").inner_text().count("There is no <photograph>.") == 1
+
+
+def test_no_other_request_is_allowed(browser, batch):
+    tab = Tab(browser, batch / "index.html", 1000, 800)
+    tab.context.set_offline(False)
+    blocked = tab.page.evaluate(
+        """() => new Promise((resolve) => {
+          const image = Object.assign(new Image(), {src: "https://elsewhere.invalid/a.png"});
+          document.addEventListener("securitypolicyviolation", (e) => resolve(e.blockedURI));
+          document.body.append(image);
+        })"""
+    )
+    assert blocked.startswith("https://elsewhere.invalid")
