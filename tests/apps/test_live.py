@@ -5,8 +5,8 @@ from __future__ import annotations
 import json
 import math
 import socket
-import time
 from collections.abc import Iterator
+from contextlib import suppress
 from dataclasses import replace
 from io import StringIO
 from pathlib import Path
@@ -357,21 +357,24 @@ def test_a_malformed_message_leaves_no_traceback(capfd):
         for sent in (b"GET / HTTP/1.1\r\nUpgrade: websocket\r\n\r\n", b"\x00\xff" * 50, b"\r\n"):
             with socket.create_connection(("127.0.0.1", server.get_port())) as browser:
                 browser.sendall(sent)
-        assert send_frames(server.get_port(), b"\xff\xff\xff", b"\x82\x01x")
+        for message in (b"\xc1no message of the page", b"", b"\x81\xa4type\xa4none", "text"):
+            send_message(server.get_port(), message)
     finally:
         server.stop()
     assert "Traceback" not in capfd.readouterr().err
 
 
-def send_frames(port: int, *frames: bytes) -> bool:
-    """Open WebSockets and send frames that are none."""
+def send_message(port: int, message: bytes | str) -> None:
+    """Connect as a page does, send a message, and wait until the server has read it."""
+    from websockets.exceptions import ConnectionClosed
     from websockets.sync.client import connect
 
-    for frame in frames:
-        with connect(f"ws://127.0.0.1:{port}", subprotocols=["viser-v0"], max_size=None) as browser:
-            browser.socket.sendall(frame)
-            time.sleep(0.2)
-    return True
+    page = {"subprotocols": [f"viser-v{viser.__version__}"], "max_size": None}
+    with connect(f"ws://127.0.0.1:{port}", **page) as browser:
+        browser.send(message)
+        with suppress(ConnectionClosed, TimeoutError):
+            while True:
+                browser.recv(timeout=0.5)
 
 
 def test_without_viser_a_sentence_says_what_to_install(room, tmp_path, monkeypatch, capsys):
