@@ -1,4 +1,4 @@
-"""What is said and refused while photographs are opened."""
+"""Lines and refusals while photographs are opened."""
 
 import json
 
