@@ -1,4 +1,4 @@
-"""Sentences and refusals while photographs are opened."""
+"""Lines and refusals while photographs are opened."""
 
 import json
 

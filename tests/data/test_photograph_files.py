@@ -239,7 +239,7 @@ def test_heic_is_refused_by_name_without_its_reader(tmp_path, monkeypatch):
 
 def test_avif_is_refused_by_name_without_its_reader(tmp_path, monkeypatch):
     monkeypatch.setattr(features, "check", lambda name: False)
-    with pytest.raises(InputError, match="a.avif is AVIF.*update Pillow"):
+    with pytest.raises(InputError, match="a.avif is AVIF.*pip install -U pillow"):
         read_pixels(write_brand(tmp_path / "a.avif", b"avif"))
 
 

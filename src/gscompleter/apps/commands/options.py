@@ -112,9 +112,8 @@ class SceneOptions(ComputeOptions, WritingOptions):
     frames: NumFrames = 40
     """Most frames of a video to take as photographs, sharp ones at even steps of the camera."""
     context: Words = None
-    """Photographs to work with: their file names, or their numbers from 0 in the order of their
-    file paths. If not given, those that help most; photographs of targets are never used. `clean`
-    takes all."""
+    """Photographs to work with: file names, or numbers from 0 in the order of the file paths. If
+    not given, those that help most; photographs of targets are never used. `clean` takes all."""
     out: Path
     format: str | None = None
     """Format of SCENE: colmap, nerfstudio, cameras-json, llff, kitti, kitti-raw, dgp, waymo,
@@ -133,7 +132,7 @@ class SceneOptions(ComputeOptions, WritingOptions):
     no_given_depth: bool = False
     """Ignore the depth that SCENE holds: depth maps, laser sweeps and COLMAP's points."""
     masks: bool = True
-    """Ignore the pixels that masks of SCENE (black) or alpha channels (transparent) hide."""
+    """Ignore what masks (black) or alpha channels of SCENE hide."""
     drop_nonfinite: bool = False
     """Drop Gaussians that contain NaN or infinity instead of refusing the file."""
 
@@ -185,7 +184,7 @@ class RemoveOptions(CompleteOptions):
     sphere: tuple[float, float, float, float] | None = None
     """Remove Gaussians inside of a sphere: x, y and z of its centre, and its radius."""
     mask: Path | None = None
-    """Remove what masks show: a folder of images named as photographs, white on the object."""
+    """Remove what masks show: a folder of images named as photographs, white there."""
     select: Path | None = None
     """Remove the Gaussians of this file, a selection that another program saved."""
     config: Annotated[CompleterConfig, tyro.conf.FlagConversionOff] = REMOVAL_CONFIG
