@@ -577,7 +577,8 @@ def describe_opening(options: SceneOptions, opened: Opened, task: Task) -> list[
     splat = ""
     if scene is not None:
         mode = "antialiased " if scene.is_antialiased else ""
-        name = quote_value(options.scene)
+        path = options.scene if task.splat_file is None else task.splat_file.path
+        name = quote_value(path)  # of a model folder, the splat that was found in it
         splat = f"; {name}, {len(scene):,} {mode}Gaussians of SH degree {scene.sh_degree}"
     return [
         f"Opened: {quote_value(options.folder)}, {opened.format}, {used} of "
