@@ -262,7 +262,10 @@ def test_all_of_the_paper_on_photographs(clips, tmp_path, monkeypatch):
         (("--figure", "seams", "--figure-cases", "x 0>1"), "there are 'a 0+2>4', 'b 0+2>4'"),
         (("--table", "steps", "--generator", "warp-inpaint"), "FLUX.1-Kontext"),
         (("--reconstructor", "plane-sweep", "plane-sweep"), "is named twice"),
-        (("--table", "models", "--weights", "x.ckpt", "y.ckpt"), "x.ckpt belongs to no reconstructor"),
+        (
+            ("--table", "models", "--weights", "x.ckpt", "y.ckpt"),
+            "x.ckpt belongs to no reconstructor",
+        ),
         (("--preset", "re10k", "--weights", "a.ckpt", "b.ckpt", "c.ckpt"), "a.ckpt"),
     ],
 )
