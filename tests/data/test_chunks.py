@@ -130,7 +130,7 @@ def test_the_authors_crop_keeps_the_principal_point_as_a_fraction(tmp_path):
 
 
 def test_the_authors_crop_of_dl3dv_resizes_nothing(tmp_path):
-    """Test that 11 x 32 in the middle of 27 x 48 stay as they are: eight rows and columns go."""
+    """The middle 11 x 32 of 27 x 48 stay as they are, from row and column 8 on."""
     view = crop_wide(tmp_path, AuthorsCrop(11, 32, is_resized=False), 27, 48)
     K = torch.tensor([[0.5 * 48, 0, 0.47 * 32], [0, 0.9 * 27, 0.52 * 11], [0, 0, 1]])
     assert torch.allclose(view.camera.K, K)

@@ -1,9 +1,9 @@
 """Reconstructors by published names, with random tensors in place of the published weights."""
 
 import json
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from pathlib import Path
-from types import SimpleNamespace
+from typing import Any
 
 import pytest
 import torch
@@ -166,13 +166,22 @@ def test_a_scene_in_metres_is_not_remarked_upon(rooms, recorded, tmp_path, monke
     assert "was trained on" not in capsys.readouterr().err
 
 
+@dataclass(frozen=True)
+class Mine:
+    """A reconstructor of one's own."""
+
+    depth_range: Any
+
+    def __call__(self, views):
+        raise NotImplementedError
+
+
 @pytest.mark.parametrize("wrong", [5.0, (1.0,), (2.0, 1.0), (0.0, 1.0), ("a", "b")])
 def test_a_range_of_ones_own_model_that_is_none_is_refused(wrong):
-    mine = SimpleNamespace(depth_range=wrong)
     with pytest.raises(InputError, match="The attribute depth_range of the reconstructor is"):
-        get_trained_range(mine)
+        get_trained_range(Mine(wrong))
 
 
 def test_a_model_of_ones_own_without_a_range_adapts_to_any():
     assert get_trained_range(lambda views: None) is None
-    assert get_trained_range(SimpleNamespace(depth_range=[1, 5])) == (1.0, 5.0)
+    assert get_trained_range(Mine([1, 5])) == (1.0, 5.0)

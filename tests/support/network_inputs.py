@@ -1,4 +1,4 @@
-"""Record the inputs that `evaluate --preset` feeds to published networks, without weights.
+"""Records of the inputs that commands give to published networks, without their weights.
 
 A stand-in takes the place of each network: it has the class and the configuration of the published
 one, and records its batch. Each case ends there, as a failed row, since no score is wanted.
@@ -27,7 +27,7 @@ from gscompleter.types import View
 
 @dataclass(frozen=True)
 class Fed:
-    """Inputs of the network and of the scores in one task."""
+    """Input that a task gave to the network and to the scores."""
 
     images: Tensor
     """Context [v, 3, h, w] in [0, 1], in the order of the call."""
@@ -38,7 +38,7 @@ class Fed:
 
 @dataclass
 class Recorded:
-    """Inputs of all tasks of a run."""
+    """Inputs of the tasks of a run."""
 
     batches: list[tuple[Tensor, Cameras]] = field(default_factory=list)
     tasks: dict[tuple[str, str], Fed] = field(default_factory=dict)

@@ -1,4 +1,4 @@
-"""Data sets loaded as the networks' authors load them in test mode.
+"""Data sets loaded as by the data loaders of the networks' authors in test mode.
 
 Ours reads any posed photographs exactly. The loaders of pixelSplat (MVSplat, VolSplat) and of
 DepthSplat differ from it and from each other in the crop, in the scenes that they leave out and in
@@ -18,7 +18,7 @@ from gscompleter.evaluation.protocols import EvaluationIndex, EvaluationProtocol
 
 @dataclass(frozen=True, kw_only=True)
 class AuthorsLoader(Settings):
-    """Properties of the authors' code that loads a data set."""
+    """Rules by which the authors' code loads a data set."""
 
     image_size: tuple[int, int]
     """Height and width of the stored photographs; scenes with another size are left out."""

@@ -31,7 +31,7 @@ class DataSet(Settings):
     far: float | None = None
     """Depth range in scene units; None for that of the data, or else of the model's authors."""
     loader: AuthorsLoader | None = None
-    """The authors' way to load the data set; None if nobody's code is followed."""
+    """Rules of the authors' data loader; None if nobody's code is followed."""
 
 
 @dataclass(frozen=True)

@@ -99,15 +99,16 @@ def get_trained_range(reconstructor: Reconstructor) -> tuple[float, float] | Non
     trained = getattr(reconstructor, "depth_range", None)
     if trained is None:
         return None
+    refusal = InputError(
+        f"The attribute depth_range of the reconstructor is {quote_value(trained)}; near and far "
+        "z-depth are needed, positive and in this order, or None."
+    )
     try:
         near, far = (float(bound) for bound in trained)
     except (TypeError, ValueError):
-        near, far = 0.0, 0.0
+        raise refusal from None
     if not 0 < near < far:
-        raise InputError(
-            f"The attribute depth_range of the reconstructor is {quote_value(trained)}; near and "
-            "far z-depth are needed, positive and in this order, or None."
-        )
+        raise refusal
     return near, far
 
 
