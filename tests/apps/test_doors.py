@@ -115,7 +115,7 @@ def test_the_splat_and_its_folder_are_never_an_output(splat, monkeypatch, capsys
 
 
 def test_a_scene_is_cleaned_in_place_and_given_back(splat, tmp_path, monkeypatch, capsys):
-    """Files that an earlier run alone wrote do not stay beside the new summary."""
+    """Files of the earlier run alone do not stay beside the new summary."""
     out = tmp_path / "out"
     assert run(monkeypatch, "clean", "--scene", splat, "--out", out, "--quiet") == 0
     (out / "report.html").write_text("mine")
