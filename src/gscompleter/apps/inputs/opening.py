@@ -7,7 +7,6 @@ import re
 from collections.abc import Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, replace
-from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -22,6 +21,7 @@ from gscompleter.apps.commands.options import (
     get_max_targets,
     parse_resolution,
 )
+from gscompleter.apps.inputs.given_depth import read_with_depth
 from gscompleter.apps.inputs.selection import (
     CHECK_VIEW_SIZE,
     choose_context,
@@ -31,7 +31,6 @@ from gscompleter.apps.inputs.selection import (
 from gscompleter.apps.report.completion import InputSplatFile, Target
 from gscompleter.data.camera_files import refuse_other_exports
 from gscompleter.data.formats import find_format, open_photographs, refuse_scenes_below
-from gscompleter.data.given_depth import give_depths
 from gscompleter.data.local_origin import (
     choose_scene_origin,
     compute_frame_from_photographs,
@@ -98,6 +97,8 @@ class Task:
     frame_description: str = "the frame of the photographs"
     check_views: Sequence[View] | None = None
     """Check views of the input splat, at low resolution."""
+    depth_notes: tuple[str, ...] = ()
+    """Sentences about the unit of the given depth."""
 
     @property
     def device(self) -> torch.device:
@@ -196,13 +197,18 @@ def make_task(
     ]
     cameras = [bounded.camera(frame, resolution) for frame in frames]
     check_sides([*cameras, *(target.camera for target in targets)])
-    load = bounded.views if options.no_given_depth else partial(give_depths, bounded)
+    depth_notes: tuple[str, ...] = ()
+    if options.no_given_depth:
+        views = bounded.views(frames, resolution)
+    else:
+        views, depth_notes = read_with_depth(bounded, frames, resolution)
     return Task(
-        [view.to(device) for view in load(frames, resolution)],
+        [view.to(device) for view in views],
         [add_photograph(target, bounded, options) for target in targets],
         compute_frame_from_photographs(given.origin),
         given.origin,
         find_depth_sources(options, given, bounded),
+        depth_notes=depth_notes,
     )
 
 
@@ -380,6 +386,7 @@ def describe_opening(options: SceneOptions, opened: Opened, task: Task) -> list[
         f"{opened.num_photographs} photographs{splat}.",
         f"Found: {task.frame_description.rstrip('.')}; depths from {camera.near:.3g} to "
         f"{camera.far:.3g}; worked at {camera.width} x {camera.height} (--resolution changes it).",
+        *task.depth_notes,
     ]
 
 
