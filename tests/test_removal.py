@@ -11,7 +11,7 @@ from gscompleter import GSCompleter
 from gscompleter.config import CompleterConfig
 from gscompleter.errors import InputError
 from gscompleter.guards import load_guards
-from gscompleter.guards.free_space import ignore_removed, is_before_surface
+from gscompleter.guards.free_space import Observed, ignore_removed, is_before_surface
 from gscompleter.guards.removal import find_removed
 from gscompleter.image_ops import dilate
 from gscompleter.removal import find_outside, remove_gaussians, restore_surroundings
@@ -147,7 +147,7 @@ def test_space_in_which_something_was_removed_is_not_free(removed, begun):
     points = removed.source.removed.means
     for state, expected in (begun, 1.0), (removed, 0.0):
         seen = ignore_removed(behind, camera, COMPLETER.observe(state, camera))
-        share = is_before_surface(points, camera, seen).float().mean()
+        share = is_before_surface(points, Observed.from_render(seen, camera, camera)).float().mean()
         assert share == pytest.approx(expected, abs=0.05)
     beside = find_removed(removed.source, camera, COMPLETER.renderer).logical_not()
     assert torch.equal(seen.alpha[beside], behind.alpha[beside])

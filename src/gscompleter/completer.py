@@ -22,6 +22,7 @@ from gscompleter.render.cache import SceneRenderer
 from gscompleter.stages.align_depth import align_depth
 from gscompleter.stages.context import choose_config, init_context
 from gscompleter.stages.filter_holes import filter_holes
+from gscompleter.stages.find_unfilled import find_unfilled
 from gscompleter.stages.lift import lift
 from gscompleter.stages.new_photos import find_new_photos, recolor_to_photos
 from gscompleter.stages.recolor import recolor
@@ -29,7 +30,7 @@ from gscompleter.stages.refine import refine
 from gscompleter.stages.slide_along_rays import slide_along_rays
 from gscompleter.stages.synthesize import GeneratedView, synthesize
 from gscompleter.stages.target_view import TargetView, render_target
-from gscompleter.state import NEW_PHOTO_ID, Completion, Photo, find_last_target_id
+from gscompleter.state import NEW_PHOTO_ID, Completion, Photo, Step, find_last_target_id
 from gscompleter.tensor_checks import describe, is_whole
 from gscompleter.timing import record_seconds, timed_stage
 from gscompleter.trust.photometric import load_trust
@@ -179,14 +180,20 @@ class GSCompleter:
             lifted = lift(self.reconstructor, image, view)  # Eq. 7
             affine = align_depth(lifted, view, rng)  # Eq. 8
             moved = slide_along_rays(lifted, affine, image, view)  # Eq. 9 to 11
-            kept = place(filter_holes(moved, view), view)  # Eq. 12
-            refined = refine(kept, image, view)  # Eq. 13
-            added, rejection = verify(Attempt(view, image, affine, refined))
+            steps = [Step("lift", lifted.gaussians), Step("register", moved.gaussians)]
+            steps.append(Step("filter", filter_holes(moved, view)))  # Eq. 12
+            steps += place(steps[-1].gaussians, view)
+            refined = refine(steps[-1].gaussians, image, view)  # Eq. 13
+            steps.append(Step("refine", refined.gaussians))
+            verified, rejection = verify(Attempt(view, image, affine, refined))
+            added = (*steps, *verified)[-1].gaussians
             recolored = recolor(image, view, state.next_target_id)
+            after = recolored.frozen.composite(added)
             result = replace(
                 view.make_unchanged_result(),
-                after=recolored.frozen.composite(added).crop(view.camera),
+                after=after.crop(view.camera),
                 added=added,
+                unfilled=find_unfilled(after, (*steps, *verified), view),
                 reference=image.crop(view.camera),
                 affine=affine,
                 losses={"register": moved.losses, "refine": refined.losses},

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
+from typing import ClassVar
 
 import torch
 from jaxtyping import Bool, Float
@@ -33,6 +34,17 @@ AFFINE_NOTES = {
 }
 """Sentence about each estimator of the depth correction; empty for the usual one."""
 NOTHING_ADDED = "Nothing of it was added."
+LOSSES = {
+    "lift": "nothing was lifted there",
+    "register": "registration moved the Gaussians away",
+    "filter": "the Gaussians of these pixels do not lie in the hole",
+    "free-space": "additions would occlude what cameras see through to (free-space)",
+    "removal": "nothing was removed there (removal)",
+    "refine": "the photographs beside the target contradict the additions (refinement)",
+    "psnr": "additions there make photographs worse (psnr)",
+    "contribution": "additions there are hardly visible (contribution)",
+}
+"""Reason why each step leaves pixels of a hole empty."""
 
 
 @dataclass(frozen=True)
@@ -52,6 +64,43 @@ class Rejection:
     guard: str = ""
     reason: str = ""
     """Sentence for the report; empty if the notes of Φ say it."""
+
+
+@dataclass(frozen=True)
+class Step:
+    """The new Gaussians after a step of a target."""
+
+    name: str
+    """`lift`, `register`, `filter`, `refine`, or the name of a guard."""
+    gaussians: Gaussians
+
+
+@dataclass(frozen=True)
+class Unfilled:
+    """The part of the dilated hole mask, at the padded target, that is still a hole afterwards."""
+
+    MAX_SHARE: ClassVar[float] = 0.005
+    """Largest share of the mask that is not worth a word."""
+
+    share: float = 0.0
+    """Share of the pixels of the mask."""
+    lost_by: Mapping[str, float] = field(default_factory=dict)
+    """The same by the step that emptied them for the first time; empty if there is little."""
+    regions: tuple[tuple[int, int, int, int], ...] = ()
+    """Bounding boxes (left, top, right, bottom) of the largest regions, in pixels of the target
+    image; its padding has coordinates below 0 and beyond its size."""
+
+    def describe(self) -> str:
+        """Write the sentence for the report; empty if the hole is filled."""
+        if self.share <= self.MAX_SHARE:
+            return ""
+        most_first = sorted(self.lost_by.items(), key=lambda each: -each[1])
+        reasons = " and ".join(f"{LOSSES.get(name, name)}, {part:.1%}" for name, part in most_first)
+        boxes = "; ".join(f"x {a} to {c}, y {b} to {d}" for a, b, c, d in self.regions)
+        return (
+            f"{self.share:.1%} of the hole (with its seam and padding) stays empty, because "
+            f"{reasons}; the largest parts: {boxes} (pixels)."
+        )
 
 
 @dataclass(frozen=True)
@@ -84,6 +133,8 @@ class TargetResult:
     """Number of rendered context Gaussians that got new colours."""
     synthesis_notes: tuple[str, ...] = ()
     """Sentences of the generator about its image."""
+    unfilled: Unfilled = Unfilled()
+    """What is left of the hole, unless the target was rejected or skipped."""
     rejection: Rejection = Rejection()
     refusal: str | None = None
     """Sentence why the target cannot be completed, or None if it can."""
@@ -111,6 +162,8 @@ class TargetResult:
         notes.append(AFFINE_NOTES[self.affine.method])
         if self.rejection.guard:
             notes += [self.rejection.reason, NOTHING_ADDED]
+        else:
+            notes.append(self.unfilled.describe())
         return tuple(filter(None, notes))
 
 

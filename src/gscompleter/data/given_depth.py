@@ -37,15 +37,35 @@ def give_depths(
 
 def give_depth(view: View, frame: Frame, origin: Float[np.ndarray, "3"]) -> View:
     """Give a photograph its depth map or laser points, and the triangulated points beside them."""
-    given = torch.zeros_like(view.image[..., 0])
-    if frame.seen_points is not None:
-        points = torch.from_numpy(frame.seen_points() - origin).float()
-        given = compute_sparse_depth(points, view.camera)
+    given = project_tracks(frame, view, origin)
     if view.depth is not None:
-        sure = drop_edges(view.depth) if frame.depth is not None else drop_hidden(view.depth)
+        sure = drop_unsure(view.depth, frame)
         given = sure.where(sure > 0, given)
     # A point that a mask hides may lie behind what the mask hides it with.
     return replace(view, depth=None, given_depth=given.where(view.valid_mask, 0.0))
+
+
+def project_tracks(
+    frame: Frame,
+    view: View,
+    origin: Float[np.ndarray, "3"],
+    points: Float[Tensor, "n 3"] | None = None,
+) -> Float[Tensor, "h w"]:
+    """Project the triangulated points that a photograph shows to its z-depths, 0 between them.
+
+    Without a list of those, `points` of the scene (relative to `origin`) take their place, of which
+    surfaces may hide some; none if there are none.
+    """
+    if frame.seen_points is not None:
+        points = torch.from_numpy(frame.seen_points() - origin).float()
+    if points is None:
+        return torch.zeros_like(view.image[..., 0])
+    return compute_sparse_depth(points, view.camera)
+
+
+def drop_unsure(depth: Float[Tensor, "h w"], frame: Frame) -> Float[Tensor, "h w"]:
+    """Set the measured depth of a frame to 0 where sensor and photograph may see two surfaces."""
+    return drop_edges(depth) if frame.depth is not None else drop_hidden(depth)
 
 
 def drop_edges(depth: Float[Tensor, "h w"]) -> Float[Tensor, "h w"]:

@@ -15,7 +15,7 @@ from gscompleter.render.cache import SceneRenderer
 from gscompleter.stages.refine import Refined
 from gscompleter.stages.synthesize import GeneratedView
 from gscompleter.stages.target_view import TargetView
-from gscompleter.state import Completion, Rejection
+from gscompleter.state import Completion, Rejection, Step
 from gscompleter.timing import timed_stage
 from gscompleter.types import DepthAffine, Gaussians
 
@@ -58,22 +58,32 @@ def prepare_guards(state: Completion, scenes: SceneRenderer) -> Completion:
 
 
 @timed_stage("integrate")
-def place(candidates: Gaussians, view: TargetView) -> Gaussians:
-    """Let guards move or drop registered Gaussians, before they are refined."""
-    guards = load_guards(view.state.config)
-    return reduce(lambda kept, guard: guard.place(kept, view), guards, candidates)
+def place(candidates: Gaussians, view: TargetView) -> tuple[Step, ...]:
+    """Let guards move or drop registered Gaussians, before they are refined.
+
+    Return the Gaussians that are left after each guard that changed them.
+    """
+    steps, kept = [], candidates
+    for guard in load_guards(view.state.config):
+        placed = guard.place(kept, view)
+        if placed is not kept:
+            steps.append(Step(guard.name, placed))
+        kept = placed
+    return tuple(steps)
 
 
 @timed_stage("integrate")
-def verify(attempt: Attempt) -> tuple[Gaussians, Rejection]:
-    """Return what may be added, and which guard rejected all of it, if one did."""
-    added = attempt.refined.gaussians
+def verify(attempt: Attempt) -> tuple[tuple[Step, ...], Rejection]:
+    """Return what may be added after each guard, and which one rejected all of it, if one did."""
+    steps, added = [], attempt.refined.gaussians
     for guard in load_guards(attempt.view.state.config):
         checked = guard.verify(added, attempt)
+        if checked is not added:
+            steps.append(Step(guard.name, checked))
         if len(added) > 0 and len(checked) == 0:
-            return checked, Rejection(guard.name, guard.explain_rejection(attempt))
+            return tuple(steps), Rejection(guard.name, guard.explain_rejection(attempt))
         added = checked
-    return added, Rejection()
+    return tuple(steps), Rejection()
 
 
 def load_guards(config: CompleterConfig) -> list[Guard]:

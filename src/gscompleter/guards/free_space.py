@@ -1,18 +1,21 @@
 """Free space (not in the paper): nothing is added in front of observed surfaces.
 
 In a hole only the lifted depth locates a Gaussian, but photographs exclude some positions: one in
-front of an observed surface slides back along its ray until no camera contradicts it.
+front of an observed surface slides back along its ray until no camera contradicts it. A Gaussian
+covers more than the pixel of its mean: beside the edge of an object that hides it, it would still
+occlude the surface behind that edge.
 """
 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from typing import Literal
 
 import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
+from torch.nn.functional import max_pool2d
 
 from gscompleter.config import FreeSpaceConfig
 from gscompleter.geometry import compute_z_depths, project, shrink_camera, slide
@@ -29,6 +32,34 @@ CLEARANCE = 0.01
 A Gaussian there is invisible to the camera and still closes the hole."""
 BORDER = 3
 """Pixels outside of an image at which a Gaussian is still visible."""
+FOOTPRINT_RADIUS = 3.0
+"""Pixels of the target around that of its mean in which a Gaussian is still visible. Additions have
+a standard deviation of half a pixel there, and renderers blur them by as much."""
+FOOTPRINT_CLEARANCE = 0.02
+"""Distance in front of a surface in these pixels, relative to depth, that still counts as the same
+surface, which may be slanted. With 0.05 more of what shows beside edges stays."""
+
+
+@dataclass(frozen=True)
+class Observed:
+    """The surfaces that a camera sees."""
+
+    camera: Camera
+    depth: Float[Tensor, "h w"]
+    """z-depth in scene units, 0 where the camera sees no surface."""
+    farthest: Float[Tensor, "h w"]
+    """Largest of these depths within the footprint of an addition."""
+
+    @staticmethod
+    def from_render(render: Render, camera: Camera, target: Camera) -> Observed:
+        """Take the surfaces of a render; additions are about a pixel of the target wide."""
+        seen = render.depth_map()
+        depth = seen.depth.where(seen.valid, 0.0)
+        zoom = (camera.K[0, 0] / target.K[0, 0]).item()
+        radius = round(FOOTPRINT_RADIUS * zoom)
+        side = 2 * radius + 1
+        farthest = max_pool2d(depth[None, None], side, stride=1, padding=radius)[0, 0]
+        return Observed(camera, depth, farthest)
 
 
 class FreeSpace(Guard):
@@ -81,9 +112,11 @@ def respect_free_space(
     ratio = torch.ones_like(gaussians.opacities)
     offsets = gaussians.means - target.center
     waiting = torch.arange(len(gaussians), device=ratio.device)
+    pairs = zip(renders, cameras, strict=True)
+    observed = [Observed.from_render(render, camera, target) for render, camera in pairs]
     for step in range(config.num_steps):
         means = target.center + ratio[waiting, None] * offsets[waiting]
-        waiting = waiting[find_in_free_space(means, cameras, renders)]
+        waiting = waiting[find_in_free_space(means, observed)]
         if len(waiting) == 0:
             break
         ratio[waiting] = (1 + SLIDE_STEP) ** (step + 1)
@@ -92,7 +125,7 @@ def respect_free_space(
         depths = compute_z_depths(gaussians.means[waiting], target)
         behind = (1 + SLIDE_STEP) * compute_sky_depth(target) / depths
         means = target.center + behind[:, None] * offsets[waiting]
-        found = ~find_in_free_space(means, cameras, renders)
+        found = ~find_in_free_space(means, observed)
         ratio[waiting[found]] = behind[found]
         waiting = waiting[~found]
     placed = torch.ones_like(ratio, dtype=torch.bool)
@@ -101,27 +134,31 @@ def respect_free_space(
 
 
 def find_in_free_space(
-    points: Float[Tensor, "n 3"], cameras: Sequence[Camera], renders: Sequence[Render]
+    points: Float[Tensor, "n 3"], observed: Sequence[Observed]
 ) -> Bool[Tensor, "n"]:
     """Find points in front of an observed surface, or inside the near distance of a camera."""
     left = torch.arange(len(points), device=points.device)
-    for camera, render in zip(cameras, renders, strict=True):
-        left = left[~is_before_surface(points[left], camera, render)]
+    for surfaces in observed:
+        left = left[~is_before_surface(points[left], surfaces)]
     return torch.ones(len(points), dtype=torch.bool, device=points.device).index_fill(
         0, left, False
     )
 
 
-def is_before_surface(
-    points: Float[Tensor, "n 3"], camera: Camera, render: Render
-) -> Bool[Tensor, "n"]:
-    """Mark points in front of what a camera observes, or inside of its near distance."""
+def is_before_surface(points: Float[Tensor, "n 3"], observed: Observed) -> Bool[Tensor, "n"]:
+    """Mark points in front of what a camera observes, or inside of its near distance.
+
+    A point that a surface hides is marked too if its footprint reaches over the edge of that
+    surface, to one behind the point.
+    """
+    camera = observed.camera
     pixels, z = project(points, camera)
     size = torch.tensor([camera.width, camera.height], device=pixels.device)
     visible = (z > 0) & (pixels > -BORDER).all(-1) & (pixels < size + BORDER).all(-1)
     nearest = torch.where(visible[:, None], pixels, 0.0).long().clamp_min(0)
     x, y = torch.minimum(nearest, size - 1).unbind(-1)
-    scene = render.depth_map()
-    before = z < (1 + CLEARANCE) * scene.depth[y, x]
+    depth = observed.depth[y, x]
+    before = z < (1 + CLEARANCE) * depth
+    beside = (depth > 0) & (z < (1 - FOOTPRINT_CLEARANCE) * observed.farthest[y, x])
     is_near = (points - camera.center).norm(dim=-1) < (camera.near or 0.0)
-    return (visible & scene.valid[y, x] & before) | is_near
+    return (visible & (before | beside)) | is_near

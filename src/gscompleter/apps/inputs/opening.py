@@ -8,7 +8,6 @@ import re
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, replace
-from functools import partial
 from pathlib import Path
 from typing import TypeVar
 
@@ -26,6 +25,7 @@ from gscompleter.apps.commands.options import (
     get_max_targets,
     parse_resolution,
 )
+from gscompleter.apps.inputs.given_depth import read_with_depth
 from gscompleter.apps.inputs.selection import (
     CHECK_VIEW_SIZE,
     choose_context,
@@ -37,7 +37,6 @@ from gscompleter.apps.report.names import name_photograph, name_target
 from gscompleter.data.camera_files import is_in_splat_frame, refuse_other_exports
 from gscompleter.data.formats import find_format, open_photographs, refuse_scenes_below
 from gscompleter.data.frame import FOLDERS
-from gscompleter.data.given_depth import give_depths
 from gscompleter.data.limits import check_planes
 from gscompleter.data.local_origin import (
     choose_scene_origin,
@@ -133,6 +132,8 @@ class Task:
     frame_description: str = "the frame of the photographs"
     check_views: Sequence[View] | None = None
     """Check views of the input splat, at low resolution."""
+    depth_notes: tuple[str, ...] = ()
+    """Sentences about the unit of the given depth."""
 
     @property
     def device(self) -> torch.device:
@@ -313,13 +314,18 @@ def make_task(
     ]
     cameras = [bounded.camera(frame, resolution) for frame in frames]
     check_sides([*cameras, *(target.camera for target in targets)])
-    load = bounded.views if options.no_given_depth else partial(give_depths, bounded)
+    depth_notes: tuple[str, ...] = ()
+    if options.no_given_depth:
+        views = bounded.views(frames, resolution)
+    else:
+        views, depth_notes = read_with_depth(bounded, frames, resolution)
     return Task(
-        [view.to(device) for view in load(frames, resolution)],
+        [view.to(device) for view in views],
         [add_photograph(target, bounded, options) for target in targets],
         compute_frame_from_photographs(given.origin),
         given.origin,
         find_depth_sources(options, given, bounded),
+        depth_notes=depth_notes,
     )
 
 
@@ -586,6 +592,7 @@ def describe_opening(options: SceneOptions, opened: Opened, task: Task) -> list[
         f"Found: {task.frame_description.rstrip('.')}; depths from {camera.near:.3g} to "
         f"{camera.far:.3g}; worked at {camera.width} x {camera.height} (--resolution changes it).",
         *describe_masks(opened.photographs, task),
+        *task.depth_notes,
     ]
 
 

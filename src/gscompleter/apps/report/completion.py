@@ -28,6 +28,7 @@ from gscompleter.apps.report.schema import (
     PairsRow,
     ScoreRow,
     TargetRow,
+    UnfilledRow,
 )
 from gscompleter.config.settings import COVERED
 from gscompleter.evaluation.metrics.coverage import RenderPair, compute_coverage
@@ -294,6 +295,7 @@ def make_target_row(
         derived_from=target.derived_from,
         recolored=result.num_recolored,
         target_id=result.target_id if len(added) or result.num_recolored else None,
+        unfilled=UnfilledRow(**vars(result.unfilled)),
         notes=result.notes,
         refused=result.refusal,
         offset=target.offset,

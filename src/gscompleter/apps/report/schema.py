@@ -90,6 +90,17 @@ class HeldOutRow(ScoreRow):
 
 
 @dataclass(frozen=True)
+class UnfilledRow:
+    """The part of the dilated hole mask, at the padded target, that stays empty."""
+
+    share: float = 0.0
+    lost_by: Mapping[str, float] = field(default_factory=dict)
+    """Share by the step or guard that lost it; empty if there is little."""
+    regions: tuple[tuple[int, int, int, int], ...] = ()
+    """Boxes (left, top, right, bottom) of the largest regions, in pixels of the target image."""
+
+
+@dataclass(frozen=True)
 class TargetRow(ScoreRow):
     """Result at a target."""
 
@@ -102,6 +113,7 @@ class TargetRow(ScoreRow):
     derived_from: int | None = None
     target_id: int | None = None
     """Value of `generated` of its Gaussians in completed.ply; None if nothing was changed."""
+    unfilled: UnfilledRow = UnfilledRow()
     notes: tuple[str, ...] = ()
     refused: str | None = None
     """Sentence why the target cannot be completed, or None if it can."""

@@ -1,0 +1,122 @@
+"""Photographs with the depth that a scene holds, in the unit of its cameras."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import replace
+
+import numpy as np
+import torch
+from jaxtyping import Float
+
+from gscompleter.data.given_depth import drop_unsure, give_depth, project_tracks
+from gscompleter.data.photographs import Photographs, Resolution
+from gscompleter.errors import InputError
+from gscompleter.reconstructors.features.depth_factor import (
+    MIN_SAMPLES,
+    DepthFactor,
+    DepthSamples,
+    compare_maps,
+    compare_with_matches,
+    fit_depth_factor,
+    join_samples,
+)
+from gscompleter.types import View
+
+WAY_OUT = "--no-given-depth leaves it out"
+
+
+def read_with_depth(
+    photographs: Photographs, frames: Sequence[int], resolution: Resolution = None
+) -> tuple[list[View], tuple[str, ...]]:
+    """Load photographs with their given depth in scene units, and say how its unit was found.
+
+    Raises InputError if it contradicts what the photographs and the points of the scene measure.
+    """
+    views = photographs.views(frames, resolution)
+    factor, note = 1.0, ""
+    if any(view.depth is not None for view in views):
+        factor, note = find_factor(photographs, frames, views, resolution)
+    held = [photographs.frame(frame) for frame in frames]
+    scaled = [scale_depth(view, factor) for view in views]
+    pairs = zip(scaled, held, strict=True)
+    given = [give_depth(view, frame, photographs.origin) for view, frame in pairs]
+    return given, (note,) if note else ()
+
+
+def scale_depth(view: View, factor: float) -> View:
+    """Multiply the measured depth of a view."""
+    if view.depth is None or factor == 1.0:
+        return view
+    return replace(view, depth=view.depth * factor)
+
+
+def find_factor(
+    photographs: Photographs,
+    frames: Sequence[int],
+    views: Sequence[View],
+    resolution: Resolution,
+) -> tuple[float, str]:
+    """Find the factor from the measured depth to scene units, and the sentence about it, or none.
+
+    The photographs after those of the context take part if these alone tell too little: if they are
+    far apart, or if there is only one.
+    """
+    samples = compare(photographs, frames, views)
+    if len(samples) < MIN_SAMPLES:
+        more = sorted({min(f + 1, len(photographs) - 1) for f in frames} - set(frames))
+        usable = [f for f in more if photographs.frame(f).has_photograph()]
+        both = [*frames, *usable]
+        samples = compare(photographs, both, [*views, *photographs.views(usable, resolution)])
+    fit = fit_depth_factor(samples)
+    if fit is None:
+        return 1.0, (
+            "The photographs show too little to compare the depth that the scene holds with; it is "
+            f"used as it is, in the unit of the cameras ({WAY_OUT})."
+        )
+    if not fit.is_consistent:
+        raise InputError(describe_contradiction(samples))
+    return fit.factor, describe_factor(fit, samples)
+
+
+def compare(photographs: Photographs, frames: Sequence[int], views: Sequence[View]) -> DepthSamples:
+    """Compare the measured depths of photographs with their tracks or points, and with matches."""
+    points = photographs.points()
+    parts, maps = [], []
+    for number, view in enumerate(views):
+        frame = photographs.frame(frames[number])
+        depth = torch.zeros_like(view.image[..., 0])
+        if view.depth is not None:
+            depth = drop_unsure(view.depth, frame)
+        tracks = project_tracks(frame, view, photographs.origin, points)
+        parts.append(compare_maps(depth, tracks, number))
+        maps.append(depth)
+    return join_samples([*parts, compare_with_matches(views, maps)])
+
+
+def describe_factor(fit: DepthFactor, samples: DepthSamples) -> str:
+    """Write the sentence about a factor; empty if nothing is changed."""
+    if fit.factor == 1.0:
+        return ""
+    return (
+        f"The depth that the scene holds is {1 / fit.factor:.3g} times what its photographs and "
+        f"points measure ({fit.agreement:.0%} of {len(samples):,} compared depths agree); it is "
+        f"multiplied by {fit.factor:.4g} ({WAY_OUT})."
+    )
+
+
+def describe_contradiction(samples: DepthSamples) -> str:
+    """Write the error for depths that no factor explains, with both ranges."""
+    given, measured = (describe_range(values) for values in (samples.given, samples.measured))
+    return (
+        f"The depth that the scene holds ({given} at {len(samples):,} compared pixels) contradicts "
+        f"what its photographs and points measure there ({measured}), and no single factor "
+        "explains it; give z-depth in one unit for all photographs, or leave it out with "
+        "--no-given-depth."
+    )
+
+
+def describe_range(depths: Float[np.ndarray, "n"]) -> str:
+    """Write the range of depths without the outermost 2 % on both sides."""
+    low, high = np.quantile(depths, [0.02, 0.98])
+    return f"{low:.3g} to {high:.3g}"
