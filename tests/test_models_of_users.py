@@ -151,6 +151,10 @@ def write_by_numpy(nearest, target, context):
         (painting(lambda image: image.to_sparse()), "a sparse tensor"),
         (painting(lambda image: image[1:]), "has to return a finite image of shape"),
         (painting(lambda image: GeneratorOutput(image, notes=(1,))), "a tuple of sentences"),
+        (
+            painting(lambda image: GeneratorOutput(image, is_photograph=torch.ones(2))),
+            "is_photograph of the generator has to be True or False",
+        ),
         (lambda *_: None, "and returned None"),
         (lambda *_: "image", "and returned 'image'"),
         (Batch(0, []), "max_batch_size of the generator .* is 0"),

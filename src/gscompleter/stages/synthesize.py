@@ -106,10 +106,16 @@ def convert_output(output: object, target: Camera) -> GeneratedView:
             f"The notes of the generator have to be a tuple of sentences, and are "
             f"{describe(output.notes)}."
         )
+    for name in ("is_inconsistent", "is_photograph"):
+        if not isinstance(getattr(output, name), bool):
+            raise InputError(
+                f"The {name} of the generator has to be True or False, and is "
+                f"{describe(getattr(output, name))}."
+            )
     return GeneratedView(
         image.detach(),
         target,
         notes=tuple(output.notes),
-        is_inconsistent=bool(output.is_inconsistent),
-        is_photograph=bool(output.is_photograph),
+        is_inconsistent=output.is_inconsistent,
+        is_photograph=output.is_photograph,
     )
