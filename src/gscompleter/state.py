@@ -134,7 +134,7 @@ class TargetResult:
     synthesis_notes: tuple[str, ...] = ()
     """Sentences of the generator about its image."""
     unfilled: Unfilled = Unfilled()
-    """What is left of the hole, unless the target was rejected or skipped."""
+    """Part of the hole that stays empty, unless the target was rejected or skipped."""
     rejection: Rejection = Rejection()
     refusal: str | None = None
     """Sentence why the target cannot be completed, or None if it can."""

@@ -17,6 +17,7 @@ from pathlib import Path
 from urllib.parse import urlsplit
 
 import numpy as np
+import plyfile
 import pytest
 import torch
 
@@ -26,6 +27,7 @@ from gscompleter.apps.report.schema import (
     AlignmentRow,
     CompletionSummary,
     ContextRow,
+    OutcomeRow,
     ResultFrame,
     SceneRow,
     TargetRow,
@@ -326,6 +328,7 @@ def completion_in(folder: Path, transform: np.ndarray, origin: np.ndarray) -> Pa
         seed=0,
         device="cpu",
         scene=SceneRow("nerfstudio", 1, 1),
+        outcome=OutcomeRow("completed", "The scene is completed."),
         frame=ResultFrame("similarity", tuple(map(tuple, transform.tolist())), tuple(origin)),
         depth_range={},
         coverage=Coverage(0.5, 1.0, 32),
@@ -487,10 +490,10 @@ def header_only(path: Path) -> None:
 
 
 def with_nan(path: Path) -> None:
-    gaussians = room_from(LEFT, 0)
-    means = gaussians.means.clone()
-    means[0] = torch.nan
-    save_ply(path, replace(gaussians, means=means))
+    save_ply(path, room_from(LEFT, 0))
+    content = plyfile.PlyData.read(path)
+    content["vertex"].data["x"][0] = np.nan
+    content.write(path)
 
 
 @pytest.mark.parametrize(

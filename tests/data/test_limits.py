@@ -130,7 +130,7 @@ def test_a_photograph_on_its_side_is_refused(tmp_path):
         Image.new("RGB", (w, h)).save(tmp_path / "a.png")
         assert load_views(tmp_path)[0].camera.width == w
     Image.new("RGB", (20, 30)).save(tmp_path / "a.png")
-    with pytest.raises(InputError, match="has 20 × 30 pixels, but its `w` and `h` are 60 × 40"):
+    with pytest.raises(InputError, match="has 20 × 30 pixels, and its camera 60 × 40"):
         load_views(tmp_path)
 
 

@@ -434,8 +434,9 @@ def image_of(tmp_path: Path, pixels: np.ndarray, mode: str | None = None) -> lis
 
 
 def test_pictures_of_every_kind_become_colours(tmp_path):
-    faint = np.full((8, 9, 4), 255, np.uint8)
-    faint[..., 3] = 51
+    # An alpha of more than a half hides nothing: the colour is the one that was stored.
+    faint = np.full((8, 9, 4), 51, np.uint8)
+    faint[..., 3] = 204
     assert image_of(tmp_path, faint) == pytest.approx([0.2, 0.2, 0.2])
     assert image_of(tmp_path, np.full((8, 9), 51, np.uint8)) == pytest.approx([0.2] * 3)
     assert image_of(tmp_path, np.full((8, 9), 51 * 257, np.uint16)) == pytest.approx([0.2] * 3)

@@ -259,7 +259,6 @@ def test_all_of_the_paper_on_photographs(clips, tmp_path, monkeypatch):
     ("more", "sentence"),
     [
         (("--table", "stress", "--protocol", "stress-2-70"), "no clip has the frames"),
-        (("--figure", "seams", "--figure-cases", "x 0>1"), "there are 'a 0+2>4', 'b 0+2>4'"),
         (("--table", "steps", "--generator", "warp-inpaint"), "FLUX.1-Kontext"),
         (("--reconstructor", "plane-sweep", "plane-sweep"), "is named twice"),
         (
@@ -273,4 +272,14 @@ def test_what_cannot_be_made_is_a_sentence(more, sentence, rooms, tmp_path, monk
     assert reproduce(monkeypatch, rooms, tmp_path, *more) == 2
     error = " ".join(capsys.readouterr().err.split())
     assert sentence in error
+    assert "Traceback" not in error
+
+
+def test_a_case_that_no_figure_can_show_is_named_once_the_cases_are_there(
+    rooms, tmp_path, monkeypatch, capsys
+):
+    more = ("--figure", "seams", "--figure-cases", "x 0>1")
+    assert reproduce(monkeypatch, rooms, tmp_path, *more) == 1
+    error = " ".join(capsys.readouterr().err.split())
+    assert "there are 'a 0+2>4', 'b 0+2>4'" in error
     assert "Traceback" not in error

@@ -189,8 +189,9 @@ def test_ours_improves_every_view_of_a_sequence_and_stays_metric(begun, ours):
     for step in ours.steps:
         assert step.scores.target_after.psnr > step.scores.target_before.psnr + 2
         assert step.psnr_end > step.scores.target_after.psnr - 0.1
-        # The median of some 50 pixels.
-        assert step.depth_scale == pytest.approx(1.1, abs=0.15)
+        # The median of some 50 pixels at the rim of the hole, where free space moves additions
+        # behind the objects that hide them: more than 1.
+        assert step.depth_scale == pytest.approx(1.2, abs=0.2)
     assert compute_scale_drift([step.depth_scale for step in ours.steps]) < 0.15
     assert ours.steps[-1].psnr_end == ours.steps[-1].scores.target_after.psnr
     assert torch.equal(ours.scene.means[: len(begun.context)], begun.context.means)

@@ -78,8 +78,8 @@ def test_values_that_mean_nothing_are_refused(key, value, message):
 
 def test_the_command_refuses_them_too_and_writes_nothing(tmp_path, capsys, monkeypatch):
     cameras = [camera_at(x, size=32) for x in (-0.3, 0.1, 0.6)]
-    photographed(tmp_path, cameras)
-    words = ["complete", tmp_path, "--context", 0, 1, "--target", 2, "--out", tmp_path / "out"]
+    scene = photographed(tmp_path / "scene", cameras)
+    words = ["complete", scene, "--context", 0, 1, "--target", 2, "--out", tmp_path / "out"]
     assert run(monkeypatch, *words, "--generator-batch-size", 8) == 2
     printed = capsys.readouterr().err
     assert "'warp-inpaint' has no setting batch_size; leave it out, or choose pe-field" in printed

@@ -21,6 +21,7 @@ from gscompleter.data.frame import describe_moved
 from gscompleter.data.masks import attach_masks
 from gscompleter.data.photographs import MAX_TRANSLATION, Photographs, Resolution
 from gscompleter.errors import InputError, quote_value
+from gscompleter.io.output_folder import holds_results
 from gscompleter.io.reading import read_json
 from gscompleter.types import View
 
@@ -97,15 +98,23 @@ class SkippedScene:
     reason: str
 
 
+def list_scenes(path: Path) -> list[Path]:
+    """List the scenes in a folder of scenes, without results of ours; else the path itself."""
+    inside = [] if find_format(path) or not os.path.isdir(path) else sorted(path.iterdir())
+    folders = [
+        child
+        for child in inside
+        if child.is_dir() and find_format(child) and not holds_results(child)
+    ]
+    return folders or [path]
+
+
 def open_clips(path: Path | str) -> Iterator[Photographs]:
     """Open the scenes in a file or folder of any format, or a folder of such, one at a time.
 
     For a vehicle with several cameras only the front camera is used.
     """
-    path = Path(path)
-    inside = [] if find_format(path) or not os.path.isdir(path) else sorted(path.iterdir())
-    folders = [child for child in inside if child.is_dir() and find_format(child)]
-    scenes = [(FORMATS[detect_format(place)], place) for place in folders or [path]]
+    scenes = [(FORMATS[detect_format(place)], place) for place in list_scenes(Path(path))]
     for format, place in scenes:
         for clip in format.open(place):
             ahead = [frame for frame in clip.frames if clip.front in (None, frame.sensor)]

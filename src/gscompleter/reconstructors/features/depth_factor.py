@@ -36,7 +36,7 @@ and in each one: relative depth has another factor in each."""
 MIN_CORRELATION = -0.3
 """Smallest rank correlation of given and measured depths. Inverted depth comes near -1."""
 NOISE = np.log(1.1)
-"""Logarithm of a factor that is not told from 1: errors of poses scale all depths of a pair."""
+"""Logarithm of a factor that counts as 1, since errors of poses scale all depths of a pair."""
 MAD_TO_SIGMA = 1.4826
 """Standard deviation of a normal distribution over its median absolute deviation."""
 
@@ -85,8 +85,11 @@ def compare_maps(
 ) -> DepthSamples:
     """Compare two depth maps of a photograph where both are known (above 0)."""
     known = (given > 0) & (measured > 0)
-    values = (depth[known].double().numpy() for depth in (given, measured))
-    return DepthSamples(*values, np.full(int(known.sum()), photograph))
+    return DepthSamples(
+        given[known].double().numpy(),
+        measured[known].double().numpy(),
+        np.full(int(known.sum()), photograph),
+    )
 
 
 def compare_with_matches(
@@ -95,7 +98,7 @@ def compare_with_matches(
     """Compare depth maps with the triangulated feature matches of neighbouring photographs.
 
     Features are used instead of the plane sweep: it searches between a near and a far plane, and
-    these may come from the depths that are in doubt.
+    these may come from the depths in question.
     """
     apart = [measure_baseline(views[0].camera, view.camera) for view in views[1:]]
     if not any(apart):
