@@ -85,8 +85,11 @@ def compare_maps(
 ) -> DepthSamples:
     """Compare two depth maps of a photograph where both are known (above 0)."""
     known = (given > 0) & (measured > 0)
-    values = (depth[known].double().numpy() for depth in (given, measured))
-    return DepthSamples(*values, np.full(int(known.sum()), photograph))
+    return DepthSamples(
+        given[known].double().numpy(),
+        measured[known].double().numpy(),
+        np.full(int(known.sum()), photograph),
+    )
 
 
 def compare_with_matches(
@@ -134,9 +137,10 @@ def fit_depth_factor(samples: DepthSamples) -> DepthFactor | None:
     if abs(log_factor) <= max(NOISE, sigma):
         log_factor = 0.0
     agrees = np.abs(ratios - log_factor) <= AGREEMENT
-    shares = [agrees.mean(), *measure_shares(agrees, samples.photograph)]
+    agreement = float(agrees.mean())
+    shares = [agreement, *measure_shares(agrees, samples.photograph)]
     is_consistent = min(shares) >= MIN_AGREEMENT and correlate_ranks(samples) >= MIN_CORRELATION
-    return DepthFactor(float(np.exp(log_factor)), float(agrees.mean()), is_consistent)
+    return DepthFactor(float(np.exp(log_factor)), agreement, is_consistent)
 
 
 def measure_shares(agrees: Bool[np.ndarray, "n"], photograph: Int[np.ndarray, "n"]) -> list[float]:
