@@ -1,4 +1,4 @@
-"""What stays empty of a hole is measured, and the step that lost it is named."""
+"""The part of a hole that stays empty is measured, and the step that lost it is named."""
 
 from functools import cache
 

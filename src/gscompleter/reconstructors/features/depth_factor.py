@@ -36,7 +36,7 @@ and in each one: relative depth has another factor in each."""
 MIN_CORRELATION = -0.3
 """Smallest rank correlation of given and measured depths. Inverted depth comes near -1."""
 NOISE = np.log(1.1)
-"""Logarithm of a factor that is not told from 1: errors of poses scale all depths of a pair."""
+"""Logarithm of a factor that cannot be distinguished from 1: errors of poses scale all depths of a pair."""
 MAD_TO_SIGMA = 1.4826
 """Standard deviation of a normal distribution over its median absolute deviation."""
 
@@ -62,7 +62,7 @@ class DepthFactor:
     """The factor from given depths to scene units."""
 
     factor: float
-    """1 if the given depths are in scene units, as far as the measurement tells."""
+    """1 if the given depths are in scene units, as far as the measurement shows."""
     agreement: float
     """Share of the samples that agree with it."""
     is_consistent: bool
