@@ -41,6 +41,8 @@ LOSSES = {
     "free-space": "additions would occlude what cameras see through to (free-space)",
     "removal": "nothing was removed there (removal)",
     "refine": "the photographs beside the target contradict the additions (refinement)",
+    "image-agreement": "the image contradicts the photographs (image-agreement)",
+    "depth-agreement": "the depths contradict the scene (depth-agreement)",
     "psnr": "additions there make photographs worse (psnr)",
     "contribution": "additions there are hardly visible (contribution)",
 }
@@ -134,7 +136,7 @@ class TargetResult:
     synthesis_notes: tuple[str, ...] = ()
     """Sentences of the generator about its image."""
     unfilled: Unfilled = Unfilled()
-    """Part of the hole that stays empty, unless the target was rejected or skipped."""
+    """The part of the hole that stays empty; nothing for a target that was skipped."""
     rejection: Rejection = Rejection()
     refusal: str | None = None
     """Sentence why the target cannot be completed, or None if it can."""
@@ -162,8 +164,7 @@ class TargetResult:
         notes.append(AFFINE_NOTES[self.affine.method])
         if self.rejection.guard:
             notes += [self.rejection.reason, NOTHING_ADDED]
-        else:
-            notes.append(self.unfilled.describe())
+        notes.append(self.unfilled.describe())
         return tuple(filter(None, notes))
 
 

@@ -108,7 +108,7 @@ def make_edge(columns: int) -> Render:
 
 
 def at_pixels(columns: list[float], depth: float) -> torch.Tensor:
-    """Place points of that depth in the middle row of the other view."""
+    """Place points of that depth in the middle row of that camera."""
     x = (torch.tensor(columns) - SIZE / 2) * depth / WITNESS.K[0, 0]
     points = torch.stack([x, torch.zeros_like(x), torch.full_like(x, depth)], dim=-1)
     return points @ WITNESS.c2w[:3, :3].T + WITNESS.center

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from contextlib import suppress
 from dataclasses import replace
 
 import numpy as np
@@ -64,10 +65,8 @@ def find_factor(
     """
     samples = compare(photographs, frames, views)
     if len(samples) < MIN_SAMPLES:
-        more = sorted({min(f + 1, len(photographs) - 1) for f in frames} - set(frames))
-        usable = [f for f in more if photographs.frame(f).has_photograph()]
-        both = [*frames, *usable]
-        samples = compare(photographs, both, [*views, *photographs.views(usable, resolution)])
+        more = read_next(photographs, frames, resolution)
+        samples = compare(photographs, [*frames, *more], [*views, *more.values()])
     fit = fit_depth_factor(samples)
     if fit is None:
         return 1.0, (
@@ -77,6 +76,18 @@ def find_factor(
     if not fit.is_consistent:
         raise InputError(describe_contradiction(samples))
     return fit.factor, describe_factor(fit, samples)
+
+
+def read_next(
+    photographs: Photographs, frames: Sequence[int], resolution: Resolution
+) -> dict[int, View]:
+    """Load the photographs after those of `frames`, by frame; those that cannot be are left out."""
+    last = len(photographs) - 1
+    found = {}
+    for frame in sorted({min(frame + 1, last) for frame in frames} - set(frames)):
+        with suppress(InputError):
+            (found[frame],) = photographs.views([frame], resolution)
+    return found
 
 
 def compare(photographs: Photographs, frames: Sequence[int], views: Sequence[View]) -> DepthSamples:

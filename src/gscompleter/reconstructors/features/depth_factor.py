@@ -36,7 +36,7 @@ and in each one: relative depth has another factor in each."""
 MIN_CORRELATION = -0.3
 """Smallest rank correlation of given and measured depths. Inverted depth comes near -1."""
 NOISE = np.log(1.1)
-"""Logarithm of a factor that counts as 1, since errors of poses scale all depths of a pair."""
+"""Logarithm of a factor that cannot be distinguished from 1: errors of poses scale all depths of a pair."""
 MAD_TO_SIGMA = 1.4826
 """Standard deviation of a normal distribution over its median absolute deviation."""
 
@@ -62,7 +62,7 @@ class DepthFactor:
     """The factor from given depths to scene units."""
 
     factor: float
-    """1 if the given depths are in scene units, as far as the measurement tells."""
+    """1 if the given depths are in scene units, as far as the measurement shows."""
     agreement: float
     """Share of the samples that agree with it."""
     is_consistent: bool
@@ -137,9 +137,10 @@ def fit_depth_factor(samples: DepthSamples) -> DepthFactor | None:
     if abs(log_factor) <= max(NOISE, sigma):
         log_factor = 0.0
     agrees = np.abs(ratios - log_factor) <= AGREEMENT
-    shares = [agrees.mean(), *measure_shares(agrees, samples.photograph)]
+    agreement = float(agrees.mean())
+    shares = [agreement, *measure_shares(agrees, samples.photograph)]
     is_consistent = min(shares) >= MIN_AGREEMENT and correlate_ranks(samples) >= MIN_CORRELATION
-    return DepthFactor(float(np.exp(log_factor)), float(agrees.mean()), is_consistent)
+    return DepthFactor(float(np.exp(log_factor)), agreement, is_consistent)
 
 
 def measure_shares(agrees: Bool[np.ndarray, "n"], photograph: Int[np.ndarray, "n"]) -> list[float]:
