@@ -491,7 +491,7 @@ def header_only(path: Path) -> None:
 
 def with_nan(path: Path) -> None:
     save_ply(path, room_from(LEFT, 0))
-    content = plyfile.PlyData.read(path)
+    content = plyfile.PlyData.read(path, mmap=False)
     content["vertex"].data["x"][0] = np.nan
     content.write(path)
 

@@ -36,7 +36,7 @@ and in each one: relative depth has another factor in each."""
 MIN_CORRELATION = -0.3
 """Smallest rank correlation of given and measured depths. Inverted depth comes near -1."""
 NOISE = np.log(1.1)
-"""Logarithm of a factor that cannot be distinguished from 1: errors of poses scale all depths of a pair."""
+"""Largest logarithm that counts as no factor: errors of poses scale all depths of a pair."""
 MAD_TO_SIGMA = 1.4826
 """Standard deviation of a normal distribution over its median absolute deviation."""
 
@@ -97,8 +97,12 @@ def compare_with_matches(
 ) -> DepthSamples:
     """Compare depth maps with the triangulated feature matches of neighbouring photographs.
 
-    Features are used instead of the plane sweep: it searches between a near and a far plane, and
-    these may come from the depths in question.
+        Features are used instead of the plane sweep: it searches between a near and a far plane, and
+    <<<<<<< HEAD
+        these may come from the depths in question.
+    =======
+        these may come from the very depths that are compared.
+    >>>>>>> f58-depth
     """
     apart = [measure_baseline(views[0].camera, view.camera) for view in views[1:]]
     if not any(apart):
