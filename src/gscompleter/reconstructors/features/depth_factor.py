@@ -97,12 +97,8 @@ def compare_with_matches(
 ) -> DepthSamples:
     """Compare depth maps with the triangulated feature matches of neighbouring photographs.
 
-        Features are used instead of the plane sweep: it searches between a near and a far plane, and
-    <<<<<<< HEAD
-        these may come from the depths in question.
-    =======
-        these may come from the very depths that are compared.
-    >>>>>>> f58-depth
+    Features are used instead of the plane sweep: it searches between a near and a far plane, and
+    these may come from the very depths that are compared.
     """
     apart = [measure_baseline(views[0].camera, view.camera) for view in views[1:]]
     if not any(apart):
