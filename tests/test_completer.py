@@ -398,7 +398,8 @@ def test_what_the_photographs_contradict_is_reported_and_not_added():
     refused = completer(context, target)
     (result,) = refused.targets
     assert len(refused.added) == len(result.added) == 0
-    assert result.notes == ("It is another room.", "Nothing of it was added.")
+    assert result.notes[:2] == ("It is another room.", "Nothing of it was added.")
+    assert "stay" in result.notes[2]  # the hole, and the step that left it open
     assert result.reference is not None
     assert torch.equal(result.after.image, result.before.image)
     literal = replace(completer, config=CompleterConfig.paper())(context, target)
@@ -431,7 +432,7 @@ def test_depths_that_the_scene_contradicts_are_reported_and_not_added(tmp_path):
     assert said["added"] == 0
     assert said["affine"]["agreement"] < 0.1
     assert "of the scene that the target sees agrees with the depths of the" in said["notes"][0]
-    assert said["notes"][-1] == "Nothing of it was added."
+    assert "Nothing of it was added." in said["notes"]
     literal = replace(completer, config=CompleterConfig.paper())(context, target)
     assert len(literal.added) > 0
 

@@ -65,10 +65,15 @@ def _has_form(
 ) -> bool:
     if tensor.dtype not in dtypes or len(tensor.shape) != len(shape):
         return False
-    if tensor.layout is not torch.strided or tensor.is_meta:
+    if tensor.layout is not torch.strided or _lacks_values(tensor):
         return False
     sides = zip(shape, tensor.shape, strict=True)
     return all(length is None or length == side for length, side in sides)
+
+
+def _lacks_values(tensor: Tensor) -> bool:
+    """Return True for a tensor that is a shape alone; subclasses may keep values of their own."""
+    return type(tensor) is Tensor and tensor.is_meta
 
 
 def iterate_tensors(value: object, name: str) -> Iterator[tuple[str, Tensor]]:
@@ -96,7 +101,7 @@ def describe(value: object) -> str:
     if not isinstance(value, Tensor):
         return f"of type {type(value).__name__}"
     layout = "" if value.layout is torch.strided else "sparse "
-    place = " without values" if value.is_meta else ""
+    place = " without values" if _lacks_values(value) else ""
     shape = quote_value(list(value.shape))
     return f"a {layout}tensor of {name_dtype(value.dtype)} and shape {shape}{place}"
 

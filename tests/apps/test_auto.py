@@ -83,10 +83,10 @@ def test_a_dry_run_writes_the_cameras_alone_and_shows_them(scene, tmp_path, monk
     out = tmp_path / "out"
     said = [word for word in QUICK if word != "--quiet"]
     assert run(monkeypatch, "complete", scene, "--out", out, "--auto", 2, "--dry-run", *said) == 0
-    assert [path.name for path in out.iterdir()] == ["targets.json"]
+    assert sorted(path.name for path in out.iterdir()) == ["summary.json", "targets.json"]
     cameras = load_cameras(out / "targets.json")
     shown = " ".join(capsys.readouterr().out.split())
-    assert f"{len(cameras)}: target near " in shown
+    assert f"{len(cameras)}: near photograph " in shown
     assert f"Edit the cameras in {out / 'targets.json'}." in shown
 
 
@@ -123,7 +123,7 @@ def test_a_scene_that_was_brought_is_explored_with_its_doubts(
     )
     assert near < 0.5
     shown = " ".join(capsys.readouterr().out.split())
-    assert "1: target near " in shown
+    assert "1: near photograph " in shown
 
 
 def test_of_a_splat_the_trusted_share_is_said_and_written(

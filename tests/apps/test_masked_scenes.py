@@ -124,8 +124,10 @@ def test_one_line_says_what_was_found(scenes, tmp_path, monkeypatch, capsys):
 
 def test_masks_are_left_out_on_request(scenes, tmp_path, monkeypatch):
     words = ("--context", 1, 3, "--target", 5, *SIZE, "--quiet", "--no-masks", "--out", tmp_path)
-    assert run(monkeypatch, "complete", scenes["masks"], *words) == 0
+    # What the masks hid contradicts the other photographs: the scene does not reconstruct.
+    assert run(monkeypatch, "complete", scenes["masks"], *words) == 1
     summary = read_summary(tmp_path)
+    assert summary["outcome"]["status"] == "not-reconstructed"
     assert [row["ignored"] for row in summary["context"]] == [0, 0]
     assert summary["targets"][0]["psnr_after"] < 18
 

@@ -95,7 +95,7 @@ def test_the_painted_image_ends_in_the_splat(found, tmp_path):
     assert (shown - image[0]).abs()[~inside].mean() < 0.05
     assert sorted(file.name for file in Path(path).parent.iterdir()) == [
         *("after.png", "before.png", "completed.ply", "context.ply", "generated.ply"),
-        "painted.png",
+        *("painted.png", "summary.json"),
     ]
 
 

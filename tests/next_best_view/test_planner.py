@@ -233,7 +233,7 @@ def test_nothing_is_added_before_what_a_bystander_sees(begun):
     for state in (begun, watched):
         scene = completer.advance(state, target).scene
         hidden.append(sum(nearer(scene, begun.scene, camera) for camera in aside))
-    assert hidden[1] < 0.6 * hidden[0]
+    assert hidden[1] < 0.9 * hidden[0]
 
 
 def nearer(scene: Gaussians, before: Gaussians, camera: Camera) -> float:

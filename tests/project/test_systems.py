@@ -16,7 +16,11 @@ UNIX_MODULES = {"fcntl", "grp", "posix", "pty", "pwd", "resource", "syslog", "te
 UNIX_NAMES = {"fork", "forkpty", "getuid", "geteuid", "getpgid", "killpg", "mkfifo", "nice"}
 UNIX_NAMES |= {"setsid", "statvfs", "sched_getaffinity", "sysconf", "uname", "wait4"}
 UNIX_NAMES |= {"SIGALRM", "SIGHUP", "SIGKILL", "SIGPIPE", "SIGUSR1", "Signals"}
-GUARDED = {("cpu_threads.py", "sched_getaffinity"), ("memory.py", "sysconf")}
+GUARDED = {
+    ("cpu_threads.py", "sched_getaffinity"),
+    ("kernels/cache.py", "getuid"),
+    ("memory.py", "sysconf"),
+}
 """Names that a condition or `suppress` precedes."""
 ENCODED = {"read_text": 0, "write_text": 1, "TextIOWrapper": 1}
 """Positions of the encoding."""
