@@ -131,7 +131,9 @@ def _parse_frame(
     # Of nerfstudio, or of NeRFCapture.
     depth = locate_file("depth_file_path") or locate_file("depth_path")
     c2w = get_array(entry, "transform_matrix", title, (3, 4), (4, 4))
-    image, name, is_moved = None, str(position), False
+    image = None
+    name = str(position)
+    is_moved = False
     if file_path is not None:
         image = locate(path.parent, file_path, partial(find_image, listings=listings))
         endings = list_endings(file_path)

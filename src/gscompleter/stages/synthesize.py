@@ -86,7 +86,8 @@ def convert_output(output: object, target: Camera) -> GeneratedView:
             f"The generator has to return a GeneratorOutput per request, and returned "
             f"{describe(output)}."
         )
-    image, shape = output.image, (target.height, target.width, 3)
+    image = output.image
+    shape = (target.height, target.width, 3)
     is_image = isinstance(image, Tensor) and image.layout is torch.strided
     if not is_image or image.dtype is not torch.float32 or tuple(image.shape) != shape:
         raise InputError(

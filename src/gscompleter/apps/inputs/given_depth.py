@@ -35,7 +35,8 @@ def read_with_depth(
     Raises InputError if it contradicts what the photographs and the points of the scene measure.
     """
     views = photographs.views(frames, resolution)
-    factor, note = 1.0, ""
+    factor = 1.0
+    note = ""
     if any(view.depth is not None for view in views):
         factor, note = find_factor(photographs, frames, views, resolution)
     held = [photographs.frame(frame) for frame in frames]

@@ -207,7 +207,8 @@ def choose_working_size(options: AnyOptions, given: Photographs, console: Consol
     """
     if options.resolution is not None:
         return options
-    side, trained = LONG_SIDE, None
+    side = LONG_SIDE
+    trained = None
     if options.scene is not None:
         some = collect_usable_cameras(given, range(min(len(given), MAX_NAMED)), LONG_SIDE)
         trained = find_training_size(options.scene, options.folder, given, list(some))

@@ -228,7 +228,8 @@ def score_held_out(
 def score_photograph(completion: Completion, view: View, renderer: Renderer) -> HeldOutRow:
     """Score a held-out photograph where the completed scene covers it."""
     pair = render_before_after(completion, view.camera, renderer)
-    truth, valid = view.image, view.valid_mask
+    truth = view.image
+    valid = view.valid_mask
     covered_before = (pair.before.alpha >= COVERED) & valid
     covered_after = (pair.after.alpha >= COVERED) & valid
     num_valid = max(int(valid.sum()), 1)
