@@ -34,7 +34,7 @@ class ViewerLibraries(BuildHookInterface[Any]):
         """Write the libraries to a file, or warn that `view` will fetch them when it first runs."""
         sys.path.insert(0, str(Path(self.root) / "src"))
         from gscompleter.apps.viewer.packages import LOCK_FILE, extract_libraries
-        from gscompleter.errors import InputError
+        from gscompleter.system.errors import InputError
 
         try:
             libraries = extract_libraries(LOCK_FILE)

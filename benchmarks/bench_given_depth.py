@@ -19,8 +19,8 @@ from statistics import fmean
 import torch
 
 from gscompleter import GSCompleter, View
-from gscompleter.data.cases import read_cases
 from gscompleter.data.given_depth import drop_edges, drop_hidden
+from gscompleter.evaluation.cases import read_cases
 from gscompleter.evaluation.metrics.geometry import compare_depths
 from gscompleter.evaluation.metrics.image import compute_masked_psnr
 

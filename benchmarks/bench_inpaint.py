@@ -23,14 +23,14 @@ from skimage.restoration import inpaint_biharmonic
 from torch import Tensor
 
 from gscompleter.apps.report.completion import join_images
-from gscompleter.data.cases import Case, read_cases
+from gscompleter.evaluation.cases import Case, read_cases
 from gscompleter.generators.warp import WarpedImage, warp_photographs
 from gscompleter.generators.warp_inpaint import WarpInpaint
-from gscompleter.image_ops import push_pull
-from gscompleter.io.image import write_image
+from gscompleter.numerics.image_ops import push_pull
 from gscompleter.reconstructors import load_reconstructor
-from gscompleter.render import load_renderer
+from gscompleter.render.loading import load_renderer
 from gscompleter.stages.select_anchor import find_nearest_view
+from gscompleter.system.files.image import write_image
 from gscompleter.types import GeneratorInput, View
 
 Image = Float[Tensor, "h w 3"]

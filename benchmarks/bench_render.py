@@ -17,7 +17,7 @@ import tyro
 
 from gscompleter import Gaussians, View, load_renderer, merge
 from gscompleter.apps.commands.demo import get_motorcycle_cameras, move_right
-from gscompleter.geometry import pad_camera
+from gscompleter.numerics.geometry import pad_camera
 from gscompleter.types import make_observed, sh_from_rgb
 
 

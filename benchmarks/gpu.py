@@ -44,9 +44,9 @@ from gscompleter.models.tables import DEPTH_PREDICTORS
 from gscompleter.models.weights.fetching import find_cached
 from gscompleter.models.weights.published import PUBLISHED
 from gscompleter.reconstructors.depth_predictors import load_depth_predictor
-from gscompleter.render import FrozenScene, Renderer
+from gscompleter.render.protocols import FrozenScene, Renderer
 from gscompleter.render.redraw import RedrawnScene
-from gscompleter.timing import STAGE_PREFIX, STAGES
+from gscompleter.system.timing import STAGE_PREFIX, STAGES
 from gscompleter.types import Camera, GeneratorInput, merge
 from scenes import Room, camera_at, gaussians_of, photographed, view_of
 

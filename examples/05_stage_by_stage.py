@@ -11,7 +11,7 @@ import sys
 import torch
 
 import gscompleter as gsc
-from gscompleter.geometry import pad_camera
+from gscompleter.numerics.geometry import pad_camera
 from gscompleter.render.cache import SceneRenderer
 from gscompleter.stages.align_depth import align_depth
 from gscompleter.stages.filter_holes import filter_holes

@@ -12,14 +12,15 @@ from jaxtyping import install_import_hook
 
 from paths import DATA, PACKAGE
 
-# The whole package except `gscompleter.kernels`, whose functions numba compiles.
+# The whole package except `gscompleter.numerics.kernels`, whose functions numba compiles. The name
+# of a package stands for all modules in it, so those of `numerics` are listed one by one.
 CHECKED = sorted(
-    path.stem
-    for path in PACKAGE.iterdir()
+    ".".join(path.relative_to(PACKAGE.parent).with_suffix("").parts)
+    for path in [*PACKAGE.iterdir(), *(PACKAGE / "numerics").iterdir()]
     if (path.suffix == ".py" or (path / "__init__.py").exists())
-    and path.stem not in ("__init__", "kernels")
+    and path.stem not in ("__init__", "numerics", "kernels")
 )
-install_import_hook([f"gscompleter.{name}" for name in CHECKED], "beartype.beartype")
+install_import_hook(CHECKED, "beartype.beartype")
 
 
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:

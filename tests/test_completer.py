@@ -18,16 +18,16 @@ from gscompleter.apps.report.completion import Target, write_report
 from gscompleter.config import PsnrGuardConfig
 from gscompleter.evaluation.metrics.image import psnr
 from gscompleter.generators import GeneratorOutput
-from gscompleter.geometry import project
 from gscompleter.guards.free_space import respect_free_space
 from gscompleter.guards.psnr import is_mostly_faded
+from gscompleter.numerics.geometry import project
 from gscompleter.render.cpu import CpuRenderer
 from gscompleter.render.reference import adapt_to_mode
 from gscompleter.stages.lift import lift_pair
 from gscompleter.stages.slide_along_rays import apply_affine
 from gscompleter.stages.target_view import compute_hole_mask
 from gscompleter.state import Completion
-from gscompleter.timing import STAGES
+from gscompleter.system.timing import STAGES
 from gscompleter.types import Camera, Gaussians, View, merge
 from parity import assert_close
 from scenes import Room, camera_at, gaussians_of, reconstruction_of, scaled, view_of

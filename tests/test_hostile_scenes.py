@@ -19,7 +19,7 @@ from driving_files import infos, write_drive, write_infos, write_swept_dgp
 from gscompleter import InputError
 from gscompleter.data.driving.mmdet3d import load_plain
 from gscompleter.data.formats import open_photographs
-from gscompleter.errors import MAX_MESSAGE_LENGTH
+from gscompleter.system.errors import MAX_MESSAGE_LENGTH
 from pose_files import WRITERS, write_photographs
 
 

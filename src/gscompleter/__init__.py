@@ -14,15 +14,15 @@ if TYPE_CHECKING:
     from gscompleter.data.scene import load_camera as load_camera
     from gscompleter.data.scene import load_cameras as load_cameras
     from gscompleter.data.scene import load_views as load_views
-    from gscompleter.errors import InputError as InputError
     from gscompleter.generators import load_generator as load_generator
     from gscompleter.reconstructors import load_reconstructor as load_reconstructor
-    from gscompleter.render import load_renderer as load_renderer
+    from gscompleter.render.loading import load_renderer as load_renderer
     from gscompleter.splats import load_splat as load_splat
     from gscompleter.splats import save_splat as save_splat
     from gscompleter.splats.ply import load_ply as load_ply
     from gscompleter.splats.ply import save_ply as save_ply
     from gscompleter.state import Completion as Completion
+    from gscompleter.system.errors import InputError as InputError
     from gscompleter.types import Camera as Camera
     from gscompleter.types import Gaussians as Gaussians
     from gscompleter.types import Render as Render
@@ -35,7 +35,7 @@ _HOMES = {
     "GSCompleter": "completer",
     "CompleterConfig": "config",
     "load_config": "config",
-    "InputError": "errors",
+    "InputError": "system.errors",
     "load_generator": "generators",
     "load_ply": "splats.ply",
     "save_ply": "splats.ply",
@@ -43,7 +43,7 @@ _HOMES = {
     "load_cameras": "data.scene",
     "load_views": "data.scene",
     "load_reconstructor": "reconstructors",
-    "load_renderer": "render",
+    "load_renderer": "render.loading",
     "load_splat": "splats",
     "save_splat": "splats",
     "Camera": "types",

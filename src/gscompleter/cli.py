@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import atexit
-import gc
 import io
 import logging
 import os
@@ -23,9 +21,14 @@ from gscompleter.apps.commands.failures import explain_failure
 from gscompleter.apps.commands.overlap import check_overlap
 from gscompleter.apps.commands.words import format_error, parse_words
 from gscompleter.config.settings import validate
-from gscompleter.cpu_threads import limit_threads
-from gscompleter.errors import PROGRAM, FullDiskError, InputError, NoCaseError
-from gscompleter.io.files import FULL_DISK_ERRORS, handle_stop_signals
+from gscompleter.system.errors import PROGRAM, FullDiskError, InputError, NoCaseError
+from gscompleter.system.files.writing import FULL_DISK_ERRORS, handle_stop_signals
+from gscompleter.system.process import (
+    import_without_collection,
+    let_idle_threads_sleep,
+    skip_last_collection,
+)
+from gscompleter.system.threads import limit_threads
 
 # Options, module and function of each command. The module is imported after the options are
 # validated, so that `--help` does not wait for torch.
@@ -98,15 +101,13 @@ def leave_output() -> None:
 
 def main() -> None:
     """Run a command and exit with one of the codes of `exit_codes`."""
-    # Waiting threads of torch must not spin, which slows a busy machine down ten times.
-    os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")
+    let_idle_threads_sleep()
     words = sys.argv[1:]
     if words == ["--version"]:
         print(__version__)
         return
     handle_stop_signals()
-    # Without a last garbage collection of torch Python ends a second earlier.
-    atexit.register(gc.freeze)
+    skip_last_collection()
     # Damaged photographs are read or refused with a sentence; Pillow's warnings add nothing.
     warnings.filterwarnings("ignore", module="PIL")
     try:
@@ -118,10 +119,8 @@ def main() -> None:
         if isinstance(given, options.ComputeOptions):
             limit_threads(given.threads)
         _, module, function = COMMANDS[words[0]]
-        gc.disable()  # imports leave no garbage, and searching for it takes 0.25 s
-        command = getattr(import_module(f"gscompleter.apps.commands.{module}"), function)
-        gc.freeze()  # each later search of torch for garbage would take 0.2 s
-        gc.enable()
+        with import_without_collection():
+            command = getattr(import_module(f"gscompleter.apps.commands.{module}"), function)
         code = command(given)
     except InputError as error:
         print(f"{PROGRAM}{format_error(error)}", file=sys.stderr)

@@ -10,15 +10,15 @@ import torch
 
 from gscompleter.config import CompleterConfig
 from gscompleter.config.settings import validate
-from gscompleter.errors import InputError
 from gscompleter.generators import Generator, ImageFunction, as_generator, load_generator
-from gscompleter.geometry import pad_camera, pad_like
 from gscompleter.guards import Attempt, place, prepare_guards, verify
-from gscompleter.image_ops import is_enclosed
-from gscompleter.progress import track
+from gscompleter.numerics.geometry import pad_camera, pad_like
+from gscompleter.numerics.image_ops import is_enclosed
+from gscompleter.numerics.value_checks import check_camera, check_gaussians, check_inputs
 from gscompleter.reconstructors import Reconstructor, load_reconstructor
-from gscompleter.render import Renderer, load_renderer
 from gscompleter.render.cache import SceneRenderer
+from gscompleter.render.loading import load_renderer
+from gscompleter.render.protocols import Renderer
 from gscompleter.stages.align_depth import align_depth
 from gscompleter.stages.context import choose_config, init_context
 from gscompleter.stages.filter_holes import filter_holes
@@ -31,11 +31,12 @@ from gscompleter.stages.slide_along_rays import slide_along_rays
 from gscompleter.stages.synthesize import GeneratedView, synthesize
 from gscompleter.stages.target_view import TargetView, render_target
 from gscompleter.state import NEW_PHOTO_ID, Completion, Photo, Step, find_last_target_id
-from gscompleter.tensor_checks import describe, is_whole
-from gscompleter.timing import record_seconds, timed_stage
+from gscompleter.system.errors import InputError
+from gscompleter.system.progress import track
+from gscompleter.system.tensor_checks import describe, is_whole
+from gscompleter.system.timing import record_seconds, timed_stage
 from gscompleter.trust.photometric import load_trust
 from gscompleter.types import Camera, Gaussians, PaddedCamera, View
-from gscompleter.value_checks import check_camera, check_gaussians, check_inputs
 
 MAX_TARGET_ID = NEW_PHOTO_ID - 1
 """Largest target id: `generated` is one byte per Gaussian, and 0 means observed."""

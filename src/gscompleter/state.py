@@ -12,7 +12,7 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 
 from gscompleter.config import CompleterConfig
-from gscompleter.timing import add_seconds
+from gscompleter.system.timing import add_seconds
 from gscompleter.trust import Trust
 from gscompleter.types import (
     Camera,

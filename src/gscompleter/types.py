@@ -22,10 +22,9 @@ import torch
 from jaxtyping import Bool, Float, Int, Int64, Shaped, UInt8
 from torch import Tensor
 
-from gscompleter.camera_limits import FOCAL_RANGE, MAX_CENTER, MAX_COORDINATE, MAX_SIDE
 from gscompleter.config.settings import COVERED
-from gscompleter.errors import InputError
-from gscompleter.tensor_checks import (
+from gscompleter.system.errors import InputError
+from gscompleter.system.tensor_checks import (
     BOOLS,
     BYTES,
     FLOATS,
@@ -36,6 +35,17 @@ from gscompleter.tensor_checks import (
     is_number,
     is_whole,
 )
+
+MAX_SIDE = 16_384
+"""Largest width or height of an image, in pixels. Files hold float64 and the pipeline uses float32,
+where 1e300 is infinity and 1e-300 is zero: every real camera keeps these bounds, and squares and
+quotients of its numbers are finite."""
+MAX_COORDINATE = 1e9
+"""Largest coordinate of a camera centre, in scene units."""
+FOCAL_RANGE = (1e-3, 1e6)
+"""Range of focal lengths, in image widths (or heights)."""
+MAX_CENTER = 100.0
+"""Largest distance of the principal point from the corner, in image widths (or heights)."""
 
 SH_C0 = 0.28209479177387814
 """Constant spherical harmonic: colour = 0.5 + SH_C0 * sh[:, 0]."""

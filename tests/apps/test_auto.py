@@ -11,7 +11,7 @@ from gscompleter import load_cameras
 from gscompleter.apps.commands.words import insert_auto_count
 from gscompleter.cli import parse_command
 from gscompleter.data.formats import open_photographs
-from gscompleter.geometry import measure_baseline
+from gscompleter.numerics.geometry import measure_baseline
 from scenes import camera_at, photographed
 
 PLACES = ((-0.4, -4), (-0.2, 0), (0.0, 0), (0.3, 4), (0.5, 8))

@@ -20,10 +20,10 @@ from command import run
 from gscompleter import InputError
 from gscompleter.apps.batch.manifest import list_results, read_manifest
 from gscompleter.apps.commands.batch import parse_row
-from gscompleter.errors import OutputError
-from gscompleter.jobs import jobs as batch
-from gscompleter.jobs.engines import open_submitit
-from gscompleter.jobs.jobs import Job, find_missing_jobs, parse_shard, run_job, run_jobs
+from gscompleter.system.errors import OutputError
+from gscompleter.system.jobs import jobs as batch
+from gscompleter.system.jobs.engines import open_submitit
+from gscompleter.system.jobs.jobs import Job, find_missing_jobs, parse_shard, run_job, run_jobs
 from paths import SUPPORT
 from scenes import camera_at, photographed
 from simulate_batch import Fleet, Replay, replay

@@ -7,11 +7,11 @@ from typing import Any
 
 import pytest
 import torch
+from gscompleter.system.files.image import write_image
 
 from browsing import Tab, launched
 from gscompleter.apps.report.page import write_overview
-from gscompleter.io.image import write_image
-from gscompleter.jobs.jobs import Job
+from gscompleter.system.jobs.jobs import Job
 
 pytestmark = pytest.mark.browser
 

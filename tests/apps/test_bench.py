@@ -30,8 +30,8 @@ from gscompleter.apps.bench.report import (
     fit_exponent,
     format_report,
 )
-from gscompleter.errors import InputError
-from gscompleter.render import load_renderer
+from gscompleter.render.loading import load_renderer
+from gscompleter.system.errors import InputError
 from paths import ROOT
 from scenes import Room, camera_at, gaussians_of, photographed, view_of
 

@@ -301,7 +301,7 @@ def test_names_that_are_no_utf_8_lose_no_run(splat, tmp_path, monkeypatch, capsy
 
 @pytest.mark.linux
 def test_a_second_conversion_to_one_file_is_refused(splat, tmp_path, monkeypatch, capsys):
-    from gscompleter.io.unfinished import make_unfinished_name
+    from gscompleter.system.files.unfinished import make_unfinished_name
 
     with subprocess.Popen(["sleep", "60"]) as other:
         with monkeypatch.context() as elsewhere:

@@ -24,12 +24,12 @@ from gscompleter.apps.report.film import (
     render_frames,
     write_comparison_video,
 )
-from gscompleter.errors import InputError
-from gscompleter.geometry import measure_baseline, measure_rotation, resize_camera
-from gscompleter.io.video import find_ffmpeg, write_video
-from gscompleter.progress import show_progress
-from gscompleter.render import load_renderer
+from gscompleter.numerics.geometry import measure_baseline, measure_rotation, resize_camera
+from gscompleter.render.loading import load_renderer
 from gscompleter.state import Completion, Photo, TargetResult
+from gscompleter.system.errors import InputError
+from gscompleter.system.files.video import find_ffmpeg, write_video
+from gscompleter.system.progress import show_progress
 from gscompleter.types import Camera
 from scenes import Room, camera_at, half_a_room_of
 from target_views import begin_with

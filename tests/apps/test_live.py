@@ -39,12 +39,12 @@ from gscompleter.apps.live.page import (
 from gscompleter.apps.live.session import Session, complete_camera, undo_step
 from gscompleter.cli import parse_command
 from gscompleter.config import CompleterConfig
-from gscompleter.errors import InputError
-from gscompleter.geometry import measure_rotation
-from gscompleter.progress import notify_of_stages
-from gscompleter.splat_alignment.similarity import make_similarity, transform_camera
+from gscompleter.numerics.geometry import measure_rotation
+from gscompleter.splats.alignment.similarity import make_similarity, transform_camera
 from gscompleter.splats.transform import transform_gaussians
-from gscompleter.timing import STAGES
+from gscompleter.system.errors import InputError
+from gscompleter.system.progress import notify_of_stages
+from gscompleter.system.timing import STAGES
 from gscompleter.types import Camera, merge
 from scenes import Room, camera_at, gaussians_of, photographed, random_gaussians, view_of
 

@@ -18,8 +18,8 @@ from gscompleter.apps.report.schema import (
     OutcomeRow,
     read_summary,
 )
-from gscompleter.errors import InputError
-from gscompleter.jobs.jobs import Job
+from gscompleter.system.errors import InputError
+from gscompleter.system.jobs.jobs import Job
 from scenes import camera_at, photographed
 
 PLACES = [(-0.9 + 0.3 * number, -12 + 4 * number) for number in range(7)]

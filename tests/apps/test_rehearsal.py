@@ -13,12 +13,13 @@ from numba.core.registry import CPUDispatcher
 from rich.console import Console
 
 from command import run
-from gscompleter import GSCompleter, kernels
+from gscompleter import GSCompleter
 from gscompleter.apps import warmup
 from gscompleter.apps.commands import doctor
-from gscompleter.kernels import compiled
-from gscompleter.kernels.cache import KernelCache
-from gscompleter.progress import show_progress
+from gscompleter.numerics import kernels
+from gscompleter.numerics.kernels import compiled
+from gscompleter.numerics.kernels.cache import KernelCache
+from gscompleter.system.progress import show_progress
 from paths import TESTS
 from scenes import Room, camera_at, view_of
 
@@ -47,7 +48,7 @@ def signatures() -> set[tuple[str, str]]:
     return {
         (f"{module.name}.{name}", str(types))
         for module in iter_modules(kernels.__path__)
-        for name, value in vars(import_module(f"gscompleter.kernels.{module.name}")).items()
+        for name, value in vars(import_module(f"{kernels.__name__}.{module.name}")).items()
         if isinstance(value, CPUDispatcher)
         for types in value.signatures
     }
@@ -64,7 +65,7 @@ def rehearsed(monkeypatch, tmp_path) -> list[bool]:
 
 PLACES = """
 import os, sys
-from gscompleter.kernels.cache import CACHE, _probe, njit
+from gscompleter.numerics.kernels.cache import CACHE, _probe, njit
 njit()(_probe)()
 print(CACHE.folder)
 print(CACHE.note)
@@ -75,11 +76,11 @@ print(CACHE.note)
 @pytest.mark.parametrize("temporary", ["private", "of-others", "missing"])
 def test_without_a_writable_cache_kernels_are_kept_elsewhere_or_nowhere(tmp_path, temporary):
     """The installation is a read-only copy, and the home and NUMBA_CACHE_DIR are no folders."""
-    package = Path(kernels.__file__).parents[1]
+    package = Path(kernels.__file__).parents[2]
     for file in ("__init__.py", "cache.py"):
-        place = tmp_path / "lib" / "gscompleter" / "kernels" / file
+        place = tmp_path / "lib" / "gscompleter" / "numerics" / "kernels" / file
         place.parent.mkdir(parents=True, exist_ok=True)
-        place.write_bytes((package / "kernels" / file).read_bytes())
+        place.write_bytes((package / "numerics" / "kernels" / file).read_bytes())
     (tmp_path / "lib" / "gscompleter" / "__init__.py").touch()
     # In the place of the folder for compiled code is a file, so that also root cannot write there.
     (place.parent / "__pycache__").write_text("")

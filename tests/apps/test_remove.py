@@ -17,9 +17,9 @@ from gscompleter.apps.inputs.removal import (
     find_same_positions,
 )
 from gscompleter.data.formats import open_photographs
-from gscompleter.geometry import axis_angle_to_matrix, rotations_to_quats
-from gscompleter.io.image import read_image, write_image
-from gscompleter.render import load_renderer
+from gscompleter.numerics.geometry import axis_angle_to_matrix, rotations_to_quats
+from gscompleter.render.loading import load_renderer
+from gscompleter.system.files.image import read_image, write_image
 from gscompleter.types import merge
 from scenes import Room, camera_at, cast, gaussians_of, photographed, random_gaussians, view_of
 

@@ -24,7 +24,7 @@ from gscompleter.apps.report.plain_words import (
     list_photograph_notes,
 )
 from gscompleter.apps.report.schema import AlignmentRow, ContextRow, TargetRow
-from gscompleter.errors import InputError
+from gscompleter.system.errors import InputError
 from scenes import camera_at
 
 VOID = {"meta", "img", "input", "link", "br", "hr"}

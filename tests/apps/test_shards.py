@@ -11,7 +11,7 @@ import pytest
 
 from gscompleter import InputError
 from gscompleter.apps.commands import evaluate as command
-from gscompleter.data.cases import read_cases
+from gscompleter.evaluation.cases import read_cases
 from gscompleter.evaluation.protocols import Task, make_case_task
 from gscompleter.evaluation.runner import (
     RETRIES,
@@ -23,8 +23,8 @@ from gscompleter.evaluation.runner import (
 )
 from gscompleter.evaluation.store import VERSION, claim, list_row_paths, read_json
 from gscompleter.evaluation.tables import write_tables
-from gscompleter.jobs.jobs import Job, write_json
 from gscompleter.models.settings import PEFieldSettings
+from gscompleter.system.jobs.jobs import Job, write_json
 from scenes import Room, camera_at, photographed
 
 SIZE = 32
@@ -34,7 +34,7 @@ TABLES = ("tables.md", "tables.tex", "tables.json")
 CLAIM = """
 import json, os, sys
 from pathlib import Path
-from gscompleter.errors import InputError
+from gscompleter.system.errors import InputError
 from gscompleter.evaluation.store import claim
 
 out, count, kinds = Path(sys.argv[1]), int(sys.argv[2]), int(sys.argv[3])

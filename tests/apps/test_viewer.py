@@ -20,6 +20,7 @@ import numpy as np
 import plyfile
 import pytest
 import torch
+from gscompleter.system.files.image import write_image
 
 from command import run
 from gscompleter.apps.commands.view import make_page_server
@@ -52,11 +53,10 @@ from gscompleter.apps.viewer.packages import (
 )
 from gscompleter.apps.viewer.page import make_page
 from gscompleter.data.scene import write_cameras
-from gscompleter.errors import InputError
 from gscompleter.evaluation.metrics.coverage import Coverage
-from gscompleter.io.image import write_image
 from gscompleter.splats.formats import load_splat
 from gscompleter.splats.ply import save_ply
+from gscompleter.system.errors import InputError
 from gscompleter.types import Gaussians, merge
 from pose_files import CAMERAS, NAMES, write_colmap_binary, write_photographs
 from scenes import camera_at

@@ -16,8 +16,8 @@ from gscompleter.apps.viewer import page as pages
 from gscompleter.apps.viewer.exhibit import ViewerContent
 from gscompleter.apps.viewer.packages import Libraries, load_libraries
 from gscompleter.apps.viewer.page import make_page
-from gscompleter.errors import InputError
-from gscompleter.render import load_renderer
+from gscompleter.render.loading import load_renderer
+from gscompleter.system.errors import InputError
 from gscompleter.types import Camera, Gaussians
 from viewer_pages import LEFT, SIDE, TARGET, room_exhibit
 

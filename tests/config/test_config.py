@@ -20,8 +20,8 @@ from gscompleter.config import (
     load_config,
 )
 from gscompleter.config.settings import RENAMED, validate
-from gscompleter.errors import InputError
 from gscompleter.evaluation.methods import METHODS
+from gscompleter.system.errors import InputError
 from paths import ROOT
 
 OTHER_STEPS = (

@@ -20,11 +20,11 @@ from chunk_files import (
     save_dataset,
 )
 from gscompleter import InputError
-from gscompleter.data.cases import SkippedScene, filter_usable, open_clips
 from gscompleter.data.formats import open_photographs
 from gscompleter.data.photographs import AuthorsCrop, Photographs
 from gscompleter.data.real_estate import open_chunks, read_camera_file
-from gscompleter.geometry import project
+from gscompleter.evaluation.cases import SkippedScene, filter_usable, open_clips
+from gscompleter.numerics.geometry import project
 from gscompleter.types import View
 
 

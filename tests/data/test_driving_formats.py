@@ -15,12 +15,12 @@ from PIL import Image
 from scipy.spatial.transform import Rotation
 
 from gscompleter import InputError
-from gscompleter.data.cases import open_clips
 from gscompleter.data.driving.mmdet3d import load_plain
 from gscompleter.data.driving.vehicle import read_sweep
 from gscompleter.data.formats import open_photographs
 from gscompleter.data.json_fields import get_number
-from gscompleter.geometry import project
+from gscompleter.evaluation.cases import open_clips
+from gscompleter.numerics.geometry import project
 
 
 def real(shared: Path, name: str) -> Path:

@@ -10,17 +10,17 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
+from gscompleter.system.files.image import read_image, write_image
+from gscompleter.system.files.reading import read_json
 from torch import Tensor
 
 from command import run
 from gscompleter.config import CompleterConfig
-from gscompleter.data.cases import Case, open_clips
 from gscompleter.data.formats import open_photographs
 from gscompleter.data.photographs import Photographs
 from gscompleter.data.scene import write_cameras
+from gscompleter.evaluation.cases import Case, open_clips
 from gscompleter.evaluation.protocols import make_tasks, parse_protocol
-from gscompleter.io.image import read_image, write_image
-from gscompleter.io.reading import read_json
 from gscompleter.reconstructors import load_reconstructor
 from gscompleter.reconstructors.features.matches import detect_features
 from gscompleter.reconstructors.features.stereo_image import make_stereo_images

@@ -11,11 +11,11 @@ from PIL import Image
 from chunk_files import SIZE, VIEWS, example, pixels_of, row_of, save_chunk, save_dataset
 from command import run
 from gscompleter import InputError
-from gscompleter.data.cases import open_clips, read_cases
 from gscompleter.data.formats import FORMATS, open_photographs, refuse_scenes_below
 from gscompleter.data.photographs import Photographs, Resolution
 from gscompleter.data.real_estate import read_camera_file
 from gscompleter.data.scene import write_cameras
+from gscompleter.evaluation.cases import open_clips, read_cases
 from gscompleter.types import View
 from pose_files import write_colmap_binary, write_photographs
 

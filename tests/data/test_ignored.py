@@ -7,20 +7,21 @@ import pytest
 import torch
 
 from gscompleter import InputError
-from gscompleter.cleaning import halve_view
 from gscompleter.config import RefineConfig, TrustConfig
-from gscompleter.data.driving.vehicle import compute_moving_boxes, mask_moving
+from gscompleter.data.driving.vehicle import compute_moving_boxes
 from gscompleter.data.formats import open_photographs
+from gscompleter.data.moving_boxes import mask_moving
+from gscompleter.editing.cleaning import halve_view
 from gscompleter.evaluation.metrics.scores import Truth, score
 from gscompleter.generators.warp import warp_photographs
-from gscompleter.geometry import compute_sparse_depth, unproject
 from gscompleter.guards.psnr import compute_squared_error, meet_error_budgets
-from gscompleter.io.image import write_image
-from gscompleter.render import load_renderer
-from gscompleter.splat_alignment.fit import score_image
-from gscompleter.splat_alignment.matching import extract_view_features
+from gscompleter.numerics.geometry import compute_sparse_depth, unproject
+from gscompleter.render.loading import load_renderer
+from gscompleter.splats.alignment.fit import score_image
+from gscompleter.splats.alignment.matching import extract_view_features
 from gscompleter.stages.context import drop_ignored
 from gscompleter.stages.refine import refine_opacities
+from gscompleter.system.files.image import write_image
 from gscompleter.trust.photometric import gather_observations
 from gscompleter.types import ErrorBudget, GeneratorInput, View, sh_from_rgb
 from scenes import Room, camera_at, gaussians_of, half_a_room_of, photographed, reconstruction_of

@@ -8,6 +8,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from gscompleter.system.files.image import write_image
 from PIL import Image
 
 from command import run
@@ -26,8 +27,7 @@ from gscompleter.data.sfm.poses import (
     make_sort_key,
     write_upright,
 )
-from gscompleter.errors import InputError
-from gscompleter.io.image import write_image
+from gscompleter.system.errors import InputError
 from scenes import Room, camera_at, view_of
 
 CAMERAS = [

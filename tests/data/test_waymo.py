@@ -14,10 +14,10 @@ from PIL import Image
 
 from command import run
 from gscompleter import InputError
-from gscompleter.data.cases import open_clips
 from gscompleter.data.driving.vehicle import build_poses
 from gscompleter.data.formats import open_photographs
 from gscompleter.data.photographs import Photographs
+from gscompleter.evaluation.cases import open_clips
 from gscompleter.evaluation.store import list_row_paths, read_json
 from kitti_city_segment import kitti_city_segment
 from waymo_segment import (

@@ -17,7 +17,7 @@ from command import run
 from gscompleter.apps.commands.evaluate import collect_tasks
 from gscompleter.apps.commands.options import EvaluateOptions
 from gscompleter.apps.commands.reproduce import apply_preset
-from gscompleter.data.cases import SkippedScene
+from gscompleter.evaluation.cases import SkippedScene
 from gscompleter.evaluation.paper import load_paper
 from gscompleter.types import View
 from network_inputs import Fed, Recorded, record_networks

@@ -9,7 +9,7 @@ from gscompleter import CompleterConfig, GSCompleter, load_renderer
 from gscompleter.config import HoleConfig
 from gscompleter.config.settings import COVERED
 from gscompleter.generators.warp import warp_photographs
-from gscompleter.geometry import project
+from gscompleter.numerics.geometry import project
 from gscompleter.stages.align_depth import align_depth
 from gscompleter.stages.slide_along_rays import slide_along_rays
 from gscompleter.types import DepthMap, Gaussians, Lift, Reconstruction, Render, merge

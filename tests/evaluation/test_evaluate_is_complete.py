@@ -4,16 +4,16 @@ from dataclasses import replace
 
 import pytest
 import torch
+from gscompleter.system.files.image import write_image
 from test_dynamic_masks import CAMERAS, ROOM, SIZE, photographed
 
 from command import run
 from gscompleter import GSCompleter
-from gscompleter.data.cases import Case
 from gscompleter.data.scene import write_cameras
+from gscompleter.evaluation.cases import Case
 from gscompleter.evaluation.protocols import make_case_task
 from gscompleter.evaluation.runner import RunConfig, evaluate, prepare_task
 from gscompleter.evaluation.store import get_step_path, get_task_folder, load_prediction
-from gscompleter.io.image import write_image
 from gscompleter.splats.ply import save_ply
 from scenes import camera_at, view_of
 

@@ -11,7 +11,6 @@ from scipy.ndimage import gaussian_filter
 from skimage.metrics import peak_signal_noise_ratio, structural_similarity
 from torch import Tensor
 
-from gscompleter.errors import InputError
 from gscompleter.evaluation.metrics.geometry import (
     Agreement,
     compare_depths,
@@ -40,10 +39,11 @@ from gscompleter.evaluation.metrics.scores import (
     measure_quality,
     score,
 )
-from gscompleter.image_ops import dilate
-from gscompleter.render import load_renderer
+from gscompleter.numerics.image_ops import dilate
+from gscompleter.render.loading import load_renderer
 from gscompleter.stages.filter_holes import select_in_mask
 from gscompleter.stages.target_view import compute_hole_mask
+from gscompleter.system.errors import InputError
 from gscompleter.types import Camera, Gaussians, View, merge
 from scenes import Room, camera_at, gaussians_of, scaled, view_of
 

@@ -11,6 +11,7 @@ from typing import get_args
 import numpy as np
 import pytest
 import torch
+from gscompleter.system.files.image import read_pixels
 
 import tiny_diffusion
 from chunk_files import example, save_chunk
@@ -23,7 +24,6 @@ from gscompleter.apps.commands.reproduce import (
     make_run,
 )
 from gscompleter.data.formats import open_photographs
-from gscompleter.errors import InputError
 from gscompleter.evaluation.baselines.reggs import RegGSConfig
 from gscompleter.evaluation.columns import BY_KEY
 from gscompleter.evaluation.figures import draw_outline, find_widest_hole
@@ -31,9 +31,9 @@ from gscompleter.evaluation.methods import METHODS
 from gscompleter.evaluation.paper import load_paper, select_names
 from gscompleter.evaluation.paper_tables import compare_cases, estimate_mean
 from gscompleter.evaluation.runner import RunConfig
-from gscompleter.io.image import read_pixels
 from gscompleter.models.feed_forward import MVSplat
 from gscompleter.models.weights.published import PUBLISHED
+from gscompleter.system.errors import InputError
 from scenes import Room, camera_at, view_of
 
 PAPER = load_paper()

@@ -8,10 +8,10 @@ import pytest
 
 from chunk_files import VIEWS, example, save_chunk
 from gscompleter import InputError
-from gscompleter.data.cases import open_clips
 from gscompleter.data.formats import open_photographs
 from gscompleter.data.photographs import Photographs
 from gscompleter.data.real_estate import open_chunks
+from gscompleter.evaluation.cases import open_clips
 from gscompleter.evaluation.protocols import (
     INDICES,
     EvaluationIndex,

@@ -15,14 +15,15 @@ from random import Random
 
 import pytest
 import torch
+from gscompleter.system.files.image import read_image
 
 from chunk_files import as_tensor, example, save_chunk
 from command import run
-from gscompleter import GSCompleter, InputError, memory
-from gscompleter.data.cases import Case
+from gscompleter import GSCompleter, InputError
 from gscompleter.evaluation import methods as runs_methods
 from gscompleter.evaluation import runner
 from gscompleter.evaluation.baselines.reggs import RegGSConfig
+from gscompleter.evaluation.cases import Case
 from gscompleter.evaluation.columns import GROUPS
 from gscompleter.evaluation.memory import measure_peak_memory
 from gscompleter.evaluation.methods import (
@@ -43,8 +44,8 @@ from gscompleter.evaluation.store import (
     read_json,
 )
 from gscompleter.evaluation.tables import summarize_run, write_tables
-from gscompleter.io.image import read_image
-from gscompleter.timing import STAGES
+from gscompleter.system import memory
+from gscompleter.system.timing import STAGES
 from scenes import Room, camera_at, photographed
 
 SIZE = 32
@@ -184,7 +185,7 @@ def test_rows_that_are_lost_are_made_again_from_what_is_saved(finished, tasks, t
 LIFE = """
 import os, signal, sys, threading, time
 from pathlib import Path
-from gscompleter.data.cases import read_cases
+from gscompleter.evaluation.cases import read_cases
 from gscompleter.evaluation.runner import RunConfig, evaluate
 from gscompleter.evaluation.protocols import make_case_task
 

@@ -10,6 +10,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
+from gscompleter.system.files.image import read_pixels
 
 from command import run
 from gscompleter import InputError
@@ -32,8 +33,7 @@ from gscompleter.evaluation.steps import (
 )
 from gscompleter.evaluation.store import read_json
 from gscompleter.evaluation.tables import write_tables
-from gscompleter.geometry import slide
-from gscompleter.io.image import read_pixels
+from gscompleter.numerics.geometry import slide
 from gscompleter.types import View
 from scenes import Room, camera_at, gaussians_of, photographed, view_of
 

@@ -10,7 +10,7 @@ import torch
 
 from gscompleter.evaluation.metrics.image import compute_masked_ssim, ssim
 from gscompleter.evaluation.metrics.unused_photographs import measure_likeness, shrink_view
-from gscompleter.geometry import axis_angle_to_matrix
+from gscompleter.numerics.geometry import axis_angle_to_matrix
 from gscompleter.reconstructors.features.consistency import count_consistent_matches
 from gscompleter.types import Render
 from scenes import Room, camera_at, view_of

@@ -5,7 +5,7 @@ from dataclasses import replace
 import torch
 
 from gscompleter.guards.contribution import find_shown
-from gscompleter.render import load_renderer
+from gscompleter.render.loading import load_renderer
 from gscompleter.types import merge
 from scenes import Room, camera_at, gaussians_of, view_of
 

@@ -8,8 +8,8 @@ from torch import Tensor
 
 from gscompleter import GSCompleter
 from gscompleter.config import CompleterConfig
-from gscompleter.geometry import project, sample, unproject
 from gscompleter.guards.dynamic_masks import find_dynamic_masks
+from gscompleter.numerics.geometry import project, sample, unproject
 from gscompleter.state import Completion, TargetResult
 from gscompleter.types import Camera, Render, View
 from scenes import Room, camera_at, cast, texture, view_of

@@ -6,9 +6,9 @@ import pytest
 import torch
 
 from gscompleter.config import FreeSpaceConfig
-from gscompleter.geometry import project
 from gscompleter.guards import free_space
 from gscompleter.guards.free_space import Observed, find_in_free_space, respect_free_space
+from gscompleter.numerics.geometry import project
 from gscompleter.types import Camera, Gaussians, Render, make_observed
 from scenes import camera_at
 

@@ -17,7 +17,8 @@ from gscompleter.guards.psnr import (
     select_fewest,
     set_error_budgets,
 )
-from gscompleter.render import FrozenScene, load_renderer
+from gscompleter.render.loading import load_renderer
+from gscompleter.render.protocols import FrozenScene
 from gscompleter.types import ErrorBudget, Gaussians, View, merge
 from scenes import Room, camera_at, gaussians_of, half_a_room_of, view_of
 

@@ -24,7 +24,6 @@ from depth_anything_fixtures import (
 from feed_forward_fixtures import Case, extra
 from gscompleter import GSCompleter, InputError
 from gscompleter.config import CompleterConfig, HoleConfig
-from gscompleter.geometry import axis_angle_to_matrix, project, quats_to_rotations, unproject
 from gscompleter.models import depth_anything
 from gscompleter.models.depth_anything import (
     VARIANTS,
@@ -55,6 +54,12 @@ from gscompleter.models.depth_anything.normalisation import (
 from gscompleter.models.depth_anything.poses import Poses, decode_poses, encode_poses
 from gscompleter.models.depth_anything.reconstructor import move_to_given_frame
 from gscompleter.models.feed_forward.build import create_depth_anything, wrap_network
+from gscompleter.numerics.geometry import (
+    axis_angle_to_matrix,
+    project,
+    quats_to_rotations,
+    unproject,
+)
 from gscompleter.reconstructors import load_reconstructor
 from gscompleter.reconstructors.from_depth import FromDepth
 from gscompleter.render.spherical_harmonics import evaluate_sh_basis

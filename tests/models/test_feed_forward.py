@@ -14,7 +14,6 @@ from torch import Tensor
 
 from feed_forward_fixtures import STORED, Case, Pass, extra, published_shapes, with_rule_v1
 from gscompleter import GSCompleter, InputError
-from gscompleter.geometry import pad_camera, project, quats_to_rotations
 from gscompleter.models.feed_forward import (
     VARIANTS,
     DepthSplat,
@@ -32,6 +31,7 @@ from gscompleter.models.feed_forward.spherical_harmonics import (
     compute_wigner_matrices,
     evaluate_harmonics,
 )
+from gscompleter.numerics.geometry import pad_camera, project, quats_to_rotations
 from gscompleter.types import View
 from parity import assert_close, assert_within, relative_error
 from scenes import Room, camera_at, view_of

@@ -9,11 +9,11 @@ import torch
 
 from feed_forward_fixtures import Case, extra, published_shapes
 from gscompleter import GSCompleter, InputError
-from gscompleter.geometry import is_inside, project
 from gscompleter.models.feed_forward import FeedForward, VolSplat, VolSplatConfig
 from gscompleter.models.feed_forward.depth_predictor import DepthConfig
 from gscompleter.models.feed_forward.inputs import create_batch
 from gscompleter.models.feed_forward.volsplat import MAX_VOXEL_OFFSET, VoxelGaussians
+from gscompleter.numerics.geometry import is_inside, project
 from gscompleter.stages.lift import lift_pair
 from gscompleter.types import SH_C0, View
 from parity import assert_within

@@ -26,7 +26,6 @@ from torch import Tensor, nn
 
 from gscompleter import reconstructors
 from gscompleter.cli import main
-from gscompleter.errors import InputError
 from gscompleter.models.weights import (
     PUBLISHED,
     PublishedWeights,
@@ -39,6 +38,7 @@ from gscompleter.models.weights import (
 )
 from gscompleter.reconstructors import Reconstructor, load_reconstructor
 from gscompleter.reconstructors.plane_sweep import PlaneSweep
+from gscompleter.system.errors import InputError
 from paths import ROOT
 
 DOCS = ROOT / "docs"

@@ -11,12 +11,12 @@ from jaxtyping import TypeCheckError
 import gscompleter
 from gscompleter.evaluation.baselines.optimization import ssim_map
 from gscompleter.evaluation.metrics.image import psnr
-from gscompleter.geometry import quats_to_rotations
+from gscompleter.numerics.geometry import quats_to_rotations
 
 MODULES = [
     module.name
     for module in walk_packages(gscompleter.__path__, "gscompleter.", onerror=pytest.fail)
-    if not module.name.startswith("gscompleter.kernels")
+    if not module.name.startswith("gscompleter.numerics.kernels")
 ]
 
 

@@ -19,7 +19,7 @@ from command import run
 from gscompleter import __version__
 from gscompleter.apps.commands.doctor import PURPOSES, find_installed_version, is_required_by
 from gscompleter.apps.warmup import PARTS, compile_kernels
-from gscompleter.kernels.compiled import get_cache_folder
+from gscompleter.numerics.kernels.compiled import get_cache_folder
 from release_check import (
     ROOT,
     built,
@@ -30,6 +30,7 @@ from release_check import (
 )
 
 DEVELOPERS = {"test", "dev", "docs"}
+KERNELS = Path("numerics", "kernels")
 """Extras that users do not need."""
 
 
@@ -107,9 +108,9 @@ def borrow_kernels(package: Path) -> None:
     """Copy our compiled kernels, which are valid for the same sources and times."""
     compile_kernels(list(PARTS))
     ours = Path(gscompleter.__file__).parent
-    for source in (ours / "kernels").glob("*.py"):
-        shutil.copystat(source, package / "kernels" / source.name)
-    place, unfinished = package / "kernels" / "__pycache__", shutil.ignore_patterns("*.tmp.*")
+    for source in (ours / KERNELS).glob("*.py"):
+        shutil.copystat(source, package / KERNELS / source.name)
+    place, unfinished = package / KERNELS / "__pycache__", shutil.ignore_patterns("*.tmp.*")
     shutil.copytree(get_cache_folder(), place, ignore=unfinished, dirs_exist_ok=True)
 
 

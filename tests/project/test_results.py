@@ -8,7 +8,7 @@ from pathlib import Path
 
 import pytest
 
-from gscompleter.data.cases import read_cases
+from gscompleter.evaluation.cases import read_cases
 from paths import ROOT
 
 BENCHMARKS = ROOT / "benchmarks"

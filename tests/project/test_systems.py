@@ -17,9 +17,9 @@ UNIX_NAMES = {"fork", "forkpty", "getuid", "geteuid", "getpgid", "killpg", "mkfi
 UNIX_NAMES |= {"setsid", "statvfs", "sched_getaffinity", "sysconf", "uname", "wait4"}
 UNIX_NAMES |= {"SIGALRM", "SIGHUP", "SIGKILL", "SIGPIPE", "SIGUSR1", "Signals"}
 GUARDED = {
-    ("cpu_threads.py", "sched_getaffinity"),
-    ("kernels/cache.py", "getuid"),
-    ("memory.py", "sysconf"),
+    ("system/threads.py", "sched_getaffinity"),
+    ("numerics/kernels/cache.py", "getuid"),
+    ("system/memory.py", "sysconf"),
 }
 """Names that a condition or `suppress` precedes."""
 ENCODED = {"read_text": 0, "write_text": 1, "TextIOWrapper": 1}

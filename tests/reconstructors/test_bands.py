@@ -7,8 +7,8 @@ import pytest
 import torch
 
 from gscompleter.evaluation.metrics.image import compute_gradient_energy_ratio
-from gscompleter.kernels import stereo
-from gscompleter.kernels.stereo import TILE_COLUMNS, TILE_ROWS
+from gscompleter.numerics.kernels import stereo
+from gscompleter.numerics.kernels.stereo import TILE_COLUMNS, TILE_ROWS
 from gscompleter.reconstructors.plane_sweep import PlaneSweep, sweep
 from gscompleter.reconstructors.plane_sweep.rig import build_rig
 from gscompleter.reconstructors.plane_sweep.sweep import (
@@ -21,7 +21,7 @@ from gscompleter.reconstructors.plane_sweep.sweep import (
     place_planes,
     sweep_view,
 )
-from gscompleter.render import load_renderer
+from gscompleter.render.loading import load_renderer
 from gscompleter.types import sh_from_rgb
 from scenes import Room, camera_at, view_of
 

@@ -6,7 +6,7 @@ import pytest
 import torch
 
 from gscompleter.evaluation.metrics.image import psnr
-from gscompleter.geometry import axis_angle_to_matrix
+from gscompleter.numerics.geometry import axis_angle_to_matrix
 from gscompleter.reconstructors.plane_sweep.directional_colors import (
     ColorLine,
     fit_directional_colors,
@@ -15,7 +15,7 @@ from gscompleter.reconstructors.plane_sweep.virtual_views import (
     extrapolate_camera,
     make_virtual_views,
 )
-from gscompleter.render import load_renderer
+from gscompleter.render.loading import load_renderer
 from gscompleter.render.spherical_harmonics import evaluate_colors
 from gscompleter.types import Gaussians, View, merge
 from scenes import Room, camera_at, gaussians_of, view_of

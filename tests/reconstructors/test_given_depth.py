@@ -14,7 +14,7 @@ from gscompleter.reconstructors.plane_sweep import PlaneSweep
 from gscompleter.reconstructors.plane_sweep.given_depth import add_given
 from gscompleter.reconstructors.plane_sweep.rig import build_rig
 from gscompleter.reconstructors.plane_sweep.sweep import Measurement, sweep_views
-from gscompleter.render import load_renderer
+from gscompleter.render.loading import load_renderer
 from gscompleter.types import DepthMap, View
 from scenes import Room, camera_at, view_of
 

@@ -8,8 +8,8 @@ import torch
 
 from gscompleter import View, load_renderer
 from gscompleter.evaluation.metrics.image import psnr
-from gscompleter.geometry import project
-from gscompleter.kernels import stereo
+from gscompleter.numerics.geometry import project
+from gscompleter.numerics.kernels import stereo
 from gscompleter.reconstructors.features.neighbours import (
     NUM_COMPARED,
     NUM_SOURCES,

@@ -14,7 +14,7 @@ from gscompleter.apps.commands.demo import (
     PRINCIPAL_POINT_DX_PX,
     get_motorcycle_cameras,
 )
-from gscompleter.geometry import project
+from gscompleter.numerics.geometry import project
 from gscompleter.reconstructors.features.depth_range import estimate_depth_range, get_depth_range
 from gscompleter.reconstructors.plane_sweep import PlaneSweep
 from gscompleter.types import DepthMap

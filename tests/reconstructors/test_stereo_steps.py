@@ -9,8 +9,8 @@ import pytest
 import torch
 
 from gscompleter.evaluation.metrics.image import psnr
-from gscompleter.kernels import stereo, tgv
-from gscompleter.kernels.parallel import run
+from gscompleter.numerics.kernels import stereo, tgv
+from gscompleter.numerics.kernels.parallel import run
 from gscompleter.reconstructors.features.matches import detect_features, match_features
 from gscompleter.reconstructors.features.stereo_image import (
     StereoImage,
@@ -26,8 +26,8 @@ from gscompleter.reconstructors.plane_sweep.sweep import (
     find_hidden,
     remove_speckles,
 )
-from gscompleter.render import load_renderer
 from gscompleter.render.cpu import CpuFrozenScene
+from gscompleter.render.loading import load_renderer
 from gscompleter.types import View, merge
 from scenes import Room, camera_at, gaussians_of, view_of
 

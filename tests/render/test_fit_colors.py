@@ -6,8 +6,8 @@ import pytest
 import torch
 
 from gscompleter.evaluation.metrics.image import psnr
-from gscompleter.render import load_renderer
 from gscompleter.render.fit_colors import fit_colors
+from gscompleter.render.loading import load_renderer
 from scenes import Room, camera_at, gaussians_of, half_a_room_of, view_of
 
 CAMERA = camera_at(size=48)

@@ -11,10 +11,9 @@ from gscompleter.apps.bench.cases import multiply_gaussians
 from gscompleter.completer import GSCompleter
 from gscompleter.config import CompleterConfig, TrustConfig
 from gscompleter.evaluation.metrics.image import psnr
-from gscompleter.memory import BYTES_PER_SPLAT
-from gscompleter.render import load_renderer
 from gscompleter.render import lod as proxies
 from gscompleter.render.cache import SceneRenderer
+from gscompleter.render.loading import load_renderer
 from gscompleter.render.lod import (
     MAX_DEVIATION,
     MAX_REACH,
@@ -23,6 +22,7 @@ from gscompleter.render.lod import (
     thin_gaussians,
 )
 from gscompleter.splats.morton import argsort_nearby
+from gscompleter.system.memory import BYTES_PER_SPLAT
 from gscompleter.trust import Trust
 from gscompleter.trust.photometric import (
     PhotoObservations,
@@ -134,7 +134,7 @@ def test_what_lies_aside_widens_it():
 
 def test_where_there_is_little_room_fewer_are_drawn(monkeypatch):
     room = len(CAMERAS) * BYTES_PER_SPLAT * len(PROXY.rendered) // 2
-    monkeypatch.setattr("gscompleter.memory.MAX_FROZEN_BYTES", room)
+    monkeypatch.setattr("gscompleter.system.memory.MAX_FROZEN_BYTES", room)
     assert len(simplify_scene(CROWD, CAMERAS).rendered) <= len(PROXY.rendered) // 2
 
 

@@ -7,9 +7,9 @@ from dataclasses import replace
 import pytest
 import torch
 
-from gscompleter.geometry import axis_angle_to_matrix, rotations_to_quats
-from gscompleter.render import load_renderer
-from gscompleter.splats.cutting import cut, split
+from gscompleter.editing.cutting import cut, split
+from gscompleter.numerics.geometry import axis_angle_to_matrix, rotations_to_quats
+from gscompleter.render.loading import load_renderer
 from gscompleter.types import Gaussians, make_observed, merge, sh_from_rgb
 from scenes import camera_at
 

@@ -59,7 +59,7 @@ def test_a_full_disk_is_a_sentence_and_leaves_nothing(pxr, tmp_path, name):
         "import resource, signal, sys\n"
         "import torch\n"
         "from gscompleter import save_splat\n"
-        "from gscompleter.errors import FullDiskError\n"
+        "from gscompleter.system.errors import FullDiskError\n"
         "from splat_files import plausible\n"
         "signal.signal(signal.SIGXFSZ, signal.SIG_IGN)\n"
         "resource.setrlimit(resource.RLIMIT_FSIZE, (2000, 2000))\n"

@@ -8,7 +8,7 @@ import torch
 from gscompleter import GSCompleter, load_renderer
 from gscompleter.config import CompleterConfig
 from gscompleter.evaluation.metrics.image import psnr
-from gscompleter.geometry import is_inside, project
+from gscompleter.numerics.geometry import is_inside, project
 from gscompleter.render.cache import SceneRenderer
 from gscompleter.stages.new_photos import find_new_photos
 from gscompleter.state import NEW_PHOTO_ID

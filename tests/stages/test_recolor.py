@@ -7,9 +7,9 @@ import torch
 from torch.nn.functional import normalize, pad
 
 from gscompleter.config import CompleterConfig, RecolorConfig
-from gscompleter.render import load_renderer
 from gscompleter.render.cache import SceneRenderer
 from gscompleter.render.cpu import CpuRenderer
+from gscompleter.render.loading import load_renderer
 from gscompleter.render.spherical_harmonics import evaluate_sh_basis
 from gscompleter.stages.recolor import fit_colors
 from gscompleter.trust import HeldViews

@@ -6,8 +6,8 @@ import pytest
 import torch
 
 from gscompleter.config import CompleterConfig, HoleConfig, RefineConfig
-from gscompleter.image_ops import dilate
-from gscompleter.render import load_renderer
+from gscompleter.numerics.image_ops import dilate
+from gscompleter.render.loading import load_renderer
 from gscompleter.stages.filter_holes import select_in_mask
 from gscompleter.stages.refine import refine, refine_opacities
 from gscompleter.stages.target_view import compute_hole_mask

@@ -6,11 +6,12 @@ import pytest
 import torch
 
 from gscompleter.config import AlignmentConfig, CompleterConfig, RegistrationConfig
-from gscompleter.geometry import project, slide
-from gscompleter.render import Renderer, load_renderer
+from gscompleter.numerics.geometry import project, slide
+from gscompleter.numerics.sky import SKY_DEPTH
 from gscompleter.render.cpu import CpuRenderer
+from gscompleter.render.loading import load_renderer
+from gscompleter.render.protocols import Renderer
 from gscompleter.render.redraw import RedrawnScene
-from gscompleter.sky import SKY_DEPTH
 from gscompleter.stages.align_depth import align_depth
 from gscompleter.stages.slide_along_rays import (
     Objective,

@@ -13,10 +13,10 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
-from gscompleter.errors import InputError
-from gscompleter.io.files import replace_file
-from gscompleter.jobs.engines import open_local, open_ray
-from gscompleter.jobs.jobs import (
+from gscompleter.system.errors import InputError
+from gscompleter.system.files.writing import replace_file
+from gscompleter.system.jobs.engines import open_local, open_ray
+from gscompleter.system.jobs.jobs import (
     JOBS,
     Engine,
     Job,

@@ -17,9 +17,9 @@ import numpy as np
 import torch
 from torch import Tensor, nn
 
-from gscompleter.geometry import multiply_quats, quats_to_rotations, rotations_to_quats
 from gscompleter.models.feed_forward.cameras import Cameras
 from gscompleter.models.feed_forward.gaussian_adapter import PixelGaussians
+from gscompleter.numerics.geometry import multiply_quats, quats_to_rotations, rotations_to_quats
 from parity import relative_error
 from paths import FIXTURES
 

@@ -39,8 +39,8 @@ import fuzz as commands
 import gscompleter as gsc
 from gscompleter.data.formats import open_photographs
 from gscompleter.generators import GeneratorOutput
+from gscompleter.numerics.value_checks import check_gaussians, check_views
 from gscompleter.types import DepthMap, Reconstruction, View
-from gscompleter.value_checks import check_gaussians, check_views
 from scenes import Room, camera_at, gaussians_of, random_gaussians, view_of
 
 jaxtyping_config.update("jaxtyping_disable", True)  # users run without it

@@ -13,7 +13,6 @@ import pytest
 import torch
 from torch import Tensor, nn
 
-from gscompleter.errors import InputError
 from gscompleter.evaluation import runner
 from gscompleter.evaluation.protocols import Task
 from gscompleter.evaluation.runner import RunConfig
@@ -22,6 +21,7 @@ from gscompleter.models.feed_forward import build
 from gscompleter.models.feed_forward.cameras import Cameras
 from gscompleter.models.feed_forward.gaussian_adapter import PixelGaussians
 from gscompleter.models.weights.published import PublishedWeights
+from gscompleter.system.errors import InputError
 from gscompleter.types import View
 
 

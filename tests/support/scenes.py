@@ -14,12 +14,12 @@ from pathlib import Path
 import numpy as np
 import plyfile
 import torch
+from gscompleter.system.files.image import write_image
 from jaxtyping import Float
 from torch import Tensor
 
 from gscompleter.data.scene import write_cameras
 from gscompleter.generators import GeneratorOutput, GeneratorRequest, as_generator
-from gscompleter.io.image import write_image
 from gscompleter.splats.ply import save_ply
 from gscompleter.types import (
     Camera,

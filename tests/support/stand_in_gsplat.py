@@ -14,7 +14,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from gscompleter.geometry import is_inside
+from gscompleter.numerics.geometry import is_inside
 from gscompleter.render.reference import Splats, composite, project
 from gscompleter.render.spherical_harmonics import evaluate_sh_basis
 from gscompleter.types import Camera, make_observed, sh_from_rgb

@@ -5,9 +5,10 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 from gscompleter.config import CompleterConfig
-from gscompleter.geometry import pad_camera
-from gscompleter.render import Renderer, load_renderer
+from gscompleter.numerics.geometry import pad_camera
 from gscompleter.render.cache import SceneRenderer
+from gscompleter.render.loading import load_renderer
+from gscompleter.render.protocols import Renderer
 from gscompleter.stages.target_view import TargetView, render_target
 from gscompleter.state import Completion, Photo
 from gscompleter.trust import Trust

@@ -11,8 +11,8 @@ import torch
 from torch import Tensor, nn
 
 from feed_forward_fixtures import EVERY, STORED, Case, rule_v1
-from gscompleter.geometry import quats_to_rotations
 from gscompleter.models.feed_forward.volsplat import VoxelGaussians
+from gscompleter.numerics.geometry import quats_to_rotations
 from parity import relative_error
 
 FIXTURES = STORED / "volsplat"

@@ -18,13 +18,13 @@ from gscompleter.config import (
     TrustConfig,
 )
 from gscompleter.evaluation.metrics.image import psnr
-from gscompleter.geometry import is_inside, project
 from gscompleter.guards.psnr import compute_squared_error
-from gscompleter.memory import estimate_bytes
-from gscompleter.render import load_renderer
+from gscompleter.numerics.geometry import is_inside, project
+from gscompleter.render.loading import load_renderer
 from gscompleter.render.lod import MIN_PROXY_GAUSSIANS
 from gscompleter.splats.morton import argsort_nearby
 from gscompleter.splats.ply import load_ply, save_ply
+from gscompleter.system.memory import estimate_bytes
 from gscompleter.trust import Trust
 from gscompleter.trust.photometric import (
     compute_trust,
@@ -228,7 +228,7 @@ def test_the_command_refuses_a_scene_that_does_not_fit(tmp_path, monkeypatch, ca
     scene = photographed(tmp_path / "scene", [*PHOTOGRAPHS, TARGET])
     save_ply(tmp_path / "splat.ply", SCENE)
     there = estimate_bytes(48 * 48, 3)
-    monkeypatch.setattr("gscompleter.memory.read_memory_bytes", lambda: there)
+    monkeypatch.setattr("gscompleter.system.memory.read_memory_bytes", lambda: there)
     assert run(monkeypatch, *complete(scene, tmp_path / "splat.ply", tmp_path / "out")) == 2
     assert f"The {len(SCENE):,} Gaussians of the scene and 3 photographs" in capsys.readouterr().err
     assert not (tmp_path / "out").exists()

@@ -8,11 +8,11 @@ from collections.abc import Collection
 import torch
 
 from gscompleter.completer import GSCompleter
-from gscompleter.image_ops import smooth_masked
-from gscompleter.kernels.compiled import get_cache_folder, is_compiled, mark_compiled
-from gscompleter.progress import stage
-from gscompleter.render import load_renderer
+from gscompleter.numerics.image_ops import smooth_masked
+from gscompleter.numerics.kernels.compiled import get_cache_folder, is_compiled, mark_compiled
+from gscompleter.render.loading import load_renderer
 from gscompleter.render.lod import simplify_scene
+from gscompleter.system.progress import stage
 from gscompleter.types import Camera, View
 
 SPLAT_PART = "splat"

@@ -16,7 +16,7 @@ from gscompleter.config.settings import (
     apply_changes,
     read_yaml,
 )
-from gscompleter.errors import InputError, quote_value, require_path
+from gscompleter.system.errors import InputError, quote_value, require_path
 
 Pixels = Annotated[int, Interval(ge=0, le=4096)]
 Step = Annotated[float, Interval(gt=0, le=10)]
@@ -272,7 +272,7 @@ GUARDS = {
     "free-space": "gscompleter.guards.free_space:FreeSpace",
     "psnr": "gscompleter.guards.psnr:PsnrGuard",
     "contribution": "gscompleter.guards.contribution:Contribution",
-    "removal": "gscompleter.guards.removal:Removal",
+    "removal": "gscompleter.editing.removal_guard:Removal",
 }
 """Module and class of each guard, imported when a preset names it."""
 USUAL_GUARDS = tuple(name for name in GUARDS if name != "removal")

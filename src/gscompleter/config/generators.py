@@ -6,8 +6,8 @@ from dataclasses import asdict, dataclass
 from typing import Any
 
 from gscompleter.config.settings import Settings
-from gscompleter.errors import InputError, quote_value
-from gscompleter.plugins import load_plugins
+from gscompleter.system.errors import InputError, quote_value
+from gscompleter.system.plugins import load_plugins
 
 
 @dataclass(frozen=True)

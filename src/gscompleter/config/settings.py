@@ -12,8 +12,8 @@ from typing import TYPE_CHECKING, Annotated, Any, ClassVar, TypeVar
 
 from annotated_types import Interval
 
-from gscompleter.errors import InputError, quote_value
-from gscompleter.io.reading import read_bytes
+from gscompleter.system.errors import InputError, quote_value
+from gscompleter.system.files.reading import read_bytes
 
 if TYPE_CHECKING:
     from pydantic_core import ErrorDetails

@@ -40,8 +40,8 @@ from gscompleter.data.limits import require
 from gscompleter.data.photographs import Photographs, Resolution, build_photographs
 from gscompleter.data.transforms import NAME as TRANSFORMS
 from gscompleter.data.transforms import read_frames
-from gscompleter.errors import InputError, quote_value
-from gscompleter.io.reading import is_json_list, read_head, read_json
+from gscompleter.system.errors import InputError, quote_value
+from gscompleter.system.files.reading import is_json_list, read_head, read_json
 
 NAME = "cameras.json"
 ADVICE = "export the cameras again"

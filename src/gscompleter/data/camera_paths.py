@@ -24,8 +24,8 @@ from gscompleter.data.limits import require
 from gscompleter.data.local_origin import read_dataparser_transforms
 from gscompleter.data.transforms import NAME as TRANSFORMS
 from gscompleter.data.transforms import OPENCV_FROM_OPENGL
-from gscompleter.errors import quote_value
-from gscompleter.io.reading import read_json
+from gscompleter.system.errors import quote_value
+from gscompleter.system.files.reading import read_json
 
 DATAPARSER_FILE = "dataparser_transforms.json"
 """File of a nerfstudio run with the transform that it applied to the scene."""

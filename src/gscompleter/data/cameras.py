@@ -18,8 +18,7 @@ import torch
 from jaxtyping import Float, Int, Shaped
 from torch import Tensor
 
-from gscompleter.data.limits import FOCAL_RANGE, MAX_CENTER, MAX_COORDINATE
-from gscompleter.types import MAX_RIGID_ERROR
+from gscompleter.types import FOCAL_RANGE, MAX_CENTER, MAX_COORDINATE, MAX_RIGID_ERROR
 
 MAX_ZOOM_OUT = 0.5
 """Smallest share of the central resolution that undistortion keeps."""

@@ -28,12 +28,13 @@ from gscompleter.data.cameras import (
     invert_viewmat,
 )
 from gscompleter.data.frame import Frame, find_file, find_path, keep_existing, locate_images
-from gscompleter.data.limits import MAX_COEFFICIENT, MAX_NUMBER, MAX_SIDE
+from gscompleter.data.limits import MAX_COEFFICIENT, MAX_NUMBER
 from gscompleter.data.photographs import Photographs, build_photographs
 from gscompleter.data.points import read_point_cloud
-from gscompleter.errors import InputError, quote_value, refuse_pointer
-from gscompleter.io.image import read_image_size, read_orientation
-from gscompleter.io.reading import open_file, read_lines
+from gscompleter.system.errors import InputError, quote_value, refuse_pointer
+from gscompleter.system.files.image import read_image_size, read_orientation
+from gscompleter.system.files.reading import open_file, read_lines
+from gscompleter.types import MAX_SIDE
 
 HOMES = ("sparse", "colmap/sparse", "distorted/sparse", "")
 """Folders that are models or hold numbered ones, in search order."""

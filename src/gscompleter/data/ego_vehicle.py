@@ -18,8 +18,8 @@ from jaxtyping import Bool, Float, Int
 
 from gscompleter.data.cameras import Pinhole, find_pose_defect
 from gscompleter.data.frame import Frame
-from gscompleter.errors import InputError
-from gscompleter.io.image import read_brightness, read_image_size, turn_upright
+from gscompleter.system.errors import InputError
+from gscompleter.system.files.image import read_brightness, read_image_size, turn_upright
 
 FEWEST, MOST = 6, 12
 """Fewest and most photographs of a camera that are searched; with fewer, nothing is found."""

@@ -35,8 +35,8 @@ from gscompleter.data.real_estate import (
 )
 from gscompleter.data.sfm.poses import ENDINGS, is_own
 from gscompleter.data.transforms import has_transforms, open_transforms
-from gscompleter.errors import InputError, join_names, quote_value, require_path
-from gscompleter.io.reading import list_folders
+from gscompleter.system.errors import InputError, join_names, quote_value, require_path
+from gscompleter.system.files.reading import list_folders
 
 
 @dataclass(frozen=True)

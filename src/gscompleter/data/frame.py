@@ -20,15 +20,15 @@ from gscompleter.data.cameras import (
     undistort_pinhole,
 )
 from gscompleter.data.file_names import FolderListings, list_endings
-from gscompleter.data.limits import MAX_SIDE
-from gscompleter.errors import InputError, join_names, quote_value
-from gscompleter.io.image import (
+from gscompleter.system.errors import InputError, join_names, quote_value
+from gscompleter.system.files.image import (
     QUARTER_TURNS,
     read_colors_and_alpha,
     read_image_size,
     read_orientation,
     turn_upright,
 )
+from gscompleter.types import MAX_SIDE
 
 ENDINGS = ("", ".png", ".jpg", ".jpeg")
 """Image file endings tried for names without one."""

@@ -16,7 +16,7 @@ from torch import Tensor
 
 from gscompleter.data.frame import Frame
 from gscompleter.data.photographs import Photographs, Resolution
-from gscompleter.geometry import compute_sparse_depth
+from gscompleter.numerics.geometry import compute_sparse_depth
 from gscompleter.types import View
 
 EDGE_SHARE, EDGE_RATIO = 1 / 128, 1.1

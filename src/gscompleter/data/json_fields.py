@@ -12,8 +12,9 @@ import numpy as np
 from jaxtyping import Float
 
 from gscompleter.data.cameras import Intrinsics, compute_rotation
-from gscompleter.data.limits import MAX_COORDINATE, MAX_NUMBER, MAX_PATH, MAX_SIDE, require
-from gscompleter.errors import quote_value
+from gscompleter.data.limits import MAX_NUMBER, MAX_PATH, require
+from gscompleter.system.errors import quote_value
+from gscompleter.types import MAX_COORDINATE, MAX_SIDE
 
 NUMBERS = (int, float, np.integer, np.floating)
 Part = TypeVar("Part")

@@ -1,19 +1,13 @@
 """Bounds for the numbers of a camera, and their checks.
 
-Files hold float64 and the pipeline uses float32, where 1e300 is infinity and 1e-300 is zero.
-Numbers are checked once, on input. The bounds admit every real camera, and squares and quotients of
-its numbers; those that `Camera` checks too are in `camera_limits`.
+Numbers of files are checked once, on input; `types` has the bounds that `Camera` checks too.
 """
 
 from __future__ import annotations
 
 from numbers import Real
 
-from gscompleter.camera_limits import FOCAL_RANGE as FOCAL_RANGE
-from gscompleter.camera_limits import MAX_CENTER as MAX_CENTER
-from gscompleter.camera_limits import MAX_COORDINATE as MAX_COORDINATE
-from gscompleter.camera_limits import MAX_SIDE as MAX_SIDE
-from gscompleter.errors import InputError
+from gscompleter.system.errors import InputError
 
 MAX_NUMBER = 1e12
 """Largest number of any kind in a camera file, such as a focal length in pixels."""

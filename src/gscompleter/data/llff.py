@@ -21,8 +21,8 @@ from gscompleter.data.json_fields import get_size
 from gscompleter.data.limits import DEPTH_RANGE, require
 from gscompleter.data.photographs import Photographs, build_photographs
 from gscompleter.data.points import FAR_FACTOR, NEAR_FACTOR
-from gscompleter.errors import InputError, quote_value
-from gscompleter.io.reading import check_file
+from gscompleter.system.errors import InputError, quote_value
+from gscompleter.system.files.reading import check_file
 
 NAME = "poses_bounds.npy"
 IMAGES = (".jpg", ".jpeg", ".png")

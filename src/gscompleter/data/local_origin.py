@@ -17,7 +17,7 @@ from jaxtyping import Float
 from gscompleter.data.cameras import find_pose_defect
 from gscompleter.data.json_fields import get_array, get_number
 from gscompleter.data.limits import require
-from gscompleter.io.reading import read_json
+from gscompleter.system.files.reading import read_json
 from gscompleter.types import Camera, Gaussians
 
 SCALE_RANGE = (1e-9, 1e9)

@@ -22,8 +22,8 @@ from PIL import Image
 from gscompleter.data.cameras import has_same_aspect
 from gscompleter.data.file_names import FolderListings
 from gscompleter.data.frame import FOLDERS, MASKS, Frame
-from gscompleter.errors import InputError, quote_value
-from gscompleter.io.image import HALF_OPAQUE, read_mask, turn_upright
+from gscompleter.system.errors import InputError, quote_value
+from gscompleter.system.files.image import HALF_OPAQUE, read_mask, turn_upright
 
 MASK_FOLDERS = (MASKS, "mask")
 """Folders of masks, beside the photographs, in their folder or beside it."""

@@ -25,8 +25,8 @@ from gscompleter.data.sfm.poses import (
     iterate_photographs,
     read_focal,
 )
-from gscompleter.errors import quote_value
-from gscompleter.io.image import ORIENTATION, open_image
+from gscompleter.system.errors import quote_value
+from gscompleter.system.files.image import ORIENTATION, open_image
 
 PHONE_FOCAL = 26 / FULL_FRAME_DIAGONAL
 """Focal length if EXIF has none, in image diagonals: 26 mm in 35 mm film, a phone's camera."""

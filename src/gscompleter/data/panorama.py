@@ -18,9 +18,9 @@ from PIL import Image
 
 from gscompleter.data.cameras import remap
 from gscompleter.data.limits import require
-from gscompleter.errors import quote_value
-from gscompleter.io.image import open_image, read_brightness, read_image_size
-from gscompleter.io.reading import read_head
+from gscompleter.system.errors import quote_value
+from gscompleter.system.files.image import open_image, read_brightness, read_image_size
+from gscompleter.system.files.reading import read_head
 
 VIEWS = (*((yaw, 0) for yaw in range(0, 360, 60)), *((yaw, 50) for yaw in range(0, 360, 120)))
 """Yaw and pitch (upwards) of the views in degrees, each 90° wide; the first faces the middle."""

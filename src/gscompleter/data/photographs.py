@@ -21,15 +21,14 @@ from PIL import Image
 from torch import Tensor
 
 from gscompleter.data.cameras import compute_fov, compute_undistortion_map, find_pose_defect, remap
-from gscompleter.data.driving.vehicle import mask_moving
 from gscompleter.data.frame import Frame
-from gscompleter.data.limits import MAX_SIDE
 from gscompleter.data.local_origin import choose_local_origin
 from gscompleter.data.masks import fill_hidden, find_hidden
-from gscompleter.errors import InputError, join_names, quote_value
-from gscompleter.geometry import compute_sparse_depth
-from gscompleter.io.image import composite_over_black, convert_to_image, has_alpha
-from gscompleter.types import Camera, View
+from gscompleter.data.moving_boxes import mask_moving
+from gscompleter.numerics.geometry import compute_sparse_depth
+from gscompleter.system.errors import InputError, join_names, quote_value
+from gscompleter.system.files.image import composite_over_black, convert_to_image, has_alpha
+from gscompleter.types import MAX_SIDE, Camera, View
 
 
 @dataclass(frozen=True)

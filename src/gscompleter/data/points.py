@@ -13,8 +13,8 @@ from torch import Tensor
 
 from gscompleter.data.limits import DEPTH_RANGE
 from gscompleter.data.photographs import Photographs, Resolution
-from gscompleter.geometry import is_inside, project
-from gscompleter.splats.ply import read_ply_file
+from gscompleter.numerics.geometry import is_inside, project
+from gscompleter.system.files.ply import read_ply_file
 from gscompleter.types import Camera
 
 AXES = ("x", "y", "z")

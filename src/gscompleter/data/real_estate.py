@@ -24,8 +24,8 @@ from gscompleter.data.cameras import FRACTIONS, Intrinsics, invert_viewmat
 from gscompleter.data.frame import Frame
 from gscompleter.data.limits import require
 from gscompleter.data.photographs import Photographs, build_photographs
-from gscompleter.errors import InputError, join_names, quote_value, refuse_pointer
-from gscompleter.io.reading import check_file, open_file, read_head, read_json, read_lines
+from gscompleter.system.errors import InputError, join_names, quote_value, refuse_pointer
+from gscompleter.system.files.reading import check_file, open_file, read_head, read_json, read_lines
 
 INDEX = "index.json"
 

@@ -13,8 +13,8 @@ from gscompleter.data.formats import open_photographs
 from gscompleter.data.limits import check_planes, require
 from gscompleter.data.photographs import Photographs, Resolution
 from gscompleter.data.transforms import OPENCV_FROM_OPENGL
-from gscompleter.errors import quote_value, require_path
-from gscompleter.io.files import replace_file
+from gscompleter.system.errors import quote_value, require_path
+from gscompleter.system.files.writing import replace_file
 from gscompleter.types import Camera, View
 
 

@@ -25,9 +25,9 @@ from gscompleter.data.json_fields import (
 from gscompleter.data.limits import DEPTH_RANGE, MAX_COEFFICIENT, MAX_NUMBER, require
 from gscompleter.data.photographs import Photographs, build_photographs
 from gscompleter.data.points import read_point_cloud
-from gscompleter.errors import quote_value
-from gscompleter.io.image import read_depth
-from gscompleter.io.reading import is_json_list, read_json
+from gscompleter.system.errors import quote_value
+from gscompleter.system.files.image import read_depth
+from gscompleter.system.files.reading import is_json_list, read_json
 
 NAME = "transforms.json"
 ADVICE = "export the scene again"

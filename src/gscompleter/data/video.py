@@ -16,9 +16,9 @@ from jaxtyping import Float, UInt8
 from PIL import Image
 
 from gscompleter.data.limits import require
-from gscompleter.errors import quote_value
-from gscompleter.io.video import read_frames
-from gscompleter.progress import stage
+from gscompleter.system.errors import quote_value
+from gscompleter.system.files.video import read_frames
+from gscompleter.system.progress import stage
 
 Image8 = UInt8[np.ndarray, "h w"]
 Corners = Float[np.ndarray, "n 1 2"]

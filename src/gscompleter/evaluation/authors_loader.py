@@ -11,8 +11,8 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 from gscompleter.config.settings import Settings
-from gscompleter.data.cases import SkippedScene
 from gscompleter.data.photographs import AuthorsCrop, Photographs
+from gscompleter.evaluation.cases import SkippedScene
 from gscompleter.evaluation.protocols import EvaluationIndex, EvaluationProtocol, Split
 
 

@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 
 from gscompleter.evaluation.steps import compute_scale_drift
-from gscompleter.timing import STAGES
+from gscompleter.system.timing import STAGES
 
 RunRow = dict[str, Any]
 """Output of `evaluate` for a task and a method."""

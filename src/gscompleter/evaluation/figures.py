@@ -10,11 +10,11 @@ from typing import Any
 import cv2
 import numpy as np
 
-from gscompleter.errors import InputError
 from gscompleter.evaluation import store
 from gscompleter.evaluation.paper import PHOTOGRAPH, TRUTH, FigureSpec, is_photograph
-from gscompleter.io.files import replace_file
-from gscompleter.io.image import read_pixels
+from gscompleter.system.errors import InputError
+from gscompleter.system.files.image import read_pixels
+from gscompleter.system.files.writing import replace_file
 
 DPI = 300
 IMAGE_INCHES = 1.4

@@ -10,16 +10,16 @@ import torch
 
 from gscompleter.completer import GSCompleter
 from gscompleter.config import ABLATIONS, get_named_config
-from gscompleter.errors import InputError, quote_value
 from gscompleter.evaluation.baselines.optimization import OptimizationConfig, optimize
 from gscompleter.evaluation.baselines.reggs import RegGSConfig, register_by_similarity
 from gscompleter.generators import Generator
 from gscompleter.reconstructors import Reconstructor
-from gscompleter.render import Renderer
+from gscompleter.render.protocols import Renderer
 from gscompleter.stages.lift import lift_pair
 from gscompleter.stages.select_anchor import select_anchor
 from gscompleter.state import Completion
-from gscompleter.timing import record_seconds, timed_stage
+from gscompleter.system.errors import InputError, quote_value
+from gscompleter.system.timing import record_seconds, timed_stage
 from gscompleter.types import Camera, Gaussians, View, merge
 
 

@@ -25,7 +25,7 @@ from gscompleter.evaluation.tables import (
     read_rows,
     summarize_run,
 )
-from gscompleter.io.files import encode_text, replace_file
+from gscompleter.system.files.writing import encode_text, replace_file
 
 SIGNIFICANCE = 0.05
 """Largest two-sided p at which a difference is more than noise."""

@@ -19,11 +19,11 @@ from annotated_types import Ge, MinLen
 from pydantic import Field, TypeAdapter, ValidationError
 
 from gscompleter.completer import MAX_TARGET_ID
-from gscompleter.data.cases import Case
 from gscompleter.data.photographs import Photographs, Resolution
-from gscompleter.errors import InputError, quote_value
-from gscompleter.io.files import replace_file
-from gscompleter.io.reading import read_json
+from gscompleter.evaluation.cases import Case
+from gscompleter.system.errors import InputError, quote_value
+from gscompleter.system.files.reading import read_json
+from gscompleter.system.files.writing import replace_file
 from gscompleter.types import View
 
 INDICES = Path(__file__).parent / "indices"

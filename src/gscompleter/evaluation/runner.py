@@ -10,19 +10,26 @@ from pathlib import Path
 from typing import Any, Literal
 
 from gscompleter.config.generators import GeneratorSettings
-from gscompleter.errors import InputError
 from gscompleter.evaluation import store
 from gscompleter.evaluation.methods import Models, check_methods
 from gscompleter.evaluation.protocols import Task
 from gscompleter.evaluation.steps import PreparedTask, attempt, complete_task
 from gscompleter.generators import load_generator
-from gscompleter.jobs.jobs import Engine, Job, check_shard, describe_loss, run_jobs, write_json
-from gscompleter.memory import check_memory
-from gscompleter.progress import show_progress, stage, track
 from gscompleter.reconstructors import load_reconstructor
-from gscompleter.render import load_renderer
+from gscompleter.render.loading import load_renderer
 from gscompleter.stages.context import normalize_exposures, reconstruct_context, sort_by_frame
-from gscompleter.timing import record_seconds
+from gscompleter.system.errors import InputError
+from gscompleter.system.jobs.jobs import (
+    Engine,
+    Job,
+    check_shard,
+    describe_loss,
+    run_jobs,
+    write_json,
+)
+from gscompleter.system.memory import check_memory
+from gscompleter.system.progress import show_progress, stage, track
+from gscompleter.system.timing import record_seconds
 from gscompleter.types import View
 
 RETRIES = 2

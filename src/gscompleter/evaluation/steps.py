@@ -14,14 +14,14 @@ from functools import partial
 from pathlib import Path
 from typing import TypeVar
 
-from gscompleter.errors import InputError, OutputError
 from gscompleter.evaluation import store
 from gscompleter.evaluation.memory import measure_peak_memory
 from gscompleter.evaluation.methods import METHODS, Models, Prediction, mark_target
 from gscompleter.evaluation.metrics import scores as scoring
-from gscompleter.io.image import write_image
 from gscompleter.stages.lift import lift_pair
 from gscompleter.state import Completion
+from gscompleter.system.errors import InputError, OutputError
+from gscompleter.system.files.image import write_image
 from gscompleter.types import DepthMap, Gaussians, View
 
 T = TypeVar("T")

@@ -25,11 +25,11 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from gscompleter.errors import InputError, quote_value
 from gscompleter.evaluation.methods import Prediction
-from gscompleter.io import reading
-from gscompleter.io.files import replace_file
-from gscompleter.jobs.jobs import claim_folder, make_folder
+from gscompleter.system.errors import InputError, quote_value
+from gscompleter.system.files import reading
+from gscompleter.system.files.writing import replace_file
+from gscompleter.system.jobs.jobs import claim_folder, make_folder
 from gscompleter.types import Gaussians, merge
 
 RUN, TASKS = "run.json", "tasks"

@@ -13,7 +13,6 @@ from functools import cached_property, partial
 from pathlib import Path
 from typing import Any
 
-from gscompleter.errors import InputError
 from gscompleter.evaluation.columns import (
     GROUPS,
     MIN_PIXELS,
@@ -33,9 +32,10 @@ from gscompleter.evaluation.store import (
     read_json,
     read_settings,
 )
-from gscompleter.io.files import encode_text, replace_file
-from gscompleter.io.image import read_image
-from gscompleter.timing import STAGES
+from gscompleter.system.errors import InputError
+from gscompleter.system.files.image import read_image
+from gscompleter.system.files.writing import encode_text, replace_file
+from gscompleter.system.timing import STAGES
 
 Fids = dict[str, float] | str
 """The Fréchet inception distance of each method, or the reason why there is none."""

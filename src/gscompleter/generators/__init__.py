@@ -11,10 +11,10 @@ from torch import Tensor
 
 from gscompleter.config.generators import PLUGINS, GeneratorSettings, get_settings_class
 from gscompleter.config.settings import validate
-from gscompleter.errors import InputError
-from gscompleter.geometry import is_same_camera
-from gscompleter.plugins import load_plugins
-from gscompleter.tensor_checks import describe, is_whole
+from gscompleter.numerics.geometry import is_same_camera
+from gscompleter.system.errors import InputError
+from gscompleter.system.plugins import load_plugins
+from gscompleter.system.tensor_checks import describe, is_whole
 from gscompleter.types import Camera, GeneratorInput, View
 
 

@@ -9,11 +9,11 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
-from gscompleter.errors import InputError
 from gscompleter.generators import GeneratorOutput
-from gscompleter.generators.exposure import fit_robust_affine
 from gscompleter.generators.warp import WarpedImage
-from gscompleter.image_ops import smooth_masked
+from gscompleter.numerics.image_ops import smooth_masked
+from gscompleter.numerics.robust import fit_robust_affine
+from gscompleter.system.errors import InputError
 
 BLUR_RADIUS = 2
 """Blur in pixels before colours are compared; edges may be a pixel off."""

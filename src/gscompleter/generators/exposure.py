@@ -14,8 +14,6 @@ DARKEST, BRIGHTEST = 0.05, 0.95
 """Range of usable values; darker ones are noise, brighter ones may be clipped."""
 MAX_GAIN = 2.0
 """Largest plausible gain; its inverse is the smallest."""
-ROUNDS = 5
-"""Number of robust fits; each one leaves out the outliers of the previous one."""
 
 
 def match_exposures(
@@ -53,25 +51,3 @@ def compute_median_ratio(
         if int(exposed.sum()) >= MIN_PIXELS:
             ratios[channel] = (b[exposed] / a[exposed]).median()
     return ratios
-
-
-def fit_robust_affine(
-    x: Float[Tensor, "n c"], y: Float[Tensor, "n c"]
-) -> tuple[Float[Tensor, "c"], Float[Tensor, "c"]]:
-    """Fit `y = gain * x + offset` per channel by trimmed least squares, starting at gain 1.
-
-    Residuals above 2.5 standard deviations are dropped; a constant channel keeps about gain 1.
-    """
-    gain = torch.ones_like(x[0])
-    offset = (y - x).median(dim=0).values
-    for _ in range(ROUNDS):
-        error = (gain * x + offset - y).abs()
-        usual = 1.4826 * error.median(dim=0).values
-        weight = (error <= 2.5 * usual.clamp_min(1e-3)).to(x)
-        total = weight.sum(dim=0).clamp_min(1.0)
-        mean_x, mean_y = (weight * x).sum(dim=0) / total, (weight * y).sum(dim=0) / total
-        a, b = x - mean_x, y - mean_y
-        variance = (weight * a * a).sum(dim=0) / total
-        gain = ((weight * a * b).sum(dim=0) / total + 1e-4) / (variance + 1e-4)
-        offset = mean_y - gain * mean_x
-    return gain, offset

@@ -12,8 +12,8 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 
 from gscompleter.generators.smooth import compute_distance_to_known, continue_smoothly
-from gscompleter.image_ops import blur_gaussian, dilate
-from gscompleter.kernels.streamlines import trace_lines
+from gscompleter.numerics.image_ops import blur_gaussian, dilate
+from gscompleter.numerics.kernels.streamlines import trace_lines
 
 GRADIENT_SIGMA, TENSOR_SIGMA = 1.0, 3.0
 """Standard deviations in pixels of the blurs before and after gradients are multiplied."""

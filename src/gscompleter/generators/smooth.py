@@ -11,7 +11,7 @@ from scipy.sparse import diags, kronsum
 from scipy.sparse.linalg import splu
 from torch import Tensor
 
-from gscompleter.kernels.pyramid_fill import build_pyramid, compute_means
+from gscompleter.numerics.kernels.pyramid_fill import build_pyramid, compute_means
 from gscompleter.types import Render
 
 BLUR_SIGMA = 1.5

@@ -12,8 +12,8 @@ from gscompleter.config.settings import COVERED
 from gscompleter.generators.exposure import match_exposures
 from gscompleter.generators.lines import continue_lines
 from gscompleter.generators.smooth import continue_smoothly, fit_membrane
-from gscompleter.geometry import is_inside, measure_baseline, project, sample, unproject
-from gscompleter.image_ops import dilate, smooth_masked
+from gscompleter.numerics.geometry import is_inside, measure_baseline, project, sample, unproject
+from gscompleter.numerics.image_ops import dilate, smooth_masked
 from gscompleter.types import Camera, GeneratorInput, Render, TensorDataclass, View
 
 DEPTH_TOLERANCE = 0.03

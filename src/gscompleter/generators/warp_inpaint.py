@@ -20,9 +20,9 @@ from torch.nn.functional import avg_pool2d, pad
 
 from gscompleter.generators.smooth import average_trusted, compute_distance_to_known
 from gscompleter.generators.warp import WarpedImage, continue_image, warp_and_fill
-from gscompleter.image_ops import dilate, smooth_masked
-from gscompleter.kernels import patchmatch
-from gscompleter.kernels.patchmatch import RADIUS, SIDE
+from gscompleter.numerics.image_ops import dilate, smooth_masked
+from gscompleter.numerics.kernels import patchmatch
+from gscompleter.numerics.kernels.patchmatch import RADIUS, SIDE
 from gscompleter.types import Camera, GeneratorInput, View
 
 STRUCTURE_REACH = 0.15

@@ -16,7 +16,7 @@ from gscompleter.stages.refine import Refined
 from gscompleter.stages.synthesize import GeneratedView
 from gscompleter.stages.target_view import TargetView
 from gscompleter.state import Completion, Rejection, Step
-from gscompleter.timing import timed_stage
+from gscompleter.system.timing import timed_stage
 from gscompleter.types import DepthAffine, Gaussians
 
 

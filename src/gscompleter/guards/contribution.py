@@ -7,7 +7,7 @@ from jaxtyping import Bool
 from torch import Tensor
 
 from gscompleter.guards import Attempt, Guard
-from gscompleter.render import FrozenScene
+from gscompleter.render.protocols import FrozenScene
 from gscompleter.types import Gaussians
 
 MIN_WEIGHT = 0.002

@@ -21,8 +21,8 @@ from torch.nn.functional import interpolate, max_pool2d
 
 from gscompleter.config import DynamicMasksConfig
 from gscompleter.config.settings import COVERED
-from gscompleter.generators.exposure import fit_robust_affine
-from gscompleter.geometry import (
+from gscompleter.guards import Guard
+from gscompleter.numerics.geometry import (
     is_inside,
     measure_baseline,
     project,
@@ -30,10 +30,10 @@ from gscompleter.geometry import (
     shrink_camera,
     unproject,
 )
-from gscompleter.guards import Guard
-from gscompleter.image_ops import average_box, dilate
-from gscompleter.render import get_view_map
+from gscompleter.numerics.image_ops import average_box, dilate
+from gscompleter.numerics.robust import fit_robust_affine
 from gscompleter.render.cache import SceneRenderer
+from gscompleter.render.view_map import get_view_map
 from gscompleter.state import Completion
 from gscompleter.types import Camera, Render, View
 

@@ -18,10 +18,10 @@ from torch import Tensor
 from torch.nn.functional import max_pool2d
 
 from gscompleter.config import FreeSpaceConfig
-from gscompleter.geometry import compute_z_depths, project, shrink_camera, slide
 from gscompleter.guards import Guard
-from gscompleter.guards.removal import find_removed
-from gscompleter.sky import compute_sky_depth, is_sky_visible
+from gscompleter.numerics.geometry import compute_z_depths, project, shrink_camera, slide
+from gscompleter.numerics.sky import compute_sky_depth, is_sky_visible
+from gscompleter.render.removed import find_removed
 from gscompleter.stages.target_view import TargetView
 from gscompleter.types import Camera, Gaussians, Render
 

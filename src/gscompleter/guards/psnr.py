@@ -13,14 +13,15 @@ from torch import Tensor
 from torch.nn.functional import pad
 
 from gscompleter.config import PsnrGuardConfig
-from gscompleter.cpu_threads import use_one_torch_thread
-from gscompleter.geometry import project_mask
 from gscompleter.guards import Attempt, Guard
-from gscompleter.image_ops import SSIM_RADIUS, dilate, ssim_map
-from gscompleter.render import FrozenScene, OpacityRender, get_view_map
+from gscompleter.numerics.geometry import project_mask
+from gscompleter.numerics.image_ops import SSIM_RADIUS, dilate, ssim_map
 from gscompleter.render.cache import SceneRenderer
+from gscompleter.render.protocols import FrozenScene, OpacityRender
+from gscompleter.render.view_map import get_view_map
 from gscompleter.stages.target_view import compute_hole_mask
 from gscompleter.state import Completion
+from gscompleter.system.threads import use_one_torch_thread
 from gscompleter.types import ErrorBudget, Gaussians, View
 
 NUM_HALVINGS = 16

@@ -10,7 +10,6 @@ from typing import Any
 
 import torch
 
-from gscompleter.errors import InputError
 from gscompleter.models.depth_anything.alignment import fit_robust_similarity
 from gscompleter.models.depth_anything.inputs import ResizeConfig, create_any_view_batch
 from gscompleter.models.depth_anything.reconstructor import (
@@ -18,6 +17,7 @@ from gscompleter.models.depth_anything.reconstructor import (
     resample_depth_maps,
 )
 from gscompleter.reconstructors.from_depth import FromDepth
+from gscompleter.system.errors import InputError
 from gscompleter.types import DepthMap, View
 
 PUBLISHED = "facebook/map-anything-apache"

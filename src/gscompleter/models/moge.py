@@ -14,9 +14,9 @@ from jaxtyping import Bool, Float
 from numpy import ndarray
 from scipy.optimize import least_squares
 
-from gscompleter.errors import InputError
 from gscompleter.models.onnx_network import ADVICE, OnnxNetwork, load_network
 from gscompleter.models.weights.published import PUBLISHED
+from gscompleter.system.errors import InputError
 from gscompleter.types import Camera, DepthMap, View
 
 SIGNATURE = {"image": ("tensor(float)", 3), "num_tokens": ("tensor(int64)", None)}

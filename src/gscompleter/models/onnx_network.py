@@ -9,10 +9,10 @@ from typing import Any
 
 from numpy import ndarray
 
-from gscompleter.cpu_threads import get_thread_count
-from gscompleter.errors import InputError
 from gscompleter.models.weights.published import PublishedWeights
 from gscompleter.models.weights.reading import fetch_checked
+from gscompleter.system.errors import InputError
+from gscompleter.system.threads import get_thread_count
 
 INSTALL = "pip install 'gscompleter[onnx]'"
 ADVICE = "check that the file is the published one, or choose another model"

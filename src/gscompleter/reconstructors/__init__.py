@@ -11,12 +11,12 @@ import torch
 from jaxtyping import Bool
 from torch import Tensor
 
-from gscompleter.errors import InputError, quote_value
-from gscompleter.plugins import load_plugins
+from gscompleter.numerics.value_checks import check_gaussians
 from gscompleter.reconstructors.depth_predictors import load_depth_predictor
-from gscompleter.tensor_checks import describe, iterate_tensors, name_dtype
+from gscompleter.system.errors import InputError, quote_value
+from gscompleter.system.plugins import load_plugins
+from gscompleter.system.tensor_checks import describe, iterate_tensors, name_dtype
 from gscompleter.types import Reconstruction, View
-from gscompleter.value_checks import check_gaussians
 
 
 @runtime_checkable

@@ -8,8 +8,8 @@ from pathlib import Path
 
 import torch
 
-from gscompleter.errors import InputError, quote_value
-from gscompleter.plugins import load_plugins
+from gscompleter.system.errors import InputError, quote_value
+from gscompleter.system.plugins import load_plugins
 from gscompleter.types import DepthMap, View
 
 DepthPredictor = Callable[[View], DepthMap]

@@ -5,8 +5,9 @@ from __future__ import annotations
 from collections.abc import Hashable, Sequence
 from itertools import takewhile
 
-from gscompleter.render import FrozenScene, Renderer, get_view_map
 from gscompleter.render.lod import MAX_PREVIEW_GAUSSIANS, thin_gaussians
+from gscompleter.render.protocols import FrozenScene, Renderer
+from gscompleter.render.view_map import get_view_map
 from gscompleter.types import Camera, Gaussians
 
 Parts = tuple[Gaussians, ...]

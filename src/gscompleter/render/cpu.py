@@ -14,12 +14,11 @@ from numpy import ndarray
 from torch import Tensor
 from torch.autograd.function import once_differentiable
 
-from gscompleter.errors import InputError
-from gscompleter.kernels import composite, project
-from gscompleter.kernels.composite import Layer, RasterFrame
-from gscompleter.kernels.project import GaussianArrays, Pinhole
-from gscompleter.kernels.simd import TILE
-from gscompleter.render import ColorErrors, ColorSums, DepthRender, OpacityRender
+from gscompleter.numerics.kernels import composite, project
+from gscompleter.numerics.kernels.composite import Layer, RasterFrame
+from gscompleter.numerics.kernels.project import GaussianArrays, Pinhole
+from gscompleter.numerics.kernels.simd import TILE
+from gscompleter.render.protocols import ColorErrors, ColorSums, DepthRender, OpacityRender
 from gscompleter.render.viewpoint import (
     BinnedSplats,
     Splats,
@@ -28,6 +27,7 @@ from gscompleter.render.viewpoint import (
     order_by_use,
     to_float32,
 )
+from gscompleter.system.errors import InputError
 from gscompleter.types import Camera, Gaussians, Render
 
 BLOCK = 1_000_000

@@ -7,9 +7,10 @@ from dataclasses import replace
 
 import torch
 
-from gscompleter.cpu_threads import use_one_torch_thread
-from gscompleter.render import ColorSums, FrozenScene, get_view_map
+from gscompleter.render.protocols import ColorSums, FrozenScene
 from gscompleter.render.spherical_harmonics import evaluate_colors
+from gscompleter.render.view_map import get_view_map
+from gscompleter.system.threads import use_one_torch_thread
 from gscompleter.types import SH_C0, Gaussians, View
 
 RELAXATION = 1.7

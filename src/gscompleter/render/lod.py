@@ -15,12 +15,12 @@ from jaxtyping import Float, Float32, Int, Int64, UInt8
 from numpy import ndarray
 from torch import Tensor
 
-from gscompleter.kernels import lod as kernels
-from gscompleter.kernels.parallel import share
-from gscompleter.kernels.project import GaussianArrays
-from gscompleter.memory import count_fitting_gaussians
+from gscompleter.numerics.kernels import lod as kernels
+from gscompleter.numerics.kernels.parallel import share
+from gscompleter.numerics.kernels.project import GaussianArrays
 from gscompleter.render.cpu import to_arrays
 from gscompleter.render.viewpoint import to_float32
+from gscompleter.system.memory import count_fitting_gaussians
 from gscompleter.types import Camera, ContextScene, Gaussians
 
 MIN_PROXY_GAUSSIANS = 500_000

@@ -10,8 +10,14 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from gscompleter.geometry import move_to_depths
-from gscompleter.render import ColorErrors, ColorSums, DepthRender, OpacityRender, Renderer
+from gscompleter.numerics.geometry import move_to_depths
+from gscompleter.render.protocols import (
+    ColorErrors,
+    ColorSums,
+    DepthRender,
+    OpacityRender,
+    Renderer,
+)
 from gscompleter.types import Camera, Gaussians, Render, merge, sh_from_rgb
 
 ColorRender = Callable[[Float[Tensor, "n 3"]], Float[Tensor, "h w 3"]]

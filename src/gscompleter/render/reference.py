@@ -10,7 +10,7 @@ from jaxtyping import Float
 from torch import Tensor
 from torch.utils.checkpoint import checkpoint
 
-from gscompleter.geometry import compute_z_depths, quats_to_rotations
+from gscompleter.numerics.geometry import compute_z_depths, quats_to_rotations
 from gscompleter.render.redraw import RedrawnScene
 from gscompleter.render.spherical_harmonics import evaluate_colors
 from gscompleter.types import Camera, Gaussians, Render

@@ -12,12 +12,12 @@ from jaxtyping import Bool, Float32, Int32, Int64, Integer
 from numpy import ndarray
 from torch import Tensor
 
-from gscompleter.errors import InputError
-from gscompleter.kernels import composite, project, tiles
-from gscompleter.kernels.composite import WANT_ALL, WANT_COLOR, Layer, RasterFrame
-from gscompleter.kernels.parallel import run, share, split_range
-from gscompleter.kernels.project import GaussianArrays, Pinhole
-from gscompleter.kernels.simd import TILE
+from gscompleter.numerics.kernels import composite, project, tiles
+from gscompleter.numerics.kernels.composite import WANT_ALL, WANT_COLOR, Layer, RasterFrame
+from gscompleter.numerics.kernels.parallel import run, share, split_range
+from gscompleter.numerics.kernels.project import GaussianArrays, Pinhole
+from gscompleter.numerics.kernels.simd import TILE
+from gscompleter.system.errors import InputError
 
 MAX_ENTRIES = np.iinfo(np.int32).max
 """Largest total length of the tiles' lists, which kernels number in 32 bits."""

@@ -16,7 +16,6 @@ import numpy as np
 from jaxtyping import Float
 from numpy import ndarray
 
-from gscompleter.io.files import replace_file
 from gscompleter.splats.packing import (
     MAX_LOG_SCALE,
     assemble_sh,
@@ -26,7 +25,9 @@ from gscompleter.splats.packing import (
     restore_largest,
     unpack_fractions,
 )
-from gscompleter.splats.ply import MODE_COMMENT, encode, has_mode_comment, make_header, read_header
+from gscompleter.splats.ply import MODE_COMMENT, encode, has_mode_comment
+from gscompleter.system.files.ply import make_header, read_header
+from gscompleter.system.files.writing import replace_file
 from gscompleter.types import SH_C0, Gaussians
 
 CHUNK_SIZE = 256

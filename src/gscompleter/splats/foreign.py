@@ -14,8 +14,8 @@ import zlib
 from contextlib import suppress
 from pathlib import Path
 
-from gscompleter.errors import InputError, quote_value
 from gscompleter.splats.packing import ZIP_MAGIC
+from gscompleter.system.errors import InputError, quote_value
 
 GZIP = b"\x1f\x8b"
 SPZ_MAGIC = b"NGSP"

@@ -23,9 +23,7 @@ from jaxtyping import UInt8
 from PIL import Image
 from torch import Tensor
 
-from gscompleter.errors import InputError, quote_value, refuse_pointer, require_path
-from gscompleter.io.files import replace_file
-from gscompleter.io.reading import open_file, read_json
+from gscompleter.numerics.value_checks import check_gaussians
 from gscompleter.splats.compressed_ply import read_compressed_ply, write_compressed_ply
 from gscompleter.splats.foreign import refuse_folder, refuse_foreign, resolve_splat
 from gscompleter.splats.glb import read_glb, write_glb
@@ -37,8 +35,10 @@ from gscompleter.splats.sog import META, read_sog, write_sog
 from gscompleter.splats.splat import read_splat, write_splat
 from gscompleter.splats.spz import read_spz, write_spz
 from gscompleter.splats.usd import refuse_usd, write_usd
+from gscompleter.system.errors import InputError, quote_value, refuse_pointer, require_path
+from gscompleter.system.files.reading import open_file, read_json
+from gscompleter.system.files.writing import replace_file
 from gscompleter.types import Gaussians
-from gscompleter.value_checks import check_gaussians
 
 OPACITY_TOLERANCE = 1e-3
 """Distance from [0, 1] up to which an opacity is clamped instead of refused."""

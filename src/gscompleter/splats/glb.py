@@ -20,12 +20,12 @@ from jaxtyping import Float
 from numpy import ndarray
 from torch import Tensor
 
-from gscompleter.errors import InputError, quote_value
-from gscompleter.geometry import quats_to_rotations
-from gscompleter.io.files import replace_file
-from gscompleter.io.reading import read_bytes
+from gscompleter.numerics.geometry import quats_to_rotations
 from gscompleter.splats.packing import UnsupportedError, build_gaussians
 from gscompleter.splats.transform import HALF_TURN_Z, rotate_half_turn, transform_gaussians
+from gscompleter.system.errors import InputError, quote_value
+from gscompleter.system.files.reading import read_bytes
+from gscompleter.system.files.writing import replace_file
 from gscompleter.types import SH_C0, Gaussians, merge
 
 FILE_HEADER = struct.Struct("<4sII")

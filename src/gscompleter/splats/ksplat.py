@@ -16,13 +16,13 @@ import numpy as np
 from jaxtyping import Float
 from numpy import ndarray
 
-from gscompleter.io.reading import read_bytes
 from gscompleter.splats.packing import (
     NUM_SH_REST,
     UnsupportedError,
     assemble_sh,
     build_gaussians,
 )
+from gscompleter.system.files.reading import read_bytes
 from gscompleter.types import Gaussians, merge
 
 HEADER_BYTES, SECTION_HEADER_BYTES = 4096, 1024

@@ -20,13 +20,10 @@ from numpy import ndarray
 from numpy.lib.recfunctions import require_fields
 from torch import Tensor
 
-from gscompleter.errors import InputError, quote_value
-from gscompleter.io.files import REMOVED_FILE
 from gscompleter.splats.foreign import resolve_splat
 from gscompleter.splats.formats import detect_splat_format, get_writer, load_splat, save_splat
 from gscompleter.splats.ply import (
     MEANS,
-    PlyFile,
     count_rest,
     decode_gaussians,
     has_surfels,
@@ -37,8 +34,10 @@ from gscompleter.splats.ply import (
     read_scene,
     require_finite,
     save_ply,
-    write_ply_file,
 )
+from gscompleter.system.errors import InputError, quote_value
+from gscompleter.system.files.ply import PlyFile, write_ply_file
+from gscompleter.system.files.writing import REMOVED_FILE
 from gscompleter.types import Gaussians, merge
 
 LABEL_COLUMN = "generated"

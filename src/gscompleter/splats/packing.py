@@ -9,7 +9,7 @@ import torch
 from jaxtyping import Float, Integer, UInt32
 from numpy import ndarray
 
-from gscompleter.errors import quote_value
+from gscompleter.system.errors import quote_value
 from gscompleter.types import SH_C0, Gaussians, make_observed
 
 NUM_SH_REST = (0, 3, 8, 15)

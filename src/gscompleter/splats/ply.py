@@ -1,6 +1,5 @@
-"""Reader and writer of .ply files: tables of any columns, and the Gaussians of 3DGS.
+"""Reader and writer of the .ply files of 3DGS.
 
-Binary files of both byte orders and ASCII are read, if they begin with the element `vertex`.
 Written is the standard layout (binary little-endian float32: x y z nx ny nz f_dc_* f_rest_*
 opacity scale_* rot_*), then `uchar generated`. Read are the same properties in any order and
 type. In the file scales are logarithms, opacities are logits, and f_rest_* has all coefficients
@@ -15,40 +14,28 @@ axis as their normal, get a thin third scale.
 from __future__ import annotations
 
 import math
-import os
 import re
-from collections.abc import Iterable, Iterator, Mapping, Sequence
-from dataclasses import dataclass, replace
-from itertools import chain, islice
+from collections.abc import Iterator, Sequence
+from dataclasses import replace
 from pathlib import Path
-from typing import BinaryIO
 
 import numpy as np
 import torch
-from jaxtyping import Bool, Float, UInt8
-from numpy.lib.recfunctions import require_fields, unstructured_to_structured
+from jaxtyping import Bool, Float
+from numpy.lib.recfunctions import require_fields
 from torch import Tensor
 
-from gscompleter.errors import InputError, quote_value, refuse_pointer, require_path
-from gscompleter.io.files import replace_file
-from gscompleter.io.reading import open_file
-from gscompleter.kernels.parallel import map_in_parallel
+from gscompleter.numerics.kernels.parallel import map_in_parallel
+from gscompleter.numerics.value_checks import LARGEST, check_gaussians, find_finite
+from gscompleter.system.errors import InputError, quote_value, require_path
+from gscompleter.system.files.ply import (
+    Element,
+    PlyFile,
+    make_header,
+    read_ply_file,
+    write_ply_file,
+)
 from gscompleter.types import Gaussians
-from gscompleter.value_checks import LARGEST, check_gaussians, find_finite
-
-_SCALARS = {
-    **dict.fromkeys(("char", "int8"), "i1"),
-    **dict.fromkeys(("uchar", "uint8"), "u1"),
-    **dict.fromkeys(("short", "int16"), "i2"),
-    **dict.fromkeys(("ushort", "uint16"), "u2"),
-    **dict.fromkeys(("int", "int32"), "i4"),
-    **dict.fromkeys(("uint", "uint32"), "u4"),
-    **dict.fromkeys(("float", "float32"), "f4"),
-    **dict.fromkeys(("double", "float64"), "f8"),
-}
-_NAMES = {"<f4": "float", "<u4": "uint", "|u1": "uchar"}
-_BYTE_ORDERS = {"ascii": "=", "binary_little_endian": "<", "binary_big_endian": ">"}
-_COUNT_LINE = re.compile(rb"^(element\s+vertex\s+)\d+", re.M)
 
 MEANS = ("x", "y", "z")
 _NORMALS = ("nx", "ny", "nz")
@@ -77,29 +64,6 @@ _ANTIALIASED = (b"mip", b"antialiased", b"1", b"true")
 
 BLOCK_ROWS = 8192
 """Rows processed at a time, so that all their columns stay in the cache."""
-
-
-@dataclass(frozen=True)
-class Element:
-    """One element: a table."""
-
-    name: str
-    count: int
-    dtype: np.dtype
-    """Type of a row; lists are objects, and such rows cannot be read."""
-
-
-@dataclass(frozen=True)
-class PlyFile:
-    """A .ply that begins with the element `vertex`."""
-
-    header: bytes
-    """Everything up to and including `end_header`."""
-    rows: np.ndarray
-    """One structured row per vertex, [n]."""
-    trailer: UInt8[np.ndarray, "m"]
-    """Everything after the last row of a binary file, in bytes."""
-    is_ascii: bool = False
 
 
 def load_ply(path: Path | str, drop_nonfinite: bool = False) -> Gaussians:
@@ -135,7 +99,7 @@ def find_finite_rows(path: Path) -> Bool[Tensor, "n"]:
 
 def read_scene(path: Path) -> PlyFile:
     """Read the rows of a 3DGS .ply, surfels of 2DGS included."""
-    scene = read_ply_file(path, _NEEDED, "3DGS scene")
+    scene = read_ply_file(path, _NEEDED, "3DGS scene", describe_other_content)
     names = scene.rows.dtype.names or ()
     num_rest = count_rest(scene)
     if num_rest not in _NUM_REST or any(f"f_rest_{i}" not in names for i in range(num_rest)):
@@ -316,79 +280,10 @@ def make_rows(gaussians: Gaussians, provenance: bool) -> np.ndarray:
     return rows
 
 
-def read_header(file: BinaryIO, path: Path) -> tuple[bytes, list[Element]]:
-    """Read the header and its elements; the file is left at the first byte of the data."""
-    refuse_pointer(path)
-    lines = [file.readline(512)]
-    if lines[0].strip() != b"ply":
-        raise InputError(f"{path} is empty or not a PLY file (it does not begin with 'ply').")
-    while lines[-1].split() != [b"end_header"]:
-        lines.append(file.readline(4096))
-        if not lines[-1].endswith(b"\n"):
-            raise InputError(f"{path} is truncated: its header has no end; fetch the file again.")
-    try:
-        return b"".join(lines), _parse_elements(lines[1:-1])
-    except (LookupError, ValueError) as error:
-        raise InputError(
-            f"{path} has a broken header ({quote_value(str(error))}); export it again."
-        ) from error
-
-
-def _parse_elements(lines: Iterable[bytes]) -> list[Element]:
-    tables: list[tuple[str, int, list[tuple[str, str]]]] = []
-    byte_order = ""
-    for line in lines:
-        match line.decode("latin-1").split():
-            case [] | ["comment" | "obj_info", *_]:
-                pass
-            case ["format", name, *_]:
-                byte_order = _BYTE_ORDERS[name]
-            case ["element", name, count] if count.isdecimal():
-                tables.append((name, int(count), []))
-            case ["property", "list", _, _, name]:
-                tables[-1][2].append((name, "O"))
-            case ["property", kind, name]:
-                tables[-1][2].append((name, byte_order + _SCALARS[kind]))
-            case words:
-                raise ValueError(" ".join(words))
-    return [Element(name, count, np.dtype(columns)) for name, count, columns in tables]
-
-
-def read_ply_file(path: Path, needed: Sequence[str], kind: str) -> PlyFile:
-    """Read a file whose vertices have the properties `needed`; errors name the `kind` of file."""
-    with open_file(path) as file:
-        header, elements = read_header(file, path)
-        vertex = elements[0] if elements and elements[0].name == "vertex" else None
-        names = () if vertex is None else vertex.dtype.names or ()
-        missing = [name for name in needed if name not in names]
-        if vertex is None or missing or vertex.dtype.hasobject:
-            other = _describe_other_content(elements) if _DC[0] in missing else None
-            raise InputError(
-                f"{path} is no {kind}"
-                + (
-                    f" but {other}."
-                    if other is not None
-                    else f": it does not begin with vertices that have "
-                    f"{', '.join(missing or names)} and no lists."
-                )
-            )
-        is_ascii = re.search(rb"^format\s+ascii", header, re.M) is not None
-        rows = (
-            _read_ascii_rows(file, vertex, path)
-            if is_ascii
-            else _map_rows(file, vertex.dtype, len(header), vertex.count)
-        )
-        if len(rows) < vertex.count:
-            raise InputError(
-                f"{path} is truncated: {len(rows):,} of {quote_value(f'{vertex.count:,}')} rows "
-                "are there; fetch or write the file again."
-            )
-        trailer = _map_rows(file, np.dtype(np.uint8), len(header) + rows.nbytes)
-        return PlyFile(header, rows, trailer, is_ascii)
-
-
-def _describe_other_content(elements: Sequence[Element]) -> str | None:
+def describe_other_content(elements: Sequence[Element], missing: Sequence[str]) -> str | None:
     """Describe what a .ply without Gaussians holds, and what to name instead; None if unknown."""
+    if _DC[0] not in missing:
+        return None
     columns = {name for element in elements for name in element.dtype.names or ()}
     if any(name.startswith(("f_offset_", "f_anchor_feat_")) for name in columns):
         return (
@@ -403,50 +298,3 @@ def _describe_other_content(elements: Sequence[Element]) -> str | None:
         "a point cloud; name the .ply that the training of the splat wrote (often "
         "point_cloud/iteration_N/point_cloud.ply or splat.ply)"
     )
-
-
-def _map_rows(file: BinaryIO, dtype: np.dtype, start: int, count: int | None = None) -> np.ndarray:
-    """Map rows of a binary file into memory: those that it has, at most `count`."""
-    available = max(os.fstat(file.fileno()).st_size - start, 0) // dtype.itemsize
-    number = available if count is None else min(count, available)
-    if number == 0:
-        return np.empty(0, dtype)
-    return np.asarray(np.memmap(file, dtype, "r", start, (number,)))
-
-
-def _read_ascii_rows(file: BinaryIO, vertex: Element, path: Path) -> np.ndarray:
-    lines = (line.split() for line in file if line.strip())
-    width = len(vertex.dtype.names or ())
-    try:
-        table = np.array(list(islice(lines, vertex.count)), np.float64).reshape(-1, width)
-    except ValueError as error:
-        raise InputError(
-            f"{path} holds rows that are not {width} numbers each; write it anew."
-        ) from error
-    # Values out of range become infinite or wrong; relevant ones are checked later.
-    with np.errstate(over="ignore", invalid="ignore"):
-        return unstructured_to_structured(table, vertex.dtype)
-
-
-def make_header(elements: Mapping[str, tuple[int, np.dtype]], comment: str | None = None) -> bytes:
-    """Make the header of a binary .ply from the number and type of the rows of each element."""
-    lines = ["ply", "format binary_little_endian 1.0"]
-    lines += [] if comment is None else [f"comment {comment}"]
-    for name, (count, dtype) in elements.items():
-        lines.append(f"element {name} {count}")
-        lines += [f"property {_NAMES[dtype[column].str]} {column}" for column in dtype.names or ()]
-    return "\n".join([*lines, "end_header", ""]).encode("ascii")
-
-
-def write_ply_file(
-    path: Path | str,
-    header: bytes,
-    count: int,
-    blocks: Iterable[np.ndarray],
-    trailer: np.ndarray | None = None,
-) -> None:
-    """Write a .ply with `count` rows in total, which replaces the number in the header."""
-    with replace_file(path) as file:
-        file.write(_COUNT_LINE.sub(rb"\g<1>" + str(count).encode(), header, count=1))
-        for rows in chain(blocks, () if trailer is None else [trailer]):
-            file.write(rows.view(np.uint8).data)

@@ -24,9 +24,6 @@ from jaxtyping import Float, Shaped, UInt8
 from numpy import ndarray
 from PIL import Image, UnidentifiedImageError
 
-from gscompleter.errors import quote_value
-from gscompleter.io.files import replace_file
-from gscompleter.io.reading import read_bytes
 from gscompleter.splats.codebooks import fit_codebook, fit_palette
 from gscompleter.splats.packing import (
     MAX_LOG_SCALE,
@@ -40,6 +37,9 @@ from gscompleter.splats.packing import (
     restore_largest,
 )
 from gscompleter.splats.ply import encode
+from gscompleter.system.errors import quote_value
+from gscompleter.system.files.reading import read_bytes
+from gscompleter.system.files.writing import replace_file
 from gscompleter.types import SH_C0, Gaussians
 
 META = "meta.json"

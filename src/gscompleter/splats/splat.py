@@ -10,9 +10,9 @@ from pathlib import Path
 
 import numpy as np
 
-from gscompleter.io.files import replace_file
-from gscompleter.io.reading import read_bytes
 from gscompleter.splats.packing import assemble_sh, build_gaussians
+from gscompleter.system.files.reading import read_bytes
+from gscompleter.system.files.writing import replace_file
 from gscompleter.types import SH_C0, Gaussians
 
 ROW = np.dtype([("mean", "<f4", 3), ("scale", "<f4", 3), ("rgba", "u1", 4), ("quat", "u1", 4)])

@@ -20,9 +20,6 @@ import numpy as np
 from jaxtyping import Float, Int, UInt8
 from numpy import ndarray
 
-from gscompleter.errors import InputError, quote_value
-from gscompleter.io.files import replace_file
-from gscompleter.io.reading import read_bytes
 from gscompleter.splats.packing import (
     NUM_SH_REST,
     UnsupportedError,
@@ -36,6 +33,9 @@ from gscompleter.splats.packing import (
 )
 from gscompleter.splats.ply import encode
 from gscompleter.splats.transform import HALF_TURN_X, rotate_half_turn
+from gscompleter.system.errors import InputError, quote_value
+from gscompleter.system.files.reading import read_bytes
+from gscompleter.system.files.writing import replace_file
 from gscompleter.types import SH_C0, Gaussians
 
 MAGIC = b"NGSP"

@@ -12,7 +12,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from gscompleter.geometry import multiply_quats, rotations_to_quats
+from gscompleter.numerics.geometry import multiply_quats, rotations_to_quats
 from gscompleter.render.spherical_harmonics import evaluate_sh_basis
 from gscompleter.types import Gaussians
 

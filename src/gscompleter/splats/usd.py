@@ -18,11 +18,11 @@ from typing import TYPE_CHECKING
 import numpy as np
 import torch
 
-from gscompleter.errors import InputError, OutputError, quote_value
-from gscompleter.io.files import convert_write_errors, replace_file
-from gscompleter.io.unfinished import make_unfinished_name
 from gscompleter.splats.glb import COLOR_SPACE
 from gscompleter.splats.transform import HALF_TURN_X, rotate_half_turn
+from gscompleter.system.errors import InputError, OutputError, quote_value
+from gscompleter.system.files.unfinished import make_unfinished_name
+from gscompleter.system.files.writing import convert_write_errors, replace_file
 from gscompleter.types import Gaussians
 
 if TYPE_CHECKING:

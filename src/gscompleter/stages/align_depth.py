@@ -10,9 +10,9 @@ from jaxtyping import Float
 from torch import Tensor
 
 from gscompleter.config import AlignmentConfig
-from gscompleter.ransac import find_affine_inliers, fit_line_ransac
+from gscompleter.numerics.robust import find_affine_inliers, fit_line_ransac
 from gscompleter.stages.target_view import TargetView
-from gscompleter.timing import timed_stage
+from gscompleter.system.timing import timed_stage
 from gscompleter.types import DepthAffine, DepthMap, DepthPairs, Lift
 
 MAX_PIXELS = 8192

@@ -11,8 +11,7 @@ from torch import Tensor
 from torch.nn.functional import avg_pool2d, max_pool2d
 
 from gscompleter.config import CompleterConfig, get_named_config
-from gscompleter.errors import InputError
-from gscompleter.geometry import compute_z_depths, project_mask
+from gscompleter.numerics.geometry import compute_z_depths, project_mask
 from gscompleter.reconstructors import Reconstructor, get_trained_range, run_reconstructor
 from gscompleter.reconstructors.depth_predictors import give_prediction, predict_nothing
 from gscompleter.reconstructors.features.depth_range import (
@@ -20,8 +19,9 @@ from gscompleter.reconstructors.features.depth_range import (
     get_depth_range,
     set_depth_range,
 )
-from gscompleter.render import Renderer
 from gscompleter.render.lod import build_proxy
+from gscompleter.render.protocols import Renderer
+from gscompleter.system.errors import InputError
 from gscompleter.types import Camera, ContextScene, Gaussians, Reconstruction, View
 
 MIN_CONTRAST = 0.02

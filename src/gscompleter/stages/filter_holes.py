@@ -8,11 +8,11 @@ import torch
 from jaxtyping import Bool, Int
 from torch import Tensor
 
-from gscompleter.geometry import project_mask
-from gscompleter.image_ops import dilate
+from gscompleter.numerics.geometry import project_mask
+from gscompleter.numerics.image_ops import dilate
 from gscompleter.stages.slide_along_rays import Registration
 from gscompleter.stages.target_view import TargetView
-from gscompleter.timing import timed_stage
+from gscompleter.system.timing import timed_stage
 from gscompleter.types import Camera, Gaussians
 
 

@@ -9,7 +9,7 @@ import numpy as np
 from jaxtyping import Bool
 from torch import Tensor
 
-from gscompleter.image_ops import dilate
+from gscompleter.numerics.image_ops import dilate
 from gscompleter.stages.target_view import TargetView, compute_hole_mask
 from gscompleter.state import Step, Unfilled
 from gscompleter.types import Render

@@ -7,11 +7,11 @@ from dataclasses import replace
 from jaxtyping import Bool
 from torch import Tensor
 
-from gscompleter.geometry import is_inside, project
+from gscompleter.numerics.geometry import is_inside, project
 from gscompleter.reconstructors import Reconstructor, run_reconstructor
 from gscompleter.render.reference import adapt_to_mode
 from gscompleter.stages.target_view import TargetView
-from gscompleter.timing import timed_stage
+from gscompleter.system.timing import timed_stage
 from gscompleter.types import Lift, View
 
 

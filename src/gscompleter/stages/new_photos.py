@@ -13,14 +13,14 @@ from jaxtyping import Float
 from torch import Tensor
 
 from gscompleter.config import CompleterConfig
-from gscompleter.generators.exposure import fit_robust_affine
-from gscompleter.geometry import pad_camera, select_spread_cameras
-from gscompleter.progress import track
+from gscompleter.numerics.geometry import pad_camera, select_spread_cameras
+from gscompleter.numerics.robust import fit_robust_affine
 from gscompleter.render.cache import Parts, SceneRenderer
 from gscompleter.stages.recolor import recolor
 from gscompleter.stages.synthesize import GeneratedView
 from gscompleter.stages.target_view import TargetView, render_target
 from gscompleter.state import NEW_PHOTO_ID, Completion
+from gscompleter.system.progress import track
 from gscompleter.types import View
 
 MAX_DROP = 6.0

@@ -15,14 +15,14 @@ from torch import Tensor
 from torch.nn.functional import normalize
 
 from gscompleter.config import RecolorConfig
-from gscompleter.cpu_threads import use_one_torch_thread
-from gscompleter.kernels.parallel import map_in_parallel
-from gscompleter.render import ColorErrors, FrozenScene, Renderer
+from gscompleter.numerics.kernels.parallel import map_in_parallel
+from gscompleter.render.protocols import ColorErrors, FrozenScene, Renderer
 from gscompleter.render.spherical_harmonics import evaluate_sh_basis
 from gscompleter.stages.synthesize import GeneratedView
 from gscompleter.stages.target_view import TargetView
 from gscompleter.state import Completion
-from gscompleter.timing import timed_stage
+from gscompleter.system.threads import use_one_torch_thread
+from gscompleter.system.timing import timed_stage
 from gscompleter.trust import HeldViews
 from gscompleter.types import Camera, Gaussians, View, merge
 

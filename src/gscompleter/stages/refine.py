@@ -10,14 +10,14 @@ from jaxtyping import Float
 from torch import Tensor
 
 from gscompleter.config import RefineConfig
-from gscompleter.cpu_threads import use_one_torch_thread
-from gscompleter.geometry import measure_baseline
-from gscompleter.optim import Adam
-from gscompleter.progress import track
-from gscompleter.render import OpacityRender
+from gscompleter.numerics.adam import Adam
+from gscompleter.numerics.geometry import measure_baseline
 from gscompleter.render.fit_colors import RELAXATION, fit_colors
+from gscompleter.render.protocols import OpacityRender
 from gscompleter.stages.target_view import TargetView
-from gscompleter.timing import timed_stage
+from gscompleter.system.progress import track
+from gscompleter.system.threads import use_one_torch_thread
+from gscompleter.system.timing import timed_stage
 from gscompleter.types import Gaussians, View
 
 

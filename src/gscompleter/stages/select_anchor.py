@@ -6,7 +6,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 from gscompleter.config import AnchorConfig
-from gscompleter.geometry import (
+from gscompleter.numerics.geometry import (
     is_inside,
     measure_baseline,
     measure_rotation,

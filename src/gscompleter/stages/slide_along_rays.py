@@ -13,15 +13,15 @@ from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from gscompleter.config import RegistrationConfig
-from gscompleter.cpu_threads import use_one_torch_thread
-from gscompleter.geometry import compute_z_depths, move_to_depths, slide
-from gscompleter.image_ops import fill_smoothly
-from gscompleter.optim import Adam
-from gscompleter.progress import track
-from gscompleter.render import FrozenScene, Renderer
-from gscompleter.sky import compute_sky_depth, is_sky, mask_out_sky
+from gscompleter.numerics.adam import Adam
+from gscompleter.numerics.geometry import compute_z_depths, move_to_depths, slide
+from gscompleter.numerics.image_ops import fill_smoothly
+from gscompleter.numerics.sky import compute_sky_depth, is_sky, mask_out_sky
+from gscompleter.render.protocols import FrozenScene, Renderer
 from gscompleter.stages.target_view import TargetView
-from gscompleter.timing import timed_stage
+from gscompleter.system.progress import track
+from gscompleter.system.threads import use_one_torch_thread
+from gscompleter.system.timing import timed_stage
 from gscompleter.types import Camera, DepthAffine, DepthMap, Gaussians, Lift, Render, View
 
 OCCLUSION_TOLERANCE = 0.05

@@ -8,7 +8,6 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from gscompleter.errors import InputError
 from gscompleter.generators import (
     Generator,
     GeneratorOutput,
@@ -16,10 +15,11 @@ from gscompleter.generators import (
     ImageFunction,
     as_generator,
 )
+from gscompleter.numerics.value_checks import check_colors
 from gscompleter.stages.select_anchor import find_nearest_view
-from gscompleter.tensor_checks import describe, iterate_tensors
+from gscompleter.system.errors import InputError
+from gscompleter.system.tensor_checks import describe, iterate_tensors
 from gscompleter.types import Camera, GeneratorInput, PaddedCamera, View
-from gscompleter.value_checks import check_colors
 
 
 @dataclass(frozen=True)

@@ -10,11 +10,11 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 
 from gscompleter.config import HoleConfig
-from gscompleter.geometry import is_same_camera, shrink_camera
-from gscompleter.image_ops import blur_gaussian, dilate
-from gscompleter.render import FrozenScene
+from gscompleter.numerics.geometry import is_same_camera, shrink_camera
+from gscompleter.numerics.image_ops import blur_gaussian, dilate
+from gscompleter.numerics.sky import mask_out_sky
 from gscompleter.render.cache import SceneRenderer
-from gscompleter.sky import mask_out_sky
+from gscompleter.render.protocols import FrozenScene
 from gscompleter.stages.select_anchor import AnchorChoice, compute_overlap, select_anchor
 from gscompleter.state import Completion, TargetResult
 from gscompleter.types import Camera, GeneratorInput, PaddedCamera, Render, View

@@ -12,7 +12,7 @@ import torch
 from jaxtyping import Float, Int, Int64
 from torch import Tensor
 
-from gscompleter.render import FrozenScene
+from gscompleter.render.protocols import FrozenScene
 from gscompleter.types import Camera
 
 

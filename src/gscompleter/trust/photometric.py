@@ -19,16 +19,17 @@ from torch import Tensor
 from torch.nn.functional import pad
 
 from gscompleter.config import CompleterConfig, TrustConfig
-from gscompleter.cpu_threads import use_one_torch_thread
-from gscompleter.generators.exposure import fit_robust_affine
-from gscompleter.geometry import compute_z_depths
-from gscompleter.image_ops import average_box
-from gscompleter.kernels import support as kernels
-from gscompleter.kernels.parallel import map_in_parallel, share
-from gscompleter.kernels.support import CameraPose
-from gscompleter.render import FrozenScene, get_view_map
+from gscompleter.numerics.geometry import compute_z_depths
+from gscompleter.numerics.image_ops import average_box
+from gscompleter.numerics.kernels import support as kernels
+from gscompleter.numerics.kernels.parallel import map_in_parallel, share
+from gscompleter.numerics.kernels.support import CameraPose
+from gscompleter.numerics.robust import fit_robust_affine
 from gscompleter.render.cache import SceneRenderer
+from gscompleter.render.protocols import FrozenScene
+from gscompleter.render.view_map import get_view_map
 from gscompleter.render.viewpoint import to_float32
+from gscompleter.system.threads import use_one_torch_thread
 from gscompleter.trust import HeldViews, Trust
 from gscompleter.types import Camera, Gaussians, Render, View
 

@@ -16,10 +16,10 @@ from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import Any
 
-from gscompleter.errors import InputError, quote_value
-from gscompleter.io.output_folder import read_command
-from gscompleter.io.reading import list_folders, read_bytes
-from gscompleter.jobs.jobs import Job
+from gscompleter.system.errors import InputError, quote_value
+from gscompleter.system.files.output_folder import read_command
+from gscompleter.system.files.reading import list_folders, read_bytes
+from gscompleter.system.jobs.jobs import Job
 
 FOLDER, NAME = "folder", "name"
 """Columns of the scene folder and of the job name."""

@@ -16,11 +16,11 @@ from pydantic import ConfigDict, TypeAdapter
 
 from gscompleter.data.formats import open_photographs
 from gscompleter.data.photographs import Photographs
-from gscompleter.errors import InputError, quote_value
 from gscompleter.evaluation.methods import Models
-from gscompleter.io.reading import read_json
 from gscompleter.splats.ply import load_ply, save_ply
 from gscompleter.state import Completion
+from gscompleter.system.errors import InputError, quote_value
+from gscompleter.system.files.reading import read_json
 from gscompleter.types import Gaussians
 
 Whole = Annotated[int, Ge(0)]

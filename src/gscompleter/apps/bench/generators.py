@@ -7,13 +7,13 @@ from dataclasses import dataclass, replace
 from statistics import fmean, median
 
 from gscompleter.apps.bench.cases import BenchCase
-from gscompleter.errors import InputError
 from gscompleter.evaluation.methods import Models
 from gscompleter.evaluation.metrics.scores import PartQuality, measure_part
 from gscompleter.evaluation.tables import format_markdown
 from gscompleter.generators import load_generator
-from gscompleter.progress import track
 from gscompleter.state import Completion
+from gscompleter.system.errors import InputError
+from gscompleter.system.progress import track
 from gscompleter.types import View
 
 

@@ -14,12 +14,12 @@ from typing import TypeVar
 
 import torch
 
-from gscompleter.errors import InputError
 from gscompleter.evaluation.memory import Peak, measure_peak_memory
-from gscompleter.io.files import SUMMARY_FILE
-from gscompleter.progress import show_progress, track
-from gscompleter.render import Renderer
+from gscompleter.render.protocols import Renderer
 from gscompleter.state import Completion
+from gscompleter.system.errors import InputError
+from gscompleter.system.files.writing import SUMMARY_FILE
+from gscompleter.system.progress import show_progress, track
 from gscompleter.types import Camera, Gaussians, make_observed, merge, sh_from_rgb
 
 SIDE = 256

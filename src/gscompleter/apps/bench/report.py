@@ -15,10 +15,10 @@ import torch
 
 from gscompleter import __version__
 from gscompleter.apps.bench.measure import PROCESS, REST, Sample
-from gscompleter.cpu_threads import count_available_cores
 from gscompleter.evaluation.tables import format_markdown
-from gscompleter.memory import read_memory_bytes
-from gscompleter.timing import STAGES
+from gscompleter.system.memory import read_memory_bytes
+from gscompleter.system.threads import count_available_cores
+from gscompleter.system.timing import STAGES
 
 COLUMNS = (*STAGES, "total", REST, PROCESS)
 """Columns of seconds; stages that did not run are omitted."""

@@ -27,17 +27,16 @@ from gscompleter.apps.commands.options import (
 )
 from gscompleter.apps.commands.words import format_error, parse_words, translate_name
 from gscompleter.config.settings import validate
-from gscompleter.cpu_threads import count_available_cores, limit_threads
-from gscompleter.errors import InputError, join_names, quote_value
-from gscompleter.io.overlap import refuse_overlap
-from gscompleter.jobs.engines import (
+from gscompleter.system.errors import InputError, join_names, quote_value
+from gscompleter.system.files.overlap import refuse_overlap
+from gscompleter.system.jobs.engines import (
     check_processes,
     choose_num_workers,
     open_local,
     open_ray,
     open_submitit,
 )
-from gscompleter.jobs.jobs import (
+from gscompleter.system.jobs.jobs import (
     JOBS,
     Engine,
     Job,
@@ -50,7 +49,8 @@ from gscompleter.jobs.jobs import (
     run_job,
     run_jobs,
 )
-from gscompleter.progress import show_preparation, show_progress, track
+from gscompleter.system.progress import show_preparation, show_progress, track
+from gscompleter.system.threads import count_available_cores, limit_threads
 
 COMPLETE = "complete"
 Command: Any = Union[  # noqa: UP007  (a command line has several)

@@ -41,10 +41,10 @@ from gscompleter.apps.commands.options import BenchOptions
 from gscompleter.data.scene import write_cameras
 from gscompleter.evaluation.methods import Models
 from gscompleter.generators import load_generator
-from gscompleter.io.output_folder import check_output, open_output_folder
-from gscompleter.progress import show_preparation, show_progress, stage
 from gscompleter.reconstructors import load_reconstructor
-from gscompleter.render import choose_device, load_renderer
+from gscompleter.render.loading import choose_device, load_renderer
+from gscompleter.system.files.output_folder import check_output, open_output_folder
+from gscompleter.system.progress import show_preparation, show_progress, stage
 
 BEYOND = (1.0, 1.25, 1.5, 1.75)
 """Distances of targets to the right of the demo's right camera, in baselines."""

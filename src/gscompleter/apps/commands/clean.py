@@ -36,16 +36,17 @@ from gscompleter.apps.report.completion import (
     save_completed_splat,
 )
 from gscompleter.apps.warmup import compile_kernels
-from gscompleter.cleaning import find_superfluous
-from gscompleter.errors import InputError, quote_value
+from gscompleter.editing.cleaning import find_superfluous
+from gscompleter.editing.floaters import find_floaters
 from gscompleter.evaluation.metrics.image import compute_masked_psnr
-from gscompleter.floaters import find_floaters
-from gscompleter.io.files import COMPLETED_FILE, REMOVED_FILE, SUMMARY_FILE
-from gscompleter.io.output_folder import reserve_output
-from gscompleter.progress import show_preparation, show_progress, stage, track
-from gscompleter.render import Renderer, choose_device, load_renderer
+from gscompleter.render.loading import choose_device, load_renderer
+from gscompleter.render.protocols import Renderer
 from gscompleter.splats.formats import load_splat
-from gscompleter.timing import record_seconds, timed_stage
+from gscompleter.system.errors import InputError, quote_value
+from gscompleter.system.files.output_folder import reserve_output
+from gscompleter.system.files.writing import COMPLETED_FILE, REMOVED_FILE, SUMMARY_FILE
+from gscompleter.system.progress import show_preparation, show_progress, stage, track
+from gscompleter.system.timing import record_seconds, timed_stage
 from gscompleter.types import Gaussians, View
 
 PHOTOGRAPH_OPTIONS = ("context", "format", "near", "far")

@@ -63,31 +63,31 @@ from gscompleter.apps.warmup import SPLAT_PART, compile_kernels
 from gscompleter.completer import GSCompleter, check_target_ids
 from gscompleter.data.local_origin import compute_frame_from_photographs
 from gscompleter.data.scene import write_cameras
-from gscompleter.errors import PROGRAM, quote_value
+from gscompleter.editing.removal import restore_surroundings
 from gscompleter.evaluation.metrics.coverage import render_pairs, sample_held_out_cameras
 from gscompleter.generators import load_generator
-from gscompleter.io.files import (
+from gscompleter.numerics.kernels.parallel import run_in_background
+from gscompleter.planning.planner import Choice, ViewPlanner
+from gscompleter.reconstructors import check_reconstructor, load_reconstructor
+from gscompleter.render.loading import choose_device, load_renderer
+from gscompleter.render.lod import MIN_PROXY_GAUSSIANS
+from gscompleter.splats.alignment.similarity import transform_camera, transform_camera_exactly
+from gscompleter.splats.formats import load_splat
+from gscompleter.splats.morton import argsort_nearby
+from gscompleter.stages.context import prepare_single
+from gscompleter.state import Completion
+from gscompleter.system.errors import PROGRAM, quote_value
+from gscompleter.system.files.output_folder import reserve_output
+from gscompleter.system.files.video import find_ffmpeg
+from gscompleter.system.files.writing import (
     COMPLETED_FILE,
     CONTEXT_FILE,
     REMOVED_FILE,
     SUMMARY_FILE,
     TARGETS_FILE,
 )
-from gscompleter.io.output_folder import reserve_output
-from gscompleter.io.video import find_ffmpeg
-from gscompleter.kernels.parallel import run_in_background
-from gscompleter.next_best_view.planner import Choice, ViewPlanner
-from gscompleter.progress import show_preparation, show_progress, stage
-from gscompleter.reconstructors import check_reconstructor, load_reconstructor
-from gscompleter.removal import restore_surroundings
-from gscompleter.render import choose_device, load_renderer
-from gscompleter.render.lod import MIN_PROXY_GAUSSIANS
-from gscompleter.splat_alignment.similarity import transform_camera, transform_camera_exactly
-from gscompleter.splats.formats import load_splat
-from gscompleter.splats.morton import argsort_nearby
-from gscompleter.stages.context import prepare_single
-from gscompleter.state import Completion
-from gscompleter.timing import add_seconds, record_seconds, timed_stage
+from gscompleter.system.progress import show_preparation, show_progress, stage
+from gscompleter.system.timing import add_seconds, record_seconds, timed_stage
 from gscompleter.types import Camera
 
 COMMAND = "complete"

@@ -7,10 +7,10 @@ from dataclasses import replace
 from rich.console import Console
 
 from gscompleter.apps.commands.options import ConvertOptions, StripOptions
-from gscompleter.io.output_file import reserve_file
-from gscompleter.progress import show_preparation, show_progress
 from gscompleter.splats.formats import describe_mode_loss, get_writer, load_splat, save_splat
 from gscompleter.splats.layout import strip
+from gscompleter.system.files.output_file import reserve_file
+from gscompleter.system.progress import show_preparation, show_progress
 
 
 def run_convert(options: ConvertOptions) -> None:

@@ -18,9 +18,9 @@ from gscompleter.apps.commands.options import CompleteOptions, DemoOptions
 from gscompleter.apps.inputs.opening import print_lines
 from gscompleter.apps.report.completion import join_images
 from gscompleter.data.scene import write_cameras
-from gscompleter.io.files import SUMMARY_FILE
-from gscompleter.io.image import read_image, write_image
-from gscompleter.io.output_folder import reserve_output
+from gscompleter.system.files.image import read_image, write_image
+from gscompleter.system.files.output_folder import reserve_output
+from gscompleter.system.files.writing import SUMMARY_FILE
 from gscompleter.types import Camera
 
 PICTURE_FILE = "before_after.png"

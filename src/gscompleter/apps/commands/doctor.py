@@ -16,14 +16,14 @@ from gscompleter.apps.bench.report import describe_machine
 from gscompleter.apps.commands.options import DoctorOptions, WarmupOptions
 from gscompleter.apps.viewer.packages import BUILT_LIBRARIES, LOCK_FILE, get_archive_path, read_lock
 from gscompleter.apps.warmup import PARTS, compile_kernels
-from gscompleter.errors import InputError
-from gscompleter.io.files import get_download_folder
-from gscompleter.kernels.cache import CACHE
-from gscompleter.kernels.compiled import get_cache_folder, is_compiled
 from gscompleter.models.weights.fetching import find_cached
 from gscompleter.models.weights.published import PUBLISHED
-from gscompleter.progress import show_progress
-from gscompleter.render import choose_device, load_renderer
+from gscompleter.numerics.kernels.cache import CACHE
+from gscompleter.numerics.kernels.compiled import get_cache_folder, is_compiled
+from gscompleter.render.loading import choose_device, load_renderer
+from gscompleter.system.errors import InputError
+from gscompleter.system.files.writing import get_download_folder
+from gscompleter.system.progress import show_progress
 
 PURPOSES = {
     "cuda": "rendering on an NVIDIA GPU",

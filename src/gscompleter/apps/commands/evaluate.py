@@ -23,22 +23,22 @@ from gscompleter.apps.commands.options import (
     parse_resolution,
 )
 from gscompleter.apps.warmup import compile_kernels
-from gscompleter.data.cases import Case, SkippedScene, filter_usable, open_clips, read_cases
 from gscompleter.data.formats import open_photographs
 from gscompleter.data.limits import check_planes
 from gscompleter.data.photographs import MAX_TRANSLATION, Photographs, Resolution, check_resolution
-from gscompleter.errors import InputError, quote_value
 from gscompleter.evaluation import protocols, tables
 from gscompleter.evaluation.authors_loader import AuthorsLoader
+from gscompleter.evaluation.cases import Case, SkippedScene, filter_usable, open_clips, read_cases
 from gscompleter.evaluation.methods import expand_methods
 from gscompleter.evaluation.paper import get_data_set
 from gscompleter.evaluation.runner import RunConfig, evaluate
 from gscompleter.evaluation.store import list_row_paths
 from gscompleter.evaluation.tables import RunSummary
-from gscompleter.io.output_file import reserve_file
-from gscompleter.jobs.jobs import parse_shard
-from gscompleter.progress import show_preparation, show_progress
-from gscompleter.render import choose_device
+from gscompleter.render.loading import choose_device
+from gscompleter.system.errors import InputError, quote_value
+from gscompleter.system.files.output_file import reserve_file
+from gscompleter.system.jobs.jobs import parse_shard
+from gscompleter.system.progress import show_preparation, show_progress
 
 
 def run_methods(options: EvaluateOptions) -> int:

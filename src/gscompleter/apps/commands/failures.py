@@ -7,8 +7,8 @@ from collections.abc import Iterator
 from dataclasses import dataclass
 
 from gscompleter.apps.commands.exit_codes import ERROR, WRONG_INPUT
-from gscompleter.errors import MAX_MESSAGE_LENGTH, PROGRAM, quote_value, shorten_message
-from gscompleter.io.files import FULL_DISK_ERRORS
+from gscompleter.system.errors import MAX_MESSAGE_LENGTH, PROGRAM, quote_value, shorten_message
+from gscompleter.system.files.writing import FULL_DISK_ERRORS
 
 NAME_ERRORS = {errno.ENAMETOOLONG, errno.ELOOP}
 """Numbers of errors of a path that names nothing on any disk."""

@@ -26,11 +26,11 @@ from gscompleter.apps.inputs.opening import describe_opening, print_lines
 from gscompleter.apps.live.session import Session
 from gscompleter.apps.report.completion import Target
 from gscompleter.data.scene import write_cameras
-from gscompleter.errors import InputError, quote_value
-from gscompleter.io.files import TARGETS_FILE
-from gscompleter.io.output_folder import check_output, open_output_folder, reserve_output
-from gscompleter.progress import show_progress
 from gscompleter.state import Completion
+from gscompleter.system.errors import InputError, quote_value
+from gscompleter.system.files.output_folder import check_output, open_output_folder, reserve_output
+from gscompleter.system.files.writing import TARGETS_FILE
+from gscompleter.system.progress import show_progress
 from gscompleter.types import Camera
 
 # viser renders antialiased scenes differently.

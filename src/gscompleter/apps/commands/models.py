@@ -12,7 +12,6 @@ from rich.console import Console
 from rich.table import Table
 
 from gscompleter.apps.commands.options import ModelsOptions
-from gscompleter.errors import InputError, quote_value
 from gscompleter.models.weights.fetching import (
     INSTALL,
     find_cached,
@@ -20,6 +19,7 @@ from gscompleter.models.weights.fetching import (
     is_hub_installed,
 )
 from gscompleter.models.weights.published import PUBLISHED, PublishedWeights
+from gscompleter.system.errors import InputError, quote_value
 
 KINDS = {
     "Gaussians": "",

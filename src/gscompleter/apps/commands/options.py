@@ -12,7 +12,7 @@ from annotated_types import Interval
 from gscompleter.config import CleaningConfig, CompleterConfig
 from gscompleter.config.generators import GeneratorOptions
 from gscompleter.config.settings import Seed, Settings
-from gscompleter.jobs.engines import EngineName
+from gscompleter.system.jobs.engines import EngineName
 
 Frame = Annotated[int, Interval(ge=0, lt=10**9)]
 Words = Annotated[tuple[int | str, ...] | None, tyro.conf.arg(metavar="PHOTO [PHOTO ...]")]

@@ -15,8 +15,8 @@ from gscompleter.apps.inputs.opening import Opened, Task
 from gscompleter.apps.inputs.selection import select_closest
 from gscompleter.apps.report.completion import HeldOut
 from gscompleter.config import CleaningConfig, CompleterConfig
-from gscompleter.errors import InputError, quote_value
-from gscompleter.io.files import COMPLETED_FILE
+from gscompleter.system.errors import InputError, quote_value
+from gscompleter.system.files.writing import COMPLETED_FILE
 from gscompleter.types import Camera, View
 
 MAX_HELD_OUT = 8

@@ -16,8 +16,8 @@ from gscompleter.apps.commands.options import (
     ViewOptions,
     list_inputs,
 )
-from gscompleter.io.files import REMOVED_FILE
-from gscompleter.io.overlap import refuse_input_file, refuse_overlap
+from gscompleter.system.files.overlap import refuse_input_file, refuse_overlap
+from gscompleter.system.files.writing import REMOVED_FILE
 
 
 def check_overlap(options: Any) -> None:
@@ -45,7 +45,7 @@ def check_overlap(options: Any) -> None:
 
 def replace_by_scenes(inputs: Sequence[Path], folders: Sequence[Path]) -> list[Path]:
     """Replace folders of scenes by their scenes, beside which results may lie."""
-    from gscompleter.data.cases import list_scenes  # it needs torch, for which no help waits
+    from gscompleter.evaluation.cases import list_scenes  # it needs torch, for which no help waits
 
     scenes = {path: list_scenes(path) for path in folders}
     return [place for path in inputs for place in scenes.get(path, [path])]

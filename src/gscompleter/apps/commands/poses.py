@@ -6,7 +6,7 @@ from rich.console import Console
 
 from gscompleter.apps.commands.options import PosesOptions
 from gscompleter.data.sfm.poses import find_poses
-from gscompleter.progress import show_progress
+from gscompleter.system.progress import show_progress
 
 
 def run_poses(options: PosesOptions) -> None:

@@ -13,11 +13,11 @@ from torch import Tensor
 from gscompleter.apps.commands.complete import Prepared, prepare_completion, run_completion
 from gscompleter.apps.commands.options import RemoveOptions
 from gscompleter.apps.inputs.removal import check_selection, choose_gaussians, find_in_region
-from gscompleter.errors import InputError, quote_value
-from gscompleter.next_best_view.photographs import PhotographPlanner
-from gscompleter.progress import stage
-from gscompleter.removal import remove_gaussians
+from gscompleter.editing.removal import remove_gaussians
+from gscompleter.planning.photographs import PhotographPlanner
 from gscompleter.state import Completion
+from gscompleter.system.errors import InputError, quote_value
+from gscompleter.system.progress import stage
 
 SELECTIONS = ("box", "box_rotation", "sphere", "mask", "select")
 

@@ -15,7 +15,6 @@ from gscompleter.apps.commands.evaluate import Scored, run_methods, score_method
 from gscompleter.apps.commands.exit_codes import choose_exit_code
 from gscompleter.apps.commands.options import AUTO, EvaluateOptions
 from gscompleter.config.generators import GeneratorOptions
-from gscompleter.errors import InputError, NoCaseError, OutputError, quote_value
 from gscompleter.evaluation.claims import HEAD, tabulate_claims
 from gscompleter.evaluation.figures import draw_figure
 from gscompleter.evaluation.paper import (
@@ -30,9 +29,10 @@ from gscompleter.evaluation.paper_tables import fill_table, write_paper_table
 from gscompleter.evaluation.protocols import list_indices
 from gscompleter.evaluation.store import make_file_name
 from gscompleter.evaluation.tables import format_markdown, write_tables
-from gscompleter.io.files import encode_text, replace_file
-from gscompleter.jobs.jobs import make_folder
-from gscompleter.render import choose_device
+from gscompleter.render.loading import choose_device
+from gscompleter.system.errors import InputError, NoCaseError, OutputError, quote_value
+from gscompleter.system.files.writing import encode_text, replace_file
+from gscompleter.system.jobs.jobs import make_folder
 
 UNUSUAL = ("stress", "sequence")
 """Kinds of the protocols that only tables of their own use."""

@@ -17,11 +17,11 @@ from gscompleter.apps.viewer.exhibit import (
     load_viewer_files,
 )
 from gscompleter.apps.viewer.page import make_page
-from gscompleter.errors import InputError, quote_value
-from gscompleter.io.files import SUMMARY_FILE, replace_file
-from gscompleter.io.output_file import reserve_file
 from gscompleter.splats.foreign import resolve_splat
 from gscompleter.splats.sog import META
+from gscompleter.system.errors import InputError, quote_value
+from gscompleter.system.files.output_file import reserve_file
+from gscompleter.system.files.writing import SUMMARY_FILE, replace_file
 
 ADDRESS = "127.0.0.1"
 HOST_NAMES = (ADDRESS, "localhost")

@@ -24,7 +24,7 @@ from tyro.constructors import (
 from gscompleter.apps.commands.options import DEFAULT_NUM_TARGETS
 from gscompleter.config import CompleterConfig, load_config
 from gscompleter.config.settings import Settings, describe_renamed
-from gscompleter.errors import PROGRAM, InputError, quote_value
+from gscompleter.system.errors import PROGRAM, InputError, quote_value
 
 HELP = ("-h", "--help")
 HELP_ALL = "--help-all"

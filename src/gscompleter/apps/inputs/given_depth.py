@@ -12,7 +12,6 @@ from jaxtyping import Float
 
 from gscompleter.data.given_depth import drop_unsure, give_depth, project_tracks
 from gscompleter.data.photographs import Photographs, Resolution
-from gscompleter.errors import InputError
 from gscompleter.reconstructors.features.depth_factor import (
     MIN_SAMPLES,
     DepthFactor,
@@ -22,6 +21,7 @@ from gscompleter.reconstructors.features.depth_factor import (
     fit_depth_factor,
     join_samples,
 )
+from gscompleter.system.errors import InputError
 from gscompleter.types import View
 
 WAY_OUT = "--no-given-depth leaves it out"

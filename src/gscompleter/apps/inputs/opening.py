@@ -54,10 +54,27 @@ from gscompleter.data.sfm.poses import (
     list_photograph_files,
 )
 from gscompleter.data.video import is_video
-from gscompleter.errors import InputError, join_names, quote_value
-from gscompleter.io.files import SUMMARY_FILE
-from gscompleter.io.output_folder import POSES
-from gscompleter.memory import (
+from gscompleter.reconstructors import Reconstructor, get_trained_range
+from gscompleter.reconstructors.features.depth_range import (
+    find_depth_range,
+    measure_feature_depths,
+    set_depth_range,
+)
+from gscompleter.render.loading import load_renderer
+from gscompleter.render.protocols import Renderer
+from gscompleter.splats.alignment.estimate import align_splat
+from gscompleter.splats.alignment.similarity import transform_camera, transform_view
+from gscompleter.splats.alignment.trainer_frames import InputSplat
+from gscompleter.splats.alignment.training_size import find_training_size
+from gscompleter.splats.foreign import resolve_splat
+from gscompleter.splats.formats import FORMATS as SPLAT_FORMATS
+from gscompleter.splats.formats import detect_splat_format
+from gscompleter.splats.ply import find_finite_rows
+from gscompleter.stages.context import find_splat_range
+from gscompleter.system.errors import InputError, join_names, quote_value
+from gscompleter.system.files.output_folder import POSES
+from gscompleter.system.files.writing import SUMMARY_FILE
+from gscompleter.system.memory import (
     check_bytes,
     check_memory,
     estimate_bytes,
@@ -65,22 +82,6 @@ from gscompleter.memory import (
     format_whole_gigabytes,
     read_memory_bytes,
 )
-from gscompleter.reconstructors import Reconstructor, get_trained_range
-from gscompleter.reconstructors.features.depth_range import (
-    find_depth_range,
-    measure_feature_depths,
-    set_depth_range,
-)
-from gscompleter.render import Renderer, load_renderer
-from gscompleter.splat_alignment.estimate import align_splat
-from gscompleter.splat_alignment.similarity import transform_camera, transform_view
-from gscompleter.splat_alignment.trainer_frames import InputSplat
-from gscompleter.splat_alignment.training_size import find_training_size
-from gscompleter.splats.foreign import resolve_splat
-from gscompleter.splats.formats import FORMATS as SPLAT_FORMATS
-from gscompleter.splats.formats import detect_splat_format
-from gscompleter.splats.ply import find_finite_rows
-from gscompleter.stages.context import find_splat_range
 from gscompleter.types import Camera, Gaussians, View
 
 AnyOptions = TypeVar("AnyOptions", bound=SceneOptions)

@@ -16,12 +16,12 @@ from gscompleter.data.frame import ENDINGS, find_file
 from gscompleter.data.local_origin import shift_to_origin
 from gscompleter.data.masks import load_mask
 from gscompleter.data.photographs import Photographs, Resolution, resize_mask
-from gscompleter.errors import InputError, quote_value
-from gscompleter.geometry import quats_to_rotations
-from gscompleter.progress import track
-from gscompleter.removal import sum_in_mask
-from gscompleter.render import Renderer
+from gscompleter.editing.removal import sum_in_mask
+from gscompleter.numerics.geometry import quats_to_rotations
+from gscompleter.render.protocols import Renderer
 from gscompleter.splats.formats import load_splat
+from gscompleter.system.errors import InputError, quote_value
+from gscompleter.system.progress import track
 from gscompleter.types import Camera, Gaussians
 
 

@@ -12,15 +12,11 @@ from torch import Tensor
 from gscompleter.apps.commands.options import CompleteOptions, parse_resolution
 from gscompleter.apps.report.completion import Target
 from gscompleter.data.photographs import Photographs, Resolution
-from gscompleter.errors import InputError
-from gscompleter.geometry import select_spread_cameras
+from gscompleter.numerics.geometry import select_spread_cameras
+from gscompleter.planning.select_context import make_points_in_front, select_context
+from gscompleter.planning.select_overview import select_overview, summarize_cameras
 from gscompleter.reconstructors.features.depth_range import estimate_depth_range
-from gscompleter.stages.select_context import (
-    make_points_in_front,
-    select_context,
-    select_overview,
-    summarize_cameras,
-)
+from gscompleter.system.errors import InputError
 from gscompleter.types import Camera
 
 NUM_CONTEXT = 3

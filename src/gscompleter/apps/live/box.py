@@ -11,8 +11,8 @@ from torch import Tensor
 
 from gscompleter.apps.inputs.removal import find_in_boxes
 from gscompleter.apps.live.session import Session
-from gscompleter.errors import InputError
-from gscompleter.removal import remove_gaussians
+from gscompleter.editing.removal import remove_gaussians
+from gscompleter.system.errors import InputError
 
 COLOR = (255, 80, 80)
 HANDLE = 0.5

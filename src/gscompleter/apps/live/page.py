@@ -36,10 +36,10 @@ from websockets.asyncio import server as websockets
 from gscompleter.apps.live.box import PageBox, remove_in_box
 from gscompleter.apps.live.session import Session, complete_camera, undo_step
 from gscompleter.apps.report.names import name_photograph
-from gscompleter.errors import InputError, quote_value
-from gscompleter.geometry import estimate_up, quats_to_rotations, rotations_to_quats
-from gscompleter.progress import notify_of_stages
+from gscompleter.numerics.geometry import estimate_up, quats_to_rotations, rotations_to_quats
 from gscompleter.state import NOTHING_ADDED, Completion, TargetResult
+from gscompleter.system.errors import InputError, quote_value
+from gscompleter.system.progress import notify_of_stages
 from gscompleter.types import SH_C0, Camera, Gaussians
 
 LOCAL_ORIGIN = re.compile(r"http://(127(\.\d{1,3}){3}|\[::1\]|localhost)(:\d+)?", re.IGNORECASE)

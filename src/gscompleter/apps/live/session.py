@@ -13,9 +13,9 @@ from gscompleter.apps.viewer.exhibit import load_scene_cameras
 from gscompleter.completer import GSCompleter
 from gscompleter.data.photographs import Resolution
 from gscompleter.data.scene import write_cameras
-from gscompleter.errors import InputError
-from gscompleter.splat_alignment.similarity import transform_camera_exactly
+from gscompleter.splats.alignment.similarity import transform_camera_exactly
 from gscompleter.state import Completion, TargetResult
+from gscompleter.system.errors import InputError
 from gscompleter.types import Camera
 
 

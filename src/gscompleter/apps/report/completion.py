@@ -31,18 +31,24 @@ from gscompleter.apps.report.schema import (
     UnfilledRow,
 )
 from gscompleter.config.settings import COVERED
+from gscompleter.editing.removal import hide_removed
 from gscompleter.evaluation.metrics.coverage import RenderPair, compute_coverage
 from gscompleter.evaluation.metrics.image import compute_masked_psnr, compute_masked_ssim, ssim
 from gscompleter.evaluation.metrics.unused_photographs import measure_likeness, shrink_view
-from gscompleter.geometry import estimate_up
-from gscompleter.io.files import COMPLETED_FILE, CONTEXT_FILE, REMOVED_FILE, SUMMARY_FILE
-from gscompleter.io.image import write_image
-from gscompleter.kernels.parallel import map_in_parallel
-from gscompleter.removal import hide_removed
-from gscompleter.render import Renderer, get_view_map
+from gscompleter.numerics.geometry import estimate_up
+from gscompleter.numerics.kernels.parallel import map_in_parallel
+from gscompleter.render.protocols import Renderer
+from gscompleter.render.view_map import get_view_map
 from gscompleter.splats.layout import save_like, save_removed
 from gscompleter.splats.ply import save_ply
 from gscompleter.state import Completion, TargetResult
+from gscompleter.system.files.image import write_image
+from gscompleter.system.files.writing import (
+    COMPLETED_FILE,
+    CONTEXT_FILE,
+    REMOVED_FILE,
+    SUMMARY_FILE,
+)
 from gscompleter.types import Camera, Gaussians, View, merge
 
 GENERATED_FILE = "generated.ply"

@@ -18,12 +18,17 @@ from jaxtyping import Float, UInt8
 from PIL import Image, ImageDraw, ImageFont
 
 from gscompleter.apps.report.completion import MAX_PHOTOGRAPHS, render_before_after, thin_evenly
-from gscompleter.geometry import embed_cameras, measure_baseline, resize_camera, shrink_camera
-from gscompleter.io.image import convert_to_pixels
-from gscompleter.io.video import write_video
-from gscompleter.progress import track
-from gscompleter.render import Renderer
+from gscompleter.numerics.geometry import (
+    embed_cameras,
+    measure_baseline,
+    resize_camera,
+    shrink_camera,
+)
+from gscompleter.render.protocols import Renderer
 from gscompleter.state import Completion
+from gscompleter.system.files.image import convert_to_pixels
+from gscompleter.system.files.video import write_video
+from gscompleter.system.progress import track
 from gscompleter.types import Camera
 
 VIDEO_FILE = "video.mp4"

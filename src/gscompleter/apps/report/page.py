@@ -42,9 +42,9 @@ from gscompleter.apps.report.schema import (
     read_summary,
 )
 from gscompleter.data.formats import FORMATS
-from gscompleter.io.files import encode_text, replace_file
-from gscompleter.io.image import encode_jpeg, read_image_size, read_pixels
-from gscompleter.jobs.jobs import JOBS, Job, read_row
+from gscompleter.system.files.image import encode_jpeg, read_image_size, read_pixels
+from gscompleter.system.files.writing import encode_text, replace_file
+from gscompleter.system.jobs.jobs import JOBS, Job, read_row
 
 REPORT_FILE, VIEWER_FILE = "report.html", "view.html"
 INDEX_FILE, TABLE_FILE = "index.html", "table.csv"

@@ -12,11 +12,11 @@ from typing import Any, Literal, TypeVar
 import numpy as np
 
 from gscompleter.apps.report.names import name_photograph, name_target
-from gscompleter.errors import InputError, quote_value
 from gscompleter.evaluation.metrics.coverage import Coverage
-from gscompleter.io.files import COMPLETED_FILE, SUMMARY_FILE
-from gscompleter.io.output_folder import read_command
-from gscompleter.io.reading import read_json
+from gscompleter.system.errors import InputError, quote_value
+from gscompleter.system.files.output_folder import read_command
+from gscompleter.system.files.reading import read_json
+from gscompleter.system.files.writing import COMPLETED_FILE, SUMMARY_FILE
 
 RECORD_FILE = "report.json"
 ADVICE = "complete the scene again"

@@ -17,12 +17,12 @@ from gscompleter.data.frame import Frame
 from gscompleter.data.local_origin import compute_frame_from_photographs
 from gscompleter.data.photographs import Resolution
 from gscompleter.data.scene import load_cameras
-from gscompleter.errors import InputError, quote_value
-from gscompleter.io.files import COMPLETED_FILE, CONTEXT_FILE, TARGETS_FILE
-from gscompleter.io.image import encode_jpeg, read_pixels, turn_upright
-from gscompleter.io.output_folder import POSES
-from gscompleter.splat_alignment.similarity import transform_camera
+from gscompleter.splats.alignment.similarity import transform_camera
 from gscompleter.splats.formats import load_splat
+from gscompleter.system.errors import InputError, quote_value
+from gscompleter.system.files.image import encode_jpeg, read_pixels, turn_upright
+from gscompleter.system.files.output_folder import POSES
+from gscompleter.system.files.writing import COMPLETED_FILE, CONTEXT_FILE, TARGETS_FILE
 from gscompleter.types import Camera, Gaussians
 
 THUMBNAIL_SIDE, THUMBNAIL_QUALITY = 160, 80

@@ -16,8 +16,8 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 
-from gscompleter.errors import InputError
-from gscompleter.io.files import get_download_folder, replace_file
+from gscompleter.system.errors import InputError
+from gscompleter.system.files.writing import get_download_folder, replace_file
 
 LOCK_FILE = Path(__file__).with_name("package-lock.json")
 BUILT_LIBRARIES = Path(__file__).with_name("libraries.json")

@@ -22,10 +22,10 @@ from torch import Tensor
 
 from gscompleter.apps.viewer.exhibit import ViewerCamera, ViewerContent
 from gscompleter.apps.viewer.packages import Libraries
-from gscompleter.errors import InputError, quote_value
-from gscompleter.geometry import embed_cameras, is_inside, project
-from gscompleter.io.files import encode_text
+from gscompleter.numerics.geometry import embed_cameras, is_inside, project
 from gscompleter.splats.spz import encode_spz
+from gscompleter.system.errors import InputError, quote_value
+from gscompleter.system.files.writing import encode_text
 from gscompleter.types import Camera, Gaussians
 
 ASSETS = Path(__file__).with_name("assets")

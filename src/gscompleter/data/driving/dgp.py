@@ -23,8 +23,8 @@ from gscompleter.data.frame import Frame
 from gscompleter.data.json_fields import get_intrinsics, get_part, get_pose, get_size, get_text
 from gscompleter.data.limits import require
 from gscompleter.data.photographs import Photographs, build_photographs
-from gscompleter.errors import InputError, quote_value
-from gscompleter.io.reading import read_head, read_json
+from gscompleter.system.errors import InputError, quote_value
+from gscompleter.system.files.reading import read_head, read_json
 
 ADVICE = "download the scene again"
 MAX_SNIFFED = 1 << 26

@@ -23,8 +23,8 @@ from gscompleter.data.driving.vehicle import build_poses, read_sweep
 from gscompleter.data.frame import Frame
 from gscompleter.data.limits import MAX_NUMBER, require
 from gscompleter.data.photographs import Photographs, build_drive, build_photographs
-from gscompleter.errors import quote_value
-from gscompleter.io.reading import MAX_LINE, read_head, read_lines
+from gscompleter.system.errors import quote_value
+from gscompleter.system.files.reading import MAX_LINE, read_head, read_lines
 
 POSES, CALIBRATION = "poses.txt", "calib.txt"
 CAMERAS = {"image_2": 2, "image_0": 0, "image_3": 3, "image_1": 1, "image_l": 0, "image_r": 1}

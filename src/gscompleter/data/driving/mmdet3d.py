@@ -26,8 +26,8 @@ from gscompleter.data.frame import Frame
 from gscompleter.data.json_fields import get_array, get_number, get_part, get_size, get_text
 from gscompleter.data.limits import require
 from gscompleter.data.photographs import Photographs, build_drive
-from gscompleter.errors import InputError, quote_value
-from gscompleter.io.reading import check_plain, read_bytes
+from gscompleter.system.errors import InputError, quote_value
+from gscompleter.system.files.reading import check_plain, read_bytes
 
 ADVICE = "write the infos again with mmdetection3d 1.1"
 FRONT = "CAM_FRONT"

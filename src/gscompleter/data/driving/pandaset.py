@@ -14,8 +14,8 @@ from gscompleter.data.frame import Frame
 from gscompleter.data.json_fields import get_intrinsics, get_pose
 from gscompleter.data.limits import require
 from gscompleter.data.photographs import Photographs, build_drive
-from gscompleter.errors import quote_value
-from gscompleter.io.reading import read_json
+from gscompleter.system.errors import quote_value
+from gscompleter.system.files.reading import read_json
 
 FRONT = "front_camera"
 POSES = "poses.json"

@@ -1,18 +1,16 @@
-"""Poses on a vehicle, its laser points as sparse z-depth, and boxes of moving objects as masks."""
+"""Poses on a vehicle, its laser points as sparse z-depth, and the boxes of moving objects."""
 
 from __future__ import annotations
 
 from itertools import product
 from pathlib import Path
 
-import cv2
 import numpy as np
-from jaxtyping import Bool, Float
+from jaxtyping import Float
 
 from gscompleter.data.limits import require
-from gscompleter.errors import quote_value
-from gscompleter.io.reading import read_bytes
-from gscompleter.types import Camera
+from gscompleter.system.errors import quote_value
+from gscompleter.system.files.reading import read_bytes
 
 POINT_BYTES = 16
 """Size of a point of KITTI: x, y, z and reflectance as float32."""
@@ -20,10 +18,6 @@ MIN_SPEED = 0.5
 """Smallest speed of a moving object, in metres per second."""
 MARGIN = 0.1
 """Relative enlargement of a box, for shadows, mirrors and time offsets."""
-NEAREST = 0.1
-"""Smallest z-depth of the corners of a box, in metres."""
-MAX_PIXELS = 1e5
-"""Largest pixel coordinate of a projected corner; rasterisers use integers."""
 
 
 def read_sweep(path: Path, world_from_laser: Float[np.ndarray, "4 4"]) -> Float[np.ndarray, "n 3"]:
@@ -71,23 +65,3 @@ def compute_moving_boxes(
     poses = vehicle @ build_poses(np.concatenate([level, headings, centers], axis=1))
     signs = np.array(list(product((-0.5, 0.5), repeat=3)))
     return transform_points((1 + MARGIN) * sides[:, None] * signs, poses[:, None])
-
-
-def mask_moving(
-    boxes: Float[np.ndarray, "n 8 3"], camera: Camera, origin: Float[np.ndarray, "3"]
-) -> Bool[np.ndarray, "h w"]:
-    """Mask pixels covered by boxes, including occluders in front of them.
-
-    `boxes` are in the world frame of the files, `camera` in coordinates relative to `origin`.
-    """
-    mask = np.zeros((camera.height, camera.width), np.uint8)
-    c2w, K = (matrix.double().cpu().numpy() for matrix in (camera.c2w, camera.K))
-    for corners in boxes - origin:
-        local = (corners - c2w[:3, 3]) @ c2w[:3, :3]
-        if np.isfinite(local).all() and local[:, 2].max() > NEAREST:
-            local[:, 2] = np.maximum(local[:, 2], NEAREST)
-            # OpenCV puts the centre of the first pixel at (0, 0).
-            pixels = (local @ K.T)[:, :2] / local[:, 2:] - 0.5
-            pixels = np.rint(np.clip(pixels, -MAX_PIXELS, MAX_PIXELS))
-            cv2.fillConvexPoly(mask, cv2.convexHull(pixels.astype(np.int32)), 1)
-    return mask > 0

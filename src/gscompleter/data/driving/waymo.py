@@ -24,8 +24,8 @@ from gscompleter.data.driving.vehicle import build_poses, compute_moving_boxes, 
 from gscompleter.data.frame import Frame
 from gscompleter.data.limits import require
 from gscompleter.data.photographs import Photographs, build_drive
-from gscompleter.errors import InputError, quote_value
-from gscompleter.io.reading import check_file
+from gscompleter.system.errors import InputError, quote_value
+from gscompleter.system.files.reading import check_file
 
 ADVICE = "download it again"
 IMAGES = "camera_image"

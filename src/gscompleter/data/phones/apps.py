@@ -22,12 +22,13 @@ from jaxtyping import Shaped
 
 from gscompleter.data.cameras import Intrinsics, compute_rotation
 from gscompleter.data.json_fields import get_array, get_intrinsics, get_number, get_part, get_size
-from gscompleter.data.limits import MAX_COORDINATE, require
+from gscompleter.data.limits import require
 from gscompleter.data.phones.export import ADVICE, Files, PoseAndLens, build_recording, find_files
 from gscompleter.data.phones.lzfse import measure_unpacked
 from gscompleter.data.photographs import Photographs
-from gscompleter.errors import InputError, quote_value
-from gscompleter.io.reading import parse_json
+from gscompleter.system.errors import InputError, quote_value
+from gscompleter.system.files.reading import parse_json
+from gscompleter.types import MAX_COORDINATE
 
 HOME, METADATA, LENSES = "keyframes", "metadata", "perFrameIntrinsicCoeffs"
 NOTE = "Depth is left out; `pip install 'gscompleter[phones]'` makes it readable."

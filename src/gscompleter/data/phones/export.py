@@ -22,9 +22,9 @@ from gscompleter.data.frame import Frame
 from gscompleter.data.limits import require
 from gscompleter.data.photographs import Photographs, build_photographs
 from gscompleter.data.transforms import OPENCV_FROM_OPENGL
-from gscompleter.errors import InputError, quote_value
-from gscompleter.io.image import open_image
-from gscompleter.io.reading import check_file, read_bytes
+from gscompleter.system.errors import InputError, quote_value
+from gscompleter.system.files.image import open_image
+from gscompleter.system.files.reading import check_file, read_bytes
 
 ADVICE = "export the recording again"
 MAX_ENTRY = 1 << 28

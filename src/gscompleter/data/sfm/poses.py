@@ -28,7 +28,6 @@ import numpy as np
 from jaxtyping import Bool
 from PIL import Image, ImageOps
 
-from gscompleter.cpu_threads import get_thread_count
 from gscompleter.data.camera_files import refuse_other_exports
 from gscompleter.data.file_names import FolderListings
 from gscompleter.data.frame import DOWNSCALE_FACTORS, MASKS
@@ -36,9 +35,8 @@ from gscompleter.data.limits import require
 from gscompleter.data.masks import MASK_FOLDERS, find_mask, leave_out_masks, load_mask
 from gscompleter.data.panorama import has_panoramas, split_panorama
 from gscompleter.data.video import NUM_FRAMES, extract_frames, is_video
-from gscompleter.errors import InputError, join_names, quote_value
-from gscompleter.io.files import SUMMARY_FILE
-from gscompleter.io.image import (
+from gscompleter.system.errors import InputError, join_names, quote_value
+from gscompleter.system.files.image import (
     HALF_OPAQUE,
     ORIENTATION,
     QUARTER_TURNS,
@@ -49,9 +47,11 @@ from gscompleter.io.image import (
     read_orientation,
     turn_upright,
 )
-from gscompleter.io.output_folder import reserve_output
-from gscompleter.io.reading import read_json
-from gscompleter.progress import stage, track
+from gscompleter.system.files.output_folder import reserve_output
+from gscompleter.system.files.reading import read_json
+from gscompleter.system.files.writing import SUMMARY_FILE
+from gscompleter.system.progress import stage, track
+from gscompleter.system.threads import get_thread_count
 
 ENDINGS = (
     ".jpg", ".jpeg", ".png", ".tif", ".tiff", ".webp", ".bmp", ".heic", ".heif", ".avif",

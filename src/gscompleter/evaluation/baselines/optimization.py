@@ -14,10 +14,10 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
-from gscompleter.geometry import compute_z_depths, quats_to_rotations
-from gscompleter.image_ops import ssim_map
-from gscompleter.progress import track
-from gscompleter.render import Renderer
+from gscompleter.numerics.geometry import compute_z_depths, quats_to_rotations
+from gscompleter.numerics.image_ops import ssim_map
+from gscompleter.render.protocols import Renderer
+from gscompleter.system.progress import track
 from gscompleter.types import Camera, Gaussians, View, merge
 
 POSITION_RATE, ROTATION_RATE, SCALE_RATE = 1.6e-4, 1e-3, 5e-3

@@ -17,9 +17,9 @@ from scipy.cluster.vq import kmeans2
 from torch import Tensor
 from torch.autograd.function import once_differentiable
 
-from gscompleter.geometry import multiply_quats, quats_to_rotations
-from gscompleter.progress import track
-from gscompleter.render import Renderer
+from gscompleter.numerics.geometry import multiply_quats, quats_to_rotations
+from gscompleter.render.protocols import Renderer
+from gscompleter.system.progress import track
 from gscompleter.types import Camera, Gaussians, View
 
 EPSILON = 0.1

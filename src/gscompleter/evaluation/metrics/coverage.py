@@ -14,15 +14,16 @@ from dataclasses import dataclass, replace
 import torch
 
 from gscompleter.config.settings import COVERED
-from gscompleter.geometry import (
+from gscompleter.numerics.geometry import (
     axis_angle_to_matrix,
     compute_spacing,
     measure_baseline,
     shrink_camera,
 )
-from gscompleter.next_best_view.candidates import interpolate_camera, move_camera
-from gscompleter.render import FrozenScene, Renderer, get_view_map
+from gscompleter.planning.candidates import interpolate_camera, move_camera
 from gscompleter.render.lod import MAX_PREVIEW_GAUSSIANS, choose_thinned_rows, thin_gaussians
+from gscompleter.render.protocols import FrozenScene, Renderer
+from gscompleter.render.view_map import get_view_map
 from gscompleter.state import Completion
 from gscompleter.trust import Trust
 from gscompleter.trust.photometric import PhotometricTrust

@@ -15,8 +15,8 @@ from jaxtyping import Bool, Float
 from scipy.spatial import cKDTree
 from torch import Tensor
 
-from gscompleter.geometry import is_inside, project, project_mask, sample
-from gscompleter.render import Renderer
+from gscompleter.numerics.geometry import is_inside, project, project_mask, sample
+from gscompleter.render.protocols import Renderer
 from gscompleter.stages.filter_holes import select_in_mask
 from gscompleter.types import Camera, DepthMap, Gaussians
 

@@ -16,7 +16,7 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 from torch.nn.functional import avg_pool2d, conv2d, pad
 
-from gscompleter.errors import InputError
+from gscompleter.system.errors import InputError
 
 Image = Float[Tensor, "h w 3"]
 

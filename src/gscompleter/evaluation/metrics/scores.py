@@ -22,7 +22,7 @@ from gscompleter.evaluation.metrics.image import (
     ssim,
 )
 from gscompleter.evaluation.metrics.perceptual import compute_flip_map, compute_lpips, haarpsi
-from gscompleter.render import Renderer
+from gscompleter.render.protocols import Renderer
 from gscompleter.stages.target_view import compute_hole_mask
 from gscompleter.types import Camera, DepthMap, Gaussians, Render, View
 

@@ -17,8 +17,8 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 
 from gscompleter.config.settings import COVERED
-from gscompleter.geometry import shrink_camera
-from gscompleter.splat_alignment.fit import convert_to_psnr, match_exposure
+from gscompleter.numerics.geometry import shrink_camera
+from gscompleter.splats.alignment.fit import convert_to_psnr, match_exposure
 from gscompleter.types import Render, View
 
 LONG_SIDE = 160

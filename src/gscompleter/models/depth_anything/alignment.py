@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import Float, Int
 
-from gscompleter.errors import InputError
+from gscompleter.system.errors import InputError
 
 Points = Float[np.ndarray, "n 3"]
 

@@ -10,7 +10,6 @@ import torch.nn.functional as F
 from jaxtyping import Float
 from torch import Tensor, nn
 
-from gscompleter.geometry import multiply_quats, rotations_to_quats
 from gscompleter.models.depth_anything.dpt import Dpt, ImageScratch, add_position_encoding
 from gscompleter.models.depth_anything.harmonics import rotate_3dgs_sh
 from gscompleter.models.depth_anything.poses import Poses
@@ -18,6 +17,7 @@ from gscompleter.models.depth_anything.vit import Tokens
 from gscompleter.models.feed_forward.dino import PATCH
 from gscompleter.models.feed_forward.gaussian_adapter import PixelGaussians, damp_sh
 from gscompleter.models.feed_forward.resampling import resize_bilinear
+from gscompleter.numerics.geometry import multiply_quats, rotations_to_quats
 
 SH = 9
 """SH coefficients per colour (degree 2)."""

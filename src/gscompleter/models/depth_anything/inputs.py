@@ -10,8 +10,6 @@ import torch
 from jaxtyping import Float, Int, UInt8
 from torch import Tensor
 
-from gscompleter.errors import InputError
-from gscompleter.geometry import sample
 from gscompleter.models.depth_anything.images import (
     Fit,
     Image,
@@ -23,6 +21,8 @@ from gscompleter.models.depth_anything.images import (
 )
 from gscompleter.models.depth_anything.poses import Poses
 from gscompleter.models.feed_forward.dino import PATCH
+from gscompleter.numerics.geometry import sample
+from gscompleter.system.errors import InputError
 from gscompleter.types import Camera, DepthMap, View
 
 

@@ -8,8 +8,8 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from gscompleter.errors import InputError
 from gscompleter.models.depth_anything.poses import Poses, invert_rigid
+from gscompleter.system.errors import InputError
 
 MIN_UNIT = 0.1
 """Smallest unit in the authors' code, in scene units."""

@@ -8,9 +8,9 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from gscompleter.geometry import multiply_quats, rotations_to_quats
 from gscompleter.models.depth_anything.harmonics import rotate_3dgs_sh
 from gscompleter.models.feed_forward.gaussian_adapter import PixelGaussians
+from gscompleter.numerics.geometry import multiply_quats, rotations_to_quats
 
 
 def move_from_first_camera(

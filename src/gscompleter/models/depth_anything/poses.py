@@ -9,7 +9,7 @@ import torch.nn.functional as F
 from jaxtyping import Float
 from torch import Tensor
 
-from gscompleter.geometry import quats_to_rotations, rotations_to_quats
+from gscompleter.numerics.geometry import quats_to_rotations, rotations_to_quats
 
 MIN_TANGENT = 1e-6
 """Smallest tangent of half a field of view."""

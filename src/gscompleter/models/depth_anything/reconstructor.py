@@ -10,7 +10,6 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from gscompleter.geometry import compute_z_depths
 from gscompleter.models.depth_anything.alignment import fit_center_similarity, fit_robust_similarity
 from gscompleter.models.depth_anything.inputs import Batch, ResizeConfig, create_any_view_batch
 from gscompleter.models.depth_anything.metric import MetricDepthAnything, set_sky_depth
@@ -23,6 +22,7 @@ from gscompleter.models.depth_anything.scene_scale import estimate_units_per_met
 from gscompleter.models.feed_forward.gaussian_adapter import PixelGaussians
 from gscompleter.models.feed_forward.precision import check_precision, lower_precision
 from gscompleter.models.feed_forward.reconstructor import flatten_gaussians
+from gscompleter.numerics.geometry import compute_z_depths
 from gscompleter.types import DepthMap, Reconstruction, View
 
 UnitFunction = Callable[[Float[Tensor, "b v 3"]], Float[Tensor, "b"]]

@@ -8,12 +8,12 @@ import numpy as np
 import torch
 from jaxtyping import Float
 
-from gscompleter.errors import InputError
-from gscompleter.geometry import sample
+from gscompleter.numerics.geometry import sample
 from gscompleter.reconstructors.features.depth_range import MIN_MATCHES
 from gscompleter.reconstructors.features.matches import triangulate
 from gscompleter.reconstructors.features.neighbours import find_neighbours
 from gscompleter.reconstructors.features.stereo_image import make_stereo_images
+from gscompleter.system.errors import InputError
 from gscompleter.types import DepthMap, View
 
 

@@ -11,11 +11,9 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
-from gscompleter.errors import InputError
 from gscompleter.generators import GeneratorOutput
 from gscompleter.generators.agreement import paint_consistently
 from gscompleter.generators.warp import BORDER_WIDTH, complete_warp
-from gscompleter.image_ops import dilate
 from gscompleter.models.diffusion.complete import check_parts, load_language_models
 from gscompleter.models.diffusion.kontext import resize_antialiased
 from gscompleter.models.diffusion.placing import move_to_device, select_dtype
@@ -27,6 +25,8 @@ from gscompleter.models.diffusion.published import (
     parse_source,
 )
 from gscompleter.models.settings import DiffusersInpaintSettings
+from gscompleter.numerics.image_ops import dilate
+from gscompleter.system.errors import InputError
 from gscompleter.types import Camera, GeneratorInput, View
 
 DEFAULT_SIDE = 512

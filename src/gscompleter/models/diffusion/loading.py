@@ -9,7 +9,6 @@ from typing import Any
 
 import torch
 
-from gscompleter.errors import InputError
 from gscompleter.models.diffusion.complete import check_complete, check_parts, load_language_models
 from gscompleter.models.diffusion.kontext import Kontext, Prompt
 from gscompleter.models.diffusion.placing import move_to_device, select_dtype
@@ -23,6 +22,7 @@ from gscompleter.models.diffusion.published import (
     parse_source,
 )
 from gscompleter.models.diffusion.rotary import HEADS, enable_per_head_positions
+from gscompleter.system.errors import InputError
 
 PROMPT = "Ensure that the picture does not change in any way"
 """Fixed prompt of the training."""

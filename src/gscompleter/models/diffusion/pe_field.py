@@ -13,11 +13,9 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from gscompleter.errors import InputError
 from gscompleter.generators import GeneratorOutput, GeneratorRequest
 from gscompleter.generators.agreement import paint_consistently
 from gscompleter.generators.warp import warp_photographs
-from gscompleter.geometry import is_same_camera
 from gscompleter.models.diffusion.kontext import Kontext, resize_antialiased
 from gscompleter.models.diffusion.loading import load_kontext
 from gscompleter.models.diffusion.position_ids import (
@@ -32,6 +30,8 @@ from gscompleter.models.diffusion.source_depth import (
 )
 from gscompleter.models.diffusion.splat import splat_forward
 from gscompleter.models.settings import PEFieldSettings
+from gscompleter.numerics.geometry import is_same_camera
+from gscompleter.system.errors import InputError
 from gscompleter.types import Camera, GeneratorInput, Render, View
 
 GUIDANCE = 3.5

@@ -12,8 +12,8 @@ from dataclasses import dataclass
 from importlib.util import find_spec
 from pathlib import Path
 
-from gscompleter.errors import InputError, quote_value
 from gscompleter.models.weights.fetching import limit_retries
+from gscompleter.system.errors import InputError, quote_value
 
 PACKAGES = ("diffusers", "transformers", "accelerate")
 """Packages that the generators import."""

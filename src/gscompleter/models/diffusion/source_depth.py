@@ -10,8 +10,6 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
-from gscompleter.errors import InputError
-from gscompleter.generators.exposure import fit_robust_affine
 from gscompleter.generators.smooth import continue_smoothly
 from gscompleter.models.diffusion.complete import load_transformers_model
 from gscompleter.models.diffusion.published import (
@@ -21,7 +19,9 @@ from gscompleter.models.diffusion.published import (
     parse_source,
 )
 from gscompleter.models.tables import DEPTH_PREDICTORS
+from gscompleter.numerics.robust import fit_robust_affine
 from gscompleter.reconstructors.depth_predictors import DepthPredictor
+from gscompleter.system.errors import InputError
 from gscompleter.types import Render, View
 
 MONOCULAR_MODEL = "depth-anything/Depth-Anything-V2-Small-hf"

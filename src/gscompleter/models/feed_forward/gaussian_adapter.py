@@ -9,9 +9,9 @@ import torch.nn.functional as F
 from jaxtyping import Float
 from torch import Tensor
 
-from gscompleter.geometry import multiply_quats, rotations_to_quats
 from gscompleter.models.feed_forward.cameras import Cameras, disable_autocast
 from gscompleter.models.feed_forward.spherical_harmonics import rotate_sh
+from gscompleter.numerics.geometry import multiply_quats, rotations_to_quats
 from gscompleter.types import SH_C0
 
 MVSPLAT_SH = 25

@@ -9,9 +9,9 @@ import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
-from gscompleter.errors import InputError
 from gscompleter.models.feed_forward.cameras import Cameras
 from gscompleter.reconstructors.features.depth_range import estimate_depth_range, get_depth_range
+from gscompleter.system.errors import InputError
 from gscompleter.types import Camera, DepthMap, View
 
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import torch
 
-from gscompleter.errors import InputError
+from gscompleter.system.errors import InputError
 
 
 def check_precision(device: torch.device, dtype: torch.dtype) -> None:

@@ -9,13 +9,13 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from gscompleter.geometry import compute_z_depths
 from gscompleter.models.feed_forward.depthsplat import DepthSplat
 from gscompleter.models.feed_forward.gaussian_adapter import PixelGaussians
 from gscompleter.models.feed_forward.inputs import Crop, create_batch
 from gscompleter.models.feed_forward.mvsplat import MVSplat
 from gscompleter.models.feed_forward.precision import check_precision, lower_precision
 from gscompleter.models.feed_forward.volsplat import VolSplat, VoxelGaussians
+from gscompleter.numerics.geometry import compute_z_depths
 from gscompleter.types import DepthMap, Gaussians, Reconstruction, View, make_observed
 
 MAX_COEFFICIENTS = 16

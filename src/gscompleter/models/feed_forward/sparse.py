@@ -12,7 +12,7 @@ import torch
 from jaxtyping import Bool, Float, Int64
 from torch import Tensor, nn
 
-from gscompleter.errors import InputError
+from gscompleter.system.errors import InputError
 
 Offset = tuple[int, int, int]
 OFFSETS: tuple[Offset, ...] = tuple((k % 3 - 1, k // 3 % 3 - 1, k // 9 - 1) for k in range(27))

@@ -8,8 +8,8 @@ import torch
 from jaxtyping import Float, Int64
 from torch import Tensor
 
-from gscompleter.errors import InputError
 from gscompleter.models.feed_forward.sparse import Grid, unique_rows
+from gscompleter.system.errors import InputError
 
 
 @dataclass(frozen=True)

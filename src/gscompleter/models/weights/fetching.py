@@ -9,9 +9,9 @@ from contextlib import contextmanager
 from importlib.util import find_spec
 from pathlib import Path
 
-from gscompleter.errors import InputError
-from gscompleter.io.files import get_download_folder
 from gscompleter.models.weights.published import PublishedWeights
+from gscompleter.system.errors import InputError
+from gscompleter.system.files.writing import get_download_folder
 
 MAX_RETRIES = 2
 """Number of retries of a request to the hub."""

@@ -8,7 +8,7 @@ from pathlib import Path
 import torch
 from torch import Tensor, nn
 
-from gscompleter.errors import InputError, quote_value
+from gscompleter.system.errors import InputError, quote_value
 
 Shapes = Mapping[str, tuple[int, ...]]
 """Shapes of the tensors of a network by name."""

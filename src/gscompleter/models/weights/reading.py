@@ -14,10 +14,10 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from gscompleter.errors import InputError, join_names, quote_value, refuse_pointer
-from gscompleter.io.reading import open_file
 from gscompleter.models.weights.fetching import fetch
 from gscompleter.models.weights.published import PUBLISHED, PublishedWeights
+from gscompleter.system.errors import InputError, join_names, quote_value, refuse_pointer
+from gscompleter.system.files.reading import open_file
 
 IGNORED_PREFIXES = ("decoder.", "losses.")
 """Prefixes of tensors of other parts that training checkpoints contain."""

@@ -14,7 +14,7 @@ import numpy as np
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
-from gscompleter.geometry import measure_baseline
+from gscompleter.numerics.geometry import measure_baseline
 from gscompleter.reconstructors.features.matches import triangulate
 from gscompleter.reconstructors.features.neighbours import find_neighbours
 from gscompleter.reconstructors.features.stereo_image import make_stereo_images

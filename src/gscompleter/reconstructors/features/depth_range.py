@@ -8,10 +8,10 @@ from dataclasses import replace
 import numpy as np
 from jaxtyping import Float
 
-from gscompleter.errors import InputError
 from gscompleter.reconstructors.features.matches import triangulate_valid
 from gscompleter.reconstructors.features.neighbours import Neighbours, find_neighbours
 from gscompleter.reconstructors.features.stereo_image import StereoImage, make_stereo_images
+from gscompleter.system.errors import InputError
 from gscompleter.types import View
 
 MIN_MATCHES = 12

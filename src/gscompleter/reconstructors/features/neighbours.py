@@ -11,7 +11,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from gscompleter.kernels.parallel import map_in_parallel
+from gscompleter.numerics.kernels.parallel import map_in_parallel
 from gscompleter.reconstructors.features.matches import (
     Pixels,
     detect_features,

@@ -9,7 +9,7 @@ import cv2
 import numpy as np
 from jaxtyping import Bool, Float, Float32
 
-from gscompleter.errors import InputError
+from gscompleter.system.errors import InputError
 from gscompleter.types import View
 
 MIN_SIDE = 8

@@ -15,8 +15,9 @@ from torch import Tensor
 from torch.nn.functional import normalize
 
 from gscompleter.reconstructors.plane_sweep.virtual_views import make_virtual_views
-from gscompleter.render import ColorErrors, Renderer, get_view_map
+from gscompleter.render.protocols import ColorErrors, Renderer
 from gscompleter.render.spherical_harmonics import SH_C1
+from gscompleter.render.view_map import get_view_map
 from gscompleter.types import SH_C0, Camera, DepthMap, Gaussians, View
 
 VIRTUAL_WEIGHT = 0.45

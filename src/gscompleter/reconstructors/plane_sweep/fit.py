@@ -16,9 +16,9 @@ from jaxtyping import Float
 from torch import Tensor
 
 from gscompleter.config.settings import COVERED
-from gscompleter.optim import Adam
-from gscompleter.render import Renderer
+from gscompleter.numerics.adam import Adam
 from gscompleter.render.fit_colors import fit_colors
+from gscompleter.render.protocols import Renderer
 from gscompleter.types import DepthMap, Gaussians, View
 
 OPACITY_STEPS = 6

@@ -9,8 +9,8 @@ import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
-from gscompleter.cpu_threads import use_one_torch_thread
-from gscompleter.geometry import rotations_to_quats
+from gscompleter.numerics.geometry import rotations_to_quats
+from gscompleter.numerics.sky import extend_sky, is_sky, restore_sky_colors
 from gscompleter.reconstructors.plane_sweep.directional_colors import fit_directional_colors
 from gscompleter.reconstructors.plane_sweep.fit import fit_jointly, fit_opacities
 from gscompleter.reconstructors.plane_sweep.fusion import (
@@ -21,9 +21,10 @@ from gscompleter.reconstructors.plane_sweep.fusion import (
 )
 from gscompleter.reconstructors.plane_sweep.rig import Transforms
 from gscompleter.reconstructors.plane_sweep.sweep import Mask
-from gscompleter.render import Renderer, load_renderer
 from gscompleter.render.fit_colors import RELAXATION, fit_colors
-from gscompleter.sky import extend_sky, is_sky, restore_sky_colors
+from gscompleter.render.loading import load_renderer
+from gscompleter.render.protocols import Renderer
+from gscompleter.system.threads import use_one_torch_thread
 from gscompleter.types import (
     DepthMap,
     Gaussians,

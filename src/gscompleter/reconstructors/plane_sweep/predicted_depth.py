@@ -7,7 +7,7 @@ from dataclasses import replace
 import numpy as np
 import torch
 
-from gscompleter.ransac import find_affine_inliers, fit_line_ransac
+from gscompleter.numerics.robust import find_affine_inliers, fit_line_ransac
 from gscompleter.reconstructors.plane_sweep.sweep import (
     Measurement,
     compute_inverse_depth,

@@ -11,8 +11,9 @@ import torch
 from jaxtyping import Bool
 from torch import Tensor
 
-from gscompleter.geometry import compute_sparse_depth, measure_baseline, unproject
-from gscompleter.kernels.parallel import map_in_parallel
+from gscompleter.numerics.geometry import compute_sparse_depth, measure_baseline, unproject
+from gscompleter.numerics.kernels.parallel import map_in_parallel
+from gscompleter.numerics.sky import SKY_DEPTH, is_sky
 from gscompleter.reconstructors.depth_predictors import DepthPredictor, predict_nothing
 from gscompleter.reconstructors.features.depth_range import get_depth_range, set_depth_range
 from gscompleter.reconstructors.features.stereo_image import StereoImage
@@ -29,7 +30,6 @@ from gscompleter.reconstructors.plane_sweep.sweep import (
     compute_inverse_depth,
     measure_depths,
 )
-from gscompleter.sky import SKY_DEPTH, is_sky
 from gscompleter.types import DepthMap, Reconstruction, View
 
 LIFT_ITERATIONS = ITERATIONS // 2

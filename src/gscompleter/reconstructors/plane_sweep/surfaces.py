@@ -11,8 +11,8 @@ import numpy as np
 import torch
 from jaxtyping import Float32
 
-from gscompleter.image_ops import fill_smoothly
-from gscompleter.kernels import tgv
+from gscompleter.numerics.image_ops import fill_smoothly
+from gscompleter.numerics.kernels import tgv
 from gscompleter.reconstructors.features.stereo_image import compute_contrast
 
 Image = Float32[np.ndarray, "h w 3"]

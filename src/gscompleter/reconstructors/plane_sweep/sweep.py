@@ -11,8 +11,8 @@ import numpy as np
 import torch
 from jaxtyping import Bool, Float32, Int, Int16, UInt8
 
-from gscompleter.kernels import stereo
-from gscompleter.kernels.stereo import TILE_COLUMNS, TILE_ROWS, Bands
+from gscompleter.numerics.kernels import stereo
+from gscompleter.numerics.kernels.stereo import TILE_COLUMNS, TILE_ROWS, Bands
 from gscompleter.reconstructors.features.stereo_image import StereoImage, compute_contrast
 from gscompleter.reconstructors.plane_sweep.rig import Rig, Transform
 

@@ -13,8 +13,8 @@ from dataclasses import replace
 import torch
 
 from gscompleter.config.settings import COVERED
-from gscompleter.geometry import is_inside, project, sample, unproject
-from gscompleter.render import Renderer
+from gscompleter.numerics.geometry import is_inside, project, sample, unproject
+from gscompleter.render.protocols import Renderer
 from gscompleter.types import Camera, DepthMap, Gaussians, View
 
 DEPTH_TOLERANCE = 0.03

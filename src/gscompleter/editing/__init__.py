@@ -1,0 +1,1 @@
+"""What a user takes out of a splat: chosen objects, and floaters."""

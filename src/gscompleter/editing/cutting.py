@@ -1,0 +1,77 @@
+"""Gaussians cut at the border of a region, so that what lies outside of it stays."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from dataclasses import replace
+
+import torch
+from jaxtyping import Bool, Float
+from torch import Tensor
+
+from gscompleter.numerics.geometry import quats_to_rotations
+from gscompleter.types import Gaussians, merge
+
+Region = Callable[[Float[Tensor, "n 3"]], Bool[Tensor, "n"]]
+"""Finds the points that lie in a region."""
+
+REACH = 3.0
+"""Standard deviations up to which a Gaussian reaches."""
+PIECE = 1 / 3
+"""Standard deviation of a piece, relative to that of its Gaussian; `STEP` is their distance."""
+STEP, STEPS = 2 / 3, 4
+MIN_LENGTH = 0.25
+"""Length, relative to the longest axis, from which on the second axis is divided as well."""
+MAX_OPACITY = 0.99
+"""Largest opacity that is divided, as a logarithm is taken."""
+MIN_OPACITY = 1 / 255
+"""Smallest opacity that is rendered."""
+
+
+def cut(gaussians: Gaussians, contains: Region) -> tuple[Gaussians, Gaussians]:
+    """Cut Gaussians at the border of the region that their centres lie in.
+
+    Returns the Gaussians, of those at the border only what lies in the region, and the rest.
+    """
+    ends = REACH * torch.cat([torch.eye(3), -torch.eye(3)]).to(gaussians.means)
+    is_inside = torch.stack([contains(move(gaussians, end)) for end in ends]).all(dim=0)
+    whole = is_inside | ~contains(gaussians.means)
+    pieces = split(gaussians[~whole])
+    inside = contains(pieces.means)
+    return merge([gaussians[whole], pieces[inside]]), pieces[~inside]
+
+
+def move(
+    gaussians: Gaussians, steps: Float[Tensor, "3"] | Float[Tensor, "n 3"]
+) -> Float[Tensor, "n 3"]:
+    """Return centres moved by standard deviations along the axes."""
+    rotations = quats_to_rotations(gaussians.quats)
+    return gaussians.means + (rotations @ (steps * gaussians.scales)[..., None])[..., 0]
+
+
+def split(gaussians: Gaussians) -> Gaussians:
+    """Split Gaussians along their two longest axes into pieces that together look the same.
+
+    Pieces at the steps of a grid, with the weights of a Gaussian of variance 1 - PIECE², add up to
+    one of variance 1. What adds up when they are composited are logarithms of transmittance.
+    """
+    steps = STEP * torch.arange(-STEPS, STEPS + 1)
+    grid = torch.cartesian_prod(steps, steps).to(gaussians.means)
+    longest, order = gaussians.scales.sort(dim=1, descending=True, stable=True)
+    is_wide = longest[:, 1] > MIN_LENGTH * longest[:, 0]
+    row, cell = (is_wide[:, None] | (grid[:, 1] == 0)).nonzero().unbind(dim=1)
+    given, axes, spread = gaussians[row], 1 + is_wide[row].long(), 1 - PIECE**2
+    step = torch.zeros_like(given.scales).scatter(1, order[row, :2], grid[cell])
+    factors = torch.where(axes[:, None] > torch.arange(2).to(axes), PIECE, 1.0).to(step)
+    shrunk = torch.ones_like(step).scatter(1, order[row, :2], factors)
+    weights = (-(step**2).sum(dim=1) / (2 * spread)).exp() / spread ** (axes / 2)
+    transmittance = 1 - (weights * given.opacities).clamp_max(MAX_OPACITY)
+    pieces = replace(
+        given,
+        means=move(given, step),
+        scales=given.scales * shrunk,
+        opacities=1 - transmittance ** ((STEP / PIECE / math.sqrt(2 * math.pi)) ** axes),
+        encoded=None,
+    )
+    return pieces[pieces.opacities > MIN_OPACITY]

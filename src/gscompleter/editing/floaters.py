@@ -1,0 +1,99 @@
+"""Removal of floaters without photographs, by statistics of neighbouring Gaussians.
+
+A Gaussian is compared with its nearest neighbours only. Far walls and the sky are sparse and large,
+but so are their neighbours, and together they leave no gaps: they stay.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import torch
+from jaxtyping import Bool, Float
+from torch import Tensor
+
+from gscompleter.config import FloaterConfig
+from gscompleter.system.errors import InputError
+from gscompleter.types import Gaussians
+
+MAX_BREADTH = 10.0
+"""Largest factor by which the limit of opacity rises with the size of a Gaussian."""
+
+
+@dataclass(frozen=True)
+class Surroundings:
+    """Statistics of n Gaussians and their nearest neighbours."""
+
+    sigmas: Float[Tensor, "n 3"]
+    """Own standard deviations in descending order, in scene units."""
+    sigma: Float[Tensor, "n"]
+    """Median of the neighbours' largest standard deviations, in scene units."""
+    distance: Float[Tensor, "n"]
+    """Median distance to the neighbours, in scene units."""
+    spacing: Float[Tensor, "n"]
+    """Median of `distance` over the neighbours, at least that of the scene."""
+    gap: Float[Tensor, "n"]
+    """Median distance to the neighbours, relative to the sum of both largest deviations."""
+
+
+def find_floaters(
+    scene: Gaussians, config: FloaterConfig = FloaterConfig()
+) -> dict[str, Bool[Tensor, "n"]]:
+    """Find floaters by reason, again without those found until none is left; generated ones stay.
+
+    A Gaussian may have several reasons. Floaters beside others show only after these are found.
+    """
+    if len(scene) <= config.neighbors:
+        raise InputError(
+            f"The scene has {len(scene)} Gaussians, too few to compare each with "
+            f"{config.neighbors} neighbours; give its photographs."
+        )
+    reasons: dict[str, Bool[Tensor, "n"]] = {}
+    left = torch.arange(len(scene), device=scene.means.device)
+    while len(left) > config.neighbors:
+        found = rate_gaussians(scene[left], config)
+        for reason, mask in found.items():
+            none = torch.zeros_like(scene.generated, dtype=torch.bool)
+            reasons[reason] = reasons.get(reason, none).index_fill(0, left[mask], True)
+        gone = torch.stack([*found.values()]).any(dim=0)
+        if not gone.any():
+            break
+        left = left[~gone]
+    return reasons
+
+
+def rate_gaussians(scene: Gaussians, config: FloaterConfig) -> dict[str, Bool[Tensor, "n"]]:
+    """Compare Gaussians with their surroundings, as `find_floaters` does in each round."""
+    around = measure_surroundings(scene, config.neighbors)
+    longest, middle, shortest = around.sigmas.unbind(dim=1)
+    size, remoteness = longest / around.sigma, around.distance / around.spacing
+    is_large = size > config.max_size
+    is_detached = around.distance > config.max_size * around.sigma
+    reasons = {
+        "isolated": around.gap > config.max_gap,
+        "huge": (shortest > config.max_thickness * around.spacing)
+        | (is_large & (remoteness > config.max_remoteness)),
+        "needles": is_large & is_detached & (longest > config.max_elongation * middle),
+        "transparent": scene.opacities < config.min_opacity * (size / 2).clamp(1, MAX_BREADTH),
+    }
+    return {reason: mask & (scene.generated == 0) for reason, mask in reasons.items()}
+
+
+def measure_surroundings(scene: Gaussians, neighbors: int) -> Surroundings:
+    """Measure each Gaussian and its nearest neighbours."""
+    # Imported here, since SciPy is slow to import.
+    from scipy.spatial import cKDTree
+
+    means = scene.means.double().cpu().numpy()
+    found = cKDTree(means).query(means, neighbors + 1, workers=torch.get_num_threads())
+    apart, rows = (torch.from_numpy(part[:, 1:]).to(scene.means.device) for part in found)
+    sigmas = scene.scales.sort(dim=1, descending=True).values
+    longest, apart = sigmas[:, 0], apart.to(sigmas)
+    distance = apart.median(dim=1).values
+    return Surroundings(
+        sigmas,
+        sigma=longest[rows].median(dim=1).values,
+        distance=distance,
+        spacing=distance[rows].median(dim=1).values.clamp_min(distance.median()),
+        gap=(apart / (longest[:, None] + longest[rows])).median(dim=1).values,
+    )

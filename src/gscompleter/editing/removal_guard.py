@@ -1,0 +1,21 @@
+"""Removal guard (not in the paper): fill only the hole that removed Gaussians leave."""
+
+from __future__ import annotations
+
+from gscompleter.guards import Guard
+from gscompleter.numerics.geometry import project_mask
+from gscompleter.render.removed import mask_removed
+from gscompleter.stages.target_view import TargetView
+from gscompleter.types import Gaussians
+
+
+class Removal(Guard):
+    """Add nothing where the scene looked the same before the removal."""
+
+    name = "removal"
+
+    def place(self, candidates: Gaussians, view: TargetView) -> Gaussians:
+        """Keep candidates in pixels that showed something removed."""
+        camera = view.camera.padded
+        shown = mask_removed(view.state.source, camera, view.scenes.renderer)
+        return candidates[project_mask(shown, candidates, camera)]

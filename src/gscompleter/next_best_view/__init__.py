@@ -1,1 +1,0 @@
-"""Choice of target cameras: candidates, gains and a greedy plan."""

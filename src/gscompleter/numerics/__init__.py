@@ -1,0 +1,1 @@
+"""Mathematics shared by all stages: geometry, image operations, robust fits, Adam, kernels."""

@@ -1,0 +1,477 @@
+"""Plane-sweep stereo: matching costs, semi-global aggregation, and consistency checks.
+
+Pixel centres are at +0.5. A 3 x 4 `transform` [A | b] maps pixel (x, y, 1) of one view at inverse
+depth w to the homogeneous pixel A (x, y, 1) + b w of another; its third entry is the depth ratio.
+"""
+
+from typing import NamedTuple
+
+import numpy as np
+
+from gscompleter.numerics.kernels.cache import njit
+from gscompleter.numerics.kernels.parallel import run, share
+
+UNSEEN = 255
+"""Cost of a plane at which the pixel falls outside the other image."""
+TILE_ROWS, TILE_COLUMNS = 16, 64
+"""Size of a tile, which is matched at once, within the cache."""
+INFEASIBLE = np.int16(16000)
+"""Infeasible cost, half of the largest int16."""
+PATHS = 8
+"""Number of paths of semi-global aggregation."""
+
+
+class Bands(NamedTuple):
+    """The planes that each tile of an image is matched at.
+
+    Costs are ordered by tile, then row, pixel and plane.
+    """
+
+    low: np.ndarray
+    """First plane of each tile [rows, columns] int32."""
+    high: np.ndarray
+    """One past the last plane of each tile [rows, columns] int32."""
+    start: np.ndarray
+    """Offset of the costs of each tile, row by row, and the end [tiles + 1] int64."""
+
+
+@njit(inline="always")
+def _get_first_cost(bands, y, x, width):
+    row, column = y // TILE_ROWS, x // TILE_COLUMNS
+    left = column * TILE_COLUMNS
+    wide = min(TILE_COLUMNS, width - left)
+    within = (y - row * TILE_ROWS) * wide + x - left
+    planes = bands.high[row, column] - bands.low[row, column]
+    return bands.start[row * bands.low.shape[1] + column] + within * planes
+
+
+@njit(fastmath={"contract"}, inline="always")
+def _clip(value, low, high):
+    """Clip to [low, high]; NaN becomes low, since the result is used as an index."""
+    value = value if value > low else low
+    return value if value < high else high
+
+
+@njit(fastmath={"contract"})
+def _sum_boxes(values, sums, column, rows, width, radius):
+    """Sum `values` over (2 radius + 1)^2 windows."""
+    for x in range(width + 2 * radius):
+        column[x] = np.float32(0)
+    for y in range(2 * radius):
+        for x in range(width + 2 * radius):
+            column[x] += values[y, x]
+    for y in range(rows):
+        for x in range(width + 2 * radius):
+            column[x] += values[y + 2 * radius, x]
+        # One pass over the row per column of the window, since a pass is vectorised.
+        for x in range(width):
+            sums[y, x] = column[x]
+        for dx in range(1, 2 * radius + 1):
+            for x in range(width):
+                sums[y, x] += column[x + dx]
+        for x in range(width + 2 * radius):
+            column[x] -= values[y, x]
+
+
+def compute_matching_costs(
+    reference, source, transform, inverse_depths, bands, radius, noise, detail
+):
+    """Compute matching costs 0..254 of the reference pixels at the planes of their tiles.
+
+    Normalised cross-correlation of windows over all colours, which ignores exposure, is mixed with
+    the difference of the two pixels from their windows' means, which is sharper at edges. Planes
+    outside the source cost UNSEEN.
+
+    transform [3, 4]: from reference to source. radius: of the windows, in pixels. noise: standard
+    deviation of image noise; weaker texture does not correlate. detail: share of the second term.
+    """
+    costs = np.empty(bands.start[-1], np.uint8)
+    images = (reference, source, transform, inverse_depths, bands)
+    share(_match_tiles, bands.low.size, *images, radius, noise, detail, costs)
+    return costs
+
+
+@njit(fastmath={"contract"}, error_model="numpy", inline="always")
+def _compare(y, own, own_mean, other, other_mean, other_square, cross, line):
+    """Turn window sums into deviations and products in place; line[0] gets pixel differences."""
+    cols = cross.shape[1]
+    radius = (own.shape[2] - cols) // 2
+    area = np.float32((2 * radius + 1) ** 2)
+    for x in range(cols):
+        line[0, x] = np.float32(0)
+    for c in range(3):
+        for x in range(cols):
+            other_mean[c, y, x] /= area
+        for x in range(cols):
+            theirs = other[c, y + radius, x + radius] - other_mean[c, y, x]
+            line[0, x] += abs(theirs - (own[c, y + radius, x + radius] - own_mean[c, y, x]))
+        for x in range(cols):
+            other_square[y, x] -= area * other_mean[c, y, x] * other_mean[c, y, x]
+        for x in range(cols):
+            cross[y, x] -= area * other_mean[c, y, x] * own_mean[c, y, x]
+
+
+@njit(nogil=True, fastmath={"contract"}, error_model="numpy")
+def _match_tiles(
+    begin, end, reference, source, transform, inverse_depths, bands, radius, noise, detail, costs
+):
+    h, w = reference.shape[:2]
+    H, W = source.shape[:2]
+    columns = bands.low.shape[1]
+    area = np.float32((2 * radius + 1) ** 2)
+    floor = np.float32(3) * area * noise * noise
+    for tile in range(begin, end):
+        top, left = tile // columns * TILE_ROWS, tile % columns * TILE_COLUMNS
+        low = bands.low[tile // columns, tile % columns]
+        count = bands.high[tile // columns, tile % columns] - low
+        rows, cols = min(TILE_ROWS, h - top), min(TILE_COLUMNS, w - left)
+        tall, wide = rows + 2 * radius, cols + 2 * radius
+        own = np.empty((3, tall, wide), np.float32)
+        other = np.empty((3, tall, wide), np.float32)
+        product = np.empty((tall, wide), np.float32)
+        own_mean = np.empty((3, rows, cols), np.float32)
+        other_mean = np.empty((3, rows, cols), np.float32)
+        own_square = np.empty((rows, cols), np.float32)
+        other_square = np.empty((rows, cols), np.float32)
+        cross = np.empty((rows, cols), np.float32)
+        seen = np.empty((tall, wide), np.bool_)
+        column = np.empty(wide, np.float32)
+        line = np.empty((2, wide), np.float32)
+        for y in range(tall):
+            for x in range(wide):
+                yy = _clip(top + y - radius, 0, h - 1)
+                xx = _clip(left + x - radius, 0, w - 1)
+                total = np.float32(0)
+                for c in range(3):
+                    own[c, y, x] = reference[yy, xx, c]
+                    total += own[c, y, x] * own[c, y, x]
+                product[y, x] = total
+        for c in range(3):
+            _sum_boxes(own[c], own_mean[c], column, rows, cols, radius)
+        _sum_boxes(product, own_square, column, rows, cols, radius)
+        for y in range(rows):
+            for x in range(cols):
+                for c in range(3):
+                    own_mean[c, y, x] /= area
+                    own_square[y, x] -= area * own_mean[c, y, x] * own_mean[c, y, x]
+
+        first = bands.start[tile]
+        for plane in range(count):
+            depth = inverse_depths[low + plane]
+            for y in range(tall):
+                py = np.float32(top + y - radius) + np.float32(0.5)
+                q0 = transform[0, 1] * py + transform[0, 2] + transform[0, 3] * depth
+                q1 = transform[1, 1] * py + transform[1, 2] + transform[1, 3] * depth
+                q2 = transform[2, 1] * py + transform[2, 2] + transform[2, 3] * depth
+                for x in range(wide):
+                    px = np.float32(left + x - radius) + np.float32(0.5)
+                    ratio = q2 + transform[2, 0] * px
+                    inverse = np.float32(1) / max(ratio, np.float32(1e-3))
+                    sx = (q0 + transform[0, 0] * px) * inverse - np.float32(0.5)
+                    sy = (q1 + transform[1, 0] * px) * inverse - np.float32(0.5)
+                    seen[y, x] = (
+                        (ratio > np.float32(1e-3))
+                        & (sx >= np.float32(-0.5))
+                        & (sx <= np.float32(W) - np.float32(0.5))
+                        & (sy >= np.float32(-0.5))
+                        & (sy <= np.float32(H) - np.float32(0.5))
+                    )
+                    line[0, x] = _clip(sx, np.float32(0), np.float32(W - 1))
+                    line[1, x] = _clip(sy, np.float32(0), np.float32(H - 1))
+                for x in range(wide):
+                    sx, sy = line[0, x], line[1, x]
+                    # `_clip` ensures 0..W - 1 and 0..H - 1 for any input.
+                    ix = np.uint32(min(np.int32(sx), W - 2))
+                    iy = np.uint32(min(np.int32(sy), H - 2))
+                    ax, ay = sx - np.float32(ix), sy - np.float32(iy)
+                    w11 = ax * ay
+                    w01 = ax - w11
+                    w10 = ay - w11
+                    w00 = np.float32(1) - ax - w10
+                    for c in range(3):
+                        other[c, y, x] = (
+                            w00 * source[iy, ix, c]
+                            + w01 * source[iy, ix + 1, c]
+                            + w10 * source[iy + 1, ix, c]
+                            + w11 * source[iy + 1, ix + 1, c]
+                        )
+            for c in range(3):
+                _sum_boxes(other[c], other_mean[c], column, rows, cols, radius)
+            for y in range(tall):
+                for x in range(wide):
+                    a, b, c = other[0, y, x], other[1, y, x], other[2, y, x]
+                    product[y, x] = a * a + b * b + c * c
+            _sum_boxes(product, other_square, column, rows, cols, radius)
+            for y in range(tall):
+                for x in range(wide):
+                    product[y, x] = (
+                        other[0, y, x] * own[0, y, x]
+                        + other[1, y, x] * own[1, y, x]
+                        + other[2, y, x] * own[2, y, x]
+                    )
+            _sum_boxes(product, cross, column, rows, cols, radius)
+            for y in range(rows):
+                place = first + y * cols * count + plane
+                _compare(y, own, own_mean, other, other_mean, other_square, cross, line)
+                for x in range(cols):
+                    correlation = cross[y, x] / np.sqrt(
+                        (max(other_square[y, x], np.float32(0)) + floor)
+                        * (max(own_square[y, x], np.float32(0)) + floor)
+                    )
+                    cost = (np.float32(1) - detail) * (np.float32(1) - correlation)
+                    cost += detail * min(line[0, x] * np.float32(5), np.float32(1))
+                    line[0, x] = min(cost * np.float32(254), np.float32(254))
+                for x in range(cols):
+                    value = np.uint8(line[0, x])
+                    if not seen[y + radius, x + radius]:
+                        value = np.uint8(UNSEEN)
+                    costs[place + x * count] = value
+
+
+def prefer_given(costs, bands, given, weight, step):
+    """Make planes beside given depths cost more, in place; within half a plane matching decides.
+
+    given [h, w]: plane of each pixel, or less than 0 if unknown. weight: of the matching cost
+    there. step: cost of each further plane.
+    """
+    share(_prefer_given, len(given), costs, bands, given, weight, step)
+
+
+@njit(nogil=True, fastmath={"contract"})
+def _prefer_given(begin, end, costs, bands, given, weight, step):
+    w = given.shape[1]
+    for y in range(begin, end):
+        for x in range(w):
+            if given[y, x] < 0:
+                continue
+            first = _get_first_cost(bands, y, x, w)
+            row, column = y // TILE_ROWS, x // TILE_COLUMNS
+            low = bands.low[row, column]
+            for k in range(bands.high[row, column] - low):
+                beside = max(
+                    abs(np.float32(low + k) - given[y, x]) - np.float32(0.5), np.float32(0)
+                )
+                cost = weight * np.float32(costs[first + k]) + step * beside
+                costs[first + k] = np.uint8(min(cost, np.float32(254)))
+
+
+@njit(fastmath={"contract"}, inline="always")
+def _step(cost, before, lowest, after, total, small, large):
+    """Advance a path by one pixel and return its lowest cost there."""
+    planes = cost.shape[0]
+    ceiling = np.int16(lowest + large)
+    best = INFEASIBLE
+    for k in range(planes):
+        # `before` has a border of one plane on either side.
+        beside = np.int16(min(before[k], before[k + 2]) + small)
+        reached = min(beside, min(before[k + 1], ceiling))
+        value = np.int16(np.int16(cost[k]) + np.int16(reached - lowest))
+        after[k + 1] = value
+        total[k] = np.int16(total[k] + value)
+        best = min(best, value)
+    after[0] = INFEASIBLE
+    after[planes + 1] = INFEASIBLE
+    return best
+
+
+@njit(inline="always")
+def _align_bands(before, band_before, band, scratch):
+    """Realign the costs of another tile's band to the planes of this one; others are FAR."""
+    if band_before[0] == band[0] and band_before[1] == band[1]:
+        return before
+    for plane in range(band[0] - 1, band[1] + 1):
+        known = band_before[0] <= plane < band_before[1]
+        scratch[plane - band[0] + 1] = before[plane - band_before[0] + 1] if known else INFEASIBLE
+    return scratch
+
+
+@njit(nogil=True, fastmath={"contract"})
+def _sweep_half(costs, bands, large_x, large_y, large_d, large_u, small, down, total):
+    """Aggregate four of the eight paths: along the row, and from the row before."""
+    h, w = large_y.shape[0] + 1, large_x.shape[1] + 1
+    widest = 2
+    for width in (bands.high - bands.low).flat:
+        widest = max(widest, width + 2)
+    rows = np.zeros((2, 3, w, widest), np.int16)
+    lows = np.zeros((2, 3, w), np.int16)
+    along = np.zeros((2, widest), np.int16)
+    nothing, scratch = np.zeros(widest, np.int16), np.empty(widest, np.int16)
+    for step in range(h):
+        y = step if down else h - 1 - step
+        now, then = step % 2, 1 - step % 2
+        row, row_before = y // TILE_ROWS, (y - 1 if down else min(y + 1, h - 1)) // TILE_ROWS
+        # The row before lies at y - 1 on the way down and at y + 1 on the way up.
+        upper = max(y - 1, 0) if down else min(y, h - 2)
+        of_left, of_right = (large_d, large_u) if down else (large_u, large_d)
+        low_along = np.int16(0)
+        for s in range(w):
+            x = s if down else w - 1 - s
+            column = x // TILE_COLUMNS
+            low, high = bands.low[row, column], bands.high[row, column]
+            first = _get_first_cost(bands, y, x, w)
+            end = first + high - low
+            cost, out = costs[first:end], total[first:end]
+            before, edge = nothing, 0
+            if s > 0:
+                back = x - 1 if down else x + 1
+                edge, tile = min(x, back), back // TILE_COLUMNS
+                band = bands.low[row, tile], bands.high[row, tile]
+                before = _align_bands(along[s % 2], band, (low, high), scratch)
+            low_along = _step(
+                cost, before, low_along, along[1 - s % 2], out, small, large_x[y, edge]
+            )
+            from_left, from_right = of_left[upper, max(x - 1, 0)], of_right[upper, min(x, w - 2)]
+            larges = (from_left, large_y[upper, x], from_right)
+            for path in range(3):
+                before, lowest, other = nothing, np.int16(0), x + path - 1
+                if step > 0 and 0 <= other < w:
+                    tile = other // TILE_COLUMNS
+                    band = bands.low[row_before, tile], bands.high[row_before, tile]
+                    lowest, states = lows[then, path, other], rows[then, path, other]
+                    before = _align_bands(states, band, (low, high), scratch)
+                lows[now, path, x] = _step(
+                    cost, before, lowest, rows[now, path, x], out, small, larges[path]
+                )
+
+
+def aggregate_semi_globally(costs, bands, large_x, large_y, large_d, large_u, small):
+    """Aggregate costs along eight paths (Hirschmüller 2008), in the order of `bands`.
+
+    Planes missing in the previous tile are reached by a jump. small: penalty of one plane.
+    large_x [h, w - 1], large_y [h - 1, w], large_d and large_u [h - 1, w - 1]: penalties of a jump
+    between a pixel and its right, lower and lower right neighbour, and along the other diagonal;
+    int16, at most 3000, so that sums do not overflow.
+    """
+    # Each half has its own sum, so that two threads can work and order does not matter.
+    totals = np.zeros((2, len(costs)), np.int16)
+    jumps = (large_x, large_y, large_d, large_u)
+    halves = [(costs, bands, *jumps, small, half == 0, totals[half]) for half in range(2)]
+    run(_sweep_half, halves)
+    totals[0] += totals[1]
+    return totals[0]
+
+
+def select_planes(totals, bands, h, w):
+    """Select the best plane of every pixel, with fraction, and its margin over the second best.
+
+    The second best is not adjacent to the best. Margins are in units of a cost, per path.
+    """
+    index = np.empty((h, w), np.float32)
+    margin = np.empty((h, w), np.float32)
+    share(_choose, h, totals, bands, index, margin)
+    return index, margin
+
+
+@njit(nogil=True, fastmath={"contract"})
+def _choose(begin, end, totals, bands, index, margin):
+    w = index.shape[1]
+    for y in range(begin, end):
+        for x in range(w):
+            row, column = y // TILE_ROWS, x // TILE_COLUMNS
+            first = _get_first_cost(bands, y, x, w)
+            planes = bands.high[row, column] - bands.low[row, column]
+            total = totals[first : first + planes]
+            best = 0
+            for k in range(planes):
+                if total[k] < total[best]:
+                    best = k
+            second = INFEASIBLE
+            for k in range(planes):
+                if abs(k - best) > 2:
+                    second = min(second, total[k])
+            margin[y, x] = np.float32(second - total[best]) / np.float32(PATHS)
+            at = np.float32(bands.low[row, column] + best)
+            if 0 < best < planes - 1:
+                # Two lines of opposite gradient: less biased towards whole planes than a parabola.
+                before = total[best - 1] - total[best]
+                after = total[best + 1] - total[best]
+                steeper = max(before, after)
+                if steeper > 0:
+                    at += np.float32(0.5) * np.float32(before - after) / np.float32(steeper)
+            index[y, x] = at
+
+
+def reproject(depth, other, b_from_a, a_from_b):
+    """Project every pixel of view a to view b and back, by their inverse depths.
+
+    Returns the distance between each pixel and its image, in pixels, or -1 if it falls outside b,
+    and its z-depth in b relative to b's own.
+    """
+    error = np.full(depth.shape, np.float32(-1), np.float32)
+    ratio = np.ones(depth.shape, np.float32)
+    share(_carry, len(depth), depth, other, b_from_a, a_from_b, error, ratio)
+    return error, ratio
+
+
+@njit(nogil=True, fastmath={"contract"})
+def _carry(begin, end, depth, other, b_from_a, a_from_b, error, ratio):
+    w = depth.shape[1]
+    H, W = other.shape
+    for y in range(begin, end):
+        for x in range(w):
+            px, py, own = np.float32(x + 0.5), np.float32(y + 0.5), depth[y, x]
+            q2 = b_from_a[2, 0] * px + b_from_a[2, 1] * py + b_from_a[2, 2] + b_from_a[2, 3] * own
+            if q2 <= np.float32(1e-3):
+                continue
+            sx = b_from_a[0, 0] * px + b_from_a[0, 1] * py + b_from_a[0, 2] + b_from_a[0, 3] * own
+            sy = b_from_a[1, 0] * px + b_from_a[1, 1] * py + b_from_a[1, 2] + b_from_a[1, 3] * own
+            sx /= q2
+            sy /= q2
+            if not (sx >= 0 and sx < W and sy >= 0 and sy < H):
+                continue
+            # The corners may lie on two surfaces; the one that agrees best counts.
+            best = np.float32(1e9)
+            expected = own / q2
+            value = other[int(sy), int(sx)]
+            x0, y0 = int(np.floor(sx - 0.5)), int(np.floor(sy - 0.5))
+            for k in range(4):
+                xx = min(max(x0 + k % 2, 0), W - 1)
+                yy = min(max(y0 + k // 2, 0), H - 1)
+                if abs(other[yy, xx] - expected) < best:
+                    best = abs(other[yy, xx] - expected)
+                    value = other[yy, xx]
+            r2 = a_from_b[2, 0] * sx + a_from_b[2, 1] * sy + a_from_b[2, 2] + a_from_b[2, 3] * value
+            if r2 <= np.float32(1e-3):
+                continue
+            rx = a_from_b[0, 0] * sx + a_from_b[0, 1] * sy + a_from_b[0, 2] + a_from_b[0, 3] * value
+            ry = a_from_b[1, 0] * sx + a_from_b[1, 1] * sy + a_from_b[1, 2] + a_from_b[1, 3] * value
+            rx = rx / r2 - px
+            ry = ry / r2 - py
+            error[y, x] = np.sqrt(rx * rx + ry * ry)
+            ratio[y, x] = value / max(expected, np.float32(1e-12))
+
+
+def fill_background(values, known):
+    """Fill unknown pixels with the second lowest known value in eight directions.
+
+    Low inverse depths are far away, and one ray may miss a thin object in front.
+    """
+    filled = values.copy()
+    share(_fill, len(values), values, known, filled)
+    return filled
+
+
+@njit(nogil=True)
+def _fill(begin, end, values, known, filled):
+    h, w = values.shape
+    for y in range(begin, end):
+        for x in range(w):
+            if known[y, x]:
+                continue
+            lowest, second = np.float32(np.inf), np.float32(np.inf)
+            for direction in range(9):
+                dy, dx = direction // 3 - 1, direction % 3 - 1
+                if dy == 0 and dx == 0:
+                    continue
+                yy, xx = y + dy, x + dx
+                while 0 <= yy < h and 0 <= xx < w and not known[yy, xx]:
+                    yy += dy
+                    xx += dx
+                if 0 <= yy < h and 0 <= xx < w:
+                    value = values[yy, xx]
+                    if value < lowest:
+                        lowest, second = value, lowest
+                    elif value < second:
+                        second = value
+            if second < np.inf:
+                filled[y, x] = second

@@ -1,0 +1,80 @@
+"""The sky: Gaussians so far behind the far plane that their parallax is invisible."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import torch
+from jaxtyping import Bool, Float, Int
+from torch import Tensor
+
+from gscompleter.numerics.image_ops import dilate, push_pull
+from gscompleter.types import Camera, DepthMap, Gaussians, Render, View, make_observed, sh_from_rgb
+
+SKY_DEPTH = 8.0
+"""z-depth of the sky, in multiples of the far plane."""
+MIN_SKY_DEPTH = 3.0
+"""Rendered z-depth from which a pixel is sky, in multiples of the far plane.
+Pixels on an edge mix surface and sky and lie in between."""
+SKY_EXTENSION = 0.125
+"""Extension of the sky behind surfaces, as a fraction of the shorter image side.
+Without it, parallax would open gaps along roofs and trees."""
+SKY_OPACITY = 0.98
+"""Opacity of the extended sky."""
+
+
+def is_sky(depth: Float[Tensor, "*n"], camera: Camera) -> Bool[Tensor, "*n"]:
+    """Return which z-depths, in scene units, are sky; none if the far plane is unknown."""
+    return depth > (float("inf") if camera.far is None else MIN_SKY_DEPTH * camera.far)
+
+
+def compute_sky_depth(camera: Camera) -> float:
+    """Compute the z-depth of the sky in scene units; `camera` must have a far plane."""
+    assert camera.far is not None, "a camera with a sky has a far plane"
+    return SKY_DEPTH * camera.far
+
+
+def is_sky_visible(render: Render, camera: Camera) -> bool:
+    """Return True if a render shows sky."""
+    depth = render.depth_map()
+    return bool((depth.valid & is_sky(depth.depth, camera)).any())
+
+
+def mask_out_sky(render: Render, camera: Camera) -> DepthMap:
+    """Return the rendered depth, valid only on surfaces and not in the sky."""
+    depth = render.depth_map()
+    return DepthMap(depth.depth, depth.valid & ~is_sky(depth.depth, camera))
+
+
+def extend_sky(
+    view: View, sky: Bool[Tensor, "h w"], sigma: float
+) -> tuple[Gaussians, Int[Tensor, "n"]]:
+    """Extend the sky behind surfaces by Gaussians of `sigma` pixels; return their pixels, too."""
+    camera, image = view.camera, view.image
+    reach = round(SKY_EXTENSION * min(camera.width, camera.height))
+    where = dilate(sky, reach) & ~sky
+    pixels = torch.nonzero(where.flatten())[:, 0]
+    depth = compute_sky_depth(camera) if len(pixels) else 0.0
+    size = sigma * depth * 2 / (camera.K[0, 0] + camera.K[1, 1])
+    gaussians = make_observed(
+        means=camera.center + depth * camera.z_rays()[where],
+        quats=image.new_tensor([1.0, 0.0, 0.0, 0.0]).repeat(len(pixels), 1),
+        scales=size.expand(len(pixels), 3).clone(),
+        opacities=image.new_full((len(pixels),), SKY_OPACITY),
+        sh=sh_from_rgb(push_pull(image, sky.to(image.dtype))[where]),
+    )
+    return gaussians, pixels
+
+
+def restore_sky_colors(made: Gaussians, fitted: Gaussians, camera: Camera) -> Gaussians:
+    """Restore the colours that Gaussians of the sky had before colours were fitted.
+
+    Fitting compensates for blur, which makes a bright line of sky along roofs; parallax would
+    reveal it. `camera` is any of those that see the Gaussians.
+    """
+    in_sky = is_sky((made.means - camera.center).norm(dim=-1), camera)
+    if not in_sky.any():
+        return fitted
+    sh = torch.where(in_sky[:, None, None], 0, fitted.sh)
+    sh[in_sky, : made.sh.shape[1]] = made.sh[in_sky]
+    return replace(fitted, sh=sh, encoded=None)

@@ -1,0 +1,181 @@
+"""Checks of the numbers in tensors: finite, in range, and large enough to work on.
+
+They read every number, so they run once, where a value enters: in the readers and writers of
+splats, in `GSCompleter.begin` and `advance`, and on what Ψ and Φ return. Constructors, which run in
+every step of an optimisation too, check types and shapes only (`tensor_checks`).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import torch
+from jaxtyping import Bool, Float
+from torch import Tensor
+
+from gscompleter.system.errors import InputError
+from gscompleter.system.memory import check_images
+from gscompleter.system.tensor_checks import describe, name_dtype
+from gscompleter.types import Camera, Gaussians, View
+
+LARGEST = 1e18
+"""Largest coordinate, scale and component of a quaternion: the sum of their squares is finite."""
+LARGEST_SH = 1e6
+"""Largest spherical harmonic; colours are in [0, 1], and 1e38 would add up to infinity."""
+MIN_QUAT_LENGTH = 1e-12
+"""Smallest length of a quaternion: `torch.nn.functional.normalize` divides by no less."""
+MIN_SIDE = 8
+"""Smallest width and height of a photograph or target, in pixels; stereo needs as many."""
+COLOR_TOLERANCE = 0.01
+"""Largest tolerated excess of a colour beyond [0, 1], as resampling causes it."""
+
+
+def find_finite(gaussians: Gaussians) -> Bool[Tensor, "n"]:
+    """Mark Gaussians of finite numbers below `LARGEST` whose quaternion is a rotation."""
+    good = torch.ones(len(gaussians), dtype=torch.bool, device=gaussians.means.device)
+    for name in ("means", "quats", "scales", "sh", "opacities"):
+        good &= ~_find_infinite(getattr(gaussians, name), LARGEST_SH if name == "sh" else LARGEST)
+    return good & (gaussians.quats.square().sum(1) >= MIN_QUAT_LENGTH**2)
+
+
+def _find_infinite(values: Float[Tensor, "n *k"], largest: float) -> Bool[Tensor, "n"]:
+    """Mark rows with NaN, infinity or a number beyond `largest`."""
+    inside = values.abs() <= largest  # False for NaN
+    return ~inside.flatten(1).all(1) if values.dim() > 1 else ~inside
+
+
+def find_out_of_range(gaussians: Gaussians) -> Bool[Tensor, "n"]:
+    """Mark Gaussians with a negative scale or an opacity outside of [0, 1]."""
+    opacities = gaussians.opacities
+    return (gaussians.scales < 0).any(1) | (opacities < 0) | (opacities > 1)
+
+
+def check_gaussians(gaussians: object, name: str) -> None:
+    """Raise InputError unless these are Gaussians of float32 with numbers that a scene can have.
+
+    `name` begins the sentence, such as "The scene". On a GPU this waits once.
+    """
+    if not isinstance(gaussians, Gaussians):
+        raise InputError(
+            f"{name} has to be Gaussians, such as gsc.load_splat returns, and is "
+            f"{describe(gaussians)}."
+        )
+    _check_float32(gaussians.means, name)
+    bad = ~find_finite(gaussians) | find_out_of_range(gaussians)
+    count = int(bad.sum())
+    if count > 0:
+        raise InputError(
+            f"{name} has {count:,} of {len(bad):,} Gaussians with {_describe_defect(gaussians)}; "
+            "repair or remove them."
+        )
+
+
+def _describe_defect(gaussians: Gaussians) -> str:
+    """Describe the first property that holds numbers which no scene can have."""
+    if _find_infinite(gaussians.means, LARGEST).any():
+        return "positions that are NaN or infinite"
+    if _find_infinite(gaussians.quats, LARGEST).any():
+        return "rotations that are NaN or of infinite length"
+    if _find_infinite(gaussians.scales, LARGEST).any() or (gaussians.scales < 0).any():
+        return "scales that are negative, NaN or infinite"
+    if _find_infinite(gaussians.sh, LARGEST_SH).any():
+        return f"spherical harmonics that are NaN or beyond {LARGEST_SH:g}"
+    if not ((gaussians.opacities >= 0) & (gaussians.opacities <= 1)).all():
+        return "opacities outside of [0, 1]"
+    return "rotations of zeros"
+
+
+def check_inputs(
+    views: Sequence[View],
+    scene: Gaussians | None,
+    check_photos: Sequence[View],
+    targets: Sequence[Camera],
+) -> None:
+    """Raise InputError for values that cannot be completed; arguments as in `GSCompleter`."""
+    check_views(views, "context")
+    check_views(check_photos, "check")
+    if scene is not None:
+        check_gaussians(scene, "The scene")
+    for number, target in enumerate(targets):
+        check_camera(target, f"Target {number}")
+    cameras = [*(view.camera for view in (*views, *check_photos)), *targets]
+    check_images(sum(camera.width * camera.height for camera in cameras), len(cameras))
+    tensors = {f"context view {number}": view.image for number, view in enumerate(views)}
+    tensors |= {f"check view {number}": view.image for number, view in enumerate(check_photos)}
+    tensors |= {f"target {number}": target.K for number, target in enumerate(targets)}
+    if scene is not None:
+        tensors["scene"] = scene.means
+    first = next(iter(tensors), "")
+    for name, tensor in tensors.items():
+        if tensor.device != tensors[first].device:
+            raise InputError(
+                f"The {first} is on {tensors[first].device} and the {name} on {tensor.device}; "
+                "move all to one device."
+            )
+
+
+def check_views(views: object, name: str) -> None:
+    """Raise InputError unless these are photographs to work on.
+
+    They are a list of `View`, at least `MIN_SIDE` pixels wide and high, with colours
+    in [0, 1], depths of at least 0, and some pixel that is not ignored. `name` is for the
+    sentences, such as "context".
+    """
+    if not isinstance(views, (list, tuple)):
+        raise InputError(
+            f"The {name} views have to be a list, such as gsc.load_views returns, and are "
+            f"{describe(views)}."
+        )
+    for number, view in enumerate(views):
+        if not isinstance(view, View):
+            raise InputError(
+                f"The {name} views have to be a list of View, and number {number} is "
+                f"{describe(view)}."
+            )
+        check_camera(view.camera, f"The camera of {name} view {number}")
+        _check_float32(view.image, f"The image of {name} view {number}")
+        check_colors(view.image, f"The image of {name} view {number}")
+        for part in ("depth", "given_depth"):
+            depth = getattr(view, part)
+            if depth is not None and not bool(((depth >= 0) & depth.isfinite()).all()):
+                raise InputError(
+                    f"The {part.replace('_', ' ')} of {name} view {number} holds NaN, infinity or "
+                    "negative numbers; write 0 where it is unknown."
+                )
+    if len(views) > 0 and not any(bool(view.valid_mask.any()) for view in views):
+        raise InputError(
+            f"The masks leave no pixel of the {name} views; give other masks or photographs."
+        )
+
+
+def check_camera(camera: object, name: str) -> None:
+    """Raise InputError unless this is a camera of float32 whose image is large enough."""
+    if not isinstance(camera, Camera):
+        raise InputError(
+            f"{name} has to be a Camera, such as gsc.load_camera returns, and is "
+            f"{describe(camera)}."
+        )
+    _check_float32(camera.K, name)
+    if min(camera.width, camera.height) < MIN_SIDE:
+        raise InputError(
+            f"{name} has an image of {camera.width} × {camera.height} pixels, and at least "
+            f"{MIN_SIDE} × {MIN_SIDE} are needed; choose a larger resolution."
+        )
+    camera.to("cpu")  # whose constructor reads the numbers, which it does not on a GPU
+
+
+def check_colors(image: Float[Tensor, "h w 3"], name: str) -> None:
+    """Raise InputError for colours outside of [0, 1], or NaN."""
+    low, high = torch.stack(image.aminmax()).tolist()
+    if not (low >= -COLOR_TOLERANCE and high <= 1 + COLOR_TOLERANCE):  # nor NaN
+        raise InputError(
+            f"{name} has values from {low:g} to {high:g}; colours in [0, 1] are needed."
+        )
+
+
+def _check_float32(tensor: Tensor, name: str) -> None:
+    if tensor.dtype is not torch.float32:
+        raise InputError(
+            f"{name} holds {name_dtype(tensor.dtype)}, and float32 is needed; convert it by "
+            ".float()."
+        )

@@ -1,0 +1,165 @@
+"""Candidate target cameras: moves of the photographs' cameras, as in ExploreGS.
+
+Each camera is translated in six directions, turned in four, and moved on four orbits. Steps are so
+short that most of what a candidate sees was observed; horizons stay as level as in photographs.
+Around a trained splat, candidates stand beside and between photographs and look at the same scene.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import torch
+from jaxtyping import Bool, Float
+from torch import Tensor
+
+from gscompleter.config import NextBestViewConfig
+from gscompleter.numerics.geometry import (
+    axis_angle_to_matrix,
+    compute_field_of_view,
+    embed_cameras,
+    estimate_up,
+    project,
+    resize_camera,
+    slerp_rotation,
+)
+from gscompleter.types import Camera, Render
+
+FREE_SPACE_MARGIN = 0.1
+"""Distance in front of a surface, relative to depth, from which a point is in free space."""
+MOVES_ASIDE = (0, 1, 10, 11)
+"""Moves of `make_moves` to the right and left, straight and around what the camera looks at."""
+MIN_COVERAGE = 0.05
+"""Fraction of its image that must show the scene for a camera to have a known depth."""
+
+
+@dataclass(frozen=True)
+class Candidate:
+    """A camera that the scene may be completed for."""
+
+    camera: Camera
+    base: int
+    """Index of the camera that it was derived from."""
+    nearest: float
+    """5 % quantile of the z-depths that this camera sees, in scene units."""
+    region: Bool[Tensor, "*size"] = torch.tensor(True)
+    """Pixels of its small image that may be completed; all by default."""
+
+
+def propose_candidates(
+    bases: Sequence[Camera],
+    renders: Sequence[Render],
+    step: float,
+    config: NextBestViewConfig = NextBestViewConfig(),
+    stays_beside: bool = False,
+) -> list[Candidate]:
+    """Propose the moves of each base camera that end in free space.
+
+    `renders` show the scene at `bases`. `step` is the longest move in scene units, 0 if unknown.
+    With `stays_beside`, cameras move aside or halfway to the most similar base only.
+    """
+    depths, nearest = compute_depth_quantiles(renders, 0.5), compute_depth_quantiles(renders, 0.05)
+    up, places = estimate_up(bases), embed_cameras(bases)
+    similar = torch.cdist(places, places).argsort(dim=1)[:, 1:2].tolist()
+    found = []
+    for index, (base, depth) in enumerate(zip(bases, depths, strict=True)):
+        longest = config.max_step * depth
+        length = min(step, longest) if step > 0 else longest
+        away = make_moves(base, depth, length, config.yaw_fraction, up)
+        if stays_beside:
+            between = [interpolate_camera(base, bases[other], 0.5) for other in similar[index]]
+            away = [*(away[move] for move in MOVES_ASIDE), *between]
+        found += [Candidate(camera, index, nearest[index]) for camera in away]
+    small = [resize_camera(b, *r.alpha.T.shape) for b, r in zip(bases, renders, strict=True)]
+    return [c for c in found if is_in_free_space(c.camera.center, small, renders)]
+
+
+def make_moves(
+    camera: Camera, depth: float, step: float, turn: float, up: Float[Tensor, "3"]
+) -> list[Camera]:
+    """Make fourteen cameras one move away from `camera`.
+
+    `depth` (of the viewed point) and `step` are in scene units; `turn` is a fraction of the field
+    of view; `up` is the unit axis of turns to the side.
+    """
+    axes = camera.c2w[:3, :3].T
+    shifts = [sign * step * axis for axis in axes for sign in (1, -1)]
+    translated = [move_camera(camera, torch.eye(3).to(up), shift) for shift in shifts]
+    ahead = camera.center + depth * camera.forward
+    wide, high = compute_field_of_view(camera)
+    return [
+        *translated,
+        *orbit_camera(camera, camera.center, (turn * wide, turn * high), up),
+        *orbit_camera(camera, ahead, (step / depth, step / depth), up),
+    ]
+
+
+def orbit_camera(
+    camera: Camera, pivot: Float[Tensor, "3"], angles: tuple[float, float], up: Float[Tensor, "3"]
+) -> list[Camera]:
+    """Turn a camera about a point by two angles in radians, about `up` and about its x axis."""
+    axes = (up, camera.c2w[:3, 0])
+    arm = camera.center - pivot
+    turns = [
+        axis_angle_to_matrix(axis, sign * angle)
+        for axis, angle in zip(axes, angles, strict=True)
+        for sign in (1, -1)
+    ]
+    return [move_camera(camera, turn, turn @ arm - arm) for turn in turns]
+
+
+def move_camera(camera: Camera, turn: Float[Tensor, "3 3"], shift: Float[Tensor, "3"]) -> Camera:
+    """Rotate a camera in world axes and shift its centre."""
+    c2w = camera.c2w.clone()
+    c2w[:3, :3] = turn @ camera.c2w[:3, :3]
+    c2w[:3, 3] += shift
+    return replace(camera, c2w=c2w)
+
+
+def interpolate_camera(first: Camera, second: Camera, share: float) -> Camera:
+    """Interpolate from `first` to the pose of `second`."""
+    turn = second.c2w[:3, :3].double() @ first.c2w[:3, :3].double().T
+    return move_camera(
+        first, slerp_rotation(turn, share).to(first.c2w), share * (second.center - first.center)
+    )
+
+
+def is_in_free_space(
+    point: Float[Tensor, "3"], cameras: Sequence[Camera], renders: Sequence[Render]
+) -> bool:
+    """Return True if a photograph sees through a point, or if none shows an occluder."""
+    hidden = False
+    for camera, render in zip(cameras, renders, strict=True):
+        pixel, z = project(point, camera)
+        x, y = (int(value) for value in pixel.clamp(-1, 1e6).floor())
+        if z <= 0 or not (0 <= x < camera.width and 0 <= y < camera.height):
+            continue
+        surface = render.depth_map()
+        if not surface.valid[y, x]:
+            continue
+        if z < (1 - FREE_SPACE_MARGIN) * surface.depth[y, x]:
+            return True
+        hidden = True
+    return not hidden
+
+
+def is_close(render: Render, nearest: float, config: NextBestViewConfig) -> bool:
+    """Return True if surfaces much closer than `nearest` fill too much of an image."""
+    seen = render.depth_map()
+    near = seen.valid & (seen.depth < config.clearance * nearest)
+    return near.float().mean().item() > config.max_close
+
+
+def compute_depth_quantiles(renders: Sequence[Render], share: float) -> list[float]:
+    """Compute a quantile of the z-depths in each render, in scene units.
+
+    A render that shows hardly anything of the scene gets the quantile over all renders.
+    """
+    valid = [render.depth_map().valid for render in renders]
+    own = [render.depth[where] for render, where in zip(renders, valid, strict=True)]
+    if sum(len(values) for values in own) == 0:
+        raise ValueError("no camera sees the scene, so its distance is unknown")
+    usual = torch.cat(own).quantile(share).item()
+    known = [where.float().mean().item() >= MIN_COVERAGE for where in valid]
+    return [v.quantile(share).item() if k else usual for v, k in zip(own, known, strict=True)]

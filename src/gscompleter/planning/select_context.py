@@ -1,0 +1,140 @@
+"""Selection of context views for given targets.
+
+A photograph scores by the target's points that it shows, from similar directions; a pair also by
+its triangulation angle. The score of a set is that of its best pair, summed over points. Selection
+is greedy; of two further photographs that are needed to show new points, each counts half.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from gscompleter.numerics.geometry import is_inside, project
+from gscompleter.types import Camera
+
+MAX_POINTS = 1000
+"""Points that are scored for all targets together."""
+MAX_CANDIDATES = 32
+"""Photographs closest to the targets whose pairs are scored."""
+MIN_POINTS = 20
+"""Fewest visible points of a target; with fewer, a plane in the middle of the scene is used."""
+GRID_SIDE = 8
+"""Points of such a plane per image side."""
+PLANES = (0.1, 0.3, 0.5, 0.7, 0.9)
+"""Planes that represent an unknown scene, in normalized inverse depth from near to far."""
+HALF_SCORE_ANGLE = 5.0
+"""Angle between viewing directions at which the score of a photograph is halved, in degrees."""
+BEST_ANGLE = 0.5
+"""Best triangulation angle of a pair, in degrees: some pixels of parallax."""
+NARROW_FALLOFF, WIDE_FALLOFF = 0.3, 20.0
+"""Angles in degrees below and above it at which the score of a pair falls to a third."""
+MIN_PAIR_SCORE = 0.1
+"""Pair score below which no pair shows a point."""
+OUTSIDE_SCORE = 1e-3
+"""Score of a point outside of an image; it ranks photographs that show none."""
+
+
+def select_context(
+    targets: Sequence[Camera],
+    candidates: Sequence[Camera],
+    points: Float[Tensor, "n 3"],
+    count: int,
+) -> list[int]:
+    """Select up to `count` of the candidates; return sorted indices.
+
+    `points` are on or near surfaces, in world coordinates; at least one.
+    """
+    share = max(MAX_POINTS // len(targets), 1)
+    seen = [find_visible_points(target, points, share) for target in targets]
+    pairs = zip(targets, seen, strict=True)
+    worth = torch.cat([score_cameras(t, candidates, p) for t, p in pairs], dim=1)
+    closest = worth.sum(1).argsort(descending=True, stable=True)[:MAX_CANDIDATES]
+    rays = compute_directions([candidates[i] for i in closest.tolist()], torch.cat(seen))
+    chosen = select_greedily(worth[closest], rays, count)
+    return sorted(closest[chosen].tolist())
+
+
+def select_greedily(
+    worth: Float[Tensor, "c p"], rays: Float[Tensor, "c p 3"], count: int
+) -> list[int]:
+    """Choose the best pair, then repeatedly the candidate that improves the pair scores most."""
+    if min(count, len(worth)) < 2:
+        return list(range(min(count, len(worth))))
+    pairs = torch.stack([score_pairs(i, worth, rays) for i in range(len(worth))])
+    first, second = divmod(int(pairs.sum(-1).argmax()), len(worth))
+    chosen, best = [first, second], pairs[first, second]
+    while len(chosen) < min(count, len(worth)):
+        now = (pairs[chosen].amax(0) - best).clamp_min(0).sum(-1)
+        later = (pairs.amax(0) * (best < MIN_PAIR_SCORE)).sum(-1) / 2
+        gains = torch.maximum(now, later) + OUTSIDE_SCORE * worth.sum(-1)
+        gains[chosen] = -1.0
+        added = int(gains.argmax())
+        best = torch.maximum(best, pairs[chosen, added].amax(0))
+        chosen.append(added)
+    return chosen
+
+
+def score_pairs(
+    one: int, worth: Float[Tensor, "c p"], rays: Float[Tensor, "c p 3"]
+) -> Float[Tensor, "c p"]:
+    """Score the pairs of candidate `one` with all others at each point."""
+    excess = compute_angles(rays[one], rays) - BEST_ANGLE
+    width = torch.where(excess < 0, NARROW_FALLOFF, WIDE_FALLOFF)
+    together = torch.minimum(worth[one], worth) * torch.exp(-((excess / width) ** 2))
+    same_place = (rays[one] == rays).all(-1)
+    return together.masked_fill(same_place, 0.0)
+
+
+def score_cameras(
+    target: Camera, candidates: Sequence[Camera], points: Float[Tensor, "p 3"]
+) -> Float[Tensor, "c p"]:
+    """Score each candidate at points that the target sees."""
+    own = compute_directions([target], points)[0]
+    apart = compute_angles(own, compute_directions(candidates, points))
+    shown = torch.stack([is_inside(*project(points, c), c) for c in candidates])
+    return torch.where(shown, 1.0, OUTSIDE_SCORE) / (1 + (apart / HALF_SCORE_ANGLE) ** 2)
+
+
+def find_visible_points(
+    target: Camera, points: Float[Tensor, "n 3"], count: int = MAX_POINTS
+) -> Float[Tensor, "p 3"]:
+    """Return every n-th point that a target sees, or points on a plane if there are few."""
+    seen = points[is_inside(*project(points, target), target)]
+    if len(seen) < MIN_POINTS:
+        seen = make_plane_in_front(target, (points - target.center).norm(dim=-1).median().item())
+    return seen[:: -(-len(seen) // count)]
+
+
+def make_points_in_front(target: Camera, near: float, far: float) -> Float[Tensor, "p 3"]:
+    """Make points on planes in front of a target, between two z-depths in scene units."""
+    inverse = [(1 - share) / near + share / far for share in PLANES]
+    return torch.cat([make_plane_in_front(target, 1 / value) for value in inverse])
+
+
+def make_plane_in_front(target: Camera, depth: float) -> Float[Tensor, "p 3"]:
+    """Make a grid of points at one z-depth, in scene units, over the image of a target."""
+    rays = target.z_rays()
+    rows, columns = (
+        torch.linspace(0, side - 1, GRID_SIDE).round().long()
+        for side in (target.height, target.width)
+    )
+    return target.center + depth * rays[rows][:, columns].reshape(-1, 3)
+
+
+def compute_directions(
+    cameras: Sequence[Camera], points: Float[Tensor, "p 3"]
+) -> Float[Tensor, "c p 3"]:
+    """Compute unit vectors from each camera centre to each point."""
+    centers = torch.stack([camera.center for camera in cameras])
+    return torch.nn.functional.normalize((points - centers[:, None]).double(), dim=-1)
+
+
+def compute_angles(
+    a: Float[Tensor, "*#shape 3"], b: Float[Tensor, "*#shape 3"]
+) -> Float[Tensor, "*shape"]:
+    """Compute the angle between unit vectors in degrees, exact for small angles."""
+    return torch.rad2deg(2 * torch.asin(((a - b).norm(dim=-1) / 2).clamp_max(1.0)))

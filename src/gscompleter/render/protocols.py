@@ -1,0 +1,66 @@
+"""What a renderer has to do: render Gaussians, and freeze a scene for one camera."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Protocol, runtime_checkable
+
+from jaxtyping import Float
+from torch import Tensor
+
+from gscompleter.types import Camera, Gaussians, Render
+
+OpacityRender = Callable[[Float[Tensor, "n"]], Render]
+"""Renders a frozen scene with Gaussians that vary in opacity [n] only."""
+DepthRender = OpacityRender
+"""Renders a frozen scene with Gaussians that vary in z-depth [n] only."""
+
+ColorSums = tuple[Float[Tensor, "n 3"], Float[Tensor, "n"]]
+"""Per Gaussian: compositing weight times an image [h, w, 3], and weight, summed over pixels."""
+
+ColorErrors = Callable[[Float[Tensor, "n 3"], Float[Tensor, "h w 3"]], ColorSums]
+"""Backprojects the residual of a photograph [h, w, 3], at given colours [n, 3]."""
+
+
+@runtime_checkable
+class FrozenScene(Protocol):
+    """A scene prepared for one camera: whatever depends on these two alone is computed once."""
+
+    @property
+    def render(self) -> Render:
+        """The render of the scene alone."""
+
+    def extend(self, new: Gaussians) -> FrozenScene:
+        """Add `new` to the frozen scene, after its Gaussians."""
+
+    def backproject(self, image: Float[Tensor, "h w 3"]) -> Float[Tensor, "n 3"]:
+        """Sum `image` over the compositing weights of each Gaussian: Σ_p w_ip image_p."""
+
+    def splat(self, values: Float[Tensor, "n"]) -> Float[Tensor, "h w"]:
+        """Splat a value >= 0 per Gaussian: Σ_i w_ip value_i."""
+
+    def composite(self, new: Gaussians) -> Render:
+        """Render the scene with `new`; differentiable in `new`."""
+
+    def vary_opacities(self, new: Gaussians) -> OpacityRender:
+        """Fix all of `new` but the opacities; the result is differentiable."""
+
+    def vary_colors(self, new: Gaussians) -> ColorErrors:
+        """Fix all of `new` but its colours, which the camera sees as given, from 0 up."""
+
+    def vary_depths(self, new: Gaussians) -> DepthRender:
+        """Fix all of `new` but its z-depths.
+
+        Gaussians move along the camera's rays with constant footprint. The depth is differentiable.
+        """
+
+
+@runtime_checkable
+class Renderer(Protocol):
+    """Renders Gaussians; differentiable in means, quats, scales, opacities and sh."""
+
+    def render(self, gaussians: Gaussians, camera: Camera) -> Render:
+        """Render `gaussians` from `camera`."""
+
+    def freeze(self, context: Gaussians, camera: Camera) -> FrozenScene:
+        """Prepare `context` for many renders from `camera`."""

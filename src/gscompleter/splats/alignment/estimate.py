@@ -1,0 +1,197 @@
+"""Estimates the similarity from the photographs' frame to the splat's frame."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterable, Sequence
+from contextlib import suppress
+from dataclasses import dataclass, replace
+from itertools import chain
+from typing import Literal
+
+import numpy as np
+import torch
+
+from gscompleter.data.photographs import Photographs
+from gscompleter.reconstructors.features.depth_range import estimate_depth_range
+from gscompleter.render.lod import build_proxy, thin_gaussians
+from gscompleter.render.protocols import Renderer
+from gscompleter.splats.alignment.fit import SplatFit, score_splat
+from gscompleter.splats.alignment.matching import (
+    extract_view_features,
+    refine_similarity,
+    search_similarities,
+)
+from gscompleter.splats.alignment.similarity import Matrix, transform_camera, transform_view
+from gscompleter.splats.alignment.trainer_frames import (
+    InputSplat,
+    Points,
+    Poses,
+    collect_poses,
+    compute_trainer_frames,
+    read_trainer_frames,
+)
+from gscompleter.system.errors import InputError
+from gscompleter.types import Gaussians, View
+
+NUM_SAMPLE_VIEWS = 8
+LONG_SIDE = 320
+"""Longer side of the samples in pixels: enough for features and for a blur of one pixel."""
+MIN_IMPROVEMENT = 2.0
+"""Gain in dB by which a frame must fit better than a simpler one; blur alone can cause 1 dB."""
+DRIFT_WARNING = 2.0
+"""Displacement in pixels of the small photographs from which the user is warned."""
+
+AlignmentMethod = Literal["given", "cameras", "dataparser", "normalised", "similarity"]
+FRAMES: dict[AlignmentMethod, str] = {
+    "given": "as it is",
+    "cameras": "in the frame of its trainer's camera list",
+    "dataparser": "in the frame of dataparser_transforms.json",
+    "normalised": "in the frame that its trainer normalised to",
+    "similarity": "in a frame found by matching image features",
+}
+FrameProposal = tuple[AlignmentMethod, Matrix]
+"""A transform from the photographs' frame to the splat's, and its source."""
+
+
+@dataclass(frozen=True)
+class SplatAlignment:
+    """The frame of a splat relative to its photographs."""
+
+    method: AlignmentMethod
+    transform: Matrix
+    """From the frame of the photographs to that of the splat."""
+    fit: SplatFit
+    given_fit: SplatFit
+    """Fit under the identity."""
+    side: int = LONG_SIDE
+    """Longer side of the largest image in which it was measured, in pixels."""
+
+    def describe(self) -> str:
+        """Describe the alignment in a sentence."""
+        told = (
+            f"The splat {FRAMES[self.method]} fits the photographs at {self.fit.psnr:.1f} dB in "
+            f"images of {self.side} px"
+        )
+        if self.method != "given":
+            told += f" ({self.given_fit.psnr:.1f} dB as given)"
+        if DRIFT_WARNING < self.fit.drift < math.inf:
+            told += f"; details are off by {self.fit.drift:.1f} px in them"
+        return f"{told}."
+
+
+@dataclass(frozen=True)
+class AlignmentData:
+    """The splat and the photographs that it is aligned with."""
+
+    scene: Gaussians
+    """The splat. Large ones are in spatial order, so that neighbours are adjacent."""
+    views: Sequence[View]
+    renderer: Renderer
+
+    def restrict_to(self, transform: Matrix) -> AlignmentData:
+        """Simplify the splat to what the cameras see under `transform`, photographs to splat."""
+        cameras = [transform_camera(view.camera, transform) for view in self.views]
+        return replace(self, scene=thin_gaussians(build_proxy(self.scene, cameras).rendered))
+
+    def score_transform(self, transform: Matrix) -> SplatFit:
+        """Score a transform from the photographs' frame to the splat's."""
+        views = [transform_view(view, transform) for view in self.views]
+        return score_splat(self.restrict_to(transform).scene, views, self.renderer)
+
+
+def align_splat(
+    splat: InputSplat, photographs: Photographs, frames: Sequence[int], renderer: Renderer
+) -> SplatAlignment:
+    """Estimate the transform from photographs (`frames` among them) to splat, at their origins."""
+    views = [view.to(splat.scene.means.device) for view in sample_views(photographs, frames)]
+    points = photographs.points()
+    return estimate_alignment(
+        AlignmentData(splat.scene, views, renderer),
+        np.stack([pose for _, pose in collect_poses(photographs)]),
+        None if points is None else points.double().numpy(),
+        read_trainer_frames(splat, photographs),
+    )
+
+
+def sample_views(photographs: Photographs, frames: Sequence[int]) -> list[View]:
+    """Load the first of `frames` and, spread over all, further photographs that can be read."""
+    named = list(frames)[: NUM_SAMPLE_VIEWS // 2]
+    spread = np.linspace(0, len(photographs) - 1, NUM_SAMPLE_VIEWS).round().astype(int).tolist()
+    others = [frame for frame in dict.fromkeys(spread) if frame not in named]
+    views = photographs.views(named, LONG_SIDE)
+    for frame in others[: NUM_SAMPLE_VIEWS - len(views)]:
+        with suppress(InputError):
+            views += photographs.views([frame], LONG_SIDE)
+    return views
+
+
+def estimate_alignment(
+    data: AlignmentData,
+    poses: Poses,
+    points: Points | None = None,
+    trainer_frames: Iterable[FrameProposal] = (),
+) -> SplatAlignment:
+    """Estimate the frame of the splat by how well it fits its photographs.
+
+    Frames are tried from the simplest on, up to the first that is exact. One that fits is replaced
+    only by one that fits better by `MIN_IMPROVEMENT`. `poses` are camera-to-world of all
+    photographs, `points` sparse points in their frame.
+    """
+    given = data.score_transform(np.eye(4))
+    side = max(max(view.camera.width, view.camera.height) for view in data.views)
+    best = SplatAlignment("given", np.eye(4), given, given, side)
+    if not given.is_match:
+        computed = compute_trainer_frames(poses, points)
+        normalised: Iterable[FrameProposal] = (("normalised", frame) for frame in computed)
+        for method, transform in chain(trainer_frames, normalised):
+            fit = data.score_transform(transform)
+            if is_better(fit, best.fit):
+                best = replace(best, method=method, transform=transform, fit=fit)
+            if best.fit.is_exact:
+                break
+    best = best if best.fit.is_exact else align_by_features(data, best, points)
+    if not best.fit.is_match:
+        raise InputError(
+            f"The splat does not show what the photographs show: at their cameras it covers "
+            f"{100 * given.coverage:.0f} % of the pixels and matches them at {given.psnr:.1f} dB; "
+            "give the photographs and poses that it was trained on."
+        )
+    return best
+
+
+def is_better(fit: SplatFit, than: SplatFit) -> bool:
+    """Return True if a fit is a match and clearly better, with at least half of the coverage."""
+    if not fit.is_match or not than.is_match:
+        return fit.is_match
+    return fit.coverage >= 0.5 * than.coverage and fit.margin > than.margin + MIN_IMPROVEMENT
+
+
+def align_by_features(
+    data: AlignmentData, best: SplatAlignment, points: Points | None
+) -> SplatAlignment:
+    """Improve an alignment by image features; without a match, search from all directions."""
+    photographs = [(view.camera, extract_view_features(view)) for view in data.views]
+    if best.fit.is_match:
+        starts: Iterable[Matrix] = [best.transform]
+    else:
+        place = estimate_points(data.views) if points is None else points
+        scene = thin_gaussians(data.scene)
+        starts = search_similarities(scene, photographs, place, data.renderer)
+    for start in starts:
+        scene = data.restrict_to(start).scene
+        transform = refine_similarity(scene, photographs, start, data.renderer)
+        fit = best.fit if transform is None else data.score_transform(transform)
+        if transform is not None and is_better(fit, best.fit):
+            return replace(best, method="similarity", transform=transform, fit=fit)
+    return best
+
+
+def estimate_points(views: Sequence[View]) -> Points:
+    """Estimate scene points without a sparse cloud: a grid at the median depth of each view."""
+    near, far = estimate_depth_range(views)
+    depth = float(np.sqrt(near * far))
+    rays = [view.camera.z_rays()[::16, ::16].reshape(-1, 3) for view in views]
+    pairs = zip(views, rays, strict=True)
+    points = torch.cat([view.camera.center + depth * ray for view, ray in pairs])
+    return points.double().cpu().numpy()

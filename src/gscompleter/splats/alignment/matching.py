@@ -1,0 +1,210 @@
+"""Finds a similarity by features: photographs are matched with renders of the splat.
+
+It is rendered from all directions until some match; renders at their cameras refine the result.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+import torch
+from jaxtyping import Float
+
+from gscompleter.config.settings import COVERED
+from gscompleter.numerics.geometry import unproject
+from gscompleter.reconstructors.features.matches import Features, detect_features, match_features
+from gscompleter.reconstructors.features.stereo_image import StereoImage
+from gscompleter.render.protocols import Renderer
+from gscompleter.render.view_map import get_view_map
+from gscompleter.splats.alignment.fit import render_from
+from gscompleter.splats.alignment.similarity import (
+    Matrix,
+    fit_pose_similarity,
+    get_pose,
+    has_baseline,
+    make_similarity,
+    transform_camera,
+)
+from gscompleter.splats.alignment.trainer_frames import Points, align_directions
+from gscompleter.types import Camera, Gaussians, View
+
+MIN_INLIERS = 15
+"""Fewest matches that must agree with a pose."""
+MAX_REPROJECTION_ERROR = 3.0
+"""Largest reprojection error of an inlier, in pixels."""
+NUM_DIRECTIONS = 40
+"""Directions around the splat, about 30° apart; features tolerate half of that and any roll."""
+SCALE_FACTORS = (1.0, 0.6, 1.7)
+"""Trial factors on the size of the splat, which far Gaussians and floaters blur."""
+NUM_ROUNDS = 2
+"""Iterations of the refinement, each with renders at the cameras of the previous one."""
+
+PhotoFeatures = tuple[Camera, Features]
+"""A photograph's camera and features."""
+RenderedFeatures = tuple[Features, Float[np.ndarray, "h w 3"]]
+"""Features of a render, and the visible point of the splat at each pixel, or NaN."""
+
+
+@dataclass(frozen=True)
+class LocatedPhoto:
+    """A photograph whose pose in the splat was found."""
+
+    camera: Camera
+    """In the photographs' frame."""
+    pose: Matrix
+    """Camera-to-world in the splat's frame."""
+    points: Float[np.ndarray, "m 3"]
+    """Inliers, in the splat's frame."""
+    pixels: Float[np.ndarray, "m 2"]
+
+
+def search_similarities(
+    scene: Gaussians, photographs: Sequence[PhotoFeatures], points: Points, renderer: Renderer
+) -> Iterator[Matrix]:
+    """Yield similarities from photographs to splat by which some photographs match."""
+    seer = photographs[len(photographs) // 2][0]
+    if len(scene) == 0 or not has_baseline([get_pose(camera) for camera, _ in photographs]):
+        return
+    solid = scene.means[scene.opacities >= scene.opacities.median()].detach().cpu().double().numpy()
+    for transform in generate_starts(get_pose(seer), points, solid):
+        rendered = render_features(scene, transform_camera(seer, transform), renderer)
+        answer = fit_similarity([locate_photo(rendered, photograph) for photograph in photographs])
+        if answer is not None:
+            yield answer
+
+
+def generate_starts(
+    pose: Matrix, points: Points, solid: Float[np.ndarray, "n 3"]
+) -> Iterator[Matrix]:
+    """Yield similarities that map `points` to `solid`, from all directions."""
+    (center, radius), (new_center, new_radius) = map(compute_center_radius, (points, solid))
+    if new_radius == 0:  # most of it is one point: all directions are alike
+        return
+    for zoom in SCALE_FACTORS:
+        scale = zoom * new_radius / max(radius, 1e-12)
+        for direction in sample_directions(NUM_DIRECTIONS):
+            turn = align_directions(pose[:3, 2], direction)
+            yield make_similarity(scale, turn, new_center - scale * turn @ center)
+
+
+def compute_center_radius(points: Points) -> tuple[Float[np.ndarray, "3"], float]:
+    """Compute centre and radius of points as medians, which ignore floaters."""
+    center = np.median(points, axis=0)
+    return center, float(np.median(np.linalg.norm(points - center, axis=1)))
+
+
+def sample_directions(count: int) -> Float[np.ndarray, "n 3"]:
+    """Sample unit vectors on a golden spiral over the sphere."""
+    z = 1 - (2 * np.arange(count) + 1) / count
+    angle = np.pi * (1 + np.sqrt(5)) * np.arange(count)
+    ring = np.sqrt(1 - z * z)
+    return np.stack([ring * np.cos(angle), ring * np.sin(angle), z], axis=1)
+
+
+def refine_similarity(
+    scene: Gaussians, photographs: Sequence[PhotoFeatures], start: Matrix, renderer: Renderer
+) -> Matrix | None:
+    """Refine a similarity (photographs to splat) by features; None if too few match."""
+
+    def locate(photograph: PhotoFeatures, camera: Camera) -> LocatedPhoto | None:
+        return locate_photo(render_features(scene, camera, renderer), photograph)
+
+    transform: Matrix | None = start
+    for _ in range(NUM_ROUNDS):
+        if transform is not None:
+            cameras = [transform_camera(camera, transform) for camera, _ in photographs]
+            found = list(get_view_map(scene.means)(locate, photographs, cameras))
+            transform = fit_similarity(found)
+    return transform
+
+
+def fit_similarity(photos: Sequence[LocatedPhoto | None]) -> Matrix | None:
+    """Fit photographs' frame to splat's frame by located photographs; None if too few."""
+    found = [photo for photo in photos if photo is not None]
+    before = [get_pose(photo.camera) for photo in found]
+    if not has_baseline(before):
+        return None
+    start = fit_pose_similarity(before, [photo.pose for photo in found])
+    return minimize_reprojection(found, start) if np.linalg.det(start[:3, :3]) > 0 else None
+
+
+def minimize_reprojection(found: Sequence[LocatedPhoto], start: Matrix) -> Matrix:
+    """Minimize the robust reprojection error over similarities.
+
+    The seven unknowns move the splat's points in the photographs' frame: logarithm of the scale,
+    rotation vector, and shift in units of the points' spread.
+    """
+    # Imported here, because it takes half a second and few splats need it.
+    from scipy.optimize import least_squares
+
+    back = np.linalg.inv(start)
+    points = [photo.points @ back[:3, :3].T + back[:3, 3] for photo in found]
+    center = np.median(np.concatenate(points), axis=0)
+    unit = float(np.median(np.linalg.norm(np.concatenate(points) - center, axis=1)))
+
+    def change(unknowns: Float[np.ndarray, "7"]) -> Matrix:
+        turn = np.exp(unknowns[0]) * cv2.Rodrigues(unknowns[1:4])[0]
+        return make_similarity(1.0, turn, center + unit * unknowns[4:] - turn @ center)
+
+    def errors(unknowns: Float[np.ndarray, "7"]) -> Float[np.ndarray, "m"]:
+        moved = change(unknowns)
+        pairs = zip(found, points, strict=True)
+        return np.concatenate(
+            [_compute_residuals(p @ moved[:3, :3].T + moved[:3, 3], f) for f, p in pairs]
+        )
+
+    answer = least_squares(errors, np.zeros(7), loss="cauchy", f_scale=0.3 * MAX_REPROJECTION_ERROR)
+    return start @ np.linalg.inv(change(answer.x))
+
+
+def _compute_residuals(
+    points: Float[np.ndarray, "m 3"], photo: LocatedPhoto
+) -> Float[np.ndarray, "k"]:
+    """Compute the reprojection errors along x and y, in pixels."""
+    pose = get_pose(photo.camera)
+    local = (points - pose[:3, 3]) @ pose[:3, :3]
+    homogeneous = local @ photo.camera.K.detach().cpu().double().numpy().T
+    ahead = np.maximum(homogeneous[:, 2:], 1e-9 * np.abs(homogeneous).max())
+    return np.clip(homogeneous[:, :2] / ahead - photo.pixels, -1e4, 1e4).ravel()
+
+
+def extract_view_features(view: View) -> Features:
+    """Extract the features of one view."""
+    pose = get_pose(view.camera)
+    pixels = np.ascontiguousarray(view.image.detach().cpu().clamp(0, 1).float().numpy())
+    K = view.camera.K.detach().cpu().double().numpy()
+    unknown = np.zeros(pixels.shape[:2], np.float32)
+    ignored = None if view.ignore_mask is None else view.ignore_mask.cpu().numpy()
+    return detect_features(StereoImage(pixels, K, pose[:3, :3], pose[:3, 3], unknown, ignored))
+
+
+def render_features(scene: Gaussians, camera: Camera, renderer: Renderer) -> RenderedFeatures:
+    """Extract the features of what `camera` sees of the splat."""
+    render = render_from(scene, camera, renderer)
+    surface = unproject(render.depth, camera).where((render.alpha >= COVERED)[..., None], torch.nan)
+    features = extract_view_features(View(render.image, camera))
+    return features, surface.detach().cpu().double().numpy()
+
+
+def locate_photo(rendered: RenderedFeatures, photograph: PhotoFeatures) -> LocatedPhoto | None:
+    """Estimate a photograph's pose by PnP against a render; None with too few inliers."""
+    (features, surface), (camera, own_features) = rendered, photograph
+    places, pixels = match_features(features, own_features)
+    columns, rows = np.floor(places).astype(int).T
+    points = surface[rows.clip(0, len(surface) - 1), columns.clip(0, surface.shape[1] - 1)]
+    known = np.isfinite(points).all(axis=1)
+    points, pixels = points[known], pixels[known]
+    if len(points) < MIN_INLIERS:
+        return None
+    K = camera.K.detach().cpu().double().numpy()
+    answer = cv2.solvePnPRansac(
+        points, pixels, K, None, iterationsCount=300, reprojectionError=MAX_REPROJECTION_ERROR
+    )
+    if not answer[0] or answer[3] is None or len(answer[3]) < MIN_INLIERS:
+        return None
+    viewmat, chosen = np.eye(4), answer[3].ravel()
+    viewmat[:3, :3], viewmat[:3, 3] = cv2.Rodrigues(answer[1])[0], answer[2].ravel()
+    return LocatedPhoto(camera, np.linalg.inv(viewmat), points[chosen], pixels[chosen])

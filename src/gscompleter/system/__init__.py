@@ -1,0 +1,1 @@
+"""What every part stands on: errors, progress, threads, memory, timing, files, jobs, plug-ins."""

@@ -1,0 +1,265 @@
+"""Conversion between image files and tensors."""
+
+from __future__ import annotations
+
+import io
+from collections.abc import Iterator
+from contextlib import contextmanager, suppress
+from importlib.util import find_spec
+from pathlib import Path
+
+import numpy as np
+import torch
+from jaxtyping import Bool, Float, Shaped, UInt8
+from PIL import Image, features
+from torch import Tensor
+
+from gscompleter.system.errors import InputError, quote_value, refuse_pointer
+from gscompleter.system.files.reading import check_file, read_head
+from gscompleter.system.files.writing import replace_file
+
+IMAGE_FORMATS = ("PNG", "JPEG", "TIFF", "WEBP", "BMP", "PPM", "GIF", "JPEG2000")
+"""Image formats that are read. Others in Pillow run programs or are no photographs."""
+HEIF_BRANDS = (b"heic", b"heix", b"heim", b"heis", b"hevc", b"hevx", b"mif1", b"msf1")
+AVIF_BRANDS = (b"avif", b"avis")
+"""Brands in the first box of a file, by which HEIC of phones and AVIF are known. `mif1` and `msf1`
+are the general container, which either may name first."""
+
+MAX_PIXELS = 178_956_970
+"""Largest number of pixels of an image, as in Pillow."""
+
+PNG_COMPRESSION = 3
+"""zlib level of written PNGs: 6 % more bytes than level 6, in a third of its time."""
+
+HEIC_TO_JPEG = "sips -s format jpeg *.HEIC --out jpeg"
+"""Command of macOS that exports the photographs of a folder."""
+
+ORIENTATION = 0x0112
+"""EXIF tag of the orientation; 1 is upright."""
+QUARTER_TURNS = (5, 6, 7, 8)
+"""Orientations that swap width and height."""
+
+HALF_OPAQUE = 128
+"""Smallest alpha, of 255, of a pixel that counts as opaque."""
+ALPHA_MODES = ("RGBA", "LA", "PA", "RGBa", "La")
+
+
+def read_image(path: Path | str) -> Float[Tensor, "h w 3"]:
+    """Read an image in [0, 1]; transparent parts are composited over black."""
+    return convert_to_image(read_pixels(path))
+
+
+def write_image(
+    path: Path | str, image: Float[Tensor, "h w 3"] | Float[Tensor, "h w"] | Bool[Tensor, "h w"]
+) -> None:
+    """Write colours, or a grey image or mask, as an 8-bit PNG."""
+    with replace_file(path) as file:
+        Image.fromarray(convert_to_pixels(image)).save(
+            file, format="PNG", compress_level=PNG_COMPRESSION
+        )
+
+
+def convert_to_pixels(
+    image: Float[Tensor, "h w 3"] | Float[Tensor, "h w"] | Bool[Tensor, "h w"],
+) -> UInt8[np.ndarray, "h w 3"] | UInt8[np.ndarray, "h w"]:
+    """Convert values in [0, 1] to 8 bits: clamped, rounded to the nearest, NaN as 0."""
+    values = image.detach().cpu().double().nan_to_num(nan=0.0).clamp(0, 1)
+    return (values * 255 + 0.5).floor().to(torch.uint8).numpy()
+
+
+def convert_to_image(pixels: UInt8[np.ndarray, "h w 3"]) -> Float[Tensor, "h w 3"]:
+    """Convert 8-bit pixels to colours in [0, 1]."""
+    return torch.from_numpy(pixels.astype(np.float32) / 255)
+
+
+def read_image_size(stored: Path | bytes, name: str = "") -> tuple[int, int]:
+    """Read width and height of an image file, or of its bytes; `name` is for errors."""
+    with open_image(stored, name) as image:
+        return image.size
+
+
+def read_orientation(stored: Path | bytes) -> int:
+    """Read the EXIF orientation of a photograph; 1, which is upright, without one."""
+    with suppress(InputError), open_image(stored) as image:
+        orientation = image.getexif().get(ORIENTATION, 1)
+        return orientation if orientation in range(1, 9) else 1
+    return 1  # reading the photograph reports the error
+
+
+def turn_upright(
+    pixels: Shaped[np.ndarray, "h w *c"], orientation: int
+) -> Shaped[np.ndarray, "h2 w2 *c"]:
+    """Turn and mirror stored pixels as their EXIF orientation asks."""
+    if orientation in QUARTER_TURNS:
+        pixels = pixels.swapaxes(0, 1)
+    if orientation in (3, 4, 7, 8):
+        pixels = pixels[::-1]
+    if orientation in (2, 3, 6, 7):
+        pixels = pixels[:, ::-1]
+    return np.ascontiguousarray(pixels)
+
+
+def has_alpha(path: Path) -> bool:
+    """Return True if an image file has an alpha channel or a transparent colour."""
+    with suppress(InputError), open_image(path) as image:
+        return _has_alpha(image)
+    return False  # reading the photograph reports the error
+
+
+def read_colors_and_alpha(
+    stored: Path | bytes, name: str = ""
+) -> tuple[UInt8[np.ndarray, "h w 3"], UInt8[np.ndarray, "h w"] | None]:
+    """Read the colours of an image as they are below its alpha, and the alpha if it has one."""
+    with open_image(stored, name) as image:
+        if not _has_alpha(image):
+            return _read_over_black(image), None
+        rgba = np.array(image.convert("RGBA"))
+    return np.ascontiguousarray(rgba[..., :3]), rgba[..., 3]
+
+
+def read_mask(path: Path) -> Bool[np.ndarray, "h w"]:
+    """Read the black or transparent pixels of a mask: those below half of its largest value.
+
+    So a mask of 0 and 1 means the same as one of 0 and 255, and soft or JPEG edges end halfway. A
+    mask without any white is black everywhere.
+    """
+    with open_image(path) as image:
+        # 16 bits are not reduced to 8, where 1 would become 0.
+        if image.mode == "F" or image.mode == "I" or image.mode.startswith("I;16"):
+            values = np.array(image).astype(np.float64)
+        else:
+            values = _read_over_black(image).max(axis=-1).astype(np.float64)
+    return ~(values > values.max() / 2)
+
+
+def read_pixels(stored: Path | str | bytes, name: str = "") -> UInt8[np.ndarray, "h w 3"]:
+    """Read an image in 8-bit colours, over black; 16-bit images are reduced.
+
+    Orientation tags are ignored, because poses and intrinsics belong to the stored pixels.
+    """
+    with open_image(stored, name) as image:
+        return _read_over_black(image)
+
+
+def read_brightness(stored: Path | bytes, side: int) -> Float[np.ndarray, "h w"]:
+    """Read the brightness (0 to 255) of an image shrunk to a longer side of `side` pixels."""
+    with open_image(stored) as image:
+        scale = min(1.0, side / max(image.size))
+        size = max(round(image.width * scale), 1), max(round(image.height * scale), 1)
+        image.draft("L", size)
+        pixels = _read_over_black(image)
+    grey = Image.fromarray(pixels).convert("L")
+    return np.array(grey.resize(size, Image.Resampling.BOX), np.float32)
+
+
+def read_depth(path: Path, unit: float) -> Float[np.ndarray, "h w"]:
+    """Read z-depth from a 16-bit PNG or a `.npy` file, times `unit`; 0 where unknown."""
+    if path.suffix == ".npy":
+        values = _read_array(path)
+    else:
+        with open_image(path) as image:
+            values = np.array(image)
+    values = values[..., 0] if values.ndim == 3 and values.shape[-1] == 1 else values
+    if values.ndim != 2 or values.dtype.kind not in "uif" or values.dtype == np.uint8:
+        raise InputError(
+            f"{quote_value(path)} is no depth map: a 16-bit grey PNG or an array [h, w] of numbers "
+            f"is needed, and it holds {values.dtype} of shape {quote_value(list(values.shape))}."
+        )
+    with np.errstate(over="ignore", invalid="ignore"):
+        depth = (values.astype(np.float64) * unit).astype(np.float32)
+    return np.where(np.isfinite(depth) & (depth > 0), depth, np.float32(0))
+
+
+def _read_array(path: Path) -> np.ndarray:
+    check_file(path)
+    try:
+        # A memory map cannot exceed the file, whatever size its header claims.
+        values = np.lib.format.open_memmap(path, mode="r")
+        if not 0 < values.size <= MAX_PIXELS:
+            raise ValueError(f"it claims {values.size:,} values")
+    except Exception as error:  # damaged files raise any kind
+        raise InputError(
+            f"The depth map {quote_value(path)} cannot be read ({quote_value(str(error))}); copy "
+            "it again."
+        ) from error
+    return values
+
+
+@contextmanager
+def open_image(stored: Path | str | bytes, name: str = "") -> Iterator[Image.Image]:
+    """Open an image file, or its bytes; any failure while it is read becomes an InputError."""
+    file = io.BytesIO(stored) if isinstance(stored, bytes) else Path(stored)
+    shown = quote_value(name) if isinstance(file, io.BytesIO) else f"The image {quote_value(file)}"
+    if isinstance(file, Path):
+        check_file(file)
+        refuse_pointer(file)
+    head = stored[:64] if isinstance(stored, bytes) else read_head(Path(stored), 64)
+    formats = _choose_formats(head, shown)
+    Image.preinit()  # usual formats only; Pillow would load all of them
+    try:
+        with Image.open(file, formats=formats) as image:
+            yield image
+    except Exception as error:  # damaged files raise any kind
+        raise InputError(
+            f"{shown} is not an image that can be read ({quote_value(str(error), 120)}); copy it "
+            "again."
+        ) from error
+
+
+def _choose_formats(head: bytes, shown: str) -> tuple[str, ...]:
+    """Choose the formats to try by the first bytes; refuse HEIC and AVIF that cannot be decoded.
+
+    Pillow reads AVIF where it was built with it, and HEIC with pillow-heif.
+    """
+    brands = [head[start : start + 4] for start in (8, *range(16, len(head), 4))]
+    if head[4:8] != b"ftyp":
+        return IMAGE_FORMATS
+    if any(brand in AVIF_BRANDS for brand in brands):
+        if features.check("avif"):
+            return ("AVIF",)
+        raise InputError(
+            f"{shown} is AVIF, which this Pillow does not read; run pip install -U pillow, or "
+            "export JPEG."
+        )
+    if any(brand in HEIF_BRANDS for brand in brands):
+        if find_spec("pillow_heif") is None:
+            raise InputError(
+                f"{shown} is HEIC, which is read with pillow-heif; run pip install "
+                f"'gscompleter[heic]', or export JPEG (on a Mac: {HEIC_TO_JPEG})."
+            )
+        import pillow_heif
+
+        pillow_heif.register_heif_opener()
+        return ("HEIF",)
+    return IMAGE_FORMATS
+
+
+def _has_alpha(image: Image.Image) -> bool:
+    return image.mode in ALPHA_MODES or "transparency" in image.info
+
+
+def _read_over_black(image: Image.Image) -> UInt8[np.ndarray, "h w 3"]:
+    if image.mode == "F":
+        raise ValueError("it holds floating-point values, not colours")
+    if image.mode == "I" or image.mode.startswith("I;16"):
+        grey = np.array(image).astype(np.float64) / 257
+        return np.repeat((grey + 0.5).clip(0, 255).astype(np.uint8)[..., None], 3, axis=-1)
+    if _has_alpha(image):
+        rgba = np.array(image.convert("RGBA"))
+        return composite_over_black(rgba[..., :3], rgba[..., 3])
+    return np.array(image.convert("RGB"))
+
+
+def composite_over_black(
+    colors: UInt8[np.ndarray, "h w 3"], alpha: UInt8[np.ndarray, "h w"]
+) -> UInt8[np.ndarray, "h w 3"]:
+    """Composite colours over black."""
+    weighted = colors.astype(np.uint16) * alpha[..., None]
+    return ((weighted + 127) // 255).astype(np.uint8)
+
+
+def encode_jpeg(image: Image.Image, quality: int) -> bytes:
+    """Encode an image as JPEG, with a quality from 1 to 95."""
+    file = io.BytesIO()
+    image.save(file, format="JPEG", quality=quality)
+    return file.getvalue()

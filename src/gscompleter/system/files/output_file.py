@@ -1,0 +1,52 @@
+"""Output files of a command, each of which the user names."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Iterator
+from contextlib import contextmanager, suppress
+from pathlib import Path
+
+from gscompleter.system.errors import InputError, quote_value
+from gscompleter.system.files.unfinished import (
+    list_unfinished,
+    make_unfinished_name,
+    remove_left_behind,
+)
+from gscompleter.system.files.writing import convert_write_errors, refuse_special_file
+
+
+@contextmanager
+def reserve_file(path: Path, overwrite: bool) -> Iterator[None]:
+    """Reserve a file for the result of this process during the block, by trying to write there.
+
+    Raise an InputError if it exists and `overwrite` is not set, if it is a device or a pipe, or if
+    another run is writing it.
+    """
+    target = Path(os.path.realpath(path))
+    mark = target.with_name(make_unfinished_name(target.name))
+    with convert_write_errors(path):
+        check_free(path, overwrite)
+        refuse_special_file(target)
+        mark.touch(exist_ok=False)
+    try:
+        entries = list_unfinished(target.parent, target.name)
+        rival = next((e for e in entries if not e.is_own() and e.is_running()), None)
+        if rival is not None:
+            raise InputError(
+                f"Another run (process {rival.pid}) is writing {quote_value(path)}; wait for its "
+                "end, or name another file."
+            )
+        remove_left_behind(target.parent, target.name)
+        yield
+    finally:
+        with suppress(OSError):
+            mark.unlink()
+
+
+def check_free(path: Path, overwrite: bool) -> None:
+    """Refuse to replace a file unless `overwrite` is set."""
+    if os.path.lexists(os.path.realpath(path)) and not overwrite:
+        raise InputError(
+            f"{quote_value(path)} exists; name another file, or overwrite it.", "overwrite"
+        )

@@ -1,0 +1,425 @@
+"""Output folders: written completely or left as they were, and replaced file by file.
+
+`summary.json` of an output folder lists under `files` what its run wrote. `--overwrite` replaces
+these files and no others: whatever else lies in the folder stays, and a file in the way of a result
+is refused.
+"""
+
+from __future__ import annotations
+
+import errno
+import json
+import os
+import random
+import shutil
+import stat
+import time
+from collections.abc import Iterable, Iterator, Sequence
+from contextlib import ExitStack, contextmanager, suppress
+from dataclasses import dataclass
+from pathlib import Path, PurePosixPath
+
+from gscompleter.system.errors import InputError, join_names, quote_value
+from gscompleter.system.files.unfinished import (
+    REPLACED_SUFFIX,
+    UNFINISHED_PREFIX,
+    Unfinished,
+    give_signs,
+    list_unfinished,
+    make_unfinished_name,
+    remove_left_behind,
+)
+from gscompleter.system.files.writing import SUMMARY_FILE, convert_write_errors, defer_interrupts
+
+FILES, COMMAND = "files", "command"
+"""Entries of `summary.json`: the files of the run, and the command that wrote them."""
+POSES = "colmap"
+"""Folder of the cameras that a completion found for its photographs; it has its own summary."""
+
+MAX_SUMMARY_BYTES = 10**9
+MAX_NAMED = 5
+"""Most foreign files that a sentence names."""
+ATTEMPTS, MAX_WAIT_SECONDS = 4, 0.2
+"""Attempts of two runs that reserve a folder at the same moment, and the time between them."""
+
+_DISK_ERRORS = {errno.ENOSPC, errno.EDQUOT, errno.EFBIG, errno.EROFS}
+
+
+@dataclass
+class OutputFolder:
+    """An output folder that no other run may write to meanwhile."""
+
+    path: Path
+    """The folder, as the user names it."""
+    command: str
+    draft: Path
+    """Folder for results that are not complete."""
+    others: Sequence[str]
+    """Files and folders in it that no run of ours wrote. They stay."""
+
+    @contextmanager
+    def write(self) -> Iterator[Path]:
+        """Open a folder whose content replaces that of an earlier run at the end.
+
+        A new output folder is made by one rename. In an existing one the files of the earlier run
+        make way for the new ones, the summary leaves first and arrives last. After any exception
+        everything is as it was.
+        """
+        target = Path(os.path.realpath(self.path))
+        try:
+            with convert_write_errors(self.path, _DISK_ERRORS):
+                self.draft.mkdir(parents=True, exist_ok=True)
+                yield self.draft
+            state = f"{quote_value(self.path)} is complete"
+            with convert_write_errors(self.path), defer_interrupts(state):
+                _list_in_summary(self.draft, self.command)
+                _publish(self.draft, target)
+        except InputError as error:
+            # The temporary name means nothing to the user.
+            whole = str(error.args[0]).replace(str(self.draft), str(self.path))
+            raise type(error)(whole, error.argument) from error
+        finally:
+            # What was not published must not get among the results of a later call.
+            shutil.rmtree(self.draft, ignore_errors=True)
+
+    def describe_others(self) -> list[str]:
+        """Write the line on what stays in the folder; none if there is nothing else."""
+        if not self.others:
+            return []
+        names = join_names(self.others, MAX_NAMED)
+        return [f"Kept: {names} in {quote_value(self.path)}, which no run wrote."]
+
+
+@contextmanager
+def reserve_output(
+    path: Path | str,
+    overwrite: bool = False,
+    command: str = "",
+    patterns: Sequence[str] = (),
+    takes_over: bool = False,
+) -> Iterator[OutputFolder]:
+    """Reserve a folder for the results of this process, by trying to write to it.
+
+    Raise an InputError if it is not empty and `overwrite` is not set, if another run is writing it,
+    or if it has files that match `patterns` (globs of the results) and that no earlier run wrote.
+    `takes_over` is for a caller that knows that no other run is left.
+    """
+    given, target = Path(path), Path(os.path.realpath(path))
+    with ExitStack() as stack:
+        draft = stack.enter_context(_reserve(given, target, overwrite, takes_over))
+        _finish_interrupted(target)
+        remove_left_behind(target)
+        remove_left_behind(target.parent, target.name)
+        with convert_write_errors(given):
+            listed = read_listing(target)
+            _refuse_unlisted(given, target, [*patterns, *_match(target, patterns)], listed)
+            others = list(_list_others(target, listed))
+        stack.enter_context(give_signs(draft))
+        yield OutputFolder(given, command, draft, others)
+
+
+@contextmanager
+def open_output_folder(
+    path: Path | str, overwrite: bool = False, command: str = ""
+) -> Iterator[Path]:
+    """Reserve a folder, and open the one that becomes its content at the end."""
+    with reserve_output(path, overwrite, command) as output, output.write() as folder:
+        yield folder
+
+
+def check_output(path: Path | str, overwrite: bool = False) -> None:
+    """Raise an InputError if results cannot be written to this folder, by trying."""
+    with reserve_output(path, overwrite):
+        pass
+
+
+def read_listing(folder: Path) -> frozenset[str]:
+    """Read which files a run of ours wrote to a folder, as relative paths; empty if none did.
+
+    Names that lead out of the folder are left out, also through links.
+    """
+    path = folder / SUMMARY_FILE
+    try:
+        if not stat.S_ISREG(path.lstat().st_mode) or path.stat().st_size > MAX_SUMMARY_BYTES:
+            return frozenset()
+        content = json.loads(path.read_bytes())
+    except (OSError, ValueError, RecursionError):
+        return frozenset()
+    names = content.get(FILES) if isinstance(content, dict) else None
+    if not isinstance(names, list) or SUMMARY_FILE not in names:
+        return frozenset()
+    inside = [name for name in names if isinstance(name, str) and _is_inside(name)]
+    return frozenset(name for name in inside if _find_obstacle(folder, name) is None)
+
+
+def holds_results(folder: Path) -> bool:
+    """Return True if a run of ours wrote the folder."""
+    return bool(read_listing(folder))
+
+
+def read_command(folder: Path) -> str | None:
+    """Read which command wrote an output folder; None if it is unknown."""
+    if not holds_results(folder):
+        return None
+    command = json.loads((folder / SUMMARY_FILE).read_bytes()).get(COMMAND)
+    return command if isinstance(command, str) else None
+
+
+@contextmanager
+def _reserve(given: Path, target: Path, overwrite: bool, takes_over: bool) -> Iterator[Path]:
+    """Create the draft of a folder, in it or beside it, with missing parents.
+
+    Of two runs that begin at the same moment both see each other and give way; each tries again
+    after another time.
+    """
+    home = target if os.path.isdir(target) else target.parent
+    missing = [folder for folder in (home, *home.parents) if not os.path.exists(folder)]
+    draft = home / make_unfinished_name(target.name)
+    try:
+        for attempt in range(1, ATTEMPTS + 1):
+            with convert_write_errors(given):
+                _check_free(given, target, overwrite)
+                draft.mkdir(parents=True)
+            rival = None if takes_over else _find_rival(draft, target)
+            if rival is None:
+                break
+            draft.rmdir()
+            if attempt == ATTEMPTS:
+                raise InputError(_describe_rival(given, rival), "out")
+            time.sleep(random.uniform(0, MAX_WAIT_SECONDS))
+        yield draft
+    finally:
+        shutil.rmtree(draft, ignore_errors=True)
+        for folder in missing:
+            with suppress(OSError):
+                folder.rmdir()
+
+
+def _find_rival(draft: Path, target: Path) -> Unfinished | None:
+    """Find the draft of another run that writes the same folder."""
+    places = [*list_unfinished(target.parent, target.name), *list_unfinished(target, target.name)]
+    others = (entry for entry in places if entry.path != draft and not entry.is_own())
+    return next((entry for entry in others if entry.is_running()), None)
+
+
+def _describe_rival(given: Path, rival: Unfinished) -> str:
+    return (
+        f"Another run (process {rival.pid}) is writing {quote_value(given)}; wait for its end, or "
+        "name another folder."
+    )
+
+
+def _check_free(given: Path, target: Path, overwrite: bool) -> None:
+    """Raise an error if `target` is a file or contains something that must not be overwritten."""
+    names = list[str]()
+    with suppress(FileNotFoundError):
+        names = [n for n in os.listdir(target) if not n.startswith(UNFINISHED_PREFIX)]
+    if names == [POSES] and os.path.isfile(target / POSES / SUMMARY_FILE):
+        return  # only the cameras that an earlier run found
+    if names and not overwrite:
+        raise InputError(
+            f"The output folder {quote_value(given)} is not empty; name another one, or overwrite "
+            "the results in it.",
+            "overwrite",
+        )
+
+
+def _match(folder: Path, patterns: Iterable[str]) -> Iterator[str]:
+    """List the entries of a folder that match globs, as relative paths, but no folders."""
+    for pattern in patterns:
+        for path in sorted(folder.glob(pattern)):
+            if os.path.islink(path) or not os.path.isdir(path):
+                yield path.relative_to(folder).as_posix()
+
+
+def _refuse_unlisted(
+    given: Path, target: Path, names: Iterable[str], listed: frozenset[str]
+) -> None:
+    """Refuse to replace what no earlier run wrote, and what is no regular file."""
+    for name in names:
+        obstacle = _find_obstacle(target, name)
+        if obstacle is None and name not in listed and os.path.lexists(target / name):
+            obstacle = name
+        if obstacle is not None:
+            raise InputError(
+                f"{quote_value(given / obstacle)} is in the way of a result, and only files that "
+                f"an earlier run wrote (listed in {SUMMARY_FILE}) are replaced; move it, or name "
+                "another folder.",
+                "out",
+            )
+
+
+def _find_obstacle(folder: Path, name: str) -> str | None:
+    """Find what keeps a file from being written to `folder / name`; None if nothing does.
+
+    It is anything but a folder in the place of one, also a link to a folder elsewhere, or anything
+    but a file in the place of the file.
+    """
+    *parents, _ = parts = PurePosixPath(name).parts
+    for depth in range(1, len(parents) + 1):
+        inner = "/".join(parts[:depth])
+        try:
+            mode = os.lstat(folder / inner).st_mode
+        except OSError:
+            return None
+        if not stat.S_ISDIR(mode):
+            return inner
+    try:
+        mode = os.lstat(folder / name).st_mode
+    except OSError:
+        return None
+    # A link is replaced itself, and what it names is kept.
+    return None if stat.S_ISREG(mode) or stat.S_ISLNK(mode) else name
+
+
+def _is_inside(name: str) -> bool:
+    """Return True if a relative path leads to a file within its folder."""
+    path = PurePosixPath(name)
+    return (
+        name == str(path)
+        and not path.is_absolute()
+        and ".." not in path.parts
+        and "\\" not in name
+        and "\0" not in name
+        and path.parts != ()
+    )
+
+
+def _list_others(folder: Path, listed: frozenset[str]) -> Iterator[str]:
+    """List what no run wrote to a folder, and to those of its folders that have results.
+
+    Folders that are results of their own, such as the cameras of a completion, are left out.
+    """
+    homes = {"", *(str(PurePosixPath(name).parent) for name in listed if "/" in name)}
+    own = {*listed, *homes, *(str(p) for home in homes for p in PurePosixPath(home).parents)}
+    for home in sorted(homes):
+        with suppress(OSError):
+            for name in sorted(os.listdir(folder / home)):
+                relative = f"{home}/{name}" if home else name
+                is_known = relative in own or name.startswith(UNFINISHED_PREFIX)
+                if not is_known and not holds_results(folder / relative):
+                    yield relative
+
+
+def _list_files(folder: Path) -> list[str]:
+    """List the files below a folder as relative paths."""
+    return sorted(
+        Path(home, name).relative_to(folder).as_posix()
+        for home, _, names in os.walk(folder)
+        for name in names
+    )
+
+
+def _list_in_summary(draft: Path, command: str) -> None:
+    """Add the names of all files to the summary of a draft, or make one of them alone."""
+    path = draft / SUMMARY_FILE
+    content = json.loads(path.read_bytes()) if path.is_file() else {}
+    made = {COMMAND: command} if command else {}
+    files = sorted({SUMMARY_FILE, *_list_files(draft)})
+    whole = json.dumps({**made, **content, FILES: files}, indent=2)
+    path.write_bytes(whole.encode() + b"\n")
+
+
+def _publish(draft: Path, target: Path) -> None:
+    """Give everything its final name, or nothing; replaced files are lost."""
+    if not os.path.lexists(target):
+        os.rename(draft, target)
+        return
+    replaced = target / f"{draft.name}{REPLACED_SUFFIX}"
+    listed = read_listing(target)
+    _refuse_unlisted(target, target, _list_files(draft), listed)
+    created = _make_folders(draft, target)
+    replaced.mkdir()
+    try:
+        _rename_all([*_list_old_moves(target, replaced, listed), *_list_new_moves(draft, target)])
+    except OSError:
+        # A file that could not be put back exists only in `replaced`, which then is not empty.
+        _remove_empty_folders(replaced)
+        for folder in reversed(created):
+            with suppress(OSError):
+                folder.rmdir()
+        raise
+    _remove_replaced(target, replaced, listed)
+
+
+def _make_folders(draft: Path, target: Path) -> list[Path]:
+    """Make the folders of a draft in its target; return those that were not there."""
+    created = []
+    for home, folders, _ in os.walk(draft):
+        for name in folders:
+            folder = target / Path(home, name).relative_to(draft)
+            if not os.path.isdir(folder):
+                folder.mkdir()
+                created.append(folder)
+    return created
+
+
+def _list_old_moves(target: Path, replaced: Path, listed: Iterable[str]) -> list[tuple[Path, Path]]:
+    """List the moves of what an earlier run wrote, the summary first."""
+    there = [name for name in listed if os.path.lexists(target / name)]
+    ordered = sorted(there, key=lambda name: (name != SUMMARY_FILE, name))
+    for name in ordered:
+        (replaced / name).parent.mkdir(parents=True, exist_ok=True)
+    return [(target / name, replaced / name) for name in ordered]
+
+
+def _list_new_moves(draft: Path, target: Path) -> list[tuple[Path, Path]]:
+    """List the moves of the new files, the summary last."""
+    ordered = sorted(_list_files(draft), key=lambda name: (name == SUMMARY_FILE, name))
+    return [(draft / name, target / name) for name in ordered]
+
+
+def _rename_all(moves: list[tuple[Path, Path]]) -> None:
+    """Do all renames, or none of them."""
+    for number, move in enumerate(moves):
+        try:
+            os.rename(*move)
+        except OSError:
+            for source, destination in reversed(moves[:number]):
+                os.rename(destination, source)
+            raise
+
+
+def _remove_replaced(target: Path, replaced: Path, listed: Iterable[str]) -> None:
+    """Remove the replaced files, and the folders of the earlier run that are empty now."""
+    shutil.rmtree(replaced, ignore_errors=True)
+    parents = {parent for name in listed for parent in PurePosixPath(name).parents}
+    for parent in sorted(parents, key=lambda parent: -len(parent.parts)):
+        if parent.parts:
+            with suppress(OSError):
+                (target / parent).rmdir()
+
+
+def _remove_empty_folders(folder: Path) -> None:
+    """Remove a folder and those in it as far as they are empty."""
+    for home, _, _ in os.walk(folder, topdown=False):
+        with suppress(OSError):
+            os.rmdir(home)
+
+
+def _finish_interrupted(target: Path) -> None:
+    """Finish the renames of a run that was killed between them.
+
+    All of its new files were complete by then. What they replace lies in a folder beside its draft.
+    """
+    for entry in list_unfinished(target, target.name):
+        if not entry.path.name.endswith(REPLACED_SUFFIX) or entry.is_running():
+            continue
+        name = entry.path.name.removesuffix(REPLACED_SUFFIX)
+        draft = next((d for d in (target / name, target.parent / name) if d.is_dir()), None)
+        if draft is not None and (draft / SUMMARY_FILE).is_file():
+            listed = read_listing(entry.path) or read_listing(target)
+            with suppress(OSError):
+                _finish_moves(draft, target, entry.path, listed)
+
+
+def _finish_moves(draft: Path, target: Path, replaced: Path, listed: frozenset[str]) -> None:
+    """Do the renames that are left: those of earlier files, unless done, and those of new ones."""
+    published = read_listing(draft).difference(_list_files(draft))
+    left = [n for n in listed - published if not os.path.lexists(replaced / n)]
+    _make_folders(draft, target)
+    for source, destination in _list_old_moves(target, replaced, left):
+        os.rename(source, destination)
+    for source, destination in _list_new_moves(draft, target):
+        os.replace(source, destination)
+    _remove_replaced(target, replaced, listed)

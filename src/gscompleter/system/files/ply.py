@@ -1,0 +1,185 @@
+"""Tables in .ply files: a header of elements and properties, then the rows of each element.
+
+Binary files of both byte orders and ASCII are read, if they begin with the element `vertex`; binary
+little-endian ones are written. What the columns mean is up to the callers: Gaussians, or points.
+"""
+
+from __future__ import annotations
+
+import os
+import re
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from dataclasses import dataclass
+from itertools import chain, islice
+from pathlib import Path
+from typing import BinaryIO
+
+import numpy as np
+from jaxtyping import UInt8
+from numpy.lib.recfunctions import unstructured_to_structured
+
+from gscompleter.system.errors import InputError, quote_value, refuse_pointer
+from gscompleter.system.files.reading import open_file
+from gscompleter.system.files.writing import replace_file
+
+_SCALARS = {
+    **dict.fromkeys(("char", "int8"), "i1"),
+    **dict.fromkeys(("uchar", "uint8"), "u1"),
+    **dict.fromkeys(("short", "int16"), "i2"),
+    **dict.fromkeys(("ushort", "uint16"), "u2"),
+    **dict.fromkeys(("int", "int32"), "i4"),
+    **dict.fromkeys(("uint", "uint32"), "u4"),
+    **dict.fromkeys(("float", "float32"), "f4"),
+    **dict.fromkeys(("double", "float64"), "f8"),
+}
+_NAMES = {"<f4": "float", "<u4": "uint", "|u1": "uchar"}
+_BYTE_ORDERS = {"ascii": "=", "binary_little_endian": "<", "binary_big_endian": ">"}
+_COUNT_LINE = re.compile(rb"^(element\s+vertex\s+)\d+", re.M)
+
+
+@dataclass(frozen=True)
+class Element:
+    """One element: a table."""
+
+    name: str
+    count: int
+    dtype: np.dtype
+    """Type of a row; lists are objects, and such rows cannot be read."""
+
+
+@dataclass(frozen=True)
+class PlyFile:
+    """A .ply that begins with the element `vertex`."""
+
+    header: bytes
+    """Everything up to and including `end_header`."""
+    rows: np.ndarray
+    """One structured row per vertex, [n]."""
+    trailer: UInt8[np.ndarray, "m"]
+    """Everything after the last row of a binary file, in bytes."""
+    is_ascii: bool = False
+
+
+def read_header(file: BinaryIO, path: Path) -> tuple[bytes, list[Element]]:
+    """Read the header and its elements; the file is left at the first byte of the data."""
+    refuse_pointer(path)
+    lines = [file.readline(512)]
+    if lines[0].strip() != b"ply":
+        raise InputError(f"{path} is empty or not a PLY file (it does not begin with 'ply').")
+    while lines[-1].split() != [b"end_header"]:
+        lines.append(file.readline(4096))
+        if not lines[-1].endswith(b"\n"):
+            raise InputError(f"{path} is truncated: its header has no end; fetch the file again.")
+    try:
+        return b"".join(lines), _parse_elements(lines[1:-1])
+    except (LookupError, ValueError) as error:
+        raise InputError(
+            f"{path} has a broken header ({quote_value(str(error))}); export it again."
+        ) from error
+
+
+def _parse_elements(lines: Iterable[bytes]) -> list[Element]:
+    tables: list[tuple[str, int, list[tuple[str, str]]]] = []
+    byte_order = ""
+    for line in lines:
+        match line.decode("latin-1").split():
+            case [] | ["comment" | "obj_info", *_]:
+                pass
+            case ["format", name, *_]:
+                byte_order = _BYTE_ORDERS[name]
+            case ["element", name, count] if count.isdecimal():
+                tables.append((name, int(count), []))
+            case ["property", "list", _, _, name]:
+                tables[-1][2].append((name, "O"))
+            case ["property", kind, name]:
+                tables[-1][2].append((name, byte_order + _SCALARS[kind]))
+            case words:
+                raise ValueError(" ".join(words))
+    return [Element(name, count, np.dtype(columns)) for name, count, columns in tables]
+
+
+def read_ply_file(
+    path: Path,
+    needed: Sequence[str],
+    kind: str,
+    describe_content: Callable[[Sequence[Element], Sequence[str]], str | None] | None = None,
+) -> PlyFile:
+    """Read a file whose vertices have the properties `needed`; errors name the `kind` of file.
+
+    `describe_content` says what a file holds instead, from its elements and the missing properties;
+    None if it does not know.
+    """
+    with open_file(path) as file:
+        header, elements = read_header(file, path)
+        vertex = elements[0] if elements and elements[0].name == "vertex" else None
+        names = () if vertex is None else vertex.dtype.names or ()
+        missing = [name for name in needed if name not in names]
+        if vertex is None or missing or vertex.dtype.hasobject:
+            content = describe_content(elements, missing) if describe_content else None
+            if content is not None:
+                raise InputError(f"{path} is no {kind} but {content}.")
+            properties = ", ".join(missing or names)
+            raise InputError(
+                f"{path} is no {kind}: it does not begin with vertices that have {properties} and "
+                "no lists."
+            )
+        is_ascii = re.search(rb"^format\s+ascii", header, re.M) is not None
+        rows = (
+            _read_ascii_rows(file, vertex, path)
+            if is_ascii
+            else _map_rows(file, vertex.dtype, len(header), vertex.count)
+        )
+        if len(rows) < vertex.count:
+            raise InputError(
+                f"{path} is truncated: {len(rows):,} of {quote_value(f'{vertex.count:,}')} rows "
+                "are there; fetch or write the file again."
+            )
+        trailer = _map_rows(file, np.dtype(np.uint8), len(header) + rows.nbytes)
+        return PlyFile(header, rows, trailer, is_ascii)
+
+
+def _map_rows(file: BinaryIO, dtype: np.dtype, start: int, count: int | None = None) -> np.ndarray:
+    """Map rows of a binary file into memory: those that it has, at most `count`."""
+    available = max(os.fstat(file.fileno()).st_size - start, 0) // dtype.itemsize
+    number = available if count is None else min(count, available)
+    if number == 0:
+        return np.empty(0, dtype)
+    return np.asarray(np.memmap(file, dtype, "r", start, (number,)))
+
+
+def _read_ascii_rows(file: BinaryIO, vertex: Element, path: Path) -> np.ndarray:
+    lines = (line.split() for line in file if line.strip())
+    width = len(vertex.dtype.names or ())
+    try:
+        table = np.array(list(islice(lines, vertex.count)), np.float64).reshape(-1, width)
+    except ValueError as error:
+        raise InputError(
+            f"{path} holds rows that are not {width} numbers each; write it anew."
+        ) from error
+    # Values out of range become infinite or wrong; relevant ones are checked later.
+    with np.errstate(over="ignore", invalid="ignore"):
+        return unstructured_to_structured(table, vertex.dtype)
+
+
+def make_header(elements: Mapping[str, tuple[int, np.dtype]], comment: str | None = None) -> bytes:
+    """Make the header of a binary .ply from the number and type of the rows of each element."""
+    lines = ["ply", "format binary_little_endian 1.0"]
+    lines += [] if comment is None else [f"comment {comment}"]
+    for name, (count, dtype) in elements.items():
+        lines.append(f"element {name} {count}")
+        lines += [f"property {_NAMES[dtype[column].str]} {column}" for column in dtype.names or ()]
+    return "\n".join([*lines, "end_header", ""]).encode("ascii")
+
+
+def write_ply_file(
+    path: Path | str,
+    header: bytes,
+    count: int,
+    blocks: Iterable[np.ndarray],
+    trailer: np.ndarray | None = None,
+) -> None:
+    """Write a .ply with `count` rows in total, which replaces the number in the header."""
+    with replace_file(path) as file:
+        file.write(_COUNT_LINE.sub(rb"\g<1>" + str(count).encode(), header, count=1))
+        for rows in chain(blocks, () if trailer is None else [trailer]):
+            file.write(rows.view(np.uint8).data)

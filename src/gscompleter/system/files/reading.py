@@ -1,0 +1,149 @@
+"""Safe reading of files from elsewhere: regular files only, of limited size."""
+
+from __future__ import annotations
+
+import json
+import os
+import stat
+from collections.abc import Iterator
+from contextlib import contextmanager, suppress
+from io import TextIOWrapper
+from pathlib import Path
+from typing import Any, BinaryIO
+
+from gscompleter.system.errors import InputError, quote_value
+
+MAX_BYTES = 1 << 33
+"""Largest file that is read at once, in bytes."""
+MAX_TEXT = 1 << 23
+"""Largest text file, in bytes."""
+MAX_LINE = 4096
+"""Longest line, in characters."""
+MAX_JSON = 1 << 29
+"""Largest JSON file, in bytes."""
+MAX_DIGITS = 20
+"""Longest integer in JSON: 64 bits have no more digits."""
+MAX_DEPTH = 64
+"""Deepest nesting of lists and dictionaries, the most dimensions that numpy supports."""
+
+_HOLDERS = (list, tuple, dict, set, frozenset)
+
+
+def check_file(path: Path) -> None:
+    """Raise InputError if `path` is not a regular file, without opening it."""
+    try:
+        mode = os.stat(path).st_mode
+    except (OSError, ValueError) as error:  # ValueError: a name that no file can have
+        raise _make_read_error(path, error) from error
+    if not stat.S_ISREG(mode):
+        raise InputError(f"{quote_value(path)} is no regular file; correct the path.")
+
+
+@contextmanager
+def open_file(path: Path) -> Iterator[BinaryIO]:
+    """Open a regular file; raise InputError if opening or reading it fails."""
+    check_file(path)
+    try:
+        with path.open("rb") as file:
+            yield file
+    except OSError as error:
+        raise _make_read_error(path, error) from error
+
+
+def read_head(path: Path, count: int) -> bytes:
+    """Read the first `count` bytes of a file, or none if it cannot be read."""
+    with suppress(InputError), open_file(path) as file:
+        return file.read(count)
+    return b""
+
+
+def read_bytes(path: Path, max_bytes: int = MAX_BYTES) -> bytes:
+    """Read a file of at most `max_bytes` bytes; raise InputError if that fails."""
+    with open_file(path) as file:
+        _check_size(path, file, max_bytes)
+        return file.read()
+
+
+def read_lines(
+    path: Path, max_length: int = MAX_LINE, max_bytes: int = MAX_TEXT, errors: str = "replace"
+) -> Iterator[str]:
+    """Read the lines of a UTF-8 text file one by one; raise InputError if it is too long."""
+    with open_file(path) as file:
+        _check_size(path, file, max_bytes)
+        text = TextIOWrapper(file, encoding="utf-8-sig", errors=errors)
+        while line := text.readline(max_length + 1):
+            if len(line) > max_length:
+                raise InputError(
+                    f"{quote_value(path)} has a line of more than {max_length:,} characters, "
+                    "which its format does not allow; copy the file again."
+                )
+            yield line
+
+
+def list_folders(folder: Path) -> list[Path]:
+    """List the folders of a folder by name; none if it cannot be read."""
+    try:
+        return sorted(child for child in folder.iterdir() if os.path.isdir(child))
+    except OSError:
+        return []
+
+
+def read_json(path: Path, advice: str) -> Any:
+    """Read a JSON file; errors end with `advice`, such as "download it again"."""
+    return parse_json(read_bytes(path, MAX_JSON), path, advice)
+
+
+def parse_json(data: bytes, name: Path | str, advice: str) -> Any:
+    """Parse the bytes of a JSON file; `name` and `advice` are for errors."""
+    try:
+        value = json.loads(data.decode("utf-8-sig"), parse_int=_parse_integer)
+    except (ValueError, RecursionError) as error:
+        raise InputError(
+            f"{quote_value(name)} is not JSON ({quote_value(str(error))}); {advice}."
+        ) from error
+    check_plain(value, name, len(data))
+    return value
+
+
+def _parse_integer(digits: str) -> int:
+    if len(digits.lstrip("-")) > MAX_DIGITS:
+        raise ValueError(f"an integer of {len(digits.lstrip('-'))} digits")
+    return int(digits)
+
+
+def is_json_list(path: Path) -> bool:
+    """Return True if the JSON file is a list, by its first character."""
+    return read_head(path, 64).removeprefix(b"\xef\xbb\xbf").lstrip().startswith(b"[")
+
+
+def check_plain(value: Any, name: Path | str, max_values: int) -> None:
+    """Raise InputError if values read from `name` are nested too deeply or too many.
+
+    Repeated values count again, so that a value that contains itself is refused as endless.
+    """
+    waiting, count = [(value, 0)], 0
+    while waiting:
+        held, depth = waiting.pop()
+        if not isinstance(held, _HOLDERS):
+            continue
+        parts = held.values() if isinstance(held, dict) else held
+        count += len(parts)
+        if depth > MAX_DEPTH or count > max_values:
+            raise InputError(
+                f"{quote_value(name)} is nested too deeply or without end; write it again."
+            )
+        waiting += [(part, depth + 1) for part in parts if isinstance(part, _HOLDERS)]
+
+
+def _check_size(path: Path, file: BinaryIO, max_bytes: int) -> None:
+    size = os.fstat(file.fileno()).st_size
+    if size > max_bytes:
+        raise InputError(
+            f"{quote_value(path)} has {size:,} bytes, and at most {max_bytes:,} are read; name a "
+            "smaller one."
+        )
+
+
+def _make_read_error(path: Path, error: Exception) -> InputError:
+    reason = getattr(error, "strerror", None) or "no file can have that name"
+    return InputError(f"{quote_value(path)} cannot be read: {reason}; correct the path.")

@@ -1,0 +1,120 @@
+"""Videos, read and written by the ffmpeg of imageio-ffmpeg."""
+
+from __future__ import annotations
+
+import math
+import re
+import subprocess
+import tempfile
+from collections.abc import Iterable, Iterator
+from contextlib import suppress
+from itertools import chain
+from pathlib import Path
+from typing import IO
+
+import numpy as np
+from jaxtyping import UInt8
+
+from gscompleter.system.errors import InputError, quote_value, refuse_pointer
+from gscompleter.system.threads import get_thread_count
+
+QUALITY = 18
+"""Constant rate factor of x264: 0 is lossless, 18 is visually lossless."""
+OPTIONS = (
+    # The colour space that players assume, stored in the file.
+    "-vf",
+    "scale=out_color_matrix=bt709:out_range=tv:flags=accurate_rnd+bitexact+bicubic,"
+    "setparams=colorspace=bt709:color_primaries=bt709:color_trc=bt709",
+    # A pixel format that all players know, and an index at the start.
+    *("-pix_fmt", "yuv420p", "-movflags", "+faststart"),
+    # The same bytes on every run and machine.
+    *("-threads", "1", "-filter_threads", "1"),
+    *("-fflags", "+bitexact", "-flags:v", "+bitexact", "-map_metadata", "-1"),
+)
+"""Options of ffmpeg for the output."""
+SAFE = ("-protocol_whitelist", "file", "-format_whitelist", "mov,matroska")
+"""Options of ffmpeg for the input: these containers, and no further files or addresses."""
+CUT_OFF = "ended prematurely"
+"""Message of ffmpeg about a truncated Matroska file, which is no error to it."""
+
+
+def find_ffmpeg() -> str:
+    """Find the path of ffmpeg; raise InputError if there is none for this machine."""
+    try:
+        from imageio_ffmpeg import get_ffmpeg_exe
+
+        return get_ffmpeg_exe()
+    except (ImportError, RuntimeError) as error:
+        raise InputError(
+            "Videos need imageio-ffmpeg, which is not installed or has no ffmpeg for this machine; "
+            "run `pip install gscompleter[film]`."
+        ) from error
+
+
+def read_frames(path: Path, filters: str, is_grey: bool) -> Iterator[UInt8[np.ndarray, "h w *c"]]:
+    """Decode a video upright, in grey or colours, after `filters` of ffmpeg; frame by frame."""
+    refuse_pointer(path)
+    command = [
+        *(find_ffmpeg(), "-v", "error", "-nostdin", "-xerror", *SAFE),
+        *("-threads", str(get_thread_count()), "-i", f"file:{path}", "-an", "-sn", "-dn"),
+        # Every frame once, whatever its time; the header of a PNM has its size.
+        *("-fps_mode", "passthrough", "-vf", filters, "-sws_flags", "accurate_rnd+bitexact"),
+        *("-f", "image2pipe", "-c:v", "pgm" if is_grey else "ppm"),
+        *("-pix_fmt", "gray" if is_grey else "rgb24", "pipe:1"),
+    ]
+    with (
+        tempfile.TemporaryFile() as log,
+        subprocess.Popen(command, stdout=subprocess.PIPE, stderr=log) as process,
+    ):
+        assert process.stdout is not None
+        try:
+            yield from _read_images(process.stdout)
+            process.wait()
+        finally:  # also where the reader stops
+            process.kill()
+        log.seek(0)
+        messages = log.read().decode(errors="replace").strip()
+        if process.returncode != 0 or CUT_OFF in messages:
+            reason = re.sub(r"\[[^]]* @ \w*\] ", "", messages).partition("\n")[0].rstrip(".")
+            raise InputError(
+                f"{quote_value(path, 80)} is no video that can be read to its end "
+                f"({quote_value(reason, 80)}); copy it again, or export it as H.264 in .mp4."
+            )
+
+
+def _read_images(stream: IO[bytes]) -> Iterator[UInt8[np.ndarray, "h w *c"]]:
+    """Read 8-bit PNM images until the stream ends."""
+    while kind := stream.readline():
+        width, height = map(int, stream.readline().split())
+        shape = (height, width) if kind == b"P5\n" else (height, width, 3)
+        stream.readline()  # 255
+        pixels = stream.read(math.prod(shape))
+        if len(pixels) == math.prod(shape):  # else ffmpeg failed
+            yield np.frombuffer(pixels, np.uint8).reshape(shape)
+
+
+def write_video(path: Path, frames: Iterable[UInt8[np.ndarray, "h w 3"]], rate: int) -> None:
+    """Write frames of one size, both sides even, as an mp4 with `rate` frames per second."""
+    iterator = iter(frames)
+    first = next(iterator)
+    size = f"{first.shape[1]}x{first.shape[0]}"
+    command = [
+        *(find_ffmpeg(), "-v", "error", "-y", "-nostdin"),
+        *("-f", "rawvideo", "-pix_fmt", "rgb24", "-s", size, "-r", str(rate)),
+        *("-i", "pipe:0", "-an", "-c:v", "libx264", "-preset", "medium", "-crf", str(QUALITY)),
+        *(*OPTIONS, str(path)),
+    ]
+    process = subprocess.Popen(command, stdin=subprocess.PIPE, stderr=subprocess.PIPE)
+    assert process.stdin is not None
+    try:
+        for frame in chain([first], iterator):
+            with suppress(OSError):  # if ffmpeg has ended, its exit code tells
+                process.stdin.write(np.ascontiguousarray(frame).data)
+        _, messages = process.communicate()
+    finally:  # also on an interrupt
+        process.kill()
+        process.wait()
+    if process.returncode != 0:
+        raise InputError(
+            f"ffmpeg could not write {quote_value(path)}: {quote_value(messages.decode(), 200)}"
+        )

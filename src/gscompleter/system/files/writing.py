@@ -1,0 +1,125 @@
+"""Atomic writes: a file is written completely or left as it was.
+
+Interrupts (Ctrl-C, `kill`, a scheduler, or a closed terminal) wait while results are renamed.
+"""
+
+from __future__ import annotations
+
+import errno
+import os
+import signal
+import threading
+from collections.abc import Container, Iterator
+from contextlib import contextmanager, suppress
+from pathlib import Path
+from typing import BinaryIO
+
+from gscompleter.system.errors import FullDiskError, OutputError, quote_value
+from gscompleter.system.files.unfinished import make_unfinished_name
+
+SUMMARY_FILE = "summary.json"
+"""File that marks a folder as complete: it is removed first and written last."""
+TARGETS_FILE = "targets.json"
+"""File of a completion with the target cameras."""
+CONTEXT_FILE, COMPLETED_FILE = "context.ply", "completed.ply"
+"""The scene of a completion before and after."""
+REMOVED_FILE = "removed.ply"
+"""Originals of changed and removed Gaussians of a given scene, beside the completed one."""
+
+FULL_DISK_ERRORS = {errno.ENOSPC, errno.EDQUOT, errno.EFBIG}
+"""Numbers of errors of a disk without space, of a full quota and of a limit of a file's size."""
+
+
+@contextmanager
+def replace_file(path: Path | str, keep_existing: bool = False) -> Iterator[BinaryIO]:
+    """Open a temporary file that is renamed to `path` once it is completely on the disk.
+
+    An existing file survives every failure. With `keep_existing`, a file that another process
+    wrote at `path` meanwhile is kept, where the file system has hard links. A device or a pipe is
+    never replaced by a file.
+    """
+    # The target of a symbolic link is replaced, not the link.
+    target = Path(os.path.realpath(path))
+    temporary = target.with_name(make_unfinished_name(target.name))
+    with convert_write_errors(path):
+        refuse_special_file(target)
+        try:
+            with temporary.open("xb") as file:
+                yield file
+                file.flush()
+                os.fsync(file.fileno())
+            if keep_existing:
+                with suppress(OSError):
+                    os.link(temporary, target)
+            if not (keep_existing and target.exists()):
+                os.replace(temporary, target)
+        finally:
+            with suppress(OSError):
+                temporary.unlink()
+
+
+def encode_text(text: str) -> bytes:
+    """Encode a text for a page or a table as UTF-8.
+
+    Names of files may hold bytes that are no UTF-8; each becomes the sign for an unknown character.
+    """
+    return text.encode("utf-8", "surrogatepass").decode("utf-8", "replace").encode()
+
+
+def refuse_special_file(path: Path) -> None:
+    """Raise an OSError if there is something other than a regular file at the path."""
+    if os.path.isdir(path):
+        raise IsADirectoryError(errno.EISDIR, os.strerror(errno.EISDIR))
+    if os.path.lexists(path) and not os.path.isfile(path):
+        raise OSError(errno.EINVAL, "it is a device or a pipe, no file")
+
+
+@contextmanager
+def convert_write_errors(path: Path | str, numbers: Container[int] | None = None) -> Iterator[None]:
+    """Convert errors of the operating system, or those of the numbers, to OutputError."""
+    try:
+        yield
+    except OSError as error:
+        if numbers is not None and error.errno not in numbers:
+            raise
+        kind = FullDiskError if error.errno in FULL_DISK_ERRORS else OutputError
+        raise kind(
+            f"Cannot write {quote_value(Path(path))}: {error.strerror or error}; free some space, "
+            "or choose another place."
+        ) from error
+
+
+def handle_stop_signals() -> None:
+    """Let the signals that end a process raise KeyboardInterrupt, so that it cleans up.
+
+    Signals that are ignored (`nohup`) or handled already stay so. This works in the main thread
+    only.
+    """
+    for name in ("SIGTERM", "SIGHUP", "SIGBREAK"):
+        number = getattr(signal, name, None)  # only Windows has the last, and no SIGHUP
+        if number is not None and signal.getsignal(number) is signal.SIG_DFL:
+            signal.signal(number, signal.default_int_handler)
+
+
+@contextmanager
+def defer_interrupts(state: str) -> Iterator[None]:
+    """Defer KeyboardInterrupt, with the message `state`, to the end of a block."""
+    came: list[int] = []
+    handled = []
+    if threading.current_thread() is threading.main_thread():
+        numbers = signal.valid_signals()  # on Windows, `Signals` has others
+        handled = [n for n in numbers if signal.getsignal(n) is signal.default_int_handler]
+    for number in handled:
+        signal.signal(number, lambda number, _: came.append(number))
+    try:
+        yield
+    finally:
+        for number in handled:
+            signal.signal(number, signal.default_int_handler)
+    if came:
+        raise KeyboardInterrupt(state)
+
+
+def get_download_folder() -> Path:
+    """Return $GSCOMPLETER_HOME, or else ~/.cache/gscompleter."""
+    return Path(os.environ.get("GSCOMPLETER_HOME") or "~/.cache/gscompleter").expanduser()

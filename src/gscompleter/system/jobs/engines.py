@@ -1,0 +1,194 @@
+"""Engines, which start workers: local processes, Ray tasks, or SLURM jobs through submitit."""
+
+from __future__ import annotations
+
+import contextlib
+import importlib
+import multiprocessing
+import os
+import signal
+import threading
+import time
+from collections.abc import Iterator, Mapping
+from concurrent.futures import Future, ProcessPoolExecutor
+from functools import partial
+from pathlib import Path
+from typing import Any, Literal
+
+from gscompleter.system.errors import InputError, quote_value
+from gscompleter.system.files.writing import handle_stop_signals
+from gscompleter.system.jobs.jobs import Pool, Share
+from gscompleter.system.memory import estimate_bytes, read_memory_bytes
+from gscompleter.system.threads import count_available_cores, limit_threads
+
+EngineName = Literal["local", "ray", "submitit"]
+
+PIXELS, IMAGES = 640 * 480, 8
+"""Size of a typical completion, for the default number of workers."""
+STOP_SECONDS = 10.0
+"""Time that stopped workers have to remove what they have not finished."""
+RAY_VARIABLES = {"RAY_USAGE_STATS_ENABLED": "0", "RAY_ACCEL_ENV_VAR_OVERRIDE_ON_ZERO": "0"}
+"""Variables against messages to Ray's makers, and of Ray on standard error."""
+STORE_BYTES = 200 * 10**6
+"""Memory for return values in a local Ray cluster; they are small, as results are files."""
+
+
+def choose_num_workers() -> int:
+    """Return the number of cores, limited by the memory of a typical completion."""
+    there, cores = read_memory_bytes(), count_available_cores()
+    return cores if there is None else max(1, min(cores, there // estimate_bytes(PIXELS, IMAGES)))
+
+
+def check_processes() -> None:
+    """Refuse to start processes on a machine without shared memory, which their queues need."""
+    try:
+        multiprocessing.get_context("spawn").Lock()
+    except (OSError, ImportError) as error:
+        raise InputError(
+            f"Processes of this machine need shared memory in /dev/shm, which is missing or cannot "
+            f"be written ({quote_value(getattr(error, 'strerror', None) or str(error))}); mount "
+            "it, or choose another engine.",
+            "engine",
+        ) from error
+
+
+@contextlib.contextmanager
+def open_local(workers: int) -> Iterator[Pool]:
+    """Open a pool of local processes, which end with this one."""
+    # One executor for each process: a killed process breaks its whole executor.
+    futures: dict[ProcessPoolExecutor, Future[Exception | None]] = {}
+    spawn = multiprocessing.get_context("spawn")
+
+    def start(share: Share) -> Future[Exception | None]:
+        idle = [one for one, old in futures.items() if old.done() and old.exception() is None]
+        executor = idle[0] if idle else ProcessPoolExecutor(1, spawn, follow_parent)
+        futures[executor] = executor.submit(share)
+        return futures[executor]
+
+    try:
+        yield Pool(workers, start)
+    finally:
+        for executor, future in futures.items():
+            if not future.done():
+                for process in executor._processes.values():
+                    process.terminate()
+        for executor in futures:
+            executor.shutdown()
+
+
+def follow_parent() -> None:
+    """Let this process end with its parent, which alone reacts to Ctrl-C."""
+    signal.signal(signal.SIGINT, signal.SIG_IGN)
+    handle_stop_signals()
+    threading.Thread(target=end_with_parent, daemon=True).start()
+
+
+def end_with_parent() -> None:
+    """Wait for the end of the parent, and then stop this process as SIGTERM does."""
+    parent = multiprocessing.parent_process()
+    if parent is not None:
+        parent.join()
+    os.kill(os.getpid(), signal.SIGTERM)
+    time.sleep(STOP_SECONDS)
+    os._exit(1)
+
+
+def import_engine(package: str, extra: str) -> Any:
+    """Import the package of an engine; raise InputError if it is not installed."""
+    try:
+        return importlib.import_module(package)
+    except ImportError as error:
+        raise InputError(
+            f"The engine {package} needs a package; install it with "
+            f"`pip install 'gscompleter[{extra}]'`."
+        ) from error
+
+
+@contextlib.contextmanager
+def open_ray(
+    workers: int | None, threads: int, gpus: float = 0.0, address: str | None = None
+) -> Iterator[Pool]:
+    """Connect to the cluster at `address`, or start one here, and open a pool of tasks.
+
+    Without a number of workers, tasks fill the cluster. `threads` and `gpus`, possibly a fraction,
+    are those of one task.
+    """
+    ray = import_engine("ray", "ray")
+    connect_to_ray(ray, address, None if workers is None else workers * threads)
+    # A lost task is not repeated by Ray, so that its attempts are counted.
+    task = ray.remote(run_task).options(num_cpus=threads, num_gpus=gpus, max_retries=0)
+    started: list[Any] = []
+
+    def start(share: Share) -> Any:
+        started.append(task.remote(share, threads))
+        return started[-1].future()
+
+    try:
+        cores = int(ray.cluster_resources().get("CPU", 1) // threads)
+        yield Pool(workers or max(1, cores), start)
+        started.clear()
+    finally:
+        for reference in started:
+            ray.cancel(reference)
+        if started:
+            ray.wait(started, num_returns=len(started), timeout=STOP_SECONDS)
+        ray.shutdown()
+
+
+def connect_to_ray(ray: Any, address: str | None, cores: int | None) -> None:
+    """Connect to a cluster, or start one of `cores` cores on this machine."""
+    for name, value in RAY_VARIABLES.items():
+        os.environ.setdefault(name, value)
+    here = {"num_cpus": cores, "include_dashboard": False, "object_store_memory": STORE_BYTES}
+    options = {"address": address} if address else {"address": "local", **here}
+    handlers = {number: signal.getsignal(number) for number in (signal.SIGTERM, signal.SIGINT)}
+    try:
+        ray.init(log_to_driver=False, logging_level="ERROR", **options)
+    except (ConnectionError, ValueError, RuntimeError) as error:
+        raise InputError(
+            f"There is no cluster of Ray at {quote_value(address)}: {quote_value(str(error))}.",
+            "address",
+        ) from error
+    for number, handler in handlers.items():  # Ray has replaced them by its own
+        signal.signal(number, handler)
+
+
+def run_task(share: Share, threads: int) -> Exception | None:
+    """Run a share in a Ray task or a SLURM job."""
+    limit_threads(threads)  # before the first job imports libraries that read it
+    return share()
+
+
+@contextlib.contextmanager
+def open_submitit(
+    workers: int, threads: int, gpus: float, folder: Path, parameters: Mapping[str, str]
+) -> Iterator[Pool]:
+    """Open a pool of SLURM jobs, or of local processes without SLURM.
+
+    `folder` is for files and output of the jobs; `parameters` are further ones of SLURM, such as
+    `partition` and `time`.
+    """
+    submitit = import_engine("submitit", "slurm")
+    executor = submitit.AutoExecutor(folder=str(folder))
+    further: dict[str, Any] = {f"slurm_{name}": value for name, value in parameters.items()}
+    if executor.cluster == "local":
+        further = {"timeout_min": 24 * 60}
+    resources = {"cpus_per_task": threads, "gpus_per_node": int(gpus), "name": "gscompleter"}
+    try:
+        executor.update_parameters(**resources, **further)
+    except (ValueError, NameError, TypeError) as error:
+        raise InputError(
+            f"A parameter of SLURM is invalid: {quote_value(str(error))}; correct it."
+        ) from error
+    started: list[Any] = []
+
+    def start(share: Share) -> Any:
+        started.append(executor.submit(partial(run_task, share, threads)))
+        return started[-1]
+
+    try:
+        yield Pool(workers, start, num_shares=workers)
+    finally:
+        for job in started:
+            with contextlib.suppress(Exception):  # it may have ended
+                job.cancel()

@@ -1,0 +1,103 @@
+"""Estimates of the memory of a completion, compared with that of this machine."""
+
+from __future__ import annotations
+
+import contextlib
+import os
+from collections.abc import Sequence
+from pathlib import Path
+
+from gscompleter.system.errors import InputError, quote_value
+
+PROGRAM_BYTES = 550 * 10**6
+"""Bytes of the program itself, for images of any size."""
+# Measured on two photographs: 0.67 GB at 256 x 256, 1.51 GB at 512 x 768. A wider depth range, with
+# more planes, still fits.
+BYTES_PER_PIXEL = 2_500
+"""Bytes per target pixel, for the costs of the anchor and of the target padded by a quarter."""
+# Measured on eight photographs instead of two, at 256 x 256 and 480 x 480.
+BYTES_PER_VIEW_PIXEL = 250
+"""Further bytes per pixel of each image: the image, its Gaussians and its renders."""
+
+MAX_FROZEN_BYTES = 2 * 2**30
+"""Bytes of splats that the frozen views of an input splat may hold together."""
+COPIES = 4
+"""Copies of a scene: in rendering order and in file order, with and without added Gaussians."""
+FREEZING_BYTES = 60
+"""Bytes per Gaussian while a view is frozen."""
+BYTES_PER_SPLAT = 52
+"""Bytes per Gaussian in a frozen view."""
+BYTES_PER_PHOTO_PIXEL = 400
+"""Bytes per pixel of each photograph of an input splat, for the fit to it."""
+
+# Of containers, for cgroup versions 2 and 1.
+_LIMIT_FILES = ("/sys/fs/cgroup/memory.max", "/sys/fs/cgroup/memory/memory.limit_in_bytes")
+
+
+def check_memory(pixels: int, images: int) -> None:
+    """Raise InputError if `images` of up to `pixels` pixels need more memory than there is."""
+    number = f"{images:,} images of up to {quote_value(f'{pixels:,}')} pixels"
+    remedy = "choose a smaller resolution, or fewer views"
+    check_bytes(estimate_bytes(pixels, images), number, remedy, "resolution")
+
+
+def estimate_bytes(pixels: int, images: int) -> int:
+    """Estimate the peak memory of a completion. Arguments as in `check_memory`."""
+    return PROGRAM_BYTES + pixels * (BYTES_PER_PIXEL + images * BYTES_PER_VIEW_PIXEL)
+
+
+def check_images(pixels: int, images: int) -> None:
+    """Raise InputError if images of `pixels` pixels in all need more memory than there is.
+
+    This is a lower bound for models of any kind: the images, their Gaussians and their renders.
+    """
+    check_bytes(
+        PROGRAM_BYTES + pixels * BYTES_PER_VIEW_PIXEL,
+        f"{images:,} photographs and targets of {quote_value(f'{pixels:,}')} pixels together",
+        "choose a smaller resolution, or fewer views",
+    )
+
+
+def check_bytes(needed: int, number: str, remedy: str, argument: str | None = None) -> None:
+    """Raise InputError if `needed` bytes, for what `number` says, exceed the memory."""
+    available = read_memory_bytes()
+    if available is not None and needed > available:
+        raise InputError(
+            f"{number} need about {format_whole_gigabytes(needed)} of memory, and there are "
+            f"{format_whole_gigabytes(available)}; {remedy}.",
+            argument,
+        )
+
+
+def estimate_scene_bytes(count: int, numbers: int, photographs: Sequence[int]) -> int:
+    """Estimate the additional peak memory for `count` Gaussians of an input splat.
+
+    Each has `numbers` float32 values; `photographs` are the pixels of each, at working resolution.
+    """
+    number = len(photographs)
+    rendered = min(count, count_fitting_gaussians(number))
+    views = number * rendered * BYTES_PER_SPLAT
+    observed = 2 * 4 * number * rendered  # areas and agreement of every Gaussian
+    fitted = BYTES_PER_PHOTO_PIXEL * sum(photographs)
+    return count * (COPIES * 4 * numbers + FREEZING_BYTES) + views + observed + fitted
+
+
+def count_fitting_gaussians(number: int) -> int:
+    """Compute how many Gaussians `number` frozen views can hold within `MAX_FROZEN_BYTES`."""
+    return MAX_FROZEN_BYTES // (number * BYTES_PER_SPLAT)
+
+
+def read_memory_bytes() -> int | None:
+    """Return the memory of this machine or its container limit, or None if unknown."""
+    found = []
+    for file in filter(os.path.isfile, _LIMIT_FILES):
+        word = Path(file).read_text("ascii").strip()
+        found += [int(word)] if word.isdecimal() else []  # cgroup 2 has "max" for no limit
+    with contextlib.suppress(AttributeError, OSError, ValueError):  # not on Windows
+        found.append(os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES"))
+    return min(found, default=None)
+
+
+def format_whole_gigabytes(number: int) -> str:
+    """Format a number of bytes in whole GB, rounded up."""
+    return quote_value(f"{-(-number // 10**9):,} GB")

@@ -1,0 +1,198 @@
+"""Removal of Gaussians from a begun completion."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import pytest
+import torch
+
+from gscompleter import GSCompleter
+from gscompleter.config import CompleterConfig
+from gscompleter.editing.removal import find_outside, remove_gaussians, restore_surroundings
+from gscompleter.guards import load_guards
+from gscompleter.guards.free_space import Observed, ignore_removed, is_before_surface
+from gscompleter.numerics.image_ops import dilate
+from gscompleter.render.removed import find_removed
+from gscompleter.state import NEW_PHOTO_ID, Completion
+from gscompleter.system.errors import InputError
+from gscompleter.types import REMOVED, REVEALED, Gaussians, make_observed, merge, sh_from_rgb
+from scenes import Room, camera_at, gaussians_of, view_of
+
+ROOM = Room()
+EMPTY = Room((ROOM.boxes[0], ROOM.boxes[2]))
+CAMERAS = [camera_at(x, yaw=yaw, size=48) for x, yaw in ((-0.4, 4), (0.0, 0), (0.4, -4))]
+COMPLETER = GSCompleter(config=CompleterConfig.splat().for_removal())
+
+
+def is_crate(points: torch.Tensor) -> torch.Tensor:
+    """Find points on the box in the middle of the room."""
+    low, high = (torch.tensor(corner) for corner in ROOM.boxes[1])
+    return ((points > low - 0.05) & (points < high + 0.05)).all(-1) & (points[:, 1] < 1.45)
+
+
+def make_junk() -> Gaussians:
+    """Make an opaque blob inside of the box, which no photograph shows."""
+    points = torch.tensor([[-0.1, 0.9, 2.6], [-0.1, 0.7, 2.6], [-0.1, 1.1, 2.6]])
+    scales, opacities = torch.full((3, 3), 0.1), torch.full((3,), 0.95)
+    quats = torch.tensor([[1.0, 0, 0, 0]]).repeat(3, 1)
+    return make_observed(points, quats, scales, opacities, sh_from_rgb(torch.ones(3, 3)))
+
+
+@pytest.fixture(scope="module")
+def begun() -> Completion:
+    views = [view_of(ROOM, camera) for camera in CAMERAS]
+    scene = merge([*map(gaussians_of, views), make_junk()])
+    return COMPLETER.begin(views, scene, [])
+
+
+def choose_surface(begun: Completion) -> torch.Tensor:
+    """Choose the box without the junk inside of it."""
+    chosen = is_crate(begun.context.means)
+    chosen[-3:] = False
+    return chosen
+
+
+@pytest.fixture(scope="module")
+def removed(begun) -> Completion:
+    return remove_gaussians(begun, choose_surface(begun), is_crate, COMPLETER.scenes)
+
+
+def test_the_chosen_are_gone_and_so_is_what_only_they_hid(begun, removed):
+    source, chosen = removed.source, choose_surface(begun)
+    assert torch.equal(source.chosen_mask, chosen)
+    assert source.stand_ins[-3:].tolist() == [REVEALED] * 3
+    assert source.gone_mask.sum() < chosen.sum() + 0.05 * len(chosen)
+    assert removed.context is begun.context
+    left = begun.context[~source.gone_mask]
+    assert torch.equal(removed.scene.means[: len(left)], left.means)
+    assert (removed.scene.generated[len(left) :] == NEW_PHOTO_ID).all()
+    assert torch.equal(source.rendered.means, left.means)
+    assert torch.equal(source.expand(source.rendered.opacities)[chosen], torch.zeros(chosen.sum()))
+    assert not removed.recolored_mask.any()
+
+
+def test_photographs_are_ignored_where_they_show_the_chosen(begun, removed):
+    for camera, photo, before in zip(CAMERAS, removed.photos, begun.photos, strict=True):
+        shown = view_of(ROOM, camera).depth < view_of(EMPTY, camera).depth - 0.01
+        ignored = photo.view.ignore_mask
+        assert ignored[shown].float().mean() > 0.97
+        assert ignored.float().mean() < shown.float().mean() + 0.15
+        same = (photo.view.image == before.view.image).all(-1)
+        assert torch.equal(same | ignored, torch.ones_like(same))
+        assert (~same)[shown].float().mean() > 0.9
+        assert photo.budgets[0].limit < before.budgets[-2].limit
+
+
+def test_nothing_is_added_outside_of_the_hole(removed):
+    view = COMPLETER.observe(removed, camera_at(0.1, size=48))
+    everywhere = gaussians_of(view_of(EMPTY, view.camera.padded))
+    (guard,) = [guard for guard in load_guards(removed.config) if guard.name == "removal"]
+    placed = guard.place(everywhere, view)
+    shown = view_of(ROOM, view.camera.padded).depth < view_of(EMPTY, view.camera.padded).depth
+    assert 0 < len(placed) < 0.35 * len(everywhere)
+    assert len(placed) >= 0.95 * shown.sum()
+
+
+def test_a_masked_photograph_can_be_a_target(begun, removed):
+    before, after = (COMPLETER.advance(state, CAMERAS[1]) for state in (begun, removed))
+    assert before.targets[0].skip_reason == "The target is a context view: nothing to complete."
+    assert len(after.targets[0].added) > 0
+    assert after.targets[0].hole_fraction > 0.02
+
+
+def test_what_photographs_need_elsewhere_returns(begun):
+    """A large Gaussian behind the wall shines through it and fills the hole as well."""
+    glow = make_observed(
+        torch.tensor([[0.0, 0.8, 5.6]]),
+        torch.tensor([[1.0, 0, 0, 0]]),
+        torch.tensor([[3.0, 3.0, 0.1]]),
+        torch.tensor([0.99]),
+        sh_from_rgb(torch.tensor([[1.0, 0.2, 0.2]])),
+    )
+    thin = replace(begun.context, opacities=0.4 * begun.context.opacities)
+    scene = merge([thin, glow])
+    views = [
+        replace(view, image=COMPLETER.renderer.render(scene, view.camera).image.clamp(0, 1))
+        for view in begun.views
+    ]
+    state = COMPLETER.begin(views, scene, [])
+    chosen = is_crate(scene.means)
+    state = remove_gaussians(state, chosen, is_crate, COMPLETER.scenes)
+    number = torch.full_like(state.source.stand_ins, REVEALED)
+    hidden = replace(
+        state.source,
+        rendered=state.parts[0][:-1],
+        proxy_index=state.source.stand_ins.where(torch.arange(len(scene)) < len(scene) - 1, number),
+    )
+    state = replace(state, source=hidden, parts=(hidden.rendered,))
+    restored = restore_surroundings(state, COMPLETER.renderer)
+    assert restored.source.stand_ins[-1] == len(restored.parts[0]) - 1
+    assert torch.equal(restored.scene.means[-1], glow.means[0])
+    assert (restored.source.stand_ins == REMOVED).sum() == chosen.sum()
+    assert restore_surroundings(begun, COMPLETER.renderer) is begun
+
+
+def test_what_shows_in_the_hole_alone_does_not_return(removed):
+    views = [photo.view for photo in removed.photos]
+    wall = removed.context[~removed.source.gone_mask][::50]
+    found = find_outside(merge([make_junk(), wall]), removed.scene, views, COMPLETER.renderer)
+    assert not found[:3].any()
+    assert found[3:].float().mean() > 0.5
+
+
+def test_space_in_which_something_was_removed_is_not_free(removed, begun):
+    camera = CAMERAS[0]
+    behind = COMPLETER.renderer.render(gaussians_of(view_of(EMPTY, camera)), camera)
+    points = removed.source.removed.means
+    for state, expected in (begun, 1.0), (removed, 0.0):
+        seen = ignore_removed(behind, camera, COMPLETER.observe(state, camera))
+        share = is_before_surface(points, Observed.from_render(seen, camera, camera)).float().mean()
+        assert share == pytest.approx(expected, abs=0.05)
+    beside = find_removed(removed.source, camera, COMPLETER.renderer).logical_not()
+    assert torch.equal(seen.alpha[beside], behind.alpha[beside])
+
+
+def measure_errors(state: Completion, scene: Gaussians) -> list[float]:
+    """Return the mean difference of each photograph to a render around the crate."""
+    errors = []
+    for camera, photo in zip(CAMERAS, state.photos, strict=True):
+        around = ~dilate(view_of(ROOM, camera).depth < view_of(EMPTY, camera).depth - 0.01, 3)
+        image = COMPLETER.renderer.render(scene, camera).image
+        errors.append((image - photo.view.image)[around].abs().mean().item())
+    return errors
+
+
+def test_what_reaches_out_of_the_place_stays_and_additions_match_photographs(begun):
+    """A large disc in front of the crate is a stain on the walls beside it, too."""
+    stain = make_observed(
+        torch.tensor([[-0.1, 0.8, 2.17]]),
+        torch.tensor([[1.0, 0, 0, 0]]),
+        torch.tensor([[0.5, 0.5, 0.01]]),
+        torch.tensor([0.5]),
+        sh_from_rgb(torch.tensor([[1.0, 0.2, 0.2]])),
+    )
+    scene = merge([begun.context, stain])
+    views = [
+        replace(view, image=COMPLETER.renderer.render(scene, view.camera).image.clamp(0, 1))
+        for view in begun.views
+    ]
+    state = COMPLETER.begin(views, scene, [])
+    cut, uncut = (
+        remove_gaussians(state, is_crate(scene.means), region, COMPLETER.scenes)
+        for region in (is_crate, lambda points: torch.zeros(len(points), dtype=torch.bool))
+    )
+    pairs = zip(*(measure_errors(state, each.scene) for each in (cut, uncut)), strict=True)
+    assert all(less < 0.5 * more for less, more in pairs)
+    assert set(cut.added.generated.tolist()) == {NEW_PHOTO_ID}
+    dyed = replace(cut.added, sh=cut.added.sh - 0.5)
+    dyed = replace(cut, parts=(cut.parts[0], dyed))
+    restored = restore_surroundings(dyed, COMPLETER.renderer)
+    before, after = measure_errors(state, dyed.scene), measure_errors(state, restored.scene)
+    assert max(after) < 0.7 * max(before)
+
+
+def test_something_has_to_be_left(begun):
+    everything = torch.ones(len(begun.context), dtype=torch.bool)
+    with pytest.raises(InputError, match="Nothing would be left"):
+        remove_gaussians(begun, everything, is_crate, COMPLETER.scenes)

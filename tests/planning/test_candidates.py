@@ -1,0 +1,137 @@
+"""Candidate cameras: moves of cameras whose surroundings are known."""
+
+import pytest
+import torch
+
+from gscompleter import Camera
+from gscompleter.config import NextBestViewConfig
+from gscompleter.numerics.geometry import (
+    compute_field_of_view,
+    compute_spacing,
+    estimate_up,
+    measure_baseline,
+    measure_rotation,
+    select_spread_cameras,
+    shrink_camera,
+)
+from gscompleter.planning.candidates import make_moves, propose_candidates
+from gscompleter.types import Render
+from scenes import Room, camera_at, cast
+
+UP = torch.tensor([0.0, -1.0, 0.0])
+
+
+def seen_by(camera: Camera, room: Room = Room()) -> Render:
+    """Render the room itself at a camera."""
+    image, depth = cast(room, camera)
+    return Render(image, depth, torch.ones_like(depth))
+
+
+def tilted(camera: Camera) -> float:
+    """Compute the tilt of a camera's horizon, as a sine."""
+    return (camera.c2w[:3, 0] @ UP).abs().item()
+
+
+def test_there_are_six_translations_four_turns_and_four_orbits():
+    camera = camera_at(0.3, yaw=20)
+    found = make_moves(camera, 3.0, 0.4, 0.25, UP)
+    rotations = torch.tensor([measure_rotation(camera, other) for other in found])
+    baselines = torch.tensor([measure_baseline(camera, other) for other in found])
+    assert torch.allclose(rotations[:6], torch.zeros(6), atol=1e-3)
+    assert torch.allclose(baselines[:6], torch.full((6,), 0.4), rtol=1e-4)
+    quarter = torch.rad2deg(torch.tensor(compute_field_of_view(camera)[0] / 4))
+    assert torch.allclose(rotations[6:10], quarter.expand(4), rtol=1e-3)
+    assert torch.allclose(baselines[6:10], torch.zeros(4), atol=1e-6)
+    assert torch.allclose(baselines[10:], torch.full((4,), 0.4), rtol=1e-2)
+    looked_at = camera.center + 3.0 * camera.forward
+    for other in found[10:]:
+        assert torch.allclose(other.center + 3.0 * other.forward, looked_at, atol=1e-5)
+
+
+def test_no_move_tilts_the_horizon():
+    for other in make_moves(camera_at(0.3, yaw=20), 3.0, 0.4, 0.25, UP):
+        assert tilted(other) < 1e-5
+
+
+def test_up_is_what_is_up_in_most_images():
+    rolled = camera_at()
+    rolled.c2w[:3, :2] = -rolled.c2w[:3, :2]
+    cameras = [camera_at(yaw=yaw) for yaw in (0, 90, 200)]
+    assert torch.allclose(estimate_up([rolled, *cameras]), UP, atol=1e-6)
+
+
+def test_a_candidate_behind_a_surface_is_none():
+    """The camera is one step in front of the wall at z = 5, which a second one sees from afar."""
+    cameras = [camera_at(-2.0, z=4.2), camera_at(-2.0, z=1.0)]
+    far = NextBestViewConfig(max_step=1.0)
+    found = propose_candidates(cameras, [seen_by(c) for c in cameras], 0.79, far)
+    centers = torch.stack([c.camera.center for c in found])
+    assert (centers[:, 2] < 4.9).all()
+    assert len(found) < 28
+    assert sum(c.base == 1 for c in found) == 14
+
+
+def test_a_step_is_as_long_as_cameras_stand_apart_and_short_of_the_scene():
+    cameras = [camera_at(x) for x in (0.0, 0.2, 0.4)]
+    renders = [seen_by(camera) for camera in cameras]
+    longest = {
+        step: max(
+            measure_baseline(c.camera, cameras[c.base])
+            for c in propose_candidates(cameras, renders, step)
+        )
+        for step in (compute_spacing(cameras), 50.0, 0.0)
+    }
+    assert longest[compute_spacing(cameras)] == pytest.approx(0.2, rel=1e-3)
+    assert longest[50.0] == longest[0.0] == pytest.approx(0.2 * 4.6, rel=0.2)
+
+
+def test_cameras_that_are_spread_are_no_neighbours():
+    cameras = [camera_at(x) for x in (0.0, 0.01, 0.02, 1.0, 1.01, 2.0)]
+    assert sorted(select_spread_cameras(cameras, 3)) == [0, 3, 5]
+    turned = [camera_at(), camera_at(), camera_at(yaw=90)]
+    assert select_spread_cameras(turned, 2) == [0, 2]
+    assert sorted(select_spread_cameras(cameras, 99)) == list(range(6))
+
+
+def test_beside_photographs_is_level_between_them_and_towards_the_same_scene():
+    cameras = [camera_at(x, yaw=yaw) for x, yaw in ((-0.3, 0), (0.1, 10), (0.7, 12))]
+    found = propose_candidates(cameras, [seen_by(c) for c in cameras], 0.3, stays_beside=True)
+    assert [c.base for c in found] == [index for index in range(3) for _ in range(5)]
+    for candidate in found:
+        camera, base = candidate.camera, cameras[candidate.base]
+        assert camera.center[1].item() == pytest.approx(base.center[1].item(), abs=1e-5)
+        assert tilted(camera) < 1e-5
+        assert measure_rotation(camera, base) < 10
+        assert measure_baseline(camera, base) < 0.31
+    between = found[4].camera
+    assert torch.allclose(between.center, (cameras[0].center + cameras[1].center) / 2, atol=1e-6)
+    assert measure_rotation(between, cameras[1]) == pytest.approx(5, abs=1e-2)
+
+
+def test_beside_a_single_photograph_there_is_nothing_between():
+    camera = camera_at()
+    found = propose_candidates([camera], [seen_by(camera)], 0.3, stays_beside=True)
+    assert len(found) == 4
+    assert min(measure_baseline(c.camera, camera) for c in found) > 0.29
+
+
+@pytest.mark.parametrize("unit", [1e-4, 1e4])
+def test_the_unit_of_the_scene_changes_no_candidate(unit):
+    places = ((-0.3, 0), (0.1, 10), (0.7, 12))
+    found = [
+        propose_candidates(
+            cameras, [seen_by(c, Room(unit=u)) for c in cameras], compute_spacing(cameras)
+        )
+        for u in (1.0, unit)
+        for cameras in [[camera_at(x, yaw=yaw, unit=u) for x, yaw in places]]
+    ]
+    assert [c.base for c in found[0]] == [c.base for c in found[1]]
+    for one, other in zip(*found, strict=True):
+        assert torch.allclose(other.camera.center / unit, one.camera.center, atol=1e-4)
+
+
+def test_a_small_image_sees_the_same():
+    small = shrink_camera(camera_at(size=96), 48)
+    assert (small.width, small.height) == (48, 48)
+    assert compute_field_of_view(small) == pytest.approx(compute_field_of_view(camera_at(size=96)))
+    assert shrink_camera(camera_at(size=40), 48).width == 40

@@ -1,0 +1,82 @@
+"""Completions that do not fit into memory are refused in a sentence, before any work."""
+
+import pytest
+
+from gscompleter import InputError
+from gscompleter.system.memory import (
+    check_bytes,
+    check_memory,
+    estimate_bytes,
+    estimate_scene_bytes,
+    read_memory_bytes,
+)
+
+
+@pytest.fixture
+def sixteen_gigabytes(monkeypatch) -> None:
+    monkeypatch.setattr("gscompleter.system.memory.read_memory_bytes", lambda: 16 * 10**9)
+
+
+@pytest.mark.parametrize(
+    "pixels", [10**12, 8000 * 8000, 16 * 10**6, 10**18, 10**400], ids=lambda n: f"{len(str(n))}"
+)
+def test_what_does_not_fit_is_refused_with_both_numbers(pixels, sixteen_gigabytes):
+    with pytest.raises(InputError, match=r"need about .* GB .* there are 16 GB") as error:
+        check_memory(pixels, 3)
+    assert len(str(error.value)) < 400
+
+
+@pytest.mark.parametrize(("pixels", "images"), [(256 * 256, 3), (512 * 768, 9), (10**6, 12)])
+def test_what_fits_is_not_refused(pixels, images, sixteen_gigabytes):
+    check_memory(pixels, images)
+
+
+def test_the_estimate_holds_what_was_measured_and_not_twice_as_much():
+    """Peak resident memory of `complete` on two photographs and one target."""
+    for pixels, measured in ((256 * 256, 669 * 10**6), (512 * 768, 1514 * 10**6)):
+        assert 0.95 * measured < estimate_bytes(pixels, 3) < 2 * measured
+
+
+WITNESSES = [256 * 384] * 2 + [213 * 320] * 28
+
+
+@pytest.mark.parametrize(("count", "measured"), [(1, 1.94), (4, 3.00), (10, 4.70)])
+def test_the_estimate_of_a_scene_holds_what_was_measured(count, measured):
+    """Peak resident memory in GB of `complete` with so many million Gaussians and `WITNESSES`."""
+    needed = estimate_bytes(256 * 384, 3) + estimate_scene_bytes(count * 10**6, 18, WITNESSES)
+    assert 0.95 * measured * 10**9 < needed < 2 * measured * 10**9
+
+
+def test_the_estimate_of_a_scene_with_harmonics_holds_what_was_measured():
+    """The same of two million with harmonics of degree 3, and 40 photographs."""
+    needed = estimate_bytes(180 * 320, 4) + estimate_scene_bytes(2 * 10**6, 64, [180 * 320] * 40)
+    assert 0.95 * 5.81e9 < needed < 2 * 5.81e9
+
+
+def test_memory_grows_less_than_with_each_photograph_of_a_large_scene():
+    one, many = (estimate_scene_bytes(10**7, 18, WITNESSES[:n]) for n in (8, 30))
+    assert many - one < 22 * 10**7 * 16 + 22 * 10**8
+
+
+def test_bytes_that_do_not_fit_are_refused_with_both_numbers(sixteen_gigabytes):
+    check_bytes(16 * 10**9, "The Gaussians", "crop the scene")
+    with pytest.raises(
+        InputError,
+        match="^The Gaussians need about 17 GB of memory, and there are 16 GB; crop the scene",
+    ):
+        check_bytes(16 * 10**9 + 1, "The Gaussians", "crop the scene")
+
+
+def test_ten_million_gaussians_fit_where_a_hundred_do_not():
+    few, many = (estimate_scene_bytes(10**power, 18, WITNESSES) for power in (7, 8))
+    assert estimate_bytes(256 * 384, 3) + few < 16 * 10**9 < many
+
+
+def test_a_container_may_hold_less_than_the_machine(tmp_path, monkeypatch):
+    (tmp_path / "memory.max").write_text("123456789\n")
+    monkeypatch.setattr("gscompleter.system.memory._LIMIT_FILES", (str(tmp_path / "memory.max"),))
+    assert read_memory_bytes() == 123456789
+    (tmp_path / "memory.max").write_text("max\n")
+    whole = read_memory_bytes()
+    assert whole is not None
+    assert whole > 10**9
