@@ -34,9 +34,12 @@ fuzz: $(VENV)/installed-test
 	$(BIN)/python tests/support/fuzz_python.py --calls 3000 --files 5000 --seed $(SEED)
 	$(BIN)/python tests/support/fuzz.py --count 1500 --seed $(SEED)
 
+# The last line prints how dense the source is: figures to read, without a limit.
 lint: $(VENV)/installed-dev
 	$(BIN)/ruff check .
 	$(BIN)/ruff format --check .
+	$(BIN)/codespell
+	$(BIN)/python tests/support/density.py
 
 format: $(VENV)/installed-dev
 	$(BIN)/ruff check --fix .

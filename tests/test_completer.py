@@ -297,15 +297,6 @@ def test_bad_input_is_refused_with_a_sentence():
         knowing()(views, target, behind)
 
 
-def test_check_views_have_their_old_keyword_still(monkeypatch):
-    def begin(completer, views, scene, check_views, targets):
-        raise InputError(f"{len(check_views)} check views")
-
-    monkeypatch.setattr(GSCompleter, "begin", begin)
-    with pytest.raises(InputError, match="^2 check views"):
-        knowing()(photographs(), cameras()[1], witnesses=photographs()[:2])
-
-
 def test_a_call_is_a_beginning_and_a_step_for_each_target():
     views, (_, target) = photographs(), cameras()
     targets = [target, camera_at(-0.9, yaw=-12, size=SIZE)]

@@ -94,13 +94,12 @@ class GSCompleter:
         """The renderer, with scenes frozen at the cameras that are visited again."""
         return SceneRenderer(self.renderer)
 
-    def __call__(  # noqa: D417  (an old name needs no explanation)
+    def __call__(
         self,
         views: Sequence[View],
         target: Camera | Sequence[Camera],
         scene: Gaussians | None = None,
         check_views: Sequence[View] | None = None,
-        witnesses: Sequence[View] | None = None,  # the old name of `check_views`
     ) -> Completion:
         """Complete what `views` never saw, as seen from one or several targets.
 
@@ -121,7 +120,6 @@ class GSCompleter:
         if scene is not None:
             check_gaussians(scene, "The scene")
             check_target_ids(scene, len(targets))
-        check_views = check_views if witnesses is None else witnesses
         return self.complete(self.begin(views, scene, check_views, targets), targets)
 
     def complete(self, state: Completion, targets: Sequence[Camera]) -> Completion:

@@ -22,8 +22,6 @@ import torch
 
 from command import run
 from gscompleter import load_ply
-from gscompleter.apps.commands.batch import parse_row
-from gscompleter.apps.commands.words import translate_name
 from gscompleter.cli import COMMANDS, parse_command
 from gscompleter.config import CompleterConfig
 from gscompleter.config.generators import GeneratorSettings
@@ -378,45 +376,6 @@ def test_the_options_of_a_generator_are_its_settings(scene, tmp_path):
     assert options.synthesis.make_settings() == DiffusersInpaintSettings(prompt="a quiet street")
     options = parse_command([str(word) for word in complete(scene, tmp_path)])
     assert options.synthesis.make_settings() == GeneratorSettings()
-
-
-@pytest.mark.parametrize(
-    ("old", "new"),
-    [
-        (("--keep-unsupported",), ("--no-recolor",)),
-        (("--keep_unsupported",), ("--no-recolor",)),
-        (("--film",), ("--video",)),
-        (("--generator-path", "a/b"), ("--generator-weights", "a/b")),
-        (("--generator-path=a/b",), ("--generator-weights", "a/b")),
-        (("--generator-at-once", 3), ("--generator-batch-size", 3)),
-    ],
-)
-def test_an_old_option_name_works_and_a_line_names_the_new_one(scene, tmp_path, capsys, old, new):
-    translate_name.cache_clear()
-    more = ("--generator", "pe-field")
-    options = [
-        parse_command(list(map(str, complete(scene, tmp_path, *more, *o)))) for o in (old, new)
-    ]
-    assert options[0] == options[1]
-    name = old[0].split("=")[0].replace("_", "-")
-    assert capsys.readouterr().err == (
-        f"gscompleter: {name} is now called {new[0]}; the old name stops working in the next "
-        "release.\n"
-    )
-
-
-def test_old_option_names_of_other_commands_and_of_rows_work_too(tmp_path, capsys):
-    translate_name.cache_clear()
-    words = ["evaluate", "cases.json", "--out", "o", "--again", "scores", "--ignore-masked"]
-    options = parse_command(words)
-    assert (options.rerun, options.ignore_moving) == ("scores", True)
-    assert (
-        parse_command(["batch", "m.csv", "--out", "o", "--again", "failures"]).rerun == "failures"
-    )
-    row = {"folder": "scene", "keep_unsupported": "true", "film": "no"}
-    options = parse_row(row, tmp_path)
-    assert (options.no_recolor, options.video) == (True, False)
-    assert capsys.readouterr().err.count("\n") == 4  # once each
 
 
 @pytest.mark.parametrize("command", COMMANDS)

@@ -3,7 +3,6 @@
 import re
 from collections.abc import Mapping
 from dataclasses import asdict
-from operator import attrgetter
 from pathlib import Path
 from typing import Any
 
@@ -19,7 +18,7 @@ from gscompleter.config import (
     get_named_config,
     load_config,
 )
-from gscompleter.config.settings import RENAMED, validate
+from gscompleter.config.settings import validate
 from gscompleter.evaluation.methods import METHODS
 from gscompleter.system.errors import InputError
 from paths import ROOT
@@ -229,38 +228,6 @@ def test_python_is_checked_alike_and_the_argument_is_named(config, name):
     with pytest.raises(InputError, match=name) as told:
         validate(config, "config.")
     assert told.value.argument == f"config.{name}"
-
-
-@pytest.mark.parametrize(
-    ("text", "sentence"),
-    [
-        ("harm: {tolerance: 1}", "setting harm.tolerance is now called psnr_guard.max_drop; use"),
-        ("harm: {}", "setting harm is now called psnr_guard; use the new name"),
-        ("harm: {loss: 1}", "setting harm is now called psnr_guard; use"),
-        ("harm: 3", "setting harm is now called psnr_guard"),
-        (
-            "registration: {affine: {bridge: none}}",
-            "affine.bridge is now called alignment.align_at",
-        ),
-        ("registration: {affine: {a: {b: 1}}}", "registration.affine is now called alignment; use"),
-        ("registration: {step: literal}", "called registration.lr_unit; use"),
-        ("support: {doubts: false}", "is now called trust; use"),
-        ("contradiction: {min_difference: 1}", "called dynamic_masks.min_color_difference"),
-    ],
-)
-def test_an_old_name_is_refused_with_the_new_one(tmp_path, text, sentence):
-    refused(tmp_path / "mine.yaml", text, sentence)
-
-
-@pytest.mark.parametrize("new", RENAMED.values())
-def test_every_new_name_is_a_setting(new):
-    assert attrgetter(new)(CompleterConfig()) is not None
-
-
-def test_no_old_name_is_a_setting_still():
-    for old in RENAMED:
-        with pytest.raises(AttributeError):
-            attrgetter(old)(CompleterConfig())
 
 
 def test_an_unknown_name_or_missing_file_gets_a_sentence():

@@ -17,12 +17,14 @@ MODULES = [
     module.name
     for module in walk_packages(gscompleter.__path__, "gscompleter.", onerror=pytest.fail)
     if not module.name.startswith("gscompleter.numerics.kernels")
+    # Its modules are listed one by one; the package itself has no annotation.
+    and module.name != "gscompleter.numerics"
 ]
 
 
 def test_every_module_but_the_compiled_ones_is_loaded_by_the_hook():
     files = Path(gscompleter.__path__[0]).rglob("*.py")
-    assert len(MODULES) == sum("kernels" not in path.parts for path in files) - 1
+    assert len(MODULES) == sum("kernels" not in path.parts for path in files) - 2
     plain = [name for name in MODULES if "jaxtyping" not in type(find_spec(name).loader).__module__]
     assert plain == []
 

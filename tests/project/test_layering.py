@@ -6,6 +6,8 @@ from collections.abc import Iterator
 from graphlib import TopologicalSorter
 from pathlib import Path
 
+import pytest
+
 from paths import ROOT
 
 PACKAGE = ROOT / "src" / "gscompleter"
@@ -66,6 +68,50 @@ def test_imports_point_down_or_stay_on_their_floor():
 def test_no_circle_of_packages():
     graph = TopologicalSorter(list_imports())
     graph.prepare()  # raises CycleError, which names the circle
+
+
+def orders_inside() -> dict[str, list[set[str]]]:
+    """Read the order of the rooms inside some packages, from the bottom up."""
+    text = (ROOT / "docs" / "architecture.md").read_text()
+    rows = re.findall(r"^\| `(\w+)` \| (.+) \|$", text, re.M)
+    return {
+        package: [set(re.findall(r"`(\w+)`", group)) for group in groups.split(", then ")]
+        for package, groups in rows
+        if "all others" in groups
+    }
+
+
+def list_imports_inside(package: str) -> dict[str, set[str]]:
+    """List, for every file and folder of a package, the others in it that it imports."""
+    found: dict[str, set[str]] = {}
+    for path in sorted((PACKAGE / package).rglob("*.py")):
+        room = path.relative_to(PACKAGE / package).parts[0].removesuffix(".py")
+        others = found.setdefault(room, set())
+        for node in ast.walk(ast.parse(path.read_text())):
+            if isinstance(node, ast.ImportFrom) and (node.module or "").startswith("gscompleter."):
+                _, owner, *inner = node.module.split(".")
+                if owner == package:
+                    others.update(inner[:1] or [alias.name for alias in node.names])
+        others.discard(room)
+    return {room: others & set(found) for room, others in found.items() if room != "__init__"}
+
+
+@pytest.mark.parametrize("package", sorted(orders_inside()))
+def test_imports_inside_a_package_point_down_and_make_no_circle(package):
+    order = orders_inside()[package]
+    imports = list_imports_inside(package)
+    named = set().union(*order)
+    assert named <= set(imports)
+    rank = {room: number for number, rooms in enumerate(order) for room in rooms or imports}
+    rank |= {room: number for number, rooms in enumerate(order) for room in rooms}
+    upward = [
+        f"{room} imports {other}"
+        for room, others in imports.items()
+        for other in others
+        if rank[other] > rank[room]
+    ]
+    assert upward == []
+    TopologicalSorter(imports).prepare()  # raises CycleError, which names the circle
 
 
 def test_no_circle_of_modules():

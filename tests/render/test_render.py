@@ -12,8 +12,8 @@ from gscompleter import Gaussians, InputError, Render, load_renderer, merge
 from gscompleter.numerics.geometry import compute_z_depths, move_to_depths
 from gscompleter.numerics.kernels import composite
 from gscompleter.render.cpu import CpuRenderer
+from gscompleter.render.device import choose_device
 from gscompleter.render.gsplat import CudaRenderer
-from gscompleter.render.loading import choose_device
 from gscompleter.render.redraw import RedrawnScene
 from gscompleter.types import make_observed, sh_from_rgb
 from parity import assert_close

@@ -31,34 +31,6 @@ Seed = Annotated[int, Interval(ge=0, lt=2**62)]
 MAX_CONFIG_BYTES = 65_536
 MAX_REASON_LENGTH = 120  # of a sentence about YAML
 
-RENAMED = {
-    "registration.affine.bridge": "alignment.align_at",
-    "registration.affine.min_agreement": "alignment.min_agreement",
-    "registration.affine.min_merged": "depth_agreement.reject_below",
-    "registration.affine": "alignment",
-    "registration.schedule": "registration.lr_schedule",
-    "registration.step": "registration.lr_unit",
-    "registration.depth_of": "registration.rendered_depth",
-    "registration.carry_into_holes": "registration.extrapolate_into_holes",
-    "holes.neighbourhood": "holes.candidate_radius",
-    "contradiction.min_difference": "dynamic_masks.min_color_difference",
-    "contradiction": "dynamic_masks",
-    "support.doubts": "trust",
-    "support.max_difference": "trust_settings.color_sigma",
-    "support.max_turn": "trust_settings.angle_sigma",
-    "support": "trust_settings",
-    "refine.min_fall": "refine.rel_tol",
-    "harm.tolerance": "psnr_guard.max_drop",
-    "harm.ssim_tolerance": "psnr_guard.max_ssim_drop",
-    "harm.max_loss": "psnr_guard.max_opacity_loss",
-    "harm": "psnr_guard",
-    "exploration.turn": "next_best_view.yaw_fraction",
-    "exploration.side": "next_best_view.image_size",
-    "exploration.reach": "next_best_view.border_radius",
-    "exploration": "next_best_view",
-}
-"""Old names of settings and groups of settings with today's."""
-
 
 class Settings:
     """Base of all settings: no unknown names, finite numbers only."""
@@ -113,10 +85,6 @@ def describe_invalid(wrong: ErrorDetails, name: str, settings: object) -> str:
     """Write the sentence about the setting called `name`."""
     given = wrong["input"]
     if wrong["type"] == "unexpected_keyword_argument":
-        is_group = isinstance(given, Mapping) and len(given) > 0
-        renamed = describe_renamed(f"{name}.{next(iter(given))}" if is_group else name)
-        if renamed is not None:
-            return renamed
         for part in wrong["loc"][:-1]:
             settings = getattr(settings, str(part))
         known = ", ".join(vars(settings))
@@ -125,14 +93,6 @@ def describe_invalid(wrong: ErrorDetails, name: str, settings: object) -> str:
     if wrong["type"] == "dataclass_type":
         return f"{name} is a group of settings, got {shown}."
     return f"{name} {re.sub(r'^[A-Z][a-z]+ should', 'must', wrong['msg'])}, got {shown}."
-
-
-def describe_renamed(path: str) -> str | None:
-    """Write the sentence about a setting under an old name; None if there was no such name."""
-    for old, new in RENAMED.items():
-        if f"{path}.".startswith(f"{old}."):
-            return f"The setting {old} is now called {new}; use the new name."
-    return None
 
 
 def read_yaml(path: Path) -> dict[str, Any]:

@@ -1,1 +1,1 @@
-"""What a user takes out of a splat: chosen objects, and floaters."""
+"""Changes that a user asks for: objects that are removed from a splat, and floaters."""

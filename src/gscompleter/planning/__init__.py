@@ -1,1 +1,1 @@
-"""Which cameras: the targets to complete next, and the photographs that are their context."""
+"""Cameras that are chosen: targets to complete next, and photographs that are their context."""

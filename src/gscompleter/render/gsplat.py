@@ -15,7 +15,7 @@ import torch
 from jaxtyping import Bool, Float, Int, Int64
 from torch import Tensor
 
-from gscompleter.render.loading import choose_device
+from gscompleter.render.device import choose_device
 from gscompleter.render.protocols import ColorErrors, ColorSums, OpacityRender
 from gscompleter.render.redraw import RedrawnScene, set_colors
 from gscompleter.render.spherical_harmonics import evaluate_colors

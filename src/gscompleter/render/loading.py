@@ -1,11 +1,6 @@
-"""Renderers by name, and the device on which they run."""
+"""Renderers by name."""
 
 from __future__ import annotations
-
-import importlib.util
-from typing import Literal
-
-import torch
 
 from gscompleter.render.protocols import Renderer
 from gscompleter.system.errors import InputError, quote_value
@@ -31,17 +26,3 @@ def load_renderer(name: str) -> Renderer:
 
         return CudaRenderer()
     raise InputError(f"There is no renderer '{quote_value(name)}'; choose reference, cpu or cuda.")
-
-
-def choose_device(device: Literal["auto", "cpu", "cuda"] = "auto") -> Literal["cpu", "cuda"]:
-    """Choose the device; `auto` uses a GPU if torch finds one and gsplat is installed."""
-    is_ready = torch.cuda.is_available() and importlib.util.find_spec("gsplat") is not None
-    if device == "cuda" and not is_ready:
-        raise InputError(
-            "The device cuda needs a GPU that torch sees, and gsplat from "
-            "`pip install gscompleter[cuda]`; without them, choose the device cpu.",
-            "device",
-        )
-    if device == "auto":
-        return "cuda" if is_ready else "cpu"
-    return device

@@ -1,4 +1,4 @@
-"""What a renderer has to do: render Gaussians, and freeze a scene for one camera."""
+"""Protocols of a renderer: it renders Gaussians, and freezes a scene for one camera."""
 
 from __future__ import annotations
 

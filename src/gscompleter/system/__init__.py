@@ -1,1 +1,1 @@
-"""What every part stands on: errors, progress, threads, memory, timing, files, jobs, plug-ins."""
+"""Errors, progress, threads, memory, timing, files, jobs and plug-ins: all others stand on them."""

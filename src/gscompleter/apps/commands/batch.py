@@ -25,7 +25,7 @@ from gscompleter.apps.commands.options import (
     EngineOptions,
     LiveOptions,
 )
-from gscompleter.apps.commands.words import format_error, parse_words, translate_name
+from gscompleter.apps.commands.words import format_error, parse_words
 from gscompleter.config.settings import validate
 from gscompleter.system.errors import InputError, join_names, quote_value
 from gscompleter.system.files.overlap import refuse_overlap
@@ -184,7 +184,7 @@ def parse_row(row: Mapping[str, Any], out: Path) -> CompleteOptions:
 def row_to_words(row: Mapping[str, Any], prefix: str = "") -> Iterator[str]:
     """Convert a row to words of a command line."""
     for key, value in row.items():
-        name = translate_name(f"{prefix}{key}".replace("_", "-"))
+        name = f"{prefix}{key}".replace("_", "-")
         if name in RESERVED:
             raise InputError(f"A row cannot set '{quote_value(name)}'; the batch sets it.")
         if isinstance(value, Mapping):

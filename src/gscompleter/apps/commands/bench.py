@@ -42,7 +42,8 @@ from gscompleter.data.scene import write_cameras
 from gscompleter.evaluation.methods import Models
 from gscompleter.generators import load_generator
 from gscompleter.reconstructors import load_reconstructor
-from gscompleter.render.loading import choose_device, load_renderer
+from gscompleter.render.device import choose_device
+from gscompleter.render.loading import load_renderer
 from gscompleter.system.files.output_folder import check_output, open_output_folder
 from gscompleter.system.progress import show_preparation, show_progress, stage
 

@@ -39,7 +39,8 @@ from gscompleter.apps.warmup import compile_kernels
 from gscompleter.editing.cleaning import find_superfluous
 from gscompleter.editing.floaters import find_floaters
 from gscompleter.evaluation.metrics.image import compute_masked_psnr
-from gscompleter.render.loading import choose_device, load_renderer
+from gscompleter.render.device import choose_device
+from gscompleter.render.loading import load_renderer
 from gscompleter.render.protocols import Renderer
 from gscompleter.splats.formats import load_splat
 from gscompleter.system.errors import InputError, quote_value

@@ -69,7 +69,8 @@ from gscompleter.generators import load_generator
 from gscompleter.numerics.kernels.parallel import run_in_background
 from gscompleter.planning.planner import Choice, ViewPlanner
 from gscompleter.reconstructors import check_reconstructor, load_reconstructor
-from gscompleter.render.loading import choose_device, load_renderer
+from gscompleter.render.device import choose_device
+from gscompleter.render.loading import load_renderer
 from gscompleter.render.lod import MIN_PROXY_GAUSSIANS
 from gscompleter.splats.alignment.similarity import transform_camera, transform_camera_exactly
 from gscompleter.splats.formats import load_splat

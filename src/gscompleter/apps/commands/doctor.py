@@ -20,7 +20,8 @@ from gscompleter.models.weights.fetching import find_cached
 from gscompleter.models.weights.published import PUBLISHED
 from gscompleter.numerics.kernels.cache import CACHE
 from gscompleter.numerics.kernels.compiled import get_cache_folder, is_compiled
-from gscompleter.render.loading import choose_device, load_renderer
+from gscompleter.render.device import choose_device
+from gscompleter.render.loading import load_renderer
 from gscompleter.system.errors import InputError
 from gscompleter.system.files.writing import get_download_folder
 from gscompleter.system.progress import show_progress

@@ -34,7 +34,7 @@ from gscompleter.evaluation.paper import get_data_set
 from gscompleter.evaluation.runner import RunConfig, evaluate
 from gscompleter.evaluation.store import list_row_paths
 from gscompleter.evaluation.tables import RunSummary
-from gscompleter.render.loading import choose_device
+from gscompleter.render.device import choose_device
 from gscompleter.system.errors import InputError, quote_value
 from gscompleter.system.files.output_file import reserve_file
 from gscompleter.system.jobs.jobs import parse_shard

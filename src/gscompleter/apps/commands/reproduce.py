@@ -29,7 +29,7 @@ from gscompleter.evaluation.paper_tables import fill_table, write_paper_table
 from gscompleter.evaluation.protocols import list_indices
 from gscompleter.evaluation.store import make_file_name
 from gscompleter.evaluation.tables import format_markdown, write_tables
-from gscompleter.render.loading import choose_device
+from gscompleter.render.device import choose_device
 from gscompleter.system.errors import InputError, NoCaseError, OutputError, quote_value
 from gscompleter.system.files.writing import encode_text, replace_file
 from gscompleter.system.jobs.jobs import make_folder

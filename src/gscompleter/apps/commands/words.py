@@ -2,12 +2,9 @@
 
 from __future__ import annotations
 
-import re
-import sys
 from collections.abc import Callable, Collection, Sequence
 from contextlib import redirect_stderr
 from dataclasses import dataclass, replace
-from functools import cache
 from inspect import get_annotations
 from io import StringIO
 from itertools import dropwhile, takewhile
@@ -23,8 +20,8 @@ from tyro.constructors import (
 
 from gscompleter.apps.commands.options import DEFAULT_NUM_TARGETS
 from gscompleter.config import CompleterConfig, load_config
-from gscompleter.config.settings import Settings, describe_renamed
-from gscompleter.system.errors import PROGRAM, InputError, quote_value
+from gscompleter.config.settings import Settings
+from gscompleter.system.errors import InputError, quote_value
 
 HELP = ("-h", "--help")
 HELP_ALL = "--help-all"
@@ -38,18 +35,6 @@ CONFIG = StructFieldSpec(
 )
 
 Rule = Callable[[StructTypeInfo], StructConstructorSpec | None]
-
-RENAMED = {
-    "keep-unsupported": "no-recolor",
-    "no-prune": "no-recolor",
-    "generator-path": "generator-weights",
-    "generator-at-once": "generator-batch-size",
-    "film": "video",
-    "again": "rerun",
-    "ignore-masked": "ignore-moving",
-    "use-masks": "ignore-moving",
-}
-"""Names of the last release with today's; they are accepted for one release."""
 
 HINTS = {"Argument helptext:": "give", "Perhaps you meant:": "the nearest is"}
 """Titles in tyro's messages before the option that is meant."""
@@ -67,7 +52,6 @@ def parse_words(words: Sequence[str], command: Any, names: Collection[str]) -> A
 
     It raises InputError for wrong words, and SystemExit after printing the help.
     """
-    words = [re.sub(r"^--([\w-]+)", lambda old: f"--{translate_name(old[1])}", w) for w in words]
     if words and words[0] not in names and words[0] not in (*HELP, HELP_ALL):
         raise InputError(
             f"There is no command {quote_value(words[0])}; choose one of {', '.join(names)} "
@@ -78,7 +62,6 @@ def parse_words(words: Sequence[str], command: Any, names: Collection[str]) -> A
     helps = [make_help_rule(show_all=HELP_ALL in words)] if asked else []
     words = ["--help" if word == HELP_ALL else word for word in words]
     check_once(words)
-    refuse_old_settings(words)
     printed = StringIO()
     try:
         with redirect_stderr(printed):
@@ -123,16 +106,6 @@ def check_once(words: Sequence[str]) -> None:
             f"{quote_value(twice)} is given twice, and only one of them would count; name it "
             "once, with all its values after it."
         )
-
-
-def refuse_old_settings(words: Sequence[str]) -> None:
-    """Refuse a setting of the method under an old name."""
-    for word in words:
-        name = word.partition("=")[0].replace("-", "_")
-        _, _, path = name.partition("__config.")
-        sentence = describe_renamed(path)
-        if sentence is not None:
-            raise InputError(sentence)
 
 
 def insert_auto_count(words: Sequence[str]) -> list[str]:
@@ -228,17 +201,3 @@ def extract_sentence(box: str) -> str:
         if title in lines:
             hint = f"; {words} {lines[lines.index(title) + 1].strip()}"
     return f"{quote_value(sentence, 200).removesuffix('.')}{hint}"
-
-
-@cache
-def translate_name(name: str) -> str:
-    """Return today's name of an option without dashes; warn of an old one once per process."""
-    old = name.replace("_", "-")
-    if old not in RENAMED:
-        return name
-    print(
-        f"{PROGRAM}--{old} is now called --{RENAMED[old]}; the old name stops working in the next "
-        "release.",
-        file=sys.stderr,
-    )
-    return RENAMED[old]

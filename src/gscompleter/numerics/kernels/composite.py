@@ -1,6 +1,6 @@
 """Compositing of splats tile by tile, front to back, and its gradients, back to front.
 
-Splats are listed in the 16 × 16 tiles that they touch (`kernels/tiles.py`). Two lists are merged by
+Splats are listed in the 16 × 16 tiles that they touch (`tiles.py`). Two lists are merged by
 depth: the frozen `context`, and `new`, which gets gradients.
 """
 

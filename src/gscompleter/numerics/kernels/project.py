@@ -12,7 +12,7 @@ BLUR = np.float32(0.3)
 TANGENT_MARGIN = np.float32(0.15)
 
 X, Y, U, V, W, DEPTH, RED, GREEN, BLUE = range(9)
-"""Columns of the splats, see `kernels/simd.py`."""
+"""Columns of the splats, see `simd.py`."""
 NUM_SPLAT_COLUMNS = 9
 
 SUM, SUM_S, SUM_T, SUM_SS, SUM_ST, SUM_TT, SUM_DEPTH, SUM_RED = range(8)
