@@ -9,12 +9,12 @@ import tempfile
 from pathlib import Path
 
 import numpy as np
-from gscompleter.system.files.image import convert_to_pixels
 from PIL import Image
 
 import gscompleter as gsc
 from gscompleter.apps.commands.demo import write_motorcycle_scene
 from gscompleter.apps.report.film import draw_corner_label
+from gscompleter.system.files.image import convert_to_pixels
 
 RESOLUTION = (500, 740)
 GAP_PX = 8

@@ -9,9 +9,8 @@ target frame.
 import sys
 from pathlib import Path
 
-from gscompleter.system.files.image import write_image
-
 import gscompleter as gsc
+from gscompleter.system.files.image import write_image
 
 
 def main() -> None:

@@ -13,8 +13,6 @@ from pathlib import Path
 from typing import Any, ClassVar
 
 import torch
-from gscompleter.system.files.image import write_image
-from gscompleter.system.files.output_folder import open_output_folder
 from torch import Tensor
 from torch.nn.functional import interpolate
 
@@ -22,6 +20,8 @@ import gscompleter as gsc
 from gscompleter.apps.report.completion import InputSplatFile, write_scenes
 from gscompleter.data.formats import open_photographs
 from gscompleter.generators import GeneratorOutput, GeneratorRequest
+from gscompleter.system.files.image import write_image
+from gscompleter.system.files.output_folder import open_output_folder
 
 HANDLE = "GSCOMPLETER_HOLES"
 """Type of the link between both nodes."""

@@ -239,7 +239,7 @@ class PaddedCamera:
     top: int
 
     def crop(self, image: Shaped[Tensor, "wide_h wide_w *c"]) -> Shaped[Tensor, "h w *c"]:
-        """Cut the padding off an image of `pad_depth`."""
+        """Cut the padding off an image [h, w, ...] of the padded camera."""
         rows = slice(self.top, self.top + self.target.height)
         return image[rows, self.left : self.left + self.target.width]
 

@@ -7,10 +7,10 @@ from typing import Any
 
 import pytest
 import torch
-from gscompleter.system.files.image import write_image
 
 from browsing import Tab, launched
 from gscompleter.apps.report.page import write_overview
+from gscompleter.system.files.image import write_image
 from gscompleter.system.jobs.jobs import Job
 
 pytestmark = pytest.mark.browser

@@ -7,13 +7,13 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from gscompleter.system.files.image import read_pixels
 from PIL import Image
 
 from command import run
 from exact_room import ExactCamera, make_cameras, write_colmap, write_transforms
 from gscompleter import load_ply
 from gscompleter.evaluation.store import list_row_paths
+from gscompleter.system.files.image import read_pixels
 
 WIDTH, HEIGHT = 96, 72
 HIDDEN_ROWS = HEIGHT // 4

@@ -20,7 +20,6 @@ import numpy as np
 import plyfile
 import pytest
 import torch
-from gscompleter.system.files.image import write_image
 
 from command import run
 from gscompleter.apps.commands.view import make_page_server
@@ -57,6 +56,7 @@ from gscompleter.evaluation.metrics.coverage import Coverage
 from gscompleter.splats.formats import load_splat
 from gscompleter.splats.ply import save_ply
 from gscompleter.system.errors import InputError
+from gscompleter.system.files.image import write_image
 from gscompleter.types import Gaussians, merge
 from pose_files import CAMERAS, NAMES, write_colmap_binary, write_photographs
 from scenes import camera_at

@@ -9,7 +9,6 @@ import cv2
 import numpy as np
 import pytest
 import torch
-from gscompleter.system.files.image import write_image
 from PIL import Image
 from test_pose_formats import check_room, write_cloud
 
@@ -19,6 +18,7 @@ from gscompleter.data.cameras import Distortion, distort
 from gscompleter.data.colmap import MODELS, _list_roots, build_intrinsics
 from gscompleter.data.formats import open_photographs
 from gscompleter.data.points import add_depth_range
+from gscompleter.system.files.image import write_image
 from gscompleter.types import Camera, View
 from pose_files import (
     CAMERAS,

@@ -10,8 +10,6 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
-from gscompleter.system.files.image import read_image, write_image
-from gscompleter.system.files.reading import read_json
 from torch import Tensor
 
 from command import run
@@ -25,6 +23,8 @@ from gscompleter.reconstructors import load_reconstructor
 from gscompleter.reconstructors.features.matches import detect_features
 from gscompleter.reconstructors.features.stereo_image import make_stereo_images
 from gscompleter.stages.context import reconstruct_context
+from gscompleter.system.files.image import read_image, write_image
+from gscompleter.system.files.reading import read_json
 from gscompleter.types import SH_C0, Camera
 from scenes import camera_at, open_street
 

@@ -7,7 +7,6 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
-from gscompleter.system.files.image import write_image
 from PIL import Image
 
 from command import run
@@ -19,6 +18,7 @@ from gscompleter.data.given_depth import drop_edges, drop_hidden, give_depths
 from gscompleter.evaluation.metrics.geometry import compare_depths
 from gscompleter.evaluation.metrics.image import compute_masked_psnr
 from gscompleter.numerics.geometry import project
+from gscompleter.system.files.image import write_image
 from gscompleter.types import Camera
 from pose_files import CAMERAS, NAMES, write_colmap_binary, write_colmap_text, write_photographs
 from scenes import Room, camera_at, photographed, view_of

@@ -9,7 +9,6 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
-from gscompleter.system.files.image import ORIENTATION, read_mask
 from PIL import Image
 
 from exact_room import ExactCamera, make_cameras, write_colmap, write_transforms
@@ -18,6 +17,7 @@ from gscompleter.data.file_names import FolderListings
 from gscompleter.data.formats import open_photographs
 from gscompleter.data.masks import fill_hidden, find_mask, leave_out_masks, load_mask
 from gscompleter.data.sfm.poses import list_all_photographs, write_upright
+from gscompleter.system.files.image import ORIENTATION, read_mask
 
 WIDTH, HEIGHT = 64, 48
 HIDDEN_ROWS = HEIGHT // 4

@@ -5,7 +5,6 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
-from gscompleter.system.files.image import write_image
 from PIL import Image
 from test_poses import similarity_removed
 
@@ -13,6 +12,7 @@ from command import run
 from gscompleter.data.formats import open_photographs
 from gscompleter.data.panorama import VIEWS, compute_rotation, has_panoramas, split_panorama
 from gscompleter.data.sfm.poses import list_photograph_files
+from gscompleter.system.files.image import write_image
 from gscompleter.types import Camera
 from scenes import Room, camera_at, cast, cast_rays, view_of
 

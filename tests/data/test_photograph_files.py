@@ -9,7 +9,6 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
-from gscompleter.system.files.image import ORIENTATION, read_pixels, turn_upright
 from PIL import Image, ImageOps, features
 
 from exact_room import make_cameras, make_pose, write_colmap, write_photographs, write_transforms
@@ -17,6 +16,7 @@ from gscompleter import InputError, load_cameras
 from gscompleter.data.file_names import list_endings
 from gscompleter.data.formats import open_photographs
 from gscompleter.system.files import image as image_io
+from gscompleter.system.files.image import ORIENTATION, read_pixels, turn_upright
 
 WIDTH, HEIGHT = 64, 48
 CAMERAS = make_cameras(4, width=WIDTH, height=HEIGHT, focal=52.0)

@@ -8,7 +8,6 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from gscompleter.system.files.image import write_image
 from PIL import Image
 
 from command import run
@@ -28,6 +27,7 @@ from gscompleter.data.sfm.poses import (
     write_upright,
 )
 from gscompleter.system.errors import InputError
+from gscompleter.system.files.image import write_image
 from scenes import Room, camera_at, view_of
 
 CAMERAS = [

@@ -7,13 +7,13 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
-from gscompleter.system.files.output_folder import open_output_folder
 from PIL import Image
 
 from gscompleter import InputError, load_camera, load_cameras, load_views
 from gscompleter.data.formats import open_photographs
 from gscompleter.data.scene import write_cameras
 from gscompleter.numerics.geometry import is_inside, project, sample, unproject
+from gscompleter.system.files.output_folder import open_output_folder
 from scenes import camera_at
 
 OPENGL = np.diag([1.0, -1.0, -1.0, 1.0])

@@ -7,8 +7,6 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pytest
-from gscompleter.system.files.image import convert_to_pixels
-from gscompleter.system.files.video import find_ffmpeg, read_frames, write_video
 from PIL import Image
 from test_panorama import panorama
 from test_poses import model_script, similarity_removed, stand_in
@@ -20,6 +18,8 @@ from gscompleter.data.sfm import poses
 from gscompleter.data.sfm.poses import find_poses
 from gscompleter.data.video import extract_frames, is_video, measure_frames, select_frames
 from gscompleter.system.errors import InputError
+from gscompleter.system.files.image import convert_to_pixels
+from gscompleter.system.files.video import find_ffmpeg, read_frames, write_video
 from scenes import Room, camera_at, view_of
 
 pytest.importorskip("imageio_ffmpeg")

@@ -11,7 +11,6 @@ from typing import get_args
 import numpy as np
 import pytest
 import torch
-from gscompleter.system.files.image import read_pixels
 
 import tiny_diffusion
 from chunk_files import example, save_chunk
@@ -34,6 +33,7 @@ from gscompleter.evaluation.runner import RunConfig
 from gscompleter.models.feed_forward import MVSplat
 from gscompleter.models.weights.published import PUBLISHED
 from gscompleter.system.errors import InputError
+from gscompleter.system.files.image import read_pixels
 from scenes import Room, camera_at, view_of
 
 PAPER = load_paper()

@@ -15,7 +15,6 @@ from random import Random
 
 import pytest
 import torch
-from gscompleter.system.files.image import read_image
 
 from chunk_files import as_tensor, example, save_chunk
 from command import run
@@ -45,6 +44,7 @@ from gscompleter.evaluation.store import (
 )
 from gscompleter.evaluation.tables import summarize_run, write_tables
 from gscompleter.system import memory
+from gscompleter.system.files.image import read_image
 from gscompleter.system.timing import STAGES
 from scenes import Room, camera_at, photographed
 

@@ -10,7 +10,6 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
-from gscompleter.system.files.image import read_pixels
 
 from command import run
 from gscompleter import InputError
@@ -34,6 +33,7 @@ from gscompleter.evaluation.steps import (
 from gscompleter.evaluation.store import read_json
 from gscompleter.evaluation.tables import write_tables
 from gscompleter.numerics.geometry import slide
+from gscompleter.system.files.image import read_pixels
 from gscompleter.types import View
 from scenes import Room, camera_at, gaussians_of, photographed, view_of
 

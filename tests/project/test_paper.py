@@ -1,22 +1,23 @@
 """Equations and sections that the code cites have the numbers of the paper."""
 
 import re
+from importlib import import_module
 from pathlib import Path
 
 import pytest
 
 import gscompleter
-from gscompleter.stages import (
-    align_depth,
-    context,
-    lift,
-    refine,
-    select_anchor,
-    slide_along_rays,
-    synthesize,
-    target_view,
-)
 from gscompleter.types import DepthAffine
+
+# As names of `gscompleter.stages` they are the functions.
+align_depth = import_module("gscompleter.stages.align_depth")
+context = import_module("gscompleter.stages.context")
+lift = import_module("gscompleter.stages.lift")
+refine = import_module("gscompleter.stages.refine")
+select_anchor = import_module("gscompleter.stages.select_anchor")
+slide_along_rays = import_module("gscompleter.stages.slide_along_rays")
+synthesize = import_module("gscompleter.stages.synthesize")
+target_view = import_module("gscompleter.stages.target_view")
 
 EQUATIONS = {
     5: (r"\Psi(\mathcal{V}_{\text{in}}; \Theta)", [context.init_context]),

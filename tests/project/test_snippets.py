@@ -264,7 +264,7 @@ def test_python_runs(page, sandbox):
     ("script", "prints"),
     [
         ("01_complete_a_scene", "Gaussians joined"),
-        ("05_stage_by_stage", "left"),
+        ("04_stage_by_stage", "left"),
         pytest.param("02_bring_your_own_models", "joined", marks=pytest.mark.slow),
         pytest.param("03_bring_your_own_generator", "joined", marks=pytest.mark.slow),
     ],

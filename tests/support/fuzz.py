@@ -93,13 +93,13 @@ def build(folder: Path) -> None:
     """Write one valid input of every kind."""
     import numpy as np
     import torch
-    from gscompleter.system.files.image import convert_to_pixels
-    from gscompleter.system.files.video import write_video
 
     from chunk_files import example, save_chunk
     from driving_files import write_drive, write_infos, write_swept_dgp
     from gscompleter import save_ply
     from gscompleter.data.scene import write_cameras
+    from gscompleter.system.files.image import convert_to_pixels
+    from gscompleter.system.files.video import write_video
     from phone_files import polycam, record3d, scanner_app, write_archive, write_folder
     from pose_files import WRITERS, write_camera_list
     from scenes import Room, camera_at, gaussians_of, photographed, view_of

@@ -12,10 +12,10 @@ from pathlib import Path
 
 import numpy as np
 import torch
-from gscompleter.system.files.image import convert_to_pixels
 from PIL import Image
 from scipy.spatial.transform import Rotation
 
+from gscompleter.system.files.image import convert_to_pixels
 from gscompleter.types import Camera
 from scenes import Room, view_of
 

@@ -9,10 +9,10 @@ from pathlib import Path
 
 import numpy as np
 import torch
-from gscompleter.system.files.image import write_image
 
 from gscompleter.data.colmap import MODELS
 from gscompleter.data.scene import write_cameras
+from gscompleter.system.files.image import write_image
 from gscompleter.types import Camera, View
 from scenes import Room, camera_at, view_of
 

@@ -14,13 +14,13 @@ from pathlib import Path
 import numpy as np
 import plyfile
 import torch
-from gscompleter.system.files.image import write_image
 from jaxtyping import Float
 from torch import Tensor
 
 from gscompleter.data.scene import write_cameras
 from gscompleter.generators import GeneratorOutput, GeneratorRequest, as_generator
 from gscompleter.splats.ply import save_ply
+from gscompleter.system.files.image import write_image
 from gscompleter.types import (
     Camera,
     DepthMap,

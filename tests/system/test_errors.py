@@ -3,7 +3,6 @@
 from pathlib import Path
 
 import pytest
-from gscompleter.system.files.image import read_pixels
 
 from gscompleter import load_ply, load_splat
 from gscompleter.apps.commands.words import format_error
@@ -13,6 +12,7 @@ from gscompleter.data.real_estate import open_chunks
 from gscompleter.data.sfm.poses import write_upright
 from gscompleter.models.weights.reading import check_kind
 from gscompleter.system.errors import InputError, join_names, quote_value
+from gscompleter.system.files.image import read_pixels
 
 
 def test_a_short_value_is_quoted_as_it_is():

@@ -11,6 +11,8 @@ from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
+
+from gscompleter import InputError
 from gscompleter.system.files.output_folder import (
     check_output,
     open_output_folder,
@@ -18,8 +20,6 @@ from gscompleter.system.files.output_folder import (
     reserve_output,
 )
 from gscompleter.system.files.unfinished import make_unfinished_name
-
-from gscompleter import InputError
 from gscompleter.system.files.writing import replace_file
 
 SUMMARY = "summary.json"

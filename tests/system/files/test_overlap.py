@@ -5,9 +5,9 @@ import os
 from pathlib import Path
 
 import pytest
-from gscompleter.system.files.overlap import refuse_input_file, refuse_overlap
 
 from gscompleter import InputError
+from gscompleter.system.files.overlap import refuse_input_file, refuse_overlap
 
 
 @pytest.fixture

@@ -4,9 +4,9 @@ import os
 import socket
 
 import pytest
-from gscompleter.system.files.reading import check_plain, read_bytes, read_head, read_lines
 
 from gscompleter import InputError, load_splat
+from gscompleter.system.files.reading import check_plain, read_bytes, read_head, read_lines
 from splat_files import made, plausible
 
 

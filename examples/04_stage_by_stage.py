@@ -1,6 +1,6 @@
 """The four stages of the paper, one call each.
 
-    python examples/05_stage_by_stage.py SCENE 0 4 8
+    python examples/04_stage_by_stage.py SCENE 0 4 8
 
 SCENE is what `gscompleter complete` takes; the numbers are two context frames and the target frame.
 `GSCompleter` does this with a wider target image, and checks what is added against the photographs.
@@ -11,15 +11,9 @@ import sys
 import torch
 
 import gscompleter as gsc
+from gscompleter import stages
 from gscompleter.numerics.geometry import pad_camera
 from gscompleter.render.cache import SceneRenderer
-from gscompleter.stages.align_depth import align_depth
-from gscompleter.stages.filter_holes import filter_holes
-from gscompleter.stages.lift import lift
-from gscompleter.stages.refine import refine
-from gscompleter.stages.slide_along_rays import slide_along_rays
-from gscompleter.stages.synthesize import synthesize
-from gscompleter.stages.target_view import compute_hole_mask, render_target
 
 
 def main() -> None:
@@ -35,20 +29,20 @@ def main() -> None:
     # 2. Anchor and lift: an image at the target, and its stereo with the best photograph.
     target = state.with_depth_range(gsc.load_camera(scene, frame=number, resolution=256))
     scenes = SceneRenderer(gsc.load_renderer("cpu"))
-    view = render_target(state, pad_camera(target, 0.0), scenes)
-    (image,) = synthesize(phi, [(target, view.make_generator_input())])
-    lifted = lift(psi, image, view)
+    view = stages.render_target(state, pad_camera(target, 0.0), scenes)
+    (image,) = stages.synthesize(phi, [(target, view.make_generator_input())])
+    lifted = stages.lift(psi, image, view)
     print(f"anchor: context view {view.anchor.index}; {len(lifted.gaussians):,} candidates")
 
     # 3. Register: one affine for all depths, then each Gaussian along its ray.
-    affine = align_depth(lifted, view, torch.Generator().manual_seed(0))
-    moved = slide_along_rays(lifted, affine, image, view)
+    affine = stages.align_depth(lifted, view, torch.Generator().manual_seed(0))
+    moved = stages.slide_along_rays(lifted, affine, image, view)
     print(f"affine: {affine}")
     print(f"loss: {moved.losses[0]:.4f} to {moved.losses[-1]:.4f}")
 
     # 4. Integrate: what lies in the hole, with opacities that suit all images.
-    added = refine(filter_holes(moved, view), image, view).gaussians
-    left = compute_hole_mask(view.frozen.composite(added).alpha)
+    added = stages.refine(stages.filter_holes(moved, view), image, view).gaussians
+    left = stages.compute_hole_mask(view.frozen.composite(added).alpha)
     shares = view.empty.float().mean(), left.float().mean()
     print("holes: {:.1%} of the target's pixels, {:.1%} left".format(*shares))
     gsc.save_ply("completed.ply", gsc.merge([state.context, added]))

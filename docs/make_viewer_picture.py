@@ -1,7 +1,7 @@
 """Make the README's picture of the viewer anew.
 
     make demo
-    python examples/04_picture_of_the_viewer.py demo docs/viewer.png
+    python docs/make_viewer_picture.py demo docs/viewer.png
 
 Needs `pip install 'gscompleter[browser]'` and Debian's chromium, which draws in software.
 """
