@@ -2,8 +2,8 @@
 
 An input splat is completed in its own file: its rows stay byte for byte, `uchar generated` is
 appended to them, and new rows follow. Removing both restores the input file. Gaussians that were
-removed or recoloured are in `removed.ply` as they were, with their row numbers in the input scene: a 3DGS .ply with a further element
-`place` that has one property `uint row`.
+removed or recoloured are in `removed.ply` as they were, with their row numbers in the input scene:
+a 3DGS .ply with a further element `place` that has one property `uint row`.
 """
 
 from __future__ import annotations

@@ -1,9 +1,9 @@
 """The steps of a completion, a file each.
 
 Those of the paper, in its order: `context`, `synthesize`, `select_anchor`, `lift`, `align_depth`,
-`slide_along_rays`, `filter_holes` and `refine`. Ours are `recolor` and `new_photos`, for splats that
-somebody trained, and `find_unfilled`, for the report. `target_view` is the scene as one target sees
-it, which all of them read.
+`slide_along_rays`, `filter_holes` and `refine`. Ours are `recolor` and `new_photos`, for splats
+that somebody trained, and `find_unfilled`, for the report. `target_view` is the scene as one target
+sees it, which all of them read.
 """
 
 from __future__ import annotations
