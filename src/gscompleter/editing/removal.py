@@ -71,7 +71,7 @@ def remove_gaussians(
         proxy_index=renumber(source, chosen, unused, gone),
         removed=merge([source.removed, replace(inner, sh=inner.sh[:, :1])]),
     )
-    # `parts[0]` is the rendered context itself until a target recolours it, and stays so.
+    # As long as nothing is recoloured, `parts[0]` is the rendered context itself, which tells so.
     context = remaining.rendered if first is source.rendered else first[~gone]
     # Outer pieces are no Gaussians of the file: they are added to it, with a label of their own.
     rest = replace(outer, generated=torch.full_like(outer.generated, NEW_PHOTO_ID))
@@ -144,8 +144,8 @@ def restore_surroundings(state: Completion, renderer: Renderer) -> Completion:
     rendered = merge([source.rendered, returned])
     first = rendered if state.parts[0] is source.rendered else merge([state.parts[0], returned])
 
-    # Colours of additions were fitted to images of the hole alone. The photographs show them beside
-    # it; ignored pixels are painted with the scene itself, so that they stay in the hole.
+    # Additions reach beyond the hole, where photographs tell their colours. Ignored pixels show the
+    # scene itself, so that colours stay as they are in the hole.
     frozen = [renderer.freeze(first, view.camera) for view in views]
     added = merge([rest, added])
     images = [

@@ -74,8 +74,9 @@ class FunctionGenerator:
         outputs = []
         for request in requests:
             answer = self.function(request.nearest, request.target, request.context)
-            is_output = isinstance(answer, GeneratorOutput)
-            outputs.append(answer if is_output else GeneratorOutput(answer))
+            if not isinstance(answer, GeneratorOutput):
+                answer = GeneratorOutput(answer)
+            outputs.append(answer)
         return outputs
 
 

@@ -74,7 +74,15 @@ def paint_consistently(
         )
     if best.is_consistent:
         return GeneratorOutput(best.image)
-    note = describe_disagreement(best, observed, len(attempts))
+
+    gains = ", ".join(f"{gain:.2f}" for gain in best.gain.tolist())
+    seeds = "" if len(attempts) == 1 else f" (best of {len(attempts)} seeds)"
+    note = (
+        "The synthesized image disagrees with the photographs: over the "
+        f"{observed.known.float().mean():.0%} of it that they show, colours differ by "
+        f"{best.residual:.3f} ({best.limit:.3f} is the limit) after scaling the channels by "
+        f"{gains}{seeds}."
+    )
     return GeneratorOutput(best.image, (note,), is_inconsistent=True)
 
 
@@ -109,7 +117,8 @@ def compare_with_observed(
     is_offset_plausible = bool((offset.abs() <= MAX_OFFSET).all())
     agrees = is_gain_plausible and is_offset_plausible and residual <= limit
     if agrees and not correct_color:
-        gain, offset = ones, zeros
+        gain = ones
+        offset = zeros
     corrected = (gain * image + offset).clamp(0, 1) if agrees else image
     return Agreement(gain, offset, residual, limit, agrees, corrected)
 
@@ -117,15 +126,3 @@ def compare_with_observed(
 def compute_quantile(values: Float[Tensor, "n"], share: float) -> float:
     """Return the value below which a fraction `share` of the values lies."""
     return values.kthvalue(1 + int(share * (len(values) - 1))).values.item()
-
-
-def describe_disagreement(agreement: Agreement, observed: WarpedImage, num_seeds: int) -> str:
-    """Describe an inconsistent image for a reader of the results."""
-    gains = ", ".join(f"{gain:.2f}" for gain in agreement.gain.tolist())
-    seeds = "" if num_seeds == 1 else f" (best of {num_seeds} seeds)"
-    return (
-        "The synthesized image disagrees with the photographs: over the "
-        f"{observed.known.float().mean():.0%} of it that they show, colours differ by "
-        f"{agreement.residual:.3f} ({agreement.limit:.3f} is the limit) after scaling the "
-        f"channels by {gains}{seeds}."
-    )

@@ -134,8 +134,7 @@ class ViewPlanner:
             completion = complete(completion, choice.camera)
             chosen.append(choice)
 
-            # A completion can only close holes, so that what gains too little now is not scored
-            # again.
+            # What gains too little now is not scored again: a completion only closes holes.
             remaining = [
                 other.candidate
                 for other in choices
