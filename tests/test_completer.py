@@ -24,7 +24,7 @@ from gscompleter.numerics.geometry import project
 from gscompleter.render.cpu import CpuRenderer
 from gscompleter.render.reference import adapt_to_mode
 from gscompleter.stages.lift import lift_pair
-from gscompleter.stages.slide_along_rays import apply_affine
+from gscompleter.stages.register import apply_affine
 from gscompleter.stages.target_view import compute_hole_mask
 from gscompleter.state import Completion
 from gscompleter.system.timing import STAGES
@@ -159,7 +159,7 @@ def test_the_depth_error_of_the_completed_region_shrinks_through_each_stage():
         return ((z - truth[y, x]).abs() / truth[y, x]).median().item()
 
     after_lift = error(lifted.gaussians[in_hole])
-    coarse = apply_affine(lifted.gaussians, result.affine, target, "constant")
+    coarse = apply_affine(lifted.gaussians, result.affine, target)
     after_affine = error(coarse[in_hole])
     after_all = error(completion.added)
     assert after_lift > 0.15
