@@ -29,15 +29,15 @@ TEXTS = {
 FILES = ("LICENSE", "CITATION.cff")
 """Files of the repository that pages link to and that are copied as they are."""
 STAGES = (
-    "select_context",
     "context",
     "target_view",
     "synthesize",
     "select_anchor",
     "lift",
     "align_depth",
-    "slide_along_rays",
-    "extrapolate",
+    "register",
+    "register_paper",
+    "extrapolate_registration",
     "filter_holes",
     "refine",
     "recolor",

@@ -98,7 +98,7 @@ class FreeSpace(Guard):
             view.camera.padded,
             cameras,
             observed,
-            state.config.registration.footprint,
+            state.config.footprint,
             state.config.free_space,
         )
         return placed[is_placed]
