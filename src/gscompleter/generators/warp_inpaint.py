@@ -231,7 +231,10 @@ def search_and_vote(
     queries = np.argwhere(centres)
     query_at = np.full((h, w), -1, np.int64)
     query_at[centres] = np.arange(len(queries))
-    weight = compute_pixel_weights(level.known)
+    # What is deep in the hole was guessed, and should not decide what matches.
+    distance = compute_distance_to_known(level.known).numpy()
+    weight_in_hole = np.maximum(WEIGHT_DECAY**distance, 0.05)
+    weight = np.where(known, 1.0, weight_in_hole).astype(np.float32)
     matches = init_matches(queries, coarse_field, usable, seed)
     images = patchmatch.pad_column(level.sources.images.numpy())
     log_depth = np.ascontiguousarray(level.sources.log_depth.numpy())
@@ -291,14 +294,6 @@ def compute_likelihood(cost: Float32[ndarray, "q"]) -> Float32[ndarray, "q"]:
     return np.maximum(likely, MIN_VOTE).astype(np.float32)
 
 
-def compute_pixel_weights(known: Bool[Tensor, "h w"]) -> Float32[ndarray, "h w"]:
-    """Compute pixel weights for patch comparison, falling with the depth in the hole."""
-    # What is deep in the hole was guessed, and should not decide what matches.
-    distance = compute_distance_to_known(known).numpy()
-    in_hole = np.maximum(WEIGHT_DECAY**distance, 0.05)
-    return np.where(known, 1.0, in_hole).astype(np.float32)
-
-
 def find_usable_centres(valid: Bool[Tensor, "s h w"]) -> Bool[ndarray, "s h w"]:
     """Mark the pixels whose whole patch is valid and inside the image."""
     is_missing = pad(~valid, (RADIUS,) * 4, value=True)
@@ -355,7 +350,7 @@ def find_nearest(mask: Bool[ndarray, "h w"]) -> Int64[ndarray, "h w 2"]:
 
 
 def downsample_level(level: Level) -> Level:
-    """Halve a level; averages leave out unknown pixels."""
+    """Halve a level and its sources; averages leave out unknown and invalid pixels."""
     # Means of the known and of the guessed pixels of a block, each divided by its share.
     known = level.known.float()[..., None]
     known_share = pool_pixels(known)
@@ -365,25 +360,20 @@ def downsample_level(level: Level) -> Level:
     expected = pool_pixels(level.expected[..., None])[..., 0]
 
     # One source at a time, since all of them and their copies take most memory of a synthesis.
-    sources = level.sources
-    halved = [
-        halve_source(*source)
-        for source in zip(sources.images, sources.valid, sources.log_depth, strict=True)
-    ]
-    images, valid, log_depths = zip(*halved, strict=True)
-    halved_sources = Sources(torch.stack(images), torch.stack(valid), torch.stack(log_depths))
-    return Level(image, known_share[..., 0] > 0.5, expected, halved_sources)
-
-
-def halve_source(
-    image: Float[Tensor, "h w 3"], valid: Bool[Tensor, "h w"], log_depth: Float[Tensor, "h w"]
-) -> tuple[Float[Tensor, "h2 w2 3"], Bool[Tensor, "h2 w2"], Float[Tensor, "h2 w2"]]:
-    """Halve a source; averages leave out invalid pixels."""
-    known = valid.float()[..., None]
-    usable = pool_pixels(known)
-    layers = torch.cat([image, log_depth[..., None]], dim=-1)
-    means = pool_pixels(layers * known) / usable.clamp_min(1e-6)
-    return means[..., :3], usable[..., 0] > 0.75, means[..., 3]
+    images = []
+    valid = []
+    log_depths = []
+    sources = zip(level.sources.images, level.sources.valid, level.sources.log_depth, strict=True)
+    for source_image, source_valid, source_log_depth in sources:
+        usable = source_valid.float()[..., None]
+        usable_share = pool_pixels(usable)
+        layers = torch.cat([source_image, source_log_depth[..., None]], dim=-1)
+        means = pool_pixels(layers * usable) / usable_share.clamp_min(1e-6)
+        images.append(means[..., :3])
+        valid.append(usable_share[..., 0] > 0.75)
+        log_depths.append(means[..., 3])
+    halved = Sources(torch.stack(images), torch.stack(valid), torch.stack(log_depths))
+    return Level(image, known_share[..., 0] > 0.5, expected, halved)
 
 
 def pool_pixels(values: Float[Tensor, "*s h w c"]) -> Float[Tensor, "*s h2 w2 c"]:

@@ -112,23 +112,22 @@ def reconstruct_context(reconstructor: Reconstructor, views: Sequence[View]) -> 
 
 def check_texture(views: Sequence[View]) -> None:
     """Raise InputError if fewer than two of several photographs have any texture to match."""
-    num_flat = sum(not has_texture(view.image) for view in views)
+    num_flat = 0
+    for view in views:
+        # A mean of 3 x 3 pixels removes most noise, before the range in 5 x 5 of them is taken.
+        smooth = avg_pool2d(view.image.mean(dim=-1)[None, None], 3, stride=1)
+        highest = max_pool2d(smooth, 5, stride=1)
+        lowest = -max_pool2d(-smooth, 5, stride=1)
+        textured_share = (highest - lowest > MIN_CONTRAST).float().mean().item()
+        if not textured_share >= MIN_TEXTURED:
+            num_flat += 1
+
     # A single photograph needs none, since its depth is given.
     if len(views) - num_flat < 2 <= len(views):
         raise InputError(
             f"{num_flat} of the {len(views)} context photographs show no texture, and stereo needs "
             "at least 2 that do; choose other photographs."
         )
-
-
-def has_texture(image: Float[Tensor, "h w 3"]) -> bool:
-    """Return True if enough of an image varies by more than noise, in windows of 5 x 5 pixels."""
-    # A mean of 3 x 3 pixels removes most noise before the range is taken.
-    smooth = avg_pool2d(image.mean(dim=-1)[None, None], 3, stride=1)
-    highest = max_pool2d(smooth, 5, stride=1)
-    lowest = -max_pool2d(-smooth, 5, stride=1)
-    varied = highest - lowest > MIN_CONTRAST
-    return varied.float().mean().item() >= MIN_TEXTURED
 
 
 def sort_by_frame(views: Sequence[View]) -> list[View]:
