@@ -148,8 +148,8 @@ def gather_observations(
     with use_one_torch_thread():
         differences = map_in_parallel(compute_color_difference, renders, views)
 
-    # A splat that is blurred everywhere differs everywhere. What is as wrong as usual in this scene
-    # is no evidence against a Gaussian, so the scale of differences grows with the usual one.
+    # A difference that is usual in this scene is no evidence against a Gaussian, so the scale of
+    # differences grows with the median one.
     medians = [
         difference[view.valid_mask].median()
         for difference, view in zip(differences, views, strict=True)
