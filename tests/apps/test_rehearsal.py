@@ -18,7 +18,7 @@ from gscompleter.apps import warmup
 from gscompleter.apps.commands import doctor
 from gscompleter.kernels import compiled
 from gscompleter.kernels.cache import KernelCache
-from gscompleter.progress import show_progress
+from gscompleter.progress import show_progress, stage
 from paths import TESTS
 from scenes import Room, camera_at, view_of
 
@@ -142,6 +142,17 @@ def test_what_is_compiled_is_compiled_once(rehearsed):
     assert warmup.compile_kernels(["cpu", warmup.SPLAT_PART]) > 0
     assert warmup.compile_kernels(["cpu", warmup.SPLAT_PART]) is None
     assert rehearsed == [False, True]
+
+
+def test_a_log_has_one_line_about_the_compilation(rehearsed, monkeypatch, capsys):
+    def work(with_splat: bool) -> None:
+        with stage("context"):
+            pass
+
+    monkeypatch.setattr(warmup, "rehearse", work)
+    with show_progress(Console(stderr=True)):
+        warmup.compile_kernels(["cpu"])
+    assert capsys.readouterr().err == "compiling kernels for this machine, once\n"
 
 
 def test_kernels_are_compiled_anew_for_another_processor(rehearsed, monkeypatch):
