@@ -592,8 +592,21 @@ def describe_opening(options: SceneOptions, opened: Opened, task: Task) -> list[
         f"{opened.num_photographs} photographs{splat}.",
         f"Found: {task.frame_description.rstrip('.')}; depths from {camera.near:.3g} to "
         f"{camera.far:.3g}; worked at {camera.width} x {camera.height} (--resolution changes it).",
+        *describe_missing(opened.photographs),
         *describe_masks(opened.photographs, task),
         *task.depth_notes,
+    ]
+
+
+def describe_missing(given: Photographs) -> list[str]:
+    """Say which cameras have no photograph; such a camera stays, because it can be a target."""
+    frames = [frame for frame in given.frames if frame.image is not None]
+    missing = [frame.name for frame in frames if not frame.has_photograph()]
+    if not missing:
+        return []
+    return [
+        f"{len(missing)} of {len(frames)} photographs are missing, and their cameras can only be "
+        f"targets: {join_names(missing, MAX_NAMED)}."
     ]
 
 

@@ -146,7 +146,7 @@ def render_completion_page(folder: Path) -> str:
             "summary": summary,
             "record": read_record(folder, summary),
             "gallery": open_gallery(folder / "images"),
-            "notes": [*list_shared_notes(summary), *list_notes(summary)],
+            "notes": [*summary.scene.notes, *list_shared_notes(summary), *list_notes(summary)],
             "own_notes": select_own_notes(summary),
             "describe_alignment": describe_alignment,
             "unit": find_length_unit(summary),
