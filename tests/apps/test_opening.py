@@ -69,6 +69,8 @@ def test_photographs_that_are_missing_are_named_also_in_the_report(tmp_path, mon
         "1 of 4 photographs are missing, and their cameras can only be targets: "
         "images/photo_002.png."
     )
-    assert told in capsys.readouterr().err
+    said = capsys.readouterr().err
+    assert told in said
+    assert "nerfstudio, 3 of 4 photographs." in said
     assert json.loads((out / "summary.json").read_text())["scene"]["notes"] == [told]
     assert told in (out / "report.html").read_text()
