@@ -159,7 +159,15 @@ class GSCompleter:
             new = find_new_photos(config, parts, made.views, self.scenes)
             known = [view for number, view in enumerate(made.views) if number not in new]
             trust = load_trust(config, parts, known, self.scenes)
-            state = Completion(config, made.source, parts, photos, len(views), trust)
+            state = Completion(
+                config,
+                made.source,
+                parts,
+                photos,
+                len(views),
+                trust,
+                is_given=scene is not None,
+            )
             state = prepare_guards(state, self.scenes)
             state = recolor_to_photos(state, [made.views[i] for i in new], self.scenes)
         return replace(state, exposure_gains=made.exposure_gains, seconds=seconds)
