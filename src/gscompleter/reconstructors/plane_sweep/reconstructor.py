@@ -13,6 +13,7 @@ from torch import Tensor
 
 from gscompleter.numerics.geometry import compute_sparse_depth, measure_baseline, unproject
 from gscompleter.numerics.kernels.parallel import map_in_parallel
+from gscompleter.numerics.sky import SKY_DEPTH, is_sky
 from gscompleter.reconstructors.depth_predictors import (
     DepthPredictor,
     predict_depth,
