@@ -24,6 +24,7 @@ TEXTS = {
     "README.md": "index.md",
     "CONTRIBUTING.md": "contributing.md",
     "CHANGELOG.md": "changelog.md",
+    "benchmarks/history.md": "history.md",
 }
 """Files of the repository that are pages of the site."""
 FILES = ("LICENSE", "CITATION.cff")

@@ -162,7 +162,15 @@ class GSCompleter:
             new = find_new_photos(config, parts, context.views, self.scenes)
             trained = [view for index, view in enumerate(context.views) if index not in new]
             trust = load_trust(config, parts, trained, self.scenes)
-            state = Completion(config, context.source, parts, photos, len(views), trust)
+            state = Completion(
+                config,
+                context.source,
+                parts,
+                photos,
+                len(views),
+                trust,
+                is_given=scene is not None,
+            )
 
             # Guards measure the scene as it was given, so before anything is recoloured.
             state = prepare_guards(state, self.scenes)

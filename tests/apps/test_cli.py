@@ -306,6 +306,30 @@ def test_what_is_no_command_gets_a_sentence_too(monkeypatch, capsys, words):
     assert said.out == ""
 
 
+@pytest.mark.parametrize(
+    ("words", "sentence"),
+    [
+        (
+            ("evaluate", "a", "--out", "b", "--overwrite"),
+            "evaluate has no option --overwrite, which belongs to complete, live, remove and 8 "
+            "more; evaluate continues the run in its folder (see gscompleter evaluate --help).",
+        ),
+        (
+            ("evaluate", "a", "--target=3"),
+            "evaluate has no option --target, which belongs to complete, remove (see",
+        ),
+        (("view", "a", "--out", "b"), "view has no option --out, which belongs to complete, "),
+        (
+            ("complete", "a", "--out", "b", "--wrokers", "3"),  # of batch
+            "Unrecognized options: --wrokers, 3 (see gscompleter complete --help).",
+        ),
+    ],
+)
+def test_an_option_of_another_command_is_told_as_such(monkeypatch, capsys, words, sentence):
+    assert run(monkeypatch, *words) == 2
+    assert sentence in capsys.readouterr().err
+
+
 @pytest.mark.parametrize("word", ["compleat", "--verson"])
 def test_the_commands_are_named_in_place_of_an_unknown_one(monkeypatch, capsys, word):
     assert run(monkeypatch, word) == 2

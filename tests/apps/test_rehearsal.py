@@ -15,7 +15,7 @@ from gscompleter.apps.commands import doctor
 from gscompleter.numerics import kernels
 from gscompleter.numerics.kernels import compiled
 from gscompleter.numerics.kernels.cache import KernelCache
-from gscompleter.system.progress import show_progress
+from gscompleter.system.progress import show_progress, stage
 from paths import TESTS
 
 COMPLETE = """
@@ -119,6 +119,17 @@ def test_what_is_compiled_is_compiled_once(rehearsed):
     assert warmup.compile_kernels(["cpu", warmup.SPLAT_PART]) > 0
     assert warmup.compile_kernels(["cpu", warmup.SPLAT_PART]) is None
     assert rehearsed == [False, True]
+
+
+def test_a_log_has_one_line_about_the_compilation(rehearsed, monkeypatch, capsys):
+    def work(with_splat: bool) -> None:
+        with stage("context"):
+            pass
+
+    monkeypatch.setattr(warmup, "rehearse", work)
+    with show_progress(Console(stderr=True)):
+        warmup.compile_kernels(["cpu"])
+    assert capsys.readouterr().err == "compiling kernels for this machine, once\n"
 
 
 def test_kernels_are_compiled_anew_for_another_processor(rehearsed, monkeypatch):

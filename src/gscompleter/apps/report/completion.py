@@ -161,8 +161,7 @@ def write_report(
         key: [asdict(replace(row, file=files.get(row.frame))) for row in group]
         for key, group in rows.items()
     }
-    is_given = input_splat is not None
-    outcome = asdict(judge_completion(completion, held_out_rows, is_given))
+    outcome = asdict(judge_completion(completion, held_out_rows))
     write_scenes(folder, completion, input_splat)
     around = render_around()
     write_pictures(folder / "images", completion, targets, at_targets)
