@@ -68,7 +68,7 @@ def remove_gaussians(
     remaining = replace(
         source,
         rendered=source.rendered[~gone],
-        proxy_index=renumber(source, chosen, unused, gone),
+        proxy_index=number_left(source, chosen, unused, gone),
         removed=merge([source.removed, replace(inner, sh=inner.sh[:, :1])]),
     )
     # As long as nothing is recoloured, `parts[0]` is the rendered context itself, which tells so.
@@ -92,7 +92,7 @@ def remove_gaussians(
     return prepare_guards(replace(changed, photos=photos), scenes)
 
 
-def renumber(
+def number_left(
     source: ContextScene,
     chosen: Bool[Tensor, "n"],
     unused: Bool[Tensor, "m"],
