@@ -57,8 +57,9 @@ class Density:
 
 def list_files(places: Sequence[Path]) -> list[Path]:
     """List the Python files of folders, and files that are given themselves."""
+    # Resolved, so that a file that two folders name is counted once.
     return [
-        file
+        file.resolve()
         for place in places
         for file in (sorted(place.rglob("*.py")) if place.is_dir() else [place])
     ]
