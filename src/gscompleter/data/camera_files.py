@@ -122,8 +122,10 @@ def read_camera_list(path: Path) -> list[Frame]:
 
 
 def _parse_camera(entry: Any, number: int, path: Path) -> Frame:
-    title, c2w = f"camera {number} of {quote_value(path)}", np.eye(4)
-    focal, size = get_focal(entry, title), get_size(entry, title)
+    title = f"camera {number} of {quote_value(path)}"
+    c2w = np.eye(4)
+    focal = get_focal(entry, title)
+    size = get_size(entry, title)
     name = get_text(entry, "img_name", title) or str(entry.get("id", number))
     c2w[:3, :3] = get_array(entry, "rotation", title, (3, 3))
     c2w[:3, 3] = get_array(entry, "position", title, (3,))

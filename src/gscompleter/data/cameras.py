@@ -51,7 +51,8 @@ class Pinhole:
 
     def resize(self, width: int, height: int) -> Pinhole:
         """Return the camera of the image resized to width × height."""
-        x, y = width / self.width, height / self.height
+        x = width / self.width
+        y = height / self.height
         return Pinhole(self.fl_x * x, self.fl_y * y, self.cx * x, self.cy * y, width, height)
 
     def crop(self, left: int, top: int, width: int, height: int) -> Pinhole:
@@ -115,7 +116,8 @@ def _compute_radius(r: Float[np.ndarray, "*n"], distortion: Distortion) -> Float
 def _apply_polynomials(
     points: Float[np.ndarray, "*n 2"], distortion: Distortion
 ) -> Float[np.ndarray, "*n 2"]:
-    x, y = points[..., 0], points[..., 1]
+    x = points[..., 0]
+    y = points[..., 1]
     r2 = x * x + y * y
     # Both are 1 + k1 r² + k2 r⁴ + …
     numerator, denominator = (
@@ -123,7 +125,8 @@ def _apply_polynomials(
         for coefficients in (distortion.radial, distortion.denominator)
     )
     radial = numerator / denominator
-    (p1, p2), (s1, s3) = distortion.tangential, distortion.prism
+    p1, p2 = distortion.tangential
+    s1, s3 = distortion.prism
     new_x = x * radial + 2 * p1 * x * y + p2 * (r2 + 2 * x * x) + s1 * r2
     new_y = y * radial + p1 * (r2 + 2 * y * y) + 2 * p2 * x * y + s3 * r2
     return np.stack([new_x, new_y], axis=-1)
@@ -139,7 +142,9 @@ def undistort_pinhole(pinhole: Pinhole, distortion: Distortion) -> Pinhole | Non
     """
     if not distortion:
         return pinhole
-    found, radius, size = None, np.zeros(()), np.array([pinhole.width, pinhole.height])
+    found = None
+    radius = np.zeros(())
+    size = np.array([pinhole.width, pinhole.height])
     for zoom in np.geomspace(MAX_ZOOM_IN, MAX_ZOOM_OUT, 400).tolist():
         new = replace(pinhole, fl_x=pinhole.fl_x * zoom, fl_y=pinhole.fl_y * zoom)
         bent = distort(_compute_border(new), distortion)
@@ -149,7 +154,8 @@ def undistort_pinhole(pinhole: Pinhole, distortion: Distortion) -> Pinhole | Non
         is_within = ((pixels >= 0.499) & (pixels <= size - 0.499)).all()
         if not is_within or (np.linalg.norm(bent, axis=-1) < radius).any():
             break
-        found, radius = new, np.linalg.norm(bent, axis=-1)
+        found = new
+        radius = np.linalg.norm(bent, axis=-1)
     return found
 
 
@@ -170,13 +176,15 @@ def remap(
     image: Shaped[np.ndarray, "h w *c"], source: Float[np.ndarray, "h2 w2 2"], interpolation: int
 ) -> Shaped[np.ndarray, "h2 w2 *c"]:
     """Sample `image` at the positions `source`."""
-    x, y = np.ascontiguousarray(source[..., 0]), np.ascontiguousarray(source[..., 1])
+    x = np.ascontiguousarray(source[..., 0])
+    y = np.ascontiguousarray(source[..., 1])
     return np.asarray(cv2.remap(image, x, y, interpolation, borderMode=cv2.BORDER_REPLICATE))
 
 
 def _compute_border(pinhole: Pinhole) -> Float[np.ndarray, "n 2"]:
     """Compute the outermost pixel centres on the image plane at z = 1."""
-    columns, rows = np.arange(pinhole.width), np.arange(pinhole.height)
+    columns = np.arange(pinhole.width)
+    rows = np.arange(pinhole.height)
     edges = (columns, rows[[0, -1]]), (columns[[0, -1]], rows)
     return np.concatenate([_compute_plane(pinhole, *edge).reshape(-1, 2) for edge in edges])
 
@@ -233,7 +241,8 @@ class Intrinsics:
 
 def has_same_aspect(one: tuple[int, int], other: tuple[int, int]) -> bool:
     """Check whether two sizes differ by a scale, whose sides were rounded to whole pixels."""
-    (w, h), (width, height) = one, other
+    w, h = one
+    width, height = other
     # A side that is rounded by a pixel changes its product by a side of the other image.
     largest = max(w, h, width, height, SAME_ASPECT * width * h)
     return abs(width * h - height * w) <= largest
@@ -290,7 +299,8 @@ def make_rigid(pose: Float[np.ndarray, "4 4"]) -> Float[np.ndarray, "4 4"]:
         u, _, v = np.linalg.svd(rotation)
         rotation = u @ v
     rigid = np.eye(4)
-    rigid[:3, :3], rigid[:3, 3] = rotation, pose[:3, 3]
+    rigid[:3, :3] = rotation
+    rigid[:3, 3] = pose[:3, 3]
     return rigid
 
 

@@ -428,7 +428,8 @@ def _find_seen(path: Path, number: int) -> Float[np.ndarray, "n 3"]:
 
 def _list_roots(scene: Path, model: Path) -> list[Path]:
     """List the folders from the model up to the scene; names decide if a model itself is given."""
-    top, roots = Path(os.path.abspath(scene)), [Path(os.path.abspath(model))]
+    top = Path(os.path.abspath(scene))
+    roots = [Path(os.path.abspath(model))]
     parts = {part for home in HOMES if home for part in home.split("/")}
     while True:
         folder = roots[-1]

@@ -83,7 +83,8 @@ def detect_vehicle(frames: tuple[Frame, ...]) -> Bool[np.ndarray, "h w"] | None:
     small = {} if motion is None else read_small(chosen)
     if motion is None or len(small) < FEWEST:
         return None
-    first, images = next(iter(small)), np.stack(list(small.values()))
+    first = next(iter(small))
+    images = np.stack(list(small.values()))
     size = first.size()
     if first.find_defect(*size) is not None:
         return None
@@ -114,7 +115,8 @@ def estimate_motion(
         return None
     moving = steps > 0.1 * np.median(steps[steps > 0])
     moves = np.einsum("nji,nj->ni", poses[:-1, :3, :3], np.diff(poses[:, :3, 3], axis=0))
-    travel, down = average_directions(moves[moving]), average_directions(poses[:, :3, 1])
+    travel = average_directions(moves[moving])
+    down = average_directions(poses[:, :3, 1])
     return None if travel is None or down is None else travel
 
 
@@ -168,8 +170,10 @@ def find_static_region(
     `images` are brightness in [0, 255], `flow` is from `predict_ground_flow`, and `first` is the
     highest row that the region may reach.
     """
-    edges, (height, width) = find_edges(images, flow), images.shape[1:]
-    found, limit = np.full(width, height), np.full(width, height)
+    edges = find_edges(images, flow)
+    height, width = images.shape[1:]
+    found = np.full(width, height)
+    limit = np.full(width, height)
     while is_vehicle(edges, outline := trace_outline(edges, first, limit, STRICT)):
         top = max(first, int(outline.min()) - CLEARANCE)
         fainter = trace_outline(edges, top, limit, LENIENT)
@@ -214,7 +218,8 @@ def trace_outline(
     reward = np.concatenate([reward, np.zeros((1, width))])  # lower border: no vehicle
     steps = np.abs(rows[:, None] - rows)
     bends = np.where(steps <= MAX_ROW_STEP, BEND_COST * steps, np.inf)
-    total, came = reward[:, 0], []
+    total = reward[:, 0]
+    came = []
     for column in range(1, width):
         reached = total - bends
         came.append(reached.argmax(axis=1))

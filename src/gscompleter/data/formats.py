@@ -101,7 +101,8 @@ def open_photographs(
         not others,
         f"{quote_value(path)} holds several scenes, such as {names}; name a path with one of them.",
     )
-    near, far = scene.near if near is None else near, scene.far if far is None else far
+    near = scene.near if near is None else near
+    far = scene.far if far is None else far
     check_planes(near, far)
     sparse = None if scene.sparse is None else cache(scene.sparse)
     posed, lost = keep_posed(scene.frames, scene.title)

@@ -85,7 +85,8 @@ def get_array(
 
 def get_focal(entry: Any, title: str) -> tuple[float, float]:
     """Return the focal lengths `fx` and `fy` in pixels."""
-    low, high = 1 / MAX_NUMBER, MAX_NUMBER
+    low = 1 / MAX_NUMBER
+    high = MAX_NUMBER
     return get_number(entry, "fx", title, low, high), get_number(entry, "fy", title, low, high)
 
 

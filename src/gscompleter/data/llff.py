@@ -45,7 +45,8 @@ def open_llff(path: Path) -> Iterator[Photographs]:
     titles = (f"row {number} of {quote_value(file)}" for number in range(len(rows)))
     images = _find_photographs(file, len(rows))
     frames = list(map(_parse_frame, images, rows, titles))
-    near, far = NEAR_FACTOR * rows[:, 15].min().item(), FAR_FACTOR * rows[:, 16].max().item()
+    near = NEAR_FACTOR * rows[:, 15].min().item()
+    far = FAR_FACTOR * rows[:, 16].max().item()
     scene = build_photographs(file.resolve().parent.name, str(file), frames)
     yield replace(scene, near=near, far=far)
 
@@ -70,7 +71,9 @@ def _read_rows(path: Path) -> Float[np.ndarray, "n 17"]:
         rows.ndim == 2 and rows.shape[1] == 17 and len(rows) > 0,
         f"{quote_value(path)} has the shape {list(rows.shape)}, not 17 columns; {ADVICE}.",
     )
-    (low, high), near, far = DEPTH_RANGE, rows[:, 15], rows[:, 16]
+    low, high = DEPTH_RANGE
+    near = rows[:, 15]
+    far = rows[:, 16]
     bounded = ((near >= low) & (near < far) & (far <= high)).all()
     require(bounded, f"The bounds in {quote_value(path)} are no z-depths, nearest first; {ADVICE}.")
     return rows

@@ -52,7 +52,8 @@ def open_photograph(path: Path) -> Iterator[Photographs]:
     with open_image(file) as image:
         exif = image.getexif()
         size = ImageOps.exif_transpose(image).size
-    found, title = read_focal(exif), quote_value(file)
+    found = read_focal(exif)
+    title = quote_value(file)
     focal = (found or PHONE_FOCAL) * math.hypot(*size)
     is_upright = exif.get(ORIENTATION, 1) == 1
     stored: Path | Callable[[], bytes] = file if is_upright else partial(read_upright, file)

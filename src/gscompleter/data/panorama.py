@@ -63,7 +63,8 @@ def _is_closed(path: Path) -> bool:
     """Check whether left and right border continue each other, and each pole is one point."""
     pixels = read_brightness(path, SMALL_WIDTH)
     steps = np.abs(np.diff(pixels, axis=1, append=pixels[:, :1])).mean(axis=0)
-    rows, columns = pixels.std(axis=1), pixels.std(axis=0)
+    rows = pixels.std(axis=1)
+    columns = pixels.std(axis=0)
     return bool(
         steps[-1] < MAX_SEAM * np.median(steps)
         and max(rows[0], rows[-1]) < MAX_POLE * np.median(rows)
@@ -108,5 +109,6 @@ def _project_rays(rotation: Float[np.ndarray, "3 3"], width: int) -> Float[np.nd
 
 def compute_rotation(yaw: int, pitch: int) -> Float[np.ndarray, "3 3"]:
     """Compute the rotation from the axes of a view (degrees) to those of its panorama."""
-    turned, raised = (0.0, math.radians(yaw), 0.0), (math.radians(pitch), 0.0, 0.0)
+    turned = (0.0, math.radians(yaw), 0.0)
+    raised = (math.radians(pitch), 0.0, 0.0)
     return cv2.Rodrigues(np.array(turned))[0] @ cv2.Rodrigues(np.array(raised))[0]

@@ -214,7 +214,8 @@ class Photographs:
     def _match_names(self, word: str) -> list[int]:
         """List the frames whose photograph a word names, those that it names exactly if any."""
         wanted = PurePosixPath(word.replace("\\", "/").casefold()).parts
-        exact, found = [], []
+        exact = []
+        found = []
         for number, frame in enumerate(self.frames):
             path = frame.name.replace("\\", "/")
             if word in (frame.name, frame.file_name, PurePosixPath(path).name):
@@ -330,7 +331,8 @@ def undistort_and_resize(
         pixels = remap(pixels, source, cv2.INTER_CUBIC if colours else cv2.INTER_NEAREST)
     filtering = Image.Resampling.LANCZOS if colours else Image.Resampling.NEAREST
     framing = compute_framing(*size, resolution)
-    (left, top), (width, height) = framing.corner, framing.size
+    left, top = framing.corner
+    width, height = framing.size
     resized = resize(pixels, framing.scaled_size, filtering)
     return np.ascontiguousarray(resized[top : top + height, left : left + width])
 
@@ -345,7 +347,8 @@ def resize_mask(
         source = compute_undistortion_map(pinhole, frame.intrinsics.distortion, new)
         share = remap(share, source, cv2.INTER_LINEAR)
     framing = compute_framing(*size, resolution)
-    (left, top), (width, height) = framing.corner, framing.size
+    left, top = framing.corner
+    width, height = framing.size
     resized = resize(share, framing.scaled_size, Image.Resampling.BOX)
     return resized[top : top + height, left : left + width] >= 0.5
 
@@ -394,7 +397,8 @@ def compute_framing(width: int, height: int, resolution: Resolution) -> Framing:
         size = max(round(width * scale), 1), max(round(height * scale), 1)
         return Framing(size, (0, 0), size)
     if isinstance(resolution, AuthorsCrop):
-        new_height, new_width = resolution.height, resolution.width
+        new_height = resolution.height
+        new_width = resolution.width
     else:
         new_height, new_width = resolution
     if isinstance(resolution, AuthorsCrop) and not resolution.is_resized:

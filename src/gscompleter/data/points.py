@@ -54,7 +54,8 @@ def compute_depth_range(
     if len(depths) < MIN_POINTS:
         return None
     low, high = np.quantile(depths.double().numpy(), PERCENTILES).tolist()
-    near, far = NEAR_FACTOR * low, FAR_FACTOR * high
+    near = NEAR_FACTOR * low
+    far = FAR_FACTOR * high
     return (near, far) if DEPTH_RANGE[0] <= near < far <= DEPTH_RANGE[1] else None
 
 

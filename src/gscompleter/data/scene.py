@@ -75,7 +75,8 @@ def load_cameras(
     """
     check_planes(near, far)
     path = require_path(path)
-    zero, frames = np.asarray(origin, dtype=np.float64), tuple(read_cameras(path, resolution))
+    zero = np.asarray(origin, dtype=np.float64)
+    frames = tuple(read_cameras(path, resolution))
     cameras = Photographs(path.stem, str(path), frames, zero, near, far)
     return [cameras.camera(number, resolution) for number in range(len(cameras))]
 

@@ -70,15 +70,19 @@ def measure_frames(frames: Iterable[Image8]) -> tuple[Values, Values]:
 
     Motion is in steps of `STEP`; the fraction is the way from the last reference frame.
     """
-    sharpness, motion = list[float](), list[float]()
-    reference, corners, steps = np.zeros((0, 0), np.uint8), None, 0
+    sharpness = list[float]()
+    motion = list[float]()
+    reference = np.zeros((0, 0), np.uint8)
+    corners = None
+    steps = 0
     for frame in frames:
         sharpness.append(float(cv2.Laplacian(frame, cv2.CV_32F).var()))
         share = 0.0 if corners is None else _measure_motion(reference, corners, frame)
         motion.append(steps + share)
         steps += share == 1
         if share == 1 or corners is None:
-            reference, distance = frame, max(frame.shape) / 40
+            reference = frame
+            distance = max(frame.shape) / 40
             corners = cv2.goodFeaturesToTrack(frame, NUM_CORNERS, 0.01, distance)
     return np.array(sharpness), np.array(motion)
 
@@ -97,7 +101,8 @@ def select_frames(sharpness: Values, motion: Values, count: int) -> list[int]:
 
     Selected frames are at least half a window apart; a window may have none.
     """
-    selected, last = list[int](), -np.inf
+    selected = list[int]()
+    last = -np.inf
     steps = int(motion.max(initial=-1)) + 1
     windows = min(count, steps)
     for start, end in pairwise(steps * n // windows for n in range(windows + 1) if windows):

@@ -89,7 +89,8 @@ def draw_figure(
 
 def list_columns(spec: FigureSpec, runs: Mapping[str, Path]) -> list[tuple[str, Path, str]]:
     """List title, run and image of the columns: methods for each model, photographs once."""
-    first, columns = next(iter(runs.values())), []
+    first = next(iter(runs.values()))
+    columns = []
     methods = spec.list_methods()
     for image in spec.images:
         if is_photograph(image):

@@ -141,7 +141,8 @@ def compare_cases(values: Mapping[str, float], others: Mapping[str, float]) -> E
 def fill_table(spec: TableSpec, runs: Mapping[tuple[str, str], Path]) -> PaperTable:
     """Fill a table from runs of `evaluate`, given by model and protocol."""
     rows: list[TableRow] = []
-    counts, notes = {}, []
+    counts = {}
+    notes = []
     for (model, protocol), folder in runs.items():
         summary = summarize_run([r for r in read_rows(folder) if r["method"] in spec.methods])
         fids = compute_fids(folder, summary) if "fid" in spec.columns else {}
@@ -181,7 +182,8 @@ def fill_cell(column: Column, values: dict[str, float], baseline: Mapping[str, f
         return Cell(None)
     if column.reduce_tasks is not statistics.fmean:
         return Cell(column.reduce_tasks([*values.values()]), cases=values)
-    found, difference = estimate_mean(values), compare_cases(values, baseline)
+    found = estimate_mean(values)
+    difference = compare_cases(values, baseline)
     is_noise = difference is None or difference.is_noise
     return Cell(found.mean, found.error, difference, is_noise, values)
 
@@ -223,7 +225,8 @@ def format_rows(
 
 def format_number(column: Column, cell: Cell, error: str, difference: str) -> str:
     """Format a cell with templates of its error and its difference."""
-    text, digits = format_score(cell.value, column.digits), column.digits
+    text = format_score(cell.value, column.digits)
+    digits = column.digits
     if cell.error is not None:
         text += error.format(f"{cell.error:.{digits}f}")
     if cell.difference is not None:

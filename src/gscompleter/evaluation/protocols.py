@@ -210,7 +210,8 @@ class Task:
     @property
     def name(self) -> str:
         """Unique name of the task in a run, as in tables."""
-        first, last = self.targets[0], self.targets[-1]
+        first = self.targets[0]
+        last = self.targets[-1]
         span = f"{first}" if first == last else f"{first}..{last}"
         return f"{self.scene} {'+'.join(map(str, self.context))}>{span}"
 

@@ -212,10 +212,12 @@ def load_or_reconstruct(path: Path, views: Sequence[View], models: Models) -> st
     if not store.is_complete(path):
         with record_seconds() as seconds:
             made = reconstruct_context(models.reconstructor, views)
-        camera, source = made.views[0].camera, made.source
+        camera = made.views[0].camera
+        source = made.source
         assert camera.near is not None
         assert camera.far is not None
-        near, far = float(camera.near), float(camera.far)
+        near = float(camera.near)
+        far = float(camera.far)
         found = store.SavedContext(
             source.gaussians, near, far, seconds["total"], made.exposure_gains
         )

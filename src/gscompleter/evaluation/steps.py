@@ -117,7 +117,8 @@ def score_step(
 ) -> tuple[Step, scoring.TargetRenders]:
     """Score a step and render its target camera."""
     truth = scoring.Truth(state.views, target, task.neighbours)
-    before, after = state.scene, prediction.scene
+    before = state.scene
+    after = prediction.scene
     found, seen = scoring.score(
         before, after, prediction.added, truth, task.models.renderer, prediction.registered
     )

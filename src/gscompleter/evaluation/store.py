@@ -84,7 +84,8 @@ def claim(out: Path, settings: Mapping[str, Any]) -> None:
     found = read_settings(out)
     for key in {**wanted, **found}:
         if found.get(key) != wanted.get(key):
-            old, new = quote_value(repr(found.get(key))), quote_value(repr(wanted.get(key)))
+            old = quote_value(repr(found.get(key)))
+            new = quote_value(repr(wanted.get(key)))
             raise InputError(
                 f"{out} holds a run with {key} {old}, and this run has {new}; name another folder."
             )

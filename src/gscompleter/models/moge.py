@@ -65,7 +65,8 @@ def fit_shift(
     used = valid[np.ix_(rows, columns)] & np.isfinite(points).all(axis=-1) & (points[..., 2] > 0)
     if used.sum() < 2:
         return 0.0
-    fx, fy = camera.K[0, 0].item(), camera.K[1, 1].item()
+    fx = camera.K[0, 0].item()
+    fy = camera.K[1, 1].item()
     rays = np.stack(np.meshgrid((columns + 0.5 - w / 2) / fx, (rows + 0.5 - h / 2) / fy), axis=-1)[
         used
     ]

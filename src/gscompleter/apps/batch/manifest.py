@@ -43,7 +43,8 @@ def read_manifest(manifest: Path, common: Mapping[str, Any], out: Path | None = 
 
     In a folder of scenes those of `list_results` are left out.
     """
-    base, here = manifest.resolve().parent, resolve_paths(common, Path.cwd())
+    base = manifest.resolve().parent
+    here = resolve_paths(common, Path.cwd())
     rows = [{**here, **resolve_paths(row, base)} for row in read_rows(manifest, out)]
     if not rows:
         raise InputError("The manifest names no job; give it a row for each scene.")
@@ -66,7 +67,8 @@ def resolve_paths(row: Mapping[str, Any], base: Path) -> Options:
         return os.path.join(base, value) if isinstance(value, str) and value else value
 
     result = {key: join(value) if key in PATHS else value for key, value in row.items()}
-    target, config = result.get("target"), result.get("config")
+    target = result.get("target")
+    config = result.get("config")
     # A text is the path of a file of cameras, or else numbers and names of photographs.
     is_number = isinstance(target, str) and re.fullmatch(r"[\d\s]*", target)
     if isinstance(target, str) and not is_number and os.path.exists(join(target)):

@@ -88,8 +88,10 @@ class Page:
 
         `files` are those of the photographs by frame.
         """
-        self.session, self.server = session, server
-        self._find_hole, self._save = find_hole, save
+        self.session = session
+        self.server = server
+        self._find_hole = find_hole
+        self._save = save
         self._first = session.latest.views[0].camera
         self._photographs = cycle(
             [
@@ -171,7 +173,8 @@ class Page:
         self._status.content = f'<div role="status" style="padding: 0.5em 1em">{lines}</div>'
 
     def _build(self) -> None:
-        scene, gui = self.server.scene, self.server.gui
+        scene = self.server.scene
+        gui = self.server.gui
         gui.configure_theme(dark_mode=True, show_logo=False, show_share_button=False)
         gui.set_panel_label("gscompleter live")
         cameras = [view.camera for view in self.session.latest.views]
@@ -209,18 +212,22 @@ class Page:
     def _set_initial_camera(self, pose: PagePose) -> None:
         rotation = viser.transforms.SO3(pose.wxyz).as_matrix()
         start = self.server.initial_camera
-        start.position, start.fov = pose.position, pose.fov
-        start.look_at, start.up = pose.position + SCENE_DISTANCE * rotation[:, 2], -rotation[:, 1]
+        start.position = pose.position
+        start.fov = pose.fov
+        start.look_at = pose.position + SCENE_DISTANCE * rotation[:, 2]
+        start.up = -rotation[:, 1]
 
     def _move_browser(self, client: viser.ClientHandle, camera: Camera) -> None:
         pose = camera_to_page(camera, self._unit)
         with client.atomic():
-            client.camera.position, client.camera.wxyz = pose.position, pose.wxyz
+            client.camera.position = pose.position
+            client.camera.wxyz = pose.wxyz
             client.camera.fov = pose.fov
 
     def _change_session(self, session: Session) -> None:
         """Show all parts of a session that differ from the one before."""
-        before, now = self.session.latest, session.latest
+        before = self.session.latest
+        now = session.latest
         self.session = session
         with self.server.atomic():
             if before.parts[0] is not now.parts[0]:

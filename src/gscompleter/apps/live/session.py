@@ -56,7 +56,8 @@ def complete_camera(session: Session, camera: Camera) -> tuple[Session, TargetRe
     result = completion.targets[-1]
     if not len(result.added) and not result.num_recolored:
         return session, result
-    completions, cameras = (*session.completions, completion), (*session.cameras, told)
+    completions = (*session.completions, completion)
+    cameras = (*session.cameras, told)
     return replace(session, completions=completions, cameras=cameras), result
 
 

@@ -195,7 +195,8 @@ def compute_scores(pair: RenderPair, photograph: View | None) -> Scores:
     """Compute PSNR (dB) and SSIM over the valid pixels, or None without a photograph."""
     scores: Scores = dict.fromkeys(SCORES)
     if photograph is not None:
-        truth, valid = photograph.image, photograph.valid_mask
+        truth = photograph.image
+        valid = photograph.valid_mask
         for when, render in (("before", pair.before), ("after", pair.after)):
             scores[f"psnr_{when}"] = compute_masked_psnr(render.image, truth, valid)
             scores[f"ssim_{when}"] = ssim(photograph.fill_ignored(render.image), truth)
@@ -252,7 +253,8 @@ def score_photograph(completion: Completion, view: View, renderer: Renderer) -> 
 
 def score_context(completion: Completion, renderer: Renderer) -> list[ContextRow]:
     """Make the rows of the context photographs."""
-    views, gains = completion.views, completion.exposure_gains
+    views = completion.views
+    gains = completion.exposure_gains
     scores = score_views(completion, views, renderer)
     gain_rows = [None] * len(views) if gains is None else map(tuple, gains.tolist())
     return [
@@ -290,7 +292,8 @@ def make_target_row(
     completion: Completion, target: Target, result: TargetResult, scores: Scores
 ) -> TargetRow:
     """Make the row of a target."""
-    fit, added = result.affine, result.added
+    fit = result.affine
+    added = result.added
     return TargetRow(
         target.frame,
         **scores,
@@ -327,7 +330,8 @@ def thin_evenly(items: Sequence[Camera], most: int) -> Sequence[Camera]:
 
 def write_scenes(folder: Path, completion: Completion, input_splat: InputSplatFile | None) -> None:
     """Write the three scenes, and the originals of recoloured Gaussians of an input splat."""
-    added, context = completion.added, completion.context
+    added = completion.added
+    context = completion.context
     if input_splat is None:
         completed = partial(save_ply, folder / COMPLETED_FILE, completion.scene, provenance=True)
     else:
@@ -370,7 +374,8 @@ def save_completed_splat(
     Recoloured Gaussians stand among the generated ones, after all that kept its bits. The originals
     of an earlier run are kept with those that it recoloured.
     """
-    kept, earlier = input_splat.context_mask, input_splat.path.with_name(REMOVED_FILE)
+    kept = input_splat.context_mask
+    earlier = input_splat.path.with_name(REMOVED_FILE)
     if not changed.any():
         if bool((context.generated > 0).any()) and earlier.is_file():
             shutil.copyfile(earlier, folder / REMOVED_FILE)
@@ -387,7 +392,8 @@ def save_changed(
     folder: Path, context: Gaussians, changed: Bool[Tensor, "n"], input_splat: InputSplatFile
 ) -> None:
     """Write `removed.ply`, the originals of the changed Gaussians."""
-    rows, kept = torch.nonzero(changed.cpu())[:, 0], input_splat.context_mask
+    rows = torch.nonzero(changed.cpu())[:, 0]
+    kept = input_splat.context_mask
     save_removed(folder / REMOVED_FILE, context[changed].to("cpu"), rows, input_splat.path, kept)
 
 

@@ -102,8 +102,10 @@ def render_frame(
 def draw_corner_label(image: UInt8[np.ndarray, "h w 3"], name: str) -> UInt8[np.ndarray, "h w 3"]:
     """Write a label in the corner, white on a dark box."""
     size = max(12, image.shape[0] // 24)
-    font, canvas = ImageFont.load_default(size), Image.fromarray(image)
-    draw, inset = ImageDraw.Draw(canvas, "RGBA"), size // 2
+    font = ImageFont.load_default(size)
+    canvas = Image.fromarray(image)
+    draw = ImageDraw.Draw(canvas, "RGBA")
+    inset = size // 2
     left, top, right, bottom = draw.textbbox((2 * inset, 2 * inset), name, font, anchor="lt")
     field = (left - inset, top - inset, right + inset, bottom + inset)
     draw.rounded_rectangle(field, radius=inset, fill=(0, 0, 0, 150))
@@ -128,7 +130,8 @@ def find_waypoints(first: Camera, second: Camera, photographs: Sequence[Camera])
     where = embed_cameras(cameras).double().cpu()
     squares = (where[:, None] - where).square().sum(dim=-1).numpy()
     _, before = shortest_path(squares, indices=0, return_predecessors=True)
-    way, number = [second], before[-1]
+    way = [second]
+    number = before[-1]
     while number > 0:
         way.append(cameras[number])
         number = before[number]

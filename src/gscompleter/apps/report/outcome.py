@@ -155,7 +155,8 @@ def describe_work(completion: Completion, is_given: bool) -> str:
         work = f"The {'splat' if is_given else 'scene'} is completed"
     else:
         return "Nothing was added to the splat; only colours changed"
-    changed, total = count_changed(completion.targets), len(completion.targets)
+    changed = count_changed(completion.targets)
+    total = len(completion.targets)
     return f"{work} for {changed} of {total} targets" if changed < total else work
 
 

@@ -44,7 +44,9 @@ NOTHING_NEW_NOTE = (
 
 def list_notes(summary: CompletionSummary) -> Iterator[str]:
     """List the notes on the whole completion."""
-    frame, scene, targets = summary.frame, summary.scene, summary.targets
+    frame = summary.frame
+    scene = summary.scene
+    targets = summary.targets
     if frame.method in FRAME_NOTES:
         yield f"The splat is {FRAME_NOTES[frame.method]}; summary.json lists the transform."
     if any(frame.origin):

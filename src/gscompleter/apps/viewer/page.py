@@ -111,7 +111,8 @@ def make_page(viewer_content: ViewerContent, libraries: Libraries) -> tuple[byte
 
 def split_layers(viewer_content: ViewerContent) -> dict[str, Gaussians]:
     """Split the content into layers: before, and the observed and generated part of after."""
-    after, before = viewer_content.after, viewer_content.before
+    after = viewer_content.after
+    before = viewer_content.before
     layers = {"observed": after[after.generated == 0], "generated": after[after.generated > 0]}
     return layers if before is None else {"before": before, **layers}
 
@@ -140,8 +141,10 @@ def describe_camera(
     view_camera: ViewerCamera, frame: PageFrame, landmarks: Float[Tensor, "n 3"]
 ) -> dict[str, Any]:
     """Describe a camera as the page reads it, focused on landmarks in page unit and scene axes."""
-    camera, thumbnail = frame.move_camera(view_camera.camera), view_camera.thumbnail
-    K, (pixels, depths) = camera.K, project(landmarks, camera)
+    camera = frame.move_camera(view_camera.camera)
+    thumbnail = view_camera.thumbnail
+    K = camera.K
+    pixels, depths = project(landmarks, camera)
     seen = depths[is_inside(pixels, depths, camera)]
     return {
         "name": view_camera.name,
@@ -158,7 +161,9 @@ def describe_camera(
 def plan_path(cameras: Sequence[Camera]) -> list[tuple[int, float]]:
     """Plan a path from the first camera, each time to the nearest one left: indices and seconds."""
     where = embed_cameras([camera.to("cpu") for camera in cameras]).double()
-    apart, left, stops = torch.cdist(where, where), torch.zeros(len(where)), [0]
+    apart = torch.cdist(where, where)
+    left = torch.zeros(len(where))
+    stops = [0]
     for _ in cameras[1:]:
         left[stops[-1]] = torch.inf
         stops.append(int((apart[stops[-1]] + left).argmin()))

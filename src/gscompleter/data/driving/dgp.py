@@ -39,7 +39,8 @@ def open_dgp(path: Path) -> Iterator[Photographs]:
     """
     file = list_scene_files(path)[0]
     content = read_json(file, ADVICE)
-    cameras, sweeps = _read_calibrations(file, content), _map_sweeps(content)
+    cameras = _read_calibrations(file, content)
+    sweeps = _map_sweeps(content)
     images = [d for d in get_part(content, "data", list) if "image" in get_part(d, "datum", dict)]
     frames = sorted((_parse_frame(d, cameras, sweeps, file) for d in images), key=lambda f: f.name)
     require(frames, f"{quote_value(file)} lists no images; name a scene with cameras.")
@@ -50,7 +51,8 @@ def open_dgp(path: Path) -> Iterator[Photographs]:
 def _parse_frame(
     datum: Any, cameras: Mapping[str, Intrinsics], sweeps: Mapping[str, Any], file: Path
 ) -> Frame:
-    image, camera = datum["datum"]["image"], str(get_part(datum, "id", dict).get("name"))
+    image = datum["datum"]["image"]
+    camera = str(get_part(datum, "id", dict).get("name"))
     name = get_text(image, "filename", str(file)) or ""
     title = f"image {quote_value(name)} of {quote_value(file)}"
     require(
@@ -59,16 +61,19 @@ def _parse_frame(
         f"calibration; {ADVICE}.",
     )
     intrinsics = replace(cameras[camera], size=get_size(image, title))
-    sweep, read = sweeps.get(str(datum.get("key"))), None
+    sweep = sweeps.get(str(datum.get("key")))
+    read = None
     points = get_text(sweep, "filename", str(file))
     if points is not None and os.path.isfile(file.parent / points):
         read = partial(_read_points, file.parent / points, _get_pose(sweep, str(file)))
-    c2w, place = _get_pose(image, title), file.parent / name
+    c2w = _get_pose(image, title)
+    place = file.parent / name
     return Frame(name, title, c2w, intrinsics, place, sensor=camera, laser_points=read)
 
 
 def _get_pose(entry: Any, title: str) -> Float[np.ndarray, "4 4"]:
-    pose, quaternion = get_part(entry, "pose", dict), ("qw", "qx", "qy", "qz")
+    pose = get_part(entry, "pose", dict)
+    quaternion = ("qw", "qx", "qy", "qz")
     return get_pose(pose, "translation", "rotation", quaternion, title)
 
 

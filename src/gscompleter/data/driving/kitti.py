@@ -55,7 +55,8 @@ def open_kitti(path: Path) -> Iterator[Photographs]:
     `path` is a folder with calib.txt and poses.txt, or with its poses in ../../poses; or a file of
     poses, with calibration and photographs beside it or in ../sequences.
     """
-    poses, folder = _list_poses(path)[0], path if os.path.isdir(path) else path.parent
+    poses = _list_poses(path)[0]
+    folder = path if os.path.isdir(path) else path.parent
     sequence = poses.resolve().parent.parent / "sequences" / poses.stem
     if poses == path and os.path.isdir(sequence):
         folder = sequence
@@ -67,10 +68,12 @@ def open_kitti(path: Path) -> Iterator[Photographs]:
     projection = _get_matrix(entries, label, calibration)
     intrinsics, first_from_camera = _split_projection(projection, calibration)
     lasers = [_get_matrix(entries, label, calibration) for label in entries if label[:2] == "Tr"]
-    frames, rows = [], _read_entries(poses)
+    frames = []
+    rows = _read_entries(poses)
     require(rows, f"{quote_value(poses)} holds no poses; copy it again.")
     for number, row in enumerate(rows):
-        name, title = f"{number:06d}", f"frame {number} of {quote_value(poses)}"
+        name = f"{number:06d}"
+        title = f"frame {number} of {quote_value(poses)}"
         first = _get_matrix(rows, row, poses)
         sweep = folder / "velodyne" / f"{name}.bin"
         points = _find_sweep(sweep, first @ lasers[0]) if lasers else None
@@ -111,7 +114,8 @@ def _find_sweep(path: Path, world_from_laser: Pose) -> partial[Float[np.ndarray,
 
 def _read_raw_camera(date: Path, camera: str) -> tuple[Intrinsics, Pose, Pose]:
     """Read the intrinsics of a camera, and the transforms from it and the laser to camera 0."""
-    path, rectify = date / "calib_cam_to_cam.txt", np.eye(4)
+    path = date / "calib_cam_to_cam.txt"
+    rectify = np.eye(4)
     entries = _read_entries(path)
     rectify[:3, :3] = _get_entry(entries, "R_rect_00", 9, path).reshape(3, 3)
     projection = _get_matrix(entries, f"P_rect_{camera}", path)
@@ -121,7 +125,8 @@ def _read_raw_camera(date: Path, camera: str) -> tuple[Intrinsics, Pose, Pose]:
 
 def _split_projection(projection: Pose, path: Path) -> tuple[Intrinsics, Pose]:
     """Split the projection of a rectified camera into intrinsics and the transform to camera 0."""
-    K, transform = projection[:3, :3], np.eye(4)
+    K = projection[:3, :3]
+    transform = np.eye(4)
     require(
         not np.tril(K, -1).any() and (np.diag(K) > 0).all() and K[2, 2] == 1,
         f"The projection in {quote_value(path)} is not that of a rectified camera; name the "

@@ -129,7 +129,8 @@ def _make_frame(path: Path, camera: str, time: float, image: Any, world_from_las
     K = get_array(image, "cam2img", title, (3, 3), (3, 4))
     size = get_size(image, title) if "width" in image and "height" in image else None
     intrinsics = Intrinsics(size, (K[0, 0], K[1, 1]), (K[0, 2], K[1, 2]))
-    name, place = f"{camera}/{os.path.basename(file)}", _find_image(path.parent, file, camera)
+    name = f"{camera}/{os.path.basename(file)}"
+    place = _find_image(path.parent, file, camera)
     return Frame(name, title, c2w, intrinsics, place, sensor=camera)
 
 

@@ -129,7 +129,8 @@ def _make_frame(
 
 
 def _read_cameras(path: Path) -> dict[int, PosedLens]:
-    title, found = quote_value(path), {}
+    title = quote_value(path)
+    found = {}
     for camera, pose, *numbers in _read_rows(path, (CAMERA, "extrinsic.transform", *LENS)):
         lens = np.array(numbers, dtype=np.float64)  # null becomes NaN
         require(
@@ -152,12 +153,14 @@ def _read_points(segment: Path, time: int) -> Float[np.ndarray, "n 3"]:
     """
     vehicle = _read_vehicle_pose(segment, time)
     lasers = _read_lasers(_locate(segment, "lidar_calibration"))
-    measured, turning = _locate(segment, "lidar"), _locate(segment, "lidar_pose")
+    measured = _locate(segment, "lidar")
+    turning = _locate(segment, "lidar_pose")
     poses = _read_range_images(turning, time) if os.path.isfile(turning) else {}
     points = [np.zeros((0, 3))]
     for laser, image in _read_range_images(measured, time).items():
         title = f"laser {laser} of {quote_value(measured)}"
-        ranges, moving = image[..., 0], poses.get(laser)
+        ranges = image[..., 0]
+        moving = poses.get(laser)
         fits = laser in lasers and (moving is None or moving.shape == (*ranges.shape, 6))
         require(fits, f"The {title} does not fit its calibration or its poses; {ADVICE}.")
         hit = np.isfinite(ranges) & (ranges > 0)
@@ -188,7 +191,8 @@ def _compute_points(
     require(rising.size == height, f"The {title} does not fit its calibration; {ADVICE}.")
     yaw = np.arctan2(extrinsic[1, 0], extrinsic[0, 0])
     azimuths = np.pi * (1 - 2 * (np.arange(width) + 0.5) / width) - yaw
-    level, up = np.cos(rising[::-1, None]), np.sin(rising[::-1, None])
+    level = np.cos(rising[::-1, None])
+    up = np.sin(rising[::-1, None])
     up = np.broadcast_to(up, ranges.shape)
     rays = np.stack([level * np.cos(azimuths), level * np.sin(azimuths), up], axis=-1)
     return transform_points(ranges[..., None] * rays, extrinsic)
@@ -209,7 +213,8 @@ def _read_lasers(path: Path) -> dict[int, tuple[Any, ...]]:
 
 def _read_range_images(path: Path, time: int) -> dict[int, Float[np.ndarray, "h w c"]]:
     """Read the range image of the first returns, or the poses of its pixels, by laser."""
-    columns, found = (LASER, "range_image_return1.values", "range_image_return1.shape"), {}
+    columns = (LASER, "range_image_return1.values", "range_image_return1.shape")
+    found = {}
     for laser, values, shape in _read_rows(path, columns, {TIME: time}):
         if values is not None and shape is not None:
             fits = len(shape) == 3 and min(shape) > 0 and len(values) == np.prod(shape)

@@ -65,7 +65,8 @@ class KeyframeFormat:
 
 def parse_polycam(entry: Any, title: str) -> PoseAndLens:
     """Parse a camera of Polycam."""
-    c2w, bound = np.eye(4), MAX_COORDINATE
+    c2w = np.eye(4)
+    bound = MAX_COORDINATE
     for row, column in np.ndindex(3, 4):
         c2w[row, column] = get_number(entry, f"t_{row}{column}", title, -bound, bound)
     return c2w, replace(get_intrinsics(entry, title), size=get_size(entry, title))
@@ -93,11 +94,13 @@ def find_recording(path: Path) -> Files:
 
 def open_recording(path: Path) -> Iterator[Photographs]:
     """Open a recording of Record3D; frames are numbered by time."""
-    title, metadata = quote_value(path), find_files(path, METADATA)
+    title = quote_value(path)
+    metadata = find_files(path, METADATA)
     require(metadata, f"There is no `{METADATA}` in {title}; {ADVICE}.")
     content = parse_json(metadata[METADATA](), f"`{METADATA}` of {title}", ADVICE)
     size = get_size(content, title, "w", "h")
-    depths, confidences = find_files(path, "rgbd/*.depth"), find_files(path, "rgbd/*.conf")
+    depths = find_files(path, "rgbd/*.depth")
+    confidences = find_files(path, "rgbd/*.conf")
     notes = (NOTE,) if depths and find_spec("liblzfse") is None else ()
     files = find_recording(path), {} if notes else depths, confidences
     decoders = partial(_unpack, "<f4", size), partial(_unpack, "u1", size)
@@ -115,7 +118,8 @@ def _parse_recorded(content: Any, size: tuple[int, int], title: str) -> dict[str
     cameras: dict[str, PoseAndLens] = {}
     for (x, y, z, w, *center), (fx, fy, cx, cy) in zip(poses, lenses.tolist(), strict=True):
         c2w = np.eye(4)
-        c2w[:3, :3], c2w[:3, 3] = compute_rotation((w, x, y, z)), center
+        c2w[:3, :3] = compute_rotation((w, x, y, z))
+        c2w[:3, 3] = center
         cameras[str(len(cameras))] = c2w, Intrinsics(size, (fx, fy), (cx, cy))
     return cameras
 

@@ -98,9 +98,12 @@ def build_recording(
 
     `decoders` are those of depth and of confidence, either of which a frame may lack.
     """
-    frames, (images, depths, confidences) = [], files
+    frames = []
+    images, depths, confidences = files
     for name in (name for name in cameras if name in images):
-        title, (c2w, lens), depth = f"frame {name} of {quote_value(path)}", cameras[name], None
+        title = f"frame {name} of {quote_value(path)}"
+        c2w, lens = cameras[name]
+        depth = None
         if name in depths:
             depth = partial(_read_depth, depths[name], confidences.get(name), decoders, title)
         frame = Frame(name, title, c2w @ OPENCV_FROM_OPENGL, lens, images[name], depth)

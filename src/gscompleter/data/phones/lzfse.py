@@ -33,7 +33,8 @@ def measure_unpacked(data: bytes) -> int:
             start += 12 + packed
         elif magic == LZFSE:
             _, unpacked, first, second, third = LZFSE_HEADER.unpack_from(data, start)
-            literals, matches = (first >> 20) & PAYLOAD_MASK, (second >> 40) & PAYLOAD_MASK
+            literals = (first >> 20) & PAYLOAD_MASK
+            matches = (second >> 40) & PAYLOAD_MASK
             header_bytes = third & 0xFFFFFFFF
             start += max(header_bytes, LZFSE_HEADER.size) + literals + matches
         else:

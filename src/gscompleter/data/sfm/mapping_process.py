@@ -204,14 +204,16 @@ def select_model(job: Job) -> tuple[pycolmap.Reconstruction | None, bool]:
     """Map with a free focal length, then with plausible fixed ones (True), until it is good."""
     if job.is_panoramic:  # the focal length of views is known
         return map_largest(job, is_focal_fixed=True), False
-    best, is_focal_fixed = map_largest(job), False
+    best = map_largest(job)
+    is_focal_fixed = False
     wanted = math.ceil(WANTED_SHARE * len(job.photographs))
     for fov in FIXED_FOVS:
         if _rate_model(best) >= (True, wanted, 0):
             break
         found = map_with_fixed_focals(job, fov)
         if _rate_model(found) > _rate_model(best):
-            best, is_focal_fixed = found, True
+            best = found
+            is_focal_fixed = True
     return best, is_focal_fixed
 
 
@@ -244,7 +246,9 @@ def _fix_focals(job: Job, focals: dict[int, float], fov: float) -> None:
     """Fix focal lengths (pixels by camera, or else as of `fov`) in the database, undistorted."""
     with pycolmap.Database.open(job.database) as database:
         for camera in database.read_all_cameras():
-            width, height, number = camera.width, camera.height, camera.camera_id
+            width = camera.width
+            height = camera.height
+            number = camera.camera_id
             focal = max(width, height) / 2 / math.tan(math.radians(fov / 2))
             known = pycolmap.Camera.create_from_model_name(
                 number, LENS, focals.get(number, focal), width, height
@@ -283,7 +287,8 @@ def has_plausible_lenses(model: pycolmap.Reconstruction) -> bool:
 
 def is_plausible(camera: pycolmap.Camera) -> bool:
     """Check whether a camera has a field of view, distortion and principal point of a real one."""
-    focal, side = camera.mean_focal_length(), max(camera.width, camera.height)
+    focal = camera.mean_focal_length()
+    side = max(camera.width, camera.height)
     if not (math.isfinite(focal) and focal > 0):
         return False
     fov = math.degrees(2 * math.atan(side / 2 / focal))
@@ -341,7 +346,8 @@ def _count_shared(a: Float[np.ndarray, "m 128"], b: Float[np.ndarray, "n 128"]) 
     if len(a) == 0 or len(b) == 0:
         return 0
     cosines = a @ b.T
-    best, back = cosines.argmax(axis=1), cosines.argmax(axis=0)
+    best = cosines.argmax(axis=1)
+    back = cosines.argmax(axis=0)
     is_mutual = back[best] == np.arange(len(a))
     return int(np.count_nonzero(is_mutual & (cosines.max(axis=1) > MIN_COSINE)))
 

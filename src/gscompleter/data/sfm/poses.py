@@ -325,7 +325,8 @@ def write_copies(
         kind, name = f"view_{number}", Path(re.sub(r"[\s#]", "_", source)).with_suffix(".jpg")
         target = _prepare_target(folder / IMAGES / kind / name, root / source)
         Image.fromarray(pixels).save(target, quality=QUALITY, subsampling=0)
-        side, place = len(pixels), f"{kind}/{name.as_posix()}"
+        side = len(pixels)
+        place = f"{kind}/{name.as_posix()}"
         is_masked = shade is not None and _write_mask(folder, place, shade, (side, side))
         copies.append(UprightCopy(place, place, side, side, side / 2, kind, is_masked))
     return copies
@@ -339,14 +340,16 @@ def write_upright(root: Path, source: str, folder: Path, mask: Path | None = Non
     """
     path = root / source
     with open_image(path) as image:
-        exif, kind = image.getexif(), image.format
+        exif = image.getexif()
+        kind = image.format
         is_known = kind in ("JPEG", "PNG")
         is_upright = exif.get(ORIENTATION, 1) == 1 and max(image.size) <= MAX_SIDE
         is_ready = is_known and is_upright and image.mode in ("RGB", "L")
         if not is_ready:  # decodes a JPEG at half or a quarter of its size if that is enough
             image.draft("RGB", (MAX_SIDE, MAX_SIDE))
         copy = ImageOps.exif_transpose(image).convert("RGB")
-        focal, lens = read_focal(exif), _describe_lens(exif)
+        focal = read_focal(exif)
+        lens = _describe_lens(exif)
     copy.thumbnail((MAX_SIDE, MAX_SIDE), Image.Resampling.LANCZOS)
     # In COLMAP's lists a space ends a name, and # begins a comment.
     name = re.sub(r"[\s#]", "_", source) + ("" if is_known else ".png")

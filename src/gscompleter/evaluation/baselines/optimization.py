@@ -55,7 +55,8 @@ def optimize(
     state = Parameters(scene, extent)
     gradients = counts = torch.zeros_like(scene.opacities)
     # Rounds of density control, evenly over the first 80 % of the iterations.
-    last, count = 0.8 * config.iterations, config.density_rounds
+    last = 0.8 * config.iterations
+    count = config.density_rounds
     rounds = {math.ceil(last * (i + 1) / count) for i in range(count)}
     order: list[int] = []
     for number in track(range(1, config.iterations + 1), "Optimising"):
@@ -68,7 +69,8 @@ def optimize(
         state.optimizer.zero_grad()
         loss.backward()
         gradient, seen = compute_image_gradients(gaussians.means, state.leaves[0].grad, view.camera)
-        gradients, counts = gradients + gradient, counts + seen
+        gradients = gradients + gradient
+        counts = counts + seen
         state.optimizer.step()
         if number in rounds:
             crowded = gradients / counts.clamp_min(1) >= config.gradient_threshold
@@ -133,7 +135,8 @@ def control_density(
     """Clone small `crowded` Gaussians, split large ones and prune faint ones."""
     with torch.no_grad():
         large = scene.scales.amax(dim=-1) > DENSE_SHARE * extent
-        clones, parents = scene[crowded & ~large], scene[crowded & large]
+        clones = scene[crowded & ~large]
+        parents = scene[crowded & large]
         kept = scene[~(crowded & large)]
         children = []
         for _ in range(2):

@@ -90,7 +90,8 @@ def register_by_similarity(
     optimizer = torch.optim.Adam(groups, amsgrad=True)
     small_lifted = cluster_gaussians(lifted, camera, config.components, seed)
     small_scene = cluster_gaussians(scene, camera, config.components, seed)
-    best, best_loss = None, np.inf
+    best = None
+    best_loss = np.inf
     distances: list[float] = []
     compare_mixtures = config.mixture_weight > 0
     for _ in track(range(config.iterations), "Registering"):
@@ -102,7 +103,8 @@ def register_by_similarity(
         depth = (moved.depth - scale * own.depth.detach())[overlap].abs().sum()
         loss = colour + DEPTH_WEIGHT * depth
         if compare_mixtures:
-            means, covariances = scale * small_lifted.means, scale**2 * small_lifted.covariances
+            means = scale * small_lifted.means
+            covariances = scale**2 * small_lifted.covariances
             scaled = Mixture(means, covariances, small_lifted.weights)
             distance = compute_mixture_wasserstein(scaled, rotate_mixture(small_scene, fit, camera))
             recent = distances[-PATIENCE:]
@@ -147,7 +149,8 @@ def cluster_gaussians(gaussians: Gaussians, camera: Camera, components: int, see
     rotation = camera.c2w[:3, :3]
     axes = rotation.T @ quats_to_rotations(gaussians.quats)
     spread = axes * gaussians.scales[:, None, :]
-    means, weights = (gaussians.means - camera.center) @ rotation, gaussians.opacities.softmax(0)
+    means = (gaussians.means - camera.center) @ rotation
+    weights = gaussians.opacities.softmax(0)
     mixture = Mixture(means, spread @ spread.transpose(-1, -2), weights)
     if len(gaussians) <= components:
         return mixture
@@ -235,9 +238,11 @@ class _MatrixRoot(torch.autograd.Function):
 def compute_mixture_wasserstein(a: Mixture, b: Mixture) -> Float[Tensor, ""]:
     """Compute Σ plan * cost by Sinkhorn iterations; the largest plan entry is 1 as in RegGS."""
     cost = compute_pairwise_costs(a, b)
-    log_a, log_b = (a.weights + 1e-10).log(), (b.weights + 1e-10).log()
+    log_a = (a.weights + 1e-10).log()
+    log_b = (b.weights + 1e-10).log()
     log_kernel = -cost / EPSILON
-    log_u, log_v = torch.zeros_like(log_a), torch.zeros_like(log_b)
+    log_u = torch.zeros_like(log_a)
+    log_v = torch.zeros_like(log_b)
     for _ in range(MAX_ITERATIONS):
         log_u = log_a - torch.logsumexp(log_kernel + log_v[None], dim=1)
         before = log_v

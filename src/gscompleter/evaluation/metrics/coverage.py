@@ -86,7 +86,8 @@ def render_trusted(frozen: FrozenScene, trust: Trust, camera: Camera) -> Render:
 
 def compute_coverage(pairs: Sequence[RenderPair]) -> Coverage:
     """Compute the coverage before and after completion, and count the cameras."""
-    before, after = [pair.before for pair in pairs], [pair.after for pair in pairs]
+    before = [pair.before for pair in pairs]
+    after = [pair.after for pair in pairs]
     return Coverage(compute_covered_share(before), compute_covered_share(after), len(pairs))
 
 

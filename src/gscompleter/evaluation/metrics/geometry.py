@@ -49,7 +49,8 @@ def compare_depths(
     known = where & (truth > 0)
     if not known.any():
         return Agreement(0)
-    d, t = depth[known].double(), truth[known].double()
+    d = depth[known].double()
+    t = truth[known].double()
     return Agreement(int(known.sum()), ((d - t).abs() / t).mean().item())
 
 
@@ -60,7 +61,8 @@ def compute_f_score(
 
     Precision P is the share of A within `threshold` (scene units) of B, recall R that of B near A.
     """
-    precision, recall = float((a_to_b <= threshold).mean()), float((b_to_a <= threshold).mean())
+    precision = float((a_to_b <= threshold).mean())
+    recall = float((b_to_a <= threshold).mean())
     total = precision + recall
     return 2 * precision * recall / total if total > 0 else 0.0
 
@@ -86,7 +88,8 @@ def measure_alignment(
     the overlap, matched with everything added. A perfect completion does not reach 0, because
     Gaussians are spaced and depths mix at edges: compare methods on the same cases.
     """
-    added, context = drop_transparent(added), drop_transparent(context)
+    added = drop_transparent(added)
+    context = drop_transparent(context)
     generated = renderer.render(added, target).depth_map()
     reference = renderer.render(context, target).depth_map()
     overlap = generated.valid & reference.valid
@@ -104,7 +107,8 @@ def measure_primitive_alignment(
     overlap. AbsRel is the mean of |z - D| / D with the z-depth z of the mean and the rendered
     context depth D. Renders would favour scattered Gaussians, which cover fewer and easier pixels.
     """
-    registered, context = drop_transparent(registered), drop_transparent(context)
+    registered = drop_transparent(registered)
+    context = drop_transparent(context)
     reference = renderer.render(context, target).depth_map()
     points = registered[project_mask(reference.valid, registered, target)].means
     pixels, z = project(points, target)

@@ -37,12 +37,14 @@ def haarpsi(image: Image, truth: Image, where: Bool[Tensor, "h w"]) -> float | N
     Images are halved first, as published; a pixel counts if half of its area is in `where`. None
     without such a pixel.
     """
-    of_image, of_truth = convert_to_yiq(image), convert_to_yiq(truth)
+    of_image = convert_to_yiq(image)
+    of_truth = convert_to_yiq(truth)
     similarity, weight = compute_similarities(of_image, of_truth)
     inside = halve_image(where[None].double().cpu())[0] >= 0.5
     if not inside.any():
         return None
-    similarity, weight = similarity[:, inside], weight[:, inside]
+    similarity = similarity[:, inside]
+    weight = weight[:, inside]
     # Without any edge all pixels have the same weight.
     tiny = torch.finfo(weight.dtype).eps
     mean = ((ALPHA * similarity).sigmoid() * (weight + tiny)).sum() / (weight + tiny).sum()
@@ -76,7 +78,8 @@ def compute_wavelets(luminance: Float[Tensor, "h w"], scale: int) -> Float[Tenso
     size = 2**scale
     step = luminance.new_full((size, size), 1 / size)
     step[size // 2 :] *= -1
-    before, after = size // 2 - 1, size // 2
+    before = size // 2 - 1
+    after = size // 2
     padded = pad(luminance[None, None], (before, after, before, after))
     return conv2d(padded, torch.stack([step, step.T])[:, None])[0].abs()
 

@@ -119,8 +119,10 @@ def score(
 
     `added` is None if existing Gaussians were changed; `registered` has all lifted Gaussians.
     """
-    target, camera = truth.target, truth.target.camera
-    was, now = renderer.render(before, camera), renderer.render(after, camera)
+    target = truth.target
+    camera = truth.target.camera
+    was = renderer.render(before, camera)
+    now = renderer.render(after, camera)
     holes = compute_hole_mask(was.alpha)
     covered = now.depth_map().valid & target.valid_mask
     context, beside = (
@@ -157,7 +159,8 @@ def measure_quality(image: Image, photograph: View) -> Quality:
 
     Ignored pixels of the photograph do not count for PSNR and count as equal for the others.
     """
-    truth, compared = photograph.image, photograph.fill_ignored(image)
+    truth = photograph.image
+    compared = photograph.fill_ignored(image)
     return Quality(
         compute_view_psnr(image, photograph),
         compute_view_ssim(image, photograph),
@@ -179,7 +182,8 @@ def compute_view_ssim(image: Image, photograph: View) -> float:
 
 def measure_part(image: Image, photograph: View, where: Bool[Tensor, "h w"]) -> PartQuality:
     """Score an image over the valid pixels of `where`."""
-    compared, truth = photograph.fill_ignored(image), photograph.image
+    compared = photograph.fill_ignored(image)
+    truth = photograph.image
     where = where & photograph.valid_mask
     errors = compute_flip_map(compared, truth)
     return PartQuality(

@@ -34,9 +34,12 @@ class Similarity:
 
 def fit_center_similarity(given: Points, found: Points) -> Similarity:
     """Fit the similarity from `given` to `found` by least squares; it needs two distinct points."""
-    x, y = given.astype(np.float64), found.astype(np.float64)
-    middle_x, middle_y = x.mean(0), y.mean(0)
-    x, y = x - middle_x, y - middle_y
+    x = given.astype(np.float64)
+    y = found.astype(np.float64)
+    middle_x = x.mean(0)
+    middle_y = y.mean(0)
+    x = x - middle_x
+    y = y - middle_y
     spread = (x**2).sum(1).mean()
     if not spread > 0:
         raise InputError(
@@ -56,7 +59,8 @@ def fit_robust_similarity(given: Points, found: Points) -> Similarity:
     if len(given) < MIN_RANSAC_CAMERAS:
         return every
     threshold = float(np.median(measure_nearest_distances(every(given), found)))
-    best, least = None, (0, np.inf)
+    best = None
+    least = (0, np.inf)
     for half in sample_halves(len(given)):
         if np.ptp(given[half], axis=0).max() == 0:
             continue
@@ -67,7 +71,8 @@ def fit_robust_similarity(given: Points, found: Points) -> Similarity:
         count = int(inliers.sum())
         mean = float(error[inliers].mean()) if count else np.inf
         if (count, -mean) > (least[0], -least[1]):
-            best, least = inliers, (count, mean)
+            best = inliers
+            least = (count, mean)
     if best is None or least[0] < 3:
         return every
     return fit_center_similarity(given[best], found[best])

@@ -38,7 +38,8 @@ class RayLayers(nn.Sequential):
     """Output layers of a level. The four levels share one norm, which files store at the first."""
 
     def __init__(self, channels: int, level: int) -> None:
-        first, last = nn.Conv2d(channels, HIDDEN, 3, 1, 1), nn.Conv2d(HIDDEN, 7, 1)
+        first = nn.Conv2d(channels, HIDDEN, 3, 1, 1)
+        last = nn.Conv2d(HIDDEN, 7, 1)
         norm = nn.Identity() if level else ChannelNorm(HIDDEN)
         super().__init__(first, nn.Identity(), norm, nn.Identity(), nn.ReLU(), last)
 
@@ -70,7 +71,8 @@ class DualScratch(ImageScratch):
         fusions = (self.refinenet1_aux, self.refinenet2_aux, self.refinenet3_aux)
         x = fuse_levels(self.project_levels(pyramid), *fusions, self.refinenet4_aux)
         x = add_position_encoding(self.output_conv1_aux[-1](x), aspect)
-        shared, last = self.output_conv2_aux[0], self.output_conv2_aux[-1]
+        shared = self.output_conv2_aux[0]
+        last = self.output_conv2_aux[-1]
         assert isinstance(shared, RayLayers)
         assert isinstance(last, RayLayers)
         return last.apply_with_norm(x, shared[NORM_INDEX])

@@ -75,7 +75,8 @@ class Window:
         """Compute the row-major index of the photograph's pixel below each window pixel."""
         x = ((torch.arange(self.width) + 0.5 + self.left) / self.scale_x).long()
         y = ((torch.arange(self.height) + 0.5 + self.top) / self.scale_y).long()
-        rows, columns = y.clamp(max=camera.height - 1), x.clamp(max=camera.width - 1)
+        rows = y.clamp(max=camera.height - 1)
+        columns = x.clamp(max=camera.width - 1)
         return (rows[:, None] * camera.width + columns).flatten()
 
     def resample_depth_map(
@@ -141,7 +142,8 @@ def crop_to_patches(image: Image, sizing: ResizeConfig) -> tuple[Image, Window]:
 
 def crop_center(image: Image, height: int, width: int) -> UInt8[np.ndarray, "{height} {width} 3"]:
     """Crop the centre of an image."""
-    top, left = (image.shape[0] - height) // 2, (image.shape[1] - width) // 2
+    top = (image.shape[0] - height) // 2
+    left = (image.shape[1] - width) // 2
     return image[top : top + height, left : left + width]
 
 

@@ -100,5 +100,6 @@ def interpolate_quantile(values: Float[Tensor, "n"], share: float) -> Float[Tens
     """Compute a quantile; `torch.interpolate_quantile` is limited to 16 million values."""
     place = share * (len(values) - 1)
     ordered = values.sort().values
-    below, above = ordered[int(place)], ordered[min(int(place) + 1, len(values) - 1)]
+    below = ordered[int(place)]
+    above = ordered[min(int(place) + 1, len(values) - 1)]
     return below + (above - below) * (place - int(place))

@@ -75,7 +75,8 @@ def fit_metres_per_unit(prediction: Prediction, metric: MetricDepth) -> float:
     counts = select_scale_pixels(prediction, metric, metres)
     if int(counts.sum()) <= MIN_PIXELS:
         return 1.0
-    a, b = metres[counts].double(), prediction.depth[counts].double()
+    a = metres[counts].double()
+    b = prediction.depth[counts].double()
     return float((a * b).sum() / (b * b).sum())
 
 

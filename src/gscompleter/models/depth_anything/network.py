@@ -45,7 +45,8 @@ class DepthAnything(nn.Module):
     def __init__(self, config: DepthAnythingConfig = DepthAnythingConfig()) -> None:
         super().__init__()
         self.config = config
-        channels, head = config.vit.num_output_channels, (config.widths, config.features)
+        channels = config.vit.num_output_channels
+        head = (config.widths, config.features)
         self.backbone = nn.ModuleDict({"pretrained": AnyViewVit(config.vit)})
         self.head = DualDpt(channels, *head)
         self.cam_dec = CameraDecoder(channels)

@@ -59,7 +59,8 @@ class AnyViewDepth:
         batch = create_any_view_batch(views, self.inference.sizing, min_views=2)
         predicted = run_network(self.network, batch, self.inference)
         assert isinstance(predicted, Prediction)
-        (given,), (found,) = get_camera_centers(batch.poses), get_camera_centers(predicted.poses)
+        (given,) = get_camera_centers(batch.poses)
+        (found,) = get_camera_centers(predicted.poses)
         depth = predicted.depth[0] / fit_robust_similarity(given, found).scale
         return resample_depth_maps(
             depth, normalize_confidence(predicted.confidence[0]), batch, views
@@ -114,9 +115,11 @@ class AnyViewGaussians:
         batch = create_any_view_batch(views, self.inference.sizing, min_views=2)
         predicted = run_network(self.network, batch, self.inference)
         if isinstance(predicted, NestedPrediction):
-            any_view, solid = predicted.any_view, predicted.metric.solid_mask
+            any_view = predicted.any_view
+            solid = predicted.metric.solid_mask
         else:
-            any_view, solid = predicted, torch.ones_like(predicted.depth, dtype=torch.bool)
+            any_view = predicted
+            solid = torch.ones_like(predicted.depth, dtype=torch.bool)
         sure = normalize_confidence(any_view.confidence) * solid
         return create_any_view_reconstruction(
             move_to_given_frame(any_view, batch.poses), sure[0], batch, views

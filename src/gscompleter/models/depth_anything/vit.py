@@ -53,7 +53,8 @@ class RotaryAttention(dino.Attention):
     ) -> Float[Tensor, "n t c"]:
         """Apply self-attention to tokens rotated by `turns`."""
         q, k, v = self.qkv(x).unflatten(2, (3, self.heads, -1)).permute(2, 0, 3, 1, 4)
-        q, k = turns(self.q_norm(q)), turns(self.k_norm(k))
+        q = turns(self.q_norm(q))
+        k = turns(self.k_norm(k))
         return self.proj(F.scaled_dot_product_attention(q, k, v).transpose(1, 2).flatten(2))
 
 
@@ -100,7 +101,8 @@ class AnyViewVit(nn.Module):
     def __init__(self, config: VitConfig) -> None:
         super().__init__()
         self.config = config
-        channels, start = config.channels, config.first_multi_view_block
+        channels = config.channels
+        start = config.first_multi_view_block
         self.cls_token = nn.Parameter(torch.zeros(1, 1, channels))
         if start is not None:
             self.camera_token = nn.Parameter(torch.zeros(1, 2, channels))
@@ -134,11 +136,13 @@ class AnyViewVit(nn.Module):
         )
         order = torch.arange(views, device=images.device).expand(scenes, -1)
         start = self.config.first_multi_view_block
-        outputs, local = [], x
+        outputs = []
+        local = x
         for number, block in enumerate(self.blocks):
             if start is not None and number == start - 1 and cameras is None and views > 2:
                 order = order_views(select_reference_view(x[:, :, 0].float()), views)
-                x, local = reorder_views(x, order), reorder_views(local, order)
+                x = reorder_views(x, order)
+                local = reorder_views(local, order)
             if number == start:
                 x = torch.cat(
                     [self.select_camera_tokens(cameras, scenes, views), x[:, :, 1:]], dim=2
@@ -168,7 +172,8 @@ class AnyViewVit(nn.Module):
         """Return the given tokens, or learned ones for the first view and for all others."""
         if cameras is not None:
             return cameras[:, :, None]
-        first, other = self.camera_token[:, :1], self.camera_token[:, 1:]
+        first = self.camera_token[:, :1]
+        other = self.camera_token[:, 1:]
         return torch.cat([first, other.expand(-1, views - 1, -1)], 1)[:, :, None].expand(
             scenes, -1, -1, -1
         )

@@ -73,7 +73,8 @@ class Kontext:
             guidance: Scale of the distilled guidance.
         """
         pipeline = self.pipeline
-        count, grid = len(photographs), self.compute_grid(size)
+        count = len(photographs)
+        grid = self.compute_grid(size)
         # One at a time: the VAE needs much more memory than the tokens.
         source = torch.stack([self.encode_image(photograph) for photograph in photographs])
         channels = pipeline.transformer.config.in_channels // 4
@@ -101,7 +102,8 @@ class Kontext:
         guidance: float,
     ) -> Float[Tensor, "b n c"]:
         """Predict the velocity of the latents, given the photographs' tokens."""
-        transformer, count = self.pipeline.transformer, len(latents)
+        transformer = self.pipeline.transformer
+        count = len(latents)
         scale = None
         if transformer.config.guidance_embeds:
             scale = torch.full((count,), guidance, device=self.device, dtype=torch.float32)
@@ -122,8 +124,10 @@ class Kontext:
         """Compute the denoising timesteps; more tokens shift them towards noise."""
         scheduler = self.pipeline.scheduler
         settings = scheduler.config
-        few, many = settings.get("base_image_seq_len", 256), settings.get("max_image_seq_len", 4096)
-        low, high = settings.get("base_shift", 0.5), settings.get("max_shift", 1.15)
+        few = settings.get("base_image_seq_len", 256)
+        many = settings.get("max_image_seq_len", 4096)
+        low = settings.get("base_shift", 0.5)
+        high = settings.get("max_shift", 1.15)
         shift = tokens * (high - low) / (many - few) + low - few * (high - low) / (many - few)
         sigmas = np.linspace(1.0, 1 / steps, steps)
         scheduler.set_timesteps(sigmas=sigmas, mu=shift, device=self.device)

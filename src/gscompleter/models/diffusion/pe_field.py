@@ -82,7 +82,8 @@ class PEField:
             first.update(zip(group, images, strict=True))
 
         def answer(i: int) -> GeneratorOutput:
-            nearest, target = requests[i].nearest, requests[i].target
+            nearest = requests[i].nearest
+            target = requests[i].target
 
             def paint(seed: int) -> Float[Tensor, "h w 3"]:
                 image = (

@@ -92,7 +92,8 @@ def project_to_target(
 ) -> tuple[Float[Tensor, "h w 2"], Float[Tensor, "h w"]]:
     """Project the pixels of `source` to pixel indices (column, row) and z-depth in `target`."""
     target_from_source = target.viewmat.double() @ source.c2w.double()
-    K_source, K_target = source.K.double(), target.K.double()
+    K_source = source.K.double()
+    K_target = target.K.double()
     y, x = torch.meshgrid(
         torch.arange(depth.shape[0], dtype=torch.float64, device=depth.device),
         torch.arange(depth.shape[1], dtype=torch.float64, device=depth.device),
@@ -113,10 +114,13 @@ def pack_cells(
     cells: Float[Tensor, "rows columns 3"], factor: int
 ) -> Float[Tensor, "tokens numbers"]:
     """Join the positions of the `factor` x `factor` cells of each token, in quadtree order."""
-    rows, columns = cells.shape[0], cells.shape[1]
+    rows = cells.shape[0]
+    columns = cells.shape[1]
     gathered = cells
     while factor > 1:
-        rows, columns, factor = rows // 2, columns // 2, factor // 2
+        rows = rows // 2
+        columns = columns // 2
+        factor = factor // 2
         gathered = (
             gathered.reshape(rows, 2, columns, 2, -1)
             .permute(0, 2, 1, 3, 4)

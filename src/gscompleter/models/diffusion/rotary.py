@@ -42,7 +42,8 @@ class PerHeadRotary(nn.Module):
             [triples[..., axis, None] * self.frequencies(axis, ids) for axis in range(3)], dim=-1
         )
         angles = angles.repeat_interleave(2, dim=-1)
-        cosines, sines = angles.cos().float(), angles.sin().float()
+        cosines = angles.cos().float()
+        sines = angles.sin().float()
         heads = torch.tensor(POSITION_OF_HEAD, device=ids.device)
         return cosines[:, :, heads], sines[:, :, heads]
 
@@ -76,10 +77,8 @@ class PerHeadAttention:
                 for text, image in zip(text_states, (query, key, value), strict=True)
             )
         if image_rotary_emb is not None:
-            query, key = (
-                rotate_channel_pairs(query, *image_rotary_emb),
-                rotate_channel_pairs(key, *image_rotary_emb),
-            )
+            query = rotate_channel_pairs(query, *image_rotary_emb)
+            key = rotate_channel_pairs(key, *image_rotary_emb)
         query, key, value = (part.transpose(1, 2) for part in (query, key, value))
         mixed = nn.functional.scaled_dot_product_attention(query, key, value, attention_mask)
         joined = mixed.transpose(1, 2).flatten(2).to(query.dtype)

@@ -117,7 +117,8 @@ def convert_disparity(guess: Float[Tensor, "h w"], render: Render) -> Float[Tens
     valid = find_valid_depth(render)
     middle = render.depth[valid].median()
     inverse = middle / render.depth[valid]
-    spread, own_spread = compute_deviation(inverse), compute_deviation(guess[valid])
+    spread = compute_deviation(inverse)
+    own_spread = compute_deviation(guess[valid])
     alike = (guess - guess[valid].median()) * (spread / own_spread.clamp_min(1e-12)) + 1.0
     gain, offset = fit_robust_affine(alike[valid][:, None], inverse[:, None])
     least = middle / (10 * render.depth[valid].max())

@@ -80,7 +80,8 @@ def compute_sampling_grid(
     """
     _, h, w = depths.shape
     with disable_autocast(K):
-        x, y = torch.arange(w, device=K.device), torch.arange(h, device=K.device)
+        x = torch.arange(w, device=K.device)
+        y = torch.arange(h, device=K.device)
         columns, rows = torch.meshgrid(x, y, indexing="xy")
         pixels = torch.stack([columns, rows, torch.ones_like(rows)]).flatten(1).to(K)
         rays = source_from_reference[:3, :3] @ torch.linalg.inv(K) @ pixels

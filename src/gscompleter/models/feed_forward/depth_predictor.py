@@ -140,8 +140,10 @@ class DepthPredictor(nn.Module):
 
     def add_scale(self, scale: int) -> None:
         """Add the layers from the cost volume of `scale` (0 is coarsest) to probabilities."""
-        width, candidates = 128 // 2**scale, self.config.num_candidates // 4**scale
-        image_channels, vit_channels = CHANNELS[f"cnn{2 - scale}"], self.vit.channels // 2**scale
+        width = 128 // 2**scale
+        candidates = self.config.num_candidates // 4**scale
+        image_channels = CHANNELS[f"cnn{2 - scale}"]
+        vit_channels = self.vit.channels // 2**scale
         channels = candidates + image_channels + width + vit_channels
         unet = UNet(width, levels=3 + scale, attention_level=2 + scale, pre_norm=True)
         self.regressor.append(create_refiner(channels, width, unet))

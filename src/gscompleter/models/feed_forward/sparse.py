@@ -31,7 +31,8 @@ class Packing:
         """Enclose `cells` in a box with a border of one cell for their neighbours."""
         if len(cells) == 0:
             raise InputError("A sparse grid has no cells; it needs at least one.")
-        low, high = cells.amin(0).tolist(), cells.amax(0).tolist()
+        low = cells.amin(0).tolist()
+        high = cells.amax(0).tolist()
         if low[0] < 0:
             raise InputError(f"Batch numbers of a sparse grid start at 0; one is {low[0]}.")
         x, y, z = (b - a + 3 for a, b in zip(low[1:], high[1:], strict=True))
@@ -100,7 +101,8 @@ class Grid:
         return Grid(unique_rows(parents)[0], stride)
 
     def _to_cells(self, coordinates: Int64[Tensor, "m 4"]) -> Int64[Tensor, "m 4"]:
-        batch, position = coordinates[:, :1], coordinates[:, 1:]
+        batch = coordinates[:, :1]
+        position = coordinates[:, 1:]
         return torch.cat([batch, position.div(self.stride, rounding_mode="floor")], dim=1)
 
 

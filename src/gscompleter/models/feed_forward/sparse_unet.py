@@ -92,7 +92,8 @@ class SparseUNet(nn.Module):
     def forward(self, features: Float[Tensor, "n c"], grid: Grid) -> Float[Tensor, "n c"]:
         """Refine the features of the cells of `grid`."""
         tables, coarsest = build_hierarchy(grid, len(CHANNELS))
-        x, encoded = features, []
+        x = features
+        encoded = []
         for encoder, downward in zip(self.encoders, tables[:-1], strict=True):
             x = encoder(x, downward)
             encoded.append(x)

@@ -63,15 +63,18 @@ def evaluate_harmonics(degree: int, directions: Float[Tensor, "*n 3"]) -> Float[
         ratio = factorial(degree - order) / factorial(degree + order)
         norm = sqrt((2 * degree + 1) / (4 * pi) * ratio * (2 if order else 1))
         polar = norm * evaluate_legendre(degree, order, y)
-        values[-order], values[order] = polar * sine, polar * cosine
+        values[-order] = polar * sine
+        values[order] = polar * cosine
         cosine, sine = z * cosine - x * sine, z * sine + x * cosine
     return torch.stack([values[order] for order in range(-degree, degree + 1)], dim=-1)
 
 
 def evaluate_legendre(degree: int, order: int, t: Float[Tensor, "*n"]) -> Float[Tensor, "*n"]:
     """Evaluate `P(t) / (1 - t²)^(order / 2)` without the Condon-Shortley sign."""
-    before, value = torch.zeros_like(t), torch.full_like(t, prod(range(1, 2 * order, 2)))
+    before = torch.zeros_like(t)
+    value = torch.full_like(t, prod(range(1, 2 * order, 2)))
     for n in range(order + 1, degree + 1):
         following = ((2 * n - 1) * t * value - (n + order - 1) * before) / (n - order)
-        before, value = value, following
+        before = value
+        value = following
     return value

@@ -38,7 +38,8 @@ class WindowAttention(nn.Module):
         back = (-shift[0], -shift[1])
         query = split_windows(self.q_proj(x[:, None].roll(back, (2, 3))))
         sources = sources.roll(back, (2, 3))
-        key, value = split_windows(self.k_proj(sources)), split_windows(self.v_proj(sources))
+        key = split_windows(self.k_proj(sources))
+        value = split_windows(self.v_proj(sources))
         if mask is not None:
             # The keys are ordered pixel by pixel, but the mask is repeated view by view, as in
             # the training of the published models. It matters with two or more source views.
@@ -153,7 +154,8 @@ def encode_window_positions(features: Float[Tensor, "n c h w"]) -> Float[Tensor,
         angle = (number / (size + 1e-6) * 2 * pi)[:, None] / period
         return torch.stack([angle[:, 0::2].sin(), angle[:, 1::2].cos()], -1).flatten(1)
 
-    rows, columns = along(height // SPLITS).T, along(width // SPLITS).T
+    rows = along(height // SPLITS).T
+    columns = along(width // SPLITS).T
     shape = (-1, rows.shape[1], columns.shape[1])
     window = torch.cat([rows[:, :, None].expand(shape), columns[:, None].expand(shape)])
     return window.repeat(1, SPLITS, SPLITS)

@@ -147,7 +147,8 @@ class UNet(nn.Module):
             self.output_blocks.append(Steps(block(2 * channels, level)))
             upsample = [Upsample(channels)] if level > 0 else []
             self.output_blocks.append(Steps([*block(2 * channels, level), *upsample]))
-        norm, conv = create_group_norm(channels), create_conv3x3(channels, channels)
+        norm = create_group_norm(channels)
+        conv = create_conv3x3(channels, channels)
         out = [norm, nn.SiLU(), conv] if pre_norm else [conv, norm, nn.SiLU()]
         self.out = nn.Sequential(*out)
 

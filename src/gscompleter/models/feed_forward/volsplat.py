@@ -98,7 +98,8 @@ def unproject_pixels(depth: Float[Tensor, "n 1 h w"], cameras: Cameras) -> Float
     along = move_channels_last(depth, cameras)
     centered = along.new_zeros((*along.shape[:4], 2))
     in_camera = compute_z_rays(centered, cameras) * along
-    rotations, centers = cameras.c2w[..., :3, :3], cameras.c2w[:, :, None, None, :3, 3]
+    rotations = cameras.c2w[..., :3, :3]
+    centers = cameras.c2w[:, :, None, None, :3, 3]
     points = centers + torch.einsum("bvij,bvhwj->bvhwi", rotations, in_camera)
     return points.flatten(0, 3)
 

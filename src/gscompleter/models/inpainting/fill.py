@@ -54,7 +54,8 @@ def fill_windows(
 
     What a window filled is known to the next, so that large images are not reduced.
     """
-    image, left = image.clone(), hole.clone()
+    image = image.clone()
+    left = hole.clone()
     windows = sorted(place_windows(*hole.shape), key=lambda at: hole[at].float().mean().item())
     for at in windows:
         if left[at].any():

@@ -31,7 +31,8 @@ def load_strictly(
     Raises:
         InputError: A tensor is missing, unknown, of another shape, or not finite.
     """
-    needed, given = get_shapes(model.state_dict()), get_shapes(state_dict)
+    needed = get_shapes(model.state_dict())
+    given = get_shapes(state_dict)
     if needed != given:
         known = {} if variants is None else variants()
         right = [name for name, shapes in known.items() if dict(shapes) == given]
