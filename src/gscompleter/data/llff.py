@@ -42,9 +42,11 @@ def open_llff(path: Path) -> Iterator[Photographs]:
     """
     file = path / NAME if os.path.isdir(path) else path
     rows = _read_rows(file)
-    titles = (f"row {number} of {quote_value(file)}" for number in range(len(rows)))
     images = _find_photographs(file, len(rows))
-    frames = list(map(_parse_frame, images, rows, titles))
+    frames = [
+        _parse_frame(image, row, f"row {number} of {quote_value(file)}")
+        for number, (image, row) in enumerate(zip(images, rows, strict=True))
+    ]
     near = NEAR_FACTOR * rows[:, 15].min().item()
     far = FAR_FACTOR * rows[:, 16].max().item()
     scene = build_photographs(file.resolve().parent.name, str(file), frames)
@@ -55,6 +57,7 @@ def _parse_frame(image: Path, row: Float[np.ndarray, "17"], title: str) -> Frame
     down, right, back, center, (height, width, focal) = row[:15].reshape(3, 5).T
     size = get_size({"width": width, "height": height}, title)
     c2w = np.eye(4)
+    # LLFF's axes are down, right and back; ours are right, down and forward.
     c2w[:3] = np.stack([right, down, -back, center], axis=1)
     intrinsics = Intrinsics(size, (float(focal), float(focal)))
     return Frame(image.name, title, c2w, intrinsics, image)

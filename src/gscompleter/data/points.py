@@ -22,8 +22,10 @@ MIN_POINTS = 100
 """Fewest visible points that define a depth range."""
 PERCENTILES = (0.01, 0.99)
 """Percentiles of z-depth; points beyond are taken for mismatches."""
-NEAR_FACTOR, FAR_FACTOR = 0.5, 2.0
-"""Factors on the nearest and farthest depth, because many surfaces have no points."""
+NEAR_FACTOR = 0.5
+"""Factor on the nearest depth, because many surfaces have no points."""
+FAR_FACTOR = 2.0
+"""Factor on the farthest depth."""
 
 
 def add_depth_range(
@@ -34,11 +36,12 @@ def add_depth_range(
     points = None if is_known else photographs.points()
     if points is None:
         return photographs
-    found = compute_depth_range(points, [photographs.camera(f, resolution) for f in frames])
-    if found is None:
+    depth_range = compute_depth_range(points, [photographs.camera(f, resolution) for f in frames])
+    if depth_range is None:
         return photographs
-    near = found[0] if photographs.near is None else photographs.near
-    far = found[1] if photographs.far is None else photographs.far
+    near = depth_range[0] if photographs.near is None else photographs.near
+    far = depth_range[1] if photographs.far is None else photographs.far
+    # A plane of the file may lie beyond one that was found; then neither is replaced.
     return photographs if near >= far else replace(photographs, near=near, far=far)
 
 

@@ -75,8 +75,8 @@ def load_cameras(
     """
     check_planes(near, far)
     path = require_path(path)
-    zero = np.asarray(origin, dtype=np.float64)
     frames = tuple(read_cameras(path, resolution))
+    zero = np.asarray(origin, dtype=np.float64)
     cameras = Photographs(path.stem, str(path), frames, zero, near, far)
     return [cameras.camera(number, resolution) for number in range(len(cameras))]
 
@@ -100,6 +100,7 @@ def write_cameras(
 
 def _build_entry(camera: Camera) -> dict[str, object]:
     (fl_x, _, cx), (_, fl_y, cy), _ = camera.K.double().tolist()
+    # float64 holds a float32 exactly, and JSON writes as many digits as restore it.
     c2w = camera.c2w.detach().cpu().double().numpy() @ OPENCV_FROM_OPENGL
     intrinsics = {"fl_x": fl_x, "fl_y": fl_y, "cx": cx, "cy": cy}
     size = {"w": camera.width, "h": camera.height}

@@ -41,8 +41,10 @@ def open_dgp(path: Path) -> Iterator[Photographs]:
     content = read_json(file, ADVICE)
     cameras = _read_calibrations(file, content)
     sweeps = _map_sweeps(content)
+    # A datum is a reading of one sensor: an image, or a point cloud.
     images = [d for d in get_part(content, "data", list) if "image" in get_part(d, "datum", dict)]
-    frames = sorted((_parse_frame(d, cameras, sweeps, file) for d in images), key=lambda f: f.name)
+    frames = [_parse_frame(datum, cameras, sweeps, file) for datum in images]
+    frames.sort(key=lambda frame: frame.name)
     require(frames, f"{quote_value(file)} lists no images; name a scene with cameras.")
     front = min(frame.sensor or "" for frame in frames)
     yield build_photographs(file.resolve().parent.name, str(file), frames, front=front)
@@ -61,14 +63,16 @@ def _parse_frame(
         f"calibration; {ADVICE}.",
     )
     intrinsics = replace(cameras[camera], size=get_size(image, title))
+
+    # Sparse depth is optional: test splits and partial downloads lack the point clouds.
     sweep = sweeps.get(str(datum.get("key")))
-    read = None
+    read_points = None
     points = get_text(sweep, "filename", str(file))
     if points is not None and os.path.isfile(file.parent / points):
-        read = partial(_read_points, file.parent / points, _get_pose(sweep, str(file)))
+        read_points = partial(_read_points, file.parent / points, _get_pose(sweep, str(file)))
     c2w = _get_pose(image, title)
     place = file.parent / name
-    return Frame(name, title, c2w, intrinsics, place, sensor=camera, laser_points=read)
+    return Frame(name, title, c2w, intrinsics, place, sensor=camera, laser_points=read_points)
 
 
 def _get_pose(entry: Any, title: str) -> Float[np.ndarray, "4 4"]:
@@ -81,12 +85,13 @@ def _map_sweeps(content: Any) -> dict[str, Any]:
     """Map the key of each datum to the point cloud of its sample."""
     data = [datum for datum in get_part(content, "data", list) if isinstance(datum, dict)]
     entries = {str(datum.get("key")): get_part(datum, "datum", dict) for datum in data}
-    found: dict[str, Any] = {}
+    sweeps: dict[str, Any] = {}
     for sample in get_part(content, "samples", list):
         keys = [str(key) for key in get_part(sample, "datum_keys", list)]
+        # All images of a sample share its only point cloud, in whatever order they are listed.
         clouds = (get_part(entries.get(key), "point_cloud", dict) for key in keys)
-        found |= dict.fromkeys(keys, next(filter(None, clouds), None))
-    return found
+        sweeps |= dict.fromkeys(keys, next(filter(None, clouds), None))
+    return sweeps
 
 
 def _read_points(
@@ -104,17 +109,20 @@ def _read_calibrations(scene: Path, content: Any) -> dict[str, Intrinsics]:
     """Read the intrinsics by camera name, without image sizes, that the first sample names."""
     samples = get_part(content, "samples", list)
     key = get_text(samples[0] if samples else None, "calibration_key", str(scene))
+    # One folder of calibrations for all samples, or a single file for the scene.
     keyed = scene.parent / "calibration" / f"{key}.json"
-    found = next(filter(os.path.isfile, (keyed, scene.with_name("calibration.json"))), None)
-    if found is None:
+    candidates = (keyed, scene.with_name("calibration.json"))
+    file = next((path for path in candidates if os.path.isfile(path)), None)
+    if file is None:
         raise InputError(
             f"The calibration of {quote_value(scene)} is missing; put it at {quote_value(keyed)}."
         )
-    calibration = read_json(found, ADVICE)
-    names, entries = (get_part(calibration, key, list) for key in ("names", "intrinsics"))
+    calibration = read_json(file, ADVICE)
+    names = get_part(calibration, "names", list)
+    entries = get_part(calibration, "intrinsics", list)
     # Entries of other sensors are zeros.
     return {
-        str(name): get_intrinsics(entry, f"camera {quote_value(name)} of {quote_value(found)}")
+        str(name): get_intrinsics(entry, f"camera {quote_value(name)} of {quote_value(file)}")
         for name, entry in zip(names, entries, strict=False)
         if isinstance(entry, dict) and entry.get("fx")
     }

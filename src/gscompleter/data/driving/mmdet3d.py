@@ -79,12 +79,16 @@ def _parse_sample(sample: Any, path: Path) -> list[Shot]:
         if isinstance(image, dict) and all(image.get(key) is not None for key in NEEDED)
     }
     require(images, f"The images of {title} have no file or no pose; {ADVICE}.")
+    # Infos of nuScenes are in seconds, those of Waymo in microseconds.
     time = get_number(sample, "timestamp", title, 0.0, 1e6 * MICROSECONDS)
     time = time * 1e-6 if time >= MICROSECONDS else time
+
     world_from_laser = _read_laser_pose(sample, title)
     things = get_part(sample, "instances", list)
     things = [t for t in things if isinstance(t, dict) and "velocity" in t]  # none in Waymo's infos
     boxes = partial(_read_boxes, things, world_from_laser, path) if things else None
+
+    # nuScenes begins its file names with the drive, "n015-2018-07-24-11-22-45+0800__CAM_FRONT__…".
     first = images.get(FRONT, next(iter(images.values())))
     file = os.path.basename(get_text(first, "img_path", title) or "")
     drive = get_text(sample, "context_name", title) or file.split("__")[0]
@@ -157,10 +161,11 @@ class _PlainUnpickler(pickle._Unpickler):  # that in C allocates whatever a few 
     """Unpickler of plain values and NumPy scalars, which calls nothing else that a file names."""
 
     def find_class(self, module: str, name: str) -> Callable[..., Any]:
-        found = CONSTRUCTORS.get((module.replace("numpy._core", "numpy.core"), name))
-        if found is None:
+        # `numpy._core` is the name of the module since NumPy 2.
+        constructor = CONSTRUCTORS.get((module.replace("numpy._core", "numpy.core"), name))
+        if constructor is None:
             raise pickle.UnpicklingError(f"it names {module}.{name}")
-        return found
+        return constructor
 
 
 def load_plain(path: Path) -> Any:
@@ -173,5 +178,6 @@ def load_plain(path: Path) -> Any:
             f"{quote_value(path)} is no pickle of plain values ({type(error).__name__}: "
             f"{quote_value(str(error))}); write it again with lists and numbers only."
         ) from error
+    # An object may refer to itself many times, and a small pickle then stands for a huge value.
     check_plain(value, path, MAX_REPEATS * len(data))
     return value

@@ -37,9 +37,9 @@ def open_pandaset(path: Path) -> Iterator[Photographs]:
 
 
 def _read_frames(file: Path) -> Iterator[Frame]:
+    camera = file.parent
     poses = read_json(file, ADVICE)
     lens = file.with_name("intrinsics.json")
-    camera = file.parent
     require(isinstance(poses, list), f"{quote_value(file)} is no list of poses; {ADVICE}.")
     intrinsics = get_intrinsics(read_json(lens, ADVICE), quote_value(lens))
     for number, pose in enumerate(poses):

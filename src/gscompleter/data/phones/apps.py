@@ -30,7 +30,9 @@ from gscompleter.system.errors import InputError, quote_value
 from gscompleter.system.files.reading import parse_json
 from gscompleter.types import MAX_COORDINATE
 
-HOME, METADATA, LENSES = "keyframes", "metadata", "perFrameIntrinsicCoeffs"
+HOME = "keyframes"
+METADATA = "metadata"
+LENSES = "perFrameIntrinsicCoeffs"
 NOTE = "Depth is left out; `pip install 'gscompleter[phones]'` makes it readable."
 
 
@@ -48,8 +50,12 @@ class KeyframeFormat:
     def find_frames(self, path: Path) -> list[Files]:
         """Find the files of the first patterns with photographs; none if there are none."""
         root = path.parent if path.name == HOME else path
-        for files in ([find_files(root, pattern) for pattern in group] for group in self.patterns):
-            if files[1] and self.mark in next(iter(files[0].values()), bytes)():
+        for group in self.patterns:
+            files = [find_files(root, pattern) for pattern in group]
+            cameras, photographs, *_ = files
+            # Other exports have JSON files of these names, too.
+            first_camera = next(iter(cameras.values()), bytes)
+            if photographs and self.mark in first_camera():
                 return files
         return []
 
@@ -112,6 +118,7 @@ def _parse_recorded(content: Any, size: tuple[int, int], title: str) -> dict[str
     count = len(get_part(content, "poses", list))
     require(count, f"{title} has no poses; record with the LiDAR.")
     poses = get_array(content, "poses", title, (count, 7))
+    # fx, fy, cx and cy of a matrix that is stored column by column.
     lenses = np.tile(get_array(content, "K", title, (9,))[[0, 4, 6, 7]], (count, 1))
     if get_part(content, LENSES, list):
         lenses = get_array(content, LENSES, title, (count, 4))
@@ -133,6 +140,7 @@ def _unpack(kind: str, size: tuple[int, int], data: bytes, title: str) -> Shaped
         limit = 8 * math.prod(size)
         if len(data) > limit or measure_unpacked(data) > limit:
             raise ValueError("it is larger than the photograph")
+        # The map has no header: its height follows from the number of values and the aspect ratio.
         values = np.frombuffer(decompress(data), kind)
         return values.reshape(round(math.sqrt(len(values) * size[1] / size[0])), -1)
     except Exception as error:  # damaged bytes raise anything

@@ -48,8 +48,11 @@ def find_files(export: Path, pattern: str) -> Files:
     read: Callable[[Any], bytes] = read_bytes
     if os.path.isfile(export) and export.suffix.lower() in (".zip", ".r3d"):
         with _open_archive(export) as archive:
-            paths = [p for p in map(PurePosixPath, archive.namelist()) if p.match(pattern)]
+            entries = [PurePosixPath(name) for name in archive.namelist()]
+            # `match` compares from the right, so that a folder around the export does not matter.
+            paths = [entry for entry in entries if entry.match(pattern)]
         read = partial(_read_entry, export)
+    # macOS adds "._x.jpg" for each "x.jpg" to an archive.
     paths = sorted(path for path in paths if not path.name.startswith("."))
     require(
         len({path.parent for path in paths}) <= 1,
@@ -100,9 +103,10 @@ def build_recording(
     """
     frames = []
     images, depths, confidences = files
-    for name in (name for name in cameras if name in images):
+    for name, (c2w, lens) in cameras.items():
+        if name not in images:
+            continue
         title = f"frame {name} of {quote_value(path)}"
-        c2w, lens = cameras[name]
         depth = None
         if name in depths:
             depth = partial(_read_depth, depths[name], confidences.get(name), decoders, title)

@@ -126,6 +126,8 @@ def join_views(job: Job) -> None:
     """Join the views of each panorama to a rig, with known rotations and one centre."""
     rig = pycolmap.RigConfig()
     for number, view in enumerate(VIEWS):
+        # COLMAP's rig maps from the rig to the camera; `compute_rotation` leads to the panorama's
+        # axes. The first camera is the reference and has no pose of its own.
         turn = pycolmap.Rigid3d(pycolmap.Rotation3d(compute_rotation(*view).T), np.zeros(3))
         camera = pycolmap.RigConfigCamera(image_prefix=f"view_{number}/", ref_sensor=number == 0)
         camera.cam_from_rig = turn if number else None
@@ -145,6 +147,8 @@ def _add_camera(job: Job, one: UprightCopy) -> int:
 def select_pairs(job: Job) -> Pairs:
     """Choose the photographs to match: sequence neighbours, all pairs, or similar photographs."""
     names = [one.name for one in job.photographs]
+    # The neighbours of a sequence are known; in a set of unknown order all pairs, or for many
+    # photographs the most similar ones.
     pairs = pair_neighbours(len(names)) if is_sequence(names) else set()
     if not pairs and len(names) <= MAX_EXHAUSTIVE:
         pairs = pair_all(len(names))
@@ -206,13 +210,14 @@ def select_model(job: Job) -> tuple[pycolmap.Reconstruction | None, bool]:
         return map_largest(job, is_focal_fixed=True), False
     best = map_largest(job)
     is_focal_fixed = False
+    # A plausible model with enough photographs is kept; until then further focal lengths are tried.
     wanted = math.ceil(WANTED_SHARE * len(job.photographs))
     for fov in FIXED_FOVS:
         if _rate_model(best) >= (True, wanted, 0):
             break
-        found = map_with_fixed_focals(job, fov)
-        if _rate_model(found) > _rate_model(best):
-            best = found
+        with_fixed_focals = map_with_fixed_focals(job, fov)
+        if _rate_model(with_fixed_focals) > _rate_model(best):
+            best = with_fixed_focals
             is_focal_fixed = True
     return best, is_focal_fixed
 
@@ -237,6 +242,7 @@ def map_with_fixed_focals(job: Job, fov: float) -> pycolmap.Reconstruction | Non
         mapped = map_largest(job, is_focal_fixed=True)
         if mapped is None:
             return model
+        # The focal length alone; distortion is refined with it at the end.
         model = refine_lenses(mapped, refine_extra_params=False)
         focals = {n: model.cameras[n].mean_focal_length() for n in _count_photographs(model)}
     return None if model is None else refine_lenses(model)
@@ -267,8 +273,8 @@ def map_largest(job: Job, is_focal_fixed: bool = False) -> pycolmap.Reconstructi
         ba_refine_extra_params=not is_focal_fixed,
         ba_refine_sensor_from_rig=False,
     )
-    found = pycolmap.incremental_mapping(job.database, job.images, job.work, options)
-    return max(found.values(), key=lambda model: model.num_reg_images(), default=None)
+    models = pycolmap.incremental_mapping(job.database, job.images, job.work, options)
+    return max(models.values(), key=lambda model: model.num_reg_images(), default=None)
 
 
 def refine_lenses(model: pycolmap.Reconstruction, **options: bool) -> pycolmap.Reconstruction:
@@ -291,8 +297,10 @@ def is_plausible(camera: pycolmap.Camera) -> bool:
     side = max(camera.width, camera.height)
     if not (math.isfinite(focal) and focal > 0):
         return False
+    # Angles of the whole side, and of the ray through a corner at z = 1.
     fov = math.degrees(2 * math.atan(side / 2 / focal))
     corner = (camera.width**2 + camera.height**2) / 4 / focal**2
+    # The model k r² of SIMPLE_RADIAL moves a point by this share of its radius.
     shift = camera.params[camera.extra_params_idxs()[0]] * corner
     off = math.hypot(
         camera.principal_point_x - camera.width / 2, camera.principal_point_y - camera.height / 2
@@ -314,6 +322,7 @@ def is_sequence(names: Sequence[str]) -> bool:
 
 def pair_neighbours(count: int) -> Pairs:
     """Pair each photograph of a sequence with the next ones, and those 16, 32, 64, … ahead."""
+    # Doubling steps close loops, and bridge a blurred or covered stretch.
     steps = [*range(1, NEIGHBOURS + 1), *(2**n for n in range(4, count.bit_length()))]
     return {(i, i + step) for step in steps for i in range(count - step)}
 
@@ -327,6 +336,7 @@ def select_largest_features(
     scales: Float[np.ndarray, "n"], descriptors: Float[np.ndarray, "n 128"]
 ) -> Float[np.ndarray, "k 128"]:
     """Select the normalized descriptors of the `NUM_LARGEST_FEATURES` largest features."""
+    # SIFT's largest blobs, not its strongest, are those that other distances and cameras find too.
     chosen = descriptors[np.argsort(-scales, kind="stable")[:NUM_LARGEST_FEATURES]]
     return chosen / np.maximum(np.linalg.norm(chosen, axis=1, keepdims=True), 1e-9)
 
@@ -335,10 +345,14 @@ def pair_similar(features: Sequence[Float[np.ndarray, "_ 128"]]) -> Pairs:
     """Pair each photograph with those that share most features with it."""
     shared = np.zeros((len(features), len(features)), dtype=np.int64)
     for i, j in pair_all(len(features)):
-        shared[i, j] = shared[j, i] = _count_shared(features[i], features[j])
+        count = _count_shared(features[i], features[j])
+        shared[i, j] = count
+        shared[j, i] = count
     order = np.argsort(-shared, axis=1, kind="stable")[:, :NUM_SIMILAR]
-    found = ((i, int(j)) for i, row in enumerate(order) for j in row if shared[i, j] >= MIN_SHARED)
-    return {(min(pair), max(pair)) for pair in found}
+    pairs: Pairs = set()
+    for i, row in enumerate(order.tolist()):
+        pairs.update((min(i, j), max(i, j)) for j in row if shared[i, j] >= MIN_SHARED)
+    return pairs
 
 
 def _count_shared(a: Float[np.ndarray, "m 128"], b: Float[np.ndarray, "n 128"]) -> int:
@@ -348,6 +362,7 @@ def _count_shared(a: Float[np.ndarray, "m 128"], b: Float[np.ndarray, "n 128"]) 
     cosines = a @ b.T
     best = cosines.argmax(axis=1)
     back = cosines.argmax(axis=0)
+    # Each feature has one best match; only those that choose each other count.
     is_mutual = back[best] == np.arange(len(a))
     return int(np.count_nonzero(is_mutual & (cosines.max(axis=1) > MIN_COSINE)))
 
