@@ -45,6 +45,7 @@ def list_cases(runs: Mapping[str, Path], methods: Sequence[str]) -> list[FigureC
                 for number in range(1, len(row["steps"]) + 1):
                     case = FigureCase(row["task"]["name"], number)
                     common[case] = common.get(case, 0) + 1
+    # A case is complete if every run has a row of every method for it.
     return [case for case, count in common.items() if count == len(runs) * len(methods)]
 
 
@@ -76,6 +77,7 @@ def draw_figure(
         holes = read_holes(next(iter(runs.values())), spec, case)
         images = [read_figure_image(folder, image, case) for _, folder, image in columns]
         box = find_widest_hole(holes)
+        # Holes are those at the target: a given photograph is seen from elsewhere.
         marked = [
             draw_outline(image, holes) if outlines and not name.startswith(PHOTOGRAPH) else image
             for image, (_, _, name) in zip(images, columns, strict=True)
@@ -95,6 +97,7 @@ def list_columns(spec: FigureSpec, runs: Mapping[str, Path]) -> list[tuple[str, 
     for image in spec.images:
         if is_photograph(image):
             columns.append((image.replace(PHOTOGRAPH, "photograph "), first, image))
+        # All methods stand where the first one is named, model by model.
         elif image == methods[0]:
             for model, folder in runs.items():
                 prefix = f"{model}\n" if len(runs) > 1 else ""
@@ -128,11 +131,11 @@ def draw_outline(image: np.ndarray, holes: np.ndarray) -> np.ndarray:
 def find_widest_hole(holes: np.ndarray) -> tuple[slice, slice]:
     """Return rows and columns of a square around the middle of the widest hole."""
     side = round(CROP * min(holes.shape))
+    # The pixel farthest from the rim is the middle of the widest hole.
     *_, (x, y) = cv2.minMaxLoc(cv2.distanceTransform(holes, cv2.DIST_L2, 3))
-    top, left = (
-        min(max(center - side // 2, 0), size - side)
-        for center, size in zip((y, x), holes.shape, strict=True)
-    )
+    height, width = holes.shape
+    top = min(max(y - side // 2, 0), height - side)
+    left = min(max(x - side // 2, 0), width - side)
     return slice(top, top + side), slice(left, left + side)
 
 
@@ -160,6 +163,7 @@ def save_grid(
         line[0].set_ylabel(name, fontsize=5)
     for axes, title in zip(grid[0], titles, strict=True):
         axes.set_title(title, fontsize=7)
+    # Dates and versions in the metadata would make each file differ.
     for suffix, metadata in ((".png", {"Software": None}), (".pdf", {"CreationDate": None})):
         with replace_file(path.with_name(path.name + suffix)) as file:
             figure.savefig(file, format=suffix[1:], dpi=DPI, metadata=metadata, bbox_inches="tight")

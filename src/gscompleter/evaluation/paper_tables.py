@@ -54,6 +54,7 @@ class Estimate:
         """Two-sided p of Student's t test that the mean is zero; 1 for a single scene."""
         if self.error is None or self.mean == 0:
             return 1.0
+        # Student's t with infinite statistic: all scenes have the same difference.
         if self.error == 0:
             return 0.0
         return float(2 * student_t.sf(abs(self.mean) / self.error, self.degrees_of_freedom))
@@ -122,6 +123,7 @@ def estimate_mean(values: Mapping[str, float]) -> Estimate:
     The error is sqrt(G / (G - 1) Σ_g (Σ_i∈g (x_i - mean))²) / n for n cases of G scenes.
     """
     mean = statistics.fmean(values.values())
+    # Residuals of one scene are added before they are squared, as they may be correlated.
     sums: dict[str, float] = defaultdict(float)
     for case, value in values.items():
         sums[get_scene(case)] += value - mean
@@ -134,8 +136,8 @@ def estimate_mean(values: Mapping[str, float]) -> Estimate:
 
 def compare_cases(values: Mapping[str, float], others: Mapping[str, float]) -> Estimate | None:
     """Average the differences over the cases that both have; None if there are none."""
-    common = {case: value - others[case] for case, value in values.items() if case in others}
-    return estimate_mean(common) if common else None
+    differences = {case: value - others[case] for case, value in values.items() if case in others}
+    return estimate_mean(differences) if differences else None
 
 
 def fill_table(spec: TableSpec, runs: Mapping[tuple[str, str], Path]) -> PaperTable:
@@ -182,10 +184,10 @@ def fill_cell(column: Column, values: dict[str, float], baseline: Mapping[str, f
         return Cell(None)
     if column.reduce_tasks is not statistics.fmean:
         return Cell(column.reduce_tasks([*values.values()]), cases=values)
-    found = estimate_mean(values)
+    estimate = estimate_mean(values)
     difference = compare_cases(values, baseline)
     is_noise = difference is None or difference.is_noise
-    return Cell(found.mean, found.error, difference, is_noise, values)
+    return Cell(estimate.mean, estimate.error, difference, is_noise, values)
 
 
 def write_paper_table(path: Path, table: PaperTable) -> None:
@@ -212,11 +214,15 @@ def format_rows(
         "protocol": lambda row: row.protocol,
         "method": lambda row: row.method,
     }
-    shown = {t: get for t, get in names.items() if len(set(map(get, table.rows))) > 1}
+    shown = {
+        title: get_name
+        for title, get_name in names.items()
+        if len({get_name(row) for row in table.rows}) > 1
+    }
     shown["method"] = names["method"]
     head = [*shown, *(column.title for column in table.columns)]
     rows = [
-        [*(get(row) for get in shown.values())]
+        [get_name(row) for get_name in shown.values()]
         + [format_cell(column, row.cells[column.key]) for column in table.columns]
         for row in table.rows
     ]

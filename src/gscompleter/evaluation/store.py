@@ -32,8 +32,10 @@ from gscompleter.system.files.writing import replace_file
 from gscompleter.system.jobs.jobs import claim_folder, make_folder
 from gscompleter.types import Gaussians, merge
 
-RUN, TASKS = "run.json", "tasks"
-"""Names of the file with the settings of a run, and of the folder that holds the tasks."""
+RUN = "run.json"
+"""File with the settings of a run."""
+TASKS = "tasks"
+"""Folder that holds the tasks."""
 VERSION = 4
 """Version of the files of a run."""
 FIELDS = ("means", "quats", "scales", "opacities", "sh", "generated")
@@ -79,12 +81,13 @@ def list_row_paths(out: Path) -> list[Path]:
 
 def claim(out: Path, settings: Mapping[str, Any]) -> None:
     """Create the folder of a run, or check that it holds a run with the same settings."""
+    # Through JSON, which turns tuples into lists: compared is what the file holds.
     wanted = json.loads(json.dumps({"version": VERSION, **settings}))
     claim_folder(out, "run", wanted)
-    found = read_settings(out)
-    for key in {**wanted, **found}:
-        if found.get(key) != wanted.get(key):
-            old = quote_value(repr(found.get(key)))
+    existing = read_settings(out)
+    for key in {**wanted, **existing}:
+        if existing.get(key) != wanted.get(key):
+            old = quote_value(repr(existing.get(key)))
             new = quote_value(repr(wanted.get(key)))
             raise InputError(
                 f"{out} holds a run with {key} {old}, and this run has {new}; name another folder."
@@ -95,14 +98,14 @@ def read_settings(out: Path) -> dict[str, Any]:
     """Read the settings of a run; raise InputError if `out` holds none of this version."""
     if not (out / RUN).is_file():
         raise InputError(f"{out} holds no run; name a folder that `evaluate` wrote.")
-    found = read_json(out / RUN, "name another folder")
-    version = found.get("version") if isinstance(found, dict) else None
+    settings = read_json(out / RUN, "name another folder")
+    version = settings.get("version") if isinstance(settings, dict) else None
     if version != VERSION:
         raise InputError(
             f"{out} holds a run of version {quote_value(version)}, and version {VERSION} is "
             "needed; name another folder and run it again."
         )
-    return dict(found)
+    return dict(settings)
 
 
 @dataclass(frozen=True)
@@ -119,6 +122,7 @@ class SavedContext:
 
 def save_prediction(path: Path, prediction: Prediction) -> None:
     """Write the added Gaussians, or the whole scene if it was changed, and the registered ones."""
+    # What a method adds follows the scene before, which is saved already.
     scene = prediction.scene if prediction.added is None else None
     seconds = dict(prediction.seconds)
     save_values(path, {**vars(prediction), "seconds": seconds, "scene": scene})

@@ -71,7 +71,8 @@ def compute_nearest_distances(
     points: Float[Tensor, "n 3"], others: Float[Tensor, "m 3"]
 ) -> Float[np.ndarray, "n"]:
     """Compute the Euclidean distance of each point to the nearest of `others`, in float64."""
-    queries, targets = (p.detach().cpu().double().numpy() for p in (points, others))
+    queries = points.detach().cpu().double().numpy()
+    targets = others.detach().cpu().double().numpy()
     # Without balancing the tree stays fast if many points coincide.
     return cKDTree(targets, balanced_tree=False).query(queries, workers=-1)[0]
 
@@ -90,6 +91,7 @@ def measure_alignment(
     """
     added = drop_transparent(added)
     context = drop_transparent(context)
+    # Each is rendered alone, so that neither hides the other.
     generated = renderer.render(added, target).depth_map()
     reference = renderer.render(context, target).depth_map()
     overlap = generated.valid & reference.valid
@@ -110,6 +112,8 @@ def measure_primitive_alignment(
     registered = drop_transparent(registered)
     context = drop_transparent(context)
     reference = renderer.render(context, target).depth_map()
+
+    # The depths of the means themselves, each against that of the context at its pixel.
     points = registered[project_mask(reference.valid, registered, target)].means
     pixels, z = project(points, target)
     x, y = pixels.long().unbind(-1)
@@ -135,6 +139,8 @@ def compare_clouds(
     scale = reference.depth[reference.valid].double().median().item()
     threshold = MATCH_DISTANCE * scale
     points = select_in_mask(generated, None, overlap, target).means
+
+    # Of the context only what the target sees: what lies behind its surface has no counterpart.
     surface = select_in_mask(context, None, overlap, target).means
     pixels, z = project(surface, target)
     at_pixel = sample(reference.depth[..., None], pixels, "nearest")[..., 0]

@@ -125,14 +125,29 @@ def score(
     now = renderer.render(after, camera)
     holes = compute_hole_mask(was.alpha)
     covered = now.depth_map().valid & target.valid_mask
-    context, beside = (
-        [[renderer.render(scene, view.camera).image for scene in (before, after)] for view in views]
-        for views in (truth.views, truth.neighbours)
-    )
-    depths: list[Agreement | None] = [None, None]
+
+    def render_both(views: Sequence[View]) -> list[list[Image]]:
+        return [
+            [renderer.render(scene, view.camera).image for scene in (before, after)]
+            for view in views
+        ]
+
+    context = render_both(truth.views)
+    beside = render_both(truth.neighbours)
+
+    # Where the photograph has a true depth: beside the hole, and in it.
+    depth_observed = None
+    depth_hole = None
     if target.depth is not None:
-        parts = (~holes & covered, holes & covered)
-        depths = [compare_depths(now.depth, target.depth, part) for part in parts]
+        depth_observed = compare_depths(now.depth, target.depth, ~holes & covered)
+        depth_hole = compare_depths(now.depth, target.depth, holes & covered)
+
+    # Agreement of what was added with the scene before; a method may have added nothing.
+    seam_step = None
+    agreement = None
+    if added:
+        seam_step = measure_seam_step(added, was, camera, renderer)
+        agreement = measure_alignment(added, before, camera, renderer)
     lifted = None
     if registered:
         lifted = measure_primitive_alignment(registered, before, camera, renderer)
@@ -145,10 +160,10 @@ def score(
         neighbours_psnr=compare(beside, truth.neighbours, compute_view_psnr),
         context_psnr=compare(context, truth.views, compute_view_psnr),
         context_ssim=compare(context, truth.views, compute_view_ssim),
-        depth_observed=depths[0],
-        depth_hole=depths[1],
-        seam_step=measure_seam_step(added, was, camera, renderer) if added else None,
-        added=measure_alignment(added, before, camera, renderer) if added else None,
+        depth_observed=depth_observed,
+        depth_hole=depth_hole,
+        seam_step=seam_step,
+        added=agreement,
         registered=lifted,
     )
     return scores, TargetRenders(was, now, holes)
