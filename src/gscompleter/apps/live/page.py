@@ -190,6 +190,7 @@ class Page:
             ("Save", self.save),
         ):
             gui.add_button(label).on_click(partial(self._submit, job))
+
         ahead = self._first.center + self._first.forward * SCENE_DISTANCE / self._unit
         self._box = PageBox(self.server, ahead.cpu().numpy() * self._unit)
         generated = scene.add_frame("/generated", show_axes=False)
@@ -232,6 +233,7 @@ class Page:
         with self.server.atomic():
             if before.parts[0] is not now.parts[0]:
                 self._show("/observed", now.kept_context)
+            # A splat is replaced as a whole: the page cannot change one in place.
             if self._generated is not None:
                 self._generated.remove()
             self._generated = self._show("/generated/splats", now.added)
@@ -246,6 +248,7 @@ def compute_page_unit(camera: Camera) -> float:
     """Compute page units per scene unit from a camera with a depth range."""
     assert camera.near is not None
     assert camera.far is not None
+    # The geometric mean of near and far is the middle of the range in the images.
     return SCENE_DISTANCE / math.sqrt(camera.near * camera.far)
 
 
@@ -275,6 +278,7 @@ def make_page_splat(gaussians: Gaussians, unit: float) -> dict[str, Any]:
     gaussians = gaussians.to("cpu")
     size = gaussians.scales.amax(dim=1).median().item()
     axes = quats_to_rotations(gaussians.quats) * (gaussians.scales / size)[:, None, :]
+    # The page has no SH beyond the constant one.
     rgbs = (0.5 + SH_C0 * gaussians.sh[:, 0]).clamp(0, 1)
     return {
         "centers": (gaussians.means / size).numpy(),
@@ -319,6 +323,7 @@ class Address:
     @property
     def is_local(self) -> bool:
         """Return True if only programs of this machine can reach it."""
+        # An IPv4 address may be written as IPv6, "::ffff:127.0.0.1"; a zone follows after "%".
         number = ipaddress.ip_address(self.host.partition("%")[0])
         return (getattr(number, "ipv4_mapped", None) or number).is_loopback
 

@@ -161,6 +161,8 @@ def write_report(
         key: [asdict(replace(row, file=files.get(row.frame))) for row in group]
         for key, group in rows.items()
     }
+
+    # The verdict comes from the rows, so that the page and the terminal agree with them.
     is_given = input_splat is not None
     outcome = asdict(judge_completion(completion, held_out_rows, is_given))
     write_scenes(folder, completion, input_splat)
@@ -185,7 +187,9 @@ def write_report(
 def render_before_after(completion: Completion, camera: Camera, renderer: Renderer) -> RenderPair:
     """Render the context and the completed scene."""
     with torch.no_grad():
-        before = after = renderer.freeze(completion.context, camera)
+        before = renderer.freeze(completion.context, camera)
+        # Without recolouring and removal the context is the same, and is projected once.
+        after = before
         if completion.kept_context is not completion.context:
             after = renderer.freeze(completion.kept_context, camera)
         return RenderPair(before.render, after.composite(completion.added))
@@ -217,6 +221,7 @@ def score_held_out(
     completion: Completion, held_out: Sequence[HeldOut], renderer: Renderer
 ) -> list[HeldOutRow]:
     """Make the rows of held-out photographs."""
+    # Photographs in use, as they are: what a reconstruction has to be better than (decision 048).
     used = [shrink_view(view).image for view in completion.views]
 
     def score(photograph: HeldOut) -> HeldOutRow:
@@ -237,6 +242,7 @@ def score_photograph(completion: Completion, view: View, renderer: Renderer) -> 
     pair = render_before_after(completion, view.camera, renderer)
     truth = view.image
     valid = view.valid_mask
+    # Both scores over what the completed scene covers: their difference is then a gain.
     covered_before = (pair.before.alpha >= COVERED) & valid
     covered_after = (pair.after.alpha >= COVERED) & valid
     num_valid = max(int(valid.sum()), 1)
@@ -256,17 +262,19 @@ def score_context(completion: Completion, renderer: Renderer) -> list[ContextRow
     views = completion.views
     gains = completion.exposure_gains
     scores = score_views(completion, views, renderer)
-    gain_rows = [None] * len(views) if gains is None else map(tuple, gains.tolist())
+    gain_rows: Sequence[Any] = [None] * len(views)
+    if gains is not None:
+        gain_rows = [tuple(row) for row in gains.tolist()]
     return [
         ContextRow(
             view.frame,
-            **found,
+            **view_scores,
             exposure_gain=gain,
             dynamic_fraction=compute_mask_fraction(view.dynamic_mask),
             given_depth=compute_mask_fraction(view.given_depth),
             ignored=compute_mask_fraction(view.ignore_mask),
         )
-        for view, found, gain in zip(views, scores, gain_rows, strict=True)
+        for view, view_scores, gain in zip(views, scores, gain_rows, strict=True)
     ]
 
 
@@ -315,8 +323,9 @@ def make_target_row(
 def count_changes(completion: Completion) -> dict[str, Any]:
     """Count the Gaussians and, of a splat, the photographs that it was not trained on."""
     counts = {"context": len(completion.context), "added": len(completion.added)}
-    if removed := int(completion.source.gone_mask.sum()):
-        counts["removed"] = removed
+    num_removed = int(completion.source.gone_mask.sum())
+    if num_removed:
+        counts["removed"] = num_removed
     if completion.config.trust == "full":
         return {"gaussians": counts}
     counts["recolored"] = int(completion.recolored_mask.sum())
@@ -335,6 +344,7 @@ def write_scenes(folder: Path, completion: Completion, input_splat: InputSplatFi
     if input_splat is None:
         completed = partial(save_ply, folder / COMPLETED_FILE, completion.scene, provenance=True)
     else:
+        # In the layout and the order of the user's file, so that what was kept is kept bit by bit.
         context, changed = restore_file_order(completion, input_splat)
         recolored = completion.recolored_context[completion.recolored_mask]
         generated = merge([recolored, added])
@@ -358,6 +368,7 @@ def restore_file_order(
     context = completion.context
     if input_splat.file_order is None:
         return context, changed
+    # `file_order[i]` is the place in the file of Gaussian i; sorting by it inverts that.
     places = input_splat.file_order.argsort().to(context.means.device)
     return context[places], changed[places]
 
@@ -375,6 +386,7 @@ def save_completed_splat(
     of an earlier run are kept with those that it recoloured.
     """
     kept = input_splat.context_mask
+    # A splat that was completed before has its originals beside it; they stay valid with it.
     earlier = input_splat.path.with_name(REMOVED_FILE)
     if not changed.any():
         if bool((context.generated > 0).any()) and earlier.is_file():
@@ -384,6 +396,7 @@ def save_completed_splat(
     save_changed(folder, context, changed, input_splat)
     stays = ~changed.cpu()
     if kept is not None:
+        # From a mask over the context to one over all Gaussians of the file.
         stays = torch.zeros_like(kept).masked_scatter(kept, stays)
     save_like(folder / COMPLETED_FILE, context[~changed], generated, input_splat.path, stays)
 
@@ -407,26 +420,30 @@ def make_record(completion: Completion, photographs: Sequence[Camera]) -> Comple
     def draw(cameras: Sequence[Camera]) -> tuple[str, ...]:
         return tuple(draw_camera(camera, frame) for camera in cameras)
 
-    pairs = tuple(map(list_depth_pairs, completion.targets))
+    pairs = tuple(list_depth_pairs(result) for result in completion.targets)
     return CompletionRecord(draw(others), draw(context), draw(targets), pairs)
 
 
 def fit_frame(cameras: Sequence[Camera]) -> DrawingFrame:
     """Fit a frame around cameras whose up axis is that of most of them."""
     up = estimate_up(cameras)
+    # The most level camera gives the direction of the view; its axes are made level exactly.
     level = min(cameras, key=lambda camera: (camera.c2w[:3, 1] @ up).item())
     back = normalize(torch.linalg.cross(level.c2w[:3, 0], up), dim=0)
     centers = torch.stack([camera.center for camera in cameras])
     middle = centers.median(dim=0).values
+    # At least a tiny radius: all cameras may stand in one place.
     radius = max(1.1 * (centers - middle).norm(dim=1).max().item(), 1e-9)
     return DrawingFrame(middle, torch.stack([torch.linalg.cross(up, back), up, back]), radius)
 
 
 def draw_camera(camera: Camera, frame: DrawingFrame) -> str:
     """Write the corners of one line along the edges of a camera pyramid, centre first."""
+    # Half the image over the focal length at z = 1, with the longer side always as long.
     size = torch.tensor([camera.width, camera.height]) / camera.K.diagonal()[:2]
     sides = torch.cat([0.6 * size / size.max(), torch.ones(1)])
     a, b, c, d = torch.tensor(FRUSTUM) * sides @ camera.c2w[:3, :3].T @ frame.axes.T
+    # Edges from the apex to the corners and around, in a single line: some are drawn twice.
     o = torch.zeros(3)
     corners = FRUSTUM_DEPTH * torch.stack([o, a, b, c, d, a, b, o, c, d, o])
     points = frame.convert(camera.center) + corners

@@ -80,6 +80,7 @@ def explain_failure(completion: Completion, held_out: Sequence[HeldOutRow]) -> s
     Unused photographs decide. Where there are none that the scene covers, the features decide that
     its own photographs share.
     """
+    # Unused photographs that the scene does not cover cannot decide.
     compared = [row for row in held_out if row.above_photograph is not None]
     if compared:
         return None if is_like(compared) else describe_mismatch(compared)
@@ -96,6 +97,8 @@ def is_like(compared: Sequence[HeldOutRow]) -> bool:
     """Return True if a scene shows what the unused photographs show."""
     gains = [row.above_photograph for row in compared if row.above_photograph is not None]
     margins = [row.above_color for row in compared if row.above_color is not None]
+    # Either is enough: a scene that hardly changes between photographs is no better than one of
+    # them.
     return median(gains) >= MIN_ABOVE_PHOTOGRAPH or median(margins) >= MAX_ABOVE_COLOR
 
 
@@ -119,6 +122,7 @@ def explain_no_gain(completion: Completion) -> str:
     results = completion.targets
     if not results:
         return f"Nothing was gained{place}, because {NO_TARGET}."
+    # Several targets may have failed for one reason, which is said once.
     causes = Counter(make_clause(find_cause(result)) for result in results)
     if len(results) == 1:
         return f"Nothing was gained{place}, because {next(iter(causes))}."

@@ -46,8 +46,12 @@ from gscompleter.system.files.image import encode_jpeg, read_image_size, read_pi
 from gscompleter.system.files.writing import encode_text, replace_file
 from gscompleter.system.jobs.jobs import JOBS, Job, read_row
 
-REPORT_FILE, VIEWER_FILE = "report.html", "view.html"
-INDEX_FILE, TABLE_FILE = "index.html", "table.csv"
+# Files of a completion and of a batch.
+REPORT_FILE = "report.html"
+VIEWER_FILE = "view.html"
+INDEX_FILE = "index.html"
+TABLE_FILE = "table.csv"
+
 TARGET_COLUMNS = ("hole_fraction", "psnr_before", "psnr_after")
 TABLE_COLUMNS = (
     *("job", "state", "reason", "attempts"),
@@ -82,7 +86,8 @@ class Gallery:
         """Embed an image as a JPEG; raise an InputError if it is missing or damaged."""
         image = Image.fromarray(read_pixels(self.folder / f"{name}.png"))
         if self.scale < 1:
-            width, height = (max(1, round(self.scale * side)) for side in image.size)
+            width = max(1, round(self.scale * image.width))
+            height = max(1, round(self.scale * image.height))
             image = image.resize((width, height), Image.Resampling.LANCZOS)
         content = base64.b64encode(encode_jpeg(image, JPEG_QUALITY)).decode()
         return Picture(alt, *image.size, f"data:image/jpeg;base64,{content}")
@@ -96,6 +101,7 @@ def open_gallery(folder: Path) -> Gallery:
     """Choose a scale at which all images of `folder` fit into a page."""
     sizes = [read_image_size(path) for path in folder.glob("*.png")]
     pixels = sum(width * height for width, height in sizes)
+    # Pixels grow with the square of the scale.
     return Gallery(folder, min(1.0, (MAX_PAGE_PIXELS / max(pixels, 1)) ** 0.5))
 
 
@@ -103,6 +109,7 @@ def render_template(template: str, values: Mapping[str, object]) -> str:
     """Render a template with style and script."""
     environment = create_environment()
     script = environment.get_template("script.js").render()
+    # The content security policy names the hash of the only script that may run.
     digest = base64.b64encode(hashlib.sha256(script.encode()).digest()).decode()
     shared = {"version": __version__, "script": Markup(script), "digest": digest}
     return environment.get_template(template).render(**shared, **values)
@@ -189,7 +196,8 @@ def average_scores(summary: Mapping[str, Any]) -> dict[str, Any]:
 
 def write_overview(out: Path, jobs: Sequence[Job]) -> None:
     """Write the table and the page of `jobs`."""
-    rows = [row for job in jobs if (row := read_row(job, out)) is not None]
+    found_rows = [read_row(job, out) for job in jobs]
+    rows = [row for row in found_rows if row is not None]
     texts = {TABLE_FILE: format_csv(rows), INDEX_FILE: render_batch_page(rows)}
     for name, text in texts.items():
         with replace_file(out / name) as file:

@@ -238,6 +238,7 @@ def read_record(folder: Path, summary: CompletionSummary) -> CompletionRecord:
     """Read `report.json`; raise an InputError if it does not fit the summary."""
     path = folder / RECORD_FILE
     record = read_result(CompletionRecord, path)
+    # Each part of the page belongs to a row of the summary.
     sizes = len(record.pairs), len(record.targets), len(record.context)
     if sizes != (len(summary.targets), len(summary.targets), len(summary.context)):
         raise InputError(f"{quote_value(path)} does not fit {SUMMARY_FILE} beside it; {ADVICE}.")
@@ -263,9 +264,9 @@ def read_result(kind: type[T], path: Path) -> T:
     try:
         return TypeAdapter(kind).validate_python(content)
     except ValidationError as error:
-        wrong = error.errors(include_url=False)[0]
-        place = ".".join(map(str, wrong["loc"])) or "its content"
+        defect = error.errors(include_url=False)[0]
+        place = ".".join(str(part) for part in defect["loc"]) or "its content"
         raise InputError(
-            f"{quote_value(path)} is damaged ({quote_value(place)}: {quote_value(wrong['msg'])}); "
+            f"{quote_value(path)} is damaged ({quote_value(place)}: {quote_value(defect['msg'])}); "
             f"{ADVICE}."
         ) from None

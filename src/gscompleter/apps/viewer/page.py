@@ -72,6 +72,7 @@ def compute_page_frame(gaussians: Gaussians) -> PageFrame:
     means = gaussians.means.double().cpu()
     centre = means.median(dim=0).values
     spread = (means - centre).norm(dim=1).median().item()
+    # A power of two scales floats without rounding.
     power = math.floor(math.log2(spread / PAGE_EXTENT)) if spread > 0 else 0
     return PageFrame(centre, 2.0**power)
 
@@ -82,14 +83,18 @@ def make_page(viewer_content: ViewerContent, libraries: Libraries) -> tuple[byte
     layers = {
         name: frame.normalize(part.to("cpu")) for name, part in split_layers(viewer_content).items()
     }
+    # .spz has fixed-point positions: what lies beyond their range cannot be written.
     shown = {name: part[part.means.norm(dim=1) <= MAX_DISTANCE] for name, part in layers.items()}
     sources = {name: encode_spz(Path(name), part) for name, part in shown.items() if len(part) > 0}
     if not sources.keys() - {"before"}:
         raise InputError(f"{quote_value(viewer_content.title)} has nothing that a page can show.")
+
+    # Most completions leave the context as it is, which is then embedded once for both layers.
     layer_sources = {name: name for name in sources}
     if sources.get("before") == sources.get("observed", b""):
         del sources["before"]
         layer_sources["before"] = "observed"
+
     means = torch.cat([layers["observed"].means, layers["generated"].means]).double()
     landmarks = means[:: max(1, len(means) // MAX_LANDMARKS)]
     cameras = viewer_content.cameras or (make_overview(viewer_content.after),)
@@ -145,6 +150,7 @@ def describe_camera(
     thumbnail = view_camera.thumbnail
     K = camera.K
     pixels, depths = project(landmarks, camera)
+    # A camera at the focus of its view orbits what it looks at: the median depth of what it sees.
     seen = depths[is_inside(pixels, depths, camera)]
     return {
         "name": view_camera.name,
@@ -162,6 +168,7 @@ def plan_path(cameras: Sequence[Camera]) -> list[tuple[int, float]]:
     """Plan a path from the first camera, each time to the nearest one left: indices and seconds."""
     where = embed_cameras([camera.to("cpu") for camera in cameras]).double()
     apart = torch.cdist(where, where)
+    # Visited cameras are infinitely far.
     left = torch.zeros(len(where))
     stops = [0]
     for _ in cameras[1:]:
