@@ -34,6 +34,7 @@ class Similarity:
 
 def fit_center_similarity(given: Points, found: Points) -> Similarity:
     """Fit the similarity from `given` to `found` by least squares; it needs two distinct points."""
+    # Umeyama's closed form: centre both sets, and take the singular values of their covariance.
     x = given.astype(np.float64)
     y = found.astype(np.float64)
     middle_x = x.mean(0)
@@ -47,6 +48,7 @@ def fit_center_similarity(given: Points, found: Points) -> Similarity:
             "taken from different positions."
         )
     u, values, v = np.linalg.svd(y.T @ x / len(x))
+    # The sign keeps the rotation from becoming a reflection.
     signs = np.array([1.0, 1.0, np.sign(np.linalg.det(u) * np.linalg.det(v))])
     rotation = (u * signs) @ v
     scale = float((values * signs).sum() / spread)
@@ -58,18 +60,21 @@ def fit_robust_similarity(given: Points, found: Points) -> Similarity:
     every = fit_center_similarity(given, found)
     if len(given) < MIN_RANSAC_CAMERAS:
         return every
+    # After the fit to all, the median distance to the nearest centre: what is farther from its own
+    # counterpart in the fit to a half is an outlier.
     threshold = float(np.median(measure_nearest_distances(every(given), found)))
     best = None
     least = (0, np.inf)
     for half in sample_halves(len(given)):
+        # Cameras in one place determine no scale.
         if np.ptp(given[half], axis=0).max() == 0:
             continue
-        error = np.linalg.norm(
-            fit_center_similarity(given[half], found[half])(given) - found, axis=1
-        )
+        fit = fit_center_similarity(given[half], found[half])
+        error = np.linalg.norm(fit(given) - found, axis=1)
         inliers = error <= threshold
         count = int(inliers.sum())
         mean = float(error[inliers].mean()) if count else np.inf
+        # More inliers win, and of equally many those with the smaller mean error.
         if (count, -mean) > (least[0], -least[1]):
             best = inliers
             least = (count, mean)

@@ -70,6 +70,8 @@ class DualScratch(ImageScratch):
         """Fuse the maps, finest first, into rays; `aspect` is image width divided by height."""
         fusions = (self.refinenet1_aux, self.refinenet2_aux, self.refinenet3_aux)
         x = fuse_levels(self.project_levels(pyramid), *fusions, self.refinenet4_aux)
+        # Of the four levels, only the last one's layers are used; with the norm that the first one
+        # stores.
         x = add_position_encoding(self.output_conv1_aux[-1](x), aspect)
         shared = self.output_conv2_aux[0]
         last = self.output_conv2_aux[-1]
@@ -98,6 +100,7 @@ class DualDpt(Dpt):
         """Predict depth up to scale, and its confidence from 1 upwards."""
         x = resize_bilinear(self.scratch.output_conv1(self.scratch(pyramid)), size)
         raw = self.scratch.output_conv2(add_position_encoding(x, size[1] / size[0]))
+        # Positive depth, and a confidence above 1, as the authors trained them.
         return raw[:, 0].exp(), 1 + raw[:, 1].exp()
 
     def predict_rays(

@@ -66,13 +66,14 @@ def create_camera_gaussians(
 
     As in training, the predicted z-depth is used as distance along the ray.
     """
-    offset, scale, rotation, sh, closer, opacity = raw.split(CHANNELS, dim=-1)
+    offset, scale, rotation, sh, depth_offset, opacity = raw.split(CHANNELS, dim=-1)
     factor = factors[:, None, None, None]
-    distance = (depth + closer[..., 0]) * factor
+    distance = (depth + depth_offset[..., 0]) * factor
+
+    # Unit rays in the frame of `poses`, through a point beside the pixel centre.
     turns = poses.c2w[..., :3, :3]
-    rays = F.normalize(
-        torch.einsum("bvij,bvhwj->bvhwi", turns, compute_offset_rays(offset, poses.K)), dim=-1
-    )
+    local_rays = compute_offset_rays(offset, poses.K)
+    rays = F.normalize(torch.einsum("bvij,bvhwj->bvhwi", turns, local_rays), dim=-1)
     centers = factor[..., None] * poses.centers[:, :, None, None]
     return PixelGaussians(
         distance,
@@ -101,6 +102,7 @@ def compute_pixel_scales(
 ) -> Float[Tensor, "b v h w 3"]:
     """Compute standard deviations at a distance of 1."""
     low, high = SCALES
+    # A tenth of the size of a pixel at a distance of 1, along x and y together.
     pixel = 0.1 * (1 / K[..., 0, 0] + 1 / K[..., 1, 1])
     return (low + (high - low) * scale.sigmoid()) * pixel[..., None, None, None]
 
@@ -115,4 +117,5 @@ def rotate_quats_as_trained(
     x, y, z, w = F.normalize(raw, dim=-1, eps=1e-8).unbind(-1)
     misread = torch.stack([z, w, x, y], dim=-1)  # (w, x, y, z) misread as xyzw, in our order
     rotated = multiply_quats(rotations_to_quats(turns)[:, :, None, None], misread)
+    # One of the two quaternions of each rotation, that with positive real part.
     return torch.where(rotated[..., :1] < 0, -rotated, rotated).roll(-1, -1)

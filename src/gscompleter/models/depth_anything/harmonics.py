@@ -18,6 +18,7 @@ def rotate_3dgs_sh(
     sh: Float[Tensor, "b v h w k 3"], turns: Float[Tensor, "b v 3 3"]
 ) -> Float[Tensor, "b v h w k 3"]:
     """Rotate SH of 3DGS such that `Y(R d) sh' = Y(d) sh` for all directions d."""
+    # 3DGS flips the sign of odd orders, and has its pole along z instead of y.
     pole = turns.new_tensor(AXIS_PERMUTATION)
     signs = compute_order_signs(sh)
     return signs * rotate_sh(signs * sh, pole.T @ turns @ pole)

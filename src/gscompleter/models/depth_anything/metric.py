@@ -80,6 +80,7 @@ class MetricDepthAnything(nn.Module):
             scratch = self.head.scratch
             pyramid = self.head.compute_pyramid(tokens, size[0] // PATCH, size[1] // PATCH)
             x = resize_bilinear(scratch.output_conv1(scratch(pyramid)), size)
+            # Two outputs of one fused map: log depth, and a sky score that is not negative.
             depth = scratch.output_conv2(x)[:, 0].exp()
             sky = scratch.sky_output_conv2(x)[:, 0].relu()
         views = images.shape[:2]
@@ -90,6 +91,7 @@ def set_sky_depth(
     depth: Float[Tensor, "b v h w"], solid: Bool[Tensor, "b v h w"], max_depth: float = torch.inf
 ) -> Float[Tensor, "b v h w"]:
     """Set the sky to the depth of the far foreground, at most `farthest`, as the authors do."""
+    # Of a few pixels neither a quantile nor a sky is certain.
     if min(int(solid.sum()), int((~solid).sum())) <= MIN_PIXELS:
         return depth
     far = interpolate_quantile(depth[solid], FAR_QUANTILE).clamp_max(max_depth)

@@ -75,6 +75,7 @@ def fit_metres_per_unit(prediction: Prediction, metric: MetricDepth) -> float:
     counts = select_scale_pixels(prediction, metric, metres)
     if int(counts.sum()) <= MIN_PIXELS:
         return 1.0
+    # Least squares without a shift: (a · b) / (b · b).
     a = metres[counts].double()
     b = prediction.depth[counts].double()
     return float((a * b).sum() / (b * b).sum())

@@ -63,6 +63,7 @@ class GatedMlp(nn.Module):
 
     def __init__(self, channels: int) -> None:
         super().__init__()
+        # Two thirds of the usual width, since a gated MLP has three matrices, in multiples of 8.
         hidden = -(-(4 * channels * 2 // 3) // 8) * 8
         self.w12 = nn.Linear(channels, 2 * hidden)
         self.w3 = nn.Linear(hidden, channels)
@@ -137,23 +138,28 @@ class AnyViewVit(nn.Module):
         order = torch.arange(views, device=images.device).expand(scenes, -1)
         start = self.config.first_multi_view_block
         outputs = []
+        # Tokens after the last block that looked at each view alone; heads get these as well.
         local = x
         for number, block in enumerate(self.blocks):
+            # Without poses, the first view is the reference; a central one is chosen for it.
             if start is not None and number == start - 1 and cameras is None and views > 2:
                 order = order_views(select_reference_view(x[:, :, 0].float()), views)
                 x = reorder_views(x, order)
                 local = reorder_views(local, order)
             if number == start:
-                x = torch.cat(
-                    [self.select_camera_tokens(cameras, scenes, views), x[:, :, 1:]], dim=2
-                )
+                camera_tokens = self.select_camera_tokens(cameras, scenes, views)
+                x = torch.cat([camera_tokens, x[:, :, 1:]], dim=2)
             if not self.is_multi_view_block(number):
-                local = x = block(x.flatten(0, 1)).unflatten(0, (scenes, views))
+                x = block(x.flatten(0, 1)).unflatten(0, (scenes, views))
+                local = x
             elif number % 2:
+                # All tokens of all views in one sequence.
                 x = block(x.flatten(1, 2), among).unflatten(1, (views, -1))
             else:
-                local = x = block(x.flatten(0, 1), within).unflatten(0, (scenes, views))
+                x = block(x.flatten(0, 1), within).unflatten(0, (scenes, views))
+                local = x
             if number in self.config.output_block_ids:
+                # In the order of the photographs again.
                 back = order.argsort(dim=1)
                 outputs.append(self.join_tokens(reorder_views(local, back), reorder_views(x, back)))
         return outputs
@@ -173,10 +179,9 @@ class AnyViewVit(nn.Module):
         if cameras is not None:
             return cameras[:, :, None]
         first = self.camera_token[:, :1]
-        other = self.camera_token[:, 1:]
-        return torch.cat([first, other.expand(-1, views - 1, -1)], 1)[:, :, None].expand(
-            scenes, -1, -1, -1
-        )
+        other = self.camera_token[:, 1:].expand(-1, views - 1, -1)
+        tokens = torch.cat([first, other], 1)
+        return tokens[:, :, None].expand(scenes, -1, -1, -1)
 
     def join_tokens(self, local: Float[Tensor, "b v t c"], x: Float[Tensor, "b v t c"]) -> Tokens:
         """Join the tokens of a block with those of the last single-view block."""

@@ -76,6 +76,7 @@ class PEField:
             InputError: The scene has no depth at the nearest photograph.
         """
         conditions = [self.create_condition(r.nearest, r.target, r.context) for r in requests]
+        # The first seed for all targets, in batches; further seeds are needed by few of them.
         first: dict[int, Tensor] = {}
         for group in group_by_size(conditions, self.max_batch_size):
             images = self.generate_images([conditions[i] for i in group], self.seed)
@@ -86,11 +87,10 @@ class PEField:
             target = requests[i].target
 
             def paint(seed: int) -> Float[Tensor, "h w 3"]:
-                image = (
-                    first[i]
-                    if seed == self.seed
-                    else self.generate_images([conditions[i]], seed)[0]
-                )
+                if seed == self.seed:
+                    image = first[i]
+                else:
+                    image = self.generate_images([conditions[i]], seed)[0]
                 back = resize_antialiased(image, (target.height, target.width)).clamp(0, 1)
                 return back.to(nearest.image.device)
 

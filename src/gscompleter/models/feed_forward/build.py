@@ -110,6 +110,7 @@ def get_variant_name(published: PublishedWeights) -> str:
 
 def collect_all_shapes() -> dict[str, dict[str, tuple[int, ...]]]:
     """Collect the tensor shapes of every supported network by the name of its weights."""
+    # Without memory or random numbers: only the shapes are wanted.
     with torch.device("meta"):
         return {
             name: get_shapes(create_network(published).state_dict())

@@ -70,9 +70,14 @@ def create_pixel_reconstruction(
     device = views[0].image.device
     gaussians = flatten_gaussians(predicted).to(device)
     per_view = crops[0].height * crops[0].width
-    depths = map(compute_depth_map, gaussians.means.split(per_view), views, crops)
+    depths = [
+        compute_depth_map(means, view, crop)
+        for means, view, crop in zip(gaussians.means.split(per_view), views, crops, strict=True)
+    ]
+    # The photograph and the pixel that each Gaussian comes from.
     pixels = [
-        crop.compute_pixel_indices(v.camera.width) for v, crop in zip(views, crops, strict=True)
+        crop.compute_pixel_indices(view.camera.width)
+        for view, crop in zip(views, crops, strict=True)
     ]
     numbers = torch.arange(len(views), device=device).repeat_interleave(per_view)
     return Reconstruction(gaussians, tuple(depths), numbers, torch.cat(pixels).to(device))

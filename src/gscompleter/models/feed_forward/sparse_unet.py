@@ -91,6 +91,7 @@ class SparseUNet(nn.Module):
 
     def forward(self, features: Float[Tensor, "n c"], grid: Grid) -> Float[Tensor, "n c"]:
         """Refine the features of the cells of `grid`."""
+        # Pairs of cells between neighbouring levels, finest first, and within the coarsest one.
         tables, coarsest = build_hierarchy(grid, len(CHANNELS))
         x = features
         encoded = []
@@ -99,6 +100,7 @@ class SparseUNet(nn.Module):
             encoded.append(x)
         x = self.bottleneck[0](x, tables[-1])
         x = self.bottleneck[1](x, coarsest)
+        # Back up through the same levels; the finest one has no skip connection.
         for decoder, downward in zip(self.decoder_blocks, tables[:0:-1], strict=True):
             x = decoder(x, downward, encoded.pop())
         return self.final_upsample(x, tables[0])

@@ -64,6 +64,7 @@ class ViewAttention(nn.Module):
     def forward(self, x: Float[Tensor, "n c h w"], views: int) -> Float[Tensor, "n c h w"]:
         """Apply attention across the views of a scene; the norm treats each view separately."""
         y = self.norm(x) if self.pre_norm else x
+        # The tokens of all views of a scene, one view after the other.
         y = y.flatten(2).unflatten(0, (-1, views)).transpose(1, 2).flatten(2)
         y = self.proj_out(self.attend(self.qkv(y)))
         y = y.unflatten(2, (views, -1)).transpose(1, 2).reshape(x.shape)

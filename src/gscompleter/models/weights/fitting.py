@@ -34,9 +34,12 @@ def load_strictly(
     needed = get_shapes(model.state_dict())
     given = get_shapes(state_dict)
     if needed != given:
+        # The file of another variant is the usual mistake, and can be named.
         known = {} if variants is None else variants()
-        right = [name for name, shapes in known.items() if dict(shapes) == given]
-        advice = f"its tensors are those of {' or '.join(right)}" if right else "give another file"
+        fitting = [name for name, shapes in known.items() if dict(shapes) == given]
+        advice = "give another file"
+        if fitting:
+            advice = f"its tensors are those of {' or '.join(fitting)}"
         raise InputError(
             f"{origin} does not fit the network {type(model).__name__}: "
             f"{describe_differences(needed, given)}; {advice}."

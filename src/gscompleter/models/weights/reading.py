@@ -120,10 +120,11 @@ def read_tensors(path: Path, name: str) -> Any:
         mapped = is_archive(path)
         return torch.load(path, map_location="cpu", weights_only=True, mmap=mapped)
     except pickle.UnpicklingError as error:
-        found = re.search(r"GLOBAL (\S+)", str(error))
-        if found is None:
+        # A pickle may name any function; torch refuses it and names what it refused.
+        refused = re.search(r"GLOBAL (\S+)", str(error))
+        if refused is None:
             raise _create_file_error(path, "holds no plain weights", name) from error
-        objects = f"Python objects too ({quote_value(found[1])}), which may run any code"
+        objects = f"Python objects too ({quote_value(refused[1])}), which may run any code"
         raise _create_file_error(path, f"holds {objects}", name) from error
     except Exception as error:  # damaged pickles raise many types
         raise _create_file_error(path, "cannot be read by torch", name) from error
@@ -153,12 +154,13 @@ def extract_network_tensors(
     def other(held: str) -> InputError:
         return InputError(f"{path} holds {held}; give {weights.file}.")
 
+    # Some files have the tensors in an entry, beside the state of the training.
     inner = content.get(weights.entry, content) if isinstance(content, Mapping) else None
     if not isinstance(inner, Mapping) or not all(isinstance(key, str) for key in inner):
         raise other("no named tensors")
     prefix = weights.prefix
-    found = {k.removeprefix(prefix): v for k, v in inner.items() if k.startswith(prefix)}
-    if not found:
+    tensors = {k.removeprefix(prefix): v for k, v in inner.items() if k.startswith(prefix)}
+    if not tensors:
         raise other(f"no tensors named {prefix}…, but {_list_some(list(inner))}")
     unknown = [
         key
@@ -168,11 +170,12 @@ def extract_network_tensors(
     ]
     if unknown:
         raise other(f"more than the network {weights.name}: {_list_some(unknown)}")
-    odd = [key for key, value in found.items() if not is_plain(value)]
+    # Only dense tensors with numbers of their own can be loaded.
+    odd = [key for key, value in tensors.items() if not is_plain(value)]
     if odd:
         kinds = "empty shells, sparse or quantized ones"
         raise other(f"tensors without plain numbers ({_list_some(odd)}): {kinds}")
-    return found
+    return tensors
 
 
 def is_plain(tensor: Tensor) -> bool:
