@@ -227,7 +227,12 @@ def _read_binary_images(path: Path) -> Iterator[PosedImage]:
     with _open_binary(path) as content:
         for _ in range(_read_count(content)):
             number, *pose, camera = _unpack(content, "<I4d3dI")
-            name = _read_name(content)
+            # A name of any length, which ends with a zero byte.
+            start = content.tell()
+            end = content.find(b"\0", start, start + MAX_NAME)
+            if end < 0:
+                raise ValueError("a name without an end")
+            name = os.fsdecode(content.read(end + 1 - start)[:-1])
             # Features take most of the file and are not needed.
             content.seek(_read_count(content) * FEATURE_SIZE, os.SEEK_CUR)
             yield build_posed_image(number, name, camera, pose)
@@ -266,14 +271,6 @@ def _unpack(content: mmap.mmap, form: str) -> tuple[Any, ...]:
 
 def _read_count(content: mmap.mmap) -> int:
     return int(_unpack(content, "<Q")[0])
-
-
-def _read_name(content: mmap.mmap) -> str:
-    start = content.tell()
-    end = content.find(b"\0", start, start + MAX_NAME)
-    if end < 0:
-        raise ValueError("a name without an end")
-    return os.fsdecode(content.read(end + 1 - start)[:-1])
 
 
 def _parse_lines(path: Path, form: str, parse: Callable[[str], Entry]) -> Iterator[Entry]:

@@ -94,8 +94,8 @@ class Photographs:
 
     def camera(self, frame: int, resolution: Resolution = None) -> Camera:
         """Return the camera of a frame, even without its photograph if the file gives the size."""
-        found = self.frame(frame)
-        return self._build_camera(found, found.size(), resolution)
+        chosen = self.frame(frame)
+        return self._build_camera(chosen, chosen.size(), resolution)
 
     def views(self, frames: Sequence[int], resolution: Resolution = None) -> list[View]:
         """Load undistorted photographs with cameras, known depth and the detected vehicle."""
@@ -135,10 +135,10 @@ class Photographs:
 
     def is_hidden(self, frame: int) -> bool:
         """Check whether a mask or the alpha channel hides all of a photograph."""
-        found = self.frame(frame)
-        if not self.is_masked or (found.mask is None and not _has_alpha(found)):
+        chosen = self.frame(frame)
+        if not self.is_masked or (chosen.mask is None and not _has_alpha(chosen)):
             return False
-        hidden = self._load_colors(found)[1]
+        hidden = self._load_colors(chosen)[1]
         return hidden is not None and bool(hidden.all())
 
     def find_moving(self, frame: int, resolution: Resolution = None) -> Bool[Tensor, "h w"] | None:

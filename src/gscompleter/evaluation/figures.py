@@ -51,11 +51,11 @@ def list_cases(runs: Mapping[str, Path], methods: Sequence[str]) -> list[FigureC
 
 def select_cases(cases: Sequence[FigureCase], names: Sequence[str]) -> list[FigureCase]:
     """Select the cases of these names, or the first ones; raise InputError if there are none."""
-    found = [case for case in cases if not names or case.name in names]
-    if not found:
+    selected = [case for case in cases if not names or case.name in names]
+    if not selected:
         known = ", ".join(f"'{case.name}'" for case in cases) or "none"
         raise InputError(f"No case for the figure was completed by all methods; there are {known}.")
-    return found if names else found[:MAX_ROWS]
+    return selected if names else selected[:MAX_ROWS]
 
 
 def draw_figure(
@@ -74,7 +74,11 @@ def draw_figure(
     columns = list_columns(spec, runs)
     rows = []
     for case in cases:
-        holes = read_holes(next(iter(runs.values())), spec, case)
+        # The mask before the completion, which all methods share.
+        task = store.get_task_folder(next(iter(runs.values())), case.name)
+        step = store.get_step_path(task, spec.list_methods()[0], case.number)
+        mask = read_pixels(step.with_name(f"holes-{case.number:03d}.png"))
+        holes = mask[..., 0].copy()
         images = [read_figure_image(folder, image, case) for _, folder, image in columns]
         box = find_widest_hole(holes)
         # Holes are those at the target: a given photograph is seen from elsewhere.
@@ -113,13 +117,6 @@ def read_figure_image(folder: Path, image: str, case: FigureCase) -> np.ndarray:
     if image.startswith(PHOTOGRAPH):
         return read_pixels(store.get_photograph_path(task, int(image.removeprefix(PHOTOGRAPH))))
     return read_pixels(store.get_step_path(task, image, case.number).with_suffix(".png"))
-
-
-def read_holes(folder: Path, spec: FigureSpec, case: FigureCase) -> np.ndarray:
-    """Read the hole mask at a target, before its completion, as uint8 [h, w] of 0 and 255."""
-    task = store.get_task_folder(folder, case.name)
-    step = store.get_step_path(task, spec.list_methods()[0], case.number)
-    return read_pixels(step.with_name(f"holes-{case.number:03d}.png"))[..., 0].copy()
 
 
 def draw_outline(image: np.ndarray, holes: np.ndarray) -> np.ndarray:

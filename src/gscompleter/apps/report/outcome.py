@@ -12,7 +12,7 @@ from statistics import median
 from gscompleter.apps.report.plain_words import format_number, format_percent
 from gscompleter.apps.report.schema import HeldOutRow, OutcomeRow, average
 from gscompleter.evaluation.metrics.unused_photographs import shrink_view
-from gscompleter.reconstructors.features.consistency import MatchCount, count_consistent_matches
+from gscompleter.reconstructors.features.consistency import count_consistent_matches
 from gscompleter.stages.target_view import NOTHING_TO_COMPLETE
 from gscompleter.state import Completion, TargetResult
 
@@ -63,15 +63,12 @@ def judge_completion(
     failure = explain_failure(completion, held_out) if is_reconstructed else None
     if failure is not None:
         return OutcomeRow("not-reconstructed", failure)
-    if not has_gained(completion):
+    # A target added or recoloured something, or a new photograph recoloured the context.
+    has_gained = bool(completion.recolored_mask.any()) or count_changed(completion.targets) > 0
+    if not has_gained:
         return OutcomeRow("nothing-gained", explain_no_gain(completion))
     work = describe_work(completion, is_given)
     return OutcomeRow("completed", describe_gain(work, held_out))
-
-
-def count_matches(completion: Completion) -> MatchCount:
-    """Count the features that the context photographs share, in small images."""
-    return count_consistent_matches([shrink_view(view) for view in completion.views])
 
 
 def explain_failure(completion: Completion, held_out: Sequence[HeldOutRow]) -> str | None:
@@ -84,7 +81,8 @@ def explain_failure(completion: Completion, held_out: Sequence[HeldOutRow]) -> s
     compared = [row for row in held_out if row.above_photograph is not None]
     if compared:
         return None if is_like(compared) else describe_mismatch(compared)
-    matches = count_matches(completion)
+    # In small images, in which poses that are a little off still fit.
+    matches = count_consistent_matches([shrink_view(view) for view in completion.views])
     if matches.total < MIN_MATCHES or matches.share >= MIN_CONSISTENT:
         return None
     return (
@@ -109,11 +107,6 @@ def describe_mismatch(compared: Sequence[HeldOutRow]) -> str:
         f"The scene did not reconstruct: seen from {name_unused(compared)}, it shows something "
         f"else ({psnr} dB; holding up one of its own photographs would be as good). {ADVICE}"
     )
-
-
-def has_gained(completion: Completion) -> bool:
-    """Return True if a target added or recoloured something, or a new photograph recoloured it."""
-    return bool(completion.recolored_mask.any()) or count_changed(completion.targets) > 0
 
 
 def explain_no_gain(completion: Completion) -> str:

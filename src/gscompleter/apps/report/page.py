@@ -144,6 +144,11 @@ def write_completion_page(folder: Path) -> None:
 def render_completion_page(folder: Path) -> str:
     """Render the page of the completion in `folder`."""
     summary = read_summary(folder)
+    # Notes that only one target has; those of several stand above.
+    groups = group_target_notes(summary.targets)
+    own_notes = [
+        row.notes if len(groups.get(row.notes, ())) == 1 else () for row in summary.targets
+    ]
     path = summary.scene.splat or str(summary.settings.get("folder") or "")
     settings = {name: getattr(summary, name) for name in SETTINGS}
     return render_template(
@@ -154,7 +159,7 @@ def render_completion_page(folder: Path) -> str:
             "record": read_record(folder, summary),
             "gallery": open_gallery(folder / "images"),
             "notes": [*list_shared_notes(summary), *list_notes(summary)],
-            "own_notes": select_own_notes(summary),
+            "own_notes": own_notes,
             "describe_alignment": describe_alignment,
             "unit": find_length_unit(summary),
             "mean_held_out": {
@@ -166,12 +171,6 @@ def render_completion_page(folder: Path) -> str:
             "viewer": VIEWER_FILE if os.path.isfile(folder / VIEWER_FILE) else None,
         },
     )
-
-
-def select_own_notes(summary: CompletionSummary) -> list[Sequence[str]]:
-    """Select the notes that only one target has; those of several stand above."""
-    groups = group_target_notes(summary.targets)
-    return [row.notes if len(groups.get(row.notes, ())) == 1 else () for row in summary.targets]
 
 
 def find_length_unit(summary: CompletionSummary) -> str:

@@ -80,9 +80,13 @@ def compute_page_frame(gaussians: Gaussians) -> PageFrame:
 def make_page(viewer_content: ViewerContent, libraries: Libraries) -> tuple[bytes, tuple[str, ...]]:
     """Make the page, and sentences on missing content; the same values give the same bytes."""
     frame = compute_page_frame(viewer_content.after)
-    layers = {
-        name: frame.normalize(part.to("cpu")) for name, part in split_layers(viewer_content).items()
+    after = viewer_content.after
+    parts = {} if viewer_content.before is None else {"before": viewer_content.before}
+    parts |= {
+        "observed": after[after.generated == 0],
+        "generated": after[after.generated > 0],
     }
+    layers = {name: frame.normalize(part.to("cpu")) for name, part in parts.items()}
     # .spz has fixed-point positions: what lies beyond their range cannot be written.
     shown = {name: part[part.means.norm(dim=1) <= MAX_DISTANCE] for name, part in layers.items()}
     sources = {name: encode_spz(Path(name), part) for name, part in shown.items() if len(part) > 0}
@@ -112,14 +116,6 @@ def make_page(viewer_content: ViewerContent, libraries: Libraries) -> tuple[byte
     notes = (f"{omitted:,} Gaussians are too far away to be shown.",) if omitted else ()
     page = fill_template(content, make_scripts(sources))
     return encode_text(page), (*viewer_content.notes, *notes)
-
-
-def split_layers(viewer_content: ViewerContent) -> dict[str, Gaussians]:
-    """Split the content into layers: before, and the observed and generated part of after."""
-    after = viewer_content.after
-    before = viewer_content.before
-    layers = {"observed": after[after.generated == 0], "generated": after[after.generated > 0]}
-    return layers if before is None else {"before": before, **layers}
 
 
 def make_scripts(sources: Mapping[str, bytes]) -> list[str]:

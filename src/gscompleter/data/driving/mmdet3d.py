@@ -83,7 +83,10 @@ def _parse_sample(sample: Any, path: Path) -> list[Shot]:
     time = get_number(sample, "timestamp", title, 0.0, 1e6 * MICROSECONDS)
     time = time * 1e-6 if time >= MICROSECONDS else time
 
-    world_from_laser = _read_laser_pose(sample, title)
+    # In Waymo's infos the laser frame is that of the vehicle.
+    lidar = {"lidar2ego": np.eye(4), **get_part(sample, "lidar_points", dict)}
+    world_from_vehicle = get_array(sample, "ego2global", title, (4, 4))
+    world_from_laser = world_from_vehicle @ get_array(lidar, "lidar2ego", title, (4, 4))
     things = get_part(sample, "instances", list)
     things = [t for t in things if isinstance(t, dict) and "velocity" in t]  # none in Waymo's infos
     boxes = partial(_read_boxes, things, world_from_laser, path) if things else None
@@ -94,13 +97,6 @@ def _parse_sample(sample: Any, path: Path) -> list[Shot]:
     drive = get_text(sample, "context_name", title) or file.split("__")[0]
     frames = (_make_frame(path, n, time, image, world_from_laser) for n, image in images.items())
     return [(drive, time, replace(frame, boxes=boxes)) for frame in frames]
-
-
-def _read_laser_pose(sample: Any, title: str) -> Pose:
-    # In Waymo's infos the laser frame is that of the vehicle.
-    lidar = {"lidar2ego": np.eye(4), **get_part(sample, "lidar_points", dict)}
-    vehicle = get_array(sample, "ego2global", title, (4, 4))
-    return vehicle @ get_array(lidar, "lidar2ego", title, (4, 4))
 
 
 def _split_scenes(shots: list[Shot]) -> Iterator[list[Shot]]:

@@ -105,8 +105,16 @@ def find_features(job: Job) -> None:
     """Extract SIFT features of all photographs; those of equal size and lens share a camera."""
     extraction = pycolmap.FeatureExtractionOptions(num_threads=job.threads, use_gpu=False)
     extraction.sift.max_num_features = MAX_FEATURES
+
     cameras = {(one.width, one.height, one.lens): one for one in job.photographs}
-    numbers = {key: _add_camera(job, one) for key, one in cameras.items()}
+    numbers = {}
+    with pycolmap.Database.open(job.database) as database:
+        for key, one in cameras.items():
+            focal = one.focal or GUESSED_FOCAL * max(one.width, one.height)
+            camera = pycolmap.Camera.create_from_model_name(1, LENS, focal, one.width, one.height)
+            camera.has_prior_focal_length = one.focal is not None
+            numbers[key] = int(database.write_camera(camera))
+
     for one in job.photographs:  # one by one, so that they are numbered in their order
         number = numbers[one.width, one.height, one.lens]
         reading = pycolmap.ImageReaderOptions(existing_camera_id=number)
@@ -136,14 +144,6 @@ def join_views(job: Job) -> None:
         pycolmap.apply_rig_config([rig], database)
 
 
-def _add_camera(job: Job, one: UprightCopy) -> int:
-    focal = one.focal or GUESSED_FOCAL * max(one.width, one.height)
-    camera = pycolmap.Camera.create_from_model_name(1, LENS, focal, one.width, one.height)
-    camera.has_prior_focal_length = one.focal is not None
-    with pycolmap.Database.open(job.database) as database:
-        return int(database.write_camera(camera))
-
-
 def select_pairs(job: Job) -> Pairs:
     """Choose the photographs to match: sequence neighbours, all pairs, or similar photographs."""
     names = [one.name for one in job.photographs]
@@ -160,12 +160,14 @@ def select_pairs(job: Job) -> Pairs:
     return {(i, j) for i, j in pairs if centres[i] != centres[j]}
 
 
-def _read_features(database: Any, name: str) -> np.ndarray:
+def _read_features(database: Any, name: str) -> Float[np.ndarray, "k 128"]:
+    """Read the normalized descriptors of a photograph's `NUM_LARGEST_FEATURES` largest features."""
     number = database.read_image_with_name(name).image_id
     scales = np.linalg.norm(database.read_keypoints(number)[:, 2:4], axis=1)
-    return select_largest_features(
-        scales, np.asarray(database.read_descriptors(number).data, dtype=np.float32)
-    )
+    descriptors = np.asarray(database.read_descriptors(number).data, dtype=np.float32)
+    # SIFT's largest blobs, not its strongest, are those that other distances and cameras find too.
+    largest = descriptors[np.argsort(-scales, kind="stable")[:NUM_LARGEST_FEATURES]]
+    return largest / np.maximum(np.linalg.norm(largest, axis=1, keepdims=True), 1e-9)
 
 
 def match(job: Job, pairs: Pairs) -> None:
@@ -330,15 +332,6 @@ def pair_neighbours(count: int) -> Pairs:
 def pair_all(count: int) -> Pairs:
     """Pair each photograph with each other."""
     return set(combinations(range(count), 2))
-
-
-def select_largest_features(
-    scales: Float[np.ndarray, "n"], descriptors: Float[np.ndarray, "n 128"]
-) -> Float[np.ndarray, "k 128"]:
-    """Select the normalized descriptors of the `NUM_LARGEST_FEATURES` largest features."""
-    # SIFT's largest blobs, not its strongest, are those that other distances and cameras find too.
-    chosen = descriptors[np.argsort(-scales, kind="stable")[:NUM_LARGEST_FEATURES]]
-    return chosen / np.maximum(np.linalg.norm(chosen, axis=1, keepdims=True), 1e-9)
 
 
 def pair_similar(features: Sequence[Float[np.ndarray, "_ 128"]]) -> Pairs:

@@ -175,10 +175,10 @@ def find_poses(
         output.write() as folder,
         _open_images(photographs, num_frames, folder) as images,
     ):
-        found = _run(images, folder, photographs)
-        content = {"poses": asdict(found), "photographs": known}
+        poses = _run(images, folder, photographs)
+        content = {"poses": asdict(poses), "photographs": known}
         (folder / SUMMARY_FILE).write_bytes(json.dumps(content, indent=1).encode())
-    return replace(found, kept=" ".join(output.describe_others()))
+    return replace(poses, kept=" ".join(output.describe_others()))
 
 
 def _identify_input(path: Path, num_frames: int) -> dict[str, list[int]]:
@@ -291,7 +291,7 @@ def _run(photographs: Path, folder: Path, given: Path) -> FoundPoses:
     ]
     result = _map(copies, folder, is_panoramic)
     missing = [copy.source for copy in copies if copy.name not in result["registered"]]
-    found = FoundPoses(
+    poses = FoundPoses(
         photographs=len(copies),
         missing=missing,
         points=result["points"],
@@ -303,15 +303,15 @@ def _run(photographs: Path, folder: Path, given: Path) -> FoundPoses:
 
     # Few photographs, few points or an odd lens: the mapper found a coincidence, not the scene.
     enough = max(MIN_PHOTOGRAPHS, MIN_SHARE * len(copies))
-    is_large = found.num_registered >= enough and found.points >= MIN_POINTS
+    is_large = poses.num_registered >= enough and poses.points >= MIN_POINTS
     if not (is_large and result["is_plausible"]):
         lens = "" if result["is_plausible"] else " and an implausible lens"
         raise InputError(
-            f"COLMAP placed {found.num_registered} of {found.photographs} photographs in "
-            f"{quote_value(given, 40)}, with {found.points:,} points{lens}, which is no "
+            f"COLMAP placed {poses.num_registered} of {poses.photographs} photographs in "
+            f"{quote_value(given, 40)}, with {poses.points:,} points{lens}, which is no "
             "usable model; add sharp photographs that overlap by two thirds, or name their cameras."
         )
-    return found
+    return poses
 
 
 def _describe_origin(given: Path, images: int, copies: int) -> str:
@@ -368,7 +368,11 @@ def write_upright(root: Path, source: str, folder: Path, mask: Path | None = Non
             image.draft("RGB", (MAX_SIDE, MAX_SIDE))
         copy = ImageOps.exif_transpose(image).convert("RGB")
         focal = read_focal(exif)
-        lens = _describe_lens(exif)
+        # Photographs of one camera, lens and zoom share their intrinsics.
+        detail = exif.get_ifd(EXIF)
+        known_lens = (exif.get(MAKE), exif.get(MODEL))
+        zoom = (detail.get(FOCAL_LENGTH), detail.get(FOCAL_LENGTH_35))
+        lens = " ".join(str(value) for value in (*known_lens, *zoom))
     copy.thumbnail((MAX_SIDE, MAX_SIDE), Image.Resampling.LANCZOS)
     # In COLMAP's lists a space ends a name, and # begins a comment.
     name = re.sub(r"[\s#]", "_", source) + ("" if is_known else ".png")
@@ -434,12 +438,6 @@ def read_focal(exif: Image.Exif) -> float | None:
     except (KeyError, TypeError, ValueError, ZeroDivisionError):  # broken values are common
         return None
     return millimetres / FULL_FRAME_DIAGONAL if 1 <= millimetres <= 5000 else None
-
-
-def _describe_lens(exif: Image.Exif) -> str:
-    detail = exif.get_ifd(EXIF)
-    values = exif.get(MAKE), exif.get(MODEL), detail.get(FOCAL_LENGTH), detail.get(FOCAL_LENGTH_35)
-    return " ".join(str(value) for value in values)
 
 
 def _map(copies: Sequence[UprightCopy], folder: Path, is_panoramic: bool) -> dict[str, Any]:

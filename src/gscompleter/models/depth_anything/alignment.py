@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from jaxtyping import Float, Int
+from jaxtyping import Float
 
 from gscompleter.system.errors import InputError
 
@@ -62,10 +62,15 @@ def fit_robust_similarity(given: Points, found: Points) -> Similarity:
         return every
     # After the fit to all, the median distance to the nearest centre: what is farther from its own
     # counterpart in the fit to a half is an outlier.
-    threshold = float(np.median(measure_nearest_distances(every(given), found)))
+    distances = np.linalg.norm(every(given)[:, None] - found, axis=-1)
+    threshold = float(np.median(distances.min(axis=1)))
+    generator = np.random.default_rng(RANSAC_SEED)
+    size = max(3, (len(given) + 1) // 2)
+    halves = [generator.choice(len(given), size, replace=False) for _ in range(NUM_RANSAC_SAMPLES)]
+
     best = None
     least = (0, np.inf)
-    for half in sample_halves(len(given)):
+    for half in halves:
         # Cameras in one place determine no scale.
         if np.ptp(given[half], axis=0).max() == 0:
             continue
@@ -81,15 +86,3 @@ def fit_robust_similarity(given: Points, found: Points) -> Similarity:
     if best is None or least[0] < 3:
         return every
     return fit_center_similarity(given[best], found[best])
-
-
-def sample_halves(count: int) -> list[Int[np.ndarray, "_"]]:
-    """Sample random halves of `count` points."""
-    generator = np.random.default_rng(RANSAC_SEED)
-    size = max(3, (count + 1) // 2)
-    return [generator.choice(count, size, replace=False) for _ in range(NUM_RANSAC_SAMPLES)]
-
-
-def measure_nearest_distances(points: Points, others: Points) -> Float[np.ndarray, "n"]:
-    """Measure the distance from each point to the nearest of the others."""
-    return np.linalg.norm(points[:, None] - others, axis=-1).min(axis=1)

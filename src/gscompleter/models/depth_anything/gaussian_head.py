@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from itertools import chain, pairwise
+from itertools import pairwise
 
 import torch
 import torch.nn.functional as F
@@ -27,13 +27,6 @@ SCALES = (1e-5, 30.0)
 """Smallest and largest standard deviation, in tenths of the sum of pixel width and height."""
 
 
-def create_image_merger(features: int) -> nn.Sequential:
-    """Create the layers that add image features to the fused map."""
-    widths = pairwise([3, features // 8, features // 4, features // 2])
-    layers = [(nn.Conv2d(a, b, 3, 1, 1), nn.GELU()) for a, b in widths]
-    return nn.Sequential(*chain.from_iterable(layers))
-
-
 class GaussianDpt(Dpt):
     """Head for the raw Gaussian channels of each pixel."""
 
@@ -42,7 +35,11 @@ class GaussianDpt(Dpt):
     def __init__(self, channels: int, widths: Sequence[int], features: int) -> None:
         super().__init__(channels, widths, coded=True)
         self.scratch = ImageScratch(widths, features, sum(CHANNELS))
-        self.images_merger = create_image_merger(features)
+        # Layers that add features of the image itself to the fused map.
+        layers: list[nn.Module] = []
+        for width_in, width_out in pairwise([3, features // 8, features // 4, features // 2]):
+            layers += [nn.Conv2d(width_in, width_out, 3, 1, 1), nn.GELU()]
+        self.images_merger = nn.Sequential(*layers)
 
     def forward(
         self, tokens: Sequence[Tokens], images: Float[Tensor, "b v 3 h w"]

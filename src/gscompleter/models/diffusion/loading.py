@@ -66,11 +66,11 @@ def find_sources(path: str | None) -> tuple[Source, Source]:
     """Determine the sources of base pipeline and transformer."""
     if path is None:
         return KONTEXT, PE_FIELD
-    given = parse_source(path)
-    if not given.is_local or (Path(given.location) / "model_index.json").is_file():
-        return given, replace(given, subfolder="transformer")
-    if (Path(given.location) / "config.json").is_file():
-        return KONTEXT, given
+    source = parse_source(path)
+    if not source.is_local or (Path(source.location) / "model_index.json").is_file():
+        return source, replace(source, subfolder="transformer")
+    if (Path(source.location) / "config.json").is_file():
+        return KONTEXT, source
     raise InputError(
         f"{path} holds neither a model_index.json (a pipeline) nor a config.json (a transformer); "
         "give a folder that diffusers saved."

@@ -87,7 +87,9 @@ def create_network(published: PublishedWeights) -> Network:
     if published.name in depth_anything.VARIANTS:
         return create_depth_anything(depth_anything.VARIANTS[published.name])
     if published.model == "DepthSplat":
-        return DepthSplat(VARIANTS[get_variant_name(published)])
+        # Published names omit a size of 256x256.
+        key = published.name.removeprefix("depthsplat-")
+        return DepthSplat(VARIANTS[key if key in VARIANTS else f"{key}-256x256"])
     return MVSplat() if published.model == "MVSplat" else VolSplat()
 
 
@@ -100,12 +102,6 @@ def create_depth_anything(
     if isinstance(config, MetricDepthConfig):
         return MetricDepthAnything(config)
     return DepthAnything(config)
-
-
-def get_variant_name(published: PublishedWeights) -> str:
-    """Return the key of `VARIANTS`; published names omit a size of 256x256."""
-    key = published.name.removeprefix("depthsplat-")
-    return key if key in VARIANTS else f"{key}-256x256"
 
 
 def collect_all_shapes() -> dict[str, dict[str, tuple[int, ...]]]:

@@ -93,8 +93,8 @@ class Grid:
         """Return the indices of `keys` that are cells of this grid, and the rows of those cells."""
         # Keys are sorted: a binary search finds the only row that a key can be in.
         rows = torch.searchsorted(self.keys, keys).clamp_max(len(self) - 1)
-        found = (self.keys[rows] == keys).nonzero()[:, 0]
-        return found, rows[found]
+        hits = (self.keys[rows] == keys).nonzero()[:, 0]
+        return hits, rows[hits]
 
     def coarsen(self) -> Grid:
         """Merge the cells into cells of twice the side length."""

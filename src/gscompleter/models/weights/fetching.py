@@ -36,7 +36,13 @@ def fetch(weights: PublishedWeights, local: Path | None = None, offline: bool = 
         WeightsNotAvailable: The file is not local and cannot be downloaded.
     """
     if local is not None:
-        return _check_local_file(weights, local)
+        path = local / weights.file if os.path.isdir(local) else local
+        if not os.path.isfile(path):
+            raise InputError(
+                f"There are no weights at {path}; name the file {weights.file} or its folder, from "
+                f"{weights.source}."
+            )
+        return path
     cached = find_cached(weights)
     if cached is not None:
         return cached
@@ -62,24 +68,14 @@ def find_cached(weights: PublishedWeights) -> Path | None:
         return None
     from huggingface_hub import try_to_load_from_cache
 
-    found = try_to_load_from_cache(weights.repository, weights.file, revision=weights.revision)
+    cached = try_to_load_from_cache(weights.repository, weights.file, revision=weights.revision)
     # The hub's answer may also be a mark that the file is known not to exist.
-    return Path(found) if isinstance(found, str) else None
+    return Path(cached) if isinstance(cached, str) else None
 
 
 def is_hub_installed() -> bool:
     """Return True if huggingface_hub is installed."""
     return find_spec("huggingface_hub") is not None
-
-
-def _check_local_file(weights: PublishedWeights, local: Path) -> Path:
-    path = local / weights.file if os.path.isdir(local) else local
-    if not os.path.isfile(path):
-        raise InputError(
-            f"There are no weights at {path}; name the file {weights.file} or its folder, from "
-            f"{weights.source}."
-        )
-    return path
 
 
 def _describe_manual_download(weights: PublishedWeights) -> str:

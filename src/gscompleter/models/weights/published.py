@@ -222,8 +222,8 @@ def _create_inpainting(
 ) -> PublishedWeights:
     """Create the entry of a generator that fills holes."""
     name = model.lower().replace("-", "")
-    given = {"name": name, "model": model, "parameters": None, "gives": "image", **others}
-    return _create_onnx(repository, licence, image_size=(512, 512), **given)
+    entries = {"name": name, "model": model, "parameters": None, "gives": "image", **others}
+    return _create_onnx(repository, licence, image_size=(512, 512), **entries)
 
 
 def _create_moge(name: str, size: str, **others: Any) -> PublishedWeights:

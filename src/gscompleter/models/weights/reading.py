@@ -71,7 +71,11 @@ def check_kind(path: Path, name: str) -> None:
 
 def check_sha256(path: Path, expected: str, name: str) -> None:
     """Raise InputError if the SHA-256 of a file does not start with `expected`."""
-    digest = compute_sha256(path)
+    hashed = hashlib.sha256()
+    with path.open("rb") as file:
+        while block := file.read(1 << 20):
+            hashed.update(block)
+    digest = hashed.hexdigest()
     if digest.startswith(expected):
         return
     for other in PUBLISHED.values():
@@ -81,15 +85,6 @@ def check_sha256(path: Path, expected: str, name: str) -> None:
                 f"model, or fetch {name}."
             )
     raise _create_file_error(path, f"is not the published file (SHA-256 {digest[:8]})", name)
-
-
-def compute_sha256(path: Path) -> str:
-    """Compute the SHA-256 of a file in blocks of 1 MiB."""
-    digest = hashlib.sha256()
-    with path.open("rb") as file:
-        while block := file.read(1 << 20):
-            digest.update(block)
-    return digest.hexdigest()
 
 
 def is_archive(path: Path) -> bool:
