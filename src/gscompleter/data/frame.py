@@ -80,6 +80,7 @@ class Frame:
     def file_name(self) -> str:
         """Path of the photograph below the folder of all, as users know it."""
         path = PurePosixPath(self.name.replace("\\", "/"))
+        # "images" in front of a name is the folder of all, which users do not name.
         inside = len(path.parts) > 1 and path.parts[0].casefold() in FOLDERS
         return str(PurePosixPath(*path.parts[1:]) if inside else path)
 
@@ -99,6 +100,7 @@ class Frame:
         A photograph inside a container file is not opened if the camera file gives its size.
         """
         stated = None if self.intrinsics.size == FRACTIONS else self.intrinsics.size
+        # The size of a container's image costs its decoding.
         stored = None if stated is not None and callable(self.image) else self.find_stored()
         if stored is not None:
             width, height = read_image_size(stored, capitalize(self.title))

@@ -334,6 +334,7 @@ def undistort_and_resize(
         pinhole, new = frame.compute_pinholes(*size)
         source = compute_undistortion_map(pinhole, frame.intrinsics.distortion, new)
         pixels = remap(pixels, source, cv2.INTER_CUBIC if is_colour else cv2.INTER_NEAREST)
+    # Colours need a window function to shrink without aliasing; values of a map must not be mixed.
     filtering = Image.Resampling.LANCZOS if is_colour else Image.Resampling.NEAREST
     framing = compute_framing(*size, resolution)
     left, top = framing.corner
@@ -373,6 +374,7 @@ def _has_alpha(frame: Frame) -> bool:
 def _find_skip_reason(
     frame: Frame, origin: Float[np.ndarray, "3"], max_translation: float | None
 ) -> str | None:
+    # The size in the camera file needs no image to be opened.
     size = frame.intrinsics.size or frame.size()
     defect = frame.find_defect(*size)
     if defect is not None:
@@ -425,6 +427,7 @@ def compute_framing(width: int, height: int, resolution: Resolution) -> Framing:
             f"An image of {width} × {height} pixels that covers {new_width} × {new_height} has a "
             f"side above {MAX_SIDE}; choose a smaller resolution, or crop the image."
         )
+    # Symmetric, with the odd pixel at the right and the lower side.
     corner = (scaled[0] - new_width) // 2, (scaled[1] - new_height) // 2
     return Framing(scaled, corner, (new_width, new_height))
 

@@ -51,6 +51,7 @@ def compute_depth_range(
     """Compute near and far planes (scene units) around visible points; None for too few."""
     seen = [torch.zeros(0)]
     for camera in cameras:
+        # Points behind a camera or outside its image say nothing about its depth range.
         pixels, z = project(points, camera)
         seen.append(z[is_inside(pixels, z, camera)])
     depths = torch.cat(seen)

@@ -54,6 +54,7 @@ def parse_camera_row(
     """Split a row into intrinsics and camera-to-world; an invalid transform stays as it is."""
     fx, fy, cx, cy = numbers[:4].tolist()
     viewmat = np.vstack([numbers[6:].reshape(3, 4), [0, 0, 0, 1]])
+    # Intrinsics are fractions of the image, which may have any size.
     return Intrinsics(FRACTIONS, (fx, fy), (cx, cy)), invert_viewmat(viewmat)
 
 

@@ -99,10 +99,10 @@ def judge_differences(differences: Mapping[str, float], column: Column, sign: in
     """Judge paired differences by case; `sign` is 1 if the claim wants them positive, else -1."""
     estimate = estimate_mean(differences)
     signs = count_signs(differences, sign)
-    measured = f"{column.title} {found.mean:+.{column.digits}f}"
+    measured = f"{column.title} {estimate.mean:+.{column.digits}f}"
     if estimate.error is None:
         return Judgement("one scene only", measured, in_favour=signs.describe())
-    measured += f" ± {found.error:.{column.digits}f}"
+    measured += f" ± {estimate.error:.{column.digits}f}"
     if signs.in_favour == signs.against == 0:
         return Judgement("no difference", measured, in_favour=signs.describe())
     return Judgement(

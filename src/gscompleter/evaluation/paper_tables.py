@@ -146,6 +146,7 @@ def fill_table(spec: TableSpec, runs: Mapping[tuple[str, str], Path]) -> PaperTa
     counts = {}
     notes = []
     for (model, protocol), folder in runs.items():
+        # Every method is averaged over the same cases, those that all finished.
         summary = summarize_run([r for r in read_rows(folder) if r["method"] in spec.methods])
         fids = compute_fids(folder, summary) if "fid" in spec.columns else {}
         notes += [f"Failed: {' '.join(failure)}" for failure in summary.failures]
@@ -153,6 +154,7 @@ def fill_table(spec: TableSpec, runs: Mapping[tuple[str, str], Path]) -> PaperTa
         counts[f"{model}, {protocol}" if protocol else model] = len(summary.common_tasks)
         for method in spec.methods:
             cells = fill_cells(spec, summary, method)
+            # FID is one number of all images, without a case to pair.
             if not isinstance(fids, str) and fids:
                 cells["fid"] = Cell(fids[method])
             rows.append(TableRow(model, protocol, method, cells))
@@ -263,6 +265,7 @@ def format_paper_latex(table: PaperTable) -> str:
     """Format a table with booktabs."""
     cell = partial(format_number, error=r"{{\tiny$\pm${}}}", difference=r"~{{\tiny({})}}")
     text = format_latex(*format_rows(table, cell))
+    # pdfLaTeX knows none of these characters.
     for sign, command in {"≈": r"$\approx$", "Ψ": r"$\Psi$", "Δ": r"$\Delta$"}.items():
         text = text.replace(sign, command)
     return f"% {table.spec.title}\n{text}\n"

@@ -94,6 +94,8 @@ def parse_protocol(text: str) -> EvaluationProtocol:
     for pattern, split in FRAME_RULES.items():
         match = re.fullmatch(pattern, text)
         if match is not None:
+            # Names of groups in the pattern are the parameters of the function; optional ones may
+            # be absent.
             numbers = {key: int(n) for key, n in match.groupdict().items() if n}
             if 0 in numbers.values() or numbers.get("steps", 0) > MAX_TARGET_ID:
                 raise InputError(
@@ -187,6 +189,7 @@ def read_evaluation_index(path: Path) -> EvaluationIndex:
 def write_evaluation_index(path: Path | str, index: EvaluationIndex) -> None:
     """Write an index atomically, in the format that `read_evaluation_index` reads."""
     scenes = {
+        # An empty list would not be valid, and null says the same.
         name: [{"context": s.context, "target": s.targets} for s in splits] or None
         for name, splits in index.scenes.items()
     }

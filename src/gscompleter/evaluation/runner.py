@@ -115,6 +115,7 @@ def evaluate(
                 row.unlink(missing_ok=True)
 
     todo = {row: task for task in share for row in runner.find_missing_rows(task)}
+    # Jobs are tasks: what all methods share is prepared once in a worker.
     named = {store.make_file_name(task.name): task for task in todo.values()}
     jobs = [Job(name, {"task": task}) for name, task in named.items()]
 
@@ -185,6 +186,7 @@ def prepare_task(task: Task, folder: Path, config: RunConfig) -> PreparedTask:
     targets = load_task_views(task, task.targets, config)
     neighbours = load_task_views(task, task.neighbours, config)
     images = [*views, *targets]
+    # Images too large for the memory are refused before the models are loaded.
     check_memory(max(v.camera.width * v.camera.height for v in images), len(images))
     models = config.load_models(targets)
     context = load_or_reconstruct(folder / "context.pt", views, models)

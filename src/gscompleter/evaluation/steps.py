@@ -97,6 +97,7 @@ def advance_task(
 ) -> Progress:
     """Complete one more target and save its prediction and images."""
     number = len(progress.steps) + 1
+    # Always with the scene as it is, so that an anchor may be the photograph of an earlier target.
     state = task.models.make_completer().begin(progress.views, progress.scene)
     path = store.get_step_path(folder, method, number)
     if not store.is_complete(path):

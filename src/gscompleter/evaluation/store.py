@@ -159,6 +159,7 @@ def load_values(path: Path, device: torch.device | str) -> dict[str, Any]:
 
 def is_complete(path: Path) -> bool:
     """Return True if a file of `save_values` exists and has its end."""
+    # A zip archive has its directory at its end.
     return is_zipfile(path)
 
 

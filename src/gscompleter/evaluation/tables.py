@@ -120,6 +120,7 @@ class RunSummary:
             return {}
         steps = [step["seconds"] for row in rows for step in row["steps"]]
         stages = sorted({stage for step in steps for stage in step}, key=rank_stage)
+        # A stage that a step did not run took no time.
         medians = {s: statistics.median(step.get(s, 0.0) for step in steps) for s in stages}
         return {"reconstruct": statistics.median(r["reconstruct_seconds"] for r in rows), **medians}
 
@@ -201,6 +202,7 @@ def compute_fids(out: Path, summary: RunSummary) -> Fids:
     ]
     values = {}
     try:
+        # The photographs are read once, and compared with the images of each method.
         truths = [read_image(get_truth_path(folder, number)) for folder, number in steps]
         for method in summary.methods:
             paths = [get_step_path(folder, method, n).with_suffix(".png") for folder, n in steps]
@@ -219,6 +221,7 @@ def format_score_cells(summary: RunSummary, columns: Sequence[Column]) -> list[l
     """Format a table of scores, one row per method; a number of tasks other than all is added."""
 
     def format_cell(method: str, column: Column) -> str:
+        # A row has as many values as its tasks; fewer are said beside the number.
         value, count = summary.compute_cell(method, column)
         number = format_score(value, column.digits)
         return number if count in (0, len(summary.common_tasks)) else f"{number} ({count})"
@@ -272,6 +275,7 @@ def format_score_markdown(summary: RunSummary, fids: Fids) -> str:
     parts += [f"{note}\n" for key, note in ABSENT_NOTES.items() if key not in present]
     parts.append(format_fid_markdown(summary, fids))
     if summary.failures:
+        # A bar in a message would end the cell.
         rows = [[cell.replace("|", "\\|") for cell in failure] for failure in summary.failures]
         parts.append("### Failed\n\n" + format_markdown(["case", "method", "reason"], rows))
     head = ["method", "frame", "anchor", "before", "after", "end", "depth scale", "added"]

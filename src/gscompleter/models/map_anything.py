@@ -9,6 +9,7 @@ from pathlib import Path
 from typing import Any
 
 import torch
+from torch import Tensor
 
 from gscompleter.models.depth_anything.alignment import fit_robust_similarity
 from gscompleter.models.depth_anything.inputs import ResizeConfig, create_any_view_batch
@@ -68,6 +69,7 @@ class MapAnythingDepth:
         predicted_centers = join("camera_poses")[:, :3, 3].double().numpy()
         scale = fit_robust_similarity(given_centers, predicted_centers).scale
         confidence = normalize_confidence(raw_confidence) * solid.view_as(raw_confidence)
+        # `depth_z` has the shape [v, h, w, 1].
         return resample_depth_maps(depth[..., 0] / scale, confidence, batch, views)
 
 

@@ -83,6 +83,7 @@ def open_session(path: Path, device: str, option: str) -> Any:
     options.use_deterministic_compute = True
     # Only fatal messages: failures become an InputError with advice.
     options.log_severity_level = 4
+    # A GPU is used if onnxruntime was built for one, and a CPU otherwise.
     wanted = ["CUDAExecutionProvider"] if device == "cuda" else []
     usable = [name for name in wanted if name in onnxruntime.get_available_providers()]
     try:

@@ -43,6 +43,7 @@ class PageBox:
             raise InputError("Tick “Box”, drag it over what you want to remove, and press again.")
         center = np.array(self.controls.position)
         half = np.array(self.size.value) / 2
+        # The box is in page units, and `remove` in those of the scene.
         corners = np.concatenate([center - half, center + half]) / unit
         return tuple(corners.tolist()), tuple(np.array(self.controls.wxyz).tolist())
 
@@ -58,10 +59,13 @@ def remove_in_box(session: Session, corners: Numbers, rotation: Numbers) -> tupl
     def contains(points: Float[Tensor, "n 3"]) -> Bool[Tensor, "n"]:
         return find_in_boxes(points.double(), corners, rotation)
 
+    # Of the context and of all that was added; what is gone already cannot go again.
     inside = [contains(part.means) for part in (state.context, *state.parts[1:])]
     context = inside[0] & ~state.source.gone_mask
     if not any(mask.any() for mask in (context, *inside[1:])):
         raise InputError("The box contains nothing; drag it, or make it larger.")
+    # As the command `remove` does: what is removed from the context is marked, and its hole may be
+    # filled. What was added is simply taken out.
     added = [part[~mask] for part, mask in zip(state.parts[1:], inside[1:], strict=True)]
     parts = (state.parts[0], *added)
     config = state.config.for_removal()

@@ -108,6 +108,7 @@ class Page:
     def handle_requests(self) -> None:
         """Run requests until the process is interrupted."""
         while True:
+            # Threads of the server hand their requests over; all work is done in this one.
             request = self._requests.get()
             try:
                 self.show_message(run_request(request))

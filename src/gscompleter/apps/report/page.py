@@ -183,6 +183,7 @@ def find_length_unit(summary: CompletionSummary) -> str:
 
 def average_scores(summary: Mapping[str, Any]) -> dict[str, Any]:
     """Average the scores of a completion over its targets."""
+    # Three columns are averages; the others are of the whole completion.
     targets = summary["targets"]
     return {
         "targets": len(targets),

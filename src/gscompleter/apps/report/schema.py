@@ -227,6 +227,7 @@ def read_summary(folder: Path) -> CompletionSummary:
     transform = np.array(summary.frame.transform)
     numbers = np.concatenate([transform.ravel(), np.array(summary.frame.origin)])
     is_bounded = bool((np.abs(numbers) <= MAX_FRAME_NUMBER).all())  # False for NaN
+    # A determinant of 0 has no inverse, and a negative one is a mirror.
     if not is_bounded or not np.linalg.det(transform[:3, :3]) > 0:
         raise InputError(
             f"{quote_value(path)} is damaged (frame: no similarity of photographs); {ADVICE}."

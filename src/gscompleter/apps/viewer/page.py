@@ -186,6 +186,7 @@ def fill_template(content: Mapping[str, Any], scripts: Sequence[str]) -> str:
         "style": read_asset("viewer.css"),
         "program": read_asset("viewer.js"),
         "parts": "\n".join(scripts),
+        # `</script>` in a text would end the element.
         "data": json.dumps(content, sort_keys=True).replace("<", "\\u003c"),
     }
     return re.sub(r"\{\{(\w+)\}\}", lambda name: texts[name[1]], read_asset("viewer.html"))

@@ -63,6 +63,7 @@ def find_files(export: Path, pattern: str) -> Files:
 
 def _read_entry(export: Path, path: PurePosixPath) -> bytes:
     with _open_archive(export) as archive:
+        # A zip archive of a few bytes may claim any size.
         if archive.getinfo(str(path)).file_size > MAX_ENTRY:
             raise ValueError(f"its {path} is too large")
         return archive.read(str(path))
@@ -121,6 +122,7 @@ def _read_depth(
 ) -> Float[np.ndarray, "h w"]:
     """Read z-depth in metres, 0 where it is unknown or unreliable."""
     stored = decoders[0](depth(), title)
+    # Confidence is optional; depth without it is taken as it is.
     sure = stored if confidence is None else decoders[1](confidence(), title)
     require(
         stored.ndim == 2 and stored.dtype.itemsize > 1 and stored.shape == sure.shape,

@@ -200,6 +200,7 @@ def measure_part(image: Image, photograph: View, where: Bool[Tensor, "h w"]) -> 
     compared = photograph.fill_ignored(image)
     truth = photograph.image
     where = where & photograph.valid_mask
+    # The map is computed once, with the surroundings of each pixel, and then averaged in the part.
     errors = compute_flip_map(compared, truth)
     return PartQuality(
         compute_masked_psnr(image, truth, where),

@@ -72,6 +72,7 @@ class Window:
 
     def compute_pixel_indices(self, camera: Camera) -> Int[Tensor, "n"]:
         """Compute the row-major index of the photograph's pixel below each window pixel."""
+        # The centre of each window pixel, back in the photograph.
         x = ((torch.arange(self.width) + 0.5 + self.left) / self.scale_x).long()
         y = ((torch.arange(self.height) + 0.5 + self.top) / self.scale_y).long()
         rows = y.clamp(max=camera.height - 1)

@@ -41,6 +41,8 @@ class MetricDepth:
 
     def convert_to_metres(self, K: Float[Tensor, "b v 3 3"]) -> Float[Tensor, "b v h w"]:
         """Compute z-depth in metres for intrinsics in pixels."""
+        # Depth is proportional to the focal length: a longer lens shows the same image of what is
+        # farther.
         focal = (K[..., 0, 0] + K[..., 1, 1]) / 2
         return self.depth * (focal / METRIC_FOCAL)[..., None, None]
 

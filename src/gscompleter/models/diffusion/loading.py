@@ -44,6 +44,8 @@ def load_kontext(path: str | None = None, device: str = "cpu", offload: bool = F
     check_packages("pe-field")
     base, transformer = find_sources(path)
     announce([base, transformer])
+    # Each source converts its own errors, which name it. The prompt is encoded first: its text
+    # encoders are freed before the transformer is in memory.
     dtype = select_dtype(device)
     with convert_load_errors(base):
         prompt = encode_prompt(base, device, dtype)
@@ -67,6 +69,7 @@ def find_sources(path: str | None) -> tuple[Source, Source]:
     if path is None:
         return KONTEXT, PE_FIELD
     source = parse_source(path)
+    # A hub repository holds a whole pipeline, of which the transformer is one folder.
     if not source.is_local or (Path(source.location) / "model_index.json").is_file():
         return source, replace(source, subfolder="transformer")
     if (Path(source.location) / "config.json").is_file():
@@ -109,6 +112,7 @@ def load_pipeline(base: Source, network: Any, dtype: torch.dtype) -> Any:
     """Load VAE and scheduler around `network`, without text encoders."""
     from diffusers import FluxKontextPipeline
 
+    # Named as absent, or diffusers would download and load them.
     unused = dict.fromkeys(("text_encoder", "text_encoder_2", "tokenizer", "tokenizer_2"))
     pipeline = FluxKontextPipeline.from_pretrained(
         base.location, transformer=network, dtype=dtype, **unused, **base.load_arguments

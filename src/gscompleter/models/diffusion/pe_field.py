@@ -94,6 +94,7 @@ class PEField:
                 back = resize_antialiased(image, (target.height, target.width)).clamp(0, 1)
                 return back.to(nearest.image.device)
 
+            # Photographs, warped to the target, judge the image and correct its colours.
             observed = warp_photographs(nearest, target, requests[i].context)
             correct = requests[i].context.correct_color
             return paint_consistently(paint, self.seed, observed, self.retries, correct)
@@ -107,6 +108,7 @@ class PEField:
         grids = self.model.compute_grid(source_size), self.model.compute_grid(size)
         source = self.depth or load_source_depth(context.source_depth, self.device)
         depth = source(nearest, find_render(nearest, context))
+        # Where the target sees what the photograph shows; the network draws it there.
         positions = compute_source_ids(depth, nearest.camera, target, *grids).cpu()
         return Condition(resize_antialiased(nearest.image, source_size), size, positions)
 

@@ -76,6 +76,7 @@ def wrap_network(
     if isinstance(network, NestedDepthAnything):
         return AnyViewGaussians(network, inference)
     if isinstance(network, DepthAnything):
+        # Depth with a head for Gaussians makes these; without one, `FromDepth` does.
         if network.gs_head is not None:
             return AnyViewGaussians(network, inference)
         return FromDepth(model=AnyViewDepth(network, inference))

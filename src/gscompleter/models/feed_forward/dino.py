@@ -38,6 +38,8 @@ class Attention(nn.Module):
 
     def forward(self, x: Float[Tensor, "n t c"]) -> Float[Tensor, "n t c"]:
         """Apply self-attention."""
+        # One matrix for queries, keys and values: [n, t, 3 c] to three times [n, heads, t, c /
+        # heads].
         q, k, v = self.qkv(x).unflatten(2, (3, self.heads, -1)).permute(2, 0, 3, 1, 4)
         return self.proj(F.scaled_dot_product_attention(q, k, v).transpose(1, 2).flatten(2))
 

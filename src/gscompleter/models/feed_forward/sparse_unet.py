@@ -58,6 +58,7 @@ class UpBlock(nn.Module):
         self, features: Float[Tensor, "m channels_in"], downward: Neighbours
     ) -> Float[Tensor, "n channels_out"]:
         """Apply the block along the transpose of `downward`."""
+        # The same pairs of cells as on the way down, with source and target swapped.
         return F.relu(self.norm(self.upconv(features, downward.transpose_pairs())))
 
 

@@ -155,6 +155,7 @@ class UNet(nn.Module):
 
     def forward(self, x: Float[Tensor, "n c h w"], views: int) -> Float[Tensor, "n c h w"]:
         """Refine the maps of n = b v images, with `views` consecutive images per scene."""
+        # The maps of the way down, deepest last, are joined on the way up.
         skipped = []
         for block in self.input_blocks:
             x = block(x, views)

@@ -43,6 +43,7 @@ class InpaintingGenerator:
                 "The generator painted no finite image; check that its weights are correct, or "
                 "choose another generator."
             )
+        # Outside the hole the photographs stay; on its rim the filling is fitted to them.
         toned = match_tone(filled, warped.image, warped.known & hole)
         image = torch.where(warped.known[..., None], warped.image, toned)
         return image.clamp(0, 1).to(nearest.image.device)
@@ -57,6 +58,7 @@ def fill_windows(
     """
     image = image.clone()
     unfilled = hole.clone()
+    # Windows that know most of their surroundings first: they continue it inwards.
     windows = sorted(place_windows(*hole.shape), key=lambda at: hole[at].float().mean().item())
     for at in windows:
         if unfilled[at].any():

@@ -44,6 +44,7 @@ def load_strictly(
             f"{origin} does not fit the network {type(model).__name__}: "
             f"{describe_differences(needed, given)}; {advice}."
         )
+    # Checked before anything is loaded, so that a failure leaves the network as it was.
     check_finite(state_dict, origin)
     model.load_state_dict(state_dict, strict=True)
 

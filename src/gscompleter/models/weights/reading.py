@@ -33,6 +33,7 @@ def read_state_dict(path: Path, weights: PublishedWeights) -> dict[str, Tensor]:
         InputError: The file is missing, damaged, a different one, or contains other objects.
     """
     check_kind(path, weights.file)
+    # A converted file has no published hash.
     converted = path.suffix == ".safetensors" and not weights.file.endswith(".safetensors")
     if weights.sha256 is not None and not converted:
         check_sha256(path, weights.sha256, weights.file)
