@@ -383,20 +383,20 @@ def _find_models(path: Path) -> list[Path]:
         return []
     for name in HOMES:
         home = find_path(path, name)
-        models = _list_home(home) if home and os.path.isdir(home) else []
+        if home is None or not os.path.isdir(home):
+            continue
+        # A home may be a model itself, or hold numbered ones.
+        numbered = sorted(entry for entry in os.listdir(home) if entry.isdecimal())
+        folders = [home, *(home / entry for entry in numbered)]
+        image_files = [_find_model_file(folder, "images") for folder in folders]
+        models = [
+            images
+            for images in image_files
+            if images and _find_model_file(images.parent, "cameras")
+        ]
         if models:
             return models
     return []
-
-
-def _list_home(home: Path) -> list[Path]:
-    """List the images files of the models in a folder, which may be one itself."""
-    numbered = sorted(name for name in os.listdir(home) if name.isdecimal())
-    folders = [home, *(home / name for name in numbered)]
-    image_files = [_find_model_file(folder, "images") for folder in folders]
-    return [
-        images for images in image_files if images and _find_model_file(images.parent, "cameras")
-    ]
 
 
 def _find_model_file(folder: Path, name: str) -> Path | None:

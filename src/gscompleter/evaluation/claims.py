@@ -114,23 +114,23 @@ def judge_differences(differences: Mapping[str, float], column: Column, sign: in
     )
 
 
-def choose_verdict(found: Estimate, signs: Signs, sign: int) -> str:
+def choose_verdict(estimate: Estimate, signs: Signs, sign: int) -> str:
     """Choose the verdict: by the t test, or else by the signs, or else noise."""
-    if not found.is_noise:
-        return "reproduced" if sign * found.mean > 0 else "not reproduced"
+    if not estimate.is_noise:
+        return "reproduced" if sign * estimate.mean > 0 else "not reproduced"
     if signs.p_value <= SIGNIFICANCE:
         is_favourable = signs.in_favour > signs.against
         return "reproduced by signs" if is_favourable else "not reproduced, by signs"
     return "within noise"
 
 
-def describe_t_test(found: Estimate) -> str:
+def describe_t_test(estimate: Estimate) -> str:
     """Return the statistic with its degrees of freedom and its p."""
-    assert found.error is not None
-    statistic = f"t({found.degrees_of_freedom})"
-    if found.error > 0:
-        statistic += f" = {found.mean / found.error:.2f}"
-    return f"{statistic}, {describe_p(found.p_value)}"
+    assert estimate.error is not None
+    statistic = f"t({estimate.degrees_of_freedom})"
+    if estimate.error > 0:
+        statistic += f" = {estimate.mean / estimate.error:.2f}"
+    return f"{statistic}, {describe_p(estimate.p_value)}"
 
 
 def describe_p(value: float) -> str:

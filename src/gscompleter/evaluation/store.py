@@ -136,17 +136,18 @@ def load_prediction(path: Path, before: Gaussians) -> Prediction:
     return Prediction(**saved)
 
 
-def collect_tensors(gaussians: Gaussians) -> dict[str, Tensor]:
-    """Copy the tensors to the CPU, in torch's own layout, on which rounding of sums depends."""
-    tensors = {name: getattr(gaussians, name).detach().cpu() for name in FIELDS}
-    layout = torch.contiguous_format
-    return {name: tensor.clone(memory_format=layout) for name, tensor in tensors.items()}
-
-
 def save_values(path: Path, content: Mapping[str, Any]) -> None:
     """Write Gaussians and plain values atomically; raise OutputError if that fails."""
     make_folder(path.parent)
-    packed = {k: collect_tensors(v) if isinstance(v, Gaussians) else v for k, v in content.items()}
+    packed = dict(content)
+    for name, value in content.items():
+        if isinstance(value, Gaussians):
+            # On the CPU, and in torch's own layout, on which the rounding of sums depends.
+            tensors = {field: getattr(value, field).detach().cpu() for field in FIELDS}
+            packed[name] = {
+                field: tensor.clone(memory_format=torch.contiguous_format)
+                for field, tensor in tensors.items()
+            }
     with replace_file(path) as file:
         torch.save(packed, file)
 

@@ -310,10 +310,16 @@ def collect_score_content(summary: RunSummary, fids: Fids) -> dict[str, Any]:
     """Return all scores with full precision, for JSON."""
     values: dict[str, float] = {} if isinstance(fids, str) else fids
     reason = fids if isinstance(fids, str) else None
+    columns = [column for group in GROUPS.values() for column in group]
+    methods = {}
+    for method in summary.methods:
+        cells = {column.key: summary.compute_cell(method, column) for column in columns}
+        scores = {key: {"value": value, "cases": count} for key, (value, count) in cells.items()}
+        methods[method] = {"finished": summary.finished[method], **scores}
     return {
         "cases": len(summary.tasks),
         "common": list(summary.common_tasks),
-        "methods": {method: collect_method_scores(summary, method) for method in summary.methods},
+        "methods": methods,
         "notes": summary.notes,
         "fid": {"values": values, "reason": reason},
         "failures": [
@@ -321,14 +327,6 @@ def collect_score_content(summary: RunSummary, fids: Fids) -> dict[str, Any]:
             for failure in summary.failures
         ],
     }
-
-
-def collect_method_scores(summary: RunSummary, method: str) -> dict[str, Any]:
-    """Return the number of finished tasks and all scores of a method, for JSON."""
-    columns = [column for group in GROUPS.values() for column in group]
-    cells = {column.key: summary.compute_cell(method, column) for column in columns}
-    scores = {key: {"value": value, "cases": count} for key, (value, count) in cells.items()}
-    return {"finished": summary.finished[method], **scores}
 
 
 def format_timing_markdown(summary: RunSummary) -> str:

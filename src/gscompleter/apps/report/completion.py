@@ -420,8 +420,13 @@ def make_record(completion: Completion, photographs: Sequence[Camera]) -> Comple
     def draw(cameras: Sequence[Camera]) -> tuple[str, ...]:
         return tuple(draw_camera(camera, frame) for camera in cameras)
 
-    pairs = tuple(list_depth_pairs(result) for result in completion.targets)
-    return CompletionRecord(draw(others), draw(context), draw(targets), pairs)
+    rows = []
+    for result in completion.targets:
+        pairs = result.affine.pairs
+        columns = pairs.predicted, pairs.context, pairs.inlier_mask
+        points = zip(*(column.tolist() for column in columns), strict=True)
+        rows.append(PairsRow(pairs.fit_view, tuple(points)))
+    return CompletionRecord(draw(others), draw(context), draw(targets), tuple(rows))
 
 
 def fit_frame(cameras: Sequence[Camera]) -> DrawingFrame:
@@ -448,13 +453,6 @@ def draw_camera(camera: Camera, frame: DrawingFrame) -> str:
     corners = FRUSTUM_DEPTH * torch.stack([o, a, b, c, d, a, b, o, c, d, o])
     points = frame.convert(camera.center) + corners
     return " ".join(f"{value:.3f}" for value in points.flatten().tolist())
-
-
-def list_depth_pairs(result: TargetResult) -> PairsRow:
-    """List the depth pairs of a target."""
-    pairs = result.affine.pairs
-    columns = pairs.predicted, pairs.context, pairs.inlier_mask
-    return PairsRow(pairs.fit_view, tuple(zip(*(c.tolist() for c in columns), strict=True)))
 
 
 def write_pictures(

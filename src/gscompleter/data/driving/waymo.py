@@ -161,7 +161,15 @@ def _read_points(segment: Path, time: int) -> Float[np.ndarray, "n 3"]:
     The roof laser rotates while the vehicle drives; `lidar_pose` has the vehicle pose per pixel.
     """
     vehicle = _read_vehicle_pose(segment, time)
-    lasers = _read_lasers(_locate(segment, "lidar_calibration"))
+    # Of each laser its pose on the vehicle, its beams, and their lower and upper end.
+    calibration = _locate(segment, "lidar_calibration")
+    beams = (f"beam_inclination.{name}" for name in ("values", "min", "max"))
+    rows = _read_rows(calibration, (LASER, "extrinsic.transform", *beams))
+    lasers = {
+        laser: (_parse_matrix(pose, quote_value(calibration)), *inclinations)
+        for laser, pose, *inclinations in rows
+    }
+
     measured = _locate(segment, "lidar")
     turning = _locate(segment, "lidar_pose")
     poses = _read_range_images(turning, time) if os.path.isfile(turning) else {}
@@ -215,13 +223,6 @@ def _read_vehicle_pose(segment: Path, time: int) -> Float[np.ndarray, "4 4"]:
     path = _locate(segment, "vehicle_pose")
     values = _read_value(path, "world_from_vehicle.transform", {TIME: time})
     return _parse_matrix(values, quote_value(path))
-
-
-def _read_lasers(path: Path) -> dict[int, tuple[Any, ...]]:
-    """Read the pose of each laser on the vehicle, its beams, and their lower and upper end."""
-    beams = (f"beam_inclination.{name}" for name in ("values", "min", "max"))
-    rows = _read_rows(path, (LASER, "extrinsic.transform", *beams))
-    return {laser: (_parse_matrix(pose, quote_value(path)), *rest) for laser, pose, *rest in rows}
 
 
 def _read_range_images(path: Path, time: int) -> dict[int, Float[np.ndarray, "h w c"]]:

@@ -32,11 +32,15 @@ class Similarity:
         return self.scale * points @ self.rotation.T + self.shift
 
 
-def fit_center_similarity(given: Points, found: Points) -> Similarity:
-    """Fit the similarity from `given` to `found` by least squares; it needs two distinct points."""
+def fit_center_similarity(source: Points, destination: Points) -> Similarity:
+    """Fit the similarity from `source` to `destination` by least squares.
+
+    Raises:
+        InputError: All points of `source` are equal.
+    """
     # Umeyama's closed form: centre both sets, and take the singular values of their covariance.
-    x = given.astype(np.float64)
-    y = found.astype(np.float64)
+    x = source.astype(np.float64)
+    y = destination.astype(np.float64)
     middle_x = x.mean(0)
     middle_y = y.mean(0)
     x = x - middle_x
@@ -55,27 +59,27 @@ def fit_center_similarity(given: Points, found: Points) -> Similarity:
     return Similarity(scale, rotation, middle_y - scale * rotation @ middle_x)
 
 
-def fit_robust_similarity(given: Points, found: Points) -> Similarity:
+def fit_robust_similarity(source: Points, destination: Points) -> Similarity:
     """Fit a similarity, with RANSAC from ten points on."""
-    every = fit_center_similarity(given, found)
-    if len(given) < MIN_RANSAC_CAMERAS:
+    every = fit_center_similarity(source, destination)
+    if len(source) < MIN_RANSAC_CAMERAS:
         return every
     # After the fit to all, the median distance to the nearest centre: what is farther from its own
     # counterpart in the fit to a half is an outlier.
-    distances = np.linalg.norm(every(given)[:, None] - found, axis=-1)
+    distances = np.linalg.norm(every(source)[:, None] - destination, axis=-1)
     threshold = float(np.median(distances.min(axis=1)))
     generator = np.random.default_rng(RANSAC_SEED)
-    size = max(3, (len(given) + 1) // 2)
-    halves = [generator.choice(len(given), size, replace=False) for _ in range(NUM_RANSAC_SAMPLES)]
+    size = max(3, (len(source) + 1) // 2)
+    halves = [generator.choice(len(source), size, replace=False) for _ in range(NUM_RANSAC_SAMPLES)]
 
     best = None
     least = (0, np.inf)
     for half in halves:
         # Cameras in one place determine no scale.
-        if np.ptp(given[half], axis=0).max() == 0:
+        if np.ptp(source[half], axis=0).max() == 0:
             continue
-        fit = fit_center_similarity(given[half], found[half])
-        error = np.linalg.norm(fit(given) - found, axis=1)
+        fit = fit_center_similarity(source[half], destination[half])
+        error = np.linalg.norm(fit(source) - destination, axis=1)
         inliers = error <= threshold
         count = int(inliers.sum())
         mean = float(error[inliers].mean()) if count else np.inf
@@ -85,4 +89,4 @@ def fit_robust_similarity(given: Points, found: Points) -> Similarity:
             least = (count, mean)
     if best is None or least[0] < 3:
         return every
-    return fit_center_similarity(given[best], found[best])
+    return fit_center_similarity(source[best], destination[best])
