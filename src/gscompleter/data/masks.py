@@ -55,6 +55,7 @@ def find_mask(photograph: Path, name: str, listings: FolderListings) -> Path | N
     is_below = is_plain and photograph.parts[-len(parts) :] == parts
     depth = len(parts) if is_below else 1
     home = photograph.parents[depth - 1]
+
     relatives = [PurePosixPath(*photograph.parts[-depth:])]
     roots = [home, photograph.parent]
     # A transforms.json calls it "images/x.png" and COLMAP "x.png", and its mask is masks/x.png or
@@ -64,6 +65,7 @@ def find_mask(photograph: Path, name: str, listings: FolderListings) -> Path | N
     if home.name.casefold() in FOLDERS:
         roots.append(home.parent)
         relatives.append(PurePosixPath(home.name, *photograph.parts[-depth:]))
+
     # In folders of masks for any of these paths, then beside the photograph.
     folders = [root / folder for root, folder in product(dict.fromkeys(roots), MASK_FOLDERS)]
     in_folders = [mask for path in relatives for mask in list_mask_names(path, is_beside=False)]

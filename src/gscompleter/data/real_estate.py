@@ -171,6 +171,7 @@ def _parse_scene(example: Any, path: Path, position: int) -> Photographs:
     called = f"scene {quote_value(name)} of {path}"
     if not (_is_dense(cameras, ndim=2) and cameras.is_floating_point() and cameras.shape[1] == 18):
         raise InputError(f"The `cameras` of the {called} are no floats of shape [n, 18].")
+
     files = images if isinstance(images, list) else []
     require(
         len(files) == len(cameras) > 0

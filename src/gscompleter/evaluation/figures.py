@@ -79,6 +79,7 @@ def draw_figure(
         step = store.get_step_path(task, spec.list_methods()[0], case.number)
         mask = read_pixels(step.with_name(f"holes-{case.number:03d}.png"))
         holes = mask[..., 0].copy()
+
         images = [read_figure_image(folder, image, case) for _, folder, image in columns]
         box = find_widest_hole(holes)
         # Holes are those at the target: a given photograph is seen from elsewhere.
@@ -86,6 +87,7 @@ def draw_figure(
             draw_outline(image, holes) if outlines and not name.startswith(PHOTOGRAPH) else image
             for image, (_, _, name) in zip(images, columns, strict=True)
         ]
+
         title = f"{case.name} ({case.number})" if case.number > 1 else case.name
         rows.append((title, marked))
         if crops:
@@ -147,10 +149,12 @@ def save_grid(
         raise InputError(
             f"Figures need matplotlib ({error}); run `pip install gscompleter[evaluation]`."
         ) from error
+
     heights = [images[0].shape[0] / images[0].shape[1] for _, images in rows]
     size = (IMAGE_INCHES * len(titles) + 0.3, IMAGE_INCHES * sum(heights) + 0.5)
     layout = ConstrainedLayoutEngine(w_pad=0.01, h_pad=0.01, wspace=0, hspace=0, compress=True)
     figure = Figure(figsize=size, layout=layout)
+
     grid: Any = figure.subplots(len(rows), len(titles), squeeze=False, height_ratios=heights)
     for line, (name, images) in zip(grid, rows, strict=True):
         for axes, image in zip(line, images, strict=True):

@@ -103,6 +103,7 @@ def parse_protocol(text: str) -> EvaluationProtocol:
                     f"steps at most {MAX_TARGET_ID}."
                 )
             return FrameRule(text, partial(split, **numbers))
+
     if os.path.isfile(text):
         return read_evaluation_index(Path(text))
     if text in list_indices():

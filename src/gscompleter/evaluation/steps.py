@@ -125,6 +125,7 @@ def score_step(
     scores, seen = scoring.score(
         before, after, prediction.added, truth, task.models.renderer, prediction.registered
     )
+
     anchor = None if prediction.anchor is None else state.views[prediction.anchor]
     scale = None
     # In a sequence, an error of scale would grow from step to step; one step cannot show that.
@@ -133,6 +134,7 @@ def score_step(
         scale = scoring.compute_depth_scale(
             prediction.added, seen.holes, target.camera, expected, task.models.renderer
         )
+
     assert target.frame is not None
     step = Step(
         frame=target.frame,

@@ -44,6 +44,7 @@ def describe_offset(camera: Camera, base: Camera) -> str:
     yaw = math.degrees(math.atan2(x, z))
     pitch = math.degrees(math.atan2(-y, math.hypot(x, z)))
     parts = []
+
     # The axes of a camera point right, down and forward; only the longest move is said.
     length, negative, positive = max(
         zip(shift, ("left", "up", "back"), ("right", "down", "forward"), strict=True),
@@ -51,6 +52,7 @@ def describe_offset(camera: Camera, base: Camera) -> str:
     )
     if abs(length) >= MIN_SHIFT * max(1.0, base.center.abs().max().item()):
         parts.append(f"moved {positive if length > 0 else negative} by {abs(length):.2g}")
+
     if max(abs(yaw), abs(pitch)) >= MIN_TURN:
         if abs(yaw) >= abs(pitch):
             side = "right" if yaw > 0 else "left"

@@ -149,6 +149,7 @@ def render_completion_page(folder: Path) -> str:
     own_notes = [
         row.notes if len(groups.get(row.notes, ())) == 1 else () for row in summary.targets
     ]
+
     path = summary.scene.splat or str(summary.settings.get("folder") or "")
     settings = {name: getattr(summary, name) for name in SETTINGS}
     return render_template(

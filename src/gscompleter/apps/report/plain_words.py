@@ -99,6 +99,7 @@ def list_photograph_notes(context: Sequence[ContextRow]) -> Iterator[str]:
             for row in moving
         )
         yield f"{', '.join(shares)} show something that moves; these regions are not used."
+
     given_share = max((row.given_depth for row in context), default=0.0)
     if given_share > 0:
         yield (
@@ -106,6 +107,7 @@ def list_photograph_notes(context: Sequence[ContextRow]) -> Iterator[str]:
             "predicted depth, which decides their surfaces (--no-given-depth ignores what SCENE "
             "holds)."
         )
+
     ignored_share = max((row.ignored for row in context), default=0.0)
     if ignored_share > 0:
         yield (
@@ -113,6 +115,7 @@ def list_photograph_notes(context: Sequence[ContextRow]) -> Iterator[str]:
             "same while the camera moves, like the bonnet of a vehicle, or shows what was removed; "
             "it is ignored, also in scores (images/context*_ignored.png)."
         )
+
     factors = [factor for row in context for factor in row.exposure_gain or ()]
     if factors:
         yield (

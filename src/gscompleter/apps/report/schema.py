@@ -224,6 +224,7 @@ def read_summary(folder: Path) -> CompletionSummary:
         )
     path = folder / SUMMARY_FILE
     summary = read_result(CompletionSummary, path)
+
     transform = np.array(summary.frame.transform)
     numbers = np.concatenate([transform.ravel(), np.array(summary.frame.origin)])
     is_bounded = bool((np.abs(numbers) <= MAX_FRAME_NUMBER).all())  # False for NaN

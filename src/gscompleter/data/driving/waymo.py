@@ -118,6 +118,7 @@ def _make_frame(
     title = f"the photograph of {name} at {time} in {quote_value(segment)}"
     require(camera in cameras, f"The camera of {title} has no calibration; {ADVICE}.")
     intrinsics, vehicle_from_camera = cameras[camera]
+
     # Components are downloaded one by one, and only the first two are needed.
     laser_points = None
     if _has_components(segment, "lidar", "lidar_calibration", "vehicle_pose"):

@@ -373,6 +373,7 @@ def write_upright(root: Path, source: str, folder: Path, mask: Path | None = Non
         known_lens = (exif.get(MAKE), exif.get(MODEL))
         zoom = (detail.get(FOCAL_LENGTH), detail.get(FOCAL_LENGTH_35))
         lens = " ".join(str(value) for value in (*known_lens, *zoom))
+
     copy.thumbnail((MAX_SIDE, MAX_SIDE), Image.Resampling.LANCZOS)
     # In COLMAP's lists a space ends a name, and # begins a comment.
     name = re.sub(r"[\s#]", "_", source) + ("" if is_known else ".png")
@@ -383,6 +384,7 @@ def write_upright(root: Path, source: str, folder: Path, mask: Path | None = Non
         copy.info.clear()  # removes the orientation, which is applied already
         written = "JPEG" if kind == "JPEG" else "PNG"
         copy.save(target, format=written, quality=QUALITY, subsampling=0)
+
     hidden = read_hidden(path, mask)
     is_masked = hidden is not None and _write_mask(folder, name, hidden, copy.size)
     diagonal = math.hypot(*copy.size)
@@ -452,6 +454,7 @@ def _map(copies: Sequence[UprightCopy], folder: Path, is_panoramic: bool) -> dic
             "is_panoramic": is_panoramic,
             "threads": min(MAX_THREADS, get_thread_count()),
         }
+
         # COLMAP aborts its process on some errors (decision 027), so it has one of its own.
         done = subprocess.run(
             [sys.executable, "-m", PROCESS],
@@ -461,6 +464,7 @@ def _map(copies: Sequence[UprightCopy], folder: Path, is_panoramic: bool) -> dic
             errors="replace",
             check=False,
         )
+
     if done.returncode != 0:
         complaint = quote_value(done.stderr.strip().rpartition("\n")[2], 200)
         raise InputError(

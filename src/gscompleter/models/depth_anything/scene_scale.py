@@ -37,6 +37,7 @@ def estimate_units_per_metre(views: Sequence[View], metres: Sequence[DepthMap]) 
             good &= known > 0
             # Triangulated inverse depths are in the unit of `make_stereo_images`.
             ratios.append(unit / (inverse[good] * known[good]))
+
     all_ratios = np.concatenate(ratios)
     if len(all_ratios) < MIN_MATCHES:
         raise InputError(

@@ -135,8 +135,10 @@ class AnyViewVit(nn.Module):
         among = compute_rotary_embedding(
             list_shared_positions(views, size[0] * size[1], images.device)
         )
+
         order = torch.arange(views, device=images.device).expand(scenes, -1)
         start = self.config.first_multi_view_block
+
         outputs = []
         # Tokens after the last block that looked at each view alone; heads get these as well.
         local = x

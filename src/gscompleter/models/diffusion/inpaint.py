@@ -83,9 +83,11 @@ class Painter:
             wanted["guidance_scale"] = 1.0  # which distilled models do not use
         if steps is not None:
             wanted["num_inference_steps"] = steps
+
         # Pipelines differ in their parameters; each gets those of its own.
         known = inspect.signature(self.pipeline.__call__).parameters
         painted = self.pipeline(**{k: v for k, v in wanted.items() if k in known}).images[0]
+
         back = resize_antialiased(painted.float().permute(1, 2, 0), (hole.shape[0], hole.shape[1]))
         return back.clamp(0, 1).to(image.device)
 

@@ -79,6 +79,7 @@ class Kontext:
         source = torch.stack([self.encode_image(photograph) for photograph in photographs])
         # The transformer takes 2 × 2 latent pixels as a token of four times the channels.
         channels = pipeline.transformer.config.in_channels // 4
+
         # On the CPU, whose generator gives the same noise for every device.
         noise = torch.randn(
             (1, channels, 2 * grid[0], 2 * grid[1]),
@@ -89,6 +90,7 @@ class Kontext:
         # One sequence: the tokens of the image to generate, then those of the photograph.
         repeated_target = target_positions.expand(count, -1, -1)
         positions = torch.cat([repeated_target, source_positions], dim=1).to(self.device)
+
         for time in self.compute_timesteps(steps, len(target_positions)):
             velocity = self.predict_velocity(latents, source, positions, time, guidance)
             latents = pipeline.scheduler.step(velocity, time, latents, return_dict=False)[0]

@@ -53,6 +53,7 @@ def load_kontext(path: str | None = None, device: str = "cpu", offload: bool = F
         network = load_transformer(transformer, dtype)
     with convert_load_errors(base):
         pipeline = load_pipeline(base, network, dtype)
+
     heads = pipeline.transformer.config.num_attention_heads
     if heads != HEADS:
         raise InputError(

@@ -77,6 +77,7 @@ class PerHeadAttention:
             query = torch.cat([text_query, query], dim=1)
             key = torch.cat([text_key, key], dim=1)
             value = torch.cat([text_value, value], dim=1)
+
         if image_rotary_emb is not None:
             query = rotate_channel_pairs(query, *image_rotary_emb)
             key = rotate_channel_pairs(key, *image_rotary_emb)
@@ -84,6 +85,7 @@ class PerHeadAttention:
         mixed = nn.functional.scaled_dot_product_attention(
             query.transpose(1, 2), key.transpose(1, 2), value.transpose(1, 2), attention_mask
         )
+
         joined = mixed.transpose(1, 2).flatten(2).to(query.dtype)
         if encoder_hidden_states is None:
             return joined

@@ -41,6 +41,7 @@ def compute_cost_volume(
     # From indices within a scene to indices in the list of all n views.
     first = torch.arange(len(sources), device=sources.device)[:, None, None] * sources.shape[1]
     numbers = (first + sources).flatten(0, 1).tolist()
+
     volumes = []
     for view in range(n):
         chunks = []

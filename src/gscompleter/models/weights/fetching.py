@@ -120,6 +120,7 @@ def _download(weights: PublishedWeights, offline: bool) -> Path:
         raise WeightsNotAvailable(
             f"huggingface_hub is missing: {INSTALL}; or {_describe_manual_download(weights)}."
         ) from error
+
     # HF_HUB_OFFLINE, as all programs of the hub obey it.
     offline = offline or constants.HF_HUB_OFFLINE
     try:
