@@ -164,20 +164,24 @@ def fill_table(spec: TableSpec, runs: Mapping[tuple[str, str], Path]) -> PaperTa
 def fill_cells(spec: TableSpec, summary: RunSummary, method: str) -> dict[str, Cell]:
     """Fill the cells of a method, by the key of their column."""
     values = collect_values(summary, method, spec.columns)
-    others = collect_values(summary, spec.baseline, spec.columns)
-    return {
-        key: fill_cell(BY_KEY[key], values[key], {} if method == spec.baseline else others[key])
-        for key in spec.columns
-    }
+    # The baseline itself has no difference to show.
+    others: dict[str, dict[str, float]] = {key: {} for key in spec.columns}
+    if method != spec.baseline:
+        others = collect_values(summary, spec.baseline, spec.columns)
+    return {key: fill_cell(BY_KEY[key], values[key], others[key]) for key in spec.columns}
 
 
 def collect_values(
     summary: RunSummary, method: str, columns: Sequence[str]
 ) -> dict[str, dict[str, float]]:
     """Collect the values of a method in each column, by case."""
-    pairs = list(zip(summary.common_tasks, summary.rows[method], strict=True))
-    values = {key: {task: BY_KEY[key].compute_row(row) for task, row in pairs} for key in columns}
-    return {key: {t: v for t, v in of.items() if v is not None} for key, of in values.items()}
+    values: dict[str, dict[str, float]] = {key: {} for key in columns}
+    for key in columns:
+        for task, row in zip(summary.common_tasks, summary.rows[method], strict=True):
+            value = BY_KEY[key].compute_row(row)
+            if value is not None:
+                values[key][task] = value
+    return values
 
 
 def fill_cell(column: Column, values: dict[str, float], baseline: Mapping[str, float]) -> Cell:

@@ -106,7 +106,7 @@ class Batch:
 
 
 def create_any_view_batch(views: Sequence[View], sizing: ResizeConfig, min_views: int) -> Batch:
-    """Create a batch of at least `fewest` views, resized and centrally cropped to one size."""
+    """Create a batch of at least `min_views` views, resized and centrally cropped to one size."""
     if len(views) < min_views:
         raise InputError(
             f"{len(views)} view was given, and the model matches at least {min_views}; name more "

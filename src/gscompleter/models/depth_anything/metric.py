@@ -92,7 +92,7 @@ class MetricDepthAnything(nn.Module):
 def set_sky_depth(
     depth: Float[Tensor, "b v h w"], solid: Bool[Tensor, "b v h w"], max_depth: float = torch.inf
 ) -> Float[Tensor, "b v h w"]:
-    """Set the sky to the depth of the far foreground, at most `farthest`, as the authors do."""
+    """Set the sky to the depth of the far foreground, at most `max_depth`, as the authors do."""
     # Of a few pixels neither a quantile nor a sky is certain.
     if min(int(solid.sum()), int((~solid).sum())) <= MIN_PIXELS:
         return depth
@@ -101,7 +101,7 @@ def set_sky_depth(
 
 
 def interpolate_quantile(values: Float[Tensor, "n"], share: float) -> Float[Tensor, ""]:
-    """Compute a quantile; `torch.interpolate_quantile` is limited to 16 million values."""
+    """Compute a quantile; `torch.quantile` is limited to 16 million values."""
     place = share * (len(values) - 1)
     ordered = values.sort().values
     below = ordered[int(place)]

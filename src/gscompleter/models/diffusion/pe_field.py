@@ -146,7 +146,7 @@ def preview(
 
 
 def group_by_size(conditions: Sequence[Condition], max_size: int) -> list[list[int]]:
-    """Group the indices of conditions of equal size into batches of at most `most`."""
+    """Group the indices of conditions of equal size into batches of at most `max_size`."""
     alike: dict[tuple[tuple[int, int], torch.Size], list[int]] = {}
     for i, one in enumerate(conditions):
         alike.setdefault((one.size, one.photograph.shape), []).append(i)
