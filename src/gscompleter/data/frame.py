@@ -100,7 +100,7 @@ class Frame:
         A photograph inside a container file is not opened if the camera file gives its size.
         """
         stated = None if self.intrinsics.size == FRACTIONS else self.intrinsics.size
-        # The size of a container's image costs its decoding.
+        # To measure an image inside a container, that has to be opened.
         stored = None if stated is not None and callable(self.image) else self.find_stored()
         if stored is not None:
             width, height = read_image_size(stored, capitalize(self.title))

@@ -99,7 +99,7 @@ def open_chunks(path: Path) -> Iterator[Photographs]:
         return _open_chunk(path)
     folder = path.parent if path.name == INDEX else _list_folders(path)[0]
     listed = _read_index(folder / INDEX) if os.path.isfile(folder / INDEX) else {}
-    # A folder may hold a part of the data set: files that no index lists are opened all.
+    # Without an index, all chunks of the folder are opened.
     files = sorted(set(listed.values())) or sorted(file.name for file in folder.glob("*.torch"))
     keys = {file: {key for key, chunk in listed.items() if chunk == file} for file in files}
     return (scene for file in files for scene in _open_chunk(folder / file, keys[file]))

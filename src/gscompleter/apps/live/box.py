@@ -64,8 +64,8 @@ def remove_in_box(session: Session, corners: Numbers, rotation: Numbers) -> tupl
     context = inside[0] & ~state.source.gone_mask
     if not any(mask.any() for mask in (context, *inside[1:])):
         raise InputError("The box contains nothing; drag it, or make it larger.")
-    # As the command `remove` does: what is removed from the context is marked, and its hole may be
-    # filled. What was added is simply taken out.
+    # What is removed from the context is marked, so that its hole may be filled. What was added is
+    # simply taken out.
     added = [part[~mask] for part, mask in zip(state.parts[1:], inside[1:], strict=True)]
     parts = (state.parts[0], *added)
     config = state.config.for_removal()

@@ -64,7 +64,7 @@ def _parse_frame(
     )
     intrinsics = replace(cameras[camera], size=get_size(image, title))
 
-    # Sparse depth is optional: test splits and partial downloads lack the point clouds.
+    # Sparse depth is optional: the point cloud may be missing on disk.
     sweep = sweeps.get(str(datum.get("key")))
     read_points = None
     points = get_text(sweep, "filename", str(file))
