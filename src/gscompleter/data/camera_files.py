@@ -45,8 +45,10 @@ from gscompleter.system.files.reading import is_json_list, read_head, read_json
 
 NAME = "cameras.json"
 ADVICE = "export the cameras again"
-DEFAULT_FOV, FOV_RANGE = 60.0, (1.0, 179.0)
-"""SuperSplat's default field of view, and its range, in degrees."""
+DEFAULT_FOV = 60.0
+"""SuperSplat's default field of view, in degrees."""
+FOV_RANGE = (1.0, 179.0)
+"""Range of the field of view, in degrees."""
 SPLAT_FROM_WORLD = np.array([-1.0, -1.0, 1.0])
 """Axis factors from SuperSplat's world to the splat: 180° about z."""
 
@@ -74,6 +76,8 @@ def read_cameras(path: Path, resolution: Resolution = None) -> list[Frame]:
         return read_scene_cameras(path) if is_colmap else read_frames(path / TRANSFORMS)
     refuse_other_exports(path)
     content = read_json(path, "name a file of cameras")
+
+    # A JSON file does not name its program; the keys tell it.
     if _is_supersplat(content):
         return _parse_supersplat(content, path, resolution)
     if is_camera_path(content):
@@ -122,9 +126,11 @@ def read_camera_list(path: Path) -> list[Frame]:
 
 
 def _parse_camera(entry: Any, number: int, path: Path) -> Frame:
-    title, c2w = f"camera {number} of {quote_value(path)}", np.eye(4)
-    focal, size = get_focal(entry, title), get_size(entry, title)
+    title = f"camera {number} of {quote_value(path)}"
+    focal = get_focal(entry, title)
+    size = get_size(entry, title)
     name = get_text(entry, "img_name", title) or str(entry.get("id", number))
+    c2w = np.eye(4)
     c2w[:3, :3] = get_array(entry, "rotation", title, (3, 3))
     c2w[:3, 3] = get_array(entry, "position", title, (3,))
     return Frame(name, title, c2w, Intrinsics(size, focal), None).with_rigid_pose()
@@ -133,6 +139,7 @@ def _parse_camera(entry: Any, number: int, path: Path) -> Frame:
 def _is_supersplat(content: Any) -> bool:
     first = content[0] if isinstance(content, list) and content else content
     keys = first if isinstance(first, dict) else {}
+    # An entry of Inria's cameras.json has a rotation where SuperSplat has a target.
     return "poseSets" in keys or ("target" in keys and "rotation" not in keys)
 
 
@@ -145,19 +152,22 @@ def _parse_supersplat(content: Any, path: Path, resolution: Resolution) -> list[
             "resolution",
         )
     if isinstance(content, dict):
+        # A project may hold several sets of poses; the first is read.
         sets = get_part(content, "poseSets", list)
         content = get_part(sets[0] if sets else None, "poses", list)
     require(content, f"{quote_value(path)} holds no poses; {ADVICE}.")
-    pairs = ((pose, f"pose {n} of {quote_value(path)}") for n, pose in enumerate(content))
-    return [_parse_supersplat_pose(pose, title, resolution) for pose, title in pairs]
+    return [
+        _parse_supersplat_pose(pose, f"pose {number} of {quote_value(path)}", resolution)
+        for number, pose in enumerate(content)
+    ]
 
 
 def _parse_supersplat_pose(pose: Any, title: str, resolution: tuple[int, int]) -> Frame:
-    position, target = (
-        get_array(pose, key, title, (3,)) * SPLAT_FROM_WORLD for key in ("position", "target")
-    )
+    position = get_array(pose, "position", title, (3,)) * SPLAT_FROM_WORLD
+    target = get_array(pose, "target", title, (3,)) * SPLAT_FROM_WORLD
     height, width = resolution
     fov = get_optional_number(pose, "fov", title, *FOV_RANGE) or DEFAULT_FOV
+    # Square pixels: the field of view is that of the longer side.
     focal = max(height, width) / 2 / math.tan(math.radians(fov) / 2)
     intrinsics = Intrinsics((width, height), (focal, focal))
     return Frame(title, title, _build_upright_c2w(position, target), intrinsics, None)
@@ -167,6 +177,7 @@ def _build_upright_c2w(
     position: Float[np.ndarray, "3"], target: Float[np.ndarray, "3"]
 ) -> Float[np.ndarray, "4 4"]:
     """Build camera-to-world of an upright camera that points at a target; NaN along y."""
+    # In the splat y points down, as in the camera: x is level, and y completes the axes.
     with np.errstate(all="ignore"):
         z = (target - position) / np.linalg.norm(target - position)
         x = np.cross([0.0, 1.0, 0.0], z)

@@ -64,11 +64,14 @@ def find_world(path: Path) -> Float[np.ndarray, "4 4"] | None:
     dataparser = next((file for file in files if os.path.isfile(file)), None)
     if dataparser is None:
         return None
+    # The trained frame is `dataparser` applied to the reconstruction, so its inverse leads back.
     to_original = np.linalg.inv(read_dataparser_transforms(dataparser))
     scenes = [folder / TRANSFORMS for folder in folders if os.path.isfile(folder / TRANSFORMS)]
     for scene in scenes:
         content = read_json(scene, ADVICE)
         if isinstance(content, dict) and content.get("applied_transform") is not None:
+            # `ns-process-data` rotates COLMAP's world before it writes transforms.json. Photographs
+            # read from that file are in the rotated world.
             applied = get_array(content, "applied_transform", str(scene), (3, 4), (4, 4))[:3]
             return np.vstack([applied, [0.0, 0.0, 0.0, 1.0]]) @ to_original
     return to_original
@@ -80,6 +83,7 @@ def _parse_camera(
     size: tuple[int, int],
     to_photographs: Float[np.ndarray, "4 4"] | None,
 ) -> Frame:
+    # Either 16 numbers row by row, or nested rows with or without the last one.
     numbers = get_array(entry, "camera_to_world", title, (16,), (4, 4), (3, 4))
     c2w = np.eye(4)
     c2w[:3] = numbers.reshape(-1, 4)[:3]

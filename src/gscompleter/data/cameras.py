@@ -51,7 +51,8 @@ class Pinhole:
 
     def resize(self, width: int, height: int) -> Pinhole:
         """Return the camera of the image resized to width × height."""
-        x, y = width / self.width, height / self.height
+        x = width / self.width
+        y = height / self.height
         return Pinhole(self.fl_x * x, self.fl_y * y, self.cx * x, self.cy * y, width, height)
 
     def crop(self, left: int, top: int, width: int, height: int) -> Pinhole:
@@ -93,6 +94,7 @@ def distort(points: Float[np.ndarray, "*n 2"], distortion: Distortion) -> Float[
     # Far outside the photograph, polynomials overflow and the division has no solution.
     with np.errstate(all="ignore"):
         if distortion.projection != "perspective":
+            # The factor below divides by r, which is 0 at the centre of the image.
             r = np.maximum(np.linalg.norm(points, axis=-1), 1e-6)
             points = points * (_compute_radius(r, distortion) / r)[..., None]
         return _apply_polynomials(points, distortion)
@@ -103,11 +105,14 @@ def _compute_radius(r: Float[np.ndarray, "*n"], distortion: Distortion) -> Float
     if distortion.projection == "equidistant":
         return np.arctan(r)
     if distortion.projection == "field-of-view":
+        # The "FOV" model of Devernay and Faugeras (2001).
         (omega,) = distortion.shape
         return np.arctan(2 * r * np.tan(omega / 2)) / omega
     if distortion.projection == "division":
+        # The smaller root of the quadratic equation, in the form that is stable for small k.
         (k,) = distortion.shape
         return 2 * r / (1 + np.sqrt(1 - 4 * k * r * r))
+    # The enhanced unified camera model (EUCM; Khomutenko et al., 2016).
     alpha, beta = distortion.shape
     return r / (alpha * np.sqrt(beta * r * r + 1) + 1 - alpha)
 
@@ -115,15 +120,15 @@ def _compute_radius(r: Float[np.ndarray, "*n"], distortion: Distortion) -> Float
 def _apply_polynomials(
     points: Float[np.ndarray, "*n 2"], distortion: Distortion
 ) -> Float[np.ndarray, "*n 2"]:
-    x, y = points[..., 0], points[..., 1]
+    x = points[..., 0]
+    y = points[..., 1]
     r2 = x * x + y * y
     # Both are 1 + k1 r² + k2 r⁴ + …
-    numerator, denominator = (
-        np.polynomial.polynomial.polyval(r2, (1.0, *coefficients))
-        for coefficients in (distortion.radial, distortion.denominator)
-    )
+    numerator = np.polynomial.polynomial.polyval(r2, (1.0, *distortion.radial))
+    denominator = np.polynomial.polynomial.polyval(r2, (1.0, *distortion.denominator))
     radial = numerator / denominator
-    (p1, p2), (s1, s3) = distortion.tangential, distortion.prism
+    p1, p2 = distortion.tangential
+    s1, s3 = distortion.prism
     new_x = x * radial + 2 * p1 * x * y + p2 * (r2 + 2 * x * x) + s1 * r2
     new_y = y * radial + p1 * (r2 + 2 * y * y) + 2 * p2 * x * y + s3 * r2
     return np.stack([new_x, new_y], axis=-1)
@@ -139,18 +144,23 @@ def undistort_pinhole(pinhole: Pinhole, distortion: Distortion) -> Pinhole | Non
     """
     if not distortion:
         return pinhole
-    found, radius, size = None, np.zeros(()), np.array([pinhole.width, pinhole.height])
+    widest = None
+    radius = np.zeros(())
+    size = np.array([pinhole.width, pinhole.height])
+    # From the narrowest view outwards: the last zoom that works loses least of the borders.
     for zoom in np.geomspace(MAX_ZOOM_IN, MAX_ZOOM_OUT, 400).tolist():
         new = replace(pinhole, fl_x=pinhole.fl_x * zoom, fl_y=pinhole.fl_y * zoom)
         bent = distort(_compute_border(new), distortion)
         # Zooming out must move every border point outwards: beyond the fold of a polynomial,
         # points return into the photograph and show something else.
         pixels = _to_pixels(pinhole, bent)
+        # Border pixels have their centres half a pixel inside, but for rounding.
         is_within = ((pixels >= 0.499) & (pixels <= size - 0.499)).all()
         if not is_within or (np.linalg.norm(bent, axis=-1) < radius).any():
             break
-        found, radius = new, np.linalg.norm(bent, axis=-1)
-    return found
+        widest = new
+        radius = np.linalg.norm(bent, axis=-1)
+    return widest
 
 
 @lru_cache(maxsize=1)
@@ -161,6 +171,7 @@ def compute_undistortion_map(
     plane = _compute_plane(new, np.arange(new.width), np.arange(new.height))
     pixels = _to_pixels(pinhole, distort(plane, distortion))
     # The nearest border fills pixels outside the field of the lens.
+    # OpenCV's `remap` counts from the centre of the first pixel.
     finite = np.nan_to_num(pixels - 0.5, nan=-1.0, posinf=-1.0, neginf=-1.0)
     with np.errstate(over="ignore"):
         return finite.astype(np.float32)
@@ -170,13 +181,15 @@ def remap(
     image: Shaped[np.ndarray, "h w *c"], source: Float[np.ndarray, "h2 w2 2"], interpolation: int
 ) -> Shaped[np.ndarray, "h2 w2 *c"]:
     """Sample `image` at the positions `source`."""
-    x, y = np.ascontiguousarray(source[..., 0]), np.ascontiguousarray(source[..., 1])
+    x = np.ascontiguousarray(source[..., 0])
+    y = np.ascontiguousarray(source[..., 1])
     return np.asarray(cv2.remap(image, x, y, interpolation, borderMode=cv2.BORDER_REPLICATE))
 
 
 def _compute_border(pinhole: Pinhole) -> Float[np.ndarray, "n 2"]:
     """Compute the outermost pixel centres on the image plane at z = 1."""
-    columns, rows = np.arange(pinhole.width), np.arange(pinhole.height)
+    columns = np.arange(pinhole.width)
+    rows = np.arange(pinhole.height)
     edges = (columns, rows[[0, -1]]), (columns[[0, -1]], rows)
     return np.concatenate([_compute_plane(pinhole, *edge).reshape(-1, 2) for edge in edges])
 
@@ -215,7 +228,10 @@ class Intrinsics:
         cx = w / 2 if self.center[0] is None else self.center[0]
         cy = h / 2 if self.center[1] is None else self.center[1]
         # With only one focal length, pixels are square.
-        fl_x, fl_y = fl_y if fl_x is None else fl_x, fl_x if fl_y is None else fl_y
+        if fl_x is None:
+            fl_x = fl_y
+        if fl_y is None:
+            fl_y = fl_x
         assert fl_x is not None
         assert fl_y is not None
         return Pinhole(fl_x, fl_y, cx, cy, w, h).resize(width, height)
@@ -233,7 +249,9 @@ class Intrinsics:
 
 def has_same_aspect(one: tuple[int, int], other: tuple[int, int]) -> bool:
     """Check whether two sizes differ by a scale, whose sides were rounded to whole pixels."""
-    (w, h), (width, height) = one, other
+    w, h = one
+    width, height = other
+    # Equal ratios have equal cross products, which needs no division by a small side.
     # A side that is rounded by a pixel changes its product by a side of the other image.
     largest = max(w, h, width, height, SAME_ASPECT * width * h)
     return abs(width * h - height * w) <= largest
@@ -241,22 +259,24 @@ def has_same_aspect(one: tuple[int, int], other: tuple[int, int]) -> bool:
 
 def find_pinhole_defect(pinhole: Pinhole) -> str | None:
     """Describe why intrinsics are impossible; None if they are valid."""
+    # Relative to the image size, so that one range fits images of all sizes.
     unit = pinhole.resize(1, 1)
     low, high = FOCAL_RANGE
     for focal in (unit.fl_x, unit.fl_y):
         if not low <= focal <= high:
-            given = f"its focal length is {focal:g} times the size of the image"
-            return f"{given}, which is not within {low:g} to {high:g}"
+            defect = f"its focal length is {focal:g} times the size of the image"
+            return f"{defect}, which is not within {low:g} to {high:g}"
     for center in (unit.cx, unit.cy):
         if not abs(center) <= MAX_CENTER:
-            given = f"its principal point lies {center:g} image sizes from the corner"
-            return f"{given}, which is beyond {MAX_CENTER:g}"
+            defect = f"its principal point lies {center:g} image sizes from the corner"
+            return f"{defect}, which is beyond {MAX_CENTER:g}"
     return None
 
 
 def compute_fov(pinhole: Pinhole) -> float:
     """Compute the larger field of view of a camera, in degrees."""
     sides = ((pinhole.fl_x, pinhole.cx, pinhole.width), (pinhole.fl_y, pinhole.cy, pinhole.height))
+    # The principal point need not be central, so each half has its own angle.
     return math.degrees(
         max(math.atan(c / focal) + math.atan((side - c) / focal) for focal, c, side in sides)
     )
@@ -275,6 +295,7 @@ def find_pose_defect(pose: Float[np.ndarray, "4 4"]) -> str | None:
     if np.abs(pose).max() > MAX_COORDINATE:
         return f"its pose holds {np.abs(pose).max():g}, which is above {MAX_COORDINATE:g}"
     rotation = pose[:3, :3]
+    # A pose of columns of unit length at right angles, and the last row of a homogeneous transform.
     errors = (rotation.T @ rotation - np.eye(3), pose[3] - [0, 0, 0, 1])
     if max(np.abs(error).max() for error in errors) > MAX_RIGID_ERROR:
         return "its pose is not a rigid transform but scaled, sheared or projective"
@@ -287,10 +308,12 @@ def make_rigid(pose: Float[np.ndarray, "4 4"]) -> Float[np.ndarray, "4 4"]:
     """Replace the rotation by the nearest exact one, unless it is within `FLOAT_NOISE`."""
     rotation = pose[:3, :3]
     if np.abs(rotation.T @ rotation - np.eye(3)).max() > FLOAT_NOISE:
+        # The nearest rotation in the Frobenius norm: the polar decomposition without its stretch.
         u, _, v = np.linalg.svd(rotation)
         rotation = u @ v
     rigid = np.eye(4)
-    rigid[:3, :3], rigid[:3, 3] = rotation, pose[:3, 3]
+    rigid[:3, :3] = rotation
+    rigid[:3, 3] = pose[:3, 3]
     return rigid
 
 
@@ -303,6 +326,8 @@ def compute_rotation(quaternion: Sequence[float]) -> Float[np.ndarray, "3 3"]:
     """Compute the rotation of a quaternion (real part first, any length); NaN if it is zero."""
     q = np.array(quaternion, dtype=np.float64)
     with np.errstate(all="ignore"):
+        # Squares of large components overflow and those of tiny ones vanish; scaled first, neither
+        # does.
         q = q / np.abs(q).max()
         w, x, y, z = q / np.linalg.norm(q)
     rows = [

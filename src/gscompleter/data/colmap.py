@@ -44,8 +44,10 @@ ENDINGS = (".bin", ".txt")
 
 MAX_NAME = 1024
 """Longest image name in a binary file, in bytes."""
-FEATURE_SIZE, SIGHTING_SIZE = 24, 8
-"""Bytes of a feature (x, y, number of its point) and of a point's sighting (image, feature)."""
+FEATURE_SIZE = 24
+"""Bytes of a feature: x, y and the number of its point."""
+SIGHTING_SIZE = 8
+"""Bytes of a point's sighting: the numbers of the image and of the feature."""
 MAX_LINE = 1 << 22
 """Longest line in characters: the features of an image."""
 MAX_BYTES = 1 << 34
@@ -108,7 +110,7 @@ MODELS = {
 """Models by COLMAP's names; k4 to k6 of FULL_OPENCV are d1 to d3, sx1 and sy1 are s1 and s3."""
 
 NUMBERS = {model.number: name for name, model in MODELS.items()}
-_SHAPES = ("omega", "k", "alpha", "beta")
+
 _IN_PIXELS = ("f", "fx", "fy", "cx", "cy")
 
 
@@ -147,13 +149,16 @@ def build_intrinsics(
                 "needed."
             )
 
-    shape, radial, denominator = (
-        tuple(values[name] for name in group if name in values)
-        for group in (_SHAPES, ("k1", "k2", "k3", "k4"), ("d1", "d2", "d3"))
-    )
+    def select(*group: str) -> tuple[float, ...]:
+        return tuple(values[name] for name in group if name in values)
+
+    shape = select("omega", "k", "alpha", "beta")
+    radial = select("k1", "k2", "k3", "k4")
+    denominator = select("d1", "d2", "d3")
     tangential = values.get("p1", 0.0), values.get("p2", 0.0)
     prism = values.get("s1", 0.0), values.get("s3", 0.0)
     distortion = Distortion(model.projection, shape, radial, tangential, denominator, prism)
+    # Models with one focal length call it f.
     focal = values.get("fx", values.get("f")), values.get("fy", values.get("f"))
     return Intrinsics(size, focal, (values["cx"], values["cy"]), distortion=distortion)
 
@@ -161,11 +166,11 @@ def build_intrinsics(
 def read_cameras(path: Path) -> dict[int, Intrinsics]:
     """Read the cameras of a cameras.bin or cameras.txt by number."""
     if _is_text(path):
-        found = _parse_lines(path, "CAMERA_ID MODEL WIDTH HEIGHT PARAMS…", _parse_camera)
+        entries = _parse_lines(path, "CAMERA_ID MODEL WIDTH HEIGHT PARAMS…", _parse_camera)
     else:
-        found = _read_binary_cameras(path)
+        entries = _read_binary_cameras(path)
     cameras = {}
-    for number, name, size, numbers in found:
+    for number, name, size, numbers in entries:
         title = f"camera {number} of {quote_value(path)}"
         cameras[number] = build_intrinsics(find_model(name, title), size, numbers, title)
     return cameras
@@ -190,11 +195,12 @@ def read_seen_points(path: Path, changed: int) -> dict[int, Float[np.ndarray, "n
 
     `changed` is the time of the last change of the file.
     """
-    found = [(image, xyz) for xyz, images in _read_tracks(path) for image in set(images)]
-    found.sort(key=lambda one: one[0])
+    # A point may be seen by two features of one image, and counts once there.
+    sightings = [(image, xyz) for xyz, images in _read_tracks(path) for image in set(images)]
+    sightings.sort(key=lambda one: one[0])
     return {
         image: np.array([xyz for _, xyz in group])
-        for image, group in groupby(found, key=lambda one: one[0])
+        for image, group in groupby(sightings, key=lambda one: one[0])
     }
 
 
@@ -221,7 +227,13 @@ def _read_binary_images(path: Path) -> Iterator[PosedImage]:
     with _open_binary(path) as content:
         for _ in range(_read_count(content)):
             number, *pose, camera = _unpack(content, "<I4d3dI")
-            name = _read_name(content)
+            # A name of any length, which ends with a zero byte.
+            start = content.tell()
+            end = content.find(b"\0", start, start + MAX_NAME)
+            if end < 0:
+                raise ValueError("a name without an end")
+            name = os.fsdecode(content.read(end + 1 - start)[:-1])
+            # Features take most of the file and are not needed.
             content.seek(_read_count(content) * FEATURE_SIZE, os.SEEK_CUR)
             yield build_posed_image(number, name, camera, pose)
 
@@ -229,6 +241,7 @@ def _read_binary_images(path: Path) -> Iterator[PosedImage]:
 def _read_binary_points(path: Path) -> Iterator[Track]:
     with _open_binary(path) as content:
         for _ in range(_read_count(content)):
+            # Between the position and the length of its track, a point has a colour and an error.
             xyz = _unpack(content, "<Q3d3Bd")[1:4]
             track = content.read(_read_count(content) * SIGHTING_SIZE)
             yield xyz, [image for image, _ in struct.iter_unpack("<II", track)]
@@ -240,6 +253,7 @@ def _open_binary(path: Path) -> Iterator[mmap.mmap]:
     refuse_pointer(path)
     with open_file(path) as file:
         try:
+            # A mapped file needs no memory for what is skipped.
             with mmap.mmap(file.fileno(), 0, access=mmap.ACCESS_READ) as content:
                 yield content
         except InputError:
@@ -259,19 +273,12 @@ def _read_count(content: mmap.mmap) -> int:
     return int(_unpack(content, "<Q")[0])
 
 
-def _read_name(content: mmap.mmap) -> str:
-    start = content.tell()
-    end = content.find(b"\0", start, start + MAX_NAME)
-    if end < 0:
-        raise ValueError("a name without an end")
-    return os.fsdecode(content.read(end + 1 - start)[:-1])
-
-
 def _parse_lines(path: Path, form: str, parse: Callable[[str], Entry]) -> Iterator[Entry]:
     """Parse the lines with content; a line without the words of `form` becomes an InputError."""
     # Names may have any encoding and are passed to the file system unchanged.
     lines = read_lines(path, MAX_LINE, MAX_BYTES, errors="surrogateescape")
-    for number, line in enumerate(map(str.strip, lines), start=1):
+    for number, raw_line in enumerate(lines, start=1):
+        line = raw_line.strip()
         if not line or line.startswith("#"):
             continue
         try:
@@ -292,8 +299,10 @@ def _parse_camera(line: str) -> CameraEntry:
 def _parse_image(line: str) -> PosedImage | None:
     """Parse a pose and a name; None for the features X Y POINT3D_ID of an image."""
     words = line.split()
+    # Features are triples that end in the number of a point, or -1; a pose has ten words.
     if len(words) % 3 == 0 and words[-1].lstrip("-").isdecimal():
         return None
+    # A name may hold spaces.
     number, qw, qx, qy, qz, x, y, z, camera, name = line.split(maxsplit=9)
     pose = [float(word) for word in (qw, qx, qy, qz, x, y, z)]
     return build_posed_image(int(number), name, int(camera), pose)
@@ -301,6 +310,7 @@ def _parse_image(line: str) -> PosedImage | None:
 
 def _parse_point(line: str) -> Track:
     _, x, y, z, *rest = line.split()
+    # After the position: colour (3) and error, then pairs of image and feature.
     return (float(x), float(y), float(z)), [int(image) for image in rest[4::2]]
 
 
@@ -342,17 +352,18 @@ def read_scene_cameras(path: Path) -> list[Frame]:
 
 def _select_largest(path: Path) -> tuple[Path, list[Frame], tuple[str, ...]]:
     """Find the largest model of a scene: its folder, frames, and notes on others."""
-    found = [(images.parent, read_image_file(images)) for images in _find_models(path)]
-    if not found:
+    # A mapper that cannot connect all photographs writes several models, sparse/0, sparse/1, …
+    models = [(images.parent, read_image_file(images)) for images in _find_models(path)]
+    if not models:
         raise InputError(
             f"There is no COLMAP model in {quote_value(path)}; a folder sparse/0 with its cameras "
             "and images, as .bin or .txt, is needed."
         )
-    model, frames = max(found, key=lambda one: len(one[1]))
-    if len(found) == 1:
+    model, frames = max(models, key=lambda one: len(one[1]))
+    if len(models) == 1:
         return model, frames, ()
     note = (
-        f"{len(found)} models lie in {model.parent}: {model.name} with {len(frames)} images is "
+        f"{len(models)} models lie in {model.parent}: {model.name} with {len(frames)} images is "
         "used; the others are ignored."
     )
     return model, frames, (note,)
@@ -370,16 +381,22 @@ def _find_models(path: Path) -> list[Path]:
         return [path]
     if not os.path.isdir(path):
         return []
-    homes = (find_path(path, home) for home in HOMES)
-    found = (_list_home(home) for home in homes if home and os.path.isdir(home))
-    return next((models for models in found if models), [])
-
-
-def _list_home(home: Path) -> list[Path]:
-    """List the images files of the models in a folder, which may be one itself."""
-    numbered = sorted(name for name in os.listdir(home) if name.isdecimal())
-    found = [_find_model_file(folder, "images") for folder in (home, *map(home.joinpath, numbered))]
-    return [images for images in found if images and _find_model_file(images.parent, "cameras")]
+    for name in HOMES:
+        home = find_path(path, name)
+        if home is None or not os.path.isdir(home):
+            continue
+        # A home may be a model itself, or hold numbered ones.
+        numbered = sorted(entry for entry in os.listdir(home) if entry.isdecimal())
+        folders = [home, *(home / entry for entry in numbered)]
+        image_files = [_find_model_file(folder, "images") for folder in folders]
+        models = [
+            images
+            for images in image_files
+            if images and _find_model_file(images.parent, "cameras")
+        ]
+        if models:
+            return models
+    return []
 
 
 def _find_model_file(folder: Path, name: str) -> Path | None:
@@ -422,13 +439,16 @@ def read_image_file(path: Path) -> list[Frame]:
 
 
 def _find_seen(path: Path, number: int) -> Float[np.ndarray, "n 3"]:
-    found = read_seen_points(path, path.stat().st_mtime_ns)
-    return found.get(number, np.zeros((0, 3)))
+    # The reader is cached by the time of change, so that a model that is written anew is read anew.
+    seen = read_seen_points(path, path.stat().st_mtime_ns)
+    return seen.get(number, np.zeros((0, 3)))
 
 
 def _list_roots(scene: Path, model: Path) -> list[Path]:
     """List the folders from the model up to the scene; names decide if a model itself is given."""
-    top, roots = Path(os.path.abspath(scene)), [Path(os.path.abspath(model))]
+    # Photographs may lie beside the model, or beside any folder on the way up to the scene.
+    top = Path(os.path.abspath(scene))
+    roots = [Path(os.path.abspath(model))]
     parts = {part for home in HOMES if home for part in home.split("/")}
     while True:
         folder = roots[-1]

@@ -21,8 +21,10 @@ from gscompleter.data.frame import Frame
 from gscompleter.system.errors import InputError
 from gscompleter.system.files.image import read_brightness, read_image_size, turn_upright
 
-FEWEST, MOST = 6, 12
-"""Fewest and most photographs of a camera that are searched; with fewer, nothing is found."""
+FEWEST = 6
+"""Fewest photographs of a camera that are searched; with fewer, nothing is found."""
+MOST = 12
+"""Most photographs of a camera that are searched."""
 SIDE = 256
 """Longer side of the small copies, in pixels."""
 MAX_TURN = 25.0
@@ -37,8 +39,10 @@ MIN_CROSSING = 0.4
 """Smallest cosine between an edge normal and the ground's motion that would move the edge."""
 HORIZON = 0.1
 """First row of the ground below the vanishing point, as a share of the image height."""
-STRICT, LENIENT = 0.55, 0.4
-"""Cost per column of an outline: to detect a vehicle, and to follow a faint outline."""
+STRICT = 0.55
+"""Cost per column of an outline, to detect a vehicle."""
+LENIENT = 0.4
+"""Cost per column of an outline, to follow a faint one."""
 MAX_ROW_STEP = 4
 """Largest change of the outline from one column to the next, in rows."""
 BEND_COST = 0.1
@@ -47,8 +51,10 @@ MIN_WIDTH = 0.25
 """Smallest share of the columns with a static edge that moving ground would have moved."""
 MIN_SUPPORT = 0.6
 """Smallest static share of the length of an outline."""
-MIN_AREA, MAX_AREA = 0.01, 0.5
-"""Smallest and largest share of the image that a vehicle covers."""
+MIN_AREA = 0.01
+"""Smallest share of the image that a vehicle covers."""
+MAX_AREA = 0.5
+"""Largest share of the image that a vehicle covers."""
 MAX_STATIC_ELSEWHERE = 0.3
 """Largest static share of the edges elsewhere; above it the camera hardly moves."""
 CLEARANCE = 4
@@ -77,13 +83,18 @@ def detect_vehicle(frames: tuple[Frame, ...]) -> Bool[np.ndarray, "h w"] | None:
     poses = np.stack([frame.c2w for frame in usable])
     steps = np.linalg.norm(np.diff(poses[:, :3, 3], axis=0), axis=1)
     motion = estimate_motion(poses, steps)
+
+    # Photographs at equal distances along the way, because those taken while the vehicle waits are
+    # all alike, and everything in them is static.
     way = np.concatenate([[0.0], np.cumsum(steps)])
     evenly = np.searchsorted(way, np.linspace(0, way[-1], MOST)).tolist()
     chosen = [usable[index] for index in dict.fromkeys(evenly)]
     small = {} if motion is None else read_small(chosen)
     if motion is None or len(small) < FEWEST:
         return None
-    first, images = next(iter(small)), np.stack(list(small.values()))
+
+    first = next(iter(small))
+    images = np.stack(list(small.values()))
     size = first.size()
     if first.find_defect(*size) is not None:
         return None
@@ -93,14 +104,14 @@ def detect_vehicle(frames: tuple[Frame, ...]) -> Bool[np.ndarray, "h w"] | None:
 
 def read_small(frames: Sequence[Frame]) -> dict[Frame, Float[np.ndarray, "h w"]]:
     """Read small copies of the photographs that have the size of the first readable one."""
-    found: dict[Frame, Float[np.ndarray, "h w"]] = {}
+    copies: dict[Frame, Float[np.ndarray, "h w"]] = {}
     for frame in frames:
         with suppress(InputError):
             stored = frame.require_stored()
             orientation = frame.find_orientation(stored, *read_image_size(stored))
-            found[frame] = turn_upright(read_brightness(stored, SIDE), orientation)
-    shape = next((image.shape for image in found.values()), None)
-    return {frame: image for frame, image in found.items() if image.shape == shape}
+            copies[frame] = turn_upright(read_brightness(stored, SIDE), orientation)
+    shape = next((image.shape for image in copies.values()), None)
+    return {frame: image for frame, image in copies.items() if image.shape == shape}
 
 
 def estimate_motion(
@@ -112,15 +123,20 @@ def estimate_motion(
     """
     if (steps > 0).sum() < FEWEST - 1:
         return None
+    # Steps of a waiting vehicle have the direction of their noise.
     moving = steps > 0.1 * np.median(steps[steps > 0])
+    # From world axes into those of each camera: R^T times the step.
     moves = np.einsum("nji,nj->ni", poses[:-1, :3, :3], np.diff(poses[:, :3, 3], axis=0))
-    travel, down = average_directions(moves[moving]), average_directions(poses[:, :3, 1])
+    travel = average_directions(moves[moving])
+    # A camera that rolls or is carried by hand would turn the down axis, and is no vehicle's.
+    down = average_directions(poses[:, :3, 1])
     return None if travel is None or down is None else travel
 
 
 def average_directions(vectors: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "3"] | None:
     """Average directions; None if they are not steady."""
     units = vectors / np.linalg.norm(vectors, axis=1, keepdims=True)
+    # The median of unit vectors ignores a few outliers, and is shorter than 1 where they disagree.
     mean = np.median(units, axis=0)
     length = np.linalg.norm(mean)
     near = units @ mean >= length * np.cos(np.radians(MAX_TURN))
@@ -138,10 +154,14 @@ def predict_ground_flow(
     height, width = shape
     small = pinhole.resize(width, height)
     y, x = np.mgrid[:height, :width] + 0.5
+    # Points of a static scene move away from the vanishing point of the motion, at every depth in
+    # the same direction: with motion (X, Y, Z), pixel x moves by (x - cx) Z - f X over the depth.
     right = (x - small.cx) * motion[2] - small.fl_x * motion[0]
     down = (y - small.cy) * motion[2] - small.fl_y * motion[1]
     flow = np.stack([right, down], axis=-1)
     flow /= np.maximum(np.linalg.norm(flow, axis=-1, keepdims=True), 1e-9)
+    # The horizon is at the height of the vanishing point of a level motion. A camera that looks
+    # sideways has none within the image, and is taken to be level.
     pitch = motion[1] / motion[2] if abs(motion[2]) > 0.5 else 0.0
     first = small.cy + small.fl_y * pitch + HORIZON * height
     return flow, int(np.clip(first, 0, height))
@@ -168,17 +188,28 @@ def find_static_region(
     `images` are brightness in [0, 255], `flow` is from `predict_ground_flow`, and `first` is the
     highest row that the region may reach.
     """
-    edges, (height, width) = find_edges(images, flow), images.shape[1:]
-    found, limit = np.full(width, height), np.full(width, height)
-    while is_vehicle(edges, outline := trace_outline(edges, first, limit, STRICT)):
+    edges = find_edges(images, flow)
+    height, width = images.shape[1:]
+    # Row of the outline in each column; `height`, the lower border, where there is no vehicle.
+    highest = np.full(width, height)
+    limit = np.full(width, height)
+    while True:
+        outline = trace_outline(edges, first, limit, STRICT)
+        if not is_vehicle(edges, outline):
+            break
+        # Once a vehicle is certain, its outline may be followed where it is faint.
         top = max(first, int(outline.min()) - CLEARANCE)
         fainter = trace_outline(edges, top, limit, LENIENT)
-        found = np.minimum(found, np.minimum(outline, fainter))
-        limit = np.where(found < height, found - CLEARANCE, height)
-    if (found == height).all():
+        highest = np.minimum(highest, np.minimum(outline, fainter))
+        # The next outline has to lie above this one.
+        limit = np.where(highest < height, highest - CLEARANCE, height)
+    if (highest == height).all():
         return None
+
+    # A dip is a place where the outline fell to a lower edge. Rows count downwards, so that an
+    # opening by a flat element removes narrow peaks of the row number.
     dips = np.ones((1, math.ceil(MAX_DIP_WIDTH * width)), np.uint8)
-    rows = np.pad(found, width // 2, mode="edge").astype(np.float32)[None]
+    rows = np.pad(highest, width // 2, mode="edge").astype(np.float32)[None]
     opened = cv2.morphologyEx(rows, cv2.MORPH_OPEN, dips)[0]
     filled = opened[width // 2 :][:width].astype(np.int64)
     return fill_below(np.where(filled < height, filled - MARGIN, height), height)
@@ -187,9 +218,12 @@ def find_static_region(
 def find_edges(images: Float[np.ndarray, "n h w"], flow: Float[np.ndarray, "h w 2"]) -> Edges:
     """Find edges and how static they are."""
     smooth = [cv2.GaussianBlur(image, (0, 0), 1.0) for image in images]
+    # x and y of the gradient: `np.gradient` gives the rows first.
     gradients = np.stack([np.stack(np.gradient(image)[::-1], axis=-1) for image in smooth])
+    # The median over the photographs keeps the edges that all of them share.
     normal = np.median(gradients, axis=0)
     normal /= np.maximum(np.linalg.norm(normal, axis=-1, keepdims=True), 1e-6)
+    # A static edge has the same gradient along that normal in each photograph.
     along = (gradients * normal).sum(axis=-1)
     return Edges(
         (np.linalg.norm(gradients, axis=-1) > MIN_GRADIENT).mean(axis=0),
@@ -209,16 +243,22 @@ def trace_outline(
     """
     height, width = edges.static_share.shape
     rows = np.arange(height + 1)
+    # Edges along the motion of the ground stay in place anyway, and count half.
     reward = edges.static_share * (0.5 + 0.5 * edges.crossing) - cost
     reward = np.where((rows[:-1, None] >= first) & (rows[:-1, None] < limit), reward, -1.0)
     reward = np.concatenate([reward, np.zeros((1, width))])  # lower border: no vehicle
+
+    # Viterbi's algorithm: `total` is the best sum of rewards of a path that ends in each row, and
+    # `came` the row of that path in the column before.
     steps = np.abs(rows[:, None] - rows)
     bends = np.where(steps <= MAX_ROW_STEP, BEND_COST * steps, np.inf)
-    total, came = reward[:, 0], []
+    total = reward[:, 0]
+    came = []
     for column in range(1, width):
         reached = total - bends
         came.append(reached.argmax(axis=1))
         total = reached.max(axis=1) + reward[:, column]
+    # The best path, followed back from the last column.
     outline = [int(total.argmax())]
     for before in reversed(came):
         outline.append(int(before[outline[-1]]))
@@ -231,16 +271,20 @@ def is_vehicle(edges: Edges, outline: Int[np.ndarray, "w"]) -> bool:
     inside = fill_below(outline, height)
     if not MIN_AREA <= inside.mean() <= MAX_AREA:
         return False
+
+    # Most of the outline has to be static, and enough of it where moving ground would have moved
+    # an edge: that is what a vehicle alone does.
     columns = np.nonzero(outline < height)[0]
     rows = outline[columns]
     kept = edges.static_share >= MIN_STATIC_SHARE
     across = kept & (edges.crossing >= MIN_CROSSING)
     near = np.ones((3, 1), np.uint8)  # a row above and one below
-    staying, staying_across = (
-        cv2.dilate(mask.astype(np.uint8), near)[rows, columns] > 0 for mask in (kept, across)
-    )
+    staying = cv2.dilate(kept.astype(np.uint8), near)[rows, columns] > 0
+    staying_across = cv2.dilate(across.astype(np.uint8), near)[rows, columns] > 0
     if staying.mean() < MIN_SUPPORT or staying_across.sum() < MIN_WIDTH * width:
         return False
+
+    # If most other edges are static too, the camera hardly moved, and the outline says nothing.
     elsewhere = ~fill_below(outline - CLEARANCE, height)
     occurring = np.where(elsewhere, edges.edge_share, 0)
     return bool(occurring[kept].sum() <= MAX_STATIC_ELSEWHERE * occurring.sum())

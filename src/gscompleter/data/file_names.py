@@ -46,6 +46,8 @@ class FolderListings:
         if folder not in self._names:
             names: list[str] = []
             with suppress(OSError):
+                # In reverse order, so that the first name of those that fold alike is written last
+                # and stays.
                 names = sorted(os.listdir(folder), reverse=True)
             folded = {name.casefold(): name for name in names}
             self._names[folder] = {**folded, **{name: name for name in names}}
@@ -69,6 +71,7 @@ def list_endings(written: str) -> list[str]:
     if not is_foreign:
         return [written]
     parts = [part for part in re.split(r"[\\/]+", written) if part not in ("", ".")]
+    # A drive letter has no meaning here.
     if parts and re.fullmatch("[A-Za-z]:", parts[0]):
         parts = parts[1:]
     return ["/".join(parts[start:]) for start in range(len(parts))]
@@ -81,4 +84,8 @@ def locate(root: Path, written: str, find: Callable[[Path], Path | None]) -> Pat
     """
     as_written = root / written
     candidates = (as_written, *(root / ending for ending in list_endings(written)))
-    return next((file for path in candidates if (file := find(path)) is not None), as_written)
+    for path in candidates:
+        file = find(path)
+        if file is not None:
+            return file
+    return as_written

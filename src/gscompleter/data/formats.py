@@ -94,21 +94,23 @@ def open_photographs(
     """
     check_planes(near, far)
     path = require_path(path)
-    found = detect_format(path, format)
-    scene, *others = islice(FORMATS[found].open(path), 2)
+    format_name = detect_format(path, format)
+    # Two scenes are enough to know that there are several, and opening one may take long.
+    scene, *others = islice(FORMATS[format_name].open(path), 2)
     names = " and ".join(quote_value(one.name) for one in (scene, *others))
     require(
         not others,
         f"{quote_value(path)} holds several scenes, such as {names}; name a path with one of them.",
     )
-    near, far = scene.near if near is None else near, scene.far if far is None else far
+    near = scene.near if near is None else near
+    far = scene.far if far is None else far
     check_planes(near, far)
     sparse = None if scene.sparse is None else cache(scene.sparse)
     posed, lost = keep_posed(scene.frames, scene.title)
     notes = (*scene.notes, *lost, *describe_moved(posed, scene.title))
     frames = attach_vehicle_detector(attach_masks(posed))
     return replace(
-        scene, frames=frames, near=near, far=far, notes=notes, format=found, sparse=sparse
+        scene, frames=frames, near=near, far=far, notes=notes, format=format_name, sparse=sparse
     )
 
 
@@ -123,14 +125,15 @@ def detect_format(path: Path, name: str | None = None) -> str:
     require(os.path.exists(path), f"There is no {quote_value(path)}; {advice}.")
     if name is not None and FORMATS[name].detect(path):
         return name
-    found = None if name else find_format(path)
-    if found is None:
+    # A named format that does not fit is an error; another one is not tried.
+    detected = None if name else find_format(path)
+    if detected is None:
         refuse_other_exports(path)
         refuse_scenes_below(path)
         refuse_unread(path)
         kind = f"photographs in the format {name}" if name else "posed photographs"
         raise InputError(f"There are no {kind} in {quote_value(path)}; {advice}.")
-    return found
+    return detected
 
 
 def refuse_scenes_below(path: Path) -> None:
@@ -143,6 +146,8 @@ def refuse_scenes_below(path: Path) -> None:
         return
     if any(name.lower().endswith(ENDINGS) for name in os.listdir(path)):
         return
+
+    # Two levels down: a folder of scenes, or one of such folders.
     near = [folder for folder in list_folders(path) if is_own(folder)]
     inside = [child for folder in near for child in list_folders(folder)]
     require(
@@ -153,12 +158,13 @@ def refuse_scenes_below(path: Path) -> None:
     below = sorted(near + [folder for folder in inside if is_own(folder)])
     posed = [folder for folder in below if find_format(folder)]
     plain = [folder for folder in below if has_image_folder(folder)]
-    found = posed or (plain if len(plain) > 1 else [])
-    found = [folder for folder in found if folder.parent not in found]
-    names = join_names([folder.relative_to(path) for folder in found], MAX_NAMED, 20)
+    scenes = posed or (plain if len(plain) > 1 else [])
+    # A folder of a scene, such as sparse/0, may be readable by itself and is not another scene.
+    scenes = [folder for folder in scenes if folder.parent not in scenes]
+    names = join_names([folder.relative_to(path) for folder in scenes], MAX_NAMED, 20)
     require(
-        not found,
-        f"{quote_value(path, 50)} is no scene itself, but holds {len(found)} scene(s) below it: "
+        not scenes,
+        f"{quote_value(path, 50)} is no scene itself, but holds {len(scenes)} scene(s) below it: "
         f"{names}; name one of them.",
     )
 

@@ -80,6 +80,7 @@ class Frame:
     def file_name(self) -> str:
         """Path of the photograph below the folder of all, as users know it."""
         path = PurePosixPath(self.name.replace("\\", "/"))
+        # "images" in front of a name is the folder of all, which users do not name.
         inside = len(path.parts) > 1 and path.parts[0].casefold() in FOLDERS
         return str(PurePosixPath(*path.parts[1:]) if inside else path)
 
@@ -99,6 +100,7 @@ class Frame:
         A photograph inside a container file is not opened if the camera file gives its size.
         """
         stated = None if self.intrinsics.size == FRACTIONS else self.intrinsics.size
+        # To measure an image inside a container, that has to be opened.
         stored = None if stated is not None and callable(self.image) else self.find_stored()
         if stored is not None:
             width, height = read_image_size(stored, capitalize(self.title))
@@ -215,9 +217,11 @@ def find_image(path: Path, listings: FolderListings | None = None) -> Path | Non
     if path.parent.name == "images":
         folders += [path.parent.with_name(f"images_{n}") for n in DOWNSCALE_FACTORS]
     candidates = (folder / (path.name + ending) for folder in folders for ending in ENDINGS)
+    # The name as written comes first, because most folders need no listing.
     exact = next((candidate for candidate in candidates if os.path.isfile(candidate)), None)
     if exact is not None or listings is None:
         return exact
+    # A camera that the file calls DSC_1.jpg may have its photograph under DSC_1.JPG, or in Images.
     beside = find_file([path.parent], [path.name + ending for ending in ENDINGS], listings)
     if beside is not None:
         return beside
@@ -247,17 +251,19 @@ def list_image_folders(roots: Sequence[Path]) -> list[Path]:
 def locate_images(frames: Sequence[Frame], roots: Sequence[Path]) -> list[Frame]:
     """Return the frames with the paths of their photographs and masks, if they exist."""
     folders = list_image_folders(roots)
-    masks = [folder for root in roots if (folder := find_path(root, MASKS)) is not None]
+    found_masks = [find_path(root, MASKS) for root in roots]
+    masks = [folder for folder in found_masks if folder is not None]
     listings = FolderListings()
-    found = []
+    located = []
     for frame in frames:
+        # A name may be a path of another machine, or lack its ending.
         names = list(dict.fromkeys([frame.name, *list_endings(frame.name)]))
         images = [name + ending for name in names for ending in ENDINGS]
         stems = [os.path.splitext(name)[0] for name in names]
         image = find_file(folders, images, listings)
         mask = find_file(masks, [f"{name}.png" for name in [*names, *stems]], listings)
-        found.append(_rename_moved(replace(frame, image=image, mask=mask), folders))
-    return found
+        located.append(_rename_moved(replace(frame, image=image, mask=mask), folders))
+    return located
 
 
 def _rename_moved(frame: Frame, folders: Sequence[Path]) -> Frame:

@@ -19,11 +19,14 @@ from gscompleter.data.photographs import Photographs, Resolution
 from gscompleter.numerics.geometry import compute_sparse_depth
 from gscompleter.types import View
 
-EDGE_SHARE, EDGE_RATIO = 1 / 128, 1.1
-"""Window around a pixel of a depth map, relative to the longer side, and the depth ratio within it
-from which the pixel lies at an edge, where sensor and photograph disagree."""
-GAP_SHARE, GAP_RATIO = 1 / 64, 1.2
-"""The same for laser points: how much nearer another is that hides a point."""
+EDGE_SHARE = 1 / 128
+"""Half the window around a pixel of a depth map, relative to the longer side."""
+EDGE_RATIO = 1.1
+"""Depth ratio in it from which a pixel lies at an edge, where sensor and photograph disagree."""
+GAP_SHARE = 1 / 64
+"""The same window around a laser point."""
+GAP_RATIO = 1.2
+"""Depth ratio from which a nearer laser point hides another."""
 
 
 def give_depths(
@@ -31,18 +34,21 @@ def give_depths(
 ) -> list[View]:
     """Load photographs whose measured depth constrains the reconstruction and scores nothing."""
     views = photographs.views(frames, resolution)
-    held = map(photographs.frame, frames)
-    return [give_depth(*pair, photographs.origin) for pair in zip(views, held, strict=True)]
+    return [
+        give_depth(view, photographs.frame(number), photographs.origin)
+        for view, number in zip(views, frames, strict=True)
+    ]
 
 
 def give_depth(view: View, frame: Frame, origin: Float[np.ndarray, "3"]) -> View:
     """Give a photograph its depth map or laser points, and the triangulated points beside them."""
-    given = project_tracks(frame, view, origin)
+    sparse = project_tracks(frame, view, origin)
     if view.depth is not None:
         sure = drop_unsure(view.depth, frame)
-        given = sure.where(sure > 0, given)
+        # A measurement of the sensor is denser than tracks, and wins where both are known.
+        sparse = sure.where(sure > 0, sparse)
     # A point that a mask hides may lie behind what the mask hides it with.
-    return replace(view, depth=None, given_depth=given.where(view.valid_mask, 0.0))
+    return replace(view, depth=None, given_depth=sparse.where(view.valid_mask, 0.0))
 
 
 def project_tracks(
@@ -85,5 +91,6 @@ def find_extremes(
     """Find the nearest and the farthest known depth around each pixel."""
     values = depth.numpy()
     window = np.ones((2 * max(1, round(share * max(values.shape))) + 1,) * 2, np.uint8)
+    # Unknown pixels are 0: infinite for the nearest depth, and smallest for the farthest.
     known = np.where(values > 0, values, np.float32(np.inf))
     return torch.from_numpy(cv2.erode(known, window)), torch.from_numpy(cv2.dilate(values, window))

@@ -48,7 +48,8 @@ def get_size(
     entry: Any, title: str, width: str = "width", height: str = "height"
 ) -> tuple[int, int]:
     """Return width and height in pixels, at the keys of these names."""
-    w, h = (get_number(entry, key, title, 1.0, float(MAX_SIDE)) for key in (width, height))
+    w = get_number(entry, width, title, 1.0, float(MAX_SIDE))
+    h = get_number(entry, height, title, 1.0, float(MAX_SIDE))
     require(
         w == int(w) and h == int(h),
         f"The `{width}` and `{height}` of {title} are no whole numbers; correct them.",
@@ -73,9 +74,11 @@ def get_array(
     try:
         array = np.array(_get(entry, key), dtype=np.float64)
     except (ValueError, TypeError, OverflowError):
+        # A ragged list, text or a number beyond float64: refused below, since no shape is empty.
         array = np.zeros(0)
     sizes = " or ".join(" × ".join(map(str, shape)) for shape in shapes)
     require(
+        # Not `<=`, which NaN would fail: a pose may hold it, and is left out later (`keep_posed`).
         array.shape in shapes and not (np.abs(array) > MAX_NUMBER).any(),
         f"The `{key}` of {title} is no list of {sizes} numbers, none above {MAX_NUMBER:g}; correct "
         "it.",
@@ -85,14 +88,18 @@ def get_array(
 
 def get_focal(entry: Any, title: str) -> tuple[float, float]:
     """Return the focal lengths `fx` and `fy` in pixels."""
-    low, high = 1 / MAX_NUMBER, MAX_NUMBER
-    return get_number(entry, "fx", title, low, high), get_number(entry, "fy", title, low, high)
+    low = 1 / MAX_NUMBER
+    high = MAX_NUMBER
+    fx = get_number(entry, "fx", title, low, high)
+    fy = get_number(entry, "fy", title, low, high)
+    return fx, fy
 
 
 def get_intrinsics(entry: Any, title: str) -> Intrinsics:
     """Return the intrinsics `fx`, `fy`, `cx` and `cy` in pixels, without an image size."""
     focal = get_focal(entry, title)
-    cx, cy = (get_number(entry, key, title, -MAX_NUMBER, MAX_NUMBER) for key in ("cx", "cy"))
+    cx = get_number(entry, "cx", title, -MAX_NUMBER, MAX_NUMBER)
+    cy = get_number(entry, "cy", title, -MAX_NUMBER, MAX_NUMBER)
     return Intrinsics(None, focal, (cx, cy))
 
 

@@ -42,10 +42,13 @@ def open_llff(path: Path) -> Iterator[Photographs]:
     """
     file = path / NAME if os.path.isdir(path) else path
     rows = _read_rows(file)
-    titles = (f"row {number} of {quote_value(file)}" for number in range(len(rows)))
     images = _find_photographs(file, len(rows))
-    frames = list(map(_parse_frame, images, rows, titles))
-    near, far = NEAR_FACTOR * rows[:, 15].min().item(), FAR_FACTOR * rows[:, 16].max().item()
+    frames = [
+        _parse_frame(image, row, f"row {number} of {quote_value(file)}")
+        for number, (image, row) in enumerate(zip(images, rows, strict=True))
+    ]
+    near = NEAR_FACTOR * rows[:, 15].min().item()
+    far = FAR_FACTOR * rows[:, 16].max().item()
     scene = build_photographs(file.resolve().parent.name, str(file), frames)
     yield replace(scene, near=near, far=far)
 
@@ -54,6 +57,7 @@ def _parse_frame(image: Path, row: Float[np.ndarray, "17"], title: str) -> Frame
     down, right, back, center, (height, width, focal) = row[:15].reshape(3, 5).T
     size = get_size({"width": width, "height": height}, title)
     c2w = np.eye(4)
+    # LLFF's axes are down, right and back; ours are right, down and forward.
     c2w[:3] = np.stack([right, down, -back, center], axis=1)
     intrinsics = Intrinsics(size, (float(focal), float(focal)))
     return Frame(image.name, title, c2w, intrinsics, image)
@@ -70,7 +74,9 @@ def _read_rows(path: Path) -> Float[np.ndarray, "n 17"]:
         rows.ndim == 2 and rows.shape[1] == 17 and len(rows) > 0,
         f"{quote_value(path)} has the shape {list(rows.shape)}, not 17 columns; {ADVICE}.",
     )
-    (low, high), near, far = DEPTH_RANGE, rows[:, 15], rows[:, 16]
+    low, high = DEPTH_RANGE
+    near = rows[:, 15]
+    far = rows[:, 16]
     bounded = ((near >= low) & (near < far) & (far <= high)).all()
     require(bounded, f"The bounds in {quote_value(path)} are no z-depths, nearest first; {ADVICE}.")
     return rows

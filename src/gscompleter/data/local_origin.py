@@ -33,6 +33,7 @@ def choose_local_origin(poses: Sequence[Float[np.ndarray, "4 4"]]) -> Float[np.n
         return np.zeros(3)
     centers = np.stack([pose[:3, 3] for pose in poses])
     spread = np.abs(centers - centers[0]).max()
+    # Where the camera is far away, relative to what it moves, float32 loses the baselines.
     remote = spread > 0 and np.abs(centers).max() > MAX_REMOTENESS * spread
     return centers[0] if remote else np.zeros(3)
 
@@ -48,6 +49,7 @@ def choose_scene_origin(scene: Gaussians, origin: Float[np.ndarray, "3"]) -> Flo
     """Choose a scene's origin: `origin` if the scene lies near it, else zero."""
     if len(scene) == 0 or not origin.any():
         return origin
+    # A given splat may have been exported at a local origin already. The median ignores floaters.
     middle = scene.means.median(dim=0).values.double().cpu().numpy()
     there = np.abs(middle - origin).max() < 0.5 * np.abs(origin).max()
     return origin if there else np.zeros(3)
@@ -59,6 +61,7 @@ def shift_to_origin(
     """Express a scene relative to `origin` (scene units); refuses too coarse float32 steps."""
     if not origin.any():
         return scene
+    # Distance to the next float32 at the largest coordinate.
     step = float(np.spacing(np.float32(np.abs(origin).max())))
     centers = torch.stack([camera.center.cpu() for camera in cameras])
     spread = (centers - centers[0]).norm(dim=-1).max().item()
@@ -68,6 +71,7 @@ def shift_to_origin(
         f"of {step:g}, and its cameras are {spread:g} apart; export the scene and its photographs "
         "relative to a local origin.",
     )
+    # In float64: the difference of two large coordinates is small.
     means = scene.means.double() - torch.from_numpy(origin).to(scene.means.device)
     return replace(scene, means=means.float())
 

@@ -38,23 +38,24 @@ INVERTED = "dynamic_mask_"
 def attach_masks(frames: Sequence[Frame]) -> tuple[Frame, ...]:
     """Attach the mask of each photograph that has one and whose format named none."""
     listings = FolderListings()
-
-    def attach(frame: Frame) -> Frame:
+    attached = []
+    for frame in frames:
         stored = frame.find_stored() if isinstance(frame.image, Path) else None
-        if frame.mask is not None or not isinstance(stored, Path):
-            return frame
-        return replace(frame, mask=find_mask(stored, frame.name, listings))
-
-    return tuple(map(attach, frames))
+        if frame.mask is None and isinstance(stored, Path):
+            frame = replace(frame, mask=find_mask(stored, frame.name, listings))
+        attached.append(frame)
+    return tuple(attached)
 
 
 def find_mask(photograph: Path, name: str, listings: FolderListings) -> Path | None:
     """Find the mask of a photograph; `name` is its path below the scene or its image folder."""
+    # The folder that `name` counts from: as many levels above the photograph as it has parts.
     parts = PurePosixPath(name).parts
     is_plain = not PurePosixPath(name).is_absolute() and ".." not in parts
     is_below = is_plain and photograph.parts[-len(parts) :] == parts
     depth = len(parts) if is_below else 1
     home = photograph.parents[depth - 1]
+
     relatives = [PurePosixPath(*photograph.parts[-depth:])]
     roots = [home, photograph.parent]
     # A transforms.json calls it "images/x.png" and COLMAP "x.png", and its mask is masks/x.png or
@@ -64,6 +65,8 @@ def find_mask(photograph: Path, name: str, listings: FolderListings) -> Path | N
     if home.name.casefold() in FOLDERS:
         roots.append(home.parent)
         relatives.append(PurePosixPath(home.name, *photograph.parts[-depth:]))
+
+    # In folders of masks for any of these paths, then beside the photograph.
     folders = [root / folder for root, folder in product(dict.fromkeys(roots), MASK_FOLDERS)]
     in_folders = [mask for path in relatives for mask in list_mask_names(path, is_beside=False)]
     found = (
@@ -106,6 +109,7 @@ def load_mask(
     ignored = read_mask(path)
     if path.name.casefold().startswith(INVERTED):
         ignored = ~ignored
+    # A mask drawn on the upright photograph has its shape; another may be of the stored pixels.
     is_stored = not has_same_aspect((ignored.shape[1], ignored.shape[0]), size)
     if is_stored and orientation != 1:
         ignored = turn_upright(ignored, orientation)

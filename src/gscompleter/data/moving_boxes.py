@@ -22,10 +22,14 @@ def mask_moving(
     `boxes` are in the world frame of the files, `camera` in coordinates relative to `origin`.
     """
     mask = np.zeros((camera.height, camera.width), np.uint8)
-    c2w, K = (matrix.double().cpu().numpy() for matrix in (camera.c2w, camera.K))
+    c2w = camera.c2w.double().cpu().numpy()
+    K = camera.K.double().cpu().numpy()
     for corners in boxes - origin:
+        # Into camera axes: R^T (corner - centre), written for rows.
         local = (corners - c2w[:3, 3]) @ c2w[:3, :3]
         if np.isfinite(local).all() and local[:, 2].max() > NEAREST:
+            # Corners behind the camera have no image. Pulled before it they only make the mask
+            # larger.
             local[:, 2] = np.maximum(local[:, 2], NEAREST)
             # OpenCV puts the centre of the first pixel at (0, 0).
             pixels = (local @ K.T)[:, :2] / local[:, 2:] - 0.5

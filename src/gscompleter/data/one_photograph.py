@@ -36,8 +36,9 @@ def find_photograph(path: Path) -> Path | None:
     """Return an image file, or the only photograph of a folder; None for anything else."""
     if os.path.isfile(path):
         return path if path.suffix.lower() in ENDINGS else None
-    found = list(islice(iterate_photographs(path), 2))
-    return found[0] if len(found) == 1 else None
+    # Two are enough to know that there are several.
+    photographs = list(islice(iterate_photographs(path), 2))
+    return photographs[0] if len(photographs) == 1 else None
 
 
 def open_photograph(path: Path) -> Iterator[Photographs]:
@@ -52,19 +53,21 @@ def open_photograph(path: Path) -> Iterator[Photographs]:
     with open_image(file) as image:
         exif = image.getexif()
         size = ImageOps.exif_transpose(image).size
-    found, title = read_focal(exif), quote_value(file)
-    focal = (found or PHONE_FOCAL) * math.hypot(*size)
+    exif_focal = read_focal(exif)
+    title = quote_value(file)
+    focal = (exif_focal or PHONE_FOCAL) * math.hypot(*size)
+    # The camera is that of the upright photograph, so the pixels are turned once and for all.
     is_upright = exif.get(ORIENTATION, 1) == 1
     stored: Path | Callable[[], bytes] = file if is_upright else partial(read_upright, file)
     frame = Frame(file.name, title, np.eye(4), Intrinsics(size, (focal, focal)), stored)
-    origin = "of EXIF" if found else "of a phone, since EXIF has none"
+    origin = "of EXIF" if exif_focal else "of a phone, since EXIF has none"
     note = f"The photograph has no camera; a focal length of {focal:.0f} px is used, {origin}."
     yield replace(build_photographs(file.stem, title, [frame]), notes=(note,))
 
 
 def read_upright(path: Path) -> bytes:
     """Read a photograph that EXIF turns, as an upright PNG."""
-    made = BytesIO()
+    upright = BytesIO()
     with open_image(path) as image:
-        ImageOps.exif_transpose(image).convert("RGB").save(made, "PNG")
-    return made.getvalue()
+        ImageOps.exif_transpose(image).convert("RGB").save(upright, "PNG")
+    return upright.getvalue()

@@ -28,8 +28,10 @@ MAX_SIDE = 1600
 """Largest side of a view in pixels."""
 BORDER = 4
 """Columns that are repeated on the other side, in pixels."""
-MARK, HEAD = b"equirectangular", 1 << 18
-"""Projection in Google's photo sphere metadata (GPano), and the first bytes that have it."""
+MARK = b"equirectangular"
+"""Projection in Google's photo sphere metadata (GPano)."""
+HEAD = 1 << 18
+"""First bytes of a file that hold the metadata."""
 SMALL_WIDTH = 1024
 """Width at which borders are compared."""
 MAX_SEAM = 3.0
@@ -49,8 +51,10 @@ def has_panoramas(files: Sequence[Path]) -> bool:
     sizes = [read_image_size(path) for path in files]
     wide = [path for path, (w, h) in zip(files, sizes, strict=True) if w == 2 * h]
     marked = any(MARK in read_head(path, HEAD) for path in wide)
-    if not marked and 2 * sum(map(_is_closed, wide)) <= len(wide):
-        return False
+    if not marked:
+        num_closed = sum(_is_closed(path) for path in wide)
+        if 2 * num_closed <= len(wide):
+            return False
     require(
         len(set(sizes)) == 1,
         f"Beside {quote_value(wide[0], 80)} and other panoramas lie photographs of other sizes; "
@@ -62,8 +66,12 @@ def has_panoramas(files: Sequence[Path]) -> bool:
 def _is_closed(path: Path) -> bool:
     """Check whether left and right border continue each other, and each pole is one point."""
     pixels = read_brightness(path, SMALL_WIDTH)
+    # Differences from each column to the next; the last one is across the seam.
     steps = np.abs(np.diff(pixels, axis=1, append=pixels[:, :1])).mean(axis=0)
-    rows, columns = pixels.std(axis=1), pixels.std(axis=0)
+    rows = pixels.std(axis=1)
+    columns = pixels.std(axis=0)
+    # The first and last row show a pole alone and vary little. A border of one colour, as of a
+    # plain background, is no evidence.
     return bool(
         steps[-1] < MAX_SEAM * np.median(steps)
         and max(rows[0], rows[-1]) < MAX_POLE * np.median(rows)
@@ -78,11 +86,13 @@ def split_panorama(
 
     `hidden` are the pixels of the panorama that its mask hides, or None without one.
     """
+    # As large as makes a view of 90° `MAX_SIDE` wide: its centre has `width` / π pixels per unit.
     widest = math.ceil(math.pi * MAX_SIDE)
     with open_image(path) as image:
         image.draft("RGB", (widest, widest // 2))
         panorama = image.convert("RGB")
     panorama.thumbnail((widest, widest), Image.Resampling.LANCZOS)
+    # Repeated columns let the interpolation continue across the seam.
     pixels = np.pad(np.asarray(panorama), ((0, 0), (BORDER, BORDER), (0, 0)), mode="wrap")
     mask = None
     if hidden is not None:
@@ -96,11 +106,14 @@ def split_panorama(
 
 def _project_rays(rotation: Float[np.ndarray, "3 3"], width: int) -> Float[np.ndarray, "s s 2"]:
     """Project the pixels of a view to positions (x, y) in a panorama of this width with borders."""
+    # A 90° view reaches from -1 to 1 at z = 1, and keeps the resolution of the panorama's equator
+    # in its centre.
     side = round(width / math.pi)
     places = (np.arange(side) + 0.5) / side * 2 - 1
     rays = np.stack([*np.meshgrid(places, places), np.ones((side, side))], axis=-1) @ rotation.T
     longitude = np.arctan2(rays[..., 0], rays[..., 2])
     latitude = np.arctan2(rays[..., 1], np.hypot(rays[..., 0], rays[..., 2]))
+    # Pixel positions as `remap` counts them: 0 is the centre of the first column without border.
     x = (longitude / (2 * np.pi) + 0.5) * width - 0.5 + BORDER
     y = (latitude / np.pi + 0.5) * width / 2 - 0.5
     return np.stack([x, y], axis=-1).astype(np.float32)
@@ -108,5 +121,6 @@ def _project_rays(rotation: Float[np.ndarray, "3 3"], width: int) -> Float[np.nd
 
 def compute_rotation(yaw: int, pitch: int) -> Float[np.ndarray, "3 3"]:
     """Compute the rotation from the axes of a view (degrees) to those of its panorama."""
-    turned, raised = (0.0, math.radians(yaw), 0.0), (math.radians(pitch), 0.0, 0.0)
+    turned = (0.0, math.radians(yaw), 0.0)
+    raised = (math.radians(pitch), 0.0, 0.0)
     return cv2.Rodrigues(np.array(turned))[0] @ cv2.Rodrigues(np.array(raised))[0]

@@ -94,8 +94,8 @@ class Photographs:
 
     def camera(self, frame: int, resolution: Resolution = None) -> Camera:
         """Return the camera of a frame, even without its photograph if the file gives the size."""
-        found = self.frame(frame)
-        return self._build_camera(found, found.size(), resolution)
+        chosen = self.frame(frame)
+        return self._build_camera(chosen, chosen.size(), resolution)
 
     def views(self, frames: Sequence[int], resolution: Resolution = None) -> list[View]:
         """Load undistorted photographs with cameras, known depth and the detected vehicle."""
@@ -107,13 +107,13 @@ class Photographs:
             return None
         chosen = [self.frame(number) for number in frames]
         named = [frame.mask for frame in chosen if frame.mask is not None]
-        clear = sum(map(_has_alpha, chosen))
+        num_transparent = sum(_has_alpha(frame) for frame in chosen)
         kinds = []
         if named:
             places = list(dict.fromkeys(path.parent for path in named))
             kinds.append(f"masks of {len(named)} photographs ({join_names(places, MAX_NAMED)})")
-        if clear:
-            kinds.append(f"the alpha channel of {clear} photographs")
+        if num_transparent:
+            kinds.append(f"the alpha channel of {num_transparent} photographs")
         return " and ".join(kinds) if kinds else None
 
     def ignore_moving(self) -> Photographs:
@@ -126,20 +126,19 @@ class Photographs:
 
     def leave_out_masks_in(self, folder: Path) -> Photographs:
         """Return a copy without the masks in a folder, which mean something else."""
-        frames = [
-            replace(frame, mask=None)
-            if frame.mask is not None and folder.resolve() in frame.mask.resolve().parents
-            else frame
-            for frame in self.frames
-        ]
+        frames = []
+        for frame in self.frames:
+            if frame.mask is not None and folder.resolve() in frame.mask.resolve().parents:
+                frame = replace(frame, mask=None)
+            frames.append(frame)
         return replace(self, frames=tuple(frames))
 
     def is_hidden(self, frame: int) -> bool:
         """Check whether a mask or the alpha channel hides all of a photograph."""
-        found = self.frame(frame)
-        if not self.is_masked or (found.mask is None and not _has_alpha(found)):
+        chosen = self.frame(frame)
+        if not self.is_masked or (chosen.mask is None and not _has_alpha(chosen)):
             return False
-        hidden = self._load_colors(found)[1]
+        hidden = self._load_colors(chosen)[1]
         return hidden is not None and bool(hidden.all())
 
     def find_moving(self, frame: int, resolution: Resolution = None) -> Bool[Tensor, "h w"] | None:
@@ -195,39 +194,42 @@ class Photographs:
         if isinstance(word, int):
             self.frame(word)
             return word
-        found = self._match_names(word)
-        names = [self.frame(number).file_name for number in found]
-        if len(found) > 1:
+        numbers = self._match_names(word)
+        names = [self.frame(number).file_name for number in numbers]
+        if len(numbers) > 1:
             raise InputError(
-                f"{len(found)} photographs of {self.title} are called {quote_value(word)}: "
+                f"{len(numbers)} photographs of {self.title} are called {quote_value(word)}: "
                 f"{join_names(names, MAX_NAMED)}; name the path of one of them."
             )
-        if not found:
+        if not numbers:
             example = self.frame(0).file_name
             raise InputError(
                 f"There is no photograph '{quote_value(word)}' in {self.title}; name one of its "
                 f"{len(self)} photographs, such as {quote_value(example)}, or its number from 0 "
                 f"to {len(self) - 1}."
             )
-        return found[0]
+        return numbers[0]
 
     def _match_names(self, word: str) -> list[int]:
         """List the frames whose photograph a word names, those that it names exactly if any."""
         wanted = PurePosixPath(word.replace("\\", "/").casefold()).parts
-        exact, found = [], []
+        exact = []
+        similar = []
         for number, frame in enumerate(self.frames):
             path = frame.name.replace("\\", "/")
             if word in (frame.name, frame.file_name, PurePosixPath(path).name):
                 exact.append(number)
+            # The word may lack folders, and so may the name: either may be the end of the other.
             names = path.casefold(), os.path.splitext(path.casefold())[0]
             if any(_ends_alike(PurePosixPath(name).parts, wanted) for name in names):
-                found.append(number)
-        return exact or found
+                similar.append(number)
+        return exact or similar
 
     def _build_camera(self, frame: Frame, size: tuple[int, int], resolution: Resolution) -> Camera:
         _, pinhole = frame.compute_pinholes(*size)
         framing = compute_framing(*size, resolution)
         final = pinhole.resize(*framing.scaled_size).crop(*framing.corner, *framing.size)
+        # The authors' loaders keep the principal point as a fraction of the image.
         if isinstance(resolution, AuthorsCrop):
             cx = pinhole.cx / pinhole.width * final.width
             cy = pinhole.cy / pinhole.height * final.height
@@ -244,6 +246,8 @@ class Photographs:
         camera = self._build_camera(frame, size, resolution)
         image = convert_to_image(undistort_and_resize(frame, colors, size, resolution))
         depth = self._load_depth(frame, camera, size, resolution)
+
+        # What files mark as ignored: masks and alpha, and boxes of moving objects.
         masks = []
         if hidden is not None:
             masks.append(torch.from_numpy(resize_mask(frame, hidden, size, resolution)))
@@ -258,6 +262,8 @@ class Photographs:
                     "choose another frame."
                 )
             depth = None if depth is None else depth.masked_fill(ignored, 0.0)
+
+        # The detected vehicle joins the mask of the view, but hides no known depth.
         vehicle = None if frame.vehicle is None else frame.vehicle()
         if vehicle is not None:
             small = undistort_and_resize(frame, vehicle.astype(np.uint8), size, resolution)
@@ -321,16 +327,18 @@ def undistort_and_resize(
     Maps are resized to `size` (width, height) first. Colours (uint8, [h, w, 3]) are interpolated,
     values of maps never.
     """
-    colours = pixels.ndim == 3
-    if not colours:
+    is_colour = pixels.ndim == 3
+    if not is_colour:
         pixels = resize(pixels, size, Image.Resampling.NEAREST)
     if frame.intrinsics.distortion:
         pinhole, new = frame.compute_pinholes(*size)
         source = compute_undistortion_map(pinhole, frame.intrinsics.distortion, new)
-        pixels = remap(pixels, source, cv2.INTER_CUBIC if colours else cv2.INTER_NEAREST)
-    filtering = Image.Resampling.LANCZOS if colours else Image.Resampling.NEAREST
+        pixels = remap(pixels, source, cv2.INTER_CUBIC if is_colour else cv2.INTER_NEAREST)
+    # Colours need a window function to shrink without aliasing; values of a map must not be mixed.
+    filtering = Image.Resampling.LANCZOS if is_colour else Image.Resampling.NEAREST
     framing = compute_framing(*size, resolution)
-    (left, top), (width, height) = framing.corner, framing.size
+    left, top = framing.corner
+    width, height = framing.size
     resized = resize(pixels, framing.scaled_size, filtering)
     return np.ascontiguousarray(resized[top : top + height, left : left + width])
 
@@ -339,13 +347,15 @@ def resize_mask(
     frame: Frame, ignored: Bool[np.ndarray, "h w"], size: tuple[int, int], resolution: Resolution
 ) -> Bool[np.ndarray, "h2 w2"]:
     """Undistort and resize a mask of the photograph's `size`: ignored where half of a pixel is."""
+    # In shares from here on, so that no step rounds a mask before the last one.
     share = ignored.astype(np.float32)
     if frame.intrinsics.distortion:
         pinhole, new = frame.compute_pinholes(*size)
         source = compute_undistortion_map(pinhole, frame.intrinsics.distortion, new)
         share = remap(share, source, cv2.INTER_LINEAR)
     framing = compute_framing(*size, resolution)
-    (left, top), (width, height) = framing.corner, framing.size
+    left, top = framing.corner
+    width, height = framing.size
     resized = resize(share, framing.scaled_size, Image.Resampling.BOX)
     return resized[top : top + height, left : left + width] >= 0.5
 
@@ -364,6 +374,7 @@ def _has_alpha(frame: Frame) -> bool:
 def _find_skip_reason(
     frame: Frame, origin: Float[np.ndarray, "3"], max_translation: float | None
 ) -> str | None:
+    # The size in the camera file needs no image to be opened.
     size = frame.intrinsics.size or frame.size()
     defect = frame.find_defect(*size)
     if defect is not None:
@@ -389,12 +400,16 @@ class Framing:
 def compute_framing(width: int, height: int, resolution: Resolution) -> Framing:
     """Compute the framing of a width × height image for a resolution."""
     check_resolution(resolution)
+    # Shrink to a longer side, without a crop.
     if resolution is None or isinstance(resolution, int):
         scale = 1.0 if resolution is None else min(1.0, resolution / max(width, height))
         size = max(round(width * scale), 1), max(round(height * scale), 1)
         return Framing(size, (0, 0), size)
+
+    # Otherwise the size is exact: scale until the image covers it, and crop the rest.
     if isinstance(resolution, AuthorsCrop):
-        new_height, new_width = resolution.height, resolution.width
+        new_height = resolution.height
+        new_width = resolution.width
     else:
         new_height, new_width = resolution
     if isinstance(resolution, AuthorsCrop) and not resolution.is_resized:
@@ -412,6 +427,7 @@ def compute_framing(width: int, height: int, resolution: Resolution) -> Framing:
             f"An image of {width} × {height} pixels that covers {new_width} × {new_height} has a "
             f"side above {MAX_SIDE}; choose a smaller resolution, or crop the image."
         )
+    # Symmetric, with the odd pixel at the right and the lower side.
     corner = (scaled[0] - new_width) // 2, (scaled[1] - new_height) // 2
     return Framing(scaled, corner, (new_width, new_height))
 
@@ -440,7 +456,8 @@ def check_resolution(resolution: Resolution) -> None:
     if isinstance(resolution, (tuple, list)) and len(resolution) == 2:
         sides = resolution
     if not all(_is_side(side) for side in sides):
+        named = " × ".join(quote_value(side) for side in sides)
         raise InputError(
-            f"The resolution {' × '.join(map(quote_value, sides))} is impossible; height and "
+            f"The resolution {named} is impossible; height and "
             f"width have to be positive, and at most {MAX_SIDE}."
         )

@@ -22,8 +22,10 @@ MIN_POINTS = 100
 """Fewest visible points that define a depth range."""
 PERCENTILES = (0.01, 0.99)
 """Percentiles of z-depth; points beyond are taken for mismatches."""
-NEAR_FACTOR, FAR_FACTOR = 0.5, 2.0
-"""Factors on the nearest and farthest depth, because many surfaces have no points."""
+NEAR_FACTOR = 0.5
+"""Factor on the nearest depth, because many surfaces have no points."""
+FAR_FACTOR = 2.0
+"""Factor on the farthest depth."""
 
 
 def add_depth_range(
@@ -34,11 +36,12 @@ def add_depth_range(
     points = None if is_known else photographs.points()
     if points is None:
         return photographs
-    found = compute_depth_range(points, [photographs.camera(f, resolution) for f in frames])
-    if found is None:
+    depth_range = compute_depth_range(points, [photographs.camera(f, resolution) for f in frames])
+    if depth_range is None:
         return photographs
-    near = found[0] if photographs.near is None else photographs.near
-    far = found[1] if photographs.far is None else photographs.far
+    near = depth_range[0] if photographs.near is None else photographs.near
+    far = depth_range[1] if photographs.far is None else photographs.far
+    # A plane of the file may lie beyond one that was found; then neither is replaced.
     return photographs if near >= far else replace(photographs, near=near, far=far)
 
 
@@ -48,13 +51,15 @@ def compute_depth_range(
     """Compute near and far planes (scene units) around visible points; None for too few."""
     seen = [torch.zeros(0)]
     for camera in cameras:
+        # Points behind a camera or outside its image say nothing about its depth range.
         pixels, z = project(points, camera)
         seen.append(z[is_inside(pixels, z, camera)])
     depths = torch.cat(seen)
     if len(depths) < MIN_POINTS:
         return None
     low, high = np.quantile(depths.double().numpy(), PERCENTILES).tolist()
-    near, far = NEAR_FACTOR * low, FAR_FACTOR * high
+    near = NEAR_FACTOR * low
+    far = FAR_FACTOR * high
     return (near, far) if DEPTH_RANGE[0] <= near < far <= DEPTH_RANGE[1] else None
 
 

@@ -32,7 +32,7 @@ INDEX = "index.json"
 
 def open_camera_files(path: Path) -> Iterator[Photographs]:
     """Open the photographs of each camera file that `path` is or holds, sorted by name."""
-    return map(read_camera_file, list_camera_files(path))
+    return (read_camera_file(file) for file in list_camera_files(path))
 
 
 def read_camera_file(path: Path) -> Photographs:
@@ -54,6 +54,7 @@ def parse_camera_row(
     """Split a row into intrinsics and camera-to-world; an invalid transform stays as it is."""
     fx, fy, cx, cy = numbers[:4].tolist()
     viewmat = np.vstack([numbers[6:].reshape(3, 4), [0, 0, 0, 1]])
+    # Intrinsics are fractions of the image, which may have any size.
     return Intrinsics(FRACTIONS, (fx, fy), (cx, cy)), invert_viewmat(viewmat)
 
 
@@ -98,6 +99,7 @@ def open_chunks(path: Path) -> Iterator[Photographs]:
         return _open_chunk(path)
     folder = path.parent if path.name == INDEX else _list_folders(path)[0]
     listed = _read_index(folder / INDEX) if os.path.isfile(folder / INDEX) else {}
+    # Without an index, all chunks of the folder are opened.
     files = sorted(set(listed.values())) or sorted(file.name for file in folder.glob("*.torch"))
     keys = {file: {key for key, chunk in listed.items() if chunk == file} for file in files}
     return (scene for file in files for scene in _open_chunk(folder / file, keys[file]))
@@ -144,12 +146,13 @@ def _read_chunk(path: Path, _written: int) -> list[Any]:
         # Torch warns about pickle protocols just before the file is refused.
         warnings.simplefilter("ignore")
         try:
+            # Nothing is unpickled but tensors and plain values.
             content = torch.load(file, map_location="cpu", weights_only=True)
         except Exception as error:  # damaged bytes raise anything
-            held = "is truncated, no file of torch.save, or too large; download it again"
+            defect = "is truncated, no file of torch.save, or too large; download it again"
             if "GLOBAL" in str(error):
-                held = "holds pickled Python objects, which are refused: they can run any code"
-            raise InputError(f"{path} {held}.") from error
+                defect = "holds pickled Python objects, which are refused: they can run any code"
+            raise InputError(f"{path} {defect}.") from error
     require(
         isinstance(content, list) and content,
         f"{path} is no chunk: a list of scenes is needed, and it holds {type(content).__name__}.",
@@ -160,12 +163,15 @@ def _read_chunk(path: Path, _written: int) -> list[Any]:
 def _parse_scene(example: Any, path: Path, position: int) -> Photographs:
     """Check a scene without decoding its images."""
     entries = example if isinstance(example, dict) else {}
-    name, cameras, images = (entries.get(key) for key in ("key", "cameras", "images"))
+    name = entries.get("key")
+    cameras = entries.get("cameras")
+    images = entries.get("images")
     if not isinstance(name, str) or not name:
         raise InputError(f"Scene {position} of {path} has no `key`; write the chunk again with it.")
     called = f"scene {quote_value(name)} of {path}"
     if not (_is_dense(cameras, ndim=2) and cameras.is_floating_point() and cameras.shape[1] == 18):
         raise InputError(f"The `cameras` of the {called} are no floats of shape [n, 18].")
+
     files = images if isinstance(images, list) else []
     require(
         len(files) == len(cameras) > 0
@@ -194,4 +200,5 @@ def _is_dense(value: Any, ndim: int) -> TypeGuard[Tensor]:
         return False
     if value.layout != torch.strided or value.is_meta or value.is_quantized:
         return False
+    # A tensor of a damaged file may claim more entries than it stores.
     return value.untyped_storage().nbytes() >= value.numel() * value.element_size()

@@ -75,7 +75,8 @@ def load_cameras(
     """
     check_planes(near, far)
     path = require_path(path)
-    zero, frames = np.asarray(origin, dtype=np.float64), tuple(read_cameras(path, resolution))
+    frames = tuple(read_cameras(path, resolution))
+    zero = np.asarray(origin, dtype=np.float64)
     cameras = Photographs(path.stem, str(path), frames, zero, near, far)
     return [cameras.camera(number, resolution) for number in range(len(cameras))]
 
@@ -88,18 +89,17 @@ def write_cameras(
     Near and far planes are not part of the format. `file_paths` are image paths relative to its
     folder, for the `transforms.json` of a scene.
     """
-    frames = [_build_entry(camera) for camera in cameras]
+    frames: list[dict[str, object]] = []
+    for camera in cameras:
+        (fl_x, _, cx), (_, fl_y, cy), _ = camera.K.double().tolist()
+        # float64 holds a float32 exactly, and JSON writes as many digits as restore it.
+        c2w = camera.c2w.detach().cpu().double().numpy() @ OPENCV_FROM_OPENGL
+        intrinsics = {"fl_x": fl_x, "fl_y": fl_y, "cx": cx, "cy": cy}
+        size = {"w": camera.width, "h": camera.height}
+        frames.append({**intrinsics, **size, "transform_matrix": c2w.tolist()})
     if file_paths is not None:
         pairs = zip(file_paths, frames, strict=True)
         frames = [{"file_path": file_path, **frame} for file_path, frame in pairs]
     content = {"camera_model": "PINHOLE", "frames": frames}
     with replace_file(path) as file:
         file.write((json.dumps(content, indent=1) + "\n").encode())
-
-
-def _build_entry(camera: Camera) -> dict[str, object]:
-    (fl_x, _, cx), (_, fl_y, cy), _ = camera.K.double().tolist()
-    c2w = camera.c2w.detach().cpu().double().numpy() @ OPENCV_FROM_OPENGL
-    intrinsics = {"fl_x": fl_x, "fl_y": fl_y, "cx": cx, "cy": cy}
-    size = {"w": camera.width, "h": camera.height}
-    return {**intrinsics, **size, "transform_matrix": c2w.tolist()}

@@ -79,8 +79,11 @@ def _find_files(scene: Path) -> list[Path]:
     if not os.path.isdir(scene):
         return [scene]
     groups = [[scene / home / n for n in names] for home in HOMES for names in ((NAME,), SPLITS)]
-    found = ([file for file in group if os.path.isfile(file)] for group in groups)
-    return next((files for files in found if files), [])
+    for group in groups:
+        files = [file for file in group if os.path.isfile(file)]
+        if files:
+            return files
+    return []
 
 
 def _make_point_reader(files: Sequence[Path]) -> partial[Float[np.ndarray, "n 3"]] | None:
@@ -103,8 +106,9 @@ def read_frames(path: Path) -> list[Frame]:
     content = read_json(path, ADVICE)
     entries = get_part(content, "frames", list)
     require(entries, f"{path} lists no frames; its `frames` has to be a list with cameras.")
+    # Integers in depth maps are millimetres by default, as nerfstudio takes them.
     units = (get_optional_number(content, key, str(path), *DEPTH_RANGE) for key in DEPTH_UNITS)
-    unit = next(filter(None, units), 1e-3)
+    unit = next((unit for unit in units if unit is not None), 1e-3)
     listings = FolderListings()
     return [
         _parse_frame(entry, i, content, unit, path, listings) for i, entry in enumerate(entries)
@@ -131,6 +135,10 @@ def _parse_frame(
     # Of nerfstudio, or of NeRFCapture.
     depth = locate_file("depth_file_path") or locate_file("depth_path")
     c2w = get_array(entry, "transform_matrix", title, (3, 4), (4, 4))
+    if len(c2w) == 3:
+        c2w = np.vstack([c2w, [0, 0, 0, 1]])
+
+    # A path of another machine: its longest end that exists here is taken, and becomes the name.
     image = None
     name = str(position)
     is_moved = False
@@ -142,7 +150,8 @@ def _parse_frame(
     frame = Frame(
         name=name,
         title=title,
-        c2w=np.vstack([c2w, [0, 0, 0, 1]]) if len(c2w) == 3 else c2w,
+        c2w=c2w,
+        # The values of a frame take the place of those of the whole file.
         intrinsics=_parse_intrinsics({**content, **entry}, title),
         image=image,
         written=file_path if is_moved else None,
@@ -155,7 +164,9 @@ def _parse_frame(
 
 def _parse_intrinsics(entry: Mapping[str, Any], title: str) -> Intrinsics:
     def read_pair(*keys: str, low: float = -MAX_NUMBER, high: float = MAX_NUMBER) -> Pair:
-        x, y = (get_optional_number(entry, key, title, low, high) for key in keys)
+        x_key, y_key = keys
+        x = get_optional_number(entry, x_key, title, low, high)
+        y = get_optional_number(entry, y_key, title, low, high)
         return x, y
 
     focal = read_pair("fl_x", "fl_y", low=1 / MAX_NUMBER)
@@ -177,6 +188,7 @@ def _parse_distortion(entry: Mapping[str, Any], title: str) -> Distortion:
         f"The camera model '{quote_value(model)}' of {title} is not supported; undistort the "
         f"images first, or use one of {', '.join(PERSPECTIVE_MODELS + FISHEYE_MODELS)}.",
     )
+    # Not all six are listed: files omit those that are zero.
     k1, k2, k3, k4, p1, p2 = (
         get_optional_number(entry, key, title, -MAX_COEFFICIENT, MAX_COEFFICIENT) or 0.0
         for key in ("k1", "k2", "k3", "k4", "p1", "p2")

@@ -50,6 +50,7 @@ def is_video(path: Path) -> bool:
 
 def extract_frames(video: Path, folder: Path, count: int) -> None:
     """Write at most `count` sharp frames of a video, upright, as JPEGs named by their numbers."""
+    # ffmpeg shrinks the frames itself, which saves their transport; small ones stay as they are.
     size = f"'min({SMALL_SIDE},iw)':'min({SMALL_SIDE},ih)':force_original_aspect_ratio=decrease"
     with stage("Choosing frames"):
         small = read_frames(video, f"scale={size}:flags=area", is_grey=True)
@@ -70,25 +71,31 @@ def measure_frames(frames: Iterable[Image8]) -> tuple[Values, Values]:
 
     Motion is in steps of `STEP`; the fraction is the way from the last reference frame.
     """
-    sharpness, motion = list[float](), list[float]()
-    reference, corners, steps = np.zeros((0, 0), np.uint8), None, 0
+    sharpness = list[float]()
+    motion = list[float]()
+    reference = np.zeros((0, 0), np.uint8)
+    corners = None
+    steps = 0
     for frame in frames:
         sharpness.append(float(cv2.Laplacian(frame, cv2.CV_32F).var()))
+        # The fraction of a step that the frame has moved; a full step makes it the next reference.
         share = 0.0 if corners is None else _measure_motion(reference, corners, frame)
         motion.append(steps + share)
         steps += share == 1
         if share == 1 or corners is None:
-            reference, distance = frame, max(frame.shape) / 40
+            reference = frame
+            # Corners in a grid of at least 1/40 of the image, so that they spread over all of it.
+            distance = max(frame.shape) / 40
             corners = cv2.goodFeaturesToTrack(frame, NUM_CORNERS, 0.01, distance)
     return np.array(sharpness), np.array(motion)
 
 
 def _measure_motion(reference: Image8, corners: Corners, frame: Image8) -> float:
     """Measure the motion of most corners in steps, at most 1; 1 if too many are lost."""
-    found, status, _ = cv2.calcOpticalFlowPyrLK(reference, frame, corners, corners.copy())
+    corners_now, status, _ = cv2.calcOpticalFlowPyrLK(reference, frame, corners, corners.copy())
     if status.mean() < MIN_TRACKED:
         return 1.0
-    moved = np.linalg.norm((found - corners)[status == 1], axis=-1)
+    moved = np.linalg.norm((corners_now - corners)[status == 1], axis=-1)
     return min(float(np.quantile(moved, QUANTILE)) / (STEP * max(frame.shape)), 1.0)
 
 
@@ -97,7 +104,9 @@ def select_frames(sharpness: Values, motion: Values, count: int) -> list[int]:
 
     Selected frames are at least half a window apart; a window may have none.
     """
-    selected, last = list[int](), -np.inf
+    selected = list[int]()
+    last = -np.inf
+    # Windows of whole steps: the camera has moved by as much in each, however fast it went.
     steps = int(motion.max(initial=-1)) + 1
     windows = min(count, steps)
     for start, end in pairwise(steps * n // windows for n in range(windows + 1) if windows):

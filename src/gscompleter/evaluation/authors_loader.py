@@ -62,6 +62,7 @@ class AuthorsLoader(Settings):
         kept: list[Split] = []
         reasons: list[str] = []
         for split in protocol.select_splits(clip):
+            # Frames beyond the end are reported with the protocol (`make_tasks`).
             frames = [frame for frame in (*split.context, *split.targets) if frame < len(clip)]
             reason = self.find_skip_reason(clip, frames)
             if reason is None:

@@ -48,7 +48,8 @@ class Case:
     @property
     def name(self) -> str:
         """Scene, context frames and target in one line."""
-        return f"{self.scene.name} {'+'.join(map(str, self.context))}>{self.target}"
+        frames = "+".join(str(frame) for frame in self.context)
+        return f"{self.scene.name} {frames}>{self.target}"
 
     def load(self, frames: tuple[int, ...]) -> list[View]:
         """Load the photographs of `frames`."""
@@ -63,7 +64,7 @@ def read_cases(path: Path) -> list[Case]:
     """Read the cases of a file."""
     content = read_json(path, "name a file of cases")
     try:
-        height, width = map(_check_whole, content["resolution"])
+        height, width = (_check_whole(side) for side in content["resolution"])
         return [_parse_case(row, (height, width), path) for row in content["cases"]]
     except (ValueError, KeyError, TypeError, OverflowError) as error:
         raise InputError(
@@ -73,15 +74,22 @@ def read_cases(path: Path) -> list[Case]:
 
 
 def _parse_case(row: Any, resolution: tuple[int, int], path: Path) -> Case:
+    def get_plane(key: str) -> float | None:
+        return None if row.get(key) is None else float(row[key])
+
     return Case(
         path.parent / os.path.expandvars(row["scene"]),
-        tuple(map(_check_whole, row["context"])),
+        _check_whole_numbers(row["context"]),
         _check_whole(row["target"]),
-        tuple(map(_check_whole, row.get("neighbours", ()))),
+        _check_whole_numbers(row.get("neighbours", ())),
         resolution,
-        None if row.get("near") is None else float(row["near"]),
-        None if row.get("far") is None else float(row["far"]),
+        get_plane("near"),
+        get_plane("far"),
     )
+
+
+def _check_whole_numbers(values: Any) -> tuple[int, ...]:
+    return tuple(_check_whole(value) for value in values)
 
 
 def _check_whole(value: Any) -> int:

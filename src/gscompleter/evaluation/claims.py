@@ -64,9 +64,19 @@ def tabulate_claims(folder: Path, claims: Iterable[Claim]) -> list[list[str]]:
     """Judge the claims by the tables in a folder; return a row for each, below `HEAD`."""
     rows = []
     for claim in claims:
-        made = judge_claim(folder, claim)
-        texts = (made.measured, made.t_test, made.in_favour, made.sign_test, made.verdict)
-        rows.append([claim.says, claim.paper, claim.table, *texts])
+        judgement = judge_claim(folder, claim)
+        rows.append(
+            [
+                claim.says,
+                claim.paper,
+                claim.table,
+                judgement.measured,
+                judgement.t_test,
+                judgement.in_favour,
+                judgement.sign_test,
+                judgement.verdict,
+            ]
+        )
     return rows
 
 
@@ -79,6 +89,7 @@ def judge_claim(folder: Path, claim: Claim) -> Judgement:
     column = BY_KEY[claim.column]
     sign = 1 if claim.better == "higher" else -1
     differences = compare_spans(rows, claim) if claim.over_spans else compare_rows(rows, claim)
+    # FID and the like are of all images at once: without a value per case there is nothing to pair.
     if not differences:
         return compare_totals(rows, claim, column, sign)
     return judge_differences(differences, column, sign)
@@ -86,40 +97,40 @@ def judge_claim(folder: Path, claim: Claim) -> Judgement:
 
 def judge_differences(differences: Mapping[str, float], column: Column, sign: int) -> Judgement:
     """Judge paired differences by case; `sign` is 1 if the claim wants them positive, else -1."""
-    found = estimate_mean(differences)
+    estimate = estimate_mean(differences)
     signs = count_signs(differences, sign)
-    measured = f"{column.title} {found.mean:+.{column.digits}f}"
-    if found.error is None:
+    measured = f"{column.title} {estimate.mean:+.{column.digits}f}"
+    if estimate.error is None:
         return Judgement("one scene only", measured, in_favour=signs.describe())
-    measured += f" ± {found.error:.{column.digits}f}"
+    measured += f" ± {estimate.error:.{column.digits}f}"
     if signs.in_favour == signs.against == 0:
         return Judgement("no difference", measured, in_favour=signs.describe())
     return Judgement(
-        choose_verdict(found, signs, sign),
+        choose_verdict(estimate, signs, sign),
         measured,
-        describe_t_test(found),
+        describe_t_test(estimate),
         signs.describe(),
         describe_p(signs.p_value),
     )
 
 
-def choose_verdict(found: Estimate, signs: Signs, sign: int) -> str:
+def choose_verdict(estimate: Estimate, signs: Signs, sign: int) -> str:
     """Choose the verdict: by the t test, or else by the signs, or else noise."""
-    if not found.is_noise:
-        return "reproduced" if sign * found.mean > 0 else "not reproduced"
+    if not estimate.is_noise:
+        return "reproduced" if sign * estimate.mean > 0 else "not reproduced"
     if signs.p_value <= SIGNIFICANCE:
         is_favourable = signs.in_favour > signs.against
         return "reproduced by signs" if is_favourable else "not reproduced, by signs"
     return "within noise"
 
 
-def describe_t_test(found: Estimate) -> str:
+def describe_t_test(estimate: Estimate) -> str:
     """Return the statistic with its degrees of freedom and its p."""
-    assert found.error is not None
-    statistic = f"t({found.degrees_of_freedom})"
-    if found.error > 0:
-        statistic += f" = {found.mean / found.error:.2f}"
-    return f"{statistic}, {describe_p(found.p_value)}"
+    assert estimate.error is not None
+    statistic = f"t({estimate.degrees_of_freedom})"
+    if estimate.error > 0:
+        statistic += f" = {estimate.mean / estimate.error:.2f}"
+    return f"{statistic}, {describe_p(estimate.p_value)}"
 
 
 def describe_p(value: float) -> str:
@@ -149,6 +160,7 @@ def compare_rows(rows: Rows, claim: Claim) -> dict[str, float]:
     for row in rows:
         if row["method"] in values:
             cases = row["cells"][claim.column]["cases"] or {}
+            # A case occurs in several models and protocols, where it is another case.
             where = f"|{row['model']}|{row['protocol']}"
             values[row["method"]] |= {case + where: value for case, value in cases.items()}
     others = values[claim.baseline]
@@ -163,10 +175,14 @@ def compare_spans(rows: Rows, claim: Claim) -> dict[str, float]:
     protocols = list(dict.fromkeys(row["protocol"] for row in rows))
     if len(protocols) < 2:
         return {}
-    first, last = (
-        average_scenes(compare_rows([row for row in rows if row["protocol"] == name], claim))
-        for name in (protocols[0], protocols[-1])
-    )
+
+    def average_protocol(name: str) -> dict[str, float]:
+        differences = compare_rows([row for row in rows if row["protocol"] == name], claim)
+        return average_scenes(differences)
+
+    first = average_protocol(protocols[0])
+    last = average_protocol(protocols[-1])
+    # `get_scene` takes the scene from the name of a case, so that these names need a last word.
     return {f"{scene} -": last[scene] - value for scene, value in first.items() if scene in last}
 
 

@@ -42,9 +42,11 @@ class Column:
 
     def get_value(self, step: StepRow) -> float | None:
         """Return the number of a step; None without ground truth."""
+        # A score of few pixels says more about them than about the method.
         if self.pixels is not None and (find_number(step, self.pixels) or 0) < MIN_PIXELS:
             return None
         value = find_number(step, self.path)
+        # A list has a number for each view; the subtracted ones are then as many.
         if value is not None and self.minus is not None:
             value = np.subtract(value, find_number(step, self.minus)).tolist()
         if isinstance(value, list):
@@ -53,20 +55,21 @@ class Column:
 
     def compute_row(self, row: RunRow) -> float | None:
         """Compute the value of a task, or None if no step has one."""
-        values = [value for step in row["steps"] if (value := self.get_value(step)) is not None]
-        return self.reduce_steps(values) if values else None
+        values = [self.get_value(step) for step in row["steps"]]
+        known = [value for value in values if value is not None]
+        return self.reduce_steps(known) if known else None
 
 
 def find_number(step: StepRow, path: str) -> Any:
     """Return the number at a place in a step or its scores, one per view, or None."""
     is_direct = path in step or path.startswith("seconds.")
-    found: Any = step if is_direct else step["scores"]
+    value: Any = step if is_direct else step["scores"]
     for key in path.split("."):
-        if isinstance(found, list):
-            found = [view[key] for view in found]
+        if isinstance(value, list):
+            value = [view[key] for view in value]
         else:
-            found = None if found is None else found.get(key)
-    return found
+            value = None if value is None else value.get(key)
+    return value
 
 
 def _make_median(key: str, title: str, digits: int, path: str) -> Column:
@@ -91,9 +94,13 @@ def _make_agreements(path: str, title: str, key: str = "registered") -> tuple[Co
     )
 
 
-BEFORE, AFTER = "target_before.psnr", "target_after.psnr"
-NEAR_BEFORE, NEAR_AFTER = "neighbours_psnr.before", "neighbours_psnr.after"
-SEEN_BEFORE, SEEN_AFTER = "context_psnr.before", "context_psnr.after"
+# Places of PSNR at the target, beside it, and at the photographs of the context.
+BEFORE = "target_before.psnr"
+AFTER = "target_after.psnr"
+NEAR_BEFORE = "neighbours_psnr.before"
+NEAR_AFTER = "neighbours_psnr.after"
+SEEN_BEFORE = "context_psnr.before"
+SEEN_AFTER = "context_psnr.after"
 PSNR_BEFORE = Column("psnr_before", "PSNR before", 2, BEFORE)
 PSNR = Column("psnr", "PSNR", 2, AFTER)
 GAIN = Column("gain", "ΔPSNR", 2, AFTER, BEFORE)

@@ -45,16 +45,17 @@ def list_cases(runs: Mapping[str, Path], methods: Sequence[str]) -> list[FigureC
                 for number in range(1, len(row["steps"]) + 1):
                     case = FigureCase(row["task"]["name"], number)
                     common[case] = common.get(case, 0) + 1
+    # A case is complete if every run has a row of every method for it.
     return [case for case, count in common.items() if count == len(runs) * len(methods)]
 
 
 def select_cases(cases: Sequence[FigureCase], names: Sequence[str]) -> list[FigureCase]:
     """Select the cases of these names, or the first ones; raise InputError if there are none."""
-    found = [case for case in cases if not names or case.name in names]
-    if not found:
+    selected = [case for case in cases if not names or case.name in names]
+    if not selected:
         known = ", ".join(f"'{case.name}'" for case in cases) or "none"
         raise InputError(f"No case for the figure was completed by all methods; there are {known}.")
-    return found if names else found[:MAX_ROWS]
+    return selected if names else selected[:MAX_ROWS]
 
 
 def draw_figure(
@@ -73,13 +74,20 @@ def draw_figure(
     columns = list_columns(spec, runs)
     rows = []
     for case in cases:
-        holes = read_holes(next(iter(runs.values())), spec, case)
+        # The mask before the completion, which all methods share.
+        task = store.get_task_folder(next(iter(runs.values())), case.name)
+        step = store.get_step_path(task, spec.list_methods()[0], case.number)
+        mask = read_pixels(step.with_name(f"holes-{case.number:03d}.png"))
+        holes = mask[..., 0].copy()
+
         images = [read_figure_image(folder, image, case) for _, folder, image in columns]
         box = find_widest_hole(holes)
+        # Holes are those at the target: a given photograph is seen from elsewhere.
         marked = [
             draw_outline(image, holes) if outlines and not name.startswith(PHOTOGRAPH) else image
             for image, (_, _, name) in zip(images, columns, strict=True)
         ]
+
         title = f"{case.name} ({case.number})" if case.number > 1 else case.name
         rows.append((title, marked))
         if crops:
@@ -89,11 +97,13 @@ def draw_figure(
 
 def list_columns(spec: FigureSpec, runs: Mapping[str, Path]) -> list[tuple[str, Path, str]]:
     """List title, run and image of the columns: methods for each model, photographs once."""
-    first, columns = next(iter(runs.values())), []
+    first = next(iter(runs.values()))
+    columns = []
     methods = spec.list_methods()
     for image in spec.images:
         if is_photograph(image):
             columns.append((image.replace(PHOTOGRAPH, "photograph "), first, image))
+        # All methods stand where the first one is named, model by model.
         elif image == methods[0]:
             for model, folder in runs.items():
                 prefix = f"{model}\n" if len(runs) > 1 else ""
@@ -111,13 +121,6 @@ def read_figure_image(folder: Path, image: str, case: FigureCase) -> np.ndarray:
     return read_pixels(store.get_step_path(task, image, case.number).with_suffix(".png"))
 
 
-def read_holes(folder: Path, spec: FigureSpec, case: FigureCase) -> np.ndarray:
-    """Read the hole mask at a target, before its completion, as uint8 [h, w] of 0 and 255."""
-    task = store.get_task_folder(folder, case.name)
-    step = store.get_step_path(task, spec.list_methods()[0], case.number)
-    return read_pixels(step.with_name(f"holes-{case.number:03d}.png"))[..., 0].copy()
-
-
 def draw_outline(image: np.ndarray, holes: np.ndarray) -> np.ndarray:
     """Draw the outline of the holes."""
     contours, _ = cv2.findContours(holes, cv2.RETR_LIST, cv2.CHAIN_APPROX_NONE)
@@ -127,11 +130,11 @@ def draw_outline(image: np.ndarray, holes: np.ndarray) -> np.ndarray:
 def find_widest_hole(holes: np.ndarray) -> tuple[slice, slice]:
     """Return rows and columns of a square around the middle of the widest hole."""
     side = round(CROP * min(holes.shape))
+    # The pixel farthest from the rim is the middle of the widest hole.
     *_, (x, y) = cv2.minMaxLoc(cv2.distanceTransform(holes, cv2.DIST_L2, 3))
-    top, left = (
-        min(max(center - side // 2, 0), size - side)
-        for center, size in zip((y, x), holes.shape, strict=True)
-    )
+    height, width = holes.shape
+    top = min(max(y - side // 2, 0), height - side)
+    left = min(max(x - side // 2, 0), width - side)
     return slice(top, top + side), slice(left, left + side)
 
 
@@ -146,10 +149,12 @@ def save_grid(
         raise InputError(
             f"Figures need matplotlib ({error}); run `pip install gscompleter[evaluation]`."
         ) from error
+
     heights = [images[0].shape[0] / images[0].shape[1] for _, images in rows]
     size = (IMAGE_INCHES * len(titles) + 0.3, IMAGE_INCHES * sum(heights) + 0.5)
     layout = ConstrainedLayoutEngine(w_pad=0.01, h_pad=0.01, wspace=0, hspace=0, compress=True)
     figure = Figure(figsize=size, layout=layout)
+
     grid: Any = figure.subplots(len(rows), len(titles), squeeze=False, height_ratios=heights)
     for line, (name, images) in zip(grid, rows, strict=True):
         for axes, image in zip(line, images, strict=True):
@@ -159,6 +164,7 @@ def save_grid(
         line[0].set_ylabel(name, fontsize=5)
     for axes, title in zip(grid[0], titles, strict=True):
         axes.set_title(title, fontsize=7)
+    # Dates and versions in the metadata would make each file differ.
     for suffix, metadata in ((".png", {"Software": None}), (".pdf", {"CreationDate": None})):
         with replace_file(path.with_name(path.name + suffix)) as file:
             figure.savefig(file, format=suffix[1:], dpi=DPI, metadata=metadata, bbox_inches="tight")

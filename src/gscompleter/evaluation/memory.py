@@ -27,6 +27,8 @@ def measure_peak_memory(device: torch.device | str = "cpu") -> Iterator[Peak]:
         return
     is_reset = False
     with suppress(OSError):
+        # Linux: this value resets the peak of resident memory (`man 5 proc`). Containers may forbid
+        # it.
         Path("/proc/self/clear_refs").write_bytes(b"5")
         is_reset = True
     yield peak
@@ -36,6 +38,8 @@ def measure_peak_memory(device: torch.device | str = "cpu") -> Iterator[Peak]:
 def read_process_peak() -> int | None:
     """Read the peak resident memory of this process, or None if the system does not report it."""
     with suppress(OSError):
-        if most := re.search(rb"VmHWM:\s*([0-9]+) kB", Path("/proc/self/status").read_bytes()):
-            return 1024 * int(most[1])
+        status = Path("/proc/self/status").read_bytes()
+        peak = re.search(rb"VmHWM:\s*([0-9]+) kB", status)
+        if peak is not None:
+            return 1024 * int(peak[1])
     return None

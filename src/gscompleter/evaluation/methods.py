@@ -80,9 +80,14 @@ def make_completion_method(config: str) -> Method:
         completer = replace(models.make_completer(config), keep_registered=True)
         views = [replace(view, dynamic_mask=None) for view in state.views]  # another config's
         done = completer.advance(completer.begin(views, state.scene), target)
-        (made,) = done.targets
+        (result,) = done.targets
         return Prediction(
-            done.scene, made.added, done.seconds, made.anchor, made.anchor_fallback, made.registered
+            done.scene,
+            result.added,
+            done.seconds,
+            result.anchor,
+            result.anchor_fallback,
+            result.registered,
         )
 
     return method
@@ -159,9 +164,9 @@ BASELINES: dict[str, Method] = {
 SCENE_CHANGING = ("densify-100", "densify-800", "distill")
 """Methods that change existing Gaussians and therefore cannot run a sequence."""
 
-_ABLATIONS = {"unconstrained" if name == "3-dof" else name: name for name in ABLATIONS}
 # Method name to config name. Three degrees of freedom are no ablation: the paper compares the ray
 # constraint with them.
+_ABLATIONS = {"unconstrained" if name == "3-dof" else name: name for name in ABLATIONS}
 
 METHODS: dict[str, Method] = {
     "context": keep_scene,

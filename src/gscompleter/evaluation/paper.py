@@ -15,8 +15,10 @@ from gscompleter.config.generators import GeneratorOptions
 from gscompleter.config.settings import Settings
 from gscompleter.evaluation.authors_loader import AuthorsLoader
 
-TRUTH, PHOTOGRAPH = "truth", "context-"
-"""Names of the images of a figure that are no method."""
+TRUTH = "truth"
+"""Name of the photograph of the target, among the images of a figure."""
+PHOTOGRAPH = "context-"
+"""Beginning of the names of the given photographs."""
 
 
 @dataclass(frozen=True)

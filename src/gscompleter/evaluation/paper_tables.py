@@ -54,6 +54,7 @@ class Estimate:
         """Two-sided p of Student's t test that the mean is zero; 1 for a single scene."""
         if self.error is None or self.mean == 0:
             return 1.0
+        # Student's t with infinite statistic: all scenes have the same difference.
         if self.error == 0:
             return 0.0
         return float(2 * student_t.sf(abs(self.mean) / self.error, self.degrees_of_freedom))
@@ -122,6 +123,7 @@ def estimate_mean(values: Mapping[str, float]) -> Estimate:
     The error is sqrt(G / (G - 1) Σ_g (Σ_i∈g (x_i - mean))²) / n for n cases of G scenes.
     """
     mean = statistics.fmean(values.values())
+    # Residuals of one scene are added before they are squared, as they may be correlated.
     sums: dict[str, float] = defaultdict(float)
     for case, value in values.items():
         sums[get_scene(case)] += value - mean
@@ -134,15 +136,17 @@ def estimate_mean(values: Mapping[str, float]) -> Estimate:
 
 def compare_cases(values: Mapping[str, float], others: Mapping[str, float]) -> Estimate | None:
     """Average the differences over the cases that both have; None if there are none."""
-    common = {case: value - others[case] for case, value in values.items() if case in others}
-    return estimate_mean(common) if common else None
+    differences = {case: value - others[case] for case, value in values.items() if case in others}
+    return estimate_mean(differences) if differences else None
 
 
 def fill_table(spec: TableSpec, runs: Mapping[tuple[str, str], Path]) -> PaperTable:
     """Fill a table from runs of `evaluate`, given by model and protocol."""
     rows: list[TableRow] = []
-    counts, notes = {}, []
+    counts = {}
+    notes = []
     for (model, protocol), folder in runs.items():
+        # Every method is averaged over the same cases, those that all finished.
         summary = summarize_run([r for r in read_rows(folder) if r["method"] in spec.methods])
         fids = compute_fids(folder, summary) if "fid" in spec.columns else {}
         notes += [f"Failed: {' '.join(failure)}" for failure in summary.failures]
@@ -150,6 +154,7 @@ def fill_table(spec: TableSpec, runs: Mapping[tuple[str, str], Path]) -> PaperTa
         counts[f"{model}, {protocol}" if protocol else model] = len(summary.common_tasks)
         for method in spec.methods:
             cells = fill_cells(spec, summary, method)
+            # FID is one number of all images, without a case to pair.
             if not isinstance(fids, str) and fids:
                 cells["fid"] = Cell(fids[method])
             rows.append(TableRow(model, protocol, method, cells))
@@ -159,20 +164,24 @@ def fill_table(spec: TableSpec, runs: Mapping[tuple[str, str], Path]) -> PaperTa
 def fill_cells(spec: TableSpec, summary: RunSummary, method: str) -> dict[str, Cell]:
     """Fill the cells of a method, by the key of their column."""
     values = collect_values(summary, method, spec.columns)
-    others = collect_values(summary, spec.baseline, spec.columns)
-    return {
-        key: fill_cell(BY_KEY[key], values[key], {} if method == spec.baseline else others[key])
-        for key in spec.columns
-    }
+    # The baseline itself has no difference to show.
+    others: dict[str, dict[str, float]] = {key: {} for key in spec.columns}
+    if method != spec.baseline:
+        others = collect_values(summary, spec.baseline, spec.columns)
+    return {key: fill_cell(BY_KEY[key], values[key], others[key]) for key in spec.columns}
 
 
 def collect_values(
     summary: RunSummary, method: str, columns: Sequence[str]
 ) -> dict[str, dict[str, float]]:
     """Collect the values of a method in each column, by case."""
-    pairs = list(zip(summary.common_tasks, summary.rows[method], strict=True))
-    values = {key: {task: BY_KEY[key].compute_row(row) for task, row in pairs} for key in columns}
-    return {key: {t: v for t, v in of.items() if v is not None} for key, of in values.items()}
+    values: dict[str, dict[str, float]] = {key: {} for key in columns}
+    for key in columns:
+        for task, row in zip(summary.common_tasks, summary.rows[method], strict=True):
+            value = BY_KEY[key].compute_row(row)
+            if value is not None:
+                values[key][task] = value
+    return values
 
 
 def fill_cell(column: Column, values: dict[str, float], baseline: Mapping[str, float]) -> Cell:
@@ -181,9 +190,10 @@ def fill_cell(column: Column, values: dict[str, float], baseline: Mapping[str, f
         return Cell(None)
     if column.reduce_tasks is not statistics.fmean:
         return Cell(column.reduce_tasks([*values.values()]), cases=values)
-    found, difference = estimate_mean(values), compare_cases(values, baseline)
+    estimate = estimate_mean(values)
+    difference = compare_cases(values, baseline)
     is_noise = difference is None or difference.is_noise
-    return Cell(found.mean, found.error, difference, is_noise, values)
+    return Cell(estimate.mean, estimate.error, difference, is_noise, values)
 
 
 def write_paper_table(path: Path, table: PaperTable) -> None:
@@ -210,11 +220,15 @@ def format_rows(
         "protocol": lambda row: row.protocol,
         "method": lambda row: row.method,
     }
-    shown = {t: get for t, get in names.items() if len(set(map(get, table.rows))) > 1}
+    shown = {
+        title: get_name
+        for title, get_name in names.items()
+        if len({get_name(row) for row in table.rows}) > 1
+    }
     shown["method"] = names["method"]
     head = [*shown, *(column.title for column in table.columns)]
     rows = [
-        [*(get(row) for get in shown.values())]
+        [get_name(row) for get_name in shown.values()]
         + [format_cell(column, row.cells[column.key]) for column in table.columns]
         for row in table.rows
     ]
@@ -223,7 +237,8 @@ def format_rows(
 
 def format_number(column: Column, cell: Cell, error: str, difference: str) -> str:
     """Format a cell with templates of its error and its difference."""
-    text, digits = format_score(cell.value, column.digits), column.digits
+    text = format_score(cell.value, column.digits)
+    digits = column.digits
     if cell.error is not None:
         text += error.format(f"{cell.error:.{digits}f}")
     if cell.difference is not None:
@@ -254,6 +269,7 @@ def format_paper_latex(table: PaperTable) -> str:
     """Format a table with booktabs."""
     cell = partial(format_number, error=r"{{\tiny$\pm${}}}", difference=r"~{{\tiny({})}}")
     text = format_latex(*format_rows(table, cell))
+    # pdfLaTeX knows none of these characters.
     for sign, command in {"≈": r"$\approx$", "Ψ": r"$\Psi$", "Δ": r"$\Delta$"}.items():
         text = text.replace(sign, command)
     return f"% {table.spec.title}\n{text}\n"

@@ -92,7 +92,10 @@ class IndexFile:
 def parse_protocol(text: str) -> EvaluationProtocol:
     """Parse a protocol: `n-10`, `n-10-stride-5`, `stress`, `sequence-4`, or a path."""
     for pattern, split in FRAME_RULES.items():
-        if match := re.fullmatch(pattern, text):
+        match = re.fullmatch(pattern, text)
+        if match is not None:
+            # Names of groups in the pattern are the parameters of the function; optional ones may
+            # be absent.
             numbers = {key: int(n) for key, n in match.groupdict().items() if n}
             if 0 in numbers.values() or numbers.get("steps", 0) > MAX_TARGET_ID:
                 raise InputError(
@@ -100,6 +103,7 @@ def parse_protocol(text: str) -> EvaluationProtocol:
                     f"steps at most {MAX_TARGET_ID}."
                 )
             return FrameRule(text, partial(split, **numbers))
+
     if os.path.isfile(text):
         return read_evaluation_index(Path(text))
     if text in list_indices():
@@ -118,11 +122,12 @@ def list_indices() -> list[str]:
 
 def extrapolate(num_frames: int, k: int, stride: int | None = None) -> tuple[Split, ...]:
     """Choose n, n + k → n + 2k and n + 2k, n + k → n, for n = 0, stride, 2 stride, …."""
-    return tuple(
-        split
-        for n in range(0, num_frames - 2 * k, stride or 2 * k + 1)
-        for split in (Split((n, n + k), (n + 2 * k,)), Split((n + 2 * k, n + k), (n,)))
-    )
+    # By default, the frames of one n and of the next do not overlap.
+    splits = []
+    for n in range(0, num_frames - 2 * k, stride or 2 * k + 1):
+        splits.append(Split((n, n + k), (n + 2 * k,)))
+        splits.append(Split((n + 2 * k, n + k), (n,)))
+    return tuple(splits)
 
 
 def split_stress_test(num_frames: int, k: int = 30, target: int = 99) -> tuple[Split, ...]:
@@ -163,19 +168,21 @@ def read_evaluation_index(path: Path) -> EvaluationIndex:
     """Read an evaluation index, published or of `write_evaluation_index`."""
     content = read_json(path, "download it again")
     if not isinstance(content, dict) or "version" not in content:
+        # A published index names the scene alone; the rest is added.
         content = {"version": VERSION, "protocol": path.stem, "scenes": content}
     try:
         file = TypeAdapter(IndexFile).validate_json(json.dumps(content), strict=True)
     except ValidationError as error:
-        wrong = error.errors(include_url=False)[0]
-        place = quote_value(".".join(map(str, wrong["loc"])))
+        defect = error.errors(include_url=False)[0]
+        place = quote_value(".".join(str(part) for part in defect["loc"]))
         raise InputError(
-            f"{path} is no evaluation index of version {VERSION} ({place}: {wrong['msg']}); it has "
-            "to map the name of each scene to its context and target frames, or to null."
+            f"{path} is no evaluation index of version {VERSION} ({place}: {defect['msg']}); it "
+            "has to map the name of each scene to its context and target frames, or to null."
         ) from None
+    # A scene has one split, several, or null, which leaves it out.
     scenes = {
-        name: (found,) if isinstance(found, Split) else found or ()
-        for name, found in file.scenes.items()
+        name: (splits,) if isinstance(splits, Split) else splits or ()
+        for name, splits in file.scenes.items()
     }
     return EvaluationIndex(file.protocol, scenes)
 
@@ -183,6 +190,7 @@ def read_evaluation_index(path: Path) -> EvaluationIndex:
 def write_evaluation_index(path: Path | str, index: EvaluationIndex) -> None:
     """Write an index atomically, in the format that `read_evaluation_index` reads."""
     scenes = {
+        # An empty list would not be valid, and null says the same.
         name: [{"context": s.context, "target": s.targets} for s in splits] or None
         for name, splits in index.scenes.items()
     }
@@ -210,9 +218,11 @@ class Task:
     @property
     def name(self) -> str:
         """Unique name of the task in a run, as in tables."""
-        first, last = self.targets[0], self.targets[-1]
+        first = self.targets[0]
+        last = self.targets[-1]
         span = f"{first}" if first == last else f"{first}..{last}"
-        return f"{self.scene} {'+'.join(map(str, self.context))}>{span}"
+        frames = "+".join(str(frame) for frame in self.context)
+        return f"{self.scene} {frames}>{span}"
 
 
 def make_case_task(case: Case) -> Task:

@@ -104,6 +104,7 @@ def evaluate(
     check_methods(methods, max((len(task.targets) for task in tasks), default=0))
     check_shard(*shard)
     check_tasks(tasks)
+    # Once before all tasks: missing weights are then an error of the call, not of each task.
     config.load_models(())
     store.claim(out, collect_settings(config))
     share = tasks[shard[0] :: shard[1]]
@@ -112,7 +113,9 @@ def evaluate(
         for row in runner.find_rows(task):
             if rerun == "scores" or (rerun == "failures" and has_failed(row)):
                 row.unlink(missing_ok=True)
+
     todo = {row: task for task in share for row in runner.find_missing_rows(task)}
+    # Jobs are tasks: what all methods share is prepared once in a worker.
     named = {store.make_file_name(task.name): task for task in todo.values()}
     jobs = [Job(name, {"task": task}) for name, task in named.items()]
 
@@ -123,7 +126,7 @@ def evaluate(
     # Cases are counted: the rows of all methods of a case come to light together.
     for _ in track(ended, "evaluating case", len(jobs)):
         pass
-    failed = sum(map(has_failed, todo))
+    failed = sum(has_failed(row) for row in todo)
     skipped = len(share) * len(runner.methods) - len(todo)
     return RowCounts(len(todo) - failed, failed, skipped, list_failures(runner, share))
 
@@ -168,10 +171,11 @@ class TaskRunner:
         for row, method in self.find_missing_rows(task).items():
             # Progress inside a task would flood a log.
             with stage(f"{task.name}, {method}"), show_progress(None):
+                # Prepared once, by the first method whose row is missing.
                 if prepared is None:
                     prepared = attempt(partial(prepare_task, task, folder, self.config))
-                made = build_row(task, method, prepared, folder)
-            write_json(row, made)
+                content = build_row(task, method, prepared, folder)
+            write_json(row, content)
 
 
 def prepare_task(task: Task, folder: Path, config: RunConfig) -> PreparedTask:
@@ -182,18 +186,23 @@ def prepare_task(task: Task, folder: Path, config: RunConfig) -> PreparedTask:
     targets = load_task_views(task, task.targets, config)
     neighbours = load_task_views(task, task.neighbours, config)
     images = [*views, *targets]
+    # Images too large for the memory are refused before the models are loaded.
     check_memory(max(v.camera.width * v.camera.height for v in images), len(images))
     models = config.load_models(targets)
     context = load_or_reconstruct(folder / "context.pt", views, models)
 
-    def set_range(view: View) -> View:
-        return replace(view, camera=replace(view.camera, near=context.near, far=context.far))
+    # All methods get the depth range that the scene was reconstructed in.
+    def set_ranges(views: Sequence[View]) -> tuple[View, ...]:
+        return tuple(
+            replace(view, camera=replace(view.camera, near=context.near, far=context.far))
+            for view in views
+        )
 
     return PreparedTask(
         context.gaussians,
-        tuple(map(set_range, normalize_exposures(views, context.gains))),
-        tuple(map(set_range, targets)),
-        tuple(map(set_range, neighbours)),
+        set_ranges(normalize_exposures(views, context.gains)),
+        set_ranges(targets),
+        set_ranges(neighbours),
         models,
         context.seconds,
     )
@@ -211,15 +220,19 @@ def load_or_reconstruct(path: Path, views: Sequence[View], models: Models) -> st
     """Load the scene saved at `path`, or reconstruct and save it."""
     if not store.is_complete(path):
         with record_seconds() as seconds:
-            made = reconstruct_context(models.reconstructor, views)
-        camera, source = made.views[0].camera, made.source
+            context = reconstruct_context(models.reconstructor, views)
+        camera = context.views[0].camera
         assert camera.near is not None
         assert camera.far is not None
-        near, far = float(camera.near), float(camera.far)
-        found = store.SavedContext(
-            source.gaussians, near, far, seconds["total"], made.exposure_gains
+        saved = store.SavedContext(
+            context.source.gaussians,
+            float(camera.near),
+            float(camera.far),
+            seconds["total"],
+            context.exposure_gains,
         )
-        store.save_values(path, vars(found))
+        store.save_values(path, vars(saved))
+    # Always read back, so that a resumed run continues with the same tensors.
     return store.SavedContext(**store.load_values(path, views[0].image.device))
 
 
@@ -227,13 +240,13 @@ def build_row(
     task: Task, method: str, prepared: PreparedTask | str, folder: Path
 ) -> dict[str, Any]:
     """Build the row of a method on a task; `prepared` may be an error instead of a task."""
-    found: dict[str, Any] = {"error": prepared, "reconstruct_seconds": None, "steps": []}
+    outcome: dict[str, Any] = {"error": prepared, "reconstruct_seconds": None, "steps": []}
     if not isinstance(prepared, str):
         progress = complete_task(prepared, method, folder)
         steps = [asdict(step) for step in progress.steps]
-        found = {"error": progress.error, "reconstruct_seconds": prepared.seconds, "steps": steps}
+        outcome = {"error": progress.error, "reconstruct_seconds": prepared.seconds, "steps": steps}
     named = {key: getattr(task, key) for key in ("name", "context", "targets", "neighbours")}
-    return {"version": store.VERSION, "task": named, "method": method, **found}
+    return {"version": store.VERSION, "task": named, "method": method, **outcome}
 
 
 def check_tasks(tasks: Sequence[Task]) -> None:

@@ -83,11 +83,13 @@ def complete_task(task: PreparedTask, method: str, folder: Path) -> Progress:
             break
         progress = following
 
-    def set_end(step: Step, target: View) -> Step:
+    # Later steps change what is seen at earlier targets, so all are scored once more at the end.
+    # After a failure, there are fewer steps than targets.
+    steps = []
+    for step, target in zip(progress.steps, task.targets, strict=False):
         image = task.models.renderer.render(progress.scene, target.camera).image
-        return replace(step, psnr_end=scoring.compute_view_psnr(image, target))
-
-    return replace(progress, steps=tuple(map(set_end, progress.steps, task.targets)))
+        steps.append(replace(step, psnr_end=scoring.compute_view_psnr(image, target)))
+    return replace(progress, steps=tuple(steps))
 
 
 def advance_task(
@@ -95,13 +97,14 @@ def advance_task(
 ) -> Progress:
     """Complete one more target and save its prediction and images."""
     number = len(progress.steps) + 1
+    # Always with the scene as it is, so that an anchor may be the photograph of an earlier target.
     state = task.models.make_completer().begin(progress.views, progress.scene)
     path = store.get_step_path(folder, method, number)
     if not store.is_complete(path):
         with measure_peak_memory(state.scene.means.device) as peak:
-            made = METHODS[method](state, target.camera, task.models)
-        made = mark_target(made, number, state.scene)
-        store.save_prediction(path, replace(made, peak_bytes=peak.bytes))
+            computed = METHODS[method](state, target.camera, task.models)
+        marked = mark_target(computed, number, state.scene)
+        store.save_prediction(path, replace(marked, peak_bytes=peak.bytes))
     # Always read back, so that a resumed run continues with the same tensors.
     prediction = store.load_prediction(path, state.scene)
     step, seen = score_step(prediction, state, target, task)
@@ -117,23 +120,27 @@ def score_step(
 ) -> tuple[Step, scoring.TargetRenders]:
     """Score a step and render its target camera."""
     truth = scoring.Truth(state.views, target, task.neighbours)
-    before, after = state.scene, prediction.scene
-    found, seen = scoring.score(
+    before = state.scene
+    after = prediction.scene
+    scores, seen = scoring.score(
         before, after, prediction.added, truth, task.models.renderer, prediction.registered
     )
+
     anchor = None if prediction.anchor is None else state.views[prediction.anchor]
     scale = None
+    # In a sequence, an error of scale would grow from step to step; one step cannot show that.
     if len(task.targets) > 1 and anchor is not None and prediction.added is not None:
         expected = get_metric_depth(target, anchor, task.models)
         scale = scoring.compute_depth_scale(
             prediction.added, seen.holes, target.camera, expected, task.models.renderer
         )
+
     assert target.frame is not None
     step = Step(
         frame=target.frame,
         anchor=None if anchor is None else anchor.frame,
         anchor_fallback=prediction.anchor_fallback,
-        scores=found,
+        scores=scores,
         psnr_end=None,
         depth_scale=scale,
         added=len(after) - len(before),
@@ -141,6 +148,7 @@ def score_step(
         seconds=dict(prediction.seconds),
         peak_bytes=prediction.peak_bytes,
     )
+    # NaN and infinity have no place in JSON: they fail this step instead of the file of the row.
     json.dumps(asdict(step), allow_nan=False)
     return step, seen
 

@@ -32,8 +32,10 @@ from gscompleter.system.files.writing import replace_file
 from gscompleter.system.jobs.jobs import claim_folder, make_folder
 from gscompleter.types import Gaussians, merge
 
-RUN, TASKS = "run.json", "tasks"
-"""Names of the file with the settings of a run, and of the folder that holds the tasks."""
+RUN = "run.json"
+"""File with the settings of a run."""
+TASKS = "tasks"
+"""Folder that holds the tasks."""
 VERSION = 4
 """Version of the files of a run."""
 FIELDS = ("means", "quats", "scales", "opacities", "sh", "generated")
@@ -79,12 +81,14 @@ def list_row_paths(out: Path) -> list[Path]:
 
 def claim(out: Path, settings: Mapping[str, Any]) -> None:
     """Create the folder of a run, or check that it holds a run with the same settings."""
+    # Through JSON, which turns tuples into lists: compared is what the file holds.
     wanted = json.loads(json.dumps({"version": VERSION, **settings}))
     claim_folder(out, "run", wanted)
-    found = read_settings(out)
-    for key in {**wanted, **found}:
-        if found.get(key) != wanted.get(key):
-            old, new = quote_value(repr(found.get(key))), quote_value(repr(wanted.get(key)))
+    existing = read_settings(out)
+    for key in {**wanted, **existing}:
+        if existing.get(key) != wanted.get(key):
+            old = quote_value(repr(existing.get(key)))
+            new = quote_value(repr(wanted.get(key)))
             raise InputError(
                 f"{out} holds a run with {key} {old}, and this run has {new}; name another folder."
             )
@@ -94,14 +98,14 @@ def read_settings(out: Path) -> dict[str, Any]:
     """Read the settings of a run; raise InputError if `out` holds none of this version."""
     if not (out / RUN).is_file():
         raise InputError(f"{out} holds no run; name a folder that `evaluate` wrote.")
-    found = read_json(out / RUN, "name another folder")
-    version = found.get("version") if isinstance(found, dict) else None
+    settings = read_json(out / RUN, "name another folder")
+    version = settings.get("version") if isinstance(settings, dict) else None
     if version != VERSION:
         raise InputError(
             f"{out} holds a run of version {quote_value(version)}, and version {VERSION} is "
             "needed; name another folder and run it again."
         )
-    return dict(found)
+    return dict(settings)
 
 
 @dataclass(frozen=True)
@@ -118,6 +122,7 @@ class SavedContext:
 
 def save_prediction(path: Path, prediction: Prediction) -> None:
     """Write the added Gaussians, or the whole scene if it was changed, and the registered ones."""
+    # What a method adds follows the scene before, which is saved already.
     scene = prediction.scene if prediction.added is None else None
     seconds = dict(prediction.seconds)
     save_values(path, {**vars(prediction), "seconds": seconds, "scene": scene})
@@ -131,17 +136,18 @@ def load_prediction(path: Path, before: Gaussians) -> Prediction:
     return Prediction(**saved)
 
 
-def collect_tensors(gaussians: Gaussians) -> dict[str, Tensor]:
-    """Copy the tensors to the CPU, in torch's own layout, on which rounding of sums depends."""
-    tensors = {name: getattr(gaussians, name).detach().cpu() for name in FIELDS}
-    layout = torch.contiguous_format
-    return {name: tensor.clone(memory_format=layout) for name, tensor in tensors.items()}
-
-
 def save_values(path: Path, content: Mapping[str, Any]) -> None:
     """Write Gaussians and plain values atomically; raise OutputError if that fails."""
     make_folder(path.parent)
-    packed = {k: collect_tensors(v) if isinstance(v, Gaussians) else v for k, v in content.items()}
+    packed = dict(content)
+    for name, value in content.items():
+        if isinstance(value, Gaussians):
+            # On the CPU, and in torch's own layout, on which the rounding of sums depends.
+            tensors = {field: getattr(value, field).detach().cpu() for field in FIELDS}
+            packed[name] = {
+                field: tensor.clone(memory_format=torch.contiguous_format)
+                for field, tensor in tensors.items()
+            }
     with replace_file(path) as file:
         torch.save(packed, file)
 
@@ -154,6 +160,7 @@ def load_values(path: Path, device: torch.device | str) -> dict[str, Any]:
 
 def is_complete(path: Path) -> bool:
     """Return True if a file of `save_values` exists and has its end."""
+    # A zip archive has its directory at its end.
     return is_zipfile(path)
 
 

@@ -80,7 +80,10 @@ class RunSummary:
     @cached_property
     def groups(self) -> dict[str, list[Column]]:
         """Columns in which any method has a value, by the title of their table."""
-        groups = {title: list(filter(self.has_value, found)) for title, found in GROUPS.items()}
+        groups = {
+            title: [column for column in columns if self.has_value(column)]
+            for title, columns in GROUPS.items()
+        }
         if not self.sequences:
             del groups["Sequences"]
         return {title: columns for title, columns in groups.items() if columns}
@@ -99,8 +102,9 @@ class RunSummary:
 
     def compute_cell(self, method: str, column: Column) -> tuple[float | None, int]:
         """Reduce the known values of the tasks as `column` says, and count them."""
-        values = [v for row in self.rows[method] if (v := column.compute_row(row)) is not None]
-        return column.reduce_tasks(values) if values else None, len(values)
+        values = [column.compute_row(row) for row in self.rows[method]]
+        known = [value for value in values if value is not None]
+        return column.reduce_tasks(known) if known else None, len(known)
 
     def has_value(self, column: Column) -> bool:
         """Return True if any method has a value."""
@@ -116,6 +120,7 @@ class RunSummary:
             return {}
         steps = [step["seconds"] for row in rows for step in row["steps"]]
         stages = sorted({stage for step in steps for stage in step}, key=rank_stage)
+        # A stage that a step did not run took no time.
         medians = {s: statistics.median(step.get(s, 0.0) for step in steps) for s in stages}
         return {"reconstruct": statistics.median(r["reconstruct_seconds"] for r in rows), **medians}
 
@@ -144,19 +149,21 @@ def rank(order: Iterable[str], name: str) -> tuple[int, str]:
     return ([*order, name].index(name), name)
 
 
-rank_method, rank_stage = partial(rank, METHODS), partial(rank, ORDER)
+rank_method = partial(rank, METHODS)
+rank_stage = partial(rank, ORDER)
 
 
 def summarize_run(rows: Sequence[RunRow]) -> RunSummary:
     """Average over the tasks that all methods finished, for a fair comparison."""
     rows = sorted(rows, key=lambda row: (row["task"]["name"], rank_method(row["method"])))
-    found = {(row["task"]["name"], row["method"]): row for row in rows}
-    methods = tuple(sorted({method for _, method in found}, key=rank_method))
-    tasks = tuple(dict.fromkeys(task for task, _ in found))
-    done = {pair: row for pair, row in found.items() if row["error"] is None}
+    by_pair = {(row["task"]["name"], row["method"]): row for row in rows}
+    methods = tuple(sorted({method for _, method in by_pair}, key=rank_method))
+    tasks = tuple(dict.fromkeys(task for task, _ in by_pair))
+    done = {pair: row for pair, row in by_pair.items() if row["error"] is None}
+    # A method that failed at hard cases would otherwise gain by its failures.
     common = tuple(task for task in tasks if all((task, method) in done for method in methods))
     sequences: dict[str, dict[str, Sequence[StepRow]]] = {}
-    for (task, method), row in found.items():
+    for (task, method), row in by_pair.items():
         if len(row["task"]["targets"]) > 1:
             sequences.setdefault(task, {})[method] = row["steps"]
     return RunSummary(
@@ -166,7 +173,7 @@ def summarize_run(rows: Sequence[RunRow]) -> RunSummary:
         {method: tuple(done[task, method] for task in common) for method in methods},
         sequences,
         {method: sum(of == method for _, of in done) for method in methods},
-        tuple((*pair, row["error"]) for pair, row in found.items() if pair not in done),
+        tuple((*pair, row["error"]) for pair, row in by_pair.items() if pair not in done),
     )
 
 
@@ -195,6 +202,7 @@ def compute_fids(out: Path, summary: RunSummary) -> Fids:
     ]
     values = {}
     try:
+        # The photographs are read once, and compared with the images of each method.
         truths = [read_image(get_truth_path(folder, number)) for folder, number in steps]
         for method in summary.methods:
             paths = [get_step_path(folder, method, n).with_suffix(".png") for folder, n in steps]
@@ -213,6 +221,7 @@ def format_score_cells(summary: RunSummary, columns: Sequence[Column]) -> list[l
     """Format a table of scores, one row per method; a number of tasks other than all is added."""
 
     def format_cell(method: str, column: Column) -> str:
+        # A row has as many values as its tasks; fewer are said beside the number.
         value, count = summary.compute_cell(method, column)
         number = format_score(value, column.digits)
         return number if count in (0, len(summary.common_tasks)) else f"{number} ({count})"
@@ -266,6 +275,7 @@ def format_score_markdown(summary: RunSummary, fids: Fids) -> str:
     parts += [f"{note}\n" for key, note in ABSENT_NOTES.items() if key not in present]
     parts.append(format_fid_markdown(summary, fids))
     if summary.failures:
+        # A bar in a message would end the cell.
         rows = [[cell.replace("|", "\\|") for cell in failure] for failure in summary.failures]
         parts.append("### Failed\n\n" + format_markdown(["case", "method", "reason"], rows))
     head = ["method", "frame", "anchor", "before", "after", "end", "depth scale", "added"]
@@ -298,13 +308,20 @@ def format_step_cells(step: StepRow) -> list[str]:
 
 def collect_score_content(summary: RunSummary, fids: Fids) -> dict[str, Any]:
     """Return all scores with full precision, for JSON."""
-    has_fids = not isinstance(fids, str)
+    values: dict[str, float] = {} if isinstance(fids, str) else fids
+    reason = fids if isinstance(fids, str) else None
+    columns = [column for group in GROUPS.values() for column in group]
+    methods = {}
+    for method in summary.methods:
+        cells = {column.key: summary.compute_cell(method, column) for column in columns}
+        scores = {key: {"value": value, "cases": count} for key, (value, count) in cells.items()}
+        methods[method] = {"finished": summary.finished[method], **scores}
     return {
         "cases": len(summary.tasks),
         "common": list(summary.common_tasks),
-        "methods": {method: collect_method_scores(summary, method) for method in summary.methods},
+        "methods": methods,
         "notes": summary.notes,
-        "fid": {"values": fids if has_fids else {}, "reason": None if has_fids else fids},
+        "fid": {"values": values, "reason": reason},
         "failures": [
             dict(zip(("case", "method", "reason"), failure, strict=True))
             for failure in summary.failures
@@ -312,23 +329,15 @@ def collect_score_content(summary: RunSummary, fids: Fids) -> dict[str, Any]:
     }
 
 
-def collect_method_scores(summary: RunSummary, method: str) -> dict[str, Any]:
-    """Return the number of finished tasks and all scores of a method, for JSON."""
-    columns = [column for group in GROUPS.values() for column in group]
-    cells = {column.key: summary.compute_cell(method, column) for column in columns}
-    scores = {key: {"value": value, "cases": count} for key, (value, count) in cells.items()}
-    return {"finished": summary.finished[method], **scores}
-
-
 def format_timing_markdown(summary: RunSummary) -> str:
     """Format median seconds by stage and peak memory."""
     seconds = {method: summary.compute_seconds(method) for method in summary.methods}
-    stages = sorted({stage for found in seconds.values() for stage in found}, key=rank_stage)
+    stages = sorted({stage for by_stage in seconds.values() for stage in by_stage}, key=rank_stage)
     rows = []
-    for method, found in seconds.items():
+    for method, by_stage in seconds.items():
         peak = summary.find_peak_bytes(method)
         memory = None if peak is None else peak / 2**30
-        cells = [*(found.get(stage) for stage in stages), memory]
+        cells = [*(by_stage.get(stage) for stage in stages), memory]
         rows.append([method, *(format_score(number, 2) for number in cells)])
     return (
         f"Median seconds of a step over the {len(summary.common_tasks)} cases that all methods "

@@ -9,6 +9,7 @@ from pathlib import Path
 from typing import Any
 
 import torch
+from torch import Tensor
 
 from gscompleter.models.depth_anything.alignment import fit_robust_similarity
 from gscompleter.models.depth_anything.inputs import ResizeConfig, create_any_view_batch
@@ -54,14 +55,21 @@ class MapAnythingDepth:
             for image, K, c2w in cameras
         ]
         with torch.no_grad():
-            found = self.model.infer(inputs, use_amp=self.device == "cuda", apply_mask=False)
-        depth, sure, solid, poses = (
-            torch.cat([one[name] for one in found]).float().cpu()
-            for name in ("depth_z", "conf", "non_ambiguous_mask", "camera_poses")
-        )
-        centers = (c2w[:, :3, 3].double().numpy() for c2w in (batch.poses.c2w[0], poses))
-        scale = fit_robust_similarity(*centers).scale
-        confidence = normalize_confidence(sure) * solid.view_as(sure)
+            predictions = self.model.infer(inputs, use_amp=self.device == "cuda", apply_mask=False)
+
+        def join(name: str) -> Tensor:
+            return torch.cat([prediction[name] for prediction in predictions]).float().cpu()
+
+        depth = join("depth_z")
+        raw_confidence = join("conf")
+        solid = join("non_ambiguous_mask")
+
+        # The answer has a unit of its own, which its cameras share with its depths.
+        given_centers = batch.poses.c2w[0][:, :3, 3].double().numpy()
+        predicted_centers = join("camera_poses")[:, :3, 3].double().numpy()
+        scale = fit_robust_similarity(given_centers, predicted_centers).scale
+        confidence = normalize_confidence(raw_confidence) * solid.view_as(raw_confidence)
+        # `depth_z` has the shape [v, h, w, 1].
         return resample_depth_maps(depth[..., 0] / scale, confidence, batch, views)
 
 

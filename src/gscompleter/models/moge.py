@@ -50,9 +50,10 @@ class MoGe:
         valid = mask[0] >= MIN_MASK
         depth = scale.item() * (points[0, ..., 2] + fit_shift(points[0], valid, view.camera))
         valid &= np.isfinite(depth) & (depth > 0)
-        made = torch.from_numpy(np.where(valid, depth, 1).astype(np.float32))
+        # Invalid pixels get any positive depth, which nobody reads.
+        filled = torch.from_numpy(np.where(valid, depth, 1).astype(np.float32))
         device = view.image.device
-        return DepthMap(made.to(device), torch.from_numpy(valid).to(device))
+        return DepthMap(filled.to(device), torch.from_numpy(valid).to(device))
 
 
 def fit_shift(
@@ -60,19 +61,24 @@ def fit_shift(
 ) -> float:
     """Fit the shift along z after which the points project to their pixels; 0 without points."""
     h, w = valid.shape
-    rows, columns = (np.unique(np.linspace(0, n - 1, FIT_SIDE).round().astype(int)) for n in (h, w))
+    # A grid of some pixels is enough for one number. A small image has fewer than that.
+    rows = np.unique(np.linspace(0, h - 1, FIT_SIDE).round().astype(int))
+    columns = np.unique(np.linspace(0, w - 1, FIT_SIDE).round().astype(int))
     points = points[np.ix_(rows, columns)].astype(np.float64)
     used = valid[np.ix_(rows, columns)] & np.isfinite(points).all(axis=-1) & (points[..., 2] > 0)
     if used.sum() < 2:
         return 0.0
-    fx, fy = camera.K[0, 0].item(), camera.K[1, 1].item()
-    rays = np.stack(np.meshgrid((columns + 0.5 - w / 2) / fx, (rows + 0.5 - h / 2) / fy), axis=-1)[
-        used
-    ]
-    found = points[used]
+
+    # The network assumes a central principal point: rays at z = 1 from the middle of the image.
+    fx = camera.K[0, 0].item()
+    fy = camera.K[1, 1].item()
+    x = (columns + 0.5 - w / 2) / fx
+    y = (rows + 0.5 - h / 2) / fy
+    rays = np.stack(np.meshgrid(x, y), axis=-1)[used]
+    used_points = points[used]
 
     def miss(shift: Float[ndarray, "1"]) -> Float[ndarray, "n"]:
-        return (found[:, :2] / (found[:, 2:] + shift) - rays).ravel()
+        return (used_points[:, :2] / (used_points[:, 2:] + shift) - rays).ravel()
 
     return float(least_squares(miss, 0.0, ftol=1e-3, method="lm").x[0])
 

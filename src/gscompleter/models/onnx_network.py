@@ -30,6 +30,7 @@ class OnnxNetwork:
     @property
     def fixed_size(self) -> tuple[int, int] | None:
         """Height and width that the network accepts, or None for any."""
+        # Images have the shape [1, c, h, w]; a side is text or None if it is free.
         height, width = (*self.session.get_inputs()[0].shape, None, None)[2:4]
         return (height, width) if isinstance(height, int) and isinstance(width, int) else None
 
@@ -59,15 +60,14 @@ def load_network(
         raise InputError(f"The model {weights.name!r} needs onnxruntime: {INSTALL}.")
     path = fetch_checked(weights, None if file is None else Path(file))
     session = open_session(path, device, option)
-    given = {
-        x.name: (x.type, x.shape[1] if len(x.shape) == 4 else None) for x in session.get_inputs()
-    }
+    inputs = session.get_inputs()
+    own_signature = {x.name: (x.type, x.shape[1] if len(x.shape) == 4 else None) for x in inputs}
     network = OnnxNetwork(session)
-    fits = given == dict(signature) and network.fixed_size in (None, weights.image_size)
+    fits = own_signature == dict(signature) and network.fixed_size in (None, weights.image_size)
     if not fits or len(session.get_outputs()) != num_outputs:
-        found = ", ".join(f"{x.name} {x.type} {x.shape}" for x in session.get_inputs())
+        listed = ", ".join(f"{x.name} {x.type} {x.shape}" for x in inputs)
         raise InputError(
-            f"{path} is no {weights.model} network: its inputs are {found}; give {weights.file} "
+            f"{path} is no {weights.model} network: its inputs are {listed}; give {weights.file} "
             f"from {weights.source}.",
             option,
         )
@@ -81,7 +81,9 @@ def open_session(path: Path, device: str, option: str) -> Any:
     options = onnxruntime.SessionOptions()
     options.intra_op_num_threads = get_thread_count()
     options.use_deterministic_compute = True
+    # Only fatal messages: failures become an InputError with advice.
     options.log_severity_level = 4
+    # A GPU is used if onnxruntime was built for one, and a CPU otherwise.
     wanted = ["CUDAExecutionProvider"] if device == "cuda" else []
     usable = [name for name in wanted if name in onnxruntime.get_available_providers()]
     try:

@@ -22,6 +22,7 @@ from gscompleter.reconstructors.depth_predictors import DepthPredictor
 from gscompleter.types import View
 
 
+# Imports are local, so that naming a model imports neither torch nor the packages of the others.
 def load_learned_reconstructor(name: str, weights: Path | None, device: str) -> Reconstructor:
     """Load the reconstructor with the published weights of that name."""
     from gscompleter.models.feed_forward.build import build

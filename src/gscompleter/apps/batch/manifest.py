@@ -21,8 +21,10 @@ from gscompleter.system.files.output_folder import read_command
 from gscompleter.system.files.reading import list_folders, read_bytes
 from gscompleter.system.jobs.jobs import Job
 
-FOLDER, NAME = "folder", "name"
-"""Columns of the scene folder and of the job name."""
+FOLDER = "folder"
+"""Column of the scene folder."""
+NAME = "name"
+"""Column of the job name."""
 PATHS = (FOLDER, "scene", "weights", "depth_weights")
 """Options that are paths."""
 MARKERS = ("batch.json", "run.json")
@@ -43,7 +45,10 @@ def read_manifest(manifest: Path, common: Mapping[str, Any], out: Path | None = 
 
     In a folder of scenes those of `list_results` are left out.
     """
-    base, here = manifest.resolve().parent, resolve_paths(common, Path.cwd())
+    # Options of the command line count from the working folder, those of a row from the manifest,
+    # and the row wins.
+    base = manifest.resolve().parent
+    here = resolve_paths(common, Path.cwd())
     rows = [{**here, **resolve_paths(row, base)} for row in read_rows(manifest, out)]
     if not rows:
         raise InputError("The manifest names no job; give it a row for each scene.")
@@ -66,7 +71,8 @@ def resolve_paths(row: Mapping[str, Any], base: Path) -> Options:
         return os.path.join(base, value) if isinstance(value, str) and value else value
 
     result = {key: join(value) if key in PATHS else value for key, value in row.items()}
-    target, config = result.get("target"), result.get("config")
+    target = result.get("target")
+    config = result.get("config")
     # A text is the path of a file of cameras, or else numbers and names of photographs.
     is_number = isinstance(target, str) and re.fullmatch(r"[\d\s]*", target)
     if isinstance(target, str) and not is_number and os.path.exists(join(target)):
@@ -117,10 +123,12 @@ def is_result(folder: Path, out: Path | None) -> bool:
 def parse_csv(text: str) -> Iterator[Options]:
     """Parse the rows of a CSV file with a header."""
     for row in csv.DictReader(io.StringIO(text, newline=""), strict=True):
-        given = {k: v.strip() for k, v in row.items() if isinstance(v, str) and v.strip()}
+        options = {k: v.strip() for k, v in row.items() if isinstance(v, str) and v.strip()}
+        # `DictReader` collects cells beyond the header under None; as an option of this name they
+        # are refused like any unknown one.
         if row.get(None) is not None:
-            given["too many cells"] = " ".join(row[None])
-        yield given
+            options["too many cells"] = " ".join(row[None])
+        yield options
 
 
 def parse_json_lines(text: str) -> Iterator[Options]:

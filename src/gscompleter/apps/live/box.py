@@ -26,7 +26,8 @@ class PageBox:
 
     def __init__(self, server: viser.ViserServer, position: np.ndarray) -> None:
         """Add the controls, hidden at first; `position` is in page units."""
-        scene, gui = server.scene, server.gui
+        scene = server.scene
+        gui = server.gui
         self.controls = scene.add_transform_controls(
             "/box", scale=HANDLE, position=position, visible=False
         )
@@ -40,7 +41,9 @@ class PageBox:
         """Return the corners, in scene units, and the rotation, as `remove` takes them."""
         if not self.shown.value:
             raise InputError("Tick “Box”, drag it over what you want to remove, and press again.")
-        center, half = np.array(self.controls.position), np.array(self.size.value) / 2
+        center = np.array(self.controls.position)
+        half = np.array(self.size.value) / 2
+        # The box is in page units, and `remove` in those of the scene.
         corners = np.concatenate([center - half, center + half]) / unit
         return tuple(corners.tolist()), tuple(np.array(self.controls.wxyz).tolist())
 
@@ -50,17 +53,22 @@ def remove_in_box(session: Session, corners: Numbers, rotation: Numbers) -> tupl
 
     Gaussians of the context that only they hid go with them.
     """
-    state, scenes = session.latest, session.completer.scenes
+    state = session.latest
+    scenes = session.completer.scenes
 
     def contains(points: Float[Tensor, "n 3"]) -> Bool[Tensor, "n"]:
         return find_in_boxes(points.double(), corners, rotation)
 
+    # Of the context and of all that was added; what is gone already cannot go again.
     inside = [contains(part.means) for part in (state.context, *state.parts[1:])]
     context = inside[0] & ~state.source.gone_mask
     if not any(mask.any() for mask in (context, *inside[1:])):
         raise InputError("The box contains nothing; drag it, or make it larger.")
+    # What is removed from the context is marked, so that its hole may be filled. What was added is
+    # simply taken out.
     added = [part[~mask] for part, mask in zip(state.parts[1:], inside[1:], strict=True)]
-    parts, config = (state.parts[0], *added), state.config.for_removal()
+    parts = (state.parts[0], *added)
+    config = state.config.for_removal()
     begun = replace(state, parts=parts, config=config)
     changed = remove_gaussians(begun, context, contains, scenes)
     gone = changed.source.gone_mask & ~state.source.gone_mask

@@ -91,8 +91,10 @@ class Page:
 
         `files` are those of the photographs by frame.
         """
-        self.session, self.server = session, server
-        self._find_hole, self._save = find_hole, save
+        self.session = session
+        self.server = server
+        self._find_hole = find_hole
+        self._save = save
         self._first = session.latest.views[0].camera
         self._photographs = cycle(
             [
@@ -109,6 +111,7 @@ class Page:
     def handle_requests(self) -> None:
         """Run requests until the process is interrupted."""
         while True:
+            # Threads of the server hand their requests over; all work is done in this one.
             request = self._requests.get()
             try:
                 self.show_message(run_request(request))
@@ -174,7 +177,8 @@ class Page:
         self._status.content = f'<div role="status" style="padding: 0.5em 1em">{lines}</div>'
 
     def _build(self) -> None:
-        scene, gui = self.server.scene, self.server.gui
+        scene = self.server.scene
+        gui = self.server.gui
         gui.configure_theme(dark_mode=True, show_logo=False, show_share_button=False)
         gui.set_panel_label("gscompleter live")
         cameras = [view.camera for view in self.session.latest.views]
@@ -190,6 +194,7 @@ class Page:
             ("Save", self.save),
         ):
             gui.add_button(label).on_click(partial(self._submit, job))
+
         ahead = self._first.center + self._first.forward * SCENE_DISTANCE / self._unit
         self._box = PageBox(self.server, ahead.cpu().numpy() * self._unit)
         generated = scene.add_frame("/generated", show_axes=False)
@@ -212,22 +217,27 @@ class Page:
     def _set_initial_camera(self, pose: PagePose) -> None:
         rotation = viser.transforms.SO3(pose.wxyz).as_matrix()
         start = self.server.initial_camera
-        start.position, start.fov = pose.position, pose.fov
-        start.look_at, start.up = pose.position + SCENE_DISTANCE * rotation[:, 2], -rotation[:, 1]
+        start.position = pose.position
+        start.fov = pose.fov
+        start.look_at = pose.position + SCENE_DISTANCE * rotation[:, 2]
+        start.up = -rotation[:, 1]
 
     def _move_browser(self, client: viser.ClientHandle, camera: Camera) -> None:
         pose = camera_to_page(camera, self._unit)
         with client.atomic():
-            client.camera.position, client.camera.wxyz = pose.position, pose.wxyz
+            client.camera.position = pose.position
+            client.camera.wxyz = pose.wxyz
             client.camera.fov = pose.fov
 
     def _change_session(self, session: Session) -> None:
         """Show all parts of a session that differ from the one before."""
-        before, now = self.session.latest, session.latest
+        before = self.session.latest
+        now = session.latest
         self.session = session
         with self.server.atomic():
             if before.parts[0] is not now.parts[0]:
                 self._show("/observed", now.kept_context)
+            # A splat is replaced as a whole: the page cannot change one in place.
             if self._generated is not None:
                 self._generated.remove()
             self._generated = self._show("/generated/splats", now.added)
@@ -242,6 +252,7 @@ def compute_page_unit(camera: Camera) -> float:
     """Compute page units per scene unit from a camera with a depth range."""
     assert camera.near is not None
     assert camera.far is not None
+    # The geometric mean of near and far is the middle of the range in the images.
     return SCENE_DISTANCE / math.sqrt(camera.near * camera.far)
 
 
@@ -271,6 +282,7 @@ def make_page_splat(gaussians: Gaussians, unit: float) -> dict[str, Any]:
     gaussians = gaussians.to("cpu")
     size = gaussians.scales.amax(dim=1).median().item()
     axes = quats_to_rotations(gaussians.quats) * (gaussians.scales / size)[:, None, :]
+    # The page has no SH beyond the constant one.
     rgbs = (0.5 + SH_C0 * gaussians.sh[:, 0]).clamp(0, 1)
     return {
         "centers": (gaussians.means / size).numpy(),
@@ -315,6 +327,7 @@ class Address:
     @property
     def is_local(self) -> bool:
         """Return True if only programs of this machine can reach it."""
+        # An IPv4 address may be written as IPv6, "::ffff:127.0.0.1"; a zone follows after "%".
         number = ipaddress.ip_address(self.host.partition("%")[0])
         return (getattr(number, "ipv4_mapped", None) or number).is_loopback
 

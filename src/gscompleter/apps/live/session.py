@@ -46,17 +46,18 @@ def complete_camera(session: Session, camera: Camera) -> tuple[Session, TargetRe
     Returns the same session if nothing was added or recoloured. The camera goes through a file
     first, so that the saved file gives the very same result.
     """
-    told = transform_camera_exactly(camera, np.linalg.inv(session.transform))
+    saved_camera = transform_camera_exactly(camera, np.linalg.inv(session.transform))
     with TemporaryDirectory() as folder:
         path = Path(folder) / "target.json"
-        write_cameras(path, [told])
+        write_cameras(path, [saved_camera])
         (target,) = load_scene_cameras(path, session.transform, session.origin, session.resolution)
     target = target.to(session.latest.views[0].image.device)
     completion = session.completer.advance(session.latest, target)
     result = completion.targets[-1]
     if not len(result.added) and not result.num_recolored:
         return session, result
-    completions, cameras = (*session.completions, completion), (*session.cameras, told)
+    completions = (*session.completions, completion)
+    cameras = (*session.cameras, saved_camera)
     return replace(session, completions=completions, cameras=cameras), result
 
 
@@ -65,5 +66,7 @@ def undo_step(session: Session) -> Session:
     earlier = session.completions[:-1]
     if not earlier:
         raise InputError("There is nothing to undo; complete something first.")
+    # A step may be a removal, which has no camera: the targets that are left tell how many there
+    # are.
     cameras = session.cameras[: len(earlier[-1].targets)]
     return replace(session, completions=earlier, cameras=cameras)

@@ -161,6 +161,8 @@ def write_report(
         key: [asdict(replace(row, file=files.get(row.frame))) for row in group]
         for key, group in rows.items()
     }
+
+    # The verdict comes from the rows, so that the page and the terminal agree with them.
     outcome = asdict(judge_completion(completion, held_out_rows))
     write_scenes(folder, completion, input_splat)
     around = render_around()
@@ -184,7 +186,9 @@ def write_report(
 def render_before_after(completion: Completion, camera: Camera, renderer: Renderer) -> RenderPair:
     """Render the context and the completed scene."""
     with torch.no_grad():
-        before = after = renderer.freeze(completion.context, camera)
+        before = renderer.freeze(completion.context, camera)
+        # Without recolouring and removal the context is the same, and is projected once.
+        after = before
         if completion.kept_context is not completion.context:
             after = renderer.freeze(completion.kept_context, camera)
         return RenderPair(before.render, after.composite(completion.added))
@@ -194,7 +198,8 @@ def compute_scores(pair: RenderPair, photograph: View | None) -> Scores:
     """Compute PSNR (dB) and SSIM over the valid pixels, or None without a photograph."""
     scores: Scores = dict.fromkeys(SCORES)
     if photograph is not None:
-        truth, valid = photograph.image, photograph.valid_mask
+        truth = photograph.image
+        valid = photograph.valid_mask
         for when, render in (("before", pair.before), ("after", pair.after)):
             scores[f"psnr_{when}"] = compute_masked_psnr(render.image, truth, valid)
             scores[f"ssim_{when}"] = ssim(photograph.fill_ignored(render.image), truth)
@@ -215,6 +220,7 @@ def score_held_out(
     completion: Completion, held_out: Sequence[HeldOut], renderer: Renderer
 ) -> list[HeldOutRow]:
     """Make the rows of held-out photographs."""
+    # Photographs in use, as they are: what a reconstruction has to be better than (decision 048).
     used = [shrink_view(view).image for view in completion.views]
 
     def score(photograph: HeldOut) -> HeldOutRow:
@@ -235,6 +241,7 @@ def score_photograph(completion: Completion, view: View, renderer: Renderer) -> 
     pair = render_before_after(completion, view.camera, renderer)
     truth = view.image
     valid = view.valid_mask
+    # Both scores over what the completed scene covers: their difference is then a gain.
     covered_before = (pair.before.alpha >= COVERED) & valid
     covered_after = (pair.after.alpha >= COVERED) & valid
     num_valid = max(int(valid.sum()), 1)
@@ -251,19 +258,22 @@ def score_photograph(completion: Completion, view: View, renderer: Renderer) -> 
 
 def score_context(completion: Completion, renderer: Renderer) -> list[ContextRow]:
     """Make the rows of the context photographs."""
-    views, gains = completion.views, completion.exposure_gains
+    views = completion.views
+    gains = completion.exposure_gains
     scores = score_views(completion, views, renderer)
-    gain_rows = [None] * len(views) if gains is None else map(tuple, gains.tolist())
+    gain_rows: Sequence[Any] = [None] * len(views)
+    if gains is not None:
+        gain_rows = [tuple(row) for row in gains.tolist()]
     return [
         ContextRow(
             view.frame,
-            **found,
+            **view_scores,
             exposure_gain=gain,
             dynamic_fraction=compute_mask_fraction(view.dynamic_mask),
             given_depth=compute_mask_fraction(view.given_depth),
             ignored=compute_mask_fraction(view.ignore_mask),
         )
-        for view, found, gain in zip(views, scores, gain_rows, strict=True)
+        for view, view_scores, gain in zip(views, scores, gain_rows, strict=True)
     ]
 
 
@@ -289,7 +299,8 @@ def make_target_row(
     completion: Completion, target: Target, result: TargetResult, scores: Scores
 ) -> TargetRow:
     """Make the row of a target."""
-    fit, added = result.affine, result.added
+    fit = result.affine
+    added = result.added
     return TargetRow(
         target.frame,
         **scores,
@@ -311,8 +322,9 @@ def make_target_row(
 def count_changes(completion: Completion) -> dict[str, Any]:
     """Count the Gaussians and, of a splat, the photographs that it was not trained on."""
     counts = {"context": len(completion.context), "added": len(completion.added)}
-    if removed := int(completion.source.gone_mask.sum()):
-        counts["removed"] = removed
+    num_removed = int(completion.source.gone_mask.sum())
+    if num_removed:
+        counts["removed"] = num_removed
     if completion.config.trust == "full":
         return {"gaussians": counts}
     counts["recolored"] = int(completion.recolored_mask.sum())
@@ -326,10 +338,12 @@ def thin_evenly(items: Sequence[Camera], most: int) -> Sequence[Camera]:
 
 def write_scenes(folder: Path, completion: Completion, input_splat: InputSplatFile | None) -> None:
     """Write the three scenes, and the originals of recoloured Gaussians of an input splat."""
-    added, context = completion.added, completion.context
+    added = completion.added
+    context = completion.context
     if input_splat is None:
         completed = partial(save_ply, folder / COMPLETED_FILE, completion.scene, provenance=True)
     else:
+        # In the layout and the order of the user's file, so that what was kept is kept bit by bit.
         context, changed = restore_file_order(completion, input_splat)
         recolored = completion.recolored_context[completion.recolored_mask]
         generated = merge([recolored, added])
@@ -353,6 +367,7 @@ def restore_file_order(
     context = completion.context
     if input_splat.file_order is None:
         return context, changed
+    # `file_order[i]` is the place in the file of Gaussian i; sorting by it inverts that.
     places = input_splat.file_order.argsort().to(context.means.device)
     return context[places], changed[places]
 
@@ -369,7 +384,9 @@ def save_completed_splat(
     Recoloured Gaussians stand among the generated ones, after all that kept its bits. The originals
     of an earlier run are kept with those that it recoloured.
     """
-    kept, earlier = input_splat.context_mask, input_splat.path.with_name(REMOVED_FILE)
+    kept = input_splat.context_mask
+    # A splat that was completed before has its originals beside it; they stay valid with it.
+    earlier = input_splat.path.with_name(REMOVED_FILE)
     if not changed.any():
         if bool((context.generated > 0).any()) and earlier.is_file():
             shutil.copyfile(earlier, folder / REMOVED_FILE)
@@ -378,6 +395,7 @@ def save_completed_splat(
     save_changed(folder, context, changed, input_splat)
     stays = ~changed.cpu()
     if kept is not None:
+        # From a mask over the context to one over all Gaussians of the file.
         stays = torch.zeros_like(kept).masked_scatter(kept, stays)
     save_like(folder / COMPLETED_FILE, context[~changed], generated, input_splat.path, stays)
 
@@ -386,7 +404,8 @@ def save_changed(
     folder: Path, context: Gaussians, changed: Bool[Tensor, "n"], input_splat: InputSplatFile
 ) -> None:
     """Write `removed.ply`, the originals of the changed Gaussians."""
-    rows, kept = torch.nonzero(changed.cpu())[:, 0], input_splat.context_mask
+    rows = torch.nonzero(changed.cpu())[:, 0]
+    kept = input_splat.context_mask
     save_removed(folder / REMOVED_FILE, context[changed].to("cpu"), rows, input_splat.path, kept)
 
 
@@ -400,37 +419,39 @@ def make_record(completion: Completion, photographs: Sequence[Camera]) -> Comple
     def draw(cameras: Sequence[Camera]) -> tuple[str, ...]:
         return tuple(draw_camera(camera, frame) for camera in cameras)
 
-    pairs = tuple(map(list_depth_pairs, completion.targets))
-    return CompletionRecord(draw(others), draw(context), draw(targets), pairs)
+    rows = []
+    for result in completion.targets:
+        pairs = result.affine.pairs
+        columns = pairs.predicted, pairs.context, pairs.inlier_mask
+        points = zip(*(column.tolist() for column in columns), strict=True)
+        rows.append(PairsRow(pairs.fit_view, tuple(points)))
+    return CompletionRecord(draw(others), draw(context), draw(targets), tuple(rows))
 
 
 def fit_frame(cameras: Sequence[Camera]) -> DrawingFrame:
     """Fit a frame around cameras whose up axis is that of most of them."""
     up = estimate_up(cameras)
+    # The most level camera gives the direction of the view; its axes are made level exactly.
     level = min(cameras, key=lambda camera: (camera.c2w[:3, 1] @ up).item())
     back = normalize(torch.linalg.cross(level.c2w[:3, 0], up), dim=0)
     centers = torch.stack([camera.center for camera in cameras])
     middle = centers.median(dim=0).values
+    # At least a tiny radius: all cameras may stand in one place.
     radius = max(1.1 * (centers - middle).norm(dim=1).max().item(), 1e-9)
     return DrawingFrame(middle, torch.stack([torch.linalg.cross(up, back), up, back]), radius)
 
 
 def draw_camera(camera: Camera, frame: DrawingFrame) -> str:
     """Write the corners of one line along the edges of a camera pyramid, centre first."""
+    # Half the image over the focal length at z = 1, with the longer side always as long.
     size = torch.tensor([camera.width, camera.height]) / camera.K.diagonal()[:2]
     sides = torch.cat([0.6 * size / size.max(), torch.ones(1)])
     a, b, c, d = torch.tensor(FRUSTUM) * sides @ camera.c2w[:3, :3].T @ frame.axes.T
+    # Edges from the apex to the corners and around, in a single line: some are drawn twice.
     o = torch.zeros(3)
     corners = FRUSTUM_DEPTH * torch.stack([o, a, b, c, d, a, b, o, c, d, o])
     points = frame.convert(camera.center) + corners
     return " ".join(f"{value:.3f}" for value in points.flatten().tolist())
-
-
-def list_depth_pairs(result: TargetResult) -> PairsRow:
-    """List the depth pairs of a target."""
-    pairs = result.affine.pairs
-    columns = pairs.predicted, pairs.context, pairs.inlier_mask
-    return PairsRow(pairs.fit_view, tuple(zip(*(c.tolist() for c in columns), strict=True)))
 
 
 def write_pictures(

@@ -65,6 +65,7 @@ def choose_stops(completion: Completion) -> list[Camera]:
     targets = [result.target for result in results[:MAX_TARGETS]]
     photographs = [view.camera for view in completion.views]
     nearest = min(photographs, key=lambda camera: measure_baseline(camera, targets[0]))
+    # Of one size and shape, since a video has no other.
     lens = fit_to_video(completion.with_depth_range(targets[0]))
     return [replace(lens, c2w=camera.c2w.to(lens.c2w)) for camera in (nearest, *targets)]
 
@@ -85,6 +86,7 @@ def render_frames(
     for camera in track(cameras, "video"):
         images.append(render_frame(completion, camera, renderer))
         yield images[-1]
+    # Backwards without the last frame and the first one, which the loop shows next.
     yield from images[-2:0:-1]
 
 
@@ -102,8 +104,10 @@ def render_frame(
 def draw_corner_label(image: UInt8[np.ndarray, "h w 3"], name: str) -> UInt8[np.ndarray, "h w 3"]:
     """Write a label in the corner, white on a dark box."""
     size = max(12, image.shape[0] // 24)
-    font, canvas = ImageFont.load_default(size), Image.fromarray(image)
-    draw, inset = ImageDraw.Draw(canvas, "RGBA"), size // 2
+    font = ImageFont.load_default(size)
+    canvas = Image.fromarray(image)
+    draw = ImageDraw.Draw(canvas, "RGBA")
+    inset = size // 2
     left, top, right, bottom = draw.textbbox((2 * inset, 2 * inset), name, font, anchor="lt")
     field = (left - inset, top - inset, right + inset, bottom + inset)
     draw.rounded_rectangle(field, radius=inset, fill=(0, 0, 0, 150))
@@ -124,11 +128,15 @@ def find_waypoints(first: Camera, second: Camera, photographs: Sequence[Camera])
     # Imported here, since SciPy is slow to import and only videos need it.
     from scipy.sparse.csgraph import shortest_path
 
+    # Squared steps make many short ones cheaper than one long one, so that the path follows the
+    # photographs. Positions and viewing directions count together (`embed_cameras`).
     cameras = [first, *photographs, second]
     where = embed_cameras(cameras).double().cpu()
     squares = (where[:, None] - where).square().sum(dim=-1).numpy()
     _, before = shortest_path(squares, indices=0, return_predecessors=True)
-    way, number = [second], before[-1]
+    # Predecessors lead from the second camera back to the first, which has index 0.
+    way = [second]
+    number = before[-1]
     while number > 0:
         way.append(cameras[number])
         number = before[number]
@@ -144,7 +152,9 @@ def follow_path(way: Sequence[Camera], count: int) -> list[Camera]:
     from scipy.interpolate import BSpline
 
     degree = min(3, len(way) - 1)
+    # The columns right, forward and centre; the down axis follows from the first two.
     poses = torch.stack([camera.c2w[:3, [0, 2, 3]] for camera in way]).double().cpu().numpy()
+    # Repeated knots at both ends: the curve begins at the first camera and ends at the last.
     knots = np.pad(np.linspace(0, 1, len(way) - degree + 1), degree, mode="edge")
     smooth = BSpline(knots, poses, degree)
     shares = np.linspace(0, 1, count + 1)
@@ -159,6 +169,7 @@ def make_camera(
     center: Float[np.ndarray, "3"],
 ) -> Camera:
     """Give a camera another pose; the axes are made orthonormal, the right one first."""
+    # QR orthonormalises the columns in their order, up to their signs.
     axes, signs = np.linalg.qr(np.column_stack([right, forward]))
     right, forward = (axes * np.where(np.diag(signs) < 0, -1, 1)).T
     pose = np.column_stack([right, np.cross(forward, right), forward, center])

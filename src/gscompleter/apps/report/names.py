@@ -37,21 +37,28 @@ def name_target(
 
 def describe_offset(camera: Camera, base: Camera) -> str:
     """Describe how a camera is moved and turned from another one, as that one looks."""
+    # Into the axes of the base camera.
     axes = base.c2w[:3, :3].double().T
     shift = (axes @ (camera.center - base.center).double()).tolist()
     x, y, z = (axes @ camera.forward.double()).tolist()
     yaw = math.degrees(math.atan2(x, z))
     pitch = math.degrees(math.atan2(-y, math.hypot(x, z)))
     parts = []
-    # The axes of a camera point right, down and forward.
+
+    # The axes of a camera point right, down and forward; only the longest move is said.
     length, negative, positive = max(
         zip(shift, ("left", "up", "back"), ("right", "down", "forward"), strict=True),
         key=lambda one: abs(one[0]),
     )
     if abs(length) >= MIN_SHIFT * max(1.0, base.center.abs().max().item()):
         parts.append(f"moved {positive if length > 0 else negative} by {abs(length):.2g}")
+
     if max(abs(yaw), abs(pitch)) >= MIN_TURN:
-        is_yaw = abs(yaw) >= abs(pitch)
-        side = ("right" if yaw > 0 else "left") if is_yaw else ("up" if pitch > 0 else "down")
-        parts.append(f"turned {side} by {abs(yaw if is_yaw else pitch):.0f}°")
+        if abs(yaw) >= abs(pitch):
+            side = "right" if yaw > 0 else "left"
+            turn = yaw
+        else:
+            side = "up" if pitch > 0 else "down"
+            turn = pitch
+        parts.append(f"turned {side} by {abs(turn):.0f}°")
     return " and ".join(parts) or "at the same place"

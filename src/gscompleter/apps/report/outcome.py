@@ -12,7 +12,7 @@ from statistics import median
 from gscompleter.apps.report.plain_words import format_number, format_percent
 from gscompleter.apps.report.schema import HeldOutRow, OutcomeRow, average
 from gscompleter.evaluation.metrics.unused_photographs import shrink_view
-from gscompleter.reconstructors.features.consistency import MatchCount, count_consistent_matches
+from gscompleter.reconstructors.features.consistency import count_consistent_matches
 from gscompleter.stages.target_view import NOTHING_TO_COMPLETE
 from gscompleter.state import Completion, TargetResult
 
@@ -61,15 +61,12 @@ def judge_completion(completion: Completion, held_out: Sequence[HeldOutRow]) -> 
     failure = explain_failure(completion, held_out) if is_reconstructed else None
     if failure is not None:
         return OutcomeRow("not-reconstructed", failure)
-    if not has_gained(completion):
+    # A target added or recoloured something, or a new photograph recoloured the context.
+    has_gained = bool(completion.recolored_mask.any()) or count_changed(completion.targets) > 0
+    if not has_gained:
         return OutcomeRow("nothing-gained", explain_no_gain(completion))
     work = describe_work(completion)
     return OutcomeRow("completed", describe_gain(work, held_out))
-
-
-def count_matches(completion: Completion) -> MatchCount:
-    """Count the features that the context photographs share, in small images."""
-    return count_consistent_matches([shrink_view(view) for view in completion.views])
 
 
 def explain_failure(completion: Completion, held_out: Sequence[HeldOutRow]) -> str | None:
@@ -78,10 +75,12 @@ def explain_failure(completion: Completion, held_out: Sequence[HeldOutRow]) -> s
     Unused photographs decide. Where there are none that the scene covers, the features decide that
     its own photographs share.
     """
+    # Unused photographs that the scene does not cover cannot decide.
     compared = [row for row in held_out if row.above_photograph is not None]
     if compared:
         return None if is_like(compared) else describe_mismatch(compared)
-    matches = count_matches(completion)
+    # In small images, in which poses that are a little off still fit.
+    matches = count_consistent_matches([shrink_view(view) for view in completion.views])
     if matches.total < MIN_MATCHES or matches.share >= MIN_CONSISTENT:
         return None
     return (
@@ -94,6 +93,8 @@ def is_like(compared: Sequence[HeldOutRow]) -> bool:
     """Return True if a scene shows what the unused photographs show."""
     gains = [row.above_photograph for row in compared if row.above_photograph is not None]
     margins = [row.above_color for row in compared if row.above_color is not None]
+    # Either is enough: a scene that hardly changes between photographs is no better than one of
+    # them.
     return median(gains) >= MIN_ABOVE_PHOTOGRAPH or median(margins) >= MAX_ABOVE_COLOR
 
 
@@ -106,17 +107,13 @@ def describe_mismatch(compared: Sequence[HeldOutRow]) -> str:
     )
 
 
-def has_gained(completion: Completion) -> bool:
-    """Return True if a target added or recoloured something, or a new photograph recoloured it."""
-    return bool(completion.recolored_mask.any()) or count_changed(completion.targets) > 0
-
-
 def explain_no_gain(completion: Completion) -> str:
     """Explain in one sentence why nothing was added at any target."""
     place = " in place of what was removed" if completion.source.gone_mask.any() else ""
     results = completion.targets
     if not results:
         return f"Nothing was gained{place}, because {NO_TARGET}."
+    # Several targets may have failed for one reason, which is said once.
     causes = Counter(make_clause(find_cause(result)) for result in results)
     if len(results) == 1:
         return f"Nothing was gained{place}, because {next(iter(causes))}."
@@ -153,7 +150,8 @@ def describe_work(completion: Completion) -> str:
         work = f"The {'splat' if completion.is_given else 'scene'} is completed"
     else:
         return "Nothing was added to the splat; only colours changed"
-    changed, total = count_changed(completion.targets), len(completion.targets)
+    changed = count_changed(completion.targets)
+    total = len(completion.targets)
     return f"{work} for {changed} of {total} targets" if changed < total else work
 
 

@@ -46,8 +46,12 @@ from gscompleter.system.files.image import encode_jpeg, read_image_size, read_pi
 from gscompleter.system.files.writing import encode_text, replace_file
 from gscompleter.system.jobs.jobs import JOBS, Job, read_row
 
-REPORT_FILE, VIEWER_FILE = "report.html", "view.html"
-INDEX_FILE, TABLE_FILE = "index.html", "table.csv"
+# Files of a completion and of a batch.
+REPORT_FILE = "report.html"
+VIEWER_FILE = "view.html"
+INDEX_FILE = "index.html"
+TABLE_FILE = "table.csv"
+
 TARGET_COLUMNS = ("hole_fraction", "psnr_before", "psnr_after")
 TABLE_COLUMNS = (
     *("job", "state", "reason", "attempts"),
@@ -82,7 +86,8 @@ class Gallery:
         """Embed an image as a JPEG; raise an InputError if it is missing or damaged."""
         image = Image.fromarray(read_pixels(self.folder / f"{name}.png"))
         if self.scale < 1:
-            width, height = (max(1, round(self.scale * side)) for side in image.size)
+            width = max(1, round(self.scale * image.width))
+            height = max(1, round(self.scale * image.height))
             image = image.resize((width, height), Image.Resampling.LANCZOS)
         content = base64.b64encode(encode_jpeg(image, JPEG_QUALITY)).decode()
         return Picture(alt, *image.size, f"data:image/jpeg;base64,{content}")
@@ -96,6 +101,7 @@ def open_gallery(folder: Path) -> Gallery:
     """Choose a scale at which all images of `folder` fit into a page."""
     sizes = [read_image_size(path) for path in folder.glob("*.png")]
     pixels = sum(width * height for width, height in sizes)
+    # Pixels grow with the square of the scale.
     return Gallery(folder, min(1.0, (MAX_PAGE_PIXELS / max(pixels, 1)) ** 0.5))
 
 
@@ -103,6 +109,7 @@ def render_template(template: str, values: Mapping[str, object]) -> str:
     """Render a template with style and script."""
     environment = create_environment()
     script = environment.get_template("script.js").render()
+    # The content security policy names the hash of the only script that may run.
     digest = base64.b64encode(hashlib.sha256(script.encode()).digest()).decode()
     shared = {"version": __version__, "script": Markup(script), "digest": digest}
     return environment.get_template(template).render(**shared, **values)
@@ -137,6 +144,12 @@ def write_completion_page(folder: Path) -> None:
 def render_completion_page(folder: Path) -> str:
     """Render the page of the completion in `folder`."""
     summary = read_summary(folder)
+    # Notes that only one target has; those of several stand above.
+    groups = group_target_notes(summary.targets)
+    own_notes = [
+        row.notes if len(groups.get(row.notes, ())) == 1 else () for row in summary.targets
+    ]
+
     path = summary.scene.splat or str(summary.settings.get("folder") or "")
     settings = {name: getattr(summary, name) for name in SETTINGS}
     return render_template(
@@ -147,7 +160,7 @@ def render_completion_page(folder: Path) -> str:
             "record": read_record(folder, summary),
             "gallery": open_gallery(folder / "images"),
             "notes": [*summary.scene.notes, *list_shared_notes(summary), *list_notes(summary)],
-            "own_notes": select_own_notes(summary),
+            "own_notes": own_notes,
             "describe_alignment": describe_alignment,
             "unit": find_length_unit(summary),
             "mean_held_out": {
@@ -161,12 +174,6 @@ def render_completion_page(folder: Path) -> str:
     )
 
 
-def select_own_notes(summary: CompletionSummary) -> list[Sequence[str]]:
-    """Select the notes that only one target has; those of several stand above."""
-    groups = group_target_notes(summary.targets)
-    return [row.notes if len(groups.get(row.notes, ())) == 1 else () for row in summary.targets]
-
-
 def find_length_unit(summary: CompletionSummary) -> str:
     """Return metres if the format defines them and the splat has no frame of its own."""
     format = FORMATS.get(summary.scene.format)
@@ -177,6 +184,7 @@ def find_length_unit(summary: CompletionSummary) -> str:
 
 def average_scores(summary: Mapping[str, Any]) -> dict[str, Any]:
     """Average the scores of a completion over its targets."""
+    # Three columns are averages; the others are of the whole completion.
     targets = summary["targets"]
     return {
         "targets": len(targets),
@@ -189,7 +197,8 @@ def average_scores(summary: Mapping[str, Any]) -> dict[str, Any]:
 
 def write_overview(out: Path, jobs: Sequence[Job]) -> None:
     """Write the table and the page of `jobs`."""
-    rows = [row for job in jobs if (row := read_row(job, out)) is not None]
+    found_rows = [read_row(job, out) for job in jobs]
+    rows = [row for row in found_rows if row is not None]
     texts = {TABLE_FILE: format_csv(rows), INDEX_FILE: render_batch_page(out, rows)}
     for name, text in texts.items():
         with replace_file(out / name) as file:

@@ -46,7 +46,9 @@ NOTHING_NEW_NOTE = (
 
 def list_notes(summary: CompletionSummary) -> Iterator[str]:
     """List the notes on the whole completion."""
-    frame, scene, targets = summary.frame, summary.scene, summary.targets
+    frame = summary.frame
+    scene = summary.scene
+    targets = summary.targets
     if frame.method in FRAME_NOTES:
         yield f"The splat is {FRAME_NOTES[frame.method]}; summary.json lists the transform."
     if any(frame.origin):
@@ -86,7 +88,8 @@ def name_targets(numbers: Sequence[int], total: int) -> str:
     """Name targets by their numbers."""
     if len(numbers) == total:
         return f"All {total} targets"
-    return f"Targets {', '.join(map(str, numbers[:-1]))} and {numbers[-1]}"
+    first = ", ".join(str(number) for number in numbers[:-1])
+    return f"Targets {first} and {numbers[-1]}"
 
 
 def list_photograph_notes(summary: CompletionSummary) -> Iterator[str]:
@@ -99,15 +102,18 @@ def list_photograph_notes(summary: CompletionSummary) -> Iterator[str]:
             for row in moving
         )
         yield f"{', '.join(shares)} show something that moves; these regions are not used."
-    given = max((row.given_depth for row in context), default=0.0)
-    if given > 0:
-        yield describe_given_depth(given, summary)
-    ignored = max((row.ignored for row in context), default=0.0)
-    if ignored > 0:
+
+    given_share = max((row.given_depth for row in context), default=0.0)
+    if given_share > 0:
+        yield describe_given_depth(given_share, summary)
+
+    ignored_share = max((row.ignored for row in context), default=0.0)
+    if ignored_share > 0:
         yield (
-            f"Up to {format_percent(ignored)} of a photograph {describe_ignored(summary)}; it is "
-            "ignored, also in scores (images/context*_ignored.png)."
+            f"Up to {format_percent(ignored_share)} of a photograph {describe_ignored(summary)}; "
+            "it is ignored, also in scores (images/context*_ignored.png)."
         )
+
     factors = [factor for row in context for factor in row.exposure_gain or ()]
     if factors:
         yield (
@@ -149,10 +155,12 @@ def list_splat_notes(summary: CompletionSummary) -> Iterator[str]:
             f"The splat does not reproduce {summary.new_photographs} of the photographs; it is "
             "recoloured to them, which helps most."
         )
-    if removed := summary.gaussians.get("removed"):
-        yield f"{removed:,} {REMOVED_NOTE}"
-    if recolored := summary.gaussians.get("recolored"):
-        yield f"{recolored:,} {RECOLORED_NOTE}"
+    num_removed = summary.gaussians.get("removed")
+    if num_removed:
+        yield f"{num_removed:,} {REMOVED_NOTE}"
+    num_recolored = summary.gaussians.get("recolored")
+    if num_recolored:
+        yield f"{num_recolored:,} {RECOLORED_NOTE}"
 
 
 def describe_wanted_photographs(targets: Sequence[TargetRow]) -> str:
@@ -188,4 +196,5 @@ def format_change(before: float | None, after: float | None, digits: int = 2) ->
     """Format the change of a score with its sign."""
     if before is None or after is None or not math.isfinite(after - before):
         return "–"
+    # Adding 0.0 turns -0.0 into 0.0, so that no change is "+0.00" and never "-0.00".
     return f"{round(after - before, digits) + 0.0:+.{digits}f}"

@@ -226,9 +226,11 @@ def read_summary(folder: Path) -> CompletionSummary:
         )
     path = folder / SUMMARY_FILE
     summary = read_result(CompletionSummary, path)
+
     transform = np.array(summary.frame.transform)
     numbers = np.concatenate([transform.ravel(), np.array(summary.frame.origin)])
     is_bounded = bool((np.abs(numbers) <= MAX_FRAME_NUMBER).all())  # False for NaN
+    # A determinant of 0 has no inverse, and a negative one is a mirror.
     if not is_bounded or not np.linalg.det(transform[:3, :3]) > 0:
         raise InputError(
             f"{quote_value(path)} is damaged (frame: no similarity of photographs); {ADVICE}."
@@ -240,6 +242,7 @@ def read_record(folder: Path, summary: CompletionSummary) -> CompletionRecord:
     """Read `report.json`; raise an InputError if it does not fit the summary."""
     path = folder / RECORD_FILE
     record = read_result(CompletionRecord, path)
+    # Each part of the page belongs to a row of the summary.
     sizes = len(record.pairs), len(record.targets), len(record.context)
     if sizes != (len(summary.targets), len(summary.targets), len(summary.context)):
         raise InputError(f"{quote_value(path)} does not fit {SUMMARY_FILE} beside it; {ADVICE}.")
@@ -265,9 +268,9 @@ def read_result(kind: type[T], path: Path) -> T:
     try:
         return TypeAdapter(kind).validate_python(content)
     except ValidationError as error:
-        wrong = error.errors(include_url=False)[0]
-        place = ".".join(map(str, wrong["loc"])) or "its content"
+        defect = error.errors(include_url=False)[0]
+        place = ".".join(str(part) for part in defect["loc"]) or "its content"
         raise InputError(
-            f"{quote_value(path)} is damaged ({quote_value(place)}: {quote_value(wrong['msg'])}); "
+            f"{quote_value(path)} is damaged ({quote_value(place)}: {quote_value(defect['msg'])}); "
             f"{ADVICE}."
         ) from None

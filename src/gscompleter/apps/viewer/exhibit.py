@@ -25,8 +25,10 @@ from gscompleter.system.files.output_folder import POSES
 from gscompleter.system.files.writing import COMPLETED_FILE, CONTEXT_FILE, TARGETS_FILE
 from gscompleter.types import Camera, Gaussians
 
-THUMBNAIL_SIDE, THUMBNAIL_QUALITY = 160, 80
-"""Longer side of a thumbnail in pixels, and its JPEG quality."""
+THUMBNAIL_SIDE = 160
+"""Longer side of a thumbnail, in pixels."""
+THUMBNAIL_QUALITY = 80
+"""JPEG quality of a thumbnail."""
 
 
 @dataclass(frozen=True)
@@ -66,6 +68,7 @@ def load_scene_cameras(
 ) -> list[Camera]:
     """Load the cameras of a file into the frame of a scene; arguments as in `ViewerContent`."""
     cameras = load_cameras(path, resolution, origin=origin.tolist())
+    # Read with an origin, which is taken off in float64, and moved back by the transform.
     relative = transform @ compute_frame_from_photographs(-origin)
     return [transform_camera(camera, relative) for camera in cameras]
 
@@ -75,8 +78,9 @@ def load_viewer_files(after: Path, before: Path | None, drop_nonfinite: bool) ->
     scene = load_splat(after, drop_nonfinite)
     if before is not None:
         return ViewerContent(after.name, scene, load_splat(before, drop_nonfinite))
-    given = scene[scene.generated == 0]
-    shown = given if 0 < len(given) < len(scene) else None
+    observed = scene[scene.generated == 0]
+    # Without anything generated or anything observed there is only one state to show.
+    shown = observed if 0 < len(observed) < len(scene) else None
     return ViewerContent(after.name, scene, shown)
 
 
@@ -91,9 +95,10 @@ def load_viewer_completion(folder: Path, drop_nonfinite: bool) -> ViewerContent:
         origin=np.array(summary.frame.origin),
     )
     targets = load_target_cameras(folder, summary, content)
-    found = folder / POSES  # the poses of photographs that had none
-    given = Path(str(summary.settings.get("folder")))
-    source = found if summary.scene.format == "photographs" else given
+    # The poses of photographs that had none lie in the folder; others stay where the user has them.
+    source = Path(str(summary.settings.get("folder")))
+    if summary.scene.format == "photographs":
+        source = folder / POSES
     try:
         photographs = load_context_cameras(source, summary, content)
     except InputError:

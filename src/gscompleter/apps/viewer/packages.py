@@ -93,6 +93,7 @@ def read_lock(lock: Path) -> list[NpmPackage]:
     return [
         NpmPackage(path.removeprefix("node_modules/"), entry["version"], entry["integrity"])
         for path, entry in entries.items()
+        # The root of the project has an empty path.
         if path
     ]
 
@@ -100,8 +101,11 @@ def read_lock(lock: Path) -> list[NpmPackage]:
 def get_archive(package: NpmPackage) -> bytes:
     """Get the archive of a package from the cache, or fetch and cache it."""
     place = get_archive_path(package)
-    if place.is_file() and package.is_intact(archive := place.read_bytes()):
-        return archive
+    # What was cached is checked as well: it may be damaged, or put there by hand.
+    if place.is_file():
+        cached = place.read_bytes()
+        if package.is_intact(cached):
+            return cached
     archive = fetch_archive(package)
     place.parent.mkdir(parents=True, exist_ok=True)
     with replace_file(place) as file:
@@ -133,6 +137,7 @@ def fetch_archive(package: NpmPackage) -> bytes:
 
 def read_archive_member(archive: bytes, name: str) -> str:
     """Read a text file of an npm archive, below its folder `package`."""
+    # The archive is never unpacked to disk.
     with tarfile.open(fileobj=io.BytesIO(archive), mode="r:gz") as files:
         file = files.extractfile(f"package/{name}")
         assert file is not None

@@ -72,6 +72,7 @@ def compute_page_frame(gaussians: Gaussians) -> PageFrame:
     means = gaussians.means.double().cpu()
     centre = means.median(dim=0).values
     spread = (means - centre).norm(dim=1).median().item()
+    # A power of two scales floats without rounding.
     power = math.floor(math.log2(spread / PAGE_EXTENT)) if spread > 0 else 0
     return PageFrame(centre, 2.0**power)
 
@@ -79,17 +80,25 @@ def compute_page_frame(gaussians: Gaussians) -> PageFrame:
 def make_page(viewer_content: ViewerContent, libraries: Libraries) -> tuple[bytes, tuple[str, ...]]:
     """Make the page, and sentences on missing content; the same values give the same bytes."""
     frame = compute_page_frame(viewer_content.after)
-    layers = {
-        name: frame.normalize(part.to("cpu")) for name, part in split_layers(viewer_content).items()
+    after = viewer_content.after
+    parts = {} if viewer_content.before is None else {"before": viewer_content.before}
+    parts |= {
+        "observed": after[after.generated == 0],
+        "generated": after[after.generated > 0],
     }
+    layers = {name: frame.normalize(part.to("cpu")) for name, part in parts.items()}
+    # .spz has fixed-point positions: what lies beyond their range cannot be written.
     shown = {name: part[part.means.norm(dim=1) <= MAX_DISTANCE] for name, part in layers.items()}
     sources = {name: encode_spz(Path(name), part) for name, part in shown.items() if len(part) > 0}
     if not sources.keys() - {"before"}:
         raise InputError(f"{quote_value(viewer_content.title)} has nothing that a page can show.")
+
+    # Most completions leave the context as it is, which is then embedded once for both layers.
     layer_sources = {name: name for name in sources}
     if sources.get("before") == sources.get("observed", b""):
         del sources["before"]
         layer_sources["before"] = "observed"
+
     means = torch.cat([layers["observed"].means, layers["generated"].means]).double()
     landmarks = means[:: max(1, len(means) // MAX_LANDMARKS)]
     cameras = viewer_content.cameras or (make_overview(viewer_content.after),)
@@ -107,13 +116,6 @@ def make_page(viewer_content: ViewerContent, libraries: Libraries) -> tuple[byte
     notes = (f"{omitted:,} Gaussians are too far away to be shown.",) if omitted else ()
     page = fill_template(content, make_scripts(sources))
     return encode_text(page), (*viewer_content.notes, *notes)
-
-
-def split_layers(viewer_content: ViewerContent) -> dict[str, Gaussians]:
-    """Split the content into layers: before, and the observed and generated part of after."""
-    after, before = viewer_content.after, viewer_content.before
-    layers = {"observed": after[after.generated == 0], "generated": after[after.generated > 0]}
-    return layers if before is None else {"before": before, **layers}
 
 
 def make_scripts(sources: Mapping[str, bytes]) -> list[str]:
@@ -140,8 +142,11 @@ def describe_camera(
     view_camera: ViewerCamera, frame: PageFrame, landmarks: Float[Tensor, "n 3"]
 ) -> dict[str, Any]:
     """Describe a camera as the page reads it, focused on landmarks in page unit and scene axes."""
-    camera, thumbnail = frame.move_camera(view_camera.camera), view_camera.thumbnail
-    K, (pixels, depths) = camera.K, project(landmarks, camera)
+    camera = frame.move_camera(view_camera.camera)
+    thumbnail = view_camera.thumbnail
+    K = camera.K
+    pixels, depths = project(landmarks, camera)
+    # A camera at the focus of its view orbits what it looks at: the median depth of what it sees.
     seen = depths[is_inside(pixels, depths, camera)]
     return {
         "name": view_camera.name,
@@ -158,7 +163,10 @@ def describe_camera(
 def plan_path(cameras: Sequence[Camera]) -> list[tuple[int, float]]:
     """Plan a path from the first camera, each time to the nearest one left: indices and seconds."""
     where = embed_cameras([camera.to("cpu") for camera in cameras]).double()
-    apart, left, stops = torch.cdist(where, where), torch.zeros(len(where)), [0]
+    apart = torch.cdist(where, where)
+    # Visited cameras are infinitely far.
+    left = torch.zeros(len(where))
+    stops = [0]
     for _ in cameras[1:]:
         left[stops[-1]] = torch.inf
         stops.append(int((apart[stops[-1]] + left).argmin()))
@@ -178,6 +186,7 @@ def fill_template(content: Mapping[str, Any], scripts: Sequence[str]) -> str:
         "style": read_asset("viewer.css"),
         "program": read_asset("viewer.js"),
         "parts": "\n".join(scripts),
+        # `</script>` in a text would end the element.
         "data": json.dumps(content, sort_keys=True).replace("<", "\\u003c"),
     }
     return re.sub(r"\{\{(\w+)\}\}", lambda name: texts[name[1]], read_asset("viewer.html"))

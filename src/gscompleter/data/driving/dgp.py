@@ -39,9 +39,12 @@ def open_dgp(path: Path) -> Iterator[Photographs]:
     """
     file = list_scene_files(path)[0]
     content = read_json(file, ADVICE)
-    cameras, sweeps = _read_calibrations(file, content), _map_sweeps(content)
+    cameras = _read_calibrations(file, content)
+    sweeps = _map_sweeps(content)
+    # A datum is a reading of one sensor: an image, or a point cloud.
     images = [d for d in get_part(content, "data", list) if "image" in get_part(d, "datum", dict)]
-    frames = sorted((_parse_frame(d, cameras, sweeps, file) for d in images), key=lambda f: f.name)
+    frames = [_parse_frame(datum, cameras, sweeps, file) for datum in images]
+    frames.sort(key=lambda frame: frame.name)
     require(frames, f"{quote_value(file)} lists no images; name a scene with cameras.")
     front = min(frame.sensor or "" for frame in frames)
     yield build_photographs(file.resolve().parent.name, str(file), frames, front=front)
@@ -50,7 +53,8 @@ def open_dgp(path: Path) -> Iterator[Photographs]:
 def _parse_frame(
     datum: Any, cameras: Mapping[str, Intrinsics], sweeps: Mapping[str, Any], file: Path
 ) -> Frame:
-    image, camera = datum["datum"]["image"], str(get_part(datum, "id", dict).get("name"))
+    image = datum["datum"]["image"]
+    camera = str(get_part(datum, "id", dict).get("name"))
     name = get_text(image, "filename", str(file)) or ""
     title = f"image {quote_value(name)} of {quote_value(file)}"
     require(
@@ -59,16 +63,21 @@ def _parse_frame(
         f"calibration; {ADVICE}.",
     )
     intrinsics = replace(cameras[camera], size=get_size(image, title))
-    sweep, read = sweeps.get(str(datum.get("key"))), None
+
+    # Sparse depth is optional: the point cloud may be missing on disk.
+    sweep = sweeps.get(str(datum.get("key")))
+    read_points = None
     points = get_text(sweep, "filename", str(file))
     if points is not None and os.path.isfile(file.parent / points):
-        read = partial(_read_points, file.parent / points, _get_pose(sweep, str(file)))
-    c2w, place = _get_pose(image, title), file.parent / name
-    return Frame(name, title, c2w, intrinsics, place, sensor=camera, laser_points=read)
+        read_points = partial(_read_points, file.parent / points, _get_pose(sweep, str(file)))
+    c2w = _get_pose(image, title)
+    place = file.parent / name
+    return Frame(name, title, c2w, intrinsics, place, sensor=camera, laser_points=read_points)
 
 
 def _get_pose(entry: Any, title: str) -> Float[np.ndarray, "4 4"]:
-    pose, quaternion = get_part(entry, "pose", dict), ("qw", "qx", "qy", "qz")
+    pose = get_part(entry, "pose", dict)
+    quaternion = ("qw", "qx", "qy", "qz")
     return get_pose(pose, "translation", "rotation", quaternion, title)
 
 
@@ -76,12 +85,13 @@ def _map_sweeps(content: Any) -> dict[str, Any]:
     """Map the key of each datum to the point cloud of its sample."""
     data = [datum for datum in get_part(content, "data", list) if isinstance(datum, dict)]
     entries = {str(datum.get("key")): get_part(datum, "datum", dict) for datum in data}
-    found: dict[str, Any] = {}
+    sweeps: dict[str, Any] = {}
     for sample in get_part(content, "samples", list):
         keys = [str(key) for key in get_part(sample, "datum_keys", list)]
+        # All images of a sample share its only point cloud, in whatever order they are listed.
         clouds = (get_part(entries.get(key), "point_cloud", dict) for key in keys)
-        found |= dict.fromkeys(keys, next(filter(None, clouds), None))
-    return found
+        sweeps |= dict.fromkeys(keys, next(filter(None, clouds), None))
+    return sweeps
 
 
 def _read_points(
@@ -99,17 +109,20 @@ def _read_calibrations(scene: Path, content: Any) -> dict[str, Intrinsics]:
     """Read the intrinsics by camera name, without image sizes, that the first sample names."""
     samples = get_part(content, "samples", list)
     key = get_text(samples[0] if samples else None, "calibration_key", str(scene))
+    # One folder of calibrations for all samples, or a single file for the scene.
     keyed = scene.parent / "calibration" / f"{key}.json"
-    found = next(filter(os.path.isfile, (keyed, scene.with_name("calibration.json"))), None)
-    if found is None:
+    candidates = (keyed, scene.with_name("calibration.json"))
+    file = next((path for path in candidates if os.path.isfile(path)), None)
+    if file is None:
         raise InputError(
             f"The calibration of {quote_value(scene)} is missing; put it at {quote_value(keyed)}."
         )
-    calibration = read_json(found, ADVICE)
-    names, entries = (get_part(calibration, key, list) for key in ("names", "intrinsics"))
+    calibration = read_json(file, ADVICE)
+    names = get_part(calibration, "names", list)
+    entries = get_part(calibration, "intrinsics", list)
     # Entries of other sensors are zeros.
     return {
-        str(name): get_intrinsics(entry, f"camera {quote_value(name)} of {quote_value(found)}")
+        str(name): get_intrinsics(entry, f"camera {quote_value(name)} of {quote_value(file)}")
         for name, entry in zip(names, entries, strict=False)
         if isinstance(entry, dict) and entry.get("fx")
     }

@@ -26,7 +26,8 @@ from gscompleter.data.photographs import Photographs, build_drive, build_photogr
 from gscompleter.system.errors import quote_value
 from gscompleter.system.files.reading import MAX_LINE, read_head, read_lines
 
-POSES, CALIBRATION = "poses.txt", "calib.txt"
+POSES = "poses.txt"
+CALIBRATION = "calib.txt"
 CAMERAS = {"image_2": 2, "image_0": 0, "image_3": 3, "image_1": 1, "image_l": 0, "image_r": 1}
 """Folders of photographs of a sequence in search order, and their camera numbers."""
 RAW_CAMERAS = ("02", "03", "00", "01")
@@ -43,6 +44,7 @@ def has_kitti(path: Path) -> bool:
     """Check whether `path` is a KITTI odometry sequence, or a file of poses."""
     if os.path.isdir(path):
         return os.path.isfile(path / CALIBRATION) and bool(_list_poses(path))
+    # A file of poses is only known by its first line: twelve numbers that are a rigid transform.
     line, _, _ = read_head(path, MAX_LINE).partition(b"\n")
     first = _parse_numbers(line.decode("utf-8-sig", errors="replace"))
     is_pose = len(first) == 12 and find_pose_defect(_complete(first)) is None
@@ -55,11 +57,14 @@ def open_kitti(path: Path) -> Iterator[Photographs]:
     `path` is a folder with calib.txt and poses.txt, or with its poses in ../../poses; or a file of
     poses, with calibration and photographs beside it or in ../sequences.
     """
-    poses, folder = _list_poses(path)[0], path if os.path.isdir(path) else path.parent
+    poses = _list_poses(path)[0]
+    folder = path if os.path.isdir(path) else path.parent
     sequence = poses.resolve().parent.parent / "sequences" / poses.stem
     if poses == path and os.path.isdir(sequence):
         folder = sequence
     calibration = folder / CALIBRATION
+
+    # calib.txt labels the projections P0 to P3; some copies omit the labels, one camera a line.
     entries = _read_entries(calibration)
     images = next((name for name in CAMERAS if os.path.isdir(folder / name)), "image_2")
     camera = CAMERAS[images]
@@ -67,10 +72,14 @@ def open_kitti(path: Path) -> Iterator[Photographs]:
     projection = _get_matrix(entries, label, calibration)
     intrinsics, first_from_camera = _split_projection(projection, calibration)
     lasers = [_get_matrix(entries, label, calibration) for label in entries if label[:2] == "Tr"]
-    frames, rows = [], _read_entries(poses)
+
+    frames = []
+    rows = _read_entries(poses)
     require(rows, f"{quote_value(poses)} holds no poses; copy it again.")
     for number, row in enumerate(rows):
-        name, title = f"{number:06d}", f"frame {number} of {quote_value(poses)}"
+        name = f"{number:06d}"
+        title = f"frame {number} of {quote_value(poses)}"
+        # All poses are those of camera 0; laser and photograph have a fixed place beside it.
         first = _get_matrix(rows, row, poses)
         sweep = folder / "velodyne" / f"{name}.bin"
         points = _find_sweep(sweep, first @ lasers[0]) if lasers else None
@@ -89,11 +98,15 @@ def open_kitti_raw(path: Path) -> Iterator[Photographs]:
     """Open the photographs of a drive in the order of their numbers; its folder names it."""
     camera = _list_raw_cameras(path)[0]
     date = path.resolve().parent
+    # The chain of frames: map <- inertial sensor <- laser <- camera 0 <- camera of the photographs.
+    # Calibration files hold the transforms in the other direction.
     imu_from_laser = np.linalg.pinv(_read_rigid(date / "calib_imu_to_velo.txt"))
     intrinsics, first_from_camera, first_from_laser = _read_raw_camera(date, camera)
     laser_from_first = np.linalg.pinv(first_from_laser)
+
     images = sorted((path / f"image_{camera}" / "data").iterdir())
     readings = [_read_oxts(path / "oxts" / "data" / f"{image.stem}.txt") for image in images]
+    # One scale of the map for all frames, that at the first latitude, so that it stays rigid.
     scale = float(np.cos(np.radians(readings[0][0])))
     frames = []
     for image, reading in zip(images, readings, strict=True):
@@ -111,8 +124,10 @@ def _find_sweep(path: Path, world_from_laser: Pose) -> partial[Float[np.ndarray,
 
 def _read_raw_camera(date: Path, camera: str) -> tuple[Intrinsics, Pose, Pose]:
     """Read the intrinsics of a camera, and the transforms from it and the laser to camera 0."""
-    path, rectify = date / "calib_cam_to_cam.txt", np.eye(4)
+    path = date / "calib_cam_to_cam.txt"
     entries = _read_entries(path)
+    # Photographs are rectified, and the laser's calibration is with the camera before that.
+    rectify = np.eye(4)
     rectify[:3, :3] = _get_entry(entries, "R_rect_00", 9, path).reshape(3, 3)
     projection = _get_matrix(entries, f"P_rect_{camera}", path)
     first_from_laser = rectify @ _read_rigid(date / "calib_velo_to_cam.txt")
@@ -121,12 +136,15 @@ def _read_raw_camera(date: Path, camera: str) -> tuple[Intrinsics, Pose, Pose]:
 
 def _split_projection(projection: Pose, path: Path) -> tuple[Intrinsics, Pose]:
     """Split the projection of a rectified camera into intrinsics and the transform to camera 0."""
-    K, transform = projection[:3, :3], np.eye(4)
+    K = projection[:3, :3]
+    # Rectified cameras are all turned alike, so the left part is K alone.
     require(
         not np.tril(K, -1).any() and (np.diag(K) > 0).all() and K[2, 2] == 1,
         f"The projection in {quote_value(path)} is not that of a rectified camera; name the "
         "calib.txt of KITTI odometry.",
     )
+    # P = K [I | t], where t leads from camera 0 to this camera.
+    transform = np.eye(4)
     transform[:3, 3] = -np.linalg.solve(K, projection[:3, 3])
     (fx, _, cx), (_, fy, cy), _ = K.tolist()
     return Intrinsics(None, (fx, fy), (cx, cy)), transform
@@ -135,6 +153,7 @@ def _split_projection(projection: Pose, path: Path) -> tuple[Intrinsics, Pose]:
 def _compute_imu_pose(reading: Numbers, scale: float) -> Pose:
     """Compute the pose of the inertial sensor in map axes (east, north, up), in metres."""
     latitude, longitude, altitude, roll, pitch, yaw = reading.tolist()
+    # Mercator's projection, as in KITTI's development kit (`convertOxtsToPose`).
     east = scale * EARTH_RADIUS * np.radians(longitude)
     north = scale * EARTH_RADIUS * np.log(np.tan(np.radians(90 + latitude) / 2))
     return build_poses(np.array([roll, pitch, yaw, east, north, altitude]))
@@ -151,8 +170,9 @@ def _read_oxts(path: Path) -> Numbers:
 def _read_rigid(path: Path) -> Pose:
     """Read a rigid transform from the lines R and T."""
     entries = _read_entries(path)
-    parts = _get_entry(entries, "R", 9, path).reshape(3, 3), _get_entry(entries, "T", 3, path)
-    return _complete(np.column_stack(parts))
+    rotation = _get_entry(entries, "R", 9, path).reshape(3, 3)
+    translation = _get_entry(entries, "T", 3, path)
+    return _complete(np.column_stack([rotation, translation]))
 
 
 def _read_entries(path: Path) -> dict[str, Numbers]:
@@ -160,17 +180,20 @@ def _read_entries(path: Path) -> dict[str, Numbers]:
     entries = {}
     for number, line in enumerate(line for line in read_lines(path) if line.strip()):
         label, colon, rest = line.partition(":")
-        entries[label.strip() if colon else str(number)] = _parse_numbers(rest if colon else line)
+        if colon:
+            entries[label.strip()] = _parse_numbers(rest)
+        else:
+            entries[str(number)] = _parse_numbers(line)
     return entries
 
 
 def _get_entry(entries: Mapping[str, Numbers], label: str, count: int, path: Path) -> Numbers:
-    found = entries.get(label, np.zeros(0))
+    numbers = entries.get(label, np.zeros(0))
     require(
-        len(found) == count,
+        len(numbers) == count,
         f"{quote_value(path)} has no line {label} of {count} numbers; copy it again.",
     )
-    return found
+    return numbers
 
 
 def _get_matrix(entries: Mapping[str, Numbers], label: str, path: Path) -> Pose:
@@ -197,7 +220,7 @@ def _list_poses(path: Path) -> list[Path]:
         return [path]
     sequence = path.resolve()
     candidates = (path / POSES, sequence.parent.parent / "poses" / f"{sequence.name}.txt")
-    return list(filter(os.path.isfile, candidates))
+    return [file for file in candidates if os.path.isfile(file)]
 
 
 def _list_raw_cameras(path: Path) -> list[str]:

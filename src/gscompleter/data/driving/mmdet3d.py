@@ -79,24 +79,24 @@ def _parse_sample(sample: Any, path: Path) -> list[Shot]:
         if isinstance(image, dict) and all(image.get(key) is not None for key in NEEDED)
     }
     require(images, f"The images of {title} have no file or no pose; {ADVICE}.")
+    # Infos of nuScenes are in seconds, those of Waymo in microseconds.
     time = get_number(sample, "timestamp", title, 0.0, 1e6 * MICROSECONDS)
     time = time * 1e-6 if time >= MICROSECONDS else time
-    world_from_laser = _read_laser_pose(sample, title)
+
+    # In Waymo's infos the laser frame is that of the vehicle.
+    lidar = {"lidar2ego": np.eye(4), **get_part(sample, "lidar_points", dict)}
+    world_from_vehicle = get_array(sample, "ego2global", title, (4, 4))
+    world_from_laser = world_from_vehicle @ get_array(lidar, "lidar2ego", title, (4, 4))
     things = get_part(sample, "instances", list)
     things = [t for t in things if isinstance(t, dict) and "velocity" in t]  # none in Waymo's infos
     boxes = partial(_read_boxes, things, world_from_laser, path) if things else None
+
+    # nuScenes begins its file names with the drive, "n015-2018-07-24-11-22-45+0800__CAM_FRONT__…".
     first = images.get(FRONT, next(iter(images.values())))
     file = os.path.basename(get_text(first, "img_path", title) or "")
     drive = get_text(sample, "context_name", title) or file.split("__")[0]
     frames = (_make_frame(path, n, time, image, world_from_laser) for n, image in images.items())
     return [(drive, time, replace(frame, boxes=boxes)) for frame in frames]
-
-
-def _read_laser_pose(sample: Any, title: str) -> Pose:
-    # In Waymo's infos the laser frame is that of the vehicle.
-    lidar = {"lidar2ego": np.eye(4), **get_part(sample, "lidar_points", dict)}
-    vehicle = get_array(sample, "ego2global", title, (4, 4))
-    return vehicle @ get_array(lidar, "lidar2ego", title, (4, 4))
 
 
 def _split_scenes(shots: list[Shot]) -> Iterator[list[Shot]]:
@@ -129,7 +129,8 @@ def _make_frame(path: Path, camera: str, time: float, image: Any, world_from_las
     K = get_array(image, "cam2img", title, (3, 3), (3, 4))
     size = get_size(image, title) if "width" in image and "height" in image else None
     intrinsics = Intrinsics(size, (K[0, 0], K[1, 1]), (K[0, 2], K[1, 2]))
-    name, place = f"{camera}/{os.path.basename(file)}", _find_image(path.parent, file, camera)
+    name = f"{camera}/{os.path.basename(file)}"
+    place = _find_image(path.parent, file, camera)
     return Frame(name, title, c2w, intrinsics, place, sensor=camera)
 
 
@@ -156,10 +157,11 @@ class _PlainUnpickler(pickle._Unpickler):  # that in C allocates whatever a few 
     """Unpickler of plain values and NumPy scalars, which calls nothing else that a file names."""
 
     def find_class(self, module: str, name: str) -> Callable[..., Any]:
-        found = CONSTRUCTORS.get((module.replace("numpy._core", "numpy.core"), name))
-        if found is None:
+        # `numpy._core` is the name of the module since NumPy 2.
+        constructor = CONSTRUCTORS.get((module.replace("numpy._core", "numpy.core"), name))
+        if constructor is None:
             raise pickle.UnpicklingError(f"it names {module}.{name}")
-        return found
+        return constructor
 
 
 def load_plain(path: Path) -> Any:
@@ -172,5 +174,6 @@ def load_plain(path: Path) -> Any:
             f"{quote_value(path)} is no pickle of plain values ({type(error).__name__}: "
             f"{quote_value(str(error))}); write it again with lists and numbers only."
         ) from error
+    # An object may refer to itself many times, and a small pickle then stands for a huge value.
     check_plain(value, path, MAX_REPEATS * len(data))
     return value

@@ -37,11 +37,14 @@ def open_pandaset(path: Path) -> Iterator[Photographs]:
 
 
 def _read_frames(file: Path) -> Iterator[Frame]:
-    poses, lens, camera = read_json(file, ADVICE), file.with_name("intrinsics.json"), file.parent
+    camera = file.parent
+    poses = read_json(file, ADVICE)
+    lens = file.with_name("intrinsics.json")
     require(isinstance(poses, list), f"{quote_value(file)} is no list of poses; {ADVICE}.")
     intrinsics = get_intrinsics(read_json(lens, ADVICE), quote_value(lens))
     for number, pose in enumerate(poses):
         title = f"pose {number} of {quote_value(file)}"
-        c2w, image = get_pose(pose, "position", "heading", "wxyz", title), camera / f"{number:02d}"
+        c2w = get_pose(pose, "position", "heading", "wxyz", title)
+        image = camera / f"{number:02d}"
         name = f"{camera.name}/{image.name}"
         yield Frame(name, title, c2w, intrinsics, image, sensor=camera.name)

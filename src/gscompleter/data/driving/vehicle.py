@@ -59,9 +59,12 @@ def compute_moving_boxes(
     A row of `objects` has centre, sides (metres) and heading (radians) of an upright box (z up) on
     the vehicle, then its velocity, which is NaN if unknown.
     """
+    # Not `>=`: an unknown speed is NaN, and such an object counts as moving.
     moving = objects[~(np.linalg.norm(objects[:, 7:], axis=1) < MIN_SPEED)]
     centers, sides, headings = np.split(moving[:, :7], [3, 6], axis=1)
+    # Boxes stand level on the vehicle: only the yaw turns them.
     level = np.zeros((len(moving), 2))
     poses = vehicle @ build_poses(np.concatenate([level, headings, centers], axis=1))
+    # Signs of the eight corners, from the centre of a box of side 1.
     signs = np.array(list(product((-0.5, 0.5), repeat=3)))
     return transform_points((1 + MARGIN) * sides[:, None] * signs, poses[:, None])

@@ -29,7 +29,9 @@ from gscompleter.system.files.reading import check_file
 
 ADVICE = "download it again"
 IMAGES = "camera_image"
-TIME, CAMERA, LASER = "key.frame_timestamp_micros", "key.camera_name", "key.laser_name"
+TIME = "key.frame_timestamp_micros"
+CAMERA = "key.camera_name"
+LASER = "key.laser_name"
 INTRINSICS = ("f_u", "f_v", "c_u", "c_v", "k1", "k2", "k3", "p1", "p2")
 LENS = ("width", "height", *(f"intrinsic.{name}" for name in INTRINSICS))
 CAMERAS = {1: "FRONT", 2: "FRONT_LEFT", 3: "FRONT_RIGHT", 4: "SIDE_LEFT", 5: "SIDE_RIGHT"}
@@ -47,7 +49,7 @@ PosedLens = tuple[Intrinsics, Float[np.ndarray, "4 4"]]
 
 def open_waymo(path: Path) -> Iterator[Photographs]:
     """Open segments; frames are numbered by camera, the front camera first, and time."""
-    return map(_open_segment, list_segments(path))
+    return (_open_segment(segment) for segment in list_segments(path))
 
 
 def list_segments(path: Path) -> list[Path]:
@@ -83,6 +85,8 @@ def _read_rows(
     check_file(path)
     filters = [(column, "==", value) for column, value in (where or {}).items()] or None
     try:
+        # Columns are called "[CameraImageComponent].image", with the name of the component in
+        # brackets.
         stored = {name.rpartition("].")[2]: name for name in parquet.read_schema(path).names}
         names = [stored.get(column, column) for column in columns]
         table = parquet.read_table(path, columns=names, filters=filters, partitioning=None)
@@ -93,9 +97,9 @@ def _read_rows(
 
 def _read_value(path: Path, column: str, where: Mapping[str, int]) -> Any:
     """Read the value of a column in the only row where other columns have these values."""
-    found = [value for (value,) in _read_rows(path, (column,), where) if value]
-    require(len(found) == 1, f"{quote_value(path)} lacks a {column} of a frame; {ADVICE}.")
-    return found[0]
+    values = [value for (value,) in _read_rows(path, (column,), where) if value]
+    require(len(values) == 1, f"{quote_value(path)} lacks a {column} of a frame; {ADVICE}.")
+    return values[0]
 
 
 def _open_segment(segment: Path) -> Photographs:
@@ -114,8 +118,14 @@ def _make_frame(
     title = f"the photograph of {name} at {time} in {quote_value(segment)}"
     require(camera in cameras, f"The camera of {title} has no calibration; {ADVICE}.")
     intrinsics, vehicle_from_camera = cameras[camera]
-    measured = _has_components(segment, "lidar", "lidar_calibration", "vehicle_pose")
-    boxed = _has_components(segment, "lidar_box", "vehicle_pose")
+
+    # Components are downloaded one by one, and only the first two are needed.
+    laser_points = None
+    if _has_components(segment, "lidar", "lidar_calibration", "vehicle_pose"):
+        laser_points = partial(_read_points, segment, time)
+    boxes = None
+    if _has_components(segment, "lidar_box", "vehicle_pose"):
+        boxes = partial(_read_boxes, segment, time)
     return Frame(
         f"{name}/{time}",
         title,
@@ -123,13 +133,14 @@ def _make_frame(
         intrinsics,
         partial(_read_value, segment, "image", {TIME: time, CAMERA: camera}),
         sensor=name,
-        laser_points=partial(_read_points, segment, time) if measured else None,
-        boxes=partial(_read_boxes, segment, time) if boxed else None,
+        laser_points=laser_points,
+        boxes=boxes,
     )
 
 
 def _read_cameras(path: Path) -> dict[int, PosedLens]:
-    title, found = quote_value(path), {}
+    title = quote_value(path)
+    cameras = {}
     for camera, pose, *numbers in _read_rows(path, (CAMERA, "extrinsic.transform", *LENS)):
         lens = np.array(numbers, dtype=np.float64)  # null becomes NaN
         require(
@@ -140,8 +151,8 @@ def _read_cameras(path: Path) -> dict[int, PosedLens]:
         distortion = Distortion(radial=tuple(radial), tangential=(p1, p2))
         size = (int(width), int(height))
         intrinsics = Intrinsics(size, (f_u, f_v), (c_u, c_v), distortion=distortion)
-        found[camera] = intrinsics, _parse_matrix(pose, title)
-    return found
+        cameras[camera] = intrinsics, _parse_matrix(pose, title)
+    return cameras
 
 
 @lru_cache(maxsize=2)
@@ -151,17 +162,29 @@ def _read_points(segment: Path, time: int) -> Float[np.ndarray, "n 3"]:
     The roof laser rotates while the vehicle drives; `lidar_pose` has the vehicle pose per pixel.
     """
     vehicle = _read_vehicle_pose(segment, time)
-    lasers = _read_lasers(_locate(segment, "lidar_calibration"))
-    measured, turning = _locate(segment, "lidar"), _locate(segment, "lidar_pose")
+    # Of each laser its pose on the vehicle, its beams, and their lower and upper end.
+    calibration = _locate(segment, "lidar_calibration")
+    beams = (f"beam_inclination.{name}" for name in ("values", "min", "max"))
+    rows = _read_rows(calibration, (LASER, "extrinsic.transform", *beams))
+    lasers = {
+        laser: (_parse_matrix(pose, quote_value(calibration)), *inclinations)
+        for laser, pose, *inclinations in rows
+    }
+
+    measured = _locate(segment, "lidar")
+    turning = _locate(segment, "lidar_pose")
     poses = _read_range_images(turning, time) if os.path.isfile(turning) else {}
     points = [np.zeros((0, 3))]
     for laser, image in _read_range_images(measured, time).items():
         title = f"laser {laser} of {quote_value(measured)}"
-        ranges, moving = image[..., 0], poses.get(laser)
+        ranges = image[..., 0]
+        moving = poses.get(laser)
         fits = laser in lasers and (moving is None or moving.shape == (*ranges.shape, 6))
         require(fits, f"The {title} does not fit its calibration or its poses; {ADVICE}.")
+        # A range of 0 or below is a beam that did not return.
         hit = np.isfinite(ranges) & (ranges > 0)
         local = _compute_points(title, ranges, *lasers[laser])[hit]
+        # Without `lidar_pose` the vehicle is taken to stand still during the turn.
         pose = vehicle if moving is None else build_poses(moving[hit])
         points.append(transform_points(local, pose))
     return np.concatenate(points)
@@ -182,14 +205,17 @@ def _compute_points(
     ascending, by default evenly spaced from `low` to `high`; `extrinsic` is the pose of the laser.
     """
     height, width = ranges.shape
+    # Elevations are listed from the lowest beam, and rows begin with the highest.
     rising = np.array(beams, dtype=np.float64)
     if beams is None and low is not None and high is not None:
         rising = low + (np.arange(height) + 0.5) / height * (high - low)
     require(rising.size == height, f"The {title} does not fit its calibration; {ADVICE}.")
+    # As in Waymo's `range_image_utils`: azimuths count from behind, in the frame of the vehicle, so
+    # the yaw of the laser is taken off.
     yaw = np.arctan2(extrinsic[1, 0], extrinsic[0, 0])
     azimuths = np.pi * (1 - 2 * (np.arange(width) + 0.5) / width) - yaw
-    level, up = np.cos(rising[::-1, None]), np.sin(rising[::-1, None])
-    up = np.broadcast_to(up, ranges.shape)
+    level = np.cos(rising[::-1, None])
+    up = np.broadcast_to(np.sin(rising[::-1, None]), ranges.shape)
     rays = np.stack([level * np.cos(azimuths), level * np.sin(azimuths), up], axis=-1)
     return transform_points(ranges[..., None] * rays, extrinsic)
 
@@ -200,30 +226,24 @@ def _read_vehicle_pose(segment: Path, time: int) -> Float[np.ndarray, "4 4"]:
     return _parse_matrix(values, quote_value(path))
 
 
-def _read_lasers(path: Path) -> dict[int, tuple[Any, ...]]:
-    """Read the pose of each laser on the vehicle, its beams, and their lower and upper end."""
-    beams = (f"beam_inclination.{name}" for name in ("values", "min", "max"))
-    rows = _read_rows(path, (LASER, "extrinsic.transform", *beams))
-    return {laser: (_parse_matrix(pose, quote_value(path)), *rest) for laser, pose, *rest in rows}
-
-
 def _read_range_images(path: Path, time: int) -> dict[int, Float[np.ndarray, "h w c"]]:
     """Read the range image of the first returns, or the poses of its pixels, by laser."""
-    columns, found = (LASER, "range_image_return1.values", "range_image_return1.shape"), {}
+    columns = (LASER, "range_image_return1.values", "range_image_return1.shape")
+    images = {}
     for laser, values, shape in _read_rows(path, columns, {TIME: time}):
         if values is not None and shape is not None:
             fits = len(shape) == 3 and min(shape) > 0 and len(values) == np.prod(shape)
             require(fits, f"A range image in {quote_value(path)} is damaged; {ADVICE}.")
-            found[laser] = np.asarray(values, dtype=np.float64).reshape(shape)
-    return found
+            images[laser] = np.asarray(values, dtype=np.float64).reshape(shape)
+    return images
 
 
 def _read_boxes(segment: Path, time: int) -> Float[np.ndarray, "n 8 3"]:
     """Read the boxes of moving objects around the vehicle, except signs."""
     vehicle = _read_vehicle_pose(segment, time)
-    center, size, speed = (
-        [f"{name}.{axis}" for axis in "xyz"] for name in ("box.center", "box.size", "speed")
-    )
+    center = [f"box.center.{axis}" for axis in "xyz"]
+    size = [f"box.size.{axis}" for axis in "xyz"]
+    speed = [f"speed.{axis}" for axis in "xyz"]
     columns = ["type", *center, *size, "box.heading", *speed]
     rows = _read_rows(_locate(segment, "lidar_box"), columns, {TIME: time})
     objects = [numbers for kind, *numbers in rows if kind != SIGN]

@@ -30,7 +30,9 @@ from gscompleter.system.errors import InputError, quote_value
 from gscompleter.system.files.reading import parse_json
 from gscompleter.types import MAX_COORDINATE
 
-HOME, METADATA, LENSES = "keyframes", "metadata", "perFrameIntrinsicCoeffs"
+HOME = "keyframes"
+METADATA = "metadata"
+LENSES = "perFrameIntrinsicCoeffs"
 NOTE = "Depth is left out; `pip install 'gscompleter[phones]'` makes it readable."
 
 
@@ -48,8 +50,12 @@ class KeyframeFormat:
     def find_frames(self, path: Path) -> list[Files]:
         """Find the files of the first patterns with photographs; none if there are none."""
         root = path.parent if path.name == HOME else path
-        for files in ([find_files(root, pattern) for pattern in group] for group in self.patterns):
-            if files[1] and self.mark in next(iter(files[0].values()), bytes)():
+        for group in self.patterns:
+            files = [find_files(root, pattern) for pattern in group]
+            cameras, photographs, *_ = files
+            # Other exports have JSON files of these names, too.
+            first_camera = next(iter(cameras.values()), bytes)
+            if photographs and self.mark in first_camera():
                 return files
         return []
 
@@ -65,7 +71,8 @@ class KeyframeFormat:
 
 def parse_polycam(entry: Any, title: str) -> PoseAndLens:
     """Parse a camera of Polycam."""
-    c2w, bound = np.eye(4), MAX_COORDINATE
+    c2w = np.eye(4)
+    bound = MAX_COORDINATE
     for row, column in np.ndindex(3, 4):
         c2w[row, column] = get_number(entry, f"t_{row}{column}", title, -bound, bound)
     return c2w, replace(get_intrinsics(entry, title), size=get_size(entry, title))
@@ -93,11 +100,13 @@ def find_recording(path: Path) -> Files:
 
 def open_recording(path: Path) -> Iterator[Photographs]:
     """Open a recording of Record3D; frames are numbered by time."""
-    title, metadata = quote_value(path), find_files(path, METADATA)
+    title = quote_value(path)
+    metadata = find_files(path, METADATA)
     require(metadata, f"There is no `{METADATA}` in {title}; {ADVICE}.")
     content = parse_json(metadata[METADATA](), f"`{METADATA}` of {title}", ADVICE)
     size = get_size(content, title, "w", "h")
-    depths, confidences = find_files(path, "rgbd/*.depth"), find_files(path, "rgbd/*.conf")
+    depths = find_files(path, "rgbd/*.depth")
+    confidences = find_files(path, "rgbd/*.conf")
     notes = (NOTE,) if depths and find_spec("liblzfse") is None else ()
     files = find_recording(path), {} if notes else depths, confidences
     decoders = partial(_unpack, "<f4", size), partial(_unpack, "u1", size)
@@ -109,13 +118,15 @@ def _parse_recorded(content: Any, size: tuple[int, int], title: str) -> dict[str
     count = len(get_part(content, "poses", list))
     require(count, f"{title} has no poses; record with the LiDAR.")
     poses = get_array(content, "poses", title, (count, 7))
+    # fx, fy, cx and cy of a matrix that is stored column by column.
     lenses = np.tile(get_array(content, "K", title, (9,))[[0, 4, 6, 7]], (count, 1))
     if get_part(content, LENSES, list):
         lenses = get_array(content, LENSES, title, (count, 4))
     cameras: dict[str, PoseAndLens] = {}
     for (x, y, z, w, *center), (fx, fy, cx, cy) in zip(poses, lenses.tolist(), strict=True):
         c2w = np.eye(4)
-        c2w[:3, :3], c2w[:3, 3] = compute_rotation((w, x, y, z)), center
+        c2w[:3, :3] = compute_rotation((w, x, y, z))
+        c2w[:3, 3] = center
         cameras[str(len(cameras))] = c2w, Intrinsics(size, (fx, fy), (cx, cy))
     return cameras
 
@@ -129,6 +140,7 @@ def _unpack(kind: str, size: tuple[int, int], data: bytes, title: str) -> Shaped
         limit = 8 * math.prod(size)
         if len(data) > limit or measure_unpacked(data) > limit:
             raise ValueError("it is larger than the photograph")
+        # The map has no header: its height follows from the number of values and the aspect ratio.
         values = np.frombuffer(decompress(data), kind)
         return values.reshape(round(math.sqrt(len(values) * size[1] / size[0])), -1)
     except Exception as error:  # damaged bytes raise anything

@@ -48,8 +48,11 @@ def find_files(export: Path, pattern: str) -> Files:
     read: Callable[[Any], bytes] = read_bytes
     if os.path.isfile(export) and export.suffix.lower() in (".zip", ".r3d"):
         with _open_archive(export) as archive:
-            paths = [p for p in map(PurePosixPath, archive.namelist()) if p.match(pattern)]
+            entries = [PurePosixPath(name) for name in archive.namelist()]
+            # `match` compares from the right, so that a folder around the export does not matter.
+            paths = [entry for entry in entries if entry.match(pattern)]
         read = partial(_read_entry, export)
+    # macOS adds "._x.jpg" for each "x.jpg" to an archive.
     paths = sorted(path for path in paths if not path.name.startswith("."))
     require(
         len({path.parent for path in paths}) <= 1,
@@ -60,6 +63,7 @@ def find_files(export: Path, pattern: str) -> Files:
 
 def _read_entry(export: Path, path: PurePosixPath) -> bytes:
     with _open_archive(export) as archive:
+        # A zip archive of a few bytes may claim any size.
         if archive.getinfo(str(path)).file_size > MAX_ENTRY:
             raise ValueError(f"its {path} is too large")
         return archive.read(str(path))
@@ -98,9 +102,13 @@ def build_recording(
 
     `decoders` are those of depth and of confidence, either of which a frame may lack.
     """
-    frames, (images, depths, confidences) = [], files
-    for name in (name for name in cameras if name in images):
-        title, (c2w, lens), depth = f"frame {name} of {quote_value(path)}", cameras[name], None
+    frames = []
+    images, depths, confidences = files
+    for name, (c2w, lens) in cameras.items():
+        if name not in images:
+            continue
+        title = f"frame {name} of {quote_value(path)}"
+        depth = None
         if name in depths:
             depth = partial(_read_depth, depths[name], confidences.get(name), decoders, title)
         frame = Frame(name, title, c2w @ OPENCV_FROM_OPENGL, lens, images[name], depth)
@@ -114,6 +122,7 @@ def _read_depth(
 ) -> Float[np.ndarray, "h w"]:
     """Read z-depth in metres, 0 where it is unknown or unreliable."""
     stored = decoders[0](depth(), title)
+    # Confidence is optional; depth without it is taken as it is.
     sure = stored if confidence is None else decoders[1](confidence(), title)
     require(
         stored.ndim == 2 and stored.dtype.itemsize > 1 and stored.shape == sure.shape,

@@ -33,7 +33,11 @@ def measure_unpacked(data: bytes) -> int:
             start += 12 + packed
         elif magic == LZFSE:
             _, unpacked, first, second, third = LZFSE_HEADER.unpack_from(data, start)
-            literals, matches = (first >> 20) & PAYLOAD_MASK, (second >> 40) & PAYLOAD_MASK
+            # Offsets and widths of the fields are those of `lzfse_compressed_block_header_v2`:
+            # literals are the second 20 bits of the first field, matches the third 20 bits of the
+            # second one.
+            literals = (first >> 20) & PAYLOAD_MASK
+            matches = (second >> 40) & PAYLOAD_MASK
             header_bytes = third & 0xFFFFFFFF
             start += max(header_bytes, LZFSE_HEADER.size) + literals + matches
         else:

@@ -105,8 +105,16 @@ def find_features(job: Job) -> None:
     """Extract SIFT features of all photographs; those of equal size and lens share a camera."""
     extraction = pycolmap.FeatureExtractionOptions(num_threads=job.threads, use_gpu=False)
     extraction.sift.max_num_features = MAX_FEATURES
+
     cameras = {(one.width, one.height, one.lens): one for one in job.photographs}
-    numbers = {key: _add_camera(job, one) for key, one in cameras.items()}
+    numbers = {}
+    with pycolmap.Database.open(job.database) as database:
+        for key, one in cameras.items():
+            focal = one.focal or GUESSED_FOCAL * max(one.width, one.height)
+            camera = pycolmap.Camera.create_from_model_name(1, LENS, focal, one.width, one.height)
+            camera.has_prior_focal_length = one.focal is not None
+            numbers[key] = int(database.write_camera(camera))
+
     for one in job.photographs:  # one by one, so that they are numbered in their order
         number = numbers[one.width, one.height, one.lens]
         reading = pycolmap.ImageReaderOptions(existing_camera_id=number)
@@ -126,6 +134,8 @@ def join_views(job: Job) -> None:
     """Join the views of each panorama to a rig, with known rotations and one centre."""
     rig = pycolmap.RigConfig()
     for number, view in enumerate(VIEWS):
+        # COLMAP's rig maps from the rig to the camera; `compute_rotation` leads to the panorama's
+        # axes. The first camera is the reference and has no pose of its own.
         turn = pycolmap.Rigid3d(pycolmap.Rotation3d(compute_rotation(*view).T), np.zeros(3))
         camera = pycolmap.RigConfigCamera(image_prefix=f"view_{number}/", ref_sensor=number == 0)
         camera.cam_from_rig = turn if number else None
@@ -134,17 +144,11 @@ def join_views(job: Job) -> None:
         pycolmap.apply_rig_config([rig], database)
 
 
-def _add_camera(job: Job, one: UprightCopy) -> int:
-    focal = one.focal or GUESSED_FOCAL * max(one.width, one.height)
-    camera = pycolmap.Camera.create_from_model_name(1, LENS, focal, one.width, one.height)
-    camera.has_prior_focal_length = one.focal is not None
-    with pycolmap.Database.open(job.database) as database:
-        return int(database.write_camera(camera))
-
-
 def select_pairs(job: Job) -> Pairs:
     """Choose the photographs to match: sequence neighbours, all pairs, or similar photographs."""
     names = [one.name for one in job.photographs]
+    # The neighbours of a sequence are known; in a set of unknown order all pairs, or for many
+    # photographs the most similar ones.
     pairs = pair_neighbours(len(names)) if is_sequence(names) else set()
     if not pairs and len(names) <= MAX_EXHAUSTIVE:
         pairs = pair_all(len(names))
@@ -156,12 +160,14 @@ def select_pairs(job: Job) -> Pairs:
     return {(i, j) for i, j in pairs if centres[i] != centres[j]}
 
 
-def _read_features(database: Any, name: str) -> np.ndarray:
+def _read_features(database: Any, name: str) -> Float[np.ndarray, "k 128"]:
+    """Read the normalized descriptors of a photograph's `NUM_LARGEST_FEATURES` largest features."""
     number = database.read_image_with_name(name).image_id
     scales = np.linalg.norm(database.read_keypoints(number)[:, 2:4], axis=1)
-    return select_largest_features(
-        scales, np.asarray(database.read_descriptors(number).data, dtype=np.float32)
-    )
+    descriptors = np.asarray(database.read_descriptors(number).data, dtype=np.float32)
+    # SIFT's largest blobs, not its strongest, are those that other distances and cameras find too.
+    largest = descriptors[np.argsort(-scales, kind="stable")[:NUM_LARGEST_FEATURES]]
+    return largest / np.maximum(np.linalg.norm(largest, axis=1, keepdims=True), 1e-9)
 
 
 def match(job: Job, pairs: Pairs) -> None:
@@ -204,14 +210,17 @@ def select_model(job: Job) -> tuple[pycolmap.Reconstruction | None, bool]:
     """Map with a free focal length, then with plausible fixed ones (True), until it is good."""
     if job.is_panoramic:  # the focal length of views is known
         return map_largest(job, is_focal_fixed=True), False
-    best, is_focal_fixed = map_largest(job), False
+    best = map_largest(job)
+    is_focal_fixed = False
+    # A plausible model with enough photographs is kept; until then further focal lengths are tried.
     wanted = math.ceil(WANTED_SHARE * len(job.photographs))
     for fov in FIXED_FOVS:
         if _rate_model(best) >= (True, wanted, 0):
             break
-        found = map_with_fixed_focals(job, fov)
-        if _rate_model(found) > _rate_model(best):
-            best, is_focal_fixed = found, True
+        with_fixed_focals = map_with_fixed_focals(job, fov)
+        if _rate_model(with_fixed_focals) > _rate_model(best):
+            best = with_fixed_focals
+            is_focal_fixed = True
     return best, is_focal_fixed
 
 
@@ -235,6 +244,7 @@ def map_with_fixed_focals(job: Job, fov: float) -> pycolmap.Reconstruction | Non
         mapped = map_largest(job, is_focal_fixed=True)
         if mapped is None:
             return model
+        # The focal length alone; distortion is refined with it at the end.
         model = refine_lenses(mapped, refine_extra_params=False)
         focals = {n: model.cameras[n].mean_focal_length() for n in _count_photographs(model)}
     return None if model is None else refine_lenses(model)
@@ -244,7 +254,9 @@ def _fix_focals(job: Job, focals: dict[int, float], fov: float) -> None:
     """Fix focal lengths (pixels by camera, or else as of `fov`) in the database, undistorted."""
     with pycolmap.Database.open(job.database) as database:
         for camera in database.read_all_cameras():
-            width, height, number = camera.width, camera.height, camera.camera_id
+            width = camera.width
+            height = camera.height
+            number = camera.camera_id
             focal = max(width, height) / 2 / math.tan(math.radians(fov / 2))
             known = pycolmap.Camera.create_from_model_name(
                 number, LENS, focals.get(number, focal), width, height
@@ -263,8 +275,8 @@ def map_largest(job: Job, is_focal_fixed: bool = False) -> pycolmap.Reconstructi
         ba_refine_extra_params=not is_focal_fixed,
         ba_refine_sensor_from_rig=False,
     )
-    found = pycolmap.incremental_mapping(job.database, job.images, job.work, options)
-    return max(found.values(), key=lambda model: model.num_reg_images(), default=None)
+    models = pycolmap.incremental_mapping(job.database, job.images, job.work, options)
+    return max(models.values(), key=lambda model: model.num_reg_images(), default=None)
 
 
 def refine_lenses(model: pycolmap.Reconstruction, **options: bool) -> pycolmap.Reconstruction:
@@ -283,11 +295,14 @@ def has_plausible_lenses(model: pycolmap.Reconstruction) -> bool:
 
 def is_plausible(camera: pycolmap.Camera) -> bool:
     """Check whether a camera has a field of view, distortion and principal point of a real one."""
-    focal, side = camera.mean_focal_length(), max(camera.width, camera.height)
+    focal = camera.mean_focal_length()
+    side = max(camera.width, camera.height)
     if not (math.isfinite(focal) and focal > 0):
         return False
+    # Angles of the whole side, and of the ray through a corner at z = 1.
     fov = math.degrees(2 * math.atan(side / 2 / focal))
     corner = (camera.width**2 + camera.height**2) / 4 / focal**2
+    # The model k r² of SIMPLE_RADIAL moves a point by this share of its radius.
     shift = camera.params[camera.extra_params_idxs()[0]] * corner
     off = math.hypot(
         camera.principal_point_x - camera.width / 2, camera.principal_point_y - camera.height / 2
@@ -309,6 +324,7 @@ def is_sequence(names: Sequence[str]) -> bool:
 
 def pair_neighbours(count: int) -> Pairs:
     """Pair each photograph of a sequence with the next ones, and those 16, 32, 64, … ahead."""
+    # Doubling steps close loops, and bridge a blurred or covered stretch.
     steps = [*range(1, NEIGHBOURS + 1), *(2**n for n in range(4, count.bit_length()))]
     return {(i, i + step) for step in steps for i in range(count - step)}
 
@@ -318,22 +334,18 @@ def pair_all(count: int) -> Pairs:
     return set(combinations(range(count), 2))
 
 
-def select_largest_features(
-    scales: Float[np.ndarray, "n"], descriptors: Float[np.ndarray, "n 128"]
-) -> Float[np.ndarray, "k 128"]:
-    """Select the normalized descriptors of the `NUM_LARGEST_FEATURES` largest features."""
-    chosen = descriptors[np.argsort(-scales, kind="stable")[:NUM_LARGEST_FEATURES]]
-    return chosen / np.maximum(np.linalg.norm(chosen, axis=1, keepdims=True), 1e-9)
-
-
 def pair_similar(features: Sequence[Float[np.ndarray, "_ 128"]]) -> Pairs:
     """Pair each photograph with those that share most features with it."""
     shared = np.zeros((len(features), len(features)), dtype=np.int64)
     for i, j in pair_all(len(features)):
-        shared[i, j] = shared[j, i] = _count_shared(features[i], features[j])
+        count = _count_shared(features[i], features[j])
+        shared[i, j] = count
+        shared[j, i] = count
     order = np.argsort(-shared, axis=1, kind="stable")[:, :NUM_SIMILAR]
-    found = ((i, int(j)) for i, row in enumerate(order) for j in row if shared[i, j] >= MIN_SHARED)
-    return {(min(pair), max(pair)) for pair in found}
+    pairs: Pairs = set()
+    for i, row in enumerate(order.tolist()):
+        pairs.update((min(i, j), max(i, j)) for j in row if shared[i, j] >= MIN_SHARED)
+    return pairs
 
 
 def _count_shared(a: Float[np.ndarray, "m 128"], b: Float[np.ndarray, "n 128"]) -> int:
@@ -341,7 +353,9 @@ def _count_shared(a: Float[np.ndarray, "m 128"], b: Float[np.ndarray, "n 128"]) 
     if len(a) == 0 or len(b) == 0:
         return 0
     cosines = a @ b.T
-    best, back = cosines.argmax(axis=1), cosines.argmax(axis=0)
+    best = cosines.argmax(axis=1)
+    back = cosines.argmax(axis=0)
+    # Each feature has one best match; only those that choose each other count.
     is_mutual = back[best] == np.arange(len(a))
     return int(np.count_nonzero(is_mutual & (cosines.max(axis=1) > MIN_COSINE)))
 

@@ -75,8 +75,14 @@ QUALITY = 95
 """JPEG quality of rotated or shrunk copies."""
 FULL_FRAME_DIAGONAL = 43.2666
 """Diagonal of 36 x 24 mm, the reference of EXIF's "focal length in 35 mm film"."""
-MAKE, MODEL = 0x010F, 0x0110
-EXIF, FOCAL_LENGTH, FOCAL_LENGTH_35 = 0x8769, 0x920A, 0xA405
+
+# Tags of EXIF.
+MAKE = 0x010F
+MODEL = 0x0110
+EXIF = 0x8769
+FOCAL_LENGTH = 0x920A
+FOCAL_LENGTH_35 = 0xA405
+
 MAX_THREADS = 4
 MAX_NAMED = 5
 """Most photographs that a note names."""
@@ -154,6 +160,7 @@ def find_poses(
     photographs: Path, out: Path, overwrite: bool = False, num_frames: int = NUM_FRAMES
 ) -> FoundPoses:
     """Find the cameras of a folder of photographs or of a video's frames; write them to `out`."""
+    # The same photographs in the same folder have the same cameras: minutes of work are reused.
     known = _identify_input(photographs, num_frames)
     earlier = _read_earlier(out, known)
     if earlier is not None:
@@ -168,10 +175,10 @@ def find_poses(
         output.write() as folder,
         _open_images(photographs, num_frames, folder) as images,
     ):
-        found = _run(images, folder, photographs)
-        content = {"poses": asdict(found), "photographs": known}
+        poses = _run(images, folder, photographs)
+        content = {"poses": asdict(poses), "photographs": known}
         (folder / SUMMARY_FILE).write_bytes(json.dumps(content, indent=1).encode())
-    return replace(found, kept=" ".join(output.describe_others()))
+    return replace(poses, kept=" ".join(output.describe_others()))
 
 
 def _identify_input(path: Path, num_frames: int) -> dict[str, list[int]]:
@@ -240,8 +247,8 @@ def _check_few(folder: Path, names: Sequence[str]) -> None:
 
 def list_all_photographs(folder: Path) -> list[str]:
     """List the photographs below a folder in natural order."""
-    found = (path.relative_to(folder).as_posix() for path in iterate_photographs(folder))
-    return sorted(found, key=make_sort_key)
+    names = (path.relative_to(folder).as_posix() for path in iterate_photographs(folder))
+    return sorted(names, key=make_sort_key)
 
 
 def iterate_photographs(folder: Path) -> Iterator[Path]:
@@ -255,6 +262,7 @@ def iterate_photographs(folder: Path) -> Iterator[Path]:
             f"{quote_value(folder)} has more than {MAX_FOLDERS:,} folders below it; name the "
             "folder of one scene.",
         )
+        # In place, as `os.walk` documents it: it then enters only these folders.
         folders[:] = [name for name in folders if is_own(Path(home, name))]
         images = [
             name
@@ -283,19 +291,27 @@ def _run(photographs: Path, folder: Path, given: Path) -> FoundPoses:
     ]
     result = _map(copies, folder, is_panoramic)
     missing = [copy.source for copy in copies if copy.name not in result["registered"]]
-    counts = len(copies), missing, result["points"], result["error"], result["focal"]
-    origin = _describe_origin(given, len(names), len(copies))
-    found = FoundPoses(*counts, origin=origin, masked=sum(copy.is_masked for copy in copies))
+    poses = FoundPoses(
+        photographs=len(copies),
+        missing=missing,
+        points=result["points"],
+        error=result["error"],
+        focal=result["focal"],
+        origin=_describe_origin(given, len(names), len(copies)),
+        masked=sum(copy.is_masked for copy in copies),
+    )
+
+    # Few photographs, few points or an odd lens: the mapper found a coincidence, not the scene.
     enough = max(MIN_PHOTOGRAPHS, MIN_SHARE * len(copies))
-    is_large = found.num_registered >= enough and found.points >= MIN_POINTS
+    is_large = poses.num_registered >= enough and poses.points >= MIN_POINTS
     if not (is_large and result["is_plausible"]):
         lens = "" if result["is_plausible"] else " and an implausible lens"
         raise InputError(
-            f"COLMAP placed {found.num_registered} of {found.photographs} photographs in "
-            f"{quote_value(given, 40)}, with {found.points:,} points{lens}, which is no "
+            f"COLMAP placed {poses.num_registered} of {poses.photographs} photographs in "
+            f"{quote_value(given, 40)}, with {poses.points:,} points{lens}, which is no "
             "usable model; add sharp photographs that overlap by two thirds, or name their cameras."
         )
-    return found
+    return poses
 
 
 def _describe_origin(given: Path, images: int, copies: int) -> str:
@@ -322,11 +338,15 @@ def write_copies(
     copies = []
     hidden = read_hidden(root / source, mask)
     for number, (pixels, shade) in enumerate(split_panorama(root / source, hidden)):
-        kind, name = f"view_{number}", Path(re.sub(r"[\s#]", "_", source)).with_suffix(".jpg")
+        kind = f"view_{number}"
+        # In COLMAP's lists a space ends a name, and # begins a comment.
+        name = Path(re.sub(r"[\s#]", "_", source)).with_suffix(".jpg")
         target = _prepare_target(folder / IMAGES / kind / name, root / source)
         Image.fromarray(pixels).save(target, quality=QUALITY, subsampling=0)
-        side, place = len(pixels), f"{kind}/{name.as_posix()}"
+        side = len(pixels)
+        place = f"{kind}/{name.as_posix()}"
         is_masked = shade is not None and _write_mask(folder, place, shade, (side, side))
+        # A view is 90° wide, so its focal length is half its side.
         copies.append(UprightCopy(place, place, side, side, side / 2, kind, is_masked))
     return copies
 
@@ -339,14 +359,21 @@ def write_upright(root: Path, source: str, folder: Path, mask: Path | None = Non
     """
     path = root / source
     with open_image(path) as image:
-        exif, kind = image.getexif(), image.format
+        exif = image.getexif()
+        kind = image.format
         is_known = kind in ("JPEG", "PNG")
         is_upright = exif.get(ORIENTATION, 1) == 1 and max(image.size) <= MAX_SIDE
         is_ready = is_known and is_upright and image.mode in ("RGB", "L")
         if not is_ready:  # decodes a JPEG at half or a quarter of its size if that is enough
             image.draft("RGB", (MAX_SIDE, MAX_SIDE))
         copy = ImageOps.exif_transpose(image).convert("RGB")
-        focal, lens = read_focal(exif), _describe_lens(exif)
+        focal = read_focal(exif)
+        # Photographs of one camera, lens and zoom share their intrinsics.
+        detail = exif.get_ifd(EXIF)
+        known_lens = (exif.get(MAKE), exif.get(MODEL))
+        zoom = (detail.get(FOCAL_LENGTH), detail.get(FOCAL_LENGTH_35))
+        lens = " ".join(str(value) for value in (*known_lens, *zoom))
+
     copy.thumbnail((MAX_SIDE, MAX_SIDE), Image.Resampling.LANCZOS)
     # In COLMAP's lists a space ends a name, and # begins a comment.
     name = re.sub(r"[\s#]", "_", source) + ("" if is_known else ".png")
@@ -357,6 +384,7 @@ def write_upright(root: Path, source: str, folder: Path, mask: Path | None = Non
         copy.info.clear()  # removes the orientation, which is applied already
         written = "JPEG" if kind == "JPEG" else "PNG"
         copy.save(target, format=written, quality=QUALITY, subsampling=0)
+
     hidden = read_hidden(path, mask)
     is_masked = hidden is not None and _write_mask(folder, name, hidden, copy.size)
     diagonal = math.hypot(*copy.size)
@@ -370,6 +398,7 @@ def read_hidden(path: Path, mask: Path | None) -> Bool[np.ndarray, "h w"] | None
     width, height = read_image_size(path)
     orientation = read_orientation(path)
     size = (height, width) if orientation in QUARTER_TURNS else (width, height)
+    # A mask is of the upright photograph, or is turned with it; alpha is stored with the pixels.
     hidden = np.zeros((size[1], size[0]), dtype=bool)
     if mask is not None:
         hidden |= load_mask(mask, size, f"the photograph {quote_value(path)}", orientation)
@@ -413,12 +442,6 @@ def read_focal(exif: Image.Exif) -> float | None:
     return millimetres / FULL_FRAME_DIAGONAL if 1 <= millimetres <= 5000 else None
 
 
-def _describe_lens(exif: Image.Exif) -> str:
-    detail = exif.get_ifd(EXIF)
-    values = exif.get(MAKE), exif.get(MODEL), detail.get(FOCAL_LENGTH), detail.get(FOCAL_LENGTH_35)
-    return " ".join(map(str, values))
-
-
 def _map(copies: Sequence[UprightCopy], folder: Path, is_panoramic: bool) -> dict[str, Any]:
     """Run `mapping_process` on the copies in `folder/images`; return its result."""
     with tempfile.TemporaryDirectory(dir=folder) as work, stage("Finding cameras"):
@@ -431,6 +454,8 @@ def _map(copies: Sequence[UprightCopy], folder: Path, is_panoramic: bool) -> dic
             "is_panoramic": is_panoramic,
             "threads": min(MAX_THREADS, get_thread_count()),
         }
+
+        # COLMAP aborts its process on some errors (decision 027), so it has one of its own.
         done = subprocess.run(
             [sys.executable, "-m", PROCESS],
             input=json.dumps(job),
@@ -439,6 +464,7 @@ def _map(copies: Sequence[UprightCopy], folder: Path, is_panoramic: bool) -> dic
             errors="replace",
             check=False,
         )
+
     if done.returncode != 0:
         complaint = quote_value(done.stderr.strip().rpartition("\n")[2], 200)
         raise InputError(
@@ -450,4 +476,5 @@ def _map(copies: Sequence[UprightCopy], folder: Path, is_panoramic: bool) -> dic
 
 def make_sort_key(name: str) -> tuple[str, ...]:
     """Return a key that sorts names by their numbers: 2.jpg before 10.jpg."""
+    # Numbers of 30 digits sort as text as they do as numbers.
     return tuple(f"{int(p):030d}" if p.isdecimal() else p for p in re.split(r"(\d+)", name))

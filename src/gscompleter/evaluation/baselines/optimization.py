@@ -20,9 +20,15 @@ from gscompleter.render.protocols import Renderer
 from gscompleter.system.progress import track
 from gscompleter.types import Camera, Gaussians, View, merge
 
-POSITION_RATE, ROTATION_RATE, SCALE_RATE = 1.6e-4, 1e-3, 5e-3
-"""Step sizes; that of positions is in camera extents."""
-OPACITY_RATE, COLOR_RATE = 0.05, 2.5e-3
+POSITION_RATE = 1.6e-4
+"""Step size of positions, in camera extents."""
+
+# Step sizes of the other parameters, in their own units.
+ROTATION_RATE = 1e-3
+SCALE_RATE = 5e-3
+OPACITY_RATE = 0.05
+COLOR_RATE = 2.5e-3
+
 DSSIM_WEIGHT = 0.2
 """Weight of 1 - SSIM in the loss; the rest is L1."""
 DENSE_SHARE = 0.01
@@ -53,12 +59,16 @@ def optimize(
     random = torch.Generator().manual_seed(seed)
     extent = compute_extent([view.camera for view in views])
     state = Parameters(scene, extent)
-    gradients = counts = torch.zeros_like(scene.opacities)
+    # Sum of the image gradients of each Gaussian since the last round, and of its views.
+    gradients = torch.zeros_like(scene.opacities)
+    counts = torch.zeros_like(scene.opacities)
     # Rounds of density control, evenly over the first 80 % of the iterations.
-    last, count = 0.8 * config.iterations, config.density_rounds
+    last = 0.8 * config.iterations
+    count = config.density_rounds
     rounds = {math.ceil(last * (i + 1) / count) for i in range(count)}
     order: list[int] = []
     for number in track(range(1, config.iterations + 1), "Optimising"):
+        # Each view once in random order, then all again.
         order = order or torch.randperm(len(views), generator=random).tolist()
         view = views[order.pop()]
         gaussians = state.make_gaussians()
@@ -67,14 +77,17 @@ def optimize(
         loss = loss + DSSIM_WEIGHT * (1 - ssim_map(image, view.image).mean())
         state.optimizer.zero_grad()
         loss.backward()
+
         gradient, seen = compute_image_gradients(gaussians.means, state.leaves[0].grad, view.camera)
-        gradients, counts = gradients + gradient, counts + seen
+        gradients = gradients + gradient
+        counts = counts + seen
         state.optimizer.step()
         if number in rounds:
             crowded = gradients / counts.clamp_min(1) >= config.gradient_threshold
             dense = control_density(state.make_gaussians(), crowded, extent, random)
             state = Parameters(dense, extent)
-            gradients = counts = torch.zeros_like(dense.opacities)
+            gradients = torch.zeros_like(dense.opacities)
+            counts = torch.zeros_like(dense.opacities)
     with torch.no_grad():  # so that the result is detached from the parameters
         return state.make_gaussians()[:]
 
@@ -115,6 +128,9 @@ def compute_image_gradients(
     if gradient is None:
         return torch.zeros_like(means[:, 0]), torch.zeros_like(means[:, 0])
     with torch.no_grad():
+        # The rasteriser of 3DGS gives the gradient at the image position. Here it follows from that
+        # of the mean: a move by one pixel is one by z / focal across the view, and half a width
+        # counts as 1.
         z = compute_z_depths(means, camera)
         across = gradient @ camera.c2w[:3, :2]
         focal = torch.stack([camera.K[0, 0], camera.K[1, 1]])
@@ -132,8 +148,11 @@ def control_density(
 ) -> Gaussians:
     """Clone small `crowded` Gaussians, split large ones and prune faint ones."""
     with torch.no_grad():
+        # 3DGS clones where a small Gaussian has to cover more, and splits where a large one covers
+        # what it should not: it is replaced by two samples of itself, smaller by its factor 1.6.
         large = scene.scales.amax(dim=-1) > DENSE_SHARE * extent
-        clones, parents = scene[crowded & ~large], scene[crowded & large]
+        clones = scene[crowded & ~large]
+        parents = scene[crowded & large]
         kept = scene[~(crowded & large)]
         children = []
         for _ in range(2):

@@ -78,6 +78,9 @@ def register_by_similarity(
     camera = reference.camera
     own = renderer.render(lifted, camera)
     theirs = renderer.render(scene, camera)
+
+    # The scale begins at the ratio of the depths that both see; the pose is known, so that rotation
+    # and translation begin at none.
     both = own.depth_map().valid & theirs.depth_map().valid
     ratio = own.depth.new_ones(())
     if both.any():
@@ -88,21 +91,28 @@ def register_by_similarity(
     parameters = (scale, quaternion, translation)
     groups = [{"params": [p], "lr": rate} for p, rate in zip(parameters, RATES, strict=True)]
     optimizer = torch.optim.Adam(groups, amsgrad=True)
+
+    # The distance of mixtures takes time and memory of n × m 3×3 matrices: clusters instead of all.
     small_lifted = cluster_gaussians(lifted, camera, config.components, seed)
     small_scene = cluster_gaussians(scene, camera, config.components, seed)
-    best, best_loss = None, np.inf
+    best = None
+    best_loss = np.inf
     distances: list[float] = []
     compare_mixtures = config.mixture_weight > 0
     for _ in track(range(config.iterations), "Registering"):
+        # The scene is moved to the lifted Gaussians, whose camera stays in place.
         fit = Similarity(scale, quaternion, translation)
         moved = renderer.render(move_scene(scene, fit), camera)
         alpha = own.alpha.detach()
+        # Pixels that the lifted Gaussians hardly cover say nothing about their place.
         colour = ((moved.image - reference.image).abs() * alpha[..., None] ** 3).sum()
         overlap = own.depth_map().valid & moved.depth_map().valid
         depth = (moved.depth - scale * own.depth.detach())[overlap].abs().sum()
         loss = colour + DEPTH_WEIGHT * depth
+
         if compare_mixtures:
-            means, covariances = scale * small_lifted.means, scale**2 * small_lifted.covariances
+            means = scale * small_lifted.means
+            covariances = scale**2 * small_lifted.covariances
             scaled = Mixture(means, covariances, small_lifted.weights)
             distance = compute_mixture_wasserstein(scaled, rotate_mixture(small_scene, fit, camera))
             recent = distances[-PATIENCE:]
@@ -111,6 +121,8 @@ def register_by_similarity(
             else:
                 loss = loss + config.mixture_weight * distance
             distances.append(distance.item())
+
+        # The best of all steps, since the loss is not monotonous.
         if loss.item() < best_loss:
             best_loss = loss.item()
             best = Similarity(*(p.detach().clone() for p in parameters))
@@ -132,6 +144,7 @@ def move_into_scene(lifted: Gaussians, fit: Similarity, camera: Camera) -> Gauss
     """Scale the lifted Gaussians about their camera and move them to the scene."""
     means = camera.center + fit.scale * (lifted.means - camera.center)
     unit = torch.nn.functional.normalize(fit.quaternion, dim=0)
+    # The conjugate of a unit quaternion is its inverse.
     back = unit * unit.new_tensor([1.0, -1.0, -1.0, -1.0])
     return replace(
         lifted,
@@ -146,8 +159,10 @@ def cluster_gaussians(gaussians: Gaussians, camera: Camera, components: int, see
     """Merge the Gaussians into k-means clusters, in camera axes."""
     rotation = camera.c2w[:3, :3]
     axes = rotation.T @ quats_to_rotations(gaussians.quats)
+    # Covariance of each Gaussian: R S S R^T, with its axes as columns of R S.
     spread = axes * gaussians.scales[:, None, :]
-    means, weights = (gaussians.means - camera.center) @ rotation, gaussians.opacities.softmax(0)
+    means = (gaussians.means - camera.center) @ rotation
+    weights = gaussians.opacities.softmax(0)
     mixture = Mixture(means, spread @ spread.transpose(-1, -2), weights)
     if len(gaussians) <= components:
         return mixture
@@ -159,6 +174,7 @@ def cluster_gaussians(gaussians: Gaussians, camera: Camera, components: int, see
 def rotate_mixture(mixture: Mixture, fit: Similarity, camera: Camera) -> Mixture:
     """Move a mixture in camera axes by the similarity of the scene."""
     c2w = camera.c2w[:3, :3]
+    # The similarity acts on world points; both mixtures are in camera axes, about the camera.
     rotation = c2w.T @ fit.rotation @ c2w
     offset = (fit.rotation @ camera.center + fit.translation - camera.center) @ c2w
     covariances = rotation @ mixture.covariances @ rotation.T
@@ -182,6 +198,7 @@ def reduce_mixture(mixture: Mixture, clusters: Int[Tensor, "n"]) -> Mixture:
     share = mixture.weights / weight[clusters]
     means = mixture.means.new_zeros(count, 3)
     means = means.index_add(0, clusters, share[:, None] * mixture.means)
+    # Moments of a mixture: the mean of the covariances plus the covariance of the means.
     offset = mixture.means - means[clusters]
     spread = mixture.covariances + offset[:, :, None] * offset[:, None, :]
     covariances = mixture.means.new_zeros(count, 3, 3)
@@ -206,6 +223,8 @@ def compute_pairwise_costs(a: Mixture, b: Mixture) -> Float[Tensor, "n m"]:
 
 def compute_matrix_root(matrices: Float[Tensor, "*n 3 3"]) -> Float[Tensor, "*n 3 3"]:
     """Compute square roots of positive matrices, differentiable at equal eigenvalues."""
+    # The gradient of `eigh` divides by differences of eigenvalues, which are 0 for round Gaussians;
+    # `_MatrixRoot` divides by their sums.
     identity = torch.eye(3, dtype=matrices.dtype, device=matrices.device)
     return _MatrixRoot.apply(matrices + 1e-6 * identity)
 
@@ -227,6 +246,7 @@ class _MatrixRoot(torch.autograd.Function):
     @once_differentiable
     def backward(ctx: Any, gradient: Tensor) -> Tensor:
         roots, vectors = ctx.saved_tensors
+        # In the basis of the eigenvectors, dM = R dR + dR R is dM_ij = (r_i + r_j) dR_ij.
         sums = (roots[..., :, None] + roots[..., None, :]).clamp_min(1e-6)
         inner = (vectors.transpose(-1, -2) @ gradient @ vectors) / sums
         return vectors @ inner @ vectors.transpose(-1, -2)
@@ -235,9 +255,12 @@ class _MatrixRoot(torch.autograd.Function):
 def compute_mixture_wasserstein(a: Mixture, b: Mixture) -> Float[Tensor, ""]:
     """Compute Σ plan * cost by Sinkhorn iterations; the largest plan entry is 1 as in RegGS."""
     cost = compute_pairwise_costs(a, b)
-    log_a, log_b = (a.weights + 1e-10).log(), (b.weights + 1e-10).log()
+    log_a = (a.weights + 1e-10).log()
+    log_b = (b.weights + 1e-10).log()
+    # Sinkhorn's iterations in the logarithm: exp(-cost / ε) vanishes for distant components.
     log_kernel = -cost / EPSILON
-    log_u, log_v = torch.zeros_like(log_a), torch.zeros_like(log_b)
+    log_u = torch.zeros_like(log_a)
+    log_v = torch.zeros_like(log_b)
     for _ in range(MAX_ITERATIONS):
         log_u = log_a - torch.logsumexp(log_kernel + log_v[None], dim=1)
         before = log_v

@@ -57,11 +57,15 @@ def render_pairs(
     completion: Completion, cameras: Sequence[Camera], renderer: Renderer
 ) -> list[RenderPair]:
     """Render the scene before and after completion in small images, from a thinned scene."""
+    # `parts[0]` is the context as it is rendered; recolouring and removal replace it.
     is_unchanged = completion.parts[0] is completion.source.rendered
     begun = thin_gaussians(completion.source.rendered, MAX_PREVIEW_GAUSSIANS)
     kept = begun if is_unchanged else thin_gaussians(completion.parts[0], MAX_PREVIEW_GAUSSIANS)
     added = [thin_gaussians(result.added, MAX_PREVIEW_GAUSSIANS) for result in completion.targets]
     new = merge([begun[:0], *added])
+
+    # Trust has values for each Gaussian, and is thinned by the same rows. Before the completion,
+    # nothing was recoloured.
     trust = completion.trust.thin(*choose_thinned_rows(completion.parts[0], MAX_PREVIEW_GAUSSIANS))
     at_first = trust
     if isinstance(trust, PhotometricTrust):
@@ -86,7 +90,8 @@ def render_trusted(frozen: FrozenScene, trust: Trust, camera: Camera) -> Render:
 
 def compute_coverage(pairs: Sequence[RenderPair]) -> Coverage:
     """Compute the coverage before and after completion, and count the cameras."""
-    before, after = [pair.before for pair in pairs], [pair.after for pair in pairs]
+    before = [pair.before for pair in pairs]
+    after = [pair.after for pair in pairs]
     return Coverage(compute_covered_share(before), compute_covered_share(after), len(pairs))
 
 
@@ -110,6 +115,7 @@ def sample_held_out_camera(
     """Sample a camera between a random one of `cameras` and its nearest neighbour."""
     first = cameras[int(torch.randint(len(cameras), (), generator=generator))]
     share = torch.rand((), generator=generator).item()
+    # The mean squared length of the shift is step².
     shift = step * torch.randn(3, generator=generator) / 3**0.5
     right, down = (TURN_DEGREES * torch.randn(2, generator=generator)).tolist()
     others = [other for other in cameras if other is not first]

@@ -49,7 +49,8 @@ def compare_depths(
     known = where & (truth > 0)
     if not known.any():
         return Agreement(0)
-    d, t = depth[known].double(), truth[known].double()
+    d = depth[known].double()
+    t = truth[known].double()
     return Agreement(int(known.sum()), ((d - t).abs() / t).mean().item())
 
 
@@ -60,7 +61,8 @@ def compute_f_score(
 
     Precision P is the share of A within `threshold` (scene units) of B, recall R that of B near A.
     """
-    precision, recall = float((a_to_b <= threshold).mean()), float((b_to_a <= threshold).mean())
+    precision = float((a_to_b <= threshold).mean())
+    recall = float((b_to_a <= threshold).mean())
     total = precision + recall
     return 2 * precision * recall / total if total > 0 else 0.0
 
@@ -69,7 +71,8 @@ def compute_nearest_distances(
     points: Float[Tensor, "n 3"], others: Float[Tensor, "m 3"]
 ) -> Float[np.ndarray, "n"]:
     """Compute the Euclidean distance of each point to the nearest of `others`, in float64."""
-    queries, targets = (p.detach().cpu().double().numpy() for p in (points, others))
+    queries = points.detach().cpu().double().numpy()
+    targets = others.detach().cpu().double().numpy()
     # Without balancing the tree stays fast if many points coincide.
     return cKDTree(targets, balanced_tree=False).query(queries, workers=-1)[0]
 
@@ -86,7 +89,9 @@ def measure_alignment(
     the overlap, matched with everything added. A perfect completion does not reach 0, because
     Gaussians are spaced and depths mix at edges: compare methods on the same cases.
     """
-    added, context = drop_transparent(added), drop_transparent(context)
+    added = drop_transparent(added)
+    context = drop_transparent(context)
+    # Each is rendered alone, so that neither hides the other.
     generated = renderer.render(added, target).depth_map()
     reference = renderer.render(context, target).depth_map()
     overlap = generated.valid & reference.valid
@@ -104,8 +109,11 @@ def measure_primitive_alignment(
     overlap. AbsRel is the mean of |z - D| / D with the z-depth z of the mean and the rendered
     context depth D. Renders would favour scattered Gaussians, which cover fewer and easier pixels.
     """
-    registered, context = drop_transparent(registered), drop_transparent(context)
+    registered = drop_transparent(registered)
+    context = drop_transparent(context)
     reference = renderer.render(context, target).depth_map()
+
+    # The depths of the means themselves, each against that of the context at its pixel.
     points = registered[project_mask(reference.valid, registered, target)].means
     pixels, z = project(points, target)
     x, y = pixels.long().unbind(-1)
@@ -131,6 +139,8 @@ def compare_clouds(
     scale = reference.depth[reference.valid].double().median().item()
     threshold = MATCH_DISTANCE * scale
     points = select_in_mask(generated, None, overlap, target).means
+
+    # Of the context only what the target sees: what lies behind its surface has no counterpart.
     surface = select_in_mask(context, None, overlap, target).means
     pixels, z = project(surface, target)
     at_pixel = sample(reference.depth[..., None], pixels, "nearest")[..., 0]

@@ -16,8 +16,10 @@ MAX_PSNR = 100.0
 LUMINANCE = (0.299, 0.587, 0.114)
 """Weights of red, green and blue (ITU-R BT.601)."""
 
-RADIUS, SIGMA = 5, 1.5
-"""Radius and sigma of SSIM's Gaussian window, in pixels."""
+RADIUS = 5
+"""Radius of SSIM's Gaussian window, in pixels."""
+SIGMA = 1.5
+"""Standard deviation of that window, in pixels."""
 
 
 def psnr(image: Float[Tensor, "h w 3"], truth: Float[Tensor, "h w 3"]) -> float:
@@ -35,10 +37,13 @@ def compute_masked_psnr(
 
 def ssim(image: Float[Tensor, "h w 3"], truth: Float[Tensor, "h w 3"]) -> float:
     """Compute SSIM as scikit-image does: 11-pixel Gaussian window, sample covariances, range 1."""
-    a, b = image.clamp(0, 1).cpu().numpy(), truth.cpu().numpy()
+    a = image.clamp(0, 1).cpu().numpy()
+    b = truth.cpu().numpy()
+    # Window pixels beyond the border are unknown; scikit-image leaves out the border likewise.
     inner = compute_ssim_map(a, b)[RADIUS:-RADIUS, RADIUS:-RADIUS]
     if inner.size == 0:
         raise ValueError(f"SSIM needs 11 x 11 pixels, got {a.shape[1]} x {a.shape[0]}")
+    # In the precision of the images, as scikit-image rounds the mean of the channels.
     channels = [inner[..., channel].mean(dtype=np.float64) for channel in range(3)]
     return float(np.array(channels, a.dtype).mean())
 
@@ -61,12 +66,16 @@ def compute_ssim_map(
     a: Float[np.ndarray, "h w 3"], b: Float[np.ndarray, "h w 3"]
 ) -> Float[np.ndarray, "h w 3"]:
     """Compute the structural similarity (Wang et al. 2004) at each pixel."""
+    # Sample instead of population covariances: n / (n - 1) for the n pixels of the window.
     unbiased = (2 * RADIUS + 1) ** 2 / ((2 * RADIUS + 1) ** 2 - 1)
-    mean_a, mean_b = blur_gaussian(a), blur_gaussian(b)
+    mean_a = blur_gaussian(a)
+    mean_b = blur_gaussian(b)
     var_a = unbiased * (blur_gaussian(a * a) - mean_a * mean_a)
     var_b = unbiased * (blur_gaussian(b * b) - mean_b * mean_b)
     cov = unbiased * (blur_gaussian(a * b) - mean_a * mean_b)
-    c1, c2 = 0.01**2, 0.03**2
+    # Constants of the paper, (0.01 L)² and (0.03 L)² with the range L = 1.
+    c1 = 0.01**2
+    c2 = 0.03**2
     similar = (2 * mean_a * mean_b + c1) * (2 * cov + c2)
     return similar / ((mean_a**2 + mean_b**2 + c1) * (var_a + var_b + c2))
 
@@ -74,7 +83,8 @@ def compute_ssim_map(
 def blur_gaussian(values: Float[np.ndarray, "h w 3"]) -> Float[np.ndarray, "h w 3"]:
     """Blur with a Gaussian window, summed in float64 and rounded after each direction."""
     weights = np.exp(-0.5 / SIGMA**2 * np.arange(-RADIUS, RADIUS + 1) ** 2)
-    line, point = weights / weights.sum(), np.ones(1)
+    line = weights / weights.sum()
+    point = np.ones(1)
     down = cv2.sepFilter2D(values, cv2.CV_64F, point, line).astype(values.dtype)
     return cv2.sepFilter2D(down, cv2.CV_64F, line, point).astype(values.dtype)
 
@@ -88,6 +98,7 @@ def compute_gradient_energy_ratio(
     neighbours in `where`. This measures sharpness, not whether edges are correct. None without such
     a pixel or gradient.
     """
+    # Central differences need the four neighbours of a pixel.
     there = where[1:-1, 1:-1] & where[:-2, 1:-1] & where[2:, 1:-1]
     there = there & where[1:-1, :-2] & where[1:-1, 2:]
     energies = [compute_gradient_energy(x)[there].sum().item() for x in (image.clamp(0, 1), truth)]

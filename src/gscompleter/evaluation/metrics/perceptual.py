@@ -37,13 +37,16 @@ def haarpsi(image: Image, truth: Image, where: Bool[Tensor, "h w"]) -> float | N
     Images are halved first, as published; a pixel counts if half of its area is in `where`. None
     without such a pixel.
     """
-    of_image, of_truth = convert_to_yiq(image), convert_to_yiq(truth)
+    of_image = convert_to_yiq(image)
+    of_truth = convert_to_yiq(truth)
     similarity, weight = compute_similarities(of_image, of_truth)
     inside = halve_image(where[None].double().cpu())[0] >= 0.5
     if not inside.any():
         return None
-    similarity, weight = similarity[:, inside], weight[:, inside]
+    similarity = similarity[:, inside]
+    weight = weight[:, inside]
     # Without any edge all pixels have the same weight.
+    # The mean of logistic values, weighted by edges, is mapped back by its inverse.
     tiny = torch.finfo(weight.dtype).eps
     mean = ((ALPHA * similarity).sigmoid() * (weight + tiny)).sum() / (weight + tiny).sum()
     return (mean.logit() / ALPHA).square().item()
@@ -59,10 +62,12 @@ def compute_similarities(
     a: Float[Tensor, "3 h w"], b: Float[Tensor, "3 h w"]
 ) -> tuple[Float[Tensor, "3 h w"], Float[Tensor, "3 h w"]]:
     """Compare two finer scales of luminance, and chrominance; the coarsest scale gives weights."""
-    of_a, of_b = ([compute_wavelets(p[0], scale) for scale in (1, 2, 3)] for p in (a, b))
+    of_a = [compute_wavelets(a[0], scale) for scale in (1, 2, 3)]
+    of_b = [compute_wavelets(b[0], scale) for scale in (1, 2, 3)]
     luminance = compare_values(torch.stack(of_a[:2]), torch.stack(of_b[:2])).mean(0)
     chrominance = compare_values(average_neighbours(a[1:]), average_neighbours(b[1:])).mean(0)
     weight = torch.maximum(of_a[2], of_b[2])
+    # The authors take the mean of the two directions as weight of the chrominance.
     return torch.cat([luminance, chrominance[None]]), torch.cat([weight, weight.mean(0)[None]])
 
 
@@ -74,9 +79,12 @@ def compare_values(a: Float[Tensor, "*n"], b: Float[Tensor, "*n"]) -> Float[Tens
 def compute_wavelets(luminance: Float[Tensor, "h w"], scale: int) -> Float[Tensor, "2 h w"]:
     """Compute magnitudes of Haar wavelets of 2^scale pixels, along columns and rows."""
     size = 2**scale
+    # A square of which one half counts positive and the other negative.
     step = luminance.new_full((size, size), 1 / size)
     step[size // 2 :] *= -1
-    before, after = size // 2 - 1, size // 2
+    # An even window has no middle pixel: it reaches one pixel further after its place than before.
+    before = size // 2 - 1
+    after = size // 2
     padded = pad(luminance[None, None], (before, after, before, after))
     return conv2d(padded, torch.stack([step, step.T])[:, None])[0].abs()
 
@@ -130,11 +138,11 @@ def compute_fid(images: Sequence[Image], truths: Sequence[Image]) -> float:
         metric = FrechetInceptionDistance(feature=2048, normalize=True)
     except MISSING as error:
         raise InputError(f"FID is not available ({error}); {ADVICE}") from error
-    for side, found in (("photographs", truths), ("rendered images", images)):
-        if len(found) < 2:
-            raise InputError(f"FID needs at least two {side}, got {len(found)}.")
-        for image in found:
-            metric.update(to_batch(image), real=found is truths)
+    for side, group in (("photographs", truths), ("rendered images", images)):
+        if len(group) < 2:
+            raise InputError(f"FID needs at least two {side}, got {len(group)}.")
+        for image in group:
+            metric.update(to_batch(image), real=group is truths)
     return float(metric.compute())
 
 

@@ -119,18 +119,35 @@ def score(
 
     `added` is None if existing Gaussians were changed; `registered` has all lifted Gaussians.
     """
-    target, camera = truth.target, truth.target.camera
-    was, now = renderer.render(before, camera), renderer.render(after, camera)
+    target = truth.target
+    camera = truth.target.camera
+    was = renderer.render(before, camera)
+    now = renderer.render(after, camera)
     holes = compute_hole_mask(was.alpha)
     covered = now.depth_map().valid & target.valid_mask
-    context, beside = (
-        [[renderer.render(scene, view.camera).image for scene in (before, after)] for view in views]
-        for views in (truth.views, truth.neighbours)
-    )
-    depths: list[Agreement | None] = [None, None]
+
+    def render_both(views: Sequence[View]) -> list[list[Image]]:
+        return [
+            [renderer.render(scene, view.camera).image for scene in (before, after)]
+            for view in views
+        ]
+
+    context = render_both(truth.views)
+    beside = render_both(truth.neighbours)
+
+    # Where the photograph has a true depth: beside the hole, and in it.
+    depth_observed = None
+    depth_hole = None
     if target.depth is not None:
-        parts = (~holes & covered, holes & covered)
-        depths = [compare_depths(now.depth, target.depth, part) for part in parts]
+        depth_observed = compare_depths(now.depth, target.depth, ~holes & covered)
+        depth_hole = compare_depths(now.depth, target.depth, holes & covered)
+
+    # Agreement of what was added with the scene before; a method may have added nothing.
+    seam_step = None
+    agreement = None
+    if added:
+        seam_step = measure_seam_step(added, was, camera, renderer)
+        agreement = measure_alignment(added, before, camera, renderer)
     lifted = None
     if registered:
         lifted = measure_primitive_alignment(registered, before, camera, renderer)
@@ -143,10 +160,10 @@ def score(
         neighbours_psnr=compare(beside, truth.neighbours, compute_view_psnr),
         context_psnr=compare(context, truth.views, compute_view_psnr),
         context_ssim=compare(context, truth.views, compute_view_ssim),
-        depth_observed=depths[0],
-        depth_hole=depths[1],
-        seam_step=measure_seam_step(added, was, camera, renderer) if added else None,
-        added=measure_alignment(added, before, camera, renderer) if added else None,
+        depth_observed=depth_observed,
+        depth_hole=depth_hole,
+        seam_step=seam_step,
+        added=agreement,
         registered=lifted,
     )
     return scores, TargetRenders(was, now, holes)
@@ -157,7 +174,8 @@ def measure_quality(image: Image, photograph: View) -> Quality:
 
     Ignored pixels of the photograph do not count for PSNR and count as equal for the others.
     """
-    truth, compared = photograph.image, photograph.fill_ignored(image)
+    truth = photograph.image
+    compared = photograph.fill_ignored(image)
     return Quality(
         compute_view_psnr(image, photograph),
         compute_view_ssim(image, photograph),
@@ -179,8 +197,10 @@ def compute_view_ssim(image: Image, photograph: View) -> float:
 
 def measure_part(image: Image, photograph: View, where: Bool[Tensor, "h w"]) -> PartQuality:
     """Score an image over the valid pixels of `where`."""
-    compared, truth = photograph.fill_ignored(image), photograph.image
+    compared = photograph.fill_ignored(image)
+    truth = photograph.image
     where = where & photograph.valid_mask
+    # The map is computed once, with the surroundings of each pixel, and then averaged in the part.
     errors = compute_flip_map(compared, truth)
     return PartQuality(
         compute_masked_psnr(image, truth, where),

@@ -72,7 +72,9 @@ def measure_likeness(
     truth = photograph.image
     size = photograph.camera.width, photograph.camera.height
     shown = compute_fitted_psnr(render.image, truth, covered)
+    # A render of black is fitted to the best single colour.
     plain = compute_fitted_psnr(torch.zeros_like(truth), truth, covered)
+    # Left as it is, without a camera: what a photograph of the same place has in common.
     as_they_are = [
         compute_fitted_psnr(resize_by_area(image, size), truth, covered) for image in used
     ]

@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from jaxtyping import Float, Int
+from jaxtyping import Float
 
 from gscompleter.system.errors import InputError
 
@@ -32,11 +32,19 @@ class Similarity:
         return self.scale * points @ self.rotation.T + self.shift
 
 
-def fit_center_similarity(given: Points, found: Points) -> Similarity:
-    """Fit the similarity from `given` to `found` by least squares; it needs two distinct points."""
-    x, y = given.astype(np.float64), found.astype(np.float64)
-    middle_x, middle_y = x.mean(0), y.mean(0)
-    x, y = x - middle_x, y - middle_y
+def fit_center_similarity(source: Points, destination: Points) -> Similarity:
+    """Fit the similarity from `source` to `destination` by least squares.
+
+    Raises:
+        InputError: All points of `source` are equal.
+    """
+    # Umeyama's closed form: centre both sets, and take the singular values of their covariance.
+    x = source.astype(np.float64)
+    y = destination.astype(np.float64)
+    middle_x = x.mean(0)
+    middle_y = y.mean(0)
+    x = x - middle_x
+    y = y - middle_y
     spread = (x**2).sum(1).mean()
     if not spread > 0:
         raise InputError(
@@ -44,42 +52,41 @@ def fit_center_similarity(given: Points, found: Points) -> Similarity:
             "taken from different positions."
         )
     u, values, v = np.linalg.svd(y.T @ x / len(x))
+    # The sign keeps the rotation from becoming a reflection.
     signs = np.array([1.0, 1.0, np.sign(np.linalg.det(u) * np.linalg.det(v))])
     rotation = (u * signs) @ v
     scale = float((values * signs).sum() / spread)
     return Similarity(scale, rotation, middle_y - scale * rotation @ middle_x)
 
 
-def fit_robust_similarity(given: Points, found: Points) -> Similarity:
+def fit_robust_similarity(source: Points, destination: Points) -> Similarity:
     """Fit a similarity, with RANSAC from ten points on."""
-    every = fit_center_similarity(given, found)
-    if len(given) < MIN_RANSAC_CAMERAS:
+    every = fit_center_similarity(source, destination)
+    if len(source) < MIN_RANSAC_CAMERAS:
         return every
-    threshold = float(np.median(measure_nearest_distances(every(given), found)))
-    best, least = None, (0, np.inf)
-    for half in sample_halves(len(given)):
-        if np.ptp(given[half], axis=0).max() == 0:
+    # After the fit to all, the median distance to the nearest centre: what is farther from its own
+    # counterpart in the fit to a half is an outlier.
+    distances = np.linalg.norm(every(source)[:, None] - destination, axis=-1)
+    threshold = float(np.median(distances.min(axis=1)))
+    generator = np.random.default_rng(RANSAC_SEED)
+    size = max(3, (len(source) + 1) // 2)
+    halves = [generator.choice(len(source), size, replace=False) for _ in range(NUM_RANSAC_SAMPLES)]
+
+    best = None
+    least = (0, np.inf)
+    for half in halves:
+        # Cameras in one place determine no scale.
+        if np.ptp(source[half], axis=0).max() == 0:
             continue
-        error = np.linalg.norm(
-            fit_center_similarity(given[half], found[half])(given) - found, axis=1
-        )
+        fit = fit_center_similarity(source[half], destination[half])
+        error = np.linalg.norm(fit(source) - destination, axis=1)
         inliers = error <= threshold
         count = int(inliers.sum())
         mean = float(error[inliers].mean()) if count else np.inf
+        # More inliers win, and of equally many those with the smaller mean error.
         if (count, -mean) > (least[0], -least[1]):
-            best, least = inliers, (count, mean)
+            best = inliers
+            least = (count, mean)
     if best is None or least[0] < 3:
         return every
-    return fit_center_similarity(given[best], found[best])
-
-
-def sample_halves(count: int) -> list[Int[np.ndarray, "_"]]:
-    """Sample random halves of `count` points."""
-    generator = np.random.default_rng(RANSAC_SEED)
-    size = max(3, (count + 1) // 2)
-    return [generator.choice(count, size, replace=False) for _ in range(NUM_RANSAC_SAMPLES)]
-
-
-def measure_nearest_distances(points: Points, others: Points) -> Float[np.ndarray, "n"]:
-    """Measure the distance from each point to the nearest of the others."""
-    return np.linalg.norm(points[:, None] - others, axis=-1).min(axis=1)
+    return fit_center_similarity(source[best], destination[best])

@@ -33,10 +33,13 @@ class Dpt(nn.Module):
     ) -> list[Float[Tensor, "n _ _ _"]]:
         """Compute the map of each level, finest first, for n = b v views."""
         maps = []
-        for given, project, resize in zip(tokens, self.projects, self.resize_layers, strict=True):
-            patches = self.normalize_patches(given.patches).flatten(0, 1).transpose(1, 2)
+        for level, project, resize in zip(tokens, self.projects, self.resize_layers, strict=True):
+            # From tokens [b, v, rows * columns, c] to maps [b * v, c, rows, columns].
+            patches = self.normalize_patches(level.patches).flatten(0, 1).transpose(1, 2)
             x = project(patches.unflatten(2, (rows, columns)))
-            maps.append(resize(add_position_encoding(x, columns / rows) if self.coded else x))
+            if self.coded:
+                x = add_position_encoding(x, columns / rows)
+            maps.append(resize(x))
         return maps
 
     def normalize_patches(self, patches: Float[Tensor, "b v p c"]) -> Float[Tensor, "b v p c"]:
@@ -61,13 +64,13 @@ def create_output_layers(channels: int, out: int) -> nn.Sequential:
 def add_position_encoding(x: Float[Tensor, "n c h w"], aspect: float) -> Float[Tensor, "n c h w"]:
     """Encode columns in the first half of the channels and rows in the second."""
     c, h, w = x.shape[1:]
+    # Positions in a frame whose half diagonal is 1, so that they do not depend on the resolution
+    # and an image that is not square keeps its proportions.
     diagonal = (aspect**2 + 1) ** 0.5
-    across = compute_sinusoids(compute_cell_positions(w, aspect / diagonal, x.device), c // 4)[
-        :, None, :
-    ].expand(-1, h, -1)
-    down = compute_sinusoids(compute_cell_positions(h, 1 / diagonal, x.device), c // 4)[
-        :, :, None
-    ].expand(-1, -1, w)
+    columns = compute_cell_positions(w, aspect / diagonal, x.device)
+    rows = compute_cell_positions(h, 1 / diagonal, x.device)
+    across = compute_sinusoids(columns, c // 4)[:, None, :].expand(-1, h, -1)
+    down = compute_sinusoids(rows, c // 4)[:, :, None].expand(-1, -1, w)
     return x + POSITION_WEIGHT * torch.cat([across, down])
 
 

@@ -38,7 +38,8 @@ class RayLayers(nn.Sequential):
     """Output layers of a level. The four levels share one norm, which files store at the first."""
 
     def __init__(self, channels: int, level: int) -> None:
-        first, last = nn.Conv2d(channels, HIDDEN, 3, 1, 1), nn.Conv2d(HIDDEN, 7, 1)
+        first = nn.Conv2d(channels, HIDDEN, 3, 1, 1)
+        last = nn.Conv2d(HIDDEN, 7, 1)
         norm = nn.Identity() if level else ChannelNorm(HIDDEN)
         super().__init__(first, nn.Identity(), norm, nn.Identity(), nn.ReLU(), last)
 
@@ -69,8 +70,11 @@ class DualScratch(ImageScratch):
         """Fuse the maps, finest first, into rays; `aspect` is image width divided by height."""
         fusions = (self.refinenet1_aux, self.refinenet2_aux, self.refinenet3_aux)
         x = fuse_levels(self.project_levels(pyramid), *fusions, self.refinenet4_aux)
+        # Of the four levels, only the last one's layers are used; with the norm that the first one
+        # stores.
         x = add_position_encoding(self.output_conv1_aux[-1](x), aspect)
-        shared, last = self.output_conv2_aux[0], self.output_conv2_aux[-1]
+        shared = self.output_conv2_aux[0]
+        last = self.output_conv2_aux[-1]
         assert isinstance(shared, RayLayers)
         assert isinstance(last, RayLayers)
         return last.apply_with_norm(x, shared[NORM_INDEX])
@@ -96,6 +100,7 @@ class DualDpt(Dpt):
         """Predict depth up to scale, and its confidence from 1 upwards."""
         x = resize_bilinear(self.scratch.output_conv1(self.scratch(pyramid)), size)
         raw = self.scratch.output_conv2(add_position_encoding(x, size[1] / size[0]))
+        # Positive depth, and a confidence above 1, as the authors trained them.
         return raw[:, 0].exp(), 1 + raw[:, 1].exp()
 
     def predict_rays(

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from itertools import chain, pairwise
+from itertools import pairwise
 
 import torch
 import torch.nn.functional as F
@@ -27,13 +27,6 @@ SCALES = (1e-5, 30.0)
 """Smallest and largest standard deviation, in tenths of the sum of pixel width and height."""
 
 
-def create_image_merger(features: int) -> nn.Sequential:
-    """Create the layers that add image features to the fused map."""
-    widths = pairwise([3, features // 8, features // 4, features // 2])
-    layers = [(nn.Conv2d(a, b, 3, 1, 1), nn.GELU()) for a, b in widths]
-    return nn.Sequential(*chain.from_iterable(layers))
-
-
 class GaussianDpt(Dpt):
     """Head for the raw Gaussian channels of each pixel."""
 
@@ -42,7 +35,11 @@ class GaussianDpt(Dpt):
     def __init__(self, channels: int, widths: Sequence[int], features: int) -> None:
         super().__init__(channels, widths, coded=True)
         self.scratch = ImageScratch(widths, features, sum(CHANNELS))
-        self.images_merger = create_image_merger(features)
+        # Layers that add features of the image itself to the fused map.
+        layers: list[nn.Module] = []
+        for width_in, width_out in pairwise([3, features // 8, features // 4, features // 2]):
+            layers += [nn.Conv2d(width_in, width_out, 3, 1, 1), nn.GELU()]
+        self.images_merger = nn.Sequential(*layers)
 
     def forward(
         self, tokens: Sequence[Tokens], images: Float[Tensor, "b v 3 h w"]
@@ -66,13 +63,14 @@ def create_camera_gaussians(
 
     As in training, the predicted z-depth is used as distance along the ray.
     """
-    offset, scale, rotation, sh, closer, opacity = raw.split(CHANNELS, dim=-1)
+    offset, scale, rotation, sh, depth_offset, opacity = raw.split(CHANNELS, dim=-1)
     factor = factors[:, None, None, None]
-    distance = (depth + closer[..., 0]) * factor
+    distance = (depth + depth_offset[..., 0]) * factor
+
+    # Unit rays in the frame of `poses`, through a point beside the pixel centre.
     turns = poses.c2w[..., :3, :3]
-    rays = F.normalize(
-        torch.einsum("bvij,bvhwj->bvhwi", turns, compute_offset_rays(offset, poses.K)), dim=-1
-    )
+    local_rays = compute_offset_rays(offset, poses.K)
+    rays = F.normalize(torch.einsum("bvij,bvhwj->bvhwi", turns, local_rays), dim=-1)
     centers = factor[..., None] * poses.centers[:, :, None, None]
     return PixelGaussians(
         distance,
@@ -101,6 +99,7 @@ def compute_pixel_scales(
 ) -> Float[Tensor, "b v h w 3"]:
     """Compute standard deviations at a distance of 1."""
     low, high = SCALES
+    # A tenth of the size of a pixel at a distance of 1, along x and y together.
     pixel = 0.1 * (1 / K[..., 0, 0] + 1 / K[..., 1, 1])
     return (low + (high - low) * scale.sigmoid()) * pixel[..., None, None, None]
 
@@ -115,4 +114,5 @@ def rotate_quats_as_trained(
     x, y, z, w = F.normalize(raw, dim=-1, eps=1e-8).unbind(-1)
     misread = torch.stack([z, w, x, y], dim=-1)  # (w, x, y, z) misread as xyzw, in our order
     rotated = multiply_quats(rotations_to_quats(turns)[:, :, None, None], misread)
+    # One of the two quaternions of each rotation, that with positive real part.
     return torch.where(rotated[..., :1] < 0, -rotated, rotated).roll(-1, -1)

@@ -18,12 +18,9 @@ def rotate_3dgs_sh(
     sh: Float[Tensor, "b v h w k 3"], turns: Float[Tensor, "b v 3 3"]
 ) -> Float[Tensor, "b v h w k 3"]:
     """Rotate SH of 3DGS such that `Y(R d) sh' = Y(d) sh` for all directions d."""
-    pole, signs = turns.new_tensor(AXIS_PERMUTATION), compute_order_signs(sh)
-    return signs * rotate_sh(signs * sh, pole.T @ turns @ pole)
-
-
-def compute_order_signs(sh: Float[Tensor, "*n k 3"]) -> Float[Tensor, "k 1"]:
-    """Return -1 for SH of odd order, 1 for the others."""
+    # 3DGS flips the sign of odd orders, and has its pole along z instead of y.
+    pole = turns.new_tensor(AXIS_PERMUTATION)
     degrees = range(isqrt(sh.shape[-2]))
     orders = [order for degree in degrees for order in range(-degree, degree + 1)]
-    return torch.tensor([(-1.0) ** order for order in orders]).to(sh)[:, None]
+    signs = torch.tensor([(-1.0) ** order for order in orders]).to(sh)[:, None]
+    return signs * rotate_sh(signs * sh, pole.T @ turns @ pole)

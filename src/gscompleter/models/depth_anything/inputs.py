@@ -58,9 +58,8 @@ class Window:
 
     def compute_intrinsics(self, camera: Camera) -> Float[Tensor, "3 3"]:
         """Compute the intrinsics of `camera` in pixels of the window."""
-        K = camera.K.float() * torch.tensor([[self.scale_x], [self.scale_y], [1.0]]).to(
-            camera.K.device
-        )
+        scales = torch.tensor([[self.scale_x], [self.scale_y], [1.0]])
+        K = camera.K.float() * scales.to(camera.K.device)
         K[0, 2] -= self.left
         K[1, 2] -= self.top
         return K
@@ -73,9 +72,11 @@ class Window:
 
     def compute_pixel_indices(self, camera: Camera) -> Int[Tensor, "n"]:
         """Compute the row-major index of the photograph's pixel below each window pixel."""
+        # The centre of each window pixel, back in the photograph.
         x = ((torch.arange(self.width) + 0.5 + self.left) / self.scale_x).long()
         y = ((torch.arange(self.height) + 0.5 + self.top) / self.scale_y).long()
-        rows, columns = y.clamp(max=camera.height - 1), x.clamp(max=camera.width - 1)
+        rows = y.clamp(max=camera.height - 1)
+        columns = x.clamp(max=camera.width - 1)
         return (rows[:, None] * camera.width + columns).flatten()
 
     def resample_depth_map(
@@ -86,6 +87,8 @@ class Window:
     ) -> DepthMap:
         """Resample inverse depth of the window to the photograph; pixels outside are invalid."""
         places = self.locate_pixels(camera).to(depth.device)
+        # Inverse depth is linear in the image on a plane; confidence may be a mask, and is not
+        # mixed.
         inverse = sample(1 / depth[..., None], places)[..., 0]
         sure = sample(confidence[..., None], places, "nearest")[..., 0]
         size = places.new_tensor([self.width, self.height])
@@ -103,23 +106,29 @@ class Batch:
 
 
 def create_any_view_batch(views: Sequence[View], sizing: ResizeConfig, min_views: int) -> Batch:
-    """Create a batch of at least `fewest` views, resized and centrally cropped to one size."""
+    """Create a batch of at least `min_views` views, resized and centrally cropped to one size."""
     if len(views) < min_views:
         raise InputError(
             f"{len(views)} view was given, and the model matches at least {min_views}; name more "
             "frames."
         )
-    seen = [crop_to_patches(quantize_image(view), sizing) for view in views]
-    height, width = (min(image.shape[side] for image, _ in seen) for side in (0, 1))
-    windows = tuple(window.crop_center_window(height, width) for _, window in seen)
-    images = np.stack([crop_center(image, height, width) for image, _ in seen])
+    resized = [crop_to_patches(quantize_image(view), sizing) for view in views]
+
+    # Photographs of several shapes are cropped to what all of them have.
+    height = min(image.shape[0] for image, _ in resized)
+    width = min(image.shape[1] for image, _ in resized)
+    windows = tuple(window.crop_center_window(height, width) for _, window in resized)
+    images = np.stack([crop_center(image, height, width) for image, _ in resized])
+
     c2w = torch.stack([view.camera.c2w.cpu() for view in views]).float()
     K = torch.stack(
-        [w.compute_intrinsics(v.camera).cpu() for v, w in zip(views, windows, strict=True)]
+        [
+            window.compute_intrinsics(view.camera).cpu()
+            for view, window in zip(views, windows, strict=True)
+        ]
     )
-    return Batch(
-        normalize_colors(torch.from_numpy(images))[None], Poses(c2w[None], K[None]), windows
-    )
+    colours = normalize_colors(torch.from_numpy(images))
+    return Batch(colours[None], Poses(c2w[None], K[None]), windows)
 
 
 def crop_to_patches(image: Image, sizing: ResizeConfig) -> tuple[Image, Window]:
@@ -131,7 +140,9 @@ def crop_to_patches(image: Image, sizing: ResizeConfig) -> tuple[Image, Window]:
             f"An image of {w} x {h} pixels is resized to {scaled.shape[1]} x {scaled.shape[0]} for "
             f"this model, which needs at least {PATCH} x {PATCH}; use a less narrow one."
         )
-    height, width = (round_to_patches(side, sizing.fit) for side in scaled.shape[:2])
+    height = round_to_patches(scaled.shape[0], sizing.fit)
+    width = round_to_patches(scaled.shape[1], sizing.fit)
+    # The second resizing may stretch the image by up to half a patch, as the authors' does.
     if sizing.fit == "resized":
         scaled = resize_photograph(scaled, height, width)
     rows, columns = scaled.shape[:2]
@@ -141,7 +152,8 @@ def crop_to_patches(image: Image, sizing: ResizeConfig) -> tuple[Image, Window]:
 
 def crop_center(image: Image, height: int, width: int) -> UInt8[np.ndarray, "{height} {width} 3"]:
     """Crop the centre of an image."""
-    top, left = (image.shape[0] - height) // 2, (image.shape[1] - width) // 2
+    top = (image.shape[0] - height) // 2
+    left = (image.shape[1] - width) // 2
     return image[top : top + height, left : left + width]
 
 

@@ -41,6 +41,8 @@ class MetricDepth:
 
     def convert_to_metres(self, K: Float[Tensor, "b v 3 3"]) -> Float[Tensor, "b v h w"]:
         """Compute z-depth in metres for intrinsics in pixels."""
+        # Depth is proportional to the focal length: a longer lens shows the same image of what is
+        # farther.
         focal = (K[..., 0, 0] + K[..., 1, 1]) / 2
         return self.depth * (focal / METRIC_FOCAL)[..., None, None]
 
@@ -80,6 +82,7 @@ class MetricDepthAnything(nn.Module):
             scratch = self.head.scratch
             pyramid = self.head.compute_pyramid(tokens, size[0] // PATCH, size[1] // PATCH)
             x = resize_bilinear(scratch.output_conv1(scratch(pyramid)), size)
+            # Two outputs of one fused map: log depth, and a sky score that is not negative.
             depth = scratch.output_conv2(x)[:, 0].exp()
             sky = scratch.sky_output_conv2(x)[:, 0].relu()
         views = images.shape[:2]
@@ -89,7 +92,8 @@ class MetricDepthAnything(nn.Module):
 def set_sky_depth(
     depth: Float[Tensor, "b v h w"], solid: Bool[Tensor, "b v h w"], max_depth: float = torch.inf
 ) -> Float[Tensor, "b v h w"]:
-    """Set the sky to the depth of the far foreground, at most `farthest`, as the authors do."""
+    """Set the sky to the depth of the far foreground, at most `max_depth`, as the authors do."""
+    # Of a few pixels neither a quantile nor a sky is certain.
     if min(int(solid.sum()), int((~solid).sum())) <= MIN_PIXELS:
         return depth
     far = interpolate_quantile(depth[solid], FAR_QUANTILE).clamp_max(max_depth)
@@ -97,8 +101,9 @@ def set_sky_depth(
 
 
 def interpolate_quantile(values: Float[Tensor, "n"], share: float) -> Float[Tensor, ""]:
-    """Compute a quantile; `torch.interpolate_quantile` is limited to 16 million values."""
+    """Compute a quantile; `torch.quantile` is limited to 16 million values."""
     place = share * (len(values) - 1)
     ordered = values.sort().values
-    below, above = ordered[int(place)], ordered[min(int(place) + 1, len(values) - 1)]
+    below = ordered[int(place)]
+    above = ordered[min(int(place) + 1, len(values) - 1)]
     return below + (above - below) * (place - int(place))

@@ -4,8 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-import torch
-from jaxtyping import Bool, Float
+from jaxtyping import Float
 from torch import Tensor, nn
 
 from gscompleter.models.depth_anything.config import NestedConfig
@@ -71,22 +70,16 @@ class NestedDepthAnything(nn.Module):
 
 def fit_metres_per_unit(prediction: Prediction, metric: MetricDepth) -> float:
     """Fit the scale from any-view to metric depth on the more confident half of the foreground."""
+    solid = metric.solid_mask
+    if not solid.any():
+        return 1.0
     metres = metric.convert_to_metres(prediction.poses.K)
-    counts = select_scale_pixels(prediction, metric, metres)
+    middle = interpolate_quantile(prediction.confidence[solid], 0.5)
+    deep = (metres > MIN_METRES) & (prediction.depth > MIN_DEPTH)
+    counts = (prediction.confidence >= middle) & deep & solid
     if int(counts.sum()) <= MIN_PIXELS:
         return 1.0
-    a, b = metres[counts].double(), prediction.depth[counts].double()
+    # Least squares without a shift: (a · b) / (b · b).
+    a = metres[counts].double()
+    b = prediction.depth[counts].double()
     return float((a * b).sum() / (b * b).sum())
-
-
-def select_scale_pixels(
-    prediction: Prediction, metric: MetricDepth, metres: Float[Tensor, "b v h w"]
-) -> Bool[Tensor, "b v h w"]:
-    """Select the pixels that determine the scale."""
-    if not metric.solid_mask.any():
-        return torch.zeros_like(metric.solid_mask)
-    sure = prediction.confidence >= interpolate_quantile(
-        prediction.confidence[metric.solid_mask], 0.5
-    )
-    deep = (metres > MIN_METRES) & (prediction.depth > MIN_DEPTH)
-    return sure & deep & metric.solid_mask

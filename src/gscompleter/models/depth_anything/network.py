@@ -45,7 +45,8 @@ class DepthAnything(nn.Module):
     def __init__(self, config: DepthAnythingConfig = DepthAnythingConfig()) -> None:
         super().__init__()
         self.config = config
-        channels, head = config.vit.num_output_channels, (config.widths, config.features)
+        channels = config.vit.num_output_channels
+        head = (config.widths, config.features)
         self.backbone = nn.ModuleDict({"pretrained": AnyViewVit(config.vit)})
         self.head = DualDpt(channels, *head)
         self.cam_dec = CameraDecoder(channels)
@@ -60,8 +61,10 @@ class DepthAnything(nn.Module):
         size = (images.shape[3], images.shape[4])
         tokens = self.compute_tokens(images, poses)
         with disable_autocast(images):
+            # Heads run in float32: depth is an exponential, which half precision resolves badly.
             pyramid = self.head.compute_pyramid(tokens, size[0] // PATCH, size[1] // PATCH)
             depth, confidence = self.head.predict_depth(pyramid, size)
+            # From the camera token of the last output block.
             numbers = self.cam_dec(tokens[-1].camera)
             raw = None if self.gs_head is None else self.gs_head(tokens, images)
             views = images.shape[:2]

@@ -18,6 +18,7 @@ MIN_UNIT = 0.1
 def normalize_poses(poses: Poses, units: Float[Tensor, "b"]) -> Poses:
     """Transform each scene to the axes of its first camera and to `units` (in scene units)."""
     c2w = poses.c2w.double()
+    # The first camera becomes the origin and the axes, whatever world the poses were in.
     relative = invert_rigid(c2w[:, :1]) @ c2w
     relative[..., :3, 3] /= units.double()[:, None, None]
     return replace(poses, c2w=relative.to(poses.c2w.dtype))
@@ -40,6 +41,7 @@ def compute_scene_units(centers: Float[Tensor, "b v 3"]) -> Float[Tensor, "b"]:
             f"All {apart.shape[1]} cameras stand in one place, and depth needs a baseline between "
             "them; give photographs taken from different positions."
         )
+    # Of two cameras the lower median is that of the first one, 0; then the other one counts.
     return torch.maximum(apart.median(dim=1).values, least)
 
 

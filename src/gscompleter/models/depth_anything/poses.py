@@ -36,6 +36,7 @@ class Poses:
 
 def invert_rigid(transforms: Float[Tensor, "*n 4 4"]) -> Float[Tensor, "*n 4 4"]:
     """Invert rigid transforms."""
+    # [R t; 0 1] inverts to [R^T -R^T t; 0 1].
     rotations = transforms[..., :3, :3].transpose(-1, -2)
     inverse = transforms.clone()
     inverse[..., :3, :3] = rotations
@@ -46,7 +47,9 @@ def invert_rigid(transforms: Float[Tensor, "*n 4 4"]) -> Float[Tensor, "*n 4 4"]
 def encode_poses(poses: Poses, size: tuple[int, int]) -> Float[Tensor, "b v 9"]:
     """Encode centre, xyzw quaternion with w >= 0, and vertical and horizontal field of view."""
     quats = rotations_to_quats(poses.c2w[..., :3, :3])
+    # wxyz to xyzw.
     quats = torch.where(quats[..., :1] < 0, -quats, quats).roll(-1, -1)
+    # Heights first: `size` is height and width.
     focal = torch.stack([poses.K[..., 1, 1], poses.K[..., 0, 0]], dim=-1)
     angles = 2 * torch.atan(focal.new_tensor(size) / 2 / focal)
     return torch.cat([poses.centers, quats, angles], dim=-1)

@@ -59,8 +59,12 @@ class AnyViewDepth:
         batch = create_any_view_batch(views, self.inference.sizing, min_views=2)
         predicted = run_network(self.network, batch, self.inference)
         assert isinstance(predicted, Prediction)
-        (given,), (found,) = get_camera_centers(batch.poses), get_camera_centers(predicted.poses)
-        depth = predicted.depth[0] / fit_robust_similarity(given, found).scale
+        # The network predicts cameras too, in the unit of its depths. Their distances, compared
+        # with the given ones, scale the depths.
+        (given_centers,) = get_camera_centers(batch.poses)
+        (predicted_centers,) = get_camera_centers(predicted.poses)
+        scale = fit_robust_similarity(given_centers, predicted_centers).scale
+        depth = predicted.depth[0] / scale
         return resample_depth_maps(
             depth, normalize_confidence(predicted.confidence[0]), batch, views
         )
@@ -85,12 +89,13 @@ class MetricViewDepth:
         batch = create_any_view_batch(views, self.inference.sizing, min_views=2)
         device = get_device(self.network)
         with torch.no_grad(), lower_precision(device, self.inference.dtype):
-            found = self.network(batch.images.to(device))
-        metres = found.convert_to_metres(batch.poses.K.to(device))
-        depth = set_sky_depth(metres, found.solid_mask)[0]
-        maps = resample_depth_maps(depth, found.solid_mask[0].float(), batch, views)
+            predicted = self.network(batch.images.to(device))
+        metres = predicted.convert_to_metres(batch.poses.K.to(device))
+        depth = set_sky_depth(metres, predicted.solid_mask)[0]
+        maps = resample_depth_maps(depth, predicted.solid_mask[0].float(), batch, views)
+        # Given cameras have a unit of their own: triangulated features tell it in metres.
         factor = estimate_units_per_metre(views, maps)
-        return [replace(known, depth=factor * known.depth) for known in maps]
+        return [replace(depth_map, depth=factor * depth_map.depth) for depth_map in maps]
 
 
 @dataclass(frozen=True)
@@ -114,9 +119,11 @@ class AnyViewGaussians:
         batch = create_any_view_batch(views, self.inference.sizing, min_views=2)
         predicted = run_network(self.network, batch, self.inference)
         if isinstance(predicted, NestedPrediction):
-            any_view, solid = predicted.any_view, predicted.metric.solid_mask
+            any_view = predicted.any_view
+            solid = predicted.metric.solid_mask
         else:
-            any_view, solid = predicted, torch.ones_like(predicted.depth, dtype=torch.bool)
+            any_view = predicted
+            solid = torch.ones_like(predicted.depth, dtype=torch.bool)
         sure = normalize_confidence(any_view.confidence) * solid
         return create_any_view_reconstruction(
             move_to_given_frame(any_view, batch.poses), sure[0], batch, views
@@ -165,6 +172,7 @@ def move_to_given_frame(predicted: Prediction, given: Poses) -> PixelGaussians:
     """Transform the Gaussians to the frame and unit of the given cameras."""
     pairs = zip(get_camera_centers(predicted.poses), get_camera_centers(given), strict=True)
     factors = [fit_center_similarity(*pair).scale for pair in pairs]
+    # The predicted frame is that of the first camera.
     first = given.c2w[:, 0].to(predicted.depth)
     return move_from_first_camera(predicted.create_gaussians(first.new_tensor(factors)), first)
 
@@ -179,13 +187,20 @@ def create_any_view_reconstruction(
     device = views[0].image.device
     means = gaussians.means[0].to(device)
     per_view = zip(means.flatten(1, 2), views, strict=True)
-    z = torch.stack([compute_z_depths(m, view.camera) for m, view in per_view]).view(
-        means.shape[:3]
-    )
+    z = torch.stack([compute_z_depths(m, view.camera) for m, view in per_view])
+    z = z.view(means.shape[:3])
+
+    # Behind its camera a Gaussian has no depth; a large one keeps the interpolation finite, and is
+    # marked as invalid by its confidence.
     ahead = z > 0
     sure = confidence.to(device) * ahead
     depths = resample_depth_maps(z.where(ahead, z.abs().max()), sure, batch, views)
-    pixels = [w.compute_pixel_indices(v.camera) for w, v in zip(batch.windows, views, strict=True)]
+
+    # The photograph and the pixel that each Gaussian comes from.
+    pixels = [
+        window.compute_pixel_indices(view.camera)
+        for window, view in zip(batch.windows, views, strict=True)
+    ]
     numbers = torch.arange(len(views)).repeat_interleave(z[0].numel())
     return Reconstruction(
         flatten_gaussians(gaussians).to(device),

@@ -23,6 +23,7 @@ class RotaryEmbedding:
 
     def __call__(self, x: Float[Tensor, "n heads t c"]) -> Float[Tensor, "n heads t c"]:
         """Rotate channel pairs k and k + 16 of each half."""
+        # The rotation of each pair (u, v) as of a complex number, for rows and columns apart.
         u, v = x.unflatten(-1, (2, 2, NUM_PAIRS)).unbind(-2)
         rotated = (u * self.cos - v * self.sin, v * self.cos + u * self.sin)
         return torch.stack(rotated, dim=-2).flatten(-3)

@@ -28,19 +28,24 @@ def estimate_units_per_metre(views: Sequence[View], metres: Sequence[DepthMap]) 
     ratios = [np.zeros(0)]
     for i, j in neighbours.pairs:
         a, b = neighbours.matches[i, j]
-        if len(a):
-            for one, two, at, to in ((i, j, a, b), (j, i, b, a)):
-                inverse, good = triangulate(images[one], images[two], at, to)
-                known = sample_depths(metres[one], at)
-                good &= known > 0
-                ratios.append(unit / (inverse[good] * known[good]))
-    found = np.concatenate(ratios)
-    if len(found) < MIN_MATCHES:
+        if len(a) == 0:
+            continue
+        # From each of the two photographs: a feature has its own depth in both.
+        for one, two, at, to in ((i, j, a, b), (j, i, b, a)):
+            inverse, good = triangulate(images[one], images[two], at, to)
+            known = sample_depths(metres[one], at)
+            good &= known > 0
+            # Triangulated inverse depths are in the unit of `make_stereo_images`.
+            ratios.append(unit / (inverse[good] * known[good]))
+
+    all_ratios = np.concatenate(ratios)
+    if len(all_ratios) < MIN_MATCHES:
         raise InputError(
-            f"The photographs share {len(found)} features of known depth, and the scale of the "
-            f"scene needs {MIN_MATCHES}; choose another reconstructor, or frames with more overlap."
+            f"The photographs share {len(all_ratios)} features of known depth, and the scale of "
+            f"the scene needs {MIN_MATCHES}; choose another reconstructor, or frames with more "
+            "overlap."
         )
-    return float(np.median(found))
+    return float(np.median(all_ratios))
 
 
 def sample_depths(depth: DepthMap, pixels: Float[np.ndarray, "k 2"]) -> Float[np.ndarray, "k"]:

@@ -53,7 +53,8 @@ class RotaryAttention(dino.Attention):
     ) -> Float[Tensor, "n t c"]:
         """Apply self-attention to tokens rotated by `turns`."""
         q, k, v = self.qkv(x).unflatten(2, (3, self.heads, -1)).permute(2, 0, 3, 1, 4)
-        q, k = turns(self.q_norm(q)), turns(self.k_norm(k))
+        q = turns(self.q_norm(q))
+        k = turns(self.k_norm(k))
         return self.proj(F.scaled_dot_product_attention(q, k, v).transpose(1, 2).flatten(2))
 
 
@@ -62,6 +63,7 @@ class GatedMlp(nn.Module):
 
     def __init__(self, channels: int) -> None:
         super().__init__()
+        # Two thirds of the usual width, since a gated MLP has three matrices, in multiples of 8.
         hidden = -(-(4 * channels * 2 // 3) // 8) * 8
         self.w12 = nn.Linear(channels, 2 * hidden)
         self.w3 = nn.Linear(hidden, channels)
@@ -100,7 +102,8 @@ class AnyViewVit(nn.Module):
     def __init__(self, config: VitConfig) -> None:
         super().__init__()
         self.config = config
-        channels, start = config.channels, config.first_multi_view_block
+        channels = config.channels
+        start = config.first_multi_view_block
         self.cls_token = nn.Parameter(torch.zeros(1, 1, channels))
         if start is not None:
             self.camera_token = nn.Parameter(torch.zeros(1, 2, channels))
@@ -132,24 +135,33 @@ class AnyViewVit(nn.Module):
         among = compute_rotary_embedding(
             list_shared_positions(views, size[0] * size[1], images.device)
         )
+
         order = torch.arange(views, device=images.device).expand(scenes, -1)
         start = self.config.first_multi_view_block
-        outputs, local = [], x
+
+        outputs = []
+        # Tokens after the last block that looked at each view alone; heads get these as well.
+        local = x
         for number, block in enumerate(self.blocks):
+            # Without poses, the first view is the reference; a central one is chosen for it.
             if start is not None and number == start - 1 and cameras is None and views > 2:
                 order = order_views(select_reference_view(x[:, :, 0].float()), views)
-                x, local = reorder_views(x, order), reorder_views(local, order)
+                x = reorder_views(x, order)
+                local = reorder_views(local, order)
             if number == start:
-                x = torch.cat(
-                    [self.select_camera_tokens(cameras, scenes, views), x[:, :, 1:]], dim=2
-                )
+                camera_tokens = self.select_camera_tokens(cameras, scenes, views)
+                x = torch.cat([camera_tokens, x[:, :, 1:]], dim=2)
             if not self.is_multi_view_block(number):
-                local = x = block(x.flatten(0, 1)).unflatten(0, (scenes, views))
+                x = block(x.flatten(0, 1)).unflatten(0, (scenes, views))
+                local = x
             elif number % 2:
+                # All tokens of all views in one sequence.
                 x = block(x.flatten(1, 2), among).unflatten(1, (views, -1))
             else:
-                local = x = block(x.flatten(0, 1), within).unflatten(0, (scenes, views))
+                x = block(x.flatten(0, 1), within).unflatten(0, (scenes, views))
+                local = x
             if number in self.config.output_block_ids:
+                # In the order of the photographs again.
                 back = order.argsort(dim=1)
                 outputs.append(self.join_tokens(reorder_views(local, back), reorder_views(x, back)))
         return outputs
@@ -168,10 +180,10 @@ class AnyViewVit(nn.Module):
         """Return the given tokens, or learned ones for the first view and for all others."""
         if cameras is not None:
             return cameras[:, :, None]
-        first, other = self.camera_token[:, :1], self.camera_token[:, 1:]
-        return torch.cat([first, other.expand(-1, views - 1, -1)], 1)[:, :, None].expand(
-            scenes, -1, -1, -1
-        )
+        first = self.camera_token[:, :1]
+        other = self.camera_token[:, 1:].expand(-1, views - 1, -1)
+        tokens = torch.cat([first, other], 1)
+        return tokens[:, :, None].expand(scenes, -1, -1, -1)
 
     def join_tokens(self, local: Float[Tensor, "b v t c"], x: Float[Tensor, "b v t c"]) -> Tokens:
         """Join the tokens of a block with those of the last single-view block."""

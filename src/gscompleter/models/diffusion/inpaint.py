@@ -48,8 +48,9 @@ class Painter:
     def compute_size(self, height: int, width: int) -> tuple[int, int]:
         """Compute a size of about `side`² pixels with the aspect ratio of the image."""
         scale = self.side / (height * width) ** 0.5
-        h, w = (max(1, round(scale * n / self.multiple)) for n in (height, width))
-        return h * self.multiple, w * self.multiple
+        rows = max(1, round(scale * height / self.multiple))
+        columns = max(1, round(scale * width / self.multiple))
+        return rows * self.multiple, columns * self.multiple
 
     def fill_hole(
         self,
@@ -65,6 +66,7 @@ class Painter:
         A pipeline that takes a reference image sees one, the nearest photograph.
         """
         size = self.compute_size(*hole.shape)
+        # A small pixel that covers any part of the hole is painted.
         mask = (resize_antialiased(hole[..., None].float(), size) > 0).float()
         wanted: dict[str, Any] = {
             "prompt": prompt,
@@ -81,8 +83,11 @@ class Painter:
             wanted["guidance_scale"] = 1.0  # which distilled models do not use
         if steps is not None:
             wanted["num_inference_steps"] = steps
+
+        # Pipelines differ in their parameters; each gets those of its own.
         known = inspect.signature(self.pipeline.__call__).parameters
         painted = self.pipeline(**{k: v for k, v in wanted.items() if k in known}).images[0]
+
         back = resize_antialiased(painted.float().permute(1, 2, 0), (hole.shape[0], hole.shape[1]))
         return back.clamp(0, 1).to(image.device)
 
@@ -104,6 +109,7 @@ class DiffusersInpaint:
     def __call__(self, nearest: View, target: Camera, context: GeneratorInput) -> GeneratorOutput:
         """Synthesize the image at `target`; pixels outside the hole are warped photographs."""
         observed = complete_warp(nearest, target, context)
+        # The rim of the hole is painted too, so that the colours of both can be compared there.
         hole = dilate(~observed.known, BORDER_WIDTH)
 
         def paint(seed: int) -> Float[Tensor, "h w 3"]:
@@ -174,10 +180,11 @@ def get_size_rules(pipeline: Any) -> tuple[int, int]:
     """Return the side length of training images and the divisor of side lengths, in pixels."""
     latent = int(getattr(pipeline, "vae_scale_factor", 8))
     unet = getattr(pipeline, "unet", None)
+    # A transformer joins 2 × 2 latent pixels to a token.
     if unet is None:
-        return int(
-            getattr(pipeline, "default_sample_size", DEFAULT_SIDE // latent)
-        ) * latent, 2 * latent
+        side = int(getattr(pipeline, "default_sample_size", DEFAULT_SIDE // latent))
+        return side * latent, 2 * latent
+    # A U-Net halves the latent image between its blocks.
     side = unet.config.get("sample_size") or DEFAULT_SIDE // latent
     side = max(side) if isinstance(side, (list, tuple)) else int(side)
     return side * latent, latent * 2 ** (len(unet.config.block_out_channels) - 1)

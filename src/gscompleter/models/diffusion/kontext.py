@@ -73,18 +73,24 @@ class Kontext:
             guidance: Scale of the distilled guidance.
         """
         pipeline = self.pipeline
-        count, grid = len(photographs), self.compute_grid(size)
+        count = len(photographs)
+        grid = self.compute_grid(size)
         # One at a time: the VAE needs much more memory than the tokens.
         source = torch.stack([self.encode_image(photograph) for photograph in photographs])
+        # The transformer takes 2 × 2 latent pixels as a token of four times the channels.
         channels = pipeline.transformer.config.in_channels // 4
+
+        # On the CPU, whose generator gives the same noise for every device.
         noise = torch.randn(
             (1, channels, 2 * grid[0], 2 * grid[1]),
             generator=torch.Generator().manual_seed(seed),
             dtype=self.dtype,
         )
         latents = pack_tokens(noise.to(self.device)).expand(count, -1, -1)
+        # One sequence: the tokens of the image to generate, then those of the photograph.
         repeated_target = target_positions.expand(count, -1, -1)
         positions = torch.cat([repeated_target, source_positions], dim=1).to(self.device)
+
         for time in self.compute_timesteps(steps, len(target_positions)):
             velocity = self.predict_velocity(latents, source, positions, time, guidance)
             latents = pipeline.scheduler.step(velocity, time, latents, return_dict=False)[0]
@@ -101,13 +107,15 @@ class Kontext:
         guidance: float,
     ) -> Float[Tensor, "b n c"]:
         """Predict the velocity of the latents, given the photographs' tokens."""
-        transformer, count = self.pipeline.transformer, len(latents)
+        transformer = self.pipeline.transformer
+        count = len(latents)
         scale = None
         if transformer.config.guidance_embeds:
             scale = torch.full((count,), guidance, device=self.device, dtype=torch.float32)
         ids = positions.transpose(0, 1).flatten(1)  # the images side by side
         (predicted,) = transformer(
             hidden_states=torch.cat([latents, source], dim=1),
+            # diffusers gives timesteps from 0 to 1000, the network takes 0 to 1.
             timestep=time.expand(count).to(self.device, latents.dtype) / 1000,
             guidance=scale,
             pooled_projections=self.prompt.pooled.expand(count, -1),
@@ -116,14 +124,19 @@ class Kontext:
             img_ids=ids,
             return_dict=False,
         )
+        # Of the answer only the part of the generated image; the photograph stays as it is.
         return predicted[:, : latents.shape[1]]
 
     def compute_timesteps(self, steps: int, tokens: int) -> Float[Tensor, "steps"]:
         """Compute the denoising timesteps; more tokens shift them towards noise."""
         scheduler = self.pipeline.scheduler
         settings = scheduler.config
-        few, many = settings.get("base_image_seq_len", 256), settings.get("max_image_seq_len", 4096)
-        low, high = settings.get("base_shift", 0.5), settings.get("max_shift", 1.15)
+        few = settings.get("base_image_seq_len", 256)
+        many = settings.get("max_image_seq_len", 4096)
+        low = settings.get("base_shift", 0.5)
+        high = settings.get("max_shift", 1.15)
+        # A line through the shifts that FLUX names for few and for many tokens, as diffusers draws
+        # it.
         shift = tokens * (high - low) / (many - few) + low - few * (high - low) / (many - few)
         sigmas = np.linspace(1.0, 1 / steps, steps)
         scheduler.set_timesteps(sigmas=sigmas, mu=shift, device=self.device)
@@ -134,6 +147,7 @@ class Kontext:
         """Encode an image in [0, 1] into latent tokens."""
         vae = self.pipeline.vae
         pixels = (2 * image.permute(2, 0, 1)[None] - 1).to(self.device, self.dtype)
+        # The mode instead of a sample, so that the same photograph gives the same tokens.
         latents = vae.encode(pixels).latent_dist.mode()
         return pack_tokens((latents - vae.config.shift_factor) * vae.config.scaling_factor)[0]
 
@@ -142,6 +156,7 @@ class Kontext:
     ) -> Float[Tensor, "h w 3"]:
         """Decode latent tokens into an image in [0, 1]."""
         vae = self.pipeline.vae
+        # The inverse of `pack_tokens`: b h/2 w/2 c 2 2 to b c h w.
         latents = tokens[None].unflatten(-1, (-1, 2, 2)).unflatten(1, grid)
         latents = latents.permute(0, 3, 1, 4, 2, 5).flatten(4).flatten(2, 3)
         latents = latents / vae.config.scaling_factor + vae.config.shift_factor

@@ -44,6 +44,8 @@ def load_kontext(path: str | None = None, device: str = "cpu", offload: bool = F
     check_packages("pe-field")
     base, transformer = find_sources(path)
     announce([base, transformer])
+    # Each source converts its own errors, which name it. The prompt is encoded first: its text
+    # encoders are freed before the transformer is in memory.
     dtype = select_dtype(device)
     with convert_load_errors(base):
         prompt = encode_prompt(base, device, dtype)
@@ -51,6 +53,7 @@ def load_kontext(path: str | None = None, device: str = "cpu", offload: bool = F
         network = load_transformer(transformer, dtype)
     with convert_load_errors(base):
         pipeline = load_pipeline(base, network, dtype)
+
     heads = pipeline.transformer.config.num_attention_heads
     if heads != HEADS:
         raise InputError(
@@ -66,11 +69,12 @@ def find_sources(path: str | None) -> tuple[Source, Source]:
     """Determine the sources of base pipeline and transformer."""
     if path is None:
         return KONTEXT, PE_FIELD
-    given = parse_source(path)
-    if not given.is_local or (Path(given.location) / "model_index.json").is_file():
-        return given, replace(given, subfolder="transformer")
-    if (Path(given.location) / "config.json").is_file():
-        return KONTEXT, given
+    source = parse_source(path)
+    # A hub repository holds a whole pipeline, of which the transformer is one folder.
+    if not source.is_local or (Path(source.location) / "model_index.json").is_file():
+        return source, replace(source, subfolder="transformer")
+    if (Path(source.location) / "config.json").is_file():
+        return KONTEXT, source
     raise InputError(
         f"{path} holds neither a model_index.json (a pipeline) nor a config.json (a transformer); "
         "give a folder that diffusers saved."
@@ -109,6 +113,7 @@ def load_pipeline(base: Source, network: Any, dtype: torch.dtype) -> Any:
     """Load VAE and scheduler around `network`, without text encoders."""
     from diffusers import FluxKontextPipeline
 
+    # Named as absent, or diffusers would download and load them.
     unused = dict.fromkeys(("text_encoder", "text_encoder_2", "tokenizer", "tokenizer_2"))
     pipeline = FluxKontextPipeline.from_pretrained(
         base.location, transformer=network, dtype=dtype, **unused, **base.load_arguments

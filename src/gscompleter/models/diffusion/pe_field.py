@@ -76,23 +76,25 @@ class PEField:
             InputError: The scene has no depth at the nearest photograph.
         """
         conditions = [self.create_condition(r.nearest, r.target, r.context) for r in requests]
+        # The first seed for all targets, in batches; further seeds are needed by few of them.
         first: dict[int, Tensor] = {}
         for group in group_by_size(conditions, self.max_batch_size):
             images = self.generate_images([conditions[i] for i in group], self.seed)
             first.update(zip(group, images, strict=True))
 
         def answer(i: int) -> GeneratorOutput:
-            nearest, target = requests[i].nearest, requests[i].target
+            nearest = requests[i].nearest
+            target = requests[i].target
 
             def paint(seed: int) -> Float[Tensor, "h w 3"]:
-                image = (
-                    first[i]
-                    if seed == self.seed
-                    else self.generate_images([conditions[i]], seed)[0]
-                )
+                if seed == self.seed:
+                    image = first[i]
+                else:
+                    image = self.generate_images([conditions[i]], seed)[0]
                 back = resize_antialiased(image, (target.height, target.width)).clamp(0, 1)
                 return back.to(nearest.image.device)
 
+            # Photographs, warped to the target, judge the image and correct its colours.
             observed = warp_photographs(nearest, target, requests[i].context)
             correct = requests[i].context.correct_color
             return paint_consistently(paint, self.seed, observed, self.retries, correct)
@@ -106,6 +108,7 @@ class PEField:
         grids = self.model.compute_grid(source_size), self.model.compute_grid(size)
         source = self.depth or load_source_depth(context.source_depth, self.device)
         depth = source(nearest, find_render(nearest, context))
+        # Where the target sees what the photograph shows; the network draws it there.
         positions = compute_source_ids(depth, nearest.camera, target, *grids).cpu()
         return Condition(resize_antialiased(nearest.image, source_size), size, positions)
 
@@ -143,7 +146,7 @@ def preview(
 
 
 def group_by_size(conditions: Sequence[Condition], max_size: int) -> list[list[int]]:
-    """Group the indices of conditions of equal size into batches of at most `most`."""
+    """Group the indices of conditions of equal size into batches of at most `max_size`."""
     alike: dict[tuple[tuple[int, int], torch.Size], list[int]] = {}
     for i, one in enumerate(conditions):
         alike.setdefault((one.size, one.photograph.shape), []).append(i)

@@ -34,10 +34,8 @@ def compute_target_ids(
     """
     levels = []
     for factor in LEVELS:
-        rows, columns = (
-            compute_cell_centers(pixels, tokens, factor)
-            for pixels, tokens in zip(size, grid, strict=True)
-        )
+        rows = compute_cell_centers(size[0], grid[0], factor)
+        columns = compute_cell_centers(size[1], grid[1], factor)
         row, column = torch.meshgrid(rows, columns, indexing="ij")
         levels.append(pack_cells(torch.stack([torch.zeros_like(row), row, column], dim=-1), factor))
     return torch.cat(levels, dim=-1).to(dtype).float()
@@ -45,6 +43,7 @@ def compute_target_ids(
 
 def compute_cell_centers(pixels: int, tokens: int, factor: int) -> Float[Tensor, "cells"]:
     """Compute the centres of `factor` cells per token along a side, in tokens, from -0.5."""
+    # Interpolated from the pixel centres: the middle of a cell where cells divide the pixels.
     centres = torch.arange(pixels, dtype=torch.float32) + 0.5
     resized = torch.nn.functional.interpolate(
         centres[None, None, None], (1, tokens * factor), mode="bilinear", align_corners=False
@@ -66,14 +65,16 @@ def compute_source_ids(
     16 pixels. Both grids are height and width in tokens.
     """
     pixels, z = project_to_target(depth, source, target)
-    nearness = z - z.min()
-    spread = nearness.max()
+    # From 0 at the pixel that is nearest to the target camera to 1 at the farthest.
+    relative_depth = z - z.min()
+    spread = relative_depth.max()
     if spread <= 1e-6 * depth.abs().max():
-        nearness = torch.full_like(z, FLAT_DEPTH)
+        relative_depth = torch.full_like(z, FLAT_DEPTH)
     else:
-        nearness = nearness / spread
-    positions = torch.stack([nearness + 1, pixels[..., 1], pixels[..., 0]], dim=-1)
+        relative_depth = relative_depth / spread
+    positions = torch.stack([relative_depth + 1, pixels[..., 1], pixels[..., 0]], dim=-1)
 
+    # From pixels to tokens of the target; the first coordinate has no unit.
     in_tokens = positions.new_tensor(
         [1.0, target_grid[0] / target.height, target_grid[1] / target.width]
     )
@@ -92,16 +93,20 @@ def project_to_target(
 ) -> tuple[Float[Tensor, "h w 2"], Float[Tensor, "h w"]]:
     """Project the pixels of `source` to pixel indices (column, row) and z-depth in `target`."""
     target_from_source = target.viewmat.double() @ source.c2w.double()
-    K_source, K_target = source.K.double(), target.K.double()
+    K_source = source.K.double()
+    K_target = target.K.double()
     y, x = torch.meshgrid(
         torch.arange(depth.shape[0], dtype=torch.float64, device=depth.device),
         torch.arange(depth.shape[1], dtype=torch.float64, device=depth.device),
         indexing="ij",
     )
+    # Unproject in the axes of the source, and move into those of the target.
     index = torch.stack([x + 0.5, y + 0.5, torch.ones_like(x)], dim=-1)
     points = index @ torch.linalg.inv(K_source).T * depth.double()[..., None]
     moved = points @ target_from_source[:3, :3].T + target_from_source[:3, 3]
     z = moved[..., 2]
+    # The principal point is added after the division, which `in_front` keeps finite: a point
+    # behind the camera goes far outside, instead of to a place within the image.
     homogeneous = moved @ K_target.T
     in_front = z.clamp_min(MIN_RELATIVE_DEPTH * float(depth.median()))
     pixels = homogeneous[..., :2] - K_target[:2, 2] * z[..., None]
@@ -113,10 +118,14 @@ def pack_cells(
     cells: Float[Tensor, "rows columns 3"], factor: int
 ) -> Float[Tensor, "tokens numbers"]:
     """Join the positions of the `factor` x `factor` cells of each token, in quadtree order."""
-    rows, columns = cells.shape[0], cells.shape[1]
+    rows = cells.shape[0]
+    columns = cells.shape[1]
     gathered = cells
+    # Joining 2 × 2 neighbours again and again puts the cells of each quarter side by side.
     while factor > 1:
-        rows, columns, factor = rows // 2, columns // 2, factor // 2
+        rows = rows // 2
+        columns = columns // 2
+        factor = factor // 2
         gathered = (
             gathered.reshape(rows, 2, columns, 2, -1)
             .permute(0, 2, 1, 3, 4)

@@ -40,6 +40,7 @@ class Source:
     @property
     def is_pinned(self) -> bool:
         """True if the files cannot change: a local folder or a commit."""
+        # A branch may move; forty hex digits are a commit.
         revision = self.revision
         return revision is None or (
             len(revision) == 40 and set(revision) <= set("0123456789abcdef")
@@ -161,6 +162,8 @@ def silence_libraries(local: bool) -> Iterator[None]:
     from diffusers.utils import logging as diffusers_logging
     from transformers.utils import logging as transformers_logging
 
+    # The libraries print progress and warnings that mean nothing to a user. What was set is set
+    # back.
     logs = (diffusers_logging, transformers_logging)
     levels = [log.get_verbosity() for log in logs]
     bars = [log for log in logs if local and log.is_progress_bar_enabled()]

@@ -38,11 +38,14 @@ class PerHeadRotary(nn.Module):
     ) -> tuple[Float[Tensor, "b tokens 24 d"], Float[Tensor, "b tokens 24 d"]]:
         """Compute cosines and sines from the 63 `ids` of each token, image by image."""
         triples = ids.unflatten(-1, (-1, IDS // 3, 3)).transpose(0, 1).double()
+        # Of the channels of a head, a part turns with z, one with the row, one with the column.
         angles = torch.cat(
             [triples[..., axis, None] * self.frequencies(axis, ids) for axis in range(3)], dim=-1
         )
+        # Both channels of a pair turn by the same angle.
         angles = angles.repeat_interleave(2, dim=-1)
-        cosines, sines = angles.cos().float(), angles.sin().float()
+        cosines = angles.cos().float()
+        sines = angles.sin().float()
         heads = torch.tensor(POSITION_OF_HEAD, device=ids.device)
         return cosines[:, :, heads], sines[:, :, heads]
 
@@ -70,18 +73,19 @@ class PerHeadAttention:
         if encoder_hidden_states is not None:
             layers = (attn.add_q_proj, attn.add_k_proj, attn.add_v_proj)
             norms = (attn.norm_added_q, attn.norm_added_k)
-            text_states = project_qkv(encoder_hidden_states, layers, norms)
-            query, key, value = (
-                torch.cat([text, image], dim=1)
-                for text, image in zip(text_states, (query, key, value), strict=True)
-            )
+            text_query, text_key, text_value = project_qkv(encoder_hidden_states, layers, norms)
+            query = torch.cat([text_query, query], dim=1)
+            key = torch.cat([text_key, key], dim=1)
+            value = torch.cat([text_value, value], dim=1)
+
         if image_rotary_emb is not None:
-            query, key = (
-                rotate_channel_pairs(query, *image_rotary_emb),
-                rotate_channel_pairs(key, *image_rotary_emb),
-            )
-        query, key, value = (part.transpose(1, 2) for part in (query, key, value))
-        mixed = nn.functional.scaled_dot_product_attention(query, key, value, attention_mask)
+            query = rotate_channel_pairs(query, *image_rotary_emb)
+            key = rotate_channel_pairs(key, *image_rotary_emb)
+        # torch wants the heads before the tokens.
+        mixed = nn.functional.scaled_dot_product_attention(
+            query.transpose(1, 2), key.transpose(1, 2), value.transpose(1, 2), attention_mask
+        )
+
         joined = mixed.transpose(1, 2).flatten(2).to(query.dtype)
         if encoder_hidden_states is None:
             return joined
@@ -94,8 +98,12 @@ def project_qkv(
     tokens: Float[Tensor, "b n c"], layers: tuple[nn.Module, ...], norms: tuple[nn.Module, ...]
 ) -> tuple[Tensor, Tensor, Tensor]:
     """Compute query, key and value [b, n, heads, d]; query and key are normalised."""
-    query, key, value = (layer(tokens).unflatten(-1, (HEADS, -1)) for layer in layers)
-    return norms[0](query), norms[1](key), value
+    to_query, to_key, to_value = layers
+    query_norm, key_norm = norms
+    query = to_query(tokens).unflatten(-1, (HEADS, -1))
+    key = to_key(tokens).unflatten(-1, (HEADS, -1))
+    value = to_value(tokens).unflatten(-1, (HEADS, -1))
+    return query_norm(query), key_norm(key), value
 
 
 def rotate_channel_pairs(
@@ -105,6 +113,7 @@ def rotate_channel_pairs(
 ) -> Float[Tensor, "b n heads d"]:
     """Rotate each pair of channels, in float32."""
     real, imaginary = states.unflatten(-1, (-1, 2)).unbind(-1)
+    # Multiplication by i turns (real, imaginary) by a quarter; with cosines and sines by any angle.
     quarter_rotated = torch.stack([-imaginary, real], dim=-1).flatten(-2)
     return (states.float() * cosines + quarter_rotated.float() * sines).to(states.dtype)
 

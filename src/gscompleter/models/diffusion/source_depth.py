@@ -49,6 +49,7 @@ def compute_context_depth(photograph: View, render: Render) -> Float[Tensor, "h 
     """
     valid = find_valid_depth(render)
     depth = torch.where(valid, render.depth, torch.ones_like(render.depth)).detach().cpu()
+    # In the logarithm, so that what is continued stays positive, and relative to the median.
     middle = depth[valid.cpu()].median()
     log_depth = (depth / middle).log()[..., None]
     filled = continue_smoothly(log_depth, valid.cpu().float())[..., 0].exp() * middle
@@ -81,15 +82,16 @@ class MonocularDepth:
         inputs = self.processor(images=pixels, return_tensors="pt").to(self.device)
         with torch.inference_mode():
             answer = self.network(**inputs)
-        found = self.processor.post_process_depth_estimation(answer, target_sizes=[size])
-        guess = found[0]["predicted_depth"].float().clone().to(render.depth.device)
+        processed = self.processor.post_process_depth_estimation(answer, target_sizes=[size])
+        guess = processed[0]["predicted_depth"].float().clone().to(render.depth.device)
+
+        # Only some kinds of networks declare what they predict; the others always predict the same.
         declared = getattr(self.network.config, "depth_estimation_type", None)
-        metric = (
-            PREDICTS_DEPTH[self.network.config.model_type]
-            if declared is None
-            else declared == "metric"
-        )
-        return rescale_depth(guess, render) if metric else convert_disparity(guess, render)
+        if declared is None:
+            is_depth = PREDICTS_DEPTH[self.network.config.model_type]
+        else:
+            is_depth = declared == "metric"
+        return rescale_depth(guess, render) if is_depth else convert_disparity(guess, render)
 
 
 @dataclass(frozen=True)
@@ -100,9 +102,9 @@ class PredictedDepth:
 
     def __call__(self, photograph: View, render: Render) -> Float[Tensor, "h w"]:
         """Predict depth and fit it to the scene; raises the errors of `compute_context_depth`."""
-        found = self.predict(photograph)
-        farthest = found.depth.where(found.valid, 0.0).max()
-        return rescale_depth(found.depth.where(found.valid, farthest), render)
+        predicted = self.predict(photograph)
+        farthest = predicted.depth.where(predicted.valid, 0.0).max()
+        return rescale_depth(predicted.depth.where(predicted.valid, farthest), render)
 
 
 def rescale_depth(guess: Float[Tensor, "h w"], render: Render) -> Float[Tensor, "h w"]:
@@ -117,9 +119,13 @@ def convert_disparity(guess: Float[Tensor, "h w"], render: Render) -> Float[Tens
     valid = find_valid_depth(render)
     middle = render.depth[valid].median()
     inverse = middle / render.depth[valid]
-    spread, own_spread = compute_deviation(inverse), compute_deviation(guess[valid])
+    # Disparities have any unit. The robust fit expects values like its own, so that they first get
+    # the median and the deviation of the scene's.
+    spread = compute_deviation(inverse)
+    own_spread = compute_deviation(guess[valid])
     alike = (guess - guess[valid].median()) * (spread / own_spread.clamp_min(1e-12)) + 1.0
     gain, offset = fit_robust_affine(alike[valid][:, None], inverse[:, None])
+    # Disparity near 0 is far away: at most ten times as far as the scene reaches.
     least = middle / (10 * render.depth[valid].max())
     return middle / (gain * alike + offset).clamp_min(float(least))
 

@@ -76,6 +76,7 @@ def wrap_network(
     if isinstance(network, NestedDepthAnything):
         return AnyViewGaussians(network, inference)
     if isinstance(network, DepthAnything):
+        # Depth with a head for Gaussians makes these; without one, `FromDepth` does.
         if network.gs_head is not None:
             return AnyViewGaussians(network, inference)
         return FromDepth(model=AnyViewDepth(network, inference))
@@ -87,7 +88,9 @@ def create_network(published: PublishedWeights) -> Network:
     if published.name in depth_anything.VARIANTS:
         return create_depth_anything(depth_anything.VARIANTS[published.name])
     if published.model == "DepthSplat":
-        return DepthSplat(VARIANTS[get_variant_name(published)])
+        # Published names omit a size of 256x256.
+        key = published.name.removeprefix("depthsplat-")
+        return DepthSplat(VARIANTS[key if key in VARIANTS else f"{key}-256x256"])
     return MVSplat() if published.model == "MVSplat" else VolSplat()
 
 
@@ -102,14 +105,9 @@ def create_depth_anything(
     return DepthAnything(config)
 
 
-def get_variant_name(published: PublishedWeights) -> str:
-    """Return the key of `VARIANTS`; published names omit a size of 256x256."""
-    key = published.name.removeprefix("depthsplat-")
-    return key if key in VARIANTS else f"{key}-256x256"
-
-
 def collect_all_shapes() -> dict[str, dict[str, tuple[int, ...]]]:
     """Collect the tensor shapes of every supported network by the name of its weights."""
+    # Without memory or random numbers: only the shapes are wanted.
     with torch.device("meta"):
         return {
             name: get_shapes(create_network(published).state_dict())

@@ -34,11 +34,14 @@ def compute_cost_volume(
     given per view or per pixel, and processed `depth_chunk` at a time to bound the memory.
     """
     n, _, h, w = features.shape
+    # Each view in the axes of its sources, and all at the resolution of the feature maps.
     K = cameras.scale_intrinsics(h, w).flatten(0, 1)
     transforms = cameras.compute_sources_from_views(sources).flatten(0, 1)
     depths = (1 / inverse_depths).expand(n, -1, h, w)
+    # From indices within a scene to indices in the list of all n views.
     first = torch.arange(len(sources), device=sources.device)[:, None, None] * sources.shape[1]
     numbers = (first + sources).flatten(0, 1).tolist()
+
     volumes = []
     for view in range(n):
         chunks = []
@@ -47,6 +50,8 @@ def compute_cost_volume(
                 correlate_features(features[view], features[source], K[view], transform, chunk)
                 for source, transform in zip(numbers[view], transforms[view], strict=True)
             ]
+            # Matches of several sources are averaged, so that any number of them gives the same
+            # scale.
             chunks.append(torch.stack(matches).mean(0))
         volumes.append(torch.cat(chunks))
     return torch.stack(volumes)
@@ -64,9 +69,9 @@ def correlate_features(
     sampled = F.grid_sample(
         source[None], grid.flatten(0, 1)[None], mode="bilinear", align_corners=True
     )
-    return (reference[:, None] * sampled[0].unflatten(1, depths.shape[:2])).sum(0) / (
-        len(reference) ** 0.5
-    )
+    candidates = sampled[0].unflatten(1, depths.shape[:2])
+    # A scalar product over the channels, scaled as in attention.
+    return (reference[:, None] * candidates).sum(0) / (len(reference) ** 0.5)
 
 
 def compute_sampling_grid(
@@ -80,9 +85,11 @@ def compute_sampling_grid(
     """
     _, h, w = depths.shape
     with disable_autocast(K):
-        x, y = torch.arange(w, device=K.device), torch.arange(h, device=K.device)
+        x = torch.arange(w, device=K.device)
+        y = torch.arange(h, device=K.device)
         columns, rows = torch.meshgrid(x, y, indexing="xy")
         pixels = torch.stack([columns, rows, torch.ones_like(rows)]).flatten(1).to(K)
+        # Rays of unit z in the axes of the source; a depth then takes them to points.
         rays = source_from_reference[:3, :3] @ torch.linalg.inv(K) @ pixels
         shift = source_from_reference[:3, 3, None, None]
         points = rays[:, None] * depths.flatten(1) + shift

@@ -140,8 +140,10 @@ class DepthPredictor(nn.Module):
 
     def add_scale(self, scale: int) -> None:
         """Add the layers from the cost volume of `scale` (0 is coarsest) to probabilities."""
-        width, candidates = 128 // 2**scale, self.config.num_candidates // 4**scale
-        image_channels, vit_channels = CHANNELS[f"cnn{2 - scale}"], self.vit.channels // 2**scale
+        width = 128 // 2**scale
+        candidates = self.config.num_candidates // 4**scale
+        image_channels = CHANNELS[f"cnn{2 - scale}"]
+        vit_channels = self.vit.channels // 2**scale
         channels = candidates + image_channels + width + vit_channels
         unet = UNet(width, levels=3 + scale, attention_level=2 + scale, pre_norm=True)
         self.regressor.append(create_refiner(channels, width, unet))
@@ -151,12 +153,13 @@ class DepthPredictor(nn.Module):
     def forward(self, images: Float[Tensor, "b v 3 h w"], cameras: Cameras) -> DepthPrediction:
         """Predict depth for at least two images in [0, 1], with sides divisible by `patch`."""
         b, v = images.shape[:2]
-        few = v <= MAX_SOURCES + 1
-        sources = (
-            list_other_views(b, v, images.device)
-            if few
-            else find_nearest_views(cameras, MAX_SOURCES)
-        )
+        if v <= MAX_SOURCES + 1:
+            sources = list_other_views(b, v, images.device)
+        else:
+            sources = find_nearest_views(cameras, MAX_SOURCES)
+
+        # Three kinds of features per scale: of the encoder, after attention to the sources, and of
+        # the vision transformer, which sees one view alone.
         flat = normalize_images(images.flatten(0, 1))
         encoded = self.backbone(flat)
         matching = self.mv_pyramid(self.transformer(encoded[-1], sources))
@@ -164,6 +167,8 @@ class DepthPredictor(nn.Module):
         deepest = resize_bilinear(vit_maps[-1], encoded[-1].shape[2:])
         contexts = list(zip(encoded[::-1], matching, self.mono_pyramid(deepest), strict=False))
 
+        # Candidates over the whole range, evenly in inverse depth; the finer scale searches around
+        # what the coarser one found.
         low, high = cameras.compute_inverse_range()
         candidates = space_evenly(low, high, self.config.num_candidates)
         disparity, probability = self.match_sources(0, contexts[0], cameras, sources, candidates)
@@ -175,6 +180,7 @@ class DepthPredictor(nn.Module):
                 scale, contexts[scale], cameras, sources, candidates
             )
 
+        # Up to full resolution, with a correction that the heads learn.
         maps = {f"cnn{i}": x for i, x in enumerate(encoded)}
         maps |= {f"matching{i}": x for i, x in enumerate(matching)}
         residual = self.upsampler(vit_maps, {**maps, "disparity": disparity})
@@ -208,6 +214,7 @@ class DepthPredictor(nn.Module):
         refined = self.regressor[scale](joined, sources.shape[1])
         logits = self.depth_head[scale](refined + self.regressor_residual[scale](joined))
         probability = logits.softmax(1)
+        # The expectation over the candidates is finer than their spacing.
         return (probability * candidates).sum(1, keepdim=True), probability
 
 

@@ -38,6 +38,8 @@ class Attention(nn.Module):
 
     def forward(self, x: Float[Tensor, "n t c"]) -> Float[Tensor, "n t c"]:
         """Apply self-attention."""
+        # One matrix for queries, keys and values: [n, t, 3 c] to three times [n, heads, t, c /
+        # heads].
         q, k, v = self.qkv(x).unflatten(2, (3, self.heads, -1)).permute(2, 0, 3, 1, 4)
         return self.proj(F.scaled_dot_product_attention(q, k, v).transpose(1, 2).flatten(2))
 
@@ -102,13 +104,13 @@ class DinoV2(nn.Module):
         """Compute feature maps after `blocks`, for normalised images with sides divisible by 14."""
         size = (images.shape[2] // PATCH, images.shape[3] // PATCH)
         class_token = self.cls_token.expand(len(images), -1, -1)
-        tokens = torch.cat(
-            [class_token, self.patch_embed(images)], 1
-        ) + self.get_position_embeddings(*size)
+        tokens = torch.cat([class_token, self.patch_embed(images)], 1)
+        tokens = tokens + self.get_position_embeddings(*size)
         maps = []
         for i, block in enumerate(self.blocks):
             tokens = block(tokens)
             if i in blocks:
+                # Without the class token, which stands for the whole image.
                 maps.append(self.norm(tokens)[:, 1:].transpose(1, 2).unflatten(2, size))
         return maps
 
@@ -123,6 +125,7 @@ def resize_position_embeddings(
     """Resize position embeddings to `rows` x `columns`, with the original's 0.1 size offset."""
     if rows == columns == GRID:
         return stored
+    # From tokens to a map, as it is resized like an image; the class token keeps its embedding.
     grid = stored[:, 1:].transpose(1, 2).unflatten(2, (GRID, GRID))
     factors = ((rows + 0.1) / GRID, (columns + 0.1) / GRID)
     resized = F.interpolate(grid, scale_factor=factors, mode="bicubic")

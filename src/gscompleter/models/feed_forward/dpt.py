@@ -81,6 +81,7 @@ class Scratch(nn.Module):
 
     def __init__(self, widths: Sequence[int], features: int, out: nn.Module | None) -> None:
         super().__init__()
+        # The names of the layers are those of the authors' files, here and below.
         self.layer1_rn = nn.Conv2d(widths[0], features, 3, 1, 1, bias=False)
         self.layer2_rn = nn.Conv2d(widths[1], features, 3, 1, 1, bias=False)
         self.layer3_rn = nn.Conv2d(widths[2], features, 3, 1, 1, bias=False)
@@ -112,6 +113,7 @@ def fuse_levels(
     coarsest: Coarsest,
 ) -> Float[Tensor, "n c h w"]:
     """Fuse four levels, finest first, to twice the size of the finest."""
+    # From the coarsest map up: each step refines what it has and resizes it to the next finer map.
     a, b, c, d = levels
     x = coarsest(d, get_map_size(c))
     x = coarser.fuse(x, c, get_map_size(b))
@@ -172,6 +174,7 @@ class DptHead(nn.Module):
             resize(project(x))
             for resize, project, x in zip(self.resize_layers, self.projects, vit_maps, strict=True)
         ]
+        # Levels 1 to 3 are joined with other features; the coarsest one is the transformer's alone.
         for level, (names, join) in enumerate(zip(self.layout, self.concat_projects, strict=True)):
             joined = [pyramid[level] if name == VIT else maps[name] for name in names]
             pyramid[level] = join(torch.cat(joined, 1))

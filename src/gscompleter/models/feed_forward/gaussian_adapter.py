@@ -53,6 +53,7 @@ def create_mvsplat_gaussians(
     )
     depth = move_channels_last(distance, cameras)[..., 0]
     h, w = depth.shape[2:]
+    # A fifth of a pixel at a distance of 1: of the mean of its width and its height.
     with disable_autocast(raw):
         focal_inverse = torch.linalg.inv(cameras.K[..., :2, :2])
         pixel = 0.1 * (focal_inverse @ raw.new_tensor([1 / w, 1 / h]).float()).sum(-1)
@@ -81,6 +82,7 @@ def create_depthsplat_gaussians(
         [1, 2, 3, 4, 3 * DEPTHSPLAT_SH], -1
     )
     coefficients = damp_sh(sh)
+    # The constant coefficient begins at the colour of the pixel, and the network corrects it.
     colour = (move_channels_last(images, cameras) - 0.5) / SH_C0
     constant = coefficients[..., :1, :] + colour[..., None, :]
     return place_in_world(
@@ -109,6 +111,7 @@ def compute_z_rays(
     x = torch.arange(w, device=offsets.device) + 0.5
     y = torch.arange(h, device=offsets.device) + 0.5
     centers = torch.stack(torch.meshgrid(x, y, indexing="xy"), dim=-1)
+    # Within the pixel: the sigmoid lies between 0 and 1.
     points = (centers + offsets.sigmoid() - 0.5) / offsets.new_tensor([w, h])
     with disable_autocast(offsets):
         inverse = torch.linalg.inv(cameras.K)
@@ -119,6 +122,7 @@ def damp_sh(sh: Float[Tensor, "*batch c"]) -> Float[Tensor, "*batch k 3"]:
     """Convert raw channels to SH coefficients, with small factors for higher degrees."""
     coefficients = sh.unflatten(-1, (3, -1)).transpose(-1, -2)
     degrees = range(1, round(coefficients.shape[-2] ** 0.5))
+    # Factors of MVSplat and of pixelSplat before it: 0.1 · 4^-degree.
     factors = [1.0] + [0.1 * 0.25**degree for degree in degrees for _ in range(2 * degree + 1)]
     return coefficients * sh.new_tensor(factors)[:, None]
 
@@ -137,6 +141,7 @@ def place_in_world(
     centers = cameras.c2w[:, :, None, None, :3, 3]
     with disable_autocast(rays):
         means = centers + torch.einsum("bvij,bvhwj->bvhwi", c2w, rays * depth[..., None])
+        # xyzw to wxyz.
         own = F.normalize(rotations.roll(1, -1), dim=-1)
         quats = multiply_quats(rotations_to_quats(c2w)[:, :, None, None], own)
     return PixelGaussians(depth, means, quats, scales, opacities, rotate_sh(sh, c2w))

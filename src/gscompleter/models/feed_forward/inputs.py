@@ -62,7 +62,8 @@ def compute_central_crops(cameras: Sequence[Camera], patch: int) -> list[Crop]:
             f"All images have {height} x {width} pixels in common, and this model needs at "
             f"least {patch} x {patch}; use larger ones."
         )
-    height, width = height // patch * patch, width // patch * patch
+    height = height // patch * patch
+    width = width // patch * patch
     return [
         Crop((camera.height - height) // 2, (camera.width - width) // 2, height, width)
         for camera in cameras

@@ -95,6 +95,8 @@ class DepthPredictor(nn.Module):
     ) -> tuple[Float[Tensor, "n 1 h w"], Float[Tensor, "n 1 h w"], Float[Tensor, "n channels h w"]]:
         """Predict depth in scene units, opacity, and the raw channels of the Gaussians."""
         views = sources.shape[1]
+        # Coarse depth at a quarter of the resolution, enlarged; then a U-Net at full resolution
+        # corrects it, in inverse depth.
         coarse, certainty = self.estimate_coarse_disparity(cross_view, cameras, sources)
         features = self.upsampler(torch.cat([cross_view, single_view], 1))
         joined = torch.cat([images, self.proj_feature(features), coarse, certainty], 1)
@@ -113,6 +115,7 @@ class DepthPredictor(nn.Module):
         joined = torch.cat([costs, features], 1)
         refined = self.corr_refine_net(joined, sources.shape[1]) + self.regressor_residual(joined)
         probability = self.depth_head_lowres(refined).softmax(1)
+        # The expectation over the candidates is finer than their spacing.
         expected = (probability * candidates).sum(1, keepdim=True)
         certainty = probability.amax(1, keepdim=True)
         return enlarge(expected, DOWNSCALE), F.interpolate(certainty, scale_factor=DOWNSCALE)

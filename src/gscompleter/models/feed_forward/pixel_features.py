@@ -41,5 +41,6 @@ class PixelFeatures(nn.Module):
         features = self.feature_upsampler(known.vit_maps, known.maps)
         certainty = F.interpolate(known.certainty, size=images.shape[-2:])
         flat = images.flatten(0, 1)
+        # The head gets what depth was found and how certainly, beside colours and fused features.
         regressed = self.gaussian_regressor(torch.cat([flat, known.depth, certainty, features], 1))
         return known.depth, torch.cat([regressed, flat, features, certainty], 1)

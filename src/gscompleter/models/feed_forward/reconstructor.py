@@ -6,8 +6,6 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import torch
-from jaxtyping import Float
-from torch import Tensor
 
 from gscompleter.models.feed_forward.depthsplat import DepthSplat
 from gscompleter.models.feed_forward.gaussian_adapter import PixelGaussians
@@ -16,7 +14,7 @@ from gscompleter.models.feed_forward.mvsplat import MVSplat
 from gscompleter.models.feed_forward.precision import check_precision, lower_precision
 from gscompleter.models.feed_forward.volsplat import VolSplat, VoxelGaussians
 from gscompleter.numerics.geometry import compute_z_depths
-from gscompleter.types import DepthMap, Gaussians, Reconstruction, View, make_observed
+from gscompleter.types import Gaussians, Reconstruction, View, make_observed
 
 MAX_COEFFICIENTS = 16
 """SH coefficients up to degree 3, the most that renderers of 3DGS use."""
@@ -70,9 +68,14 @@ def create_pixel_reconstruction(
     device = views[0].image.device
     gaussians = flatten_gaussians(predicted).to(device)
     per_view = crops[0].height * crops[0].width
-    depths = map(compute_depth_map, gaussians.means.split(per_view), views, crops)
+    depths = []
+    for means, view, crop in zip(gaussians.means.split(per_view), views, crops, strict=True):
+        z = compute_z_depths(means, view.camera)
+        depths.append(crop.pad_depth(z.view(crop.height, crop.width), view.camera))
+    # The photograph and the pixel that each Gaussian comes from.
     pixels = [
-        crop.compute_pixel_indices(v.camera.width) for v, crop in zip(views, crops, strict=True)
+        crop.compute_pixel_indices(view.camera.width)
+        for view, crop in zip(views, crops, strict=True)
     ]
     numbers = torch.arange(len(views), device=device).repeat_interleave(per_view)
     return Reconstruction(gaussians, tuple(depths), numbers, torch.cat(pixels).to(device))
@@ -99,9 +102,3 @@ def flatten_gaussians(predicted: PixelGaussians | VoxelGaussians) -> Gaussians:
         predicted.opacities.flatten(),
         predicted.sh[..., :MAX_COEFFICIENTS, :].flatten(0, -3),
     )
-
-
-def compute_depth_map(means: Float[Tensor, "n 3"], view: View, crop: Crop) -> DepthMap:
-    """Compute the z-depth of the Gaussians of the crop, in the whole image."""
-    z = compute_z_depths(means, view.camera)
-    return crop.pad_depth(z.view(crop.height, crop.width), view.camera)

@@ -31,10 +31,12 @@ class Packing:
         """Enclose `cells` in a box with a border of one cell for their neighbours."""
         if len(cells) == 0:
             raise InputError("A sparse grid has no cells; it needs at least one.")
-        low, high = cells.amin(0).tolist(), cells.amax(0).tolist()
+        low = cells.amin(0).tolist()
+        high = cells.amax(0).tolist()
         if low[0] < 0:
             raise InputError(f"Batch numbers of a sparse grid start at 0; one is {low[0]}.")
-        x, y, z = (b - a + 3 for a, b in zip(low[1:], high[1:], strict=True))
+        # One cell for the difference, and the border of one on both sides.
+        x, y, z = (last - first + 3 for first, last in zip(low[1:], high[1:], strict=True))
         if (high[0] + 1) * x * y * z >= 2**63:
             raise InputError(
                 f"The voxels span {x:,} x {y:,} x {z:,} cells, which 64-bit numbers cannot count; "
@@ -44,6 +46,7 @@ class Packing:
 
     def number_cells(self, cells: Int64[Tensor, "n 4"]) -> Int64[Tensor, "n"]:
         """Compute the number of each cell (batch, x, y, z)."""
+        # As digits of a number with the spans as bases: sorted numbers are sorted rows.
         batch, x, y, z = cells.unbind(1)
         key = batch * self.spans[0] + (x - self.low[0])
         key = key * self.spans[1] + (y - self.low[1])
@@ -88,19 +91,22 @@ class Grid:
         self, keys: Int64[Tensor, "m"]
     ) -> tuple[Int64[Tensor, "found"], Int64[Tensor, "found"]]:
         """Return the indices of `keys` that are cells of this grid, and the rows of those cells."""
+        # Keys are sorted: a binary search finds the only row that a key can be in.
         rows = torch.searchsorted(self.keys, keys).clamp_max(len(self) - 1)
-        found = (self.keys[rows] == keys).nonzero()[:, 0]
-        return found, rows[found]
+        hits = (self.keys[rows] == keys).nonzero()[:, 0]
+        return hits, rows[hits]
 
     def coarsen(self) -> Grid:
         """Merge the cells into cells of twice the side length."""
         stride = 2 * self.stride
         parents = self.coordinates.clone()
+        # Negative cells round down too, so that all cells have the same size.
         parents[:, 1:] = parents[:, 1:].div(stride, rounding_mode="floor") * stride
         return Grid(unique_rows(parents)[0], stride)
 
     def _to_cells(self, coordinates: Int64[Tensor, "m 4"]) -> Int64[Tensor, "m 4"]:
-        batch, position = coordinates[:, :1], coordinates[:, 1:]
+        batch = coordinates[:, :1]
+        position = coordinates[:, 1:]
         return torch.cat([batch, position.div(self.stride, rounding_mode="floor")], dim=1)
 
 
@@ -111,6 +117,7 @@ def unique_rows(
     keys = Packing.enclose(coordinates).number_cells(coordinates)
     unique, inverse = torch.unique(keys, return_inverse=True)
     rows = coordinates.new_empty((len(unique), 4))
+    # Any of the equal rows may be written last.
     rows[inverse] = coordinates
     return rows, inverse
 
@@ -153,6 +160,8 @@ def _find_rows_at(
     offset: Offset, odd: Bool[Tensor, "n 3"], fine: Grid, coarse: Grid
 ) -> tuple[Int64[Tensor, "m"], Int64[Tensor, "m"]]:
     """Find the pairs of fine and coarse rows at `offset` from the corner of the coarse cell."""
+    # A coarse corner is even along all axes. At an offset from it lie the fine cells that are odd
+    # along just those axes where the offset is not 0: only these are looked up.
     away = torch.tensor(offset, device=odd.device)
     rows = (odd == (away != 0)).all(dim=1).nonzero()[:, 0]
     corners = fine.coordinates[rows]
@@ -170,6 +179,7 @@ def convolve(
     if len(features) != neighbours.num_sources:
         raise ValueError(f"the grid has {neighbours.num_sources} cells, not {len(features)}")
     output = features.new_zeros((neighbours.num_targets, kernel.shape[2]))
+    # One offset after the other, and rows in their order: sums of floats depend on it.
     for sources, targets, matrix in zip(
         neighbours.sources, neighbours.targets, kernel, strict=True
     ):

@@ -58,6 +58,7 @@ class UpBlock(nn.Module):
         self, features: Float[Tensor, "m channels_in"], downward: Neighbours
     ) -> Float[Tensor, "n channels_out"]:
         """Apply the block along the transpose of `downward`."""
+        # The same pairs of cells as on the way down, with source and target swapped.
         return F.relu(self.norm(self.upconv(features, downward.transpose_pairs())))
 
 
@@ -91,13 +92,16 @@ class SparseUNet(nn.Module):
 
     def forward(self, features: Float[Tensor, "n c"], grid: Grid) -> Float[Tensor, "n c"]:
         """Refine the features of the cells of `grid`."""
+        # Pairs of cells between neighbouring levels, finest first, and within the coarsest one.
         tables, coarsest = build_hierarchy(grid, len(CHANNELS))
-        x, encoded = features, []
+        x = features
+        encoded = []
         for encoder, downward in zip(self.encoders, tables[:-1], strict=True):
             x = encoder(x, downward)
             encoded.append(x)
         x = self.bottleneck[0](x, tables[-1])
         x = self.bottleneck[1](x, coarsest)
+        # Back up through the same levels; the finest one has no skip connection.
         for decoder, downward in zip(self.decoder_blocks, tables[:0:-1], strict=True):
             x = decoder(x, downward, encoded.pop())
         return self.final_upsample(x, tables[0])

@@ -37,6 +37,7 @@ def compute_wigner_matrices(
     degree: int, rotations: Float[Tensor, "*n 3 3"]
 ) -> Float[Tensor, "*n m m"]:
     """Compute Wigner matrices D with `Y(R d) = D Y(d)` for all directions d, by least squares."""
+    # Y(R d) as a combination of Y(d), fitted at the sample directions.
     directions, inverse = sample_harmonics(degree)
     rotated = directions.to(rotations.device) @ rotations.double().transpose(-1, -2)
     matrices = inverse.to(rotations.device) @ evaluate_harmonics(degree, rotated)
@@ -46,6 +47,7 @@ def compute_wigner_matrices(
 @cache
 def sample_harmonics(degree: int) -> tuple[Float64[Tensor, "d 3"], Float64[Tensor, "m d"]]:
     """Sample directions on the sphere, with the pseudo-inverse of the SH at them."""
+    # A golden spiral: evenly spread, so that the fit is well conditioned.
     number = torch.arange(NUM_DIRECTIONS, dtype=torch.float64)
     y = 1 - (2 * number + 1) / NUM_DIRECTIONS
     azimuth = number * pi * (3 - sqrt(5))
@@ -58,20 +60,27 @@ def evaluate_harmonics(degree: int, directions: Float[Tensor, "*n 3"]) -> Float[
     """Evaluate real SH of orders -degree to degree at unit directions, with polar axis y."""
     x, y, z = directions.unbind(-1)
     values = {}
-    cosine, sine = torch.ones_like(x), torch.zeros_like(x)  # of order * azimuth, from z to x
+    # cos and sin of order * azimuth, counted from z to x, times (1 - y²)^(order / 2).
+    cosine = torch.ones_like(x)
+    sine = torch.zeros_like(x)
     for order in range(degree + 1):
         ratio = factorial(degree - order) / factorial(degree + order)
         norm = sqrt((2 * degree + 1) / (4 * pi) * ratio * (2 if order else 1))
         polar = norm * evaluate_legendre(degree, order, y)
-        values[-order], values[order] = polar * sine, polar * cosine
+        values[-order] = polar * sine
+        values[order] = polar * cosine
+        # Angle addition: from one order to the next.
         cosine, sine = z * cosine - x * sine, z * sine + x * cosine
     return torch.stack([values[order] for order in range(-degree, degree + 1)], dim=-1)
 
 
 def evaluate_legendre(degree: int, order: int, t: Float[Tensor, "*n"]) -> Float[Tensor, "*n"]:
     """Evaluate `P(t) / (1 - t²)^(order / 2)` without the Condon-Shortley sign."""
-    before, value = torch.zeros_like(t), torch.full_like(t, prod(range(1, 2 * order, 2)))
+    # From degree = order upwards, by the recurrence of three terms.
+    before = torch.zeros_like(t)
+    value = torch.full_like(t, prod(range(1, 2 * order, 2)))
     for n in range(order + 1, degree + 1):
         following = ((2 * n - 1) * t * value - (n + order - 1) * before) / (n - order)
-        before, value = value, following
+        before = value
+        value = following
     return value

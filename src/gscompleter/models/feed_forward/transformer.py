@@ -33,12 +33,14 @@ class WindowAttention(nn.Module):
         mask: Float[Tensor, "windows p p"] | None,
     ) -> Float[Tensor, "n h w c"]:
         """Attend from `x` to `sources`; with a `mask`, windows are shifted."""
+        # Shifted windows (Swin): the image is rolled by half a window, split, and rolled back.
         _, h, w, _ = x.shape
         shift = (0, 0) if mask is None else (h // SPLITS // 2, w // SPLITS // 2)
         back = (-shift[0], -shift[1])
         query = split_windows(self.q_proj(x[:, None].roll(back, (2, 3))))
         sources = sources.roll(back, (2, 3))
-        key, value = split_windows(self.k_proj(sources)), split_windows(self.v_proj(sources))
+        key = split_windows(self.k_proj(sources))
+        value = split_windows(self.v_proj(sources))
         if mask is not None:
             # The keys are ordered pixel by pixel, but the mask is repeated view by view, as in
             # the training of the published models. It matters with two or more source views.
@@ -130,6 +132,7 @@ def create_shifted_window_mask(
 ) -> Float[Tensor, "windows p p"]:
     """Create the attention bias of shifted windows: -100 between opposite image borders."""
 
+    # Rolling brings opposite borders into one window: three bands a side tell them apart.
     def bands(size: int) -> Tensor:
         window = size // SPLITS
         band = torch.zeros(size, device=device)
@@ -151,9 +154,12 @@ def encode_window_positions(features: Float[Tensor, "n c h w"]) -> Float[Tensor,
     def along(size: int) -> Float[Tensor, "size c"]:
         number = torch.arange(1, size + 1, device=features.device, dtype=torch.float32)
         angle = (number / (size + 1e-6) * 2 * pi)[:, None] / period
+        # Sines and cosines alternate; two channels share a period.
         return torch.stack([angle[:, 0::2].sin(), angle[:, 1::2].cos()], -1).flatten(1)
 
-    rows, columns = along(height // SPLITS).T, along(width // SPLITS).T
+    rows = along(height // SPLITS).T
+    columns = along(width // SPLITS).T
     shape = (-1, rows.shape[1], columns.shape[1])
     window = torch.cat([rows[:, :, None].expand(shape), columns[:, None].expand(shape)])
+    # All windows have the same encoding.
     return window.repeat(1, SPLITS, SPLITS)

@@ -64,6 +64,7 @@ class ViewAttention(nn.Module):
     def forward(self, x: Float[Tensor, "n c h w"], views: int) -> Float[Tensor, "n c h w"]:
         """Apply attention across the views of a scene; the norm treats each view separately."""
         y = self.norm(x) if self.pre_norm else x
+        # The tokens of all views of a scene, one view after the other.
         y = y.flatten(2).unflatten(0, (-1, views)).transpose(1, 2).flatten(2)
         y = self.proj_out(self.attend(self.qkv(y)))
         y = y.unflatten(2, (views, -1)).transpose(1, 2).reshape(x.shape)
@@ -147,12 +148,14 @@ class UNet(nn.Module):
             self.output_blocks.append(Steps(block(2 * channels, level)))
             upsample = [Upsample(channels)] if level > 0 else []
             self.output_blocks.append(Steps([*block(2 * channels, level), *upsample]))
-        norm, conv = create_group_norm(channels), create_conv3x3(channels, channels)
+        norm = create_group_norm(channels)
+        conv = create_conv3x3(channels, channels)
         out = [norm, nn.SiLU(), conv] if pre_norm else [conv, norm, nn.SiLU()]
         self.out = nn.Sequential(*out)
 
     def forward(self, x: Float[Tensor, "n c h w"], views: int) -> Float[Tensor, "n c h w"]:
         """Refine the maps of n = b v images, with `views` consecutive images per scene."""
+        # The maps of the way down, deepest last, are joined on the way up.
         skipped = []
         for block in self.input_blocks:
             x = block(x, views)

@@ -84,6 +84,8 @@ class VolSplat(PixelFeatures):
         if len(images) != 1:
             raise ValueError(f"VolSplat takes one scene at a time, got {len(images)}")
         depth, features = self.compute_pixel_features(images, cameras)
+        # Pixels of all views that fall into one voxel are averaged, so that the number of Gaussians
+        # follows the scene and not the photographs.
         with disable_autocast(images):
             points = unproject_pixels(depth, cameras)
             rows = move_channels_last(features, cameras).flatten(0, 3)
@@ -96,9 +98,11 @@ class VolSplat(PixelFeatures):
 def unproject_pixels(depth: Float[Tensor, "n 1 h w"], cameras: Cameras) -> Float[Tensor, "p 3"]:
     """Unproject all pixel centres to world space, view by view and row by row."""
     along = move_channels_last(depth, cameras)
+    # Offsets of 0: the middle of each pixel (`compute_z_rays` takes them through a sigmoid).
     centered = along.new_zeros((*along.shape[:4], 2))
     in_camera = compute_z_rays(centered, cameras) * along
-    rotations, centers = cameras.c2w[..., :3, :3], cameras.c2w[:, :, None, None, :3, 3]
+    rotations = cameras.c2w[..., :3, :3]
+    centers = cameras.c2w[:, :, None, None, :3, 3]
     points = centers + torch.einsum("bvij,bvhwj->bvhwi", rotations, in_camera)
     return points.flatten(0, 3)
 

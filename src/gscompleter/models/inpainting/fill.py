@@ -35,6 +35,7 @@ class InpaintingGenerator:
     ) -> Float[Tensor, "h w 3"]:
         """Synthesize the image at `target`; pixels outside the hole are warped photographs."""
         warped = complete_warp(nearest, target, context).to("cpu")
+        # The rim of the hole is filled too: there, both colours are known and are compared.
         hole = dilate(~warped.known, BORDER_WIDTH)
         filled = fill_windows(warped.image, hole, self.fill)
         if not filled.isfinite().all():
@@ -42,6 +43,7 @@ class InpaintingGenerator:
                 "The generator painted no finite image; check that its weights are correct, or "
                 "choose another generator."
             )
+        # Outside the hole the photographs stay; on its rim the filling is fitted to them.
         toned = match_tone(filled, warped.image, warped.known & hole)
         image = torch.where(warped.known[..., None], warped.image, toned)
         return image.clamp(0, 1).to(nearest.image.device)
@@ -54,13 +56,15 @@ def fill_windows(
 
     What a window filled is known to the next, so that large images are not reduced.
     """
-    image, left = image.clone(), hole.clone()
+    image = image.clone()
+    unfilled = hole.clone()
+    # Windows that know most of their surroundings first: they continue it inwards.
     windows = sorted(place_windows(*hole.shape), key=lambda at: hole[at].float().mean().item())
     for at in windows:
-        if left[at].any():
-            filled = fill(image[at], left[at])
-            image[at] = torch.where(left[at][..., None], filled, image[at])
-            left[at] = False
+        if unfilled[at].any():
+            filled = fill(image[at], unfilled[at])
+            image[at] = torch.where(unfilled[at][..., None], filled, image[at])
+            unfilled[at] = False
     return image
 
 
@@ -78,8 +82,11 @@ def place_windows(height: int, width: int) -> Iterator[tuple[slice, slice]]:
     """Cover an image by windows that overlap by at least half, in equal distances."""
 
     def place(length: int) -> list[slice]:
+        # Steps of half a window at most; rounded up, as -(-a // b) does.
         steps = -(-2 * max(length - WINDOW, 0) // WINDOW)
-        starts = [round(i * (length - WINDOW) / steps) for i in range(steps + 1)] if steps else [0]
+        starts = [0]
+        if steps:
+            starts = [round(i * (length - WINDOW) / steps) for i in range(steps + 1)]
         return [slice(start, start + WINDOW) for start in starts]
 
     return ((rows, columns) for rows in place(height) for columns in place(width))

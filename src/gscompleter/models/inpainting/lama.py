@@ -27,6 +27,7 @@ class LaMa:
     ) -> Float[Tensor, "h w 3"]:
         """Fill the hole of an image in [0, 1], reflected beyond its border to a valid size."""
         height, width = hole.shape
+        # To the size that the file fixes, or up to the next multiple.
         rows, columns = self.network.fixed_size or (
             -(-height // MULTIPLE) * MULTIPLE,
             -(-width // MULTIPLE) * MULTIPLE,

@@ -36,10 +36,16 @@ def fetch(weights: PublishedWeights, local: Path | None = None, offline: bool = 
         WeightsNotAvailable: The file is not local and cannot be downloaded.
     """
     if local is not None:
-        return _check_local_file(weights, local)
-    found = find_cached(weights)
-    if found is not None:
-        return found
+        path = local / weights.file if os.path.isdir(local) else local
+        if not os.path.isfile(path):
+            raise InputError(
+                f"There are no weights at {path}; name the file {weights.file} or its folder, from "
+                f"{weights.source}."
+            )
+        return path
+    cached = find_cached(weights)
+    if cached is not None:
+        return cached
     if weights.repository is None:
         raise WeightsNotAvailable(
             f"The weights {weights.name} are not on this machine and have no automatic download; "
@@ -62,23 +68,14 @@ def find_cached(weights: PublishedWeights) -> Path | None:
         return None
     from huggingface_hub import try_to_load_from_cache
 
-    found = try_to_load_from_cache(weights.repository, weights.file, revision=weights.revision)
-    return Path(found) if isinstance(found, str) else None
+    cached = try_to_load_from_cache(weights.repository, weights.file, revision=weights.revision)
+    # The hub's answer may also be a mark that the file is known not to exist.
+    return Path(cached) if isinstance(cached, str) else None
 
 
 def is_hub_installed() -> bool:
     """Return True if huggingface_hub is installed."""
     return find_spec("huggingface_hub") is not None
-
-
-def _check_local_file(weights: PublishedWeights, local: Path) -> Path:
-    path = local / weights.file if os.path.isdir(local) else local
-    if not os.path.isfile(path):
-        raise InputError(
-            f"There are no weights at {path}; name the file {weights.file} or its folder, from "
-            f"{weights.source}."
-        )
-    return path
 
 
 def _describe_manual_download(weights: PublishedWeights) -> str:
@@ -91,21 +88,27 @@ def limit_retries() -> Iterator[None]:
     """Limit the hub's library to `MAX_RETRIES` retries, by temporarily changed defaults."""
     from huggingface_hub import utils
 
+    # The library has no setting for it: the defaults of its functions are changed and set back.
+    # Which of the functions there are depends on its version.
     functions = (getattr(utils, name, None) for name in ("http_backoff", "http_stream_backoff"))
-    defaults = [getattr(function, "__kwdefaults__", None) or {} for function in functions]
-    changed = [(held, held["max_retries"]) for held in defaults if "max_retries" in held]
+    all_defaults = [getattr(function, "__kwdefaults__", None) or {} for function in functions]
+    changed = [
+        (defaults, defaults["max_retries"])
+        for defaults in all_defaults
+        if "max_retries" in defaults
+    ]
     verbosity = utils.logging.get_verbosity()
     utils.logging.set_verbosity_error()
-    for held, _ in changed:
-        held["max_retries"] = MAX_RETRIES
+    for defaults, _ in changed:
+        defaults["max_retries"] = MAX_RETRIES
     try:
         with warnings.catch_warnings():
             warnings.filterwarnings("ignore", module="huggingface_hub")
             yield
     finally:
         utils.logging.set_verbosity(verbosity)
-        for held, retries in changed:
-            held["max_retries"] = retries
+        for defaults, retries in changed:
+            defaults["max_retries"] = retries
 
 
 def _download(weights: PublishedWeights, offline: bool) -> Path:
@@ -117,6 +120,8 @@ def _download(weights: PublishedWeights, offline: bool) -> Path:
         raise WeightsNotAvailable(
             f"huggingface_hub is missing: {INSTALL}; or {_describe_manual_download(weights)}."
         ) from error
+
+    # HF_HUB_OFFLINE, as all programs of the hub obey it.
     offline = offline or constants.HF_HUB_OFFLINE
     try:
         with limit_retries():

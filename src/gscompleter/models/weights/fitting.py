@@ -31,15 +31,20 @@ def load_strictly(
     Raises:
         InputError: A tensor is missing, unknown, of another shape, or not finite.
     """
-    needed, given = get_shapes(model.state_dict()), get_shapes(state_dict)
+    needed = get_shapes(model.state_dict())
+    given = get_shapes(state_dict)
     if needed != given:
+        # The file of another variant is the usual mistake, and can be named.
         known = {} if variants is None else variants()
-        right = [name for name, shapes in known.items() if dict(shapes) == given]
-        advice = f"its tensors are those of {' or '.join(right)}" if right else "give another file"
+        fitting = [name for name, shapes in known.items() if dict(shapes) == given]
+        advice = "give another file"
+        if fitting:
+            advice = f"its tensors are those of {' or '.join(fitting)}"
         raise InputError(
             f"{origin} does not fit the network {type(model).__name__}: "
             f"{describe_differences(needed, given)}; {advice}."
         )
+    # Checked before anything is loaded, so that a failure leaves the network as it was.
     check_finite(state_dict, origin)
     model.load_state_dict(state_dict, strict=True)
 

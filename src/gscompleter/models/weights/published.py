@@ -84,7 +84,8 @@ class PublishedWeights:
 
 
 FROM_DEPTH_ANYTHING = "training started from Depth Anything V2 {}, which is CC BY-NC 4.0"
-FROM_BASE, FROM_LARGE = FROM_DEPTH_ANYTHING.format("Base"), FROM_DEPTH_ANYTHING.format("Large")
+FROM_BASE = FROM_DEPTH_ANYTHING.format("Base")
+FROM_LARGE = FROM_DEPTH_ANYTHING.format("Large")
 NON_COMMERCIAL = "the licence of the file, CC BY-NC 4.0, allows non-commercial use only"
 ON_DL3DV = "trained on DL3DV-10K, whose terms allow non-commercial research only"
 ON_DEPTH_DATA = f"{ON_DL3DV}, and on ScanNet, TartanAir and VKITTI2, which have their own terms"
@@ -134,6 +135,7 @@ def _create_depthsplat(
     file: str, configuration: str, caution: str = "", far: float = 100.0
 ) -> PublishedWeights:
     """Parse the name of a DepthSplat file: model, image size, view range, start of its SHA-256."""
+    # An example is depthsplat-gs-base-dl3dv-256x448-randview2-6-02c7b19d.pth.
     parts = re.fullmatch(r"(.+-(\d+)x(\d+))-\w*view(\d+)(?:-(\d+))?-([0-9a-f]{8})\.pth", file)
     assert parts is not None, file
     stem, height, width, fewest, most, digits = parts.groups()
@@ -220,8 +222,8 @@ def _create_inpainting(
 ) -> PublishedWeights:
     """Create the entry of a generator that fills holes."""
     name = model.lower().replace("-", "")
-    given = {"name": name, "model": model, "parameters": None, "gives": "image", **others}
-    return _create_onnx(repository, licence, image_size=(512, 512), **given)
+    entries = {"name": name, "model": model, "parameters": None, "gives": "image", **others}
+    return _create_onnx(repository, licence, image_size=(512, 512), **entries)
 
 
 def _create_moge(name: str, size: str, **others: Any) -> PublishedWeights:

@@ -33,6 +33,7 @@ def read_state_dict(path: Path, weights: PublishedWeights) -> dict[str, Tensor]:
         InputError: The file is missing, damaged, a different one, or contains other objects.
     """
     check_kind(path, weights.file)
+    # A converted file has no published hash.
     converted = path.suffix == ".safetensors" and not weights.file.endswith(".safetensors")
     if weights.sha256 is not None and not converted:
         check_sha256(path, weights.sha256, weights.file)
@@ -71,7 +72,11 @@ def check_kind(path: Path, name: str) -> None:
 
 def check_sha256(path: Path, expected: str, name: str) -> None:
     """Raise InputError if the SHA-256 of a file does not start with `expected`."""
-    digest = compute_sha256(path)
+    hashed = hashlib.sha256()
+    with path.open("rb") as file:
+        while block := file.read(1 << 20):
+            hashed.update(block)
+    digest = hashed.hexdigest()
     if digest.startswith(expected):
         return
     for other in PUBLISHED.values():
@@ -81,15 +86,6 @@ def check_sha256(path: Path, expected: str, name: str) -> None:
                 f"model, or fetch {name}."
             )
     raise _create_file_error(path, f"is not the published file (SHA-256 {digest[:8]})", name)
-
-
-def compute_sha256(path: Path) -> str:
-    """Compute the SHA-256 of a file in blocks of 1 MiB."""
-    digest = hashlib.sha256()
-    with path.open("rb") as file:
-        while block := file.read(1 << 20):
-            digest.update(block)
-    return digest.hexdigest()
 
 
 def is_archive(path: Path) -> bool:
@@ -120,10 +116,11 @@ def read_tensors(path: Path, name: str) -> Any:
         mapped = is_archive(path)
         return torch.load(path, map_location="cpu", weights_only=True, mmap=mapped)
     except pickle.UnpicklingError as error:
-        found = re.search(r"GLOBAL (\S+)", str(error))
-        if found is None:
+        # A pickle may name any function; torch refuses it and names what it refused.
+        refused = re.search(r"GLOBAL (\S+)", str(error))
+        if refused is None:
             raise _create_file_error(path, "holds no plain weights", name) from error
-        objects = f"Python objects too ({quote_value(found[1])}), which may run any code"
+        objects = f"Python objects too ({quote_value(refused[1])}), which may run any code"
         raise _create_file_error(path, f"holds {objects}", name) from error
     except Exception as error:  # damaged pickles raise many types
         raise _create_file_error(path, "cannot be read by torch", name) from error
@@ -153,12 +150,13 @@ def extract_network_tensors(
     def other(held: str) -> InputError:
         return InputError(f"{path} holds {held}; give {weights.file}.")
 
+    # Some files have the tensors in an entry, beside the state of the training.
     inner = content.get(weights.entry, content) if isinstance(content, Mapping) else None
     if not isinstance(inner, Mapping) or not all(isinstance(key, str) for key in inner):
         raise other("no named tensors")
     prefix = weights.prefix
-    found = {k.removeprefix(prefix): v for k, v in inner.items() if k.startswith(prefix)}
-    if not found:
+    tensors = {k.removeprefix(prefix): v for k, v in inner.items() if k.startswith(prefix)}
+    if not tensors:
         raise other(f"no tensors named {prefix}…, but {_list_some(list(inner))}")
     unknown = [
         key
@@ -168,11 +166,12 @@ def extract_network_tensors(
     ]
     if unknown:
         raise other(f"more than the network {weights.name}: {_list_some(unknown)}")
-    odd = [key for key, value in found.items() if not is_plain(value)]
+    # Only dense tensors with numbers of their own can be loaded.
+    odd = [key for key, value in tensors.items() if not is_plain(value)]
     if odd:
         kinds = "empty shells, sparse or quantized ones"
         raise other(f"tensors without plain numbers ({_list_some(odd)}): {kinds}")
-    return found
+    return tensors
 
 
 def is_plain(tensor: Tensor) -> bool:
