@@ -75,6 +75,7 @@ class CudaRenderer:
         """Project Gaussians, sort them by depth and bin them into the tiles of an image."""
         if len(gaussians) == 0:
             return BinnedGaussians.empty(camera, gaussians.means.device)
+        # Rasterizing also returns what gsplat projected and sorted; the image is not used.
         _, _, projected = self.rasterize(gaussians, camera)
         before = gaussians.opacities.float()
         after = projected["opacities"].reshape(-1)
@@ -97,6 +98,7 @@ class CudaRenderer:
         Fainter Gaussians render the same in the larger box, where alpha 1/255 drops the rest.
         """
         binned = self.bin_gaussians(gaussians, camera)
+        # The depth is composited as a fourth colour, and divided by alpha as in "RGB+ED".
         with torch.no_grad():
             colors = compute_colors(gaussians, camera)
             values = torch.cat([colors, binned.depths[0, :, None]], dim=-1)

@@ -73,6 +73,7 @@ class RedrawnScene:
             return self.composite(set_colors(new, colors)).image
 
         def errors(colors: Float[Tensor, "n 3"], photograph: Float[Tensor, "h w 3"]) -> ColorSums:
+            # Weights are those of an image of ones; all three channels have the same.
             missing = photograph - render(colors).detach()
             weights = backproject(render, new, torch.ones_like(missing))[:, 0]
             return backproject(render, new, missing), weights

@@ -105,7 +105,8 @@ def load_splat(path: Path | str, drop_nonfinite: bool = False) -> Gaussians:
     name = detect_splat_format(path)
     if name == "ply":
         return load_ply(path, drop_nonfinite)
-    errors = (*DECODING_ERRORS, *(JSON_ERRORS if name in ("sog", "sog-folder", "glb") else ()))
+    has_json = name in ("sog", "sog-folder", "glb")
+    errors = DECODING_ERRORS + JSON_ERRORS if has_json else DECODING_ERRORS
     try:
         with np.errstate(over="ignore", invalid="ignore"):  # infinite values are refused below
             gaussians = FORMATS[name].read(path)
@@ -205,8 +206,10 @@ def get_writer(path: Path) -> Callable[[Path, Gaussians], None]:
 
 
 def _match_extension(path: Path) -> str | None:
-    endings = {name: format_.extensions for name, format_ in FORMATS.items()}
-    return next((n for n, ends in endings.items() if path.name.lower().endswith(ends)), None)
+    for name, format_ in FORMATS.items():
+        if path.name.lower().endswith(format_.extensions):
+            return name
+    return None
 
 
 def get_labels_path(path: Path) -> Path:

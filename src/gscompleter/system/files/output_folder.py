@@ -31,16 +31,20 @@ from gscompleter.system.files.unfinished import (
 )
 from gscompleter.system.files.writing import SUMMARY_FILE, convert_write_errors, defer_interrupts
 
-FILES, COMMAND = "files", "command"
-"""Entries of `summary.json`: the files of the run, and the command that wrote them."""
+FILES = "files"
+"""Entry of `summary.json`: the files of the run."""
+COMMAND = "command"
+"""Entry of `summary.json`: the command that wrote them."""
 POSES = "colmap"
 """Folder of the cameras that a completion found for its photographs; it has its own summary."""
 
 MAX_SUMMARY_BYTES = 10**9
 MAX_NAMED = 5
 """Most foreign files that a sentence names."""
-ATTEMPTS, MAX_WAIT_SECONDS = 4, 0.2
-"""Attempts of two runs that reserve a folder at the same moment, and the time between them."""
+ATTEMPTS = 4
+"""Attempts of two runs that reserve a folder at the same moment."""
+MAX_WAIT_SECONDS = 0.2
+"""Longest time between two attempts."""
 
 _DISK_ERRORS = {errno.ENOSPC, errno.EDQUOT, errno.EFBIG, errno.EROFS}
 
@@ -104,7 +108,8 @@ def reserve_output(
     or if it has files that match `patterns` (globs of the results) and that no earlier run wrote.
     `takes_over` is for a caller that knows that no other run is left.
     """
-    given, target = Path(path), Path(os.path.realpath(path))
+    given = Path(path)
+    target = Path(os.path.realpath(path))
     with ExitStack() as stack:
         draft = stack.enter_context(_reserve(given, target, overwrite, takes_over))
         _finish_interrupted(target)
@@ -185,7 +190,11 @@ def _reserve(given: Path, target: Path, overwrite: bool, takes_over: bool) -> It
                 break
             draft.rmdir()
             if attempt == ATTEMPTS:
-                raise InputError(_describe_rival(given, rival), "out")
+                raise InputError(
+                    f"Another run (process {rival.pid}) is writing {quote_value(given)}; wait for "
+                    "its end, or name another folder.",
+                    "out",
+                )
             time.sleep(random.uniform(0, MAX_WAIT_SECONDS))
         yield draft
     finally:
@@ -198,15 +207,10 @@ def _reserve(given: Path, target: Path, overwrite: bool, takes_over: bool) -> It
 def _find_rival(draft: Path, target: Path) -> Unfinished | None:
     """Find the draft of another run that writes the same folder."""
     places = [*list_unfinished(target.parent, target.name), *list_unfinished(target, target.name)]
-    others = (entry for entry in places if entry.path != draft and not entry.is_own())
-    return next((entry for entry in others if entry.is_running()), None)
-
-
-def _describe_rival(given: Path, rival: Unfinished) -> str:
-    return (
-        f"Another run (process {rival.pid}) is writing {quote_value(given)}; wait for its end, or "
-        "name another folder."
-    )
+    for entry in places:
+        if entry.path != draft and not entry.is_own() and entry.is_running():
+            return entry
+    return None
 
 
 def _check_free(given: Path, target: Path, overwrite: bool) -> None:
@@ -255,8 +259,9 @@ def _find_obstacle(folder: Path, name: str) -> str | None:
     It is anything but a folder in the place of one, also a link to a folder elsewhere, or anything
     but a file in the place of the file.
     """
-    *parents, _ = parts = PurePosixPath(name).parts
-    for depth in range(1, len(parents) + 1):
+    # From the outermost parent on; below one that does not exist, nothing is in the way.
+    parts = PurePosixPath(name).parts
+    for depth in range(1, len(parts)):
         inner = "/".join(parts[:depth])
         try:
             mode = os.lstat(folder / inner).st_mode
@@ -314,9 +319,9 @@ def _list_in_summary(draft: Path, command: str) -> None:
     """Add the names of all files to the summary of a draft, or make one of them alone."""
     path = draft / SUMMARY_FILE
     content = json.loads(path.read_bytes()) if path.is_file() else {}
-    made = {COMMAND: command} if command else {}
+    origin = {COMMAND: command} if command else {}
     files = sorted({SUMMARY_FILE, *_list_files(draft)})
-    whole = json.dumps({**made, **content, FILES: files}, indent=2)
+    whole = json.dumps({**origin, **content, FILES: files}, indent=2)
     path.write_bytes(whole.encode() + b"\n")
 
 
@@ -328,6 +333,8 @@ def _publish(draft: Path, target: Path) -> None:
     replaced = target / f"{draft.name}{REPLACED_SUFFIX}"
     listed = read_listing(target)
     _refuse_unlisted(target, target, _list_files(draft), listed)
+    # Renames of old files, then of new ones: a run that is killed in between leaves both folders,
+    # from which the next one finishes (`_finish_interrupted`).
     created = _make_folders(draft, target)
     replaced.mkdir()
     try:
