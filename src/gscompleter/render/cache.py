@@ -55,7 +55,10 @@ class SceneRenderer:
     def _update(
         self, parts: Parts, camera: Camera, known: Parts, frozen: FrozenScene | None
     ) -> FrozenScene:
-        """Extend a frozen scene if the new one begins with its parts, else freeze anew."""
+        """Extend a frozen scene if the new one begins with its parts, else freeze anew.
+
+        Parts are immutable, so that an identical object is an equal part.
+        """
         shared = 0
         while shared < min(len(known), len(parts)) and known[shared] is parts[shared]:
             shared += 1
@@ -76,6 +79,7 @@ class SceneRenderer:
 
 def make_camera_key(camera: Camera) -> Hashable:
     """Make a key that is equal for cameras with equal images."""
+    # Not the far plane, which no renderer uses.
     camera = camera.on_cpu
     numbers = (*camera.c2w.flatten().tolist(), *camera.K.flatten().tolist())
     return (*numbers, camera.width, camera.height, camera.near_plane)

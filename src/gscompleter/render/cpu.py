@@ -138,6 +138,7 @@ class CpuFrozenScene:
 
     def splat(self, values: Float[Tensor, "n"]) -> Float[Tensor, "h w"]:
         """Composite the frozen lists once more, with the values as red."""
+        # Colours below 0 are cut off before kernels get them.
         splats = self.layer.splats.copy()
         splats[:, project.RED] = np.maximum(to_float32(values)[self.rows], 0)
         nothing = freeze_nothing(self.viewpoint)
@@ -251,6 +252,8 @@ class _VaryOpacities(torch.autograd.Function):
         opacities = to_float32(ctx.saved_tensors[0])
         gradients = view.viewpoint.composite_backward(view.layer, binned, frame, d_frame)
         sums = view.viewpoint.sum_by_gaussian(binned, gradients)[:, project.SUM]
+        # Sums are of alpha · dL/dalpha, and alpha is proportional to the opacity. An opacity of 0
+        # has no sum, and keeps the gradient 0.
         result = np.divide(sums, opacities, out=np.zeros_like(opacities), where=sums != 0)
         return None, None, torch.from_numpy(result)
 
@@ -267,6 +270,7 @@ class _VaryDepths(torch.autograd.Function):
         frame, render = view.composite_layer(binned.layer)
         ctx.scene = (view, binned, frame)
         ctx.save_for_backward(render.depth, render.alpha)
+        # Footprints are constant, so that only the depth varies smoothly; order may change.
         ctx.mark_non_differentiable(render.image, render.alpha)
         return render.image, render.depth, render.alpha
 
@@ -310,6 +314,7 @@ def make_pinhole(camera: Camera) -> Pinhole:
             f"An image of {camera.width} x {camera.height} pixels cannot be rendered; its sides "
             f"must have 1 to {MAX_SIDE:,} pixels."
         )
+    # In float64 until the end, so that the inverse is as exact as float32 holds it.
     K = camera.K.detach().to("cpu", torch.float64)
     c2w = camera.c2w.detach().to("cpu", torch.float64)
     return Pinhole(

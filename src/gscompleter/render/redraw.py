@@ -97,6 +97,7 @@ def backproject(
 
     A compositing weight is the gradient of a pixel in the colour of the Gaussian.
     """
+    # Any colour serves, as the image is linear in colours; 0.5 is not cut off at 0.
     with torch.enable_grad():
         colors = torch.full_like(gaussians.means, 0.5).requires_grad_()
         (gradient,) = torch.autograd.grad((image * render(colors)).sum(), colors)

@@ -148,6 +148,7 @@ def composite(
     offsets = pixels - splats.centers[:, None]
     sigma = 0.5 * torch.einsum("mpi,mij,mpj->mp", offsets, splats.precisions, offsets)
     alpha = (splats.opacities[:, None] * torch.exp(-sigma)).clamp(max=MAX_ALPHA)
+    # As in the rasterizer of 3DGS, faint splats are not drawn.
     alpha = torch.where((alpha >= MIN_ALPHA) & (sigma >= 0), alpha, 0)
 
     # Transmittance falls monotonically, so that what comes after the stop is masked as well.

@@ -45,6 +45,7 @@ def fit_palette(
 
     The space of rows is divided into as many cells as each has entries, which bounds the time.
     """
+    # Few distinct rows are kept exactly.
     distinct, numbers = np.unique(rows, axis=0, return_inverse=True)
     size = min(max(MIN_PALETTE_SIZE, len(rows) // ROWS_PER_ENTRY), MAX_PALETTE_SIZE)
     if len(distinct) <= size:

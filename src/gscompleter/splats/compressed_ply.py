@@ -112,6 +112,7 @@ def write_compressed_ply(path: Path, gaussians: Gaussians) -> None:
     """Write a compressed .ply; the Gaussians should be sorted with `sort_along_morton`."""
     log_scales = np.clip(encode(gaussians)[:, :3].numpy(), -MAX_LOG_SCALE, MAX_LOG_SCALE)
     rgb = 0.5 + SH_C0 * gaussians.sh[:, 0].numpy()
+    # Row of the first Gaussian of each chunk, and chunk of each Gaussian.
     starts = np.arange(0, len(gaussians), CHUNK_SIZE)
     of_chunk = np.arange(len(gaussians)) // CHUNK_SIZE
     bounds = []
@@ -119,6 +120,7 @@ def write_compressed_ply(path: Path, gaussians: Gaussians) -> None:
     for values in (gaussians.means.numpy(), log_scales, rgb):
         low = np.minimum.reduceat(values, starts)
         high = np.maximum.reduceat(values, starts)
+        # A chunk without extent has the fraction 0 instead of 0 / 0.
         extent = np.where(high > low, high - low, 1)
         bounds += [low, high]
         fractions.append((values - low[of_chunk]) / extent[of_chunk])
@@ -133,6 +135,7 @@ def write_compressed_ply(path: Path, gaussians: Gaussians) -> None:
         pack_fractions(rgba, COLOR_BITS),
     ]
     rest = gaussians.sh[:, 1:].transpose(1, 2).reshape(len(gaussians), -1).numpy()
+    # The byte of the interval that a value in [-4, 4] lies in.
     rest_bytes = np.clip(np.floor((rest / 8 + 0.5) * 256), 0, 255).astype(np.uint8)
     with replace_file(path) as file:
         file.write(_make_header(gaussians, len(starts), rest.shape[1]))

@@ -50,16 +50,16 @@ def find_newest_splat(folder: Path) -> Path | None:
 
     The first pattern with a file decides; of several files, the largest number in the name.
     """
+
+    def get_iteration(path: Path) -> int:
+        numbers = re.findall(r"\d+", str(path.relative_to(folder)))
+        return int(numbers[-1][:18]) if numbers else -1
+
     for pattern in _PATTERNS:
         paths = [path for path in folder.glob(pattern) if path.is_file()]
         if paths:
-            return max(paths, key=lambda path: (_get_iteration(path, folder), str(path)))
+            return max(paths, key=lambda path: (get_iteration(path), str(path)))
     return None
-
-
-def _get_iteration(path: Path, folder: Path) -> int:
-    numbers = re.findall(r"\d+", str(path.relative_to(folder)))
-    return int(numbers[-1][:18]) if numbers else -1
 
 
 def resolve_splat(path: Path) -> Path:

@@ -181,6 +181,7 @@ def detect_splat_format(path: Path) -> str:
     if not head:
         raise InputError(f"{quote_value(path)} is empty; a file of Gaussians is needed.")
     refuse_foreign(path, head)
+    # Content decides before the name, since files are renamed.
     for name, format_ in FORMATS.items():
         if head.lstrip().startswith(format_.starts) and format_.contains in head:
             return name
@@ -224,6 +225,7 @@ def save_labels(path: Path, generated: UInt8[Tensor, "n"]) -> None:
         with contextlib.suppress(FileNotFoundError):
             place.unlink()
         return
+    # Run lengths, as labels come in long runs; the digest ties them to this very file.
     runs = [[label, len(list(run))] for label, run in groupby(generated.tolist())]
     with replace_file(place) as file:
         file.write(json.dumps({"sha256": _hash_file(path), "generated": runs}).encode())

@@ -64,6 +64,7 @@ def read_glb(path: Path) -> Gaussians:
     placed = list(_find_primitives(document))
     if not placed:
         raise UnsupportedError(_describe_other_content(document.table))
+    # Accessors may share bytes, so that a small file can claim any number.
     counts = [_get_accessor(document, p, "POSITION")["count"] for p, _ in placed]
     if sum(counts) * MIN_GAUSSIAN_BYTES > len(document.binary):
         raise ValueError("it claims more Gaussians than fit into it")
@@ -182,6 +183,7 @@ def _read_accessor(document: GlbDocument, accessor: dict[str, Any]) -> Float[nda
         return values.astype(np.float32)
     if not accessor.get("normalized") and width != 3:
         raise UnsupportedError("has rotations or opacities that are no fractions")
+    # Signed normalized integers are symmetric: the lowest one stands for -1, too.
     largest = np.iinfo(kind).max if accessor.get("normalized") else 1
     return np.maximum(values.astype(np.float32) / largest, -1 if largest > 1 else -np.inf)
 
@@ -190,6 +192,7 @@ def write_glb(path: Path, gaussians: Gaussians) -> None:
     """Write a .glb whose scene is one primitive of Gaussians, with all SH."""
     columns = _make_columns(rotate_half_turn(gaussians, HALF_TURN_Z))
     text = json.dumps(_describe_scene(columns)).encode()
+    # Chunks are aligned to four bytes, JSON with spaces.
     text += b" " * (-len(text) % 4)
     size = sum(column.nbytes for column in columns.values())
     total = FILE_HEADER.size + 2 * CHUNK_HEADER.size + len(text) + size
@@ -232,6 +235,7 @@ def _describe_scene(columns: dict[str, Float[ndarray, "n k"]]) -> dict[str, Any]
         accessors.append({"bufferView": view, **form})
         size += values.nbytes
     means = columns["POSITION"]
+    # The standard demands bounds of positions.
     accessors[0] |= {"min": means.min(0).tolist(), "max": means.max(0).tolist()}
     primitive = {
         "attributes": {name: index for index, name in enumerate(columns)},

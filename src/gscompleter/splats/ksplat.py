@@ -103,6 +103,7 @@ def _decode_section(
         low = sh_range[0] or -1.5
         high = sh_range[1] or 1.5
         rest = low + rest / 255 * (high - low)
+    # Level 0 has positions, the others steps from the centre of a bucket, from -num_steps on.
     means = rows["mean"].astype(np.float64)
     if rows["mean"].dtype == np.uint16:
         num_steps = section.num_steps or DEFAULT_STEPS

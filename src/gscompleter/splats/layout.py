@@ -88,6 +88,7 @@ def save_like(
     if layout is None or numbers is None:
         save_ply(path, merge([context, added]), provenance=True)
         return
+    # The file's own columns stay as they are; only `generated` is added, or written anew.
     header = _add_label_line(layout.header)
     label = [(LABEL_COLUMN, "u1")]
     if LABEL_COLUMN in (layout.rows.dtype.names or ()):
@@ -112,6 +113,7 @@ def _match_rows(
     layout: PlyFile, context: Gaussians, added: Gaussians, kept: Bool[Tensor, "n"] | None
 ) -> Int[ndarray, "m"] | None:
     """Find the rows of a file that its context was read from, or None if `added` do not fit in."""
+    # Rows are copied only if their positions are those of the context, one by one.
     names = layout.rows.dtype.names or ()
     has_other_labels = LABEL_COLUMN in names and layout.rows.dtype[LABEL_COLUMN] != np.uint8
     if has_surfels(layout) or has_other_labels:
@@ -208,6 +210,7 @@ def reinsert(
     rows = np.zeros(0, np.int64)
     if b"element place " in source.header and len(source.trailer) == 4 * len(removed):
         rows = source.trailer.view("<u4").astype(np.int64)
+    # Row numbers ascend, and the last one lies within the scene.
     is_ordered = len(rows) > 0 and bool((np.diff(rows, append=total) > 0).all())
     if not is_ordered or kept.is_antialiased != removed.is_antialiased:
         raise InputError(

@@ -132,6 +132,7 @@ def decode_gaussians(scene: PlyFile) -> Gaussians:
         lambda columns: torch.from_numpy(read_columns(rows, columns)),
         [rests, MEANS, _QUATS, logs, _DC],
     )
+    # The file has all coefficients of red, then green, then blue.
     rest = rest.view(len(rows), 3, num_rest // 3).transpose(1, 2)
     # Logarithms of scales: the third one of a surfel is thinner than the smaller one by a factor.
     if has_surfels(scene):

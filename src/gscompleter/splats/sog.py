@@ -144,6 +144,7 @@ def _interpolate(
 
 
 def _decode_quats(packed: UInt8[ndarray, "n 4"]) -> Float[ndarray, "n 4"]:
+    # Components in [-sqrt(1/2), sqrt(1/2)]; the fourth byte says which one was dropped.
     smaller = (packed[:, :3].astype(np.float32) / 255 - 0.5) * np.float32(np.sqrt(2))
     quats = restore_largest(packed[:, 3] & 3, smaller)
     quats[packed[:, 3] < ROTATION_MARK] = (1, 0, 0, 0)  # the identity, as in other readers
@@ -221,6 +222,7 @@ def _encode_means(means: Float[ndarray, "n 3"]) -> Coded:
     logs = np.sign(means) * np.log1p(np.abs(means))
     low = logs.min(0)
     high = logs.max(0)
+    # 16 bits, of which each image holds 8.
     steps = np.rint((logs - low) / np.where(high > low, high - low, 1) * 65535).astype(np.int64)
     images = {"means_l.webp": _encode_image(steps & 255), "means_u.webp": _encode_image(steps >> 8)}
     return {"mins": low.tolist(), "maxs": high.tolist()}, images
@@ -228,6 +230,7 @@ def _encode_means(means: Float[ndarray, "n 3"]) -> Coded:
 
 def _encode_sh_rest(gaussians: Gaussians) -> Coded:
     """Encode SH of degree 1 and above as numbers of rows of a palette."""
+    # Rows of all higher coefficients become a palette, and its numbers a codebook of 256.
     rest = gaussians.sh[:, 1:].flatten(1).numpy()
     palette, labels = fit_palette(rest)
     book, codes = fit_codebook(palette)
@@ -244,6 +247,7 @@ def _encode_image(values: Shaped[ndarray, "n k"], width: int = 0) -> bytes:
     """Encode rows of 3 or 4 bytes as a lossless image, by default about square."""
     n, k = values.shape
     width = width or BLOCK * math.ceil(math.sqrt(n) / BLOCK)
+    # Pixels beyond the last Gaussian are white and opaque.
     pixels = np.full((math.ceil(n / width), width, 4), 255, np.uint8)
     pixels.reshape(-1, 4)[:n, :k] = values
     file = io.BytesIO()

@@ -102,6 +102,7 @@ def _parse_header(data: bytes) -> SpzHeader:
 
 
 def _unpack_gzip(data: bytes) -> bytes:
+    # The header says how long the content is; a bomb is refused before it is unpacked.
     with gzip.GzipFile(fileobj=io.BytesIO(data)) as file:
         start = file.read(HEADER.size)
         size = sum(_parse_header(start).stream_sizes)
@@ -121,6 +122,7 @@ def _read_zstd(header: SpzHeader, data: bytes) -> list[bytes]:
     table = np.frombuffer(data, "<u8", 2 * header.num_streams, place).reshape(-1, 2)
     start = place + table.nbytes
     streams = []
+    # No more than the stated size is unpacked of a stream.
     for packed, size in zip(table[:, 0].tolist(), header.stream_sizes, strict=False):
         unpacker = zstandard.ZstdDecompressor(max_window_size=MAX_WINDOW)
         try:
@@ -157,6 +159,7 @@ def _decode_int24(positions: UInt8[ndarray, "n 9"]) -> Int[ndarray, "n 3"]:
 
 
 def _decode_quats_v2(rotations: UInt8[ndarray, "n 3"]) -> Float[ndarray, "n 4"]:
+    # w is positive, and follows from the length of 1.
     xyz = rotations.astype(np.float32) / 127.5 - 1
     w = np.sqrt(np.maximum(0, 1 - np.square(xyz).sum(1, keepdims=True)))
     return np.concatenate([w, xyz], axis=1)
@@ -204,6 +207,7 @@ def encode_spz(path: Path, gaussians: Gaussians) -> bytes:
 
 def _choose_fractional_bits(path: Path, gaussians: Gaussians) -> int:
     """Choose the fractional bits that the farthest coordinate leaves of 23."""
+    # Positions are signed numbers of 24 bits: what the whole part leaves of 23 is for the fraction.
     farthest = gaussians.means.abs().max().item()
     bits = 23 - int(np.ceil(np.log2(farthest + 1)))
     if bits < 0:
@@ -225,6 +229,7 @@ def _pack_positions(means: Float[ndarray, "n 3"], bits: int) -> bytes:
 
 
 def _pack_rotations(quats: Float[ndarray, "n 4"]) -> bytes:
+    # From wxyz to the file's xyzw; sign and size take 1 and 9 bits of each component.
     largest, smaller = drop_largest(np.roll(quats, -1, axis=1))
     fields = np.stack([smaller < 0, np.abs(smaller) / np.sqrt(0.5)], axis=2).reshape(-1, 6)
     packed = (largest.astype(np.uint32) << np.uint32(30)) | pack_fractions(fields, SIGN_SIZE_BITS)

@@ -52,6 +52,7 @@ def write_usd(path: Path, gaussians: Gaussians) -> None:
         with _convert_usd_errors(path, folder):
             stage.GetRootLayer().Export(str(layer))
             if ending == ".usdz":
+                # A zip stores the time of its files.
                 os.utime(layer, (time.mktime(PACKAGED),) * 2)
                 result = layer.with_suffix(ending)
                 UsdUtils.CreateNewUsdzPackage(str(layer), str(result))

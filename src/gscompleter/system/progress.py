@@ -76,6 +76,7 @@ class Display:
             self._print_line()
 
     def _update_bars(self, bars: Progress) -> None:
+        # Bars are in the order of the running activities, and take over each other's place.
         for task in bars.task_ids[len(self._running) :]:
             bars.remove_task(task)
         for index, activity in enumerate(self._running):

@@ -39,6 +39,7 @@ def timed_stage(name: str) -> Iterator[None]:
     """Show a stage as running and record its wall time; inside another stage, it counts there."""
     seconds = _record.get()
     start = time.perf_counter()
+    # A stage inside this one finds no record, and so is not counted twice.
     token = _record.set(None)
     try:
         with stage(name), record_function(STAGE_PREFIX + name):

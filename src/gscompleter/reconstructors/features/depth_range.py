@@ -6,7 +6,6 @@ from collections.abc import Callable, Sequence
 from dataclasses import replace
 
 import numpy as np
-from jaxtyping import Float
 
 from gscompleter.reconstructors.features.matches import triangulate_valid
 from gscompleter.reconstructors.features.neighbours import Neighbours, find_neighbours
@@ -54,7 +53,14 @@ def measure_extreme_depths(
     images: Sequence[StereoImage], neighbours: Neighbours
 ) -> tuple[float, float] | None:
     """Measure the depths of the nearest and farthest 2 %, per widest baseline; None for too few."""
-    inverse = triangulate_neighbours(images, neighbours)
+    # Inverse z-depths of the matches of neighbouring views, seen from either view.
+    inverses = [np.zeros(0)]
+    for i, j in neighbours.pairs:
+        in_i, in_j = neighbours.matches[i, j]
+        if len(in_i):
+            inverses.append(triangulate_valid(images[i], images[j], in_i, in_j))
+            inverses.append(triangulate_valid(images[j], images[i], in_j, in_i))
+    inverse = np.concatenate(inverses)
     if len(inverse) < MIN_MATCHES:
         return None
     # The nearest depth is the largest inverse depth.
@@ -111,16 +117,3 @@ def derive_range_from_baselines(
     baselines = [float(np.linalg.norm(images[i].center - images[j].center)) for i, j in pairs]
     baseline = float(np.median(baselines))
     return baseline * focal / (0.4 * width), baseline * 3.0 * focal
-
-
-def triangulate_neighbours(
-    images: Sequence[StereoImage], neighbours: Neighbours
-) -> Float[np.ndarray, "n"]:
-    """Triangulate the matches of neighbouring views; inverse z-depth per widest baseline."""
-    inverses = [np.zeros(0)]
-    for i, j in neighbours.pairs:
-        in_i, in_j = neighbours.matches[i, j]
-        if len(in_i):
-            inverses.append(triangulate_valid(images[i], images[j], in_i, in_j))
-            inverses.append(triangulate_valid(images[j], images[i], in_j, in_i))
-    return np.concatenate(inverses)

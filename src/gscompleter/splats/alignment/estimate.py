@@ -116,6 +116,7 @@ def align_splat(
 
 def sample_views(photographs: Photographs, frames: Sequence[int]) -> list[View]:
     """Load the first of `frames` and, spread over all, further photographs that can be read."""
+    # Half of the samples are the frames of the context, half are from all over.
     named = list(frames)[: NUM_SAMPLE_VIEWS // 2]
     spread = np.linspace(0, len(photographs) - 1, NUM_SAMPLE_VIEWS).round().astype(int).tolist()
     others = [frame for frame in dict.fromkeys(spread) if frame not in named]
@@ -176,6 +177,7 @@ def align_by_features(
     data: AlignmentData, best: SplatAlignment, points: Points | None
 ) -> SplatAlignment:
     """Improve an alignment by image features; without a match, search from all directions."""
+    # A match is refined where it is; else the splat is searched all around for a start.
     photographs = [(view.camera, extract_view_features(view)) for view in data.views]
     if best.fit.is_match:
         starts: Iterable[Matrix] = [best.transform]

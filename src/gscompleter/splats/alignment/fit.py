@@ -77,6 +77,7 @@ class SplatFit(NamedTuple):
 
 def summarize_fits(images: Sequence[ImageFit]) -> SplatFit:
     """Summarize the fits to several photographs."""
+    # The better half by margin: some photographs may show what the splat does not.
     seen = [image for image in images if image.coverage >= MIN_COVERAGE]
     seen.sort(key=lambda image: image.margin, reverse=True)
     better = seen[: math.ceil(len(seen) / 2)] or [ImageFit()]
@@ -162,6 +163,7 @@ def measure_drift(
         return math.inf
     there, is_found = track_corners(before, after, corners)
     back, is_found_again = track_corners(after, before, there)
+    # A corner that was tracked to a wrong place rarely returns to where it began.
     is_back = np.linalg.norm(back - corners, axis=2)[:, 0] < MAX_ROUND_TRIP_ERROR
     trusted = is_found & is_found_again & is_back
     if trusted.sum() < MIN_TRACKED_CORNERS:

@@ -69,6 +69,7 @@ def search_similarities(
     seer = photographs[len(photographs) // 2][0]
     if len(scene) == 0 or not has_baseline([get_pose(camera) for camera, _ in photographs]):
         return
+    # The fainter half of the Gaussians, floaters among them, says little about the extent.
     solid = scene.means[scene.opacities >= scene.opacities.median()].detach().cpu().double().numpy()
     for transform in generate_starts(get_pose(seer), points, solid):
         rendered = render_features(scene, transform_camera(seer, transform), renderer)
@@ -90,6 +91,7 @@ def generate_starts(
     for zoom in SCALE_FACTORS:
         scale = zoom * new_radius / max(radius, 1e-12)
         for direction in sample_directions(NUM_DIRECTIONS):
+            # The camera then looks along `direction`, with any roll, which features tolerate.
             turn = align_directions(pose[:3, 2], direction)
             yield make_similarity(scale, turn, new_center - scale * turn @ center)
 

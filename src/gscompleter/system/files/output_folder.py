@@ -112,6 +112,7 @@ def reserve_output(
     target = Path(os.path.realpath(path))
     with ExitStack() as stack:
         draft = stack.enter_context(_reserve(given, target, overwrite, takes_over))
+        # Killed runs first: what they completed counts as an earlier result.
         _finish_interrupted(target)
         remove_left_behind(target)
         remove_left_behind(target.parent, target.name)
@@ -178,6 +179,7 @@ def _reserve(given: Path, target: Path, overwrite: bool, takes_over: bool) -> It
     after another time.
     """
     home = target if os.path.isdir(target) else target.parent
+    # Parents that this run makes are removed again if nothing comes of it.
     missing = [folder for folder in (home, *home.parents) if not os.path.exists(folder)]
     draft = home / make_unfinished_name(target.name)
     try:
@@ -382,6 +384,7 @@ def _rename_all(moves: list[tuple[Path, Path]]) -> None:
         try:
             os.rename(*move)
         except OSError:
+            # In the reverse order, so that the summary, which left first, comes back last.
             for source, destination in reversed(moves[:number]):
                 os.rename(destination, source)
             raise
@@ -391,6 +394,7 @@ def _remove_replaced(target: Path, replaced: Path, listed: Iterable[str]) -> Non
     """Remove the replaced files, and the folders of the earlier run that are empty now."""
     shutil.rmtree(replaced, ignore_errors=True)
     parents = {parent for name in listed for parent in PurePosixPath(name).parents}
+    # The innermost folders first, so that outer ones are empty when it is their turn.
     for parent in sorted(parents, key=lambda parent: -len(parent.parts)):
         if parent.parts:
             with suppress(OSError):
@@ -422,6 +426,7 @@ def _finish_interrupted(target: Path) -> None:
 
 def _finish_moves(draft: Path, target: Path, replaced: Path, listed: frozenset[str]) -> None:
     """Do the renames that are left: those of earlier files, unless done, and those of new ones."""
+    # New files that left the draft have their final name already, and must not be moved away.
     published = read_listing(draft).difference(_list_files(draft))
     left = [n for n in listed - published if not os.path.lexists(replaced / n)]
     _make_folders(draft, target)

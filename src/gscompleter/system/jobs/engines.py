@@ -149,6 +149,7 @@ def connect_to_ray(ray: Any, address: str | None, cores: int | None) -> None:
     """Connect to a cluster, or start one of `cores` cores on this machine."""
     for name, value in RAY_VARIABLES.items():
         os.environ.setdefault(name, value)
+    # A cluster elsewhere has its own settings.
     here = {"num_cpus": cores, "include_dashboard": False, "object_store_memory": STORE_BYTES}
     options = {"address": address} if address else {"address": "local", **here}
     handlers = {number: signal.getsignal(number) for number in (signal.SIGTERM, signal.SIGINT)}

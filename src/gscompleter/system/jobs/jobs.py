@@ -64,6 +64,7 @@ def run_with_retries(
     work: Callable[[], Mapping[str, Any]], lost: int, retries: int
 ) -> dict[str, Any]:
     """Run `work` with retries and return its part of a row; `lost` attempts have been killed."""
+    # Attempts that killed their process count, too.
     reason = describe_loss(lost)
     for number in range(lost + 1, retries + 2):
         try:
