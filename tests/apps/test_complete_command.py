@@ -15,7 +15,7 @@ from gscompleter import InputError, load_cameras, load_ply
 from gscompleter.apps.commands import complete as command
 from gscompleter.apps.commands.evaluate import collect_tasks
 from gscompleter.apps.commands.options import parse_resolution
-from gscompleter.apps.inputs.opening import Opened, Task, estimate_memory, read_task
+from gscompleter.apps.inputs.opening import CompletionTask, Opened, estimate_memory, read_task
 from gscompleter.apps.inputs.selection import select_near_and_far
 from gscompleter.cli import parse_command
 from gscompleter.data.formats import open_photographs
@@ -103,7 +103,7 @@ def test_four_lines_come_before_the_work(scene, chosen):
     assert re.fullmatch(r"Memory: up to 1 GB of [0-9,]+ GB\.", memory)
 
 
-def opened_with(scene: Path, *words: object) -> Task:
+def opened_with(scene: Path, *words: object) -> CompletionTask:
     """Open `scene` with these options; nothing is completed."""
     options = parse_command([str(word) for word in ("complete", scene, *words, "--out", "OUT")])
     photographs = open_photographs(scene, near=0.5, far=20.0)

@@ -21,7 +21,7 @@ from gscompleter.evaluation.runner import (
     collect_settings,
     evaluate,
 )
-from gscompleter.evaluation.store import VERSION, claim, list_row_paths, read_json
+from gscompleter.evaluation.store import VERSION, claim, list_row_paths, read_run_file
 from gscompleter.evaluation.tables import write_tables
 from gscompleter.models.settings import PEFieldSettings
 from gscompleter.system.jobs.jobs import Job, write_json
@@ -73,13 +73,13 @@ def test_of_many_simultaneous_claims_none_is_refused(tmp_path):
         codes, refused = claimed(out, 75)
         assert codes == [0] * 75, refused
         assert os.listdir(out) == ["run.json"]
-        assert read_json(out / "run.json") == {"version": VERSION, "seed": 0}
+        assert read_run_file(out / "run.json") == {"version": VERSION, "seed": 0}
 
 
 @pytest.mark.linux
 def test_of_simultaneous_claims_with_other_settings_one_kind_wins(tmp_path):
     codes, refused = claimed(tmp_path / "out", 40, kinds=2)
-    seed = read_json(tmp_path / "out" / "run.json")["seed"]
+    seed = read_run_file(tmp_path / "out" / "run.json")["seed"]
     assert codes == [0 if i % 2 == seed else 2 for i in range(40)]
     sentence = f"holds a run with seed {seed}, and this run has {1 - seed}; name another folder."
     assert refused.count(sentence) == 20
@@ -88,7 +88,7 @@ def test_of_simultaneous_claims_with_other_settings_one_kind_wins(tmp_path):
 def test_what_a_killed_process_left_unfinished_is_nobody_elses_content(tmp_path):
     (tmp_path / ".gscompleter-0123456789ab").write_bytes(b"half")
     claim(tmp_path, {"seed": 0})
-    assert read_json(tmp_path / "run.json")["seed"] == 0
+    assert read_run_file(tmp_path / "run.json")["seed"] == 0
 
 
 def test_without_hard_links_a_folder_is_claimed_too(tmp_path, monkeypatch):
@@ -103,7 +103,7 @@ def test_without_hard_links_a_folder_is_claimed_too(tmp_path, monkeypatch):
 def test_a_file_that_another_process_made_first_stays(tmp_path):
     for content in ("first", "second"):
         write_json(tmp_path / "run.json", content, keep_existing=True)
-    assert read_json(tmp_path / "run.json") == "first"
+    assert read_run_file(tmp_path / "run.json") == "first"
     assert os.listdir(tmp_path) == ["run.json"]
 
 
@@ -232,7 +232,7 @@ def test_workers_end_with_the_tables_of_one_run(scenes, finished, tmp_path):
 def test_a_case_whose_workers_were_killed_is_given_up(tasks, tmp_path):
     job = Job("given up", {"task": tasks[0]}, lost=RETRIES + 1)
     TaskRunner(tmp_path, METHOD_NAMES, RunConfig())(job)
-    errors = [read_json(row)["error"] for row in list_row_paths(tmp_path)]
+    errors = [read_run_file(row)["error"] for row in list_row_paths(tmp_path)]
     assert len(errors) == len(METHOD_NAMES)
     assert all("killed 3 times" in error for error in errors)
 

@@ -11,7 +11,7 @@ from PIL import Image
 from chunk_files import SIZE, VIEWS, example, pixels_of, row_of, save_chunk, save_dataset
 from command import run
 from gscompleter import InputError
-from gscompleter.data.formats import FORMATS, open_photographs, refuse_scenes_below
+from gscompleter.data.formats import SCENE_FORMATS, open_photographs, refuse_scenes_below
 from gscompleter.data.photographs import Photographs, Resolution
 from gscompleter.data.real_estate import read_camera_file
 from gscompleter.data.scene import write_cameras
@@ -145,7 +145,7 @@ def test_a_chunk_and_a_camera_file_are_completed_like_a_folder(tmp_path, monkeyp
         "chunks": save_chunk(tmp_path / "chunks" / "0.torch", example(form="PNG")),
         "real-estate-10k": save_camera_file(tmp_path / "files" / "room.txt", "room"),
     }
-    assert set(places) <= set(FORMATS)
+    assert set(places) <= set(SCENE_FORMATS)
     summaries = []
     for format, place in places.items():
         out = tmp_path / f"out-{format}"

@@ -9,7 +9,7 @@ from PIL import Image
 
 from command import run
 from gscompleter.data.formats import open_photographs
-from gscompleter.data.panorama import VIEWS, compute_rotation, has_panoramas, split_panorama
+from gscompleter.data.panorama import VIEWS, compute_view_rotation, has_panoramas, split_panorama
 from gscompleter.data.sfm.poses import list_photograph_files
 from gscompleter.system.files.image import write_image
 from gscompleter.types import Camera
@@ -42,7 +42,7 @@ def test_views_are_what_pinhole_cameras_see(tmp_path):
     assert len(views) == len(VIEWS)
     for pixels, (yaw, pitch) in zip(views, VIEWS, strict=True):
         c2w, side = torch.eye(4), len(pixels)
-        c2w[:3, :3] = torch.from_numpy(compute_rotation(yaw, pitch))
+        c2w[:3, :3] = torch.from_numpy(compute_view_rotation(yaw, pitch))
         c2w[:3, 3] = torch.tensor(CENTRES[0])
         K = torch.tensor([[side / 2, 0, side / 2], [0, side / 2, side / 2], [0, 0, 1]])
         true, _ = cast(Room(), Camera(c2w, K, side, side, 0.1, 20.0))
@@ -52,10 +52,10 @@ def test_views_are_what_pinhole_cameras_see(tmp_path):
 
 
 def test_a_view_that_rises_looks_up():
-    ahead, up = compute_rotation(0, 0)[:, 2], compute_rotation(0, 50)[:, 2]
+    ahead, up = compute_view_rotation(0, 0)[:, 2], compute_view_rotation(0, 50)[:, 2]
     assert ahead == pytest.approx([0, 0, 1])
     assert up[1] < -0.7
-    assert compute_rotation(90, 0)[:, 2] == pytest.approx([1, 0, 0])
+    assert compute_view_rotation(90, 0)[:, 2] == pytest.approx([1, 0, 0])
 
 
 def test_panoramas_are_recognised_by_their_borders_or_their_metadata(tmp_path):
@@ -127,7 +127,7 @@ def test_several_panoramas_are_a_scene_of_views_with_common_centres(tmp_path, mo
             first, view = poses[f"view_0/{i}.jpg"], poses[f"view_{number}/{i}.jpg"]
             assert np.abs(view[:3, 3] - first[:3, 3]).max() < 1e-6 * extent
             assert first[:3, :3].T @ view[:3, :3] == pytest.approx(
-                compute_rotation(yaw, pitch), abs=1e-6
+                compute_view_rotation(yaw, pitch), abs=1e-6
             )
     true = np.array(CENTRES)
     off = np.linalg.norm(similarity_removed(found, true) - true, axis=1)

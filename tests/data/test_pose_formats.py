@@ -10,7 +10,7 @@ import torch
 from PIL import Image
 
 from gscompleter import InputError, load_cameras
-from gscompleter.data.formats import FORMATS, open_photographs
+from gscompleter.data.formats import SCENE_FORMATS, open_photographs
 from gscompleter.data.local_origin import read_dataparser_transforms
 from gscompleter.data.points import MIN_POINTS, add_depth_range, compute_depth_range
 from gscompleter.data.scene import write_cameras
@@ -52,7 +52,7 @@ def test_every_format_shows_the_room_from_where_it_says(tmp_path, kind):
 def test_every_format_is_tried_here_or_in_the_file_of_its_own():
     of_their_own = {"chunks", "real-estate-10k", "kitti-raw", "pandaset", "mmdet3d", "waymo"}
     of_their_own |= {"polycam", "record3d", "3d-scanner-app", "photograph"}
-    assert {name for name, _ in WRITERS.values()} | of_their_own == set(FORMATS)
+    assert {name for name, _ in WRITERS.values()} | of_their_own == set(SCENE_FORMATS)
 
 
 # Cameras as targets.

@@ -17,7 +17,7 @@ from gscompleter.data.sfm.poses import find_poses
 from gscompleter.data.video import extract_frames, is_video, measure_frames, select_frames
 from gscompleter.system.errors import InputError
 from gscompleter.system.files.image import convert_to_pixels
-from gscompleter.system.files.video import find_ffmpeg, read_frames, write_video
+from gscompleter.system.files.video import find_ffmpeg, read_video, write_video
 from mapping_stand_in import model_script, similarity_removed, stand_in
 from panoramas import panorama
 from scenes import Room, camera_at, view_of
@@ -93,7 +93,7 @@ def test_ten_bits_are_read_as_eight(video, tmp_path):
     command = [find_ffmpeg(), "-v", "error", "-i", str(video), *options, str(deep)]
     subprocess.run(command, check=True)
     for is_grey in (False, True):
-        pixels, true = (next(read_frames(path, "null", is_grey)) for path in (deep, video))
+        pixels, true = (next(read_video(path, "null", is_grey)) for path in (deep, video))
         assert pixels.shape == true.shape
         assert np.abs(pixels.astype(int) - true).mean() < 6
 
@@ -102,11 +102,11 @@ def test_ten_bits_are_read_as_eight(video, tmp_path):
 def test_rotation_metadata_and_containers_are_honoured(video, tmp_path, ending):
     lying = change(video, tmp_path / f"lying{ending}", "-display_rotation", 90)
     assert is_video(lying)
-    upright, turned = (next(read_frames(path, "null", False)) for path in (video, lying))
+    upright, turned = (next(read_video(path, "null", False)) for path in (video, lying))
     assert turned.shape == (160, 120, 3)
     assert np.abs(np.rot90(upright).astype(int) - turned).mean() < 2
     assert np.abs(np.rot90(upright, 3).astype(int) - turned).mean() > 20
-    small = next(read_frames(lying, "scale=w=40:h=40:force_original_aspect_ratio=decrease", True))
+    small = next(read_video(lying, "scale=w=40:h=40:force_original_aspect_ratio=decrease", True))
     assert small.shape == (40, 30)
 
 

@@ -18,7 +18,7 @@ from gscompleter.data.driving.vehicle import build_poses
 from gscompleter.data.formats import open_photographs
 from gscompleter.data.photographs import Photographs
 from gscompleter.evaluation.cases import open_clips
-from gscompleter.evaluation.store import list_row_paths, read_json
+from gscompleter.evaluation.store import list_row_paths, read_run_file
 from kitti_city_segment import kitti_city_segment
 from waymo_segment import (
     SEGMENT,
@@ -270,7 +270,7 @@ def test_a_real_road_is_evaluated(shared, tmp_path, monkeypatch, capsys):
     words = ("--protocol", "n-2", "--limit", 1, "--resolution", 36, 120, "--quiet")
     methods = ("--methods", "context", "full", "paper")
     assert run(monkeypatch, "evaluate", root, *words, *methods, "--out", tmp_path / "out") == 0
-    rows = [read_json(path) for path in list_row_paths(tmp_path / "out")]
+    rows = [read_run_file(path) for path in list_row_paths(tmp_path / "out")]
     assert sorted(row["method"] for row in rows) == ["context", "full", "paper"]
     assert {row["task"]["name"] for row in rows} == {f"{SEGMENT} 0+2>4"}
     scores = {row["method"]: row["steps"][0]["scores"] for row in rows}
@@ -288,7 +288,9 @@ def test_what_moves_on_a_real_road_does_not_count(shared, tmp_path, monkeypatch,
     for out, more in (("all", ()), ("ignoring", ("--ignore-moving",))):
         assert run(monkeypatch, "evaluate", root, *words, *more, "--out", tmp_path / out) == 0
     found = [
-        read_json(path) for out in ("all", "ignoring") for path in list_row_paths(tmp_path / out)
+        read_run_file(path)
+        for out in ("all", "ignoring")
+        for path in list_row_paths(tmp_path / out)
     ]
     every, ignoring = (row["steps"][0]["scores"] for row in found)
     assert ignoring["hole_fraction"] > every["hole_fraction"]

@@ -12,7 +12,7 @@ from skimage.metrics import peak_signal_noise_ratio, structural_similarity
 from torch import Tensor
 
 from gscompleter.evaluation.metrics.geometry import (
-    Agreement,
+    SurfaceAgreement,
     compare_depths,
     compute_f_score,
     compute_nearest_distances,
@@ -234,7 +234,7 @@ def test_a_depth_ten_percent_too_great_has_an_abs_rel_of_a_tenth():
     everywhere = torch.ones(3, 4, dtype=torch.bool)
     found = compare_depths(1.1 * truth, truth, everywhere)
     assert found.abs_rel == pytest.approx(0.1, abs=1e-6)
-    assert compare_depths(truth, 0 * truth, everywhere) == Agreement(0)
+    assert compare_depths(truth, 0 * truth, everywhere) == SurfaceAgreement(0)
 
 
 # Point sets
@@ -312,7 +312,7 @@ def filling(context: Gaussians, factor: float = 1.0, dilation: int = 3) -> Gauss
     return gaussians_of(view, factor * view.depth)[hole.flatten()]
 
 
-def score_of(context: Gaussians, added: Gaussians, target: Camera = TARGET) -> Agreement:
+def score_of(context: Gaussians, added: Gaussians, target: Camera = TARGET) -> SurfaceAgreement:
     return measure_alignment(added, context, target, RENDERER)
 
 
@@ -381,7 +381,7 @@ def test_alignment_in_another_unit_of_length_is_the_same():
 def test_where_nothing_overlaps_there_is_no_alignment():
     context = room_context()
     nothing = score_of(context, context[:0])
-    assert nothing == Agreement(0, None, None, None)
+    assert nothing == SurfaceAgreement(0, None, None, None)
     unseen = replace(context, opacities=torch.full_like(context.opacities, 0.001))
     assert score_of(context, unseen) == nothing
     assert measure_primitive_alignment(unseen, context, TARGET, RENDERER) == nothing
@@ -436,7 +436,7 @@ def test_scores_count_the_pixels_that_they_are_measured_over():
     scores, seen = score(
         context[:0], context, context, Truth((), view), RENDERER
     )  # everything is a hole that the context fills
-    assert scores.depth_observed == Agreement(0)
+    assert scores.depth_observed == SurfaceAgreement(0)
     assert scores.depth_hole.pixels == seen.after.depth_map().valid.sum() > 500
     after = merge([context, added])
     scores, seen = score(context, after, added, truth, RENDERER, lifted)

@@ -17,7 +17,7 @@ from gscompleter.evaluation.protocols import (
     EvaluationIndex,
     Split,
     build_index,
-    find_neighbours,
+    find_neighbour_frames,
     list_indices,
     make_tasks,
     parse_protocol,
@@ -128,10 +128,10 @@ def test_scenes_of_our_indices_are_long_enough_by_the_published_ones(shared):
 
 
 def test_neighbours_exist_and_are_not_context():
-    assert find_neighbours(5, (0, 1), 10) == (4, 6)
-    assert find_neighbours(2, (0, 1), 10) == (3,)
-    assert find_neighbours(9, (0, 1), 10) == (8,)
-    assert find_neighbours(0, (2, 1), 10) == ()
+    assert find_neighbour_frames(5, (0, 1), 10) == (4, 6)
+    assert find_neighbour_frames(2, (0, 1), 10) == (3,)
+    assert find_neighbour_frames(9, (0, 1), 10) == (8,)
+    assert find_neighbour_frames(0, (2, 1), 10) == ()
 
 
 def test_a_case_has_one_target_and_loads_its_views():

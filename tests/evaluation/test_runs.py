@@ -40,7 +40,7 @@ from gscompleter.evaluation.store import (
     get_task_folder,
     load_prediction,
     load_values,
-    read_json,
+    read_run_file,
 )
 from gscompleter.evaluation.tables import summarize_run, write_tables
 from gscompleter.system import memory
@@ -103,7 +103,7 @@ def same_tables(out: Path, other: Path) -> None:
 
 
 def test_each_case_and_method_has_a_row_and_full_beats_the_context(finished):
-    content = read_json(finished / "tables.json")
+    content = read_run_file(finished / "tables.json")
     assert list(content["methods"]) == list(METHOD_NAMES)
     assert (content["cases"], len(content["common"]), content["failures"]) == (2, 2, [])
     scores = {name: row["psnr"]["value"] for name, row in content["methods"].items()}
@@ -127,7 +127,7 @@ def test_each_case_and_method_has_a_row_and_full_beats_the_context(finished):
 
 def scores_of(out: Path, method: str) -> list[dict]:
     """Return the scores of a method in each task of one step."""
-    rows = [read_json(path) for path in sorted((out / "tasks").glob(f"*/{method}.json"))]
+    rows = [read_run_file(path) for path in sorted((out / "tasks").glob(f"*/{method}.json"))]
     return [row["steps"][0]["scores"] for row in rows]
 
 
@@ -148,7 +148,7 @@ def test_what_was_added_and_all_that_was_lifted_are_compared_with_the_context(fi
 
 
 def test_geometry_of_few_pixels_is_left_out(finished):
-    rows = [read_json(path) for path in sorted((finished / "tasks").glob("*/full.json"))]
+    rows = [read_run_file(path) for path in sorted((finished / "tasks").glob("*/full.json"))]
     rows = [copy.deepcopy(rows[i % 2]) for i in range(4)]
     for number, row in enumerate(rows):
         row["task"]["name"] = str(number)
@@ -274,7 +274,7 @@ def test_time_and_memory_are_told_apart_from_scores(finished):
 def test_fid_is_a_number_or_a_reason(finished, monkeypatch):
     write_tables(finished, with_fid=True)
     text = (finished / "tables.md").read_text()
-    reason = read_json(finished / "tables.json")["fid"]["reason"]
+    reason = read_run_file(finished / "tables.json")["fid"]["reason"]
     if reason is None:
         assert "### FID" in text
     else:
@@ -363,13 +363,13 @@ def test_baselines_run(tasks, tmp_path, monkeypatch):
     out = tmp_path / "out"
     config = RunConfig(baseline_iterations=2)
     assert evaluate(tasks[:1], ("distill", "reggs"), out, config) == RowCounts(2, 0, 0)
-    rows = {path.stem: read_json(path) for path in (out / "tasks").glob("*/*.json")}
+    rows = {path.stem: read_run_file(path) for path in (out / "tasks").glob("*/*.json")}
     (distill,), (reggs,) = (rows[method]["steps"] for method in ("distill", "reggs"))
     assert (distill["added"], distill["anchor"], distill["scores"]["seam_step"]) == (0, None, None)
     assert (reggs["added"], reggs["anchor"]) == (SIZE * SIZE, 0)
     assert reggs["scores"]["registered"]["pixels"] > 500
     write_tables(out)
-    (note,) = (n for n in read_json(out / "tables.json")["notes"] if n.startswith("reggs"))
+    (note,) = (n for n in read_run_file(out / "tables.json")["notes"] if n.startswith("reggs"))
     for name in ("tables.md", "tables.tex"):
         assert note in (out / name).read_text()
 
@@ -414,7 +414,7 @@ def test_the_commands_run_end_to_end(scenes, tmp_path, monkeypatch, capsys):
     more = ["--out", tmp_path / "more", "--limit", 1, "--quiet", "--device", "cpu"]
     assert run(monkeypatch, *by_index, *more, "--resolution", 24, 24) == 0
     (row,) = (tmp_path / "more" / "tasks").glob("*/context.json")
-    assert read_json(row)["error"] is None
+    assert read_run_file(row)["error"] is None
 
 
 @pytest.mark.parametrize(("broken", "code"), [((0, 1), 1), ((1,), 3)])
@@ -465,7 +465,7 @@ def test_chunks_run_end_to_end_and_a_broken_image_costs_its_own_cases(
     assert run(monkeypatch, *arguments, "--methods", "context", "--device", "cpu") == 3
     errors = " ".join(capsys.readouterr().err.split())
     assert "Skipped wide: frame 0: its opening angle" in errors
-    rows = [read_json(path) for path in (out / "tasks").glob("*/*.json")]
+    rows = [read_run_file(path) for path in (out / "tasks").glob("*/*.json")]
     reasons = {row["task"]["name"]: row["error"] for row in rows}
     assert len(reasons) == 8
     for name, reason in reasons.items():
@@ -508,15 +508,15 @@ def test_one_case_per_scene_is_the_first(scenes, tmp_path, monkeypatch, capsys):
     def names(out: Path, *words: object) -> set[str]:
         options = ("--methods", "context", "--device", "cpu", "--quiet", "--out", out)
         assert run(monkeypatch, "evaluate", *words, *options) == 0
-        return {read_json(path)["task"]["name"] for path in out.glob("tasks/*/context.json")}
+        return {read_run_file(path)["task"]["name"] for path in out.glob("tasks/*/context.json")}
 
     clips = (scenes / "box", scenes / "wide", "--resolution", 24, 24, "--protocol", "n-1")
     assert len(names(tmp_path / "all", *clips)) == 4
     once = names(tmp_path / "once", *clips, "--one-per-scene")
     assert once == {"box 0+1>2", "wide 0+1>2"}
-    assert read_json(tmp_path / "once" / "run.json")["source"]["one_per_scene"] is True
+    assert read_run_file(tmp_path / "once" / "run.json")["source"]["one_per_scene"] is True
 
-    content = read_json(scenes / "cases.json")
+    content = read_run_file(scenes / "cases.json")
     turned = {**content["cases"][0], "context": [1, 0]}
     content["cases"] = [*content["cases"], turned]
     file = scenes / "three.json"
@@ -546,4 +546,4 @@ def test_a_task_beyond_the_memory_is_a_row_that_says_so(tasks, tmp_path, monkeyp
     monkeypatch.setattr(memory, "read_memory_bytes", lambda: 10**8)
     assert evaluate(tasks[:1], ("full",), tmp_path / "out", CONFIG) == RowCounts(0, 1, 0)
     (row,) = (tmp_path / "out" / "tasks").glob("*/full.json")
-    assert "of memory, and there are 1 GB; choose a smaller" in read_json(row)["error"]
+    assert "of memory, and there are 1 GB; choose a smaller" in read_run_file(row)["error"]

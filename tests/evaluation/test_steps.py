@@ -30,7 +30,7 @@ from gscompleter.evaluation.steps import (
     compute_scale_drift,
     get_metric_depth,
 )
-from gscompleter.evaluation.store import read_json
+from gscompleter.evaluation.store import read_run_file
 from gscompleter.evaluation.tables import write_tables
 from gscompleter.numerics.geometry import slide
 from gscompleter.system.files.image import read_pixels
@@ -129,7 +129,7 @@ def turned_away(view: View) -> View:
 
 def without_cost(path: Path) -> bytes:
     """Drop times and memory from a row, but keep the names of stages."""
-    row = read_json(path)
+    row = read_run_file(path)
     for step in row["steps"]:
         step["seconds"], step["peak_bytes"] = sorted(step["seconds"]), None
     row["reconstruct_seconds"] = None
@@ -225,7 +225,7 @@ def test_the_baseline_may_choose_them_too(begun, finished):
         assert state.views[predicted.anchor].frame == 2
         assert not predicted.anchor_fallback
         assert METHODS[method](away, begun.targets[0].camera, begun.models).anchor_fallback
-    steps = read_json(finished / "tasks" / FOLDER / "reggs.json")["steps"]
+    steps = read_run_file(finished / "tasks" / FOLDER / "reggs.json")["steps"]
     assert [step["anchor"] for step in steps] == [
         0,
         0,
@@ -235,7 +235,7 @@ def test_the_baseline_may_choose_them_too(begun, finished):
 
 def test_the_baseline_adds_all_that_it_lifts_and_the_context_adds_nothing(finished):
     folder = finished / "tasks" / FOLDER
-    reggs, context = (read_json(folder / f"{name}.json") for name in ("reggs", "context"))
+    reggs, context = (read_run_file(folder / f"{name}.json") for name in ("reggs", "context"))
     assert [step["added"] for step in reggs["steps"]] == [SIZE * SIZE] * 2
     for step in context["steps"]:
         assert psnr_of(step, "before") == psnr_of(step) == step["psnr_end"]
@@ -329,7 +329,7 @@ def test_rows_that_are_lost_are_made_again_from_what_is_saved(finished, tmp_path
 def test_a_picture_shows_what_the_camera_of_a_step_sees(finished):
     folder = finished / "tasks" / FOLDER
     truth = view_of(ROOM, CAMERAS[3]).image
-    row = read_json(folder / "full.json")
+    row = read_run_file(folder / "full.json")
     seen = torch.from_numpy(read_pixels(folder / "full" / "step-002.png")) / 255
     psnr = -10 * math.log10((seen - truth).square().mean().item())
     assert psnr == pytest.approx(psnr_of(row["steps"][1]), abs=0.1)
@@ -338,11 +338,11 @@ def test_a_picture_shows_what_the_camera_of_a_step_sees(finished):
 def test_a_broken_frame_costs_its_sequence(tmp_path):
     out = tmp_path / "out"
     assert evaluate([walk(broken=(4,))], ["full"], out, CONFIG) == RowCounts(0, 1, 0)
-    (row,) = map(read_json, (out / "tasks").glob("*/*.json"))
+    (row,) = map(read_run_file, (out / "tasks").glob("*/*.json"))
     assert row["error"] == "The image of frame 4 is damaged; download it again."
     assert row["steps"] == []
     write_tables(out)
-    content = read_json(out / "tables.json")
+    content = read_run_file(out / "tables.json")
     assert (content["cases"], content["common"]) == (1, [])
     assert "frame 4 is damaged" in (out / "tables.md").read_text()
 
@@ -375,9 +375,9 @@ def test_methods_that_change_the_scene_are_refused(tmp_path):
 
 
 def test_the_tables_say_what_the_steps_say(finished):
-    content = read_json(finished / "tables.json")
+    content = read_run_file(finished / "tables.json")
     assert list(content["methods"]) == list(METHOD_NAMES)
-    steps = read_json(finished / "tasks" / FOLDER / "full.json")["steps"]
+    steps = read_run_file(finished / "tasks" / FOLDER / "full.json")["steps"]
     full = {key: cell for key, cell in content["methods"]["full"].items() if key != "finished"}
     full = {key: cell["value"] for key, cell in full.items()}
     assert full["psnr"] == pytest.approx(sum(map(psnr_of, steps)) / 2)
@@ -418,7 +418,7 @@ def test_the_command_runs_end_to_end(tmp_path, monkeypatch, capsys):
     assert "Scored 2, failed 0" in captured.err
     assert "1 of 1 cases" in captured.out
     assert "PSNR at the end" in captured.out
-    scores = read_json(out / "tables.json")["methods"]
+    scores = read_run_file(out / "tables.json")["methods"]
     assert scores["full"]["psnr"]["value"] > scores["context"]["psnr"]["value"] + 0.5
     assert run(monkeypatch, *arguments, "context", "full", "--quiet") == 0
     assert capsys.readouterr().out == ""

@@ -14,7 +14,7 @@ from gscompleter.numerics.geometry import project
 from gscompleter.numerics.sky import SKY_DEPTH, extend_sky, is_sky, mask_out_sky
 from gscompleter.reconstructors.features.depth_range import get_depth_range, set_depth_range
 from gscompleter.reconstructors.plane_sweep import PlaneSweep
-from gscompleter.reconstructors.plane_sweep.sweep import find_hidden
+from gscompleter.reconstructors.plane_sweep.sweep import find_hidden_pixels
 from gscompleter.render.loading import load_renderer
 from gscompleter.stages.extrapolate_registration import extrapolate_sky
 from gscompleter.types import SH_C0, DepthMap, View, sh_from_rgb
@@ -203,6 +203,6 @@ def test_what_another_view_could_not_have_seen_is_hidden_by_nothing():
     there, back = np.eye(3, 4, dtype=np.float32), np.eye(3, 4, dtype=np.float32)
     there[0, 3], back[0, 3] = -10, 10
     near = np.full((32, 32), 0.5, np.float32), there, back
-    hidden = find_hidden(np.full((32, 32), 0.1, np.float32), [near])
+    hidden = find_hidden_pixels(np.full((32, 32), 0.1, np.float32), [near])
     assert hidden[:, 6:].all()
     assert not hidden[:, :4].any()

@@ -9,7 +9,7 @@ import torch
 from gscompleter import GSCompleter, View, load_renderer
 from gscompleter.evaluation.metrics.image import psnr
 from gscompleter.reconstructors.plane_sweep import PlaneSweep, gaussians
-from gscompleter.reconstructors.plane_sweep.fusion import Layer, estimate_gains
+from gscompleter.reconstructors.plane_sweep.fusion import DepthLayer, estimate_gains
 from gscompleter.reconstructors.plane_sweep.rig import build_rig
 from scenes import Room, camera_at, view_of
 
@@ -39,7 +39,7 @@ def found_gains(views: list[View]) -> np.ndarray:
     """Gains that perfect stereo gives."""
     rig = build_rig(views)
     inverses = [np.float32(rig.unit) / view.depth.numpy() for view in views]
-    layers = [Layer(i, d, np.ones_like(d)) for i, d in zip(rig.images, inverses, strict=True)]
+    layers = [DepthLayer(i, d, np.ones_like(d)) for i, d in zip(rig.images, inverses, strict=True)]
     return estimate_gains(layers, rig.transforms)
 
 

@@ -19,7 +19,7 @@ from gscompleter.reconstructors.features.stereo_image import make_stereo_images
 from gscompleter.reconstructors.plane_sweep import PlaneSweep
 from gscompleter.reconstructors.plane_sweep.fit import STEPS_PER_VIEW, fit_jointly, shuffle_views
 from gscompleter.reconstructors.plane_sweep.fusion import (
-    Layer,
+    DepthLayer,
     find_finest_pixels,
     find_free_pixels,
 )
@@ -35,13 +35,13 @@ def row_of_views(count: int, size: int = SIZE) -> list[View]:
     return [view_of(Room(), camera_at(x, size=size)) for x in offsets.tolist()]
 
 
-def true_layers(views: list[View], measured: float = 1.0) -> tuple[list[Layer], dict]:
+def true_layers(views: list[View], measured: float = 1.0) -> tuple[list[DepthLayer], dict]:
     """Layers of perfect stereo."""
     rig = build_rig(views)
     layers = []
     for view, image in zip(views, rig.images, strict=True):
         inverse = np.float32(rig.unit) / view.depth.numpy()
-        layers.append(Layer(image, inverse, np.full_like(inverse, measured)))
+        layers.append(DepthLayer(image, inverse, np.full_like(inverse, measured)))
     return layers, rig.transforms
 
 

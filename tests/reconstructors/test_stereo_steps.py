@@ -10,7 +10,7 @@ import torch
 
 from gscompleter.evaluation.metrics.image import psnr
 from gscompleter.numerics.kernels import stereo, tgv
-from gscompleter.numerics.kernels.parallel import run
+from gscompleter.numerics.kernels.parallel import run_calls
 from gscompleter.reconstructors.features.matches import detect_features, match_features
 from gscompleter.reconstructors.features.stereo_image import (
     StereoImage,
@@ -23,7 +23,7 @@ from gscompleter.reconstructors.plane_sweep.rig import compute_epipolar_distance
 from gscompleter.reconstructors.plane_sweep.surfaces import fit_surfaces
 from gscompleter.reconstructors.plane_sweep.sweep import (
     compute_confidence,
-    find_hidden,
+    find_hidden_pixels,
     remove_speckles,
 )
 from gscompleter.render.cpu import CpuFrozenScene
@@ -135,7 +135,7 @@ def test_what_only_one_view_sees_past_an_object_is_found_occluded():
     right_from_left = compute_source_from_reference(left, right)
     left_from_right = compute_source_from_reference(right, left)
     visible, _ = stereo.reproject(*inverse, right_from_left, left_from_right)
-    hidden = find_hidden(inverse[0], [(inverse[1], right_from_left, left_from_right)])
+    hidden = find_hidden_pixels(inverse[0], [(inverse[1], right_from_left, left_from_right)])
     assert hidden.sum() > 50
     assert not hidden[(visible >= 0) & (visible < 1.5)].any()
     assert not hidden[visible < 0].any()
@@ -205,7 +205,7 @@ def test_bands_of_rows_fit_the_surfaces_of_one(monkeypatch, threads, iterations)
 
     def counted(kernel, calls, threads):
         parts.append(len(calls))
-        return run(kernel, calls, threads)
+        return run_calls(kernel, calls, threads)
 
     monkeypatch.setattr(tgv, "run", counted)
     for count in (1, threads):

@@ -8,7 +8,7 @@ import torch
 from gscompleter import GSCompleter
 from gscompleter.completer import check_any_completed
 from gscompleter.guards.psnr import PsnrGuard
-from gscompleter.stages.find_unfilled import find_regions
+from gscompleter.stages.find_unfilled import find_largest_regions
 from gscompleter.state import Completion, Unfilled
 from scenes import Room, camera_at, view_of
 
@@ -57,5 +57,5 @@ def test_regions_are_the_largest_first_and_count_from_the_corner_of_the_target()
     mask = torch.zeros(20, 30, dtype=torch.bool)
     mask[2:4, 3:5] = True
     mask[10:16, 20:30] = True
-    assert find_regions(mask, -5, -2) == ((15, 8, 25, 14), (-2, 0, 0, 2))
-    assert find_regions(mask[:1], 0, 0) == ()
+    assert find_largest_regions(mask, -5, -2) == ((15, 8, 25, 14), (-2, 0, 0, 2))
+    assert find_largest_regions(mask[:1], 0, 0) == ()

@@ -11,7 +11,7 @@ from gscompleter.render.cache import SceneRenderer
 from gscompleter.render.cpu import CpuRenderer
 from gscompleter.render.loading import load_renderer
 from gscompleter.render.spherical_harmonics import evaluate_sh_basis
-from gscompleter.stages.recolor import fit_colors
+from gscompleter.stages.recolor import fit_image_colors
 from gscompleter.trust import HeldViews
 from gscompleter.trust.photometric import load_trust, sum_weights
 from gscompleter.types import ContextScene, View
@@ -48,7 +48,7 @@ def darker(scene, camera) -> View:
 def recolored(scene, camera=TARGET, weight=LEFT, held=None, config=CONFIG, renderer=RENDERER):
     held = hold(scene, config) if held is None else held
     frozen, wanted = renderer.freeze(scene, camera), darker(scene, camera)
-    return fit_colors(scene, frozen, wanted, weight, held, renderer, config)
+    return fit_image_colors(scene, frozen, wanted, weight, held, renderer, config)
 
 
 def change(scene, **kwargs):

@@ -15,7 +15,7 @@ import torch
 from torch import Tensor
 
 from gscompleter.numerics.geometry import is_inside
-from gscompleter.render.reference import Splats, composite, project
+from gscompleter.render.reference import ProjectedSplats, composite_splats, project_gaussians
 from gscompleter.render.spherical_harmonics import evaluate_sh_basis
 from gscompleter.types import Camera, make_observed, sh_from_rgb
 
@@ -59,7 +59,7 @@ def rasterization(
     }
     values = torch.zeros(1, n, 4)
     for i in range(n):
-        own = project(gaussians[i : i + 1], camera)
+        own = project_gaussians(gaussians[i : i + 1], camera)
         if len(own.depths) == 0 or not touches(own, camera):
             continue
         found["radii"][0, i] = 1
@@ -78,7 +78,7 @@ def rasterization(
     return torch.cat([sums[..., :3], depth], dim=-1), alphas, found
 
 
-def touches(splats: Splats, camera: Camera) -> bool:
+def touches(splats: ProjectedSplats, camera: Camera) -> bool:
     """Return True if the box of a single splat reaches the image."""
     covariance = torch.linalg.inv(splats.precisions[0])
     reach = 3.33 * covariance.diagonal().sqrt()
@@ -110,10 +110,12 @@ def rasterize_to_pixels(
     precisions = conics[0, order][:, [0, 1, 1, 2]].view(-1, 2, 2)
     # The reference sums three channels and a fourth in place of the depth.
     values = torch.nn.functional.pad(colors[0, order], (0, 4 - colors.shape[2]))
-    splats = Splats(means2d[0, order], precisions, values[:, 3], opacities[0, order], values[:, :3])
+    splats = ProjectedSplats(
+        means2d[0, order], precisions, values[:, 3], opacities[0, order], values[:, :3]
+    )
     x, y = torch.arange(image_width) + 0.5, torch.arange(image_height) + 0.5
     pixels = torch.stack(torch.meshgrid(x, y, indexing="xy"), dim=-1).reshape(-1, 2)
-    colour, depth, alpha = composite(splats, pixels)
+    colour, depth, alpha = composite_splats(splats, pixels)
     size = (1, image_height, image_width)
     sums = torch.cat([colour, depth[:, None]], dim=-1)[:, : colors.shape[2]]
     return sums.view(*size, -1), alpha.view(*size, 1)

@@ -13,7 +13,7 @@ import torch
 from gscompleter.numerics.kernels.parallel import (
     get_thread_pool,
     map_small_tasks,
-    run,
+    run_calls,
     run_in_background,
     share,
 )
@@ -152,9 +152,11 @@ def test_who_asks_works_where_others_keep_the_threads_busy(monkeypatch):
     done = threading.Event()
     busy = get_thread_pool(1, os.getpid()).submit(done.wait, 60)
     try:
-        assert run(divmod, [(number, 3) for number in range(7)]) == [divmod(n, 3) for n in range(7)]
+        assert run_calls(divmod, [(number, 3) for number in range(7)]) == [
+            divmod(n, 3) for n in range(7)
+        ]
         with pytest.raises(ZeroDivisionError):
-            run(divmod, [(1, 1), (1, 0), (2, 1)])
+            run_calls(divmod, [(1, 1), (1, 0), (2, 1)])
         assert not busy.done()
     finally:
         done.set()
@@ -168,6 +170,6 @@ def test_pieces_are_taken_by_all_threads_and_come_in_their_order(monkeypatch):
         together.wait()  # Nobody gets on before three are here.
         return number, threading.get_ident()
 
-    found = run(piece, [(number,) for number in range(6)])
+    found = run_calls(piece, [(number,) for number in range(6)])
     assert [number for number, _ in found] == list(range(6))
     assert len({thread for _, thread in found}) == 3

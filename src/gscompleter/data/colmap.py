@@ -163,7 +163,7 @@ def build_intrinsics(
     return Intrinsics(size, focal, (values["cx"], values["cy"]), distortion=distortion)
 
 
-def read_cameras(path: Path) -> dict[int, Intrinsics]:
+def read_intrinsics(path: Path) -> dict[int, Intrinsics]:
     """Read the cameras of a cameras.bin or cameras.txt by number."""
     if _is_text(path):
         entries = _parse_lines(path, "CAMERA_ID MODEL WIDTH HEIGHT PARAMS…", _parse_camera)
@@ -415,7 +415,7 @@ def read_image_file(path: Path) -> list[Frame]:
             f"There is no cameras.txt or cameras.bin beside {quote_value(path)}, and it holds "
             "poses only; copy it there from the same model."
         )
-    cameras = read_cameras(cameras_file)
+    cameras = read_intrinsics(cameras_file)
     images = read_images(path)
     if not images:
         raise InputError(f"{quote_value(path)} lists no images; export the model again.")

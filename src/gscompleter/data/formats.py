@@ -40,7 +40,7 @@ from gscompleter.system.files.reading import list_folders
 
 
 @dataclass(frozen=True)
-class Format:
+class SceneFormat:
     """A layout of posed photographs on disk."""
 
     detect: Callable[[Path], object]
@@ -63,23 +63,23 @@ MAX_NAMED = 4
 MAX_BELOW = 1000
 """Most folders below a path that are searched for scenes to name."""
 
-FORMATS = {
-    "chunks": Format(has_chunks, open_chunks),
-    "dgp": Format(list_scene_files, open_dgp, "m"),
-    "nerfstudio": Format(has_transforms, open_transforms),
-    "colmap": Format(has_colmap, open_colmap),
-    "cameras-json": Format(has_camera_list, open_camera_list),
-    "llff": Format(has_llff, open_llff),
-    "kitti": Format(has_kitti, open_kitti, "m"),
-    "kitti-raw": Format(has_kitti_raw, open_kitti_raw, "m"),
-    "pandaset": Format(has_pandaset, open_pandaset, "m"),
-    "mmdet3d": Format(has_infos, open_infos, "m"),
-    "waymo": Format(list_segments, open_waymo, "m"),
-    "real-estate-10k": Format(list_camera_files, open_camera_files),
-    "polycam": Format(POLYCAM.find_frames, POLYCAM.open, "m"),
-    "record3d": Format(find_recording, open_recording, "m"),
-    "3d-scanner-app": Format(SCANNER_APP.find_frames, SCANNER_APP.open, "m"),
-    "photograph": Format(find_photograph, open_photograph),
+SCENE_FORMATS = {
+    "chunks": SceneFormat(has_chunks, open_chunks),
+    "dgp": SceneFormat(list_scene_files, open_dgp, "m"),
+    "nerfstudio": SceneFormat(has_transforms, open_transforms),
+    "colmap": SceneFormat(has_colmap, open_colmap),
+    "cameras-json": SceneFormat(has_camera_list, open_camera_list),
+    "llff": SceneFormat(has_llff, open_llff),
+    "kitti": SceneFormat(has_kitti, open_kitti, "m"),
+    "kitti-raw": SceneFormat(has_kitti_raw, open_kitti_raw, "m"),
+    "pandaset": SceneFormat(has_pandaset, open_pandaset, "m"),
+    "mmdet3d": SceneFormat(has_infos, open_infos, "m"),
+    "waymo": SceneFormat(list_segments, open_waymo, "m"),
+    "real-estate-10k": SceneFormat(list_camera_files, open_camera_files),
+    "polycam": SceneFormat(POLYCAM.find_frames, POLYCAM.open, "m"),
+    "record3d": SceneFormat(find_recording, open_recording, "m"),
+    "3d-scanner-app": SceneFormat(SCANNER_APP.find_frames, SCANNER_APP.open, "m"),
+    "photograph": SceneFormat(find_photograph, open_photograph),
 }
 """Formats by the names that `open_photographs` takes, in the order of detection."""
 
@@ -96,7 +96,7 @@ def open_photographs(
     path = require_path(path)
     format_name = detect_format(path, format)
     # Two scenes are enough to know that there are several, and opening one may take long.
-    scene, *others = islice(FORMATS[format_name].open(path), 2)
+    scene, *others = islice(SCENE_FORMATS[format_name].open(path), 2)
     names = " and ".join(quote_value(one.name) for one in (scene, *others))
     require(
         not others,
@@ -116,14 +116,14 @@ def open_photographs(
 
 def detect_format(path: Path, name: str | None = None) -> str:
     """Return the given format name after checking it, or detect the format of `path`."""
-    formats = ", ".join(FORMATS)
+    formats = ", ".join(SCENE_FORMATS)
     advice = "name photographs with cameras, such as colmap, nerfstudio or others (docs/formats.md)"
     require(
-        name is None or (isinstance(name, str) and name in FORMATS),
+        name is None or (isinstance(name, str) and name in SCENE_FORMATS),
         f"There is no format '{quote_value(name)}'; choose one of {formats}.",
     )
     require(os.path.exists(path), f"There is no {quote_value(path)}; {advice}.")
-    if name is not None and FORMATS[name].detect(path):
+    if name is not None and SCENE_FORMATS[name].detect(path):
         return name
     # A named format that does not fit is an error; another one is not tried.
     detected = None if name else find_format(path)
@@ -183,4 +183,4 @@ def refuse_unread(path: Path) -> None:
 
 def find_format(path: Path) -> str | None:
     """Detect the first format that fits a file or folder; None if none does."""
-    return next((name for name, format in FORMATS.items() if format.detect(path)), None)
+    return next((name for name, format in SCENE_FORMATS.items() if format.detect(path)), None)

@@ -124,7 +124,7 @@ def load_mask(
     return np.array(scaled, dtype=bool)
 
 
-def find_hidden(
+def find_masked(
     frame: Frame, alpha: UInt8[np.ndarray, "h w"] | None, size: tuple[int, int], orientation: int
 ) -> Bool[np.ndarray, "h w"] | None:
     """Find the pixels of an upright photograph that its mask or its alpha hides; None if none."""

@@ -99,7 +99,7 @@ def split_panorama(
         scaled = Image.fromarray(hidden).resize(panorama.size, Image.Resampling.NEAREST)
         mask = np.pad(np.asarray(scaled, np.uint8), ((0, 0), (BORDER, BORDER)), mode="wrap")
     for view in VIEWS:
-        places = _project_rays(compute_rotation(*view), panorama.width)
+        places = _project_rays(compute_view_rotation(*view), panorama.width)
         seen = None if mask is None else remap(mask, places, cv2.INTER_NEAREST) > 0
         yield remap(pixels, places, cv2.INTER_CUBIC), seen
 
@@ -119,7 +119,7 @@ def _project_rays(rotation: Float[np.ndarray, "3 3"], width: int) -> Float[np.nd
     return np.stack([x, y], axis=-1).astype(np.float32)
 
 
-def compute_rotation(yaw: int, pitch: int) -> Float[np.ndarray, "3 3"]:
+def compute_view_rotation(yaw: int, pitch: int) -> Float[np.ndarray, "3 3"]:
     """Compute the rotation from the axes of a view (degrees) to those of its panorama."""
     turned = (0.0, math.radians(yaw), 0.0)
     raised = (math.radians(pitch), 0.0, 0.0)

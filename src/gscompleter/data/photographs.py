@@ -23,7 +23,7 @@ from torch import Tensor
 from gscompleter.data.cameras import compute_fov, compute_undistortion_map, find_pose_defect, remap
 from gscompleter.data.frame import Frame
 from gscompleter.data.local_origin import choose_local_origin
-from gscompleter.data.masks import fill_hidden, find_hidden
+from gscompleter.data.masks import fill_hidden, find_masked
 from gscompleter.data.moving_boxes import mask_moving
 from gscompleter.numerics.geometry import compute_sparse_depth
 from gscompleter.system.errors import InputError, join_names, quote_value
@@ -283,7 +283,7 @@ class Photographs:
         if not self.is_masked:
             return (colors if alpha is None else composite_over_black(colors, alpha)), None
         size = colors.shape[1], colors.shape[0]
-        hidden = find_hidden(frame, alpha, size, orientation)
+        hidden = find_masked(frame, alpha, size, orientation)
         return (colors if hidden is None else fill_hidden(colors, hidden)), hidden
 
     def _load_depth(

@@ -17,7 +17,7 @@ from PIL import Image
 
 from gscompleter.data.limits import require
 from gscompleter.system.errors import quote_value
-from gscompleter.system.files.video import read_frames
+from gscompleter.system.files.video import read_video
 from gscompleter.system.progress import stage
 
 Image8 = UInt8[np.ndarray, "h w"]
@@ -53,14 +53,14 @@ def extract_frames(video: Path, folder: Path, count: int) -> None:
     # ffmpeg shrinks the frames itself, which saves their transport; small ones stay as they are.
     size = f"'min({SMALL_SIDE},iw)':'min({SMALL_SIDE},ih)':force_original_aspect_ratio=decrease"
     with stage("Choosing frames"):
-        small = read_frames(video, f"scale={size}:flags=area", is_grey=True)
+        small = read_video(video, f"scale={size}:flags=area", is_grey=True)
         chosen = select_frames(*measure_frames(small), count)
         require(
             len(chosen) >= MIN_FRAMES,
             f"The camera hardly moves in {quote_value(video, 80)}, of which {len(chosen)} frames "
             f"differ and {MIN_FRAMES} are needed; film for longer, and walk around the scene.",
         )
-        images = read_frames(video, f"select='{_write_choice(chosen)}'", is_grey=False)
+        images = read_video(video, f"select='{_write_choice(chosen)}'", is_grey=False)
         for number, pixels in zip(chosen, images, strict=True):
             path = folder / f"frame_{number:06d}.jpg"
             Image.fromarray(pixels).save(path, quality=QUALITY, subsampling=0)

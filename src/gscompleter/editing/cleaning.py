@@ -166,12 +166,14 @@ def exclude_needed(
         missing_before = missing
         for view, max_error in zip(views, max_errors, strict=True):
             plan = renderer.freeze(rest, view.camera).vary_opacities(candidates)
-            missing = missing & ~find_needed(plan, candidates.opacities, missing, view, max_error)
+            missing = missing & ~find_needed_by_photographs(
+                plan, candidates.opacities, missing, view, max_error
+            )
         if torch.equal(missing, missing_before):
             return removable.masked_scatter(removable, missing)
 
 
-def find_needed(
+def find_needed_by_photographs(
     plan: OpacityRender,
     opacities: Float[Tensor, "n"],
     missing: Bool[Tensor, "n"],

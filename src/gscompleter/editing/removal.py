@@ -136,7 +136,7 @@ def restore_surroundings(state: Completion, renderer: Renderer) -> Completion:
     added = fade_harmful(state.added[~is_rest], merge([known, revealed]), state, renderer)
 
     # Revealed Gaussians that return follow those that are rendered, as rows of their own.
-    is_needed = find_needed(revealed, known, added, views, renderer)
+    is_needed = find_needed_revealed(revealed, known, added, views, renderer)
     returned = revealed[is_needed]
     is_returned = is_revealed.masked_scatter(is_revealed, is_needed)
     rows = len(source.rendered) + torch.arange(len(returned), device=is_returned.device)
@@ -158,7 +158,7 @@ def restore_surroundings(state: Completion, renderer: Renderer) -> Completion:
     )
 
 
-def find_needed(
+def find_needed_revealed(
     revealed: Gaussians,
     known: Gaussians,
     added: Gaussians,

@@ -16,7 +16,7 @@ from pathlib import Path
 from typing import Any
 
 from gscompleter.data.ego_vehicle import attach_vehicle_detector
-from gscompleter.data.formats import FORMATS, detect_format, find_format, open_photographs
+from gscompleter.data.formats import SCENE_FORMATS, detect_format, find_format, open_photographs
 from gscompleter.data.frame import describe_moved
 from gscompleter.data.masks import attach_masks
 from gscompleter.data.photographs import MAX_TRANSLATION, Photographs, Resolution
@@ -122,7 +122,7 @@ def open_clips(path: Path | str) -> Iterator[Photographs]:
 
     For a vehicle with several cameras only the front camera is used.
     """
-    scenes = [(FORMATS[detect_format(place)], place) for place in list_scenes(Path(path))]
+    scenes = [(SCENE_FORMATS[detect_format(place)], place) for place in list_scenes(Path(path))]
     for format, place in scenes:
         for clip in format.open(place):
             ahead = [frame for frame in clip.frames if clip.front in (None, frame.sensor)]

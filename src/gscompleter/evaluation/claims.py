@@ -20,7 +20,7 @@ from scipy.stats import binomtest
 from gscompleter.evaluation.columns import BY_KEY, Column
 from gscompleter.evaluation.paper import Claim
 from gscompleter.evaluation.paper_tables import SIGNIFICANCE, Estimate, estimate_mean, get_scene
-from gscompleter.evaluation.store import read_json
+from gscompleter.evaluation.store import read_run_file
 
 HEAD = ("claim", "the paper", "table", "measured", "t test", "in favour", "sign test", "verdict")
 """Titles of the columns of a table of claims."""
@@ -83,7 +83,7 @@ def tabulate_claims(folder: Path, claims: Iterable[Claim]) -> list[list[str]]:
 def judge_claim(folder: Path, claim: Claim) -> Judgement:
     """Judge a claim by the table in a folder."""
     path = folder / f"{claim.table}.json"
-    rows: Rows = list(read_json(path)["rows"]) if path.is_file() else []
+    rows: Rows = list(read_run_file(path)["rows"]) if path.is_file() else []
     if claim.model is not None:
         rows = [row for row in rows if row["model"] == claim.model]
     column = BY_KEY[claim.column]

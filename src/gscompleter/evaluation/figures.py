@@ -40,7 +40,7 @@ def list_cases(runs: Mapping[str, Path], methods: Sequence[str]) -> list[FigureC
     common: dict[FigureCase, int] = {}
     for folder in runs.values():
         for path in store.list_row_paths(folder):
-            row = store.read_json(path)
+            row = store.read_run_file(path)
             if row["method"] in methods and row["error"] is None:
                 for number in range(1, len(row["steps"]) + 1):
                     case = FigureCase(row["task"]["name"], number)

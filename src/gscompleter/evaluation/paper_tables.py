@@ -22,7 +22,7 @@ from gscompleter.evaluation.tables import (
     format_latex,
     format_markdown,
     format_score,
-    read_rows,
+    read_run_rows,
     summarize_run,
 )
 from gscompleter.system.files.writing import encode_text, replace_file
@@ -147,7 +147,7 @@ def fill_table(spec: TableSpec, runs: Mapping[tuple[str, str], Path]) -> PaperTa
     notes = []
     for (model, protocol), folder in runs.items():
         # Every method is averaged over the same cases, those that all finished.
-        summary = summarize_run([r for r in read_rows(folder) if r["method"] in spec.methods])
+        summary = summarize_run([r for r in read_run_rows(folder) if r["method"] in spec.methods])
         fids = compute_fids(folder, summary) if "fid" in spec.columns else {}
         notes += [f"Failed: {' '.join(failure)}" for failure in summary.failures]
         notes += [fids] if isinstance(fids, str) else []
@@ -235,7 +235,7 @@ def format_rows(
     return head, rows
 
 
-def format_number(column: Column, cell: Cell, error: str, difference: str) -> str:
+def format_paper_number(column: Column, cell: Cell, error: str, difference: str) -> str:
     """Format a cell with templates of its error and its difference."""
     text = format_score(cell.value, column.digits)
     digits = column.digits
@@ -251,7 +251,7 @@ def format_paper_markdown(table: PaperTable) -> str:
     """Format a table with its title and notes."""
     counts = [f"{count} ({name})" for name, count in table.num_cases.items()]
     about = ABOUT.format(baseline=table.spec.baseline, cases=", ".join(counts))
-    head, rows = format_rows(table, partial(format_number, error=" ± {}", difference=" ({})"))
+    head, rows = format_rows(table, partial(format_paper_number, error=" ± {}", difference=" ({})"))
     notes = [f"{note}\n" for note in table.notes]
     body = [format_markdown(head, rows), *describe_missing(table), *notes]
     return "\n".join([f"## {table.spec.title}\n", f"{about}\n", *body])
@@ -267,7 +267,7 @@ def describe_missing(table: PaperTable) -> list[str]:
 
 def format_paper_latex(table: PaperTable) -> str:
     """Format a table with booktabs."""
-    cell = partial(format_number, error=r"{{\tiny$\pm${}}}", difference=r"~{{\tiny({})}}")
+    cell = partial(format_paper_number, error=r"{{\tiny$\pm${}}}", difference=r"~{{\tiny({})}}")
     text = format_latex(*format_rows(table, cell))
     # pdfLaTeX knows none of these characters.
     for sign, command in {"≈": r"$\approx$", "Ψ": r"$\Psi$", "Δ": r"$\Delta$"}.items():

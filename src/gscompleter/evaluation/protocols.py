@@ -253,7 +253,7 @@ def make_tasks(
             tasks.append(Task(clip.name, split.context, split.targets, load, (), keeps_order))
             continue
         for target in split.targets:
-            beside = find_neighbours(target, split.context, len(clip))
+            beside = find_neighbour_frames(target, split.context, len(clip))
             tasks.append(Task(clip.name, split.context, (target,), load, beside, keeps_order))
     return tasks
 
@@ -265,7 +265,7 @@ def load_clip_views(
     return clip.views(frames, resolution)
 
 
-def find_neighbours(target: int, context: Sequence[int], num_frames: int) -> tuple[int, ...]:
+def find_neighbour_frames(target: int, context: Sequence[int], num_frames: int) -> tuple[int, ...]:
     """Return the frames before and after `target` that exist and are not context."""
     beside = (target - 1, target + 1)
     return tuple(frame for frame in beside if 0 <= frame < num_frames and frame not in context)

@@ -134,7 +134,7 @@ def evaluate(
 def list_failures(runner: TaskRunner, tasks: Sequence[Task]) -> list[str]:
     """Describe the rows of tasks that hold an error, with the reason of each."""
     return [
-        f"{task.name}, {method}: {store.read_json(row)['error']}"
+        f"{task.name}, {method}: {store.read_run_file(row)['error']}"
         for task in tasks
         for row, method in runner.find_rows(task).items()
         if has_failed(row)
@@ -143,7 +143,7 @@ def list_failures(runner: TaskRunner, tasks: Sequence[Task]) -> list[str]:
 
 def has_failed(row: Path) -> bool:
     """Return True if a row exists and holds an error."""
-    return row.exists() and store.read_json(row).get("error") is not None
+    return row.exists() and store.read_run_file(row).get("error") is not None
 
 
 @dataclass(frozen=True)
@@ -156,7 +156,9 @@ class TaskRunner:
 
     def find_rows(self, task: Task) -> dict[Path, str]:
         """Return the paths of the rows of a task, with their methods."""
-        return {store.get_row_path(self.out, task.name, method): method for method in self.methods}
+        return {
+            store.get_score_path(self.out, task.name, method): method for method in self.methods
+        }
 
     def find_missing_rows(self, task: Task) -> dict[Path, str]:
         """Return the rows of a task that have to be computed, with their methods."""

@@ -42,7 +42,7 @@ class PreparedTask:
 
 
 @dataclass(frozen=True)
-class Step:
+class SequenceStep:
     """Result of a method for one target."""
 
     frame: int
@@ -67,7 +67,7 @@ class Progress:
 
     scene: Gaussians
     views: tuple[View, ...]
-    steps: tuple[Step, ...] = ()
+    steps: tuple[SequenceStep, ...] = ()
     error: str | None = None
 
 
@@ -117,7 +117,7 @@ def advance_task(
 
 def score_step(
     prediction: Prediction, state: Completion, target: View, task: PreparedTask
-) -> tuple[Step, scoring.TargetRenders]:
+) -> tuple[SequenceStep, scoring.TargetRenders]:
     """Score a step and render its target camera."""
     truth = scoring.Truth(state.views, target, task.neighbours)
     before = state.scene
@@ -136,7 +136,7 @@ def score_step(
         )
 
     assert target.frame is not None
-    step = Step(
+    step = SequenceStep(
         frame=target.frame,
         anchor=None if anchor is None else anchor.frame,
         anchor_fallback=prediction.anchor_fallback,

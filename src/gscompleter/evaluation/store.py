@@ -54,7 +54,7 @@ def get_task_folder(out: Path, task: str) -> Path:
     return out / TASKS / make_file_name(task)
 
 
-def get_row_path(out: Path, task: str, method: str) -> Path:
+def get_score_path(out: Path, task: str, method: str) -> Path:
     """Return the path of the row of a task and a method."""
     return get_task_folder(out, task) / f"{make_file_name(method)}.json"
 
@@ -84,7 +84,7 @@ def claim(out: Path, settings: Mapping[str, Any]) -> None:
     # Through JSON, which turns tuples into lists: compared is what the file holds.
     wanted = json.loads(json.dumps({"version": VERSION, **settings}))
     claim_folder(out, "run", wanted)
-    existing = read_settings(out)
+    existing = read_run_settings(out)
     for key in {**wanted, **existing}:
         if existing.get(key) != wanted.get(key):
             old = quote_value(repr(existing.get(key)))
@@ -94,11 +94,11 @@ def claim(out: Path, settings: Mapping[str, Any]) -> None:
             )
 
 
-def read_settings(out: Path) -> dict[str, Any]:
+def read_run_settings(out: Path) -> dict[str, Any]:
     """Read the settings of a run; raise InputError if `out` holds none of this version."""
     if not (out / RUN).is_file():
         raise InputError(f"{out} holds no run; name a folder that `evaluate` wrote.")
-    settings = read_json(out / RUN, "name another folder")
+    settings = read_run_file(out / RUN, "name another folder")
     version = settings.get("version") if isinstance(settings, dict) else None
     if version != VERSION:
         raise InputError(
@@ -164,6 +164,6 @@ def is_complete(path: Path) -> bool:
     return is_zipfile(path)
 
 
-def read_json(path: Path, advice: str = "delete it and run again") -> Any:
+def read_run_file(path: Path, advice: str = "delete it and run again") -> Any:
     """Read a JSON file of results."""
     return reading.read_json(path, advice)

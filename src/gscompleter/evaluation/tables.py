@@ -29,8 +29,8 @@ from gscompleter.evaluation.store import (
     get_task_folder,
     get_truth_path,
     list_row_paths,
-    read_json,
-    read_settings,
+    read_run_file,
+    read_run_settings,
 )
 from gscompleter.system.errors import InputError
 from gscompleter.system.files.image import read_image
@@ -130,10 +130,10 @@ class RunSummary:
         return max((peak for peak in peaks if peak is not None), default=None)
 
 
-def read_rows(out: Path) -> list[RunRow]:
+def read_run_rows(out: Path) -> list[RunRow]:
     """Read the rows of a run."""
-    read_settings(out)
-    rows = {path: read_json(path) for path in list_row_paths(out)}
+    read_run_settings(out)
+    rows = {path: read_run_file(path) for path in list_row_paths(out)}
     if not rows:
         raise InputError(
             f"The run in {out} has no finished case; run `gscompleter evaluate` first."
@@ -179,7 +179,7 @@ def summarize_run(rows: Sequence[RunRow]) -> RunSummary:
 
 def write_tables(out: Path, with_fid: bool = False) -> RunSummary:
     """Write tables.md, tables.tex, tables.json and timings.md of a run; FID takes longer."""
-    summary = summarize_run(read_rows(out))
+    summary = summarize_run(read_run_rows(out))
     fids: Fids = compute_fids(out, summary) if with_fid else "not requested."
     texts = {
         "tables.md": format_score_markdown(summary, fids),

@@ -181,7 +181,7 @@ def compare_both_ways(
 ) -> tuple[Comparison, Comparison]:
     """Compare two photographs both ways: `one` reprojected into `other`, then the reverse."""
     map_views = get_view_map(one.image)
-    there, back = map_views(compare, (one, other), (other, one), [min_difference] * 2)
+    there, back = map_views(compare_photographs, (one, other), (other, one), [min_difference] * 2)
     # The depth of a moved object is wrong, and may hide what the photograph does show. So surfaces
     # that are in conflict in the reverse comparison occlude nothing: they are put at infinity.
     return (
@@ -190,7 +190,7 @@ def compare_both_ways(
     )
 
 
-def compare(photo: SmallPhoto, other: SmallPhoto, min_difference: float) -> Comparison:
+def compare_photographs(photo: SmallPhoto, other: SmallPhoto, min_difference: float) -> Comparison:
     """Reproject the surfaces of one photograph into another and compare colours.
 
     Masks of the result have the size of `photo`.
@@ -257,13 +257,13 @@ def find_mutual_regions(
     """
     # The regions of one photograph that go may have confirmed some of the other, so those of the
     # first are tested again.
-    other_regions = find_regions(other)
-    own_regions = keep_shared_parts(find_regions(one), other_regions, one.pixels)
+    other_regions = find_moving_regions(other)
+    own_regions = keep_shared_parts(find_moving_regions(one), other_regions, one.pixels)
     other_regions = keep_shared_parts(other_regions, own_regions, other.pixels)
     return keep_shared_parts(own_regions, other_regions, one.pixels), other_regions
 
 
-def find_regions(comparison: Comparison) -> Bool[Tensor, "h w"]:
+def find_moving_regions(comparison: Comparison) -> Bool[Tensor, "h w"]:
     """Find regions in conflict that are large enough and surrounded by confirmed pixels."""
     # Beyond the image nothing is in frame and nothing confirmed, so that an outline that leaves it
     # counts there like one that the other photograph does not show.

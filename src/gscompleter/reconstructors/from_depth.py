@@ -18,7 +18,7 @@ from gscompleter.reconstructors.features.stereo_image import (
     compute_source_from_reference,
     make_stereo_images,
 )
-from gscompleter.reconstructors.plane_sweep.fusion import Layer
+from gscompleter.reconstructors.plane_sweep.fusion import DepthLayer
 from gscompleter.reconstructors.plane_sweep.gaussians import Splatter
 from gscompleter.types import DepthMap, Reconstruction, View
 
@@ -44,7 +44,8 @@ class FromDepth(Splatter):
         images, unit = make_stereo_images(views)
         depths = self.predict(views)
         layers = [
-            make_layer(image, depth, unit) for image, depth in zip(images, depths, strict=True)
+            make_given_layer(image, depth, unit)
+            for image, depth in zip(images, depths, strict=True)
         ]
         transforms = {
             (i, j): compute_source_from_reference(images[i], images[j])
@@ -64,8 +65,8 @@ class FromDepth(Splatter):
         return list(depths)
 
 
-def make_layer(image: StereoImage, depth: DepthMap, unit: float) -> Layer:
+def make_given_layer(image: StereoImage, depth: DepthMap, unit: float) -> DepthLayer:
     """Convert a predicted depth map to inverse depth per widest baseline (`unit`)."""
     inverse = (unit / depth.depth.detach().cpu().double()).float().numpy()
     sure = depth.valid.float() if depth.confidence is None else depth.confidence
-    return Layer(image, inverse, np.ascontiguousarray(sure.detach().cpu().float().numpy()))
+    return DepthLayer(image, inverse, np.ascontiguousarray(sure.detach().cpu().float().numpy()))

@@ -16,7 +16,7 @@ from torch.autograd.function import once_differentiable
 
 from gscompleter.numerics.kernels import composite, project
 from gscompleter.numerics.kernels.composite import Layer, RasterFrame
-from gscompleter.numerics.kernels.project import GaussianArrays, Pinhole
+from gscompleter.numerics.kernels.project import CameraArrays, GaussianArrays
 from gscompleter.numerics.kernels.simd import TILE
 from gscompleter.render.protocols import ColorErrors, ColorSums, DepthRender, OpacityRender
 from gscompleter.render.viewpoint import (
@@ -307,7 +307,7 @@ def freeze_nothing(viewpoint: Viewpoint) -> CpuFrozenScene:
     return CpuFrozenScene(viewpoint, layer, frame, limits, np.empty(0, np.int32), 0)
 
 
-def make_pinhole(camera: Camera) -> Pinhole:
+def make_pinhole(camera: Camera) -> CameraArrays:
     """Convert a camera for the kernels, whose image must not be too large for them."""
     if not 0 < min(camera.width, camera.height) <= max(camera.width, camera.height) <= MAX_SIDE:
         raise InputError(
@@ -317,7 +317,7 @@ def make_pinhole(camera: Camera) -> Pinhole:
     # In float64 until the end, so that the inverse is as exact as float32 holds it.
     K = camera.K.detach().to("cpu", torch.float64)
     c2w = camera.c2w.detach().to("cpu", torch.float64)
-    return Pinhole(
+    return CameraArrays(
         rotation=tuple(to_float32(torch.linalg.inv(c2w[:3, :3])).ravel()),
         center=to_float32(c2w[:3, 3]),
         intrinsics=to_float32(torch.stack([K[0, 0], K[1, 1], K[0, 2], K[1, 2]])),

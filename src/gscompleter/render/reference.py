@@ -33,7 +33,7 @@ class ReferenceRenderer:
 
     def render(self, gaussians: Gaussians, camera: Camera) -> Render:
         """Render `gaussians` from `camera`."""
-        splats = project(gaussians, camera)
+        splats = project_gaussians(gaussians, camera)
         camera = camera.to(gaussians.means.device)
         x = torch.arange(camera.width, device=camera.K.device) + 0.5
         y = torch.arange(camera.height, device=camera.K.device) + 0.5
@@ -42,7 +42,7 @@ class ReferenceRenderer:
         per_chunk = max(1, self.max_elements // max(1, len(splats.depths)))
         # Checkpoints keep the backward pass within the same bound as the forward pass.
         chunks = [
-            checkpoint(composite, splats, chunk, use_reentrant=False)
+            checkpoint(composite_splats, splats, chunk, use_reentrant=False)
             for chunk in pixels.split(per_chunk)
         ]
         size = (camera.height, camera.width)
@@ -58,7 +58,7 @@ class ReferenceRenderer:
 
 
 @dataclass(frozen=True)
-class Splats:
+class ProjectedSplats:
     """Gaussians projected to the image, front to back."""
 
     centers: Float[Tensor, "m 2"]
@@ -70,7 +70,7 @@ class Splats:
     colors: Float[Tensor, "m 3"]
 
 
-def project(gaussians: Gaussians, camera: Camera) -> Splats:
+def project_gaussians(gaussians: Gaussians, camera: Camera) -> ProjectedSplats:
     """Project the Gaussians beyond the near plane by the affine EWA approximation, sorted by z."""
     dtype = gaussians.means.dtype
     device = gaussians.means.device
@@ -94,7 +94,7 @@ def project(gaussians: Gaussians, camera: Camera) -> Splats:
     opacities = gaussians.opacities
     if gaussians.is_antialiased:
         opacities = opacities * compute_compensations(flat, covariances)
-    return Splats(
+    return ProjectedSplats(
         centers=points[:, :2] / points[:, 2:] * K.diagonal()[:2] + K[:2, 2],
         precisions=invert_symmetric(covariances),
         depths=points[:, 2],
@@ -141,8 +141,8 @@ def compute_compensations(
     return area / torch.linalg.det(covariances).sqrt()
 
 
-def composite(
-    splats: Splats, pixels: Float[Tensor, "p 2"]
+def composite_splats(
+    splats: ProjectedSplats, pixels: Float[Tensor, "p 2"]
 ) -> tuple[Float[Tensor, "p 3"], Float[Tensor, "p"], Float[Tensor, "p"]]:
     """Sum weight times colour, weight times depth, and weight over the splats."""
     offsets = pixels - splats.centers[:, None]

@@ -14,8 +14,8 @@ from torch import Tensor
 
 from gscompleter.numerics.kernels import composite, project, tiles
 from gscompleter.numerics.kernels.composite import WANT_ALL, WANT_COLOR, Layer, RasterFrame
-from gscompleter.numerics.kernels.parallel import run, share, split_range
-from gscompleter.numerics.kernels.project import GaussianArrays, Pinhole
+from gscompleter.numerics.kernels.parallel import run_calls, share, split_range
+from gscompleter.numerics.kernels.project import CameraArrays, GaussianArrays
 from gscompleter.numerics.kernels.simd import TILE
 from gscompleter.system.errors import InputError
 
@@ -60,7 +60,7 @@ EntryGradients = tuple[Float32[ndarray, "entries columns"], Bool[ndarray, "entri
 class Viewpoint:
     """A camera and its rendering threads; calls the kernels in order."""
 
-    pinhole: Pinhole
+    pinhole: CameraArrays
     threads: int
 
     @property
@@ -89,7 +89,7 @@ class Viewpoint:
         columns = np.empty((n, project.NUM_SPLAT_COLUMNS), np.float32)
         boxes = np.empty((n, 4), self.box_dtype)
         factors = np.zeros(n, np.float32) if is_antialiased else None
-        self.share(project.project, n, gaussians, self.pinhole, columns, boxes, factors)
+        self.share(project.project_splats, n, gaussians, self.pinhole, columns, boxes, factors)
         opacities = gaussians.opacities if factors is None else gaussians.opacities * factors
         return Splats(columns, opacities, boxes, factors)
 
@@ -103,7 +103,7 @@ class Viewpoint:
             (*chunk, splats.columns, splats.boxes, depth_limits, self.tiles_x, count)
             for chunk, count in zip(chunks, counts, strict=True)
         ]
-        run(tiles.count_entries, counting, self.threads)
+        run_calls(tiles.count_entries, counting, self.threads)
         total = int(counts.sum(dtype=np.int64))
         if total > MAX_ENTRIES:
             raise InputError(
@@ -116,7 +116,7 @@ class Viewpoint:
         entries = np.empty(total, np.int32)
         keys = np.empty(total, np.uint32)
         filling = [(*call, entries, keys) for call in counting]
-        run(tiles.fill_entries, filling, self.threads)
+        run_calls(tiles.fill_entries, filling, self.threads)
         self.share(tiles.sort_lists, self.tiles, tile_start, entries, keys)
         return Layer(splats.columns, splats.opacities, splats.boxes, tile_start, entries)
 

@@ -2,6 +2,6 @@
 
 from __future__ import annotations
 
-from gscompleter.splats.formats import FORMATS as FORMATS
+from gscompleter.splats.formats import SPLAT_FORMATS as SPLAT_FORMATS
 from gscompleter.splats.formats import load_splat as load_splat
 from gscompleter.splats.formats import save_splat as save_splat

@@ -32,7 +32,7 @@ from gscompleter.splats.morton import sort_along_morton
 from gscompleter.splats.packing import ZIP_MAGIC, UnsupportedError
 from gscompleter.splats.ply import load_ply, make_memory_error, require_finite, save_ply
 from gscompleter.splats.sog import META, read_sog, write_sog
-from gscompleter.splats.splat import read_splat, write_splat
+from gscompleter.splats.splat import read_splat_rows, write_splat
 from gscompleter.splats.spz import read_spz, write_spz
 from gscompleter.splats.usd import refuse_usd, write_usd
 from gscompleter.system.errors import InputError, quote_value, refuse_pointer, require_path
@@ -57,7 +57,7 @@ HEAD_BYTES = 8192
 
 
 @dataclass(frozen=True)
-class Format:
+class SplatFormat:
     """Functions that detect, read and write one file format."""
 
     extensions: tuple[str, ...]
@@ -69,23 +69,23 @@ class Format:
     """Text near the start of a file that tells it from others with the same first bytes."""
 
 
-FORMATS = {
-    "compressed-ply": Format(
+SPLAT_FORMATS = {
+    "compressed-ply": SplatFormat(
         (".compressed.ply",),
         (b"ply",),
         read_compressed_ply,
         write_compressed_ply,
         contains=b"packed_position",
     ),
-    "ply": Format((".ply",), (b"ply",), load_ply, save_ply),
-    "spz": Format((".spz",), (b"NGSP", b"\x1f\x8b"), read_spz, write_spz),
-    "usdz": Format((".usdz",), (ZIP_MAGIC,), refuse_usd, write_usd, contains=b".usd"),
-    "usd": Format((".usdc", ".usda", ".usd"), (b"PXR-USDC", b"#usda"), refuse_usd, write_usd),
-    "sog": Format((".sog",), (ZIP_MAGIC,), read_sog, write_sog),
-    "sog-folder": Format((META,), (b"{",), read_sog),
-    "glb": Format((".glb",), (b"glTF",), read_glb, write_glb),
-    "splat": Format((".splat",), (), read_splat, write_splat),
-    "ksplat": Format((".ksplat",), (), read_ksplat),
+    "ply": SplatFormat((".ply",), (b"ply",), load_ply, save_ply),
+    "spz": SplatFormat((".spz",), (b"NGSP", b"\x1f\x8b"), read_spz, write_spz),
+    "usdz": SplatFormat((".usdz",), (ZIP_MAGIC,), refuse_usd, write_usd, contains=b".usd"),
+    "usd": SplatFormat((".usdc", ".usda", ".usd"), (b"PXR-USDC", b"#usda"), refuse_usd, write_usd),
+    "sog": SplatFormat((".sog",), (ZIP_MAGIC,), read_sog, write_sog),
+    "sog-folder": SplatFormat((META,), (b"{",), read_sog),
+    "glb": SplatFormat((".glb",), (b"glTF",), read_glb, write_glb),
+    "splat": SplatFormat((".splat",), (), read_splat_rows, write_splat),
+    "ksplat": SplatFormat((".ksplat",), (), read_ksplat),
 }
 """Formats by name; the first that fits the start of a file is taken."""
 SORTED = (write_compressed_ply, write_sog)
@@ -109,7 +109,7 @@ def load_splat(path: Path | str, drop_nonfinite: bool = False) -> Gaussians:
     errors = DECODING_ERRORS + JSON_ERRORS if has_json else DECODING_ERRORS
     try:
         with np.errstate(over="ignore", invalid="ignore"):  # infinite values are refused below
-            gaussians = FORMATS[name].read(path)
+            gaussians = SPLAT_FORMATS[name].read(path)
     except InputError:
         raise
     except UnsupportedError as error:
@@ -182,11 +182,11 @@ def detect_splat_format(path: Path) -> str:
         raise InputError(f"{quote_value(path)} is empty; a file of Gaussians is needed.")
     refuse_foreign(path, head)
     # Content decides before the name, since files are renamed.
-    for name, format_ in FORMATS.items():
+    for name, format_ in SPLAT_FORMATS.items():
         if head.lstrip().startswith(format_.starts) and format_.contains in head:
             return name
     named = _match_extension(path)
-    if named is None or FORMATS[named].starts:
+    if named is None or SPLAT_FORMATS[named].starts:
         raise InputError(
             f"{quote_value(path)} holds no Gaussians in a format that is known; name a .ply, "
             ".spz, .splat, .ksplat or .glb (docs/formats.md has them all)."
@@ -197,17 +197,17 @@ def detect_splat_format(path: Path) -> str:
 def get_writer(path: Path) -> Callable[[Path, Gaussians], None]:
     """Get the function that writes the format for the extension of `path`."""
     name = _match_extension(path)
-    write = None if name is None else FORMATS[name].write
+    write = None if name is None else SPLAT_FORMATS[name].write
     if write is None:
         raise InputError(
             f"{quote_value(path)} cannot be written in the format of its extension; end it in "
-            f"{', '.join(f.extensions[0] for f in FORMATS.values() if f.write)}."
+            f"{', '.join(f.extensions[0] for f in SPLAT_FORMATS.values() if f.write)}."
         )
     return write
 
 
 def _match_extension(path: Path) -> str | None:
-    for name, format_ in FORMATS.items():
+    for name, format_ in SPLAT_FORMATS.items():
         if path.name.lower().endswith(format_.extensions):
             return name
     return None

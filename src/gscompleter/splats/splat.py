@@ -18,7 +18,7 @@ from gscompleter.types import SH_C0, Gaussians
 ROW = np.dtype([("mean", "<f4", 3), ("scale", "<f4", 3), ("rgba", "u1", 4), ("quat", "u1", 4)])
 
 
-def read_splat(path: Path) -> Gaussians:
+def read_splat_rows(path: Path) -> Gaussians:
     """Read a .splat."""
     rows = np.frombuffer(read_bytes(path), ROW)
     rgba = rows["rgba"].astype(np.float32) / 255

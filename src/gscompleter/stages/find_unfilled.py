@@ -41,11 +41,11 @@ def find_unfilled(after: Render, steps: Sequence[Step], view: TargetView) -> Unf
         is_open = compute_hole_mask(alpha, holes)
         lost[step.name] = int((unexplained & is_open).sum()) / total
         unexplained = unexplained & ~is_open
-    regions = find_regions(empty, -view.camera.left, -view.camera.top)
+    regions = find_largest_regions(empty, -view.camera.left, -view.camera.top)
     return Unfilled(share, {name: part for name, part in lost.items() if part > 0}, regions)
 
 
-def find_regions(
+def find_largest_regions(
     mask: Bool[Tensor, "h w"], left: int, top: int
 ) -> tuple[tuple[int, int, int, int], ...]:
     """Find the bounding boxes (left, top, right, bottom) of the largest connected regions.

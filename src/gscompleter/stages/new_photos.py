@@ -59,7 +59,7 @@ def compute_error(image: Float[Tensor, "h w 3"], view: View) -> Float[Tensor, ""
     return (gain * shown + offset - photo).square().mean()
 
 
-def match_exposure(photo: View, view: TargetView) -> Float[Tensor, "h w 3"]:
+def match_new_photo(photo: View, view: TargetView) -> Float[Tensor, "h w 3"]:
     """Match the exposure of a photograph to the scene where the scene is trusted.
 
     `view` is the scene at the camera of the photograph. If hardly anything there is trusted, the
@@ -84,7 +84,7 @@ def recolor_to_photos(
         photo = photos[index]
         view = render_target(state, pad_camera(photo.camera, 0.0), scenes)
         # Where the photograph is ignored, the render itself is wanted: nothing changes.
-        wanted = match_exposure(photo, view)
+        wanted = match_new_photo(photo, view)
         wanted = torch.where(photo.valid_mask[..., None], wanted, view.render.image)
         reference = GeneratedView(wanted, photo.camera, is_photograph=True)
         state = recolor(reference, view, NEW_PHOTO_ID).state

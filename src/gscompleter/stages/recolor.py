@@ -57,7 +57,7 @@ def recolor(reference: GeneratedView, view: TargetView, label: int) -> Recolored
     weight = torch.ones_like(view.alpha) if reference.is_photograph else view.distrust
     if reference.is_inconsistent or not weight.any():
         return Recolored(state, view.frozen, 0)
-    rows, delta = fit_colors(
+    rows, delta = fit_image_colors(
         merge(state.parts),
         view.frozen,
         reference,
@@ -81,7 +81,7 @@ def recolor(reference: GeneratedView, view: TargetView, label: int) -> Recolored
     return Recolored(replace(state, parts=parts, trust=trust), frozen, len(rows))
 
 
-def fit_colors(
+def fit_image_colors(
     scene: Gaussians,
     frozen: FrozenScene,
     reference: View,

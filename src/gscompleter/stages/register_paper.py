@@ -34,7 +34,7 @@ def register_as_paper(
     if len(initial) == 0 or view.state.config.paper_registration.iterations == 0:
         # Nothing was lifted, or the ablation without RC (Table IV): the affine alone counts.
         return Registration(initial, lifted.pixel_index, ())
-    registered, losses = optimize_distances(initial, reference, view)
+    registered, losses = optimize_paper_distances(initial, reference, view)
     return Registration(registered, lifted.pixel_index, losses)
 
 
@@ -49,7 +49,7 @@ def initialize_distances(lifted: Gaussians, affine: DepthAffine, camera: Camera)
     return slide(lifted, camera, aligned / predicted, "fixed")
 
 
-def optimize_distances(
+def optimize_paper_distances(
     initial: Gaussians, reference: View, view: TargetView
 ) -> tuple[Gaussians, tuple[float, ...]]:
     """Minimize Eq. 11 over the distances; also return its value at each iteration.

@@ -14,7 +14,7 @@ from gscompleter.splats.alignment.estimate import AlignmentData, align_splat, es
 from gscompleter.splats.alignment.fit import score_splat
 from gscompleter.splats.alignment.similarity import (
     fit_pose_similarity,
-    get_pose,
+    get_camera_pose,
     get_scale,
     make_similarity,
     transform_camera,
@@ -55,7 +55,7 @@ def splat(views):
 
 
 def poses_of(views):
-    return np.stack([get_pose(view.camera) for view in views])
+    return np.stack([get_camera_pose(view.camera) for view in views])
 
 
 def points_of(splat):

@@ -49,7 +49,7 @@ def read_manifest(manifest: Path, common: Mapping[str, Any], out: Path | None = 
     # and the row wins.
     base = manifest.resolve().parent
     here = resolve_paths(common, Path.cwd())
-    rows = [{**here, **resolve_paths(row, base)} for row in read_rows(manifest, out)]
+    rows = [{**here, **resolve_paths(row, base)} for row in read_manifest_rows(manifest, out)]
     if not rows:
         raise InputError("The manifest names no job; give it a row for each scene.")
     names = [make_job_name(row) for row in rows]
@@ -82,7 +82,7 @@ def resolve_paths(row: Mapping[str, Any], base: Path) -> Options:
     return result
 
 
-def read_rows(manifest: Path, out: Path | None = None) -> list[Options]:
+def read_manifest_rows(manifest: Path, out: Path | None = None) -> list[Options]:
     """Read the rows of a manifest as they are."""
     if os.path.isdir(manifest):
         results = list_results(manifest, out)

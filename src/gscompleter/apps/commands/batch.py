@@ -75,7 +75,7 @@ def run_batch(options: BatchOptions) -> int:
         with show_preparation("reading the manifest"):
             common = parse_pairs(options.each, "each")
             jobs = read_manifest(options.manifest, common, options.out)
-            refuse_overlap(options.out, list_scenes(jobs))
+            refuse_overlap(options.out, list_job_scenes(jobs))
             out = options.out.resolve()  # absolute, for workers elsewhere
             engine = make_engine(options, out)
             claim_folder(out, "batch", {"version": 1, "kind": "batch"})
@@ -97,7 +97,7 @@ def run_batch(options: BatchOptions) -> int:
     return choose_exit_code(len(failures), len(share))
 
 
-def list_scenes(jobs: Sequence[Job]) -> list[Path]:
+def list_job_scenes(jobs: Sequence[Job]) -> list[Path]:
     """List the paths that the rows of a batch read."""
     paths = [job.options.get(name) for job in jobs for name in PATHS]
     return [Path(path) for path in dict.fromkeys(paths) if isinstance(path, str) and path]

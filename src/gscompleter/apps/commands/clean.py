@@ -105,11 +105,11 @@ def clean_by_photographs(options: CleanOptions, console: Console) -> Cleaning:
     check_context(options)
     device = choose_device(options.device)
     renderer = load_renderer(device)
-    opened = open_scene(options, console, partial(read_splat, options))
+    opened = open_scene(options, console, partial(load_given_splat, options))
     options = choose_working_size(options, opened.photographs, console)
     with show_preparation("reading photographs"):
         task = read_photographs(options, opened, device)
-    loaded = read_splat(options)
+    loaded = load_given_splat(options)
     compile_kernels([device])
     with show_preparation("aligning the scene"):
         task = move_to_splat(task, loaded, options.scene, options, opened)
@@ -133,7 +133,7 @@ def clean_alone(options: CleanOptions, console: Console) -> Cleaning:
     named = next((n for n in PHOTOGRAPH_OPTIONS if getattr(options, n) is not None), None)
     if named is not None:
         raise InputError("There are no photographs to apply this to; name their SCENE.", named)
-    given, floaters = read_splat(options), options.config.floaters
+    given, floaters = load_given_splat(options), options.config.floaters
     with record_seconds(()) as seconds, timed_stage("clean"):
         reasons = find_floaters(given, floaters)
     run_info = {
@@ -145,7 +145,7 @@ def clean_alone(options: CleanOptions, console: Console) -> Cleaning:
     return Cleaning(given, removed, locate_splat(options, options.scene), run_info)
 
 
-def read_splat(options: CleanOptions) -> Gaussians:
+def load_given_splat(options: CleanOptions) -> Gaussians:
     """Read the splat to clean."""
     with show_preparation("reading the scene"):
         return load_splat(options.scene, options.drop_nonfinite)

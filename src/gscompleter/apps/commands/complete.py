@@ -22,8 +22,8 @@ from gscompleter.apps.commands.options import (
 )
 from gscompleter.apps.commands.output import describe_run, read_held_out, refuse_results
 from gscompleter.apps.inputs.opening import (
+    CompletionTask,
     Opened,
-    Task,
     add_check_views,
     apply_scene_range,
     apply_splat_range,
@@ -105,7 +105,7 @@ class Prepared:
 
     options: CompleteOptions
     opened: Opened
-    task: Task
+    task: CompletionTask
     explorer: ViewPlanner
     cameras: Mapping[int, Camera]
     """Cameras of all usable photographs by frame, in the frame of the result."""
@@ -148,7 +148,7 @@ def check_options(options: CompleteOptions) -> None:
     options.synthesis.make_settings()
 
 
-def check_inputs(options: CompleteOptions, device: str) -> None:
+def check_completion_inputs(options: CompleteOptions, device: str) -> None:
     """Read what can be read without the cameras of the photographs, and refuse it if it is wrong.
 
     It takes seconds, and the search for cameras after it minutes.
@@ -164,7 +164,7 @@ def prepare_completion(options: CompleteOptions, console: Console) -> Prepared:
     check_options(options)
     device = choose_device(options.device)
     options = resolve_scene(options)
-    opened = open_scene(options, console, partial(check_inputs, options, device))
+    opened = open_scene(options, console, partial(check_completion_inputs, options, device))
     options = choose_working_size(options, opened.photographs, console)
     if not options.config.ego_mask:
         opened = replace(opened, photographs=opened.photographs.keep_ego_vehicle())
@@ -291,8 +291,8 @@ def write_done(folder: Path, ready: Prepared, completion: Completion) -> dict[st
 
 
 def add_splat(
-    task: Task, path: Path, options: CompleteOptions, opened: Opened, parts: Sequence[str]
-) -> Task:
+    task: CompletionTask, path: Path, options: CompleteOptions, opened: Opened, parts: Sequence[str]
+) -> CompletionTask:
     """Compile the kernels, and add the input splat to the task."""
     with show_preparation("reading the scene"):
         task = add_check_views(task, opened.photographs)
@@ -390,7 +390,9 @@ def describe_result(summary: CompletionSummary, options: CompleteOptions) -> Ite
         yield f"Video: {options.out / VIDEO_FILE}"
 
 
-def collect_cameras(options: CompleteOptions, opened: Opened, task: Task) -> dict[int, Camera]:
+def collect_cameras(
+    options: CompleteOptions, opened: Opened, task: CompletionTask
+) -> dict[int, Camera]:
     """Return the cameras of all usable photographs by frame, in the frame of the result."""
     given = opened.photographs
     transform = task.frame @ compute_frame_from_photographs(-given.origin)
@@ -416,7 +418,7 @@ def complete_targets(ready: Prepared) -> tuple[Completion, Prepared]:
     return completion, ready.with_choices(choices)
 
 
-def plan_completion(ready: Prepared) -> tuple[Task, Sequence[float]]:
+def plan_completion(ready: Prepared) -> tuple[CompletionTask, Sequence[float]]:
     """Find the targets, and the hole fraction of each after those before it are completed."""
     begun, targets = ready.begin(), ready.task.target_cameras
     if targets:
@@ -441,7 +443,7 @@ def print_plan(
     console.print(f"Edit the cameras in {quote_value(options.out / TARGETS_FILE)}.", soft_wrap=True)
 
 
-def write_targets(folder: Path, task: Task) -> None:
+def write_targets(folder: Path, task: CompletionTask) -> None:
     """Write the target cameras in the frame of the photographs, as `--target` reads them."""
     if task.targets:
         back = np.linalg.inv(task.frame)

@@ -71,7 +71,7 @@ def print_models(found: Sequence[tuple[PublishedWeights, Path | None]]) -> None:
         table.add_column(title, no_wrap=title == "name")
     table.add_column("source", overflow="fold")
     for weights, path in found:
-        table.add_row(*format_cells(weights, path))
+        table.add_row(*format_model_cells(weights, path))
     width = None if sys.stdout.isatty() else 1000  # a file or a pipe wraps no rows
     Console(width=width, markup=False, highlight=False).print(table)
     print("\n(!) Whether commercial use is allowed is unclear:")
@@ -82,7 +82,7 @@ def print_models(found: Sequence[tuple[PublishedWeights, Path | None]]) -> None:
         print(f"\nThe hub's cache was not searched, for lack of huggingface_hub: {INSTALL}")
 
 
-def format_cells(weights: PublishedWeights, path: Path | None) -> tuple[str, ...]:
+def format_model_cells(weights: PublishedWeights, path: Path | None) -> tuple[str, ...]:
     """Format a row of the table."""
     fewest, most = weights.views
     count = weights.parameters

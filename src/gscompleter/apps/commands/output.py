@@ -11,7 +11,7 @@ from types import MappingProxyType
 from typing import Any
 
 from gscompleter.apps.commands.options import SceneOptions, parse_resolution
-from gscompleter.apps.inputs.opening import Opened, Task, describe_missing
+from gscompleter.apps.inputs.opening import CompletionTask, Opened, describe_missing
 from gscompleter.apps.inputs.selection import select_closest
 from gscompleter.apps.report.completion import HeldOut
 from gscompleter.config import CleaningConfig, CompleterConfig
@@ -25,7 +25,7 @@ MAX_HELD_OUT = 8
 def describe_run(
     options: SceneOptions,
     opened: Opened,
-    task: Task,
+    task: CompletionTask,
     config: CompleterConfig | CleaningConfig,
     settings: Mapping[str, Any] = MappingProxyType({}),
 ) -> dict[str, Any]:
@@ -65,7 +65,7 @@ def describe_run(
 
 
 def read_held_out(
-    options: SceneOptions, opened: Opened, task: Task, cameras: Mapping[int, Camera]
+    options: SceneOptions, opened: Opened, task: CompletionTask, cameras: Mapping[int, Camera]
 ) -> list[HeldOut]:
     """Read up to `MAX_HELD_OUT` unused photographs, nearest to the targets or the context.
 

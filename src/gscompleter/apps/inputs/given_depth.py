@@ -64,10 +64,10 @@ def find_factor(
     The photographs after those of the context take part if these alone tell too little: if they are
     far apart, or if there is only one.
     """
-    samples = compare(photographs, frames, views)
+    samples = compare_given_depth(photographs, frames, views)
     if len(samples) < MIN_SAMPLES:
         more = read_next(photographs, frames, resolution)
-        samples = compare(photographs, [*frames, *more], [*views, *more.values()])
+        samples = compare_given_depth(photographs, [*frames, *more], [*views, *more.values()])
     fit = fit_depth_factor(samples)
     if fit is None:
         return 1.0, (
@@ -91,7 +91,9 @@ def read_next(
     return found
 
 
-def compare(photographs: Photographs, frames: Sequence[int], views: Sequence[View]) -> DepthSamples:
+def compare_given_depth(
+    photographs: Photographs, frames: Sequence[int], views: Sequence[View]
+) -> DepthSamples:
     """Compare the measured depths of photographs with their tracks or points, and with matches."""
     points = photographs.points()
     parts, maps = [], []

@@ -67,7 +67,7 @@ from gscompleter.splats.alignment.similarity import transform_camera, transform_
 from gscompleter.splats.alignment.trainer_frames import InputSplat
 from gscompleter.splats.alignment.training_size import find_training_size
 from gscompleter.splats.foreign import resolve_splat
-from gscompleter.splats.formats import FORMATS as SPLAT_FORMATS
+from gscompleter.splats.formats import SPLAT_FORMATS as SPLAT_FORMATS
 from gscompleter.splats.formats import detect_splat_format
 from gscompleter.splats.ply import find_finite_rows
 from gscompleter.stages.context import find_splat_range
@@ -115,7 +115,7 @@ class Opened:
 
 
 @dataclass(frozen=True)
-class Task:
+class CompletionTask:
     """Input of a completion."""
 
     views: Sequence[View]
@@ -276,7 +276,7 @@ def resolve_scene(options: AnyOptions) -> AnyOptions:
     return replace(options, scene=resolve_splat(options.scene))
 
 
-def read_task(options: CompleteOptions, opened: Opened, device: str) -> Task:
+def read_task(options: CompleteOptions, opened: Opened, device: str) -> CompletionTask:
     """Read the photographs and targets of the options, after checking the memory."""
     given, resolution = opened.photographs, parse_resolution(options.resolution)
     targets = read_targets(given, options)
@@ -287,7 +287,7 @@ def read_task(options: CompleteOptions, opened: Opened, device: str) -> Task:
     return make_task(options, given, frames, targets, device)
 
 
-def read_photographs(options: SceneOptions, opened: Opened, device: str) -> Task:
+def read_photographs(options: SceneOptions, opened: Opened, device: str) -> CompletionTask:
     """Read the named photographs, or all."""
     given, resolution = opened.photographs, parse_resolution(options.resolution)
     frames = find_context(options, given) or tuple(
@@ -307,7 +307,7 @@ def make_task(
     frames: Sequence[int],
     targets: Sequence[Target],
     device: str,
-) -> Task:
+) -> CompletionTask:
     """Read the photographs of `frames`, in ascending order, and those of the targets."""
     frames, resolution = sorted(frames), parse_resolution(options.resolution)
     bounded = add_depth_range(given, frames, resolution)
@@ -321,7 +321,7 @@ def make_task(
         views = bounded.views(frames, resolution)
     else:
         views, depth_notes = read_with_depth(bounded, frames, resolution)
-    return Task(
+    return CompletionTask(
         [view.to(device) for view in views],
         [add_photograph(target, bounded, options) for target in targets],
         compute_frame_from_photographs(given.origin),
@@ -332,13 +332,13 @@ def make_task(
 
 
 def move_to_splat(
-    task: Task,
+    task: CompletionTask,
     scene: Gaussians,
     path: Path,
     options: SceneOptions,
     opened: Opened,
     order: Int64[Tensor, "n"] | None = None,
-) -> Task:
+) -> CompletionTask:
     """Add the splat of a file to the task, and move its cameras into the splat's frame.
 
     `order` has the index of each Gaussian in the file if they were reordered.
@@ -377,7 +377,7 @@ def locate_splat(options: SceneOptions, path: Path) -> InputSplatFile:
     return InputSplatFile(path, find_finite_rows(path) if is_masked else None)
 
 
-def add_check_views(task: Task, given: Photographs) -> Task:
+def add_check_views(task: CompletionTask, given: Photographs) -> CompletionTask:
     """Add check views: unused photographs near the targets and all around."""
     others = [frame for frame in range(len(given)) if frame not in task.used_frames]
     cameras = collect_usable_cameras(given, others, CHECK_VIEW_SIZE)
@@ -388,13 +388,13 @@ def add_check_views(task: Task, given: Photographs) -> Task:
     return replace(task, check_views=[view.to(task.device) for view in views])
 
 
-def apply_splat_range(task: Task, scene: Gaussians, renderer: Renderer) -> Task:
+def apply_splat_range(task: CompletionTask, scene: Gaussians, renderer: Renderer) -> CompletionTask:
     """Set the depth range of the photographs of an input splat; it is measured if not known."""
     near, far = find_splat_range(task.views, scene, renderer)
     return replace(task, views=set_depth_range(task.views, near, far))
 
 
-def apply_scene_range(task: Task, reconstructor: Reconstructor) -> Task:
+def apply_scene_range(task: CompletionTask, reconstructor: Reconstructor) -> CompletionTask:
     """Set the depth range of the photographs from which Ψ reconstructs the scene."""
     trained = get_trained_range(reconstructor)
     near, far = find_depth_range(task.views, trained)
@@ -404,7 +404,7 @@ def apply_scene_range(task: Task, reconstructor: Reconstructor) -> Task:
     return replace(task, views=set_depth_range(task.views, near, far), depths=depths)
 
 
-def describe_range_mismatch(task: Task, reconstructor: Reconstructor) -> list[str]:
+def describe_range_mismatch(task: CompletionTask, reconstructor: Reconstructor) -> list[str]:
     """Say that the scene's features lie outside of the depths that Ψ was trained on.
 
     Published networks sweep planes between depths that their authors chose for scenes in metres. A
@@ -530,7 +530,7 @@ def add_photograph(target: Target, given: Photographs, options: SceneOptions) ->
     return replace(target, photograph=view.image, ignore_mask=view.ignore_mask)
 
 
-def check_scene(task: Task, scene: Gaussians) -> None:
+def check_scene(task: CompletionTask, scene: Gaussians) -> None:
     """Refuse a splat that does not fit into memory together with its photographs."""
     photographs = len(task.views) + len(task.check_views or ())
     what = f"The {len(scene):,} Gaussians of the scene and {photographs} photographs"
@@ -538,7 +538,7 @@ def check_scene(task: Task, scene: Gaussians) -> None:
     check_bytes(estimate_memory(task, scene), what, remedy)
 
 
-def estimate_memory(task: Task, scene: Gaussians | None) -> int:
+def estimate_memory(task: CompletionTask, scene: Gaussians | None) -> int:
     """Estimate the bytes that a completion needs, with an input splat or without."""
     pixels = max(camera.width * camera.height for camera in task.cameras)
     needed = estimate_bytes(pixels, len(task.cameras))
@@ -560,7 +560,7 @@ def check_sides(cameras: Sequence[Camera]) -> None:
             )
 
 
-def describe_task(options: CompleteOptions, opened: Opened, task: Task) -> list[str]:
+def describe_task(options: CompleteOptions, opened: Opened, task: CompletionTask) -> list[str]:
     """Write the four lines; the cameras of `task` have the working depth range."""
     targets = join_names([opened.name_target(target) for target in task.targets], MAX_NAMED)
     files = opened.files
@@ -579,7 +579,7 @@ def describe_task(options: CompleteOptions, opened: Opened, task: Task) -> list[
     ]
 
 
-def describe_opening(options: SceneOptions, opened: Opened, task: Task) -> list[str]:
+def describe_opening(options: SceneOptions, opened: Opened, task: CompletionTask) -> list[str]:
     """Write the lines on the opened scene."""
     scene, camera, given = task.scene, task.views[0].camera, opened.photographs
     used = len(given) - len(list_missing(given))
@@ -617,7 +617,7 @@ def describe_missing(given: Photographs) -> list[str]:
     ]
 
 
-def describe_masks(given: Photographs, task: Task) -> list[str]:
+def describe_masks(given: Photographs, task: CompletionTask) -> list[str]:
     """Say which masks were found for the photographs of a task, and how much they hide."""
     found = given.describe_masks(sorted(filter_numbers(task.used_frames)))
     if found is None:

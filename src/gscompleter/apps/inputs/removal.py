@@ -11,7 +11,7 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 
 from gscompleter.apps.commands.options import RemoveOptions, parse_resolution
-from gscompleter.apps.inputs.opening import Task
+from gscompleter.apps.inputs.opening import CompletionTask
 from gscompleter.data.frame import ENDINGS, find_file
 from gscompleter.data.local_origin import shift_to_origin
 from gscompleter.data.masks import load_mask
@@ -50,7 +50,7 @@ def check_selection(options: RemoveOptions) -> None:
 
 def choose_gaussians(
     options: RemoveOptions,
-    task: Task,
+    task: CompletionTask,
     photographs: Photographs,
     cameras: Mapping[int, Camera],
     renderer: Renderer,

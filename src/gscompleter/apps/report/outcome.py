@@ -58,7 +58,7 @@ def judge_completion(completion: Completion, held_out: Sequence[HeldOutRow]) -> 
     depths of a single photograph are predicted, in a unit that other photographs need not share.
     """
     is_reconstructed = not completion.is_given and len(completion.views) > 1
-    failure = explain_failure(completion, held_out) if is_reconstructed else None
+    failure = explain_unreconstructed(completion, held_out) if is_reconstructed else None
     if failure is not None:
         return OutcomeRow("not-reconstructed", failure)
     # A target added or recoloured something, or a new photograph recoloured the context.
@@ -69,7 +69,7 @@ def judge_completion(completion: Completion, held_out: Sequence[HeldOutRow]) -> 
     return OutcomeRow("completed", describe_gain(work, held_out))
 
 
-def explain_failure(completion: Completion, held_out: Sequence[HeldOutRow]) -> str | None:
+def explain_unreconstructed(completion: Completion, held_out: Sequence[HeldOutRow]) -> str | None:
     """Explain why a scene counts as not reconstructed; None if it does not.
 
     Unused photographs decide. Where there are none that the scene covers, the features decide that

@@ -41,7 +41,7 @@ from gscompleter.apps.report.schema import (
     read_record,
     read_summary,
 )
-from gscompleter.data.formats import FORMATS
+from gscompleter.data.formats import SCENE_FORMATS
 from gscompleter.system.files.image import encode_jpeg, read_image_size, read_pixels
 from gscompleter.system.files.writing import encode_text, replace_file
 from gscompleter.system.jobs.jobs import JOBS, Job, read_row
@@ -176,7 +176,7 @@ def render_completion_page(folder: Path) -> str:
 
 def find_length_unit(summary: CompletionSummary) -> str:
     """Return metres if the format defines them and the splat has no frame of its own."""
-    format = FORMATS.get(summary.scene.format)
+    format = SCENE_FORMATS.get(summary.scene.format)
     if format is None or format.unit is None or summary.frame.method != "given":
         return "scene units"
     return str(format.unit)

@@ -23,7 +23,7 @@ import numpy as np
 import pycolmap
 from jaxtyping import Float
 
-from gscompleter.data.panorama import VIEWS, compute_rotation
+from gscompleter.data.panorama import VIEWS, compute_view_rotation
 from gscompleter.data.sfm.poses import MIN_PHOTOGRAPHS, UprightCopy
 
 SEED = 0
@@ -66,7 +66,7 @@ Pairs = set[tuple[int, int]]
 
 
 @dataclass(frozen=True)
-class Job:
+class MappingJob:
     """Input of the process."""
 
     images: str
@@ -91,7 +91,7 @@ def main() -> None:
     """Run the job that standard input holds."""
     task = json.load(sys.stdin)
     copies = [UprightCopy(**one) for one in task.pop("photographs")]
-    job = Job(photographs=copies, **task)
+    job = MappingJob(photographs=copies, **task)
     pycolmap.logging.minloglevel = pycolmap.logging.Level.ERROR.value
     pycolmap.set_random_seed(SEED)
     find_features(job)
@@ -101,7 +101,7 @@ def main() -> None:
     print(json.dumps(map_photographs(job)))
 
 
-def find_features(job: Job) -> None:
+def find_features(job: MappingJob) -> None:
     """Extract SIFT features of all photographs; those of equal size and lens share a camera."""
     extraction = pycolmap.FeatureExtractionOptions(num_threads=job.threads, use_gpu=False)
     extraction.sift.max_num_features = MAX_FEATURES
@@ -130,13 +130,13 @@ def find_features(job: Job) -> None:
         )
 
 
-def join_views(job: Job) -> None:
+def join_views(job: MappingJob) -> None:
     """Join the views of each panorama to a rig, with known rotations and one centre."""
     rig = pycolmap.RigConfig()
     for number, view in enumerate(VIEWS):
         # COLMAP's rig maps from the rig to the camera; `compute_rotation` leads to the panorama's
         # axes. The first camera is the reference and has no pose of its own.
-        turn = pycolmap.Rigid3d(pycolmap.Rotation3d(compute_rotation(*view).T), np.zeros(3))
+        turn = pycolmap.Rigid3d(pycolmap.Rotation3d(compute_view_rotation(*view).T), np.zeros(3))
         camera = pycolmap.RigConfigCamera(image_prefix=f"view_{number}/", ref_sensor=number == 0)
         camera.cam_from_rig = turn if number else None
         rig.cameras = [*rig.cameras, camera]
@@ -144,7 +144,7 @@ def join_views(job: Job) -> None:
         pycolmap.apply_rig_config([rig], database)
 
 
-def select_pairs(job: Job) -> Pairs:
+def select_pairs(job: MappingJob) -> Pairs:
     """Choose the photographs to match: sequence neighbours, all pairs, or similar photographs."""
     names = [one.name for one in job.photographs]
     # The neighbours of a sequence are known; in a set of unknown order all pairs, or for many
@@ -170,7 +170,7 @@ def _read_features(database: Any, name: str) -> Float[np.ndarray, "k 128"]:
     return largest / np.maximum(np.linalg.norm(largest, axis=1, keepdims=True), 1e-9)
 
 
-def match(job: Job, pairs: Pairs) -> None:
+def match(job: MappingJob, pairs: Pairs) -> None:
     """Match the features of all pairs and verify them with an essential matrix."""
     names = [one.name for one in job.photographs]
     listed = pycolmap.ImportedPairingOptions(match_list_path=Path(job.work) / "pairs.txt")
@@ -182,7 +182,7 @@ def match(job: Job, pairs: Pairs) -> None:
     pycolmap.match_image_pairs(job.database, matching, listed, verification, pycolmap.Device.cpu)
 
 
-def map_photographs(job: Job) -> dict[str, Any]:
+def map_photographs(job: MappingJob) -> dict[str, Any]:
     """Find cameras and points from the matches; write the best model and return its quality.
 
     `registered` are the names of the copies, `error` is the mean reprojection error in pixels, and
@@ -206,7 +206,7 @@ def map_photographs(job: Job) -> dict[str, Any]:
     }
 
 
-def select_model(job: Job) -> tuple[pycolmap.Reconstruction | None, bool]:
+def select_model(job: MappingJob) -> tuple[pycolmap.Reconstruction | None, bool]:
     """Map with a free focal length, then with plausible fixed ones (True), until it is good."""
     if job.is_panoramic:  # the focal length of views is known
         return map_largest(job, is_focal_fixed=True), False
@@ -231,7 +231,7 @@ def _rate_model(model: pycolmap.Reconstruction | None) -> tuple[bool, int, int]:
     return has_plausible_lenses(model), model.num_reg_images(), model.num_points3D()
 
 
-def map_with_fixed_focals(job: Job, fov: float) -> pycolmap.Reconstruction | None:
+def map_with_fixed_focals(job: MappingJob, fov: float) -> pycolmap.Reconstruction | None:
     """Map with focal lengths fixed for a field of view in degrees, then with the refined ones.
 
     With a wrong focal length the mapper still connects photographs that it cannot connect with a
@@ -250,7 +250,7 @@ def map_with_fixed_focals(job: Job, fov: float) -> pycolmap.Reconstruction | Non
     return None if model is None else refine_lenses(model)
 
 
-def _fix_focals(job: Job, focals: dict[int, float], fov: float) -> None:
+def _fix_focals(job: MappingJob, focals: dict[int, float], fov: float) -> None:
     """Fix focal lengths (pixels by camera, or else as of `fov`) in the database, undistorted."""
     with pycolmap.Database.open(job.database) as database:
         for camera in database.read_all_cameras():
@@ -265,7 +265,7 @@ def _fix_focals(job: Job, focals: dict[int, float], fov: float) -> None:
             database.update_camera(known)
 
 
-def map_largest(job: Job, is_focal_fixed: bool = False) -> pycolmap.Reconstruction | None:
+def map_largest(job: MappingJob, is_focal_fixed: bool = False) -> pycolmap.Reconstruction | None:
     """Map the scene; return the model with most photographs, or None if there is none."""
     options = pycolmap.IncrementalPipelineOptions(
         num_threads=job.threads,

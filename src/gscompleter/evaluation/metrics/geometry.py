@@ -28,7 +28,7 @@ MATCH_DISTANCE = 0.05
 
 
 @dataclass(frozen=True)
-class Agreement:
+class SurfaceAgreement:
     """Agreement of depths, and of Gaussians with the context, where both overlap; None for none."""
 
     pixels: int
@@ -41,17 +41,17 @@ class Agreement:
 
 def compare_depths(
     depth: Float[Tensor, "h w"], truth: Float[Tensor, "h w"], where: Bool[Tensor, "h w"]
-) -> Agreement:
+) -> SurfaceAgreement:
     """Compute mean(|depth - truth| / truth) over pixels of `where` with known truth; 0 is best.
 
     No scale is fitted, because registration has to remove scale errors.
     """
     known = where & (truth > 0)
     if not known.any():
-        return Agreement(0)
+        return SurfaceAgreement(0)
     d = depth[known].double()
     t = truth[known].double()
-    return Agreement(int(known.sum()), ((d - t).abs() / t).mean().item())
+    return SurfaceAgreement(int(known.sum()), ((d - t).abs() / t).mean().item())
 
 
 def compute_f_score(
@@ -80,7 +80,7 @@ def compute_nearest_distances(
 @torch.no_grad()
 def measure_alignment(
     added: Gaussians, context: Gaussians, target: Camera, renderer: Renderer
-) -> Agreement:
+) -> SurfaceAgreement:
     """Measure AbsRel, Chamfer distance and F-score of the added Gaussians against `context`.
 
     The overlap is the set of target pixels that both cover when rendered alone, the rim of the
@@ -102,7 +102,7 @@ def measure_alignment(
 @torch.no_grad()
 def measure_primitive_alignment(
     registered: Gaussians, context: Gaussians, target: Camera, renderer: Renderer
-) -> Agreement:
+) -> SurfaceAgreement:
     """Measure the same for all registered Gaussians, without filtering and rendering them.
 
     A Gaussian counts if its mean projects to a pixel that the context covers; these pixels are the
@@ -131,11 +131,11 @@ def compare_clouds(
     reference: DepthMap,
     overlap: Bool[Tensor, "h w"],
     error: float | None,
-) -> Agreement:
+) -> SurfaceAgreement:
     """Add Chamfer distance and F-score over `overlap` to the AbsRel `error`."""
     count = int(overlap.sum())
     if count == 0:
-        return Agreement(0)
+        return SurfaceAgreement(0)
     scale = reference.depth[reference.valid].double().median().item()
     threshold = MATCH_DISTANCE * scale
     points = select_in_mask(generated, None, overlap, target).means
@@ -146,12 +146,12 @@ def compare_clouds(
     at_pixel = sample(reference.depth[..., None], pixels, "nearest")[..., 0]
     surface = surface[is_inside(pixels, z, target) & ((z - at_pixel).abs() <= threshold)]
     if len(points) == 0 or len(surface) == 0:
-        return Agreement(count, error)
+        return SurfaceAgreement(count, error)
     there = compute_nearest_distances(points, context.means)
     back = compute_nearest_distances(surface, generated.means)
     # Distances are not squared, so that floaters do not dominate.
     chamfer = float(there.mean() + back.mean()) / 2 / scale
-    return Agreement(count, error, chamfer, compute_f_score(there, back, threshold))
+    return SurfaceAgreement(count, error, chamfer, compute_f_score(there, back, threshold))
 
 
 def drop_transparent(gaussians: Gaussians) -> Gaussians:

@@ -68,11 +68,11 @@ def compute_ssim_map(
     """Compute the structural similarity (Wang et al. 2004) at each pixel."""
     # Sample instead of population covariances: n / (n - 1) for the n pixels of the window.
     unbiased = (2 * RADIUS + 1) ** 2 / ((2 * RADIUS + 1) ** 2 - 1)
-    mean_a = blur_gaussian(a)
-    mean_b = blur_gaussian(b)
-    var_a = unbiased * (blur_gaussian(a * a) - mean_a * mean_a)
-    var_b = unbiased * (blur_gaussian(b * b) - mean_b * mean_b)
-    cov = unbiased * (blur_gaussian(a * b) - mean_a * mean_b)
+    mean_a = blur_in_window(a)
+    mean_b = blur_in_window(b)
+    var_a = unbiased * (blur_in_window(a * a) - mean_a * mean_a)
+    var_b = unbiased * (blur_in_window(b * b) - mean_b * mean_b)
+    cov = unbiased * (blur_in_window(a * b) - mean_a * mean_b)
     # Constants of the paper, (0.01 L)² and (0.03 L)² with the range L = 1.
     c1 = 0.01**2
     c2 = 0.03**2
@@ -80,7 +80,7 @@ def compute_ssim_map(
     return similar / ((mean_a**2 + mean_b**2 + c1) * (var_a + var_b + c2))
 
 
-def blur_gaussian(values: Float[np.ndarray, "h w 3"]) -> Float[np.ndarray, "h w 3"]:
+def blur_in_window(values: Float[np.ndarray, "h w 3"]) -> Float[np.ndarray, "h w 3"]:
     """Blur with a Gaussian window, summed in float64 and rounded after each direction."""
     weights = np.exp(-0.5 / SIGMA**2 * np.arange(-RADIUS, RADIUS + 1) ** 2)
     line = weights / weights.sum()

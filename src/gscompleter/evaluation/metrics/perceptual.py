@@ -40,7 +40,7 @@ def haarpsi(image: Image, truth: Image, where: Bool[Tensor, "h w"]) -> float | N
     of_image = convert_to_yiq(image)
     of_truth = convert_to_yiq(truth)
     similarity, weight = compute_similarities(of_image, of_truth)
-    inside = halve_image(where[None].double().cpu())[0] >= 0.5
+    inside = halve_channels(where[None].double().cpu())[0] >= 0.5
     if not inside.any():
         return None
     similarity = similarity[:, inside]
@@ -55,7 +55,7 @@ def haarpsi(image: Image, truth: Image, where: Bool[Tensor, "h w"]) -> float | N
 def convert_to_yiq(image: Float[Tensor, "h w 3"]) -> Float[Tensor, "3 half_h half_w"]:
     """Convert to YIQ in units of 8-bit colours, at half the size."""
     colours = 255 * image.clamp(0, 1).double().cpu()
-    return halve_image((colours @ colours.new_tensor(YIQ).T).movedim(-1, 0))
+    return halve_channels((colours @ colours.new_tensor(YIQ).T).movedim(-1, 0))
 
 
 def compute_similarities(
@@ -94,7 +94,7 @@ def average_neighbours(values: Float[Tensor, "c h w"]) -> Float[Tensor, "c h w"]
     return avg_pool2d(pad(values, (0, 1, 0, 1)), 2, stride=1).abs()
 
 
-def halve_image(values: Float[Tensor, "c h w"]) -> Float[Tensor, "c half_h half_w"]:
+def halve_channels(values: Float[Tensor, "c h w"]) -> Float[Tensor, "c half_h half_w"]:
     """Average 2 x 2 pixels, with black beyond an odd side."""
     h, w = values.shape[1:]
     return avg_pool2d(pad(values, (0, w % 2, 0, h % 2)), 2)

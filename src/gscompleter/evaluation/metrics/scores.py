@@ -10,7 +10,7 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 
 from gscompleter.evaluation.metrics.geometry import (
-    Agreement,
+    SurfaceAgreement,
     compare_depths,
     measure_alignment,
     measure_primitive_alignment,
@@ -86,14 +86,14 @@ class Scores:
     neighbours_psnr: tuple[Change, ...]
     context_psnr: tuple[Change, ...]
     context_ssim: tuple[Change, ...]
-    depth_observed: Agreement | None
+    depth_observed: SurfaceAgreement | None
     """Depth against the true one where the context covers it; `depth_hole` in the filled hole."""
-    depth_hole: Agreement | None
+    depth_hole: SurfaceAgreement | None
     seam_step: float | None
     """Median relative depth difference of the added Gaussians to the context, where both cover."""
-    added: Agreement | None
+    added: SurfaceAgreement | None
     """Added Gaussians against the context (`geometry.measure_alignment`)."""
-    registered: Agreement | None
+    registered: SurfaceAgreement | None
     """All registered Gaussians against the context, before filtering."""
 
 
@@ -157,9 +157,9 @@ def score(
         target_after=measure_quality(now.image, target),
         hole=measure_part(now.image, target, holes),
         observed=measure_part(now.image, target, ~holes),
-        neighbours_psnr=compare(beside, truth.neighbours, compute_view_psnr),
-        context_psnr=compare(context, truth.views, compute_view_psnr),
-        context_ssim=compare(context, truth.views, compute_view_ssim),
+        neighbours_psnr=compare_views(beside, truth.neighbours, compute_view_psnr),
+        context_psnr=compare_views(context, truth.views, compute_view_psnr),
+        context_ssim=compare_views(context, truth.views, compute_view_ssim),
         depth_observed=depth_observed,
         depth_hole=depth_hole,
         seam_step=seam_step,
@@ -240,7 +240,7 @@ def compute_median(values: Float[Tensor, "h w"], where: Bool[Tensor, "h w"]) -> 
     return None if where.sum() < MIN_PIXELS else values[where].median().item()
 
 
-def compare(
+def compare_views(
     pairs: Sequence[Sequence[Image]],
     views: Sequence[View],
     metric: Callable[[Image, View], float],

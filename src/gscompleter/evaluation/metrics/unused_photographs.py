@@ -18,7 +18,7 @@ from torch import Tensor
 
 from gscompleter.config.settings import COVERED
 from gscompleter.numerics.geometry import shrink_camera
-from gscompleter.splats.alignment.fit import convert_to_psnr, match_exposure
+from gscompleter.splats.alignment.fit import convert_to_psnr, match_render
 from gscompleter.types import Render, View
 
 LONG_SIDE = 160
@@ -86,5 +86,5 @@ def compute_fitted_psnr(
 ) -> float:
     """Compute PSNR in dB over the pixels of `where`, after matching the exposure."""
     wanted = truth[where].double()
-    fitted = match_exposure(image[where].double(), wanted)
+    fitted = match_render(image[where].double(), wanted)
     return convert_to_psnr((fitted - wanted).square().mean())

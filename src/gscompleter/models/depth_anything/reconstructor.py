@@ -57,7 +57,7 @@ class AnyViewDepth:
             InputError: Fewer than two views, or all at one position.
         """
         batch = create_any_view_batch(views, self.inference.sizing, min_views=2)
-        predicted = run_network(self.network, batch, self.inference)
+        predicted = run_depth_network(self.network, batch, self.inference)
         assert isinstance(predicted, Prediction)
         # The network predicts cameras too, in the unit of its depths. Their distances, compared
         # with the given ones, scale the depths.
@@ -117,7 +117,7 @@ class AnyViewGaussians:
             InputError: Fewer than two views, or all at one position.
         """
         batch = create_any_view_batch(views, self.inference.sizing, min_views=2)
-        predicted = run_network(self.network, batch, self.inference)
+        predicted = run_depth_network(self.network, batch, self.inference)
         if isinstance(predicted, NestedPrediction):
             any_view = predicted.any_view
             solid = predicted.metric.solid_mask
@@ -135,7 +135,7 @@ def get_device(network: torch.nn.Module) -> torch.device:
     return next(network.parameters()).device
 
 
-def run_network(
+def run_depth_network(
     network: DepthAnything | NestedDepthAnything, batch: Batch, inference: Inference
 ) -> Prediction | NestedPrediction:
     """Run a network on a batch, with poses in normalised units."""

@@ -116,7 +116,7 @@ class Pyramid(nn.Module):
         return [stage(x) for stage in self.stages]
 
 
-class DepthPredictor(nn.Module):
+class MultiViewDepth(nn.Module):
     """Depth from cost volumes and monocular features, coarse to fine."""
 
     def __init__(self, config: DepthConfig) -> None:

@@ -64,7 +64,7 @@ class Backbone(nn.Module):
         return self.transformer(alone, sources), alone
 
 
-class DepthPredictor(nn.Module):
+class MVSplatDepth(nn.Module):
     """Depth from a cost volume, refined at full resolution, and raw Gaussian channels."""
 
     def __init__(self, depth_chunk: int) -> None:
@@ -128,7 +128,7 @@ class MVSplat(nn.Module):
         super().__init__()
         self.config = config
         self.backbone = Backbone()
-        self.depth_predictor = DepthPredictor(config.depth_chunk)
+        self.depth_predictor = MVSplatDepth(config.depth_chunk)
 
     def forward(self, images: Float[Tensor, "b v 3 h w"], cameras: Cameras) -> PixelGaussians:
         """Predict a Gaussian for each pixel of at least two views with sides divisible by 16."""

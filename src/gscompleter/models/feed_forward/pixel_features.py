@@ -11,7 +11,7 @@ from gscompleter.models.feed_forward.cameras import Cameras
 from gscompleter.models.feed_forward.depth_predictor import (
     VITS,
     DepthConfig,
-    DepthPredictor,
+    MultiViewDepth,
     create_dpt_head,
 )
 from gscompleter.models.feed_forward.unet import create_conv_block
@@ -29,7 +29,7 @@ class PixelFeatures(nn.Module):
         super().__init__()
         features = VITS[config.vit].gaussian_features
         self.channels = NUM_REGRESSED + 3 + features + 1
-        self.depth_predictor = DepthPredictor(config)
+        self.depth_predictor = MultiViewDepth(config)
         self.feature_upsampler = create_dpt_head(config, features, with_disparity=False)
         self.gaussian_regressor = create_conv_block(features + 5, NUM_REGRESSED, NUM_REGRESSED)
 

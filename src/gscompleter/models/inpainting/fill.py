@@ -68,7 +68,7 @@ def fill_windows(
     return image
 
 
-def run_network(network: OnnxNetwork, image: ndarray, mask: ndarray) -> ndarray:
+def run_inpainting_network(network: OnnxNetwork, image: ndarray, mask: ndarray) -> ndarray:
     """Run a network on an image and a mask; raise InputError if its answer is of another size."""
     (result,) = network(image=image, mask=mask)
     if result.shape != image.shape:

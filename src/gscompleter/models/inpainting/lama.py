@@ -7,7 +7,7 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
-from gscompleter.models.inpainting.fill import InpaintingGenerator, run_network
+from gscompleter.models.inpainting.fill import InpaintingGenerator, run_inpainting_network
 from gscompleter.models.onnx_network import OnnxNetwork, load_network
 from gscompleter.models.weights.published import PUBLISHED
 
@@ -35,7 +35,7 @@ class LaMa:
         border = ((0, rows - height), (0, columns - width))
         pixels = np.pad(image.numpy(), (*border, (0, 0)), mode="symmetric").transpose(2, 0, 1)[None]
         mask = np.pad(hole.float().numpy(), border, mode="symmetric")[None, None]
-        result = run_network(self.network, image=np.ascontiguousarray(pixels), mask=mask)
+        result = run_inpainting_network(self.network, image=np.ascontiguousarray(pixels), mask=mask)
         return torch.from_numpy(result[0] / 255).permute(1, 2, 0)[:height, :width]
 
 

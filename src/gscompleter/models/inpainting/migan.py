@@ -6,7 +6,7 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
-from gscompleter.models.inpainting.fill import InpaintingGenerator, run_network
+from gscompleter.models.inpainting.fill import InpaintingGenerator, run_inpainting_network
 from gscompleter.models.onnx_network import OnnxNetwork, load_network
 from gscompleter.models.weights.published import PUBLISHED
 
@@ -25,7 +25,9 @@ class MIGAN:
         """Fill the hole of an image in [0, 1]."""
         pixels = (255 * image.clamp(0, 1)).round().byte().permute(2, 0, 1)[None]
         known = 255 * (~hole).byte()[None, None]
-        result = run_network(self.network, image=pixels.contiguous().numpy(), mask=known.numpy())
+        result = run_inpainting_network(
+            self.network, image=pixels.contiguous().numpy(), mask=known.numpy()
+        )
         return torch.from_numpy(result[0]).permute(1, 2, 0).float() / 255
 
 

@@ -5,7 +5,7 @@ import math
 import numpy as np
 
 from gscompleter.numerics.kernels.cache import njit
-from gscompleter.numerics.kernels.project import compute_rotation, normalize_quat
+from gscompleter.numerics.kernels.project import normalize_quat, rotate_by_quat
 
 BLOCK = 4096
 """Consecutive Gaussians that are cut into runs independently of the others."""
@@ -101,7 +101,7 @@ def _compute_variance(first, last, shares, means, quats, scales, mean, axis):
     for i in range(first, last):
         dx, dy, dz = means[i, 0] - mean[0], means[i, 1] - mean[1], means[i, 2] - mean[2]
         squares = (ax * dx + ay * dy + az * dz) ** 2
-        own = compute_rotation(normalize_quat(quats, i)[0])
+        own = rotate_by_quat(normalize_quat(quats, i)[0])
         for k in range(3):
             along = (ax * own[k] + ay * own[3 + k] + az * own[6 + k]) * scales[i, k]
             squares += along * along
@@ -127,7 +127,7 @@ def merge_runs(begin, end, start, gaussians, shares, merged):
         if last - first == 1:
             to_scales[run], to_opacities[run] = scales[first], opacities[first]
             continue
-        axes = compute_rotation(normalize_quat(quats, most)[0])
+        axes = rotate_by_quat(normalize_quat(quats, most)[0])
         for k in range(3):
             axis = axes[k], axes[3 + k], axes[6 + k]
             seen = (means, quats, scales, to_means[run], axis)

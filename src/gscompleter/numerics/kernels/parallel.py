@@ -31,10 +31,10 @@ def share(kernel, count, *arguments, threads=None):
     """
     threads = count_threads(threads)
     pieces = split_range(count, threads * PIECES_PER_THREAD if threads > 1 else 1)
-    run(kernel, [(*piece, *arguments) for piece in pieces], threads)
+    run_calls(kernel, [(*piece, *arguments) for piece in pieces], threads)
 
 
-def run(kernel, calls, threads=None):
+def run_calls(kernel, calls, threads=None):
     """Run a kernel for each of `calls`, on this thread and idle ones, and return the results."""
     threads = count_threads(threads)
     if threads == 1 or len(calls) == 1:

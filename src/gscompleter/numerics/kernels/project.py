@@ -20,7 +20,7 @@ SUM, SUM_S, SUM_T, SUM_SS, SUM_ST, SUM_TT, SUM_DEPTH, SUM_RED = range(8)
 NUM_GRADIENT_COLUMNS = 10
 
 
-class Pinhole(NamedTuple):
+class CameraArrays(NamedTuple):
     """A camera in the form that kernels read."""
 
     rotation: tuple[np.float32, ...]
@@ -84,7 +84,7 @@ def normalize_quat(quats, i):
 
 
 @njit(fastmath={"contract"})
-def compute_rotation(quat):
+def rotate_by_quat(quat):
     """Compute the rotation matrix of a unit quaternion, row by row."""
     w, x, y, z = quat
     one, two = np.float32(1), np.float32(2)
@@ -229,7 +229,7 @@ def _basis_backward(direction, g):
 
 
 @njit(nogil=True, fastmath={"contract"}, error_model="numpy")
-def project(begin, end, gaussians, pinhole, splats, boxes, factors):
+def project_splats(begin, end, gaussians, pinhole, splats, boxes, factors):
     """Project the Gaussians begin..end to `splats` and `boxes`, empty if invisible.
 
     A box encloses the pixels in which alpha reaches 1/255 at the given opacity. factors [n]
@@ -253,7 +253,7 @@ def project(begin, end, gaussians, pinhole, splats, boxes, factors):
             continue
         tan_x, tan_y = x * (one / z), y * (one / z)
         quat, _ = normalize_quat(quats, i)
-        axes = _scale_columns(_multiply(view, compute_rotation(quat)), scales, i)
+        axes = _scale_columns(_multiply(view, rotate_by_quat(quat)), scales, i)
         flat = _flatten(axes, _compute_jacobian(fx, fy, tan_x, tan_y, one / z, limits))
 
         # The determinant of F Fᵀ + blur is summed from squares: nothing cancels, however thin
@@ -377,7 +377,7 @@ def project_backward(
         inverse_z = one / z
         tan_x, tan_y = x * inverse_z, y * inverse_z
         quat, unit_factor = normalize_quat(quats, i)
-        rotation = _multiply(view, compute_rotation(quat))
+        rotation = _multiply(view, rotate_by_quat(quat))
         axes = _scale_columns(rotation, scales, i)
         jacobian = _compute_jacobian(fx, fy, tan_x, tan_y, inverse_z, limits)
         flat = _flatten(axes, jacobian)

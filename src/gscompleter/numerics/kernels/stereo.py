@@ -9,7 +9,7 @@ from typing import NamedTuple
 import numpy as np
 
 from gscompleter.numerics.kernels.cache import njit
-from gscompleter.numerics.kernels.parallel import run, share
+from gscompleter.numerics.kernels.parallel import run_calls, share
 
 UNSEEN = 255
 """Cost of a plane at which the pixel falls outside the other image."""
@@ -358,7 +358,7 @@ def aggregate_semi_globally(costs, bands, large_x, large_y, large_d, large_u, sm
     totals = np.zeros((2, len(costs)), np.int16)
     jumps = (large_x, large_y, large_d, large_u)
     halves = [(costs, bands, *jumps, small, half == 0, totals[half]) for half in range(2)]
-    run(_sweep_half, halves)
+    run_calls(_sweep_half, halves)
     totals[0] += totals[1]
     return totals[0]
 

@@ -3,7 +3,7 @@
 import numpy as np
 
 from gscompleter.numerics.kernels.cache import njit
-from gscompleter.numerics.kernels.parallel import count_threads, run, split_range
+from gscompleter.numerics.kernels.parallel import count_threads, run_calls, split_range
 
 PRIMAL_STEP, GRADIENT_STEP = np.float32(0.25), np.float32(0.2)
 DUAL_STEP, GRADIENT_DUAL_STEP = np.float32(1 / 3), np.float32(0.5)
@@ -41,7 +41,7 @@ def fit(heights, gradients, data, weight, across, down, bend, tolerance, iterati
         inner = [(top, int(top > 0), end, -int(end < h)) for top, end in bands]
         seams = [(top, -1, top, 1) for top, _ in bands[1:]]
         for parts in (inner, seams):
-            run(advance, [(*part, count, state, given) for part in parts], threads)
+            run_calls(advance, [(*part, count, state, given) for part in parts], threads)
 
 
 @njit(nogil=True, fastmath={"contract"}, error_model="numpy")

@@ -48,7 +48,7 @@ ColorRatio = tuple[Float[np.ndarray, "3"], Float[np.ndarray, "3"]]
 
 
 @dataclass(frozen=True)
-class Layer:
+class DepthLayer:
     """The inverse depth of one view."""
 
     image: StereoImage
@@ -75,7 +75,7 @@ class DepthComparison:
 
 
 def compare_with_views(
-    number: int, layers: Sequence[Layer], kept: Sequence[Mask], transforms: Transforms
+    number: int, layers: Sequence[DepthLayer], kept: Sequence[Mask], transforms: Transforms
 ) -> Iterator[DepthComparison]:
     """Compare view `number` with the measured and `kept` pixels of each other view.
 
@@ -98,7 +98,7 @@ def compare_with_views(
         yield DepthComparison(other, through, same)
 
 
-def find_free_pixels(layers: Sequence[Layer], transforms: Transforms) -> list[Mask]:
+def find_free_pixels(layers: Sequence[DepthLayer], transforms: Transforms) -> list[Mask]:
     """Find the pixels of each view that are outside the free space of all other views.
 
     No view sees through them, or more views confirm than refute them.
@@ -116,7 +116,7 @@ def find_free_pixels(layers: Sequence[Layer], transforms: Transforms) -> list[Ma
 
 
 def find_finest_pixels(
-    layers: Sequence[Layer], free: Sequence[Mask], transforms: Transforms
+    layers: Sequence[DepthLayer], free: Sequence[Mask], transforms: Transforms
 ) -> list[Mask]:
     """Find the `free` pixels of each view whose surface no other view measured better.
 
@@ -147,7 +147,7 @@ def compute_depth_ratio(inverse: Map, transform: Transform) -> Float[np.ndarray,
     return a * x + b * y + c + d * inverse
 
 
-def estimate_gains(layers: Sequence[Layer], transforms: Transforms) -> Gains:
+def estimate_gains(layers: Sequence[DepthLayer], transforms: Transforms) -> Gains:
     """Estimate how much brighter each photograph is than their mean, per channel.
 
     The log-gains have mean 0. All gains are exactly 1 for two photographs, whose colours depend on
@@ -181,7 +181,7 @@ def solve_log_gains(ratios: Iterable[tuple[list[int], ColorRatio]], count: int) 
 
 
 def measure_ratios(
-    layers: Sequence[Layer], transforms: Transforms
+    layers: Sequence[DepthLayer], transforms: Transforms
 ) -> Iterator[tuple[list[int], ColorRatio]]:
     """Yield the colour ratio of every ordered pair of photographs."""
     measured = [layer.measured_mask for layer in layers]
@@ -220,7 +220,7 @@ def measure_ratio(
 
 
 def sample_colors(
-    layer: Layer,
+    layer: DepthLayer,
     rows: Int[np.ndarray, "n"],
     columns: Int[np.ndarray, "n"],
     other: StereoImage,

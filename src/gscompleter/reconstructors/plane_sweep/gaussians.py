@@ -14,7 +14,7 @@ from gscompleter.numerics.sky import extend_sky, is_sky, restore_sky_colors
 from gscompleter.reconstructors.plane_sweep.directional_colors import fit_directional_colors
 from gscompleter.reconstructors.plane_sweep.fit import fit_jointly, fit_opacities
 from gscompleter.reconstructors.plane_sweep.fusion import (
-    Layer,
+    DepthLayer,
     estimate_gains,
     find_finest_pixels,
     find_free_pixels,
@@ -59,7 +59,7 @@ class Splatter:
         self,
         views: Sequence[View],
         depths: Sequence[DepthMap],
-        layers: Sequence[Layer],
+        layers: Sequence[DepthLayer],
         transforms: Transforms,
     ) -> Reconstruction:
         """Build the Gaussians of `views` and fit them to the photographs.
@@ -123,7 +123,7 @@ class Splatter:
         self,
         gaussians: Gaussians,
         views: Sequence[View],
-        layers: Sequence[Layer],
+        layers: Sequence[DepthLayer],
         transforms: Transforms,
     ) -> Bool[Tensor, "n"]:
         """Select the pixels that form the scene, over all views in turn."""

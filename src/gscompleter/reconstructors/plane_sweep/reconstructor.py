@@ -21,7 +21,7 @@ from gscompleter.reconstructors.depth_predictors import (
 )
 from gscompleter.reconstructors.features.depth_range import get_depth_range, set_depth_range
 from gscompleter.reconstructors.features.stereo_image import StereoImage
-from gscompleter.reconstructors.plane_sweep.fusion import Layer
+from gscompleter.reconstructors.plane_sweep.fusion import DepthLayer
 from gscompleter.reconstructors.plane_sweep.gaussians import Splatter
 from gscompleter.reconstructors.plane_sweep.given_depth import add_given, measure_nothing
 from gscompleter.reconstructors.plane_sweep.predicted_depth import add_prediction
@@ -103,7 +103,7 @@ class PlaneSweep(Splatter):
         rig = build_rig(views)
         return make_depth_maps(self.compute_layers(rig, views), rig.unit, views)
 
-    def compute_layers(self, rig: Rig, views: Sequence[View]) -> list[Layer]:
+    def compute_layers(self, rig: Rig, views: Sequence[View]) -> list[DepthLayer]:
         """Compute the completed inverse depth of each view."""
         min_halved_side = MIN_HALVED_SIDES["pair" if len(views) == 2 else "many"]
         measured = [
@@ -142,25 +142,29 @@ def match_views(rig: Rig, views: Sequence[View], min_halved_side: float) -> list
     ]
 
 
-def make_layer(image: StereoImage, measured: Measurement, iterations: int = ITERATIONS) -> Layer:
+def make_layer(
+    image: StereoImage, measured: Measurement, iterations: int = ITERATIONS
+) -> DepthLayer:
     """Convert the measured depths of a view to a layer, by surfaces after so many iterations."""
     full = measured.resize_to(image.size)
     index = fit_surfaces(full.index, full.weight, image.image, iterations)
-    return Layer(image, compute_inverse_depth(full.planes, index), full.confidence)
+    return DepthLayer(image, compute_inverse_depth(full.planes, index), full.confidence)
 
 
-def add_sky(layer: Layer, measured: Measurement, sky: Mask) -> Layer:
+def add_sky(layer: DepthLayer, measured: Measurement, sky: Mask) -> DepthLayer:
     """Set the sky of a layer to the sky depth, with full confidence."""
     # The first plane is the far plane, in inverse depth.
     inverse_sky_depth = np.float32(measured.planes[0] / SKY_DEPTH)
-    return Layer(
+    return DepthLayer(
         layer.image,
         inverse=np.where(sky, inverse_sky_depth, layer.inverse),
         confidence=np.where(sky, np.float32(1), layer.confidence),
     )
 
 
-def make_depth_maps(layers: Sequence[Layer], unit: float, views: Sequence[View]) -> list[DepthMap]:
+def make_depth_maps(
+    layers: Sequence[DepthLayer], unit: float, views: Sequence[View]
+) -> list[DepthMap]:
     """Convert layers to z-depths in scene units; the sky is not valid."""
     depths = []
     for layer, view in zip(layers, views, strict=True):

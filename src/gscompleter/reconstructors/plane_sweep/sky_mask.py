@@ -136,7 +136,7 @@ def find_even_region(image: StereoImage) -> Mask:
     core = np.isin(labels, top)
     # An edge raises the gradient around it, so that the core ends before the sky does. Pixels
     # beside it that have its colour are added.
-    alike = compute_color_difference(core, image) < MAX_SKY_DIFFERENCE
+    alike = compute_difference_from_core(core, image) < MAX_SKY_DIFFERENCE
     return core | (dilate_square(core, EDGE_RADIUS) & alike)
 
 
@@ -149,7 +149,7 @@ def compute_color_gradient(image: StereoImage) -> Map:
     return take_largest_channel(cv2.magnitude(across, down))
 
 
-def compute_color_difference(core: Mask, image: StereoImage) -> Map:
+def compute_difference_from_core(core: Mask, image: StereoImage) -> Map:
     """Compute the largest channel difference to the mean colour of `core` nearby."""
     colour = image.image.astype(np.float32)
     weight = core.astype(np.float32)

@@ -168,7 +168,7 @@ def add_background(sweep: Sweep, confidence: Map, neighbours: Sequence[Neighbour
     """
     background = stereo.fill_background(sweep.index, confidence > 0)
     behind = compute_inverse_depth(sweep.planes, background)
-    occluded = (confidence == 0) & find_hidden(behind, neighbours)
+    occluded = (confidence == 0) & find_hidden_pixels(behind, neighbours)
     weight = np.where(occluded, BACKGROUND_WEIGHT, confidence)
     index = np.where(occluded, background, sweep.index)
     return Measurement(sweep.planes, index, weight, confidence)
@@ -194,7 +194,7 @@ def remove_speckles(index: Map, mask: Mask) -> Mask:
     return levels > 0
 
 
-def find_hidden(background: Map, neighbours: Sequence[Neighbour]) -> Mask:
+def find_hidden_pixels(background: Map, neighbours: Sequence[Neighbour]) -> Mask:
     """Mark background surfaces that some view occludes and no view observes."""
     hidden = np.zeros(background.shape, bool)
     seen = np.zeros(background.shape, bool)

@@ -116,7 +116,7 @@ def score_image(render: Render, view: View) -> ImageFit:
     if covered < MIN_COVERAGE:
         return ImageFit(coverage=covered)
     truth = photograph[where].double()
-    rendered = match_exposure(render.image[where].double(), truth)
+    rendered = match_render(render.image[where].double(), truth)
     psnr = convert_to_psnr((rendered - truth).square().mean())
 
     # A blurred or uniform photograph has a high PSNR with any image, so the margin counts.
@@ -132,7 +132,7 @@ def score_image(render: Render, view: View) -> ImageFit:
     return ImageFit(psnr, margin, covered, drift)
 
 
-def match_exposure(
+def match_render(
     rendered: Float[Tensor, "n 3"], truth: Float[Tensor, "n 3"]
 ) -> Float[Tensor, "n 3"]:
     """Match the exposure of `truth` by one gain and one offset (least squares)."""

@@ -23,7 +23,7 @@ from gscompleter.splats.alignment.fit import render_from
 from gscompleter.splats.alignment.similarity import (
     Matrix,
     fit_pose_similarity,
-    get_pose,
+    get_camera_pose,
     has_baseline,
     make_similarity,
     transform_camera,
@@ -67,11 +67,11 @@ def search_similarities(
     """Yield similarities from photographs to splat by which some photographs match."""
     # One camera is placed around the splat; the others are located in its render.
     seer = photographs[len(photographs) // 2][0]
-    if len(scene) == 0 or not has_baseline([get_pose(camera) for camera, _ in photographs]):
+    if len(scene) == 0 or not has_baseline([get_camera_pose(camera) for camera, _ in photographs]):
         return
     # The fainter half of the Gaussians, floaters among them, says little about the extent.
     solid = scene.means[scene.opacities >= scene.opacities.median()].detach().cpu().double().numpy()
-    for transform in generate_starts(get_pose(seer), points, solid):
+    for transform in generate_starts(get_camera_pose(seer), points, solid):
         rendered = render_features(scene, transform_camera(seer, transform), renderer)
         similarity = fit_similarity(
             [locate_photo(rendered, photograph) for photograph in photographs]
@@ -130,7 +130,7 @@ def refine_similarity(
 def fit_similarity(photos: Sequence[LocatedPhoto | None]) -> Matrix | None:
     """Fit photographs' frame to splat's frame by located photographs; None if too few."""
     located = [photo for photo in photos if photo is not None]
-    before = [get_pose(photo.camera) for photo in located]
+    before = [get_camera_pose(photo.camera) for photo in located]
     if not has_baseline(before):
         return None
     start = fit_pose_similarity(before, [photo.pose for photo in located])
@@ -179,7 +179,7 @@ def _compute_residuals(
     points: Float[np.ndarray, "m 3"], photo: LocatedPhoto
 ) -> Float[np.ndarray, "k"]:
     """Compute the reprojection errors along x and y, in pixels."""
-    pose = get_pose(photo.camera)
+    pose = get_camera_pose(photo.camera)
     local = (points - pose[:3, 3]) @ pose[:3, :3]
     homogeneous = local @ photo.camera.K.detach().cpu().double().numpy().T
     # A point behind the camera gets a large error instead of a mirrored pixel.
@@ -189,7 +189,7 @@ def _compute_residuals(
 
 def extract_view_features(view: View) -> Features:
     """Extract the features of one view."""
-    pose = get_pose(view.camera)
+    pose = get_camera_pose(view.camera)
     pixels = np.ascontiguousarray(view.image.detach().cpu().clamp(0, 1).float().numpy())
     K = view.camera.K.detach().cpu().double().numpy()
     unknown = np.zeros(pixels.shape[:2], np.float32)

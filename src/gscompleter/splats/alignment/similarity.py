@@ -43,7 +43,7 @@ def transform_camera(camera: Camera, transform: Matrix) -> Camera:
     if np.array_equal(transform, np.eye(4)):
         return camera
     factor = get_scale(transform)
-    c2w = torch.from_numpy(transform_pose(get_pose(camera), transform)).to(camera.c2w)
+    c2w = torch.from_numpy(transform_pose(get_camera_pose(camera), transform)).to(camera.c2w)
     near = None if camera.near is None else camera.near * factor
     far = None if camera.far is None else camera.far * factor
     return replace(camera, c2w=c2w, near=near, far=far)
@@ -68,7 +68,7 @@ def transform_view(view: View, transform: Matrix) -> View:
     )
 
 
-def get_pose(camera: Camera) -> Matrix:
+def get_camera_pose(camera: Camera) -> Matrix:
     """Get the camera-to-world transform as a float64 array."""
     return camera.c2w.detach().cpu().double().numpy()
 

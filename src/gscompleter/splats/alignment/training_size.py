@@ -76,7 +76,7 @@ Record = tuple[float, str]
 
 def read_inria_scale(splat: Path, folder: Path, width: int) -> Record | None:
     """Read the scale of Inria's trainer: of its folder of images, and of what it makes of them."""
-    text = read_settings(splat, folder, INRIA_FILE)
+    text = read_trainer_settings(splat, folder, INRIA_FILE)
     resolution = re.search(r"\bresolution=(-?\d{1,5})\b", text)
     if resolution is None:
         return None
@@ -95,7 +95,7 @@ def read_inria_scale(splat: Path, folder: Path, width: int) -> Record | None:
 
 def read_gsplat_scale(splat: Path, folder: Path) -> Record | None:
     """Read the scale of gsplat's example trainer."""
-    text = read_settings(splat, folder, GSPLAT_FILE)
+    text = read_trainer_settings(splat, folder, GSPLAT_FILE)
     factor = re.search(r"^data_factor:\s*(\d{1,2})\s*$", text, re.MULTILINE)
     return None if factor is None else (1 / max(int(factor[1]), 1), GSPLAT_FILE)
 
@@ -115,7 +115,7 @@ def read_listed_scale(
     return None
 
 
-def read_settings(splat: Path, folder: Path, name: str) -> str:
+def read_trainer_settings(splat: Path, folder: Path, name: str) -> str:
     """Read a small text file of the trainer from the nearest folder that has it, or nothing."""
     near = list_trainer_folders(splat, folder)
     for place in [*near, near[0].parent]:  # gsplat keeps its files in folders beside `cfg.yml`

@@ -51,7 +51,7 @@ def find_ffmpeg() -> str:
         ) from error
 
 
-def read_frames(path: Path, filters: str, is_grey: bool) -> Iterator[UInt8[np.ndarray, "h w *c"]]:
+def read_video(path: Path, filters: str, is_grey: bool) -> Iterator[UInt8[np.ndarray, "h w *c"]]:
     """Decode a video upright, in grey or colours, after `filters` of ffmpeg; frame by frame."""
     refuse_pointer(path)
     command = [
