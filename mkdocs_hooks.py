@@ -24,20 +24,21 @@ TEXTS = {
     "README.md": "index.md",
     "CONTRIBUTING.md": "contributing.md",
     "CHANGELOG.md": "changelog.md",
+    "benchmarks/history.md": "history.md",
 }
 """Files of the repository that are pages of the site."""
 FILES = ("LICENSE", "CITATION.cff")
 """Files of the repository that pages link to and that are copied as they are."""
 STAGES = (
-    "select_context",
     "context",
     "target_view",
     "synthesize",
     "select_anchor",
     "lift",
     "align_depth",
-    "slide_along_rays",
-    "extrapolate",
+    "register",
+    "register_paper",
+    "extrapolate_registration",
     "filter_holes",
     "refine",
     "recolor",

@@ -36,7 +36,7 @@ def main() -> None:
 
     # 3. Register: one affine for all depths, then each Gaussian along its ray.
     affine = stages.align_depth(lifted, view, torch.Generator().manual_seed(0))
-    moved = stages.slide_along_rays(lifted, affine, image, view)
+    moved = stages.register_as_paper(lifted, affine, image, view)
     print(f"affine: {affine}")
     print(f"loss: {moved.losses[0]:.4f} to {moved.losses[-1]:.4f}")
 

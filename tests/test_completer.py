@@ -24,11 +24,12 @@ from gscompleter.numerics.geometry import project
 from gscompleter.render.cpu import CpuRenderer
 from gscompleter.render.reference import adapt_to_mode
 from gscompleter.stages.lift import lift_pair
-from gscompleter.stages.slide_along_rays import apply_affine
+from gscompleter.stages.register import apply_affine
 from gscompleter.stages.target_view import compute_hole_mask
 from gscompleter.state import Completion
 from gscompleter.system.timing import STAGES
 from gscompleter.types import Camera, Gaussians, View, merge
+from knowing_models import KnowingGenerator, KnowingReconstructor, knowing
 from parity import assert_close
 from scenes import Room, camera_at, gaussians_of, reconstruction_of, scaled, view_of
 
@@ -45,39 +46,6 @@ def photographs(unit: float = 1.0) -> list[View]:
     return [view_of(Room(unit=unit), c, i) for i, c in enumerate(cameras(unit)[0])]
 
 
-def bumps(camera: Camera) -> torch.Tensor:
-    """Make depth errors, about 20 % short, that vary by 8 % over 64 pixels."""
-    x, y = torch.linspace(0, 3, camera.width), torch.linspace(0, 3, camera.height)
-    return 0.8 * (1 + 0.08 * torch.sin(x)[None] * torch.cos(y)[:, None])
-
-
-class KnowingReconstructor:
-    """Ψ that knows the room, with depth errors where nothing was photographed."""
-
-    def __init__(self, unit: float = 1.0) -> None:
-        self.unit = unit
-
-    def __call__(self, views):
-        depths = []
-        for view in views:
-            depth = view_of(Room(unit=self.unit), view.camera).depth
-            invented = view.frame is None
-            # A pair is consistent in itself: the anchor errs by the same scale as the reference.
-            paired = any(v.frame is None for v in views)
-            depths.append(depth * (bumps(view.camera) if invented else 0.8 if paired else 1.0))
-        return reconstruction_of(views, depths)
-
-
-class KnowingGenerator:
-    """Φ that knows the room."""
-
-    def __init__(self, unit: float = 1.0) -> None:
-        self.unit = unit
-
-    def __call__(self, nearest, target, context):
-        return view_of(Room(unit=self.unit), target).image
-
-
 class KnowingTogether(KnowingGenerator):
     """The same generator, for two targets at a time."""
 
@@ -92,10 +60,6 @@ class KnowingTogether(KnowingGenerator):
         self.calls.append(list(requests))
         notes = (f"One of {len(requests)}.",)
         return [GeneratorOutput(self(r.nearest, r.target, r.context), notes) for r in requests]
-
-
-def knowing(config: CompleterConfig = CompleterConfig(), unit: float = 1.0) -> GSCompleter:
-    return GSCompleter(KnowingReconstructor(unit), KnowingGenerator(unit), config=config)
 
 
 @cache
@@ -159,7 +123,7 @@ def test_the_depth_error_of_the_completed_region_shrinks_through_each_stage():
         return ((z - truth[y, x]).abs() / truth[y, x]).median().item()
 
     after_lift = error(lifted.gaussians[in_hole])
-    coarse = apply_affine(lifted.gaussians, result.affine, target, "constant")
+    coarse = apply_affine(lifted.gaussians, result.affine, target)
     after_affine = error(coarse[in_hole])
     after_all = error(completion.added)
     assert after_lift > 0.15

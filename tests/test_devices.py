@@ -75,8 +75,10 @@ def check_there(value: object) -> None:
 
 def few_steps(config: CompleterConfig) -> CompleterConfig:
     """Reduce the stages to a few steps."""
-    registration = replace(config.registration, iterations=2)
-    return replace(config, registration=registration, refine=replace(config.refine, iterations=2))
+    name = "registration" if config.registration_method == "ours" else "paper_registration"
+    registration = replace(getattr(config, name), iterations=2)
+    refine = replace(config.refine, iterations=2)
+    return replace(config, **{name: registration}, refine=refine)
 
 
 @pytest.mark.parametrize("config", [CompleterConfig(), CompleterConfig.paper()])

@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Any
 __version__ = "0.1.0"
 
 if TYPE_CHECKING:
+    from gscompleter.apps.report.judge import judge as judge
     from gscompleter.completer import GSCompleter as GSCompleter
     from gscompleter.config import CompleterConfig as CompleterConfig
     from gscompleter.config import load_config as load_config
@@ -36,6 +37,7 @@ _HOMES = {
     "CompleterConfig": "config",
     "load_config": "config",
     "InputError": "system.errors",
+    "judge": "apps.report.judge",
     "load_generator": "generators",
     "load_ply": "splats.ply",
     "save_ply": "splats.ply",

@@ -27,7 +27,8 @@ from gscompleter.stages.lift import lift
 from gscompleter.stages.new_photos import find_new_photos, recolor_to_photos
 from gscompleter.stages.recolor import recolor
 from gscompleter.stages.refine import refine
-from gscompleter.stages.slide_along_rays import slide_along_rays
+from gscompleter.stages.register import register_along_rays
+from gscompleter.stages.register_paper import register_as_paper
 from gscompleter.stages.synthesize import GeneratedView, synthesize
 from gscompleter.stages.target_view import TargetView, render_target
 from gscompleter.state import NEW_PHOTO_ID, Completion, Photo, Step, find_last_target_id
@@ -42,6 +43,8 @@ MAX_TARGET_ID = NEW_PHOTO_ID - 1
 """Largest target id: `generated` is one byte per Gaussian, and 0 means observed."""
 MAX_SEED = 2**62
 """Levels and rounds add to the seed, which has 64 bits."""
+REGISTRATIONS = {"paper": register_as_paper, "ours": register_along_rays}
+"""Registration by the name that a preset gives it."""
 
 
 @dataclass(frozen=True)
@@ -156,7 +159,15 @@ class GSCompleter:
             new = find_new_photos(config, parts, made.views, self.scenes)
             known = [view for number, view in enumerate(made.views) if number not in new]
             trust = load_trust(config, parts, known, self.scenes)
-            state = Completion(config, made.source, parts, photos, len(views), trust)
+            state = Completion(
+                config,
+                made.source,
+                parts,
+                photos,
+                len(views),
+                trust,
+                is_given=scene is not None,
+            )
             state = prepare_guards(state, self.scenes)
             state = recolor_to_photos(state, [made.views[i] for i in new], self.scenes)
         return replace(state, exposure_gains=made.exposure_gains, seconds=seconds)
@@ -178,7 +189,8 @@ class GSCompleter:
             image = reference or self.synthesize([view])[0]  # Eq. 6
             lifted = lift(self.reconstructor, image, view)  # Eq. 7
             affine = align_depth(lifted, view, rng)  # Eq. 8
-            moved = slide_along_rays(lifted, affine, image, view)  # Eq. 9 to 11
+            register = REGISTRATIONS[state.config.registration_method]
+            moved = register(lifted, affine, image, view)  # Eq. 9 to 11
             steps = [Step("lift", lifted.gaussians), Step("register", moved.gaussians)]
             steps.append(Step("filter", filter_holes(moved, view)))  # Eq. 12
             steps += place(steps[-1].gaussians, view)

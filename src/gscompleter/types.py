@@ -563,6 +563,17 @@ class Lift:
 
 
 @dataclass(frozen=True)
+class Registration:
+    """Registered Gaussians."""
+
+    gaussians: Gaussians
+    pixel_index: Int[Tensor, "n"] | None
+    """Row-major pixel of the reference that each Gaussian comes from, or None if unknown."""
+    losses: tuple[float, ...]
+    """Value of Eq. 11 at each iteration."""
+
+
+@dataclass(frozen=True)
 class DepthAffine:
     """Correction `D_ctx = scale * D_pred + shift` on z-depth (paper, Eq. 8)."""
 

@@ -29,15 +29,18 @@ def batch(tmp_path) -> Path:
     """Write the folder of a batch with a scene that is done and one that failed."""
     done = {"state": "done", "targets": 1, "added": 3, "seconds": 2.0, **dict.fromkeys(SCORES, 0.5)}
     failed = {"state": "failed", "reason": "There is no <photograph>."}
+    shards = {"state": "failed", "reason": "The scene did not reconstruct."}
     (tmp_path / "rows").mkdir()
-    for name, row in (("room & hall", done), ("cellar", failed)):
+    for name, row in (("room & hall", done), ("cellar", failed), ("attic", shards)):
         content = {"job": name, "options": {}, "attempts": 1, **row}
         (tmp_path / "rows" / f"{name}.json").write_text(json.dumps(content))
     images = tmp_path / "jobs" / "room & hall" / "images"
     images.mkdir(parents=True)
     for number, when in enumerate(("before", "after")):
         write_image(images / f"target1_{when}.png", torch.full((24, 32, 3), 0.5 + 0.2 * number))
-    write_overview(tmp_path, [Job("room & hall"), Job("cellar")])
+    (tmp_path / "jobs" / "attic").mkdir()
+    (tmp_path / "jobs" / "attic" / "report.html").write_text("<title>Attic</title>")
+    write_overview(tmp_path, [Job("room & hall"), Job("cellar"), Job("attic")])
     return tmp_path
 
 
@@ -50,6 +53,14 @@ def test_the_pictures_of_the_jobs_are_shown(browser, batch):
     below = batch.as_uri()
     assert all(url.startswith(below) for url in tab.requests)
     assert tab.page.locator("#failures").inner_text().count("There is no <photograph>.") == 1
+
+
+def test_a_failed_job_that_left_a_report_links_to_it(browser, batch):
+    tab = Tab(browser, batch / "index.html", 1000, 800)
+    (link,) = tab.page.locator("#failures a").all()
+    assert link.inner_text() == "attic"
+    link.click()
+    assert tab.page.title() == "Attic"
 
 
 def test_no_other_request_is_allowed(browser, batch):

@@ -261,12 +261,7 @@ def test_wrong_frames_are_refused(scene, tmp_path, monkeypatch, capsys, more, se
         (("--sed", 1), "nearest is --seed INT (see gscompleter complete --help)."),
         (("--drop_nonfinit",), "options: --drop_nonfinit; the nearest is --drop-nonfinite (see"),
         (("--qwertz", 1), "Unrecognized options: --qwertz, 1 (see gscompleter complete --help)."),
-        (("--config.registration.lr-unitt", 1), "nearest is --config.registration.lr-unit"),
-        (
-            ("--config.harm.max-loss", 1),
-            "setting harm.max_loss is now called psnr_guard.max_opacity_loss; use the new name.",
-        ),
-        (("--config.support.doubts=no",), "support.doubts is now called trust; use"),
+        (("--config.registration.hole-deptth", 1), "nearest is --config.registration.hole-depth"),
         (("--device", "tpu"), "invalid choice 'tpu' for argument '--device'."),
         (("--near", "a" * 5000), "aaa…aaa"),
         (("--config",), "Missing value for argument '--config'."),
@@ -274,11 +269,12 @@ def test_wrong_frames_are_refused(scene, tmp_path, monkeypatch, capsys, more, se
         (("--config", "nowhere.yaml"), "nowhere.yaml"),
         (("--config.margin", 1e9), "got 1000000000.0 (--config.margin)."),
         (("--config.margin", "nan"), "config.margin must be a finite number"),
-        (("--config.registration.beta1", 1), "config.registration.beta1 must be less than 1"),
+        (("--config.holes.max-alpha", 2), "config.holes.max_alpha must be less than or equal to 1"),
         (("--config.registration.iterations", 10**12), "(--config.registration.iterations)."),
         (("--config.registration.iterations", "many"), "'many'"),
         (("--config.registration.speed", 1), "--config.registration.speed"),
-        (("--config.registration.footprint", "round"), "'round'"),
+        (("--config.registration.hole-depth", "round"), "'round'"),
+        (("--config.paper-registration.iterations", 7), "does not read them; choose the other"),
         (("--generator-steps", 8, "--generator", "oracle"), "choose pe-field or diffusers-inp"),
         (("--generator-steps", 0, "--generator", "pe-field"), "got 0 (--generator-steps)."),
         (("--generator-steps", "few"), "'few'"),
@@ -310,6 +306,30 @@ def test_what_is_no_command_gets_a_sentence_too(monkeypatch, capsys, words):
     assert said.out == ""
 
 
+@pytest.mark.parametrize(
+    ("words", "sentence"),
+    [
+        (
+            ("evaluate", "a", "--out", "b", "--overwrite"),
+            "evaluate has no option --overwrite, which belongs to complete, live, remove and 8 "
+            "more; evaluate continues the run in its folder (see gscompleter evaluate --help).",
+        ),
+        (
+            ("evaluate", "a", "--target=3"),
+            "evaluate has no option --target, which belongs to complete, remove (see",
+        ),
+        (("view", "a", "--out", "b"), "view has no option --out, which belongs to complete, "),
+        (
+            ("complete", "a", "--out", "b", "--wrokers", "3"),  # of batch
+            "Unrecognized options: --wrokers, 3 (see gscompleter complete --help).",
+        ),
+    ],
+)
+def test_an_option_of_another_command_is_told_as_such(monkeypatch, capsys, words, sentence):
+    assert run(monkeypatch, *words) == 2
+    assert sentence in capsys.readouterr().err
+
+
 @pytest.mark.parametrize("word", ["compleat", "--verson"])
 def test_the_commands_are_named_in_place_of_an_unknown_one(monkeypatch, capsys, word):
     assert run(monkeypatch, word) == 2
@@ -338,14 +358,16 @@ def test_single_settings_are_applied_over_those_that_are_named(scene, tmp_path, 
         CompleterConfig(), registration=replace(CompleterConfig().registration, iterations=7)
     )
     paper = CompleterConfig.paper()
+    one = ("--config.paper-registration.iterations", 7)
     config = config_of(scene, tmp_path, monkeypatch, *one, "--config", "paper")
-    assert config == replace(paper, registration=replace(paper.registration, iterations=7))
+    changed = replace(paper.paper_registration, iterations=7)
+    assert config == replace(paper, paper_registration=changed)
     file = tmp_path / "mine.yaml"
     file.write_text("base: paper\nmargin: 0.1\n")
-    changes = ("--config.psnr-guard.max-drop", 0.5, "--config.registration.mask_occluded", "True")
+    changes = ("--config.psnr-guard.max-drop", 0.5, "--config.paper_registration.rgb_weight", "0.2")
     config = config_of(scene, tmp_path, monkeypatch, f"--config={file}", *changes)
     assert (config.margin, config.psnr_guard.max_drop) == (0.1, 0.5)
-    assert config.registration == replace(paper.registration, mask_occluded=True)
+    assert config.paper_registration == replace(paper.paper_registration, rgb_weight=0.2)
 
 
 def test_a_single_setting_reaches_the_completion_and_its_summary(scene, tmp_path, monkeypatch):

@@ -59,3 +59,18 @@ def test_photographs_are_named_by_file_in_options_lines_and_results(tmp_path, mo
         "photograph 1 (photo_001.png)",
     ):
         assert text in page
+
+
+def test_photographs_that_are_missing_are_named_also_in_the_report(tmp_path, monkeypatch, capsys):
+    scene, out = write_transforms(tmp_path / "scene", CAMERAS), tmp_path / "out"
+    (scene / "images" / "photo_002.png").unlink()
+    assert run(monkeypatch, "complete", scene, "--target", 2, "--out", out) == 0
+    told = (
+        "1 of 4 photographs are missing, and their cameras can only be targets: "
+        "images/photo_002.png."
+    )
+    said = capsys.readouterr().err
+    assert told in said
+    assert "nerfstudio, 3 of 4 photographs." in said
+    assert json.loads((out / "summary.json").read_text())["scene"]["notes"] == [told]
+    assert told in (out / "report.html").read_text()

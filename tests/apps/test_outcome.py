@@ -9,6 +9,7 @@ from pathlib import Path
 
 import pytest
 
+import gscompleter as gsc
 from command import run
 from gscompleter.apps.commands.batch import complete_job
 from gscompleter.apps.report.outcome import describe_gain, is_like, make_clause
@@ -87,6 +88,21 @@ def test_a_scene_of_wrong_poses_is_no_success(scene, tmp_path, monkeypatch, caps
     said = capsys.readouterr()
     assert said.out == ""
     assert said.err == f"gscompleter: {outcome['headline']}\n"
+
+
+def test_python_gets_the_verdict_of_the_command(scene, tmp_path, monkeypatch):
+    for folder in (scene, permute_poses(scene, tmp_path / "broken")):
+        out = tmp_path / f"out-{folder.name}"
+        run(monkeypatch, *complete(folder, out, "--quiet"))
+        settings = {"resolution": 64, "near": 0.5, "far": 20.0}
+        views = gsc.load_views(folder, frames=CONTEXT, **settings)
+        target = gsc.load_camera(folder, frame=TARGET, **settings)
+        completion = gsc.GSCompleter()(views, target)
+        verdict = gsc.judge(completion, gsc.load_views(folder, frames=(1, 3, 5), **settings))
+        assert {"status": verdict.status, "headline": verdict.headline} == outcome_of(out)
+        assert "no unused photograph" in gsc.judge(completion).headline or folder != scene
+    with pytest.raises(InputError, match="frame 0 is part of the context"):
+        gsc.judge(completion, views)
 
 
 def test_a_job_of_a_batch_that_did_not_reconstruct_has_failed(scene, tmp_path):

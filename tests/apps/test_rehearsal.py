@@ -4,54 +4,29 @@ import io
 import os
 import subprocess
 import sys
-from importlib import import_module
 from pathlib import Path
-from pkgutil import iter_modules
 
 import pytest
-from numba.core.registry import CPUDispatcher
 from rich.console import Console
 
 from command import run
-from gscompleter import GSCompleter
 from gscompleter.apps import warmup
 from gscompleter.apps.commands import doctor
 from gscompleter.numerics import kernels
 from gscompleter.numerics.kernels import compiled
 from gscompleter.numerics.kernels.cache import KernelCache
-from gscompleter.system.progress import show_progress
+from gscompleter.system.progress import show_progress, stage
 from paths import TESTS
-from scenes import Room, camera_at, view_of
 
 COMPLETE = """
 import sys
 import numba.core.event
-sys.path[:0] = [sys.argv[1], f"{sys.argv[1]}/../support"]
-from test_rehearsal import complete
+sys.path.insert(0, sys.argv[1])
+from kernel_signatures import complete
 with numba.core.event.install_recorder("numba:compile") as found:
     complete()
 print(len(found.buffer))
 """
-
-
-def complete() -> None:
-    """Complete a room beside two and three photographs, reconstructed and given."""
-    target = camera_at(0.7, yaw=12, size=64)
-    for places in ((-0.3, 0.1), (-0.3, 0.1, 0.3)):
-        views = [view_of(Room(), camera_at(x, size=64)) for x in places]
-        completion = GSCompleter()(views, target)
-    GSCompleter()(views, target, completion.scene)
-
-
-def signatures() -> set[tuple[str, str]]:
-    """Return the names and argument types of all kernels that ran in this process."""
-    return {
-        (f"{module.name}.{name}", str(types))
-        for module in iter_modules(kernels.__path__)
-        for name, value in vars(import_module(f"{kernels.__name__}.{module.name}")).items()
-        if isinstance(value, CPUDispatcher)
-        for types in value.signatures
-    }
 
 
 @pytest.fixture
@@ -121,14 +96,15 @@ def test_a_rehearsal_meets_every_kernel_of_a_completion():
     """It runs in a process of its own, because kernels may have run here before."""
     said = """
 import sys
-sys.path[:0] = [sys.argv[1], f"{sys.argv[1]}/../support"]
-from test_rehearsal import complete, signatures, warmup
+sys.path.insert(0, sys.argv[1])
+from gscompleter.apps import warmup
+from kernel_signatures import complete, signatures
 warmup.rehearse(with_splat=True)
 rehearsed = signatures()
 complete()
 print(len(rehearsed), *sorted(signatures() - rehearsed), sep="\\n")
 """
-    command = [sys.executable, "-c", said, str(TESTS / "apps")]
+    command = [sys.executable, "-c", said, str(TESTS / "support")]
     life = subprocess.run(command, capture_output=True, text=True, check=True)
     number, *others = life.stdout.splitlines()
     assert int(number) > 15
@@ -143,6 +119,17 @@ def test_what_is_compiled_is_compiled_once(rehearsed):
     assert warmup.compile_kernels(["cpu", warmup.SPLAT_PART]) > 0
     assert warmup.compile_kernels(["cpu", warmup.SPLAT_PART]) is None
     assert rehearsed == [False, True]
+
+
+def test_a_log_has_one_line_about_the_compilation(rehearsed, monkeypatch, capsys):
+    def work(with_splat: bool) -> None:
+        with stage("context"):
+            pass
+
+    monkeypatch.setattr(warmup, "rehearse", work)
+    with show_progress(Console(stderr=True)):
+        warmup.compile_kernels(["cpu"])
+    assert capsys.readouterr().err == "compiling kernels for this machine, once\n"
 
 
 def test_kernels_are_compiled_anew_for_another_processor(rehearsed, monkeypatch):
@@ -176,6 +163,6 @@ def test_after_a_warmup_a_completion_compiles_nothing(tmp_path):
     environment = {**os.environ, "NUMBA_CACHE_DIR": str(tmp_path)}
     warm = [sys.executable, "-c", "from gscompleter.cli import main; main()", "warmup"]
     subprocess.run(warm, env=environment, check=True)
-    command = [sys.executable, "-c", COMPLETE, str(TESTS / "apps")]
+    command = [sys.executable, "-c", COMPLETE, str(TESTS / "support")]
     life = subprocess.run(command, env=environment, capture_output=True, text=True, check=True)
     assert life.stdout == "0\n"

@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import re
 import shutil
+from dataclasses import replace
 from html.parser import HTMLParser
 from pathlib import Path
 
@@ -23,7 +24,7 @@ from gscompleter.apps.report.plain_words import (
     format_percent,
     list_photograph_notes,
 )
-from gscompleter.apps.report.schema import AlignmentRow, ContextRow, TargetRow
+from gscompleter.apps.report.schema import AlignmentRow, ContextRow, TargetRow, read_summary
 from gscompleter.system.errors import InputError
 from scenes import camera_at
 
@@ -340,16 +341,43 @@ def test_the_drawing_stands_upright():
     assert frame.convert(torch.stack([c.center for c in cameras])).norm(dim=1).max() <= 1
 
 
-def test_that_something_moved_is_told_with_where():
-    scores = [None] * 4
-    still = [ContextRow(frame, *scores) for frame in (7, 15)]
-    assert list(list_photograph_notes(still)) == []
+def test_that_something_moved_is_told_with_where(completed_room):
+    summary, scores = read_summary(completed_room), [None] * 4
+    still = tuple(ContextRow(frame, *scores) for frame in (7, 15))
+    assert list(list_photograph_notes(replace(summary, context=still))) == []
     rows = [
         ContextRow(frame, *scores, dynamic_fraction=share)
         for frame, share in ((7, 0.0155), (15, 0.0), (23, 0.006))
     ]
-    (said,) = list_photograph_notes(rows)
+    (said,) = list_photograph_notes(replace(summary, context=tuple(rows)))
     assert "1.6 % of photograph 7, 0.6 % of photograph 23" in said
+
+
+@pytest.mark.parametrize(
+    ("format", "said"),
+    [
+        ("colmap", "the depth of COLMAP's points, which"),
+        ("photographs", "the depth of COLMAP's points, which"),
+        ("nerfstudio", "a measured or predicted depth, which"),
+    ],
+)
+def test_a_known_depth_is_told_with_its_source(completed_room, format, said):
+    summary = read_summary(completed_room)
+    row = ContextRow(7, *[None] * 4, given_depth=0.014)
+    scene = replace(summary.scene, format=format)
+    (note,) = list_photograph_notes(replace(summary, scene=scene, context=(row, row)))
+    assert note.startswith(f"Up to 1.4 % of a photograph's pixels have {said}")
+
+
+def test_what_is_ignored_is_told_with_its_cause(completed_room):
+    summary = read_summary(completed_room)
+    hidden = replace(summary, context=(ContextRow(7, *[None] * 4, ignored=0.25),))
+    (said,) = list_photograph_notes(hidden)
+    assert "Up to 25.0 % of a photograph is hidden by a mask, or stays the same" in said
+    removed = replace(hidden, gaussians={**hidden.gaussians, "removed": 3})
+    (said,) = list_photograph_notes(removed)
+    assert "Up to 25.0 % of a photograph shows what was removed, or is hidden by a mask;" in said
+    assert "bonnet" not in said
 
 
 def test_where_to_stand_for_new_photographs():

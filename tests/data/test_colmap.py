@@ -10,7 +10,6 @@ import numpy as np
 import pytest
 import torch
 from PIL import Image
-from test_pose_formats import check_room, write_cloud
 
 from command import run
 from gscompleter import InputError, load_cameras
@@ -30,6 +29,7 @@ from pose_files import (
     write_colmap_text,
     write_photographs,
 )
+from room_checks import check_room, write_cloud
 from scenes import Room, camera_at, cast, view_of
 
 LAYOUTS = [

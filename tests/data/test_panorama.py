@@ -6,7 +6,6 @@ import numpy as np
 import pytest
 import torch
 from PIL import Image
-from test_poses import similarity_removed
 
 from command import run
 from gscompleter.data.formats import open_photographs
@@ -14,21 +13,12 @@ from gscompleter.data.panorama import VIEWS, compute_rotation, has_panoramas, sp
 from gscompleter.data.sfm.poses import list_photograph_files
 from gscompleter.system.files.image import write_image
 from gscompleter.types import Camera
-from scenes import Room, camera_at, cast, cast_rays, view_of
+from mapping_stand_in import similarity_removed
+from panoramas import panorama
+from scenes import Room, camera_at, cast, view_of
 
 CENTRES = [(-0.6, 0.0, 1.0), (-0.1, 0.2, 1.4), (0.5, -0.1, 1.6), (0.2, 0.1, 0.6)]
-WIDTH = 640
 GPANO = b'http://ns.adobe.com/xap/1.0/\0<x GPano:ProjectionType="equirectangular"/>'
-
-
-def panorama(path: Path, centre: tuple[float, float, float], yaw: float = 0.0) -> Path:
-    """Write a panorama of the room whose middle faces `yaw` degrees, cast ray by ray."""
-    longitude = ((torch.arange(WIDTH).double() + 0.5) / WIDTH * 2 - 1) * torch.pi
-    latitude = ((torch.arange(WIDTH // 2).double() + 0.5) / WIDTH * 2 - 0.5) * torch.pi
-    down, turn = torch.meshgrid(latitude, longitude + np.radians(yaw), indexing="ij")
-    rays = [turn.sin() * down.cos(), down.sin(), turn.cos() * down.cos()]
-    write_image(path, cast_rays(Room(), torch.tensor(centre).double(), torch.stack(rays, -1))[0])
-    return path
 
 
 def panoramas(folder: Path, count: int) -> Path:

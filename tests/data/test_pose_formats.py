@@ -12,7 +12,6 @@ from PIL import Image
 from gscompleter import InputError, load_cameras
 from gscompleter.data.formats import FORMATS, open_photographs
 from gscompleter.data.local_origin import read_dataparser_transforms
-from gscompleter.data.photographs import Photographs
 from gscompleter.data.points import MIN_POINTS, add_depth_range, compute_depth_range
 from gscompleter.data.scene import write_cameras
 from gscompleter.types import Camera
@@ -35,26 +34,8 @@ from pose_files import (
     write_colmap_text,
     write_photographs,
 )
+from room_checks import check, check_room, write_cloud
 from scenes import Room, view_of
-
-
-def check(camera: Camera, truth: Camera) -> None:
-    assert torch.allclose(camera.c2w, truth.c2w, atol=2e-6)
-    assert torch.allclose(camera.K, truth.K, atol=1e-3)
-    assert (camera.width, camera.height) == (truth.width, truth.height)
-
-
-def check_room(photographs: Photographs, numbers: list[int] | None = None) -> None:
-    """Check that the photographs show the room from their cameras."""
-    numbers = list(range(len(CAMERAS))) if numbers is None else numbers
-    assert len(photographs) == len(numbers)
-    for view, number in zip(photographs.views(range(len(numbers))), numbers, strict=True):
-        check(view.camera, CAMERAS[number])
-        seen = view_of(Room(), view.camera).image
-        assert (view.image - seen).abs().mean() < 0.003
-        # The room differs from any other place.
-        other = view_of(Room(), CAMERAS[number - 1]).image
-        assert (view.image - other).abs().mean() > 0.01
 
 
 @pytest.mark.parametrize("kind", WRITERS)
@@ -202,13 +183,6 @@ def test_dl3dv_keeps_its_file_and_small_copies_in_a_folder_nerfstudio(tmp_path):
     photographs = open_photographs(tmp_path / "room")
     assert photographs.name == "room"
     check_room(photographs)
-
-
-def write_cloud(path: Path, points: np.ndarray) -> None:
-    header = f"ply\nformat ascii 1.0\nelement vertex {len(points)}\n"
-    header += "".join(f"property float {axis}\n" for axis in "xyz") + "property uchar red\n"
-    rows = "\n".join(" ".join([*map(repr, point), "7"]) for point in points.tolist())
-    path.write_text(f"{header}end_header\n{rows}\n")
 
 
 def test_points_of_nerfstudio_lie_in_the_frame_of_the_cameras(tmp_path):

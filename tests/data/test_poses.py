@@ -28,6 +28,7 @@ from gscompleter.data.sfm.poses import (
 )
 from gscompleter.system.errors import InputError
 from gscompleter.system.files.image import write_image
+from mapping_stand_in import model_script, similarity_removed, stand_in
 from scenes import Room, camera_at, view_of
 
 CAMERAS = [
@@ -51,22 +52,6 @@ def blank(folder: Path, count: int) -> Path:
     for number in range(count):
         Image.new("RGB", (64, 48), "grey").save(folder / f"{number}.png")
     return folder
-
-
-def similarity_removed(found: np.ndarray, true: np.ndarray) -> np.ndarray:
-    """Align `found` positions [n, 3] to the `true` ones by a similarity."""
-    a, b = found - found.mean(0), true - true.mean(0)
-    U, S, Vt = np.linalg.svd(b.T @ a)
-    signs = np.array([1, 1, np.sign(np.linalg.det(U @ Vt))])
-    scale = (S * signs).sum() / (a**2).sum()
-    return scale * a @ (U @ np.diag(signs) @ Vt).T + true.mean(0)
-
-
-def stand_in(monkeypatch: pytest.MonkeyPatch, tmp_path: Path, script: str) -> None:
-    """Replace the process that runs COLMAP by a script."""
-    (tmp_path / "stand_in_mapping.py").write_text(script)
-    monkeypatch.setenv("PYTHONPATH", str(tmp_path))
-    monkeypatch.setattr(poses, "PROCESS", "stand_in_mapping")
 
 
 def test_the_cameras_of_a_room_are_found_up_to_a_similarity(tmp_path, monkeypatch, capsys):
@@ -99,25 +84,6 @@ def test_the_next_run_keeps_what_was_found(tmp_path, monkeypatch):
     with pytest.raises(InputError, match="asked again"):
         find_poses(given, out, overwrite=True)
     assert find_poses_summary(out)["poses"]["missing"] == ["1.png"]  # what was there survives
-
-
-def model_script(
-    registered: list[str], points: int = 90, plausible: bool = True, focal: float | None = None
-) -> str:
-    """Write a script that reports these photographs as registered."""
-    result = {
-        "registered": registered,
-        "points": points,
-        "error": 0.5,
-        "is_plausible": plausible,
-        "focal": focal,
-    }
-    return f"""
-import json, pathlib, sys
-pathlib.Path(json.load(sys.stdin)["model"]).mkdir(parents=True)
-print("a line of COLMAP")
-print({json.dumps(result)!r})
-"""
 
 
 def find_poses_summary(out: Path) -> dict:

@@ -8,8 +8,6 @@ import cv2
 import numpy as np
 import pytest
 from PIL import Image
-from test_panorama import panorama
-from test_poses import model_script, similarity_removed, stand_in
 
 from command import run
 from gscompleter.data.formats import open_photographs
@@ -20,6 +18,8 @@ from gscompleter.data.video import extract_frames, is_video, measure_frames, sel
 from gscompleter.system.errors import InputError
 from gscompleter.system.files.image import convert_to_pixels
 from gscompleter.system.files.video import find_ffmpeg, read_frames, write_video
+from mapping_stand_in import model_script, similarity_removed, stand_in
+from panoramas import panorama
 from scenes import Room, camera_at, view_of
 
 pytest.importorskip("imageio_ffmpeg")

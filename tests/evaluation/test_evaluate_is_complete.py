@@ -4,7 +4,6 @@ from dataclasses import replace
 
 import pytest
 import torch
-from test_dynamic_masks import CAMERAS, ROOM, SIZE, photographed
 
 from command import run
 from gscompleter import GSCompleter
@@ -15,6 +14,7 @@ from gscompleter.evaluation.runner import RunConfig, evaluate, prepare_task
 from gscompleter.evaluation.store import get_step_path, get_task_folder, load_prediction
 from gscompleter.splats.ply import save_ply
 from gscompleter.system.files.image import write_image
+from moving_object import CAMERAS, ROOM, SIZE, photographed
 from scenes import camera_at, view_of
 
 TARGET = camera_at(0.5, -0.5, yaw=10, size=SIZE)

@@ -219,6 +219,7 @@ def test_a_table_and_a_figure_of_rooms(rooms, tmp_path, monkeypatch):
     assert {path: path.read_bytes() for path in tmp_path.glob("*/s*.*")} == first
 
 
+@pytest.mark.slow
 def test_all_of_the_paper_on_photographs(clips, tmp_path, monkeypatch):
     """Two models with random weights, and for steps a tiny model in place of PE-Field's."""
     weights = []

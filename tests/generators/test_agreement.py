@@ -2,7 +2,6 @@
 
 import pytest
 import torch
-from test_generators import TARGET, known_room
 
 from gscompleter import InputError
 from gscompleter.generators import GeneratorOutput, as_generator
@@ -10,6 +9,7 @@ from gscompleter.generators.agreement import compare_with_observed, paint_consis
 from gscompleter.generators.warp import WarpedImage
 from gscompleter.generators.warp_inpaint import WarpInpaint
 from gscompleter.stages.synthesize import synthesize
+from known_room import TARGET, known_room
 from scenes import Room, camera_at, view_of
 
 TRUTH = view_of(Room(), camera_at(0.0)).image

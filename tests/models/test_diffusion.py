@@ -19,8 +19,6 @@ pytest.importorskip("transformers", reason="needs gscompleter[diffusion]")
 pytest.importorskip("accelerate", reason="needs gscompleter[diffusion]")
 
 from safetensors.torch import load_file, save_file
-from test_generators import TARGET, known_room
-from test_source_depth import tiny_model
 
 import tiny_diffusion
 from command import run
@@ -39,8 +37,10 @@ from gscompleter.models.diffusion.source_depth import (
 )
 from gscompleter.models.settings import DiffusersInpaintSettings, PEFieldSettings
 from gscompleter.types import Gaussians, GeneratorInput, merge
+from known_room import TARGET, known_room
 from parity import assert_close
 from scenes import Room, answer, camera_at, gaussians_of, photographed, view_of
+from tiny_depth_model import tiny_model
 
 SIZE = 64
 

@@ -15,7 +15,6 @@ pytest.importorskip("onnxruntime", reason="needs gscompleter[onnx]")
 
 import onnx
 from onnx import TensorProto, helper, numpy_helper
-from test_generators import TARGET, known_room
 from torch.nn.functional import conv2d
 
 from command import run
@@ -33,6 +32,7 @@ from gscompleter.models.inpainting.lama import load_lama
 from gscompleter.models.inpainting.migan import load_migan
 from gscompleter.models.settings import FileSettings
 from gscompleter.models.weights.published import PUBLISHED
+from known_room import TARGET, known_room
 from scenes import camera_at, photographed
 
 WEIGHTS = torch.randn(3, 4, 3, 3, generator=torch.Generator().manual_seed(0)) / 10

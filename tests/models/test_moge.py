@@ -13,13 +13,13 @@ pytest.importorskip("onnxruntime", reason="needs gscompleter[onnx]")
 
 import onnx
 from onnx import TensorProto, helper
-from test_generators import known_room
 
 from command import run
 from gscompleter import InputError, load_ply, load_reconstructor
 from gscompleter.models.diffusion.source_depth import load_source_depth
 from gscompleter.models.moge import load_moge
 from gscompleter.models.weights.published import PUBLISHED
+from known_room import known_room
 from scenes import Room, camera_at, photographed, view_of
 
 FLOAT = TensorProto.FLOAT

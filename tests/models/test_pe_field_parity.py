@@ -11,7 +11,6 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import torch
-from test_generators import TARGET, known_room
 
 from feed_forward_fixtures import rule_v1
 from gscompleter.evaluation.metrics.image import psnr
@@ -31,6 +30,7 @@ from gscompleter.models.diffusion.rotary import (
 )
 from gscompleter.models.diffusion.splat import splat_forward
 from gscompleter.types import Camera
+from known_room import TARGET, known_room
 from parity import assert_close
 from paths import FIXTURES
 from scenes import Room, view_of

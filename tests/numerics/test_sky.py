@@ -16,7 +16,7 @@ from gscompleter.reconstructors.features.depth_range import get_depth_range, set
 from gscompleter.reconstructors.plane_sweep import PlaneSweep
 from gscompleter.reconstructors.plane_sweep.sweep import find_hidden
 from gscompleter.render.loading import load_renderer
-from gscompleter.stages.slide_along_rays import extrapolate_sky
+from gscompleter.stages.extrapolate_registration import extrapolate_sky
 from gscompleter.types import SH_C0, DepthMap, View, sh_from_rgb
 from scenes import (
     Room,

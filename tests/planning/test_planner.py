@@ -26,8 +26,8 @@ from gscompleter.render.loading import load_renderer
 from gscompleter.stages.select_anchor import compute_overlap
 from gscompleter.state import Completion
 from gscompleter.types import Camera, Gaussians, Render, View, merge
+from knowing_models import KnowingGenerator, KnowingReconstructor, knowing
 from scenes import Room, camera_at, cast, gaussians_of, view_of
-from test_completer import KnowingGenerator, KnowingReconstructor, knowing
 
 SIZE = 64
 PLACES = (-0.3, 0.1)

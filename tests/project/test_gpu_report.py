@@ -159,7 +159,11 @@ def test_limits_leave_time_for_what_comes_after_the_build():
 
 @pytest.mark.parametrize(
     "part",
-    ["build", "agreement", "renderer", "stages", "profile", "commands", "baselines", "models"],
+    [
+        *("build", "agreement", "renderer", "stages", "profile", "models"),
+        # Minutes on a CPU.
+        *(pytest.param(part, marks=pytest.mark.slow) for part in ("commands", "baselines")),
+    ],
 )
 def test_every_part_gives_rows(part):
     rows = list(getattr(gpu, f"measure_{part}")(SMALL))

@@ -15,7 +15,8 @@ context = import_module("gscompleter.stages.context")
 lift = import_module("gscompleter.stages.lift")
 refine = import_module("gscompleter.stages.refine")
 select_anchor = import_module("gscompleter.stages.select_anchor")
-slide_along_rays = import_module("gscompleter.stages.slide_along_rays")
+register = import_module("gscompleter.stages.register")
+register_paper = import_module("gscompleter.stages.register_paper")
 synthesize = import_module("gscompleter.stages.synthesize")
 target_view = import_module("gscompleter.stages.target_view")
 
@@ -24,11 +25,19 @@ EQUATIONS = {
     6: (r"\Phi(\mathbf{I}_n, \mathbf{P}_t)", [synthesize.synthesize]),
     7: (r"\Psi(\mathcal{V}_{\text{pair}}; \Theta)", [lift.lift_pair]),
     8: (r"(s \cdot D_{\text{pred}}^{\text{anc}}", [align_depth.fit_affine, DepthAffine]),
-    9: (r"d_i^{\text{init}} = \frac", [slide_along_rays.apply_affine]),
-    10: (r"\mathbf{c}_{\text{tgt}} + d_i \cdot \mathbf{r}_i", [slide_along_rays.move_along_rays]),
+    9: (r"d_i^{\text{init}} = \frac", [register_paper.initialize_distances, register.apply_affine]),
+    10: (
+        r"\mathbf{c}_{\text{tgt}} + d_i \cdot \mathbf{r}_i",
+        [register_paper.move_on_rays, register.move_along_rays],
+    ),
     11: (
         r"\lambda_s \mathcal{L}_{\text{stereo}}",
-        [slide_along_rays.Objective, slide_along_rays.register_along_rays],
+        [
+            register_paper.weigh_losses,
+            register_paper.optimize_distances,
+            register.Objective,
+            register.optimize_distances,
+        ],
     ),
     12: (r"\mathbf{A}_{\text{ctx}}(\mathbf{p}) < \tau", [target_view.compute_hole_mask]),
     13: (r"\mathcal{L}_{\text{mv}} =", [refine.refine_opacities]),
@@ -38,7 +47,7 @@ EQUATIONS = {
 SECTIONS = {
     "III-C": ("Feed-Forward Metric Context Initialization", [context]),
     "III-D": ("Anchor-Guided Gaussian Initialization", [select_anchor]),
-    "III-E": ("Ray-Constrained Gaussian Registration", [align_depth, slide_along_rays]),
+    "III-E": ("Ray-Constrained Gaussian Registration", [align_depth, register_paper, register]),
     "III-F": (r"Multi-View Gaussian Integration \& Refinement", [refine]),
 }
 

@@ -9,6 +9,7 @@ import torch
 from gscompleter import InputError, load_reconstructor
 from gscompleter.reconstructors import RECONSTRUCTORS
 from gscompleter.reconstructors.depth_predictors import predict_nothing
+from gscompleter.reconstructors.from_depth import FromDepth
 from gscompleter.reconstructors.plane_sweep import PlaneSweep
 from gscompleter.reconstructors.plane_sweep.predicted_depth import WEIGHT, add_prediction
 from gscompleter.reconstructors.plane_sweep.sweep import Measurement
@@ -26,6 +27,34 @@ FOUND = Measurement(PLANES, INDEX * KNOWN, KNOWN, KNOWN)
 def predict(inverse) -> DepthMap:
     depth = torch.from_numpy(1 / inverse)
     return DepthMap(depth, torch.ones_like(depth, dtype=torch.bool))
+
+
+@pytest.mark.parametrize(
+    ("answer", "sentence"),
+    [
+        (lambda d: d, "has to return a gscompleter.types.DepthMap .*, and returned a tensor"),
+        (lambda d: None, "has to return a gscompleter.types.DepthMap .*, and returned None"),
+        (lambda d: DepthMap(d[:9], d[:9] > 0), r"shape \[9, 32\] for a view of shape \[32, 32\]"),
+        (lambda d: DepthMap(0 * d, d > 0), "NaN or not above 0; mark these pixels as not valid"),
+        (lambda d: DepthMap(d * float("nan"), d > 0), "NaN or not above 0"),
+    ],
+)
+def test_what_is_no_depth_of_its_view_is_refused(answer, sentence):
+    views = [view_of(Room(), camera_at(x, size=32)) for x in (-0.2, 0.2)]
+    depth = torch.ones(32, 32)
+    with pytest.raises(InputError, match=sentence):
+        PlaneSweep(predict_depth=lambda view: answer(depth))(views)
+    with pytest.raises(InputError, match=sentence):
+        FromDepth(model=lambda views: [answer(depth) for _ in views])(views)
+
+
+def test_a_depth_model_answers_for_every_view():
+    views = [view_of(Room(), camera_at(x, size=32)) for x in (-0.2, 0.2)]
+    depth = DepthMap(torch.ones(32, 32), torch.ones(32, 32, dtype=torch.bool))
+    with pytest.raises(
+        InputError, match="a list of 2 depth maps, one for each view, and returned 1"
+    ):
+        FromDepth(model=lambda views: [depth])(views)
 
 
 def test_a_prediction_is_aligned_and_fills_what_is_not_measured():

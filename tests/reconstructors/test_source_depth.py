@@ -5,7 +5,6 @@ from pathlib import Path
 
 import pytest
 import torch
-from test_generators import known_room
 
 from gscompleter import InputError
 from gscompleter.models.diffusion import source_depth
@@ -18,6 +17,8 @@ from gscompleter.models.diffusion.source_depth import (
     rescale_depth,
 )
 from gscompleter.types import Render
+from known_room import known_room
+from tiny_depth_model import tiny_model
 
 CONTEXT = known_room()
 VIEW, RENDER = CONTEXT.views[0], CONTEXT.view_renders[0]
@@ -62,35 +63,6 @@ def test_a_disparity_of_unknown_scale_and_shift_is_brought_to_the_scenes_depth()
 def test_a_scene_nobody_sees_is_refused():
     with pytest.raises(InputError, match="sees nothing"):
         compute_context_depth(VIEW, replace(RENDER, alpha=torch.zeros(96, 96)))
-
-
-def tiny_model(folder: Path) -> Path:
-    """Depth Anything with random weights."""
-    transformers = pytest.importorskip("transformers", reason="needs gscompleter[diffusion]")
-    pytest.importorskip("diffusers", reason="needs gscompleter[diffusion]")
-    torch.manual_seed(0)
-    backbone = transformers.Dinov2Config(
-        hidden_size=32,
-        num_hidden_layers=4,
-        num_attention_heads=2,
-        intermediate_size=32,
-        image_size=56,
-        patch_size=14,
-        out_features=["stage1", "stage2", "stage3", "stage4"],
-        reshape_hidden_states=False,
-    )
-    config = transformers.DepthAnythingConfig(
-        backbone_config=backbone,
-        reassemble_hidden_size=32,
-        neck_hidden_sizes=[8, 8, 8, 8],
-        fusion_hidden_size=8,
-        head_hidden_size=8,
-    )
-    transformers.DepthAnythingForDepthEstimation(config).save_pretrained(folder)
-    size = {"height": 56, "width": 56}
-    processor = transformers.DPTImageProcessorPil(size=size, ensure_multiple_of=14, do_pad=False)
-    processor.save_pretrained(folder)
-    return folder
 
 
 def tiny_dpt(folder: Path) -> Path:

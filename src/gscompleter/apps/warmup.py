@@ -12,7 +12,7 @@ from gscompleter.numerics.image_ops import smooth_masked
 from gscompleter.numerics.kernels.compiled import get_cache_folder, is_compiled, mark_compiled
 from gscompleter.render.loading import load_renderer
 from gscompleter.render.lod import simplify_scene
-from gscompleter.system.progress import stage
+from gscompleter.system.progress import show_progress, stage
 from gscompleter.types import Camera, View
 
 SPLAT_PART = "splat"
@@ -34,7 +34,8 @@ def compile_kernels(names: Collection[str]) -> float | None:
     if not missing or get_cache_folder() is None:
         return None
     start = time.perf_counter()
-    with stage("compiling kernels for this machine, once"):
+    # The stages of the rehearsal are none of the user's scene, and are not shown.
+    with stage("compiling kernels for this machine, once"), show_progress(None):
         rehearse(with_splat=SPLAT_PART in missing)
     for name in PARTS:
         if name != SPLAT_PART or SPLAT_PART in missing:

@@ -20,7 +20,6 @@ from gscompleter.system.errors import InputError, quote_value, require_path
 
 Pixels = Annotated[int, Interval(ge=0, le=4096)]
 Step = Annotated[float, Interval(gt=0, le=10)]
-Memory = Annotated[float, Interval(ge=0, lt=1)]
 
 
 @dataclass(frozen=True)
@@ -69,45 +68,44 @@ class DepthAgreementConfig(Settings):
 
 @dataclass(frozen=True)
 class RegistrationConfig(Settings):
-    """Registration of the lifted Gaussians along their rays (Eq. 9 to 11)."""
+    """Registration of the lifted Gaussians along their rays, as we do it (`stages/register.py`)."""
 
     iterations: Count = 6
     """Iterations of Adam; 0 keeps the affine alignment (ablation without RC)."""
     learning_rate: Step = 0.025
-    """Learning rate of Adam, in the unit of `lr_unit`."""
-    lr_schedule: Literal["linear", "constant"] = "linear"
-    """`linear` decreases the learning rate to zero, `constant` keeps it (paper)."""
-    beta1: Memory = 0.0
-    """Adam's decay rate of gradients. The usual 0.9 overshoots in so few iterations."""
-    beta2: Memory = 0.8
-    """Adam's decay rate of squared gradients, usually 0.999."""
-    lr_unit: Literal["distance", "scene"] = "distance"
-    """`distance`: relative to each Gaussian's distance, and depth losses to the median depth, so
-    that the unit of the scene does not matter. `scene`: in scene units (paper)."""
+    """Learning rate of Adam, relative to the distance of each Gaussian; it decreases to zero."""
     degrees_of_freedom: Literal[1, 3] = 1
     """1 moves Gaussians along their rays, 3 moves them freely (ablation of the paper)."""
     depth_weight: Weight = 1.0
     """λ_d of Eq. 11."""
     stereo_weight: Weight = 1.0
     """λ_s of Eq. 11."""
-    rgb_weight: Weight = 0.0
-    """λ_c of Eq. 11 (paper: 0.1). With a constant footprint this term has no gradient."""
-    rendered_depth: Literal["candidates", "composite"] = "candidates"
-    """Gaussians that L_depth renders: the lifted ones alone, so that hidden ones get a gradient
-    too, or those together with the scene (paper)."""
-    footprint: Literal["constant", "fixed"] = "constant"
-    """`constant` scales a Gaussian with its distance, which preserves the target image; `fixed`
-    keeps its size (paper)."""
-    mask_occluded: bool = True
-    """Exclude surfaces that the scene hides from the anchor from the stereo loss (paper: no)."""
-    mask_sky: bool = True
-    """Exclude the sky from the depth losses (paper: included)."""
-    min_ratio: Annotated[float, Interval(gt=0, le=1)] | None = 0.1
-    """Smallest factor by which a distance may shrink. None sets no limit (paper)."""
     hole_depth: Literal["lifted", "scene"] = "lifted"
     """Depth in holes: of the lifted Gaussians, or continued smoothly from the scene around."""
     extrapolate_into_holes: bool = True
-    """Move pixels in a hole like those around it. The paper keeps their affine alignment."""
+    """Move pixels in a hole like those around it."""
+
+
+SPLAT_REGISTRATION = RegistrationConfig(hole_depth="scene")
+"""Registration to a splat that comes with further photographs."""
+
+
+@dataclass(frozen=True)
+class PaperRegistrationConfig(Settings):
+    """Registration of the lifted Gaussians as in the paper (`stages/register_paper.py`)."""
+
+    iterations: Count = 50
+    """Iterations of Adam; 0 keeps the affine alignment (ablation without RC)."""
+    learning_rate: Step = 0.01
+    """Learning rate of Adam, in scene units."""
+    degrees_of_freedom: Literal[1, 3] = 1
+    """1 moves Gaussians along their rays, 3 moves them freely (ablation)."""
+    depth_weight: Weight = 1.0
+    """λ_d of Eq. 11."""
+    stereo_weight: Weight = 1.0
+    """λ_s of Eq. 11."""
+    rgb_weight: Weight = 0.1
+    """λ_c of Eq. 11."""
 
 
 @dataclass(frozen=True)
@@ -306,7 +304,10 @@ class CompleterConfig(Settings):
     synthesis: SynthesisConfig = SynthesisConfig()
     anchor: AnchorConfig = AnchorConfig()
     alignment: AlignmentConfig = AlignmentConfig()
+    registration_method: Literal["ours", "paper"] = "ours"
+    """Registration: `ours` reads `registration`, `paper` reads `paper_registration`."""
     registration: RegistrationConfig = RegistrationConfig()
+    paper_registration: PaperRegistrationConfig = PaperRegistrationConfig()
     holes: HoleConfig = HoleConfig()
     refine: RefineConfig = RefineConfig()
     recolor: RecolorConfig = RecolorConfig()
@@ -317,6 +318,26 @@ class CompleterConfig(Settings):
     psnr_guard: PsnrGuardConfig = PsnrGuardConfig()
     next_best_view: NextBestViewConfig = NextBestViewConfig()
 
+    def __post_init__(self) -> None:
+        """Raise InputError for settings of the registration that is not used."""
+        if self.registration_method == "ours":
+            others = "paper_registration"
+            is_untouched = self.paper_registration == PaperRegistrationConfig()
+        else:
+            others = "registration"
+            is_untouched = self.registration in (RegistrationConfig(), SPLAT_REGISTRATION)
+        if not is_untouched:
+            raise InputError(
+                f"The settings {others} are changed, and the registration_method "
+                f"{self.registration_method} does not read them; choose the other method, or "
+                "change its own settings."
+            )
+
+    @property
+    def footprint(self) -> Literal["constant", "fixed"]:
+        """Size of a Gaussian that moves along its ray: that of its image, or its own (paper)."""
+        return "constant" if self.registration_method == "ours" else "fixed"
+
     @staticmethod
     def splat() -> CompleterConfig:
         """Return the settings for a splat that comes with further photographs."""
@@ -324,7 +345,7 @@ class CompleterConfig(Settings):
             trust="photometric",
             guards=("image-agreement", "free-space", "psnr", "contribution"),
             margin=0.0,
-            registration=RegistrationConfig(hole_depth="scene"),
+            registration=SPLAT_REGISTRATION,
             psnr_guard=PsnrGuardConfig(max_drop=0.0),
         )
 
@@ -338,21 +359,7 @@ class CompleterConfig(Settings):
             synthesis=SynthesisConfig(correct_color=False, source_depth="moge-2-large"),
             anchor=AnchorConfig(min_baseline=0.0, min_overlap=0.0),
             alignment=AlignmentConfig(min_agreement=0.0),
-            registration=RegistrationConfig(
-                iterations=50,
-                learning_rate=0.01,
-                lr_schedule="constant",
-                beta1=0.9,
-                beta2=0.999,
-                lr_unit="scene",
-                rgb_weight=0.1,
-                rendered_depth="composite",
-                footprint="fixed",
-                mask_occluded=False,
-                mask_sky=False,
-                min_ratio=None,
-                extrapolate_into_holes=False,
-            ),
+            registration_method="paper",
             refine=RefineConfig(color_rounds=0, iterations=30, rel_tol=None, learning_rate=0.08),
             holes=HoleConfig(dilation=0, candidate_radius=None),
         )
@@ -395,7 +402,8 @@ ABLATIONS: dict[str, dict[str, Any]] = {
     "theta-45": {"anchor": {"max_rotation": 45.0}},
     "theta-90": {"anchor": {"max_rotation": 90.0}},
 }
-"""Changes to a config for each ablation of the paper."""
+"""Changes to a config for each ablation of the paper. `registration` stands for the settings of the
+registration that the config names."""
 
 
 def get_named_config(name: str, is_splat: bool = False) -> CompleterConfig:
@@ -417,7 +425,11 @@ def get_named_config(name: str, is_splat: bool = False) -> CompleterConfig:
             f"{', '.join(ABLATIONS)} (paper/no-sa for an ablation of the paper's settings), or "
             "give a YAML file."
         )
-    config = apply_changes(bases[base or "default"], ABLATIONS[ablation])
+    changed = bases[base or "default"]
+    changes = dict(ABLATIONS[ablation])
+    if "registration" in changes and changed.registration_method == "paper":
+        changes["paper_registration"] = changes.pop("registration")
+    config = apply_changes(changed, changes)
     return config.without_guard("psnr") if ablation == "no-mv" else config
 
 

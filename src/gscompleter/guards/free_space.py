@@ -85,7 +85,7 @@ class FreeSpace(Guard):
             view.camera.padded,
             cameras,
             [ignore_removed(*pair, view) for pair in zip(renders, cameras, strict=True)],
-            state.config.registration.footprint,
+            state.config.footprint,
             state.config.free_space,
         )
         return placed[is_placed]

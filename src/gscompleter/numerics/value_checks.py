@@ -16,7 +16,7 @@ from torch import Tensor
 from gscompleter.system.errors import InputError
 from gscompleter.system.memory import check_images
 from gscompleter.system.tensor_checks import describe, name_dtype
-from gscompleter.types import Camera, Gaussians, View
+from gscompleter.types import Camera, DepthMap, Gaussians, View
 
 LARGEST = 1e18
 """Largest coordinate, scale and component of a quaternion: the sum of their squares is finite."""
@@ -145,6 +145,42 @@ def check_views(views: object, name: str) -> None:
     if len(views) > 0 and not any(bool(view.valid_mask.any()) for view in views):
         raise InputError(
             f"The masks leave no pixel of the {name} views; give other masks or photographs."
+        )
+
+
+def check_depths(depths: object, views: Sequence[View]) -> None:
+    """Raise InputError unless these are one depth map of its size for each view."""
+    if not isinstance(depths, (list, tuple)) or len(depths) != len(views):
+        found = f"{len(depths)}" if isinstance(depths, (list, tuple)) else describe(depths)
+        raise InputError(
+            f"The depth model has to return a list of {len(views)} depth maps, one for each view, "
+            f"and returned {found}."
+        )
+    for depth, view in zip(depths, views, strict=True):
+        check_depth(depth, view)
+
+
+def check_depth(depth: object, view: View) -> None:
+    """Raise InputError unless this is a depth map of the size of a view, above 0 where it is valid.
+
+    Infinity is far away, as the sky is. On a GPU this waits once.
+    """
+    if not isinstance(depth, DepthMap):
+        raise InputError(
+            "The depth model has to return a gscompleter.types.DepthMap of depths and validity for "
+            f"each view, and returned {describe(depth)}."
+        )
+    height, width = view.camera.height, view.camera.width
+    if depth.depth.shape != (height, width):
+        raise InputError(
+            f"The depth model returned a depth map of shape {list(depth.depth.shape)} for a view "
+            f"of shape {[height, width]}; resize it to the view."
+        )
+    known = depth.depth[depth.valid]
+    if not bool((known > 0).all()):  # nor NaN
+        raise InputError(
+            "The depth model returned depths that are NaN or not above 0; mark these pixels as not "
+            "valid."
         )
 
 

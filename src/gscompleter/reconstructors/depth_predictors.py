@@ -8,6 +8,7 @@ from pathlib import Path
 
 import torch
 
+from gscompleter.numerics.value_checks import check_depth
 from gscompleter.system.errors import InputError, quote_value
 from gscompleter.system.plugins import load_plugins
 from gscompleter.types import DepthMap, View
@@ -22,6 +23,13 @@ def predict_nothing(view: View) -> DepthMap:
     return DepthMap(depth, torch.zeros_like(depth, dtype=torch.bool))
 
 
+def predict_depth(predict: DepthPredictor, view: View) -> DepthMap:
+    """Predict the depth of a view; raise InputError if it does not fit the view."""
+    depth = predict(view)
+    check_depth(depth, view)
+    return depth
+
+
 def give_prediction(views: Sequence[View], predict: DepthPredictor) -> list[View]:
     """Give a single photograph the predicted depth, in the scale of the predictor.
 
@@ -29,7 +37,7 @@ def give_prediction(views: Sequence[View], predict: DepthPredictor) -> list[View
     """
     if len(views) != 1 or len(views[0].known_depths):
         return list(views)
-    predicted = predict(views[0])
+    predicted = predict_depth(predict, views[0])
     return [replace(views[0], given_depth=predicted.depth.where(predicted.valid, 0.0))]
 
 

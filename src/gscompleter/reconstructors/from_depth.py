@@ -11,6 +11,7 @@ import numpy as np
 from jaxtyping import Bool
 from torch import Tensor
 
+from gscompleter.numerics.value_checks import check_depths
 from gscompleter.reconstructors.features.depth_range import get_depth_range, set_depth_range
 from gscompleter.reconstructors.features.stereo_image import (
     StereoImage,
@@ -41,7 +42,7 @@ class FromDepth(Splatter):
         """Predict depths and build the scene; errors as in `PlaneSweep.__call__`."""
         views = set_depth_range(views, *get_depth_range(views))
         images, unit = make_stereo_images(views)
-        depths = self.model(views)
+        depths = self.predict(views)
         layers = [make_layer(*pair, unit) for pair in zip(images, depths, strict=True)]
         pairs = permutations(range(len(images)), 2)
         transforms = {(i, j): compute_source_from_reference(images[i], images[j]) for i, j in pairs}
@@ -50,7 +51,13 @@ class FromDepth(Splatter):
     def lift(self, views: Sequence[View], pixel_mask: Bool[Tensor, "h w"]) -> Reconstruction:
         """Lift the pixels of `pixel_mask` in the first view; errors as in `__call__`."""
         views = set_depth_range(views, *get_depth_range(views))
-        return self.lift_pixels(views, self.model(views), pixel_mask)
+        return self.lift_pixels(views, self.predict(views), pixel_mask)
+
+    def predict(self, views: Sequence[View]) -> list[DepthMap]:
+        """Predict depths; raise InputError if the model returns none that fit the views."""
+        depths = self.model(views)
+        check_depths(depths, views)
+        return list(depths)
 
 
 def make_layer(image: StereoImage, depth: DepthMap, unit: float) -> Layer:

@@ -10,10 +10,9 @@ from torch import Tensor
 
 from gscompleter.numerics.geometry import project_mask
 from gscompleter.numerics.image_ops import dilate
-from gscompleter.stages.slide_along_rays import Registration
 from gscompleter.stages.target_view import TargetView
 from gscompleter.system.timing import timed_stage
-from gscompleter.types import Camera, Gaussians
+from gscompleter.types import Camera, Gaussians, Registration
 
 
 @timed_stage("integrate")

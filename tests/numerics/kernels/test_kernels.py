@@ -47,6 +47,7 @@ def test_kernels_of_others_find_blas_all_the_same():
     assert (squared(2 * np.eye(2)) == 4 * np.eye(2)).all()
 
 
+@pytest.mark.slow
 def test_a_process_that_compiles_and_one_that_finds_it_done_give_the_same_bytes(tmp_path):
     environment = {**os.environ, "NUMBA_CACHE_DIR": str(tmp_path)}
     command = [sys.executable, "-c", COMPLETE, str(SUPPORT)]

@@ -11,7 +11,7 @@ from types import MappingProxyType
 from typing import Any
 
 from gscompleter.apps.commands.options import SceneOptions, parse_resolution
-from gscompleter.apps.inputs.opening import Opened, Task
+from gscompleter.apps.inputs.opening import Opened, Task, describe_missing
 from gscompleter.apps.inputs.selection import select_closest
 from gscompleter.apps.report.completion import HeldOut
 from gscompleter.config import CleaningConfig, CompleterConfig
@@ -53,6 +53,7 @@ def describe_run(
             "photographs": opened.num_photographs,
             "used": len(task.views),
             "splat": splat,
+            "notes": [*opened.photographs.notes, *describe_missing(opened.photographs)],
         },
         "frame": {
             "method": task.method,

@@ -38,6 +38,8 @@ def run_view(options: ViewOptions) -> None:
             page = load_page(options)
             with replace_file(options.save) as file:
                 file.write(page)
+        if not options.quiet:
+            print(options.save)
     else:
         serve_page(options, load_page(options))
 

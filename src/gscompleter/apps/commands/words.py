@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Collection, Sequence
+from collections.abc import Callable, Collection, Mapping, Sequence
 from contextlib import redirect_stderr
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, is_dataclass, replace
 from inspect import get_annotations
 from io import StringIO
 from itertools import dropwhile, takewhile
-from typing import Annotated, Any
+from typing import Annotated, Any, get_args, get_type_hints
 
 import tyro
 from tyro.constructors import (
@@ -21,7 +21,7 @@ from tyro.constructors import (
 from gscompleter.apps.commands.options import DEFAULT_NUM_TARGETS
 from gscompleter.config import CompleterConfig, load_config
 from gscompleter.config.settings import Settings
-from gscompleter.system.errors import InputError, quote_value
+from gscompleter.system.errors import InputError, join_names, quote_value
 
 HELP = ("-h", "--help")
 HELP_ALL = "--help-all"
@@ -36,7 +36,13 @@ CONFIG = StructFieldSpec(
 
 Rule = Callable[[StructTypeInfo], StructConstructorSpec | None]
 
-HINTS = {"Argument helptext:": "give", "Perhaps you meant:": "the nearest is"}
+CONTINUING = ("batch", "evaluate")
+"""Commands that continue the run in their folder, and replace nothing there."""
+MAX_NAMED_COMMANDS = 3
+"""Most commands that a sentence names as those with an option."""
+
+NEAREST = "the nearest is"
+HINTS = {"Argument helptext:": "give", "Perhaps you meant:": NEAREST}
 """Titles in tyro's messages before the option that is meant."""
 
 
@@ -81,8 +87,53 @@ def parse_words(words: Sequence[str], command: Any, names: Collection[str]) -> A
     except SystemExit as stop:
         if not stop.code:
             raise
+        unions = zip(names, get_args(command), strict=False)
+        kinds: dict[str, type] = {name: get_args(kind)[0] for name, kind in unions}
+        sentence = explain_words(words, kinds, printed.getvalue())
         see = " ".join(["gscompleter", *words[:1]])
-        raise InputError(f"{extract_sentence(printed.getvalue())} (see {see} --help).") from None
+        raise InputError(f"{sentence} (see {see} --help).") from None
+
+
+def explain_words(words: Sequence[str], kinds: Mapping[str, type], box: str) -> str:
+    """Explain wrong words by tyro's message; `kinds` has the option class of each command."""
+    kind = kinds.get(words[0]) if words else None
+    if kind is None:
+        return extract_sentence(box, ())
+    own = list_options(kind)
+    return describe_foreign_option(words, own, kinds) or extract_sentence(box, own)
+
+
+def list_options(kind: Any, prefix: str = "") -> set[str]:
+    """List the names of the options of a command, without dashes before them."""
+    found = set()
+    for field, hint in get_type_hints(kind, include_extras=True).items():
+        marks = get_args(hint)[1:]
+        inner: Any = get_args(hint)[0] if marks else hint
+        name = f"{prefix}{field.replace('_', '-')}"
+        if is_dataclass(inner):
+            is_flat = tyro.conf.OmitArgPrefixes in marks
+            found |= list_options(inner, "" if is_flat else f"{name}.")
+        elif tyro.conf.Positional not in marks:
+            found.add(name)
+    return found
+
+
+def describe_foreign_option(
+    words: Sequence[str], own: Collection[str], kinds: Mapping[str, type]
+) -> str:
+    """Describe the first option that only other commands have; empty if there is none."""
+    for word in words[1:]:
+        name = word.partition("=")[0].removeprefix("--").replace("_", "-")
+        if not word.startswith("--") or name in own:
+            continue
+        owners = [other for other, kind in kinds.items() if name in list_options(kind)]
+        if owners:
+            sentence = f"{words[0]} has no option --{name}, which belongs to "
+            sentence += join_names(owners, MAX_NAMED_COMMANDS)
+            if name == "overwrite" and words[0] in CONTINUING:
+                sentence += f"; {words[0]} continues the run in its folder"
+            return sentence
+    return ""
 
 
 def refuse_empty_words(words: Sequence[str]) -> None:
@@ -190,8 +241,11 @@ def tidy_field(field: StructFieldSpec, show_all: bool) -> StructFieldSpec:
     return replace(field, helptext=text, type=kind)
 
 
-def extract_sentence(box: str) -> str:
-    """Extract the sentence from tyro's boxed error message, with the option that is meant."""
+def extract_sentence(box: str, own: Collection[str]) -> str:
+    """Extract the sentence from tyro's boxed error message, with the option that is meant.
+
+    tyro also suggests options of other commands; only those of this one (`own`) are named.
+    """
     lines = [line[2:].rstrip("│ ") for line in box.splitlines()[1:]]
     text = dropwhile(lambda line: not line.strip("─- "), lines)
     paragraph = takewhile(lambda line: line.strip("─- "), text)
@@ -199,5 +253,8 @@ def extract_sentence(box: str) -> str:
     hint = ""
     for title, words in HINTS.items():
         if title in lines:
-            hint = f"; {words} {lines[lines.index(title) + 1].strip()}"
+            option = lines[lines.index(title) + 1].strip()
+            name = option.partition(" ")[0].removeprefix("--")
+            if words != NEAREST or name in own:
+                hint = f"; {words} {option}"
     return f"{quote_value(sentence, 200).removesuffix('.')}{hint}"

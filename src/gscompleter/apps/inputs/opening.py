@@ -581,7 +581,8 @@ def describe_task(options: CompleteOptions, opened: Opened, task: Task) -> list[
 
 def describe_opening(options: SceneOptions, opened: Opened, task: Task) -> list[str]:
     """Write the lines on the opened scene."""
-    scene, camera, used = task.scene, task.views[0].camera, len(opened.photographs)
+    scene, camera, given = task.scene, task.views[0].camera, opened.photographs
+    used = len(given) - len(list_missing(given))
     splat = ""
     if scene is not None:
         mode = "antialiased " if scene.is_antialiased else ""
@@ -593,8 +594,26 @@ def describe_opening(options: SceneOptions, opened: Opened, task: Task) -> list[
         f"{opened.num_photographs} photographs{splat}.",
         f"Found: {task.frame_description.rstrip('.')}; depths from {camera.near:.3g} to "
         f"{camera.far:.3g}; worked at {camera.width} x {camera.height} (--resolution changes it).",
-        *describe_masks(opened.photographs, task),
+        *describe_missing(given),
+        *describe_masks(given, task),
         *task.depth_notes,
+    ]
+
+
+def list_missing(given: Photographs) -> list[str]:
+    """List the names of photographs that cameras name and that are not there."""
+    frames = (frame for frame in given.frames if frame.image is not None)
+    return [frame.name for frame in frames if not frame.has_photograph()]
+
+
+def describe_missing(given: Photographs) -> list[str]:
+    """Say which cameras have no photograph; such a camera stays, because it can be a target."""
+    missing = list_missing(given)
+    if not missing:
+        return []
+    return [
+        f"{len(missing)} of {len(given)} photographs are missing, and their cameras can only be "
+        f"targets: {join_names(missing, MAX_NAMED)}."
     ]
 
 

@@ -47,7 +47,10 @@ NOTICE_SECONDS = 4.0
 SCENE_DISTANCE = 3.0
 """Distance of the middle of the depth range, in page units."""
 
-WELCOME = "Fly to a hole in the scene, then press “Complete what I see”."
+WELCOME = (
+    "Fly to a hole in the scene, then press “Complete what I see”: what is in the middle of the "
+    "window, in the shape of a photograph."
+)
 BUSY = "The last request is still running; press the button again when it is done."
 CONTROLS_HELP = (
     "Drag to rotate, drag with the right button to move, scroll to zoom, fly with W A S D Q E."

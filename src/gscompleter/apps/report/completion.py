@@ -163,8 +163,7 @@ def write_report(
     }
 
     # The verdict comes from the rows, so that the page and the terminal agree with them.
-    is_given = input_splat is not None
-    outcome = asdict(judge_completion(completion, held_out_rows, is_given))
+    outcome = asdict(judge_completion(completion, held_out_rows))
     write_scenes(folder, completion, input_splat)
     around = render_around()
     write_pictures(folder / "images", completion, targets, at_targets)

@@ -51,15 +51,13 @@ REJECTED = "the generated image contradicts the photographs"
 NOTHING_LEFT = "no Gaussian that was generated lies in the hole"
 
 
-def judge_completion(
-    completion: Completion, held_out: Sequence[HeldOutRow], is_given: bool
-) -> OutcomeRow:
+def judge_completion(completion: Completion, held_out: Sequence[HeldOutRow]) -> OutcomeRow:
     """Judge a completion by photographs that were not used, and by what was added.
 
     A given scene did reconstruct: it was compared with its photographs when it was aligned. The
     depths of a single photograph are predicted, in a unit that other photographs need not share.
     """
-    is_reconstructed = not is_given and len(completion.views) > 1
+    is_reconstructed = not completion.is_given and len(completion.views) > 1
     failure = explain_failure(completion, held_out) if is_reconstructed else None
     if failure is not None:
         return OutcomeRow("not-reconstructed", failure)
@@ -67,7 +65,7 @@ def judge_completion(
     has_gained = bool(completion.recolored_mask.any()) or count_changed(completion.targets) > 0
     if not has_gained:
         return OutcomeRow("nothing-gained", explain_no_gain(completion))
-    work = describe_work(completion, is_given)
+    work = describe_work(completion)
     return OutcomeRow("completed", describe_gain(work, held_out))
 
 
@@ -143,13 +141,13 @@ def count_changed(targets: Sequence[TargetResult]) -> int:
     return sum(len(result.added) > 0 or result.num_recolored > 0 for result in targets)
 
 
-def describe_work(completion: Completion, is_given: bool) -> str:
+def describe_work(completion: Completion) -> str:
     """Describe in a clause what was done, and for how many of several targets."""
     has_added = any(len(result.added) > 0 for result in completion.targets)
     if completion.source.gone_mask.any():
         work = "The selection is removed and its place is filled"
     elif has_added:
-        work = f"The {'splat' if is_given else 'scene'} is completed"
+        work = f"The {'splat' if completion.is_given else 'scene'} is completed"
     else:
         return "Nothing was added to the splat; only colours changed"
     changed = count_changed(completion.targets)

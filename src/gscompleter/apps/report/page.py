@@ -159,7 +159,7 @@ def render_completion_page(folder: Path) -> str:
             "summary": summary,
             "record": read_record(folder, summary),
             "gallery": open_gallery(folder / "images"),
-            "notes": [*list_shared_notes(summary), *list_notes(summary)],
+            "notes": [*summary.scene.notes, *list_shared_notes(summary), *list_notes(summary)],
             "own_notes": own_notes,
             "describe_alignment": describe_alignment,
             "unit": find_length_unit(summary),
@@ -199,7 +199,7 @@ def write_overview(out: Path, jobs: Sequence[Job]) -> None:
     """Write the table and the page of `jobs`."""
     found_rows = [read_row(job, out) for job in jobs]
     rows = [row for row in found_rows if row is not None]
-    texts = {TABLE_FILE: format_csv(rows), INDEX_FILE: render_batch_page(rows)}
+    texts = {TABLE_FILE: format_csv(rows), INDEX_FILE: render_batch_page(out, rows)}
     for name, text in texts.items():
         with replace_file(out / name) as file:
             file.write(encode_text(text))
@@ -214,8 +214,8 @@ def format_csv(rows: Iterable[Mapping[str, Any]]) -> str:
     return text.getvalue()
 
 
-def render_batch_page(rows: Sequence[Mapping[str, Any]]) -> str:
-    """Render the page of a batch."""
+def render_batch_page(out: Path, rows: Sequence[Mapping[str, Any]]) -> str:
+    """Render the page of the batch in `out`."""
     good = [row for row in rows if row["state"] == "done"]
     gains = [r["psnr_after"] - r["psnr_before"] for r in good if r["psnr_after"] is not None]
     seconds = [row["seconds"] for row in good]
@@ -223,7 +223,10 @@ def render_batch_page(rows: Sequence[Mapping[str, Any]]) -> str:
         "batch.html",
         {
             "jobs": good,
-            "failures": [f"{r['job']}: {r['reason']}" for r in rows if r["state"] == "failed"],
+            "failures": [row for row in rows if row["state"] == "failed"],
+            "reported": {
+                row["job"] for row in rows if os.path.isfile(out / JOBS / row["job"] / REPORT_FILE)
+            },
             "gain": median(gains) if gains else None,
             "seconds": median(seconds) if seconds else None,
             "hours": sum(seconds) / 3600,

@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Iterator, Sequence
 
-from gscompleter.apps.report.schema import AlignmentRow, CompletionSummary, ContextRow, TargetRow
+from gscompleter.apps.report.schema import AlignmentRow, CompletionSummary, TargetRow
 
 FRAME_NOTES = {
     "cameras": "in the frame of its cameras.json, not in that of the photographs",
@@ -24,6 +24,8 @@ ORIGIN_NOTE = (
     "The coordinates are much larger than the distances between the cameras, so the result is "
     "relative to a local origin, which summary.json lists."
 )
+POINT_FORMATS = ("colmap", "photographs")
+"""Formats whose only depth is that of points which COLMAP triangulated."""
 ORACLE_NOTE = (
     "The generator uses the photographs of the targets, so the scores measure the geometry and not "
     "the synthesized images."
@@ -51,7 +53,7 @@ def list_notes(summary: CompletionSummary) -> Iterator[str]:
         yield f"The splat is {FRAME_NOTES[frame.method]}; summary.json lists the transform."
     if any(frame.origin):
         yield ORIGIN_NOTE
-    yield from list_photograph_notes(summary.context)
+    yield from list_photograph_notes(summary)
     if summary.settings.get("context") is None:
         yield f"{scene.used} of {scene.photographs} photographs were chosen as the context."
     if summary.settings.get("uses_target_photographs"):
@@ -90,8 +92,9 @@ def name_targets(numbers: Sequence[int], total: int) -> str:
     return f"Targets {first} and {numbers[-1]}"
 
 
-def list_photograph_notes(context: Sequence[ContextRow]) -> Iterator[str]:
+def list_photograph_notes(summary: CompletionSummary) -> Iterator[str]:
     """List the notes on what moves, on what is ignored, and on exposures."""
+    context = summary.context
     moving = [row for row in context if row.dynamic_fraction > 0]
     if moving:
         shares = (
@@ -102,17 +105,12 @@ def list_photograph_notes(context: Sequence[ContextRow]) -> Iterator[str]:
 
     given_share = max((row.given_depth for row in context), default=0.0)
     if given_share > 0:
-        yield (
-            f"Up to {format_percent(given_share)} of a photograph's pixels have a measured or "
-            "predicted depth, which decides their surfaces (--no-given-depth ignores what SCENE "
-            "holds)."
-        )
+        yield describe_given_depth(given_share, summary)
 
     ignored_share = max((row.ignored for row in context), default=0.0)
     if ignored_share > 0:
         yield (
-            f"Up to {format_percent(ignored_share)} of a photograph is hidden by a mask, stays the "
-            "same while the camera moves, like the bonnet of a vehicle, or shows what was removed; "
+            f"Up to {format_percent(ignored_share)} of a photograph {describe_ignored(summary)}; "
             "it is ignored, also in scores (images/context*_ignored.png)."
         )
 
@@ -123,6 +121,28 @@ def list_photograph_notes(context: Sequence[ContextRow]) -> Iterator[str]:
             f"{max(factors) / min(factors):.2f}; the scene has the mean exposure, at which these "
             "photographs are scored. Target photographs are scored as they are."
         )
+
+
+def describe_given_depth(share: float, summary: CompletionSummary) -> str:
+    """Describe the largest share of a photograph whose depth is known without stereo."""
+    has_only_points = summary.scene.format in POINT_FORMATS
+    is_predicted = len(summary.context) == 1 and summary.settings.get("depth") != "none"
+    if has_only_points and not is_predicted:
+        return (
+            f"Up to {format_percent(share)} of a photograph's pixels have the depth of COLMAP's "
+            "points, which decides their surfaces (--no-given-depth leaves it out)."
+        )
+    return (
+        f"Up to {format_percent(share)} of a photograph's pixels have a measured or predicted "
+        "depth, which decides their surfaces (--no-given-depth ignores what SCENE holds)."
+    )
+
+
+def describe_ignored(summary: CompletionSummary) -> str:
+    """Describe in a clause what may hide a part of a photograph."""
+    if summary.gaussians.get("removed"):
+        return "shows what was removed, or is hidden by a mask"
+    return "is hidden by a mask, or stays the same while the camera moves, like a vehicle's bonnet"
 
 
 def list_splat_notes(summary: CompletionSummary) -> Iterator[str]:

@@ -153,6 +153,8 @@ class SceneRow:
     photographs: int
     used: int
     splat: str | None = None
+    notes: tuple[str, ...] = ()
+    """Sentences about the opening: photographs and cameras that are left out, for example."""
 
 
 @dataclass(frozen=True)

@@ -14,7 +14,11 @@ from torch import Tensor
 from gscompleter.numerics.geometry import compute_sparse_depth, measure_baseline, unproject
 from gscompleter.numerics.kernels.parallel import map_in_parallel
 from gscompleter.numerics.sky import SKY_DEPTH, is_sky
-from gscompleter.reconstructors.depth_predictors import DepthPredictor, predict_nothing
+from gscompleter.reconstructors.depth_predictors import (
+    DepthPredictor,
+    predict_depth,
+    predict_nothing,
+)
 from gscompleter.reconstructors.features.depth_range import get_depth_range, set_depth_range
 from gscompleter.reconstructors.features.stereo_image import StereoImage
 from gscompleter.reconstructors.plane_sweep.fusion import Layer
@@ -69,7 +73,7 @@ class PlaneSweep(Splatter):
         first, second = match_views(rig, views, MIN_HALVED_SIDES["lift"])
         first = add_given(first, rig.images[0])
         open_there = find_sky(rig.images[1], second)
-        first = add_prediction(first, self.predict_depth(views[0]))
+        first = add_prediction(first, predict_depth(self.predict_depth, views[0]))
         layers = [
             make_layer(
                 rig.images[0], first.exclude(transfer_sky(rig, open_there)), LIFT_ITERATIONS
@@ -101,7 +105,8 @@ class PlaneSweep(Splatter):
         stereo = match_views(rig, views, least)
         found = list(map(add_given, stereo, rig.images))
         seen = find_skies(rig, found)
-        guided = map(add_prediction, found, map(self.predict_depth, views))
+        predicted = [predict_depth(self.predict_depth, view) for view in views]
+        guided = map(add_prediction, found, predicted)
         surfaces = map_in_parallel(make_layer, rig.images, map(Measurement.exclude, guided, seen))
         return list(map(add_sky, surfaces, found, seen))
 

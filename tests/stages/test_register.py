@@ -5,7 +5,9 @@ from dataclasses import dataclass, replace
 import pytest
 import torch
 
+from gscompleter.completer import REGISTRATIONS
 from gscompleter.config import AlignmentConfig, CompleterConfig, RegistrationConfig
+from gscompleter.config import PaperRegistrationConfig as PaperConfig
 from gscompleter.numerics.geometry import project, slide
 from gscompleter.numerics.sky import SKY_DEPTH
 from gscompleter.render.cpu import CpuRenderer
@@ -13,11 +15,14 @@ from gscompleter.render.loading import load_renderer
 from gscompleter.render.protocols import Renderer
 from gscompleter.render.redraw import RedrawnScene
 from gscompleter.stages.align_depth import align_depth
-from gscompleter.stages.slide_along_rays import (
+from gscompleter.stages.register import (
     Objective,
     apply_affine,
-    move_along_rays,
-    slide_along_rays,
+    register_along_rays,
+)
+from gscompleter.stages.register_paper import (
+    initialize_distances,
+    move_on_rays,
 )
 from gscompleter.stages.target_view import TargetView
 from gscompleter.types import Camera, DepthAffine, DepthMap, Gaussians, Lift, View, merge
@@ -30,7 +35,7 @@ ROOM = Room()
 TARGET = camera_at(0.2, size=SIZE)
 ANCHOR = camera_at(-0.2, size=SIZE)
 CPU = load_renderer("cpu")
-PAPER = CompleterConfig.paper().registration
+PAPER = PaperConfig()
 
 
 def everywhere(depth: torch.Tensor) -> DepthMap:
@@ -60,19 +65,24 @@ class Registered:
 def register(lift: Lift, reference: View, view: TargetView) -> Registered:
     """Register lifted Gaussians to the scene of a target."""
     affine = align_depth(lift, view, torch.Generator().manual_seed(0))
-    moved = slide_along_rays(lift, affine, reference, view)
+    move = REGISTRATIONS[view.state.config.registration_method]
+    moved = move(lift, affine, reference, view)
     return Registered(moved.gaussians, moved.losses, affine)
 
 
 def with_registration(
-    config: RegistrationConfig, alignment: AlignmentConfig = AlignmentConfig()
+    config: RegistrationConfig | PaperConfig, alignment: AlignmentConfig = AlignmentConfig()
 ) -> CompleterConfig:
+    if isinstance(config, PaperConfig):
+        return CompleterConfig(
+            registration_method="paper", paper_registration=config, alignment=alignment
+        )
     return CompleterConfig(registration=config, alignment=alignment)
 
 
 def registered(
     error: torch.Tensor | float,
-    config: RegistrationConfig,
+    config: RegistrationConfig | PaperConfig,
     unit: float = 1.0,
     renderer: Renderer = CPU,
 ):
@@ -169,8 +179,9 @@ def test_where_nothing_is_compared_candidates_stay():
     assert result.losses == ()
 
 
-def test_free_motion_leaves_the_pixels():
-    result, reference = registered(bumpy(), replace(RegistrationConfig(), degrees_of_freedom=3))
+@pytest.mark.parametrize("config", [RegistrationConfig(), PAPER], ids=["ours", "paper"])
+def test_free_motion_leaves_the_pixels(config):
+    result, reference = registered(bumpy(), replace(config, degrees_of_freedom=3))
     pixels, _ = project(result.gaussians.means, reference.camera)
     expected, _ = project(gaussians_of(reference).means, reference.camera)
     assert (pixels - expected).abs().max() > 0.1
@@ -201,13 +212,9 @@ def test_with_a_fixed_footprint_sizes_stay():
 def test_the_affine_acts_on_z_depth_and_a_shift_pushes_nothing_through_the_camera():
     gaussians = gaussians_of(view_of(ROOM, TARGET))
     _, z = project(gaussians.means, TARGET)
-    _, moved = project(
-        apply_affine(gaussians, DepthAffine(1.5, 0.25), TARGET, "fixed").means, TARGET
-    )
+    _, moved = project(apply_affine(gaussians, DepthAffine(1.5, 0.25), TARGET).means, TARGET)
     assert torch.allclose(moved, 1.5 * z + 0.25, rtol=1e-4)
-    _, clamped = project(
-        apply_affine(gaussians, DepthAffine(1.0, -100.0), TARGET, "fixed").means, TARGET
-    )
+    _, clamped = project(apply_affine(gaussians, DepthAffine(1.0, -100.0), TARGET).means, TARGET)
     assert (clamped > 0).all()
 
 
@@ -215,21 +222,25 @@ def test_the_papers_affine_and_distances_are_not_bounded():
     gaussians = gaussians_of(view_of(ROOM, TARGET))
     _, z = project(gaussians.means, TARGET)
     affine = DepthAffine(1.0, -100.0)
-    moved = apply_affine(gaussians, affine, TARGET, "fixed", PAPER.min_ratio)
+    moved = initialize_distances(gaussians, affine, TARGET)
     assert torch.allclose(project(moved.means, TARGET)[1], z - 100.0, rtol=1e-4)
-    back = move_along_rays(gaussians, torch.full((len(gaussians), 1), -100.0), TARGET, PAPER)
+    back = move_on_rays(gaussians, torch.full((len(gaussians), 1), -100.0), TARGET)
     distances = (gaussians.means - TARGET.center).norm(dim=-1)
     assert torch.allclose((back.means - TARGET.center).norm(dim=-1), 100.0 - distances, rtol=1e-4)
 
 
-@pytest.mark.parametrize(("config", "counts"), [(RegistrationConfig(), False), (PAPER, True)])
-def test_the_sky_counts_in_the_papers_losses_alone(config, counts):
-    view = view_of(ROOM, TARGET)
-    depth = torch.full_like(view.depth, SKY_DEPTH * TARGET.far)
-    at = load_renderer("cpu").render(gaussians_of(view, depth), TARGET)
-    objective = Objective.from_renders(at, at, view, TARGET, config)
-    assert bool(objective.target_depth.valid.any()) == counts
-    assert bool(objective.anchor_depth.valid.any()) == counts
+def test_the_sky_counts_in_the_papers_losses_alone():
+    """The lifted Gaussians are at half of the depth of a sky that fills the target."""
+    view, anchor = view_of(ROOM, TARGET), view_of(ROOM, ANCHOR)
+    sky = gaussians_of(view, torch.full_like(view.depth, SKY_DEPTH * TARGET.far))
+    at = load_renderer("cpu").render(sky, TARGET)
+    objective = Objective.from_renders(at, at, view, TARGET, RegistrationConfig())
+    assert not objective.target_depth.valid.any()
+    assert not objective.anchor_depth.valid.any()
+    config = with_registration(replace(PAPER, rgb_weight=0.0), AlignmentConfig(align_at="none"))
+    half = lifted(view, anchor, SKY_DEPTH * TARGET.far / (2 * view.depth))
+    result = register(half, view, observe(sky, [anchor], TARGET, config))
+    assert result.losses[0] > 0.1 * TARGET.far
 
 
 @pytest.mark.parametrize("unit", [0.001, 1000.0])
@@ -246,7 +257,7 @@ def test_the_unit_of_the_scene_scales_the_result_and_changes_nothing_else(unit):
 def test_a_surface_hidden_from_the_anchor_is_not_pulled_onto_what_hides_it():
     """A panel 1 m in front of the anchor hides a wall 4 m away, with the target's Gaussians.
 
-    The literal stereo loss pulls them onto the panel; the masked one does not.
+    The paper's stereo loss pulls them onto the panel; ours does not.
     """
     renderer = load_renderer("cpu")
     wall = torch.full((SIZE, SIZE), 4.0)
@@ -256,15 +267,14 @@ def test_a_surface_hidden_from_the_anchor_is_not_pulled_onto_what_hides_it():
     panel = gaussians_of(View(colours[1], ANCHOR), torch.full((SIZE, SIZE), 1.0))
     nothing_else = renderer.freeze(panel[:0], TARGET)
 
-    def moved(mask_occluded: bool) -> float:
-        config = RegistrationConfig(mask_occluded=mask_occluded, rgb_weight=0.0)
+    def moved(config: RegistrationConfig | PaperConfig) -> float:
         chosen = with_registration(config, AlignmentConfig(align_at="none"))
         seen = observe(panel, [View(colours[1], ANCHOR)], TARGET, chosen)
         result = register(candidates, reference, replace(seen, frozen=nothing_else))
         return (result.gaussians.means[:, 2] - 4.0).abs().mean().item()
 
-    assert moved(mask_occluded=False) > 0.2
-    assert moved(mask_occluded=True) < 1e-3
+    assert moved(replace(PAPER, rgb_weight=0.0)) > 0.2
+    assert moved(RegistrationConfig()) < 1e-3
 
 
 def test_in_holes_a_splat_is_continued_at_the_depth_around_them():
@@ -296,7 +306,7 @@ def test_where_nothing_overlaps_the_scene_the_affine_is_kept():
     view = observe(scene, [anchor], TARGET, CompleterConfig())
     whole = lifted(reference, anchor, 1.1)
     alone = replace(whole, gaussians=whole.gaussians[rows], pixel_index=rows)
-    moved = slide_along_rays(alone, DepthAffine(1.0, 0.0), reference, view)
+    moved = register_along_rays(alone, DepthAffine(1.0, 0.0), reference, view)
     assert moved.losses == ()
     assert_close(moved.gaussians.means, alone.gaussians.means, "means")
 

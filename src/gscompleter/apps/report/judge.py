@@ -1,0 +1,47 @@
+"""The verdict on a completion for users of the Python interface."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+from gscompleter.apps.report.completion import HeldOut, score_held_out
+from gscompleter.apps.report.outcome import judge_completion
+from gscompleter.apps.report.schema import OutcomeRow
+from gscompleter.numerics.value_checks import check_views
+from gscompleter.render.loading import load_renderer
+from gscompleter.state import Completion
+from gscompleter.system.errors import InputError
+from gscompleter.types import View
+
+
+def judge(completion: Completion, unused_views: Sequence[View] = ()) -> OutcomeRow:
+    """Judge whether the scene reconstructed and whether anything was gained, as `complete` does.
+
+    Args:
+        completion: A completion with its targets.
+        unused_views: Photographs of the place that are not part of the context, in the frame of its
+            cameras. They decide; without any, only the features that the context photographs share
+            can, which notices fewer errors.
+
+    Returns:
+        `status`, which is completed, nothing-gained or not-reconstructed, and the sentence
+        `headline`.
+
+    Raises:
+        InputError: An unused view is none, or is a part of the context.
+    """
+    check_views(unused_views, "unused")
+    device = completion.views[0].image.device
+    used = {view.frame for view in completion.views if view.frame is not None}
+    held_out = []
+    for view in unused_views:
+        if view.frame in used:
+            raise InputError(
+                f"The unused view of frame {view.frame} is part of the context, which cannot test "
+                "itself; give photographs that were not used."
+            )
+        camera = completion.with_depth_range(view.camera)
+        plain = View(view.image, camera, view.frame, ignore_mask=view.ignore_mask)
+        held_out.append(HeldOut(plain.to(device)))
+    renderer = load_renderer(device.type)
+    return judge_completion(completion, score_held_out(completion, held_out, renderer))

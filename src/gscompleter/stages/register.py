@@ -1,0 +1,234 @@
+"""Registration of the lifted Gaussians as we do it: Sec. III-E, with departures.
+
+`register_paper.py` is the paper's. Each departure is named where it is made, with its reason.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+
+import torch
+from jaxtyping import Bool, Float, Int
+from torch import Tensor
+
+from gscompleter.config import RegistrationConfig
+from gscompleter.numerics.adam import Adam
+from gscompleter.numerics.geometry import compute_z_depths, move_to_depths, slide
+from gscompleter.numerics.image_ops import fill_smoothly
+from gscompleter.numerics.sky import mask_out_sky
+from gscompleter.render.protocols import Renderer
+from gscompleter.stages.extrapolate_registration import extrapolate_into_holes, extrapolate_sky
+from gscompleter.stages.target_view import TargetView
+from gscompleter.system.progress import track
+from gscompleter.system.threads import use_one_torch_thread
+from gscompleter.system.timing import timed_stage
+from gscompleter.types import (
+    Camera,
+    DepthAffine,
+    DepthMap,
+    Gaussians,
+    Lift,
+    Registration,
+    Render,
+    View,
+)
+
+MIN_RATIO = 0.1
+"""Smallest factor by which a distance may shrink: an affine with a negative shift would push near
+Gaussians through the camera."""
+ADAM_BETAS = (0.0, 0.8)
+"""Adam's decay rates of gradients and of their squares. The usual 0.9 and 0.999 overshoot in so few
+steps (decision 003)."""
+OCCLUSION_TOLERANCE = 0.05
+"""Distance behind the context, relative to depth, that still counts as the same surface."""
+
+RenderAlone = Callable[[Gaussians], Render]
+"""Renders moved Gaussians at the target without the scene."""
+
+
+@timed_stage("register")
+@use_one_torch_thread()
+def register_along_rays(
+    lifted: Lift, affine: DepthAffine, reference: View, view: TargetView
+) -> Registration:
+    """Align all Gaussians by one affine of depth, then each along its ray.
+
+    `reference` is the synthesized image at the target camera.
+    """
+    config = view.state.config.registration
+    pixel_index = lifted.pixel_index
+    camera = reference.camera
+    coarse = apply_affine(lifted.gaussians, affine, camera)
+    if config.iterations == 0:
+        return Registration(coarse, pixel_index, ())
+    if pixel_index is None:
+        # Voxel-aligned models do not say which pixel a Gaussian belongs to, so that no depth map
+        # of corrections can be made.
+        registered, losses = optimize_distances(coarse, reference, view)
+        return Registration(registered, None, losses)
+    if config.hole_depth == "scene":
+        # A trained splat has its depth from many photographs, which two-view stereo cannot better.
+        depth = fill_smoothly(view.render.depth, ~view.holes).flatten()[pixel_index]
+        return Registration(move_to_depths(coarse, camera, depth), pixel_index, ())
+    if config.extrapolate_into_holes and config.degrees_of_freedom == 1:
+        return register_beside_holes(coarse, pixel_index, reference, view)
+    registered, losses = optimize_distances(coarse, reference, view)
+    return Registration(registered, pixel_index, losses)
+
+
+def register_beside_holes(
+    coarse: Gaussians, pixel_index: Int[Tensor, "n"], reference: View, view: TargetView
+) -> Registration:
+    """Register Gaussians that overlap the scene, and move those in holes like them.
+
+    No loss acts inside a hole. In the paper its pixels keep the affine while those around it move,
+    which leaves a step of depth at the border (decision 005).
+    """
+    camera = reference.camera
+    scene = view.render.depth_map(view.state.config.holes.max_alpha)
+    overlapping = torch.nonzero(scene.valid.flatten()[pixel_index])[:, 0]
+    registered, losses = optimize_distances(coarse[overlapping], reference, view)
+    ratios = extrapolate_into_holes(
+        coarse[overlapping], registered, pixel_index[overlapping], scene, camera
+    )
+    moved = slide(coarse, camera, ratios.flatten()[pixel_index], "constant")
+    return Registration(extrapolate_sky(moved, pixel_index, scene, reference), pixel_index, losses)
+
+
+def apply_affine(gaussians: Gaussians, affine: DepthAffine, camera: Camera) -> Gaussians:
+    """Move Gaussians along their rays to z-depth `scale * z + shift` (Eq. 9).
+
+    The paper keeps their sizes. With a constant footprint the image at the target stays exactly
+    what it was, and only depth and order have to be rendered again (decision 002).
+    """
+    z = compute_z_depths(gaussians.means, camera)
+    ratio = (affine.scale * z + affine.shift) / z
+    return slide(gaussians, camera, ratio.clamp_min(MIN_RATIO), "constant")
+
+
+def optimize_distances(
+    coarse: Gaussians, reference: View, view: TargetView
+) -> tuple[Gaussians, tuple[float, ...]]:
+    """Minimize Eq. 11 over one distance per Gaussian; also return the loss per iteration."""
+    if len(coarse) == 0:
+        return coarse, ()
+    config = view.state.config.registration
+    renderer = view.scenes.renderer
+    anchor = view.anchor_view.camera
+    objective = Objective.from_renders(view.render, view.anchor_render, reference, anchor, config)
+    alone = make_renderer_alone(coarse, reference.camera, renderer, config)
+    parameters = torch.zeros(
+        (len(coarse), config.degrees_of_freedom), device=coarse.means.device, requires_grad=True
+    )
+    optimizer = Adam([(parameters, config.learning_rate)], ADAM_BETAS)
+    losses = []
+    for iteration in track(range(config.iterations), "Registering"):
+        # The steps shrink to zero: few of them suffice, where the paper takes fifty equal ones
+        # (decision 003).
+        remaining = 1 - iteration / config.iterations
+        moved = move_along_rays(coarse, parameters, reference.camera, config.degrees_of_freedom)
+        loss = objective(alone(moved), renderer.render(moved, anchor))
+        optimizer.step(loss, remaining)
+        losses.append(loss.detach())
+    with torch.no_grad():
+        moved = move_along_rays(coarse, parameters, reference.camera, config.degrees_of_freedom)
+    # Read together at the end: a GPU would have to finish each step before the next begins.
+    return moved, tuple(torch.stack(losses).tolist())
+
+
+def move_along_rays(
+    coarse: Gaussians,
+    parameters: Float[Tensor, "n dof"],
+    camera: Camera,
+    degrees_of_freedom: int = 1,
+) -> Gaussians:
+    """Move Gaussians along their target rays (Eq. 10), or freely with three degrees of freedom.
+
+    A parameter is relative to the distance of its Gaussian, and not in scene units as in the paper:
+    one learning rate then suits near and far Gaussians, and any unit of the scene.
+    """
+    distances = (coarse.means - camera.center).norm(dim=1, keepdim=True)
+    shifts = distances * parameters  # in scene units
+    if degrees_of_freedom == 3:
+        return replace(coarse, means=coarse.means + shifts, encoded=None)
+    ratio = 1 + (shifts / distances)[:, 0]
+    return slide(coarse, camera, ratio.clamp_min(MIN_RATIO), "constant")
+
+
+def make_renderer_alone(
+    coarse: Gaussians, camera: Camera, renderer: Renderer, config: RegistrationConfig
+) -> RenderAlone:
+    """Return a renderer of moved Gaussians alone.
+
+    With a constant footprint their image does not change along rays, so only depth is rendered
+    again.
+    """
+    if config.degrees_of_freedom == 3:
+        return lambda moved: renderer.render(moved, camera)
+    plan = renderer.freeze(coarse[:0], camera).vary_depths(coarse)
+    return lambda moved: plan(compute_z_depths(moved.means, camera))
+
+
+@dataclass(frozen=True)
+class Objective:
+    """Loss `λ_d L_depth + λ_s L_stereo` (Eq. 11), as means over the image.
+
+    L_rgb is missing: with a constant footprint the image does not depend on the distances.
+    """
+
+    target_depth: DepthMap
+    anchor_depth: DepthMap
+    unit: float
+    """Divisor of depth residuals, in scene units."""
+    config: RegistrationConfig
+
+    @staticmethod
+    def from_renders(
+        at_target: Render,
+        at_anchor: Render,
+        reference: View,
+        anchor: Camera,
+        config: RegistrationConfig,
+    ) -> Objective:
+        """Create the objective from renders of the scene at target and anchor.
+
+        The sky is left out: it lies at a depth that we chose, and nothing measures it (decision
+        016).
+        """
+        target_depth = mask_out_sky(at_target, reference.camera)
+        anchor_depth = mask_out_sky(at_anchor, anchor)
+        seen = anchor_depth.depth[anchor_depth.valid]
+        # Residuals are relative to the median depth, so that the unit of the scene does not matter.
+        unit = seen.median().item() if len(seen) > 0 else 1.0
+        return Objective(target_depth, anchor_depth, unit, config)
+
+    def __call__(self, at_target: Render, at_anchor: Render) -> Float[Tensor, ""]:
+        """Compute the loss from renders of the candidates alone, at target and anchor.
+
+        The paper renders L_depth of the composite scene, where a candidate behind a surface gets no
+        gradient and stays there (decision 004).
+        """
+        l_depth = self.compute_depth_error(
+            at_target, self.target_depth, self.target_depth.valid & at_target.depth_map().valid
+        )
+        l_stereo = self.compute_depth_error(
+            at_anchor, self.anchor_depth, self.find_comparable(at_anchor)
+        )
+        return self.config.depth_weight * l_depth + self.config.stereo_weight * l_stereo
+
+    def compute_depth_error(
+        self, shown: Render, expected: DepthMap, where: Bool[Tensor, "h w"]
+    ) -> Float[Tensor, ""]:
+        """Compute the L1 depth error inside `where`, in `unit`, averaged over the image."""
+        error = (shown.depth - expected.depth).abs() / self.unit
+        return torch.where(where, error, 0.0).mean()
+
+    def find_comparable(self, at_anchor: Render) -> Bool[Tensor, "h w"]:
+        """Find anchor pixels that show the scene and candidates that it does not hide.
+
+        The paper compares hidden ones too, which pulls them onto what hides them (decision 007).
+        """
+        seen = self.anchor_depth.valid & at_anchor.depth_map().valid
+        limit = self.anchor_depth.depth * (1 + OCCLUSION_TOLERANCE)
+        return seen & ~(at_anchor.depth.detach() > limit)
