@@ -151,26 +151,31 @@ class GSCompleter:
         check_inputs(views, scene, check_views or (), targets)
         config = choose_config(self.config, scene, check_views)
         with record_seconds() as seconds, timed_stage("context"):
-            made = init_context(
+            context = init_context(
                 self.reconstructor, views, scene, check_views or (), targets, self.renderer
             )
-            photos = tuple(Photo(view) for view in made.views)
-            parts = (made.source.rendered,)
-            new = find_new_photos(config, parts, made.views, self.scenes)
-            known = [view for number, view in enumerate(made.views) if number not in new]
-            trust = load_trust(config, parts, known, self.scenes)
+            photos = tuple(Photo(view) for view in context.views)
+            parts = (context.source.rendered,)
+
+            # Photographs that a splat was not trained on say nothing about the trust in it. They
+            # are targets themselves, before all others (decision 041).
+            new = find_new_photos(config, parts, context.views, self.scenes)
+            trained = [view for index, view in enumerate(context.views) if index not in new]
+            trust = load_trust(config, parts, trained, self.scenes)
             state = Completion(
                 config,
-                made.source,
+                context.source,
                 parts,
                 photos,
                 len(views),
                 trust,
                 is_given=scene is not None,
             )
+
+            # Guards measure the scene as it was given, so before anything is recoloured.
             state = prepare_guards(state, self.scenes)
-            state = recolor_to_photos(state, [made.views[i] for i in new], self.scenes)
-        return replace(state, exposure_gains=made.exposure_gains, seconds=seconds)
+            state = recolor_to_photos(state, [context.views[i] for i in new], self.scenes)
+        return replace(state, exposure_gains=context.exposure_gains, seconds=seconds)
 
     def advance(
         self, state: Completion, target: Camera, reference: GeneratedView | None = None
@@ -181,11 +186,15 @@ class GSCompleter:
         supports it.
         """
         check_target_ids(state.context, len(state.targets) + 1)
+        # Seeded anew for each target, so that its result does not depend on how many came before.
         rng = torch.Generator().manual_seed(self.seed)
         with record_seconds() as seconds:
             view = self.observe(state, target, reference)
             if view.skip_reason:
                 return state.extended(view.make_unchanged_result(), seconds)
+
+            # Stages 2 to 4 of the paper, an equation a line. `steps` keeps the new Gaussians after
+            # each one, from which the report tells which step left a hole empty.
             image = reference or self.synthesize([view])[0]  # Eq. 6
             lifted = lift(self.reconstructor, image, view)  # Eq. 7
             affine = align_depth(lifted, view, rng)  # Eq. 8
@@ -197,14 +206,17 @@ class GSCompleter:
             refined = refine(steps[-1].gaussians, image, view)  # Eq. 13
             steps.append(Step("refine", refined.gaussians))
             verified, rejection = verify(Attempt(view, image, affine, refined))
-            added = (*steps, *verified)[-1].gaussians
+            steps += verified
+            added = steps[-1].gaussians
+
+            # Not in the paper: what covers the target without being trusted takes new colours.
             recolored = recolor(image, view, state.next_target_id)
             after = recolored.frozen.composite(added)
             result = replace(
                 view.make_unchanged_result(),
                 after=after.crop(view.camera),
                 added=added,
-                unfilled=find_unfilled(after, (*steps, *verified), view),
+                unfilled=find_unfilled(after, steps, view),
                 reference=image.crop(view.camera),
                 affine=affine,
                 losses={"register": moved.losses, "refine": refined.losses},
@@ -216,7 +228,10 @@ class GSCompleter:
         return recolored.state.extended(result, seconds)
 
     def advance_batch(self, state: Completion, targets: Sequence[Camera]) -> Completion:
-        """Complete several targets, whose images Φ synthesizes in one call."""
+        """Complete several targets, whose images Φ synthesizes in one call.
+
+        All images are of the scene before the first of these targets.
+        """
         if len(targets) == 1:
             return self.advance(state, targets[0])
         with record_seconds() as seconds:
@@ -239,6 +254,9 @@ class GSCompleter:
         camera = self.pad_target(state, target)
         if reference:
             return render_target(state, pad_like(camera.target, reference.camera), self.scenes)
+
+        # A camera that moves on from the target meets the next hole at the border of its image
+        # (decision 001). Holes that do not reach it need no padding.
         view = render_target(state, camera, self.scenes)
         if is_enclosed(view.camera.crop(view.holes)):
             view = render_target(state, pad_camera(camera.target, 0.0), self.scenes)
@@ -271,11 +289,11 @@ def list_targets(target: object) -> list[Camera]:
 
 def check_target_ids(scene: Gaussians | None, num_targets: int) -> None:
     """Raise InputError if `generated` cannot hold the ids of `num_targets` more targets."""
-    given = 0 if scene is None else find_last_target_id(scene)
-    if given + num_targets > MAX_TARGET_ID:
+    num_before = 0 if scene is None else find_last_target_id(scene)
+    if num_before + num_targets > MAX_TARGET_ID:
         raise InputError(
-            f"{num_targets} targets were given after {given} in the scene, and a .ply can tell "
-            f"{MAX_TARGET_ID} apart; complete the scene in several runs."
+            f"{num_targets} targets were given after {num_before} in the scene, and a .ply can "
+            f"tell {MAX_TARGET_ID} apart; complete the scene in several runs."
         )
 
 

@@ -96,9 +96,13 @@ class Unfilled:
         """Write the sentence for the report; empty if the hole is filled."""
         if self.share <= self.MAX_SHARE:
             return ""
-        most_first = sorted(self.lost_by.items(), key=lambda each: -each[1])
-        reasons = " and ".join(f"{LOSSES.get(name, name)}, {part:.1%}" for name, part in most_first)
-        boxes = "; ".join(f"x {a} to {c}, y {b} to {d}" for a, b, c, d in self.regions)
+        largest_first = sorted(self.lost_by.items(), key=lambda step_and_share: -step_and_share[1])
+        reasons = " and ".join(
+            f"{LOSSES.get(step, step)}, {share:.1%}" for step, share in largest_first
+        )
+        boxes = "; ".join(
+            f"x {left} to {right}, y {top} to {bottom}" for left, top, right, bottom in self.regions
+        )
         return (
             f"{self.share:.1%} of the hole (with its seam and padding) stays empty, because "
             f"{reasons}; the largest parts: {boxes} (pixels)."
@@ -222,15 +226,20 @@ class Completion:
     @cached_property
     def recolored_context(self) -> Gaussians:
         """The context with the new colours and target ids of recoloured Gaussians."""
-        before, after, given = self.source.rendered, self.parts[0], self.source.gaussians
+        before = self.source.rendered
+        after = self.parts[0]
+        gaussians = self.source.gaussians
         if after is before:
-            return given
-        changed = self.recolored_mask
-        sh = torch.where(
-            changed[:, None, None], given.sh + self.source.expand(after.sh - before.sh), given.sh
-        )
-        generated = torch.where(changed, self.source.expand(after.generated), given.generated)
-        return replace(given, sh=sh, generated=generated)
+            return gaussians
+
+        # What was recoloured may be an LOD proxy: each Gaussian that it stands for takes its change
+        # (decision 024). The others keep their bits, which adding zero might not.
+        is_changed = self.recolored_mask
+        change = self.source.expand(after.sh - before.sh)
+        sh = torch.where(is_changed[:, None, None], gaussians.sh + change, gaussians.sh)
+        target_ids = self.source.expand(after.generated)
+        generated = torch.where(is_changed, target_ids, gaussians.generated)
+        return replace(gaussians, sh=sh, generated=generated)
 
     @cached_property
     def kept_context(self) -> Gaussians:
@@ -245,7 +254,7 @@ class Completion:
 
     def with_depth_range(self, camera: Camera) -> Camera:
         """Return the camera with the depth range of this completion."""
-        known = self.photos[0].view.camera
+        known = self.photos[0].view.camera  # all photographs share one depth range
         return replace(camera, near=known.near, far=known.far)
 
     def extended(self, result: TargetResult, seconds: Mapping[str, float]) -> Completion:

@@ -50,8 +50,10 @@ MAX_CENTER = 100.0
 SH_C0 = 0.28209479177387814
 """Constant spherical harmonic: colour = 0.5 + SH_C0 * sh[:, 0]."""
 
-REMOVED, REVEALED = -1, -2
-"""Numbers, in a `ContextScene`, of Gaussians that were removed, and of unseen ones behind them."""
+REMOVED = -1
+"""Number, in a `ContextScene`, of Gaussians that were removed."""
+REVEALED = -2
+"""Number, in a `ContextScene`, of unseen Gaussians behind those that were removed."""
 
 MAX_RIGID_ERROR = 1e-3
 """Largest entry of RᵀR - I that counts as rounding error of a rotation R."""
@@ -83,10 +85,13 @@ class TensorDataclass:
         return replace(self, **{name: part.detach() for name, part in parts.items()})
 
     def _list_parts(self) -> dict[str, Any]:
-        # Of the fields alone: cached properties lie beside them.
+        """List the fields that hold tensors, by name."""
+        # Not by `vars`, in which cached properties lie beside the fields.
         values = {part.name: getattr(self, part.name) for part in fields(self)}
         return {
-            name: it for name, it in values.items() if isinstance(it, (Tensor, TensorDataclass))
+            name: value
+            for name, value in values.items()
+            if isinstance(value, (Tensor, TensorDataclass))
         }
 
 
@@ -119,7 +124,8 @@ class Camera(TensorDataclass):
         )
         if defect is not None:
             raise InputError(f"There is no such camera: {defect}.")
-        # NumPy's numbers cannot be written as JSON.
+        # NumPy's numbers cannot be written as JSON. Fields of a frozen dataclass are set through
+        # `object`.
         for name, convert in (("width", int), ("height", int), ("near", float), ("far", float)):
             number = getattr(self, name)
             if number is not None and type(number) is not convert:
@@ -199,9 +205,13 @@ def _find_pose_defect(c2w: Float[Tensor, "4 4"]) -> str | None:
         return "its pose holds NaN or infinity"
     if np.abs(pose[:3, 3]).max() > MAX_COORDINATE:
         return f"its centre is more than {MAX_COORDINATE:g} scene units from the origin"
-    errors = pose[:, :3].T @ pose[:, :3] - np.eye(3), pose[3] - np.eye(4)[3]
-    if not max(abs(error).max() for error in errors) <= MAX_RIGID_ERROR:
+
+    # RᵀR = I for a rotation. The last row is part of the product, as it has to be 0 0 0 1 as well.
+    rotation_error = np.abs(pose[:, :3].T @ pose[:, :3] - np.eye(3)).max()
+    last_row_error = np.abs(pose[3] - np.eye(4)[3]).max()
+    if not max(rotation_error, last_row_error) <= MAX_RIGID_ERROR:
         return "its pose is no rotation and translation but scaled, sheared or projective"
+    # The determinant is 1 or -1 now; -1 is a reflection.
     if np.linalg.det(pose) < 0:
         return "its pose is left-handed; mirror one of its axes"
     return None
@@ -214,6 +224,7 @@ def _find_intrinsics_defect(K: Float[Tensor, "3 3"], width: int, height: int) ->
     if K.device.type != "cpu":
         return None
     (fx, skew, cx), (below, fy, cy), last = K.tolist()
+    # The sum is finite only if all of them are.
     if not (fx > 0 and fy > 0 and math.isfinite(fx + fy + cx + cy)):
         return f"its focal lengths are {fx:g} and {fy:g}, its centre is ({cx:g}, {cy:g})"
     # Renderers read the focal lengths and the centre only; rays take the inverse of the whole K.
@@ -300,15 +311,20 @@ class View(TensorDataclass):
                 f"The image of a view is on {self.image.device}, and its camera on "
                 f"{self.camera.K.device}; move one of them."
             )
-        given, scored = self.given_depth, self.depth
-        if given is not None and scored is not None and ((given > 0) & (scored > 0)).any():
+        # A score over depths that the reconstruction was given would be no measurement.
+        if (
+            self.given_depth is not None
+            and self.depth is not None
+            and ((self.given_depth > 0) & (self.depth > 0)).any()
+        ):
             raise InputError("A depth both constrains and scores a view; leave one of them out.")
 
     @property
     def known_depths(self) -> Float[Tensor, "n"]:
         """Given depths of the pixels that have one."""
-        given = self.image.new_zeros(0) if self.given_depth is None else self.given_depth
-        return given[given > 0]
+        if self.given_depth is None:
+            return self.image.new_zeros(0)
+        return self.given_depth[self.given_depth > 0]
 
     @property
     def valid_mask(self) -> Bool[Tensor, "h w"]:
@@ -369,7 +385,8 @@ class Gaussians(TensorDataclass):
     def __post_init__(self) -> None:
         """Raise InputError for other types, shapes and devices; no number is read."""
         check_tensors(self, self.owner, self.forms)
-        counts = {n: len(it) for n in self.forms if (it := getattr(self, n)) is not None}
+        values = {name: getattr(self, name) for name in self.forms}
+        counts = {name: len(value) for name, value in values.items() if value is not None}
         if len(set(counts.values())) > 1:
             raise InputError(
                 "All properties of Gaussians need as many rows, and "
@@ -391,8 +408,10 @@ class Gaussians(TensorDataclass):
 
     def __getitem__(self, index: Tensor | slice) -> Gaussians:
         """Return the Gaussians at a boolean mask [n], integer indices [m] or a slice."""
-        tensors: dict[str, Any] = {n: p for n, p in vars(self).items() if isinstance(p, Tensor)}
-        return replace(self, **{n: part[index] for n, part in tensors.items()})
+        rows: dict[str, Any] = {
+            name: value[index] for name, value in vars(self).items() if isinstance(value, Tensor)
+        }
+        return replace(self, **rows)
 
     @property
     def sh_degree(self) -> int:
@@ -423,18 +442,29 @@ def merge(parts: Sequence[Gaussians]) -> Gaussians:
         raise InputError("merge needs at least one set of Gaussians, and got none.")
     if len({part.is_antialiased for part in parts}) > 1:
         raise InputError("Antialiased Gaussians cannot be merged with others; convert one of them.")
+
     k = max(part.sh.shape[1] for part in parts)
     sh = [torch.nn.functional.pad(part.sh, (0, 0, 0, k - part.sh.shape[1])) for part in parts]
-    unknown = float("nan")  # unequal to anything: the writer encodes these again
-    encoded = [
-        part.means.new_full((len(part), 4), unknown) if part.encoded is None else part.encoded
-        for part in parts
-    ]
-    names = ("means", "quats", "scales", "opacities", "generated")
+    encoded = None
+    if any(part.encoded is not None for part in parts):
+        # NaN is unequal to anything, so that the writer encodes these rows again.
+        unknown = float("nan")
+        encoded = torch.cat(
+            [
+                part.means.new_full((len(part), 4), unknown)
+                if part.encoded is None
+                else part.encoded
+                for part in parts
+            ]
+        )
     return Gaussians(
-        **{name: torch.cat([getattr(part, name) for part in parts]) for name in names},
+        means=torch.cat([part.means for part in parts]),
+        quats=torch.cat([part.quats for part in parts]),
+        scales=torch.cat([part.scales for part in parts]),
+        opacities=torch.cat([part.opacities for part in parts]),
         sh=torch.cat(sh),
-        encoded=torch.cat(encoded) if any(part.encoded is not None for part in parts) else None,
+        generated=torch.cat([part.generated for part in parts]),
+        encoded=encoded,
         is_antialiased=parts[0].is_antialiased,
     )
 
@@ -482,7 +512,8 @@ class DepthMap(TensorDataclass):
     def __post_init__(self) -> None:
         """Raise InputError for other types, shapes and devices; no number is read."""
         check_tensors(self, self.owner, self.forms)
-        shapes = {tuple(getattr(self, n).shape) for n in self.forms if getattr(self, n) is not None}
+        values = [getattr(self, name) for name in self.forms]
+        shapes = {tuple(value.shape) for value in values if value is not None}
         if len(shapes) > 1:
             raise InputError(
                 f"The parts of a depth map have to be of one size, and have the shapes "
@@ -657,6 +688,7 @@ class ContextScene:
         """Map values of rendered Gaussians to those they stand for; 0 for removed ones."""
         if self.rendered is self.gaussians:
             return values
+        # Numbers below 0 read the row of zeros at the end.
         return torch.cat([values, torch.zeros_like(values[:1])])[self.proxy_index.clamp_min(-1)]
 
 

@@ -57,8 +57,9 @@ class Density:
 
 def list_files(places: Sequence[Path]) -> list[Path]:
     """List the Python files of folders, and files that are given themselves."""
+    # Resolved, so that a file that two folders name is counted once.
     return [
-        file
+        file.resolve()
         for place in places
         for file in (sorted(place.rglob("*.py")) if place.is_dir() else [place])
     ]
@@ -110,6 +111,7 @@ def measure(places: Sequence[Path], users: Sequence[Path] = ()) -> Density:
                 homes[node.name].add(file)
             if isinstance(node, FUNCTIONS):
                 own.append(node)
+    definitions = Counter(function.name for function in own)
     nodes = [node for tree in trees.values() for node in ast.walk(tree)]
     return Density(
         lines=sum(len(file.read_text("utf-8").splitlines()) for file in files),
@@ -118,7 +120,13 @@ def measure(places: Sequence[Path], users: Sequence[Path] = ()) -> Density:
         lengths=[measure_length(f) for tree in trees.values() for f in iterate_functions(tree)],
         num_module_functions=len(own),
         # A name that stands in two places is defined in one and used in the other.
-        one_use=[f.name for f in own if measure_length(f) <= SHORT and words[f.name] == 2],
+        one_use=[
+            function.name
+            for function in own
+            if measure_length(function) <= SHORT
+            and definitions[function.name] == 1
+            and words[function.name] == 2
+        ],
         repeated=sorted(name for name, places in homes.items() if len(places) > 1),
     )
 

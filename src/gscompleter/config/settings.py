@@ -29,6 +29,8 @@ COVERED = 0.5
 Seed = Annotated[int, Interval(ge=0, lt=2**62)]
 
 MAX_CONFIG_BYTES = 65_536
+MAX_BRACKETS = 1000
+"""Most lists and mappings in brackets; the settings nest two levels."""
 MAX_REASON_LENGTH = 120  # of a sentence about YAML
 
 
@@ -99,7 +101,11 @@ def read_yaml(path: Path) -> dict[str, Any]:
     """Read the mapping in a YAML file, limited to JSON values, or raise InputError."""
     import yaml
 
-    name, data = f"The config {quote_value(path)}", read_bytes(path, MAX_CONFIG_BYTES)
+    name = f"The config {quote_value(path)}"
+    data = read_bytes(path, MAX_CONFIG_BYTES)
+    # PyYAML looks at all open brackets again for each new one: 60,000 take half a minute.
+    if data.count(b"[") + data.count(b"{") > MAX_BRACKETS:
+        raise InputError(f"{name} is nested too deeply.")
     try:
         # They can expand a short file endlessly.
         if any(isinstance(token, yaml.AliasToken) for token in yaml.scan(data.decode())):

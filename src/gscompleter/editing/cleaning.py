@@ -44,24 +44,29 @@ def find_superfluous(
     config: CleaningConfig = CleaningConfig(),
 ) -> Bool[Tensor, "n"]:
     """Find Gaussians that can be removed together; generated and unobserved ones stay."""
-    removable = torch.zeros_like(scene.generated, dtype=torch.bool)
-    removable = find_removable(scene, removable, views, renderer, config) & (scene.generated == 0)
-    removable = find_removable(scene, removable, views, renderer, config) & removable
-    checks = [*views, *map(halve_view, views)]
-    allowed = limit_errors(scene, checks, config.tolerance, renderer)
-    return exclude_needed(scene, removable, checks, allowed, renderer)
+    none = torch.zeros_like(scene.generated, dtype=torch.bool)
+    removable = find_removable(scene, none, views, renderer, config) & (scene.generated == 0)
+    # A wall behind floaters is hidden, and looks superfluous. With the floaters faded, photographs
+    # need it.
+    removable &= find_removable(scene, removable, views, renderer, config)
+
+    # One at a time they are superfluous; together they may not be. Photographs are compared at half
+    # size as well.
+    checks = [*views, *(halve_view(view) for view in views)]
+    max_errors = limit_errors(scene, checks, config.tolerance, renderer)
+    return exclude_needed(scene, removable, checks, max_errors, renderer)
 
 
 def limit_errors(
     scene: Gaussians, views: Sequence[View], tolerance: float, renderer: Renderer
 ) -> list[float]:
     """Compute the mean squared error of each photograph after a loss of PSNR, in dB."""
-    allowed = []
+    limits = []
     for view in views:
         image = view.fill_ignored(renderer.render(scene, view.camera).image)
         error = compute_squared_error(image, view.image).item()
-        allowed.append(add_psnr_loss(error, tolerance))
-    return allowed
+        limits.append(add_psnr_loss(error, tolerance))
+    return limits
 
 
 def find_removable(
@@ -73,15 +78,18 @@ def find_removable(
 ) -> Bool[Tensor, "n"]:
     """Find Gaussians that can be removed one at a time while the others in `faded` are faint."""
     generator = torch.Generator().manual_seed(0)
-    gained, lost = torch.zeros_like(scene.opacities), torch.zeros_like(scene.opacities)
+    # Relative changes of the photographs' errors without each Gaussian, summed by their sign.
+    gained = torch.zeros_like(scene.opacities)
+    lost = torch.zeros_like(scene.opacities)
     equal_share = 0.0
     for view in track(views, "Comparing photographs"):
         change = predict_error_change(scene, faded, view, renderer, config.probes, generator)
         gained += (-change).clamp_min(0)
         lost += change.clamp_min(0)
+        # What a Gaussian would lose if all that a photograph shows were equally important.
         equal_share += 1 / max(int((change != 0).sum()), 1) / len(views)
-    shown = gained + lost > 0
-    return shown & (lost < gained / config.min_ratio + config.idle * equal_share)
+    is_observed = gained + lost > 0
+    return is_observed & (lost < gained / config.min_ratio + config.idle * equal_share)
 
 
 def predict_error_change(
@@ -95,11 +103,13 @@ def predict_error_change(
     """Predict the relative change of a photograph's squared error without each Gaussian."""
     plan = renderer.freeze(scene[:0], view.camera).vary_opacities(scene)
     full = scene.opacities
-    left = torch.where(faded, full.clamp_max(FADED_OPACITY), full)
-    error, gradient = compute_mse_and_gradient(plan, view, left)
-    square = estimate_squared_gradient(plan, left, view.valid_mask, probes, generator)
-    # Difference of the parabola between zero and full opacity, expanded at `left`.
-    return (square * (left**2 - (full - left) ** 2) - gradient * full) / max(error, MIN_ERROR)
+    current = torch.where(faded, full.clamp_max(FADED_OPACITY), full)
+    error, gradient = compute_mse_and_gradient(plan, view, current)
+    square = estimate_squared_gradient(plan, current, view.valid_mask, probes, generator)
+    # A pixel is linear in the opacity of one Gaussian, so the error is a parabola in it:
+    # E(o) = E + gradient (o - current) + square (o - current)², and this is E(0) - E(full).
+    change = square * (current**2 - (full - current) ** 2) - gradient * full
+    return change / max(error, MIN_ERROR)
 
 
 def estimate_squared_gradient(
@@ -129,6 +139,7 @@ def estimate_squared_gradient(
 def halve_view(view: View) -> View:
     """Reduce a photograph to half its size; a pixel with an ignored part is ignored."""
     image = avg_pool2d(view.image.permute(2, 0, 1), 2).permute(1, 2, 0)
+    # Pixel coordinates are halved as they are, since they count from the corner of the image.
     K = view.camera.K * view.camera.K.new_tensor([[0.5], [0.5], [1.0]])
     camera = replace(view.camera, K=K, height=image.shape[0], width=image.shape[1])
     ignored = None
@@ -148,14 +159,16 @@ def exclude_needed(
 
     Restored Gaussians may change other photographs, so all are checked until nothing changes.
     """
-    candidates, rest = scene[removable], scene[~removable]
-    missing, before = torch.ones_like(candidates.opacities, dtype=torch.bool), None
-    while before is None or not torch.equal(missing, before):
-        before = missing
-        for view, error in zip(views, max_errors, strict=True):
+    candidates = scene[removable]
+    rest = scene[~removable]
+    missing = torch.ones_like(candidates.opacities, dtype=torch.bool)
+    while True:
+        missing_before = missing
+        for view, max_error in zip(views, max_errors, strict=True):
             plan = renderer.freeze(rest, view.camera).vary_opacities(candidates)
-            missing = missing & ~find_needed(plan, candidates.opacities, missing, view, error)
-    return removable.masked_scatter(removable, missing)
+            missing = missing & ~find_needed(plan, candidates.opacities, missing, view, max_error)
+        if torch.equal(missing, missing_before):
+            return removable.masked_scatter(removable, missing)
 
 
 def find_needed(
@@ -165,7 +178,11 @@ def find_needed(
     view: View,
     max_error: float,
 ) -> Bool[Tensor, "n"]:
-    """Find the missing Gaussians that a photograph needs back to be within its limit."""
+    """Find the missing Gaussians that a photograph needs back to be within its limit.
+
+    Opacities [n] are those that the Gaussians have if they are not missing. After `MAX_TRIALS`
+    rounds the photograph gets back all that it sees.
+    """
     back = torch.zeros_like(missing)
     for _ in range(MAX_TRIALS):
         absent = missing & ~back
@@ -173,10 +190,10 @@ def find_needed(
         error = compute_squared_error(image, view.image).item()
         if error <= max_error or not absent.any():
             return back
-        _, gradient = compute_mse_and_gradient(
-            plan, view, torch.where(absent, GRADIENT_OPACITY, 1.0) * opacities
-        )
-        back = back | select_fewest(
-            torch.where(absent, -gradient * opacities, 0.0), error - max_error
-        )
+
+        # To first order, the error falls by -gradient * opacity if a Gaussian returns.
+        faint = torch.where(absent, GRADIENT_OPACITY, 1.0) * opacities
+        _, gradient = compute_mse_and_gradient(plan, view, faint)
+        relief = torch.where(absent, -gradient * opacities, 0.0)
+        back = back | select_fewest(relief, error - max_error)
     return back | (missing & (gradient != 0))

@@ -19,8 +19,11 @@ Region = Callable[[Float[Tensor, "n 3"]], Bool[Tensor, "n"]]
 REACH = 3.0
 """Standard deviations up to which a Gaussian reaches."""
 PIECE = 1 / 3
-"""Standard deviation of a piece, relative to that of its Gaussian; `STEP` is their distance."""
-STEP, STEPS = 2 / 3, 4
+"""Standard deviation of a piece, relative to that of its Gaussian."""
+STEP = 2 / 3
+"""Distance of neighbouring pieces, in standard deviations of their Gaussian."""
+STEPS = 4
+"""Pieces on either side of the middle one, along an axis."""
 MIN_LENGTH = 0.25
 """Length, relative to the longest axis, from which on the second axis is divided as well."""
 MAX_OPACITY = 0.99
@@ -34,12 +37,16 @@ def cut(gaussians: Gaussians, contains: Region) -> tuple[Gaussians, Gaussians]:
 
     Returns the Gaussians, of those at the border only what lies in the region, and the rest.
     """
+    # A Gaussian lies in the region as a whole if the six ends of its axes do. One whose centre lies
+    # outside is not cut either.
     ends = REACH * torch.cat([torch.eye(3), -torch.eye(3)]).to(gaussians.means)
     is_inside = torch.stack([contains(move(gaussians, end)) for end in ends]).all(dim=0)
-    whole = is_inside | ~contains(gaussians.means)
-    pieces = split(gaussians[~whole])
-    inside = contains(pieces.means)
-    return merge([gaussians[whole], pieces[inside]]), pieces[~inside]
+    is_whole = is_inside | ~contains(gaussians.means)
+
+    pieces = split(gaussians[~is_whole])
+    is_piece_inside = contains(pieces.means)
+    kept = merge([gaussians[is_whole], pieces[is_piece_inside]])
+    return kept, pieces[~is_piece_inside]
 
 
 def move(
@@ -56,22 +63,36 @@ def split(gaussians: Gaussians) -> Gaussians:
     Pieces at the steps of a grid, with the weights of a Gaussian of variance 1 - PIECE², add up to
     one of variance 1. What adds up when they are composited are logarithms of transmittance.
     """
+    # A cell is a step along the longest and one along the second axis, in standard deviations.
     steps = STEP * torch.arange(-STEPS, STEPS + 1)
     grid = torch.cartesian_prod(steps, steps).to(gaussians.means)
+
+    # Needles are divided along their longest axis alone: they take the cells without a second step.
     longest, order = gaussians.scales.sort(dim=1, descending=True, stable=True)
     is_wide = longest[:, 1] > MIN_LENGTH * longest[:, 0]
     row, cell = (is_wide[:, None] | (grid[:, 1] == 0)).nonzero().unbind(dim=1)
-    given, axes, spread = gaussians[row], 1 + is_wide[row].long(), 1 - PIECE**2
-    step = torch.zeros_like(given.scales).scatter(1, order[row, :2], grid[cell])
-    factors = torch.where(axes[:, None] > torch.arange(2).to(axes), PIECE, 1.0).to(step)
-    shrunk = torch.ones_like(step).scatter(1, order[row, :2], factors)
-    weights = (-(step**2).sum(dim=1) / (2 * spread)).exp() / spread ** (axes / 2)
-    transmittance = 1 - (weights * given.opacities).clamp_max(MAX_OPACITY)
+
+    # One row per piece from here on. `order` names the axes that the steps and factors belong to.
+    whole = gaussians[row]
+    num_axes = 1 + is_wide[row].long()
+    divided = order[row, :2]
+    step = torch.zeros_like(whole.scales).scatter(1, divided, grid[cell])
+    is_divided = num_axes[:, None] > torch.arange(2).to(num_axes)
+    factors = torch.where(is_divided, PIECE, 1.0).to(step)
+    shrunk = torch.ones_like(step).scatter(1, divided, factors)
+
+    # Convolved with a piece of variance PIECE², these weights give a Gaussian of variance 1. The
+    # division by the root of the variance, per axis, keeps its height at 1.
+    variance = 1 - PIECE**2
+    weights = (-(step**2).sum(dim=1) / (2 * variance)).exp() / variance ** (num_axes / 2)
+    transmittance = 1 - (weights * whole.opacities).clamp_max(MAX_OPACITY)
+    # About PIECE / STEP * sqrt(2 pi) pieces overlap at a point, along each axis.
+    share = (STEP / PIECE / math.sqrt(2 * math.pi)) ** num_axes
     pieces = replace(
-        given,
-        means=move(given, step),
-        scales=given.scales * shrunk,
-        opacities=1 - transmittance ** ((STEP / PIECE / math.sqrt(2 * math.pi)) ** axes),
+        whole,
+        means=move(whole, step),
+        scales=whole.scales * shrunk,
+        opacities=1 - transmittance**share,
         encoded=None,
     )
     return pieces[pieces.opacities > MIN_OPACITY]

@@ -48,33 +48,39 @@ def find_floaters(
             f"The scene has {len(scene)} Gaussians, too few to compare each with "
             f"{config.neighbors} neighbours; give its photographs."
         )
-    reasons: dict[str, Bool[Tensor, "n"]] = {}
-    left = torch.arange(len(scene), device=scene.means.device)
-    while len(left) > config.neighbors:
-        found = rate_gaussians(scene[left], config)
-        for reason, mask in found.items():
+    masks: dict[str, Bool[Tensor, "n"]] = {}
+    remaining = torch.arange(len(scene), device=scene.means.device)
+    while len(remaining) > config.neighbors:
+        is_floater_by_reason = rate_gaussians(scene[remaining], config)
+        for reason, is_floater in is_floater_by_reason.items():
             none = torch.zeros_like(scene.generated, dtype=torch.bool)
-            reasons[reason] = reasons.get(reason, none).index_fill(0, left[mask], True)
-        gone = torch.stack([*found.values()]).any(dim=0)
+            known = masks.get(reason, none)
+            masks[reason] = known.index_fill(0, remaining[is_floater], True)
+        gone = torch.stack(list(is_floater_by_reason.values())).any(dim=0)
         if not gone.any():
             break
-        left = left[~gone]
-    return reasons
+        remaining = remaining[~gone]
+    return masks
 
 
 def rate_gaussians(scene: Gaussians, config: FloaterConfig) -> dict[str, Bool[Tensor, "n"]]:
     """Compare Gaussians with their surroundings, as `find_floaters` does in each round."""
     around = measure_surroundings(scene, config.neighbors)
     longest, middle, shortest = around.sigmas.unbind(dim=1)
-    size, remoteness = longest / around.sigma, around.distance / around.spacing
+    # All sizes and distances are relative to those of the neighbours: walls and the sky are far,
+    # large and sparse, but all of their Gaussians are.
+    size = longest / around.sigma
+    remoteness = around.distance / around.spacing
     is_large = size > config.max_size
     is_detached = around.distance > config.max_size * around.sigma
+    # The larger a Gaussian is beside its neighbours, the more opaque it has to be.
+    min_opacity = config.min_opacity * (size / 2).clamp(1, MAX_BREADTH)
     reasons = {
         "isolated": around.gap > config.max_gap,
         "huge": (shortest > config.max_thickness * around.spacing)
         | (is_large & (remoteness > config.max_remoteness)),
         "needles": is_large & is_detached & (longest > config.max_elongation * middle),
-        "transparent": scene.opacities < config.min_opacity * (size / 2).clamp(1, MAX_BREADTH),
+        "transparent": scene.opacities < min_opacity,
     }
     return {reason: mask & (scene.generated == 0) for reason, mask in reasons.items()}
 
@@ -85,11 +91,16 @@ def measure_surroundings(scene: Gaussians, neighbors: int) -> Surroundings:
     from scipy.spatial import cKDTree
 
     means = scene.means.double().cpu().numpy()
-    found = cKDTree(means).query(means, neighbors + 1, workers=torch.get_num_threads())
-    apart, rows = (torch.from_numpy(part[:, 1:]).to(scene.means.device) for part in found)
+    workers = torch.get_num_threads()
+    distances, indices = cKDTree(means).query(means, neighbors + 1, workers=workers)
+    # The first neighbour of a Gaussian is itself.
     sigmas = scene.scales.sort(dim=1, descending=True).values
-    longest, apart = sigmas[:, 0], apart.to(sigmas)
+    apart = torch.from_numpy(distances[:, 1:]).to(sigmas)
+    rows = torch.from_numpy(indices[:, 1:]).to(scene.means.device)
+
+    longest = sigmas[:, 0]
     distance = apart.median(dim=1).values
+    # `spacing` is at least that of the scene, so that nothing is remote in its densest parts.
     return Surroundings(
         sigmas,
         sigma=longest[rows].median(dim=1).values,

@@ -24,7 +24,7 @@ from gscompleter.render.cache import SceneRenderer
 from gscompleter.render.fit_colors import RELAXATION, fit_colors
 from gscompleter.render.protocols import FrozenScene, Renderer
 from gscompleter.render.removed import mask_removed
-from gscompleter.state import NEW_PHOTO_ID, Completion, Photo
+from gscompleter.state import NEW_PHOTO_ID, Completion
 from gscompleter.system.errors import InputError
 from gscompleter.trust import Trust
 from gscompleter.trust.photometric import PhotoObservations, gather_observations
@@ -52,43 +52,68 @@ def remove_gaussians(
     Those in a region are removed as far as it reaches, and the rest of them is added.
     A rendered Gaussian that stands for several goes with the last of them.
     """
-    source, first = state.source, state.parts[0]
-    asked = find_unused(source, chosen)
-    inner, outer = cut(source.gaussians[chosen], contains)
-    gone, hidden = find_revealed(state, asked, inner, outer, scenes)
-    if gone.all():
-        raise InputError("Nothing would be left of the splat; choose fewer Gaussians.")
-    left = replace(
-        source,
-        rendered=source.rendered[~gone],
-        proxy_index=number_left(source, chosen, asked, gone),
-        removed=merge([source.removed, replace(inner, sh=inner.sh[:, :1])]),
-    )
-    context = left.rendered if first is source.rendered else first[~gone]
-    rest = replace(outer, generated=torch.full_like(outer.generated, NEW_PHOTO_ID))[~hidden]
-    parts = (context, *state.parts[1:], *([rest] if len(rest) else []))
-    changed = replace(state, source=left, parts=parts, trust=Trust())
-    photos = hide_in_photographs(changed, scenes)
-    return prepare_guards(replace(changed, photos=photos), scenes)
+    source = state.source
+    first = state.parts[0]
 
-
-def find_unused(source: ContextScene, chosen: Bool[Tensor, "n"]) -> Bool[Tensor, "m"]:
-    """Find the rendered Gaussians that stand for none but chosen ones."""
+    # Rendered Gaussians go if they stand for none but chosen ones.
     used = source.stand_ins[~chosen & ~source.gone_mask]
     unused = torch.ones(len(source.rendered), dtype=torch.bool, device=used.device)
-    return unused.index_fill(0, used, False)
+    unused = unused.index_fill(0, used, False)
+
+    inner, outer = cut(source.gaussians[chosen], contains)
+    gone, is_outer_revealed = find_revealed(state, unused, inner, outer, scenes)
+    if gone.all():
+        raise InputError("Nothing would be left of the splat; choose fewer Gaussians.")
+
+    remaining = replace(
+        source,
+        rendered=source.rendered[~gone],
+        proxy_index=number_left(source, chosen, unused, gone),
+        removed=merge([source.removed, replace(inner, sh=inner.sh[:, :1])]),
+    )
+    # As long as nothing is recoloured, `parts[0]` is the rendered context itself, which tells so.
+    context = remaining.rendered if first is source.rendered else first[~gone]
+    # Outer pieces are no Gaussians of the file: they are added to it, with a label of their own.
+    rest = replace(outer, generated=torch.full_like(outer.generated, NEW_PHOTO_ID))
+    rest = rest[~is_outer_revealed]
+    parts = (context, *state.parts[1:])
+    if len(rest):
+        parts = (*parts, rest)
+    changed = replace(state, source=remaining, parts=parts, trust=Trust())
+
+    # The photographs still show the object. Its pixels are ignored and painted over, so that no
+    # model copies from them.
+    views = [hide_removed(photo.view, remaining, scenes.renderer) for photo in state.photos]
+    shown = scenes.freeze_at(parts, [view.camera for view in views])
+    photos = tuple(
+        replace(photo, view=paint_over(view, scene.render))
+        for photo, view, scene in zip(state.photos, views, shown, strict=True)
+    )
+    return prepare_guards(replace(changed, photos=photos), scenes)
 
 
 def number_left(
     source: ContextScene,
     chosen: Bool[Tensor, "n"],
-    asked: Bool[Tensor, "m"],
+    unused: Bool[Tensor, "m"],
     gone: Bool[Tensor, "m"],
 ) -> Int64[Tensor, "n"]:
-    """Compute the `proxy_index` of what is left: rendered Gaussians are numbered anew."""
-    number = torch.where(asked, REMOVED, torch.where(gone, REVEALED, (~gone).cumsum(0) - 1))
-    before = torch.arange(REVEALED, 0, device=chosen.device)  # numbers of those already gone
-    return torch.cat([number, before])[source.stand_ins.where(~chosen, REMOVED)]
+    """Compute the `proxy_index` of what is left, in which rendered Gaussians are numbered anew.
+
+    `unused` rendered Gaussians are removed; the other `gone` ones are revealed.
+    """
+    # The new number of each rendered Gaussian: its place among those that stay, or the reason why
+    # it is gone.
+    number = (~gone).cumsum(0) - 1
+    number = torch.where(gone, REVEALED, number)
+    number = torch.where(unused, REMOVED, number)
+
+    # Gaussians that were gone before have the numbers REVEALED and REMOVED instead of a rendered
+    # one, and keep them. Chosen ones are removed, whatever stands for them.
+    was_gone = source.gone_mask
+    index = number[source.stand_ins.where(~was_gone, 0)]
+    index = torch.where(was_gone, source.stand_ins, index)
+    return index.where(~chosen, REMOVED)
 
 
 def restore_surroundings(state: Completion, renderer: Renderer) -> Completion:
@@ -97,23 +122,39 @@ def restore_surroundings(state: Completion, renderer: Renderer) -> Completion:
     What was generated is faded until none is worse than with all revealed Gaussians behind it. Of
     these, the needed return. At last the colours of all additions are fitted.
     """
-    source, views = state.source, [photo.view for photo in state.photos]
+    source = state.source
+    views = [photo.view for photo in state.photos]
     if len(source.removed) == 0:
         return state
-    is_rest, back = state.added.generated == NEW_PHOTO_ID, source.stand_ins == REVEALED
-    revealed, rest = source.gaussians[back], state.added[is_rest]
+
+    # Outer pieces of what was cut are among the additions, but were not generated.
+    is_rest = state.added.generated == NEW_PHOTO_ID
+    rest = state.added[is_rest]
     known = merge([state.parts[0], rest])
+    is_revealed = source.stand_ins == REVEALED
+    revealed = source.gaussians[is_revealed]
     added = fade_harmful(state.added[~is_rest], merge([known, revealed]), state, renderer)
-    needed = find_needed(revealed, known, added, views, renderer)
-    back, returned = back.masked_scatter(back, needed), revealed[needed]
-    numbers = len(source.rendered) + torch.arange(len(returned), device=back.device)
+
+    # Revealed Gaussians that return follow those that are rendered, as rows of their own.
+    is_needed = find_needed(revealed, known, added, views, renderer)
+    returned = revealed[is_needed]
+    is_returned = is_revealed.masked_scatter(is_revealed, is_needed)
+    rows = len(source.rendered) + torch.arange(len(returned), device=is_returned.device)
+    index = source.stand_ins.masked_scatter(is_returned, rows)
     rendered = merge([source.rendered, returned])
     first = rendered if state.parts[0] is source.rendered else merge([state.parts[0], returned])
-    index = source.stand_ins.masked_scatter(back, numbers)
+
+    # Additions reach beyond the hole, where photographs tell their colours. Ignored pixels show the
+    # scene itself, so that colours stay as they are in the hole.
+    frozen = [renderer.freeze(first, view.camera) for view in views]
+    added = merge([rest, added])
+    images = [
+        paint_over(view, scene.composite(added)) for view, scene in zip(views, frozen, strict=True)
+    ]
     return replace(
         state,
         source=replace(source, rendered=rendered, proxy_index=index),
-        parts=(first, fit_to_photographs(merge([rest, added]), first, views, renderer)),
+        parts=(first, fit_colors(added, frozen, images, [RELAXATION] * COLOR_ROUNDS)),
     )
 
 
@@ -128,47 +169,44 @@ def find_needed(
 
     What shows hardly anywhere but in the hole is not needed.
     """
-    found = find_outside(revealed, merge([known, added]), views, renderer)
-    whole = merge([known, revealed[found]])
-    missing = torch.arange(len(whole) + len(added), device=found.device)
-    missing = (missing >= len(known)) & (missing < len(whole))
+    is_outside = find_outside(revealed, merge([known, added]), views, renderer)
+    candidates = revealed[is_outside]
+
+    # The scene with all candidates, but without additions, sets the limit of each photograph.
+    # Candidates are rows of the scene between what is known and what was added.
+    whole = merge([known, candidates])
     limits = limit_errors(whole, views, TOLERANCE, renderer)
-    missing = exclude_needed(merge([whole, added]), missing, views, limits, renderer)
-    return found.masked_scatter(found, ~missing[len(known) : len(whole)])
+    row = torch.arange(len(whole) + len(added), device=is_outside.device)
+    is_candidate = (row >= len(known)) & (row < len(whole))
+    superfluous = exclude_needed(merge([whole, added]), is_candidate, views, limits, renderer)
+    return is_outside.masked_scatter(is_outside, ~superfluous[len(known) : len(whole)])
 
 
 def find_outside(
     revealed: Gaussians, others: Gaussians, views: Sequence[View], renderer: Renderer
 ) -> Bool[Tensor, "n"]:
     """Find the revealed Gaussians that photographs see outside of the hole as well."""
-    scene, sums = merge([others, revealed]), torch.zeros_like(revealed.means)
+    scene = merge([others, revealed])
+    sums = torch.zeros_like(revealed.means)
     for view in views:
         frozen = renderer.freeze(scene, view.camera)
         sums += sum_in_mask(frozen, view.valid_mask.to(sums))[len(others) :]
+    # Valid pixels are those outside of the hole, since those in it are ignored.
     return sums[:, 0] > MIN_OUTSIDE * sums.sum(dim=1)
 
 
 def sum_in_mask(frozen: FrozenScene, inside: Float[Tensor, "h w"]) -> Float[Tensor, "n 3"]:
     """Sum how much of each Gaussian is shown inside and outside of a mask; the third sum is 0."""
+    # A backprojection takes three channels.
     return frozen.backproject(torch.stack([inside, 1 - inside, torch.zeros_like(inside)], dim=-1))
-
-
-def fit_to_photographs(
-    added: Gaussians, context: Gaussians, views: Sequence[View], renderer: Renderer
-) -> Gaussians:
-    """Fit the colours of additions to photographs, and leave them as they are in the hole."""
-    frozen = [renderer.freeze(context, view.camera) for view in views]
-    images = [
-        paint_over(view, scene.composite(added)) for view, scene in zip(views, frozen, strict=True)
-    ]
-    return fit_colors(added, frozen, images, [RELAXATION] * COLOR_ROUNDS)
 
 
 def fade_harmful(
     added: Gaussians, context: Gaussians, state: Completion, renderer: Renderer
 ) -> Gaussians:
     """Fade what was generated until no photograph is worse than `context` alone."""
-    config, views = state.config.psnr_guard, [photo.view for photo in state.photos]
+    config = state.config.psnr_guard
+    views = [photo.view for photo in state.photos]
     frozen = [renderer.freeze(context, view.camera) for view in views]
     budgets = [
         set_error_budgets(
@@ -186,48 +224,46 @@ def fade_harmful(
 
 def find_revealed(
     state: Completion,
-    asked: Bool[Tensor, "m"],
+    unused: Bool[Tensor, "m"],
     inner: Gaussians,
     outer: Gaussians,
     scenes: SceneRenderer,
 ) -> tuple[Bool[Tensor, "m"], Bool[Tensor, "o"]]:
-    """Add to those `asked` for, of `state.parts[0]`, what only becomes visible without them.
+    """Add to `unused` Gaussians of `state.parts[0]` those that only become visible without them.
 
-    Also returns which `outer` pieces do. With `inner` ones they stand for those asked for.
+    Also returns which `outer` pieces do. With `inner` ones they stand for the unused ones.
     """
+    # One set of rows for all that may go: the context, in which the unused Gaussians are invisible,
+    # then their pieces. Of these, the inner ones go in any case.
     first = state.parts[0]
-    others = replace(first, opacities=first.opacities.masked_fill(asked, 0.0), encoded=None)
+    others = replace(first, opacities=first.opacities.masked_fill(unused, 0.0), encoded=None)
     state = replace(state, parts=(merge([others, inner, outer]), *state.parts[1:]))
-    gone = torch.cat([asked, asked.new_ones(len(inner)), asked.new_zeros(len(outer))])
-    before = observe(state, ~torch.zeros_like(gone), scenes)
-    confirmed = (before.areas * before.agreement).amax(dim=0)
+    gone = torch.cat([unused, unused.new_ones(len(inner)), unused.new_zeros(len(outer))])
+
+    before = observe(state, torch.ones_like(gone), scenes)
+    confirmed_area = (before.areas * before.agreement).amax(dim=0)
+    # A round reveals the next layer: what is behind it was hidden until then.
     for _ in range(MAX_ROUNDS):
-        after = torch.zeros_like(before.areas)
-        after[:, ~gone] = observe(state, ~gone, scenes).areas
-        most = after.amax(dim=0)
-        revealed = (after - before.areas).amax(dim=0) > MIN_REVEALED * most
-        revealed &= confirmed < MIN_CONFIRMED * most
+        areas = torch.zeros_like(before.areas)
+        areas[:, ~gone] = observe(state, ~gone, scenes).areas
+        largest = areas.amax(dim=0)
+        revealed = (areas - before.areas).amax(dim=0) > MIN_REVEALED * largest
+        # What a photograph showed before, in the right colours, was trained on and stays.
+        revealed &= confirmed_area < MIN_CONFIRMED * largest
         if not revealed.any():
             break
         gone = gone | revealed
     return gone[: len(first)], gone[len(gone) - len(outer) :]
 
 
-def observe(state: Completion, left: Bool[Tensor, "m"], scenes: SceneRenderer) -> PhotoObservations:
-    """Observe the Gaussians of the first part that are left in all photographs."""
-    views, context = [photo.view for photo in state.photos], state.parts[0][left]
+def observe(
+    state: Completion, remaining: Bool[Tensor, "m"], scenes: SceneRenderer
+) -> PhotoObservations:
+    """Observe the remaining Gaussians of the first part in all photographs."""
+    views = [photo.view for photo in state.photos]
+    context = state.parts[0][remaining]
     frozen = scenes.freeze_at((context, *state.parts[1:]), [view.camera for view in views])
     return gather_observations(context, views, frozen, state.config.trust_settings)
-
-
-def hide_in_photographs(state: Completion, scenes: SceneRenderer) -> tuple[Photo, ...]:
-    """Ignore the pixels of photographs that show something removed, and paint them over."""
-    views = [hide_removed(photo.view, state.source, scenes.renderer) for photo in state.photos]
-    shown = scenes.freeze_at(state.parts, [view.camera for view in views])
-    return tuple(
-        replace(photo, view=paint_over(view, scene.render))
-        for photo, view, scene in zip(state.photos, views, shown, strict=True)
-    )
 
 
 def hide_removed(view: View, source: ContextScene, renderer: Renderer) -> View:

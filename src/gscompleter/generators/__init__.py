@@ -71,12 +71,18 @@ class FunctionGenerator:
 
     def synthesize(self, requests: Sequence[GeneratorRequest]) -> list[GeneratorOutput]:
         """Call the function once per request."""
-        answers = [self.function(r.nearest, r.target, r.context) for r in requests]
-        return [a if isinstance(a, GeneratorOutput) else GeneratorOutput(a) for a in answers]
+        outputs = []
+        for request in requests:
+            answer = self.function(request.nearest, request.target, request.context)
+            if not isinstance(answer, GeneratorOutput):
+                answer = GeneratorOutput(answer)
+            outputs.append(answer)
+        return outputs
 
 
 def as_generator(phi: Any) -> Generator:
     """Return a `Generator`, wrapping an `ImageFunction`; raise InputError for anything else."""
+    # A class has the attributes of its instances, too, and would pass for one.
     is_object = isinstance(phi, Generator) and not isinstance(phi, type)
     if not is_object and (not callable(phi) or isinstance(phi, type)):
         raise InputError(

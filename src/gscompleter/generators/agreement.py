@@ -57,20 +57,33 @@ def paint_consistently(
     While it is inconsistent, up to `retries` further seeds are tried and the best image is kept.
     Raise InputError if no seed gives finite colours.
     """
-    found: list[Agreement] = []
+    attempts: list[Agreement] = []
     for attempt in range(retries + 1):
         image = paint(seed + attempt)
-        found.append(compare_with_observed(image, observed.image, observed.known, correct_color))
-        if found[-1].is_consistent:
+        agreement = compare_with_observed(image, observed.image, observed.known, correct_color)
+        attempts.append(agreement)
+        if agreement.is_consistent:
             break
-    best = min(found, key=lambda one: (not one.is_consistent, one.residual))
+
+    # A consistent image may have a larger residual than one that was refused for its gain.
+    best = min(attempts, key=lambda agreement: (not agreement.is_consistent, agreement.residual))
     if best.residual == float("inf"):
         raise InputError(
-            f"The generator painted no finite image ({len(found)} seed(s) tried); check that its "
-            "weights are correct, or choose another generator."
+            f"The generator painted no finite image ({len(attempts)} seed(s) tried); check that "
+            "its weights are correct, or choose another generator."
         )
-    notes = () if best.is_consistent else (describe_disagreement(best, observed, len(found)),)
-    return GeneratorOutput(best.image, notes, not best.is_consistent)
+    if best.is_consistent:
+        return GeneratorOutput(best.image)
+
+    gains = ", ".join(f"{gain:.2f}" for gain in best.gain.tolist())
+    seeds = "" if len(attempts) == 1 else f" (best of {len(attempts)} seeds)"
+    note = (
+        "The synthesized image disagrees with the photographs: over the "
+        f"{observed.known.float().mean():.0%} of it that they show, colours differ by "
+        f"{best.residual:.3f} ({best.limit:.3f} is the limit) after scaling the channels by "
+        f"{gains}{seeds}."
+    )
+    return GeneratorOutput(best.image, (note,), is_inconsistent=True)
 
 
 def compare_with_observed(
@@ -80,24 +93,32 @@ def compare_with_observed(
     correct_color: bool = True,
 ) -> Agreement:
     """Fit the colour shift of `image` to the `known` pixels and correct it if consistent."""
-    ones, zeros = torch.ones(3).to(image), torch.zeros(3).to(image)
+    ones = torch.ones(3).to(image)
+    zeros = torch.zeros(3).to(image)
     if not image.isfinite().all():
         return Agreement(ones, zeros, float("inf"), MIN_LIMIT, False, image)
     if int(known.sum()) < MIN_PIXELS:
         return Agreement(ones, zeros, 0.0, MIN_LIMIT, True, image)
-    ours = smooth_masked(image, known, BLUR_RADIUS)[known]
-    theirs = smooth_masked(observed, known, BLUR_RADIUS)[known]
-    gain, offset = fit_robust_affine(ours, theirs)
-    residual = compute_quantile((gain * ours + offset - theirs).abs().mean(dim=-1), QUANTILE)
-    plain = theirs - theirs.median(dim=0).values
-    contrast = compute_quantile(plain.abs().mean(dim=-1), QUANTILE)
+
+    painted = smooth_masked(image, known, BLUR_RADIUS)[known]
+    photographed = smooth_masked(observed, known, BLUR_RADIUS)[known]
+    gain, offset = fit_robust_affine(painted, photographed)
+    differences = (gain * painted + offset - photographed).abs().mean(dim=-1)
+    residual = compute_quantile(differences, QUANTILE)
+
+    # A single colour would match photographs of a blank wall as well, so the residual of one is
+    # the scale that an image has to be better than.
+    median = photographed.median(dim=0).values
+    contrast = compute_quantile((photographed - median).abs().mean(dim=-1), QUANTILE)
     limit = max(MIN_LIMIT, MAX_SHARE * contrast)
-    plausible = bool(
-        ((gain >= 1 / MAX_GAIN) & (gain <= MAX_GAIN)).all() and (offset.abs() <= MAX_OFFSET).all()
-    )
-    agrees = plausible and residual <= limit
+
+    # With any gain and offset an image of another scene could be fitted, too.
+    is_gain_plausible = bool(((gain >= 1 / MAX_GAIN) & (gain <= MAX_GAIN)).all())
+    is_offset_plausible = bool((offset.abs() <= MAX_OFFSET).all())
+    agrees = is_gain_plausible and is_offset_plausible and residual <= limit
     if agrees and not correct_color:
-        gain, offset = ones, zeros
+        gain = ones
+        offset = zeros
     corrected = (gain * image + offset).clamp(0, 1) if agrees else image
     return Agreement(gain, offset, residual, limit, agrees, corrected)
 
@@ -105,15 +126,3 @@ def compare_with_observed(
 def compute_quantile(values: Float[Tensor, "n"], share: float) -> float:
     """Return the value below which a fraction `share` of the values lies."""
     return values.kthvalue(1 + int(share * (len(values) - 1))).values.item()
-
-
-def describe_disagreement(found: Agreement, observed: WarpedImage, num_seeds: int) -> str:
-    """Describe an inconsistent image for a reader of the results."""
-    gains = ", ".join(f"{gain:.2f}" for gain in found.gain.tolist())
-    seeds = "" if num_seeds == 1 else f" (best of {num_seeds} seeds)"
-    return (
-        "The synthesized image disagrees with the photographs: over the "
-        f"{observed.known.float().mean():.0%} of it that they show, colours differ by "
-        f"{found.residual:.3f} ({found.limit:.3f} is the limit) after scaling the channels by "
-        f"{gains}{seeds}."
-    )

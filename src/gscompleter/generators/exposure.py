@@ -10,8 +10,10 @@ from torch import Tensor
 
 MIN_PIXELS = 100
 """Fewest shared pixels to compare two photographs."""
-DARKEST, BRIGHTEST = 0.05, 0.95
-"""Range of usable values; darker ones are noise, brighter ones may be clipped."""
+DARKEST = 0.05
+"""Smallest usable value; darker ones are noise."""
+BRIGHTEST = 0.95
+"""Largest usable value; brighter ones may be clipped."""
 MAX_GAIN = 2.0
 """Largest plausible gain; its inverse is the smallest."""
 
@@ -26,18 +28,20 @@ def match_exposures(
     The pairs that share most `visible` pixels are matched first; others keep a gain of 1.
     """
     ones = torch.ones(3, dtype=colors[reference].dtype, device=colors[reference].device)
-    found = {reference: ones}
+    gains = {reference: ones}
     waiting = [i for i in range(len(colors)) if i != reference]
+    # A photograph that shares nothing with the reference is matched through others, along a maximum
+    # spanning tree of shared pixels (Prim's algorithm).
     while waiting:
-        pairs = [(i, j, int((visible[i] & visible[j]).sum())) for i in waiting for j in found]
-        best, known, shared = max(pairs, key=lambda pair: pair[2])
+        pairs = [(i, j, int((visible[i] & visible[j]).sum())) for i in waiting for j in gains]
+        best, known, num_shared = max(pairs, key=lambda pair: pair[2])
         waiting.remove(best)
-        overlap = visible[best] & visible[known]
-        found[best] = ones
-        if shared >= MIN_PIXELS:
-            own, other = colors[best][overlap], colors[known][overlap]
-            found[best] = found[known] * compute_median_ratio(own, other)
-    return [found[i].clamp(1 / MAX_GAIN, MAX_GAIN) for i in range(len(colors))]
+        gains[best] = ones
+        if num_shared >= MIN_PIXELS:
+            overlap = visible[best] & visible[known]
+            ratio = compute_median_ratio(colors[best][overlap], colors[known][overlap])
+            gains[best] = gains[known] * ratio
+    return [gains[i].clamp(1 / MAX_GAIN, MAX_GAIN) for i in range(len(colors))]
 
 
 def compute_median_ratio(
@@ -46,8 +50,10 @@ def compute_median_ratio(
     """Compute the median of `other / own` per channel; 1 without enough exposed values."""
     ratios = torch.ones_like(own[0])
     for channel in range(3):
-        a, b = own[:, channel], other[:, channel]
-        exposed = (torch.minimum(a, b) > DARKEST) & (torch.maximum(a, b) < BRIGHTEST)
-        if int(exposed.sum()) >= MIN_PIXELS:
-            ratios[channel] = (b[exposed] / a[exposed]).median()
+        own_values = own[:, channel]
+        other_values = other[:, channel]
+        is_exposed = torch.minimum(own_values, other_values) > DARKEST
+        is_exposed &= torch.maximum(own_values, other_values) < BRIGHTEST
+        if int(is_exposed.sum()) >= MIN_PIXELS:
+            ratios[channel] = (other_values[is_exposed] / own_values[is_exposed]).median()
     return ratios

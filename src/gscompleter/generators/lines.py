@@ -15,8 +15,10 @@ from gscompleter.generators.smooth import compute_distance_to_known, continue_sm
 from gscompleter.numerics.image_ops import blur_gaussian, dilate
 from gscompleter.numerics.kernels.streamlines import trace_lines
 
-GRADIENT_SIGMA, TENSOR_SIGMA = 1.0, 3.0
-"""Standard deviations in pixels of the blurs before and after gradients are multiplied."""
+GRADIENT_SIGMA = 1.0
+"""Standard deviation in pixels of the blur before gradients are taken."""
+TENSOR_SIGMA = 3.0
+"""Standard deviation in pixels of the blur of their products."""
 RIM_WIDTH = 2
 """Width in pixels of the border around a hole whose gradients see the filling."""
 REACH = 0.08
@@ -33,15 +35,23 @@ def continue_lines(
     Returns the colours that they carry and their weights in [0, 1], which are the coherence, fall
     with the length, and are 0 where known.
     """
+    # With the eigenvalues a >= b of the tensor, the coherence is (a - b) / (a + b): 1 at an edge, 0
+    # where no direction prevails. The gradient has the angle of the first eigenvector; a line runs
+    # across it.
     xx, xy, yy = continue_structure_tensor(image, known).unbind(-1)
     coherence = torch.hypot(xx - yy, 2 * xy) / (xx + yy).clamp_min(1e-8)
     angle = 0.5 * torch.atan2(2 * xy, xx - yy)
     directions = torch.stack([-angle.sin(), angle.cos()], dim=-1)
+
+    # A line is given up at the length at which its weight would fall below the least. Where even
+    # the straight way to a known pixel is longer, none is traced.
     reach = REACH * max(known.shape)
     limits = reach * (coherence.where(~known, 0.0) / MIN_WEIGHT).clamp_min(1).log()
     limits = limits.where(limits > compute_distance_to_known(known), 0.0)
-    arrays = (layer.contiguous().numpy() for layer in (image, known, directions, limits))
-    colours, lengths = map(torch.from_numpy, trace_lines(*arrays))
+
+    layers = (image, known, directions, limits)
+    traced = trace_lines(*(layer.contiguous().numpy() for layer in layers))
+    colours, lengths = (torch.from_numpy(array) for array in traced)
     return colours, coherence * torch.exp(-lengths / reach)
 
 
@@ -52,8 +62,11 @@ def continue_structure_tensor(
     luminance = blur_gaussian(image.mean(dim=-1), GRADIENT_SIGMA).numpy()
     x = torch.from_numpy(cv2.Sobel(luminance, -1, 1, 0))
     y = torch.from_numpy(cv2.Sobel(luminance, -1, 0, 1))
+
+    # Gradients beside the hole are partly those of the filling, and would continue that.
     inner = known & ~dilate(~known, RIM_WIDTH)
     weight = (inner if inner.any() else known).to(image.dtype)
+    # A normalized blur: products and their weights are blurred alike, then divided.
     sums = torch.stack([x * x, x * y, y * y, torch.ones_like(x)], dim=-1) * weight[..., None]
     sums = blur_gaussian(sums, TENSOR_SIGMA)
     return continue_smoothly(sums[..., :3] / sums[..., 3:].clamp_min(1e-6), weight)

@@ -26,8 +26,10 @@ MEAN_WEIGHT = 1e-3
 """Weight of the mean colour in every cell, on the same scale."""
 MEANS_SIDE = 160
 """Longer side of the small image in which trusted colours are averaged, in pixels."""
-FIRST_SIGMA, NUM_SCALES = 5.0, 5
-"""Standard deviation of the finest mean in that image, and number of scales, each of twice it."""
+FIRST_SIGMA = 5.0
+"""Standard deviation of the finest mean in that image, in its pixels."""
+NUM_SCALES = 5
+"""Number of scales; each has twice the standard deviation of the one before."""
 COARSER_WEIGHT = 0.02
 """Weight of a scale relative to the next finer one: it counts only where that is empty."""
 MIN_TRUST = 0.1
@@ -47,12 +49,16 @@ def continue_smoothly(
     known = weight > 0
     if not known.any():
         return torch.zeros_like(values)
+    # The last channel is the sum of weights that the others are divided by.
     weighted = torch.cat([values * weight[..., None], weight[..., None]], dim=-1).numpy()
     pyramid = build_pyramid(build_sum_pyramid(np.ascontiguousarray(weighted, np.float32)))
 
+    # Each pixel reads the level, between two if need be, whose blur fits its distance: sharp beside
+    # the border, wide in the middle of a hole.
     pixels = np.argwhere(~known.numpy())
-    size = SIGMA_PER_DISTANCE * compute_distance_to_known(known).numpy()[pixels[:, 0], pixels[:, 1]]
-    level = np.log2(np.maximum(size / BLUR_SIGMA, 1.0)).clip(0, len(pyramid.starts) - 1)
+    distance = compute_distance_to_known(known).numpy()[pixels[:, 0], pixels[:, 1]]
+    sigma = SIGMA_PER_DISTANCE * distance
+    level = np.log2(np.maximum(sigma / BLUR_SIGMA, 1.0)).clip(0, len(pyramid.starts) - 1)
     filled = values.clone()
     filled[~known] = torch.from_numpy(compute_means(pyramid, pixels, level)).to(values)
     return filled
@@ -68,7 +74,9 @@ def build_sum_pyramid(weighted: Float32[ndarray, "h w c"]) -> list[Float32[ndarr
             return sums
         half = ((weighted.shape[1] + 1) // 2, (weighted.shape[0] + 1) // 2)
         # OpenCV averages at most four channels of odd sizes, so they are resized one by one.
-        planes = [cv2.resize(p, half, interpolation=cv2.INTER_AREA) for p in cv2.split(blurred)]
+        planes = [
+            cv2.resize(plane, half, interpolation=cv2.INTER_AREA) for plane in cv2.split(blurred)
+        ]
         weighted = np.stack(planes, axis=-1)
 
 
@@ -77,19 +85,29 @@ def fit_membrane(
 ) -> Float[Tensor, "h w c"]:
     """Fit a membrane to `values` by `weight`; some pixel must have one.
 
-    It is the likeliest continuation of an image whose spectrum falls with the squared frequency.
+    It is the likeliest continuation of an image whose spectrum falls with the squared frequency. It
+    minimizes Σ FIDELITY w (m - v)² + MEAN_WEIGHT (m - mean)² + Σ (m - m')² over its cells m, where
+    v are the values, w their weights, and m' the right and the lower neighbour of m.
     """
+    # The membrane is smooth, so that a coarse grid is enough: 128 instead of 96 cells gain nothing
+    # (decision 042).
     height, width = weight.shape
     scale = min(1.0, MEMBRANE_SIDE / max(height, width))
-    rows, columns = max(round(scale * height), 2), max(round(scale * width), 2)
+    rows = max(round(scale * height), 2)
+    columns = max(round(scale * width), 2)
     layers = torch.cat([values * weight[..., None], weight[..., None]], dim=-1).numpy()
     cells = cv2.resize(layers, (columns, rows), interpolation=cv2.INTER_AREA)
     sums = cells.reshape(rows * columns, -1).astype(np.float64)
-    steps = [diags([-1.0, 1.0], [0, 1], shape=(n - 1, n)) for n in (columns, rows)]
-    stiffness = kronsum(*(step.T @ step for step in steps))
+
+    # The normal equations. The Laplacian of a grid is the Kronecker sum of those of its two sides.
+    differences = [diags([-1.0, 1.0], [0, 1], shape=(side - 1, side)) for side in (columns, rows)]
+    stiffness = kronsum(*(difference.T @ difference for difference in differences))
     matrix = (stiffness + diags(FIDELITY * sums[:, -1] + MEAN_WEIGHT)).tocsc()
     total = sums.sum(axis=0)
     wanted = FIDELITY * sums[:, :-1] + MEAN_WEIGHT * total[:-1] / total[-1]
+
+    # The matrix is symmetric and positive definite: it needs no pivots, and its entries are ordered
+    # as those of a symmetric one.
     solver = splu(matrix, "MMD_AT_PLUS_A", diag_pivot_thresh=0, options={"SymmetricMode": True})
     fitted = solver.solve(wanted).reshape(rows, columns, -1).astype(np.float32)
     enlarged = cv2.resize(fitted, (width, height), interpolation=cv2.INTER_CUBIC)
@@ -103,9 +121,16 @@ def average_trusted(render: Render, trust: Float[Tensor, "h w"]) -> Float[Tensor
     """
     height, width = trust.shape
     scale = min(1.0, MEANS_SIDE / max(height, width))
-    size = max(round(scale * width), 1), max(round(scale * height), 1)
+    size = (max(round(scale * width), 1), max(round(scale * height), 1))
+
+    # Colours of a render over black are multiplied by alpha already, so that alpha is the weight
+    # that goes with them.
     shown = torch.cat([render.image.clamp(0, 1), render.alpha[..., None]], dim=-1)
-    layers = ((MIN_TRUST + (1 - MIN_TRUST) * trust)[..., None] * shown).cpu().numpy()
+    weight = MIN_TRUST + (1 - MIN_TRUST) * trust
+    layers = (weight[..., None] * shown).cpu().numpy()
+
+    # Sums over all scales are divided once. A coarser scale counts where the finer ones hardly
+    # have any weight.
     small = cv2.resize(layers, size, interpolation=cv2.INTER_AREA)
     total: Float32[ndarray, "h w 4"] = np.zeros_like(small, np.float32)
     for level in range(NUM_SCALES):

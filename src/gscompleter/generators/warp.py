@@ -58,32 +58,43 @@ def warp_photographs(nearest: View, target: Camera, context: GeneratorInput) -> 
     scene = context.target_render
     known = ~context.holes
     points = unproject(scene.depth, target)
-    colours, weights = [], []
+    min_weight = MIN_WEIGHT**SHARPNESS
+    colours = []
+    weights = []
     dynamic = torch.zeros_like(known)
     for view, render in zip(context.views, context.view_renders, strict=True):
         pixels, z = project(points, view.camera)
         visible = _compute_visibility(pixels, z, view, render)
-        shown = (visible * _compute_closeness(points, target, view)) ** SHARPNESS
+        # The high power prefers the photograph from the most similar direction.
+        weight = (visible * _compute_closeness(points, target, view)) ** SHARPNESS
         colours.append(sample(view.image, pixels))
-        weights.append(shown * ~_touches_mask(~view.static_mask, pixels))
+        weights.append(weight * ~_touches_mask(~view.static_mask, pixels))
         if view.dynamic_mask is not None:
-            dynamic |= (shown > MIN_WEIGHT**SHARPNESS) & _touches_mask(view.dynamic_mask, pixels)
+            dynamic |= (weight > min_weight) & _touches_mask(view.dynamic_mask, pixels)
 
+    # Exposures are matched to the nearest photograph, which is one of the views.
     baselines = [measure_baseline(nearest.camera, view.camera) for view in context.views]
     reference = baselines.index(min(baselines))
-    factors = match_exposures(colours, [known & (w > 1) for w in weights], reference)
+    gains = match_exposures(colours, [known & (weight > 1) for weight in weights], reference)
     total = torch.stack(weights).sum(dim=0)
-    colour = torch.stack(
-        [w[..., None] * c * g for w, c, g in zip(weights, colours, factors, strict=True)]
-    ).sum(dim=0)
+    weighted = [
+        weight[..., None] * colour * gain
+        for weight, colour, gain in zip(weights, colours, gains, strict=True)
+    ]
+    colour = torch.stack(weighted).sum(dim=0)
 
+    # The render is over black, so its colours are divided by alpha, where that is no hole. It shows
+    # where no photograph counts.
     rendered = scene.image / scene.alpha.clamp_min(context.max_alpha)[..., None]
-    trust = (total / (total + 1e-4))[..., None]
-    image = torch.lerp(rendered, colour / total.clamp_min(1e-12)[..., None], trust)
+    photo_share = (total / (total + 1e-4))[..., None]
+    image = torch.lerp(rendered, colour / total.clamp_min(1e-12)[..., None], photo_share)
+
+    # What a photograph shows is known, even if the Gaussians there are not trusted. What moved is
+    # unknown, unless another photograph shows the surface.
     if context.trusted_alpha is not None:
-        known = known | ((scene.alpha >= context.max_alpha) & (total > MIN_WEIGHT**SHARPNESS))
-    known = known & ~(dilate(dynamic, DYNAMIC_MARGIN) & (total < MIN_WEIGHT**SHARPNESS))
-    return WarpedImage(image.clamp(0, 1), known, scene.depth, torch.stack(factors))
+        known = known | ((scene.alpha >= context.max_alpha) & (total > min_weight))
+    known = known & ~(dilate(dynamic, DYNAMIC_MARGIN) & (total < min_weight))
+    return WarpedImage(image.clamp(0, 1), known, scene.depth, torch.stack(gains))
 
 
 def fill_background_first(warped: WarpedImage) -> WarpedImage:
@@ -92,15 +103,17 @@ def fill_background_first(warped: WarpedImage) -> WarpedImage:
     A hole beside an object usually shows the background, so the weight is the squared depth. Some
     pixel must be known.
     """
-    known, depth = warped.known.cpu(), warped.depth.cpu()
-    middle = depth[known].median()
-    relative = (depth / middle).clamp(0.1, 10.0)
+    known = warped.known.cpu()
+    depth = warped.depth.cpu()
+    # In multiples of the median, so that the unit of the scene does not matter.
+    median = depth[known].median()
+    relative = (depth / median).clamp(0.1, 10.0)
     layers = torch.cat([warped.image.cpu(), relative.log()[..., None]], dim=-1)
     filled = continue_smoothly(layers, relative**2 * known).to(warped.depth.device)
-    depth = middle.to(filled) * filled[..., 3].exp()
-    return replace(
-        warped, image=filled[..., :3], depth=torch.where(warped.known, warped.depth, depth)
-    )
+    # Known pixels keep their own depth, which the range of relative depths may have clamped.
+    filled_depth = median.to(filled) * filled[..., 3].exp()
+    depth = torch.where(warped.known, warped.depth, filled_depth)
+    return replace(warped, image=filled[..., :3], depth=depth)
 
 
 def add_unexplained(filled: WarpedImage, target: Camera, context: GeneratorInput) -> WarpedImage:
@@ -110,7 +123,8 @@ def add_unexplained(filled: WarpedImage, target: Camera, context: GeneratorInput
     empty in that direction count; others show an occluder.
     """
     points = unproject(filled.depth, target)
-    colour, total = torch.zeros_like(filled.image), torch.zeros_like(filled.depth)
+    colour = torch.zeros_like(filled.image)
+    total = torch.zeros_like(filled.depth)
     for view, render, gain in zip(context.views, context.view_renders, filled.gains, strict=True):
         pixels, z = project(points, view.camera)
         empty = sample(render.alpha[..., None], pixels)[..., 0] < COVERED
@@ -119,10 +133,10 @@ def add_unexplained(filled: WarpedImage, target: Camera, context: GeneratorInput
         weight = unexplained * _compute_closeness(points, target, view) ** SHARPNESS
         colour = colour + weight[..., None] * gain * sample(view.image, pixels)
         total = total + weight
-    found = total > 0
+    is_shown = total > 0
     shown = (colour / total.clamp_min(1e-12)[..., None]).clamp(0, 1)
-    image = torch.where(found[..., None], shown, filled.image)
-    return replace(filled, image=image, known=filled.known | found)
+    image = torch.where(is_shown[..., None], shown, filled.image)
+    return replace(filled, image=image, known=filled.known | is_shown)
 
 
 def continue_image(
@@ -134,15 +148,22 @@ def continue_image(
     so what an object hid keeps the filling. Beyond the frame nothing was hidden and all depths
     count alike: the sky does not cover the ground.
     """
-    image, known = filled.image.cpu(), filled.known.cpu()
+    image = filled.image.cpu()
+    known = filled.known.cpu()
     occluded = find_occluded(filled, target, context).cpu()[..., None].float()
-    share = smooth_masked(occluded, ~known, OCCLUSION_RADIUS)
+    # Averaged, so that the filling and the membrane fade into each other.
+    background_share = smooth_masked(occluded, ~known, OCCLUSION_RADIUS)
     lines, weight = continue_lines(image, known)
-    weight = weight[..., None] * (1 - share)
+    # What an object hid keeps the filling, so that lines do not count there.
+    weight = weight[..., None] * (1 - background_share)
+
+    # As data of the membrane, with a small weight, lines carry the tone of their ends into the hole
+    # (decision 042).
     known = known[..., None]
     fidelity = torch.where(known, 1.0, LINE_FIDELITY * weight)[..., 0]
     tone = fit_membrane(torch.where(known, image, lines), fidelity)
-    return torch.where(known, image, torch.lerp(tone, image, share)), lines, weight
+    tone = torch.where(known, image, torch.lerp(tone, image, background_share))
+    return tone, lines, weight
 
 
 def warp_and_fill(nearest: View, target: Camera, context: GeneratorInput) -> WarpedImage:
@@ -170,8 +191,9 @@ def find_occluded(
     occluded = torch.zeros_like(warped.known)
     for view, render in zip(context.views, context.view_renders, strict=True):
         pixels, z = project(points, view.camera)
-        shown, alpha = sample(torch.stack([render.depth, render.alpha], dim=-1), pixels).unbind(-1)
-        hides = (alpha >= COVERED) & (shown < (1 - OCCLUDER_MARGIN) * z)
+        layers = torch.stack([render.depth, render.alpha], dim=-1)
+        depth, alpha = sample(layers, pixels).unbind(-1)
+        hides = (alpha >= COVERED) & (depth < (1 - OCCLUDER_MARGIN) * z)
         occluded |= is_inside(pixels, z, view.camera) & hides
     return occluded
 
@@ -201,4 +223,4 @@ def _compute_closeness(
     to_target = torch.nn.functional.normalize(target.center - points, dim=-1)
     to_view = torch.nn.functional.normalize(view.camera.center - points, dim=-1)
     angle = torch.acos((to_target * to_view).sum(-1).clamp(-1, 1))
-    return 1 / (angle + 0.02)
+    return 1 / (angle + 0.02)  # finite at equal rays; 0.02 are about one degree

@@ -39,8 +39,10 @@ DEPTH_PENALTY = 0.02
 """Cost per squared log-depth of a source in front of the expected depth."""
 DISTANCE_PENALTY = 0.002
 """Cost of a source at the other end of the image."""
-MIN_VOTE_ROUNDS, MAX_VOTE_ROUNDS = 2, 8
-"""Iterations on the finest and the coarsest level, where sharp votes need more to agree."""
+MIN_VOTE_ROUNDS = 2
+"""Iterations on the finest level."""
+MAX_VOTE_ROUNDS = 8
+"""Iterations on the coarsest level, where sharp votes need more to agree."""
 VOTE_SHARPNESS = 8
 """Decay of a vote with its cost; at 1, averaged patches lose a quarter of their detail."""
 MIN_VOTE = 1e-6
@@ -67,7 +69,8 @@ class WarpInpaint:
 
         A scene that is not fully trusted gets smooth colours, which cannot be wrong in structure.
         """
-        render, trusted_alpha = context.target_render, context.trusted_alpha
+        render = context.target_render
+        trusted_alpha = context.trusted_alpha
         if trusted_alpha is None or trusted_alpha is render.alpha:
             return self.fill_holes(nearest, target, context)
         return average_trusted(render, trusted_alpha / render.alpha.clamp_min(1e-6))
@@ -80,7 +83,9 @@ class WarpInpaint:
         if not warped.known.any():
             return warped.image
         tone, lines, weight = continue_image(warped, target, context)
-        image = torch.lerp(self.add_structure(tone, warped.to("cpu"), context), lines, weight)
+        structured = self.add_structure(tone, warped.to("cpu"), context)
+        # Patches yield to lines by their weight (decision 042).
+        image = torch.lerp(structured, lines, weight)
         return image.clamp(0, 1).to(nearest.image.device)
 
     def add_structure(
@@ -88,35 +93,40 @@ class WarpInpaint:
     ) -> Float[Tensor, "h w 3"]:
         """Add structure to the smooth image `tone` along the borders of its holes."""
         reach = STRUCTURE_REACH * max(warped.known.shape)
-        away = compute_distance_to_known(warped.known)
-        undecided = remove_cracks(~warped.known, CRACK_WIDTH) & (away <= reach)
+        distance = compute_distance_to_known(warped.known)
+        undecided = remove_cracks(~warped.known, CRACK_WIDTH) & (distance <= reach)
         if not undecided.any():
             return tone
-        sources = collect_sources(context, warped)
+
+        # Patches come from photographs of equal exposure, and from the known target pixels. These
+        # are the last source: `init_matches` relies on it.
+        images = [
+            (gain * view.image.cpu()).clamp(0, 1)
+            for view, gain in zip(context.views, warped.gains, strict=True)
+        ]
+        valid = [view.static_mask.cpu() for view in context.views]
+        depths = [render.depth.cpu() for render in context.view_renders]
+        sources = Sources.stack_images(
+            [*images, warped.image], [*valid, warped.known], [*depths, warped.depth]
+        )
+
+        # Patches add what is finer than the tone, and keep the tone itself (decision 033). Deep in
+        # a hole they fade.
         patched = fill_by_patches(tone, ~undecided, warped.depth.log(), sources, self.seed)
         detail = patched - tone
         detail = detail - smooth_masked(detail, undecided, TONE_RADIUS)
-        fading = (2 * (1 - away / reach)).clamp(0, 1)
+        fading = (2 * (1 - distance / reach)).clamp(0, 1)
         return torch.where(undecided[..., None], tone + fading[..., None] * detail, tone)
 
 
 def remove_cracks(hole: Bool[Tensor, "h w"], width: int) -> Bool[Tensor, "h w"]:
     """Keep the parts of `hole` wider than `width` pixels; the image border is no limit."""
+    # An opening removes what the square does not fit into. Beyond the image holes go on.
     kernel = np.ones((width + 1, width + 1), np.uint8)
     padded = np.pad(hole.numpy().astype(np.uint8), width + 1, mode="edge")
     opened = cv2.morphologyEx(padded, cv2.MORPH_OPEN, kernel)
     inner = slice(width + 1, -width - 1)
     return torch.from_numpy(opened[inner, inner] > 0)
-
-
-def collect_sources(context: GeneratorInput, warped: WarpedImage) -> Sources:
-    """Collect patch sources: photographs of equal exposure, and the known target pixels."""
-    pairs = zip(context.views, warped.gains, strict=True)
-    return Sources.stack_images(
-        [*((gain * view.image.cpu()).clamp(0, 1) for view, gain in pairs), warped.image],
-        [*(view.static_mask.cpu() for view in context.views), warped.known],
-        [*(render.depth.cpu() for render in context.view_renders), warped.depth],
-    )
 
 
 @dataclass(frozen=True)
@@ -134,17 +144,21 @@ class Sources:
         depths: list[Float[Tensor, "_ _"]],
     ) -> Sources:
         """Stack images of any size; depth is in scene units, 0 if unknown."""
-        h, w = (max(image.shape[axis] for image in images) for axis in (0, 1))
+        height = max(image.shape[0] for image in images)
+        width = max(image.shape[1] for image in images)
 
         def stack(layers: list[Tensor]) -> Tensor:
-            borders = [(0, w - layer.shape[1], 0, h - layer.shape[0]) for layer in layers]
-            return torch.stack(
-                [pad(x, (0, 0) * (x.dim() - 2) + b) for x, b in zip(layers, borders, strict=True)]
-            )
+            padded = []
+            for layer in layers:
+                channels = (0, 0) * (layer.dim() - 2)  # `pad` begins with the last dimension
+                right = width - layer.shape[1]
+                below = height - layer.shape[0]
+                padded.append(pad(layer, (*channels, 0, right, 0, below)))
+            return torch.stack(padded)
 
         # Unknown depth counts as far away, which costs nothing.
         farthest = max(depth.max().item() for depth in depths)
-        logs = [torch.where(d > 0, d, farthest).clamp_min(1e-30).log() for d in depths]
+        logs = [torch.where(depth > 0, depth, farthest).clamp_min(1e-30).log() for depth in depths]
         return Sources(stack(images), stack(valid), stack(logs))
 
 
@@ -174,22 +188,25 @@ def fill_by_patches(
     Unknown pixels of `image` hold a first guess of the tone. `expected` is the expected log-depth;
     nearer sources cost more.
     """
+    # Coarse to fine (Wexler et al. 2007): the coarsest level decides what goes where, and each
+    # finer one starts from its matches.
     levels = [Level(image, known, expected, sources)]
     while min(levels[-1].known.shape) // 2 >= MIN_SIZE:
         levels.append(downsample_level(levels[-1]))
-    filled, field = image, None
+
+    filled = image
+    field = None
     for number, level in reversed(list(enumerate(levels))):
-        share = number / max(len(levels) - 1, 1)
-        rounds = MIN_VOTE_ROUNDS + round((MAX_VOTE_ROUNDS - MIN_VOTE_ROUNDS) * share)
-        centres = find_patch_centres(level.known, FINEST_SPACING if number == 0 else 1)
+        coarseness = number / max(len(levels) - 1, 1)
+        rounds = MIN_VOTE_ROUNDS + round((MAX_VOTE_ROUNDS - MIN_VOTE_ROUNDS) * coarseness)
+        # All patches that overlap the hole. The finest level, which has the most, takes every
+        # second one on each diagonal, as scores do not change (decision 045).
+        spacing = FINEST_SPACING if number == 0 else 1
+        rows, columns = np.indices(level.known.shape)
+        centres = dilate(~level.known, RADIUS).numpy() & ((rows + columns) % spacing == 0)
+        # Each level and round draws other random numbers; the steps between seeds are primes.
         filled, field = search_and_vote(level, field, centres, rounds, seed + 7919 * number)
     return filled
-
-
-def find_patch_centres(known: Bool[Tensor, "h w"], spacing: int) -> Bool[ndarray, "h w"]:
-    """Find the patches that overlap the hole, every `spacing`-th on each diagonal."""
-    rows, columns = np.indices(known.shape)
-    return dilate(~known, RADIUS).numpy() & ((rows + columns) % spacing == 0)
 
 
 def search_and_vote(
@@ -199,43 +216,72 @@ def search_and_vote(
     rounds: int,
     seed: int,
 ) -> tuple[Float[Tensor, "h w 3"], Field | None]:
-    """Alternate between searching the best patches around `centres` and voting for the image."""
+    """Alternate between searching the best patches around `centres` and voting for the image.
+
+    Returns the image and the field of the matches, from which the next finer level starts; None if
+    there is nothing to copy or to fill.
+    """
     h, w = level.known.shape
     known = level.known.numpy()
     usable = find_usable_centres(level.sources.valid)
     if not usable.any() or known.all():
         return level.image, None
 
+    # A query is the patch of the target around a centre, q in number; `query_at` finds it by pixel.
     queries = np.argwhere(centres)
     query_at = np.full((h, w), -1, np.int64)
     query_at[centres] = np.arange(len(queries))
-    weight = compute_pixel_weights(level.known)
-    votes, shift = weight[centres], np.zeros((len(queries), 3), np.float32)
+    # What is deep in the hole was guessed, and should not decide what matches.
+    distance = compute_distance_to_known(level.known).numpy()
+    weight_in_hole = np.maximum(WEIGHT_DECAY**distance, 0.05)
+    weight = np.where(known, 1.0, weight_in_hole).astype(np.float32)
     matches = init_matches(queries, coarse_field, usable, seed)
     images = patchmatch.pad_column(level.sources.images.numpy())
     log_depth = np.ascontiguousarray(level.sources.log_depth.numpy())
-    frame = patchmatch.pad_border(np.repeat(weight[..., None], 3, axis=-1))
-    total = cv2.boxFilter(weight, -1, (SIDE, SIDE), normalize=False, borderType=cv2.BORDER_CONSTANT)
-    target = (total[centres], queries, query_at, level.expected.numpy()[centres])
-    diagonal = math.hypot(*usable.shape[1:])
-    penalties = MAX_BIAS, BIAS_PENALTY, DEPTH_PENALTY, DISTANCE_PENALTY, diagonal
-    costs = patchmatch.Costs(*map(np.float32, penalties))
+    channel_weight = patchmatch.pad_border(np.repeat(weight[..., None], 3, axis=-1))
+    # Beyond the image a patch has no weight.
+    total_weight = cv2.boxFilter(
+        weight, -1, (SIDE, SIDE), normalize=False, borderType=cv2.BORDER_CONSTANT
+    )
+    costs = patchmatch.Costs(
+        max_bias=np.float32(MAX_BIAS),
+        bias_penalty=np.float32(BIAS_PENALTY),
+        depth_penalty=np.float32(DEPTH_PENALTY),
+        distance_penalty=np.float32(DISTANCE_PENALTY),
+        diagonal=np.float32(math.hypot(*usable.shape[1:])),
+    )
+
+    # Every pixel of the hole is the mean of what the patches over it show there, each with its
+    # colour shift and weighted by its vote. Before the first search all votes are equally likely.
+    votes = weight[centres]
+    shift = np.zeros((len(queries), 3), np.float32)
 
     def vote_colors() -> Float32[ndarray, "p 3"]:
         return patchmatch.vote(query_at, votes, images, matches, shift)[0][~known]
 
+    # The matches of a coarser level are nearly right, so that they are searched around alone. The
+    # coarsest level begins with the tone, and searches everywhere.
     current = level.image.numpy().copy()
     reach = max(usable.shape)
     if coarse_field is not None:
         current[~known] = vote_colors()
         reach = FINE_REACH
     for number in range(rounds):
-        matched = patchmatch.PatchProblem(
-            patchmatch.pad_border(current), frame, *target, images, usable, log_depth
+        problem = patchmatch.PatchProblem(
+            image=patchmatch.pad_border(current),
+            weight=channel_weight,
+            total=total_weight[centres],
+            queries=queries,
+            query_at=query_at,
+            expected_log_depth=level.expected.numpy()[centres],
+            sources=images,
+            usable_mask=usable,
+            log_depth=log_depth,
         )
-        cost, shift = patchmatch.search(matched, costs, matches, reach, seed + 31 * number)
+        cost, shift = patchmatch.search(problem, costs, matches, reach, seed + 31 * number)
         votes = weight[centres] * compute_likelihood(cost)
         current[~known] = vote_colors()
+
     field = np.full((h, w, 3), -1, np.int64)
     field[centres] = matches
     return torch.from_numpy(current), field
@@ -248,17 +294,11 @@ def compute_likelihood(cost: Float32[ndarray, "q"]) -> Float32[ndarray, "q"]:
     return np.maximum(likely, MIN_VOTE).astype(np.float32)
 
 
-def compute_pixel_weights(known: Bool[Tensor, "h w"]) -> Float32[ndarray, "h w"]:
-    """Compute pixel weights for patch comparison, falling with the depth in the hole."""
-    away = compute_distance_to_known(known).numpy()
-    return np.where(known, 1.0, np.maximum(WEIGHT_DECAY**away, 0.05)).astype(np.float32)
-
-
 def find_usable_centres(valid: Bool[Tensor, "s h w"]) -> Bool[ndarray, "s h w"]:
     """Mark the pixels whose whole patch is valid and inside the image."""
-    lacking = pad(~valid, (RADIUS,) * 4, value=True)
+    is_missing = pad(~valid, (RADIUS,) * 4, value=True)
     inner = slice(RADIUS, -RADIUS)
-    return np.stack([~dilate(v, RADIUS)[inner, inner].numpy() for v in lacking])
+    return np.stack([~dilate(mask, RADIUS)[inner, inner].numpy() for mask in is_missing])
 
 
 def init_matches(
@@ -267,7 +307,11 @@ def init_matches(
     usable: Bool[ndarray, "s source_h source_w"],
     seed: int,
 ) -> Int64[ndarray, "q 3"]:
-    """Initialize matches from the coarse level, the nearest known patch, or at random."""
+    """Initialize matches from the coarse level, the nearest known patch, or at random.
+
+    A match is a source with the row and column of a patch centre in it. The target image itself is
+    the last source.
+    """
     own = len(usable) - 1
     if usable[own].any():
         places = find_nearest(usable[own])[queries[:, 0], queries[:, 1]]
@@ -276,21 +320,26 @@ def init_matches(
         centres = np.argwhere(usable)
         matches = centres[np.random.default_rng(seed).integers(len(centres), size=len(queries))]
     if coarse_field is not None:
+        # A pixel inherits the match of the coarse pixel over it, at twice the coordinates and with
+        # its own place in the 2 x 2 block.
         h, w = coarse_field.shape[:2]
-        above = coarse_field[
-            np.minimum(queries[:, 0] // 2, h - 1), np.minimum(queries[:, 1] // 2, w - 1)
-        ]
-        guess = above.copy()
-        guess[:, 1:] = above[:, 1:] * 2 + queries % 2
-        inside = (above[:, 0] >= 0) & (guess[:, 1:] < usable.shape[1:]).all(axis=1)
-        guess[~inside] = 0
-        inside &= usable[guess[:, 0], guess[:, 1], guess[:, 2]]
-        matches[inside] = guess[inside]
+        rows = np.minimum(queries[:, 0] // 2, h - 1)
+        columns = np.minimum(queries[:, 1] // 2, w - 1)
+        coarse = coarse_field[rows, columns]
+        guess = coarse.copy()
+        guess[:, 1:] = coarse[:, 1:] * 2 + queries % 2
+        # Only matches that exist, lie in their source, and have a whole patch there are inherited.
+        is_valid = (coarse[:, 0] >= 0) & (guess[:, 1:] < usable.shape[1:]).all(axis=1)
+        guess[~is_valid] = 0
+        is_valid &= usable[guess[:, 0], guess[:, 1], guess[:, 2]]
+        matches[is_valid] = guess[is_valid]
     return np.ascontiguousarray(matches)
 
 
 def find_nearest(mask: Bool[ndarray, "h w"]) -> Int64[ndarray, "h w 2"]:
     """Find row and column of the nearest pixel of `mask`, for every pixel."""
+    # OpenCV gives every pixel of the mask a label, and each other pixel the label of the nearest
+    # one. So the labels in the mask tell which place each label stands for.
     _, labels = cv2.distanceTransformWithLabels(
         (~mask).astype(np.uint8), cv2.DIST_L2, 5, labelType=cv2.DIST_LABEL_PIXEL
     )
@@ -301,29 +350,30 @@ def find_nearest(mask: Bool[ndarray, "h w"]) -> Int64[ndarray, "h w 2"]:
 
 
 def downsample_level(level: Level) -> Level:
-    """Halve a level; averages leave out unknown pixels."""
+    """Halve a level and its sources; averages leave out unknown and invalid pixels."""
+    # Means of the known and of the guessed pixels of a block, each divided by its share.
     known = level.known.float()[..., None]
-    share = pool_pixels(known)
-    guess = pool_pixels(level.image * (1 - known)) / (1 - share).clamp_min(1e-6)
-    seen = pool_pixels(level.image * known) / share.clamp_min(1e-6)
-    image = torch.where(share > 0.5, seen, guess)
+    known_share = pool_pixels(known)
+    guess = pool_pixels(level.image * (1 - known)) / (1 - known_share).clamp_min(1e-6)
+    seen = pool_pixels(level.image * known) / known_share.clamp_min(1e-6)
+    image = torch.where(known_share > 0.5, seen, guess)
     expected = pool_pixels(level.expected[..., None])[..., 0]
 
     # One source at a time, since all of them and their copies take most memory of a synthesis.
-    parts = level.sources.images, level.sources.valid, level.sources.log_depth
-    halved = Sources(*map(torch.stack, zip(*map(halve_source, *parts), strict=True)))
-    return Level(image, share[..., 0] > 0.5, expected, halved)
-
-
-def halve_source(
-    image: Float[Tensor, "h w 3"], valid: Bool[Tensor, "h w"], log_depth: Float[Tensor, "h w"]
-) -> tuple[Float[Tensor, "h2 w2 3"], Bool[Tensor, "h2 w2"], Float[Tensor, "h2 w2"]]:
-    """Halve a source; averages leave out invalid pixels."""
-    known = valid.float()[..., None]
-    usable = pool_pixels(known)
-    layers = torch.cat([image, log_depth[..., None]], dim=-1)
-    means = pool_pixels(layers * known) / usable.clamp_min(1e-6)
-    return means[..., :3], usable[..., 0] > 0.75, means[..., 3]
+    images = []
+    valid = []
+    log_depths = []
+    sources = zip(level.sources.images, level.sources.valid, level.sources.log_depth, strict=True)
+    for source_image, source_valid, source_log_depth in sources:
+        usable = source_valid.float()[..., None]
+        usable_share = pool_pixels(usable)
+        layers = torch.cat([source_image, source_log_depth[..., None]], dim=-1)
+        means = pool_pixels(layers * usable) / usable_share.clamp_min(1e-6)
+        images.append(means[..., :3])
+        valid.append(usable_share[..., 0] > 0.75)
+        log_depths.append(means[..., 3])
+    halved = Sources(torch.stack(images), torch.stack(valid), torch.stack(log_depths))
+    return Level(image, known_share[..., 0] > 0.5, expected, halved)
 
 
 def pool_pixels(values: Float[Tensor, "*s h w c"]) -> Float[Tensor, "*s h2 w2 c"]:

@@ -6,7 +6,6 @@ A new guard is a class that overrides one of three hooks, and an entry in `confi
 from __future__ import annotations
 
 from dataclasses import dataclass
-from functools import reduce
 from importlib import import_module
 from typing import ClassVar
 
@@ -54,7 +53,9 @@ class Guard:
 
 def prepare_guards(state: Completion, scenes: SceneRenderer) -> Completion:
     """Let the guards of a completion inspect the scene before its first target."""
-    return reduce(lambda state, guard: guard.begin(state, scenes), load_guards(state.config), state)
+    for guard in load_guards(state.config):
+        state = guard.begin(state, scenes)
+    return state
 
 
 @timed_stage("integrate")
@@ -63,9 +64,11 @@ def place(candidates: Gaussians, view: TargetView) -> tuple[Step, ...]:
 
     Return the Gaussians that are left after each guard that changed them.
     """
-    steps, kept = [], candidates
+    steps = []
+    kept = candidates
     for guard in load_guards(view.state.config):
         placed = guard.place(kept, view)
+        # A guard that changes nothing returns its argument itself, and is no step.
         if placed is not kept:
             steps.append(Step(guard.name, placed))
         kept = placed
@@ -74,8 +77,12 @@ def place(candidates: Gaussians, view: TargetView) -> tuple[Step, ...]:
 
 @timed_stage("integrate")
 def verify(attempt: Attempt) -> tuple[tuple[Step, ...], Rejection]:
-    """Return what may be added after each guard, and which one rejected all of it, if one did."""
-    steps, added = [], attempt.refined.gaussians
+    """Return what may be added after each guard, and which one rejected all of it, if one did.
+
+    After a rejection no further guard is asked.
+    """
+    steps = []
+    added = attempt.refined.gaussians
     for guard in load_guards(attempt.view.state.config):
         checked = guard.verify(added, attempt)
         if checked is not added:
@@ -88,5 +95,9 @@ def verify(attempt: Attempt) -> tuple[tuple[Step, ...], Rejection]:
 
 def load_guards(config: CompleterConfig) -> list[Guard]:
     """Load the guards that a config names, in its order."""
-    places = [GUARDS[name].partition(":") for name in config.guards]
-    return [getattr(import_module(module), kind)() for module, _, kind in places]
+    guards = []
+    # Imported by name, since the modules of guards import this one.
+    for name in config.guards:
+        module, _, class_name = GUARDS[name].partition(":")
+        guards.append(getattr(import_module(module), class_name)())
+    return guards

@@ -26,9 +26,13 @@ class DepthAgreement(Guard):
 
     def verify(self, added: Gaussians, attempt: Attempt) -> Gaussians:
         """Drop everything if too few depths at the target agree with the affine correction."""
-        affine, least = attempt.affine, attempt.view.state.config.depth_agreement.reject_below
+        affine = attempt.affine
+        min_agreement = attempt.view.state.config.depth_agreement.reject_below
+        # Over hardly any pixels, the share that agrees says nothing.
         is_checked = affine.coverage >= MIN_TARGET_COVERAGE
-        return added[:0] if is_checked and (affine.agreement or 0.0) < least else added
+        if is_checked and (affine.agreement or 0.0) < min_agreement:
+            return added[:0]
+        return added
 
     def explain_rejection(self, attempt: Attempt) -> str:
         """Name the share that agrees."""

@@ -30,5 +30,6 @@ class Contribution(Guard):
 
 def find_shown(added: Gaussians, frozen: FrozenScene) -> Bool[Tensor, "n"]:
     """Find Gaussians with enough summed weight in the image of a frozen scene."""
+    # The weights do not depend on the colours that are fitted, so any colours and image will do.
     _, sums = frozen.vary_colors(added)(torch.zeros_like(added.means), frozen.render.image)
     return sums > MIN_WEIGHT

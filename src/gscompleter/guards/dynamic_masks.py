@@ -133,13 +133,19 @@ def find_dynamic_masks(
     renders: Sequence[Render],
     config: DynamicMasksConfig = DynamicMasksConfig(),
 ) -> list[Bool[Tensor, "_ _"]]:
-    """Compute a dynamic mask for each photograph by comparison with its neighbours."""
+    """Compute a dynamic mask for each photograph by comparison with its neighbours.
+
+    `renders` show the scene at `views`. Masks have the sizes of the photographs.
+    """
     photos = [shrink_photo(view, render) for view, render in zip(views, renders, strict=True)]
     votes = [torch.zeros_like(photo.valid_mask, dtype=torch.int32) for photo in photos]
     for one, other in pair_with_neighbours([view.camera for view in views]):
-        pair = compare_both_ways(photos[one], photos[other], config.min_color_difference)
-        regions = find_mutual_regions(*pair)
-        for index, comparison, region in zip((one, other), pair, regions, strict=True):
+        comparisons = compare_both_ways(photos[one], photos[other], config.min_color_difference)
+        regions = find_mutual_regions(*comparisons)
+        # Each neighbour votes: +1 for a pixel that contradicts it, -1 for one that it confirms, 0
+        # where it does not show the surface. With two photographs the only vote decides, so that
+        # both are masked; with more, the majority does.
+        for index, comparison, region in zip((one, other), comparisons, regions, strict=True):
             votes[index] += region.int() - (comparison.match_mask & ~region).int()
     return [
         interpolate((vote > 0)[None, None].float(), view.image.shape[:2])[0, 0] > 0
@@ -153,25 +159,31 @@ def pair_with_neighbours(cameras: Sequence[Camera]) -> list[tuple[int, int]]:
     for index, camera in enumerate(cameras):
         others = [other for other in range(len(cameras)) if other != index]
         others.sort(key=lambda other: measure_baseline(camera, cameras[other]))
-        pairs.update((min(index, o), max(index, o)) for o in others[:NUM_NEIGHBOURS])
+        for other in others[:NUM_NEIGHBOURS]:
+            pairs.add((min(index, other), max(index, other)))
     return sorted(pairs)
 
 
 def shrink_photo(view: View, render: Render) -> SmallPhoto:
-    """Shrink a photograph to `IMAGE_SIDE` pixels; depths are sampled, not averaged."""
+    """Shrink a photograph and the render at its camera to `IMAGE_SIDE` pixels."""
     camera = shrink_camera(view.camera, IMAGE_SIDE)
-    size = camera.height, camera.width
+    size = (camera.height, camera.width)
     image = interpolate(view.image.permute(2, 0, 1)[None], size, mode="area")[0].permute(1, 2, 0)
+    # Depths are sampled: a mean over an edge would be a surface that does not exist.
     depth, alpha = interpolate(torch.stack([render.depth, render.alpha])[None], size)[0]
-    ignored = interpolate((~view.valid_mask)[None, None].float(), size, mode="area")[0, 0]
-    return SmallPhoto(image, depth, (alpha >= COVERED) & (ignored == 0), camera)
+    # A small pixel is invalid if any part of it is ignored.
+    ignored_share = interpolate((~view.valid_mask)[None, None].float(), size, mode="area")[0, 0]
+    return SmallPhoto(image, depth, (alpha >= COVERED) & (ignored_share == 0), camera)
 
 
 def compare_both_ways(
     one: SmallPhoto, other: SmallPhoto, min_difference: float
 ) -> tuple[Comparison, Comparison]:
-    """Compare two photographs both ways, twice: surfaces in conflict then occlude nothing."""
-    there, back = get_view_map(one.image)(compare, (one, other), (other, one), [min_difference] * 2)
+    """Compare two photographs both ways: `one` reprojected into `other`, then the reverse."""
+    map_views = get_view_map(one.image)
+    there, back = map_views(compare, (one, other), (other, one), [min_difference] * 2)
+    # The depth of a moved object is wrong, and may hide what the photograph does show. So surfaces
+    # that are in conflict in the reverse comparison occlude nothing: they are put at infinity.
     return (
         there.occlude_by(other.depth.where(~back.conflict_mask, torch.inf)),
         back.occlude_by(one.depth.where(~there.conflict_mask, torch.inf)),
@@ -179,19 +191,27 @@ def compare_both_ways(
 
 
 def compare(photo: SmallPhoto, other: SmallPhoto, min_difference: float) -> Comparison:
-    """Reproject the surfaces of one photograph into another and compare colours."""
+    """Reproject the surfaces of one photograph into another and compare colours.
+
+    Masks of the result have the size of `photo`.
+    """
     pixels, z = project(unproject(photo.depth, photo.camera), other.camera)
-    framed = is_inside(pixels - BORDER, z, other.camera)
-    framed &= is_inside(pixels + BORDER, z, other.camera)
-    seen = sample(other.valid_mask[..., None].float(), pixels)[..., 0] == 1
-    known = framed & photo.valid_mask & seen
+    in_frame = is_inside(pixels - BORDER, z, other.camera)
+    in_frame &= is_inside(pixels + BORDER, z, other.camera)
+    # Bilinear samples are 1 only if all pixels around are valid.
+    is_valid_there = sample(other.valid_mask[..., None].float(), pixels)[..., 0] == 1
+    known = in_frame & photo.valid_mask & is_valid_there
     visible = known & find_unoccluded(pixels, z, other.depth)
     if int(visible.sum()) < MIN_SHARED_PIXELS:
         nothing = torch.zeros_like(known)
-        return Comparison(pixels, z, framed, nothing, nothing, nothing)
+        return Comparison(pixels, z, in_frame, nothing, nothing, nothing)
+
+    # Reflections, exposure and errors of depth make colours differ everywhere. Motion is what
+    # differs far more than usual in this pair.
     difference = compute_patch_difference(photo, other, pixels, visible)
-    limit = max(min_difference, MAX_MEDIAN_RATIO * difference[visible].median().item())
-    return Comparison(pixels, z, framed, known, visible, difference > limit)
+    usual = difference[visible].median().item()
+    limit = max(min_difference, MAX_MEDIAN_RATIO * usual)
+    return Comparison(pixels, z, in_frame, known, visible, difference > limit)
 
 
 def find_unoccluded(
@@ -199,7 +219,8 @@ def find_unoccluded(
 ) -> Bool[Tensor, "h w"]:
     """Find points that no surface of a depth map occludes, including its 3 x 3 neighbours."""
     nearest = -max_pool2d(-depth[None, None], 3, stride=1, padding=1)[0, 0]
-    return sample(nearest[..., None], pixels, "nearest")[..., 0] >= (1 - HIDDEN_TOLERANCE) * z
+    surface = sample(nearest[..., None], pixels, "nearest")[..., 0]
+    return surface >= (1 - HIDDEN_TOLERANCE) * z
 
 
 def compute_patch_difference(
@@ -214,20 +235,28 @@ def compute_patch_difference(
     """
     gain, offset = fit_robust_affine(sample(other.image, pixels)[visible], photo.image[visible])
     normalized = (gain * other.image + offset).clamp(0, 1)
-    least = torch.ones_like(photo.image[..., 0])
+
+    # Errors of depth and pose displace what is compared by a pixel or two.
     # One tensor of all shifts: each would be copied to the GPU by itself.
     shifts = pixels.new_tensor(list(product(range(-MAX_SHIFT, MAX_SHIFT + 1), repeat=2)))
+    smallest = torch.ones_like(photo.image[..., 0])
     for shift in shifts:
         shown = sample(normalized, pixels + shift)
-        differs = (shown - photo.image).abs().amax(dim=-1)
-        least = torch.minimum(least, average_box(differs, PATCH_RADIUS))
-    return least
+        difference = (shown - photo.image).abs().amax(dim=-1)
+        smallest = torch.minimum(smallest, average_box(difference, PATCH_RADIUS))
+    return smallest
 
 
 def find_mutual_regions(
     one: Comparison, other: Comparison
 ) -> tuple[Bool[Tensor, "h w"], Bool[Tensor, "other_h other_w"]]:
-    """Find regions in which two photographs contradict each other, each in both images."""
+    """Find regions in which two photographs contradict each other, each in both images.
+
+    A moved object is in conflict at its place in either photograph. Wrong depths often are in one
+    alone, so regions stay that project onto a region of the other photograph.
+    """
+    # The regions of one photograph that go may have confirmed some of the other, so those of the
+    # first are tested again.
     other_regions = find_regions(other)
     own_regions = keep_shared_parts(find_regions(one), other_regions, one.pixels)
     other_regions = keep_shared_parts(other_regions, own_regions, other.pixels)
@@ -236,20 +265,34 @@ def find_mutual_regions(
 
 def find_regions(comparison: Comparison) -> Bool[Tensor, "h w"]:
     """Find regions in conflict that are large enough and surrounded by confirmed pixels."""
+    # Beyond the image nothing is in frame and nothing confirmed, so that an outline that leaves it
+    # counts there like one that the other photograph does not show.
     width = GAP_RADIUS + OUTLINE_WIDTH
-    masks = comparison.conflict_mask, comparison.in_frame_mask, comparison.match_mask
-    conflict, framed, confirmed = (
-        np.pad(mask.cpu().numpy().astype(np.uint8), width) for mask in masks
-    )
-    whole = cv2.morphologyEx(conflict, cv2.MORPH_CLOSE, make_disc(GAP_RADIUS))
-    found = np.zeros(conflict.shape, bool)
-    for region in split_parts(cv2.morphologyEx(whole, cv2.MORPH_OPEN, make_disc(NOISE_RADIUS))):
-        outline = compute_outline(region)
-        closed = framed[outline].mean() >= 1 - MAX_OUT_OF_FRAME
-        certain = confirmed[outline].mean() >= MIN_CONFIRMED
-        if region.sum() >= MIN_AREA * comparison.conflict_mask.numel() and closed and certain:
-            found |= region
-    return torch.from_numpy(found[width:-width, width:-width]).to(comparison.conflict_mask.device)
+
+    def pad_mask(mask: Bool[Tensor, "h w"]) -> UInt8[np.ndarray, "padded_h padded_w"]:
+        return np.pad(mask.cpu().numpy().astype(np.uint8), width)
+
+    conflict = pad_mask(comparison.conflict_mask)
+    in_frame = pad_mask(comparison.in_frame_mask)
+    confirmed = pad_mask(comparison.match_mask)
+
+    # Parts of a moving object may match by chance: such gaps are closed, then specks removed.
+    closed = cv2.morphologyEx(conflict, cv2.MORPH_CLOSE, make_disc(GAP_RADIUS))
+    opened = cv2.morphologyEx(closed, cv2.MORPH_OPEN, make_disc(NOISE_RADIUS))
+    min_size = MIN_AREA * comparison.conflict_mask.numel()
+    regions = np.zeros(conflict.shape, bool)
+    for region in split_parts(opened):
+        # The outline is a ring around the region, without the pixels that touch it.
+        mask = region.astype(np.uint8)
+        outer = cv2.dilate(mask, make_disc(OUTLINE_WIDTH)) > 0
+        outline = outer & (cv2.dilate(mask, make_disc(1)) == 0)
+        is_framed = in_frame[outline].mean() >= 1 - MAX_OUT_OF_FRAME
+        # Around an object the background agrees; around a wrong depth little does.
+        is_surrounded = confirmed[outline].mean() >= MIN_CONFIRMED
+        if region.sum() >= min_size and is_framed and is_surrounded:
+            regions |= region
+    inner = regions[width:-width, width:-width]
+    return torch.from_numpy(inner).to(comparison.conflict_mask.device)
 
 
 def keep_shared_parts(
@@ -258,18 +301,14 @@ def keep_shared_parts(
     pixels: Float[Tensor, "h w 2"],
 ) -> Bool[Tensor, "h w"]:
     """Keep the parts of a region that project onto regions of the other photograph."""
-    falls = sample(dilate(others, 2)[..., None].float(), pixels, "nearest")[..., 0] > 0
-    shared, found = falls.cpu().numpy(), np.zeros(region.shape, bool)
+    # With a tolerance of two pixels around the regions of the other photograph.
+    reached = dilate(others, 2)[..., None].float()
+    is_shared = (sample(reached, pixels, "nearest")[..., 0] > 0).cpu().numpy()
+    kept = np.zeros(region.shape, bool)
     for part in split_parts(region.cpu().numpy().astype(np.uint8)):
-        if (part & shared).sum() >= MIN_SHARED_REGION * part.sum():
-            found |= part
-    return torch.from_numpy(found).to(region.device)
-
-
-def compute_outline(region: Bool[np.ndarray, "h w"]) -> Bool[np.ndarray, "h w"]:
-    """Compute the ring around a region, without the pixels that touch it."""
-    mask = region.astype(np.uint8)
-    return (cv2.dilate(mask, make_disc(OUTLINE_WIDTH)) > 0) & (cv2.dilate(mask, make_disc(1)) == 0)
+        if (part & is_shared).sum() >= MIN_SHARED_REGION * part.sum():
+            kept |= part
+    return torch.from_numpy(kept).to(region.device)
 
 
 def split_parts(mask: UInt8[np.ndarray, "h w"]) -> Iterator[Bool[np.ndarray, "h w"]]:

@@ -53,8 +53,10 @@ class Observed:
     @staticmethod
     def from_render(render: Render, camera: Camera, target: Camera) -> Observed:
         """Take the surfaces of a render; additions are about a pixel of the target wide."""
-        seen = render.depth_map()
-        depth = seen.depth.where(seen.valid, 0.0)
+        surfaces = render.depth_map()
+        depth = surfaces.depth.where(surfaces.valid, 0.0)
+        # The footprint is given in pixels of the target. A camera with a longer focal length sees
+        # it over more of its own.
         zoom = (camera.K[0, 0] / target.K[0, 0]).item()
         radius = round(FOOTPRINT_RADIUS * zoom)
         side = 2 * radius + 1
@@ -70,21 +72,32 @@ class FreeSpace(Guard):
     def place(self, candidates: Gaussians, view: TargetView) -> Gaussians:
         """Slide candidates back until no photograph or completed target sees through them."""
         state = view.state
-        completed = [result.target for result in state.targets if len(result.added)]
-        side = state.config.next_best_view.image_size
-        small = [shrink_camera(c, side) for c in (*state.free_space_cameras, *completed)]
+        # The context bounds free space only as far as it is trusted: what no photograph confirms
+        # may be a floater.
         cameras = [photo.camera for photo in state.views]
         renders = [
             replace(frozen.render, alpha=state.trust.compute_alpha(frozen, camera))
             for frozen, camera in zip(view.at(state.views), cameras, strict=True)
         ]
+
+        # Completed targets count, or else a later target hangs its additions before those of an
+        # earlier one (decision 008), and so do cameras of further photographs (decision 029).
+        # Both are rendered small, to save time.
+        completed = [result.target for result in state.targets if len(result.added)]
+        side = state.config.next_best_view.image_size
+        small = [shrink_camera(camera, side) for camera in (*state.free_space_cameras, *completed)]
         renders += [frozen.render for frozen in view.scenes.freeze_small(state.parts, small)]
         cameras += small
+
+        observed = [
+            ignore_removed(render, camera, view)
+            for render, camera in zip(renders, cameras, strict=True)
+        ]
         placed, is_placed = respect_free_space(
             candidates,
             view.camera.padded,
             cameras,
-            [ignore_removed(*pair, view) for pair in zip(renders, cameras, strict=True)],
+            observed,
             state.config.footprint,
             state.config.free_space,
         )
@@ -108,41 +121,52 @@ def respect_free_space(
     footprint: Literal["constant", "fixed"],
     config: FreeSpaceConfig = FreeSpaceConfig(),
 ) -> tuple[Gaussians, Bool[Tensor, "n"]]:
-    """Slide Gaussians back along target rays out of free space; mark those that found a place."""
+    """Slide Gaussians back along target rays out of free space; mark those that found a place.
+
+    `renders` show the scene at `cameras`. A position along a ray is the ratio to the distance that
+    a Gaussian had at first. Those without a place end where the last step left them.
+    """
+    observed = [
+        Observed.from_render(render, camera, target)
+        for render, camera in zip(renders, cameras, strict=True)
+    ]
     ratio = torch.ones_like(gaussians.opacities)
     offsets = gaussians.means - target.center
     waiting = torch.arange(len(gaussians), device=ratio.device)
-    pairs = zip(renders, cameras, strict=True)
-    observed = [Observed.from_render(render, camera, target) for render, camera in pairs]
     for step in range(config.num_steps):
         means = target.center + ratio[waiting, None] * offsets[waiting]
         waiting = waiting[find_in_free_space(means, observed)]
         if len(waiting) == 0:
             break
+        # Relative to the distance, so that the result does not depend on the scene unit.
         ratio[waiting] = (1 + SLIDE_STEP) ** (step + 1)
+
+    # Gaussians that find no position up to the sky become part of it: just behind its depth they
+    # count as occluded.
     if any(is_sky_visible(render, camera) for render, camera in zip(renders, cameras, strict=True)):
-        # Gaussians that find no position up to the sky become part of the sky.
         depths = compute_z_depths(gaussians.means[waiting], target)
         behind = (1 + SLIDE_STEP) * compute_sky_depth(target) / depths
         means = target.center + behind[:, None] * offsets[waiting]
-        found = ~find_in_free_space(means, observed)
-        ratio[waiting[found]] = behind[found]
-        waiting = waiting[~found]
-    placed = torch.ones_like(ratio, dtype=torch.bool)
-    placed[waiting] = False
-    return slide(gaussians, target, ratio, footprint), placed
+        is_placed = ~find_in_free_space(means, observed)
+        ratio[waiting[is_placed]] = behind[is_placed]
+        waiting = waiting[~is_placed]
+
+    has_place = torch.ones_like(ratio, dtype=torch.bool)
+    has_place[waiting] = False
+    return slide(gaussians, target, ratio, footprint), has_place
 
 
 def find_in_free_space(
     points: Float[Tensor, "n 3"], observed: Sequence[Observed]
 ) -> Bool[Tensor, "n"]:
     """Find points in front of an observed surface, or inside the near distance of a camera."""
-    left = torch.arange(len(points), device=points.device)
+    # One camera is enough to exclude a point, so each tests only those that none did before it:
+    # with 40 photographs this halves the time of stage 4 (decision 045).
+    allowed = torch.arange(len(points), device=points.device)
     for surfaces in observed:
-        left = left[~is_before_surface(points[left], surfaces)]
-    return torch.ones(len(points), dtype=torch.bool, device=points.device).index_fill(
-        0, left, False
-    )
+        allowed = allowed[~is_before_surface(points[allowed], surfaces)]
+    is_free = torch.ones(len(points), dtype=torch.bool, device=points.device)
+    return is_free.index_fill(0, allowed, False)
 
 
 def is_before_surface(points: Float[Tensor, "n 3"], observed: Observed) -> Bool[Tensor, "n"]:
@@ -155,10 +179,19 @@ def is_before_surface(points: Float[Tensor, "n 3"], observed: Observed) -> Bool[
     pixels, z = project(points, camera)
     size = torch.tensor([camera.width, camera.height], device=pixels.device)
     visible = (z > 0) & (pixels > -BORDER).all(-1) & (pixels < size + BORDER).all(-1)
+
+    # A mean just outside of the image reads the pixel at its border, since the Gaussian still
+    # covers that. The pixels of invisible means, which may be infinite, are replaced first.
     nearest = torch.where(visible[:, None], pixels, 0.0).long().clamp_min(0)
     x, y = torch.minimum(nearest, size - 1).unbind(-1)
     depth = observed.depth[y, x]
+
+    # Depth is 0 where no surface is seen, so that nothing is in front of it.
     before = z < (1 + CLEARANCE) * depth
+    # Half-way between an object and the wall, a mean is hidden by the object, but its footprint
+    # shows beside the edge, before the wall (decision 049). It has to slide on to the wall.
     beside = (depth > 0) & (z < (1 - FOOTPRINT_CLEARANCE) * observed.farthest[y, x])
+    # In any direction, in the image or not: without this, photographs of a capture lost up to
+    # 8.6 dB (decision 029).
     is_near = (points - camera.center).norm(dim=-1) < (camera.near or 0.0)
     return (visible & (before | beside)) | is_near

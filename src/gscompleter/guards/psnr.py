@@ -53,8 +53,11 @@ class PsnrGuard(Guard):
             )
             for photo, scene in zip(state.photos, frozen, strict=True)
         ]
-        photos = zip(state.photos, budgets, strict=True)
-        return replace(state, photos=tuple(replace(p, budgets=limits) for p, limits in photos))
+        photos = tuple(
+            replace(photo, budgets=limits)
+            for photo, limits in zip(state.photos, budgets, strict=True)
+        )
+        return replace(state, photos=photos)
 
     def verify(self, added: Gaussians, attempt: Attempt) -> Gaussians:
         """Fade added Gaussians until every photograph is within its budgets."""
@@ -81,33 +84,47 @@ def set_error_budgets(
 ) -> tuple[ErrorBudget, ...]:
     """Set the error budgets of a photograph from the render and holes of the context there.
 
-    They limit the mean squared error without the holes, so that closing a hole cannot compensate
-    for an error elsewhere, then over the whole photograph (both by a loss of PSNR in dB), then the
-    loss of SSIM.
+    The first limits the mean squared error outside of the holes. If there are holes, the second
+    limits it over the whole photograph. Both allow a loss of PSNR of `tolerance`, in dB. The last
+    limits the loss of SSIM to `ssim_tolerance`.
     """
 
-    def budget(view: View, metric: Literal["mse", "dssim"]) -> ErrorBudget:
-        error = compute_pixel_errors(image.clamp(0, 1), ErrorBudget(view, metric, 0.0)).sum().item()
+    def set_budget(view: View, metric: Literal["mse", "dssim"]) -> ErrorBudget:
+        unlimited = ErrorBudget(view, metric, 0.0)
+        error = compute_pixel_errors(image.clamp(0, 1), unlimited).sum().item()
         if metric == "mse":
             return ErrorBudget(view, metric, add_psnr_loss(error, max(tolerance, MIN_PSNR_LOSS)))
         return ErrorBudget(view, metric, error + ssim_tolerance)
 
-    budgets = [budget(replace(photograph, ignore_mask=holes | ~photograph.valid_mask), "mse")]
+    # The part without holes has a budget of its own. A closed hole lowers the error of the whole
+    # image, and could pay for an error elsewhere: a photograph of 33 dB lost 1.3 dB where its
+    # border was filled (decision 009).
+    without_holes = replace(photograph, ignore_mask=holes | ~photograph.valid_mask)
+    budgets = [set_budget(without_holes, "mse")]
     if holes.any():
-        budgets.append(budget(photograph, "mse"))
+        budgets.append(set_budget(photograph, "mse"))
+
+    # Equal PSNR does not exclude visible structure, such as a thin floater over an even wall
+    # (decision 010). An image that no window of SSIM fits into has no such budget.
     if min(photograph.image.shape[:2]) > 2 * SSIM_RADIUS:
-        budgets.append(budget(photograph, "dssim"))
+        budgets.append(set_budget(photograph, "dssim"))
     return tuple(budgets)
 
 
 def compute_pixel_errors(
     image: Float[Tensor, "h w 3"], budget: ErrorBudget
 ) -> Float[Tensor, "h w"]:
-    """Compute what each pixel adds to the error that a budget limits; differentiable."""
+    """Compute what each pixel adds to the error that a budget limits; differentiable.
+
+    The sum over all pixels is the mean squared error, or 1 - SSIM.
+    """
     view = budget.view
     masked = view.fill_ignored(image)
     if budget.metric == "mse":
         return (masked - view.image).square().mean(dim=-1) / view.valid_mask.numel()
+
+    # At the border the window of SSIM reaches into the black around the image, so the mean is over
+    # the inner pixels, and the border adds nothing.
     inner = slice(SSIM_RADIUS, -SSIM_RADIUS)
     dissimilar = (1 - ssim_map(masked, view.image).mean(dim=(0, 1)))[inner, inner]
     return pad(dissimilar / dissimilar.numel(), (SSIM_RADIUS,) * 4)
@@ -124,27 +141,35 @@ def meet_error_budgets(
     """Fade added Gaussians until every photograph is within its error budgets.
 
     In a photograph over budget, opacities with a harmful gradient are halved, the most harmful
-    first and no more than needed. If that fails (two Gaussians may occlude each other), Gaussians
-    at the worst pixels are removed, finally all that the photograph sees. None are left if they
-    would lose more than `max_opacity_loss` of their opacity.
+    first and no more than needed. If that fails, Gaussians at the worst pixels are removed, finally
+    all that the photograph sees. None are left if they would lose more than `max_opacity_loss` of
+    their opacity.
     """
     if len(added) == 0:
         return added
-    before = [frozen.render.image for frozen in frozen_views]
-    checks = [Check(*each) for each in zip(budgets, before, plans, strict=True)]
-    opacities, active = added.opacities, checks
+
+    images_before = [frozen.render.image for frozen in frozen_views]
+    checks = [Check(*parts) for parts in zip(budgets, images_before, plans, strict=True)]
+    opacities = added.opacities
+    active = checks
     for trial in range(NUM_HALVINGS + NUM_REMOVALS + 1):
         worse = find_over_budget(active, opacities)
-        if not worse and len(active) < len(checks):  # Faded Gaussians may have occluded others.
+        # While opacities are halved, only photographs that were over budget are rendered. A
+        # Gaussian that faded may have occluded another one in the rest, so that all of them have
+        # to be within budget at the end.
+        if not worse and len(active) < len(checks):
             worse = find_over_budget(checks, opacities)
         if not worse:
             break
-        lowered = [seen.choose_fading(trial, added) for seen in worse]
-        left = 0.5 if trial < NUM_HALVINGS else 0.0
-        opacities = torch.where(torch.stack(lowered).any(dim=0), left * opacities, opacities)
+
+        # A Gaussian that one photograph objects to gives way, whatever it improves in others.
+        objections = [render.choose_fading(trial, added) for render in worse]
+        is_lowered = torch.stack(objections).any(dim=0)
+        factor = 0.5 if trial < NUM_HALVINGS else 0.0
+        opacities = torch.where(is_lowered, factor * opacities, opacities)
         if is_mostly_faded(added.opacities, opacities, config):
             return added[:0]
-        active = [seen.check for seen in worse] if trial + 1 < NUM_HALVINGS else checks
+        active = [render.check for render in worse] if trial + 1 < NUM_HALVINGS else checks
     return replace(added, opacities=opacities, encoded=None)
 
 
@@ -171,25 +196,32 @@ class CheckedRender:
     """Error above the limit of that budget."""
 
     def choose_fading(self, trial: int, added: Gaussians) -> Bool[Tensor, "n"]:
-        """Choose the Gaussians that lose opacity.
+        """Choose the Gaussians that lose opacity in round `trial`.
 
-        SSIM is not linear in opacities, so Gaussians at the worst pixels are chosen from the first
-        round on.
+        In rounds of halving, the gradient chooses those whose fading lowers the squared error. SSIM
+        is not linear in opacities, so for it Gaussians at the worst pixels are chosen from the
+        first round on.
         """
-        is_first_order = self.worst_budget.metric == "mse" and trial < NUM_HALVINGS
-        if not is_first_order and trial < NUM_HALVINGS + NUM_REMOVALS:
+        uses_gradient = self.worst_budget.metric == "mse" and trial < NUM_HALVINGS
+        # Two Gaussians that occlude each other both have a helpful gradient, so halving never
+        # reaches the budget. Those at the worst pixels go before everything does, or else a hole
+        # loses its whole rim (decision 011).
+        if not uses_gradient and trial < NUM_HALVINGS + NUM_REMOVALS:
             return self.find_at_worst_pixels(added)
+
         gradient = compute_gradient(self.image, self.worst_budget, self.opacities)
-        if is_first_order:
+        # To first order, an error falls by gradient * o / 2 if the opacity o is halved.
+        if uses_gradient:
             return select_fewest(gradient * self.opacities.detach() / 2, self.excess)
+        # What the photograph does not see has no gradient.
         return gradient != 0
 
     def find_at_worst_pixels(self, added: Gaussians) -> Bool[Tensor, "n"]:
         """Find Gaussians at the fewest pixels that account for the excess."""
-        images = (self.image.detach(), self.check.image_before)
-        after, before = (
-            compute_pixel_errors(image.clamp(0, 1), self.worst_budget) for image in images
-        )
+        image_after = self.image.detach().clamp(0, 1)
+        image_before = self.check.image_before.clamp(0, 1)
+        after = compute_pixel_errors(image_after, self.worst_budget)
+        before = compute_pixel_errors(image_before, self.worst_budget)
         relief = after - before
         pixels = select_fewest(relief.flatten(), self.excess).view(relief.shape)
         return project_mask(dilate(pixels, PIXEL_RADIUS), added, self.worst_budget.view.camera)
@@ -202,14 +234,24 @@ def find_over_budget(checks: Sequence[Check], opacities: Float[Tensor, "n"]) -> 
 
 
 def render_check(check: Check, opacities: Float[Tensor, "n"]) -> CheckedRender:
-    """Render a photograph and compare it with its error budgets."""
+    """Render the scene at a photograph and compare it with the error budgets.
+
+    Opacities [n] are those of the added Gaussians. The image keeps its gradient, since the same
+    render decides which of them fade.
+    """
     variable, image = render_with_gradient(check.plan, opacities)
     clipped = image.detach().clamp(0, 1)
     sums = [compute_pixel_errors(clipped, budget).sum() for budget in check.budgets]
-    errors = torch.stack(sums).tolist()
-    budgets = zip(check.budgets, errors, strict=True)
-    worst, error = max(budgets, key=lambda pair: pair[1] / max(pair[0].limit, 1e-12))
-    return CheckedRender(check, variable, image, worst, error - worst.limit)
+    errors = torch.stack(sums).tolist()  # read from a GPU once for all budgets
+
+    # Squared errors and 1 - SSIM have no common unit, so errors are compared relative to limits.
+    used = [
+        error / max(budget.limit, 1e-12)
+        for budget, error in zip(check.budgets, errors, strict=True)
+    ]
+    worst = used.index(max(used))
+    budget = check.budgets[worst]
+    return CheckedRender(check, variable, image, budget, errors[worst] - budget.limit)
 
 
 def is_mostly_faded(
@@ -223,22 +265,31 @@ def is_mostly_faded(
 def select_fewest(relief: Float[Tensor, "n"], needed: float) -> Bool[Tensor, "n"]:
     """Select the fewest entries whose relief sums to `needed`, or to half of all relief.
 
-    Relief is a first-order estimate, so the other half is re-evaluated after the change.
+    The relief of an entry is what the error falls by if it changes. It is a first-order estimate,
+    so the other half is re-evaluated after the change.
     """
     helpful = (relief > 0).nonzero()[:, 0]
+    # Stable, so that the result does not depend on how equal entries are sorted.
     most_first, order = relief[helpful].sort(descending=True, stable=True)
     enough = min(needed, most_first.sum().item() / 2)
-    taken = helpful[order[most_first.cumsum(0) - most_first < enough]]
+    # An entry is taken as long as those before it do not suffice.
+    relief_before = most_first.cumsum(0) - most_first
+    taken = helpful[order[relief_before < enough]]
     return torch.zeros_like(relief, dtype=torch.bool).index_fill(0, taken, True)
 
 
 def compute_mse_and_gradient(
     plan: OpacityRender, view: View, opacities: Float[Tensor, "n"]
 ) -> tuple[float, Float[Tensor, "n"]]:
-    """Compute the squared error against a photograph and its gradient in the opacities."""
+    """Compute the mean squared error against a photograph and its gradient in the opacities.
+
+    The error is that of the clipped image, as it is shown. The gradient is that of the image as it
+    is rendered, since a clipped value has none.
+    """
     variable, image = render_with_gradient(plan, opacities)
     gradient = compute_gradient(image, ErrorBudget(view, "mse", 0.0), variable)
-    return compute_squared_error(view.fill_ignored(image.detach()), view.image).item(), gradient
+    error = compute_squared_error(view.fill_ignored(image.detach()), view.image).item()
+    return error, gradient
 
 
 def render_with_gradient(

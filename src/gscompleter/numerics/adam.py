@@ -21,7 +21,8 @@ class Adam:
     def __init__(
         self, rates: Sequence[tuple[Tensor, float]], betas: tuple[float, float] = (0.9, 0.999)
     ) -> None:
-        self._rates, self._betas = list(rates), betas
+        self._rates = list(rates)
+        self._betas = betas
         self._means = [torch.zeros_like(variable) for variable, _ in rates]
         self._squares = [torch.zeros_like(variable) for variable, _ in rates]
         self._counts = [torch.zeros(()) for _ in rates]

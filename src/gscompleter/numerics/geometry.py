@@ -26,6 +26,7 @@ def project(
     """Project world points to pixels (x, y), meaningful for positive z-depth only, and z-depths."""
     camera_points = (points - camera.center) @ camera.c2w[:3, :3]
     z = camera_points[..., 2]
+    # Without the absolute value and its bound, points on the camera plane would divide by 0.
     homogeneous = camera_points @ camera.K.T
     return homogeneous[..., :2] / z.abs().clamp_min(torch.finfo(z.dtype).tiny)[..., None], z
 
@@ -121,7 +122,8 @@ def pad_pixels(camera: Camera, left: int, top: int) -> PaddedCamera:
 
 def pad_like(camera: Camera, padded: Camera) -> PaddedCamera:
     """Pad the image of `camera` to the size of `padded`, centred."""
-    left, top = (padded.width - camera.width) // 2, (padded.height - camera.height) // 2
+    left = (padded.width - camera.width) // 2
+    top = (padded.height - camera.height) // 2
     return pad_pixels(camera, left, top)
 
 
@@ -150,9 +152,13 @@ def quats_to_rotations(quats: Float[Tensor, "*n 4"]) -> Float[Tensor, "*n 3 3"]:
 
 def rotations_to_quats(rotations: Float[Tensor, "*n 3 3"]) -> Float[Tensor, "*n 4"]:
     """Convert rotation matrices to unit wxyz quaternions, by the largest component."""
+    # Each row of 4 q qᵀ is the quaternion times four times one of its components; the row of the
+    # largest component is the most exact.
     r = rotations.flatten(-2).unbind(-1)
-    w, x = 1 + r[0] + r[4] + r[8], 1 + r[0] - r[4] - r[8]
-    y, z = 1 - r[0] + r[4] - r[8], 1 - r[0] - r[4] + r[8]
+    w = 1 + r[0] + r[4] + r[8]
+    x = 1 + r[0] - r[4] - r[8]
+    y = 1 - r[0] + r[4] - r[8]
+    z = 1 - r[0] - r[4] + r[8]
     a, b, c = r[7] - r[5], r[2] - r[6], r[3] - r[1]
     d, e, f = r[3] + r[1], r[2] + r[6], r[7] + r[5]
     candidates = stack_matrices([w, a, b, c], [a, x, d, e], [b, d, y, f], [c, e, f, z])
@@ -199,6 +205,8 @@ def compute_field_of_view(camera: Camera) -> tuple[float, float]:
 
 def estimate_up(cameras: Sequence[Camera]) -> Float[Tensor, "3"]:
     """Estimate the unit up direction that most images share."""
+    # The direction most like all others is the seed; cameras that are upside down against it are
+    # left out of the mean.
     ups = torch.stack([-camera.c2w[:3, 1] for camera in cameras])
     likeness = (ups @ ups.T).sum(dim=1)
     return normalize(ups[(ups @ ups[likeness.argmax()]) > 0].mean(dim=0), dim=0)
@@ -207,7 +215,8 @@ def estimate_up(cameras: Sequence[Camera]) -> Float[Tensor, "3"]:
 def shrink_camera(camera: Camera, side: int) -> Camera:
     """Reduce the image of a camera to at most `side` pixels on its longer side."""
     factor = min(side / max(camera.width, camera.height), 1.0)
-    width, height = (max(round(factor * side), 1) for side in (camera.width, camera.height))
+    width = max(round(factor * camera.width), 1)
+    height = max(round(factor * camera.height), 1)
     return resize_camera(camera, width, height)
 
 
@@ -224,6 +233,7 @@ def select_spread_cameras(cameras: Sequence[Camera], count: int) -> list[int]:
     apart = (where - where[0]).norm(dim=1)
     while len(chosen) < min(count, len(cameras)):
         chosen.append(int(apart.argmax()))
+        # Distance of each camera from the nearest chosen one; those of one place stay unique.
         apart = torch.minimum(apart, (where - where[chosen[-1]]).norm(dim=1))
         apart[chosen] = -1.0
     return chosen
@@ -251,5 +261,6 @@ def project_mask(
     """Find Gaussians whose means project into `mask`."""
     pixels, z = project(gaussians.means, camera)
     seen = is_inside(pixels, z, camera)
+    # Pixels outside must not be looked up; they are (0, 0) here and excluded by `seen`.
     x, y = pixels.where(seen[:, None], 0.0).long().unbind(-1)
     return seen & mask[y, x]

@@ -10,8 +10,10 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 from torch.nn.functional import avg_pool2d, interpolate, max_pool2d, pad
 
-SSIM_RADIUS, SSIM_SIGMA = 5, 1.5
-"""Radius and standard deviation of the Gaussian window of SSIM, in pixels."""
+SSIM_RADIUS = 5
+"""Radius of the Gaussian window of SSIM, in pixels."""
+SSIM_SIGMA = 1.5
+"""Standard deviation of the window, in pixels."""
 
 
 def fill_smoothly(
@@ -52,6 +54,7 @@ def push_pull(
 def _fill(
     weighted: Float[Tensor, "1 c h w"], weight: Float[Tensor, "1 1 h w"]
 ) -> Float[Tensor, "1 c h w"]:
+    """Fill what has no weight from an image of half the size, which is filled first."""
     own = weighted / weight.clamp_min(1e-8)
     size = (weight.shape[2], weight.shape[3])
     if max(size) == 1 or bool((weight > 0).all()):
@@ -91,7 +94,9 @@ def blur_gaussian(values: Float[Tensor, "h w *c"], sigma: float) -> Float[Tensor
 
 def dilate(mask: Bool[Tensor, "h w"], radius: int) -> Bool[Tensor, "h w"]:
     """Dilate `mask` by a square of 2 radius + 1 pixels."""
-    side, grown = 2 * radius + 1, mask[None, None].float()
+    side = 2 * radius + 1
+    grown = mask[None, None].float()
+    # The square in two passes, along x and along y.
     for size, padding in (((1, side), (0, radius)), ((side, 1), (radius, 0))):
         grown = max_pool2d(grown, size, stride=1, padding=padding)
     return grown[0, 0] > 0
@@ -113,9 +118,15 @@ def ssim_map(
         padded = pad(values.permute(2, 0, 1)[None], (SSIM_RADIUS,) * 4)
         return correlate(correlate(padded, weights, 3), weights, 2)
 
-    a, b = blur(image), blur(other)
-    aa, bb, ab = blur(image**2) - a**2, blur(other**2) - b**2, blur(image * other) - a * b
-    c1, c2 = 0.01**2, 0.03**2
+    # Local means a and b, variances aa and bb, and covariance ab.
+    a = blur(image)
+    b = blur(other)
+    aa = blur(image**2) - a**2
+    bb = blur(other**2) - b**2
+    ab = blur(image * other) - a * b
+    # The constants of the paper, for colours in [0, 1].
+    c1 = 0.01**2
+    c2 = 0.03**2
     return (2 * a * b + c1) * (2 * ab + c2) / ((a**2 + b**2 + c1) * (aa + bb + c2))
 
 

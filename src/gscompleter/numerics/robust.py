@@ -31,18 +31,24 @@ def fit_line_ransac(
     Residuals are relative to depth, so that distant pixels do not dominate. Returns (0, 0) if no
     hypothesis has a positive scale.
     """
+    # A line through two points each. Equal x give a scale of 0, which no hypothesis may have.
     i, j = torch.randint(len(x), (2, MAX_TRIALS), generator=rng).to(x.device)
     scales = (y[i] - y[j]) / torch.where(x[i] == x[j], torch.inf, x[i] - x[j])
     shifts = y[i] - scales * x[i]
+    # (scale x + shift - y) / y = scale (x / y) + shift (1 / y) - 1, for all pairs in one product.
     points = torch.stack([x / y, 1 / y])
     batches = torch.stack([scales, shifts], dim=1).split(HYPOTHESES_PER_BATCH)
-    residuals = ((batch @ points).sub_(1).abs_() for batch in batches)
-    counts = torch.cat([(each < RESIDUAL_THRESHOLD).sum(dim=1) for each in residuals])
-    best = counts.where(scales > 0, -1).argmax()
+    counts = []
+    for batch in batches:
+        residuals = (batch @ points).sub_(1).abs_()
+        counts.append((residuals < RESIDUAL_THRESHOLD).sum(dim=1))
+    best = torch.cat(counts).where(scales > 0, -1).argmax()
     if scales[best] <= 0:
         return 0.0, 0.0
 
-    scale, shift = scales[best].item(), shifts[best].item()
+    # Least squares on the inliers, whose set changes with the line.
+    scale = scales[best].item()
+    shift = shifts[best].item()
     for _ in range(3):
         agree = find_affine_inliers(x, y, scale, shift)
         weight = 1 / y[agree]
@@ -68,12 +74,16 @@ def fit_robust_affine(
     offset = (y - x).median(dim=0).values
     for _ in range(TRIMMED_ROUNDS):
         error = (gain * x + offset - y).abs()
-        usual = 1.4826 * error.median(dim=0).values
-        weight = (error <= 2.5 * usual.clamp_min(1e-3)).to(x)
+        sigma = 1.4826 * error.median(dim=0).values
+        weight = (error <= 2.5 * sigma.clamp_min(1e-3)).to(x)
         total = weight.sum(dim=0).clamp_min(1.0)
-        mean_x, mean_y = (weight * x).sum(dim=0) / total, (weight * y).sum(dim=0) / total
-        a, b = x - mean_x, y - mean_y
-        variance = (weight * a * a).sum(dim=0) / total
-        gain = ((weight * a * b).sum(dim=0) / total + 1e-4) / (variance + 1e-4)
+        mean_x = (weight * x).sum(dim=0) / total
+        mean_y = (weight * y).sum(dim=0) / total
+        centred_x = x - mean_x
+        centred_y = y - mean_y
+        variance = (weight * centred_x * centred_x).sum(dim=0) / total
+        covariance = (weight * centred_x * centred_y).sum(dim=0) / total
+        # The two constants pull the gain towards 1 where the channel hardly varies.
+        gain = (covariance + 1e-4) / (variance + 1e-4)
         offset = mean_y - gain * mean_x
     return gain, offset

@@ -50,7 +50,8 @@ def extend_sky(
     view: View, sky: Bool[Tensor, "h w"], sigma: float
 ) -> tuple[Gaussians, Int[Tensor, "n"]]:
     """Extend the sky behind surfaces by Gaussians of `sigma` pixels; return their pixels, too."""
-    camera, image = view.camera, view.image
+    camera = view.camera
+    image = view.image
     reach = round(SKY_EXTENSION * min(camera.width, camera.height))
     where = dilate(sky, reach) & ~sky
     pixels = torch.nonzero(where.flatten())[:, 0]

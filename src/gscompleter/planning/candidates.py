@@ -59,20 +59,33 @@ def propose_candidates(
     `renders` show the scene at `bases`. `step` is the longest move in scene units, 0 if unknown.
     With `stays_beside`, cameras move aside or halfway to the most similar base only.
     """
-    depths, nearest = compute_depth_quantiles(renders, 0.5), compute_depth_quantiles(renders, 0.05)
-    up, places = estimate_up(bases), embed_cameras(bases)
+    depths = compute_depth_quantiles(renders, 0.5)
+    nearest = compute_depth_quantiles(renders, 0.05)
+    up = estimate_up(bases)
+    # The first of the sorted cameras is the camera itself. Of a single base there is no second.
+    places = embed_cameras(bases)
     similar = torch.cdist(places, places).argsort(dim=1)[:, 1:2].tolist()
-    found = []
+
+    candidates = []
     for index, (base, depth) in enumerate(zip(bases, depths, strict=True)):
+        # Relative to the depth, or else a step would leave all that the photograph shows.
         longest = config.max_step * depth
         length = min(step, longest) if step > 0 else longest
-        away = make_moves(base, depth, length, config.yaw_fraction, up)
+        moved = make_moves(base, depth, length, config.yaw_fraction, up)
         if stays_beside:
             between = [interpolate_camera(base, bases[other], 0.5) for other in similar[index]]
-            away = [*(away[move] for move in MOVES_ASIDE), *between]
-        found += [Candidate(camera, index, nearest[index]) for camera in away]
-    small = [resize_camera(b, *r.alpha.T.shape) for b, r in zip(bases, renders, strict=True)]
-    return [c for c in found if is_in_free_space(c.camera.center, small, renders)]
+            moved = [*(moved[move] for move in MOVES_ASIDE), *between]
+        candidates += [Candidate(camera, index, nearest[index]) for camera in moved]
+
+    small = [
+        resize_camera(base, *render.alpha.T.shape)
+        for base, render in zip(bases, renders, strict=True)
+    ]
+    return [
+        candidate
+        for candidate in candidates
+        if is_in_free_space(candidate.camera.center, small, renders)
+    ]
 
 
 def make_moves(
@@ -83,6 +96,8 @@ def make_moves(
     `depth` (of the viewed point) and `step` are in scene units; `turn` is a fraction of the field
     of view; `up` is the unit axis of turns to the side.
     """
+    # The order is that of `MOVES_ASIDE`: right, left, down, up, forward, back; four turns in place;
+    # then four orbits about the point that the camera looks at.
     axes = camera.c2w[:3, :3].T
     shifts = [sign * step * axis for axis in axes for sign in (1, -1)]
     translated = [move_camera(camera, torch.eye(3).to(up), shift) for shift in shifts]
@@ -99,6 +114,7 @@ def orbit_camera(
     camera: Camera, pivot: Float[Tensor, "3"], angles: tuple[float, float], up: Float[Tensor, "3"]
 ) -> list[Camera]:
     """Turn a camera about a point by two angles in radians, about `up` and about its x axis."""
+    # About `up` instead of the camera's own y axis, which keeps the horizon level.
     axes = (up, camera.c2w[:3, 0])
     arm = camera.center - pivot
     turns = [
@@ -119,19 +135,23 @@ def move_camera(camera: Camera, turn: Float[Tensor, "3 3"], shift: Float[Tensor,
 
 def interpolate_camera(first: Camera, second: Camera, share: float) -> Camera:
     """Interpolate from `first` to the pose of `second`."""
+    # The rotation, in world axes, that turns the first camera into the second.
     turn = second.c2w[:3, :3].double() @ first.c2w[:3, :3].double().T
-    return move_camera(
-        first, slerp_rotation(turn, share).to(first.c2w), share * (second.center - first.center)
-    )
+    shift = share * (second.center - first.center)
+    return move_camera(first, slerp_rotation(turn, share).to(first.c2w), shift)
 
 
 def is_in_free_space(
     point: Float[Tensor, "3"], cameras: Sequence[Camera], renders: Sequence[Render]
 ) -> bool:
-    """Return True if a photograph sees through a point, or if none shows an occluder."""
-    hidden = False
+    """Return True if a photograph sees through a point, or if none shows an occluder.
+
+    `renders` show the scene at `cameras` and have their sizes.
+    """
+    is_hidden = False
     for camera, render in zip(cameras, renders, strict=True):
         pixel, z = project(point, camera)
+        # Clamped, since a point beside the camera has infinite coordinates.
         x, y = (int(value) for value in pixel.clamp(-1, 1e6).floor())
         if z <= 0 or not (0 <= x < camera.width and 0 <= y < camera.height):
             continue
@@ -140,8 +160,8 @@ def is_in_free_space(
             continue
         if z < (1 - FREE_SPACE_MARGIN) * surface.depth[y, x]:
             return True
-        hidden = True
-    return not hidden
+        is_hidden = True
+    return not is_hidden
 
 
 def is_close(render: Render, nearest: float, config: NextBestViewConfig) -> bool:
@@ -157,9 +177,11 @@ def compute_depth_quantiles(renders: Sequence[Render], share: float) -> list[flo
     A render that shows hardly anything of the scene gets the quantile over all renders.
     """
     valid = [render.depth_map().valid for render in renders]
-    own = [render.depth[where] for render, where in zip(renders, valid, strict=True)]
-    if sum(len(values) for values in own) == 0:
+    depths = [render.depth[mask] for render, mask in zip(renders, valid, strict=True)]
+    if sum(len(values) for values in depths) == 0:
         raise ValueError("no camera sees the scene, so its distance is unknown")
-    usual = torch.cat(own).quantile(share).item()
-    known = [where.float().mean().item() >= MIN_COVERAGE for where in valid]
-    return [v.quantile(share).item() if k else usual for v, k in zip(own, known, strict=True)]
+    usual = torch.cat(depths).quantile(share).item()
+    return [
+        values.quantile(share).item() if mask.float().mean().item() >= MIN_COVERAGE else usual
+        for values, mask in zip(depths, valid, strict=True)
+    ]

@@ -29,9 +29,8 @@ class PhotographPlanner(ViewPlanner):
         chosen = sorted(select_spread_cameras(cameras, MAX_CANDIDATES))
         ranged = [completion.with_depth_range(cameras[index]) for index in chosen]
         propose = partial(self.propose, completion)
-        return list(get_view_map(completion.context.means)(propose, ranged, chosen)), (
-            compute_spacing(cameras)
-        )
+        candidates = list(get_view_map(completion.context.means)(propose, ranged, chosen))
+        return candidates, compute_spacing(cameras)
 
     def score_candidate(
         self, completion: Completion, anchors: Sequence[SmallView], candidate: Candidate

@@ -87,6 +87,7 @@ class ViewPlanner:
             completion = add_free_space_cameras(completion, cameras)
             advance = self.completer.advance
             completion, choices = self.complete_greedily(completion, cameras, count, advance)
+        # The stages of each target have recorded their times; what is left is the search.
         total = before + seconds["total"]
         explore = total - completion.seconds["total"]
         recorded = {**completion.seconds, "explore": explore, "total": total}
@@ -106,11 +107,12 @@ class ViewPlanner:
         self, completion: Completion, cameras: Sequence[Camera]
     ) -> list[float]:
         """Compute the hole fraction at each camera after those before it are completed."""
-        small, shares = simplify_completion(completion), []
+        small = simplify_completion(completion)
+        fractions = []
         for camera in cameras:
-            shares.append(self.render_small_view(small, camera).holes.float().mean().item())
+            fractions.append(self.render_small_view(small, camera).holes.float().mean().item())
             small = self.add_placeholders(small, camera)
-        return shares
+        return fractions
 
     def complete_greedily(
         self,
@@ -131,11 +133,20 @@ class ViewPlanner:
                 break
             completion = complete(completion, choice.camera)
             chosen.append(choice)
-            left = [c.candidate for c in choices if c.gain >= config.min_gain]
-            remaining = [candidate for candidate in left if candidate is not choice.candidate]
-            if completion.config.trust != "full":  # one attempt for each place
-                at = [choice.camera]
-                remaining = [c for c in remaining if compute_remoteness(c.camera, at, step) > 1]
+
+            # What gains too little now is not scored again: a completion only closes holes.
+            remaining = [
+                other.candidate
+                for other in choices
+                if other.gain >= config.min_gain and other.candidate is not choice.candidate
+            ]
+            # A recoloured place may still be distrusted. It gets one attempt.
+            if completion.config.trust != "full":
+                remaining = [
+                    candidate
+                    for candidate in remaining
+                    if compute_remoteness(candidate.camera, [choice.camera], step) > 1
+                ]
         return completion, tuple(chosen)
 
     def find_candidates(
@@ -144,12 +155,14 @@ class ViewPlanner:
         """Propose candidate cameras; also return the step length in scene units."""
         config = completion.config.next_best_view
         bases = select_spread_cameras(cameras, config.bases)
-        near = [completion.with_depth_range(cameras[index]) for index in bases]
-        step = compute_spacing(near)
+        base_cameras = [completion.with_depth_range(cameras[index]) for index in bases]
+        step = compute_spacing(base_cameras)
         small = simplify_completion(completion)
-        renders = [self.render_small_view(small, camera).render for camera in near]
-        found = propose_candidates(near, renders, step, config, completion.config.trust != "full")
-        return [replace(candidate, base=bases[candidate.base]) for candidate in found], step
+        renders = [self.render_small_view(small, camera).render for camera in base_cameras]
+        stays_beside = completion.config.trust != "full"
+        candidates = propose_candidates(base_cameras, renders, step, config, stays_beside)
+        # From an index among the bases to one among all cameras.
+        return [replace(candidate, base=bases[candidate.base]) for candidate in candidates], step
 
     def score_candidates(
         self, completion: Completion, candidates_left: Sequence[Candidate]
@@ -166,20 +179,23 @@ class ViewPlanner:
         self, completion: Completion, anchors: Sequence[SmallView], candidate: Candidate
     ) -> Choice:
         """Score one candidate; its gain is 0 if it is too close to a surface."""
-        config, views = completion.config, completion.views
+        config = completion.config
         small_view = self.render_small_view(completion, candidate.camera)
         region = candidate.region.to(small_view.holes.device)
-        holes, distrust = small_view.holes & region, small_view.distrust.where(region, 0.0)
-        hole = holes.float().mean().item()
+        holes = small_view.holes & region
+        distrust = small_view.distrust.where(region, 0.0)
+        hole_fraction = holes.float().mean().item()
         if is_close(small_view.render, candidate.nearest, config.next_best_view):
-            return Choice(candidate, hole, 0.0)
+            return Choice(candidate, hole_fraction, 0.0)
+
+        # The lift triangulates with the anchor, so the gain counts as far as that sees the scene.
         overlaps = [
             compute_overlap(small_view.camera, small_view.render, anchor.camera, anchor.render)
             for anchor in anchors
         ]
-        anchor = select_anchor(candidate.camera, views, config.anchor, overlaps).index
+        anchor = select_anchor(candidate.camera, completion.views, config.anchor, overlaps).index
         gain = compute_gain(holes, distrust, overlaps[anchor], config.next_best_view)
-        return Choice(candidate, hole, gain)
+        return Choice(candidate, hole_fraction, gain)
 
     def render_small_view(self, completion: Completion, camera: Camera) -> SmallView:
         """Render the scene at a camera in a small image."""
@@ -205,9 +221,12 @@ def add_free_space_cameras(completion: Completion, cameras: Sequence[Camera]) ->
 
     An input splat gets none: its renders may be wrong there, and check views protect it better.
     """
-    taken = [view.camera for view in completion.views]
-    new = [c for c in cameras if not any(is_same_camera(c, t) for t in taken)]
-    others = list(map(completion.with_depth_range, new))
+    context = [view.camera for view in completion.views]
+    others = [
+        completion.with_depth_range(camera)
+        for camera in cameras
+        if not any(is_same_camera(camera, known) for known in context)
+    ]
     if completion.config.trust == "photometric" or not others:
         return completion
     chosen = select_spread_cameras(others, MAX_FREE_SPACE_CAMERAS)
@@ -225,6 +244,7 @@ def compute_gain(
     Pixels outside of `holes` count by the square of their `distrust` in [0, 1], since a little of
     it is everywhere. `overlap` is the fraction of the observed part that the anchor sees, too.
     """
+    # Far from what is observed, anything could be there.
     radius = max(round(config.border_radius * max(holes.shape)), 1)
     bordering = holes & dilate(~holes, radius)
     return torch.where(holes, bordering.float(), distrust**2).mean().item() * overlap
@@ -237,12 +257,13 @@ def choose_best(
     config: NextBestViewConfig = NextBestViewConfig(),
 ) -> Choice | None:
     """Choose the camera to complete next, or None if little is left; `step` is in scene units."""
-    most = max((choice.gain for choice in choices), default=0.0)
-    if most < config.min_gain:
+    largest = max((choice.gain for choice in choices), default=0.0)
+    if largest < config.min_gain:
         return None
-    good = [choice for choice in choices if choice.gain >= config.enough * most]
+    good = [choice for choice in choices if choice.gain >= config.enough * largest]
 
     def order(choice: Choice) -> tuple[int, float]:
+        # In whole steps, so that among cameras about as near the gain decides.
         return round(compute_remoteness(choice.camera, photographs, step)), -choice.gain
 
     return min(good, key=order)
@@ -263,6 +284,7 @@ def make_placeholders(render: Render, holes: Bool[Tensor, "h w"], camera: Camera
     seen = render.depth_map()
     depth = fill_smoothly(seen.depth, seen.valid & ~holes)
     means = unproject(depth, camera)[holes]
+    # One sphere per pixel, with a standard deviation of 0.7 pixels, which leaves no gaps.
     size = (0.7 * depth / camera.K[0, 0])[holes]
     quats = torch.eye(4).to(means)[:1].repeat(len(means), 1)
     return make_observed(

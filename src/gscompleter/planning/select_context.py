@@ -7,6 +7,7 @@ is greedy; of two further photographs that are needed to show new points, each c
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 
 import torch
@@ -30,8 +31,10 @@ HALF_SCORE_ANGLE = 5.0
 """Angle between viewing directions at which the score of a photograph is halved, in degrees."""
 BEST_ANGLE = 0.5
 """Best triangulation angle of a pair, in degrees: some pixels of parallax."""
-NARROW_FALLOFF, WIDE_FALLOFF = 0.3, 20.0
-"""Angles in degrees below and above it at which the score of a pair falls to a third."""
+NARROW_FALLOFF = 0.3
+"""Angle below it, in degrees, at which the score of a pair falls to a third."""
+WIDE_FALLOFF = 20.0
+"""Angle above it, in degrees, at which the score of a pair falls to a third."""
 MIN_PAIR_SCORE = 0.1
 """Pair score below which no pair shows a point."""
 OUTSIDE_SCORE = 1e-3
@@ -48,10 +51,18 @@ def select_context(
 
     `points` are on or near surfaces, in world coordinates; at least one.
     """
-    share = max(MAX_POINTS // len(targets), 1)
-    seen = [find_visible_points(target, points, share) for target in targets]
-    pairs = zip(targets, seen, strict=True)
-    worth = torch.cat([score_cameras(t, candidates, p) for t, p in pairs], dim=1)
+    num_points = max(MAX_POINTS // len(targets), 1)
+    seen = [find_visible_points(target, points, num_points) for target in targets]
+    # `worth` [c, p] is the score of each candidate at each point that some target sees.
+    worth = torch.cat(
+        [
+            score_cameras(target, candidates, visible)
+            for target, visible in zip(targets, seen, strict=True)
+        ],
+        dim=1,
+    )
+
+    # Pairs are scored for the best candidates alone: their number grows with the square.
     closest = worth.sum(1).argsort(descending=True, stable=True)[:MAX_CANDIDATES]
     rays = compute_directions([candidates[i] for i in closest.tolist()], torch.cat(seen))
     chosen = select_greedily(worth[closest], rays, count)
@@ -62,14 +73,23 @@ def select_greedily(
     worth: Float[Tensor, "c p"], rays: Float[Tensor, "c p 3"], count: int
 ) -> list[int]:
     """Choose the best pair, then repeatedly the candidate that improves the pair scores most."""
-    if min(count, len(worth)) < 2:
-        return list(range(min(count, len(worth))))
+    count = min(count, len(worth))
+    if count < 2:
+        return list(range(count))
+
+    # `pairs` [c, c, p] are the scores of all pairs at each point. A point counts by the best pair
+    # of chosen candidates, `best` [p].
     pairs = torch.stack([score_pairs(i, worth, rays) for i in range(len(worth))])
     first, second = divmod(int(pairs.sum(-1).argmax()), len(worth))
-    chosen, best = [first, second], pairs[first, second]
-    while len(chosen) < min(count, len(worth)):
+    chosen = [first, second]
+    best = pairs[first, second]
+    while len(chosen) < count:
+        # The gain of each candidate together with one of the chosen.
         now = (pairs[chosen].amax(0) - best).clamp_min(0).sum(-1)
+        # Points that no pair shows may need two further photographs. Each counts half of what they
+        # gain together, since the first alone gains nothing.
         later = (pairs.amax(0) * (best < MIN_PAIR_SCORE)).sum(-1) / 2
+        # The last term breaks ties by what a photograph shows on its own.
         gains = torch.maximum(now, later) + OUTSIDE_SCORE * worth.sum(-1)
         gains[chosen] = -1.0
         added = int(gains.argmax())
@@ -82,6 +102,8 @@ def score_pairs(
     one: int, worth: Float[Tensor, "c p"], rays: Float[Tensor, "c p 3"]
 ) -> Float[Tensor, "c p"]:
     """Score the pairs of candidate `one` with all others at each point."""
+    # Below the best angle, depth is uncertain, and the score falls fast; above, images get less
+    # alike, and it falls slowly.
     excess = compute_angles(rays[one], rays) - BEST_ANGLE
     width = torch.where(excess < 0, NARROW_FALLOFF, WIDE_FALLOFF)
     together = torch.minimum(worth[one], worth) * torch.exp(-((excess / width) ** 2))
@@ -94,9 +116,9 @@ def score_cameras(
 ) -> Float[Tensor, "c p"]:
     """Score each candidate at points that the target sees."""
     own = compute_directions([target], points)[0]
-    apart = compute_angles(own, compute_directions(candidates, points))
-    shown = torch.stack([is_inside(*project(points, c), c) for c in candidates])
-    return torch.where(shown, 1.0, OUTSIDE_SCORE) / (1 + (apart / HALF_SCORE_ANGLE) ** 2)
+    angles = compute_angles(own, compute_directions(candidates, points))
+    shown = torch.stack([is_inside(*project(points, camera), camera) for camera in candidates])
+    return torch.where(shown, 1.0, OUTSIDE_SCORE) / (1 + (angles / HALF_SCORE_ANGLE) ** 2)
 
 
 def find_visible_points(
@@ -106,7 +128,8 @@ def find_visible_points(
     seen = points[is_inside(*project(points, target), target)]
     if len(seen) < MIN_POINTS:
         seen = make_plane_in_front(target, (points - target.center).norm(dim=-1).median().item())
-    return seen[:: -(-len(seen) // count)]
+    step = math.ceil(len(seen) / count)
+    return seen[::step]
 
 
 def make_points_in_front(target: Camera, near: float, far: float) -> Float[Tensor, "p 3"]:
@@ -118,10 +141,8 @@ def make_points_in_front(target: Camera, near: float, far: float) -> Float[Tenso
 def make_plane_in_front(target: Camera, depth: float) -> Float[Tensor, "p 3"]:
     """Make a grid of points at one z-depth, in scene units, over the image of a target."""
     rays = target.z_rays()
-    rows, columns = (
-        torch.linspace(0, side - 1, GRID_SIDE).round().long()
-        for side in (target.height, target.width)
-    )
+    rows = torch.linspace(0, target.height - 1, GRID_SIDE).round().long()
+    columns = torch.linspace(0, target.width - 1, GRID_SIDE).round().long()
     return target.center + depth * rays[rows][:, columns].reshape(-1, 3)
 
 
@@ -137,4 +158,5 @@ def compute_angles(
     a: Float[Tensor, "*#shape 3"], b: Float[Tensor, "*#shape 3"]
 ) -> Float[Tensor, "*shape"]:
     """Compute the angle between unit vectors in degrees, exact for small angles."""
+    # From half the chord: the arc cosine of the scalar product is inexact near 0.
     return torch.rad2deg(2 * torch.asin(((a - b).norm(dim=-1) / 2).clamp_max(1.0)))

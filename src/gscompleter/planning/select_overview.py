@@ -44,50 +44,59 @@ def select_overview(
 
     `points` are on or near surfaces, in world coordinates; at least one.
     """
-    number = count
+    # Partners take places of medoids, so there are fewer medoids until both are at most `count`.
+    # Two are needed in any case: one medoid and its partner.
+    num_medoids = count
     while True:
-        chosen = find_medoids(cameras, number)
-        alone = [i for i in chosen if not has_partner(i, chosen, cameras, points)]
-        found = sorted({*chosen, *(find_partner(i, cameras, points) for i in alone)})
-        if len(found) <= max(count, 2):
-            return found
-        number -= 1
+        medoids = find_medoids(cameras, num_medoids)
+        alone = [i for i in medoids if not has_partner(i, medoids, cameras, points)]
+        partners = [find_partner(i, cameras, points) for i in alone]
+        chosen = sorted({*medoids, *partners})
+        if len(chosen) <= max(count, 2):
+            return chosen
+        num_medoids -= 1
 
 
 def find_medoids(cameras: Sequence[Camera], count: int) -> list[int]:
     """Cluster cameras by k-medoids; return the sorted indices of the medoids."""
-    where = embed_cameras(cameras)
-    apart = torch.cdist(where, where)
-    chosen = select_spread_cameras(cameras, count)
+    places = embed_cameras(cameras)
+    distances = torch.cdist(places, places)
+    medoids = select_spread_cameras(cameras, count)
     for _ in range(NUM_ROUNDS):
-        groups = apart[:, chosen].argmin(dim=1)
-        members = [torch.nonzero(groups == group)[:, 0] for group in groups.unique()]
-        costs = [apart[own][:, own].square().sum(dim=1) for own in members]
-        pairs = zip(members, costs, strict=True)
-        before, chosen = chosen, [int(own[cost.argmin()]) for own, cost in pairs]
-        if chosen == before:
+        # Each camera joins the nearest medoid; of each group, the camera with the smallest squared
+        # distances to the others is the next one.
+        nearest = distances[:, medoids].argmin(dim=1)
+        medoids_before = medoids
+        medoids = []
+        for group in nearest.unique():
+            members = torch.nonzero(nearest == group)[:, 0]
+            costs = distances[members][:, members].square().sum(dim=1)
+            medoids.append(int(members[costs.argmin()]))
+        if medoids == medoids_before:
             break
-    return sorted(set(chosen))
+    return sorted(set(medoids))
 
 
 def has_partner(
     index: int, chosen: Sequence[int], cameras: Sequence[Camera], points: Float[Tensor, "n 3"]
 ) -> bool:
     """Return True if another chosen camera shares enough points at usable triangulation angles."""
-    seen = find_visible_points(cameras[index], points)
-    own, *rays = compute_directions([cameras[i] for i in (index, *chosen)], seen)
-    for number, directions in zip(chosen, rays, strict=True):
-        turn, camera = compute_angles(own, directions), cameras[number]
-        shared = (turn > 0) & (turn < MAX_ANGLE) & is_inside(*project(seen, camera), camera)
-        if number != index and shared.float().mean().item() >= MIN_SHARED_FRACTION:
+    visible = find_visible_points(cameras[index], points)
+    own, *others = compute_directions([cameras[i] for i in (index, *chosen)], visible)
+    for other, directions in zip(chosen, others, strict=True):
+        camera = cameras[other]
+        angles = compute_angles(own, directions)
+        shared = (angles > 0) & (angles < MAX_ANGLE)
+        shared &= is_inside(*project(visible, camera), camera)
+        if other != index and shared.float().mean().item() >= MIN_SHARED_FRACTION:
             return True
     return False
 
 
 def find_partner(index: int, cameras: Sequence[Camera], points: Float[Tensor, "n 3"]) -> int:
     """Find the camera that makes the best stereo pair with another."""
-    seen = find_visible_points(cameras[index], points)
-    worth = score_cameras(cameras[index], cameras, seen)
-    pairs = score_pairs(index, worth, compute_directions(cameras, seen)).sum(dim=-1)
-    pairs[index] = -1.0
+    visible = find_visible_points(cameras[index], points)
+    worth = score_cameras(cameras[index], cameras, visible)
+    pairs = score_pairs(index, worth, compute_directions(cameras, visible)).sum(dim=-1)
+    pairs[index] = -1.0  # a camera is no partner of itself
     return int(pairs.argmax())

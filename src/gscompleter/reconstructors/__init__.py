@@ -53,42 +53,42 @@ def run_reconstructor(
     With `pixel_mask`, only these pixels of the first view need Gaussians; Ψ may return more.
     """
     if pixel_mask is not None and isinstance(reconstructor, Lifter):
-        made = reconstructor.lift(views, pixel_mask)
+        reconstruction = reconstructor.lift(views, pixel_mask)
     else:
-        made = reconstructor(views)
-    check_reconstruction(made, views)
+        reconstruction = reconstructor(views)
+    check_reconstruction(reconstruction, views)
     return replace(
-        made,
-        gaussians=made.gaussians.detach(),
-        depths=tuple(depth.detach() for depth in made.depths),
+        reconstruction,
+        gaussians=reconstruction.gaussians.detach(),
+        depths=tuple(depth.detach() for depth in reconstruction.depths),
     )
 
 
-def check_reconstruction(made: object, views: Sequence[View]) -> None:
+def check_reconstruction(output: object, views: Sequence[View]) -> None:
     """Raise InputError if the output of Ψ does not fit its views, or holds impossible numbers.
 
     On a GPU this waits a few times.
     """
-    if not isinstance(made, Reconstruction):
+    if not isinstance(output, Reconstruction):
         raise InputError(
-            f"The reconstructor has to return a Reconstruction, and returned {describe(made)}."
+            f"The reconstructor has to return a Reconstruction, and returned {describe(output)}."
         )
     device = views[0].image.device
-    for name, tensor in iterate_tensors(made, "the reconstruction"):
+    for name, tensor in iterate_tensors(output, "the reconstruction"):
         if tensor.device != device:
             raise InputError(
                 f"the reconstructor returned {name} on {tensor.device}, and its views are on "
                 f"{device}; it must return all tensors on the device of the views' images"
             )
-    check_gaussians(made.gaussians, "The reconstruction")
-    if bool((made.gaussians.generated != 0).any()):
+    check_gaussians(output.gaussians, "The reconstruction")
+    if bool((output.gaussians.generated != 0).any()):
         raise InputError(
             "The reconstruction labels Gaussians as generated, and all of them are observed; "
             "return zeros in `generated`."
         )
-    _check_depths(made, views)
-    _check_pixels(made, views)
-    _check_gains(made, views)
+    _check_depths(output, views)
+    _check_pixels(output, views)
+    _check_gains(output, views)
 
 
 def get_trained_range(reconstructor: Reconstructor) -> tuple[float, float] | None:
@@ -104,7 +104,7 @@ def get_trained_range(reconstructor: Reconstructor) -> tuple[float, float] | Non
         "z-depth are needed, positive and in this order, or None."
     )
     try:
-        near, far = (float(bound) for bound in trained)
+        near, far = [float(bound) for bound in trained]
     except (TypeError, ValueError):
         raise refusal from None
     if not 0 < near < far:
@@ -112,13 +112,13 @@ def get_trained_range(reconstructor: Reconstructor) -> tuple[float, float] | Non
     return near, far
 
 
-def _check_depths(made: Reconstruction, views: Sequence[View]) -> None:
-    if len(made.depths) != len(views):
+def _check_depths(output: Reconstruction, views: Sequence[View]) -> None:
+    if len(output.depths) != len(views):
         raise InputError(
-            f"The reconstructor got {len(views)} views and returned {len(made.depths)} depth maps; "
-            "return one for each."
+            f"The reconstructor got {len(views)} views and returned {len(output.depths)} depth "
+            "maps; return one for each."
         )
-    for number, (depth, view) in enumerate(zip(made.depths, views, strict=True)):
+    for number, (depth, view) in enumerate(zip(output.depths, views, strict=True)):
         if depth.depth.shape != view.image.shape[:2]:
             raise InputError(
                 f"Depth map {number} of the reconstruction has the shape "
@@ -138,22 +138,23 @@ def _check_depths(made: Reconstruction, views: Sequence[View]) -> None:
             )
 
 
-def _check_pixels(made: Reconstruction, views: Sequence[View]) -> None:
-    if made.view_index is None or made.pixel_index is None:
+def _check_pixels(output: Reconstruction, views: Sequence[View]) -> None:
+    if output.view_index is None or output.pixel_index is None:
         return
-    counts = {len(made.gaussians), len(made.view_index), len(made.pixel_index)}
+    counts = {len(output.gaussians), len(output.view_index), len(output.pixel_index)}
     if len(counts) > 1:
         raise InputError(
-            f"The reconstruction has {len(made.gaussians)} Gaussians, {len(made.view_index)} view "
-            f"indices and {len(made.pixel_index)} pixel indices; return as many of each."
+            f"The reconstruction has {len(output.gaussians)} Gaussians, {len(output.view_index)} "
+            f"view indices and {len(output.pixel_index)} pixel indices; return as many of each."
         )
-    if len(made.gaussians) == 0:
+    if len(output.gaussians) == 0:
         return
     sizes = [view.camera.width * view.camera.height for view in views]
-    view_index = made.view_index.long()
+    view_index = output.view_index.long()
     is_view = (view_index >= 0) & (view_index < len(views))
+    # An impossible view index must not be looked up; it has view 0 here and is refused below.
     limits = torch.tensor(sizes, device=view_index.device)[view_index.where(is_view, 0)]
-    is_pixel = (made.pixel_index >= 0) & (made.pixel_index < limits)
+    is_pixel = (output.pixel_index >= 0) & (output.pixel_index < limits)
     if not bool((is_view & is_pixel).all()):
         raise InputError(
             f"The reconstruction names views or pixels that there are not: it got {len(views)} "
@@ -161,8 +162,8 @@ def _check_pixels(made: Reconstruction, views: Sequence[View]) -> None:
         )
 
 
-def _check_gains(made: Reconstruction, views: Sequence[View]) -> None:
-    gains = made.exposure_gains
+def _check_gains(output: Reconstruction, views: Sequence[View]) -> None:
+    gains = output.exposure_gains
     if gains is None:
         return
     is_positive = bool(((gains > 0) & gains.isfinite()).all())
@@ -220,12 +221,14 @@ def load_reconstructor(
     """
     check_reconstructor(name)
     load = RECONSTRUCTORS.get(name) or list_reconstructors()[name]
-    made = load(None if weights is None else Path(weights), device)
+    reconstructor = load(None if weights is None else Path(weights), device)
     if depth == "none":
-        return made
-    if "predict_depth" not in getattr(made, "__dataclass_fields__", ()):
+        return reconstructor
+    if "predict_depth" not in getattr(reconstructor, "__dataclass_fields__", ()):
         raise InputError(
             f"The reconstructor '{name}' uses no monocular depth; leave it out.", "depth"
         )
-    given = None if depth_weights is None else Path(depth_weights)
-    return replace(made, predict_depth=load_depth_predictor(depth, given, device))  # type: ignore[type-var]
+    predictor = load_depth_predictor(
+        depth, None if depth_weights is None else Path(depth_weights), device
+    )
+    return replace(reconstructor, predict_depth=predictor)  # type: ignore[type-var]

@@ -43,9 +43,13 @@ class FromDepth(Splatter):
         views = set_depth_range(views, *get_depth_range(views))
         images, unit = make_stereo_images(views)
         depths = self.predict(views)
-        layers = [make_layer(*pair, unit) for pair in zip(images, depths, strict=True)]
-        pairs = permutations(range(len(images)), 2)
-        transforms = {(i, j): compute_source_from_reference(images[i], images[j]) for i, j in pairs}
+        layers = [
+            make_layer(image, depth, unit) for image, depth in zip(images, depths, strict=True)
+        ]
+        transforms = {
+            (i, j): compute_source_from_reference(images[i], images[j])
+            for i, j in permutations(range(len(images)), 2)
+        }
         return self.build_scene(views, depths, layers, transforms)
 
     def lift(self, views: Sequence[View], pixel_mask: Bool[Tensor, "h w"]) -> Reconstruction:
@@ -55,7 +59,7 @@ class FromDepth(Splatter):
 
     def predict(self, views: Sequence[View]) -> list[DepthMap]:
         """Predict depths; raise InputError if the model returns none that fit the views."""
-        depths = self.model(views)
+        depths = self.predict(views)
         check_depths(depths, views)
         return list(depths)
 

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Hashable, Sequence
-from itertools import takewhile
 
 from gscompleter.render.lod import MAX_PREVIEW_GAUSSIANS, thin_gaussians
 from gscompleter.render.protocols import FrozenScene, Renderer
@@ -40,9 +39,11 @@ class SceneRenderer:
         known = [self._views.get(key, ((), None)) for key in keys]
 
         def update(camera: Camera, before: tuple[Parts, FrozenScene | None]) -> FrozenScene:
-            return self._update(parts, camera, *before)
+            known_parts, frozen = before
+            return self._update(parts, camera, known_parts, frozen)
 
         frozen = tuple(get_view_map(parts[0].means)(update, cameras, known))
+        # Threads only read the cache; it is written when all of them are done.
         self._views.update((key, (parts, view)) for key, view in zip(keys, frozen, strict=True))
         return frozen
 
@@ -54,23 +55,31 @@ class SceneRenderer:
     def _update(
         self, parts: Parts, camera: Camera, known: Parts, frozen: FrozenScene | None
     ) -> FrozenScene:
-        """Extend a frozen scene if the new one begins with its parts, else freeze anew."""
-        pairs = zip(known, parts, strict=False)
-        shared = len(list(takewhile(lambda pair: pair[0] is pair[1], pairs)))
+        """Extend a frozen scene if the new one begins with its parts, else freeze anew.
+
+        Parts are immutable, so that an identical object is an equal part.
+        """
+        shared = 0
+        while shared < min(len(known), len(parts)) and known[shared] is parts[shared]:
+            shared += 1
         if frozen is None or shared < len(known):
-            frozen, shared = self.renderer.freeze(parts[0], camera), 1
+            frozen = self.renderer.freeze(parts[0], camera)
+            shared = 1
         for part in parts[shared:]:
             frozen = frozen.extend(part)
         return frozen
 
     def _thin(self, part: Gaussians) -> tuple[Gaussians, Gaussians]:
         """Simplify a part, or find it among those simplified before."""
-        known = [pair for pair in self._thinned if pair[0] is part]
-        return known[0] if known else (part, thin_gaussians(part, MAX_PREVIEW_GAUSSIANS))
+        for pair in self._thinned:
+            if pair[0] is part:
+                return pair
+        return part, thin_gaussians(part, MAX_PREVIEW_GAUSSIANS)
 
 
 def make_camera_key(camera: Camera) -> Hashable:
     """Make a key that is equal for cameras with equal images."""
+    # Not the far plane, which no renderer uses.
     camera = camera.on_cpu
     numbers = (*camera.c2w.flatten().tolist(), *camera.K.flatten().tolist())
     return (*numbers, camera.width, camera.height, camera.near_plane)

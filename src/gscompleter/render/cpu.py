@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from functools import cached_property, reduce
+from functools import cached_property
 from typing import Any
 
 import numba
@@ -81,42 +81,64 @@ class CpuFrozenScene:
 
     def extend(self, new: Gaussians) -> CpuFrozenScene:
         """Freeze context and `new` together, in that order, some at a time to save memory."""
-        blocks = (new[start : start + BLOCK] for start in range(0, len(new), BLOCK))
-        return reduce(CpuFrozenScene._extend, blocks, self)
+        frozen = self
+        for start in range(0, len(new), BLOCK):
+            frozen = frozen._extend(new[start : start + BLOCK])
+        return frozen
 
     def _extend(self, new: Gaussians) -> CpuFrozenScene:
+        """Freeze context and `new` together: composite once, and keep what the image showed."""
         splats = self.viewpoint.project(to_arrays(new), new.is_antialiased)
         added, order = order_by_use(self.viewpoint.fill_lists(splats, self.depth_limits))
         count = self.count + len(new)
         if len(added.entries) == 0:
             return replace(self, count=count)
         frame = self.viewpoint.composite(self.layer, self.frame, added)
+
+        # In each tile, the entries of context and new splats that were composited until it was full
+        # are merged by depth to one list. Whatever lies behind is dropped, since nothing that is
+        # added later can uncover it.
         used = np.zeros_like(frame.used)
         used[:, 0] = frame.used.sum(axis=1)
         tile_start = np.concatenate([[0], np.cumsum(used[:, 0], dtype=np.int64)])
         entries = np.empty(tile_start[-1], np.int32)
         depth_limits = np.empty(self.viewpoint.tiles, np.float32)
-        walked = (self.layer, added, frame.used, frame.full)
-        merged = (tile_start, entries, depth_limits)
-        self.viewpoint.share(composite.merge_lists, len(used), *walked, *merged)
-        layer, kept = join_layers(self.layer, added, tile_start, entries)
-        rows = np.concatenate([self.rows[kept[0]], order[kept[1]] + np.int32(self.count)])
+        self.viewpoint.share(
+            composite.merge_lists,
+            len(used),
+            self.layer,
+            added,
+            frame.used,
+            frame.full,
+            tile_start,
+            entries,
+            depth_limits,
+        )
+
+        layer, (context_rows, new_rows) = join_layers(self.layer, added, tile_start, entries)
+        rows = np.concatenate([self.rows[context_rows], order[new_rows] + np.int32(self.count)])
         frame = frame._replace(used=used)
         return CpuFrozenScene(self.viewpoint, layer, frame, depth_limits, rows, count)
 
     def backproject(self, image: Float[Tensor, "h w 3"]) -> Float[Tensor, "n 3"]:
         """Backproject `image` by the backward pass on the frozen frame."""
-        nothing, itself = freeze_nothing(self.viewpoint).layer, bin_layer(self.layer)
+        # Kernels give gradients to new splats only, so that the context is passed as the new layer
+        # before an empty context; `used` counts entries of the context first, then of the new.
+        nothing = freeze_nothing(self.viewpoint).layer
+        itself = bin_layer(self.layer)
         frame = self.frame._replace(used=np.ascontiguousarray(self.frame.used[:, ::-1]))
-        d_frame = (image, torch.zeros_like(image[..., 0]), torch.zeros_like(image[..., 0]))
-        composited = (nothing, itself, frame, d_frame, composite.WANT_COLOR)
-        gradients = self.viewpoint.composite_backward(*composited)
+        zeros = torch.zeros_like(image[..., 0])
+        gradients = self.viewpoint.composite_backward(
+            nothing, itself, frame, (image, zeros, zeros), composite.WANT_COLOR
+        )
+
         totals = np.zeros((self.count, 3), np.float32)
         totals[self.rows] = self.viewpoint.sum_by_gaussian(itself, gradients)
         return torch.from_numpy(totals)
 
     def splat(self, values: Float[Tensor, "n"]) -> Float[Tensor, "h w"]:
         """Composite the frozen lists once more, with the values as red."""
+        # Colours below 0 are cut off before kernels get them.
         splats = self.layer.splats.copy()
         splats[:, project.RED] = np.maximum(to_float32(values)[self.rows], 0)
         nothing = freeze_nothing(self.viewpoint)
@@ -125,7 +147,9 @@ class CpuFrozenScene:
 
     def composite(self, new: Gaussians) -> Render:
         """Render context and `new`; only `new` is projected, sorted and binned."""
-        tensors = (getattr(new, name).to("cpu", torch.float32) for name in GaussianArrays._fields)
+        # The conversion is outside the autograd function, so that gradients return to the dtype and
+        # device of `new`.
+        tensors = [getattr(new, name).to("cpu", torch.float32) for name in GaussianArrays._fields]
         return Render(*_Composite.apply(self, new.is_antialiased, *tensors))
 
     def composite_layer(self, new: Layer) -> tuple[RasterFrame, Render]:
@@ -150,6 +174,7 @@ class CpuFrozenScene:
         binned = self.viewpoint.enter(splats, self.depth_limits)
 
         def errors(colors: Float[Tensor, "n 3"], photograph: Float[Tensor, "h w 3"]) -> ColorSums:
+            # Written in place instead of into a copy; calls must not overlap.
             binned.layer.splats[:, project.RED :] = np.maximum(to_float32(colors), 0)
             sums = self.viewpoint.backproject_residual(self.layer, binned, to_float32(photograph))
             return torch.from_numpy(sums[:, :3]), torch.from_numpy(sums[:, 3])
@@ -173,10 +198,11 @@ class _Composite(torch.autograd.Function):
     def forward(
         ctx: Any, view: CpuFrozenScene, is_antialiased: bool, *tensors: Tensor
     ) -> tuple[Tensor, ...]:
-        gaussians = GaussianArrays(*map(to_float32, tensors))
+        gaussians = GaussianArrays(*[to_float32(tensor) for tensor in tensors])
         splats = view.viewpoint.project(gaussians, is_antialiased)
         binned = view.viewpoint.enter(splats, view.depth_limits)
         frame, render = view.composite_layer(binned.layer)
+        # `save_for_backward` takes tensors alone; arrays are attributes.
         ctx.scene = (view, splats.factors, binned, frame)
         # Torch raises an error if a saved tensor is written to before the backward pass.
         ctx.save_for_backward(*tensors, render.depth, render.alpha)
@@ -186,13 +212,23 @@ class _Composite(torch.autograd.Function):
     @once_differentiable
     def backward(ctx: Any, *d_frame: Tensor) -> tuple[Tensor | None, ...]:
         view, factors, binned, frame = ctx.scene
-        gaussians = GaussianArrays(*map(to_float32, ctx.saved_tensors[:5]))
-        gradients = view.viewpoint.composite_backward(view.layer, binned, frame, d_frame)
-        result = GaussianArrays(*map(np.zeros_like, gaussians))
-        seen = (gaussians, view.viewpoint.pinhole, factors, binned.layer.splats)
-        received = (binned.slot_start, *gradients, result)
-        view.viewpoint.share(project.project_backward, len(result.means), *seen, *received)
-        return None, None, *map(torch.from_numpy, result)
+        gaussians = GaussianArrays(*[to_float32(tensor) for tensor in ctx.saved_tensors[:5]])
+        values, written = view.viewpoint.composite_backward(view.layer, binned, frame, d_frame)
+        result = GaussianArrays(*[np.zeros_like(array) for array in gaussians])
+        view.viewpoint.share(
+            project.project_backward,
+            len(result.means),
+            gaussians,
+            view.viewpoint.pinhole,
+            factors,
+            binned.layer.splats,
+            binned.slot_start,
+            values,
+            written,
+            result,
+        )
+        # No gradients for the scene and the mode.
+        return None, None, *[torch.from_numpy(array) for array in result]
 
 
 class _VaryOpacities(torch.autograd.Function):
@@ -202,8 +238,8 @@ class _VaryOpacities(torch.autograd.Function):
     def forward(
         ctx: Any, view: CpuFrozenScene, binned: BinnedSplats, opacities: Tensor
     ) -> tuple[Tensor, ...]:
-        seen = to_float32(opacities) * binned.layer.opacities  # those of opaque Gaussians
-        layer = binned.layer._replace(opacities=seen)
+        # The layer was projected at opacity 1: its opacities are the factors of antialiasing.
+        layer = binned.layer._replace(opacities=to_float32(opacities) * binned.layer.opacities)
         frame, render = view.composite_layer(layer)
         ctx.scene = (view, replace(binned, layer=layer), frame)
         ctx.save_for_backward(opacities, render.depth, render.alpha)
@@ -216,6 +252,8 @@ class _VaryOpacities(torch.autograd.Function):
         opacities = to_float32(ctx.saved_tensors[0])
         gradients = view.viewpoint.composite_backward(view.layer, binned, frame, d_frame)
         sums = view.viewpoint.sum_by_gaussian(binned, gradients)[:, project.SUM]
+        # Sums are of alpha · dL/dalpha, and alpha is proportional to the opacity. An opacity of 0
+        # has no sum, and keeps the gradient 0.
         result = np.divide(sums, opacities, out=np.zeros_like(opacities), where=sums != 0)
         return None, None, torch.from_numpy(result)
 
@@ -232,6 +270,7 @@ class _VaryDepths(torch.autograd.Function):
         frame, render = view.composite_layer(binned.layer)
         ctx.scene = (view, binned, frame)
         ctx.save_for_backward(render.depth, render.alpha)
+        # Footprints are constant, so that only the depth varies smoothly; order may change.
         ctx.mark_non_differentiable(render.image, render.alpha)
         return render.image, render.depth, render.alpha
 
@@ -246,7 +285,8 @@ class _VaryDepths(torch.autograd.Function):
 
 def freeze_nothing(viewpoint: Viewpoint) -> CpuFrozenScene:
     """Freeze a context without Gaussians."""
-    height, width = viewpoint.pinhole.height, viewpoint.pinhole.width
+    height = viewpoint.pinhole.height
+    width = viewpoint.pinhole.width
     frame = RasterFrame(
         image=np.zeros((height, width, 3), np.float32),
         depth=np.zeros((height, width), np.float32),
@@ -274,6 +314,7 @@ def make_pinhole(camera: Camera) -> Pinhole:
             f"An image of {camera.width} x {camera.height} pixels cannot be rendered; its sides "
             f"must have 1 to {MAX_SIDE:,} pixels."
         )
+    # In float64 until the end, so that the inverse is as exact as float32 holds it.
     K = camera.K.detach().to("cpu", torch.float64)
     c2w = camera.c2w.detach().to("cpu", torch.float64)
     return Pinhole(
@@ -297,24 +338,34 @@ def join_layers(
     Entries number the splats of `new` after those of the context. Also returns the rows used of
     each layer.
     """
-    counts = len(context.splats), len(new.splats)
-    named = np.zeros(sum(counts), np.bool_)
+    named = np.zeros(len(context.splats) + len(new.splats), np.bool_)
     named[entries] = True
+    # New number of each splat that is named: how many named ones precede it.
     numbers = np.cumsum(named, dtype=np.int32) - np.int32(1)
-    rows = [np.flatnonzero(part).astype(np.int32) for part in np.split(named, counts[:1])]
-    splats, opacities, boxes = (
-        np.concatenate([old[rows[0]], added[rows[1]]])
-        for old, added in zip(context[:3], new[:3], strict=True)
+
+    context_rows = np.flatnonzero(named[: len(context.splats)]).astype(np.int32)
+    new_rows = np.flatnonzero(named[len(context.splats) :]).astype(np.int32)
+    layer = Layer(
+        splats=np.concatenate([context.splats[context_rows], new.splats[new_rows]]),
+        opacities=np.concatenate([context.opacities[context_rows], new.opacities[new_rows]]),
+        boxes=np.concatenate([context.boxes[context_rows], new.boxes[new_rows]]),
+        tile_start=tile_start,
+        entries=numbers[entries],
     )
-    return Layer(splats, opacities, boxes, tile_start, numbers[entries]), rows
+    return layer, [context_rows, new_rows]
 
 
 def to_arrays(gaussians: Gaussians) -> GaussianArrays:
     """Convert Gaussians for the kernels, without gradients."""
-    tensors = (getattr(gaussians, name) for name in GaussianArrays._fields)
-    return GaussianArrays(*map(to_float32, tensors))
+    return GaussianArrays(
+        *[to_float32(getattr(gaussians, name)) for name in GaussianArrays._fields]
+    )
 
 
 def to_render(frame: RasterFrame) -> Render:
     """Convert a frame to tensors that share its memory."""
-    return Render(*map(torch.from_numpy, (frame.image, frame.depth, frame.alpha)))
+    return Render(
+        torch.from_numpy(frame.image),
+        torch.from_numpy(frame.depth),
+        torch.from_numpy(frame.alpha),
+    )

@@ -37,10 +37,14 @@ def fit_colors(
         colors = evaluate_colors(new.sh, new.means, view.camera.center)
         return scene.vary_colors(new)(colors + change, view.image)
 
+    # Each Gaussian moves by the mean residual of the pixels that show it, by their weight, over all
+    # images; the next round sees what its neighbours did.
     for relaxation in relaxations:
-        sums, weights = change.new_zeros(change.shape), change.new_zeros(len(change))
+        sums = change.new_zeros(change.shape)
+        weights = change.new_zeros(len(change))
         for pull, weight in get_view_map(change)(measure, frozen, images):
-            sums, weights = sums + pull, weights + weight
+            sums = sums + pull
+            weights = weights + weight
         change = change + relaxation * sums / weights.clamp_min(MIN_WEIGHT)[:, None]
     sh = torch.cat([new.sh[:, :1] + change[:, None] / SH_C0, new.sh[:, 1:]], dim=1)
     return replace(new, sh=sh, encoded=None)

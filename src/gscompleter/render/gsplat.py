@@ -75,6 +75,7 @@ class CudaRenderer:
         """Project Gaussians, sort them by depth and bin them into the tiles of an image."""
         if len(gaussians) == 0:
             return BinnedGaussians.empty(camera, gaussians.means.device)
+        # Rasterizing also returns what gsplat projected and sorted; the image is not used.
         _, _, projected = self.rasterize(gaussians, camera)
         before = gaussians.opacities.float()
         after = projected["opacities"].reshape(-1)
@@ -97,6 +98,7 @@ class CudaRenderer:
         Fainter Gaussians render the same in the larger box, where alpha 1/255 drops the rest.
         """
         binned = self.bin_gaussians(gaussians, camera)
+        # The depth is composited as a fourth colour, and divided by alpha as in "RGB+ED".
         with torch.no_grad():
             colors = compute_colors(gaussians, camera)
             values = torch.cat([colors, binned.depths[0, :, None]], dim=-1)
@@ -255,6 +257,7 @@ class CudaFrozenScene(RedrawnScene):
     @cached_property
     def visible_scene(self) -> Gaussians:
         """The visible Gaussians, with their colours as this camera sees them."""
+        # Colours of one camera are fixed, so that harmonics need not be evaluated in each render.
         kept = self.scene[self.visible_rows]
         center = self.camera.center.to(kept.means.device)
         colors = evaluate_colors(kept.sh, kept.means, center)
@@ -267,6 +270,7 @@ class CudaFrozenScene(RedrawnScene):
 
     def extend(self, new: Gaussians) -> CudaFrozenScene:
         """Add `new` to the visible Gaussians."""
+        # Rows count all Gaussians that were ever added, visible or not, as their owner does.
         numbers = self.count + torch.arange(len(new), device=self.rows.device)
         rows = torch.cat([self.rows[self.visible_rows], numbers])
         count = self.count + len(new)
@@ -308,6 +312,8 @@ class CudaFrozenScene(RedrawnScene):
                 leaf = torch.nn.functional.pad(colors.clamp_min(0), (0, 1)).requires_grad_()
                 drawn = torch.nn.functional.pad(context, (0, 1))
                 sums, _ = binned.composite(torch.cat([drawn, leaf]))
+            # The gradient of Σ image · drawn in a colour is Σ_p w_ip image_p; ones in the fourth
+            # channel give Σ_p w_ip.
             missing = photograph - sums[..., :3].detach()
             image = torch.nn.functional.pad(missing, (0, 1), value=1.0)
             (gradient,) = torch.autograd.grad(sums, leaf, image)

@@ -45,18 +45,30 @@ def simplify_scene(scene: Gaussians, cameras: Sequence[Camera]) -> ContextScene:
 
     Runs are as few as frozen views of `cameras` can hold. A scene in random order has no runs.
     """
-    given = to_arrays(scene)
-    given = given._replace(sh=given.sh.reshape(len(scene), -1))
-    start = find_run_starts(given.means, given.scales, scene.generated.numpy(), cameras)
-    found = [np.empty((len(start) - 1, *array.shape[1:]), np.float32) for array in given]
+    # Kernels take harmonics as one row per Gaussian.
+    arrays = to_arrays(scene)
+    arrays = arrays._replace(sh=arrays.sh.reshape(len(scene), -1))
+    start = find_run_starts(arrays.means, arrays.scales, scene.generated.numpy(), cameras)
+    num_runs = len(start) - 1
+    merged_arrays = GaussianArrays(
+        *[np.empty((num_runs, *array.shape[1:]), np.float32) for array in arrays]
+    )
     shares = np.empty(len(scene), np.float32)
-    share(kernels.merge_runs, len(start) - 1, start, given, shares, GaussianArrays(*found))
-    means, quats, scales, opacities, sh = map(torch.from_numpy, found)
-    first, sizes = torch.from_numpy(start[:-1]), torch.from_numpy(np.diff(start))
-    run = torch.arange(len(sizes)).repeat_interleave(sizes)
-    appearance = opacities, sh.unflatten(1, scene.sh.shape[1:]), scene.generated[first]
-    merged = Gaussians(means, quats, scales, *appearance, is_antialiased=scene.is_antialiased)
-    return ContextScene.build(scene, merged, run)
+    share(kernels.merge_runs, num_runs, start, arrays, shares, merged_arrays)
+
+    first = torch.from_numpy(start[:-1])
+    sizes = torch.from_numpy(np.diff(start))
+    merged = Gaussians(
+        means=torch.from_numpy(merged_arrays.means),
+        quats=torch.from_numpy(merged_arrays.quats),
+        scales=torch.from_numpy(merged_arrays.scales),
+        opacities=torch.from_numpy(merged_arrays.opacities),
+        sh=torch.from_numpy(merged_arrays.sh).unflatten(1, scene.sh.shape[1:]),
+        generated=scene.generated[first],
+        is_antialiased=scene.is_antialiased,
+    )
+    run_of_gaussian = torch.arange(num_runs).repeat_interleave(sizes)
+    return ContextScene.build(scene, merged, run_of_gaussian)
 
 
 def find_run_starts(
@@ -69,18 +81,32 @@ def find_run_starts(
     centers = to_float32(torch.stack([camera.center for camera in cameras]))
     focals = to_float32(torch.stack([camera.K[0, 0] for camera in cameras]))
     begins = np.empty(len(means), np.bool_)
-    most, growth = count_fitting_gaussians(len(cameras)), 1.0
+    max_runs = count_fitting_gaussians(len(cameras))
+    num_blocks = -(-len(means) // kernels.BLOCK)
+    # A coarser proxy is better than one that does not fit in memory.
+    growth = 1.0
     while True:
-        limits = np.float32(growth * MAX_REACH), np.float32(growth * MAX_DEVIATION)
-        seen = (means, scales, generated, centers, focals, *limits, begins)
-        share(kernels.mark_run_starts, -(-len(means) // kernels.BLOCK), *seen)
-        if np.count_nonzero(begins) <= most or growth >= MAX_GROWTH:
+        share(
+            kernels.mark_run_starts,
+            num_blocks,
+            means,
+            scales,
+            generated,
+            centers,
+            focals,
+            np.float32(growth * MAX_REACH),
+            np.float32(growth * MAX_DEVIATION),
+            begins,
+        )
+        if np.count_nonzero(begins) <= max_runs or growth >= MAX_GROWTH:
             return np.append(np.flatnonzero(begins), len(means))
         growth *= 2
 
 
-MAX_GAUSSIANS, MAX_PREVIEW_GAUSSIANS = 400_000, 25_000
-"""Largest number kept by default, and for previews: several per pixel of a small image."""
+MAX_GAUSSIANS = 400_000
+"""Largest number of Gaussians that are kept by default."""
+MAX_PREVIEW_GAUSSIANS = 25_000
+"""Largest number that is kept for previews: several per pixel of a small image."""
 SAMPLE_SIZE = 100_000
 """Gaussians from which the distribution of sizes is estimated."""
 
@@ -104,10 +130,12 @@ def choose_thinned_rows(
     """Select the rows to keep, and the factor by which their sizes grow."""
     if len(scene) <= max_gaussians:
         return torch.arange(len(scene), device=scene.means.device), torch.ones_like(scene.opacities)
-    chance = compute_keep_probabilities(scene, max_gaussians)
-    place = chance.double().cumsum(0).floor()
-    rows = torch.nonzero(place > torch.nn.functional.pad(place[:-1], (1, 0)))[:, 0]
-    return rows, chance[rows].rsqrt()
+    # Systematic sampling: a Gaussian is kept if the sum of probabilities passes a whole number
+    # there. It stands for 1 / probability Gaussians, and its area grows by that factor.
+    probability = compute_keep_probabilities(scene, max_gaussians)
+    passed = probability.double().cumsum(0).floor()
+    rows = torch.nonzero(passed > torch.nn.functional.pad(passed[:-1], (1, 0)))[:, 0]
+    return rows, probability[rows].rsqrt()
 
 
 def compute_keep_probabilities(scene: Gaussians, max_gaussians: int) -> Float[Tensor, "n"]:
@@ -115,6 +143,7 @@ def compute_keep_probabilities(scene: Gaussians, max_gaussians: int) -> Float[Te
 
     The largest 1 % is clamped: floaters and sky are large, few, and useless for matching.
     """
+    # The product of the two longer standard deviations: the area of the largest face.
     cross_section = scene.scales.prod(dim=1) / scene.scales.amin(dim=1).clamp_min(1e-30)
     size = (cross_section * scene.opacities).sqrt()
     sample = size[:: max(1, len(size) // SAMPLE_SIZE)]

@@ -73,6 +73,7 @@ class RedrawnScene:
             return self.composite(set_colors(new, colors)).image
 
         def errors(colors: Float[Tensor, "n 3"], photograph: Float[Tensor, "h w 3"]) -> ColorSums:
+            # Weights are those of an image of ones; all three channels have the same.
             missing = photograph - render(colors).detach()
             weights = backproject(render, new, torch.ones_like(missing))[:, 0]
             return backproject(render, new, missing), weights
@@ -96,6 +97,7 @@ def backproject(
 
     A compositing weight is the gradient of a pixel in the colour of the Gaussian.
     """
+    # Any colour serves, as the image is linear in colours; 0.5 is not cut off at 0.
     with torch.enable_grad():
         colors = torch.full_like(gaussians.means, 0.5).requires_grad_()
         (gradient,) = torch.autograd.grad((image * render(colors)).sum(), colors)

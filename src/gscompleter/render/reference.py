@@ -46,7 +46,8 @@ class ReferenceRenderer:
             for chunk in pixels.split(per_chunk)
         ]
         size = (camera.height, camera.width)
-        color, weighted_depth, alpha = (torch.cat(parts) for parts in zip(*chunks, strict=True))
+        color, weighted_depth, alpha = [torch.cat(parts) for parts in zip(*chunks, strict=True)]
+        # The inner `where` keeps a division by 0, whose gradient would be NaN, out of the graph.
         seen = alpha > 0
         depth = torch.where(seen, weighted_depth / torch.where(seen, alpha, 1), 0)
         return Render(color.view(*size, 3), depth.view(size), alpha.view(size))
@@ -71,16 +72,22 @@ class Splats:
 
 def project(gaussians: Gaussians, camera: Camera) -> Splats:
     """Project the Gaussians beyond the near plane by the affine EWA approximation, sorted by z."""
-    dtype, device = gaussians.means.dtype, gaussians.means.device
-    c2w, K = camera.c2w.to(device, dtype), camera.K.to(device, dtype)
+    dtype = gaussians.means.dtype
+    device = gaussians.means.device
+    c2w = camera.c2w.to(device, dtype)
+    K = camera.K.to(device, dtype)
     camera_from_world = torch.linalg.inv(c2w[:3, :3])
     points = (gaussians.means - c2w[:3, 3]) @ camera_from_world.T
 
+    # Gradients pass through the points, and not through their order.
     z = points[:, 2].detach()
     order = torch.argsort(z, stable=True)
     order = order[z[order] > max(camera.near_plane, 0.0)]
-    gaussians, points = gaussians[order], points[order]
+    gaussians = gaussians[order]
+    points = points[order]
 
+    # EWA splatting (Zwicker et al. 2001): the covariance in the image, in px², is
+    # J W R S Sᵀ Rᵀ Wᵀ Jᵀ, and `flat` is its factor J W R S [n, 2, 3].
     axes = quats_to_rotations(gaussians.quats) * gaussians.scales[:, None, :]
     flat = compute_jacobians(points, K, camera.width, camera.height) @ camera_from_world @ axes
     covariances = flat @ flat.transpose(1, 2) + BLUR * torch.eye(2, dtype=dtype, device=device)
@@ -102,7 +109,9 @@ def compute_jacobians(
     """Compute the Jacobian of the projection at points in the camera, with clamped tangents."""
     fx, fy, cx, cy = K[0, 0], K[1, 1], K[0, 2], K[1, 2]
     x, y, z = points.unbind(-1)
-    margin_x, margin_y = TANGENT_MARGIN * width, TANGENT_MARGIN * height
+    # Far outside the image the linearization would make huge splats; its tangents end at a margin.
+    margin_x = TANGENT_MARGIN * width
+    margin_y = TANGENT_MARGIN * height
     tan_x = (x / z).clamp(-(cx + margin_x) / fx, (width - cx + margin_x) / fx)
     tan_y = (y / z).clamp(-(cy + margin_y) / fy, (height - cy + margin_y) / fy)
     zero = torch.zeros_like(z)
@@ -139,6 +148,7 @@ def composite(
     offsets = pixels - splats.centers[:, None]
     sigma = 0.5 * torch.einsum("mpi,mij,mpj->mp", offsets, splats.precisions, offsets)
     alpha = (splats.opacities[:, None] * torch.exp(-sigma)).clamp(max=MAX_ALPHA)
+    # As in the rasterizer of 3DGS, faint splats are not drawn.
     alpha = torch.where((alpha >= MIN_ALPHA) & (sigma >= 0), alpha, 0)
 
     # Transmittance falls monotonically, so that what comes after the stop is masked as well.

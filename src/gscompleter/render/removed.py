@@ -26,7 +26,10 @@ def mask_removed(source: ContextScene, camera: Camera, renderer: Renderer) -> Bo
 
 def find_removed(source: ContextScene, camera: Camera, renderer: Renderer) -> Bool[Tensor, "h w"]:
     """Mark the pixels that showed something removed."""
-    given, removed = source.gaussians, source.removed
-    others = replace(given, opacities=given.opacities.masked_fill(source.chosen_mask, 0.0))
-    values = torch.cat([torch.zeros_like(given.opacities), torch.ones_like(removed.opacities)])
+    scene = source.gaussians
+    removed = source.removed
+    # What is chosen for removal is among `removed`, too, and must not be drawn twice.
+    others = replace(scene, opacities=scene.opacities.masked_fill(source.chosen_mask, 0.0))
+    # With a value of 1 for the removed Gaussians and 0 for the others, the image is their weight.
+    values = torch.cat([torch.zeros_like(scene.opacities), torch.ones_like(removed.opacities)])
     return renderer.freeze(others, camera).extend(removed).splat(values) > MIN_WEIGHT

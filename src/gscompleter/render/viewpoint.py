@@ -37,6 +37,7 @@ class Splats:
         """Move the splats to other z-depths; those not beyond `near` get empty boxes."""
         columns = self.columns.copy()
         columns[:, project.DEPTH] = depths
+        # A box of zeros covers no tile.
         return replace(self, columns=columns, boxes=self.boxes * (depths > near)[:, None])
 
 
@@ -94,10 +95,14 @@ class Viewpoint:
 
     def fill_lists(self, splats: Splats, depth_limits: Float32[ndarray, "tiles"]) -> Layer:
         """Enter splats into the lists of the tiles, and sort these."""
+        # A counting sort by tile: each thread counts the entries of its chunk of splats per tile,
+        # the counts become offsets, and each thread fills its own places. Depth sorts each list.
         chunks = split_range(len(splats.columns), self.threads)
         counts = np.zeros((len(chunks), self.tiles), np.int32)
-        seen = (splats.columns, splats.boxes, depth_limits, self.tiles_x)
-        counting = [(*chunk, *seen, count) for chunk, count in zip(chunks, counts, strict=True)]
+        counting = [
+            (*chunk, splats.columns, splats.boxes, depth_limits, self.tiles_x, count)
+            for chunk, count in zip(chunks, counts, strict=True)
+        ]
         run(tiles.count_entries, counting, self.threads)
         total = int(counts.sum(dtype=np.int64))
         if total > MAX_ENTRIES:
@@ -106,8 +111,10 @@ class Viewpoint:
                 f"most {MAX_ENTRIES:,} can be rendered; use fewer or smaller Gaussians, or a "
                 "smaller image."
             )
+
         tile_start = tiles.counts_to_offsets(counts)
-        entries, keys = np.empty(total, np.int32), np.empty(total, np.uint32)
+        entries = np.empty(total, np.int32)
+        keys = np.empty(total, np.uint32)
         filling = [(*call, entries, keys) for call in counting]
         run(tiles.fill_entries, filling, self.threads)
         self.share(tiles.sort_lists, self.tiles, tile_start, entries, keys)
@@ -115,7 +122,8 @@ class Viewpoint:
 
     def composite(self, context: Layer, frame: RasterFrame, new: Layer) -> RasterFrame:
         """Composite a context, rendered to `frame`, with a new layer in its tiles."""
-        frame = RasterFrame(*(array.copy() for array in frame))
+        # Tiles that the new layer does not touch stay as they are.
+        frame = RasterFrame(*[array.copy() for array in frame])
         tiles = find_touched_tiles(new)
         self.share(composite.composite, len(tiles), tiles, context, new, frame)
         return frame
@@ -133,9 +141,19 @@ class Viewpoint:
         values = np.empty((len(new.slots), columns), np.float32)
         written = np.zeros(len(new.slots), np.bool_)
         tiles = find_touched_tiles(new.layer)
-        composited = (tiles, context, new.layer, frame, tuple(map(to_float32, d_frame)))
-        received = (new.slots, wanted, values, written)
-        self.share(composite.composite_backward, len(tiles), *composited, *received)
+        self.share(
+            composite.composite_backward,
+            len(tiles),
+            tiles,
+            context,
+            new.layer,
+            frame,
+            tuple([to_float32(gradient) for gradient in d_frame]),
+            new.slots,
+            wanted,
+            values,
+            written,
+        )
         return values, written
 
     def backproject_residual(
@@ -145,16 +163,30 @@ class Viewpoint:
         values = np.empty((len(new.slots), 4), np.float32)
         written = np.zeros(len(new.slots), np.bool_)
         tiles = find_touched_tiles(new.layer)
-        composited = (tiles, context, new.layer, photograph, new.slots, values, written)
-        self.share(composite.backproject_residual, len(tiles), *composited)
+        self.share(
+            composite.backproject_residual,
+            len(tiles),
+            tiles,
+            context,
+            new.layer,
+            photograph,
+            new.slots,
+            values,
+            written,
+        )
         return self.sum_by_gaussian(new, (values, written))
 
     def sum_by_gaussian(
         self, new: BinnedSplats, gradients: EntryGradients
     ) -> Float32[ndarray, "n columns"]:
-        """Sum the gradients of the entries of each Gaussian."""
-        totals = np.empty((len(new.slot_start) - 1, gradients[0].shape[1]), np.float32)
-        self.share(tiles.sum_entries, len(totals), new.slot_start, *gradients, totals)
+        """Sum the gradients of the entries of each Gaussian.
+
+        The order of its slots is that of the tiles, so that threads do not change the sum
+        (decision 036).
+        """
+        values, written = gradients
+        totals = np.empty((len(new.slot_start) - 1, values.shape[1]), np.float32)
+        self.share(tiles.sum_entries, len(totals), new.slot_start, values, written, totals)
         return totals
 
     def share(self, kernel: Callable[..., None], count: int, *arguments: Any) -> None:
@@ -164,7 +196,8 @@ class Viewpoint:
 
 def bin_layer(layer: Layer) -> BinnedSplats:
     """Give the entries of each splat adjacent slots."""
-    return BinnedSplats(layer, *tiles.number_slots(layer.entries, len(layer.splats)))
+    slots, slot_start = tiles.number_slots(layer.entries, len(layer.splats))
+    return BinnedSplats(layer, slots, slot_start)
 
 
 def find_touched_tiles(layer: Layer) -> Int64[ndarray, "touched"]:
@@ -175,8 +208,10 @@ def find_touched_tiles(layer: Layer) -> Int64[ndarray, "touched"]:
 def order_by_use(layer: Layer) -> tuple[Layer, Int32[ndarray, "splats"]]:
     """Reorder splats by first use and drop unused ones, for locality; also return their order."""
     order, entries = tiles.number_by_use(layer.entries, len(layer.splats))
-    used = layer.splats[order], layer.opacities[order], layer.boxes[order]
-    return Layer(*used, layer.tile_start, entries), order
+    used = Layer(
+        layer.splats[order], layer.opacities[order], layer.boxes[order], layer.tile_start, entries
+    )
+    return used, order
 
 
 def check_lengths(gaussians: GaussianArrays) -> int:

@@ -38,27 +38,35 @@ CHUNK_PROPERTIES = (
 )
 """Properties of a chunk. Early files lack the bounds of colours, which are then [0, 1]."""
 PACKED_PROPERTIES = ("packed_position", "packed_rotation", "packed_scale", "packed_color")
-VECTOR_BITS, QUAT_BITS, COLOR_BITS = (11, 10, 11), (10, 10, 10), (8, 8, 8, 8)
-"""Bits of positions and log-scales, of three components of a rotation, of colour and opacity."""
+VECTOR_BITS = (11, 10, 11)
+"""Bits of positions and log-scales."""
+QUAT_BITS = (10, 10, 10)
+"""Bits of three components of a rotation; the number of the fourth has the upper two."""
+COLOR_BITS = (8, 8, 8, 8)
+"""Bits of colour and opacity."""
 
 
 def read_compressed_ply(path: Path) -> Gaussians:
     """Read a compressed .ply of SH degree 0 to 3."""
     header, tables = _read_tables(path)
-    chunk, vertex = tables["chunk"], tables["vertex"]
-    position, rotation, scale, color = (
+    chunk = tables["chunk"]
+    vertex = tables["vertex"]
+    position, rotation, scale, color = [
         vertex[name].astype(np.uint32) for name in PACKED_PROPERTIES
-    )
-    means, log_scales = (
-        _map_to_chunk(chunk, bounds, unpack_fractions(packed, VECTOR_BITS))
-        for packed, bounds in ((position, CHUNK_PROPERTIES[:6]), (scale, CHUNK_PROPERTIES[6:12]))
-    )
+    ]
+    means = _map_to_chunk(chunk, CHUNK_PROPERTIES[:6], unpack_fractions(position, VECTOR_BITS))
+    log_scales = _map_to_chunk(chunk, CHUNK_PROPERTIES[6:12], unpack_fractions(scale, VECTOR_BITS))
+
     rgba = unpack_fractions(color, COLOR_BITS)
+    rgb = rgba[:, :3]
     has_color_bounds = set(CHUNK_PROPERTIES) <= set(chunk.dtype.names or ())
-    rgb = _map_to_chunk(chunk, CHUNK_PROPERTIES[12:], rgba[:, :3]) if has_color_bounds else rgba
+    if has_color_bounds:
+        rgb = _map_to_chunk(chunk, CHUNK_PROPERTIES[12:], rgb)
+
+    # The three smaller components of a unit quaternion are at most sqrt(1/2) in size.
     smaller = (unpack_fractions(rotation, QUAT_BITS) - 0.5) * np.float32(np.sqrt(2))
     quats = restore_largest(rotation >> np.uint32(30), smaller)
-    sh = assemble_sh(rgb[:, :3], _unpack_sh_rest(tables["sh"]) if "sh" in tables else None)
+    sh = assemble_sh(rgb, _unpack_sh_rest(tables["sh"]) if "sh" in tables else None)
     gaussians = build_gaussians(means, quats, np.exp(log_scales), rgba[:, 3], sh)
     return replace(gaussians, is_antialiased=has_mode_comment(header))
 
@@ -79,7 +87,8 @@ def _read_tables(path: Path) -> tuple[bytes, dict[str, ndarray]]:
         data = file.read()
     if b"\nformat binary" not in header:
         raise ValueError("it is no binary file")
-    tables, start = {}, 0
+    tables = {}
+    start = 0
     for element in elements:
         if element.dtype.itemsize > 0:
             rows = np.frombuffer(data, element.dtype, element.count, start)
@@ -90,9 +99,11 @@ def _read_tables(path: Path) -> tuple[bytes, dict[str, ndarray]]:
 
 def _unpack_sh_rest(table: ndarray) -> Float[ndarray, "n k 3"]:
     """Unpack SH of degree 1 and above; a byte stands for the middle of its interval."""
-    count, num_rest = len(table), len(table.dtype.names or ())
+    count = len(table)
+    num_rest = len(table.dtype.names or ())
     packed = np.stack([table[f"f_rest_{i}"] for i in range(num_rest)], axis=1)
     values = np.clip((packed.astype(np.float32) + 0.5) / 256, 0, 1)
+    # The first and the last byte stand for the ends, so that they are reached exactly.
     values = np.where(packed == 0, 0, np.where(packed == 255, 1, values)) * 8 - 4
     return values.reshape(count, 3, num_rest // 3).transpose(0, 2, 1)
 
@@ -101,11 +112,15 @@ def write_compressed_ply(path: Path, gaussians: Gaussians) -> None:
     """Write a compressed .ply; the Gaussians should be sorted with `sort_along_morton`."""
     log_scales = np.clip(encode(gaussians)[:, :3].numpy(), -MAX_LOG_SCALE, MAX_LOG_SCALE)
     rgb = 0.5 + SH_C0 * gaussians.sh[:, 0].numpy()
+    # Row of the first Gaussian of each chunk, and chunk of each Gaussian.
     starts = np.arange(0, len(gaussians), CHUNK_SIZE)
     of_chunk = np.arange(len(gaussians)) // CHUNK_SIZE
-    bounds, fractions = [], []
+    bounds = []
+    fractions = []
     for values in (gaussians.means.numpy(), log_scales, rgb):
-        low, high = np.minimum.reduceat(values, starts), np.maximum.reduceat(values, starts)
+        low = np.minimum.reduceat(values, starts)
+        high = np.maximum.reduceat(values, starts)
+        # A chunk without extent has the fraction 0 instead of 0 / 0.
         extent = np.where(high > low, high - low, 1)
         bounds += [low, high]
         fractions.append((values - low[of_chunk]) / extent[of_chunk])
@@ -120,6 +135,7 @@ def write_compressed_ply(path: Path, gaussians: Gaussians) -> None:
         pack_fractions(rgba, COLOR_BITS),
     ]
     rest = gaussians.sh[:, 1:].transpose(1, 2).reshape(len(gaussians), -1).numpy()
+    # The byte of the interval that a value in [-4, 4] lies in.
     rest_bytes = np.clip(np.floor((rest / 8 + 0.5) * 256), 0, 255).astype(np.uint8)
     with replace_file(path) as file:
         file.write(_make_header(gaussians, len(starts), rest.shape[1]))
@@ -129,7 +145,8 @@ def write_compressed_ply(path: Path, gaussians: Gaussians) -> None:
 
 
 def _make_header(gaussians: Gaussians, chunks: int, num_rest: int) -> bytes:
-    count, rest = len(gaussians), [(f"f_rest_{i}", "u1") for i in range(num_rest)]
+    count = len(gaussians)
+    rest = [(f"f_rest_{i}", "u1") for i in range(num_rest)]
     elements = {
         "chunk": (chunks, np.dtype([(name, "<f4") for name in CHUNK_PROPERTIES])),
         "vertex": (count, np.dtype([(name, "<u4") for name in PACKED_PROPERTIES])),

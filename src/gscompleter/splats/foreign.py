@@ -50,16 +50,16 @@ def find_newest_splat(folder: Path) -> Path | None:
 
     The first pattern with a file decides; of several files, the largest number in the name.
     """
+
+    def get_iteration(path: Path) -> int:
+        numbers = re.findall(r"\d+", str(path.relative_to(folder)))
+        return int(numbers[-1][:18]) if numbers else -1
+
     for pattern in _PATTERNS:
         paths = [path for path in folder.glob(pattern) if path.is_file()]
         if paths:
-            return max(paths, key=lambda path: (_get_iteration(path, folder), str(path)))
+            return max(paths, key=lambda path: (get_iteration(path), str(path)))
     return None
-
-
-def _get_iteration(path: Path, folder: Path) -> int:
-    numbers = re.findall(r"\d+", str(path.relative_to(folder)))
-    return int(numbers[-1][:18]) if numbers else -1
 
 
 def resolve_splat(path: Path) -> Path:
@@ -73,7 +73,10 @@ def refuse_folder(path: Path) -> None:
     """Raise InputError for a folder without a splat."""
     name = quote_value(path)
     if os.path.isfile(path / LOD_META):
-        raise InputError(_describe_stream(name))
+        raise InputError(
+            f"{name} is a streamed scene in several levels of detail ({LOD_META}); join one level "
+            "to a .ply (splat-transform does), and name that."
+        )
     with suppress(OSError):
         inside = sorted(n for n in os.listdir(path) if n.lower().endswith(SPLATS))
         if inside:
@@ -86,7 +89,8 @@ def refuse_folder(path: Path) -> None:
 
 def refuse_foreign(path: Path, head: bytes) -> None:
     """Raise InputError for a file of another kind; `head` are its first bytes."""
-    name, ending = quote_value(path), path.suffix.lower()
+    name = quote_value(path)
+    ending = path.suffix.lower()
     kind = _describe_by_content(path, head) or _describe_by_name(ending, head)
     if kind is not None:
         raise InputError(f"{name} {kind}.")
@@ -129,13 +133,6 @@ def _describe_checkpoint() -> str:
 
 def _describe_points() -> str:
     return "is a point cloud, not a splat; train a splat from photographs, and name its .ply"
-
-
-def _describe_stream(name: str) -> str:
-    return (
-        f"{name} is a streamed scene in several levels of detail ({LOD_META}); join one level to a "
-        ".ply (splat-transform does), and name that."
-    )
 
 
 def _describe_zip(path: Path) -> str | None:

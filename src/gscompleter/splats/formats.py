@@ -105,7 +105,8 @@ def load_splat(path: Path | str, drop_nonfinite: bool = False) -> Gaussians:
     name = detect_splat_format(path)
     if name == "ply":
         return load_ply(path, drop_nonfinite)
-    errors = (*DECODING_ERRORS, *(JSON_ERRORS if name in ("sog", "sog-folder", "glb") else ()))
+    has_json = name in ("sog", "sog-folder", "glb")
+    errors = DECODING_ERRORS + JSON_ERRORS if has_json else DECODING_ERRORS
     try:
         with np.errstate(over="ignore", invalid="ignore"):  # infinite values are refused below
             gaussians = FORMATS[name].read(path)
@@ -180,6 +181,7 @@ def detect_splat_format(path: Path) -> str:
     if not head:
         raise InputError(f"{quote_value(path)} is empty; a file of Gaussians is needed.")
     refuse_foreign(path, head)
+    # Content decides before the name, since files are renamed.
     for name, format_ in FORMATS.items():
         if head.lstrip().startswith(format_.starts) and format_.contains in head:
             return name
@@ -205,8 +207,10 @@ def get_writer(path: Path) -> Callable[[Path, Gaussians], None]:
 
 
 def _match_extension(path: Path) -> str | None:
-    endings = {name: format_.extensions for name, format_ in FORMATS.items()}
-    return next((n for n, ends in endings.items() if path.name.lower().endswith(ends)), None)
+    for name, format_ in FORMATS.items():
+        if path.name.lower().endswith(format_.extensions):
+            return name
+    return None
 
 
 def get_labels_path(path: Path) -> Path:
@@ -221,6 +225,7 @@ def save_labels(path: Path, generated: UInt8[Tensor, "n"]) -> None:
         with contextlib.suppress(FileNotFoundError):
             place.unlink()
         return
+    # Run lengths, as labels come in long runs; the digest ties them to this very file.
     runs = [[label, len(list(run))] for label, run in groupby(generated.tolist())]
     with replace_file(place) as file:
         file.write(json.dumps({"sha256": _hash_file(path), "generated": runs}).encode())

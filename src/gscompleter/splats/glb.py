@@ -30,15 +30,20 @@ from gscompleter.types import SH_C0, Gaussians, merge
 
 FILE_HEADER = struct.Struct("<4sII")
 CHUNK_HEADER = struct.Struct("<II")
-JSON, BINARY = 0x4E4F534A, 0x004E4942
+JSON = 0x4E4F534A
+"""Type of the chunk of JSON: its name in ASCII."""
+BINARY = 0x004E4942
+"""Type of the binary chunk: "BIN" in ASCII."""
 EXTENSION = "KHR_gaussian_splatting"
 SH_NAMES = [f"{EXTENSION}:SH_DEGREE_{d}_COEF_{i}" for d in range(4) for i in range(2 * d + 1)]
 COLOR_SPACE = "srgb_rec709_display"
 """The colour space in which all splat trainers work."""
 COMPONENT_TYPES = {5120: "<i1", 5121: "<u1", 5122: "<i2", 5123: "<u2", 5126: "<f4"}
 """numpy names of the component types."""
-FLOAT, POINTS = 5126, 0
-"""Component type and primitive mode that are written."""
+FLOAT = 5126
+"""Component type that is written."""
+POINTS = 0
+"""Primitive mode that is written."""
 NUM_COMPONENTS = {"SCALAR": 1, "VEC3": 3, "VEC4": 4}
 MAX_FILE_BYTES = 2**32 - 1
 """Largest size that the header of a .glb can state."""
@@ -59,6 +64,7 @@ def read_glb(path: Path) -> Gaussians:
     placed = list(_find_primitives(document))
     if not placed:
         raise UnsupportedError(_describe_other_content(document.table))
+    # Accessors may share bytes, so that a small file can claim any number.
     counts = [_get_accessor(document, p, "POSITION")["count"] for p, _ in placed]
     if sum(counts) * MIN_GAUSSIAN_BYTES > len(document.binary):
         raise ValueError("it claims more Gaussians than fit into it")
@@ -79,7 +85,7 @@ def _describe_other_content(table: dict[str, Any]) -> str:
 
 def _parse_document(data: bytes) -> GlbDocument:
     chunks: dict[int, bytes] = {}
-    start = 12
+    start = FILE_HEADER.size
     while start < len(data):
         size, kind = CHUNK_HEADER.unpack_from(data, start)
         start += CHUNK_HEADER.size + size
@@ -94,6 +100,8 @@ def _find_primitives(
     table = document.table
     scenes = table.get("scenes")
     roots = scenes[table.get("scene", 0)]["nodes"] if scenes else range(len(table["nodes"]))
+    # Breadth first, with the transform of each node's parent to the scene. In a tree no node comes
+    # twice.
     waiting = [(index, torch.eye(4, dtype=torch.float64)) for index in roots]
     visited: set[int] = set()
     while waiting:
@@ -120,6 +128,7 @@ def _read_transform(node: dict[str, Any]) -> Float[Tensor, "4 4"]:
         place[:3, :3] = quats_to_rotations(torch.tensor([w, x, y, z], dtype=torch.float64))
         place[:3, :3] *= torch.tensor(node.get("scale", (1, 1, 1)), dtype=torch.float64)
         place[:3, 3] = torch.tensor(node.get("translation", (0, 0, 0)), dtype=torch.float64)
+    # For s R, with s > 0, the determinant is s³ and the product with the transpose s² I.
     linear = place[:3, :3]
     volume = float(torch.linalg.det(linear))
     shape = linear @ linear.T / max(volume, 1e-30) ** (2 / 3)
@@ -174,6 +183,7 @@ def _read_accessor(document: GlbDocument, accessor: dict[str, Any]) -> Float[nda
         return values.astype(np.float32)
     if not accessor.get("normalized") and width != 3:
         raise UnsupportedError("has rotations or opacities that are no fractions")
+    # Signed normalized integers are symmetric: the lowest one stands for -1, too.
     largest = np.iinfo(kind).max if accessor.get("normalized") else 1
     return np.maximum(values.astype(np.float32) / largest, -1 if largest > 1 else -np.inf)
 
@@ -182,6 +192,7 @@ def write_glb(path: Path, gaussians: Gaussians) -> None:
     """Write a .glb whose scene is one primitive of Gaussians, with all SH."""
     columns = _make_columns(rotate_half_turn(gaussians, HALF_TURN_Z))
     text = json.dumps(_describe_scene(columns)).encode()
+    # Chunks are aligned to four bytes, JSON with spaces.
     text += b" " * (-len(text) % 4)
     size = sum(column.nbytes for column in columns.values())
     total = FILE_HEADER.size + 2 * CHUNK_HEADER.size + len(text) + size
@@ -196,8 +207,10 @@ def write_glb(path: Path, gaussians: Gaussians) -> None:
 
 def _make_columns(gaussians: Gaussians) -> dict[str, Float[ndarray, "n k"]]:
     """Make the attributes of the primitive by name, from Gaussians in the axes of glTF."""
-    opacities, quats = gaussians.opacities[:, None], gaussians.quats
+    opacities = gaussians.opacities[:, None]
+    quats = gaussians.quats
     rgb = (0.5 + SH_C0 * gaussians.sh[:, 0]).clamp(0, 1)
+    # The inverse of the transfer function of sRGB.
     linear = torch.where(rgb <= 0.04045, rgb / 12.92, ((rgb + 0.055) / 1.055) ** 2.4)
     columns = {
         "POSITION": gaussians.means,
@@ -207,7 +220,7 @@ def _make_columns(gaussians: Gaussians) -> dict[str, Float[ndarray, "n k"]]:
         f"{EXTENSION}:OPACITY": opacities,
         **dict(zip(SH_NAMES, gaussians.sh.unbind(1), strict=False)),
     }
-    return {name: np.require(it.numpy(), "<f4", ["C"]) for name, it in columns.items()}
+    return {name: np.require(tensor.numpy(), "<f4", ["C"]) for name, tensor in columns.items()}
 
 
 def _describe_scene(columns: dict[str, Float[ndarray, "n k"]]) -> dict[str, Any]:
@@ -222,6 +235,7 @@ def _describe_scene(columns: dict[str, Float[ndarray, "n k"]]) -> dict[str, Any]
         accessors.append({"bufferView": view, **form})
         size += values.nbytes
     means = columns["POSITION"]
+    # The standard demands bounds of positions.
     accessors[0] |= {"min": means.min(0).tolist(), "max": means.max(0).tolist()}
     primitive = {
         "attributes": {name: index for index, name in enumerate(columns)},

@@ -25,7 +25,8 @@ from gscompleter.splats.packing import (
 from gscompleter.system.files.reading import read_bytes
 from gscompleter.types import Gaussians, merge
 
-HEADER_BYTES, SECTION_HEADER_BYTES = 4096, 1024
+HEADER_BYTES = 4096
+SECTION_HEADER_BYTES = 1024
 HEADER = struct.Struct("<BBxxI12xH14xff")
 """Version, number of sections, level of compression, SH values of bytes 0 and 255 at level 2."""
 SECTION_HEADER = struct.Struct("<IIIIfHxxI4xIIH")
@@ -66,7 +67,8 @@ def read_ksplat(path: Path) -> Gaussians:
             f"is .ksplat version {major}.{minor} with compression {level}, and version 0.1 with "
             "compression 0 to 2 is read"
         )
-    parts, start = [], HEADER_BYTES + num_sections * SECTION_HEADER_BYTES
+    parts = []
+    start = HEADER_BYTES + num_sections * SECTION_HEADER_BYTES
     for number in range(num_sections):
         header = SECTION_HEADER.unpack_from(data, HEADER_BYTES + number * SECTION_HEADER_BYTES)
         section = Section(*header)
@@ -97,8 +99,11 @@ def _decode_section(
     rows = np.frombuffer(data, row, section.num_rows, section.rows_offset)
     rest = rows["rest"].astype(np.float64)
     if rows["rest"].dtype == np.uint8:
-        low, high = sh_range[0] or -1.5, sh_range[1] or 1.5
+        # 0 stands for the default range.
+        low = sh_range[0] or -1.5
+        high = sh_range[1] or 1.5
         rest = low + rest / 255 * (high - low)
+    # Level 0 has positions, the others steps from the centre of a bucket, from -num_steps on.
     means = rows["mean"].astype(np.float64)
     if rows["mean"].dtype == np.uint16:
         num_steps = section.num_steps or DEFAULT_STEPS
@@ -116,16 +121,27 @@ def _decode_section(
 
 def _lookup_centers(data: memoryview, section: Section) -> Float[ndarray, "n 3"]:
     """Look up the centre of each Gaussian's bucket."""
+    # Full buckets have `bucket_size` rows each; the file lists the sizes of the others.
     partial = np.frombuffer(data, "<u4", section.num_partial).astype(np.int64)
     full = section.num_full * section.bucket_size
     numbers = np.arange(section.num_rows)
     of_partial = section.num_full + np.searchsorted(full + partial.cumsum(), numbers, side="right")
     bucket = np.where(numbers < full, numbers // max(section.bucket_size, 1), of_partial)
-    shape, strides = (section.num_buckets, 3), (section.bucket_bytes, 4)
-    return np.ndarray(shape, "<f4", data, section.num_partial * 4, strides)[bucket]
+    # Centres are three float32 at the start of each bucket's bytes.
+    centers = np.ndarray(
+        (section.num_buckets, 3),
+        "<f4",
+        data,
+        offset=section.num_partial * 4,
+        strides=(section.bucket_bytes, 4),
+    )
+    return centers[bucket]
 
 
 def _reorder_sh(rest: Float[ndarray, "n m"]) -> Float[ndarray, "n k 3"]:
     """Reorder SH, stored by degree and then by channel, to [n, k, 3]."""
-    bands = np.split(rest, [9, 24], axis=1)
-    return np.concatenate([b.reshape(len(rest), 3, -1).transpose(0, 2, 1) for b in bands], axis=1)
+    # Degrees 1 to 3 have 3, 5 and 7 coefficients of three channels.
+    degrees = np.split(rest, [9, 24], axis=1)
+    return np.concatenate(
+        [degree.reshape(len(rest), 3, -1).transpose(0, 2, 1) for degree in degrees], axis=1
+    )

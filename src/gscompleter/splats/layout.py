@@ -81,15 +81,19 @@ def save_like(
     `added`), a column `generated` of another type, fewer SH coefficients than `added`, or rows that
     do not match `context`. `kept` marks the rows of `given` that the context has; None for all.
     """
-    context, layout = context.to("cpu"), find_layout(given)
+    context = context.to("cpu")
+    layout = find_layout(given)
     added = merge([context[:0], added.to("cpu")])
     numbers = None if layout is None else _match_rows(layout, context, added, kept)
     if layout is None or numbers is None:
         save_ply(path, merge([context, added]), provenance=True)
         return
-    header, label = _add_label_line(layout.header), [(LABEL_COLUMN, "u1")]
+    # The file's own columns stay as they are; only `generated` is added, or written anew.
+    header = _add_label_line(layout.header)
+    label = [(LABEL_COLUMN, "u1")]
     if LABEL_COLUMN in (layout.rows.dtype.names or ()):
-        header, label = layout.header, []
+        header = layout.header
+        label = []
     dtype = np.dtype([*layout.rows.dtype.descr, *label])
 
     def write_labels(values: ndarray, labels: UInt8[Tensor, "m"]) -> ndarray:
@@ -109,6 +113,7 @@ def _match_rows(
     layout: PlyFile, context: Gaussians, added: Gaussians, kept: Bool[Tensor, "n"] | None
 ) -> Int[ndarray, "m"] | None:
     """Find the rows of a file that its context was read from, or None if `added` do not fit in."""
+    # Rows are copied only if their positions are those of the context, one by one.
     names = layout.rows.dtype.names or ()
     has_other_labels = LABEL_COLUMN in names and layout.rows.dtype[LABEL_COLUMN] != np.uint8
     if has_surfels(layout) or has_other_labels:
@@ -133,31 +138,35 @@ def strip(path: Path, out: Path) -> tuple[int, int]:
     left out.
     """
     path = resolve_splat(path)
-    completed, layout = load_splat(path), find_layout(path)
-    given = drop_sh_padding(completed)
+    completed = load_splat(path)
+    layout = find_layout(path)
+    scene = drop_sh_padding(completed)
     layout = None if layout is None else drop_generated(layout)
     removed = path.parent / REMOVED_FILE
     if removed.is_file():
-        given, layout = reinsert(given, layout, removed)
-    if len(given) == 0:
+        scene, layout = reinsert(scene, layout, removed)
+    if len(scene) == 0:
         raise InputError(
             f"{quote_value(path)} holds only generated Gaussians: there is no input scene to "
             "restore."
         )
-    is_padded = layout is None or count_rest(layout) != 3 * (given.sh.shape[1] - 1)
+    # The rows of the file cannot be copied if they have the SH of the generated Gaussians.
+    is_padded = layout is None or count_rest(layout) != 3 * (scene.sh.shape[1] - 1)
     if layout is None or is_padded or get_writer(out) is not save_ply:
-        save_splat(out, given)
+        save_splat(out, scene)
     else:
         write_ply_file(out, layout.header, len(layout.rows), [layout.rows], layout.trailer)
-    return len(given), int((completed.generated > 0).sum())
+    return len(scene), int((completed.generated > 0).sum())
 
 
 def drop_sh_padding(completed: Gaussians) -> Gaussians:
     """Select the observed Gaussians, without the SH padding of a scene of lower degree."""
     observed = completed[completed.generated == 0]
     generated = completed[completed.generated > 0]
+    # A scene of lower degree was padded with zeros, which the generated Gaussians fill. Where both
+    # are zero, the degree is that of the file.
     k = completed.sh.shape[1]
-    for lower in (width for width in (9, 4, 1) if width < k):
+    for lower in [width for width in (9, 4, 1) if width < k]:
         if not generated.sh[:, lower:k].any() or observed.sh[:, lower:k].any():
             break
         k = lower
@@ -179,10 +188,12 @@ def save_removed(
     layout = find_layout(given)
     if layout is None:
         has_labels = bool((removed.generated > 0).any())
-        header, values = make_scene_header(removed, has_labels), make_rows(removed, has_labels)
+        header = make_scene_header(removed, has_labels)
+        values = make_rows(removed, has_labels)
     else:
-        held = layout.rows if kept is None else layout.rows[kept.numpy()]
-        header, values = layout.header, held[rows.numpy()]
+        scene_rows = layout.rows if kept is None else layout.rows[kept.numpy()]
+        header = layout.header
+        values = scene_rows[rows.numpy()]
     first, _, end = split_header(header)
     place = f"element place {len(rows)}\nproperty uint row\n".encode()
     trailer = rows.numpy().astype("<u4")
@@ -195,21 +206,25 @@ def reinsert(
     """Insert the replaced originals of the file `path` at their rows; None if columns differ."""
     source = read_scene(path)
     removed = require_finite(decode_gaussians(source), path, drop_nonfinite=False)
-    total, rows = len(kept) + len(removed), np.zeros(0, np.int64)
+    total = len(kept) + len(removed)
+    rows = np.zeros(0, np.int64)
     if b"element place " in source.header and len(source.trailer) == 4 * len(removed):
         rows = source.trailer.view("<u4").astype(np.int64)
+    # Row numbers ascend, and the last one lies within the scene.
     is_ordered = len(rows) > 0 and bool((np.diff(rows, append=total) > 0).all())
     if not is_ordered or kept.is_antialiased != removed.is_antialiased:
         raise InputError(
             f"{quote_value(path)} does not say where its Gaussians belong in the scene beside it; "
             "fetch both files again."
         )
+    # Place of each Gaussian: the originals take their rows, the others the rest, in their order.
     taken = torch.zeros(total, dtype=torch.bool)
     taken[torch.from_numpy(rows)] = True
     order = torch.empty(total, dtype=torch.int64)
     order[~taken] = torch.arange(len(kept))
     order[taken] = torch.arange(len(kept), total)
-    restored, others = merge([kept, removed])[order], drop_generated(source).rows
+    restored = merge([kept, removed])[order]
+    others = drop_generated(source).rows
     if layout is None or others.dtype != layout.rows.dtype or len(others) != len(removed):
         return restored, None
     joined = np.concatenate([layout.rows, others], dtype=others.dtype)

@@ -34,8 +34,10 @@ def argsort_morton(
     """Compute the order of positions along the curve through a box; the sort is stable."""
     extent = np.maximum(high - low, np.finfo(np.float64).tiny)
     cells = (((means - low) / extent).clip(0, 1) * (2**BITS_PER_AXIS - 1)).astype(np.int64)
-    # The code has the bits of the axes in turn; a table spreads 11 bits of an axis at a time.
-    numbers, spread = np.arange(2**11), np.zeros(2**11, np.int64)
+    # The code has the bits of the axes in turn; a table spreads 11 bits of an axis at a time, with
+    # two zeros above each.
+    numbers = np.arange(2**11)
+    spread = np.zeros(2**11, np.int64)
     for bit in range(11):
         spread |= ((numbers >> bit) & 1) << (3 * bit)
     code = np.zeros(len(cells), np.int64)

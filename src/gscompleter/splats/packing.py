@@ -54,6 +54,7 @@ def restore_largest(
 ) -> Float[ndarray, "n 4"]:
     """Restore unit quaternions whose positive component `largest` was dropped."""
     quats = np.empty((len(smaller), 4), np.float32)
+    # Places of the other three: those from the dropped one on move up by one.
     places = np.arange(3) + (np.arange(3) >= largest[:, None])
     np.put_along_axis(quats, places, smaller.astype(np.float32), axis=1)
     rest = np.sqrt(np.maximum(0, 1 - np.square(smaller).sum(1, keepdims=True)))
@@ -67,6 +68,7 @@ def drop_largest(
     """Drop the largest component, made positive; return its number and the other three."""
     unit = quats / np.linalg.norm(quats, axis=1, keepdims=True)
     largest = np.abs(unit).argmax(1)
+    # q and -q are the same rotation, so that the sign of the dropped component need not be stored.
     unit = unit * np.where(np.take_along_axis(unit, largest[:, None], axis=1) < 0, -1.0, 1.0)
     places = np.arange(3) + (np.arange(3) >= largest[:, None])
     return largest, np.take_along_axis(unit, places, axis=1)
@@ -90,7 +92,7 @@ def build_gaussians(
     if len({len(array) for array in arrays}) > 1 or sh.shape[1] - 1 not in NUM_SH_REST:
         raise ValueError("its Gaussians do not all have the same properties")
     return make_observed(
-        *(torch.from_numpy(np.require(array, np.float32, ["C", "W"])) for array in arrays)
+        *[torch.from_numpy(np.require(array, np.float32, ["C", "W"])) for array in arrays]
     )
 
 

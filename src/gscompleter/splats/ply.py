@@ -123,7 +123,8 @@ def has_mode_comment(header: bytes) -> bool:
 
 def decode_gaussians(scene: PlyFile) -> Gaussians:
     """Decode the Gaussians of a .ply, non-finite ones included."""
-    rows, num_rest = scene.rows, count_rest(scene)
+    rows = scene.rows
+    num_rest = count_rest(scene)
     names = rows.dtype.names or ()
     rests = tuple(f"f_rest_{i}" for i in range(num_rest))
     logs = (*(name for name in _SCALES if name in names), "opacity")
@@ -131,7 +132,9 @@ def decode_gaussians(scene: PlyFile) -> Gaussians:
         lambda columns: torch.from_numpy(read_columns(rows, columns)),
         [rests, MEANS, _QUATS, logs, _DC],
     )
+    # The file has all coefficients of red, then green, then blue.
     rest = rest.view(len(rows), 3, num_rest // 3).transpose(1, 2)
+    # Logarithms of scales: the third one of a surfel is thinner than the smaller one by a factor.
     if has_surfels(scene):
         thin = encoded[:, :2].amin(1) + math.log(SURFEL_THICKNESS)
         encoded = torch.cat([encoded[:, :2], thin[:, None], encoded[:, 2:]], dim=1)
@@ -228,11 +231,11 @@ def encode(gaussians: Gaussians) -> Float[Tensor, "n 4"]:
     anew = torch.cat([scales, opacities.clamp_min(-_MAX_LOGIT)[:, None]], dim=1).float()
     if gaussians.encoded is None:
         return anew
-    held = gaussians.encoded
-    same_scales = _decode_scales(held) == gaussians.scales
-    same_opacities = _decode_opacities(held) == gaussians.opacities
+    from_file = gaussians.encoded
+    same_scales = _decode_scales(from_file) == gaussians.scales
+    same_opacities = _decode_opacities(from_file) == gaussians.opacities
     same = torch.cat([same_scales, same_opacities[:, None]], dim=1)
-    return torch.where(same & held.isfinite(), held, anew)
+    return torch.where(same & from_file.isfinite(), from_file, anew)
 
 
 def save_ply(path: Path | str, gaussians: Gaussians, provenance: bool | None = None) -> None:

@@ -125,22 +125,26 @@ def _read_pixels(read: FileReader, name: object, count: int) -> UInt8[ndarray, "
 
 
 def _decode_means(read: FileReader, table: dict[str, Any], count: int) -> Float[ndarray, "n 3"]:
+    # Two images have the lower and the upper bytes.
     low, high = (
         _read_pixels(read, name, count)[:, :3].astype(np.float32) for name in table["files"]
     )
     steps = (low + 256 * high) / 65535
     logs = _interpolate(table["mins"], table["maxs"], steps, 3)
+    # The inverse of sign(x) log(1 + |x|), which spends most steps near the origin.
     return np.sign(logs) * np.expm1(np.abs(logs))
 
 
 def _interpolate(
     low: object, high: object, fractions: Float[ndarray, "n k"], k: int
 ) -> Float[ndarray, "n k"]:
-    lowest, highest = (np.asarray(bound, np.float32).reshape(k) for bound in (low, high))
+    lowest = np.asarray(low, np.float32).reshape(k)
+    highest = np.asarray(high, np.float32).reshape(k)
     return lowest + (highest - lowest) * fractions
 
 
 def _decode_quats(packed: UInt8[ndarray, "n 4"]) -> Float[ndarray, "n 4"]:
+    # Components in [-sqrt(1/2), sqrt(1/2)]; the fourth byte says which one was dropped.
     smaller = (packed[:, :3].astype(np.float32) / 255 - 0.5) * np.float32(np.sqrt(2))
     quats = restore_largest(packed[:, 3] & 3, smaller)
     quats[packed[:, 3] < ROTATION_MARK] = (1, 0, 0, 0)  # the identity, as in other readers
@@ -175,7 +179,8 @@ def _decode_sh_rest(read: FileReader, table: dict[str, Any], count: int) -> Floa
     number = label[:, 0] + 256 * label[:, 1]
     if "codebook" in table:
         return _get_codebook(table)[rows[number]]
-    low, high = float(table["mins"]), float(table["maxs"])
+    low = float(table["mins"])
+    high = float(table["maxs"])
     return low + (high - low) * rows[number].astype(np.float32) / 255
 
 
@@ -207,13 +212,17 @@ def _encode_scene(gaussians: Gaussians) -> dict[str, Coded]:
         "quats": ({}, {"quats.webp": _encode_image(quats)}),
         "sh0": ({"codebook": color_book.tolist()}, {"sh0.webp": _encode_image(rgba)}),
     }
-    return coded | ({"shN": _encode_sh_rest(gaussians)} if gaussians.sh_degree else {})
+    if gaussians.sh_degree:
+        coded["shN"] = _encode_sh_rest(gaussians)
+    return coded
 
 
 def _encode_means(means: Float[ndarray, "n 3"]) -> Coded:
     """Encode positions as 16 bits between bounds on the logarithmic scale."""
     logs = np.sign(means) * np.log1p(np.abs(means))
-    low, high = logs.min(0), logs.max(0)
+    low = logs.min(0)
+    high = logs.max(0)
+    # 16 bits, of which each image holds 8.
     steps = np.rint((logs - low) / np.where(high > low, high - low, 1) * 65535).astype(np.int64)
     images = {"means_l.webp": _encode_image(steps & 255), "means_u.webp": _encode_image(steps >> 8)}
     return {"mins": low.tolist(), "maxs": high.tolist()}, images
@@ -221,6 +230,7 @@ def _encode_means(means: Float[ndarray, "n 3"]) -> Coded:
 
 def _encode_sh_rest(gaussians: Gaussians) -> Coded:
     """Encode SH of degree 1 and above as numbers of rows of a palette."""
+    # Rows of all higher coefficients become a palette, and its numbers a codebook of 256.
     rest = gaussians.sh[:, 1:].flatten(1).numpy()
     palette, labels = fit_palette(rest)
     book, codes = fit_codebook(palette)
@@ -237,6 +247,7 @@ def _encode_image(values: Shaped[ndarray, "n k"], width: int = 0) -> bytes:
     """Encode rows of 3 or 4 bytes as a lossless image, by default about square."""
     n, k = values.shape
     width = width or BLOCK * math.ceil(math.sqrt(n) / BLOCK)
+    # Pixels beyond the last Gaussian are white and opaque.
     pixels = np.full((math.ceil(n / width), width, 4), 255, np.uint8)
     pixels.reshape(-1, 4)[:n, :k] = values
     file = io.BytesIO()

@@ -80,7 +80,11 @@ def read_spz(path: Path) -> Gaussians:
     if data.startswith(GZIP):
         data = _unpack_gzip(data)
     header = _parse_header(data)
-    streams = _split_streams(header, data) if header.version < 4 else _read_zstd(header, data)
+    if header.version < 4:
+        ends = np.cumsum([HEADER.size, *header.stream_sizes]).tolist()
+        streams = [data[start:end] for start, end in pairwise(ends)]
+    else:
+        streams = _read_zstd(header, data)
     turned = rotate_half_turn(_decode_streams(header, streams), HALF_TURN_X)
     return replace(turned, is_antialiased=bool(header.flags & ANTIALIASED_FLAG))
 
@@ -98,6 +102,7 @@ def _parse_header(data: bytes) -> SpzHeader:
 
 
 def _unpack_gzip(data: bytes) -> bytes:
+    # The header says how long the content is; a bomb is refused before it is unpacked.
     with gzip.GzipFile(fileobj=io.BytesIO(data)) as file:
         start = file.read(HEADER.size)
         size = sum(_parse_header(start).stream_sizes)
@@ -107,19 +112,17 @@ def _unpack_gzip(data: bytes) -> bytes:
     return start + body
 
 
-def _split_streams(header: SpzHeader, data: bytes) -> list[bytes]:
-    ends = np.cumsum([HEADER.size, *header.stream_sizes]).tolist()
-    return [data[start:end] for start, end in pairwise(ends)]
-
-
 def _read_zstd(header: SpzHeader, data: bytes) -> list[bytes]:
     """Decompress the attributes of version 4, each from its own stream; SH may be absent."""
     import zstandard  # only version 4 needs it
 
     check_growth(sum(header.stream_sizes), len(data))
+    # After the header lies the offset of a table with the packed and unpacked size of each stream.
     (place,) = struct.unpack_from("<I", data, HEADER.size)
     table = np.frombuffer(data, "<u8", 2 * header.num_streams, place).reshape(-1, 2)
-    start, streams = place + table.nbytes, []
+    start = place + table.nbytes
+    streams = []
+    # No more than the stated size is unpacked of a stream.
     for packed, size in zip(table[:, 0].tolist(), header.stream_sizes, strict=False):
         unpacker = zstandard.ZstdDecompressor(max_window_size=MAX_WINDOW)
         try:
@@ -133,10 +136,10 @@ def _read_zstd(header: SpzHeader, data: bytes) -> list[bytes]:
 def _decode_streams(header: SpzHeader, streams: list[bytes]) -> Gaussians:
     """Decode the Gaussians, in the axes of the file."""
     n = header.num_gaussians
-    positions, opacities, colours, scales, rotations, rest = (
+    positions, opacities, colours, scales, rotations, rest = [
         np.frombuffer(stream, np.uint8).reshape(n, width)
         for stream, width in zip(streams, header.widths, strict=True)
-    )
+    ]
     colour = 0.5 + SH_C0 * (colours.astype(np.float32) / 255 - 0.5) / COLOR_SCALE
     higher = (rest.astype(np.float32) - 128) / 128
     return build_gaussians(
@@ -150,11 +153,13 @@ def _decode_streams(header: SpzHeader, streams: list[bytes]) -> Gaussians:
 
 def _decode_int24(positions: UInt8[ndarray, "n 9"]) -> Int[ndarray, "n 3"]:
     """Decode three signed 24-bit numbers from each row of 9 bytes."""
-    a, b, c = np.moveaxis(positions.reshape(-1, 3, 3).astype(np.int32), 2, 0)
-    return ((a | (b << 8) | (c << 16)) ^ (1 << 23)) - (1 << 23)
+    low, middle, high = np.moveaxis(positions.reshape(-1, 3, 3).astype(np.int32), 2, 0)
+    # Flipping the sign bit and subtracting it extends the sign to 32 bits.
+    return ((low | (middle << 8) | (high << 16)) ^ (1 << 23)) - (1 << 23)
 
 
 def _decode_quats_v2(rotations: UInt8[ndarray, "n 3"]) -> Float[ndarray, "n 4"]:
+    # w is positive, and follows from the length of 1.
     xyz = rotations.astype(np.float32) / 127.5 - 1
     w = np.sqrt(np.maximum(0, 1 - np.square(xyz).sum(1, keepdims=True)))
     return np.concatenate([w, xyz], axis=1)
@@ -166,6 +171,7 @@ def _decode_quats_v3(rotations: UInt8[ndarray, "n 4"]) -> Float[ndarray, "n 4"]:
     fields = unpack_fractions(packed, SIGN_SIZE_BITS)
     sizes = fields[:, 1::2] * np.float32(np.sqrt(0.5))
     smaller = np.where(fields[:, ::2] > 0, -sizes, sizes)
+    # The file has xyzw.
     return np.roll(restore_largest(packed >> np.uint32(30), smaller), 1, axis=1)
 
 
@@ -201,6 +207,7 @@ def encode_spz(path: Path, gaussians: Gaussians) -> bytes:
 
 def _choose_fractional_bits(path: Path, gaussians: Gaussians) -> int:
     """Choose the fractional bits that the farthest coordinate leaves of 23."""
+    # Positions are signed numbers of 24 bits: what the whole part leaves of 23 is for the fraction.
     farthest = gaussians.means.abs().max().item()
     bits = 23 - int(np.ceil(np.log2(farthest + 1)))
     if bits < 0:
@@ -217,10 +224,12 @@ def _quantize_to_bytes(values: Float[ndarray, "*n"]) -> bytes:
 
 def _pack_positions(means: Float[ndarray, "n 3"], bits: int) -> bytes:
     fixed = np.rint(means.astype(np.float64) * 2**bits).clip(-(2**23), 2**23 - 1).astype("<i4")
+    # The three lower bytes of each little-endian number.
     return fixed.view(np.uint8).reshape(-1, 3, 4)[:, :, :3].tobytes()
 
 
 def _pack_rotations(quats: Float[ndarray, "n 4"]) -> bytes:
+    # From wxyz to the file's xyzw; sign and size take 1 and 9 bits of each component.
     largest, smaller = drop_largest(np.roll(quats, -1, axis=1))
     fields = np.stack([smaller < 0, np.abs(smaller) / np.sqrt(0.5)], axis=2).reshape(-1, 6)
     packed = (largest.astype(np.uint32) << np.uint32(30)) | pack_fractions(fields, SIGN_SIZE_BITS)

@@ -16,16 +16,20 @@ from gscompleter.numerics.geometry import multiply_quats, rotations_to_quats
 from gscompleter.render.spherical_harmonics import evaluate_sh_basis
 from gscompleter.types import Gaussians
 
-HALF_TURN_X, HALF_TURN_Z = (1.0, -1.0, -1.0), (-1.0, -1.0, 1.0)
-"""Signs of the axes after half a turn about x and about z."""
+HALF_TURN_X = (1.0, -1.0, -1.0)
+"""Signs of the axes after half a turn about x."""
+HALF_TURN_Z = (-1.0, -1.0, 1.0)
+"""Signs of the axes after half a turn about z."""
 
 
 def rotate_half_turn(gaussians: Gaussians, signs: tuple[float, float, float]) -> Gaussians:
     """Rotate Gaussians by half a turn about an axis; exact, because only signs change."""
-    flip, k = torch.tensor(signs), gaussians.sh.shape[1]
+    flip = torch.tensor(signs)
+    k = gaussians.sh.shape[1]
     # Each SH basis function is even or odd under half a turn: any direction tells its sign.
     direction = torch.nn.functional.normalize(torch.tensor([[0.3, 0.5, 0.7]]), dim=1)
-    before, after = evaluate_sh_basis(direction, k), evaluate_sh_basis(direction * flip, k)
+    before = evaluate_sh_basis(direction, k)
+    after = evaluate_sh_basis(direction * flip, k)
     return replace(
         gaussians,
         means=gaussians.means * flip,
@@ -54,6 +58,7 @@ def _rotate_sh(
     """Rotate SH by least squares, so that they show along `R d` what `sh` shows along d."""
     k = sh.shape[1]
     generator = torch.Generator().manual_seed(0)
+    # 64 directions determine the 16 coefficients of degree 3; each degree maps to itself.
     directions = torch.nn.functional.normalize(
         torch.randn(64, 3, generator=generator, dtype=torch.float64), dim=1
     )

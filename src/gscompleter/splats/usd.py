@@ -43,17 +43,21 @@ def write_usd(path: Path, gaussians: Gaussians) -> None:
     _require_usd()
     from pxr import UsdUtils
 
-    stage, ending = _make_stage(rotate_half_turn(gaussians, HALF_TURN_X)), path.suffix.lower()
+    stage = _make_stage(rotate_half_turn(gaussians, HALF_TURN_X))
+    ending = path.suffix.lower()
     with _make_folder_beside(path) as folder:
-        made = layer = folder / f"splat{ending.replace('z', 'c')}"
+        # A .usdz is made of a .usdc.
+        layer = folder / f"splat{ending.replace('z', 'c')}"
+        result = layer
         with _convert_usd_errors(path, folder):
             stage.GetRootLayer().Export(str(layer))
             if ending == ".usdz":
+                # A zip stores the time of its files.
                 os.utime(layer, (time.mktime(PACKAGED),) * 2)
-                made = layer.with_suffix(ending)
-                UsdUtils.CreateNewUsdzPackage(str(layer), str(made))
+                result = layer.with_suffix(ending)
+                UsdUtils.CreateNewUsdzPackage(str(layer), str(result))
         with replace_file(path) as file:
-            file.write(made.read_bytes())
+            file.write(result.read_bytes())
 
 
 @contextmanager
@@ -97,7 +101,8 @@ def _make_stage(gaussians: Gaussians) -> Usd.Stage:
     prim = stage.DefinePrim("/Splat", KIND)
     stage.SetDefaultPrim(prim)
     Usd.ColorSpaceAPI.Apply(prim).CreateColorSpaceNameAttr(COLOR_SPACE)
-    means, reach = gaussians.means, EXTENT * gaussians.scales.amax(1, keepdim=True)
+    means = gaussians.means
+    reach = EXTENT * gaussians.scales.amax(1, keepdim=True)
     values = {
         "extent": torch.stack([(means - reach).amin(0), (means + reach).amax(0)]),
         "positions": means,

@@ -49,6 +49,7 @@ def choose_config(
     A scene that was completed before is not recoloured again: one file keeps the originals of one
     run.
     """
+    # Without check views nothing tells how far a given scene can be trusted.
     is_splat = scene is not None and check_views is not None
     config = config or get_named_config("default", is_splat)
     if scene and bool((scene.generated > 0).any()):
@@ -64,7 +65,11 @@ def init_context(
     targets: Sequence[Camera],
     renderer: Renderer,
 ) -> InitialContext:
-    """Reconstruct the context from photographs, or take the scene that was given (Eq. 5)."""
+    """Reconstruct the context from photographs, or take the scene that was given (Eq. 5).
+
+    A given scene that is large is rendered through an LOD proxy, which is made fine enough for all
+    photographs and targets.
+    """
     views = sort_by_frame(views)
     if scene is None:
         views = prepare_single(reconstructor, views)
@@ -72,12 +77,18 @@ def init_context(
         raise InputError("No context view was given; name at least one frame.")
     if scene is None:
         return reconstruct_context(reconstructor, views)
-    return take_scene(scene, views, check_views, targets, renderer)
+
+    photos = [*views, *check_views]
+    source = build_proxy(scene.detach(), [*targets, *(view.camera for view in photos)])
+    near, far = find_splat_range(views, source.rendered, renderer)
+    return InitialContext(source, tuple(set_depth_range(photos, near, far)))
 
 
 def prepare_single(reconstructor: Reconstructor, views: Sequence[View]) -> list[View]:
     """Give a single photograph its predicted depth; raise InputError if it has no depth at all."""
-    views = give_prediction(views, getattr(reconstructor, "predict_depth", predict_nothing))
+    # A reconstructor may be any function of views; depth models have this method besides.
+    predict_depth = getattr(reconstructor, "predict_depth", predict_nothing)
+    views = give_prediction(views, predict_depth)
     if len(views) < 2 and not any(len(view.known_depths) for view in views):
         raise InputError(
             f"{len(views)} context view was given, and stereo needs at least 2; name more frames, "
@@ -90,46 +101,33 @@ def prepare_single(reconstructor: Reconstructor, views: Sequence[View]) -> list[
 def reconstruct_context(reconstructor: Reconstructor, views: Sequence[View]) -> InitialContext:
     """Reconstruct `G_ctx = Ψ(V_in)` from posed photographs (paper, Eq. 5)."""
     check_texture(views)
-    views = set_depth_range(views, *find_depth_range(views, get_trained_range(reconstructor)))
-    made = run_reconstructor(reconstructor, views)
-    source, gains = ContextScene.whole(drop_ignored(made, views)), made.exposure_gains
+    near, far = find_depth_range(views, get_trained_range(reconstructor))
+    views = set_depth_range(views, near, far)
+    reconstruction = run_reconstructor(reconstructor, views)
+    source = ContextScene.whole(drop_ignored(reconstruction, views))
+    # The scene has one exposure, which the photographs have to share from here on.
+    gains = reconstruction.exposure_gains
     return InitialContext(source, normalize_exposures(views, gains), gains)
-
-
-def take_scene(
-    scene: Gaussians,
-    views: Sequence[View],
-    check_views: Sequence[View],
-    targets: Sequence[Camera],
-    renderer: Renderer,
-) -> InitialContext:
-    """Take a given scene as the context; a large one is rendered through an LOD proxy.
-
-    The proxy is made fine enough for all photographs and targets.
-    """
-    photos = [*views, *check_views]
-    source = build_proxy(scene.detach(), [*targets, *(view.camera for view in photos)])
-    near, far = find_splat_range(views, source.rendered, renderer)
-    return InitialContext(source, tuple(set_depth_range(photos, near, far)))
 
 
 def check_texture(views: Sequence[View]) -> None:
     """Raise InputError if fewer than two of several photographs have any texture to match."""
-    num_flat = sum(not has_texture(view.image) for view in views)
+    num_flat = 0
+    for view in views:
+        # A mean of 3 x 3 pixels removes most noise, before the range in 5 x 5 of them is taken.
+        smooth = avg_pool2d(view.image.mean(dim=-1)[None, None], 3, stride=1)
+        highest = max_pool2d(smooth, 5, stride=1)
+        lowest = -max_pool2d(-smooth, 5, stride=1)
+        textured_share = (highest - lowest > MIN_CONTRAST).float().mean().item()
+        if not textured_share >= MIN_TEXTURED:
+            num_flat += 1
+
+    # A single photograph needs none, since its depth is given.
     if len(views) - num_flat < 2 <= len(views):
         raise InputError(
             f"{num_flat} of the {len(views)} context photographs show no texture, and stereo needs "
             "at least 2 that do; choose other photographs."
         )
-
-
-def has_texture(image: Float[Tensor, "h w 3"]) -> bool:
-    """Return True if enough of an image varies by more than noise."""
-    smooth = avg_pool2d(image.mean(dim=-1)[None, None], 3, stride=1)
-    highest = max_pool2d(smooth, 5, stride=1)
-    lowest = -max_pool2d(-smooth, 5, stride=1)
-    varied = highest - lowest > MIN_CONTRAST
-    return varied.float().mean().item() >= MIN_TEXTURED
 
 
 def sort_by_frame(views: Sequence[View]) -> list[View]:
@@ -139,17 +137,19 @@ def sort_by_frame(views: Sequence[View]) -> list[View]:
     return sorted(views, key=lambda view: view.frame or 0)
 
 
-def drop_ignored(made: Reconstruction, views: Sequence[View]) -> Gaussians:
+def drop_ignored(reconstruction: Reconstruction, views: Sequence[View]) -> Gaussians:
     """Drop Gaussians of ignored pixels; if Ψ is not pixel-aligned, those that project onto them."""
-    gaussians = made.gaussians
+    gaussians = reconstruction.gaussians
+    view_index = reconstruction.view_index
+    pixel_index = reconstruction.pixel_index
     gone = torch.zeros(len(gaussians), dtype=torch.bool, device=gaussians.means.device)
     for number, view in enumerate(views):
         ignored = ~view.valid_mask
-        if made.view_index is None or made.pixel_index is None:
+        if view_index is None or pixel_index is None:
             gone |= project_mask(ignored, gaussians, view.camera)
         else:
-            own = made.view_index == number
-            gone[own] = ignored.flatten()[made.pixel_index[own]]
+            own = view_index == number
+            gone[own] = ignored.flatten()[pixel_index[own]]
     return gaussians[~gone] if gone.any() else gaussians
 
 
@@ -157,7 +157,9 @@ def normalize_exposures(
     views: Sequence[View], gains: Float[Tensor, "v 3"] | None
 ) -> tuple[View, ...]:
     """Normalize photographs to the exposure of the context."""
-    return tuple(views) if gains is None else tuple(map(View.normalize_exposure, views, gains))
+    if gains is None:
+        return tuple(views)
+    return tuple(view.normalize_exposure(gain) for view, gain in zip(views, gains, strict=False))
 
 
 def find_splat_range(
@@ -180,6 +182,7 @@ def measure_depth_range(
         z = compute_z_depths(scene.means, camera)
         if not (z > 0).any():
             continue
+        # No near plane is known yet, and the scene may have any unit: the median depth is one.
         unit = z[z > 0].median().item()
         seen = renderer.render(scene, replace(camera, near=0.1 * unit)).depth_map()
         depths.append(seen.depth[seen.valid])
@@ -189,5 +192,7 @@ def measure_depth_range(
             "photographs share one world frame and one unit."
         )
     ordered = torch.cat(depths).sort().values  # torch.quantile stops at 16 million
-    low, high = (ordered[round(share * (len(ordered) - 1))].item() for share in (0.01, 0.99))
+    last = len(ordered) - 1
+    low = ordered[round(0.01 * last)].item()
+    high = ordered[round(0.99 * last)].item()
     return 0.5 * low, 2.0 * high

@@ -18,6 +18,7 @@ from gscompleter.types import Camera, Gaussians, Registration
 @timed_stage("integrate")
 def filter_holes(moved: Registration, view: TargetView) -> Gaussians:
     """Keep registered Gaussians inside the dilated hole mask, labelled with the target's id."""
+    # Beyond Eq. 12 the mask is dilated, since a hard border leaves seams (decision 037).
     mask = dilate(view.empty, view.state.config.holes.dilation)
     kept = select_in_mask(moved.gaussians, moved.pixel_index, mask, view.camera.padded)
     return replace(kept, generated=torch.full_like(kept.generated, view.state.next_target_id))

@@ -31,6 +31,9 @@ def find_unfilled(after: Render, steps: Sequence[Step], view: TargetView) -> Unf
     share = int(empty.sum()) / total
     if share <= Unfilled.MAX_SHARE:
         return Unfilled(share)
+
+    # Each empty pixel is put down to the first step after which it is open. A later step is not
+    # to blame, since there was nothing left for it to lose.
     lost: dict[str, float] = {}
     unexplained = empty
     for step in steps:
@@ -51,7 +54,9 @@ def find_regions(
     """
     pixels = mask.cpu().numpy().astype(np.uint8)
     _, _, stats, _ = cv2.connectedComponentsWithStats(pixels, connectivity=8)
-    largest = stats[1:][(-stats[1:, cv2.CC_STAT_AREA]).argsort(kind="stable")][:MAX_REGIONS]
+    regions = stats[1:]  # the first component is the background
+    largest_first = (-regions[:, cv2.CC_STAT_AREA]).argsort(kind="stable")
+    largest = regions[largest_first][:MAX_REGIONS]
     return tuple(
         (left + int(x), top + int(y), left + int(x + width), top + int(y + height))
         for x, y, width, height, _ in largest

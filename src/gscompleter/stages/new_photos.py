@@ -27,8 +27,10 @@ MAX_DROP = 6.0
 """PSNR in dB below the best third of the photographs from which on a photograph is new."""
 MIN_ERROR = 1e-4
 """Mean squared error up to which a photograph is reproduced, 40 dB."""
-MAX_DISTRUST, MIN_KNOWN = 0.5, 0.05
-"""Distrust up to which a pixel is compared in exposure, and smallest fraction of such pixels."""
+MAX_DISTRUST = 0.5
+"""Distrust up to which a pixel is compared in exposure."""
+MIN_KNOWN = 0.05
+"""Smallest fraction of such pixels."""
 MAX_PHOTOS = 32
 """Most new photographs that are used; of more, those far apart."""
 
@@ -40,21 +42,29 @@ def find_new_photos(
     if config.trust == "full":
         return []
     frozen = scenes.freeze_at(parts, [view.camera for view in views])
-    pairs = zip(frozen, views, strict=True)
-    errors = torch.stack([compute_error(scene.render.image, view) for scene, view in pairs])
-    good = errors.sort().values[len(errors) // 6].clamp_min(MIN_ERROR)  # median of the best third
-    return torch.nonzero(errors > good * 10 ** (MAX_DROP / 10))[:, 0].tolist()
+    errors = torch.stack(
+        [compute_error(scene.render.image, view) for scene, view in zip(frozen, views, strict=True)]
+    )
+    # The scene reproduces what it was trained on about equally well. Even if most photographs are
+    # new, the best third is not: its median is the error of a photograph that was trained on.
+    trained_error = errors.sort().values[len(errors) // 6].clamp_min(MIN_ERROR)
+    return torch.nonzero(errors > trained_error * 10 ** (MAX_DROP / 10))[:, 0].tolist()
 
 
 def compute_error(image: Float[Tensor, "h w 3"], view: View) -> Float[Tensor, ""]:
     """Compute the mean squared error of a render, fitted to the exposure of a photograph."""
-    shown, photo = image.clamp(0, 1)[view.valid_mask], view.image[view.valid_mask]
+    shown = image.clamp(0, 1)[view.valid_mask]
+    photo = view.image[view.valid_mask]
     gain, offset = fit_robust_affine(shown, photo)
     return (gain * shown + offset - photo).square().mean()
 
 
 def match_exposure(photo: View, view: TargetView) -> Float[Tensor, "h w 3"]:
-    """Match the exposure of a photograph to the scene where the scene is trusted."""
+    """Match the exposure of a photograph to the scene where the scene is trusted.
+
+    `view` is the scene at the camera of the photograph. If hardly anything there is trusted, the
+    photograph stays as it is.
+    """
     image = view.render.image.clamp(0, 1)
     known = photo.valid_mask & ~view.holes & (view.distrust < MAX_DISTRUST)
     if int(known.sum()) < MIN_KNOWN * known.numel():
@@ -67,10 +77,13 @@ def recolor_to_photos(
     state: Completion, photos: Sequence[View], scenes: SceneRenderer
 ) -> Completion:
     """Recolour the scene to new photographs, held in the directions of all others."""
-    chosen = select_spread_cameras([photo.camera for photo in photos], MAX_PHOTOS) if photos else []
+    chosen: list[int] = []
+    if photos:
+        chosen = select_spread_cameras([photo.camera for photo in photos], MAX_PHOTOS)
     for index in track(sorted(chosen), "Learning new photographs"):
-        view = render_target(state, pad_camera(photos[index].camera, 0.0), scenes)
         photo = photos[index]
+        view = render_target(state, pad_camera(photo.camera, 0.0), scenes)
+        # Where the photograph is ignored, the render itself is wanted: nothing changes.
         wanted = match_exposure(photo, view)
         wanted = torch.where(photo.valid_mask[..., None], wanted, view.render.image)
         reference = GeneratedView(wanted, photo.camera, is_photograph=True)

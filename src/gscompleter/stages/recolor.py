@@ -51,7 +51,9 @@ def recolor(reference: GeneratedView, view: TargetView, label: int) -> Recolored
     an image that is inconsistent with them recolours nothing. `label` marks the recoloured
     Gaussians as generated.
     """
-    state, camera, context = view.state, view.camera.padded, view.state.parts[0]
+    state = view.state
+    camera = view.camera.padded
+    context = state.parts[0]
     weight = torch.ones_like(view.alpha) if reference.is_photograph else view.distrust
     if reference.is_inconsistent or not weight.any():
         return Recolored(state, view.frozen, 0)
@@ -66,9 +68,15 @@ def recolor(reference: GeneratedView, view: TargetView, label: int) -> Recolored
     )
     if len(rows) == 0:
         return Recolored(state, view.frozen, 0)
-    generated = context.generated.index_fill(0, rows, label)
-    context = replace(context, sh=context.sh.index_add(0, rows, delta), generated=generated)
-    parts, trust = (context, *state.parts[1:]), state.trust.accept(view.frozen, camera, rows)
+
+    recolored = replace(
+        context,
+        sh=context.sh.index_add(0, rows, delta),
+        generated=context.generated.index_fill(0, rows, label),
+    )
+    parts = (recolored, *state.parts[1:])
+    # Trusted at later targets: otherwise targets in a row compound their errors (decision 038).
+    trust = state.trust.accept(view.frozen, camera, rows)
     frozen = view.scenes.freeze(parts, camera)
     return Recolored(replace(state, parts=parts, trust=trust), frozen, len(rows))
 
@@ -84,22 +92,34 @@ def fit_colors(
 ) -> tuple[Int64[Tensor, "c"], Float[Tensor, "c k 3"]]:
     """Fit colours towards `reference`; return rows of `scene` and the change of their harmonics.
 
-    Only the m Gaussians of the context, which are the first of `scene`, may change, as far as the
-    `held` views allow. Where `weight`, in [0, 1], is low, the render of `scene` is wanted instead.
+    `frozen` is `scene` at the camera of `reference`. Only the m Gaussians of the context, which are
+    the first of `scene`, may change, as far as the `held` views allow. Where `weight`, in [0, 1],
+    is low, the render of `scene` is wanted instead. Equations: "Recolouring" in docs/method.md.
     """
+    # Gaussians are open to change if they show in a pixel that wants another colour. Three
+    # channels are backprojected at once: all pixels, wanting pixels, and nothing.
     layers = torch.stack([torch.ones_like(weight), weight, torch.zeros_like(weight)], dim=-1)
     sums, open_sums, _ = frozen.backproject(layers).unbind(-1)
     is_open = open_sums > MIN_WEIGHT
-    is_open[held.sums.shape[1] :] = False
+    num_context = held.sums.shape[1]
+    is_open[num_context:] = False
     rows = torch.nonzero(is_open)[:, 0]
     if len(rows) == 0 or config.iterations == 0:
         return rows[:0], scene.sh[:0]
+
+    # A Gaussian has k coefficients per channel, of which the target sees one combination, bᵀ sh. Of
+    # all changes of that colour, A⁻¹ b is the one that costs the held views least. So one number s
+    # per channel is left, and the colour changes by γ s.
     basis, change = solve_directions(scene, rows, sums[rows], reference.camera, held, config.ridge)
     colors = 0.5 + torch.einsum("nk,nkc->nc", basis, scene.sh[rows].double())
-    gains = (basis * change).sum(dim=1, keepdim=True)
+    gains = (basis * change).sum(dim=1, keepdim=True)  # γ = bᵀ A⁻¹ b
+
     wanted = torch.lerp(frozen.render.image, reference.image, weight[..., None])
     errors = renderer.freeze(scene[~is_open], reference.camera).vary_colors(scene[rows])
     steps = fit_steps(errors, wanted, colors, gains, config.iterations)
+
+    # Changes that nobody sees would only mark Gaussians as generated. Leaving them out changes a
+    # fifth as many, for the same gain (decision 038).
     is_changed = (gains * steps).abs().amax(dim=1) > config.min_change
     delta = change[is_changed, :, None] * steps[is_changed, None]
     return rows[is_changed], delta.to(scene.sh)
@@ -115,22 +135,28 @@ def solve_directions(
 ) -> tuple[Float64[Tensor, "c k"], Float64[Tensor, "c k"]]:
     """Return the basis b at `camera` and the cheapest change of harmonics, A⁻¹ b, of some rows.
 
-    A = Σ_v weight_v sum_v b_v b_vᵀ + ridge (sum + Σ_v sum_v) I over the held views v.
+    A = Σ_v weight_v sum_v b_v b_vᵀ + ridge (sum + Σ_v sum_v) I over the held views v, where sums
+    are the compositing weights of a Gaussian in an image; `sums` [c] are those at `camera`.
     """
-    k, centers = scene.sh.shape[1], torch.cat([held.centers, camera.center.to(held.centers)[None]])
+    k = scene.sh.shape[1]
+    centers = torch.cat([held.centers, camera.center.to(held.centers)[None]])
 
     def solve(chunk: Int64[Tensor, "_"], own: Float[Tensor, "_"]) -> Float64[Tensor, "2 _ k"]:
+        # In float64, since views beside each other have nearly equal b, and A is close to singular.
         rays = normalize(scene.means[chunk, None].double() - centers.double(), dim=-1)
         basis = evaluate_sh_basis(rays.flatten(0, 1), k).unflatten(0, rays.shape[:2])
-        views, seen = basis[:, :-1], held.sums[:, chunk].double().T
-        cost = views.mT @ (views * (seen * held.weights)[..., None])
-        cost.diagonal(dim1=1, dim2=2).add_(ridge * (own + seen.sum(dim=1))[:, None])
-        change = torch.cholesky_solve(basis[:, -1, :, None], torch.linalg.cholesky(cost))
-        return torch.stack([basis[:, -1], change[..., 0]])
+        held_basis = basis[:, :-1]
+        target_basis = basis[:, -1]
+        held_sums = held.sums[:, chunk].double().T
+        cost = held_basis.mT @ (held_basis * (held_sums * held.weights)[..., None])
+        # The ridge grows with all weights, so that the result does not depend on image sizes.
+        cost.diagonal(dim1=1, dim2=2).add_(ridge * (own + held_sums.sum(dim=1))[:, None])
+        change = torch.cholesky_solve(target_basis[..., None], torch.linalg.cholesky(cost))
+        return torch.stack([target_basis, change[..., 0]])
 
     with use_one_torch_thread():
-        parts = map_in_parallel(solve, rows.split(CHUNK), sums.split(CHUNK))
-    basis, change = torch.cat(parts, dim=1)
+        chunks = map_in_parallel(solve, rows.split(CHUNK), sums.split(CHUNK))
+    basis, change = torch.cat(chunks, dim=1)
     return basis, change
 
 
@@ -143,12 +169,16 @@ def fit_steps(
 ) -> Float64[Tensor, "c 3"]:
     """Minimize Σ (wanted - image)² + gains s² over s; Gaussians have the colours + gains s.
 
-    Each iteration minimizes an upper bound in which every s stands alone: weights of a pixel sum to
-    at most 1.
+    Each iteration minimizes an upper bound in which every s stands alone.
     """
     steps = torch.zeros_like(colors)
     for _ in range(iterations):
-        missing, sums = errors((colors + gains * steps).to(wanted), wanted)
+        # The residual at the current colours, and the weights, summed over the pixels of each
+        # Gaussian.
+        residual, sums = errors((colors + gains * steps).to(wanted), wanted)
+        # The weights w_i of a pixel sum to at most 1. So (Σ_i w_i x_i)² <= Σ_i w_i x_i², which
+        # replaces the square of the sum of all changes by a sum of squares: the minimum over each s
+        # is a division.
         stiffness = sums[:, None] * gains
-        steps = (missing + stiffness * steps) / (1 + stiffness)
+        steps = (residual + stiffness * steps) / (1 + stiffness)
     return steps

@@ -59,24 +59,35 @@ def select_anchor(
 
     rotations = [measure_rotation(target, view.camera) for view in views]
     baselines = [measure_baseline(target, view.camera) for view in views]
-    least = config.min_baseline * max(baselines)
-    possible = [i for i in range(len(views)) if baselines[i] >= least]
-    overlapping = [i for i in possible if rotations[i] < config.max_rotation]
+    # A view at the place of the target has no parallax at all.
+    min_baseline = config.min_baseline * max(baselines)
+    possible = [i for i in range(len(views)) if baselines[i] >= min_baseline]
+    facing = [i for i in possible if rotations[i] < config.max_rotation]
+    if not facing:
+        least_turned = min(possible, key=lambda i: rotations[i])
+        return AnchorChoice(least_turned, fallback=True)
+
+    # On a path of 40 m the widest baseline shows something else (decision 015).
+    overlap_of = overlaps or [1.0] * len(views)
+    overlapping = [i for i in facing if overlap_of[i] >= config.min_overlap]
     if not overlapping:
-        return AnchorChoice(min(possible, key=rotations.__getitem__), fallback=True)
-    overlaps = overlaps or [1.0] * len(views)
-    enough = [i for i in overlapping if overlaps[i] >= config.min_overlap]
-    if not enough:
-        return AnchorChoice(max(overlapping, key=overlaps.__getitem__), fallback=False)
-    return AnchorChoice(max(enough, key=baselines.__getitem__), fallback=False)
+        most_overlapping = max(facing, key=lambda i: overlap_of[i])
+        return AnchorChoice(most_overlapping, fallback=False)
+    widest = max(overlapping, key=lambda i: baselines[i])
+    return AnchorChoice(widest, fallback=False)
 
 
 def compute_overlap(camera: Camera, render: Render, anchor: Camera, at_anchor: Render) -> float:
-    """Compute the fraction of visible surfaces that the anchor sees, too; 0 if there are none."""
-    seen = render.depth_map()
-    points = unproject(seen.depth, camera)[seen.valid]
+    """Compute the fraction of visible surfaces that the anchor sees, too; 0 if there are none.
+
+    `render` shows the scene at `camera`, `at_anchor` at `anchor`.
+    """
+    surfaces = render.depth_map()
+    points = unproject(surfaces.depth, camera)[surfaces.valid]
     if len(points) == 0:
         return 0.0
+
+    # What lies behind the surface that the anchor sees there is hidden from it.
     pixels, z = project(points, anchor)
     surface = sample(at_anchor.depth[..., None], pixels)[:, 0]
     shared = is_inside(pixels, z, anchor) & (z < (1 + SURFACE_TOLERANCE) * surface)

@@ -47,6 +47,7 @@ def synthesize(
         GeneratorRequest(context.views[find_nearest_view(target, context.views)], target, context)
         for target, context in inputs
     ]
+    # Φ is code of others that gets the scene itself, without a copy of it.
     states = [fingerprint(request) for request in requests]
     outputs = as_generator(generator).synthesize(requests)
     if not isinstance(outputs, (list, tuple)) or len(outputs) != len(requests):
@@ -60,7 +61,10 @@ def synthesize(
             "The generator changed its input, which is the scene itself; let it work on copies "
             "(.clone())."
         )
-    return [convert_output(output, r.target) for output, r in zip(outputs, requests, strict=True)]
+    return [
+        convert_output(output, request.target)
+        for output, request in zip(outputs, requests, strict=True)
+    ]
 
 
 def fingerprint(request: GeneratorRequest) -> tuple[object, ...]:
@@ -69,14 +73,15 @@ def fingerprint(request: GeneratorRequest) -> tuple[object, ...]:
     PyTorch counts what is written in place. NumPy, which shares the memory, does not: the sums
     notice it in the images that a Φ most often paints on.
     """
-    parts = [tensor for _, tensor in iterate_tensors(request, "") if not tensor.is_inference()]
-    versions = tuple(tensor._version for tensor in parts)
-    images = (request.nearest.image, request.context.target_render.image)
-    return (*versions, *map(_sum_bits, images))
-
-
-def _sum_bits(image: Tensor) -> int:
-    return int(image.contiguous().view(torch.int32).sum(dtype=torch.int64))
+    # Tensors that were made in inference mode have no version.
+    tensors = [tensor for _, tensor in iterate_tensors(request, "") if not tensor.is_inference()]
+    versions = [tensor._version for tensor in tensors]
+    # Bits are summed as integers: a sum of floats may round a small change away.
+    sums = [
+        int(image.contiguous().view(torch.int32).sum(dtype=torch.int64))
+        for image in (request.nearest.image, request.context.target_render.image)
+    ]
+    return (*versions, *sums)
 
 
 def convert_output(output: object, target: Camera) -> GeneratedView:

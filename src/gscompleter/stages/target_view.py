@@ -63,7 +63,10 @@ class TargetView:
     def distrust(self) -> Float[Tensor, "h w"]:
         """Weight in [0, 1] with which covered pixels take the synthesized colour."""
         weight = compute_distrust(self.alpha, self.render.alpha)
-        weight = blur_gaussian(weight.where(~self.empty, 0.0), DISTRUST_BLUR * max(weight.shape))
+        # Empty pixels get Gaussians of their own, and are no reason to recolour what is beside
+        # them: they are left out before the blur, and again after it.
+        sigma = DISTRUST_BLUR * max(weight.shape)
+        weight = blur_gaussian(weight.where(~self.empty, 0.0), sigma)
         return weight.where(~self.empty, 0.0)
 
     @property
@@ -99,14 +102,16 @@ class TargetView:
     @cached_property
     def refusal(self) -> str | None:
         """Sentence why the target cannot be completed, or None if it can."""
-        before, least = self.render.crop(self.camera), self.state.config.holes.min_covered
+        # The sky is no surface that anything could be registered to.
+        before = self.render.crop(self.camera)
         covered = mask_out_sky(before, self.camera.target).valid.float().mean().item()
-        if covered >= least:
+        min_covered = self.state.config.holes.min_covered
+        if covered >= min_covered:
             return None
         return (
             f"The target sees surfaces of the scene in {covered:.1%} of its image, and at least "
-            f"{least:.0%} are needed; move it closer to the photographs, or turn it towards what "
-            "they show."
+            f"{min_covered:.0%} are needed; move it closer to the photographs, or turn it towards "
+            "what they show."
         )
 
     @property
@@ -115,7 +120,10 @@ class TargetView:
         if self.refusal:
             return self.refusal
         unsure = self.camera.crop(self.holes | (self.distrust > 0))
-        same = [v for v in self.state.views if is_same_camera(self.camera.target, v.camera)]
+        # At a context view, Φ could only return the photograph. That is no reason where its pixels
+        # are ignored, since nothing is known of them.
+        target = self.camera.target
+        same = [view for view in self.state.views if is_same_camera(target, view.camera)]
         if any(not (unsure & ~view.valid_mask).any() for view in same):
             return f"The target is a context view{NOTHING_TO_COMPLETE}"
         if not unsure.any():
@@ -178,12 +186,17 @@ def render_target(state: Completion, camera: PaddedCamera, scenes: SceneRenderer
 
 def choose_anchor(state: Completion, target: Camera, scenes: SceneRenderer) -> AnchorChoice:
     """Select the anchor by rotation, baseline and, beyond the paper, overlap in small images."""
-    config, views = state.config.anchor, state.views
+    config = state.config.anchor
+    views = state.views
     if config.min_overlap == 0:
         return select_anchor(target, views, config)
+
     side = state.config.next_best_view.image_size
-    cameras = [shrink_camera(c, side) for c in (target, *(view.camera for view in views))]
-    seen, *at_views = (f.render for f in scenes.freeze_small(state.parts, cameras))
-    pairs = zip(cameras[1:], at_views, strict=True)
-    overlaps = [compute_overlap(cameras[0], seen, camera, render) for camera, render in pairs]
+    small_target = shrink_camera(target, side)
+    small_views = [shrink_camera(view.camera, side) for view in views]
+    at_target, *at_views = scenes.freeze_small(state.parts, [small_target, *small_views])
+    overlaps = [
+        compute_overlap(small_target, at_target.render, camera, frozen.render)
+        for camera, frozen in zip(small_views, at_views, strict=True)
+    ]
     return select_anchor(target, views, config, overlaps)

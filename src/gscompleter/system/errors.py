@@ -15,7 +15,9 @@ MAX_PATH_LENGTH = 250
 LFS_POINTER = b"version https://git-lfs"
 
 _REPR = Repr()
-_REPR.maxlevel, _REPR.maxstring, _REPR.maxother = 4, 4 * MAX_QUOTE_LENGTH, 4 * MAX_QUOTE_LENGTH
+_REPR.maxlevel = 4
+_REPR.maxstring = 4 * MAX_QUOTE_LENGTH
+_REPR.maxother = 4 * MAX_QUOTE_LENGTH
 _REPR.maxlist = _REPR.maxtuple = _REPR.maxdict = _REPR.maxset = MAX_QUOTE_LENGTH // 2
 
 
@@ -59,6 +61,7 @@ def quote_value(value: object, length: int | None = None) -> str:
     text = str(value) if isinstance(value, (str, os.PathLike)) else _REPR.repr(value)
     # Only the ends of very long texts are processed.
     ends = text if len(text) <= 4 * length else text[: 2 * length] + text[-2 * length :]
+    # Line breaks and control characters would split the sentence or drive the terminal.
     line = "".join(c if c.isprintable() else " " for c in ends)
     if len(text) <= length:
         return line
@@ -69,8 +72,11 @@ def quote_value(value: object, length: int | None = None) -> str:
 def shorten_message(message: str, most: int) -> str:
     """Shorten the longest words of a message, such as paths but not URLs, and then its middle."""
     words = message.split()
-    while (excess := len(" ".join(words)) - most) > 0:
-        longest = max(range(len(words)), key=lambda i: len(words[i]) * ("://" not in words[i]))
+    while len(" ".join(words)) > most:
+        excess = len(" ".join(words)) - most
+        # URLs count as empty words.
+        lengths = [0 if "://" in word else len(word) for word in words]
+        longest = lengths.index(max(lengths))
         length = max(len(words[longest]) - excess, MAX_QUOTE_LENGTH)
         if length >= len(words[longest]):
             break

@@ -89,13 +89,15 @@ def count_fitting_gaussians(number: int) -> int:
 
 def read_memory_bytes() -> int | None:
     """Return the memory of this machine or its container limit, or None if unknown."""
-    found = []
-    for file in filter(os.path.isfile, _LIMIT_FILES):
-        word = Path(file).read_text("ascii").strip()
-        found += [int(word)] if word.isdecimal() else []  # cgroup 2 has "max" for no limit
+    limits = []
+    for file in _LIMIT_FILES:
+        if os.path.isfile(file):
+            word = Path(file).read_text("ascii").strip()
+            if word.isdecimal():  # cgroup 2 has "max" for no limit
+                limits.append(int(word))
     with contextlib.suppress(AttributeError, OSError, ValueError):  # not on Windows
-        found.append(os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES"))
-    return min(found, default=None)
+        limits.append(os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES"))
+    return min(limits, default=None)
 
 
 def format_whole_gigabytes(number: int) -> str:

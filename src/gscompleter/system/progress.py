@@ -43,7 +43,8 @@ class Display:
         self._console = console
         self._bars: Progress | None = None
         self._running: list[Activity] = []
-        self._line, self._line_time = "", 0.0
+        self._line = ""
+        self._line_time = 0.0
 
     @contextmanager
     def show(self, activity: Activity) -> Iterator[None]:
@@ -56,6 +57,7 @@ class Display:
             self.update()
             yield
         finally:
+            # With whatever an exception left running inside.
             del self._running[depth:]
             if not self._running:
                 self.stop()
@@ -74,6 +76,7 @@ class Display:
             self._print_line()
 
     def _update_bars(self, bars: Progress) -> None:
+        # Bars are in the order of the running activities, and take over each other's place.
         for task in bars.task_ids[len(self._running) :]:
             bars.remove_task(task)
         for index, activity in enumerate(self._running):
@@ -91,7 +94,8 @@ class Display:
         ]
         line = ": ".join(shown)
         if line != self._line:
-            self._line, self._line_time = line, time.monotonic()
+            self._line = line
+            self._line_time = time.monotonic()
             self._console.print(line, highlight=False, markup=False, soft_wrap=True)
 
 
@@ -143,7 +147,8 @@ def notify_of_stages(listener: Callable[[str], None]) -> Iterator[None]:
 
 def stage(name: str) -> AbstractContextManager[None]:
     """Show a stage during the block, and notify the listener."""
-    listener, display = _listener.get(), _display.get()
+    listener = _listener.get()
+    display = _display.get()
     if listener is not None:
         listener(name)
     return nullcontext() if display is None else display.show(Activity(name))

@@ -32,9 +32,12 @@ def check_tensors(value: object, owner: str, forms: Mapping[str, Form]) -> None:
     `owner` names the value in sentences, such as "a camera". Tensors whose class gives them the
     default None may be absent.
     """
-    kind, device, dtype = type(value), None, None
+    kind = type(value)
+    device = None
+    dtype = None
     for name, (dtypes, shape) in forms.items():
         tensor = getattr(value, name)
+        # A default of None is an attribute of the class; a field without one is no attribute of it.
         if tensor is None and getattr(kind, name, tensor) is None and hasattr(kind, name):
             continue
         if not isinstance(tensor, Tensor) or not _has_form(tensor, dtypes, shape):

@@ -53,13 +53,17 @@ def use_one_torch_thread() -> Iterator[None]:
 
 def count_available_cores() -> int:
     """Count the cores of this process, limited by its CPU quota."""
-    pinned = hasattr(os, "sched_getaffinity")  # Windows and macOS have none
-    cores = len(os.sched_getaffinity(0)) if pinned else os.cpu_count() or 1
+    if hasattr(os, "sched_getaffinity"):  # Windows and macOS have none
+        cores = len(os.sched_getaffinity(0))
+    else:
+        cores = os.cpu_count() or 1
     return max(1, round(min(cores, read_quota(QUOTA_FILE))))
 
 
 def read_quota(file: Path) -> float:
     """Read a CPU quota in cores; infinite if there is none."""
     words = file.read_text("ascii").split() if file.is_file() else []
-    bounded = len(words) == 2 and all(word.isdecimal() for word in words)
-    return int(words[0]) / int(words[1]) if bounded else math.inf
+    # "max" stands for no quota.
+    if len(words) != 2 or not all(word.isdecimal() for word in words):
+        return math.inf
+    return int(words[0]) / int(words[1])

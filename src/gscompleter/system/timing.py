@@ -24,7 +24,8 @@ _record: ContextVar[dict[str, float] | None] = ContextVar("record", default=None
 @contextmanager
 def record_seconds(stages: Sequence[str] = STAGES) -> Iterator[dict[str, float]]:
     """Record the wall time of each stage that runs inside, and of everything as `total`."""
-    seconds, start = dict.fromkeys(stages, 0.0), time.perf_counter()
+    seconds = dict.fromkeys(stages, 0.0)
+    start = time.perf_counter()
     token = _record.set(seconds)
     try:
         yield seconds
@@ -36,7 +37,9 @@ def record_seconds(stages: Sequence[str] = STAGES) -> Iterator[dict[str, float]]
 @contextmanager
 def timed_stage(name: str) -> Iterator[None]:
     """Show a stage as running and record its wall time; inside another stage, it counts there."""
-    seconds, start = _record.get(), time.perf_counter()
+    seconds = _record.get()
+    start = time.perf_counter()
+    # A stage inside this one finds no record, and so is not counted twice.
     token = _record.set(None)
     try:
         with stage(name), record_function(STAGE_PREFIX + name):

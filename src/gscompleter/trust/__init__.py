@@ -56,5 +56,8 @@ class Trust:
         return self
 
     def thin(self, rows: Int[Tensor, "r"], growth: Float[Tensor, "r"]) -> Trust:
-        """Restrict to rows that stand for their neighbours, each enlarged by a factor."""
+        """Restrict to rows that stand for their neighbours, each enlarged by a factor.
+
+        `growth` is the factor of the lengths.
+        """
         return self

@@ -72,11 +72,18 @@ class PhotometricTrust(Trust):
         return self.held_views
 
     def compute_alpha(self, frozen: FrozenScene, camera: Camera) -> Float[Tensor, "h w"]:
-        """Render accumulated opacity weighted by trust; added and invisible Gaussians have 1."""
-        sums, count = sum_weights(frozen), len(self.observations.means)
-        trust = compute_trust(self.observations, sums[:count], camera, self.config)
+        """Render accumulated opacity weighted by trust; added and invisible Gaussians have 1.
+
+        This is A_trust of the method page.
+        """
+        sums = sum_weights(frozen)
+        num_context = len(self.observations.means)
+        trust = compute_trust(self.observations, sums[:num_context], camera, self.config)
+        # Recoloured Gaussians are trusted: without this, targets in a row compound (decision 038).
         trust = torch.where(self.is_recolored, 1.0, trust)
-        weights = pad(trust, (0, len(sums) - count), value=1.0)
+        # Added Gaussians follow those of the context.
+        weights = pad(trust, (0, len(sums) - num_context), value=1.0)
+        # The blur also spreads trust into holes, where no more can be trusted than is opaque.
         return torch.minimum(blur(frozen.splat(weights)), frozen.render.alpha)
 
     def accept(
@@ -93,8 +100,12 @@ class PhotometricTrust(Trust):
     def thin(self, rows: Int[Tensor, "r"], growth: Float[Tensor, "r"]) -> PhotometricTrust:
         """Restrict to rows that stand for their neighbours, each enlarged by a factor."""
         seen = self.observations
-        areas, agreement = seen.areas[:, rows] * growth**2, seen.agreement[:, rows]
-        thinned = PhotoObservations(seen.means[rows], seen.centers, areas, agreement)
+        thinned = PhotoObservations(
+            means=seen.means[rows],
+            centers=seen.centers,
+            areas=seen.areas[:, rows] * growth**2,  # growth is of the lengths
+            agreement=seen.agreement[:, rows],
+        )
         held = replace(self.held, sums=self.held.sums[:, rows])
         return PhotometricTrust(thinned, self.is_recolored[rows], self.config, held)
 
@@ -108,9 +119,13 @@ def load_trust(
     """Load the trust that a config names, from all photographs of the scene."""
     if config.trust == "full":
         return Trust()
+    settings = config.trust_settings
     cameras = tuple(view.camera for view in views)
-    frozen, settings = scenes.freeze_at(parts, cameras), config.trust_settings
+    frozen = scenes.freeze_at(parts, cameras)
     observations = gather_observations(parts[0], views, frozen, settings)
+
+    # Photographs hold colours by their summed weights in pixels. Those are the visible areas,
+    # divided by the area of a pixel, and so leave out ignored pixels.
     pixels = torch.stack([compute_pixel_areas(observations.means, camera) for camera in cameras])
     sums = observations.areas / pixels.clamp_min(1e-30)
     weights = sums.new_full((len(cameras),), config.recolor.hold_weight)
@@ -129,18 +144,26 @@ def gather_observations(
     rendered: Gaussians, views: Sequence[View], frozen: Sequence[FrozenScene], config: TrustConfig
 ) -> PhotoObservations:
     """Measure visible area and photometric consistency of each Gaussian in each photograph."""
+    renders = [scene.render for scene in frozen]
     with use_one_torch_thread():
-        differences = map_in_parallel(compute_color_difference, [f.render for f in frozen], views)
-    known = [d[view.valid_mask].median() for d, view in zip(differences, views, strict=True)]
-    usual = torch.stack(known).median().item()
+        differences = map_in_parallel(compute_color_difference, renders, views)
+
+    # A difference that is usual in this scene is no evidence against a Gaussian, so the scale of
+    # differences grows with the median one.
+    medians = [
+        difference[view.valid_mask].median()
+        for difference, view in zip(differences, views, strict=True)
+    ]
+    usual = torch.stack(medians).median().item()
     scale = config.color_sigma * max(1.0, usual / EXACT_DIFFERENCE)
+
     areas, agreement = torch.empty((2, len(views), len(rendered))).to(rendered.means)
 
     def gather(k: int) -> None:
         agrees = torch.exp(-((differences[k] / scale) ** 2))
-        measured = measure_agreement(frozen[k], rendered.means, views[k], agrees)
-        areas[k], agreement[k] = measured
+        areas[k], agreement[k] = measure_agreement(frozen[k], rendered.means, views[k], agrees)
 
+    # The map is lazy on a GPU: each photograph is measured when its result is asked for.
     for _ in get_view_map(rendered.means)(gather, range(len(views))):
         pass
     centers = torch.stack([view.camera.center for view in views])
@@ -152,24 +175,35 @@ def measure_agreement(
 ) -> tuple[Float[Tensor, "m"], Float[Tensor, "m"]]:
     """Measure visible area [m] and mean agreement [m] of the first m Gaussians at a photograph.
 
-    Its ignored pixels show none of them.
+    `agrees` is the agreement of each pixel, in [0, 1]. Ignored pixels show none of the Gaussians.
     """
+    # Two sums are needed, and a backprojection takes three channels.
     valid = view.valid_mask.to(agrees)
     layers = torch.stack([valid, valid * agrees, torch.zeros_like(agrees)], dim=-1)
     sums = to_float32(frozen.backproject(layers)[: len(means)])
-    area, agreement = np.empty((2, len(means)), np.float32)
-    seen = (sums, to_float32(means), convert_camera(view.camera))
-    share(kernels.measure_photo_agreement, len(means), *seen, area, agreement)
+    area = np.empty(len(means), np.float32)
+    agreement = np.empty(len(means), np.float32)
+    share(
+        kernels.measure_photo_agreement,
+        len(means),
+        sums,
+        to_float32(means),
+        convert_camera(view.camera),
+        area,
+        agreement,
+    )
     return torch.from_numpy(area).to(means), torch.from_numpy(agreement).to(means)
 
 
 def compute_color_difference(render: Render, view: View) -> Float[Tensor, "h w"]:
     """Compute the absolute colour difference after an exposure fit, averaged over a few pixels."""
     shown = render.image.clamp(0, 1)
+    # The fit takes every n-th valid pixel, to save time.
     valid = view.valid_mask.flatten()
-    pixels = slice(None, None, max(1, int(valid.sum()) // EXPOSURE_PIXELS))
-    pairs = (image.reshape(-1, 3)[valid][pixels] for image in (shown, view.image))
-    gain, offset = fit_robust_affine(*pairs)
+    step = max(1, int(valid.sum()) // EXPOSURE_PIXELS)
+    shown_pixels = shown.reshape(-1, 3)[valid][::step]
+    photo_pixels = view.image.reshape(-1, 3)[valid][::step]
+    gain, offset = fit_robust_affine(shown_pixels, photo_pixels)
     return blur((view.fill_ignored(gain * shown + offset) - view.image).abs().mean(dim=-1))
 
 
@@ -181,13 +215,23 @@ def compute_trust(
 ) -> Float[Tensor, "m"]:
     """Compute the trust of each Gaussian from a camera: in [0, 1], 1 for invisible ones.
 
-    `sums` are the summed compositing weights of each Gaussian in its image.
+    This is trust_i of the method page. `sums` are the summed compositing weights of each Gaussian
+    in the image of `camera`.
     """
-    seen = (observations.areas, observations.agreement, observations.means, sums)
-    arrays = map(to_float32, (observations.centers, *seen))
-    limits = np.float32(math.radians(config.angle_sigma)), np.float32(FULL_TRUST_FRACTION)
     values = np.empty(len(sums), np.float32)
-    share(kernels.accumulate_trust, len(values), *arrays, convert_camera(camera), *limits, values)
+    share(
+        kernels.accumulate_trust,
+        len(values),
+        to_float32(observations.centers),
+        to_float32(observations.areas),
+        to_float32(observations.agreement),
+        to_float32(observations.means),
+        to_float32(sums),
+        convert_camera(camera),
+        np.float32(math.radians(config.angle_sigma)),
+        np.float32(FULL_TRUST_FRACTION),
+        values,
+    )
     return torch.from_numpy(values).to(sums)
 
 

@@ -82,10 +82,12 @@ def merge_lists(begin, end, context, new, used, full, tile_start, entries, depth
                 n += 1
                 n_depth = _get_depth(n_splats, n_entries, n, n, n_end, infinity)
             place += 1
+        # At most one of the lists has entries left.
         for rest in range(c, c_end):
             entries[place + rest - c] = c_entries[rest]
         for rest in range(n, n_end):
             entries[place + rest - n] = len(c_splats) + n_entries[rest]
+        # Depth of the last entry: of a full tile, no splat behind it is shown.
         if c < c_end:
             depth = c_splats[c_entries[c_end - 1], DEPTH]
         if n < n_end:
@@ -170,6 +172,7 @@ def composite(begin, end, tiles, context, new, frame):
 
         used[tile, 0], used[tile, 1] = c - c_begin, n - n_begin
         full[tile] = open_rows == 0
+        # A negative transmittance marks a pixel that is full. The depth is the mean over alpha.
         for row in range(rows):
             for column in range(columns):
                 transmittance = abs(state[row, 0, column])
@@ -228,12 +231,14 @@ def backproject_residual(begin, end, tiles, context, new, photograph, slots, sum
             open_rows -= simd.weigh_rows(first, stop, place, state, row_limit, kept, splat)
             place += max(stop - first, 0)
 
+        # The image of the tile becomes its residual, in place.
         for row in range(rows):
             for channel in range(3):
                 for column in range(columns):
                     wanted = photograph[top + row, left + column, channel]
                     state[row, 1 + channel, column] = wanted - state[row, 1 + channel, column]
 
+        # The rows of weights lie in the order in which they were written.
         place = 0
         for entry in range(n_begin, n):
             i, slot = n_entries[entry], slots[entry]
@@ -275,6 +280,8 @@ def composite_backward(
         state[:] = 0
         last[:] = -1
         row_limit[:] = -1
+        # The depth is D = S / A, with S the weighted sum and A alpha: dL/dS = dL/dD / A, and alpha
+        # gets -dL/dD D / A besides its own gradient.
         for row in range(rows):
             for column in range(columns):
                 y, x = top + row, left + column
@@ -294,6 +301,8 @@ def composite_backward(
         n_depth = _get_depth(n_splats, n_entries, n - 1, n_begin, n, nothing)
         while n > n_begin:
             position = np.int32(c - c_begin + n - n_begin - 1)
+            # The reverse of the forward order, in which the context comes first at equal depth. Its
+            # splats get no gradients, but change the transmittance.
             if c_depth > n_depth:
                 c -= 1
                 first, stop, splat = _place(c_splats, c_opacities, c_boxes, c_entries[c], left, top)
@@ -312,6 +321,8 @@ def composite_backward(
                     gradients[slot, channel] = sums[channel]
                 continue
             simd.revert_rows(*rows_of_splat)
+            # Moments of the gradient over the pixels, in x and y relative to the splat, become
+            # moments in s = u x + v y and t = w y, in which the splat is round.
             u, v, w = splat[2], splat[3], splat[4]
             x, y, xx, xy, yy = sums[1], sums[2], sums[3], sums[4], sums[5]
             gradients[slot, project.SUM] = sums[0]

@@ -35,6 +35,7 @@ def mark_run_starts(begin, end, means, scales, generated, centers, focals, reach
             if begins[i]:
                 x, y, z, origin = means[i, 0], means[i, 1], means[i, 2], generated[i]
                 pixel = _compute_pixel_size(x, y, z, centers, focals)
+                # Nothing joins a Gaussian that is too wide itself: no distance is below a negative.
                 if size > largest * pixel:
                     pixel = np.float32(-1)
 
@@ -94,6 +95,7 @@ def _compute_mean(first, last, shares, values, mean):
 
 @njit(fastmath={"contract"}, error_model="numpy")
 def _compute_variance(first, last, shares, means, quats, scales, mean, axis):
+    """Compute the variance of a run along a unit axis: that of the means, plus that of each."""
     ax, ay, az = axis
     variance = np.float32(0)
     for i in range(first, last):

@@ -76,6 +76,7 @@ def pad_column(images):
 
 @njit(inline="always")
 def _copy(image, y, x, patch):
+    """Copy a patch of a padded image, its pixels and channels side by side in each row."""
     numbers = image.reshape(-1)
     stride = np.uintp(3 * image.shape[1])
     start = np.uintp(y) * stride + np.uintp(3 * x)
@@ -93,6 +94,7 @@ def _compute_patch_cost(costs, patch, weight, total, sources, s, sy, sx, sums, b
     # Unsigned, so that no index is checked for negative values.
     stride = np.uintp(3 * W)
     start = np.uintp(3 * ((s * H + sy - RADIUS) * W + sx - RADIUS))
+    # Each lane sums its column of the patch over all rows, so that lanes are vectorised.
     for lane in range(LANES):
         square = difference = np.float32(0)
         for row in range(SIDE):
@@ -112,6 +114,8 @@ def _compute_patch_cost(costs, patch, weight, total, sources, s, sy, sx, sums, b
     d0 *= inverse
     d1 *= inverse
     d2 *= inverse
+    # With mean difference d and shift b, the mean square falls by 2 b d - b²: d is the best shift,
+    # as far as it is allowed.
     b0 = min(max(d0, -max_bias), max_bias)
     b1 = min(max(d1, -max_bias), max_bias)
     b2 = min(max(d2, -max_bias), max_bias)
@@ -123,6 +127,10 @@ def _compute_patch_cost(costs, patch, weight, total, sources, s, sy, sx, sums, b
 
 @njit(fastmath={"contract"})
 def _compute_prior(costs, nearer, dy, dx):
+    """Compute the cost of a source by its depth and distance, whatever its colours are.
+
+    nearer: logarithm of the expected depth over that of the source.
+    """
     distance = np.float32(np.sqrt(float(dy**2 + dx**2)))
     nearer = max(nearer, np.float32(0))
     return costs.depth_penalty * min(nearer * nearer, np.float32(1)) + (
@@ -193,6 +201,7 @@ def _improve(begin, end, problem, costs, max_reach, seed, before, field, cost, s
                 continue
             nearer = problem.expected_log_depth[i] - problem.log_depth[s, sy, sx]
             prior = _compute_prior(costs, nearer, sy - y, sx - x)
+            # Costs only add to it, so that the patch need not be compared.
             if prior >= best:
                 continue
             proposed = prior + _compute_patch_cost(
@@ -224,6 +233,7 @@ def vote(query_at, vote_weight, sources, field, shift):
 @njit(nogil=True, fastmath={"contract"})
 def _vote(begin, end, query_at, vote_weight, sources, field, shift, colors, totals):
     h, w = query_at.shape
+    # A thread writes its own rows alone, and reads the patches that reach into them from outside.
     for y in range(max(begin - RADIUS, 0), min(end + RADIUS, h)):
         for x in range(w):
             q = query_at[y, x]

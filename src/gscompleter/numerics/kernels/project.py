@@ -276,6 +276,8 @@ def project(begin, end, gaussians, pinhole, splats, boxes, factors):
             if not opacity >= MIN_ALPHA:
                 continue
 
+        # Alpha is opacity exp(-r² / 2) at r standard deviations; it reaches MIN_ALPHA at `sigmas`.
+        # The box of an ellipse is as wide as the deviations along x and y.
         center_x, center_y = fx * tan_x + cx, fy * tan_y + cy
         sigmas = math.sqrt(np.float32(2) * math.log(opacity / MIN_ALPHA)) + np.float32(1e-3)
         radius_x, radius_y = sigmas * deviation_x, sigmas * deviation_y
@@ -287,6 +289,8 @@ def project(begin, end, gaussians, pinhole, splats, boxes, factors):
             continue
         boxes[i, 0], boxes[i, 1] = np.int32(left), np.int32(right)
         boxes[i, 2], boxes[i, 3] = np.int32(top), np.int32(bottom)
+        # Cholesky factor of half the inverse covariance: alpha is opacity exp(-(s² + t²)), with
+        # s = u x + v y and t = w y.
         u = root_half * deviation_y / np.float32(math.sqrt(determinant))
         splats[i, X], splats[i, Y] = center_x, center_y
         splats[i, U] = u
@@ -350,6 +354,7 @@ def project_backward(
                     sums[column] += gradients[slot, column]
         if not any_written:
             continue
+        # SUM is alpha times its gradient, and alpha is proportional to the opacity.
         d_opacities[i] = sums[SUM] / opacities[i]
 
         # Colour, which is cut off at zero
@@ -362,6 +367,7 @@ def project_backward(
                 for k in range(len(basis)):
                     d_sh[i, k, channel] = d_color * basis[k]
                     d_basis[k] += d_color * sh[i, k, channel]
+        # Through the direction, the mean: only the part across the viewing ray turns it.
         turn = _basis_backward(direction, d_basis)
         radial = direction[0] * turn[0] + direction[1] * turn[1] + direction[2] * turn[2]
 
@@ -421,6 +427,8 @@ def project_backward(
             )
         d_rotation = _multiply(from_view, _scale_columns(d_axes, scales, i))
         d_quat = _rotation_backward(quat, d_rotation)
+        # The rotation does not depend on the length of the quaternion, so that the gradient has no
+        # part along it.
         along = quat[0] * d_quat[0] + quat[1] * d_quat[1]
         along = along + quat[2] * d_quat[2] + quat[3] * d_quat[3]
         for k in range(4):

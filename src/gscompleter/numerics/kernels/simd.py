@@ -73,6 +73,8 @@ class _Lanes:
 
 def _sum_lanes(builder, vectors):
     """Sum the lanes of each of up to sixteen vectors into one lane of the result."""
+    # A tree of pairs: two vectors become one that holds the sums of both, with half as many lanes
+    # each. Sixteen vectors take 15 additions instead of 16 times 4.
     values = [vector.value for vector in vectors]
     undefined = ir.Constant(_FLOATS, ir.Undefined)
     width = TILE
@@ -108,6 +110,7 @@ def _exp_negative(values):
     builder = values.builder
     power = values * -_LOG2_E
     power = power.where(power.compare(">", -120.0), -120.0)
+    # Truncation leaves a fraction in (-1, 0], where the polynomial holds.
     whole = builder.fptosi(power.value, _INTS)
     fraction = power - _Lanes(builder, builder.sitofp(whole, _FLOATS))
     polynomial = fraction.multiply_add(_EXP2[0], _EXP2[1])
@@ -189,7 +192,11 @@ def _loop_over_rows(builder, rows, position, row_limit, body):
 
 
 def _blend(splat, state, row):
-    """Composite a splat over a row; return its weights, and masks of visible and passing lanes."""
+    """Composite a splat over a row; return its weights, and masks of visible and passing lanes.
+
+    With transmittance T, weight = alpha T and T' = T - alpha T. A pixel closes with the splat that
+    would lower T to `MIN_TRANSMITTANCE`, which is not drawn; its T is kept with a minus sign.
+    """
     _, _, alpha, visible = splat.compute_falloff(row)
     alpha = alpha.where(visible, 0.0)
     before = state.load(row, 0)
@@ -329,6 +336,9 @@ def _make_revert(wanted):
                 gradients = [state.load(row, index) for index in range(2, 7)]
                 behind = state.load(row, 1)
 
+                # Back to front, T before a splat is T behind it over 1 - alpha. With c the gradient
+                # of the loss along the splat's channels (`value`) and B the sum of weight times c
+                # behind it, dL/dalpha = T c - B / (1 - alpha).
                 opening = 1.0 / (1.0 - alpha)
                 before = state.load(row, 0) * opening
                 weight = alpha * before
@@ -346,6 +356,7 @@ def _make_revert(wanted):
                     return
 
                 q = (before * value - behind * opening) * alpha
+                # A capped alpha does not depend on the splat.
                 q = q.where(raw.compare("<=", MAX_ALPHA), 0.0)
                 dys = _broadcast(builder, dy)
                 terms = [q, q * dys, q * dys * dys]
@@ -355,6 +366,7 @@ def _make_revert(wanted):
 
             _loop_over_rows(builder, (begin, end), position, limits, revert)
 
+            # dx is the same in all rows of a lane, so that the moments in it are made once, here.
             columns = [total.load() for total in totals]
             if wanted == "all":
                 q, q_dy, q_dy2 = columns[:3]

@@ -37,6 +37,7 @@ class Bands(NamedTuple):
 
 @njit(inline="always")
 def _get_first_cost(bands, y, x, width):
+    """Return the place of a pixel's first cost: tiles come first, then rows, pixels and planes."""
     row, column = y // TILE_ROWS, x // TILE_COLUMNS
     left = column * TILE_COLUMNS
     wide = min(TILE_COLUMNS, width - left)
@@ -119,6 +120,7 @@ def _match_tiles(
     H, W = source.shape[:2]
     columns = bands.low.shape[1]
     area = np.float32((2 * radius + 1) ** 2)
+    # Squared noise, summed over a window of three colours; it damps correlations of weak texture.
     floor = np.float32(3) * area * noise * noise
     for tile in range(begin, end):
         top, left = tile // columns * TILE_ROWS, tile % columns * TILE_COLUMNS
@@ -137,6 +139,8 @@ def _match_tiles(
         seen = np.empty((tall, wide), np.bool_)
         column = np.empty(wide, np.float32)
         line = np.empty((2, wide), np.float32)
+        # The reference window sums are the same at all planes: computed once, with a border of
+        # `radius` pixels around the tile.
         for y in range(tall):
             for x in range(wide):
                 yy = _clip(top + y - radius, 0, h - 1)
@@ -149,6 +153,7 @@ def _match_tiles(
         for c in range(3):
             _sum_boxes(own[c], own_mean[c], column, rows, cols, radius)
         _sum_boxes(product, own_square, column, rows, cols, radius)
+        # Sum of squared deviations: Σ a² - n mean².
         for y in range(rows):
             for x in range(cols):
                 for c in range(3):
@@ -157,6 +162,7 @@ def _match_tiles(
 
         first = bands.start[tile]
         for plane in range(count):
+            # Warp: A (x, y, 1) + b w, of which the part without x is constant along the row.
             depth = inverse_depths[low + plane]
             for y in range(tall):
                 py = np.float32(top + y - radius) + np.float32(0.5)
@@ -184,6 +190,7 @@ def _match_tiles(
                     ix = np.uint32(min(np.int32(sx), W - 2))
                     iy = np.uint32(min(np.int32(sy), H - 2))
                     ax, ay = sx - np.float32(ix), sy - np.float32(iy)
+                    # Bilinear weights, from one product.
                     w11 = ax * ay
                     w01 = ax - w11
                     w10 = ay - w11
@@ -214,6 +221,7 @@ def _match_tiles(
                 place = first + y * cols * count + plane
                 _compare(y, own, own_mean, other, other_mean, other_square, cross, line)
                 for x in range(cols):
+                    # Zero-mean normalised cross-correlation over all three channels together.
                     correlation = cross[y, x] / np.sqrt(
                         (max(other_square[y, x], np.float32(0)) + floor)
                         * (max(own_square[y, x], np.float32(0)) + floor)
@@ -258,6 +266,9 @@ def _prefer_given(begin, end, costs, bands, given, weight, step):
 @njit(fastmath={"contract"}, inline="always")
 def _step(cost, before, lowest, after, total, small, large):
     """Advance a path by one pixel and return its lowest cost there."""
+    # Hirschmüller's recursion: L(p, d) = C(p, d) + min(L(q, d), L(q, d ± 1) + small,
+    # min L(q) + large) - min L(q), with q the pixel before p on the path. Subtracting the lowest
+    # cost before bounds L, so that it fits into 16 bits.
     planes = cost.shape[0]
     ceiling = np.int16(lowest + large)
     best = INFEASIBLE
@@ -292,6 +303,7 @@ def _sweep_half(costs, bands, large_x, large_y, large_d, large_u, small, down, t
     widest = 2
     for width in (bands.high - bands.low).flat:
         widest = max(widest, width + 2)
+    # States of the row before and of this one, for the three paths that come from the row before.
     rows = np.zeros((2, 3, w, widest), np.int16)
     lows = np.zeros((2, 3, w), np.int16)
     along = np.zeros((2, widest), np.int16)
@@ -375,6 +387,7 @@ def _choose(begin, end, totals, bands, index, margin):
             for k in range(planes):
                 if total[k] < total[best]:
                     best = k
+            # Neighbours of the best plane are the same surface, and no rivals.
             second = INFEASIBLE
             for k in range(planes):
                 if abs(k - best) > 2:
@@ -410,6 +423,7 @@ def _carry(begin, end, depth, other, b_from_a, a_from_b, error, ratio):
     for y in range(begin, end):
         for x in range(w):
             px, py, own = np.float32(x + 0.5), np.float32(y + 0.5), depth[y, x]
+            # Into b: the homogeneous pixel and, as its third entry, the ratio of z-depths.
             q2 = b_from_a[2, 0] * px + b_from_a[2, 1] * py + b_from_a[2, 2] + b_from_a[2, 3] * own
             if q2 <= np.float32(1e-3):
                 continue
@@ -430,6 +444,7 @@ def _carry(begin, end, depth, other, b_from_a, a_from_b, error, ratio):
                 if abs(other[yy, xx] - expected) < best:
                     best = abs(other[yy, xx] - expected)
                     value = other[yy, xx]
+            # And back, with the inverse depth that b has there.
             r2 = a_from_b[2, 0] * sx + a_from_b[2, 1] * sy + a_from_b[2, 2] + a_from_b[2, 3] * value
             if r2 <= np.float32(1e-3):
                 continue
@@ -459,6 +474,7 @@ def _fill(begin, end, values, known, filled):
             if known[y, x]:
                 continue
             lowest, second = np.float32(np.inf), np.float32(np.inf)
+            # The eight neighbours of a 3 x 3 block are the directions.
             for direction in range(9):
                 dy, dx = direction // 3 - 1, direction % 3 - 1
                 if dy == 0 and dx == 0:

@@ -43,6 +43,7 @@ def _trace_rows(begin, end, image, known, directions, limits, colours, lengths):
                     colours[y, x, 1] += weight * g
                     colours[y, x, 2] += weight * b
                     lengths[y, x] = min(lengths[y, x], length)
+            # Without an end the total is 0, and so are the colours.
             for c in range(3):
                 colours[y, x, c] /= max(total, np.float32(1e-12))
 

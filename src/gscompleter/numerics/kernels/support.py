@@ -35,6 +35,7 @@ class CameraPose(NamedTuple):
 
 @njit(fastmath={"contract"})
 def _acos(x):
+    """Compute the arccosine as sqrt(1 - |x|) times a polynomial in |x|."""
     one = np.float32(1)
     away = min(abs(x), one)
     series = _A3 + away * (_A4 + away * (_A5 + away * (_A6 + away * _A7)))
@@ -47,6 +48,8 @@ def _acos(x):
 def _exp_negative(x):
     """Compute exp(-x) for x >= 0; beyond 80 it is practically 0."""
     power = max(-_LOG2_E * x, np.float32(-120))
+    # 2^power by its whole part, which goes into the exponent of a float32, and a polynomial for the
+    # rest, in (-1, 0].
     whole = np.int32(power)
     rest = power - np.float32(whole)
     series = _E0 + rest * (_E1 + rest * (_E2 + rest * (_E3 + rest * (_E4 + rest * _E5))))

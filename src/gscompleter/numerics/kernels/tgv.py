@@ -53,6 +53,8 @@ def advance(top, top_step, end, end_step, iterations, state, given):
     """
     for begin in range(0, iterations, ITERATIONS_PER_PASS):
         count = min(ITERATIONS_PER_PASS, iterations - begin)
+        # A wave over the rows: iteration `number` is `number` rows behind the front, so that a row
+        # has what it needs of the iteration before, and stays in the cache.
         for front in range(top, end + 2 * count):
             for number in range(1, count + 1):
                 y = front - number
@@ -65,6 +67,11 @@ def advance(top, top_step, end, end_step, iterations, state, given):
 
 @njit(nogil=True, fastmath={"contract"}, error_model="numpy")
 def _raise_duals(y, state, given):
+    """Ascend the dual variables of a row and project them onto their bounds.
+
+    `steps` belong to u_x - v_x and u_y - v_y, bounded by `across` and `down`; `bends` to the four
+    derivatives of v, whose length together is bounded by `bend`.
+    """
     _, _, ahead, gradients_ahead, steps, bends = state
     _, _, across, down, bend, _ = given
     h, w = ahead.shape
@@ -91,10 +98,12 @@ def _raise_duals(y, state, given):
 
 @njit(nogil=True, fastmath={"contract"}, error_model="numpy")
 def _lower_primals(y, state, given):
+    """Descend heights and gradients of a row, and extrapolate both for the next dual step."""
     heights, gradients, ahead, gradients_ahead, steps, bends = state
     data, weight, _, _, _, tolerance = given
     two, none = np.float32(2), np.float32(0)
     for x in range(heights.shape[1]):
+        # Negative divergence of the duals, with nothing beyond the border.
         push = steps[0, y, x] + steps[1, y, x]
         turn0 = bends[0, y, x] + bends[1, y, x]
         turn1 = bends[2, y, x] + bends[3, y, x]
@@ -109,6 +118,7 @@ def _lower_primals(y, state, given):
         before = heights[y, x]
         pull = PRIMAL_STEP * weight[y, x]
         miss = before + PRIMAL_STEP * push - data[y, x]
+        # Proximal step of the Huber loss: shrinking near the data, a constant pull farther off.
         if abs(miss) <= pull + tolerance:
             miss *= tolerance / (tolerance + pull)
         else:

@@ -26,6 +26,7 @@ def count_entries(begin, end, splats, boxes, depth_limits, tiles_x, counts):
 
 def counts_to_offsets(counts):
     """Turn counts [chunks, tiles] into offsets in place, and return the starts of the lists."""
+    # Tile by tile and, within a tile, chunk by chunk: so a list keeps the order of the Gaussians.
     ends = np.cumsum(counts.T, dtype=np.int64).reshape(counts.T.shape)
     starts = ends - counts.T
     counts[:] = starts.T
@@ -61,6 +62,7 @@ def sort_lists(begin, end, tile_start, entries, keys):
         start, stop = tile_start[tile], tile_start[tile + 1]
         size = stop - start
         own_entries, own_keys = entries[start:stop], keys[start:stop]
+        # Positive floats sort like their bits. One pass counts the digits of all four steps.
         places[:] = 0
         for k in range(size):
             for step in range(4):
@@ -72,6 +74,7 @@ def sort_lists(begin, end, tile_start, entries, keys):
                 most = max(most, count)
                 places[step, digit] = place
                 place += count
+            # All keys have this digit, as depths in a tile are alike in their upper bits.
             if most == size:
                 continue
             for k in range(size):
@@ -92,6 +95,7 @@ def number_slots(entries, count):
     slot_start = np.zeros(count + 1, np.int64)
     for place in range(len(entries)):
         slot_start[entries[place] + 1] += 1
+    # Counts become starts.
     slot = 0
     for i in range(count + 1):
         slot += slot_start[i]

@@ -60,6 +60,7 @@ def fit_poses(
     inverse, _ = triangulate(reference, source, pixels, matched)
     transform = compute_source_from_reference(reference, source).astype(np.float64)
     rays = np.concatenate([pixels, np.ones((len(pixels), 1))], axis=1) @ transform[:, :3].T
+    # A negative inverse depth lies behind the camera; the nearest possible one is that of infinity.
     points = rays + np.maximum(inverse, 0)[:, None] * transform[:, 3]
     is_ahead = points[:, 2] > MIN_DEPTH
     depths = np.where(is_ahead, points[:, 2], 1.0)

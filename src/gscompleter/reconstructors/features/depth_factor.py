@@ -11,7 +11,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from jaxtyping import Bool, Float, Int
+from jaxtyping import Float, Int
 from torch import Tensor
 
 from gscompleter.numerics.geometry import measure_baseline
@@ -100,19 +100,20 @@ def compare_with_matches(
     Features are used instead of the plane sweep: it searches between a near and a far plane, and
     these may come from the very depths that are compared.
     """
-    apart = [measure_baseline(views[0].camera, view.camera) for view in views[1:]]
-    if not any(apart):
+    baselines = [measure_baseline(views[0].camera, view.camera) for view in views[1:]]
+    if not any(baselines):
         return join_samples([])
     images, unit = make_stereo_images(views)
     neighbours = find_neighbours(images)
     parts = []
     for i, j in neighbours.pairs:
+        # Each match gives a depth in either photograph of the pair.
         in_i, in_j = neighbours.matches[i, j]
-        for a, b, here, there in ((i, j, in_i, in_j), (j, i, in_j, in_i)):
-            if len(here) == 0:
+        for a, b, in_a, in_b in ((i, j, in_i, in_j), (j, i, in_j, in_i)):
+            if len(in_a) == 0:
                 continue
-            inverse, is_valid = triangulate(images[a], images[b], here, there)
-            columns, rows = here.astype(int).T
+            inverse, is_valid = triangulate(images[a], images[b], in_a, in_b)
+            columns, rows = in_a.astype(int).T
             given = depths[a].double().numpy()[rows, columns]
             known = is_valid & (given > 0)
             number = np.full(int(known.sum()), a)
@@ -129,25 +130,26 @@ def fit_depth_factor(samples: DepthSamples) -> DepthFactor | None:
     if len(samples) < MIN_SAMPLES:
         return None
     ratios = np.log(samples.measured) - np.log(samples.given)
+
+    # The window around one of the ratios that holds the most of them, and the median in it.
     ordered = np.sort(ratios)
-    first, last = (np.searchsorted(ordered, ordered + shift) for shift in (-CORE, CORE))
+    first = np.searchsorted(ordered, ordered - CORE)
+    last = np.searchsorted(ordered, ordered + CORE)
     center = ordered[(last - first).argmax()]
     log_factor = float(np.median(ratios[np.abs(ratios - center) <= CORE]))
+
+    # A factor within the noise of the poses, or of the ratios themselves, counts as 1.
     sigma = MAD_TO_SIGMA * float(np.median(np.abs(ratios - log_factor)))
     if abs(log_factor) <= max(NOISE, sigma):
         log_factor = 0.0
+
     agrees = np.abs(ratios - log_factor) <= AGREEMENT
     agreement = float(agrees.mean())
-    shares = [agreement, *measure_shares(agrees, samples.photograph)]
+    count = np.bincount(samples.photograph)
+    share_of = np.bincount(samples.photograph, agrees) / np.maximum(count, 1)
+    shares = [agreement, *share_of[count >= MIN_OWN_SAMPLES].tolist()]
     is_consistent = min(shares) >= MIN_AGREEMENT and correlate_ranks(samples) >= MIN_CORRELATION
     return DepthFactor(float(np.exp(log_factor)), agreement, is_consistent)
-
-
-def measure_shares(agrees: Bool[np.ndarray, "n"], photograph: Int[np.ndarray, "n"]) -> list[float]:
-    """Measure the share that agrees in each photograph with enough samples."""
-    count = np.bincount(photograph)
-    share = np.bincount(photograph, agrees) / np.maximum(count, 1)
-    return [float(part) for part in share[count >= MIN_OWN_SAMPLES]]
 
 
 def correlate_ranks(samples: DepthSamples) -> float:

@@ -6,7 +6,6 @@ from collections.abc import Callable, Sequence
 from dataclasses import replace
 
 import numpy as np
-from jaxtyping import Float
 
 from gscompleter.reconstructors.features.matches import triangulate_valid
 from gscompleter.reconstructors.features.neighbours import Neighbours, find_neighbours
@@ -35,9 +34,9 @@ def estimate_depth_range(views: Sequence[View]) -> tuple[float, float]:
     depths = measure_extreme_depths(images, neighbours)
     if depths is None:
         near, far = derive_range_from_baselines(images, neighbours)
-    else:
-        near, far = MARGINS[0] * depths[0], MARGINS[1] * depths[1]
-    return near * unit, far * unit
+        return near * unit, far * unit
+    nearest, farthest = depths
+    return MARGINS[0] * nearest * unit, MARGINS[1] * farthest * unit
 
 
 def measure_feature_depths(views: Sequence[View]) -> tuple[float, float] | None:
@@ -54,9 +53,17 @@ def measure_extreme_depths(
     images: Sequence[StereoImage], neighbours: Neighbours
 ) -> tuple[float, float] | None:
     """Measure the depths of the nearest and farthest 2 %, per widest baseline; None for too few."""
-    inverse = triangulate_neighbours(images, neighbours)
+    # Inverse z-depths of the matches of neighbouring views, seen from either view.
+    inverses = [np.zeros(0)]
+    for i, j in neighbours.pairs:
+        in_i, in_j = neighbours.matches[i, j]
+        if len(in_i):
+            inverses.append(triangulate_valid(images[i], images[j], in_i, in_j))
+            inverses.append(triangulate_valid(images[j], images[i], in_j, in_i))
+    inverse = np.concatenate(inverses)
     if len(inverse) < MIN_MATCHES:
         return None
+    # The nearest depth is the largest inverse depth.
     low, high = np.quantile(inverse, [0.02, 0.98]).tolist()
     return 1 / high, 1 / low
 
@@ -66,10 +73,12 @@ def get_depth_range(
     estimate: Callable[[Sequence[View]], tuple[float, float]] = estimate_depth_range,
 ) -> tuple[float, float]:
     """Return near and far z-depth of the first camera, estimated if unknown."""
-    near, far = views[0].camera.near, views[0].camera.far
+    near = views[0].camera.near
+    far = views[0].camera.far
     if near is None or far is None:
         low, high = estimate(views)
-        near, far = near if near is not None else low, far if far is not None else high
+        near = low if near is None else near
+        far = high if far is None else far
     if not 0 < near < far:
         raise InputError(
             f"The depth range {near:g} to {far:g} is empty; near must be positive and less "
@@ -97,23 +106,14 @@ def set_depth_range(views: Sequence[View], near: float, far: float) -> list[View
 def derive_range_from_baselines(
     images: Sequence[StereoImage], neighbours: Neighbours
 ) -> tuple[float, float]:
-    """Derive a depth range from a parallax of 0.4 image widths and of a third of a pixel."""
+    """Derive a depth range from a parallax of 0.4 image widths and of a third of a pixel.
+
+    A parallax of p pixels has the depth baseline · focal / p. Baseline is the median over each
+    view and its best neighbour, in units of the widest one.
+    """
     focal = float(np.median([image.K[0, 0] for image in images]))
     width = float(np.median([image.size[1] for image in images]))
     pairs = [(i, others[0]) for i, others in enumerate(neighbours.neighbours_of) if others]
-    apart = [float(np.linalg.norm(images[i].center - images[j].center)) for i, j in pairs]
-    baseline = float(np.median(apart))
+    baselines = [float(np.linalg.norm(images[i].center - images[j].center)) for i, j in pairs]
+    baseline = float(np.median(baselines))
     return baseline * focal / (0.4 * width), baseline * 3.0 * focal
-
-
-def triangulate_neighbours(
-    images: Sequence[StereoImage], neighbours: Neighbours
-) -> Float[np.ndarray, "n"]:
-    """Triangulate the matches of neighbouring views; inverse z-depth per widest baseline."""
-    found = [np.zeros(0)]
-    for i, j in neighbours.pairs:
-        a, b = neighbours.matches[i, j]
-        if len(a):
-            found.append(triangulate_valid(images[i], images[j], a, b))
-            found.append(triangulate_valid(images[j], images[i], b, a))
-    return np.concatenate(found)

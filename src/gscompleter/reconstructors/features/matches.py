@@ -50,9 +50,12 @@ def match_features(a: Features, b: Features) -> tuple[Pixels, Pixels]:
     """Match mutual nearest neighbours that pass the ratio test."""
     if len(a[0]) < 2 or len(b[0]) < 2:
         return np.zeros((0, 2)), np.zeros((0, 2))
+    # Squared distances of all descriptors [features of a, features of b].
     squares = (a[1] ** 2).sum(1)[:, None] + (b[1] ** 2).sum(1)[None] - 2 * a[1] @ b[1].T
-    forward, backward = squares.argmin(1), squares.argmin(0)
+    forward = squares.argmin(1)
+    backward = squares.argmin(0)
     best, second = np.partition(squares, 1, axis=1)[:, :2].T
+    # Ratio test (Lowe 2004): 0.8 times the second best distance, squared.
     i = np.flatnonzero((backward[forward] == np.arange(len(a[0]))) & (best < 0.64 * second))
     return a[0][i], b[0][forward[i]]
 
@@ -76,10 +79,13 @@ def triangulate(
     factor = b[:2] - matched * b[2]
     offset = matched * at_infinity[:, 2:] - at_infinity[:, :2]
     inverse = (factor * offset).sum(1) / np.maximum((factor * factor).sum(1), 1e-12)
+
+    # A match is valid if its point lies in front of both cameras, close to the match in the image,
+    # and moves between the images by more than the noise.
     at_depth = at_infinity + inverse[:, None] * b
     ahead = (at_depth[:, 2] > 1e-6) & (at_infinity[:, 2] > 1e-6)
     scale = np.where(ahead, at_depth[:, 2], 1.0)[:, None]
     error = np.linalg.norm(at_depth[:, :2] / scale - matched, axis=1)
-    start = at_infinity[:, :2] / np.where(ahead, at_infinity[:, 2], 1.0)[:, None]
-    parallax = np.linalg.norm(start - matched, axis=1)
+    infinite = at_infinity[:, :2] / np.where(ahead, at_infinity[:, 2], 1.0)[:, None]
+    parallax = np.linalg.norm(infinite - matched, axis=1)
     return inverse, ahead & (inverse > 0) & (error < MAX_ERROR) & (parallax > MIN_PARALLAX)

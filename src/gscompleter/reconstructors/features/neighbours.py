@@ -28,8 +28,10 @@ TURN_PER_TWO_STEPS = 15.0
 """Rotation in degrees that counts as much as two steps between cameras."""
 BEST_ANGLE = 5.0
 """Best triangulation angle, in degrees."""
-NARROWER_SIGMA, WIDER_SIGMA = 2.0, 10.0
-"""Standard deviations of the score below and above that angle, in degrees."""
+NARROWER_SIGMA = 2.0
+"""Standard deviation of the score below that angle, in degrees."""
+WIDER_SIGMA = 10.0
+"""Standard deviation of the score above that angle, in degrees."""
 MIN_PAIR_SCORE = 1e-6
 """Score of a pair without shared features: better than no neighbour."""
 
@@ -60,24 +62,32 @@ class Neighbours:
 def find_neighbours(images: Sequence[StereoImage], count: int = NUM_SOURCES) -> Neighbours:
     """Select up to `count` neighbours for each image."""
     features = map_in_parallel(detect_features, images)
-    found = {(i, j): match_features(features[i], features[j]) for i, j in find_close_pairs(images)}
-    worth = np.zeros((len(images), len(images)))
-    for (i, j), pixels in found.items():
-        worth[i, j] = worth[j, i] = MIN_PAIR_SCORE + score_pair(images[i], images[j], *pixels)
-    ranked = (-worth).argsort(axis=1, kind="stable")[:, :count]
-    chosen = [tuple(int(j) for j in row if worth[i, j] > 0) for i, row in enumerate(ranked)]
-    return Neighbours(tuple(chosen), found)
+    matches = {
+        (i, j): match_features(features[i], features[j]) for i, j in find_close_pairs(images)
+    }
+    # 0 for pairs that were not compared, which become no neighbours.
+    scores = np.zeros((len(images), len(images)))
+    for (i, j), (in_i, in_j) in matches.items():
+        score = MIN_PAIR_SCORE + score_pair(images[i], images[j], in_i, in_j)
+        scores[i, j] = score
+        scores[j, i] = score
+    # A stable order: of equal scores the first image wins on every machine.
+    ranked = (-scores).argsort(axis=1, kind="stable")[:, :count]
+    chosen = [tuple(int(j) for j in row if scores[i, j] > 0) for i, row in enumerate(ranked)]
+    return Neighbours(tuple(chosen), matches)
 
 
 def find_close_pairs(images: Sequence[StereoImage]) -> list[Pair]:
     """List pairs i < j with a baseline and a similar position and direction."""
     centers = np.stack([image.center for image in images])
     forward = np.stack([image.rotation[:, 2] for image in images])
-    apart = np.linalg.norm(centers[:, None] - centers[None], axis=-1)
+    distance = np.linalg.norm(centers[:, None] - centers[None], axis=-1)
     turned = np.degrees(np.arccos((forward @ forward.T).clip(-1, 1)))
-    apart[apart == 0] = np.inf
-    step = np.median(apart.min(axis=1))
-    unlike = apart / step + 2 * turned / TURN_PER_TWO_STEPS
+    # Cameras in one place, the same one among them, form no pair: there is no parallax.
+    distance[distance == 0] = np.inf
+    # The usual distance between neighbouring cameras is the unit of the dissimilarity.
+    step = np.median(distance.min(axis=1))
+    unlike = distance / step + 2 * turned / TURN_PER_TWO_STEPS
     nearest = unlike.argsort(axis=1, kind="stable")[:, :NUM_COMPARED]
     pairs = {(i, int(j)) for i, row in enumerate(nearest) for j in row if np.isfinite(unlike[i, j])}
     return sort_pairs(pairs)
@@ -92,6 +102,7 @@ def score_pair(a: StereoImage, b: StereoImage, in_a: Pixels, in_b: Pixels) -> fl
     """Score two photographs by the triangulation angles of their matches, each up to 1."""
     if len(in_a) == 0:
         return 0.0
+    # Baseline over depth; half of it is the tangent of half the angle at a point between both.
     ratio = float(np.linalg.norm(a.center - b.center)) * triangulate_valid(a, b, in_a, in_b)
     excess = np.degrees(2 * np.arctan(ratio / 2)) - BEST_ANGLE
     sigma = np.where(excess < 0, NARROWER_SIGMA, WIDER_SIGMA)

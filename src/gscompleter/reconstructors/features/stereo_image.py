@@ -60,6 +60,8 @@ def make_stereo_images(views: Sequence[View]) -> tuple[list[StereoImage], float]
     near = views[0].camera.near
     if is_single and near:
         return [_make_stereo_image(views[0], np.zeros(3), near)], near
+
+    # Baselines below the rounding of the coordinates count as none.
     centers = np.stack([view.camera.center.detach().cpu().double().numpy() for view in views])
     unit = float(np.linalg.norm(centers[:, None] - centers[None], axis=-1).max())
     if unit <= 2e-7 * float(np.linalg.norm(centers, axis=-1).max()):
@@ -68,30 +70,27 @@ def make_stereo_images(views: Sequence[View]) -> tuple[list[StereoImage], float]
             "them; give photographs taken from different positions."
         )
     offsets = np.round((centers - centers[0]) / unit * 2**16) / 2**16
-    return [
+    images = [
         _make_stereo_image(view, offset, unit) for view, offset in zip(views, offsets, strict=True)
-    ], unit
+    ]
+    return images, unit
 
 
 def _make_stereo_image(view: View, center: Float[np.ndarray, "3"], unit: float) -> StereoImage:
     camera = view.camera
+    given = np.zeros(view.image.shape[:2], np.float32)
+    if view.given_depth is not None:
+        depth = view.given_depth.detach().cpu().numpy()
+        inverse = unit / np.maximum(depth, NEAREST * unit)
+        given = np.where(depth > 0, inverse, 0).astype(np.float32)
     return StereoImage(
         np.ascontiguousarray(view.image.detach().cpu().float().numpy()),
         camera.K.detach().cpu().double().numpy(),
         camera.c2w[:3, :3].detach().cpu().double().numpy(),
         center,
-        invert_given(view, unit),
+        given,
         None if view.ignore_mask is None else view.ignore_mask.cpu().numpy(),
     )
-
-
-def invert_given(view: View, unit: float) -> Float32[np.ndarray, "h w"]:
-    """Invert the given depth of a view, in scene units, to units of `unit`; 0 where unknown."""
-    if view.given_depth is None:
-        return np.zeros(view.image.shape[:2], np.float32)
-    depth = view.given_depth.detach().cpu().numpy()
-    inverse = unit / np.maximum(depth, NEAREST * unit)
-    return np.where(depth > 0, inverse, 0).astype(np.float32)
 
 
 def compute_contrast(

@@ -23,8 +23,10 @@ from gscompleter.types import DepthMap, Gaussians, View
 
 OPACITY_STEPS = 6
 """Adam steps on the opacities of two photographs."""
-OPACITY_RATE, OPACITY_BETAS = 1.0, (0.7, 0.99)
-"""Adam step size and decay rates, short because there are few steps."""
+OPACITY_RATE = 1.0
+"""Adam step size of the opacities, in logits."""
+OPACITY_BETAS = 0.7, 0.99
+"""Adam decay rates of the opacities, short because there are few steps."""
 REMOVAL_PENALTY = 0.01
 """Loss per unit of removed opacity; keeps Gaussians that no photograph contradicts."""
 
@@ -49,10 +51,13 @@ def fit_opacities(
 
     Also return the depth rendered at each view before its last step.
     """
+    # Only opacities move, so that projection and depth order are computed once per view.
     nothing = gaussians[:0]
     plans = [(renderer.freeze(nothing, v.camera).vary_opacities(gaussians), v.image) for v in views]
+
     logits = gaussians.opacities.logit(eps=1e-4).requires_grad_()
     optimizer = Adam([(logits, OPACITY_RATE)], OPACITY_BETAS)
+    # Each step has the loss of all views, estimated from one of them in turn.
     weight = REMOVAL_PENALTY * len(views) / len(gaussians)
     depths: list[DepthMap] = []
     for step in range(OPACITY_STEPS):
@@ -73,25 +78,32 @@ def fit_jointly(
 ) -> Gaussians:
     """Minimize the squared image error, with renders scaled by each view's exposure gain.
 
-    Colours are linear in the images, so that they are then fitted without gradients.
+    The images are linear in the colours, so that these are then fitted alone, to all views at once
+    and without gradients. Two such rounds are worth several Adam steps (decision 045).
     """
     unknown = init_parameters(gaussians)
     optimizer = Adam([(unknown[name], rate) for name, rate in RATES.items()], BETAS)
     order = shuffle_views(len(views))
     for step, number in enumerate(order):
-        view, fitted = views[number], apply_parameters(gaussians, unknown)
+        view = views[number]
+        fitted = apply_parameters(gaussians, unknown)
         image = renderer.render(fitted, view.camera).image
-        left = 1 - (1 - FINAL_RATE) * step / len(order)
-        optimizer.step((gains[number] * image - view.image).square().mean(), left)
-    found = {name: value.detach() for name, value in unknown.items()}
-    made = apply_parameters(gaussians, found)
-    frozen = [renderer.freeze(made[:0], view.camera) for view in views]
-    even = [replace(v, image=v.image / gain) for v, gain in zip(views, gains, strict=True)]
-    return fit_colors(made, frozen, even, COLOR_RELAXATIONS)
+        rate_factor = 1 - (1 - FINAL_RATE) * step / len(order)
+        optimizer.step((gains[number] * image - view.image).square().mean(), rate_factor)
+
+    fitted = apply_parameters(gaussians, {name: v.detach() for name, v in unknown.items()})
+    frozen = [renderer.freeze(fitted[:0], view.camera) for view in views]
+    # The scene has one exposure, so that each photograph is divided by its own.
+    normalized = [replace(v, image=v.image / gain) for v, gain in zip(views, gains, strict=True)]
+    return fit_colors(fitted, frozen, normalized, COLOR_RELAXATIONS)
 
 
 def init_parameters(gaussians: Gaussians) -> dict[str, Tensor]:
-    """Initialize the optimized parameters, with the keys of `RATES`."""
+    """Initialize the optimized parameters, with the keys of `RATES`.
+
+    `moved` is an offset in units of the Gaussian's size and `grown` the logarithm of a factor of
+    its size, so that one step size suits Gaussians of all sizes and units.
+    """
     start = {
         "moved": torch.zeros_like(gaussians.means),
         "quats": gaussians.quats,
@@ -103,7 +115,7 @@ def init_parameters(gaussians: Gaussians) -> dict[str, Tensor]:
 
 
 def apply_parameters(gaussians: Gaussians, unknown: dict[str, Tensor]) -> Gaussians:
-    """Apply the parameters to the Gaussians."""
+    """Apply the parameters of `init_parameters` to the Gaussians that they began with."""
     size = gaussians.scales.amax(dim=-1, keepdim=True)
     return replace(
         gaussians,

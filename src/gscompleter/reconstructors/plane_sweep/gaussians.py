@@ -71,23 +71,36 @@ class Splatter:
         """
         gains = torch.from_numpy(estimate_gains(layers, transforms)).float()
         device = views[0].image.device
-        normalized = list(map(View.normalize_exposure, views, gains.to(device)))
+        normalized = [
+            view.normalize_exposure(gain)
+            for view, gain in zip(views, gains.to(device), strict=True)
+        ]
+
+        # A disc for every pixel of every view, of which those that form the scene are kept.
         parts = [self.splat(view, depth) for view, depth in zip(normalized, depths, strict=True)]
-        every, on_cpu = merge(parts).to("cpu"), [view.to("cpu") for view in views]
-        counted = flatten_masks([view.valid_mask for view in on_cpu])
-        chosen = self.select_pixels(every, on_cpu, layers, transforms) & counted
-        behind = self.extend_skies(normalized, depths)
-        made = merge([every[chosen], *(gaussians.to("cpu") for _, gaussians, _ in behind)])
-        known = [self.replace_ignored(made, *pair) for pair in zip(on_cpu, gains, strict=True)]
-        fitted = restore_sky_colors(made, self.fit_gaussians(made, known, gains), on_cpu[0].camera)
-        rows = torch.cat([torch.arange(len(part)) for part in parts])[chosen]
-        numbers = torch.cat([torch.full((len(part),), i) for i, part in enumerate(parts)])[chosen]
-        more = [torch.full((len(pixels),), i) for i, _, pixels in behind]
+        candidates = merge(parts).to("cpu")
+        on_cpu = [view.to("cpu") for view in views]
+        kept = self.select_pixels(candidates, on_cpu, layers, transforms)
+        kept &= flatten_masks([view.valid_mask for view in on_cpu])
+        skies = self.extend_skies(normalized, depths)
+        scene = merge([candidates[kept], *(gaussians.to("cpu") for _, gaussians, _ in skies)])
+
+        photographs = [
+            self.replace_ignored(scene, view, gain)
+            for view, gain in zip(on_cpu, gains, strict=True)
+        ]
+        fitted = self.fit_gaussians(scene, photographs, gains)
+        fitted = restore_sky_colors(scene, fitted, on_cpu[0].camera)
+
+        # View and pixel of each Gaussian, in the order of the scene.
+        pixels = torch.cat([torch.arange(len(part)) for part in parts])[kept]
+        numbers = torch.cat([torch.full((len(part),), i) for i, part in enumerate(parts)])[kept]
+        sky_numbers = [torch.full((len(sky_pixels),), i) for i, _, sky_pixels in skies]
         return Reconstruction(
             fitted.to(device),
             tuple(depths),
-            torch.cat([numbers, *more]).to(device),
-            torch.cat([rows, *(pixels.cpu() for _, _, pixels in behind)]).to(device),
+            torch.cat([numbers, *sky_numbers]).to(device),
+            torch.cat([pixels, *(sky_pixels.cpu() for _, _, sky_pixels in skies)]).to(device),
             None if (gains == 1).all() else gains.to(device),
         )
 
@@ -95,10 +108,11 @@ class Splatter:
         self, views: Sequence[View], depths: Sequence[DepthMap], pixel_mask: Bool[Tensor, "h w"]
     ) -> Reconstruction:
         """Lift the pixels of `pixel_mask` in the first view and fit their colours to it."""
-        rows = torch.nonzero(pixel_mask.reshape(-1))[:, 0]
-        blurred, image = self.splat(views[0], depths[0])[rows].to("cpu"), views[0].to("cpu")
-        made = self.fit_to_image(blurred, image).to(rows.device)
-        return Reconstruction(made, tuple(depths), torch.zeros_like(rows), rows)
+        pixels = torch.nonzero(pixel_mask.reshape(-1))[:, 0]
+        # Discs overlap, so that colours of the pixels alone would draw a blurred image.
+        blurred = self.splat(views[0], depths[0])[pixels].to("cpu")
+        lifted = self.fit_to_image(blurred, views[0].to("cpu")).to(pixels.device)
+        return Reconstruction(lifted, tuple(depths), torch.zeros_like(pixels), pixels)
 
     def fit_to_image(self, gaussians: Gaussians, view: View) -> Gaussians:
         """Fit only the colours, to one image."""
@@ -117,6 +131,8 @@ class Splatter:
             return torch.ones(len(gaussians), dtype=torch.bool)
         free = find_free_pixels(layers, transforms)
         kept = flatten_masks(find_finest_pixels(layers, free, transforms))
+        # Where the finer views do not close a surface, a view gets its own pixels back. Each view
+        # sees what those before it restored.
         start = 0
         for view, mask in zip(views, free, strict=True):
             alpha = self.renderer.render(gaussians[kept], view.camera).alpha
@@ -125,11 +141,11 @@ class Splatter:
             start += gap.numel()
         return kept
 
-    def replace_ignored(self, made: Gaussians, view: View, gain: Float[Tensor, "3"]) -> View:
+    def replace_ignored(self, scene: Gaussians, view: View, gain: Float[Tensor, "3"]) -> View:
         """Replace ignored pixels by the render, so that nothing is fitted to them."""
         if view.ignore_mask is None:
             return view
-        image = self.renderer.render(made, view.camera).image * gain
+        image = self.renderer.render(scene, view.camera).image * gain
         return replace(view, image=torch.where(view.ignore_mask[..., None], image, view.image))
 
     @use_one_torch_thread()
@@ -152,11 +168,13 @@ class Splatter:
         self, views: Sequence[View], depths: Sequence[DepthMap]
     ) -> list[tuple[int, Gaussians, Int[Tensor, "n"]]]:
         """List view number, Gaussians and pixels of the sky behind each view's objects."""
-        return [
-            (i, *extend_sky(view, sky, self.disc_sigma))
-            for i, (view, depth) in enumerate(zip(views, depths, strict=True))
-            if (sky := is_sky(depth.depth, view.camera)).any()
-        ]
+        extended = []
+        for number, (view, depth) in enumerate(zip(views, depths, strict=True)):
+            sky = is_sky(depth.depth, view.camera)
+            if sky.any():
+                gaussians, pixels = extend_sky(view, sky, self.disc_sigma)
+                extended.append((number, gaussians, pixels))
+        return extended
 
 
 def flatten_masks(masks: Sequence[Mask | Tensor]) -> Bool[Tensor, "n"]:
@@ -175,12 +193,17 @@ def make_discs(
     camera = view.camera
     rays = camera.z_rays()
     means = (camera.center + depth[..., None] * rays).reshape(-1, 3)
+    # Width of a pixel at the depth of the surface, in scene units.
     pixel = depth.reshape(-1) * 2 / (camera.K[0, 0] + camera.K[1, 1])
 
+    # Both in world axes.
     normal = normals.reshape(-1, 3) @ camera.c2w[:3, :3].T
     towards = -torch.nn.functional.normalize(rays, dim=-1).reshape(-1, 3)
     cosine = (normal * towards).sum(-1, keepdim=True).clamp_min(1 / MAX_STRETCH)
-    # On a slanted surface the disc is elongated, so that its projection stays round.
+
+    # On a slanted surface the disc is elongated by 1 / cosine, so that its projection stays round:
+    # its short axis is perpendicular to normal and ray. A frontal disc is round, and its axis only
+    # has to lie in the surface.
     across = torch.linalg.cross(normal, towards)
     flat = across.norm(dim=-1, keepdim=True) < 1e-3
     across = torch.where(flat, camera.c2w[:3, 0].expand_as(across), across)
@@ -204,11 +227,13 @@ def compute_normals(depth: Float[Tensor, "h w"], view: View) -> Float[Tensor, "h
     """Compute normals in camera axes, towards the camera, by one-sided differences."""
     camera = view.camera
     rays = camera.z_rays() @ camera.c2w[:3, :3]
-    # Scale by a power of two, which is exact, so that squares neither overflow nor vanish.
+    # Rays are in camera axes. The unit is a power of two, which is exact, so that squares neither
+    # overflow nor vanish.
     unit = 2.0 ** depth.median().log2().round().item()
     points = rays * (depth / unit)[..., None]
 
     def difference(p: Float[Tensor, "a b 3"]) -> Float[Tensor, "a b 3"]:
+        # Of the steps to both neighbours the one with less change of depth stays on the surface.
         step = p[:, 1:] - p[:, :-1]
         after = torch.cat([step, step[:, -1:]], 1)
         before = torch.cat([step[:, :1], step], 1)

@@ -14,9 +14,12 @@ from gscompleter.reconstructors.plane_sweep.sweep import (
 )
 
 
-def add_given(found: Measurement, image: StereoImage) -> Measurement:
+def add_given(measured: Measurement, image: StereoImage) -> Measurement:
     """Use given depths instead of stereo, with the weight of the most confident stereo."""
-    full, known, sure = found.resize_to(image.size), image.given > 0, np.float32(1)
+    full = measured.resize_to(image.size)
+    known = image.given > 0
+    sure = np.float32(1)
+    # Given depths outside the searched range lie one plane beyond it.
     index = compute_plane_index(full.planes, image.given).clip(-1, len(full.planes))
     return replace(
         full,

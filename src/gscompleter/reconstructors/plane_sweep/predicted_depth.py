@@ -27,23 +27,28 @@ WEIGHT = np.float32(0.1)
 """Weight of a predicted pixel in the surface fit; a confident measurement has 1."""
 
 
-def add_prediction(found: Measurement, predicted: DepthMap) -> Measurement:
+def add_prediction(measured: Measurement, predicted: DepthMap) -> Measurement:
     """Use predicted depth where stereo measured nothing, aligned to the confident pixels.
 
     RANSAC fits one affine function of inverse depth, up to which monocular depth is right.
     """
     valid = predicted.valid.cpu().numpy()
-    full = found.resize_to(valid.shape)
+    full = measured.resize_to(valid.shape)
     guess = np.where(valid, 1 / predicted.depth.cpu().numpy().clip(1e-9), 0)
     sure = np.flatnonzero(valid & (full.confidence >= MIN_CONFIDENCE))
     if len(sure) < MIN_PIXELS:
-        return found
+        return measured
+
+    # Inverse depths of every n-th confident pixel: x predicted, y measured.
     sample = sure[:: -(-len(sure) // MAX_PIXELS)]
-    pair = guess, compute_inverse_depth(full.planes, full.index)
-    x, y = (torch.from_numpy(values.ravel()[sample]).double() for values in pair)
+    inverse_measured = compute_inverse_depth(full.planes, full.index)
+    x = torch.from_numpy(guess.ravel()[sample]).double()
+    y = torch.from_numpy(inverse_measured.ravel()[sample]).double()
     scale, shift = fit_line_ransac(x, y, torch.Generator().manual_seed(0))
     if find_affine_inliers(x, y, scale, shift).double().mean() < MIN_INLIERS:
-        return found
+        return measured
+
+    # At most twice as far as the far plane; the shift may bring inverse depths to 0 and below.
     inverse = np.maximum(scale * guess + shift, full.planes[0] / 2).astype(np.float32)
     empty = valid & (full.weight == 0)
     index = np.where(empty, compute_plane_index(full.planes, inverse), full.index)

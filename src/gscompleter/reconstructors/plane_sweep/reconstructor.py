@@ -72,13 +72,15 @@ class PlaneSweep(Splatter):
         rig = build_rig(views)
         first, second = match_views(rig, views, MIN_HALVED_SIDES["lift"])
         first = add_given(first, rig.images[0])
-        open_there = find_sky(rig.images[1], second)
         first = add_prediction(first, predict_depth(self.predict_depth, views[0]))
+
+        # The sky is found in the photograph and carried over by direction; the synthesized image
+        # only has to be even there.
+        sky_of_second = find_sky(rig.images[1], second)
+        sky_of_first = transfer_sky(rig, sky_of_second)
         layers = [
-            make_layer(
-                rig.images[0], first.exclude(transfer_sky(rig, open_there)), LIFT_ITERATIONS
-            ),
-            make_layer(rig.images[1], second.exclude(open_there), 0),
+            make_layer(rig.images[0], first.exclude(sky_of_first), LIFT_ITERATIONS),
+            make_layer(rig.images[1], second.exclude(sky_of_second), 0),
         ]
         return self.lift_pixels(views, make_depth_maps(layers, rig.unit, views), pixel_mask)
 
@@ -87,6 +89,8 @@ class PlaneSweep(Splatter):
     ) -> Reconstruction:
         """Lift an image by the given depth of a photograph from the same place."""
         assert anchor.given_depth is not None
+        # Both cameras have one centre and may differ in rotation, so that the given depths are
+        # carried over as points.
         known = anchor.given_depth > 0
         points = unproject(anchor.given_depth, anchor.camera)[known]
         turned = replace(image, given_depth=compute_sparse_depth(points, image.camera))
@@ -101,14 +105,25 @@ class PlaneSweep(Splatter):
 
     def compute_layers(self, rig: Rig, views: Sequence[View]) -> list[Layer]:
         """Compute the completed inverse depth of each view."""
-        least = MIN_HALVED_SIDES["pair" if len(views) == 2 else "many"]
-        stereo = match_views(rig, views, least)
-        found = list(map(add_given, stereo, rig.images))
-        seen = find_skies(rig, found)
-        predicted = [predict_depth(self.predict_depth, view) for view in views]
-        guided = map(add_prediction, found, predicted)
-        surfaces = map_in_parallel(make_layer, rig.images, map(Measurement.exclude, guided, seen))
-        return list(map(add_sky, surfaces, found, seen))
+        min_halved_side = MIN_HALVED_SIDES["pair" if len(views) == 2 else "many"]
+        measured = [
+            add_given(measurement, image)
+            for measurement, image in zip(
+                match_views(rig, views, min_halved_side), rig.images, strict=True
+            )
+        ]
+        # The sky is judged by measurements alone, before predictions fill its pixels. Surfaces are
+        # fitted without it, as its matches are arbitrary, and it gets its depth afterwards.
+        skies = find_skies(rig, measured)
+        observed = [
+            add_prediction(measurement, predict_depth(self.predict_depth, view)).exclude(sky)
+            for measurement, view, sky in zip(measured, views, skies, strict=True)
+        ]
+        surfaces = map_in_parallel(make_layer, rig.images, observed)
+        return [
+            add_sky(surface, measurement, sky)
+            for surface, measurement, sky in zip(surfaces, measured, skies, strict=True)
+        ]
 
 
 def match_views(rig: Rig, views: Sequence[View], min_halved_side: float) -> list[Measurement]:
@@ -120,25 +135,29 @@ def match_views(rig: Rig, views: Sequence[View], min_halved_side: float) -> list
     if len(views) == 1:
         return [measure_nothing(rig.images[0], near / rig.unit, far / rig.unit)]
     is_halved = min(min(image.size) for image in rig.images) >= min_halved_side
-    found = measure_depths(rig.halve() if is_halved else rig, near, far)
+    measurements = measure_depths(rig.halve() if is_halved else rig, near, far)
     return [
-        one if image.ignore_mask is None else one.exclude(image.ignore_mask)
-        for one, image in zip(found, rig.images, strict=True)
+        measurement if image.ignore_mask is None else measurement.exclude(image.ignore_mask)
+        for measurement, image in zip(measurements, rig.images, strict=True)
     ]
 
 
-def make_layer(image: StereoImage, found: Measurement, iterations: int = ITERATIONS) -> Layer:
+def make_layer(image: StereoImage, measured: Measurement, iterations: int = ITERATIONS) -> Layer:
     """Convert the measured depths of a view to a layer, by surfaces after so many iterations."""
-    full = found.resize_to(image.size)
+    full = measured.resize_to(image.size)
     index = fit_surfaces(full.index, full.weight, image.image, iterations)
     return Layer(image, compute_inverse_depth(full.planes, index), full.confidence)
 
 
-def add_sky(layer: Layer, found: Measurement, sky: Mask) -> Layer:
+def add_sky(layer: Layer, measured: Measurement, sky: Mask) -> Layer:
     """Set the sky of a layer to the sky depth, with full confidence."""
-    beyond = np.float32(found.planes[0] / SKY_DEPTH)
-    inverse = np.where(sky, beyond, layer.inverse)
-    return Layer(layer.image, inverse, np.where(sky, np.float32(1), layer.confidence))
+    # The first plane is the far plane, in inverse depth.
+    inverse_sky_depth = np.float32(measured.planes[0] / SKY_DEPTH)
+    return Layer(
+        layer.image,
+        inverse=np.where(sky, inverse_sky_depth, layer.inverse),
+        confidence=np.where(sky, np.float32(1), layer.confidence),
+    )
 
 
 def make_depth_maps(layers: Sequence[Layer], unit: float, views: Sequence[View]) -> list[DepthMap]:

@@ -58,6 +58,7 @@ def build_rig(views: Sequence[View]) -> Rig:
     neighbours = find_neighbours(images) if len(images) > 1 else Neighbours(((),), {})
     transforms = {}
     for i, j in combinations(range(len(images)), 2):
+        # The correction holds for this pair only; each pair of a view gets its own.
         source = images[j]
         if (i, j) in neighbours.matches:
             source = rotate_to_matches(images[i], source, *neighbours.matches[i, j])
@@ -69,44 +70,58 @@ def build_rig(views: Sequence[View]) -> Rig:
 def halve_image(image: StereoImage) -> StereoImage:
     """Halve an image; the last row or column of an odd size is repeated first."""
     h, w = image.size
+    # Colours are means of 2 x 2 pixels. Given depth is the nearest of them, since a mean of two
+    # surfaces lies on neither; 0 is unknown, and inverse depth makes the nearest the largest.
     even = np.pad(image.image, ((0, h % 2), (0, w % 2), (0, 0)), mode="edge")
     rows = even[::2] + even[1::2]
     pixels = (rows[:, ::2] + rows[:, 1::2]) / 4
-    K = image.K * np.array([[0.5], [0.5], [1.0]])
-    ignored = None if image.ignore_mask is None else image.ignore_mask[::2, ::2]
     padded = np.pad(image.given, ((0, h % 2), (0, w % 2)))
     nearest = np.maximum(padded[::2], padded[1::2])
-    given = np.maximum(nearest[:, ::2], nearest[:, 1::2])
-    halved = pixels.astype(np.float32)
-    return replace(image, image=halved, K=K, given=given, ignore_mask=ignored)
+    return replace(
+        image,
+        image=pixels.astype(np.float32),
+        K=image.K * np.array([[0.5], [0.5], [1.0]]),
+        given=np.maximum(nearest[:, ::2], nearest[:, 1::2]),
+        ignore_mask=None if image.ignore_mask is None else image.ignore_mask[::2, ::2],
+    )
 
 
 def halve_transform(transform: Transform) -> Transform:
     """Convert a transform between two views to their halved images."""
-    half, twice = np.diag([0.5, 0.5, 1.0]), np.diag([2.0, 2.0, 1.0, 1.0])
-    return (half @ transform @ twice).astype(np.float32)
+    full_from_half = np.diag([2.0, 2.0, 1.0, 1.0])
+    half_from_full = np.diag([0.5, 0.5, 1.0])
+    return (half_from_full @ transform @ full_from_half).astype(np.float32)
 
 
 def rotate_to_matches(
     reference: StereoImage, source: StereoImage, pixels: Pixels, matched: Pixels
 ) -> StereoImage:
-    """Rotate `source` about its centre so that matches lie on their epipolar lines."""
+    """Rotate `source` about its centre so that matches lie on their epipolar lines.
+
+    Iteratively reweighted least squares for a small rotation vector, in camera axes of the source.
+    """
     distance, normal = compute_epipolar_distances(reference, source, pixels, matched)
     near = np.abs(distance) < MAX_DISTANCE
     if near.sum() < MIN_MATCHES:
         return source
-    distance, normal = distance[near], normal[near]
+    distance = distance[near]
+    normal = normal[near]
+
+    # Pixel motion per radian, split into its parts across and along the epipolar line [m, 3].
     motion = compute_rotation_motion(source, matched[near])
     beside = (normal[:, :, None] * motion).sum(axis=1)
     along = normal[:, 0, None] * motion[:, 1] - normal[:, 1, None] * motion[:, 0]
+
     turn = np.zeros(3)
     for _ in range(ITERATIONS):
+        # Cauchy weights; the scale is the median deviation, not below 0.05 pixels.
         miss = distance - beside @ turn
         spread = max(1.4826 * float(np.median(np.abs(miss))), 0.05)
         weight = 1 / (1 + (miss / spread) ** 2)
         cost = (beside.T * weight) @ beside
         # A squared motion along the lines costs as much as a squared distance from them.
         cost += weight.mean() * (along.T @ along)
+        # The system stays solvable if all matches lie on one line.
         cost += 1e-9 * np.trace(cost) * np.eye(3)
         turn = np.linalg.solve(cost, (beside.T * weight) @ distance)
     rotation, _ = cv2.Rodrigues(turn)
@@ -119,6 +134,8 @@ def compute_epipolar_distances(
     """Compute signed distances from the epipolar lines, in pixels, and the line normals."""
     transform = compute_source_from_reference(reference, source).astype(np.float64)
     ones = np.ones((len(pixels), 1))
+    # The line joins the images of the ray's point at infinity and of the reference centre. With a
+    # normal of length 1, its product with a homogeneous pixel is the distance.
     at_infinity = np.concatenate([pixels, ones], axis=1) @ transform[:, :3].T
     lines = np.cross(at_infinity, transform[:, 3])
     lines /= np.maximum(np.linalg.norm(lines[:, :2], axis=1, keepdims=True), 1e-12)
@@ -128,6 +145,7 @@ def compute_epipolar_distances(
 def compute_rotation_motion(view: StereoImage, pixels: Pixels) -> Float[np.ndarray, "m 2 3"]:
     """Compute the pixel motion per radian of rotation about each camera axis."""
     rays = np.concatenate([pixels, np.ones((len(pixels), 1))], axis=1) @ np.linalg.inv(view.K).T
+    # Derivative of X/Z and Y/Z for a point X + turn x X, with Z = 1; K turns it into pixels.
     turned = np.cross(np.eye(3)[None], rays[:, None])
     motion = turned[..., :2] - rays[:, None, :2] * turned[..., 2:]
     return (motion @ view.K[:2, :2].T).transpose(0, 2, 1)

@@ -36,24 +36,30 @@ MIN_HEIGHT = 0.1
 """Smallest mean height of a sky over its columns, as a fraction of the image height."""
 MIN_UNBROKEN = 0.6
 """Smallest fraction of a sky that is directly connected to the top of the image."""
-LOWEST, MIN_ABOVE = 0.55, 0.95
-"""Image height fraction, and the smallest fraction of a sky that lies above it."""
+LOWEST = 0.55
+"""Fraction of the image height, from the top, in which nearly all of a sky lies."""
+MIN_ABOVE = 0.95
+"""Smallest fraction of a sky that lies there."""
 MIN_OUTLINE = 64
 """Fewest measured outline pixels for a decision."""
 END_SHARE = 0.05
 """Fraction of the outline, the farthest, that must be close to infinity."""
 END_PLANES = 3.0
 """Largest distance from infinity of that part, in planes of half a pixel of parallax."""
-FAR_PLANE_MARGIN, MAX_FAR_PLANE = 2.0, 10.0
-"""Alternative limit in planes beyond the far plane, and the largest sum that is far."""
+FAR_PLANE_MARGIN = 2.0
+"""Alternative to `END_PLANES`: distance of that part from the far plane of the sweep, in planes."""
+MAX_FAR_PLANE = 10.0
+"""Largest distance from infinity of far plane and margin together for which that holds."""
 FAR_SHARE = 0.2
 """Fraction of the outline, the farthest, that must be far away."""
 FAR_RATIO = 2.5
 """Smallest depth of that part, in median depths of the measured scene."""
 MAX_ON_PLANE = 0.8
 """Fraction of the outline on one plane from which the region is a ceiling or wall."""
-NEAR_PLANES, MAX_NEAR_ON_PLANE = 5.0, 0.9
-"""Planes from infinity of near outline pixels, and the same limit for these alone."""
+NEAR_PLANES = 5.0
+"""Distance from infinity, in planes, from which an outline pixel is near."""
+MAX_NEAR_ON_PLANE = 0.9
+"""The same limit for the near outline pixels alone."""
 PLANE_TOLERANCE = 2.0
 """Largest distance of a pixel from a plane it lies on, in sweep planes."""
 ROUNDS = 20
@@ -62,12 +68,14 @@ MIN_SKY_AGREEMENT = 0.5
 """Fraction of a sky that must also be sky in the other views."""
 
 
-def find_skies(rig: Rig, found: Sequence[Measurement]) -> list[Mask]:
+def find_skies(rig: Rig, measurements: Sequence[Measurement]) -> list[Mask]:
     """Find the sky of each view that the other views confirm."""
-    own = [find_sky(image, f) for image, f in zip(rig.images, found, strict=True)]
+    skies = [
+        find_sky(image, measured) for image, measured in zip(rig.images, measurements, strict=True)
+    ]
     return [
-        sky if is_confirmed(number, sky, own, rig) else np.zeros_like(sky)
-        for number, sky in enumerate(own)
+        sky if is_confirmed(number, sky, skies, rig) else np.zeros_like(sky)
+        for number, sky in enumerate(skies)
     ]
 
 
@@ -77,24 +85,28 @@ def transfer_sky(rig: Rig, sky_of_second: Mask) -> Mask:
     return find_even_region(first) & (sample_at_infinity(first.size, sky_of_second, rig, 0, 1) == 1)
 
 
-def find_sky(image: StereoImage, found: Measurement) -> Mask:
+def find_sky(image: StereoImage, measured: Measurement) -> Mask:
     """Find the uniform region at the top of the image if its outline is that of a sky."""
     region = find_even_region(image)
-    return region if is_open(image, found, region) else np.zeros_like(region)
+    return region if is_open(image, measured, region) else np.zeros_like(region)
 
 
-def is_open(image: StereoImage, found: Measurement, region: Mask) -> bool:
+def is_open(image: StereoImage, measured: Measurement, region: Mask) -> bool:
     """Test the outline of `region` for an open sky."""
-    full = found.resize_to(image.size)
-    measured = full.confidence > 0
-    outline = dilate_square(region, OUTLINE_WIDTH) & ~region & measured
+    full = measured.resize_to(image.size)
+    is_measured = full.confidence > 0
+    outline = dilate_square(region, OUTLINE_WIDTH) & ~region & is_measured
     if not is_overhead(region) or outline.sum() < MIN_OUTLINE:
         return False
+
+    # Inverse depths from infinity on, in sweep planes; indices count from the far plane.
     heights = full.index + full.planes[0] / (full.planes[1] - full.planes[0])
     bright = bool(np.median(image.image[region]) > np.median(image.image[outline]))
     far_plane = float(heights.min() - full.index.min())
-    if not bright or not is_distant(heights[outline], heights[measured & ~region], far_plane):
+    if not bright or not is_distant(heights[outline], heights[is_measured & ~region], far_plane):
         return False
+
+    # The outline of a ceiling or wall lies on one plane; its near part is tested alone, too.
     near = outline & (heights > max(NEAR_PLANES, 2 * np.quantile(heights[outline], END_SHARE)))
     return (
         measure_planarity(outline, heights) < MAX_ON_PLANE
@@ -104,9 +116,11 @@ def is_open(image: StereoImage, found: Measurement, region: Mask) -> bool:
 
 def is_overhead(region: Mask) -> bool:
     """Test if `region` covers a large part of the top of the image."""
-    width, area = region[0].mean(), region.mean()
+    width = region[0].mean()
+    area = region.mean()
     if width < MIN_WIDTH or area < MIN_HEIGHT * width:
         return False
+    # Unbroken pixels have only pixels of the region above them in their column.
     unbroken = np.logical_and.accumulate(region, axis=0).sum() / region.sum()
     above = region[: round(LOWEST * len(region))].sum() / region.sum()
     return bool(unbroken >= MIN_UNBROKEN and above >= MIN_ABOVE)
@@ -115,10 +129,13 @@ def is_overhead(region: Mask) -> bool:
 def find_even_region(image: StereoImage) -> Mask:
     """Find the uniform region connected to the top of the image, up to its edges."""
     smooth = compute_color_gradient(image) < MAX_SKY_GRADIENT
+    # Erosion cuts narrow bridges between the sky and an even surface.
     even = cv2.erode(smooth.astype(np.uint8), np.ones((3, 3), np.uint8))
     _, labels = cv2.connectedComponents(even, connectivity=4)
     top = labels[0][labels[0] > 0]
     core = np.isin(labels, top)
+    # An edge raises the gradient around it, so that the core ends before the sky does. Pixels
+    # beside it that have its colour are added.
     alike = compute_color_difference(core, image) < MAX_SKY_DIFFERENCE
     return core | (dilate_square(core, EDGE_RADIUS) & alike)
 
@@ -126,15 +143,16 @@ def find_even_region(image: StereoImage) -> Mask:
 def compute_color_gradient(image: StereoImage) -> Map:
     """Compute the largest colour gradient of each pixel."""
     smooth = cv2.GaussianBlur(image.image.astype(np.float32), (0, 0), 1.0)
-    across, down = (
-        cv2.Sobel(smooth, cv2.CV_32F, *order, ksize=3, scale=1 / 8) for order in ((1, 0), (0, 1))
-    )
+    # Weights of the filter sum to 8 on either side; the scale makes it a difference per pixel.
+    across = cv2.Sobel(smooth, cv2.CV_32F, 1, 0, ksize=3, scale=1 / 8)
+    down = cv2.Sobel(smooth, cv2.CV_32F, 0, 1, ksize=3, scale=1 / 8)
     return take_largest_channel(cv2.magnitude(across, down))
 
 
 def compute_color_difference(core: Mask, image: StereoImage) -> Map:
     """Compute the largest channel difference to the mean colour of `core` nearby."""
-    colour, weight = image.image.astype(np.float32), core.astype(np.float32)
+    colour = image.image.astype(np.float32)
+    weight = core.astype(np.float32)
     size = (4 * EDGE_RADIUS + 1, 4 * EDGE_RADIUS + 1)
     total = cv2.boxFilter(weight, -1, size)
     mean = cv2.boxFilter(colour * weight[..., None], -1, size) / np.maximum(total, 1e-6)[..., None]
@@ -156,7 +174,10 @@ def measure_planarity(outline: Mask, heights: Map) -> float:
         return 0.0
     rows, columns = np.nonzero(outline)
     sites = np.stack([columns, rows, np.ones_like(rows)], axis=1).astype(np.float64)
-    values, weight = heights[outline].astype(np.float64), np.ones(len(rows))
+    values = heights[outline].astype(np.float64)
+    weight = np.ones(len(rows))
+    # Weights 1 / |deviation| make least squares minimize the sum of deviations, which outliers do
+    # not dominate.
     for _ in range(ROUNDS):
         weighted = sites * weight[:, None]
         plane = np.linalg.lstsq(weighted.T @ sites, weighted.T @ values, rcond=None)[0]
@@ -182,15 +203,18 @@ def sample_at_infinity(
     size: tuple[int, ...], mask: Mask, rig: Rig, this: int, other: int
 ) -> Float32[np.ndarray, "h w"]:
     """Sample the mask of another view in each pixel's direction; -1 if outside."""
-    x, y = np.arange(size[1]) + 0.5, np.arange(size[0])[:, None] + 0.5
-    turn = rig.transforms[this, other][:, :3]
-    u, v, w = (a * x + b * y + c for a, b, c in turn)
+    x = np.arange(size[1]) + 0.5
+    y = np.arange(size[0])[:, None] + 0.5
+    # At inverse depth 0 only the homography of the transform counts.
+    homography = rig.transforms[this, other][:, :3]
+    u, v, w = [a * x + b * y + c for a, b, c in homography]
     ahead = np.maximum(w, 1e-6)
-    column, row = np.floor(u / ahead), np.floor(v / ahead)
-    h, wide = mask.shape
-    seen = (w > 1e-6) & (column >= 0) & (column < wide) & (row >= 0) & (row < h)
-    at = row.clip(0, h - 1).astype(int), column.clip(0, wide - 1).astype(int)
-    return np.where(seen, mask[at], -1).astype(np.float32)
+    column = np.floor(u / ahead)
+    row = np.floor(v / ahead)
+    height, width = mask.shape
+    seen = (w > 1e-6) & (column >= 0) & (column < width) & (row >= 0) & (row < height)
+    sampled = mask[row.clip(0, height - 1).astype(int), column.clip(0, width - 1).astype(int)]
+    return np.where(seen, sampled, -1).astype(np.float32)
 
 
 def dilate_square(mask: Mask, radius: int) -> Mask:

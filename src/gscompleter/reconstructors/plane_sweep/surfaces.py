@@ -44,49 +44,68 @@ def fit_surfaces(measured: Map, confidence: Map, image: Image, iterations: int =
     """
     if iterations == 0 or not (confidence > 0).any():
         return measured
+    # Coarse to fine: an iteration carries heights to neighbouring pixels only, so that coarse
+    # levels have to bring planes across large unmeasured areas.
     levels: list[Level] = [(measured, confidence, image)]
     while len(levels) < LEVELS and min(levels[-1][0].shape) > 4:
         levels.append(halve_level(*levels[-1]))
-    known, sure, _ = (torch.from_numpy(part) for part in levels[-1])
-    heights = fill_smoothly(known, sure > 0).numpy().copy()
+
+    coarsest, coarsest_weight, _ = levels[-1]
+    known = torch.from_numpy(coarsest_weight) > 0
+    heights = fill_smoothly(torch.from_numpy(coarsest), known).numpy().copy()
     gradients = np.zeros((2, *heights.shape), np.float32)
     for number, (data, weight, colours) in reversed(list(enumerate(levels))):
         if heights.shape != data.shape:
             heights = upsample_bilinear(heights, data.shape)
+            # A gradient is per pixel, and pixels are half as wide now.
             gradients = np.stack([upsample_bilinear(part, data.shape) / 2 for part in gradients])
+
         # A coarse pixel covers 4 ** number fine ones, and its steps are 2 ** number times higher.
+        # So costs per pixel shrink, those of steps by 2 ** number, those of bends by its square.
         scale = 2.0**number
-        across, down = (cost / np.float32(scale) for cost in compute_step_costs(colours))
-        bend, tolerance = np.float32(BEND_PENALTY / scale**2), np.float32(TOLERANCE)
-        steps = iterations * 2**number
-        tgv.fit(heights, gradients, data, weight, across, down, bend, tolerance, steps)
+        step_right, step_down = compute_step_costs(colours)
+        tgv.fit(
+            heights,
+            gradients,
+            data,
+            weight,
+            across=step_right / np.float32(scale),
+            down=step_down / np.float32(scale),
+            bend=np.float32(BEND_PENALTY / scale**2),
+            tolerance=np.float32(TOLERANCE),
+            iterations=iterations * 2**number,
+        )
     return heights
 
 
 def compute_step_costs(image: Image) -> tuple[Map, Map]:
     """Compute the cost of a step to the right and lower neighbour; low at edges."""
 
-    def cost(beside: Image) -> Map:
+    def compute_cost(beside: Image) -> Map:
         share = np.maximum(np.exp(-compute_contrast(image, beside) / EDGE_CONTRAST), MIN_STEP_SHARE)
         return (STEP_PENALTY * share).astype(np.float32)
 
-    right, below = np.append(image[:, 1:], image[:, -1:], 1), np.append(image[1:], image[-1:], 0)
-    return cost(right), cost(below)
+    right = np.append(image[:, 1:], image[:, -1:], 1)
+    below = np.append(image[1:], image[-1:], 0)
+    return compute_cost(right), compute_cost(below)
 
 
 def halve_level(data: Map, weight: Map, image: Image) -> Level:
-    """Halve a pyramid level; measurements are averaged by weight."""
+    """Halve a pyramid level; measurements are averaged by weight.
+
+    At the end of an odd side a coarse pixel covers fewer fine ones; its weight is their mean.
+    """
     h, w = data.shape
-    size = (h + 1) // 2, (w + 1) // 2
+    height, width = (h + 1) // 2, (w + 1) // 2
 
-    def sums(values: Map) -> AnyMap:
-        padded = np.pad(values, ((0, size[0] * 2 - h), (0, size[1] * 2 - w)))
-        return padded.reshape(size[0], 2, size[1], 2).sum(axis=(1, 3))
+    def sum_pixels(values: Map) -> AnyMap:
+        padded = np.pad(values, ((0, height * 2 - h), (0, width * 2 - w)))
+        return padded.reshape(height, 2, width, 2).sum(axis=(1, 3))
 
-    total = sums(weight)
-    mean = sums(weight * data) / np.maximum(total, np.float32(1e-9))
-    area = sums(np.ones_like(data))
-    smaller = cv2.resize(image, size[::-1], interpolation=cv2.INTER_AREA)
+    total = sum_pixels(weight)
+    mean = sum_pixels(weight * data) / np.maximum(total, np.float32(1e-9))
+    area = sum_pixels(np.ones_like(data))
+    smaller = cv2.resize(image, (width, height), interpolation=cv2.INTER_AREA)
     return mean, total / area, smaller
 
 

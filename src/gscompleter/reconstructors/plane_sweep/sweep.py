@@ -1,4 +1,10 @@
-"""Stereo depth of each view by a plane sweep, before surfaces are fitted."""
+"""Stereo depth of each view by a plane sweep, before surfaces are fitted.
+
+A plane is one inverse depth, parallel to the image of the reference view (Collins 1996). Each pixel
+gets a cost at each plane, from the other views; semi-global matching (Hirschmüller 2008) smooths
+the costs, and the cheapest plane wins. Large images are swept at half size first, so that each tile
+of the full size is matched only near the planes found there.
+"""
 
 from __future__ import annotations
 
@@ -59,8 +65,10 @@ NOISE = np.float32(0.015)
 """Standard deviation of the image noise; weaker texture does not correlate."""
 PIXEL_WEIGHT = np.float32(0.4)
 """Weight of the per-pixel difference in the cost; the rest is window correlation."""
-GIVEN_SHARE, GIVEN_COST = np.float32(1 / 8), np.float32(60)
-"""Weight of the matching cost at pixels with given depth, and cost of each plane beside it."""
+GIVEN_SHARE = np.float32(1 / 8)
+"""Weight of the matching cost at pixels with given depth."""
+GIVEN_COST = np.float32(60)
+"""Cost of each plane between a pixel's given depth and the plane it is matched at."""
 UNSEEN_COST = np.uint8(140)
 """Cost, from 0 to 254, of a plane at which no other view observes the pixel."""
 
@@ -103,27 +111,40 @@ class Measurement:
         """Upsample to `size` if the image was halved."""
         if self.index.shape == size:
             return self
-        index, weight, confidence = (
-            repeat_pixels(values, size) for values in (self.index, self.weight, self.confidence)
+        return Measurement(
+            self.planes,
+            index=repeat_pixels(self.index, size),
+            weight=repeat_pixels(self.weight, size),
+            confidence=repeat_pixels(self.confidence, size),
         )
-        return Measurement(self.planes, index, weight, confidence)
 
     def exclude(self, mask: Bool[np.ndarray, "h w"]) -> Measurement:
         """Set weight and confidence to 0 at the pixels of a full-size mask, such as the sky."""
         full = self.resize_to(mask.shape)
         none = np.float32(0)
-        weight, confidence = (np.where(mask, none, w) for w in (full.weight, full.confidence))
-        return replace(full, weight=weight, confidence=confidence)
+        return replace(
+            full,
+            weight=np.where(mask, none, full.weight),
+            confidence=np.where(mask, none, full.confidence),
+        )
 
 
 def measure_depths(rig: Rig, near: float, far: float) -> list[Measurement]:
     """Measure the depth of each view, between two z-depths in scene units."""
     sweeps = sweep_views(rig, near / rig.unit, far / rig.unit)
     inverses = [sweep.inverse for sweep in sweeps]
+
+    # Left-right check: a depth counts if one other view measured the same surface there.
     confidences = []
     for i, sweep in enumerate(sweeps):
-        checks = [find_consistent(sweep.inverse, other) for other in pair_up(i, inverses, rig)]
+        checks = []
+        for neighbour in pair_up(i, inverses, rig):
+            # The error is -1 where the pixel falls outside the other view.
+            error, _ = stereo.reproject(sweep.inverse, *neighbour)
+            checks.append((error >= 0) & (error < MAX_RETURN_ERROR))
         confidences.append(compute_confidence(sweep.index, sweep.margin, np.any(checks, axis=0)))
+
+    # Occlusions are judged by confident depths only: a wrong one in front would occlude anything.
     sure = [np.where(c > 0, w, UNKNOWN) for c, w in zip(confidences, inverses, strict=True)]
     return [
         add_background(sweep, confidence, pair_up(i, sure, rig))
@@ -140,19 +161,17 @@ def pair_up(number: int, inverses: Sequence[Map], rig: Rig) -> list[Neighbour]:
 
 
 def add_background(sweep: Sweep, confidence: Map, neighbours: Sequence[Neighbour]) -> Measurement:
-    """Give pixels that are occluded in the confident depths of others the background depth."""
+    """Give pixels that are occluded in the confident depths of others the background depth.
+
+    A pixel that no other view observes cannot be matched, so its best plane is arbitrary. It shows
+    the surface behind the occluder, which continues beside the unmatched pixels.
+    """
     background = stereo.fill_background(sweep.index, confidence > 0)
     behind = compute_inverse_depth(sweep.planes, background)
     occluded = (confidence == 0) & find_hidden(behind, neighbours)
     weight = np.where(occluded, BACKGROUND_WEIGHT, confidence)
     index = np.where(occluded, background, sweep.index)
     return Measurement(sweep.planes, index, weight, confidence)
-
-
-def find_consistent(inverse: Map, neighbour: Neighbour) -> Mask:
-    """Mark pixels whose reprojection to the other view and back ends where it began."""
-    error, _ = stereo.reproject(inverse, *neighbour)
-    return (error >= 0) & (error < MAX_RETURN_ERROR)
 
 
 def compute_confidence(index: Map, margin: Map, confirmed: Mask) -> Map:
@@ -167,7 +186,8 @@ def compute_confidence(index: Map, margin: Map, confirmed: Mask) -> Map:
 
 def remove_speckles(index: Map, mask: Mask) -> Mask:
     """Remove patches of similar depth smaller than `MIN_AREA` pixels from `mask`."""
-    # OpenCV takes 16-bit fixed-point disparities; 0 marks masked pixels.
+    # OpenCV takes 16-bit fixed-point disparities; 0 marks masked pixels. Without the offset by
+    # one plane, a pixel of the farthest plane would count as masked.
     scale = min(16.0, 30000.0 / max(float(index.max()), 1.0))
     levels = np.where(mask, index.clip(0) * scale + scale, 0).astype(np.int16)
     cv2.filterSpeckles(levels, 0, MIN_AREA, MAX_STEP * scale)
@@ -180,8 +200,11 @@ def find_hidden(background: Map, neighbours: Sequence[Neighbour]) -> Mask:
     seen = np.zeros(background.shape, bool)
     for neighbour in neighbours:
         error, ratio = stereo.reproject(background, *neighbour)
+        # `ratio` is z as expected in the other view over z as measured there; near 0 it is unknown.
         known = (error >= 0) & (ratio > 1e-3)
+        # The other view measured something nearer, and not merely the same surface inexactly.
         before = known & (error > MAX_RETURN_ERROR) & (ratio > 1)
+        # The ray of the pixel, at the depth of the occluder, has to lie in the other view, too.
         within, _ = stereo.reproject(background * ratio, *neighbour)
         hidden |= before & (within >= 0)
         seen |= known & ~before
@@ -191,7 +214,8 @@ def find_hidden(background: Map, neighbours: Sequence[Neighbour]) -> Mask:
 def sweep_views(rig: Rig, near: float, far: float) -> list[Sweep]:
     """Sweep all views, coarse to fine; `near` and `far` are in widest baselines."""
     numbers = range(len(rig.images))
-    if min(min(image.size) for image in rig.images) < MIN_GUIDED_SIDE:
+    shortest_side = min(min(image.size) for image in rig.images)
+    if shortest_side < MIN_GUIDED_SIDE:
         return [sweep_view(i, rig, near, far) for i in numbers]
     guesses = sweep_views(rig.halve(), near, far)
     return [sweep_view(i, rig, near, far, guesses[i]) for i in numbers]
@@ -208,10 +232,16 @@ def sweep_view(number: int, rig: Rig, near: float, far: float, guess: Sweep | No
         likely = compute_plane_index(planes, guess.inverse)
         bands = make_guided_bands(likely, 2, image.size, len(planes))
     costs = compute_costs(image, sources, planes, bands)
+
+    # A given depth enters the costs before they are aggregated, so that it spreads to the pixels
+    # around it (decision 046). The kernel takes -1 as unknown.
     given = compute_plane_index(planes, image.given).clip(0, len(planes) - 1)
     stereo.prefer_given(costs, bands, np.where(image.given > 0, given, -1), GIVEN_SHARE, GIVEN_COST)
-    index, margin = stereo.select_planes(aggregate(costs, bands, image), bands, *image.size)
+
+    totals = aggregate(costs, bands, image)
+    index, margin = stereo.select_planes(totals, bands, *image.size)
     if guess is not None:
+        # A narrow band leaves out rivals of the best plane; the half-size sweep has seen them.
         margin = np.minimum(margin, repeat_pixels(guess.margin, image.size))
     return Sweep(planes, index, margin)
 
@@ -219,7 +249,12 @@ def sweep_view(number: int, rig: Rig, near: float, far: float, guess: Sweep | No
 def place_planes(
     reference: StereoImage, sources: Sequence[Source], near: float, far: float
 ) -> Planes:
-    """Space inverse depths evenly from far to near, without planes outside all sources."""
+    """Space inverse depths evenly from far to near, without planes outside all sources.
+
+    Evenly spaced inverse depths move a pixel by equal steps along its epipolar line, if the camera
+    does not move forward. Their number is such that a step is about `MAX_PLANE_MOTION` pixels.
+    """
+    # A grid of 9 x 9 reference pixels stands for the image; 257 depths bound 256 steps.
     h, w = reference.size
     x, y = np.meshgrid(np.linspace(0.5, w - 0.5, 9), np.linspace(0.5, h - 0.5, 9))
     pixels = np.stack([x, y, np.ones_like(x)], axis=-1).reshape(-1, 3)
@@ -228,21 +263,26 @@ def place_planes(
     overlap = np.zeros(257)
     for source, float_transform in sources:
         transform = float_transform.astype(np.float64)
+        # Pixels of the grid in the source at each depth [257, 81, 3], homogeneous.
         moved = (pixels @ transform[:, :3].T)[None] + samples[:, None, None] * transform[:, 3]
         ratio = moved[..., 2]
-        at = moved[..., :2] / np.maximum(ratio, 1e-3)[..., None]
+        projected = moved[..., :2] / np.maximum(ratio, 1e-3)[..., None]
         H, W = source.size
-        seen = (ratio > 1e-3) & (at >= 0).all(-1) & (at[..., 0] < W) & (at[..., 1] < H)
-        steps = np.linalg.norm(np.diff(at, axis=0), axis=-1)
+        inside = (projected >= 0).all(-1) & (projected[..., 0] < W) & (projected[..., 1] < H)
+        seen = (ratio > 1e-3) & inside
+        # The motion of a step: 80 % of the pixels move less, in the source that moves most.
+        steps = np.linalg.norm(np.diff(projected, axis=0), axis=-1)
         known = torch.from_numpy(np.where(seen[1:] & seen[:-1], steps, np.nan))
         usual = known.nanquantile(0.8, dim=1).nan_to_num().numpy()  # 0 where nothing is seen
         motion = np.maximum(motion, usual)
         overlap = np.maximum(overlap, seen.mean(axis=1))
+
+    # The sweep ends at the nearest depth at which some source still shows 2 % of the grid.
     useful = np.flatnonzero(overlap >= 0.02)
     last = max(int(useful[-1]), 8) if len(useful) else 256
-    wanted = float(motion[:last].sum()) / MAX_PLANE_MOTION
-    planes = int(np.clip(np.ceil(wanted), MIN_PLANES, MAX_PLANES))
-    return np.linspace(samples[0], samples[last], planes).astype(np.float32)
+    num_steps = float(motion[:last].sum()) / MAX_PLANE_MOTION
+    num_planes = int(np.clip(np.ceil(num_steps), MIN_PLANES, MAX_PLANES))
+    return np.linspace(samples[0], samples[last], num_planes).astype(np.float32)
 
 
 def make_full_bands(size: tuple[int, int], planes: int) -> Bands:
@@ -254,6 +294,7 @@ def make_full_bands(size: tuple[int, int], planes: int) -> Bands:
 def make_guided_bands(guess: Map, shrinkage: int, size: tuple[int, int], planes: int) -> Bands:
     """Create bands around the planes `guess` of an image `1 / shrinkage` the `size`."""
     likely = cv2.medianBlur(guess, MEDIAN_SIZE)
+    # A tile also searches the depths that the guess has just outside of it.
     window = np.ones((2 * GUESS_MARGIN + 1, 2 * GUESS_MARGIN + 1), np.uint8)
     lowest = reduce_tiles(np.minimum, cv2.erode(likely, window), shrinkage, size)
     highest = reduce_tiles(np.maximum, cv2.dilate(likely, window), shrinkage, size)
@@ -265,17 +306,20 @@ def make_guided_bands(guess: Map, shrinkage: int, size: tuple[int, int], planes:
 def reduce_tiles(
     extreme: np.ufunc, values: Map, shrinkage: int, size: tuple[int, int]
 ) -> Float32[np.ndarray, "r c"]:
-    """Reduce the values of each tile with `extreme` (minimum or maximum)."""
-    tops, lefts = (
-        np.arange(count) * side // shrinkage
-        for count, side in zip(compute_tile_grid(size), (TILE_ROWS, TILE_COLUMNS), strict=True)
-    )
+    """Reduce the values of each tile with `extreme` (minimum or maximum).
+
+    Tiles are those of an image of `size`, and `values` an image of `1 / shrinkage` the size.
+    """
+    rows, columns = compute_tile_grid(size)
+    tops = np.arange(rows) * TILE_ROWS // shrinkage
+    lefts = np.arange(columns) * TILE_COLUMNS // shrinkage
     return extreme.reduceat(extreme.reduceat(values, tops, axis=0), lefts, axis=1)
 
 
 def compute_tile_grid(size: tuple[int, int]) -> tuple[int, int]:
-    """Count the rows and columns of tiles."""
-    return -(-size[0] // TILE_ROWS), -(-size[1] // TILE_COLUMNS)
+    """Count the rows and columns of tiles, with incomplete ones at the lower and right border."""
+    height, width = size
+    return -(-height // TILE_ROWS), -(-width // TILE_COLUMNS)
 
 
 def make_bands(
@@ -293,7 +337,10 @@ def make_bands(
 def compute_costs(
     reference: StereoImage, sources: Sequence[Source], planes: Planes, bands: Bands
 ) -> UInt8[np.ndarray, "cells"]:
-    """Compute costs (0 to 254) of the planes in `bands`; the best source view counts."""
+    """Compute costs (0 to 254) of the planes in `bands`; the best source view counts.
+
+    The best, rather than the mean: a surface that one source sees may be occluded in the others.
+    """
     costs = [
         stereo.compute_matching_costs(
             reference.image, source.image, transform, planes, bands, RADIUS, NOISE, PIXEL_WEIGHT
@@ -314,8 +361,10 @@ def aggregate(
         a: Float32[np.ndarray, "r c 3"], b: Float32[np.ndarray, "r c 3"]
     ) -> Int16[np.ndarray, "r c"]:
         penalty = LARGE_PENALTY / (1 + compute_contrast(a, b) / EDGE_CONTRAST)
+        # Even at the strongest edge a jump is dearer than a change by one plane (P2 > P1).
         return np.rint(np.maximum(penalty, 1.5 * SMALL_PENALTY)).astype(np.int16)
 
+    # Neighbours along rows, columns and both diagonals; each pair serves two opposite paths.
     return stereo.aggregate_semi_globally(
         costs,
         bands,

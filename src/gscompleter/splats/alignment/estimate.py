@@ -69,15 +69,15 @@ class SplatAlignment:
 
     def describe(self) -> str:
         """Describe the alignment in a sentence."""
-        told = (
+        sentence = (
             f"The splat {FRAMES[self.method]} fits the photographs at {self.fit.psnr:.1f} dB in "
             f"images of {self.side} px"
         )
         if self.method != "given":
-            told += f" ({self.given_fit.psnr:.1f} dB as given)"
+            sentence += f" ({self.given_fit.psnr:.1f} dB as given)"
         if DRIFT_WARNING < self.fit.drift < math.inf:
-            told += f"; details are off by {self.fit.drift:.1f} px in them"
-        return f"{told}."
+            sentence += f"; details are off by {self.fit.drift:.1f} px in them"
+        return f"{sentence}."
 
 
 @dataclass(frozen=True)
@@ -116,6 +116,7 @@ def align_splat(
 
 def sample_views(photographs: Photographs, frames: Sequence[int]) -> list[View]:
     """Load the first of `frames` and, spread over all, further photographs that can be read."""
+    # Half of the samples are the frames of the context, half are from all over.
     named = list(frames)[: NUM_SAMPLE_VIEWS // 2]
     spread = np.linspace(0, len(photographs) - 1, NUM_SAMPLE_VIEWS).round().astype(int).tolist()
     others = [frame for frame in dict.fromkeys(spread) if frame not in named]
@@ -141,6 +142,8 @@ def estimate_alignment(
     given = data.score_transform(np.eye(4))
     side = max(max(view.camera.width, view.camera.height) for view in data.views)
     best = SplatAlignment("given", np.eye(4), given, given, side)
+
+    # Frames that trainers' files state come before computed ones, which are made when tried.
     if not given.is_match:
         computed = compute_trainer_frames(poses, points)
         normalised: Iterable[FrameProposal] = (("normalised", frame) for frame in computed)
@@ -150,7 +153,10 @@ def estimate_alignment(
                 best = replace(best, method=method, transform=transform, fit=fit)
             if best.fit.is_exact:
                 break
-    best = best if best.fit.is_exact else align_by_features(data, best, points)
+
+    # Features find any frame, and correct one that is slightly off.
+    if not best.fit.is_exact:
+        best = align_by_features(data, best, points)
     if not best.fit.is_match:
         raise InputError(
             f"The splat does not show what the photographs show: at their cameras it covers "
@@ -171,18 +177,22 @@ def align_by_features(
     data: AlignmentData, best: SplatAlignment, points: Points | None
 ) -> SplatAlignment:
     """Improve an alignment by image features; without a match, search from all directions."""
+    # A match is refined where it is; else the splat is searched all around for a start.
     photographs = [(view.camera, extract_view_features(view)) for view in data.views]
     if best.fit.is_match:
         starts: Iterable[Matrix] = [best.transform]
     else:
-        place = estimate_points(data.views) if points is None else points
+        if points is None:
+            points = estimate_points(data.views)
         scene = thin_gaussians(data.scene)
-        starts = search_similarities(scene, photographs, place, data.renderer)
+        starts = search_similarities(scene, photographs, points, data.renderer)
     for start in starts:
         scene = data.restrict_to(start).scene
         transform = refine_similarity(scene, photographs, start, data.renderer)
-        fit = best.fit if transform is None else data.score_transform(transform)
-        if transform is not None and is_better(fit, best.fit):
+        if transform is None:
+            continue
+        fit = data.score_transform(transform)
+        if is_better(fit, best.fit):
             return replace(best, method="similarity", transform=transform, fit=fit)
     return best
 
@@ -191,7 +201,8 @@ def estimate_points(views: Sequence[View]) -> Points:
     """Estimate scene points without a sparse cloud: a grid at the median depth of each view."""
     near, far = estimate_depth_range(views)
     depth = float(np.sqrt(near * far))
-    rays = [view.camera.z_rays()[::16, ::16].reshape(-1, 3) for view in views]
-    pairs = zip(views, rays, strict=True)
-    points = torch.cat([view.camera.center + depth * ray for view, ray in pairs])
-    return points.double().cpu().numpy()
+    points = []
+    for view in views:
+        rays = view.camera.z_rays()[::16, ::16].reshape(-1, 3)
+        points.append(view.camera.center + depth * rays)
+    return torch.cat(points).double().cpu().numpy()

@@ -29,8 +29,10 @@ MIN_PSNR = 30.0
 """PSNR in dB above which a flat photograph counts as a match, if half of it is covered."""
 MAX_DRIFT = 0.25
 """Largest displacement of an exact alignment, in pixels; a scale error of 0.5 % causes 0.5."""
-MIN_TRACKED_CORNERS, MAX_CORNERS = 15, 200
-"""Fewest tracked corners for a valid median, and most."""
+MIN_TRACKED_CORNERS = 15
+"""Fewest tracked corners for a valid median."""
+MAX_CORNERS = 200
+"""Most corners that are tracked."""
 MAX_ROUND_TRIP_ERROR = 1.0
 """Largest error of a corner tracked forward and back, in pixels."""
 
@@ -75,11 +77,14 @@ class SplatFit(NamedTuple):
 
 def summarize_fits(images: Sequence[ImageFit]) -> SplatFit:
     """Summarize the fits to several photographs."""
+    # The better half by margin: some photographs may show what the splat does not.
     seen = [image for image in images if image.coverage >= MIN_COVERAGE]
     seen.sort(key=lambda image: image.margin, reverse=True)
     better = seen[: math.ceil(len(seen) / 2)] or [ImageFit()]
-    columns = zip(*better, strict=True)
-    psnr, margin, _, drift = (sorted(values)[len(better) // 2] for values in columns)
+    # The upper median of each, which may come from different photographs.
+    psnr, margin, _, drift = [
+        sorted(values)[len(better) // 2] for values in zip(*better, strict=True)
+    ]
     coverage = sum(image.coverage for image in images) / max(len(images), 1)
     is_match = sum(image.is_match for image in images) >= max(1, min(2, len(images)))
     return SplatFit(psnr, margin, coverage, drift, is_match)
@@ -97,6 +102,7 @@ def score_splat(scene: Gaussians, views: Sequence[View], renderer: Renderer) -> 
 def render_from(scene: Gaussians, camera: Camera, renderer: Renderer) -> Render:
     """Render `scene`, with a near plane derived from its own depths."""
     z = compute_z_depths(scene.means, camera)
+    # The near plane of the photographs is in their unit, and the splat may have another.
     unit = z[z > 0].median().item() if (z > 0).any() else 1.0
     with torch.no_grad():
         return renderer.render(scene, replace(camera, near=0.1 * unit))
@@ -112,10 +118,18 @@ def score_image(render: Render, view: View) -> ImageFit:
     truth = photograph[where].double()
     rendered = match_exposure(render.image[where].double(), truth)
     psnr = convert_to_psnr((rendered - truth).square().mean())
+
+    # A blurred or uniform photograph has a high PSNR with any image, so the margin counts.
     margin = psnr - convert_to_psnr((truth - truth.mean()).square().mean())
-    shown = photograph.double().index_put((where,), rendered)
-    before, after = (i.mean(dim=-1).cpu().numpy() for i in (shown, photograph.double()))
-    return ImageFit(psnr, margin, covered, measure_drift(before, after, where.cpu().numpy()))
+
+    # Outside the covered pixels both images are the photograph, so that the border moves no corner.
+    composed = photograph.double().index_put((where,), rendered)
+    drift = measure_drift(
+        composed.mean(dim=-1).cpu().numpy(),
+        photograph.double().mean(dim=-1).cpu().numpy(),
+        where.cpu().numpy(),
+    )
+    return ImageFit(psnr, margin, covered, drift)
 
 
 def match_exposure(
@@ -141,13 +155,15 @@ def measure_drift(
 
     Corners are tracked forward and back (Lucas-Kanade); infinity if too few survive.
     """
-    before, after = ((255 * i.clip(0, 1)).round().astype(np.uint8) for i in (rendered, truth))
+    before = (255 * rendered.clip(0, 1)).round().astype(np.uint8)
+    after = (255 * truth.clip(0, 1)).round().astype(np.uint8)
     mask = valid_mask.astype(np.uint8)
     corners = cv2.goodFeaturesToTrack(before, MAX_CORNERS, 0.01, 5, mask=mask)
     if corners is None:
         return math.inf
     there, is_found = track_corners(before, after, corners)
     back, is_found_again = track_corners(after, before, there)
+    # A corner that was tracked to a wrong place rarely returns to where it began.
     is_back = np.linalg.norm(back - corners, axis=2)[:, 0] < MAX_ROUND_TRIP_ERROR
     trusted = is_found & is_found_again & is_back
     if trusted.sum() < MIN_TRACKED_CORNERS:

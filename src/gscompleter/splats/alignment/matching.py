@@ -65,27 +65,33 @@ def search_similarities(
     scene: Gaussians, photographs: Sequence[PhotoFeatures], points: Points, renderer: Renderer
 ) -> Iterator[Matrix]:
     """Yield similarities from photographs to splat by which some photographs match."""
+    # One camera is placed around the splat; the others are located in its render.
     seer = photographs[len(photographs) // 2][0]
     if len(scene) == 0 or not has_baseline([get_pose(camera) for camera, _ in photographs]):
         return
+    # The fainter half of the Gaussians, floaters among them, says little about the extent.
     solid = scene.means[scene.opacities >= scene.opacities.median()].detach().cpu().double().numpy()
     for transform in generate_starts(get_pose(seer), points, solid):
         rendered = render_features(scene, transform_camera(seer, transform), renderer)
-        answer = fit_similarity([locate_photo(rendered, photograph) for photograph in photographs])
-        if answer is not None:
-            yield answer
+        similarity = fit_similarity(
+            [locate_photo(rendered, photograph) for photograph in photographs]
+        )
+        if similarity is not None:
+            yield similarity
 
 
 def generate_starts(
     pose: Matrix, points: Points, solid: Float[np.ndarray, "n 3"]
 ) -> Iterator[Matrix]:
     """Yield similarities that map `points` to `solid`, from all directions."""
-    (center, radius), (new_center, new_radius) = map(compute_center_radius, (points, solid))
+    center, radius = compute_center_radius(points)
+    new_center, new_radius = compute_center_radius(solid)
     if new_radius == 0:  # most of it is one point: all directions are alike
         return
     for zoom in SCALE_FACTORS:
         scale = zoom * new_radius / max(radius, 1e-12)
         for direction in sample_directions(NUM_DIRECTIONS):
+            # The camera then looks along `direction`, with any roll, which features tolerate.
             turn = align_directions(pose[:3, 2], direction)
             yield make_similarity(scale, turn, new_center - scale * turn @ center)
 
@@ -116,22 +122,25 @@ def refine_similarity(
     for _ in range(NUM_ROUNDS):
         if transform is not None:
             cameras = [transform_camera(camera, transform) for camera, _ in photographs]
-            found = list(get_view_map(scene.means)(locate, photographs, cameras))
-            transform = fit_similarity(found)
+            located = list(get_view_map(scene.means)(locate, photographs, cameras))
+            transform = fit_similarity(located)
     return transform
 
 
 def fit_similarity(photos: Sequence[LocatedPhoto | None]) -> Matrix | None:
     """Fit photographs' frame to splat's frame by located photographs; None if too few."""
-    found = [photo for photo in photos if photo is not None]
-    before = [get_pose(photo.camera) for photo in found]
+    located = [photo for photo in photos if photo is not None]
+    before = [get_pose(photo.camera) for photo in located]
     if not has_baseline(before):
         return None
-    start = fit_pose_similarity(before, [photo.pose for photo in found])
-    return minimize_reprojection(found, start) if np.linalg.det(start[:3, :3]) > 0 else None
+    start = fit_pose_similarity(before, [photo.pose for photo in located])
+    # Poses found in one place leave no scale.
+    if not np.linalg.det(start[:3, :3]) > 0:
+        return None
+    return minimize_reprojection(located, start)
 
 
-def minimize_reprojection(found: Sequence[LocatedPhoto], start: Matrix) -> Matrix:
+def minimize_reprojection(photos: Sequence[LocatedPhoto], start: Matrix) -> Matrix:
     """Minimize the robust reprojection error over similarities.
 
     The seven unknowns move the splat's points in the photographs' frame: logarithm of the scale,
@@ -141,7 +150,7 @@ def minimize_reprojection(found: Sequence[LocatedPhoto], start: Matrix) -> Matri
     from scipy.optimize import least_squares
 
     back = np.linalg.inv(start)
-    points = [photo.points @ back[:3, :3].T + back[:3, 3] for photo in found]
+    points = [photo.points @ back[:3, :3].T + back[:3, 3] for photo in photos]
     center = np.median(np.concatenate(points), axis=0)
     unit = float(np.median(np.linalg.norm(np.concatenate(points) - center, axis=1)))
 
@@ -151,13 +160,19 @@ def minimize_reprojection(found: Sequence[LocatedPhoto], start: Matrix) -> Matri
 
     def errors(unknowns: Float[np.ndarray, "7"]) -> Float[np.ndarray, "m"]:
         moved = change(unknowns)
-        pairs = zip(found, points, strict=True)
         return np.concatenate(
-            [_compute_residuals(p @ moved[:3, :3].T + moved[:3, 3], f) for f, p in pairs]
+            [
+                _compute_residuals(own_points @ moved[:3, :3].T + moved[:3, 3], photo)
+                for photo, own_points in zip(photos, points, strict=True)
+            ]
         )
 
-    answer = least_squares(errors, np.zeros(7), loss="cauchy", f_scale=0.3 * MAX_REPROJECTION_ERROR)
-    return start @ np.linalg.inv(change(answer.x))
+    # Some matches are false; a Cauchy loss bounds their pull.
+    solution = least_squares(
+        errors, np.zeros(7), loss="cauchy", f_scale=0.3 * MAX_REPROJECTION_ERROR
+    )
+    # `change` maps the splat's points to where they belong, so that the frame moves inversely.
+    return start @ np.linalg.inv(change(solution.x))
 
 
 def _compute_residuals(
@@ -167,6 +182,7 @@ def _compute_residuals(
     pose = get_pose(photo.camera)
     local = (points - pose[:3, 3]) @ pose[:3, :3]
     homogeneous = local @ photo.camera.K.detach().cpu().double().numpy().T
+    # A point behind the camera gets a large error instead of a mirrored pixel.
     ahead = np.maximum(homogeneous[:, 2:], 1e-9 * np.abs(homogeneous).max())
     return np.clip(homogeneous[:, :2] / ahead - photo.pixels, -1e4, 1e4).ravel()
 
@@ -191,20 +207,25 @@ def render_features(scene: Gaussians, camera: Camera, renderer: Renderer) -> Ren
 
 def locate_photo(rendered: RenderedFeatures, photograph: PhotoFeatures) -> LocatedPhoto | None:
     """Estimate a photograph's pose by PnP against a render; None with too few inliers."""
-    (features, surface), (camera, own_features) = rendered, photograph
+    features, surface = rendered
+    camera, own_features = photograph
+    # Each feature of the render has a point of the splat, which gives 2D to 3D matches.
     places, pixels = match_features(features, own_features)
     columns, rows = np.floor(places).astype(int).T
     points = surface[rows.clip(0, len(surface) - 1), columns.clip(0, surface.shape[1] - 1)]
     known = np.isfinite(points).all(axis=1)
-    points, pixels = points[known], pixels[known]
+    points = points[known]
+    pixels = pixels[known]
     if len(points) < MIN_INLIERS:
         return None
     K = camera.K.detach().cpu().double().numpy()
-    answer = cv2.solvePnPRansac(
+    is_solved, turn, shift, inliers = cv2.solvePnPRansac(
         points, pixels, K, None, iterationsCount=300, reprojectionError=MAX_REPROJECTION_ERROR
     )
-    if not answer[0] or answer[3] is None or len(answer[3]) < MIN_INLIERS:
+    if not is_solved or inliers is None or len(inliers) < MIN_INLIERS:
         return None
-    viewmat, chosen = np.eye(4), answer[3].ravel()
-    viewmat[:3, :3], viewmat[:3, 3] = cv2.Rodrigues(answer[1])[0], answer[2].ravel()
+    viewmat = np.eye(4)
+    viewmat[:3, :3] = cv2.Rodrigues(turn)[0]
+    viewmat[:3, 3] = shift.ravel()
+    chosen = inliers.ravel()
     return LocatedPhoto(camera, np.linalg.inv(viewmat), points[chosen], pixels[chosen])

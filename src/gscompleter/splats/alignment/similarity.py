@@ -59,9 +59,13 @@ def transform_view(view: View, transform: Matrix) -> View:
     """Transform a photograph's camera and its depths."""
     if np.array_equal(transform, np.eye(4)):
         return view
-    scale, names = get_scale(transform), ("depth", "given_depth")
-    depths = {name: d * scale for name in names if (d := getattr(view, name)) is not None}
-    return replace(view, camera=transform_camera(view.camera, transform), **depths)
+    scale = get_scale(transform)
+    return replace(
+        view,
+        camera=transform_camera(view.camera, transform),
+        depth=None if view.depth is None else view.depth * scale,
+        given_depth=None if view.given_depth is None else view.given_depth * scale,
+    )
 
 
 def get_pose(camera: Camera) -> Matrix:
@@ -81,9 +85,12 @@ def fit_pose_similarity(before: Sequence[Matrix], after: Sequence[Matrix]) -> Ma
     The rotation is the one closest to most, scale and shift are medians; both `has_baseline`.
     """
     turns = np.stack([b[:3, :3] @ a[:3, :3].T for a, b in zip(before, after, strict=True)])
+    # trace(R_iᵀ R_j) grows as the angle between two rotations falls; each pair of poses gives one
+    # rotation, and the one with the largest median trace is the closest to most.
     closeness = np.einsum("iab,jab->ij", turns, turns)
     rotation = turns[np.median(closeness, axis=1).argmax()]
-    old, new = np.stack(before)[:, :3, 3], np.stack(after)[:, :3, 3]
+    old = np.stack(before)[:, :3, 3]
+    new = np.stack(after)[:, :3, 3]
     apart = np.linalg.norm(old[:, None] - old, axis=-1)
     # Every camera is far enough from at least one of the two that are farthest apart.
     apart[apart < 0.3 * apart.max()] = np.nan

@@ -80,13 +80,15 @@ def read_trainer_frames(
     to_splat = compute_frame_from_photographs(splat.origin)
     ours = dict(collect_poses(photographs))
     for file in find_camera_lists(splat.path, splat.photographs):
-        theirs = {f.name: to_splat @ f.c2w for f in read_camera_list(file)}
+        theirs = {frame.name: to_splat @ frame.c2w for frame in read_camera_list(file)}
         transform = fit_named_cameras(ours, theirs)
         if transform is not None:
             yield "cameras", transform
     for folder in list_trainer_folders(splat.path, splat.photographs):
         if (folder / DATAPARSER_FILE).is_file():
             transform = read_dataparser_transforms(folder / DATAPARSER_FILE)
+            # Right to left: local photographs, their world, COLMAP's world, nerfstudio's, local
+            # splat.
             for world in NERFSTUDIO_WORLDS:
                 original = make_similarity(1.0, world.T, np.zeros(3))
                 yield "dataparser", to_splat @ transform @ original @ to_photographs
@@ -117,7 +119,8 @@ def fit_named_cameras(ours: Mapping[str, Matrix], theirs: Mapping[str, Matrix]) 
     """Fit the similarity from `ours` to `theirs` by name; None without two matched positions."""
     pairs = match_names(list(ours), list(theirs))
     pairs = pairs[:: max(1, len(pairs) // MAX_PAIRS)]
-    before, after = [ours[a] for a, _ in pairs], [theirs[b] for _, b in pairs]
+    before = [ours[a] for a, _ in pairs]
+    after = [theirs[b] for _, b in pairs]
     if not has_baseline(before) or not has_baseline(after):
         return None
     return fit_pose_similarity(before, after)
@@ -126,9 +129,10 @@ def fit_named_cameras(ours: Mapping[str, Matrix], theirs: Mapping[str, Matrix]) 
 def match_names(ours: Sequence[str], theirs: Sequence[str]) -> list[tuple[str, str]]:
     """Match names that differ only in extension, or in folder if base names are unique."""
     for with_folder in (True, False):
-        a, b = index_unique(ours, with_folder), index_unique(theirs, with_folder)
-        if len(a.keys() & b.keys()) >= 2:
-            return [(a[name], b[name]) for name in a if name in b]
+        our_names = index_unique(ours, with_folder)
+        their_names = index_unique(theirs, with_folder)
+        if len(our_names.keys() & their_names.keys()) >= 2:
+            return [(our_names[key], their_names[key]) for key in our_names if key in their_names]
     return []
 
 
@@ -173,7 +177,9 @@ def normalize_gsplat_cameras(poses: Poses) -> Matrix:
     Up becomes -y, the point that the cameras face the origin, and their median distance from it 1.
     """
     turn = align_directions(-poses[:, :3, 1].mean(axis=0), np.array([0.0, -1.0, 0.0]))
-    centers, forward = poses[:, :3, 3] @ turn.T, poses[:, :3, 2] @ turn.T
+    centers = poses[:, :3, 3] @ turn.T
+    forward = poses[:, :3, 2] @ turn.T
+    # The point of each viewing ray that is nearest to the origin; the cameras face their median.
     nearest = centers - (forward * centers).sum(axis=1, keepdims=True) * forward
     shift = -np.median(nearest, axis=0)
     scale = 1 / max(float(np.median(np.linalg.norm(centers + shift, axis=1))), 1e-12)
@@ -189,6 +195,7 @@ def align_gsplat_axes(cameras: Matrix, points: Points) -> Iterator[Matrix]:
     center = np.median(moved, axis=0)
     _, vectors = np.linalg.eigh(np.cov(moved - center, rowvar=False))
     axes = vectors[:, ::-1].T
+    # Eigenvalues ascend. A mirrored set of axes is negated, which makes it a rotation.
     axes = axes * np.sign(np.linalg.det(axes))
     for signs in ((1, 1, 1), (1, -1, -1), (-1, 1, -1), (-1, -1, 1)):
         turn = np.diag(np.array(signs, dtype=np.float64)) @ axes
@@ -202,7 +209,9 @@ def align_directions(
     start = start / max(float(np.linalg.norm(start)), 1e-12)
     x, y, z = np.cross(start, end)
     cosine = float(start @ end)
+    # Opposite directions have no unique rotation: half a turn about y, or about z for those near y.
     if cosine < -1 + 1e-8:
         return np.diag([-1.0, 1.0, -1.0]) if abs(end[1]) < 0.5 else np.diag([-1.0, -1.0, 1.0])
+    # Rodrigues' formula with sine |start x end|: I + [v] + [v]² / (1 + cos).
     skew = np.array([[0, -z, y], [z, 0, -x], [-y, x, 0]])
     return np.eye(3) + skew + skew @ skew / (1 + cosine)

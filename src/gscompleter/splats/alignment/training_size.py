@@ -23,8 +23,10 @@ from gscompleter.splats.alignment.trainer_frames import (
 from gscompleter.system.errors import InputError
 from gscompleter.system.files.reading import read_head
 
-INRIA_FILE, GSPLAT_FILE = "cfg_args", "cfg.yml"
-"""Settings of Inria's trainer and of gsplat's example trainer, in the folder of the model."""
+INRIA_FILE = "cfg_args"
+"""Settings of Inria's trainer, in the folder of the model."""
+GSPLAT_FILE = "cfg.yml"
+"""Settings of gsplat's example trainer, in the folder of the model."""
 INRIA_DIVISORS = (1, 2, 4, 8)
 """Values of Inria's `resolution` that divide the width; others above 0 are the width itself."""
 INRIA_MAX_WIDTH = 1600
@@ -80,13 +82,14 @@ def read_inria_scale(splat: Path, folder: Path, width: int) -> Record | None:
         return None
     reduced = re.search(r"\bimages=['\"]images_(\d{1,2})['\"]", text)
     scale = 1.0 if reduced is None else 1 / max(int(reduced[1]), 1)
-    asked, width_there = int(resolution[1]), scale * width
-    if asked in INRIA_DIVISORS:
-        scale /= asked
-    elif asked > 0:
-        scale *= asked / width_there
-    elif width_there > INRIA_MAX_WIDTH:
-        scale *= INRIA_MAX_WIDTH / width_there
+    setting = int(resolution[1])
+    reduced_width = scale * width
+    if setting in INRIA_DIVISORS:
+        scale /= setting
+    elif setting > 0:
+        scale *= setting / reduced_width
+    elif reduced_width > INRIA_MAX_WIDTH:
+        scale *= INRIA_MAX_WIDTH / reduced_width
     return scale, INRIA_FILE
 
 

@@ -146,6 +146,7 @@ def read_brightness(stored: Path | bytes, side: int) -> Float[np.ndarray, "h w"]
     with open_image(stored) as image:
         scale = min(1.0, side / max(image.size))
         size = max(round(image.width * scale), 1), max(round(image.height * scale), 1)
+        # A JPEG is decoded at a fraction of its size, which is much faster; others ignore it.
         image.draft("L", size)
         pixels = _read_over_black(image)
     grey = Image.fromarray(pixels).convert("L")
@@ -211,6 +212,7 @@ def _choose_formats(head: bytes, shown: str) -> tuple[str, ...]:
 
     Pillow reads AVIF where it was built with it, and HEIC with pillow-heif.
     """
+    # The first box names a main brand, a version, and further brands.
     brands = [head[start : start + 4] for start in (8, *range(16, len(head), 4))]
     if head[4:8] != b"ftyp":
         return IMAGE_FORMATS
@@ -242,6 +244,7 @@ def _read_over_black(image: Image.Image) -> UInt8[np.ndarray, "h w 3"]:
     if image.mode == "F":
         raise ValueError("it holds floating-point values, not colours")
     if image.mode == "I" or image.mode.startswith("I;16"):
+        # 65535 / 257 is 255.
         grey = np.array(image).astype(np.float64) / 257
         return np.repeat((grey + 0.5).clip(0, 255).astype(np.uint8)[..., None], 3, axis=-1)
     if _has_alpha(image):
@@ -255,6 +258,7 @@ def composite_over_black(
 ) -> UInt8[np.ndarray, "h w 3"]:
     """Composite colours over black."""
     weighted = colors.astype(np.uint16) * alpha[..., None]
+    # Rounded to the nearest.
     return ((weighted + 127) // 255).astype(np.uint8)
 
 

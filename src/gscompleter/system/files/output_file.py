@@ -31,12 +31,14 @@ def reserve_file(path: Path, overwrite: bool) -> Iterator[None]:
         mark.touch(exist_ok=False)
     try:
         entries = list_unfinished(target.parent, target.name)
-        rival = next((e for e in entries if not e.is_own() and e.is_running()), None)
-        if rival is not None:
-            raise InputError(
-                f"Another run (process {rival.pid}) is writing {quote_value(path)}; wait for its "
-                "end, or name another file."
-            )
+        # The mark of this run is made before it looks for others: of two runs at least one sees the
+        # other.
+        for entry in entries:
+            if not entry.is_own() and entry.is_running():
+                raise InputError(
+                    f"Another run (process {entry.pid}) is writing {quote_value(path)}; wait for "
+                    "its end, or name another file."
+                )
         remove_left_behind(target.parent, target.name)
         yield
     finally:

@@ -31,16 +31,20 @@ from gscompleter.system.files.unfinished import (
 )
 from gscompleter.system.files.writing import SUMMARY_FILE, convert_write_errors, defer_interrupts
 
-FILES, COMMAND = "files", "command"
-"""Entries of `summary.json`: the files of the run, and the command that wrote them."""
+FILES = "files"
+"""Entry of `summary.json`: the files of the run."""
+COMMAND = "command"
+"""Entry of `summary.json`: the command that wrote them."""
 POSES = "colmap"
 """Folder of the cameras that a completion found for its photographs; it has its own summary."""
 
 MAX_SUMMARY_BYTES = 10**9
 MAX_NAMED = 5
 """Most foreign files that a sentence names."""
-ATTEMPTS, MAX_WAIT_SECONDS = 4, 0.2
-"""Attempts of two runs that reserve a folder at the same moment, and the time between them."""
+ATTEMPTS = 4
+"""Attempts of two runs that reserve a folder at the same moment."""
+MAX_WAIT_SECONDS = 0.2
+"""Longest time between two attempts."""
 
 _DISK_ERRORS = {errno.ENOSPC, errno.EDQUOT, errno.EFBIG, errno.EROFS}
 
@@ -104,9 +108,11 @@ def reserve_output(
     or if it has files that match `patterns` (globs of the results) and that no earlier run wrote.
     `takes_over` is for a caller that knows that no other run is left.
     """
-    given, target = Path(path), Path(os.path.realpath(path))
+    given = Path(path)
+    target = Path(os.path.realpath(path))
     with ExitStack() as stack:
         draft = stack.enter_context(_reserve(given, target, overwrite, takes_over))
+        # Killed runs first: what they completed counts as an earlier result.
         _finish_interrupted(target)
         remove_left_behind(target)
         remove_left_behind(target.parent, target.name)
@@ -173,6 +179,7 @@ def _reserve(given: Path, target: Path, overwrite: bool, takes_over: bool) -> It
     after another time.
     """
     home = target if os.path.isdir(target) else target.parent
+    # Parents that this run makes are removed again if nothing comes of it.
     missing = [folder for folder in (home, *home.parents) if not os.path.exists(folder)]
     draft = home / make_unfinished_name(target.name)
     try:
@@ -185,7 +192,11 @@ def _reserve(given: Path, target: Path, overwrite: bool, takes_over: bool) -> It
                 break
             draft.rmdir()
             if attempt == ATTEMPTS:
-                raise InputError(_describe_rival(given, rival), "out")
+                raise InputError(
+                    f"Another run (process {rival.pid}) is writing {quote_value(given)}; wait for "
+                    "its end, or name another folder.",
+                    "out",
+                )
             time.sleep(random.uniform(0, MAX_WAIT_SECONDS))
         yield draft
     finally:
@@ -198,15 +209,10 @@ def _reserve(given: Path, target: Path, overwrite: bool, takes_over: bool) -> It
 def _find_rival(draft: Path, target: Path) -> Unfinished | None:
     """Find the draft of another run that writes the same folder."""
     places = [*list_unfinished(target.parent, target.name), *list_unfinished(target, target.name)]
-    others = (entry for entry in places if entry.path != draft and not entry.is_own())
-    return next((entry for entry in others if entry.is_running()), None)
-
-
-def _describe_rival(given: Path, rival: Unfinished) -> str:
-    return (
-        f"Another run (process {rival.pid}) is writing {quote_value(given)}; wait for its end, or "
-        "name another folder."
-    )
+    for entry in places:
+        if entry.path != draft and not entry.is_own() and entry.is_running():
+            return entry
+    return None
 
 
 def _check_free(given: Path, target: Path, overwrite: bool) -> None:
@@ -255,8 +261,9 @@ def _find_obstacle(folder: Path, name: str) -> str | None:
     It is anything but a folder in the place of one, also a link to a folder elsewhere, or anything
     but a file in the place of the file.
     """
-    *parents, _ = parts = PurePosixPath(name).parts
-    for depth in range(1, len(parents) + 1):
+    # From the outermost parent on; below one that does not exist, nothing is in the way.
+    parts = PurePosixPath(name).parts
+    for depth in range(1, len(parts)):
         inner = "/".join(parts[:depth])
         try:
             mode = os.lstat(folder / inner).st_mode
@@ -314,9 +321,9 @@ def _list_in_summary(draft: Path, command: str) -> None:
     """Add the names of all files to the summary of a draft, or make one of them alone."""
     path = draft / SUMMARY_FILE
     content = json.loads(path.read_bytes()) if path.is_file() else {}
-    made = {COMMAND: command} if command else {}
+    origin = {COMMAND: command} if command else {}
     files = sorted({SUMMARY_FILE, *_list_files(draft)})
-    whole = json.dumps({**made, **content, FILES: files}, indent=2)
+    whole = json.dumps({**origin, **content, FILES: files}, indent=2)
     path.write_bytes(whole.encode() + b"\n")
 
 
@@ -328,6 +335,8 @@ def _publish(draft: Path, target: Path) -> None:
     replaced = target / f"{draft.name}{REPLACED_SUFFIX}"
     listed = read_listing(target)
     _refuse_unlisted(target, target, _list_files(draft), listed)
+    # Renames of old files, then of new ones: a run that is killed in between leaves both folders,
+    # from which the next one finishes (`_finish_interrupted`).
     created = _make_folders(draft, target)
     replaced.mkdir()
     try:
@@ -375,6 +384,7 @@ def _rename_all(moves: list[tuple[Path, Path]]) -> None:
         try:
             os.rename(*move)
         except OSError:
+            # In the reverse order, so that the summary, which left first, comes back last.
             for source, destination in reversed(moves[:number]):
                 os.rename(destination, source)
             raise
@@ -384,6 +394,7 @@ def _remove_replaced(target: Path, replaced: Path, listed: Iterable[str]) -> Non
     """Remove the replaced files, and the folders of the earlier run that are empty now."""
     shutil.rmtree(replaced, ignore_errors=True)
     parents = {parent for name in listed for parent in PurePosixPath(name).parents}
+    # The innermost folders first, so that outer ones are empty when it is their turn.
     for parent in sorted(parents, key=lambda parent: -len(parent.parts)):
         if parent.parts:
             with suppress(OSError):
@@ -415,6 +426,7 @@ def _finish_interrupted(target: Path) -> None:
 
 def _finish_moves(draft: Path, target: Path, replaced: Path, listed: frozenset[str]) -> None:
     """Do the renames that are left: those of earlier files, unless done, and those of new ones."""
+    # New files that left the draft have their final name already, and must not be moved away.
     published = read_listing(draft).difference(_list_files(draft))
     left = [n for n in listed - published if not os.path.lexists(replaced / n)]
     _make_folders(draft, target)

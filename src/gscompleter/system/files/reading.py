@@ -121,12 +121,13 @@ def check_plain(value: Any, name: Path | str, max_values: int) -> None:
 
     Repeated values count again, so that a value that contains itself is refused as endless.
     """
-    waiting, count = [(value, 0)], 0
+    waiting = [(value, 0)]
+    count = 0
     while waiting:
-        held, depth = waiting.pop()
-        if not isinstance(held, _HOLDERS):
+        holder, depth = waiting.pop()
+        if not isinstance(holder, _HOLDERS):
             continue
-        parts = held.values() if isinstance(held, dict) else held
+        parts = holder.values() if isinstance(holder, dict) else holder
         count += len(parts)
         if depth > MAX_DEPTH or count > max_values:
             raise InputError(

@@ -55,7 +55,10 @@ class Unfinished:
 
     def is_running(self) -> bool:
         """Return True if the process that writes the entry is, or may be, still running."""
-        if self.machine == _describe_machine() and _can_see_processes():
+        # The system may not list processes with the times at which they began; then signs count.
+        can_see_processes = _read_start(os.getpid()) is not None
+        if self.machine == _describe_machine() and can_see_processes:
+            # A process of the same number that began at another time is not the owner.
             start = _read_start(self.pid)
             return _is_hidden(self.pid) if start is None else start == self.start
         try:
@@ -94,12 +97,15 @@ def list_unfinished(folder: Path, target: str | None = None) -> list[Unfinished]
         names = os.listdir(folder)
     except OSError:
         return []
-    matches = [match for name in names if (match := _NAME.fullmatch(name))]
-    return [
-        Unfinished(folder / m[0], m["target"], m["machine"], int(m["pid"]), int(m["start"]))
-        for m in matches
-        if target is None or m["target"] == digest_target(target)
-    ]
+    entries = []
+    for name in names:
+        match = _NAME.fullmatch(name)
+        if match is None or (target is not None and match["target"] != digest_target(target)):
+            continue
+        pid = int(match["pid"])
+        start = int(match["start"])
+        entries.append(Unfinished(folder / name, match["target"], match["machine"], pid, start))
+    return entries
 
 
 def remove_left_behind(folder: Path, target: str | None = None) -> None:
@@ -113,6 +119,7 @@ def remove_left_behind_below(folder: Path) -> None:
     """Remove unfinished entries whose process is gone from a folder and all folders in it."""
     for home, folders, _ in os.walk(folder):
         remove_left_behind(Path(home))
+        # `os.walk` goes on with what is left in its list.
         folders[:] = [name for name in folders if not name.startswith(UNFINISHED_PREFIX)]
 
 
@@ -151,11 +158,6 @@ def _describe_machine() -> str:
     with suppress(OSError):
         parts.append(os.readlink("/proc/self/ns/pid"))
     return hashlib.sha256("\n".join(parts).encode()).hexdigest()[:8]
-
-
-def _can_see_processes() -> bool:
-    """Return True if the system lists its processes with the times at which they began."""
-    return _read_start(os.getpid()) is not None
 
 
 def _read_start(pid: int) -> int | None:

@@ -84,6 +84,7 @@ def read_frames(path: Path, filters: str, is_grey: bool) -> Iterator[UInt8[np.nd
 
 def _read_images(stream: IO[bytes]) -> Iterator[UInt8[np.ndarray, "h w *c"]]:
     """Read 8-bit PNM images until the stream ends."""
+    # Each image has three lines of header: the kind, both sides, and the largest value.
     while kind := stream.readline():
         width, height = map(int, stream.readline().split())
         shape = (height, width) if kind == b"P5\n" else (height, width, 3)

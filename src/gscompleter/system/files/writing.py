@@ -21,8 +21,10 @@ SUMMARY_FILE = "summary.json"
 """File that marks a folder as complete: it is removed first and written last."""
 TARGETS_FILE = "targets.json"
 """File of a completion with the target cameras."""
-CONTEXT_FILE, COMPLETED_FILE = "context.ply", "completed.ply"
-"""The scene of a completion before and after."""
+CONTEXT_FILE = "context.ply"
+"""Scene before its completion."""
+COMPLETED_FILE = "completed.ply"
+"""Scene after its completion."""
 REMOVED_FILE = "removed.ply"
 """Originals of changed and removed Gaussians of a given scene, beside the completed one."""
 
@@ -48,6 +50,7 @@ def replace_file(path: Path | str, keep_existing: bool = False) -> Iterator[Bina
                 yield file
                 file.flush()
                 os.fsync(file.fileno())
+            # Unlike a rename, a hard link fails if the name is taken.
             if keep_existing:
                 with suppress(OSError):
                     os.link(temporary, target)

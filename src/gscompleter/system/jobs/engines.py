@@ -23,8 +23,10 @@ from gscompleter.system.threads import count_available_cores, limit_threads
 
 EngineName = Literal["local", "ray", "submitit"]
 
-PIXELS, IMAGES = 640 * 480, 8
-"""Size of a typical completion, for the default number of workers."""
+PIXELS = 640 * 480
+"""Pixels per image of a typical completion, for the default number of workers."""
+IMAGES = 8
+"""Images of a typical completion."""
 STOP_SECONDS = 10.0
 """Time that stopped workers have to remove what they have not finished."""
 RAY_VARIABLES = {"RAY_USAGE_STATS_ENABLED": "0", "RAY_ACCEL_ENV_VAR_OVERRIDE_ON_ZERO": "0"}
@@ -35,8 +37,11 @@ STORE_BYTES = 200 * 10**6
 
 def choose_num_workers() -> int:
     """Return the number of cores, limited by the memory of a typical completion."""
-    there, cores = read_memory_bytes(), count_available_cores()
-    return cores if there is None else max(1, min(cores, there // estimate_bytes(PIXELS, IMAGES)))
+    memory = read_memory_bytes()
+    cores = count_available_cores()
+    if memory is None:
+        return cores
+    return max(1, min(cores, memory // estimate_bytes(PIXELS, IMAGES)))
 
 
 def check_processes() -> None:
@@ -60,7 +65,11 @@ def open_local(workers: int) -> Iterator[Pool]:
     spawn = multiprocessing.get_context("spawn")
 
     def start(share: Share) -> Future[Exception | None]:
-        idle = [one for one, old in futures.items() if old.done() and old.exception() is None]
+        idle = [
+            executor
+            for executor, future in futures.items()
+            if future.done() and future.exception() is None
+        ]
         executor = idle[0] if idle else ProcessPoolExecutor(1, spawn, follow_parent)
         futures[executor] = executor.submit(share)
         return futures[executor]
@@ -69,6 +78,7 @@ def open_local(workers: int) -> Iterator[Pool]:
         yield Pool(workers, start)
     finally:
         for executor, future in futures.items():
+            # `shutdown` waits for running work, so that its processes are stopped first.
             if not future.done():
                 for process in executor._processes.values():
                     process.terminate()
@@ -139,6 +149,7 @@ def connect_to_ray(ray: Any, address: str | None, cores: int | None) -> None:
     """Connect to a cluster, or start one of `cores` cores on this machine."""
     for name, value in RAY_VARIABLES.items():
         os.environ.setdefault(name, value)
+    # A cluster elsewhere has its own settings.
     here = {"num_cpus": cores, "include_dashboard": False, "object_store_memory": STORE_BYTES}
     options = {"address": address} if address else {"address": "local", **here}
     handlers = {number: signal.getsignal(number) for number in (signal.SIGTERM, signal.SIGINT)}

@@ -26,8 +26,10 @@ from gscompleter.system.files.reading import read_json
 from gscompleter.system.files.unfinished import UNFINISHED_PREFIX, remove_left_behind_below
 from gscompleter.system.files.writing import convert_write_errors, replace_file
 
-JOBS, ROWS = "jobs", "rows"
-"""Folders in the folder of a batch."""
+JOBS = "jobs"
+"""Folder of the results of jobs, in the folder of a batch."""
+ROWS = "rows"
+"""Folder of the rows of jobs, in the folder of a batch."""
 RETRY_SECONDS = 1.0
 """Delay before the first retry after an error not caused by the input; doubled for the next."""
 POLL_SECONDS = 0.1
@@ -62,6 +64,7 @@ def run_with_retries(
     work: Callable[[], Mapping[str, Any]], lost: int, retries: int
 ) -> dict[str, Any]:
     """Run `work` with retries and return its part of a row; `lost` attempts have been killed."""
+    # Attempts that killed their process count, too.
     reason = describe_loss(lost)
     for number in range(lost + 1, retries + 2):
         try:
@@ -204,6 +207,7 @@ def run_jobs(
         return
     running: dict[Any, list[Job]] = {}
     with engine() as pool:
+        # Every n-th job, as in `parse_shard`.
         count = min(pool.num_shares or len(jobs), len(jobs))
         waiting = deque(list(jobs[i::count]) for i in range(count))
         while waiting or running:
@@ -211,13 +215,15 @@ def run_jobs(
                 share = waiting.popleft()
                 running[pool.start(partial(run_share, perform, tuple(share)))] = share
             time.sleep(POLL_SECONDS)
+            # Asked before the rows are looked at: a share that has ended has written all of them.
             ended = [future for future in running if future.done()]
             for share in running.values():
                 while share and has_row(share[0]):
                     yield share.pop(0)
             for future in ended:
                 share = running.pop(future)
-                if rest := collect_rest(future, share, retries):
+                rest = collect_rest(future, share, retries)
+                if rest:
                     waiting.append(rest)
                 else:
                     yield from share
@@ -230,9 +236,12 @@ def collect_rest(future: Any, share: list[Job], retries: int) -> list[Job]:
     a job as failed.
     """
     killed = future.exception()
-    if killed is None and (error := future.result()) is not None:
-        raise error
-    if killed is None or not share:
+    if killed is None:
+        error = future.result()
+        if error is not None:
+            raise error
+        return []
+    if not share:
         return []
     first = replace(share[0], lost=share[0].lost + 1)
     if first.lost > retries + 1:
@@ -258,7 +267,9 @@ def parse_shard(text: str | None, environment: Mapping[str, str]) -> tuple[int, 
         task, first, count = map(int, numbers)
         return check_shard(task - first, count)
     match = re.fullmatch(r"([0-9]{1,6})/([0-9]{1,6})", text)
-    return check_shard(*map(int, match.groups() if match else (-1, 0)))
+    if match is None:
+        return check_shard(-1, 0)
+    return check_shard(int(match[1]), int(match[2]))
 
 
 def check_shard(number: int, count: int) -> tuple[int, int]:
