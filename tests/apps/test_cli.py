@@ -274,7 +274,10 @@ def test_wrong_frames_are_refused(scene, tmp_path, monkeypatch, capsys, more, se
         (("--config.registration.iterations", "many"), "'many'"),
         (("--config.registration.speed", 1), "--config.registration.speed"),
         (("--config.registration.hole-depth", "round"), "'round'"),
-        (("--config.paper-registration.iterations", 7), "does not read them; choose the other"),
+        (
+            ("--config.paper-registration.iterations", 7),
+            "gscompleter: The settings paper_registration are changed",
+        ),
         (("--generator-steps", 8, "--generator", "oracle"), "choose pe-field or diffusers-inp"),
         (("--generator-steps", 0, "--generator", "pe-field"), "got 0 (--generator-steps)."),
         (("--generator-steps", "few"), "'few'"),

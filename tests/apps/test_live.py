@@ -386,11 +386,11 @@ def test_without_viser_a_sentence_says_what_to_install(room, tmp_path, monkeypat
 
 def test_the_options_of_complete_are_those_of_live(room, tmp_path):
     words = ["live", str(room), "--out", str(tmp_path / "out"), "--config", "paper"]
-    options = parse_command([*words, "--config.registration.iterations", "7", "--seed", "3"])
+    options = parse_command([*words, "--config.paper-registration.iterations", "7", "--seed", "3"])
     asked = live.make_complete_options(options)
     paper = CompleterConfig.paper()
-    registration = replace(paper.registration, iterations=7)
-    assert asked.config == replace(paper, registration=registration)
+    registration = replace(paper.paper_registration, iterations=7)
+    assert asked.config == replace(paper, paper_registration=registration)
     assert (asked.seed, asked.resolution, asked.target) == (3, (256, 256), ())
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Callable, Collection, Mapping, Sequence
 from contextlib import redirect_stderr
 from dataclasses import dataclass, is_dataclass, replace
@@ -250,6 +251,8 @@ def extract_sentence(box: str, own: Collection[str]) -> str:
     text = dropwhile(lambda line: not line.strip("─- "), lines)
     paragraph = takewhile(lambda line: line.strip("─- "), text)
     sentence = " ".join(line.strip() for line in paragraph if not line.startswith(" " * 5))
+    # What settings refuse themselves comes with tyro's name of the class around them.
+    sentence = re.sub(r"^Error parsing [\w.-]+: ", "", sentence)
     hint = ""
     for title, words in HINTS.items():
         if title in lines:

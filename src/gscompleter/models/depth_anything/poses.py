@@ -28,11 +28,6 @@ class Poses:
         """Camera centres."""
         return self.c2w[..., :3, 3]
 
-    @property
-    def w2c(self) -> Float[Tensor, "b v 4 4"]:
-        """World-to-camera transforms."""
-        return invert_rigid(self.c2w)
-
 
 def invert_rigid(transforms: Float[Tensor, "*n 4 4"]) -> Float[Tensor, "*n 4 4"]:
     """Invert rigid transforms."""
