@@ -52,6 +52,7 @@ def extend_sky(
     """Extend the sky behind surfaces by Gaussians of `sigma` pixels; return their pixels, too."""
     camera = view.camera
     image = view.image
+    # Only behind surfaces: where the sky is seen, the reconstruction has its Gaussians.
     reach = round(SKY_EXTENSION * min(camera.width, camera.height))
     where = dilate(sky, reach) & ~sky
     pixels = torch.nonzero(where.flatten())[:, 0]
@@ -76,6 +77,7 @@ def restore_sky_colors(made: Gaussians, fitted: Gaussians, camera: Camera) -> Ga
     in_sky = is_sky((made.means - camera.center).norm(dim=-1), camera)
     if not in_sky.any():
         return fitted
+    # The fit may have added harmonics, which the sky does not have.
     sh = torch.where(in_sky[:, None, None], 0, fitted.sh)
     sh[in_sky, : made.sh.shape[1]] = made.sh[in_sky]
     return replace(fitted, sh=sh, encoded=None)

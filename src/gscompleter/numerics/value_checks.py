@@ -98,6 +98,7 @@ def check_inputs(
         check_gaussians(scene, "The scene")
     for number, target in enumerate(targets):
         check_camera(target, f"Target {number}")
+    # Before anything of this size is allocated.
     cameras = [*(view.camera for view in (*views, *check_photos)), *targets]
     check_images(sum(camera.width * camera.height for camera in cameras), len(cameras))
     tensors = {f"context view {number}": view.image for number, view in enumerate(views)}

@@ -91,6 +91,8 @@ def fit_pose_similarity(before: Sequence[Matrix], after: Sequence[Matrix]) -> Ma
     rotation = turns[np.median(closeness, axis=1).argmax()]
     old = np.stack(before)[:, :3, 3]
     new = np.stack(after)[:, :3, 3]
+    # Scale: the median over cameras of the median ratio of its distances to the others, since pairs
+    # with a camera that is an outlier are wrong altogether.
     apart = np.linalg.norm(old[:, None] - old, axis=-1)
     # Every camera is far enough from at least one of the two that are farthest apart.
     apart[apart < 0.3 * apart.max()] = np.nan

@@ -29,6 +29,7 @@ def refuse_overlap(
     of its folders that are results of their own: a completion is cleaned in place, or completed
     from the cameras that were found for it.
     """
+    # Photographs may be links to a folder elsewhere, which is an input as well.
     chain = list(_identify_chain(out))
     for given in inputs:
         if may_continue and _is_earlier_result(given, out):

@@ -124,11 +124,10 @@ def read_ply_file(
                 "no lists."
             )
         is_ascii = re.search(rb"^format\s+ascii", header, re.M) is not None
-        rows = (
-            _read_ascii_rows(file, vertex, path)
-            if is_ascii
-            else _map_rows(file, vertex.dtype, len(header), vertex.count)
-        )
+        if is_ascii:
+            rows = _read_ascii_rows(file, vertex, path)
+        else:
+            rows = _map_rows(file, vertex.dtype, len(header), vertex.count)
         if len(rows) < vertex.count:
             raise InputError(
                 f"{path} is truncated: {len(rows):,} of {quote_value(f'{vertex.count:,}')} rows "
@@ -140,6 +139,7 @@ def read_ply_file(
 
 def _map_rows(file: BinaryIO, dtype: np.dtype, start: int, count: int | None = None) -> np.ndarray:
     """Map rows of a binary file into memory: those that it has, at most `count`."""
+    # The header may claim any count; no memory is taken for rows that are not there.
     available = max(os.fstat(file.fileno()).st_size - start, 0) // dtype.itemsize
     number = available if count is None else min(count, available)
     if number == 0:
@@ -164,7 +164,8 @@ def _read_ascii_rows(file: BinaryIO, vertex: Element, path: Path) -> np.ndarray:
 def make_header(elements: Mapping[str, tuple[int, np.dtype]], comment: str | None = None) -> bytes:
     """Make the header of a binary .ply from the number and type of the rows of each element."""
     lines = ["ply", "format binary_little_endian 1.0"]
-    lines += [] if comment is None else [f"comment {comment}"]
+    if comment is not None:
+        lines.append(f"comment {comment}")
     for name, (count, dtype) in elements.items():
         lines.append(f"element {name} {count}")
         lines += [f"property {_NAMES[dtype[column].str]} {column}" for column in dtype.names or ()]
