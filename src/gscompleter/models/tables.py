@@ -10,6 +10,7 @@ from typing import Any
 
 from gscompleter.config.generators import GeneratorSettings
 from gscompleter.generators import Generator, as_generator
+from gscompleter.models.depth_predictors import DEPTH_PREDICTORS as DEPTH_PREDICTORS
 from gscompleter.models.settings import (
     DiffusersInpaintSettings,
     FileSettings,
@@ -18,7 +19,6 @@ from gscompleter.models.settings import (
 )
 from gscompleter.models.weights.published import PUBLISHED
 from gscompleter.reconstructors import Reconstructor
-from gscompleter.reconstructors.depth_predictors import DepthPredictor
 from gscompleter.types import View
 
 
@@ -30,7 +30,7 @@ def load_learned_reconstructor(name: str, weights: Path | None, device: str) -> 
     return build(name, weights, device)
 
 
-def load_map_anything(weights: Path | None, device: str) -> Reconstructor:
+def _load_map_anything(weights: Path | None, device: str) -> Reconstructor:
     """Load MapAnything through its own package."""
     from gscompleter.models.map_anything import load_map_anything
 
@@ -51,35 +51,28 @@ class GeneratorLoader:
         return as_generator(self.load(settings, seed, device))
 
 
-def load_pe_field(settings: Any, seed: int, device: str) -> Any:
+def _load_pe_field(settings: Any, seed: int, device: str) -> Any:
     """Load PE-Field, the diffusion transformer of the paper."""
     from gscompleter.models.diffusion.pe_field import load_pe_field
 
     return load_pe_field(seed, device, settings)
 
 
-def load_diffusers_inpaint(settings: Any, seed: int, device: str) -> Any:
+def _load_diffusers_inpaint(settings: Any, seed: int, device: str) -> Any:
     """Load an inpainting pipeline of diffusers."""
     from gscompleter.models.diffusion.inpaint import load_diffusers_inpaint
 
     return load_diffusers_inpaint(seed, device, settings)
 
 
-def load_moge(name: str, weights: Path | None, device: str) -> DepthPredictor:
-    """Load MoGe-2."""
-    from gscompleter.models.moge import load_moge
-
-    return load_moge(name, weights, device)
-
-
-def load_migan(settings: FileSettings, seed: int, device: str) -> Any:
+def _load_migan(settings: FileSettings, seed: int, device: str) -> Any:
     """Load MI-GAN."""
     from gscompleter.models.inpainting.migan import load_migan
 
     return load_migan(settings.weights, device)
 
 
-def load_lama(settings: FileSettings, seed: int, device: str) -> Any:
+def _load_lama(settings: FileSettings, seed: int, device: str) -> Any:
     """Load LaMa."""
     from gscompleter.models.inpainting.lama import load_lama
 
@@ -90,21 +83,14 @@ RECONSTRUCTORS: dict[str, Callable[[Path | None, str], Reconstructor]] = {
     name: partial(load_learned_reconstructor, name)
     for name, weights in PUBLISHED.items()
     if weights.is_reconstructor
-} | {"mapanything": load_map_anything}
+} | {"mapanything": _load_map_anything}
 """Loaders of the learned reconstructors, called with the path of the weights and a device."""
 
 GENERATORS = {
-    "pe-field": GeneratorLoader(load_pe_field, PEFieldSettings),
-    "diffusers-inpaint": GeneratorLoader(load_diffusers_inpaint, DiffusersInpaintSettings),
-    "flux2-klein": GeneratorLoader(load_diffusers_inpaint, Flux2KleinSettings),
-    "migan": GeneratorLoader(load_migan, FileSettings),
-    "lama": GeneratorLoader(load_lama, FileSettings),
+    "pe-field": GeneratorLoader(_load_pe_field, PEFieldSettings),
+    "diffusers-inpaint": GeneratorLoader(_load_diffusers_inpaint, DiffusersInpaintSettings),
+    "flux2-klein": GeneratorLoader(_load_diffusers_inpaint, Flux2KleinSettings),
+    "migan": GeneratorLoader(_load_migan, FileSettings),
+    "lama": GeneratorLoader(_load_lama, FileSettings),
 }
 """Loaders of the learned generators, called with settings, seed, true images and a device."""
-
-DEPTH_PREDICTORS = {
-    name: partial(load_moge, name)
-    for name, weights in PUBLISHED.items()
-    if weights.gives == "monocular depth"
-}
-"""Loaders of monocular depth, called with the path of the weights and a device."""

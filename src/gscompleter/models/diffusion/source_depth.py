@@ -11,6 +11,7 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 
 from gscompleter.generators.smooth import continue_smoothly
+from gscompleter.models.depth_predictors import DEPTH_PREDICTORS
 from gscompleter.models.diffusion.complete import load_transformers_model
 from gscompleter.models.diffusion.published import (
     announce,
@@ -18,7 +19,6 @@ from gscompleter.models.diffusion.published import (
     convert_load_errors,
     parse_source,
 )
-from gscompleter.models.tables import DEPTH_PREDICTORS
 from gscompleter.numerics.robust import fit_robust_affine
 from gscompleter.reconstructors.depth_predictors import DepthPredictor
 from gscompleter.system.errors import InputError
