@@ -384,7 +384,9 @@ def measure_pe_field(bench: Bench, kontext: Callable[[str], Any] | None = None) 
     generator = PEField((kontext or build_random_kontext)(bench.device))
 
     def painted() -> None:
-        generator.generate_images([generator.create_condition(views[1], target, context)], seed=0)
+        generator.generate_images(
+            [generator.create_condition(GeneratorRequest(views[1], target, context))], seed=0
+        )
 
     seconds = measure_median_seconds(painted, bench.repetitions)
     yield Row(f"{size[0]}x{size[1]}, {generator.steps} steps", seconds, "s")

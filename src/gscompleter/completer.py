@@ -270,8 +270,10 @@ class GSCompleter:
     @timed_stage("generate")
     def synthesize(self, views: Sequence[TargetView]) -> list[GeneratedView]:
         """Synthesize the image of each padded target (paper, Eq. 6)."""
+        if not views:
+            return []
         inputs = [(view.camera.padded, view.make_generator_input()) for view in views]
-        return synthesize(self.generator, inputs)
+        return synthesize(self.generator, inputs, views[0].state.config.synthesis)
 
 
 def list_targets(target: object) -> list[Camera]:

@@ -567,10 +567,6 @@ class GeneratorInput:
     """Render of the scene at the target camera."""
     max_alpha: float = COVERED
     """Pixels of the target with less alpha are holes."""
-    correct_color: bool = True
-    """True if a learned Φ adapts its colours to those of the photographs."""
-    source_depth: Literal["context", "monocular", "moge-2-large"] = "context"
-    """Source of the photograph's depth for PE-Field, unless its own settings name one."""
     trusted_alpha: Float[Tensor, "h w"] | None = None
     """Alpha at the target weighted by trust, or None under full trust."""
 

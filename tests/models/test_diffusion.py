@@ -23,6 +23,7 @@ from safetensors.torch import load_file, save_file
 import tiny_diffusion
 from command import run
 from gscompleter import InputError, load_generator, load_renderer
+from gscompleter.config import SynthesisConfig
 from gscompleter.config.generators import get_settings_class
 from gscompleter.generators import GeneratorRequest
 from gscompleter.models.diffusion import pe_field
@@ -144,7 +145,7 @@ def test_images_made_together_are_those_made_alone(kontext_folder):
         GeneratorRequest(context.views[1], target, known)
         for target, known in zip(targets, contexts, strict=True)
     ]
-    conditions = [generator.create_condition(r.nearest, r.target, r.context) for r in calls]
+    conditions = [generator.create_condition(call) for call in calls]
     assert group_by_size(conditions, 2) == [[0, 1], [3], [2]]
     together = [found.image for found in generator.synthesize(calls)]
     alone = [generator.synthesize([call])[0].image for call in calls]
@@ -162,8 +163,9 @@ def test_pe_field_takes_the_depth_that_the_completer_names(kontext_folder, tmp_p
     generator = PEField(load_kontext(str(kontext_folder)), steps=1)
 
     def image(generator, source):
-        changed = replace(context, source_depth=source, correct_color=False)
-        return answer(generator, context.views[1], TARGET, changed).image
+        synthesis = SynthesisConfig(source_depth=source, correct_color=False)
+        request = GeneratorRequest(context.views[1], TARGET, context, synthesis)
+        return generator.synthesize([request])[0].image
 
     for source, depth in named.items():
         assert torch.equal(

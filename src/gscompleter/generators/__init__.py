@@ -9,6 +9,7 @@ from typing import Any, Protocol, runtime_checkable
 from jaxtyping import Float
 from torch import Tensor
 
+from gscompleter.config import SynthesisConfig
 from gscompleter.config.generators import PLUGINS, GeneratorSettings, get_settings_class
 from gscompleter.config.settings import validate
 from gscompleter.numerics.geometry import is_same_camera
@@ -25,6 +26,8 @@ class GeneratorRequest:
     nearest: View
     target: Camera
     context: GeneratorInput
+    synthesis: SynthesisConfig = SynthesisConfig()
+    """Settings of the completion for a learned Φ; the built-in ones read none of them."""
 
 
 @dataclass(frozen=True)

@@ -12,7 +12,7 @@ from jaxtyping import Bool
 from torch import Tensor
 
 from gscompleter.numerics.value_checks import check_gaussians
-from gscompleter.reconstructors.depth_predictors import load_depth_predictor
+from gscompleter.reconstructors.depth_predictors import DepthPredictor, load_depth_predictor
 from gscompleter.system.errors import InputError, quote_value
 from gscompleter.system.plugins import load_plugins
 from gscompleter.system.tensor_checks import describe, iterate_tensors, name_dtype
@@ -41,6 +41,14 @@ class Lifter(Protocol):
 
     def lift(self, views: Sequence[View], pixel_mask: Bool[Tensor, "h w"]) -> Reconstruction:
         """Reconstruct `views`, with the Gaussians of `pixel_mask` in the first view only."""
+
+
+@runtime_checkable
+class DepthAware(Protocol):
+    """Interface of a Ψ that lets monocular depth support its stereo."""
+
+    predict_depth: DepthPredictor
+    """Depth where stereo measures nothing, and the only one of a single photograph."""
 
 
 def run_reconstructor(
@@ -224,11 +232,12 @@ def load_reconstructor(
     reconstructor = load(None if weights is None else Path(weights), device)
     if depth == "none":
         return reconstructor
-    if "predict_depth" not in getattr(reconstructor, "__dataclass_fields__", ()):
+    if not isinstance(reconstructor, DepthAware):
         raise InputError(
             f"The reconstructor '{name}' uses no monocular depth; leave it out.", "depth"
         )
     predictor = load_depth_predictor(
         depth, None if depth_weights is None else Path(depth_weights), device
     )
+    # Loaders return frozen dataclasses.
     return replace(reconstructor, predict_depth=predictor)  # type: ignore[type-var]

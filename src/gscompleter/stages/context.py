@@ -12,8 +12,13 @@ from torch.nn.functional import avg_pool2d, max_pool2d
 
 from gscompleter.config import CompleterConfig, get_named_config
 from gscompleter.numerics.geometry import compute_z_depths, project_mask
-from gscompleter.reconstructors import Reconstructor, get_trained_range, run_reconstructor
-from gscompleter.reconstructors.depth_predictors import give_prediction, predict_nothing
+from gscompleter.reconstructors import (
+    DepthAware,
+    Reconstructor,
+    get_trained_range,
+    run_reconstructor,
+)
+from gscompleter.reconstructors.depth_predictors import give_prediction
 from gscompleter.reconstructors.features.depth_range import (
     find_depth_range,
     get_depth_range,
@@ -86,16 +91,15 @@ def init_context(
 
 def prepare_single(reconstructor: Reconstructor, views: Sequence[View]) -> list[View]:
     """Give a single photograph its predicted depth; raise InputError if it has no depth at all."""
-    # A reconstructor may be any function of views; depth models have this method besides.
-    predict_depth = getattr(reconstructor, "predict_depth", predict_nothing)
-    views = give_prediction(views, predict_depth)
+    if isinstance(reconstructor, DepthAware):
+        views = give_prediction(views, reconstructor.predict_depth)
     if len(views) < 2 and not any(len(view.known_depths) for view in views):
         raise InputError(
             f"{len(views)} context view was given, and stereo needs at least 2; name more frames, "
             "give a scene, or give one photograph with its depth or with a model that predicts it "
             "(moge-2)."
         )
-    return views
+    return list(views)
 
 
 def reconstruct_context(reconstructor: Reconstructor, views: Sequence[View]) -> InitialContext:

@@ -8,6 +8,7 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
+from gscompleter.config import SynthesisConfig
 from gscompleter.generators import (
     Generator,
     GeneratorOutput,
@@ -38,15 +39,17 @@ class GeneratedView(View):
 
 
 def synthesize(
-    generator: Generator | ImageFunction, inputs: Sequence[tuple[Camera, GeneratorInput]]
+    generator: Generator | ImageFunction,
+    inputs: Sequence[tuple[Camera, GeneratorInput]],
+    synthesis: SynthesisConfig = SynthesisConfig(),
 ) -> list[GeneratedView]:
     """Synthesize `Ĩ_t = Φ(I_n, P_t)` for targets in one call of Φ (paper, Eq. 6)."""
     if not inputs:
         return []
-    requests = [
-        GeneratorRequest(context.views[find_nearest_view(target, context.views)], target, context)
-        for target, context in inputs
-    ]
+    requests = []
+    for target, context in inputs:
+        nearest = context.views[find_nearest_view(target, context.views)]
+        requests.append(GeneratorRequest(nearest, target, context, synthesis))
     # Φ is code of others that gets the scene itself, without a copy of it.
     states = [fingerprint(request) for request in requests]
     outputs = as_generator(generator).synthesize(requests)

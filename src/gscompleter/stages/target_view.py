@@ -149,14 +149,11 @@ class TargetView:
 
     def make_generator_input(self) -> GeneratorInput:
         """Collect the input of Φ."""
-        config = self.state.config
         return GeneratorInput(
             self.state.views,
             self.view_renders,
             self.render,
-            config.holes.max_alpha,
-            config.synthesis.correct_color,
-            config.synthesis.source_depth,
+            self.state.config.holes.max_alpha,
             self.alpha,
         )
 

@@ -3,15 +3,16 @@
 from __future__ import annotations
 
 import inspect
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import lru_cache
-from typing import Any
+from typing import Any, ClassVar
 
 import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
-from gscompleter.generators import GeneratorOutput
+from gscompleter.generators import GeneratorOutput, GeneratorRequest
 from gscompleter.generators.agreement import paint_consistently
 from gscompleter.generators.warp import BORDER_WIDTH, complete_warp
 from gscompleter.models.diffusion.complete import check_parts, load_language_models
@@ -27,7 +28,6 @@ from gscompleter.models.diffusion.published import (
 from gscompleter.models.settings import DiffusersInpaintSettings
 from gscompleter.numerics.image_ops import dilate
 from gscompleter.system.errors import InputError
-from gscompleter.types import Camera, GeneratorInput, View
 
 DEFAULT_SIDE = 512
 """Default side length of the square image, in pixels."""
@@ -106,9 +106,17 @@ class DiffusersInpaint:
     retries: int = 0
     """Number of further seeds to try if the image is inconsistent with the warped photographs."""
 
-    def __call__(self, nearest: View, target: Camera, context: GeneratorInput) -> GeneratorOutput:
-        """Synthesize the image at `target`; pixels outside the hole are warped photographs."""
-        observed = complete_warp(nearest, target, context)
+    supports_padding: ClassVar[bool] = True
+    max_batch_size: ClassVar[int] = 1
+
+    def synthesize(self, requests: Sequence[GeneratorRequest]) -> list[GeneratorOutput]:
+        """Synthesize images; pixels outside the holes are warped photographs."""
+        return [self.paint_hole(request) for request in requests]
+
+    def paint_hole(self, request: GeneratorRequest) -> GeneratorOutput:
+        """Synthesize the image of one target."""
+        nearest = request.nearest
+        observed = complete_warp(nearest, request.target, request.context)
         # The rim of the hole is painted too, so that the colours of both can be compared there.
         hole = dilate(~observed.known, BORDER_WIDTH)
 
@@ -118,7 +126,7 @@ class DiffusersInpaint:
             )
 
         compared = replace(observed, known=~hole)
-        correct = context.correct_color
+        correct = request.synthesis.correct_color
         painted = paint_consistently(paint, self.seed, compared, self.retries, correct)
         known = observed.known[..., None]
         return replace(painted, image=torch.where(known, observed.image, painted.image))

@@ -75,7 +75,7 @@ class PEField:
         Raises:
             InputError: The scene has no depth at the nearest photograph.
         """
-        conditions = [self.create_condition(r.nearest, r.target, r.context) for r in requests]
+        conditions = [self.create_condition(request) for request in requests]
         # The first seed for all targets, in batches; further seeds are needed by few of them.
         first: dict[int, Tensor] = {}
         for group in group_by_size(conditions, self.max_batch_size):
@@ -96,18 +96,20 @@ class PEField:
 
             # Photographs, warped to the target, judge the image and correct its colours.
             observed = warp_photographs(nearest, target, requests[i].context)
-            correct = requests[i].context.correct_color
+            correct = requests[i].synthesis.correct_color
             return paint_consistently(paint, self.seed, observed, self.retries, correct)
 
         return [answer(i) for i in range(len(requests))]
 
-    def create_condition(self, nearest: View, target: Camera, context: GeneratorInput) -> Condition:
+    def create_condition(self, request: GeneratorRequest) -> Condition:
         """Create the model input for a target; raises the errors of `synthesize`."""
+        nearest = request.nearest
+        target = request.target
         size = self.model.compute_size(target.height, target.width)
         source_size = self.model.compute_size(nearest.camera.height, nearest.camera.width)
         grids = self.model.compute_grid(source_size), self.model.compute_grid(size)
-        source = self.depth or load_source_depth(context.source_depth, self.device)
-        depth = source(nearest, find_render(nearest, context))
+        source = self.depth or load_source_depth(request.synthesis.source_depth, self.device)
+        depth = source(nearest, find_render(nearest, request.context))
         # Where the target sees what the photograph shows; the network draws it there.
         positions = compute_source_ids(depth, nearest.camera, target, *grids).cpu()
         return Condition(resize_antialiased(nearest.image, source_size), size, positions)
