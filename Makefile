@@ -21,7 +21,7 @@ test: $(VENV)/installed-test
 test-slow: $(VENV)/installed-test
 	$(BIN)/python -m pytest -m slow
 
-# The net under a restructuring: `make golden` before it, `make check-golden` after it. ONLY=scenes, ONLY=texts.
+# The net under a restructuring: `make golden` before it, `make check-golden` after it. ONLY=scenes|room|texts.
 golden: $(VENV)/installed
 	$(BIN)/python benchmarks/golden.py record $(if $(ONLY),--only $(ONLY))
 

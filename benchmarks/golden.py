@@ -1,12 +1,14 @@
 """Record what the commands give, and compare a later state of the code with it.
 
-    python benchmarks/golden.py record [--only scenes|texts] [--data DIR] [--file FILE]
-    python benchmarks/golden.py check  [--only scenes|texts] [--data DIR] [--file FILE]
+    python benchmarks/golden.py record [--only scenes|room|texts] [--data DIR] [--file FILE]
+    python benchmarks/golden.py check  [--only scenes|room|texts] [--data DIR] [--file FILE]
 
 `scenes` holds the SHA-256 of every .ply and the PSNR and SSIM of every view: 24 development cases
 with the settings `default` and `paper`, a trained splat at seven targets, and eight targets in
-sequence. `texts` holds the help of every command, and exit code and sentence of wrong input. Bytes
-are compared on the machine that recorded them; other machines round otherwise and compare scores.
+sequence. `room` is the same for a synthetic room, which needs no data: the tests check it
+everywhere. `texts` holds the help of every command, and exit code and sentence of wrong input.
+Bytes are compared on the machine that recorded them; other machines round otherwise and compare
+scores.
 """
 
 from __future__ import annotations
@@ -31,6 +33,7 @@ DATA = Path(os.environ.get("GSCOMPLETER_DATA", ROOT.parent / "shared"))
 PROGRAM = (sys.executable, "-c", "from gscompleter.cli import run; run()")
 MEAN_TOLERANCE, CASE_TOLERANCE = 0.02, 0.1
 """dB by which the mean PSNR, and the PSNR of one view, may fall on another machine."""
+SECTIONS = ("scenes", "room", "texts")
 COMMANDS = [
     *("complete", "batch", "live", "clean", "demo", "evaluate", "tables", "index", "bench"),
     *("models", "convert", "poses", "report", "strip", "view", "doctor", "warmup"),
@@ -41,16 +44,21 @@ def main() -> None:
     """Record or check, as the command line asks; exit code 1 where something differs."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("action", choices=("record", "check"))
-    parser.add_argument("--only", choices=("scenes", "texts"))
+    parser.add_argument("--only", choices=SECTIONS)
     parser.add_argument("--data", type=Path, default=DATA)
     parser.add_argument("--file", type=Path, default=ROOT / "benchmarks" / "golden.json")
     options = parser.parse_args()
-    sections = (options.only,) if options.only else ("scenes", "texts")
+    sections = (options.only,) if options.only else SECTIONS
     if "scenes" in sections and not (options.data / "data" / "cases.json").is_file():
         parser.error(f"{options.data} has no data/cases.json; name the data by GSCOMPLETER_DATA")
     known = json.loads(options.file.read_text()) if options.file.is_file() else {}
     with tempfile.TemporaryDirectory() as folder:
-        present = {"scenes": lambda: run_scenes(options.data, Path(folder)), "texts": run_texts}
+        place = Path(folder)
+        present = {
+            "scenes": lambda: run_scenes(dict(list_runs(options.data)), place / "scenes"),
+            "room": lambda: run_scenes(dict(list_room_runs(place)), place / "rooms"),
+            "texts": run_texts,
+        }
         found = {"machine": describe_machine()} | {name: present[name]() for name in sections}
     if options.action == "record":
         content = json.dumps(known | found, indent=1, sort_keys=True, ensure_ascii=False)
@@ -96,9 +104,21 @@ def list_runs(data: Path) -> Iterator[tuple[str, list[str]]]:
     yield "re10k_0d4de33c, 8 targets", [*given, "--far", "100", "--target", *frames]
 
 
-def run_scenes(data: Path, folder: Path) -> dict[str, Any]:
+def list_room_runs(folder: Path) -> Iterator[tuple[str, list[str]]]:
+    """Write photographs of a synthetic room, and list completions of it with their arguments."""
+    sys.path.insert(0, str(ROOT / "tests" / "support"))
+    from scenes import camera_at, photographed
+
+    places = ((-0.3, 0), (0.1, 0), (0.7, 12))
+    cameras = [camera_at(x, yaw=yaw, size=96) for x, yaw in places]
+    scene = photographed(folder / "room", cameras)
+    given = [str(scene), "--context", "0", "1", "--target", "2", "--near", "0.5", "--far", "20"]
+    for config in ("default", "paper"):
+        yield f"room, {config}", [*given, "--config", config]
+
+
+def run_scenes(runs: Mapping[str, list[str]], folder: Path) -> dict[str, Any]:
     """Run every completion, two at a time."""
-    runs = dict(list_runs(data))
     with ThreadPoolExecutor(2) as pool:
         outputs = [folder / str(number) for number in range(len(runs))]
         return dict(zip(runs, pool.map(run_scene, runs.values(), outputs), strict=True))
@@ -170,8 +190,10 @@ def compare(known: Mapping[str, Any], found: Mapping[str, Any]) -> list[str]:
     same_machine = known["machine"] == found["machine"]
     match = match_bytes if same_machine else match_scores
     differences = []
-    for name, row in found.get("scenes", {}).items():
-        differences += [f"{name}: {text}" for text in match(known["scenes"].get(name), row)]
+    for section in ("scenes", "room"):
+        for name, row in found.get(section, {}).items():
+            recorded = known.get(section, {}).get(name)
+            differences += [f"{name}: {text}" for text in match(recorded, row)]
     if not same_machine and "scenes" in found:
         fall = mean_psnr(known["scenes"]) - mean_psnr(found["scenes"])
         differences += [f"mean PSNR fell by {fall:.3f} dB"] * (fall > MEAN_TOLERANCE)
