@@ -204,7 +204,7 @@ def test_settings_reach_the_generators(kontext_folder, inpaint_folder, tmp_path)
     chosen_settings = DiffusersInpaintSettings(
         str(inpaint_folder), steps=3, retries=1, prompt="a quiet street"
     )
-    painter = load_generator("diffusers-inpaint", settings=chosen_settings).function
+    painter = load_generator("diffusers-inpaint", settings=chosen_settings)
     assert (painter.prompt, painter.steps, painter.retries) == ("a quiet street", 3, 1)
 
 
@@ -213,9 +213,9 @@ def test_an_inpainter_reads_its_prompt(inpaint_folder):
     chosen_settings = DiffusersInpaintSettings(
         str(inpaint_folder), steps=2, prompt="a quiet street"
     )
-    painter = load_generator("diffusers-inpaint", settings=chosen_settings).function
+    painter = load_generator("diffusers-inpaint", settings=chosen_settings)
     other = replace(painter, prompt="a b c")
-    images = [one(context.views[1], TARGET, context).image for one in (painter, other)]
+    images = [answer(one, context.views[1], TARGET, context).image for one in (painter, other)]
     assert not torch.equal(*images)
 
 
@@ -245,15 +245,15 @@ def test_inpainting_keeps_what_was_warped_and_fills_the_rest(name, tmp_path):
     context, painter = known_room(), load_painter(str(folder))
     painter = replace(painter, side=min(painter.side, 256))  # Flux counts 128 latents
     generator = DiffusersInpaint(painter, steps=2)
-    image = generator(context.views[1], TARGET, context).image
+    image = answer(generator, context.views[1], TARGET, context).image
     warped = complete_warp(context.views[1], TARGET, context)
     assert 0.05 < (~warped.known).float().mean() < 0.9
     assert torch.equal(image[warped.known], warped.image[warped.known])
     assert (image - warped.image)[~warped.known].abs().mean() > 0.01
     assert image.min() >= 0
     assert image.max() <= 1
-    assert torch.equal(image, generator(context.views[1], TARGET, context).image)
-    other = replace(generator, seed=1)(context.views[1], TARGET, context).image
+    assert torch.equal(image, answer(generator, context.views[1], TARGET, context).image)
+    other = answer(replace(generator, seed=1), context.views[1], TARGET, context).image
     assert not torch.equal(image, other)
 
 
@@ -264,7 +264,7 @@ def test_flux2_klein_sees_the_nearest_photograph(tmp_path):
         4,
         "black-forest-labs/FLUX.2-klein-4B",
     )
-    generator = load_generator("flux2-klein", settings=kind(weights=str(folder))).function
+    generator = load_generator("flux2-klein", settings=kind(weights=str(folder)))
     painter = replace(generator.painter, side=128)
     assert type(painter.pipeline).__name__ == "Flux2KleinInpaintPipeline"
     context, seen = known_room(), {}
@@ -278,7 +278,7 @@ def test_flux2_klein_sees_the_nearest_photograph(tmp_path):
         __call__.__signature__ = inspect.signature(call)
 
     painter.pipeline.__class__ = Watched
-    replace(generator, painter=painter)(context.views[1], TARGET, context)
+    answer(replace(generator, painter=painter), context.views[1], TARGET, context)
     assert torch.equal(seen["image_reference"][0].permute(1, 2, 0), context.views[1].image)
     assert (seen["num_inference_steps"], seen["strength"]) == (4, 1.0)
 
@@ -312,7 +312,7 @@ def test_a_checker_of_images_is_no_exception(tmp_path):
     index["feature_extractor"] = ["transformers", "CLIPFeatureExtractor"]
     (folder / "model_index.json").write_text(json.dumps(index))
     generator = load_generator("diffusers-inpaint", settings=DiffusersInpaintSettings(str(folder)))
-    assert generator.function.painter.pipeline.safety_checker is not None
+    assert generator.painter.pipeline.safety_checker is not None
     broken = tmp_path / "broken"
     shutil.copytree(folder, broken)
     (file,) = (broken / "safety_checker").glob("*.safetensors")
