@@ -72,11 +72,14 @@ class GeneratorOptions(Settings):
     def make_settings(self) -> GeneratorSettings:
         """Return the settings, or raise InputError if one is unknown to the generator."""
         kind = get_settings_class(self.generator)
+
+        # None and False are the defaults of the options: the generator then has its own.
         given = {
             name.removeprefix(PREFIX): value
             for name, value in vars(self).items()
             if name.startswith(PREFIX) and value is not None and value is not False
         }
+        # Refused, not ignored: the user would believe that the setting was obeyed.
         for setting in given:
             if not hasattr(kind, setting):
                 others = load_plugins(PLUGINS)

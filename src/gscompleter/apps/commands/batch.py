@@ -78,7 +78,9 @@ def run_batch(options: BatchOptions) -> int:
         with show_preparation("reading the manifest"):
             common = parse_pairs(options.each, "each")
             jobs = read_manifest(options.manifest, common, options.out)
-            refuse_overlap(options.out, list_job_scenes(jobs))
+            paths = [job.options.get(name) for job in jobs for name in PATHS]
+            inputs = [Path(p) for p in dict.fromkeys(paths) if isinstance(p, str) and p]
+            refuse_overlap(options.out, inputs)
 
             # Workers may run in another working folder, so they get an absolute path.
             out = options.out.resolve()
@@ -101,23 +103,15 @@ def run_batch(options: BatchOptions) -> int:
             write_batch_results(out, jobs)
 
     # The exit code and the sentence count this share, with the jobs that failed in earlier runs.
-    failures = collect_failures(out, share)
+    failures = []
+    for job in share:
+        row = read_row(job, out)
+        if row is not None and row["state"] == "failed":
+            failures.append(f"{row['job']}: {row['reason']}")
     print_failures(console, failures)
     sentence = f"{summarize_rows(out, share, left)} All results: {options.out}/index.html"
     console.print(sentence, markup=False, soft_wrap=True)
     return choose_exit_code(len(failures), len(share))
-
-
-def list_job_scenes(jobs: Sequence[Job]) -> list[Path]:
-    """List the paths that the rows of a batch read."""
-    paths = [job.options.get(name) for job in jobs for name in PATHS]
-    return [Path(path) for path in dict.fromkeys(paths) if isinstance(path, str) and path]
-
-
-def collect_failures(out: Path, jobs: Sequence[Job]) -> list[str]:
-    """Describe the jobs that failed, now or earlier, with the reasons."""
-    rows = [row for job in jobs if (row := read_row(job, out)) is not None]
-    return [f"{row['job']}: {row['reason']}" for row in rows if row["state"] == "failed"]
 
 
 def print_failures(console: Console, failures: Sequence[str]) -> None:

@@ -321,9 +321,9 @@ def add_splat(
     """Compile the kernels, and add the input splat to the task."""
     with show_preparation("reading the scene"):
         task = add_check_views(task, opened.photographs)
-        given = load_splat(path, options.drop_nonfinite)
+        gaussians = load_splat(path, options.drop_nonfinite)
         if "cpu" in parts:
-            check_scene(task, given)
+            check_scene(task, gaussians)
     compile_kernels([*parts, SPLAT_PART] if "cpu" in parts else parts)
 
     with show_preparation("aligning the scene"):
@@ -331,10 +331,10 @@ def add_splat(
         # over. Large scenes are sorted along a Morton curve (decision 025); files are written in
         # the order of the given file, which `order` leads back to.
         order = None
-        if len(given) >= MIN_PROXY_GAUSSIANS:
-            order = argsort_nearby(given)
-            given = given[order]
-        return move_to_splat(task, given, path, options, opened, order)
+        if len(gaussians) >= MIN_PROXY_GAUSSIANS:
+            order = argsort_nearby(gaussians)
+            gaussians = gaussians[order]
+        return move_to_splat(task, gaussians, path, options, opened, order)
 
 
 def describe_settings(options: CompleteOptions) -> dict[str, Any]:
@@ -377,7 +377,17 @@ def print_completion(options: CompleteOptions) -> None:
     summary = read_summary(options.out)
     console.print(summary.outcome.headline, markup=False, soft_wrap=True)
     console.print(make_score_table(summary))
-    for sentence in (*list_target_notes(summary), *describe_result(summary, options)):
+
+    # What holds for several targets is said once, before the notes of each. If nothing was gained,
+    # the headline gives the reason for all.
+    sentences = list(list_shared_notes(summary))
+    if summary.outcome.status != "nothing-gained":
+        for notes, numbers in group_target_notes(summary.targets).items():
+            if len(numbers) == 1:
+                name = summary.targets[numbers[0] - 1].name
+                sentences.append(f"{name}: {' '.join(notes)}")
+    sentences += describe_result(summary, options)
+    for sentence in sentences:
         console.print(sentence, markup=False, soft_wrap=True)
 
 
@@ -395,15 +405,6 @@ def make_score_table(summary: CompletionSummary) -> Table:
         hole = format_percent(target.hole_fraction)
         table.add_row(f"target: {target.name}", hole, before, after, f"{target.added:,}")
     return table
-
-
-def list_target_notes(summary: CompletionSummary) -> Iterator[str]:
-    """List the notes on targets: what holds for several is said once."""
-    yield from list_shared_notes(summary)
-    # If nothing was gained, the headline gives the reason for all targets.
-    for notes, numbers in group_target_notes(summary.targets).items():
-        if len(numbers) == 1 and summary.outcome.status != "nothing-gained":
-            yield f"{summary.targets[numbers[0] - 1].name}: {' '.join(notes)}"
 
 
 def describe_result(summary: CompletionSummary, options: CompleteOptions) -> Iterator[str]:

@@ -256,7 +256,13 @@ def iterate_tasks(
 
     # With a preset, images are cropped and scenes left out as by its authors' code (decision 047).
     loader = find_loader(options)
-    size = find_resolution(options)
+    resolution = LONG_SIDE if options.resolution is None else options.resolution
+    size: Resolution
+    if loader is not None and isinstance(resolution, tuple):
+        height, width = resolution
+        size = loader.make_crop(height, width)
+    else:
+        size = parse_resolution(resolution)
     # Their code also keeps clips whose coordinates are large.
     max_translation = MAX_TRANSLATION if loader is None else None
     for path in options.paths:
@@ -298,16 +304,6 @@ def find_loader(options: EvaluateOptions) -> AuthorsLoader | None:
     """Find the loader to follow; none without a preset, or at another size than the preset's."""
     preset = get_data_set(options.preset)
     return preset.loader if options.resolution == preset.resolution else None
-
-
-def find_resolution(options: EvaluateOptions) -> Resolution:
-    """Find how the photographs of scenes are resized and cropped."""
-    resolution = LONG_SIDE if options.resolution is None else options.resolution
-    loader = find_loader(options)
-    if loader is not None and isinstance(resolution, tuple):
-        height, width = resolution
-        return loader.make_crop(height, width)
-    return parse_resolution(resolution)
 
 
 def find_cases_file(path: Path) -> Path:

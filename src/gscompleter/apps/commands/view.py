@@ -41,8 +41,16 @@ def run_view(options: ViewOptions) -> None:
                 file.write(page)
         if not options.quiet:
             print(options.save)
-    else:
-        serve_page(options, load_page(options))
+        return
+
+    page = load_page(options)
+    with make_page_server(page, options.port) as server, suppress(KeyboardInterrupt):
+        address = f"http://{ADDRESS}:{server.server_address[1]}/"
+        # Printed once the server listens.
+        print(f"{address} (Ctrl-C ends it)", flush=True)
+        if not options.no_open:
+            webbrowser.open(address)
+        server.serve_forever()
 
 
 def load_page(options: ViewOptions) -> bytes:
@@ -75,17 +83,6 @@ def load_content(options: ViewOptions) -> ViewerContent:
     if options.cameras is None:
         return content
     return add_file_cameras(content, options.cameras, options.resolution)
-
-
-def serve_page(options: ViewOptions, page: bytes) -> None:
-    """Serve the page to this machine until Ctrl-C."""
-    with make_page_server(page, options.port) as server, suppress(KeyboardInterrupt):
-        address = f"http://{ADDRESS}:{server.server_address[1]}/"
-        # Printed once the server listens.
-        print(f"{address} (Ctrl-C ends it)", flush=True)
-        if not options.no_open:
-            webbrowser.open(address)
-        server.serve_forever()
 
 
 def make_page_server(page: bytes, port: int = 0) -> ThreadingHTTPServer:

@@ -62,7 +62,13 @@ def find_factor(
     """
     samples = compare_given_depth(photographs, frames, views)
     if len(samples) < MIN_SAMPLES:
-        more = read_next(photographs, frames, resolution)
+        last = len(photographs) - 1
+        next_frames = {min(frame + 1, last) for frame in frames} - set(frames)
+        more: dict[int, View] = {}
+        for frame in sorted(next_frames):
+            # One that cannot be read is left out: it is only wanted for this comparison.
+            with suppress(InputError):
+                (more[frame],) = photographs.views([frame], resolution)
         samples = compare_given_depth(photographs, [*frames, *more], [*views, *more.values()])
 
     fit = fit_depth_factor(samples)
@@ -82,19 +88,6 @@ def find_factor(
         f"points measure ({fit.agreement:.0%} of {len(samples):,} compared depths agree); it is "
         f"multiplied by {fit.factor:.4g} ({WAY_OUT})."
     )
-
-
-def read_next(
-    photographs: Photographs, frames: Sequence[int], resolution: Resolution
-) -> dict[int, View]:
-    """Load the photographs after those of `frames`, by frame; those that cannot be are left out."""
-    last = len(photographs) - 1
-    next_frames = {min(frame + 1, last) for frame in frames} - set(frames)
-    views = {}
-    for frame in sorted(next_frames):
-        with suppress(InputError):
-            (views[frame],) = photographs.views([frame], resolution)
-    return views
 
 
 def compare_given_depth(

@@ -154,7 +154,8 @@ def find_in_masks(
 
     A mask is scaled to its photograph; one of another aspect ratio raises an InputError.
     """
-    # Blending weight of each Gaussian over all photographs: inside of masks, outside, ...
+    # How much of each Gaussian all photographs show: inside of masks, outside, and an empty third
+    # channel.
     sums = torch.zeros_like(scene.means)
     for number in track([number for number in masks if number in cameras], "masks"):
         frame = photographs.frame(number)

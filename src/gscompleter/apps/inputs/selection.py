@@ -30,7 +30,7 @@ CHECK_VIEW_SIZE = 320
 
 
 def choose_context(
-    options: CompleteOptions, given: Photographs, targets: Sequence[Target]
+    options: CompleteOptions, photographs: Photographs, targets: Sequence[Target]
 ) -> tuple[int, ...]:
     """Choose context frames for the targets, or for the whole scene without any.
 
@@ -38,12 +38,12 @@ def choose_context(
     photographs of which a mask hides everything.
     """
     target_frames = {target.frame for target in targets}
-    others = [frame for frame in range(len(given)) if frame not in target_frames]
+    others = [frame for frame in range(len(photographs)) if frame not in target_frames]
 
     # Only chosen photographs are asked for their masks, since each has to be read for it.
     while True:
-        chosen = _choose_frames(options, given, targets, others)
-        hidden = {frame for frame in chosen if given.is_hidden(frame)}
+        chosen = _choose_frames(options, photographs, targets, others)
+        hidden = {frame for frame in chosen if photographs.is_hidden(frame)}
         if not hidden:
             return chosen
         others = [frame for frame in others if frame not in hidden]
@@ -51,12 +51,12 @@ def choose_context(
 
 def _choose_frames(
     options: CompleteOptions,
-    given: Photographs,
+    photographs: Photographs,
     targets: Sequence[Target],
     others: Sequence[int],
 ) -> tuple[int, ...]:
     """Choose context frames among `others`."""
-    cameras = collect_usable_cameras(given, others, parse_resolution(options.resolution))
+    cameras = collect_usable_cameras(photographs, others, parse_resolution(options.resolution))
     if not cameras:
         raise InputError(
             "The context needs photographs, and without the targets none can be used; name fewer "
@@ -70,10 +70,10 @@ def _choose_frames(
 
     # What a photograph shows is judged by points of the scene: those of COLMAP, or else points
     # that are spread in front of the cameras over the depth range.
-    points = given.points()
+    points = photographs.points()
     if points is None or len(points) == 0:
         goals = target_cameras or summarize_cameras(candidates)
-        points = sample_scene_points(given, goals, cameras)
+        points = sample_scene_points(photographs, goals, cameras)
 
     # Without targets, medoids of all photographs with a partner each; with targets, photographs
     # that show what the targets see (decision 030).
@@ -87,14 +87,14 @@ def _choose_frames(
 
 
 def collect_usable_cameras(
-    given: Photographs, frames: Sequence[int], resolution: Resolution
+    photographs: Photographs, frames: Sequence[int], resolution: Resolution
 ) -> dict[int, Camera]:
     """Return the valid cameras of frames that have a photograph."""
     cameras = {}
     for frame in frames:
         with suppress(InputError):
-            if given.frame(frame).has_photograph():
-                cameras[frame] = given.camera(frame, resolution)
+            if photographs.frame(frame).has_photograph():
+                cameras[frame] = photographs.camera(frame, resolution)
     return cameras
 
 
@@ -111,16 +111,18 @@ def select_closest(
 
 
 def sample_scene_points(
-    given: Photographs, targets: Sequence[Camera], cameras: dict[int, Camera]
+    photographs: Photographs, targets: Sequence[Camera], cameras: dict[int, Camera]
 ) -> Float[Tensor, "n 3"]:
     """Sample points in front of the targets within the known or estimated depth range."""
-    near = given.near
-    far = given.far
+    near = photographs.near
+    far = photographs.far
     if near is None or far is None:
         # Small photographs near the targets: the range need not be exact to choose among cameras.
         closest = select_closest(targets, cameras, NUM_DEPTH_VIEWS)
-        frames = [frame for frame in closest if not given.is_hidden(frame)]
-        estimated_near, estimated_far = estimate_depth_range(given.views(frames, CHECK_VIEW_SIZE))
+        frames = [frame for frame in closest if not photographs.is_hidden(frame)]
+        estimated_near, estimated_far = estimate_depth_range(
+            photographs.views(frames, CHECK_VIEW_SIZE)
+        )
         near = estimated_near if near is None else near
         far = estimated_far if far is None else far
     return torch.cat([make_points_in_front(target, near, far) for target in targets])
