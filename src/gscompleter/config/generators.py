@@ -74,13 +74,13 @@ class GeneratorOptions(Settings):
         kind = get_settings_class(self.generator)
 
         # None and False are the defaults of the options: the generator then has its own.
-        given = {
+        settings = {
             name.removeprefix(PREFIX): value
             for name, value in vars(self).items()
             if name.startswith(PREFIX) and value is not None and value is not False
         }
         # Refused, not ignored: the user would believe that the setting was obeyed.
-        for setting in given:
+        for setting in settings:
             if not hasattr(kind, setting):
                 others = load_plugins(PLUGINS)
                 knowing = [name for name in others if hasattr(get_settings_class(name), setting)]
@@ -89,7 +89,7 @@ class GeneratorOptions(Settings):
                     f"choose {' or '.join(knowing)}.",
                     PREFIX + setting,
                 )
-        return kind(**given)
+        return kind(**settings)
 
     def describe(self) -> dict[str, Any]:
         """Describe the generator for `summary.json`."""

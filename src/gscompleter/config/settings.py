@@ -90,7 +90,7 @@ def merge_nested(values: Mapping[str, Any], changes: Mapping[str, Any]) -> dict[
 
 def describe_invalid(wrong: ErrorDetails, name: str, settings: object) -> str:
     """Write the sentence about the setting called `name`."""
-    given = wrong["input"]
+    value = wrong["input"]
 
     # The group that does not know the name, to list the names that it knows.
     if wrong["type"] == "unexpected_keyword_argument":
@@ -98,7 +98,7 @@ def describe_invalid(wrong: ErrorDetails, name: str, settings: object) -> str:
             settings = getattr(settings, str(part))
         known = ", ".join(vars(settings))
         return f"There is no setting '{quote_value(name)}'; choose one of {known}."
-    shown = f"'{quote_value(given)}'" if isinstance(given, str) else quote_value(given)
+    shown = f"'{quote_value(value)}'" if isinstance(value, str) else quote_value(value)
     if wrong["type"] == "dataclass_type":
         return f"{name} is a group of settings, got {shown}."
     # Pydantic says "Input should be greater than ...".

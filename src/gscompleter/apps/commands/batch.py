@@ -78,8 +78,10 @@ def run_batch(options: BatchOptions) -> int:
         with show_preparation("reading the manifest"):
             common = parse_pairs(options.each, "each")
             jobs = read_manifest(options.manifest, common, options.out)
-            paths = [job.options.get(name) for job in jobs for name in PATHS]
-            inputs = [Path(p) for p in dict.fromkeys(paths) if isinstance(p, str) and p]
+
+            # The results may not lie in what the rows read.
+            cells = dict.fromkeys(job.options.get(name) for job in jobs for name in PATHS)
+            inputs = [Path(cell) for cell in cells if isinstance(cell, str) and cell]
             refuse_overlap(options.out, inputs)
 
             # Workers may run in another working folder, so they get an absolute path.

@@ -124,16 +124,16 @@ def inspect_extra(extra: str, purpose: str) -> Found:
         for requirement in list_requirements(extra)
     }
     missing = [name for name, version in versions.items() if version is None]
-    # The metadata of an installed package name an extra only if it has requirements here: an older
-    # version does not know the extra, and markers may leave out this version of Python.
+    # No requirement at all: an older version of the package does not know the extra, or its markers
+    # leave out this version of Python.
     if not versions:
-        told = f"the installed version or this Python is older than this extra; for {purpose}"
+        detail = f"the installed version or this Python is older than this extra; for {purpose}"
     elif missing:
-        told = f"{', '.join(missing)}, for {purpose}; pip install 'gscompleter[{extra}]'"
+        detail = f"{', '.join(missing)}, for {purpose}; pip install 'gscompleter[{extra}]'"
     else:
         names = ", ".join(f"{name} {version}" for name, version in versions.items())
-        told = f"{names}, for {purpose}"
-    return Found("extras", extra, bool(versions) and not missing, told)
+        detail = f"{names}, for {purpose}"
+    return Found("extras", extra, bool(versions) and not missing, detail)
 
 
 def list_requirements(extra: str = "") -> list[Requirement]:

@@ -36,7 +36,8 @@ class PreparedRemoval(Prepared):
             chosen = choose_gaussians(
                 self.options, self.task, self.opened.photographs, self.cameras, completer.renderer
             )
-            # `contains` cuts Gaussians that reach out of the region; masks and files have none.
+            # Gaussians that reach out of a box or the sphere are cut at its border. Those that a
+            # mask or a file selects go as a whole.
             return remove_gaussians(begun, chosen, self.contains, completer.scenes)
 
     def contains(self, points: Float[Tensor, "n 3"]) -> Bool[Tensor, "n"]:

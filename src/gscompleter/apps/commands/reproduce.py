@@ -201,8 +201,8 @@ def choose_protocols(options: EvaluateOptions, spec: Requirements) -> tuple[str,
     """
     kinds = {get_kind(name) for name in spec.protocol}
     if kinds:
-        given = tuple(name for name in options.protocol if get_kind(name) in kinds)
-        return given or spec.protocol
+        suitable = tuple(name for name in options.protocol if get_kind(name) in kinds)
+        return suitable or spec.protocol
 
     # A table without a kind of its own takes a given protocol, or that of the data set.
     usual = [name for name in options.protocol if get_kind(name) not in UNUSUAL]

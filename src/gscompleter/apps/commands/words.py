@@ -117,7 +117,8 @@ def list_options(kind: Any, prefix: str = "") -> set[str]:
     """List the names of the options of a command, without dashes before them."""
     options = set()
     for field, hint in get_type_hints(kind, include_extras=True).items():
-        # `Annotated[inner, *marks]`; a plain union has arguments, too, which are no marks.
+        # `Annotated[inner, *marks]`. Of a plain union the first member is `inner`, and the others
+        # count as marks, none of which is searched for.
         marks = get_args(hint)[1:]
         inner: Any = get_args(hint)[0] if marks else hint
         name = f"{prefix}{field.replace('_', '-')}"

@@ -117,10 +117,10 @@ def compare_given_depth(
 
 def describe_contradiction(samples: DepthSamples) -> str:
     """Write the error for depths that no factor explains, with both ranges."""
-    given = describe_range(samples.given)
+    held = describe_range(samples.given)
     measured = describe_range(samples.measured)
     return (
-        f"The depth that the scene holds ({given} at {len(samples):,} compared pixels) contradicts "
+        f"The depth that the scene holds ({held} at {len(samples):,} compared pixels) contradicts "
         f"what its photographs and points measure there ({measured}), and no single factor "
         "explains it; give z-depth in one unit for all photographs, or leave it out with "
         "--no-given-depth."

@@ -212,7 +212,8 @@ def open_scene(
     assert photographs.format is not None
     if num_photographs is None:
         return Opened(photographs, photographs.format, len(photographs))
-    # COLMAP may not find all cameras; the user's format and number are reported, not its own.
+    # The user gave photographs, of which COLMAP may not have found all cameras. Their number is
+    # reported, and not the format and number of what COLMAP wrote.
     return Opened(photographs, "photographs", num_photographs)
 
 
@@ -230,10 +231,10 @@ def choose_working_size(
     trained = None
     if options.scene is not None:
         # A few photographs are enough to find the size by.
-        some = collect_usable_cameras(
+        usable = collect_usable_cameras(
             photographs, range(min(len(photographs), MAX_NAMED)), LONG_SIDE
         )
-        trained = find_training_size(options.scene, options.folder, photographs, list(some))
+        trained = find_training_size(options.scene, options.folder, photographs, list(usable))
     if trained is not None:
         sentence = f"{quote_value(options.scene)} was trained at {trained.long_side} px"
         sentence += f" ({quote_value(trained.source)})"
