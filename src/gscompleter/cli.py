@@ -61,18 +61,23 @@ Command: Any = Union[  # noqa: UP007  (of as many as there are)
 def run() -> None:
     """Run `main` as the command `gscompleter`, whose output may be closed, full or left."""
     replace_closed_outputs()
+
+    # Windows writes no UTF-8 into pipes, and file names may have no characters in any encoding.
     for output in (sys.stdout, sys.stderr):
-        if isinstance(output, io.TextIOWrapper):  # Windows writes no UTF-8 into pipes
+        if isinstance(output, io.TextIOWrapper):
             output.reconfigure(errors="backslashreplace")
+
     try:
         try:
             main()
         finally:
+            # What is buffered fails here, where it can be caught, and not when Python ends.
             sys.stdout.flush()
     except BrokenPipeError:  # the reader, such as `head`, has ended
         leave_output()
         sys.exit(ERROR)
     except OSError as error:
+        # `main` explains a full disk with a file; without one it is that of the standard output.
         if error.errno not in FULL_DISK_ERRORS:
             raise
         leave_output()
@@ -87,6 +92,7 @@ def replace_closed_outputs() -> None:
     """
     for number, name in ((1, "stdout"), (2, "stderr")):
         if getattr(sys, name) is None:
+            # `open` takes the lowest free number, which may be this one.
             null = os.open(os.devnull, os.O_WRONLY)
             if null != number:
                 os.dup2(null, number)
@@ -101,6 +107,7 @@ def leave_output() -> None:
 
 def main() -> None:
     """Run a command and exit with one of the codes of `exit_codes`."""
+    # Before anything imports torch, which reads this setting once.
     let_idle_threads_sleep()
     words = sys.argv[1:]
     if words == ["--version"]:
@@ -112,25 +119,32 @@ def main() -> None:
     warnings.filterwarnings("ignore", module="PIL")
     try:
         check_working_folder()
-        given = validate(parse_command(words))
-        check_overlap(given)
-        if getattr(given, "quiet", False):
+
+        # tyro converts the words to types, and `validate` adds the ranges of the annotations.
+        command_options = validate(parse_command(words))
+        check_overlap(command_options)
+        if getattr(command_options, "quiet", False):
             logging.getLogger("gscompleter").setLevel(logging.ERROR)
-        if isinstance(given, options.ComputeOptions):
-            limit_threads(given.threads)
+
+        # Numba reads the number of threads when it is imported, with the command.
+        if isinstance(command_options, options.ComputeOptions):
+            limit_threads(command_options.threads)
         _, module, function = COMMANDS[words[0]]
         with import_without_collection():
             command = getattr(import_module(f"gscompleter.apps.commands.{module}"), function)
-        code = command(given)
+        code = command(command_options)
     except InputError as error:
+        # Both are InputErrors for their sentences alone: no other input would help.
         print(f"{PROGRAM}{format_error(error)}", file=sys.stderr)
         is_input = not isinstance(error, (FullDiskError, NoCaseError))
         sys.exit(WRONG_INPUT if is_input else ERROR)
     except KeyboardInterrupt as stop:
+        # Whoever writes results says if they were complete when the signal came.
         reason = str(stop) or "no unfinished result was written"
         print(f"{PROGRAM}interrupted; {reason}.", file=sys.stderr)
         sys.exit(INTERRUPTED)
     except Exception as error:
+        # A lack of memory or a path of the user gets a sentence, a defect its traceback.
         failure = explain_failure(error)
         if failure is None:
             raise

@@ -1,4 +1,8 @@
-"""Compilation of all kernels in advance, by completing a tiny scene: a textured wall."""
+"""Compilation of all kernels in advance, by completing a tiny scene: a textured wall.
+
+Kernels are compiled at their first call, for the types of its arguments. A completion calls all of
+them with the types that users' scenes have.
+"""
 
 from __future__ import annotations
 
@@ -33,10 +37,14 @@ def compile_kernels(names: Collection[str]) -> float | None:
     # Without a cache each kernel is compiled when it is used, and a rehearsal gains nothing.
     if not missing or get_cache_folder() is None:
         return None
+
     start = time.perf_counter()
     # The stages of the rehearsal are none of the user's scene, and are not shown.
     with stage("compiling kernels for this machine, once"), show_progress(None):
         rehearse(with_splat=SPLAT_PART in missing)
+
+    # The rehearsal completes with all models, and so compiles all parts but that of the splat even
+    # if only one of them was asked for.
     for name in PARTS:
         if name != SPLAT_PART or SPLAT_PART in missing:
             mark_compiled(name)
@@ -46,18 +54,22 @@ def compile_kernels(names: Collection[str]) -> float | None:
 def rehearse(with_splat: bool) -> None:
     """Complete the wall, reconstructed from two photographs and optionally given."""
     completer = GSCompleter(renderer=load_renderer("cpu"))
-    views, target = make_photographs(), make_wall_camera(2)
+    views = make_photographs()
+    target = make_wall_camera(2)
     completion = completer(views, target)
     if with_splat:
+        # The reconstructed context stands for a splat, which comes with check views.
         completer(views, target, completion.context, views)
         simplify_scene(completion.context, [target])
 
 
 def make_photographs() -> list[View]:
     """Create photographs of the wall, parallel to their image planes, by two cameras."""
+    # Smoothed noise is a texture that stereo can match; white noise differs from pixel to pixel.
     random = torch.Generator().manual_seed(0)
     noise = torch.rand(IMAGE_SIZE_PX, IMAGE_SIZE_PX + DISPARITY_PX, 3, generator=random)
     wall = smooth_masked(noise, torch.ones(noise.shape[:2], dtype=torch.bool), 1)
+    # A camera one baseline farther to the right sees the same wall, shifted by the disparity.
     return [
         View(wall[:, DISPARITY_PX * i :][:, :IMAGE_SIZE_PX].contiguous(), make_wall_camera(i))
         for i in range(2)
@@ -68,6 +80,7 @@ def make_wall_camera(place: int) -> Camera:
     """Create a camera `place` baselines to the right."""
     c2w = torch.eye(4)
     c2w[0, 3] = place
+    # Disparity = focal length * baseline / depth, with a baseline of 1.
     focal = DISPARITY_PX * WALL_DEPTH
     K = torch.tensor([[focal, 0, IMAGE_SIZE_PX / 2], [0, focal, IMAGE_SIZE_PX / 2], [0, 0, 1]])
     return Camera(c2w, K, IMAGE_SIZE_PX, IMAGE_SIZE_PX, near=WALL_DEPTH / 2, far=WALL_DEPTH * 4)

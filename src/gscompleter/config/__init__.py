@@ -274,9 +274,12 @@ GUARDS = {
 }
 """Module and class of each guard, imported when a preset names it."""
 USUAL_GUARDS = tuple(name for name in GUARDS if name != "removal")
-REMOVAL_ALPHA, REMOVAL_RADIUS = 0.85, 0.05
-"""`holes.max_alpha` and `next_best_view.border_radius` after a removal."""
+REMOVAL_ALPHA = 0.85
+"""`holes.max_alpha` after a removal."""
+REMOVAL_RADIUS = 0.05
+"""`next_best_view.border_radius` after a removal."""
 
+# A type checker cannot read a Literal that is computed from a table; pydantic and tyro can.
 if TYPE_CHECKING:
     GuardName = str
 else:
@@ -320,11 +323,13 @@ class CompleterConfig(Settings):
 
     def __post_init__(self) -> None:
         """Raise InputError for settings of the registration that is not used."""
+        # Such settings would change nothing, and a comparison of their values would mislead.
         if self.registration_method == "ours":
             others = "paper_registration"
             is_untouched = self.paper_registration == PaperRegistrationConfig()
         else:
             others = "registration"
+            # A preset for splats keeps its own settings if only the method is changed.
             is_untouched = self.registration in (RegistrationConfig(), SPLAT_REGISTRATION)
         if not is_untouched:
             raise InputError(
@@ -341,6 +346,8 @@ class CompleterConfig(Settings):
     @staticmethod
     def splat() -> CompleterConfig:
         """Return the settings for a splat that comes with further photographs."""
+        # A trained splat is right where photographs confirm it (decision 019), and none of these
+        # may get worse.
         return CompleterConfig(
             trust="photometric",
             guards=("image-agreement", "free-space", "psnr", "contribution"),
@@ -370,10 +377,12 @@ class CompleterConfig(Settings):
         Nothing but the hole is completed. Gaussians at its border are often half transparent, and
         targets are best that show much of that border.
         """
+        # First in the list: the others judge what it leaves in the hole.
+        others = tuple(name for name in self.guards if name != "removal")
         return replace(
             self,
             trust="full",
-            guards=("removal", *(name for name in self.guards if name != "removal")),
+            guards=("removal", *others),
             holes=replace(self.holes, max_alpha=REMOVAL_ALPHA),
             next_best_view=replace(self.next_best_view, border_radius=REMOVAL_RADIUS),
         )
@@ -418,6 +427,8 @@ def get_named_config(name: str, is_splat: bool = False) -> CompleterConfig:
     }
     if name in bases:
         return bases[name]
+
+    # `no-sa` alone is an ablation of the default, `paper/no-sa` one of the paper's settings.
     base, _, ablation = name.rpartition("/")
     if (base or "default") not in bases or ablation not in ABLATIONS:
         raise InputError(
@@ -425,11 +436,15 @@ def get_named_config(name: str, is_splat: bool = False) -> CompleterConfig:
             f"{', '.join(ABLATIONS)} (paper/no-sa for an ablation of the paper's settings), or "
             "give a YAML file."
         )
-    changed = bases[base or "default"]
+
+    # An ablation changes the registration that its base names; the other one is not read.
+    base_config = bases[base or "default"]
     changes = dict(ABLATIONS[ablation])
-    if "registration" in changes and changed.registration_method == "paper":
+    if "registration" in changes and base_config.registration_method == "paper":
         changes["paper_registration"] = changes.pop("registration")
-    config = apply_changes(changed, changes)
+    config = apply_changes(base_config, changes)
+
+    # The guard would fade what the missing refinement leaves too opaque, and hide its effect.
     return config.without_guard("psnr") if ablation == "no-mv" else config
 
 

@@ -72,12 +72,15 @@ class GeneratorOptions(Settings):
     def make_settings(self) -> GeneratorSettings:
         """Return the settings, or raise InputError if one is unknown to the generator."""
         kind = get_settings_class(self.generator)
-        given = {
+
+        # None and False are the defaults of the options: the generator then has its own.
+        settings = {
             name.removeprefix(PREFIX): value
             for name, value in vars(self).items()
             if name.startswith(PREFIX) and value is not None and value is not False
         }
-        for setting in given:
+        # Refused, not ignored: the user would believe that the setting was obeyed.
+        for setting in settings:
             if not hasattr(kind, setting):
                 others = load_plugins(PLUGINS)
                 knowing = [name for name in others if hasattr(get_settings_class(name), setting)]
@@ -86,7 +89,7 @@ class GeneratorOptions(Settings):
                     f"choose {' or '.join(knowing)}.",
                     PREFIX + setting,
                 )
-        return kind(**given)
+        return kind(**settings)
 
     def describe(self) -> dict[str, Any]:
         """Describe the generator for `summary.json`."""

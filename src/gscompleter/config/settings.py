@@ -46,7 +46,7 @@ class Settings:
 
 def validate(settings: S, prefix: str = "") -> S:
     """Validate types and ranges; InputErrors name `prefix` and the setting as their argument."""
-    from pydantic import TypeAdapter
+    from pydantic import TypeAdapter  # imported late, so that `--help` does not wait for it
 
     with translate_errors(settings, prefix=prefix):
         return TypeAdapter(type(settings)).validate_python(settings, strict=True)
@@ -56,6 +56,7 @@ def apply_changes(settings: S, changes: Mapping[str, Any], where: str = "") -> S
     """Apply nested changes; the sentences of InputErrors begin with `where`."""
     from pydantic import TypeAdapter
 
+    # YAML has no tuples. In strict mode pydantic refuses a list for a tuple, but not in JSON.
     text = json.dumps(merge_nested(asdict(settings), changes))  # type: ignore[call-overload]
     with translate_errors(settings, where):
         return TypeAdapter(type(settings)).validate_json(text, strict=True)
@@ -69,6 +70,8 @@ def translate_errors(settings: object, where: str = "", prefix: str = "") -> Ite
     try:
         yield
     except ValidationError as error:
+        # A sentence names one setting: that of the first error. Parts of its place that are no
+        # text are indices.
         wrong = error.errors(include_url=False)[0]
         name = ".".join(part for part in wrong["loc"] if isinstance(part, str))
         raise InputError(where + describe_invalid(wrong, name, settings), prefix + name) from None
@@ -78,22 +81,27 @@ def merge_nested(values: Mapping[str, Any], changes: Mapping[str, Any]) -> dict[
     """Merge nested mappings; `changes` win."""
     result = dict(values)
     for name, change in changes.items():
-        nested = isinstance(change, Mapping) and isinstance(values.get(name), Mapping)
-        result[name] = merge_nested(values[name], change) if nested else change
+        if isinstance(change, Mapping) and isinstance(values.get(name), Mapping):
+            result[name] = merge_nested(values[name], change)
+        else:
+            result[name] = change
     return result
 
 
 def describe_invalid(wrong: ErrorDetails, name: str, settings: object) -> str:
     """Write the sentence about the setting called `name`."""
-    given = wrong["input"]
+    value = wrong["input"]
+
+    # The group that does not know the name, to list the names that it knows.
     if wrong["type"] == "unexpected_keyword_argument":
         for part in wrong["loc"][:-1]:
             settings = getattr(settings, str(part))
         known = ", ".join(vars(settings))
         return f"There is no setting '{quote_value(name)}'; choose one of {known}."
-    shown = f"'{quote_value(given)}'" if isinstance(given, str) else quote_value(given)
+    shown = f"'{quote_value(value)}'" if isinstance(value, str) else quote_value(value)
     if wrong["type"] == "dataclass_type":
         return f"{name} is a group of settings, got {shown}."
+    # Pydantic says "Input should be greater than ...".
     return f"{name} {re.sub(r'^[A-Z][a-z]+ should', 'must', wrong['msg'])}, got {shown}."
 
 
@@ -107,9 +115,10 @@ def read_yaml(path: Path) -> dict[str, Any]:
     if data.count(b"[") + data.count(b"{") > MAX_BRACKETS:
         raise InputError(f"{name} is nested too deeply.")
     try:
-        # They can expand a short file endlessly.
+        # Aliases can expand a short file endlessly.
         if any(isinstance(token, yaml.AliasToken) for token in yaml.scan(data.decode())):
             raise yaml.YAMLError("aliases are not read; write the value out")
+        # Through JSON: dates and other types of YAML become texts, which validation refuses.
         content = json.loads(json.dumps(yaml.safe_load(data.decode()), default=str))
     except RecursionError as error:
         raise InputError(f"{name} is nested too deeply.") from error

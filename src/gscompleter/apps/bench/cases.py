@@ -116,18 +116,22 @@ def get_size(axis: str, case: BenchCase) -> int:
 
 def read_manifest(path: Path) -> Manifest:
     """Read a manifest from a JSON file; paths are relative to its folder."""
+    # As JSON, in which strict validation takes lists for tuples.
     text = json.dumps(read_json(path, "name a file of cases to measure"))
     try:
-        found = TypeAdapter(Manifest).validate_json(text, strict=True)
+        manifest = TypeAdapter(Manifest).validate_json(text, strict=True)
     except ValueError as error:
         raise InputError(
             f"{quote_value(path)} names no cases to measure ({quote_value(str(error))}); it needs "
             "cases, each with name, scene, context, targets and resolution.",
             "cases",
         ) from error
-    base = path.parent
-    cases = [replace(c, scene=base / os.path.expandvars(c.scene)) for c in found.cases]
-    return replace(found, cases=tuple(cases))
+
+    # Scenes of the project's own cases lie in the folder that GSCOMPLETER_DATA names.
+    cases = [
+        replace(case, scene=path.parent / os.path.expandvars(case.scene)) for case in manifest.cases
+    ]
+    return replace(manifest, cases=tuple(cases))
 
 
 def check_frames(cases: Sequence[BenchCase]) -> None:
@@ -142,6 +146,7 @@ def write_input_splat(case: BenchCase, folder: Path, models: Models, device: str
     """Write the input splat of a case to `folder` once; None if the context is reconstructed."""
     if case.gaussians is None:
         return None
+    # Equal cases share a file within this process, whose hashes the name is made of.
     path = folder / f"{abs(hash(case)):x}.ply"
     if not path.exists():
         context = case.begin(models, device).context
@@ -155,12 +160,18 @@ def multiply_gaussians(scene: Gaussians, count: int, seed: int = 0) -> Gaussians
     All copies of a Gaussian together have its opacity. If `count` is smaller than the scene, a
     random subset is returned.
     """
+    # Whole rounds through a random order, so that the numbers of copies differ by one at most.
     rng = torch.Generator().manual_seed(seed)
     order = torch.randperm(len(scene), generator=rng)
     rows = order.repeat(math.ceil(count / len(scene)))[:count]
     copies = torch.bincount(rows, minlength=len(scene))[rows].to(scene.means)
     repeats = scene[rows.to(scene.means.device)]
+
+    # Copies at one place would be sorted and blended as no real splat is. The smallest standard
+    # deviation keeps them on their surface.
     offsets = JITTER * torch.randn(count, 3, generator=rng).to(repeats.means)
     means = repeats.means + offsets * repeats.scales.amin(dim=1, keepdim=True)
+
+    # n copies of opacity b let through (1 - b)^n, which has to be 1 - a: b = 1 - (1 - a)^(1 / n).
     fainter = -torch.expm1(torch.log1p(-repeats.opacities) / copies)
     return replace(repeats, means=means, opacities=fainter, encoded=None)

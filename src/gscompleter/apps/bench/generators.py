@@ -11,10 +11,8 @@ from gscompleter.evaluation.methods import Models
 from gscompleter.evaluation.metrics.scores import PartQuality, measure_part
 from gscompleter.evaluation.tables import format_markdown
 from gscompleter.generators import load_generator
-from gscompleter.state import Completion
 from gscompleter.system.errors import InputError
 from gscompleter.system.progress import track
-from gscompleter.types import View
 
 
 @dataclass(frozen=True)
@@ -36,40 +34,36 @@ def compare_generators(
             has a hole.
     """
     loaded = {name: load_generator(name, models.seed, device=device) for name in names}
-    found: dict[str, list[Filling]] = {name: [] for name in names}
+    fillings: dict[str, list[Filling]] = {name: [] for name in names}
     for case in track(cases, "filling"):
         (photograph,) = case.open().views(case.targets[:1], case.resolution)
+        # All generators continue the same context, so that only the filling differs.
         state = case.begin(models, device)
         for name, generator in loaded.items():
             completer = replace(models, generator=generator).make_completer()
-            done = completer.advance(state, photograph.camera.to(device))
-            found[name] += score_filling(done, photograph.to(device))
-    if not any(found.values()):
+            completion = completer.advance(state, photograph.camera.to(device))
+            result = completion.targets[-1]
+            # Without a synthesized image there was nothing to fill.
+            if result.reference is not None:
+                hole = measure_part(result.after.image, photograph.to(device), result.hole_mask)
+                fillings[name].append(Filling(completion.seconds["generate"], hole))
+    if not any(fillings.values()):
         raise InputError("No case has a hole at its first target; name others.", "cases")
-    return found
+    return fillings
 
 
-def score_filling(done: Completion, photograph: View) -> list[Filling]:
-    """Score the last target in its hole; none if there was nothing to fill."""
-    result = done.targets[-1]
-    if result.reference is None:
-        return []
-    hole = measure_part(result.after.image, photograph, result.hole_mask)
-    return [Filling(done.seconds["generate"], hole)]
-
-
-def format_generators(found: dict[str, list[Filling]]) -> str:
+def format_generators(fillings_by_name: dict[str, list[Filling]]) -> str:
     """Format the mean scores in holes and the median seconds, one row per generator."""
     columns = ["generator", "cases", "seconds", "PSNR (hole)", "HaarPSI (hole)"]
     rows = [
         [
             name,
             str(len(fillings)),
-            f"{median(one.seconds for one in fillings):.2f}",
-            format_mean([one.hole.psnr for one in fillings], 2),
-            format_mean([one.hole.haarpsi for one in fillings], 3),
+            f"{median(filling.seconds for filling in fillings):.2f}",
+            format_mean([filling.hole.psnr for filling in fillings], 2),
+            format_mean([filling.hole.haarpsi for filling in fillings], 3),
         ]
-        for name, fillings in found.items()
+        for name, fillings in fillings_by_name.items()
     ]
     return format_markdown(columns, rows)
 

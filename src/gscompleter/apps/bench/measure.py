@@ -29,8 +29,10 @@ SHIFTS = (-0.2, 0.2, 0.4)
 RUNS = 5
 """Number of runs of which the median is taken."""
 
-PROCESS, REST = "process", "rest"
-"""Seconds of the whole process, and those outside the stages: start, imports, files, scores."""
+PROCESS = "process"
+"""Seconds of the whole process."""
+REST = "rest"
+"""Seconds outside of the stages: start, imports, files, scores."""
 PROGRAM = """
 from gscompleter.cli import run
 try:
@@ -61,7 +63,8 @@ class Sample:
     @property
     def ratio(self) -> float:
         """Seconds of the last stage, in yardsticks."""
-        return [*self.seconds.values()][-1] / self.yardstick
+        last = list(self.seconds.values())[-1]
+        return last / self.yardstick
 
 
 def make_yardstick(renderer: Renderer, device: str) -> Yardstick:
@@ -79,6 +82,7 @@ def make_yardstick(renderer: Renderer, device: str) -> Yardstick:
         image = renderer.render(replace(scene, **varied), cameras[-1]).image
         torch.autograd.grad(image.sum(), variables)
 
+    # Compiles everything, before the first run that counts.
     render()
     return render
 
@@ -86,8 +90,9 @@ def make_yardstick(renderer: Renderer, device: str) -> Yardstick:
 def measure_beside(yardstick: Yardstick, measure: Callable[[], T]) -> tuple[T, float]:
     """Run `measure`, and return the mean yardstick of just before and just after."""
     before = measure_median_seconds(yardstick)
-    found = measure()
-    return found, (before + measure_median_seconds(yardstick)) / 2
+    result = measure()
+    after = measure_median_seconds(yardstick)
+    return result, (before + after) / 2
 
 
 def measure_median_seconds(work: Yardstick) -> float:
@@ -96,6 +101,7 @@ def measure_median_seconds(work: Yardstick) -> float:
     for _ in range(RUNS):
         start = time.perf_counter()
         work()
+        # A GPU works on after the call has returned.
         if torch.cuda.is_available():
             torch.cuda.synchronize()
         seconds.append(time.perf_counter() - start)
@@ -128,6 +134,7 @@ def make_surface(camera: Camera) -> Gaussians:
 def measure_command(words: Sequence[str], out: Path, yardstick: Yardstick) -> Sample:
     """Measure one run of a command that writes to `out`, in a process of its own."""
     (spent, peak_bytes), unit = measure_beside(yardstick, lambda: run_command(words))
+    # The stages were timed by the command itself; what it needed besides is the rest.
     summary = json.loads((out / SUMMARY_FILE).read_bytes())
     stages = summary["seconds"]
     seconds = {**stages, REST: spent - stages["total"], PROCESS: spent}

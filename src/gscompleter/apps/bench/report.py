@@ -65,6 +65,7 @@ def fit_exponent(sizes: Sequence[int], values: Sequence[float]) -> float | None:
     known = [(size, value) for size, value in zip(sizes, values, strict=True) if value > 0]
     if len({size for size, _ in known}) < 2:
         return None
+    # value ~ size^p is a line of slope p in logarithms.
     x, y = np.log(np.array(known, dtype=np.float64)).T
     return float(np.polyfit(x, y, 1)[0])
 
@@ -89,19 +90,23 @@ def format_case_table(cases: Sequence[Measured]) -> str:
     rows = []
     for case in cases:
         counts = [case.samples[0].gaussians[key] for key in ("context", "added")]
-        rows.append([*format_cells(case, columns), *(f"{count:,}" for count in counts)])
+        rows.append([*format_cells(case, columns), *[f"{count:,}" for count in counts]])
     return format_table("case", columns, rows, "Gaussians", "added")
 
 
 def format_growth_table(axis: str, points: Mapping[int, Measured]) -> str:
     """Format seconds and memory, one row per size, and the exponents p of value ~ size^p."""
-    found, sizes = [*points.values()], [*points]
-    columns = select_columns(found, COLUMNS)
-    values = [[point.seconds[column] for point in found] for column in columns]
-    values += [[point.ratio for point in found], [float(point.peak_bytes) for point in found]]
-    powers = [fit_exponent(sizes, column) for column in values]
-    last = ["exponent", *("–" if power is None else f"{power:.2f}" for power in powers)]
-    return format_table(axis, columns, [*(format_cells(p, columns) for p in found), last])
+    measured = list(points.values())
+    columns = select_columns(measured, COLUMNS)
+    rows = [format_cells(point, columns) for point in measured]
+
+    # The last row has an exponent below each column of `format_cells`.
+    values = [[point.seconds[column] for point in measured] for column in columns]
+    values.append([point.ratio for point in measured])
+    values.append([float(point.peak_bytes) for point in measured])
+    exponents = [fit_exponent(list(points), column) for column in values]
+    rows.append(["exponent", *["–" if p is None else f"{p:.2f}" for p in exponents]])
+    return format_table(axis, columns, rows)
 
 
 def format_table(
@@ -111,20 +116,26 @@ def format_table(
     return format_markdown([first, *columns, "in yardsticks", "peak (GB)", *last], rows)
 
 
-def select_columns(found: Sequence[Measured], columns: Sequence[str]) -> list[str]:
+def select_columns(measured: Sequence[Measured], columns: Sequence[str]) -> list[str]:
     """Select the columns with a positive time."""
-    return [c for c in columns if any(one.seconds.get(c, 0.0) > 0 for one in found)]
+    return [
+        column
+        for column in columns
+        if any(point.seconds.get(column, 0.0) > 0 for point in measured)
+    ]
 
 
-def format_cells(found: Measured, columns: Sequence[str]) -> list[str]:
+def format_cells(measured: Measured, columns: Sequence[str]) -> list[str]:
     """Format the name, the seconds of each column, the yardsticks, and the memory."""
-    seconds, ratios = found.seconds, [sample.ratio for sample in found.samples]
+    # Medians of all samples, computed once.
+    seconds = measured.seconds
+    ratios = [sample.ratio for sample in measured.samples]
     spread = f" ({min(ratios):.1f}–{max(ratios):.1f})" if len(ratios) > 1 else ""
     return [
-        found.name,
-        *(f"{seconds[c]:.2f}" if c in seconds else "–" for c in columns),
-        f"{found.ratio:.1f}{spread}",
-        f"{found.peak_bytes / 1e9:.2f}" if found.peak_bytes else "–",
+        measured.name,
+        *(f"{seconds[column]:.2f}" if column in seconds else "–" for column in columns),
+        f"{measured.ratio:.1f}{spread}",
+        f"{measured.peak_bytes / 1e9:.2f}" if measured.peak_bytes else "–",
     ]
 
 

@@ -61,12 +61,15 @@ RESERVED = ("out", "overwrite", "quiet", "threads", "dry-run", "help", "help-all
 """Options that a batch sets for all jobs."""
 MAX_NAMED_FAILURES = 5
 """Most failures that the terminal names."""
-TRUE, FALSE = ("true", "yes", "1"), ("false", "no", "0", "")
-"""Values of a flag in a CSV."""
+TRUE = ("true", "yes", "1")
+"""Values of a CSV that set a flag."""
+FALSE = ("false", "no", "0", "")
+"""Values of a CSV that leave a flag unset; an empty cell is one of them."""
 
 
 def run_batch(options: BatchOptions) -> int:
     """Complete the scenes of a manifest, write the table and the page, and return the exit code."""
+    # Two letters at least: `C:/results` is a path of Windows.
     if re.match(r"\w\w+:/", str(options.out)):
         raise InputError(f"{quote_value(options.out)} is an address; name a folder.", "out")
     number, count = parse_shard(options.shard, os.environ)
@@ -75,38 +78,42 @@ def run_batch(options: BatchOptions) -> int:
         with show_preparation("reading the manifest"):
             common = parse_pairs(options.each, "each")
             jobs = read_manifest(options.manifest, common, options.out)
-            refuse_overlap(options.out, list_job_scenes(jobs))
-            out = options.out.resolve()  # absolute, for workers elsewhere
+
+            # The results may not lie in what the rows read.
+            cells = dict.fromkeys(job.options.get(name) for job in jobs for name in PATHS)
+            inputs = [Path(cell) for cell in cells if isinstance(cell, str) and cell]
+            refuse_overlap(options.out, inputs)
+
+            # Workers may run in another working folder, so they get an absolute path.
+            out = options.out.resolve()
             engine = make_engine(options, out)
             claim_folder(out, "batch", {"version": 1, "kind": "batch"})
+
             share = jobs[number::count]
             left = find_missing_jobs(share, out, options.rerun == "failures")
+
+        # A folder of scenes can hold the results of earlier runs, which are no input.
         if results := list_results(options.manifest, options.out):
             names = join_names([path.name for path in results], MAX_NAMED_FAILURES)
             console.print(f"Left out, as results and no scenes: {names}.", markup=False)
+
         perform = partial(perform_job, out=out, retries=options.retries)
         ended = run_jobs(left, perform, partial(has_row, out=out), engine, options.retries)
         for _ in track(ended, "completing", len(left)):
             pass
         with show_preparation("table"):
             write_batch_results(out, jobs)
-    failures = collect_failures(out, share)
+
+    # The exit code and the sentence count this share, with the jobs that failed in earlier runs.
+    failures = []
+    for job in share:
+        row = read_row(job, out)
+        if row is not None and row["state"] == "failed":
+            failures.append(f"{row['job']}: {row['reason']}")
     print_failures(console, failures)
     sentence = f"{summarize_rows(out, share, left)} All results: {options.out}/index.html"
     console.print(sentence, markup=False, soft_wrap=True)
     return choose_exit_code(len(failures), len(share))
-
-
-def list_job_scenes(jobs: Sequence[Job]) -> list[Path]:
-    """List the paths that the rows of a batch read."""
-    paths = [job.options.get(name) for job in jobs for name in PATHS]
-    return [Path(path) for path in dict.fromkeys(paths) if isinstance(path, str) and path]
-
-
-def collect_failures(out: Path, jobs: Sequence[Job]) -> list[str]:
-    """Describe the jobs that failed, now or earlier, with the reasons."""
-    rows = [row for job in jobs if (row := read_row(job, out)) is not None]
-    return [f"{row['job']}: {row['reason']}" for row in rows if row["state"] == "failed"]
 
 
 def print_failures(console: Console, failures: Sequence[str]) -> None:
@@ -119,23 +126,36 @@ def print_failures(console: Console, failures: Sequence[str]) -> None:
 
 def summarize_rows(out: Path, share: Sequence[Job], left: Sequence[Job]) -> str:
     """Summarize the rows of a share, of which `left` were run now."""
-    names = {job.name for job in left}
-    rows = [(job.name in names, read_row(job, out)) for job in share]
-    failed = [is_new for is_new, row in rows if row is not None and row["state"] == "failed"]
+    names_left = {job.name for job in left}
+    failed_now = 0
+    failed_earlier = 0
+    for job in share:
+        row = read_row(job, out)
+        if row is None or row["state"] != "failed":
+            continue
+        if job.name in names_left:
+            failed_now += 1
+        else:
+            failed_earlier += 1
+
     before = f"done earlier {len(share) - len(left)}"
-    if not all(failed):
-        before += f", {failed.count(False)} of them failed (--rerun failures repeats them)"
-    return f"Done {len(left) - sum(failed)}, failed {sum(failed)}, {before}."
+    if failed_earlier:
+        before += f", {failed_earlier} of them failed (--rerun failures repeats them)"
+    return f"Done {len(left) - failed_now}, failed {failed_now}, {before}."
 
 
 def write_batch_results(out: Path, jobs: Sequence[Job]) -> None:
     """Write the table and the page, repeatedly while other shards add rows."""
     from gscompleter.apps.report.page import write_overview
 
-    seen = None
-    while seen != (there := [job for job in jobs if has_row(job, out)]):
-        seen = there
-        write_overview(out, there)
+    # A shard that ends while this one writes may be overwritten by an older table. Whoever writes
+    # last looks once more, and so the table that remains has all rows.
+    written: list[Job] | None = None
+    finished = [job for job in jobs if has_row(job, out)]
+    while finished != written:
+        write_overview(out, finished)
+        written = finished
+        finished = [job for job in jobs if has_row(job, out)]
 
 
 def perform_job(job: Job, out: Path, retries: int) -> None:
@@ -151,20 +171,26 @@ def complete_job(job: Job, jobs: Path) -> dict[str, Any]:
     from gscompleter.apps.report.page import average_scores
     from gscompleter.evaluation.memory import measure_peak_memory
 
-    warnings.filterwarnings("ignore", module="PIL")  # as the command line has it
-    start, cpu_start = time.monotonic(), time.process_time()
+    # A worker does not run `cli.main`, which sets this filter for the other commands.
+    warnings.filterwarnings("ignore", module="PIL")
+    start = time.monotonic()
+    cpu_start = time.process_time()
     make_folder(jobs)
     with measure_peak_memory() as peak:
         # The batch gives each job to one worker, and a further one only if that is lost.
         summary = complete_folder(parse_row(job.options, jobs / job.name), takes_over=True)
+
+    # A scene that did not reconstruct counts as failed. Its folder stays, to look at.
     outcome = summary["outcome"]
-    if outcome["status"] == "not-reconstructed":  # its folder stays, to look at
+    if outcome["status"] == "not-reconstructed":
         raise InputError(outcome["headline"])
+
+    files = [path for path in (jobs / job.name).rglob("*") if path.is_file()]
     return {
         **average_scores(summary),
         "seconds": time.monotonic() - start,
         "cpu_seconds": time.process_time() - cpu_start,
-        "result_bytes": sum(f.stat().st_size for f in (jobs / job.name).rglob("*") if f.is_file()),
+        "result_bytes": sum(path.stat().st_size for path in files),
         "peak_bytes": peak.bytes,
     }
 
@@ -173,16 +199,19 @@ def parse_row(row: Mapping[str, Any], out: Path) -> CompleteOptions:
     """Parse a row, or raise InputError; `out` is the output folder."""
     if not isinstance(row.get(FOLDER), str):
         raise InputError("The row has no folder; give it the folder of a scene.")
+    # The row becomes a command line, so that its values are read and refused as those of
+    # `complete`. Overwriting is safe: the folder of a job is in the batch's own output.
     words = [COMPLETE, row[FOLDER], *row_to_words(row), "--out", str(out), "--overwrite", "--quiet"]
     try:
         options: CompleteOptions = validate(parse_words(words, Command, (COMPLETE,)))
     except InputError as error:
+        # Only the sentence is kept in the row of a failed job, so it names the option itself.
         raise InputError(format_error(error)) from error
     return options
 
 
 def row_to_words(row: Mapping[str, Any], prefix: str = "") -> Iterator[str]:
-    """Convert a row to words of a command line."""
+    """Convert a row to words of a command line; nested mappings give `--config.holes.dilation`."""
     for key, value in row.items():
         name = f"{prefix}{key}".replace("_", "-")
         if name in RESERVED:
@@ -196,16 +225,23 @@ def row_to_words(row: Mapping[str, Any], prefix: str = "") -> Iterator[str]:
 def option_to_words(name: str, value: Any) -> list[str]:
     """Convert an option to words; a text is split like a shell if it can have several values."""
     kind = get_type_hints(CompleteOptions).get(name.replace("-", "_"))
+
+    # A flag has no value on the command line: it is there or not.
     if kind is bool:
         if str(value).lower() not in TRUE + FALSE:
             raise InputError(f"{name} is {quote_value(str(value))}; it must be true or false.")
         return [f"--{name}"] if str(value).lower() in TRUE else []
+
+    # A CSV has one text for `0 4`, where JSON has a list. Only options with several values are
+    # split, because a single path may contain spaces.
     values = value if isinstance(value, list) else [value]
     if isinstance(value, str) and "tuple" in str(kind).lower():
         try:
             values = shlex.split(value)
         except ValueError as error:
             raise InputError(f"'{quote_value(value)}' has an unmatched quotation mark.") from error
+
+    # The parser would take a value such as `--out` for an option; negative numbers are none.
     words = [str(item) for item in values]
     for word in words:
         if re.match(r"-(?![\d.])", word):
@@ -233,13 +269,17 @@ def make_engine(options: EngineOptions, out: Path) -> Engine | None:
     """
     if options.engine is None:
         return None
+
+    # Cores of machines elsewhere are not known here, so their workers get one thread by default.
     threads = options.threads or 1
     if options.engine == "ray":
         return partial(open_ray, options.workers, threads, options.gpus, options.address)
     if options.engine == "submitit":
-        slurm, folder = parse_pairs(options.slurm, "slurm"), out / "submitit"
+        slurm = parse_pairs(options.slurm, "slurm")
         workers = options.workers or 1
-        return partial(open_submitit, workers, threads, options.gpus, folder, slurm)
+        return partial(open_submitit, workers, threads, options.gpus, out / "submitit", slurm)
+
+    # Workers on this machine share its cores. With torch's default each would take all of them.
     check_processes()
     workers = options.workers or choose_num_workers()
     limit_threads(options.threads or max(1, count_available_cores() // workers))

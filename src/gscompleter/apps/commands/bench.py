@@ -74,14 +74,14 @@ class Bench:
         if self.options.in_process:
             call = partial(case.complete, self.models, self.device, scene)
             return measure_call(call, self.device, self.yardstick)
-        given = {"--near": case.near, "--far": case.far, "--scene": scene}
-        words = [
-            *("complete", case.scene, "--out", out, "--overwrite", "--quiet"),
-            *("--context", *case.context, "--target", *case.targets),
-            *("--resolution", *case.resolution),
-            *("--device", self.device, "--seed", self.options.seed),
-            *(word for pair in given.items() if pair[1] is not None for word in pair),
-        ]
+
+        words: list[object] = ["complete", case.scene, "--out", out, "--overwrite", "--quiet"]
+        words += ["--context", *case.context, "--target", *case.targets]
+        words += ["--resolution", *case.resolution]
+        words += ["--device", self.device, "--seed", self.options.seed]
+        for option, value in (("--near", case.near), ("--far", case.far), ("--scene", scene)):
+            if value is not None:
+                words += [option, value]
         return measure_command([str(word) for word in words], out, self.yardstick)
 
 
@@ -93,20 +93,28 @@ def run_bench(options: BenchOptions) -> None:
         options = replace(options, repeats=1, growth=())
     with TemporaryDirectory(prefix="gscompleter-bench-") as temporary:
         manifest = load_manifest(options, Path(temporary) / "motorcycle")
-        cases, series = [*manifest.cases], manifest.make_series(options.growth)
+        cases = list(manifest.cases)
+        series = manifest.make_series(options.growth)
         if options.quick:
             cases = [min(cases, key=lambda case: (case.gaussians or 0, case.pixels))]
-        check_frames([*cases, *(case for found in series.values() for case in found.values())])
+
+        # A missing frame is reported before minutes of measurements, not in the middle of them.
+        check_frames([*cases, *list_grown_cases(series)])
         with show_progress(None if options.quiet else Console(stderr=True)):
             with show_preparation("getting ready"):
                 bench = prepare_bench(options, Path(temporary))
             if options.generators:
-                found = compare_generators(options.generators, cases, bench.models, bench.device)
-                values = {name: [asdict(one) for one in some] for name, some in found.items()}
-                write_results(values, format_generators(found), options)
+                fillings = compare_generators(options.generators, cases, bench.models, bench.device)
+                values = {name: [asdict(one) for one in own] for name, own in fillings.items()}
+                write_results(values, format_generators(fillings), options)
                 return
             report = run_measurements(bench, cases, series)
     write_results(asdict(report), format_report(report), options)
+
+
+def list_grown_cases(series: Series) -> list[BenchCase]:
+    """List the cases of all axes of growth."""
+    return [case for grown in series.values() for case in grown.values()]
 
 
 def write_results(values: dict[str, Any], tables: str, options: BenchOptions) -> None:
@@ -123,7 +131,10 @@ def load_manifest(options: BenchOptions, folder: Path) -> Manifest:
     """Read the cases of a file, or write the demo's pair to `folder`."""
     if options.cases is not None:
         return read_manifest(options.cases)
+
     write_motorcycle_scene(folder)
+    # Width and height of the pair in pixels. Targets have no photograph: they lie beyond the right
+    # camera, each a quarter of a baseline farther than the one before it.
     left, right = get_motorcycle_cameras(741, 500)
     beyond = [move_right(right, step * BASELINE_M) for step in BEYOND]
     names = [f"images/{name}.png" for name in ("left", "right", *BEYOND)]
@@ -147,18 +158,21 @@ def prepare_bench(options: BenchOptions, folder: Path) -> Bench:
 def run_measurements(bench: Bench, cases: Sequence[BenchCase], series: Series) -> Report:
     """Run all measurements in rounds, after a first run that is not counted."""
     options = bench.options
+
+    # The first completion also fills the caches of kernels and files for the later ones.
     if not options.quick:
         with stage("warming up"):
             bench.complete(cases[0])
-    grown = [case for found in series.values() for case in found.values()]
-    tasks = {case: partial(bench.complete, case) for case in (*cases, *grown)}
+
+    # Cases that differ only in their names are equal, and so are measured once.
+    tasks = {case: partial(bench.complete, case) for case in (*cases, *list_grown_cases(series))}
     samples = measure_in_rounds(tasks, options.repeats)
     return Report(
         describe_machine(bench.device),
         {"seed": options.seed, "repeats": options.repeats, "in_process": options.in_process},
         [Measured(case.name, samples[case]) for case in cases],
         {
-            axis: {size: Measured(f"{size:,}", samples[case]) for size, case in found.items()}
-            for axis, found in series.items()
+            axis: {size: Measured(f"{size:,}", samples[case]) for size, case in grown.items()}
+            for axis, grown in series.items()
         },
     )

@@ -6,7 +6,6 @@ import json
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass
 from functools import partial
-from pathlib import Path
 from typing import Any
 
 import torch
@@ -93,11 +92,23 @@ def run_clean(options: CleanOptions) -> None:
             )
         summary = {"version": __version__, **cleaning.run_info, "gaussians": cleaning.counts}
         with output.write() as folder, stage("writing"):
-            write_cleaning(folder, cleaning, options.dry_run)
+            if not options.dry_run:
+                # `given[:0]`: a cleaning adds nothing.
+                save_completed_splat(
+                    folder,
+                    cleaning.given,
+                    cleaning.removed,
+                    cleaning.given[:0],
+                    cleaning.splat_file,
+                )
+            elif cleaning.removed.any():
+                save_changed(folder, cleaning.given, cleaning.removed, cleaning.splat_file)
             (folder / SUMMARY_FILE).write_bytes(json.dumps(summary, indent=2).encode() + b"\n")
     if not options.quiet:
-        begin, name = ("Dry run: ", REMOVED_FILE) if options.dry_run else ("", COMPLETED_FILE)
-        print(f"{begin}{describe_cleaning(summary)}: {options.out / name}")
+        if options.dry_run:
+            print(f"Dry run: {describe_cleaning(summary)}: {options.out / REMOVED_FILE}")
+        else:
+            print(f"{describe_cleaning(summary)}: {options.out / COMPLETED_FILE}")
 
 
 def clean_by_photographs(options: CleanOptions, console: Console) -> Cleaning:
@@ -105,6 +116,9 @@ def clean_by_photographs(options: CleanOptions, console: Console) -> Cleaning:
     check_context(options)
     device = choose_device(options.device)
     renderer = load_renderer(device)
+
+    # The splat is also read before cameras are searched for, so that a damaged file is refused
+    # within seconds: the search takes minutes.
     opened = open_scene(options, console, partial(load_given_splat, options))
     options = choose_working_size(options, opened.photographs, console)
     with show_preparation("reading photographs"):
@@ -113,13 +127,18 @@ def clean_by_photographs(options: CleanOptions, console: Console) -> Cleaning:
     compile_kernels([device])
     with show_preparation("aligning the scene"):
         task = move_to_splat(task, loaded, options.scene, options, opened)
-    given, splat_file = task.scene, task.splat_file
+
+    # From here on the splat is that of the task, whose coordinates may have a local origin.
+    given = task.scene
+    splat_file = task.splat_file
     assert given is not None
     assert splat_file is not None
     task = apply_splat_range(task, given, renderer)
+
     plan = f"compared with {len(task.views)} photographs on {device}"
     plan += f", written to {quote_value(options.out)}"
     print_lines(console, *describe_opening(options, opened, task), f"To do: {plan}.")
+
     with record_seconds(()) as seconds, timed_stage("clean"):
         removed = find_superfluous(given, task.views, renderer, options.config)
     run_info = describe_run(options, opened, task, options.config)
@@ -130,10 +149,12 @@ def clean_by_photographs(options: CleanOptions, console: Console) -> Cleaning:
 
 def clean_alone(options: CleanOptions, console: Console) -> Cleaning:
     """Find floaters by statistics of the splat alone."""
-    named = next((n for n in PHOTOGRAPH_OPTIONS if getattr(options, n) is not None), None)
-    if named is not None:
-        raise InputError("There are no photographs to apply this to; name their SCENE.", named)
-    given, floaters = load_given_splat(options), options.config.floaters
+    for name in PHOTOGRAPH_OPTIONS:
+        if getattr(options, name) is not None:
+            raise InputError("There are no photographs to apply this to; name their SCENE.", name)
+
+    given = load_given_splat(options)
+    floaters = options.config.floaters
     with record_seconds(()) as seconds, timed_stage("clean"):
         reasons = find_floaters(given, floaters)
     run_info = {
@@ -141,7 +162,8 @@ def clean_alone(options: CleanOptions, console: Console) -> Cleaning:
         "reasons": {reason: int(mask.sum()) for reason, mask in reasons.items()},
         "seconds": seconds,
     }
-    removed = torch.stack([*reasons.values()]).any(dim=0)
+    # A Gaussian can have several reasons, so their counts may exceed the number that goes.
+    removed = torch.stack(list(reasons.values())).any(dim=0)
     return Cleaning(given, removed, locate_splat(options, options.scene), run_info)
 
 
@@ -151,15 +173,6 @@ def load_given_splat(options: CleanOptions) -> Gaussians:
         return load_splat(options.scene, options.drop_nonfinite)
 
 
-def write_cleaning(folder: Path, cleaning: Cleaning, dry_run: bool) -> None:
-    """Write both parts of the splat, or only what goes."""
-    given, removed, splat_file = cleaning.given, cleaning.removed, cleaning.splat_file
-    if not dry_run:
-        save_completed_splat(folder, given, removed, given[:0], splat_file)
-    elif removed.any():
-        save_changed(folder, given, removed, splat_file)
-
-
 def score_cleaning(
     given: Gaussians,
     views: Sequence[View],
@@ -167,31 +180,37 @@ def score_cleaning(
     renderer: Renderer,
     files: Mapping[int | None, str],
 ) -> list[dict[str, Any]]:
-    """Compute PSNR (dB) of each photograph before and after; `files` are theirs by frame."""
+    """Compute PSNR (dB) of each photograph before and after, without the pixels of its mask.
+
+    `taken` are the Gaussians that go; `files` has the file of each photograph by frame.
+    """
+    kept = given[~taken]
     rows = []
     for view in track(views, "scores"):
-        before, after = (
-            compute_masked_psnr(
-                renderer.render(scene, view.camera).image, view.image, view.valid_mask
-            )
-            for scene in (given, given[~taken])
+        before = renderer.render(given, view.camera).image
+        after = renderer.render(kept, view.camera).image
+        rows.append(
+            {
+                "frame": view.frame,
+                "file": files.get(view.frame),
+                "psnr_before": compute_masked_psnr(before, view.image, view.valid_mask),
+                "psnr_after": compute_masked_psnr(after, view.image, view.valid_mask),
+                "ignored": compute_mask_fraction(view.ignore_mask),
+            }
         )
-        ignored = compute_mask_fraction(view.ignore_mask)
-        scores = {"psnr_before": before, "psnr_after": after, "ignored": ignored}
-        rows.append({"frame": view.frame, "file": files.get(view.frame), **scores})
     return rows
 
 
 def describe_cleaning(summary: Mapping[str, Any]) -> str:
     """Describe the numbers of Gaussians, and the change of PSNR or the reasons."""
-    counts, seconds = summary["gaussians"], summary["seconds"]["total"]
+    counts = summary["gaussians"]
+    seconds = summary["seconds"]["total"]
     text = f"{counts['removed']:,} of {counts['given']:,} Gaussians removed in {seconds:.1f} s; "
     if "reasons" in summary:
         return text + ", ".join(f"{count:,} {name}" for name, count in summary["reasons"].items())
-    before, after = (
-        torch.tensor([row[f"psnr_{when}"] for row in summary["photographs"]])
-        for when in ("before", "after")
-    )
+
+    before = torch.tensor([row["psnr_before"] for row in summary["photographs"]])
+    after = torch.tensor([row["psnr_after"] for row in summary["photographs"]])
     return text + (
         f"mean PSNR of the photographs {before.mean():.2f} dB before, {after.mean():.2f} dB after, "
         f"worst change {(after - before).min():+.3f} dB"

@@ -121,31 +121,21 @@ class Prepared:
         task = self.task
         return self.completer.begin(task.views, task.scene, task.check_views, task.target_cameras)
 
+    # `PreparedRemoval` adds the selection to them.
     def describe_settings(self) -> dict[str, Any]:
         """Describe the settings of targets and models for `summary.json`."""
         return describe_settings(self.options)
 
     def with_choices(self, choices: Iterable[Choice]) -> Prepared:
         """Return a copy with chosen candidates as targets."""
+        # A candidate counts its photograph among the usable ones, where a target names its frame.
         frames = list(self.cameras)
-        bases = [frames[choice.candidate.base] for choice in choices]
-        targets = [
-            Target(
-                choice.camera,
-                derived_from=base,
-                offset=describe_offset(choice.camera, self.cameras[base]),
-            )
-            for choice, base in zip(choices, bases, strict=True)
-        ]
+        targets = []
+        for choice in choices:
+            frame = frames[choice.candidate.base]
+            offset = describe_offset(choice.camera, self.cameras[frame])
+            targets.append(Target(choice.camera, derived_from=frame, offset=offset))
         return replace(self, task=replace(self.task, targets=targets))
-
-
-def check_options(options: CompleteOptions) -> None:
-    """Refuse options that are wrong whatever the scene is."""
-    check_context(options)
-    check_targets(options)
-    check_reconstructor(options.reconstructor)
-    options.synthesis.make_settings()
 
 
 def check_completion_inputs(options: CompleteOptions, device: str) -> None:
@@ -161,7 +151,12 @@ def check_completion_inputs(options: CompleteOptions, device: str) -> None:
 
 def prepare_completion(options: CompleteOptions, console: Console) -> Prepared:
     """Open the scene and load the models."""
-    check_options(options)
+    # First what is wrong whatever the scene is.
+    check_context(options)
+    check_targets(options)
+    check_reconstructor(options.reconstructor)
+    options.synthesis.make_settings()
+
     device = choose_device(options.device)
     options = resolve_scene(options)
     opened = open_scene(options, console, partial(check_completion_inputs, options, device))
@@ -170,22 +165,30 @@ def prepare_completion(options: CompleteOptions, console: Console) -> Prepared:
         opened = replace(opened, photographs=opened.photographs.keep_ego_vehicle())
     with show_preparation("reading photographs"):
         task = read_task(options, opened, device)
-    parts = device, options.reconstructor, options.synthesis.generator
+
+    parts = (device, options.reconstructor, options.synthesis.generator)
     if options.scene is None:
         compile_kernels(parts)
     else:
         task = add_splat(task, options.scene, options, opened, parts)
+
+    # Only here, because the oracle is given the photographs of the targets.
     with show_preparation("loading models"):
         completer = load_completer(options, task.targets, device)
     reconstructor = completer.reconstructor
+
+    # A single photograph has no stereo, so a network predicts its depth; a splat needs neither.
     if options.scene is None:
         task = replace(task, views=prepare_single(reconstructor, task.views))
+
+    # The depth range is counted as a part of the context stage, whose seconds it is added to.
     with show_preparation("depth range"), record_seconds() as seconds, timed_stage("context"):
         if task.scene is None:
             task = apply_scene_range(task, reconstructor)
         else:
             task = apply_splat_range(task, task.scene, completer.renderer)
     print_lines(console, *describe_range_mismatch(task, reconstructor))
+
     cameras = collect_cameras(options, opened, task)
     return Prepared(options, opened, task, ViewPlanner(completer), cameras, seconds)
 
@@ -220,27 +223,41 @@ def complete_folder(
     options: CompleteOptions, prepare: Prepare = prepare_completion, takes_over: bool = False
 ) -> dict[str, Any]:
     """Complete the scene, write `options.out`, and return the summary."""
+    # A missing ffmpeg ends the command at its beginning, not after the completion.
     if options.video:
         find_ffmpeg()
     with open_completion(options, prepare, takes_over) as (ready, folder):
         completion, ready = complete_targets(ready)
+
+        # Frozen views of the scene take memory, and the report does not use them.
         ready.completer.scenes.clear()
         with stage("report"):
             summary = write_done(folder, ready, completion)
             write_targets(folder, ready.task)
         if options.video:
-            photographs, renderer = list(ready.cameras.values()), ready.completer.renderer
-            write_comparison_video(folder, completion, photographs, renderer)
+            photographs = list(ready.cameras.values())
+            write_comparison_video(folder, completion, photographs, ready.completer.renderer)
     return summary
 
 
 def plan_folder(options: CompleteOptions, prepare: Prepare) -> None:
-    """Write the targets and print the plan, without completing the scene."""
+    """Write the targets and print the plan, without completing the scene.
+
+    The hole fraction of each target is that after those before it are completed.
+    """
     with open_completion(options, prepare) as (ready, folder):
-        task, holes = plan_completion(ready)
-        write_targets(folder, task)
+        begun = ready.begin()
+        targets = ready.task.target_cameras
+        if targets:
+            holes = ready.explorer.compute_hole_fractions(begun, targets)
+        else:
+            cameras = list(ready.cameras.values())
+            choices = ready.explorer.plan(begun, cameras, get_max_targets(ready.options))
+            ready = ready.with_choices(choices)
+            holes = [choice.hole_fraction for choice in choices]
+        write_targets(folder, ready.task)
     if not options.quiet:
-        print_plan(options, ready.opened, task.targets, holes)
+        print_plan(options, ready.opened, ready.task.targets, holes)
 
 
 @contextmanager
@@ -267,18 +284,26 @@ def open_completion(
 
 def write_done(folder: Path, ready: Prepared, completion: Completion) -> dict[str, Any]:
     """Write all results but the targets and the video, and return the summary."""
-    options, task, completer = ready.options, ready.task, ready.completer
-    completion = restore_surroundings(completion, completer.renderer)
+    options = ready.options
+    task = ready.task
+    renderer = ready.completer.renderer
+
+    # After a removal, photographs must look as before where they do not show what was removed.
+    # Without one this returns the completion as it is.
+    completion = restore_surroundings(completion, renderer)
     completion = replace(completion, seconds=add_seconds(completion.seconds, ready.seconds))
+
+    # Coverage is measured from cameras beside the photographs, not from the targets themselves.
+    # They are rendered while the files are written.
     cameras = tuple(ready.cameras.values())
     aside = sample_held_out_cameras(cameras, options.seed)
     facts = describe_run(options, ready.opened, task, completion.config, ready.describe_settings())
-    with run_in_background(render_pairs, completion, aside, completer.renderer) as looks:
+    with run_in_background(render_pairs, completion, aside, renderer) as looks:
         summary = write_report(
             folder,
             completion,
             task.targets,
-            completer.renderer,
+            renderer,
             {**facts, "seed": options.seed},
             task.splat_file,
             cameras,
@@ -296,14 +321,20 @@ def add_splat(
     """Compile the kernels, and add the input splat to the task."""
     with show_preparation("reading the scene"):
         task = add_check_views(task, opened.photographs)
-        given = load_splat(path, options.drop_nonfinite)
+        gaussians = load_splat(path, options.drop_nonfinite)
         if "cpu" in parts:
-            check_scene(task, given)
-    compile_kernels([*parts, *([SPLAT_PART] if "cpu" in parts else [])])
+            check_scene(task, gaussians)
+    compile_kernels([*parts, SPLAT_PART] if "cpu" in parts else parts)
+
     with show_preparation("aligning the scene"):
-        order = argsort_nearby(given) if len(given) >= MIN_PROXY_GAUSSIANS else None
-        given = given if order is None else given[order]
-        return move_to_splat(task, given, path, options, opened, order)
+        # Gaussians of a file lie in random order, and each tile of an image would read memory all
+        # over. Large scenes are sorted along a Morton curve (decision 025); files are written in
+        # the order of the given file, which `order` leads back to.
+        order = None
+        if len(gaussians) >= MIN_PROXY_GAUSSIANS:
+            order = argsort_nearby(gaussians)
+            gaussians = gaussians[order]
+        return move_to_splat(task, gaussians, path, options, opened, order)
 
 
 def describe_settings(options: CompleteOptions) -> dict[str, Any]:
@@ -321,8 +352,10 @@ def describe_settings(options: CompleteOptions) -> dict[str, Any]:
 
 def load_completer(options: CompleteOptions, targets: Sequence[Target], device: str) -> GSCompleter:
     """Load the models of the options."""
+    # Only the oracle reads the photographs of the targets.
     photographs = [target.view for target in targets if target.view is not None]
-    synthesis, config = options.synthesis, options.config
+    synthesis = options.synthesis
+    config = options.config
     if options.no_recolor:
         config = replace(config, recolor=replace(config.recolor, iterations=0))
     return GSCompleter(
@@ -344,43 +377,54 @@ def print_completion(options: CompleteOptions) -> None:
     summary = read_summary(options.out)
     console.print(summary.outcome.headline, markup=False, soft_wrap=True)
     console.print(make_score_table(summary))
-    for sentence in (*list_target_notes(summary), *describe_result(summary, options)):
+
+    # What holds for several targets is said once, before the notes of each. If nothing was gained,
+    # the headline gives the reason for all.
+    sentences = list(list_shared_notes(summary))
+    if summary.outcome.status != "nothing-gained":
+        for notes, numbers in group_target_notes(summary.targets).items():
+            if len(numbers) == 1:
+                name = summary.targets[numbers[0] - 1].name
+                sentences.append(f"{name}: {' '.join(notes)}")
+    sentences += describe_result(summary, options)
+    for sentence in sentences:
         console.print(sentence, markup=False, soft_wrap=True)
 
 
 def make_score_table(summary: CompletionSummary) -> Table:
     """Make the table of PSNR before and after at each camera."""
     table = Table("camera", "hole", "PSNR before", "PSNR after", "added", box=None)
+    # Photographs of the context have neither a hole nor Gaussians of their own.
     for row in summary.context:
-        scores = format_number(row.psnr_before), format_number(row.psnr_after)
-        table.add_row(f"context {row.photograph}", "", *scores, "")
+        before = format_number(row.psnr_before)
+        after = format_number(row.psnr_after)
+        table.add_row(f"context {row.photograph}", "", before, after, "")
     for target in summary.targets:
-        scores = format_number(target.psnr_before), format_number(target.psnr_after)
+        before = format_number(target.psnr_before)
+        after = format_number(target.psnr_after)
         hole = format_percent(target.hole_fraction)
-        table.add_row(f"target: {target.name}", hole, *scores, f"{target.added:,}")
+        table.add_row(f"target: {target.name}", hole, before, after, f"{target.added:,}")
     return table
-
-
-def list_target_notes(summary: CompletionSummary) -> Iterator[str]:
-    """List the notes on targets: what holds for several is said once."""
-    yield from list_shared_notes(summary)
-    for notes, numbers in group_target_notes(summary.targets).items():
-        if len(numbers) == 1 and summary.outcome.status != "nothing-gained":
-            yield f"{summary.targets[numbers[0] - 1].name}: {' '.join(notes)}"
 
 
 def describe_result(summary: CompletionSummary, options: CompleteOptions) -> Iterator[str]:
     """Write the sentences below the table."""
     yield from list_notes(summary)
+
+    # Under photometric trust covered is not enough: photographs have to confirm what covers.
     share = "Trusted" if summary.settings["config"]["trust"] == "photometric" else "Coverage"
-    before, after = map(format_percent, (summary.coverage.before, summary.coverage.after))
+    before = format_percent(summary.coverage.before)
+    after = format_percent(summary.coverage.after)
     yield f"{share} around the photographs: {before} before, {after} after."
+
     rows = select_testing(summary.held_out)
     if rows:
         at_first = format_percent(average(row.covered_before for row in rows))
         at_last = format_percent(average(row.covered_after for row in rows))
         yield f"Covered of {name_unused(rows)}: {at_first} before, {at_last} after."
-    counts, seconds = summary.gaussians, summary.seconds["total"]
+
+    counts = summary.gaussians
+    seconds = summary.seconds["total"]
     yield (
         f"Added {counts['added']:,} Gaussians to {counts['context']:,} in {seconds:.1f} s: "
         f"{options.out / COMPLETED_FILE}"
@@ -394,21 +438,31 @@ def collect_cameras(
     options: CompleteOptions, opened: Opened, task: CompletionTask
 ) -> dict[int, Camera]:
     """Return the cameras of all usable photographs by frame, in the frame of the result."""
-    given = opened.photographs
-    transform = task.frame @ compute_frame_from_photographs(-given.origin)
-    known = task.views[0].camera
-    cameras = collect_usable_cameras(given, range(len(given)), parse_resolution(options.resolution))
+    photographs = opened.photographs
+    cameras = collect_usable_cameras(
+        photographs, range(len(photographs)), parse_resolution(options.resolution)
+    )
+
+    # Photographs are read relative to their local origin. `task.frame` begins at their own frame,
+    # so the shift is undone before it.
+    transform = task.frame @ compute_frame_from_photographs(-photographs.origin)
+
+    # One depth range for all: that of the context, which was measured in the frame of the result.
+    context_camera = task.views[0].camera
+    near = context_camera.near
+    far = context_camera.far
     return {
-        frame: replace(
-            transform_camera(camera, transform).to(task.device), near=known.near, far=known.far
-        )
+        frame: replace(transform_camera(camera, transform).to(task.device), near=near, far=far)
         for frame, camera in cameras.items()
     }
 
 
 def complete_targets(ready: Prepared) -> tuple[Completion, Prepared]:
     """Complete the scene for the named targets, or for targets that it finds."""
-    task, count = ready.task, get_max_targets(ready.options)
+    task = ready.task
+    count = get_max_targets(ready.options)
+
+    # Too many targets for the labels of a .ply are refused before the first one is completed.
     if task.targets:
         check_target_ids(task.scene, len(task.targets))
         return ready.completer.complete(ready.begin(), task.target_cameras), ready
@@ -416,16 +470,6 @@ def complete_targets(ready: Prepared) -> tuple[Completion, Prepared]:
     cameras = list(ready.cameras.values())
     completion, choices = ready.explorer.explore(ready.begin(), cameras, count)
     return completion, ready.with_choices(choices)
-
-
-def plan_completion(ready: Prepared) -> tuple[CompletionTask, Sequence[float]]:
-    """Find the targets, and the hole fraction of each after those before it are completed."""
-    begun, targets = ready.begin(), ready.task.target_cameras
-    if targets:
-        return ready.task, ready.explorer.compute_hole_fractions(begun, targets)
-    cameras = list(ready.cameras.values())
-    choices = ready.explorer.plan(begun, cameras, get_max_targets(ready.options))
-    return ready.with_choices(choices).task, [choice.hole_fraction for choice in choices]
 
 
 def print_plan(
@@ -446,6 +490,7 @@ def print_plan(
 def write_targets(folder: Path, task: CompletionTask) -> None:
     """Write the target cameras in the frame of the photographs, as `--target` reads them."""
     if task.targets:
+        # In float64, because coordinates of maps are large.
         back = np.linalg.inv(task.frame)
         cameras = [transform_camera_exactly(target.camera, back) for target in task.targets]
         write_cameras(folder / TARGETS_FILE, cameras)

@@ -23,10 +23,14 @@ def run_convert(options: ConvertOptions) -> None:
         with show_preparation("reading"):
             gaussians = load_splat(options.source, options.drop_nonfinite)
         generated = gaussians.generated
-        written = replace(gaussians, generated=generated.new_zeros(len(gaussians)))
+        written = gaussians
+        if options.plain:
+            # Without generated Gaussians a writer leaves the labels out altogether.
+            written = replace(gaussians, generated=generated.new_zeros(len(gaussians)))
         with show_preparation("writing"):
-            save_splat(options.out, written if options.plain else gaussians)
+            save_splat(options.out, written)
     if not options.quiet:
+        # Some formats cannot say that a scene is antialiased.
         if note := describe_mode_loss(options.out, gaussians):
             print(note)
         count = int((generated > 0).sum())
@@ -35,8 +39,8 @@ def run_convert(options: ConvertOptions) -> None:
 
 def run_strip(options: StripOptions) -> None:
     """Write the original scene and print the number of Gaussians."""
-    get_writer(options.out)
+    get_writer(options.out)  # refuses a name without a format
     with reserve_file(options.out, options.overwrite):
-        given, generated = strip(options.completed, options.out)
+        num_given, num_generated = strip(options.completed, options.out)
     if not options.quiet:
-        print(f"{given:,} Gaussians, {generated:,} generated ones removed: {options.out}")
+        print(f"{num_given:,} Gaussians, {num_generated:,} generated ones removed: {options.out}")

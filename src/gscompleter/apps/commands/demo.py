@@ -36,7 +36,11 @@ RESULTS = ("scene/**/*", "completion/**/*", PICTURE_FILE, SUMMARY_FILE)
 
 
 def get_motorcycle_cameras(width: int, height: int) -> tuple[Camera, Camera]:
-    """Return the left and right camera in metres; the left one is the world frame."""
+    """Return the left and right camera in metres; the left one is the world frame.
+
+    The pair is rectified: both cameras have the same focal length and axes, and the right one only
+    another principal point.
+    """
     K = torch.diag(torch.tensor([FOCAL_PX, FOCAL_PX, 1.0]))
     K[:2, 2] = torch.tensor(PRINCIPAL_POINT_PX)
     left = Camera(torch.eye(4), K, width, height)
@@ -63,6 +67,9 @@ def write_motorcycle_scene(folder: Path) -> None:
     write_cameras(
         folder / "transforms.json", [left, right], ["images/left.png", "images/right.png"]
     )
+
+    # Two targets, each a baseline beyond one of the cameras: they look behind what both
+    # photographs show in front.
     beyond = [move_right(left, -BASELINE_M), move_right(right, BASELINE_M)]
     write_cameras(folder / "targets.json", beyond)
 
@@ -87,10 +94,14 @@ def run_demo(options: DemoOptions) -> None:
             quiet=options.quiet,
         )
         complete_folder(complete_options)
+
+        # One row of four images: before and after at the first target, then at the second.
         images = folder / "completion" / "images"
         names = [f"target{n}_{when}" for n in (1, 2) for when in ("before", "after")]
-        shown = join_images([read_image(images / f"{name}.png") for name in names])
-        write_image(folder / PICTURE_FILE, shown)
+        picture = join_images([read_image(images / f"{name}.png") for name in names])
+        write_image(folder / PICTURE_FILE, picture)
+
+    # `output.write` has moved the results from its temporary folder to OUT by now.
     if not options.quiet:
         print_completion(replace(complete_options, out=options.out / "completion"))
         print(f"Before and after, beyond either camera: {options.out / PICTURE_FILE}")

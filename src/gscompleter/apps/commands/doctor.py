@@ -59,34 +59,52 @@ class Found:
 
 def run_doctor(options: DoctorOptions) -> None:
     """Inspect the installation and print the result."""
-    found = list(inspect_installation())
+    parts = list(inspect_installation())
     if options.json:
-        print(json.dumps([asdict(one) for one in found], indent=2))
+        print(json.dumps([asdict(part) for part in parts], indent=2))
         return
-    width = max(len(one.name) for one in found)
-    for kind, lines in groupby(found, lambda one: one.kind):
+    width = max(len(part.name) for part in parts)
+    for kind, parts_of_kind in groupby(parts, lambda part: part.kind):
         print(f"{kind}:")
-        for one in lines:
-            print(f"  {one.name:{width}}  {'' if one.there else 'missing: '}{one.told}")
+        for part in parts_of_kind:
+            print(f"  {part.name:{width}}  {'' if part.there else 'missing: '}{part.told}")
 
 
 def inspect_installation() -> Iterator[Found]:
     """Inspect all parts, in the order of the result."""
     for name, value in describe_machine(choose_device()).items():
         yield Found("machine", name, True, str(value))
+
     for requirement in list_requirements():
         version = find_installed_version(requirement)
         remedy = f"every command needs it; pip install '{requirement}'"
         yield Found("packages", requirement.name, version is not None, version or remedy)
     for extra, purpose in PURPOSES.items():
         yield inspect_extra(extra, purpose)
+
+    # Loading is the test: a renderer can be installed and lack its GPU or its compiled part.
     for name in ("cpu", "cuda", "reference"):
-        yield inspect_renderer(name)
-    compiled = all(map(is_compiled, PARTS))
+        try:
+            load_renderer(name)
+        except InputError as error:
+            yield Found("renderers", name, False, str(error))
+        else:
+            yield Found("renderers", name, True, "draws here")
+    compiled = all(is_compiled(part) for part in PARTS)
     remedy = "compiled by the first completion, or in advance by `gscompleter warmup`"
     yield Found("renderers", "kernels", compiled, "compiled" if compiled else remedy)
-    yield from inspect_weights()
-    yield inspect_viewer()
+
+    # One file of weights is enough to count as there: nobody needs all of them.
+    here = [name for name, published in PUBLISHED.items() if find_cached(published)]
+    weights = ", ".join(here) or f"all {len(PUBLISHED)} that `gscompleter models` lists"
+    yield Found("weights", "reconstructors", bool(here), f"{weights}, for --reconstructor")
+
+    # A wheel contains the libraries in one file; a checkout downloads an archive of each.
+    archives = [get_archive_path(package) for package in read_lock(LOCK_FILE)]
+    there = BUILT_LIBRARIES.is_file() or all(path.is_file() for path in archives)
+    remedy = "fetched with npm's registry when `gscompleter view` first runs"
+    yield Found("viewer", "libraries", there, "here" if there else remedy)
+
     yield Found("caches", "downloads", True, f"{get_download_folder()} (GSCOMPLETER_HOME)")
     yield inspect_kernel_cache()
     yield Found("caches", "torch.hub", True, f"{torch.hub.get_dir()} (TORCH_HOME)")
@@ -101,25 +119,33 @@ def inspect_kernel_cache() -> Found:
 
 def inspect_extra(extra: str, purpose: str) -> Found:
     """Inspect the packages of an extra."""
-    versions = {r.name: find_installed_version(r) for r in list_requirements(extra)}
+    versions = {
+        requirement.name: find_installed_version(requirement)
+        for requirement in list_requirements(extra)
+    }
     missing = [name for name, version in versions.items() if version is None]
+    # No requirement at all: an older version of the package does not know the extra, or its markers
+    # leave out this version of Python.
     if not versions:
-        told = f"the installed version or this Python is older than this extra; for {purpose}"
+        detail = f"the installed version or this Python is older than this extra; for {purpose}"
     elif missing:
-        told = f"{', '.join(missing)}, for {purpose}; pip install 'gscompleter[{extra}]'"
+        detail = f"{', '.join(missing)}, for {purpose}; pip install 'gscompleter[{extra}]'"
     else:
-        told = f"{', '.join(f'{name} {it}' for name, it in versions.items())}, for {purpose}"
-    return Found("extras", extra, bool(versions) and not missing, told)
+        names = ", ".join(f"{name} {version}" for name, version in versions.items())
+        detail = f"{names}, for {purpose}"
+    return Found("extras", extra, bool(versions) and not missing, detail)
 
 
 def list_requirements(extra: str = "") -> list[Requirement]:
     """List the requirements of the package, or those that an extra adds."""
     lines = importlib.metadata.requires("gscompleter") or []
-    return [r for r in map(Requirement, lines) if is_required_by(extra, r)]
+    requirements = [Requirement(line) for line in lines]
+    return [requirement for requirement in requirements if is_required_by(extra, requirement)]
 
 
 def is_required_by(extra: str, requirement: Requirement) -> bool:
     """Return True if an extra adds this requirement; without a name, if all need it."""
+    # A marker that holds without an extra, such as one for a platform, belongs to the package.
     if requirement.marker is None or requirement.marker.evaluate({"extra": ""}):
         return not extra
     return bool(extra) and requirement.marker.evaluate({"extra": extra})
@@ -131,35 +157,13 @@ def find_installed_version(requirement: Requirement) -> str | None:
         version = importlib.metadata.version(requirement.name)
     except importlib.metadata.PackageNotFoundError:
         return None
+    # A pre-release, as nightly builds of torch are, counts by its number alone.
     return version if requirement.specifier.contains(version, prereleases=True) else None
-
-
-def inspect_renderer(name: str) -> Found:
-    """Load a renderer."""
-    try:
-        load_renderer(name)
-    except InputError as error:
-        return Found("renderers", name, False, str(error))
-    return Found("renderers", name, True, "draws here")
-
-
-def inspect_weights() -> Iterator[Found]:
-    """Inspect the published weights of reconstructors."""
-    here = [name for name, published in PUBLISHED.items() if find_cached(published)]
-    listed = ", ".join(here) or f"all {len(PUBLISHED)} that `gscompleter models` lists"
-    yield Found("weights", "reconstructors", bool(here), f"{listed}, for --reconstructor")
-
-
-def inspect_viewer() -> Found:
-    """Inspect the JavaScript libraries of the pages."""
-    archives = [get_archive_path(package) for package in read_lock(LOCK_FILE)]
-    there = BUILT_LIBRARIES.is_file() or all(path.is_file() for path in archives)
-    told = "here" if there else "fetched with npm's registry when `gscompleter view` first runs"
-    return Found("viewer", "libraries", there, told)
 
 
 def run_warmup(options: WarmupOptions) -> None:
     """Compile missing kernels, and print the time and the folder."""
+    # Without a folder for the cache, compiled kernels would end with this process.
     if get_cache_folder() is None:
         raise InputError(str(CACHE.note))
     with show_progress(Console(stderr=True, quiet=options.quiet)):

@@ -72,13 +72,16 @@ def score_methods(options: EvaluateOptions) -> Scored:
     shard = parse_shard(options.shard, os.environ)
     if options.resolution is not None:
         check_resolution(parse_resolution(options.resolution))
+
     skipped: list[SkippedScene] = []
     notes: list[str] = []
     with show_progress(console), show_preparation("reading cases"):
         tasks = collect_tasks(options, skipped, notes)
+    # Several clips can have the same note.
     for note in dict.fromkeys(notes):
         console.print(note, markup=False, soft_wrap=True)
     print_skipped(skipped, console)
+
     config = RunConfig(
         reconstructor=options.reconstructor[0],
         weights=str(options.weights[0]) if options.weights else None,
@@ -91,9 +94,12 @@ def score_methods(options: EvaluateOptions) -> Scored:
         source=describe_source(options, any(task.has_masks for task in tasks)),
     )
     engine = make_engine(options, options.out.resolve())
+
+    # Kernels are compiled here once, before workers would each compile them.
     with show_progress(console):
         compile_kernels((config.device, config.reconstructor, config.generator))
         counts = evaluate(tasks, methods, options.out, config, shard, options.rerun, engine)
+
     print_failures(console, counts.failures)
     line = f"Scored {counts.done}, failed {counts.failed}, done earlier {counts.skipped}"
     console.print(f"{line}, of {len(tasks)} cases by {len(methods)} methods.")
@@ -106,6 +112,7 @@ def describe_source(options: EvaluateOptions, has_masks: bool = False) -> dict[s
 
     Scores with masks are not continued with scores without, nor the other way round.
     """
+    # A cases.json has the resolution of each case; scenes of a protocol have none.
     size = LONG_SIDE if options.resolution is None and options.protocol else options.resolution
     loader = find_loader(options)
     return {
@@ -117,7 +124,8 @@ def describe_source(options: EvaluateOptions, has_masks: bool = False) -> dict[s
         **({"one_per_scene": True} if options.one_per_scene else {}),
         **({} if options.ego_mask else {"ego_mask": False}),
         **({} if loader is None else {"loader": asdict(loader)}),
-        **{k: v for k in ("near", "far") if (v := getattr(options, k)) is not None},
+        **({} if options.near is None else {"near": options.near}),
+        **({} if options.far is None else {"far": options.far}),
     }
 
 
@@ -134,12 +142,15 @@ def write_and_print_tables(
 
     It repeats this if other shards added rows meanwhile and all `num_rows` are there.
     """
-    seen, there = None, list_row_times(out)
-    while seen is None or (there != seen and len(there) >= num_rows):
-        seen = there
+    # Several shards may end together, and each writes the tables. The one that saw all rows writes
+    # again until no row changed while it wrote, so that the tables that remain are complete.
+    written = None
+    rows = list_row_times(out)
+    while written is None or (rows != written and len(rows) >= num_rows):
+        written = rows
         with show_preparation("tables"):
             summary = tables.write_tables(out, with_fid)
-        there = list_row_times(out)
+        rows = list_row_times(out)
     if not quiet:
         print_tables(summary, out)
 
@@ -159,12 +170,20 @@ def run_index(options: IndexOptions) -> None:
         show_preparation("reading clips"),
     ):
         index = protocols.build_index(rule, filter_usable(open_clips(options.path), skipped))
+        # Skipped scenes are recorded as scenes without a case, not left out.
         index = replace(index, scenes={**index.scenes, **{clip.name: () for clip in skipped}})
         if not any(index.scenes.values()):
-            raise InputError(describe_empty_index(options, len(index.scenes), skipped))
+            reason = f" ({skipped[0].name}: {skipped[0].reason})" if skipped else ""
+            raise InputError(
+                f"The protocol {quote_value(options.protocol)} chooses no case in the "
+                f"{len(index.scenes)} scene(s) of {quote_value(options.path)}{reason}; choose one "
+                "with a smaller step, or other data."
+            )
         protocols.write_evaluation_index(options.out, index)
     console = Console(quiet=options.quiet, highlight=False)
     print_skipped(skipped, console)
+
+    # A split is one choice of context frames, and each of its targets is a case.
     targets = [len(split.targets) for splits in index.scenes.values() for split in splits]
     used = [name for name, splits in index.scenes.items() if splits]
     console.print(
@@ -179,16 +198,22 @@ def collect_tasks(
 ) -> list[protocols.Task]:
     """Collect the tasks of the options, and append to `skipped` and `notes`."""
     if options.protocol:
+        # The iterator opens clips one by one, so those beyond the limit are not opened.
         return list(islice(iterate_tasks(options, skipped, notes), options.limit))
+
     cases = [case for path in options.paths for case in read_cases(find_cases_file(path))]
     if options.one_per_scene:
+        # The first case of a scene is the last that overwrites its entry in reversed order.
         first = {case.scene: case for case in reversed(cases)}
         cases = [case for case in cases if case is first[case.scene]]
     cases = cases[: options.limit]
+
     tasks: list[protocols.Task] = []
+    # Cases of one scene stand together in a file, so that each scene is opened once for its notes.
     for scene, group in groupby(cases, lambda case: case.scene):
         own = [protocols.make_case_task(apply_options(case, options)) for case in group]
-        with suppress(InputError):  # a row of the table says why a scene cannot be opened
+        # A scene that cannot be opened fails later, and its row in the table has the reason.
+        with suppress(InputError):
             clip = open_photographs(scene)
             notes += clip.notes
             own = mark_masked(clip if options.masks else clip.leave_out_masks(), own, notes)
@@ -200,11 +225,12 @@ def mark_masked(
     clip: Photographs, tasks: Sequence[protocols.Task], notes: list[str]
 ) -> list[protocols.Task]:
     """Mark the tasks of a clip if their photographs have masks, and append a note about these."""
-    frames = {f for task in tasks for f in (*task.context, *task.targets, *task.neighbours)}
-    found = clip.describe_masks(sorted(frame for frame in frames if frame < len(clip)))
-    if found is None:
-        return [*tasks]
-    notes.append(f"{clip.name}: {found} are read; what they hide is ignored.")
+    frames = {frame for task in tasks for frame in (*task.context, *task.targets, *task.neighbours)}
+    # Frames that the clip does not have are refused when their case is run.
+    masks = clip.describe_masks(sorted(frame for frame in frames if frame < len(clip)))
+    if masks is None:
+        return list(tasks)
+    notes.append(f"{clip.name}: {masks} are read; what they hide is ignored.")
     return [replace(task, has_masks=True) for task in tasks]
 
 
@@ -222,25 +248,22 @@ def apply_options(case: Case, options: EvaluateOptions) -> Case:
     )
 
 
-def describe_empty_index(
-    options: IndexOptions, num_scenes: int, skipped: Sequence[SkippedScene]
-) -> str:
-    """Describe why a protocol chooses no case at all."""
-    reason = f" ({skipped[0].name}: {skipped[0].reason})" if skipped else ""
-    return (
-        f"The protocol {quote_value(options.protocol)} chooses no case in the {num_scenes} "
-        f"scene(s) of {quote_value(options.path)}{reason}; choose one with a smaller step, or "
-        "other data."
-    )
-
-
 def iterate_tasks(
     options: EvaluateOptions, skipped: list[SkippedScene], notes: list[str]
 ) -> Iterator[protocols.Task]:
     """Iterate over the tasks of the protocols, clip by clip."""
     rules = [protocols.parse_protocol(text) for text in options.protocol]
+
+    # With a preset, images are cropped and scenes left out as by its authors' code (decision 047).
     loader = find_loader(options)
-    size = find_resolution(options)
+    resolution = LONG_SIDE if options.resolution is None else options.resolution
+    size: Resolution
+    if loader is not None and isinstance(resolution, tuple):
+        height, width = resolution
+        size = loader.make_crop(height, width)
+    else:
+        size = parse_resolution(resolution)
+    # Their code also keeps clips whose coordinates are large.
     max_translation = MAX_TRANSLATION if loader is None else None
     for path in options.paths:
         for clip in filter_usable(open_clips(path), skipped, max_translation):
@@ -250,20 +273,27 @@ def iterate_tasks(
                     f"{clip.name} has no boxes of moving objects; leave --ignore-moving out. Masks "
                     "are always read (--no-masks leaves them out)."
                 )
+
             # The authors' code scores every pixel of their data sets.
             scores_all = loader is not None
-            clip = clip if options.ego_mask and not scores_all else clip.keep_ego_vehicle()
-            clip = clip if options.masks and not scores_all else clip.leave_out_masks()
-            clip = clip.ignore_moving() if options.ignore_moving else clip
+            if scores_all or not options.ego_mask:
+                clip = clip.keep_ego_vehicle()
+            if scores_all or not options.masks:
+                clip = clip.leave_out_masks()
+            if options.ignore_moving:
+                clip = clip.ignore_moving()
+
             near = clip.near if options.near is None else options.near
             far = clip.far if options.far is None else options.far
             check_planes(near, far)
             clip = replace(clip, near=near, far=far)
+
             for rule in rules:
                 if isinstance(rule, protocols.FrameRule) and not rule.select_splits(clip):
                     reason = f"{rule.name} chooses none of its {len(clip)} frames"
                     skipped.append(SkippedScene(clip.name, reason))
                 kept = rule if loader is None else loader.choose_splits(rule, clip, skipped)
+                # The authors' loaders keep the order of the context; ours is ascending.
                 keeps_order = loader is not None
                 tasks = protocols.make_tasks(kept, clip, size, keeps_order)
                 tasks = mark_masked(clip, tasks, notes)
@@ -276,18 +306,10 @@ def find_loader(options: EvaluateOptions) -> AuthorsLoader | None:
     return preset.loader if options.resolution == preset.resolution else None
 
 
-def find_resolution(options: EvaluateOptions) -> Resolution:
-    """Find how the photographs of scenes are resized and cropped."""
-    given = LONG_SIDE if options.resolution is None else options.resolution
-    loader = find_loader(options)
-    if loader is not None and isinstance(given, tuple):
-        return loader.make_crop(*given)
-    return parse_resolution(given)
-
-
 def find_cases_file(path: Path) -> Path:
     """Find the cases.json that `path` is or contains."""
     file = path / "cases.json" if os.path.isdir(path) else path
+    # A transforms.json is a scene, and so needs a protocol.
     if file.suffix != ".json" or not os.path.isfile(file) or file.name == "transforms.json":
         raise InputError(
             f"{quote_value(path)} is no cases.json; name one, or add --protocol for scenes, as in "
@@ -308,6 +330,8 @@ def print_tables(summary: RunSummary, out: Path) -> None:
     cells = tables.format_score_cells(summary, summary.columns)
     for number, column in enumerate(summary.columns, start=1):
         table.add_row(column.title, *(row[number] for row in cells))
+
+    # Seconds compare methods, so they are those of the cases that all of them completed.
     if summary.common_tasks:
         seconds = [summary.compute_seconds(method)["total"] for method in summary.methods]
         table.add_row("seconds", *(f"{total:.1f}" for total in seconds))

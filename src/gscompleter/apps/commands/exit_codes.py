@@ -1,7 +1,11 @@
 """Exit codes of all commands, which docs/contracts.md explains."""
 
-DONE, ERROR, WRONG_INPUT, SOME_FAILED, INTERRUPTED = 0, 1, 2, 3, 130
-"""130 is 128 + 2, the number of SIGINT, as shells have it."""
+DONE = 0
+ERROR = 1
+WRONG_INPUT = 2
+SOME_FAILED = 3
+INTERRUPTED = 130
+"""128 + 2, the number of SIGINT, as shells have it."""
 
 
 def choose_exit_code(failed: int, total: int) -> int:

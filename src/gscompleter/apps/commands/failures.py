@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import errno
-from collections.abc import Iterator
 from dataclasses import dataclass
 
 from gscompleter.apps.commands.exit_codes import ERROR, WRONG_INPUT
@@ -40,24 +39,22 @@ class Failure:
 
 def explain_failure(error: BaseException) -> Failure | None:
     """Explain an error of the machine or of a path; None for any other, which is a defect."""
-    for cause in iterate_causes(error):
-        sentence, code = _explain(cause)
-        if sentence:
-            return Failure(shorten_message(sentence, MAX_MESSAGE_LENGTH - len(PROGRAM)), code)
-    return None
-
-
-def iterate_causes(error: BaseException) -> Iterator[BaseException]:
-    """Iterate over an error and those that it was raised from."""
+    # Libraries wrap the error of the system in their own, so the causes are searched, too. A chain
+    # of causes may lead back to its beginning.
     seen: list[BaseException] = []
     cause: BaseException | None = error
     while cause is not None and cause not in seen:
-        yield cause
+        sentence, code = _explain(cause)
+        if sentence:
+            return Failure(shorten_message(sentence, MAX_MESSAGE_LENGTH - len(PROGRAM)), code)
         seen.append(cause)
         cause = cause.__cause__ or cause.__context__
+    return None
 
 
 def _explain(error: BaseException) -> tuple[str, int]:
+    """Return the sentence and exit code for an error alone; an empty sentence for a defect."""
+    # torch and numba raise RuntimeError for a lack of memory, so their words are read, too.
     number = getattr(error, "errno", None)
     is_memory = isinstance(error, MemoryError) or number == errno.ENOMEM
     if is_memory or any(words in str(error).lower() for words in MEMORY_WORDS):
@@ -66,9 +63,12 @@ def _explain(error: BaseException) -> tuple[str, int]:
             "photographs, or raise the limit (ulimit -v).",
             ERROR,
         )
+
+    # Without a file name an error of the system names nothing that the user could correct.
     if not isinstance(error, OSError) or error.filename is None:
         return "", ERROR
-    name, reason = quote_value(str(error.filename), 120), error.strerror
+    name = quote_value(str(error.filename), 120)
+    reason = error.strerror
     if number in NAME_ERRORS:
         return f"{name} is no path: {reason}; correct it.", WRONG_INPUT
     if number in ACCESS_ERRORS:

@@ -49,6 +49,7 @@ def run_live(options: LiveOptions) -> None:
         )
     from gscompleter.apps.live.page import check_bindable, resolve_host
 
+    # A port in use is reported now, not after the scene is reconstructed.
     check_bindable(resolve_host(options.host), options.host, options.port)
     with reserve_output(options.out, options.overwrite, COMMAND, RESULTS) as output:
         console = Console(stderr=True, quiet=options.quiet)
@@ -89,9 +90,12 @@ def prepare(options: LiveOptions, console: Console) -> Prepared:
     print_lines(console, *describe_opening(ready.options, ready.opened, ready.task))
     if ready.task.scene is not None and ready.task.scene.is_antialiased:
         print_lines(console, ANTIALIASED_NOTE)
+
+    # What the session chose is recorded in summary.json as options of `complete`: the context, and
+    # the file into which the cameras of the session are saved.
     target = (str(options.out / TARGETS_FILE),)
-    named = replace(ready.options, context=ready.task.context_frames, target=target)
-    return replace(ready, options=named)
+    complete_options = replace(ready.options, context=ready.task.context_frames, target=target)
+    return replace(ready, options=complete_options)
 
 
 def make_complete_options(options: LiveOptions) -> CompleteOptions:
@@ -102,8 +106,13 @@ def make_complete_options(options: LiveOptions) -> CompleteOptions:
 
 def begin_session(ready: Prepared) -> Session:
     """Start the session."""
-    origin, resolution = ready.opened.photographs.origin, parse_resolution(ready.options.resolution)
-    return Session(ready.completer, (ready.begin(),), ready.task.frame, origin, resolution)
+    return Session(
+        ready.completer,
+        (ready.begin(),),
+        ready.task.frame,
+        ready.opened.photographs.origin,
+        parse_resolution(ready.options.resolution),
+    )
 
 
 def find_next_target(ready: Prepared, completion: Completion) -> Camera | None:
@@ -114,15 +123,15 @@ def find_next_target(ready: Prepared, completion: Completion) -> Camera | None:
 
 def save_session(ready: Prepared, session: Session) -> str:
     """Write the results of `complete`, in place of those saved before, and return a sentence."""
+    # The first completion of a session is the context alone.
     if len(session.completions) == 1:
         raise InputError("There is nothing to save; complete a hole first.")
     out = ready.options.out
     targets = [Target(result.target) for result in session.latest.targets]
+    with_targets = replace(ready, task=replace(ready.task, targets=targets))
     # Whether it may be replaced was decided when the session began.
     with open_output_folder(out, overwrite=True, command=COMMAND) as folder:
-        summary = write_done(
-            folder, replace(ready, task=replace(ready.task, targets=targets)), session.latest
-        )
+        summary = write_done(folder, with_targets, session.latest)
         if session.cameras:
             write_cameras(folder / TARGETS_FILE, session.cameras)
     return f"Saved in {quote_value(out)}. {summary['outcome']['headline']}"

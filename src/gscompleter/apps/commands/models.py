@@ -35,9 +35,9 @@ def run_models(options: ModelsOptions) -> None:
     """Print the published weights and their location on this machine; download some first."""
     for name in options.download:
         download(name)
-    found = [(weights, find_cached(weights)) for weights in PUBLISHED.values()]
+    cached = [(weights, find_cached(weights)) for weights in PUBLISHED.values()]
     if not options.json:
-        print_models(found)
+        print_models(cached)
         return
     rows = [
         {
@@ -47,7 +47,7 @@ def run_models(options: ModelsOptions) -> None:
             "cached": None if path is None else str(path),
             "place": str(get_cache_path(weights)),
         }
-        for weights, path in found
+        for weights, path in cached
     ]
     print(json.dumps(rows, indent=2))
 
@@ -64,19 +64,25 @@ def download(name: str) -> None:
     fetch_checked(PUBLISHED[name])
 
 
-def print_models(found: Sequence[tuple[PublishedWeights, Path | None]]) -> None:
-    """Print the table and its footnotes."""
+def print_models(cached: Sequence[tuple[PublishedWeights, Path | None]]) -> None:
+    """Print the table and its footnotes; `cached` has the file of each, or None."""
     table = Table(box=None)
     for title in ("name", "model", "parameters", "views", "size", "code / weights", "cached"):
         table.add_column(title, no_wrap=title == "name")
     table.add_column("source", overflow="fold")
-    for weights, path in found:
+    for weights, path in cached:
         table.add_row(*format_model_cells(weights, path))
-    width = None if sys.stdout.isatty() else 1000  # a file or a pipe wraps no rows
+    # In a file or a pipe rows are not wrapped, so that a line has a model.
+    width = None if sys.stdout.isatty() else 1000
     Console(width=width, markup=False, highlight=False).print(table)
+
+    # Models of one repository share a caution, which is printed once after all their names.
     print("\n(!) Whether commercial use is allowed is unclear:")
-    for caution in dict.fromkeys(w.caution for w in PUBLISHED.values() if w.caution):
-        names = [w.name for w in PUBLISHED.values() if w.caution == caution]
+    names_by_caution: dict[str, list[str]] = {}
+    for weights in PUBLISHED.values():
+        if weights.caution:
+            names_by_caution.setdefault(weights.caution, []).append(weights.name)
+    for caution, names in names_by_caution.items():
         print(f"    {', '.join(names)}: {caution}.")
     if not is_hub_installed():
         print(f"\nThe hub's cache was not searched, for lack of huggingface_hub: {INSTALL}")

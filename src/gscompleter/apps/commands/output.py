@@ -71,12 +71,17 @@ def read_held_out(
 
     `cameras` are those of all usable photographs by frame, in the frame of the result.
     """
-    others = {f: camera for f, camera in cameras.items() if f not in task.used_frames}
+    used = task.used_frames
+    others = {frame: camera for frame, camera in cameras.items() if frame not in used}
+    # Check views of a splat guard its completion, so they test less than photographs that nothing
+    # has read.
     checks = {view.frame for view in task.check_views or ()}
     held_out: list[HeldOut] = []
     for frame in select_closest(task.goals, others, MAX_HELD_OUT):
+        # A photograph that cannot be read tests nothing; it is no input of this run.
         with suppress(InputError):
             (view,) = opened.photographs.views([frame], parse_resolution(options.resolution))
+            # Its own camera is in the frame of the photographs.
             view = View(view.image, others[frame], frame, ignore_mask=view.ignore_mask)
             held_out.append(HeldOut(view.to(task.device), frame in checks))
     return held_out

@@ -36,8 +36,14 @@ from gscompleter.system.jobs.jobs import make_folder
 
 UNUSUAL = ("stress", "sequence")
 """Kinds of the protocols that only tables of their own use."""
-TABLES, FIGURES, RUNS, RESULTS = "tables", "figures", "runs", "results.md"
-"""Files of a reproduction in OUT."""
+TABLES = "tables"
+"""Folder of the tables in OUT."""
+FIGURES = "figures"
+"""Folder of the figures in OUT."""
+RUNS = "runs"
+"""Folder in OUT with the scores of each run, as `evaluate` writes them."""
+RESULTS = "results.md"
+"""Page in OUT with all tables, claims and figures."""
 
 
 def run_evaluation(options: EvaluateOptions) -> int:
@@ -63,12 +69,13 @@ def assign_weights(models: Sequence[str], weights: Sequence[Path]) -> dict[str, 
     """
     named: dict[str, Path] = {}
     plain: list[Path] = []
-    for given in weights:
-        name, _, file = str(given).partition("=")
+    for word in weights:
+        # A path may contain `=`, too; only a known name before it makes it NAME=FILE.
+        name, _, file = str(word).partition("=")
         if file and name in models:
             named[name] = Path(file)
         else:
-            plain.append(given)
+            plain.append(word)
     if plain and (named or len(plain) != len(models)):
         raise InputError(
             f"{quote_value(plain[0])} belongs to no reconstructor; give --weights one file for "
@@ -98,24 +105,31 @@ def reproduce(options: EvaluateOptions) -> int:
 
     Return the exit code, which counts the cases of all tables and figures.
     """
-    paper, console = load_paper(), Console(stderr=True, quiet=options.quiet, highlight=False)
+    paper = load_paper()
+    console = Console(stderr=True, quiet=options.quiet, highlight=False)
     generator = options.synthesis.generator
-    names = options.table or (() if options.figure else ("models",))
-    chosen = {
-        TABLES: select_names(names, paper.tables, generator),
-        FIGURES: select_names(options.figure, paper.figures, generator),
-    }
+
+    # A preset or several reconstructors alone stand for the table of models.
+    names = options.table
+    if not names and not options.figure:
+        names = ("models",)
+    tables = select_names(names, paper.tables, generator)
+    figures = select_names(options.figure, paper.figures, generator)
+
     scored: list[Scored] = []
-    for name, spec in (item for specs in chosen.values() for item in specs.items()):
+    for name, spec in [*tables.items(), *figures.items()]:
         console.print(f"{name}: {spec.title}", markup=False)
         try:
             write_output(options, name, spec, scored)
         except InputError as error:
+            # Of `all`, those are left out whose data or models are not here. One that is named has
+            # to succeed.
             if "all" not in (*options.table, *options.figure):
                 raise
             console.print(f"Left out {name}: {error}", markup=False, soft_wrap=True)
     if not scored:
         raise InputError("None of the tables and figures could be begun; the lines above say why.")
+
     text = write_results(options)
     if not options.quiet:
         Console(highlight=False).print(text, markup=False, soft_wrap=True)
@@ -130,7 +144,7 @@ def write_output(
     runs = run_all(options, spec, scored)
     try:
         write_from_runs(options, name, spec, runs)
-    except OutputError:
+    except OutputError:  # an InputError, too, which keeps its exit code
         raise
     except InputError as error:
         # The runs are written by now, so this is no refusal of the input.
@@ -149,10 +163,17 @@ def write_from_runs(
         make_folder(options.out / TABLES)
         write_paper_table(options.out / TABLES / name, table)
     if isinstance(spec, FigureSpec):
+        # A figure compares models on one protocol.
         by_model = {model: folder for (model, _), folder in runs.items()}
-        names, path = options.figure_cases, options.out / FIGURES / name
         make_folder(options.out / FIGURES)
-        draw_figure(path, spec, by_model, names, options.outlines, options.crops)
+        draw_figure(
+            options.out / FIGURES / name,
+            spec,
+            by_model,
+            options.figure_cases,
+            options.outlines,
+            options.crops,
+        )
 
 
 def run_all(
@@ -165,6 +186,7 @@ def run_all(
     runs = {}
     for number, model in enumerate(options.reconstructor):
         for protocol in choose_protocols(options, spec):
+            # Tables share runs: rows that an earlier one has scored are read, not computed again.
             run = make_run(options, spec, number, protocol)
             scored.append(score_methods(run))
             write_tables(run.out)
@@ -179,8 +201,11 @@ def choose_protocols(options: EvaluateOptions, spec: Requirements) -> tuple[str,
     """
     kinds = {get_kind(name) for name in spec.protocol}
     if kinds:
-        return tuple(p for p in options.protocol if get_kind(p) in kinds) or spec.protocol
-    usual = [p for p in options.protocol if get_kind(p) not in UNUSUAL]
+        suitable = tuple(name for name in options.protocol if get_kind(name) in kinds)
+        return suitable or spec.protocol
+
+    # A table without a kind of its own takes a given protocol, or that of the data set.
+    usual = [name for name in options.protocol if get_kind(name) not in UNUSUAL]
     return tuple(usual[:1]) or get_data_set(options.preset).protocol or ("",)
 
 
@@ -194,17 +219,21 @@ def make_run(
     options: EvaluateOptions, spec: Requirements, number: int, protocol: str
 ) -> EvaluateOptions:
     """Return the options of a run of one model with one protocol, in a folder of its own."""
+    # Settings belong to the generator that was chosen, so that of the table has its defaults.
     synthesis = options.synthesis
     if spec.generator and spec.generator != synthesis.generator:
         synthesis = GeneratorOptions(spec.generator)
     one_per_scene = options.one_per_scene or spec.one_per_scene
     model = options.reconstructor[number]
-    parts = (model, Path(protocol).stem or "cases", synthesis.generator)
-    name = " ".join([*parts, *(["one-per-scene"] if one_per_scene else [])])
+
+    # The folder is named by all that differs between the runs of one reproduction.
+    parts = [model, Path(protocol).stem or "cases", synthesis.generator]
+    if one_per_scene:
+        parts.append("one-per-scene")
     own = assign_weights(options.reconstructor, options.weights).get(model)
     return replace(
         options,
-        out=options.out / RUNS / make_file_name(name),
+        out=options.out / RUNS / make_file_name(" ".join(parts)),
         reconstructor=(model,),
         weights=() if own is None else (own,),
         protocol=(protocol,) if protocol else (),
@@ -216,9 +245,13 @@ def make_run(
 
 def write_results(options: EvaluateOptions) -> str:
     """Write all tables, claims and figures in OUT as one page, and return its text."""
-    out, paper = options.out, load_paper()
+    out = options.out
+    paper = load_paper()
     machine = {**describe_machine(choose_device(options.device)), **find_commit()}
-    parts = [f"# Results\n\n{', '.join(f'{key} {value}' for key, value in machine.items())}.\n"]
+    facts = ", ".join(f"{key} {value}" for key, value in machine.items())
+    parts = [f"# Results\n\n{facts}.\n"]
+
+    # Tables and figures of earlier calls in the same folder are on the page, too.
     tables = [out / TABLES / f"{name}.md" for name in paper.tables]
     parts += [path.read_text("utf-8") for path in tables if path.is_file()]
     judged = format_markdown(HEAD, tabulate_claims(out / TABLES, paper.claims))
@@ -226,6 +259,7 @@ def write_results(options: EvaluateOptions) -> str:
     for name, figure in paper.figures.items():
         if (out / FIGURES / f"{name}.png").is_file():
             parts.append(f"## {figure.title}\n\n![{figure.title}]({FIGURES}/{name}.png)\n")
+
     text = "\n".join(parts)
     with replace_file(out / RESULTS) as file:
         file.write(encode_text(text))
@@ -234,6 +268,7 @@ def write_results(options: EvaluateOptions) -> str:
 
 def find_commit() -> dict[str, str]:
     """Return the commit of this code, or nothing if it is not a git checkout."""
+    # From src/gscompleter/apps/commands of a checkout; an installed package has no .git there.
     root = Path(__file__).parents[4]
     if not (root / ".git").exists() or shutil.which("git") is None:
         return {}

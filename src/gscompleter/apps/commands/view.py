@@ -34,43 +34,16 @@ def run_view(options: ViewOptions) -> None:
         if options.save.suffix.lower() not in (".html", ".htm"):
             name = quote_value(options.save)
             raise InputError(f"{name} is no .html file; name it *.html.", "save")
+        # Reserved first: a file that may not be replaced ends the command before scenes are read.
         with reserve_file(options.save, options.overwrite):
             page = load_page(options)
             with replace_file(options.save) as file:
                 file.write(page)
         if not options.quiet:
             print(options.save)
-    else:
-        serve_page(options, load_page(options))
+        return
 
-
-def load_page(options: ViewOptions) -> bytes:
-    """Make the page of the scenes and cameras of the options, and print its notes."""
-    libraries = packages.load_libraries()
-    page, notes = make_page(load_content(options), libraries)
-    for note in () if options.quiet else notes:
-        print(note)
-    return page
-
-
-def load_content(options: ViewOptions) -> ViewerContent:
-    """Read the scenes and cameras of the options."""
-    scene, other, drop_nonfinite = options.scene, options.other, options.drop_nonfinite
-    if not (scene / SUMMARY_FILE).is_file():
-        scene = resolve_splat(scene)
-    if other is not None:
-        content = load_viewer_files(other, scene, drop_nonfinite)
-    elif os.path.isdir(scene) and not os.path.isfile(scene / META):
-        content = load_viewer_completion(scene, drop_nonfinite)
-    else:
-        content = load_viewer_files(scene, None, drop_nonfinite)
-    if options.cameras is None:
-        return content
-    return add_file_cameras(content, options.cameras, options.resolution)
-
-
-def serve_page(options: ViewOptions, page: bytes) -> None:
-    """Serve the page to this machine until Ctrl-C."""
+    page = load_page(options)
     with make_page_server(page, options.port) as server, suppress(KeyboardInterrupt):
         address = f"http://{ADDRESS}:{server.server_address[1]}/"
         # Printed once the server listens.
@@ -78,6 +51,38 @@ def serve_page(options: ViewOptions, page: bytes) -> None:
         if not options.no_open:
             webbrowser.open(address)
         server.serve_forever()
+
+
+def load_page(options: ViewOptions) -> bytes:
+    """Make the page of the scenes and cameras of the options, and print its notes."""
+    # Libraries first: they may have to be downloaded, and a lack of network is said before large
+    # scenes are read.
+    libraries = packages.load_libraries()
+    page, notes = make_page(load_content(options), libraries)
+    if not options.quiet:
+        for note in notes:
+            print(note)
+    return page
+
+
+def load_content(options: ViewOptions) -> ViewerContent:
+    """Read the scenes and cameras of the options."""
+    # A folder is that of a completion, of a trainer's model, or an unpacked .sog.
+    scene = options.scene
+    if not (scene / SUMMARY_FILE).is_file():
+        scene = resolve_splat(scene)
+
+    if options.other is not None:
+        # B is the scene after, A the one before.
+        content = load_viewer_files(options.other, scene, options.drop_nonfinite)
+    elif os.path.isdir(scene) and not os.path.isfile(scene / META):
+        content = load_viewer_completion(scene, options.drop_nonfinite)
+    else:
+        content = load_viewer_files(scene, None, options.drop_nonfinite)
+
+    if options.cameras is None:
+        return content
+    return add_file_cameras(content, options.cameras, options.resolution)
 
 
 def make_page_server(page: bytes, port: int = 0) -> ThreadingHTTPServer:

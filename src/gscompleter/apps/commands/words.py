@@ -8,7 +8,6 @@ from contextlib import redirect_stderr
 from dataclasses import dataclass, is_dataclass, replace
 from inspect import get_annotations
 from io import StringIO
-from itertools import dropwhile, takewhile
 from typing import Annotated, Any, get_args, get_type_hints
 
 import tyro
@@ -65,10 +64,16 @@ def parse_words(words: Sequence[str], command: Any, names: Collection[str]) -> A
             "(see gscompleter --help)."
         )
     refuse_empty_words(words)
-    asked = any(word in (*HELP, HELP_ALL) for word in words)
-    helps = [make_help_rule(show_all=HELP_ALL in words)] if asked else []
+
+    # The rule for help pages changes the fields, so that no option could be parsed with it.
+    rules: list[Rule] = []
+    if any(word in (*HELP, HELP_ALL) for word in words):
+        rules.append(make_help_rule(show_all=HELP_ALL in words))
     words = ["--help" if word == HELP_ALL else word for word in words]
     check_once(words)
+
+    # tyro prints an error in a box and ends the process. The box is caught, and one sentence of it
+    # becomes that of an InputError.
     printed = StringIO()
     try:
         with redirect_stderr(printed):
@@ -83,13 +88,16 @@ def parse_words(words: Sequence[str], command: Any, names: Collection[str]) -> A
                     tyro.conf.FlagCreatePairsOff,
                     tyro.conf.OmitSubcommandPrefixes,
                 ),
-                registry=make_registry(config, *helps),
+                registry=make_registry(config, *rules),
             )
     except SystemExit as stop:
+        # Code 0: the help was printed.
         if not stop.code:
             raise
-        unions = zip(names, get_args(command), strict=False)
-        kinds: dict[str, type] = {name: get_args(kind)[0] for name, kind in unions}
+        # The members of the union are `Annotated[OPTIONS, subcommand(NAME)]`, in the order of the
+        # names.
+        members = zip(names, get_args(command), strict=False)
+        kinds: dict[str, type] = {name: get_args(member)[0] for name, member in members}
         sentence = explain_words(words, kinds, printed.getvalue())
         see = " ".join(["gscompleter", *words[:1]])
         raise InputError(f"{sentence} (see {see} --help).") from None
@@ -100,23 +108,26 @@ def explain_words(words: Sequence[str], kinds: Mapping[str, type], box: str) -> 
     kind = kinds.get(words[0]) if words else None
     if kind is None:
         return extract_sentence(box, ())
+    # tyro only says that an option is unknown; that it belongs to another command says more.
     own = list_options(kind)
     return describe_foreign_option(words, own, kinds) or extract_sentence(box, own)
 
 
 def list_options(kind: Any, prefix: str = "") -> set[str]:
     """List the names of the options of a command, without dashes before them."""
-    found = set()
+    options = set()
     for field, hint in get_type_hints(kind, include_extras=True).items():
+        # `Annotated[inner, *marks]`. Of a plain union the first member is `inner`, and the others
+        # count as marks, none of which is searched for.
         marks = get_args(hint)[1:]
         inner: Any = get_args(hint)[0] if marks else hint
         name = f"{prefix}{field.replace('_', '-')}"
         if is_dataclass(inner):
             is_flat = tyro.conf.OmitArgPrefixes in marks
-            found |= list_options(inner, "" if is_flat else f"{name}.")
+            options |= list_options(inner, "" if is_flat else f"{name}.")
         elif tyro.conf.Positional not in marks:
-            found.add(name)
-    return found
+            options.add(name)
+    return options
 
 
 def describe_foreign_option(
@@ -141,6 +152,7 @@ def refuse_empty_words(words: Sequence[str]) -> None:
     """Refuse an empty word, which as a path would mean the working folder."""
     for before, word in zip(["gscompleter", *words], words, strict=False):
         name, sign, value = word.partition("=")
+        # Empty is the word itself, or what follows the sign in `--out=`.
         if word and not (name.startswith("--") and sign and not value):
             continue
         raise InputError(
@@ -152,12 +164,12 @@ def refuse_empty_words(words: Sequence[str]) -> None:
 def check_once(words: Sequence[str]) -> None:
     """Refuse an option that is given twice."""
     named = [word.split("=")[0].replace("_", "-") for word in words if word.startswith("--")]
-    twice = next((name for name in named if named.count(name) > 1), None)
-    if twice is not None:
-        raise InputError(
-            f"{quote_value(twice)} is given twice, and only one of them would count; name it "
-            "once, with all its values after it."
-        )
+    for name in named:
+        if named.count(name) > 1:
+            raise InputError(
+                f"{quote_value(name)} is given twice, and only one of them would count; name it "
+                "once, with all its values after it."
+            )
 
 
 def insert_auto_count(words: Sequence[str]) -> list[str]:
@@ -178,21 +190,29 @@ class NamedConfig:
 
 
 def load_named_config(words: Sequence[str]) -> tuple[CompleterConfig, Sequence[str]]:
-    """Load the config of `--config NAME`, and return it with the other words."""
+    """Load the config of `--config NAME`, and return it with the other words.
+
+    Its settings are the defaults of options such as `--config.holes.dilation`, so it has to be
+    known before these are parsed.
+    """
     if words[:1] not in (["complete"], ["live"], ["remove"]):
         return CompleterConfig(), words
     named, others = tyro.cli(
         NamedConfig, prog="gscompleter", args=words, return_unknown_args=True, add_help=False
     )
+    # The default config depends on the input: a splat has settings of its own.
     is_splat = any(word.partition("=")[0] == "--scene" for word in others)
     config = load_config(named.config, is_splat)
-    return config.for_removal() if words[0] == "remove" else config, others
+    if words[0] == "remove":
+        config = config.for_removal()
+    return config, others
 
 
 def make_registry(config: CompleterConfig, *rules: Rule) -> ConstructorRegistry:
     """Create tyro's registry, with `config` as the default CompleterConfig."""
 
     def config_flags(info: StructTypeInfo) -> Any:
+        # The call below asks all rules again. This one then sees its own default and gives way.
         if info.type is not CompleterConfig or info.default == config:
             return None
         return ConstructorRegistry.get_struct_spec(StructTypeInfo.make(info.type, config, False))
@@ -206,6 +226,7 @@ def make_registry(config: CompleterConfig, *rules: Rule) -> ConstructorRegistry:
 
 def make_help_rule(show_all: bool) -> Rule:
     """Return a rule by which tyro writes help pages. No option can be parsed with it."""
+    # Classes whose own specification is being made: for them the rule gives way to tyro's.
     entered: list[type] = []
 
     def rule(info: StructTypeInfo) -> StructConstructorSpec | None:
@@ -217,6 +238,7 @@ def make_help_rule(show_all: bool) -> Rule:
         entered.remove(kind)
         if not isinstance(spec, StructConstructorSpec):
             return None
+        # The options of a command itself come first, those that it shares with others after them.
         own = get_annotations(kind)
         fields = sorted(spec.fields, key=lambda field: field.name not in own)
         return replace(spec, fields=tuple(tidy_field(field, show_all) for field in fields))
@@ -233,8 +255,9 @@ def tidy_field(field: StructFieldSpec, show_all: bool) -> StructFieldSpec:
         return CONFIG
 
     def text() -> str | None:
-        found = field.helptext() if callable(field.helptext) else field.helptext
-        return None if found is None else " ".join(found.split())
+        # Docstrings are wrapped in the source; tyro wraps them again to the terminal's width.
+        original = field.helptext() if callable(field.helptext) else field.helptext
+        return None if original is None else " ".join(original.split())
 
     kind: Any = field.type
     if field.default is None or field.default is False or field.default == ():
@@ -247,12 +270,22 @@ def extract_sentence(box: str, own: Collection[str]) -> str:
 
     tyro also suggests options of other commands; only those of this one (`own`) are named.
     """
+    # Without the border: the first line is its top, and each other one begins with `│ `.
     lines = [line[2:].rstrip("│ ") for line in box.splitlines()[1:]]
-    text = dropwhile(lambda line: not line.strip("─- "), lines)
-    paragraph = takewhile(lambda line: line.strip("─- "), text)
+
+    # The message is the first paragraph, up to an empty line or a rule. Its deeply indented lines
+    # are lists of arguments, no part of a sentence.
+    paragraph: list[str] = []
+    for line in lines:
+        if line.strip("─- "):
+            paragraph.append(line)
+        elif paragraph:
+            break
     sentence = " ".join(line.strip() for line in paragraph if not line.startswith(" " * 5))
     # What settings refuse themselves comes with tyro's name of the class around them.
     sentence = re.sub(r"^Error parsing [\w.-]+: ", "", sentence)
+
+    # Below a title tyro lists the option that is meant, in the next line; the last title counts.
     hint = ""
     for title, words in HINTS.items():
         if title in lines:

@@ -14,7 +14,6 @@ from gscompleter.data.given_depth import drop_unsure, give_depth, project_tracks
 from gscompleter.data.photographs import Photographs, Resolution
 from gscompleter.reconstructors.features.depth_factor import (
     MIN_SAMPLES,
-    DepthFactor,
     DepthSamples,
     compare_maps,
     compare_with_matches,
@@ -39,18 +38,15 @@ def read_with_depth(
     note = ""
     if any(view.depth is not None for view in views):
         factor, note = find_factor(photographs, frames, views, resolution)
-    held = [photographs.frame(frame) for frame in frames]
-    scaled = [scale_depth(view, factor) for view in views]
-    pairs = zip(scaled, held, strict=True)
-    given = [give_depth(view, frame, photographs.origin) for view, frame in pairs]
-    return given, (note,) if note else ()
 
-
-def scale_depth(view: View, factor: float) -> View:
-    """Multiply the measured depth of a view."""
-    if view.depth is None or factor == 1.0:
-        return view
-    return replace(view, depth=view.depth * factor)
+    views_with_depth = []
+    for view, frame in zip(views, frames, strict=True):
+        if view.depth is not None and factor != 1.0:
+            view = replace(view, depth=view.depth * factor)
+        # Given depth takes the place of stereo in the reconstruction (decision 046).
+        view = give_depth(view, photographs.frame(frame), photographs.origin)
+        views_with_depth.append(view)
+    return views_with_depth, (note,) if note else ()
 
 
 def find_factor(
@@ -66,9 +62,18 @@ def find_factor(
     """
     samples = compare_given_depth(photographs, frames, views)
     if len(samples) < MIN_SAMPLES:
-        more = read_next(photographs, frames, resolution)
+        last = len(photographs) - 1
+        next_frames = {min(frame + 1, last) for frame in frames} - set(frames)
+        more: dict[int, View] = {}
+        for frame in sorted(next_frames):
+            # One that cannot be read is left out: it is only wanted for this comparison.
+            with suppress(InputError):
+                (more[frame],) = photographs.views([frame], resolution)
         samples = compare_given_depth(photographs, [*frames, *more], [*views, *more.values()])
+
     fit = fit_depth_factor(samples)
+    # Too few samples prove nothing, so the depth is believed. Many that contradict it are an error:
+    # no factor can be right.
     if fit is None:
         return 1.0, (
             "The photographs show too little to compare the depth that the scene holds with; it is "
@@ -76,19 +81,13 @@ def find_factor(
         )
     if not fit.is_consistent:
         raise InputError(describe_contradiction(samples))
-    return fit.factor, describe_factor(fit, samples)
-
-
-def read_next(
-    photographs: Photographs, frames: Sequence[int], resolution: Resolution
-) -> dict[int, View]:
-    """Load the photographs after those of `frames`, by frame; those that cannot be are left out."""
-    last = len(photographs) - 1
-    found = {}
-    for frame in sorted({min(frame + 1, last) for frame in frames} - set(frames)):
-        with suppress(InputError):
-            (found[frame],) = photographs.views([frame], resolution)
-    return found
+    if fit.factor == 1.0:
+        return 1.0, ""
+    return fit.factor, (
+        f"The depth that the scene holds is {1 / fit.factor:.3g} times what its photographs and "
+        f"points measure ({fit.agreement:.0%} of {len(samples):,} compared depths agree); it is "
+        f"multiplied by {fit.factor:.4g} ({WAY_OUT})."
+    )
 
 
 def compare_given_depth(
@@ -96,34 +95,32 @@ def compare_given_depth(
 ) -> DepthSamples:
     """Compare the measured depths of photographs with their tracks or points, and with matches."""
     points = photographs.points()
-    parts, maps = [], []
+    samples = []
+    depths = []
     for number, view in enumerate(views):
         frame = photographs.frame(frames[number])
+
+        # 0 where nothing is measured, and at edges, where the sensor and the photograph may see
+        # two surfaces.
         depth = torch.zeros_like(view.image[..., 0])
         if view.depth is not None:
             depth = drop_unsure(view.depth, frame)
+        depths.append(depth)
+
+        # Tracks and points were triangulated with the cameras, and so are in their unit.
         tracks = project_tracks(frame, view, photographs.origin, points)
-        parts.append(compare_maps(depth, tracks, number))
-        maps.append(depth)
-    return join_samples([*parts, compare_with_matches(views, maps)])
+        samples.append(compare_maps(depth, tracks, number))
 
-
-def describe_factor(fit: DepthFactor, samples: DepthSamples) -> str:
-    """Write the sentence about a factor; empty if nothing is changed."""
-    if fit.factor == 1.0:
-        return ""
-    return (
-        f"The depth that the scene holds is {1 / fit.factor:.3g} times what its photographs and "
-        f"points measure ({fit.agreement:.0%} of {len(samples):,} compared depths agree); it is "
-        f"multiplied by {fit.factor:.4g} ({WAY_OUT})."
-    )
+    # Matches between the photographs measure the unit, too, if the scene has no points.
+    return join_samples([*samples, compare_with_matches(views, depths)])
 
 
 def describe_contradiction(samples: DepthSamples) -> str:
     """Write the error for depths that no factor explains, with both ranges."""
-    given, measured = (describe_range(values) for values in (samples.given, samples.measured))
+    held = describe_range(samples.given)
+    measured = describe_range(samples.measured)
     return (
-        f"The depth that the scene holds ({given} at {len(samples):,} compared pixels) contradicts "
+        f"The depth that the scene holds ({held} at {len(samples):,} compared pixels) contradicts "
         f"what its photographs and points measure there ({measured}), and no single factor "
         "explains it; give z-depth in one unit for all photographs, or leave it out with "
         "--no-given-depth."

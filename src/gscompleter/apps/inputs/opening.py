@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 import os
 import re
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -175,32 +175,51 @@ def open_scene(
     `check` is called before that search, which takes minutes, and raises what would end the command
     after it.
     """
-    folder, poses, number = options.folder, options.out / POSES, None
-    refuse_splat(folder)
+    folder = options.folder
+    if not os.path.isdir(folder) and folder.name.lower().endswith(SPLAT_EXTENSIONS):
+        raise InputError(
+            f"{quote_value(folder, 80)} is a file of Gaussians, which goes to --scene; SCENE has "
+            "to be the folder of its photographs, with or without cameras, or a video."
+        )
     check_planes(options.near, options.far)
     check_resolution(parse_resolution(options.resolution))
+
+    # Photographs without cameras: COLMAP finds them once, and a later run reads them from OUT.
+    num_photographs = None
     if options.format is None and find_format(folder) is None and has_photographs(folder):
+        poses = options.out / POSES
+        # First all that can be refused at once, because the search takes minutes.
         refuse_other_exports(folder)
         refuse_scenes_below(folder)
         print_lines(console, *describe_cameras_above(folder))
         check_frame_numbers(options, folder)
         check()
-        ours = options.overwrite or os.path.isfile(poses / SUMMARY_FILE)
-        found = find_poses(folder, poses, ours, options.frames)
-        print_lines(console, *found.notes)
-        folder, number = poses, found.photographs
-    given = open_photographs(folder, options.format, options.near, options.far)
-    given = given if options.masks else given.leave_out_masks()
+        # A folder of poses with a summary was written by us, and may be continued or replaced.
+        is_ours = options.overwrite or os.path.isfile(poses / SUMMARY_FILE)
+        found_poses = find_poses(folder, poses, is_ours, options.frames)
+        print_lines(console, *found_poses.notes)
+        folder = poses
+        num_photographs = found_poses.photographs
+
+    photographs = open_photographs(folder, options.format, options.near, options.far)
+    if not options.masks:
+        photographs = photographs.leave_out_masks()
+    # Masks of what is to be removed may lie in the scene, and are not those of what to ignore.
     if isinstance(options, RemoveOptions) and options.mask is not None:
-        given = given.leave_out_masks_in(options.mask)
-    print_lines(console, *given.notes)
-    assert given.format is not None
-    if number is None:
-        return Opened(given, given.format, len(given))
-    return Opened(given, "photographs", number)
+        photographs = photographs.leave_out_masks_in(options.mask)
+    print_lines(console, *photographs.notes)
+
+    assert photographs.format is not None
+    if num_photographs is None:
+        return Opened(photographs, photographs.format, len(photographs))
+    # The user gave photographs, of which COLMAP may not have found all cameras. Their number is
+    # reported, and not the format and number of what COLMAP wrote.
+    return Opened(photographs, "photographs", num_photographs)
 
 
-def choose_working_size(options: AnyOptions, given: Photographs, console: Console) -> AnyOptions:
+def choose_working_size(
+    options: AnyOptions, photographs: Photographs, console: Console
+) -> AnyOptions:
     """Choose the working size unless it is given: that of the training of a splat, if smaller.
 
     A larger one is only reported: details beyond the default size cost much time, and no harm is
@@ -211,29 +230,35 @@ def choose_working_size(options: AnyOptions, given: Photographs, console: Consol
     side = LONG_SIDE
     trained = None
     if options.scene is not None:
-        some = collect_usable_cameras(given, range(min(len(given), MAX_NAMED)), LONG_SIDE)
-        trained = find_training_size(options.scene, options.folder, given, list(some))
+        # A few photographs are enough to find the size by.
+        usable = collect_usable_cameras(
+            photographs, range(min(len(photographs), MAX_NAMED)), LONG_SIDE
+        )
+        trained = find_training_size(options.scene, options.folder, photographs, list(usable))
     if trained is not None:
-        told = f"{quote_value(options.scene)} was trained at {trained.long_side} px"
-        told += f" ({quote_value(trained.source)})"
+        sentence = f"{quote_value(options.scene)} was trained at {trained.long_side} px"
+        sentence += f" ({quote_value(trained.source)})"
         if trained.long_side <= LONG_SIDE:
             side = trained.long_side
-            told += ", which is the working size; --resolution changes it."
+            sentence += ", which is the working size; --resolution changes it."
         else:
-            told += f"; the working size stays {side} px unless --resolution changes it."
-        print_lines(console, told)
+            sentence += f"; the working size stays {side} px unless --resolution changes it."
+        print_lines(console, sentence)
     return replace(options, resolution=side)
 
 
 def describe_cameras_above(folder: Path) -> list[str]:
     """Say that the folder above one of photographs has their cameras, which are not used."""
+    if folder.name.casefold() not in FOLDERS:
+        return []
     above = folder.resolve().parent
-    found = find_format(above) if folder.name.casefold() in FOLDERS else None
-    if found is None or found == "photograph":
+    format = find_format(above)
+    # Any folder with one image has the format `photograph`, which needs no cameras.
+    if format is None or format == "photograph":
         return []
     return [
-        f"{quote_value(above)} has cameras of these photographs ({found}); name that folder to use "
-        "them. Here they are found anew."
+        f"{quote_value(above)} has cameras of these photographs ({format}); name that folder to "
+        "use them. Here they are found anew."
     ]
 
 
@@ -242,31 +267,24 @@ def check_frame_numbers(options: SceneOptions, folder: Path) -> None:
 
     Panoramas are split into several photographs each, and a video into as many as it is sharp.
     """
-    words = [*(options.context or ()), *getattr(options, "target", ())]
-    frames = [int(word) for word in map(str, words) if FRAME_NUMBER.fullmatch(word)]
-    count = options.frames if is_video(folder) else len(list_photograph_files(folder))
-    if not frames or (not is_video(folder) and has_panoramas_in(folder)):
-        return
-    wrong = next((frame for frame in frames if not 0 <= frame < count), None)
-    if wrong is not None:
-        raise InputError(
-            f"There is no frame {wrong} among the {count} photographs of {quote_value(folder)}; "
-            f"name frames from 0 to {count - 1}."
-        )
+    # Numbers only; a name may still be that of a photograph.
+    words = [str(word) for word in (*(options.context or ()), *getattr(options, "target", ()))]
+    frames = [int(word) for word in words if FRAME_NUMBER.fullmatch(word)]
+    if is_video(folder):
+        count = options.frames
+    else:
+        files = list_photograph_files(folder)
+        count = len(files)
+        # Telling panoramas apart opens each photograph, so it is done only if a number needs it.
+        if frames and has_panoramas([folder / name for name in files]):
+            return
 
-
-def has_panoramas_in(folder: Path) -> bool:
-    """Return True if the photographs of a folder are panoramas."""
-    return has_panoramas([folder / name for name in list_photograph_files(folder)])
-
-
-def refuse_splat(path: Path) -> None:
-    """Refuse a file of Gaussians given as the folder of photographs."""
-    if not os.path.isdir(path) and path.name.lower().endswith(SPLAT_EXTENSIONS):
-        raise InputError(
-            f"{quote_value(path, 80)} is a file of Gaussians, which goes to --scene; SCENE has to "
-            "be the folder of its photographs, with or without cameras, or a video."
-        )
+    for frame in frames:
+        if not 0 <= frame < count:
+            raise InputError(
+                f"There is no frame {frame} among the {count} photographs of "
+                f"{quote_value(folder)}; name frames from 0 to {count - 1}."
+            )
 
 
 def resolve_scene(options: AnyOptions) -> AnyOptions:
@@ -278,55 +296,74 @@ def resolve_scene(options: AnyOptions) -> AnyOptions:
 
 def read_task(options: CompleteOptions, opened: Opened, device: str) -> CompletionTask:
     """Read the photographs and targets of the options, after checking the memory."""
-    given, resolution = opened.photographs, parse_resolution(options.resolution)
-    targets = read_targets(given, options)
-    frames = find_context(options, given) or choose_context(options, given, targets)
-    cameras = [given.camera(frame, resolution) for frame in frames]
+    photographs = opened.photographs
+    resolution = parse_resolution(options.resolution)
+    targets = read_targets(photographs, options)
+    frames = find_context(options, photographs) or choose_context(options, photographs, targets)
+
+    # Cameras are enough to estimate the memory, before any photograph is loaded.
+    cameras = [photographs.camera(frame, resolution) for frame in frames]
     cameras += [target.camera for target in targets]
     check_memory(max(camera.width * camera.height for camera in cameras), len(cameras))
-    return make_task(options, given, frames, targets, device)
+    return make_task(options, photographs, frames, targets, device)
 
 
 def read_photographs(options: SceneOptions, opened: Opened, device: str) -> CompletionTask:
     """Read the named photographs, or all."""
-    given, resolution = opened.photographs, parse_resolution(options.resolution)
-    frames = find_context(options, given) or tuple(
-        collect_usable_cameras(given, range(len(given)), resolution)
-    )
+    photographs = opened.photographs
+    resolution = parse_resolution(options.resolution)
+    frames = find_context(options, photographs)
+    if not frames:
+        frames = tuple(collect_usable_cameras(photographs, range(len(photographs)), resolution))
     if not frames:
         raise InputError(
             f"No photograph of {quote_value(options.folder)} can be used; name the folder that the "
             "splat was trained on."
         )
-    return make_task(options, given, frames, (), device)
+    return make_task(options, photographs, frames, (), device)
 
 
 def make_task(
     options: SceneOptions,
-    given: Photographs,
+    photographs: Photographs,
     frames: Sequence[int],
     targets: Sequence[Target],
     device: str,
 ) -> CompletionTask:
     """Read the photographs of `frames`, in ascending order, and those of the targets."""
-    frames, resolution = sorted(frames), parse_resolution(options.resolution)
-    bounded = add_depth_range(given, frames, resolution)
+    frames = sorted(frames)
+    resolution = parse_resolution(options.resolution)
+
+    # `bounded` has the depth range of the options and the scene, or that of its sparse points. The
+    # targets were read before the context was known that chooses the points.
+    bounded = add_depth_range(photographs, frames, resolution)
     targets = [
-        replace(t, camera=replace(t.camera, near=bounded.near, far=bounded.far)) for t in targets
+        replace(target, camera=replace(target.camera, near=bounded.near, far=bounded.far))
+        for target in targets
     ]
     cameras = [bounded.camera(frame, resolution) for frame in frames]
-    check_sides([*cameras, *(target.camera for target in targets)])
+    for camera in (*cameras, *(target.camera for target in targets)):
+        if min(camera.width, camera.height) < MIN_IMAGE_SIZE:
+            raise InputError(
+                f"An image is {camera.width} x {camera.height} pixels, and both sides must have at "
+                f"least {MIN_IMAGE_SIZE}; choose a larger --resolution, or another camera."
+            )
+
     depth_notes: tuple[str, ...] = ()
     if options.no_given_depth:
         views = bounded.views(frames, resolution)
     else:
         views, depth_notes = read_with_depth(bounded, frames, resolution)
+    views = [view.to(device) for view in views]
+
+    # Photographs of the targets score the result, and only the oracle generator sees them.
+    targets = [add_photograph(target, bounded, options) for target in targets]
     return CompletionTask(
-        [view.to(device) for view in views],
-        [add_photograph(target, bounded, options) for target in targets],
-        compute_frame_from_photographs(given.origin),
-        given.origin,
-        find_depth_sources(options, given, bounded),
+        views,
+        targets,
+        compute_frame_from_photographs(photographs.origin),
+        photographs.origin,
+        find_depth_sources(options, photographs, bounded),
         depth_notes=depth_notes,
     )
 
@@ -343,48 +380,59 @@ def move_to_splat(
 
     `order` has the index of each Gaussian in the file if they were reordered.
     """
-    given = opened.photographs
-    origin = choose_scene_origin(scene, given.origin)
+    photographs = opened.photographs
+
+    # Coordinates of maps are too large for float32, so that work is done near the scene's origin.
+    origin = choose_scene_origin(scene, photographs.origin)
     scene = shift_to_origin(origin, scene, task.cameras).to(task.device)
+
+    # A trainer may have moved and scaled the cameras before it trained the splat.
     splat = InputSplat(path, scene, origin, options.folder)
-    found = align_splat(splat, given, task.context_frames, load_renderer(task.device.type))
-    # Cameras were read relative to the origin of the photographs, whatever frame they are in.
-    back = compute_frame_from_photographs(-given.origin)
-    to_result = {
-        False: found.transform,
-        True: compute_frame_from_photographs(origin) @ back,
-    }
+    alignment = align_splat(
+        splat, photographs, task.context_frames, load_renderer(task.device.type)
+    )
+
+    # Cameras were read relative to the origin of the photographs, whatever frame they are in. Those
+    # of the splat's own frame only change to its origin; all others are aligned.
+    from_photographs = alignment.transform
+    from_splat = compute_frame_from_photographs(origin) @ compute_frame_from_photographs(
+        -photographs.origin
+    )
+    targets = []
+    for target in task.targets:
+        transform = from_splat if target.is_in_splat_frame else from_photographs
+        targets.append(replace(target, camera=transform_camera(target.camera, transform)))
+
     return replace(
         task,
-        views=[transform_view(view, found.transform) for view in task.views],
-        targets=[
-            replace(t, camera=transform_camera(t.camera, to_result[t.is_in_splat_frame]))
-            for t in task.targets
-        ],
-        frame=found.transform @ task.frame,
-        origin=given.origin if found.method == "given" else origin,
+        views=[transform_view(view, from_photographs) for view in task.views],
+        targets=targets,
+        frame=from_photographs @ task.frame,
+        origin=photographs.origin if alignment.method == "given" else origin,
         scene=scene,
         splat_file=replace(locate_splat(options, path), file_order=order),
-        method=found.method,
-        frame_description=found.describe(),
-        check_views=[transform_view(view, found.transform) for view in task.check_views or ()],
+        method=alignment.method,
+        frame_description=alignment.describe(),
+        check_views=[transform_view(view, from_photographs) for view in task.check_views or ()],
     )
 
 
 def locate_splat(options: SceneOptions, path: Path) -> InputSplatFile:
     """Describe the file of the input splat."""
-    is_masked = options.drop_nonfinite and detect_splat_format(path) == "ply"
-    return InputSplatFile(path, find_finite_rows(path) if is_masked else None)
+    # A .ply is written again from its own rows, of which those that were dropped are left out.
+    if options.drop_nonfinite and detect_splat_format(path) == "ply":
+        return InputSplatFile(path, find_finite_rows(path))
+    return InputSplatFile(path, None)
 
 
-def add_check_views(task: CompletionTask, given: Photographs) -> CompletionTask:
-    """Add check views: unused photographs near the targets and all around."""
-    others = [frame for frame in range(len(given)) if frame not in task.used_frames]
-    cameras = collect_usable_cameras(given, others, CHECK_VIEW_SIZE)
+def add_check_views(task: CompletionTask, photographs: Photographs) -> CompletionTask:
+    """Add check views: unused photographs near the targets and all around (decision 020)."""
+    others = [frame for frame in range(len(photographs)) if frame not in task.used_frames]
+    cameras = collect_usable_cameras(photographs, others, CHECK_VIEW_SIZE)
     views = []
     for frame in select_near_and_far(task.goals, cameras, MAX_CHECK_VIEWS):
         with suppress(InputError):
-            views += given.views([frame], CHECK_VIEW_SIZE)
+            views += photographs.views([frame], CHECK_VIEW_SIZE)
     return replace(task, check_views=[view.to(task.device) for view in views])
 
 
@@ -396,11 +444,15 @@ def apply_splat_range(task: CompletionTask, scene: Gaussians, renderer: Renderer
 
 def apply_scene_range(task: CompletionTask, reconstructor: Reconstructor) -> CompletionTask:
     """Set the depth range of the photographs from which Ψ reconstructs the scene."""
+    # A published network has the depth range of its authors (decision 047), which takes the place
+    # of a range estimated from features.
     trained = get_trained_range(reconstructor)
     near, far = find_depth_range(task.views, trained)
     depths = dict(task.depths)
     if trained is not None:
-        depths = {name: "model" if s == "features" else s for name, s in depths.items()}
+        for name, source in task.depths.items():
+            if source == "features":
+                depths[name] = "model"
     return replace(task, views=set_depth_range(task.views, near, far), depths=depths)
 
 
@@ -432,7 +484,9 @@ def describe_range_mismatch(task: CompletionTask, reconstructor: Reconstructor) 
 def check_context(options: SceneOptions) -> None:
     """Refuse an empty context, and repeated frames."""
     context = options.context
-    if context is not None and not 0 < len(context) == len(set(context)):
+    if context is None:
+        return
+    if len(context) == 0 or len(set(context)) < len(context):
         raise InputError(
             "--context names no frame, or one twice; name different ones, as in --context 0 4, or "
             "leave it out."
@@ -464,69 +518,72 @@ def check_target_files(options: CompleteOptions) -> None:
 
 
 def find_depth_sources(
-    options: SceneOptions, given: Photographs, bounded: Photographs
+    options: SceneOptions, photographs: Photographs, bounded: Photographs
 ) -> dict[str, str]:
     """Find the sources of `near` and `far`; `bounded` has those of the sparse points."""
     estimate = "features" if options.scene is None else "splat"
-    sources = {"given": options, "scene": given, "points": bounded}
-    return {
-        name: next((s for s, held in sources.items() if getattr(held, name) is not None), estimate)
-        for name in ("near", "far")
-    }
+    # In this order: each of them keeps what the one before it has.
+    sources = {"given": options, "scene": photographs, "points": bounded}
+    source_by_name = {}
+    for name in ("near", "far"):
+        known = [source for source, value in sources.items() if getattr(value, name) is not None]
+        source_by_name[name] = known[0] if known else estimate
+    return source_by_name
 
 
-def read_targets(given: Photographs, options: CompleteOptions) -> list[Target]:
+def read_targets(photographs: Photographs, options: CompleteOptions) -> list[Target]:
     """Read the target cameras in the order of the command line."""
     resolution = parse_resolution(options.resolution)
     targets: list[Target] = []
     for word in options.target:
         if os.path.exists(word) and not is_image(word):
-            cameras = load_cameras(word, resolution, origin=given.origin.tolist())
+            cameras = load_cameras(word, resolution, origin=photographs.origin.tolist())
             is_of_splat = options.scene is not None and is_in_splat_frame(Path(word))
             targets += [Target(camera, is_in_splat_frame=is_of_splat) for camera in cameras]
+        # A photograph in the working folder can be called as one of the scene, which is meant.
         else:
-            frame = find_frame(given, word, "target")
-            targets.append(Target(given.camera(frame, resolution), frame))
+            frame = find_frame(photographs, word, "target")
+            targets.append(Target(photographs.camera(frame, resolution), frame))
     return targets
 
 
-def find_context(options: SceneOptions, given: Photographs) -> tuple[int, ...]:
+def find_context(options: SceneOptions, photographs: Photographs) -> tuple[int, ...]:
     """Find the context frames that the options name; none if they name none."""
-    frames = tuple(find_frame(given, word, "context") for word in options.context or ())
+    frames = tuple(find_frame(photographs, word, "context") for word in options.context or ())
+    # Words differ by now (`check_context`), but a name and a number can mean one photograph.
     if len(set(frames)) < len(frames):
         twice = next(frame for frame in frames if frames.count(frame) > 1)
-        raise InputError(
-            f"--context names photograph {twice} ({quote_value(given.frame(twice).file_name)}) "
-            "twice; name different ones."
-        )
+        name = quote_value(photographs.frame(twice).file_name)
+        raise InputError(f"--context names photograph {twice} ({name}) twice; name different ones.")
     return frames
 
 
-def find_frame(given: Photographs, word: int | str, option: str) -> int:
+def find_frame(photographs: Photographs, word: int | str, option: str) -> int:
     """Find the frame of a word of an option: a number, or the name of a photograph."""
     number = int(word) if FRAME_NUMBER.fullmatch(str(word)) else word
     try:
-        return given.find_frame(number)
+        return photographs.find_frame(number)
     except InputError as error:
         if option == "target" and isinstance(number, str):
             raise InputError(
                 f"'{quote_value(word, 60)}' is no target: name a photograph or its number from 0 "
-                f"to {len(given) - 1}, or an existing file of cameras, such as a transforms.json.",
+                f"to {len(photographs) - 1}, or an existing file of cameras, such as a "
+                "transforms.json.",
                 option,
             ) from error
         raise InputError(str(error), option) from error
 
 
 def is_image(path: str) -> bool:
-    """Check whether a path names a photograph, not a file of cameras."""
+    """Return True if a path names a photograph, not a file of cameras."""
     return path.lower().endswith(ENDINGS)
 
 
-def add_photograph(target: Target, given: Photographs, options: SceneOptions) -> Target:
+def add_photograph(target: Target, photographs: Photographs, options: SceneOptions) -> Target:
     """Add its photograph to a target, if there is one."""
-    if target.frame is None or not given.frame(target.frame).has_photograph():
+    if target.frame is None or not photographs.frame(target.frame).has_photograph():
         return target
-    (view,) = given.views([target.frame], parse_resolution(options.resolution))
+    (view,) = photographs.views([target.frame], parse_resolution(options.resolution))
     return replace(target, photograph=view.image, ignore_mask=view.ignore_mask)
 
 
@@ -544,20 +601,14 @@ def estimate_memory(task: CompletionTask, scene: Gaussians | None) -> int:
     needed = estimate_bytes(pixels, len(task.cameras))
     if scene is None:
         return needed
+
+    # A splat is frozen for each photograph that guards it. Its memory grows with the numbers of a
+    # Gaussian, most of which are spherical harmonics.
     cameras = [view.camera for view in (*task.views, *(task.check_views or ()))]
-    numbers = sum(part[0].numel() for part in vars(scene).values() if isinstance(part, Tensor))
+    parts = [part for part in vars(scene).values() if isinstance(part, Tensor)]
+    numbers = sum(part[0].numel() for part in parts)
     sizes = [camera.width * camera.height for camera in cameras]
     return needed + estimate_scene_bytes(len(scene), numbers, sizes)
-
-
-def check_sides(cameras: Sequence[Camera]) -> None:
-    """Refuse images that are too small."""
-    for camera in cameras:
-        if min(camera.width, camera.height) < MIN_IMAGE_SIZE:
-            raise InputError(
-                f"An image is {camera.width} x {camera.height} pixels, and both sides must have at "
-                f"least {MIN_IMAGE_SIZE}; choose a larger --resolution, or another camera."
-            )
 
 
 def describe_task(options: CompleteOptions, opened: Opened, task: CompletionTask) -> list[str]:
@@ -565,24 +616,31 @@ def describe_task(options: CompleteOptions, opened: Opened, task: CompletionTask
     targets = join_names([opened.name_target(target) for target in task.targets], MAX_NAMED)
     files = opened.files
     context = [name_photograph(frame, files.get(frame)) for frame in task.context_frames]
-    count = get_max_targets(options)
-    found = "a camera that is found" if count == 1 else f"up to {count} cameras that are found"
+    if not targets:
+        count = get_max_targets(options)
+        targets = (
+            "a camera that is found" if count == 1 else f"up to {count} cameras that are found"
+        )
     models = f"{options.reconstructor} and {options.synthesis.generator} on {task.device.type}"
+
+    # On a GPU the splat is in its memory, not in that of the machine.
     needed = estimate_memory(task, task.scene if task.device.type == "cpu" else None)
     available = read_memory_bytes()
     of = "" if available is None else f" of {format_whole_gigabytes(available)}"
     return [
         *describe_opening(options, opened, task),
         f"To do: complete the scene from photographs {join_names(context, MAX_NAMED)} for "
-        f"{targets or found} by {models}, written to {quote_value(options.out)}.",
+        f"{targets} by {models}, written to {quote_value(options.out)}.",
         f"Memory: up to {format_whole_gigabytes(needed)}{of}.",
     ]
 
 
 def describe_opening(options: SceneOptions, opened: Opened, task: CompletionTask) -> list[str]:
     """Write the lines on the opened scene."""
-    scene, camera, given = task.scene, task.views[0].camera, opened.photographs
-    used = len(given) - len(list_missing(given))
+    scene = task.scene
+    camera = task.views[0].camera
+    photographs = opened.photographs
+    used = len(photographs) - len(list_missing(photographs))
     splat = ""
     if scene is not None:
         mode = "antialiased " if scene.is_antialiased else ""
@@ -594,44 +652,41 @@ def describe_opening(options: SceneOptions, opened: Opened, task: CompletionTask
         f"{opened.num_photographs} photographs{splat}.",
         f"Found: {task.frame_description.rstrip('.')}; depths from {camera.near:.3g} to "
         f"{camera.far:.3g}; worked at {camera.width} x {camera.height} (--resolution changes it).",
-        *describe_missing(given),
-        *describe_masks(given, task),
+        *describe_missing(photographs),
+        *describe_masks(photographs, task),
         *task.depth_notes,
     ]
 
 
-def list_missing(given: Photographs) -> list[str]:
+def list_missing(photographs: Photographs) -> list[str]:
     """List the names of photographs that cameras name and that are not there."""
-    frames = (frame for frame in given.frames if frame.image is not None)
-    return [frame.name for frame in frames if not frame.has_photograph()]
+    named = [frame for frame in photographs.frames if frame.image is not None]
+    return [frame.name for frame in named if not frame.has_photograph()]
 
 
-def describe_missing(given: Photographs) -> list[str]:
+def describe_missing(photographs: Photographs) -> list[str]:
     """Say which cameras have no photograph; such a camera stays, because it can be a target."""
-    missing = list_missing(given)
+    missing = list_missing(photographs)
     if not missing:
         return []
     return [
-        f"{len(missing)} of {len(given)} photographs are missing, and their cameras can only be "
-        f"targets: {join_names(missing, MAX_NAMED)}."
+        f"{len(missing)} of {len(photographs)} photographs are missing, and their cameras can only "
+        f"be targets: {join_names(missing, MAX_NAMED)}."
     ]
 
 
-def describe_masks(given: Photographs, task: CompletionTask) -> list[str]:
+def describe_masks(photographs: Photographs, task: CompletionTask) -> list[str]:
     """Say which masks were found for the photographs of a task, and how much they hide."""
-    found = given.describe_masks(sorted(filter_numbers(task.used_frames)))
-    if found is None:
+    # Cameras from elsewhere have no frame, and no mask.
+    frames = [frame for frame in task.used_frames if frame is not None]
+    masks = photographs.describe_masks(sorted(frames))
+    if masks is None:
         return []
     most = max(compute_mask_fraction(view.ignore_mask) for view in task.views)
     return [
-        f"Masks: {found}; what they hide, up to {100 * most:.1f} % of a photograph, is neither "
+        f"Masks: {masks}; what they hide, up to {100 * most:.1f} % of a photograph, is neither "
         "reconstructed nor scored (--no-masks uses it)."
     ]
-
-
-def filter_numbers(frames: Iterable[int | None]) -> list[int]:
-    """List the frame numbers, without None of cameras from elsewhere."""
-    return [frame for frame in frames if frame is not None]
 
 
 def print_lines(console: Console, *lines: str) -> None:

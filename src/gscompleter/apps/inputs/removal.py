@@ -31,6 +31,8 @@ def check_selection(options: RemoveOptions) -> None:
         raise InputError(
             "Nothing is named that is to be removed; give --box, --sphere, --mask or --select."
         )
+
+    # A rest of fewer than six numbers is no box and is refused by their count.
     lows, highs = split_boxes(options.box)
     if len(options.box) % 6 or not bool((lows < highs).all()):
         raise InputError(
@@ -44,6 +46,7 @@ def check_selection(options: RemoveOptions) -> None:
         raise InputError("A rotation is a quaternion w x y z that is not zero.", "box-rotation")
     if options.mask and not os.path.isdir(options.mask):
         raise InputError(f"There is no folder {quote_value(options.mask)}.", "mask")
+    # Read only to refuse a damaged file before the scene is opened.
     if options.select:
         load_splat(options.select, options.drop_nonfinite)
 
@@ -61,6 +64,9 @@ def choose_gaussians(
     """
     scene = task.scene
     assert scene is not None
+
+    # Boxes and spheres are in the coordinates of the file. The scene was shifted to a local origin
+    # if these are large, and float32 could not resolve them.
     points = scene.means.double() + torch.from_numpy(task.origin).to(scene.means.device)
     chosen = find_in_region(points, options)
     if options.mask:
@@ -71,8 +77,11 @@ def choose_gaussians(
         selected = load_splat(options.select, options.drop_nonfinite)
         selected = shift_to_origin(task.origin, selected, list(cameras.values()))
         chosen |= find_same_positions(scene, selected.to(scene.means.device))
+
     if not chosen.any():
-        low, high = (" ".join(f"{x:.4g}" for x in end) for end in points.aminmax(dim=0))
+        smallest, largest = points.aminmax(dim=0)
+        low = " ".join(f"{x:.4g}" for x in smallest)
+        high = " ".join(f"{x:.4g}" for x in largest)
         raise InputError(
             f"No Gaussian of the splat, which reaches from {low} to {high} in its own frame, is "
             "selected; name another place, or selected Gaussians that were not moved."
@@ -91,8 +100,9 @@ def find_in_region(points: Float[Tensor, "n 3"], options: RemoveOptions) -> Bool
 
 def split_boxes(numbers: Sequence[float]) -> tuple[Float[Tensor, "b 3"], Float[Tensor, "b 3"]]:
     """Split numbers into the smallest and the largest corners of boxes; a rest is left out."""
-    whole = torch.tensor(numbers[: len(numbers) // 6 * 6], dtype=torch.float64).reshape(-1, 6)
-    return whole[:, :3], whole[:, 3:]
+    num_boxes = len(numbers) // 6
+    corners = torch.tensor(numbers[: 6 * num_boxes], dtype=torch.float64).reshape(-1, 6)
+    return corners[:, :3], corners[:, 3:]
 
 
 def find_in_boxes(
@@ -100,10 +110,14 @@ def find_in_boxes(
 ) -> Bool[Tensor, "n"]:
     """Find points inside of boxes that a wxyz quaternion rotates about their centres."""
     # The square of a large number overflows, and a rotation has no length.
-    largest = max(map(abs, rotation))
+    largest = max(abs(part) for part in rotation)
     axes = quats_to_rotations(points.new_tensor([part / largest for part in rotation]))
+
+    lows, highs = split_boxes(boxes)
     inside = torch.zeros(len(points), dtype=torch.bool, device=points.device)
-    for low, high in zip(*(ends.to(points) for ends in split_boxes(boxes)), strict=True):
+    for low, high in zip(lows.to(points), highs.to(points), strict=True):
+        # Row vectors times the rotation are its inverse: from the world into the box's own axes,
+        # in which it is |x| <= half of its size.
         local = (points - (low + high) / 2) @ axes
         inside |= (local.abs() <= (high - low) / 2).all(dim=1)
     return inside
@@ -111,20 +125,21 @@ def find_in_boxes(
 
 def find_masks(folder: Path, photographs: Photographs) -> dict[int, Path]:
     """Find the masks that are named as photographs, by frame."""
-    found = {}
+    masks = {}
     for number, frame in enumerate(photographs.frames):
+        # Of a/b.jpg: a/b.jpg.png, a/b.png, b.jpg.png or b.png, as annotation programs name masks.
         name = Path(frame.name)
         stems = (name, name.with_suffix(""), Path(name.name), Path(name.stem))
         path = find_file([folder], [f"{stem}{ending}" for stem in stems for ending in ENDINGS])
         if path is not None:
-            found[number] = path
-    if not found:
+            masks[number] = path
+    if not masks:
         raise InputError(
             f"{quote_value(folder)} has no mask that is named as a photograph, such as "
             f"{quote_value(Path(photographs.frames[0].name).stem)}.png.",
             "mask",
         )
-    return found
+    return masks
 
 
 def find_in_masks(
@@ -139,10 +154,13 @@ def find_in_masks(
 
     A mask is scaled to its photograph; one of another aspect ratio raises an InputError.
     """
+    # How much of each Gaussian all photographs show: inside of masks, outside, and an empty third
+    # channel.
     sums = torch.zeros_like(scene.means)
     for number in track([number for number in masks if number in cameras], "masks"):
         frame = photographs.frame(number)
         size = frame.size()
+        # Masks of a scene hide what is black; here white is what goes.
         white = ~load_mask(masks[number], size, frame.title, frame.find_turn())
         mask = resize_mask(frame, white, size, resolution)
         frozen = renderer.freeze(scene, cameras[number])
@@ -152,7 +170,10 @@ def find_in_masks(
 
 def find_same_positions(scene: Gaussians, selected: Gaussians) -> Bool[Tensor, "n"]:
     """Find Gaussians of a scene at exactly the positions of others."""
+    # Equal positions get equal numbers, which can be compared as single values. Exactly, because a
+    # program that saves a selection leaves the positions as they were.
     points = torch.cat([selected.means, scene.means])
-    _, number = torch.unique(points, dim=0, return_inverse=True)
-    own, others = number[len(selected) :], number[: len(selected)]
-    return torch.isin(own, others)
+    _, numbers = torch.unique(points, dim=0, return_inverse=True)
+    numbers_of_selected = numbers[: len(selected)]
+    numbers_of_scene = numbers[len(selected) :]
+    return torch.isin(numbers_of_scene, numbers_of_selected)

@@ -20,15 +20,17 @@ from gscompleter.system.errors import InputError
 from gscompleter.types import Camera
 
 NUM_CONTEXT = 3
-"""Number of context photographs if targets but no context are named."""
+"""Number of context photographs if targets but no context are named (decision 030)."""
 NUM_CONTEXT_WITH_SPLAT = 8
 """Number of context photographs of an input splat, or if no targets are named either."""
-NUM_DEPTH_VIEWS, CHECK_VIEW_SIZE = 6, 320
-"""Photographs for depth range estimation, and the longer side of these and of check views."""
+NUM_DEPTH_VIEWS = 6
+"""Number of photographs from which a depth range is estimated."""
+CHECK_VIEW_SIZE = 320
+"""Longer side of these photographs and of check views, in pixels."""
 
 
 def choose_context(
-    options: CompleteOptions, given: Photographs, targets: Sequence[Target]
+    options: CompleteOptions, photographs: Photographs, targets: Sequence[Target]
 ) -> tuple[int, ...]:
     """Choose context frames for the targets, or for the whole scene without any.
 
@@ -36,10 +38,12 @@ def choose_context(
     photographs of which a mask hides everything.
     """
     target_frames = {target.frame for target in targets}
-    others = [frame for frame in range(len(given)) if frame not in target_frames]
+    others = [frame for frame in range(len(photographs)) if frame not in target_frames]
+
+    # Only chosen photographs are asked for their masks, since each has to be read for it.
     while True:
-        chosen = _choose_frames(options, given, targets, others)
-        hidden = {frame for frame in chosen if given.is_hidden(frame)}
+        chosen = _choose_frames(options, photographs, targets, others)
+        hidden = {frame for frame in chosen if photographs.is_hidden(frame)}
         if not hidden:
             return chosen
         others = [frame for frame in others if frame not in hidden]
@@ -47,12 +51,12 @@ def choose_context(
 
 def _choose_frames(
     options: CompleteOptions,
-    given: Photographs,
+    photographs: Photographs,
     targets: Sequence[Target],
     others: Sequence[int],
 ) -> tuple[int, ...]:
     """Choose context frames among `others`."""
-    cameras = collect_usable_cameras(given, others, parse_resolution(options.resolution))
+    cameras = collect_usable_cameras(photographs, others, parse_resolution(options.resolution))
     if not cameras:
         raise InputError(
             "The context needs photographs, and without the targets none can be used; name fewer "
@@ -60,11 +64,19 @@ def _choose_frames(
         )
     if len(cameras) == 1:
         return tuple(cameras)
-    candidates, target_cameras = list(cameras.values()), [target.camera for target in targets]
-    points = given.points()
+
+    candidates = list(cameras.values())
+    target_cameras = [target.camera for target in targets]
+
+    # What a photograph shows is judged by points of the scene: those of COLMAP, or else points
+    # that are spread in front of the cameras over the depth range.
+    points = photographs.points()
     if points is None or len(points) == 0:
         goals = target_cameras or summarize_cameras(candidates)
-        points = sample_scene_points(given, goals, cameras)
+        points = sample_scene_points(photographs, goals, cameras)
+
+    # Without targets, medoids of all photographs with a partner each; with targets, photographs
+    # that show what the targets see (decision 030).
     if not targets:
         chosen = select_overview(candidates, points, NUM_CONTEXT_WITH_SPLAT)
     else:
@@ -75,14 +87,14 @@ def _choose_frames(
 
 
 def collect_usable_cameras(
-    given: Photographs, frames: Sequence[int], resolution: Resolution
+    photographs: Photographs, frames: Sequence[int], resolution: Resolution
 ) -> dict[int, Camera]:
     """Return the valid cameras of frames that have a photograph."""
     cameras = {}
     for frame in frames:
         with suppress(InputError):
-            if given.frame(frame).has_photograph():
-                cameras[frame] = given.camera(frame, resolution)
+            if photographs.frame(frame).has_photograph():
+                cameras[frame] = photographs.camera(frame, resolution)
     return cameras
 
 
@@ -91,22 +103,28 @@ def select_closest(
 ) -> list[int]:
     """Select the frames whose cameras are nearest to a target, in ascending order."""
     centers = torch.stack([target.center for target in targets])
-    distance = {
-        f: (centers - c.center.to(centers)).norm(dim=-1).min().item() for f, c in cameras.items()
-    }
-    return sorted(sorted(cameras, key=distance.__getitem__)[:count])
+    distances = {}
+    for frame, camera in cameras.items():
+        distances[frame] = (centers - camera.center.to(centers)).norm(dim=-1).min().item()
+    nearest = sorted(cameras, key=lambda frame: distances[frame])[:count]
+    return sorted(nearest)
 
 
 def sample_scene_points(
-    given: Photographs, targets: Sequence[Camera], cameras: dict[int, Camera]
+    photographs: Photographs, targets: Sequence[Camera], cameras: dict[int, Camera]
 ) -> Float[Tensor, "n 3"]:
     """Sample points in front of the targets within the known or estimated depth range."""
-    near, far = given.near, given.far
+    near = photographs.near
+    far = photographs.far
     if near is None or far is None:
+        # Small photographs near the targets: the range need not be exact to choose among cameras.
         closest = select_closest(targets, cameras, NUM_DEPTH_VIEWS)
-        frames = [frame for frame in closest if not given.is_hidden(frame)]
-        low, high = estimate_depth_range(given.views(frames, CHECK_VIEW_SIZE))
-        near, far = low if near is None else near, high if far is None else far
+        frames = [frame for frame in closest if not photographs.is_hidden(frame)]
+        estimated_near, estimated_far = estimate_depth_range(
+            photographs.views(frames, CHECK_VIEW_SIZE)
+        )
+        near = estimated_near if near is None else near
+        far = estimated_far if far is None else far
     return torch.cat([make_points_in_front(target, near, far) for target in targets])
 
 
@@ -114,9 +132,10 @@ def select_near_and_far(
     wanted: Sequence[Camera], cameras: Mapping[int, Camera], count: int
 ) -> list[int]:
     """Select up to `count` frames: half nearest to `wanted`, the others spread over the rest."""
+    # With the nearest alone, photographs from other sides get worse unseen (decision 020).
     near = select_closest(wanted, cameras, count if len(cameras) <= count else count // 2)
     rest = [frame for frame in cameras if frame not in near]
     if not rest:
         return near
-    far = select_spread_cameras([cameras[frame] for frame in rest], count - len(near))
-    return sorted([*near, *(rest[i] for i in far)])
+    spread = select_spread_cameras([cameras[frame] for frame in rest], count - len(near))
+    return sorted([*near, *(rest[index] for index in spread)])
