@@ -275,6 +275,15 @@ def test_a_wrong_row_is_a_sentence(row, sentence, tmp_path):
         parse_row({"folder": "room", **row}, tmp_path / "out")
 
 
+def test_a_path_that_is_no_text_fails_its_row_alone(tmp_path, monkeypatch, capsys):
+    rows = [{"folder": ["a"], "name": "one"}, {"folder": "a", "scene": ["b"], "name": "two"}]
+    (tmp_path / "m.jsonl").write_text("\n".join(map(json.dumps, rows)))
+    assert run(monkeypatch, "batch", tmp_path / "m.jsonl", "--out", tmp_path / "out") == 1
+    said = capsys.readouterr().err
+    assert "Failed: one: The row has no folder" in said
+    assert "Done 0, failed 2" in said
+
+
 @pytest.fixture(scope="module")
 def manifest(tmp_path_factory) -> Path:
     """Write a manifest with two rooms, a missing folder, and a wrong option."""

@@ -80,8 +80,10 @@ def run_batch(options: BatchOptions) -> int:
             jobs = read_manifest(options.manifest, common, options.out)
 
             # The results may not lie in what the rows read.
-            cells = dict.fromkeys(job.options.get(name) for job in jobs for name in PATHS)
-            inputs = [Path(cell) for cell in cells if isinstance(cell, str) and cell]
+            # A row whose path is no text, as JSON allows, fails by itself.
+            cells = [job.options.get(name) for job in jobs for name in PATHS]
+            paths = dict.fromkeys(cell for cell in cells if isinstance(cell, str) and cell)
+            inputs = [Path(path) for path in paths]
             refuse_overlap(options.out, inputs)
 
             # Workers may run in another working folder, so they get an absolute path.
