@@ -21,19 +21,23 @@ from gscompleter.system.files.reading import read_json
 from gscompleter.types import Camera, Gaussians
 
 SCALE_RANGE = (1e-9, 1e9)
+"""Accepted range of the `scale` in a file of nerfstudio."""
 MAX_REMOTENESS = 1e3
-"""Ratio of coordinates to camera spread above which a local origin is used."""
+"""Ratio of the largest coordinate to the camera spread above which a local origin is used."""
 MAX_STEP = 1e-3
 """Coarsest float32 step of coordinates, relative to the camera spread."""
 
 
 def choose_local_origin(poses: Sequence[Float[np.ndarray, "4 4"]]) -> Float[np.ndarray, "3"]:
-    """Choose the coordinate origin: zero, or the first camera centre for remote cameras."""
+    """Choose the coordinate origin: zero, or the first camera centre for remote cameras.
+
+    `poses` are camera-to-world, in the photographs' frame.
+    """
     if not poses:
         return np.zeros(3)
     centers = np.stack([pose[:3, 3] for pose in poses])
     spread = np.abs(centers - centers[0]).max()
-    # Where the camera is far away, relative to what it moves, float32 loses the baselines.
+    # Where cameras are far from zero, relative to their distances, float32 loses the baselines.
     remote = spread > 0 and np.abs(centers).max() > MAX_REMOTENESS * spread
     return centers[0] if remote else np.zeros(3)
 
@@ -46,10 +50,13 @@ def compute_frame_from_photographs(origin: Float[np.ndarray, "3"]) -> Float[np.n
 
 
 def choose_scene_origin(scene: Gaussians, origin: Float[np.ndarray, "3"]) -> Float[np.ndarray, "3"]:
-    """Choose a scene's origin: `origin` if the scene lies near it, else zero."""
+    """Choose a scene's origin: `origin`, that of the photographs, if the scene lies near it.
+
+    Otherwise it is zero: a given splat may have been exported at a local origin already.
+    """
     if len(scene) == 0 or not origin.any():
         return origin
-    # A given splat may have been exported at a local origin already. The median ignores floaters.
+    # Near is less than half-way to zero, by the largest coordinate. The median ignores floaters.
     middle = scene.means.median(dim=0).values.double().cpu().numpy()
     there = np.abs(middle - origin).max() < 0.5 * np.abs(origin).max()
     return origin if there else np.zeros(3)
@@ -58,7 +65,10 @@ def choose_scene_origin(scene: Gaussians, origin: Float[np.ndarray, "3"]) -> Flo
 def shift_to_origin(
     origin: Float[np.ndarray, "3"], scene: Gaussians, cameras: Sequence[Camera]
 ) -> Gaussians:
-    """Express a scene relative to `origin` (scene units); refuses too coarse float32 steps."""
+    """Express a scene relative to `origin`, in scene units; refuse too coarse float32 steps.
+
+    The means of a given scene are float32 already, and what was rounded there cannot be restored.
+    """
     if not origin.any():
         return scene
     # Distance to the next float32 at the largest coordinate.
@@ -77,7 +87,7 @@ def shift_to_origin(
 
 
 def read_dataparser_transforms(path: Path) -> Float[np.ndarray, "4 4"]:
-    """Read the similarity from the reconstruction's frame to that of the trained scene.
+    """Read nerfstudio's similarity from the reconstruction's frame to that of the trained scene.
 
     The file holds a rigid 3×4 `transform` and a `scale` that multiplies its result.
     """

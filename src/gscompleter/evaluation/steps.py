@@ -1,7 +1,8 @@
 """Steps of a method on a task: one target after the other, into the same scene.
 
-After each step the photograph of its target is known and may be the anchor of a later step. In the
-paper the generator gets it too (our `oracle`), so that only registration is compared.
+After each step the photograph of its target is known and may be the anchor of a later step. With
+the generator `oracle` that photograph also stands in place of the synthesized image: then all
+images are true, and only their registration is compared, as in the paper's comparison with RegGS.
 """
 
 from __future__ import annotations
@@ -38,7 +39,7 @@ class PreparedTask:
     """Photographs beside the target, for scoring only."""
     models: Models
     seconds: float
-    """Wall time of the reconstruction."""
+    """Wall time of the reconstruction of the context."""
 
 
 @dataclass(frozen=True)
@@ -46,18 +47,22 @@ class SequenceStep:
     """Result of a method for one target."""
 
     frame: int
+    """Frame of the target."""
     anchor: int | None
     """Anchor frame, or None for a method that lifts nothing."""
     anchor_fallback: bool
+    """True if every view was rotated too far, so that the least rotated one is the anchor."""
     scores: scoring.Scores
     psnr_end: float | None
     """PSNR at the target, in dB, of the final scene of the task; None while the task runs."""
     depth_scale: float | None
     """See `scores.compute_depth_scale`; None in a task of one step or for too few pixels."""
     added: int
+    """Number of Gaussians in the scene after the step, less those before it."""
     gaussians: int
     """Number of Gaussians in the scene after the step."""
     seconds: dict[str, float]
+    """Wall time of each stage."""
     peak_bytes: int | None
 
 
@@ -154,7 +159,10 @@ def score_step(
 
 
 def get_metric_depth(target: View, anchor: View, models: Models) -> DepthMap:
-    """Return the measured depth of `target`, or an estimate of Ψ if the data have none."""
+    """Return the measured depth of `target`, or an estimate of Ψ if the data have none.
+
+    With an estimate the scale is not absolute: it is relative to that of the model.
+    """
     if target.depth is not None:
         return DepthMap(target.depth, target.depth > 0)
     return lift_pair(models.reconstructor, target, anchor).reference_depth
@@ -166,7 +174,10 @@ def compute_scale_drift(scales: Sequence[float]) -> float | None:
 
 
 def attempt(compute: Callable[[], T]) -> T | str:
-    """Return the result of `compute` or the reason of its failure; only OutputError is raised."""
+    """Return the result of `compute` or the reason of its failure; only OutputError is raised.
+
+    Where outputs cannot be written, as on a full disk, no other task would succeed either.
+    """
     try:
         return compute()
     except OutputError:

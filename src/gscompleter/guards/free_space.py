@@ -1,9 +1,10 @@
 """Free space (not in the paper): nothing is added in front of observed surfaces.
 
-In a hole only the lifted depth locates a Gaussian, but photographs exclude some positions: one in
-front of an observed surface slides back along its ray until no camera contradicts it. A Gaussian
-covers more than the pixel of its mean: beside the edge of an object that hides it, it would still
-occlude the surface behind that edge.
+In a hole only the lifted depth locates a Gaussian, but cameras exclude some positions: whatever
+stands in front of a surface that a camera sees would hide it there. Such a Gaussian slides back
+along its ray from the target camera until it hides no observed surface, or is dropped (decision
+008). A Gaussian covers more than the pixel of its mean. So one whose mean is hidden by an object
+slides, too, if it would show beside the edge of that object (decision 049).
 """
 
 from __future__ import annotations
@@ -26,18 +27,19 @@ from gscompleter.stages.target_view import TargetView
 from gscompleter.types import Camera, Gaussians, Render
 
 SLIDE_STEP = 0.04
-"""Step of a Gaussian along its ray, relative to its distance."""
+"""Step of a Gaussian along its ray, relative to its distance before the step."""
 CLEARANCE = 0.01
-"""Distance behind an observed surface, relative to depth, that counts as occluded.
+"""Least distance behind an observed surface, relative to its depth, that counts as occluded.
 A Gaussian there is invisible to the camera and still closes the hole."""
 BORDER = 3
-"""Pixels outside of an image at which a Gaussian is still visible."""
+"""Pixels beyond the border of an image up to which a Gaussian there still shows inside."""
 FOOTPRINT_RADIUS = 3.0
-"""Pixels of the target around that of its mean in which a Gaussian is still visible. Additions have
-a standard deviation of half a pixel there, and renderers blur them by as much."""
+"""Distance from its mean up to which a Gaussian is visible, in pixels of the target. Additions
+have a standard deviation of half a pixel there, and renderers blur them by as much."""
 FOOTPRINT_CLEARANCE = 0.02
-"""Distance in front of a surface in these pixels, relative to depth, that still counts as the same
-surface, which may be slanted. With 0.05 more of what shows beside edges stays."""
+"""Largest distance in front of the farthest surface of a footprint, relative to its depth, at
+which a hidden mean counts as part of that surface, which may be slanted. With 0.05, more Gaussians
+that show beside an edge would stay there."""
 
 
 @dataclass(frozen=True)
@@ -48,11 +50,11 @@ class Observed:
     depth: Float[Tensor, "h w"]
     """z-depth in scene units, 0 where the camera sees no surface."""
     farthest: Float[Tensor, "h w"]
-    """Largest of these depths within the footprint of an addition."""
+    """Largest of these depths within the footprint of an addition, in scene units."""
 
     @staticmethod
     def from_render(render: Render, camera: Camera, target: Camera) -> Observed:
-        """Take the surfaces of a render; additions are about a pixel of the target wide."""
+        """Take the surfaces of a render; `target` is the camera that additions are made for."""
         surfaces = render.depth_map()
         depth = surfaces.depth.where(surfaces.valid, 0.0)
         # The footprint is given in pixels of the target. A camera with a longer focal length sees
@@ -70,7 +72,7 @@ class FreeSpace(Guard):
     name = "free-space"
 
     def place(self, candidates: Gaussians, view: TargetView) -> Gaussians:
-        """Slide candidates back until no photograph or completed target sees through them."""
+        """Slide candidates back until no camera sees through them; drop those without a place."""
         state = view.state
         # The context bounds free space only as far as it is trusted: what no photograph confirms
         # may be a floater.
@@ -105,7 +107,11 @@ class FreeSpace(Guard):
 
 
 def ignore_removed(render: Render, camera: Camera, view: TargetView) -> Render:
-    """Observe nothing where something was removed: what stands behind it bounds no free space."""
+    """Let a camera observe nothing in pixels where something was removed from the scene.
+
+    A render now shows there what stands behind the removed object. The space in front of that was
+    filled by the object, so no photograph saw through it, and the fill may stand there.
+    """
     source = view.state.source
     if len(source.removed) == 0:
         return render
@@ -123,13 +129,15 @@ def respect_free_space(
 ) -> tuple[Gaussians, Bool[Tensor, "n"]]:
     """Slide Gaussians back along target rays out of free space; mark those that found a place.
 
-    `renders` show the scene at `cameras`. A position along a ray is the ratio to the distance that
-    a Gaussian had at first. Those without a place end where the last step left them.
+    `renders` show the scene at `cameras`. With a constant `footprint` Gaussians grow with their
+    distance, so that the image at the target stays the same. Those without a place end where the
+    last step left them; the caller drops them.
     """
     observed = [
         Observed.from_render(render, camera, target)
         for render, camera in zip(renders, cameras, strict=True)
     ]
+    # A position along a ray is a multiple of the distance that a Gaussian had at first.
     ratio = torch.ones_like(gaussians.opacities)
     offsets = gaussians.means - target.center
     waiting = torch.arange(len(gaussians), device=ratio.device)
@@ -141,8 +149,8 @@ def respect_free_space(
         # Relative to the distance, so that the result does not depend on the scene unit.
         ratio[waiting] = (1 + SLIDE_STEP) ** (step + 1)
 
-    # Gaussians that find no position up to the sky become part of it: just behind its depth they
-    # count as occluded.
+    # The steps may end before the sky. What still waits is placed just behind the depth at which
+    # the sky is drawn. There it counts as occluded, unless another camera sees through it.
     if any(is_sky_visible(render, camera) for render, camera in zip(renders, cameras, strict=True)):
         depths = compute_z_depths(gaussians.means[waiting], target)
         behind = (1 + SLIDE_STEP) * compute_sky_depth(target) / depths
@@ -173,7 +181,7 @@ def is_before_surface(points: Float[Tensor, "n 3"], observed: Observed) -> Bool[
     """Mark points in front of what a camera observes, or inside of its near distance.
 
     A point that a surface hides is marked too if its footprint reaches over the edge of that
-    surface, to one behind the point.
+    surface and covers another surface, which lies behind the point.
     """
     camera = observed.camera
     pixels, z = project(points, camera)
@@ -189,9 +197,10 @@ def is_before_surface(points: Float[Tensor, "n 3"], observed: Observed) -> Bool[
     # Depth is 0 where no surface is seen, so that nothing is in front of it.
     before = z < (1 + CLEARANCE) * depth
     # Half-way between an object and the wall, a mean is hidden by the object, but its footprint
-    # shows beside the edge, before the wall (decision 049). It has to slide on to the wall.
+    # shows beside the edge, before the wall (decision 049). It has to slide on to the wall. Where
+    # its own pixel shows no surface, nothing hides it: it is in a hole of this camera and may stay.
     beside = (depth > 0) & (z < (1 - FOOTPRINT_CLEARANCE) * observed.farthest[y, x])
-    # In any direction, in the image or not: without this, photographs of a capture lost up to
-    # 8.6 dB (decision 029).
+    # The near distance counts in any direction, in the image or not: without this rule,
+    # photographs of a capture lost up to 8.6 dB (decision 029).
     is_near = (points - camera.center).norm(dim=-1) < (camera.near or 0.0)
     return (visible & (before | beside)) | is_near

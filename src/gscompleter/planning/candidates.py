@@ -2,7 +2,8 @@
 
 Each camera is translated in six directions, turned in four, and moved on four orbits. Steps are so
 short that most of what a candidate sees was observed; horizons stay as level as in photographs.
-Around a trained splat, candidates stand beside and between photographs and look at the same scene.
+Around a trained splat, candidates only stand beside and between photographs, and look at the same
+scene (`stays_beside`).
 """
 
 from __future__ import annotations
@@ -27,7 +28,7 @@ from gscompleter.numerics.geometry import (
 from gscompleter.types import Camera, Render
 
 FREE_SPACE_MARGIN = 0.1
-"""Distance in front of a surface, relative to depth, from which a point is in free space."""
+"""Least distance in front of a surface, relative to its depth, of a point in free space."""
 MOVES_ASIDE = (0, 1, 10, 11)
 """Moves of `make_moves` to the right and left, straight and around what the camera looks at."""
 MIN_COVERAGE = 0.05
@@ -42,7 +43,7 @@ class Candidate:
     base: int
     """Index of the camera that it was derived from."""
     nearest: float
-    """5 % quantile of the z-depths that this camera sees, in scene units."""
+    """5 % quantile of the z-depths that the base camera sees, in scene units."""
     region: Bool[Tensor, "*size"] = torch.tensor(True)
     """Pixels of its small image that may be completed; all by default."""
 
@@ -56,19 +57,20 @@ def propose_candidates(
 ) -> list[Candidate]:
     """Propose the moves of each base camera that end in free space.
 
-    `renders` show the scene at `bases`. `step` is the longest move in scene units, 0 if unknown.
-    With `stays_beside`, cameras move aside or halfway to the most similar base only.
+    `renders` show the scene at `bases`, at a small size. `step` is the longest move in scene units,
+    0 if unknown. With `stays_beside`, cameras move aside or halfway to the most similar base only.
     """
     depths = compute_depth_quantiles(renders, 0.5)
     nearest = compute_depth_quantiles(renders, 0.05)
     up = estimate_up(bases)
-    # The first of the sorted cameras is the camera itself. Of a single base there is no second.
+    # The base that is most similar to each: the second of the sorted ones, since the first is the
+    # camera itself. Of a single base there is no second, and the list stays empty.
     places = embed_cameras(bases)
     similar = torch.cdist(places, places).argsort(dim=1)[:, 1:2].tolist()
 
     candidates = []
     for index, (base, depth) in enumerate(zip(bases, depths, strict=True)):
-        # Relative to the depth, or else a step would leave all that the photograph shows.
+        # At most a fraction of the depth, or else a step would leave all that the photograph shows.
         longest = config.max_step * depth
         length = min(step, longest) if step > 0 else longest
         moved = make_moves(base, depth, length, config.yaw_fraction, up)
@@ -113,7 +115,10 @@ def make_moves(
 def orbit_camera(
     camera: Camera, pivot: Float[Tensor, "3"], angles: tuple[float, float], up: Float[Tensor, "3"]
 ) -> list[Camera]:
-    """Turn a camera about a point by two angles in radians, about `up` and about its x axis."""
+    """Turn a camera about `pivot`, both ways: about `up`, and about its own x axis.
+
+    `angles`, in radians, are those of the two axes.
+    """
     # About `up` instead of the camera's own y axis, which keeps the horizon level.
     axes = (up, camera.c2w[:3, 0])
     arm = camera.center - pivot
@@ -126,7 +131,7 @@ def orbit_camera(
 
 
 def move_camera(camera: Camera, turn: Float[Tensor, "3 3"], shift: Float[Tensor, "3"]) -> Camera:
-    """Rotate a camera in world axes and shift its centre."""
+    """Rotate a camera by `turn` and shift its centre by `shift`, both in world axes."""
     c2w = camera.c2w.clone()
     c2w[:3, :3] = turn @ camera.c2w[:3, :3]
     c2w[:3, 3] += shift
@@ -134,7 +139,7 @@ def move_camera(camera: Camera, turn: Float[Tensor, "3 3"], shift: Float[Tensor,
 
 
 def interpolate_camera(first: Camera, second: Camera, share: float) -> Camera:
-    """Interpolate from `first` to the pose of `second`."""
+    """Move `first` by a `share` in [0, 1] of the way to the pose of `second`."""
     # The rotation, in world axes, that turns the first camera into the second.
     turn = second.c2w[:3, :3].double() @ first.c2w[:3, :3].double().T
     shift = share * (second.center - first.center)
@@ -144,9 +149,11 @@ def interpolate_camera(first: Camera, second: Camera, share: float) -> Camera:
 def is_in_free_space(
     point: Float[Tensor, "3"], cameras: Sequence[Camera], renders: Sequence[Render]
 ) -> bool:
-    """Return True if a photograph sees through a point, or if none shows an occluder.
+    """Return True if a photograph sees through a point, or if none has a surface at or before it.
 
-    `renders` show the scene at `cameras` and have their sizes.
+    One photograph that sees through it outweighs others that do not: to them it may be hidden.
+    `renders` show the scene at `cameras` and have their sizes. Only surfaces count: a hole, and
+    what is outside of an image, says nothing.
     """
     is_hidden = False
     for camera, render in zip(cameras, renders, strict=True):
@@ -165,14 +172,14 @@ def is_in_free_space(
 
 
 def is_close(render: Render, nearest: float, config: NextBestViewConfig) -> bool:
-    """Return True if surfaces much closer than `nearest` fill too much of an image."""
+    """Return True if surfaces much closer than `nearest` (z-depth) fill too much of an image."""
     seen = render.depth_map()
     near = seen.valid & (seen.depth < config.clearance * nearest)
     return near.float().mean().item() > config.max_close
 
 
 def compute_depth_quantiles(renders: Sequence[Render], share: float) -> list[float]:
-    """Compute a quantile of the z-depths in each render, in scene units.
+    """Compute the quantile at `share` in [0, 1] of the z-depths in each render, in scene units.
 
     A render that shows hardly anything of the scene gets the quantile over all renders.
     """

@@ -1,7 +1,10 @@
-"""LOD proxies of large scenes.
+"""LOD proxies of large scenes, because time and memory of every stage grow with the Gaussians.
 
-Gaussians within half a pixel of each other are merged, at the working resolution of all cameras.
-Completion uses the proxy; all output is made from the scene itself.
+A run is a sequence of Gaussians, adjacent in the order of the scene, that lie within half a pixel
+of the first of them in all cameras, at working resolution. Each run is merged to one Gaussian.
+Large scenes are sorted along a Morton curve before (decision 025), so that neighbours in space are
+mostly neighbours in this order. Completion uses the proxy; all output is made from the scene itself
+(decision 024). The second half of this file thins scenes by sampling, without any camera.
 """
 
 from __future__ import annotations
@@ -30,7 +33,7 @@ MAX_REACH = 0.5
 MAX_DEVIATION = 2.0
 """Largest standard deviation of a Gaussian that shares a run, in pixels."""
 MAX_GROWTH = 8.0
-"""Largest factor on both, if the proxy would be too large otherwise."""
+"""Largest factor on MAX_REACH and MAX_DEVIATION, if the proxy would be too large otherwise."""
 
 
 def build_proxy(scene: Gaussians, cameras: Sequence[Camera]) -> ContextScene:
@@ -43,7 +46,8 @@ def build_proxy(scene: Gaussians, cameras: Sequence[Camera]) -> ContextScene:
 def simplify_scene(scene: Gaussians, cameras: Sequence[Camera]) -> ContextScene:
     """Merge runs of adjacent, close Gaussians of one provenance to one Gaussian each.
 
-    Runs are as few as frozen views of `cameras` can hold. A scene in random order has no runs.
+    Runs become longer until their number fits in the memory of the frozen views of `cameras`. In a
+    scene in random order adjacent Gaussians are far apart, and almost nothing is merged.
     """
     # Kernels take harmonics as one row per Gaussian.
     arrays = to_arrays(scene)
@@ -77,7 +81,11 @@ def find_run_starts(
     generated: UInt8[ndarray, "n"],
     cameras: Sequence[Camera],
 ) -> Int64[ndarray, "bounds"]:
-    """Find the start of each run, and the end [m + 1]."""
+    """Find the first row of each of m runs, and append the number of Gaussians: m + 1 bounds.
+
+    `means` are in the world frame; `generated` is the provenance, which is the same within a run.
+    A pixel is that of the camera in which a Gaussian appears largest.
+    """
     centers = to_float32(torch.stack([camera.center for camera in cameras]))
     focals = to_float32(torch.stack([camera.K[0, 0] for camera in cameras]))
     begins = np.empty(len(means), np.bool_)
@@ -114,8 +122,8 @@ SAMPLE_SIZE = 100_000
 def thin_gaussians(scene: Gaussians, max_gaussians: int = MAX_GAUSSIANS) -> Gaussians:
     """Reduce a scene to about `max_gaussians` Gaussians, enlarged to cover the same area.
 
-    Gaussians are kept with a probability proportional to their size. The choice depends on their
-    order alone, and neighbours in the file are thinned evenly.
+    Gaussians are kept with a probability proportional to their size. No random number takes part,
+    so that the same scene is always thinned alike, and every stretch of the file is thinned evenly.
     """
     if len(scene) <= max_gaussians:
         return scene
@@ -127,11 +135,12 @@ def thin_gaussians(scene: Gaussians, max_gaussians: int = MAX_GAUSSIANS) -> Gaus
 def choose_thinned_rows(
     scene: Gaussians, max_gaussians: int = MAX_GAUSSIANS
 ) -> tuple[Int[Tensor, "m"], Float[Tensor, "m"]]:
-    """Select the rows to keep, and the factor by which their sizes grow."""
+    """Select the rows to keep, and the factor by which their standard deviations grow."""
     if len(scene) <= max_gaussians:
         return torch.arange(len(scene), device=scene.means.device), torch.ones_like(scene.opacities)
-    # Systematic sampling: a Gaussian is kept if the sum of probabilities passes a whole number
-    # there. It stands for 1 / probability Gaussians, and its area grows by that factor.
+    # Systematic sampling: a Gaussian is kept if the running sum of probabilities reaches the next
+    # whole number at its row. It stands for 1 / probability Gaussians, and its area grows by that
+    # factor, so that its standard deviations grow by the square root.
     probability = compute_keep_probabilities(scene, max_gaussians)
     passed = probability.double().cumsum(0).floor()
     rows = torch.nonzero(passed > torch.nn.functional.pad(passed[:-1], (1, 0)))[:, 0]
@@ -139,7 +148,9 @@ def choose_thinned_rows(
 
 
 def compute_keep_probabilities(scene: Gaussians, max_gaussians: int) -> Float[Tensor, "n"]:
-    """Compute keep probabilities proportional to projected size; their sum is at most the limit.
+    """Compute keep probabilities proportional to size; their sum is at most the limit.
+
+    Size is the square root of area times opacity, without any camera.
 
     The largest 1 % is clamped: floaters and sky are large, few, and useless for matching.
     """

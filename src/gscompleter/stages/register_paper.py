@@ -1,6 +1,8 @@
 """Registration of the lifted Gaussians as the paper has it: Eq. 9 to 11 (Sec. III-E).
 
-`register.py` is ours, which departs from it where measurements favour another choice.
+The affine of Eq. 8 is given (`align_depth.py`). `register.py` is our registration, which departs
+from the paper where measurements favour another choice. `docs/paper.md` lists how we read what the
+paper leaves open; comments here say "our reading" at these places.
 """
 
 from __future__ import annotations
@@ -28,11 +30,13 @@ def register_as_paper(
 ) -> Registration:
     """Align all Gaussians by one affine of depth, then each along its own ray.
 
-    `reference` is the synthesized image Ĩ_t at the target camera.
+    With `paper()` these are all of G_tgt: the paper filters by holes only afterwards. `reference`
+    is the synthesized image Ĩ_t at the target camera.
     """
     initial = initialize_distances(lifted.gaussians, affine, reference.camera)
     if len(initial) == 0 or view.state.config.paper_registration.iterations == 0:
-        # Nothing was lifted, or the ablation without RC (Table IV): the affine alone counts.
+        # Nothing was lifted, or the ablation without RC (Table IV): the affine alone counts. The
+        # paper's text calls that row "unconstrained optimization"; our reading is that of its name.
         return Registration(initial, lifted.pixel_index, ())
     registered, losses = optimize_paper_distances(initial, reference, view)
     return Registration(registered, lifted.pixel_index, losses)
@@ -41,8 +45,10 @@ def register_as_paper(
 def initialize_distances(lifted: Gaussians, affine: DepthAffine, camera: Camera) -> Gaussians:
     """Move Gaussians along their rays to z-depth `s D + t` of the target (Eq. 9).
 
-    Both the z-depth of a point on a ray and its distance from the camera are proportional to it,
-    d_init = D_init / (r · v), so that the ratio of depths is that of distances.
+    Eq. 9 divides z-depth by `r · v`, the cosine between ray and principal axis, which is the same
+    before and after the move. So the ratio of z-depths is the ratio of distances d_i. Our reading:
+    the paper samples D at the projection u_i of a Gaussian, and we take the z-depth of its mean,
+    which is that value for pixel-aligned Gaussians. Scales stay, as the paper names no change.
     """
     predicted = compute_z_depths(lifted.means, camera)
     aligned = affine.scale * predicted + affine.shift
@@ -54,17 +60,20 @@ def optimize_paper_distances(
 ) -> tuple[Gaussians, tuple[float, ...]]:
     """Minimize Eq. 11 over the distances; also return its value at each iteration.
 
-    Rotations, scales, opacities and colours are frozen.
+    Rotations, scales, opacities and colours are frozen, as all but positions. Our reading: the
+    paper names no optimizer and no unit of its learning rate; we take Adam and scene units.
     """
     config = view.state.config.paper_registration
     target = reference.camera
     anchor = view.anchor_view.camera
-    # What the context shows is compared with throughout: D_ctx at the target and at the anchor.
+    # D_ctx^tgt and D_ctx^anc are rendered from G_ctx once, since G_ctx is frozen. It contains what
+    # earlier targets added.
     context_at_target = view.render.depth_map()
     context_at_anchor = view.anchor_render.depth_map()
     move = MOVES[config.degrees_of_freedom]
 
-    # Adam changes d_i = d_i^init + δ_i in scene units, beginning with δ_i = 0.
+    # Adam changes δ_i, beginning with 0, in d_i = d_i^init + δ_i (scene units). Its steps depend on
+    # gradients alone, so that they are those of optimizing d_i. For 3-DoF, δ_i is a vector.
     offsets = torch.zeros(
         (len(initial), config.degrees_of_freedom),
         device=initial.means.device,
@@ -108,11 +117,15 @@ def move_freely(initial: Gaussians, offsets: Float[Tensor, "n 3"], camera: Camer
 MOVES = {1: move_on_rays, 3: move_freely}
 """Motion by degrees of freedom."""
 ADAM_BETAS = (0.9, 0.999)
-"""Adam's usual decay rates; the paper names none."""
+"""Adam's usual decay rates; the paper names neither the optimizer nor its rates."""
 
 
 def compute_depth_error(rendered: DepthMap, context: DepthMap) -> Float[Tensor, ""]:
-    """Compute the L1 error of depth where both show a surface, averaged over the whole image."""
+    """Compute the L1 error of depth where both show a surface, averaged over the whole image.
+
+    Our reading: the paper writes a norm ‖·‖_1 over the image, and neither a mean nor a mask. A
+    render shows a surface where its alpha is at least 0.5.
+    """
     error = (rendered.depth - context.depth).abs()
     return torch.where(rendered.valid & context.valid, error, 0.0).mean()
 

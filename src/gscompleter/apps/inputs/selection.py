@@ -22,11 +22,12 @@ from gscompleter.types import Camera
 NUM_CONTEXT = 3
 """Number of context photographs if targets but no context are named (decision 030)."""
 NUM_CONTEXT_WITH_SPLAT = 8
-"""Number of context photographs of an input splat, or if no targets are named either."""
+"""Number of context photographs with an input splat. It is also the number without one if no
+targets are named either, so that the photographs have to show the whole scene (decision 030)."""
 NUM_DEPTH_VIEWS = 6
 """Number of photographs from which a depth range is estimated."""
 CHECK_VIEW_SIZE = 320
-"""Longer side of these photographs and of check views, in pixels."""
+"""Longer side, in pixels, of check views and of the photographs for a depth range."""
 
 
 def choose_context(
@@ -55,7 +56,7 @@ def _choose_frames(
     targets: Sequence[Target],
     others: Sequence[int],
 ) -> tuple[int, ...]:
-    """Choose context frames among `others`."""
+    """Choose context frames among `others`, hidden by a mask or not."""
     cameras = collect_usable_cameras(photographs, others, parse_resolution(options.resolution))
     if not cameras:
         raise InputError(
@@ -89,7 +90,7 @@ def _choose_frames(
 def collect_usable_cameras(
     photographs: Photographs, frames: Sequence[int], resolution: Resolution
 ) -> dict[int, Camera]:
-    """Return the valid cameras of frames that have a photograph."""
+    """Return the cameras of frames that have a photograph, and leave out invalid ones."""
     cameras = {}
     for frame in frames:
         with suppress(InputError):
@@ -132,7 +133,8 @@ def select_near_and_far(
     wanted: Sequence[Camera], cameras: Mapping[int, Camera], count: int
 ) -> list[int]:
     """Select up to `count` frames: half nearest to `wanted`, the others spread over the rest."""
-    # With the nearest alone, photographs from other sides get worse unseen (decision 020).
+    # With the nearest alone, photographs from other sides get worse without being checked
+    # (decision 020).
     near = select_closest(wanted, cameras, count if len(cameras) <= count else count // 2)
     rest = [frame for frame in cameras if frame not in near]
     if not rest:

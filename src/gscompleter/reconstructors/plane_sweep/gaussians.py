@@ -65,9 +65,10 @@ class Splatter:
         """Build the Gaussians of `views` and fit them to the photographs.
 
         One or two views keep all pixels. With more views each surface is kept once, from the view
-        that resolves it best; observed free space stays empty, and clearly different exposures are
-        normalized to their mean. `depths` are in scene units, `layers` are the same per widest
-        baseline.
+        that resolves it best, and observed free space stays empty, because merged views contradict
+        each other (decision 031). Clearly different exposures are normalized to their mean.
+        `depths` are in scene units. `layers` hold the inverse depths, with the widest baseline as
+        unit of length, and `transforms` relate the views of these layers.
         """
         gains = torch.from_numpy(estimate_gains(layers, transforms)).float()
         device = views[0].image.device
@@ -81,6 +82,7 @@ class Splatter:
         candidates = merge(parts).to("cpu")
         on_cpu = [view.to("cpu") for view in views]
         kept = self.select_pixels(candidates, on_cpu, layers, transforms)
+        # Nothing is reconstructed from masked pixels.
         kept &= flatten_masks([view.valid_mask for view in on_cpu])
         skies = self.extend_skies(normalized, depths)
         scene = merge([candidates[kept], *(gaussians.to("cpu") for _, gaussians, _ in skies)])
@@ -116,6 +118,7 @@ class Splatter:
 
     def fit_to_image(self, gaussians: Gaussians, view: View) -> Gaussians:
         """Fit only the colours, to one image."""
+        # The Gaussians are drawn alone: the frozen scene that they are added to is empty.
         alone = self.renderer.freeze(gaussians[:0], view.camera)
         return fit_colors(gaussians, [alone], [view], [RELAXATION] * COLOR_ROUNDS)
 
@@ -126,9 +129,10 @@ class Splatter:
         layers: Sequence[DepthLayer],
         transforms: Transforms,
     ) -> Bool[Tensor, "n"]:
-        """Select the pixels that form the scene, over all views in turn."""
+        """Select the pixels that form the scene: a mask over the pixels of all views in turn."""
         if len(views) <= 2:
             return torch.ones(len(gaussians), dtype=torch.bool)
+        # `free` marks pixels without contradiction: other views do not see through their points.
         free = find_free_pixels(layers, transforms)
         kept = flatten_masks(find_finest_pixels(layers, free, transforms))
         # Where the finer views do not close a surface, a view gets its own pixels back. Each view
@@ -152,7 +156,12 @@ class Splatter:
     def fit_gaussians(
         self, gaussians: Gaussians, views: Sequence[View], gains: Float[Tensor, "views 3"]
     ) -> Gaussians:
-        """Fit the Gaussians to views that are brighter by `gains`."""
+        """Fit the Gaussians to views whose colours are `gains` times those of the scene.
+
+        Of one view only colours are fitted. Two views get colours by direction: plain ones, fitted
+        to both, would cancel other errors there and be wrong elsewhere (decision 043). Of more
+        views place, size, direction, opacity and colour are fitted together (decision 031).
+        """
         if len(views) == 1:
             return self.fit_to_image(gaussians, views[0])
         if len(views) == 2:
@@ -187,8 +196,8 @@ def make_discs(
 ) -> Gaussians:
     """Create one Gaussian per pixel of `view`, row by row, at z-depth `depth`.
 
-    `normals` are in camera axes, towards the camera; `sigma` is the standard deviation across the
-    viewing ray, in pixels.
+    `depth` is in scene units; `normals` are unit vectors in camera axes, towards the camera;
+    `sigma` is the standard deviation across the viewing ray, in pixels. Means are in world axes.
     """
     camera = view.camera
     rays = camera.z_rays()
@@ -196,7 +205,7 @@ def make_discs(
     # Width of a pixel at the depth of the surface, in scene units.
     pixel = depth.reshape(-1) * 2 / (camera.K[0, 0] + camera.K[1, 1])
 
-    # Both in world axes.
+    # Normal and direction towards the camera, both in world axes.
     normal = normals.reshape(-1, 3) @ camera.c2w[:3, :3].T
     towards = -torch.nn.functional.normalize(rays, dim=-1).reshape(-1, 3)
     cosine = (normal * towards).sum(-1, keepdim=True).clamp_min(1 / MAX_STRETCH)
@@ -224,11 +233,15 @@ def make_discs(
 
 
 def compute_normals(depth: Float[Tensor, "h w"], view: View) -> Float[Tensor, "h w 3"]:
-    """Compute normals in camera axes, towards the camera, by one-sided differences."""
+    """Compute unit normals in camera axes, towards the camera, by one-sided differences.
+
+    Central differences would mix two surfaces at the edge of an object.
+    """
     camera = view.camera
+    # To camera axes.
     rays = camera.z_rays() @ camera.c2w[:3, :3]
-    # Rays are in camera axes. The unit is a power of two, which is exact, so that squares neither
-    # overflow nor vanish.
+    # Depths are divided by about their median, so that squares neither overflow nor vanish. The
+    # unit is a power of two, by which a division is exact.
     unit = 2.0 ** depth.median().log2().round().item()
     points = rays * (depth / unit)[..., None]
 

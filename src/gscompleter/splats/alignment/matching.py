@@ -1,6 +1,7 @@
-"""Finds a similarity by features: photographs are matched with renders of the splat.
+"""Finds the similarity from the photographs' frame to the splat's frame by matching features.
 
-It is rendered from all directions until some match; renders at their cameras refine the result.
+The splat is rendered from all directions until some photographs match a render. Then it is rendered
+at the cameras of the photographs, mapped into its frame, which refines the result.
 """
 
 from __future__ import annotations
@@ -38,14 +39,15 @@ MAX_REPROJECTION_ERROR = 3.0
 NUM_DIRECTIONS = 40
 """Directions around the splat, about 30° apart; features tolerate half of that and any roll."""
 SCALE_FACTORS = (1.0, 0.6, 1.7)
-"""Trial factors on the size of the splat, which far Gaussians and floaters blur."""
+"""Factors on the measured size of the splat, which are all tried, since far Gaussians and floaters
+make it uncertain."""
 NUM_ROUNDS = 2
-"""Iterations of the refinement, each with renders at the cameras of the previous one."""
+"""Iterations of the refinement, each with renders at the cameras that the previous one found."""
 
 PhotoFeatures = tuple[Camera, Features]
 """A photograph's camera and features."""
 RenderedFeatures = tuple[Features, Float[np.ndarray, "h w 3"]]
-"""Features of a render, and the visible point of the splat at each pixel, or NaN."""
+"""Features of a render, and per pixel the visible point in the splat's frame, or NaN."""
 
 
 @dataclass(frozen=True)
@@ -59,13 +61,18 @@ class LocatedPhoto:
     points: Float[np.ndarray, "m 3"]
     """Inliers, in the splat's frame."""
     pixels: Float[np.ndarray, "m 2"]
+    """Where the photograph shows these points."""
 
 
 def search_similarities(
     scene: Gaussians, photographs: Sequence[PhotoFeatures], points: Points, renderer: Renderer
 ) -> Iterator[Matrix]:
-    """Yield similarities from photographs to splat by which some photographs match."""
-    # One camera is placed around the splat; the others are located in its render.
+    """Yield similarities from the photographs' to the splat's frame for which photographs match.
+
+    `points` are points of the scene in the photographs' frame.
+    """
+    # The camera `seer` is placed around the splat, and each photograph is located by its features
+    # in what that camera sees.
     seer = photographs[len(photographs) // 2][0]
     if len(scene) == 0 or not has_baseline([get_camera_pose(camera) for camera, _ in photographs]):
         return
@@ -83,7 +90,10 @@ def search_similarities(
 def generate_starts(
     pose: Matrix, points: Points, solid: Float[np.ndarray, "n 3"]
 ) -> Iterator[Matrix]:
-    """Yield similarities that map `points` to `solid`, from all directions."""
+    """Yield similarities that map `points` onto `solid`, one for each direction of view and size.
+
+    `pose` (camera-to-world) and `points` are in the photographs' frame, `solid` in the splat's.
+    """
     center, radius = compute_center_radius(points)
     new_center, new_radius = compute_center_radius(solid)
     if new_radius == 0:  # most of it is one point: all directions are alike
@@ -113,7 +123,7 @@ def sample_directions(count: int) -> Float[np.ndarray, "n 3"]:
 def refine_similarity(
     scene: Gaussians, photographs: Sequence[PhotoFeatures], start: Matrix, renderer: Renderer
 ) -> Matrix | None:
-    """Refine a similarity (photographs to splat) by features; None if too few match."""
+    """Refine a similarity (photographs' to splat's frame); None if too few photographs match."""
 
     def locate(photograph: PhotoFeatures, camera: Camera) -> LocatedPhoto | None:
         return locate_photo(render_features(scene, camera, renderer), photograph)
@@ -128,23 +138,28 @@ def refine_similarity(
 
 
 def fit_similarity(photos: Sequence[LocatedPhoto | None]) -> Matrix | None:
-    """Fit photographs' frame to splat's frame by located photographs; None if too few."""
+    """Fit the similarity from the photographs' to the splat's frame; None without a solution.
+
+    Photographs that were not located are None. The others need a baseline: poses at one place
+    determine no scale.
+    """
     located = [photo for photo in photos if photo is not None]
     before = [get_camera_pose(photo.camera) for photo in located]
     if not has_baseline(before):
         return None
     start = fit_pose_similarity(before, [photo.pose for photo in located])
-    # Poses found in one place leave no scale.
+    # The poses found in the splat may coincide, too, which makes the scale zero.
     if not np.linalg.det(start[:3, :3]) > 0:
         return None
     return minimize_reprojection(located, start)
 
 
 def minimize_reprojection(photos: Sequence[LocatedPhoto], start: Matrix) -> Matrix:
-    """Minimize the robust reprojection error over similarities.
+    """Minimize the robust reprojection error over similarities, from `start` on.
 
-    The seven unknowns move the splat's points in the photographs' frame: logarithm of the scale,
-    rotation vector, and shift in units of the points' spread.
+    `start` and the result map the photographs' frame to the splat's. The splat's points are taken
+    to the photographs' frame by the inverse of `start`. Seven unknowns then move them there:
+    logarithm of the scale, rotation vector, and shift in units of the points' spread.
     """
     # Imported here, because it takes half a second and few splats need it.
     from scipy.optimize import least_squares
@@ -178,7 +193,10 @@ def minimize_reprojection(photos: Sequence[LocatedPhoto], start: Matrix) -> Matr
 def _compute_residuals(
     points: Float[np.ndarray, "m 3"], photo: LocatedPhoto
 ) -> Float[np.ndarray, "k"]:
-    """Compute the reprojection errors along x and y, in pixels."""
+    """Compute the reprojection errors along x and y, in pixels, at the camera of `photo`.
+
+    `points` are in the photographs' frame.
+    """
     pose = get_camera_pose(photo.camera)
     local = (points - pose[:3, 3]) @ pose[:3, :3]
     homogeneous = local @ photo.camera.K.detach().cpu().double().numpy().T
@@ -198,7 +216,7 @@ def extract_view_features(view: View) -> Features:
 
 
 def render_features(scene: Gaussians, camera: Camera, renderer: Renderer) -> RenderedFeatures:
-    """Extract the features of what `camera` sees of the splat."""
+    """Extract the features of what `camera`, in the splat's frame, sees of the splat."""
     render = render_from(scene, camera, renderer)
     surface = unproject(render.depth, camera).where((render.alpha >= COVERED)[..., None], torch.nan)
     features = extract_view_features(View(render.image, camera))
@@ -206,7 +224,7 @@ def render_features(scene: Gaussians, camera: Camera, renderer: Renderer) -> Ren
 
 
 def locate_photo(rendered: RenderedFeatures, photograph: PhotoFeatures) -> LocatedPhoto | None:
-    """Estimate a photograph's pose by PnP against a render; None with too few inliers."""
+    """Estimate a photograph's pose in the splat's frame by PnP; None with too few inliers."""
     features, surface = rendered
     camera, own_features = photograph
     # Each feature of the render has a point of the splat, which gives 2D to 3D matches.

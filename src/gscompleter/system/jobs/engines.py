@@ -1,4 +1,8 @@
-"""Engines, which start workers: local processes, Ray tasks, or SLURM jobs through submitit."""
+"""Engines, which start workers: local processes, Ray tasks, or SLURM jobs through submitit.
+
+Each `open_…` yields a `Pool`. Its `start` takes a share, the callable that one worker runs, and
+returns a future of the exception that ended the share, or of None.
+"""
 
 from __future__ import annotations
 
@@ -24,15 +28,17 @@ from gscompleter.system.threads import count_available_cores, limit_threads
 EngineName = Literal["local", "ray", "submitit"]
 
 PIXELS = 640 * 480
-"""Pixels per image of a typical completion, for the default number of workers."""
+"""Pixels per image of a typical completion; its memory limits the default number of workers."""
 IMAGES = 8
 """Images of a typical completion."""
 STOP_SECONDS = 10.0
-"""Time that stopped workers have to remove what they have not finished."""
+"""Time, in seconds, that stopped workers have to remove what they have not finished."""
 RAY_VARIABLES = {"RAY_USAGE_STATS_ENABLED": "0", "RAY_ACCEL_ENV_VAR_OVERRIDE_ON_ZERO": "0"}
-"""Variables against messages to Ray's makers, and of Ray on standard error."""
+"""Environment of Ray. The first variable turns off usage reports to its makers, the second a
+warning on standard error."""
 STORE_BYTES = 200 * 10**6
-"""Memory for return values in a local Ray cluster; they are small, as results are files."""
+"""Memory, in bytes, for return values in a local Ray cluster. Results are files, so that return
+values are small."""
 
 
 def choose_num_workers() -> int:
@@ -60,7 +66,8 @@ def check_processes() -> None:
 @contextlib.contextmanager
 def open_local(workers: int) -> Iterator[Pool]:
     """Open a pool of local processes, which end with this one."""
-    # One executor for each process: a killed process breaks its whole executor.
+    # One executor for each process: a killed process breaks its whole executor. A broken one, whose
+    # future has an exception, is not used again.
     futures: dict[ProcessPoolExecutor, Future[Exception | None]] = {}
     spawn = multiprocessing.get_context("spawn")
 
@@ -94,7 +101,10 @@ def follow_parent() -> None:
 
 
 def end_with_parent() -> None:
-    """Wait for the end of the parent, and then stop this process as SIGTERM does."""
+    """Wait for the end of the parent, and then stop this process as SIGTERM does.
+
+    A process that does not clean up in time is ended without.
+    """
     parent = multiprocessing.parent_process()
     if parent is not None:
         parent.join()
@@ -136,6 +146,7 @@ def open_ray(
     try:
         cores = int(ray.cluster_resources().get("CPU", 1) // threads)
         yield Pool(workers or max(1, cores), start)
+        # All is done, and nothing is left to cancel. Only an exception skips this line.
         started.clear()
     finally:
         for reference in started:
@@ -165,7 +176,7 @@ def connect_to_ray(ray: Any, address: str | None, cores: int | None) -> None:
 
 
 def run_task(share: Share, threads: int) -> Exception | None:
-    """Run a share in a Ray task or a SLURM job."""
+    """Run a share in a Ray task or a SLURM job, on `threads` threads."""
     limit_threads(threads)  # before the first job imports libraries that read it
     return share()
 
@@ -176,13 +187,15 @@ def open_submitit(
 ) -> Iterator[Pool]:
     """Open a pool of SLURM jobs, or of local processes without SLURM.
 
-    `folder` is for files and output of the jobs; `parameters` are further ones of SLURM, such as
-    `partition` and `time`.
+    `threads` and `gpus` are those of one job; a fraction of a GPU is rounded down. `folder` is for
+    files and output of the jobs; `parameters` are further ones of SLURM, such as `partition` and
+    `time`.
     """
     submitit = import_engine("submitit", "slurm")
     executor = submitit.AutoExecutor(folder=str(folder))
     further: dict[str, Any] = {f"slurm_{name}": value for name, value in parameters.items()}
     if executor.cluster == "local":
+        # Local processes take none of the parameters of SLURM. Their limit of time is one day.
         further = {"timeout_min": 24 * 60}
     resources = {"cpus_per_task": threads, "gpus_per_node": int(gpus), "name": "gscompleter"}
     try:
