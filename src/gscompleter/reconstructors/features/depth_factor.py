@@ -154,11 +154,18 @@ def fit_depth_factor(samples: DepthSamples) -> DepthFactor | None:
 
 def correlate_ranks(samples: DepthSamples) -> float:
     """Compute Spearman's rank correlation of given and measured depths; 0 if one is constant."""
-    # Only depth that users give needs it, and its import takes about a second.
-    from scipy.stats import rankdata
-
-    given = rankdata(samples.given)
-    measured = rankdata(samples.measured)
+    given = rank(samples.given)
+    measured = rank(samples.measured)
     if np.ptp(given) == 0 or np.ptp(measured) == 0:
         return 0.0
     return float(np.corrcoef(given, measured)[0, 1])
+
+
+def rank(values: Float[np.ndarray, "n"]) -> Float[np.ndarray, "n"]:
+    """Rank values; equal ones share their mean rank.
+
+    `scipy.stats.rankdata` gives the same, and its import takes longer than a tenth of a completion.
+    """
+    _, place, count = np.unique(values, return_inverse=True, return_counts=True)
+    last = np.cumsum(count)
+    return (last - (count - 1) / 2)[place]
