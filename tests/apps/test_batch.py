@@ -22,7 +22,7 @@ from gscompleter.apps.batch.manifest import list_results, read_manifest
 from gscompleter.apps.commands.batch import parse_row
 from gscompleter.system.errors import OutputError
 from gscompleter.system.jobs import jobs as batch
-from gscompleter.system.jobs.engines import open_submitit
+from gscompleter.system.jobs.engines import connect_to_ray, open_submitit
 from gscompleter.system.jobs.jobs import Job, find_missing_jobs, parse_shard, run_job, run_jobs
 from paths import SUPPORT
 from scenes import camera_at, photographed
@@ -416,6 +416,27 @@ def test_ray_does_what_is_told_and_tells_of_lost_workers(tmp_path, monkeypatch):
 
 
 @pytest.mark.slow
+def test_slurm_gives_no_part_of_a_gpu(tmp_path):
+    with (
+        pytest.raises(InputError, match="whole GPUs, and 0.5 was asked for"),
+        open_submitit(1, 1, 0.5, tmp_path, {}),
+    ):
+        pass
+
+
+@pytest.mark.parametrize(
+    ("address", "sentence"), [(None, "Ray cannot start on this machine"), ("far:1", "Ray at far:1")]
+)
+def test_ray_that_does_not_answer_is_a_sentence(address, sentence):
+    class Ray:
+        @staticmethod
+        def init(**options):
+            raise ConnectionError("no answer")
+
+    with pytest.raises(InputError, match=f"{sentence}: no answer"):
+        connect_to_ray(Ray, address, 1)
+
+
 def test_submitit_does_the_shares_and_a_lost_one_is_done_again(tmp_path, monkeypatch):
     pytest.importorskip("submitit")
     monkeypatch.setenv("PYTHONPATH", os.pathsep.join(p for p in sys.path if p))

@@ -167,10 +167,13 @@ def connect_to_ray(ray: Any, address: str | None, cores: int | None) -> None:
     try:
         ray.init(log_to_driver=False, logging_level="ERROR", **options)
     except (ConnectionError, ValueError, RuntimeError) as error:
-        raise InputError(
-            f"There is no cluster of Ray at {quote_value(address)}: {quote_value(str(error))}.",
-            "address",
-        ) from error
+        if address is None:
+            reason = f"Ray cannot start on this machine: {quote_value(str(error))}."
+        else:
+            reason = (
+                f"There is no cluster of Ray at {quote_value(address)}: {quote_value(str(error))}."
+            )
+        raise InputError(reason, "address") from error
     for number, handler in handlers.items():  # Ray has replaced them by its own
         signal.signal(number, handler)
 
@@ -187,10 +190,15 @@ def open_submitit(
 ) -> Iterator[Pool]:
     """Open a pool of SLURM jobs, or of local processes without SLURM.
 
-    `threads` and `gpus` are those of one job; a fraction of a GPU is rounded down. `folder` is for
-    files and output of the jobs; `parameters` are further ones of SLURM, such as `partition` and
-    `time`.
+    `threads` and `gpus` are those of one job. `folder` is for files and output of the jobs;
+    `parameters` are further ones of SLURM, such as `partition` and `time`. Raise InputError for a
+    fraction of a GPU, which SLURM cannot give.
     """
+    if gpus != int(gpus):
+        raise InputError(
+            f"A job of SLURM gets whole GPUs, and {gpus:g} was asked for; give a whole number.",
+            "gpus",
+        )
     submitit = import_engine("submitit", "slurm")
     executor = submitit.AutoExecutor(folder=str(folder))
     further: dict[str, Any] = {f"slurm_{name}": value for name, value in parameters.items()}
