@@ -133,7 +133,7 @@ def run_tests(*arguments: str) -> Iterator[Row]:
 
 def measure_agreement(bench: Bench) -> Iterator[Row]:
     """Compare renders and gradients with those of the reference renderer, in float64 on the CPU."""
-    from test_render import (
+    from render_scenes import (
         CAMERA,
         PARAMETERS,
         REFERENCE,
@@ -433,16 +433,13 @@ def measure_free_models(bench: Bench, klein: Callable[[str], Any] | None = None)
     views, target = bench.make_views(size), bench.make_target(size)
     scene = bench.make_scene(views)
     seen = tuple(bench.renderer.render(scene, view.camera) for view in views)
-    request = (
-        views[1],
-        target,
-        GeneratorInput(tuple(views), seen, bench.renderer.render(scene, target)),
-    )
+    context = GeneratorInput(tuple(views), seen, bench.renderer.render(scene, target))
+    requests = [GeneratorRequest(views[1], target, context)]
 
     def painted() -> Iterator[Row]:
         pipeline = (klein or build_random_klein)(bench.device)
         generator = DiffusersInpaint(Painter(pipeline, *get_size_rules(pipeline)), steps=4)
-        seconds = measure_median_seconds(lambda: generator(*request), bench.repetitions)
+        seconds = measure_median_seconds(lambda: generator.synthesize(requests), bench.repetitions)
         yield Row("flux2-klein, 4 steps", seconds, "s")
 
     def ran(name: str) -> Iterator[Row]:
@@ -455,9 +452,10 @@ def measure_free_models(bench: Bench, klein: Callable[[str], Any] | None = None)
             )
         else:
             phi = load_generator(name, device=bench.device)
-            asked = [GeneratorRequest(*request)]
             yield Row(
-                name, measure_median_seconds(lambda: phi.synthesize(asked), bench.repetitions), "s"
+                name,
+                measure_median_seconds(lambda: phi.synthesize(requests), bench.repetitions),
+                "s",
             )
 
     yield from try_rows("flux2-klein", painted)

@@ -34,7 +34,7 @@ EQUATIONS = {
         r"\lambda_s \mathcal{L}_{\text{stereo}}",
         [
             register_paper.weigh_losses,
-            register_paper.optimize_distances,
+            register_paper.optimize_paper_distances,
             register.Objective,
             register.optimize_distances,
         ],

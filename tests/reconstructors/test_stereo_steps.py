@@ -207,7 +207,7 @@ def test_bands_of_rows_fit_the_surfaces_of_one(monkeypatch, threads, iterations)
         parts.append(len(calls))
         return run_calls(kernel, calls, threads)
 
-    monkeypatch.setattr(tgv, "run", counted)
+    monkeypatch.setattr(tgv, "run_calls", counted)
     for count in (1, threads):
         heights, gradients = np.zeros(shape, np.float32), np.zeros((2, *shape), np.float32)
         tgv.fit(heights, gradients, *given, threads=count)

@@ -2,7 +2,6 @@
 
 import sys
 from dataclasses import replace
-from functools import cache
 
 import pytest
 import torch
@@ -17,53 +16,25 @@ from gscompleter.render.gsplat import CudaRenderer
 from gscompleter.render.redraw import RedrawnScene
 from gscompleter.types import make_observed, sh_from_rgb
 from parity import assert_close
+from render_scenes import (
+    CAMERA,
+    PARAMETERS,
+    REFERENCE,
+    SCENES,
+    compute_gradients,
+    find_covered_pixels,
+    in_dtype,
+)
 from scenes import Room, camera_at, gaussians_of, random_gaussians, scaled, view_of
 
-CAMERA = camera_at(size=48)
-CPU, REFERENCE = load_renderer("cpu"), load_renderer("reference")
+CPU = load_renderer("cpu")
 EVERYWHERE = torch.ones(48, 48, dtype=torch.bool)
 DRAWN = ("image", "depth", "alpha")
-PARAMETERS = ("means", "quats", "scales", "opacities", "sh")
 ROUNDING = 1e-5
 """Largest difference of drawings and of gradients, of the largest value. At most 5.1e-6 was
 measured, and 6.4e-6 with kernels compiled without fused multiplications."""
 
 
-def in_dtype(gaussians: Gaussians, dtype: torch.dtype) -> Gaussians:
-    return replace(gaussians, **{n: getattr(gaussians, n).to(dtype) for n in PARAMETERS})
-
-
-def strange(sh_degree: int = 0) -> Gaussians:
-    """Make Gaussians behind, before the near plane, outside, transparent, huge and tiny."""
-    gaussians = random_gaussians(60, seed=4, sh_degree=sh_degree)
-    gaussians.means[0:5, 2] = -2.0
-    gaussians.means[5:10, 2] = 0.003
-    gaussians.means[10:15, 0] += 3.0
-    gaussians.opacities[15:20] = 0.0
-    gaussians.scales[20:24] = torch.tensor([4.0, 3.0, 2.0])
-    gaussians.scales[24:29] = 1e-7
-    gaussians.quats[30:40] *= 37.0
-    return gaussians
-
-
-def smooth(gaussians: Gaussians) -> Gaussians:
-    """Avoid parameters without comparable gradients: round Gaussians, and the kink at black."""
-    flat = gaussians.scales * torch.tensor([1.2, 1.0, 0.5])
-    turned = gaussians.quats + torch.tensor([0.0, 0.3, -0.2, 0.4])
-    return replace(gaussians, sh=0.9 * gaussians.sh, scales=flat, quats=turned)
-
-
-SCENES = {
-    "random": random_gaussians(300),
-    "harmonics": random_gaussians(200, seed=1, sh_degree=3),
-    "strange": strange(),
-    "strange-harmonics": strange(sh_degree=2),
-    "room": smooth(gaussians_of(view_of(Room(), camera_at(0.2, size=24)))),
-}
-SCENES |= {
-    f"antialiased-{name}": replace(SCENES[name], is_antialiased=True)
-    for name in ("random", "harmonics", "strange", "room")
-}
 MODES = pytest.mark.parametrize("antialiased", [False, True], ids=["classic", "antialiased"])
 
 
@@ -91,33 +62,6 @@ def test_cpu_and_reference_draw_the_same(name):
     truth = REFERENCE.render(in_dtype(SCENES[name], torch.float64), CAMERA)
     assert_same_render(ours, truth)
     assert truth.alpha.max() > 0.5
-
-
-@cache
-def find_covered_pixels(name: str) -> torch.Tensor:
-    """Find the pixels of a scene whose depth is compared.
-
-    The reference in float64 decides for all renderers: where alpha is at the threshold up to
-    rounding, two renderers that decide by themselves would compare different pixels.
-    """
-    return REFERENCE.render(in_dtype(SCENES[name], torch.float64), CAMERA).alpha > 0.05
-
-
-def compute_gradients(
-    renderer, gaussians: Gaussians, covered: torch.Tensor, camera=CAMERA
-) -> dict[str, torch.Tensor]:
-    """Compute gradients of a fixed random weighting of image, depth and alpha.
-
-    The depth counts in the `covered` pixels [h, w].
-    """
-    leaves = {n: getattr(gaussians, n).detach().clone().requires_grad_() for n in PARAMETERS}
-    render = renderer.render(replace(gaussians, **leaves), camera)
-    generator = torch.Generator().manual_seed(9)
-    weight = torch.randn(camera.height, camera.width, 5, generator=generator).to(render.image)
-    covered = covered.to(render.image)
-    loss = (render.image * weight[..., :3]).sum() + (render.alpha * weight[..., 3]).sum()
-    loss = loss + (render.depth * weight[..., 4] * covered).sum()
-    return dict(zip(leaves, torch.autograd.grad(loss, list(leaves.values())), strict=True))
 
 
 @pytest.mark.parametrize("name", SCENES)

@@ -26,7 +26,7 @@ from gscompleter.models.depth_anything.metric import MetricDepthAnything, set_sk
 from gscompleter.models.depth_anything.nested import NestedDepthAnything
 from gscompleter.models.depth_anything.network import DepthAnything, Prediction
 from gscompleter.models.depth_anything.normalisation import compute_authors_units, normalize_poses
-from gscompleter.models.depth_anything.poses import Poses
+from gscompleter.models.depth_anything.poses import Poses, invert_rigid
 from gscompleter.models.depth_anything.reconstructor import get_camera_centers
 from gscompleter.models.depth_anything.reference_view import select_reference_view
 from gscompleter.models.feed_forward.build import create_depth_anything
@@ -151,7 +151,7 @@ def through_any_view(network: DepthAnything, case: Case) -> tuple[Prediction, di
     found["ray"] = ray.unflatten(0, (scenes, views))
     found["ray_conf"] = ray_confidence.unflatten(0, (scenes, views))
     if poses is not None:
-        found["ext_norm"] = poses.w2c
+        found["ext_norm"] = invert_rigid(poses.c2w)
     if predicted.raw is not None:
         found["raw_gs"] = predicted.raw[..., :37]
     start = network.config.vit.first_multi_view_block
@@ -198,7 +198,7 @@ def any_view_errors(network: DepthAnything, case: Case) -> dict[str, float]:
 
 def outputs_of(predicted: Prediction, scale: float = 1.0) -> dict[str, Tensor]:
     """Convert the predicted cameras to a unit of 1 / `scale`."""
-    w2c = predicted.poses.w2c[:, :, :3].clone()
+    w2c = invert_rigid(predicted.poses.c2w)[:, :, :3].clone()
     w2c[..., 3] *= scale
     return {
         "pose_enc": predicted.camera_parameters,

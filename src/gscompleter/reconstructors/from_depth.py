@@ -60,7 +60,7 @@ class FromDepth(Splatter):
 
     def predict(self, views: Sequence[View]) -> list[DepthMap]:
         """Predict depths; raise InputError if the model returns none that fit the views."""
-        depths = self.predict(views)
+        depths = self.model(views)
         check_depths(depths, views)
         return list(depths)
 
