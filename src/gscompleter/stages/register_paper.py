@@ -45,10 +45,10 @@ def register_as_paper(
 def initialize_distances(lifted: Gaussians, affine: DepthAffine, camera: Camera) -> Gaussians:
     """Move Gaussians along their rays to z-depth `s D + t` of the target (Eq. 9).
 
-    The equation divides z-depth by `r · v`, the cosine between ray and principal axis, which is the same
-    before and after the move. So the ratio of z-depths is the ratio of distances d_i. Our reading:
-    the paper samples D at the projection u_i of a Gaussian, and we take the z-depth of its mean,
-    which is that value for pixel-aligned Gaussians. Scales stay, as the paper names no change.
+    The equation divides z-depth by `r · v`, the cosine between ray and principal axis, which is the
+    same before and after the move. So the ratio of z-depths is the ratio of distances d_i. Our
+    reading: the paper samples D at the projection u_i of a Gaussian, and we take the z-depth of its
+    mean, which is that value for pixel-aligned Gaussians. Scales stay: the paper names no change.
     """
     predicted = compute_z_depths(lifted.means, camera)
     aligned = affine.scale * predicted + affine.shift
