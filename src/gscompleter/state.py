@@ -184,7 +184,7 @@ class Completion:
     """Context photographs, then check photographs."""
     num_context: int
     trust: Trust
-    """Trust in `parts[0]`; added Gaussians have full trust."""
+    """Trust in `rendered_context`; added Gaussians have full trust."""
     targets: tuple[TargetResult, ...] = ()
     free_space_cameras: tuple[Camera, ...] = ()
     """Further cameras whose free space stays empty; their images are not read."""
@@ -203,6 +203,11 @@ class Completion:
         return tuple(photo.view for photo in self.photos[: self.num_context])
 
     @property
+    def rendered_context(self) -> Gaussians:
+        """The context as stages see it: recoloured in part, and of a large scene a proxy."""
+        return self.parts[0]
+
+    @property
     def context(self) -> Gaussians:
         """The scene before its first target, bit for bit."""
         return self.source.gaussians
@@ -210,12 +215,12 @@ class Completion:
     @cached_property
     def added(self) -> Gaussians:
         """Generated Gaussians of all targets."""
-        return merge([self.parts[0][:0], *self.parts[1:]])
+        return merge([self.rendered_context[:0], *self.parts[1:]])
 
     @property
     def recolored_mask(self) -> Bool[Tensor, "n"]:
         """True for Gaussians of `context` that got new colours."""
-        return self.source.expand(self.parts[0].generated != self.source.rendered.generated)
+        return self.source.expand(self.rendered_context.generated != self.source.rendered.generated)
 
     @cached_property
     def scene(self) -> Gaussians:
@@ -227,7 +232,7 @@ class Completion:
     def recolored_context(self) -> Gaussians:
         """The context with the new colours and target ids of recoloured Gaussians."""
         before = self.source.rendered
-        after = self.parts[0]
+        after = self.rendered_context
         gaussians = self.source.gaussians
         if after is before:
             return gaussians

@@ -122,12 +122,12 @@ def test_what_photographs_need_elsewhere_returns(begun):
     number = torch.full_like(state.source.stand_ins, REVEALED)
     hidden = replace(
         state.source,
-        rendered=state.parts[0][:-1],
+        rendered=state.rendered_context[:-1],
         proxy_index=state.source.stand_ins.where(torch.arange(len(scene)) < len(scene) - 1, number),
     )
     state = replace(state, source=hidden, parts=(hidden.rendered,))
     restored = restore_surroundings(state, COMPLETER.renderer)
-    assert restored.source.stand_ins[-1] == len(restored.parts[0]) - 1
+    assert restored.source.stand_ins[-1] == len(restored.rendered_context) - 1
     assert torch.equal(restored.scene.means[-1], glow.means[0])
     assert (restored.source.stand_ins == REMOVED).sum() == chosen.sum()
     assert restore_surroundings(begun, COMPLETER.renderer) is begun
@@ -186,7 +186,7 @@ def test_what_reaches_out_of_the_place_stays_and_additions_match_photographs(beg
     assert all(less < 0.5 * more for less, more in pairs)
     assert set(cut.added.generated.tolist()) == {NEW_PHOTO_ID}
     dyed = replace(cut.added, sh=cut.added.sh - 0.5)
-    dyed = replace(cut, parts=(cut.parts[0], dyed))
+    dyed = replace(cut, parts=(cut.rendered_context, dyed))
     restored = restore_surroundings(dyed, COMPLETER.renderer)
     before, after = measure_errors(state, dyed.scene), measure_errors(state, restored.scene)
     assert max(after) < 0.7 * max(before)

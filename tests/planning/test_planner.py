@@ -121,7 +121,7 @@ def test_the_second_camera_is_chosen_in_the_scene_that_the_first_left(begun):
 
 def test_a_splat_is_completed_where_it_is_opaque_and_not_trusted(opaque):
     _, (choice,) = explorer().explore(opaque, cameras(), 1)
-    alpha = load_renderer("cpu").render(opaque.parts[0], choice.camera).alpha
+    alpha = load_renderer("cpu").render(opaque.rendered_context, choice.camera).alpha
     assert choice.gain > 0.05 > 1.5 * (alpha < COVERED).float().mean()
     assert choice.camera.center[0] > 0.1
 
@@ -144,9 +144,12 @@ def test_coverage_of_a_splat_is_what_is_trusted_and_includes_what_was_recoloured
     renderer = load_renderer("cpu")
     aside = [camera_at(0.7, yaw=yaw, size=SIZE) for yaw in (15, 25)]
     found = compute_coverage(render_pairs(opaque, aside, renderer))
-    seen = [renderer.render(opaque.parts[0], camera) for camera in aside]
+    seen = [renderer.render(opaque.rendered_context, camera) for camera in aside]
     assert found.before == found.after < compute_covered_share(seen) - 0.1
-    frozen, rows = renderer.freeze(opaque.parts[0], aside[0]), torch.arange(len(opaque.parts[0]))
+    frozen, rows = (
+        renderer.freeze(opaque.rendered_context, aside[0]),
+        torch.arange(len(opaque.rendered_context)),
+    )
     trusted = replace(opaque, trust=opaque.trust.accept(frozen, aside[0], rows))
     then = compute_coverage(render_pairs(trusted, aside, renderer))
     assert then.before == found.before
@@ -197,11 +200,13 @@ def test_stand_ins_close_the_hole_and_hide_nothing():
 
 def test_a_miniature_covers_what_the_scene_covers(begun):
     small = simplify_completion(begun, 3000)
-    assert len(small.parts[0]) <= 3000 < len(begun.parts[0])
+    assert len(small.rendered_context) <= 3000 < len(begun.rendered_context)
     renderer = load_renderer("cpu")
     aside = sample_held_out_cameras(cameras(), seed=3, count=8)
     shares = [
-        compute_covered_share([renderer.render(completion.parts[0], camera) for camera in aside])
+        compute_covered_share(
+            [renderer.render(completion.rendered_context, camera) for camera in aside]
+        )
         for completion in (begun, small)
     ]
     assert shares[1] == pytest.approx(shares[0], abs=0.02)

@@ -57,7 +57,7 @@ def pixel_at(scene: Gaussians) -> torch.Tensor:
 def test_a_small_scene_is_its_own_proxy():
     assert build_proxy(ROOM, CAMERAS).rendered is ROOM
     completion = GSCompleter(KnowingReconstructor()).begin(VIEWS[::2], ROOM, VIEWS[1:2])
-    assert completion.parts[0] is completion.scene is completion.context is ROOM
+    assert completion.rendered_context is completion.scene is completion.context is ROOM
 
 
 def test_a_crowd_is_drawn_with_few_and_looks_alike():
@@ -206,4 +206,4 @@ def test_a_scene_is_drawn_as_finely_as_the_targets_that_are_known(monkeypatch):
     near = replace(TARGET, K=TARGET.K * torch.tensor([[4.0], [4.0], [1.0]]))
     coarse = completer.begin(VIEWS[::2], CROWD)
     fine = completer.begin(VIEWS[::2], CROWD, targets=[near])
-    assert len(coarse.parts[0]) < len(fine.parts[0]) <= len(CROWD)
+    assert len(coarse.rendered_context) < len(fine.rendered_context) <= len(CROWD)

@@ -218,7 +218,7 @@ def test_a_sorted_scene_is_the_same_in_the_order_of_its_file():
     state = begin_with(SCENE[order], VIEWS)
     is_changed = torch.arange(len(SCENE)) % 3 == 0
     ids = is_changed[order].to(torch.uint8)
-    state = replace(state, parts=(replace(state.parts[0], generated=ids),))
+    state = replace(state, parts=(replace(state.rendered_context, generated=ids),))
     context, changed = restore_file_order(state, given)
     assert torch.equal(context.means, SCENE.means)
     assert torch.equal(changed, is_changed)

@@ -53,7 +53,7 @@ def remove_gaussians(
     A rendered Gaussian that stands for several goes with the last of them.
     """
     source = state.source
-    first = state.parts[0]
+    first = state.rendered_context
 
     # Rendered Gaussians go if they stand for none but chosen ones.
     used = source.stand_ins[~chosen & ~source.gone_mask]
@@ -71,7 +71,7 @@ def remove_gaussians(
         proxy_index=number_left(source, chosen, unused, gone),
         removed=merge([source.removed, replace(inner, sh=inner.sh[:, :1])]),
     )
-    # As long as nothing is recoloured, `parts[0]` is the rendered context itself, which tells so.
+    # As long as nothing is recoloured, the state has that of its source itself, which tells so.
     context = remaining.rendered if first is source.rendered else first[~gone]
     # Outer pieces are no Gaussians of the file: they are added to it, with a label of their own.
     rest = replace(outer, generated=torch.full_like(outer.generated, NEW_PHOTO_ID))
@@ -130,7 +130,7 @@ def restore_surroundings(state: Completion, renderer: Renderer) -> Completion:
     # Outer pieces of what was cut are among the additions, but were not generated.
     is_rest = state.added.generated == NEW_PHOTO_ID
     rest = state.added[is_rest]
-    known = merge([state.parts[0], rest])
+    known = merge([state.rendered_context, rest])
     is_revealed = source.stand_ins == REVEALED
     revealed = source.gaussians[is_revealed]
     added = fade_harmful(state.added[~is_rest], merge([known, revealed]), state, renderer)
@@ -142,7 +142,11 @@ def restore_surroundings(state: Completion, renderer: Renderer) -> Completion:
     rows = len(source.rendered) + torch.arange(len(returned), device=is_returned.device)
     index = source.stand_ins.masked_scatter(is_returned, rows)
     rendered = merge([source.rendered, returned])
-    first = rendered if state.parts[0] is source.rendered else merge([state.parts[0], returned])
+    first = (
+        rendered
+        if state.rendered_context is source.rendered
+        else merge([state.rendered_context, returned])
+    )
 
     # Additions reach beyond the hole, where photographs tell their colours. Ignored pixels show the
     # scene itself, so that colours stay as they are in the hole.
@@ -229,13 +233,13 @@ def find_revealed(
     outer: Gaussians,
     scenes: SceneRenderer,
 ) -> tuple[Bool[Tensor, "m"], Bool[Tensor, "o"]]:
-    """Add to `unused` Gaussians of `state.parts[0]` those that only become visible without them.
+    """Add those that only become visible without them to `unused` Gaussians of the context.
 
     Also returns which `outer` pieces do. With `inner` ones they stand for the unused ones.
     """
     # One set of rows for all that may go: the context, in which the unused Gaussians are invisible,
     # then their pieces. Of these, the inner ones go in any case.
-    first = state.parts[0]
+    first = state.rendered_context
     others = replace(first, opacities=first.opacities.masked_fill(unused, 0.0), encoded=None)
     state = replace(state, parts=(merge([others, inner, outer]), *state.parts[1:]))
     gone = torch.cat([unused, unused.new_ones(len(inner)), unused.new_zeros(len(outer))])
@@ -261,7 +265,7 @@ def observe(
 ) -> PhotoObservations:
     """Observe the remaining Gaussians of the first part in all photographs."""
     views = [photo.view for photo in state.photos]
-    context = state.parts[0][remaining]
+    context = state.rendered_context[remaining]
     frozen = scenes.freeze_at((context, *state.parts[1:]), [view.camera for view in views])
     return gather_observations(context, views, frozen, state.config.trust_settings)
 

@@ -171,7 +171,7 @@ class ViewPlanner:
         small = simplify_completion(completion)
         anchors = [self.render_small_view(small, view.camera) for view in small.views]
         choose = partial(self.score_candidate, small, anchors)
-        choices = get_view_map(small.parts[0].means)(choose, candidates_left)
+        choices = get_view_map(small.rendered_context.means)(choose, candidates_left)
         counted = zip(track(candidates_left, "finding targets"), choices, strict=True)
         return [choice for _, choice in counted]
 
@@ -212,7 +212,7 @@ class ViewPlanner:
         padded = self.completer.pad_target(completion, camera).padded
         view = self.render_small_view(completion, padded)
         placeholders = make_placeholders(view.render, view.holes, view.camera)
-        added = adapt_to_mode(completion.parts[0], placeholders, view.camera)
+        added = adapt_to_mode(completion.rendered_context, placeholders, view.camera)
         return replace(completion, parts=(*completion.parts, added))
 
 
@@ -298,8 +298,8 @@ def make_placeholders(render: Render, holes: Bool[Tensor, "h w"], camera: Camera
 
 def simplify_completion(completion: Completion, most: int = MAX_PREVIEW_GAUSSIANS) -> Completion:
     """Simplify what is rendered of a completion for small images, with its trust."""
-    rows, growth = choose_thinned_rows(completion.parts[0], most)
-    context = thin_gaussians(completion.parts[0], most)
+    rows, growth = choose_thinned_rows(completion.rendered_context, most)
+    context = thin_gaussians(completion.rendered_context, most)
     parts = (context, thin_gaussians(completion.added, most))
     trust = completion.trust.thin(rows, growth)
     return replace(completion, parts=parts, trust=trust)

@@ -19,7 +19,7 @@ from gscompleter.types import Lift, View
 def lift(reconstructor: Reconstructor, reference: View, view: TargetView) -> Lift:
     """Lift the pixels near holes to Gaussians in the antialiasing mode of the scene."""
     lifted = lift_pair(reconstructor, reference, view.anchor_view, view.candidate_mask)
-    adapted = adapt_to_mode(view.state.parts[0], lifted.gaussians, reference.camera)
+    adapted = adapt_to_mode(view.state.rendered_context, lifted.gaussians, reference.camera)
     return replace(lifted, gaussians=adapted)
 
 

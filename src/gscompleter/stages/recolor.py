@@ -53,7 +53,7 @@ def recolor(reference: GeneratedView, view: TargetView, label: int) -> Recolored
     """
     state = view.state
     camera = view.camera.padded
-    context = state.parts[0]
+    context = state.rendered_context
     weight = torch.ones_like(view.alpha) if reference.is_photograph else view.distrust
     if reference.is_inconsistent or not weight.any():
         return Recolored(state, view.frozen, 0)

@@ -141,7 +141,7 @@ class TargetView:
             trusted_alpha=self.camera.crop(self.alpha),
             anchor=self.anchor.index,
             anchor_fallback=self.anchor.fallback,
-            added=self.state.parts[0][:0],
+            added=self.state.rendered_context[:0],
             refusal=self.refusal,
             skip_reason=self.skip_reason,
             target_id=self.state.next_target_id,

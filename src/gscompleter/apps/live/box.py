@@ -67,7 +67,7 @@ def remove_in_box(session: Session, corners: Numbers, rotation: Numbers) -> tupl
     # What is removed from the context is marked, so that its hole may be filled. What was added is
     # simply taken out.
     added = [part[~mask] for part, mask in zip(state.parts[1:], inside[1:], strict=True)]
-    parts = (state.parts[0], *added)
+    parts = (state.rendered_context, *added)
     config = state.config.for_removal()
     begun = replace(state, parts=parts, config=config)
     changed = remove_gaussians(begun, context, contains, scenes)

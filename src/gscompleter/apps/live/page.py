@@ -235,7 +235,7 @@ class Page:
         now = session.latest
         self.session = session
         with self.server.atomic():
-            if before.parts[0] is not now.parts[0]:
+            if before.rendered_context is not now.rendered_context:
                 self._show("/observed", now.kept_context)
             # A splat is replaced as a whole: the page cannot change one in place.
             if self._generated is not None:

@@ -57,16 +57,22 @@ def render_pairs(
     completion: Completion, cameras: Sequence[Camera], renderer: Renderer
 ) -> list[RenderPair]:
     """Render the scene before and after completion in small images, from a thinned scene."""
-    # `parts[0]` is the context as it is rendered; recolouring and removal replace it.
-    is_unchanged = completion.parts[0] is completion.source.rendered
+    # The context as it is rendered; recolouring and removal replace it.
+    is_unchanged = completion.rendered_context is completion.source.rendered
     begun = thin_gaussians(completion.source.rendered, MAX_PREVIEW_GAUSSIANS)
-    kept = begun if is_unchanged else thin_gaussians(completion.parts[0], MAX_PREVIEW_GAUSSIANS)
+    kept = (
+        begun
+        if is_unchanged
+        else thin_gaussians(completion.rendered_context, MAX_PREVIEW_GAUSSIANS)
+    )
     added = [thin_gaussians(result.added, MAX_PREVIEW_GAUSSIANS) for result in completion.targets]
     new = merge([begun[:0], *added])
 
     # Trust has values for each Gaussian, and is thinned by the same rows. Before the completion,
     # nothing was recoloured.
-    trust = completion.trust.thin(*choose_thinned_rows(completion.parts[0], MAX_PREVIEW_GAUSSIANS))
+    trust = completion.trust.thin(
+        *choose_thinned_rows(completion.rendered_context, MAX_PREVIEW_GAUSSIANS)
+    )
     at_first = trust
     if isinstance(trust, PhotometricTrust):
         at_first = replace(trust, is_recolored=torch.zeros_like(trust.is_recolored))
