@@ -40,6 +40,7 @@ def fit_affine(predicted: DepthMap, context: DepthMap, rng: torch.Generator) -> 
         sample = torch.randperm(len(x), generator=rng)[:MAX_PIXELS].to(x.device)
         x, y = x[sample], y[sample]
 
+    # In a flat view, such as a wall from the front, scale and shift cannot be told apart.
     low, median, high = x.quantile(x.new_tensor([0.05, 0.5, 0.95])).tolist()
     if (high - low) / median >= MIN_DEPTH_SPREAD:
         scale, shift = fit_line_ransac(x, y, rng)
@@ -68,10 +69,12 @@ def align_depth(lift: Lift, view: TargetView, rng: torch.Generator) -> DepthAffi
     anchor.
     """
     config = view.state.config.alignment
-    at_target = lift.reference_depth, view.render.depth_map()
-    at_anchor = lift.anchor_depth, view.anchor_render.depth_map()
     if config.align_at == "none":
         return DepthAffine()
+
+    # Pairs of D_pred, as Ψ lifted it, and D_ctx, as the scene is rendered.
+    at_target = (lift.reference_depth, view.render.depth_map())
+    at_anchor = (lift.anchor_depth, view.anchor_render.depth_map())
     if config.align_at == "target":
         affine = fit_affine(*at_target, rng)
     else:

@@ -1,4 +1,8 @@
-"""Stage 4: refine added Gaussians, and nothing else (paper, Sec. III-F)."""
+"""Stage 4: refine added Gaussians, and nothing else (paper, Sec. III-F).
+
+One file serves the paper and us: both minimize Eq. 13 in the same way. Ours fits colours first
+(`color_rounds`, 0 in the paper) and stops when the loss has settled (`rel_tol`, None in the paper).
+"""
 
 from __future__ import annotations
 
@@ -39,15 +43,28 @@ def refine(kept: Gaussians, reference: View, view: TargetView) -> Refined:
     Registration changes which Gaussians hide others, and so the image that Ψ fitted their colours
     to. The paper refines opacities alone (Eq. 13).
     """
-    views, config = view.state.views, view.state.config.refine
+    views = view.state.views
+    config = view.state.config.refine
+
+    # Colours against the image alone: the paper has no such step (decision 044).
     relaxations = [RELAXATION] * config.color_rounds
     colored = fit_colors(kept, [view.frozen], [reference], relaxations)
-    plans = tuple(frozen.vary_opacities(colored) for frozen in view.frozen_photos)
+
+    # N_t of Eq. 13: the photographs taken closest to the target.
     distances = [measure_baseline(reference.camera, photo.camera) for photo in views]
-    near = sorted(range(len(views)), key=distances.__getitem__)[: config.num_views]
-    at_target = view.frozen.vary_opacities(colored)
+    order = sorted(range(len(views)), key=distances.__getitem__)
+    nearest = order[: config.num_views]
+
+    # Only opacities change, so that everything else is projected and sorted once. The guard `psnr`
+    # needs the plans of all photographs afterwards.
+    plans = tuple(frozen.vary_opacities(colored) for frozen in view.frozen_photos)
     refined, losses = refine_opacities(
-        colored, at_target, reference, [plans[i] for i in near], [views[i] for i in near], config
+        colored,
+        view.frozen.vary_opacities(colored),
+        reference,
+        [plans[i] for i in nearest],
+        [views[i] for i in nearest],
+        config,
     )
     return Refined(refined, plans, losses)
 
@@ -75,20 +92,23 @@ def refine_opacities(
     """
     if config.iterations == 0 or len(added) == 0:
         return added, ()
+
+    # The terms of Eq. 13: λ for the synthesized image, 1 for each photograph.
     plans = [(at_target, reference, config.target_weight)]
     plans += [(plan, view, 1.0) for plan, view in zip(at_views, views, strict=True)]
 
-    logit = config.parametrization == "logit"
-    start = added.opacities.logit(eps=1e-4) if logit else added.opacities
+    # In logits, as 3DGS stores opacities, no step leaves the range from 0 to 1.
+    is_logit = config.parametrization == "logit"
+    start = added.opacities.logit(eps=1e-4) if is_logit else added.opacities
     parameters = start.clone().requires_grad_()
     optimizer = Adam([(parameters, config.learning_rate)])
 
-    def opacities() -> Float[Tensor, "n"]:
-        return parameters.sigmoid() if logit else parameters.clamp(0, 1)
+    def compute_opacities() -> Float[Tensor, "n"]:
+        return parameters.sigmoid() if is_logit else parameters.clamp(0, 1)
 
     losses: list[Tensor] = []
     for _ in track(range(config.iterations), "Refining"):
-        current = opacities()
+        current = compute_opacities()
         terms = [
             weight * (view.fill_ignored(plan(current).image) - view.image).abs().mean()
             for plan, view, weight in plans
@@ -98,5 +118,5 @@ def refine_opacities(
         if config.rel_tol is not None and has_settled(losses, config.rel_tol):
             break
         optimizer.step(loss)
-    refined = replace(added, opacities=opacities().detach(), encoded=None)
+    refined = replace(added, opacities=compute_opacities().detach(), encoded=None)
     return refined, tuple(torch.stack(losses).tolist())
