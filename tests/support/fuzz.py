@@ -73,13 +73,14 @@ YAML += ["!!python/object:os.system x", "~", "'²'", "0", "1", "-1", "1000000000
 
 @dataclass(frozen=True)
 class Outcome:
-    """Result of a run with mutated files."""
+    """Result of a run with mutated files, or of a call with odd values."""
 
     name: str
-    command: list[str]
     refused: bool
     finding: str | None
     """Problem in one line, if any."""
+    command: Sequence[str] = ()
+    """Words of the command, for a run."""
 
 
 Mutation = Callable[[Path, random.Random], list[str]]
@@ -663,7 +664,7 @@ def finished(running: dict[int, Running], given: set[str]) -> list[Outcome]:
         written = run.folder / "words"
         words = written.read_text(errors="replace").split("\0") if written.exists() else []
         refused = os.WIFEXITED(status) and os.WEXITSTATUS(status) == 2
-        outcomes.append(Outcome(run.name, [word[:60] for word in words], refused, finding))
+        outcomes.append(Outcome(run.name, refused, finding, [word[:60] for word in words]))
         shutil.rmtree(run.folder, ignore_errors=True)
     return outcomes
 
@@ -678,6 +679,19 @@ def import_everything() -> None:
     import gscompleter.generators.warp_inpaint
     import gscompleter.reconstructors.plane_sweep  # noqa: F401
     import pose_files  # noqa: F401  (likewise)
+
+
+def print_findings(outcomes: Sequence[Outcome], kind: str, seconds: float) -> int:
+    """Print each kind of finding with its first example, then the counts; return their number."""
+    findings = [outcome for outcome in outcomes if outcome.finding is not None]
+    for what, count in Counter(finding.finding for finding in findings).most_common():
+        first = next(finding for finding in findings if finding.finding == what)
+        print(f"{count:4d}  {first.name}  {what}")
+        if first.command:
+            print(f"      {' '.join(first.command)[:300]!r}")
+    refused = sum(outcome.refused for outcome in outcomes)
+    print(f"{len(outcomes)} {kind}, {len(findings)} findings, {refused} refused, {seconds:.0f} s")
+    return len(findings)
 
 
 def main() -> None:
@@ -695,14 +709,7 @@ def main() -> None:
         chosen = [(kind, int(number))]
     start = time.monotonic()
     outcomes = fuzz(chosen, given.seed, given.limit, given.workers)
-    findings = [outcome for outcome in outcomes if outcome.finding is not None]
-    for what, count in Counter(finding.finding for finding in findings).most_common():
-        first = next(finding for finding in findings if finding.finding == what)
-        print(f"{count:4d}  {first.name}  {what}\n      {' '.join(first.command)[:300]!r}")
-    refused = sum(outcome.refused for outcome in outcomes)
-    seconds = time.monotonic() - start
-    print(f"{len(chosen)} mutations, {len(findings)} findings, {refused} refused, {seconds:.0f} s")
-    sys.exit(1 if findings else 0)
+    sys.exit(1 if print_findings(outcomes, "mutations", time.monotonic() - start) else 0)
 
 
 if __name__ == "__main__":

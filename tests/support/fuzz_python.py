@@ -22,10 +22,9 @@ import tempfile
 import time
 import traceback
 import warnings
-from collections import Counter
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
-from dataclasses import dataclass, fields, is_dataclass, replace
+from dataclasses import fields, is_dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -37,6 +36,7 @@ from jaxtyping import config as jaxtyping_config
 
 import fuzz as commands
 import gscompleter as gsc
+from fuzz import Outcome
 from gscompleter.data.formats import open_photographs
 from gscompleter.generators import GeneratorOutput
 from gscompleter.numerics.value_checks import check_gaussians, check_views
@@ -56,16 +56,6 @@ ODD: list[Any] = [
     *([], {}, object(), np.zeros(3, np.float32), np.eye(4), np.float32(2), np.int64(7)),
     *(torch.zeros(()), torch.eye(4), torch.zeros(0, 3), Path("/absent"), int, gsc.Gaussians),
 ]
-
-
-@dataclass(frozen=True)
-class Outcome:
-    """Result of one call."""
-
-    name: str
-    refused: bool
-    finding: str | None
-    """Problem in one line, if any."""
 
 
 Call = Callable[[random.Random, Path], None]
@@ -611,14 +601,8 @@ def main() -> None:
     resource.setrlimit(resource.RLIMIT_AS, (ADDRESS_SPACE, ADDRESS_SPACE))
     start = time.monotonic()
     outcomes = run_all(given.calls, given.files, given.seed, given.only)
-    findings = [outcome for outcome in outcomes if outcome.finding is not None]
-    for what, count in Counter(finding.finding for finding in findings).most_common():
-        first = next(finding for finding in findings if finding.finding == what)
-        print(f"{count:4d}  {first.name}  {what}")
-    refused = sum(outcome.refused for outcome in outcomes)
-    seconds = time.monotonic() - start
-    print(f"{len(outcomes)} inputs, {len(findings)} findings, {refused} refused, {seconds:.0f} s")
-    sys.exit(1 if findings else 0)
+    found = commands.print_findings(outcomes, "inputs", time.monotonic() - start)
+    sys.exit(1 if found else 0)
 
 
 if __name__ == "__main__":

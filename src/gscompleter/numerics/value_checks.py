@@ -171,11 +171,11 @@ def check_depth(depth: object, view: View) -> None:
             "The depth model has to return a gscompleter.types.DepthMap of depths and validity for "
             f"each view, and returned {describe(depth)}."
         )
-    height, width = view.camera.height, view.camera.width
-    if depth.depth.shape != (height, width):
+    shape = tuple(view.image.shape[:2])
+    if depth.depth.shape != shape:
         raise InputError(
             f"The depth model returned a depth map of shape {list(depth.depth.shape)} for a view "
-            f"of shape {[height, width]}; resize it to the view."
+            f"of shape {list(shape)}; resize it to the view."
         )
     known = depth.depth[depth.valid]
     if not bool((known > 0).all()):  # nor NaN

@@ -61,7 +61,7 @@ class LocatedPhoto:
     points: Float[np.ndarray, "m 3"]
     """Inliers, in the splat's frame."""
     pixels: Float[np.ndarray, "m 2"]
-    """Where the photograph shows these points."""
+    """Pixels of the photograph that show these points."""
 
 
 def search_similarities(
