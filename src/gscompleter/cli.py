@@ -10,9 +10,7 @@ import warnings
 from collections.abc import Sequence
 from contextlib import suppress
 from importlib import import_module
-from typing import Annotated, Any, Union
-
-import tyro
+from typing import Any
 
 from gscompleter import __version__
 from gscompleter.apps.commands import options
@@ -21,7 +19,7 @@ from gscompleter.apps.commands.failures import explain_failure
 from gscompleter.apps.commands.overlap import check_overlap
 from gscompleter.apps.commands.words import format_error, parse_words
 from gscompleter.config.settings import validate
-from gscompleter.system.errors import PROGRAM, FullDiskError, InputError, NoCaseError
+from gscompleter.system.errors import FullDiskError, InputError, NoCaseError, print_error
 from gscompleter.system.files.writing import FULL_DISK_ERRORS, handle_stop_signals
 from gscompleter.system.process import (
     import_without_collection,
@@ -53,10 +51,6 @@ COMMANDS: dict[str, tuple[type, str, str]] = {
     "warmup": (options.WarmupOptions, "doctor", "run_warmup"),
 }
 
-Command: Any = Union[  # noqa: UP007  (of as many as there are)
-    tuple(Annotated[kind, tyro.conf.subcommand(name)] for name, (kind, _, _) in COMMANDS.items())
-]
-
 
 def run() -> None:
     """Run `main` as the command `gscompleter`, whose output may be closed, full or left."""
@@ -81,7 +75,7 @@ def run() -> None:
         if error.errno not in FULL_DISK_ERRORS:
             raise
         leave_output()
-        print(f"{PROGRAM}the standard output cannot be written: {error.strerror}.", file=sys.stderr)
+        print_error(f"the standard output cannot be written: {error.strerror}.")
         sys.exit(ERROR)
 
 
@@ -135,20 +129,20 @@ def main() -> None:
         code = command(command_options)
     except InputError as error:
         # Both are InputErrors for their sentences alone: no other input would help.
-        print(f"{PROGRAM}{format_error(error)}", file=sys.stderr)
+        print_error(format_error(error))
         is_input = not isinstance(error, (FullDiskError, NoCaseError))
         sys.exit(WRONG_INPUT if is_input else ERROR)
     except KeyboardInterrupt as stop:
         # Whoever writes results says if they were complete when the signal came.
         reason = str(stop) or "no unfinished result was written"
-        print(f"{PROGRAM}interrupted; {reason}.", file=sys.stderr)
+        print_error(f"interrupted; {reason}.")
         sys.exit(INTERRUPTED)
     except Exception as error:
         # A lack of memory or a path of the user gets a sentence, a defect its traceback.
         failure = explain_failure(error)
         if failure is None:
             raise
-        print(f"{PROGRAM}{failure.sentence}", file=sys.stderr)
+        print_error(failure.sentence)
         sys.exit(failure.code)
     if code:
         sys.exit(code)
@@ -166,4 +160,4 @@ def check_working_folder() -> None:
 
 def parse_command(words: Sequence[str]) -> Any:
     """Parse the options of the command; raises as `parse_words`."""
-    return parse_words(words, Command, COMMANDS)
+    return parse_words(words, {name: kind for name, (kind, _, _) in COMMANDS.items()})

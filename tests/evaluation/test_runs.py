@@ -435,7 +435,11 @@ def test_cases_that_fail_are_no_success_and_the_first_are_named(
     done = 2 - len(broken)
     assert f"Scored {done}, failed {len(broken)}, done earlier 0, of 2 cases by 1 methods." in said
     assert "evaluating case 1 of 2" in said
+    # A quiet run says it, too, in one line: nobody should have to guess at an exit code.
     assert run(monkeypatch, *words, "--out", tmp_path / "out", "--quiet") == code
+    said = capsys.readouterr().err
+    assert said.startswith(f"gscompleter: {len(broken)} of 2 cases failed; the first: ")
+    assert said.count("\n") == 1
 
 
 @pytest.mark.parametrize("more", [("--table", "rotation"), ("--figure", "qualitative"), ()])

@@ -1,6 +1,7 @@
 """Errors for the user, and the sentences that they hold."""
 
 import os
+import sys
 from collections.abc import Sequence
 from contextlib import suppress
 from pathlib import Path
@@ -48,6 +49,13 @@ class FullDiskError(OutputError):
 
 class NoCaseError(InputError):
     """No case of an evaluation was completed, so that there is no table or figure to write."""
+
+
+def print_error(sentence: str) -> None:
+    """Print a sentence as one line of the standard error, shortened to `MAX_MESSAGE_LENGTH`."""
+    print(
+        f"{PROGRAM}{shorten_message(sentence, MAX_MESSAGE_LENGTH - len(PROGRAM))}", file=sys.stderr
+    )
 
 
 def quote_value(value: object, length: int | None = None) -> str:

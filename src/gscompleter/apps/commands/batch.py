@@ -12,9 +12,8 @@ import time
 from collections.abc import Iterator, Mapping, Sequence
 from functools import partial
 from pathlib import Path
-from typing import Annotated, Any, Union, get_type_hints
+from typing import Any, get_type_hints
 
-import tyro
 from rich.console import Console
 
 from gscompleter.apps.batch.manifest import FOLDER, PATHS, list_results, read_manifest
@@ -23,11 +22,10 @@ from gscompleter.apps.commands.options import (
     BatchOptions,
     CompleteOptions,
     EngineOptions,
-    LiveOptions,
 )
 from gscompleter.apps.commands.words import format_error, parse_words
 from gscompleter.config.settings import validate
-from gscompleter.system.errors import InputError, join_names, quote_value
+from gscompleter.system.errors import InputError, join_names, print_error, quote_value
 from gscompleter.system.files.overlap import refuse_overlap
 from gscompleter.system.jobs.engines import (
     check_processes,
@@ -53,10 +51,6 @@ from gscompleter.system.progress import show_preparation, show_progress, track
 from gscompleter.system.threads import count_available_cores, limit_threads
 
 COMPLETE = "complete"
-Command: Any = Union[  # noqa: UP007  (a command line has several)
-    Annotated[CompleteOptions, tyro.conf.subcommand(COMPLETE)],
-    Annotated[LiveOptions, tyro.conf.subcommand("live")],
-]
 RESERVED = ("out", "overwrite", "quiet", "threads", "dry-run", "help", "help-all")
 """Options that a batch sets for all jobs."""
 MAX_NAMED_FAILURES = 5
@@ -112,14 +106,20 @@ def run_batch(options: BatchOptions) -> int:
         row = read_row(job, out)
         if row is not None and row["state"] == "failed":
             failures.append(f"{row['job']}: {row['reason']}")
-    print_failures(console, failures)
+    print_failures(console, failures, len(share))
     sentence = f"{summarize_rows(out, share, left)} All results: {options.out}/index.html"
     console.print(sentence, markup=False, soft_wrap=True)
     return choose_exit_code(len(failures), len(share))
 
 
-def print_failures(console: Console, failures: Sequence[str]) -> None:
-    """Print the first failures with their reasons, and the number of the others."""
+def print_failures(console: Console, failures: Sequence[str], num_cases: int) -> None:
+    """Print the first failures with their reasons, and the number of the others.
+
+    A quiet console gets one line: an exit code other than 0 is never without a reason.
+    """
+    if failures and console.quiet:
+        counted = f"{len(failures)} of {num_cases} cases failed"
+        print_error(f"{counted}; the first: {failures[0]}")
     for failure in failures[:MAX_NAMED_FAILURES]:
         console.print(f"Failed: {failure}", markup=False, soft_wrap=True)
     if len(failures) > MAX_NAMED_FAILURES:
@@ -205,7 +205,7 @@ def parse_row(row: Mapping[str, Any], out: Path) -> CompleteOptions:
     # `complete`. Overwriting is safe: the folder of a job is in the batch's own output.
     words = [COMPLETE, row[FOLDER], *row_to_words(row), "--out", str(out), "--overwrite", "--quiet"]
     try:
-        options: CompleteOptions = validate(parse_words(words, Command, (COMPLETE,)))
+        options: CompleteOptions = validate(parse_words(words, {COMPLETE: CompleteOptions}))
     except InputError as error:
         # Only the sentence is kept in the row of a failed job, so it names the option itself.
         raise InputError(format_error(error)) from error

@@ -77,7 +77,7 @@ from gscompleter.splats.formats import load_splat
 from gscompleter.splats.morton import argsort_nearby
 from gscompleter.stages.context import prepare_single
 from gscompleter.state import Completion
-from gscompleter.system.errors import PROGRAM, quote_value
+from gscompleter.system.errors import print_error, quote_value
 from gscompleter.system.files.output_folder import reserve_output
 from gscompleter.system.files.video import find_ffmpeg
 from gscompleter.system.files.writing import (
@@ -208,7 +208,7 @@ def run_completion(options: CompleteOptions, prepare: Prepare = prepare_completi
         print_completion(options)
     if outcome.status == "not-reconstructed":
         if options.quiet:
-            print(f"{PROGRAM}{outcome.headline}", file=sys.stderr)
+            print_error(outcome.headline)
         sys.exit(1)
 
 

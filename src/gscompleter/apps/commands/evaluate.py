@@ -100,10 +100,10 @@ def score_methods(options: EvaluateOptions) -> Scored:
         compile_kernels((config.device, config.reconstructor, config.generator))
         counts = evaluate(tasks, methods, options.out, config, shard, options.rerun, engine)
 
-    print_failures(console, counts.failures)
+    own = counts.done + counts.failed + counts.skipped
+    print_failures(console, counts.failures, own)
     line = f"Scored {counts.done}, failed {counts.failed}, done earlier {counts.skipped}"
     console.print(f"{line}, of {len(tasks)} cases by {len(methods)} methods.")
-    own = counts.done + counts.failed + counts.skipped
     return Scored(len(tasks) * len(methods), own, counts.failures)
 
 

@@ -6,7 +6,7 @@ import errno
 from dataclasses import dataclass
 
 from gscompleter.apps.commands.exit_codes import ERROR, WRONG_INPUT
-from gscompleter.system.errors import MAX_MESSAGE_LENGTH, PROGRAM, quote_value, shorten_message
+from gscompleter.system.errors import quote_value
 from gscompleter.system.files.writing import FULL_DISK_ERRORS
 
 NAME_ERRORS = {errno.ENAMETOOLONG, errno.ELOOP}
@@ -46,7 +46,7 @@ def explain_failure(error: BaseException) -> Failure | None:
     while cause is not None and cause not in seen:
         sentence, code = _explain(cause)
         if sentence:
-            return Failure(shorten_message(sentence, MAX_MESSAGE_LENGTH - len(PROGRAM)), code)
+            return Failure(sentence, code)
         seen.append(cause)
         cause = cause.__cause__ or cause.__context__
     return None
