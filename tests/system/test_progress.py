@@ -92,6 +92,27 @@ def test_a_terminal_has_a_line_that_goes_away():
     assert said.rstrip("\n").endswith(("\x1b[2K", "\x1b[?25h"))  # the line erased, the cursor shown
 
 
+def test_a_terminal_shows_only_what_runs():
+    console = terminal()
+    with show_progress(console), stage("outer"):
+        for _ in track(range(2), "steps"):
+            pass
+    assert "steps 1 of 2" in written(console)
+    assert "steps" not in written(console).rpartition("outer")[2]
+
+
+def test_an_iteration_that_outlives_its_stage_ends_quietly():
+    """As after an exception, whose traceback keeps the generator of a loop."""
+    console = terminal()
+    with show_progress(console):
+        with stage("poses"):
+            photographs = iter(track(range(5), "photographs"))
+            next(photographs)
+        with stage("report"):
+            photographs.close()  # type: ignore[attr-defined]
+    assert "report" in written(console)
+
+
 def test_a_terminal_has_its_cursor_back_after_an_interrupt():
     console = terminal()
     with pytest.raises(KeyboardInterrupt), show_progress(console), stage("context"):

@@ -6,12 +6,11 @@ import time
 from collections.abc import Callable, Iterable, Iterator, Sized
 from contextlib import AbstractContextManager, contextmanager, nullcontext
 from contextvars import ContextVar
-from dataclasses import dataclass
 from typing import TYPE_CHECKING, TypeVar
 
 if TYPE_CHECKING:
     from rich.console import Console
-    from rich.progress import Progress
+    from rich.progress import Progress, Task, TaskID
 
 T = TypeVar("T")
 
@@ -19,93 +18,84 @@ LOG_SECONDS = 10.0
 """Seconds between log lines of counted steps."""
 
 
-@dataclass(eq=False)
-class Activity:
-    """A running stage, or a number of counted steps."""
-
-    name: str
-    total: int | None = None
-    """Number of steps; None for a stage."""
-    num_done: int = 0
-
-    def format_label(self) -> str:
-        """Return the name, with the number of the current step."""
-        if self.total is None:
-            return self.name
-        return f"{self.name} {min(self.num_done + 1, self.total)} of {self.total}"
-
-
 class Display:
-    """The running activities on a console, the outermost first."""
+    """The running activities on a console: tasks of rich, the outermost first.
+
+    On a terminal rich shows them. In a log it only keeps them, for the lines that are printed.
+    """
 
     def __init__(self, console: Console) -> None:
         self.has_bars = console.is_terminal and not console.is_dumb_terminal
         self._console = console
-        self._bars: Progress | None = None
-        self._running: list[Activity] = []
+        self._running = make_bars(console)
         self._line = ""
         self._line_time = 0.0
 
     @contextmanager
-    def show(self, activity: Activity) -> Iterator[None]:
-        """Show an activity during the block."""
-        if self.has_bars and not self._running:
-            self._bars = start_bars(self._console)
-        depth = len(self._running)
-        self._running.append(activity)
+    def show(self, name: str, total: int | None = None) -> Iterator[TaskID]:
+        """Show a number of counted steps during the block, or without `total` a stage."""
+        if self.has_bars and not self._running.tasks:
+            # New ones: if bars are started again, they erase the lines above them.
+            self._running = make_bars(self._console)
+            self._running.start()
+        running = self._running
+        task = running.add_task(name, total=total)
         try:
-            self.update()
-            yield
+            self._log()
+            yield task
         finally:
             # With whatever an exception left running inside.
-            del self._running[depth:]
-            if not self._running:
-                self.stop()
+            ended = [number for number in running.task_ids if number >= task]
+            if self.has_bars and ended == running.task_ids:
+                # Before the tasks are removed: without any, rich erases a line too many.
+                running.stop()
+            for number in ended:
+                running.remove_task(number)
+
+    def advance(self, task: TaskID) -> None:
+        """Count a step; a log shows it only `LOG_SECONDS` after its last line."""
+        self._running.advance(task)
+        if time.monotonic() >= self._line_time + LOG_SECONDS:
+            self._log()
 
     def stop(self) -> None:
         """Remove the live lines."""
-        if self._bars is not None:
-            self._bars.stop()
-        self._bars = None
+        if self.has_bars:
+            self._running.stop()
 
-    def update(self, log_seconds: float = 0.0) -> None:
-        """Show a change; a log shows it only `log_seconds` after its last line."""
-        if self._bars is not None:
-            self._update_bars(self._bars)
-        elif not self.has_bars and time.monotonic() >= self._line_time + log_seconds:
-            self._print_line()
+    def _log(self) -> None:
+        """Print the running activities as a line of a log, unless it would be the last one again.
 
-    def _update_bars(self, bars: Progress) -> None:
-        # Bars are in the order of the running activities, and take over each other's place.
-        for task in bars.task_ids[len(self._running) :]:
-            bars.remove_task(task)
-        for index, activity in enumerate(self._running):
-            label = activity.format_label()
-            if index == len(bars.task_ids):
-                bars.add_task(label, total=activity.total)
-            bars.update(bars.task_ids[index], description=label, completed=activity.num_done)
-
-    def _print_line(self) -> None:
-        # Steps inside a stage are hidden.
+        Steps inside a stage are hidden.
+        """
+        running = self._running.tasks
         shown = [
-            activity.format_label()
-            for outer, activity in zip([None, *self._running], self._running, strict=False)
-            if activity.total is None or outer is None or outer.total is not None
+            format_label(task)
+            for outer, task in zip([None, *running], running, strict=False)
+            if task.total is None or outer is None or outer.total is not None
         ]
         line = ": ".join(shown)
-        if line != self._line:
+        if not self.has_bars and line != self._line:
             self._line = line
             self._line_time = time.monotonic()
             self._console.print(line, highlight=False, markup=False, soft_wrap=True)
 
 
-def start_bars(console: Console) -> Progress:
-    """Start live lines that disappear at the end."""
-    from rich import progress  # a log does not need it
+def make_bars(console: Console) -> Progress:
+    """Make live lines that disappear at the end."""
+    # Imported by commands that show progress; a library call does without.
+    from rich import progress
+    from rich.text import Text
 
-    bars = progress.Progress(
+    class LabelColumn(progress.ProgressColumn):
+        """The name of an activity, with the number of the current step."""
+
+        def render(self, task: Task) -> Text:
+            return Text(format_label(task))
+
+    return progress.Progress(
         progress.SpinnerColumn(),
-        progress.TextColumn("{task.description}", markup=False),
+        LabelColumn(),
         progress.BarColumn(24),
         progress.TimeElapsedColumn(),
         progress.TimeRemainingColumn(),
@@ -114,8 +104,13 @@ def start_bars(console: Console) -> Progress:
         refresh_per_second=4,
         redirect_stdout=False,
     )
-    bars.start()
-    return bars
+
+
+def format_label(task: Task) -> str:
+    """Return the name of an activity, with the number of the current step."""
+    if task.total is None:
+        return task.description
+    return f"{task.description} {min(task.completed + 1, task.total)} of {task.total}"
 
 
 _display: ContextVar[Display | None] = ContextVar("display", default=None)
@@ -145,21 +140,21 @@ def notify_of_stages(listener: Callable[[str], None]) -> Iterator[None]:
         _listener.reset(token)
 
 
-def stage(name: str) -> AbstractContextManager[None]:
+def stage(name: str) -> AbstractContextManager[object]:
     """Show a stage during the block, and notify the listener."""
     listener = _listener.get()
     display = _display.get()
     if listener is not None:
         listener(name)
-    return nullcontext() if display is None else display.show(Activity(name))
+    return nullcontext() if display is None else display.show(name)
 
 
-def show_preparation(name: str) -> AbstractContextManager[None]:
+def show_preparation(name: str) -> AbstractContextManager[object]:
     """Show a preparation with its stages during the block, on a terminal only."""
     display = _display.get()
     if display is None or not display.has_bars:
         return show_progress(None)
-    return display.show(Activity(name))
+    return display.show(name)
 
 
 def track(items: Iterable[T], description: str, total: int | None = None) -> Iterable[T]:
@@ -168,13 +163,12 @@ def track(items: Iterable[T], description: str, total: int | None = None) -> Ite
     total = len(items) if isinstance(items, Sized) else total
     if display is None or not total:
         return items
-    return count_items(items, Activity(description, total), display)
+    return count_items(items, description, total, display)
 
 
-def count_items(items: Iterable[T], activity: Activity, display: Display) -> Iterator[T]:
+def count_items(items: Iterable[T], description: str, total: int, display: Display) -> Iterator[T]:
     """Count items on a display while iterating over them."""
-    with display.show(activity):
+    with display.show(description, total) as task:
         for item in items:
             yield item
-            activity.num_done += 1
-            display.update(LOG_SECONDS)
+            display.advance(task)
