@@ -96,7 +96,7 @@ def test_what_is_killed_goes_on_and_every_job_is_done_once(tmp_path):
 @pytest.mark.parametrize("engine", ["local", "ray"])
 def test_of_two_hundred_jobs_each_is_done_once_whatever_is_killed(engine, tmp_path):
     if engine == "ray":
-        pytest.importorskip("ray")
+        pytest.importorskip("ray", reason="needs gscompleter[ray]")
     killed_and_started_again(engine, tmp_path, 200, 0.2)
 
 
@@ -407,7 +407,7 @@ def test_a_folder_of_something_else_is_refused(tmp_path, manifest, monkeypatch, 
 
 @pytest.mark.slow
 def test_ray_does_what_is_told_and_tells_of_lost_workers(tmp_path, monkeypatch):
-    pytest.importorskip("ray")
+    pytest.importorskip("ray", reason="needs gscompleter[ray]")
     monkeypatch.setenv("PYTHONPATH", os.pathsep.join(p for p in sys.path if p))
     jobs = [Job("bad", {"ends": "always killed"}), *plain_jobs(3, 0.0)]
     names = run_all(tmp_path, jobs, engine_named("ray", 1), 0)
@@ -438,7 +438,7 @@ def test_ray_that_does_not_answer_is_a_sentence(address, sentence):
 
 
 def test_submitit_does_the_shares_and_a_lost_one_is_done_again(tmp_path, monkeypatch):
-    pytest.importorskip("submitit")
+    pytest.importorskip("submitit", reason="needs gscompleter[slurm]")
     monkeypatch.setenv("PYTHONPATH", os.pathsep.join(p for p in sys.path if p))
     jobs = [Job("shy", {"ends": "killed once"}), *plain_jobs(4, 0.0)]
     engine = partial(open_submitit, 2, 1, 0.0, tmp_path / "submitit", {})

@@ -37,7 +37,7 @@ from target_views import begin_with
 UP = torch.tensor([0.0, -1.0, 0.0])
 SIZE = 32
 
-imageio_ffmpeg = pytest.importorskip("imageio_ffmpeg")
+imageio_ffmpeg = pytest.importorskip("imageio_ffmpeg", reason="needs gscompleter[film]")
 
 
 def pitched(camera: Camera, degrees: float) -> Camera:

@@ -15,9 +15,12 @@ from unittest.mock import MagicMock, Mock
 import numpy as np
 import pytest
 import torch
-import viser
 from rich.console import Console
 from scipy.spatial.transform import Rotation
+
+pytest.importorskip("viser", reason="needs gscompleter[live]")
+
+import viser
 
 from command import run
 from gscompleter import load_ply, save_ply

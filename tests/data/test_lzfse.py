@@ -40,7 +40,7 @@ def test_other_data_is_refused(data):
 
 @pytest.mark.parametrize("count", [0, 3, 100, 20_000, 500_000])
 def test_sizes_agree_with_the_library(count):
-    library = pytest.importorskip("liblzfse")
+    library = pytest.importorskip("liblzfse", reason="needs gscompleter[phones]")
     smooth = np.linspace(0, 3, count, dtype="<f4").tobytes()
     noise = np.random.default_rng(0).integers(0, 256, count, dtype=np.uint8).tobytes()
     for data in (bytes(count), smooth, noise):

@@ -77,7 +77,7 @@ def test_panoramas_are_recognised_by_their_borders_or_their_metadata(tmp_path):
 
 
 def test_panoramas_beside_other_sizes_are_refused(tmp_path, monkeypatch, capsys):
-    pytest.importorskip("pycolmap")
+    pytest.importorskip("pycolmap", reason="needs gscompleter[poses]")
     for width in (64, 128):
         ordinary(panoramas(tmp_path / f"p{width}", 2) / "other.png", width)
         out = tmp_path / "out"
@@ -90,7 +90,7 @@ def test_panoramas_beside_other_sizes_are_refused(tmp_path, monkeypatch, capsys)
 
 @pytest.mark.parametrize("command", ["poses", "complete"])
 def test_one_panorama_is_refused(tmp_path, monkeypatch, capsys, command):
-    pytest.importorskip("pycolmap")
+    pytest.importorskip("pycolmap", reason="needs gscompleter[poses]")
     given, out = panoramas(tmp_path / "p", 1), tmp_path / "out"
     assert run(monkeypatch, command, given, "--out", out, "--quiet") == 2
     assert "There is a single panorama in " in capsys.readouterr().err
@@ -111,7 +111,7 @@ def test_files_of_insta360_have_to_be_exported_first(tmp_path, monkeypatch, caps
 
 
 def test_several_panoramas_are_a_scene_of_views_with_common_centres(tmp_path, monkeypatch, capsys):
-    pytest.importorskip("pycolmap")
+    pytest.importorskip("pycolmap", reason="needs gscompleter[poses]")
     given, out = panoramas(tmp_path / "room", 4), tmp_path / "poses"
     assert run(monkeypatch, "poses", given, "--out", out) == 0
     said = capsys.readouterr().out.splitlines()

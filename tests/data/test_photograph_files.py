@@ -257,7 +257,7 @@ def test_avif_is_read(tmp_path):
 
 
 def test_heic_is_read_with_pillow_heif(tmp_path):
-    heif = pytest.importorskip("pillow_heif")
+    heif = pytest.importorskip("pillow_heif", reason="needs gscompleter[heic]")
     heif.from_pillow(Image.fromarray(CAMERAS[0].photograph)).save(tmp_path / "a.HEIC", quality=95)
     difference = read_pixels(tmp_path / "a.HEIC").astype(int) - CAMERAS[0].photograph
     assert np.abs(difference).mean() < 8

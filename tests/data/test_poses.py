@@ -13,12 +13,6 @@ from PIL import Image
 from command import run
 from gscompleter.data.formats import open_photographs
 from gscompleter.data.sfm import poses
-from gscompleter.data.sfm.mapping_process import (
-    is_sequence,
-    pair_all,
-    pair_neighbours,
-    pair_similar,
-)
 from gscompleter.data.sfm.poses import (
     MAX_SIDE,
     find_poses,
@@ -55,7 +49,7 @@ def blank(folder: Path, count: int) -> Path:
 
 
 def test_the_cameras_of_a_room_are_found_up_to_a_similarity(tmp_path, monkeypatch, capsys):
-    pytest.importorskip("pycolmap")
+    pytest.importorskip("pycolmap", reason="needs gscompleter[poses]")
     given, out = photographs(tmp_path / "room"), tmp_path / "poses"
     assert run(monkeypatch, "poses", given, "--out", out) == 0
     assert capsys.readouterr().out.startswith("8 of 8 cameras and ")
@@ -135,25 +129,8 @@ def test_a_focal_length_that_was_held_is_told(tmp_path, monkeypatch):
     assert "344 px" in note
 
 
-def test_lenses_that_no_camera_has_are_implausible():
-    pycolmap = pytest.importorskip("pycolmap")
-    from gscompleter.data.sfm.mapping_process import is_plausible
-
-    def camera(focal: float, distortion: float = 0, x: float = 320) -> object:
-        return pycolmap.Camera(
-            model="SIMPLE_RADIAL", width=640, height=193, params=[focal, x, 96.5, distortion]
-        )
-
-    assert is_plausible(camera(344, -0.1))
-    assert is_plausible(camera(1488))  # a telephoto lens
-    assert not is_plausible(camera(1549, 137))
-    assert not is_plausible(camera(22530))
-    assert not is_plausible(camera(0))
-    assert not is_plausible(camera(344, x=400))
-
-
 def test_a_drive_is_placed_with_its_focal_length_held(shared, tmp_path):
-    pytest.importorskip("pycolmap")
+    pytest.importorskip("pycolmap", reason="needs gscompleter[poses]")
     given = tmp_path / "drive"
     given.mkdir()
     for source in list_photographs(shared, "kitti_city", 30)[20:]:
@@ -168,7 +145,7 @@ def test_a_drive_is_placed_with_its_focal_length_held(shared, tmp_path):
 
 
 def test_photographs_of_nothing_have_no_cameras(tmp_path, monkeypatch, capsys):
-    pytest.importorskip("pycolmap")
+    pytest.importorskip("pycolmap", reason="needs gscompleter[poses]")
     out = tmp_path / "out"
     assert run(monkeypatch, "poses", blank(tmp_path / "p", 3), "--out", out, "--quiet") == 2
     assert "COLMAP placed 0 of 3 photographs" in capsys.readouterr().err
@@ -266,7 +243,7 @@ def test_masks_hidden_files_and_our_own_results_are_no_photographs(tmp_path):
 
 
 def test_photographs_alone_are_completed_and_their_cameras_kept(tmp_path, monkeypatch):
-    pytest.importorskip("pycolmap")
+    pytest.importorskip("pycolmap", reason="needs gscompleter[poses]")
     given, out = photographs(tmp_path / "room"), tmp_path / "out"
     words = ["complete", given, "--context", 0, 2, "--out", out, "--resolution", 48, 48, "--quiet"]
     assert run(monkeypatch, *words, "--target", 4) == 0
@@ -286,36 +263,9 @@ def test_names_are_sorted_as_people_count():
     assert sorted(["10.jpg", "9.jpg", "b.jpg"], key=make_sort_key) == ["9.jpg", "10.jpg", "b.jpg"]
 
 
-@pytest.mark.parametrize(
-    ("names", "counts"),
-    [
-        (["IMG_0001.jpg", "IMG_0002.jpg"], True),
-        (["7.png", "10.png"], True),
-        (["2024-05-01 frame 3.png", "2024-05-01 frame 4.png"], True),
-        (["left/1.png", "right/2.png"], False),
-        (["door.png", "window.png"], False),
-    ],
-)
-def test_names_with_a_number_are_a_sequence(names, counts):
-    assert is_sequence(names) is counts
-
-
-def test_neighbours_reach_ten_on_and_then_by_doubling():
-    assert {j for i, j in pair_neighbours(40) if i == 0} == {*range(1, 11), 16, 32}
-    assert pair_neighbours(3) == pair_all(3) == {(0, 1), (0, 2), (1, 2)}
-
-
-def test_photographs_with_the_same_features_look_alike():
-    generator = np.random.default_rng(0)
-    near, far = (generator.standard_normal((40, 128)).astype(np.float32) for _ in range(2))
-    near, far = (x / np.linalg.norm(x, axis=1, keepdims=True) for x in (near, far))
-    nothing = np.zeros((0, 128), np.float32)
-    assert pair_similar([near, far, near[::-1].copy(), nothing]) == {(0, 2)}
-
-
 @pytest.mark.slow
 def test_forty_real_photographs_are_all_placed(shared, tmp_path):
-    pytest.importorskip("pycolmap")
+    pytest.importorskip("pycolmap", reason="needs gscompleter[poses]")
     found = find_poses(shared / "data" / "fox" / "images", tmp_path / "fox")
     assert found.num_registered == 40
     assert found.error < 0.5
@@ -323,7 +273,7 @@ def test_forty_real_photographs_are_all_placed(shared, tmp_path):
 
 @pytest.mark.slow
 def test_of_two_scenes_in_a_folder_the_larger_is_kept(shared, tmp_path):
-    pytest.importorskip("pycolmap")
+    pytest.importorskip("pycolmap", reason="needs gscompleter[poses]")
     sources = [*list_photographs(shared, "fox", 12), *list_photographs(shared, "hololens_room", 8)]
     names = [f"{letter}.jpg" for letter in string.ascii_lowercase[: len(sources)]]
     (tmp_path / "both").mkdir()

@@ -22,7 +22,7 @@ from mapping_stand_in import model_script, similarity_removed, stand_in
 from panoramas import panorama
 from scenes import Room, camera_at, view_of
 
-pytest.importorskip("imageio_ffmpeg")
+pytest.importorskip("imageio_ffmpeg", reason="needs gscompleter[film]")
 
 STILL, BLURRED = 5, (9, 14, 15, 28)
 """Frames before the camera moves, and frames without sharp edges."""
@@ -165,7 +165,7 @@ BROKEN = {
 
 @pytest.mark.parametrize("kind", BROKEN)
 def test_what_cannot_be_used_is_refused_with_a_sentence(video, tmp_path, monkeypatch, capsys, kind):
-    pytest.importorskip("pycolmap")
+    pytest.importorskip("pycolmap", reason="needs gscompleter[poses]")
     given, out = broken(video, tmp_path, kind), tmp_path / "out"
     for command in ("poses", "complete"):
         assert run(monkeypatch, command, given, "--out", out, "--quiet") == 2
@@ -190,7 +190,7 @@ def test_a_missing_video_is_refused(tmp_path, monkeypatch, capsys):
 
 
 def test_a_missing_package_is_named(video, tmp_path, monkeypatch, capsys):
-    pytest.importorskip("pycolmap")
+    pytest.importorskip("pycolmap", reason="needs gscompleter[poses]")
     monkeypatch.setitem(sys.modules, "imageio_ffmpeg", None)
     assert run(monkeypatch, "poses", video, "--out", tmp_path / "out", "--quiet") == 2
     assert "pip install gscompleter[film]" in capsys.readouterr().err
@@ -218,7 +218,7 @@ def test_the_next_run_keeps_the_poses_unless_it_wants_other_frames(video, tmp_pa
 
 
 def test_a_video_is_completed_by_one_command(video, tmp_path, monkeypatch, capsys):
-    pytest.importorskip("pycolmap")
+    pytest.importorskip("pycolmap", reason="needs gscompleter[poses]")
     out = tmp_path / "out"
     words = ["complete", video, "--out", out, "--frames", 8, "--resolution", 48, 48]
     assert run(monkeypatch, *words, "--context", 0, 2, "--target", 4) == 0

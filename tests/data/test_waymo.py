@@ -12,6 +12,8 @@ import pytest
 import torch
 from PIL import Image
 
+pytest.importorskip("pyarrow", reason="needs gscompleter[waymo]")
+
 from command import run
 from gscompleter import InputError
 from gscompleter.data.driving.vehicle import build_poses

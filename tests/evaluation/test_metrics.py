@@ -185,7 +185,7 @@ def test_the_border_of_a_hole_is_no_gradient():
 
 
 def test_looks_are_of_the_pixels_that_are_asked_for():
-    pytest.importorskip("flip_evaluator")
+    pytest.importorskip("flip_evaluator", reason="needs gscompleter[evaluation]")
     _, truth = images(size=64)
     damaged = torch.where(left_half(truth)[..., None], blurred(truth, 2.0), truth)
     inside = torch.arange(truth.shape[1]) < truth.shape[1] // 2 - 12

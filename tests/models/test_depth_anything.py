@@ -578,7 +578,7 @@ def test_wrong_views_and_precisions_are_refused_with_a_sentence():
 
 
 def test_a_file_as_published_fills_the_network(tmp_path, monkeypatch):
-    safetensors = pytest.importorskip("safetensors.torch")
+    safetensors = pytest.importorskip("safetensors.torch", reason="needs gscompleter[models]")
     monkeypatch.setattr(depth_anything, "VARIANTS", {"da3-base": TINY})
     path = tmp_path / "model.safetensors"
     state = {f"model.{name}": value for name, value in random(TINY).state_dict().items()}

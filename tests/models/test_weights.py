@@ -18,11 +18,14 @@ from functools import partial
 from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 from pathlib import Path
 
-import huggingface_hub
 import pytest
 import torch
-from huggingface_hub import constants
 from torch import Tensor, nn
+
+pytest.importorskip("huggingface_hub", reason="needs gscompleter[models]")
+
+import huggingface_hub
+from huggingface_hub import constants
 
 from gscompleter import reconstructors
 from gscompleter.cli import main
@@ -565,7 +568,7 @@ def write_safetensors(path: Path, tensors: dict[str, Tensor]) -> None:
 
 
 def test_a_conversion_to_safetensors_needs_no_hash_but_has_to_fit(tmp_path: Path):
-    pytest.importorskip("safetensors")
+    pytest.importorskip("safetensors", reason="needs gscompleter[models]")
     path = tmp_path / "weights.safetensors"
     tensors = published_tensors()
     write_safetensors(path, tensors)

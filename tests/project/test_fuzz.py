@@ -12,6 +12,8 @@ import pytest
 
 from paths import SUPPORT
 
+pytest.importorskip("imageio_ffmpeg", reason="needs gscompleter[film]")
+
 
 @pytest.mark.linux
 def test_mutated_inputs_end_in_a_sentence_or_a_result():

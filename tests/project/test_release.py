@@ -29,7 +29,7 @@ from release_check import (
     install,
 )
 
-DEVELOPERS = {"test", "dev", "docs"}
+DEVELOPERS = {"test-core", "test", "dev", "docs"}
 KERNELS = Path("numerics", "kernels")
 """Extras that users do not need."""
 

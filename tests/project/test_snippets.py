@@ -171,6 +171,7 @@ def test_commands_within_sentences_name_what_there_is(page):
 
 @pytest.mark.parametrize("command", ["complete", "view"])
 def test_the_reference_has_a_term_for_each_option(command):
+    pytest.importorskip("mkdocs", reason="needs gscompleter[docs]")
     site = runpy.run_path(str(ROOT / "mkdocs_hooks.py"))
     page = site["as_definitions"](site["help_of"](command))
     terms = set(re.findall(r"^`(?:-h, )?(--[\w.-]+)[^`]*`\n:   +\S", page, re.M))
