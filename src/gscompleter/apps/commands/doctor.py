@@ -43,7 +43,7 @@ PURPOSES = {
     "heic": "photographs as HEIC, as iPhones take them",
     "usd": "splats as OpenUSD (.usda, .usdc, .usdz)",
 }
-"""Purpose of each extra. Those for developers (`test-core`, `test`, `dev`, `docs`) are not listed."""
+"""Purpose of each extra, without those for developers (`test-core`, `test`, `dev`, `docs`)."""
 
 
 @dataclass(frozen=True)
