@@ -199,6 +199,7 @@ def reproduce(monkeypatch, data: Path, out: Path, *more: object) -> int:
 
 
 def test_a_table_and_a_figure_of_rooms(rooms, tmp_path, monkeypatch):
+    pytest.importorskip("matplotlib", reason="needs gscompleter[evaluation]")
     more = ("--table", "models", "spans", "--figure", "seams", "--outlines", "--crops")
     assert reproduce(monkeypatch, rooms, tmp_path, *more) == 0
     table = json.loads((tmp_path / "tables" / "spans.json").read_text())
@@ -222,6 +223,8 @@ def test_a_table_and_a_figure_of_rooms(rooms, tmp_path, monkeypatch):
 @pytest.mark.slow
 def test_all_of_the_paper_on_photographs(clips, tmp_path, monkeypatch):
     """Two models with random weights, and for steps a tiny model in place of PE-Field's."""
+    pytest.importorskip("matplotlib", reason="needs gscompleter[evaluation]")
+    pytest.importorskip("diffusers", reason="needs gscompleter[diffusion]")
     weights = []
     for seed in range(2):
         torch.manual_seed(seed)
@@ -260,7 +263,6 @@ def test_all_of_the_paper_on_photographs(clips, tmp_path, monkeypatch):
     ("more", "sentence"),
     [
         (("--table", "stress", "--protocol", "stress-2-70"), "no clip has the frames"),
-        (("--table", "steps", "--generator", "warp-inpaint"), "FLUX.1-Kontext"),
         (("--reconstructor", "plane-sweep", "plane-sweep"), "is named twice"),
         (
             ("--table", "models", "--weights", "x.ckpt", "y.ckpt"),
@@ -274,6 +276,14 @@ def test_what_cannot_be_made_is_a_sentence(more, sentence, rooms, tmp_path, monk
     error = " ".join(capsys.readouterr().err.split())
     assert sentence in error
     assert "Traceback" not in error
+
+
+def test_the_steps_need_the_model_of_the_paper(rooms, tmp_path, monkeypatch, capsys):
+    for package in ("diffusers", "transformers", "accelerate"):
+        pytest.importorskip(package, reason="needs gscompleter[diffusion]")
+    more = ("--table", "steps", "--generator", "warp-inpaint")
+    assert reproduce(monkeypatch, rooms, tmp_path, *more) == 2
+    assert "FLUX.1-Kontext" in capsys.readouterr().err
 
 
 def test_a_case_that_no_figure_can_show_is_named_once_the_cases_are_there(
