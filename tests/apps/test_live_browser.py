@@ -16,6 +16,8 @@ from browsing import PATIENCE, SWITCHES, launched
 from command import run
 from scenes import camera_at, photographed
 
+pytest.importorskip("viser", reason="needs gscompleter[live]")
+
 pytestmark = pytest.mark.browser
 
 SIZE = 48
