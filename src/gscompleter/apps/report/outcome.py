@@ -43,8 +43,8 @@ MIN_LOSS = 0.05
 """Loss of PSNR in dB from which the headline mentions it; smaller ones cannot be seen."""
 
 ADVICE = (
-    "Usual reasons: camera poses or focal lengths that are not those of the photographs, "
-    "things that moved, or photographs with too little in common."
+    "Usual reasons: wrong poses or focal lengths of the cameras, things that moved, or photographs "
+    "with too little in common."
 )
 NO_TARGET = "no large hole was found around the photographs"
 REJECTED = "the generated image contradicts the photographs"
