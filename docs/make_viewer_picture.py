@@ -13,8 +13,7 @@ from tempfile import TemporaryDirectory
 
 from playwright.sync_api import sync_playwright
 
-from gscompleter.apps.commands.options import ViewOptions
-from gscompleter.apps.commands.view import run_view
+from gscompleter.apps.commands.view import ViewOptions, run_view
 
 SWITCHES = ["--no-sandbox", "--use-angle=swiftshader", "--enable-unsafe-swiftshader"]
 LINK = "#camera=target-2&mode=side&generated=show"

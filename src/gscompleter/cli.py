@@ -7,49 +7,48 @@ import logging
 import os
 import sys
 import warnings
-from collections.abc import Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import suppress
 from importlib import import_module
+from types import ModuleType
 from typing import Any
 
 from gscompleter import __version__
-from gscompleter.apps.commands import options
-from gscompleter.apps.commands.exit_codes import ERROR, INTERRUPTED, WRONG_INPUT
-from gscompleter.apps.commands.failures import explain_failure
-from gscompleter.apps.commands.overlap import check_overlap
-from gscompleter.apps.commands.words import format_error, parse_words
+from gscompleter.apps.command_line.exit_codes import ERROR, INTERRUPTED, WRONG_INPUT
+from gscompleter.apps.command_line.failures import explain_failure
+from gscompleter.apps.command_line.words import format_error, parse_words
+from gscompleter.apps.commands.shared_options import ComputeOptions, Options
 from gscompleter.config.settings import validate
 from gscompleter.system.errors import FullDiskError, InputError, NoCaseError, print_error
 from gscompleter.system.files.writing import FULL_DISK_ERRORS, handle_stop_signals
-from gscompleter.system.process import (
-    import_without_collection,
-    let_idle_threads_sleep,
-    skip_last_collection,
-)
+from gscompleter.system.process import let_idle_threads_sleep, skip_last_collection
 from gscompleter.system.threads import limit_threads
 
-# Options, module and function of each command. The module is imported after the options are
-# validated, so that `--help` does not wait for torch.
-COMMANDS: dict[str, tuple[type, str, str]] = {
-    "complete": (options.CompleteOptions, "complete", "run_completion"),
-    "batch": (options.BatchOptions, "batch", "run_batch"),
-    "live": (options.LiveOptions, "live", "run_live"),
-    "remove": (options.RemoveOptions, "remove", "run_removal"),
-    "clean": (options.CleanOptions, "clean", "run_clean"),
-    "demo": (options.DemoOptions, "demo", "run_demo"),
-    "evaluate": (options.EvaluateOptions, "reproduce", "run_evaluation"),
-    "tables": (options.TablesOptions, "evaluate", "run_tables"),
-    "index": (options.IndexOptions, "evaluate", "run_index"),
-    "bench": (options.BenchOptions, "bench", "run_bench"),
-    "models": (options.ModelsOptions, "models", "run_models"),
-    "convert": (options.ConvertOptions, "convert", "run_convert"),
-    "poses": (options.PosesOptions, "poses", "run_poses"),
-    "report": (options.ReportOptions, "complete", "run_report"),
-    "strip": (options.StripOptions, "convert", "run_strip"),
-    "view": (options.ViewOptions, "view", "run_view"),
-    "doctor": (options.DoctorOptions, "doctor", "run_doctor"),
-    "warmup": (options.WarmupOptions, "doctor", "run_warmup"),
-}
+COMMANDS = (
+    *("complete", "batch", "live", "remove", "clean", "demo", "evaluate", "tables", "index"),
+    *("bench", "models", "convert", "poses", "report", "strip", "view", "doctor", "warmup"),
+)
+"""Names of all commands, in the order of the help page.
+
+The command `complete` is the file `apps/commands/complete.py` with the class `CompleteOptions` and
+the function `run_complete`, and so are all others.
+"""
+
+
+class OptionClasses(Mapping[str, type]):
+    """Class of the options of each command, imported when it is asked for."""
+
+    def __getitem__(self, name: str) -> type:
+        if name not in COMMANDS:
+            raise KeyError(name)
+        kind: type = getattr(import_command(name), f"{name.capitalize()}Options")
+        return kind
+
+    def __iter__(self) -> Iterator[str]:
+        return iter(COMMANDS)
+
+    def __len__(self) -> int:
+        return len(COMMANDS)
 
 
 def run() -> None:
@@ -116,17 +115,16 @@ def main() -> None:
 
         # tyro converts the words to types, and `validate` adds the ranges of the annotations.
         command_options = validate(parse_command(words))
-        check_overlap(command_options)
+        if isinstance(command_options, Options):
+            command_options.check_overlap()
         if getattr(command_options, "quiet", False):
             logging.getLogger("gscompleter").setLevel(logging.ERROR)
 
         # Numba reads the number of threads when it is imported, with the command.
-        if isinstance(command_options, options.ComputeOptions):
+        if isinstance(command_options, ComputeOptions):
             limit_threads(command_options.threads)
-        _, module, function = COMMANDS[words[0]]
-        with import_without_collection():
-            command = getattr(import_module(f"gscompleter.apps.commands.{module}"), function)
-        code = command(command_options)
+        run_command = getattr(import_command(words[0]), f"run_{words[0]}")
+        code = run_command(command_options)
     except InputError as error:
         # Both are InputErrors for their sentences alone: no other input would help.
         print_error(format_error(error))
@@ -160,4 +158,9 @@ def check_working_folder() -> None:
 
 def parse_command(words: Sequence[str]) -> Any:
     """Parse the options of the command; raises as `parse_words`."""
-    return parse_words(words, {name: kind for name, (kind, _, _) in COMMANDS.items()})
+    return parse_words(words, OptionClasses())
+
+
+def import_command(name: str) -> ModuleType:
+    """Import the file of a command."""
+    return import_module(f"gscompleter.apps.commands.{name}")

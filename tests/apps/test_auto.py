@@ -8,7 +8,7 @@ import torch
 
 from command import run
 from gscompleter import load_cameras
-from gscompleter.apps.commands.words import insert_auto_count
+from gscompleter.apps.command_line.words import insert_auto_count
 from gscompleter.cli import parse_command
 from gscompleter.data.formats import open_photographs
 from gscompleter.numerics.geometry import measure_baseline

@@ -19,7 +19,7 @@ from batch_jobs import Writing, engine_named, plain_jobs, run_all
 from command import run
 from gscompleter import InputError
 from gscompleter.apps.batch.manifest import list_results, read_manifest
-from gscompleter.apps.commands.batch import parse_row
+from gscompleter.apps.batch.rows import parse_row
 from gscompleter.system.errors import OutputError
 from gscompleter.system.jobs import jobs as batch
 from gscompleter.system.jobs.engines import connect_to_ray, open_submitit

@@ -22,7 +22,7 @@ import torch
 
 from command import run
 from gscompleter import load_ply
-from gscompleter.cli import COMMANDS, parse_command
+from gscompleter.cli import COMMANDS, OptionClasses, parse_command
 from gscompleter.config import CompleterConfig
 from gscompleter.config.generators import GeneratorSettings
 from gscompleter.data.scene import write_cameras
@@ -412,7 +412,7 @@ def test_help_has_every_option_and_one_for_the_settings(monkeypatch, capsys, com
     assert said.count("\n") < 125
     assert "None" not in said
     shown = set(re.findall(r"^(?:  |│ )(?:-h, )?(--[a-z-]+)", said, re.MULTILINE))
-    kind, _, _ = COMMANDS[command]
+    kind = OptionClasses()[command]
     known = {f"--{f.name.replace('_', '-')}" for f in fields(kind) if "Positional" not in f.type}
     positive = known - {"--ego-mask", "--masks", "--synthesis"}
     assert positive - shown <= {"--config"}

@@ -12,9 +12,10 @@ import torch
 
 from command import run
 from gscompleter import InputError, load_cameras, load_ply
-from gscompleter.apps.commands import complete as command
-from gscompleter.apps.commands.evaluate import collect_tasks
-from gscompleter.apps.commands.options import parse_resolution
+from gscompleter.apps.commands.shared_options import parse_resolution
+from gscompleter.apps.completing import complete as command
+from gscompleter.apps.completing import preparation
+from gscompleter.apps.evaluating.cases import collect_tasks
 from gscompleter.apps.inputs.opening import CompletionTask, Opened, estimate_memory, read_task
 from gscompleter.apps.inputs.selection import select_near_and_far
 from gscompleter.cli import parse_command
@@ -218,7 +219,7 @@ def test_an_interrupt_leaves_a_sentence(scene, tmp_path, monkeypatch, capsys):
     def open_scene(*_: object) -> None:
         raise KeyboardInterrupt
 
-    monkeypatch.setattr(command, "open_scene", open_scene)
+    monkeypatch.setattr(preparation, "open_scene", open_scene)
     assert run(monkeypatch, *complete(scene, tmp_path / "out")) == 130
     assert "interrupted; no unfinished result was written." in capsys.readouterr().err
     assert not (tmp_path / "out").exists()

@@ -24,8 +24,8 @@ import viser
 
 from command import run
 from gscompleter import load_ply, save_ply
-from gscompleter.apps.commands import live
-from gscompleter.apps.commands.options import LiveOptions
+from gscompleter.apps.commands.live import LiveOptions
+from gscompleter.apps.live import serving
 from gscompleter.apps.live.box import remove_in_box
 from gscompleter.apps.live.page import (
     Address,
@@ -73,13 +73,13 @@ def options_for(room: Path, out: Path, **others) -> LiveOptions:
 
 
 @pytest.fixture(scope="module")
-def ready(room, tmp_path_factory) -> live.Prepared:
-    return live.prepare(options_for(room, tmp_path_factory.mktemp("outs") / "out"), QUIET)
+def ready(room, tmp_path_factory) -> serving.Prepared:
+    return serving.prepare(options_for(room, tmp_path_factory.mktemp("outs") / "out"), QUIET)
 
 
 @pytest.fixture(scope="module")
 def begun(ready) -> Session:
-    return live.begin_session(ready)
+    return serving.begin_session(ready)
 
 
 def test_undo_goes_back_and_the_same_camera_leads_to_the_same_scene(begun):
@@ -114,7 +114,7 @@ def test_stages_are_heard_as_they_begin(begun):
     assert list(dict.fromkeys(heard)) == list(STAGES)
 
 
-def the_same_as_complete(monkeypatch, ready: live.Prepared, tmp_path: Path, *more) -> bool:
+def the_same_as_complete(monkeypatch, ready: serving.Prepared, tmp_path: Path, *more) -> bool:
     """Compare the saved files with those of `complete` at the saved cameras."""
     out, other = ready.options.out, tmp_path / "by complete"
     context = json.loads((out / "summary.json").read_text())["settings"]["context"]
@@ -128,12 +128,12 @@ def the_same_as_complete(monkeypatch, ready: live.Prepared, tmp_path: Path, *mor
 
 def test_what_is_saved_is_what_complete_writes(ready, begun, tmp_path, monkeypatch):
     with pytest.raises(InputError, match="nothing to save"):
-        live.save_session(ready, begun)
+        serving.save_session(ready, begun)
     session, _ = complete_camera(begun, HOLES[0])
-    assert str(ready.options.out) in live.save_session(ready, session)
+    assert str(ready.options.out) in serving.save_session(ready, session)
     assert the_same_as_complete(monkeypatch, ready, tmp_path)
     session, _ = complete_camera(session, HOLES[1])
-    live.save_session(ready, session)  # replaces its own files
+    serving.save_session(ready, session)  # replaces its own files
     assert len(json.loads((ready.options.out / "summary.json").read_text())["targets"]) == 2
     assert the_same_as_complete(monkeypatch, ready, tmp_path, "--overwrite")
 
@@ -142,7 +142,7 @@ def test_what_others_wrote_is_not_replaced(room, tmp_path):
     (tmp_path / "out").mkdir()
     (tmp_path / "out" / "mine.txt").write_text("mine")
     with pytest.raises(InputError, match="not empty"):
-        live.prepare(options_for(room, tmp_path / "out"), QUIET)
+        serving.prepare(options_for(room, tmp_path / "out"), QUIET)
 
 
 def test_what_is_saved_of_a_splat_in_a_frame_of_its_own_is_too(tmp_path, monkeypatch):
@@ -156,14 +156,14 @@ def test_what_is_saved_of_a_splat_in_a_frame_of_its_own_is_too(tmp_path, monkeyp
     )
     config = CompleterConfig.splat()
     options = options_for(room, tmp_path / "out", scene=tmp_path / "splat.ply", config=config)
-    ready = live.prepare(options, QUIET)
+    ready = serving.prepare(options, QUIET)
     assert ready.task.method == "dataparser"
-    session = live.begin_session(ready)
+    session = serving.begin_session(ready)
     target = transform_camera(HOLES[0], ready.task.frame)
     session, result = complete_camera(session, target)
     assert len(result.added) > 0
     assert torch.allclose(session.cameras[0].c2w.float(), HOLES[0].c2w, atol=1e-6)
-    live.save_session(ready, session)
+    serving.save_session(ready, session)
     assert the_same_as_complete(monkeypatch, ready, tmp_path, "--scene", options.scene)
 
 
@@ -172,24 +172,24 @@ def test_an_antialiased_splat_is_named_so_and_saved_as_one(room, tmp_path):
     save_ply(tmp_path / "splat.ply", replace(scene, is_antialiased=True))
     options = options_for(room, tmp_path / "out", scene=tmp_path / "splat.ply")
     console = Console(file=StringIO())
-    ready = live.prepare(options, console)
+    ready = serving.prepare(options, console)
     said = console.file.getvalue().replace("\n", " ")
     assert "antialiased Gaussians of SH degree 0" in said
     assert "The page renders antialiased Gaussians as classic ones" in said
-    session, _ = complete_camera(live.begin_session(ready), HOLES[0])
-    live.save_session(ready, session)
+    session, _ = complete_camera(serving.begin_session(ready), HOLES[0])
+    serving.save_session(ready, session)
     for name in ("context.ply", "completed.ply", "generated.ply"):
         assert load_ply(tmp_path / "out" / name).is_antialiased, name
 
 
 def test_the_frames_that_were_chosen_are_named(room, tmp_path):
-    ready = live.prepare(options_for(room, tmp_path / "out", context=None), QUIET)
+    ready = serving.prepare(options_for(room, tmp_path / "out", context=None), QUIET)
     assert ready.options.context == tuple(view.frame for view in ready.task.views)
     assert len(ready.options.context) >= 2
 
 
 def test_a_hole_is_found_where_something_is_missing(ready, begun):
-    camera = live.find_next_target(ready, begun.latest)
+    camera = serving.find_next_target(ready, begun.latest)
     assert camera is not None
     _, result = complete_camera(begun, camera)
     assert result.hole_fraction > 0.05
@@ -265,8 +265,8 @@ def test_a_box_is_removed_completed_undone_and_saved(room, tmp_path, monkeypatch
     scene = merge([gaussians_of(view_of(Room(), camera)) for camera in CAMERAS])
     save_ply(tmp_path / "splat.ply", scene)
     options = options_for(room, tmp_path / "out", scene=tmp_path / "splat.ply")
-    ready = live.prepare(replace(options, config=CompleterConfig.splat()), QUIET)
-    begun = live.begin_session(ready)
+    ready = serving.prepare(replace(options, config=CompleterConfig.splat()), QUIET)
+    begun = serving.begin_session(ready)
     removed, count = remove_in_box(begun, CRATE, UPRIGHT)
     assert count == removed.latest.source.gone_mask.sum() > 100
     rest = removed.latest.added  # of what reached out of the box
@@ -280,12 +280,12 @@ def test_a_box_is_removed_completed_undone_and_saved(room, tmp_path, monkeypatch
     assert undo_step(removed) == begun
     with pytest.raises(InputError, match="contains nothing"):
         remove_in_box(removed, (50.0, 50.0, 50.0, 51.0, 51.0, 51.0), UPRIGHT)
-    live.save_session(ready, filled)
+    serving.save_session(ready, filled)
     out, restored = tmp_path / "out", tmp_path / "restored.ply"
     assert json.loads((out / "summary.json").read_text())["gaussians"]["removed"] > 100
     assert run(monkeypatch, "strip", out / "completed.ply", "--out", restored, "--quiet") == 0
     assert restored.read_bytes() == (tmp_path / "splat.ply").read_bytes()
-    live.save_session(ready, removed)
+    serving.save_session(ready, removed)
     assert json.loads((out / "summary.json").read_text())["gaussians"]["added"] == len(rest)
 
 
@@ -381,7 +381,7 @@ def send_message(port: int, message: bytes | str) -> None:
 
 
 def test_without_viser_a_sentence_says_what_to_install(room, tmp_path, monkeypatch, capsys):
-    monkeypatch.setattr(live, "find_spec", lambda _: None)
+    monkeypatch.setattr(serving, "find_spec", lambda _: None)
     assert run(monkeypatch, "live", room, "--out", tmp_path / "out") == 2
     assert "pip install 'gscompleter[live]'" in capsys.readouterr().err
     assert not (tmp_path / "out").exists()
@@ -390,7 +390,7 @@ def test_without_viser_a_sentence_says_what_to_install(room, tmp_path, monkeypat
 def test_the_options_of_complete_are_those_of_live(room, tmp_path):
     words = ["live", str(room), "--out", str(tmp_path / "out"), "--config", "paper"]
     options = parse_command([*words, "--config.paper-registration.iterations", "7", "--seed", "3"])
-    asked = live.make_complete_options(options)
+    asked = serving.make_complete_options(options)
     paper = CompleterConfig.paper()
     registration = replace(paper.paper_registration, iterations=7)
     assert asked.config == replace(paper, paper_registration=registration)

@@ -11,7 +11,7 @@ import pytest
 
 import gscompleter as gsc
 from command import run
-from gscompleter.apps.commands.batch import complete_job
+from gscompleter.apps.batch.running import complete_job
 from gscompleter.apps.report.outcome import describe_gain, is_like, make_clause
 from gscompleter.apps.report.plain_words import list_shared_notes
 from gscompleter.apps.report.schema import (

@@ -10,8 +10,7 @@ import pytest
 from rich.console import Console
 
 from command import run
-from gscompleter.apps import warmup
-from gscompleter.apps.commands import doctor
+from gscompleter.apps import installation, warmup
 from gscompleter.numerics import kernels
 from gscompleter.numerics.kernels import compiled
 from gscompleter.numerics.kernels.cache import KernelCache
@@ -87,8 +86,8 @@ def test_without_a_writable_cache_kernels_are_kept_elsewhere_or_nowhere(tmp_path
 
 def test_the_doctor_says_why_kernels_are_kept_elsewhere(monkeypatch, capsys):
     note = "Compiled kernels cannot be written to /proc/none."
-    monkeypatch.setattr(doctor, "CACHE", KernelCache(None, note))
-    found = doctor.inspect_kernel_cache()
+    monkeypatch.setattr(installation, "CACHE", KernelCache(None, note))
+    found = installation.inspect_kernel_cache()
     assert (found.there, found.told) == (False, note)
 
 

@@ -10,7 +10,7 @@ from pathlib import Path
 import pytest
 
 from gscompleter import InputError
-from gscompleter.apps.commands import evaluate as command
+from gscompleter.apps.evaluating import tables as command
 from gscompleter.evaluation.cases import read_cases
 from gscompleter.evaluation.protocols import Task, make_case_task
 from gscompleter.evaluation.runner import (

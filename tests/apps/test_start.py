@@ -48,6 +48,37 @@ def test_a_completion_does_not_wait_for(imported, module):
     assert module not in imported
 
 
+PARSE = """
+import sys
+from contextlib import suppress
+from gscompleter.cli import parse_command
+with suppress(SystemExit):
+    parse_command(sys.argv[1:])
+print()
+print(*sys.modules)
+"""
+
+
+def list_imported(*words: object) -> set[str]:
+    """Return the modules that parsing a command line imports."""
+    command = [sys.executable, "-c", PARSE, *map(str, words)]
+    done = subprocess.run(command, capture_output=True, text=True, check=True)
+    return set(done.stdout.splitlines()[-1].split())
+
+
+@pytest.mark.parametrize("words", [("--help",), ("complete", "--help"), ("complete", "--help-all")])
+def test_help_waits_for_nothing_that_computes(words):
+    modules = list_imported(*words)
+    assert "gscompleter.apps.commands.complete" in modules
+    assert not modules & {"torch", "numba", "numpy", "rich.console"}
+
+
+def test_a_command_line_imports_the_options_of_its_command_alone():
+    modules = list_imported("complete", "SCENE", "--out", "OUT")
+    files = {name.rpartition(".")[2] for name in modules if "apps.commands." in name}
+    assert files == {"complete", "shared_options"}
+
+
 ENDING = """
 import atexit, sys
 from gscompleter.cli import run

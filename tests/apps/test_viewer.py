@@ -22,7 +22,6 @@ import pytest
 import torch
 
 from command import run
-from gscompleter.apps.commands.view import make_page_server
 from gscompleter.apps.report.schema import (
     AlignmentRow,
     CompletionSummary,
@@ -51,6 +50,7 @@ from gscompleter.apps.viewer.packages import (
     read_lock,
 )
 from gscompleter.apps.viewer.page import make_page
+from gscompleter.apps.viewer.serving import make_page_server
 from gscompleter.data.scene import write_cameras
 from gscompleter.evaluation.metrics.coverage import Coverage
 from gscompleter.splats.formats import load_splat

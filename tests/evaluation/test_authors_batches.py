@@ -14,9 +14,9 @@ import pytest
 import torch
 
 from command import run
-from gscompleter.apps.commands.evaluate import collect_tasks
-from gscompleter.apps.commands.options import EvaluateOptions
-from gscompleter.apps.commands.reproduce import apply_preset
+from gscompleter.apps.commands.evaluate import EvaluateOptions
+from gscompleter.apps.evaluating.cases import collect_tasks
+from gscompleter.apps.evaluating.reproduction import apply_preset
 from gscompleter.evaluation.cases import SkippedScene
 from gscompleter.evaluation.paper import load_paper
 from gscompleter.types import View

@@ -15,8 +15,8 @@ import torch
 import tiny_diffusion
 from chunk_files import example, save_chunk
 from command import run
-from gscompleter.apps.commands.options import EvaluateOptions, FigureName, TableName
-from gscompleter.apps.commands.reproduce import (
+from gscompleter.apps.commands.evaluate import EvaluateOptions, FigureName, TableName
+from gscompleter.apps.evaluating.reproduction import (
     apply_preset,
     assign_weights,
     choose_protocols,
@@ -233,7 +233,7 @@ def test_all_of_the_paper_on_photographs(clips, tmp_path, monkeypatch):
         torch.save({"state_dict": state}, weights[-1])
     kontext = tiny_diffusion.saved(tiny_diffusion.kontext_pipeline(), tmp_path / "kontext")
     few = partial(RunConfig, baseline_iterations=3)
-    monkeypatch.setattr("gscompleter.apps.commands.evaluate.RunConfig", few)
+    monkeypatch.setattr("gscompleter.apps.evaluating.scoring.RunConfig", few)
     monkeypatch.setattr("gscompleter.evaluation.methods.RegGSConfig", CoarseRegGS)
     out, names = tmp_path / "out", ("mvsplat-re10k", "mvsplat-acid")
     more = ("--reconstructor", *names, "--weights", *weights)

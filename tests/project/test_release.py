@@ -17,7 +17,7 @@ from packaging.requirements import Requirement
 import gscompleter
 from command import run
 from gscompleter import __version__
-from gscompleter.apps.commands.doctor import PURPOSES, find_installed_version, is_required_by
+from gscompleter.apps.installation import PURPOSES, find_installed_version, is_required_by
 from gscompleter.apps.warmup import PARTS, compile_kernels
 from gscompleter.numerics.kernels.compiled import get_cache_folder
 from release_check import (

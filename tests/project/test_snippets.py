@@ -21,7 +21,7 @@ import pytest
 import torch
 
 from command import run
-from gscompleter.apps.commands.doctor import PURPOSES
+from gscompleter.apps.installation import PURPOSES
 from gscompleter.apps.viewer.packages import Libraries
 from gscompleter.cli import COMMANDS, parse_command
 from gscompleter.config.settings import validate

@@ -675,8 +675,8 @@ def import_everything() -> None:
     """Import everything once for all forks. Nothing is computed, as threads do not survive."""
     sys.path.insert(0, str(Path(__file__).parent / "support"))
     import chunk_files  # noqa: F401  (its photographs are drawn in one thread)
-    import gscompleter.apps.commands.complete
-    import gscompleter.apps.commands.evaluate
+    import gscompleter.apps.completing.complete
+    import gscompleter.apps.evaluating.reproduction
     import gscompleter.cli
     import gscompleter.generators.warp_inpaint
     import gscompleter.reconstructors.plane_sweep  # noqa: F401

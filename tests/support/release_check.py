@@ -19,7 +19,7 @@ from collections.abc import Iterator
 from pathlib import Path
 
 from gscompleter import __version__
-from gscompleter.apps.commands.doctor import PURPOSES
+from gscompleter.apps.installation import PURPOSES
 from paths import ROOT
 
 IMPORT_ALL = "import gscompleter; [getattr(gscompleter, name) for name in gscompleter.__all__]"
@@ -28,7 +28,7 @@ IMPORT_EXTRA = """
 import sys
 from importlib import import_module
 from importlib.metadata import distribution
-from gscompleter.apps.commands.doctor import list_requirements
+from gscompleter.apps.installation import list_requirements
 for name in {requirement.name for requirement in list_requirements(sys.argv[1])}:
     paths = [path.parts for path in distribution(name).files]
     folders = {parts[0] for parts in paths if parts[1:] == ("__init__.py",)}

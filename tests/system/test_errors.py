@@ -5,7 +5,7 @@ from pathlib import Path
 import pytest
 
 from gscompleter import load_ply, load_splat
-from gscompleter.apps.commands.words import format_error
+from gscompleter.apps.command_line.words import format_error
 from gscompleter.data.colmap import read_images
 from gscompleter.data.points import read_point_cloud
 from gscompleter.data.real_estate import open_chunks

@@ -193,7 +193,7 @@ def complete(scene, splat, out, *more):
 @pytest.mark.parametrize("worth", [0, MIN_PROXY_GAUSSIANS], ids=["sorted", "as-given"])
 def test_the_command_recolours_and_strip_puts_back(tmp_path, monkeypatch, worth):
     """Restored to the byte, whether or not the scene was sorted in between."""
-    monkeypatch.setattr("gscompleter.apps.commands.complete.MIN_PROXY_GAUSSIANS", worth)
+    monkeypatch.setattr("gscompleter.apps.completing.preparation.MIN_PROXY_GAUSSIANS", worth)
     scene = photographed(tmp_path / "scene", [*PHOTOGRAPHS, TARGET])
     splat, out = tmp_path / "splat.ply", tmp_path / "out"
     save_ply(splat, SCENE)
@@ -236,7 +236,7 @@ def test_the_command_refuses_a_scene_that_does_not_fit(tmp_path, monkeypatch, ca
 
 @pytest.mark.parametrize("worth", [0, MIN_PROXY_GAUSSIANS], ids=["sorted", "as-given"])
 def test_rows_of_another_program_come_back_whole(tmp_path, monkeypatch, worth):
-    monkeypatch.setattr("gscompleter.apps.commands.complete.MIN_PROXY_GAUSSIANS", worth)
+    monkeypatch.setattr("gscompleter.apps.completing.preparation.MIN_PROXY_GAUSSIANS", worth)
     scene = photographed(tmp_path / "scene", [*PHOTOGRAPHS, TARGET])
     splat, out = labelled(tmp_path / "splat.ply", SCENE), tmp_path / "out"
     assert run(monkeypatch, *complete(scene, splat, out)) == 0

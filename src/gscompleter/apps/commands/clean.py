@@ -2,216 +2,41 @@
 
 from __future__ import annotations
 
-import json
-from collections.abc import Mapping, Sequence
-from dataclasses import asdict, dataclass
-from functools import partial
-from typing import Any
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Annotated
 
-import torch
-from jaxtyping import Bool
-from rich.console import Console
-from torch import Tensor
+import tyro
 
-from gscompleter import __version__
-from gscompleter.apps.commands.options import CleanOptions
-from gscompleter.apps.commands.output import describe_run, refuse_results
-from gscompleter.apps.inputs.opening import (
-    apply_splat_range,
-    check_context,
-    choose_working_size,
-    describe_opening,
-    locate_splat,
-    move_to_splat,
-    open_scene,
-    print_lines,
-    read_photographs,
-    resolve_scene,
-)
-from gscompleter.apps.report.completion import (
-    InputSplatFile,
-    compute_mask_fraction,
-    save_changed,
-    save_completed_splat,
-)
-from gscompleter.apps.warmup import compile_kernels
-from gscompleter.editing.cleaning import find_superfluous
-from gscompleter.editing.floaters import find_floaters
-from gscompleter.evaluation.metrics.image import compute_masked_psnr
-from gscompleter.render.device import choose_device
-from gscompleter.render.loading import load_renderer
-from gscompleter.render.protocols import Renderer
-from gscompleter.splats.formats import load_splat
-from gscompleter.system.errors import InputError, quote_value
-from gscompleter.system.files.output_folder import reserve_output
-from gscompleter.system.files.writing import COMPLETED_FILE, REMOVED_FILE, SUMMARY_FILE
-from gscompleter.system.progress import show_preparation, show_progress, stage, track
-from gscompleter.system.timing import record_seconds, timed_stage
-from gscompleter.types import Gaussians, View
-
-PHOTOGRAPH_OPTIONS = ("context", "format", "near", "far")
-COMMAND = "clean"
-RESULTS = (COMPLETED_FILE, REMOVED_FILE, SUMMARY_FILE)
-"""Files that it may write."""
+from gscompleter.apps.commands.shared_options import Device, SceneOptions
+from gscompleter.config import CleaningConfig
+from gscompleter.system.process import import_without_collection
 
 
-@dataclass(frozen=True)
-class Cleaning:
-    """A splat and what goes."""
+@dataclass(frozen=True, kw_only=True)
+class CleanOptions(SceneOptions):
+    """Remove Gaussians of a splat that make its photographs worse or that none of them needs.
 
-    given: Gaussians
-    removed: Bool[Tensor, "n"]
-    splat_file: InputSplatFile
-    run_info: Mapping[str, Any]
-    """Further entries of `summary.json`."""
+    No photograph loses more than 0.01 dB. Without SCENE, remove those that stand out from their
+    neighbours: isolated, huge, needles, transparent. `gscompleter strip` puts all back.
+    """
 
-    @property
-    def counts(self) -> dict[str, int]:
-        """Numbers of Gaussians."""
-        count = int(self.removed.sum())
-        return {"given": len(self.given), "kept": len(self.given) - count, "removed": count}
+    folder: Annotated[Path | None, tyro.conf.Positional, tyro.conf.arg(metavar="SCENE")] = None  # type: ignore[assignment]
+    """Folder of the photographs, as in `complete`; if not given, neighbours decide."""
+    out: Path
+    """Folder for completed.ply, removed.ply and summary.json."""
+    scene: Path
+    """File of Gaussians to clean."""
+    dry_run: bool = False
+    """Write only removed.ply, the Gaussians that would go, and summary.json."""
+    device: Device = "auto"
+    """Device to compare photographs on."""
+    config: CleaningConfig = CleaningConfig()
 
 
 def run_clean(options: CleanOptions) -> None:
     """Clean the splat, write the result, and print a summary."""
-    options = resolve_scene(options)
-    console = Console(stderr=True, quiet=options.quiet)
-    clean = clean_alone if options.folder is None else clean_by_photographs
-    with (
-        show_progress(console),
-        reserve_output(options.out, options.overwrite, COMMAND, RESULTS) as output,
-    ):
-        if options.dry_run:
-            refuse_results(options.out)
-        print_lines(console, *output.describe_others())
-        cleaning = clean(options, console)
-        if cleaning.removed.all():
-            raise InputError(
-                "Every Gaussian of the splat would go; check the settings, and that photographs "
-                "show the same scene."
-            )
-        summary = {"version": __version__, **cleaning.run_info, "gaussians": cleaning.counts}
-        with output.write() as folder, stage("writing"):
-            if not options.dry_run:
-                # `given[:0]`: a cleaning adds nothing.
-                save_completed_splat(
-                    folder,
-                    cleaning.given,
-                    cleaning.removed,
-                    cleaning.given[:0],
-                    cleaning.splat_file,
-                )
-            elif cleaning.removed.any():
-                save_changed(folder, cleaning.given, cleaning.removed, cleaning.splat_file)
-            (folder / SUMMARY_FILE).write_bytes(json.dumps(summary, indent=2).encode() + b"\n")
-    if not options.quiet:
-        if options.dry_run:
-            print(f"Dry run: {describe_cleaning(summary)}: {options.out / REMOVED_FILE}")
-        else:
-            print(f"{describe_cleaning(summary)}: {options.out / COMPLETED_FILE}")
-
-
-def clean_by_photographs(options: CleanOptions, console: Console) -> Cleaning:
-    """Find what makes the photographs worse, or what none of them needs."""
-    check_context(options)
-    device = choose_device(options.device)
-    renderer = load_renderer(device)
-
-    # The splat is also read before cameras are searched for, so that a damaged file is refused
-    # within seconds: the search takes minutes.
-    opened = open_scene(options, console, partial(load_given_splat, options))
-    options = choose_working_size(options, opened.photographs, console)
-    with show_preparation("reading photographs"):
-        task = read_photographs(options, opened, device)
-    loaded = load_given_splat(options)
-    compile_kernels([device])
-    with show_preparation("aligning the scene"):
-        task = move_to_splat(task, loaded, options.scene, options, opened)
-
-    # From here on the splat is that of the task, whose coordinates may have a local origin.
-    given = task.scene
-    splat_file = task.splat_file
-    assert given is not None
-    assert splat_file is not None
-    task = apply_splat_range(task, given, renderer)
-
-    plan = f"compared with {len(task.views)} photographs on {device}"
-    plan += f", written to {quote_value(options.out)}"
-    print_lines(console, *describe_opening(options, opened, task), f"To do: {plan}.")
-
-    with record_seconds(()) as seconds, timed_stage("clean"):
-        removed = find_superfluous(given, task.views, renderer, options.config)
-    run_info = describe_run(options, opened, task, options.config)
-    scores = score_cleaning(given, task.views, removed, renderer, opened.files)
-    run_info = {**run_info, "photographs": scores, "seconds": seconds}
-    return Cleaning(given, removed, splat_file, run_info)
-
-
-def clean_alone(options: CleanOptions, console: Console) -> Cleaning:
-    """Find floaters by statistics of the splat alone."""
-    for name in PHOTOGRAPH_OPTIONS:
-        if getattr(options, name) is not None:
-            raise InputError("There are no photographs to apply this to; name their SCENE.", name)
-
-    given = load_given_splat(options)
-    floaters = options.config.floaters
-    with record_seconds(()) as seconds, timed_stage("clean"):
-        reasons = find_floaters(given, floaters)
-    run_info = {
-        "settings": {"scene": str(options.scene), "config": {"floaters": asdict(floaters)}},
-        "reasons": {reason: int(mask.sum()) for reason, mask in reasons.items()},
-        "seconds": seconds,
-    }
-    # A Gaussian can have several reasons, so their counts may exceed the number that goes.
-    removed = torch.stack(list(reasons.values())).any(dim=0)
-    return Cleaning(given, removed, locate_splat(options, options.scene), run_info)
-
-
-def load_given_splat(options: CleanOptions) -> Gaussians:
-    """Read the splat to clean."""
-    with show_preparation("reading the scene"):
-        return load_splat(options.scene, options.drop_nonfinite)
-
-
-def score_cleaning(
-    given: Gaussians,
-    views: Sequence[View],
-    taken: Bool[Tensor, "n"],
-    renderer: Renderer,
-    files: Mapping[int | None, str],
-) -> list[dict[str, Any]]:
-    """Compute PSNR (dB) of each photograph before and after, without the pixels of its mask.
-
-    `taken` are the Gaussians that go; `files` has the file of each photograph by frame.
-    """
-    kept = given[~taken]
-    rows = []
-    for view in track(views, "scores"):
-        before = renderer.render(given, view.camera).image
-        after = renderer.render(kept, view.camera).image
-        rows.append(
-            {
-                "frame": view.frame,
-                "file": files.get(view.frame),
-                "psnr_before": compute_masked_psnr(before, view.image, view.valid_mask),
-                "psnr_after": compute_masked_psnr(after, view.image, view.valid_mask),
-                "ignored": compute_mask_fraction(view.ignore_mask),
-            }
-        )
-    return rows
-
-
-def describe_cleaning(summary: Mapping[str, Any]) -> str:
-    """Describe the numbers of Gaussians, and the change of PSNR or the reasons."""
-    counts = summary["gaussians"]
-    seconds = summary["seconds"]["total"]
-    text = f"{counts['removed']:,} of {counts['given']:,} Gaussians removed in {seconds:.1f} s; "
-    if "reasons" in summary:
-        return text + ", ".join(f"{count:,} {name}" for name, count in summary["reasons"].items())
-
-    before = torch.tensor([row["psnr_before"] for row in summary["photographs"]])
-    after = torch.tensor([row["psnr_after"] for row in summary["photographs"]])
-    return text + (
-        f"mean PSNR of the photographs {before.mean():.2f} dB before, {after.mean():.2f} dB after, "
-        f"worst change {(after - before).min():+.3f} dB"
-    )
+    # Imported here, so that help pages do not wait for torch.
+    with import_without_collection():
+        from gscompleter.apps.cleaning import clean_splat
+    clean_splat(options)

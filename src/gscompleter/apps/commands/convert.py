@@ -1,20 +1,56 @@
-"""The commands `convert` and `strip`: the same Gaussians in another file."""
+"""The command `convert`: the same Gaussians in another format."""
 
 from __future__ import annotations
 
-from dataclasses import replace
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Annotated
 
-from rich.console import Console
+import tyro
 
-from gscompleter.apps.commands.options import ConvertOptions, StripOptions
-from gscompleter.splats.formats import describe_mode_loss, get_writer, load_splat, save_splat
-from gscompleter.splats.layout import strip
-from gscompleter.system.files.output_file import reserve_file
-from gscompleter.system.progress import show_preparation, show_progress
+from gscompleter.apps.commands.shared_options import WritingOptions, list_inputs
+from gscompleter.system.files.overlap import refuse_input_file
+from gscompleter.system.process import import_without_collection
+
+
+@dataclass(frozen=True, kw_only=True)
+class ConvertOptions(WritingOptions):
+    """Convert a file of Gaussians to another format, by the name of B.
+
+    Formats are .ply, .compressed.ply, .spz, .splat, .sog, .glb (KHR_gaussian_splatting), and
+    .usda, .usdc and .usdz (OpenUSD, with usd-core). It also reads .ksplat and the folder of a .sog.
+    """
+
+    source: Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="A")]
+    """File to read, or the folder of a .sog."""
+    out: Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="B")]
+    """File to write."""
+    drop_nonfinite: bool = False
+    """Drop Gaussians that contain NaN or infinity instead of refusing the file."""
+    plain: bool = False
+    """Write no labels of generated Gaussians, which some programs misread: no property `generated`
+    in a .ply, no file beside other formats."""
+
+    def check_overlap(self) -> None:
+        """Refuse to write over the input."""
+        refuse_input_file(self.out, list_inputs(self))
 
 
 def run_convert(options: ConvertOptions) -> None:
     """Convert A to B, and print the number of Gaussians."""
+    # Imported here, so that help pages do not wait for torch.
+    with import_without_collection():
+        from rich.console import Console
+
+        from gscompleter.splats.formats import (
+            describe_mode_loss,
+            get_writer,
+            load_splat,
+            save_splat,
+        )
+        from gscompleter.system.files.output_file import reserve_file
+        from gscompleter.system.progress import show_preparation, show_progress
+
     get_writer(options.out)  # refuses a name without a format
     with (
         reserve_file(options.out, options.overwrite),
@@ -35,12 +71,3 @@ def run_convert(options: ConvertOptions) -> None:
             print(note)
         count = int((generated > 0).sum())
         print(f"{len(gaussians):,} Gaussians, {count:,} of them generated: {options.out}")
-
-
-def run_strip(options: StripOptions) -> None:
-    """Write the original scene and print the number of Gaussians."""
-    get_writer(options.out)  # refuses a name without a format
-    with reserve_file(options.out, options.overwrite):
-        num_given, num_generated = strip(options.completed, options.out)
-    if not options.quiet:
-        print(f"{num_given:,} Gaussians, {num_generated:,} generated ones removed: {options.out}")

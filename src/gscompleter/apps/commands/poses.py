@@ -2,23 +2,49 @@
 
 from __future__ import annotations
 
-from rich.console import Console
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Annotated
 
-from gscompleter.apps.commands.options import PosesOptions
-from gscompleter.data.sfm.poses import find_poses
-from gscompleter.system.progress import show_progress
+import tyro
+
+from gscompleter.apps.commands.shared_options import ComputeOptions, NumFrames, WritingOptions
+from gscompleter.system.process import import_without_collection
+
+
+@dataclass(frozen=True, kw_only=True)
+class PosesOptions(ComputeOptions, WritingOptions):
+    """Find the cameras of photographs with COLMAP, and write a COLMAP folder.
+
+    A second run with the same photographs or video keeps the result.
+    """
+
+    photographs: Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="PHOTOS")]
+    """Folder of overlapping photographs or 360° panoramas (2:1) of one scene, or a video. They are
+    not changed."""
+    frames: NumFrames = 40
+    """Most frames of a video to take as photographs, sharp ones at even steps of the camera."""
+    out: Path
+    """Output folder: upright copies in images, cameras and points in sparse/0."""
 
 
 def run_poses(options: PosesOptions) -> None:
     """Find and write the cameras, and print their number and error."""
+    # Imported here, so that help pages do not wait for torch.
+    with import_without_collection():
+        from rich.console import Console
+
+        from gscompleter.data.sfm.poses import find_poses
+        from gscompleter.system.progress import show_progress
+
     with show_progress(Console(stderr=True, quiet=options.quiet)):
-        found = find_poses(options.photographs, options.out, options.overwrite, options.frames)
+        poses = find_poses(options.photographs, options.out, options.overwrite, options.frames)
     if options.quiet:
         return
-    for note in found.notes:
+    for note in poses.notes:
         print(note)
     print(
-        f"{found.num_registered} of {found.photographs} cameras and {found.points:,} points, "
-        f"mean error {found.error:.2f} px"
-        f"{', found by an earlier run' if found.reused else ''}: {options.out}"
+        f"{poses.num_registered} of {poses.photographs} cameras and {poses.points:,} points, "
+        f"mean error {poses.error:.2f} px"
+        f"{', found by an earlier run' if poses.reused else ''}: {options.out}"
     )

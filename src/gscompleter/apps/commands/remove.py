@@ -2,74 +2,47 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-from typing import Any
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Annotated
 
-import torch
-from jaxtyping import Bool, Float
-from rich.console import Console
-from torch import Tensor
+import tyro
 
-from gscompleter.apps.commands.complete import Prepared, prepare_completion, run_completion
-from gscompleter.apps.commands.options import RemoveOptions
-from gscompleter.apps.inputs.removal import check_selection, choose_gaussians, find_in_region
-from gscompleter.editing.removal import remove_gaussians
-from gscompleter.planning.photographs import PhotographPlanner
-from gscompleter.state import Completion
-from gscompleter.system.errors import InputError, quote_value
-from gscompleter.system.progress import stage
+from gscompleter.apps.commands.complete import CompleteOptions
+from gscompleter.config import CompleterConfig
+from gscompleter.system.process import import_without_collection
 
-SELECTIONS = ("box", "box_rotation", "sphere", "mask", "select")
+REMOVAL_CONFIG = CompleterConfig.splat().for_removal()
 
 
-@dataclass(frozen=True)
-class PreparedRemoval(Prepared):
-    """A completion that begins with the removal."""
+@dataclass(frozen=True, kw_only=True)
+class RemoveOptions(CompleteOptions):
+    """Remove something from a splat, and complete the hole that it leaves.
 
-    options: RemoveOptions
+    What other photographs show behind it fills the hole, and the generator invents the rest.
+    `gscompleter strip` gives the splat back as it was. Coordinates are those of the splat's file.
+    """
 
-    def begin(self) -> Completion:
-        """Initialize the context, and remove the selected Gaussians from it."""
-        begun = super().begin()
-        completer = self.completer
-        with stage("removing"):
-            chosen = choose_gaussians(
-                self.options, self.task, self.opened.photographs, self.cameras, completer.renderer
-            )
-            # Gaussians that reach out of a box or the sphere are cut at its border. Those that a
-            # mask or a file selects go as a whole.
-            return remove_gaussians(begun, chosen, self.contains, completer.scenes)
-
-    def contains(self, points: Float[Tensor, "n 3"]) -> Bool[Tensor, "n"]:
-        """Find points, in the frame of the result, in the boxes and the sphere."""
-        # The region is given in the coordinates of the file, which float32 may not resolve.
-        origin = torch.from_numpy(self.task.origin).to(points.device)
-        return find_in_region(points.double() + origin, self.options)
-
-    def describe_settings(self) -> dict[str, Any]:
-        """Describe the settings, with the selection."""
-        selection = {name: getattr(self.options, name) for name in SELECTIONS}
-        # JSON has no paths.
-        texts = {name: str(selection[name]) for name in ("mask", "select") if selection[name]}
-        return {**super().describe_settings(), **selection, **texts}
+    scene: Path = field()  # without the default of `complete`
+    """File of Gaussians (a splat) to remove something from."""
+    box: tuple[float, ...] = ()
+    """Remove Gaussians inside of boxes: smallest x, y and z of each, then largest."""
+    box_rotation: tuple[float, float, float, float] = (1.0, 0.0, 0.0, 0.0)
+    """Rotation of the boxes about their centres, as a quaternion w x y z."""
+    sphere: tuple[float, float, float, float] | None = None
+    """Remove Gaussians inside of a sphere: x, y and z of its centre, and its radius."""
+    mask: Path | None = None
+    """Remove what masks show: a folder of images named as photographs, white there."""
+    select: Path | None = None
+    """Remove the Gaussians of this file, a selection that another program saved."""
+    config: Annotated[CompleterConfig, tyro.conf.FlagConversionOff] = REMOVAL_CONFIG
+    """Settings of the method, which change those of `--config NAME`."""
 
 
-def run_removal(options: RemoveOptions) -> None:
-    """Remove the selection, complete the hole, and print a summary."""
-    run_completion(options, prepare_removal)
-
-
-def prepare_removal(options: RemoveOptions, console: Console) -> PreparedRemoval:
-    """Open the scene, and load the models; targets are searched for among the photographs."""
-    check_selection(options)
-    ready = prepare_completion(options, console)
-
-    # `strip` puts back what one removed.ply holds, and so cannot undo two runs.
-    if ready.task.scene is not None and bool((ready.task.scene.generated > 0).any()):
-        raise InputError(
-            f"{quote_value(options.scene)} was completed before, and removed.ply keeps what one "
-            "run removed; strip it first, and remove everything at once."
-        )
-
-    explorer = PhotographPlanner(ready.completer)
-    return PreparedRemoval(**{**vars(ready), "explorer": explorer})
+def run_remove(options: RemoveOptions) -> int:
+    """Remove the selection, complete the hole, and print a summary; exit codes as of `complete`."""
+    # Imported here, so that help pages do not wait for torch.
+    with import_without_collection():
+        from gscompleter.apps.completing.complete import complete_scene
+        from gscompleter.apps.completing.remove import prepare_removal
+    return complete_scene(options, prepare_removal)

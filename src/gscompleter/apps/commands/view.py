@@ -2,123 +2,51 @@
 
 from __future__ import annotations
 
-import os
-import sys
-import webbrowser
-from contextlib import suppress
-from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Annotated
 
-from gscompleter.apps.commands.options import ViewOptions
-from gscompleter.apps.viewer import packages
-from gscompleter.apps.viewer.exhibit import (
-    ViewerContent,
-    add_file_cameras,
-    load_viewer_completion,
-    load_viewer_files,
-)
-from gscompleter.apps.viewer.page import make_page
-from gscompleter.splats.foreign import resolve_splat
-from gscompleter.splats.sog import META
-from gscompleter.system.errors import InputError, quote_value
-from gscompleter.system.files.output_file import reserve_file
-from gscompleter.system.files.writing import SUMMARY_FILE, replace_file
+import tyro
 
-ADDRESS = "127.0.0.1"
-HOST_NAMES = (ADDRESS, "localhost")
-"""Accepted host names; any other one may be a DNS rebinding attack by a website."""
+from gscompleter.apps.commands.shared_options import Port, WritingOptions, list_inputs
+from gscompleter.system.files.overlap import refuse_input_file
+from gscompleter.system.process import import_without_collection
+
+
+@dataclass(frozen=True, kw_only=True)
+class ViewOptions(WritingOptions):
+    """Show a scene before and after its completion in the browser.
+
+    Side by side, with a slider, or one at a time; generated Gaussians can be tinted or hidden.
+    """
+
+    scene: Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="A")]
+    """Output folder of `complete`, or a file of Gaussians in any format that `convert` reads."""
+    other: Annotated[Path | None, tyro.conf.Positional, tyro.conf.arg(metavar="B")] = None
+    """The scene after, if A is the one before; by default A with its generated Gaussians."""
+    cameras: Path | None = None
+    """Cameras to jump to: a file as in `complete --target`, or a folder with a transforms.json or a
+    COLMAP model; in the coordinates of the photographs if A is an output folder, else of A."""
+    resolution: tuple[int, int] | None = None
+    """Image size (height and width) of cameras whose file has none."""
+    save: Path | None = None
+    """Write the page to this file instead of serving it."""
+    port: Port = 0
+    """Port of the page on 127.0.0.1; a free one if not given."""
+    no_open: bool = False
+    """Print the address without opening a browser."""
+    drop_nonfinite: bool = False
+    """Drop Gaussians that contain NaN or infinity instead of refusing the file."""
+
+    def check_overlap(self) -> None:
+        """Refuse to write the page over an input."""
+        if self.save is not None:
+            refuse_input_file(self.save, list_inputs(self), "save")
 
 
 def run_view(options: ViewOptions) -> None:
     """Make the page, and write it or serve it until Ctrl-C."""
-    if options.save is not None:
-        if options.save.suffix.lower() not in (".html", ".htm"):
-            name = quote_value(options.save)
-            raise InputError(f"{name} is no .html file; name it *.html.", "save")
-        # Reserved first: a file that may not be replaced ends the command before scenes are read.
-        with reserve_file(options.save, options.overwrite):
-            page = load_page(options)
-            with replace_file(options.save) as file:
-                file.write(page)
-        if not options.quiet:
-            print(options.save)
-        return
-
-    page = load_page(options)
-    with make_page_server(page, options.port) as server, suppress(KeyboardInterrupt):
-        address = f"http://{ADDRESS}:{server.server_address[1]}/"
-        # Printed once the server listens.
-        print(f"{address} (Ctrl-C ends it)", flush=True)
-        if not options.no_open:
-            webbrowser.open(address)
-        server.serve_forever()
-
-
-def load_page(options: ViewOptions) -> bytes:
-    """Make the page of the scenes and cameras of the options, and print its notes."""
-    # Libraries first: they may have to be downloaded, and a lack of network is said before large
-    # scenes are read.
-    libraries = packages.load_libraries()
-    page, notes = make_page(load_content(options), libraries)
-    if not options.quiet:
-        for note in notes:
-            print(note)
-    return page
-
-
-def load_content(options: ViewOptions) -> ViewerContent:
-    """Read the scenes and cameras of the options."""
-    # A folder is that of a completion, of a trainer's model, or an unpacked .sog.
-    scene = options.scene
-    if not (scene / SUMMARY_FILE).is_file():
-        scene = resolve_splat(scene)
-
-    if options.other is not None:
-        # B is the scene after, A the one before.
-        content = load_viewer_files(options.other, scene, options.drop_nonfinite)
-    elif os.path.isdir(scene) and not os.path.isfile(scene / META):
-        content = load_viewer_completion(scene, options.drop_nonfinite)
-    else:
-        content = load_viewer_files(scene, None, options.drop_nonfinite)
-
-    if options.cameras is None:
-        return content
-    return add_file_cameras(content, options.cameras, options.resolution)
-
-
-def make_page_server(page: bytes, port: int = 0) -> ThreadingHTTPServer:
-    """Make a server on `port` (0 for any) that shows the page to browsers of this machine."""
-
-    class Handler(BaseHTTPRequestHandler):
-        def do_GET(self) -> None:
-            if self.headers.get("Host", "").rsplit(":", 1)[0].lower() not in HOST_NAMES:
-                self.send_error(421, "This server answers to 127.0.0.1 and localhost only")
-            elif self.path != "/":
-                self.send_error(404)
-            else:
-                self.send_page()
-
-        def send_page(self) -> None:
-            self.send_response(200)
-            self.send_header("Content-Type", "text/html; charset=utf-8")
-            self.send_header("Content-Length", str(len(page)))
-            self.send_header("Cross-Origin-Resource-Policy", "same-origin")
-            self.send_header("Cache-Control", "no-store")
-            self.end_headers()
-            self.wfile.write(page)
-
-        def log_message(self, format: str, *args: object) -> None:
-            """Log nothing."""
-
-    class Server(ThreadingHTTPServer):
-        def handle_error(self, request: object, client_address: object) -> None:
-            """Ignore a browser that leaves while it is answered; report any other error."""
-            if not isinstance(sys.exc_info()[1], ConnectionError):
-                super().handle_error(request, client_address)  # type: ignore[arg-type]
-
-    try:
-        return Server((ADDRESS, port), Handler)
-    except OSError as error:
-        raise InputError(
-            f"Port {port} of {ADDRESS} is not available ({error.strerror}); name another one.",
-            "port",
-        ) from error
+    # Imported here, so that help pages do not wait for torch.
+    with import_without_collection():
+        from gscompleter.apps.viewer.serving import show_scenes
+    show_scenes(options)

@@ -17,14 +17,9 @@ from jaxtyping import Float, Int64
 from rich.console import Console
 from torch import Tensor
 
-from gscompleter.apps.commands.options import (
-    LONG_SIDE,
-    CompleteOptions,
-    RemoveOptions,
-    SceneOptions,
-    get_max_targets,
-    parse_resolution,
-)
+from gscompleter.apps.commands.complete import CompleteOptions
+from gscompleter.apps.commands.remove import RemoveOptions
+from gscompleter.apps.commands.shared_options import LONG_SIDE, SceneOptions, parse_resolution
 from gscompleter.apps.inputs.given_depth import read_with_depth
 from gscompleter.apps.inputs.selection import (
     CHECK_VIEW_SIZE,
@@ -617,7 +612,7 @@ def describe_task(options: CompleteOptions, opened: Opened, task: CompletionTask
     files = opened.files
     context = [name_photograph(frame, files.get(frame)) for frame in task.context_frames]
     if not targets:
-        count = get_max_targets(options)
+        count = options.max_targets
         targets = (
             "a camera that is found" if count == 1 else f"up to {count} cameras that are found"
         )

@@ -10,7 +10,8 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
-from gscompleter.apps.commands.options import RemoveOptions, parse_resolution
+from gscompleter.apps.commands.remove import RemoveOptions
+from gscompleter.apps.commands.shared_options import parse_resolution
 from gscompleter.apps.inputs.opening import CompletionTask
 from gscompleter.data.frame import ENDINGS, find_file
 from gscompleter.data.local_origin import shift_to_origin

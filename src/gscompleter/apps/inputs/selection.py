@@ -9,7 +9,8 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from gscompleter.apps.commands.options import CompleteOptions, parse_resolution
+from gscompleter.apps.commands.complete import CompleteOptions
+from gscompleter.apps.commands.shared_options import parse_resolution
 from gscompleter.apps.report.completion import Target
 from gscompleter.data.photographs import Photographs, Resolution
 from gscompleter.numerics.geometry import select_spread_cameras

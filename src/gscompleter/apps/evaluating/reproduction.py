@@ -1,4 +1,4 @@
-"""The command `evaluate`: scores of methods, and from them tables and figures of the paper."""
+"""Scores of methods, and from them tables and figures of the paper."""
 
 from __future__ import annotations
 
@@ -11,9 +11,9 @@ from pathlib import Path
 from rich.console import Console
 
 from gscompleter.apps.bench.report import describe_machine
-from gscompleter.apps.commands.evaluate import Scored, run_methods, score_methods
-from gscompleter.apps.commands.exit_codes import choose_exit_code
-from gscompleter.apps.commands.options import AUTO, EvaluateOptions
+from gscompleter.apps.command_line.exit_codes import choose_exit_code
+from gscompleter.apps.commands.evaluate import AUTO, EvaluateOptions
+from gscompleter.apps.evaluating.scoring import Scored, run_methods, score_methods
 from gscompleter.config.generators import GeneratorOptions
 from gscompleter.evaluation.claims import HEAD, tabulate_claims
 from gscompleter.evaluation.figures import draw_figure
@@ -268,7 +268,7 @@ def write_results(options: EvaluateOptions) -> str:
 
 def find_commit() -> dict[str, str]:
     """Return the commit of this code, or nothing if it is not a git checkout."""
-    # From src/gscompleter/apps/commands of a checkout; an installed package has no .git there.
+    # From src/gscompleter/apps/evaluating of a checkout; an installed package has no .git there.
     root = Path(__file__).parents[4]
     if not (root / ".git").exists() or shutil.which("git") is None:
         return {}

@@ -10,7 +10,7 @@ from pathlib import Path
 from types import MappingProxyType
 from typing import Any
 
-from gscompleter.apps.commands.options import SceneOptions, parse_resolution
+from gscompleter.apps.commands.shared_options import SceneOptions, parse_resolution
 from gscompleter.apps.inputs.opening import CompletionTask, Opened, describe_missing
 from gscompleter.apps.inputs.selection import select_closest
 from gscompleter.apps.report.completion import HeldOut

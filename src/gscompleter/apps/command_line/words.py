@@ -18,7 +18,7 @@ from tyro.constructors import (
     StructTypeInfo,
 )
 
-from gscompleter.apps.commands.options import DEFAULT_NUM_TARGETS
+from gscompleter.apps.commands.shared_options import DEFAULT_NUM_TARGETS
 from gscompleter.config import CompleterConfig, load_config
 from gscompleter.config.settings import Settings
 from gscompleter.system.errors import InputError, join_names, quote_value

@@ -5,7 +5,7 @@ from __future__ import annotations
 import errno
 from dataclasses import dataclass
 
-from gscompleter.apps.commands.exit_codes import ERROR, WRONG_INPUT
+from gscompleter.apps.command_line.exit_codes import ERROR, WRONG_INPUT
 from gscompleter.system.errors import quote_value
 from gscompleter.system.files.writing import FULL_DISK_ERRORS
 

@@ -1,0 +1,77 @@
+"""Rows of a manifest as options of `complete`."""
+
+from __future__ import annotations
+
+import re
+import shlex
+from collections.abc import Iterator, Mapping
+from pathlib import Path
+from typing import Any, get_type_hints
+
+from gscompleter.apps.batch.manifest import FOLDER
+from gscompleter.apps.command_line.words import format_error, parse_words
+from gscompleter.apps.commands.complete import CompleteOptions
+from gscompleter.config.settings import validate
+from gscompleter.system.errors import InputError, quote_value
+
+COMPLETE = "complete"
+RESERVED = ("out", "overwrite", "quiet", "threads", "dry-run", "help", "help-all")
+"""Options that a batch sets for all jobs."""
+TRUE = ("true", "yes", "1")
+"""Values of a CSV that set a flag."""
+FALSE = ("false", "no", "0", "")
+"""Values of a CSV that leave a flag unset; an empty cell is one of them."""
+
+
+def parse_row(row: Mapping[str, Any], out: Path) -> CompleteOptions:
+    """Parse a row, or raise InputError; `out` is the output folder."""
+    if not isinstance(row.get(FOLDER), str):
+        raise InputError("The row has no folder; give it the folder of a scene.")
+    # The row becomes a command line, so that its values are read and refused as those of
+    # `complete`. Overwriting is safe: the folder of a job is in the batch's own output.
+    words = [COMPLETE, row[FOLDER], *row_to_words(row), "--out", str(out), "--overwrite", "--quiet"]
+    try:
+        options: CompleteOptions = validate(parse_words(words, {COMPLETE: CompleteOptions}))
+    except InputError as error:
+        # Only the sentence is kept in the row of a failed job, so it names the option itself.
+        raise InputError(format_error(error)) from error
+    return options
+
+
+def row_to_words(row: Mapping[str, Any], prefix: str = "") -> Iterator[str]:
+    """Convert a row to words of a command line; nested mappings give `--config.holes.dilation`."""
+    for key, value in row.items():
+        name = f"{prefix}{key}".replace("_", "-")
+        if name in RESERVED:
+            raise InputError(f"A row cannot set '{quote_value(name)}'; the batch sets it.")
+        if isinstance(value, Mapping):
+            yield from row_to_words(value, f"{name}.")
+        elif name != FOLDER and value is not None:
+            yield from option_to_words(name, value)
+
+
+def option_to_words(name: str, value: Any) -> list[str]:
+    """Convert an option to words; a text is split like a shell if it can have several values."""
+    kind = get_type_hints(CompleteOptions).get(name.replace("-", "_"))
+
+    # A flag has no value on the command line: it is there or not.
+    if kind is bool:
+        if str(value).lower() not in TRUE + FALSE:
+            raise InputError(f"{name} is {quote_value(str(value))}; it must be true or false.")
+        return [f"--{name}"] if str(value).lower() in TRUE else []
+
+    # A CSV has one text for `0 4`, where JSON has a list. Only options with several values are
+    # split, because a single path may contain spaces.
+    values = value if isinstance(value, list) else [value]
+    if isinstance(value, str) and "tuple" in str(kind).lower():
+        try:
+            values = shlex.split(value)
+        except ValueError as error:
+            raise InputError(f"'{quote_value(value)}' has an unmatched quotation mark.") from error
+
+    # The parser would take a value such as `--out` for an option; negative numbers are none.
+    words = [str(item) for item in values]
+    for word in words:
+        if re.match(r"-(?![\d.])", word):
+            raise InputError(f"{name} cannot be '{quote_value(word)}', which begins with a dash.")
+    return [f"--{name}", *words]

@@ -1,0 +1,176 @@
+"""Completion of the scenes of a manifest, on several processes and machines.
+
+Workers import this module before they set their number of threads, so it imports no torch.
+"""
+
+from __future__ import annotations
+
+import os
+import re
+import time
+from collections.abc import Sequence
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+from rich.console import Console
+
+from gscompleter.apps.batch.engine import make_engine, parse_pairs
+from gscompleter.apps.batch.manifest import PATHS, list_results, read_manifest
+from gscompleter.apps.batch.rows import parse_row
+from gscompleter.apps.command_line.exit_codes import choose_exit_code
+from gscompleter.apps.commands.batch import BatchOptions
+from gscompleter.system.errors import InputError, join_names, print_error, quote_value
+from gscompleter.system.files.overlap import refuse_overlap
+from gscompleter.system.jobs.jobs import (
+    JOBS,
+    Job,
+    claim_folder,
+    find_missing_jobs,
+    has_row,
+    make_folder,
+    parse_shard,
+    read_row,
+    run_job,
+    run_jobs,
+)
+from gscompleter.system.progress import show_preparation, show_progress, track
+
+MAX_NAMED_FAILURES = 5
+"""Most failures that the terminal names."""
+
+
+def complete_batch(options: BatchOptions) -> int:
+    """Complete the scenes of a manifest, write the table and the page, and return the exit code."""
+    # Two letters at least: `C:/results` is a path of Windows.
+    if re.match(r"\w\w+:/", str(options.out)):
+        raise InputError(f"{quote_value(options.out)} is an address; name a folder.", "out")
+    number, count = parse_shard(options.shard, os.environ)
+    console = Console(stderr=True, quiet=options.quiet, highlight=False)
+    with show_progress(console):
+        with show_preparation("reading the manifest"):
+            common = parse_pairs(options.each, "each")
+            jobs = read_manifest(options.manifest, common, options.out)
+
+            # The results may not lie in what the rows read.
+            # A row whose path is no text, as JSON allows, fails by itself.
+            cells = [job.options.get(name) for job in jobs for name in PATHS]
+            paths = dict.fromkeys(cell for cell in cells if isinstance(cell, str) and cell)
+            inputs = [Path(path) for path in paths]
+            refuse_overlap(options.out, inputs)
+
+            # Workers may run in another working folder, so they get an absolute path.
+            out = options.out.resolve()
+            engine = make_engine(options, out)
+            claim_folder(out, "batch", {"version": 1, "kind": "batch"})
+
+            share = jobs[number::count]
+            left = find_missing_jobs(share, out, options.rerun == "failures")
+
+        # A folder of scenes can hold the results of earlier runs, which are no input.
+        if results := list_results(options.manifest, options.out):
+            names = join_names([path.name for path in results], MAX_NAMED_FAILURES)
+            console.print(f"Left out, as results and no scenes: {names}.", markup=False)
+
+        perform = partial(perform_job, out=out, retries=options.retries)
+        ended = run_jobs(left, perform, partial(has_row, out=out), engine, options.retries)
+        for _ in track(ended, "completing", len(left)):
+            pass
+        with show_preparation("table"):
+            write_batch_results(out, jobs)
+
+    # The exit code and the sentence count this share, with the jobs that failed in earlier runs.
+    failures = []
+    for job in share:
+        row = read_row(job, out)
+        if row is not None and row["state"] == "failed":
+            failures.append(f"{row['job']}: {row['reason']}")
+    print_failures(console, failures, len(share))
+    sentence = f"{summarize_rows(out, share, left)} All results: {options.out}/index.html"
+    console.print(sentence, markup=False, soft_wrap=True)
+    return choose_exit_code(len(failures), len(share))
+
+
+def print_failures(console: Console, failures: Sequence[str], num_cases: int) -> None:
+    """Print the first failures with their reasons, and the number of the others.
+
+    A quiet console gets one line: an exit code other than 0 is never without a reason.
+    """
+    if failures and console.quiet:
+        counted = f"{len(failures)} of {num_cases} cases failed"
+        print_error(f"{counted}; the first: {failures[0]}")
+    for failure in failures[:MAX_NAMED_FAILURES]:
+        console.print(f"Failed: {failure}", markup=False, soft_wrap=True)
+    if len(failures) > MAX_NAMED_FAILURES:
+        console.print(f"... and {len(failures) - MAX_NAMED_FAILURES} more failed.")
+
+
+def summarize_rows(out: Path, share: Sequence[Job], left: Sequence[Job]) -> str:
+    """Summarize the rows of a share, of which `left` were run now."""
+    names_left = {job.name for job in left}
+    failed_now = 0
+    failed_earlier = 0
+    for job in share:
+        row = read_row(job, out)
+        if row is None or row["state"] != "failed":
+            continue
+        if job.name in names_left:
+            failed_now += 1
+        else:
+            failed_earlier += 1
+
+    before = f"done earlier {len(share) - len(left)}"
+    if failed_earlier:
+        before += f", {failed_earlier} of them failed (--rerun failures repeats them)"
+    return f"Done {len(left) - failed_now}, failed {failed_now}, {before}."
+
+
+def write_batch_results(out: Path, jobs: Sequence[Job]) -> None:
+    """Write the table and the page, repeatedly while other shards add rows."""
+    from gscompleter.apps.report.page import write_overview
+
+    # A shard that ends while this one writes may be overwritten by an older table. Whoever writes
+    # last looks once more, and so the table that remains has all rows.
+    written: list[Job] | None = None
+    finished = [job for job in jobs if has_row(job, out)]
+    while finished != written:
+        write_overview(out, finished)
+        written = finished
+        finished = [job for job in jobs if has_row(job, out)]
+
+
+def perform_job(job: Job, out: Path, retries: int) -> None:
+    """Complete the scene of a job in any process, and write its row."""
+    run_job(job, out, lambda: complete_job(job, out / JOBS), retries)
+
+
+def complete_job(job: Job, jobs: Path) -> dict[str, Any]:
+    """Complete the scene of a job in a folder of `jobs`, and return its part of a row."""
+    import warnings
+
+    from gscompleter.apps.completing.complete import complete_folder
+    from gscompleter.apps.report.page import average_scores
+    from gscompleter.evaluation.memory import measure_peak_memory
+
+    # A worker does not run `cli.main`, which sets this filter for the other commands.
+    warnings.filterwarnings("ignore", module="PIL")
+    start = time.monotonic()
+    cpu_start = time.process_time()
+    make_folder(jobs)
+    with measure_peak_memory() as peak:
+        # The batch gives each job to one worker, and a further one only if that is lost.
+        summary = complete_folder(parse_row(job.options, jobs / job.name), takes_over=True)
+
+    # A scene that did not reconstruct counts as failed. Its folder stays, to look at.
+    outcome = summary["outcome"]
+    if outcome["status"] == "not-reconstructed":
+        raise InputError(outcome["headline"])
+
+    files = [path for path in (jobs / job.name).rglob("*") if path.is_file()]
+    return {
+        **average_scores(summary),
+        "seconds": time.monotonic() - start,
+        "cpu_seconds": time.process_time() - cpu_start,
+        "result_bytes": sum(path.stat().st_size for path in files),
+        "peak_bytes": peak.bytes,
+    }

@@ -1,0 +1,1 @@
+"""Parsing of the command line, its help pages, exit codes and sentences for failures."""

@@ -1,0 +1,191 @@
+"""Options that several commands share. Nothing here needs torch."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Annotated, Literal
+
+import tyro
+from annotated_types import Interval
+
+from gscompleter.config import CompleterConfig
+from gscompleter.config.generators import GeneratorOptions
+from gscompleter.config.settings import Seed, Settings
+from gscompleter.system.files.overlap import refuse_overlap
+from gscompleter.system.jobs.engines import EngineName
+
+Words = Annotated[tuple[int | str, ...] | None, tyro.conf.arg(metavar="PHOTO [PHOTO ...]")]
+Threads = Annotated[int, Interval(ge=1, le=1024)]
+Port = Annotated[int, Interval(ge=0, le=65535)]
+NumFrames = Annotated[int, Interval(ge=3, le=1000)]
+Device = Literal["auto", "cpu", "cuda"]
+Size = tuple[int, int] | int | Literal["full"]
+"""Height and width, the longest side, or `full` for the photographs' own size."""
+LONG_SIDE = 640
+"""Default length of a photograph's longer side, in pixels."""
+
+DEFAULT_NUM_TARGETS = 4
+OUTPUTS = ("out", "save")
+"""Options that name what a command writes."""
+WORDS_OR_PATHS = ("target", "protocol", "generator_weights")
+"""Options whose words may be paths of files that are read."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Options(Settings):
+    """Options of every command that writes something."""
+
+    quiet: bool = False
+    """Print errors only."""
+
+    def check_overlap(self) -> None:
+        """Raise an InputError if the output of the command is, holds or lies in an input."""
+        out = getattr(self, "out", None)
+        if isinstance(out, Path):
+            refuse_overlap(out, list_inputs(self))
+
+
+@dataclass(frozen=True, kw_only=True)
+class WritingOptions(Options):
+    """Options of every command that replaces earlier results on request only."""
+
+    overwrite: bool = False
+    """Replace an existing file, or in the output folder the files that an earlier run wrote."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class ComputeOptions(Options):
+    """Options of every command that computes for long."""
+
+    threads: Threads | None = None
+    """CPU threads to compute with; all available cores if not given."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class RunOptions(ComputeOptions):
+    """Options of every command that completes scenes."""
+
+    device: Device = "auto"
+    """Device to compute on; `auto` takes an NVIDIA GPU if there is one."""
+    seed: Seed = 0
+    """Seed of all random numbers. The same seed gives the same files on CPUs of one type."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class SynthesisOptions(RunOptions):
+    """Options of every command with a choice of the generator."""
+
+    depth: str = "none"
+    """Monocular depth that helps plane-sweep where stereo measures nothing: none, or moge-2."""
+    depth_weights: Path | None = None
+    """Weights file of that depth; downloaded if not given."""
+    synthesis: Annotated[GeneratorOptions, tyro.conf.OmitArgPrefixes] = GeneratorOptions()
+
+
+@dataclass(frozen=True, kw_only=True)
+class ModelOptions(SynthesisOptions):
+    """Options of every command with a choice of models."""
+
+    reconstructor: str = "plane-sweep"
+    """Model that turns photographs into Gaussians: plane-sweep, or one of `gscompleter models`."""
+    weights: Path | None = None
+    """Weights file of the reconstructor; downloaded if not given."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class SceneOptions(ComputeOptions, WritingOptions):
+    """Options of every command that opens photographs with cameras."""
+
+    folder: Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="SCENE")]
+    """Folder of the photographs: COLMAP, nerfstudio, cameras.json, LLFF, KITTI, DGP, Waymo,
+    PandaSet, a pixelSplat chunk, a RealEstate10K camera file, or what Polycam, Record3D or 3d
+    Scanner App exports. If it has no cameras, COLMAP finds them and they are kept in OUT/colmap;
+    also of 360° panoramas (2:1) and of a video (.mp4, .mov, .mkv). One image needs none."""
+    frames: NumFrames = 40
+    """Most frames of a video to take as photographs, sharp ones at even steps of the camera."""
+    context: Words = None
+    """Photographs to work with: file names, or numbers from 0 in the order of the file paths. If
+    not given, those that help most; photographs of targets are never used. `clean` takes all."""
+    out: Path
+    format: str | None = None
+    """Format of SCENE: colmap, nerfstudio, cameras-json, llff, kitti, kitti-raw, dgp, waymo,
+    mmdet3d, pandaset, chunks, real-estate-10k, polycam, record3d, 3d-scanner-app or photograph.
+    Detected if not given."""
+    scene: Path | None
+    resolution: Size | None = None
+    """Working size: the longest side in pixels (photographs are never enlarged), or height and
+    width (photographs are scaled and cropped), or `full`. If not given, 640, or the size that the
+    splat was trained at if that is smaller."""
+    near: float | None = None
+    """Smallest depth in the scene, in the unit of its cameras; if not given, that of the data or of
+    the model's authors, or else estimated."""
+    far: float | None = None
+    """Largest depth in the scene, in the unit of its cameras; if not given, as for near."""
+    no_given_depth: bool = False
+    """Ignore the depth that SCENE holds: depth maps, laser sweeps and COLMAP's points."""
+    masks: bool = True
+    """Ignore what masks (black) or alpha channels of SCENE hide."""
+    drop_nonfinite: bool = False
+    """Drop Gaussians that contain NaN or infinity instead of refusing the file."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class CompletingOptions(SceneOptions, ModelOptions):
+    """Options of the commands that complete one scene."""
+
+    scene: Path | None = None
+    """File of Gaussians (a splat) to complete instead of reconstructing the scene; all are kept."""
+    no_recolor: bool = False
+    """Keep the colours of the splat, too; Gaussians are only added where it is empty."""
+    config: Annotated[CompleterConfig, tyro.conf.FlagConversionOff] = CompleterConfig()
+    """Settings of the method, which change those of `--config NAME`."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class EngineOptions(Options):
+    """Options of every command that can run on several machines."""
+
+    engine: EngineName | None
+    workers: Annotated[int, Interval(ge=1, le=100_000)] | None = None
+    """Number of workers; as many as fit if not given (one with SLURM)."""
+    threads: Threads | None = None
+    """CPU threads of each worker; an equal share of this machine's cores, or one elsewhere."""
+    address: str | None = None
+    """Address of a running Ray cluster; a cluster is started here if not given."""
+    gpus: Annotated[float, Interval(ge=0, le=1024)] = 0.0
+    """GPUs per worker with Ray (also fractions) or SLURM."""
+    slurm: tuple[str, ...] = ()
+    """Parameters for SLURM with --engine submitit, as in --slurm partition=gpu time=120."""
+    shard: str | None = None
+    """Run every n-th job or case from the i-th on, given as i/n with i from 0; `auto` takes both
+    from a SLURM array."""
+
+
+def list_inputs(options: Settings) -> list[Path]:
+    """List the paths that a command reads: those of all its options but the outputs."""
+    inputs: list[Path] = []
+    for name, value in vars(options).items():
+        values = value if isinstance(value, tuple) else (value,)
+        if name in WORDS_OR_PATHS:
+            inputs += [Path(word) for word in values if isinstance(word, str)]
+        elif isinstance(value, Settings):
+            inputs += list_inputs(value)
+        elif name not in OUTPUTS:
+            inputs += [path for path in values if isinstance(path, Path)]
+    return inputs
+
+
+def replace_by_scenes(inputs: Sequence[Path], folders: Sequence[Path]) -> list[Path]:
+    """Replace folders of scenes by their scenes, beside which results may lie."""
+    from gscompleter.evaluation.cases import list_scenes  # it needs torch, for which no help waits
+
+    scenes = {path: list_scenes(path) for path in folders}
+    return [place for path in inputs for place in scenes.get(path, [path])]
+
+
+def parse_resolution(given: Size | None) -> tuple[int, int] | int | None:
+    """Return `--resolution` as the readers of photographs take it."""
+    size = LONG_SIDE if given is None else given
+    return None if size == "full" else size

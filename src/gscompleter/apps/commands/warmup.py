@@ -1,0 +1,35 @@
+"""The command `warmup`: compile all kernels in advance."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+from gscompleter.apps.commands.shared_options import ComputeOptions
+from gscompleter.system.errors import InputError
+from gscompleter.system.process import import_without_collection
+
+
+@dataclass(frozen=True, kw_only=True)
+class WarmupOptions(ComputeOptions):
+    """Compile all kernels for this type of processor into numba's cache (NUMBA_CACHE_DIR)."""
+
+
+def run_warmup(options: WarmupOptions) -> None:
+    """Compile missing kernels, and print the time and the folder."""
+    # Imported here, so that help pages do not wait for torch.
+    with import_without_collection():
+        from rich.console import Console
+
+        from gscompleter.apps.warmup import PARTS, compile_kernels
+        from gscompleter.numerics.kernels.cache import CACHE
+        from gscompleter.numerics.kernels.compiled import get_cache_folder
+        from gscompleter.system.progress import show_progress
+
+    # Without a folder for the cache, compiled kernels would end with this process.
+    if get_cache_folder() is None:
+        raise InputError(str(CACHE.note))
+    with show_progress(Console(stderr=True, quiet=options.quiet)):
+        seconds = compile_kernels(list(PARTS))
+    if not options.quiet:
+        done = " already" if seconds is None else f", in {seconds:.1f} s"
+        print(f"All kernels are compiled{done}: {get_cache_folder()}")

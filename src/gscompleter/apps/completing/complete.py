@@ -1,0 +1,197 @@
+"""Completion of a scene, and the report on it."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from rich.console import Console
+
+from gscompleter.apps.command_line.exit_codes import DONE, ERROR
+from gscompleter.apps.commands.complete import CompleteOptions
+from gscompleter.apps.completing.preparation import Prepared, prepare_completion
+from gscompleter.apps.completing.printing import print_completion, print_plan
+from gscompleter.apps.completing.run_info import describe_run, read_held_out, refuse_results
+from gscompleter.apps.inputs.opening import (
+    CompletionTask,
+    describe_task,
+    print_lines,
+)
+from gscompleter.apps.report.completion import GENERATED_FILE, write_report
+from gscompleter.apps.report.film import VIDEO_FILE, write_comparison_video
+from gscompleter.apps.report.page import REPORT_FILE, write_completion_page
+from gscompleter.apps.report.schema import (
+    RECORD_FILE,
+    read_summary,
+)
+from gscompleter.completer import check_target_ids
+from gscompleter.data.scene import write_cameras
+from gscompleter.editing.removal import restore_surroundings
+from gscompleter.evaluation.metrics.coverage import render_pairs, sample_held_out_cameras
+from gscompleter.numerics.kernels.parallel import run_in_background
+from gscompleter.splats.alignment.similarity import transform_camera_exactly
+from gscompleter.state import Completion
+from gscompleter.system.errors import print_error
+from gscompleter.system.files.output_folder import reserve_output
+from gscompleter.system.files.video import find_ffmpeg
+from gscompleter.system.files.writing import (
+    COMPLETED_FILE,
+    CONTEXT_FILE,
+    REMOVED_FILE,
+    SUMMARY_FILE,
+    TARGETS_FILE,
+)
+from gscompleter.system.progress import show_progress, stage
+from gscompleter.system.timing import add_seconds
+
+COMMAND = "complete"
+RESULTS = (
+    *(COMPLETED_FILE, CONTEXT_FILE, GENERATED_FILE, REMOVED_FILE, TARGETS_FILE),
+    *(REPORT_FILE, RECORD_FILE, SUMMARY_FILE, VIDEO_FILE, "images/target*.png"),
+)
+"""Globs of the files that a completion may write."""
+
+
+Prepare = Callable[[Any, Console], Prepared]
+"""Opens the input of a command, whose options it takes, and loads the models."""
+
+
+def complete_scene(options: CompleteOptions, prepare: Prepare = prepare_completion) -> int:
+    """Complete the scene, print a summary, and return the exit code."""
+    if options.dry_run:
+        plan_folder(options, prepare)
+        return DONE
+    complete_folder(options, prepare)
+    outcome = read_summary(options.out).outcome
+    if not options.quiet:
+        print_completion(options)
+    if outcome.status != "not-reconstructed":
+        return DONE
+    # A quiet run that fails says why.
+    if options.quiet:
+        print_error(outcome.headline)
+    return ERROR
+
+
+def complete_folder(
+    options: CompleteOptions, prepare: Prepare = prepare_completion, takes_over: bool = False
+) -> dict[str, Any]:
+    """Complete the scene, write `options.out`, and return the summary."""
+    # A missing ffmpeg ends the command at its beginning, not after the completion.
+    if options.video:
+        find_ffmpeg()
+    with open_completion(options, prepare, takes_over) as (ready, folder):
+        completion, ready = complete_targets(ready)
+
+        # Frozen views of the scene take memory, and the report does not use them.
+        ready.completer.scenes.clear()
+        with stage("report"):
+            summary = write_done(folder, ready, completion)
+            write_targets(folder, ready.task)
+        if options.video:
+            photographs = list(ready.cameras.values())
+            write_comparison_video(folder, completion, photographs, ready.completer.renderer)
+    return summary
+
+
+def plan_folder(options: CompleteOptions, prepare: Prepare) -> None:
+    """Write the targets and print the plan, without completing the scene.
+
+    The hole fraction of each target is that after those before it are completed.
+    """
+    with open_completion(options, prepare) as (ready, folder):
+        begun = ready.begin()
+        targets = ready.task.target_cameras
+        if targets:
+            holes = ready.explorer.compute_hole_fractions(begun, targets)
+        else:
+            cameras = list(ready.cameras.values())
+            choices = ready.explorer.plan(begun, cameras, ready.options.max_targets)
+            ready = ready.with_choices(choices)
+            holes = [choice.hole_fraction for choice in choices]
+        write_targets(folder, ready.task)
+    if not options.quiet:
+        print_plan(options, ready.opened, ready.task.targets, holes)
+
+
+@contextmanager
+def open_completion(
+    options: CompleteOptions, prepare: Prepare, takes_over: bool = False
+) -> Iterator[tuple[Prepared, Path]]:
+    """Reserve the output folder, load everything, print the input, and open the folder.
+
+    `takes_over` is that of `reserve_output`.
+    """
+    console = Console(stderr=True, quiet=options.quiet)
+    with (
+        show_progress(console),
+        reserve_output(options.out, options.overwrite, COMMAND, RESULTS, takes_over) as output,
+    ):
+        if options.dry_run:
+            refuse_results(options.out)
+        print_lines(console, *output.describe_others())
+        ready = prepare(options, console)
+        print_lines(console, *describe_task(options, ready.opened, ready.task))
+        with output.write() as folder:
+            yield ready, folder
+
+
+def write_done(folder: Path, ready: Prepared, completion: Completion) -> dict[str, Any]:
+    """Write all results but the targets and the video, and return the summary."""
+    options = ready.options
+    task = ready.task
+    renderer = ready.completer.renderer
+
+    # After a removal, photographs must look as before where they do not show what was removed.
+    # Without one this returns the completion as it is.
+    completion = restore_surroundings(completion, renderer)
+    completion = replace(completion, seconds=add_seconds(completion.seconds, ready.seconds))
+
+    # Coverage is measured from cameras beside the photographs, not from the targets themselves.
+    # They are rendered while the files are written.
+    cameras = tuple(ready.cameras.values())
+    aside = sample_held_out_cameras(cameras, options.seed)
+    facts = describe_run(options, ready.opened, task, completion.config, ready.describe_settings())
+    with run_in_background(render_pairs, completion, aside, renderer) as looks:
+        summary = write_report(
+            folder,
+            completion,
+            task.targets,
+            renderer,
+            {**facts, "seed": options.seed},
+            task.splat_file,
+            cameras,
+            looks,
+            read_held_out(options, ready.opened, task, ready.cameras),
+            ready.opened.files,
+        )
+    write_completion_page(folder)
+    return summary
+
+
+def complete_targets(ready: Prepared) -> tuple[Completion, Prepared]:
+    """Complete the scene for the named targets, or for targets that it finds."""
+    task = ready.task
+    count = ready.options.max_targets
+
+    # Too many targets for the labels of a .ply are refused before the first one is completed.
+    if task.targets:
+        check_target_ids(task.scene, len(task.targets))
+        return ready.completer.complete(ready.begin(), task.target_cameras), ready
+    check_target_ids(task.scene, count)
+    cameras = list(ready.cameras.values())
+    completion, choices = ready.explorer.explore(ready.begin(), cameras, count)
+    return completion, ready.with_choices(choices)
+
+
+def write_targets(folder: Path, task: CompletionTask) -> None:
+    """Write the target cameras in the frame of the photographs, as `--target` reads them."""
+    if task.targets:
+        # In float64, because coordinates of maps are large.
+        back = np.linalg.inv(task.frame)
+        cameras = [transform_camera_exactly(target.camera, back) for target in task.targets]
+        write_cameras(folder / TARGETS_FILE, cameras)

@@ -1,0 +1,225 @@
+"""Everything that is opened and loaded before a completion."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass, replace
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+from rich.console import Console
+
+from gscompleter.apps.commands.complete import CompleteOptions
+from gscompleter.apps.commands.shared_options import parse_resolution
+from gscompleter.apps.inputs.opening import (
+    CompletionTask,
+    Opened,
+    add_check_views,
+    apply_scene_range,
+    apply_splat_range,
+    check_context,
+    check_scene,
+    check_target_files,
+    check_targets,
+    choose_working_size,
+    describe_range_mismatch,
+    move_to_splat,
+    open_scene,
+    print_lines,
+    read_task,
+    resolve_scene,
+)
+from gscompleter.apps.inputs.selection import collect_usable_cameras
+from gscompleter.apps.report.completion import Target
+from gscompleter.apps.report.names import describe_offset
+from gscompleter.apps.warmup import SPLAT_PART, compile_kernels
+from gscompleter.completer import GSCompleter
+from gscompleter.data.local_origin import compute_frame_from_photographs
+from gscompleter.generators import load_generator
+from gscompleter.planning.planner import Choice, ViewPlanner
+from gscompleter.reconstructors import check_reconstructor, load_reconstructor
+from gscompleter.render.device import choose_device
+from gscompleter.render.loading import load_renderer
+from gscompleter.render.lod import MIN_PROXY_GAUSSIANS
+from gscompleter.splats.alignment.similarity import transform_camera
+from gscompleter.splats.formats import load_splat
+from gscompleter.splats.morton import argsort_nearby
+from gscompleter.stages.context import prepare_single
+from gscompleter.state import Completion
+from gscompleter.system.progress import show_preparation
+from gscompleter.system.timing import record_seconds, timed_stage
+from gscompleter.types import Camera
+
+
+@dataclass(frozen=True)
+class Prepared:
+    """Everything that is loaded before the first completion."""
+
+    options: CompleteOptions
+    opened: Opened
+    task: CompletionTask
+    explorer: ViewPlanner
+    cameras: Mapping[int, Camera]
+    """Cameras of all usable photographs by frame, in the frame of the result."""
+    seconds: Mapping[str, float]
+
+    @property
+    def completer(self) -> GSCompleter:
+        """The completer with its models."""
+        return self.explorer.completer
+
+    def begin(self) -> Completion:
+        """Initialize the context."""
+        task = self.task
+        return self.completer.begin(task.views, task.scene, task.check_views, task.target_cameras)
+
+    # `PreparedRemoval` adds the selection to them.
+    def describe_settings(self) -> dict[str, Any]:
+        """Describe the settings of targets and models for `summary.json`."""
+        return describe_settings(self.options)
+
+    def with_choices(self, choices: Iterable[Choice]) -> Prepared:
+        """Return a copy with chosen candidates as targets."""
+        # A candidate counts its photograph among the usable ones, where a target names its frame.
+        frames = list(self.cameras)
+        targets = []
+        for choice in choices:
+            frame = frames[choice.candidate.base]
+            offset = describe_offset(choice.camera, self.cameras[frame])
+            targets.append(Target(choice.camera, derived_from=frame, offset=offset))
+        return replace(self, task=replace(self.task, targets=targets))
+
+
+def prepare_completion(options: CompleteOptions, console: Console) -> Prepared:
+    """Open the scene and load the models."""
+    # First what is wrong whatever the scene is.
+    check_context(options)
+    check_targets(options)
+    check_reconstructor(options.reconstructor)
+    options.synthesis.make_settings()
+
+    device = choose_device(options.device)
+    options = resolve_scene(options)
+    opened = open_scene(options, console, partial(check_completion_inputs, options, device))
+    options = choose_working_size(options, opened.photographs, console)
+    if not options.config.ego_mask:
+        opened = replace(opened, photographs=opened.photographs.keep_ego_vehicle())
+    with show_preparation("reading photographs"):
+        task = read_task(options, opened, device)
+
+    parts = (device, options.reconstructor, options.synthesis.generator)
+    if options.scene is None:
+        compile_kernels(parts)
+    else:
+        task = add_splat(task, options.scene, options, opened, parts)
+
+    # Only here, because the oracle is given the photographs of the targets.
+    with show_preparation("loading models"):
+        completer = load_completer(options, task.targets, device)
+    reconstructor = completer.reconstructor
+
+    # A single photograph has no stereo, so a network predicts its depth; a splat needs neither.
+    if options.scene is None:
+        task = replace(task, views=prepare_single(reconstructor, task.views))
+
+    # The depth range is counted as a part of the context stage, whose seconds it is added to.
+    with show_preparation("depth range"), record_seconds() as seconds, timed_stage("context"):
+        if task.scene is None:
+            task = apply_scene_range(task, reconstructor)
+        else:
+            task = apply_splat_range(task, task.scene, completer.renderer)
+    print_lines(console, *describe_range_mismatch(task, reconstructor))
+
+    cameras = collect_cameras(options, opened, task)
+    return Prepared(options, opened, task, ViewPlanner(completer), cameras, seconds)
+
+
+def check_completion_inputs(options: CompleteOptions, device: str) -> None:
+    """Read what can be read without the cameras of the photographs, and refuse it if it is wrong.
+
+    It takes seconds, and the search for cameras after it minutes.
+    """
+    load_completer(options, (), device)
+    check_target_files(options)
+    if options.scene is not None:
+        load_splat(options.scene, options.drop_nonfinite)
+
+
+def add_splat(
+    task: CompletionTask, path: Path, options: CompleteOptions, opened: Opened, parts: Sequence[str]
+) -> CompletionTask:
+    """Compile the kernels, and add the input splat to the task."""
+    with show_preparation("reading the scene"):
+        task = add_check_views(task, opened.photographs)
+        gaussians = load_splat(path, options.drop_nonfinite)
+        if "cpu" in parts:
+            check_scene(task, gaussians)
+    compile_kernels([*parts, SPLAT_PART] if "cpu" in parts else parts)
+
+    with show_preparation("aligning the scene"):
+        # Gaussians of a file lie in random order, and each tile of an image would read memory all
+        # over. Large scenes are sorted along a Morton curve (decision 025); files are written in
+        # the order of the given file, which `order` leads back to.
+        order = None
+        if len(gaussians) >= MIN_PROXY_GAUSSIANS:
+            order = argsort_nearby(gaussians)
+            gaussians = gaussians[order]
+        return move_to_splat(task, gaussians, path, options, opened, order)
+
+
+def load_completer(options: CompleteOptions, targets: Sequence[Target], device: str) -> GSCompleter:
+    """Load the models of the options."""
+    # Only the oracle reads the photographs of the targets.
+    photographs = [target.view for target in targets if target.view is not None]
+    synthesis = options.synthesis
+    config = options.config
+    if options.no_recolor:
+        config = replace(config, recolor=replace(config.recolor, iterations=0))
+    return GSCompleter(
+        load_reconstructor(
+            options.reconstructor, options.weights, device, options.depth, options.depth_weights
+        ),
+        load_generator(
+            synthesis.generator, options.seed, photographs, device, synthesis.make_settings()
+        ),
+        load_renderer(device),
+        config,
+        options.seed,
+    )
+
+
+def collect_cameras(
+    options: CompleteOptions, opened: Opened, task: CompletionTask
+) -> dict[int, Camera]:
+    """Return the cameras of all usable photographs by frame, in the frame of the result."""
+    photographs = opened.photographs
+    cameras = collect_usable_cameras(
+        photographs, range(len(photographs)), parse_resolution(options.resolution)
+    )
+
+    # Photographs are read relative to their local origin. `task.frame` begins at their own frame,
+    # so the shift is undone before it.
+    transform = task.frame @ compute_frame_from_photographs(-photographs.origin)
+
+    # One depth range for all: that of the context, which was measured in the frame of the result.
+    context_camera = task.views[0].camera
+    near = context_camera.near
+    far = context_camera.far
+    return {
+        frame: replace(transform_camera(camera, transform).to(task.device), near=near, far=far)
+        for frame, camera in cameras.items()
+    }
+
+
+def describe_settings(options: CompleteOptions) -> dict[str, Any]:
+    """Describe the settings of targets and models for `summary.json`."""
+    return {
+        "target": list(options.target),
+        "auto": None if options.target else options.max_targets,
+        "reconstructor": options.reconstructor,
+        "weights": None if options.weights is None else str(options.weights),
+        "depth": options.depth,
+        **options.synthesis.describe(),
+        "uses_target_photographs": options.synthesis.generator == "oracle",
+    }

@@ -1,0 +1,103 @@
+"""What a completion prints on the terminal."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+
+from rich.console import Console
+from rich.table import Table
+
+from gscompleter.apps.commands.complete import CompleteOptions
+from gscompleter.apps.inputs.opening import Opened
+from gscompleter.apps.report.completion import Target
+from gscompleter.apps.report.film import VIDEO_FILE
+from gscompleter.apps.report.outcome import name_unused, select_testing
+from gscompleter.apps.report.page import REPORT_FILE
+from gscompleter.apps.report.plain_words import (
+    format_number,
+    format_percent,
+    group_target_notes,
+    list_notes,
+    list_shared_notes,
+)
+from gscompleter.apps.report.schema import CompletionSummary, average, read_summary
+from gscompleter.system.errors import quote_value
+from gscompleter.system.files.writing import COMPLETED_FILE, TARGETS_FILE
+
+
+def print_completion(options: CompleteOptions) -> None:
+    """Print the scores per camera, the notes, and the location of the results."""
+    console = Console(highlight=False)
+    summary = read_summary(options.out)
+    console.print(summary.outcome.headline, markup=False, soft_wrap=True)
+    console.print(make_score_table(summary))
+
+    # What holds for several targets is said once, before the notes of each. If nothing was gained,
+    # the headline gives the reason for all.
+    sentences = list(list_shared_notes(summary))
+    if summary.outcome.status != "nothing-gained":
+        for notes, numbers in group_target_notes(summary.targets).items():
+            if len(numbers) == 1:
+                name = summary.targets[numbers[0] - 1].name
+                sentences.append(f"{name}: {' '.join(notes)}")
+    sentences += describe_result(summary, options)
+    for sentence in sentences:
+        console.print(sentence, markup=False, soft_wrap=True)
+
+
+def make_score_table(summary: CompletionSummary) -> Table:
+    """Make the table of PSNR before and after at each camera."""
+    table = Table("camera", "hole", "PSNR before", "PSNR after", "added", box=None)
+    # Photographs of the context have neither a hole nor Gaussians of their own.
+    for row in summary.context:
+        before = format_number(row.psnr_before)
+        after = format_number(row.psnr_after)
+        table.add_row(f"context {row.photograph}", "", before, after, "")
+    for target in summary.targets:
+        before = format_number(target.psnr_before)
+        after = format_number(target.psnr_after)
+        hole = format_percent(target.hole_fraction)
+        table.add_row(f"target: {target.name}", hole, before, after, f"{target.added:,}")
+    return table
+
+
+def describe_result(summary: CompletionSummary, options: CompleteOptions) -> Iterator[str]:
+    """Write the sentences below the table."""
+    yield from list_notes(summary)
+
+    # Under photometric trust covered is not enough: photographs have to confirm what covers.
+    share = "Trusted" if summary.settings["config"]["trust"] == "photometric" else "Coverage"
+    before = format_percent(summary.coverage.before)
+    after = format_percent(summary.coverage.after)
+    yield f"{share} around the photographs: {before} before, {after} after."
+
+    rows = select_testing(summary.held_out)
+    if rows:
+        at_first = format_percent(average(row.covered_before for row in rows))
+        at_last = format_percent(average(row.covered_after for row in rows))
+        yield f"Covered of {name_unused(rows)}: {at_first} before, {at_last} after."
+
+    counts = summary.gaussians
+    seconds = summary.seconds["total"]
+    yield (
+        f"Added {counts['added']:,} Gaussians to {counts['context']:,} in {seconds:.1f} s: "
+        f"{options.out / COMPLETED_FILE}"
+    )
+    yield f"Report: {options.out / REPORT_FILE}"
+    if options.video and summary.targets:
+        yield f"Video: {options.out / VIDEO_FILE}"
+
+
+def print_plan(
+    options: CompleteOptions, opened: Opened, targets: Sequence[Target], holes: Sequence[float]
+) -> None:
+    """Print the targets and their holes."""
+    console = Console(highlight=False)
+    if not targets:
+        console.print("No camera has much to gain; there is nothing to complete.")
+        return
+    table = Table("camera", "hole", box=None)
+    for number, (target, hole) in enumerate(zip(targets, holes, strict=True), 1):
+        table.add_row(f"{number}: {opened.name_target(target)}", format_percent(hole))
+    console.print(table)
+    console.print(f"Edit the cameras in {quote_value(options.out / TARGETS_FILE)}.", soft_wrap=True)

@@ -1,0 +1,70 @@
+"""Removal of something from a splat, whose hole is completed."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import torch
+from jaxtyping import Bool, Float
+from rich.console import Console
+from torch import Tensor
+
+from gscompleter.apps.commands.remove import RemoveOptions
+from gscompleter.apps.completing.preparation import Prepared, prepare_completion
+from gscompleter.apps.inputs.removal import check_selection, choose_gaussians, find_in_region
+from gscompleter.editing.removal import remove_gaussians
+from gscompleter.planning.photographs import PhotographPlanner
+from gscompleter.state import Completion
+from gscompleter.system.errors import InputError, quote_value
+from gscompleter.system.progress import stage
+
+SELECTIONS = ("box", "box_rotation", "sphere", "mask", "select")
+
+
+@dataclass(frozen=True)
+class PreparedRemoval(Prepared):
+    """A completion that begins with the removal."""
+
+    options: RemoveOptions
+
+    def begin(self) -> Completion:
+        """Initialize the context, and remove the selected Gaussians from it."""
+        begun = super().begin()
+        completer = self.completer
+        with stage("removing"):
+            chosen = choose_gaussians(
+                self.options, self.task, self.opened.photographs, self.cameras, completer.renderer
+            )
+            # Gaussians that reach out of a box or the sphere are cut at its border. Those that a
+            # mask or a file selects go as a whole.
+            return remove_gaussians(begun, chosen, self.contains, completer.scenes)
+
+    def contains(self, points: Float[Tensor, "n 3"]) -> Bool[Tensor, "n"]:
+        """Find points, in the frame of the result, in the boxes and the sphere."""
+        # The region is given in the coordinates of the file, which float32 may not resolve.
+        origin = torch.from_numpy(self.task.origin).to(points.device)
+        return find_in_region(points.double() + origin, self.options)
+
+    def describe_settings(self) -> dict[str, Any]:
+        """Describe the settings, with the selection."""
+        selection = {name: getattr(self.options, name) for name in SELECTIONS}
+        # JSON has no paths.
+        texts = {name: str(selection[name]) for name in ("mask", "select") if selection[name]}
+        return {**super().describe_settings(), **selection, **texts}
+
+
+def prepare_removal(options: RemoveOptions, console: Console) -> PreparedRemoval:
+    """Open the scene, and load the models; targets are searched for among the photographs."""
+    check_selection(options)
+    ready = prepare_completion(options, console)
+
+    # `strip` puts back what one removed.ply holds, and so cannot undo two runs.
+    if ready.task.scene is not None and bool((ready.task.scene.generated > 0).any()):
+        raise InputError(
+            f"{quote_value(options.scene)} was completed before, and removed.ply keeps what one "
+            "run removed; strip it first, and remove everything at once."
+        )
+
+    explorer = PhotographPlanner(ready.completer)
+    return PreparedRemoval(**{**vars(ready), "explorer": explorer})

@@ -1,0 +1,154 @@
+"""The cases that the options of `evaluate` name."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Iterator, Sequence
+from contextlib import suppress
+from dataclasses import replace
+from itertools import groupby, islice
+from pathlib import Path
+
+from rich.console import Console
+
+from gscompleter.apps.commands.evaluate import EvaluateOptions
+from gscompleter.apps.commands.shared_options import LONG_SIDE, parse_resolution
+from gscompleter.data.formats import open_photographs
+from gscompleter.data.limits import check_planes
+from gscompleter.data.photographs import MAX_TRANSLATION, Photographs, Resolution
+from gscompleter.evaluation import protocols
+from gscompleter.evaluation.authors_loader import AuthorsLoader
+from gscompleter.evaluation.cases import Case, SkippedScene, filter_usable, open_clips, read_cases
+from gscompleter.evaluation.paper import get_data_set
+from gscompleter.system.errors import InputError, quote_value
+
+
+def collect_tasks(
+    options: EvaluateOptions, skipped: list[SkippedScene], notes: list[str]
+) -> list[protocols.Task]:
+    """Collect the tasks of the options, and append to `skipped` and `notes`."""
+    if options.protocol:
+        # The iterator opens clips one by one, so those beyond the limit are not opened.
+        return list(islice(iterate_tasks(options, skipped, notes), options.limit))
+
+    cases = [case for path in options.paths for case in read_cases(find_cases_file(path))]
+    if options.one_per_scene:
+        # The first case of a scene is the last that overwrites its entry in reversed order.
+        first = {case.scene: case for case in reversed(cases)}
+        cases = [case for case in cases if case is first[case.scene]]
+    cases = cases[: options.limit]
+
+    tasks: list[protocols.Task] = []
+    # Cases of one scene stand together in a file, so that each scene is opened once for its notes.
+    for scene, group in groupby(cases, lambda case: case.scene):
+        own = [protocols.make_case_task(apply_options(case, options)) for case in group]
+        # A scene that cannot be opened fails later, and its row in the table has the reason.
+        with suppress(InputError):
+            clip = open_photographs(scene)
+            notes += clip.notes
+            own = mark_masked(clip if options.masks else clip.leave_out_masks(), own, notes)
+        tasks += own
+    return tasks
+
+
+def mark_masked(
+    clip: Photographs, tasks: Sequence[protocols.Task], notes: list[str]
+) -> list[protocols.Task]:
+    """Mark the tasks of a clip if their photographs have masks, and append a note about these."""
+    frames = {frame for task in tasks for frame in (*task.context, *task.targets, *task.neighbours)}
+    # Frames that the clip does not have are refused when their case is run.
+    masks = clip.describe_masks(sorted(frame for frame in frames if frame < len(clip)))
+    if masks is None:
+        return list(tasks)
+    notes.append(f"{clip.name}: {masks} are read; what they hide is ignored.")
+    return [replace(task, has_masks=True) for task in tasks]
+
+
+def apply_options(case: Case, options: EvaluateOptions) -> Case:
+    """Return a case with masks, resolution and depth range of the options."""
+    size = options.resolution
+    return replace(
+        case,
+        near=case.near if options.near is None else options.near,
+        far=case.far if options.far is None else options.far,
+        resolution=case.resolution if size is None else parse_resolution(size),
+        masks=options.masks,
+        ignore_moving=options.ignore_moving,
+        ego_mask=options.ego_mask,
+    )
+
+
+def iterate_tasks(
+    options: EvaluateOptions, skipped: list[SkippedScene], notes: list[str]
+) -> Iterator[protocols.Task]:
+    """Iterate over the tasks of the protocols, clip by clip."""
+    rules = [protocols.parse_protocol(text) for text in options.protocol]
+
+    # With a preset, images are cropped and scenes left out as by its authors' code (decision 047).
+    loader = find_loader(options)
+    resolution = LONG_SIDE if options.resolution is None else options.resolution
+    size: Resolution
+    if loader is not None and isinstance(resolution, tuple):
+        height, width = resolution
+        size = loader.make_crop(height, width)
+    else:
+        size = parse_resolution(resolution)
+    # Their code also keeps clips whose coordinates are large.
+    max_translation = MAX_TRANSLATION if loader is None else None
+    for path in options.paths:
+        for clip in filter_usable(open_clips(path), skipped, max_translation):
+            notes += clip.notes
+            if options.ignore_moving and not clip.has_boxes:
+                raise InputError(
+                    f"{clip.name} has no boxes of moving objects; leave --ignore-moving out. Masks "
+                    "are always read (--no-masks leaves them out)."
+                )
+
+            # The authors' code scores every pixel of their data sets.
+            scores_all = loader is not None
+            if scores_all or not options.ego_mask:
+                clip = clip.keep_ego_vehicle()
+            if scores_all or not options.masks:
+                clip = clip.leave_out_masks()
+            if options.ignore_moving:
+                clip = clip.ignore_moving()
+
+            near = clip.near if options.near is None else options.near
+            far = clip.far if options.far is None else options.far
+            check_planes(near, far)
+            clip = replace(clip, near=near, far=far)
+
+            for rule in rules:
+                if isinstance(rule, protocols.FrameRule) and not rule.select_splits(clip):
+                    reason = f"{rule.name} chooses none of its {len(clip)} frames"
+                    skipped.append(SkippedScene(clip.name, reason))
+                kept = rule if loader is None else loader.choose_splits(rule, clip, skipped)
+                # The authors' loaders keep the order of the context; ours is ascending.
+                keeps_order = loader is not None
+                tasks = protocols.make_tasks(kept, clip, size, keeps_order)
+                tasks = mark_masked(clip, tasks, notes)
+                yield from tasks[:1] if options.one_per_scene else tasks
+
+
+def find_loader(options: EvaluateOptions) -> AuthorsLoader | None:
+    """Find the loader to follow; none without a preset, or at another size than the preset's."""
+    preset = get_data_set(options.preset)
+    return preset.loader if options.resolution == preset.resolution else None
+
+
+def find_cases_file(path: Path) -> Path:
+    """Find the cases.json that `path` is or contains."""
+    file = path / "cases.json" if os.path.isdir(path) else path
+    # A transforms.json is a scene, and so needs a protocol.
+    if file.suffix != ".json" or not os.path.isfile(file) or file.name == "transforms.json":
+        raise InputError(
+            f"{quote_value(path)} is no cases.json; name one, or add --protocol for scenes, as in "
+            "--protocol n-10."
+        )
+    return file
+
+
+def print_skipped(skipped: Sequence[SkippedScene], console: Console) -> None:
+    """Print the skipped clips with the reasons."""
+    for clip in skipped:
+        console.print(f"Skipped {clip.name}: {clip.reason}.")

@@ -1,0 +1,48 @@
+"""The evaluation index of a protocol."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+from rich.console import Console
+
+from gscompleter.apps.commands.index import IndexOptions
+from gscompleter.apps.evaluating.cases import print_skipped
+from gscompleter.evaluation import protocols
+from gscompleter.evaluation.cases import SkippedScene, filter_usable, open_clips
+from gscompleter.system.errors import InputError, quote_value
+from gscompleter.system.files.output_file import reserve_file
+from gscompleter.system.progress import show_preparation, show_progress
+
+
+def write_index(options: IndexOptions) -> None:
+    """Write the evaluation index of a protocol for a data set."""
+    skipped: list[SkippedScene] = []
+    rule = protocols.parse_protocol(options.protocol)
+    with (
+        reserve_file(options.out, options.overwrite),
+        show_progress(Console(stderr=True, quiet=options.quiet)),
+        show_preparation("reading clips"),
+    ):
+        index = protocols.build_index(rule, filter_usable(open_clips(options.path), skipped))
+        # Skipped scenes are recorded as scenes without a case, not left out.
+        index = replace(index, scenes={**index.scenes, **{clip.name: () for clip in skipped}})
+        if not any(index.scenes.values()):
+            reason = f" ({skipped[0].name}: {skipped[0].reason})" if skipped else ""
+            raise InputError(
+                f"The protocol {quote_value(options.protocol)} chooses no case in the "
+                f"{len(index.scenes)} scene(s) of {quote_value(options.path)}{reason}; choose one "
+                "with a smaller step, or other data."
+            )
+        protocols.write_evaluation_index(options.out, index)
+    console = Console(quiet=options.quiet, highlight=False)
+    print_skipped(skipped, console)
+
+    # A split is one choice of context frames, and each of its targets is a case.
+    targets = [len(split.targets) for splits in index.scenes.values() for split in splits]
+    used = [name for name, splits in index.scenes.items() if splits]
+    console.print(
+        f"{sum(targets)} cases in {len(used)} scenes, {len(index.scenes) - len(used)} scenes "
+        f"skipped: {options.out}",
+        soft_wrap=True,
+    )

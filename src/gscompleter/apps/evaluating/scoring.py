@@ -1,0 +1,116 @@
+"""Methods run on cases and scored, with the tables of the scores."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Sequence
+from dataclasses import asdict, dataclass
+from typing import Any
+
+from rich.console import Console
+
+from gscompleter.apps.batch.engine import make_engine
+from gscompleter.apps.batch.running import print_failures
+from gscompleter.apps.command_line.exit_codes import choose_exit_code
+from gscompleter.apps.commands.evaluate import EvaluateOptions
+from gscompleter.apps.commands.shared_options import LONG_SIDE, parse_resolution
+from gscompleter.apps.evaluating.cases import collect_tasks, find_loader, print_skipped
+from gscompleter.apps.evaluating.tables import write_and_print_tables
+from gscompleter.apps.warmup import compile_kernels
+from gscompleter.data.photographs import check_resolution
+from gscompleter.evaluation.cases import SkippedScene
+from gscompleter.evaluation.methods import expand_methods
+from gscompleter.evaluation.runner import RunConfig, evaluate
+from gscompleter.evaluation.store import list_row_paths
+from gscompleter.render.device import choose_device
+from gscompleter.system.errors import InputError
+from gscompleter.system.jobs.jobs import parse_shard
+from gscompleter.system.progress import show_preparation, show_progress
+
+
+def run_methods(options: EvaluateOptions) -> int:
+    """Run and score the methods on the cases, write and print the tables; return the exit code."""
+    scored = score_methods(options)
+    # A shard without cases has no tables.
+    if list_row_paths(options.out):
+        with show_progress(Console(stderr=True, quiet=options.quiet)):
+            write_and_print_tables(options.out, options.quiet, num_rows=scored.num_rows)
+    return choose_exit_code(len(scored.failures), scored.num_own_rows)
+
+
+@dataclass(frozen=True)
+class Scored:
+    """Outcome of a call of `evaluate`."""
+
+    num_rows: int
+    """Number of rows of all shards."""
+    num_own_rows: int
+    """Number of rows of this shard, scored now or earlier."""
+    failures: Sequence[str]
+    """Rows of this shard without a score, with the reasons."""
+
+
+def score_methods(options: EvaluateOptions) -> Scored:
+    """Run and score the methods on the cases, and print the first failures."""
+    if not options.paths:
+        raise InputError("No data is given; name a cases.json, or scenes with --protocol.")
+    console = Console(stderr=True, quiet=options.quiet, highlight=False)
+    methods = expand_methods(options.methods)
+    shard = parse_shard(options.shard, os.environ)
+    if options.resolution is not None:
+        check_resolution(parse_resolution(options.resolution))
+
+    skipped: list[SkippedScene] = []
+    notes: list[str] = []
+    with show_progress(console), show_preparation("reading cases"):
+        tasks = collect_tasks(options, skipped, notes)
+    # Several clips can have the same note.
+    for note in dict.fromkeys(notes):
+        console.print(note, markup=False, soft_wrap=True)
+    print_skipped(skipped, console)
+
+    config = RunConfig(
+        reconstructor=options.reconstructor[0],
+        weights=str(options.weights[0]) if options.weights else None,
+        depth=options.depth,
+        depth_weights=str(options.depth_weights) if options.depth_weights else None,
+        generator=options.synthesis.generator,
+        generator_settings=options.synthesis.make_settings(),
+        device=choose_device(options.device),
+        seed=options.seed,
+        source=describe_source(options, any(task.has_masks for task in tasks)),
+    )
+    engine = make_engine(options, options.out.resolve())
+
+    # Kernels are compiled here once, before workers would each compile them.
+    with show_progress(console):
+        compile_kernels((config.device, config.reconstructor, config.generator))
+        counts = evaluate(tasks, methods, options.out, config, shard, options.rerun, engine)
+
+    own = counts.done + counts.failed + counts.skipped
+    print_failures(console, counts.failures, own)
+    line = f"Scored {counts.done}, failed {counts.failed}, done earlier {counts.skipped}"
+    console.print(f"{line}, of {len(tasks)} cases by {len(methods)} methods.")
+    return Scored(len(tasks) * len(methods), own, counts.failures)
+
+
+def describe_source(options: EvaluateOptions, has_masks: bool = False) -> dict[str, Any]:
+    """Describe the cases, as an output folder records them.
+
+    Scores with masks are not continued with scores without, nor the other way round.
+    """
+    # A cases.json has the resolution of each case; scenes of a protocol have none.
+    size = LONG_SIDE if options.resolution is None and options.protocol else options.resolution
+    loader = find_loader(options)
+    return {
+        "paths": [path.resolve().name for path in options.paths],
+        "protocols": list(options.protocol),
+        "resolution": list(size) if isinstance(size, tuple) else size,
+        **({"masks": True} if has_masks else {}),
+        **({"ignore_moving": True} if options.ignore_moving else {}),
+        **({"one_per_scene": True} if options.one_per_scene else {}),
+        **({} if options.ego_mask else {"ego_mask": False}),
+        **({} if loader is None else {"loader": asdict(loader)}),
+        **({} if options.near is None else {"near": options.near}),
+        **({} if options.far is None else {"far": options.far}),
+    }

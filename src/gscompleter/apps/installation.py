@@ -1,0 +1,143 @@
+"""What is installed and compiled on this machine."""
+
+from __future__ import annotations
+
+import importlib.metadata
+from collections.abc import Iterator
+from dataclasses import dataclass
+
+import torch
+from packaging.requirements import Requirement
+
+from gscompleter.apps.bench.report import describe_machine
+from gscompleter.apps.viewer.packages import BUILT_LIBRARIES, LOCK_FILE, get_archive_path, read_lock
+from gscompleter.apps.warmup import PARTS
+from gscompleter.models.weights.fetching import find_cached
+from gscompleter.models.weights.published import PUBLISHED
+from gscompleter.numerics.kernels.cache import CACHE
+from gscompleter.numerics.kernels.compiled import get_cache_folder, is_compiled
+from gscompleter.render.device import choose_device
+from gscompleter.render.loading import load_renderer
+from gscompleter.system.errors import InputError
+from gscompleter.system.files.writing import get_download_folder
+
+PURPOSES = {
+    "cuda": "rendering on an NVIDIA GPU",
+    "evaluation": "the plots of evaluate and tables, FLIP, LPIPS and FID",
+    "models": "downloading published weights from the Hugging Face hub",
+    "diffusion": "--generator pe-field and diffusers-inpaint",
+    "onnx": "--generator migan and lama",
+    "poses": "photographs whose cameras are not known",
+    "live": "completing in the browser with gscompleter live",
+    "browser": "the picture of the viewer (examples/04_picture_of_the_viewer.py)",
+    "film": "videos as SCENE, and complete --video",
+    "ray": "batch --engine ray",
+    "slurm": "batch --engine submitit",
+    "waymo": "the Waymo Open Dataset 2, whose tables are parquet",
+    "phones": "the depth of Record3D",
+    "heic": "photographs as HEIC, as iPhones take them",
+    "usd": "splats as OpenUSD (.usda, .usdc, .usdz)",
+}
+"""Purpose of each extra, without those for developers (`test-core`, `test`, `dev`, `docs`)."""
+
+
+@dataclass(frozen=True)
+class Found:
+    """One line of the result."""
+
+    kind: str
+    name: str
+    there: bool
+    told: str
+    """Versions and locations, or the purpose of a missing part and what to do."""
+
+
+def inspect_installation() -> Iterator[Found]:
+    """Inspect all parts, in the order of the result."""
+    for name, value in describe_machine(choose_device()).items():
+        yield Found("machine", name, True, str(value))
+
+    for requirement in list_requirements():
+        version = find_installed_version(requirement)
+        remedy = f"every command needs it; pip install '{requirement}'"
+        yield Found("packages", requirement.name, version is not None, version or remedy)
+    for extra, purpose in PURPOSES.items():
+        yield inspect_extra(extra, purpose)
+
+    # Loading is the test: a renderer can be installed and lack its GPU or its compiled part.
+    for name in ("cpu", "cuda", "reference"):
+        try:
+            load_renderer(name)
+        except InputError as error:
+            yield Found("renderers", name, False, str(error))
+        else:
+            yield Found("renderers", name, True, "draws here")
+    compiled = all(is_compiled(part) for part in PARTS)
+    remedy = "compiled by the first completion, or in advance by `gscompleter warmup`"
+    yield Found("renderers", "kernels", compiled, "compiled" if compiled else remedy)
+
+    # One file of weights is enough to count as there: nobody needs all of them.
+    here = [name for name, published in PUBLISHED.items() if find_cached(published)]
+    weights = ", ".join(here) or f"all {len(PUBLISHED)} that `gscompleter models` lists"
+    yield Found("weights", "reconstructors", bool(here), f"{weights}, for --reconstructor")
+
+    # A wheel contains the libraries in one file; a checkout downloads an archive of each.
+    archives = [get_archive_path(package) for package in read_lock(LOCK_FILE)]
+    there = BUILT_LIBRARIES.is_file() or all(path.is_file() for path in archives)
+    remedy = "fetched with npm's registry when `gscompleter view` first runs"
+    yield Found("viewer", "libraries", there, "here" if there else remedy)
+
+    yield Found("caches", "downloads", True, f"{get_download_folder()} (GSCOMPLETER_HOME)")
+    yield inspect_kernel_cache()
+    yield Found("caches", "torch.hub", True, f"{torch.hub.get_dir()} (TORCH_HOME)")
+
+
+def inspect_kernel_cache() -> Found:
+    """Inspect the folder of compiled kernels; a note says why it is not the usual one."""
+    if CACHE.note is not None:
+        return Found("caches", "kernels", False, CACHE.note)
+    return Found("caches", "kernels", True, f"{get_cache_folder()} (NUMBA_CACHE_DIR)")
+
+
+def inspect_extra(extra: str, purpose: str) -> Found:
+    """Inspect the packages of an extra."""
+    versions = {
+        requirement.name: find_installed_version(requirement)
+        for requirement in list_requirements(extra)
+    }
+    missing = [name for name, version in versions.items() if version is None]
+    # No requirement at all: an older version of the package does not know the extra, or its markers
+    # leave out this version of Python.
+    if not versions:
+        detail = f"the installed version or this Python is older than this extra; for {purpose}"
+    elif missing:
+        detail = f"{', '.join(missing)}, for {purpose}; pip install 'gscompleter[{extra}]'"
+    else:
+        names = ", ".join(f"{name} {version}" for name, version in versions.items())
+        detail = f"{names}, for {purpose}"
+    return Found("extras", extra, bool(versions) and not missing, detail)
+
+
+def list_requirements(extra: str = "") -> list[Requirement]:
+    """List the requirements of the package, or those that an extra adds."""
+    lines = importlib.metadata.requires("gscompleter") or []
+    requirements = [Requirement(line) for line in lines]
+    return [requirement for requirement in requirements if is_required_by(extra, requirement)]
+
+
+def is_required_by(extra: str, requirement: Requirement) -> bool:
+    """Return True if an extra adds this requirement; without a name, if all need it."""
+    # A marker that holds without an extra, such as one for a platform, belongs to the package.
+    if requirement.marker is None or requirement.marker.evaluate({"extra": ""}):
+        return not extra
+    return bool(extra) and requirement.marker.evaluate({"extra": extra})
+
+
+def find_installed_version(requirement: Requirement) -> str | None:
+    """Return the installed version if it satisfies the requirement."""
+    try:
+        version = importlib.metadata.version(requirement.name)
+    except importlib.metadata.PackageNotFoundError:
+        return None
+    # A pre-release, as nightly builds of torch are, counts by its number alone.
+    return version if requirement.specifier.contains(version, prereleases=True) else None

@@ -1,0 +1,124 @@
+"""The page of a scene before and after, written or served."""
+
+from __future__ import annotations
+
+import os
+import sys
+import webbrowser
+from contextlib import suppress
+from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
+
+from gscompleter.apps.commands.view import ViewOptions
+from gscompleter.apps.viewer import packages
+from gscompleter.apps.viewer.exhibit import (
+    ViewerContent,
+    add_file_cameras,
+    load_viewer_completion,
+    load_viewer_files,
+)
+from gscompleter.apps.viewer.page import make_page
+from gscompleter.splats.foreign import resolve_splat
+from gscompleter.splats.sog import META
+from gscompleter.system.errors import InputError, quote_value
+from gscompleter.system.files.output_file import reserve_file
+from gscompleter.system.files.writing import SUMMARY_FILE, replace_file
+
+ADDRESS = "127.0.0.1"
+HOST_NAMES = (ADDRESS, "localhost")
+"""Accepted host names; any other one may be a DNS rebinding attack by a website."""
+
+
+def show_scenes(options: ViewOptions) -> None:
+    """Make the page, and write it or serve it until Ctrl-C."""
+    if options.save is not None:
+        if options.save.suffix.lower() not in (".html", ".htm"):
+            name = quote_value(options.save)
+            raise InputError(f"{name} is no .html file; name it *.html.", "save")
+        # Reserved first: a file that may not be replaced ends the command before scenes are read.
+        with reserve_file(options.save, options.overwrite):
+            page = load_page(options)
+            with replace_file(options.save) as file:
+                file.write(page)
+        if not options.quiet:
+            print(options.save)
+        return
+
+    page = load_page(options)
+    with make_page_server(page, options.port) as server, suppress(KeyboardInterrupt):
+        address = f"http://{ADDRESS}:{server.server_address[1]}/"
+        # Printed once the server listens.
+        print(f"{address} (Ctrl-C ends it)", flush=True)
+        if not options.no_open:
+            webbrowser.open(address)
+        server.serve_forever()
+
+
+def load_page(options: ViewOptions) -> bytes:
+    """Make the page of the scenes and cameras of the options, and print its notes."""
+    # Libraries first: they may have to be downloaded, and a lack of network is said before large
+    # scenes are read.
+    libraries = packages.load_libraries()
+    page, notes = make_page(load_content(options), libraries)
+    if not options.quiet:
+        for note in notes:
+            print(note)
+    return page
+
+
+def load_content(options: ViewOptions) -> ViewerContent:
+    """Read the scenes and cameras of the options."""
+    # A folder is that of a completion, of a trainer's model, or an unpacked .sog.
+    scene = options.scene
+    if not (scene / SUMMARY_FILE).is_file():
+        scene = resolve_splat(scene)
+
+    if options.other is not None:
+        # B is the scene after, A the one before.
+        content = load_viewer_files(options.other, scene, options.drop_nonfinite)
+    elif os.path.isdir(scene) and not os.path.isfile(scene / META):
+        content = load_viewer_completion(scene, options.drop_nonfinite)
+    else:
+        content = load_viewer_files(scene, None, options.drop_nonfinite)
+
+    if options.cameras is None:
+        return content
+    return add_file_cameras(content, options.cameras, options.resolution)
+
+
+def make_page_server(page: bytes, port: int = 0) -> ThreadingHTTPServer:
+    """Make a server on `port` (0 for any) that shows the page to browsers of this machine."""
+
+    class Handler(BaseHTTPRequestHandler):
+        def do_GET(self) -> None:
+            if self.headers.get("Host", "").rsplit(":", 1)[0].lower() not in HOST_NAMES:
+                self.send_error(421, "This server answers to 127.0.0.1 and localhost only")
+            elif self.path != "/":
+                self.send_error(404)
+            else:
+                self.send_page()
+
+        def send_page(self) -> None:
+            self.send_response(200)
+            self.send_header("Content-Type", "text/html; charset=utf-8")
+            self.send_header("Content-Length", str(len(page)))
+            self.send_header("Cross-Origin-Resource-Policy", "same-origin")
+            self.send_header("Cache-Control", "no-store")
+            self.end_headers()
+            self.wfile.write(page)
+
+        def log_message(self, format: str, *args: object) -> None:
+            """Log nothing."""
+
+    class Server(ThreadingHTTPServer):
+        def handle_error(self, request: object, client_address: object) -> None:
+            """Ignore a browser that leaves while it is answered; report any other error."""
+            if not isinstance(sys.exc_info()[1], ConnectionError):
+                super().handle_error(request, client_address)  # type: ignore[arg-type]
+
+    try:
+        return Server((ADDRESS, port), Handler)
+    except OSError as error:
+        raise InputError(
+            f"Port {port} of {ADDRESS} is not available ({error.strerror}); name another one.",
+            "port",
+        ) from error
