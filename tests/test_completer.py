@@ -14,7 +14,8 @@ from gscompleter import (
     load_ply,
     load_renderer,
 )
-from gscompleter.apps.report.completion import Target, write_report
+from gscompleter.apps.inputs.task import Target
+from gscompleter.apps.report.completion import write_report
 from gscompleter.config import PsnrGuardConfig
 from gscompleter.evaluation.metrics.image import psnr
 from gscompleter.generators import GeneratorOutput

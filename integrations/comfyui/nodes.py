@@ -17,7 +17,8 @@ from torch import Tensor
 from torch.nn.functional import interpolate
 
 import gscompleter as gsc
-from gscompleter.apps.report.completion import InputSplatFile, write_scenes
+from gscompleter.apps.inputs.task import InputSplatFile
+from gscompleter.apps.report.completion import write_scenes
 from gscompleter.data.formats import open_photographs
 from gscompleter.generators import GeneratorOutput, GeneratorRequest
 from gscompleter.system.files.image import write_image

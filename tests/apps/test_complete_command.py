@@ -16,8 +16,10 @@ from gscompleter.apps.commands.shared_options import parse_resolution
 from gscompleter.apps.completing import complete as command
 from gscompleter.apps.completing import preparation
 from gscompleter.apps.evaluating.cases import collect_tasks
-from gscompleter.apps.inputs.opening import CompletionTask, Opened, estimate_memory, read_task
+from gscompleter.apps.inputs.memory import estimate_memory
+from gscompleter.apps.inputs.reading import read_task
 from gscompleter.apps.inputs.selection import select_near_and_far
+from gscompleter.apps.inputs.task import CompletionTask, Opened
 from gscompleter.cli import parse_command
 from gscompleter.data.formats import open_photographs
 from gscompleter.data.scene import write_cameras
@@ -108,7 +110,8 @@ def opened_with(scene: Path, *words: object) -> CompletionTask:
     """Open `scene` with these options; nothing is completed."""
     options = parse_command([str(word) for word in ("complete", scene, *words, "--out", "OUT")])
     photographs = open_photographs(scene, near=0.5, far=20.0)
-    return read_task(options, Opened(photographs, "nerfstudio", 5), "cpu")
+    opened = Opened(options.make_scene_request(), photographs, "nerfstudio", 5)
+    return read_task(opened, options.context, options.target, "cpu", has_splat=False)
 
 
 def test_a_context_that_is_named_is_the_one_that_is_taken(scene):

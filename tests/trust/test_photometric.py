@@ -9,7 +9,8 @@ import pytest
 import torch
 
 from command import run
-from gscompleter.apps.report.completion import InputSplatFile, restore_file_order
+from gscompleter.apps.inputs.task import InputSplatFile
+from gscompleter.apps.report.completion import restore_file_order
 from gscompleter.completer import GSCompleter
 from gscompleter.config import (
     AlignmentConfig,

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 from collections.abc import Mapping, Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from functools import partial
 from typing import Any
 
@@ -15,32 +15,24 @@ from torch import Tensor
 
 from gscompleter import __version__
 from gscompleter.apps.commands.clean import CleanOptions
+from gscompleter.apps.completing.preparation import open_input
 from gscompleter.apps.completing.run_info import describe_run, refuse_results
-from gscompleter.apps.inputs.opening import (
-    apply_splat_range,
-    check_context,
-    choose_working_size,
-    describe_opening,
-    locate_splat,
-    move_to_splat,
-    open_scene,
-    print_lines,
-    read_photographs,
-    resolve_scene,
-)
-from gscompleter.apps.report.completion import (
-    InputSplatFile,
-    compute_mask_fraction,
-    save_changed,
-    save_completed_splat,
-)
+from gscompleter.apps.inputs.depth_range import apply_splat_range
+from gscompleter.apps.inputs.describing import describe_opening, print_lines
+from gscompleter.apps.inputs.named_photographs import check_context
+from gscompleter.apps.inputs.reading import read_photographs
+from gscompleter.apps.inputs.splat import locate_splat, move_to_splat
+from gscompleter.apps.inputs.task import InputSplatFile
+from gscompleter.apps.report.completion import save_changed, save_completed_splat
 from gscompleter.apps.warmup import compile_kernels
 from gscompleter.editing.cleaning import find_superfluous
 from gscompleter.editing.floaters import find_floaters
 from gscompleter.evaluation.metrics.image import compute_masked_psnr
+from gscompleter.numerics.image_ops import compute_mask_fraction
 from gscompleter.render.device import choose_device
 from gscompleter.render.loading import load_renderer
 from gscompleter.render.protocols import Renderer
+from gscompleter.splats.foreign import resolve_splat
 from gscompleter.splats.formats import load_splat
 from gscompleter.system.errors import InputError, quote_value
 from gscompleter.system.files.output_folder import reserve_output
@@ -74,7 +66,7 @@ class Cleaning:
 
 def clean_splat(options: CleanOptions) -> None:
     """Clean the splat, write the result, and print a summary."""
-    options = resolve_scene(options)
+    options = replace(options, scene=resolve_splat(options.scene))
     console = Console(stderr=True, quiet=options.quiet)
     clean = clean_alone if options.folder is None else clean_by_photographs
     with (
@@ -113,31 +105,29 @@ def clean_splat(options: CleanOptions) -> None:
 
 def clean_by_photographs(options: CleanOptions, console: Console) -> Cleaning:
     """Find what makes the photographs worse, or what none of them needs."""
-    check_context(options)
+    check_context(options.context)
     device = choose_device(options.device)
     renderer = load_renderer(device)
 
     # The splat is also read before cameras are searched for, so that a damaged file is refused
     # within seconds: the search takes minutes.
-    opened = open_scene(options, console, partial(load_given_splat, options))
-    options = choose_working_size(options, opened.photographs, console)
+    opened = open_input(options, console, partial(load_given_splat, options))
     with show_preparation("reading photographs"):
-        task = read_photographs(options, opened, device)
+        task = read_photographs(opened, options.context, device)
     loaded = load_given_splat(options)
     compile_kernels([device])
     with show_preparation("aligning the scene"):
-        task = move_to_splat(task, loaded, options.scene, options, opened)
+        splat_file = locate_splat(options.scene, options.drop_nonfinite)
+        task = move_to_splat(task, loaded, splat_file, opened)
 
     # From here on the splat is that of the task, whose coordinates may have a local origin.
     given = task.scene
-    splat_file = task.splat_file
     assert given is not None
-    assert splat_file is not None
     task = apply_splat_range(task, given, renderer)
 
     plan = f"compared with {len(task.views)} photographs on {device}"
     plan += f", written to {quote_value(options.out)}"
-    print_lines(console, *describe_opening(options, opened, task), f"To do: {plan}.")
+    print_lines(console, *describe_opening(opened, task), f"To do: {plan}.")
 
     with record_seconds(()) as seconds, timed_stage("clean"):
         removed = find_superfluous(given, task.views, renderer, options.config)
@@ -164,7 +154,7 @@ def clean_alone(options: CleanOptions, console: Console) -> Cleaning:
     }
     # A Gaussian can have several reasons, so their counts may exceed the number that goes.
     removed = torch.stack(list(reasons.values())).any(dim=0)
-    return Cleaning(given, removed, locate_splat(options, options.scene), run_info)
+    return Cleaning(given, removed, locate_splat(options.scene, options.drop_nonfinite), run_info)
 
 
 def load_given_splat(options: CleanOptions) -> Gaussians:

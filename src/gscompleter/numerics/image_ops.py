@@ -140,3 +140,8 @@ def correlate(values: Tensor, weights: Sequence[float], dim: int) -> Tensor:
     for start, weight in enumerate(weights[1:], 1):
         total.add_(values.narrow(dim, start, size), alpha=weight)
     return total
+
+
+def compute_mask_fraction(mask: Bool[Tensor, "h w"] | Float[Tensor, "h w"] | None) -> float:
+    """Compute the fraction of True or positive pixels; 0 without a mask."""
+    return 0.0 if mask is None else (mask > 0).float().mean().item()

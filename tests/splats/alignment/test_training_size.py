@@ -10,7 +10,7 @@ import pytest
 from PIL import Image
 from rich.console import Console
 
-from gscompleter.apps.inputs.opening import choose_working_size
+from gscompleter.apps.completing.preparation import open_input
 from gscompleter.cli import parse_command
 from gscompleter.data.formats import open_photographs
 from gscompleter.splats.alignment.training_size import TrainingSize, find_training_size
@@ -116,8 +116,8 @@ def test_the_working_size_follows_unless_it_is_given(scene, tmp_path, side, word
         ["complete", str(scene), "--scene", str(splat), "--out", str(tmp_path / "o"), *words]
     )
     console = Console(file=io.StringIO(), width=1000)
-    chosen = choose_working_size(options, open_photographs(scene), console)
-    assert chosen.resolution == expected
+    opened = open_input(options, console, lambda: None)
+    assert opened.request.resolution == expected
     printed = console.file.getvalue()
     assert said in printed
     assert bool(printed) == bool(said)

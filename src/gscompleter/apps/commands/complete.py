@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Annotated
 
 from annotated_types import Interval
 
 from gscompleter.apps.commands.shared_options import DEFAULT_NUM_TARGETS, CompletingOptions
+from gscompleter.apps.inputs.scene_request import PosesRequest
 from gscompleter.system.process import import_without_collection
 
 
@@ -28,6 +29,11 @@ class CompleteOptions(CompletingOptions):
     """Folder for completed.ply, the report (report.html), images and summary.json."""
     video: bool = False
     """Also write video.mp4: a flight through the holes, before and after side by side."""
+
+    def make_poses_request(self) -> PosesRequest:
+        """Make the request for the cameras, with the targets among the named photographs."""
+        request = super().make_poses_request()
+        return replace(request, named=(*request.named, *self.target))
 
     @property
     def max_targets(self) -> int:

@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Annotated
 
 import tyro
 
 from gscompleter.apps.commands.complete import CompleteOptions
+from gscompleter.apps.inputs.scene_request import SceneRequest
 from gscompleter.config import CompleterConfig
 from gscompleter.system.process import import_without_collection
 
@@ -37,6 +38,10 @@ class RemoveOptions(CompleteOptions):
     """Remove the Gaussians of this file, a selection that another program saved."""
     config: Annotated[CompleterConfig, tyro.conf.FlagConversionOff] = REMOVAL_CONFIG
     """Settings of the method, which change those of `--config NAME`."""
+
+    def make_scene_request(self) -> SceneRequest:
+        """Make the request for the photographs, of which masks of the removal hide nothing."""
+        return replace(super().make_scene_request(), removal_masks=self.mask)
 
 
 def run_remove(options: RemoveOptions) -> int:

@@ -10,6 +10,7 @@ from typing import Annotated, Literal
 import tyro
 from annotated_types import Interval
 
+from gscompleter.apps.inputs.scene_request import LONG_SIDE, PosesRequest, SceneRequest
 from gscompleter.config import CompleterConfig
 from gscompleter.config.generators import GeneratorOptions
 from gscompleter.config.settings import Seed, Settings
@@ -23,9 +24,6 @@ NumFrames = Annotated[int, Interval(ge=3, le=1000)]
 Device = Literal["auto", "cpu", "cuda"]
 Size = tuple[int, int] | int | Literal["full"]
 """Height and width, the longest side, or `full` for the photographs' own size."""
-LONG_SIDE = 640
-"""Default length of a photograph's longer side, in pixels."""
-
 DEFAULT_NUM_TARGETS = 4
 OUTPUTS = ("out", "save")
 """Options that name what a command writes."""
@@ -129,6 +127,22 @@ class SceneOptions(ComputeOptions, WritingOptions):
     """Ignore what masks (black) or alpha channels of SCENE hide."""
     drop_nonfinite: bool = False
     """Drop Gaussians that contain NaN or infinity instead of refusing the file."""
+
+    def make_scene_request(self) -> SceneRequest:
+        """Make the request for the photographs."""
+        return SceneRequest(
+            self.folder,
+            self.format,
+            parse_resolution(self.resolution),
+            self.near,
+            self.far,
+            uses_given_depth=not self.no_given_depth,
+            uses_masks=self.masks,
+        )
+
+    def make_poses_request(self) -> PosesRequest:
+        """Make the request for the cameras of photographs that have none; OUT keeps them."""
+        return PosesRequest(self.out, self.overwrite, self.frames, self.context or ())
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -16,11 +16,8 @@ from gscompleter.apps.commands.complete import CompleteOptions
 from gscompleter.apps.completing.preparation import Prepared, prepare_completion
 from gscompleter.apps.completing.printing import print_completion, print_plan
 from gscompleter.apps.completing.run_info import describe_run, read_held_out, refuse_results
-from gscompleter.apps.inputs.opening import (
-    CompletionTask,
-    describe_task,
-    print_lines,
-)
+from gscompleter.apps.inputs.describing import describe_task, print_lines
+from gscompleter.apps.inputs.task import CompletionTask
 from gscompleter.apps.report.completion import GENERATED_FILE, write_report
 from gscompleter.apps.report.film import VIDEO_FILE, write_comparison_video
 from gscompleter.apps.report.page import REPORT_FILE, write_completion_page
@@ -135,7 +132,9 @@ def open_completion(
             refuse_results(options.out)
         print_lines(console, *output.describe_others())
         ready = prepare(options, console)
-        print_lines(console, *describe_task(options, ready.opened, ready.task))
+        models = f"{options.reconstructor} and {options.synthesis.generator}"
+        plan = describe_task(ready.opened, ready.task, options.max_targets, models, options.out)
+        print_lines(console, *plan)
         with output.write() as folder:
             yield ready, folder
 
@@ -166,7 +165,7 @@ def write_done(folder: Path, ready: Prepared, completion: Completion) -> dict[st
             task.splat_file,
             cameras,
             looks,
-            read_held_out(options, ready.opened, task, ready.cameras),
+            read_held_out(ready.opened, task, ready.cameras),
             ready.opened.files,
         )
     write_completion_page(folder)

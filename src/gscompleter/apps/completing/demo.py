@@ -17,7 +17,7 @@ from gscompleter.apps.commands.complete import CompleteOptions
 from gscompleter.apps.commands.demo import DemoOptions
 from gscompleter.apps.completing.complete import complete_folder
 from gscompleter.apps.completing.printing import print_completion
-from gscompleter.apps.inputs.opening import print_lines
+from gscompleter.apps.inputs.describing import print_lines
 from gscompleter.apps.report.completion import join_images
 from gscompleter.data.scene import write_cameras
 from gscompleter.system.files.image import read_image, write_image

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
@@ -11,28 +11,21 @@ from typing import Any
 from rich.console import Console
 
 from gscompleter.apps.commands.complete import CompleteOptions
-from gscompleter.apps.commands.shared_options import parse_resolution
-from gscompleter.apps.inputs.opening import (
-    CompletionTask,
-    Opened,
-    add_check_views,
+from gscompleter.apps.commands.shared_options import SceneOptions, parse_resolution
+from gscompleter.apps.inputs.depth_range import (
     apply_scene_range,
     apply_splat_range,
-    check_context,
-    check_scene,
-    check_target_files,
-    check_targets,
-    choose_working_size,
     describe_range_mismatch,
-    move_to_splat,
-    open_scene,
-    print_lines,
-    read_task,
-    resolve_scene,
 )
+from gscompleter.apps.inputs.describing import print_lines
+from gscompleter.apps.inputs.memory import check_scene
+from gscompleter.apps.inputs.named_photographs import check_context, check_target_files
+from gscompleter.apps.inputs.names import describe_offset
+from gscompleter.apps.inputs.opening import choose_working_size, open_scene
+from gscompleter.apps.inputs.reading import read_task
 from gscompleter.apps.inputs.selection import collect_usable_cameras
-from gscompleter.apps.report.completion import Target
-from gscompleter.apps.report.names import describe_offset
+from gscompleter.apps.inputs.splat import add_check_views, locate_splat, move_to_splat
+from gscompleter.apps.inputs.task import CompletionTask, Opened, Target
 from gscompleter.apps.warmup import SPLAT_PART, compile_kernels
 from gscompleter.completer import GSCompleter
 from gscompleter.data.local_origin import compute_frame_from_photographs
@@ -43,10 +36,12 @@ from gscompleter.render.device import choose_device
 from gscompleter.render.loading import load_renderer
 from gscompleter.render.lod import MIN_PROXY_GAUSSIANS
 from gscompleter.splats.alignment.similarity import transform_camera
+from gscompleter.splats.foreign import resolve_splat
 from gscompleter.splats.formats import load_splat
 from gscompleter.splats.morton import argsort_nearby
 from gscompleter.stages.context import prepare_single
 from gscompleter.state import Completion
+from gscompleter.system.errors import InputError
 from gscompleter.system.progress import show_preparation
 from gscompleter.system.timing import record_seconds, timed_stage
 from gscompleter.types import Camera
@@ -94,25 +89,26 @@ class Prepared:
 def prepare_completion(options: CompleteOptions, console: Console) -> Prepared:
     """Open the scene and load the models."""
     # First what is wrong whatever the scene is.
-    check_context(options)
+    check_context(options.context)
     check_targets(options)
     check_reconstructor(options.reconstructor)
     options.synthesis.make_settings()
 
     device = choose_device(options.device)
-    options = resolve_scene(options)
-    opened = open_scene(options, console, partial(check_completion_inputs, options, device))
-    options = choose_working_size(options, opened.photographs, console)
+    if options.scene is not None:
+        options = replace(options, scene=resolve_splat(options.scene))
+    opened = open_input(options, console, partial(check_completion_inputs, options, device))
     if not options.config.ego_mask:
         opened = replace(opened, photographs=opened.photographs.keep_ego_vehicle())
     with show_preparation("reading photographs"):
-        task = read_task(options, opened, device)
+        has_splat = options.scene is not None
+        task = read_task(opened, options.context, options.target, device, has_splat)
 
     parts = (device, options.reconstructor, options.synthesis.generator)
     if options.scene is None:
         compile_kernels(parts)
     else:
-        task = add_splat(task, options.scene, options, opened, parts)
+        task = add_splat(task, options.scene, options.drop_nonfinite, opened, parts)
 
     # Only here, because the oracle is given the photographs of the targets.
     with show_preparation("loading models"):
@@ -131,8 +127,29 @@ def prepare_completion(options: CompleteOptions, console: Console) -> Prepared:
             task = apply_splat_range(task, task.scene, completer.renderer)
     print_lines(console, *describe_range_mismatch(task, reconstructor))
 
-    cameras = collect_cameras(options, opened, task)
+    cameras = collect_cameras(opened, task)
     return Prepared(options, opened, task, ViewPlanner(completer), cameras, seconds)
+
+
+def open_input(options: SceneOptions, console: Console, check: Callable[[], object]) -> Opened:
+    """Open the photographs, and choose their working size unless it is given.
+
+    `check` is that of `open_scene`.
+    """
+    opened = open_scene(options.make_scene_request(), options.make_poses_request(), console, check)
+    if options.scene is not None and options.resolution is None:
+        opened = choose_working_size(opened, options.scene, console)
+    return opened
+
+
+def check_targets(options: CompleteOptions) -> None:
+    """Refuse `--target` together with `--auto`."""
+    if options.target and options.auto is not None:
+        raise InputError(
+            "--target and --auto are both given; use one of them, and complete the result again "
+            "with the other.",
+            "auto",
+        )
 
 
 def check_completion_inputs(options: CompleteOptions, device: str) -> None:
@@ -141,18 +158,18 @@ def check_completion_inputs(options: CompleteOptions, device: str) -> None:
     It takes seconds, and the search for cameras after it minutes.
     """
     load_completer(options, (), device)
-    check_target_files(options)
+    check_target_files(options.target, parse_resolution(options.resolution))
     if options.scene is not None:
         load_splat(options.scene, options.drop_nonfinite)
 
 
 def add_splat(
-    task: CompletionTask, path: Path, options: CompleteOptions, opened: Opened, parts: Sequence[str]
+    task: CompletionTask, path: Path, drop_nonfinite: bool, opened: Opened, parts: Sequence[str]
 ) -> CompletionTask:
     """Compile the kernels, and add the input splat to the task."""
     with show_preparation("reading the scene"):
         task = add_check_views(task, opened.photographs)
-        gaussians = load_splat(path, options.drop_nonfinite)
+        gaussians = load_splat(path, drop_nonfinite)
         if "cpu" in parts:
             check_scene(task, gaussians)
     compile_kernels([*parts, SPLAT_PART] if "cpu" in parts else parts)
@@ -160,12 +177,13 @@ def add_splat(
     with show_preparation("aligning the scene"):
         # Gaussians of a file lie in random order, and each tile of an image would read memory all
         # over. Large scenes are sorted along a Morton curve (decision 025); files are written in
-        # the order of the given file, which `order` leads back to.
-        order = None
+        # the order of the given file, which `file_order` leads back to.
+        splat_file = locate_splat(path, drop_nonfinite)
         if len(gaussians) >= MIN_PROXY_GAUSSIANS:
             order = argsort_nearby(gaussians)
             gaussians = gaussians[order]
-        return move_to_splat(task, gaussians, path, options, opened, order)
+            splat_file = replace(splat_file, file_order=order)
+        return move_to_splat(task, gaussians, splat_file, opened)
 
 
 def load_completer(options: CompleteOptions, targets: Sequence[Target], device: str) -> GSCompleter:
@@ -189,14 +207,11 @@ def load_completer(options: CompleteOptions, targets: Sequence[Target], device: 
     )
 
 
-def collect_cameras(
-    options: CompleteOptions, opened: Opened, task: CompletionTask
-) -> dict[int, Camera]:
+def collect_cameras(opened: Opened, task: CompletionTask) -> dict[int, Camera]:
     """Return the cameras of all usable photographs by frame, in the frame of the result."""
     photographs = opened.photographs
-    cameras = collect_usable_cameras(
-        photographs, range(len(photographs)), parse_resolution(options.resolution)
-    )
+    numbers = range(len(photographs))
+    cameras = collect_usable_cameras(photographs, numbers, opened.request.resolution)
 
     # Photographs are read relative to their local origin. `task.frame` begins at their own frame,
     # so the shift is undone before it.

@@ -8,8 +8,7 @@ from rich.console import Console
 from rich.table import Table
 
 from gscompleter.apps.commands.complete import CompleteOptions
-from gscompleter.apps.inputs.opening import Opened
-from gscompleter.apps.report.completion import Target
+from gscompleter.apps.inputs.task import Opened, Target
 from gscompleter.apps.report.film import VIDEO_FILE
 from gscompleter.apps.report.outcome import name_unused, select_testing
 from gscompleter.apps.report.page import REPORT_FILE

@@ -12,7 +12,12 @@ from torch import Tensor
 
 from gscompleter.apps.commands.remove import RemoveOptions
 from gscompleter.apps.completing.preparation import Prepared, prepare_completion
-from gscompleter.apps.inputs.removal import check_selection, choose_gaussians, find_in_region
+from gscompleter.apps.inputs.removal import (
+    Selection,
+    check_selection,
+    choose_gaussians,
+    find_in_region,
+)
 from gscompleter.editing.removal import remove_gaussians
 from gscompleter.planning.photographs import PhotographPlanner
 from gscompleter.state import Completion
@@ -28,13 +33,18 @@ class PreparedRemoval(Prepared):
 
     options: RemoveOptions
 
+    @property
+    def selection(self) -> Selection:
+        """The Gaussians to remove, as the options select them."""
+        return make_selection(self.options)
+
     def begin(self) -> Completion:
         """Initialize the context, and remove the selected Gaussians from it."""
         begun = super().begin()
         completer = self.completer
         with stage("removing"):
             chosen = choose_gaussians(
-                self.options, self.task, self.opened.photographs, self.cameras, completer.renderer
+                self.selection, self.task, self.opened, self.cameras, completer.renderer
             )
             # Gaussians that reach out of a box or the sphere are cut at its border. Those that a
             # mask or a file selects go as a whole.
@@ -44,7 +54,7 @@ class PreparedRemoval(Prepared):
         """Find points, in the frame of the result, in the boxes and the sphere."""
         # The region is given in the coordinates of the file, which float32 may not resolve.
         origin = torch.from_numpy(self.task.origin).to(points.device)
-        return find_in_region(points.double() + origin, self.options)
+        return find_in_region(points.double() + origin, self.selection)
 
     def describe_settings(self) -> dict[str, Any]:
         """Describe the settings, with the selection."""
@@ -56,7 +66,7 @@ class PreparedRemoval(Prepared):
 
 def prepare_removal(options: RemoveOptions, console: Console) -> PreparedRemoval:
     """Open the scene, and load the models; targets are searched for among the photographs."""
-    check_selection(options)
+    check_selection(make_selection(options))
     ready = prepare_completion(options, console)
 
     # `strip` puts back what one removed.ply holds, and so cannot undo two runs.
@@ -68,3 +78,15 @@ def prepare_removal(options: RemoveOptions, console: Console) -> PreparedRemoval
 
     explorer = PhotographPlanner(ready.completer)
     return PreparedRemoval(**{**vars(ready), "explorer": explorer})
+
+
+def make_selection(options: RemoveOptions) -> Selection:
+    """Make the selection that the options describe."""
+    return Selection(
+        options.box,
+        options.box_rotation,
+        options.sphere,
+        options.mask,
+        options.select,
+        options.drop_nonfinite,
+    )

@@ -10,9 +10,10 @@ from pathlib import Path
 from types import MappingProxyType
 from typing import Any
 
-from gscompleter.apps.commands.shared_options import SceneOptions, parse_resolution
-from gscompleter.apps.inputs.opening import CompletionTask, Opened, describe_missing
+from gscompleter.apps.commands.shared_options import SceneOptions
+from gscompleter.apps.inputs.describing import describe_missing
 from gscompleter.apps.inputs.selection import select_closest
+from gscompleter.apps.inputs.task import CompletionTask, Opened
 from gscompleter.apps.report.completion import HeldOut
 from gscompleter.config import CleaningConfig, CompleterConfig
 from gscompleter.system.errors import InputError, quote_value
@@ -31,6 +32,7 @@ def describe_run(
 ) -> dict[str, Any]:
     """Describe the input and all settings that determine the result, with further `settings`."""
     camera = task.views[0].camera
+    resolution = opened.request.resolution
     splat = None if options.scene is None else str(options.scene)
     return {
         "settings": {
@@ -40,7 +42,7 @@ def describe_run(
             "context": None if options.context is None else list(options.context),
             "scene": splat,
             **settings,
-            "resolution": options.resolution,
+            "resolution": "full" if resolution is None else resolution,
             "near": options.near,
             "far": options.far,
             "no_given_depth": options.no_given_depth,
@@ -65,7 +67,7 @@ def describe_run(
 
 
 def read_held_out(
-    options: SceneOptions, opened: Opened, task: CompletionTask, cameras: Mapping[int, Camera]
+    opened: Opened, task: CompletionTask, cameras: Mapping[int, Camera]
 ) -> list[HeldOut]:
     """Read up to `MAX_HELD_OUT` unused photographs, nearest to the targets or the context.
 
@@ -80,7 +82,7 @@ def read_held_out(
     for frame in select_closest(task.goals, others, MAX_HELD_OUT):
         # A photograph that cannot be read tests nothing; it is no input of this run.
         with suppress(InputError):
-            (view,) = opened.photographs.views([frame], parse_resolution(options.resolution))
+            (view,) = opened.photographs.views([frame], opened.request.resolution)
             # Its own camera is in the frame of the photographs.
             view = View(view.image, others[frame], frame, ignore_mask=view.ignore_mask)
             held_out.append(HeldOut(view.to(task.device), frame in checks))

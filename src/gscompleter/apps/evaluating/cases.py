@@ -12,7 +12,8 @@ from pathlib import Path
 from rich.console import Console
 
 from gscompleter.apps.commands.evaluate import EvaluateOptions
-from gscompleter.apps.commands.shared_options import LONG_SIDE, parse_resolution
+from gscompleter.apps.commands.shared_options import parse_resolution
+from gscompleter.apps.inputs.scene_request import LONG_SIDE
 from gscompleter.data.formats import open_photographs
 from gscompleter.data.limits import check_planes
 from gscompleter.data.photographs import MAX_TRANSLATION, Photographs, Resolution

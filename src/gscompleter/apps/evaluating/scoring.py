@@ -13,9 +13,10 @@ from gscompleter.apps.batch.engine import make_engine
 from gscompleter.apps.batch.running import print_failures
 from gscompleter.apps.command_line.exit_codes import choose_exit_code
 from gscompleter.apps.commands.evaluate import EvaluateOptions
-from gscompleter.apps.commands.shared_options import LONG_SIDE, parse_resolution
+from gscompleter.apps.commands.shared_options import parse_resolution
 from gscompleter.apps.evaluating.cases import collect_tasks, find_loader, print_skipped
 from gscompleter.apps.evaluating.tables import write_and_print_tables
+from gscompleter.apps.inputs.scene_request import LONG_SIDE
 from gscompleter.apps.warmup import compile_kernels
 from gscompleter.data.photographs import check_resolution
 from gscompleter.evaluation.cases import SkippedScene

@@ -4,15 +4,14 @@ from __future__ import annotations
 
 import os
 from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
 from pathlib import Path
 
 import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
-from gscompleter.apps.commands.remove import RemoveOptions
-from gscompleter.apps.commands.shared_options import parse_resolution
-from gscompleter.apps.inputs.opening import CompletionTask
+from gscompleter.apps.inputs.task import CompletionTask, Opened
 from gscompleter.data.frame import ENDINGS, find_file
 from gscompleter.data.local_origin import shift_to_origin
 from gscompleter.data.masks import load_mask
@@ -26,40 +25,58 @@ from gscompleter.system.progress import track
 from gscompleter.types import Camera, Gaussians
 
 
-def check_selection(options: RemoveOptions) -> None:
+@dataclass(frozen=True)
+class Selection:
+    """Gaussians of a splat that are selected in any of these ways; coordinates are the file's."""
+
+    boxes: Sequence[float] = ()
+    """Six numbers per box: its smallest x, y and z, then its largest."""
+    box_rotation: Sequence[float] = (1.0, 0.0, 0.0, 0.0)
+    """Quaternion wxyz that rotates the boxes about their centres."""
+    sphere: Sequence[float] | None = None
+    """Centre and radius."""
+    masks: Path | None = None
+    """Folder of images that are named as photographs, white where something goes."""
+    file: Path | None = None
+    """File of selected Gaussians."""
+    drop_nonfinite: bool = False
+    """True to drop Gaussians of that file that contain NaN or infinity."""
+
+
+def check_selection(selection: Selection) -> None:
     """Refuse a selection that is missing or impossible."""
-    if not (options.box or options.sphere or options.mask or options.select):
+    if not (selection.boxes or selection.sphere or selection.masks or selection.file):
         raise InputError(
             "Nothing is named that is to be removed; give --box, --sphere, --mask or --select."
         )
 
     # A rest of fewer than six numbers is no box and is refused by their count.
-    lows, highs = split_boxes(options.box)
-    if len(options.box) % 6 or not bool((lows < highs).all()):
+    lows, highs = split_boxes(selection.boxes)
+    if len(selection.boxes) % 6 or not bool((lows < highs).all()):
         raise InputError(
             "A box needs six numbers: its smallest x, y and z, then its largest; several boxes "
             "need six each.",
             "box",
         )
-    if options.sphere and options.sphere[3] <= 0:
+    if selection.sphere and selection.sphere[3] <= 0:
         raise InputError("A sphere needs a positive radius after its centre.", "sphere")
-    if not any(options.box_rotation):
+    if not any(selection.box_rotation):
         raise InputError("A rotation is a quaternion w x y z that is not zero.", "box-rotation")
-    if options.mask and not os.path.isdir(options.mask):
-        raise InputError(f"There is no folder {quote_value(options.mask)}.", "mask")
+    if selection.masks and not os.path.isdir(selection.masks):
+        raise InputError(f"There is no folder {quote_value(selection.masks)}.", "mask")
     # Read only to refuse a damaged file before the scene is opened.
-    if options.select:
-        load_splat(options.select, options.drop_nonfinite)
+    if selection.file:
+        load_splat(selection.file, selection.drop_nonfinite)
 
 
 def choose_gaussians(
-    options: RemoveOptions,
+    selection: Selection,
     task: CompletionTask,
-    photographs: Photographs,
+    opened: Opened,
     cameras: Mapping[int, Camera],
     renderer: Renderer,
 ) -> Bool[Tensor, "n"]:
-    """Choose the Gaussians of the input splat that the options select in any way.
+    """Choose the Gaussians of the input splat that are selected in any way.
 
     `cameras` are those of the photographs by frame, in the frame of the splat.
     """
@@ -69,13 +86,14 @@ def choose_gaussians(
     # Boxes and spheres are in the coordinates of the file. The scene was shifted to a local origin
     # if these are large, and float32 could not resolve them.
     points = scene.means.double() + torch.from_numpy(task.origin).to(scene.means.device)
-    chosen = find_in_region(points, options)
-    if options.mask:
-        masks = find_masks(options.mask, photographs)
-        resolution = parse_resolution(options.resolution)
+    chosen = find_in_region(points, selection)
+    if selection.masks:
+        photographs = opened.photographs
+        masks = find_masks(selection.masks, photographs)
+        resolution = opened.request.resolution
         chosen |= find_in_masks(masks, scene, photographs, cameras, resolution, renderer)
-    if options.select:
-        selected = load_splat(options.select, options.drop_nonfinite)
+    if selection.file:
+        selected = load_splat(selection.file, selection.drop_nonfinite)
         selected = shift_to_origin(task.origin, selected, list(cameras.values()))
         chosen |= find_same_positions(scene, selected.to(scene.means.device))
 
@@ -90,12 +108,12 @@ def choose_gaussians(
     return chosen
 
 
-def find_in_region(points: Float[Tensor, "n 3"], options: RemoveOptions) -> Bool[Tensor, "n"]:
-    """Find points in the boxes and the sphere of the options."""
-    inside = find_in_boxes(points, options.box, options.box_rotation)
-    if options.sphere:
-        center = points.new_tensor(options.sphere[:3])
-        inside |= (points - center).norm(dim=1) <= options.sphere[3]
+def find_in_region(points: Float[Tensor, "n 3"], selection: Selection) -> Bool[Tensor, "n"]:
+    """Find points in the boxes and the sphere of a selection."""
+    inside = find_in_boxes(points, selection.boxes, selection.box_rotation)
+    if selection.sphere:
+        center = points.new_tensor(selection.sphere[:3])
+        inside |= (points - center).norm(dim=1) <= selection.sphere[3]
     return inside
 
 

@@ -9,9 +9,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from gscompleter.apps.commands.complete import CompleteOptions
-from gscompleter.apps.commands.shared_options import parse_resolution
-from gscompleter.apps.report.completion import Target
+from gscompleter.apps.inputs.task import Target
 from gscompleter.data.photographs import Photographs, Resolution
 from gscompleter.numerics.geometry import select_spread_cameras
 from gscompleter.planning.select_context import make_points_in_front, select_context
@@ -32,7 +30,7 @@ CHECK_VIEW_SIZE = 320
 
 
 def choose_context(
-    options: CompleteOptions, photographs: Photographs, targets: Sequence[Target]
+    photographs: Photographs, targets: Sequence[Target], resolution: Resolution, has_splat: bool
 ) -> tuple[int, ...]:
     """Choose context frames for the targets, or for the whole scene without any.
 
@@ -44,7 +42,7 @@ def choose_context(
 
     # Only chosen photographs are asked for their masks, since each has to be read for it.
     while True:
-        chosen = _choose_frames(options, photographs, targets, others)
+        chosen = _choose_frames(photographs, targets, others, resolution, has_splat)
         hidden = {frame for frame in chosen if photographs.is_hidden(frame)}
         if not hidden:
             return chosen
@@ -52,13 +50,14 @@ def choose_context(
 
 
 def _choose_frames(
-    options: CompleteOptions,
     photographs: Photographs,
     targets: Sequence[Target],
     others: Sequence[int],
+    resolution: Resolution,
+    has_splat: bool,
 ) -> tuple[int, ...]:
     """Choose context frames among `others`, hidden by a mask or not."""
-    cameras = collect_usable_cameras(photographs, others, parse_resolution(options.resolution))
+    cameras = collect_usable_cameras(photographs, others, resolution)
     if not cameras:
         raise InputError(
             "The context needs photographs, and without the targets none can be used; name fewer "
@@ -82,7 +81,7 @@ def _choose_frames(
     if not targets:
         chosen = select_overview(candidates, points, NUM_CONTEXT_WITH_SPLAT)
     else:
-        count = NUM_CONTEXT if options.scene is None else NUM_CONTEXT_WITH_SPLAT
+        count = NUM_CONTEXT_WITH_SPLAT if has_splat else NUM_CONTEXT
         chosen = select_context(target_cameras, candidates, points, count)
     frames = list(cameras)
     return tuple(frames[index] for index in chosen)

@@ -11,12 +11,12 @@ from rich.console import Console
 
 from gscompleter.apps.commands.complete import CompleteOptions
 from gscompleter.apps.commands.live import LiveOptions
-from gscompleter.apps.commands.shared_options import CompletingOptions, parse_resolution
+from gscompleter.apps.commands.shared_options import CompletingOptions
 from gscompleter.apps.completing.complete import COMMAND, RESULTS, write_done
 from gscompleter.apps.completing.preparation import Prepared, prepare_completion
-from gscompleter.apps.inputs.opening import describe_opening, print_lines
+from gscompleter.apps.inputs.describing import describe_opening, print_lines
+from gscompleter.apps.inputs.task import Target
 from gscompleter.apps.live.session import Session
-from gscompleter.apps.report.completion import Target
 from gscompleter.data.scene import write_cameras
 from gscompleter.state import Completion
 from gscompleter.system.errors import InputError, quote_value
@@ -79,7 +79,7 @@ def prepare(options: LiveOptions, console: Console) -> Prepared:
     """Open the scene as `complete` does."""
     check_output(options.out, options.overwrite)
     ready = prepare_completion(make_complete_options(options), console)
-    print_lines(console, *describe_opening(ready.options, ready.opened, ready.task))
+    print_lines(console, *describe_opening(ready.opened, ready.task))
     if ready.task.scene is not None and ready.task.scene.is_antialiased:
         print_lines(console, ANTIALIASED_NOTE)
 
@@ -103,7 +103,7 @@ def begin_session(ready: Prepared) -> Session:
         (ready.begin(),),
         ready.task.frame,
         ready.opened.photographs.origin,
-        parse_resolution(ready.options.resolution),
+        ready.opened.request.resolution,
     )
 
 

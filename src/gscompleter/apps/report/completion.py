@@ -12,11 +12,12 @@ from types import MappingProxyType
 from typing import Any
 
 import torch
-from jaxtyping import Bool, Float, Int64
+from jaxtyping import Bool, Float
 from torch import Tensor
 from torch.nn.functional import normalize
 
 from gscompleter import __version__
+from gscompleter.apps.inputs.task import InputSplatFile, Target
 from gscompleter.apps.report.outcome import judge_completion
 from gscompleter.apps.report.schema import (
     RECORD_FILE,
@@ -36,6 +37,7 @@ from gscompleter.evaluation.metrics.coverage import RenderPair, compute_coverage
 from gscompleter.evaluation.metrics.image import compute_masked_psnr, compute_masked_ssim, ssim
 from gscompleter.evaluation.metrics.unused_photographs import measure_likeness, shrink_view
 from gscompleter.numerics.geometry import estimate_up
+from gscompleter.numerics.image_ops import compute_mask_fraction
 from gscompleter.numerics.kernels.parallel import map_in_parallel
 from gscompleter.render.protocols import Renderer
 from gscompleter.render.view_map import get_view_map
@@ -65,49 +67,12 @@ Scores = dict[str, Any]
 
 
 @dataclass(frozen=True)
-class Target:
-    """A target camera with the photograph that scores it."""
-
-    camera: Camera
-    frame: int | None = None
-    """Frame number in the scene; None for a camera from elsewhere."""
-    photograph: Float[Tensor, "h w 3"] | None = None
-    """Photograph at the target, if there is one. Only the generator `oracle` uses it."""
-    ignore_mask: Bool[Tensor, "h w"] | None = None
-    """True for pixels that are not scored; None if all are."""
-    derived_from: int | None = None
-    """Frame number that a planned camera was derived from; None if the user gave the camera."""
-    offset: str | None = None
-    """Move and turn of a planned camera from that frame, in words."""
-    is_in_splat_frame: bool = False
-    """True if the camera is in the frame of the input splat's file."""
-
-    @property
-    def view(self) -> View | None:
-        """The photograph with its camera, or None."""
-        if self.photograph is None:
-            return None
-        return View(self.photograph, self.camera, self.frame, ignore_mask=self.ignore_mask)
-
-
-@dataclass(frozen=True)
 class HeldOut:
     """A photograph that is neither context nor target and only scores the result."""
 
     view: View
     is_check: bool = False
     """True if a small copy of it checked the input splat."""
-
-
-@dataclass(frozen=True)
-class InputSplatFile:
-    """The file of the input splat."""
-
-    path: Path
-    context_mask: Bool[Tensor, "n"] | None = None
-    """Mask of the Gaussians in the file that form the context; None for all."""
-    file_order: Int64[Tensor, "n"] | None = None
-    """Index among these of each Gaussian of the context; None for the order of the file."""
 
 
 @dataclass(frozen=True)
@@ -275,11 +240,6 @@ def score_context(completion: Completion, renderer: Renderer) -> list[ContextRow
         )
         for view, view_scores, gain in zip(views, scores, gain_rows, strict=True)
     ]
-
-
-def compute_mask_fraction(mask: Bool[Tensor, "h w"] | Float[Tensor, "h w"] | None) -> float:
-    """Compute the fraction of True or positive pixels; 0 without a mask."""
-    return 0.0 if mask is None else (mask > 0).float().mean().item()
 
 
 def score_targets(

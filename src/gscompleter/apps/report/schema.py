@@ -11,7 +11,7 @@ from typing import Any, Literal, TypeVar
 
 import numpy as np
 
-from gscompleter.apps.report.names import name_photograph, name_target
+from gscompleter.apps.inputs.names import name_photograph, name_target
 from gscompleter.evaluation.metrics.coverage import Coverage
 from gscompleter.system.errors import InputError, quote_value
 from gscompleter.system.files.output_folder import read_command

@@ -1,0 +1,106 @@
+"""Lines on what was opened and what is to be done."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+from rich.console import Console
+
+from gscompleter.apps.inputs.memory import estimate_memory
+from gscompleter.apps.inputs.names import name_photograph
+from gscompleter.apps.inputs.task import CompletionTask, Opened
+from gscompleter.data.photographs import Photographs
+from gscompleter.numerics.image_ops import compute_mask_fraction
+from gscompleter.system.errors import join_names, quote_value
+from gscompleter.system.memory import format_whole_gigabytes, read_memory_bytes
+
+MAX_NAMED = 8
+"""Most photographs that a line names."""
+
+
+def describe_task(
+    opened: Opened, task: CompletionTask, max_targets: int, models: str, out: Path
+) -> list[str]:
+    """Write the four lines; the cameras of `task` have the working depth range.
+
+    `max_targets` is the number of targets to search for if the task has none, and `models` names Ψ
+    and Φ.
+    """
+    targets = join_names([opened.name_target(target) for target in task.targets], MAX_NAMED)
+    files = opened.files
+    context = [name_photograph(frame, files.get(frame)) for frame in task.context_frames]
+    if not targets:
+        targets = f"up to {max_targets} cameras that are found"
+        if max_targets == 1:
+            targets = "a camera that is found"
+
+    # On a GPU the splat is in its memory, not in that of the machine.
+    needed = estimate_memory(task, task.scene if task.device.type == "cpu" else None)
+    available = read_memory_bytes()
+    of = "" if available is None else f" of {format_whole_gigabytes(available)}"
+    return [
+        *describe_opening(opened, task),
+        f"To do: complete the scene from photographs {join_names(context, MAX_NAMED)} for "
+        f"{targets} by {models} on {task.device.type}, written to {quote_value(out)}.",
+        f"Memory: up to {format_whole_gigabytes(needed)}{of}.",
+    ]
+
+
+def describe_opening(opened: Opened, task: CompletionTask) -> list[str]:
+    """Write the lines on the opened scene."""
+    scene = task.scene
+    camera = task.views[0].camera
+    photographs = opened.photographs
+    used = len(photographs) - len(list_missing(photographs))
+    splat = ""
+    if scene is not None:
+        mode = "antialiased " if scene.is_antialiased else ""
+        assert task.splat_file is not None
+        name = quote_value(task.splat_file.path)
+        splat = f"; {name}, {len(scene):,} {mode}Gaussians of SH degree {scene.sh_degree}"
+    return [
+        f"Opened: {quote_value(opened.request.folder)}, {opened.format}, {used} of "
+        f"{opened.num_photographs} photographs{splat}.",
+        f"Found: {task.frame_description.rstrip('.')}; depths from {camera.near:.3g} to "
+        f"{camera.far:.3g}; worked at {camera.width} x {camera.height} (--resolution changes it).",
+        *describe_missing(photographs),
+        *describe_masks(photographs, task),
+        *task.depth_notes,
+    ]
+
+
+def list_missing(photographs: Photographs) -> list[str]:
+    """List the names of photographs that cameras name and that are not there."""
+    named = [frame for frame in photographs.frames if frame.image is not None]
+    return [frame.name for frame in named if not frame.has_photograph()]
+
+
+def describe_missing(photographs: Photographs) -> list[str]:
+    """Say which cameras have no photograph; such a camera stays, because it can be a target."""
+    missing = list_missing(photographs)
+    if not missing:
+        return []
+    return [
+        f"{len(missing)} of {len(photographs)} photographs are missing, and their cameras can only "
+        f"be targets: {join_names(missing, MAX_NAMED)}."
+    ]
+
+
+def describe_masks(photographs: Photographs, task: CompletionTask) -> list[str]:
+    """Say which masks were found for the photographs of a task, and how much they hide."""
+    # Cameras from elsewhere have no frame, and no mask.
+    frames = [frame for frame in task.used_frames if frame is not None]
+    masks = photographs.describe_masks(sorted(frames))
+    if masks is None:
+        return []
+    most = max(compute_mask_fraction(view.ignore_mask) for view in task.views)
+    return [
+        f"Masks: {masks}; what they hide, up to {100 * most:.1f} % of a photograph, is neither "
+        "reconstructed nor scored (--no-masks uses it)."
+    ]
+
+
+def print_lines(console: Console, *lines: str) -> None:
+    """Print lines without markup."""
+    for line in lines:
+        console.print(line, highlight=False, markup=False, soft_wrap=True)

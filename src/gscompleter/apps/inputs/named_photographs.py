@@ -1,0 +1,129 @@
+"""Photographs and cameras that a command line names: the context and the targets."""
+
+from __future__ import annotations
+
+import os
+import re
+from collections.abc import Sequence
+from dataclasses import replace
+from pathlib import Path
+
+from gscompleter.apps.inputs.task import Target
+from gscompleter.data.camera_files import is_in_splat_frame
+from gscompleter.data.panorama import has_panoramas
+from gscompleter.data.photographs import Photographs, Resolution
+from gscompleter.data.scene import load_cameras
+from gscompleter.data.sfm.poses import ENDINGS, list_photograph_files
+from gscompleter.data.video import is_video
+from gscompleter.system.errors import InputError, quote_value
+
+FRAME_NUMBER = re.compile("-?[0-9]{1,9}")
+
+PhotographNames = Sequence[int | str]
+"""Photographs by number or by name."""
+
+
+def check_context(context: PhotographNames | None) -> None:
+    """Refuse an empty context, and repeated frames."""
+    if context is None:
+        return
+    if len(context) == 0 or len(set(context)) < len(context):
+        raise InputError(
+            "--context names no frame, or one twice; name different ones, as in --context 0 4, or "
+            "leave it out."
+        )
+
+
+def find_context(photographs: Photographs, context: PhotographNames | None) -> tuple[int, ...]:
+    """Find the context frames that are named; none if there are none."""
+    frames = tuple(find_frame(photographs, word, "context") for word in context or ())
+    # Words differ by now (`check_context`), but a name and a number can mean one photograph.
+    if len(set(frames)) < len(frames):
+        twice = next(frame for frame in frames if frames.count(frame) > 1)
+        name = quote_value(photographs.frame(twice).file_name)
+        raise InputError(f"--context names photograph {twice} ({name}) twice; name different ones.")
+    return frames
+
+
+def find_frame(photographs: Photographs, word: int | str, option: str) -> int:
+    """Find the frame of a word of an option: a number, or the name of a photograph."""
+    number = int(word) if FRAME_NUMBER.fullmatch(str(word)) else word
+    try:
+        return photographs.find_frame(number)
+    except InputError as error:
+        if option == "target" and isinstance(number, str):
+            raise InputError(
+                f"'{quote_value(word, 60)}' is no target: name a photograph or its number from 0 "
+                f"to {len(photographs) - 1}, or an existing file of cameras, such as a "
+                "transforms.json.",
+                option,
+            ) from error
+        raise InputError(str(error), option) from error
+
+
+def check_frame_numbers(folder: Path, words: PhotographNames, num_video_frames: int) -> None:
+    """Refuse frames beyond the photographs whose cameras have to be found.
+
+    Panoramas are split into several photographs each, and a video into as many as it is sharp.
+    """
+    # Numbers only; a name may still be that of a photograph.
+    frames = [int(word) for word in map(str, words) if FRAME_NUMBER.fullmatch(word)]
+    if is_video(folder):
+        count = num_video_frames
+    else:
+        files = list_photograph_files(folder)
+        count = len(files)
+        # Telling panoramas apart opens each photograph, so it is done only if a number needs it.
+        if frames and has_panoramas([folder / name for name in files]):
+            return
+
+    for frame in frames:
+        if not 0 <= frame < count:
+            raise InputError(
+                f"There is no frame {frame} among the {count} photographs of "
+                f"{quote_value(folder)}; name frames from 0 to {count - 1}."
+            )
+
+
+def check_target_files(words: Sequence[str], resolution: Resolution) -> None:
+    """Read the cameras of `--target`, and refuse words that are neither frames nor files."""
+    for word in words:
+        if FRAME_NUMBER.fullmatch(word):
+            continue
+        if not os.path.exists(word):
+            raise InputError(
+                f"'{quote_value(word, 60)}' is no target: name the number of a frame, or an "
+                "existing file of cameras, such as a transforms.json.",
+                "target",
+            )
+        load_cameras(word, resolution)
+
+
+def read_targets(
+    photographs: Photographs, words: Sequence[str], resolution: Resolution, has_splat: bool
+) -> list[Target]:
+    """Read the target cameras in the order of the command line."""
+    targets: list[Target] = []
+    for word in words:
+        if os.path.exists(word) and not is_image(word):
+            cameras = load_cameras(word, resolution, origin=photographs.origin.tolist())
+            is_of_splat = has_splat and is_in_splat_frame(Path(word))
+            targets += [Target(camera, is_in_splat_frame=is_of_splat) for camera in cameras]
+        # A photograph in the working folder can be called as one of the scene, which is meant.
+        else:
+            frame = find_frame(photographs, word, "target")
+            targets.append(Target(photographs.camera(frame, resolution), frame))
+    return targets
+
+
+def is_image(path: str) -> bool:
+    """Return True if a path names a photograph, not a file of cameras."""
+    return path.lower().endswith(ENDINGS)
+
+
+def add_photograph(target: Target, photographs: Photographs, resolution: Resolution) -> Target:
+    """Add its photograph to a target, if there is one."""
+    if target.frame is None or not photographs.frame(target.frame).has_photograph():
+        return target
+    (view,) = photographs.views([target.frame], resolution)
+    return replace(target, photograph=view.image, ignore_mask=view.ignore_mask)

@@ -1,0 +1,126 @@
+"""Photographs of an opened scene as the input of a completion."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import replace
+
+from gscompleter.apps.inputs.given_depth import read_with_depth
+from gscompleter.apps.inputs.named_photographs import (
+    PhotographNames,
+    add_photograph,
+    find_context,
+    read_targets,
+)
+from gscompleter.apps.inputs.selection import choose_context, collect_usable_cameras
+from gscompleter.apps.inputs.task import CompletionTask, Opened, Target
+from gscompleter.data.local_origin import compute_frame_from_photographs
+from gscompleter.data.photographs import Photographs
+from gscompleter.data.points import add_depth_range
+from gscompleter.system.errors import InputError, quote_value
+from gscompleter.system.memory import check_memory
+
+MIN_IMAGE_SIZE = 16
+"""Smallest side of an image, in pixels."""
+
+
+def read_task(
+    opened: Opened,
+    context: PhotographNames | None,
+    target_words: Sequence[str],
+    device: str,
+    has_splat: bool,
+) -> CompletionTask:
+    """Read the context and the targets, after checking the memory.
+
+    A context that is not named is chosen. `has_splat` is True if an input splat is completed.
+    """
+    photographs = opened.photographs
+    resolution = opened.request.resolution
+    targets = read_targets(photographs, target_words, resolution, has_splat)
+    frames = find_context(photographs, context)
+    if not frames:
+        frames = choose_context(photographs, targets, resolution, has_splat)
+
+    # Cameras are enough to estimate the memory, before any photograph is loaded.
+    cameras = [photographs.camera(frame, resolution) for frame in frames]
+    cameras += [target.camera for target in targets]
+    check_memory(max(camera.width * camera.height for camera in cameras), len(cameras))
+    return make_task(opened, frames, targets, device, has_splat)
+
+
+def read_photographs(
+    opened: Opened, context: PhotographNames | None, device: str
+) -> CompletionTask:
+    """Read the named photographs of a splat, or all."""
+    photographs = opened.photographs
+    request = opened.request
+    frames = find_context(photographs, context)
+    if not frames:
+        numbers = range(len(photographs))
+        frames = tuple(collect_usable_cameras(photographs, numbers, request.resolution))
+    if not frames:
+        raise InputError(
+            f"No photograph of {quote_value(request.folder)} can be used; name the folder that the "
+            "splat was trained on."
+        )
+    return make_task(opened, frames, (), device, has_splat=True)
+
+
+def make_task(
+    opened: Opened,
+    frames: Sequence[int],
+    targets: Sequence[Target],
+    device: str,
+    has_splat: bool,
+) -> CompletionTask:
+    """Read the photographs of `frames`, in ascending order, and those of the targets."""
+    frames = sorted(frames)
+    request = opened.request
+    photographs = opened.photographs
+    resolution = request.resolution
+
+    # `bounded` has the depth range of the request and the scene, or that of its sparse points. The
+    # targets were read before the context was known that chooses the points.
+    bounded = add_depth_range(photographs, frames, resolution)
+    targets = [
+        replace(target, camera=replace(target.camera, near=bounded.near, far=bounded.far))
+        for target in targets
+    ]
+    cameras = [bounded.camera(frame, resolution) for frame in frames]
+    for camera in (*cameras, *(target.camera for target in targets)):
+        if min(camera.width, camera.height) < MIN_IMAGE_SIZE:
+            raise InputError(
+                f"An image is {camera.width} x {camera.height} pixels, and both sides must have at "
+                f"least {MIN_IMAGE_SIZE}; choose a larger --resolution, or another camera."
+            )
+
+    depth_notes: tuple[str, ...] = ()
+    if request.uses_given_depth:
+        views, depth_notes = read_with_depth(bounded, frames, resolution)
+    else:
+        views = bounded.views(frames, resolution)
+    views = [view.to(device) for view in views]
+
+    # Photographs of the targets score the result, and only the oracle generator sees them.
+    targets = [add_photograph(target, bounded, resolution) for target in targets]
+    return CompletionTask(
+        views,
+        targets,
+        compute_frame_from_photographs(photographs.origin),
+        photographs.origin,
+        find_depth_sources(opened, bounded, has_splat),
+        depth_notes=depth_notes,
+    )
+
+
+def find_depth_sources(opened: Opened, bounded: Photographs, has_splat: bool) -> dict[str, str]:
+    """Find the sources of `near` and `far`; `bounded` has those of the sparse points."""
+    estimate = "splat" if has_splat else "features"
+    # In this order: each of them keeps what the one before it has.
+    sources = {"given": opened.request, "scene": opened.photographs, "points": bounded}
+    source_by_name = {}
+    for name in ("near", "far"):
+        known = [source for source, value in sources.items() if getattr(value, name) is not None]
+        source_by_name[name] = known[0] if known else estimate
+    return source_by_name

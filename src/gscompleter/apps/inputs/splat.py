@@ -1,0 +1,94 @@
+"""The input splat: its file, its frame, and the photographs that check it."""
+
+from __future__ import annotations
+
+from contextlib import suppress
+from dataclasses import replace
+from pathlib import Path
+
+from gscompleter.apps.inputs.selection import (
+    CHECK_VIEW_SIZE,
+    collect_usable_cameras,
+    select_near_and_far,
+)
+from gscompleter.apps.inputs.task import CompletionTask, InputSplatFile, Opened
+from gscompleter.data.local_origin import (
+    choose_scene_origin,
+    compute_frame_from_photographs,
+    shift_to_origin,
+)
+from gscompleter.data.photographs import Photographs
+from gscompleter.render.loading import load_renderer
+from gscompleter.splats.alignment.estimate import align_splat
+from gscompleter.splats.alignment.similarity import transform_camera, transform_view
+from gscompleter.splats.alignment.trainer_frames import InputSplat
+from gscompleter.splats.formats import detect_splat_format
+from gscompleter.splats.ply import find_finite_rows
+from gscompleter.system.errors import InputError
+from gscompleter.types import Gaussians
+
+MAX_CHECK_VIEWS = 40
+"""Most photographs that check a splat."""
+
+
+def locate_splat(path: Path, drop_nonfinite: bool) -> InputSplatFile:
+    """Describe the file of the input splat, of which Gaussians may have been dropped."""
+    # A .ply is written again from its own rows, of which those that were dropped are left out.
+    if drop_nonfinite and detect_splat_format(path) == "ply":
+        return InputSplatFile(path, find_finite_rows(path))
+    return InputSplatFile(path)
+
+
+def move_to_splat(
+    task: CompletionTask,
+    scene: Gaussians,
+    splat_file: InputSplatFile,
+    opened: Opened,
+) -> CompletionTask:
+    """Add the splat of a file to the task, and move its cameras into the splat's frame."""
+    photographs = opened.photographs
+
+    # Coordinates of maps are too large for float32, so that work is done near the scene's origin.
+    origin = choose_scene_origin(scene, photographs.origin)
+    scene = shift_to_origin(origin, scene, task.cameras).to(task.device)
+
+    # A trainer may have moved and scaled the cameras before it trained the splat.
+    splat = InputSplat(splat_file.path, scene, origin, opened.request.folder)
+    alignment = align_splat(
+        splat, photographs, task.context_frames, load_renderer(task.device.type)
+    )
+
+    # Cameras were read relative to the origin of the photographs, whatever frame they are in. Those
+    # of the splat's own frame only change to its origin; all others are aligned.
+    from_photographs = alignment.transform
+    from_splat = compute_frame_from_photographs(origin) @ compute_frame_from_photographs(
+        -photographs.origin
+    )
+    targets = []
+    for target in task.targets:
+        transform = from_splat if target.is_in_splat_frame else from_photographs
+        targets.append(replace(target, camera=transform_camera(target.camera, transform)))
+
+    return replace(
+        task,
+        views=[transform_view(view, from_photographs) for view in task.views],
+        targets=targets,
+        frame=from_photographs @ task.frame,
+        origin=photographs.origin if alignment.method == "given" else origin,
+        scene=scene,
+        splat_file=splat_file,
+        method=alignment.method,
+        frame_description=alignment.describe(),
+        check_views=[transform_view(view, from_photographs) for view in task.check_views or ()],
+    )
+
+
+def add_check_views(task: CompletionTask, photographs: Photographs) -> CompletionTask:
+    """Add check views: unused photographs near the targets and all around (decision 020)."""
+    others = [frame for frame in range(len(photographs)) if frame not in task.used_frames]
+    cameras = collect_usable_cameras(photographs, others, CHECK_VIEW_SIZE)
+    views = []
+    for frame in select_near_and_far(task.goals, cameras, MAX_CHECK_VIEWS):
+        with suppress(InputError):
+            views += photographs.views([frame], CHECK_VIEW_SIZE)
+    return replace(task, check_views=[view.to(task.device) for view in views])

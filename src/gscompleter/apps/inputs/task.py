@@ -1,0 +1,133 @@
+"""Values that are opened and read: photographs, targets, and the input of a completion."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import numpy as np
+import torch
+from jaxtyping import Bool, Float, Int64
+from torch import Tensor
+
+from gscompleter.apps.inputs.names import name_target
+from gscompleter.apps.inputs.scene_request import SceneRequest
+from gscompleter.data.photographs import Photographs
+from gscompleter.types import Camera, Gaussians, View
+
+
+@dataclass(frozen=True)
+class Target:
+    """A target camera with the photograph that scores it."""
+
+    camera: Camera
+    frame: int | None = None
+    """Frame number in the scene; None for a camera from elsewhere."""
+    photograph: Float[Tensor, "h w 3"] | None = None
+    """Photograph at the target, if there is one. Only the generator `oracle` uses it."""
+    ignore_mask: Bool[Tensor, "h w"] | None = None
+    """True for pixels that are not scored; None if all are."""
+    derived_from: int | None = None
+    """Frame number that a planned camera was derived from; None if the user gave the camera."""
+    offset: str | None = None
+    """Move and turn of a planned camera from that frame, in words."""
+    is_in_splat_frame: bool = False
+    """True if the camera is in the frame of the input splat's file."""
+
+    @property
+    def view(self) -> View | None:
+        """The photograph with its camera, or None."""
+        if self.photograph is None:
+            return None
+        return View(self.photograph, self.camera, self.frame, ignore_mask=self.ignore_mask)
+
+
+@dataclass(frozen=True)
+class InputSplatFile:
+    """The file of the input splat."""
+
+    path: Path
+    context_mask: Bool[Tensor, "n"] | None = None
+    """Mask of the Gaussians in the file that form the context; None for all."""
+    file_order: Int64[Tensor, "n"] | None = None
+    """Index among these of each Gaussian of the context; None for the order of the file."""
+
+
+@dataclass(frozen=True)
+class Opened:
+    """Photographs with cameras, and their source."""
+
+    request: SceneRequest
+    photographs: Photographs
+    format: str
+    num_photographs: int
+    """Number of photographs, with those whose camera was not found."""
+
+    def with_resolution(self, resolution: int) -> Opened:
+        """Return a copy with another working size, the longest side in pixels."""
+        return replace(self, request=replace(self.request, resolution=resolution))
+
+    @property
+    def files(self) -> dict[int | None, str]:
+        """Files of the photographs by frame, below the folder of all."""
+        return {number: f.file_name for number, f in enumerate(self.photographs.frames)}
+
+    def name_target(self, target: Target) -> str:
+        """Name a target for lines and tables."""
+        near = target.derived_from
+        file = self.files.get(target.frame if near is None else near)
+        return name_target(target.frame, file, near, target.offset)
+
+
+@dataclass(frozen=True)
+class CompletionTask:
+    """Input of a completion."""
+
+    views: Sequence[View]
+    targets: Sequence[Target]
+    frame: Float[np.ndarray, "4 4"]
+    """Similarity from the frame of the photographs to that of the result."""
+    origin: Float[np.ndarray, "3"]
+    """Origin of the result in the coordinates of the input; zero unless those are large."""
+    depths: Mapping[str, str]
+    """Source of `near` and `far`: given, scene, points, splat, model or features."""
+    scene: Gaussians | None = None
+    """Input splat, or None to reconstruct the context."""
+    splat_file: InputSplatFile | None = None
+    method: str = "given"
+    frame_description: str = "the frame of the photographs"
+    check_views: Sequence[View] | None = None
+    """Check views of the input splat, at low resolution."""
+    depth_notes: tuple[str, ...] = ()
+    """Sentences about the unit of the given depth."""
+
+    @property
+    def device(self) -> torch.device:
+        """Device of the photographs."""
+        return self.views[0].image.device
+
+    @property
+    def cameras(self) -> list[Camera]:
+        """Cameras of the context and of the targets."""
+        return [*(view.camera for view in self.views), *(t.camera for t in self.targets)]
+
+    @property
+    def target_cameras(self) -> list[Camera]:
+        """Target cameras on the device of the photographs."""
+        return [target.camera.to(self.device) for target in self.targets]
+
+    @property
+    def goals(self) -> list[Camera]:
+        """Target cameras, or those of the context without targets."""
+        return self.target_cameras or [view.camera for view in self.views]
+
+    @property
+    def context_frames(self) -> tuple[int, ...]:
+        """Frame numbers of the context."""
+        return tuple(view.frame for view in self.views if view.frame is not None)
+
+    @property
+    def used_frames(self) -> set[int | None]:
+        """Frame numbers of the context and of the targets."""
+        return {*self.context_frames, *(target.frame for target in self.targets)}
