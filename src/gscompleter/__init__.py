@@ -8,13 +8,13 @@ from typing import TYPE_CHECKING, Any
 __version__ = "0.1.0"
 
 if TYPE_CHECKING:
-    from gscompleter.apps.report.judge import judge as judge
     from gscompleter.completer import GSCompleter as GSCompleter
     from gscompleter.config import CompleterConfig as CompleterConfig
     from gscompleter.config import load_config as load_config
     from gscompleter.data.scene import load_camera as load_camera
     from gscompleter.data.scene import load_cameras as load_cameras
     from gscompleter.data.scene import load_views as load_views
+    from gscompleter.evaluation.verdict.judge import judge as judge
     from gscompleter.generators import load_generator as load_generator
     from gscompleter.reconstructors import load_reconstructor as load_reconstructor
     from gscompleter.render.loading import load_renderer as load_renderer
@@ -37,7 +37,7 @@ _HOMES = {
     "CompleterConfig": "config",
     "load_config": "config",
     "InputError": "system.errors",
-    "judge": "apps.report.judge",
+    "judge": "evaluation.verdict.judge",
     "load_generator": "generators",
     "load_ply": "splats.ply",
     "save_ply": "splats.ply",

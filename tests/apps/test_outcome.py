@@ -12,13 +12,10 @@ import pytest
 import gscompleter as gsc
 from command import run
 from gscompleter.apps.batch.running import complete_job
-from gscompleter.apps.report.outcome import describe_gain, is_like, make_clause
 from gscompleter.apps.report.plain_words import list_shared_notes
-from gscompleter.apps.report.schema import (
-    HeldOutRow,
-    OutcomeRow,
-    read_summary,
-)
+from gscompleter.apps.report.schema import read_summary
+from gscompleter.evaluation.verdict.outcome import describe_gain, is_like, make_clause
+from gscompleter.evaluation.verdict.rows import HeldOutRow, OutcomeRow
 from gscompleter.system.errors import InputError
 from gscompleter.system.jobs.jobs import Job
 from scenes import camera_at, photographed

@@ -26,7 +26,6 @@ from gscompleter.apps.report.schema import (
     AlignmentRow,
     CompletionSummary,
     ContextRow,
-    OutcomeRow,
     ResultFrame,
     SceneRow,
     TargetRow,
@@ -53,6 +52,7 @@ from gscompleter.apps.viewer.page import make_page
 from gscompleter.apps.viewer.serving import make_page_server
 from gscompleter.data.scene import write_cameras
 from gscompleter.evaluation.metrics.coverage import Coverage
+from gscompleter.evaluation.verdict.rows import OutcomeRow
 from gscompleter.splats.formats import load_splat
 from gscompleter.splats.ply import save_ply
 from gscompleter.system.errors import InputError

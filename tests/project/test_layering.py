@@ -114,6 +114,25 @@ def test_imports_inside_a_package_point_down_and_make_no_circle(package):
     TopologicalSorter(imports).prepare()  # raises CycleError, which names the circle
 
 
+@pytest.mark.parametrize(
+    ("folder", "others"),
+    [("inputs", ("commands", "completing", "report")), ("report", ("commands", "completing"))],
+)
+def test_inputs_and_reports_know_no_command(folder, others):
+    names = tuple(f"gscompleter.apps.{other}" for other in others)
+    imported = [
+        node.module
+        for path in sorted((PACKAGE / "apps" / folder).rglob("*.py"))
+        for node in ast.walk(ast.parse(path.read_text()))
+        if isinstance(node, ast.ImportFrom) and (node.module or "").startswith(names)
+    ]
+    assert imported == []
+
+
+def test_the_package_itself_imports_no_application():
+    assert "apps" not in set(imported_rooms(PACKAGE / "__init__.py"))
+
+
 def test_no_circle_of_modules():
     modules = {
         ".".join(path.relative_to(ROOT / "src").with_suffix("").parts).removesuffix(".__init__")

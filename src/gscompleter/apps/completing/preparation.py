@@ -20,7 +20,6 @@ from gscompleter.apps.inputs.depth_range import (
 from gscompleter.apps.inputs.describing import print_lines
 from gscompleter.apps.inputs.memory import check_scene
 from gscompleter.apps.inputs.named_photographs import check_context, check_target_files
-from gscompleter.apps.inputs.names import describe_offset
 from gscompleter.apps.inputs.opening import choose_working_size, open_scene
 from gscompleter.apps.inputs.reading import read_task
 from gscompleter.apps.inputs.selection import collect_usable_cameras
@@ -29,6 +28,7 @@ from gscompleter.apps.inputs.task import CompletionTask, Opened, Target
 from gscompleter.apps.warmup import SPLAT_PART, compile_kernels
 from gscompleter.completer import GSCompleter
 from gscompleter.data.local_origin import compute_frame_from_photographs
+from gscompleter.data.photograph_names import describe_offset
 from gscompleter.generators import load_generator
 from gscompleter.planning.planner import Choice, ViewPlanner
 from gscompleter.reconstructors import check_reconstructor, load_reconstructor

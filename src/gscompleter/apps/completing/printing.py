@@ -10,16 +10,11 @@ from rich.table import Table
 from gscompleter.apps.commands.complete import CompleteOptions
 from gscompleter.apps.inputs.task import Opened, Target
 from gscompleter.apps.report.film import VIDEO_FILE
-from gscompleter.apps.report.outcome import name_unused, select_testing
 from gscompleter.apps.report.page import REPORT_FILE
-from gscompleter.apps.report.plain_words import (
-    format_number,
-    format_percent,
-    group_target_notes,
-    list_notes,
-    list_shared_notes,
-)
-from gscompleter.apps.report.schema import CompletionSummary, average, read_summary
+from gscompleter.apps.report.plain_words import group_target_notes, list_notes, list_shared_notes
+from gscompleter.apps.report.schema import CompletionSummary, read_summary
+from gscompleter.evaluation.verdict.numbers import average, format_number, format_percent
+from gscompleter.evaluation.verdict.outcome import name_unused, select_testing
 from gscompleter.system.errors import quote_value
 from gscompleter.system.files.writing import COMPLETED_FILE, TARGETS_FILE
 

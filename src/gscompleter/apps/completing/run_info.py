@@ -14,8 +14,8 @@ from gscompleter.apps.commands.shared_options import SceneOptions
 from gscompleter.apps.inputs.describing import describe_missing
 from gscompleter.apps.inputs.selection import select_closest
 from gscompleter.apps.inputs.task import CompletionTask, Opened
-from gscompleter.apps.report.completion import HeldOut
 from gscompleter.config import CleaningConfig, CompleterConfig
+from gscompleter.evaluation.verdict.held_out import HeldOut
 from gscompleter.system.errors import InputError, quote_value
 from gscompleter.system.files.writing import COMPLETED_FILE
 from gscompleter.types import Camera, View

@@ -7,8 +7,8 @@ from pathlib import Path
 from rich.console import Console
 
 from gscompleter.apps.inputs.memory import estimate_memory
-from gscompleter.apps.inputs.names import name_photograph
 from gscompleter.apps.inputs.task import CompletionTask, Opened
+from gscompleter.data.photograph_names import name_photograph
 from gscompleter.data.photographs import Photographs
 from gscompleter.numerics.image_ops import compute_mask_fraction
 from gscompleter.system.errors import join_names, quote_value

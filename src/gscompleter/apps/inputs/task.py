@@ -11,8 +11,8 @@ import torch
 from jaxtyping import Bool, Float, Int64
 from torch import Tensor
 
-from gscompleter.apps.inputs.names import name_target
 from gscompleter.apps.inputs.scene_request import SceneRequest
+from gscompleter.data.photograph_names import name_target
 from gscompleter.data.photographs import Photographs
 from gscompleter.types import Camera, Gaussians, View
 

@@ -33,9 +33,9 @@ import viser
 from jaxtyping import Float
 from websockets.asyncio import server as websockets
 
-from gscompleter.apps.inputs.names import name_photograph
 from gscompleter.apps.live.box import PageBox, remove_in_box
 from gscompleter.apps.live.session import Session, complete_camera, undo_step
+from gscompleter.data.photograph_names import name_photograph
 from gscompleter.numerics.geometry import estimate_up, quats_to_rotations, rotations_to_quats
 from gscompleter.state import NOTHING_ADDED, Completion, TargetResult
 from gscompleter.system.errors import InputError, quote_value

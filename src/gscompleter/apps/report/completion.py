@@ -18,24 +18,22 @@ from torch.nn.functional import normalize
 
 from gscompleter import __version__
 from gscompleter.apps.inputs.task import InputSplatFile, Target
-from gscompleter.apps.report.outcome import judge_completion
 from gscompleter.apps.report.schema import (
     RECORD_FILE,
     SCORES,
     AlignmentRow,
     CompletionRecord,
     ContextRow,
-    HeldOutRow,
     PairsRow,
-    ScoreRow,
     TargetRow,
     UnfilledRow,
 )
-from gscompleter.config.settings import COVERED
 from gscompleter.editing.removal import hide_removed
 from gscompleter.evaluation.metrics.coverage import RenderPair, compute_coverage
-from gscompleter.evaluation.metrics.image import compute_masked_psnr, compute_masked_ssim, ssim
-from gscompleter.evaluation.metrics.unused_photographs import measure_likeness, shrink_view
+from gscompleter.evaluation.metrics.image import compute_masked_psnr, ssim
+from gscompleter.evaluation.verdict.held_out import HeldOut, render_before_after, score_held_out
+from gscompleter.evaluation.verdict.outcome import judge_completion
+from gscompleter.evaluation.verdict.rows import ScoreRow
 from gscompleter.numerics.geometry import estimate_up
 from gscompleter.numerics.image_ops import compute_mask_fraction
 from gscompleter.numerics.kernels.parallel import map_in_parallel
@@ -64,15 +62,6 @@ FRUSTUM_DEPTH = 0.11
 
 Scores = dict[str, Any]
 """PSNR and SSIM before and after by name, or None without a photograph."""
-
-
-@dataclass(frozen=True)
-class HeldOut:
-    """A photograph that is neither context nor target and only scores the result."""
-
-    view: View
-    is_check: bool = False
-    """True if a small copy of it checked the input splat."""
 
 
 @dataclass(frozen=True)
@@ -148,17 +137,6 @@ def write_report(
     return summary
 
 
-def render_before_after(completion: Completion, camera: Camera, renderer: Renderer) -> RenderPair:
-    """Render the context and the completed scene."""
-    with torch.no_grad():
-        before = renderer.freeze(completion.context, camera)
-        # Without recolouring and removal the context is the same, and is projected once.
-        after = before
-        if completion.kept_context is not completion.context:
-            after = renderer.freeze(completion.kept_context, camera)
-        return RenderPair(before.render, after.composite(completion.added))
-
-
 def compute_scores(pair: RenderPair, photograph: View | None) -> Scores:
     """Compute PSNR (dB) and SSIM over the valid pixels, or None without a photograph."""
     scores: Scores = dict.fromkeys(SCORES)
@@ -179,46 +157,6 @@ def score_views(completion: Completion, views: Sequence[View], renderer: Rendere
         return compute_scores(render_before_after(completion, view.camera, renderer), shown)
 
     return list(get_view_map(completion.added.means)(score, views))
-
-
-def score_held_out(
-    completion: Completion, held_out: Sequence[HeldOut], renderer: Renderer
-) -> list[HeldOutRow]:
-    """Make the rows of held-out photographs."""
-    # Photographs in use, as they are: what a reconstruction has to be better than (decision 048).
-    used = [shrink_view(view).image for view in completion.views]
-
-    def score(photograph: HeldOut) -> HeldOutRow:
-        view = hide_removed(photograph.view, completion.source, renderer)
-        row = score_photograph(completion, view, renderer)
-        small = shrink_view(view)
-        with torch.no_grad():
-            render = renderer.render(completion.source.rendered, small.camera)
-        likeness = measure_likeness(render, small, used)
-        row = replace(row, is_check=photograph.is_check)
-        return row if likeness is None else replace(row, **asdict(likeness))
-
-    return list(get_view_map(completion.added.means)(score, held_out))
-
-
-def score_photograph(completion: Completion, view: View, renderer: Renderer) -> HeldOutRow:
-    """Score a held-out photograph where the completed scene covers it."""
-    pair = render_before_after(completion, view.camera, renderer)
-    truth = view.image
-    valid = view.valid_mask
-    # Both scores over what the completed scene covers: their difference is then a gain.
-    covered_before = (pair.before.alpha >= COVERED) & valid
-    covered_after = (pair.after.alpha >= COVERED) & valid
-    num_valid = max(int(valid.sum()), 1)
-    return HeldOutRow(
-        view.frame,
-        psnr_before=compute_masked_psnr(pair.before.image, truth, covered_after),
-        psnr_after=compute_masked_psnr(pair.after.image, truth, covered_after),
-        ssim_before=compute_masked_ssim(pair.before.image, truth, covered_after),
-        ssim_after=compute_masked_ssim(pair.after.image, truth, covered_after),
-        covered_before=int(covered_before.sum()) / num_valid,
-        covered_after=int(covered_after.sum()) / num_valid,
-    )
 
 
 def score_context(completion: Completion, renderer: Renderer) -> list[ContextRow]:

@@ -27,21 +27,18 @@ from PIL import Image
 from gscompleter import __version__
 from gscompleter.apps.report.plain_words import (
     describe_alignment,
-    format_change,
-    format_number,
-    format_percent,
     group_target_notes,
     list_notes,
     list_shared_notes,
 )
-from gscompleter.apps.report.schema import (
-    SCORES,
-    CompletionSummary,
-    average,
-    read_record,
-    read_summary,
-)
+from gscompleter.apps.report.schema import SCORES, CompletionSummary, read_record, read_summary
 from gscompleter.data.formats import SCENE_FORMATS
+from gscompleter.evaluation.verdict.numbers import (
+    average,
+    format_change,
+    format_number,
+    format_percent,
+)
 from gscompleter.system.files.image import encode_jpeg, read_image_size, read_pixels
 from gscompleter.system.files.writing import encode_text, replace_file
 from gscompleter.system.jobs.jobs import JOBS, Job, read_row

@@ -2,10 +2,10 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Iterator, Sequence
 
 from gscompleter.apps.report.schema import AlignmentRow, CompletionSummary, TargetRow
+from gscompleter.evaluation.verdict.numbers import format_percent
 
 FRAME_NOTES = {
     "cameras": "in the frame of its cameras.json, not in that of the photographs",
@@ -180,21 +180,3 @@ def describe_alignment(affine: AlignmentRow, unit: str) -> str:
     if affine.agreement is None:
         return fit
     return f"{fit} At the target, {format_percent(affine.agreement, 0)} of the visible scene agree."
-
-
-def format_number(value: float | None, digits: int = 2) -> str:
-    """Format a number, with a dash for None or an infinite one."""
-    return "–" if value is None or not math.isfinite(value) else f"{value:.{digits}f}"
-
-
-def format_percent(share: float | None, digits: int = 1) -> str:
-    """Format a fraction as a percentage."""
-    return "–" if share is None or not math.isfinite(share) else f"{100 * share:.{digits}f} %"
-
-
-def format_change(before: float | None, after: float | None, digits: int = 2) -> str:
-    """Format the change of a score with its sign."""
-    if before is None or after is None or not math.isfinite(after - before):
-        return "–"
-    # Adding 0.0 turns -0.0 into 0.0, so that no change is "+0.00" and never "-0.00".
-    return f"{round(after - before, digits) + 0.0:+.{digits}f}"

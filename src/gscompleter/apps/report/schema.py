@@ -3,16 +3,16 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Iterable, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
-from statistics import fmean
 from typing import Any, Literal, TypeVar
 
 import numpy as np
 
-from gscompleter.apps.inputs.names import name_photograph, name_target
+from gscompleter.data.photograph_names import name_photograph, name_target
 from gscompleter.evaluation.metrics.coverage import Coverage
+from gscompleter.evaluation.verdict.rows import HeldOutRow, OutcomeRow, ScoreRow
 from gscompleter.system.errors import InputError, quote_value
 from gscompleter.system.files.output_folder import read_command
 from gscompleter.system.files.reading import read_json
@@ -42,24 +42,6 @@ class AlignmentRow:
 
 
 @dataclass(frozen=True)
-class ScoreRow:
-    """PSNR (dB) and SSIM of a camera against its photograph; None without one."""
-
-    frame: int | None
-    psnr_before: float | None
-    psnr_after: float | None
-    ssim_before: float | None
-    ssim_after: float | None
-    file: str | None = field(default=None, kw_only=True)
-    """File of the photograph, below the folder of all; None if it is not known."""
-
-    @property
-    def photograph(self) -> str:
-        """Number and file of the photograph."""
-        return name_photograph(self.frame, self.file)
-
-
-@dataclass(frozen=True)
 class ContextRow(ScoreRow):
     """A photograph of the context."""
 
@@ -68,25 +50,6 @@ class ContextRow(ScoreRow):
     given_depth: float = 0.0
     """Share of the pixels whose depth was given."""
     ignored: float = 0.0
-
-
-@dataclass(frozen=True)
-class HeldOutRow(ScoreRow):
-    """A photograph that only scores the result, where the completed scene covers it.
-
-    The scores before are of the same pixels as those after, so that their difference is a gain. The
-    pixels that stay empty count in the covered shares alone.
-    """
-
-    is_check: bool = False
-    covered_before: float = 0.0
-    """Share of the valid pixels that the scene covers before the completion."""
-    covered_after: float = 0.0
-    above_color: float | None = None
-    """PSNR in dB by which the scene before the completion is nearer to the photograph than a single
-    colour, in a small image; None if it covers too little of it."""
-    above_photograph: float | None = None
-    """The same beyond the nearest of the photographs that were used, left as they are."""
 
 
 @dataclass(frozen=True)
@@ -155,15 +118,6 @@ class SceneRow:
     splat: str | None = None
     notes: tuple[str, ...] = ()
     """Sentences about the opening: photographs and cameras that are left out, for example."""
-
-
-@dataclass(frozen=True)
-class OutcomeRow:
-    """The verdict on a completion."""
-
-    status: Literal["completed", "nothing-gained", "not-reconstructed"]
-    headline: str
-    """First line of the report and of what the terminal shows."""
 
 
 @dataclass(frozen=True)
@@ -247,12 +201,6 @@ def read_record(folder: Path, summary: CompletionSummary) -> CompletionRecord:
     if sizes != (len(summary.targets), len(summary.targets), len(summary.context)):
         raise InputError(f"{quote_value(path)} does not fit {SUMMARY_FILE} beside it; {ADVICE}.")
     return record
-
-
-def average(values: Iterable[float | None]) -> float | None:
-    """Average the scores that there are; None without any."""
-    known = [value for value in values if value is not None]
-    return fmean(known) if known else None
 
 
 def read_result(kind: type[T], path: Path) -> T:

@@ -9,12 +9,12 @@ import numpy as np
 from jaxtyping import Float
 from PIL import Image
 
-from gscompleter.apps.inputs.names import name_photograph
 from gscompleter.apps.report.schema import CompletionSummary, read_summary
 from gscompleter.data.camera_files import read_cameras
 from gscompleter.data.formats import open_photographs
 from gscompleter.data.frame import Frame
 from gscompleter.data.local_origin import compute_frame_from_photographs
+from gscompleter.data.photograph_names import name_photograph
 from gscompleter.data.photographs import Resolution
 from gscompleter.data.scene import load_cameras
 from gscompleter.splats.alignment.similarity import transform_camera

@@ -2,7 +2,7 @@
 
 import pytest
 
-from gscompleter.apps.inputs.names import describe_offset, name_photograph, name_target
+from gscompleter.data.photograph_names import describe_offset, name_photograph, name_target
 from scenes import camera_at
 
 

@@ -4,9 +4,9 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 
-from gscompleter.apps.report.completion import HeldOut, score_held_out
-from gscompleter.apps.report.outcome import judge_completion
-from gscompleter.apps.report.schema import OutcomeRow
+from gscompleter.evaluation.verdict.held_out import HeldOut, score_held_out
+from gscompleter.evaluation.verdict.outcome import judge_completion
+from gscompleter.evaluation.verdict.rows import OutcomeRow
 from gscompleter.numerics.value_checks import check_views
 from gscompleter.render.loading import load_renderer
 from gscompleter.state import Completion

@@ -9,9 +9,9 @@ from collections import Counter
 from collections.abc import Sequence
 from statistics import median
 
-from gscompleter.apps.report.plain_words import format_number, format_percent
-from gscompleter.apps.report.schema import HeldOutRow, OutcomeRow, average
 from gscompleter.evaluation.metrics.unused_photographs import shrink_view
+from gscompleter.evaluation.verdict.numbers import average, format_number, format_percent
+from gscompleter.evaluation.verdict.rows import HeldOutRow, OutcomeRow
 from gscompleter.reconstructors.features.consistency import count_consistent_matches
 from gscompleter.stages.target_view import NOTHING_TO_COMPLETE
 from gscompleter.state import Completion, TargetResult

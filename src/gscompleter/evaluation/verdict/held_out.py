@@ -1,0 +1,79 @@
+"""Photographs that only score a completion."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import asdict, dataclass, replace
+
+import torch
+
+from gscompleter.config.settings import COVERED
+from gscompleter.editing.removal import hide_removed
+from gscompleter.evaluation.metrics.coverage import RenderPair
+from gscompleter.evaluation.metrics.image import compute_masked_psnr, compute_masked_ssim
+from gscompleter.evaluation.metrics.unused_photographs import measure_likeness, shrink_view
+from gscompleter.evaluation.verdict.rows import HeldOutRow
+from gscompleter.render.protocols import Renderer
+from gscompleter.render.view_map import get_view_map
+from gscompleter.state import Completion
+from gscompleter.types import Camera, View
+
+
+@dataclass(frozen=True)
+class HeldOut:
+    """A photograph that is neither context nor target and only scores the result."""
+
+    view: View
+    is_check: bool = False
+    """True if a small copy of it checked the input splat."""
+
+
+def render_before_after(completion: Completion, camera: Camera, renderer: Renderer) -> RenderPair:
+    """Render the context and the completed scene."""
+    with torch.no_grad():
+        before = renderer.freeze(completion.context, camera)
+        # Without recolouring and removal the context is the same, and is projected once.
+        after = before
+        if completion.kept_context is not completion.context:
+            after = renderer.freeze(completion.kept_context, camera)
+        return RenderPair(before.render, after.composite(completion.added))
+
+
+def score_held_out(
+    completion: Completion, held_out: Sequence[HeldOut], renderer: Renderer
+) -> list[HeldOutRow]:
+    """Make the rows of held-out photographs."""
+    # Photographs in use, as they are: what a reconstruction has to be better than (decision 048).
+    used = [shrink_view(view).image for view in completion.views]
+
+    def score(photograph: HeldOut) -> HeldOutRow:
+        view = hide_removed(photograph.view, completion.source, renderer)
+        row = score_photograph(completion, view, renderer)
+        small = shrink_view(view)
+        with torch.no_grad():
+            render = renderer.render(completion.source.rendered, small.camera)
+        likeness = measure_likeness(render, small, used)
+        row = replace(row, is_check=photograph.is_check)
+        return row if likeness is None else replace(row, **asdict(likeness))
+
+    return list(get_view_map(completion.added.means)(score, held_out))
+
+
+def score_photograph(completion: Completion, view: View, renderer: Renderer) -> HeldOutRow:
+    """Score a held-out photograph where the completed scene covers it."""
+    pair = render_before_after(completion, view.camera, renderer)
+    truth = view.image
+    valid = view.valid_mask
+    # Both scores over what the completed scene covers: their difference is then a gain.
+    covered_before = (pair.before.alpha >= COVERED) & valid
+    covered_after = (pair.after.alpha >= COVERED) & valid
+    num_valid = max(int(valid.sum()), 1)
+    return HeldOutRow(
+        view.frame,
+        psnr_before=compute_masked_psnr(pair.before.image, truth, covered_after),
+        psnr_after=compute_masked_psnr(pair.after.image, truth, covered_after),
+        ssim_before=compute_masked_ssim(pair.before.image, truth, covered_after),
+        ssim_after=compute_masked_ssim(pair.after.image, truth, covered_after),
+        covered_before=int(covered_before.sum()) / num_valid,
+        covered_after=int(covered_after.sum()) / num_valid,
+    )
