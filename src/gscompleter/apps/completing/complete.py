@@ -21,10 +21,7 @@ from gscompleter.apps.inputs.task import CompletionTask
 from gscompleter.apps.report.completion import GENERATED_FILE, write_report
 from gscompleter.apps.report.film import VIDEO_FILE, write_comparison_video
 from gscompleter.apps.report.page import REPORT_FILE, write_completion_page
-from gscompleter.apps.report.schema import (
-    RECORD_FILE,
-    read_summary,
-)
+from gscompleter.apps.report.schema import RECORD_FILE, read_summary
 from gscompleter.completer import check_target_ids
 from gscompleter.data.scene import write_cameras
 from gscompleter.editing.removal import restore_surroundings
@@ -51,7 +48,6 @@ RESULTS = (
     *(REPORT_FILE, RECORD_FILE, SUMMARY_FILE, VIDEO_FILE, "images/target*.png"),
 )
 """Globs of the files that a completion may write."""
-
 
 Prepare = Callable[[Any, Console], Prepared]
 """Opens the input of a command, whose options it takes, and loads the models."""

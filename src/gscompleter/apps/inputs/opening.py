@@ -11,19 +11,14 @@ from rich.console import Console
 from gscompleter.apps.inputs.describing import print_lines
 from gscompleter.apps.inputs.named_photographs import check_frame_numbers
 from gscompleter.apps.inputs.scene_request import LONG_SIDE, PosesRequest, SceneRequest
-from gscompleter.apps.inputs.selection import (
-    collect_usable_cameras,
-)
+from gscompleter.apps.inputs.selection import collect_usable_cameras
 from gscompleter.apps.inputs.task import Opened
 from gscompleter.data.camera_files import refuse_other_exports
 from gscompleter.data.formats import find_format, open_photographs, refuse_scenes_below
 from gscompleter.data.frame import FOLDERS
 from gscompleter.data.limits import check_planes
 from gscompleter.data.photographs import check_resolution
-from gscompleter.data.sfm.poses import (
-    find_poses,
-    has_photographs,
-)
+from gscompleter.data.sfm.poses import find_poses, has_photographs
 from gscompleter.splats.alignment.training_size import find_training_size
 from gscompleter.splats.formats import SPLAT_FORMATS
 from gscompleter.system.errors import InputError, quote_value
