@@ -70,7 +70,7 @@ RESULTS ?= results
 evaluate: $(VENV)/installed-evaluation
 	$(BIN)/gscompleter evaluate $(CASES) --methods $(METHODS) --out $(RESULTS)
 
-# Tables, figures and claims of the paper on the same photographs, in under half an hour; the slow
+# Tables, figures and claims of the paper on the same photographs, within an hour; the slow
 # baselines run on few cases. docs/reproduce.md explains them.
 REPRODUCED ?= $(RESULTS)/paper
 SCENES ?= $(dir $(CASES))

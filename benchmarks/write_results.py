@@ -26,7 +26,6 @@ from pathlib import Path
 from typing import Any
 
 import yaml
-from PIL import Image
 
 from gscompleter.evaluation.claims import HEAD, tabulate_claims
 from gscompleter.evaluation.columns import BY_KEY
@@ -38,8 +37,6 @@ STORED = DOCS / "results"
 PAGES = ("reproduce.md", "results.md", "../README.md")
 DEVELOPMENT = "plane-sweep-cases-warp-inpaint"
 """Start of the name of the run with the table of all development cases."""
-MAX_FIGURE_SIDE = 1200
-"""Longer side of the stored figures, in pixels."""
 REGION = re.compile(r"(<!-- ours: (?P<words>[^>]*?) -->\n)(?P<body>.*?)(<!-- end -->)", re.DOTALL)
 NOT_MEASURED = "Not measured yet.\n"
 
@@ -70,24 +67,15 @@ def main() -> None:
 
 
 def copy_reproduction(out: Path) -> None:
-    """Copy tables, figures and results of a reproduction, and the scores of all cases."""
-    for path in sorted((out / "tables").iterdir()):
-        if path.suffix in (".json", ".tex"):
-            shutil.copyfile(path, STORED / "tables" / path.name)
-    for path in sorted((out / "figures").glob("*.png")):
-        copy_figure(path, STORED / "figures" / path.name)
-    shutil.copyfile(out / "results.md", STORED / "results.md")
+    """Copy tables and results of a reproduction, and the scores of all cases."""
+    for path in sorted((out / "tables").glob("*.json")):
+        shutil.copyfile(path, STORED / "tables" / path.name)
+    # Figures show photographs, which may not be redistributed.
+    text = (out / "results.md").read_text("utf-8")
+    without_figures = re.sub(r"## [^\n]*\n+!\[[^\n]*\n*", "", text)
+    (STORED / "results.md").write_text(without_figures.rstrip() + "\n", "utf-8")
     (scores,) = (out / "runs").glob(f"{DEVELOPMENT}/tables.json")
     shutil.copyfile(scores, STORED / "development.json")
-
-
-def copy_figure(source: Path, goal: Path) -> None:
-    """Copy a figure for the pages, which are narrower than the 300 dpi of print."""
-    with Image.open(source) as figure:
-        image = figure.convert("RGB")
-    image.thumbnail((MAX_FIGURE_SIDE, MAX_FIGURE_SIDE))
-    # A palette halves the size, and shows no difference in photographs of this size.
-    image.quantize(256).save(goal, optimize=True)
 
 
 def fill_page(text: str) -> str:
