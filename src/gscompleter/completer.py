@@ -19,6 +19,7 @@ from gscompleter.reconstructors import Reconstructor, load_reconstructor
 from gscompleter.render.cache import SceneRenderer
 from gscompleter.render.loading import load_renderer
 from gscompleter.render.protocols import Renderer
+from gscompleter.stages.add_observed import add_observed
 from gscompleter.stages.align_depth import align_depth
 from gscompleter.stages.context import choose_config, init_context
 from gscompleter.stages.filter_holes import filter_holes
@@ -36,6 +37,7 @@ from gscompleter.system.errors import InputError
 from gscompleter.system.progress import track
 from gscompleter.system.tensor_checks import describe, is_whole
 from gscompleter.system.timing import record_seconds, timed_stage
+from gscompleter.trust import Trust
 from gscompleter.trust.photometric import load_trust
 from gscompleter.types import Camera, Gaussians, PaddedCamera, View
 
@@ -157,23 +159,32 @@ class GSCompleter:
             photos = tuple(Photo(view) for view in context.views)
             parts = (context.source.rendered,)
 
-            # Photographs that a splat was not trained on say nothing about the trust in it. They
-            # are targets themselves, before all others (decision 041).
-            new = find_new_photos(config, parts, context.views, self.scenes)
-            trained = [view for index, view in enumerate(context.views) if index not in new]
-            trust = load_trust(config, parts, trained, self.scenes)
             state = Completion(
                 config,
                 context.source,
                 parts,
                 photos,
                 len(views),
-                trust,
+                Trust(),
                 is_given=scene is not None,
             )
-
-            # Guards measure the scene as it was given, so before anything is recoloured.
+            # Guards measure the scene as it was given, so before anything changes.
             state = prepare_guards(state, self.scenes)
+
+            # The order of evidence: what photographs show goes in first, what the scene shows is
+            # kept, and Φ invents only the rest (decision 051).
+            rng = torch.Generator().manual_seed(self.seed)
+            state = add_observed(self.reconstructor, state, self.scenes, rng)
+            if state.num_observed:
+                # What photographs gained by it has to stay, too.
+                state = prepare_guards(state, self.scenes)
+
+            # Photographs that a splat was not trained on say nothing about the trust in it. They
+            # are targets themselves, before all others (decision 041).
+            new = find_new_photos(config, state.parts, context.views, self.scenes)
+            trained = [view for index, view in enumerate(context.views) if index not in new]
+            trust = load_trust(config, state.parts, trained, self.scenes)
+            state = replace(state, trust=trust)
             state = recolor_to_photos(state, [context.views[i] for i in new], self.scenes)
         return replace(state, exposure_gains=context.exposure_gains, seconds=seconds)
 

@@ -194,6 +194,8 @@ class Completion:
     """Exposure gain of each original photograph relative to `views`, or None if not estimated."""
     num_new_photos: int = 0
     """Number of photographs that a given scene did not reproduce."""
+    num_observed: int = 0
+    """Number of Gaussians that were added from photographs, before any target."""
     is_given: bool = False
     """True if the context is a scene that was given, and Ψ did not reconstruct it."""
 

@@ -14,12 +14,12 @@ from gscompleter.data.moving_boxes import mask_moving
 from gscompleter.editing.cleaning import halve_view
 from gscompleter.evaluation.metrics.scores import Truth, score
 from gscompleter.generators.warp import warp_photographs
-from gscompleter.guards.psnr import compute_squared_error, meet_error_budgets
 from gscompleter.numerics.geometry import compute_sparse_depth, unproject
 from gscompleter.render.loading import load_renderer
 from gscompleter.splats.alignment.fit import score_image
 from gscompleter.splats.alignment.matching import extract_view_features
 from gscompleter.stages.context import drop_ignored
+from gscompleter.stages.error_budgets import compute_squared_error, meet_error_budgets
 from gscompleter.stages.refine import refine_opacities
 from gscompleter.system.files.image import write_image
 from gscompleter.trust.photometric import gather_observations

@@ -13,9 +13,9 @@ from command import run
 from gscompleter.config import CleaningConfig
 from gscompleter.editing.cleaning import find_removable, find_superfluous, predict_error_change
 from gscompleter.evaluation.metrics.image import psnr
-from gscompleter.guards.psnr import compute_squared_error
 from gscompleter.render.loading import load_renderer
 from gscompleter.splats.ply import load_ply
+from gscompleter.stages.error_budgets import compute_squared_error
 from gscompleter.types import View, merge, sh_from_rgb
 from scenes import Room, camera_at, gaussians_of, labelled, photographed, view_of
 

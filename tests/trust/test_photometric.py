@@ -19,12 +19,12 @@ from gscompleter.config import (
     TrustConfig,
 )
 from gscompleter.evaluation.metrics.image import psnr
-from gscompleter.guards.psnr import compute_squared_error
 from gscompleter.numerics.geometry import is_inside, project
 from gscompleter.render.loading import load_renderer
 from gscompleter.render.lod import MIN_PROXY_GAUSSIANS
 from gscompleter.splats.morton import argsort_nearby
 from gscompleter.splats.ply import load_ply, save_ply
+from gscompleter.stages.error_budgets import compute_squared_error
 from gscompleter.system.memory import estimate_bytes
 from gscompleter.trust import Trust
 from gscompleter.trust.photometric import (
@@ -154,6 +154,7 @@ def test_closing_a_hole_makes_up_for_nothing_that_was_good():
     paint = lambda nearest, target, context: view_of(Room(), target).image  # noqa: E731
     unmended = AlignmentConfig(align_at="none"), RegistrationConfig(iterations=0)
     config = replace(CompleterConfig.splat(), alignment=unmended[0], registration=unmended[1])
+    config = replace(config, add_observed=False)
     completer = GSCompleter(NearReconstructor(), paint, config=config)
     completion = completer(VIEWS[::2], TARGET, half, check_views=VIEWS[1:2])
     assert len(completion.targets[0].added) > 0

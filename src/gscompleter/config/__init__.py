@@ -193,8 +193,10 @@ class PsnrGuardConfig(Settings):
     """Largest loss of PSNR of any photograph, in dB over the whole image."""
     max_ssim_drop: Share = 0.0009
     """Largest loss of SSIM of any photograph."""
+    invisible_psnr: Annotated[float, Interval(ge=0, le=200)] = 45.0
+    """PSNR in dB from which on an error is invisible, so that any loss down to it is allowed."""
     max_opacity_loss: Share = 0.75
-    """Add nothing if the added Gaussians lose more than this share of their opacity."""
+    """Drop a connected part of the hole if its Gaussians lose more than this share of opacity."""
 
 
 @dataclass(frozen=True)
@@ -298,6 +300,9 @@ class CompleterConfig(Settings):
     as photographs confirm it."""
     guards: tuple[GuardName, ...] = USUAL_GUARDS
     """Safeguards beyond the paper, in the order in which they are asked (paper: none)."""
+    add_observed: bool = True
+    """Add what the photographs of a given scene show and the scene lacks, before Φ invents
+    anything (paper: False)."""
     margin: Annotated[float, Interval(ge=0, le=4)] = 0.25
     """Padding of the target image on every side, relative to its size, if a hole reaches its
     border, so that nearby cameras see no new hole there (paper: 0)."""
@@ -353,7 +358,6 @@ class CompleterConfig(Settings):
             guards=("image-agreement", "free-space", "psnr", "contribution"),
             margin=0.0,
             registration=SPLAT_REGISTRATION,
-            psnr_guard=PsnrGuardConfig(max_drop=0.0),
         )
 
     @staticmethod
@@ -361,6 +365,7 @@ class CompleterConfig(Settings):
         """Return the settings of the paper; `docs/paper.md` lists the remaining differences."""
         return CompleterConfig(
             guards=(),
+            add_observed=False,
             margin=0.0,
             ego_mask=False,
             synthesis=SynthesisConfig(correct_color=False, source_depth="moge-2-large"),
@@ -383,6 +388,8 @@ class CompleterConfig(Settings):
             self,
             trust="full",
             guards=("removal", *others),
+            # Its photographs still show what was removed.
+            add_observed=False,
             holes=replace(self.holes, max_alpha=REMOVAL_ALPHA),
             next_best_view=replace(self.next_best_view, border_radius=REMOVAL_RADIUS),
         )

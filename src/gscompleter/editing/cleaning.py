@@ -17,13 +17,13 @@ from torch import Tensor
 from torch.nn.functional import avg_pool2d, max_pool2d
 
 from gscompleter.config import CleaningConfig
-from gscompleter.guards.psnr import (
+from gscompleter.render.protocols import OpacityRender, Renderer
+from gscompleter.stages.error_budgets import (
     add_psnr_loss,
     compute_mse_and_gradient,
     compute_squared_error,
     select_fewest,
 )
-from gscompleter.render.protocols import OpacityRender, Renderer
 from gscompleter.system.progress import track
 from gscompleter.types import Gaussians, View
 

@@ -19,11 +19,11 @@ from torch import Tensor
 from gscompleter.editing.cleaning import exclude_needed, limit_errors
 from gscompleter.editing.cutting import Region, cut
 from gscompleter.guards import prepare_guards
-from gscompleter.guards.psnr import meet_error_budgets, set_error_budgets
 from gscompleter.render.cache import SceneRenderer
 from gscompleter.render.fit_colors import RELAXATION, fit_colors
 from gscompleter.render.protocols import FrozenScene, Renderer
 from gscompleter.render.removed import mask_removed
+from gscompleter.stages.error_budgets import meet_error_budgets, set_error_budgets
 from gscompleter.state import NEW_PHOTO_ID, Completion
 from gscompleter.system.errors import InputError
 from gscompleter.trust import Trust
@@ -210,6 +210,7 @@ def fade_harmful(
 ) -> Gaussians:
     """Fade what was generated until no photograph is worse than `context` alone."""
     config = state.config.psnr_guard
+    config = replace(config, max_drop=max(config.max_drop, TOLERANCE))
     views = [photo.view for photo in state.photos]
     frozen = [renderer.freeze(context, view.camera) for view in views]
     budgets = [
@@ -217,8 +218,7 @@ def fade_harmful(
             view,
             scene.render.image,
             ~view.valid_mask,
-            max(config.max_drop, TOLERANCE),
-            config.max_ssim_drop,
+            config,
         )
         for view, scene in zip(views, frozen, strict=True)
     ]

@@ -8,7 +8,7 @@ from patches of the photographs, coarse to fine, after Wexler et al. (2007), Bar
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import cv2
 import numpy as np
@@ -19,7 +19,12 @@ from torch import Tensor
 from torch.nn.functional import avg_pool2d, pad
 
 from gscompleter.generators.smooth import average_trusted, compute_distance_to_known
-from gscompleter.generators.warp import WarpedImage, continue_image, warp_and_fill
+from gscompleter.generators.warp import (
+    BORDER_WIDTH,
+    WarpedImage,
+    continue_image,
+    warp_and_fill,
+)
 from gscompleter.numerics.image_ops import dilate, smooth_masked
 from gscompleter.numerics.kernels import patchmatch
 from gscompleter.numerics.kernels.patchmatch import RADIUS, SIDE
@@ -67,13 +72,20 @@ class WarpInpaint:
     ) -> Float[Tensor, "h w 3"]:
         """Synthesize the complete image of `target`, in [0, 1].
 
-        A scene that is not fully trusted gets smooth colours, which cannot be wrong in structure.
+        Where a scene covers the target without being fully trusted it gets smooth colours, which
+        cannot be wrong in structure. Empty pixels are filled as those of any other scene.
         """
         render = context.target_render
         trusted_alpha = context.trusted_alpha
         if trusted_alpha is None or trusted_alpha is render.alpha:
             return self.fill_holes(nearest, target, context)
-        return average_trusted(render, trusted_alpha / render.alpha.clamp_min(1e-6))
+        smooth = average_trusted(render, trusted_alpha / render.alpha.clamp_min(1e-6))
+        empty = render.alpha < context.max_alpha
+        if not empty.any():
+            return smooth
+        structured = self.fill_holes(nearest, target, replace(context, trusted_alpha=None))
+        # Additions reach over the border of a hole, and show the same image there.
+        return structured.where(dilate(empty, BORDER_WIDTH)[..., None], smooth)
 
     def fill_holes(
         self, nearest: View, target: Camera, context: GeneratorInput

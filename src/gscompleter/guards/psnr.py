@@ -3,35 +3,25 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
-from functools import partial
-from typing import Literal
+from dataclasses import replace
 
-import torch
-from jaxtyping import Bool, Float
-from torch import Tensor
-from torch.nn.functional import pad
-
-from gscompleter.config import PsnrGuardConfig
 from gscompleter.guards import Attempt, Guard
-from gscompleter.numerics.geometry import project_mask
-from gscompleter.numerics.image_ops import SSIM_RADIUS, dilate, ssim_map
+from gscompleter.numerics.geometry import look_up
+from gscompleter.numerics.image_ops import dilate, label_regions
 from gscompleter.render.cache import SceneRenderer
-from gscompleter.render.protocols import FrozenScene, OpacityRender
-from gscompleter.render.view_map import get_view_map
+from gscompleter.render.fit_colors import RELAXATION, fit_colors
+from gscompleter.render.protocols import OpacityRender
+from gscompleter.stages.error_budgets import (
+    find_exceeding,
+    meet_error_budgets,
+    set_error_budgets,
+)
 from gscompleter.stages.target_view import compute_hole_mask
 from gscompleter.state import Completion
-from gscompleter.system.threads import use_one_torch_thread
-from gscompleter.types import ErrorBudget, Gaussians, View
+from gscompleter.types import Gaussians
 
-NUM_HALVINGS = 16
-"""Rounds of halving opacities before Gaussians at the worst pixels are removed."""
-NUM_REMOVALS = 12
-"""Rounds of removal before a photograph loses all generated Gaussians that it sees."""
-MIN_PSNR_LOSS = 1e-4
-"""Smallest tolerated loss of PSNR in dB, for rounding."""
-PIXEL_RADIUS = 2
-"""Radius around the worst pixels within which Gaussians are removed, in pixels."""
+COLOR_ROUNDS = 4
+"""Rounds in which colours are fitted to photographs that additions make worse."""
 
 
 class PsnrGuard(Guard):
@@ -48,8 +38,7 @@ class PsnrGuard(Guard):
                 photo.view,
                 scene.render.image,
                 compute_hole_mask(scene.render.alpha, config.holes),
-                config.psnr_guard.max_drop,
-                config.psnr_guard.max_ssim_drop,
+                config.psnr_guard,
             )
             for photo, scene in zip(state.photos, frozen, strict=True)
         ]
@@ -60,263 +49,36 @@ class PsnrGuard(Guard):
         return replace(state, photos=photos)
 
     def verify(self, added: Gaussians, attempt: Attempt) -> Gaussians:
-        """Fade added Gaussians until every photograph is within its budgets."""
-        state = attempt.view.state
-        return meet_error_budgets(
-            added,
-            attempt.view.frozen_photos,
-            [photo.budgets for photo in state.photos],
-            attempt.refined.plans,
-            state.config.psnr_guard,
-        )
+        """Fade added Gaussians until every photograph is within its budgets.
+
+        Each connected part of the hole is judged by itself: one wrong corner is no reason to drop
+        what is added elsewhere.
+        """
+        view = attempt.view
+        state = view.state
+        plans: Sequence[OpacityRender] = attempt.refined.plans
+        budgets = [photo.budgets for photo in state.photos]
+
+        # What a photograph sees of the additions takes the colours of the photograph first, so that
+        # less of it has to fade. At the target the image counts as much as each photograph.
+        objecting = find_exceeding(budgets, view.frozen_photos, plans, added)
+        if objecting:
+            frozen = [view.frozen, *(view.frozen_photos[index] for index in objecting)]
+            images = [attempt.reference, *(state.photos[index].view for index in objecting)]
+            shown = [scene.render.image for scene in frozen]
+            wanted = [
+                replace(image, image=render.where(~image.valid_mask[..., None], image.image))
+                for image, render in zip(images, shown, strict=True)
+            ]
+            added = fit_colors(added, frozen, wanted, [RELAXATION] * COLOR_ROUNDS)
+            plans = [scene.vary_opacities(added) for scene in view.frozen_photos]
+
+        hole = dilate(view.empty, state.config.holes.dilation)
+        labels, _ = label_regions(hole)
+        regions = look_up(labels, added, view.camera.padded)
+        settings = state.config.psnr_guard
+        return meet_error_budgets(added, view.frozen_photos, budgets, plans, settings, regions)
 
     def explain_rejection(self, attempt: Attempt) -> str:
         """Name the photographs as the reason."""
         return "Most of the Gaussians that were generated for the target make photographs worse."
-
-
-def set_error_budgets(
-    photograph: View,
-    image: Float[Tensor, "h w 3"],
-    holes: Bool[Tensor, "h w"],
-    tolerance: float,
-    ssim_tolerance: float,
-) -> tuple[ErrorBudget, ...]:
-    """Set the error budgets of a photograph from the render and holes of the context there.
-
-    The first limits the mean squared error outside of the holes. If there are holes, the second
-    limits it over the whole photograph. Both allow a loss of PSNR of `tolerance`, in dB. The last
-    limits the loss of SSIM to `ssim_tolerance`.
-    """
-
-    def set_budget(view: View, metric: Literal["mse", "dssim"]) -> ErrorBudget:
-        unlimited = ErrorBudget(view, metric, 0.0)
-        error = compute_pixel_errors(image.clamp(0, 1), unlimited).sum().item()
-        if metric == "mse":
-            return ErrorBudget(view, metric, add_psnr_loss(error, max(tolerance, MIN_PSNR_LOSS)))
-        return ErrorBudget(view, metric, error + ssim_tolerance)
-
-    # The part without holes has a budget of its own. A closed hole lowers the error of the whole
-    # image, and could pay for an error elsewhere: a photograph of 33 dB lost 1.3 dB where its
-    # border was filled (decision 009).
-    without_holes = replace(photograph, ignore_mask=holes | ~photograph.valid_mask)
-    budgets = [set_budget(without_holes, "mse")]
-    if holes.any():
-        budgets.append(set_budget(photograph, "mse"))
-
-    # Equal PSNR does not exclude visible structure, such as a thin floater over an even wall
-    # (decision 010). An image that no window of SSIM fits into has no such budget.
-    if min(photograph.image.shape[:2]) > 2 * SSIM_RADIUS:
-        budgets.append(set_budget(photograph, "dssim"))
-    return tuple(budgets)
-
-
-def compute_pixel_errors(
-    image: Float[Tensor, "h w 3"], budget: ErrorBudget
-) -> Float[Tensor, "h w"]:
-    """Compute what each pixel adds to the error that a budget limits; differentiable.
-
-    The sum over all pixels is the mean squared error, or 1 - SSIM.
-    """
-    view = budget.view
-    masked = view.fill_ignored(image)
-    if budget.metric == "mse":
-        return (masked - view.image).square().mean(dim=-1) / view.valid_mask.numel()
-
-    # At the border the window of SSIM reaches into the black around the image, so the mean is over
-    # the inner pixels, and the border adds nothing.
-    inner = slice(SSIM_RADIUS, -SSIM_RADIUS)
-    dissimilar = (1 - ssim_map(masked, view.image).mean(dim=(0, 1)))[inner, inner]
-    return pad(dissimilar / dissimilar.numel(), (SSIM_RADIUS,) * 4)
-
-
-@use_one_torch_thread()
-def meet_error_budgets(
-    added: Gaussians,
-    frozen_views: Sequence[FrozenScene],
-    budgets: Sequence[Sequence[ErrorBudget]],
-    plans: Sequence[OpacityRender],
-    config: PsnrGuardConfig = PsnrGuardConfig(),
-) -> Gaussians:
-    """Fade added Gaussians until every photograph is within its error budgets.
-
-    In a photograph over budget, opacities with a harmful gradient are halved, the most harmful
-    first and no more than needed. If that fails, Gaussians at the worst pixels are removed, finally
-    all that the photograph sees. None are left if they would lose more than `max_opacity_loss` of
-    their opacity.
-    """
-    if len(added) == 0:
-        return added
-
-    images_before = [frozen.render.image for frozen in frozen_views]
-    checks = [Check(*parts) for parts in zip(budgets, images_before, plans, strict=True)]
-    opacities = added.opacities
-    active = checks
-    for trial in range(NUM_HALVINGS + NUM_REMOVALS + 1):
-        worse = find_over_budget(active, opacities)
-        # While opacities are halved, only photographs that were over budget are rendered. A
-        # Gaussian that faded may have occluded another one in the rest, so that all of them have
-        # to be within budget at the end.
-        if not worse and len(active) < len(checks):
-            worse = find_over_budget(checks, opacities)
-        if not worse:
-            break
-
-        # A Gaussian that one photograph objects to gives way, whatever it improves in others.
-        objections = [render.choose_fading(trial, added) for render in worse]
-        is_lowered = torch.stack(objections).any(dim=0)
-        factor = 0.5 if trial < NUM_HALVINGS else 0.0
-        opacities = torch.where(is_lowered, factor * opacities, opacities)
-        if is_mostly_faded(added.opacities, opacities, config):
-            return added[:0]
-        active = [render.check for render in worse] if trial + 1 < NUM_HALVINGS else checks
-    return replace(added, opacities=opacities, encoded=None)
-
-
-@dataclass(frozen=True)
-class Check:
-    """A photograph with its error budgets."""
-
-    budgets: Sequence[ErrorBudget]
-    image_before: Float[Tensor, "h w 3"]
-    plan: OpacityRender
-    """Differentiable in the opacities of the added Gaussians."""
-
-
-@dataclass(frozen=True)
-class CheckedRender:
-    """A photograph's render with given opacities."""
-
-    check: Check
-    opacities: Float[Tensor, "n"]
-    image: Float[Tensor, "h w 3"]
-    worst_budget: ErrorBudget
-    """The budget that is exceeded most, relative to its limit."""
-    excess: float
-    """Error above the limit of that budget."""
-
-    def choose_fading(self, trial: int, added: Gaussians) -> Bool[Tensor, "n"]:
-        """Choose the Gaussians that lose opacity in round `trial`.
-
-        In rounds of halving, the gradient chooses those whose fading lowers the squared error. SSIM
-        is not linear in opacities, so for it Gaussians at the worst pixels are chosen from the
-        first round on.
-        """
-        uses_gradient = self.worst_budget.metric == "mse" and trial < NUM_HALVINGS
-        # Two Gaussians that occlude each other both have a helpful gradient, so halving never
-        # reaches the budget. Those at the worst pixels go before everything does, or else a hole
-        # loses its whole rim (decision 011).
-        if not uses_gradient and trial < NUM_HALVINGS + NUM_REMOVALS:
-            return self.find_at_worst_pixels(added)
-
-        gradient = compute_gradient(self.image, self.worst_budget, self.opacities)
-        # To first order, an error falls by gradient * o / 2 if the opacity o is halved.
-        if uses_gradient:
-            return select_fewest(gradient * self.opacities.detach() / 2, self.excess)
-        # What the photograph does not see has no gradient.
-        return gradient != 0
-
-    def find_at_worst_pixels(self, added: Gaussians) -> Bool[Tensor, "n"]:
-        """Find Gaussians at the fewest pixels that account for the excess."""
-        image_after = self.image.detach().clamp(0, 1)
-        image_before = self.check.image_before.clamp(0, 1)
-        after = compute_pixel_errors(image_after, self.worst_budget)
-        before = compute_pixel_errors(image_before, self.worst_budget)
-        relief = after - before
-        pixels = select_fewest(relief.flatten(), self.excess).view(relief.shape)
-        return project_mask(dilate(pixels, PIXEL_RADIUS), added, self.worst_budget.view.camera)
-
-
-def find_over_budget(checks: Sequence[Check], opacities: Float[Tensor, "n"]) -> list[CheckedRender]:
-    """Render all photographs and return those over budget."""
-    rendered = get_view_map(opacities)(partial(render_check, opacities=opacities), checks)
-    return [render for render in rendered if render.excess > 0]
-
-
-def render_check(check: Check, opacities: Float[Tensor, "n"]) -> CheckedRender:
-    """Render the scene at a photograph and compare it with the error budgets.
-
-    Opacities [n] are those of the added Gaussians. The image keeps its gradient, since the same
-    render decides which of them fade.
-    """
-    variable, image = render_with_gradient(check.plan, opacities)
-    clipped = image.detach().clamp(0, 1)
-    sums = [compute_pixel_errors(clipped, budget).sum() for budget in check.budgets]
-    errors = torch.stack(sums).tolist()  # read from a GPU once for all budgets
-
-    # Squared errors and 1 - SSIM have no common unit, so errors are compared relative to limits.
-    used = [
-        error / max(budget.limit, 1e-12)
-        for budget, error in zip(check.budgets, errors, strict=True)
-    ]
-    worst = used.index(max(used))
-    budget = check.budgets[worst]
-    return CheckedRender(check, variable, image, budget, errors[worst] - budget.limit)
-
-
-def is_mostly_faded(
-    added: Float[Tensor, "n"], left: Float[Tensor, "n"], config: PsnrGuardConfig = PsnrGuardConfig()
-) -> bool:
-    """Return True if added Gaussians lost more than `max_opacity_loss` of their opacity."""
-    lost = added.sum() - left.sum()
-    return lost.item() > config.max_opacity_loss * added.sum().item()
-
-
-def select_fewest(relief: Float[Tensor, "n"], needed: float) -> Bool[Tensor, "n"]:
-    """Select the fewest entries whose relief sums to `needed`, or to half of all relief.
-
-    The relief of an entry is what the error falls by if it changes. It is a first-order estimate,
-    so the other half is re-evaluated after the change.
-    """
-    helpful = (relief > 0).nonzero()[:, 0]
-    # Stable, so that the result does not depend on how equal entries are sorted.
-    most_first, order = relief[helpful].sort(descending=True, stable=True)
-    enough = min(needed, most_first.sum().item() / 2)
-    # An entry is taken as long as those before it do not suffice.
-    relief_before = most_first.cumsum(0) - most_first
-    taken = helpful[order[relief_before < enough]]
-    return torch.zeros_like(relief, dtype=torch.bool).index_fill(0, taken, True)
-
-
-def compute_mse_and_gradient(
-    plan: OpacityRender, view: View, opacities: Float[Tensor, "n"]
-) -> tuple[float, Float[Tensor, "n"]]:
-    """Compute the mean squared error against a photograph and its gradient in the opacities.
-
-    The error is that of the clipped image, as it is shown. The gradient is that of the image as it
-    is rendered, since a clipped value has none.
-    """
-    variable, image = render_with_gradient(plan, opacities)
-    gradient = compute_gradient(image, ErrorBudget(view, "mse", 0.0), variable)
-    error = compute_squared_error(view.fill_ignored(image.detach()), view.image).item()
-    return error, gradient
-
-
-def render_with_gradient(
-    plan: OpacityRender, opacities: Float[Tensor, "n"]
-) -> tuple[Float[Tensor, "n"], Float[Tensor, "h w 3"]]:
-    """Render with opacities as the variable of gradients."""
-    with torch.enable_grad():
-        variable = opacities.detach().clone().requires_grad_()
-        return variable, plan(variable).image
-
-
-def compute_gradient(
-    image: Float[Tensor, "h w 3"], budget: ErrorBudget, variable: Float[Tensor, "n"]
-) -> Float[Tensor, "n"]:
-    """Differentiate the error that a budget limits."""
-    with torch.enable_grad():
-        error = compute_pixel_errors(image, budget).sum()
-    return torch.autograd.grad(error, variable)[0]
-
-
-def compute_squared_error(
-    image: Float[Tensor, "h w 3"], photograph: Float[Tensor, "h w 3"]
-) -> Tensor:
-    """Compute the mean squared error of an image clipped to [0, 1]."""
-    return (image.clamp(0, 1) - photograph).square().mean()
-
-
-def add_psnr_loss(error: float, decibel: float) -> float:
-    """Compute the mean squared error after a loss of PSNR in dB."""
-    return error * 10 ** (decibel / 10)

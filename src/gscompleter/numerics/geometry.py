@@ -8,7 +8,7 @@ from dataclasses import replace
 from typing import Literal
 
 import torch
-from jaxtyping import Bool, Float
+from jaxtyping import Bool, Float, Shaped
 from torch import Tensor
 from torch.nn.functional import normalize
 
@@ -259,8 +259,16 @@ def project_mask(
     mask: Bool[Tensor, "h w"], gaussians: Gaussians, camera: Camera
 ) -> Bool[Tensor, "n"]:
     """Find Gaussians whose means project into `mask`."""
+    return look_up(mask, gaussians, camera)
+
+
+def look_up(
+    values: Shaped[Tensor, "h w"], gaussians: Gaussians, camera: Camera
+) -> Shaped[Tensor, "n"]:
+    """Look up the value of the pixel that each mean projects to; 0 outside of the image."""
     pixels, z = project(gaussians.means, camera)
     seen = is_inside(pixels, z, camera)
-    # Pixels outside must not be looked up; they are (0, 0) here and excluded by `seen`.
+    # Pixels outside must not be looked up; they are (0, 0) here and replaced afterwards.
     x, y = pixels.where(seen[:, None], 0.0).long().unbind(-1)
-    return seen & mask[y, x]
+    looked_up = values[y, x]
+    return looked_up.where(seen, torch.zeros_like(looked_up))

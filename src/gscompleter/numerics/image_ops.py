@@ -5,8 +5,9 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 import cv2
+import numpy as np
 import torch
-from jaxtyping import Bool, Float
+from jaxtyping import Bool, Float, Int64
 from torch import Tensor
 from torch.nn.functional import avg_pool2d, interpolate, max_pool2d, pad
 
@@ -100,6 +101,13 @@ def dilate(mask: Bool[Tensor, "h w"], radius: int) -> Bool[Tensor, "h w"]:
     for size, padding in (((1, side), (0, radius)), ((side, 1), (radius, 0))):
         grown = max_pool2d(grown, size, stride=1, padding=padding)
     return grown[0, 0] > 0
+
+
+def label_regions(mask: Bool[Tensor, "h w"]) -> tuple[Int64[Tensor, "h w"], int]:
+    """Label the connected regions of `mask` (8 neighbours) from 1, and count the labels with 0."""
+    pixels = mask.cpu().numpy().astype(np.uint8)
+    count, labels = cv2.connectedComponents(pixels, connectivity=8)
+    return torch.from_numpy(labels).long().to(mask.device), count
 
 
 def is_enclosed(mask: Bool[Tensor, "h w"]) -> bool:

@@ -9,7 +9,7 @@ from collections.abc import Sequence
 from dataclasses import replace
 
 import torch
-from jaxtyping import Float
+from jaxtyping import Bool, Float
 from torch import Tensor
 
 from gscompleter.config import CompleterConfig
@@ -62,15 +62,23 @@ def compute_error(image: Float[Tensor, "h w 3"], view: View) -> Float[Tensor, ""
 def match_new_photo(photo: View, view: TargetView) -> Float[Tensor, "h w 3"]:
     """Match the exposure of a photograph to the scene where the scene is trusted.
 
-    `view` is the scene at the camera of the photograph. If hardly anything there is trusted, the
-    photograph stays as it is.
+    `view` is the scene at the camera of the photograph.
     """
-    image = view.render.image.clamp(0, 1)
     known = photo.valid_mask & ~view.holes & (view.distrust < MAX_DISTRUST)
+    return match_exposure(photo.image, view.render.image, known)
+
+
+def match_exposure(
+    photograph: Float[Tensor, "h w 3"], image: Float[Tensor, "h w 3"], known: Bool[Tensor, "h w"]
+) -> Float[Tensor, "h w 3"]:
+    """Match the exposure of a photograph to a render of the scene, where that is `known` to agree.
+
+    If hardly any pixel is, the photograph stays as it is.
+    """
     if int(known.sum()) < MIN_KNOWN * known.numel():
-        return photo.image
-    gain, offset = fit_robust_affine(photo.image[known], image[known])
-    return (gain * photo.image + offset).clamp(0, 1)
+        return photograph
+    gain, offset = fit_robust_affine(photograph[known], image.clamp(0, 1)[known])
+    return (gain * photograph + offset).clamp(0, 1)
 
 
 def recolor_to_photos(

@@ -59,6 +59,7 @@ def recolor(reference: GeneratedView, view: TargetView, label: int) -> Recolored
         return Recolored(state, view.frozen, 0)
     rows, delta = fit_image_colors(
         merge(state.parts),
+        context.sh.shape[1],
         view.frozen,
         reference,
         weight,
@@ -83,6 +84,7 @@ def recolor(reference: GeneratedView, view: TargetView, label: int) -> Recolored
 
 def fit_image_colors(
     scene: Gaussians,
+    num_sh: int,
     frozen: FrozenScene,
     reference: View,
     weight: Float[Tensor, "h w"],
@@ -93,8 +95,9 @@ def fit_image_colors(
     """Fit colours towards `reference`; return rows of `scene` and the change of their harmonics.
 
     `frozen` is `scene` at the camera of `reference`. Only the m Gaussians of the context, which are
-    the first of `scene`, may change, as far as the `held` views allow. Where `weight`, in [0, 1],
-    is low, the render of `scene` is wanted instead. Equations: "Recolouring" in docs/method.md.
+    the first of `scene`, may change, as far as the `held` views allow; they have k = `num_sh`
+    coefficients per channel, where additions may have more. Where `weight`, in [0, 1], is low, the
+    render of `scene` is wanted instead. Equations: "Recolouring" in docs/method.md.
     """
     # Gaussians are open to change if they show in a pixel that wants another colour. Three
     # channels are backprojected at once: all pixels, wanting pixels, and nothing.
@@ -104,14 +107,18 @@ def fit_image_colors(
     num_context = held.sums.shape[1]
     is_open[num_context:] = False
     rows = torch.nonzero(is_open)[:, 0]
+    sh = scene.sh[rows, :num_sh]
     if len(rows) == 0 or config.iterations == 0:
-        return rows[:0], scene.sh[:0]
+        return rows[:0], sh[:0]
 
     # A Gaussian has k coefficients per channel, of which the target sees one combination, bᵀ sh. Of
     # all changes of that colour, A⁻¹ b is the one that costs the held views least. So one number s
     # per channel is left, and the colour changes by γ s.
-    basis, change = solve_directions(scene, rows, sums[rows], reference.camera, held, config.ridge)
-    colors = 0.5 + torch.einsum("nk,nkc->nc", basis, scene.sh[rows].double())
+    means = scene.means[rows]
+    basis, change = solve_directions(
+        means, num_sh, rows, sums[rows], reference.camera, held, config.ridge
+    )
+    colors = 0.5 + torch.einsum("nk,nkc->nc", basis, sh.double())
     gains = (basis * change).sum(dim=1, keepdim=True)  # γ = bᵀ A⁻¹ b
 
     wanted = torch.lerp(frozen.render.image, reference.image, weight[..., None])
@@ -122,28 +129,30 @@ def fit_image_colors(
     # fifth as many, for the same gain (decision 038).
     is_changed = (gains * steps).abs().amax(dim=1) > config.min_change
     delta = change[is_changed, :, None] * steps[is_changed, None]
-    return rows[is_changed], delta.to(scene.sh)
+    return rows[is_changed], delta.to(sh)
 
 
 def solve_directions(
-    scene: Gaussians,
+    means: Float[Tensor, "c 3"],
+    k: int,
     rows: Int64[Tensor, "c"],
     sums: Float[Tensor, "c"],
     camera: Camera,
     held: HeldViews,
     ridge: float,
 ) -> tuple[Float64[Tensor, "c k"], Float64[Tensor, "c k"]]:
-    """Return the basis b at `camera` and the cheapest change of harmonics, A⁻¹ b, of some rows.
+    """Return the basis b at `camera` and the cheapest change of k harmonics, A⁻¹ b, of some rows.
 
     A = Σ_v weight_v sum_v b_v b_vᵀ + ridge (sum + Σ_v sum_v) I over the held views v, where sums
     are the compositing weights of a Gaussian in an image; `sums` [c] are those at `camera`.
     """
-    k = scene.sh.shape[1]
     centers = torch.cat([held.centers, camera.center.to(held.centers)[None]])
 
-    def solve(chunk: Int64[Tensor, "_"], own: Float[Tensor, "_"]) -> Float64[Tensor, "2 _ k"]:
+    def solve(
+        places: Float[Tensor, "_ 3"], chunk: Int64[Tensor, "_"], own: Float[Tensor, "_"]
+    ) -> Float64[Tensor, "2 _ k"]:
         # In float64, since views beside each other have nearly equal b, and A is close to singular.
-        rays = normalize(scene.means[chunk, None].double() - centers.double(), dim=-1)
+        rays = normalize(places[:, None].double() - centers.double(), dim=-1)
         basis = evaluate_sh_basis(rays.flatten(0, 1), k).unflatten(0, rays.shape[:2])
         held_basis = basis[:, :-1]
         target_basis = basis[:, -1]
@@ -155,7 +164,8 @@ def solve_directions(
         return torch.stack([target_basis, change[..., 0]])
 
     with use_one_torch_thread():
-        chunks = map_in_parallel(solve, rows.split(CHUNK), sums.split(CHUNK))
+        parts = (means.split(CHUNK), rows.split(CHUNK), sums.split(CHUNK))
+        chunks = map_in_parallel(solve, *parts)
     basis, change = torch.cat(chunks, dim=1)
     return basis, change
 

@@ -23,6 +23,9 @@ class CompleteOptions(CompletingOptions):
     poses). If not given, cameras that see holes are searched for and written to targets.json."""
     auto: Annotated[int, Interval(ge=1, le=254)] | None = None
     """Most cameras to search for if no target is given; 4 if no number follows."""
+    from_photographs_only: bool = False
+    """Add only what photographs show and the splat of `--scene` lacks. The generator invents
+    nothing, and there are no targets."""
     dry_run: bool = False
     """Only print the plan, and write its cameras to targets.json, which `--target` reads."""
     out: Path
@@ -38,6 +41,8 @@ class CompleteOptions(CompletingOptions):
     @property
     def max_targets(self) -> int:
         """Number of targets to search for."""
+        if self.from_photographs_only:
+            return 0
         return DEFAULT_NUM_TARGETS if self.auto is None else self.auto
 
 

@@ -152,7 +152,7 @@ class CompletingOptions(SceneOptions, ModelOptions):
     scene: Path | None = None
     """File of Gaussians (a splat) to complete instead of reconstructing the scene; all are kept."""
     no_recolor: bool = False
-    """Keep the colours of the splat, too; Gaussians are only added where it is empty."""
+    """Keep the colours of the splat, too; Gaussians are only added."""
     config: Annotated[CompleterConfig, tyro.conf.FlagConversionOff] = CompleterConfig()
     """Settings of the method, which change those of `--config NAME`."""
 

@@ -128,7 +128,9 @@ def open_completion(
             refuse_results(options.out)
         print_lines(console, *output.describe_others())
         ready = prepare(options, console)
-        models = f"{options.reconstructor} and {options.synthesis.generator}"
+        models = options.reconstructor
+        if not options.from_photographs_only:
+            models += f" and {options.synthesis.generator}"
         plan = describe_task(ready.opened, ready.task, options.max_targets, models, options.out)
         print_lines(console, *plan)
         with output.write() as folder:
@@ -172,6 +174,10 @@ def complete_targets(ready: Prepared) -> tuple[Completion, Prepared]:
     """Complete the scene for the named targets, or for targets that it finds."""
     task = ready.task
     count = ready.options.max_targets
+
+    # What photographs show is added when the completion begins, before any target.
+    if ready.options.from_photographs_only:
+        return ready.begin(), ready
 
     # Too many targets for the labels of a .ply are refused before the first one is completed.
     if task.targets:

@@ -143,12 +143,26 @@ def open_input(options: SceneOptions, console: Console, check: Callable[[], obje
 
 
 def check_targets(options: CompleteOptions) -> None:
-    """Refuse `--target` together with `--auto`."""
+    """Refuse options for targets that exclude each other."""
     if options.target and options.auto is not None:
         raise InputError(
             "--target and --auto are both given; use one of them, and complete the result again "
             "with the other.",
             "auto",
+        )
+    if not options.from_photographs_only:
+        return
+    if options.scene is None:
+        raise InputError(
+            "Without --scene the whole scene is reconstructed from photographs already; name the "
+            "splat that lacks what they show.",
+            "from-photographs-only",
+        )
+    if options.target or options.auto is not None or options.dry_run:
+        raise InputError(
+            "With --from-photographs-only no target is completed; leave --target, --auto and "
+            "--dry-run out.",
+            "from-photographs-only",
         )
 
 

@@ -23,16 +23,21 @@ def describe_task(
 ) -> list[str]:
     """Write the four lines; the cameras of `task` have the working depth range.
 
-    `max_targets` is the number of targets to search for if the task has none, and `models` names Ψ
-    and Φ.
+    `max_targets` is the number of targets to search for if the task has none; 0 for what
+    photographs show alone. `models` names Ψ and Φ.
     """
-    targets = join_names([opened.name_target(target) for target in task.targets], MAX_NAMED)
     files = opened.files
     context = [name_photograph(frame, files.get(frame)) for frame in task.context_frames]
-    if not targets:
-        targets = f"up to {max_targets} cameras that are found"
-        if max_targets == 1:
-            targets = "a camera that is found"
+    goal = f"complete the scene from photographs {join_names(context, MAX_NAMED)}"
+    targets = join_names([opened.name_target(target) for target in task.targets], MAX_NAMED)
+    if targets:
+        goal += f" for {targets}"
+    elif max_targets == 1:
+        goal += " for a camera that is found"
+    elif max_targets > 1:
+        goal += f" for up to {max_targets} cameras that are found"
+    else:
+        goal = f"add what photographs {join_names(context, MAX_NAMED)} show and the splat lacks"
 
     # On a GPU the splat is in its memory, not in that of the machine.
     needed = estimate_memory(task, task.scene if task.device.type == "cpu" else None)
@@ -40,8 +45,7 @@ def describe_task(
     of = "" if available is None else f" of {format_whole_gigabytes(available)}"
     return [
         *describe_opening(opened, task),
-        f"To do: complete the scene from photographs {join_names(context, MAX_NAMED)} for "
-        f"{targets} by {models} on {task.device.type}, written to {quote_value(out)}.",
+        f"To do: {goal} by {models} on {task.device.type}, written to {quote_value(out)}.",
         f"Memory: up to {format_whole_gigabytes(needed)}{of}.",
     ]
 

@@ -220,6 +220,8 @@ def make_target_row(
 def count_changes(completion: Completion) -> dict[str, Any]:
     """Count the Gaussians and, of a splat, the photographs that it was not trained on."""
     counts = {"context": len(completion.context), "added": len(completion.added)}
+    if completion.is_given:
+        counts["from_photographs"] = completion.num_observed
     num_removed = int(completion.source.gone_mask.sum())
     if num_removed:
         counts["removed"] = num_removed

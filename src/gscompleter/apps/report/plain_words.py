@@ -147,10 +147,17 @@ def describe_ignored(summary: CompletionSummary) -> str:
 
 def list_splat_notes(summary: CompletionSummary) -> Iterator[str]:
     """List the notes on what photographs bring to a splat."""
-    if summary.new_photographs == 0:
+    from_photographs = summary.gaussians.get("from_photographs")
+    if from_photographs:
+        invented = summary.gaussians["added"] - from_photographs
+        yield (
+            f"{from_photographs:,} of the added Gaussians come from photographs, which show what "
+            f"the splat lacked; the generator invented {invented:,}."
+        )
+    if summary.new_photographs == 0 and not from_photographs:
         yield NOTHING_NEW_NOTE
         yield describe_wanted_photographs(summary.targets)
-    elif summary.new_photographs is not None:
+    elif summary.new_photographs:
         yield (
             f"The splat does not reproduce {summary.new_photographs} of the photographs; it is "
             "recoloured to them, which helps most."

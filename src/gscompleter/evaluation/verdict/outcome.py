@@ -61,8 +61,12 @@ def judge_completion(completion: Completion, held_out: Sequence[HeldOutRow]) -> 
     failure = explain_unreconstructed(completion, held_out) if is_reconstructed else None
     if failure is not None:
         return OutcomeRow("not-reconstructed", failure)
-    # A target added or recoloured something, or a new photograph recoloured the context.
-    has_gained = bool(completion.recolored_mask.any()) or count_changed(completion.targets) > 0
+    # A target added or recoloured something, or photographs added to a splat or recoloured it.
+    has_gained = (
+        completion.num_observed > 0
+        or bool(completion.recolored_mask.any())
+        or count_changed(completion.targets) > 0
+    )
     if not has_gained:
         return OutcomeRow("nothing-gained", explain_no_gain(completion))
     work = describe_work(completion)
@@ -144,10 +148,13 @@ def count_changed(targets: Sequence[TargetResult]) -> int:
 def describe_work(completion: Completion) -> str:
     """Describe in a clause what was done, and for how many of several targets."""
     has_added = any(len(result.added) > 0 for result in completion.targets)
+    has_observed = completion.num_observed > 0
     if completion.source.gone_mask.any():
         work = "The selection is removed and its place is filled"
     elif has_added:
         work = f"The {'splat' if completion.is_given else 'scene'} is completed"
+    elif has_observed:
+        return "What photographs show and the splat lacked is added"
     else:
         return "Nothing was added to the splat; only colours changed"
     changed = count_changed(completion.targets)

@@ -1,0 +1,289 @@
+"""What photographs show and a given scene lacks; it goes in before Φ invents (not in the paper).
+
+Φ warps photographs through the depth of the scene, and a hole has none: the image at a target is a
+blur where eight photographs show a box. So Ψ reconstructs the photographs that show what is
+missing, as it reconstructs a context without a scene. Its Gaussians of these pixels are registered
+to the scene by Eq. 8 and 9 at the photographs, selected by Eq. 12 at the photographs, and refined
+against all of them, since each is a true image (decision 051).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import torch
+from jaxtyping import Bool
+from torch import Tensor
+
+from gscompleter.numerics.geometry import compute_z_depths, look_up, select_spread_cameras
+from gscompleter.numerics.image_ops import dilate, label_regions
+from gscompleter.reconstructors import Reconstructor, run_reconstructor
+from gscompleter.render.cache import SceneRenderer
+from gscompleter.render.fit_colors import RELAXATION, fit_colors
+from gscompleter.render.protocols import FrozenScene
+from gscompleter.render.reference import adapt_to_mode
+from gscompleter.stages.align_depth import fit_affine
+from gscompleter.stages.error_budgets import meet_error_budgets
+from gscompleter.stages.new_photos import match_exposure
+from gscompleter.stages.refine import refine_opacities
+from gscompleter.stages.register import apply_affine
+from gscompleter.stages.select_anchor import find_nearest_view
+from gscompleter.stages.target_view import compute_hole_mask
+from gscompleter.state import NEW_PHOTO_ID, Completion
+from gscompleter.system.progress import track
+from gscompleter.trust.photometric import compute_color_difference
+from gscompleter.types import DepthMap, Gaussians, Reconstruction, View, merge
+
+MAX_ROUNDS = 3
+"""Most reconstructions. One fills what it sees; a further one serves photographs elsewhere."""
+MAX_PHOTOS = 8
+"""Most photographs of one reconstruction, spread over those that show something missing."""
+MIN_SHARE = 0.002
+"""Smallest share of a photograph that is worth adding."""
+MIN_REGION = 0.005
+"""Smallest contradicted region, as a share of the photograph. In a splat that lacks nothing, such
+as the fox, edges and highlights make up to 0.4 %."""
+MIN_WITNESSES = 2
+"""Fewest photographs that have to contradict a scene: one alone may show something that moved."""
+MIN_DIFFERENCE = 0.06
+"""Smallest colour difference, in [0, 1], by which a scene contradicts a photograph."""
+MAX_DIFFERENCE_RATIO = 4.0
+"""Multiple of the median difference of this scene that such a difference has to exceed, too."""
+NEARER = 0.97
+"""Ratio to the depth of the scene below which a photograph shows something in front of it."""
+MIN_NEARER = 0.5
+"""Smallest share of the measured pixels of a contradicted region that have to be nearer."""
+SAME_SURFACE = 0.03
+"""Relative distance from the depth of a photograph within which a Gaussian is what it shows."""
+COLOR_ROUNDS = 5
+"""Rounds in which colours are fitted to all photographs."""
+
+
+@dataclass(frozen=True)
+class Lack:
+    """Pixels of a photograph in which the scene does not show what the photograph shows."""
+
+    empty: Bool[Tensor, "h w"]
+    """The scene is empty: A < τ."""
+    contradicted: Bool[Tensor, "h w"]
+    """The scene is covered and has another colour, in regions that are large enough."""
+
+    @property
+    def mask(self) -> Bool[Tensor, "h w"]:
+        """All of these pixels."""
+        return self.empty | self.contradicted
+
+    @property
+    def share(self) -> float:
+        """Share of the image."""
+        return self.mask.float().mean().item()
+
+
+@dataclass(frozen=True)
+class Evidence:
+    """A photograph that shows something missing, and the scene at its camera."""
+
+    view: View
+    frozen: FrozenScene
+    lack: Lack
+
+
+def add_observed(
+    reconstructor: Reconstructor, state: Completion, scenes: SceneRenderer, rng: torch.Generator
+) -> Completion:
+    """Add what photographs show and the scene lacks, and count it in `num_observed`.
+
+    Nothing changes for a context that Ψ reconstructed: it has what its photographs show.
+    """
+    if not state.is_given or not state.config.add_observed:
+        return state
+    views = [photo.view for photo in state.photos]
+    for _ in track(range(MAX_ROUNDS), "Adding what photographs show"):
+        frozen = scenes.freeze_at(state.parts, [view.camera for view in views])
+        lacks = find_lacks(state, frozen)
+        chosen = choose_photographs(views, lacks)
+        if not chosen:
+            break
+        photos = [Evidence(views[i], frozen[i], lacks[i]) for i in chosen]
+        part = reconstruct_lacking(reconstructor, photos, state, rng)
+        part = fit_to_photographs(part, frozen, state)
+        # What was found and could not be added would be found again.
+        if len(part) == 0:
+            break
+        state = replace(
+            state, parts=(*state.parts, part), num_observed=state.num_observed + len(part)
+        )
+    return state
+
+
+def find_lacks(state: Completion, frozen: Sequence[FrozenScene]) -> list[Lack]:
+    """Find what the scene lacks in each photograph, apart from pixels that are ignored."""
+    views = [photo.view for photo in state.photos]
+    renders = [scene.render for scene in frozen]
+    differences = [
+        compute_color_difference(render, view) for render, view in zip(renders, views, strict=True)
+    ]
+    # A difference that is usual in this scene is no contradiction.
+    medians = [
+        difference[view.valid_mask].median()
+        for difference, view in zip(differences, views, strict=True)
+    ]
+    usual = torch.stack(medians).median().item()
+    limit = max(MIN_DIFFERENCE, MAX_DIFFERENCE_RATIO * usual)
+
+    lacks: list[Lack] = []
+    for render, view, difference in zip(renders, views, differences, strict=True):
+        is_usable = view.valid_mask
+        if view.dynamic_mask is not None:
+            is_usable = is_usable & ~view.dynamic_mask
+        empty = compute_hole_mask(render.alpha, state.config.holes) & is_usable
+        contradicted = (difference > limit) & is_usable & ~empty
+        lacks.append(Lack(empty, keep_large_regions(contradicted)))
+    if sum(bool(lack.contradicted.any()) for lack in lacks) < MIN_WITNESSES:
+        lacks = [Lack(lack.empty, torch.zeros_like(lack.empty)) for lack in lacks]
+    return lacks
+
+
+def keep_large_regions(mask: Bool[Tensor, "h w"]) -> Bool[Tensor, "h w"]:
+    """Keep connected regions of at least `MIN_REGION` of the image."""
+    labels, count = label_regions(mask)
+    is_large = torch.bincount(labels.flatten(), minlength=count) >= MIN_REGION * mask.numel()
+    is_large[0] = False  # the background
+    return is_large[labels]
+
+
+def choose_photographs(views: Sequence[View], lacks: Sequence[Lack]) -> list[int]:
+    """Choose photographs that show together what the scene lacks; none if no two show anything.
+
+    A single photograph has no stereo, so that it gets the one that is taken closest to it.
+    """
+    showing = [index for index, lack in enumerate(lacks) if lack.share >= MIN_SHARE]
+    if not showing or len(views) < 2:
+        return []
+    # The networks need images of one size; check views may be smaller than the context.
+    most = max(showing, key=lambda index: lacks[index].share)
+    size = views[most].image.shape
+    alike = [index for index, view in enumerate(views) if view.image.shape == size]
+    showing = [index for index in showing if index in alike]
+    if len(showing) == 1:
+        others = [index for index in alike if index != most]
+        if not others:
+            return []
+        nearest = find_nearest_view(views[most].camera, [views[index] for index in others])
+        showing.append(others[nearest])
+    # Spread over all of them: eight neighbours left the far photographs 1.4 dB lower.
+    spread = select_spread_cameras([views[index].camera for index in showing], MAX_PHOTOS)
+    return sorted(showing[index] for index in spread)
+
+
+def reconstruct_lacking(
+    reconstructor: Reconstructor,
+    photos: Sequence[Evidence],
+    state: Completion,
+    rng: torch.Generator,
+) -> Gaussians:
+    """Reconstruct photographs and keep the Gaussians of what the scene lacks, registered to it."""
+    views = []
+    for photo in photos:
+        known = photo.view.valid_mask & ~photo.lack.mask
+        image = match_exposure(photo.view.image, photo.frozen.render.image, known)
+        views.append(replace(photo.view, image=image))
+    reconstruction = run_reconstructor(reconstructor, views)
+
+    # D_pred is Ψ's depth of a photograph, D_ctx that of the scene there, where it is not wrong.
+    affines = []
+    masks = []
+    for photo, predicted in zip(photos, reconstruction.depths, strict=True):
+        scene = photo.frozen.render.depth_map()
+        affine = fit_affine(predicted, replace(scene, valid=scene.valid & ~photo.lack.mask), rng)
+        depth = replace(predicted, depth=affine.scale * predicted.depth + affine.shift)
+        masks.append(select_pixels(photo.lack, depth, scene, state.config.holes.dilation))
+        affines.append(affine)
+
+    shown = find_shown(reconstruction, views, masks)
+    if reconstruction.view_index is None:
+        # A Ψ that is not pixel-aligned does not say from which camera a Gaussian could slide.
+        parts = [
+            adapt_to_mode(state.rendered_context, reconstruction.gaussians[shown], views[0].camera)
+        ]
+    else:
+        parts = []
+        for number, (view, affine) in enumerate(zip(views, affines, strict=True)):
+            own = shown & (reconstruction.view_index == number)
+            moved = apply_affine(reconstruction.gaussians[own], affine, view.camera)
+            parts.append(adapt_to_mode(state.rendered_context, moved, view.camera))
+    part = merge(parts)
+    # No more harmonics than the scene has, whose file has no place for them. The fit of colours
+    # that follows makes up for them.
+    return replace(
+        part,
+        sh=part.sh[:, : state.context.sh.shape[1]],
+        generated=torch.full_like(part.generated, NEW_PHOTO_ID),
+        encoded=None,
+    )
+
+
+def select_pixels(
+    lack: Lack, photographed: DepthMap, scene: DepthMap, dilation: int
+) -> Bool[Tensor, "h w"]:
+    """Select the pixels of a photograph whose Gaussians are added (Eq. 12 at the photograph).
+
+    Of contradicted regions these are pixels at which the photographs measure something in front of
+    the scene. What they see through to cannot be mended by adding, since the scene hides it.
+    """
+    nearer = photographed.depth < NEARER * scene.depth
+    labels, count = label_regions(lack.contradicted)
+    # A region counts as a whole, by the pixels with a measured depth: a few of them in any region
+    # are wrong.
+    measured = lack.contradicted & photographed.valid & scene.valid
+    num_measured = torch.bincount(labels[measured], minlength=count)
+    num_nearer = torch.bincount(labels[measured & nearer], minlength=count)
+    is_in_front = (num_measured > 0) & (num_nearer >= MIN_NEARER * num_measured)
+    # Only empty pixels have a seam that has to be covered: around others the scene is right, and
+    # better than what Ψ makes of a few photographs.
+    return dilate(lack.empty, dilation) | (lack.contradicted & is_in_front[labels] & nearer)
+
+
+def find_shown(
+    reconstruction: Reconstruction, views: Sequence[View], masks: Sequence[Bool[Tensor, "h w"]]
+) -> Bool[Tensor, "n"]:
+    """Find the Gaussians that any photograph shows in its mask.
+
+    The source pixel alone does not tell: of the Gaussians of one surface in several photographs Ψ
+    keeps one, whose own pixel may lie outside of the mask there. With it alone the box needed four
+    rounds, and the photographs ended 1.5 dB lower.
+    """
+    gaussians = reconstruction.gaussians
+    shown = torch.zeros(len(gaussians), dtype=torch.bool, device=gaussians.means.device)
+    for number, (view, mask) in enumerate(zip(views, masks, strict=True)):
+        z = compute_z_depths(gaussians.means, view.camera)
+        depth = look_up(reconstruction.depths[number].depth, gaussians, view.camera)
+        is_visible = (z - depth).abs() < SAME_SURFACE * depth
+        shown |= is_visible & look_up(mask, gaussians, view.camera)
+        if reconstruction.view_index is not None and reconstruction.pixel_index is not None:
+            own = reconstruction.view_index == number
+            shown |= own & mask.flatten()[reconstruction.pixel_index.where(own, 0)]
+    return shown
+
+
+def fit_to_photographs(
+    part: Gaussians, frozen: Sequence[FrozenScene], state: Completion
+) -> Gaussians:
+    """Fit new Gaussians to all photographs that see them, and let none of these get worse.
+
+    Colours, then opacities (Eq. 13): photographs are true images, so each has the weight 1.
+    """
+    if len(part) == 0:
+        return part
+    views = [photo.view for photo in state.photos]
+    wanted = [
+        replace(view, image=scene.render.image.where(~view.valid_mask[..., None], view.image))
+        for view, scene in zip(views, frozen, strict=True)
+    ]
+    colored = fit_colors(part, frozen, wanted, [RELAXATION] * COLOR_ROUNDS)
+    plans = [scene.vary_opacities(colored) for scene in frozen]
+    settings = replace(state.config.refine, target_weight=1.0)
+    refined, _ = refine_opacities(colored, plans[0], views[0], plans[1:], views[1:], settings)
+    budgets = [photo.budgets for photo in state.photos]
+    return meet_error_budgets(refined, frozen, budgets, plans, state.config.psnr_guard)

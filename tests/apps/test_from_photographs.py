@@ -1,0 +1,97 @@
+"""`complete --scene`: what photographs show and a splat lacks comes from them."""
+
+import json
+from pathlib import Path
+
+import numpy as np
+import plyfile
+import pytest
+import torch
+
+from command import run
+from gscompleter import load_ply, save_ply
+from gscompleter.state import NEW_PHOTO_ID
+from gscompleter.types import merge
+from scenes import Room, camera_at, gaussians_of, photographed, view_of
+
+SIZE = 96
+PLACES = (-0.6, -0.3, 0.0, 0.3, 0.6)
+CAMERAS = [camera_at(x, size=SIZE) for x in PLACES]
+TARGET = 2
+
+
+@pytest.fixture(scope="module")
+def room(tmp_path_factory) -> Path:
+    return photographed(tmp_path_factory.mktemp("room"), CAMERAS)
+
+
+@pytest.fixture(scope="module")
+def cut(tmp_path_factory) -> Path:
+    """Return a splat of the room without what stands near its middle: a hole at each photograph."""
+    whole = merge([gaussians_of(view_of(Room(), CAMERAS[index])) for index in (0, 2, 4)])
+    low, high = torch.tensor(Room().boxes[1])
+    is_gone = ((whole.means > low - 0.05) & (whole.means < high + 0.05)).all(dim=1)
+    path = tmp_path_factory.mktemp("splat") / "cut.ply"
+    save_ply(path, whole[~is_gone])
+    return path
+
+
+def read_summary(out: Path) -> dict:
+    return json.loads((out / "summary.json").read_text())
+
+
+def test_the_generator_invents_only_what_no_photograph_shows(
+    room, cut, tmp_path, monkeypatch, capsys
+):
+    out = tmp_path / "out"
+    words = ("complete", room, "--scene", cut, "--target", TARGET, "--far", 20, "--out", out)
+    assert run(monkeypatch, *words) == 0
+    summary = read_summary(out)
+    counts = summary["gaussians"]
+    assert 100 < counts["from_photographs"] <= counts["added"]
+    # Every photograph gains: it sees what it showed.
+    for row in summary["context"]:
+        assert row["psnr_after"] > row["psnr_before"] + 3
+    (target,) = summary["targets"]
+    assert target["psnr_after"] > target["psnr_before"] + 3
+    said = capsys.readouterr().out
+    assert f"{counts['from_photographs']:,} of the added Gaussians come from photographs" in said
+    assert "The splat reproduces all photographs" not in said
+    generated = load_ply(out / "completed.ply").generated
+    assert int((generated == NEW_PHOTO_ID).sum()) >= counts["from_photographs"]
+
+    back = tmp_path / "back.ply"
+    assert run(monkeypatch, "strip", out / "completed.ply", "--out", back, "--quiet") == 0
+    assert back.read_bytes() == cut.read_bytes()
+
+
+def test_without_the_generator_there_are_no_targets(room, cut, tmp_path, monkeypatch, capsys):
+    out = tmp_path / "out"
+    words = ("complete", room, "--scene", cut, "--far", 20, "--out", out)
+    assert run(monkeypatch, *words, "--from-photographs-only") == 0
+    summary = read_summary(out)
+    assert summary["targets"] == []
+    assert summary["gaussians"]["from_photographs"] == summary["gaussians"]["added"] > 100
+    assert summary["outcome"]["status"] == "completed"
+    printed = capsys.readouterr()
+    assert printed.out.startswith("What photographs show and the splat lacked is added")
+    assert "show and the splat lacks by plane-sweep on cpu" in printed.err
+    rows = plyfile.PlyData.read(str(out / "completed.ply"))["vertex"].data
+    assert set(np.unique(rows["generated"])) == {0, NEW_PHOTO_ID}
+
+
+@pytest.mark.parametrize(
+    ("more", "sentence"),
+    [
+        ((), "name the splat that lacks what they show (--from-photographs-only)"),
+        (("--scene", "x.ply", "--target", 1), "leave --target, --auto and --dry-run out"),
+        (("--scene", "x.ply", "--auto", 2), "leave --target, --auto and --dry-run out"),
+        (("--scene", "x.ply", "--dry-run"), "leave --target, --auto and --dry-run out"),
+    ],
+)
+def test_what_does_not_go_together_is_refused(room, tmp_path, monkeypatch, capsys, more, sentence):
+    out = tmp_path / "out"
+    words = ("complete", room, "--out", out, "--from-photographs-only", *more)
+    assert run(monkeypatch, *words) == 2
+    assert sentence in capsys.readouterr().err
+    assert not out.exists()

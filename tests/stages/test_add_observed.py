@@ -1,0 +1,169 @@
+"""What photographs show and a given scene lacks is added before any target."""
+
+from dataclasses import replace
+
+import pytest
+import torch
+
+from gscompleter import GSCompleter, load_renderer
+from gscompleter.config import CompleterConfig
+from gscompleter.evaluation.metrics.image import psnr
+from gscompleter.numerics.geometry import project
+from gscompleter.stages.add_observed import (
+    Lack,
+    choose_photographs,
+    keep_large_regions,
+    select_pixels,
+)
+from gscompleter.state import NEW_PHOTO_ID
+from gscompleter.types import DepthMap, Gaussians, Reconstruction, View, merge
+from scenes import Room, camera_at, gaussians_of, reconstruction_of, view_of
+
+SIZE = 64
+RENDERER = load_renderer("cpu")
+ROOM = Room()
+EMPTY_ROOM = Room(boxes=ROOM.boxes[:1])
+PLACES = (-0.6, -0.3, 0.0, 0.3, 0.6)
+PHOTOS = [view_of(ROOM, camera_at(x, size=SIZE), k) for k, x in enumerate(PLACES)]
+SPLAT = CompleterConfig.splat()
+
+
+def make_scene() -> Gaussians:
+    """Make the room as three of the photographs show it."""
+    return merge([gaussians_of(PHOTOS[index]) for index in (0, 2, 4)])
+
+
+def is_in_front_box(scene: Gaussians) -> torch.Tensor:
+    low, high = ROOM.boxes[1]
+    margin = 0.05
+    above = (scene.means > torch.tensor(low) - margin).all(dim=1)
+    return above & (scene.means < torch.tensor(high) + margin).all(dim=1)
+
+
+WHOLE = make_scene()
+PHOTOS = [replace(v, image=RENDERER.render(WHOLE, v.camera).image.clamp(0, 1)) for v in PHOTOS]
+"""Photographs that the whole scene reproduces exactly."""
+CUT = WHOLE[~is_in_front_box(WHOLE)]
+"""The scene without the front box: a hole that all photographs show."""
+
+
+def reconstruct_exactly(views: list[View]) -> Reconstruction:
+    """Reconstruct photographs as an ideal Ψ: the true surface of each pixel."""
+    return reconstruction_of(views, [view.depth for view in views])
+
+
+def begin(scene: Gaussians, config: CompleterConfig = SPLAT, photos=PHOTOS):
+    return GSCompleter(reconstruct_exactly, config=config).begin(photos[:2], scene, photos[2:])
+
+
+def score(scene: Gaussians) -> list[float]:
+    return [psnr(RENDERER.render(scene, v.camera).image.clamp(0, 1), v.image) for v in PHOTOS]
+
+
+def test_a_hole_that_photographs_show_is_filled_from_them():
+    state = begin(CUT)
+    assert state.num_observed == len(state.added) > 100
+    assert (state.added.generated == NEW_PHOTO_ID).all()
+    for before, after in zip(score(CUT), score(state.scene), strict=True):
+        assert after > before + 8
+    # What was given stays, bit for bit.
+    assert torch.equal(state.scene.means[: len(CUT)], CUT.means)
+
+
+def test_what_stands_before_a_wall_that_the_scene_shows_is_added():
+    # The front box is gone, and one sees the wall that stood behind it.
+    wall = gaussians_of(view_of(EMPTY_ROOM, PHOTOS[2].camera))
+    pixels = gaussians_of(view_of(ROOM, PHOTOS[2].camera))
+    behind = merge([CUT, wall[is_in_front_box(pixels)]])
+    state = begin(behind)
+    assert state.num_observed > 100
+    for before, after in zip(score(behind), score(state.scene), strict=True):
+        assert after > before + 2
+    # The additions are the boxes, not the walls behind them.
+    _, z = project(state.added.means, PHOTOS[2].camera)
+    assert z.quantile(0.9) < 4.0
+
+
+def test_a_scene_that_lacks_nothing_is_left_alone():
+    state = begin(WHOLE)
+    assert state.num_observed == 0
+    assert len(state.parts) == 1
+
+
+@pytest.mark.parametrize(
+    "config", [replace(SPLAT, add_observed=False), CompleterConfig.paper(), SPLAT.for_removal()]
+)
+def test_the_paper_and_a_removal_add_nothing_from_photographs(config):
+    assert begin(CUT, config).num_observed == 0
+
+
+def test_a_context_without_a_given_scene_is_what_its_photographs_show():
+    state = GSCompleter(reconstruct_exactly).begin(PHOTOS[:2])
+    assert state.num_observed == 0
+
+
+def test_ignored_pixels_show_nothing():
+    everywhere = torch.ones(SIZE, SIZE, dtype=torch.bool)
+    everywhere[:8] = False  # the ceiling, which the scene has
+    hidden = [replace(photo, ignore_mask=everywhere) for photo in PHOTOS]
+    assert begin(CUT, photos=hidden).num_observed == 0
+
+
+def test_no_photograph_gets_worse_by_a_wrong_reconstruction():
+    def reconstruct_wrongly(views: list[View]) -> Reconstruction:
+        exact = reconstruct_exactly(views)
+        # Twice as far as they are; the depths that are compared with the scene stay right.
+        far = replace(exact.gaussians, means=2 * exact.gaussians.means)
+        return replace(exact, gaussians=far)
+
+    state = GSCompleter(reconstruct_wrongly, config=SPLAT).begin(PHOTOS[:2], CUT, PHOTOS[2:])
+    for before, after in zip(score(CUT), score(state.scene), strict=True):
+        assert after > before - 0.02
+
+
+def make_lack(empty: float, contradicted: float = 0.0) -> Lack:
+    """Make a lack with shares of the image, in rows from the top and from the bottom."""
+    rows = torch.arange(100)[:, None].expand(100, 100)
+    return Lack(rows < 100 * empty, rows >= 100 * (1 - contradicted))
+
+
+def test_photographs_that_show_nothing_new_are_not_reconstructed():
+    views = [PHOTOS[index] for index in range(3)]
+    assert choose_photographs(views, [make_lack(0.0)] * 3) == []
+    # A single one gets the nearest as its stereo partner.
+    assert choose_photographs(views, [make_lack(0.1), make_lack(0.0), make_lack(0.0)]) == [0, 1]
+    assert choose_photographs(views[:1], [make_lack(0.1)]) == []
+    small = view_of(ROOM, camera_at(0.1, size=32))
+    assert choose_photographs([*views, small], [make_lack(0.1)] * 4) == [0, 1, 2]
+
+
+def test_small_regions_are_no_contradiction():
+    mask = torch.zeros(100, 100, dtype=torch.bool)
+    mask[10:12, 10:12] = True
+    mask[50:60, 50:60] = True
+    kept = keep_large_regions(mask)
+    assert int(kept.sum()) == 100
+    assert kept[50, 50]
+
+
+def test_only_what_is_nearer_than_the_scene_can_be_added():
+    lack = make_lack(0.0, contradicted=0.2)
+    everywhere = torch.ones(100, 100, dtype=torch.bool)
+    scene = DepthMap(torch.full((100, 100), 4.0), everywhere, torch.ones(100, 100))
+    nearer = replace(scene, depth=torch.full((100, 100), 3.0))
+    farther = replace(scene, depth=torch.full((100, 100), 5.0))
+    assert int(select_pixels(lack, nearer, scene, 3).sum()) == 2000
+    assert int(select_pixels(lack, farther, scene, 3).sum()) == 0
+    # Most of a region decides, and of that region the nearer pixels are taken.
+    mixed = replace(nearer, depth=nearer.depth.clone())
+    mixed.depth[80:85] = 5.0
+    assert int(select_pixels(lack, mixed, scene, 3).sum()) == 1500
+    mixed.depth[80:92] = 5.0
+    assert int(select_pixels(lack, mixed, scene, 3).sum()) == 0
+
+
+def test_an_empty_region_is_widened_over_its_seam():
+    lack = make_lack(0.1)
+    everywhere = torch.ones(100, 100, dtype=torch.bool)
+    scene = DepthMap(torch.full((100, 100), 4.0), everywhere, torch.ones(100, 100))
+    assert int(select_pixels(lack, scene, scene, 3).sum()) == 1300
