@@ -201,7 +201,7 @@ def reconstruct_lacking(
         masks.append(select_pixels(photo.lack, depth, scene, state.config.holes.dilation))
         affines.append(affine)
 
-    shown = find_shown(reconstruction, views, masks)
+    shown = find_photographed(reconstruction, views, masks)
     if reconstruction.view_index is None:
         # A Ψ that is not pixel-aligned does not say from which camera a Gaussian could slide.
         parts = [
@@ -245,7 +245,7 @@ def select_pixels(
     return dilate(lack.empty, dilation) | (lack.contradicted & is_in_front[labels] & nearer)
 
 
-def find_shown(
+def find_photographed(
     reconstruction: Reconstruction, views: Sequence[View], masks: Sequence[Bool[Tensor, "h w"]]
 ) -> Bool[Tensor, "n"]:
     """Find the Gaussians that any photograph shows in its mask.

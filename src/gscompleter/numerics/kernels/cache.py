@@ -35,7 +35,8 @@ def njit(**options):
 
 
 def _choose_cache():
-    wanted, folder = os.environ.get(VARIABLE), _find_cache_folder()
+    wanted = os.environ.get(VARIABLE)
+    folder = _find_cache_folder()
     if folder is not None:
         if not wanted or Path(os.path.abspath(wanted)) in Path(os.path.abspath(folder)).parents:
             return KernelCache(folder)

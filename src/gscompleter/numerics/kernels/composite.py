@@ -67,18 +67,22 @@ def merge_lists(begin, end, context, new, used, full, tile_start, entries, depth
     n_splats, _, _, n_start, n_entries = new
     infinity = np.float32(np.inf)
     for tile in range(begin, end):
-        c, n = c_start[tile], n_start[tile]
+        c = c_start[tile]
+        n = n_start[tile]
         c_end, n_end = c + used[tile, 0], n + used[tile, 1]
-        place, depth = tile_start[tile], infinity
+        place = tile_start[tile]
+        depth = infinity
         c_depth = _get_depth(c_splats, c_entries, c, c, c_end, infinity)
         n_depth = _get_depth(n_splats, n_entries, n, n, n_end, infinity)
         while c < c_end and n < n_end:
             if c_depth <= n_depth:
-                depth, entries[place] = c_depth, c_entries[c]
+                depth = c_depth
+                entries[place] = c_entries[c]
                 c += 1
                 c_depth = _get_depth(c_splats, c_entries, c, c, c_end, infinity)
             else:
-                depth, entries[place] = n_depth, len(c_splats) + n_entries[n]
+                depth = n_depth
+                entries[place] = len(c_splats) + n_entries[n]
                 n += 1
                 n_depth = _get_depth(n_splats, n_entries, n, n, n_end, infinity)
             place += 1
@@ -155,7 +159,8 @@ def composite(begin, end, tiles, context, new, frame):
 
         c_begin, c_end = c_start[tile], c_start[tile + 1]
         n_begin, n_end = n_start[tile], n_start[tile + 1]
-        c, n = c_begin, n_begin
+        c = c_begin
+        n = n_begin
         c_depth = _get_depth(c_splats, c_entries, c, c_begin, c_end, infinity)
         n_depth = _get_depth(n_splats, n_entries, n, n_begin, n_end, infinity)
         while open_rows > 0 and (c < c_end or n < n_end):
@@ -212,8 +217,12 @@ def backproject_residual(begin, end, tiles, context, new, photograph, slots, sum
         row_limit[:] = 0
         open_rows = rows
 
-        c, c_begin, c_end = c_start[tile], c_start[tile], c_start[tile + 1]
-        n, n_begin, n_end = n_start[tile], n_start[tile], n_start[tile + 1]
+        c = c_start[tile]
+        c_begin = c_start[tile]
+        c_end = c_start[tile + 1]
+        n = n_start[tile]
+        n_begin = n_start[tile]
+        n_end = n_start[tile + 1]
         c_depth = _get_depth(c_splats, c_entries, c, c_begin, c_end, infinity)
         n_depth = _get_depth(n_splats, n_entries, n, n_begin, n_end, infinity)
         place = np.int64(0)  # with a plain 0, its callees are compiled twice
@@ -241,7 +250,8 @@ def backproject_residual(begin, end, tiles, context, new, photograph, slots, sum
         # The rows of weights lie in the order in which they were written.
         place = 0
         for entry in range(n_begin, n):
-            i, slot = n_entries[entry], slots[entry]
+            i = n_entries[entry]
+            slot = slots[entry]
             first = max(np.int64(n_boxes[i, 2]) - top, 0)
             stop = min(np.int64(n_boxes[i, 3]) - top, TILE)
             simd.sum_weighted_rows(first, stop, place, state, kept, totals)

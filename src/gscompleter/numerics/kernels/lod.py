@@ -24,16 +24,24 @@ def mark_run_starts(begin, end, means, scales, generated, centers, focals, reach
     of it, and is no wider than `largest` pixels, for the smallest pixel of all cameras.
     """
     for block in range(begin, end):
-        pixel, x, y, z = np.float32(-1), np.float32(0), np.float32(0), np.float32(0)
+        pixel = np.float32(-1)
+        x = np.float32(0)
+        y = np.float32(0)
+        z = np.float32(0)
         origin = generated[block * BLOCK]
         for i in range(block * BLOCK, min((block + 1) * BLOCK, len(means))):
-            dx, dy, dz = means[i, 0] - x, means[i, 1] - y, means[i, 2] - z
+            dx = means[i, 0] - x
+            dy = means[i, 1] - y
+            dz = means[i, 2] - z
             size = max(scales[i, 0], scales[i, 1], scales[i, 2])
             apart = dx * dx + dy * dy + dz * dz
             near = size <= largest * pixel and apart <= (reach * pixel) ** 2
             begins[i] = not (near and generated[i] == origin)
             if begins[i]:
-                x, y, z, origin = means[i, 0], means[i, 1], means[i, 2], generated[i]
+                x = means[i, 0]
+                y = means[i, 1]
+                z = means[i, 2]
+                origin = generated[i]
                 pixel = _compute_pixel_size(x, y, z, centers, focals)
                 # Nothing joins a Gaussian that is too wide itself: no distance is below a negative.
                 if size > largest * pixel:
@@ -45,14 +53,18 @@ def _compute_pixel_size(x, y, z, centers, focals):
     """Compute the smallest pixel of all cameras at a point, in scene units."""
     smallest = np.float32(np.inf)
     for k in range(len(centers)):
-        dx, dy, dz = x - centers[k, 0], y - centers[k, 1], z - centers[k, 2]
+        dx = x - centers[k, 0]
+        dy = y - centers[k, 1]
+        dz = z - centers[k, 2]
         smallest = min(smallest, (dx * dx + dy * dy + dz * dz) / (focals[k] * focals[k]))
     return math.sqrt(smallest)
 
 
 @njit(fastmath={"contract"}, error_model="numpy")
 def _compute_cross_section(scales, i):
-    a, b, c = scales[i, 0], scales[i, 1], scales[i, 2]
+    a = scales[i, 0]
+    b = scales[i, 1]
+    c = scales[i, 2]
     return max(a * b, b * c, c * a)
 
 
@@ -71,7 +83,8 @@ def _compute_fullness(thickness):
 @njit(fastmath={"contract"}, error_model="numpy")
 def _compute_shares(first, last, scales, opacities, shares):
     """Write shares of first..last in thickness times cross-section; return largest and total."""
-    total, most = np.float32(0), first
+    total = np.float32(0)
+    most = first
     for i in range(first, last):
         shares[i] = _compute_thickness(opacities[i]) * _compute_cross_section(scales, i)
         total += shares[i]
@@ -99,7 +112,9 @@ def _compute_variance(first, last, shares, means, quats, scales, mean, axis):
     ax, ay, az = axis
     variance = np.float32(0)
     for i in range(first, last):
-        dx, dy, dz = means[i, 0] - mean[0], means[i, 1] - mean[1], means[i, 2] - mean[2]
+        dx = means[i, 0] - mean[0]
+        dy = means[i, 1] - mean[1]
+        dz = means[i, 2] - mean[2]
         squares = (ax * dx + ay * dy + az * dz) ** 2
         own = rotate_by_quat(normalize_quat(quats, i)[0])
         for k in range(3):
@@ -119,7 +134,8 @@ def merge_runs(begin, end, start, gaussians, shares, merged):
     means, quats, scales, opacities, sh = gaussians
     to_means, to_quats, to_scales, to_opacities, to_sh = merged
     for run in range(begin, end):
-        first, last = start[run], start[run + 1]
+        first = start[run]
+        last = start[run + 1]
         most, total = _compute_shares(first, last, scales, opacities, shares)
         _compute_mean(first, last, shares, means, to_means[run])
         _compute_mean(first, last, shares, sh, to_sh[run])

@@ -39,7 +39,8 @@ def run_calls(kernel, calls, threads=None):
     threads = count_threads(threads)
     if threads == 1 or len(calls) == 1:
         return [kernel(*arguments) for arguments in calls]
-    results, waiting = [None] * len(calls), iter(enumerate(calls))
+    results = [None] * len(calls)
+    waiting = iter(enumerate(calls))
 
     def work():
         for number, arguments in waiting:

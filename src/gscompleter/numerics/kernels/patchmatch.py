@@ -88,7 +88,8 @@ def _copy(image, y, x, patch):
 @njit(inline="always")
 def _compute_patch_cost(costs, patch, weight, total, sources, s, sy, sx, sums, bias):
     """Compute the mean squared difference of `patch` and (s, sy, sx) after the best shift."""
-    max_bias, bias_penalty = costs.max_bias, costs.bias_penalty
+    max_bias = costs.max_bias
+    bias_penalty = costs.bias_penalty
     numbers = sources.reshape(-1)
     H, W = sources.shape[1:3]
     # Unsigned, so that no index is checked for negative values.
@@ -146,7 +147,8 @@ def search(problem, costs, field, max_reach, seed):
     Returns the cost of every match [q] and its shift of colour [q, 3].
     """
     count = len(problem.queries)
-    cost, shift = np.full(count, np.inf, np.float32), np.zeros((count, 3), np.float32)
+    cost = np.full(count, np.inf, np.float32)
+    shift = np.zeros((count, 3), np.float32)
     share(_improve, count, problem, costs, max_reach, seed, field.copy(), field, cost, shift)
     return cost, shift
 
@@ -154,11 +156,14 @@ def search(problem, costs, field, max_reach, seed):
 @njit(nogil=True, fastmath={"contract"})
 def _improve(begin, end, problem, costs, max_reach, seed, before, field, cost, shift):
     """Improve the queries begin..end; `before` is the previous field."""
-    usable, query_at = problem.usable_mask, problem.query_at
+    usable = problem.usable_mask
+    query_at = problem.query_at
     num_sources, H, W = usable.shape
     h, w = query_at.shape
-    patch, weight = np.empty((SIDE, LANES), np.float32), np.empty((SIDE, LANES), np.float32)
-    sums, bias = np.empty((2, LANES), np.float32), np.empty(3, np.float32)
+    patch = np.empty((SIDE, LANES), np.float32)
+    weight = np.empty((SIDE, LANES), np.float32)
+    sums = np.empty((2, LANES), np.float32)
+    bias = np.empty(3, np.float32)
     for i in range(begin, end):
         y, x = problem.queries[i, 0], problem.queries[i, 1]
         _copy(problem.image, y, x, patch)
@@ -169,7 +174,9 @@ def _improve(begin, end, problem, costs, max_reach, seed, before, field, cost, s
         for trial in range(-1, 24):
             if trial < 0:
                 # The cost of the initial match is not known yet.
-                s, sy, sx = field[i, 0], field[i, 1], field[i, 2]
+                s = field[i, 0]
+                sy = field[i, 1]
+                sx = field[i, 2]
             elif trial < 8:
                 # Neighbours one and four pixels away propose their own offset.
                 step = 1 if trial < 4 else 4
@@ -240,9 +247,12 @@ def _vote(begin, end, query_at, vote_weight, sources, field, shift, colors, tota
             if q < 0:
                 continue
             a = vote_weight[q]
-            s, sy, sx = field[q, 0], field[q, 1], field[q, 2]
+            s = field[q, 0]
+            sy = field[q, 1]
+            sx = field[q, 2]
             for dy in range(max(-RADIUS, begin - y), min(RADIUS, end - 1 - y) + 1):
-                source_row, sums = sources[s, sy + dy], colors[y + dy]
+                source_row = sources[s, sy + dy]
+                sums = colors[y + dy]
                 for column in range(SIDE):
                     for c in range(3):
                         color = source_row[sx - RADIUS + column, c] + shift[q, c]

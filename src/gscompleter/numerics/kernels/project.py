@@ -87,7 +87,8 @@ def normalize_quat(quats, i):
 def rotate_by_quat(quat):
     """Compute the rotation matrix of a unit quaternion, row by row."""
     w, x, y, z = quat
-    one, two = np.float32(1), np.float32(2)
+    one = np.float32(1)
+    two = np.float32(2)
     return (
         one - two * (y * y + z * z),
         two * (x * y - w * z),
@@ -159,11 +160,15 @@ def _flatten(axes, jacobian):
 
 
 # Spherical harmonics in the basis and with the signs of 3DGS, see render/spherical_harmonics.py.
-_C0, _C1 = np.float32(0.28209479177387814), np.float32(0.4886025119029199)
-_C2XY, _C2Z = np.float32(1.0925484305920792), np.float32(0.31539156525252005)
+_C0 = np.float32(0.28209479177387814)
+_C1 = np.float32(0.4886025119029199)
+_C2XY = np.float32(1.0925484305920792)
+_C2Z = np.float32(0.31539156525252005)
 _C2XX = np.float32(0.5462742152960396)
-_C3A, _C3XYZ = np.float32(0.5900435899266435), np.float32(2.890611442640554)
-_C3B, _C3Z = np.float32(0.4570457994644658), np.float32(0.3731763325901154)
+_C3A = np.float32(0.5900435899266435)
+_C3XYZ = np.float32(2.890611442640554)
+_C3B = np.float32(0.4570457994644658)
+_C3Z = np.float32(0.3731763325901154)
 _C3XX = np.float32(1.445305721320277)
 
 
@@ -179,7 +184,9 @@ def _compute_direction(center, means, i):
 def _evaluate_basis(direction, basis):
     """Evaluate 1, 4, 9 or 16 basis functions at a unit direction."""
     x, y, z = direction
-    two, three, four = np.float32(2), np.float32(3), np.float32(4)
+    two = np.float32(2)
+    three = np.float32(3)
+    four = np.float32(4)
     xx, yy, zz = x * x, y * y, z * z
     basis[0] = _C0
     if len(basis) >= 4:
@@ -204,8 +211,11 @@ def _evaluate_basis(direction, basis):
 def _basis_backward(direction, g):
     """Compute the gradient in the direction of the sum of g[k] times basis function k."""
     x, y, z = direction
-    two, three, four = np.float32(2), np.float32(3), np.float32(4)
-    six, eight = np.float32(6), np.float32(8)
+    two = np.float32(2)
+    three = np.float32(3)
+    four = np.float32(4)
+    six = np.float32(6)
+    eight = np.float32(8)
     xx, yy, zz, xy, xz, yz = x * x, y * y, z * z, x * y, x * z, y * z
     dx = dy = dz = np.float32(0)
     if len(g) >= 4:
@@ -236,12 +246,16 @@ def project_splats(begin, end, gaussians, pinhole, splats, boxes, factors):
     receives the factors on the opacities of antialiased Gaussians, and is None for classic ones.
     """
     means, quats, scales, opacities, sh = gaussians
-    view, center, near = pinhole.rotation, pinhole.center, pinhole.near
+    view = pinhole.rotation
+    center = pinhole.center
+    near = pinhole.near
     fx, fy, cx, cy = pinhole.intrinsics
     limits = _compute_tangent_limits(pinhole)
     width, height = np.float32(pinhole.width), np.float32(pinhole.height)
     basis = np.empty(sh.shape[1], np.float32)
-    zero, half, one = np.float32(0), np.float32(0.5), np.float32(1)
+    zero = np.float32(0)
+    half = np.float32(0.5)
+    one = np.float32(1)
     root_half = np.float32(math.sqrt(0.5))
     for i in range(begin, end):
         boxes[i, 0] = boxes[i, 1] = boxes[i, 2] = boxes[i, 3] = 0
@@ -317,7 +331,8 @@ def _compensation_backward(flat, q):
     b0, b1, b2 = np.float64(flat[3]), np.float64(flat[4]), np.float64(flat[5])
     c0, c1, c2 = a1 * b2 - a2 * b1, a2 * b0 - a0 * b2, a0 * b1 - a1 * b0
     squares = a0 * a0 + a1 * a1 + a2 * a2 + b0 * b0 + b1 * b1 + b2 * b2
-    area, added = c0 * c0 + c1 * c1 + c2 * c2, BLUR * squares + BLUR * BLUR
+    area = c0 * c0 + c1 * c1 + c2 * c2
+    added = BLUR * squares + BLUR * BLUR
     of_area = q * added / (area * (area + added))
     of_squares = q * BLUR / (area + added)
     return (
@@ -337,13 +352,17 @@ def project_backward(
     """Write gradients of the Gaussians begin..end to `d_gaussians` from those of entries."""
     means, quats, scales, opacities, sh = gaussians
     d_means, d_quats, d_scales, d_opacities, d_sh = d_gaussians
-    view, center = pinhole.rotation, pinhole.center
+    view = pinhole.rotation
+    center = pinhole.center
     from_view = _transpose(view)
     fx, fy = pinhole.intrinsics[0], pinhole.intrinsics[1]
     limits = _compute_tangent_limits(pinhole)
-    one, two, four = np.float32(1), np.float32(2), np.float32(4)
+    one = np.float32(1)
+    two = np.float32(2)
+    four = np.float32(4)
     sums = np.empty(NUM_GRADIENT_COLUMNS, np.float32)
-    basis, d_basis = np.empty(sh.shape[1], np.float32), np.empty(sh.shape[1], np.float32)
+    basis = np.empty(sh.shape[1], np.float32)
+    d_basis = np.empty(sh.shape[1], np.float32)
     for i in range(begin, end):
         any_written = False
         sums[:] = 0

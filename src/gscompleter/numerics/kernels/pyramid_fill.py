@@ -43,7 +43,8 @@ def compute_means(pyramid, pixels, level):
 @njit(nogil=True, fastmath={"contract"})
 def _compute_means(begin, end, pyramid, pixels, level, result):
     count = len(pyramid.global_mean)
-    wider, sums = np.empty(count, np.float32), np.empty(count + 1, np.float32)
+    wider = np.empty(count, np.float32)
+    sums = np.empty(count + 1, np.float32)
     for p in range(begin, end):
         below = int(level[p])
         above = np.float32(level[p] - below)
@@ -75,7 +76,8 @@ def _sample(pyramid, y, x, level, sums):
     left, along = _locate(x, w, pyramid.sizes[0, 1])
     bottom, right = min(top + 1, h - 1), min(left + 1, w - 1)
     for c in range(len(sums)):
-        a, b = pyramid.sums[start + top * w + left, c], pyramid.sums[start + top * w + right, c]
+        a = pyramid.sums[start + top * w + left, c]
+        b = pyramid.sums[start + top * w + right, c]
         upper = a + along * (b - a)
         a = pyramid.sums[start + bottom * w + left, c]
         b = pyramid.sums[start + bottom * w + right, c]

@@ -20,8 +20,11 @@ MIN_ALPHA = np.float32(1 / 255)
 MAX_ALPHA = np.float32(0.999)
 MIN_TRANSMITTANCE = np.float32(1e-4)
 
-_FLOAT, _INT, _LONG = ir.FloatType(), ir.IntType(32), ir.IntType(64)
-_FLOATS, _INTS = ir.VectorType(_FLOAT, TILE), ir.VectorType(_INT, TILE)
+_FLOAT = ir.FloatType()
+_INT = ir.IntType(32)
+_LONG = ir.IntType(64)
+_FLOATS = ir.VectorType(_FLOAT, TILE)
+_INTS = ir.VectorType(_INT, TILE)
 
 # Least squares polynomial of 2**x on [-1, 0], highest power first: relative error 2e-7.
 _EXP2 = (0.000938116473, 0.00918687438, 0.055278135, 0.240171588, 0.693142171, 0.999999923)
@@ -263,7 +266,8 @@ def weigh_rows(typing, begin, end, place, state, row_limit, kept, splat):
         kept = _Rows(context, builder, signature.args[5], kept, _FLOATS, 1)
         filled = cgutils.alloca_once_value(builder, ir.Constant(_LONG, 0))
         with cgutils.for_range(builder, end, start=begin, intp=_LONG) as loop:
-            row, at = loop.index, builder.add(place, builder.sub(loop.index, begin))
+            row = loop.index
+            at = builder.add(place, builder.sub(loop.index, begin))
             limit = builder.load(builder.gep(limits, [row]))
             is_open = builder.icmp_signed(">=", limit, ir.Constant(_INT, 0))
             with builder.if_else(is_open) as (open_row, full_row):

@@ -13,7 +13,8 @@ from gscompleter.numerics.kernels.parallel import run_calls, share
 
 UNSEEN = 255
 """Cost of a plane at which the pixel falls outside the other image."""
-TILE_ROWS, TILE_COLUMNS = 16, 64
+TILE_ROWS = 16
+TILE_COLUMNS = 64
 """Size of a tile, which is matched at once, within the cache."""
 INFEASIBLE = np.int16(16000)
 """Infeasible cost, half of the largest int16."""
@@ -206,7 +207,9 @@ def _match_tiles(
                 _sum_boxes(other[c], other_mean[c], column, rows, cols, radius)
             for y in range(tall):
                 for x in range(wide):
-                    a, b, c = other[0, y, x], other[1, y, x], other[2, y, x]
+                    a = other[0, y, x]
+                    b = other[1, y, x]
+                    c = other[2, y, x]
                     product[y, x] = a * a + b * b + c * c
             _sum_boxes(product, other_square, column, rows, cols, radius)
             for y in range(tall):
@@ -307,10 +310,12 @@ def _sweep_half(costs, bands, large_x, large_y, large_d, large_u, small, down, t
     rows = np.zeros((2, 3, w, widest), np.int16)
     lows = np.zeros((2, 3, w), np.int16)
     along = np.zeros((2, widest), np.int16)
-    nothing, scratch = np.zeros(widest, np.int16), np.empty(widest, np.int16)
+    nothing = np.zeros(widest, np.int16)
+    scratch = np.empty(widest, np.int16)
     for step in range(h):
         y = step if down else h - 1 - step
-        now, then = step % 2, 1 - step % 2
+        now = step % 2
+        then = 1 - step % 2
         row, row_before = y // TILE_ROWS, (y - 1 if down else min(y + 1, h - 1)) // TILE_ROWS
         # The row before lies at y - 1 on the way down and at y + 1 on the way up.
         upper = max(y - 1, 0) if down else min(y, h - 2)
@@ -322,24 +327,31 @@ def _sweep_half(costs, bands, large_x, large_y, large_d, large_u, small, down, t
             low, high = bands.low[row, column], bands.high[row, column]
             first = _get_first_cost(bands, y, x, w)
             end = first + high - low
-            cost, out = costs[first:end], total[first:end]
-            before, edge = nothing, 0
+            cost = costs[first:end]
+            out = total[first:end]
+            before = nothing
+            edge = 0
             if s > 0:
                 back = x - 1 if down else x + 1
-                edge, tile = min(x, back), back // TILE_COLUMNS
+                edge = min(x, back)
+                tile = back // TILE_COLUMNS
                 band = bands.low[row, tile], bands.high[row, tile]
                 before = _align_bands(along[s % 2], band, (low, high), scratch)
             low_along = _step(
                 cost, before, low_along, along[1 - s % 2], out, small, large_x[y, edge]
             )
-            from_left, from_right = of_left[upper, max(x - 1, 0)], of_right[upper, min(x, w - 2)]
+            from_left = of_left[upper, max(x - 1, 0)]
+            from_right = of_right[upper, min(x, w - 2)]
             larges = (from_left, large_y[upper, x], from_right)
             for path in range(3):
-                before, lowest, other = nothing, np.int16(0), x + path - 1
+                before = nothing
+                lowest = np.int16(0)
+                other = x + path - 1
                 if step > 0 and 0 <= other < w:
                     tile = other // TILE_COLUMNS
                     band = bands.low[row_before, tile], bands.high[row_before, tile]
-                    lowest, states = lows[then, path, other], rows[then, path, other]
+                    lowest = lows[then, path, other]
+                    states = rows[then, path, other]
                     before = _align_bands(states, band, (low, high), scratch)
                 lows[now, path, x] = _step(
                     cost, before, lowest, rows[now, path, x], out, small, larges[path]
@@ -422,7 +434,9 @@ def _carry(begin, end, depth, other, b_from_a, a_from_b, error, ratio):
     H, W = other.shape
     for y in range(begin, end):
         for x in range(w):
-            px, py, own = np.float32(x + 0.5), np.float32(y + 0.5), depth[y, x]
+            px = np.float32(x + 0.5)
+            py = np.float32(y + 0.5)
+            own = depth[y, x]
             # Into b: the homogeneous pixel and, as its third entry, the ratio of z-depths.
             q2 = b_from_a[2, 0] * px + b_from_a[2, 1] * py + b_from_a[2, 2] + b_from_a[2, 3] * own
             if q2 <= np.float32(1e-3):
@@ -473,7 +487,8 @@ def _fill(begin, end, values, known, filled):
         for x in range(w):
             if known[y, x]:
                 continue
-            lowest, second = np.float32(np.inf), np.float32(np.inf)
+            lowest = np.float32(np.inf)
+            second = np.float32(np.inf)
             # The eight neighbours of a 3 x 3 block are the directions.
             for direction in range(9):
                 dy, dx = direction // 3 - 1, direction % 3 - 1

@@ -24,7 +24,8 @@ def trace_lines(image, known, directions, limits):
         The mean colours at both ends [h, w, 3], weighted by the inverse squared lengths, and the
         length of the shorter way [h, w] in pixels, infinite if neither ends.
     """
-    colours, lengths = np.zeros_like(image), np.full(known.shape, np.inf, np.float32)
+    colours = np.zeros_like(image)
+    lengths = np.full(known.shape, np.inf, np.float32)
     share(_trace_rows, len(known), image, known, directions, limits, colours, lengths)
     return colours, lengths
 
@@ -33,7 +34,8 @@ def trace_lines(image, known, directions, limits):
 def _trace_rows(begin, end, image, known, directions, limits, colours, lengths):
     for y in range(begin, end):
         for x in range(known.shape[1]):
-            total, limit = np.float32(0), limits[y, x]
+            total = np.float32(0)
+            limit = limits[y, x]
             for sign in (np.float32(-1), np.float32(1)):
                 length, r, g, b = _trace_way(image, known, directions, y, x, sign, limit)
                 if length < limit:

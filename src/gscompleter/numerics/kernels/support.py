@@ -19,7 +19,8 @@ _A4, _A5, _A6, _A7 = map(np.float32, (0.0308918810, -0.0170881256, 0.0066700901,
 # Least squares polynomial of 2**x on [-1, 0]: relative error 2e-7.
 _E0, _E1, _E2 = map(np.float32, (0.999999923, 0.693142171, 0.240171588))
 _E3, _E4, _E5 = map(np.float32, (0.055278135, 0.00918687438, 0.000938116473))
-_LOG2_E, _PI = np.float32(1.4426950408889634), np.float32(math.pi)
+_LOG2_E = np.float32(1.4426950408889634)
+_PI = np.float32(math.pi)
 
 
 class CameraPose(NamedTuple):
@@ -59,7 +60,8 @@ def _exp_negative(x):
 @njit(fastmath={"contract"}, error_model="numpy")
 def _compute_pixel_area(means, i, place):
     """Compute the area of a pixel at the depth of Gaussian i, in squared scene units."""
-    center, forward = place.center, place.forward
+    center = place.center
+    forward = place.forward
     z = (means[i, 0] - center[0]) * forward[0]
     z += (means[i, 1] - center[1]) * forward[1]
     z += (means[i, 2] - center[2]) * forward[2]
@@ -86,7 +88,9 @@ def _add_agreement(x, y, z, rays, center, turn, areas, agreement, totals):
     agreeing, weights, largest = totals
     center_x, center_y, center_z = center
     for j in range(len(areas)):
-        dx, dy, dz = x[j] - center_x, y[j] - center_y, z[j] - center_z
+        dx = x[j] - center_x
+        dy = y[j] - center_y
+        dz = z[j] - center_z
         inverse = one / math.sqrt(max(dx * dx + dy * dy + dz * dz, MIN_DIVISOR))
         turned = _acos((dx * ray_x[j] + dy * ray_y[j] + dz * ray_z[j]) * inverse) * turn
         weight = areas[j] * (_exp_negative(turned * turned) + MIN_ANGLE_WEIGHT)
@@ -106,7 +110,8 @@ def accumulate_trust(
     max_turn: angle at which the weight of a photograph has fallen to 1/e, in radians.
     enough: share of the area seen by the camera that a photograph has to see for full trust.
     """
-    one, turn = np.float32(1), np.float32(1) / max_turn
+    one = np.float32(1)
+    turn = np.float32(1) / max_turn
     known = np.empty((6, BLOCK), np.float32)
     x, y, z, ray_x, ray_y, ray_z = known
     agreeing, weights, largest = totals = np.empty((3, BLOCK), np.float32)
@@ -115,7 +120,9 @@ def accumulate_trust(
         totals[:] = 0
         for j in range(count):
             x[j], y[j], z[j] = means[start + j, 0], means[start + j, 1], means[start + j, 2]
-            dx, dy, dz = x[j] - place.center[0], y[j] - place.center[1], z[j] - place.center[2]
+            dx = x[j] - place.center[0]
+            dy = y[j] - place.center[1]
+            dz = z[j] - place.center[2]
             inverse = one / math.sqrt(max(dx * dx + dy * dy + dz * dz, MIN_DIVISOR))
             ray_x[j], ray_y[j], ray_z[j] = dx * inverse, dy * inverse, dz * inverse
         for k in range(len(centers)):

@@ -5,8 +5,10 @@ import numpy as np
 from gscompleter.numerics.kernels.cache import njit
 from gscompleter.numerics.kernels.parallel import count_threads, run_calls, split_range
 
-PRIMAL_STEP, GRADIENT_STEP = np.float32(0.25), np.float32(0.2)
-DUAL_STEP, GRADIENT_DUAL_STEP = np.float32(1 / 3), np.float32(0.5)
+PRIMAL_STEP = np.float32(0.25)
+GRADIENT_STEP = np.float32(0.2)
+DUAL_STEP = np.float32(1 / 3)
+GRADIENT_DUAL_STEP = np.float32(0.5)
 """Steps of the four variables: inverse row sums of the operator (Pock and Chambolle 2011)."""
 ITERATIONS_PER_PASS = 10
 """Iterations per pass over the image, each one row behind the last, with rows in the cache."""
@@ -58,7 +60,8 @@ def advance(top, top_step, end, end_step, iterations, state, given):
         for front in range(top, end + 2 * count):
             for number in range(1, count + 1):
                 y = front - number
-                first, last = top + number * top_step, end + number * end_step
+                first = top + number * top_step
+                last = end + number * end_step
                 if first - (top_step > 0) <= y < last - (end_step > 0):
                     _raise_duals(y, state, given)
                 if first <= y < last:
@@ -101,7 +104,8 @@ def _lower_primals(y, state, given):
     """Descend heights and gradients of a row, and extrapolate both for the next dual step."""
     heights, gradients, ahead, gradients_ahead, steps, bends = state
     data, weight, _, _, _, tolerance = given
-    two, none = np.float32(2), np.float32(0)
+    two = np.float32(2)
+    none = np.float32(0)
     for x in range(heights.shape[1]):
         # Negative divergence of the duals, with nothing beyond the border.
         push = steps[0, y, x] + steps[1, y, x]
@@ -125,7 +129,8 @@ def _lower_primals(y, state, given):
             miss -= pull if miss > none else -pull
         heights[y, x] = data[y, x] + miss
         ahead[y, x] = two * heights[y, x] - before
-        v0, v1 = gradients[0, y, x], gradients[1, y, x]
+        v0 = gradients[0, y, x]
+        v1 = gradients[1, y, x]
         gradients[0, y, x] = v0 + GRADIENT_STEP * (steps[0, y, x] + turn0)
         gradients[1, y, x] = v1 + GRADIENT_STEP * (steps[1, y, x] + turn1)
         gradients_ahead[0, y, x] = two * gradients[0, y, x] - v0

@@ -56,19 +56,23 @@ def sort_lists(begin, end, tile_start, entries, keys):
     largest = 0
     for tile in range(begin, end):
         largest = max(largest, tile_start[tile + 1] - tile_start[tile])
-    spare_entries, spare_keys = np.empty(largest, np.int32), np.empty(largest, np.uint32)
+    spare_entries = np.empty(largest, np.int32)
+    spare_keys = np.empty(largest, np.uint32)
     places = np.empty((4, 256), np.int64)
     for tile in range(begin, end):
         start, stop = tile_start[tile], tile_start[tile + 1]
         size = stop - start
-        own_entries, own_keys = entries[start:stop], keys[start:stop]
+        own_entries = entries[start:stop]
+        own_keys = keys[start:stop]
         # Positive floats sort like their bits. One pass counts the digits of all four steps.
         places[:] = 0
         for k in range(size):
             for step in range(4):
                 places[step, (own_keys[k] >> np.uint32(8 * step)) & np.uint32(255)] += 1
         for step in range(4):
-            shift, place, most = np.uint32(8 * step), 0, 0
+            shift = np.uint32(8 * step)
+            place = 0
+            most = 0
             for digit in range(256):
                 count = places[step, digit]
                 most = max(most, count)
@@ -100,7 +104,8 @@ def number_slots(entries, count):
     for i in range(count + 1):
         slot += slot_start[i]
         slot_start[i] = slot
-    slots, taken = np.empty_like(entries), slot_start.copy()
+    slots = np.empty_like(entries)
+    taken = slot_start.copy()
     for place in range(len(entries)):
         i = entries[place]
         slots[place] = taken[i]
@@ -112,7 +117,8 @@ def number_slots(entries, count):
 def number_by_use(entries, count):
     """Renumber `entries` by the first use of splats; return the used splats in order, and them."""
     numbers = np.full(count, -1, np.int32)
-    order, renamed = np.empty(count, np.int32), np.empty_like(entries)
+    order = np.empty(count, np.int32)
+    renamed = np.empty_like(entries)
     used = 0
     for place in range(len(entries)):
         i = entries[place]
