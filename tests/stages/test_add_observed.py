@@ -133,6 +133,11 @@ def test_photographs_that_show_nothing_new_are_not_reconstructed():
     # A single one gets the nearest as its stereo partner.
     assert choose_photographs(views, [make_lack(0.1), make_lack(0.0), make_lack(0.0)]) == [0, 1]
     assert choose_photographs(views[:1], [make_lack(0.1)]) == []
+    # Nor are those from one place, unless there is another.
+    same = [views[0], replace(views[0], frame=7)]
+    assert choose_photographs(same, [make_lack(0.1)] * 2) == []
+    lacks = [make_lack(0.1), make_lack(0.1), make_lack(0.0)]
+    assert choose_photographs([*same, views[1]], lacks) == [0, 1, 2]
     small = view_of(ROOM, camera_at(0.1, size=32))
     assert choose_photographs([*views, small], [make_lack(0.1)] * 4) == [0, 1, 2]
 

@@ -35,10 +35,13 @@ class Models:
     """Maximum number of iterations of the baselines; None keeps their own numbers."""
 
     def make_completer(self, config: str = "default") -> GSCompleter:
-        """Return our method with the named config."""
-        return GSCompleter(
-            self.reconstructor, self.generator, self.renderer, get_named_config(config), self.seed
-        )
+        """Return our method with the named config.
+
+        Scenes that are handed on from target to target are what Ψ made of the photographs, so that
+        nothing is added to them but at targets.
+        """
+        settings = replace(get_named_config(config), add_observed=False)
+        return GSCompleter(self.reconstructor, self.generator, self.renderer, settings, self.seed)
 
     def limit_iterations(self, num_iterations: int) -> int:
         """Limit a number of iterations to `baseline_iterations`."""

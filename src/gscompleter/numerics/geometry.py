@@ -231,9 +231,11 @@ def select_spread_cameras(cameras: Sequence[Camera], count: int) -> list[int]:
     where = embed_cameras(cameras)
     chosen = [0]
     apart = (where - where[0]).norm(dim=1)
+    # A camera is chosen once, also where others stand in its place.
+    apart[0] = -1.0
     while len(chosen) < min(count, len(cameras)):
         chosen.append(int(apart.argmax()))
-        # Distance of each camera from the nearest chosen one; those of one place stay unique.
+        # Distance of each camera from the nearest chosen one.
         apart = torch.minimum(apart, (where - where[chosen[-1]]).norm(dim=1))
         apart[chosen] = -1.0
     return chosen

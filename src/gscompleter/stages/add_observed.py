@@ -16,7 +16,12 @@ import torch
 from jaxtyping import Bool
 from torch import Tensor
 
-from gscompleter.numerics.geometry import compute_z_depths, look_up, select_spread_cameras
+from gscompleter.numerics.geometry import (
+    compute_z_depths,
+    look_up,
+    measure_baseline,
+    select_spread_cameras,
+)
 from gscompleter.numerics.image_ops import dilate, label_regions
 from gscompleter.reconstructors import Reconstructor, run_reconstructor
 from gscompleter.render.cache import SceneRenderer
@@ -154,10 +159,7 @@ def keep_large_regions(mask: Bool[Tensor, "h w"]) -> Bool[Tensor, "h w"]:
 
 
 def choose_photographs(views: Sequence[View], lacks: Sequence[Lack]) -> list[int]:
-    """Choose photographs that show together what the scene lacks; none if no two show anything.
-
-    A single photograph has no stereo, so that it gets the one that is taken closest to it.
-    """
+    """Choose photographs that show together what the scene lacks; none if there is no stereo."""
     showing = [index for index, lack in enumerate(lacks) if lack.share >= MIN_SHARE]
     if not showing or len(views) < 2:
         return []
@@ -166,15 +168,19 @@ def choose_photographs(views: Sequence[View], lacks: Sequence[Lack]) -> list[int
     size = views[most].image.shape
     alike = [index for index, view in enumerate(views) if view.image.shape == size]
     showing = [index for index in showing if index in alike]
-    if len(showing) == 1:
-        others = [index for index in alike if index != most]
-        if not others:
-            return []
-        nearest = find_nearest_view(views[most].camera, [views[index] for index in others])
-        showing.append(others[nearest])
     # Spread over all of them: eight neighbours left the far photographs 1.4 dB lower.
     spread = select_spread_cameras([views[index].camera for index in showing], MAX_PHOTOS)
-    return sorted(showing[index] for index in spread)
+    chosen = [showing[index] for index in spread]
+
+    # Stereo needs a second place: photographs from one place get the nearest one from elsewhere.
+    here = views[most].camera
+    if all(measure_baseline(here, views[index].camera) == 0 for index in chosen):
+        elsewhere = [i for i in alike if measure_baseline(here, views[i].camera) > 0]
+        if not elsewhere:
+            return []
+        nearest = find_nearest_view(here, [views[index] for index in elsewhere])
+        chosen.append(elsewhere[nearest])
+    return sorted(chosen)
 
 
 def reconstruct_lacking(
