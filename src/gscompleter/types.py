@@ -64,6 +64,7 @@ NUM_SH = (1, 4, 9, 16)
 """Spherical harmonics per channel, by degree."""
 
 M = TypeVar("M", bound="TensorDataclass")
+V = TypeVar("V", bound="View")
 
 
 @dataclass(frozen=True)
@@ -343,6 +344,12 @@ class View(TensorDataclass):
         if self.ignore_mask is None:
             return image
         return torch.where(self.ignore_mask[..., None], self.image, image)
+
+    def paint_ignored(self: V, image: Float[Tensor, "h w 3"]) -> V:
+        """Replace ignored pixels of the photograph by those of a render."""
+        if self.ignore_mask is None:
+            return self
+        return replace(self, image=torch.where(self.ignore_mask[..., None], image, self.image))
 
     def normalize_exposure(self, gain: Float[Tensor, "3"]) -> View:
         """Divide the image by an exposure gain per channel."""

@@ -1,4 +1,4 @@
-"""What photographs show and a given scene lacks is added before any target."""
+"""Photographs add what a given scene lacks, before any target."""
 
 from dataclasses import replace
 

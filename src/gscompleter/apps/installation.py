@@ -1,4 +1,4 @@
-"""What is installed and compiled on this machine."""
+"""Check of the installation: packages, devices and compiled kernels of this machine."""
 
 from __future__ import annotations
 

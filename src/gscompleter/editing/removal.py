@@ -28,7 +28,7 @@ from gscompleter.state import NEW_PHOTO_ID, Completion
 from gscompleter.system.errors import InputError
 from gscompleter.trust import Trust
 from gscompleter.trust.photometric import PhotoObservations, gather_observations
-from gscompleter.types import REMOVED, REVEALED, ContextScene, Gaussians, Render, View, merge
+from gscompleter.types import REMOVED, REVEALED, ContextScene, Gaussians, View, merge
 
 TOLERANCE = 0.003
 """Largest loss of PSNR of a photograph, in dB, by revealed Gaussians that do not return."""
@@ -86,7 +86,8 @@ def remove_gaussians(
     views = [hide_removed(photo.view, remaining, scenes.renderer) for photo in state.photos]
     shown = scenes.freeze_at(parts, [view.camera for view in views])
     photos = tuple(
-        replace(photo, view=paint_over(view, scene.render))
+        # So that no model copies from ignored pixels.
+        replace(photo, view=view.paint_ignored(scene.render.image.clamp(0, 1)))
         for photo, view, scene in zip(state.photos, views, shown, strict=True)
     )
     return prepare_guards(replace(changed, photos=photos), scenes)
@@ -153,7 +154,8 @@ def restore_surroundings(state: Completion, renderer: Renderer) -> Completion:
     frozen = [renderer.freeze(first, view.camera) for view in views]
     added = merge([rest, added])
     images = [
-        paint_over(view, scene.composite(added)) for view, scene in zip(views, frozen, strict=True)
+        view.paint_ignored(scene.composite(added).image.clamp(0, 1))
+        for view, scene in zip(views, frozen, strict=True)
     ]
     return replace(
         state,
@@ -276,9 +278,3 @@ def hide_removed(view: View, source: ContextScene, renderer: Renderer) -> View:
         return view
     mask = mask_removed(source, view.camera, renderer)
     return replace(view, ignore_mask=mask | ~view.valid_mask)
-
-
-def paint_over(view: View, render: Render) -> View:
-    """Replace the ignored pixels of a photograph by a render, so that no model copies from them."""
-    shown = render.image.clamp(0, 1)
-    return replace(view, image=torch.where(view.valid_mask[..., None], view.image, shown))

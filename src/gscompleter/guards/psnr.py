@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import replace
 
 from gscompleter.guards import Attempt, Guard
@@ -10,7 +9,6 @@ from gscompleter.numerics.geometry import look_up
 from gscompleter.numerics.image_ops import dilate, label_regions
 from gscompleter.render.cache import SceneRenderer
 from gscompleter.render.fit_colors import RELAXATION, fit_colors
-from gscompleter.render.protocols import OpacityRender
 from gscompleter.stages.error_budgets import (
     find_exceeding,
     meet_error_budgets,
@@ -56,22 +54,21 @@ class PsnrGuard(Guard):
         """
         view = attempt.view
         state = view.state
-        plans: Sequence[OpacityRender] = attempt.refined.plans
         budgets = [photo.budgets for photo in state.photos]
 
         # What a photograph sees of the additions takes the colours of the photograph first, so that
         # less of it has to fade. At the target the image counts as much as each photograph.
-        objecting = find_exceeding(budgets, view.frozen_photos, plans, added)
-        if objecting:
-            frozen = [view.frozen, *(view.frozen_photos[index] for index in objecting)]
-            images = [attempt.reference, *(state.photos[index].view for index in objecting)]
-            shown = [scene.render.image for scene in frozen]
-            wanted = [
-                replace(image, image=render.where(~image.valid_mask[..., None], image.image))
-                for image, render in zip(images, shown, strict=True)
-            ]
-            added = fit_colors(added, frozen, wanted, [RELAXATION] * COLOR_ROUNDS)
-            plans = [scene.vary_opacities(added) for scene in view.frozen_photos]
+        objecting = find_exceeding(budgets, view.frozen_photos, attempt.refined.plans, added)
+        if not objecting:
+            return added
+        frozen = [view.frozen, *(view.frozen_photos[index] for index in objecting)]
+        images = [attempt.reference, *(state.photos[index].view for index in objecting)]
+        wanted = [
+            image.paint_ignored(scene.render.image)
+            for image, scene in zip(images, frozen, strict=True)
+        ]
+        added = fit_colors(added, frozen, wanted, [RELAXATION] * COLOR_ROUNDS)
+        plans = [scene.vary_opacities(added) for scene in view.frozen_photos]
 
         hole = dilate(view.empty, state.config.holes.dilation)
         labels, _ = label_regions(hole)

@@ -1,4 +1,4 @@
-"""What photographs show and a given scene lacks; it goes in before Φ invents (not in the paper).
+"""Add what photographs show and a given scene lacks, before Φ invents (not in the paper).
 
 Φ warps photographs through the depth of the scene, and a hole has none: the image at a target is a
 blur where eight photographs show a box. So Ψ reconstructs the photographs that show what is
@@ -37,7 +37,7 @@ from gscompleter.stages.select_anchor import find_nearest_view
 from gscompleter.stages.target_view import compute_hole_mask
 from gscompleter.state import NEW_PHOTO_ID, Completion
 from gscompleter.system.progress import track
-from gscompleter.trust.photometric import compute_color_difference
+from gscompleter.trust.photometric import compute_color_differences
 from gscompleter.types import DepthMap, Gaussians, Reconstruction, View, merge
 
 MAX_ROUNDS = 3
@@ -125,24 +125,16 @@ def add_observed(
 def find_lacks(state: Completion, frozen: Sequence[FrozenScene]) -> list[Lack]:
     """Find what the scene lacks in each photograph, apart from pixels that are ignored."""
     views = [photo.view for photo in state.photos]
-    renders = [scene.render for scene in frozen]
-    differences = [
-        compute_color_difference(render, view) for render, view in zip(renders, views, strict=True)
-    ]
     # A difference that is usual in this scene is no contradiction.
-    medians = [
-        difference[view.valid_mask].median()
-        for difference, view in zip(differences, views, strict=True)
-    ]
-    usual = torch.stack(medians).median().item()
+    differences, usual = compute_color_differences(views, frozen)
     limit = max(MIN_DIFFERENCE, MAX_DIFFERENCE_RATIO * usual)
 
     lacks: list[Lack] = []
-    for render, view, difference in zip(renders, views, differences, strict=True):
+    for scene, view, difference in zip(frozen, views, differences, strict=True):
         is_usable = view.valid_mask
         if view.dynamic_mask is not None:
             is_usable = is_usable & ~view.dynamic_mask
-        empty = compute_hole_mask(render.alpha, state.config.holes) & is_usable
+        empty = compute_hole_mask(scene.render.alpha, state.config.holes) & is_usable
         contradicted = (difference > limit) & is_usable & ~empty
         lacks.append(Lack(empty, keep_large_regions(contradicted)))
     if sum(bool(lack.contradicted.any()) for lack in lacks) < MIN_WITNESSES:
@@ -161,7 +153,7 @@ def keep_large_regions(mask: Bool[Tensor, "h w"]) -> Bool[Tensor, "h w"]:
 def choose_photographs(views: Sequence[View], lacks: Sequence[Lack]) -> list[int]:
     """Choose photographs that show together what the scene lacks; none if there is no stereo."""
     showing = [index for index, lack in enumerate(lacks) if lack.share >= MIN_SHARE]
-    if not showing or len(views) < 2:
+    if not showing:
         return []
     # The networks need images of one size; check views may be smaller than the context.
     most = max(showing, key=lambda index: lacks[index].share)
@@ -283,9 +275,9 @@ def fit_to_photographs(
     if len(part) == 0:
         return part
     views = [photo.view for photo in state.photos]
+    # In ignored pixels colours stay as the scene shows them.
     wanted = [
-        replace(view, image=scene.render.image.where(~view.valid_mask[..., None], view.image))
-        for view, scene in zip(views, frozen, strict=True)
+        view.paint_ignored(scene.render.image) for view, scene in zip(views, frozen, strict=True)
     ]
     colored = fit_colors(part, frozen, wanted, [RELAXATION] * COLOR_ROUNDS)
     plans = [scene.vary_opacities(colored) for scene in frozen]

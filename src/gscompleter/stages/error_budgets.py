@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 from typing import Literal
@@ -110,8 +110,7 @@ def meet_error_budgets(
     opacity_before = torch.bincount(regions, weights=added.opacities)
     is_dropped = torch.zeros_like(opacity_before, dtype=torch.bool)
 
-    images_before = [frozen.render.image for frozen in frozen_views]
-    checks = [Check(*parts) for parts in zip(budgets, images_before, plans, strict=True)]
+    checks = make_checks(budgets, frozen_views, plans)
     opacities = added.opacities
     active = checks
     for trial in range(NUM_HALVINGS + NUM_REMOVALS + 1):
@@ -148,11 +147,19 @@ def find_exceeding(
     """Find the photographs that added Gaussians take over their budgets; return their indices."""
     if len(added) == 0:
         return []
+    checks = make_checks(budgets, frozen_views, plans)
+    rendered = render_checks(checks, added.opacities)
+    return [index for index, render in enumerate(rendered) if render.excess > 0]
+
+
+def make_checks(
+    budgets: Sequence[Sequence[ErrorBudget]],
+    frozen_views: Sequence[FrozenScene],
+    plans: Sequence[OpacityRender],
+) -> list[Check]:
+    """Make the check of each photograph."""
     images_before = [frozen.render.image for frozen in frozen_views]
-    checks = [Check(*parts) for parts in zip(budgets, images_before, plans, strict=True)]
-    worse = find_over_budget(checks, added.opacities)
-    exceeding = [id(render.check) for render in worse]
-    return [index for index, check in enumerate(checks) if id(check) in exceeding]
+    return [Check(*parts) for parts in zip(budgets, images_before, plans, strict=True)]
 
 
 @dataclass(frozen=True)
@@ -211,8 +218,14 @@ class CheckedRender:
 
 def find_over_budget(checks: Sequence[Check], opacities: Float[Tensor, "n"]) -> list[CheckedRender]:
     """Render all photographs and return those over budget."""
-    rendered = get_view_map(opacities)(partial(render_check, opacities=opacities), checks)
-    return [render for render in rendered if render.excess > 0]
+    return [render for render in render_checks(checks, opacities) if render.excess > 0]
+
+
+def render_checks(
+    checks: Sequence[Check], opacities: Float[Tensor, "n"]
+) -> Iterable[CheckedRender]:
+    """Render the scene at all photographs, and compare it with their error budgets."""
+    return get_view_map(opacities)(partial(render_check, opacities=opacities), checks)
 
 
 def render_check(check: Check, opacities: Float[Tensor, "n"]) -> CheckedRender:

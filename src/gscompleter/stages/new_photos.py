@@ -92,8 +92,8 @@ def recolor_to_photos(
         photo = photos[index]
         view = render_target(state, pad_camera(photo.camera, 0.0), scenes)
         # Where the photograph is ignored, the render itself is wanted: nothing changes.
-        wanted = match_new_photo(photo, view)
-        wanted = torch.where(photo.valid_mask[..., None], wanted, view.render.image)
-        reference = GeneratedView(wanted, photo.camera, is_photograph=True)
+        matched = replace(photo, image=match_new_photo(photo, view))
+        wanted = matched.paint_ignored(view.render.image)
+        reference = GeneratedView(wanted.image, photo.camera, is_photograph=True)
         state = recolor(reference, view, NEW_PHOTO_ID).state
     return replace(state, num_new_photos=len(photos))

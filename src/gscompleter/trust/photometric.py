@@ -144,17 +144,9 @@ def gather_observations(
     rendered: Gaussians, views: Sequence[View], frozen: Sequence[FrozenScene], config: TrustConfig
 ) -> PhotoObservations:
     """Measure visible area and photometric consistency of each Gaussian in each photograph."""
-    renders = [scene.render for scene in frozen]
-    with use_one_torch_thread():
-        differences = map_in_parallel(compute_color_difference, renders, views)
-
     # A difference that is usual in this scene is no evidence against a Gaussian, so the scale of
     # differences grows with the median one.
-    medians = [
-        difference[view.valid_mask].median()
-        for difference, view in zip(differences, views, strict=True)
-    ]
-    usual = torch.stack(medians).median().item()
+    differences, usual = compute_color_differences(views, frozen)
     scale = config.color_sigma * max(1.0, usual / EXACT_DIFFERENCE)
 
     areas, agreement = torch.empty((2, len(views), len(rendered))).to(rendered.means)
@@ -193,6 +185,23 @@ def measure_agreement(
         agreement,
     )
     return torch.from_numpy(area).to(means), torch.from_numpy(agreement).to(means)
+
+
+def compute_color_differences(
+    views: Sequence[View], frozen: Sequence[FrozenScene]
+) -> tuple[list[Float[Tensor, "_ _"]], float]:
+    """Compute the colour difference at each photograph, and the one that is usual in the scene.
+
+    That is the median of the medians of all photographs.
+    """
+    renders = [scene.render for scene in frozen]
+    with use_one_torch_thread():
+        differences = map_in_parallel(compute_color_difference, renders, views)
+    medians = [
+        difference[view.valid_mask].median()
+        for difference, view in zip(differences, views, strict=True)
+    ]
+    return differences, torch.stack(medians).median().item()
 
 
 def compute_color_difference(render: Render, view: View) -> Float[Tensor, "h w"]:

@@ -1,4 +1,4 @@
-"""What a completion prints on the terminal."""
+"""Lines and tables that a completion prints on the terminal."""
 
 from __future__ import annotations
 

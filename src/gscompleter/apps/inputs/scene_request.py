@@ -1,4 +1,4 @@
-"""What a user asks to open. Nothing here needs torch."""
+"""Requests of a user to open photographs. Nothing here needs torch."""
 
 from __future__ import annotations
 
