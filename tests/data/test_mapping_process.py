@@ -7,13 +7,8 @@ pytest.importorskip("pycolmap", reason="needs gscompleter[poses]")
 
 import pycolmap
 
-from gscompleter.data.sfm.mapping_process import (
-    is_plausible,
-    is_sequence,
-    pair_all,
-    pair_neighbours,
-    pair_similar,
-)
+from gscompleter.data.sfm.mapping_process import is_plausible
+from gscompleter.data.sfm.matching import is_sequence, pair_all, pair_neighbours, pair_similar
 
 
 def test_lenses_that_no_camera_has_are_implausible():

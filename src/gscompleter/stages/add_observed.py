@@ -16,6 +16,7 @@ import torch
 from jaxtyping import Bool
 from torch import Tensor
 
+from gscompleter.config import HoleConfig
 from gscompleter.numerics.geometry import (
     compute_z_depths,
     look_up,
@@ -38,7 +39,7 @@ from gscompleter.stages.target_view import compute_hole_mask
 from gscompleter.state import NEW_PHOTO_ID, Completion
 from gscompleter.system.progress import track
 from gscompleter.trust.photometric import compute_color_differences
-from gscompleter.types import DepthMap, Gaussians, Reconstruction, View, merge
+from gscompleter.types import DepthMap, Gaussians, Reconstruction, Render, View, merge
 
 MAX_ROUNDS = 3
 """Most reconstructions. One fills what it sees; a further one serves photographs elsewhere."""
@@ -106,7 +107,8 @@ def add_observed(
     views = [photo.view for photo in state.photos]
     for _ in track(range(MAX_ROUNDS), "Adding what photographs show"):
         frozen = scenes.freeze_at(state.parts, [view.camera for view in views])
-        lacks = find_lacks(state, frozen)
+        renders = [scene.render for scene in frozen]
+        lacks = find_lacks(views, renders, state.config.holes)
         chosen = choose_photographs(views, lacks)
         if not chosen:
             break
@@ -122,19 +124,20 @@ def add_observed(
     return state
 
 
-def find_lacks(state: Completion, frozen: Sequence[FrozenScene]) -> list[Lack]:
+def find_lacks(
+    views: Sequence[View], renders: Sequence[Render], settings: HoleConfig
+) -> list[Lack]:
     """Find what the scene lacks in each photograph, apart from pixels that are ignored."""
-    views = [photo.view for photo in state.photos]
     # A difference that is usual in this scene is no contradiction.
-    differences, usual = compute_color_differences(views, frozen)
+    differences, usual = compute_color_differences(views, renders)
     limit = max(MIN_DIFFERENCE, MAX_DIFFERENCE_RATIO * usual)
 
     lacks: list[Lack] = []
-    for scene, view, difference in zip(frozen, views, differences, strict=True):
+    for render, view, difference in zip(renders, views, differences, strict=True):
         is_usable = view.valid_mask
         if view.dynamic_mask is not None:
             is_usable = is_usable & ~view.dynamic_mask
-        empty = compute_hole_mask(scene.render.alpha, state.config.holes) & is_usable
+        empty = compute_hole_mask(render.alpha, settings) & is_usable
         contradicted = (difference > limit) & is_usable & ~empty
         lacks.append(Lack(empty, keep_large_regions(contradicted)))
     if sum(bool(lack.contradicted.any()) for lack in lacks) < MIN_WITNESSES:

@@ -146,7 +146,7 @@ def gather_observations(
     """Measure visible area and photometric consistency of each Gaussian in each photograph."""
     # A difference that is usual in this scene is no evidence against a Gaussian, so the scale of
     # differences grows with the median one.
-    differences, usual = compute_color_differences(views, frozen)
+    differences, usual = compute_color_differences(views, [scene.render for scene in frozen])
     scale = config.color_sigma * max(1.0, usual / EXACT_DIFFERENCE)
 
     areas, agreement = torch.empty((2, len(views), len(rendered))).to(rendered.means)
@@ -188,13 +188,12 @@ def measure_agreement(
 
 
 def compute_color_differences(
-    views: Sequence[View], frozen: Sequence[FrozenScene]
+    views: Sequence[View], renders: Sequence[Render]
 ) -> tuple[list[Float[Tensor, "_ _"]], float]:
     """Compute the colour difference at each photograph, and the one that is usual in the scene.
 
     That is the median of the medians of all photographs.
     """
-    renders = [scene.render for scene in frozen]
     with use_one_torch_thread():
         differences = map_in_parallel(compute_color_difference, renders, views)
     medians = [

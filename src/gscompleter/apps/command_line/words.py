@@ -40,6 +40,8 @@ Rule = Callable[[StructTypeInfo], StructConstructorSpec | None]
 
 CONTINUING = ("batch", "evaluate")
 """Commands that continue the run in their folder, and replace nothing there."""
+CONFIGURED = ("complete", "live", "update", "remove")
+"""Commands with the option `--config NAME`."""
 MAX_NAMED_COMMANDS = 3
 """Most commands that a sentence names as those with an option."""
 
@@ -200,7 +202,7 @@ def load_named_config(words: Sequence[str]) -> tuple[CompleterConfig, Sequence[s
     Its settings are the defaults of options such as `--config.holes.dilation`, so it has to be
     known before these are parsed.
     """
-    if words[:1] not in (["complete"], ["live"], ["remove"]):
+    if not words or words[0] not in CONFIGURED:
         return CompleterConfig(), words
     named, others = tyro.cli(
         NamedConfig, prog="gscompleter", args=words, return_unknown_args=True, add_help=False

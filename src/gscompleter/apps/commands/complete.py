@@ -27,7 +27,8 @@ class CompleteOptions(CompletingOptions):
     """Add only what photographs show and the splat of `--scene` lacks. The generator invents
     nothing, and there are no targets."""
     dry_run: bool = False
-    """Only print the plan, and write its cameras to targets.json, which `--target` reads."""
+    """Only print the plan, write its cameras to targets.json, which `--target` reads, and what they
+    see to images."""
     out: Path
     """Folder for completed.ply, the report (report.html), images and summary.json."""
     video: bool = False

@@ -72,24 +72,35 @@ class RunOptions(ComputeOptions):
 
 
 @dataclass(frozen=True, kw_only=True)
-class SynthesisOptions(RunOptions):
-    """Options of every command with a choice of the generator."""
+class DepthOptions(RunOptions):
+    """Options of every command with a choice of monocular depth."""
 
     depth: str = "none"
     """Monocular depth that helps plane-sweep where stereo measures nothing: none, or moge-2."""
     depth_weights: Path | None = None
     """Weights file of that depth; downloaded if not given."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class SynthesisOptions(DepthOptions):
+    """Options of every command with a choice of the generator."""
+
     synthesis: Annotated[GeneratorOptions, tyro.conf.OmitArgPrefixes] = GeneratorOptions()
 
 
 @dataclass(frozen=True, kw_only=True)
-class ModelOptions(SynthesisOptions):
-    """Options of every command with a choice of models."""
+class ReconstructorOptions(DepthOptions):
+    """Options of every command with a choice of one reconstructor."""
 
     reconstructor: str = "plane-sweep"
     """Model that turns photographs into Gaussians: plane-sweep, or one of `gscompleter models`."""
     weights: Path | None = None
     """Weights file of the reconstructor; downloaded if not given."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class ModelOptions(ReconstructorOptions, SynthesisOptions):
+    """Options of every command with a choice of models."""
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -18,7 +18,12 @@ from gscompleter.apps.completing.printing import print_completion, print_plan
 from gscompleter.apps.completing.run_info import describe_run, read_held_out, refuse_results
 from gscompleter.apps.inputs.describing import describe_task, print_lines
 from gscompleter.apps.inputs.task import CompletionTask
-from gscompleter.apps.report.completion import GENERATED_FILE, write_report
+from gscompleter.apps.report.completion import (
+    GENERATED_FILE,
+    IMAGES,
+    write_images,
+    write_report,
+)
 from gscompleter.apps.report.film import VIDEO_FILE, write_comparison_video
 from gscompleter.apps.report.page import REPORT_FILE, write_completion_page
 from gscompleter.apps.report.schema import RECORD_FILE, read_summary
@@ -46,6 +51,7 @@ COMMAND = "complete"
 RESULTS = (
     *(COMPLETED_FILE, CONTEXT_FILE, GENERATED_FILE, REMOVED_FILE, TARGETS_FILE),
     *(REPORT_FILE, RECORD_FILE, SUMMARY_FILE, VIDEO_FILE, "images/target*.png"),
+    *("images/photograph*.png", "images/context*.png"),
 )
 """Globs of the files that a completion may write."""
 
@@ -107,8 +113,25 @@ def plan_folder(options: CompleteOptions, prepare: Prepare) -> None:
             ready = ready.with_choices(choices)
             holes = [choice.hole_fraction for choice in choices]
         write_targets(folder, ready.task)
+        write_plan_pictures(folder / IMAGES, ready, begun)
     if not options.quiet:
         print_plan(options, ready.opened, ready.task.targets, holes)
+
+
+def write_plan_pictures(folder: Path, ready: Prepared, begun: Completion) -> None:
+    """Write what each target sees of the scene, and the photograph that it was derived from.
+
+    They show where to stand for a further photograph.
+    """
+    folder.mkdir()
+    renderer = ready.completer.renderer
+    for number, target in enumerate(ready.task.targets, start=1):
+        render = renderer.render(begun.scene, target.camera.to(ready.task.device))
+        write_images(folder, f"target{number}", {"before": render.image})
+        if target.derived_from is not None:
+            resolution = ready.opened.request.resolution
+            (beside,) = ready.opened.photographs.views([target.derived_from], resolution)
+            write_images(folder, f"target{number}", {"beside": beside.image})
 
 
 @contextmanager
@@ -165,6 +188,7 @@ def write_done(folder: Path, ready: Prepared, completion: Completion) -> dict[st
             looks,
             read_held_out(ready.opened, task, ready.cameras),
             ready.opened.files,
+            has_searched=not options.from_photographs_only,
         )
     write_completion_page(folder)
     return summary

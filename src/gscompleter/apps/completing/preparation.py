@@ -8,6 +8,8 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+from jaxtyping import Float
 from rich.console import Console
 
 from gscompleter.apps.commands.complete import CompleteOptions
@@ -88,18 +90,35 @@ class Prepared:
 
 def prepare_completion(options: CompleteOptions, console: Console) -> Prepared:
     """Open the scene and load the models."""
-    # First what is wrong whatever the scene is.
+    options = check_options(options)
+    opened = open_photographs(options, console)
+    task = read_inputs(options, opened)
+    return load_models(options, opened, task, console)
+
+
+def check_options(options: CompleteOptions) -> CompleteOptions:
+    """Refuse what is wrong whatever the scene is; return the options with the chosen device."""
     check_context(options.context)
     check_targets(options)
     check_reconstructor(options.reconstructor)
     options.synthesis.make_settings()
-
-    device = choose_device(options.device)
+    options = replace(options, device=choose_device(options.device))
     if options.scene is not None:
         options = replace(options, scene=resolve_splat(options.scene))
-    opened = open_input(options, console, partial(check_completion_inputs, options, device))
+    return options
+
+
+def open_photographs(options: CompleteOptions, console: Console) -> Opened:
+    """Open the photographs, after reading what can be wrong without their cameras."""
+    opened = open_input(options, console, partial(check_completion_inputs, options))
     if not options.config.ego_mask:
         opened = replace(opened, photographs=opened.photographs.keep_ego_vehicle())
+    return opened
+
+
+def read_inputs(options: CompleteOptions, opened: Opened) -> CompletionTask:
+    """Read the context and the targets, and add the input splat; compile the kernels."""
+    device = options.device
     with show_preparation("reading photographs"):
         has_splat = options.scene is not None
         task = read_task(opened, options.context, options.target, device, has_splat)
@@ -107,12 +126,17 @@ def prepare_completion(options: CompleteOptions, console: Console) -> Prepared:
     parts = (device, options.reconstructor, options.synthesis.generator)
     if options.scene is None:
         compile_kernels(parts)
-    else:
-        task = add_splat(task, options.scene, options.drop_nonfinite, opened, parts)
+        return task
+    return add_splat(task, options.scene, options.drop_nonfinite, opened, parts)
 
+
+def load_models(
+    options: CompleteOptions, opened: Opened, task: CompletionTask, console: Console
+) -> Prepared:
+    """Load the models, and set the depth range of the photographs."""
     # Only here, because the oracle is given the photographs of the targets.
     with show_preparation("loading models"):
-        completer = load_completer(options, task.targets, device)
+        completer = load_completer(options, task.targets)
     reconstructor = completer.reconstructor
 
     # A single photograph has no stereo, so a network predicts its depth; a splat needs neither.
@@ -158,6 +182,12 @@ def check_targets(options: CompleteOptions) -> None:
             "splat that lacks what they show.",
             "from-photographs-only",
         )
+    if not options.config.add_observed:
+        raise InputError(
+            "With config.add_observed off nothing is added from photographs, as in the config "
+            "paper; choose another config.",
+            "config",
+        )
     if options.target or options.auto is not None or options.dry_run:
         raise InputError(
             "With --from-photographs-only no target is completed; leave --target, --auto and "
@@ -166,12 +196,12 @@ def check_targets(options: CompleteOptions) -> None:
         )
 
 
-def check_completion_inputs(options: CompleteOptions, device: str) -> None:
+def check_completion_inputs(options: CompleteOptions) -> None:
     """Read what can be read without the cameras of the photographs, and refuse it if it is wrong.
 
     It takes seconds, and the search for cameras after it minutes.
     """
-    load_completer(options, (), device)
+    load_completer(options, ())
     check_target_files(options.target, parse_resolution(options.resolution))
     if options.scene is not None:
         load_splat(options.scene, options.drop_nonfinite)
@@ -182,7 +212,7 @@ def add_splat(
 ) -> CompletionTask:
     """Compile the kernels, and add the input splat to the task."""
     with show_preparation("reading the scene"):
-        task = add_check_views(task, opened.photographs)
+        task = add_check_views(task, opened)
         gaussians = load_splat(path, drop_nonfinite)
         if "cpu" in parts:
             check_scene(task, gaussians)
@@ -200,8 +230,9 @@ def add_splat(
         return move_to_splat(task, gaussians, splat_file, opened)
 
 
-def load_completer(options: CompleteOptions, targets: Sequence[Target], device: str) -> GSCompleter:
+def load_completer(options: CompleteOptions, targets: Sequence[Target]) -> GSCompleter:
     """Load the models of the options."""
+    device = options.device
     # Only the oracle reads the photographs of the targets.
     photographs = [target.view for target in targets if target.view is not None]
     synthesis = options.synthesis
@@ -221,15 +252,19 @@ def load_completer(options: CompleteOptions, targets: Sequence[Target], device: 
     )
 
 
+def compute_view_transform(opened: Opened, task: CompletionTask) -> Float[np.ndarray, "4 4"]:
+    """Compute the similarity from photographs as they are read to the frame of the result."""
+    # Photographs are read relative to their local origin. `task.frame` begins at their own frame,
+    # so the shift is undone before it.
+    return task.frame @ compute_frame_from_photographs(-opened.photographs.origin)
+
+
 def collect_cameras(opened: Opened, task: CompletionTask) -> dict[int, Camera]:
     """Return the cameras of all usable photographs by frame, in the frame of the result."""
     photographs = opened.photographs
     numbers = range(len(photographs))
     cameras = collect_usable_cameras(photographs, numbers, opened.request.resolution)
-
-    # Photographs are read relative to their local origin. `task.frame` begins at their own frame,
-    # so the shift is undone before it.
-    transform = task.frame @ compute_frame_from_photographs(-photographs.origin)
+    transform = compute_view_transform(opened, task)
 
     # One depth range for all: that of the context, which was measured in the frame of the result.
     context_camera = task.views[0].camera

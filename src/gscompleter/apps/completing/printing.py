@@ -9,6 +9,7 @@ from rich.table import Table
 
 from gscompleter.apps.commands.complete import CompleteOptions
 from gscompleter.apps.inputs.task import Opened, Target
+from gscompleter.apps.report.completion import IMAGES
 from gscompleter.apps.report.film import VIDEO_FILE
 from gscompleter.apps.report.page import REPORT_FILE
 from gscompleter.apps.report.plain_words import group_target_notes, list_notes, list_shared_notes
@@ -47,6 +48,11 @@ def make_score_table(summary: CompletionSummary) -> Table:
         before = format_number(row.psnr_before)
         after = format_number(row.psnr_after)
         table.add_row(f"context {row.photograph}", "", before, after, "")
+    # Without targets, what was not used tests the result.
+    for held_out in () if summary.targets else summary.held_out:
+        before = format_number(held_out.psnr_before)
+        after = format_number(held_out.psnr_after)
+        table.add_row(f"not used: {held_out.photograph}", "", before, after, "")
     for target in summary.targets:
         before = format_number(target.psnr_before)
         after = format_number(target.psnr_after)
@@ -95,3 +101,9 @@ def print_plan(
         table.add_row(f"{number}: {opened.name_target(target)}", format_percent(hole))
     console.print(table)
     console.print(f"Edit the cameras in {quote_value(options.out / TARGETS_FILE)}.", soft_wrap=True)
+    # New photographs from there are the best help, and `update` adds what they show.
+    console.print(
+        "What each camera sees now, and the photograph beside it: "
+        f"{quote_value(options.out / IMAGES)}",
+        soft_wrap=True,
+    )

@@ -69,9 +69,10 @@ def describe_run(
 def read_held_out(
     opened: Opened, task: CompletionTask, cameras: Mapping[int, Camera]
 ) -> list[HeldOut]:
-    """Read up to `MAX_HELD_OUT` unused photographs, nearest to the targets or the context.
+    """Read the photographs that were kept back, or up to `MAX_HELD_OUT` unused ones.
 
-    `cameras` are those of all usable photographs by frame, in the frame of the result.
+    The unused ones are those nearest to the targets or the context. `cameras` are those of all
+    usable photographs by frame, in the frame of the result.
     """
     used = task.used_frames
     others = {frame: camera for frame, camera in cameras.items() if frame not in used}
@@ -79,7 +80,8 @@ def read_held_out(
     # has read.
     checks = {view.frame for view in task.check_views or ()}
     held_out: list[HeldOut] = []
-    for frame in select_closest(task.goals, others, MAX_HELD_OUT):
+    frames = opened.held_out or select_closest(task.goals, others, MAX_HELD_OUT)
+    for frame in frames:
         # A photograph that cannot be read tests nothing; it is no input of this run.
         with suppress(InputError):
             (view,) = opened.photographs.views([frame], opened.request.resolution)

@@ -40,7 +40,7 @@ def read_task(
     targets = read_targets(photographs, target_words, resolution, has_splat)
     frames = find_context(photographs, context)
     if not frames:
-        frames = choose_context(photographs, targets, resolution, has_splat)
+        frames = choose_context(photographs, targets, resolution, has_splat, opened.held_out)
 
     # Cameras are enough to estimate the memory, before any photograph is loaded.
     cameras = [photographs.camera(frame, resolution) for frame in frames]

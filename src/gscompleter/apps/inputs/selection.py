@@ -30,15 +30,19 @@ CHECK_VIEW_SIZE = 320
 
 
 def choose_context(
-    photographs: Photographs, targets: Sequence[Target], resolution: Resolution, has_splat: bool
+    photographs: Photographs,
+    targets: Sequence[Target],
+    resolution: Resolution,
+    has_splat: bool,
+    held_out: Sequence[int] = (),
 ) -> tuple[int, ...]:
     """Choose context frames for the targets, or for the whole scene without any.
 
-    Targets are never chosen, because their photographs score the result, and neither are
-    photographs of which a mask hides everything.
+    Targets and `held_out` are never chosen, because their photographs score the result, and neither
+    are photographs of which a mask hides everything.
     """
-    target_frames = {target.frame for target in targets}
-    others = [frame for frame in range(len(photographs)) if frame not in target_frames]
+    scoring = {*held_out, *(target.frame for target in targets)}
+    others = [frame for frame in range(len(photographs)) if frame not in scoring]
 
     # Only chosen photographs are asked for their masks, since each has to be read for it.
     while True:

@@ -17,7 +17,6 @@ from gscompleter.data.local_origin import (
     compute_frame_from_photographs,
     shift_to_origin,
 )
-from gscompleter.data.photographs import Photographs
 from gscompleter.render.loading import load_renderer
 from gscompleter.splats.alignment.estimate import align_splat
 from gscompleter.splats.alignment.similarity import transform_camera, transform_view
@@ -83,9 +82,11 @@ def move_to_splat(
     )
 
 
-def add_check_views(task: CompletionTask, photographs: Photographs) -> CompletionTask:
+def add_check_views(task: CompletionTask, opened: Opened) -> CompletionTask:
     """Add check views: unused photographs near the targets and all around (decision 020)."""
-    others = [frame for frame in range(len(photographs)) if frame not in task.used_frames]
+    photographs = opened.photographs
+    known = task.used_frames | set(opened.held_out)
+    others = [frame for frame in range(len(photographs)) if frame not in known]
     cameras = collect_usable_cameras(photographs, others, CHECK_VIEW_SIZE)
     views = []
     for frame in select_near_and_far(task.goals, cameras, MAX_CHECK_VIEWS):

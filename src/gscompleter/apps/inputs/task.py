@@ -63,6 +63,8 @@ class Opened:
     format: str
     num_photographs: int
     """Number of photographs, with those whose camera was not found."""
+    held_out: tuple[int, ...] = ()
+    """Frames that are kept back: they only score the result."""
 
     def with_resolution(self, resolution: int) -> Opened:
         """Return a copy with another working size, the longest side in pixels."""

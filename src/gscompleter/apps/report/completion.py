@@ -52,6 +52,8 @@ from gscompleter.system.files.writing import (
 from gscompleter.types import Camera, Gaussians, View, merge
 
 GENERATED_FILE = "generated.ply"
+IMAGES = "images"
+"""Folder of the pictures of a completion."""
 MAX_PHOTOGRAPHS = 200
 """Largest number of photographs in the drawing and for the path of the video."""
 IGNORED_COLOR = (1.0, 0.0, 1.0)
@@ -89,19 +91,23 @@ def write_report(
     render_around: Callable[[], Sequence[RenderPair]] = list,
     held_out: Sequence[HeldOut] = (),
     files: Mapping[int | None, str] = MappingProxyType({}),
+    has_searched: bool = True,
 ) -> dict[str, Any]:
     """Write the scenes, `images/`, `report.json` and `summary.json`; return the summary.
 
     `photographs` are the cameras of all, in the frame of the result. `render_around` renders the
-    views whose coverage is measured. `files` are those of the photographs by frame.
+    views whose coverage is measured. `files` are those of the photographs by frame. `has_searched`
+    is False if targets were neither named nor searched for.
     """
     at_targets = [
         render_before_after(completion, result.target, renderer) for result in completion.targets
     ]
     held_out_rows = score_held_out(completion, held_out, renderer)
+    gains = completion.exposure_gains
+    gain_rows = [None] * len(completion.views) if gains is None else gains.tolist()
     rows: dict[str, Sequence[ScoreRow]] = {
         "held_out": held_out_rows,
-        "context": score_context(completion, renderer),
+        "context": score_photographs(completion, completion.views, gain_rows, renderer),
         "targets": [
             replace(
                 row,
@@ -111,16 +117,24 @@ def write_report(
             for row in score_targets(completion, targets, at_targets, renderer)
         ],
     }
+    # Without targets, the photographs are what there is to look at.
+    shown: list[View] = []
+    if not completion.targets:
+        photos = [photo.view for photo in completion.photos]
+        shown = [*photos, *(photograph.view for photograph in held_out)]
+        checks = photos[completion.num_context :]
+        rows["checks"] = score_photographs(completion, checks, [None] * len(checks), renderer)
     scores = {
         key: [asdict(replace(row, file=files.get(row.frame))) for row in group]
         for key, group in rows.items()
     }
 
     # The verdict comes from the rows, so that the page and the terminal agree with them.
-    outcome = asdict(judge_completion(completion, held_out_rows))
+    outcome = asdict(judge_completion(completion, held_out_rows, has_searched=has_searched))
     write_scenes(folder, completion, input_splat)
     around = render_around()
-    write_pictures(folder / "images", completion, targets, at_targets)
+    write_pictures(folder / IMAGES, completion, targets, at_targets)
+    write_photographs(folder / IMAGES, completion, shown, renderer)
     record = make_record(completion, thin_evenly(photographs, MAX_PHOTOGRAPHS))
     (folder / RECORD_FILE).write_bytes(json.dumps(asdict(record)).encode() + b"\n")
     coverage = {"coverage": asdict(compute_coverage(around))} if around else {}
@@ -159,24 +173,24 @@ def score_views(completion: Completion, views: Sequence[View], renderer: Rendere
     return list(get_view_map(completion.added.means)(score, views))
 
 
-def score_context(completion: Completion, renderer: Renderer) -> list[ContextRow]:
-    """Make the rows of the context photographs."""
-    views = completion.views
-    gains = completion.exposure_gains
+def score_photographs(
+    completion: Completion,
+    views: Sequence[View],
+    exposure_gains: Sequence[Any],
+    renderer: Renderer,
+) -> list[ContextRow]:
+    """Make the rows of photographs of the context, or of those that checked a splat."""
     scores = score_views(completion, views, renderer)
-    gain_rows: Sequence[Any] = [None] * len(views)
-    if gains is not None:
-        gain_rows = [tuple(row) for row in gains.tolist()]
     return [
         ContextRow(
             view.frame,
             **view_scores,
-            exposure_gain=gain,
+            exposure_gain=None if gain is None else tuple(gain),
             dynamic_fraction=compute_mask_fraction(view.dynamic_mask),
             given_depth=compute_mask_fraction(view.given_depth),
             ignored=compute_mask_fraction(view.ignore_mask),
         )
-        for view, view_scores, gain in zip(views, scores, gain_rows, strict=True)
+        for view, view_scores, gain in zip(views, scores, exposure_gains, strict=True)
     ]
 
 
@@ -368,6 +382,20 @@ def write_pictures(
     for number, view in enumerate(completion.views, start=1):
         if view.ignore_mask is not None:
             write_images(folder, f"context{number}", {"ignored": paint_ignored(view)})
+
+
+def write_photographs(
+    folder: Path, completion: Completion, views: Sequence[View], renderer: Renderer
+) -> None:
+    """Write photographs and the scene before and after at their cameras, numbered from 1."""
+    for number, view in enumerate(views, start=1):
+        pair = render_before_after(completion, view.camera, renderer)
+        images = {
+            "before": pair.before.image,
+            "after": pair.after.image,
+            "truth": paint_ignored(view),
+        }
+        write_images(folder, f"photograph{number}", images)
 
 
 def paint_ignored(view: View) -> Float[Tensor, "h w 3"]:

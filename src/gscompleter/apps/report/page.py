@@ -39,6 +39,7 @@ from gscompleter.evaluation.verdict.numbers import (
     format_number,
     format_percent,
 )
+from gscompleter.evaluation.verdict.rows import ScoreRow
 from gscompleter.system.files.image import encode_jpeg, read_image_size, read_pixels
 from gscompleter.system.files.writing import encode_text, replace_file
 from gscompleter.system.jobs.jobs import JOBS, Job, read_row
@@ -158,6 +159,7 @@ def render_completion_page(folder: Path) -> str:
             "gallery": open_gallery(folder / "images"),
             "notes": [*summary.scene.notes, *list_shared_notes(summary), *list_notes(summary)],
             "own_notes": own_notes,
+            "photographs": list_photographs(summary),
             "describe_alignment": describe_alignment,
             "unit": find_length_unit(summary),
             "mean_held_out": {
@@ -169,6 +171,22 @@ def render_completion_page(folder: Path) -> str:
             "viewer": VIEWER_FILE if os.path.isfile(folder / VIEWER_FILE) else None,
         },
     )
+
+
+def list_photographs(summary: CompletionSummary) -> list[tuple[str, ScoreRow, str]]:
+    """List images, row and use of each photograph of a page without targets.
+
+    The images are numbered in the order in which they were written.
+    """
+    if summary.targets:
+        return []
+    used = [(row, "used") for row in summary.context]
+    checks = [(row, "used in a small copy") for row in summary.checks]
+    held_out = [(row, "not used") for row in summary.held_out]
+    numbered = enumerate([*used, *checks, *held_out], start=1)
+    listed = [(f"photograph{number}", row, use) for number, (row, use) in numbered]
+    # Those that were not used come first, since they test the result.
+    return [*listed[len(listed) - len(held_out) :], *listed[: len(listed) - len(held_out)]]
 
 
 def find_length_unit(summary: CompletionSummary) -> str:

@@ -138,6 +138,8 @@ class CompletionSummary:
     gaussians: Mapping[str, int]
     seconds: Mapping[str, float]
     held_out: tuple[HeldOutRow, ...] = ()
+    checks: tuple[ContextRow, ...] = ()
+    """Small copies of further photographs that guarded a given scene; empty with targets."""
     new_photographs: int | None = None
     """Photographs that a splat was not trained on; None if the scene was reconstructed."""
 

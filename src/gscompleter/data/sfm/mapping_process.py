@@ -1,36 +1,33 @@
 """Structure from motion in a separate process, because COLMAP aborts on errors.
 
-Standard input is a `Job` as JSON. The last line of the output is the result, as JSON too. Of many
-unordered photographs, those are matched whose few largest features match (preemptive matching; Wu,
-"Towards Linear-time Incremental Structure from Motion", 2013).
+Standard input is a `MappingJob` as JSON. The last line of the output is the result, as JSON too.
 """
 
 from __future__ import annotations
 
 import json
 import math
-import re
 import sys
 from collections import Counter
-from collections.abc import Sequence
 from copy import deepcopy
 from dataclasses import dataclass
-from itertools import combinations
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pycolmap
-from jaxtyping import Float
 
 from gscompleter.data.panorama import VIEWS, compute_view_rotation
+from gscompleter.data.sfm.matching import (
+    SEED,
+    ColmapJob,
+    extract_features,
+    match,
+    prepare_colmap,
+    select_pairs,
+)
 from gscompleter.data.sfm.poses import MIN_PHOTOGRAPHS, UprightCopy
 
-SEED = 0
-MAX_FEATURES = 4096
-"""Most features in a photograph."""
-MAX_EXHAUSTIVE = 60
-"""Most unordered photographs that are all matched with each other."""
 LENS = "SIMPLE_RADIAL"
 """COLMAP's camera model: one focal length, one distortion coefficient."""
 GUESSED_FOCAL = 1.2
@@ -50,41 +47,14 @@ FIXED_FOVS = (75.0, 60.0, 90.0, 45.0)
 ROUNDS = 2
 """Rounds of mapping with a fixed focal length, the second at the value that the first fitted."""
 
-NEIGHBOURS = 10
-"""Photographs before and after each one of a sequence to match it with."""
-NUM_SIMILAR = 20
-"""Most similar photographs to match each one with."""
-NUM_LARGEST_FEATURES = 256
-"""Largest-scale features that decide similarity."""
-MIN_SHARED = 4
-"""Fewest matches among these for a pair."""
-MIN_COSINE = 0.85
-"""Smallest cosine between descriptors of matching features."""
 
-Pairs = set[tuple[int, int]]
-"""Index pairs of photographs, the smaller index first."""
+@dataclass(frozen=True, kw_only=True)
+class MappingJob(ColmapJob):
+    """Input of the process; `model` is the folder for the largest model."""
 
-
-@dataclass(frozen=True)
-class MappingJob:
-    """Input of the process."""
-
-    images: str
-    masks: str
-    """Folder of the masks of some photographs."""
-    work: str
-    """Folder for the database and temporary files."""
-    model: str
-    """Folder for the largest model; it does not exist yet."""
     photographs: list[UprightCopy]
     is_panoramic: bool
     """True if these are views of panoramas, in the folders view_0, view_1, …"""
-    threads: int
-
-    @property
-    def database(self) -> Path:
-        """Path of COLMAP's database."""
-        return Path(self.work) / "database.db"
 
 
 def main() -> None:
@@ -92,20 +62,20 @@ def main() -> None:
     task = json.load(sys.stdin)
     copies = [UprightCopy(**one) for one in task.pop("photographs")]
     job = MappingJob(photographs=copies, **task)
-    pycolmap.logging.minloglevel = pycolmap.logging.Level.ERROR.value
-    pycolmap.set_random_seed(SEED)
+    prepare_colmap()
     find_features(job)
     if job.is_panoramic:
         join_views(job)
-    match(job, select_pairs(job))
+    names = [one.name for one in job.photographs]
+    pairs = select_pairs(job, names)
+    # Between views of one panorama there is no baseline.
+    centres = [name.partition("/")[2] if job.is_panoramic else name for name in names]
+    match(job, names, {(i, j) for i, j in pairs if centres[i] != centres[j]})
     print(json.dumps(map_photographs(job)))
 
 
 def find_features(job: MappingJob) -> None:
     """Extract SIFT features of all photographs; those of equal size and lens share a camera."""
-    extraction = pycolmap.FeatureExtractionOptions(num_threads=job.threads, use_gpu=False)
-    extraction.sift.max_num_features = MAX_FEATURES
-
     cameras = {(one.width, one.height, one.lens): one for one in job.photographs}
     numbers = {}
     with pycolmap.Database.open(job.database) as database:
@@ -117,17 +87,7 @@ def find_features(job: MappingJob) -> None:
 
     for one in job.photographs:  # one by one, so that they are numbered in their order
         number = numbers[one.width, one.height, one.lens]
-        reading = pycolmap.ImageReaderOptions(existing_camera_id=number)
-        if one.is_masked:
-            reading.mask_path = job.masks
-        pycolmap.extract_features(
-            job.database,
-            job.images,
-            [one.name],
-            reader_options=reading,
-            extraction_options=extraction,
-            device=pycolmap.Device.cpu,
-        )
+        extract_features(job, one.name, number, one.is_masked)
 
 
 def join_views(job: MappingJob) -> None:
@@ -142,44 +102,6 @@ def join_views(job: MappingJob) -> None:
         rig.cameras = [*rig.cameras, camera]
     with pycolmap.Database.open(job.database) as database:
         pycolmap.apply_rig_config([rig], database)
-
-
-def select_pairs(job: MappingJob) -> Pairs:
-    """Choose the photographs to match: sequence neighbours, all pairs, or similar photographs."""
-    names = [one.name for one in job.photographs]
-    # The neighbours of a sequence are known; in a set of unknown order all pairs, or for many
-    # photographs the most similar ones.
-    pairs = pair_neighbours(len(names)) if is_sequence(names) else set()
-    if not pairs and len(names) <= MAX_EXHAUSTIVE:
-        pairs = pair_all(len(names))
-    else:
-        with pycolmap.Database.open(job.database) as database:
-            pairs |= pair_similar([_read_features(database, name) for name in names])
-    # Between views of one panorama there is no baseline.
-    centres = [name.partition("/")[2] if job.is_panoramic else name for name in names]
-    return {(i, j) for i, j in pairs if centres[i] != centres[j]}
-
-
-def _read_features(database: Any, name: str) -> Float[np.ndarray, "k 128"]:
-    """Read the normalized descriptors of a photograph's `NUM_LARGEST_FEATURES` largest features."""
-    number = database.read_image_with_name(name).image_id
-    scales = np.linalg.norm(database.read_keypoints(number)[:, 2:4], axis=1)
-    descriptors = np.asarray(database.read_descriptors(number).data, dtype=np.float32)
-    # SIFT's largest blobs, not its strongest, are those that other distances and cameras find too.
-    largest = descriptors[np.argsort(-scales, kind="stable")[:NUM_LARGEST_FEATURES]]
-    return largest / np.maximum(np.linalg.norm(largest, axis=1, keepdims=True), 1e-9)
-
-
-def match(job: MappingJob, pairs: Pairs) -> None:
-    """Match the features of all pairs and verify them with an essential matrix."""
-    names = [one.name for one in job.photographs]
-    listed = pycolmap.ImportedPairingOptions(match_list_path=Path(job.work) / "pairs.txt")
-    lines = "".join(f"{names[i]} {names[j]}\n" for i, j in sorted(pairs))
-    listed.match_list_path.write_bytes(lines.encode())
-    matching = pycolmap.FeatureMatchingOptions(num_threads=job.threads, use_gpu=False)
-    verification = pycolmap.TwoViewGeometryOptions()
-    verification.ransac.random_seed = SEED
-    pycolmap.match_image_pairs(job.database, matching, listed, verification, pycolmap.Device.cpu)
 
 
 def map_photographs(job: MappingJob) -> dict[str, Any]:
@@ -314,50 +236,6 @@ def is_plausible(camera: pycolmap.Camera) -> bool:
 def _count_photographs(model: pycolmap.Reconstruction) -> Counter[int]:
     """Count the photographs of each camera in the model."""
     return Counter(model.images[i].camera_id for i in model.reg_image_ids())
-
-
-def is_sequence(names: Sequence[str]) -> bool:
-    """Check whether the names differ only in the last number of the file name."""
-    forms = {re.sub(r"\d+(?=[^\d/]*$)", "#", name) for name in names}
-    return len(forms) == 1 and not forms & set(names)
-
-
-def pair_neighbours(count: int) -> Pairs:
-    """Pair each photograph of a sequence with the next ones, and those 16, 32, 64, … ahead."""
-    # Doubling steps close loops, and bridge a blurred or covered stretch.
-    steps = [*range(1, NEIGHBOURS + 1), *(2**n for n in range(4, count.bit_length()))]
-    return {(i, i + step) for step in steps for i in range(count - step)}
-
-
-def pair_all(count: int) -> Pairs:
-    """Pair each photograph with each other."""
-    return set(combinations(range(count), 2))
-
-
-def pair_similar(features: Sequence[Float[np.ndarray, "_ 128"]]) -> Pairs:
-    """Pair each photograph with those that share most features with it."""
-    shared = np.zeros((len(features), len(features)), dtype=np.int64)
-    for i, j in pair_all(len(features)):
-        count = _count_shared(features[i], features[j])
-        shared[i, j] = count
-        shared[j, i] = count
-    order = np.argsort(-shared, axis=1, kind="stable")[:, :NUM_SIMILAR]
-    pairs: Pairs = set()
-    for i, row in enumerate(order.tolist()):
-        pairs.update((min(i, j), max(i, j)) for j in row if shared[i, j] >= MIN_SHARED)
-    return pairs
-
-
-def _count_shared(a: Float[np.ndarray, "m 128"], b: Float[np.ndarray, "n 128"]) -> int:
-    """Count the mutual best matches above `MIN_COSINE`."""
-    if len(a) == 0 or len(b) == 0:
-        return 0
-    cosines = a @ b.T
-    best = cosines.argmax(axis=1)
-    back = cosines.argmax(axis=0)
-    # Each feature has one best match; only those that choose each other count.
-    is_mutual = back[best] == np.arange(len(a))
-    return int(np.count_nonzero(is_mutual & (cosines.max(axis=1) > MIN_COSINE)))
 
 
 if __name__ == "__main__":

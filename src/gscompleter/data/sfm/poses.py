@@ -59,6 +59,9 @@ ENDINGS = (
 """Endings of photographs, in any case."""
 OTHER_FOLDERS = (*MASK_FOLDERS, "depth", "depths", *(f"images_{n}" for n in DOWNSCALE_FACTORS))
 """Folders that hold no photographs of the user."""
+SEPARATORS = r"[\s#]"
+"""Characters that names of copies do not have: in COLMAP's lists a space ends a name, and # begins
+a comment."""
 IMAGES = "images"
 """Folder of the copies."""
 MAX_FOLDERS = 10_000
@@ -339,8 +342,7 @@ def write_copies(
     hidden = read_hidden(root / source, mask)
     for number, (pixels, shade) in enumerate(split_panorama(root / source, hidden)):
         kind = f"view_{number}"
-        # In COLMAP's lists a space ends a name, and # begins a comment.
-        name = Path(re.sub(r"[\s#]", "_", source)).with_suffix(".jpg")
+        name = Path(re.sub(SEPARATORS, "_", source)).with_suffix(".jpg")
         target = _prepare_target(folder / IMAGES / kind / name, root / source)
         Image.fromarray(pixels).save(target, quality=QUALITY, subsampling=0)
         side = len(pixels)
@@ -368,15 +370,10 @@ def write_upright(root: Path, source: str, folder: Path, mask: Path | None = Non
             image.draft("RGB", (MAX_SIDE, MAX_SIDE))
         copy = ImageOps.exif_transpose(image).convert("RGB")
         focal = read_focal(exif)
-        # Photographs of one camera, lens and zoom share their intrinsics.
-        detail = exif.get_ifd(EXIF)
-        known_lens = (exif.get(MAKE), exif.get(MODEL))
-        zoom = (detail.get(FOCAL_LENGTH), detail.get(FOCAL_LENGTH_35))
-        lens = " ".join(str(value) for value in (*known_lens, *zoom))
+        lens = read_lens(exif)
 
     copy.thumbnail((MAX_SIDE, MAX_SIDE), Image.Resampling.LANCZOS)
-    # In COLMAP's lists a space ends a name, and # begins a comment.
-    name = re.sub(r"[\s#]", "_", source) + ("" if is_known else ".png")
+    name = re.sub(SEPARATORS, "_", source) + ("" if is_known else ".png")
     target = _prepare_target(folder / IMAGES / name, path)
     if is_ready:
         shutil.copyfile(path, target)
@@ -433,6 +430,18 @@ def _prepare_target(target: Path, source: Path) -> Path:
     return target
 
 
+def read_lens(exif: Image.Exif) -> str:
+    """Read the key of camera, lens and zoom; photographs with the same one share intrinsics."""
+    detail = exif.get_ifd(EXIF)
+    values = (
+        exif.get(MAKE),
+        exif.get(MODEL),
+        detail.get(FOCAL_LENGTH),
+        detail.get(FOCAL_LENGTH_35),
+    )
+    return " ".join(str(value) for value in values)
+
+
 def read_focal(exif: Image.Exif) -> float | None:
     """Read the focal length in image diagonals from the 35 mm equivalent; None if there is none."""
     try:
@@ -444,21 +453,25 @@ def read_focal(exif: Image.Exif) -> float | None:
 
 def _map(copies: Sequence[UprightCopy], folder: Path, is_panoramic: bool) -> dict[str, Any]:
     """Run `mapping_process` on the copies in `folder/images`; return its result."""
-    with tempfile.TemporaryDirectory(dir=folder) as work, stage("Finding cameras"):
-        job = {
-            "images": str(folder / IMAGES),
-            "masks": str(folder / MASKS),
-            "work": work,
-            "model": str(folder / "sparse" / "0"),
-            "photographs": [asdict(copy) for copy in copies],
-            "is_panoramic": is_panoramic,
-            "threads": min(MAX_THREADS, get_thread_count()),
-        }
+    job = {
+        "images": str(folder / IMAGES),
+        "masks": str(folder / MASKS),
+        "model": str(folder / "sparse" / "0"),
+        "photographs": [asdict(copy) for copy in copies],
+        "is_panoramic": is_panoramic,
+    }
+    return run_colmap(PROCESS, job, folder, "Finding cameras")
+
+
+def run_colmap(process: str, job: Mapping[str, Any], folder: Path, title: str) -> dict[str, Any]:
+    """Run a process of COLMAP with temporary files in `folder`; return its result."""
+    with tempfile.TemporaryDirectory(dir=folder) as work, stage(title):
+        whole = {**job, "work": work, "threads": min(MAX_THREADS, get_thread_count())}
 
         # COLMAP aborts its process on some errors (decision 027), so it has one of its own.
         done = subprocess.run(
-            [sys.executable, "-m", PROCESS],
-            input=json.dumps(job),
+            [sys.executable, "-m", process],
+            input=json.dumps(whole),
             capture_output=True,
             encoding="utf-8",
             errors="replace",

@@ -47,12 +47,17 @@ ADVICE = (
     "with too little in common."
 )
 NO_TARGET = "no large hole was found around the photographs"
+NOTHING_LACKS = "Nothing was gained, because photographs show nothing that the splat lacks."
 REJECTED = "the generated image contradicts the photographs"
 NOTHING_LEFT = "no Gaussian that was generated lies in the hole"
 
 
-def judge_completion(completion: Completion, held_out: Sequence[HeldOutRow]) -> OutcomeRow:
+def judge_completion(
+    completion: Completion, held_out: Sequence[HeldOutRow], has_searched: bool = True
+) -> OutcomeRow:
     """Judge a completion by photographs that were not used, and by what was added.
+
+    `has_searched` is False if targets were neither named nor searched for.
 
     A given scene did reconstruct: it was compared with its photographs when it was aligned. The
     depths of a single photograph are predicted, in a unit that other photographs need not share.
@@ -68,7 +73,8 @@ def judge_completion(completion: Completion, held_out: Sequence[HeldOutRow]) -> 
         or count_changed(completion.targets) > 0
     )
     if not has_gained:
-        return OutcomeRow("nothing-gained", explain_no_gain(completion))
+        reason = explain_no_gain(completion) if has_searched else NOTHING_LACKS
+        return OutcomeRow("nothing-gained", reason)
     work = describe_work(completion)
     return OutcomeRow("completed", describe_gain(work, held_out))
 

@@ -1,0 +1,382 @@
+"""Cameras for new photographs of a scene whose other photographs have theirs, by COLMAP.
+
+The known cameras stay as they are, so that a splat that was trained with them stays in its frame.
+Any format of scene will do, since COLMAP is given copies of its photographs without distortion. The
+output folder has COLMAP's standard layout, with the new photographs alone: copies in `images` and
+their cameras in `sparse/0`, in the coordinates of the scene.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import math
+import os
+import re
+import tempfile
+from collections.abc import Mapping, Sequence
+from dataclasses import asdict, dataclass, replace
+from importlib.util import find_spec
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from PIL import Image
+
+from gscompleter.data.cameras import Intrinsics
+from gscompleter.data.colmap import open_colmap
+from gscompleter.data.file_names import FolderListings
+from gscompleter.data.frame import MASKS, Frame
+from gscompleter.data.masks import find_mask
+from gscompleter.data.photographs import Photographs, build_photographs
+from gscompleter.data.sfm.poses import (
+    COMMAND,
+    IMAGES,
+    MAX_SIDE,
+    RESULTS,
+    SEPARATORS,
+    list_all_photographs,
+    read_focal,
+    read_lens,
+    run_colmap,
+)
+from gscompleter.numerics.geometry import select_spread_cameras
+from gscompleter.system.errors import InputError, quote_value
+from gscompleter.system.files.image import (
+    QUARTER_TURNS,
+    convert_to_pixels,
+    open_image,
+    read_image_size,
+    read_orientation,
+)
+from gscompleter.system.files.output_folder import reserve_output
+from gscompleter.system.files.reading import read_json
+from gscompleter.system.files.writing import SUMMARY_FILE
+from gscompleter.system.progress import track
+from gscompleter.types import View
+
+MAX_KNOWN = 200
+"""Most photographs with known cameras that new ones are compared with; of more, those far apart."""
+MIN_MATCHES = 30
+"""Features that COLMAP needs in common with the points of the scene."""
+MAX_NAMED = 5
+"""Most photographs that a sentence names."""
+KNOWN = "known"
+"""Folder of the copies with known cameras, among those that COLMAP reads."""
+NEW = "new"
+PROCESS = "gscompleter.data.sfm.placing_process"
+
+LensKey = tuple[int, int, str]
+"""Width and height of upright photographs, and the key of camera, lens and zoom from EXIF."""
+Pinhole = tuple[float, float, float, float]
+"""Focal lengths and principal point in pixels: fx, fy, cx, cy."""
+
+
+@dataclass(frozen=True)
+class KnownCopy:
+    """A copy of a photograph with a known camera."""
+
+    name: str
+    """File, relative to the folder that COLMAP reads."""
+    width: int
+    height: int
+    pinhole: Pinhole
+    viewmat: list[list[float]]
+    """World to camera, as the rows of a 3 × 4 matrix."""
+    is_masked: bool
+
+
+@dataclass(frozen=True)
+class NewCopy:
+    """A copy of a photograph whose camera is searched for."""
+
+    name: str
+    """File, relative to the folder that COLMAP reads."""
+    width: int
+    height: int
+    lens: str
+    """Key of camera, lens and zoom from EXIF."""
+    focal: float | None
+    """Focal length in pixels from EXIF, or None."""
+    pinhole: Pinhole | None
+    """Intrinsics of the undistorted copy, if a known photograph was taken by the same lens."""
+    is_masked: bool
+
+
+@dataclass(frozen=True)
+class Placed:
+    """What became of new photographs."""
+
+    total: int
+    """Number of new photographs."""
+    failures: dict[str, str]
+    """Reason why a photograph could not be placed, by its file."""
+    skipped: int = 0
+    """Photographs that have cameras in the scene already."""
+    reused: bool = False
+    """True if the result is from an earlier run."""
+
+    @property
+    def notes(self) -> list[str]:
+        """Sentences for the user."""
+        count = self.total - len(self.failures)
+        notes = [f"{count} of {self.total} new photographs were placed among those of the scene."]
+        if self.failures:
+            listed = list(self.failures.items())[:MAX_NAMED]
+            reasons = "; ".join(f"{quote_value(name)} ({reason})" for name, reason in listed)
+            more = len(self.failures) - len(listed)
+            rest = f"; and {more} more" if more else ""
+            notes.append(f"Not placed, and left out: {reasons}{rest}.")
+        if self.skipped:
+            notes.append(f"{self.skipped} of the photographs have cameras in SCENE already.")
+        return notes
+
+
+def place_photographs(
+    folder: Path, photographs: Photographs, out: Path, overwrite: bool = False
+) -> tuple[Photographs, Placed]:
+    """Find the cameras of new photographs, and add them to those of a scene.
+
+    The result is written to `out`, from which a later run with the same photographs takes it.
+    Raises InputError if none can be placed.
+    """
+    found = list_all_photographs(folder) if os.path.isdir(folder) else []
+    known = {stored.resolve() for stored in map(find_file, photographs.frames) if stored}
+    names = [name for name in found if (folder / name).resolve() not in known]
+    if not found:
+        raise InputError(f"There are no photographs in {quote_value(folder)}.", "photos")
+    if not names:
+        raise InputError(
+            f"All {len(found)} photographs in {quote_value(folder)} have cameras in SCENE already; "
+            "leave it out.",
+            "photos",
+        )
+
+    identity = identify_input(folder, names, photographs)
+    placed = read_earlier(out, identity)
+    if placed is None:
+        if find_spec("pycolmap") is None:
+            raise InputError(
+                "Placing new photographs needs pycolmap, which is not installed; run "
+                "pip install 'gscompleter[poses]'."
+            )
+        with reserve_output(out, overwrite, COMMAND, RESULTS) as output, output.write() as draft:
+            placed = run(folder, names, photographs, draft)
+            content = {"placed": asdict(placed), "photographs": identity}
+            (draft / SUMMARY_FILE).write_bytes(json.dumps(content, indent=1).encode())
+    placed = replace(placed, skipped=len(found) - len(names))
+    (opened,) = open_colmap(out)
+    joined = replace(photographs, frames=(*photographs.frames, *opened.frames))
+    return joined, placed
+
+
+def find_file(frame: Frame) -> Path | None:
+    """Return the file of a photograph, or None if it is in a container or missing."""
+    stored = frame.find_stored() if isinstance(frame.image, Path) else None
+    return stored if isinstance(stored, Path) else None
+
+
+def identify_input(folder: Path, names: Sequence[str], photographs: Photographs) -> dict[str, Any]:
+    """Identify new photographs by size and time of change, and the known cameras by a hash."""
+    stats = {name: (folder / name).stat() for name in names}
+    digest = hashlib.sha256()
+    for frame in photographs.frames:
+        digest.update(frame.name.encode(errors="surrogateescape"))
+        digest.update(frame.c2w.tobytes())
+    return {
+        "new": {name: [stat.st_size, stat.st_mtime_ns] for name, stat in stats.items()},
+        "known": digest.hexdigest(),
+    }
+
+
+def read_earlier(out: Path, identity: Mapping[str, Any]) -> Placed | None:
+    """Read the earlier result for these photographs; None if there is none."""
+    if not os.path.isfile(out / SUMMARY_FILE) or not os.path.isdir(out / "sparse" / "0"):
+        return None
+    content = read_json(out / SUMMARY_FILE, "name another folder")
+    is_ours = isinstance(content, dict) and {"placed", "photographs"} <= content.keys()
+    if not is_ours or content["photographs"] != identity:
+        return None
+    return replace(Placed(**content["placed"]), reused=True)
+
+
+def run(folder: Path, names: Sequence[str], photographs: Photographs, draft: Path) -> Placed:
+    """Write `images` and `sparse/0` of the photographs that can be placed into `draft`."""
+    with tempfile.TemporaryDirectory(dir=draft) as work:
+        home = Path(work)
+        known, sources = write_known(photographs, home)
+        new = write_new(folder, names, photographs, home)
+        job = {
+            "images": str(home / IMAGES),
+            "masks": str(home / MASKS),
+            "model": str(draft / "sparse" / "0"),
+            "known": [asdict(copy) for copy in known],
+            "new": [asdict(copy) for copy in new],
+            "origin": photographs.origin.tolist(),
+        }
+        result = run_colmap(PROCESS, job, home, "Placing photographs")
+        failures = {
+            name: explain_failure(row, sources)
+            for name, row in zip(names, result["new"], strict=True)
+            if not row["is_placed"]
+        }
+        placed = Placed(len(names), failures)
+        if len(failures) == len(names):
+            raise InputError(
+                f"No photograph in {quote_value(folder)} could be placed among those of SCENE. "
+                + placed.notes[1],
+                "photos",
+            )
+        for copy, row in zip(new, result["new"], strict=True):
+            if row["is_placed"]:
+                keep_copy(home, draft, copy)
+    return placed
+
+
+def explain_failure(row: Mapping[str, Any], sources: Mapping[str, str]) -> str:
+    """Explain in a clause why a photograph could not be placed."""
+    matches = row["matches"]
+    if matches == 0:
+        return "it shares no features with a photograph of SCENE"
+    like = quote_value(sources[row["like"]])
+    if matches < MIN_MATCHES:
+        return f"{matches} features in common with {like}, and {MIN_MATCHES} are needed"
+    return f"{matches} features in common with {like} fit no single camera"
+
+
+def write_known(photographs: Photographs, home: Path) -> tuple[list[KnownCopy], dict[str, str]]:
+    """Write undistorted copies of photographs with known cameras; return their files by copy."""
+    frames = choose_known(photographs)
+    copies = []
+    sources = {}
+    for number in track(frames, "Reading photographs"):
+        (view,) = photographs.views([number], MAX_SIDE)
+        name = f"{KNOWN}/{number:05d}.png"
+        is_masked = write_view(view, home, name)
+        camera = view.camera
+        viewmat = np.linalg.inv(camera.c2w.double().numpy())[:3]
+        copies.append(
+            KnownCopy(
+                name, camera.width, camera.height, read_pinhole(view), viewmat.tolist(), is_masked
+            )
+        )
+        sources[name] = photographs.frame(number).file_name
+    return copies, sources
+
+
+def choose_known(photographs: Photographs) -> list[int]:
+    """Choose photographs to compare with: those that exist, of very many some far apart."""
+    frames = [
+        number
+        for number in range(len(photographs))
+        if photographs.frame(number).has_photograph() and not photographs.is_hidden(number)
+    ]
+    if len(frames) <= MAX_KNOWN:
+        return frames
+    cameras = [photographs.camera(number, MAX_SIDE) for number in frames]
+    return sorted(frames[index] for index in select_spread_cameras(cameras, MAX_KNOWN))
+
+
+def write_view(view: View, home: Path, name: str) -> bool:
+    """Write the photograph of a view, and its mask if it has one (True)."""
+    save_pixels(home / IMAGES / name, convert_to_pixels(view.image))
+    if view.ignore_mask is None or not bool(view.ignore_mask.any()):
+        return False
+    # COLMAP's masks are black where no features are wanted, and named after the whole file.
+    save_pixels(home / MASKS / f"{name}.png", convert_to_pixels(~view.ignore_mask))
+    return True
+
+
+def save_pixels(path: Path, pixels: np.ndarray) -> None:
+    """Save a copy that COLMAP reads, as a PNG."""
+    path.parent.mkdir(parents=True, exist_ok=True)
+    Image.fromarray(pixels).save(path, compress_level=1)
+
+
+def read_pinhole(view: View) -> Pinhole:
+    """Return the intrinsics of a view."""
+    K = view.camera.K.tolist()
+    return K[0][0], K[1][1], K[0][2], K[1][2]
+
+
+def write_new(
+    folder: Path, names: Sequence[str], photographs: Photographs, home: Path
+) -> list[NewCopy]:
+    """Write copies of new photographs, undistorted if their lens is a known one."""
+    lenses = collect_lenses(photographs)
+    listings = FolderListings()
+    copies = []
+    for name in track(names, "Reading new photographs"):
+        key = read_lens_key(folder / name)
+        copies.append(write_copy(folder, name, key, lenses.get(key), home, listings))
+    return copies
+
+
+def collect_lenses(photographs: Photographs) -> dict[LensKey, Intrinsics]:
+    """Collect the intrinsics of the known photographs by size and lens."""
+    lenses: dict[LensKey, Intrinsics] = {}
+    for frame in photographs.frames:
+        file = find_file(frame)
+        # The camera of a photograph belongs to the pixels as they are stored, unless it is turned.
+        if file is not None and frame.find_turn() == 1 and read_orientation(file) == 1:
+            lenses.setdefault(read_lens_key(file), frame.intrinsics)
+    return lenses
+
+
+def read_lens_key(path: Path) -> LensKey:
+    """Read the size of an upright photograph, and the key of its camera, lens and zoom."""
+    width, height = read_image_size(path)
+    if read_orientation(path) in QUARTER_TURNS:
+        width, height = height, width
+    with open_image(path) as image:
+        return width, height, read_lens(image.getexif())
+
+
+def write_copy(
+    folder: Path,
+    name: str,
+    key: LensKey,
+    known: Intrinsics | None,
+    home: Path,
+    listings: FolderListings,
+) -> NewCopy:
+    """Write the copy of a new photograph, which is undistorted if its lens is `known`."""
+    path = folder / name
+    title = f"the photograph {quote_value(path)}"
+    # Without a known lens the intrinsics are not used, but for the size that makes it upright.
+    width, height, lens = key
+    guess = Intrinsics((width, height), (float(width), float(width)))
+    mask = find_mask(path, name, listings)
+    frame = Frame(name, title, np.eye(4), known or guess, path, mask=mask)
+    (view,) = build_photographs(name, title, [frame]).views([0], MAX_SIDE)
+
+    # Two photographs may differ in their endings alone.
+    plain = re.sub(SEPARATORS, "_", name)
+    copy = f"{NEW}/{Path(plain).with_suffix('.png').as_posix()}"
+    if (home / IMAGES / copy).exists():
+        copy = f"{NEW}/{plain}.png"
+    if (home / IMAGES / copy).exists():
+        raise InputError(f"Two photographs would be called {quote_value(copy)}; rename one.")
+    is_masked = write_view(view, home, copy)
+    camera = view.camera
+    focal = read_focal_pixels(path, camera.width, camera.height)
+    pinhole = None if known is None else read_pinhole(view)
+    return NewCopy(copy, camera.width, camera.height, lens, focal, pinhole, is_masked)
+
+
+def read_focal_pixels(path: Path, width: int, height: int) -> float | None:
+    """Read the focal length from EXIF, in pixels of a copy of this size; None if it has none."""
+    with open_image(path) as image:
+        diagonals = read_focal(image.getexif())
+    return None if diagonals is None else diagonals * math.hypot(width, height)
+
+
+def keep_copy(home: Path, draft: Path, copy: NewCopy) -> None:
+    """Move the copy of a placed photograph, and its mask, to their place in `draft`."""
+    name = copy.name.partition("/")[2]
+    moves = [(home / IMAGES / copy.name, draft / IMAGES / name)]
+    if copy.is_masked:
+        moves.append((home / MASKS / f"{copy.name}.png", draft / MASKS / f"{name}.png"))
+    for source, target in moves:
+        target.parent.mkdir(parents=True, exist_ok=True)
+        os.replace(source, target)

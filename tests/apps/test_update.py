@@ -1,0 +1,152 @@
+"""`update`: photographs add to a splat what it lacks, also such whose cameras are not known."""
+
+import json
+from pathlib import Path
+
+import pytest
+import torch
+
+from command import run
+from gscompleter import load_ply, save_ply
+from gscompleter.state import NEW_PHOTO_ID
+from gscompleter.system.files.image import write_image
+from gscompleter.types import merge
+from scenes import Room, camera_at, gaussians_of, photographed, view_of
+
+SIZE = 128
+CAMERAS = [camera_at(x=0.25 * i - 0.875, y=0.1 * (i % 3), size=SIZE) for i in range(8)]
+NEW = (3, 5)
+"""Cameras whose photographs come without them."""
+
+
+@pytest.fixture(scope="module")
+def room(tmp_path_factory) -> Path:
+    """Write photographs with cameras."""
+    known = [camera for number, camera in enumerate(CAMERAS) if number not in NEW]
+    return photographed(tmp_path_factory.mktemp("room"), known)
+
+
+@pytest.fixture(scope="module")
+def new(tmp_path_factory) -> Path:
+    folder = tmp_path_factory.mktemp("new")
+    for number in NEW:
+        write_image(folder / f"{number}.png", view_of(Room(), CAMERAS[number]).image)
+    return folder
+
+
+@pytest.fixture(scope="module")
+def cut(tmp_path_factory) -> Path:
+    """Return a splat of the room without what stands near its middle."""
+    whole = merge([gaussians_of(view_of(Room(), CAMERAS[index])) for index in (0, 4, 7)])
+    low, high = torch.tensor(Room().boxes[1])
+    is_gone = ((whole.means > low - 0.05) & (whole.means < high + 0.05)).all(dim=1)
+    path = tmp_path_factory.mktemp("splat") / "cut.ply"
+    save_ply(path, whole[~is_gone])
+    return path
+
+
+def read_summary(out: Path) -> dict:
+    return json.loads((out / "summary.json").read_text())
+
+
+def test_photographs_fill_a_splat_and_others_confirm_it(room, cut, tmp_path, monkeypatch, capsys):
+    out = tmp_path / "out"
+    words = ("update", room, "--scene", cut, "--far", 20, "--hold-out", 2, "--out", out)
+    assert run(monkeypatch, *words) == 0
+    summary = read_summary(out)
+    assert summary["targets"] == []
+    assert summary["gaussians"]["from_photographs"] == summary["gaussians"]["added"] > 100
+    assert summary["settings"]["hold_out"] == 2
+
+    # Photographs that were kept back are neither in the context nor among the checks.
+    held_out = [row["frame"] for row in summary["held_out"]]
+    assert held_out == [1, 4]
+    used = [row["frame"] for row in (*summary["context"], *summary["checks"])]
+    assert sorted(used) == [0, 2, 3, 5]
+    for row in (*summary["context"], *summary["held_out"]):
+        assert row["psnr_after"] > row["psnr_before"] + 3
+    assert "not used: 1 (1.png)" in capsys.readouterr().out
+
+    # The page shows each of them, and first those that were not used.
+    page = (out / "report.html").read_text()
+    assert page.count(", used</h3>") == 4
+    assert page.index("Photograph 1 (1.png), not used") < page.index("Photograph 0 (0.png), used")
+    names = {path.name for path in (out / "images").iterdir()}
+    assert {"photograph1_before.png", "photograph6_after.png", "photograph6_truth.png"} <= names
+
+    back = tmp_path / "back.ply"
+    assert run(monkeypatch, "strip", out / "completed.ply", "--out", back, "--quiet") == 0
+    assert back.read_bytes() == cut.read_bytes()
+
+
+def test_photographs_without_cameras_are_placed_and_used(
+    room, new, cut, tmp_path, monkeypatch, capsys
+):
+    pytest.importorskip("pycolmap", reason="needs gscompleter[poses]")
+    out = tmp_path / "out"
+    words = ("update", room, "--scene", cut, "--far", 20, "--photos", new, "--out", out)
+    assert run(monkeypatch, *words) == 0
+    summary = read_summary(out)
+    assert summary["scene"]["photographs"] == 8
+    frames = {row["frame"] for row in summary["context"]}
+    assert {6, 7} <= frames
+    printed = capsys.readouterr()
+    assert "2 of 2 new photographs were placed among those of the scene." in printed.err
+    assert "context 6 (3.png)" in printed.out
+    for row in summary["context"]:
+        assert row["psnr_after"] > row["psnr_before"] + 2
+    assert bool((load_ply(out / "completed.ply").generated == NEW_PHOTO_ID).any())
+    assert (out / "colmap" / "images" / "3.png").is_file()
+
+
+def test_a_splat_that_lacks_nothing_stays(room, tmp_path, monkeypatch, capsys):
+    known = [camera for number, camera in enumerate(CAMERAS) if number not in NEW]
+    whole = merge([gaussians_of(view_of(Room(), camera)) for camera in known])
+    path = tmp_path / "whole.ply"
+    save_ply(path, whole)
+    out = tmp_path / "out"
+    assert run(monkeypatch, "update", room, "--scene", path, "--far", 20, "--out", out) == 0
+    said = capsys.readouterr().out
+    assert said.startswith("Nothing was gained, because photographs show nothing that the splat")
+
+
+@pytest.mark.parametrize(
+    ("more", "sentence"),
+    [
+        (("--hold-out", 6), "there are 6 to choose from, and at least 2 of 6 have to be left"),
+        (("--photos", "nowhere"), "There are no photographs in nowhere"),
+        (("--config", "paper"), "nothing is added from photographs, as in the config paper"),
+        (("--target", 1), "update has no option --target, which belongs to"),
+    ],
+)
+def test_wrong_options_are_refused_in_a_sentence(
+    room, cut, tmp_path, monkeypatch, capsys, more, sentence
+):
+    out = tmp_path / "out"
+    assert run(monkeypatch, "update", room, "--scene", cut, "--out", out, *more) == 2
+    assert sentence in capsys.readouterr().err
+    assert not out.exists()
+
+
+def test_a_scene_without_cameras_has_no_place_for_new_photographs(
+    new, cut, tmp_path, monkeypatch, capsys
+):
+    pytest.importorskip("pycolmap", reason="needs gscompleter[poses]")
+    bare = tmp_path / "bare"
+    bare.mkdir()
+    for number in (0, 1, 2, 4, 6, 7):
+        write_image(bare / f"{number}.png", view_of(Room(), CAMERAS[number]).image)
+    words = ("update", bare, "--scene", cut, "--photos", new, "--out", tmp_path / "out")
+    assert run(monkeypatch, *words) == 2
+    assert "put all photographs into one folder" in capsys.readouterr().err
+
+
+def test_a_plan_shows_where_to_stand(room, cut, tmp_path, monkeypatch, capsys):
+    out = tmp_path / "out"
+    words = ("complete", room, "--scene", cut, "--far", 20, "--auto", 1, "--dry-run", "--out", out)
+    assert run(monkeypatch, *words) == 0
+    if not (out / "targets.json").exists():
+        pytest.skip("no camera was planned")
+    names = {path.name for path in (out / "images").iterdir()}
+    assert names == {"target1_before.png", "target1_beside.png"}
+    assert "What each camera sees now, and the photograph beside it" in capsys.readouterr().out
