@@ -79,12 +79,20 @@ def test_the_cameras_stand_beside_the_photographs_they_were_derived_from(scene, 
         assert measure_baseline(camera, photographs.camera(row["derived_from"], 48)) < 0.5
 
 
-def test_a_dry_run_writes_the_cameras_alone_and_shows_them(scene, tmp_path, monkeypatch, capsys):
+def test_a_dry_run_writes_the_cameras_and_what_they_see(scene, tmp_path, monkeypatch, capsys):
     out = tmp_path / "out"
     said = [word for word in QUICK if word != "--quiet"]
     assert run(monkeypatch, "complete", scene, "--out", out, "--auto", 2, "--dry-run", *said) == 0
-    assert sorted(path.name for path in out.iterdir()) == ["summary.json", "targets.json"]
+    names = sorted(path.name for path in out.iterdir())
+    assert names == ["images", "summary.json", "targets.json"]
     cameras = load_cameras(out / "targets.json")
+    # What each camera sees, and the photograph beside it, show where to stand.
+    pictures = {path.name for path in (out / "images").iterdir()}
+    assert pictures == {
+        f"target{number + 1}_{what}.png"
+        for number in range(len(cameras))
+        for what in ("before", "beside")
+    }
     shown = " ".join(capsys.readouterr().out.split())
     assert f"{len(cameras)}: near photograph " in shown
     assert f"Edit the cameras in {out / 'targets.json'}." in shown

@@ -112,7 +112,7 @@ def test_a_plan_names_a_photograph_and_the_hole_that_is_left(scene, tmp_path, mo
     (row,) = [line for line in capsys.readouterr().out.splitlines() if "1: near photograph" in line]
     assert 2 < float(row.split()[-2]) < 40
     names = sorted(path.name for path in (tmp_path / "out").iterdir())
-    assert names == ["summary.json", "targets.json"]
+    assert names == ["images", "summary.json", "targets.json"]
 
 
 def test_boxes_are_rotated_about_their_centres():

@@ -139,14 +139,3 @@ def test_a_scene_without_cameras_has_no_place_for_new_photographs(
     words = ("update", bare, "--scene", cut, "--photos", new, "--out", tmp_path / "out")
     assert run(monkeypatch, *words) == 2
     assert "put all photographs into one folder" in capsys.readouterr().err
-
-
-def test_a_plan_shows_where_to_stand(room, cut, tmp_path, monkeypatch, capsys):
-    out = tmp_path / "out"
-    words = ("complete", room, "--scene", cut, "--far", 20, "--auto", 1, "--dry-run", "--out", out)
-    assert run(monkeypatch, *words) == 0
-    if not (out / "targets.json").exists():
-        pytest.skip("no camera was planned")
-    names = {path.name for path in (out / "images").iterdir()}
-    assert names == {"target1_before.png", "target1_beside.png"}
-    assert "What each camera sees now, and the photograph beside it" in capsys.readouterr().out

@@ -113,7 +113,8 @@ def plan_folder(options: CompleteOptions, prepare: Prepare) -> None:
             ready = ready.with_choices(choices)
             holes = [choice.hole_fraction for choice in choices]
         write_targets(folder, ready.task)
-        write_plan_pictures(folder / IMAGES, ready, begun)
+        if ready.task.targets:
+            write_plan_pictures(folder / IMAGES, ready, begun)
     if not options.quiet:
         print_plan(options, ready.opened, ready.task.targets, holes)
 
