@@ -138,6 +138,9 @@ def test_photographs_that_show_nothing_new_are_not_reconstructed():
     assert choose_photographs(same, [make_lack(0.1)] * 2) == []
     lacks = [make_lack(0.1), make_lack(0.1), make_lack(0.0)]
     assert choose_photographs([*same, views[1]], lacks) == [0, 1, 2]
+    # What photographs still show that were reconstructed before could not be added.
+    assert choose_photographs(views, [make_lack(0.1)] * 3, {0, 1}) == [1, 2]
+    assert choose_photographs(views, [make_lack(0.1)] * 3, {0, 1, 2}) == []
     small = view_of(ROOM, camera_at(0.1, size=32))
     assert choose_photographs([*views, small], [make_lack(0.1)] * 4) == [0, 1, 2]
 

@@ -9,7 +9,7 @@ against all of them, since each is a true image (decision 051).
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Collection, Sequence
 from dataclasses import dataclass, replace
 
 import torch
@@ -105,13 +105,15 @@ def add_observed(
     if not state.is_given or not state.config.add_observed:
         return state
     views = [photo.view for photo in state.photos]
+    reconstructed: set[int] = set()
     for _ in track(range(MAX_ROUNDS), "Adding what photographs show"):
         frozen = scenes.freeze_at(state.parts, [view.camera for view in views])
         renders = [scene.render for scene in frozen]
         lacks = find_lacks(views, renders, state.config.holes)
-        chosen = choose_photographs(views, lacks)
+        chosen = choose_photographs(views, lacks, reconstructed)
         if not chosen:
             break
+        reconstructed.update(chosen)
         photos = [Evidence(views[i], frozen[i], lacks[i]) for i in chosen]
         part = reconstruct_lacking(reconstructor, photos, state, rng)
         part = fit_to_photographs(part, frozen, state)
@@ -153,9 +155,18 @@ def keep_large_regions(mask: Bool[Tensor, "h w"]) -> Bool[Tensor, "h w"]:
     return is_large[labels]
 
 
-def choose_photographs(views: Sequence[View], lacks: Sequence[Lack]) -> list[int]:
-    """Choose photographs that show together what the scene lacks; none if there is no stereo."""
-    showing = [index for index, lack in enumerate(lacks) if lack.share >= MIN_SHARE]
+def choose_photographs(
+    views: Sequence[View], lacks: Sequence[Lack], reconstructed: Collection[int] = ()
+) -> list[int]:
+    """Choose photographs that show together what the scene lacks; none if there is no stereo.
+
+    What those that were `reconstructed` before still show could not be added.
+    """
+    showing = [
+        index
+        for index, lack in enumerate(lacks)
+        if lack.share >= MIN_SHARE and index not in reconstructed
+    ]
     if not showing:
         return []
     # The networks need images of one size; check views may be smaller than the context.

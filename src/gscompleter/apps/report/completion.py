@@ -28,6 +28,7 @@ from gscompleter.apps.report.schema import (
     TargetRow,
     UnfilledRow,
 )
+from gscompleter.config.settings import COVERED
 from gscompleter.editing.removal import hide_removed
 from gscompleter.evaluation.metrics.coverage import RenderPair, compute_coverage
 from gscompleter.evaluation.metrics.image import compute_masked_psnr, ssim
@@ -404,6 +405,15 @@ def paint_ignored(view: View) -> Float[Tensor, "h w 3"]:
     return torch.where(view.valid_mask[..., None], view.image, color)
 
 
+def paint_unfilled(result: TargetResult, pair: RenderPair) -> Float[Tensor, "h w 3"] | None:
+    """Paint what stays empty of the hole of a target; None if the report has no word on it."""
+    if not result.unfilled.describe():
+        return None
+    is_open = result.hole_mask & (pair.after.alpha < COVERED)
+    color = pair.after.image.new_tensor(IGNORED_COLOR)
+    return torch.where(is_open[..., None], color, pair.after.image)
+
+
 def name_target_images(
     target: Target, result: TargetResult, pair: RenderPair
 ) -> dict[str, Tensor | None]:
@@ -413,6 +423,7 @@ def name_target_images(
         "before": pair.before.image,
         "after": pair.after.image,
         "hole_mask": result.hole_mask.float(),
+        "unfilled": paint_unfilled(result, pair),
         "support": None if torch.equal(alpha, result.before.alpha) else alpha,
         "reference": None if result.reference is None else result.reference.image,
         "truth": None if target.view is None else paint_ignored(target.view),
