@@ -28,16 +28,14 @@ from typing import Any
 
 import torch
 
+from gscompleter.cli import COMMANDS
+
 ROOT = Path(__file__).resolve().parents[1]
 DATA = Path(os.environ.get("GSCOMPLETER_DATA", ROOT.parent / "shared"))
 PROGRAM = (sys.executable, "-c", "from gscompleter.cli import run; run()")
 MEAN_TOLERANCE, CASE_TOLERANCE = 0.02, 0.1
 """dB by which the mean PSNR, and the PSNR of one view, may fall on another machine."""
 SECTIONS = ("scenes", "room", "texts")
-COMMANDS = [
-    *("complete", "batch", "live", "clean", "demo", "evaluate", "tables", "index", "bench"),
-    *("models", "convert", "poses", "report", "strip", "view", "doctor", "warmup"),
-]
 
 
 def main() -> None:

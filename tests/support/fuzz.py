@@ -182,6 +182,7 @@ def as_ascii(data: bytes) -> bytes:
     return head + b"end_header\n" + text.encode() + b"\n"
 
 
+UPDATE = ["update", "scene", "--scene", "scene.ply", "--out", "out", "--quiet", "--near", "0.5"]
 COMPLETE = ["complete", "scene", "--context", "0", "1", "--out", "out", "--quiet", "--target"]
 
 
@@ -473,6 +474,8 @@ KINDS: dict[str, Mutation] = {
     "image": in_bytes("scene/1.png", [*COMPLETE, "2", *RANGE]),
     "depth": in_bytes("scene/1.npy", [*COMPLETE, "2", *RANGE]),
     "ply": in_bytes("scene.ply", [*COMPLETE, "2", *RANGE, "--scene", "scene.ply"]),
+    "update": in_bytes("scene.ply", [*UPDATE, "--hold-out", "1"]),
+    "update-image": in_bytes("scene/1.png", UPDATE),
     "small-ply": in_bytes("small.ply", ["convert", "small.ply", "out.ply", "--quiet"]),
     "ascii-ply": in_bytes("ascii.ply", ["convert", "ascii.ply", "out.ply", "--quiet"]),
     "cases": in_json("cases.json", ["evaluate", "cases.json", *SCORES]),

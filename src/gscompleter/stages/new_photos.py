@@ -31,8 +31,6 @@ MAX_DISTRUST = 0.5
 """Distrust up to which a pixel is compared in exposure."""
 MIN_KNOWN = 0.05
 """Smallest fraction of such pixels."""
-EXPOSURE_PIXELS = 10_000
-"""Pixels that the exposure of a photograph is fitted to."""
 MAX_PHOTOS = 32
 """Most new photographs that are used; of more, those far apart."""
 
@@ -77,12 +75,9 @@ def match_exposure(
 
     If hardly any pixel is, the photograph stays as it is.
     """
-    num_known = int(known.sum())
-    if num_known < MIN_KNOWN * known.numel():
+    if int(known.sum()) < MIN_KNOWN * known.numel():
         return photograph
-    # Two numbers for each channel need no more: all pixels took 5 % of a completion.
-    step = max(1, num_known // EXPOSURE_PIXELS)
-    gain, offset = fit_robust_affine(photograph[known][::step], image.clamp(0, 1)[known][::step])
+    gain, offset = fit_robust_affine(photograph[known], image.clamp(0, 1)[known])
     return (gain * photograph + offset).clamp(0, 1)
 
 
