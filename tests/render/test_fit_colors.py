@@ -6,6 +6,7 @@ import pytest
 import torch
 
 from gscompleter.evaluation.metrics.image import psnr
+from gscompleter.numerics.value_checks import LARGEST_SH
 from gscompleter.render.fit_colors import fit_colors
 from gscompleter.render.loading import load_renderer
 from scenes import Room, camera_at, gaussians_of, half_a_room_of, view_of
@@ -53,3 +54,14 @@ def test_no_round_keeps_the_colours():
     scene = gaussians_of(VIEW)
     kept = fit_colors(scene, [load_renderer("cpu").freeze(scene[:0], CAMERA)], [VIEW], [])
     assert torch.equal(kept.sh, scene.sh)
+
+
+def test_colours_stay_within_what_a_file_may_hold():
+    _, context, added = half_a_room_of(Room(), CAMERA)
+    absurd = torch.full_like(context.sh, 0.9 * LARGEST_SH)
+    thin = replace(context, sh=absurd, opacities=0.9 * context.opacities)
+    thin = replace(thin, means=0.99 * context.means)
+    frozen = load_renderer("cpu").freeze(thin, CAMERA)
+    fitted = fit_colors(added, [frozen], [VIEW], [1.7] * 4)
+    # They try to make up for the scene in front, and cannot.
+    assert fitted.sh.abs().max() == LARGEST_SH

@@ -7,6 +7,7 @@ from dataclasses import replace
 
 import torch
 
+from gscompleter.numerics.value_checks import LARGEST_SH
 from gscompleter.render.protocols import ColorSums, FrozenScene
 from gscompleter.render.spherical_harmonics import evaluate_colors
 from gscompleter.render.view_map import get_view_map
@@ -46,5 +47,7 @@ def fit_colors(
             sums = sums + pull
             weights = weights + weight
         change = change + relaxation * sums / weights.clamp_min(MIN_WEIGHT)[:, None]
-    sh = torch.cat([new.sh[:, :1] + change[:, None] / SH_C0, new.sh[:, 1:]], dim=1)
-    return replace(new, sh=sh, encoded=None)
+    # Beside a scene with absurd colours, which a Ψ of one's own may give, a fit would exceed what a
+    # file may hold.
+    constant = (new.sh[:, :1] + change[:, None] / SH_C0).clamp(-LARGEST_SH, LARGEST_SH)
+    return replace(new, sh=torch.cat([constant, new.sh[:, 1:]], dim=1), encoded=None)

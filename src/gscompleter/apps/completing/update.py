@@ -29,6 +29,7 @@ from gscompleter.apps.inputs.selection import CHECK_VIEW_SIZE, collect_usable_ca
 from gscompleter.apps.inputs.splat import add_check_views
 from gscompleter.apps.inputs.task import Opened
 from gscompleter.config import CompleterConfig
+from gscompleter.data.formats import find_format
 from gscompleter.data.sfm.placing import place_photographs
 from gscompleter.splats.alignment.similarity import transform_view
 from gscompleter.stages.add_observed import MIN_SHARE, find_lacks
@@ -69,6 +70,13 @@ def prepare_update(
 ) -> PreparedUpdate:
     """Open the scene with new photographs, and choose those that show what the splat lacks."""
     options = check_options(options)
+    # Cameras for all of SCENE would be searched for minutes, in the folder meant for the new ones.
+    if update.photos is not None and (update.format or find_format(update.folder)) is None:
+        raise InputError(
+            "SCENE has no cameras to place new photographs among; put all photographs into one "
+            "folder, whose cameras are found together.",
+            "photos",
+        )
     opened = open_photographs(options, console)
     num_known = len(opened.photographs)
     if update.photos is not None:
@@ -85,13 +93,6 @@ def prepare_update(
 def add_new_photographs(update: UpdateOptions, opened: Opened, console: Console) -> Opened:
     """Place new photographs among those of the scene, and add them."""
     assert update.photos is not None
-    # A scene without cameras has just got them in the folder that is meant for the new ones.
-    if opened.format == "photographs":
-        raise InputError(
-            "SCENE has no cameras to place new photographs among; put all photographs into one "
-            "folder, whose cameras are found together.",
-            "photos",
-        )
     photographs, placed = place_photographs(
         update.photos, opened.photographs, update.out / POSES, update.overwrite
     )
