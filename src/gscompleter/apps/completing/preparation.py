@@ -91,7 +91,7 @@ class Prepared:
 def prepare_completion(options: CompleteOptions, console: Console) -> Prepared:
     """Open the scene and load the models."""
     options = check_options(options)
-    opened = open_photographs(options, console)
+    opened = open_for_completion(options, console)
     task = read_inputs(options, opened)
     return load_models(options, opened, task, console)
 
@@ -108,7 +108,7 @@ def check_options(options: CompleteOptions) -> CompleteOptions:
     return options
 
 
-def open_photographs(options: CompleteOptions, console: Console) -> Opened:
+def open_for_completion(options: CompleteOptions, console: Console) -> Opened:
     """Open the photographs, after reading what can be wrong without their cameras."""
     opened = open_input(options, console, partial(check_completion_inputs, options))
     if not options.config.ego_mask:

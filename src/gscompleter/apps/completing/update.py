@@ -18,7 +18,7 @@ from gscompleter.apps.completing.preparation import (
     collect_cameras,
     compute_view_transform,
     load_models,
-    open_photographs,
+    open_for_completion,
     read_inputs,
 )
 from gscompleter.apps.inputs.depth_range import apply_splat_range
@@ -77,7 +77,7 @@ def prepare_update(
             "folder, whose cameras are found together.",
             "photos",
         )
-    opened = open_photographs(options, console)
+    opened = open_for_completion(options, console)
     num_known = len(opened.photographs)
     if update.photos is not None:
         opened = add_new_photographs(update, opened, console)

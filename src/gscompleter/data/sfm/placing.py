@@ -141,7 +141,7 @@ def place_photographs(
     Raises InputError if none can be placed.
     """
     found = list_all_photographs(folder) if os.path.isdir(folder) else []
-    known = {stored.resolve() for stored in map(find_file, photographs.frames) if stored}
+    known = {stored.resolve() for stored in map(find_stored_file, photographs.frames) if stored}
     names = [name for name in found if (folder / name).resolve() not in known]
     if not found:
         raise InputError(f"There are no photographs in {quote_value(folder)}.", "photos")
@@ -161,7 +161,7 @@ def place_photographs(
                 "pip install 'gscompleter[poses]'."
             )
         with reserve_output(out, overwrite, COMMAND, RESULTS) as output, output.write() as draft:
-            placed = run(folder, names, photographs, draft)
+            placed = place_copies(folder, names, photographs, draft)
             content = {"placed": asdict(placed), "photographs": identity}
             (draft / SUMMARY_FILE).write_bytes(json.dumps(content, indent=1).encode())
     placed = replace(placed, skipped=len(found) - len(names))
@@ -170,7 +170,7 @@ def place_photographs(
     return joined, placed
 
 
-def find_file(frame: Frame) -> Path | None:
+def find_stored_file(frame: Frame) -> Path | None:
     """Return the file of a photograph, or None if it is in a container or missing."""
     stored = frame.find_stored() if isinstance(frame.image, Path) else None
     return stored if isinstance(stored, Path) else None
@@ -200,7 +200,9 @@ def read_earlier(out: Path, identity: Mapping[str, Any]) -> Placed | None:
     return replace(Placed(**content["placed"]), reused=True)
 
 
-def run(folder: Path, names: Sequence[str], photographs: Photographs, draft: Path) -> Placed:
+def place_copies(
+    folder: Path, names: Sequence[str], photographs: Photographs, draft: Path
+) -> Placed:
     """Write `images` and `sparse/0` of the photographs that can be placed into `draft`."""
     with tempfile.TemporaryDirectory(dir=draft) as work:
         home = Path(work)
@@ -216,7 +218,7 @@ def run(folder: Path, names: Sequence[str], photographs: Photographs, draft: Pat
         }
         result = run_colmap(PROCESS, job, home, "Placing photographs")
         failures = {
-            name: explain_failure(row, sources)
+            name: explain_unplaced(row, sources)
             for name, row in zip(names, result["new"], strict=True)
             if not row["is_placed"]
         }
@@ -233,7 +235,7 @@ def run(folder: Path, names: Sequence[str], photographs: Photographs, draft: Pat
     return placed
 
 
-def explain_failure(row: Mapping[str, Any], sources: Mapping[str, str]) -> str:
+def explain_unplaced(row: Mapping[str, Any], sources: Mapping[str, str]) -> str:
     """Explain in a clause why a photograph could not be placed."""
     matches = row["matches"]
     if matches == 0:
@@ -316,7 +318,7 @@ def collect_lenses(photographs: Photographs) -> dict[LensKey, Intrinsics]:
     """Collect the intrinsics of the known photographs by size and lens."""
     lenses: dict[LensKey, Intrinsics] = {}
     for frame in photographs.frames:
-        file = find_file(frame)
+        file = find_stored_file(frame)
         # The camera of a photograph belongs to the pixels as they are stored, unless it is turned.
         if file is not None and frame.find_turn() == 1 and read_orientation(file) == 1:
             lenses.setdefault(read_lens_key(file), frame.intrinsics)

@@ -56,27 +56,27 @@ def main() -> None:
     new = [NewCopy(**one) for one in task.pop("new")]
     job = PlacingJob(known=known, new=new, **task)
     prepare_colmap()
-    cameras = find_features(job)
+    cameras = extract_all_features(job)
     match(job, job.names, select_pairs(job, job.names))
     model = register_new(job, cameras)
     placed = find_placed(job, model)
     write_placed(job, model, placed)
-    print(json.dumps(describe(job, model, placed)))
+    print(json.dumps(describe_placed(job, model, placed)))
 
 
-def find_features(job: PlacingJob) -> dict[str, int]:
+def extract_all_features(job: PlacingJob) -> dict[str, int]:
     """Extract the features of all copies, and return the number of the camera of each."""
     cameras: dict[str, int] = {}
     with pycolmap.Database.open(job.database) as database:
         for known in job.known:
-            cameras[known.name] = database.write_camera(make_pinhole(known.pinhole, known))
+            cameras[known.name] = database.write_camera(make_known_camera(known.pinhole, known))
 
         # New photographs of one lens share a camera, whose focal length they determine together.
         numbers: dict[tuple[int, int, str], int] = {}
         for new in job.new:
             lens = new.width, new.height, new.lens
             if lens not in numbers:
-                numbers[lens] = database.write_camera(make_camera(new))
+                numbers[lens] = database.write_camera(make_new_camera(new))
             cameras[new.name] = numbers[lens]
 
     for copy in job.copies:
@@ -84,7 +84,7 @@ def find_features(job: PlacingJob) -> dict[str, int]:
     return cameras
 
 
-def make_pinhole(pinhole: Pinhole, copy: KnownCopy | NewCopy) -> pycolmap.Camera:
+def make_known_camera(pinhole: Pinhole, copy: KnownCopy | NewCopy) -> pycolmap.Camera:
     """Make the camera of an undistorted copy with known intrinsics."""
     camera = pycolmap.Camera(
         model="PINHOLE", width=copy.width, height=copy.height, params=list(pinhole)
@@ -93,10 +93,10 @@ def make_pinhole(pinhole: Pinhole, copy: KnownCopy | NewCopy) -> pycolmap.Camera
     return camera
 
 
-def make_camera(copy: NewCopy) -> pycolmap.Camera:
+def make_new_camera(copy: NewCopy) -> pycolmap.Camera:
     """Make the camera of a new photograph, whose intrinsics may have to be guessed."""
     if copy.pinhole is not None:
-        return make_pinhole(copy.pinhole, copy)
+        return make_known_camera(copy.pinhole, copy)
     focal = copy.focal or GUESSED_FOCAL * max(copy.width, copy.height)
     camera = pycolmap.Camera.create_from_model_name(1, LENS, focal, copy.width, copy.height)
     camera.has_prior_focal_length = copy.focal is not None
@@ -178,7 +178,7 @@ def shift_pose(image: pycolmap.Image, origin: Float[np.ndarray, "3"]) -> pycolma
     return pycolmap.Rigid3d(pose.rotation, pose.translation - rotation @ origin)
 
 
-def describe(
+def describe_placed(
     job: PlacingJob, model: pycolmap.Reconstruction, placed: dict[str, pycolmap.Image]
 ) -> dict[str, Any]:
     """Describe what became of each new photograph.
