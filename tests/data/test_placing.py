@@ -12,7 +12,7 @@ from PIL import Image
 from gscompleter.data.formats import open_photographs
 from gscompleter.data.photographs import Photographs
 from gscompleter.data.sfm import placing
-from gscompleter.data.sfm.placing import place_photographs
+from gscompleter.data.sfm.placing import identify_input, place_photographs
 from gscompleter.system.errors import InputError
 from gscompleter.system.files.image import write_image
 from mapping_stand_in import stand_in
@@ -160,6 +160,12 @@ def test_masks_of_new_photographs_are_kept(known, new, tmp_path):
     assert view.ignore_mask is not None
     assert view.ignore_mask[:38].all()
     assert not view.ignore_mask[42:].any()
+
+    # A mask that comes later makes another result.
+    names = [f"new {number}.png" for number in NEW]
+    with_mask = identify_input(new, names, known)
+    (new / "masks" / "new 2.png").unlink()
+    assert identify_input(new, names, known) != with_mask
 
 
 def test_real_photographs_are_placed_within_a_pixel(shared, tmp_path):

@@ -177,8 +177,12 @@ def find_stored_file(frame: Frame) -> Path | None:
 
 
 def identify_input(folder: Path, names: Sequence[str], photographs: Photographs) -> dict[str, Any]:
-    """Identify new photographs by size and time of change, and the known cameras by a hash."""
-    stats = {name: (folder / name).stat() for name in names}
+    """Identify new photographs and their masks by size and time of change, cameras by a hash."""
+    files = {name: folder / name for name in names}
+    listings = FolderListings()
+    masks = {name: find_mask(file, name, listings) for name, file in files.items()}
+    files |= {f"mask of {name}": mask for name, mask in masks.items() if mask is not None}
+    stats = {name: file.stat() for name, file in files.items()}
     digest = hashlib.sha256()
     for frame in photographs.frames:
         digest.update(frame.name.encode(errors="surrogateescape"))

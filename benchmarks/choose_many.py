@@ -1,0 +1,69 @@
+"""Write many/ORDER-N.json: the development cases with N further photographs in the context.
+
+    GSCOMPLETER_DATA=DIR python benchmarks/choose_many.py
+
+Users bring more than a pair. Further frames are never the target nor the photographs beside it by
+which a case is scored. `nearest` takes those whose cameras are nearest to the target, `spread`
+takes them at even steps of what is left. A scene with fewer frames has no case in a file.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+DATA = Path(os.environ["GSCOMPLETER_DATA"]) / "data"
+OUT = Path(__file__).with_name("many")
+COUNTS = (1, 3, 6, 14)
+
+
+def main() -> None:
+    """Write a file of cases for each order and number of further photographs."""
+    content = json.loads((DATA / "cases.json").read_text())
+    OUT.mkdir(exist_ok=True)
+    for order in ("nearest", "spread"):
+        for count in COUNTS:
+            cases = [add_photographs(row, order, count) for row in content["cases"]]
+            kept = [case for case in cases if case is not None]
+            write_cases(OUT / f"{order}-{count}.json", order, count, kept, content["resolution"])
+            print(f"{order}-{count}: {len(kept)} cases")
+
+
+def write_cases(
+    path: Path, order: str, count: int, cases: Sequence[dict[str, Any]], resolution: Sequence[int]
+) -> None:
+    """Write a file of cases, one a line."""
+    head = {
+        "about": f"The development cases with {count} further photographs ({order}), from "
+        "benchmarks/choose_many.py.",
+        "resolution": resolution,
+    }
+    lines = [f" {json.dumps(key)}: {json.dumps(value)}," for key, value in head.items()]
+    listed = ",\n".join(f"  {json.dumps(case)}" for case in cases)
+    path.write_text("\n".join(["{", *lines, ' "cases": [', listed, " ]", "}"]) + "\n")
+
+
+def add_photographs(row: dict[str, Any], order: str, count: int) -> dict[str, Any] | None:
+    """Add further photographs to the context of a case; None if the scene has too few."""
+    frames = json.loads((DATA / row["scene"] / "transforms.json").read_text())["frames"]
+    centres = np.array([frame["transform_matrix"] for frame in frames])[:, :3, 3]
+    used = {*row["context"], row["target"], *row["neighbours"]}
+    left = [number for number in range(len(frames)) if number not in used]
+    if len(left) < count:
+        return None
+    if order == "nearest":
+        distances = np.linalg.norm(centres - centres[row["target"]], axis=1)
+        further = sorted(left, key=lambda number: distances[number])[:count]
+    else:
+        further = [left[(2 * step + 1) * len(left) // (2 * count)] for step in range(count)]
+    place = f"$GSCOMPLETER_DATA/data/{row['scene']}"
+    return {**row, "scene": place, "context": [*row["context"], *sorted(further)]}
+
+
+if __name__ == "__main__":
+    main()
