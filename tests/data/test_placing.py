@@ -11,7 +11,7 @@ from PIL import Image
 
 from gscompleter.data.formats import open_photographs
 from gscompleter.data.photographs import Photographs
-from gscompleter.data.sfm import placing
+from gscompleter.data.sfm import placing, poses
 from gscompleter.data.sfm.placing import identify_input, place_photographs
 from gscompleter.system.errors import InputError
 from gscompleter.system.files.image import write_image
@@ -134,7 +134,7 @@ def test_reasons_follow_from_the_features_in_common(known, new, tmp_path, monkey
     script = f"import json\nprint(json.dumps(dict(new={rows}, error=0.5)))"
     stand_in(monkeypatch, tmp_path, script)
     monkeypatch.setattr(placing, "PROCESS", "stand_in_mapping")
-    monkeypatch.setattr(placing, "find_spec", lambda name: True)
+    monkeypatch.setattr(poses, "find_spec", lambda name: True)
     with pytest.raises(InputError) as caught:
         place_photographs(new, known, tmp_path / "colmap")
     name = known.frames[3].file_name
@@ -144,7 +144,7 @@ def test_reasons_follow_from_the_features_in_common(known, new, tmp_path, monkey
 
 
 def test_a_missing_package_is_told_how_to_install(known, new, tmp_path, monkeypatch):
-    monkeypatch.setattr(placing, "find_spec", lambda name: None)
+    monkeypatch.setattr(poses, "find_spec", lambda name: None)
     with pytest.raises(InputError, match=r"pip install 'gscompleter\[poses\]'"):
         place_photographs(new, known, tmp_path / "colmap")
 

@@ -143,6 +143,14 @@ def gaussians_of(view: View, depth: Float[Tensor, "h w"] | None = None) -> Gauss
     )
 
 
+def room_without_a_box(cameras: Sequence[Camera], room: Room = Room()) -> Gaussians:
+    """Make the Gaussians that these cameras see of a room, without what stands near its middle."""
+    whole = merge([gaussians_of(view_of(room, camera)) for camera in cameras])
+    low, high = torch.tensor(room.boxes[1])
+    is_gone = ((whole.means > low - 0.05) & (whole.means < high + 0.05)).all(dim=1)
+    return whole[~is_gone]
+
+
 def half_a_room_of(room: Room, camera: Camera) -> tuple[View, Gaussians, Gaussians]:
     """Return a view, a context that lacks the right half of the room, and the right half."""
     view = view_of(room, camera)

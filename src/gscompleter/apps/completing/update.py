@@ -168,13 +168,18 @@ def measure_lacks(ready: Prepared) -> dict[int, float]:
     scene = task.scene
     assert scene is not None
     cameras = collect_cameras(opened, task)
+    checks = {view.frame: view for view in task.check_views or ()}
     frames = []
     views = []
     renders = []
     for frame in track(list(cameras), "Comparing photographs"):
         if frame in opened.held_out or opened.photographs.is_hidden(frame):
             continue
-        (view,) = opened.photographs.views([frame], CHECK_VIEW_SIZE)
+        # Check views have this size, and are in memory.
+        if frame in checks:
+            view = checks[frame]
+        else:
+            (view,) = opened.photographs.views([frame], CHECK_VIEW_SIZE)
         view = replace(view, camera=cameras[frame]).to(task.device)
         frames.append(frame)
         views.append(view)

@@ -185,8 +185,8 @@ def list_photographs(summary: CompletionSummary) -> list[tuple[str, ScoreRow, st
     held_out = [(row, "not used") for row in summary.held_out]
     numbered = enumerate([*used, *checks, *held_out], start=1)
     listed = [(f"photograph{number}", row, use) for number, (row, use) in numbered]
-    # Those that were not used come first, since they test the result.
-    return [*listed[len(listed) - len(held_out) :], *listed[: len(listed) - len(held_out)]]
+    # Those that were not used come first, since they test the result; the sort is stable.
+    return sorted(listed, key=lambda photograph: photograph[2] != "not used")
 
 
 def find_length_unit(summary: CompletionSummary) -> str:

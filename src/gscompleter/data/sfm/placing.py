@@ -16,7 +16,6 @@ import re
 import tempfile
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass, replace
-from importlib.util import find_spec
 from pathlib import Path
 from typing import Any
 
@@ -35,22 +34,23 @@ from gscompleter.data.sfm.poses import (
     MAX_SIDE,
     RESULTS,
     SEPARATORS,
+    identify_files,
     list_all_photographs,
+    read_earlier,
     read_focal,
     read_lens,
+    require_pycolmap,
     run_colmap,
 )
 from gscompleter.numerics.geometry import select_spread_cameras
 from gscompleter.system.errors import InputError, quote_value
 from gscompleter.system.files.image import (
-    QUARTER_TURNS,
     convert_to_pixels,
     open_image,
-    read_image_size,
     read_orientation,
+    read_upright_size,
 )
 from gscompleter.system.files.output_folder import reserve_output
-from gscompleter.system.files.reading import read_json
 from gscompleter.system.files.writing import SUMMARY_FILE
 from gscompleter.system.progress import track
 from gscompleter.types import View
@@ -105,7 +105,7 @@ class NewCopy:
 
 @dataclass(frozen=True)
 class Placed:
-    """What became of new photographs."""
+    """Result of the search for the cameras of new photographs."""
 
     total: int
     """Number of new photographs."""
@@ -153,13 +153,11 @@ def place_photographs(
         )
 
     identity = identify_input(folder, names, photographs)
-    placed = read_earlier(out, identity)
-    if placed is None:
-        if find_spec("pycolmap") is None:
-            raise InputError(
-                "Placing new photographs needs pycolmap, which is not installed; run "
-                "pip install 'gscompleter[poses]'."
-            )
+    earlier = read_earlier(out, "placed", identity)
+    if earlier is not None:
+        placed = replace(Placed(**earlier), reused=True)
+    else:
+        require_pycolmap()
         with reserve_output(out, overwrite, COMMAND, RESULTS) as output, output.write() as draft:
             placed = place_copies(folder, names, photographs, draft)
             content = {"placed": asdict(placed), "photographs": identity}
@@ -177,31 +175,15 @@ def find_stored_file(frame: Frame) -> Path | None:
 
 
 def identify_input(folder: Path, names: Sequence[str], photographs: Photographs) -> dict[str, Any]:
-    """Identify new photographs and their masks by size and time of change, cameras by a hash."""
-    files = {name: folder / name for name in names}
-    listings = FolderListings()
-    masks = {name: find_mask(file, name, listings) for name, file in files.items()}
-    files |= {f"mask of {name}": mask for name, mask in masks.items() if mask is not None}
-    stats = {name: file.stat() for name, file in files.items()}
+    """Identify new photographs as files, and the known cameras by a hash."""
     digest = hashlib.sha256()
     for frame in photographs.frames:
         digest.update(frame.name.encode(errors="surrogateescape"))
         digest.update(frame.c2w.tobytes())
     return {
-        "new": {name: [stat.st_size, stat.st_mtime_ns] for name, stat in stats.items()},
+        "new": identify_files(folder, names),
         "known": digest.hexdigest(),
     }
-
-
-def read_earlier(out: Path, identity: Mapping[str, Any]) -> Placed | None:
-    """Read the earlier result for these photographs; None if there is none."""
-    if not os.path.isfile(out / SUMMARY_FILE) or not os.path.isdir(out / "sparse" / "0"):
-        return None
-    content = read_json(out / SUMMARY_FILE, "name another folder")
-    is_ours = isinstance(content, dict) and {"placed", "photographs"} <= content.keys()
-    if not is_ours or content["photographs"] != identity:
-        return None
-    return replace(Placed(**content["placed"]), reused=True)
 
 
 def place_copies(
@@ -331,9 +313,7 @@ def collect_lenses(photographs: Photographs) -> dict[LensKey, Intrinsics]:
 
 def read_lens_key(path: Path) -> LensKey:
     """Read the size of an upright photograph, and the key of its camera, lens and zoom."""
-    width, height = read_image_size(path)
-    if read_orientation(path) in QUARTER_TURNS:
-        width, height = height, width
+    width, height = read_upright_size(path)
     with open_image(path) as image:
         return width, height, read_lens(image.getexif())
 

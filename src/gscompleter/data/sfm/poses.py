@@ -39,12 +39,11 @@ from gscompleter.system.errors import InputError, join_names, quote_value
 from gscompleter.system.files.image import (
     HALF_OPAQUE,
     ORIENTATION,
-    QUARTER_TURNS,
     has_alpha,
     open_image,
     read_colors_and_alpha,
-    read_image_size,
     read_orientation,
+    read_upright_size,
     turn_upright,
 )
 from gscompleter.system.files.output_folder import reserve_output
@@ -165,14 +164,10 @@ def find_poses(
     """Find the cameras of a folder of photographs or of a video's frames; write them to `out`."""
     # The same photographs in the same folder have the same cameras: minutes of work are reused.
     known = _identify_input(photographs, num_frames)
-    earlier = _read_earlier(out, known)
+    earlier = read_earlier(out, "poses", known)
     if earlier is not None:
-        return earlier
-    if find_spec("pycolmap") is None:
-        raise InputError(
-            "Finding the cameras of photographs needs pycolmap, which is not installed; run "
-            "pip install 'gscompleter[poses]'."
-        )
+        return replace(FoundPoses(**earlier), reused=True)
+    require_pycolmap()
     with (
         reserve_output(out, overwrite, COMMAND, RESULTS) as output,
         output.write() as folder,
@@ -189,7 +184,12 @@ def _identify_input(path: Path, num_frames: int) -> dict[str, list[int]]:
     if is_video(path):
         stat = path.stat()
         return {path.name: [stat.st_size, stat.st_mtime_ns, num_frames]}
-    files = {name: path / name for name in list_photograph_files(path)}
+    return identify_files(path, list_photograph_files(path))
+
+
+def identify_files(folder: Path, names: Sequence[str]) -> dict[str, list[int]]:
+    """Identify photographs and their masks by size and time of change."""
+    files = {name: folder / name for name in names}
     listings = FolderListings()
     masks = {name: find_mask(file, name, listings) for name, file in files.items()}
     files |= {f"mask of {name}": mask for name, mask in masks.items() if mask is not None}
@@ -208,15 +208,25 @@ def _open_images(path: Path, num_frames: int, home: Path) -> Iterator[Path]:
         yield Path(folder)
 
 
-def _read_earlier(out: Path, known: Mapping[str, list[int]]) -> FoundPoses | None:
-    """Read the earlier result for these photographs; None if there is none."""
+def require_pycolmap() -> None:
+    """Raise InputError if COLMAP is not installed."""
+    if find_spec("pycolmap") is None:
+        raise InputError(
+            "Finding the cameras of photographs needs pycolmap, which is not installed; run "
+            "pip install 'gscompleter[poses]'."
+        )
+
+
+def read_earlier(out: Path, entry: str, known: Mapping[str, Any]) -> dict[str, Any] | None:
+    """Read the earlier result for these photographs, an entry of the summary; None without one."""
     if not os.path.isfile(out / SUMMARY_FILE) or not os.path.isdir(out / "sparse" / "0"):
         return None
     content = read_json(out / SUMMARY_FILE, "name another folder")
-    is_ours = isinstance(content, dict) and {"poses", "photographs"} <= content.keys()
+    is_ours = isinstance(content, dict) and {entry, "photographs"} <= content.keys()
     if not is_ours or content["photographs"] != known:
         return None
-    return replace(FoundPoses(**content["poses"]), reused=True)
+    result: dict[str, Any] = content[entry]
+    return result
 
 
 def has_photographs(path: Path) -> bool:
@@ -392,9 +402,8 @@ def read_hidden(path: Path, mask: Path | None) -> Bool[np.ndarray, "h w"] | None
     """Read what a mask or the alpha of a photograph hides, upright; None if it has neither."""
     if mask is None and not has_alpha(path):
         return None
-    width, height = read_image_size(path)
     orientation = read_orientation(path)
-    size = (height, width) if orientation in QUARTER_TURNS else (width, height)
+    size = read_upright_size(path)
     # A mask is of the upright photograph, or is turned with it; alpha is stored with the pixels.
     hidden = np.zeros((size[1], size[0]), dtype=bool)
     if mask is not None:
