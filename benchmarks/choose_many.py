@@ -4,7 +4,7 @@
 
 Users bring more than a pair. Further frames are never the target nor the photographs beside it by
 which a case is scored. `nearest` takes those whose cameras are nearest to the target, `spread`
-takes them at even steps of what is left. A scene with fewer frames has no case in a file.
+takes them at even steps of what is left. A scene with fewer frames gives all that it has.
 """
 
 from __future__ import annotations
@@ -29,9 +29,7 @@ def main() -> None:
     for order in ("nearest", "spread"):
         for count in COUNTS:
             cases = [add_photographs(row, order, count) for row in content["cases"]]
-            kept = [case for case in cases if case is not None]
-            write_cases(OUT / f"{order}-{count}.json", order, count, kept, content["resolution"])
-            print(f"{order}-{count}: {len(kept)} cases")
+            write_cases(OUT / f"{order}-{count}.json", order, count, cases, content["resolution"])
 
 
 def write_cases(
@@ -39,7 +37,7 @@ def write_cases(
 ) -> None:
     """Write a file of cases, one a line."""
     head = {
-        "about": f"The development cases with {count} further photographs ({order}), from "
+        "about": f"The development cases with up to {count} further photographs ({order}), from "
         "benchmarks/choose_many.py.",
         "resolution": resolution,
     }
@@ -48,14 +46,13 @@ def write_cases(
     path.write_text("\n".join(["{", *lines, ' "cases": [', listed, " ]", "}"]) + "\n")
 
 
-def add_photographs(row: dict[str, Any], order: str, count: int) -> dict[str, Any] | None:
-    """Add further photographs to the context of a case; None if the scene has too few."""
+def add_photographs(row: dict[str, Any], order: str, count: int) -> dict[str, Any]:
+    """Add further photographs to the context of a case."""
     frames = json.loads((DATA / row["scene"] / "transforms.json").read_text())["frames"]
     centres = np.array([frame["transform_matrix"] for frame in frames])[:, :3, 3]
     used = {*row["context"], row["target"], *row["neighbours"]}
     left = [number for number in range(len(frames)) if number not in used]
-    if len(left) < count:
-        return None
+    count = min(count, len(left))
     if order == "nearest":
         distances = np.linalg.norm(centres - centres[row["target"]], axis=1)
         further = sorted(left, key=lambda number: distances[number])[:count]

@@ -11,7 +11,10 @@ import torch
 from gscompleter.evaluation.metrics.image import compute_masked_ssim, ssim
 from gscompleter.evaluation.metrics.unused_photographs import measure_likeness, shrink_view
 from gscompleter.numerics.geometry import axis_angle_to_matrix
-from gscompleter.reconstructors.features.consistency import count_consistent_matches
+from gscompleter.reconstructors.features.consistency import (
+    count_consistent_matches,
+    measure_pose_errors,
+)
 from gscompleter.types import Render
 from scenes import Room, camera_at, view_of
 
@@ -99,3 +102,28 @@ def test_features_without_parallax_confirm_a_rotation():
     count = count_consistent_matches([view_of(ROOM, near), view_of(ROOM, turned)])
     assert count.total > 30
     assert count.share > 0.8
+
+
+def test_the_pose_that_is_off_has_the_largest_error_in_pixels():
+    cameras = [camera_at(x, size=128) for x in (-0.4, -0.2, 0.0, 0.2, 0.4)]
+    views = [view_of(ROOM, camera) for camera in cameras]
+    true = measure_pose_errors(views)
+    assert all(error is not None and error < 0.4 for error in true)
+    # A rotation about the horizontal axis moves pixels across the epipolar lines.
+    pitch = axis_angle_to_matrix(torch.tensor([1.0, 0.0, 0.0]), 3 / views[0].camera.K[1, 1].item())
+    c2w = views[2].camera.c2w.clone()
+    c2w[:3, :3] @= pitch
+    views[2] = replace(views[2], camera=replace(views[2].camera, c2w=c2w))
+    off = measure_pose_errors(views)
+    assert max(range(5), key=lambda number: off[number]) == 2
+    assert off[2] == pytest.approx(3, rel=0.3)
+
+
+def test_pose_errors_are_unknown_without_features_or_without_a_baseline():
+    flat = [
+        replace(view_of(ROOM, camera_at(x, size=64)), image=OTHER.image[:64, :64] * 0)
+        for x in (0, 1, 2)
+    ]
+    assert measure_pose_errors(flat) == [None] * 3
+    here = [view_of(ROOM, camera_at(0.0, yaw=yaw, size=64)) for yaw in (0, 5, 10)]
+    assert measure_pose_errors(here) == [None] * 3

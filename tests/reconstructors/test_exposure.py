@@ -102,8 +102,9 @@ def test_the_scene_has_one_exposure_and_shows_places_between_better(made, uneven
         even, mixed = (renderer.render(m.gaussians, truth.camera).image for m in (made, uneven))
         assert at_best_gain(even, truth.image) > at_best_gain(mixed, truth.image) + 0.5
         ratios.append((even * truth.image).sum((0, 1)) / even.square().sum((0, 1)))
-    # Each channel has the same error of brightness at all positions.
-    assert (torch.stack(ratios).amax(0) / torch.stack(ratios).amin(0)).max() < 1.012
+    # Each channel has the same error of brightness at all positions. What was clipped at white
+    # remains, as colours by direction keep it near the photograph that shows it.
+    assert (torch.stack(ratios).amax(0) / torch.stack(ratios).amin(0)).max() < 1.02
 
 
 def test_each_photograph_is_what_is_drawn_times_its_gain(made):

@@ -38,6 +38,7 @@ from gscompleter.evaluation.verdict.rows import ScoreRow
 from gscompleter.numerics.geometry import estimate_up
 from gscompleter.numerics.image_ops import compute_mask_fraction
 from gscompleter.numerics.kernels.parallel import map_in_parallel
+from gscompleter.reconstructors.features.consistency import measure_pose_errors
 from gscompleter.render.protocols import Renderer
 from gscompleter.render.view_map import get_view_map
 from gscompleter.splats.layout import save_like, save_removed
@@ -57,6 +58,8 @@ IMAGES = "images"
 """Folder of the pictures of a completion."""
 MAX_PHOTOGRAPHS = 200
 """Largest number of photographs in the drawing and for the path of the video."""
+MIN_POSED = 3
+"""Fewest photographs whose poses are compared."""
 IGNORED_COLOR = (1.0, 0.0, 1.0)
 FRUSTUM = ((-1, -1, 1), (1, -1, 1), (1, 1, 1), (-1, 1, 1))
 """Image corners of a camera pyramid, whose apex is the origin."""
@@ -108,7 +111,9 @@ def write_report(
     gain_rows = [None] * len(completion.views) if gains is None else gains.tolist()
     rows: dict[str, Sequence[ScoreRow]] = {
         "held_out": held_out_rows,
-        "context": score_photographs(completion, completion.views, gain_rows, renderer),
+        "context": add_pose_errors(
+            score_photographs(completion, completion.views, gain_rows, renderer), completion.views
+        ),
         "targets": [
             replace(
                 row,
@@ -193,6 +198,17 @@ def score_photographs(
         )
         for view, view_scores, gain in zip(views, scores, exposure_gains, strict=True)
     ]
+
+
+def add_pose_errors(rows: Sequence[ContextRow], views: Sequence[View]) -> list[ContextRow]:
+    """Add the pose errors to the rows of three photographs or more, which blur the scene by them.
+
+    Two photographs agree with any pose but across their epipolar lines.
+    """
+    if len(views) < MIN_POSED:
+        return list(rows)
+    errors = measure_pose_errors(views)
+    return [replace(row, pose_error=error) for row, error in zip(rows, errors, strict=True)]
 
 
 def score_targets(

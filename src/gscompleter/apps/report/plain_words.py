@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterator, Sequence
 
 from gscompleter.apps.report.schema import AlignmentRow, CompletionSummary, TargetRow
-from gscompleter.evaluation.verdict.numbers import format_percent
+from gscompleter.evaluation.verdict.numbers import format_number, format_percent
 
 FRAME_NOTES = {
     "cameras": "in the frame of its cameras.json, not in that of the photographs",
@@ -24,6 +24,8 @@ ORIGIN_NOTE = (
     "The coordinates are much larger than the distances between the cameras, so the result is "
     "relative to a local origin, which summary.json lists."
 )
+MIN_POSE_ERROR = 1.0
+"""Error of a pose in pixels from which it is said; that of features alone is 0.1 to 0.3."""
 POINT_FORMATS = ("colmap", "photographs")
 """Formats whose only depth is that of points which COLMAP triangulated."""
 ORACLE_NOTE = (
@@ -93,7 +95,7 @@ def name_targets(numbers: Sequence[int], total: int) -> str:
 
 
 def list_photograph_notes(summary: CompletionSummary) -> Iterator[str]:
-    """List the notes on what moves, on what is ignored, and on exposures."""
+    """List the notes on what moves, on what is ignored, on poses and on exposures."""
     context = summary.context
     moving = [row for row in context if row.dynamic_fraction > 0]
     if moving:
@@ -112,6 +114,15 @@ def list_photograph_notes(summary: CompletionSummary) -> Iterator[str]:
         yield (
             f"Up to {format_percent(ignored_share)} of a photograph {describe_ignored(summary)}; "
             "it is ignored, also in scores (images/context*_ignored.png)."
+        )
+
+    displaced = [row for row in context if (row.pose_error or 0) >= MIN_POSE_ERROR]
+    if displaced:
+        named = ", ".join(str(row.photograph) for row in displaced)
+        worst = max(row.pose_error or 0 for row in displaced)
+        yield (
+            f"The poses of photographs {named} contradict the other photographs by up to "
+            f"{format_number(worst, 1)} pixels, which blurs what they show together."
         )
 
     factors = [factor for row in context for factor in row.exposure_gain or ()]

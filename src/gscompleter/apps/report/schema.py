@@ -50,6 +50,9 @@ class ContextRow(ScoreRow):
     given_depth: float = 0.0
     """Share of the pixels whose depth was given."""
     ignored: float = 0.0
+    pose_error: float | None = None
+    """Median distance, in pixels, of features that it shares with other photographs from where the
+    poses put them; None for fewer than three photographs, or few features."""
 
 
 @dataclass(frozen=True)

@@ -2,6 +2,9 @@
 
 Pairs are scored by shared features and triangulation angle (Schönberger et al., ECCV 2016). Only
 photographs with a similar position and direction are compared, for linear time.
+
+The best two often leave a part of a photograph out, such as a door post at its side that only the
+next frame shows as well. So one more photograph is taken, the one that shows most of that part.
 """
 
 from __future__ import annotations
@@ -10,6 +13,7 @@ from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
+from jaxtyping import Bool
 
 from gscompleter.numerics.kernels.parallel import map_in_parallel
 from gscompleter.reconstructors.features.matches import (
@@ -21,7 +25,14 @@ from gscompleter.reconstructors.features.matches import (
 from gscompleter.reconstructors.features.stereo_image import StereoImage
 
 NUM_SOURCES = 2
-"""Number of neighbours per photograph."""
+"""Number of best neighbours per photograph."""
+CELLS = 16
+"""Rows and columns of the grid in which matches count as covering a photograph."""
+MIN_ADDED_CELLS = 0.05
+"""Share of all covered cells that a neighbour has to add to be taken; 0.15 loses 0.3 dB."""
+MIN_COVERING_MATCHES = 30
+"""Fewest matches of a neighbour that is taken for what it covers. Photographs without a common
+surface have up to 25 false ones."""
 NUM_COMPARED = 6
 """Number of photographs per photograph whose features are compared."""
 TURN_PER_TWO_STEPS = 15.0
@@ -45,7 +56,7 @@ class Neighbours:
     """Selected neighbours of all photographs."""
 
     neighbours_of: tuple[tuple[int, ...], ...]
-    """Neighbours of each photograph, the best one first."""
+    """Neighbours of each photograph, the best one first, and last the one that covers the rest."""
     matches: Matches
 
     @property
@@ -60,7 +71,7 @@ class Neighbours:
 
 
 def find_neighbours(images: Sequence[StereoImage], count: int = NUM_SOURCES) -> Neighbours:
-    """Select up to `count` neighbours for each image."""
+    """Select up to `count` best neighbours for each image, and one that covers the rest."""
     features = map_in_parallel(detect_features, images)
     matches = {
         (i, j): match_features(features[i], features[j]) for i, j in find_close_pairs(images)
@@ -73,8 +84,40 @@ def find_neighbours(images: Sequence[StereoImage], count: int = NUM_SOURCES) -> 
         scores[j, i] = score
     # A stable order: of equal scores the first image wins on every machine.
     ranked = (-scores).argsort(axis=1, kind="stable")[:, :count]
-    chosen = [tuple(int(j) for j in row if scores[i, j] > 0) for i, row in enumerate(ranked)]
+    chosen = []
+    for i, row in enumerate(ranked):
+        best = [int(j) for j in row if scores[i, j] > 0]
+        chosen.append((*best, *find_covering(i, images[i], best, matches)))
     return Neighbours(tuple(chosen), matches)
+
+
+def find_covering(
+    number: int, image: StereoImage, chosen: Sequence[int], matches: Matches
+) -> list[int]:
+    """Find the photograph whose matches cover most of what those chosen leave out, if any."""
+    covered: dict[int, Bool[np.ndarray, "cells cells"]] = {}
+    for (i, j), (in_i, in_j) in sorted(matches.items()):
+        if number in (i, j):
+            other, pixels = (j, in_i) if number == i else (i, in_j)
+            covered[other] = find_covered_cells(image, pixels)
+    if not covered:
+        return []
+    everything = np.logical_or.reduce(list(covered.values()))
+    left_out = everything & ~np.logical_or.reduce([covered[other] for other in chosen])
+    added = {other: int((cells & left_out).sum()) for other, cells in covered.items()}
+    best = max(added, key=lambda other: added[other])
+    is_worth = added[best] > 0 and added[best] >= MIN_ADDED_CELLS * everything.sum()
+    return [best] if is_worth else []
+
+
+def find_covered_cells(image: StereoImage, pixels: Pixels) -> Bool[np.ndarray, "cells cells"]:
+    """Find the cells of an image that matches lie in; none if there are few."""
+    cells = np.zeros((CELLS, CELLS), bool)
+    if len(pixels) >= MIN_COVERING_MATCHES:
+        height, width = image.size
+        columns, rows = (pixels * CELLS / [width, height]).astype(int).clip(0, CELLS - 1).T
+        cells[rows, columns] = True
+    return cells
 
 
 def find_close_pairs(images: Sequence[StereoImage]) -> list[Pair]:

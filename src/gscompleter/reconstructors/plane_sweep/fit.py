@@ -17,7 +17,7 @@ from torch import Tensor
 
 from gscompleter.config.settings import COVERED
 from gscompleter.numerics.adam import Adam
-from gscompleter.render.fit_colors import fit_colors
+from gscompleter.reconstructors.plane_sweep.linear_colors import fit_linear_colors
 from gscompleter.render.protocols import Renderer
 from gscompleter.types import DepthMap, Gaussians, View
 
@@ -38,8 +38,6 @@ FINAL_RATE = 0.5
 """Final step size relative to the initial one; the decay is linear."""
 BETAS = 0.8, 0.99
 """Adam decay rates of the joint fit."""
-COLOR_RELAXATIONS = 2.0, 1.0
-"""Step sizes of the rounds in which colours alone are fitted, to all photographs at once."""
 FAINTEST = 0.02
 """Margin from 0 and 1 to which the initial opacities are clamped."""
 
@@ -78,8 +76,8 @@ def fit_jointly(
 ) -> Gaussians:
     """Minimize the squared image error, with renders scaled by each view's exposure gain.
 
-    The images are linear in the colours, so that these are then fitted alone, to all views at once
-    and without gradients. Two such rounds are worth several Adam steps (decision 045).
+    The images are linear in the colours, so that these are then fitted alone, by direction, to all
+    views at once and without gradients.
     """
     unknown = init_parameters(gaussians)
     optimizer = Adam([(unknown[name], rate) for name, rate in RATES.items()], BETAS)
@@ -92,10 +90,10 @@ def fit_jointly(
         optimizer.step((gains[number] * image - view.image).square().mean(), rate_factor)
 
     fitted = apply_parameters(gaussians, {name: v.detach() for name, v in unknown.items()})
-    frozen = [renderer.freeze(fitted[:0], view.camera) for view in views]
     # The scene has one exposure, so that each photograph is divided by its own.
     normalized = [replace(v, image=v.image / gain) for v, gain in zip(views, gains, strict=True)]
-    return fit_colors(fitted, frozen, normalized, COLOR_RELAXATIONS)
+    depths = [renderer.render(fitted, view.camera).depth_map() for view in views]
+    return fit_linear_colors(fitted, normalized, depths, renderer)
 
 
 def init_parameters(gaussians: Gaussians) -> dict[str, Tensor]:

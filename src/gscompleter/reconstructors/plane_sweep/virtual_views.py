@@ -1,7 +1,7 @@
-"""Virtual photographs beyond a pair: what each of the two shows, from one baseline further on.
+"""Virtual photographs: what each photograph shows, from one baseline beyond its nearest neighbour.
 
-Two photographs do not determine the colours of twice as many Gaussians: fitted to both alone, they
-cancel errors of depth, pose and exposure there and look wrong from everywhere else. Virtual
+Photographs do not determine the colours of many more Gaussians than pixels: fitted to them alone,
+colours cancel errors of depth, pose and exposure there and look wrong from everywhere else. Virtual
 photographs say what the scene should look like elsewhere.
 """
 
@@ -24,16 +24,30 @@ DEPTH_TOLERANCE = 0.03
 def make_virtual_views(
     scene: Gaussians, views: Sequence[View], depths: Sequence[DepthMap], renderer: Renderer
 ) -> list[View]:
-    """Warp two photographs to one camera beyond each, through the depth of `scene` there.
+    """Warp each photograph to a camera beyond it, through the depth of `scene` there.
 
-    `depths` are those of the scene at the photographs.
+    The camera continues the way from the nearest other photograph. `depths` are those of the scene
+    at the photographs.
     """
-    first, second = [view.camera for view in views]
-    cameras = [extrapolate_camera(second, first), extrapolate_camera(first, second)]
+    cameras = [view.camera for view in views]
     return [
-        warp(view, depth, scene, camera, renderer)
-        for view, depth, camera in zip(views, depths, cameras, strict=True)
+        warp(
+            view,
+            depth,
+            scene,
+            extrapolate_camera(find_nearest_camera(view.camera, cameras), view.camera),
+            renderer,
+        )
+        for view, depth in zip(views, depths, strict=True)
     ]
+
+
+def find_nearest_camera(camera: Camera, cameras: Sequence[Camera]) -> Camera:
+    """Find the nearest of `cameras` that stands in another place."""
+    distances = torch.stack([(camera.center - other.center).norm() for other in cameras])
+    # Cameras in one place give no direction to go on in.
+    distances = torch.where(distances > 0, distances, torch.inf)
+    return cameras[int(distances.argmin())]
 
 
 def extrapolate_camera(before: Camera, camera: Camera) -> Camera:
