@@ -16,7 +16,11 @@ from gscompleter.reconstructors.features.neighbours import (
     find_covering,
     find_neighbours,
 )
-from gscompleter.reconstructors.features.stereo_image import make_stereo_images
+from gscompleter.reconstructors.features.stereo_image import (
+    StereoImage,
+    compute_source_from_reference,
+    make_stereo_images,
+)
 from gscompleter.reconstructors.plane_sweep import PlaneSweep
 from gscompleter.reconstructors.plane_sweep.fit import STEPS_PER_VIEW, fit_jointly, shuffle_views
 from gscompleter.reconstructors.plane_sweep.fusion import (
@@ -25,9 +29,11 @@ from gscompleter.reconstructors.plane_sweep.fusion import (
     find_free_pixels,
 )
 from gscompleter.reconstructors.plane_sweep.rig import build_rig, halve_image, halve_transform
+from gscompleter.reconstructors.plane_sweep.sweep import UNSEEN_COST, compute_costs
 from scenes import Room, camera_at, gaussians_of, view_of
 
 SIZE = 64
+Matched = tuple[np.ndarray, np.ndarray]
 
 
 def row_of_views(count: int, size: int = SIZE) -> list[View]:
@@ -68,25 +74,52 @@ def test_each_view_is_matched_with_the_ones_beside_it():
     )
 
 
-def make_matches(columns: range, count: int) -> np.ndarray:
-    """Spread pixels over some columns of an image of 64 x 64 pixels."""
+def match_columns(first: StereoImage, second: StereoImage, columns: range, count: int) -> Matched:
+    """Match pixels in some columns of the first image, by a wall at a depth of two baselines."""
     generator = np.random.default_rng(0)
     across = generator.uniform(columns.start, columns.stop, count)
-    return np.stack([across, generator.uniform(0, SIZE, count)], axis=1)
+    pixels = np.stack([across, generator.uniform(0, SIZE, count)], axis=1)
+    transform = compute_source_from_reference(first, second)
+    points = np.concatenate([pixels, np.full((count, 1), 1.0), np.full((count, 1), 0.5)], axis=1)
+    moved = points @ transform.T
+    return pixels, moved[:, :2] / moved[:, 2:]
 
 
 def test_the_photograph_that_shows_what_the_chosen_leave_out_is_matched_too():
-    image = make_stereo_images(row_of_views(2))[0][0]
-    left = make_matches(range(32), 300)
-    right = make_matches(range(32, 64), 300)
-    everywhere = make_matches(range(64), 300)
-    # Pairs are (smaller, larger), with the pixels of each in this order.
-    matches = {(0, 2): (left, right), (1, 2): (everywhere, right), (2, 3): (left, left)}
-    assert find_covering(2, image, [0], matches) == [3]
-    assert find_covering(2, image, [0, 3], matches) == []
-    # Few matches are as many as photographs without a common surface have.
-    assert find_covering(2, image, [0], {(0, 2): (left, right), (2, 3): (left[:25], left)}) == []
-    assert find_covering(3, image, [2], {(0, 2): (left, right)}) == []
+    images = make_stereo_images(row_of_views(4))[0]
+    left = {other: match_columns(images[0], images[other], range(32), 300) for other in (1, 3)}
+    right = match_columns(images[0], images[2], range(32, 64), 300)
+    matches = {(0, 1): left[1], (0, 2): right, (0, 3): left[3]}
+    assert find_covering(0, images, [1], matches) == [2]
+    assert find_covering(0, images, [1, 2], matches) == []
+    # Pixels of the second image of a pair are found as well.
+    assert find_covering(2, images, [], matches) == [0]
+    assert find_covering(3, images, [0], {(0, 1): left[1]}) == []
+
+
+def test_few_or_false_matches_cover_nothing():
+    images = make_stereo_images(row_of_views(3))[0]
+    left = match_columns(images[0], images[1], range(32), 300)
+    in_first, in_second = match_columns(images[0], images[2], range(32, 64), 300)
+    few = in_first[:15], in_second[:15]
+    assert find_covering(0, images, [1], {(0, 1): left, (0, 2): few}) == []
+    # Ten pixels off the epipolar lines.
+    wrong = in_first, in_second + np.array([0.0, 10.0])
+    assert find_covering(0, images, [1], {(0, 1): left, (0, 2): wrong}) == []
+
+
+def test_a_covering_source_costs_more_where_others_see_a_plane(monkeypatch):
+    views = [
+        replace(v, camera=replace(v.camera, near=1.0, far=10.0)) for v in row_of_views(4, size=16)
+    ]
+    rig = build_rig(views)
+    # Costs of three sources at five cells; 255 is unseen.
+    given = [[200, 50, 255, 255, 255], [90, 255, 255, 255, 255], [10, 10, 30, 250, 255]]
+    queue = [np.array(row, np.uint8) for row in given]
+    monkeypatch.setattr(stereo, "compute_matching_costs", lambda *_: queue.pop(0))
+    sources = [(rig.images[other], rig.transforms[0, other]) for other in (1, 2, 3)]
+    costs = compute_costs(rig.images[0], sources, np.zeros(2, np.float32), None)
+    assert costs.tolist() == [26, 26, 30, 250, UNSEEN_COST]
 
 
 def test_a_view_from_the_same_place_tells_no_depth_and_is_not_chosen():

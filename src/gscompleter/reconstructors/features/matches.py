@@ -21,6 +21,8 @@ CACHE_SIZE = 32
 """Images whose features are cached, because each target matches them again."""
 MAX_ERROR = 3.0
 """Largest distance of a match from its epipolar line, in pixels; poses are noisy."""
+MIN_DEPTH = 1e-6
+"""Smallest z in the source, per z in the reference, that lies in front of it."""
 MIN_PARALLAX = 1.0
 """Smallest parallax that gives a depth, in pixels."""
 
@@ -89,3 +91,29 @@ def triangulate(
     infinite = at_infinity[:, :2] / np.where(ahead, at_infinity[:, 2], 1.0)[:, None]
     parallax = np.linalg.norm(infinite - matched, axis=1)
     return inverse, ahead & (inverse > 0) & (error < MAX_ERROR) & (parallax > MIN_PARALLAX)
+
+
+def fit_poses(
+    reference: StereoImage, source: StereoImage, pixels: Pixels, matched: Pixels
+) -> Bool[np.ndarray, "n"]:
+    """Find matches that a point in front of both cameras explains up to `MAX_ERROR` pixels."""
+    errors, is_ahead = measure_match_errors(reference, source, pixels, matched)
+    return is_ahead & (errors < MAX_ERROR)
+
+
+def measure_match_errors(
+    reference: StereoImage, source: StereoImage, pixels: Pixels, matched: Pixels
+) -> tuple[Float[np.ndarray, "n"], Bool[np.ndarray, "n"]]:
+    """Measure the pixels from each match to the nearest point of its ray, and if that is ahead.
+
+    Unlike `triangulate`, it accepts points at infinity: a match without parallax has no depth, but
+    it confirms the rotation.
+    """
+    inverse, _ = triangulate(reference, source, pixels, matched)
+    transform = compute_source_from_reference(reference, source).astype(np.float64)
+    rays = np.concatenate([pixels, np.ones((len(pixels), 1))], axis=1) @ transform[:, :3].T
+    # A negative inverse depth lies behind the camera; the nearest possible one is that of infinity.
+    points = rays + np.maximum(inverse, 0)[:, None] * transform[:, 3]
+    is_ahead = points[:, 2] > MIN_DEPTH
+    depths = np.where(is_ahead, points[:, 2], 1.0)
+    return np.linalg.norm(points[:, :2] / depths[:, None] - matched, axis=1), is_ahead

@@ -19,6 +19,7 @@ from gscompleter.numerics.kernels.parallel import map_in_parallel
 from gscompleter.reconstructors.features.matches import (
     Pixels,
     detect_features,
+    fit_poses,
     match_features,
     triangulate_valid,
 )
@@ -30,9 +31,8 @@ CELLS = 16
 """Rows and columns of the grid in which matches count as covering a photograph."""
 MIN_ADDED_CELLS = 0.05
 """Share of all covered cells that a neighbour has to add to be taken; 0.15 loses 0.3 dB."""
-MIN_COVERING_MATCHES = 30
-"""Fewest matches of a neighbour that is taken for what it covers. Photographs without a common
-surface have up to 25 false ones."""
+MIN_COVERING_MATCHES = 20
+"""Fewest matches that fit the poses, of a neighbour that is taken for what it covers."""
 NUM_COMPARED = 6
 """Number of photographs per photograph whose features are compared."""
 TURN_PER_TWO_STEPS = 15.0
@@ -87,19 +87,23 @@ def find_neighbours(images: Sequence[StereoImage], count: int = NUM_SOURCES) -> 
     chosen = []
     for i, row in enumerate(ranked):
         best = [int(j) for j in row if scores[i, j] > 0]
-        chosen.append((*best, *find_covering(i, images[i], best, matches)))
+        chosen.append((*best, *find_covering(i, images, best, matches)))
     return Neighbours(tuple(chosen), matches)
 
 
 def find_covering(
-    number: int, image: StereoImage, chosen: Sequence[int], matches: Matches
+    number: int, images: Sequence[StereoImage], chosen: Sequence[int], matches: Matches
 ) -> list[int]:
-    """Find the photograph whose matches cover most of what those chosen leave out, if any."""
+    """Find the photograph whose matches cover most of what those chosen leave out, if any.
+
+    Only matches that fit the poses count: photographs without a common surface have false ones.
+    """
     covered: dict[int, Bool[np.ndarray, "cells cells"]] = {}
     for (i, j), (in_i, in_j) in sorted(matches.items()):
         if number in (i, j):
             other, pixels = (j, in_i) if number == i else (i, in_j)
-            covered[other] = find_covered_cells(image, pixels)
+            is_true = fit_poses(images[i], images[j], in_i, in_j)
+            covered[other] = find_covered_cells(images[number], pixels[is_true])
     if not covered:
         return []
     everything = np.logical_or.reduce(list(covered.values()))

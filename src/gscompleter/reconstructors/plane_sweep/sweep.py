@@ -19,6 +19,7 @@ from jaxtyping import Bool, Float32, Int, Int16, UInt8
 
 from gscompleter.numerics.kernels import stereo
 from gscompleter.numerics.kernels.stereo import TILE_COLUMNS, TILE_ROWS, Bands
+from gscompleter.reconstructors.features.neighbours import NUM_SOURCES
 from gscompleter.reconstructors.features.stereo_image import StereoImage, compute_contrast
 from gscompleter.reconstructors.plane_sweep.rig import Rig, Transform
 
@@ -71,6 +72,13 @@ GIVEN_COST = np.float32(60)
 """Cost of each plane between a pixel's given depth and the plane it is matched at."""
 UNSEEN_COST = np.uint8(140)
 """Cost, from 0 to 254, of a plane at which no other view observes the pixel."""
+
+MAX_COST = np.uint8(254)
+"""Largest cost of a plane that a source sees."""
+COVERING_PENALTY = np.uint8(16)
+"""Additional cost in a source that was chosen for what it covers. It often stands so near that all
+planes look alike in it: without, depth gets coarser, and if it counts only where no other source
+sees the plane, near things at the side of a photograph are lost."""
 
 SMALL_PENALTY = 25
 """Cost of a change by one plane between neighbouring pixels."""
@@ -340,6 +348,8 @@ def compute_costs(
     """Compute costs (0 to 254) of the planes in `bands`; the best source view counts.
 
     The best, rather than the mean: a surface that one source sees may be occluded in the others.
+    Those from `NUM_SOURCES` on cover what the first ones leave out, and cost more where these see a
+    plane.
     """
     costs = [
         stereo.compute_matching_costs(
@@ -347,7 +357,10 @@ def compute_costs(
         )
         for source, transform in sources
     ]
-    best = np.minimum.reduce(costs)
+    best = np.minimum.reduce(costs[:NUM_SOURCES])
+    for covering in costs[NUM_SOURCES:]:
+        dearer = np.minimum(covering, MAX_COST - COVERING_PENALTY) + COVERING_PENALTY
+        best = np.where(best == stereo.UNSEEN, covering, np.minimum(best, dearer))
     return np.where(best == stereo.UNSEEN, UNSEEN_COST, best)
 
 
