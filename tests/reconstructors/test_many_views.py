@@ -29,7 +29,7 @@ from gscompleter.reconstructors.plane_sweep.fusion import (
     find_free_pixels,
 )
 from gscompleter.reconstructors.plane_sweep.rig import build_rig, halve_image, halve_transform
-from gscompleter.reconstructors.plane_sweep.sweep import UNSEEN_COST, compute_costs
+from gscompleter.reconstructors.plane_sweep.sweep import UNSEEN_COST, compute_costs, make_bands
 from scenes import Room, camera_at, gaussians_of, view_of
 
 SIZE = 64
@@ -118,7 +118,8 @@ def test_a_covering_source_costs_more_where_others_see_a_plane(monkeypatch):
     queue = [np.array(row, np.uint8) for row in given]
     monkeypatch.setattr(stereo, "compute_matching_costs", lambda *_: queue.pop(0))
     sources = [(rig.images[other], rig.transforms[0, other]) for other in (1, 2, 3)]
-    costs = compute_costs(rig.images[0], sources, np.zeros(2, np.float32), None)
+    bands = make_bands(np.zeros((1, 1), int), np.ones((1, 1), int), (16, 16))
+    costs = compute_costs(rig.images[0], sources, np.zeros(2, np.float32), bands)
     assert costs.tolist() == [26, 26, 30, 250, UNSEEN_COST]
 
 
