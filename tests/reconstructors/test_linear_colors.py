@@ -7,7 +7,6 @@ import torch
 
 from gscompleter.evaluation.metrics.image import psnr
 from gscompleter.reconstructors.plane_sweep.linear_colors import (
-    MAX_PREPARED,
     LinearColors,
     fit_linear_colors,
     invert_symmetric,
@@ -81,16 +80,6 @@ def test_harmonics_are_linear_in_the_ray_in_every_direction():
     # The Gaussians stand where the directions from the origin lead.
     found = evaluate_colors(colors.to_sh(), directions, torch.zeros(3))
     assert torch.allclose(found, expected.clamp_min(0), atol=1e-5)
-
-
-def test_many_images_are_fitted_the_same_without_keeping_what_is_prepared(monkeypatch):
-    views = take_photographs()
-    assert 2 * len(views) <= MAX_PREPARED
-    _, kept = fit(views)
-    module = "gscompleter.reconstructors.plane_sweep.linear_colors.MAX_PREPARED"
-    monkeypatch.setattr(module, 0)
-    _, prepared_again = fit(views)
-    assert torch.equal(kept.sh, prepared_again.sh)
 
 
 def test_a_matrix_times_its_inverse_is_one():
