@@ -84,10 +84,20 @@ def test_the_summary_has_the_keys_of_the_contract_and_the_numbers_add_up(complet
     assert [row["frame"] for row in summary["context"]] == [0, 1]
     assert all(
         set(row)
-        == {"frame", "file", "exposure_gain", "dynamic_fraction", "given_depth", "ignored", *scores}
+        == {
+            "frame",
+            "file",
+            "exposure_gain",
+            "dynamic_fraction",
+            "given_depth",
+            "ignored",
+            "pose_error",
+            *scores,
+        }
         for row in summary["context"]
     )
     assert all(row["exposure_gain"] is None for row in summary["context"])  # as they were taken
+    assert all(row["pose_error"] is None for row in summary["context"])  # two agree with any pose
     (target,) = summary["targets"]
     assert set(target) >= {"frame", "anchor", "anchor_fallback", "hole_fraction", "affine", *scores}
     assert (target["frame"], target["anchor"], target["anchor_fallback"]) == (2, 0, False)
