@@ -1,7 +1,7 @@
 # gscompleter on NVIDIA GPUs. `make dist` first; then, in the root of the repository:
 #   docker build -f docker/cuda.Dockerfile -t gscompleter:cuda .
 # Not built where this was written: no container engine was at hand.
-# gsplat compiles its CUDA kernels when they are first used, for which nvcc has to be there.
+# gsplat compiles its CUDA kernels for the architectures of ARCHITECTURES, which needs nvcc but no GPU.
 FROM nvidia/cuda:12.8.1-devel-ubuntu24.04
 
 RUN apt-get update \
@@ -18,6 +18,8 @@ RUN python3 -m venv /opt/gscompleter \
     && pip install torch torchvision --index-url https://download.pytorch.org/whl/cu128 \
     && pip install "gscompleter[cuda,evaluation,film,models,poses] @ file://$(ls /tmp/*.whl)" \
     && rm /tmp/*.whl
+ARG ARCHITECTURES="7.5;8.0;8.6;8.9;9.0;12.0+PTX"
+RUN TORCH_CUDA_ARCH_LIST="$ARCHITECTURES" python -c "from gsplat.cuda._backend import _C; assert _C"
 RUN gscompleter warmup \
     && mkdir -p /var/cache/gscompleter/extensions \
     && chmod -R a+rwX /var/cache/gscompleter
