@@ -26,7 +26,9 @@ from choose_many import add_photographs
 from gscompleter.config.settings import COVERED
 from gscompleter.evaluation.cases import Case, read_cases
 from gscompleter.evaluation.metrics.image import compute_masked_psnr
-from gscompleter.evaluation.runner import RunConfig
+from gscompleter.evaluation.protocols import make_case_task
+from gscompleter.evaluation.runner import RunConfig, load_task_views
+from gscompleter.reconstructors.features.depth_range import set_depth_range
 from gscompleter.stages.context import normalize_exposures, reconstruct_context, sort_by_frame
 from gscompleter.types import Gaussians, View
 
@@ -93,27 +95,21 @@ def add_set(case: Case, name: str) -> Case:
 def reconstruct(case: Case) -> tuple[Gaussians, list[View], list[View], float]:
     """Reconstruct a case; return its scene, photographs, target and neighbours, and seconds."""
     models = RunConfig().load_models(())
-    views = sort_by_frame(load_numbered(case, case.context))
+    views = sort_by_frame(load(case, case.context))
     start = time.perf_counter()
     context = reconstruct_context(models.reconstructor, views)
     seconds = time.perf_counter() - start
     camera = context.views[0].camera
-
-    def set_range(views: list[View]) -> list[View]:
-        return [
-            replace(v, camera=replace(v.camera, near=camera.near, far=camera.far)) for v in views
-        ]
-
-    given = set_range(list(normalize_exposures(views, context.exposure_gains)))
-    shown = set_range(load_numbered(case, (case.target, *case.neighbours)))
+    given = normalize_exposures(views, context.exposure_gains)
+    shown = load(case, (case.target, *case.neighbours))
+    # All are seen in the depth range that the scene was reconstructed in.
+    given, shown = (set_depth_range(group, camera.near, camera.far) for group in (given, shown))
     return context.source.gaussians, given, shown, seconds
 
 
-def load_numbered(case: Case, frames: tuple[int, ...]) -> list[View]:
+def load(case: Case, frames: tuple[int, ...]) -> list[View]:
     """Load photographs with their frame numbers, by which they are sorted."""
-    return [
-        replace(view, frame=frame) for view, frame in zip(case.load(frames), frames, strict=True)
-    ]
+    return load_task_views(make_case_task(case), frames, RunConfig())
 
 
 def find_hole(case: Case) -> Bool[Tensor, "h w"]:

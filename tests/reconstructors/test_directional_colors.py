@@ -5,7 +5,7 @@ from dataclasses import replace
 import pytest
 import torch
 
-from gscompleter.evaluation.metrics.image import psnr
+from color_fits import fit_with, measure_covered
 from gscompleter.numerics.geometry import axis_angle_to_matrix
 from gscompleter.reconstructors.plane_sweep.directional_colors import (
     ColorLine,
@@ -17,7 +17,7 @@ from gscompleter.reconstructors.plane_sweep.virtual_views import (
 )
 from gscompleter.render.loading import load_renderer
 from gscompleter.render.spherical_harmonics import evaluate_colors
-from gscompleter.types import Gaussians, View, merge
+from gscompleter.types import View, merge
 from scenes import Room, camera_at, gaussians_of, view_of
 
 SIZE = 96
@@ -28,20 +28,6 @@ def take_pair() -> list[View]:
     """Two photographs of a room; the second is darker."""
     first, second = (view_of(Room(), camera_at(x, size=SIZE)) for x in (-0.2, 0.2))
     return [first, replace(second, image=GAIN * second.image)]
-
-
-def fit(views: list[View]) -> tuple[Gaussians, Gaussians]:
-    """Return the Gaussians of both photographs before and after the fit."""
-    scene, renderer = merge([gaussians_of(view) for view in views]), load_renderer("cpu")
-    depths = [renderer.render(scene, view.camera).depth_map() for view in views]
-    return scene, fit_directional_colors(scene, views, depths, renderer)
-
-
-def measure(scene: Gaussians, view: View) -> float:
-    """PSNR where the scene covers the image."""
-    render = load_renderer("cpu").render(scene, view.camera)
-    covered = render.alpha > 0.9
-    return psnr(render.image[covered][None], view.image[covered][None])
 
 
 def test_rays_of_the_two_photographs_are_at_minus_one_and_one():
@@ -93,17 +79,17 @@ def test_virtual_photographs_show_what_the_nearer_photograph_does():
 
 def test_each_photograph_keeps_its_tone_and_cameras_beyond_see_the_nearer_one():
     views = take_pair()
-    scene, fitted = fit(views)
+    scene, fitted = fit_with(fit_directional_colors, views)
     for view in views:
-        assert measure(fitted, view) > measure(scene, view) + 1
+        assert measure_covered(fitted, view) > measure_covered(scene, view) + 1
     for gain, x in ((1.0, -0.45), (GAIN, 0.45)):
         unseen = view_of(Room(), camera_at(x, size=SIZE))
         unseen = replace(unseen, image=gain * unseen.image)
-        assert measure(fitted, unseen) > measure(scene, unseen) + 0.5
+        assert measure_covered(fitted, unseen) > measure_covered(scene, unseen) + 0.5
 
 
 def test_colours_stay_calm_far_off_the_photographs():
-    _, fitted = fit(take_pair())
+    _, fitted = fit_with(fit_directional_colors, take_pair())
     for x in (-1.5, 1.5):
         center = camera_at(x, size=SIZE).center
         colors = evaluate_colors(fitted.sh, fitted.means, center)

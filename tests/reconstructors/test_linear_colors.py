@@ -5,7 +5,7 @@ from dataclasses import replace
 import pytest
 import torch
 
-from gscompleter.evaluation.metrics.image import psnr
+from color_fits import fit_with, measure_covered
 from gscompleter.reconstructors.plane_sweep.linear_colors import (
     LinearColors,
     fit_linear_colors,
@@ -17,7 +17,7 @@ from gscompleter.reconstructors.plane_sweep.virtual_views import (
 )
 from gscompleter.render.loading import load_renderer
 from gscompleter.render.spherical_harmonics import evaluate_colors
-from gscompleter.types import Gaussians, View, merge
+from gscompleter.types import View, merge
 from scenes import Room, camera_at, gaussians_of, view_of
 
 SIZE = 64
@@ -34,33 +34,19 @@ def take_photographs() -> list[View]:
     ]
 
 
-def fit(views: list[View]) -> tuple[Gaussians, Gaussians]:
-    """Return the Gaussians of all photographs before and after the fit."""
-    scene, renderer = merge([gaussians_of(view) for view in views]), load_renderer("cpu")
-    depths = [renderer.render(scene, view.camera).depth_map() for view in views]
-    return scene, fit_linear_colors(scene, views, depths, renderer)
-
-
-def measure(scene: Gaussians, view: View) -> float:
-    """PSNR where the scene covers the image."""
-    render = load_renderer("cpu").render(scene, view.camera)
-    covered = render.alpha > 0.9
-    return psnr(render.image[covered][None], view.image[covered][None])
-
-
 def test_each_photograph_keeps_its_tone_and_cameras_beyond_see_the_nearest_one():
     views = take_photographs()
-    scene, fitted = fit(views)
+    scene, fitted = fit_with(fit_linear_colors, views)
     for view in views:
-        assert measure(fitted, view) > measure(scene, view) + 1
+        assert measure_covered(fitted, view) > measure_covered(scene, view) + 1
     for gain, x in ((1.0, -0.55), (0.85, 0.55)):
         unseen = view_of(Room(), camera_at(x, size=SIZE))
         unseen = replace(unseen, image=gain * unseen.image)
-        assert measure(fitted, unseen) > measure(scene, unseen) + 0.5
+        assert measure_covered(fitted, unseen) > measure_covered(scene, unseen) + 0.5
 
 
 def test_colours_stay_calm_far_off_the_photographs():
-    _, fitted = fit(take_photographs())
+    _, fitted = fit_with(fit_linear_colors, take_photographs())
     for x in (-1.5, 1.5):
         colors = evaluate_colors(fitted.sh, fitted.means, camera_at(x, size=SIZE).center)
         middle = evaluate_colors(fitted.sh, fitted.means, torch.zeros(3))

@@ -16,6 +16,7 @@ from gscompleter.evaluation.protocols import Task
 from gscompleter.evaluation.steps import PreparedTask, attempt, complete_task
 from gscompleter.generators import load_generator
 from gscompleter.reconstructors import load_reconstructor
+from gscompleter.reconstructors.features.depth_range import set_depth_range
 from gscompleter.render.loading import load_renderer
 from gscompleter.stages.context import normalize_exposures, reconstruct_context, sort_by_frame
 from gscompleter.system.errors import InputError
@@ -194,17 +195,13 @@ def prepare_task(task: Task, folder: Path, config: RunConfig) -> PreparedTask:
     context = load_or_reconstruct(folder / "context.pt", views, models)
 
     # All methods get the depth range that the scene was reconstructed in.
-    def set_ranges(views: Sequence[View]) -> tuple[View, ...]:
-        return tuple(
-            replace(view, camera=replace(view.camera, near=context.near, far=context.far))
-            for view in views
-        )
-
+    given = normalize_exposures(views, context.gains)
+    near, far = context.near, context.far
     return PreparedTask(
         context.gaussians,
-        set_ranges(normalize_exposures(views, context.gains)),
-        set_ranges(targets),
-        set_ranges(neighbours),
+        tuple(set_depth_range(given, near, far)),
+        tuple(set_depth_range(targets, near, far)),
+        tuple(set_depth_range(neighbours, near, far)),
         models,
         context.seconds,
     )

@@ -86,6 +86,7 @@ class Moments:
     def covariance(self) -> Float[Tensor, "n 3 3"]:
         """Covariance of the rays, weighted by how much the images show of the Gaussian."""
         total = self.total.clamp_min(MIN_WEIGHT)
+        # Up to MIN_WEIGHT hardly any image shows a Gaussian, and the division would blow up.
         mean = self.first / total
         return self.second / total[..., None] - multiply_outer(mean, mean)
 
@@ -191,6 +192,7 @@ class ColorEquations:
         gradients: Float[Tensor, "n 3 3"],
     ) -> tuple[Float[Tensor, "n 3"], Float[Tensor, "n 3 3"]]:
         """Solve for the changes of colour and gradient."""
+        # The colour is eliminated first, so that only a 3 x 3 system is left for the gradient.
         pull = turning - self.damping @ gradients
         reduced = pull - multiply_outer(self.first, color_pull / self.total)
         gradient_step = self.inverse @ reduced
@@ -205,6 +207,8 @@ def fit_linear_colors(
 
     `depths` are those of the scene at the photographs. The photographs have one exposure.
     """
+    # Rays, in world axes, are taken relative to those from the middle of the cameras: they differ
+    # by angles of some hundredths, whose squares float32 would lose beside rays of length 1.
     middle = torch.stack([view.camera.center for view in views]).mean(dim=0)
     reference = normalize(scene.means - middle, dim=-1)
     fit = LinearColorFit(scene, reference, renderer)
@@ -227,6 +231,7 @@ def multiply_outer(a: Float[Tensor, "n 3"], b: Float[Tensor, "n 3"]) -> Float[Te
 
 def invert_symmetric(matrices: Float[Tensor, "n 3 3"]) -> Float[Tensor, "n 3 3"]:
     """Invert positive definite matrices by their cofactors, faster than a solver of any size."""
+    # The rows of the cofactors are cross products of the rows, and the matrix is symmetric.
     a, b, c = matrices.unbind(dim=1)
     cofactors = torch.stack(
         [torch.linalg.cross(b, c), torch.linalg.cross(c, a), torch.linalg.cross(a, b)], dim=1
