@@ -4,14 +4,23 @@ VENV ?= .venv
 BIN := $(VENV)/bin
 TORCH ?= torch==2.13.0
 TORCH_CPU_INDEX ?= https://download.pytorch.org/whl/cpu
-# Without a GPU the CPU build of torch saves gigabytes of CUDA packages. It comes first, so that
-# nothing that depends on torch pulls another build.
-TORCH_INDEX := $(shell command -v nvidia-smi >/dev/null 2>&1 || echo --extra-index-url $(TORCH_CPU_INDEX))
+# A GPU is used where nvcc is as well: gsplat, the renderer on a GPU, compiles its kernels. Otherwise
+# the CPU build of torch saves gigabytes of CUDA packages. torch comes first, so that nothing that
+# depends on it pulls another build.
+NVIDIA := $(shell command -v nvidia-smi 2>/dev/null)
+NVCC := $(shell command -v nvcc 2>/dev/null || ls "$$CUDA_HOME/bin/nvcc" 2>/dev/null)
+GPU := $(and $(NVIDIA),$(NVCC))
+TORCH_INDEX := $(if $(GPU),,--extra-index-url $(TORCH_CPU_INDEX))
 PIP := $(BIN)/python -m pip install --quiet --disable-pip-version-check
 
 .PHONY: demo test test-slow golden check-golden lint format types docs dist release-check fuzz evaluate reproduce held-out results-pages bench gpu clean
 
 demo: $(VENV)/installed
+ifneq ($(NVIDIA),)
+ifeq ($(NVCC),)
+	@echo 'There is a GPU but no nvcc (CUDA_HOME): the demo runs on the CPU. See docs/install.md.'
+endif
+endif
 	$(BIN)/gscompleter demo --out demo --overwrite
 
 # A process for each core, up to four: most tests wait for one core, and files share what they set up.
@@ -121,7 +130,7 @@ $(VENV)/torch: | $(VENV)/bin/python
 	touch $@
 
 $(VENV)/installed: pyproject.toml | $(VENV)/torch
-	$(PIP) -e .
+	$(PIP) -e '.$(if $(GPU),[cuda])'
 	touch $@
 
 $(VENV)/installed-evaluation: pyproject.toml | $(VENV)/torch

@@ -20,6 +20,7 @@ from gscompleter.render.device import choose_device
 from gscompleter.render.loading import load_renderer
 from gscompleter.system.errors import InputError
 from gscompleter.system.files.writing import get_download_folder
+from gscompleter.types import Camera, Gaussians, make_observed, sh_from_rgb
 
 PURPOSES = {
     "cuda": "rendering on an NVIDIA GPU",
@@ -39,6 +40,11 @@ PURPOSES = {
     "usd": "splats as OpenUSD (.usda, .usdc, .usdz)",
 }
 """Purpose of each extra, without those for developers (`test-core`, `test`, `dev`, `docs`)."""
+
+TEST_SIZE = 16
+"""Width and height, in pixels, of the picture that each renderer draws."""
+MIN_TEST_ALPHA = 0.5
+"""Smallest alpha in the middle of that picture, where an opaque Gaussian is."""
 
 
 @dataclass(frozen=True)
@@ -64,14 +70,8 @@ def inspect_installation() -> Iterator[Found]:
     for extra, purpose in PURPOSES.items():
         yield inspect_extra(extra, purpose)
 
-    # Loading is the test: a renderer can be installed and lack its GPU or its compiled part.
     for name in ("cpu", "cuda", "reference"):
-        try:
-            load_renderer(name)
-        except InputError as error:
-            yield Found("renderers", name, False, str(error))
-        else:
-            yield Found("renderers", name, True, "draws here")
+        yield inspect_renderer(name)
     compiled = all(is_compiled(part) for part in PARTS)
     remedy = "compiled by the first completion, or in advance by `gscompleter warmup`"
     yield Found("renderers", "kernels", compiled, "compiled" if compiled else remedy)
@@ -90,6 +90,41 @@ def inspect_installation() -> Iterator[Found]:
     yield Found("caches", "downloads", True, f"{get_download_folder()} (GSCOMPLETER_HOME)")
     yield inspect_kernel_cache()
     yield Found("caches", "torch.hub", True, f"{torch.hub.get_dir()} (TORCH_HOME)")
+
+
+def inspect_renderer(name: str) -> Found:
+    """Draw a picture with a renderer: it can be installed and lack its GPU or its kernels."""
+    try:
+        renderer = load_renderer(name)
+    except InputError as error:
+        return Found("renderers", name, False, str(error))
+    try:
+        alpha = renderer.render(*make_test_scene("cuda" if name == "cuda" else "cpu")).alpha
+    # Whatever a driver or a compiler raises, doctor says it and goes on.
+    except Exception as error:
+        first_line = str(error).strip().partition("\n")[0]
+        return Found("renderers", name, False, f"{type(error).__name__}: {first_line}")
+    middle = float(alpha[TEST_SIZE // 2, TEST_SIZE // 2])
+    if not middle > MIN_TEST_ALPHA:
+        return Found("renderers", name, False, f"draws nothing: alpha {middle:.2f} in the middle")
+    return Found("renderers", name, True, "draws here")
+
+
+def make_test_scene(device: str) -> tuple[Gaussians, Camera]:
+    """Create one opaque white Gaussian, and a camera that sees it in the middle of its image."""
+    gaussian = make_observed(
+        means=torch.tensor([[0.0, 0.0, 2.0]]),
+        quats=torch.tensor([[1.0, 0.0, 0.0, 0.0]]),
+        scales=torch.full((1, 3), 0.2),
+        opacities=torch.tensor([0.99]),
+        sh=sh_from_rgb(torch.ones(1, 3)),
+    )
+    half = TEST_SIZE / 2
+    K = torch.tensor(
+        [[float(TEST_SIZE), 0.0, half], [0.0, float(TEST_SIZE), half], [0.0, 0.0, 1.0]]
+    )
+    camera = Camera(torch.eye(4), K, TEST_SIZE, TEST_SIZE, near=1.0, far=4.0)
+    return gaussian.to(device), camera.to(device)
 
 
 def inspect_kernel_cache() -> Found:

@@ -14,6 +14,7 @@ import torch
 from gscompleter.completer import GSCompleter
 from gscompleter.numerics.image_ops import smooth_masked
 from gscompleter.numerics.kernels.compiled import get_cache_folder, is_compiled, mark_compiled
+from gscompleter.render.gsplat_kernels import explain_missing_gpu, explain_missing_renderer
 from gscompleter.render.loading import load_renderer
 from gscompleter.render.lod import simplify_scene
 from gscompleter.system.progress import show_progress, stage
@@ -49,6 +50,16 @@ def compile_kernels(names: Collection[str]) -> float | None:
         if name != SPLAT_PART or SPLAT_PART in missing:
             mark_compiled(name)
     return time.perf_counter() - start
+
+
+def compile_gsplat() -> str | None:
+    """Compile gsplat's kernels for the GPU, if there is one; return a sentence about it."""
+    if explain_missing_gpu() is not None:
+        return None
+    missing = explain_missing_renderer()
+    if missing is None:
+        return "gsplat is compiled for the GPU."
+    return f"The GPU cannot draw: {missing}."
 
 
 def rehearse(with_splat: bool) -> None:

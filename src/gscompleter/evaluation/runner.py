@@ -49,6 +49,8 @@ class RunConfig:
     generator: str = "warp-inpaint"
     generator_settings: GeneratorSettings | None = None
     device: Literal["cpu", "cuda"] = "cpu"
+    """Device of the renderer, and of photographs and Gaussians."""
+    network_device: Literal["cpu", "cuda", "mps"] = "cpu"
     seed: int = 0
     baseline_iterations: int | None = None
     """As of `Models`."""
@@ -62,10 +64,18 @@ class RunConfig:
         """
         return Models(
             load_reconstructor(
-                self.reconstructor, self.weights, self.device, self.depth, self.depth_weights
+                self.reconstructor,
+                self.weights,
+                self.network_device,
+                self.depth,
+                self.depth_weights,
             ),
             load_generator(
-                self.generator, self.seed, targets, self.device, self.generator_settings
+                self.generator,
+                self.seed,
+                targets,
+                self.network_device,
+                self.generator_settings,
             ),
             load_renderer(self.device),
             self.seed,

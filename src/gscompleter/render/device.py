@@ -1,24 +1,95 @@
-"""The device on which renderers and networks run."""
+"""The devices on which the renderer and the networks run."""
 
 from __future__ import annotations
 
-import importlib.util
+import logging
+from dataclasses import dataclass
+from functools import cache
 from typing import Literal
 
 import torch
 
+from gscompleter.render.gsplat_kernels import explain_missing_gpu, explain_missing_renderer
 from gscompleter.system.errors import InputError
 
+RendererDevice = Literal["cpu", "cuda"]
+NetworkDevice = Literal["cpu", "cuda", "mps"]
+"""AMD's GPUs are `cuda` as well (torch for ROCm); `mps` is the GPU of a Mac."""
 
-def choose_device(device: Literal["auto", "cpu", "cuda"] = "auto") -> Literal["cpu", "cuda"]:
-    """Choose the device; `auto` uses a GPU if torch finds one and gsplat is installed."""
-    is_ready = torch.cuda.is_available() and importlib.util.find_spec("gsplat") is not None
-    if device == "cuda" and not is_ready:
+
+@dataclass(frozen=True)
+class Devices:
+    """The device of the renderer, which photographs and Gaussians share, and that of networks."""
+
+    renderer: RendererDevice
+    networks: NetworkDevice
+
+
+def choose_devices(
+    device: Literal["auto", "cpu", "cuda"] = "auto",
+    renderer: RendererDevice | None = None,
+    networks: NetworkDevice | None = None,
+) -> Devices:
+    """Choose both devices: `device` for both, unless one is given for the renderer or networks."""
+    return Devices(
+        choose_device(device) if renderer is None else choose_device(renderer, "renderer-device"),
+        choose_network_device(device if networks is None else networks),
+    )
+
+
+def choose_device(
+    device: Literal["auto", "cpu", "cuda"] = "auto", option: str = "device"
+) -> RendererDevice:
+    """Choose the device of the renderer; `auto` uses a GPU if gsplat can draw on it.
+
+    Raises:
+        InputError: `device` is `cuda`, and gsplat cannot draw; it says what is missing.
+    """
+    # The CPU is chosen without asking for a GPU, which takes time and memory on one.
+    if device == "cpu":
+        return "cpu"
+    missing = explain_missing_renderer()
+    if missing is None:
+        return "cuda"
+    if device == "cuda":
+        # A GPU that torch sees still runs the networks.
+        hint = ""
+        if torch.cuda.is_available():
+            hint = ", or the GPU for networks alone (--renderer-device cpu)"
         raise InputError(
-            "The device cuda needs a GPU that torch sees, and gsplat from "
-            "`pip install gscompleter[cuda]`; without them, choose the device cpu.",
-            "device",
+            f"The device cuda cannot draw: {missing}. docs/install.md lists all steps; choose the "
+            f"device cpu{hint}.",
+            option,
         )
+    # Without a GPU nothing is missed, and nothing has to be said.
+    if torch.cuda.is_available():
+        _warn_of_cpu(missing)
+    return "cpu"
+
+
+def choose_network_device(device: Literal["auto", "cpu", "cuda", "mps"]) -> NetworkDevice:
+    """Choose the device of the networks; `auto` uses any GPU that torch sees.
+
+    Raises:
+        InputError: torch does not see the GPU that is asked for.
+    """
+    if device == "cpu":
+        return "cpu"
+    if device in ("auto", "cuda") and torch.cuda.is_available():
+        return "cuda"
+    if device in ("auto", "mps") and torch.backends.mps.is_available():
+        return "mps"
     if device == "auto":
-        return "cuda" if is_ready else "cpu"
-    return device
+        return "cpu"
+    reason = explain_missing_gpu() if device == "cuda" else "torch sees no GPU of a Mac"
+    raise InputError(
+        f"The networks cannot run on {device}: {reason}; choose cpu.", "network-device"
+    )
+
+
+@cache
+def _warn_of_cpu(missing: str) -> None:
+    """Say once in a process that the renderer stays on the CPU though there is a GPU."""
+    logging.getLogger("gscompleter").warning(
+        "gscompleter: there is a GPU, but the renderer runs on the CPU: %s.", missing
+    )

@@ -54,6 +54,14 @@ def explain_failure(error: BaseException) -> Failure | None:
 
 def _explain(error: BaseException) -> tuple[str, int]:
     """Return the sentence and exit code for an error alone; an empty sentence for a defect."""
+    # torch has its own error for the memory of a GPU; torch is not imported to name it.
+    if type(error).__name__ == "OutOfMemoryError":
+        return (
+            "The memory of the GPU ran out; choose a smaller --resolution, fewer photographs or "
+            "--generator-offload (diffusion models), or run a part on the CPU: --renderer-device "
+            "cpu, --network-device cpu.",
+            ERROR,
+        )
     # torch and numba raise RuntimeError for a lack of memory, so their words are read, too.
     number = getattr(error, "errno", None)
     is_memory = isinstance(error, MemoryError) or number == errno.ENOMEM

@@ -66,7 +66,8 @@ class RunOptions(ComputeOptions):
     """Options of every command that completes scenes."""
 
     device: Device = "auto"
-    """Device to compute on; `auto` takes an NVIDIA GPU if there is one."""
+    """Device to compute on. `auto` draws on an NVIDIA GPU if gsplat can, and runs networks on any
+    GPU that torch sees."""
     seed: Seed = 0
     """Seed of all random numbers. The same seed gives the same files on CPUs of one type."""
 
@@ -79,6 +80,11 @@ class DepthOptions(RunOptions):
     """Monocular depth that helps plane-sweep where stereo measures nothing: none, or moge-2."""
     depth_weights: Path | None = None
     """Weights file of that depth; downloaded if not given."""
+    renderer_device: Literal["cpu", "cuda"] | None = None
+    """Device of the renderer alone, and of the photographs; as `--device` if not given."""
+    network_device: Literal["cpu", "cuda", "mps"] | None = None
+    """Device of the networks alone: cuda for GPUs of NVIDIA and AMD, mps for those of a Mac; as
+    `--device` if not given."""
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -11,7 +11,10 @@ from gscompleter.system.process import import_without_collection
 
 @dataclass(frozen=True, kw_only=True)
 class WarmupOptions(ComputeOptions):
-    """Compile all kernels for this type of processor into numba's cache (NUMBA_CACHE_DIR)."""
+    """Compile all kernels for this processor and its GPU into the caches of numba and torch.
+
+    NUMBA_CACHE_DIR and TORCH_EXTENSIONS_DIR name these folders.
+    """
 
 
 def run_warmup(options: WarmupOptions) -> None:
@@ -20,7 +23,7 @@ def run_warmup(options: WarmupOptions) -> None:
     with import_without_collection():
         from rich.console import Console
 
-        from gscompleter.apps.warmup import PARTS, compile_kernels
+        from gscompleter.apps.warmup import PARTS, compile_gsplat, compile_kernels
         from gscompleter.numerics.kernels.cache import CACHE
         from gscompleter.numerics.kernels.compiled import get_cache_folder
         from gscompleter.system.progress import show_progress
@@ -30,6 +33,9 @@ def run_warmup(options: WarmupOptions) -> None:
         raise InputError(str(CACHE.note))
     with show_progress(Console(stderr=True, quiet=options.quiet)):
         seconds = compile_kernels(list(PARTS))
+        about_gpu = compile_gsplat()
     if not options.quiet:
         done = " already" if seconds is None else f", in {seconds:.1f} s"
         print(f"All kernels are compiled{done}: {get_cache_folder()}")
+        if about_gpu is not None:
+            print(about_gpu)

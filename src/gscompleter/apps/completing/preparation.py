@@ -34,7 +34,7 @@ from gscompleter.data.photograph_names import describe_offset
 from gscompleter.generators import load_generator
 from gscompleter.planning.planner import Choice, ViewPlanner
 from gscompleter.reconstructors import check_reconstructor, load_reconstructor
-from gscompleter.render.device import choose_device
+from gscompleter.render.device import choose_devices
 from gscompleter.render.loading import load_renderer
 from gscompleter.render.lod import MIN_PROXY_GAUSSIANS
 from gscompleter.splats.alignment.similarity import transform_camera
@@ -97,12 +97,18 @@ def prepare_completion(options: CompleteOptions, console: Console) -> Prepared:
 
 
 def check_options(options: CompleteOptions) -> CompleteOptions:
-    """Refuse what is wrong whatever the scene is; return the options with the chosen device."""
+    """Refuse what is wrong whatever the scene is; return the options with the chosen devices."""
     check_context(options.context)
     check_targets(options)
     check_reconstructor(options.reconstructor)
     options.synthesis.make_settings()
-    options = replace(options, device=choose_device(options.device))
+    devices = choose_devices(options.device, options.renderer_device, options.network_device)
+    options = replace(
+        options,
+        device=devices.renderer,
+        renderer_device=devices.renderer,
+        network_device=devices.networks,
+    )
     if options.scene is not None:
         options = replace(options, scene=resolve_splat(options.scene))
     return options
@@ -232,21 +238,22 @@ def add_splat(
 
 def load_completer(options: CompleteOptions, targets: Sequence[Target]) -> GSCompleter:
     """Load the models of the options."""
-    device = options.device
     # Only the oracle reads the photographs of the targets.
     photographs = [target.view for target in targets if target.view is not None]
     synthesis = options.synthesis
+    # `check_options` has chosen both devices.
+    networks = options.network_device or options.device
     config = options.config
     if options.no_recolor:
         config = replace(config, recolor=replace(config.recolor, iterations=0))
     return GSCompleter(
         load_reconstructor(
-            options.reconstructor, options.weights, device, options.depth, options.depth_weights
+            options.reconstructor, options.weights, networks, options.depth, options.depth_weights
         ),
         load_generator(
-            synthesis.generator, options.seed, photographs, device, synthesis.make_settings()
+            synthesis.generator, options.seed, photographs, networks, synthesis.make_settings()
         ),
-        load_renderer(device),
+        load_renderer(options.device),
         config,
         options.seed,
     )
@@ -284,6 +291,7 @@ def describe_settings(options: CompleteOptions) -> dict[str, Any]:
         "reconstructor": options.reconstructor,
         "weights": None if options.weights is None else str(options.weights),
         "depth": options.depth,
+        "network_device": options.network_device,
         **options.synthesis.describe(),
         "uses_target_photographs": options.synthesis.generator == "oracle",
     }

@@ -247,7 +247,8 @@ def write_results(options: EvaluateOptions) -> str:
     """Write all tables, claims and figures in OUT as one page, and return its text."""
     out = options.out
     paper = load_paper()
-    machine = {**describe_machine(choose_device(options.device)), **find_commit()}
+    device = choose_device(options.renderer_device or options.device)
+    machine = {**describe_machine(device), **find_commit()}
     facts = ", ".join(f"{key} {value}" for key, value in machine.items())
     parts = [f"# Results\n\n{facts}.\n"]
 

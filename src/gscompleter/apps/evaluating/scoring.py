@@ -23,7 +23,7 @@ from gscompleter.evaluation.cases import SkippedScene
 from gscompleter.evaluation.methods import expand_methods
 from gscompleter.evaluation.runner import RunConfig, evaluate
 from gscompleter.evaluation.store import list_row_paths
-from gscompleter.render.device import choose_device
+from gscompleter.render.device import choose_devices
 from gscompleter.system.errors import InputError
 from gscompleter.system.jobs.jobs import parse_shard
 from gscompleter.system.progress import show_preparation, show_progress
@@ -70,6 +70,7 @@ def score_methods(options: EvaluateOptions) -> Scored:
         console.print(note, markup=False, soft_wrap=True)
     print_skipped(skipped, console)
 
+    devices = choose_devices(options.device, options.renderer_device, options.network_device)
     config = RunConfig(
         reconstructor=options.reconstructor[0],
         weights=str(options.weights[0]) if options.weights else None,
@@ -77,7 +78,8 @@ def score_methods(options: EvaluateOptions) -> Scored:
         depth_weights=str(options.depth_weights) if options.depth_weights else None,
         generator=options.synthesis.generator,
         generator_settings=options.synthesis.make_settings(),
-        device=choose_device(options.device),
+        device=devices.renderer,
+        network_device=devices.networks,
         seed=options.seed,
         source=describe_source(options, any(task.has_masks for task in tasks)),
     )
