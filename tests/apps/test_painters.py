@@ -12,9 +12,11 @@ from PIL import Image
 from command import run
 from gscompleter import load_cameras, load_splat, load_views
 from gscompleter.apps.batch.rows import parse_row
+from gscompleter.apps.completing.path_video import plan_path
 from gscompleter.numerics.geometry import is_same_camera
 from gscompleter.system.errors import InputError
 from gscompleter.system.files.image import read_depth, read_image, read_pixels
+from gscompleter.system.files.video import read_video, write_video
 from scenes import Room, camera_at, cast, photographed, view_of
 
 SIZE = 64
@@ -237,6 +239,7 @@ def test_a_damaged_holes_file_is_refused(scene, holes, tmp_path, monkeypatch, ca
         (["--images", "EMPTY", "--auto", 2], "leave --auto"),
         (["--images", "EMPTY", "--generator", "oracle"], "takes the place of a generator"),
         (["--images", "EMPTY", "--generator-steps", 3], "takes the place of a generator"),
+        (["--path"], "is a video of what --export-holes writes"),
         (["--export-holes", "NEW", "--dry-run"], "completes nothing"),
         (["--export-holes", "NEW", "--video"], "completes nothing"),
         (["--export-holes", "OUT"], "is the input|holds the input"),
@@ -286,3 +289,82 @@ def test_targets_of_an_export_are_found(scene, tmp_path, monkeypatch, capsys):
     assert row["derived_from"] is not None
     assert row["offset"]
     assert row["added"] > 0
+
+
+def repair(scene: Path, holes: Path, name: str, side: int, drop: int = 0) -> None:
+    """Paint the truth into the frames of the targets, as a model that repairs the video."""
+    content = json.loads((holes / "holes.json").read_text())
+    frames = [frame.copy() for frame in read_video(holes / "path.mp4", "null", is_grey=False)]
+    masks = [frame > 127 for frame in read_video(holes / "path_mask.mp4", "null", is_grey=False)]
+    for entry in content["frames"]:
+        (view,) = load_views(scene, frames=[entry["frame"]])
+        number = entry["path_frame"]
+        truth = (view.image * 255).round().byte().numpy()
+        frames[number] = np.where(masks[number], truth, frames[number])
+    images = [Image.fromarray(frame).resize((side, side)) for frame in frames]
+    kept = [np.asarray(image) for image in images[: len(images) - drop]]
+    write_video(holes / name, kept, rate=16)
+
+
+@pytest.fixture(scope="module")
+def filmed(scene, tmp_path_factory) -> Path:
+    """Return the holes of two targets with a video."""
+    pytest.importorskip("imageio_ffmpeg", reason="needs gscompleter[film]")
+    home = tmp_path_factory.mktemp("filmed")
+    named = ("--context", 0, 1, "--target", *TARGETS, "--export-holes", home / "holes", "--path")
+    with pytest.MonkeyPatch.context() as monkeypatch:
+        assert run(monkeypatch, *words(scene, home / "out", *named)) == 0
+    return home / "holes"
+
+
+def test_a_video_passes_the_targets(filmed):
+    content = json.loads((filmed / "holes.json").read_text())
+    path = content["path"]
+    frames = list(read_video(filmed / path["video_path"], "null", is_grey=False))
+    masks = list(read_video(filmed / path["hole_mask_path"], "null", is_grey=False))
+    assert len(frames) == len(masks) == len(path["cameras"]) == path["num_frames"]
+    assert path["num_frames"] % 4 == 1
+    for entry in content["frames"]:
+        number = entry["path_frame"]
+        assert path["cameras"][number]["transform_matrix"] == [
+            pytest.approx(row, abs=1e-5) for row in entry["transform_matrix"]
+        ]
+        image = read_pixels(filmed / entry["image_path"]).astype(int)
+        # The colours of a video have half the resolution.
+        errors = [np.abs(frame.astype(int) - image).mean() for frame in frames]
+        assert errors[number] < 0.3 * max(errors)
+        mask = read_pixels(filmed / entry["hole_mask_path"])[..., 0] > 127
+        assert ((masks[number][..., 0] > 127) == mask).mean() > 0.98
+    listed = summary_of(filmed)["files"]
+    assert sorted(file.name for file in filmed.iterdir()) == listed
+
+
+def test_a_repaired_video_completes_the_targets(scene, filmed, tmp_path, monkeypatch, capsys):
+    """It has another size and rate; a painted image of a target counts more."""
+    holes = Path(shutil.copytree(filmed, tmp_path / "holes"))
+    repair(scene, holes, "path.mov", side=3 * SIZE)
+    images = ("--images", holes, "--painter", "a video model")
+    paint(holes, 1, MAGENTA, "target1.webp")
+    assert run(monkeypatch, *words(scene, tmp_path / "out", *images)) == 0
+    first, second = summary_of(tmp_path / "out")["targets"]
+    assert first["psnr_after"] < first["psnr_before"] + 1
+    assert second["psnr_after"] > second["psnr_before"] + 3
+    assert second["painter"] == "a video model"
+
+    (holes / "path.mov").unlink()
+    repair(scene, holes, "path.mp4", side=SIZE, drop=1)
+    command = words(scene, tmp_path / "again", *images)
+    assert "and 73 were exported; keep all of them" in refused(monkeypatch, capsys, *command)
+
+
+def test_targets_of_another_lens_are_not_in_the_video():
+    wide, narrow = camera_at(0.5, size=SIZE), camera_at(0.7, size=SIZE, focal=1.2)
+    odd = camera_at(0.5, size=SIZE - 1)
+    context = [camera_at(0.0, size=SIZE)]
+    planned = plan_path(context, [odd, narrow, odd], [])
+    frames = [frame for frame in planned.target_frames if frame is not None]
+    assert planned.target_frames[1] is None
+    assert len(frames) == 2
+    assert frames[-1] == len(planned.cameras) - 1
+    assert {(camera.width, camera.height) for camera in planned.cameras} == {(SIZE, SIZE)}
+    assert plan_path(context, [wide], []).cameras[-1].K.allclose(wide.K)

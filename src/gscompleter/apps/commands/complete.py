@@ -38,9 +38,13 @@ class CompleteOptions(CompletingOptions):
     """Only write, for each target, what another program needs to paint its hole to this folder:
     image, mask, warped photographs, depth, reference and camera (holes.json). OUT stays as it is;
     the same command with `--images` completes the scene."""
+    path: bool = False
+    """With `--export-holes`, also write a video along the targets and its mask, for models that
+    repair video (path.mp4, path_mask.mp4)."""
     images: Path | None = None
-    """Folder of images that were painted for the targets, named as those of `--export-holes`, in
-    place of a generator. Without `--target`, its holes.json has the targets and the context."""
+    """Folder of images that were painted for the targets, or a repaired video, named as those of
+    `--export-holes`, in place of a generator. Without `--target`, its holes.json has the targets
+    and the context."""
     painter: str | None = None
     """Name of the program, model or person that painted them, for the report."""
     out: Path

@@ -126,6 +126,8 @@ def plan_folder(options: CompleteOptions, prepare: Prepare) -> None:
 def export_folder(options: CompleteOptions, prepare: Prepare) -> None:
     """Write the holes of the targets to be painted, and print how to go on."""
     refuse_painted(options.results)
+    if options.path:
+        find_ffmpeg()
     with open_completion(options, prepare) as (ready, folder):
         begun = ready.begin()
         if not ready.task.targets:

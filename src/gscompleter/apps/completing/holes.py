@@ -15,6 +15,7 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 
 from gscompleter import __version__
+from gscompleter.apps.completing.path_video import PATH_MASK, PATH_VIDEO, plan_path, write_path
 from gscompleter.apps.completing.preparation import Prepared
 from gscompleter.apps.inputs.holes_file import HOLES_FILE, HoleRow, read_holes
 from gscompleter.apps.inputs.paintings import is_exported
@@ -32,7 +33,7 @@ from gscompleter.system.files.image import write_depth, write_image
 from gscompleter.system.progress import track
 from gscompleter.types import Camera, View
 
-EXPORTED = ("target*.png", HOLES_FILE)
+EXPORTED = ("target*.png", PATH_VIDEO, PATH_MASK, HOLES_FILE)
 """Globs of the files that an export may write."""
 DEPTH_STEPS = 65535
 """Largest value of a 16-bit depth map."""
@@ -65,13 +66,16 @@ class ExportedHole:
 
 def refuse_painted(folder: Path) -> None:
     """Refuse to replace the images of an earlier export that were painted."""
-    rows: tuple[HoleRow, ...] = ()
+    exported: dict[str, str] = {}
     # A damaged file says nothing of its images, and is replaced.
     with suppress(InputError):
-        rows = read_holes(folder).frames
-    for row in rows:
-        path = folder / row.image_path
-        if path.is_file() and not is_exported(path, row):
+        holes = read_holes(folder)
+        exported = {row.image_path: row.sha256 for row in holes.frames}
+        if holes.path is not None:
+            exported[holes.path.video_path] = holes.path.sha256
+    for name, sha256 in exported.items():
+        path = folder / name
+        if path.is_file() and not is_exported(path, sha256):
             raise InputError(
                 f"{quote_value(path)} was painted; name another folder for the export.",
                 "export-holes",
@@ -99,12 +103,21 @@ def write_holes(folder: Path, ready: Prepared, begun: Completion) -> list[str]:
     # One unit for all depth maps, as in a transforms.json.
     unit = max(hole.depth.max().item() for hole in exported) / DEPTH_STEPS
     rows = [write_hole(folder, hole, unit, ready) for hole in exported]
+    path = None
+    if ready.options.path:
+        targets = [begun.with_depth_range(hole.target.camera) for hole in exported]
+        context = [view.camera for view in begun.views]
+        planned = plan_path(context, targets, list(ready.cameras.values()))
+        path = write_path(folder, ready, begun, planned)
+        for row, frame in zip(rows, planned.target_frames, strict=True):
+            row["path_frame"] = frame
     content = {
         "version": __version__,
         "camera_model": "PINHOLE",
         "depth_unit_scale_factor": unit,
         "context": list(ready.task.context_frames),
         "frames": rows,
+        "path": path,
     }
     (folder / HOLES_FILE).write_bytes(json.dumps(content, indent=1).encode() + b"\n")
     return skipped

@@ -39,6 +39,10 @@ def choose_paintings(options: CompleteOptions) -> CompleteOptions:
 def refuse_combinations(options: CompleteOptions) -> None:
     """Refuse options for exported holes and painted images that exclude others."""
     is_export = options.export_holes is not None
+    if options.path and not is_export:
+        raise InputError(
+            "--path is a video of what --export-holes writes; name its folder.", "export-holes"
+        )
     if options.images is None:
         if options.painter is not None:
             raise InputError("--painter names who painted --images; name their folder.", "images")

@@ -40,6 +40,17 @@ class HoleRow:
     """Frame that a planned camera was derived from."""
     offset: str | None = None
     """Move and turn from that frame, in words."""
+    path_frame: int | None = None
+    """Frame of the video at which the camera stands here, from 0; None if it never does."""
+
+
+@dataclass(frozen=True)
+class PathRow:
+    """A video along the targets."""
+
+    video_path: str
+    sha256: str
+    num_frames: int
 
 
 @dataclass(frozen=True)
@@ -50,6 +61,7 @@ class HolesFile:
     context: tuple[int, ...]
     """Frames of the context, from which the scene was made."""
     frames: tuple[HoleRow, ...]
+    path: PathRow | None = None
 
 
 def has_holes(folder: Path) -> bool:
@@ -77,3 +89,5 @@ def list_names(holes: HolesFile) -> Iterator[str]:
     """List the files that are read."""
     for row in holes.frames:
         yield from (row.image_path, row.hole_mask_path)
+    if holes.path is not None:
+        yield holes.path.video_path
