@@ -234,6 +234,7 @@ class GSCompleter:
                 registered=moved.gaussians if self.keep_registered else None,
                 num_recolored=recolored.count,
                 synthesis_notes=image.notes,
+                painter=image.painter,
                 rejection=rejection,
             )
         return recolored.state.extended(result, seconds)

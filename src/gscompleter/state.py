@@ -139,6 +139,8 @@ class TargetResult:
     """Number of rendered context Gaussians that got new colours."""
     synthesis_notes: tuple[str, ...] = ()
     """Sentences of the generator about its image."""
+    painter: str = ""
+    """Who painted the image elsewhere; empty if Φ synthesized it."""
     unfilled: Unfilled = Unfilled()
     """The part of the hole that stays empty; nothing for a target that was skipped."""
     rejection: Rejection = Rejection()

@@ -49,6 +49,8 @@ NOT_RUN = {
 """Commands that no test here runs, and why."""
 NEEDS_WEIGHTS = ("--reconstructor", "--generator")
 """Options that name published weights, which no machine of ours has."""
+NEEDS_PAINTER = ("--images",)
+"""Options that name what somebody painted; test_painters.py does."""
 FAST = ("doctor", "models", "report", "strip", "view", "convert")
 """Commands that take a second or two."""
 WRITES_OUT = ("complete", "clean")
@@ -181,7 +183,8 @@ def test_the_reference_has_a_term_for_each_option(command):
 
 def is_run(words: list[str]) -> bool:
     """Return True if these words after `gscompleter` can be run here."""
-    return words[0] in COMMANDS and words[0] not in NOT_RUN and not set(words) & set(NEEDS_WEIGHTS)
+    needed = {*NEEDS_WEIGHTS, *NEEDS_PAINTER}
+    return words[0] in COMMANDS and words[0] not in NOT_RUN and not set(words) & needed
 
 
 def ours(block: Block) -> list[list[str]]:

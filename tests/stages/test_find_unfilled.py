@@ -8,7 +8,7 @@ import torch
 from gscompleter import GSCompleter
 from gscompleter.completer import check_any_completed
 from gscompleter.guards.psnr import PsnrGuard
-from gscompleter.stages.find_unfilled import find_largest_regions
+from gscompleter.numerics.image_ops import find_largest_regions
 from gscompleter.state import Completion, Unfilled
 from scenes import Room, camera_at, view_of
 

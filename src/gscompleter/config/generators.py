@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 from dataclasses import asdict, dataclass
-from typing import Any
+from typing import Annotated, Any
+
+from annotated_types import Len
 
 from gscompleter.config.settings import Settings
 from gscompleter.system.errors import InputError, quote_value
@@ -15,8 +17,20 @@ class GeneratorSettings(Settings):
     """Settings of a generator; each is an option that the class `GeneratorOptions` explains."""
 
 
-BUILT_IN = ("warp-inpaint", "oracle")
-"""Generators without settings."""
+@dataclass(frozen=True)
+class PaintedSettings(GeneratorSettings):
+    """Images that were painted elsewhere."""
+
+    painter: Annotated[str, Len(1, 100)] = "an unnamed painter"
+    """Name of the program, model or person."""
+
+
+BUILT_IN: dict[str, type[GeneratorSettings]] = {
+    "warp-inpaint": GeneratorSettings,
+    "oracle": GeneratorSettings,
+    "painted": PaintedSettings,
+}
+"""Settings of the built-in generators."""
 
 PREFIX = "generator_"
 
@@ -30,7 +44,7 @@ A loader that takes settings has their class as its attribute `settings`.
 def get_settings_class(name: str) -> type[GeneratorSettings]:
     """Return the class of a generator's settings, or raise InputError for an unknown name."""
     if isinstance(name, str) and name in BUILT_IN:
-        return GeneratorSettings
+        return BUILT_IN[name]
     others = load_plugins(PLUGINS)
     if isinstance(name, str) and name in others:
         return getattr(others[name], "settings", GeneratorSettings)
@@ -47,8 +61,8 @@ class GeneratorOptions(Settings):
 
     generator: str = "warp-inpaint"
     """Model that synthesizes the image at a target: warp-inpaint (warped photographs, holes filled
-    by patches), oracle (the real photograph), pe-field (the paper's), diffusers-inpaint, or one of
-    the other models that docs/generators.md lists."""
+    by patches), oracle (the real photograph), painted (by --images), pe-field (the paper's),
+    diffusers-inpaint, or one of the other models that docs/generators.md lists."""
     generator_weights: str | None = None
     """Weights, by default those published: a folder saved by diffusers, USER/NAME or
     USER/NAME@COMMIT on the Hugging Face hub for pe-field and diffusers-inpaint (which has no
@@ -82,8 +96,8 @@ class GeneratorOptions(Settings):
         # Refused, not ignored: the user would believe that the setting was obeyed.
         for setting in settings:
             if not hasattr(kind, setting):
-                others = load_plugins(PLUGINS)
-                knowing = [name for name in others if hasattr(get_settings_class(name), setting)]
+                names = [*BUILT_IN, *load_plugins(PLUGINS)]
+                knowing = [name for name in names if hasattr(get_settings_class(name), setting)]
                 raise InputError(
                     f"The generator '{self.generator}' has no setting {setting}; leave it out, or "
                     f"choose {' or '.join(knowing)}.",
@@ -95,3 +109,11 @@ class GeneratorOptions(Settings):
         """Describe the generator for `summary.json`."""
         settings = asdict(self.make_settings())
         return {"generator": self.generator, **{PREFIX + name: settings[name] for name in settings}}
+
+
+@dataclass(frozen=True)
+class PaintedOptions(GeneratorOptions):
+    """The generator of painted images, which the options of their folder choose."""
+
+    generator: str = "painted"
+    generator_painter: str | None = None

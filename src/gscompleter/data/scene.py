@@ -89,17 +89,26 @@ def write_cameras(
     Near and far planes are not part of the format. `file_paths` are image paths relative to its
     folder, for the `transforms.json` of a scene.
     """
-    frames: list[dict[str, object]] = []
-    for camera in cameras:
-        (fl_x, _, cx), (_, fl_y, cy), _ = camera.K.double().tolist()
-        # float64 holds a float32 exactly, and JSON writes as many digits as restore it.
-        c2w = camera.c2w.detach().cpu().double().numpy() @ OPENCV_FROM_OPENGL
-        intrinsics = {"fl_x": fl_x, "fl_y": fl_y, "cx": cx, "cy": cy}
-        size = {"w": camera.width, "h": camera.height}
-        frames.append({**intrinsics, **size, "transform_matrix": c2w.tolist()})
+    frames = [describe_camera(camera) for camera in cameras]
     if file_paths is not None:
         pairs = zip(file_paths, frames, strict=True)
         frames = [{"file_path": file_path, **frame} for file_path, frame in pairs]
     content = {"camera_model": "PINHOLE", "frames": frames}
     with replace_file(path) as file:
         file.write((json.dumps(content, indent=1) + "\n").encode())
+
+
+def describe_camera(camera: Camera) -> dict[str, object]:
+    """Describe a camera by the keys of a frame in `transforms.json`, in OpenGL axes."""
+    (fl_x, _, cx), (_, fl_y, cy), _ = camera.K.double().tolist()
+    # float64 holds a float32 exactly, and JSON writes as many digits as restore it.
+    c2w = camera.c2w.detach().cpu().double().numpy() @ OPENCV_FROM_OPENGL
+    return {
+        "fl_x": fl_x,
+        "fl_y": fl_y,
+        "cx": cx,
+        "cy": cy,
+        "w": camera.width,
+        "h": camera.height,
+        "transform_matrix": c2w.tolist(),
+    }

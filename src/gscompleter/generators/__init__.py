@@ -10,7 +10,12 @@ from jaxtyping import Float
 from torch import Tensor
 
 from gscompleter.config import SynthesisConfig
-from gscompleter.config.generators import PLUGINS, GeneratorSettings, get_settings_class
+from gscompleter.config.generators import (
+    PLUGINS,
+    GeneratorSettings,
+    PaintedSettings,
+    get_settings_class,
+)
 from gscompleter.config.settings import validate
 from gscompleter.numerics.geometry import is_same_camera
 from gscompleter.system.errors import InputError
@@ -42,6 +47,8 @@ class GeneratorOutput:
     """True if the image does not show the scene of the photographs."""
     is_photograph: bool = False
     """True if the image is a true photograph, which may recolour all that it shows."""
+    painter: str = ""
+    """Name of the program, model or person that painted the image elsewhere; empty for Φ itself."""
 
 
 @runtime_checkable
@@ -111,7 +118,10 @@ def load_generator(
     device: str = "cpu",
     settings: GeneratorSettings | None = None,
 ) -> Generator:
-    """Load a generator by name; only `oracle` uses `photographs`, the true target images."""
+    """Load a generator by name; only `oracle` and `painted` use `photographs`.
+
+    They are the images of the targets: true ones, or those that were painted.
+    """
     kind = get_settings_class(name)
     settings = settings or kind()
     if type(settings) is not kind:
@@ -153,8 +163,18 @@ def _load_oracle(
     return FunctionGenerator(find_photograph, supports_padding=False)
 
 
+def _load_painted(
+    settings: GeneratorSettings, seed: int, photographs: Sequence[View], *_: Any
+) -> Generator:
+    from gscompleter.generators.painted import Painted
+
+    assert isinstance(settings, PaintedSettings)
+    return Painted(tuple(photographs), settings.painter)
+
+
 GENERATORS: dict[str, Callable[..., Generator]] = {
     "warp-inpaint": _load_warp_inpaint,
     "oracle": _load_oracle,
+    "painted": _load_painted,
 }
-"""Loader of each built-in generator: (settings, seed, true images, device) -> Φ."""
+"""Loader of each built-in generator: (settings, seed, images of the targets, device) -> Φ."""

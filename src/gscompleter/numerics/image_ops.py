@@ -15,6 +15,8 @@ SSIM_RADIUS = 5
 """Radius of the Gaussian window of SSIM, in pixels."""
 SSIM_SIGMA = 1.5
 """Standard deviation of the window, in pixels."""
+MAX_REGIONS = 3
+"""Most regions that are listed, the largest first."""
 
 
 def fill_smoothly(
@@ -108,6 +110,24 @@ def label_regions(mask: Bool[Tensor, "h w"]) -> tuple[Int64[Tensor, "h w"], int]
     pixels = mask.cpu().numpy().astype(np.uint8)
     count, labels = cv2.connectedComponents(pixels, connectivity=8)
     return torch.from_numpy(labels).long().to(mask.device), count
+
+
+def find_largest_regions(
+    mask: Bool[Tensor, "h w"], left: int, top: int
+) -> tuple[tuple[int, int, int, int], ...]:
+    """Find the bounding boxes (left, top, right, bottom) of the largest connected regions.
+
+    The corner of the mask has the coordinates `left`, `top`; right and bottom are exclusive.
+    """
+    pixels = mask.cpu().numpy().astype(np.uint8)
+    _, _, stats, _ = cv2.connectedComponentsWithStats(pixels, connectivity=8)
+    regions = stats[1:]  # the first component is the background
+    largest_first = (-regions[:, cv2.CC_STAT_AREA]).argsort(kind="stable")
+    largest = regions[largest_first][:MAX_REGIONS]
+    return tuple(
+        (left + int(x), top + int(y), left + int(x + width), top + int(y + height))
+        for x, y, width, height, _ in largest
+    )
 
 
 def is_enclosed(mask: Bool[Tensor, "h w"]) -> bool:

@@ -4,18 +4,10 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 
-import cv2
-import numpy as np
-from jaxtyping import Bool
-from torch import Tensor
-
-from gscompleter.numerics.image_ops import dilate
+from gscompleter.numerics.image_ops import dilate, find_largest_regions
 from gscompleter.stages.target_view import TargetView, compute_hole_mask
 from gscompleter.state import Step, Unfilled
 from gscompleter.types import Render
-
-MAX_REGIONS = 3
-"""Most regions that are listed, the largest first."""
 
 
 def find_unfilled(after: Render, steps: Sequence[Step], view: TargetView) -> Unfilled:
@@ -43,21 +35,3 @@ def find_unfilled(after: Render, steps: Sequence[Step], view: TargetView) -> Unf
         unexplained = unexplained & ~is_open
     regions = find_largest_regions(empty, -view.camera.left, -view.camera.top)
     return Unfilled(share, {name: part for name, part in lost.items() if part > 0}, regions)
-
-
-def find_largest_regions(
-    mask: Bool[Tensor, "h w"], left: int, top: int
-) -> tuple[tuple[int, int, int, int], ...]:
-    """Find the bounding boxes (left, top, right, bottom) of the largest connected regions.
-
-    The corner of the mask has the coordinates `left`, `top`; right and bottom are exclusive.
-    """
-    pixels = mask.cpu().numpy().astype(np.uint8)
-    _, _, stats, _ = cv2.connectedComponentsWithStats(pixels, connectivity=8)
-    regions = stats[1:]  # the first component is the background
-    largest_first = (-regions[:, cv2.CC_STAT_AREA]).argsort(kind="stable")
-    largest = regions[largest_first][:MAX_REGIONS]
-    return tuple(
-        (left + int(x), top + int(y), left + int(x + width), top + int(y + height))
-        for x, y, width, height, _ in largest
-    )

@@ -32,6 +32,8 @@ class GeneratedView(View):
     is_inconsistent: bool = False
     """True if the image is photometrically inconsistent with the photographs."""
     is_photograph: bool = False
+    painter: str = ""
+    """Who painted it elsewhere; empty for Φ itself."""
 
     def crop(self, camera: PaddedCamera) -> View:
         """Cut the padding off the image."""
@@ -121,10 +123,15 @@ def convert_output(output: object, target: Camera) -> GeneratedView:
                 f"The {name} of the generator has to be True or False, and is "
                 f"{describe(getattr(output, name))}."
             )
+    if not isinstance(output.painter, str):
+        raise InputError(
+            f"The painter of the generator has to be a name, and is {describe(output.painter)}."
+        )
     return GeneratedView(
         image.detach(),
         target,
         notes=tuple(output.notes),
         is_inconsistent=output.is_inconsistent,
         is_photograph=output.is_photograph,
+        painter=output.painter,
     )

@@ -25,7 +25,7 @@ FOLDER = "folder"
 """Column of the scene folder."""
 NAME = "name"
 """Column of the job name."""
-PATHS = (FOLDER, "scene", "weights", "depth_weights")
+PATHS = (FOLDER, "scene", "weights", "depth_weights", "images")
 """Options that are paths."""
 MARKERS = ("batch.json", "run.json")
 """Files that mark the output folders of `batch` and `evaluate`."""

@@ -35,6 +35,10 @@ def parse_row(row: Mapping[str, Any], out: Path) -> CompleteOptions:
     except InputError as error:
         # Only the sentence is kept in the row of a failed job, so it names the option itself.
         raise InputError(format_error(error)) from error
+    if options.export_holes is not None:
+        raise InputError(
+            "A batch completes scenes and exports no holes; run `complete --export-holes` for each."
+        )
     return options
 
 

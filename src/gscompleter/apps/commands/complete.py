@@ -8,8 +8,13 @@ from typing import Annotated
 
 from annotated_types import Interval
 
-from gscompleter.apps.commands.shared_options import DEFAULT_NUM_TARGETS, CompletingOptions
+from gscompleter.apps.commands.shared_options import (
+    DEFAULT_NUM_TARGETS,
+    CompletingOptions,
+    list_inputs,
+)
 from gscompleter.apps.inputs.scene_request import PosesRequest
+from gscompleter.system.files.overlap import refuse_overlap
 from gscompleter.system.process import import_without_collection
 
 
@@ -29,6 +34,19 @@ class CompleteOptions(CompletingOptions):
     dry_run: bool = False
     """Only print the plan, write its cameras to targets.json, which `--target` reads, and what they
     see to images."""
+    export_holes: Path | None = None
+    """Only write, for each target, what another program needs to paint its hole to this folder:
+    image, mask, warped photographs, depth, reference and camera (holes.json). OUT stays as it is;
+    the same command with `--images` completes the scene."""
+    path: bool = False
+    """With `--export-holes`, also write a video along the targets and its mask, for models that
+    repair video (path.mp4, path_mask.mp4)."""
+    images: Path | None = None
+    """Folder of images that were painted for the targets, or a repaired video, named as those of
+    `--export-holes`, in place of a generator. Without `--target`, its holes.json has the targets
+    and the context."""
+    painter: str | None = None
+    """Name of the program, model or person that painted them, for the report."""
     out: Path
     """Folder for completed.ply, the report (report.html), images and summary.json."""
     video: bool = False
@@ -38,6 +56,18 @@ class CompleteOptions(CompletingOptions):
         """Make the request for the cameras, with the targets among the named photographs."""
         request = super().make_poses_request()
         return replace(request, named=(*request.named, *self.target))
+
+    def check_overlap(self) -> None:
+        """Refuse an output that is, holds or lies in an input or the other output."""
+        super().check_overlap()
+        if self.export_holes is not None:
+            inputs = [*list_inputs(self), self.out]
+            refuse_overlap(self.export_holes, inputs, "export-holes", may_continue=False)
+
+    @property
+    def results(self) -> Path:
+        """Folder that is written: that of the export, or else OUT."""
+        return self.out if self.export_holes is None else self.export_holes
 
     @property
     def max_targets(self) -> int:

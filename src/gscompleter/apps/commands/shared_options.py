@@ -25,7 +25,7 @@ Device = Literal["auto", "cpu", "cuda"]
 Size = tuple[int, int] | int | Literal["full"]
 """Height and width, the longest side, or `full` for the photographs' own size."""
 DEFAULT_NUM_TARGETS = 4
-OUTPUTS = ("out", "save")
+OUTPUTS = ("out", "save", "export_holes")
 """Options that name what a command writes."""
 WORDS_OR_PATHS = ("target", "protocol", "generator_weights")
 """Options whose words may be paths of files that are read."""

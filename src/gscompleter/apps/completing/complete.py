@@ -13,8 +13,9 @@ from rich.console import Console
 
 from gscompleter.apps.command_line.exit_codes import DONE, ERROR
 from gscompleter.apps.commands.complete import CompleteOptions
+from gscompleter.apps.completing.holes import EXPORTED, refuse_painted, write_holes
 from gscompleter.apps.completing.preparation import Prepared, prepare_completion
-from gscompleter.apps.completing.printing import print_completion, print_plan
+from gscompleter.apps.completing.printing import print_completion, print_export, print_plan
 from gscompleter.apps.completing.run_info import describe_run, read_held_out, refuse_results
 from gscompleter.apps.inputs.describing import describe_task, print_lines
 from gscompleter.apps.inputs.task import CompletionTask
@@ -34,7 +35,7 @@ from gscompleter.evaluation.metrics.coverage import render_pairs, sample_held_ou
 from gscompleter.numerics.kernels.parallel import run_in_background
 from gscompleter.splats.alignment.similarity import transform_camera_exactly
 from gscompleter.state import Completion
-from gscompleter.system.errors import print_error
+from gscompleter.system.errors import print_error, quote_value
 from gscompleter.system.files.output_folder import reserve_output
 from gscompleter.system.files.video import find_ffmpeg
 from gscompleter.system.files.writing import (
@@ -61,6 +62,9 @@ Prepare = Callable[[Any, Console], Prepared]
 
 def complete_scene(options: CompleteOptions, prepare: Prepare = prepare_completion) -> int:
     """Complete the scene, print a summary, and return the exit code."""
+    if options.export_holes is not None:
+        export_folder(options, prepare)
+        return DONE
     if options.dry_run:
         plan_folder(options, prepare)
         return DONE
@@ -119,6 +123,21 @@ def plan_folder(options: CompleteOptions, prepare: Prepare) -> None:
         print_plan(options, ready.opened, ready.task.targets, holes)
 
 
+def export_folder(options: CompleteOptions, prepare: Prepare) -> None:
+    """Write the holes of the targets to be painted, and print how to go on."""
+    refuse_painted(options.results)
+    if options.path:
+        find_ffmpeg()
+    with open_completion(options, prepare) as (ready, folder):
+        begun = ready.begin()
+        if not ready.task.targets:
+            cameras = list(ready.cameras.values())
+            ready = ready.with_choices(ready.explorer.plan(begun, cameras, options.max_targets))
+        lines = write_holes(folder, ready, begun)
+    if not options.quiet:
+        print_export(options, lines)
+
+
 def write_plan_pictures(folder: Path, ready: Prepared, begun: Completion) -> None:
     """Write what each target sees of the scene, and the photograph that it was derived from.
 
@@ -146,19 +165,40 @@ def open_completion(
     console = Console(stderr=True, quiet=options.quiet)
     with (
         show_progress(console),
-        reserve_output(options.out, options.overwrite, COMMAND, RESULTS, takes_over) as output,
+        reserve_output(
+            options.results, options.overwrite, COMMAND, list_results(options), takes_over
+        ) as output,
     ):
         if options.dry_run:
             refuse_results(options.out)
         print_lines(console, *output.describe_others())
         ready = prepare(options, console)
-        models = options.reconstructor
-        if not options.from_photographs_only:
-            models += f" and {options.synthesis.generator}"
-        plan = describe_task(ready.opened, ready.task, options.max_targets, models, options.out)
+        plan = describe_task(
+            ready.opened,
+            ready.task,
+            options.max_targets,
+            describe_models(ready.options),
+            options.results,
+            "complete the scene" if options.export_holes is None else "export holes of the scene",
+        )
         print_lines(console, *plan)
         with output.write() as folder:
             yield ready, folder
+
+
+def list_results(options: CompleteOptions) -> tuple[str, ...]:
+    """List globs of the files that a command may write to its folder."""
+    return RESULTS if options.export_holes is None else EXPORTED
+
+
+def describe_models(options: CompleteOptions) -> str:
+    """Name Ψ and Φ for the lines before the work."""
+    if options.from_photographs_only or options.export_holes is not None:
+        return options.reconstructor
+    if options.images is None:
+        return f"{options.reconstructor} and {options.synthesis.generator}"
+    painter = options.painter or "an unnamed painter"
+    return f"{options.reconstructor} and images of {quote_value(painter)}"
 
 
 def write_done(folder: Path, ready: Prepared, completion: Completion) -> dict[str, Any]:

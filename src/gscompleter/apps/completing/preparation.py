@@ -14,6 +14,7 @@ from rich.console import Console
 
 from gscompleter.apps.commands.complete import CompleteOptions
 from gscompleter.apps.commands.shared_options import SceneOptions, parse_resolution
+from gscompleter.apps.completing.paintings import add_paintings, choose_paintings
 from gscompleter.apps.inputs.depth_range import (
     apply_scene_range,
     apply_splat_range,
@@ -100,6 +101,7 @@ def check_options(options: CompleteOptions) -> CompleteOptions:
     """Refuse what is wrong whatever the scene is; return the options with the chosen devices."""
     check_context(options.context)
     check_targets(options)
+    options = choose_paintings(options)
     check_reconstructor(options.reconstructor)
     options.synthesis.make_settings()
     devices = choose_devices(options.device, options.renderer_device, options.network_device)
@@ -128,6 +130,7 @@ def read_inputs(options: CompleteOptions, opened: Opened) -> CompletionTask:
     with show_preparation("reading photographs"):
         has_splat = options.scene is not None
         task = read_task(opened, options.context, options.target, device, has_splat)
+        task = add_paintings(task, options, opened)
 
     parts = (device, options.reconstructor, options.synthesis.generator)
     if options.scene is None:
@@ -238,8 +241,9 @@ def add_splat(
 
 def load_completer(options: CompleteOptions, targets: Sequence[Target]) -> GSCompleter:
     """Load the models of the options."""
-    # Only the oracle reads the photographs of the targets.
-    photographs = [target.view for target in targets if target.view is not None]
+    # Only the oracle reads the photographs of the targets, and only `painted` what was painted.
+    images = [t.view if options.images is None else t.placed_painting for t in targets]
+    photographs = [image for image in images if image is not None]
     synthesis = options.synthesis
     # `check_options` has chosen both devices.
     networks = options.network_device or options.device
@@ -293,5 +297,6 @@ def describe_settings(options: CompleteOptions) -> dict[str, Any]:
         "depth": options.depth,
         "network_device": options.network_device,
         **options.synthesis.describe(),
+        "images": None if options.images is None else str(options.images),
         "uses_target_photographs": options.synthesis.generator == "oracle",
     }

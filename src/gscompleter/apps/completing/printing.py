@@ -8,6 +8,7 @@ from rich.console import Console
 from rich.table import Table
 
 from gscompleter.apps.commands.complete import CompleteOptions
+from gscompleter.apps.inputs.holes_file import read_holes
 from gscompleter.apps.inputs.task import Opened, Target
 from gscompleter.apps.report.completion import IMAGES
 from gscompleter.apps.report.film import VIDEO_FILE
@@ -107,3 +108,23 @@ def print_plan(
         f"{quote_value(options.out / IMAGES)}",
         soft_wrap=True,
     )
+
+
+def print_export(options: CompleteOptions, lines: Sequence[str]) -> None:
+    """Print what was exported, and how to go on."""
+    console = Console(highlight=False)
+    folder = options.results
+    holes = read_holes(folder)
+    table = Table("image", "hole", box=None)
+    for row in holes.frames:
+        table.add_row(row.image_path, format_percent(row.hole_fraction))
+    console.print(table)
+    sentences = [
+        *lines,
+        f"Nothing was completed. The holes are in {quote_value(folder)}: paint each image where "
+        "its mask is white, and save it by the same name (.png, .jpg or .webp).",
+        f"Then run the same command with --images {quote_value(folder)} --painter NAME in place of "
+        "--export-holes.",
+    ]
+    for sentence in sentences:
+        console.print(sentence, markup=False, soft_wrap=True)

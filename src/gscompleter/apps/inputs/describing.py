@@ -19,16 +19,21 @@ MAX_NAMED = 8
 
 
 def describe_task(
-    opened: Opened, task: CompletionTask, max_targets: int, models: str, out: Path
+    opened: Opened,
+    task: CompletionTask,
+    max_targets: int,
+    models: str,
+    out: Path,
+    doing: str = "complete the scene",
 ) -> list[str]:
     """Write the four lines; the cameras of `task` have the working depth range.
 
     `max_targets` is the number of targets to search for if the task has none; 0 for what
-    photographs show alone. `models` names Ψ and Φ.
+    photographs show alone. `models` names Ψ and Φ, `doing` what is done with the scene.
     """
     files = opened.files
     context = [name_photograph(frame, files.get(frame)) for frame in task.context_frames]
-    goal = f"complete the scene from photographs {join_names(context, MAX_NAMED)}"
+    goal = f"{doing} from photographs {join_names(context, MAX_NAMED)}"
     targets = join_names([opened.name_target(target) for target in task.targets], MAX_NAMED)
     if targets:
         goal += f" for {targets}"

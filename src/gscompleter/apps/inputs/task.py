@@ -14,6 +14,7 @@ from torch import Tensor
 from gscompleter.apps.inputs.scene_request import SceneRequest
 from gscompleter.data.photograph_names import name_target
 from gscompleter.data.photographs import Photographs
+from gscompleter.generators.painted import Painting
 from gscompleter.types import Camera, Gaussians, View
 
 
@@ -34,6 +35,13 @@ class Target:
     """Move and turn of a planned camera from that frame, in words."""
     is_in_splat_frame: bool = False
     """True if the camera is in the frame of the input splat's file."""
+    painting: Painting | None = None
+    """Image that was painted for the target, with the camera as it was read."""
+
+    @property
+    def placed_painting(self) -> Painting | None:
+        """The painted image with the camera of the target, or None."""
+        return self.painting and replace(self.painting, camera=self.camera)
 
     @property
     def view(self) -> View | None:

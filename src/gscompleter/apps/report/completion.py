@@ -245,6 +245,7 @@ def make_target_row(
         notes=result.notes,
         refused=result.refusal,
         offset=target.offset,
+        painter=result.painter or None,
     )
 
 

@@ -15,7 +15,7 @@ from gscompleter.evaluation.metrics.coverage import Coverage
 from gscompleter.evaluation.verdict.rows import HeldOutRow, OutcomeRow, ScoreRow
 from gscompleter.system.errors import InputError, quote_value
 from gscompleter.system.files.output_folder import read_command
-from gscompleter.system.files.reading import read_json
+from gscompleter.system.files.typed_json import read_typed_json
 from gscompleter.system.files.writing import COMPLETED_FILE, SUMMARY_FILE
 
 RECORD_FILE = "report.json"
@@ -89,6 +89,8 @@ class TargetRow(ScoreRow):
     """Move and turn from that photograph, in words."""
     anchor_file: str | None = None
     """File of the anchor's photograph."""
+    painter: str | None = None
+    """Who painted the image from which Gaussians were added; None if a generator made it."""
 
     @property
     def name(self) -> str:
@@ -210,20 +212,9 @@ def read_record(folder: Path, summary: CompletionSummary) -> CompletionRecord:
 
 def read_result(kind: type[T], path: Path) -> T:
     """Read and validate a JSON file of a completion."""
-    from pydantic import TypeAdapter, ValidationError
-
     if not os.path.isfile(path):
         raise InputError(
             f"{quote_value(path.parent)} has no {path.name}; name the output folder of a "
             "completion."
         )
-    content = read_json(path, ADVICE)
-    try:
-        return TypeAdapter(kind).validate_python(content)
-    except ValidationError as error:
-        defect = error.errors(include_url=False)[0]
-        place = ".".join(str(part) for part in defect["loc"]) or "its content"
-        raise InputError(
-            f"{quote_value(path)} is damaged ({quote_value(place)}: {quote_value(defect['msg'])}); "
-            f"{ADVICE}."
-        ) from None
+    return read_typed_json(kind, path, ADVICE)

@@ -59,6 +59,18 @@ def write_image(
         )
 
 
+def write_depth(path: Path | str, depth: Float[Tensor, "h w"], unit: float) -> None:
+    """Write z-depth as a 16-bit PNG in multiples of `unit`, 0 where it is unknown.
+
+    `read_depth` reads it back. Depths beyond 65535 units are clamped.
+    """
+    values = (depth.detach().cpu().double() / unit + 0.5).floor().clamp(0, 65535)
+    with replace_file(path) as file:
+        Image.fromarray(values.numpy().astype(np.uint16)).save(
+            file, format="PNG", compress_level=PNG_COMPRESSION
+        )
+
+
 def convert_to_pixels(
     image: Float[Tensor, "h w 3"] | Float[Tensor, "h w"] | Bool[Tensor, "h w"],
 ) -> UInt8[np.ndarray, "h w 3"] | UInt8[np.ndarray, "h w"]:

@@ -1,0 +1,190 @@
+"""Export of the holes of targets, for whoever paints them."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+from contextlib import suppress
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from jaxtyping import Bool, Float
+from torch import Tensor
+
+from gscompleter import __version__
+from gscompleter.apps.completing.path_video import PATH_MASK, PATH_VIDEO, plan_path, write_path
+from gscompleter.apps.completing.preparation import Prepared
+from gscompleter.apps.inputs.holes_file import HOLES_FILE, HoleRow, read_holes
+from gscompleter.apps.inputs.paintings import is_exported
+from gscompleter.apps.inputs.task import Target
+from gscompleter.data.scene import describe_camera
+from gscompleter.generators.warp import BORDER_WIDTH, complete_warp
+from gscompleter.numerics.geometry import pad_camera
+from gscompleter.numerics.image_ops import dilate
+from gscompleter.splats.alignment.similarity import get_scale, transform_camera_exactly
+from gscompleter.stages.select_anchor import find_nearest_view
+from gscompleter.stages.target_view import TargetView, render_target
+from gscompleter.state import Completion
+from gscompleter.system.errors import InputError, quote_value
+from gscompleter.system.files.image import write_depth, write_image
+from gscompleter.system.progress import track
+from gscompleter.types import Camera, View
+
+EXPORTED = ("target*.png", PATH_VIDEO, PATH_MASK, HOLES_FILE)
+"""Globs of the files that an export may write."""
+DEPTH_STEPS = 65535
+"""Largest value of a 16-bit depth map."""
+
+
+@dataclass(frozen=True)
+class ExportedHole:
+    """What a target shows before it is painted."""
+
+    number: int
+    """Number of the target, from 1, by which its files are named."""
+    target: Target
+    image: Float[Tensor, "h w 3"]
+    mask: Bool[Tensor, "h w"]
+    """True where to paint: the hole with its dark rim."""
+    warped: Float[Tensor, "h w 3"]
+    depth: Float[Tensor, "h w"]
+    """z-depth in the unit of the photographs' cameras, 0 in holes."""
+    reference: View
+    """The nearest photograph of the context."""
+    camera: Camera
+    """In the frame of the photographs, in float64."""
+    hole_fraction: float
+
+    @property
+    def name(self) -> str:
+        """Beginning of the names of its files."""
+        return f"target{self.number}"
+
+
+def refuse_painted(folder: Path) -> None:
+    """Refuse to replace the images of an earlier export that were painted."""
+    exported: dict[str, str] = {}
+    # A damaged file says nothing of its images, and is replaced.
+    with suppress(InputError):
+        holes = read_holes(folder)
+        exported = {row.image_path: row.sha256 for row in holes.frames}
+        if holes.path is not None:
+            exported[holes.path.video_path] = holes.path.sha256
+    for name, sha256 in exported.items():
+        path = folder / name
+        if path.is_file() and not is_exported(path, sha256):
+            raise InputError(
+                f"{quote_value(path)} was painted; name another folder for the export.",
+                "export-holes",
+            )
+
+
+def write_holes(folder: Path, ready: Prepared, begun: Completion) -> list[str]:
+    """Write the files of an export; return the lines about targets that have no hole.
+
+    All targets are seen in the scene as it is, so that a hole which several of them see is exported
+    with each. Raise InputError if no target has a hole.
+    """
+    exported = []
+    skipped = []
+    for number, target in enumerate(track(ready.task.targets, "target"), start=1):
+        view = observe_hole(ready, begun, target)
+        if view.skip_reason:
+            skipped.append(f"Target {number} is left out: {view.skip_reason}")
+        else:
+            exported.append(make_export(number, target, view, ready.task.frame))
+    if not exported:
+        reason = skipped[0].partition(": ")[2] if skipped else "No camera has much to gain."
+        raise InputError(f"There is nothing to paint: {reason}", "target")
+
+    # One unit for all depth maps, as in a transforms.json.
+    unit = max(hole.depth.max().item() for hole in exported) / DEPTH_STEPS
+    rows = [write_hole(folder, hole, unit, ready) for hole in exported]
+    path = None
+    if ready.options.path:
+        targets = [begun.with_depth_range(hole.target.camera) for hole in exported]
+        context = [view.camera for view in begun.views]
+        planned = plan_path(context, targets, list(ready.cameras.values()))
+        path = write_path(folder, ready, begun, planned)
+        for row, frame in zip(rows, planned.target_frames, strict=True):
+            row["path_frame"] = frame
+    content = {
+        "version": __version__,
+        "camera_model": "PINHOLE",
+        "depth_unit_scale_factor": unit,
+        "context": list(ready.task.context_frames),
+        "frames": rows,
+        "path": path,
+    }
+    (folder / HOLES_FILE).write_bytes(json.dumps(content, indent=1).encode() + b"\n")
+    return skipped
+
+
+def observe_hole(ready: Prepared, begun: Completion, target: Target) -> TargetView:
+    """Render the scene at a target without padding: painters get the target's own image."""
+    camera = begun.with_depth_range(target.camera.to(ready.task.device))
+    return render_target(begun, pad_camera(camera, 0.0), ready.completer.scenes)
+
+
+def make_export(
+    number: int, target: Target, view: TargetView, frame: Float[np.ndarray, "4 4"]
+) -> ExportedHole:
+    """Collect what a target shows; `frame` leads from the photographs to the result."""
+    camera = view.camera.target
+    context = view.make_generator_input()
+    nearest = context.views[find_nearest_view(camera, context.views)]
+    warped = complete_warp(nearest, camera, context)
+    back = np.linalg.inv(frame)
+    depth = view.render.depth_map()
+    return ExportedHole(
+        number,
+        target,
+        view.render.image,
+        dilate(view.holes, BORDER_WIDTH),
+        warped.image,
+        torch.where(depth.valid, depth.depth, 0.0) * get_scale(back),
+        nearest,
+        transform_camera_exactly(camera, back),
+        view.holes.float().mean().item(),
+    )
+
+
+def write_hole(folder: Path, hole: ExportedHole, unit: float, ready: Prepared) -> dict[str, Any]:
+    """Write the pictures of a target, and return its entry in `holes.json`."""
+    name = hole.name
+    pictures = {
+        f"{name}.png": hole.image,
+        f"{name}_mask.png": hole.mask,
+        f"{name}_warped.png": hole.warped,
+        f"{name}_reference.png": hole.reference.image,
+    }
+    for file, picture in pictures.items():
+        write_image(folder / file, picture)
+    write_depth(folder / f"{name}_depth.png", hole.depth, unit)
+
+    target = hole.target
+    files = ready.opened.files
+    row = HoleRow(
+        image_path=f"{name}.png",
+        sha256=hashlib.sha256((folder / f"{name}.png").read_bytes()).hexdigest(),
+        hole_mask_path=f"{name}_mask.png",
+        w=hole.camera.width,
+        h=hole.camera.height,
+        hole_fraction=hole.hole_fraction,
+        frame=target.frame,
+        derived_from=target.derived_from,
+        offset=target.offset,
+    )
+    return {
+        **asdict(row),
+        "title": ready.opened.name_target(target),
+        "depth_file_path": f"{name}_depth.png",
+        "warped_path": f"{name}_warped.png",
+        "reference_path": f"{name}_reference.png",
+        "reference_frame": hole.reference.frame,
+        "reference_file": files.get(hole.reference.frame),
+        **describe_camera(hole.camera),
+    }

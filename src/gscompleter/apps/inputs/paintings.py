@@ -1,0 +1,238 @@
+"""Painted images of targets, read from a folder."""
+
+from __future__ import annotations
+
+import hashlib
+import os
+from collections.abc import Sequence
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import torch
+from jaxtyping import UInt8
+
+from gscompleter.apps.inputs.holes_file import (
+    HOLES_FILE,
+    HoleRow,
+    PathRow,
+    has_holes,
+    read_holes,
+)
+from gscompleter.apps.inputs.named_photographs import add_photograph
+from gscompleter.apps.inputs.task import Target
+from gscompleter.data.photographs import Photographs, Resolution
+from gscompleter.data.scene import load_cameras
+from gscompleter.generators.painted import Painting, fit_mask, fit_painting
+from gscompleter.numerics.geometry import is_same_camera
+from gscompleter.system.errors import InputError, join_names, quote_value
+from gscompleter.system.files.image import (
+    HALF_OPAQUE,
+    convert_to_image,
+    read_colors_and_alpha,
+    read_mask,
+)
+from gscompleter.system.files.reading import read_bytes
+from gscompleter.system.files.video import read_video
+from gscompleter.types import Camera
+
+ENDINGS = (".png", ".jpg", ".jpeg", ".webp")
+"""Endings of painted images."""
+VIDEO_ENDINGS = (".mp4", ".mov", ".mkv", ".webm")
+"""Endings of repaired videos."""
+
+
+def check_paintings(folder: Path, num_targets: int) -> None:
+    """Find and read all images of a folder, before the scene is opened.
+
+    `num_targets` are those named on the command line; without any, `holes.json` has them.
+    """
+    if not os.path.isdir(folder):
+        raise InputError(
+            f"There is no folder {quote_value(folder)}; name that of the painted images.", "images"
+        )
+    if has_holes(folder):
+        holes = read_holes(folder)
+        # Which of them named targets need is known when the cameras are.
+        for row in holes.frames if num_targets == 0 else ():
+            source = find_painted(folder, row.image_path, row, holes.path)
+            if source.suffix.lower() in ENDINGS:
+                read_colors_and_alpha(source)
+    elif num_targets == 0:
+        raise InputError(
+            f"{quote_value(folder)} has no {HOLES_FILE}, which tells the cameras of the images; "
+            "copy that of the export there, or name the targets.",
+            "target",
+        )
+
+
+def read_paintings(
+    targets: Sequence[Target], photographs: Photographs, resolution: Resolution, folder: Path
+) -> list[Target]:
+    """Add its painted image to each target, and to those of `holes.json` what is known of them.
+
+    Cameras of the targets are as they were read, in the frame of the photographs.
+    """
+    if not has_holes(folder):
+        names = [f"target{number}.png" for number in range(1, len(targets) + 1)]
+        return [
+            replace(target, painting=read_painting(find_painted(folder, name), target.camera))
+            for target, name in zip(targets, names, strict=True)
+        ]
+
+    holes = read_holes(folder)
+    origin = photographs.origin.tolist()
+    cameras = load_cameras(folder / HOLES_FILE, resolution, origin=origin)
+    rows = []
+    for number, target in enumerate(targets, start=1):
+        row = find_row(target.camera, holes.frames, cameras)
+        if row is None:
+            raise InputError(
+                f"{quote_value(folder / HOLES_FILE)} has no image for the camera of target "
+                f"{number}; leave the targets out to take all that were exported, or export this "
+                "one too.",
+                "target",
+            )
+        rows.append(row)
+    sources = [find_painted(folder, row.image_path, row, holes.path) for row in rows]
+    stills = read_video_frames(sources, rows, holes.path)
+    return [
+        replace(
+            name_target(target, row, photographs, resolution),
+            painting=read_painting(source, target.camera, row, still),
+        )
+        for target, row, source, still in zip(targets, rows, sources, stills, strict=True)
+    ]
+
+
+def read_video_frames(
+    sources: Sequence[Path], rows: Sequence[HoleRow], path: PathRow | None
+) -> list[UInt8[np.ndarray, "h w 3"] | None]:
+    """Read the frame of each target that is painted in the video; None for the others.
+
+    Raise InputError if the video has another number of frames than the one that was exported.
+    """
+    numbers = [
+        row.path_frame if source.suffix.lower() in VIDEO_ENDINGS else None
+        for source, row in zip(sources, rows, strict=True)
+    ]
+    wanted = set(numbers) - {None}
+    if not wanted or path is None:
+        return [None] * len(sources)
+
+    video = next(source for source in sources if source.suffix.lower() in VIDEO_ENDINGS)
+    frames = {}
+    count = 0
+    for frame in read_video(video, "null", is_grey=False):
+        if count in wanted:
+            frames[count] = frame
+        count += 1
+    if count != path.num_frames:
+        raise InputError(
+            f"{quote_value(video)} has {count} frames, and {path.num_frames} were exported; keep "
+            "all of them, whatever their size and rate.",
+            "images",
+        )
+    return [None if number is None else frames[number] for number in numbers]
+
+
+def find_row(camera: Camera, rows: Sequence[HoleRow], cameras: Sequence[Camera]) -> HoleRow | None:
+    """Find the row of a camera; None if its hole was not exported."""
+    same = (row for row, known in zip(rows, cameras, strict=True) if is_same_camera(camera, known))
+    return next(same, None)
+
+
+def name_target(
+    target: Target, row: HoleRow, photographs: Photographs, resolution: Resolution
+) -> Target:
+    """Add the photograph that a target is, or was derived from, as the export knew it."""
+    if target.frame is not None:
+        return target
+    frame = row.frame
+    if frame is not None and frame in range(len(photographs)):
+        # A scene that got photographs since then numbers them in another way.
+        camera = photographs.camera(frame, resolution)
+        if is_same_camera(camera, target.camera):
+            return add_photograph(replace(target, frame=frame), photographs, resolution)
+    base = row.derived_from
+    if base is not None and base in range(len(photographs)):
+        return replace(target, derived_from=base, offset=row.offset)
+    return target
+
+
+def find_painted(
+    folder: Path, name: str, row: HoleRow | None = None, path: PathRow | None = None
+) -> Path:
+    """Find the painted image that is named like `name`, or the repaired video.
+
+    What was exported is not painted; what is may lie beside it, with another ending.
+    """
+    painted = find_by_stem(folder, name, ENDINGS, None if row is None else row.sha256)
+    if painted is not None:
+        return painted
+    if path is not None and row is not None and row.path_frame is not None:
+        video = find_by_stem(folder, path.video_path, VIDEO_ENDINGS, path.sha256)
+        if video is not None:
+            return video
+    if row is not None and find_by_stem(folder, name, ENDINGS) is not None:
+        raise InputError(
+            f"{quote_value(folder / name)} is as it was exported; paint what "
+            f"{quote_value(row.hole_mask_path)} shows white, or take its entry out of "
+            f"{HOLES_FILE}.",
+            "images",
+        )
+    raise InputError(
+        f"{quote_value(folder)} has no {Path(name).stem}.png (or .jpg, .webp); paint it, or name "
+        "the targets that are painted.",
+        "images",
+    )
+
+
+def find_by_stem(
+    folder: Path, name: str, endings: Sequence[str], exported: str | None = None
+) -> Path | None:
+    """Find the only file named like `name` with any of the endings, but not the exported one.
+
+    `exported` is the checksum of that; without it every file counts. Raise InputError for several.
+    """
+    found = sorted(
+        path
+        for path in folder.iterdir()
+        if path.stem == Path(name).stem and path.suffix.lower() in endings and path.is_file()
+    )
+    if exported is not None:
+        found = [path for path in found if not is_exported(path, exported)]
+    if len(found) > 1:
+        names = join_names([path.name for path in found], len(endings))
+        raise InputError(
+            f"{quote_value(folder)} has several images of one target ({names}); keep one of them.",
+            "images",
+        )
+    return found[0] if found else None
+
+
+def is_exported(path: Path, sha256: str) -> bool:
+    """Check whether a file has the bytes that were exported."""
+    return hashlib.sha256(read_bytes(path)).hexdigest() == sha256
+
+
+def read_painting(
+    path: Path,
+    camera: Camera,
+    row: HoleRow | None = None,
+    still: UInt8[np.ndarray, "h w 3"] | None = None,
+) -> Painting:
+    """Read a painted image at the size of its camera, with the mask of the export beside it.
+
+    `still` is the frame of the target, if `path` is a video.
+    """
+    colors, alpha = (still, None) if still is not None else read_colors_and_alpha(path)
+    opaque = np.full(colors.shape[:2], True) if alpha is None else alpha >= HALF_OPAQUE
+    camera = camera.to("cpu")
+    painting = fit_painting(convert_to_image(colors), torch.from_numpy(opaque), camera, path.name)
+    mask = path.with_name(row.hole_mask_path) if row else None
+    if mask is None or not mask.is_file():
+        return painting
+    # `read_mask` has what is black.
+    asked = fit_mask(torch.from_numpy(~read_mask(mask)), camera, mask.name)
+    return replace(painting, asked=asked)
