@@ -29,6 +29,7 @@ if TYPE_CHECKING:
     from gscompleter.types import Render as Render
     from gscompleter.types import View as View
     from gscompleter.types import merge as merge
+    from gscompleter.virtual_capture.render_views import render_views as render_views
 
 # Module of each public name, imported on first use, so that `import gscompleter` and
 # `gscompleter --help` do not wait for torch.
@@ -54,6 +55,7 @@ _HOMES = {
     "Render": "types",
     "View": "types",
     "merge": "types",
+    "render_views": "virtual_capture.render_views",
 }
 
 __all__ = sorted(_HOMES)

@@ -353,9 +353,8 @@ def test_a_splat_in_place_of_the_photographs_is_sent_to_its_option(tmp_path, mon
     splat, out = tmp_path / "a.ply", tmp_path / "out"
     splat.write_bytes(b"ply\n")
     told = "which goes to --scene; SCENE has to be the folder of its photographs"
-    refused(monkeypatch, capsys, out, ("complete", splat, "--out", out), told)
-    pytest.importorskip("viser", reason="needs gscompleter[live]")
-    refused(monkeypatch, capsys, out, ("live", splat, "--out", out, "--no-open"), told)
+    words = ("clean", splat, "--scene", splat, "--out", out)
+    refused(monkeypatch, capsys, out, words, told)
 
 
 def config_of(scene, tmp_path, monkeypatch, *more) -> CompleterConfig:

@@ -5,8 +5,12 @@ from dataclasses import replace
 import pytest
 import torch
 
-from gscompleter.config import PsnrGuardConfig
+from gscompleter.config import CompleterConfig, PsnrGuardConfig
 from gscompleter.evaluation.metrics.image import psnr, ssim
+from gscompleter.guards import Attempt
+from gscompleter.guards.psnr import PsnrGuard
+from gscompleter.numerics.geometry import pad_camera
+from gscompleter.render.cache import SceneRenderer
 from gscompleter.render.loading import load_renderer
 from gscompleter.render.protocols import FrozenScene
 from gscompleter.stages import error_budgets as guard
@@ -18,8 +22,12 @@ from gscompleter.stages.error_budgets import (
     select_fewest,
     set_error_budgets,
 )
-from gscompleter.types import ErrorBudget, Gaussians, View, merge
+from gscompleter.stages.refine import Refined
+from gscompleter.stages.synthesize import GeneratedView
+from gscompleter.stages.target_view import render_target
+from gscompleter.types import DepthAffine, ErrorBudget, Gaussians, View, merge
 from scenes import Room, camera_at, gaussians_of, half_a_room_of, view_of
+from target_views import begin_with
 
 SIZE = 48
 ROOM = Room()
@@ -190,3 +198,26 @@ def test_the_fewest_gaussians_that_suffice_are_lowered():
     assert select_fewest(relief, 0.3).tolist() == [False, True, False, False, False]
     assert select_fewest(relief, 0.45).tolist() == [False, True, False, True, False]
     assert select_fewest(relief, 9.0).tolist() == [False, True, False, True, False]
+
+
+def test_ignored_pixels_say_nothing_about_the_colours_of_additions():
+    """A photograph objects to colours below its mask; those that the mask hides stay."""
+    view, context, right = half_a_room()
+    wrong = replace(right, sh=-right.sh, generated=torch.ones_like(right.generated))
+    is_above = wrong.means[:, 1] < 0
+    ignored = torch.zeros((SIZE, SIZE), dtype=torch.bool)
+    ignored[: SIZE // 2, SIZE // 2 :] = True
+    photograph = replace(view, ignore_mask=ignored, depth=None)
+    config = CompleterConfig(psnr_guard=MENDED)
+    scenes = SceneRenderer(load_renderer("cpu"))
+    state = PsnrGuard().begin(begin_with(context, [photograph], config), scenes)
+    seen = render_target(state, pad_camera(camera_at(0.05, size=SIZE), 0.0), scenes)
+    # The image at the target shows the additions as they are.
+    reference = GeneratedView(seen.frozen.composite(wrong).image, seen.camera.target)
+    (frozen,) = seen.frozen_photos
+    refined = Refined(wrong, (frozen.vary_opacities(wrong),), ())
+    fitted = PsnrGuard().verify(wrong, Attempt(seen, reference, DepthAffine(), refined))
+    assert len(fitted) == len(wrong)
+    # Beside the border of the mask, Gaussians are seen above and below it.
+    change = (fitted.sh - wrong.sh)[:, 0].norm(dim=1)
+    assert change[is_above].median() < 0.02 * change[~is_above].median()

@@ -234,6 +234,7 @@ def sandbox(scene, completed_room, tmp_path, monkeypatch) -> Path:
         shutil.copy(completed_room / file, name)
     shutil.copy(completed_room / "context.ply", "splat.ply")
     shutil.copy(completed_room / "targets.json", "cameras.json")
+    shutil.copy(scene / "transforms.json", "renders.json")
     return tmp_path
 
 

@@ -87,7 +87,7 @@ class RegistrationConfig(Settings):
 
 
 SPLAT_REGISTRATION = RegistrationConfig(hole_depth="scene")
-"""Registration to a splat that comes with further photographs."""
+"""Registration to a splat, with further photographs or without any."""
 
 
 @dataclass(frozen=True)
@@ -290,7 +290,7 @@ else:
 
 @dataclass(frozen=True)
 class CompleterConfig(Settings):
-    """Settings of a completion; `paper()`, the defaults and `splat()` are three values of it.
+    """Settings of a completion; `paper()`, the defaults, `splat()` and `bare()` are values of it.
 
     The defaults are ours where measurements favour them over the paper's (`docs/method.md`).
     """
@@ -361,6 +361,20 @@ class CompleterConfig(Settings):
         )
 
     @staticmethod
+    def bare() -> CompleterConfig:
+        """Return the settings for a splat without photographs, of which renders take their place.
+
+        Renders confirm all that the splat shows, so it has full trust, and they show nothing that
+        it lacks. Nothing moves in them. The error budgets are not relative to their error, which is
+        zero: what is invisible is allowed (`psnr_guard.invisible_psnr`).
+        """
+        return CompleterConfig(
+            guards=("image-agreement", "free-space", "psnr", "contribution"),
+            add_observed=False,
+            registration=SPLAT_REGISTRATION,
+        )
+
+    @staticmethod
     def paper() -> CompleterConfig:
         """Return the settings of the paper; `docs/paper.md` lists the remaining differences."""
         return CompleterConfig(
@@ -422,14 +436,19 @@ ABLATIONS: dict[str, dict[str, Any]] = {
 registration that the config names."""
 
 
-def get_named_config(name: str, is_splat: bool = False) -> CompleterConfig:
-    """Return `default`, `splat` or `paper`, or one of them with an ablation: `paper/no-sa`.
+def get_named_config(
+    name: str, is_splat: bool = False, has_photographs: bool = True
+) -> CompleterConfig:
+    """Return `default`, `splat`, `bare` or `paper`, or one with an ablation: `paper/no-sa`.
 
-    `default` follows the input: it is `splat` for a splat that comes with further photographs.
+    `default` follows the input: it is `splat` for a splat that comes with further photographs, and
+    `bare` for one without any.
     """
+    for_splats = CompleterConfig.splat() if has_photographs else CompleterConfig.bare()
     bases = {
-        "default": CompleterConfig.splat() if is_splat else CompleterConfig(),
+        "default": for_splats if is_splat else CompleterConfig(),
         "splat": CompleterConfig.splat(),
+        "bare": CompleterConfig.bare(),
         "paper": CompleterConfig.paper(),
     }
     if name in bases:
@@ -439,8 +458,8 @@ def get_named_config(name: str, is_splat: bool = False) -> CompleterConfig:
     base, _, ablation = name.rpartition("/")
     if (base or "default") not in bases or ablation not in ABLATIONS:
         raise InputError(
-            f"There is no config '{quote_value(name)}'; choose default, splat, paper or one of "
-            f"{', '.join(ABLATIONS)} (paper/no-sa for an ablation of the paper's settings), or "
+            f"There is no config '{quote_value(name)}'; choose default, splat, bare, paper or one "
+            f"of {', '.join(ABLATIONS)} (paper/no-sa for an ablation of the paper's settings), or "
             "give a YAML file."
         )
 
@@ -455,11 +474,14 @@ def get_named_config(name: str, is_splat: bool = False) -> CompleterConfig:
     return config.without_guard("psnr") if ablation == "no-mv" else config
 
 
-def load_config(source: str, is_splat: bool = False) -> CompleterConfig:
+def load_config(
+    source: str, is_splat: bool = False, has_photographs: bool = True
+) -> CompleterConfig:
     """Return a config by name, or read the changes to its `base` from a YAML file."""
     path = require_path(source)
     if path.suffix not in {".yaml", ".yml"}:
-        return get_named_config(source, is_splat)
+        return get_named_config(source, is_splat, has_photographs)
     changes = read_yaml(path)
-    base = get_named_config(str(changes.pop("base", "default")), is_splat)
+    base_name = str(changes.pop("base", "default"))
+    base = get_named_config(base_name, is_splat, has_photographs)
     return apply_changes(base, changes, f"{quote_value(source)}: ")

@@ -21,6 +21,8 @@ from gscompleter.state import Completion
 from gscompleter.system.errors import InputError, quote_value
 from gscompleter.system.timing import record_seconds, timed_stage
 from gscompleter.types import Camera, Gaussians, View, merge
+from gscompleter.virtual_capture.around_target import choose_cameras_around
+from gscompleter.virtual_capture.render_views import render_views
 
 
 @dataclass(frozen=True)
@@ -82,18 +84,39 @@ def make_completion_method(config: str) -> Method:
     def method(state: Completion, target: Camera, models: Models) -> Prediction:
         completer = replace(models.make_completer(config), keep_registered=True)
         views = [replace(view, dynamic_mask=None) for view in state.views]  # another config's
-        done = completer.advance(completer.begin(views, state.scene), target)
-        (result,) = done.targets
-        return Prediction(
-            done.scene,
-            result.added,
-            done.seconds,
-            result.anchor,
-            result.anchor_fallback,
-            result.registered,
-        )
+        return predict(completer.advance(completer.begin(views, state.scene), target))
 
     return method
+
+
+def predict(done: Completion) -> Prediction:
+    """Return what the completion of a single target leaves."""
+    (result,) = done.targets
+    return Prediction(
+        done.scene,
+        result.added,
+        done.seconds,
+        result.anchor,
+        result.anchor_fallback,
+        result.registered,
+    )
+
+
+def complete_bare(state: Completion, target: Camera, models: Models) -> Prediction:
+    """Complete the scene without its photographs, from renders of it around the target."""
+    completer = replace(models.make_completer("bare"), keep_registered=True)
+    with record_seconds() as seconds, timed_stage("context"):
+        cameras = choose_cameras_around(state.scene, target, models.renderer)
+        views = render_views(state.scene, cameras, models.renderer)
+    # Nothing is to be seen around a target without a hole, which needs no completion either.
+    if not views:
+        return keep_scene(state, target, models)
+    # The depth range of the photographs is not known without them.
+    unranged = replace(target, near=None, far=None)
+    done = completer.advance(completer.begin(views, state.scene), unranged)
+    prediction = predict(done.plus_seconds(seconds))
+    # The anchor is a render, and not one of the photographs of the state.
+    return replace(prediction, anchor=None)
 
 
 def make_steps_method(steps: int) -> Method:
@@ -174,6 +197,7 @@ _ABLATIONS = {"unconstrained" if name == "3-dof" else name: name for name in ABL
 METHODS: dict[str, Method] = {
     "context": keep_scene,
     "full": make_completion_method("default"),
+    "bare": complete_bare,
     "paper": make_completion_method("paper"),
     **{title: make_completion_method(name) for title, name in _ABLATIONS.items()},
     **{f"paper/{t}": make_completion_method(f"paper/{name}") for t, name in _ABLATIONS.items()},

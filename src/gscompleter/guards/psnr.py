@@ -63,8 +63,10 @@ class PsnrGuard(Guard):
             return added
         frozen = [view.frozen, *(view.frozen_photos[index] for index in objecting)]
         images = [attempt.reference, *(state.photos[index].view for index in objecting)]
+        # Ignored pixels show the additions themselves, and so say nothing about their colours.
+        # Painted as the scene is without them, the black of its holes would be wanted there.
         wanted = [
-            image.paint_ignored(scene.render.image)
+            image.paint_ignored(scene.composite(added).image)
             for image, scene in zip(images, frozen, strict=True)
         ]
         added = fit_colors(added, frozen, wanted, [RELAXATION] * COLOR_ROUNDS)

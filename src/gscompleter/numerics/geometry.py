@@ -220,6 +220,31 @@ def shrink_camera(camera: Camera, side: int) -> Camera:
     return resize_camera(camera, width, height)
 
 
+def add_near_plane(camera: Camera, points: Float[Tensor, "n 3"]) -> Camera:
+    """Add a near plane, relative to the depth of points in front of a camera that has none.
+
+    A scene may have any unit, and their median depth is one. The far plane is left out: no renderer
+    uses it.
+    """
+    z = compute_z_depths(points, camera)
+    if camera.near is not None or not (z > 0).any():
+        return camera
+    return replace(camera, near=0.1 * z[z > 0].median().item(), far=None)
+
+
+def look_along(camera: Camera, direction: Float[Tensor, "3"], up: Float[Tensor, "3"]) -> Camera:
+    """Turn a camera in place to look along a direction, with a level horizon.
+
+    `direction` must not be parallel to `up`; neither needs unit length.
+    """
+    forward = normalize(direction, dim=0)
+    right = normalize(torch.linalg.cross(forward, up), dim=0)
+    axes = torch.stack([right, torch.linalg.cross(forward, right), forward], dim=1)
+    c2w = camera.c2w.clone()
+    c2w[:3, :3] = axes
+    return replace(camera, c2w=c2w)
+
+
 def resize_camera(camera: Camera, width: int, height: int) -> Camera:
     """Change the image size of a camera, in pixels."""
     scale = torch.tensor([width / camera.width, height / camera.height, 1.0]).to(camera.K)

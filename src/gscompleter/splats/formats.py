@@ -206,6 +206,11 @@ def get_writer(path: Path) -> Callable[[Path, Gaussians], None]:
     return write
 
 
+def has_splat_extension(path: Path) -> bool:
+    """Check whether a name ends as that of a splat does."""
+    return _match_extension(path) is not None
+
+
 def _match_extension(path: Path) -> str | None:
     for name, format_ in SPLAT_FORMATS.items():
         if path.name.lower().endswith(format_.extensions):

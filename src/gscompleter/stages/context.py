@@ -11,7 +11,7 @@ from torch import Tensor
 from torch.nn.functional import avg_pool2d, max_pool2d
 
 from gscompleter.config import CompleterConfig, get_named_config
-from gscompleter.numerics.geometry import compute_z_depths, project_mask
+from gscompleter.numerics.geometry import add_near_plane, compute_z_depths, project_mask
 from gscompleter.reconstructors import (
     DepthAware,
     Reconstructor,
@@ -183,12 +183,11 @@ def measure_depth_range(
     """
     depths = []
     for camera in cameras:
-        z = compute_z_depths(scene.means, camera)
-        if not (z > 0).any():
+        if not (compute_z_depths(scene.means, camera) > 0).any():
             continue
-        # No near plane is known yet, and the scene may have any unit: the median depth is one.
-        unit = z[z > 0].median().item()
-        seen = renderer.render(scene, replace(camera, near=0.1 * unit)).depth_map()
+        # No near plane is known yet.
+        ranged = add_near_plane(replace(camera, near=None), scene.means)
+        seen = renderer.render(scene, ranged).depth_map()
         depths.append(seen.depth[seen.valid])
     if not depths or sum(d.numel() for d in depths) == 0:
         raise InputError(

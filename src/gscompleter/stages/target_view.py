@@ -105,14 +105,7 @@ class TargetView:
         # The sky is no surface that anything could be registered to.
         before = self.render.crop(self.camera)
         covered = mask_out_sky(before, self.camera.target).valid.float().mean().item()
-        min_covered = self.state.config.holes.min_covered
-        if covered >= min_covered:
-            return None
-        return (
-            f"The target sees surfaces of the scene in {covered:.1%} of its image, and at least "
-            f"{min_covered:.0%} are needed; move it closer to the photographs, or turn it towards "
-            "what they show."
-        )
+        return explain_little_covered(covered, self.state.config.holes)
 
     @property
     def skip_reason(self) -> str:
@@ -164,6 +157,17 @@ def compute_distrust(
     """Compute a weight in [0, 1] that falls with the mean trust of what a pixel shows."""
     trust = trusted_alpha / alpha.clamp_min(1e-6)
     return ((FULL_TRUST - trust) / (FULL_TRUST - NO_TRUST)).clamp(0, 1)
+
+
+def explain_little_covered(covered: float, config: HoleConfig = HoleConfig()) -> str | None:
+    """Explain that too small a share of a target's image is covered; None if it is enough."""
+    if covered >= config.min_covered:
+        return None
+    return (
+        f"The target sees surfaces of the scene in {covered:.1%} of its image, and at least "
+        f"{config.min_covered:.0%} are needed; move it closer to the photographs, or turn it "
+        "towards what they show."
+    )
 
 
 def compute_hole_mask(

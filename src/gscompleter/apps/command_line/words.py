@@ -18,7 +18,7 @@ from tyro.constructors import (
     StructTypeInfo,
 )
 
-from gscompleter.apps.commands.shared_options import DEFAULT_NUM_TARGETS
+from gscompleter.apps.commands.shared_options import DEFAULT_NUM_TARGETS, CompletingOptions
 from gscompleter.config import CompleterConfig, load_config
 from gscompleter.config.settings import Settings
 from gscompleter.system.errors import InputError, join_names, quote_value
@@ -81,12 +81,20 @@ def parse_words(words: Sequence[str], kinds: Mapping[str, type]) -> Any:
     printed = StringIO()
     try:
         with redirect_stderr(printed):
-            config, words = load_named_config(insert_auto_count(words))
+            counted = insert_auto_count(words)
+            config, words = load_named_config(counted)
             registry = make_registry(config, *rules)
             # tyro prepares all options of what it is given. For 18 commands that takes 0.1 s longer
             # than for one, which is 2 % of a completion.
             if words and words[0] in kinds:
                 prog = f"gscompleter {words[0]}"
+                parsed = call_tyro(kinds[words[0]], prog, None, words[1:], registry)
+                if not isinstance(parsed, CompletingOptions) or not parsed.lacks_photographs:
+                    return parsed
+                # Only parsed words tell that a splat comes without photographs. Its config is
+                # another one, whose settings are then the defaults.
+                config, words = load_named_config(counted, has_photographs=False)
+                registry = make_registry(config, *rules)
                 return call_tyro(kinds[words[0]], prog, None, words[1:], registry)
             named = [Annotated[kind, tyro.conf.subcommand(name)] for name, kind in kinds.items()]
             of_any: Any = Union[tuple(named)]  # noqa: UP007  (of as many as there are)
@@ -196,7 +204,9 @@ class NamedConfig:
     config: str = "default"
 
 
-def load_named_config(words: Sequence[str]) -> tuple[CompleterConfig, Sequence[str]]:
+def load_named_config(
+    words: Sequence[str], has_photographs: bool = True
+) -> tuple[CompleterConfig, Sequence[str]]:
     """Load the config of `--config NAME`, and return it with the other words.
 
     Its settings are the defaults of options such as `--config.holes.dilation`, so it has to be
@@ -208,8 +218,9 @@ def load_named_config(words: Sequence[str]) -> tuple[CompleterConfig, Sequence[s
         NamedConfig, prog="gscompleter", args=words, return_unknown_args=True, add_help=False
     )
     # The default config depends on the input: a splat has settings of its own.
-    is_splat = any(word.partition("=")[0] == "--scene" for word in others)
-    config = load_config(named.config, is_splat)
+    is_splat = not has_photographs
+    is_splat |= any(word.partition("=")[0] == "--scene" for word in others)
+    config = load_config(named.config, is_splat, has_photographs)
     if words[0] == "remove":
         config = config.for_removal()
     return config, others

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -166,12 +167,27 @@ class SceneOptions(ComputeOptions, WritingOptions):
 class CompletingOptions(SceneOptions, ModelOptions):
     """Options of the commands that complete one scene."""
 
+    folder: Annotated[Path | None, tyro.conf.Positional, tyro.conf.arg(metavar="SCENE")] = None  # type: ignore[assignment]
+    """Folder of the photographs: COLMAP, nerfstudio, cameras.json, LLFF, KITTI, DGP, Waymo,
+    PandaSet, a pixelSplat chunk, a RealEstate10K camera file, or what Polycam, Record3D or 3d
+    Scanner App exports. If it has no cameras, COLMAP finds them and they are kept in OUT/colmap;
+    also of 360° panoramas (2:1) and of a video (.mp4, .mov, .mkv). One image needs none. A splat
+    may come without photographs: leave SCENE out, or name the splat as SCENE."""
     scene: Path | None = None
     """File of Gaussians (a splat) to complete instead of reconstructing the scene; all are kept."""
+    cameras: Path | None = None
+    """File of cameras for a splat without photographs, as of `--target`: renders at some of them
+    take the place of photographs. If not given, a cameras.json beside the splat, or cameras that
+    are found around the targets."""
     no_recolor: bool = False
     """Keep the colours of the splat, too; Gaussians are only added."""
     config: Annotated[CompleterConfig, tyro.conf.FlagConversionOff] = CompleterConfig()
     """Settings of the method, which change those of `--config NAME`."""
+
+    @property
+    def lacks_photographs(self) -> bool:
+        """True for a splat without photographs: SCENE is left out, or is the splat itself."""
+        return self.folder is None or is_splat(self.folder)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -206,6 +222,15 @@ def list_inputs(options: Settings) -> list[Path]:
         elif name not in OUTPUTS:
             inputs += [path for path in values if isinstance(path, Path)]
     return inputs
+
+
+def is_splat(path: Path) -> bool:
+    """Check whether a path names an existing file of Gaussians, by its ending."""
+    if not os.path.isfile(path):
+        return False
+    from gscompleter.splats.formats import has_splat_extension  # as in `replace_by_scenes`
+
+    return has_splat_extension(path)
 
 
 def replace_by_scenes(inputs: Sequence[Path], folders: Sequence[Path]) -> list[Path]:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import replace
 from pathlib import Path
@@ -42,15 +42,18 @@ from gscompleter.system.files.writing import (
     COMPLETED_FILE,
     CONTEXT_FILE,
     REMOVED_FILE,
+    RENDERS_FILE,
     SUMMARY_FILE,
     TARGETS_FILE,
 )
 from gscompleter.system.progress import show_progress, stage
 from gscompleter.system.timing import add_seconds
+from gscompleter.types import Camera
 
 COMMAND = "complete"
 RESULTS = (
     *(COMPLETED_FILE, CONTEXT_FILE, GENERATED_FILE, REMOVED_FILE, TARGETS_FILE),
+    RENDERS_FILE,
     *(REPORT_FILE, RECORD_FILE, SUMMARY_FILE, VIDEO_FILE, "images/target*.png"),
     *("images/photograph*.png", "images/context*.png"),
 )
@@ -117,6 +120,7 @@ def plan_folder(options: CompleteOptions, prepare: Prepare) -> None:
             ready = ready.with_choices(choices)
             holes = [choice.hole_fraction for choice in choices]
         write_targets(folder, ready.task)
+        write_render_cameras(folder, ready)
         if ready.task.targets:
             write_plan_pictures(folder / IMAGES, ready, begun)
     if not options.quiet:
@@ -231,6 +235,7 @@ def write_done(folder: Path, ready: Prepared, completion: Completion) -> dict[st
             ready.opened.files,
             has_searched=not options.from_photographs_only,
         )
+    write_render_cameras(folder, ready)
     write_completion_page(folder)
     return summary
 
@@ -257,7 +262,18 @@ def complete_targets(ready: Prepared) -> tuple[Completion, Prepared]:
 def write_targets(folder: Path, task: CompletionTask) -> None:
     """Write the target cameras in the frame of the photographs, as `--target` reads them."""
     if task.targets:
-        # In float64, because coordinates of maps are large.
-        back = np.linalg.inv(task.frame)
-        cameras = [transform_camera_exactly(target.camera, back) for target in task.targets]
-        write_cameras(folder / TARGETS_FILE, cameras)
+        write_in_first_frame(folder / TARGETS_FILE, task, [t.camera for t in task.targets])
+
+
+def write_render_cameras(folder: Path, ready: Prepared) -> None:
+    """Write the cameras of renders that took the place of photographs, as `--cameras` reads."""
+    if ready.opened.renders_from is not None:
+        cameras = [view.camera for view in ready.task.views]
+        write_in_first_frame(folder / RENDERS_FILE, ready.task, cameras)
+
+
+def write_in_first_frame(path: Path, task: CompletionTask, cameras: Sequence[Camera]) -> None:
+    """Write cameras of the result in the frame of the photographs, or of a splat alone."""
+    # In float64, because coordinates of maps are large.
+    back = np.linalg.inv(task.frame)
+    write_cameras(path, [transform_camera_exactly(camera, back) for camera in cameras])

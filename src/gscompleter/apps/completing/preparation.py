@@ -25,9 +25,10 @@ from gscompleter.apps.inputs.memory import check_scene
 from gscompleter.apps.inputs.named_photographs import check_context, check_target_files
 from gscompleter.apps.inputs.opening import choose_working_size, open_scene
 from gscompleter.apps.inputs.reading import read_task
+from gscompleter.apps.inputs.renders import RenderRequest, open_renders
 from gscompleter.apps.inputs.selection import collect_usable_cameras
 from gscompleter.apps.inputs.splat import add_check_views, locate_splat, move_to_splat
-from gscompleter.apps.inputs.task import CompletionTask, Opened, Target
+from gscompleter.apps.inputs.task import CompletionTask, InputSplatFile, Opened, Target
 from gscompleter.apps.warmup import SPLAT_PART, compile_kernels
 from gscompleter.completer import GSCompleter
 from gscompleter.data.local_origin import compute_frame_from_photographs
@@ -44,10 +45,13 @@ from gscompleter.splats.formats import load_splat
 from gscompleter.splats.morton import argsort_nearby
 from gscompleter.stages.context import prepare_single
 from gscompleter.state import Completion
-from gscompleter.system.errors import InputError
+from gscompleter.system.errors import InputError, quote_value
 from gscompleter.system.progress import show_preparation
 from gscompleter.system.timing import record_seconds, timed_stage
-from gscompleter.types import Camera
+from gscompleter.types import Camera, Gaussians
+
+PHOTOGRAPH_OPTIONS = {"format": None, "frames": 40, "masks": True, "from_photographs_only": False}
+"""Options that only photographs can follow, with their defaults."""
 
 
 @dataclass(frozen=True)
@@ -92,14 +96,19 @@ class Prepared:
 def prepare_completion(options: CompleteOptions, console: Console) -> Prepared:
     """Open the scene and load the models."""
     options = check_options(options)
-    opened = open_for_completion(options, console)
-    task = read_inputs(options, opened)
+    if options.folder is None:
+        opened, task = read_splat_alone(options)
+        print_lines(console, *opened.photographs.notes)
+    else:
+        opened = open_for_completion(options, console)
+        task = read_inputs(options, opened)
     return load_models(options, opened, task, console)
 
 
 def check_options(options: CompleteOptions) -> CompleteOptions:
     """Refuse what is wrong whatever the scene is; return the options with the chosen devices."""
     check_context(options.context)
+    options = check_photographs(options)
     check_targets(options)
     options = choose_paintings(options)
     check_reconstructor(options.reconstructor)
@@ -175,6 +184,38 @@ def open_input(options: SceneOptions, console: Console, check: Callable[[], obje
     return opened
 
 
+def check_photographs(options: CompleteOptions) -> CompleteOptions:
+    """Refuse what does not fit the photographs or their absence.
+
+    A splat that is named as SCENE is returned as `scene`.
+    """
+    if not options.lacks_photographs:
+        if options.cameras is not None:
+            raise InputError(
+                "The photographs of SCENE have cameras of their own; leave --cameras out, or name "
+                "the splat alone.",
+                "cameras",
+            )
+        return options
+    if options.folder is not None and options.scene is not None:
+        raise InputError(
+            f"Two splats are named, {quote_value(options.folder, 80)} and "
+            f"{quote_value(options.scene, 80)}; name one, and as SCENE only its photographs.",
+            "scene",
+        )
+    if options.folder is None and options.scene is None:
+        raise InputError(
+            "Nothing is named that is to be completed; name SCENE, the folder of photographs, or "
+            "a splat."
+        )
+    for name, default in PHOTOGRAPH_OPTIONS.items():
+        if getattr(options, name) != default:
+            raise InputError(
+                "There are no photographs to apply this to; name their folder as SCENE.", name
+            )
+    return replace(options, folder=None, scene=options.scene or options.folder)
+
+
 def check_targets(options: CompleteOptions) -> None:
     """Refuse options for targets that exclude each other."""
     if options.target and options.auto is not None:
@@ -228,15 +269,45 @@ def add_splat(
     compile_kernels([*parts, SPLAT_PART] if "cpu" in parts else parts)
 
     with show_preparation("aligning the scene"):
-        # Gaussians of a file lie in random order, and each tile of an image would read memory all
-        # over. Large scenes are sorted along a Morton curve (decision 025); files are written in
-        # the order of the given file, which `file_order` leads back to.
-        splat_file = locate_splat(path, drop_nonfinite)
-        if len(gaussians) >= MIN_PROXY_GAUSSIANS:
-            order = argsort_nearby(gaussians)
-            gaussians = gaussians[order]
-            splat_file = replace(splat_file, file_order=order)
+        gaussians, splat_file = sort_splat(gaussians, locate_splat(path, drop_nonfinite))
         return move_to_splat(task, gaussians, splat_file, opened)
+
+
+def sort_splat(
+    gaussians: Gaussians, splat_file: InputSplatFile
+) -> tuple[Gaussians, InputSplatFile]:
+    """Sort a large splat along a Morton curve, and keep the order of its file."""
+    # Gaussians of a file lie in random order, and each tile of an image would read memory all over
+    # (decision 025). Files are written in the order of the given file, which `file_order` leads
+    # back to.
+    if len(gaussians) < MIN_PROXY_GAUSSIANS:
+        return gaussians, splat_file
+    order = argsort_nearby(gaussians)
+    return gaussians[order], replace(splat_file, file_order=order)
+
+
+def read_splat_alone(options: CompleteOptions) -> tuple[Opened, CompletionTask]:
+    """Read a splat without photographs, and render it in their place; compile the kernels."""
+    assert options.scene is not None
+    device = options.device
+    # What can be wrong is read before anything that takes time.
+    load_completer(options, ())
+    with show_preparation("reading the scene"):
+        gaussians = load_splat(options.scene, options.drop_nonfinite)
+        splat_file = locate_splat(options.scene, options.drop_nonfinite)
+        gaussians, splat_file = sort_splat(gaussians, splat_file)
+    parts = [device, options.reconstructor, options.synthesis.generator]
+    compile_kernels([*parts, SPLAT_PART] if device == "cpu" else parts)
+
+    reading = replace(options, folder=options.scene).make_scene_request()
+    request = RenderRequest(
+        reading, options.cameras, options.target, options.context, options.config.holes
+    )
+    with show_preparation("choosing cameras"):
+        opened, task = open_renders(request, splat_file, gaussians, load_renderer(device), device)
+        if device == "cpu":
+            check_scene(task, gaussians)
+    return opened, task
 
 
 def load_completer(options: CompleteOptions, targets: Sequence[Target]) -> GSCompleter:

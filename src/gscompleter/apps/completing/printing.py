@@ -70,7 +70,7 @@ def describe_result(summary: CompletionSummary, options: CompleteOptions) -> Ite
     share = "Trusted" if summary.settings["config"]["trust"] == "photometric" else "Coverage"
     before = format_percent(summary.coverage.before)
     after = format_percent(summary.coverage.after)
-    yield f"{share} around the photographs: {before} before, {after} after."
+    yield f"{share} around the {summary.scene.images}: {before} before, {after} after."
 
     rows = select_testing(summary.held_out)
     if rows:

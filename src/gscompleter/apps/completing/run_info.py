@@ -36,7 +36,7 @@ def describe_run(
     splat = None if options.scene is None else str(options.scene)
     return {
         "settings": {
-            "folder": str(options.folder),
+            "folder": None if options.folder is None else str(options.folder),
             "format": options.format,
             "frames": options.frames,
             "context": None if options.context is None else list(options.context),
@@ -55,6 +55,7 @@ def describe_run(
             "photographs": opened.num_photographs,
             "used": len(task.views),
             "splat": splat,
+            "renders_from": opened.renders_from,
             "notes": [*opened.photographs.notes, *describe_missing(opened.photographs)],
         },
         "frame": {
@@ -74,6 +75,9 @@ def read_held_out(
     The unused ones are those nearest to the targets or the context. `cameras` are those of all
     usable photographs by frame, in the frame of the result.
     """
+    # Renders of the splat itself test nothing.
+    if opened.renders_from is not None:
+        return []
     used = task.used_frames
     others = {frame: camera for frame, camera in cameras.items() if frame not in used}
     # Check views of a splat guard its completion, so they test less than photographs that nothing

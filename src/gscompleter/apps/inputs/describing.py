@@ -33,7 +33,8 @@ def describe_task(
     """
     files = opened.files
     context = [name_photograph(frame, files.get(frame)) for frame in task.context_frames]
-    goal = f"{doing} from photographs {join_names(context, MAX_NAMED)}"
+    images = "photographs" if opened.renders_from is None else "renders"
+    goal = f"{doing} from {images} {join_names(context, MAX_NAMED)}"
     targets = join_names([opened.name_target(target) for target in task.targets], MAX_NAMED)
     if targets:
         goal += f" for {targets}"
@@ -67,9 +68,12 @@ def describe_opening(opened: Opened, task: CompletionTask) -> list[str]:
         assert task.splat_file is not None
         name = quote_value(task.splat_file.path)
         splat = f"; {name}, {len(scene):,} {mode}Gaussians of SH degree {scene.sh_degree}"
+    source = f"{quote_value(opened.request.folder)}, {opened.format}, {used} of "
+    source += f"{opened.num_photographs} photographs{splat}"
+    if opened.renders_from is not None:
+        source = f"{splat.removeprefix('; ')}; no photographs"
     return [
-        f"Opened: {quote_value(opened.request.folder)}, {opened.format}, {used} of "
-        f"{opened.num_photographs} photographs{splat}.",
+        f"Opened: {source}.",
         f"Found: {task.frame_description.rstrip('.')}; depths from {camera.near:.3g} to "
         f"{camera.far:.3g}; worked at {camera.width} x {camera.height} (--resolution changes it).",
         *describe_missing(photographs),

@@ -20,12 +20,11 @@ from gscompleter.data.limits import check_planes
 from gscompleter.data.photographs import check_resolution
 from gscompleter.data.sfm.poses import find_poses, has_photographs
 from gscompleter.splats.alignment.training_size import find_training_size
-from gscompleter.splats.formats import SPLAT_FORMATS
+from gscompleter.splats.formats import has_splat_extension
 from gscompleter.system.errors import InputError, quote_value
 from gscompleter.system.files.output_folder import POSES
 from gscompleter.system.files.writing import SUMMARY_FILE
 
-SPLAT_EXTENSIONS = tuple(end for format in SPLAT_FORMATS.values() for end in format.extensions)
 NUM_SIZE_PHOTOGRAPHS = 8
 """Number of photographs that are enough to find the size of a training by."""
 
@@ -42,7 +41,7 @@ def open_scene(
     after it.
     """
     folder = request.folder
-    if not os.path.isdir(folder) and folder.name.lower().endswith(SPLAT_EXTENSIONS):
+    if not os.path.isdir(folder) and has_splat_extension(folder):
         raise InputError(
             f"{quote_value(folder, 80)} is a file of Gaussians, which goes to --scene; SCENE has "
             "to be the folder of its photographs, with or without cameras, or a video."

@@ -19,6 +19,7 @@ from gscompleter.data.photographs import Photographs
 from gscompleter.data.points import add_depth_range
 from gscompleter.system.errors import InputError, quote_value
 from gscompleter.system.memory import check_memory
+from gscompleter.types import Camera
 
 MIN_IMAGE_SIZE = 16
 """Smallest side of an image, in pixels."""
@@ -88,12 +89,7 @@ def make_task(
         for target in targets
     ]
     cameras = [bounded.camera(frame, resolution) for frame in frames]
-    for camera in (*cameras, *(target.camera for target in targets)):
-        if min(camera.width, camera.height) < MIN_IMAGE_SIZE:
-            raise InputError(
-                f"An image is {camera.width} x {camera.height} pixels, and both sides must have at "
-                f"least {MIN_IMAGE_SIZE}; choose a larger --resolution, or another camera."
-            )
+    check_sizes([*cameras, *(target.camera for target in targets)])
 
     depth_notes: tuple[str, ...] = ()
     if request.uses_given_depth:
@@ -112,6 +108,16 @@ def make_task(
         find_depth_sources(opened, bounded, has_splat),
         depth_notes=depth_notes,
     )
+
+
+def check_sizes(cameras: Sequence[Camera]) -> None:
+    """Refuse cameras whose images are too small."""
+    for camera in cameras:
+        if min(camera.width, camera.height) < MIN_IMAGE_SIZE:
+            raise InputError(
+                f"An image is {camera.width} x {camera.height} pixels, and both sides must have at "
+                f"least {MIN_IMAGE_SIZE}; choose a larger --resolution, or another camera."
+            )
 
 
 def find_depth_sources(opened: Opened, bounded: Photographs, has_splat: bool) -> dict[str, str]:

@@ -139,7 +139,8 @@ def write_report(
     outcome = asdict(judge_completion(completion, held_out_rows, has_searched=has_searched))
     write_scenes(folder, completion, input_splat)
     around = render_around()
-    write_pictures(folder / IMAGES, completion, targets, at_targets)
+    name_view = "ignored" if run_info["scene"].get("renders_from") is None else "render"
+    write_pictures(folder / IMAGES, completion, targets, at_targets, name_view)
     write_photographs(folder / IMAGES, completion, shown, renderer)
     record = make_record(completion, thin_evenly(photographs, MAX_PHOTOGRAPHS))
     (folder / RECORD_FILE).write_bytes(json.dumps(asdict(record)).encode() + b"\n")
@@ -391,15 +392,16 @@ def write_pictures(
     completion: Completion,
     targets: Sequence[Target],
     at_targets: Sequence[RenderPair],
+    name_view: str = "ignored",
 ) -> None:
-    """Write `images/`: targets, and photographs with ignored regions."""
+    """Write `images/`: targets, and photographs with ignored regions, or all renders of a splat."""
     folder.mkdir()
     results = zip(targets, completion.targets, at_targets, strict=True)
     for number, (target, result, pair) in enumerate(results, start=1):
         write_images(folder, f"target{number}", name_target_images(target, result, pair))
     for number, view in enumerate(completion.views, start=1):
-        if view.ignore_mask is not None:
-            write_images(folder, f"context{number}", {"ignored": paint_ignored(view)})
+        if view.ignore_mask is not None or name_view == "render":
+            write_images(folder, f"context{number}", {name_view: paint_ignored(view)})
 
 
 def write_photographs(

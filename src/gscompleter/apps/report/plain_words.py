@@ -40,6 +40,16 @@ REMOVED_NOTE = (
     "Gaussians were removed: those selected, and those behind them that no photograph shows; "
     "removed.ply has them, and strip puts them back."
 )
+BARE_NOTE = (
+    "No photograph checked this: renders of the splat took the place of photographs, and their "
+    "scores only say how much the completion changed them. What was given stays bit for bit, and "
+    "strip takes the rest away."
+)
+RISKS = {
+    "cameras": "0.1 dB on average where the cameras came from a file",
+    "targets": "0.3 dB on average where they were found around a target",
+}
+"""What photographs lost that nobody had given, by where the cameras came from (decision 053)."""
 NOTHING_NEW_NOTE = (
     "The splat reproduces all photographs. Where it is wrong from elsewhere, only smooth colours "
     "are known: little is to be gained without new photographs of the place or a learned generator."
@@ -55,8 +65,15 @@ def list_notes(summary: CompletionSummary) -> Iterator[str]:
         yield f"The splat is {FRAME_NOTES[frame.method]}; summary.json lists the transform."
     if any(frame.origin):
         yield ORIGIN_NOTE
-    yield from list_photograph_notes(summary)
-    if summary.settings.get("context") is None:
+    if scene.renders_from is not None:
+        yield BARE_NOTE
+        yield (
+            "Real photographs of the scene that were not given may get worse: on development "
+            f"cases they lost {RISKS[scene.renders_from]}."
+        )
+    else:
+        yield from list_photograph_notes(summary)
+    if scene.renders_from is None and summary.settings.get("context") is None:
         yield f"{scene.used} of {scene.photographs} photographs were chosen as the context."
     if summary.settings.get("uses_target_photographs"):
         yield ORACLE_NOTE

@@ -121,8 +121,16 @@ class SceneRow:
     photographs: int
     used: int
     splat: str | None = None
+    renders_from: str | None = None
+    """Where the cameras of renders come from that took the place of photographs: `cameras` of a
+    file, or around the `targets`; None if there are photographs."""
     notes: tuple[str, ...] = ()
     """Sentences about the opening: photographs and cameras that are left out, for example."""
+
+    @property
+    def images(self) -> str:
+        """What the scene is compared with, in the plural."""
+        return "photographs" if self.renders_from is None else "renders"
 
 
 @dataclass(frozen=True)

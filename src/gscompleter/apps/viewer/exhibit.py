@@ -22,7 +22,12 @@ from gscompleter.splats.formats import load_splat
 from gscompleter.system.errors import InputError, quote_value
 from gscompleter.system.files.image import encode_jpeg, read_pixels, turn_upright
 from gscompleter.system.files.output_folder import POSES
-from gscompleter.system.files.writing import COMPLETED_FILE, CONTEXT_FILE, TARGETS_FILE
+from gscompleter.system.files.writing import (
+    COMPLETED_FILE,
+    CONTEXT_FILE,
+    RENDERS_FILE,
+    TARGETS_FILE,
+)
 from gscompleter.types import Camera, Gaussians
 
 THUMBNAIL_SIDE = 160
@@ -96,6 +101,8 @@ def load_viewer_completion(folder: Path, drop_nonfinite: bool) -> ViewerContent:
     )
     targets = load_target_cameras(folder, summary, content)
     # The poses of photographs that had none lie in the folder; others stay where the user has them.
+    if summary.scene.renders_from is not None:
+        return replace(content, cameras=(*targets, *load_render_cameras(folder, summary, content)))
     source = Path(str(summary.settings.get("folder")))
     if summary.scene.format == "photographs":
         source = folder / POSES
@@ -123,6 +130,22 @@ def load_target_cameras(
             row.notes,
         )
         for number, (camera, row) in enumerate(zip(cameras, summary.targets, strict=False), 1)
+    )
+
+
+def load_render_cameras(
+    folder: Path, summary: CompletionSummary, content: ViewerContent
+) -> tuple[ViewerCamera, ...]:
+    """Load the cameras of renders that took the place of photographs, with thumbnails."""
+    cameras = load_scene_cameras(folder / RENDERS_FILE, content.transform, content.origin)
+    return tuple(
+        ViewerCamera(
+            f"photograph-{row.frame}",
+            f"Render {row.photograph}",
+            camera,
+            make_thumbnail(folder / "images" / f"context{number}_render.png"),
+        )
+        for number, (camera, row) in enumerate(zip(cameras, summary.context, strict=False), 1)
     )
 
 

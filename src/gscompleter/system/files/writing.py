@@ -20,6 +20,8 @@ from gscompleter.system.files.unfinished import make_unfinished_name
 SUMMARY_FILE = "summary.json"
 """File that marks a folder as complete: it is removed first and written last."""
 TARGETS_FILE = "targets.json"
+RENDERS_FILE = "renders.json"
+"""Cameras at which renders of the splat took the place of photographs."""
 """File of a completion with the target cameras."""
 CONTEXT_FILE = "context.ply"
 """Scene before its completion."""

@@ -1,0 +1,167 @@
+"""`complete` of a splat without photographs: cameras are given, beside it, or around a target."""
+
+import json
+import shutil
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+
+from command import run
+from gscompleter import load_cameras, load_ply, save_ply
+from gscompleter.data.scene import write_cameras
+from gscompleter.types import Camera
+from scenes import Room, camera_at, gaussians_of, photographed, view_of
+
+SIZE = 64
+
+
+def make_camera(x: float = 0.0, yaw: float = 0.0) -> Camera:
+    return replace(camera_at(x, yaw=yaw, size=SIZE), near=None, far=None)
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory) -> Path:
+    """Return a splat of one photograph, and cameras beside which its hole is seen."""
+    folder = tmp_path_factory.mktemp("alone")
+    save_ply(folder / "splat.ply", gaussians_of(view_of(Room(), camera_at(size=SIZE))))
+    write_cameras(folder / "target.json", [make_camera(yaw=12)])
+    write_cameras(folder / "around.json", [make_camera(-0.3), make_camera(0.3), make_camera(0.1)])
+    return folder
+
+
+@pytest.fixture(scope="module")
+def done(folder) -> Path:
+    """Return the output for a named target."""
+    out = folder / "done"
+    with pytest.MonkeyPatch.context() as monkeypatch:
+        words = ("complete", folder / "splat.ply", "--target", folder / "target.json")
+        assert run(monkeypatch, *words, "--out", out, "--quiet") == 0
+    return out
+
+
+def read_summary(out: Path) -> dict:
+    return json.loads((out / "summary.json").read_text())
+
+
+def test_a_named_target_is_completed_from_renders_around_it(folder, done, tmp_path, monkeypatch):
+    summary = read_summary(done)
+    scene = summary["scene"]
+    assert (scene["format"], scene["renders_from"]) == ("renders", "targets")
+    assert summary["settings"]["folder"] is None
+    assert summary["settings"]["config"]["trust"] == "full"
+    assert summary["settings"]["config"]["registration"]["hole_depth"] == "scene"
+    assert summary["held_out"] == []
+    assert 1 <= len(summary["context"]) <= 3
+    (target,) = summary["targets"]
+    assert target["added"] > 100
+    assert summary["coverage"]["after"] > summary["coverage"]["before"]
+
+    page = (done / "report.html").read_text()
+    assert "Renders in place of photographs" in page
+    assert "No photograph checked this" in page
+    assert "0.3 dB on average" in page
+    for number in range(1, len(summary["context"]) + 1):
+        assert (done / "images" / f"context{number}_render.png").is_file()
+    assert len(load_cameras(done / "renders.json")) == len(summary["context"])
+
+    # All that was given comes back, byte for byte.
+    back = tmp_path / "back.ply"
+    assert run(monkeypatch, "strip", done / "completed.ply", "--out", back, "--quiet") == 0
+    assert back.read_bytes() == (folder / "splat.ply").read_bytes()
+
+
+def test_the_cameras_of_a_run_give_the_same_scene_again(folder, done, tmp_path, monkeypatch):
+    words = ("complete", "--scene", folder / "splat.ply", "--target", folder / "target.json")
+    cameras = ("--cameras", done / "renders.json")
+    out = tmp_path / "out"
+    assert run(monkeypatch, *words, *cameras, "--out", out, "--quiet") == 0
+    assert (out / "completed.ply").read_bytes() == (done / "completed.ply").read_bytes()
+    assert read_summary(out)["scene"]["renders_from"] == "cameras"
+
+
+def test_cameras_beside_the_splat_are_found_and_said(folder, tmp_path, monkeypatch, capsys):
+    shutil.copy(folder / "splat.ply", tmp_path / "splat.ply")
+    write_inria_cameras(tmp_path / "cameras.json", load_cameras(folder / "around.json"))
+    words = ("complete", tmp_path / "splat.ply", "--target", folder / "target.json")
+    out = tmp_path / "out"
+    assert run(monkeypatch, *words, "--context", "0", "cam_1", "--out", out) == 0
+    said = capsys.readouterr().err
+    assert "cameras.json, which was found beside the splat, take their place" in said
+    summary = read_summary(out)
+    assert [row["frame"] for row in summary["context"]] == [0, 1]
+    assert [row["file"] for row in summary["context"]] == ["cam_0", "cam_1"]
+    assert summary["targets"][0]["added"] > 100
+
+
+def write_inria_cameras(path: Path, cameras: list[Camera]) -> None:
+    """Write cameras as the trainers of 3DGS do."""
+    rows = [
+        {
+            "id": number,
+            "img_name": f"cam_{number}",
+            "width": camera.width,
+            "height": camera.height,
+            "position": camera.center.tolist(),
+            "rotation": camera.c2w[:3, :3].tolist(),
+            "fx": camera.K[0, 0].item(),
+            "fy": camera.K[1, 1].item(),
+        }
+        for number, camera in enumerate(cameras)
+    ]
+    path.write_text(json.dumps(rows))
+
+
+def test_cameras_alone_let_targets_be_found(folder, tmp_path, monkeypatch):
+    words = ("complete", folder / "splat.ply", "--cameras", folder / "around.json", "--auto", 1)
+    out = tmp_path / "out"
+    assert run(monkeypatch, *words, "--out", out, "--dry-run", "--quiet") == 0
+    assert len(load_cameras(out / "targets.json")) == 1
+    assert len(load_cameras(out / "renders.json")) == 3
+    assert (out / "images" / "target1_beside.png").is_file()
+
+
+@pytest.mark.parametrize(
+    ("words", "sentence"),
+    [
+        ((), "Nothing is named that is to be completed"),
+        (("--scene", "splat.ply"), "does not tell where to stand or what is missing"),
+        (("splat.ply", "--scene", "splat.ply"), "Two splats are named"),
+        (("splat.ply", "--target", "3"), "'3' is no target: there are no photographs to name"),
+        (("splat.ply", "--target", "target.json", "--context", "0"), "there is none"),
+        (("splat.ply", "--target", "opaque.json"), "opaque everywhere in the image of the target"),
+        (("splat.ply", "--target", "away.json"), "sees surfaces of the scene in 0.0%"),
+        (("splat.ply", "--target", "target.json", "--no-masks"), r"apply this to.*\(--masks\)"),
+        (("splat.ply", "--from-photographs-only"), "There are no photographs to apply this to"),
+        (("photographs", "--cameras", "around.json"), "photographs of SCENE have cameras"),
+        (("splat.ply", "--cameras", "nothing.json"), "nothing.json"),
+    ],
+)
+def test_what_cannot_be_done_is_refused_with_what_to_give_instead(
+    folder, tmp_path, monkeypatch, capsys, words, sentence
+):
+    narrow = make_camera()
+    narrow.K[[0, 1], [0, 1]] *= 2
+    write_cameras(folder / "opaque.json", [narrow])
+    write_cameras(folder / "away.json", [make_camera(yaw=180)])
+    if not (folder / "photographs").exists():
+        photographed(folder / "photographs", [camera_at(0.1, size=SIZE)])
+    monkeypatch.chdir(folder)
+    assert run(monkeypatch, "complete", *words, "--out", tmp_path / "out", "--quiet") == 2
+    assert_sentence(capsys.readouterr().err, sentence)
+    assert not (tmp_path / "out").exists()
+
+
+def assert_sentence(printed: str, sentence: str) -> None:
+    import re
+
+    assert re.search(sentence, printed), printed
+
+
+def test_the_splat_is_kept_bit_for_bit(folder, done):
+    given = load_ply(folder / "splat.ply")
+    completed = load_ply(done / "completed.ply")
+    kept = completed[completed.generated == 0]
+    assert len(kept) == len(given)
+    assert (kept.means == given.means).all()
+    assert (kept.sh == given.sh).all()
