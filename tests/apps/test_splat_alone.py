@@ -6,10 +6,12 @@ from dataclasses import replace
 from pathlib import Path
 
 import pytest
+import torch
 
 from command import run
 from gscompleter import load_cameras, load_ply, save_ply
 from gscompleter.data.scene import write_cameras
+from gscompleter.system.files.image import read_image, write_image
 from gscompleter.types import Camera
 from scenes import Room, camera_at, gaussians_of, photographed, view_of
 
@@ -165,3 +167,24 @@ def test_the_splat_is_kept_bit_for_bit(folder, done):
     assert len(kept) == len(given)
     assert (kept.means == given.means).all()
     assert (kept.sh == given.sh).all()
+
+
+def test_a_painted_hole_of_a_splat_alone_is_completed(folder, tmp_path, monkeypatch):
+    words = ("complete", folder / "splat.ply", "--quiet", "--overwrite")
+    target = ("--target", folder / "target.json")
+    holes = tmp_path / "holes"
+    out = tmp_path / "out"
+    assert run(monkeypatch, *words, *target, "--out", out, "--export-holes", holes) == 0
+    # The cameras of the renders have no names that could be repeated; they are found again.
+    assert json.loads((holes / "holes.json").read_text())["context"] == []
+
+    image = read_image(holes / "target1.png")
+    is_hole = read_image(holes / "target1_mask.png").mean(dim=-1) > 0.5
+    image[is_hole] = torch.tensor([1.0, 0.0, 0.0])
+    write_image(holes / "target1.png", image)
+    assert run(monkeypatch, *words, "--images", holes, "--painter", "a hand", "--out", out) == 0
+    (row,) = read_summary(out)["targets"]
+    assert row["painter"] == "a hand"
+    after = read_image(out / "images" / "target1_after.png")
+    red = (after[..., 0] > 0.6) & (after[..., 1] < 0.4)
+    assert (red & is_hole).sum() > 0.8 * is_hole.sum()

@@ -111,11 +111,13 @@ def write_holes(folder: Path, ready: Prepared, begun: Completion) -> list[str]:
         path = write_path(folder, ready, begun, planned)
         for row, frame in zip(rows, planned.target_frames, strict=True):
             row["path_frame"] = frame
+    # Cameras that were found around the targets are found again.
+    frames = ready.task.context_frames if ready.opened.has_numbered_frames else ()
     content = {
         "version": __version__,
         "camera_model": "PINHOLE",
         "depth_unit_scale_factor": unit,
-        "context": list(ready.task.context_frames),
+        "context": list(frames),
         "frames": rows,
         "path": path,
     }

@@ -31,8 +31,10 @@ def choose_paintings(options: CompleteOptions) -> CompleteOptions:
         return options
     if not options.target:
         options = replace(options, target=(str(folder / HOLES_FILE),))
-    if options.context is None:
-        options = replace(options, context=read_holes(folder).context)
+    context = read_holes(folder).context
+    # None is listed where renders take the place of photographs, at cameras that are found.
+    if options.context is None and context:
+        options = replace(options, context=context)
     return options
 
 

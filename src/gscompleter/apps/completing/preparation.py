@@ -98,6 +98,7 @@ def prepare_completion(options: CompleteOptions, console: Console) -> Prepared:
     options = check_options(options)
     if options.folder is None:
         opened, task = read_splat_alone(options)
+        task = add_paintings(task, options, opened)
         print_lines(console, *opened.photographs.notes)
     else:
         opened = open_for_completion(options, console)

@@ -59,7 +59,8 @@ class HolesFile:
 
     version: str
     context: tuple[int, ...]
-    """Frames of the context, from which the scene was made."""
+    """Frames of the context, from which the scene was made; none for renders of a splat alone whose
+    cameras were found."""
     frames: tuple[HoleRow, ...]
     path: PathRow | None = None
 

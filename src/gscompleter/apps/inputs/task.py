@@ -77,6 +77,11 @@ class Opened:
     """Where the cameras of renders come from that take the place of photographs: `cameras` of a
     file, or around the `targets`; None if there are photographs."""
 
+    @property
+    def has_numbered_frames(self) -> bool:
+        """True if the user can name the frames: photographs, or cameras of a file."""
+        return self.renders_from in (None, "cameras")
+
     def with_resolution(self, resolution: int) -> Opened:
         """Return a copy with another working size, the longest side in pixels."""
         return replace(self, request=replace(self.request, resolution=resolution))
