@@ -6,7 +6,7 @@ PyTorch's inference mode, which both nodes leave because registration needs grad
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+import json
 from dataclasses import dataclass, replace
 from itertools import count
 from pathlib import Path
@@ -14,37 +14,25 @@ from typing import Any, ClassVar
 
 import torch
 from torch import Tensor
-from torch.nn.functional import interpolate
 
 import gscompleter as gsc
 from gscompleter.apps.inputs.task import InputSplatFile
 from gscompleter.apps.report.completion import write_scenes
+from gscompleter.apps.report.hole_pictures import draw_hole
 from gscompleter.data.formats import open_photographs
-from gscompleter.generators import GeneratorOutput, GeneratorRequest
+from gscompleter.generators.painted import Painted, fit_painting
 from gscompleter.system.files.image import write_image
 from gscompleter.system.files.output_folder import open_output_folder
+from gscompleter.system.files.writing import SUMMARY_FILE
 
 HANDLE = "GSCOMPLETER_HOLES"
 """Type of the link between both nodes."""
 MAX_CHECK_VIEWS = 40
 """Largest number of further photographs that a splat is compared with."""
-MAX_STRETCH = 0.01
-"""Largest relative difference of the proportions of the painted image from those of the target."""
-
-
-@dataclass(frozen=True)
-class Painted:
-    """Generator Φ whose image was painted elsewhere."""
-
-    image: Tensor | None = None
-    """[h, w, 3] in [0, 1]; None before it is painted."""
-    supports_padding: bool = False
-    max_batch_size: int = 1
-
-    def synthesize(self, requests: Sequence[GeneratorRequest]) -> list[GeneratorOutput]:
-        """Return the image for the only request."""
-        assert self.image is not None
-        return [GeneratorOutput(fit_image(self.image, request.target)) for request in requests]
+PAINTER = "ComfyUI"
+"""Name of the painter unless the user names another."""
+NAME = "The painted image"
+"""Name of the image in sentences."""
 
 
 @dataclass(frozen=True)
@@ -57,24 +45,17 @@ class Holes:
     splat: Path | None
 
 
-def fit_image(image: Tensor, camera: gsc.Camera) -> Tensor:
-    """Scale an image [h, w, 3] to the size of a camera; its proportions must be the same."""
-    height, width = image.shape[:2]
-    if abs(width * camera.height / (height * camera.width) - 1) > MAX_STRETCH:
-        raise gsc.InputError(
-            f"The painted image has {width} x {height} pixels, and the target {camera.width} x "
-            f"{camera.height}; scale it without cropping."
-        )
-    size = camera.height, camera.width
-    scaled = interpolate(image.movedim(-1, 0)[None], size, mode="bilinear", antialias=True)
-    return scaled[0].movedim(0, -1).clamp(0, 1)
+def convert_depth(depth: Tensor) -> Tensor:
+    """Convert z-depth [h, w] to a picture [h, w, 3]: near is white, far and holes are black."""
+    inverse = torch.where(depth > 0, 1 / depth.clamp_min(1e-12), 0.0)
+    return (inverse / inverse.max().clamp_min(1e-12))[..., None].expand(-1, -1, 3)
 
 
 class FindHoles:
     """Render a scene at a target camera, and mark what is empty or not confirmed."""
 
-    RETURN_TYPES: ClassVar = ("IMAGE", "MASK", HANDLE)
-    RETURN_NAMES: ClassVar = ("image", "mask", "holes")
+    RETURN_TYPES: ClassVar = ("IMAGE", "MASK", HANDLE, "IMAGE", "IMAGE", "IMAGE")
+    RETURN_NAMES: ClassVar = ("image", "mask", "holes", "warped", "reference", "depth")
     FUNCTION = "find"
     CATEGORY = "3d/gscompleter"
 
@@ -105,13 +86,19 @@ class FindHoles:
         width: int,
         splat: str = "",
         camera: int = 0,
-    ) -> tuple[Tensor, Tensor, Holes]:
-        """Return the image [1, h, w, 3], the mask [1, h, w] and the state."""
+    ) -> tuple[Tensor, Tensor, Holes, Tensor, Tensor, Tensor]:
+        """Return image [1, h, w, 3], mask [1, h, w], the state, and three further images."""
         with torch.inference_mode(False), torch.enable_grad():
             holes = open_holes(scene, parse_frames(context), target, (height, width), splat, camera)
-            view = holes.completer.observe(holes.state, holes.target)
-            image = view.camera.crop(view.render.image).detach().clamp(0, 1)
-            return image[None], view.camera.crop(view.holes)[None].float(), holes
+            shown = draw_hole(holes.completer.observe(holes.state, holes.target))
+            return (
+                shown.image.clamp(0, 1)[None],
+                shown.mask[None].float(),
+                holes,
+                shown.warped[None],
+                shown.reference.image[None],
+                convert_depth(shown.depth)[None],
+            )
 
 
 def parse_frames(text: str) -> list[int]:
@@ -135,7 +122,7 @@ def open_holes(
         if number >= len(cameras):
             raise gsc.InputError(f"{target} has {len(cameras)} cameras; choose one.", "camera")
         camera = cameras[number]
-    completer = gsc.GSCompleter(generator=Painted())
+    completer = gsc.GSCompleter(generator=Painted((), PAINTER))  # no padding, as what is painted
     if not splat:
         return Holes(completer, completer.begin(views, targets=[camera]), camera, None)
     used = {*frames, int(target) if target.strip().isdecimal() else -1}
@@ -163,14 +150,22 @@ class RegisterPainting:
                 "holes": (HANDLE,),
                 "image": ("IMAGE", {"tooltip": "The painted image"}),
                 "out": ("STRING", out),
-            }
+            },
+            "optional": {
+                "painter": ("STRING", {"default": PAINTER, "tooltip": "Name for the summary"}),
+            },
         }
 
-    def register(self, holes: Holes, image: Tensor, out: str) -> tuple[str]:
-        """Return the path of completed.ply; `image` is [b, h, w, 3], and the first one counts."""
+    def register(self, holes: Holes, image: Tensor, out: str, painter: str = PAINTER) -> tuple[str]:
+        """Return the path of completed.ply.
+
+        `image` is [b, h, w, 3], or has alpha as the fourth channel, and the first one counts.
+        """
         with torch.inference_mode(False), torch.enable_grad():
-            painted = image[0, ..., :3].detach().cpu().float().clone()
-            completer = replace(holes.completer, generator=Painted(painted))
+            first = image[0].detach().cpu().float().clone()
+            opaque = first[..., 3] >= 0.5 if first.shape[-1] == 4 else torch.ones(first.shape[:2])
+            painting = fit_painting(first[..., :3], opaque.bool(), holes.target, NAME)
+            completer = replace(holes.completer, generator=Painted((painting,), painter))
             completion = completer.advance(holes.state, holes.target)
             result = completion.targets[-1]
             if not len(result.added) and not result.num_recolored:
@@ -181,8 +176,16 @@ class RegisterPainting:
                 splat = None if holes.splat is None else InputSplatFile(holes.splat)
                 write_scenes(folder, completion, splat)
                 write_image(folder / "before.png", result.before.image)
-                write_image(folder / "painted.png", fit_image(painted, holes.target))
+                write_image(folder / "painted.png", painting.image)
                 write_image(folder / "after.png", result.after.image)
+                summary = {
+                    "painter": painter,
+                    "target_id": result.target_id,
+                    "added": len(result.added),
+                    "recolored": result.num_recolored,
+                    "notes": list(result.notes),
+                }
+                (folder / SUMMARY_FILE).write_text(json.dumps(summary))
             return (str(place / "completed.ply"),)
 
 

@@ -225,3 +225,29 @@ def test_masks_of_the_fox_choose_the_fox(fox, tmp_path):
     visible = seen > 1
     both, either = (chosen & inside & visible).sum(), ((chosen | inside) & visible).sum()
     assert both > 0.7 * either
+
+
+def test_the_hole_of_what_was_removed_can_be_painted(scene, tmp_path, monkeypatch):
+    """With the same selection both times; `strip` gives the splat back."""
+    out, holes = tmp_path / "out", tmp_path / "holes"
+    target = photographed(tmp_path / "camera", [TARGET]) / "transforms.json"
+    words = remove(scene, out, "--box", *CRATE, "--target", target)
+    assert run(monkeypatch, *words, "--export-holes", holes) == 0
+    assert not out.exists()
+    mask = read_image(holes / "target1_mask.png")[..., 0] > 0.5
+    assert 0.03 < mask.float().mean() < 0.5
+    image = read_image(holes / "target1.png")
+    behind, _ = cast(EMPTY, TARGET)
+    write_image(holes / "target1.png", torch.where(mask[..., None], behind, image))
+
+    words = remove(scene, out, "--box", *CRATE, "--images", holes, "--painter", "me")
+    assert run(monkeypatch, *words) == 0
+    completed = load_ply(out / "completed.ply")
+    after = RENDERER.render(completed, TARGET).image
+    left = RENDERER.render(completed[completed.generated == 0], TARGET)
+    hole = left.alpha < 0.5
+    assert (after - behind).abs()[hole].mean() < 0.3 * (left.image - behind).abs()[hole].mean()
+    (row,) = json.loads((out / "summary.json").read_text())["targets"]
+    assert row["painter"] == "me"
+    assert run(monkeypatch, "strip", out / "completed.ply", "--out", tmp_path / "back.ply") == 0
+    assert (tmp_path / "back.ply").read_bytes() == (scene / "splat.ply").read_bytes()

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import importlib.util
 import inspect
+import json
 import sys
 from pathlib import Path
 
@@ -69,7 +70,7 @@ def found(scene):
 
 
 def test_the_holes_come_in_the_layouts_of_comfyui(found):
-    image, mask, _ = found
+    image, mask, _, warped, reference, depth = found
     assert image.shape == (1, SIZE, SIZE, 3)
     assert mask.shape == (1, SIZE, SIZE)
     assert (image.dtype, mask.dtype) == (torch.float32, torch.float32)
@@ -80,9 +81,18 @@ def test_the_holes_come_in_the_layouts_of_comfyui(found):
     error = (image[0] - truth).abs().mean(dim=-1)
     assert error[mask[0] == 0].median() < 0.3 * error[mask[0] == 1].median()
 
+    # For models that take more than an image and a mask.
+    for more in (warped, reference, depth):
+        assert (more.shape, more.dtype) == ((1, SIZE, SIZE, 3), torch.float32)
+    assert (warped[0] - truth).abs()[mask[0] == 0].median() < 0.05
+    differences = [(reference[0] - view_of(Room(), camera).image).abs() for camera in CAMERAS]
+    assert min(difference.max() for difference in differences) < 0.01
+    assert depth.max() == 1
+    assert depth[0][mask[0] == 1].median() == 0
+
 
 def test_the_painted_image_ends_in_the_splat(found, tmp_path):
-    image, mask, holes = found
+    image, mask, holes, *_ = found
     (path,) = call(
         "GSCompleterRegisterPainting", holes=holes, image=paint(image, mask), out=str(tmp_path)
     )
@@ -93,6 +103,10 @@ def test_the_painted_image_ends_in_the_splat(found, tmp_path):
     shown = gsc.load_renderer("cpu").render(scene, holes.target).image
     assert (shown - MAGENTA).abs()[inside].mean() < 0.1
     assert (shown - image[0]).abs()[~inside].mean() < 0.05
+    summary = json.loads((Path(path).parent / "summary.json").read_text())
+    assert summary["painter"] == "ComfyUI"
+    assert summary["target_id"] == 1
+    assert summary["added"] == len(generated)
     assert sorted(file.name for file in Path(path).parent.iterdir()) == [
         *("after.png", "before.png", "completed.ply", "context.ply", "generated.ply"),
         *("painted.png", "summary.json"),
@@ -100,7 +114,7 @@ def test_the_painted_image_ends_in_the_splat(found, tmp_path):
 
 
 def test_each_painting_gets_its_folder_and_may_be_larger(found, tmp_path):
-    image, mask, holes = found
+    image, mask, holes, *_ = found
     large = paint(image, mask).repeat_interleave(2, dim=1).repeat_interleave(2, dim=2)
     results = [
         call("GSCompleterRegisterPainting", holes=holes, image=batch, out=str(tmp_path))[0]
@@ -111,10 +125,24 @@ def test_each_painting_gets_its_folder_and_may_be_larger(found, tmp_path):
     assert (small.sh[-1] - scaled.sh[-1]).abs().max() < 0.2 * small.sh[-1].abs().max()
 
 
+def test_a_layer_with_the_filling_alone_is_enough(found, tmp_path):
+    """Its fourth channel is alpha, and what it does not cover is the scene."""
+    image, mask, holes, *_ = found
+    layer = torch.cat([MAGENTA.expand_as(image) * mask[..., None], mask[..., None]], dim=-1)
+    inputs = {"holes": holes, "image": layer, "out": str(tmp_path), "painter": "a person"}
+    (path,) = call("GSCompleterRegisterPainting", **inputs)
+    shown = gsc.load_renderer("cpu").render(gsc.load_splat(path), holes.target).image
+    assert (shown - MAGENTA).abs()[mask[0] == 1].mean() < 0.1
+    assert (shown - image[0]).abs()[mask[0] == 0].mean() < 0.05
+    summary = json.loads((Path(path).parent / "summary.json").read_text())
+    assert summary["painter"] == "a person"
+    assert summary["notes"] == []
+
+
 def test_a_splat_keeps_its_bytes(scene, tmp_path, monkeypatch):
     seen = [gaussians_of(view_of(Room(), camera)) for camera in CAMERAS[::2]]
     splat = labelled(tmp_path / "splat.ply", gsc.merge(seen))
-    image, mask, holes = find(scene, splat=str(splat))
+    image, mask, holes, *_ = find(scene, splat=str(splat))
     (path,) = call(
         "GSCompleterRegisterPainting", holes=holes, image=paint(image, mask), out=str(tmp_path)
     )
@@ -138,9 +166,12 @@ def test_wrong_inputs_get_a_sentence(scene, more, sentence):
 
 
 def test_wrong_paintings_get_a_sentence_and_write_nothing(found, tmp_path):
-    image, _, holes = found
-    with pytest.raises(gsc.InputError, match="scale it without cropping"):
+    image, _, holes, *_ = found
+    with pytest.raises(gsc.InputError, match="same aspect ratio, without cropping"):
         call("GSCompleterRegisterPainting", holes=holes, image=image[:, :32], out=str(tmp_path))
+    other = view_of(Room(), camera_at(-0.5, yaw=-20, size=SIZE)).image[None]
+    with pytest.raises(gsc.InputError, match="does not show what its camera sees"):
+        call("GSCompleterRegisterPainting", holes=holes, image=other, out=str(tmp_path))
     assert list(tmp_path.iterdir()) == []
 
 

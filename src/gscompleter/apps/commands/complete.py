@@ -35,18 +35,15 @@ class CompleteOptions(CompletingOptions):
     """Only print the plan, write its cameras to targets.json, which `--target` reads, and what they
     see to images."""
     export_holes: Path | None = None
-    """Only write, for each target, what another program needs to paint its hole to this folder:
-    image, mask, warped photographs, depth, reference and camera (holes.json). OUT stays as it is;
-    the same command with `--images` completes the scene."""
+    """Only write to this folder what another program needs to paint the holes of the targets. The
+    same command with `--images` completes the scene."""
     path: bool = False
-    """With `--export-holes`, also write a video along the targets and its mask, for models that
-    repair video (path.mp4, path_mask.mp4)."""
+    """With `--export-holes`, also write a video along the targets and its mask."""
     images: Path | None = None
-    """Folder of images that were painted for the targets, or a repaired video, named as those of
-    `--export-holes`, in place of a generator. Without `--target`, its holes.json has the targets
-    and the context."""
+    """Folder of painted images or of a repaired video, named as `--export-holes` did, in place of a
+    generator. Without `--target`, its holes.json has the targets."""
     painter: str | None = None
-    """Name of the program, model or person that painted them, for the report."""
+    """Name of their painter, for the report."""
     out: Path
     """Folder for completed.ply, the report (report.html), images and summary.json."""
     video: bool = False

@@ -10,8 +10,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import torch
-from jaxtyping import Bool, Float
+from jaxtyping import Float
 from torch import Tensor
 
 from gscompleter import __version__
@@ -20,18 +19,16 @@ from gscompleter.apps.completing.preparation import Prepared
 from gscompleter.apps.inputs.holes_file import HOLES_FILE, HoleRow, read_holes
 from gscompleter.apps.inputs.paintings import is_exported
 from gscompleter.apps.inputs.task import Target
+from gscompleter.apps.report.hole_pictures import HolePictures, draw_hole
 from gscompleter.data.scene import describe_camera
-from gscompleter.generators.warp import BORDER_WIDTH, complete_warp
 from gscompleter.numerics.geometry import pad_camera
-from gscompleter.numerics.image_ops import dilate
 from gscompleter.splats.alignment.similarity import get_scale, transform_camera_exactly
-from gscompleter.stages.select_anchor import find_nearest_view
 from gscompleter.stages.target_view import TargetView, render_target
 from gscompleter.state import Completion
 from gscompleter.system.errors import InputError, quote_value
 from gscompleter.system.files.image import write_depth, write_image
 from gscompleter.system.progress import track
-from gscompleter.types import Camera, View
+from gscompleter.types import Camera
 
 EXPORTED = ("target*.png", PATH_VIDEO, PATH_MASK, HOLES_FILE)
 """Globs of the files that an export may write."""
@@ -41,21 +38,16 @@ DEPTH_STEPS = 65535
 
 @dataclass(frozen=True)
 class ExportedHole:
-    """What a target shows before it is painted."""
+    """A target whose hole is exported."""
 
     number: int
     """Number of the target, from 1, by which its files are named."""
     target: Target
-    image: Float[Tensor, "h w 3"]
-    mask: Bool[Tensor, "h w"]
-    """True where to paint: the hole with its dark rim."""
-    warped: Float[Tensor, "h w 3"]
-    depth: Float[Tensor, "h w"]
-    """z-depth in the unit of the photographs' cameras, 0 in holes."""
-    reference: View
-    """The nearest photograph of the context."""
     camera: Camera
     """In the frame of the photographs, in float64."""
+    pictures: HolePictures
+    depth: Float[Tensor, "h w"]
+    """z-depth in the unit of `camera`, 0 in holes."""
     hole_fraction: float
 
     @property
@@ -135,21 +127,14 @@ def make_export(
     number: int, target: Target, view: TargetView, frame: Float[np.ndarray, "4 4"]
 ) -> ExportedHole:
     """Collect what a target shows; `frame` leads from the photographs to the result."""
-    camera = view.camera.target
-    context = view.make_generator_input()
-    nearest = context.views[find_nearest_view(camera, context.views)]
-    warped = complete_warp(nearest, camera, context)
     back = np.linalg.inv(frame)
-    depth = view.render.depth_map()
+    pictures = draw_hole(view)
     return ExportedHole(
         number,
         target,
-        view.render.image,
-        dilate(view.holes, BORDER_WIDTH),
-        warped.image,
-        torch.where(depth.valid, depth.depth, 0.0) * get_scale(back),
-        nearest,
-        transform_camera_exactly(camera, back),
+        transform_camera_exactly(view.camera.target, back),
+        pictures,
+        pictures.depth * get_scale(back),
         view.holes.float().mean().item(),
     )
 
@@ -157,11 +142,12 @@ def make_export(
 def write_hole(folder: Path, hole: ExportedHole, unit: float, ready: Prepared) -> dict[str, Any]:
     """Write the pictures of a target, and return its entry in `holes.json`."""
     name = hole.name
+    shown = hole.pictures
     pictures = {
-        f"{name}.png": hole.image,
-        f"{name}_mask.png": hole.mask,
-        f"{name}_warped.png": hole.warped,
-        f"{name}_reference.png": hole.reference.image,
+        f"{name}.png": shown.image,
+        f"{name}_mask.png": shown.mask,
+        f"{name}_warped.png": shown.warped,
+        f"{name}_reference.png": shown.reference.image,
     }
     for file, picture in pictures.items():
         write_image(folder / file, picture)
@@ -186,7 +172,7 @@ def write_hole(folder: Path, hole: ExportedHole, unit: float, ready: Prepared) -
         "depth_file_path": f"{name}_depth.png",
         "warped_path": f"{name}_warped.png",
         "reference_path": f"{name}_reference.png",
-        "reference_frame": hole.reference.frame,
-        "reference_file": files.get(hole.reference.frame),
+        "reference_frame": shown.reference.frame,
+        "reference_file": files.get(shown.reference.frame),
         **describe_camera(hole.camera),
     }
