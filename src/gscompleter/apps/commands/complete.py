@@ -21,6 +21,9 @@ class CompleteOptions(CompletingOptions):
     """Cameras to complete the scene for: file names or numbers of photographs, or a file of cameras
     (transforms.json, cameras.json, nerfstudio's camera_path.json, COLMAP's images.txt, SuperSplat
     poses). If not given, cameras that see holes are searched for and written to targets.json."""
+    mask: tuple[Path, ...] = ()
+    """Images that mark what is wrong at the targets, white there: one for each target camera. What
+    they show goes, is a hole whatever stands behind it, and is filled; `strip` puts it back."""
     auto: Annotated[int, Interval(ge=1, le=254)] | None = None
     """Most cameras to search for if no target is given; 4 if no number follows."""
     from_photographs_only: bool = False
@@ -38,6 +41,11 @@ class CompleteOptions(CompletingOptions):
         """Make the request for the cameras, with the targets among the named photographs."""
         request = super().make_poses_request()
         return replace(request, named=(*request.named, *self.target))
+
+    @property
+    def marks(self) -> tuple[Path, ...]:
+        """Masks of what is wrong at the targets."""
+        return self.mask
 
     @property
     def max_targets(self) -> int:

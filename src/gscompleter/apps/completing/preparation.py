@@ -6,7 +6,7 @@ from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
 from jaxtyping import Float
@@ -96,9 +96,11 @@ def prepare_completion(options: CompleteOptions, console: Console) -> Prepared:
     """Open the scene and load the models."""
     options = check_options(options)
     if options.folder is None:
-        opened, task = read_splat_alone(options)
+        options, opened, task = read_splat_alone(options)
         print_lines(console, *opened.photographs.notes)
     else:
+        # With photographs, a scene is what they show, unless the user says otherwise.
+        options = options if options.holes == "auto" else with_holes(options, options.holes)
         opened = open_for_completion(options, console)
         task = read_inputs(options, opened)
     return load_models(options, opened, task, console)
@@ -186,6 +188,11 @@ def check_photographs(options: CompleteOptions) -> CompleteOptions:
                 "The photographs of SCENE have cameras of their own; leave --cameras out, or name "
                 "the splat alone.",
                 "cameras",
+            )
+        if options.up is not None:
+            raise InputError(
+                "The photographs of SCENE tell what is up; leave --up out.",
+                "up",
             )
         return options
     if options.folder is not None and options.scene is not None:
@@ -277,8 +284,13 @@ def sort_splat(
     return gaussians[order], replace(splat_file, file_order=order)
 
 
-def read_splat_alone(options: CompleteOptions) -> tuple[Opened, CompletionTask]:
-    """Read a splat without photographs, and render it in their place; compile the kernels."""
+def read_splat_alone(
+    options: CompleteOptions,
+) -> tuple[CompleteOptions, Opened, CompletionTask]:
+    """Read a splat without photographs, and render it in their place; compile the kernels.
+
+    Returns the options with what a hole of this splat is.
+    """
     assert options.scene is not None
     device = options.device
     # What can be wrong is read before anything that takes time.
@@ -292,13 +304,27 @@ def read_splat_alone(options: CompleteOptions) -> tuple[Opened, CompletionTask]:
 
     reading = replace(options, folder=options.scene).make_scene_request()
     request = RenderRequest(
-        reading, options.cameras, options.target, options.context, options.config.holes
+        reading,
+        options.cameras,
+        options.target,
+        options.context,
+        options.marks,
+        options.config.holes,
+        options.holes,
+        options.up,
     )
     with show_preparation("choosing cameras"):
-        opened, task = open_renders(request, splat_file, gaussians, load_renderer(device), device)
+        renderer = load_renderer(device)
+        opened, task, kind = open_renders(request, splat_file, gaussians, renderer, device)
         if device == "cpu":
             check_scene(task, gaussians)
-    return opened, task
+    return with_holes(options, kind), opened, task
+
+
+def with_holes(options: CompleteOptions, kind: Literal["all", "enclosed"]) -> CompleteOptions:
+    """Return the options with the kind of holes."""
+    config = options.config
+    return replace(options, config=replace(config, holes=replace(config.holes, kind=kind)))
 
 
 def load_completer(options: CompleteOptions, targets: Sequence[Target]) -> GSCompleter:

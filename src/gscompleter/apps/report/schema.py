@@ -121,7 +121,7 @@ class SceneRow:
     splat: str | None = None
     renders_from: str | None = None
     """Where the cameras of renders come from that took the place of photographs: `cameras` of a
-    file, or around the `targets`; None if there are photographs."""
+    file, around the `targets`, or the `pixels` of the splat; None if there are photographs."""
     notes: tuple[str, ...] = ()
     """Sentences about the opening: photographs and cameras that are left out, for example."""
 
