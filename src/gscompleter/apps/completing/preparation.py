@@ -24,6 +24,7 @@ from gscompleter.apps.inputs.memory import check_scene
 from gscompleter.apps.inputs.named_photographs import check_context, check_target_files
 from gscompleter.apps.inputs.opening import choose_working_size, open_scene
 from gscompleter.apps.inputs.reading import read_task
+from gscompleter.apps.inputs.removal import Selection
 from gscompleter.apps.inputs.renders import RenderRequest, open_renders
 from gscompleter.apps.inputs.selection import collect_usable_cameras
 from gscompleter.apps.inputs.splat import add_check_views, locate_splat, move_to_splat
@@ -92,11 +93,16 @@ class Prepared:
         return replace(self, task=replace(self.task, targets=targets))
 
 
-def prepare_completion(options: CompleteOptions, console: Console) -> Prepared:
-    """Open the scene and load the models."""
+def prepare_completion(
+    options: CompleteOptions, console: Console, place: Selection | None = None
+) -> Prepared:
+    """Open the scene and load the models.
+
+    `place` is what will be removed, around which cameras are found if there are no photographs.
+    """
     options = check_options(options)
     if options.folder is None:
-        options, opened, task = read_splat_alone(options)
+        options, opened, task = read_splat_alone(options, place)
         print_lines(console, *opened.photographs.notes)
     else:
         # With photographs, a scene is what they show, unless the user says otherwise.
@@ -285,7 +291,7 @@ def sort_splat(
 
 
 def read_splat_alone(
-    options: CompleteOptions,
+    options: CompleteOptions, place: Selection | None
 ) -> tuple[CompleteOptions, Opened, CompletionTask]:
     """Read a splat without photographs, and render it in their place; compile the kernels.
 
@@ -312,6 +318,8 @@ def read_splat_alone(
         options.config.holes,
         options.holes,
         options.up,
+        place,
+        options.stands_anywhere,
     )
     with show_preparation("choosing cameras"):
         renderer = load_renderer(device)

@@ -66,8 +66,9 @@ class PreparedRemoval(Prepared):
 
 def prepare_removal(options: RemoveOptions, console: Console) -> PreparedRemoval:
     """Open the scene, and load the models; targets are searched for among the photographs."""
-    check_selection(make_selection(options))
-    ready = prepare_completion(options, console)
+    selection = make_selection(options)
+    check_selection(selection)
+    ready = prepare_completion(options, console, selection)
 
     refuse_completed(ready, options.scene)
     explorer = PhotographPlanner(ready.completer)

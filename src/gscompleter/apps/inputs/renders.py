@@ -19,7 +19,8 @@ from torch.nn.functional import interpolate
 
 from gscompleter.apps.inputs.named_photographs import PhotographNames, find_context, read_targets
 from gscompleter.apps.inputs.reading import check_sizes
-from gscompleter.apps.inputs.scene_request import SceneRequest
+from gscompleter.apps.inputs.removal import Selection, select_gaussians
+from gscompleter.apps.inputs.scene_request import LONG_SIDE, SceneRequest
 from gscompleter.apps.inputs.selection import choose_context
 from gscompleter.apps.inputs.task import CompletionTask, InputSplatFile, Opened
 from gscompleter.config import HoleConfig
@@ -32,7 +33,12 @@ from gscompleter.data.local_origin import (
     compute_frame_from_photographs,
     shift_to_origin,
 )
-from gscompleter.data.photographs import Photographs, build_photographs, check_resolution
+from gscompleter.data.photographs import (
+    Photographs,
+    Resolution,
+    build_photographs,
+    check_resolution,
+)
 from gscompleter.numerics.geometry import add_near_plane, is_same_camera
 from gscompleter.render.protocols import Renderer
 from gscompleter.stages.enclosed_holes import keep_enclosed
@@ -49,6 +55,7 @@ from gscompleter.virtual_capture.pixel_aligned import (
     move_beside,
 )
 from gscompleter.virtual_capture.render_views import render_views
+from gscompleter.virtual_capture.standpoints import choose_cameras_around_place, find_standpoints
 
 HoleKind = Literal["all", "enclosed"]
 
@@ -76,6 +83,8 @@ USUAL_UP = (0.0, -1.0, 0.0)
 """Upward direction of most files: the cameras of photographs point y down."""
 MIN_FOUND_COVERED = 0.9
 """Least share of its image in which a camera that was found sees the splat."""
+NUM_STANDPOINTS = 6
+"""Most cameras from which a trained splat looks well."""
 MIN_FOUND_SIDE = 64
 """Least width and height of such a camera, in pixels."""
 TRAINER_LEVELS = 2
@@ -101,7 +110,11 @@ class RenderRequest:
     kind: Literal["auto", "all", "enclosed"] = "auto"
     """Kind of holes; `auto` takes those that an object encloses, and all in a scene."""
     up: tuple[float, float, float] | None = None
-    """Upward direction of a splat whose camera is found; None for that of most files, -y."""
+    """Upward direction of a splat whose cameras are found; None for that of most files, -y."""
+    place: Selection | None = None
+    """What is to be removed, around which cameras are found; None to complete the splat."""
+    takes_standpoints: bool = False
+    """True to stand anywhere if nothing tells where the cameras were."""
 
 
 @dataclass(frozen=True)
@@ -111,7 +124,8 @@ class Capture:
     cameras: Sequence[Camera]
     names: Sequence[str]
     source: str
-    """`cameras` of a file, found around the `targets`, or from the sizes of `pixels`."""
+    """`cameras` of a file, found around the `targets` or the `place` of a removal, from the sizes
+    of `pixels`, or `standpoints`."""
     where: str
     """Clause that says which cameras they are."""
     more: str
@@ -132,7 +146,9 @@ def open_renders(
     reading = request.reading
     check_planes(reading.near, reading.far)
     check_resolution(reading.resolution)
-    path = request.cameras or find_cameras_beside(reading.folder)
+    # Around what is removed, cameras are found; those of a file have to be named.
+    beside = find_cameras_beside(reading.folder) if request.place is None else None
+    path = request.cameras or beside
     check_words(request, path)
 
     # Coordinates of maps are too large for float32, so that work is done near a local origin.
@@ -152,15 +168,19 @@ def open_renders(
     if path is not None:
         capture = take_from_file(path, known, request)
         near_cameras = target_cameras or capture.cameras
+    elif request.place is not None:
+        capture = search_around_place(scene, origin, renderer, request)
+        near_cameras = capture.cameras
     elif targets:
         capture = None
         near_cameras = target_cameras
     else:
-        capture = find_pixel_cameras(scene, renderer, request)
+        capture = find_cameras_alone(scene, renderer, request)
         near_cameras = capture.cameras
     kind = choose_kind(request.kind, scene, near_cameras, renderer)
     holes = [read_marks(*pair) for pair in pair_masks(request.masks, target_cameras)]
-    if not holes:
+    # A removal makes its hole itself.
+    if not holes and request.place is None:
         config = replace(request.holes, kind=kind)
         holes = find_target_holes(target_cameras, scene, renderer, config)
     if capture is None:
@@ -220,7 +240,8 @@ def find_cameras_beside(splat: Path) -> Path | None:
 
 def check_words(request: RenderRequest, path: Path | None) -> None:
     """Refuse names of cameras without a file of them, and a direction that nothing follows."""
-    if request.up is not None and (path is not None or request.targets):
+    follows_targets = bool(request.targets) and request.place is None
+    if request.up is not None and (path is not None or follows_targets):
         raise InputError(
             "The cameras that are given have an upward direction of their own; leave --up out.",
             "up",
@@ -349,14 +370,20 @@ def take_from_file(path: Path, known: Photographs, request: RenderRequest) -> Ca
     return Capture(cameras, names, "cameras", where, more)
 
 
-def find_pixel_cameras(scene: Gaussians, renderer: Renderer, request: RenderRequest) -> Capture:
-    """Find the camera of a pixel-aligned splat, and take it with small moves of it."""
+def find_cameras_alone(scene: Gaussians, renderer: Renderer, request: RenderRequest) -> Capture:
+    """Find cameras by the splat alone.
+
+    That of a pixel-aligned splat is taken with small moves of it; a trained splat tells no more
+    than from where it looks well.
+    """
     resolution = request.reading.resolution
     # Two photographs are the fewest, so that no image had more pixels than half of the Gaussians.
     side = max(MIN_FOUND_SIDE, round((len(scene) / 2) ** 0.5))
     sides = (side,) if resolution is None else (side, *np.ravel(resolution).tolist())
     up = scene.means.new_tensor(request.up or USUAL_UP)
     camera = find_pixel_camera(scene, up, min(sides))
+    if camera is None and request.takes_standpoints:
+        return find_standing_cameras(scene, renderer, request)
     if camera is None:
         raise InputError(
             "The file of the splat does not tell where to stand or what is missing; name a camera "
@@ -377,9 +404,54 @@ def find_pixel_cameras(scene: Gaussians, renderer: Renderer, request: RenderRequ
         replace(moved, near=request.reading.near, far=request.reading.far)
         for moved in move_beside(camera, depth)
     ]
-    names = [f"render {number}" for number in range(1, len(cameras) + 1)]
     where = "cameras that follow from the sizes of its Gaussians"
-    return Capture(cameras, names, "pixels", where, "; --cameras names others")
+    return name_capture(cameras, "pixels", where)
+
+
+def find_standing_cameras(scene: Gaussians, renderer: Renderer, request: RenderRequest) -> Capture:
+    """Find cameras from which a trained splat looks like a photograph."""
+    up = scene.means.new_tensor(request.up or USUAL_UP)
+    side = choose_side(request.reading.resolution)
+    cameras = find_standpoints(scene, up, side, renderer, NUM_STANDPOINTS)
+    if not cameras:
+        raise InputError(
+            "There is no place from which the splat looks like a photograph; name its cameras with "
+            "--cameras, or which way is up with --up."
+        )
+    return name_capture(cameras, "standpoints", "cameras from which it looks like a photograph")
+
+
+def search_around_place(
+    scene: Gaussians,
+    origin: Float[np.ndarray, "3"],
+    renderer: Renderer,
+    request: RenderRequest,
+) -> Capture:
+    """Search for cameras around what is to be removed."""
+    assert request.place is not None
+    chosen = select_gaussians(request.place, scene, origin)
+    up = scene.means.new_tensor(request.up or USUAL_UP)
+    side = choose_side(request.reading.resolution)
+    cameras = choose_cameras_around_place(scene, chosen, up, side, renderer)
+    if not cameras:
+        raise InputError(
+            "No camera around what is to be removed sees it unhidden; name cameras with --cameras, "
+            "or which way is up with --up."
+        )
+    return name_capture(cameras, "place", "cameras around what is removed")
+
+
+def choose_side(resolution: Resolution) -> int:
+    """Choose the width and height of cameras that are found by the splat alone."""
+    if isinstance(resolution, (tuple, list)):
+        return max(resolution)
+    return resolution if isinstance(resolution, int) else LONG_SIDE
+
+
+def name_capture(cameras: Sequence[Camera], source: str, where: str) -> Capture:
+    """Name cameras that were found."""
+    names = [f"render {number}" for number in range(1, len(cameras) + 1)]
+    return Capture(cameras, names, source, where, "; --cameras names others")
 
 
 def search_around(
@@ -396,9 +468,7 @@ def search_around(
         for camera in choose_cameras_around(scene, target, renderer, hole, count):
             if not any(is_same_camera(camera, other) for other in cameras):
                 cameras.append(replace(camera, near=target.near, far=target.far))
-    names = [f"render {number}" for number in range(1, len(cameras) + 1)]
-    where = "cameras that were found around the targets"
-    return Capture(cameras, names, "targets", where, "; --cameras names others")
+    return name_capture(cameras, "targets", "cameras that were found around the targets")
 
 
 def describe_capture(capture: Capture, num_chosen: int) -> str:

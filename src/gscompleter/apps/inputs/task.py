@@ -67,7 +67,8 @@ class Opened:
     """Frames that are kept back: they only score the result."""
     renders_from: str | None = None
     """Where the cameras of renders come from that take the place of photographs: `cameras` of a
-    file, around the `targets`, or the `pixels` of the splat; None if there are photographs."""
+    file, around the `targets` or the `place` of a removal, the `pixels` of the splat, or
+    `standpoints`; None if there are photographs."""
 
     def with_resolution(self, resolution: int) -> Opened:
         """Return a copy with another working size, the longest side in pixels."""
