@@ -182,6 +182,38 @@ def test_an_antialiased_splat_is_named_so_and_saved_as_one(room, tmp_path):
         assert load_ply(tmp_path / "out" / name).is_antialiased, name
 
 
+def test_a_splat_alone_is_completed_and_saved(tmp_path, monkeypatch):
+    splat = tmp_path / "splat.ply"
+    save_ply(splat, gaussians_of(view_of(Room(), camera_at(size=SIZE))))
+    monkeypatch.chdir(tmp_path)
+    words = ["live", "splat.ply", "--out", "out", "--resolution", "64", "64", "--no-open"]
+    ready = serving.prepare(parse_command(words), QUIET)
+    assert ready.opened.renders_from == "pixels"
+    assert ready.options.config.trust == "full"
+    session, result = complete_camera(serving.begin_session(ready), HOLES[0])
+    assert len(result.added) > 0
+    serving.save_session(ready, session)
+    assert (tmp_path / "out" / "renders.json").is_file()
+    kept = load_ply(tmp_path / "out" / "completed.ply")
+    assert torch.equal(kept[kept.generated == 0].means, load_ply(splat).means)
+
+
+def test_a_trained_splat_alone_begins_where_it_looks_well(tmp_path, monkeypatch):
+    monkeypatch.setattr("gscompleter.virtual_capture.standpoints.NUM_RANDOM", 80)
+    monkeypatch.setattr("gscompleter.virtual_capture.standpoints.NUM_IMPROVED", 8)
+    cameras = [camera_at(yaw=angle, size=SIZE, focal=0.45) for angle in (0, 90, 180, 270)]
+    room = merge([gaussians_of(view_of(Room(), camera)) for camera in cameras])
+    # As large as those of a trainer, whatever the distance.
+    save_ply(tmp_path / "room.ply", replace(room, scales=torch.full_like(room.scales, 0.1)))
+    options = LiveOptions(scene=tmp_path / "room.ply", out=tmp_path / "out", resolution=(48, 48))
+    ready = serving.prepare(replace(options, config=CompleterConfig.bare()), QUIET)
+    assert ready.opened.renders_from == "standpoints"
+    session = serving.begin_session(ready)
+    assert len(session.latest.views) >= 2
+    for view in session.latest.views:
+        assert view.valid_mask.float().mean() > 0.5
+
+
 def test_the_frames_that_were_chosen_are_named(room, tmp_path):
     ready = serving.prepare(options_for(room, tmp_path / "out", context=None), QUIET)
     assert ready.options.context == tuple(view.frame for view in ready.task.views)

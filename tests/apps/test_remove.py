@@ -251,3 +251,43 @@ def test_the_hole_of_what_was_removed_can_be_painted(scene, tmp_path, monkeypatc
     assert row["painter"] == "me"
     assert run(monkeypatch, "strip", out / "completed.ply", "--out", tmp_path / "back.ply") == 0
     assert (tmp_path / "back.ply").read_bytes() == (scene / "splat.ply").read_bytes()
+
+
+def test_without_photographs_renders_around_the_place_take_their_part(
+    scene, tmp_path, monkeypatch, capsys
+):
+    out = tmp_path / "out"
+    words = ("remove", "--scene", scene / "splat.ply", "--box", *CRATE, "--resolution", 96)
+    assert run(monkeypatch, *words, "--auto", 1, "--out", out) == 0
+    assert "cameras around what is removed take their place" in capsys.readouterr().err
+    summary = json.loads((out / "summary.json").read_text())
+    assert summary["scene"]["renders_from"] == "place"
+    assert summary["settings"]["config"]["trust"] == "full"
+    assert "removal" in summary["settings"]["config"]["guards"]
+    assert summary["gaussians"]["removed"] > 100
+    assert 2 <= len(summary["context"]) <= 6
+    # Its place is filled at the camera that shows it best, which is one of the renders.
+    assert summary["targets"][0]["added"] > 50
+    back = tmp_path / "back.ply"
+    assert run(monkeypatch, "strip", out / "completed.ply", "--out", back, "--quiet") == 0
+    assert back.read_bytes() == (scene / "splat.ply").read_bytes()
+
+
+@pytest.mark.parametrize(
+    ("words", "sentence"),
+    [
+        (("--mask", "MASKS"), "Masks are named as photographs, and there are none"),
+        (("--sphere", 90, 90, 90, 1), "No Gaussian of the splat"),
+        (("--box", *CRATE, "--no-masks"), "There are no photographs to apply this to"),
+    ],
+)
+def test_what_needs_photographs_is_refused_without(
+    scene, tmp_path, monkeypatch, capsys, words, sentence
+):
+    masks = write_masks(tmp_path / "masks")
+    words = [masks if word == "MASKS" else word for word in words]
+    out = tmp_path / "out"
+    splat = scene / "splat.ply"
+    assert run(monkeypatch, "remove", "--scene", splat, *words, "--out", out, "--quiet") == 2
+    assert sentence in capsys.readouterr().err
+    assert not out.exists()

@@ -1,6 +1,7 @@
 """`complete` of a splat without photographs: cameras are given, beside it, or around a target."""
 
 import json
+import re
 import shutil
 from dataclasses import replace
 from pathlib import Path
@@ -13,7 +14,7 @@ from gscompleter import load_cameras, load_ply, save_ply
 from gscompleter.data.scene import write_cameras
 from gscompleter.system.files.image import read_image, write_image
 from gscompleter.types import Camera
-from scenes import Room, camera_at, gaussians_of, photographed, view_of
+from scenes import Room, camera_at, gaussians_of, photographed, random_gaussians, view_of
 
 SIZE = 64
 
@@ -127,7 +128,19 @@ def test_cameras_alone_let_targets_be_found(folder, tmp_path, monkeypatch):
     ("words", "sentence"),
     [
         ((), "Nothing is named that is to be completed"),
-        (("--scene", "splat.ply"), "does not tell where to stand or what is missing"),
+        (("--scene", "fog.ply"), "does not tell where to stand or what is missing"),
+        (("splat.ply", "--up", "0", "0", "0"), "three numbers that are not all zero"),
+        (("splat.ply", "--up", "0", "1", "0", "--target", "target.json"), "leave --up out"),
+        (("photographs", "--up", "0", "1", "0"), "photographs of SCENE tell what is up"),
+        (("object.ply", "--target", "object.json"), "its only hole there is the space around it"),
+        (("splat.ply", "--mask", "mask.png"), "name the camera of each with --target"),
+        (
+            ("splat.ply", "--target", "target.json", "--mask", "mask.png", "mask.png"),
+            "There are 2 masks and 1 target cameras",
+        ),
+        (("splat.ply", "--target", "target.json", "--mask", "wide.png"), "aspect ratio of 64 × 64"),
+        (("splat.ply", "--target", "target.json", "--mask", "black.png"), "marks nothing"),
+        (("photographs", "--target", "target.json", "--mask", "mask.png"), "Without a splat"),
         (("splat.ply", "--scene", "splat.ply"), "Two splats are named"),
         (("splat.ply", "--target", "3"), "'3' is no target: there are no photographs to name"),
         (("splat.ply", "--target", "target.json", "--context", "0"), "there is none"),
@@ -142,22 +155,34 @@ def test_cameras_alone_let_targets_be_found(folder, tmp_path, monkeypatch):
 def test_what_cannot_be_done_is_refused_with_what_to_give_instead(
     folder, tmp_path, monkeypatch, capsys, words, sentence
 ):
+    write_refused(folder)
+    monkeypatch.chdir(folder)
+    assert run(monkeypatch, "complete", *words, "--out", tmp_path / "out", "--quiet") == 2
+    assert re.search(sentence, capsys.readouterr().err)
+    assert not (tmp_path / "out").exists()
+
+
+def write_refused(folder: Path) -> None:
+    """Write what is refused into the folder, once."""
+    if (folder / "photographs").exists():
+        return
+    photographed(folder / "photographs", [camera_at(0.1, size=SIZE)])
+    save_ply(folder / "fog.ply", random_gaussians(2000))
+    # A ball of Gaussians of one size, in front of nothing.
+    ball = torch.randn((3000, 3), generator=torch.Generator().manual_seed(0))
+    ball = torch.nn.functional.normalize(ball, dim=1) * 0.8 + torch.tensor([0.0, 0.0, 4.0])
+    dots = gaussians_of(view_of(Room(), camera_at(size=SIZE)))[:3000]
+    save_ply(folder / "object.ply", replace(dots, means=ball, scales=torch.full_like(ball, 0.06)))
+    write_cameras(folder / "object.json", [make_camera()])
+    mask = torch.zeros((SIZE, SIZE), dtype=torch.bool)
+    write_image(folder / "black.png", mask)
+    write_image(folder / "wide.png", torch.zeros((SIZE, 2 * SIZE)).bool())
+    mask[20:30, 20:34] = True
+    write_image(folder / "mask.png", mask)
     narrow = make_camera()
     narrow.K[[0, 1], [0, 1]] *= 2
     write_cameras(folder / "opaque.json", [narrow])
     write_cameras(folder / "away.json", [make_camera(yaw=180)])
-    if not (folder / "photographs").exists():
-        photographed(folder / "photographs", [camera_at(0.1, size=SIZE)])
-    monkeypatch.chdir(folder)
-    assert run(monkeypatch, "complete", *words, "--out", tmp_path / "out", "--quiet") == 2
-    assert_sentence(capsys.readouterr().err, sentence)
-    assert not (tmp_path / "out").exists()
-
-
-def assert_sentence(printed: str, sentence: str) -> None:
-    import re
-
-    assert re.search(sentence, printed), printed
 
 
 def test_the_splat_is_kept_bit_for_bit(folder, done):
@@ -187,4 +212,48 @@ def test_a_painted_hole_of_a_splat_alone_is_completed(folder, tmp_path, monkeypa
     assert row["painter"] == "a hand"
     after = read_image(out / "images" / "target1_after.png")
     red = (after[..., 0] > 0.6) & (after[..., 1] < 0.4)
-    assert (red & is_hole).sum() > 0.8 * is_hole.sum()
+    assert (red & is_hole).sum() > 0.7 * is_hole.sum()
+
+
+def test_with_nothing_named_the_camera_of_a_pixel_aligned_splat_is_found(
+    folder, tmp_path, monkeypatch, capsys
+):
+    out = tmp_path / "out"
+    words = ("complete", folder / "splat.ply", "--auto", 1, "--out", out)
+    assert run(monkeypatch, *words) == 0
+    said = capsys.readouterr()
+    assert "renders of the splat at 8 cameras that follow from the sizes" in said.err
+    assert "0.5 dB on average" in said.out
+    summary = read_summary(out)
+    assert summary["scene"]["renders_from"] == "pixels"
+    assert summary["targets"][0]["added"] > 100
+    first = load_cameras(out / "renders.json")[0]
+    assert first.center.norm() < 0.5
+    assert first.forward[2] > 0.98
+
+
+def test_a_camera_that_covers_little_is_refused(folder, tmp_path, monkeypatch, capsys):
+    monkeypatch.setattr("gscompleter.apps.inputs.renders.MIN_FOUND_COVERED", 1.01)
+    words = ("complete", folder / "splat.ply", "--out", tmp_path / "out", "--quiet")
+    assert run(monkeypatch, *words) == 2
+    assert "at least 101% are needed to trust it" in capsys.readouterr().err
+
+
+def test_what_a_mask_marks_goes_and_is_filled_and_strip_puts_it_back(folder, tmp_path, monkeypatch):
+    write_refused(folder)
+    write_cameras(tmp_path / "front.json", [make_camera(0.02)])
+    out = tmp_path / "out"
+    words = ("complete", folder / "splat.ply", "--target", tmp_path / "front.json")
+    words = (*words, "--mask", folder / "mask.png", "--out", out, "--quiet")
+    assert run(monkeypatch, *words) == 0
+    summary = read_summary(out)
+    assert summary["settings"]["mask"] == [str(folder / "mask.png")]
+    assert summary["settings"]["config"]["holes"]["forces_removed"] is True
+    assert summary["gaussians"]["removed"] > 50
+    (target,) = summary["targets"]
+    assert target["added"] > 50
+    # The hole is what was marked, with its seam.
+    assert 0.03 < target["hole_fraction"] < 0.12
+    back = tmp_path / "back.ply"
+    assert run(monkeypatch, "strip", out / "completed.ply", "--out", back, "--quiet") == 0
+    assert back.read_bytes() == (folder / "splat.ply").read_bytes()

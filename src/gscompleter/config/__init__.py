@@ -127,6 +127,10 @@ class HoleConfig(Settings):
     """Smallest share of the target image that must show the scene; others are skipped."""
     dilation: Pixels = 3
     """Pixels by which the hole mask is dilated to hide seams; 0 disables it (paper)."""
+    kind: Literal["all", "enclosed"] = "all"
+    """What is a hole: all empty pixels, or in an object on nothing only those that it encloses."""
+    forces_removed: bool = False
+    """Pixels that showed something removed are holes, whatever stands behind it."""
     candidate_radius: Pixels | None = 16
     """Distance to a hole, in pixels, within which Gaussians are registered (paper: None, all)."""
 
@@ -407,6 +411,14 @@ class CompleterConfig(Settings):
             holes=replace(self.holes, max_alpha=REMOVAL_ALPHA),
             next_best_view=replace(self.next_best_view, border_radius=REMOVAL_RADIUS),
         )
+
+    def for_marks(self) -> CompleterConfig:
+        """Return the same settings for a splat of which the user marked what is wrong.
+
+        That is removed, and its place is a hole whatever stands behind it.
+        """
+        removal = self.for_removal()
+        return replace(removal, holes=replace(removal.holes, forces_removed=True))
 
     def without_guard(self, name: GuardName) -> CompleterConfig:
         """Return the same settings without one guard."""

@@ -43,6 +43,9 @@ steps (decision 003)."""
 OCCLUSION_TOLERANCE = 0.05
 """Distance behind the context, relative to depth, that still counts as the same surface."""
 
+IN_FRONT = 0.98
+"""Depth of what fills a forced hole, relative to what is left in it."""
+
 RenderAlone = Callable[[Gaussians], Render]
 """Renders moved Gaussians at the target without the scene."""
 
@@ -69,7 +72,14 @@ def register_along_rays(
         return Registration(registered, None, losses)
     if config.hole_depth == "scene":
         # A trained splat has its depth from many photographs, which two-view stereo cannot better.
-        depth = fill_smoothly(view.render.depth, ~view.holes).flatten()[pixel_index]
+        # Beside an object there is neither a hole nor a depth.
+        surface = view.render.depth_map(view.state.config.holes.max_alpha)
+        depth = fill_smoothly(surface.depth, ~view.holes & surface.valid)
+        if view.forced is not None:
+            # What is left in a forced hole is wrong, and must not hide what fills it.
+            in_front = torch.minimum(depth, IN_FRONT * surface.depth)
+            depth = torch.where(view.forced & surface.valid, in_front, depth)
+        depth = depth.flatten()[pixel_index]
         return Registration(move_to_depths(coarse, camera, depth), pixel_index, ())
     if config.extrapolate_into_holes and config.degrees_of_freedom == 1:
         return register_beside_holes(coarse, pixel_index, reference, view)
@@ -86,7 +96,8 @@ def register_beside_holes(
     which leaves a step of depth at the border (decision 005).
     """
     camera = reference.camera
-    scene = view.render.depth_map(view.state.config.holes.max_alpha)
+    surface = view.render.depth_map(view.state.config.holes.max_alpha)
+    scene = replace(surface, valid=surface.valid & ~view.empty)
     overlapping = torch.nonzero(scene.valid.flatten()[pixel_index])[:, 0]
     registered, losses = optimize_distances(coarse[overlapping], reference, view)
     ratios = extrapolate_into_holes(

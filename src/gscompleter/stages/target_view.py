@@ -15,9 +15,11 @@ from gscompleter.numerics.image_ops import blur_gaussian, dilate
 from gscompleter.numerics.sky import mask_out_sky
 from gscompleter.render.cache import SceneRenderer
 from gscompleter.render.protocols import FrozenScene
+from gscompleter.render.removed import find_removed
+from gscompleter.stages.enclosed_holes import keep_enclosed
 from gscompleter.stages.select_anchor import AnchorChoice, compute_overlap, select_anchor
-from gscompleter.state import Completion, TargetResult
-from gscompleter.types import Camera, GeneratorInput, PaddedCamera, Render, View
+from gscompleter.state import NEW_PHOTO_ID, Completion, TargetResult
+from gscompleter.types import Camera, GeneratorInput, PaddedCamera, Render, View, merge
 
 FULL_TRUST = 1.0
 """Mean trust of what a pixel shows from which on it is not recoloured."""
@@ -52,12 +54,40 @@ class TargetView:
     @cached_property
     def holes(self) -> Bool[Tensor, "h w"]:
         """Pixels that Φ fills: empty or not trusted."""
-        return compute_hole_mask(self.alpha, self.state.config.holes)
+        return self.find_holes(self.alpha)
 
     @cached_property
     def empty(self) -> Bool[Tensor, "h w"]:
         """Hole mask M_hole of Eq. 12, before dilation: Gaussians are added here."""
-        return compute_hole_mask(self.render.alpha, self.state.config.holes)
+        # Under full trust both are the same.
+        return self.holes if self.alpha is self.render.alpha else self.find_holes(self.render.alpha)
+
+    def find_holes(self, alpha: Float[Tensor, "h w"]) -> Bool[Tensor, "h w"]:
+        """Decide what a hole is, given the accumulated opacity [h, w] that counts."""
+        config = self.state.config.holes
+        holes = compute_hole_mask(alpha, config)
+        # Beside an object nothing is missing; nor is it where an object was taken away from there.
+        if config.kind == "enclosed":
+            holes = keep_enclosed(holes, self.render, self.camera.padded, self.render_at)
+        return holes if self.forced is None else holes | self.forced
+
+    @cached_property
+    def forced(self) -> Bool[Tensor, "h w"] | None:
+        """Pixels that are holes whatever stands there, as the user marked them; None without."""
+        source = self.state.source
+        if not self.state.config.holes.forces_removed or len(source.removed) == 0:
+            return None
+        forced = find_removed(source, self.camera.padded, self.scenes.renderer)
+        # What an earlier target filled is no hole any more.
+        filled = [part[part.generated != NEW_PHOTO_ID] for part in self.state.parts[1:]]
+        if sum(map(len, filled)) == 0:
+            return forced
+        alpha = self.scenes.renderer.render(merge(filled), self.camera.padded).alpha
+        return forced & compute_hole_mask(alpha, self.state.config.holes)
+
+    def render_at(self, camera: Camera) -> Render:
+        """Render the same scene at another camera."""
+        return self.scenes.freeze(self.state.parts, camera).render
 
     @cached_property
     def distrust(self) -> Float[Tensor, "h w"]:
@@ -65,9 +95,11 @@ class TargetView:
         weight = compute_distrust(self.alpha, self.render.alpha)
         # Empty pixels get Gaussians of their own, and are no reason to recolour what is beside
         # them: they are left out before the blur, and again after it.
+        # So is what is empty around an object, and is no hole.
+        covered = ~self.empty & ~compute_hole_mask(self.render.alpha, self.state.config.holes)
         sigma = DISTRUST_BLUR * max(weight.shape)
-        weight = blur_gaussian(weight.where(~self.empty, 0.0), sigma)
-        return weight.where(~self.empty, 0.0)
+        weight = blur_gaussian(weight.where(covered, 0.0), sigma)
+        return weight.where(covered, 0.0)
 
     @property
     def candidate_mask(self) -> Bool[Tensor, "h w"] | None:
@@ -141,14 +173,21 @@ class TargetView:
         )
 
     def make_generator_input(self) -> GeneratorInput:
-        """Collect the input of Φ."""
-        return GeneratorInput(
-            self.state.views,
-            self.view_renders,
-            self.render,
-            self.state.config.holes.max_alpha,
-            self.alpha,
-        )
+        """Collect the input of Φ, whose holes are those of this view."""
+        config = self.state.config.holes
+        render = self.render
+        alpha = self.alpha
+        # Φ takes as holes what has too little alpha, which is more than the holes of an object.
+        if config.kind == "enclosed":
+            alpha = alpha.where(self.holes, 1.0)
+        # What stands in a forced hole is wrong, so that Φ must not see it.
+        if self.forced is not None:
+            alpha = alpha.where(~self.forced, 0.0)
+            shown = ~self.forced
+            render = Render(
+                render.image * shown[..., None], render.depth * shown, render.alpha * shown
+            )
+        return GeneratorInput(self.state.views, self.view_renders, render, config.max_alpha, alpha)
 
 
 def compute_distrust(

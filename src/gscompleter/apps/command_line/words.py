@@ -89,11 +89,16 @@ def parse_words(words: Sequence[str], kinds: Mapping[str, type]) -> Any:
             if words and words[0] in kinds:
                 prog = f"gscompleter {words[0]}"
                 parsed = call_tyro(kinds[words[0]], prog, None, words[1:], registry)
-                if not isinstance(parsed, CompletingOptions) or not parsed.lacks_photographs:
+                if not isinstance(parsed, CompletingOptions):
                     return parsed
-                # Only parsed words tell that a splat comes without photographs. Its config is
-                # another one, whose settings are then the defaults.
-                config, words = load_named_config(counted, has_photographs=False)
+                # Only parsed words tell that a splat comes without photographs, or with masks. Its
+                # config is another one, whose settings are then the defaults.
+                has_marks = bool(parsed.marks)
+                if not parsed.lacks_photographs and not has_marks:
+                    return parsed
+                config, words = load_named_config(
+                    counted, not parsed.lacks_photographs, has_marks=has_marks
+                )
                 registry = make_registry(config, *rules)
                 return call_tyro(kinds[words[0]], prog, None, words[1:], registry)
             named = [Annotated[kind, tyro.conf.subcommand(name)] for name, kind in kinds.items()]
@@ -205,7 +210,7 @@ class NamedConfig:
 
 
 def load_named_config(
-    words: Sequence[str], has_photographs: bool = True
+    words: Sequence[str], has_photographs: bool = True, has_marks: bool = False
 ) -> tuple[CompleterConfig, Sequence[str]]:
     """Load the config of `--config NAME`, and return it with the other words.
 
@@ -223,6 +228,8 @@ def load_named_config(
     config = load_config(named.config, is_splat, has_photographs)
     if words[0] == "remove":
         config = config.for_removal()
+    if has_marks:
+        config = config.for_marks()
     return config, others
 
 

@@ -26,6 +26,9 @@ class CompleteOptions(CompletingOptions):
     """Cameras to complete the scene for: file names or numbers of photographs, or a file of cameras
     (transforms.json, cameras.json, nerfstudio's camera_path.json, COLMAP's images.txt, SuperSplat
     poses). If not given, cameras that see holes are searched for and written to targets.json."""
+    mask: tuple[Path, ...] = ()
+    """Images that mark what is wrong at the targets, white there: one for each target camera. What
+    they show goes, is a hole whatever stands behind it, and is filled; `strip` puts it back."""
     auto: Annotated[int, Interval(ge=1, le=254)] | None = None
     """Most cameras to search for if no target is given; 4 if no number follows."""
     from_photographs_only: bool = False
@@ -65,6 +68,17 @@ class CompleteOptions(CompletingOptions):
     def results(self) -> Path:
         """Folder that is written: that of the export, or else OUT."""
         return self.out if self.export_holes is None else self.export_holes
+
+    @property
+    def marks(self) -> tuple[Path, ...]:
+        """Masks of what is wrong at the targets."""
+        return self.mask
+
+    @property
+    def stands_anywhere(self) -> bool:
+        """True to complete a trained splat of which neither cameras nor targets are known."""
+        # It is seldom of use, so that the search has to be asked for.
+        return self.auto is not None
 
     @property
     def max_targets(self) -> int:

@@ -32,12 +32,17 @@ class RemoveOptions(CompleteOptions):
     """Rotation of the boxes about their centres, as a quaternion w x y z."""
     sphere: tuple[float, float, float, float] | None = None
     """Remove Gaussians inside of a sphere: x, y and z of its centre, and its radius."""
-    mask: Path | None = None
+    mask: Path | None = None  # type: ignore[assignment]
     """Remove what masks show: a folder of images named as photographs, white there."""
     select: Path | None = None
     """Remove the Gaussians of this file, a selection that another program saved."""
     config: Annotated[CompleterConfig, tyro.conf.FlagConversionOff] = REMOVAL_CONFIG
     """Settings of the method, which change those of `--config NAME`."""
+
+    @property
+    def marks(self) -> tuple[Path, ...]:
+        """No masks of targets: here they select what goes."""
+        return ()
 
     def make_scene_request(self) -> SceneRequest:
         """Make the request for the photographs, of which masks of the removal hide nothing."""

@@ -179,10 +179,21 @@ class CompletingOptions(SceneOptions, ModelOptions):
     """File of cameras for a splat without photographs, as of `--target`: renders at some of them
     take the place of photographs. If not given, a cameras.json beside the splat, or cameras that
     are found around the targets."""
+    up: tuple[float, float, float] | None = None
+    """Upward direction of a splat without photographs whose cameras are found by the sizes of its
+    Gaussians: x, y and z in its file. If not given, -y."""
+    holes: Literal["auto", "all", "enclosed"] = "auto"
+    """What is a hole: all that is empty, or only what the splat encloses, as in an object that
+    stands on nothing. `auto` tells an object without photographs by what its cameras see around."""
     no_recolor: bool = False
     """Keep the colours of the splat, too; Gaussians are only added."""
     config: Annotated[CompleterConfig, tyro.conf.FlagConversionOff] = CompleterConfig()
     """Settings of the method, which change those of `--config NAME`."""
+
+    @property
+    def marks(self) -> tuple[Path, ...]:
+        """Masks of what is wrong at the targets."""
+        return ()
 
     @property
     def lacks_photographs(self) -> bool:

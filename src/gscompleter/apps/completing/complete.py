@@ -14,7 +14,8 @@ from rich.console import Console
 from gscompleter.apps.command_line.exit_codes import DONE, ERROR
 from gscompleter.apps.commands.complete import CompleteOptions
 from gscompleter.apps.completing.holes import EXPORTED, refuse_painted, write_holes
-from gscompleter.apps.completing.preparation import Prepared, prepare_completion
+from gscompleter.apps.completing.marking import prepare_marked
+from gscompleter.apps.completing.preparation import Prepared
 from gscompleter.apps.completing.printing import print_completion, print_export, print_plan
 from gscompleter.apps.completing.run_info import describe_run, read_held_out, refuse_results
 from gscompleter.apps.inputs.describing import describe_task, print_lines
@@ -63,7 +64,7 @@ Prepare = Callable[[Any, Console], Prepared]
 """Opens the input of a command, whose options it takes, and loads the models."""
 
 
-def complete_scene(options: CompleteOptions, prepare: Prepare = prepare_completion) -> int:
+def complete_scene(options: CompleteOptions, prepare: Prepare = prepare_marked) -> int:
     """Complete the scene, print a summary, and return the exit code."""
     if options.export_holes is not None:
         export_folder(options, prepare)
@@ -84,7 +85,7 @@ def complete_scene(options: CompleteOptions, prepare: Prepare = prepare_completi
 
 
 def complete_folder(
-    options: CompleteOptions, prepare: Prepare = prepare_completion, takes_over: bool = False
+    options: CompleteOptions, prepare: Prepare = prepare_marked, takes_over: bool = False
 ) -> dict[str, Any]:
     """Complete the scene, write `options.out`, and return the summary."""
     # A missing ffmpeg ends the command at its beginning, not after the completion.

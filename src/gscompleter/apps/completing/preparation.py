@@ -6,7 +6,7 @@ from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
 from jaxtyping import Float
@@ -25,6 +25,7 @@ from gscompleter.apps.inputs.memory import check_scene
 from gscompleter.apps.inputs.named_photographs import check_context, check_target_files
 from gscompleter.apps.inputs.opening import choose_working_size, open_scene
 from gscompleter.apps.inputs.reading import read_task
+from gscompleter.apps.inputs.removal import Selection
 from gscompleter.apps.inputs.renders import RenderRequest, open_renders
 from gscompleter.apps.inputs.selection import collect_usable_cameras
 from gscompleter.apps.inputs.splat import add_check_views, locate_splat, move_to_splat
@@ -93,14 +94,21 @@ class Prepared:
         return replace(self, task=replace(self.task, targets=targets))
 
 
-def prepare_completion(options: CompleteOptions, console: Console) -> Prepared:
-    """Open the scene and load the models."""
+def prepare_completion(
+    options: CompleteOptions, console: Console, place: Selection | None = None
+) -> Prepared:
+    """Open the scene and load the models.
+
+    `place` is what will be removed, around which cameras are found if there are no photographs.
+    """
     options = check_options(options)
     if options.folder is None:
-        opened, task = read_splat_alone(options)
+        options, opened, task = read_splat_alone(options, place)
         task = add_paintings(task, options, opened)
         print_lines(console, *opened.photographs.notes)
     else:
+        # With photographs, a scene is what they show, unless the user says otherwise.
+        options = options if options.holes == "auto" else with_holes(options, options.holes)
         opened = open_for_completion(options, console)
         task = read_inputs(options, opened)
     return load_models(options, opened, task, console)
@@ -197,6 +205,11 @@ def check_photographs(options: CompleteOptions) -> CompleteOptions:
                 "the splat alone.",
                 "cameras",
             )
+        if options.up is not None:
+            raise InputError(
+                "The photographs of SCENE tell what is up; leave --up out.",
+                "up",
+            )
         return options
     if options.folder is not None and options.scene is not None:
         raise InputError(
@@ -287,8 +300,13 @@ def sort_splat(
     return gaussians[order], replace(splat_file, file_order=order)
 
 
-def read_splat_alone(options: CompleteOptions) -> tuple[Opened, CompletionTask]:
-    """Read a splat without photographs, and render it in their place; compile the kernels."""
+def read_splat_alone(
+    options: CompleteOptions, place: Selection | None
+) -> tuple[CompleteOptions, Opened, CompletionTask]:
+    """Read a splat without photographs, and render it in their place; compile the kernels.
+
+    Returns the options with what a hole of this splat is.
+    """
     assert options.scene is not None
     device = options.device
     # What can be wrong is read before anything that takes time.
@@ -302,13 +320,29 @@ def read_splat_alone(options: CompleteOptions) -> tuple[Opened, CompletionTask]:
 
     reading = replace(options, folder=options.scene).make_scene_request()
     request = RenderRequest(
-        reading, options.cameras, options.target, options.context, options.config.holes
+        reading,
+        options.cameras,
+        options.target,
+        options.context,
+        options.marks,
+        options.config.holes,
+        options.holes,
+        options.up,
+        place,
+        options.stands_anywhere,
     )
     with show_preparation("choosing cameras"):
-        opened, task = open_renders(request, splat_file, gaussians, load_renderer(device), device)
+        renderer = load_renderer(device)
+        opened, task, kind = open_renders(request, splat_file, gaussians, renderer, device)
         if device == "cpu":
             check_scene(task, gaussians)
-    return opened, task
+    return with_holes(options, kind), opened, task
+
+
+def with_holes(options: CompleteOptions, kind: Literal["all", "enclosed"]) -> CompleteOptions:
+    """Return the options with the kind of holes."""
+    config = options.config
+    return replace(options, config=replace(config, holes=replace(config.holes, kind=kind)))
 
 
 def load_completer(options: CompleteOptions, targets: Sequence[Target]) -> GSCompleter:

@@ -11,6 +11,7 @@ from rich.console import Console
 from torch import Tensor
 
 from gscompleter.apps.commands.remove import RemoveOptions
+from gscompleter.apps.completing.marking import refuse_completed
 from gscompleter.apps.completing.preparation import Prepared, prepare_completion
 from gscompleter.apps.inputs.removal import (
     Selection,
@@ -21,7 +22,6 @@ from gscompleter.apps.inputs.removal import (
 from gscompleter.editing.removal import remove_gaussians
 from gscompleter.planning.photographs import PhotographPlanner
 from gscompleter.state import Completion
-from gscompleter.system.errors import InputError, quote_value
 from gscompleter.system.progress import stage
 
 SELECTIONS = ("box", "box_rotation", "sphere", "mask", "select")
@@ -66,16 +66,11 @@ class PreparedRemoval(Prepared):
 
 def prepare_removal(options: RemoveOptions, console: Console) -> PreparedRemoval:
     """Open the scene, and load the models; targets are searched for among the photographs."""
-    check_selection(make_selection(options))
-    ready = prepare_completion(options, console)
+    selection = make_selection(options)
+    check_selection(selection)
+    ready = prepare_completion(options, console, selection)
 
-    # `strip` puts back what one removed.ply holds, and so cannot undo two runs.
-    if ready.task.scene is not None and bool((ready.task.scene.generated > 0).any()):
-        raise InputError(
-            f"{quote_value(options.scene)} was completed before, and removed.ply keeps what one "
-            "run removed; strip it first, and remove everything at once."
-        )
-
+    refuse_completed(ready, options.scene)
     explorer = PhotographPlanner(ready.completer)
     return PreparedRemoval(**{**vars(ready), "explorer": explorer})
 

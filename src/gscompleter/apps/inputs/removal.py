@@ -4,16 +4,16 @@ from __future__ import annotations
 
 import os
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
+import numpy as np
 import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
 from gscompleter.apps.inputs.task import CompletionTask, Opened
 from gscompleter.data.frame import ENDINGS, find_file
-from gscompleter.data.local_origin import shift_to_origin
 from gscompleter.data.masks import load_mask
 from gscompleter.data.photographs import Photographs, Resolution, resize_mask
 from gscompleter.editing.removal import sum_in_mask
@@ -85,19 +85,53 @@ def choose_gaussians(
 
     # Boxes and spheres are in the coordinates of the file. The scene was shifted to a local origin
     # if these are large, and float32 could not resolve them.
-    points = scene.means.double() + torch.from_numpy(task.origin).to(scene.means.device)
-    chosen = find_in_region(points, selection)
+    chosen = find_selected(selection, scene, task.origin)
     if selection.masks:
         photographs = opened.photographs
         masks = find_masks(selection.masks, photographs)
         resolution = opened.request.resolution
         chosen |= find_in_masks(masks, scene, photographs, cameras, resolution, renderer)
+    return refuse_nothing(chosen, scene, task.origin)
+
+
+def select_gaussians(
+    selection: Selection, scene: Gaussians, origin: Float[np.ndarray, "3"]
+) -> Bool[Tensor, "n"]:
+    """Select the Gaussians of a splat without photographs, and so without masks of them.
+
+    `scene` is relative to `origin`, which is in the coordinates of the file.
+    """
+    if selection.masks:
+        raise InputError(
+            "Masks are named as photographs, and there are none; select with --box, --sphere or "
+            "--select, or name cameras with --cameras and masks as these.",
+            "mask",
+        )
+    return refuse_nothing(find_selected(selection, scene, origin), scene, origin)
+
+
+def find_selected(
+    selection: Selection, scene: Gaussians, origin: Float[np.ndarray, "3"]
+) -> Bool[Tensor, "n"]:
+    """Find the Gaussians of a scene that are selected in any way but by masks."""
+    points = scene.means.double() + torch.from_numpy(origin).to(scene.means.device)
+    chosen = find_in_region(points, selection)
     if selection.file:
         selected = load_splat(selection.file, selection.drop_nonfinite)
-        selected = shift_to_origin(task.origin, selected, list(cameras.values()))
+        # Moved as the scene was, whose positions are then exactly equal.
+        if origin.any():
+            moved = selected.means.double() - torch.from_numpy(origin)
+            selected = replace(selected, means=moved.float())
         chosen |= find_same_positions(scene, selected.to(scene.means.device))
+    return chosen
 
+
+def refuse_nothing(
+    chosen: Bool[Tensor, "n"], scene: Gaussians, origin: Float[np.ndarray, "3"]
+) -> Bool[Tensor, "n"]:
+    """Return the choice, unless it is empty."""
     if not chosen.any():
+        points = scene.means.double() + torch.from_numpy(origin).to(scene.means.device)
         smallest, largest = points.aminmax(dim=0)
         low = " ".join(f"{x:.4g}" for x in smallest)
         high = " ".join(f"{x:.4g}" for x in largest)

@@ -75,7 +75,8 @@ class Opened:
     """Frames that are kept back: they only score the result."""
     renders_from: str | None = None
     """Where the cameras of renders come from that take the place of photographs: `cameras` of a
-    file, or around the `targets`; None if there are photographs."""
+    file, around the `targets` or the `place` of a removal, the `pixels` of the splat, or
+    `standpoints`; None if there are photographs."""
 
     @property
     def has_numbered_frames(self) -> bool:

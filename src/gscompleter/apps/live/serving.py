@@ -11,7 +11,7 @@ from rich.console import Console
 
 from gscompleter.apps.commands.complete import CompleteOptions
 from gscompleter.apps.commands.live import LiveOptions
-from gscompleter.apps.commands.shared_options import CompletingOptions
+from gscompleter.apps.commands.shared_options import DEFAULT_NUM_TARGETS, CompletingOptions
 from gscompleter.apps.completing.complete import COMMAND, RESULTS, write_done
 from gscompleter.apps.completing.preparation import Prepared, prepare_completion
 from gscompleter.apps.inputs.describing import describe_opening, print_lines
@@ -93,7 +93,8 @@ def prepare(options: LiveOptions, console: Console) -> Prepared:
 def make_complete_options(options: LiveOptions) -> CompleteOptions:
     """Convert the options to those of `complete`."""
     shared = {field.name: getattr(options, field.name) for field in fields(CompletingOptions)}
-    return CompleteOptions(**shared)
+    # A session begins wherever the splat looks well, if nothing tells where its cameras were.
+    return CompleteOptions(**shared, auto=DEFAULT_NUM_TARGETS)
 
 
 def begin_session(ready: Prepared) -> Session:

@@ -48,6 +48,7 @@ BARE_NOTE = (
 RISKS = {
     "cameras": "0.1 dB on average where the cameras came from a file",
     "targets": "0.3 dB on average where they were found around a target",
+    "pixels": "0.5 dB on average where they were found from the splat alone",
 }
 """What photographs lost that nobody had given, by where the cameras came from (decision 053)."""
 NOTHING_NEW_NOTE = (
@@ -67,10 +68,9 @@ def list_notes(summary: CompletionSummary) -> Iterator[str]:
         yield ORIGIN_NOTE
     if scene.renders_from is not None:
         yield BARE_NOTE
-        yield (
-            "Real photographs of the scene that were not given may get worse: on development "
-            f"cases they lost {RISKS[scene.renders_from]}."
-        )
+        worse = "Real photographs of the scene that were not given may get worse"
+        risk = RISKS.get(scene.renders_from)
+        yield f"{worse}." if risk is None else f"{worse}: on development cases they lost {risk}."
     else:
         yield from list_photograph_notes(summary)
     if scene.renders_from is None and summary.settings.get("context") is None:

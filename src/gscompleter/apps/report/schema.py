@@ -123,7 +123,8 @@ class SceneRow:
     splat: str | None = None
     renders_from: str | None = None
     """Where the cameras of renders come from that took the place of photographs: `cameras` of a
-    file, or around the `targets`; None if there are photographs."""
+    file, around the `targets` or the `place` of a removal, the `pixels` of the splat, or
+    `standpoints`; None if there are photographs."""
     notes: tuple[str, ...] = ()
     """Sentences about the opening: photographs and cameras that are left out, for example."""
 

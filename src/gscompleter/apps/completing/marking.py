@@ -1,0 +1,86 @@
+"""Completion of what a user marked as wrong, which goes before its place is filled."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import torch
+from jaxtyping import Bool, Float
+from rich.console import Console
+from torch import Tensor
+
+from gscompleter.apps.commands.complete import CompleteOptions
+from gscompleter.apps.completing.preparation import Prepared, prepare_completion
+from gscompleter.apps.inputs.renders import pair_masks, read_marks
+from gscompleter.editing.marking import find_marked
+from gscompleter.editing.removal import remove_gaussians
+from gscompleter.state import Completion
+from gscompleter.system.errors import InputError, quote_value
+from gscompleter.system.progress import stage
+
+
+@dataclass(frozen=True)
+class PreparedMarked(Prepared):
+    """A completion that begins with the removal of what is marked."""
+
+    def begin(self) -> Completion:
+        """Initialize the context, and remove from it what the masks show."""
+        begun = super().begin()
+        scene = self.task.scene
+        assert scene is not None
+        cameras = [begun.with_depth_range(camera) for camera in self.task.target_cameras]
+        with stage("removing"):
+            marks = [read_marks(*pair) for pair in pair_masks(self.options.marks, cameras)]
+            chosen = find_marked(scene, cameras, marks, self.completer.renderer)
+            if not chosen.any():
+                raise InputError(
+                    "The masks show no Gaussian of the splat; mark what the images of the targets "
+                    "show, or leave --mask out where nothing is to be seen.",
+                    "mask",
+                )
+            return remove_gaussians(begun, chosen, contain_nothing, self.completer.scenes)
+
+    def describe_settings(self) -> dict[str, Any]:
+        """Describe the settings, with the masks."""
+        return {**super().describe_settings(), "mask": [str(path) for path in self.options.marks]}
+
+
+def prepare_marked(options: CompleteOptions, console: Console) -> Prepared:
+    """Open the scene, and load the models; with masks, what they show is removed first."""
+    if not options.marks:
+        return prepare_completion(options, console)
+    check_marks(options)
+    ready = prepare_completion(options, console)
+    refuse_completed(ready, options.scene)
+    # Before anything is rendered or removed.
+    pair_masks(options.marks, ready.task.target_cameras)
+    return PreparedMarked(**vars(ready))
+
+
+def check_marks(options: CompleteOptions) -> None:
+    """Refuse masks without a splat or without targets."""
+    if options.scene is None and not options.lacks_photographs:
+        raise InputError(
+            "Without a splat there is nothing that masks could mark; name it with --scene.", "mask"
+        )
+    if not options.target:
+        raise InputError(
+            "A mask is painted on the image of a target; name the camera of each with --target.",
+            "mask",
+        )
+
+
+def refuse_completed(ready: Prepared, path: Path | None) -> None:
+    """Refuse a splat that was completed before: `strip` cannot undo two runs that remove."""
+    if ready.task.scene is not None and bool((ready.task.scene.generated > 0).any()):
+        raise InputError(
+            f"{quote_value(path or ready.options.scene)} was completed before, and removed.ply "
+            "keeps what one run removed; strip it first, and remove everything at once."
+        )
+
+
+def contain_nothing(points: Float[Tensor, "n 3"]) -> Bool[Tensor, "n"]:
+    """Return False for all points: what is marked goes as a whole, and nothing is cut."""
+    return torch.zeros(len(points), dtype=torch.bool, device=points.device)

@@ -1,0 +1,242 @@
+"""Cameras from which a trained splat looks like a photograph, and cameras around a place in it."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+from itertools import product
+
+import torch
+from jaxtyping import Bool, Float
+from torch import Tensor
+from torch.nn.functional import normalize
+
+from gscompleter.numerics.geometry import look_along, measure_rotation, resize_camera
+from gscompleter.render.lod import MAX_PREVIEW_GAUSSIANS, thin_gaussians
+from gscompleter.render.protocols import Renderer
+from gscompleter.render.view_map import get_view_map
+from gscompleter.types import Camera, Gaussians
+from gscompleter.virtual_capture.pixel_aligned import Core, make_intrinsics, measure_core
+from gscompleter.virtual_capture.quality import measure_quality
+
+SIDE = 48
+"""Width and height of the images in which cameras are compared."""
+FIELD_OF_VIEW = 60.0
+"""Field of view of cameras that are found, in degrees."""
+NEAR = 0.02
+"""Near plane of the images that are compared, in radii of the core."""
+SEED = 0
+
+NUM_RANDOM = 300
+"""Random cameras of the search for standpoints."""
+NUM_IMPROVED = 30
+"""Best cameras that are moved a little, in each of two rounds."""
+NUM_MOVES = 3
+PITCH = (-0.75, 0.35)
+"""Range of the sine of the angle by which a camera looks up."""
+MIN_NEAREST = 0.04
+"""Least depth of the nearest surface, in radii of the core."""
+FREE_NEAREST = 0.12
+"""The same, from which on it does not matter."""
+APART = (0.35, 0.6)
+"""Distance, in radii of the core, and angle, in radians, of standpoints that count as others."""
+MIN_SHARE = 0.3
+"""Least score of a standpoint, relative to the best."""
+
+DISTANCES = (2.5, 4.0, 6.0)
+"""Distances of cameras around a place, in its radii."""
+AZIMUTH_STEP = 20
+ELEVATIONS = (0, 20, 45)
+"""Directions of cameras around a place, in degrees."""
+MIN_SHOWN = 0.35
+"""Least share of a place, against a ball of its size, that a camera around it has to show."""
+AROUND_APART = 35.0
+"""Angle, in degrees, from which on cameras around a place show other sides of it."""
+MIN_AROUND = 0.1
+"""Least gain of a camera around a place, relative to the best."""
+
+
+@dataclass(frozen=True)
+class Standpoint:
+    """A camera with its score."""
+
+    score: float
+    camera: Camera
+
+
+def find_standpoints(
+    scene: Gaussians, up: Float[Tensor, "3"], side: int, renderer: Renderer, count: int
+) -> list[Camera]:
+    """Find up to `count` cameras where a photographer may have stood, the best first.
+
+    Random cameras inside and around the core, level up to a pitch, are rated by what they see; the
+    best are improved. `side` is the size of their images, in pixels.
+    """
+    core = measure_core(scene.means)
+    small = thin_gaussians(scene, MAX_PREVIEW_GAUSSIANS)
+    up = normalize(up, dim=0)
+    generator = torch.Generator().manual_seed(SEED)
+
+    def rate(camera: Camera) -> Standpoint:
+        quality = measure_quality(small, camera, renderer.freeze(small, camera))
+        nearest = quality.nearest / core.radius
+        if nearest < MIN_NEAREST:
+            return Standpoint(0.0, camera)
+        return Standpoint(quality.score * min(nearest / FREE_NEAREST, 1.0), camera)
+
+    def rate_all(cameras: Sequence[Camera]) -> list[Standpoint]:
+        return list(get_view_map(scene.means)(rate, cameras))
+
+    found = rate_all([draw_camera(core, up, generator) for _ in range(NUM_RANDOM)])
+    for reach in (1.0, 0.5):
+        found.sort(key=lambda one: -one.score)
+        moved = [
+            shift_camera(one.camera, core, up, reach, generator)
+            for one in found[:NUM_IMPROVED]
+            for _ in range(NUM_MOVES)
+        ]
+        found += rate_all(moved)
+
+    def measure_apart(one: Camera, other: Camera) -> float:
+        distance = (one.center - other.center).norm().item() / core.radius
+        return distance / APART[0] + math.radians(measure_rotation(one, other)) / APART[1]
+
+    chosen = choose_apart(found, measure_apart, count, MIN_SHARE)
+    return [replace(resize_camera(camera, side, side), near=None) for camera in chosen]
+
+
+def choose_cameras_around_place(
+    scene: Gaussians,
+    chosen: Bool[Tensor, "n"],
+    up: Float[Tensor, "3"],
+    side: int,
+    renderer: Renderer,
+    count: int = 6,
+) -> list[Camera]:
+    """Choose up to `count` cameras that see chosen Gaussians unhidden, from several sides.
+
+    A camera counts by its quality and by the share of the place that it shows.
+    """
+    core = measure_core(scene.means)
+    up = normalize(up, dim=0)
+    middle = scene.means[chosen].median(dim=0).values
+    radius = (scene.means[chosen] - middle).norm(dim=1).quantile(0.9).item()
+    radius = max(radius, 1e-3 * core.radius)
+    small, values = thin_with_values(scene, chosen)
+    half = math.tan(math.radians(FIELD_OF_VIEW) / 2)
+
+    def rate(place: tuple[float, int, int]) -> Standpoint:
+        distance, azimuth, elevation = place
+        aside = make_direction(up, math.radians(azimuth), math.radians(elevation))
+        center = middle + distance * radius * aside
+        camera = make_camera(center, -aside, up, 0.05 * radius)
+        frozen = renderer.freeze(small, camera)
+        # A ball of that radius covers this share of the image.
+        expected = math.pi / distance**2 / (4 * half**2)
+        shown = (frozen.splat(values) > 0.5).float().mean().item() / expected
+        if shown < MIN_SHOWN:
+            return Standpoint(0.0, camera)
+        return Standpoint(measure_quality(small, camera, frozen).score * min(shown, 1.0), camera)
+
+    places = list(product(DISTANCES, range(0, 360, AZIMUTH_STEP), ELEVATIONS))
+    rated = list(get_view_map(scene.means)(rate, places))
+
+    def measure_apart(one: Camera, other: Camera) -> float:
+        return measure_rotation(one, other) / AROUND_APART
+
+    cameras = choose_apart(rated, measure_apart, count, MIN_AROUND)
+    return [replace(resize_camera(camera, side, side), near=None) for camera in cameras]
+
+
+def choose_apart(
+    found: Sequence[Standpoint],
+    measure_apart: Callable[[Camera, Camera], float],
+    count: int,
+    min_share: float,
+) -> list[Camera]:
+    """Choose cameras greedily by score, each as far apart from the others as counts in full."""
+    best = max((one.score for one in found), default=0.0)
+    chosen: list[Camera] = []
+    while len(chosen) < count:
+        gains = [
+            one.score * min([1.0, *(measure_apart(one.camera, other) for other in chosen)])
+            for one in found
+        ]
+        gain = max(gains, default=0.0)
+        if gain <= 0 or gain < min_share * best:
+            break
+        chosen.append(found[gains.index(gain)].camera)
+    return chosen
+
+
+def thin_with_values(
+    scene: Gaussians, chosen: Bool[Tensor, "n"]
+) -> tuple[Gaussians, Float[Tensor, "m"]]:
+    """Thin a scene, and return 1 for each of the Gaussians left that is chosen, else 0."""
+    # The id of a target is a byte that thinning carries along.
+    marked = replace(scene, generated=chosen.to(torch.uint8))
+    small = thin_gaussians(marked, MAX_PREVIEW_GAUSSIANS)
+    return small, small.generated.to(small.means)
+
+
+def draw_camera(core: Core, up: Float[Tensor, "3"], generator: torch.Generator) -> Camera:
+    """Draw a camera in the core or around it, which looks across or at the middle."""
+
+    def draw(low: float, high: float) -> float:
+        return low + (high - low) * torch.rand((), generator=generator).item()
+
+    if draw(0.0, 1.0) < 0.5:
+        offset = torch.tensor([draw(-1.0, 1.0) for _ in range(3)]).to(up)
+        center = core.center + offset * core.radius / 3**0.5
+    else:
+        aside = make_direction(up, draw(0.0, 2 * math.pi), math.radians(draw(-5.0, 45.0)))
+        center = core.center + core.radius * draw(0.5, 2.7) * aside
+    if draw(0.0, 1.0) < 0.5:
+        spot = torch.tensor([draw(-0.25, 0.25) for _ in range(3)]).to(up)
+        forward = core.center + spot * core.radius - center
+    else:
+        forward = make_direction(up, draw(0.0, 2 * math.pi), -math.asin(draw(-0.15, 0.45)))
+    return make_camera(center, limit_pitch(forward, up), up, NEAR * core.radius)
+
+
+def shift_camera(
+    camera: Camera,
+    core: Core,
+    up: Float[Tensor, "3"],
+    reach: float,
+    generator: torch.Generator,
+) -> Camera:
+    """Move and turn a camera a little."""
+    steps = torch.randn((2, 3), generator=generator).to(up)
+    center = camera.center + 0.15 * reach * core.radius * steps[0]
+    forward = limit_pitch(camera.forward + 0.25 * reach * steps[1], up)
+    return make_camera(center, forward, up, NEAR * core.radius)
+
+
+def limit_pitch(forward: Float[Tensor, "3"], up: Float[Tensor, "3"]) -> Float[Tensor, "3"]:
+    """Return a unit direction that looks neither too far up nor too far down."""
+    forward = normalize(forward, dim=0)
+    sine = (forward @ up).clamp(*PITCH)
+    level = normalize(forward - up * (forward @ up), dim=0)
+    return (1 - sine**2).sqrt() * level + sine * up
+
+
+def make_direction(up: Float[Tensor, "3"], azimuth: float, elevation: float) -> Float[Tensor, "3"]:
+    """Make a unit direction from angles in radians."""
+    # Any axis that is not parallel to the upward direction starts the azimuths.
+    start = torch.eye(3).to(up)[int(up.abs().argmin())]
+    first = normalize(start - up * (start @ up), dim=0)
+    second = torch.linalg.cross(up, first)
+    level = math.cos(azimuth) * first + math.sin(azimuth) * second
+    return math.cos(elevation) * level + math.sin(elevation) * up
+
+
+def make_camera(
+    center: Float[Tensor, "3"], forward: Float[Tensor, "3"], up: Float[Tensor, "3"], near: float
+) -> Camera:
+    """Make a small camera at a place."""
+    c2w = torch.eye(4).to(center)
+    c2w[:3, 3] = center
+    K = make_intrinsics(SIDE, math.tan(math.radians(FIELD_OF_VIEW) / 2)).to(center)
+    return look_along(Camera(c2w, K, SIDE, SIDE, near=near), forward, up)

@@ -1,0 +1,62 @@
+"""The camera of a pixel-aligned splat, found from the sizes of its Gaussians."""
+
+from dataclasses import replace
+
+import pytest
+import torch
+
+from gscompleter.render.loading import load_renderer
+from gscompleter.types import merge
+from gscompleter.virtual_capture.kind import is_object
+from gscompleter.virtual_capture.pixel_aligned import (
+    find_pixel_camera,
+    find_pixel_center,
+    measure_core,
+    move_beside,
+)
+from scenes import Room, camera_at, gaussians_of, random_gaussians, view_of
+
+SIZE = 48
+UP = torch.tensor([0.0, -1.0, 0.0])
+
+
+@pytest.mark.parametrize("places", [(0.0,), (-0.2, 0.2)])
+@pytest.mark.parametrize("unit", [1.0, 100.0])
+def test_the_camera_is_where_sizes_are_proportional_to_distances(places, unit):
+    cameras = [camera_at(x, yaw=10, size=SIZE) for x in places]
+    scene = merge([gaussians_of(view_of(Room(), camera)) for camera in cameras])
+    scene = replace(scene, means=unit * scene.means, scales=unit * scene.scales)
+    found = find_pixel_camera(scene, UP, SIZE)
+    middle = unit * torch.stack([camera.center for camera in cameras]).mean(dim=0)
+    assert (found.center - middle).norm() < 0.15 * measure_core(scene.means).radius
+    # It looks where they do, and its horizon is level.
+    assert found.forward @ cameras[0].forward > 0.98
+    assert found.c2w[1, 0].abs() < 1e-4
+    assert 0.6 < found.K[0, 0] / cameras[0].K[0, 0] < 1.5
+
+
+def test_other_splats_have_none():
+    assert find_pixel_center(random_gaussians(2000)) is None
+    scene = gaussians_of(view_of(Room(), camera_at(size=SIZE)))
+    alike = replace(scene, scales=torch.full_like(scene.scales, 0.02))
+    assert find_pixel_center(alike) is None
+    assert find_pixel_center(scene[:3]) is None
+
+
+def test_small_moves_keep_the_view():
+    camera = camera_at(0.3, yaw=20, size=SIZE)
+    first, *others = move_beside(camera, 4.0)
+    assert first is camera
+    for other in others:
+        assert torch.equal(other.c2w[:3, :3], camera.c2w[:3, :3])
+        assert 0.1 < (other.center - camera.center).norm() < 0.6
+
+
+def test_an_object_is_told_by_what_is_around_it():
+    renderer = load_renderer("cpu")
+    inside = [camera_at(yaw=angle, size=SIZE, focal=0.3) for angle in (0, 90, 180, 270)]
+    room = merge([gaussians_of(view_of(Room(), camera)) for camera in inside])
+    cameras = [camera_at(size=SIZE), camera_at(0.3, yaw=40, size=SIZE)]
+    assert not is_object(room, cameras, renderer)
+    box = room[(room.means - torch.tensor([-0.1, 0.9, 2.6])).norm(dim=1) < 1.0]
+    assert is_object(box, cameras, renderer)
