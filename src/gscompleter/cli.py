@@ -25,9 +25,9 @@ from gscompleter.system.process import let_idle_threads_sleep, skip_last_collect
 from gscompleter.system.threads import limit_threads
 
 COMMANDS = (
-    *("complete", "batch", "live", "update", "remove", "clean", "demo", "evaluate", "tables"),
-    *("index", "bench", "models", "convert", "poses", "report", "strip", "view", "doctor"),
-    "warmup",
+    *("complete", "batch", "live", "update", "remove", "repair", "clean", "demo", "evaluate"),
+    *("tables", "index", "bench", "models", "convert", "poses", "report", "strip", "view"),
+    *("doctor", "warmup"),
 )
 """Names of all commands, in the order of the help page.
 

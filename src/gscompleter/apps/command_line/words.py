@@ -40,7 +40,7 @@ Rule = Callable[[StructTypeInfo], StructConstructorSpec | None]
 
 CONTINUING = ("batch", "evaluate")
 """Commands that continue the run in their folder, and replace nothing there."""
-CONFIGURED = ("complete", "live", "update", "remove")
+CONFIGURED = ("complete", "live", "update", "remove", "repair")
 """Commands with the option `--config NAME`."""
 MAX_NAMED_COMMANDS = 3
 """Most commands that a sentence names as those with an option."""

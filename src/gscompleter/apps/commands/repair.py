@@ -1,0 +1,54 @@
+"""The command `repair`: take what is wrong out of a splat, and fill its place."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Annotated
+
+import tyro
+
+from gscompleter.apps.commands.complete import CompleteOptions
+from gscompleter.apps.commands.shared_options import CompletingOptions
+from gscompleter.config import CompleterConfig
+from gscompleter.system.process import import_without_collection
+
+REPAIR_CONFIG = CompleterConfig.splat().for_marks()
+
+
+@dataclass(frozen=True, kw_only=True)
+class RepairOptions(CompletingOptions):
+    """Take what masks mark out of a splat, and fill its place.
+
+    What is marked goes, up to the surface that is seen there, and is a hole whatever stands behind
+    it. SCENE is the splat, or the photographs of the splat of `--scene`, which help. `gscompleter
+    strip` gives the splat back as it was.
+    """
+
+    camera: Path = field()
+    """File with the camera of each mask, as of `--target`."""
+    mask: tuple[Path, ...] = field()
+    """Images of the splat from these cameras, in the same order: white where it is wrong."""
+    out: Path
+    """Folder for completed.ply, the report (report.html), images and summary.json."""
+    config: Annotated[CompleterConfig, tyro.conf.FlagConversionOff] = REPAIR_CONFIG
+    """Settings of the method, which change those of `--config NAME`."""
+
+    @property
+    def marks(self) -> tuple[Path, ...]:
+        """Masks of what is wrong."""
+        return self.mask
+
+    def make_completion(self) -> CompleteOptions:
+        """Make the options of the completion, at the cameras of the masks, that a repair is."""
+        shared = {**vars(self)}
+        camera = shared.pop("camera")
+        return CompleteOptions(**shared, target=(str(camera),))
+
+
+def run_repair(options: RepairOptions) -> int:
+    """Repair the splat, and print a summary; exit codes as of `complete`."""
+    # Imported here, so that help pages do not wait for torch.
+    with import_without_collection():
+        from gscompleter.apps.completing.complete import complete_scene
+    return complete_scene(options.make_completion())
