@@ -281,7 +281,8 @@ def test_targets_of_an_export_are_found(scene, tmp_path, monkeypatch, capsys):
     assert run(monkeypatch, *command) == 0
     printed = capsys.readouterr().out
     assert "Nothing was completed" in printed
-    assert f"--images {tmp_path / 'holes'}" in printed
+    assert f"--images {tmp_path / 'holes'} --painter NAME in place of" in " ".join(printed.split())
+    assert "--export-holes and --auto." in printed
     paint(tmp_path / "holes", 1, MAGENTA)
     images = ("--images", tmp_path / "holes")
     assert run(monkeypatch, *words(scene, tmp_path / "out", *images)) == 0
