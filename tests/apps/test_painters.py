@@ -231,13 +231,17 @@ def test_a_camera_that_was_not_exported_is_refused(scene, holes, tmp_path, monke
         ("{", "is not JSON"),
         ('{"version": "1", "context": [0], "frames": []}', "lists no frames"),
         ('{"version": "1", "frames": []}', "context"),
-        (None, "only files beside it are read"),
+        ({"image_path": "../target1.png"}, "only files beside it are read"),
+        ({"path_frame": 3}, "names frame 3 of a video with 0"),
+        ({"w": "wide"}, "frames.0.w"),
+        ({"transform_matrix": [1, 2]}, "transform_matrix"),
     ],
 )
 def test_a_damaged_holes_file_is_refused(scene, holes, tmp_path, monkeypatch, capsys, damage, part):
-    if damage is None:
+    if isinstance(damage, dict):
+        paint_truth(scene, holes)
         content = json.loads((holes / "holes.json").read_text())
-        content["frames"][0]["image_path"] = "../target1.png"
+        content["frames"][0] |= damage
         damage = json.dumps(content)
     (holes / "holes.json").write_text(damage)
     command = words(scene, tmp_path / "out", "--images", holes)
