@@ -14,6 +14,7 @@ from gscompleter.apps.commands.shared_options import (
     list_inputs,
 )
 from gscompleter.apps.inputs.scene_request import PosesRequest
+from gscompleter.system.errors import InputError, quote_value
 from gscompleter.system.files.overlap import refuse_overlap
 from gscompleter.system.process import import_without_collection
 
@@ -60,9 +61,18 @@ class CompleteOptions(CompletingOptions):
     def check_overlap(self) -> None:
         """Refuse an output that is, holds or lies in an input or the other output."""
         super().check_overlap()
-        if self.export_holes is not None:
-            inputs = [*list_inputs(self), self.out]
-            refuse_overlap(self.export_holes, inputs, "export-holes", may_continue=False)
+        folder = self.export_holes
+        if folder is None:
+            return
+        refuse_overlap(folder, list_inputs(self), "export-holes", may_continue=False)
+        try:
+            refuse_overlap(folder, [self.out], may_continue=False)
+        except InputError as error:
+            raise InputError(
+                f"{quote_value(folder)} and OUT have to lie apart from each other, since what is "
+                "painted is an input of the completion; name another folder.",
+                "export-holes",
+            ) from error
 
     @property
     def results(self) -> Path:

@@ -93,7 +93,8 @@ def write_holes(folder: Path, ready: Prepared, begun: Completion) -> list[str]:
         raise InputError(f"There is nothing to paint: {reason}", "target")
 
     # One unit for all depth maps, as in a transforms.json.
-    unit = max(hole.depth.max().item() for hole in exported) / DEPTH_STEPS
+    farthest = max(hole.depth.max().item() for hole in exported)
+    unit = (farthest or 1.0) / DEPTH_STEPS
     rows = [write_hole(folder, hole, unit, ready) for hole in exported]
     path = None
     if ready.options.path:

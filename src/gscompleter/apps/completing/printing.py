@@ -119,12 +119,15 @@ def print_export(options: CompleteOptions, lines: Sequence[str]) -> None:
     for row in holes.frames:
         table.add_row(row.image_path, format_percent(row.hole_fraction))
     console.print(table)
+    replaced = ["--export-holes"]
+    replaced += ["--path"] if options.path else []
+    replaced += [] if options.auto is None else ["--auto"]
     sentences = [
         *lines,
         f"Nothing was completed. The holes are in {quote_value(folder)}: paint each image where "
         "its mask is white, and save it by the same name (.png, .jpg or .webp).",
         f"Then run the same command with --images {quote_value(folder)} --painter NAME in place of "
-        "--export-holes.",
+        f"{' and '.join(replaced)}.",
     ]
     for sentence in sentences:
         console.print(sentence, markup=False, soft_wrap=True)

@@ -83,6 +83,13 @@ def read_holes(folder: Path) -> HolesFile:
                 f"{quote_value(path)} names the file '{quote_value(name)}', and only files beside "
                 f"it are read; {ADVICE}."
             )
+    num_frames = 0 if holes.path is None else holes.path.num_frames
+    for row in holes.frames:
+        if row.path_frame is not None and row.path_frame not in range(num_frames):
+            raise InputError(
+                f"{quote_value(path)} names frame {row.path_frame} of a video with {num_frames}; "
+                f"{ADVICE}."
+            )
     return holes
 
 

@@ -178,9 +178,11 @@ def list_splat_notes(summary: CompletionSummary) -> Iterator[str]:
     from_photographs = summary.gaussians.get("from_photographs")
     if from_photographs:
         invented = summary.gaussians["added"] - from_photographs
+        painters = {row.painter for row in summary.targets if row.painter}
+        maker = " and ".join(sorted(painters)) or "the generator"
         yield (
             f"{from_photographs:,} of the added Gaussians come from photographs, which show what "
-            f"the splat lacked; the generator invented {invented:,}."
+            f"the splat lacked; {maker} invented {invented:,}."
         )
     if summary.new_photographs == 0 and not from_photographs:
         yield NOTHING_NEW_NOTE
