@@ -63,7 +63,7 @@ def test_a_named_target_is_completed_from_renders_around_it(folder, done, tmp_pa
     page = (done / "report.html").read_text()
     assert "Renders in place of photographs" in page
     assert "No photograph checked this" in page
-    assert "0.3 dB on average" in page
+    assert "0.2 dB on average" in page
     for number in range(1, len(summary["context"]) + 1):
         assert (done / "images" / f"context{number}_render.png").is_file()
     assert len(load_cameras(done / "renders.json")) == len(summary["context"])
