@@ -63,7 +63,7 @@ def test_a_named_target_is_completed_from_renders_around_it(folder, done, tmp_pa
     page = (done / "report.html").read_text()
     assert "Renders in place of photographs" in page
     assert "No photograph checked this" in page
-    assert "0.3 dB on average" in page
+    assert "0.2 dB on average" in page
     for number in range(1, len(summary["context"]) + 1):
         assert (done / "images" / f"context{number}_render.png").is_file()
     assert len(load_cameras(done / "renders.json")) == len(summary["context"])
@@ -232,8 +232,21 @@ def test_with_nothing_named_the_camera_of_a_pixel_aligned_splat_is_found(
     assert first.forward[2] > 0.98
 
 
+def test_around_an_object_no_target_is_found(folder, tmp_path, monkeypatch, capsys):
+    write_refused(folder)
+    write_cameras(tmp_path / "cameras.json", [make_camera(-0.3), make_camera(0.3)])
+    words = ("complete", folder / "object.ply", "--cameras", tmp_path / "cameras.json")
+    out = tmp_path / "out"
+    assert run(monkeypatch, *words, "--auto", 1, "--out", out) == 0
+    said = capsys.readouterr()
+    assert "The splat is an object on nothing" in said.err
+    assert said.out.startswith("Nothing was gained")
+    assert read_summary(out)["gaussians"]["added"] == 0
+    assert read_summary(out)["targets"] == []
+
+
 def test_a_camera_that_covers_little_is_refused(folder, tmp_path, monkeypatch, capsys):
-    monkeypatch.setattr("gscompleter.apps.inputs.renders.MIN_FOUND_COVERED", 1.01)
+    monkeypatch.setattr("gscompleter.apps.inputs.captures.MIN_FOUND_COVERED", 1.01)
     words = ("complete", folder / "splat.ply", "--out", tmp_path / "out", "--quiet")
     assert run(monkeypatch, *words) == 2
     assert "at least 101% are needed to trust it" in capsys.readouterr().err

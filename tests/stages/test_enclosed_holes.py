@@ -8,8 +8,9 @@ import torch
 
 import gscompleter as gsc
 from gscompleter.config import CompleterConfig
-from gscompleter.numerics.geometry import add_near_plane, look_along
-from gscompleter.numerics.image_ops import label_regions
+from gscompleter.config.settings import COVERED
+from gscompleter.numerics.geometry import add_near_plane, look_along, resize_camera, unproject
+from gscompleter.numerics.image_ops import dilate, label_regions
 from gscompleter.render.loading import load_renderer
 from gscompleter.stages.enclosed_holes import keep_enclosed
 from gscompleter.stages.target_view import compute_hole_mask
@@ -147,3 +148,29 @@ def test_parts_of_the_same_object_are_judged_alone():
     assert label_regions(find(cut(make_plate(), 0.4)))[1] == 2
     # What a plate behind covers is no hole.
     assert not find(two)[SIZE // 2, SIZE // 2]
+
+
+def test_most_holes_that_are_cut_into_an_object_count():
+    path = DATA / "formats" / "gaussians" / "playbot_lod4.from-sog.ply"
+    if not path.is_file():
+        pytest.skip(f"needs {path}")
+    scene = gsc.load_splat(path)
+    generator = torch.Generator().manual_seed(3)
+    outcomes = []
+    for degrees in range(10, 370, 45):
+        camera = resize_camera(orbit(scene, degrees), 224, 224)
+        render = RENDERER.render(scene, camera)
+        # Well inside of the object, so that the cut is enclosed.
+        inside = (render.alpha > 0.95) & ~dilate(compute_hole_mask(render.alpha), 14)
+        pixels = inside.nonzero()
+        for choice in torch.randint(0, len(pixels), (2,), generator=generator):
+            y, x = pixels[choice].tolist()
+            middle = unproject(render.depth, camera)[y, x]
+            radius = 0.07 * render.depth[y, x]
+            rest = scene[(scene.means - middle).norm(dim=1) > radius]
+            empty = compute_hole_mask(RENDERER.render(rest, camera).alpha)
+            missing = empty & (render.alpha >= COVERED)
+            counted = find(rest, camera) & missing
+            outcomes.append(int(counted.sum()) > 0.5 * int(missing.sum()))
+    assert len(outcomes) == 16
+    assert sum(outcomes) >= 14

@@ -32,6 +32,7 @@ from gscompleter.planning.candidates import Candidate, is_close, propose_candida
 from gscompleter.render.lod import MAX_PREVIEW_GAUSSIANS, choose_thinned_rows, thin_gaussians
 from gscompleter.render.reference import adapt_to_mode
 from gscompleter.render.view_map import get_view_map
+from gscompleter.stages.enclosed_holes import keep_enclosed
 from gscompleter.stages.select_anchor import compute_overlap, select_anchor
 from gscompleter.stages.target_view import compute_distrust, compute_hole_mask
 from gscompleter.state import Completion
@@ -205,7 +206,16 @@ class ViewPlanner:
         frozen = self.completer.scenes.freeze(completion.parts, camera)
         alpha = completion.trust.compute_alpha(frozen, camera)
         distrust = compute_distrust(alpha, frozen.render.alpha)
-        return SmallView(camera, frozen.render, compute_hole_mask(alpha, config.holes), distrust)
+        holes = compute_hole_mask(alpha, config.holes)
+        # Around an object nothing is to be gained, and its background is no distrust either.
+        if config.holes.kind == "enclosed":
+            distrust = distrust.where(~compute_hole_mask(frozen.render.alpha, config.holes), 0.0)
+            holes = keep_enclosed(holes, frozen.render, camera, partial(self.render, completion))
+        return SmallView(camera, frozen.render, holes, distrust)
+
+    def render(self, completion: Completion, camera: Camera) -> Render:
+        """Render the scene at a camera."""
+        return self.completer.scenes.freeze(completion.parts, camera).render
 
     def add_placeholders(self, completion: Completion, camera: Camera) -> Completion:
         """Close the holes at a camera by grey placeholders."""

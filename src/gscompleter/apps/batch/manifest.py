@@ -25,7 +25,7 @@ FOLDER = "folder"
 """Column of the scene folder."""
 NAME = "name"
 """Column of the job name."""
-PATHS = (FOLDER, "scene", "weights", "depth_weights", "images")
+PATHS = (FOLDER, "scene", "cameras", "weights", "depth_weights", "images")
 """Options that are paths."""
 MARKERS = ("batch.json", "run.json")
 """Files that mark the output folders of `batch` and `evaluate`."""
@@ -77,6 +77,9 @@ def resolve_paths(row: Mapping[str, Any], base: Path) -> Options:
     is_number = isinstance(target, str) and re.fullmatch(r"[\d\s]*", target)
     if isinstance(target, str) and not is_number and os.path.exists(join(target)):
         result["target"] = [join(target)]
+    if isinstance(result.get("mask"), (str, list)):
+        masks = result["mask"] if isinstance(result["mask"], list) else [result["mask"]]
+        result["mask"] = [join(mask) for mask in masks]
     if isinstance(config, str) and config.endswith((".yaml", ".yml")):
         result["config"] = join(config)
     return result

@@ -13,7 +13,7 @@ from torch import Tensor
 
 from gscompleter.apps.commands.complete import CompleteOptions
 from gscompleter.apps.completing.preparation import Prepared, prepare_completion
-from gscompleter.apps.inputs.renders import pair_masks, read_marks
+from gscompleter.apps.inputs.hole_kinds import pair_masks, read_marks
 from gscompleter.editing.marking import find_marked
 from gscompleter.editing.removal import remove_gaussians
 from gscompleter.state import Completion

@@ -15,6 +15,7 @@ from rich.console import Console
 from gscompleter.apps.commands.complete import CompleteOptions
 from gscompleter.apps.commands.shared_options import SceneOptions, parse_resolution
 from gscompleter.apps.completing.paintings import add_paintings, choose_paintings
+from gscompleter.apps.inputs.captures import RenderRequest
 from gscompleter.apps.inputs.depth_range import (
     apply_scene_range,
     apply_splat_range,
@@ -26,7 +27,7 @@ from gscompleter.apps.inputs.named_photographs import check_context, check_targe
 from gscompleter.apps.inputs.opening import choose_working_size, open_scene
 from gscompleter.apps.inputs.reading import read_task
 from gscompleter.apps.inputs.removal import Selection
-from gscompleter.apps.inputs.renders import RenderRequest, open_renders
+from gscompleter.apps.inputs.renders import open_renders
 from gscompleter.apps.inputs.selection import collect_usable_cameras
 from gscompleter.apps.inputs.splat import add_check_views, locate_splat, move_to_splat
 from gscompleter.apps.inputs.task import CompletionTask, InputSplatFile, Opened, Target

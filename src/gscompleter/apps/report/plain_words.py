@@ -47,7 +47,7 @@ BARE_NOTE = (
 )
 RISKS = {
     "cameras": "0.1 dB on average where the cameras came from a file",
-    "targets": "0.3 dB on average where they were found around a target",
+    "targets": "0.2 dB on average where they were found around a target",
     "pixels": "0.5 dB on average where they were found from the splat alone",
 }
 """What photographs lost that nobody had given, by where the cameras came from (decision 053)."""

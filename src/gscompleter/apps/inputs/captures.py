@@ -1,0 +1,226 @@
+"""Cameras at which renders of a splat take the place of photographs."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Literal
+
+import numpy as np
+from jaxtyping import Bool, Float
+from torch import Tensor
+
+from gscompleter.apps.inputs.named_photographs import PhotographNames
+from gscompleter.apps.inputs.removal import Selection, select_gaussians
+from gscompleter.apps.inputs.scene_request import LONG_SIDE, SceneRequest
+from gscompleter.config import HoleConfig
+from gscompleter.data.camera_files import NAME, has_camera_list
+from gscompleter.data.photographs import (
+    Photographs,
+    Resolution,
+)
+from gscompleter.numerics.geometry import add_near_plane, is_same_camera
+from gscompleter.render.protocols import Renderer
+from gscompleter.system.errors import InputError, quote_value
+from gscompleter.types import Camera, Gaussians
+from gscompleter.virtual_capture.around_target import NUM_CAMERAS, choose_cameras_around
+from gscompleter.virtual_capture.pixel_aligned import (
+    find_pixel_camera,
+    move_beside,
+)
+from gscompleter.virtual_capture.standpoints import choose_cameras_around_place, find_standpoints
+
+MAX_AROUND = 12
+"""Most cameras around all targets together: each takes the memory of a frozen scene."""
+USUAL_UP = (0.0, -1.0, 0.0)
+"""Upward direction of most files: the cameras of photographs point y down."""
+MIN_FOUND_COVERED = 0.9
+"""Least share of its image in which a camera that was found sees the splat."""
+NUM_STANDPOINTS = 6
+"""Most cameras from which a trained splat looks well."""
+MIN_FOUND_SIDE = 64
+"""Least width and height of such a camera, in pixels."""
+TRAINER_LEVELS = 2
+"""Folders between the cameras.json of a trainer and its point_cloud/iteration_N/*.ply."""
+
+
+@dataclass(frozen=True)
+class RenderRequest:
+    """A splat without photographs, and what is known of its cameras."""
+
+    reading: SceneRequest
+    """Resolution and depth range; its folder is the file of the splat."""
+    cameras: Path | None = None
+    """File of cameras whose renders take the place of photographs, or None to find cameras."""
+    targets: tuple[str, ...] = ()
+    """Files of cameras, or numbers and names of cameras of `cameras`."""
+    context: PhotographNames | None = None
+    """Numbers or names of the cameras to use; None to choose."""
+    masks: tuple[Path, ...] = ()
+    """Masks that mark what is wrong at each target, white there."""
+    holes: HoleConfig = HoleConfig()
+    """What counts as a hole, but for its kind."""
+    kind: Literal["auto", "all", "enclosed"] = "auto"
+    """Kind of holes; `auto` takes those that an object encloses, and all in a scene."""
+    up: tuple[float, float, float] | None = None
+    """Upward direction of a splat whose cameras are found; None for that of most files, -y."""
+    place: Selection | None = None
+    """What is to be removed, around which cameras are found; None to complete the splat."""
+    takes_standpoints: bool = False
+    """True to stand anywhere if nothing tells where the cameras were."""
+
+
+@dataclass(frozen=True)
+class Capture:
+    """Cameras at which the splat can be rendered in place of photographs."""
+
+    cameras: Sequence[Camera]
+    names: Sequence[str]
+    source: str
+    """`cameras` of a file, found around the `targets` or the `place` of a removal, from the sizes
+    of `pixels`, or `standpoints`."""
+    where: str
+    """Clause that says which cameras they are."""
+    more: str
+    """Clause on what else could be given; empty if the user named the cameras."""
+
+
+def find_cameras_beside(splat: Path) -> Path | None:
+    """Find the cameras.json beside a splat, or in the folder of its trainer; None without one."""
+    folder = splat.resolve().parent
+    # The trainers of 3DGS write point_cloud/iteration_30000/point_cloud.ply below cameras.json.
+    folders = [folder]
+    if folder.parent.name == "point_cloud":
+        folders.append(folder.parents[TRAINER_LEVELS - 1])
+    found = [place / NAME for place in folders if has_camera_list(place / NAME)]
+    return found[0] if found else None
+
+
+def take_from_file(path: Path, known: Photographs, request: RenderRequest) -> Capture:
+    """Take all cameras of a file."""
+    where = f"cameras of {quote_value(path)}"
+    more = ""
+    if request.cameras is None:
+        where += ", which was found beside the splat,"
+        more = "; --cameras names another file"
+    cameras = [known.camera(number, request.reading.resolution) for number in range(len(known))]
+    names = [frame.file_name for frame in known.frames]
+    return Capture(cameras, names, "cameras", where, more)
+
+
+def find_cameras_alone(scene: Gaussians, renderer: Renderer, request: RenderRequest) -> Capture:
+    """Find cameras by the splat alone.
+
+    That of a pixel-aligned splat is taken with small moves of it; a trained splat tells no more
+    than from where it looks well.
+    """
+    resolution = request.reading.resolution
+    # Two photographs are the fewest, so that no image had more pixels than half of the Gaussians.
+    side = max(MIN_FOUND_SIDE, round((len(scene) / 2) ** 0.5))
+    sides = (side,) if resolution is None else (side, *np.ravel(resolution).tolist())
+    up = scene.means.new_tensor(request.up or USUAL_UP)
+    camera = find_pixel_camera(scene, up, min(sides))
+    if camera is None and request.takes_standpoints:
+        return find_standing_cameras(scene, renderer, request)
+    if camera is None:
+        raise InputError(
+            "The file of the splat does not tell where to stand or what is missing; name a camera "
+            "to complete it for with --target, or the cameras it was made from with --cameras, or "
+            "its photographs as SCENE."
+        )
+    ranged = add_near_plane(camera, scene.means)
+    seen = renderer.render(scene, ranged).depth_map()
+    covered = seen.valid.float().mean().item()
+    if covered < MIN_FOUND_COVERED:
+        raise InputError(
+            f"The camera that fits the splat sees it in {covered:.0%} of its image, and at least "
+            f"{MIN_FOUND_COVERED:.0%} are needed to trust it; name a camera with --target, or the "
+            "cameras it was made from with --cameras."
+        )
+    depth = seen.depth[seen.valid].median().item()
+    cameras = [
+        replace(moved, near=request.reading.near, far=request.reading.far)
+        for moved in move_beside(camera, depth)
+    ]
+    where = "cameras that follow from the sizes of its Gaussians"
+    return name_capture(cameras, "pixels", where)
+
+
+def find_standing_cameras(scene: Gaussians, renderer: Renderer, request: RenderRequest) -> Capture:
+    """Find cameras from which a trained splat looks like a photograph."""
+    up = scene.means.new_tensor(request.up or USUAL_UP)
+    side = choose_side(request.reading.resolution)
+    cameras = find_standpoints(scene, up, side, renderer, NUM_STANDPOINTS)
+    if not cameras:
+        raise InputError(
+            "There is no place from which the splat looks like a photograph; name its cameras with "
+            "--cameras, or which way is up with --up."
+        )
+    return name_capture(cameras, "standpoints", "cameras from which it looks like a photograph")
+
+
+def search_around_place(
+    scene: Gaussians,
+    origin: Float[np.ndarray, "3"],
+    renderer: Renderer,
+    request: RenderRequest,
+) -> Capture:
+    """Search for cameras around what is to be removed."""
+    assert request.place is not None
+    chosen = select_gaussians(request.place, scene, origin)
+    up = scene.means.new_tensor(request.up or USUAL_UP)
+    side = choose_side(request.reading.resolution)
+    cameras = choose_cameras_around_place(scene, chosen, up, side, renderer)
+    if not cameras:
+        raise InputError(
+            "No camera around what is to be removed sees it unhidden; name cameras with --cameras, "
+            "or which way is up with --up."
+        )
+    return name_capture(cameras, "place", "cameras around what is removed")
+
+
+def choose_side(resolution: Resolution) -> int:
+    """Choose the width and height of cameras that are found by the splat alone."""
+    if isinstance(resolution, (tuple, list)):
+        return max(resolution)
+    return resolution if isinstance(resolution, int) else LONG_SIDE
+
+
+def search_around(
+    targets: Sequence[Camera],
+    holes: Sequence[Bool[Tensor, "h w"]],
+    scene: Gaussians,
+    renderer: Renderer,
+) -> Capture:
+    """Search for cameras around the holes of all targets."""
+    # Fewer around each of many targets.
+    count = max(1, min(NUM_CAMERAS, MAX_AROUND // max(len(targets), 1)))
+    cameras: list[Camera] = []
+    for target, hole in zip(targets, holes, strict=True):
+        for camera in choose_cameras_around(scene, target, renderer, hole, count):
+            if not any(is_same_camera(camera, other) for other in cameras):
+                cameras.append(replace(camera, near=target.near, far=target.far))
+    if not cameras:
+        raise InputError(
+            "No camera around the targets sees what surrounds their holes; move them closer to the "
+            "scene, or name cameras with --cameras.",
+            "target",
+        )
+    return name_capture(cameras, "targets", "cameras that were found around the targets")
+
+
+def name_capture(cameras: Sequence[Camera], source: str, where: str) -> Capture:
+    """Name cameras that were found."""
+    names = [f"render {number}" for number in range(1, len(cameras) + 1)]
+    return Capture(cameras, names, source, where, "; --cameras names others")
+
+
+def describe_capture(capture: Capture, num_chosen: int) -> str:
+    """Write the sentence on the cameras whose renders take the place of photographs."""
+    total = len(capture.cameras)
+    count = f"{total}" if num_chosen == total else f"{num_chosen} of the {total}"
+    return (
+        f"There are no photographs: renders of the splat at {count} {capture.where} take their "
+        f"place{capture.more}."
+    )

@@ -1,0 +1,113 @@
+"""What a hole of a splat without photographs is, and what the user marked as one."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from functools import partial
+from pathlib import Path
+from typing import Literal
+
+import torch
+from jaxtyping import Bool
+from torch import Tensor
+from torch.nn.functional import interpolate
+
+from gscompleter.config import HoleConfig
+from gscompleter.data.cameras import has_same_aspect
+from gscompleter.numerics.geometry import add_near_plane
+from gscompleter.render.protocols import Renderer
+from gscompleter.stages.enclosed_holes import keep_enclosed
+from gscompleter.stages.target_view import compute_hole_mask, explain_little_covered
+from gscompleter.system.errors import InputError, quote_value
+from gscompleter.system.files.image import read_mask
+from gscompleter.types import Camera, Gaussians
+from gscompleter.virtual_capture.kind import is_object
+from gscompleter.virtual_capture.pixel_aligned import (
+    find_pixel_center,
+)
+
+HoleKind = Literal["all", "enclosed"]
+OPAQUE = (
+    "The splat is opaque everywhere in the image of the target, and nothing in it tells what is "
+    "wrong; mark that with --mask, or name the photographs of the scene as SCENE."
+)
+NOTHING_ENCLOSED = (
+    "The splat is an object on nothing, and its only hole there is the space around it, which "
+    "stays empty; mark what is wrong with --mask, or fill all that is empty with --holes all."
+)
+OBJECT_NOTE = (
+    "The splat is an object on nothing: only holes that it encloses are filled (--holes all fills "
+    "what is around it, too)."
+)
+
+
+def choose_kind(
+    kind: str, scene: Gaussians, cameras: Sequence[Camera], renderer: Renderer
+) -> HoleKind:
+    """Choose what a hole is: of an object on nothing, only what it encloses."""
+    if kind == "enclosed" or (
+        kind == "auto"
+        and find_pixel_center(scene) is None
+        and is_object(scene, [camera.to(scene.means.device) for camera in cameras], renderer)
+    ):
+        return "enclosed"
+    return "all"
+
+
+def find_target_holes(
+    targets: Sequence[Camera], scene: Gaussians, renderer: Renderer, config: HoleConfig
+) -> list[Bool[Tensor, "h w"]]:
+    """Find the holes that each target sees; refuse targets if none of them can be completed."""
+    reasons = []
+    holes = []
+    for target in targets:
+        ranged = add_near_plane(target, scene.means)
+        render = renderer.render(scene, ranged)
+        covered = render.depth_map().valid.float().mean().item()
+        reason = explain_little_covered(covered, config)
+        empty = compute_hole_mask(render.alpha, config)
+        if reason is None and not empty.any():
+            reason = OPAQUE
+        if config.kind == "enclosed":
+            empty = keep_enclosed(empty, render, ranged, partial(renderer.render, scene))
+        if reason is None and not empty.any():
+            reason = NOTHING_ENCLOSED
+        reasons.append(reason)
+        holes.append(empty)
+    # One target that can be completed is enough; the report says why others were not.
+    if reasons and None not in reasons:
+        raise InputError(str(reasons[0]), "target")
+    return holes
+
+
+def pair_masks(masks: Sequence[Path], targets: Sequence[Camera]) -> list[tuple[Path, Camera]]:
+    """Pair masks with the targets that they belong to, in order."""
+    if masks and len(masks) != len(targets):
+        raise InputError(
+            f"There are {len(masks)} masks and {len(targets)} target cameras; give a mask for each "
+            "target, in their order.",
+            "mask",
+        )
+    return list(zip(masks, targets, strict=True)) if masks else []
+
+
+def read_marks(path: Path, target: Camera) -> Bool[Tensor, "h w"]:
+    """Read the white pixels of a mask at the size of its target."""
+    white = ~read_mask(path)
+    size = white.shape[1], white.shape[0]
+    if not has_same_aspect(size, (target.width, target.height)):
+        raise InputError(
+            f"{quote_value(path)} has {size[0]} × {size[1]} pixels, and its target has the aspect "
+            f"ratio of {target.width} × {target.height}; paint it on the image of the target.",
+            "mask",
+        )
+    if not white.any() or white.all():
+        raise InputError(
+            f"{quote_value(path)} marks {'all' if white.all() else 'nothing'} of its target; paint "
+            "white what is wrong, and black what is right.",
+            "mask",
+        )
+    mask = torch.from_numpy(white).to(target.K.device)[None, None].float()
+    size_at_target = (target.height, target.width)
+    # A pixel is marked if half of it is.
+    return interpolate(mask, size=size_at_target, mode="area")[0, 0] >= 0.5
