@@ -139,7 +139,7 @@ def write_report(
     outcome = asdict(judge_completion(completion, held_out_rows, has_searched=has_searched))
     write_scenes(folder, completion, input_splat)
     around = render_around()
-    name_view = "ignored" if run_info["scene"].get("renders_from") is None else "render"
+    name_view = "ignored" if run_info.get("scene", {}).get("renders_from") is None else "render"
     write_pictures(folder / IMAGES, completion, targets, at_targets, name_view)
     write_photographs(folder / IMAGES, completion, shown, renderer)
     record = make_record(completion, thin_evenly(photographs, MAX_PHOTOGRAPHS))
