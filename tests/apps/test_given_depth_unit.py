@@ -150,3 +150,21 @@ def test_one_photograph_of_another_unit_is_not_outvoted():
     given = np.where(number == 3, 3 * TRUE, TRUE)
     assert not fit_depth_factor(DepthSamples(given, TRUE, number)).is_consistent
     assert fit_depth_factor(DepthSamples(TRUE, TRUE, number)).is_consistent
+
+
+def test_scattered_depths_of_one_photograph_prove_nothing():
+    """Of a pair with a wrong pose hardly any depth agrees, and the others with no factor either."""
+    measured = TRUE.copy()
+    photograph = np.repeat([0, 1, 2], [150, 150, 100])
+    is_scattered = photograph == 2
+    measured[is_scattered] *= RANDOM.uniform(1.3, 2.6, 100)
+    fit = fit_depth_factor(DepthSamples(TRUE, measured, photograph))
+    assert fit is not None
+    assert fit.is_consistent
+    assert fit.factor == 1.0
+
+    # Inverted depths scatter as well, but in the wrong order.
+    inverted = np.where(is_scattered, 20 / TRUE, TRUE)
+    fit = fit_depth_factor(DepthSamples(inverted, TRUE, photograph))
+    assert fit is not None
+    assert not fit.is_consistent

@@ -167,7 +167,8 @@ def contradicts_factor(samples: DepthSamples, log_factor: float) -> bool:
     """Return True if the samples of one photograph tell that it has another factor, or none.
 
     Samples that agree with no factor at all prove nothing: they come from a pair with a wrong pose
-    or a short baseline, whose triangulated depths scatter (7 of 40 targets of redkitchen).
+    or a short baseline, whose triangulated depths scatter (a photograph of redkitchen has 0.42 to
+    0.83 of the sensor's depth between the 10 % and 90 % quantiles).
     """
     ratios = np.log(samples.measured) - np.log(samples.given)
     if compute_agreement(ratios, log_factor) >= MIN_AGREEMENT:
