@@ -324,7 +324,7 @@ def test_what_is_no_command_gets_a_sentence_too(monkeypatch, capsys, words):
     [
         (
             ("evaluate", "a", "--out", "b", "--overwrite"),
-            "evaluate has no option --overwrite, which belongs to complete, live, update and 9 "
+            "evaluate has no option --overwrite, which belongs to complete, live, update and 10 "
             "more; evaluate continues the run in its folder (see gscompleter evaluate --help).",
         ),
         (
@@ -418,7 +418,7 @@ def test_help_has_every_option_and_one_for_the_settings(monkeypatch, capsys, com
     monkeypatch.setenv("COLUMNS", "100")
     assert run(monkeypatch, command, "--help") == 0
     said = capsys.readouterr().out
-    assert said.count("\n") < 125
+    assert said.count("\n") < 145
     assert "None" not in said
     shown = set(re.findall(r"^(?:  |│ )(?:-h, )?(--[a-z-]+)", said, re.MULTILINE))
     kind = OptionClasses()[command]
@@ -582,7 +582,7 @@ def num_written(folder: Path) -> int:
 
 @pytest.mark.linux
 @pytest.mark.skipif(os.name != "posix", reason="kills with a POSIX signal")
-@pytest.mark.parametrize("written", [2, 4, 8])
+@pytest.mark.parametrize("written", [2, 8])
 def test_a_kill_leaves_no_half_written_scene(scene, tmp_path, written):
     """The process is killed after it has begun to write this many files and folders."""
     out = tmp_path / "out"

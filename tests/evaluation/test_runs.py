@@ -222,6 +222,7 @@ for delay in delays:
 """Program of runs in sequence, each killed seconds after it wrote something new, or never."""
 
 
+@pytest.mark.slow
 @pytest.mark.linux
 @pytest.mark.skipif(os.name != "posix", reason="forks, and kills with a POSIX signal")
 def test_a_run_killed_five_times_ends_as_one_that_was_not(scenes, finished, tmp_path):

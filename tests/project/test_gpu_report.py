@@ -160,9 +160,12 @@ def test_limits_leave_time_for_what_comes_after_the_build():
 @pytest.mark.parametrize(
     "part",
     [
-        *("build", "agreement", "renderer", "stages", "profile", "models"),
-        # Minutes on a CPU.
-        *(pytest.param(part, marks=pytest.mark.slow) for part in ("commands", "baselines")),
+        *("build", "agreement", "renderer", "models"),
+        # Up to minutes on a CPU.
+        *(
+            pytest.param(part, marks=pytest.mark.slow)
+            for part in ("stages", "profile", "commands", "baselines")
+        ),
     ],
 )
 def test_every_part_gives_rows(part):

@@ -78,7 +78,7 @@ def test_a_mac_that_is_none_is_refused():
 
 def test_a_gpu_without_gsplat_runs_networks_alone(gpu, monkeypatch, caplog):
     monkeypatch.setattr("importlib.util.find_spec", lambda name: None)
-    with caplog.at_level(logging.WARNING):
+    with caplog.at_level(logging.WARNING, logger="gscompleter"):
         assert choose_devices("auto") == Devices("cpu", "cuda")
         assert choose_devices("auto") == Devices("cpu", "cuda")
     said = [record.getMessage() for record in caplog.records]
@@ -115,7 +115,7 @@ def test_a_compiler_that_fails_is_a_sentence(gpu, tmp_path, monkeypatch):
 def test_compiled_gsplat_draws_and_is_tried_once(gpu, tmp_path, monkeypatch, caplog):
     install_gsplat(tmp_path, COMPILED, monkeypatch)
     monkeypatch.setattr(gsplat_kernels, "find_missing_tools", lambda: iter(()))
-    with caplog.at_level(logging.WARNING):
+    with caplog.at_level(logging.WARNING, logger="gscompleter"):
         assert choose_devices("auto") == Devices("cuda", "cuda")
         assert choose_devices("cuda", networks="cpu") == Devices("cuda", "cpu")
     said = [record.getMessage() for record in caplog.records]
@@ -128,7 +128,7 @@ def test_nothing_is_said_of_compiling_what_is_compiled(gpu, tmp_path, monkeypatc
     built = tmp_path / "extensions" / "py311_cu130" / "gsplat_cuda"
     built.mkdir(parents=True)
     (built / "gsplat_cuda.so").touch()
-    with caplog.at_level(logging.WARNING):
+    with caplog.at_level(logging.WARNING, logger="gscompleter"):
         assert choose_device("auto") == "cuda"
     assert not caplog.records
 
