@@ -112,6 +112,14 @@ def test_a_compiler_that_fails_is_a_sentence(gpu, tmp_path, monkeypatch):
         choose_device("cuda")
 
 
+def test_a_gsplat_that_cannot_be_imported_is_a_sentence(gpu, tmp_path, monkeypatch):
+    install_gsplat(tmp_path, COMPILED, monkeypatch)
+    (tmp_path / "gsplat" / "__init__.py").write_text("import package_that_is_not_there\n")
+    assert choose_device("auto") == "cpu"
+    with pytest.raises(InputError, match="No module named 'package_that_is_not_there'"):
+        choose_device("cuda")
+
+
 def test_compiled_gsplat_draws_and_is_tried_once(gpu, tmp_path, monkeypatch, caplog):
     install_gsplat(tmp_path, COMPILED, monkeypatch)
     monkeypatch.setattr(gsplat_kernels, "find_missing_tools", lambda: iter(()))

@@ -7,6 +7,7 @@ import logging
 import os
 import shutil
 from collections.abc import Iterator
+from contextlib import suppress
 from functools import cache
 from pathlib import Path
 
@@ -75,8 +76,10 @@ def load_gsplat() -> str | None:
 
 def has_compiled_gsplat() -> bool:
     """Return True if gsplat's kernels are compiled: in its package, or in torch's cache."""
-    if importlib.util.find_spec("gsplat.csrc") is not None:
-        return True
+    # This imports gsplat itself. If that fails, `load_gsplat` meets the same error and says it.
+    with suppress(Exception):
+        if importlib.util.find_spec("gsplat.csrc") is not None:
+            return True
     from torch.utils import cpp_extension
 
     root = os.environ.get("TORCH_EXTENSIONS_DIR") or cpp_extension.get_default_build_root()
