@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
@@ -12,13 +13,17 @@ import pytest
 import torch
 
 from browsing import CHROMIUM, SWITCHES, Picture, Tab, launched, needed
+from command import run
+from gscompleter import load_cameras, save_ply
 from gscompleter.apps.viewer import page as pages
 from gscompleter.apps.viewer.exhibit import ViewerContent
 from gscompleter.apps.viewer.packages import Libraries, load_libraries
 from gscompleter.apps.viewer.page import make_page
 from gscompleter.render.loading import load_renderer
 from gscompleter.system.errors import InputError
+from gscompleter.system.files.image import read_image
 from gscompleter.types import Camera, Gaussians
+from parity import assert_close
 from viewer_pages import LEFT, SIDE, TARGET, room_exhibit
 
 pytestmark = pytest.mark.browser
@@ -320,3 +325,62 @@ def test_text_from_outside_stays_text(browser, libraries, tmp_path):
     assert tab.page.locator("h1").text_content() == evil
     assert tab.page.locator("h1 *").count() == 0
     tab.context.close()
+
+
+def test_what_is_painted_is_saved_with_its_camera_and_repaired(
+    browser, saved, exhibit, tmp_path, monkeypatch
+):
+    tab = Window(browser, saved, 900, 700)
+    tab.do('gsc.goTo("target-1")')
+    assert not tab.page.is_visible("#brush")
+    tab.key("m")
+    assert tab.do("gsc.stats()")["drag"] == "mark"
+    assert tab.page.is_visible("#brush")
+    eye = tab.do("gsc.stats().eye")
+
+    # A stroke through the middle of the picture, which is where the photograph is.
+    box = tab.page.locator("#stage").bounding_box()
+    middle = (box["x"] + box["width"] / 2, box["y"] + box["height"] / 2)
+    tab.page.mouse.move(middle[0] - 40, middle[1])
+    tab.page.mouse.down()
+    tab.page.mouse.move(middle[0] + 40, middle[1], steps=5)
+    tab.page.mouse.up()
+    assert distance(tab.do("gsc.stats().eye"), eye) == 0.0
+    with tab.page.expect_download() as download:
+        tab.page.click("#save-mask")
+    download.value.save_as(tmp_path / "mask.png")
+    with tab.page.expect_download() as download:
+        tab.key("c")
+    download.value.save_as(tmp_path / "camera.json")
+    assert download.value.suggested_filename == "camera.json"
+
+    # The mask has the size of the photograph, and the stroke in its middle.
+    mask = read_image(tmp_path / "mask.png").mean(dim=-1) > 0.5
+    assert mask.shape == (TARGET.height, TARGET.width)
+    rows, columns = torch.nonzero(mask).float().mean(dim=0).tolist()
+    assert abs(rows - TARGET.height / 2) < 1.5
+    assert abs(columns - TARGET.width / 2) < 1.5
+    assert 0.005 < mask.float().mean() < 0.2
+    (camera,) = load_cameras(tmp_path / "camera.json")
+    assert_close(camera.c2w, TARGET.c2w, "c2w", 1e-5)
+    assert_close(camera.K, TARGET.K, "K", 1e-6)
+
+    # An erased stroke, one that is taken back, and a move leave nothing.
+    tab.key("z")
+    assert tab.do("gsc.maskPng()") is None
+    tab.page.mouse.move(*middle)
+    tab.page.mouse.down()
+    tab.page.mouse.up()
+    assert tab.do("gsc.maskPng().then((png) => png.size)") > 0
+    tab.key("w")
+    assert tab.do("gsc.maskPng()") is None
+    assert "camera moved" in tab.page.inner_text("#message")
+
+    after = exhibit.after
+    save_ply(tmp_path / "splat.ply", replace(after, generated=torch.zeros_like(after.generated)))
+    words = ("repair", tmp_path / "splat.ply", "--camera", tmp_path / "camera.json", "--quiet")
+    out = tmp_path / "out"
+    assert run(monkeypatch, *words, "--mask", tmp_path / "mask.png", "--out", out) == 0
+    summary = json.loads((out / "summary.json").read_text())
+    assert summary["gaussians"]["removed"] > 0
+    assert summary["targets"][0]["added"] > 0

@@ -7,7 +7,7 @@ a photograph: fx, fy, cx, cy in pixels of its size, the centre of the top-left o
 
 const MODES = ["side", "slider", "before", "after"];
 const GENERATED = ["show", "tint", "hide"];
-const DRAGS = ["orbit", "fly"];
+const DRAGS = ["orbit", "fly", "mark"];
 /* What the colours of generated Gaussians are multiplied by. */
 const TINT = [1.3, 0.5, 1.2];
 /* Near and far plane, in the page's unit. */
@@ -29,6 +29,13 @@ const MOVE_BY_KEY = 0.6;
 /* Seconds that a key counts for at least, and that a slow frame counts for at most. */
 const SHORTEST_STEP = 0.03;
 const LONGEST_STEP = 0.1;
+/* Narrowest and widest brush, relative to the longer side of the photograph, and the factor that a
+   key widens it by. */
+const NARROWEST = 0.005;
+const WIDEST = 0.3;
+const WIDENING = 1.25;
+/* Colour of what is marked, over the picture. */
+const MARK_COLOUR = "rgb(255 0 80 / 55%)";
 /* How near to straight up or down one may look: the cosine. */
 const STEEPEST = 0.995;
 
@@ -52,12 +59,18 @@ const state = {
   size: null,
   seconds: 0,
   playing: false,
+  brush: 0.06,
+  erases: false,
 };
 let THREE, SPARK;
 let pictures = [];
 let path = [];
 let frames = 0;
 let pending = 0;
+/* What is marked in the photograph of the camera `marked`: strokes of {points, width, erases}, in its
+   pixels. */
+let strokes = [];
+let marked = "";
 
 /* ------------------------------------------------------------------------------ libraries */
 
@@ -184,6 +197,7 @@ function drawAll() {
   stage.dataset.shown = state.held ? "before" : state.mode;
   stage.style.setProperty("--divider", `${state.divider}%`);
   for (const picture of pictures) picture.draw();
+  drawMarks();
 }
 
 /* Resolves once nothing is left to be sorted or drawn, or at once while the path is played. */
@@ -313,6 +327,142 @@ function dolly(factor) {
   changed();
 }
 
+/* ----------------------------------------------------------------------------------- marks */
+
+/* Pixels of the canvas per pixel of the photograph, which is in its middle. */
+function zoomOfStage() {
+  return Math.min(stage.clientWidth / state.size[0], stage.clientHeight / state.size[1]);
+}
+
+/* The pixel of the photograph at a place of the window. */
+function pixelAt({ clientX, clientY }) {
+  const box = stage.getBoundingClientRect();
+  const zoom = zoomOfStage();
+  return [
+    (clientX - box.left - box.width / 2) / zoom + state.size[0] / 2,
+    (clientY - box.top - box.height / 2) / zoom + state.size[1] / 2,
+  ];
+}
+
+function beginStroke(event) {
+  const width = state.brush * Math.max(...state.size);
+  strokes.push({ points: [pixelAt(event)], width, erases: state.erases });
+  marked = placeOf();
+  changed();
+}
+
+function extendStroke(event) {
+  strokes.at(-1)?.points.push(pixelAt(event));
+  changed();
+}
+
+/* Where the camera is: what is marked there is marked nowhere else. */
+function placeOf() {
+  return [...state.eye.toArray(), ...state.turn.toArray(), ...state.lens, ...state.size].join();
+}
+
+/* The mask of a size: transparent, and what is marked in a colour. */
+function drawStrokes(colour) {
+  const canvas = document.createElement("canvas");
+  [canvas.width, canvas.height] = state.size;
+  const pen = canvas.getContext("2d");
+  Object.assign(pen, { lineCap: "round", lineJoin: "round", strokeStyle: colour });
+  for (const { points, width, erases } of strokes) {
+    pen.globalCompositeOperation = erases ? "destination-out" : "source-over";
+    pen.lineWidth = width;
+    pen.beginPath();
+    pen.moveTo(...points[0]);
+    // A line of no length is drawn as a dot by its round ends.
+    for (const point of points) pen.lineTo(...point);
+    pen.stroke();
+  }
+  return canvas;
+}
+
+function drawMarks() {
+  if (strokes.length > 0 && placeOf() !== marked) {
+    strokes = [];
+    say("The camera moved, so nothing is marked any more.");
+  }
+  const canvas = byId("marks");
+  const { clientWidth: width, clientHeight: height } = stage;
+  Object.assign(canvas, { width, height });
+  if (strokes.length === 0) return;
+  const zoom = zoomOfStage();
+  const [w, h] = [zoom * state.size[0], zoom * state.size[1]];
+  const pen = canvas.getContext("2d");
+  pen.drawImage(drawStrokes("#fff"), (width - w) / 2, (height - h) / 2, w, h);
+  // Where strokes overlap, the colour is as transparent as anywhere else.
+  pen.globalCompositeOperation = "source-in";
+  pen.fillStyle = MARK_COLOUR;
+  pen.fillRect(0, 0, width, height);
+}
+
+function undoStroke() {
+  strokes.pop();
+  changed();
+}
+
+function widen(factor) {
+  state.brush = Math.min(WIDEST, Math.max(NARROWEST, state.brush * factor));
+  byId("width").value = Math.log(state.brush / NARROWEST) / Math.log(WIDEST / NARROWEST);
+}
+
+function erase(erases) {
+  state.erases = erases;
+  byId("erase").setAttribute("aria-pressed", String(erases));
+}
+
+/* The mask as a PNG: white where something is marked, or null. */
+async function maskPng() {
+  if (strokes.length === 0) return null;
+  const canvas = document.createElement("canvas");
+  [canvas.width, canvas.height] = state.size;
+  const pen = canvas.getContext("2d");
+  pen.fillRect(0, 0, ...state.size);
+  pen.drawImage(drawStrokes("#fff"), 0, 0);
+  return new Promise((resolve) => { canvas.toBlob(resolve, "image/png"); });
+}
+
+/* The camera as a transforms.json with one frame, in the frame of the file and OpenGL axes. */
+function cameraJson() {
+  const { centre, unit } = content.frame;
+  const axes = new THREE.Matrix4().makeRotationFromQuaternion(state.turn).elements;
+  // The page is turned half about x: its y and z are those of the file, negated.
+  const rows = [0, 1, 2].map((row) => {
+    const sign = row === 0 ? 1 : -1;
+    const place = centre[row] + sign * unit * state.eye.getComponent(row);
+    return [...[0, 4, 8].map((column) => sign * axes[column + row]), place];
+  });
+  const [fl_x, fl_y, cx, cy] = state.lens;
+  const [w, h] = state.size;
+  const frame = { fl_x, fl_y, cx, cy, w, h, transform_matrix: [...rows, [0, 0, 0, 1]] };
+  return `${JSON.stringify({ camera_model: "PINHOLE", frames: [frame] }, null, 1)}\n`;
+}
+
+function download(name, blob) {
+  const anchor = document.createElement("a");
+  anchor.href = URL.createObjectURL(blob);
+  anchor.download = name;
+  anchor.click();
+  setTimeout(() => URL.revokeObjectURL(anchor.href), 10000);
+}
+
+function saveCamera() {
+  download("camera.json", new Blob([cameraJson()], { type: "application/json" }));
+  say("camera.json is where you stand: complete SPLAT --target camera.json --out OUT");
+}
+
+async function saveMask() {
+  const png = await maskPng();
+  if (!png) {
+    say("Nothing is marked: choose Mark, and paint over what is wrong.");
+    return;
+  }
+  download("mask.png", png);
+  say("Save the camera, too, then: gscompleter repair SPLAT --camera camera.json --mask mask.png --out OUT");
+}
+
 /* -------------------------------------------------------------------------------- controls */
 
 const choices = {
@@ -322,7 +472,14 @@ const choices = {
     state.generated = how;
     for (const picture of pictures) picture.setGenerated(how);
   },
-  drag: (drag) => { if (DRAGS.includes(drag)) state.drag = drag; },
+  drag: (drag) => {
+    if (!DRAGS.includes(drag)) return;
+    state.drag = drag;
+    stage.dataset.drag = drag;
+    byId("brush").hidden = drag !== "mark";
+    // A single picture fills the stage, and is what is marked.
+    if (drag === "mark" && ["side", "slider"].includes(state.mode)) choose("mode", "after");
+  },
 };
 
 /* Sets a choice, shows which it is, and says so. */
@@ -387,7 +544,13 @@ const KEYS = {
   3: () => choose("mode", "before"),
   4: () => choose("mode", "after"),
   g: () => next("generated", GENERATED),
-  f: () => next("drag", DRAGS),
+  f: () => choose("drag", state.drag === "orbit" ? "fly" : "orbit"),
+  m: () => choose("drag", state.drag === "mark" ? "orbit" : "mark"),
+  c: saveCamera,
+  n: saveMask,
+  z: undoStroke,
+  ",": () => widen(1 / WIDENING),
+  ".": () => widen(WIDENING),
   b: () => hold(true),
   r: () => goTo(state.shot),
   p: () => play(!state.playing),
@@ -398,7 +561,10 @@ const KEYS = {
 
 function onKeyDown(event) {
   if (event.ctrlKey || event.metaKey || event.altKey || !state.eye) return;
-  if (event.target === byId("divider") && event.key.startsWith("Arrow")) {
+  if (event.target === byId("width") && event.key.startsWith("Arrow")) return;
+  if (state.drag === "mark" && event.code === "KeyE") {
+    if (!event.repeat) erase(!state.erases);
+  } else if (event.target === byId("divider") && event.key.startsWith("Arrow")) {
     setDivider(state.divider + (["ArrowLeft", "ArrowDown"].includes(event.key) ? -2 : 2));
   } else if (MOVES[event.code] || (TURNS[event.code] && event.target === stage)) {
     press(event.code);
@@ -422,6 +588,7 @@ function onPointerDown(event) {
   play(false);
   stage.setPointerCapture(event.pointerId);
   pointers.set(event.pointerId, { x: event.clientX, y: event.clientY });
+  if (state.drag === "mark" && pointers.size === 1) beginStroke(event);
 }
 
 /* One pointer turns or, with Shift or another button, moves; two move and change the distance. */
@@ -429,6 +596,11 @@ function onPointerMove(event) {
   const before = pointers.get(event.pointerId);
   if (!before) return;
   const now = { x: event.clientX, y: event.clientY };
+  if (state.drag === "mark" && pointers.size === 1) {
+    extendStroke(event);
+    pointers.set(event.pointerId, now);
+    return;
+  }
   const share = 1 / (stage.clientHeight * pointers.size);
   const [right, down] = [(now.x - before.x) * share, (now.y - before.y) * share];
   if (pointers.size === 1 && !event.shiftKey && event.buttons === 1) {
@@ -453,7 +625,8 @@ function onPointerEnd(event) {
 function onWheel(event) {
   event.preventDefault();
   play(false);
-  if (state.eye) dolly(Math.exp(Math.max(-0.5, Math.min(0.5, event.deltaY * 0.002))));
+  if (state.drag === "mark") widen(event.deltaY > 0 ? 1 / WIDENING : WIDENING);
+  else if (state.eye) dolly(Math.exp(Math.max(-0.5, Math.min(0.5, event.deltaY * 0.002))));
 }
 
 function onDividerMove(event) {
@@ -485,6 +658,13 @@ function listen() {
   byId("hold").addEventListener("keydown", (event) => { if ([" ", "Enter"].includes(event.key)) hold(true); });
   byId("hold").addEventListener("keyup", () => hold(false));
   byId("play").addEventListener("click", () => play(!state.playing));
+  byId("width").addEventListener("input", (event) => {
+    widen(NARROWEST * (WIDEST / NARROWEST) ** event.target.valueAsNumber / state.brush);
+  });
+  byId("erase").addEventListener("click", () => erase(!state.erases));
+  byId("undo").addEventListener("click", undoStroke);
+  byId("save-camera").addEventListener("click", saveCamera);
+  byId("save-mask").addEventListener("click", saveMask);
   for (const kind of Object.keys(choices)) {
     for (const button of document.querySelectorAll(`button[data-${kind}]`)) {
       button.addEventListener("click", () => choose(kind, button.dataset[kind]));
@@ -580,6 +760,7 @@ async function start() {
   ];
   await Promise.all(pictures.map((picture) => picture.ready));
   listen();
+  widen(1);
   if (!followLink()) goTo(content.shots[0].name);
   for (const kind of Object.keys(choices)) choose(kind, state[kind]);
   await settled();
@@ -600,6 +781,8 @@ window.gsc = {
   seek,
   setMode: (mode) => choose("mode", mode),
   setGenerated: (how) => choose("generated", how),
+  cameraJson,
+  maskPng,
   settled,
   stats,
 };
