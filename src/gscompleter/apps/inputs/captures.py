@@ -126,8 +126,8 @@ def find_cameras_alone(scene: Gaussians, renderer: Renderer, request: RenderRequ
     if camera is None:
         raise InputError(
             "The file of the splat does not tell where to stand or what is missing; name a camera "
-            "to complete it for with --target, or the cameras it was made from with --cameras, or "
-            "its photographs as SCENE."
+            "with --target (`gscompleter view` saves one), mark what is wrong with --mask, or give "
+            "its own cameras with --cameras or its photographs as SCENE."
         )
     ranged = add_near_plane(camera, scene.means)
     seen = renderer.render(scene, ranged).depth_map()
