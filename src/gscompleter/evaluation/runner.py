@@ -206,7 +206,8 @@ def prepare_task(task: Task, folder: Path, config: RunConfig) -> PreparedTask:
 
     # All methods get the depth range that the scene was reconstructed in.
     given = normalize_exposures(views, context.gains)
-    near, far = context.near, context.far
+    near = context.near
+    far = context.far
     return PreparedTask(
         context.gaussians,
         tuple(set_depth_range(given, near, far)),

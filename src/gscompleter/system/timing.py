@@ -46,12 +46,17 @@ def timed_stage(name: str) -> Iterator[None]:
             yield
     finally:
         _record.reset(token)
-        # Only if something ran on a GPU: asking CUDA itself would start it, for half a second and
-        # half a gigabyte, even with `--device cpu`.
-        if torch.cuda.is_initialized():
-            torch.cuda.synchronize()
+        wait_for_gpu()
         if seconds is not None:
             seconds[name] = seconds.get(name, 0.0) + time.perf_counter() - start
+
+
+def wait_for_gpu() -> None:
+    """Wait until a GPU has done what it was given; it works on after calls have returned."""
+    # Only if something ran on a GPU: asking CUDA itself would start it, for half a second and half
+    # a gigabyte, even with `--device cpu`.
+    if torch.cuda.is_initialized():
+        torch.cuda.synchronize()
 
 
 def add_seconds(before: Mapping[str, float], more: Mapping[str, float]) -> dict[str, float]:

@@ -20,6 +20,7 @@ from gscompleter.state import Completion
 from gscompleter.system.errors import InputError
 from gscompleter.system.files.writing import SUMMARY_FILE
 from gscompleter.system.progress import show_progress, track
+from gscompleter.system.timing import wait_for_gpu
 from gscompleter.types import Camera, Gaussians, make_observed, merge, sh_from_rgb
 
 SIDE = 256
@@ -101,10 +102,7 @@ def measure_median_seconds(work: Yardstick) -> float:
     for _ in range(RUNS):
         start = time.perf_counter()
         work()
-        # A GPU works on after the call has returned.
-        # Nothing starts CUDA if the device is the CPU.
-        if torch.cuda.is_initialized():
-            torch.cuda.synchronize()
+        wait_for_gpu()
         seconds.append(time.perf_counter() - start)
     return statistics.median(seconds)
 

@@ -183,7 +183,7 @@ class CompletingOptions(SceneOptions, ModelOptions):
     """Upward direction of a splat without photographs whose cameras are found by the sizes of its
     Gaussians: x, y and z in its file. If not given, -y."""
     holes: Literal["auto", "all", "enclosed"] = "auto"
-    """What is a hole: all that is empty, or only what the splat encloses, as in an object that
+    """Holes to fill: all that is empty, or only what the splat encloses, as in an object that
     stands on nothing. `auto` tells an object without photographs by what its cameras see around."""
     no_recolor: bool = False
     """Keep the colours of the splat, too; Gaussians are only added."""

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import hashlib
 import json
 from contextlib import suppress
 from dataclasses import asdict, dataclass
@@ -27,6 +26,7 @@ from gscompleter.stages.target_view import TargetView, render_target
 from gscompleter.state import Completion
 from gscompleter.system.errors import InputError, quote_value
 from gscompleter.system.files.image import write_depth, write_image
+from gscompleter.system.files.reading import hash_file
 from gscompleter.system.progress import track
 from gscompleter.types import Camera
 
@@ -158,7 +158,7 @@ def write_hole(folder: Path, hole: ExportedHole, unit: float, ready: Prepared) -
     files = ready.opened.files
     row = HoleRow(
         image_path=f"{name}.png",
-        sha256=hashlib.sha256((folder / f"{name}.png").read_bytes()).hexdigest(),
+        sha256=hash_file(folder / f"{name}.png"),
         hole_mask_path=f"{name}_mask.png",
         w=hole.camera.width,
         h=hole.camera.height,

@@ -6,7 +6,6 @@ frames at which it stands at a target, a repaired video shows what was painted f
 
 from __future__ import annotations
 
-import hashlib
 from collections.abc import Iterator, Sequence
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
@@ -33,6 +32,7 @@ from gscompleter.splats.alignment.similarity import transform_camera_exactly
 from gscompleter.stages.target_view import compute_hole_mask
 from gscompleter.state import Completion
 from gscompleter.system.files.image import convert_to_pixels
+from gscompleter.system.files.reading import hash_file
 from gscompleter.system.files.video import write_video
 from gscompleter.system.progress import track
 from gscompleter.types import Camera
@@ -89,7 +89,7 @@ def write_path(
     write_video(folder / PATH_MASK, masks, FRAMES_PER_SECOND)
     row = PathRow(
         video_path=PATH_VIDEO,
-        sha256=hashlib.sha256((folder / PATH_VIDEO).read_bytes()).hexdigest(),
+        sha256=hash_file(folder / PATH_VIDEO),
         num_frames=len(path.cameras),
     )
     back = np.linalg.inv(ready.task.frame)

@@ -60,15 +60,19 @@ class RenderRequest:
     masks: tuple[Path, ...] = ()
     """Masks that mark what is wrong at each target, white there."""
     holes: HoleConfig = HoleConfig()
-    """What counts as a hole, but for its kind."""
+    """Limits of holes; their kind is chosen by `kind`."""
     kind: Literal["auto", "all", "enclosed"] = "auto"
     """Kind of holes; `auto` takes those that an object encloses, and all in a scene."""
     up: tuple[float, float, float] | None = None
     """Upward direction of a splat whose cameras are found; None for that of most files, -y."""
     place: Selection | None = None
-    """What is to be removed, around which cameras are found; None to complete the splat."""
+    """Gaussians to be removed, around which cameras are found; None to complete the splat."""
     takes_standpoints: bool = False
     """True to stand anywhere if nothing tells where the cameras were."""
+
+    def make_up(self, scene: Gaussians) -> Float[Tensor, "3"]:
+        """Make the upward direction, in the axes of the file, on the device of the scene."""
+        return scene.means.new_tensor(self.up or USUAL_UP)
 
 
 @dataclass(frozen=True)
@@ -119,7 +123,7 @@ def find_cameras_alone(scene: Gaussians, renderer: Renderer, request: RenderRequ
     # Two photographs are the fewest, so that no image had more pixels than half of the Gaussians.
     side = max(MIN_FOUND_SIDE, round((len(scene) / 2) ** 0.5))
     sides = (side,) if resolution is None else (side, *np.ravel(resolution).tolist())
-    up = scene.means.new_tensor(request.up or USUAL_UP)
+    up = request.make_up(scene)
     camera = find_pixel_camera(scene, up, min(sides))
     if camera is None and request.takes_standpoints:
         return find_standing_cameras(scene, renderer, request)
@@ -149,7 +153,7 @@ def find_cameras_alone(scene: Gaussians, renderer: Renderer, request: RenderRequ
 
 def find_standing_cameras(scene: Gaussians, renderer: Renderer, request: RenderRequest) -> Capture:
     """Find cameras from which a trained splat looks like a photograph."""
-    up = scene.means.new_tensor(request.up or USUAL_UP)
+    up = request.make_up(scene)
     side = choose_side(request.reading.resolution)
     cameras = find_standpoints(scene, up, side, renderer, NUM_STANDPOINTS)
     if not cameras:
@@ -169,7 +173,7 @@ def search_around_place(
     """Search for cameras around what is to be removed."""
     assert request.place is not None
     chosen = select_gaussians(request.place, scene, origin)
-    up = scene.means.new_tensor(request.up or USUAL_UP)
+    up = request.make_up(scene)
     side = choose_side(request.reading.resolution)
     cameras = choose_cameras_around_place(scene, chosen, up, side, renderer)
     if not cameras:

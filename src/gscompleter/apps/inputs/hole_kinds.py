@@ -1,4 +1,4 @@
-"""What a hole of a splat without photographs is, and what the user marked as one."""
+"""Holes of a splat without photographs, and places that the user marked as such."""
 
 from __future__ import annotations
 

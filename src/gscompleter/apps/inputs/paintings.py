@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import hashlib
 import os
 from collections.abc import Sequence
 from dataclasses import replace
@@ -32,7 +31,7 @@ from gscompleter.system.files.image import (
     read_colors_and_alpha,
     read_mask,
 )
-from gscompleter.system.files.reading import read_bytes
+from gscompleter.system.files.reading import hash_file
 from gscompleter.system.files.video import read_video
 from gscompleter.types import Camera
 
@@ -213,7 +212,7 @@ def find_by_stem(
 
 def is_exported(path: Path, sha256: str) -> bool:
     """Check whether a file has the bytes that were exported."""
-    return hashlib.sha256(read_bytes(path)).hexdigest() == sha256
+    return hash_file(path) == sha256
 
 
 def read_painting(

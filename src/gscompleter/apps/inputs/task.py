@@ -74,7 +74,7 @@ class Opened:
     held_out: tuple[int, ...] = ()
     """Frames that are kept back: they only score the result."""
     renders_from: str | None = None
-    """Where the cameras of renders come from that take the place of photographs: `cameras` of a
+    """Source of the cameras of renders that take the place of photographs: `cameras` of a
     file, around the `targets` or the `place` of a removal, the `pixels` of the splat, or
     `standpoints`; None if there are photographs."""
 

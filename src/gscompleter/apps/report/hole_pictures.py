@@ -1,4 +1,4 @@
-"""What a target shows before its hole is painted."""
+"""Pictures of a target before its hole is painted."""
 
 from __future__ import annotations
 

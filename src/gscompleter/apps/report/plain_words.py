@@ -50,7 +50,7 @@ RISKS = {
     "targets": "0.2 dB on average where they were found around a target",
     "pixels": "0.5 dB on average where they were found from the splat alone",
 }
-"""What photographs lost that nobody had given, by where the cameras came from (decision 053)."""
+"""Loss of photographs that nobody had given, by where the cameras came from (decision 053)."""
 NOTHING_NEW_NOTE = (
     "The splat reproduces all photographs. Where it is wrong from elsewhere, only smooth colours "
     "are known: little is to be gained without new photographs of the place or a learned generator."

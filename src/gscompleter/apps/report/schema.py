@@ -122,7 +122,7 @@ class SceneRow:
     used: int
     splat: str | None = None
     renders_from: str | None = None
-    """Where the cameras of renders come from that took the place of photographs: `cameras` of a
+    """Source of the cameras of renders that took the place of photographs: `cameras` of a
     file, around the `targets` or the `place` of a removal, the `pixels` of the splat, or
     `standpoints`; None if there are photographs."""
     notes: tuple[str, ...] = ()

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import hashlib
 import json
 import os
 import stat
@@ -55,6 +56,11 @@ def read_head(path: Path, count: int) -> bytes:
     with suppress(InputError), open_file(path) as file:
         return file.read(count)
     return b""
+
+
+def hash_file(path: Path) -> str:
+    """Compute the SHA-256 of a file, in hexadecimal."""
+    return hashlib.sha256(read_bytes(path)).hexdigest()
 
 
 def read_bytes(path: Path, max_bytes: int = MAX_BYTES) -> bytes:
