@@ -98,6 +98,7 @@ def test_a_dry_run_writes_the_cameras_and_what_they_see(scene, tmp_path, monkeyp
     assert f"Edit the cameras in {out / 'targets.json'}." in shown
 
 
+@pytest.mark.slow
 def test_a_plan_begins_as_the_completion_and_can_be_given_back(
     scene, completed, tmp_path, monkeypatch
 ):

@@ -81,6 +81,7 @@ def test_a_quick_run_tells_every_stage_of_its_case(quick):
     assert report["settings"]["repeats"] == 1
 
 
+@pytest.mark.slow
 def test_completions_in_one_process_have_no_start_up(scene, tmp_path, monkeypatch):
     cases, out = write_cases(scene, near=0.5, far=20, gaussians=3000), tmp_path / "out"
     words = ("bench", "--cases", cases, "--growth", "targets", "--repeats", 2, "--quiet")

@@ -190,6 +190,7 @@ def plyfile_names(path: Path) -> tuple[str, ...]:
     return plyfile.PlyData.read(str(path))["vertex"].data.dtype.names
 
 
+@pytest.mark.slow
 def test_rows_that_were_dropped_stay_out_of_the_users_layout(scene, chosen, tmp_path, monkeypatch):
     gaussians = load_ply(chosen[0] / "context.ply")
     content = plyfile.PlyData.read(str(chosen[0] / "context.ply"), mmap=False)

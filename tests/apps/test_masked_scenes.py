@@ -189,6 +189,7 @@ def test_batch_reads_masks(scenes, tmp_path, monkeypatch):
     assert [row["file"] for row in summary["targets"]] == ["photo_005.png"]
 
 
+@pytest.mark.slow
 def test_clean_compares_nothing_with_what_is_masked(
     scenes, completed, tmp_path, monkeypatch, capsys
 ):
@@ -206,6 +207,7 @@ def test_clean_compares_nothing_with_what_is_masked(
     assert "does not show what the photographs show" in capsys.readouterr().err
 
 
+@pytest.mark.slow
 def test_the_masks_of_a_removal_hide_nothing(scenes, completed, tmp_path, monkeypatch, capsys):
     """Users keep them in `masks`, too: white is what goes."""
     scene = write_colmap(tmp_path / "scene", small_cameras(), n_points=50)

@@ -69,6 +69,7 @@ def test_a_scene_that_unused_photographs_confirm_is_a_success(scene, tmp_path, m
         assert 0.3 < row["covered_before"] <= row["covered_after"] <= 1
 
 
+@pytest.mark.slow
 def test_a_scene_of_wrong_poses_is_no_success(scene, tmp_path, monkeypatch, capsys):
     broken, out = permute_poses(scene, tmp_path / "broken"), tmp_path / "out"
     assert run(monkeypatch, *complete(broken, out)) == 1

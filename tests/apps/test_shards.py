@@ -174,6 +174,7 @@ def three_at_once(scenes: Path, out: Path, finished: Path) -> None:
     same_tables(out, finished)
 
 
+@pytest.mark.slow
 def test_three_shards_at_once_end_with_the_tables_of_one_run(scenes, finished, tmp_path):
     three_at_once(scenes, tmp_path / "out", finished)
 

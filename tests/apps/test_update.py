@@ -75,6 +75,7 @@ def test_photographs_fill_a_splat_and_others_confirm_it(room, cut, tmp_path, mon
     assert back.read_bytes() == cut.read_bytes()
 
 
+@pytest.mark.slow
 def test_photographs_without_cameras_are_placed_and_used(
     room, new, cut, tmp_path, monkeypatch, capsys
 ):

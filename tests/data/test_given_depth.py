@@ -115,6 +115,7 @@ def test_one_photograph_of_a_folder_with_depth_is_completed(tmp_path, monkeypatc
     assert "stereo needs at least 2; name more frames" in capsys.readouterr().err
 
 
+@pytest.mark.slow
 def test_exact_depth_gives_no_worse_picture_than_none(tmp_path):
     """Disocclusions beside the boxes were black with it (21.7 dB; without the depth 25.5)."""
     cameras = make_cameras(8)

@@ -110,6 +110,7 @@ def test_files_of_insta360_have_to_be_exported_first(tmp_path, monkeypatch, caps
         assert said.count("\n") == 1
 
 
+@pytest.mark.slow
 def test_several_panoramas_are_a_scene_of_views_with_common_centres(tmp_path, monkeypatch, capsys):
     pytest.importorskip("pycolmap", reason="needs gscompleter[poses]")
     given, out = panoramas(tmp_path / "room", 4), tmp_path / "poses"

@@ -168,6 +168,7 @@ def test_masks_of_new_photographs_are_kept(known, new, tmp_path):
     assert identify_input(new, names, known) != with_mask
 
 
+@pytest.mark.slow
 def test_real_photographs_are_placed_within_a_pixel(shared, tmp_path):
     pytest.importorskip("pycolmap", reason="needs gscompleter[poses]")
     opened = open_photographs(shared / "data" / "fountain_p11")

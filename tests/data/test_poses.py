@@ -48,6 +48,7 @@ def blank(folder: Path, count: int) -> Path:
     return folder
 
 
+@pytest.mark.slow
 def test_the_cameras_of_a_room_are_found_up_to_a_similarity(tmp_path, monkeypatch, capsys):
     pytest.importorskip("pycolmap", reason="needs gscompleter[poses]")
     given, out = photographs(tmp_path / "room"), tmp_path / "poses"
@@ -129,6 +130,7 @@ def test_a_focal_length_that_was_held_is_told(tmp_path, monkeypatch):
     assert "344 px" in note
 
 
+@pytest.mark.slow
 def test_a_drive_is_placed_with_its_focal_length_held(shared, tmp_path):
     pytest.importorskip("pycolmap", reason="needs gscompleter[poses]")
     given = tmp_path / "drive"

@@ -32,7 +32,10 @@ def scene(tmp_path_factory):
     return folder
 
 
-@pytest.mark.parametrize(("method", "config"), [("full", "default"), ("paper", "paper")])
+@pytest.mark.parametrize(
+    ("method", "config"),
+    [("full", "default"), pytest.param("paper", "paper", marks=pytest.mark.slow)],
+)
 def test_a_case_gives_the_bytes_of_complete(method, config, scene, tmp_path, monkeypatch):
     out = tmp_path / "out"
     frames = ("--context", 0, 1, "--target", 2, "--near", 0.5, "--far", 20, "--resolution", 96, 96)
@@ -48,6 +51,7 @@ def test_a_case_gives_the_bytes_of_complete(method, config, scene, tmp_path, mon
     assert (tmp_path / "evaluated.ply").read_bytes() == (out / "completed.ply").read_bytes()
 
 
+@pytest.mark.slow
 def test_the_order_of_the_context_does_not_matter(scene, tmp_path, monkeypatch):
     written = []
     for order in ((0, 1), (1, 0)):

@@ -198,6 +198,7 @@ def reproduce(monkeypatch, data: Path, out: Path, *more: object) -> int:
     return run(monkeypatch, *words, *protocols, "--quiet", *more)
 
 
+@pytest.mark.slow
 def test_a_table_and_a_figure_of_rooms(rooms, tmp_path, monkeypatch):
     pytest.importorskip("matplotlib", reason="needs gscompleter[evaluation]")
     more = ("--table", "models", "spans", "--figure", "seams", "--outlines", "--crops")

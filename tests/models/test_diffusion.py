@@ -132,6 +132,7 @@ def test_pe_field_depends_on_seed_and_depth_and_on_nothing_else(kontext_folder):
     assert not torch.equal(first, image(replace(context, view_renders=renders), seed=1))
 
 
+@pytest.mark.slow
 def test_images_made_together_are_those_made_alone(kontext_folder):
     context, flat = known_room(), camera_at(0.6, yaw=8, size=96)
     flat = replace(flat, height=48)  # another size, which is painted by itself
@@ -174,6 +175,7 @@ def test_pe_field_takes_the_depth_that_the_completer_names(kontext_folder, tmp_p
     assert not torch.equal(image(generator, "context"), image(generator, "monocular"))
 
 
+@pytest.mark.slow
 def test_further_seeds_are_tried_and_the_best_is_kept(kontext_folder):
     context = known_room()
     generator = load_generator(

@@ -178,6 +178,7 @@ def test_every_part_gives_rows(part):
         assert [row.value > 0 for row in rows] == [True] * 10
 
 
+@pytest.mark.slow
 def test_every_reconstructor_completes_a_room_and_one_that_fails_is_a_row(monkeypatch):
     rows = list(gpu.measure_completions(SMALL))
     assert [row.what for row in rows if not row.failed] == list(SMALL.models)
@@ -192,6 +193,7 @@ def test_every_reconstructor_completes_a_room_and_one_that_fails_is_a_row(monkey
     assert not fine.failed
 
 
+@pytest.mark.slow
 def test_the_tests_count_where_they_passed_and_only_there(tmp_path):
     (tmp_path / "test_it.py").write_text("def test_good(): pass\ndef test_bad(): assert 0\n")
     path = str(tmp_path / "test_it.py")
@@ -206,6 +208,7 @@ def test_the_tests_count_where_they_passed_and_only_there(tmp_path):
     assert nothing.failed
 
 
+@pytest.mark.slow
 def test_pe_field_paints_with_any_model_of_its_kind():
     pytest.importorskip("diffusers", reason="needs gscompleter[diffusion]")
     pytest.importorskip("transformers", reason="needs gscompleter[diffusion]")
@@ -224,6 +227,7 @@ def test_pe_field_paints_with_any_model_of_its_kind():
     assert row.value > 0
 
 
+@pytest.mark.slow
 def test_free_models_run_where_their_files_are(monkeypatch):
     pytest.importorskip("diffusers", reason="needs gscompleter[diffusion]")
     pytest.importorskip("transformers", reason="needs gscompleter[diffusion]")

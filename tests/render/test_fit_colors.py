@@ -15,7 +15,7 @@ CAMERA = camera_at(size=48)
 VIEW = view_of(Room(), CAMERA)
 
 
-@pytest.mark.parametrize("name", ["cpu", "reference"])
+@pytest.mark.parametrize("name", ["cpu", pytest.param("reference", marks=pytest.mark.slow)])
 def test_an_image_gets_back_what_rendering_blurs(name):
     blurred, renderer = gaussians_of(VIEW), load_renderer(name)
     fitted = fit_colors(blurred, [renderer.freeze(blurred[:0], CAMERA)], [VIEW], [1.7] * 4)

@@ -52,7 +52,9 @@ def read_gaussians(path) -> Gaussians:
 
 
 @pytest.mark.linux
-@pytest.mark.parametrize("name", NAMES)
+@pytest.mark.parametrize(
+    "name", [NAMES[0], *(pytest.param(name, marks=pytest.mark.slow) for name in NAMES[1:])]
+)
 def test_a_full_disk_is_a_sentence_and_leaves_nothing(pxr, tmp_path, name):
     """A limit of the size of files stands for it; the temporary folder is not used."""
     code = (

@@ -214,6 +214,7 @@ def test_gaussians_follow_their_proxy():
     assert torch.equal(after.sh[~state.recolored_mask], scene[index].sh[~state.recolored_mask])
 
 
+@pytest.mark.slow
 def test_the_reference_renderer_recolours_alike():
     scene = splat()
     found = change(scene), change(scene, renderer=load_renderer("reference"))

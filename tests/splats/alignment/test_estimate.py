@@ -122,6 +122,7 @@ def test_any_similarity_is_found_by_the_images(views, splat):
     assert_takes_to(found.transform, ARBITRARY, 0.03)
 
 
+@pytest.mark.slow
 def test_a_splat_of_another_scene_is_refused(views):
     with pytest.raises(InputError, match="does not show what the photographs show"):
         find(views, random_gaussians(300))
