@@ -41,13 +41,14 @@ from gscompleter.apps.viewer.packages import Libraries
 from gscompleter.cli import parse_command
 from gscompleter.config import CompleterConfig
 from gscompleter.data.scene import describe_camera
+from gscompleter.numerics.geometry import project
 from gscompleter.splats.alignment.similarity import make_similarity, transform_camera
 from gscompleter.splats.formats import load_splat
 from gscompleter.splats.transform import transform_gaussians
 from gscompleter.system.errors import InputError
 from gscompleter.system.progress import notify_of_stages
 from gscompleter.system.timing import STAGES
-from gscompleter.types import Camera, Gaussians, merge
+from gscompleter.types import Camera, ContextScene, Gaussians, merge
 from scenes import Room, camera_at, gaussians_of, photographed, view_of
 
 SIZE = 48
@@ -331,13 +332,25 @@ def test_what_is_marked_is_removed_filled_and_repaired(splat_begun):
     repaired, text = apply_step(splat_begun, marked(splat_begun, "repair"))
     assert torch.equal(repaired.latest.source.gone_mask, gone)
     assert "are removed" in text
-    # Filling stays in the marks, and a repair may reach beyond them.
-    assert len(repaired.latest.added) >= len(filled.latest.added)
-    half = mark(slice(18, 30), slice(20, 26))
-    less, _ = apply_step(removed, marked(removed, "fill", half))
-    assert 0 < len(less.latest.added) < 0.8 * len(filled.latest.added)
+    # To touch the hole is enough.
+    dab, _ = apply_step(removed, marked(removed, "fill", mark(slice(22, 24), slice(24, 26))))
+    assert torch.equal(dab.latest.scene.means, filled.latest.scene.means)
     assert repaired.cameras == (repaired.steps[0].camera,)
     assert removed.cameras == ()
+
+
+def test_only_holes_that_are_marked_are_filled(splat_begun):
+    other = mark(slice(18, 28), slice(2, 12))
+    removed, _ = apply_step(splat_begun, marked(splat_begun, "remove"))
+    removed, _ = apply_step(removed, marked(removed, "remove", other))
+    filled, _ = apply_step(removed, marked(removed, "fill"))
+    camera = filled.latest.targets[-1].target
+    added = filled.latest.targets[-1].added
+    columns = project(added.means, camera)[0][:, 0]
+    assert len(added) > 50
+    assert columns.min() > 14
+    both, _ = complete_camera(removed, CAMERAS[1])
+    assert len(both.latest.added) > 1.2 * len(filled.latest.added)
 
 
 def test_what_was_added_is_removed_by_marks_too(splat_begun):
@@ -353,6 +366,29 @@ def test_marks_that_nothing_can_be_done_with_are_refused(splat_begun):
         with pytest.raises(InputError, match="marks nothing"):
             nothing = mark(slice(0), slice(0))
             apply_step(splat_begun, marked(splat_begun, action, nothing))
+
+
+def test_nothing_that_is_given_is_ignored(splat_begun):
+    camera = save_camera(splat_begun, CAMERAS[1])
+    for step in (
+        Step("fill", camera, SPOT, box=CRATE),
+        Step("remove", camera, SPOT, box=CRATE),
+        Step("complete", camera, SPOT),
+    ):
+        with pytest.raises(InputError, match=r"leave it out|takes no mask"):
+            apply_step(splat_begun, step)
+
+
+def test_nothing_more_is_removed_from_a_completed_splat(splat_begun):
+    first = splat_begun.latest
+    labels = first.context.generated.clone()
+    labels[:9] = 1
+    context = replace(first.context, generated=labels)
+    parts = (context, *first.parts[1:])
+    completed = replace(first, source=ContextScene.whole(context), parts=parts)
+    session = replace(splat_begun, completions=(completed,))
+    with pytest.raises(InputError, match="completed before"):
+        apply_step(session, marked(session, "remove"))
 
 
 # ------------------------------------------------------------------------- what a page is sent

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import secrets
 import traceback
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -77,6 +78,7 @@ class LivePage:
         self._scene = scene
         self._find_hole = find_hole
         self._save = save
+        self._number = secrets.token_hex(8)
         self._requests: SimpleQueue[PageRequest] = SimpleQueue()
         self._busy = Lock()
         self._revision = 0
@@ -158,6 +160,7 @@ class LivePage:
         """Show a text on all pages, and where the session is; only `client` goes to `camera`."""
         self.channel.send(
             {
+                "session": self._number,
                 "text": text,
                 "busy": is_busy,
                 "revision": self._revision,

@@ -107,6 +107,7 @@ def apply_step(session: Session, step: Step) -> tuple[Session, str]:
 
     Camera and mask go through files first, so that the saved ones give the very same result.
     """
+    check_step(step)
     start = time.perf_counter()
     camera = place_camera(session, step.camera)
     completion, text = PERFORM[step.action](session, step, camera)
@@ -116,6 +117,14 @@ def apply_step(session: Session, step: Step) -> tuple[Session, str]:
     return session.extended(completion, step), f"Done in {seconds:.1f} s: {text}"
 
 
+def check_step(step: Step) -> None:
+    """Refuse a box or a mask that the action would ignore."""
+    if step.box is not None and step.action != "remove":
+        raise InputError(f"Only Remove takes a box, and {step.action} has one; leave it out.")
+    if step.mask is not None and (step.action == "complete" or step.box is not None):
+        raise InputError("A step with a box, or that completes all holes, takes no mask.")
+
+
 def complete_step(session: Session, step: Step, camera: Camera) -> tuple[Completion, str]:
     """Complete all holes that the camera sees."""
     first = session.completions[0].config
@@ -123,7 +132,7 @@ def complete_step(session: Session, step: Step, camera: Camera) -> tuple[Complet
 
 
 def fill_step(session: Session, step: Step, camera: Camera) -> tuple[Completion, str]:
-    """Fill the holes inside of the marks."""
+    """Fill the holes that the marks touch."""
     marked = read_step_marks(step, camera)
     return keep_change(session, fill_marked(session.completer, session.latest, camera, marked))
 

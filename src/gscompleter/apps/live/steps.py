@@ -22,6 +22,7 @@ from gscompleter.editing.cutting import Region
 from gscompleter.editing.marking import find_marked
 from gscompleter.editing.removal import remove_gaussians
 from gscompleter.numerics.geometry import look_up
+from gscompleter.numerics.image_ops import dilate, label_regions
 from gscompleter.render.removed import mask_removed
 from gscompleter.state import Completion, Unfilled
 from gscompleter.system.errors import InputError
@@ -62,7 +63,7 @@ def sees_removed(completer: GSCompleter, state: Completion, camera: Camera) -> b
 def fill_marked(
     completer: GSCompleter, state: Completion, camera: Camera, marked: Bool[Tensor, "h w"]
 ) -> Completion:
-    """Fill the holes that marks show, and nothing beside them; no colours change."""
+    """Fill the holes that marks touch, and no others; no colours change."""
     # Colours would change all over the image, not only in the marks.
     config = replace(state.config, recolor=replace(state.config.recolor, iterations=0))
     completed = completer.advance(replace(state, config=config), camera)
@@ -70,18 +71,28 @@ def fill_marked(
     if not len(result.added):
         return replace(completed, config=state.config)
 
-    added = result.added[look_up(marked, result.added, result.target)]
+    # Gaussians are added in the dilated hole mask (decision 037).
+    touched = find_touched(result.hole_mask, marked)
+    region = dilate(touched, config.holes.dilation)
+    added = result.added[look_up(region, result.added, result.target)]
     parts = (*state.parts, added) if len(added) else state.parts
     filled = replace(
         result,
         added=added,
         after=completer.scenes.freeze(parts, state.with_depth_range(camera)).render,
-        hole_mask=result.hole_mask & marked,
-        # What is outside of the marks stays empty on purpose.
+        hole_mask=touched,
+        # Other holes stay empty on purpose.
         unfilled=Unfilled(),
     )
     targets = (*completed.targets[:-1], filled)
     return replace(completed, config=state.config, parts=parts, targets=targets)
+
+
+def find_touched(holes: Bool[Tensor, "h w"], marked: Bool[Tensor, "h w"]) -> Bool[Tensor, "h w"]:
+    """Find the connected parts of a hole mask that marks touch."""
+    labels, _ = label_regions(holes)
+    # Label 0 is no hole.
+    return holes & torch.isin(labels, labels[marked])
 
 
 def remove_marked(

@@ -1,10 +1,12 @@
 /* ---- connection: a live page asks the running program, and shows what changed ---- */
 
+/* Actions on what is marked. */
+const MARKING = ["repair", "remove", "fill"];
 /* Actions that leave nothing of what is marked to be done. */
 const FILLING = ["repair", "fill"];
 /* This page among all that the program serves. */
 const client = Math.random().toString(36).slice(2);
-/* The latest message of the program: text, busy, revision, steps, undone, camera, client. */
+/* The latest message of the program: session, text, busy, revision, steps, undone, camera, client. */
 let latest = null;
 /* The revision of the scene that is shown, and what this page asked for last. */
 let shownRevision = 0;
@@ -29,6 +31,8 @@ async function connect() {
 
 /* Shows what a message says. */
 async function hear(message) {
+  // Another program at the same address has another scene.
+  if (latest && latest.session !== message.session) location.reload();
   latest = message;
   showButtons(message);
   say(message.text);
@@ -89,9 +93,11 @@ async function ask(action) {
   if (!content.live || !latest || latest.busy) return null;
   asked = action;
   const request = { action, client, camera: JSON.parse(cameraJson()) };
-  const png = await maskPng();
-  if (png) request.mask = await base64Of(png);
   if (action === "remove" && state.drag === "box") Object.assign(request, boxInScene());
+  else if (MARKING.includes(action)) {
+    const png = await maskPng();
+    if (png) request.mask = await base64Of(png);
+  }
   const isDone = new Promise((resolve) => { answered = resolve; });
   try {
     const headers = { "Content-Type": "application/json" };

@@ -108,9 +108,20 @@ const KEYS = {
   t: nextHandles,
 };
 
+/* Ctrl+Z and Ctrl+Y, or with Shift, as everywhere: a stroke first, else a step of the scene. */
+function undoOrRedo(event) {
+  const goesBack = event.key.toLowerCase() === "z" && !event.shiftKey;
+  if (goesBack && strokes.length > 0) undoStroke();
+  else if (goesBack) ask("undo");
+  else if (undoneStrokes.length > 0) redoStroke();
+  else ask("redo");
+  event.preventDefault();
+}
+
 function onKeyDown(event) {
-  if (event.ctrlKey || event.metaKey || event.altKey || !state.eye) return;
   if (event.target.tagName === "INPUT" && event.target.type === "number") return;
+  if ((event.ctrlKey || event.metaKey) && ["z", "y"].includes(event.key.toLowerCase())) undoOrRedo(event);
+  if (event.ctrlKey || event.metaKey || event.altKey || !state.eye) return;
   if (event.target === byId("width") && event.key.startsWith("Arrow")) return;
   if (event.target.tagName === "BUTTON" && event.key === "Enter") return;
   if (PAINTS.includes(state.drag) && event.code === "KeyE") {

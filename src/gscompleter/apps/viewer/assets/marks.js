@@ -78,6 +78,8 @@ function drawMarks() {
 
 /* Draws the border of the photograph, where it is what is painted on or completed. */
 function drawFrame(pen, left, top, width, height) {
+  // Two pictures side by side have a photograph each.
+  if (state.mode === "side" && !state.held) return;
   if (!content.live && !PAINTS.includes(state.drag)) return;
   pen.strokeStyle = FRAME_COLOUR;
   pen.strokeRect(left + 0.5, top + 0.5, width - 1, height - 1);
