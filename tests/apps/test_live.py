@@ -654,11 +654,8 @@ def test_pages_from_elsewhere_are_refused(page, host):
             page.handle(page._requests.get())
             assert answer_of(server, own, f"http://{own}") == 202
             page.handle(page._requests.get())
-            for origin in (
-                "http://elsewhere.example",
-                "http://127.0.0.1.elsewhere.example",
-                "null",
-            ):
+            others = ("http://elsewhere.example", f"http://{own}.elsewhere.example")
+            for origin in (*others, "null", "http://["):
                 assert answer_of(server, own, origin) == 403
         # A site whose name points here is its own origin.
         assert answer_of(server, "elsewhere.example", "http://elsewhere.example") == 421
@@ -769,3 +766,20 @@ def test_strokes_that_are_none_are_refused(splat, tmp_path, monkeypatch, capsys,
 def test_what_is_wrong_is_named_once(splat, tmp_path, monkeypatch, capsys, words, said):
     assert run(monkeypatch, "repair", splat, *words, "--out", tmp_path / "out") == 2
     assert said in capsys.readouterr().err
+
+
+def test_a_scene_of_photographs_is_repaired_and_replayed_too(
+    ready, begun, room, tmp_path, monkeypatch
+):
+    session, _ = apply_step(begun, marked(begun, "repair"))
+    out, other = tmp_path / "out", tmp_path / "other"
+    elsewhere = replace(ready, options=replace(ready.options, out=out))
+    serving.save_session(elsewhere, session)
+    words = ("repair", room, "--strokes", out / "strokes.json", "--out", other, "--quiet")
+    assert run(monkeypatch, *words) == 0
+    for name in ("completed.ply", "context.ply"):
+        assert (out / name).read_bytes() == (other / name).read_bytes(), name
+    # There is no file of a splat to give back: the context is the scene as it was.
+    assert len(load_ply(out / "context.ply")) == len(begun.latest.context)
+    kept = load_ply(out / "completed.ply")
+    assert int((kept.generated == 0).sum()) < len(begun.latest.context)

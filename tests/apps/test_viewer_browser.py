@@ -431,7 +431,7 @@ def touch(page: Any, count: int) -> None:
 
 
 def test_a_lasso_marks_its_inside_and_strokes_come_back(browser, saved, tmp_path):
-    tab = Window(browser, saved, 900, 700)
+    tab = Window(browser, saved, 420, 400)
     tab.do('gsc.goTo("target-1")')
     tab.key("l")
     box = tab.page.locator("#stage").bounding_box()

@@ -50,7 +50,12 @@ class Address:
         Any page in a browser may send requests here; only `Origin` shows its source. Programs send
         none.
         """
-        return origin is None or urlsplit(origin).netloc.lower() == host.lower() != ""
+        if origin is None:
+            return True
+        try:
+            return urlsplit(origin).netloc.lower() == host.lower() != ""
+        except ValueError:  # no address at all
+            return False
 
 
 def resolve_host(host: str) -> Address:

@@ -68,7 +68,7 @@ def build_page(
         ViewerCamera(
             f"photograph-{view.frame}",
             f"{kind} {name_photograph(view.frame, ready.opened.files.get(view.frame))}",
-            view.camera,
+            view.camera.on_cpu,
             shrink_image(Image.fromarray(convert_to_pixels(view.image))),
         )
         for view in session.latest.views

@@ -43,7 +43,7 @@ function saveCamera() {
 async function saveMask() {
   const png = await maskPng();
   if (!png) {
-    say("Nothing is marked: choose Mark, and paint over what is wrong.");
+    say("Nothing is marked: choose Brush or Lasso, and paint over what is wrong.");
     return;
   }
   download("mask.png", png);
