@@ -396,6 +396,7 @@ def test_fingers_paint_and_move(browser, saved):
     page.keyboard.press("m")
     # The picture has room on a phone, too.
     assert page.locator("#stage").bounding_box()["height"] > 300
+    assert page.evaluate("[innerWidth, innerHeight]") == [420, 700]
     touch(page, 1)
     assert page.evaluate("gsc.stats()")["strokes"] == 1
     page.keyboard.press("z")
